@@ -1,0 +1,69 @@
+"""Errors that a user can cause and mend: one base class, one child a kind of mistake.
+
+Every message says what came, what was expected and what exists. The command line prints the message alone.
+"""
+
+from collections.abc import Iterable
+from difflib import get_close_matches
+
+
+class VisthrowError(Exception):
+    """Base of all errors that name a user's mistake or a state of the machine that the user can change."""
+
+
+class ConfigError(VisthrowError):
+    """A configuration file, an override or a name of a configuration is wrong."""
+
+
+class PolicyError(VisthrowError):
+    """A policy file cannot be read or does not describe a policy."""
+
+
+class MismatchError(PolicyError):
+    """A policy was trained under other conditions than those it is to be used in."""
+
+
+class LogError(VisthrowError):
+    """A flight log cannot be read or its channels contradict each other."""
+
+
+class CalibrationError(VisthrowError):
+    """A camera calibration file cannot be used; raised where ``camera``'s ``ValueError`` reaches the user."""
+
+
+class TrainError(VisthrowError):
+    """Training cannot start, go on or resume."""
+
+
+class CheckpointError(TrainError):
+    """A checkpoint is missing, cut short or of another run."""
+
+
+class DeviceError(VisthrowError):
+    """The compute device asked for is not there."""
+
+
+class DependencyError(VisthrowError):
+    """An optional package that the command needs is not installed."""
+
+
+class StorageError(VisthrowError):
+    """A result could not be written: full disk, no permission, missing folder."""
+
+
+def suggest(name: str, known: Iterable[str]) -> str:
+    """Say what exists, and which of it is closest to a name that does not.
+
+    Args:
+        name: What the user wrote.
+        known: What exists.
+
+    Returns:
+        ``"did you mean 'mass'? Known: inertia, mass"``, or ``"Nothing is known here"`` for nothing.
+    """
+    names = sorted(known)
+    if not names:
+        return "nothing is known here"
+    close = get_close_matches(name, names, n=1)
+    listed = ", ".join(names)
+    return f"did you mean '{close[0]}'? Known: {listed}" if close else f"known: {listed}"

@@ -1,0 +1,60 @@
+"""Writes nested dictionaries as TOML; the standard library only reads it."""
+
+import json
+import math
+import re
+from typing import Any
+
+_BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
+
+
+def dumps(tree: dict[str, Any]) -> str:
+    """Write a nested dictionary as TOML text that ``tomllib.loads`` reads back to equal values.
+
+    Args:
+        tree: Strings, bools, ints, finite floats, lists or tuples of them, and dictionaries with string keys.
+
+    Returns:
+        The text, plain keys first, each table under its own header.
+
+    Raises:
+        ValueError: If a value has no TOML form (NaN, infinity, None, other types).
+    """
+    lines: list[str] = []
+    _table(tree, (), lines)
+    return "\n".join(lines).strip("\n") + "\n"
+
+
+def _table(tree: dict[str, Any], path: tuple[str, ...], lines: list[str]) -> None:
+    plain = {key: value for key, value in tree.items() if not isinstance(value, dict)}
+    tables = {key: value for key, value in tree.items() if isinstance(value, dict)}
+    if path and (plain or not tables):
+        lines += ["", f"[{'.'.join(_key(part) for part in path)}]"]
+    lines += [f"{_key(key)} = {_value(value, (*path, key))}" for key, value in plain.items()]
+    for key, value in tables.items():
+        _table(value, (*path, key), lines)
+
+
+def _key(key: str) -> str:
+    return key if _BARE_KEY.fullmatch(key) else _string(key)
+
+
+def _string(text: str) -> str:
+    # JSON's escapes are TOML's, except that TOML refuses a bare DEL.
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
+def _value(value: Any, path: tuple[str, ...]) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        return _string(value)
+    if isinstance(value, int):
+        return str(value)
+    if isinstance(value, float) and math.isfinite(value):
+        return repr(value)
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(_value(item, path) for item in value) + "]"
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{_key(key)} = {_value(item, path)}" for key, item in value.items()) + "}"
+    raise ValueError(f"{'.'.join(path)}: {value!r} has no TOML form: no string, bool, finite number, list or table")
