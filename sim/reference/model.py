@@ -1,0 +1,173 @@
+"""MuJoCo models of quadrotor, rope and payload, built with ``MjSpec``.
+
+Body frames: a rod's body frame has its origin at the rod's upper end and its z axis against the rod's direction, so that
+a level quadrotor with a hanging rope has every relative rotation at identity.
+
+Joints:
+
+- ``universal``: two perpendicular hinges a segment, first about the frame's y axis, then about its x axis. The first
+  turns without limit, so a rope may fold back on itself in the pitch plane, where throws happen; the pair is singular
+  only where the second stands at +-90 deg, that is where a segment points along +-y of its parent.
+- ``ball``: a ball joint a segment; no singularity. Axial spin is then a coordinate of its own that no force drives.
+
+Joint damping acts on the relative rate of a universal joint, which lies in the plane of its two axes. Ball joints get
+none here: ``sim.reference.plant`` applies it as a couple.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import mujoco
+import numpy as np
+
+from sim.params import GRAVITY
+
+AXIAL_INERTIA = 1e-12
+"""Inertia of a rod about its axis with universal joints [kg m^2]: they pass twist on, so that it must not matter."""
+
+
+@dataclass(frozen=True)
+class RopeModel:
+    """Masses and lengths of one quadrotor with one rope; the same quantities as ``sim.params``."""
+
+    mass: float  # of the quadrotor [kg]
+    inertia: tuple[float, float, float]  # [kg m^2]
+    mount: tuple[float, float, float]  # body frame [m]
+    segments: int
+    segment_length: float  # [m]
+    segment_mass: float  # [kg]
+    payload_mass: float  # [kg]
+    payload_inertia: float  # transverse, about the payload's centre [kg m^2]
+    payload_offset: float  # payload's centre past the end of the last segment [m]
+    joint_damping: float  # [N m s]
+    gravity: float = GRAVITY  # [m/s^2]
+
+
+def _set_inertial(body: "mujoco.MjsBody", mass: float, centre_z: float, inertia: tuple[float, float, float]) -> None:
+    body.mass = mass
+    body.ipos = [0.0, 0.0, centre_z]
+    body.inertia = list(inertia)
+    body.explicitinertial = True
+
+
+def _rod_inertial(rope: RopeModel, last: bool, with_payload: bool, axial: float) -> tuple[float, float, tuple[float, float, float]]:
+    """Mass, height of the centre of mass in the rod's frame and inertia about it, payload included on the last rod."""
+    mass, length = rope.segment_mass, rope.segment_length
+    about_centre = mass * length**2 / 12.0
+    if not (last and with_payload):
+        return mass, -length / 2, (about_centre, about_centre, axial)
+    reach = length + rope.payload_offset
+    total = mass + rope.payload_mass
+    centre = (mass * length / 2 + rope.payload_mass * reach) / total
+    transverse = about_centre + rope.payload_inertia
+    transverse += mass * (centre - length / 2) ** 2 + rope.payload_mass * (reach - centre) ** 2
+    return total, -centre, (transverse, transverse, axial)
+
+
+def _add_joints(body: "mujoco.MjsBody", index: int, joints: str, damping: float, armature: float) -> None:
+    if joints == "ball":
+        body.add_joint(name=f"ball{index}", type=mujoco.mjtJoint.mjJNT_BALL)
+        return
+    for name, axis in (("y", [0, 1, 0]), ("x", [1, 0, 0])):
+        joint = body.add_joint(name=f"{name}{index}", type=mujoco.mjtJoint.mjJNT_HINGE, axis=axis)
+        joint.damping[0] = damping
+        joint.armature = armature
+
+
+def _new_spec(gravity: float) -> "mujoco.MjSpec":
+    spec = mujoco.MjSpec()
+    spec.option.gravity = [0.0, 0.0, -gravity]
+    spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT) | int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+    return spec
+
+
+def _add_vehicle(spec: "mujoco.MjSpec", rope: RopeModel) -> "mujoco.MjsBody":
+    vehicle = spec.worldbody.add_body(name="vehicle")
+    vehicle.add_freejoint(name="root")
+    _set_inertial(vehicle, rope.mass, 0.0, rope.inertia)
+    vehicle.add_site(name="centre")
+    # Forces in the body frame as actuators on a site: MuJoCo turns them with the body in every stage of RK4, an
+    # applied world force it would hold for the whole step.
+    for i, name in enumerate(("fx", "fy", "fz", "tx", "ty", "tz")):
+        gear = [0.0] * 6
+        gear[i] = 1.0
+        spec.add_actuator(name=name, trntype=mujoco.mjtTrn.mjTRN_SITE, target="centre", gear=gear)
+    return vehicle
+
+
+def build_attached(
+    rope: RopeModel,
+    joints: Literal["universal", "ball"] = "universal",
+    armature: float = 0.0,
+    stretch: tuple[float, float] | None = None,
+) -> "mujoco.MjModel":
+    """Build the quadrotor with its rope.
+
+    Args:
+        rope: masses and lengths.
+        joints: kind of the rope's joints.
+        armature: reflected inertia added to every hinge [kg m^2]; 0 is the physical model.
+        stretch: stiffness [N/m] and damping [N s/m] of a slide along the rope between last segment and payload.
+
+    Returns:
+        Compiled model with the bodies ``vehicle``, ``rod0`` .. and, with ``stretch``, ``payload``.
+    """
+    spec = _new_spec(rope.gravity)
+    parent, anchor = _add_vehicle(spec, rope), list(rope.mount)
+    _add_chain(spec, rope, parent, anchor, joints, armature, stretch, free_root=False)
+    return spec.compile()
+
+
+def build_free(rope: RopeModel, stretch: tuple[float, float] | None = None) -> "mujoco.MjModel":
+    """Build the rope and the payload alone: first rod on a free joint, ball joints below."""
+    spec = _new_spec(rope.gravity)
+    _add_chain(spec, rope, spec.worldbody, [0.0, 0.0, 0.0], "ball", 0.0, stretch, free_root=True)
+    return spec.compile()
+
+
+def _add_chain(
+    spec: "mujoco.MjSpec",
+    rope: RopeModel,
+    parent: "mujoco.MjsBody",
+    anchor: list[float],
+    joints: str,
+    armature: float,
+    stretch: tuple[float, float] | None,
+    free_root: bool,
+) -> None:
+    for i in range(rope.segments):
+        rod = parent.add_body(name=f"rod{i}", pos=anchor)
+        mass, centre, inertia = _rod_inertial(rope, i == rope.segments - 1, stretch is None, AXIAL_INERTIA)
+        if joints == "ball":
+            # Without twist in the joints the axial inertia enters nothing; this one keeps the mass matrix well scaled.
+            inertia = (inertia[0], inertia[1], inertia[0])
+        _set_inertial(rod, mass, centre, inertia)
+        if i == 0 and free_root:
+            rod.add_freejoint(name="root")
+        else:
+            _add_joints(rod, i, joints, rope.joint_damping, armature)
+        parent, anchor = rod, [0.0, 0.0, -rope.segment_length]
+    if stretch is not None:
+        payload = parent.add_body(name="payload", pos=[0.0, 0.0, -rope.segment_length - rope.payload_offset])
+        _set_inertial(payload, rope.payload_mass, 0.0, (rope.payload_inertia,) * 3)
+        slide = payload.add_joint(name="stretch", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 0, -1])
+        slide.stiffness[0] = stretch[0]
+        slide.damping[0] = stretch[1]
+
+
+def rotation_from_direction(direction_w: np.ndarray) -> np.ndarray:
+    """Return rotations whose -z axis is ``direction_w``, shape (..., 3, 3), turned as little as possible from hanging.
+
+    Args:
+        direction_w: unit vectors, shape (..., 3).
+
+    Source: Frisvad, Building an orthonormal basis from a 3D unit vector without normalization, 2012, with the branch of
+    Duff et al. 2017 on the sign of z, so that no direction is singular.
+    """
+    z = -np.asarray(direction_w, dtype=np.float64)
+    sign = np.where(z[..., 2] >= 0.0, 1.0, -1.0)
+    a = -1.0 / (sign + z[..., 2])
+    b = z[..., 0] * z[..., 1] * a
+    x_axis = np.stack((1.0 + sign * z[..., 0] ** 2 * a, sign * b, -sign * z[..., 0]), -1)
+    y_axis = np.stack((b, sign + z[..., 1] ** 2 * a, -z[..., 1]), -1)
+    return np.stack((x_axis, y_axis, z), -1)
