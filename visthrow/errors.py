@@ -27,10 +27,6 @@ class LogError(VisthrowError):
     """A flight log cannot be read or its channels contradict each other."""
 
 
-class CalibrationError(VisthrowError):
-    """A camera calibration file cannot be used; raised where ``camera``'s ``ValueError`` reaches the user."""
-
-
 class TrainError(VisthrowError):
     """Training cannot start, go on or resume."""
 
@@ -41,10 +37,6 @@ class CheckpointError(TrainError):
 
 class DeviceError(VisthrowError):
     """The compute device asked for is not there."""
-
-
-class DependencyError(VisthrowError):
-    """An optional package that the command needs is not installed."""
 
 
 class StorageError(VisthrowError):

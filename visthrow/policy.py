@@ -1,8 +1,8 @@
 """The exported policy: a small network, the conditions that it was trained under, and how it was made.
 
 Onboard-safe: torch, numpy and json only. The file is an ``.npz`` without pickle: ``layer<i>_weight`` and
-``layer<i>_bias`` (float32), optionally ``normalizer_mean``, ``normalizer_std``, ``normalizer_eps``, and ``header``, JSON
-text with ``format_version``, ``activation``, ``contract`` and ``made_by``.
+``layer<i>_bias`` (float32), optionally ``normalizer_mean``, ``normalizer_std``, ``normalizer_eps``, and ``header``,
+JSON text with ``format_version``, ``activation``, ``contract`` and ``made_by``.
 
 ``contract`` is a nested dictionary of everything that whoever flies the policy must share with its training: camera,
 mount, action limits, release lag, vehicle, observation layout. ``contract["observation"]["dimension"]`` and

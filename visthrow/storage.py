@@ -46,6 +46,15 @@ def atomic_write(path: str | Path, content: bytes | str) -> None:
                 os.unlink(temporary)
 
 
+def write_json(path: str | Path, value: Any) -> None:
+    """Write a value as indented JSON, atomically; NaN and infinity become null, as JSON has neither.
+
+    Raises:
+        StorageError: As ``atomic_write``.
+    """
+    atomic_write(path, json.dumps(_without_nan(value), indent=2, allow_nan=False) + "\n")
+
+
 def savez(path: str | Path, arrays: dict[str, np.ndarray]) -> None:
     """Write named arrays as a compressed ``.npz``, atomically and without pickle.
 
@@ -98,6 +107,16 @@ def from_json_array(array: np.ndarray) -> Any:
         ValueError: If the array holds no JSON.
     """
     return json.loads(np.asarray(array, dtype=np.uint8).tobytes().decode("utf-8"))
+
+
+def _without_nan(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(key): _without_nan(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_without_nan(item) for item in value]
+    if isinstance(value, np.generic | np.ndarray):
+        return _without_nan(value.tolist())
+    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def _umask() -> int:

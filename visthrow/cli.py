@@ -1,0 +1,121 @@
+"""The command line. Each command is imported only when chosen, so that ``visthrow --help`` answers at once."""
+
+import argparse
+import importlib
+import os
+import sys
+from collections.abc import Sequence
+from typing import NoReturn
+
+from visthrow import __version__
+from visthrow.errors import VisthrowError
+
+COMMANDS = {
+    "demo": ("throw once with the shipped vision policy and compare it with the state policy", "visthrow.demo"),
+    "train": ("train a throwing policy from scratch", "visthrow.train_cli"),
+    "fly": ("fly one throw and write a 3D recording and a picture of it", "visthrow.fly"),
+    "compare": ("throw many times with each policy and print landing errors and durations", "visthrow.compare"),
+    "bench": ("measure the speed of the simulator and of the camera", "visthrow.bench"),
+    "config": ("print a configuration with all its values filled in", "visthrow.config_cli"),
+}
+"""Name -> (help, module). The module has ``add_arguments(parser)`` and ``run(args) -> int``."""
+
+TRACEBACK_VARIABLE = "VISTHROW_TRACEBACK"
+EXIT_BAD_INPUT = 2
+EXIT_INTERRUPTED = 130
+
+_EXTRAS = {"mujoco": "reference"}
+"""Optional packages by import name, and the extra of visthrow that installs them."""
+
+_DESCRIPTION = """\
+Train, compare and fly policies that throw a ball hanging on a rope below a quadrotor onto a target.
+"""
+
+_EPILOG = """\
+examples:
+  visthrow demo                                  a first look: one throw, a picture, a table
+  visthrow train state --device cuda             train the policy that sees true positions
+  visthrow fly --target 2.0                      one throw at a target 2 m away
+  visthrow compare --json out/table.json         state against vision over many throws
+  visthrow config vehicle paper                  the values of the simulated vehicle
+
+'visthrow COMMAND --help' tells more about a command. Set VISTHROW_TRACEBACK=1 to see where an error came from.
+"""
+
+
+def add_common(parser: argparse.ArgumentParser, *, device: bool = True, json: bool = True) -> None:
+    """Add the options that commands share: ``--device``, ``--set``, ``--json``.
+
+    Args:
+        parser: Of the command.
+        device: Whether the command computes on a device; read ``args.device`` through ``visthrow.device.resolve``.
+        json: Whether the command prints a table; write it to ``args.json`` as well where that is not None.
+    """
+    parser.add_argument(
+        "--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE",
+        help="change one value of the configuration, for instance --set vehicle.body.mass=0.25; may be repeated",
+    )  # fmt: skip
+    if device:
+        parser.add_argument(
+            "--device",
+            default="auto",
+            metavar="NAME",
+            help="auto, cpu, cuda or cuda:1 (default: a GPU if there is one)",
+        )
+    if json:
+        parser.add_argument("--json", metavar="FILE", help="write the printed figures to this file as well")
+
+
+def build_parser(chosen: str | None = None) -> argparse.ArgumentParser:
+    """Build the parser; only the chosen command's module is imported and asked for its arguments."""
+    form = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser("visthrow", description=_DESCRIPTION, epilog=_EPILOG, formatter_class=form)
+    parser.add_argument("--version", action="version", version=f"visthrow {__version__}")
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", title="commands", required=True)
+    for name, (text, module) in COMMANDS.items():
+        sub = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".", formatter_class=form)
+        if name == chosen:
+            importlib.import_module(module).add_arguments(sub)
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line and return the exit status.
+
+    Returns:
+        The command's own status; 2 for a mistake of the user, told in one message; 130 after Ctrl-C.
+    """
+    argv = list(sys.argv[1:] if argv is None else argv)
+    chosen = next((word for word in argv if not word.startswith("-")), None)
+    try:
+        args = build_parser(chosen).parse_args(argv)
+        return int(importlib.import_module(COMMANDS[args.command][1]).run(args) or 0)
+    except KeyboardInterrupt:
+        print("visthrow: interrupted", file=sys.stderr)
+        return EXIT_INTERRUPTED
+    except BrokenPipeError:  # the reader of our output went away, as `head` does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except ModuleNotFoundError as error:
+        extra = _EXTRAS.get((error.name or "").split(".")[0])
+        if extra is None:
+            raise
+        return _refuse(f"this needs the package '{error.name}'; install it with: pip install 'visthrow[{extra}]'")
+    except (VisthrowError, ValueError, OSError) as error:
+        if os.environ.get(TRACEBACK_VARIABLE):
+            raise
+        return _refuse(str(error) or type(error).__name__)
+
+
+def _refuse(message: str) -> int:
+    print(f"visthrow: error: {message}", file=sys.stderr)
+    return EXIT_BAD_INPUT
+
+
+def entry() -> NoReturn:
+    """Run ``main`` as a process (``python -m visthrow.cli``)."""
+    sys.exit(main())
+
+
+if __name__ == "__main__":
+    entry()

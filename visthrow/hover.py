@@ -1,0 +1,162 @@
+"""The hover controller: collective thrust and body rates that hold a position and a heading.
+
+Onboard-safe (numpy only). It serves before a throw, with the payload hanging below, and after the release, without it;
+the policy learns neither. Batched over vehicles; the same code with a batch of one on board.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+GRAVITY = 9.81
+"""[m/s^2]; written again here because onboard modules do not import ``sim``."""
+
+
+@dataclass(frozen=True)
+class HoverParams:
+    """Gains and limits, for a delay of some 0.1 s from command to attitude and a payload on a rope.
+
+    The swing of a 0.33 m rope under this vehicle (5.9 rad/s with the vehicle free to move) lies above the position
+    loop and is damped by it: the vehicle gives way to the pull of the rope at the rate that ``velocity_gain`` allows.
+
+    Raises:
+        ValueError: If a gain or limit is negative, or the thrust limits are not ordered.
+    """
+
+    position_gain: float = 1.5  # velocity asked for a metre off [1/s]
+    velocity_gain: float = 3.5  # [1/s]
+    integral_gain: float = 1.0  # [1/s^3]
+    integral_limit: float = 1.5  # of each component [m/s^2]
+    integral_radius: float = 0.15  # distance from the goal within which the integral grows [m]
+    max_speed: float = 1.5  # of the velocity asked for [m/s]
+    max_acceleration: float = 6.0  # up and down, asked for besides gravity [m/s^2]
+    max_tilt: float = 0.6  # of the thrust asked for [rad]
+    attitude_gain: float = 10.0  # [1/s]
+    yaw_gain: float = 2.0  # [1/s]
+    max_rate: tuple[float, float, float] = (8.0, 8.0, 2.0)  # [rad/s]
+    min_thrust: float = 0.2  # [N]
+    max_thrust: float = 14.0  # [N]
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if np.any(np.asarray(value) < 0.0):
+                raise ValueError(f"{name} is {value}; expected 0 or more")
+        if not self.min_thrust < self.max_thrust:
+            raise ValueError(f"min_thrust {self.min_thrust} N is not below max_thrust {self.max_thrust} N")
+        if not self.max_tilt < np.pi / 2:
+            raise ValueError(f"max_tilt {self.max_tilt} rad; expected less than pi/2, thrust must hold the weight")
+
+
+class HoverController:
+    """Position controller with an integral, one for each of E vehicles."""
+
+    def __init__(self, params: HoverParams, period: float, count: int = 1) -> None:
+        """Start with empty integrals.
+
+        Args:
+            params: Gains and limits.
+            period: Time between two calls [s].
+            count: Number of vehicles E.
+
+        Raises:
+            ValueError: If the period or count is not positive.
+        """
+        if not (period > 0.0 and count >= 1):
+            raise ValueError(f"period {period} s and count {count}; expected both above 0")
+        self.params = params
+        self.period = period
+        self._integral_w = np.zeros((count, 3))
+
+    def reset(self, mask: np.ndarray | None = None) -> None:
+        """Empty the integrals of the vehicles where ``mask`` (E,) is true, of all without a mask."""
+        self._integral_w[slice(None) if mask is None else np.asarray(mask, dtype=bool)] = 0.0
+
+    def step(
+        self,
+        pos_w: np.ndarray,
+        quat_wb: np.ndarray,
+        vel_w: np.ndarray,
+        goal_w: np.ndarray,
+        mass: float | np.ndarray,
+        yaw: float | np.ndarray = 0.0,
+    ) -> np.ndarray:
+        """Return the command that brings the vehicles to their goals.
+
+        Args:
+            pos_w: Positions [m], shape (E, 3), world frame.
+            quat_wb: Attitudes, xyzw, shape (E, 4).
+            vel_w: Velocities [m/s], shape (E, 3), world frame.
+            goal_w: Positions to hold [m], shape (E, 3) or (3,), world frame.
+            mass: Total mass, with whatever hangs below [kg], scalar or shape (E,).
+            yaw: Headings to hold [rad], scalar or shape (E,).
+
+        Returns:
+            Collective thrust along body z [N] and body rates [rad/s], shape (E, 4).
+        """
+        params = self.params
+        rot_wb = rot_from_quat(np.asarray(quat_wb, dtype=float))
+        thrust_w = self._acceleration(pos_w, vel_w, goal_w)
+        thrust_w[:, 2] += GRAVITY
+        thrust_w = _tilt_limited(thrust_w, params.max_tilt)
+        # Projected on where the vehicle's thrust points now: while it still turns, none is spent sideways.
+        thrust = np.asarray(mass) * np.sum(thrust_w * rot_wb[:, :, 2], axis=1)
+        rates_b = _rates(rot_wb, thrust_w, np.asarray(yaw, dtype=float), params)
+        command = np.empty((len(rates_b), 4))
+        command[:, 0] = np.clip(thrust, params.min_thrust, params.max_thrust)
+        command[:, 1:] = np.clip(rates_b, np.negative(params.max_rate), params.max_rate)
+        return command
+
+    def _acceleration(self, pos_w: np.ndarray, vel_w: np.ndarray, goal_w: np.ndarray) -> np.ndarray:
+        params = self.params
+        error_w = np.asarray(goal_w, dtype=float) - pos_w
+        asked_w = params.position_gain * error_w
+        speed = np.linalg.norm(asked_w, axis=1, keepdims=True)
+        far = speed > params.max_speed
+        asked_w *= np.where(far, params.max_speed / np.maximum(speed, 1e-9), 1.0)
+        # On the way there from far off an integral would only wind up, and overshoot on arrival.
+        near = np.linalg.norm(error_w, axis=1, keepdims=True) < params.integral_radius
+        growth_w = np.where(near, params.integral_gain * self.period * error_w, 0.0)
+        self._integral_w = np.clip(self._integral_w + growth_w, -params.integral_limit, params.integral_limit)
+        acceleration_w = params.velocity_gain * (asked_w - vel_w) + self._integral_w
+        acceleration_w[:, 2] = np.clip(acceleration_w[:, 2], -params.max_acceleration, params.max_acceleration)
+        return acceleration_w
+
+
+def rot_from_quat(quat_wb: np.ndarray) -> np.ndarray:
+    """Return the rotation matrices of unit quaternions.
+
+    Args:
+        quat_wb: xyzw, shape (E, 4); normalised here.
+
+    Returns:
+        ``rot_wb``, shape (E, 3, 3).
+    """
+    x, y, z, w = np.moveaxis(quat_wb / np.linalg.norm(quat_wb, axis=1, keepdims=True), 1, 0)
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
+        (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
+        (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
+    )
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def _tilt_limited(thrust_w: np.ndarray, max_tilt: float) -> np.ndarray:
+    """Shorten the horizontal part until the thrust (E, 3) leans no more than ``max_tilt`` [rad] from the vertical."""
+    up = np.maximum(thrust_w[:, 2], 0.1 * GRAVITY)  # falling is no reason to turn over
+    flat = np.linalg.norm(thrust_w[:, :2], axis=1)
+    scale = np.minimum(1.0, np.tan(max_tilt) * up / np.maximum(flat, 1e-9))
+    return np.column_stack((thrust_w[:, :2] * scale[:, None], up))
+
+
+def _rates(rot_wb: np.ndarray, thrust_w: np.ndarray, yaw: np.ndarray, params: HoverParams) -> np.ndarray:
+    """Return body rates (E, 3) [rad/s] that turn body z onto the thrust on the shortest way, and the heading to yaw."""
+    aim_b = np.einsum("eji,ej->ei", rot_wb, thrust_w / np.linalg.norm(thrust_w, axis=1, keepdims=True))
+    sine = np.linalg.norm(aim_b[:, :2], axis=1)
+    angle = np.arctan2(sine, aim_b[:, 2])
+    # e_z x aim = (-aim_y, aim_x, 0); upside down exactly, any axis will do.
+    axis = np.where(sine[:, None] > 1e-9, np.column_stack((-aim_b[:, 1], aim_b[:, 0])), (1.0, 0.0))
+    tilt_rates = params.attitude_gain * angle[:, None] * axis / np.where(sine > 1e-9, sine, 1.0)[:, None]
+    heading = np.arctan2(rot_wb[:, 1, 0], rot_wb[:, 0, 0])
+    error = np.angle(np.exp(1j * (yaw - heading)))
+    # A turn about the world's vertical has this much of body z in it; none where the vehicle lies on its side.
+    return np.column_stack((tilt_rates, params.yaw_gain * error * rot_wb[:, 2, 2]))

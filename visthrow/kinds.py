@@ -1,0 +1,33 @@
+"""Which schema each folder of configs, and each file that differs from its folder, is read with."""
+
+import importlib
+from pathlib import Path
+
+from visthrow.errors import ConfigError, suggest
+
+SCHEMAS = {
+    "vehicle": "sim.params:VehicleParams",
+    "rope": "sim.params:RopeParams",
+    "camera": "camera.params:CameraParams",
+    "vehicle/reference_realistic": "sim.reference.extras:ReferenceExtras",
+}
+"""``kind`` or ``kind/name`` -> ``module:class``; the longer key wins."""
+
+
+def schema_of(kind: str, name: str = "") -> type:
+    """Return the schema of a config; its module is imported only now.
+
+    Raises:
+        ConfigError: If no schema is known for the kind.
+    """
+    target = SCHEMAS.get(f"{kind}/{name}") or SCHEMAS.get(kind)
+    if target is None:
+        raise ConfigError(f"no kind of config '{kind}'; {suggest(kind, (key for key in SCHEMAS if '/' not in key))}")
+    module, attribute = target.split(":")
+    return getattr(importlib.import_module(module), attribute)
+
+
+def schema_of_file(path: str | Path) -> type:
+    """Return the schema of a config file from its folder's and its own name."""
+    path = Path(path)
+    return schema_of(path.resolve().parent.name, path.stem)
