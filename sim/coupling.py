@@ -1,0 +1,155 @@
+"""One integration step of the vehicle with the chain as one body: root solve, ROS2 stages, momentum, fall-back."""
+
+from types import SimpleNamespace
+
+import warp as wp
+
+from sim.quadrotor.rigid_body import advance, angular_acceleration, blend
+from sim.structs import Types
+
+
+def build_root(t: Types):
+    """Solve for the root's acceleration, given what the chain asks for (``sim.rope.chain``).
+
+    Returns:
+        Warp function ``root(p, rope, state, force_b, torque_b, d, o, b, gravity)`` -> acceleration of the centre of mass
+        [m/s^2, world], angular acceleration [rad/s^2, body], acceleration of the mount [world], force on the chain [N, world].
+    """
+    vec3, mat33, Vehicle, Rope, QuadState = t.vec3, t.mat33, t.Vehicle, t.Rope, t.QuadState
+    real = t.real
+
+    @wp.func
+    def root(p: Vehicle, rope: Rope, s: QuadState, force_b: vec3, torque_b: vec3, d: vec3, o: vec3, b: vec3, gravity: vec3):
+        r = rope.mount
+        rot = wp.quat_to_matrix(s.quat_wb)
+        inv_mass = real(1.0) / p.body.mass
+        alpha = angular_acceleration(p, s.rate_b, torque_b)
+        acc = inv_mass * (rot * force_b) + gravity
+        free = acc + rot * (wp.cross(alpha, r) + wp.cross(s.rate_b, wp.cross(s.rate_b, r)))
+        arm = rot * wp.skew(r)
+        inv_inertia = vec3(
+            real(1.0) / p.body.inertia[0], real(1.0) / p.body.inertia[1], real(1.0) / p.body.inertia[2]
+        )
+        mobility = wp.diag(vec3(inv_mass, inv_mass, inv_mass)) + arm * wp.diag(inv_inertia) * wp.transpose(arm)
+        mass = mat33(d[0], o[0], o[1], o[0], d[1], o[2], o[1], o[2], d[2])
+        eye = wp.diag(vec3(real(1.0), real(1.0), real(1.0)))
+        mount_acc = wp.inverse(eye + mobility * mass) * (free - mobility * b)
+        pull = mass * mount_acc + b
+        reaction_b = -(wp.transpose(rot) * pull)
+        alpha = alpha + wp.cw_mul(inv_inertia, wp.cross(r, reaction_b))
+        return acc - inv_mass * pull, alpha, mount_acc, pull
+
+    return root
+
+
+def build_coupled_step(t: Types, flow, rate, motor_advance, chain: SimpleNamespace):
+    """One step of h seconds of vehicle and chain.
+
+    The vehicle advances by Heun's method, the chain by ROS2, both from the same two solves. The velocity of the root
+    follows from the total linear momentum, which external forces alone change; so it is conserved to round-off.
+    Where a rod turns more than ``max_turn`` in the step, the first stage alone (linearly implicit Euler) is kept.
+
+    Returns:
+        Warp function ``step(p, rope, state, command, n, u, stiffness, work..., gravity, gamma, max_turn, h)`` ->
+        new state, whether it fell back. The arrays n (directions), u (their rates) and stiffness change in place.
+    """
+    vec3, vec4, real = t.vec3, t.vec4, t.real
+    Vehicle, Rope, QuadState, QuadRate, Flow = t.Vehicle, t.Rope, t.QuadState, t.QuadRate, t.Flow
+    vec2 = chain.vec2
+    L = chain.segments
+    root = build_root(t)
+
+    @wp.func
+    def stage(
+        p: Vehicle, rope: Rope, s: QuadState, f: Flow,
+        n: wp.array(dtype=vec3), u: wp.array(dtype=vec3), k1: wp.array(dtype=vec3), stiffness: wp.array(dtype=real),
+        next_stiffness: wp.array(dtype=real), c1: wp.array(dtype=vec3), c2: wp.array(dtype=vec3), hs: wp.array(dtype=vec2),
+        acc: wp.array(dtype=vec3), gravity: vec3, gamma: real, h: real, index: int,
+    ):
+        rate_w = wp.quat_rotate(s.quat_wb, s.rate_b)
+        d, o, b = chain.up(rope, n, u, k1, stiffness, rate_w, gravity, gamma, h, index, c1, c2, hs)
+        drag_w = rope.joint_damping * (wp.cross(n[0], u[0]) - rate_w)
+        torque = f.torque_b + wp.quat_rotate_inv(s.quat_wb, drag_w)
+        acc_w, alpha_b, mount_acc, pull = root(p, rope, s, f.force_b, torque, d, o, b, gravity)
+        chain.down(rope, n, u, mount_acc, pull, gravity, c1, c2, hs, acc, next_stiffness)
+        return rate(p, s, f, acc_w, alpha_b)
+
+    @wp.func
+    def mount_velocity(rope: Rope, s: QuadState):
+        return s.vel_w + wp.quat_rotate(s.quat_wb, wp.cross(s.rate_b, rope.mount))
+
+    @wp.func
+    def step(
+        p: Vehicle, rope: Rope, s: QuadState, command: vec4,
+        n: wp.array(dtype=vec3), u: wp.array(dtype=vec3), stiffness: wp.array(dtype=real),
+        gravity: vec3, gamma: real, max_turn: real, h: real,
+    ):
+        k1 = wp.zeros(shape=(L,), dtype=vec3)
+        k2 = wp.zeros(shape=(L,), dtype=vec3)
+        n2 = wp.zeros(shape=(L,), dtype=vec3)
+        u2 = wp.zeros(shape=(L,), dtype=vec3)
+        c1 = wp.zeros(shape=(L,), dtype=vec3)
+        c2 = wp.zeros(shape=(L,), dtype=vec3)
+        hs = wp.zeros(shape=(L,), dtype=vec2)
+        new_stiffness = wp.zeros(shape=(L,), dtype=real)
+        half = real(0.5)
+        gh = gamma * h
+        total_mass = p.body.mass + rope.total_mass
+
+        f1 = flow(p, s, command)
+        r1 = stage(p, rope, s, f1, n, u, k1, stiffness, new_stiffness, c1, c2, hs, k2, gravity, gamma, h, 0)
+        momentum = p.body.mass * s.vel_w + rope.total_mass * mount_velocity(rope, s) + chain.momentum(rope, u)
+        fastest = real(0.0)
+        for i in range(L):
+            k1[i] = k2[i]
+            u2[i] = u[i] + h * k1[i]
+            n2[i] = wp.normalize(n[i] + h * (u[i] + gh * k1[i]))
+            fastest = wp.max(fastest, wp.max(wp.dot(u[i], u[i]), wp.dot(u2[i], u2[i])))
+        s2 = advance(s, r1, h)
+        s2.motor_speed = motor_advance(s2.motor_speed, f1.motor_speed)
+        fell_back = fastest * h * h > max_turn * max_turn
+        if fell_back:
+            for i in range(L):
+                n[i] = n2[i]
+                u[i] = u2[i] - n2[i] * wp.dot(n2[i], u2[i])
+                stiffness[i] = new_stiffness[i]
+            s2.vel_w = (
+                momentum + h * (wp.quat_rotate(s.quat_wb, f1.force_b) + total_mass * gravity)
+                - rope.total_mass * wp.quat_rotate(s2.quat_wb, wp.cross(s2.rate_b, rope.mount)) - chain.momentum(rope, u)
+            ) / total_mass
+            return s2, fell_back
+
+        f2 = flow(p, s2, command)
+        r2 = stage(p, rope, s2, f2, n2, u2, k1, stiffness, new_stiffness, c1, c2, hs, k2, gravity, gamma, h, 1)
+        out = advance(s, blend(r1, half, r2, half), h)
+        out.motor_speed = motor_advance(out.motor_speed, f2.motor_speed)
+        for i in range(L):
+            ni = wp.normalize(n[i] + (half * h) * (u[i] + u2[i] + gh * (k2[i] - k1[i])))
+            ui = u[i] + (half * h) * (k1[i] + k2[i])
+            n[i] = ni
+            u[i] = ui - ni * wp.dot(ni, ui)
+            stiffness[i] = new_stiffness[i]
+        push = wp.quat_rotate(s.quat_wb, f1.force_b) + wp.quat_rotate(s2.quat_wb, f2.force_b)
+        momentum += (half * h) * push + (h * total_mass) * gravity
+        out.vel_w = (
+            momentum - rope.total_mass * wp.quat_rotate(out.quat_wb, wp.cross(out.rate_b, rope.mount)) - chain.momentum(rope, u)
+        ) / total_mass
+        return out, fell_back
+
+    @wp.func
+    def step_alone(p: Vehicle, s: QuadState, command: vec4, gravity: vec3, h: real):
+        """Heun step of the vehicle after the payload has left."""
+        f1 = flow(p, s, command)
+        inv_mass = real(1.0) / p.body.mass
+        acc1 = inv_mass * wp.quat_rotate(s.quat_wb, f1.force_b) + gravity
+        r1 = rate(p, s, f1, acc1, angular_acceleration(p, s.rate_b, f1.torque_b))
+        s2 = advance(s, r1, h)
+        s2.motor_speed = motor_advance(s2.motor_speed, f1.motor_speed)
+        f2 = flow(p, s2, command)
+        acc2 = inv_mass * wp.quat_rotate(s2.quat_wb, f2.force_b) + gravity
+        r2 = rate(p, s2, f2, acc2, angular_acceleration(p, s2.rate_b, f2.torque_b))
+        out = advance(s, blend(r1, real(0.5), r2, real(0.5)), h)
+        out.motor_speed = motor_advance(out.motor_speed, f2.motor_speed)
+        return out
+
+    return SimpleNamespace(step=step, step_alone=step_alone, mount_velocity=mount_velocity)

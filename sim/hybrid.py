@@ -1,0 +1,197 @@
+"""HybridSim: a batch of quadrotors with a rope and a payload each, stepped one control period at a time."""
+
+import dataclasses
+
+import numpy as np
+import warp as wp
+
+from sim import state as st
+from sim.params import GRAVITY, PlantParams, RandomizationParams, RopeParams, VehicleParams
+from sim.quadrotor.queue import queue_depth
+from sim.randomize import build_reset
+from sim.step import build_step
+from sim.structs import pack, pack_rope, pack_vehicle, types
+
+wp.config.log_level = wp.LOG_WARNING
+_BUILDS: dict = {}
+
+
+def _kinds(params: PlantParams, direct: bool) -> tuple:
+    v = params.vehicle
+    return (params.sim.precision, params.rope.segments, v.controller.kind, v.motor.kind, v.battery.kind, v.aero.kind, direct)
+
+
+def _kernels(params: PlantParams, direct: bool):
+    """Kernels of one choice of blocks; built once a process."""
+    key = _kinds(params, direct)
+    if key not in _BUILDS:
+        t = types(params.sim.precision)
+        step = build_step(t, params, direct)
+        _BUILDS[key] = (t, step, build_reset(t, params, step.State))
+    return _BUILDS[key]
+
+
+def tether_lengths(rope: RopeParams, z: RandomizationParams) -> list[RopeParams]:
+    """The rope in ``tether_variants`` lengths that span +-``tether_spread``; its mass per metre is kept.
+
+    Environment e gets entry ``e % tether_variants`` (the paper, Sec. III-C).
+    """
+    if z.tether_variants < 1:
+        raise ValueError(f"tether_variants {z.tether_variants}: expected 1 or more")
+    factors = [1.0] if z.tether_variants == 1 else np.linspace(1 - z.tether_spread, 1 + z.tether_spread, z.tether_variants)
+    return [
+        dataclasses.replace(rope, length=rope.length * float(f), rope_mass=rope.rope_mass * float(f)) for f in factors
+    ]
+
+
+class HybridSim:
+    """Batched plant: command queue, rate controller, motors, battery, aerodynamics, rope, payload, release.
+
+    All arrays live on the device and keep their addresses for life, so a captured graph of ``step`` stays valid.
+
+    Attributes:
+        command: [N, rad/s], shape (E,) of vec4: collective thrust and body rates of the next step.
+        release: shape (E,), int: non-zero asks for the release; the latch keeps it.
+        state: arrays of :data:`sim.state.STATE_FIELDS`.
+        out: arrays of :data:`sim.state.OUTPUT_FIELDS`.
+        goal_w: [m], shape (E,) of vec3: goals that :meth:`randomize` draws.
+    """
+
+    def __init__(
+        self, params: PlantParams, count: int, device: str = "cpu", seed: int = 0, *, vehicles: list[VehicleParams] | None = None,
+        ropes: list[RopeParams] | None = None, direct: bool = False,
+    ):
+        """Allocate ``count`` plants.
+
+        Args:
+            params: the plant; its kinds and numerics hold for all.
+            count: number of environments E.
+            device: Warp device, "cpu" or "cuda:0".
+            seed: of :meth:`randomize`.
+            vehicles: parameters of environment e at ``e % len(vehicles)``; default ``[params.vehicle]``.
+            ropes: likewise; all with the same number of segments.
+            direct: by-pass the blocks: commands are thrust [N] and torque [N m].
+
+        Raises:
+            ValueError: no environment, ropes of different segment counts, or an unphysical parameter.
+        """
+        if count < 1:
+            raise ValueError(f"HybridSim of {count} environments: expected 1 or more")
+        ropes = ropes or [params.rope]
+        vehicles = vehicles or [params.vehicle]
+        if {r.segments for r in ropes} != {params.rope.segments}:
+            raise ValueError(f"ropes of {sorted({r.segments for r in ropes})} segments in one batch of {params.rope.segments}")
+        self.params, self.count, self.device, self.seed = params, count, device, seed
+        self.types, self._step, self._reset = _kernels(params, direct)
+        t = self.types
+        self._vehicles = wp.array(pack_vehicle(t, vehicles), dtype=t.Vehicle, device=device)
+        self._ropes = wp.array(pack_rope(t, ropes), dtype=t.Rope, device=device)
+        self._release = wp.array(pack(t.Release, params.release), dtype=t.Release, device=device)
+        segments, period = params.rope.segments, params.sim.control_period
+        depth = max(queue_depth(v.queue.delay, period) for v in vehicles)
+        rows = {"cable_dir_w": segments, "cable_vel_w": segments, "stiffness": segments, "queue": depth}
+        self.state = st.allocate(t, self._step.State, st.STATE_FIELDS, count, rows, device)
+        outputs = {k: (v, False) for k, v in st.OUTPUT_FIELDS.items()}
+        self.out = st.allocate(t, self._step.Output, outputs, count, {}, device)
+        self.command = wp.zeros(count, dtype=t.vec4, device=device)
+        self.release = wp.zeros(count, dtype=wp.int32, device=device)
+        self.goal_w = wp.zeros(count, dtype=t.vec3, device=device)
+        self.episode = wp.zeros(count, dtype=wp.int32, device=device)
+        self._all = wp.full(count, 1, dtype=wp.int32, device=device)
+        self._used = wp.zeros(count, dtype=t.real, device=device)
+        self._ideal = vehicles[0].battery.reference_voltage if vehicles[0].battery.kind == "ideal" else -1.0
+        self._spreads: tuple[RandomizationParams, wp.array] | None = None
+        self.place(pos_w=np.zeros((count, 3)))
+
+    def step(self) -> None:
+        """Advance every plant by one control period under ``command`` and ``release``."""
+        s = self.params.sim
+        wp.launch(
+            self._step.step, self.count,
+            [self._vehicles, self._ropes, self._release, s.control_period, s.substep, s.gamma, s.max_turn, GRAVITY,
+             self.state, self.command, self.release, self.out],
+            device=self.device, block_dim=64,
+        )
+
+    def randomize(self, spreads: RandomizationParams, mask: wp.array | None = None) -> None:
+        """Start new episodes where ``mask`` (shape (E,), int) is non-zero; everywhere without one."""
+        if self._spreads is None or self._spreads[0] != spreads:
+            packed = pack(self.types.Randomization, spreads)
+            self._spreads = (spreads, wp.array(packed, dtype=self.types.Randomization, device=self.device))
+        mask = self._all if mask is None else mask
+        wp.launch(
+            self._reset.randomize, self.count,
+            [self._vehicles, self._ropes, self._spreads[1], self._ideal, GRAVITY, self.seed, self.state, self.episode, mask, self.goal_w],
+            device=self.device,
+        )
+        self._update_payload()
+
+    def place(
+        self, pos_w: np.ndarray, quat_wb: np.ndarray | None = None, vel_w: np.ndarray | None = None,
+        rate_b: np.ndarray | None = None, cable_dir_w: np.ndarray | None = None, cable_vel_w: np.ndarray | None = None,
+        battery_used: float = 0.0,
+    ) -> None:
+        """Put every plant into a stated pose, actuators at hover, command queue filled with hover.
+
+        Args:
+            pos_w: [m], shape (E, 3).
+            quat_wb: xyzw, shape (E, 4); default level.
+            vel_w: [m/s], shape (E, 3). rate_b: [rad/s], shape (E, 3).
+            cable_dir_w: unit vectors, shape (E, L, 3); default hanging.
+            cable_vel_w: their time derivatives [1/s], shape (E, L, 3).
+            battery_used: fraction of charge used.
+
+        Raises:
+            ValueError: a shape that does not fit.
+        """
+        E, L = self.count, self.params.rope.segments
+        level, down = np.tile([0.0, 0.0, 0.0, 1.0], (E, 1)), np.tile([0.0, 0.0, -1.0], (E, L, 1))
+        given = {
+            "pos_w": (pos_w, (E, 3), None), "quat_wb": (quat_wb, (E, 4), level), "vel_w": (vel_w, (E, 3), None),
+            "rate_b": (rate_b, (E, 3), None), "cable_dir_w": (cable_dir_w, (E, L, 3), down),
+            "cable_vel_w": (cable_vel_w, (E, L, 3), None),
+        }
+        for name, (value, shape, default) in given.items():
+            value = (np.zeros(shape) if default is None else default) if value is None else np.asarray(value, dtype=float)
+            if value.shape != shape:
+                raise ValueError(f"{name} of shape {value.shape}: expected {shape}")
+            target = getattr(self.state, name)
+            target.assign((np.swapaxes(value, 0, 1) if len(shape) == 3 else value).astype(self._numpy))
+        self.state.mass_scale.fill_(1.0)
+        self._used.fill_(battery_used)
+        wp.launch(
+            self._reset.place, self.count,
+            [self._vehicles, self._ropes, self._ideal, GRAVITY, self.state, self._all, self._used], device=self.device,
+        )
+        self._update_payload()
+
+    @property
+    def _numpy(self) -> type:
+        return np.float32 if self.types.real is wp.float32 else np.float64
+
+    def _update_payload(self) -> None:
+        wp.launch(self._step.payload, self.count, [self._ropes, self.state, self.out], device=self.device)
+
+    def set_command(self, command: np.ndarray, release: np.ndarray | None = None) -> None:
+        """Copy commands [N, rad/s], shape (E, 4), and release requests, shape (E,), to the device."""
+        self.command.assign(np.asarray(command, dtype=self._numpy).reshape(self.count, 4))
+        asked = np.zeros(self.count) if release is None else np.asarray(release)
+        self.release.assign(asked.astype(np.int32).reshape(self.count))
+
+    def get(self, name: str) -> np.ndarray:
+        """Copy of a state or output array by name, environment first: shape (E, ...) or (E, L, ...)."""
+        if name in st.STATE_FIELDS:
+            value = getattr(self.state, name).numpy()
+            return np.swapaxes(value, 0, 1) if st.STATE_FIELDS[name][1] else value
+        if name in st.OUTPUT_FIELDS:
+            return getattr(self.out, name).numpy()
+        raise ValueError(f"no array {name!r}; there are {sorted(st.STATE_FIELDS | st.OUTPUT_FIELDS)}")
+
+    def cable_points_w(self) -> np.ndarray:
+        """Joints of the rope from the mount to its lower end [m], shape (E, L + 1, 3), world frame."""
+        ropes = self._ropes.numpy()
+        rows = np.arange(self.count) % len(ropes)
+        q, r = self.get("quat_wb").astype(float), ropes["mount"][rows].astype(float)
+        mount = self.get("pos_w") + r + 2 * np.cross(q[:, :3], np.cross(q[:, :3], r) + q[:, 3:] * r)
+        steps = ropes["segment_length"][rows][:, None, None] * self.get("cable_dir_w")
+        return mount[:, None, :] + np.concatenate([np.zeros((self.count, 1, 3)), np.cumsum(steps, axis=1)], axis=1)

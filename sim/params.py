@@ -1,0 +1,252 @@
+"""Physical parameters of the vehicle, the rope and the release: frozen dataclasses, SI units.
+
+Each dataclass mirrors one TOML file of ``configs/``. The equations that the fields enter stand in the docstring of the
+class; the blocks of ``sim/quadrotor`` and ``sim/rope`` implement them in Warp, ``sim/reference`` implements them again,
+independently, in float64. Every value below is documented as ``[unit]``; vectors are in the body frame (x forward,
+y left, z up) with the origin at the vehicle's centre of mass unless said otherwise.
+"""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+GRAVITY = 9.81
+"""Standard acceleration of free fall used by every plant of the project [m/s^2]."""
+
+
+@dataclass(frozen=True)
+class BodyParams:
+    """Rigid body of the vehicle, rotors included.
+
+    ``m v' = R F_b + m g``, ``J w' = tau_b - w x J w``.
+    """
+
+    mass: float  # [kg]
+    inertia: tuple[float, float, float]  # principal moments about the centre of mass [kg m^2]
+
+
+@dataclass(frozen=True)
+class RotorParams:
+    """Geometry of the four rotors.
+
+    Rotor i sits at ``r_i = (x_i, y_i, z)`` and turns with sense ``s_i``: +1 turns clockwise seen from above, so that its
+    drag torque on the body points along +z.
+    """
+
+    x: tuple[float, float, float, float]  # [m]
+    y: tuple[float, float, float, float]  # [m]
+    z: float  # height of the rotor plane above the centre of mass [m]
+    spin: tuple[float, float, float, float]  # s_i, +1 or -1
+    radius: float  # propeller radius [m]
+    inertia: float  # J_r of one propeller and bell about its shaft [kg m^2]
+
+
+@dataclass(frozen=True)
+class QueueParams:
+    """Command queue: the command given at t acts from t + delay on, held until the next one (zero-order hold)."""
+
+    delay: float  # tau_d, transmission and actuation [s]
+
+
+@dataclass(frozen=True)
+class ControllerParams:
+    """Body-rate controller.
+
+    ``betaflight``: with the delayed command (c, w_cmd), measured rate w, filtered set-point r, filtered gyro g,
+    integral i (a torque):
+
+    - ``r' = (w_cmd - r) / setpoint_time_constant``
+    - ``g' = (w - g) / gyro_time_constant``
+    - ``tau = p_gain (r - w) + i - d_gain g' + feedforward_gain r'``  (per axis, [N m])
+    - ``i' = i_gain (r - w)``, held at 0 where it would grow an integral beyond ``integral_limit`` (|i| >= limit and
+      i' i > 0), or while the mixer is saturated and ``i' i > 0``.
+
+    Mixer: per-motor thrusts ``f_i = c/4 + roll_i + pitch_i + yaw_i`` with ``roll_i = tau_x y_i / (4 ybar^2)``,
+    ``pitch_i = -tau_y x_i / (4 xbar^2)``, ``yaw_i = tau_z s_i / (4 kappa)`` (``ybar^2`` mean of y_i^2, ``xbar^2`` of x_i^2,
+    kappa the nominal torque-to-thrust ratio). With D = f_max - f_min: roll+pitch are scaled by D / range where their range
+    exceeds D; then yaw is clipped to what range D leaves; then the collective is shifted so that every f_i lies in
+    [f_min, f_max]. ``f_max = max_thrust (u / u_ref)^2`` follows the battery voltage u. The mixer counts as saturated when
+    any of the three acted. Motor-speed set-point: ``Omega* = sqrt(f_i / k_f) (1 + (1 - voltage_compensation) (u / u_ref - 1))``.
+
+    ``geometric`` (the ablation): ``tau = geometric_gain J (w_cmd - w) + w x J w`` without filters, integral or
+    voltage; f_i clipped one by one to [f_min, max_thrust]; ``Omega* = sqrt(f_i / k_f)``.
+    """
+
+    kind: Literal["betaflight", "geometric"]
+    p_gain: tuple[float, float, float]  # [N m s/rad]
+    i_gain: tuple[float, float, float]  # [N m/rad]
+    d_gain: tuple[float, float, float]  # [N m s^2/rad]
+    feedforward_gain: tuple[float, float, float]  # [N m s^2/rad]
+    integral_limit: tuple[float, float, float]  # [N m]
+    setpoint_time_constant: float  # [s]
+    gyro_time_constant: float  # [s]
+    min_thrust: float  # f_min a motor, idle [N]
+    max_thrust: float  # f_max a motor at u_ref [N]
+    voltage_compensation: float  # 0: none, 1: full [-]
+    geometric_gain: float  # [1/s]
+
+
+@dataclass(frozen=True)
+class MotorParams:
+    """Motor speed: ``Omega' = (Omega* - Omega) / time_constant`` (``first_order``) or ``Omega = Omega*`` (``instant``)."""
+
+    kind: Literal["first_order", "instant"]
+    time_constant: float  # [s]
+
+
+@dataclass(frozen=True)
+class BatteryParams:
+    """Battery of one pack.
+
+    State: fraction used q, terminal voltage u. Electrical power ``P = P_0 + sum_i |tau_i| Omega_i / efficiency``
+    with ``tau_i`` the aerodynamic rotor torque ``kappa f_i``; current ``I = P / u``; ``q' = I / (3600 capacity)``;
+    open-circuit voltage ``u_oc = ocv[0] + ocv[1] q + ocv[2] q^2 + ocv[3] q^3``;
+    ``u' = (u_oc - resistance I - u) / time_constant`` (``sag``). ``ideal``: u = u_ref, q = 0 always.
+    """
+
+    kind: Literal["sag", "ideal"]
+    capacity: float  # [A h]
+    ocv: tuple[float, float, float, float]  # polynomial in the used fraction [V]
+    resistance: float  # [Ohm]
+    time_constant: float  # of the load-dependent sag [s]
+    idle_power: float  # P_0, electronics [W]
+    efficiency: float  # motor and speed controller [-]
+    reference_voltage: float  # u_ref: voltage at which the thrust map was taken [V]
+
+
+@dataclass(frozen=True)
+class ThrustParams:
+    """Thrust and torque of rotor i from its speed and the battery voltage.
+
+    ``f_i = (k_f Omega_i^2 + k_1 Omega_i) (1 + voltage_coefficient (u - u_ref))``, ``tau_i = torque_ratio f_i``.
+    """
+
+    k_f: float  # thrust coefficient [N s^2/rad^2]
+    k_1: float  # linear term [N s/rad]
+    voltage_coefficient: float  # [1/V]
+    torque_ratio: float  # kappa [m]
+
+
+@dataclass(frozen=True)
+class AeroParams:
+    """Aerodynamics of the vehicle in still air, from the body velocity v_b of the centre of mass and the rate w.
+
+    - rotor drag: ``dF = -(drag_x v_x, drag_y v_y, drag_z v_z)``
+    - body drag: ``dF += -parasitic |v| v``
+    - inflow on rotor i, with its hub velocity ``v_i = v_b + w x r_i``:
+      ``df_i = f_i (-inflow v_iz + translational_lift (v_ix^2 + v_iy^2))``, added to the thrust with its arm, and to the
+      rotor's drag torque by ``-torque_inflow`` in place of ``-inflow``: ``dtau_i = kappa f_i (-torque_inflow v_iz)``
+    - blade flapping: ``dtau = flapping T (e_z x v_b)`` with T the sum of f_i.
+
+    ``none``: all of it zero (the ablation).
+    """
+
+    kind: Literal["rotor_drag", "none"]
+    drag_x: float  # [kg/s]
+    drag_y: float  # [kg/s]
+    drag_z: float  # [kg/s]
+    parasitic: float  # 1/2 rho C_d A [kg/m]
+    inflow: float  # [s/m]
+    torque_inflow: float  # [s/m]
+    translational_lift: float  # [s^2/m^2]
+    flapping: float  # [s]
+
+
+@dataclass(frozen=True)
+class VehicleParams:
+    """A quadrotor: the seven blocks of Table I of the paper and the rigid body.
+
+    The composer adds them up: ``F_b = (0, 0, sum f_i) + dF``,
+    ``tau_b = sum_i r_i x (0, 0, f_i + df_i) + e_z sum_i s_i (tau_i + dtau_i + J_r Omega_i') - w x e_z h + dtau``
+    with the rotors' momentum ``h = -J_r sum_i s_i Omega_i`` (the gyroscopic torque does no work). A rotor that turns
+    clockwise from above (s_i = +1) has angular momentum along -z and pushes the body towards +z.
+    """
+
+    body: BodyParams
+    rotors: RotorParams
+    queue: QueueParams
+    controller: ControllerParams
+    motor: MotorParams
+    battery: BatteryParams
+    thrust: ThrustParams
+    aero: AeroParams
+    collision_radius: float  # sphere about the centre of mass that the payload must not enter [m]
+
+
+@dataclass(frozen=True)
+class RopeParams:
+    """Rope of rigid slender segments on universal joints, and the payload rigidly on the last one.
+
+    Segment i has length ``length / segments`` and mass ``rope_mass / segments``, its centre of mass in the middle,
+    transverse inertia ``m l^2 / 12`` about it, none about its axis. The payload's centre lies ``payload_offset`` past
+    the end of the last segment, on its axis. Viscous joint torque ``-joint_damping (w_i - w_(i-1))`` in every joint, the
+    one on the vehicle included.
+    """
+
+    segments: int  # L, 1 to 64
+    length: float  # of the rope, without the payload [m]
+    rope_mass: float  # [kg]
+    payload_mass: float  # [kg]
+    payload_inertia: float  # transverse, about the payload's centre [kg m^2]
+    payload_offset: float  # [m]
+    payload_radius: float  # of the ball, for drawing, keypoints and collisions [m]
+    joint_damping: float  # [N m s]
+    mount: tuple[float, float, float]  # rope attachment in the body frame [m]
+
+
+@dataclass(frozen=True)
+class ReleaseParams:
+    """Release mechanism and the closed-form flight that follows.
+
+    The latch trips when the release command exceeds ``threshold`` and does not untrip; the payload separates ``lag``
+    later. From the payload's position p and velocity v at separation:
+    ``t_hit = (v_z + sqrt(v_z^2 + 2 g (p_z - landing_height))) / g``.
+    """
+
+    threshold: float  # [-]
+    lag: float  # [s]
+    landing_height: float  # z of the payload's centre at impact [m]
+    clearance_samples: int  # K points of the flight at which the distance to the vehicle is taken
+    clearance_margin: float  # d_m [m]
+
+
+@dataclass(frozen=True)
+class SimParams:
+    """Numerics of the batched simulator."""
+
+    control_period: float  # of the policy [s]
+    substep: float  # largest integration step [s]
+    gamma: float  # of the ROS2 W-method [-]
+    max_turn: float  # a segment that turns more in one substep falls back to the first stage [rad]
+    precision: Literal["float32", "float64"] = "float32"
+
+
+@dataclass(frozen=True)
+class PlantParams:
+    """All that defines one simulated plant."""
+
+    vehicle: VehicleParams
+    rope: RopeParams
+    release: ReleaseParams
+    sim: SimParams = field(default_factory=lambda: SimParams(0.02, 0.002, 1.3, 0.2))
+
+
+@dataclass(frozen=True)
+class RandomizationParams:
+    """Uniform distributions of an episode's start (the paper, Sec. III-C, "Domain randomization").
+
+    The vehicle starts at ``(0, 0, spawn_height)`` plus offsets; the cable hangs straight from the mount in the direction
+    ``Rz(yaw) Rx(roll) (-z)`` of the body frame, with the two angles' rates on top of the body's.
+    """
+
+    spawn_height: float  # of the vehicle's centre of mass [m]
+    position: tuple[float, float, float]  # +- [m]
+    velocity: tuple[float, float, float]  # +- [m/s]
+    attitude_deg: tuple[float, float, float]  # +- roll, pitch, yaw [deg]
+    rate_deg: tuple[float, float, float]  # +- body rates [deg/s]
+    mass: float  # +- fraction of the vehicle's mass
+    cable_angle_deg: float  # +- yaw and roll of the cable [deg]
+    cable_rate_deg: float  # +- their rates [deg/s]
+    tether_variants: int  # number of cable lengths, one for each environment for good
+    tether_spread: float  # the lengths span +- this fraction
+    battery_used: float  # fraction of charge used is drawn from 0 to this
+    goal_radius: float  # goals are uniform on a ground disk of this radius about the spawn point [m]

@@ -1,0 +1,107 @@
+"""Low-level controller: body-rate command to motor-speed set-points. Equations: :class:`sim.params.ControllerParams`."""
+
+from typing import Any
+
+import warp as wp
+
+
+@wp.func
+def speed_of_thrust(p: Any, thrust: Any):
+    """Motor speed that gives a thrust by the quadratic map [N] -> [rad/s]."""
+    return wp.sqrt(wp.max(thrust, thrust - thrust) / p.thrust.k_f)
+
+
+@wp.func
+def speeds_of_thrusts(p: Any, f: Any):
+    """Motor speeds [rad/s], shape (4,), of thrusts [N], shape (4,)."""
+    speed = f
+    for i in range(4):
+        speed[i] = speed_of_thrust(p, f[i])
+    return speed
+
+
+@wp.func
+def clip_yaw(p: Any, roll_pitch: Any, yaw: Any, room: Any):
+    """Yaw share of a motor's thrust [N] that keeps the spread of all four within ``room``, given roll and pitch."""
+    big = type(yaw)(1.0e6)
+    high_plus, low_plus, high_minus, low_minus = -big, big, -big, big
+    for i in range(4):
+        if p.rotors.spin[i] > yaw - yaw:
+            high_plus = wp.max(high_plus, roll_pitch[i])
+            low_plus = wp.min(low_plus, roll_pitch[i])
+        else:
+            high_minus = wp.max(high_minus, roll_pitch[i])
+            low_minus = wp.min(low_minus, roll_pitch[i])
+    half = type(yaw)(0.5)
+    upper = half * (room - (high_plus - low_minus))
+    lower = -half * (room - (high_minus - low_plus))
+    return wp.clamp(yaw, lower, upper)
+
+
+@wp.func
+def mix(p: Any, collective: Any, torque_b: Any, max_thrust: Any):
+    """Distribute thrust [N] and torque [N m] over four rotors; gives up yaw first, then collective, then roll and pitch.
+
+    Returns:
+        Thrust of each rotor [N], shape (4,), and whether the demand could not be met.
+    """
+    zero = collective - collective
+    room = max_thrust - p.controller.min_thrust
+    roll_pitch = p.mixer.roll * torque_b[0] + p.mixer.pitch * torque_b[1]
+    spread = wp.max(roll_pitch) - wp.min(roll_pitch)
+    scale = type(collective)(1.0)
+    if spread > room:
+        scale = room / spread
+    roll_pitch = roll_pitch * scale
+    yaw_wanted = p.mixer.yaw[0] * p.rotors.spin[0] * torque_b[2]
+    yaw = clip_yaw(p, roll_pitch, yaw_wanted, room)
+    share = roll_pitch + p.rotors.spin * yaw
+    quarter = collective / type(collective)(4.0)
+    base = wp.clamp(quarter, p.controller.min_thrust - wp.min(share), max_thrust - wp.max(share))
+    f = share
+    for i in range(4):
+        f[i] = wp.max(share[i] + base, zero)
+    saturated = scale < type(collective)(1.0) or yaw != yaw_wanted or base != quarter
+    return f, saturated
+
+
+@wp.func
+def rate_controller_betaflight(p: Any, command: Any, rate_b: Any, integral: Any, setpoint: Any, gyro: Any, voltage: Any):
+    """PID with feed-forward, filtered gyro and smoothed set-point, after Betaflight.
+
+    Returns:
+        Motor-speed set-points [rad/s], shape (4,), and the derivatives of integral, set-point filter and gyro filter.
+    """
+    c = p.controller
+    rate_command = type(rate_b)(command[1], command[2], command[3])
+    setpoint_rate = (rate_command - setpoint) / c.setpoint_time_constant
+    gyro_rate = (rate_b - gyro) / c.gyro_time_constant
+    error = setpoint - rate_b
+    torque = (
+        wp.cw_mul(c.p_gain, error) + integral - wp.cw_mul(c.d_gain, gyro_rate) + wp.cw_mul(c.feedforward_gain, setpoint_rate)
+    )
+    ratio = voltage / p.battery.reference_voltage
+    f, saturated = mix(p, command[0], torque, c.max_thrust * ratio * ratio)
+    integral_rate = wp.cw_mul(c.i_gain, error)
+    zero = voltage - voltage
+    for i in range(3):
+        grows = integral_rate[i] * integral[i] > zero
+        if grows and (saturated or wp.abs(integral[i]) >= c.integral_limit[i]):
+            integral_rate[i] = zero
+    one = type(voltage)(1.0)
+    speed = speeds_of_thrusts(p, f) * (one + (one - c.voltage_compensation) * (ratio - one))
+    return speed, integral_rate, setpoint_rate, gyro_rate
+
+
+@wp.func
+def rate_controller_geometric(p: Any, command: Any, rate_b: Any, integral: Any, setpoint: Any, gyro: Any, voltage: Any):
+    """Proportional rate controller with the gyroscopic term, each rotor clipped by itself (the paper's ablation)."""
+    rate_command = type(rate_b)(command[1], command[2], command[3])
+    momentum = wp.cw_mul(p.body.inertia, rate_b)
+    torque = p.controller.geometric_gain * wp.cw_mul(p.body.inertia, rate_command - rate_b) + wp.cross(rate_b, momentum)
+    f = p.mixer.roll * torque[0] + p.mixer.pitch * torque[1] + p.mixer.yaw * torque[2]
+    quarter = command[0] / type(voltage)(4.0)
+    for i in range(4):
+        f[i] = wp.clamp(f[i] + quarter, p.controller.min_thrust, p.controller.max_thrust)
+    still = rate_b - rate_b
+    return speeds_of_thrusts(p, f), still, still, still

@@ -1,0 +1,29 @@
+"""Command queue: a continuous delay of the zero-order-held command.
+
+Convention: commands stand newest first; slot j holds the command that the policy gave j control periods ago. With
+``delay = whole * period + rest`` the command of slot ``whole + 1`` acts until ``rest`` into the period, that of slot
+``whole`` from then on. The step ends a substep exactly there, so the delay is exact, not rounded to substeps.
+"""
+
+import math
+from typing import Any
+
+import warp as wp
+
+
+def queue_depth(delay: float, period: float) -> int:
+    """Slots that a delay needs. Raises ValueError for a negative or non-finite one."""
+    if not (math.isfinite(delay) and delay >= 0):
+        raise ValueError(f"command delay {delay} s: expected a finite value of 0 or more")
+    return int(math.floor(delay / period + 1e-6)) + 2
+
+
+@wp.func
+def split_delay(p: Any, period: Any):
+    """Split the delay into whole periods and the rest [s]; a rest below a microsecond counts as none."""
+    tiny = type(period)(1.0e-6)
+    whole = wp.floor(p.queue.delay / period + tiny / period)
+    rest = p.queue.delay - whole * period
+    if rest < tiny:
+        rest = period - period
+    return int(whole), rest

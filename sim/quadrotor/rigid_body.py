@@ -1,0 +1,142 @@
+"""The quadrotor's state as one struct: derivative from the blocks, advance along a derivative.
+
+``build_flow`` composes the seven blocks for one choice of kinds; the result is what both the hybrid simulator and the
+quadrotor alone integrate.
+"""
+
+from typing import Any
+
+import warp as wp
+
+from sim.params import VehicleParams
+from sim.quadrotor import aero, battery, composer, controller, motor, thrust
+from sim.structs import Types
+
+CONTROLLERS = {"betaflight": controller.rate_controller_betaflight, "geometric": controller.rate_controller_geometric}
+MOTORS = {
+    "first_order": (motor.motor_rate_first_order, motor.motor_advance_first_order),
+    "instant": (motor.motor_rate_instant, motor.motor_advance_instant),
+}
+BATTERIES = {"sag": battery.battery_sag, "ideal": battery.battery_ideal}
+AEROS = {"rotor_drag": aero.aero_rotor_drag, "none": aero.aero_none}
+
+
+@wp.func
+def quat_rate(quat_wb: Any, rate_b: Any):
+    """Time derivative of the attitude: half of ``quat_wb * (rate_b, 0)``."""
+    half = type(rate_b[0])(0.5)
+    return quat_wb * type(quat_wb)(rate_b[0] * half, rate_b[1] * half, rate_b[2] * half, rate_b[0] - rate_b[0])
+
+
+@wp.func
+def angular_acceleration(p: Any, rate_b: Any, torque_b: Any):
+    """Euler's equation: ``J^-1 (torque - w x J w)`` [rad/s^2], body frame."""
+    momentum = wp.cw_mul(p.body.inertia, rate_b)
+    return wp.cw_div(torque_b - wp.cross(rate_b, momentum), p.body.inertia)
+
+
+@wp.func
+def advance(s: Any, r: Any, h: Any):
+    """State after moving along the derivative ``r`` for ``h`` seconds; the attitude is normalised."""
+    out = s
+    out.pos_w = s.pos_w + h * r.pos_w
+    out.quat_wb = wp.normalize(s.quat_wb + r.quat_wb * h)
+    out.vel_w = s.vel_w + h * r.vel_w
+    out.rate_b = s.rate_b + h * r.rate_b
+    out.motor_speed = s.motor_speed + h * r.motor_speed
+    out.integral = s.integral + h * r.integral
+    out.setpoint = s.setpoint + h * r.setpoint
+    out.gyro = s.gyro + h * r.gyro
+    out.charge_used = s.charge_used + h * r.charge_used
+    out.voltage = s.voltage + h * r.voltage
+    return out
+
+
+@wp.func
+def blend(a: Any, wa: Any, b: Any, wb: Any):
+    """Weighted sum of two derivatives."""
+    out = a
+    out.pos_w = wa * a.pos_w + wb * b.pos_w
+    out.quat_wb = a.quat_wb * wa + b.quat_wb * wb
+    out.vel_w = wa * a.vel_w + wb * b.vel_w
+    out.rate_b = wa * a.rate_b + wb * b.rate_b
+    out.motor_speed = wa * a.motor_speed + wb * b.motor_speed
+    out.integral = wa * a.integral + wb * b.integral
+    out.setpoint = wa * a.setpoint + wb * b.setpoint
+    out.gyro = wa * a.gyro + wb * b.gyro
+    out.charge_used = wa * a.charge_used + wb * b.charge_used
+    out.voltage = wa * a.voltage + wb * b.voltage
+    return out
+
+
+def build_flow(t: Types, vehicle: VehicleParams):
+    """Compose the blocks of a vehicle's kinds.
+
+    Returns:
+        ``flow(p, state, command) -> t.Flow`` (body wrench and the derivatives of all internal states),
+        ``rate(p, state, flow, acc_w, angular_acc_b) -> t.QuadRate``, and ``motor_advance``.
+    """
+    rate_controller = CONTROLLERS[vehicle.controller.kind]
+    motor_rate, motor_advance = MOTORS[vehicle.motor.kind]
+    battery_rate = BATTERIES[vehicle.battery.kind]
+    aerodynamics = AEROS[vehicle.aero.kind]
+    Vehicle, QuadState, QuadRate, Flow, vec3, vec4 = t.Vehicle, t.QuadState, t.QuadRate, t.Flow, t.vec3, t.vec4
+
+    @wp.func
+    def flow(p: Vehicle, s: QuadState, command: vec4):
+        out = Flow()
+        target, integral_rate, setpoint_rate, gyro_rate = rate_controller(
+            p, command, s.rate_b, s.integral, s.setpoint, s.gyro, s.voltage
+        )
+        speed, speed_rate = motor_rate(p, s.motor_speed, target)
+        f = thrust.rotor_thrust(p, speed, s.voltage)
+        charge_rate, voltage_rate = battery_rate(p, s.charge_used, s.voltage, speed, f)
+        vel_b = wp.quat_rotate_inv(s.quat_wb, s.vel_w)
+        aero_force, aero_torque = aerodynamics(p, vel_b, s.rate_b, f)
+        force, torque = composer.compose(
+            p, s.rate_b, f, thrust.rotor_torque(p, f), speed, speed_rate, aero_force, aero_torque
+        )
+        out.force_b = force
+        out.torque_b = torque
+        out.motor_speed = speed
+        out.motor_rate = speed_rate
+        out.integral_rate = integral_rate
+        out.setpoint_rate = setpoint_rate
+        out.gyro_rate = gyro_rate
+        out.charge_rate = charge_rate
+        out.voltage_rate = voltage_rate
+        return out
+
+    @wp.func
+    def rate(p: Vehicle, s: QuadState, f: Flow, acc_w: vec3, angular_acc_b: vec3):
+        out = QuadRate()
+        out.pos_w = s.vel_w
+        out.quat_wb = quat_rate(s.quat_wb, s.rate_b)
+        out.vel_w = acc_w
+        out.rate_b = angular_acc_b
+        out.motor_speed = f.motor_rate
+        out.integral = f.integral_rate
+        out.setpoint = f.setpoint_rate
+        out.gyro = f.gyro_rate
+        out.charge_used = f.charge_rate
+        out.voltage = f.voltage_rate
+        return out
+
+    return flow, rate, motor_advance
+
+
+def build_direct_flow(t: Types):
+    """The blocks by-passed: the command is (thrust [N], torque [N m] about x, y, z), acting at once and exactly.
+
+    What the bare-dynamics scenes of the tests fly, and an idealised vehicle for whoever wants one.
+    """
+    Vehicle, QuadState, Flow, vec3, vec4, real = t.Vehicle, t.QuadState, t.Flow, t.vec3, t.vec4, t.real
+
+    @wp.func
+    def flow(p: Vehicle, s: QuadState, command: vec4):
+        out = Flow()
+        out.force_b = vec3(real(0.0), real(0.0), command[0])
+        out.torque_b = vec3(command[1], command[2], command[3])
+        return out
+
+    return flow

@@ -1,0 +1,18 @@
+"""Thrust and torque of the rotors from motor speed and battery voltage. Equations: :class:`sim.params.ThrustParams`."""
+
+from typing import Any
+
+import warp as wp
+
+
+@wp.func
+def rotor_thrust(p: Any, motor_speed: Any, voltage: Any):
+    """Thrust of each rotor [N], shape (4,)."""
+    scale = type(voltage)(1.0) + p.thrust.voltage_coefficient * (voltage - p.battery.reference_voltage)
+    return (p.thrust.k_f * wp.cw_mul(motor_speed, motor_speed) + p.thrust.k_1 * motor_speed) * scale
+
+
+@wp.func
+def rotor_torque(p: Any, thrust: Any):
+    """Magnitude of each rotor's drag torque [N m], shape (4,)."""
+    return p.thrust.torque_ratio * thrust

@@ -1,0 +1,152 @@
+"""Start of an episode on the device: placing a plant at rest in its actuators, and the paper's randomisation.
+
+Random numbers are counter-based: they depend on the seed, the environment and how often it was reset, so a masked reset
+leaves all others untouched and a batch draws what its members alone would draw.
+"""
+
+from dataclasses import dataclass
+import warp as wp
+
+from sim.params import PlantParams
+from sim.quadrotor.battery import open_circuit_voltage
+from sim.quadrotor.controller import speed_of_thrust
+from sim.structs import Types
+
+
+@dataclass(frozen=True)
+class ResetKernels:
+    """Kernels that start episodes."""
+
+    place: wp.Kernel
+    randomize: wp.Kernel
+
+
+def build_reset(t: Types, params: PlantParams, State: type) -> ResetKernels:
+    """Build the reset kernels for a number of segments."""
+    real, vec3, vec4, quat = t.real, t.vec3, t.vec4, t.quat
+    Vehicle, Rope, Randomization = t.Vehicle, t.Rope, t.Randomization
+    L = params.rope.segments
+
+    @wp.func
+    def rest(p: Vehicle, rope: Rope, state: State, env: int, used: real, gravity: real):
+        """Motors, controller, battery and queue as in hover; nothing of the last episode stays."""
+        mass = p.body.mass * state.mass_scale[env] + rope.total_mass
+        thrust = mass * gravity
+        speed = speed_of_thrust(p, thrust / real(4.0))
+        state.motor_speed[env] = vec4(speed, speed, speed, speed)
+        state.integral[env] = vec3()
+        state.setpoint[env] = state.rate_b[env]
+        state.gyro[env] = state.rate_b[env]
+        state.charge_used[env] = used
+        power = p.battery.idle_power + thrust * speed * p.thrust.torque_ratio / p.battery.efficiency
+        open_voltage = open_circuit_voltage(p, used)
+        state.voltage[env] = open_voltage - p.battery.resistance * power / open_voltage
+        for k in range(state.queue.shape[0]):
+            state.queue[k, env] = vec4(thrust, real(0.0), real(0.0), real(0.0))
+        below = rope.last_mass * rope.last_center
+        state.stiffness[L - 1, env] = below * gravity
+        hanging = rope.last_mass
+        for step in range(L - 1):
+            i = L - 2 - step
+            state.stiffness[i, env] = (hanging + real(0.5) * rope.segment_mass) * rope.segment_length * gravity
+            hanging += rope.segment_mass
+        state.release_timer[env] = real(-1.0)
+        state.attached[env] = 1
+        state.status[env] = 0
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def place_kernel(
+        # Params:
+        vehicle: wp.array(dtype=Vehicle),
+        ropes: wp.array(dtype=Rope),
+        ideal_voltage: real,
+        gravity: real,
+        # State in:
+        state: State,
+        # In:
+        mask: wp.array(dtype=wp.int32),
+        used: wp.array(dtype=real),
+    ):
+        env = wp.tid()
+        if mask[env] != 0:
+            p = vehicle[env % vehicle.shape[0]]
+            rest(p, ropes[env % ropes.shape[0]], state, env, used[env], gravity)
+            if ideal_voltage > real(0.0):
+                state.voltage[env] = ideal_voltage
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def randomize_kernel(
+        # Params:
+        vehicle: wp.array(dtype=Vehicle),
+        ropes: wp.array(dtype=Rope),
+        spreads: wp.array(dtype=Randomization),
+        ideal_voltage: real,
+        gravity: real,
+        seed: int,
+        # State in:
+        state: State,
+        episode: wp.array(dtype=wp.int32),
+        # In:
+        mask: wp.array(dtype=wp.int32),
+        # Out:
+        goal_w: wp.array(dtype=vec3),
+    ):
+        env = wp.tid()
+        if mask[env] != 0:
+            p = vehicle[env % vehicle.shape[0]]
+            rope = ropes[env % ropes.shape[0]]
+            z = spreads[0]
+            rng = wp.rand_init(seed * 9781 + episode[env], env)
+            episode[env] = episode[env] + 1
+            degree = real(0.017453292519943295)
+            home = vec3(real(0.0), real(0.0), z.spawn_height)
+            offset = vec3(
+                z.position[0] * real(wp.randf(rng, -1.0, 1.0)),
+                z.position[1] * real(wp.randf(rng, -1.0, 1.0)),
+                z.position[2] * real(wp.randf(rng, -1.0, 1.0)),
+            )
+            state.pos_w[env] = home + offset
+            state.vel_w[env] = vec3(
+                z.velocity[0] * real(wp.randf(rng, -1.0, 1.0)),
+                z.velocity[1] * real(wp.randf(rng, -1.0, 1.0)),
+                z.velocity[2] * real(wp.randf(rng, -1.0, 1.0)),
+            )
+            roll = z.attitude_deg[0] * real(wp.randf(rng, -1.0, 1.0)) * degree
+            pitch = z.attitude_deg[1] * real(wp.randf(rng, -1.0, 1.0)) * degree
+            yaw = z.attitude_deg[2] * real(wp.randf(rng, -1.0, 1.0)) * degree
+            x_axis = vec3(real(1.0), real(0.0), real(0.0))
+            y_axis = vec3(real(0.0), real(1.0), real(0.0))
+            z_axis = vec3(real(0.0), real(0.0), real(1.0))
+            q = quat(wp.quat_from_axis_angle(z_axis, yaw)) * wp.quat_from_axis_angle(y_axis, pitch)
+            q = q * wp.quat_from_axis_angle(x_axis, roll)
+            state.quat_wb[env] = q
+            rate = (
+                vec3(
+                    z.rate_deg[0] * real(wp.randf(rng, -1.0, 1.0)),
+                    z.rate_deg[1] * real(wp.randf(rng, -1.0, 1.0)),
+                    z.rate_deg[2] * real(wp.randf(rng, -1.0, 1.0)),
+                )
+                * degree
+            )
+            state.rate_b[env] = rate
+            state.mass_scale[env] = real(1.0) + z.mass * real(wp.randf(rng, -1.0, 1.0))
+            azimuth = z.cable_angle_deg * real(wp.randf(rng, -1.0, 1.0)) * degree
+            tilt = z.cable_angle_deg * real(wp.randf(rng, -1.0, 1.0)) * degree
+            azimuth_rate = z.cable_rate_deg * real(wp.randf(rng, -1.0, 1.0)) * degree
+            tilt_rate = z.cable_rate_deg * real(wp.randf(rng, -1.0, 1.0)) * degree
+            turn = wp.quat_from_axis_angle(z_axis, azimuth)
+            down_b = wp.quat_rotate(turn * wp.quat_from_axis_angle(x_axis, tilt), -z_axis)
+            rate_b = rate + azimuth_rate * z_axis + tilt_rate * wp.quat_rotate(turn, x_axis)
+            direction = wp.quat_rotate(q, down_b)
+            swing = wp.quat_rotate(q, wp.cross(rate_b, down_b))
+            for i in range(L):
+                state.cable_dir_w[i, env] = direction
+                state.cable_vel_w[i, env] = swing
+            radius = z.goal_radius * wp.sqrt(real(wp.randf(rng)))
+            angle = real(wp.randf(rng)) * real(6.283185307179586)
+            goal_w[env] = vec3(radius * wp.cos(angle), radius * wp.sin(angle), real(0.0))
+            rest(p, rope, state, env, real(wp.randf(rng)) * z.battery_used, gravity)
+            if ideal_voltage > real(0.0):
+                state.voltage[env] = ideal_voltage
+
+    return ResetKernels(place_kernel, randomize_kernel)

@@ -1,0 +1,249 @@
+"""The fused control step: command queue, blocks, chain, release and checks of one control period in one kernel.
+
+``build_step`` composes the functions of one choice of blocks into one kernel. One thread an environment, no atomics,
+nothing else is launched; the same kernel runs on the CPU and on CUDA.
+"""
+
+from dataclasses import dataclass
+
+import warp as wp
+
+from sim import release as rel
+from sim import state as st
+from sim.coupling import build_coupled_step
+from sim.params import PlantParams
+from sim.quadrotor.queue import split_delay
+from sim.quadrotor.rigid_body import build_direct_flow, build_flow
+from sim.rope.chain import build_chain
+from sim.structs import Types
+
+SPEED_LIMIT = 1000.0  # [m/s], [rad/s]: beyond it a state is broken, not fast
+wp.config.enable_backward = False
+wp.config.max_unroll = 4  # longer unrolled loops cost half a minute of compile time and gain nothing
+
+
+@dataclass(frozen=True)
+class StepKernels:
+    """Kernels of one build and the structs that they take."""
+
+    step: wp.Kernel
+    payload: wp.Kernel
+    State: type
+    Output: type
+
+
+def build_step(t: Types, params: PlantParams, direct: bool = False) -> StepKernels:
+    """Compose the kernel for the kinds and the number of segments of ``params``.
+
+    Args:
+        t: types of the wanted precision.
+        params: kinds and segment count are read here; all numbers are read by the kernel at run time.
+        direct: by-pass the blocks; see :func:`sim.quadrotor.rigid_body.build_direct_flow`.
+    """
+    real, vec3, vec4 = t.real, t.vec3, t.vec4
+    Vehicle, Rope, Release, QuadState = t.Vehicle, t.Rope, t.Release, t.QuadState
+    L = params.rope.segments
+    State = st.array_struct(t, "State", st.STATE_FIELDS)
+    Output = st.array_struct(t, "Output", {k: (v, False) for k, v in st.OUTPUT_FIELDS.items()})
+    flow, rate, motor_advance = build_flow(t, params.vehicle)
+    if direct:
+        flow = build_direct_flow(t)
+    chain = build_chain(t, L)
+    coupled = build_coupled_step(t, flow, rate, motor_advance, chain)
+    vec3_limit = real(SPEED_LIMIT)
+
+    @wp.func
+    def load(state: State, env: int):
+        s = QuadState()
+        s.pos_w = state.pos_w[env]
+        s.quat_wb = state.quat_wb[env]
+        s.vel_w = state.vel_w[env]
+        s.rate_b = state.rate_b[env]
+        s.motor_speed = state.motor_speed[env]
+        s.integral = state.integral[env]
+        s.setpoint = state.setpoint[env]
+        s.gyro = state.gyro[env]
+        s.charge_used = state.charge_used[env]
+        s.voltage = state.voltage[env]
+        return s
+
+    @wp.func
+    def store(state: State, env: int, s: QuadState):
+        state.pos_w[env] = s.pos_w
+        state.quat_wb[env] = s.quat_wb
+        state.vel_w[env] = s.vel_w
+        state.rate_b[env] = s.rate_b
+        state.motor_speed[env] = s.motor_speed
+        state.integral[env] = s.integral
+        state.setpoint[env] = s.setpoint
+        state.gyro[env] = s.gyro
+        state.charge_used[env] = s.charge_used
+        state.voltage[env] = s.voltage
+
+    @wp.func
+    def sane(s: QuadState, u: wp.array(dtype=vec3), n: wp.array(dtype=vec3)):
+        """Finite and below the speed limit; a comparison with NaN is false."""
+        total = wp.length(s.vel_w) + wp.length(s.rate_b) + wp.length(s.quat_wb) + wp.length(s.pos_w) * real(1.0e-3)
+        total += wp.abs(s.voltage) + wp.length(s.motor_speed) * real(1.0e-3)
+        for i in range(L):
+            total += wp.length(u[i]) * real(1.0e-1) + wp.length(n[i])
+        return total < vec3_limit
+
+    @wp.func
+    def rope_in_rotor(p: Vehicle, rope: Rope, s: QuadState, n: wp.array(dtype=vec3)):
+        """Whether a joint of the rope stands within a propeller disc, one centimetre thick."""
+        hit = bool(False)
+        point = rope.mount
+        for i in range(L):
+            point += rope.segment_length * wp.quat_rotate_inv(s.quat_wb, n[i])
+            if wp.abs(point[2] - p.rotors.z) < real(0.01):
+                for j in range(4):
+                    dx = point[0] - p.rotors.x[j]
+                    dy = point[1] - p.rotors.y[j]
+                    if dx * dx + dy * dy < p.rotors.radius * p.rotors.radius:
+                        hit = bool(True)
+        return hit
+
+    @wp.func
+    def separate(
+        p: Vehicle, rope: Rope, r: Release, s: QuadState, n: wp.array(dtype=vec3), u: wp.array(dtype=vec3),
+        gravity: real, out: Output, env: int, elapsed: real,
+    ):
+        """Write what follows from the payload's state at separation."""
+        mount = s.pos_w + wp.quat_rotate(s.quat_wb, rope.mount)
+        pos, vel = chain.payload(rope, mount, coupled.mount_velocity(rope, s), n, u)
+        time = rel.time_to_height(pos, vel, r.landing_height, gravity)
+        out.payload_pos_w[env] = pos
+        out.payload_vel_w[env] = vel
+        out.separated[env] = 1
+        out.landing_w[env] = rel.projectile(pos, vel, gravity, time)
+        out.time_to_impact[env] = time
+        out.clearance[env] = rel.clearance(pos, vel, gravity, time, s.pos_w, r.clearance_samples)
+        out.separation_time[env] = elapsed
+        out.release_pos_w[env] = s.pos_w
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def step_kernel(
+        # Params:
+        vehicle: wp.array(dtype=Vehicle),
+        ropes: wp.array(dtype=Rope),
+        releases: wp.array(dtype=Release),
+        period: real,
+        substep: real,
+        gamma: real,
+        max_turn: real,
+        gravity: real,
+        # State in:
+        state: State,
+        # In:
+        command: wp.array(dtype=vec4),
+        release: wp.array(dtype=wp.int32),
+        # Out:
+        out: Output,
+    ):
+        env = wp.tid()
+        p = vehicle[env % vehicle.shape[0]]
+        rope = ropes[env % ropes.shape[0]]
+        r = releases[env % releases.shape[0]]
+        p.body.mass = p.body.mass * state.mass_scale[env]
+        g = vec3(real(0.0), real(0.0), -gravity)
+        n = wp.zeros(shape=(L,), dtype=vec3)
+        u = wp.zeros(shape=(L,), dtype=vec3)
+        stiffness = wp.zeros(shape=(L,), dtype=real)
+        for i in range(L):
+            n[i] = state.cable_dir_w[i, env]
+            u[i] = state.cable_vel_w[i, env]
+            stiffness[i] = state.stiffness[i, env]
+        s = load(state, env)
+
+        depth = state.queue.shape[0]
+        for k in range(depth - 1):
+            state.queue[depth - 1 - k, env] = state.queue[depth - 2 - k, env]
+        state.queue[0, env] = command[env]
+        whole, switch = split_delay(p, period)
+        timer = state.release_timer[env]
+        attached = state.attached[env]
+        if release[env] != 0 and timer < real(0.0) and attached != 0:
+            timer = r.lag
+        tiny = real(1.0e-6)
+        status = int(0)
+        out.separated[env] = 0
+
+        time = real(0.0)
+        if attached != 0 and timer >= real(0.0) and timer < tiny:
+            separate(p, rope, r, s, n, u, gravity, out, env, time)
+            attached = int(0)
+        while time < period - tiny:
+            until = period
+            slot = whole
+            if time < switch - tiny:
+                until = wp.min(until, switch)
+                slot = whole + 1
+            if attached != 0 and timer > time + tiny:
+                until = wp.min(until, timer)
+            count = int(wp.ceil((until - time) / substep - real(1.0e-3)))
+            h = (until - time) / real(float(count))
+            active = state.queue[wp.min(slot, depth - 1), env]
+            for k in range(count):
+                if attached != 0:
+                    s, fell_back = coupled.step(p, rope, s, active, n, u, stiffness, g, gamma, max_turn, h)
+                    if fell_back:
+                        status = status | 2
+                else:
+                    s = coupled.step_alone(p, s, active, g, h)
+            time = until
+            if attached != 0 and timer >= real(0.0) and time > timer - tiny:
+                separate(p, rope, r, s, n, u, gravity, out, env, time)
+                attached = int(0)
+
+        if timer >= real(0.0):
+            timer = wp.max(timer - period, real(0.0))
+        state.release_timer[env] = timer
+        state.attached[env] = attached
+        if sane(s, u, n):
+            store(state, env, s)
+            for i in range(L):
+                state.cable_dir_w[i, env] = n[i]
+                state.cable_vel_w[i, env] = u[i]
+                state.stiffness[i, env] = stiffness[i]
+        else:
+            status = status | 1
+            s = load(state, env)
+            for i in range(L):
+                n[i] = state.cable_dir_w[i, env]
+                u[i] = state.cable_vel_w[i, env]
+        if attached != 0:
+            mount = s.pos_w + wp.quat_rotate(s.quat_wb, rope.mount)
+            pos, vel = chain.payload(rope, mount, coupled.mount_velocity(rope, s), n, u)
+            out.payload_pos_w[env] = pos
+            out.payload_vel_w[env] = vel
+            if wp.length(pos - s.pos_w) < rope.payload_radius + p.collision_radius:
+                status = status | 4
+            if rope_in_rotor(p, rope, s, n):
+                status = status | 8
+        state.status[env] = status
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def payload_kernel(
+        # Params:
+        ropes: wp.array(dtype=Rope),
+        # State in:
+        state: State,
+        # Out:
+        out: Output,
+    ):
+        env = wp.tid()
+        rope = ropes[env % ropes.shape[0]]
+        s = load(state, env)
+        n = wp.zeros(shape=(L,), dtype=vec3)
+        u = wp.zeros(shape=(L,), dtype=vec3)
+        for i in range(L):
+            n[i] = state.cable_dir_w[i, env]
+            u[i] = state.cable_vel_w[i, env]
+        if state.attached[env] != 0:
+            mount = s.pos_w + wp.quat_rotate(s.quat_wb, rope.mount)
+            pos, vel = chain.payload(rope, mount, coupled.mount_velocity(rope, s), n, u)
+            out.payload_pos_w[env] = pos
+            out.payload_vel_w[env] = vel
+
+    return StepKernels(step_kernel, payload_kernel, State, Output)

@@ -1,0 +1,153 @@
+"""Warp structs of the parameters and of the vehicle's state, made for one floating-point precision.
+
+The dataclasses of :mod:`sim.params` are the only place where a parameter is declared: :class:`Types` derives the Warp
+struct of each from its annotations, so a field added there reaches the kernels under the same name.
+"""
+
+import dataclasses
+import typing
+from functools import lru_cache
+from types import SimpleNamespace
+
+import numpy as np
+import warp as wp
+
+from sim import params as P
+
+
+def make_struct(name: str, fields: dict[str, type]) -> type:
+    return wp.struct(type(name, (), {"__annotations__": fields, "__module__": __name__}))
+
+
+class Types:
+    """Scalar, vector and struct types of one precision.
+
+    Attributes:
+        real, vec3, vec4, mat33, quat: Warp types.
+        Vehicle: struct of :class:`sim.params.VehicleParams`, with the mixer's columns added under ``mixer``.
+        Rope: struct of :class:`sim.params.RopeParams` per segment (``segment_length``, ``segment_mass``, ...).
+        QuadState, QuadRate: state of the quadrotor alone and its time derivative.
+    """
+
+    def __init__(self, real: type):
+        self.real = real
+        self.vec3 = wp.types.vector(3, real)
+        self.vec4 = wp.types.vector(4, real)
+        self.mat33 = wp.types.matrix((3, 3), real)
+        self.quat = wp.types.quaternion(real)
+        self.Mixer = make_struct("Mixer", {"roll": self.vec4, "pitch": self.vec4, "yaw": self.vec4})
+        self.Vehicle = self._from_dataclass(P.VehicleParams, {"mixer": self.Mixer})
+        self.Release = self._from_dataclass(P.ReleaseParams, {})
+        self.Randomization = self._from_dataclass(P.RandomizationParams, {})
+        self.Rope = make_struct("Rope", {
+            "mount": self.vec3, "segment_length": real, "segment_mass": real, "segment_inertia": real,
+            "last_mass": real, "last_center": real, "last_inertia": real, "payload_offset": real,
+            "payload_radius": real, "joint_damping": real, "total_mass": real,
+        })
+        fields = {
+            "pos_w": self.vec3, "quat_wb": self.quat, "vel_w": self.vec3, "rate_b": self.vec3, "motor_speed": self.vec4,
+            "integral": self.vec3, "setpoint": self.vec3, "gyro": self.vec3, "charge_used": real, "voltage": real,
+        }
+        self.QuadState = make_struct("QuadState", fields)
+        self.QuadRate = make_struct("QuadRate", dict(fields))
+        self.Flow = make_struct("Flow", {
+            "force_b": self.vec3, "torque_b": self.vec3, "motor_speed": self.vec4, "motor_rate": self.vec4,
+            "integral_rate": self.vec3, "setpoint_rate": self.vec3, "gyro_rate": self.vec3,
+            "charge_rate": real, "voltage_rate": real,
+        })
+
+    def _field_type(self, annotation) -> type | None:
+        if annotation is float:
+            return self.real
+        if annotation is int:
+            return wp.int32
+        if typing.get_origin(annotation) is tuple:
+            return {3: self.vec3, 4: self.vec4}[len(typing.get_args(annotation))]
+        if dataclasses.is_dataclass(annotation):
+            return self._from_dataclass(annotation, {})
+        return None  # kinds are chosen when the kernel is built; they are no run-time parameters
+
+    def _from_dataclass(self, schema: type, extra: dict[str, type]) -> type:
+        hints = typing.get_type_hints(schema)
+        fields = {f.name: self._field_type(hints[f.name]) for f in dataclasses.fields(schema)}
+        return make_struct(schema.__name__, {k: v for k, v in fields.items() if v is not None} | extra)
+
+
+@lru_cache
+def types(precision: str) -> Types:
+    """Types of ``"float32"`` or ``"float64"``; made once, so that kernels of one precision share their structs."""
+    if precision not in ("float32", "float64"):
+        raise ValueError(f"precision {precision!r}: expected 'float32' or 'float64'")
+    return Types(wp.float32 if precision == "float32" else wp.float64)
+
+
+def _fill(row: np.void, value) -> None:
+    for f in dataclasses.fields(value):
+        if f.name not in row.dtype.names:
+            continue
+        item = getattr(value, f.name)
+        if dataclasses.is_dataclass(item):
+            _fill(row[f.name], item)
+        else:
+            row[f.name] = item
+
+
+def mixer_columns(rotors: P.RotorParams, torque_ratio: float) -> SimpleNamespace:
+    """Thrust of each rotor [N] that makes 1 N m about x, y and z without changing the sum; each of shape (4,)."""
+    x, y, s = np.asarray(rotors.x), np.asarray(rotors.y), np.asarray(rotors.spin)
+    return SimpleNamespace(roll=y / (4 * np.mean(y**2)), pitch=-x / (4 * np.mean(x**2)), yaw=s / (4 * torque_ratio))
+
+
+def pack_vehicle(t: Types, vehicles: list[P.VehicleParams]) -> np.ndarray:
+    """Structured array of shape (1,) or (E,) for ``wp.array(dtype=t.Vehicle)``.
+
+    Raises:
+        ValueError: a rotor geometry that cannot make a torque about each axis.
+    """
+    rows = np.zeros(len(vehicles), dtype=t.Vehicle.numpy_dtype())
+    for row, vehicle in zip(rows, vehicles, strict=True):
+        _fill(row, vehicle)
+        if not (np.any(vehicle.rotors.x) and np.any(vehicle.rotors.y)) or abs(sum(vehicle.rotors.spin)) > 0:
+            raise ValueError(
+                f"rotors at x={vehicle.rotors.x}, y={vehicle.rotors.y} with spin {vehicle.rotors.spin}: expected four "
+                "rotors spread along x and y, two turning each way"
+            )
+        columns = mixer_columns(vehicle.rotors, vehicle.thrust.torque_ratio)
+        for name in ("roll", "pitch", "yaw"):
+            row["mixer"][name] = getattr(columns, name)
+    return rows
+
+
+def pack(struct: type, value) -> np.ndarray:
+    """Structured array of shape (1,) for ``wp.array(dtype=struct)``, filled from the dataclass it was derived from."""
+    rows = np.zeros(1, dtype=struct.numpy_dtype())
+    _fill(rows[0], value)
+    return rows
+
+
+def pack_rope(t: Types, ropes: list[P.RopeParams]) -> np.ndarray:
+    """Structured array of shape (1,) or (E,) for ``wp.array(dtype=t.Rope)``.
+
+    The last rod carries the payload: its mass, centre and transverse inertia about its upper joint are combined here.
+
+    Raises:
+        ValueError: a number of segments outside 1 to 64, or a mass or length that is not positive.
+    """
+    rows = np.zeros(len(ropes), dtype=t.Rope.numpy_dtype())
+    for row, rope in zip(rows, ropes, strict=True):
+        if not 1 <= rope.segments <= 64:
+            raise ValueError(f"rope of {rope.segments} segments: expected 1 to 64")
+        if min(rope.length, rope.rope_mass, rope.payload_mass) <= 0:
+            raise ValueError(
+                f"rope of length {rope.length} m, mass {rope.rope_mass} kg, payload {rope.payload_mass} kg: expected positive values"
+            )
+        length, mass = rope.length / rope.segments, rope.rope_mass / rope.segments
+        ball = length + rope.payload_offset
+        last_mass = mass + rope.payload_mass
+        row["segment_length"], row["segment_mass"], row["segment_inertia"] = length, mass, mass * length**2 / 3
+        row["last_mass"], row["last_center"] = last_mass, (mass * length / 2 + rope.payload_mass * ball) / last_mass
+        row["last_inertia"] = mass * length**2 / 3 + rope.payload_inertia + rope.payload_mass * ball**2
+        row["payload_offset"], row["payload_radius"] = rope.payload_offset, rope.payload_radius
+        row["joint_damping"], row["mount"] = rope.joint_damping, rope.mount
+        row["total_mass"] = rope.rope_mass + rope.payload_mass
+    return rows
