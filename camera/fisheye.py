@@ -1,0 +1,270 @@
+"""Kannala-Brandt fisheye model in torch: valid past 90 deg off the axis, finite and differentiable on the whole sphere.
+
+The same functions serve a batch of thousands on a GPU inside a CUDA graph and a batch of one on board: no host copies,
+no branches on data, no boolean-mask indexing. Only elementwise operations whose vector and scalar paths agree are used
+(``atan``, not ``atan2``, whose remainder loop rounds otherwise), so that a batch of N equals N singles bit for bit on
+the CPU.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+AXIS_EPSILON = 1e-20
+"""Added to x^2 + y^2 so that value and gradient are finite on the axis: a radius of 1e-10 in the points' unit."""
+
+NEWTON_STEPS = 24
+"""Safeguarded Newton steps of the inverse: quadratic near the root, bisection where a Newton step would leave the
+bracket."""
+
+
+@dataclass(frozen=True)
+class FisheyeParams:
+    """Intrinsics of a Kannala-Brandt fisheye camera.
+
+    ``theta = atan2(sqrt(x^2 + y^2), z)``, ``theta_d = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8)``,
+    ``u = fx theta_d cos(phi) + cx``, ``v = fy theta_d sin(phi) + cy``. All k zero: the equidistant lens.
+
+    Convention: pixel (0, 0) is the *centre* of the top left pixel, u to the right, v down, as in OpenCV, Kalibr, ROS
+    and basalt.
+    Source: Kannala and Brandt, "A generic camera model and calibration method", TPAMI 28(8), 2006, eq. 6.
+    """
+
+    width: int  # [px]
+    height: int  # [px]
+    fx: float  # [px/rad]
+    fy: float  # [px/rad]
+    cx: float  # [px]
+    cy: float  # [px]
+    k1: float = 0.0  # [rad^-2]
+    k2: float = 0.0  # [rad^-4]
+    k3: float = 0.0  # [rad^-6]
+    k4: float = 0.0  # [rad^-8]
+    fov_deg: float = 220.0  # full field of view, twice the largest angle off the axis [deg]
+
+    @property
+    def coefficients(self) -> tuple[float, float, float, float]:
+        """Distortion coefficients (k1, k2, k3, k4)."""
+        return (self.k1, self.k2, self.k3, self.k4)
+
+    @property
+    def half_fov(self) -> float:
+        """Largest angle off the optical axis that is inside the field of view [rad]."""
+        return math.radians(self.fov_deg) / 2.0
+
+
+def check_fisheye(params: FisheyeParams) -> None:
+    """Refuse intrinsics that describe no camera.
+
+    Raises:
+        ValueError: A value is not finite or out of range, or theta_d does not grow all the way to the edge of the field
+        of view.
+    """
+    for name in ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "fov_deg"):
+        if not math.isfinite(getattr(params, name)):
+            raise ValueError(f"fisheye {name} is {getattr(params, name)}; expected a finite number")
+    for name in ("width", "height", "fx", "fy"):
+        if getattr(params, name) <= 0:
+            raise ValueError(f"fisheye {name} is {getattr(params, name)}; expected a number above 0")
+    if not 0.0 < params.fov_deg <= 360.0:
+        raise ValueError(f"fisheye fov_deg is {params.fov_deg}; expected a full angle above 0 and up to 360 deg")
+    limit = monotonic_limit(params.coefficients)
+    if limit <= params.half_fov:
+        raise ValueError(
+            f"theta_d with k = {params.coefficients} stops growing at {math.degrees(limit):.2f} deg off the axis, inside "
+            f"the field of view; expected fov_deg below {2 * math.degrees(limit):.2f}, got {params.fov_deg}"
+        )
+
+
+def monotonic_limit(coefficients: tuple[float, ...]) -> float:
+    """Angle off the axis at which theta_d stops growing, ``inf`` where it never does [rad]."""
+    slope = [(2 * i + 3) * k for i, k in enumerate(coefficients)][::-1] + [1.0]
+    roots = np.roots(np.trim_zeros(slope, "f")) if any(slope[:-1]) else np.zeros(0)
+    real = roots[np.abs(roots.imag) < 1e-12 * np.abs(roots)].real if roots.size else roots
+    positive = real[real > 0.0]
+    return float(np.sqrt(positive.min())) if positive.size else math.inf
+
+
+class Fisheye:
+    """Projection and unprojection of a Kannala-Brandt fisheye.
+
+    Normalised image coordinates are 1 at the edge of the stated field of view, in every direction and for any fx, fy:
+    ``x_n = (u - cx) / (fx R)``, ``y_n = (v - cy) / (fy R)`` with ``R = theta_d(fov / 2)``. They do not depend on fx,
+    fy, cx, cy at all, only on the shape of theta_d and the field of view.
+
+    Past the field of view theta_d goes on along its tangent, so that the map stays one-to-one and smooth on the whole
+    sphere even where the polynomial folds back; such points are never valid. Results have the dtype and device of the
+    input.
+
+    Attributes:
+        params: The intrinsics.
+        half_fov: Largest valid angle off the axis [rad].
+        edge_radius: ``R = theta_d(fov / 2)`` [rad].
+        circle_inside_image: Whether the whole field of view falls on the sensor; if not, validity also asks for the
+            image.
+    """
+
+    def __init__(self, params: FisheyeParams):
+        """Check the intrinsics and precompute the edge of the field of view.
+
+        Raises:
+            ValueError: See `check_fisheye`.
+        """
+        check_fisheye(params)
+        self.params = params
+        self.half_fov = params.half_fov
+        self._equidistant = not any(params.coefficients)
+        k1, k2, k3, k4 = params.coefficients
+        t2 = self.half_fov**2
+        self.edge_radius = self.half_fov * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
+        self._edge_slope = 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
+        reach_x, reach_y = params.fx * self.edge_radius, params.fy * self.edge_radius
+        slack = 1e-9
+        self._bounds = (-0.5 - slack, params.width - 0.5 + slack, -0.5 - slack, params.height - 0.5 + slack)
+        left, right, top, bottom = self._bounds
+        self.circle_inside_image = (
+            params.cx - reach_x >= left
+            and params.cx + reach_x <= right
+            and params.cy - reach_y >= top
+            and params.cy + reach_y <= bottom
+        )
+        self._constants: dict = {}
+
+    def angle(
+        self, points_c: torch.Tensor, epsilon: float = AXIS_EPSILON
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Angle off the optical axis of points.
+
+        Args:
+            points_c: Points [any unit], shape (..., 3), camera frame.
+            epsilon: Added to x^2 + y^2 [unit of the points, squared].
+
+        Returns:
+            theta in [0, pi] [rad], distance from the axis and distance from the lens [unit of the points], each shape
+            (...).
+        """
+        x, y, z = points_c.unbind(-1)
+        radius2 = x * x + y * y + epsilon
+        radius = radius2.sqrt()
+        distance = (radius2 + z * z).sqrt()
+        behind = z < 0.0
+        # theta / 2 = atan(r / (d + z)) = atan((d - z) / r): the form without cancellation on each side of the lens
+        # plane.
+        reach = distance + torch.where(behind, -z, z)
+        tangent = torch.where(behind, reach, radius) / torch.where(behind, radius, reach)
+        return tangent.atan() * 2.0, radius, distance
+
+    def radius_from_angle(self, theta: torch.Tensor) -> torch.Tensor:
+        """theta_d [rad], shape of theta; past the field of view it goes on along its tangent."""
+        if self._equidistant:
+            return theta
+        k1, k2, k3, k4 = self.params.coefficients
+        inner = theta.clamp(max=self.half_fov)
+        t2 = inner * inner
+        return inner * (t2 * (t2 * (t2 * (t2 * k4 + k3) + k2) + k1) + 1.0) + (theta - inner) * self._edge_slope
+
+    def slope_from_angle(self, theta: torch.Tensor) -> torch.Tensor:
+        """d theta_d / d theta [-], shape of theta; constant past the field of view."""
+        if self._equidistant:
+            return torch.ones_like(theta)
+        k1, k2, k3, k4 = self.params.coefficients
+        inner = theta.clamp(max=self.half_fov)
+        t2 = inner * inner
+        return t2 * (t2 * (t2 * (t2 * (9 * k4) + 7 * k3) + 5 * k2) + 3 * k1) + 1.0
+
+    def project_normalized(self, points_c: torch.Tensor, clip: bool = False) -> tuple[torch.Tensor, torch.Tensor]:
+        """Project points to normalised image coordinates.
+
+        Args:
+            points_c: Points [any unit], shape (..., 3), camera frame.
+            clip: Pull points outside the field of view to its edge (radius 1), along their own direction in the image.
+
+        Returns:
+            Normalised coordinates [-], shape (..., 2), and validity (bool), shape (...): inside the field of view and
+            on the sensor.
+        """
+        theta, radius, _ = self.angle(points_c)
+        valid = theta <= self.half_fov
+        shrink = self.radius_from_angle(theta.clamp(max=self.half_fov) if clip else theta) / radius
+        normalized = points_c[..., :2] * (shrink * (1.0 / self.edge_radius)).unsqueeze(-1)
+        if not self.circle_inside_image:
+            valid = valid & self.on_sensor(self.denormalize(normalized))
+        return normalized, valid
+
+    def project(self, points_c: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Project points to pixels.
+
+        Args:
+            points_c: Points [any unit], shape (..., 3), camera frame.
+
+        Returns:
+            Pixels [px], shape (..., 2), finite everywhere, and validity (bool), shape (...): theta <= fov / 2. Whether
+            a valid point also falls on the sensor is `on_sensor`'s to say.
+        """
+        theta, radius, _ = self.angle(points_c)
+        focal, centre = self._pixel_constants(points_c)
+        scale = (self.radius_from_angle(theta) / radius).unsqueeze(-1)
+        return points_c[..., :2] * scale * focal + centre, theta <= self.half_fov
+
+    def unproject(self, pixels: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Turn pixels into unit rays.
+
+        Args:
+            pixels: Pixels [px], shape (..., 2).
+
+        Returns:
+            Unit rays [-], shape (..., 3), camera frame, and validity (bool), shape (...): inside the field of view.
+            Pixels beyond it give the ray at the edge.
+        """
+        focal, centre = self._pixel_constants(pixels)
+        plane = (pixels - centre) / focal
+        x, y = plane.unbind(-1)
+        radius = (x * x + y * y + AXIS_EPSILON).sqrt()
+        # A ray that was projected from the very edge may round to either side of it.
+        valid = radius <= self.edge_radius * (1.0 + 8.0 * torch.finfo(pixels.dtype).eps)
+        theta = self._angle_from_radius(radius.clamp(max=self.edge_radius))
+        across = plane * (theta.sin() / radius).unsqueeze(-1)
+        return torch.cat([across, theta.cos().unsqueeze(-1)], -1), valid
+
+    def normalize(self, pixels: torch.Tensor) -> torch.Tensor:
+        """Normalised image coordinates [-] of pixels [px], both shape (..., 2)."""
+        focal, centre = self._pixel_constants(pixels)
+        return (pixels - centre) / (focal * self.edge_radius)
+
+    def denormalize(self, normalized: torch.Tensor) -> torch.Tensor:
+        """Pixels [px] of normalised image coordinates [-], both shape (..., 2)."""
+        focal, centre = self._pixel_constants(normalized)
+        return normalized * (focal * self.edge_radius) + centre
+
+    def on_sensor(self, pixels: torch.Tensor) -> torch.Tensor:
+        """Whether pixels [px], shape (..., 2), lie on the sensor, edges of the outer pixels included: bool, shape
+        (...)."""
+        left, right, top, bottom = self._bounds
+        u, v = pixels.unbind(-1)
+        return (u >= left) & (u <= right) & (v >= top) & (v <= bottom)
+
+    def _angle_from_radius(self, radius: torch.Tensor) -> torch.Tensor:
+        """Invert theta_d by Newton inside a shrinking bracket; differentiable through the last step."""
+        if self._equidistant:
+            return radius
+        with torch.no_grad():
+            theta = radius * (self.half_fov / self.edge_radius)
+            low, high = torch.zeros_like(theta), torch.full_like(theta, self.half_fov)
+            for _ in range(NEWTON_STEPS):
+                excess = self.radius_from_angle(theta) - radius
+                low = torch.where(excess < 0.0, theta, low)
+                high = torch.where(excess < 0.0, high, theta)
+                step = theta - excess / self.slope_from_angle(theta)
+                theta = torch.where((step < low) | (step > high), (low + high) * 0.5, step)
+        return theta - (self.radius_from_angle(theta) - radius) / self.slope_from_angle(theta)
+
+    def _pixel_constants(self, like: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Focal lengths and principal point on the device of a tensor, made once so that a CUDA graph can be captured
+        later."""
+        key = (like.device, like.dtype)
+        if key not in self._constants:
+            p = self.params
+            self._constants[key] = (like.new_tensor([p.fx, p.fy]), like.new_tensor([p.cx, p.cy]))
+        return self._constants[key]

@@ -1,0 +1,67 @@
+"""Fixed-length history of tensors, newest first, as pure functions.
+
+No indexing by masks and no branches on data: the functions run inside a CUDA graph. Filled with the first value on
+reset, so that a history never mixes two episodes and never holds zeros that were no measurement.
+"""
+
+import torch
+
+
+def filled(new: torch.Tensor, length: int) -> torch.Tensor:
+    """History of ``length`` copies of new (E, ...): shape (E, H, ...).
+
+    Raises:
+        ValueError: length is below 1.
+    """
+    if length < 1:
+        raise ValueError(f"history length is {length}; expected at least 1 (the newest value itself)")
+    return new.unsqueeze(1).repeat_interleave(length, 1)
+
+
+def push(history: torch.Tensor, new: torch.Tensor, reset_mask: torch.Tensor) -> torch.Tensor:
+    """Return the history with a value put in front and the oldest dropped.
+
+    Args:
+        history: Shape (E, H, ...), newest first.
+        new: The newest value, shape (E, ...).
+        reset_mask: Environments whose history is filled with the new value, bool, shape (E,).
+
+    Returns:
+        A new tensor, shape (E, H, ...).
+    """
+    front = new.unsqueeze(1)
+    mask = reset_mask.reshape(-1, *(1,) * (history.dim() - 1))
+    return torch.where(mask, front, torch.cat([front, history[:, :-1]], 1))
+
+
+def push_(history: torch.Tensor, new: torch.Tensor, reset_mask: torch.Tensor) -> torch.Tensor:
+    """`push` into the same storage, for buffers whose address a CUDA graph holds; returns history."""
+    return history.copy_(push(history, new, reset_mask))
+
+
+def at_latency(history: torch.Tensor, latency: torch.Tensor) -> torch.Tensor:
+    """Value that is ``latency`` steps old, linear between the two stored neighbours.
+
+    Written as hat-function weights over the whole (short) history: no gather, latencies may differ by environment.
+    A latency beyond the history reads its oldest value.
+
+    Args:
+        history: Floating point, shape (E, H, ...), newest first.
+        latency: Age [steps], shape (E,) or scalar tensor.
+
+    Returns:
+        Shape (E, ...).
+    """
+    weights = latency_weights(history.shape[1], latency, history)
+    weights = weights.reshape(*weights.shape, *(1,) * (history.dim() - 2))
+    value = history[:, 0] * weights[:, 0]
+    for age in range(1, history.shape[1]):
+        value = value + history[:, age] * weights[:, age]
+    return value
+
+
+def latency_weights(length: int, latency: torch.Tensor, like: torch.Tensor) -> torch.Tensor:
+    """Weight of each stored age: shape (E, H), rows sum to 1; (1, H) for a scalar latency."""
+    ages = torch.arange(length, device=like.device, dtype=like.dtype)
+    age = latency.to(like.dtype).reshape(-1, 1).clamp(0.0, length - 1.0)
+    return (1.0 - (ages - age).abs()).clamp(min=0.0)

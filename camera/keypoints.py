@@ -1,0 +1,207 @@
+"""Keypoints that the vision policy sees: corners of the goal square and the bounding box of the ball.
+
+`keypoints` is the one function that the training environment calls with a batch of thousands and the HIL runner with a
+batch of one.
+"""
+
+import torch
+
+from camera.fisheye import AXIS_EPSILON, Fisheye
+from camera.mount import extrinsics_with_error, nominal_rot_cb, points_c_from_w
+from camera.params import CameraParams, check_camera
+
+GOAL_KEYPOINTS = 4
+PAYLOAD_KEYPOINTS = 4
+KEYPOINTS = GOAL_KEYPOINTS + PAYLOAD_KEYPOINTS
+"""K = 8 keypoints: 0 to 3 the goal corners, 4 to 7 the payload box."""
+
+MAX_SINE = 0.99
+"""Sine of the largest half-angle of the ball: keeps the box finite when the lens touches the ball or sinks into it."""
+
+
+DIRECTION_EPSILON = 1e-10
+"""Added to the squared sine of the ball's angle: its box's derivative, ~ sin^-4 behind the lens, then stays inside
+float32."""
+
+
+class KeypointCamera:
+    """A camera with its constants on one device, made once before the first step (and before a CUDA graph is captured).
+
+    Attributes:
+        params: The configuration.
+        fisheye: The lens.
+        rot_cb: Nominal extrinsic rotation, body to camera, shape (3, 3).
+        position_b: Nominal lens position [m], shape (3,), body frame.
+        square_w: Goal corners from the goal [m], shape (4, 3), world frame.
+        edge_reads: Whether points outside the field of view read as its edge (else as zero).
+    """
+
+    def __init__(self, params: CameraParams, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32):
+        """Check the parameters and put the constants on the device.
+
+        Raises:
+            ValueError: See `check_camera`.
+        """
+        check_camera(params)
+        self.params = params
+        self.fisheye = Fisheye(params.fisheye)
+        self.rot_cb = nominal_rot_cb(params.mount).to(device=device, dtype=dtype)
+        self.position_b = torch.tensor(params.mount.position_b, device=device, dtype=dtype)
+        self.square_w = goal_square(params.goal_side).to(device=device, dtype=dtype)
+        self.edge_reads = params.noise.invalid_reads == "edge"
+        self._identity = torch.eye(2, device=device, dtype=dtype)
+        self.fisheye.normalize(self.position_b[:2])  # makes the lens constants on this device
+
+    def extrinsics(
+        self, rotation_error: torch.Tensor, position_error: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Extrinsics with an error per environment; see `camera.mount.extrinsics_with_error`.
+
+        Args:
+            rotation_error: Rotation vectors [rad], shape (E, 3), body frame.
+            position_error: Offsets [m], shape (E, 3), body frame.
+
+        Returns:
+            rot_cb, shape (E, 3, 3), and position_b [m], shape (E, 3): the ``extrinsics`` of `keypoints`.
+        """
+        return extrinsics_with_error(self.rot_cb, self.position_b, rotation_error, position_error)
+
+
+def goal_square(side: float) -> torch.Tensor:
+    """Corners of the goal square from its centre [m], float64, shape (4, 3), world frame.
+
+    Convention: (+x, +y), (+x, -y), (-x, -y), (-x, +y), so clockwise seen from above and, from a downward camera whose
+    vehicle faces +x, top left, top right, bottom right, bottom left in the image. Sides are parallel to the world's
+    axes.
+    """
+    h = side / 2.0
+    return torch.tensor([[h, h, 0.0], [h, -h, 0.0], [-h, -h, 0.0], [-h, h, 0.0]], dtype=torch.float64)
+
+
+def goal_corners_w(goal_w: torch.Tensor, side: float = 0.25, square_w: torch.Tensor | None = None) -> torch.Tensor:
+    """Corners of the ground square around the goal, on z = 0 whatever the goal's height.
+
+    Args:
+        goal_w: Goal [m], shape (E, 2) or (E, 3), world frame.
+        side: Side of the square [m].
+        square_w: `goal_square` of that side on the goal's device, to save making it.
+
+    Returns:
+        Corners [m], shape (E, 4, 3), world frame, in the order of `goal_square`.
+    """
+    if square_w is None:
+        square_w = goal_square(side).to(goal_w)
+    return torch.nn.functional.pad(goal_w[:, :2], (0, 1)).unsqueeze(-2) + square_w
+
+
+def ball_extremes_c(
+    fisheye: Fisheye, ball_c: torch.Tensor, radius: float, identity: torch.Tensor | None = None
+) -> torch.Tensor:
+    """Rays to the leftmost, topmost, rightmost and bottommost point of a ball's outline in the image.
+
+    The outline of a ball of radius r at distance d is the cone of half-angle ``a = asin(r / d)`` about its centre's ray
+    c, exactly and in every direction, past 90 deg too. The image coordinate u grows fastest along its gradient on the
+    sphere, so the extremes of u are the rays ``cos(a) c -+ sin(a) grad u / |grad u|``, and likewise for v. With
+    ``rho = theta_d``, ``s = sin(theta)``, ``g = rho / s``, ``q = (rho' cos(theta) - g) / s^2``:
+    ``grad u = (g + q c_x^2, q c_x c_y, -rho' c_x)``. The gradient is taken at the centre: the ray's place on the
+    outline is right to first order in a, the extreme value itself, being stationary, to second. At a rope's length
+    (0.38 m) the box is off by at most 2.2e-4 in normalised coordinates.
+
+    Args:
+        fisheye: The lens.
+        ball_c: Centre of the ball [m], shape (E, 3), camera frame.
+        radius: Radius of the ball [m].
+        identity: eye(2) on the ball's device, to save making it.
+
+    Returns:
+        Unit rays, shape (E, 4, 3), camera frame: left, top, right, bottom.
+    """
+    if identity is None:
+        identity = torch.eye(2, device=ball_c.device, dtype=ball_c.dtype)
+    x, y, z = ball_c.unbind(-1)
+    distance = (x * x + y * y + z * z + AXIS_EPSILON).sqrt()
+    centre = ball_c / distance.unsqueeze(-1)
+    theta, s, _ = fisheye.angle(centre, DIRECTION_EPSILON)
+    sine = (radius / distance).clamp(max=MAX_SINE)
+    cosine = (1.0 - sine * sine).sqrt()
+    g = fisheye.radius_from_angle(theta) / s
+    slope = fisheye.slope_from_angle(theta)
+    q = (slope * centre[:, 2] - g) / (s * s)
+    across = centre[:, :2]
+    row = across.unsqueeze(-1)  # (E, 2, 1): the image axis whose gradient it is
+    tangent = row * (across * q.unsqueeze(-1)).unsqueeze(-2) + g[:, None, None] * identity
+    along = row * -slope[:, None, None]
+    tx, ty, tz = tangent[..., 0:1], tangent[..., 1:2], along
+    size = (tx * tx + ty * ty + tz * tz + AXIS_EPSILON).sqrt()
+    step = torch.cat([tangent, along], -1) * (sine[:, None, None] / size)
+    middle = (centre * cosine.unsqueeze(-1)).unsqueeze(-2)
+    return torch.cat([middle - step, middle + step], -2)
+
+
+def box_midpoints(extremes: torch.Tensor) -> torch.Tensor:
+    """Edge midpoints of the axis-aligned box through four extreme points.
+
+    A detector reports a box: four numbers. Its edge midpoints are computed from these alone, so a real detector can
+    take the projection's place; unlike its corners they lie on or next to the ball's outline, so that the field of view
+    decides about each of them.
+
+    Args:
+        extremes: Image points left, top, right, bottom, shape (E, 4, 2).
+
+    Returns:
+        Midpoints of the left, top, right and bottom edge, shape (E, 4, 2).
+    """
+    left, top, right, bottom = extremes[:, 0, 0], extremes[:, 1, 1], extremes[:, 2, 0], extremes[:, 3, 1]
+    u, v = (left + right) * 0.5, (top + bottom) * 0.5
+    return torch.stack([left, v, u, top, right, v, u, bottom], -1).unflatten(-1, (4, 2))
+
+
+def payload_keypoints(camera: KeypointCamera, ball_c: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Payload keypoints alone: what a detector's box around the ball would give.
+
+    Args:
+        camera: The camera.
+        ball_c: Centre of the ball [m], shape (E, 3), camera frame.
+
+    Returns:
+        Normalised edge midpoints (left, top, right, bottom) [-], shape (E, 4, 2), and validity, shape (E, 4): the
+        outline's point on that side is inside the field of view and on the sensor. Extremes beyond the field of view
+        are clipped to its edge first.
+    """
+    rays = ball_extremes_c(camera.fisheye, ball_c, camera.params.payload_radius, camera._identity)
+    extremes, valid = camera.fisheye.project_normalized(rays, clip=True)
+    return box_midpoints(extremes), valid
+
+
+def keypoints(
+    camera: KeypointCamera,
+    pos_w: torch.Tensor,
+    rot_wb: torch.Tensor,
+    goal_w: torch.Tensor,
+    payload_w: torch.Tensor,
+    extrinsics: tuple[torch.Tensor, torch.Tensor] | None = None,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Keypoints of goal and payload as the camera sees them, without noise.
+
+    Args:
+        camera: The camera, on the device of the other arguments.
+        pos_w: Centre of mass of the vehicle [m], shape (E, 3), world frame.
+        rot_wb: Attitude, body to world, shape (E, 3, 3).
+        goal_w: Goal [m], shape (E, 2) or (E, 3), world frame; the corners lie on z = 0.
+        payload_w: Centre of the ball [m], shape (E, 3), world frame.
+        extrinsics: rot_cb and position_b per environment (`KeypointCamera.extrinsics`); the nominal mount if left out.
+
+    Returns:
+        Keypoints [-], shape (E, 8, 2), normalised image coordinates (x right, y down, 1 at the edge of the field of
+        view), goal corners first (order of `goal_square`), then the payload's box (left, top, right, bottom); and
+        validity (bool), shape (E, 8). Invalid points are on the edge (``invalid_reads = "edge"``) or zero.
+    """
+    rot_cb, position_b = (camera.rot_cb, camera.position_b) if extrinsics is None else extrinsics
+    corners_w = goal_corners_w(goal_w, square_w=camera.square_w)
+    points_c = points_c_from_w(torch.cat([corners_w, payload_w.unsqueeze(-2)], -2), pos_w, rot_wb, rot_cb, position_b)
+    rays_c = ball_extremes_c(camera.fisheye, points_c[:, 4], camera.params.payload_radius, camera._identity)
+    seen, valid = camera.fisheye.project_normalized(torch.cat([points_c[:, :4], rays_c], -2), clip=True)
+    points = torch.cat([seen[:, :4], box_midpoints(seen[:, 4:])], -2)
+    if not camera.edge_reads:
+        points = points * valid.unsqueeze(-1)
+    return points, valid

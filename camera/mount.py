@@ -1,0 +1,116 @@
+"""Mount of the camera on the vehicle: nominal extrinsics, per-environment extrinsic error, world to camera.
+
+Products are written out elementwise: a batched matrix product would round differently with the batch size (and in TF32
+where the trainer turns that on), and the training environment must equal the onboard batch of one bit for bit.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+
+DOWNWARD_ROT_CB = ((0.0, -1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
+"""rot_cb of the downward camera: x_c (image right) = -y_b, y_c (image down) = -x_b, z_c (optical axis) = -z_b."""
+
+
+@dataclass(frozen=True)
+class MountParams:
+    """Where the camera sits on the body and how it is turned.
+
+    Convention: with ``rpy_deg`` zero the camera looks down and the top of the image is the vehicle's front:
+    x_c (image right) = -y_b (the vehicle's right), y_c (image down) = -x_b, z_c (optical axis) = -z_b. ``rpy_deg``
+    turns the camera about the body axes from there, ``rot_bc = Rz(yaw) Ry(pitch) Rx(roll) rot_bc_down``: a negative
+    pitch lets it look forward.
+    """
+
+    position_b: tuple[float, float, float] = (0.0, 0.0, 0.0)  # lens from the centre of mass [m], body frame
+    rpy_deg: tuple[float, float, float] = (
+        0.0,
+        0.0,
+        0.0,
+    )  # roll, pitch, yaw from the downward pose [deg], about body axes
+    rotation_error_std: float = 0.0  # per episode and axis, unknown to the policy [rad]
+    position_error_std: float = 0.0  # per episode and axis, unknown to the policy [m]
+
+
+def rotation_from_vector(vector: torch.Tensor) -> torch.Tensor:
+    """Rotation matrix of a rotation vector (Rodrigues), finite and differentiable at zero.
+
+    Args:
+        vector: Axis times angle [rad], shape (..., 3).
+
+    Returns:
+        Rotation matrices, shape (..., 3, 3).
+    """
+    x, y, z = vector.unbind(-1)
+    angle = (x * x + y * y + z * z + 1e-20).sqrt()
+    a = angle.sin() / angle
+    half = (angle * 0.5).sin() / angle
+    b = half * half * 2.0
+    rows = [
+        1.0 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y,
+        b * x * y + a * z, 1.0 - b * (x * x + z * z), b * y * z - a * x,
+        b * x * z - a * y, b * y * z + a * x, 1.0 - b * (x * x + y * y),
+    ]  # fmt: skip
+    return torch.stack(rows, -1).unflatten(-1, (3, 3))
+
+
+def nominal_rot_cb(mount: MountParams) -> torch.Tensor:
+    """rot_cb of the mount without error, float64, shape (3, 3)."""
+    roll, pitch, yaw = (math.radians(a) for a in mount.rpy_deg)
+    axes = torch.diag(torch.tensor([roll, pitch, yaw], dtype=torch.float64))
+    about_x, about_y, about_z = rotation_from_vector(axes)
+    down = torch.tensor(DOWNWARD_ROT_CB, dtype=torch.float64)
+    return down @ (about_z @ about_y @ about_x).T
+
+
+def extrinsics_with_error(
+    rot_cb: torch.Tensor, position_b: torch.Tensor, rotation_error: torch.Tensor, position_error: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Extrinsics of cameras that are mounted a little off.
+
+    Args:
+        rot_cb: Nominal rotation, body to camera, shape (3, 3) or (E, 3, 3).
+        position_b: Nominal lens position [m], shape (3,) or (E, 3), body frame.
+        rotation_error: Rotation vector by which the camera is turned on the body [rad], shape (E, 3), body frame.
+        position_error: Offset of the lens [m], shape (E, 3), body frame.
+
+    Returns:
+        rot_cb, shape (E, 3, 3), and position_b [m], shape (E, 3).
+    """
+    turn = rotation_from_vector(rotation_error)  # rot_bc = turn @ nominal, hence rot_cb = nominal @ turn^T
+    return rotate(turn, rot_cb.expand(turn.shape)), position_b + position_error
+
+
+def rotate(rot: torch.Tensor, vectors: torch.Tensor) -> torch.Tensor:
+    """``rot @ v`` for each row v of vectors; as a matrix product, ``vectors @ rot^T``.
+
+    Args:
+        rot: Rotations, shape (..., 3, 3).
+        vectors: Row vectors, shape (..., K, 3).
+
+    Returns:
+        Rotated row vectors, shape (..., K, 3).
+    """
+    rot = rot.unsqueeze(-3)
+    x, y, z = vectors[..., 0:1], vectors[..., 1:2], vectors[..., 2:3]
+    return x * rot[..., 0] + y * rot[..., 1] + z * rot[..., 2]
+
+
+def points_c_from_w(
+    points_w: torch.Tensor, pos_w: torch.Tensor, rot_wb: torch.Tensor, rot_cb: torch.Tensor, position_b: torch.Tensor
+) -> torch.Tensor:
+    """Bring world points into the camera frame.
+
+    Args:
+        points_w: Points [m], shape (E, K, 3), world frame.
+        pos_w: Centre of mass of the vehicle [m], shape (E, 3), world frame.
+        rot_wb: Attitude, body to world, shape (E, 3, 3).
+        rot_cb: Extrinsic rotation, body to camera, shape (3, 3) or (E, 3, 3).
+        position_b: Lens position [m], shape (3,) or (E, 3), body frame.
+
+    Returns:
+        Points [m], shape (E, K, 3), camera frame.
+    """
+    points_b = rotate(rot_wb.transpose(-1, -2), points_w - pos_w.unsqueeze(-2))
+    return rotate(rot_cb, points_b - position_b.unsqueeze(-2))

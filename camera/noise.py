@@ -1,0 +1,119 @@
+"""Imperfections of a keypoint detector: noise, per-episode bias, drop-out, latency, and what an invalid point reads.
+
+The randomness is an argument (`draw_step`, `draw_episode` make it from a torch.Generator): the functions that apply it
+are pure, so that a CUDA graph can replay them on refilled buffers and the HIL runner can pass zeros.
+"""
+
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import torch
+
+from camera.history import at_latency, latency_weights
+
+
+@dataclass(frozen=True)
+class KeypointNoiseParams:
+    """Imperfections of the keypoints, in normalised image coordinates (1 at the edge of the field of view).
+
+    ``invalid_reads``: ``edge``: a point outside the field of view reads as its direction at the edge, radius 1: it
+    moves smoothly there and away again, says on which side to look, and cannot be taken for a point in the middle of
+    the image even by an actor without validity bits. Whoever knows poses (training, HIL) can compute it; behind a
+    detector it takes a tracker. ``zero``: it reads as the principal point. A dropped-out point reads zero in both:
+    nothing was measured.
+    """
+
+    step_std: float = 0.01  # Gaussian per step, keypoint and axis [-]
+    bias_std: float = 0.001  # Gaussian per episode, keypoint and axis [-]
+    drop_probability: float = 0.0  # per step and keypoint that it reads as invalid [-]
+    latency: float = 0.0  # age of the keypoints that the policy sees, fractions interpolated [policy steps]
+    invalid_reads: Literal["edge", "zero"] = "edge"
+
+    @property
+    def history_length(self) -> int:
+        """Entries that a latency buffer must hold."""
+        return int(-(-self.latency // 1)) + 1
+
+
+class StepDraw(NamedTuple):
+    """Randomness of one step: standard normals, shape (E, K, 2), and uniforms in [0, 1), shape (E, K)."""
+
+    normals: torch.Tensor
+    uniforms: torch.Tensor
+
+
+def check_noise(params: KeypointNoiseParams) -> None:
+    """Refuse noise settings out of range.
+
+    Raises:
+        ValueError: A negative spread or latency, a probability outside [0, 1], or an unknown ``invalid_reads``.
+    """
+    for name in ("step_std", "bias_std", "latency"):
+        if not getattr(params, name) >= 0.0:
+            raise ValueError(f"keypoint noise {name} is {getattr(params, name)}; expected a number of at least 0")
+    if not 0.0 <= params.drop_probability <= 1.0:
+        raise ValueError(f"keypoint noise drop_probability is {params.drop_probability}; expected a number in [0, 1]")
+    if params.invalid_reads not in ("edge", "zero"):
+        raise ValueError(f"keypoint noise invalid_reads is {params.invalid_reads!r}; expected one of 'edge', 'zero'")
+
+
+def draw_step(
+    environments: int, keypoints: int, generator: torch.Generator, dtype: torch.dtype = torch.float32
+) -> StepDraw:
+    """Draw the randomness of one step on the generator's device."""
+    options = {"generator": generator, "device": generator.device, "dtype": dtype}
+    return StepDraw(torch.randn(environments, keypoints, 2, **options), torch.rand(environments, keypoints, **options))
+
+
+def draw_episode(
+    params: KeypointNoiseParams,
+    environments: int,
+    keypoints: int,
+    generator: torch.Generator,
+    dtype: torch.dtype = torch.float32,
+) -> torch.Tensor:
+    """Draw per-episode biases [-], shape (E, K, 2), on the generator's device."""
+    normals = torch.randn(environments, keypoints, 2, generator=generator, device=generator.device, dtype=dtype)
+    return normals * params.bias_std
+
+
+def apply_noise(
+    params: KeypointNoiseParams, keypoints: torch.Tensor, valid: torch.Tensor, bias: torch.Tensor, draw: StepDraw
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Add noise and bias, drop points out, and set what invalid points read.
+
+    Args:
+        params: Spreads and the rule for invalid points.
+        keypoints: Exact keypoints [-], shape (E, K, 2), normalised; with ``invalid_reads = "edge"`` clipped to the
+            edge.
+        valid: Shape (E, K), bool.
+        bias: Of this episode [-], shape (E, K, 2).
+        draw: Randomness of this step.
+
+    Returns:
+        What the detector reports [-], shape (E, K, 2), and its validity bits, shape (E, K).
+    """
+    noisy = keypoints + bias + draw.normals * params.step_std
+    kept = draw.uniforms >= params.drop_probability
+    seen = valid & kept
+    # Clipped points carry no noise: they are a rule, not a measurement.
+    unseen = keypoints * kept.unsqueeze(-1) if params.invalid_reads == "edge" else torch.zeros_like(keypoints)
+    return torch.where(seen.unsqueeze(-1), noisy, unseen), seen
+
+
+def apply_latency(
+    history: torch.Tensor, valid_history: torch.Tensor, latency: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Keypoints as they were ``latency`` steps ago.
+
+    Args:
+        history: Keypoints [-], shape (E, H, K, 2), newest first (`camera.history.push`).
+        valid_history: Shape (E, H, K), bool.
+        latency: Age [policy steps], shape (E,) or scalar tensor.
+
+    Returns:
+        Keypoints [-], shape (E, K, 2), and validity, shape (E, K): every entry that the interpolation used was valid.
+    """
+    used = latency_weights(history.shape[1], latency, history) > 0.0
+    valid = (valid_history | ~used.unsqueeze(-1)).all(1)
+    return at_latency(history, latency), valid

@@ -1,0 +1,219 @@
+"""Mount, goal corners, payload box, and the one function of environment and HIL."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from camera import (
+    CameraParams,
+    Fisheye,
+    FisheyeParams,
+    KeypointCamera,
+    KeypointNoiseParams,
+    MountParams,
+    keypoints,
+    payload_keypoints,
+)
+from camera.keypoints import ball_extremes_c, goal_corners_w
+from camera.mount import nominal_rot_cb, points_c_from_w, rotation_from_vector
+
+LENS = FisheyeParams(640, 640, 166.6786, 166.6786, 319.5, 319.5)
+PARAMS = CameraParams(LENS, MountParams(position_b=(0.03, 0.0, -0.02)), KeypointNoiseParams(), 0.25, 0.033)
+CENTRED = replace(PARAMS, mount=MountParams())
+EDGE = math.radians(110.0)
+
+
+def hover(height: float, environments: int = 1) -> tuple[torch.Tensor, torch.Tensor]:
+    """Level vehicle above the origin, float64."""
+    pos_w = torch.zeros(environments, 3, dtype=torch.float64)
+    pos_w[:, 2] = height
+    return pos_w, torch.eye(3, dtype=torch.float64).expand(environments, 3, 3)
+
+
+def scene(environments: int, dtype: torch.dtype = torch.float32):
+    """Random poses, goals and balls."""
+    generator = torch.Generator().manual_seed(5)
+    normal = lambda *shape: torch.randn(*shape, generator=generator, dtype=dtype)  # noqa: E731
+    pos_w = 0.5 * normal(environments, 3) + torch.tensor([0.0, 0.0, 1.5], dtype=dtype)
+    return (
+        pos_w,
+        rotation_from_vector(0.6 * normal(environments, 3)),
+        2.0 * normal(environments, 2),
+        pos_w + 0.3 * normal(environments, 3),
+    )
+
+
+def test_downward_mount_axes():
+    pos_w, rot_wb = hover(2.0)
+    front, left, below = [1.0, 0.0, 2.0], [0.0, 1.0, 2.0], [0.0, 0.0, 0.0]
+    points_w = torch.tensor([[front, left, below]], dtype=torch.float64)
+    points_c = points_c_from_w(
+        points_w, pos_w, rot_wb, nominal_rot_cb(MountParams()), torch.zeros(3, dtype=torch.float64)
+    )
+    # Front is up in the image (-y_c), left is left (-x_c), below is ahead of the lens (+z_c).
+    expected = torch.tensor([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 2.0]], dtype=torch.float64)
+    assert torch.allclose(points_c[0], expected, atol=1e-12)
+
+
+def test_mount_rotation_is_about_body_axes():
+    # Pitch -90 deg about body y (left) turns the downward camera to the front: z_c = +x_b; image top is then body up.
+    rot_cb = nominal_rot_cb(MountParams(rpy_deg=(0.0, -90.0, 0.0)))
+    assert torch.allclose(rot_cb[2], torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64), atol=1e-9)
+    assert torch.allclose(rot_cb[1], torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64), atol=1e-9)
+    assert torch.allclose(rot_cb @ rot_cb.T, torch.eye(3, dtype=torch.float64), atol=1e-9)
+
+
+def test_rotation_vector_against_the_matrix_exponential():
+    vector = torch.tensor(
+        [[0.3, -1.2, 0.4], [0.0, 0.0, 0.0], [1e-4, 0.0, 3.0]], dtype=torch.float64, requires_grad=True
+    )
+    x, y, z = vector.detach().unbind(-1)
+    zero = torch.zeros_like(x)
+    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
+    rotation = rotation_from_vector(vector)
+    assert torch.allclose(rotation, torch.linalg.matrix_exp(cross), atol=1e-9)
+    (gradient,) = torch.autograd.grad(rotation.sum(), vector)
+    assert gradient.isfinite().all()
+
+
+def test_extrinsic_error_moves_and_turns_the_camera():
+    camera = KeypointCamera(CENTRED, dtype=torch.float64)
+    angle = 0.05
+    rotation_error = torch.tensor([[0.0, -angle, 0.0], [0.0, 0.0, 0.0]], dtype=torch.float64)
+    position_error = torch.tensor([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]], dtype=torch.float64)
+    pos_w, rot_wb = hover(2.0, 2)
+    payload_w = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64).expand(2, 3)
+    goal_w = torch.zeros(2, 2, dtype=torch.float64)
+    points, _ = keypoints(camera, pos_w, rot_wb, goal_w, payload_w, camera.extrinsics(rotation_error, position_error))
+    middle = points[:, 4:].mean(1)
+    # Camera pitched to the front by 0.05 rad: the ball below lies 0.05 rad towards the image's bottom. Camera 0.1 m
+    # forward: atan(0.1) in the same direction.
+    assert torch.allclose(middle[0], torch.tensor([0.0, angle / EDGE], dtype=torch.float64), atol=1e-6)
+    assert torch.allclose(middle[1], torch.tensor([0.0, math.atan(0.1) / EDGE], dtype=torch.float64), atol=1e-4)
+
+
+def test_goal_corners_order_and_place():
+    corners = goal_corners_w(torch.tensor([[2.0, 1.0, 0.04]]), 0.25)
+    assert torch.equal(
+        corners[0], torch.tensor([[2.125, 1.125, 0.0], [2.125, 0.875, 0.0], [1.875, 0.875, 0.0], [1.875, 1.125, 0.0]])
+    )
+
+
+def test_goal_below_a_level_vehicle_closed_form():
+    camera = KeypointCamera(CENTRED, dtype=torch.float64)
+    pos_w, rot_wb = hover(1.0)
+    points, valid = keypoints(
+        camera,
+        pos_w,
+        rot_wb,
+        torch.zeros(1, 2, dtype=torch.float64),
+        torch.tensor([[0.0, 0.0, 0.5]], dtype=torch.float64),
+    )
+    # Corner 0 (front left) 0.125 m each way, 1 m below: angle atan(0.125 sqrt 2), up and left in the image, 45 deg.
+    c = math.atan(0.125 * math.sqrt(2.0)) / EDGE / math.sqrt(2.0)
+    expected = torch.tensor([[-c, -c], [c, -c], [c, c], [-c, c]], dtype=torch.float64)
+    assert valid.all()
+    assert torch.allclose(points[0, :4], expected, atol=1e-12)
+    # Ball of 33 mm at 0.5 m on the axis: a circle of radius asin(0.066).
+    a = math.asin(0.066) / EDGE
+    box = torch.tensor([[-a, 0.0], [0.0, -a], [a, 0.0], [0.0, a]], dtype=torch.float64)
+    assert torch.allclose(points[0, 4:], box, atol=1e-9)
+
+
+@pytest.mark.parametrize(("distance", "tolerance"), [(0.2, 2e-3), (0.38, 3e-4), (0.6, 1e-4)])
+def test_payload_box_against_the_dense_outline(distance, tolerance):
+    # Tolerances: the box's second-order error up to 105 deg off the axis; at 0.38 m, the rope's length, a thirtieth of
+    # the noise.
+    lens = Fisheye(LENS)
+    generator = torch.Generator().manual_seed(1)
+    centre = torch.randn(2000, 3, generator=generator, dtype=torch.float64)
+    centre = centre / centre.norm(dim=1, keepdim=True)
+    centre = centre[lens.angle(centre)[0] < math.radians(105.0)]
+    helper = torch.where(
+        centre[:, :1].abs() < 0.9, torch.eye(3, dtype=torch.float64)[0], torch.eye(3, dtype=torch.float64)[1]
+    )
+    e1 = torch.nn.functional.normalize(torch.linalg.cross(centre, helper), dim=-1)
+    e2 = torch.linalg.cross(centre, e1)
+    phi = torch.linspace(0.0, 2.0 * math.pi, 361, dtype=torch.float64)[None, :, None]
+    a = math.asin(0.033 / distance)
+    outline = math.cos(a) * centre[:, None] + math.sin(a) * (phi.cos() * e1[:, None] + phi.sin() * e2[:, None])
+    image, _ = lens.project_normalized(outline)
+    points, _ = lens.project_normalized(ball_extremes_c(lens, centre * distance, 0.033))
+    ours = torch.stack([points[:, 0, 0], points[:, 1, 1], points[:, 2, 0], points[:, 3, 1]], -1)
+    theirs = torch.cat([image.amin(1), image.amax(1)], -1)
+    assert (ours - theirs).abs().max() < tolerance
+
+
+def test_payload_box_layout_and_smoothness():
+    camera = KeypointCamera(CENTRED, dtype=torch.float64)
+    ball_c = torch.tensor([[0.1, 0.2, 0.3], [0.3, -0.1, -0.05]], dtype=torch.float64, requires_grad=True)
+    box, valid = payload_keypoints(camera, ball_c)
+    left, top, right, bottom = box.unbind(1)
+    assert valid.all()
+    assert (left[:, 0] < right[:, 0]).all()
+    assert (top[:, 1] < bottom[:, 1]).all()
+    assert torch.equal(left[:, 1], right[:, 1])
+    assert torch.equal(top[:, 0], bottom[:, 0])
+    assert torch.allclose(top[:, 0], 0.5 * (left[:, 0] + right[:, 0]))
+    assert torch.allclose(left[:, 1], 0.5 * (top[:, 1] + bottom[:, 1]))
+    assert torch.autograd.gradcheck(lambda p: payload_keypoints(camera, p)[0], (ball_c,))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_keypoints_are_finite_in_every_pose(dtype):
+    camera = KeypointCamera(PARAMS, dtype=dtype)
+    special = torch.tensor(
+        [[0, 0, 1], [0, 0, -1], [0, 0, 0], [0.01, 0, 0], [0, 0, -0.033], [1, 0, 0], [0, 0, 1e4]], dtype=dtype
+    )
+    special.requires_grad_()
+    box, _ = payload_keypoints(camera, special)
+    (gradient,) = torch.autograd.grad(box.sum(), special)
+    assert box.isfinite().all()
+    assert gradient.isfinite().all()
+
+
+def test_target_past_90_degrees_is_seen_and_the_sky_is_not():
+    # Nose down by 40 deg (a positive pitch about body y), target 62 deg off the vertical in front: 102 deg off the
+    # axis.
+    camera = KeypointCamera(CENTRED, dtype=torch.float64)
+    pos_w, _ = hover(1.0)
+    rot_wb = rotation_from_vector(torch.tensor([[0.0, math.radians(40.0), 0.0]], dtype=torch.float64))
+    goal_w = torch.tensor([[math.tan(math.radians(62.0)), 0.0]], dtype=torch.float64)
+    above_w = torch.tensor([[0.0, 0.0, 2.0]], dtype=torch.float64)
+    points, valid = keypoints(camera, pos_w, rot_wb, goal_w, above_w)
+    assert valid[0, :4].all()
+    assert not valid[0, 4:].any()
+    # 102 deg of 110 towards the image's top; the square's corners lie about it.
+    assert points[0, :4, 1].mean() == pytest.approx(-102.0 / 110.0, abs=5e-3)
+
+
+@pytest.mark.parametrize("reads", ["edge", "zero"])
+def test_what_invalid_points_read(reads):
+    camera = KeypointCamera(replace(PARAMS, noise=KeypointNoiseParams(invalid_reads=reads)), dtype=torch.float64)
+    points, valid = keypoints(camera, *scene(2000, torch.float64))
+    corners = points[:, :4][~valid[:, :4]]
+    expected = 1.0 if reads == "edge" else 0.0
+    assert len(corners) > 50
+    assert torch.allclose(corners.norm(dim=-1), torch.full((len(corners),), expected, dtype=torch.float64))
+    assert points.abs().max() <= 1.0 + 1e-12
+
+
+def test_batch_of_many_equals_batch_of_one_bit_for_bit():
+    camera = KeypointCamera(PARAMS)
+    arguments = scene(1003)
+    extrinsics = camera.extrinsics(0.02 * torch.ones(1003, 3), 0.001 * torch.ones(1003, 3))
+    points, valid = keypoints(camera, *arguments, extrinsics)
+    for i in range(0, 1003, 13):
+        one, seen = keypoints(camera, *(a[i : i + 1] for a in arguments), tuple(e[i : i + 1] for e in extrinsics))
+        assert torch.equal(one[0], points[i])
+        assert torch.equal(seen[0], valid[i])
+
+
+@pytest.mark.parametrize(
+    ("field", "value"), [("goal_side", 0.0), ("payload_radius", -0.1), ("payload_radius", float("nan"))]
+)
+def test_bad_sizes_are_refused(field, value):
+    with pytest.raises(ValueError, match=field):
+        KeypointCamera(replace(PARAMS, **{field: value}))

@@ -1,0 +1,106 @@
+"""History ring and detector imperfections."""
+
+import pytest
+import torch
+
+from camera import (
+    KeypointNoiseParams,
+    StepDraw,
+    apply_latency,
+    apply_noise,
+    at_latency,
+    draw_episode,
+    draw_step,
+    filled,
+    push,
+    push_,
+)
+from camera.noise import check_noise
+
+SAMPLES = 20_000
+
+
+def test_push_shifts_and_fills_on_reset():
+    history = torch.tensor([[[1.0], [2.0], [3.0]], [[4.0], [5.0], [6.0]]])
+    new = torch.tensor([[7.0], [8.0]])
+    pushed = push(history, new, torch.tensor([False, True]))
+    assert pushed[..., 0].tolist() == [[7.0, 1.0, 2.0], [8.0, 8.0, 8.0]]
+    assert push_(history, new, torch.tensor([False, True])) is history
+    assert torch.equal(history, pushed)
+    assert filled(new, 3)[..., 0].tolist() == [[7.0, 7.0, 7.0], [8.0, 8.0, 8.0]]
+    with pytest.raises(ValueError, match="at least 1"):
+        filled(new, 0)
+
+
+def test_push_of_one_entry_and_of_bits():
+    bits = torch.tensor([[[True, False]]])
+    assert push(bits, torch.tensor([[False, True]]), torch.tensor([False])).tolist() == [[[False, True]]]
+
+
+def test_latency_interpolates_between_whole_steps():
+    history = torch.tensor([[0.0, 1.0, 4.0, 9.0]]).repeat(4, 1)
+    latency = torch.tensor([0.0, 1.0, 1.25, 7.0])
+    # 1 + 0.25 (4 - 1) = 1.75; beyond the history its oldest value.
+    assert torch.allclose(at_latency(history, latency), torch.tensor([0.0, 1.0, 1.75, 9.0]))
+    assert torch.allclose(at_latency(history, torch.tensor(2.5)), torch.full((4,), 6.5))
+
+
+def test_latency_is_valid_only_where_all_that_it_used_was():
+    points = torch.zeros(3, 3, 1, 2)
+    valid = torch.tensor([[[True], [False], [True]]]).repeat(3, 1, 1)
+    _, seen = apply_latency(points, valid, torch.tensor([0.0, 0.5, 2.0]))
+    assert seen[:, 0].tolist() == [True, False, True]
+
+
+def test_noise_has_the_stated_spread():
+    params = KeypointNoiseParams(step_std=0.01, bias_std=0.002, drop_probability=0.2)
+    generator = torch.Generator().manual_seed(0)
+    bias = draw_episode(params, SAMPLES, 8, generator)
+    exact = torch.full((SAMPLES, 8, 2), 0.3)
+    points, seen = apply_noise(
+        params, exact, torch.ones(SAMPLES, 8, dtype=torch.bool), bias, draw_step(SAMPLES, 8, generator)
+    )
+    # 160,000 points: the spread is known to 0.2 %, the drop-out rate to 0.001 (one sigma); the margins are five of
+    # them.
+    assert points[seen].std() == pytest.approx((0.01**2 + 0.002**2) ** 0.5, rel=0.01)
+    assert bias.std() == pytest.approx(0.002, rel=0.01)
+    assert 1.0 - seen.float().mean() == pytest.approx(0.2, abs=0.005)
+    assert (points[~seen] == 0.0).all()
+
+
+@pytest.mark.parametrize(
+    ("reads", "expected"), [("edge", [[0.6, 0.8], [0.0, 0.0]]), ("zero", [[0.0, 0.0], [0.0, 0.0]])]
+)
+def test_what_invalid_and_dropped_points_read(reads, expected):
+    params = KeypointNoiseParams(step_std=0.01, drop_probability=0.5, invalid_reads=reads)
+    exact = torch.tensor([[[0.6, 0.8], [0.1, 0.2], [0.1, 0.2]]])
+    draw = StepDraw(torch.ones(1, 3, 2), torch.tensor([[0.9, 0.4, 0.5]]))
+    points, seen = apply_noise(params, exact, torch.tensor([[False, True, True]]), torch.zeros(1, 3, 2), draw)
+    assert seen.tolist() == [[False, False, True]]
+    assert torch.allclose(points[0], torch.tensor([*expected, [0.11, 0.21]]))
+
+
+def test_same_seed_same_noise():
+    draws = [draw_step(4, 8, torch.Generator().manual_seed(9)) for _ in range(2)]
+    assert torch.equal(draws[0].normals, draws[1].normals)
+    assert torch.equal(draws[0].uniforms, draws[1].uniforms)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"step_std": -1.0},
+        {"bias_std": float("nan")},
+        {"latency": -0.5},
+        {"drop_probability": 1.5},
+        {"invalid_reads": "last"},
+    ],
+)
+def test_bad_noise_is_refused(change):
+    with pytest.raises(ValueError, match=next(iter(change))):
+        check_noise(KeypointNoiseParams(**change))
+
+
+@pytest.mark.parametrize(("latency", "length"), [(0.0, 1), (0.5, 2), (1.0, 2), (2.2, 4)])
+def test_history_length_holds_the_latency(latency, length):
+    assert KeypointNoiseParams(latency=latency).history_length == length
