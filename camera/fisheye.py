@@ -16,8 +16,7 @@ AXIS_EPSILON = 1e-20
 """Added to x^2 + y^2 so that value and gradient are finite on the axis: a radius of 1e-10 in the points' unit."""
 
 NEWTON_STEPS = 24
-"""Safeguarded Newton steps of the inverse: quadratic near the root, bisection where a Newton step would leave the
-bracket."""
+"""Safeguarded Newton steps of the inverse: bisection where a Newton step would leave the bracket."""
 
 
 @dataclass(frozen=True)
@@ -73,8 +72,8 @@ def check_fisheye(params: FisheyeParams) -> None:
     limit = monotonic_limit(params.coefficients)
     if limit <= params.half_fov:
         raise ValueError(
-            f"theta_d with k = {params.coefficients} stops growing at {math.degrees(limit):.2f} deg off the axis, inside "
-            f"the field of view; expected fov_deg below {2 * math.degrees(limit):.2f}, got {params.fov_deg}"
+            f"theta_d with k = {params.coefficients} stops growing at {math.degrees(limit):.2f} deg off the axis, "
+            f"inside the field of view; expected fov_deg below {2 * math.degrees(limit):.2f}, got {params.fov_deg}"
         )
 
 
@@ -239,8 +238,7 @@ class Fisheye:
         return normalized * (focal * self.edge_radius) + centre
 
     def on_sensor(self, pixels: torch.Tensor) -> torch.Tensor:
-        """Whether pixels [px], shape (..., 2), lie on the sensor, edges of the outer pixels included: bool, shape
-        (...)."""
+        """Whether pixels [px], shape (..., 2), lie on the sensor, outer pixels' edges included: bool, shape (...)."""
         left, right, top, bottom = self._bounds
         u, v = pixels.unbind(-1)
         return (u >= left) & (u <= right) & (v >= top) & (v <= bottom)
@@ -261,8 +259,7 @@ class Fisheye:
         return theta - (self.radius_from_angle(theta) - radius) / self.slope_from_angle(theta)
 
     def _pixel_constants(self, like: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Focal lengths and principal point on the device of a tensor, made once so that a CUDA graph can be captured
-        later."""
+        """Focal lengths and principal point on a tensor's device, made once: a CUDA graph can be captured later."""
         key = (like.device, like.dtype)
         if key not in self._constants:
             p = self.params

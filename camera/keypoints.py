@@ -20,8 +20,7 @@ MAX_SINE = 0.99
 
 
 DIRECTION_EPSILON = 1e-10
-"""Added to the squared sine of the ball's angle: its box's derivative, ~ sin^-4 behind the lens, then stays inside
-float32."""
+"""Added to the squared sine of the ball's angle: the box's derivative behind the lens then stays inside float32."""
 
 
 class KeypointCamera:
