@@ -235,8 +235,8 @@ def _override(schema: type, tree: Table, override: str) -> None:
             if key not in known:
                 _schema.fail(source, here, f"unknown key '{key}'; {suggest(key, known)}")
             current = known[key]
-        elif getattr(current, "__origin__", None) is dict:
-            current = current.__args__[1]
+        elif (values := _schema.dict_values(current)) is not None:
+            current = values
         else:
             _schema.fail(source, here, f"has no keys, so '{key}' cannot be set; expected {_schema.describe(current)}")
         if depth < len(keys) - 1:

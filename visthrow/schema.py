@@ -48,6 +48,13 @@ def dataclass_of(annotation: Any) -> type | None:
     return None
 
 
+def dict_values(annotation: Any) -> Any:
+    """Return what the values of ``dict[str, X]`` or ``dict[str, X] | None`` are, else None."""
+    options = typing.get_args(annotation) if is_union(annotation) else (annotation,)
+    found = [typing.get_args(option)[1] for option in options if typing.get_origin(option) is dict]
+    return found[0] if len(found) == 1 else None
+
+
 def is_union(annotation: Any) -> bool:
     """Tell whether an annotation is a union, in either spelling."""
     return typing.get_origin(annotation) in (Union, types.UnionType)

@@ -1,0 +1,149 @@
+"""The command line: quick help, one clear message for a mistake, exit statuses."""
+
+import subprocess
+import sys
+import time
+import types
+
+import pytest
+
+from visthrow import cli, device, kinds
+from visthrow.errors import ConfigError, DeviceError, VisthrowError, suggest
+
+HELP_BUDGET = 0.5
+"""[s], bar of the project for ``visthrow --help``, interpreter start included; the best of a few runs counts."""
+
+HEAVY = {"torch", "warp", "rsl_rl", "tensordict", "cv2", "kornia", "rerun", "matplotlib", "scipy", "mujoco", "numpy"}
+
+
+def run(*arguments: str) -> subprocess.CompletedProcess:
+    return subprocess.run([sys.executable, "-m", "visthrow.cli", *arguments], capture_output=True, text=True)
+
+
+@pytest.fixture
+def command(monkeypatch):
+    """Install a command 'try' whose ``run`` raises or returns what the test wants."""
+
+    def install(outcome):
+        def run(args):
+            if isinstance(outcome, BaseException):
+                raise outcome
+            return outcome
+
+        module = types.ModuleType("fake_command")
+        module.add_arguments = lambda parser: cli.add_common(parser)
+        module.run = run
+        monkeypatch.setitem(sys.modules, "fake_command", module)
+        monkeypatch.setitem(cli.COMMANDS, "try", ("try it", "fake_command"))
+
+    return install
+
+
+def test_help_is_quick_and_names_every_command():
+    best = float("inf")
+    for _ in range(3):
+        start = time.perf_counter()
+        result = run("--help")
+        best = min(best, time.perf_counter() - start)
+    assert result.returncode == 0
+    assert all(name in result.stdout for name in cli.COMMANDS)
+    assert "examples:" in result.stdout
+    assert best < HELP_BUDGET
+
+
+def test_help_imports_nothing_heavy():
+    code = "import sys; from visthrow.cli import build_parser; build_parser().format_help(); print(*sys.modules)"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert HEAVY.isdisjoint(result.stdout.split())
+
+
+def test_no_command_and_unknown_command_list_the_commands():
+    for arguments in ((), ("thrwo",)):
+        result = run(*arguments)
+        assert result.returncode == 2
+        assert "Traceback" not in result.stderr
+    assert "compare" in result.stderr
+
+
+@pytest.mark.parametrize("error", [ConfigError("a: b"), ValueError("a: b"), OSError(28, "a: b")])
+def test_a_mistake_is_one_message_and_status_2(command, capsys, monkeypatch, error):
+    command(error)
+    monkeypatch.delenv(cli.TRACEBACK_VARIABLE, raising=False)
+    assert cli.main(["try"]) == 2
+    err = capsys.readouterr().err
+    assert err.startswith("visthrow: error: ")
+    assert "a: b" in err
+    assert err.count("\n") == 1
+    monkeypatch.setenv(cli.TRACEBACK_VARIABLE, "1")
+    with pytest.raises(type(error)):
+        cli.main(["try"])
+
+
+def test_defects_are_not_hidden(command):
+    command(KeyError("a defect"))
+    with pytest.raises(KeyError):
+        cli.main(["try"])
+
+
+def test_ctrl_c_is_status_130(command, capsys):
+    command(KeyboardInterrupt())
+    assert cli.main(["try"]) == 130
+    assert "Traceback" not in capsys.readouterr().err
+
+
+def test_a_missing_optional_package_names_the_extra(command, capsys):
+    command(ModuleNotFoundError("No module named 'mujoco'", name="mujoco"))
+    assert cli.main(["try"]) == 2
+    assert "visthrow[reference]" in capsys.readouterr().err
+    command(ModuleNotFoundError("No module named 'visthrow.gone'", name="visthrow.gone"))
+    with pytest.raises(ModuleNotFoundError):
+        cli.main(["try"])
+
+
+def test_the_command_s_status_is_returned(command):
+    command(3)
+    assert cli.main(["try", "--device", "cpu", "--set", "a=1", "--set", "b.c=2", "--json", "x"]) == 3
+    command(None)
+    assert cli.main(["try"]) == 0
+
+
+def test_config_prints_what_loads_back(capsys, tmp_path):
+    from sim.params import VehicleParams
+    from visthrow import config
+
+    assert cli.main(["config", "vehicle", "paper", "--set", "body.mass=0.25", "--json", str(tmp_path / "a.json")]) == 0
+    printed = config.loads(VehicleParams, capsys.readouterr().out)
+    assert printed.body.mass == 0.25
+    assert '"mass": 0.25' in (tmp_path / "a.json").read_text()
+    assert cli.main(["config", "vehicle"]) == 0
+    assert "paper" in capsys.readouterr().out.split()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["config", "vehicel"], "did you mean 'vehicle'"),
+        (["config", "vehicle", "papr"], "did you mean 'paper'"),
+        (["config", "vehicle", "paper", "--set", "body.mas=1"], "did you mean 'mass'"),
+        (["config", "vehicle", "--set", "body.mass=1"], "--set needs the NAME"),
+    ],
+)
+def test_config_mistakes(arguments, said, capsys):
+    assert cli.main(arguments) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_devices_that_are_not_there_are_refused():
+    assert device.resolve("cpu") == "cpu"
+    assert device.resolve("auto") in ("cpu", "cuda:0")
+    with pytest.raises(DeviceError, match=r"'cuda:99' is not there; expected auto or one of cpu"):
+        device.resolve("cuda:99")
+
+
+def test_suggestions():
+    assert suggest("mas", ["mass", "inertia"]) == "did you mean 'mass'? Known: inertia, mass"
+    assert suggest("xyz", ["mass"]) == "known: mass"
+    assert suggest("xyz", []) == "nothing is known here"
+    assert issubclass(ConfigError, VisthrowError)
+    with pytest.raises(ConfigError, match="no kind of config 'nothing'"):
+        kinds.schema_of("nothing")

@@ -1,0 +1,152 @@
+"""The flight log: round trips, what it refuses, and what the exported tables hold."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+
+from visthrow.errors import LogError
+from visthrow.flightlog import STANDARD_CHANNELS, Channel, FlightLog, FlightRecorder
+from visthrow.logexport import columns, export
+
+
+@pytest.fixture
+def log() -> FlightLog:
+    recorder = FlightRecorder({"plant": "test", "goal": [2.0, 0.0]})
+    recorder.declare("wind", "m/s", "world")
+    for k in range(5):
+        recorder.add(0.02 * k, pos_w=[k, 2.0 * k, 1.0], attached=k < 3)
+        recorder.add(0.02 * k + 0.005, valid=k != 2, battery_voltage=16.0 - k if k != 2 else np.nan)
+    recorder.add(0.0, wind=np.zeros(3, dtype=np.float32))
+    recorder.add(0.05, landing=[1.9, 0.1, 0.04])
+    return recorder.log()
+
+
+def test_round_trip(log, tmp_path):
+    log.save(tmp_path / "f.npz")
+    loaded = FlightLog.load(tmp_path / "f.npz")
+    assert loaded.meta == log.meta
+    assert loaded.channels.keys() == log.channels.keys()
+    for name, channel in log.channels.items():
+        assert (loaded[name].unit, loaded[name].frame) == (channel.unit, channel.frame)
+        assert loaded[name].values.dtype == channel.values.dtype
+        for field in ("time", "values", "valid"):
+            np.testing.assert_array_equal(getattr(loaded[name], field), getattr(channel, field))
+
+
+def test_recorder_copies_what_it_is_given():
+    recorder, position = FlightRecorder(), np.zeros(3)
+    recorder.add(0.0, pos_w=position)
+    position += 1.0
+    recorder.add(1.0, pos_w=position)
+    np.testing.assert_array_equal(recorder.log()["pos_w"].values, [[0, 0, 0], [1, 1, 1]])
+
+
+def test_hold_returns_the_last_valid_sample(log):
+    # Valid at 0.005, 0.025, 0.065, 0.085 s; the one at 0.045 s is not.
+    held = log["battery_voltage"].hold(np.array([-1.0, 0.005, 0.024, 0.05, 0.065, 9.0]))
+    np.testing.assert_array_equal(held, [16.0, 16.0, 16.0, 15.0, 13.0, 12.0])
+    with pytest.raises(LogError, match="no sample"):
+        Channel(np.zeros(1), np.zeros(1), "m", valid=np.zeros(1)).hold(np.zeros(1))
+
+
+@pytest.mark.parametrize(
+    ("time", "values", "valid", "said"),
+    [
+        ([0.0, 1.0], [1.0], None, r"time \(2,\), values \(1,\)"),
+        ([0.0, 1.0], [1.0, 2.0], [True], r"validity \(1,\)"),
+        ([0.0, 0.2, 0.1], [1, 2, 3], None, "sample 1 is at 0.2 s, sample 2 at 0.1 s"),
+        ([0.0, 0.0], [1, 2], None, "time must increase"),
+        ([0.0, np.nan], [1, 2], None, "time stamp 1 is not finite"),
+        ([0.0, 1.0], [1.0, np.inf], None, "marked valid is not finite"),
+        ([0.0], ["x"], None, "numbers or bools"),
+    ],
+)
+def test_contradictory_channels_are_refused(time, values, valid, said):
+    with pytest.raises(LogError, match=said):
+        Channel(np.array(time), np.array(values), "m", "world", None if valid is None else np.array(valid))
+
+
+def test_unknown_frames_are_refused():
+    with pytest.raises(LogError, match="did you mean 'world'"):
+        Channel(np.zeros(1), np.zeros(1), "m", "wrld")
+
+
+def test_standard_names_keep_their_unit_frame_and_shape():
+    time = np.zeros(1)
+    with pytest.raises(LogError, match=r"'pos_w' is in unit and frame \('mm', 'world'\)"):
+        FlightLog({"pos_w": Channel(time, np.zeros((1, 3)), "mm", "world")})
+    with pytest.raises(LogError, match=r"samples of shape \(4,\); its name stands for \(3,\)"):
+        FlightLog({"pos_w": Channel(time, np.zeros((1, 4)), "m", "world")})
+    FlightLog({"cable_points_w": Channel(time, np.zeros((1, 16, 3)), "m", "world")})
+
+
+def test_missing_and_undeclared_channels_name_what_exists(log):
+    with pytest.raises(LogError, match=r"no channel 'pos'; did you mean 'pos_w'"):
+        log["pos"]
+    with pytest.raises(LogError, match=r"'payload_pos' was not declared; did you mean 'payload_pos_w'"):
+        FlightRecorder().add(0.0, payload_pos=[0, 0, 0])
+    recorder = FlightRecorder()
+    recorder.add(0.0, pos_w=[0, 0, 0])
+    recorder.add(0.1, pos_w=[0, 0])
+    with pytest.raises(LogError, match="channel 'pos_w'"):
+        recorder.log()
+
+
+@pytest.mark.parametrize("kept", [0.0, 0.3, 0.95])
+def test_truncated_files_are_refused(log, tmp_path, kept):
+    path = tmp_path / "f.npz"
+    log.save(path)
+    data = path.read_bytes()
+    path.write_bytes(data[: int(kept * len(data))])
+    with pytest.raises(LogError, match="cut short or damaged"):
+        FlightLog.load(path)
+
+
+def test_incomplete_files_are_refused(log, tmp_path):
+    path = tmp_path / "f.npz"
+    log.save(path)
+    arrays = dict(np.load(path))
+    del arrays["pos_w/time"]
+    np.savez(path, **arrays)
+    with pytest.raises(LogError, match="pos_w/time"):
+        FlightLog.load(path)
+    np.savez(path, header=np.zeros(3, dtype=np.uint8))
+    with pytest.raises(LogError, match="incomplete"):
+        FlightLog.load(path)
+
+
+def test_table_is_the_union_of_all_time_stamps(log):
+    table = columns(log)
+    # 5 stamps of pos_w, 5 of the voltage 5 ms later, 1 of the landing between them.
+    assert len(table["time [s]"]) == 11
+    assert table["pos_w[1] [m, world]"].compressed().tolist() == [0.0, 2.0, 4.0, 6.0, 8.0]
+    assert table["battery_voltage [V]"].compressed().tolist() == [16.0, 15.0, 13.0, 12.0]
+    assert table["landing[0] [m, world]"].count() == 1
+
+
+def test_csv_and_parquet_hold_the_same_table(log, tmp_path):
+    import pyarrow.parquet as pq
+
+    export(log, tmp_path / "f.csv")
+    export(log, tmp_path / "f.parquet")
+    with open(tmp_path / "f.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    table = pq.read_table(tmp_path / "f.parquet")
+    assert json.loads(table.schema.metadata[b"visthrow"]) == log.meta
+    assert table.column_names == list(rows[0])
+    for name in table.column_names:
+        from_csv = [row[name] for row in rows]
+        assert from_csv == ["" if value is None else str(value) for value in table[name].to_pylist()]
+    with pytest.raises(LogError, match=r"'\.xlsx'; expected one of \.csv, \.parquet"):
+        export(log, tmp_path / "f.xlsx")
+
+
+def test_standard_channels_are_in_known_frames():
+    from visthrow.flightlog import FRAMES
+
+    assert {spec.frame for spec in STANDARD_CHANNELS.values()} <= set(FRAMES)
+    for name, spec in STANDARD_CHANNELS.items():
+        suffix = {"_w": "world", "_b": "body", "_c": "camera"}.get(name[-2:])
+        assert suffix in (None, spec.frame), f"{name} is named for another frame than {spec.frame}"

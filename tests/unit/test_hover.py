@@ -1,0 +1,256 @@
+"""The hover controller on a quadrotor with a payload on a massless rigid rope: settles, damps the swing, recovers."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from visthrow.hover import GRAVITY, HoverController, HoverParams, rot_from_quat
+
+VEHICLE, PAYLOAD, LENGTH = 0.214, 0.058, 0.38
+"""Vehicle with the rope [kg], ball [kg], mount to the ball's centre [m]: the paper's."""
+DELAY, MOTOR_LAG, RATE_LAG = 0.022, 0.033, 1.0 / 30.0
+"""Of the command, the thrust, and the body-rate loop [s]."""
+PERIOD, STEP = 0.02, 0.002
+GOAL = np.array([0.0, 0.0, 2.0])
+
+
+class Pendulum:
+    """Quadrotor with a point mass on a massless rigid rope at its centre of mass, in float64; E of them at once.
+
+    Source: Sreenath, Lee, Kumar, "Geometric control and differential flatness of a quadrotor UAV with a cable-suspended
+    load" (CDC 2013), eqs. 5-6, with q from vehicle to payload, F the thrust, l the rope's length:
+    ``(m_Q + m_L)(x_L'' + g e3) = (q . F - m_Q l |q'|^2) q`` and ``m_Q l w_q' = -q x F``.
+    Without payload: ``m_Q x'' = F - m_Q g e3``.
+    """
+
+    def __init__(
+        self,
+        pos_w,
+        payload=PAYLOAD,
+        swing=0.0,
+        quat_wb=(0.0, 0.0, 0.0, 1.0),
+        vel_w=(0.0, 0.0, 0.0),
+        delay=DELAY,
+        step=STEP,
+    ):
+        self.delay, self.step = delay, step
+        self.pos_w = np.atleast_2d(np.array(pos_w, dtype=float))
+        count = len(self.pos_w)
+        self.payload, self.mass = payload, VEHICLE + payload
+        self.vel_w = np.tile(np.array(vel_w, dtype=float), (count, 1))
+        self.quat_wb = np.tile(np.array(quat_wb, dtype=float), (count, 1))
+        self.rate_b = np.zeros((count, 3))
+        self.thrust = np.full(count, self.mass * GRAVITY)
+        self.rope_w = np.tile([np.sin(swing), 0.0, -np.cos(swing)], (count, 1))
+        self.rope_rate_w = np.zeros((count, 3))
+        self.queue = []
+        self.active = np.column_stack((self.thrust, self.rate_b))
+
+    def advance(self, time: float, command: np.ndarray) -> None:
+        """Integrate one control period with the symplectic Euler rule."""
+        self.queue.append((time + self.delay, command))
+        for k in range(round(PERIOD / self.step)):
+            while self.queue and self.queue[0][0] <= time + k * self.step + 1e-9:
+                self.active = self.queue.pop(0)[1]
+            self.thrust += self.step / MOTOR_LAG * (self.active[:, 0] - self.thrust)
+            self.rate_b += self.step / RATE_LAG * (self.active[:, 1:] - self.rate_b)
+            self.quat_wb = turned(self.quat_wb, self.rate_b * self.step)
+            force_w = self.thrust[:, None] * rot_from_quat(self.quat_wb)[:, :, 2]
+            self.vel_w += self.step * self._acceleration(force_w)
+            self.pos_w += self.step * self.vel_w
+
+    def _acceleration(self, force_w: np.ndarray) -> np.ndarray:
+        gravity_w = np.array([0.0, 0.0, -GRAVITY])
+        if self.payload == 0.0:
+            return force_w / self.mass + gravity_w
+        q, w = self.rope_w, self.rope_rate_w
+        turn = -np.cross(q, force_w) / (VEHICLE * LENGTH)
+        pull = np.sum(q * force_w, axis=1) - VEHICLE * LENGTH * np.sum(w * w, axis=1)
+        load = (pull / self.mass)[:, None] * q + gravity_w
+        acceleration = load - LENGTH * (np.cross(turn, q) + np.cross(w, np.cross(w, q)))
+        self.rope_rate_w = w + self.step * turn
+        self.rope_w = q + self.step * np.cross(self.rope_rate_w, q)
+        self.rope_w /= np.linalg.norm(self.rope_w, axis=1, keepdims=True)
+        return acceleration
+
+    @property
+    def swing(self) -> np.ndarray:
+        """Angle of the rope from the vertical [rad], shape (E,)."""
+        return np.arccos(np.clip(-self.rope_w[:, 2], -1.0, 1.0))
+
+
+def turned(quat: np.ndarray, angle_b: np.ndarray) -> np.ndarray:
+    """Turn quaternions (E, 4), xyzw, by rotation vectors (E, 3) [rad] in the body frame."""
+    size = np.linalg.norm(angle_b, axis=1, keepdims=True)
+    v = angle_b * np.sinc(size / (2 * np.pi)) / 2
+    w = np.cos(size[:, 0] / 2)
+    vector = quat[:, 3:] * v + w[:, None] * quat[:, :3] + np.cross(quat[:, :3], v)
+    return np.column_stack((vector, quat[:, 3] * w - np.sum(quat[:, :3] * v, axis=1)))
+
+
+def fly(plant: Pendulum, duration: float, yaw: float = 0.0, params: HoverParams | None = None, told_mass=None):
+    """Fly to GOAL; return times (T,), distances (T, E), swings (T, E), heights (T, E)."""
+    controller = HoverController(params or HoverParams(), PERIOD, len(plant.pos_w))
+    rows = []
+    for k in range(round(duration / PERIOD)):
+        mass = plant.mass if told_mass is None else told_mass
+        command = controller.step(plant.pos_w, plant.quat_wb, plant.vel_w, GOAL, mass, yaw)
+        plant.advance(k * PERIOD, command)
+        distance = np.linalg.norm(plant.pos_w - GOAL, axis=1)
+        rows.append((distance, plant.swing.copy(), plant.pos_w[:, 2].copy()))
+    return (PERIOD * np.arange(1, len(rows) + 1), *map(np.array, zip(*rows)))
+
+
+def settled(times, distances, within):
+    """Return the time after which the distance (T,) stays within a bound."""
+    outside = np.flatnonzero(distances > within)
+    return times[outside[-1]] if len(outside) else 0.0
+
+
+def test_the_plant_of_these_tests_conserves_energy():
+    """Falling freely with the rope whirling, what is lost comes from the step and vanishes with it."""
+
+    def drift(step: float) -> float:
+        plant = Pendulum([0.0, 0.0, 50.0], step=step)
+        plant.rope_w, plant.rope_rate_w = np.array([[1.0, 0.0, 0.0]]), np.array([[0.0, 3.0, 0.0]])
+        plant.thrust[:], plant.active[:] = 0.0, 0.0
+        before = energy(plant)
+        for k in range(25):
+            plant.advance(k * PERIOD, np.zeros((1, 4)))
+        return abs(energy(plant) - before)
+
+    coarse, fine = drift(STEP), drift(STEP / 4)
+    # Symplectic Euler, first order: free fall alone loses m g (g t h / 2) = 13 mJ in 0.5 s at 2 ms.
+    assert coarse < 0.05
+    assert fine == pytest.approx(coarse / 4, rel=0.1)
+
+
+def energy(plant: Pendulum) -> float:
+    """Return kinetic and potential energy of vehicle and payload [J]."""
+    load_pos_w = plant.pos_w + LENGTH * plant.rope_w
+    load_vel_w = plant.vel_w + LENGTH * np.cross(plant.rope_rate_w, plant.rope_w)
+    kinetic = (VEHICLE * np.sum(plant.vel_w**2) + PAYLOAD * np.sum(load_vel_w**2)) / 2
+    return float(kinetic + GRAVITY * (VEHICLE * plant.pos_w[0, 2] + PAYLOAD * load_pos_w[0, 2]))
+
+
+def test_settles_from_half_a_metre_with_the_payload():
+    starts = GOAL + 0.5 * np.array([[1, 0, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1], [0.6, 0.64, -0.48]])
+    times, distances, swings, _ = fly(Pendulum(starts), 6.0)
+    for one in distances.T:
+        assert settled(times, one, 0.10) < 1.6
+        assert settled(times, one, 0.03) < 3.5
+    assert distances[-1].max() < 0.01
+    assert swings.max() < 0.6, "the payload must not swing up on the way"
+    assert swings[-50:].max() < 0.01
+
+
+@pytest.mark.parametrize("delay", [DELAY, DELAY + 0.02])
+def test_swing_is_damped_never_amplified(delay):
+    start = 0.35
+    times, distances, swings, _ = fly(Pendulum(GOAL, swing=start, delay=delay), 5.0)
+    peaks = [swings[(times > t) & (times <= t + 1.0)].max() for t in range(5)]
+    assert max(peaks) <= start
+    assert all(later < 0.7 * earlier for earlier, later in itertools.pairwise(peaks[:4]))
+    # With the vehicle held fast a frictionless pendulum would swing for ever: this damping is the controller's.
+    assert peaks[4] < 0.02 * start
+    assert distances.max() < 0.15
+
+
+def test_hover_without_the_payload_and_yaw_turns():
+    plant = Pendulum(GOAL + [[0.4, -0.3, 0.0]], payload=0.0)
+    times, distances, _, _ = fly(plant, 6.0, yaw=2.0)
+    assert settled(times, distances[:, 0], 0.03) < 3.5
+    rot_wb = rot_from_quat(plant.quat_wb)[0]
+    assert np.arctan2(rot_wb[1, 0], rot_wb[0, 0]) == pytest.approx(2.0, abs=0.02)
+
+
+def test_integral_makes_up_for_a_wrong_mass():
+    _, distances, _, _ = fly(Pendulum(GOAL), 12.0, told_mass=0.95 * (VEHICLE + PAYLOAD))
+    assert distances.max() > 0.05
+    assert distances[-1, 0] < 0.01
+    _, without, _, _ = fly(
+        Pendulum(GOAL), 12.0, told_mass=0.95 * (VEHICLE + PAYLOAD), params=HoverParams(integral_gain=0.0)
+    )
+    assert without[-1, 0] > 0.05
+
+
+@pytest.mark.parametrize("pitch", [1.3, 2.8, np.pi])
+def test_recovers_after_a_release_at_any_attitude(pitch):
+    quat = (0.0, np.sin(pitch / 2), 0.0, np.cos(pitch / 2))
+    _, distances, _, heights = fly(Pendulum(GOAL + [[1, 0, 0]], 0.0, 0.0, quat, (2.0, 0.0, 1.5)), 6.0)
+    assert distances[-1, 0] < 0.03
+    assert heights.min() > 0.8
+
+
+def test_far_goals_are_approached_at_the_speed_limit():
+    params = HoverParams()
+    plant = Pendulum(GOAL - [[10.0, 0, 0]])
+    controller = HoverController(params, PERIOD)
+    for k in range(150):
+        plant.advance(k * PERIOD, controller.step(plant.pos_w, plant.quat_wb, plant.vel_w, GOAL, plant.mass))
+    assert plant.vel_w[0, 0] == pytest.approx(params.max_speed, rel=0.05)
+
+
+def test_commands_by_hand():
+    controller = HoverController(HoverParams(), PERIOD)
+    level = np.array([[0.0, 0.0, 0.0, 1.0]])
+    still = np.zeros((1, 3))
+    hover = controller.step(still, level, still, still, 0.27)
+    np.testing.assert_allclose(hover, [[0.27 * GRAVITY, 0, 0, 0]], atol=1e-12)
+    # Goal ahead (+x): lean forward, a positive turn about y (left). Goal to the left (+y): a negative turn about x.
+    assert controller.step(still, level, still, np.array([1.0, 0, 0]), 0.27)[0, 2] > 0.5
+    assert controller.step(still, level, still, np.array([0, 1.0, 0]), 0.27)[0, 1] < -0.5
+    controller.reset()
+    # 0.1 m above the goal, integral aside: velocity asked -0.15 m/s, acceleration -0.525 m/s^2.
+    low = controller.step(np.array([[0, 0, 0.1]]), level, still, still, 1.0)[0, 0]
+    step_of_integral = 2.0 * PERIOD * 0.1
+    assert low == pytest.approx(GRAVITY - 3.5 * 1.5 * 0.1 - step_of_integral, abs=1e-12)
+
+
+def test_limits_hold_for_any_state():
+    params = HoverParams()
+    rng = np.random.default_rng(0)
+    count = 1000
+    quats = rng.normal(size=(count, 4))
+    quats[0] = (1.0, 0.0, 0.0, 0.0)  # upside down exactly
+    controller = HoverController(params, PERIOD, count)
+    command = controller.step(
+        10 * rng.normal(size=(count, 3)),
+        quats,
+        10 * rng.normal(size=(count, 3)),
+        GOAL,
+        0.27,
+        7 * rng.normal(size=count),
+    )
+    assert np.isfinite(command).all()
+    assert command[:, 0].min() >= params.min_thrust
+    assert command[:, 0].max() <= params.max_thrust
+    assert (np.abs(command[:, 1:]) <= params.max_rate).all()
+
+
+def test_a_batch_equals_singles_and_reset_is_masked():
+    rng = np.random.default_rng(1)
+    state = rng.normal(size=(4, 3)), rng.normal(size=(4, 4)), rng.normal(size=(4, 3))
+    goal = state[0] + 0.1
+    batch = HoverController(HoverParams(), PERIOD, 4)
+    singles = [HoverController(HoverParams(), PERIOD) for _ in range(4)]
+    for _ in range(3):
+        together = batch.step(*state, goal, 0.27)
+        alone = [one.step(*(part[i : i + 1] for part in state), goal[i], 0.27) for i, one in enumerate(singles)]
+        np.testing.assert_array_equal(together, np.concatenate(alone))
+    batch.reset(np.array([True, False, False, False]))
+    fresh = HoverController(HoverParams(), PERIOD, 4).step(*state, goal, 0.27)
+    after = batch.step(*state, goal, 0.27)
+    np.testing.assert_array_equal(after[0], fresh[0])
+    assert not np.array_equal(after[1:], fresh[1:])
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"position_gain": -1.0}, {"max_rate": (1.0, -1.0, 1.0)}, {"max_tilt": 1.6}, {"max_thrust": 0.1}]
+)
+def test_nonsense_parameters_are_refused(wrong):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        HoverParams(**wrong)
+    with pytest.raises(ValueError, match="period"):
+        HoverController(HoverParams(), 0.0)

@@ -1,0 +1,67 @@
+"""Provenance: complete, free of paths and names, and a run folder is never overwritten."""
+
+import getpass
+import json
+import socket
+import sys
+import tomllib
+from dataclasses import dataclass
+
+import pytest
+
+from visthrow import provenance
+from visthrow.errors import StorageError
+from visthrow.storage import atomic_write, write_json
+
+
+@dataclass(frozen=True)
+class Settings:
+    seed: int
+    rate: float
+
+
+def test_record_is_complete_and_free_of_names(monkeypatch):
+    monkeypatch.setattr(
+        sys, "argv", ["/home/somebody/bin/visthrow", "train", "--out=/data/x/run", "--set", "a.b=0.5/2"]
+    )
+    record = provenance.collect()
+    assert record["command"] == "visthrow train --out=run --set a.b=0.5/2"
+    assert {"commit", "time", "versions", "processors"} <= record.keys()
+    assert record["versions"].keys() >= {"visthrow", "python", "numpy", "torch", "warp-lang", "rsl-rl-lib"}
+    text = json.dumps({key: record[key] for key in record if key != "command"})
+    for private in (socket.gethostname(), f"/{getpass.getuser()}/", "/home/"):
+        assert private not in text
+
+
+def test_commit_of_a_copy_without_history_is_what_it_was_told(monkeypatch, tmp_path):
+    monkeypatch.setattr(provenance, "__file__", str(tmp_path / "visthrow" / "provenance.py"))
+    monkeypatch.delenv(provenance.COMMIT_VARIABLE, raising=False)
+    assert provenance.commit() == "unknown"
+    monkeypatch.setenv(provenance.COMMIT_VARIABLE, "abc123")
+    assert provenance.commit() == "abc123"
+
+
+def test_run_folder_holds_config_and_record_and_is_not_overwritten(tmp_path):
+    folder = tmp_path / "deep" / "run"
+    written = provenance.write_run_folder(folder, Settings(3, 1e-3), seed=3)
+    assert tomllib.loads((folder / "config.toml").read_text()) == {"seed": 3, "rate": 1e-3}
+    assert json.loads((folder / "provenance.json").read_text()) == written
+    assert written["seed"] == 3
+    with pytest.raises(StorageError, match="holds a run already"):
+        provenance.write_run_folder(folder, Settings(4, 1.0))
+    provenance.write_run_folder(folder, Settings(4, 1.0), resume=True)
+    assert tomllib.loads((folder / "config.toml").read_text())["seed"] == 3
+    assert (folder / "provenance_1.json").exists()
+
+
+def test_writing_where_a_file_stands_in_the_way_names_the_place(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(StorageError, match="cannot write"):
+        atomic_write(tmp_path / "file" / "below", "x")
+
+
+def test_json_has_no_nan(tmp_path):
+    import numpy as np
+
+    write_json(tmp_path / "a.json", {"a": float("nan"), "b": np.float32(1.5), "c": np.array([1.0, np.inf])})
+    assert json.loads((tmp_path / "a.json").read_text()) == {"a": None, "b": 1.5, "c": [1.0, None]}

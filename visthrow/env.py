@@ -1,0 +1,260 @@
+"""ThrowEnv: the throwing task as rsl_rl's vectorised environment.
+
+A step is a chain of device operations without branches on data, allocations on the simulator's side or copies to the
+host, so a whole rollout can be captured in one CUDA graph (:mod:`visthrow.train`). Every observation is a fresh tensor.
+"""
+
+import torch
+from rsl_rl.env import VecEnv
+from tensordict import TensorDict
+from torch import Tensor
+
+from camera import history as hist
+from camera.keypoints import KEYPOINTS, KeypointCamera
+from camera.noise import StepDraw, apply_latency, apply_noise
+from sim.hybrid import HybridSim, tether_lengths
+from sim.params import GRAVITY
+from sim.torch_bridge import TorchViews, on_torch_stream
+from visthrow import actions as act
+from visthrow import observations as ob
+from visthrow import rewards, terminations
+from visthrow.task import Experiment, plant_of
+
+RESULTS = ("episodes", "released", "landing_error", "duration", "steps", "clearance_lost")
+"""Sums over finished episodes; landing error [m], duration [s] and lost clearance over the released ones."""
+
+
+class ThrowEnv(VecEnv):
+    """Batch of throws. Observation groups: ``actor`` and ``critic``.
+
+    The critic sees the vehicle, goal offset, payload history and payload velocity without noise, and further the time to
+    separation, the time since start, the vehicle's mass and the battery's voltage.
+
+    Attributes:
+        last: what the last step ended: ``released``, ``negative`` (bool), ``landing_error`` [m], ``duration`` [s] from the
+            policy's start to the payload's landing, ``landing_w`` [m], ``clearance`` [m]; each over (E,).
+        totals: running sums of :data:`RESULTS`.
+    """
+
+    def __init__(self, experiment: Experiment, device: str = "cpu", seed: int = 0, count: int | None = None):
+        """Build simulator and buffers and start all episodes.
+
+        Args:
+            experiment: plant, camera, task.
+            device: "cpu" or "cuda:0".
+            seed: of the simulator's resets; torch's own generator draws the noise and is the caller's to seed.
+            count: number of environments; default the experiment's.
+        """
+        self.cfg = experiment
+        task = experiment.task
+        self.num_envs = count or experiment.ppo.environments
+        self.num_actions = act.ACTIONS
+        self.device = device
+        self.max_episode_length = round(task.bounds.time_limit / experiment.sim.control_period)
+        self.sim = HybridSim(plant_of(experiment), self.num_envs, device, seed, ropes=tether_lengths(experiment.rope, task.start))
+        self.views = TorchViews(self.sim)
+        self.layout = ob.layout_of(task.observation)
+        self.camera = KeypointCamera(experiment.camera, device)
+        E, make = self.num_envs, {"device": device, "dtype": torch.float32}
+        weight = GRAVITY * (experiment.vehicle.body.mass + experiment.rope.rope_mass + experiment.rope.payload_mass)
+        self._start_action = torch.tensor(act.hover_action(weight, task.action.max_thrust), **make)
+        self._max_rate = torch.tensor(task.action.max_rate, **make)
+        self._rate_weights = torch.tensor(task.reward.rate_command, **make)
+        self._change_weights = torch.tensor(task.reward.command_change, **make)
+        self.episode_length_buf = torch.zeros(E, device=device, dtype=torch.long)
+        latency = experiment.camera.noise.history_length
+        self._memory = {
+            "previous": torch.zeros(E, act.ACTIONS, **make),
+            "history": torch.zeros(E, 1 + self.layout.history, self.layout.payload, **make),
+            "true_history": torch.zeros(E, 1 + self.layout.history, 3, **make),
+            "frame_bias": torch.zeros(E, ob.VEHICLE + 5, **make),
+            "command_bias": torch.zeros(E, act.COMMANDS, **make),
+            "keypoint_bias": torch.zeros(E, KEYPOINTS, 2, **make),
+            "extrinsic_rotation": torch.zeros(E, 3, **make),
+            "extrinsic_offset": torch.zeros(E, 3, **make),
+            "late_points": torch.zeros(E, latency, KEYPOINTS, 2, **make),
+            "late_valid": torch.zeros(E, latency, KEYPOINTS, device=device, dtype=torch.bool),
+            "totals": torch.zeros(len(RESULTS), device=device, dtype=torch.float64),
+        }
+        self._latency = torch.tensor(experiment.camera.noise.latency, **make)
+        self.last: dict[str, Tensor] = {}
+        self.reset()
+
+    @property
+    def totals(self) -> dict[str, float]:
+        """Sums over finished episodes since :meth:`clear_totals`."""
+        return dict(zip(RESULTS, self._memory["totals"].tolist(), strict=True))
+
+    def clear_totals(self) -> None:
+        """Start the sums again."""
+        self._memory["totals"].zero_()
+
+    def reset(self) -> TensorDict:
+        """Start a new episode everywhere."""
+        fresh = torch.ones(self.num_envs, device=self.device, dtype=torch.bool)
+        with on_torch_stream(self.device):
+            self.sim.randomize(self.cfg.task.start)
+        self._begin(fresh)
+        self._observations = self._observe(fresh)
+        return self._observations
+
+    def get_observations(self) -> TensorDict:
+        """Observations of the current step."""
+        return self._observations.clone()
+
+    def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict]:
+        """Apply actions, shape (E, 5), for one control period; finished episodes start anew.
+
+        Returns:
+            Observations, rewards (E,), dones (E,), and an empty dictionary: the time limit is a negative end and must not
+            be bootstrapped, so there are no ``time_outs``.
+        """
+        task, memory = self.cfg.task, self._memory
+        action = act.clip_action(actions)
+        noisy = action[:, : act.COMMANDS] + torch.randn_like(memory["command_bias"]) * task.noise.command_step
+        noisy = noisy + memory["command_bias"]
+        self.views.command.copy_(act.command_from_action(noisy, task.action.max_thrust, self._max_rate))
+        self.views.release.copy_(act.release_asked(actions, self.cfg.release.threshold))
+        with on_torch_stream(self.device):
+            self.sim.step()
+        self.episode_length_buf += 1
+        reward, done = self._judge(action)
+        self._tally(done)
+        with on_torch_stream(self.device):
+            self.sim.randomize(task.start, self._mask(done))
+        memory["previous"].copy_(action)
+        self._begin(done)
+        self._observations = self._observe(done)
+        return self._observations, reward, done.to(torch.float32), {}
+
+    def _mask(self, done: Tensor):
+        """Warp view of a boolean mask."""
+        import warp as wp
+
+        self._done = done.to(torch.int32)
+        return wp.from_torch(self._done)
+
+    def _judge(self, action: Tensor) -> tuple[Tensor, Tensor]:
+        """Reward and end of the step just made."""
+        task, state, out = self.cfg.task, self.views.state, self.views.out
+        period = self.cfg.sim.control_period
+        p = task.reward
+        rot_wb = ob.rotation_from_quat(state["quat_wb"])
+        released = out["separated"] != 0
+        latched = state["release_timer"] >= 0.0
+        time = self.episode_length_buf * period
+        payload = out["payload_pos_w"]
+        negative = ~released & terminations.negative(
+            task.bounds, state["pos_w"], rot_wb, payload, state["status"], latched, time, self.cfg.release.landing_height
+        )
+        error = (out["landing_w"] - self.views.goal_w)[:, :2].square().sum(-1).sqrt()
+        carry = (
+            rewards.kinetic(p, state["vel_w"], state["rate_b"], out["payload_vel_w"])
+            + rewards.command(p, action, self._rate_weights)
+            + rewards.change(p, action, self._memory["previous"], self._change_weights)
+            + rewards.carry_time(p, period)
+        )
+        at_release = (
+            rewards.landing(p, error)
+            + rewards.time_of_flight(p, out["time_to_impact"])
+            + rewards.proximity(p, out["clearance"], self.cfg.release.clearance_margin)
+        )
+        reward = carry + torch.where(released, at_release, 0.0) - p.termination * negative
+        self.last = {
+            "released": released,
+            "negative": negative,
+            "landing_error": error,
+            "duration": time - period + out["separation_time"] + out["time_to_impact"],
+            "landing_w": out["landing_w"].clone(),
+            "clearance": out["clearance"].clone(),
+        }
+        return p.scale * reward, released | negative
+
+    def _tally(self, done: Tensor) -> None:
+        last = self.last
+        hit = last["released"].to(torch.float64)
+        lost = (self.cfg.release.clearance_margin - last["clearance"]).clamp(min=0.0)
+        sums = [done.to(torch.float64), hit, last["landing_error"] * hit, last["duration"] * hit, self.episode_length_buf * done, lost * hit]
+        self._memory["totals"] += torch.stack([s.sum() for s in sums])
+
+    def _begin(self, fresh: Tensor) -> None:
+        """Draw what holds for an episode where one begins."""
+        memory, noise, camera = self._memory, self.cfg.task.noise, self.cfg.camera
+        self.episode_length_buf.masked_fill_(fresh, 0)
+        memory["previous"].copy_(torch.where(fresh[:, None], self._start_action, memory["previous"]))
+        spreads = {
+            "frame_bias": noise.observation_bias, "command_bias": noise.command_bias, "keypoint_bias": camera.noise.bias_std,
+            "extrinsic_rotation": camera.mount.rotation_error_std, "extrinsic_offset": camera.mount.position_error_std,
+        }
+        for name, std in spreads.items():
+            if std > 0.0:
+                old = memory[name]
+                mask = fresh.view(-1, *(1,) * (old.dim() - 1))
+                old.copy_(torch.where(mask, torch.randn_like(old) * std, old))
+
+    def _observe(self, fresh: Tensor) -> TensorDict:
+        """Actor's and critic's view of the current state."""
+        state, memory, noise = self.views.state, self._memory, self.cfg.task.noise
+        payload, goal = self.views.out["payload_pos_w"], self.views.goal_w
+        rot_wb = ob.rotation_from_quat(state["quat_wb"])
+        vehicle = ob.vehicle_part(state["pos_w"], state["vel_w"], state["rate_b"], rot_wb)
+        exact = torch.cat([vehicle, ob.state_part(state["pos_w"], goal, payload)], dim=-1)
+        attached = state["attached"].to(torch.float32)
+        measured = exact + torch.randn_like(exact) * noise.observation_step + memory["frame_bias"]
+        valid = None
+        if self.layout.name == "vision":
+            points, valid = self._see(rot_wb, fresh)
+            measured = torch.cat([measured[:, : ob.VEHICLE], points.flatten(1)], dim=-1)
+        actor, history = ob.observe(self.layout, measured, valid, memory["previous"], attached, memory["history"], fresh)
+        memory["history"].copy_(history)
+        goal_offset, relative = exact[:, ob.VEHICLE : ob.VEHICLE + 2], exact[:, ob.VEHICLE + 2 :]
+        true_history = hist.push(memory["true_history"], relative, fresh)
+        memory["true_history"].copy_(true_history)
+        time = self.episode_length_buf.to(torch.float32) * self.cfg.sim.control_period
+        inner = torch.stack([state["release_timer"], time, state["mass_scale"], state["voltage"], attached], dim=-1)
+        critic = torch.cat(
+            [vehicle, memory["previous"], goal_offset, true_history.flatten(1), self.views.out["payload_vel_w"], inner], dim=-1
+        )
+        return TensorDict({"actor": actor, "critic": critic}, batch_size=[self.num_envs], device=self.device)
+
+    def _see(self, rot_wb: Tensor, fresh: Tensor) -> tuple[Tensor, Tensor]:
+        """Keypoints as the detector reports them: extrinsic error, latency, noise, drop-out."""
+        memory, camera = self._memory, self.cfg.camera
+        extrinsics = None
+        if camera.mount.rotation_error_std > 0.0 or camera.mount.position_error_std > 0.0:
+            extrinsics = self.camera.extrinsics(memory["extrinsic_rotation"], memory["extrinsic_offset"])
+        points, valid = ob.vision_part(
+            self.camera, self.views.state["pos_w"], rot_wb, self.views.goal_w, self.views.out["payload_pos_w"], extrinsics
+        )
+        if camera.noise.latency > 0.0:
+            memory["late_points"].copy_(hist.push(memory["late_points"], points, fresh))
+            memory["late_valid"].copy_(hist.push(memory["late_valid"], valid, fresh))
+            points, valid = apply_latency(memory["late_points"], memory["late_valid"], self._latency)
+        draw = StepDraw(torch.randn_like(points), torch.rand_like(points[..., 0]))
+        return apply_noise(camera.noise, points, valid, memory["keypoint_bias"], draw)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """All that the next step depends on, besides torch's generators."""
+        saved = {f"sim.{k}": v for k, v in self.views.state.items()} | {f"memory.{k}": v for k, v in self._memory.items()}
+        import warp as wp
+
+        saved |= {"episode": wp.to_torch(self.sim.episode), "goal_w": self.views.goal_w, "length": self.episode_length_buf}
+        saved |= {f"out.{k}": v for k, v in self.views.out.items()} | {f"obs.{k}": v for k, v in self._observations.items()}
+        return {k: v.clone() for k, v in saved.items()}
+
+    def load_state_dict(self, saved: dict[str, Tensor]) -> None:
+        """Take up a state of :meth:`state_dict` of an environment of the same experiment and size.
+
+        Raises:
+            ValueError: a missing entry or another shape.
+        """
+        import warp as wp
+
+        targets = {f"sim.{k}": v for k, v in self.views.state.items()} | {f"memory.{k}": v for k, v in self._memory.items()}
+        targets |= {"episode": wp.to_torch(self.sim.episode), "goal_w": self.views.goal_w, "length": self.episode_length_buf}
+        targets |= {f"out.{k}": v for k, v in self.views.out.items()} | {f"obs.{k}": v for k, v in self._observations.items()}
+        for name, target in targets.items():
+            if name not in saved or saved[name].shape != target.shape:
+                have = tuple(saved[name].shape) if name in saved else "nothing"
+                raise ValueError(f"environment state {name!r}: expected shape {tuple(target.shape)}, got {have}")
+            target.copy_(saved[name])

@@ -1,0 +1,164 @@
+"""Schema of the throwing task and of an experiment: what is flown, seen, rewarded and trained. SI units.
+
+One experiment file of ``configs/train`` names the files of vehicle, rope, camera and task and holds the learning
+parameters; :func:`plant_of` gives what the simulator needs of it.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from camera.params import CameraParams
+from sim.params import PlantParams, RandomizationParams, ReleaseParams, RopeParams, SimParams, VehicleParams
+from visthrow.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class ActionParams:
+    """Limits of the command; see :mod:`visthrow.actions`."""
+
+    max_thrust: float  # collective thrust at +1 [N]
+    max_rate: tuple[float, float, float]  # body rates at +-1 [rad/s]
+
+
+@dataclass(frozen=True)
+class ObservationParams:
+    """What the actor sees; see :mod:`visthrow.observations`."""
+
+    layout: Literal["state", "vision"]
+    history: int  # earlier payload measurements beside the current one
+    validity: bool  # vision: whether the actor is told which keypoints are valid
+
+
+@dataclass(frozen=True)
+class NoiseParams:
+    """Gaussian noise of measurements and commands (the paper, Sec. III-C). Keypoints have their own in the camera."""
+
+    observation_step: float  # per step, in each entry's SI unit
+    observation_bias: float  # per episode
+    command_step: float  # per step, in normalised commands
+    command_bias: float  # per episode
+
+
+@dataclass(frozen=True)
+class BoundsParams:
+    """Ends of an episode (the paper, Sec. III-C); the numbers are ours."""
+
+    altitude: tuple[float, float]  # of the vehicle [m]
+    horizontal: float  # distance of the vehicle from the spawn axis [m]
+    tilt_deg: float  # between body z and the vertical [deg]
+    time_limit: float  # a negative end, never bootstrapped [s]
+
+
+@dataclass(frozen=True)
+class RewardParams:
+    """Coefficients of Table II, by the names of its meanings; see :mod:`visthrow.rewards`."""
+
+    scale: float  # of the whole reward; the learner's only, the paper's is 1
+    velocity: float  # alpha_v
+    angular_velocity: float  # alpha_omega
+    relative_velocity: float  # alpha_p
+    smoothness: float  # beta
+    rate_command: tuple[float, float, float]  # c^omega
+    command_change: tuple[float, float, float, float]  # c^Delta
+    l1_mix: float  # eta
+    carry_time: float  # gamma_t [1/s]
+    landing: float  # k_l
+    landing_decay: float  # lambda [1/m]
+    time_of_flight: float  # k_h
+    proximity: float  # k_p
+    termination: float  # k_d
+
+
+@dataclass(frozen=True)
+class TaskParams:
+    """The throwing task."""
+
+    action: ActionParams
+    observation: ObservationParams
+    noise: NoiseParams
+    start: RandomizationParams
+    bounds: BoundsParams
+    reward: RewardParams
+
+
+@dataclass(frozen=True)
+class PPOParams:
+    """Learning parameters of rsl_rl's PPO."""
+
+    environments: int
+    steps: int  # per environment and iteration
+    iterations: int
+    hidden: tuple[int, ...]
+    activation: str
+    normalize: bool  # empirical observation normalisation
+    initial_std: float
+    epochs: int
+    minibatches: int
+    learning_rate: float
+    schedule: Literal["adaptive", "fixed"]
+    desired_kl: float
+    discount: float
+    gae_lambda: float
+    clip: float
+    entropy: float
+    value_coefficient: float
+    max_grad_norm: float
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """All that a training run depends on; written beside its results."""
+
+    vehicle: VehicleParams
+    rope: RopeParams
+    release: ReleaseParams
+    sim: SimParams
+    camera: CameraParams
+    task: TaskParams
+    ppo: PPOParams
+
+    def __post_init__(self) -> None:
+        if self.ppo.environments < 1 or self.ppo.steps < 1 or self.ppo.iterations < 1:
+            raise ConfigError(
+                f"ppo: {self.ppo.environments} environments, {self.ppo.steps} steps, {self.ppo.iterations} iterations; "
+                "expected 1 or more of each"
+            )
+        if abs(self.camera.payload_radius - self.rope.payload_radius) > 1e-9:
+            raise ConfigError(
+                f"camera.payload_radius is {self.camera.payload_radius} m and rope.payload_radius {self.rope.payload_radius} m; "
+                "expected the same ball"
+            )
+
+
+def plant_of(experiment: Experiment) -> PlantParams:
+    """The plant of an experiment."""
+    return PlantParams(experiment.vehicle, experiment.rope, experiment.release, experiment.sim)
+
+
+def contract_of(experiment: Experiment) -> dict:
+    """What whoever flies a policy must share with its training; see :mod:`visthrow.policy`.
+
+    The camera enters for vision policies only. Noise and randomisation are training matters and stay out.
+    """
+    from visthrow import config
+    from visthrow.observations import layout_of
+
+    layout = layout_of(experiment.task.observation)
+    contract = {
+        "observation": {**config.to_dict(experiment.task.observation), "dimension": layout.dimension},
+        "action": {**config.to_dict(experiment.task.action), "dimension": 5},
+        "control_period": experiment.sim.control_period,
+        "release": {"lag": experiment.release.lag, "threshold": experiment.release.threshold},
+        "vehicle": config.to_dict(experiment.vehicle),
+        "rope": config.to_dict(experiment.rope),
+    }
+    if experiment.task.observation.layout == "vision":
+        camera = config.to_dict(experiment.camera)
+        contract["camera"] = {
+            "fisheye": camera["fisheye"],
+            "mount": {k: camera["mount"][k] for k in ("position_b", "rpy_deg")},
+            "goal_side": camera["goal_side"],
+            "payload_radius": camera["payload_radius"],
+            "invalid_reads": camera["noise"]["invalid_reads"],
+        }
+    return contract
