@@ -5,6 +5,7 @@ host, so a whole rollout can be captured in one CUDA graph (:mod:`visthrow.train
 """
 
 import torch
+import warp as wp
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 from torch import Tensor
@@ -78,7 +79,23 @@ class ThrowEnv(VecEnv):
         }
         self._latency = torch.tensor(experiment.camera.noise.latency, **make)
         self.last: dict[str, Tensor] = {}
+        self._goal: Tensor | None = None
         self.reset()
+
+    @property
+    def previous_action(self) -> Tensor:
+        """Clipped action of the last step, shape (E, 5)."""
+        return self._memory["previous"]
+
+    def fix_goal(self, goal_w: Tensor | None) -> None:
+        """Use one goal [m], shape (3,), for all episodes from the next reset on, or drawn ones again (None)."""
+        self._goal = goal_w
+
+    def _start(self, mask=None) -> None:
+        with on_torch_stream(self.device):
+            self.sim.randomize(self.cfg.task.start, mask)
+        if self._goal is not None:
+            self.views.goal_w.copy_(self._goal.expand_as(self.views.goal_w))
 
     @property
     def totals(self) -> dict[str, float]:
@@ -92,8 +109,7 @@ class ThrowEnv(VecEnv):
     def reset(self) -> TensorDict:
         """Start a new episode everywhere."""
         fresh = torch.ones(self.num_envs, device=self.device, dtype=torch.bool)
-        with on_torch_stream(self.device):
-            self.sim.randomize(self.cfg.task.start)
+        self._start()
         self._begin(fresh)
         self._observations = self._observe(fresh)
         return self._observations
@@ -120,8 +136,7 @@ class ThrowEnv(VecEnv):
         self.episode_length_buf += 1
         reward, done = self._judge(action)
         self._tally(done)
-        with on_torch_stream(self.device):
-            self.sim.randomize(task.start, self._mask(done))
+        self._start(self._mask(done))
         memory["previous"].copy_(action)
         self._begin(done)
         self._observations = self._observe(done)
@@ -129,8 +144,6 @@ class ThrowEnv(VecEnv):
 
     def _mask(self, done: Tensor):
         """Warp view of a boolean mask."""
-        import warp as wp
-
         self._done = done.to(torch.int32)
         return wp.from_torch(self._done)
 
@@ -167,6 +180,7 @@ class ThrowEnv(VecEnv):
             "duration": time - period + out["separation_time"] + out["time_to_impact"],
             "landing_w": out["landing_w"].clone(),
             "clearance": out["clearance"].clone(),
+            "action": action,
         }
         return p.scale * reward, released | negative
 
@@ -233,14 +247,15 @@ class ThrowEnv(VecEnv):
         draw = StepDraw(torch.randn_like(points), torch.rand_like(points[..., 0]))
         return apply_noise(camera.noise, points, valid, memory["keypoint_bias"], draw)
 
-    def state_dict(self) -> dict[str, Tensor]:
+    def _tensors(self) -> dict[str, Tensor]:
         """All that the next step depends on, besides torch's generators."""
-        saved = {f"sim.{k}": v for k, v in self.views.state.items()} | {f"memory.{k}": v for k, v in self._memory.items()}
-        import warp as wp
+        found = {f"sim.{k}": v for k, v in self.views.state.items()} | {f"out.{k}": v for k, v in self.views.out.items()}
+        found |= {f"memory.{k}": v for k, v in self._memory.items()} | {f"obs.{k}": v for k, v in self._observations.items()}
+        return found | {"episode": wp.to_torch(self.sim.episode), "goal_w": self.views.goal_w, "length": self.episode_length_buf}
 
-        saved |= {"episode": wp.to_torch(self.sim.episode), "goal_w": self.views.goal_w, "length": self.episode_length_buf}
-        saved |= {f"out.{k}": v for k, v in self.views.out.items()} | {f"obs.{k}": v for k, v in self._observations.items()}
-        return {k: v.clone() for k, v in saved.items()}
+    def state_dict(self) -> dict[str, Tensor]:
+        """Copy of all that the next step depends on, besides torch's generators."""
+        return {k: v.clone() for k, v in self._tensors().items()}
 
     def load_state_dict(self, saved: dict[str, Tensor]) -> None:
         """Take up a state of :meth:`state_dict` of an environment of the same experiment and size.
@@ -248,12 +263,7 @@ class ThrowEnv(VecEnv):
         Raises:
             ValueError: a missing entry or another shape.
         """
-        import warp as wp
-
-        targets = {f"sim.{k}": v for k, v in self.views.state.items()} | {f"memory.{k}": v for k, v in self._memory.items()}
-        targets |= {"episode": wp.to_torch(self.sim.episode), "goal_w": self.views.goal_w, "length": self.episode_length_buf}
-        targets |= {f"out.{k}": v for k, v in self.views.out.items()} | {f"obs.{k}": v for k, v in self._observations.items()}
-        for name, target in targets.items():
+        for name, target in self._tensors().items():
             if name not in saved or saved[name].shape != target.shape:
                 have = tuple(saved[name].shape) if name in saved else "nothing"
                 raise ValueError(f"environment state {name!r}: expected shape {tuple(target.shape)}, got {have}")
