@@ -9,6 +9,10 @@ SCHEMAS = {
     "vehicle": "sim.params:VehicleParams",
     "rope": "sim.params:RopeParams",
     "camera": "camera.params:CameraParams",
+    "release": "sim.params:ReleaseParams",
+    "sim": "sim.params:SimParams",
+    "task": "visthrow.task:TaskParams",
+    "train": "visthrow.task:Experiment",
     "vehicle/reference_realistic": "sim.reference.extras:ReferenceExtras",
 }
 """``kind`` or ``kind/name`` -> ``module:class``; the longer key wins."""

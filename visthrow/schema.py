@@ -159,7 +159,7 @@ def _build_dataclass(schema: type, node: Leaf | Table, path: str) -> Any:
     values = {key: build(types_of[key], item, _join(path, key)) for key, item in node.items.items()}
     try:
         return schema(**values)
-    except ValueError as error:
+    except (ValueError, ConfigError) as error:
         fail(node.source, path, str(error))
 
 

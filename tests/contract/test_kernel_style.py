@@ -1,0 +1,77 @@
+"""Every Warp kernel of the simulator states what its arguments are, in one order, under one set of headings."""
+
+import ast
+import io
+import tokenize
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+GROUPS = ("Params:", "State in:", "In:", "State out:", "Out:")
+"""Headings of the argument groups; some may be missing, the order may not differ."""
+
+
+def is_kernel(node: ast.AST) -> bool:
+    """Tell whether a function is decorated as ``wp.kernel`` or ``wp.kernel(...)``."""
+    if not isinstance(node, ast.FunctionDef):
+        return False
+    marks = (mark.func if isinstance(mark, ast.Call) else mark for mark in node.decorator_list)
+    return any(isinstance(mark, ast.Attribute) and mark.attr == "kernel" for mark in marks)
+
+
+def kernels(text: str) -> list[ast.FunctionDef]:
+    return [node for node in ast.walk(ast.parse(text)) if is_kernel(node)]
+
+
+def problems(text: str, kernel: ast.FunctionDef) -> list[str]:
+    """Return what is wrong with the headings of one kernel's arguments."""
+    comments = {
+        token.start[0]: token.string.lstrip("# ").strip()
+        for token in tokenize.generate_tokens(io.StringIO(text).readline)
+        if token.type == tokenize.COMMENT and token.line.strip().startswith("#")
+    }
+    arguments = kernel.args.posonlyargs + kernel.args.args
+    if not arguments:
+        return []
+    first, last = kernel.lineno, kernel.body[0].lineno
+    headings = [(line, word) for line, word in sorted(comments.items()) if first < line < last and word in GROUPS]
+    found = [word for _, word in headings]
+    wrong = []
+    if found != sorted(set(found), key=GROUPS.index):
+        wrong.append(f"headings stand as {found}; expected an ordered choice of {list(GROUPS)}")
+    if not headings or headings[0][0] > arguments[0].lineno:
+        wrong.append(f"argument '{arguments[0].arg}' stands under no heading")
+    for (line, word), (following, _) in zip(headings, [*headings[1:], (last, "")]):
+        if not any(line < argument.lineno < following for argument in arguments):
+            wrong.append(f"no argument stands under '{word}'")
+    return wrong
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "sim").rglob("*.py")), ids=lambda path: str(path.relative_to(ROOT)))
+def test_arguments_of_kernels_are_grouped(path):
+    text = path.read_text(encoding="utf-8")
+    wrong = [f"{path.name}: {kernel.name}: {problem}" for kernel in kernels(text) for problem in problems(text, kernel)]
+    assert not wrong
+
+
+def test_there_are_kernels_to_check():
+    found = [kernel.name for path in (ROOT / "sim").rglob("*.py") for kernel in kernels(path.read_text())]
+    assert found
+
+
+@pytest.mark.parametrize(
+    ("arguments", "count"),
+    [
+        ("# Params:\n p: int,\n # In:\n a: int,\n # Out:\n b: int,", 0),
+        ("# In:\n a: int,\n # Params:\n p: int,", 1),
+        ("# In:\n a: int,\n # In:\n p: int,", 1),
+        ("a: int,\n # Out:\n b: int,", 1),
+        ("a: int,", 1),
+        ("# Params:\n # In:\n a: int,", 1),
+    ],
+)
+def test_the_check_itself(arguments, count):
+    text = f"@wp.kernel(module='unique')\ndef k(\n {arguments}\n):\n    pass\n"
+    (kernel,) = kernels(text)
+    assert len(problems(text, kernel)) == count

@@ -1,0 +1,80 @@
+"""What is tracked holds no path or host of the machine that it was written on, and no file outgrows its room."""
+
+import re
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+BINARY = {".png", ".jpg", ".gif", ".npz", ".rrd", ".parquet", ".onnx", ".ulg", ".pdf"}
+LONGEST = 500
+"""Lines of a Python file."""
+
+MACHINE_PATHS = re.compile(
+    r"(?<![\w.:/-])/(?:home|root|Users|workspace|work|opt|mnt|scratch)/\w+"  # absolute folders
+    r"|file://|\bindex-url\b|\bfind-links\b"
+    r"|\b[\w-]+\.(?:pypi|pythonhosted)\.org\b|\bpypi\.org\b",
+    re.IGNORECASE,
+)
+EXEMPT = {"tests/contract/test_text.py", "tests/unit/test_provenance.py"}
+"""This file holds the pattern; the other one tests that such paths are left out."""
+
+
+def tracked() -> list[Path]:
+    """Return the tracked files; in a copy without history, every file of the source folders."""
+    listed = subprocess.run(["git", "-C", str(ROOT), "ls-files", "-z"], capture_output=True, text=True)
+    if listed.returncode == 0 and listed.stdout:
+        files = [ROOT / name for name in listed.stdout.split("\0") if name]
+    else:
+        files = [
+            path
+            for part in ("camera", "sim", "visthrow", "hil", "tests", "configs")
+            for path in ROOT.joinpath(part).rglob("*")
+        ]
+    return [path for path in files if path.is_file() and path.suffix not in BINARY]
+
+
+FILES = tracked()
+
+
+def test_files_are_found():
+    assert ROOT / "pyproject.toml" in FILES or ROOT / "visthrow" / "cli.py" in FILES
+
+
+def test_no_machine_paths():
+    wrong = []
+    for path in FILES:
+        name = path.relative_to(ROOT).as_posix()
+        if name in EXEMPT:
+            continue
+        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+            if MACHINE_PATHS.search(line):
+                wrong.append(f"{name}:{number}: {line.strip()[:120]}")
+    assert not wrong
+
+
+@pytest.mark.parametrize(
+    ("line", "caught"),
+    [
+        ("/home/me/x", True), ("see /root/x", True), ("--index-url x", True), ("https://pypi.org/simple", True),
+        ("a/work/b", False), ("../shared", False), ("/dev/null", False), ("#!/usr/bin/env bash", False),
+        ("N m/rad", False), ("/proc/cpuinfo", False),
+    ],
+)  # fmt: skip
+def test_the_pattern_itself(line, caught):
+    assert bool(MACHINE_PATHS.search(line)) == caught
+
+
+def test_no_python_file_is_too_long():
+    wrong = {
+        path.relative_to(ROOT).as_posix(): lines
+        for path in FILES
+        if path.suffix == ".py" and (lines := len(path.read_text(encoding="utf-8").splitlines())) > LONGEST
+    }
+    assert not wrong
+
+
+def test_no_test_folder_shadows_a_package():
+    folders = {path.name for path in (ROOT / "tests").iterdir() if path.is_dir()}
+    assert folders.isdisjoint({"camera", "sim", "visthrow", "hil"})
