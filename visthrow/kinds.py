@@ -12,6 +12,7 @@ SCHEMAS = {
     "release": "sim.params:ReleaseParams",
     "sim": "sim.params:SimParams",
     "task": "visthrow.task:TaskParams",
+    "start": "sim.params:RandomizationParams",
     "train": "visthrow.task:Experiment",
     "vehicle/reference_realistic": "sim.reference.extras:ReferenceExtras",
 }
