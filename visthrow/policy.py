@@ -86,7 +86,7 @@ class Policy:
         """Number of actions A."""
         return self.weights[-1].shape[0]
 
-    @torch.inference_mode()
+    @torch.no_grad()
     def act(self, obs: Tensor) -> Tensor:
         """Return the deterministic action.
 
@@ -243,6 +243,23 @@ class Policy:
             take("obs_normalizer._std").reshape(-1) if normalized else None,
             eps if normalized else 0.0,
         )
+
+
+SHIPPED = Path(__file__).resolve().parent / "policies"
+"""Folder of the policies that come with the package."""
+
+
+def find_policy(name: str | Path) -> Path:
+    """Find a policy by the name of a shipped one (``vision``) or by the path of a file.
+
+    Raises:
+        PolicyError: If there is neither; the message lists what exists.
+    """
+    for candidate in (Path(name), SHIPPED / f"{name}.npz"):
+        if candidate.is_file():
+            return candidate
+    shipped = suggest(str(name), (path.stem for path in SHIPPED.glob("*.npz")))
+    raise PolicyError(f"no policy '{name}': neither a file nor one that comes with visthrow; {shipped}")
 
 
 _ABSENT = object()

@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDict
 
 from visthrow.errors import MismatchError, PolicyError, VisthrowError
-from visthrow.policy import FORMAT_VERSION, Policy
+from visthrow.policy import FORMAT_VERSION, Policy, find_policy
 from visthrow.storage import from_json_array, json_array
 
 OBS, ACTIONS = 35, 5
@@ -167,6 +167,16 @@ def test_other_files_and_missing_files_are_refused(policy, tmp_path):
         Policy.load(tmp_path / "text.npz")
     with pytest.raises(PolicyError, match=r"no such file.*there\.npz"):
         Policy.load(tmp_path / "gone.npz")
+
+
+def test_policies_are_found_by_shipped_name_or_path(policy, tmp_path, monkeypatch):
+    monkeypatch.setattr("visthrow.policy.SHIPPED", tmp_path / "shipped")
+    policy.save(tmp_path / "shipped" / "vision.npz")
+    policy.save(tmp_path / "mine.npz")
+    assert find_policy("vision") == tmp_path / "shipped" / "vision.npz"
+    assert find_policy(tmp_path / "mine.npz") == tmp_path / "mine.npz"
+    with pytest.raises(PolicyError, match="no policy 'vison'.*did you mean 'vision'"):
+        find_policy("vison")
 
 
 def test_pickles_are_never_loaded(tmp_path):
