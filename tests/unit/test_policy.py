@@ -175,7 +175,7 @@ def test_policies_are_found_by_shipped_name_or_path(policy, tmp_path, monkeypatc
     policy.save(tmp_path / "mine.npz")
     assert find_policy("vision") == tmp_path / "shipped" / "vision.npz"
     assert find_policy(tmp_path / "mine.npz") == tmp_path / "mine.npz"
-    with pytest.raises(PolicyError, match="no policy 'vison'.*did you mean 'vision'"):
+    with pytest.raises(PolicyError, match=r"no policy 'vison'.*did you mean 'vision'"):
         find_policy("vison")
 
 
