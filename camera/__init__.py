@@ -6,7 +6,7 @@ the optical axis).
 Knows neither the simulator nor the rest of the project. cv2 and kornia are imported by the functions that use them.
 """
 
-from camera.fisheye import Fisheye, FisheyeParams
+from camera.fisheye import Fisheye, FisheyeParams, transfer_pixels
 from camera.history import at_latency, filled, push, push_
 from camera.keypoints import KEYPOINTS, KeypointCamera, goal_corners_w, keypoints, payload_keypoints
 from camera.mount import MountParams, points_c_from_w
@@ -34,4 +34,5 @@ __all__ = [
     "points_c_from_w",
     "push",
     "push_",
+    "transfer_pixels",
 ]

@@ -15,7 +15,7 @@ import torch
 AXIS_EPSILON = 1e-20
 """Added to x^2 + y^2 so that value and gradient are finite on the axis: a radius of 1e-10 in the points' unit."""
 
-NEWTON_STEPS = 24
+NEWTON_STEPS = 16
 """Safeguarded Newton steps of the inverse: bisection where a Newton step would leave the bracket."""
 
 
@@ -75,6 +75,22 @@ def check_fisheye(params: FisheyeParams) -> None:
             f"theta_d with k = {params.coefficients} stops growing at {math.degrees(limit):.2f} deg off the axis, "
             f"inside the field of view; expected fov_deg below {2 * math.degrees(limit):.2f}, got {params.fov_deg}"
         )
+
+
+def transfer_pixels(pixels: torch.Tensor, source: "Fisheye", target: "Fisheye") -> tuple[torch.Tensor, torch.Tensor]:
+    """Normalised coordinates in one lens of what another lens at the same place sees.
+
+    Args:
+        pixels: Pixels of the source [px], shape (..., 2).
+        source: The lens that took them.
+        target: The lens, say of training, whose coordinates are wanted.
+
+    Returns:
+        Normalised coordinates of the target [-], shape (..., 2), and validity (bool), shape (...): both lenses see it.
+    """
+    rays, seen = source.unproject(pixels)
+    normalized, valid = target.project_normalized(rays)
+    return normalized, seen & valid
 
 
 def monotonic_limit(coefficients: tuple[float, ...]) -> float:

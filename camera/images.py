@@ -1,0 +1,145 @@
+"""Image side of the camera, on kornia: rectified views, rotations and photometric augmentation of fisheye frames.
+
+Frames are torch images: float in [0, 1], shape (B, C, H, W), as kornia has them.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+
+from camera.fisheye import Fisheye
+
+
+@dataclass(frozen=True)
+class ViewParams:
+    """A pinhole view cut out of a fisheye frame.
+
+    The view looks along the fisheye's axis, turned by ``yaw_deg`` about the image's down axis (positive: to the right),
+    then by ``pitch_deg`` about its own right axis (positive: up).
+    """
+
+    width: int  # [px]
+    height: int  # [px]
+    fov_deg: float  # full horizontal field of view, below 180 [deg]
+    yaw_deg: float = 0.0  # [deg]
+    pitch_deg: float = 0.0  # [deg]
+
+
+@dataclass(frozen=True)
+class AugmentParams:
+    """Photometric augmentation; each factor is drawn uniformly within its half-width, per frame."""
+
+    brightness: float = 0.2  # [-]
+    contrast: float = 0.2  # [-]
+    saturation: float = 0.2  # [-]
+    hue: float = 0.02  # [turns]
+    noise_std: float = 0.02  # Gaussian, of the full scale [-]
+    blur_probability: float = 0.3  # of a 3 x 3 Gaussian blur [-]
+
+
+def view_rotation(view: ViewParams) -> torch.Tensor:
+    """Rotation from the view's frame to the fisheye's camera frame, float64, shape (3, 3)."""
+    yaw, pitch = math.radians(view.yaw_deg), math.radians(view.pitch_deg)
+    cy, sy, cp, sp = math.cos(yaw), math.sin(yaw), math.cos(pitch), math.sin(pitch)
+    about_y = torch.tensor([[cy, 0.0, sy], [0.0, 1.0, 0.0], [-sy, 0.0, cy]], dtype=torch.float64)
+    about_x = torch.tensor([[1.0, 0.0, 0.0], [0.0, cp, -sp], [0.0, sp, cp]], dtype=torch.float64)
+    return about_y @ about_x
+
+
+def view_focal(view: ViewParams) -> float:
+    """Focal length of a view [px].
+
+    Raises:
+        ValueError: The field of view is not one of a pinhole.
+    """
+    if not 0.0 < view.fov_deg < 180.0:
+        raise ValueError(
+            f"view fov_deg is {view.fov_deg}; expected an angle above 0 and below 180 deg, as a pinhole has"
+        )
+    return view.width / 2.0 / math.tan(math.radians(view.fov_deg) / 2.0)
+
+
+def view_map(lens: Fisheye, view: ViewParams) -> tuple[torch.Tensor, torch.Tensor]:
+    """Where in the fisheye frame each pixel of a view comes from.
+
+    Returns:
+        Pixels [px], float64, shape (H, W, 2), and whether they lie in the field of view and on the sensor, shape (H,
+        W).
+    """
+    focal = view_focal(view)
+    u = torch.arange(view.width, dtype=torch.float64) - (view.width - 1) / 2.0
+    v = torch.arange(view.height, dtype=torch.float64) - (view.height - 1) / 2.0
+    plane = torch.stack(torch.meshgrid(u, v, indexing="xy"), -1) / focal
+    rays = torch.cat([plane, torch.ones_like(plane[..., :1])], -1) @ view_rotation(view).T
+    pixels, valid = lens.project(rays)
+    return pixels, valid & lens.on_sensor(pixels)
+
+
+def rectify(frames: torch.Tensor, lens: Fisheye, view: ViewParams) -> torch.Tensor:
+    """Cut a rectified (pinhole) view out of fisheye frames.
+
+    Args:
+        frames: Shape (B, C, H, W) of the lens's size.
+        lens: The lens.
+        view: The view.
+
+    Returns:
+        Shape (B, C, view.height, view.width), black where the fisheye sees nothing.
+
+    Raises:
+        ValueError: The frames do not have the lens's size, or the view is no pinhole.
+    """
+    from kornia.geometry.transform import remap
+
+    size = (lens.params.height, lens.params.width)
+    if frames.dim() != 4 or tuple(frames.shape[-2:]) != size:
+        raise ValueError(f"frames of shape {tuple(frames.shape)} came; expected (B, C, {size[0]}, {size[1]})")
+    pixels, valid = view_map(lens, view)
+    pixels = pixels.to(frames)
+    batch = frames.shape[0]
+    map_x, map_y = (pixels[..., i].expand(batch, -1, -1) for i in (0, 1))
+    return remap(frames, map_x, map_y, mode="bilinear", align_corners=True) * valid.to(frames)
+
+
+def rotate_frames(frames: torch.Tensor, angle_deg: torch.Tensor, lens: Fisheye) -> torch.Tensor:
+    """Turn frames about the principal point: what the camera sees when it is turned about its optical axis.
+
+    Exact for a fisheye with fx = fy, whatever its distortion.
+
+    Args:
+        frames: Shape (B, C, H, W).
+        angle_deg: Angle by which the picture turns, counter-clockwise as seen [deg], shape (B,).
+        lens: The lens.
+
+    Returns:
+        Shape (B, C, H, W).
+    """
+    from kornia.geometry.transform import rotate as kornia_rotate
+
+    centre = frames.new_tensor([[lens.params.cx, lens.params.cy]]).expand(frames.shape[0], -1)
+    return kornia_rotate(frames, angle_deg.to(frames), center=centre, mode="bilinear", align_corners=True)
+
+
+def augment(frames: torch.Tensor, params: AugmentParams, seed: int) -> torch.Tensor:
+    """Vary brightness, contrast, saturation, hue, blur and noise of rendered frames; the geometry stays.
+
+    Args:
+        frames: RGB, shape (B, 3, H, W).
+        params: How much.
+        seed: Seed of this call; torch's global random state is left as it was.
+
+    Returns:
+        Shape (B, 3, H, W), in [0, 1].
+    """
+    from kornia.augmentation import AugmentationSequential, ColorJitter, RandomGaussianBlur, RandomGaussianNoise
+
+    steps = AugmentationSequential(
+        ColorJitter(params.brightness, params.contrast, params.saturation, params.hue, p=1.0),
+        RandomGaussianBlur((3, 3), (0.3, 1.2), p=params.blur_probability),
+        RandomGaussianNoise(0.0, params.noise_std, p=1.0),
+        data_keys=["input"],
+    )
+    with torch.random.fork_rng(devices=[frames.device] if frames.is_cuda else []):
+        torch.manual_seed(seed)
+        return steps(frames).clamp(0.0, 1.0)

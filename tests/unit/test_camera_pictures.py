@@ -1,0 +1,145 @@
+"""Renderer, overlay and image side: what is drawn lies where the keypoints say."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from camera import CameraParams, FisheyeParams, KeypointCamera, KeypointNoiseParams, MountParams, keypoints
+from camera.images import AugmentParams, ViewParams, augment, rectify, rotate_frames, view_map
+from camera.mount import rotation_from_vector
+from camera.overlay import draw_overlay
+from camera.render import pixel_rays, render_scene
+
+LENS = FisheyeParams(320, 320, 83.3, 83.3, 159.5, 159.5)
+CAMERA = KeypointCamera(
+    CameraParams(LENS, MountParams(position_b=(0.03, 0.0, -0.02)), KeypointNoiseParams(), 0.25, 0.033),
+    dtype=torch.float64,
+)
+# On the narrow side the picture is 320 px for 220 deg; a keypoint and the drawn edge differ by a pixel's width at most.
+PIXEL_TOLERANCE = 1.0
+
+
+def throw_scene(pitch_deg: float):
+    """A vehicle before the throw, its keypoints and its picture."""
+    pos_w = torch.tensor([[0.3, 0.05, 1.3]], dtype=torch.float64)
+    rot_wb = rotation_from_vector(torch.tensor([[0.1, math.radians(pitch_deg), 0.2]], dtype=torch.float64))
+    goal_w = torch.tensor([[1.4, 0.2]], dtype=torch.float64)
+    ball_w = torch.tensor([[0.45, 0.1, 1.02]], dtype=torch.float64)
+    points, valid = keypoints(CAMERA, pos_w, rot_wb, goal_w, ball_w)
+    eye_w = pos_w[0] + rot_wb[0] @ CAMERA.position_b
+    frame = render_scene(CAMERA.fisheye, eye_w, rot_wb[0] @ CAMERA.rot_cb.T, goal_w[0], ball_w[0], supersample=3)
+    return points[0], valid[0], frame
+
+
+@pytest.mark.parametrize("pitch_deg", [0.0, 30.0])
+def test_drawn_ball_and_goal_lie_where_the_keypoints_say(pitch_deg):
+    points, valid, frame = throw_scene(pitch_deg)
+    assert valid.all()
+    pixels = CAMERA.fisheye.denormalize(points).numpy()
+    red, green, blue = frame.numpy().transpose(2, 0, 1)
+    ball = (green > 1.5 * blue) & (red > 1.3 * blue)  # felt is the only yellow in the scene
+    v, u = np.nonzero(ball)
+    drawn = np.array([u.min() - 0.5, v.min() - 0.5, u.max() + 0.5, v.max() + 0.5])
+    box = np.array([pixels[4, 0], pixels[5, 1], pixels[6, 0], pixels[7, 1]])
+    assert np.abs(drawn - box).max() < PIXEL_TOLERANCE + 0.5
+    v, u = np.nonzero((green > 1.5 * red) & (green > 1.3 * blue))  # the goal's field is the only green
+    assert np.hypot(u.mean() - pixels[:4, 0].mean(), v.mean() - pixels[:4, 1].mean()) < PIXEL_TOLERANCE
+
+
+def test_frame_is_black_outside_the_field_of_view():
+    _, _, frame = throw_scene(0.0)
+    assert frame.shape == (320, 320, 3)
+    assert frame[0, 0].max() == 0.0
+    assert 0.0 < frame[160, 2].max() <= 1.0
+
+
+def test_pixel_rays_hit_pixel_centres():
+    rays, seen = pixel_rays(CAMERA.fisheye)
+    pixels, _ = CAMERA.fisheye.project(rays[100:110, 200:205])
+    assert seen[100, 200]
+    assert torch.allclose(pixels[0, 0], torch.tensor([200.0, 100.0], dtype=torch.float64), atol=1e-9)
+
+
+def test_overlay_colours_the_points_and_leaves_the_input():
+    points, valid, _ = throw_scene(0.0)
+    before = np.full((320, 320, 3), 7, np.uint8)
+    image = draw_overlay(CAMERA, points, valid, before, "t = 0")
+    assert image.dtype == np.uint8
+    assert (before == 7).all()
+    pixels = CAMERA.fisheye.denormalize(points).round().long()
+    for index, (u, v) in enumerate(pixels.tolist()):
+        _, green, red = image[v, u].astype(int)
+        assert (green > red + 60) if index < 4 else (red > green + 60)
+    assert (image > 200).all(-1).sum() > 60, "body axes"
+
+
+def test_overlay_marks_invalid_points_even_far_outside():
+    points, valid, _ = throw_scene(0.0)
+    all_seen = draw_overlay(CAMERA, points, valid)
+    points[0] = torch.tensor([1e9, -1e9])
+    valid = valid.clone()
+    valid[0] = False
+    image = draw_overlay(CAMERA, points, valid)
+    assert not np.array_equal(image, all_seen)
+    assert image[:8, -8:].max() > 100, "cut off to the image's corner"
+    with pytest.raises(ValueError, match="expected \\(320, 320, 3\\)"):
+        draw_overlay(CAMERA, points, valid, np.zeros((10, 10, 3), np.uint8))
+
+
+def test_rectified_view_has_straight_lines():
+    # A frame whose colour is the tangent of the angle to the right of the axis rectifies to a linear ramp.
+    lens = CAMERA.fisheye
+    rays, _ = pixel_rays(lens)
+    ahead = rays[..., 2] > 0.3
+    ramp = torch.where(ahead, rays[..., 0] / rays[..., 2].clamp(min=0.3), torch.zeros_like(rays[..., 0]))
+    view = ViewParams(81, 61, 90.0)
+    straight = rectify(ramp[None, None], lens, view)[0, 0]
+    expected = (torch.arange(81, dtype=torch.float64) - 40.0) / 40.5
+    # Bilinear sampling of tan(theta) at 83 px/rad: second-order, (1/83)^2 / 8 * tan'' = 7e-4 at 45 deg off and corners.
+    assert (straight[30] - expected).abs().max() < 2e-3
+    assert (straight[:, 60] - expected[60]).abs().max() < 2e-3
+
+
+def test_turned_view_looks_where_it_says():
+    pixels, seen = view_map(CAMERA.fisheye, ViewParams(41, 41, 60.0, yaw_deg=50.0))
+    # Equidistant: 50 deg to the right is 83.3 * 50 deg from the principal point, along u.
+    assert seen.all()
+    expected = torch.tensor([159.5 + 83.3 * math.radians(50.0), 159.5], dtype=torch.float64)
+    assert torch.allclose(pixels[20, 20], expected, atol=1e-9)
+    up, _ = view_map(CAMERA.fisheye, ViewParams(41, 41, 60.0, pitch_deg=50.0))
+    assert torch.allclose(up[20, 20], torch.tensor([159.5, 159.5 - 83.3 * math.radians(50.0)], dtype=torch.float64))
+    _, past = view_map(CAMERA.fisheye, ViewParams(41, 41, 90.0, yaw_deg=100.0))
+    assert not past[20, 40]
+
+
+def test_turned_frame_turns_the_keypoints():
+    _, _, frame = throw_scene(0.0)
+    frames = frame.permute(2, 0, 1)[None]
+    turned = rotate_frames(frames, torch.tensor([90.0]), CAMERA.fisheye)[0]
+    # A quarter turn counter-clockwise about the middle of a square picture is a transpose and a flip.
+    assert (turned - frames[0].rot90(1, (1, 2))).abs().max() < 1e-3
+
+
+def test_augmentation_is_photometric_and_seeded():
+    _, _, frame = throw_scene(0.0)
+    frames = frame.permute(2, 0, 1)[None].repeat(2, 1, 1, 1)
+    state = torch.random.get_rng_state()
+    first, again, other = (augment(frames, AugmentParams(), seed) for seed in (1, 1, 2))
+    assert torch.equal(state, torch.random.get_rng_state())
+    assert torch.equal(first, again)
+    assert not torch.equal(first, other)
+    assert not torch.equal(first[0], first[1])
+    assert first.min() >= 0.0
+    assert first.max() <= 1.0
+    # Geometry stays: bright and dark tiles remain in place, so the pictures stay correlated.
+    assert torch.corrcoef(torch.stack([frames[0].mean(0).ravel(), first[0].mean(0).ravel()]))[0, 1] > 0.9
+
+
+def test_image_refusals():
+    frames = torch.zeros(1, 3, 10, 10)
+    with pytest.raises(ValueError, match=r"expected \(B, C, 320, 320\)"):
+        rectify(frames, CAMERA.fisheye, ViewParams(10, 10, 90.0))
+    with pytest.raises(ValueError, match="below 180 deg"):
+        rectify(torch.zeros(1, 3, 320, 320), CAMERA.fisheye, ViewParams(10, 10, 190.0))
