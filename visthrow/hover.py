@@ -25,7 +25,7 @@ class HoverParams:
 
     position_gain: float = 1.5  # velocity asked for a metre off [1/s]
     velocity_gain: float = 3.5  # [1/s]
-    integral_gain: float = 2.0  # [1/s^3]
+    integral_gain: float = 3.0  # [1/s^3]
     integral_limit: float = 1.5  # of each component [m/s^2]
     integral_radius: float = 0.3  # distance from the goal within which the integral grows [m]
     max_speed: float = 1.5  # of the velocity asked for [m/s]

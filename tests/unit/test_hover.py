@@ -204,7 +204,7 @@ def test_commands_by_hand():
     controller.reset()
     # 0.1 m above the goal, integral aside: velocity asked -0.15 m/s, acceleration -0.525 m/s^2.
     low = controller.step(np.array([[0, 0, 0.1]]), level, still, still, 1.0)[0, 0]
-    step_of_integral = 2.0 * PERIOD * 0.1
+    step_of_integral = 3.0 * PERIOD * 0.1
     assert low == pytest.approx(GRAVITY - 3.5 * 1.5 * 0.1 - step_of_integral, abs=1e-12)
 
 
