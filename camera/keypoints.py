@@ -193,7 +193,8 @@ def keypoints(
     Returns:
         Keypoints [-], shape (E, 8, 2), normalised image coordinates (x right, y down, 1 at the edge of the field of
         view), goal corners first (order of `goal_square`), then the payload's box (left, top, right, bottom); and
-        validity (bool), shape (E, 8). Invalid points are on the edge (``invalid_reads = "edge"``) or zero.
+        validity (bool), shape (E, 8). With ``invalid_reads = "edge"`` an invalid corner reads its direction at the edge
+        and an invalid side of the box is that of the outline clipped to the edge; with ``"zero"`` both read zero.
     """
     rot_cb, position_b = (camera.rot_cb, camera.position_b) if extrinsics is None else extrinsics
     corners_w = goal_corners_w(goal_w, square_w=camera.square_w)
