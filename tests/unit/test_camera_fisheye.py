@@ -194,3 +194,16 @@ def test_pixels_of_another_lens_are_taken_over():
     theta = torch.atan2(rays[:, :2].norm(dim=-1), rays[:, 2])
     assert torch.equal(valid, theta <= source.half_fov)
     assert torch.allclose(moved[valid], expected[valid], atol=ANGLE_TOLERANCE)
+
+
+def test_same_bits_for_any_batch_and_memory_layout():
+    generator = torch.Generator().manual_seed(2)
+    components = torch.randn(3, 1003, 8, generator=generator)  # x, y and z each contiguous
+    for params in (EQUIDISTANT, BENT):
+        lens = Fisheye(params)
+        batch, _ = lens.project_normalized(components.movedim(0, -1))
+        packed, _ = lens.project_normalized(components.movedim(0, -1).contiguous())
+        assert torch.equal(batch, packed)
+        for i in range(0, 1003, 17):
+            single, _ = lens.project_normalized(components[:, i : i + 1].contiguous().movedim(0, -1))
+            assert torch.equal(single[0], batch[i])
