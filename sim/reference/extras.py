@@ -11,8 +11,8 @@ Vector = tuple[float, float, float]
 class ReferenceExtras:
     """Switchable effects of the reference plant.
 
-    Fields that end in ``_sigma`` are standard deviations of a normal draw at each reset, one an environment; fields that
-    end in ``_jitter`` are half-widths of a uniform draw at each event; the others are values. Zero switches off.
+    Fields that end in ``_sigma`` are standard deviations of a normal draw at each reset, one an environment; fields
+    that end in ``_jitter`` are half-widths of a uniform draw at each event; the others are values. Zero switches off.
 
     Raises:
         ValueError: a negative value where only the sign of 0 or more makes sense.
@@ -20,9 +20,15 @@ class ReferenceExtras:
 
     payload_drag: float = 0.0  # 1/2 rho C_d A of the payload, on the rope and in flight [kg/m]
     wind_mean_w: Vector = (0.0, 0.0, 0.0)  # world frame [m/s]
-    wind_sigma_w: Vector = (0.0, 0.0, 0.0)  # of an Ornstein-Uhlenbeck process, each axis [m/s]; drawn on, not at reset only
+    wind_sigma_w: Vector = (
+        0.0,
+        0.0,
+        0.0,
+    )  # of an Ornstein-Uhlenbeck process, each axis [m/s]; drawn on, not at reset only
     wind_time_constant: float = 1.0  # of that process [s]
-    stretch_stiffness: float = 0.0  # of the whole rope, tension over elongation, lumped at its end [N/m]; 0: inextensible
+    stretch_stiffness: float = (
+        0.0  # of the whole rope, tension over elongation, lumped at its end [N/m]; 0: inextensible
+    )
     stretch_damping: float = 0.0  # [N s/m]
     extra_joint_damping: float = 0.0  # added to RopeParams.joint_damping [N m s]
     com_offset: Vector = (0.0, 0.0, 0.0)  # centre of mass from the frame's origin, body frame [m]
@@ -59,5 +65,7 @@ def load_extras(path: str | Path) -> ReferenceExtras:
         raw = tomllib.load(file)
     known = {f.name for f in fields(ReferenceExtras)}
     if raw.keys() != known:
-        raise ValueError(f"{path}: unknown keys {sorted(raw.keys() - known)}, missing keys {sorted(known - raw.keys())}")
+        raise ValueError(
+            f"{path}: unknown keys {sorted(raw.keys() - known)}, missing keys {sorted(known - raw.keys())}"
+        )
     return ReferenceExtras(**{key: tuple(value) if isinstance(value, list) else value for key, value in raw.items()})

@@ -1,7 +1,7 @@
 """MuJoCo models of quadrotor, rope and payload, built with ``MjSpec``.
 
-Body frames: a rod's body frame has its origin at the rod's upper end and its z axis against the rod's direction, so that
-a level quadrotor with a hanging rope has every relative rotation at identity.
+Body frames: a rod's body frame has its origin at the rod's upper end and its z axis against the rod's direction, so
+that a level quadrotor with a hanging rope has every relative rotation at identity.
 
 Joints:
 
@@ -18,7 +18,6 @@ from dataclasses import dataclass
 from typing import Literal
 
 import mujoco
-import numpy as np
 
 from sim.params import GRAVITY
 
@@ -50,7 +49,9 @@ def _set_inertial(body: "mujoco.MjsBody", mass: float, centre_z: float, inertia:
     body.explicitinertial = True
 
 
-def _rod_inertial(rope: RopeModel, last: bool, with_payload: bool, axial: float) -> tuple[float, float, tuple[float, float, float]]:
+def _rod_inertial(
+    rope: RopeModel, last: bool, with_payload: bool, axial: float
+) -> tuple[float, float, tuple[float, float, float]]:
     """Mass, height of the centre of mass in the rod's frame and inertia about it, payload included on the last rod."""
     mass, length = rope.segment_mass, rope.segment_length
     about_centre = mass * length**2 / 12.0
@@ -153,21 +154,3 @@ def _add_chain(
         slide = payload.add_joint(name="stretch", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 0, -1])
         slide.stiffness[0] = stretch[0]
         slide.damping[0] = stretch[1]
-
-
-def rotation_from_direction(direction_w: np.ndarray) -> np.ndarray:
-    """Return rotations whose -z axis is ``direction_w``, shape (..., 3, 3), turned as little as possible from hanging.
-
-    Args:
-        direction_w: unit vectors, shape (..., 3).
-
-    Source: Frisvad, Building an orthonormal basis from a 3D unit vector without normalization, 2012, with the branch of
-    Duff et al. 2017 on the sign of z, so that no direction is singular.
-    """
-    z = -np.asarray(direction_w, dtype=np.float64)
-    sign = np.where(z[..., 2] >= 0.0, 1.0, -1.0)
-    a = -1.0 / (sign + z[..., 2])
-    b = z[..., 0] * z[..., 1] * a
-    x_axis = np.stack((1.0 + sign * z[..., 0] ** 2 * a, sign * b, -sign * z[..., 0]), -1)
-    y_axis = np.stack((b, sign + z[..., 1] ** 2 * a, -z[..., 1]), -1)
-    return np.stack((x_axis, y_axis, z), -1)

@@ -86,7 +86,9 @@ def initial_data(model: "mujoco.MjModel", scene: Scene) -> "mujoco.MjData":
     """Return MuJoCo data of a universal-joint model at the start of a scene."""
     data = mujoco.MjData(model)
     rot_wb = matrix_from_quat(scene.quat_wb)
-    angles, rates = hinges_from_directions(rot_wb, rot_wb @ np.array(scene.rate_b), scene.cable_dir_w(), scene.cable_vel_w())
+    angles, rates = hinges_from_directions(
+        rot_wb, rot_wb @ np.array(scene.rate_b), scene.cable_dir_w(), scene.cable_vel_w()
+    )
     data.qpos[:3], data.qpos[3:7] = scene.pos_w, np.roll(scene.quat_wb, 1)
     data.qpos[7:] = angles
     data.qvel[:3], data.qvel[3:6], data.qvel[6:] = scene.vel_w, scene.rate_b, rates

@@ -42,13 +42,24 @@ class Scene:
     ball_inertia: float  # transverse, about the ball's centre [kg m^2]
     ball_offset: float  # ball's centre past the end of the last segment [m]
     direction: tuple[float, float, float]  # of the whole rope from the mount outwards, world frame, any length
-    cable_rate_w: tuple[float, float, float]  # angular velocity of the whole rope, world frame [rad/s]; axial part ignored
+    cable_rate_w: tuple[
+        float, float, float
+    ]  # angular velocity of the whole rope, world frame [rad/s]; axial part ignored
     joint_damping: float  # [N m s]
     duration: float  # [s]
     schedule: tuple[Wrench, ...]
 
     def __post_init__(self) -> None:
-        lengths = {"inertia": 3, "pos_w": 3, "quat_wb": 4, "vel_w": 3, "rate_b": 3, "mount": 3, "direction": 3, "cable_rate_w": 3}
+        lengths = {
+            "inertia": 3,
+            "pos_w": 3,
+            "quat_wb": 4,
+            "vel_w": 3,
+            "rate_b": 3,
+            "mount": 3,
+            "direction": 3,
+            "cable_rate_w": 3,
+        }
         for name, size in lengths.items():
             if len(getattr(self, name)) != size:
                 raise ValueError(f"scene: {name} has {len(getattr(self, name))} numbers, expected {size}")
@@ -95,7 +106,9 @@ def load_scene(path: str | Path) -> Scene:
         raw = tomllib.load(file)
     known = {f.name for f in fields(Scene)}
     if raw.keys() != known:
-        raise ValueError(f"{path}: unknown keys {sorted(raw.keys() - known)}, missing keys {sorted(known - raw.keys())}")
+        raise ValueError(
+            f"{path}: unknown keys {sorted(raw.keys() - known)}, missing keys {sorted(known - raw.keys())}"
+        )
     entries = raw.pop("schedule")
     values = {key: tuple(value) if isinstance(value, list) else value for key, value in raw.items()}
     weight = (values["mass"] + values["segments"] * values["segment_mass"] + values["ball_mass"]) * GRAVITY
@@ -103,7 +116,9 @@ def load_scene(path: str | Path) -> Scene:
     for entry in entries:
         allowed = {"t_start", "torque_b", "thrust_weights"}, {"t_start", "torque_b", "force_b"}
         if entry.keys() not in allowed:
-            raise ValueError(f"{path}: schedule entry has {sorted(entry)}, expected t_start, torque_b and force_b or thrust_weights")
+            raise ValueError(
+                f"{path}: schedule entry has {sorted(entry)}, expected t_start, torque_b and force_b or thrust_weights"
+            )
         force = entry["force_b"] if "force_b" in entry else (0.0, 0.0, entry["thrust_weights"] * weight)
         schedule.append(Wrench(float(entry["t_start"]), tuple(force), tuple(entry["torque_b"])))
     return Scene(**values, schedule=tuple(schedule))

@@ -1,0 +1,237 @@
+"""The blocks of the vehicle in float64 NumPy, from the equations in the docstrings of ``sim.params``.
+
+Every function is pure and takes E environments at once. Body frame x forward, y left, z up; SI units. Suffix ``_dot``
+is a time derivative. Written apart from the training simulator on purpose: it shares the equations, not the code.
+"""
+
+import numpy as np
+
+from sim.params import (
+    AeroParams,
+    BatteryParams,
+    ControllerParams,
+    MotorParams,
+    RotorParams,
+    ThrustParams,
+    VehicleParams,
+)
+from sim.reference.rotations import cross
+
+TIME_TOLERANCE = 1e-10
+"""Times closer than this are one event [s]; a control period of 20 ms has no finer structure."""
+
+
+def command_queue(times: np.ndarray, commands: np.ndarray, now: np.ndarray) -> np.ndarray:
+    """Return the command that acts at ``now``: the latest whose time has come.
+
+    Args:
+        times: when each command starts to act [s], shape (K, E), ascending along K; the first long before ``now``.
+        commands: collective thrust [N] and body rates [rad/s], shape (K, E, 4).
+        now: [s], shape (E,).
+    """
+    index = np.sum(times <= now + TIME_TOLERANCE, axis=0) - 1
+    return commands[index, np.arange(len(now))]
+
+
+def _motor_shares(torque: np.ndarray, rotors: RotorParams, torque_ratio: float) -> tuple[np.ndarray, np.ndarray]:
+    """Thrust of each motor for roll and pitch, and for yaw [N], shapes (E, 4)."""
+    x, y, spin = np.array(rotors.x), np.array(rotors.y), np.array(rotors.spin)
+    roll = torque[:, :1] * y / (4.0 * np.mean(y**2))
+    pitch = -torque[:, 1:2] * x / (4.0 * np.mean(x**2))
+    yaw = torque[:, 2:] * spin / (4.0 * torque_ratio)
+    return roll + pitch, yaw
+
+
+def mixer(
+    thrust: np.ndarray, torque: np.ndarray, rotors: RotorParams, torque_ratio: float, f_min: float, f_max: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Share collective thrust and torque out to the motors; yaw gives way first, then roll and pitch.
+
+    Args:
+        thrust: [N], shape (E,).
+        torque: [N m], shape (E, 3).
+        rotors: geometry.
+        torque_ratio: nominal kappa [m].
+        f_min: least thrust a motor [N].
+        f_max: largest thrust a motor [N], shape (E,).
+
+    Returns:
+        Thrusts [N], shape (E, 4); whether a limit acted, shape (E,).
+    """
+    tilt, yaw = _motor_shares(torque, rotors, torque_ratio)
+    room = f_max - f_min
+    extent = np.ptp(tilt, axis=1)
+    scale = np.where(extent > room, room / np.maximum(extent, 1e-300), 1.0)
+    tilt = tilt * scale[:, None]
+    left = np.maximum(room - np.ptp(tilt, axis=1), 0.0) / 2.0
+    clipped_yaw = np.clip(yaw, -left[:, None], left[:, None])
+    wanted = thrust[:, None] / 4.0 + tilt + clipped_yaw
+    raise_by = np.maximum(f_min - wanted.min(axis=1), 0.0)
+    lower_by = np.maximum(wanted.max(axis=1) - f_max, 0.0)
+    saturated = (scale < 1.0) | np.any(clipped_yaw != yaw, axis=1) | (raise_by > 0.0) | (lower_by > 0.0)
+    return wanted + (raise_by - lower_by)[:, None], saturated
+
+
+def betaflight(
+    vehicle: VehicleParams,
+    setpoint: np.ndarray,
+    gyro: np.ndarray,
+    integral: np.ndarray,
+    command: np.ndarray,
+    rate: np.ndarray,
+    voltage: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Rate controller with set-point filter, P, I with anti-windup, D on a filtered gyro, feed-forward and mixer.
+
+    Args:
+        vehicle: parameters.
+        setpoint: filtered set-point [rad/s], shape (E, 3).
+        gyro: filtered rate [rad/s], shape (E, 3).
+        integral: [N m], shape (E, 3).
+        command: acting command, shape (E, 4).
+        rate: true body rate [rad/s], shape (E, 3).
+        voltage: of the battery [V], shape (E,).
+
+    Returns:
+        Motor-speed set-points [rad/s], shape (E, 4), and the time derivatives of set-point, gyro and integral.
+    """
+    gains: ControllerParams = vehicle.controller
+    setpoint_dot = (command[:, 1:] - setpoint) / gains.setpoint_time_constant
+    gyro_dot = (rate - gyro) / gains.gyro_time_constant
+    torque = np.array(gains.p_gain) * (setpoint - rate) + integral
+    torque = torque - np.array(gains.d_gain) * gyro_dot + np.array(gains.feedforward_gain) * setpoint_dot
+    relative = voltage / vehicle.battery.reference_voltage
+    f_max = gains.max_thrust * relative**2
+    thrusts, saturated = mixer(
+        command[:, 0], torque, vehicle.rotors, vehicle.thrust.torque_ratio, gains.min_thrust, f_max
+    )
+    integral_dot = np.array(gains.i_gain) * (setpoint - rate)
+    growing = integral_dot * integral > 0.0
+    full = np.abs(integral) >= np.array(gains.integral_limit)
+    integral_dot = np.where(growing & (full | saturated[:, None]), 0.0, integral_dot)
+    correction = 1.0 + (1.0 - gains.voltage_compensation) * (relative - 1.0)
+    return np.sqrt(thrusts / vehicle.thrust.k_f) * correction[:, None], setpoint_dot, gyro_dot, integral_dot
+
+
+def geometric(vehicle: VehicleParams, command: np.ndarray, rate: np.ndarray) -> np.ndarray:
+    """Return the motor-speed set-points of the simple rate controller [rad/s], shape (E, 4)."""
+    gains = vehicle.controller
+    inertia = np.array(vehicle.body.inertia)
+    torque = gains.geometric_gain * inertia * (command[:, 1:] - rate) + cross(rate, inertia * rate)
+    tilt, yaw = _motor_shares(torque, vehicle.rotors, vehicle.thrust.torque_ratio)
+    thrusts = np.clip(command[:, :1] / 4.0 + tilt + yaw, gains.min_thrust, gains.max_thrust)
+    return np.sqrt(thrusts / vehicle.thrust.k_f)
+
+
+def motor(params: MotorParams, speed: np.ndarray, setpoint: np.ndarray) -> np.ndarray:
+    """Return the acceleration of the rotors [rad/s^2], shape (E, 4); zero where they follow at once."""
+    if params.kind == "instant":
+        return np.zeros_like(speed)
+    return (setpoint - speed) / params.time_constant
+
+
+def open_circuit_voltage(params: BatteryParams, used: np.ndarray) -> np.ndarray:
+    """Return the voltage without load [V], shape (E,)."""
+    return params.ocv[0] + used * (params.ocv[1] + used * (params.ocv[2] + used * params.ocv[3]))
+
+
+def electrical_power(params: BatteryParams, speed: np.ndarray, rotor_torque: np.ndarray) -> np.ndarray:
+    """Return the power that the vehicle draws [W], shape (E,)."""
+    return params.idle_power + np.sum(np.abs(rotor_torque) * speed, axis=1) / params.efficiency
+
+
+def battery(
+    params: BatteryParams, used: np.ndarray, voltage: np.ndarray, speed: np.ndarray, rotor_torque: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the rates of used fraction [1/s] and terminal voltage [V/s], shapes (E,)."""
+    if params.kind == "ideal":
+        return np.zeros_like(used), np.zeros_like(voltage)
+    current = electrical_power(params, speed, rotor_torque) / voltage
+    sagged = open_circuit_voltage(params, used) - params.resistance * current
+    return current / (3600.0 * params.capacity), (sagged - voltage) / params.time_constant
+
+
+def thrust_map(
+    params: ThrustParams, reference_voltage: float, speed: np.ndarray, voltage: np.ndarray, gain: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return thrust [N] and aerodynamic torque [N m] of the rotors, shapes (E, 4).
+
+    Args:
+        params: thrust map.
+        reference_voltage: u_ref [V].
+        speed: [rad/s], shape (E, 4).
+        voltage: [V], shape (E,).
+        gain: error of each motor's thrust, 1 for none, shape (E, 4).
+    """
+    factor = 1.0 + params.voltage_coefficient * (voltage - reference_voltage)
+    thrust = (params.k_f * speed**2 + params.k_1 * speed) * factor[:, None] * gain
+    return thrust, params.torque_ratio * thrust
+
+
+def aerodynamics(
+    params: AeroParams,
+    arms: np.ndarray,
+    torque_ratio: float,
+    thrust: np.ndarray,
+    air_velocity_b: np.ndarray,
+    rate: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return what the relative air adds.
+
+    Args:
+        params: coefficients.
+        arms: rotor hubs from the centre of mass [m], shape (E, 4, 3).
+        torque_ratio: kappa [m].
+        thrust: of the rotors [N], shape (E, 4).
+        air_velocity_b: of the centre of mass relative to the air, body frame [m/s], shape (E, 3).
+        rate: body rate [rad/s], shape (E, 3).
+
+    Returns:
+        Drag force [N] and flapping torque [N m], shapes (E, 3); change of each rotor's thrust [N] and of its drag
+        torque [N m], shapes (E, 4).
+    """
+    if params.kind == "none":
+        return np.zeros_like(rate), np.zeros_like(rate), np.zeros_like(thrust), np.zeros_like(thrust)
+    v = air_velocity_b
+    force = -np.array([params.drag_x, params.drag_y, params.drag_z]) * v
+    force = force - params.parasitic * np.linalg.norm(v, axis=1, keepdims=True) * v
+    hub = v[:, None, :] + cross(rate[:, None, :], arms)
+    thrust_change = thrust * (
+        -params.inflow * hub[..., 2] + params.translational_lift * (hub[..., 0] ** 2 + hub[..., 1] ** 2)
+    )
+    torque_change = torque_ratio * thrust * (-params.torque_inflow * hub[..., 2])
+    total = thrust.sum(axis=1)
+    flapping = params.flapping * total[:, None] * np.stack((-v[:, 1], v[:, 0], np.zeros_like(total)), -1)
+    return force, flapping, thrust_change, torque_change
+
+
+def composer(
+    rotors: RotorParams,
+    arms: np.ndarray,
+    thrust: np.ndarray,
+    rotor_torque: np.ndarray,
+    speed: np.ndarray,
+    speed_dot: np.ndarray,
+    rate: np.ndarray,
+    aero: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+) -> tuple[np.ndarray, np.ndarray]:
+    """Add up the body wrench about the centre of mass.
+
+    Returns:
+        Force [N] and torque [N m], body frame, shapes (E, 3).
+
+    Convention: the change of thrust by inflow enters the force as well as the torque.
+    """
+    spin = np.array(rotors.spin)
+    drag, flapping, thrust_change, torque_change = aero
+    lift = thrust + thrust_change
+    force = drag.copy()
+    force[:, 2] += lift.sum(axis=1)
+    torque = flapping.copy()
+    torque[:, 0] += np.sum(arms[..., 1] * lift, axis=1)
+    torque[:, 1] -= np.sum(arms[..., 0] * lift, axis=1)
+    torque[:, 2] += np.sum(spin * (rotor_torque + torque_change + rotors.inertia * speed_dot), axis=1)
+    momentum = -rotors.inertia * np.sum(spin * speed, axis=1)
+    torque[:, 0] -= rate[:, 1] * momentum
+    torque[:, 1] += rate[:, 0] * momentum
+    return force, torque

@@ -1,0 +1,416 @@
+"""The whole plant in float64: vehicle, rope and payload, release and flight, with the extras of the real world.
+
+Integration: classical RK4 over bodies, rope and block states together; MuJoCo gives the accelerations of each stage.
+Command switches, the separation and the instants of motion-capture samples fall on step edges exactly.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sim.params import GRAVITY, PlantParams
+from sim.reference import blocks
+from sim.reference.extras import ReferenceExtras
+from sim.reference.flight import crossing, segments_of_period
+from sim.reference.model import RopeModel
+from sim.reference.quadrotor import BLOCKS, BODY, VehicleErrors, initial_blocks, rigid_body_rates, vehicle_rates
+from sim.reference.rope import RopeDynamics
+from sim.reference.rotations import cross, quat_dot, rotation_from_quat, turned, turned_back
+from sim.reference.stepping import halving_rk4
+
+LARGEST_DECAY = 2.2
+"""Decay rate times step that the plant allows itself [-]; RK4 is stable to 2.78 on the real axis."""
+
+
+@dataclass(frozen=True)
+class PlantState:
+    """State of E plants; world frame, quaternions xyzw.
+
+    Positions are of the frame's origin, not of a shifted centre of mass.
+    """
+
+    time: float  # [s]
+    pos_w: np.ndarray  # [m], shape (E, 3)
+    quat_wb: np.ndarray  # shape (E, 4)
+    vel_w: np.ndarray  # [m/s], shape (E, 3)
+    rate_b: np.ndarray  # [rad/s], shape (E, 3)
+    payload_pos_w: np.ndarray  # its centre [m], shape (E, 3); where it landed after landing
+    payload_vel_w: np.ndarray  # [m/s], shape (E, 3)
+    cable_points_w: np.ndarray  # upper end, joints, lower end of the rope [m], shape (E, L+1, 3)
+    motor_speed: np.ndarray  # [rad/s], shape (E, 4)
+    battery_voltage: np.ndarray  # [V], shape (E,)
+    attached: np.ndarray  # rope on the vehicle, shape (E,), bool
+    latched: np.ndarray  # release requested, shape (E,), bool
+
+
+@dataclass(frozen=True)
+class Landing:
+    """Where and when the payloads came down; NaN where they did not yet."""
+
+    landed: np.ndarray  # shape (E,), bool
+    point_w: np.ndarray  # of the payload's centre [m], shape (E, 3)
+    time: np.ndarray  # [s], shape (E,)
+    separation_time: np.ndarray  # [s], shape (E,)
+
+
+class ReferencePlant:
+    """Vehicles with ropes.
+
+    Args:
+        params: vehicle, rope, release; of ``params.sim`` only the control period is used.
+        extras: effects that the training simulator lacks.
+        seed: of every random draw.
+        count: E.
+        step: largest integration step [s].
+
+    Raises:
+        ValueError: a step that is not positive.
+    """
+
+    def __init__(
+        self,
+        params: PlantParams,
+        extras: ReferenceExtras = ReferenceExtras(),
+        seed: int = 0,
+        count: int = 1,
+        step: float = 5e-4,
+    ) -> None:
+        if not step > 0.0:
+            raise ValueError(f"plant: step is {step} s, expected more than 0")
+        self.params, self.extras, self.count, self.step_size = params, extras, count, step
+        self._rng = np.random.default_rng(seed)
+        self._ropes = None
+        height = 1.5
+        pos_w = np.tile([0.0, 0.0, height], (count, 1))
+        self.reset(pos_w, np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)), np.zeros((count, 3)), np.zeros((count, 3)))
+
+    def reset(
+        self,
+        pos_w: np.ndarray,
+        quat_wb: np.ndarray,
+        vel_w: np.ndarray,
+        rate_b: np.ndarray,
+        cable_dir_w: np.ndarray | None = None,
+        cable_vel_w: np.ndarray | None = None,
+    ) -> None:
+        """Draw new vehicles and ropes and put them at a state; rotors, battery and command queue in hover.
+
+        Args:
+            pos_w: of the frame's origin [m], shape (E, 3).
+            quat_wb: xyzw, shape (E, 4).
+            vel_w: of the frame's origin [m/s], shape (E, 3).
+            rate_b: [rad/s], shape (E, 3).
+            cable_dir_w: unit directions of the segments from the mount outwards, shape (E, L, 3); None for hanging.
+            cable_vel_w: their time derivatives [1/s], shape (E, L, 3); None for zero.
+
+        Raises:
+            ValueError: an array of another shape.
+        """
+        count, segments = self.count, self.params.rope.segments
+        hanging = np.tile([0.0, 0.0, -1.0], (count, segments, 1))
+        given = {
+            "pos_w": (pos_w, (count, 3)),
+            "quat_wb": (quat_wb, (count, 4)),
+            "vel_w": (vel_w, (count, 3)),
+            "rate_b": (rate_b, (count, 3)),
+            "cable_dir_w": (hanging if cable_dir_w is None else cable_dir_w, (count, segments, 3)),
+            "cable_vel_w": (np.zeros_like(hanging) if cable_vel_w is None else cable_vel_w, (count, segments, 3)),
+        }
+        values = {}
+        for name, (value, shape) in given.items():
+            values[name] = np.array(value, dtype=np.float64)
+            if values[name].shape != shape:
+                raise ValueError(f"plant: {name} has shape {values[name].shape}, expected {shape}")
+        self._draw()
+        rotation = rotation_from_quat(values["quat_wb"])
+        offset_w = turned(rotation, self._errors.com_offset)
+        offset_vel = turned(rotation, cross(values["rate_b"], self._errors.com_offset))
+        body = np.hstack(
+            (values["pos_w"] + offset_w, values["quat_wb"], values["vel_w"] + offset_vel, values["rate_b"])
+        )
+        weight = (self.params.vehicle.body.mass + self._rope_mass) * GRAVITY
+        block = initial_blocks(self.params.vehicle, values["rate_b"], weight, self._used)
+        n = values["cable_dir_w"] / np.linalg.norm(values["cable_dir_w"], axis=-1, keepdims=True)
+        n_dot = values["cable_vel_w"] - np.sum(values["cable_vel_w"] * n, -1, keepdims=True) * n
+        self._state = np.hstack(
+            (body, block, np.zeros((count, 6)), n.reshape(count, -1), n_dot.reshape(count, -1), np.zeros((count, 2)))
+        )
+        if self._ropes.stretch is not None:
+            self._state[:, -2] = self._payload_mass * GRAVITY / self.extras.stretch_stiffness
+        hover = np.zeros((count, 4))
+        hover[:, 0] = weight
+        self._queue_times, self._queue_commands = [np.full(count, -np.inf)], [hover]
+        self.time = 0.0
+        self._attached, self._latched, self._landed = np.ones(count, bool), np.zeros(count, bool), np.zeros(count, bool)
+        self._separation, self._landing_time = np.full(count, np.nan), np.full(count, np.nan)
+        self._landing_point = np.full((count, 3), np.nan)
+        self._samples = [(-np.inf, self.state)]
+
+    def _draw(self) -> None:
+        """Draw the errors of this episode and build the ropes."""
+        extras, rope, vehicle, count, rng = self.extras, self.params.rope, self.params.vehicle, self.count, self._rng
+        gain = 1.0 + extras.thrust_gain_error + extras.thrust_gain_sigma * rng.standard_normal((count, 1))
+        gain = gain + extras.motor_gain_sigma * rng.standard_normal((count, 4))
+        com = np.array(extras.com_offset) + np.array(extras.com_offset_sigma) * rng.standard_normal((count, 3))
+        self._errors = VehicleErrors(gain, com)
+        self._payload_mass = rope.payload_mass * (1.0 + extras.payload_mass_sigma * rng.standard_normal(count))
+        length = rope.length * (1.0 + extras.rope_length_sigma * rng.standard_normal(count))
+        self._used = rng.uniform(0.0, 1.0, count) * extras.battery_start_used
+        self._rope_mass = self._payload_mass + rope.rope_mass
+        self._wind = np.array(extras.wind_mean_w) + np.array(extras.wind_sigma_w) * rng.standard_normal((count, 3))
+        self._next_wind = self._wind
+        # Compiling a model takes milliseconds; without these draws the ropes of the last episode serve on.
+        if self._ropes is not None and not (
+            extras.payload_mass_sigma or extras.rope_length_sigma or any(extras.com_offset_sigma)
+        ):
+            return
+        base = RopeModel(
+            mass=vehicle.body.mass,
+            inertia=vehicle.body.inertia,
+            mount=rope.mount,
+            segments=rope.segments,
+            segment_length=rope.length / rope.segments,
+            segment_mass=rope.rope_mass / rope.segments,
+            payload_mass=rope.payload_mass,
+            payload_inertia=rope.payload_inertia,
+            payload_offset=rope.payload_offset,
+            joint_damping=rope.joint_damping + extras.extra_joint_damping,
+        )
+        models = [
+            replace(
+                base,
+                mount=tuple(np.array(rope.mount) - com[i]),
+                segment_length=length[i] / rope.segments,
+                payload_mass=self._payload_mass[i],
+                payload_inertia=rope.payload_inertia * self._payload_mass[i] / rope.payload_mass,
+            )
+            for i in range(count)
+        ]
+        stretch = (extras.stretch_stiffness, extras.stretch_damping) if extras.stretch_stiffness > 0.0 else None
+        self._ropes = RopeDynamics(models, stretch)
+        # The bending modes of light segments die out faster than RK4 bears, at rates up to 48 d / (m l^2).
+        fastest = 48.0 * base.joint_damping / (base.segment_mass * float(np.min(length) / rope.segments) ** 2)
+        self._step = min(self.step_size, LARGEST_DECAY / fastest) if fastest > 0.0 else self.step_size
+
+    def _rope_of(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Directions, their derivatives, elongation and its rate."""
+        n, n_dot = (state[:, columns].reshape(len(state), -1, 3) for columns in self._rope_columns)
+        return n, n_dot, state[:, -2], state[:, -1]
+
+    @property
+    def _rope_columns(self) -> tuple[slice, slice]:
+        start, size = BODY + BLOCKS + 6, 3 * self._ropes.segments
+        return slice(start, start + size), slice(start + size, start + 2 * size)
+
+    def _upper_end(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Position and velocity of the rope's upper end: the mount while attached."""
+        rotation = rotation_from_quat(state[:, 3:7])
+        arm = turned(rotation, self._ropes.mount)
+        arm_dot = turned(rotation, cross(state[:, 10:13], self._ropes.mount))
+        on = self._attached[:, None]
+        free = state[:, BODY + BLOCKS : BODY + BLOCKS + 6]
+        return np.where(on, state[:, 0:3] + arm, free[:, :3]), np.where(on, state[:, 7:10] + arm_dot, free[:, 3:])
+
+    def _rates(self, state: np.ndarray, command: np.ndarray, wind_w: np.ndarray, moving: np.ndarray) -> np.ndarray:
+        """Time derivative of the whole state; ropes that have landed and environments not ``moving`` stand still."""
+        vehicle, rates = self.params.vehicle, np.zeros_like(state)
+        rotation = rotation_from_quat(state[:, 3:7])
+        body, rate_b = state[:, :BODY], state[:, 10:13]
+        air_b = turned_back(rotation, body[:, 7:10] - wind_w)
+        force_b, torque_b, rates[:, BODY : BODY + BLOCKS] = vehicle_rates(
+            vehicle, self._errors, state[:, BODY : BODY + BLOCKS], command, air_b, rate_b
+        )
+        force_w = turned(rotation, force_b)
+        rates[:, :BODY] = rigid_body_rates(vehicle, body, force_w, torque_b)
+        rope = self._rope_of(state)
+        root = self._upper_end(state)
+        drag_w = self._payload_force(root, rope, wind_w)
+        second = np.zeros_like(rope[0])
+        stretch_dot = np.zeros(self.count)
+        ids = np.flatnonzero(self._attached & moving)
+        if len(ids):
+            picked = tuple(part[ids] for part in rope)
+            wrench = (force_w[ids], torque_b[ids])
+            rates[ids, 7:10], rates[ids, 10:13], second[ids], stretch_dot[ids] = self._ropes.attached(
+                ids, body[ids], rotation[ids], wrench, picked, drag_w[ids]
+            )
+        flying = np.flatnonzero(~self._attached & ~self._landed & moving)
+        free = slice(BODY + BLOCKS, BODY + BLOCKS + 6)
+        if len(flying):
+            picked = tuple(part[flying] for part in rope)
+            acceleration, second[flying], stretch_dot[flying] = self._ropes.free(
+                flying, (root[0][flying], root[1][flying]), picked, drag_w[flying]
+            )
+            rates[flying, free] = np.hstack((root[1][flying], acceleration))
+        airborne = (~self._landed)[:, None]
+        direction, velocity = self._rope_columns
+        rates[:, direction] = (rope[1] * airborne[..., None]).reshape(self.count, -1)
+        rates[:, velocity] = second.reshape(self.count, -1)
+        rates[:, -2], rates[:, -1] = rope[3] * airborne[:, 0], stretch_dot
+        return rates
+
+    def _payload_force(
+        self, root: tuple[np.ndarray, np.ndarray], rope: tuple[np.ndarray, ...], wind_w: np.ndarray
+    ) -> np.ndarray:
+        """Drag of the payload [N], world frame, shape (E, 3)."""
+        if self.extras.payload_drag == 0.0:
+            return np.zeros((self.count, 3))
+        relative = self._ropes.points(*root, rope)[2] - wind_w
+        return -self.extras.payload_drag * np.linalg.norm(relative, axis=1, keepdims=True) * relative
+
+    def step(self, command: np.ndarray, release: np.ndarray | bool = False) -> None:
+        """Give a command now and advance one control period.
+
+        Args:
+            command: collective thrust [N] and body rates [rad/s], shape (E, 4); acts after the delay of the queue.
+            release: latch the release now, shape (E,), bool; a latch does not untrip.
+        """
+        extras, rng, period = self.extras, self._rng, self.params.sim.control_period
+        start, end = self.time, self.time + period
+        delay = self.params.vehicle.queue.delay + extras.delay_jitter * rng.uniform(-1.0, 1.0, self.count)
+        self._queue_times.append(np.maximum(start + np.maximum(delay, 0.0), self._queue_times[-1]))
+        self._queue_commands.append(np.broadcast_to(np.asarray(command, dtype=np.float64), (self.count, 4)).copy())
+        lag = self.params.release.lag + extras.release_lag_jitter * rng.uniform(-1.0, 1.0, self.count)
+        tripped = np.broadcast_to(np.asarray(release, dtype=bool), (self.count,)) & ~self._latched
+        self._separation = np.where(tripped, start + np.maximum(lag, 0.0), self._separation)
+        self._latched = self._latched | tripped
+        decay = np.exp(-period / extras.wind_time_constant)
+        mean, sigma = np.array(extras.wind_mean_w), np.array(extras.wind_sigma_w)
+        self._next_wind = (
+            mean + decay * (self._wind - mean) + np.sqrt(1 - decay**2) * sigma * rng.standard_normal((self.count, 3))
+        )
+        self._advance(start, end)
+        self._wind, self.time = self._next_wind, end
+        self._prune(end)
+
+    def _advance(self, start: float, end: float) -> None:
+        """Integrate one period, from event to event in each environment."""
+        sample = end - self.extras.mocap_latency % (end - start)
+        times, commands = np.array(self._queue_times), np.array(self._queue_commands)
+        edges = [
+            [start, *[t for t in (*times[1:, e], self._separation[e], sample) if start < t < end], end]
+            for e in range(self.count)
+        ]
+        steps = segments_of_period(edges, self._step)
+        clock = np.full(self.count, start)
+        for column in steps.T:
+            self._separate(clock)
+            moving = column > 0.0
+            middle = clock + 0.5 * column
+            command = blocks.command_queue(times, commands, middle)
+            share = ((middle - start) / (end - start))[:, None]
+            wind_w = self._wind + share * (self._next_wind - self._wind)
+            before = self._state
+            self._state = halving_rk4(
+                lambda x, h: self._rates(x, command, wind_w, h > 0.0), before, column, *self._rope_columns
+            )
+            self._normalise()
+            self._land(before, clock, column)
+            clock = clock + column
+            reached = moving & (np.abs(clock - sample) < blocks.TIME_TOLERANCE)
+            if np.any(reached):
+                self._keep_sample(sample, reached)
+        self._separate(clock)
+
+    def _separate(self, clock: np.ndarray) -> None:
+        """Open the loop of the ropes whose time has come: their upper ends fly on with the mount's velocity."""
+        due = self._attached & (self._separation <= clock + blocks.TIME_TOLERANCE)
+        if np.any(due):
+            pos, vel = self._upper_end(self._state)
+            self._state[due, BODY + BLOCKS : BODY + BLOCKS + 6] = np.hstack((pos, vel))[due]
+            self._attached = self._attached & ~due
+
+    def _normalise(self) -> None:
+        self._state[:, 3:7] /= np.linalg.norm(self._state[:, 3:7], axis=1, keepdims=True)
+        n, n_dot, _, _ = self._rope_of(self._state)
+        n /= np.linalg.norm(n, axis=-1, keepdims=True)
+        n_dot -= np.sum(n * n_dot, -1, keepdims=True) * n
+
+    def _land(self, before: np.ndarray, clock: np.ndarray, step: np.ndarray) -> None:
+        """Record payloads that pass the landing height within this step."""
+        flying = ~self._attached & ~self._landed & (step > 0.0)
+        if not np.any(flying):
+            return
+        height = self.params.release.landing_height
+        ends = [
+            self._ropes.points(*self._upper_end(state), self._rope_of(state))[1:] for state in (before, self._state)
+        ]
+        for e in np.flatnonzero(flying & (ends[1][0][:, 2] <= height)):
+            share, point = crossing(ends[0][0][e], ends[0][1][e], ends[1][0][e], ends[1][1][e], step[e], height)
+            self._landed[e] = True
+            self._landing_time[e], self._landing_point[e] = clock[e] + share * step[e], point
+
+    def _keep_sample(self, time: float, reached: np.ndarray) -> None:
+        """Keep the state for the motion capture; environments reach the same instant in different columns."""
+        now = self.state
+        if self._samples[-1][0] == time:
+            older = self._samples.pop()[1]
+            keep = {}
+            for name in ("pos_w", "quat_wb", "vel_w", "rate_b", "payload_pos_w", "payload_vel_w", "cable_points_w"):
+                new, old = getattr(now, name), getattr(older, name)
+                keep[name] = np.where(reached.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+            now = replace(older, **keep)
+        self._samples.append((time, replace(now, time=time)))
+
+    def _prune(self, now: float) -> None:
+        while len(self._queue_times) > 1 and np.all(self._queue_times[1] <= now):
+            del self._queue_times[0], self._queue_commands[0]
+        while len(self._samples) > 1 and self._samples[1][0] <= now - self.extras.mocap_latency + blocks.TIME_TOLERANCE:
+            del self._samples[0]
+
+    @property
+    def state(self) -> PlantState:
+        """The true state now."""
+        state = self._state
+        rotation = rotation_from_quat(state[:, 3:7])
+        offset = self._errors.com_offset
+        points, payload, payload_vel = self._ropes.points(*self._upper_end(state), self._rope_of(state))
+        return PlantState(
+            time=self.time,
+            pos_w=state[:, 0:3] - turned(rotation, offset),
+            quat_wb=state[:, 3:7].copy(),
+            vel_w=state[:, 7:10] - turned(rotation, cross(state[:, 10:13], offset)),
+            rate_b=state[:, 10:13].copy(),
+            payload_pos_w=np.where(self._landed[:, None], self._landing_point, payload),
+            payload_vel_w=np.where(self._landed[:, None], 0.0, payload_vel),
+            cable_points_w=points,
+            motor_speed=state[:, BODY + 9 : BODY + 13].copy(),
+            battery_voltage=state[:, BODY + 14].copy(),
+            attached=self._attached.copy(),
+            latched=self._latched.copy(),
+        )
+
+    @property
+    def landing(self) -> Landing:
+        """Where and when the payloads came down."""
+        separated = np.where(self._attached, np.nan, self._separation)
+        return Landing(self._landed.copy(), self._landing_point.copy(), self._landing_time.copy(), separated)
+
+    def measured(self) -> PlantState:
+        """Return the state as motion capture and gyro give it: late by the latency, with noise drawn anew at each call.
+
+        ``time`` is when the sample was taken. ``cable_points_w`` and the flags are not measured: points come without
+        noise for drawing, the flags as the vehicle knows them now.
+        """
+        extras, rng = self.extras, self._rng
+        time, sample = self._samples[0]
+        rotation_noise = 0.5 * extras.mocap_angle_sigma * rng.standard_normal((self.count, 3))
+        quat = sample.quat_wb + quat_dot(sample.quat_wb, 2.0 * rotation_noise)
+        noisy = {
+            name: getattr(sample, name) + sigma * rng.standard_normal((self.count, 3))
+            for name, sigma in (
+                ("pos_w", extras.mocap_position_sigma),
+                ("payload_pos_w", extras.mocap_position_sigma),
+                ("vel_w", extras.mocap_velocity_sigma),
+                ("payload_vel_w", extras.mocap_velocity_sigma),
+                ("rate_b", extras.gyro_sigma),
+            )
+        }
+        return replace(
+            sample,
+            time=max(time, 0.0),
+            quat_wb=quat / np.linalg.norm(quat, axis=1, keepdims=True),
+            attached=self._attached.copy(),
+            latched=self._latched.copy(),
+            **noisy,
+        )

@@ -1,0 +1,187 @@
+"""The quadrotor without a rope: the seven blocks on a free rigid body, float64 RK4 in NumPy.
+
+Also the vehicle of ``sim.reference.plant``: there MuJoCo takes the place of the rigid body while the rope is on.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sim.params import GRAVITY, VehicleParams
+from sim.reference import blocks
+from sim.reference.rotations import cross, quat_dot, rotation_from_quat, turned, turned_back
+from sim.reference.stepping import rk4
+
+BODY = 13
+"""Columns of a body: position 0:3, quaternion xyzw 3:7, velocity 7:10 (world, centre of mass), rate 10:13 (body)."""
+BLOCKS = 15
+"""Columns of the blocks: set-point 0:3, gyro 3:6, integral 6:9, motor speed 9:13, used fraction 13, voltage 14."""
+
+
+@dataclass(frozen=True)
+class VehicleErrors:
+    """Errors of E built vehicles against their parameters."""
+
+    thrust_gain: np.ndarray  # of each motor, 1 for none, shape (E, 4)
+    com_offset: np.ndarray  # centre of mass from the frame's origin, body frame [m], shape (E, 3)
+
+    @classmethod
+    def none(cls, count: int) -> "VehicleErrors":
+        """Return perfect vehicles."""
+        return cls(np.ones((count, 4)), np.zeros((count, 3)))
+
+
+def rotor_arms(vehicle: VehicleParams, errors: VehicleErrors) -> np.ndarray:
+    """Return the rotor hubs from the centre of mass [m], shape (E, 4, 3)."""
+    rotors = vehicle.rotors
+    hubs = np.stack((np.array(rotors.x), np.array(rotors.y), np.full(4, rotors.z)), -1)
+    return hubs[None] - errors.com_offset[:, None, :]
+
+
+def initial_blocks(vehicle: VehicleParams, rate_b: np.ndarray, weight: np.ndarray, used: np.ndarray) -> np.ndarray:
+    """Return block states in steady hover, shape (E, 15).
+
+    Set-point filter at zero, gyro filter settled on the present rate, no integral, rotors at the speed that carries
+    ``weight``, terminal voltage settled under that load.
+
+    Args:
+        vehicle: parameters.
+        rate_b: [rad/s], shape (E, 3).
+        weight: to be carried [N], shape (E,).
+        used: fraction of the battery used, shape (E,).
+    """
+    count, cell, thrust = len(weight), vehicle.battery, vehicle.thrust
+    state = np.zeros((count, BLOCKS))
+    state[:, 3:6] = rate_b
+    voltage = np.full(count, cell.reference_voltage)
+    for _ in range(50):
+        lift = weight / 4.0 / (1.0 + thrust.voltage_coefficient * (voltage - cell.reference_voltage))
+        speed = 2.0 * lift / (thrust.k_1 + np.sqrt(thrust.k_1**2 + 4.0 * thrust.k_f * lift))
+        if cell.kind == "ideal":
+            break
+        torque = np.full((count, 4), thrust.torque_ratio) * weight[:, None] / 4.0
+        power = blocks.electrical_power(cell, np.repeat(speed[:, None], 4, 1), torque)
+        source = blocks.open_circuit_voltage(cell, used)
+        voltage = (source + np.sqrt(source**2 - 4.0 * cell.resistance * power)) / 2.0
+    state[:, 9:13] = speed[:, None]
+    if cell.kind != "ideal":
+        state[:, 13] = used
+    state[:, 14] = voltage
+    return state
+
+
+def vehicle_rates(
+    vehicle: VehicleParams,
+    errors: VehicleErrors,
+    state: np.ndarray,
+    command: np.ndarray,
+    air_velocity_b: np.ndarray,
+    rate_b: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Run the seven blocks.
+
+    Args:
+        vehicle: parameters.
+        errors: of the vehicles.
+        state: of the blocks, shape (E, 15).
+        command: acting command, shape (E, 4).
+        air_velocity_b: velocity relative to the air, body frame [m/s], shape (E, 3).
+        rate_b: [rad/s], shape (E, 3).
+
+    Returns:
+        Force [N] and torque [N m] about the centre of mass, body frame, shapes (E, 3), and the state's time derivative.
+    """
+    used, voltage = state[:, 13], state[:, 14]
+    rates = np.zeros_like(state)
+    if vehicle.controller.kind == "geometric":
+        setpoint = blocks.geometric(vehicle, command, rate_b)
+    else:
+        setpoint, rates[:, 0:3], rates[:, 3:6], rates[:, 6:9] = blocks.betaflight(
+            vehicle, state[:, 0:3], state[:, 3:6], state[:, 6:9], command, rate_b, voltage
+        )
+    speed = setpoint if vehicle.motor.kind == "instant" else state[:, 9:13]
+    rates[:, 9:13] = blocks.motor(vehicle.motor, speed, setpoint)
+    thrust, torque = blocks.thrust_map(
+        vehicle.thrust, vehicle.battery.reference_voltage, speed, voltage, errors.thrust_gain
+    )
+    rates[:, 13], rates[:, 14] = blocks.battery(vehicle.battery, used, voltage, speed, torque)
+    arms = rotor_arms(vehicle, errors)
+    aero = blocks.aerodynamics(vehicle.aero, arms, vehicle.thrust.torque_ratio, thrust, air_velocity_b, rate_b)
+    force_b, torque_b = blocks.composer(vehicle.rotors, arms, thrust, torque, speed, rates[:, 9:13], rate_b, aero)
+    return force_b, torque_b, rates
+
+
+def rigid_body_rates(vehicle: VehicleParams, body: np.ndarray, force_w: np.ndarray, torque_b: np.ndarray) -> np.ndarray:
+    """Return the time derivative of free bodies, shape (E, 13), under world force [N], gravity and torque [N m]."""
+    inertia = np.array(vehicle.body.inertia)
+    rate = body[:, 10:13]
+    rates = np.empty_like(body)
+    rates[:, 0:3] = body[:, 7:10]
+    rates[:, 3:7] = quat_dot(body[:, 3:7], rate)
+    rates[:, 7:10] = force_w / vehicle.body.mass - np.array([0.0, 0.0, GRAVITY])
+    rates[:, 10:13] = (torque_b - cross(rate, inertia * rate)) / inertia
+    return rates
+
+
+class ReferenceQuadrotor:
+    """Quadrotors without ropes.
+
+    Args:
+        vehicle: parameters.
+        count: E.
+        step: largest integration step [s].
+    """
+
+    def __init__(self, vehicle: VehicleParams, count: int = 1, step: float = 5e-4) -> None:
+        self.vehicle, self.count, self.step_size = vehicle, count, step
+        self.errors = VehicleErrors.none(count)
+        self.force_w = np.zeros((count, 3))  # external, at the centre of mass [N]
+        self.torque_b = np.zeros((count, 3))  # external, about the centre of mass [N m]
+        self.reset(
+            np.zeros((count, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)), np.zeros((count, 3)), np.zeros((count, 3))
+        )
+
+    def reset(self, pos_w: np.ndarray, quat_wb: np.ndarray, vel_w: np.ndarray, rate_b: np.ndarray) -> None:
+        """Put all vehicles at a state with the rotors, battery and command queue in hover."""
+        self.time = 0.0
+        weight = np.full(self.count, self.vehicle.body.mass * GRAVITY)
+        self.body = np.hstack((pos_w, quat_wb, vel_w, rate_b)).astype(np.float64)
+        self.blocks = initial_blocks(self.vehicle, self.body[:, 10:13], weight, np.zeros(self.count))
+        hover = np.zeros((self.count, 4))
+        hover[:, 0] = weight
+        self._queue = [(-np.inf, hover)]
+
+    def _rates(self, state: np.ndarray, command: np.ndarray) -> np.ndarray:
+        body, rotation = state[:, :BODY], rotation_from_quat(state[:, 3:7])
+        air = turned_back(rotation, body[:, 7:10])
+        force, torque, block_rates = vehicle_rates(
+            self.vehicle, self.errors, state[:, BODY:], command, air, body[:, 10:13]
+        )
+        force_w = turned(rotation, force) + self.force_w
+        return np.hstack((rigid_body_rates(self.vehicle, body, force_w, torque + self.torque_b), block_rates))
+
+    def step(self, command: np.ndarray, period: float = 0.02) -> None:
+        """Give a command now and advance one control period.
+
+        Args:
+            command: collective thrust [N] and body rates [rad/s], shape (E, 4).
+            period: [s].
+        """
+        self._queue.append((self.time + self.vehicle.queue.delay, np.array(command, dtype=np.float64)))
+        end = self.time + period
+        edges = [
+            self.time,
+            *[t for t, _ in self._queue if self.time + blocks.TIME_TOLERANCE < t < end - blocks.TIME_TOLERANCE],
+            end,
+        ]
+        state = np.hstack((self.body, self.blocks))
+        for start, stop in zip(edges, edges[1:]):
+            acting = [c for t, c in self._queue if t <= start + blocks.TIME_TOLERANCE][-1]
+            count = int(np.ceil((stop - start) / self.step_size - 1e-6))
+            for _ in range(count):
+                state = rk4(lambda x: self._rates(x, acting), state, (stop - start) / count)
+                state[:, 3:7] /= np.linalg.norm(state[:, 3:7], axis=1, keepdims=True)
+        self.body, self.blocks = state[:, :BODY], state[:, BODY:]
+        self.time = end
+        past = [i for i, (t, _) in enumerate(self._queue) if t <= end]
+        self._queue = self._queue[past[-1] :]
