@@ -57,18 +57,26 @@ def mixer(
 
     Returns:
         Thrusts [N], shape (E, 4); whether a limit acted, shape (E,).
+
+    Convention: yaw takes the largest part of what is asked for that keeps the spread of the four within the limits.
     """
-    tilt, yaw = _motor_shares(torque, rotors, torque_ratio)
+    tilt, _ = _motor_shares(torque, rotors, torque_ratio)
     room = f_max - f_min
     extent = np.ptp(tilt, axis=1)
     scale = np.where(extent > room, room / np.maximum(extent, 1e-300), 1.0)
     tilt = tilt * scale[:, None]
-    left = np.maximum(room - np.ptp(tilt, axis=1), 0.0) / 2.0
-    clipped_yaw = np.clip(yaw, -left[:, None], left[:, None])
+    # Yaw y lifts the motors of one sense by y and lowers the others; a spread grows by 2 y between the two kinds only.
+    spin = np.array(rotors.spin)
+    clockwise, other = tilt[:, spin > 0.0], tilt[:, spin < 0.0]
+    most = (room - (clockwise.max(axis=1) - other.min(axis=1))) / 2.0
+    least = -(room - (other.max(axis=1) - clockwise.min(axis=1))) / 2.0
+    amount = torque[:, 2] / (4.0 * torque_ratio)
+    clipped = np.clip(amount, np.minimum(least, 0.0), np.maximum(most, 0.0))
+    clipped_yaw = spin * clipped[:, None]
     wanted = thrust[:, None] / 4.0 + tilt + clipped_yaw
     raise_by = np.maximum(f_min - wanted.min(axis=1), 0.0)
     lower_by = np.maximum(wanted.max(axis=1) - f_max, 0.0)
-    saturated = (scale < 1.0) | np.any(clipped_yaw != yaw, axis=1) | (raise_by > 0.0) | (lower_by > 0.0)
+    saturated = (scale < 1.0) | (clipped != amount) | (raise_by > 0.0) | (lower_by > 0.0)
     return wanted + (raise_by - lower_by)[:, None], saturated
 
 

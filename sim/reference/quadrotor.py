@@ -41,7 +41,7 @@ def rotor_arms(vehicle: VehicleParams, errors: VehicleErrors) -> np.ndarray:
 def initial_blocks(vehicle: VehicleParams, rate_b: np.ndarray, weight: np.ndarray, used: np.ndarray) -> np.ndarray:
     """Return block states in steady hover, shape (E, 15).
 
-    Set-point filter at zero, gyro filter settled on the present rate, no integral, rotors at the speed that carries
+    Filters of set-point and gyro settled on the present rate, no integral, rotors at the speed that carries
     ``weight``, terminal voltage settled under that load.
 
     Args:
@@ -52,6 +52,7 @@ def initial_blocks(vehicle: VehicleParams, rate_b: np.ndarray, weight: np.ndarra
     """
     count, cell, thrust = len(weight), vehicle.battery, vehicle.thrust
     state = np.zeros((count, BLOCKS))
+    state[:, 0:3] = rate_b
     state[:, 3:6] = rate_b
     voltage = np.full(count, cell.reference_voltage)
     for _ in range(50):
