@@ -57,15 +57,15 @@ class ControllerParams:
     - ``r' = (w_cmd - r) / setpoint_time_constant``
     - ``g' = (w - g) / gyro_time_constant``
     - ``tau = p_gain (r - w) + i - d_gain g' + feedforward_gain r'``  (per axis, [N m])
-    - ``i' = i_gain (r - w)``, held at 0 where it would grow an integral beyond ``integral_limit`` (|i| >= limit and
-      i' i > 0), or while the mixer is saturated and ``i' i > 0``.
+    - ``i' = i_gain (r - w)``; where it would grow an integral (``i' i > 0``) it is 0 at ``|i| >= integral_limit`` and
+      otherwise scaled by the share of the demanded torque that the mixer delivers: roll and pitch by their common scale,
+      yaw by clipped over wanted. (Continuous in the state: a hard hold while saturated makes trajectories depend on the step.)
 
     Mixer: per-motor thrusts ``f_i = c/4 + roll_i + pitch_i + yaw_i`` with ``roll_i = tau_x y_i / (4 ybar^2)``,
     ``pitch_i = -tau_y x_i / (4 xbar^2)``, ``yaw_i = tau_z s_i / (4 kappa)`` (``ybar^2`` mean of y_i^2, ``xbar^2`` of x_i^2,
     kappa the nominal torque-to-thrust ratio). With D = f_max - f_min: roll+pitch are scaled by D / range where their range
     exceeds D; then yaw is clipped to what range D leaves; then the collective is shifted so that every f_i lies in
-    [f_min, f_max]. ``f_max = max_thrust (u / u_ref)^2`` follows the battery voltage u. The mixer counts as saturated when
-    any of the three acted. Motor-speed set-point: ``Omega* = sqrt(f_i / k_f) (1 + (1 - voltage_compensation) (u / u_ref - 1))``.
+    [f_min, f_max]. ``f_max = max_thrust (u / u_ref)^2`` follows the battery voltage u. Motor-speed set-point: ``Omega* = sqrt(f_i / k_f) (1 + (1 - voltage_compensation) (u / u_ref - 1))``.
 
     ``geometric`` (the ablation): ``tau = geometric_gain J (w_cmd - w) + w x J w`` without filters, integral or
     voltage; f_i clipped one by one to [f_min, max_thrust]; ``Omega* = sqrt(f_i / k_f)``.

@@ -27,4 +27,5 @@ def on_torch_stream(device: str):
     """Context in which Warp launches on torch's current stream, so that both can be captured in one CUDA graph."""
     if not device.startswith("cuda"):
         return wp.ScopedDevice(device)
-    return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream()))
+    capturing = torch.cuda.is_current_stream_capturing()  # a capture may not wait for another stream
+    return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream()), sync_enter=not capturing)

@@ -14,6 +14,7 @@ os.environ.setdefault("GIT_PYTHON_REFRESH", "quiet")
 
 import torch
 from rsl_rl.algorithms import PPO
+from rsl_rl.modules.distribution import GaussianDistribution
 from tensordict import TensorDict
 
 from visthrow import config, protocol, provenance
@@ -27,12 +28,20 @@ CHECKPOINT = "checkpoint.pt"
 POLICY = "policy.npz"
 
 
+class CapturableGaussian(GaussianDistribution):
+    """rsl_rl's Gaussian with a sample that a CUDA graph can hold: torch.normal copies its spread's minimum to the host."""
+
+    def sample(self) -> torch.Tensor:
+        """Sample of the current distribution."""
+        return self.mean + self.std * torch.randn_like(self.mean)
+
+
 def rsl_rl_config(p: PPOParams, ranks: dict | None) -> dict:
     """Configuration dictionary of rsl_rl 5.5 for our parameters; both observation groups are named."""
     network = {
         "class_name": "MLPModel", "hidden_dims": list(p.hidden), "activation": p.activation, "obs_normalization": p.normalize,
     }
-    spread = {"class_name": "GaussianDistribution", "init_std": p.initial_std, "std_type": "log"}
+    spread = {"class_name": CapturableGaussian, "init_std": p.initial_std, "std_type": "log"}
     algorithm = {
         "class_name": "PPO", "num_learning_epochs": p.epochs, "num_mini_batches": p.minibatches, "learning_rate": p.learning_rate,
         "schedule": p.schedule, "desired_kl": p.desired_kl, "gamma": p.discount, "lam": p.gae_lambda, "clip_param": p.clip,
@@ -112,7 +121,20 @@ class Trainer:
             with torch.cuda.graph(graph):
                 self._rollout()
             self._graph = graph
+            self._captured_std = [(n, n._std) for n in self._normalizers()]
             graph.replay()
+
+    def _normalizers(self) -> list:
+        models = (self.alg.actor, self.alg.critic)
+        return [m.obs_normalizer for m in models if m.obs_normalization]
+
+    def _learn(self) -> dict[str, float]:
+        figures = self.alg.update()
+        if self._graph is not None:  # rsl_rl makes a new tensor of the spread; the graph reads the one it was captured with
+            for normalizer, captured in self._captured_std:
+                captured.copy_(normalizer._std)
+                normalizer._std = captured
+        return figures
 
     def step(self) -> dict[str, float]:
         """One iteration: rollout and update. Returns losses and the finished episodes' means."""
@@ -122,7 +144,7 @@ class Trainer:
         if self.device.startswith("cuda"):
             torch.cuda.synchronize()
         middle = time.perf_counter()
-        figures = self.alg.update()
+        figures = self._learn()
         end = time.perf_counter()
         self.seconds["rollout"] += middle - start
         self.seconds["learning"] += end - middle

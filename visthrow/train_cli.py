@@ -69,13 +69,13 @@ def run(args: argparse.Namespace) -> int:
     last = args.iterations or experiment.ppo.iterations
     log = Log(folder / "progress.csv", trainer.samples_per_iteration, last, start, quiet=not lead, resume=args.resume)
     interrupted = False
-    evaluated = {}
     try:
         while trainer.iteration < last:
             figures = trainer.step()
             if lead and args.evaluate_every and trainer.iteration % args.evaluate_every == 0:
                 evaluated = trainer.evaluate(EVALUATION_TARGET)
-                figures |= {"error_2m": evaluated.get("error_mean", float("nan")), "success_2m": evaluated["success"]}
+                nan = float("nan")
+                figures |= {"error_2m": evaluated.get("error_mean", nan), "duration_2m": evaluated.get("duration_mean", nan)}
             log.row(figures)
             if lead and trainer.iteration % args.checkpoint_every == 0:
                 trainer.save(folder / CHECKPOINT)
@@ -134,7 +134,7 @@ class Log:
         wall = time.perf_counter() - self.start
         names = [
             "iteration", "released", "landing_error", "duration", "episodes", "value", "surrogate", "entropy", "learning_rate",
-            "rollout_s", "learning_s", "wall_s", "error_2m", "success_2m",
+            "rollout_s", "learning_s", "wall_s", "error_2m", "duration_2m",
         ]
         if self._writer is None:
             self._writer = csv.DictWriter(self._file, names, extrasaction="ignore")
@@ -148,7 +148,7 @@ class Log:
             f"landing error {figures['landing_error']:.3f} m  {wall:.0f} s"
         )
         if "error_2m" in figures:
-            print(f"\r{text}  at 2.0 m: {figures['error_2m']:.4f} m", flush=True)
+            print(f"\r{text}  at 2.0 m: {figures['error_2m']:.4f} m, {figures['duration_2m']:.3f} s", flush=True)
         elif sys.stdout.isatty():
             print(f"\r{text}   ", end="", flush=True)
         elif figures["iteration"] % 25 == 0:

@@ -43,7 +43,7 @@ def mix(p: Any, collective: Any, torque_b: Any, max_thrust: Any):
     """Distribute thrust [N] and torque [N m] over four rotors; gives up yaw first, then collective, then roll and pitch.
 
     Returns:
-        Thrust of each rotor [N], shape (4,), and whether the demand could not be met.
+        Thrust of each rotor [N], shape (4,), and the delivered shares of the roll-pitch and of the yaw demand, 0 to 1.
     """
     zero = collective - collective
     room = max_thrust - p.controller.min_thrust
@@ -61,8 +61,10 @@ def mix(p: Any, collective: Any, torque_b: Any, max_thrust: Any):
     f = share
     for i in range(4):
         f[i] = wp.max(share[i] + base, zero)
-    saturated = scale < type(collective)(1.0) or yaw != yaw_wanted or base != quarter
-    return f, saturated
+    yaw_share = type(collective)(1.0)
+    if yaw != yaw_wanted:
+        yaw_share = wp.max(yaw / yaw_wanted, zero)
+    return f, scale, yaw_share
 
 
 @wp.func
@@ -81,13 +83,17 @@ def rate_controller_betaflight(p: Any, command: Any, rate_b: Any, integral: Any,
         wp.cw_mul(c.p_gain, error) + integral - wp.cw_mul(c.d_gain, gyro_rate) + wp.cw_mul(c.feedforward_gain, setpoint_rate)
     )
     ratio = voltage / p.battery.reference_voltage
-    f, saturated = mix(p, command[0], torque, c.max_thrust * ratio * ratio)
+    f, share, yaw_share = mix(p, command[0], torque, c.max_thrust * ratio * ratio)
     integral_rate = wp.cw_mul(c.i_gain, error)
     zero = voltage - voltage
     for i in range(3):
-        grows = integral_rate[i] * integral[i] > zero
-        if grows and (saturated or wp.abs(integral[i]) >= c.integral_limit[i]):
-            integral_rate[i] = zero
+        if integral_rate[i] * integral[i] > zero:
+            delivered = share
+            if i == 2:
+                delivered = yaw_share
+            if wp.abs(integral[i]) >= c.integral_limit[i]:
+                delivered = zero
+            integral_rate[i] = integral_rate[i] * delivered
     one = type(voltage)(1.0)
     speed = speeds_of_thrusts(p, f) * (one + (one - c.voltage_compensation) * (ratio - one))
     return speed, integral_rate, setpoint_rate, gyro_rate
