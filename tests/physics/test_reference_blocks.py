@@ -1,0 +1,192 @@
+"""The reference's blocks against closed forms and conservation laws."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from sim.params import GRAVITY
+from sim.reference import blocks
+from sim.reference.quadrotor import (
+    ReferenceQuadrotor,
+    VehicleErrors,
+    initial_blocks,
+    rigid_body_rates,
+    rotor_arms,
+    vehicle_rates,
+)
+from sim.reference.stepping import rk4
+from tests.plants import paper_plant, plain_vehicle
+
+EXACT = 1e-12
+"""Round-off of some ten operations on numbers of order 1."""
+LEVEL = np.array([[0.0, 0.0, 0.0, 1.0]])
+
+
+@pytest.fixture(scope="module")
+def vehicle():
+    return paper_plant().vehicle
+
+
+def fly(quadrotor, command, periods):
+    for _ in range(periods):
+        quadrotor.step(np.array([command]))
+
+
+def test_queue_switches_at_the_delay_exactly(vehicle):
+    """A step of thrust after 22 ms: the rotors answer 22 ms after the command, within a period, as 1 - exp(-t / T)."""
+    plain = plain_vehicle(vehicle)
+    quadrotor = ReferenceQuadrotor(plain)
+    start = quadrotor.blocks[0, 9]
+    weight = plain.body.mass * GRAVITY
+    fly(quadrotor, (2.0 * weight, 0.0, 0.0, 0.0), 1)
+    np.testing.assert_allclose(quadrotor.blocks[0, 9:13], start, rtol=EXACT)
+    fly(quadrotor, (2.0 * weight, 0.0, 0.0, 0.0), 2)
+    answered = 0.06 - plain.queue.delay
+    final = np.sqrt(2.0 * weight / 4.0 / plain.thrust.k_f)
+    expected = final + (start - final) * np.exp(-answered / plain.motor.time_constant)
+    np.testing.assert_allclose(quadrotor.blocks[0, 9:13], expected, rtol=1e-9)  # RK4, 15 us to the power of 4
+
+
+def test_queue_takes_the_latest_that_is_due():
+    times = np.array([[-np.inf, -np.inf], [1.0, 2.0], [3.0, 3.0]])
+    commands = np.arange(24.0).reshape(3, 2, 4)
+    picked = blocks.command_queue(times, commands, np.array([1.0, 1.999]))
+    np.testing.assert_array_equal(picked, [commands[1, 0], commands[0, 1]])
+
+
+def test_battery_settles_where_source_and_load_meet(vehicle):
+    """u = (u_oc + sqrt(u_oc^2 - 4 R P)) / 2 under constant power, approached within time constants."""
+    cell = vehicle.battery
+    speed, torque = np.full((1, 4), 3000.0), np.full((1, 4), 0.015)
+    power = cell.idle_power + 4 * 0.015 * 3000.0 / cell.efficiency
+    state = np.array([[0.2, 16.0]])
+
+    def rates(x):
+        return np.stack(blocks.battery(cell, x[:, 0], x[:, 1], speed, torque), -1)
+
+    for _ in range(2000):
+        state = rk4(rates, state, 5e-4)
+    used, voltage = state[0]
+    source = np.polynomial.polynomial.polyval(used, cell.ocv)
+    settled = (source + np.sqrt(source**2 - 4.0 * cell.resistance * power)) / 2.0
+    drawn = 1.0 * power / settled / (3600.0 * cell.capacity)
+    slope = np.polynomial.polynomial.polyval(0.2, np.polynomial.polynomial.polyder(cell.ocv))
+    assert 0.0 < voltage - settled < 1.2 * abs(slope) * drawn * cell.time_constant  # lags the falling source by T
+    assert abs(used - 0.2 - drawn) < 0.01 * drawn
+
+
+def test_mixer_delivers_what_fits(vehicle):
+    rotors, ratio = vehicle.rotors, vehicle.thrust.torque_ratio
+    torque = np.array([[0.02, -0.03, 0.004]])
+    thrusts, saturated = blocks.mixer(np.array([4.0]), torque, rotors, ratio, 0.03, np.array([3.5]))
+    x, y, spin = np.array(rotors.x), np.array(rotors.y), np.array(rotors.spin)
+    delivered = [np.sum(thrusts * y), -np.sum(thrusts * x), ratio * np.sum(thrusts * spin)]
+    np.testing.assert_allclose(delivered, torque[0], atol=EXACT)
+    assert abs(thrusts.sum() - 4.0) < EXACT
+    assert not saturated[0]
+
+
+@pytest.mark.parametrize("torque", [(0.0, 0.0, 0.1), (0.3, 0.1, 0.3), (0.05, 0.15, -0.1)])
+def test_mixer_gives_up_yaw_before_roll_and_pitch(vehicle, torque):
+    rotors, ratio = vehicle.rotors, vehicle.thrust.torque_ratio
+    thrusts, saturated = blocks.mixer(np.array([2.0]), np.array([torque]), rotors, ratio, 0.03, np.array([3.5]))
+    assert saturated[0]
+    assert thrusts.min() > 0.03 - EXACT
+    assert thrusts.max() < 3.5 + EXACT
+    x, y, spin = np.array(rotors.x), np.array(rotors.y), np.array(rotors.spin)
+    roll, pitch, yaw = np.sum(thrusts * y), -np.sum(thrusts * x), ratio * np.sum(thrusts * spin)
+    np.testing.assert_allclose(roll * torque[1], pitch * torque[0], atol=EXACT)
+    assert abs(yaw) < abs(torque[2])
+    assert abs(np.ptp(thrusts) - 3.47) < 1e-9  # what there is, is used
+
+
+def test_gyroscopic_torque_does_no_work(vehicle):
+    rng = np.random.default_rng(0)
+    rate, speed = rng.normal(size=(5, 3)) * 5.0, rng.uniform(500.0, 4000.0, (5, 4))
+    nothing = np.zeros((5, 4))
+    still = np.zeros((5, 3)), np.zeros((5, 3)), nothing, nothing
+    arms = rotor_arms(vehicle, VehicleErrors.none(5))
+    _, torque = blocks.composer(vehicle.rotors, arms, nothing, nothing, speed, nothing, rate, still)
+    assert np.abs(torque).max() > 1e-3
+    np.testing.assert_allclose(np.sum(torque * rate, axis=1), 0.0, atol=1e-15)
+
+
+def test_rotors_and_body_keep_their_angular_momentum(vehicle):
+    """Spinning rotors up without drag torque turns the body back: J_z w_z + h stays what it was."""
+    frictionless = dataclasses.replace(
+        plain_vehicle(vehicle), thrust=dataclasses.replace(vehicle.thrust, torque_ratio=0.0)
+    )
+    spin = np.array(vehicle.rotors.spin)
+    speed_dot = np.array([[100.0, -50.0, 20.0, 400.0]])
+    arms = rotor_arms(frictionless, VehicleErrors.none(1))
+    still, nothing = np.zeros((1, 3)), np.zeros((1, 4))
+    _, torque = blocks.composer(
+        vehicle.rotors, arms, nothing, nothing, nothing, speed_dot, still, (still, still, nothing, nothing)
+    )
+    momentum_dot = -vehicle.rotors.inertia * np.sum(spin * speed_dot)
+    assert abs(torque[0, 2] + momentum_dot) < 1e-18
+
+
+def test_air_only_takes_energy_from_a_still_rotor_vehicle(vehicle):
+    rng = np.random.default_rng(1)
+    velocity = rng.normal(size=(20, 3)) * 4.0
+    arms = rotor_arms(vehicle, VehicleErrors.none(20))
+    force, torque, thrust_change, torque_change = blocks.aerodynamics(
+        vehicle.aero, arms, 0.0075, np.zeros((20, 4)), velocity, np.zeros((20, 3))
+    )
+    assert np.all(np.sum(force * velocity, axis=1) < 0.0)
+    for nothing in (torque, thrust_change, torque_change):
+        assert not np.any(nothing)
+
+
+@pytest.mark.parametrize("battery", ["ideal", "sag"])
+def test_hover_is_an_equilibrium(vehicle, battery):
+    """Thrust equals weight at the start; a battery that holds 16.7 V makes the rotors a little fast afterwards."""
+    plain = plain_vehicle(vehicle, aero="rotor_drag", battery=battery)
+    weight = plain.body.mass * GRAVITY
+    state = initial_blocks(plain, np.zeros((1, 3)), np.array([weight]), np.zeros(1))
+    command = np.array([[weight, 0.0, 0.0, 0.0]])
+    force, torque, rates = vehicle_rates(
+        plain, VehicleErrors.none(1), state, command, np.zeros((1, 3)), np.zeros((1, 3))
+    )
+    np.testing.assert_allclose(force[0], (0.0, 0.0, weight), atol=1e-9)
+    assert abs(rates[0, 14]) < 1e-9
+    if battery == "ideal":
+        np.testing.assert_allclose(rates, 0.0, atol=1e-9)
+        np.testing.assert_allclose(torque, 0.0, atol=EXACT)
+
+
+@pytest.mark.parametrize(("controller", "motor"), [("betaflight", "first_order"), ("geometric", "instant")])
+def test_rates_reach_their_command(vehicle, controller, motor):
+    plain = plain_vehicle(vehicle, controller=controller, motor=motor)
+    quadrotor = ReferenceQuadrotor(plain)
+    fly(quadrotor, (plain.body.mass * GRAVITY, 2.0, -1.0, 0.5), 40)
+    np.testing.assert_allclose(quadrotor.body[0, 10:13], (2.0, -1.0, 0.5), atol=0.15)
+
+
+def test_thrown_vehicle_falls_freely(vehicle):
+    """No thrust at all: instantaneous rotors at f_min = 0 and no air."""
+    idle = dataclasses.replace(vehicle.controller, kind="geometric", min_thrust=0.0)
+    plain = dataclasses.replace(
+        plain_vehicle(vehicle, motor="instant"), controller=idle, queue=dataclasses.replace(vehicle.queue, delay=0.0)
+    )
+    quadrotor = ReferenceQuadrotor(plain)
+    quadrotor.reset(np.zeros((1, 3)), LEVEL, np.array([[1.0, 2.0, 3.0]]), np.zeros((1, 3)))
+    fly(quadrotor, (0.0, 0.0, 0.0, 0.0), 10)
+    np.testing.assert_allclose(quadrotor.body[0, :3], (0.2, 0.4, 0.6 - 0.5 * GRAVITY * 0.04), atol=EXACT)
+
+
+def test_turning_body_keeps_momentum_and_energy(vehicle):
+    """A free top: |J w| in the world frame and w.J.w stay."""
+    inertia = np.array(vehicle.body.inertia)
+    rate = np.array([[6.0, 3.0, -4.0]])
+    body = np.hstack((np.zeros((1, 3)), LEVEL, np.zeros((1, 3)), rate))
+    for _ in range(1000):
+        body = rk4(lambda x: rigid_body_rates(vehicle, x, np.zeros((1, 3)), np.zeros((1, 3))), body, 5e-4)
+    assert abs(np.sum(inertia * body[0, 10:] ** 2) / np.sum(inertia * rate**2) - 1.0) < 1e-10
+    x, y, z, w = body[0, 3:7]
+    momentum = inertia * body[0, 10:]
+    axis, cross = np.array([x, y, z]), np.cross
+    turned = momentum + 2.0 * cross(axis, cross(axis, momentum) + w * momentum)
+    np.testing.assert_allclose(turned, inertia * rate[0], rtol=1e-9)

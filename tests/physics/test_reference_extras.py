@@ -1,0 +1,188 @@
+"""Each extra of the reference plant does what it says, and nothing when it is off."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from sim.params import GRAVITY
+from sim.reference.extras import ReferenceExtras, load_extras
+from sim.reference.plant import ReferencePlant
+from tests.plants import paper_plant, plain_plant
+from visthrow import config
+
+WEIGHT = 0.272 * GRAVITY
+LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
+
+
+def short(plant, segments=2):
+    """The same rope in few segments: the extras do not depend on their number and the tests take less time."""
+    return dataclasses.replace(plant, rope=dataclasses.replace(plant.rope, segments=segments))
+
+
+def start(extras, plant=None, count=1, speed=0.0, height=1.5, seed=0):
+    reference = ReferencePlant(short(plant or plain_plant()), extras, seed, count)
+    velocity = np.tile([speed, 0.0, 0.0], (count, 1))
+    reference.reset(np.tile([0.0, 0.0, height], (count, 1)), np.tile(LEVEL, (count, 1)), velocity, np.zeros((count, 3)))
+    return reference
+
+
+def hover(reference, periods, release=False):
+    for _ in range(periods):
+        reference.step(np.array([WEIGHT, 0.0, 0.0, 0.0]), release)
+    return reference.state
+
+
+def test_all_off_by_default():
+    values = dataclasses.astuple(ReferenceExtras(wind_time_constant=0.0))
+    assert not np.any(np.hstack([np.ravel(value) for value in values]))
+
+
+def test_payload_drag_slows_by_its_equation():
+    """On the rope and in flight: 2 m/s of translation lose k v^2 / m_total, then k v^2 / (ball and rope)."""
+    k, speed = 2e-3, 2.0
+    reference = start(ReferenceExtras(payload_drag=k), speed=speed)
+    clean = start(ReferenceExtras(), speed=speed)
+    lost = hover(clean, 2).payload_vel_w[0, 0] - hover(reference, 2).payload_vel_w[0, 0]
+    inertia = 0.058  # within 40 ms the ball alone is slowed, the rope leans later
+    assert lost == pytest.approx(k * speed**2 / inertia * 0.04, rel=0.1)
+    flying = hover(start(ReferenceExtras(payload_drag=k), speed=speed), 7, True)
+    free = hover(start(ReferenceExtras(), speed=speed), 7, True)
+    assert not flying.attached[0]
+    assert flying.payload_vel_w[0, 0] < free.payload_vel_w[0, 0] - 0.01
+
+
+def test_wind_pushes_vehicle_and_payload():
+    extras = ReferenceExtras(payload_drag=2e-3, wind_mean_w=(3.0, 0.0, 0.0))
+    state = hover(start(extras, paper_plant()), 5)
+    still = hover(start(ReferenceExtras(payload_drag=2e-3), paper_plant()), 5)
+    assert state.vel_w[0, 0] > still.vel_w[0, 0] + 0.03
+    assert state.payload_vel_w[0, 0] > still.payload_vel_w[0, 0] + 0.02
+
+
+def test_wind_has_its_deviation_and_memory():
+    reference = start(ReferenceExtras(wind_sigma_w=(0.5, 0.0, 0.0), wind_time_constant=0.1), count=400)
+    first = reference._wind[:, 0].copy()
+    hover(reference, 2)
+    later = reference._wind[:, 0]
+    assert later.std() == pytest.approx(0.5, rel=0.15)
+    assert np.mean(first * later) == pytest.approx(0.25 * np.exp(-0.4), rel=0.25)
+    assert not np.any(reference._wind[:, 1:])
+
+
+def test_stretch_is_weight_over_stiffness_and_holds():
+    state = hover(start(ReferenceExtras(stretch_stiffness=1000.0, stretch_damping=1.0)), 5)
+    below = state.pos_w[0, 2] - state.payload_pos_w[0, 2]
+    assert below == pytest.approx(0.02 + 0.33 + 0.033 + 0.058 * GRAVITY / 1000.0, abs=2e-6)
+
+
+def test_joint_damping_calms_the_swing():
+    direction = np.tile([[[0.5, 0.0, -0.8]], [[-0.5, 0.0, -0.8]]], (1, 1, 1)).reshape(1, 2, 3)
+    rates = []
+    for damping in (0.0, 4e-3):
+        reference = start(ReferenceExtras(extra_joint_damping=damping))
+        reference.reset(np.array([[0, 0, 1.5]]), LEVEL[None], np.zeros((1, 3)), np.zeros((1, 3)), direction)
+        hover(reference, 2)
+        rates.append(np.abs(np.diff(reference._rope_of(reference._state)[1], axis=1)).max())
+    assert rates[1] < 0.9 * rates[0]
+
+
+def test_centre_of_mass_offset_tips_the_vehicle():
+    """The reported position stays the frame's; a centre 5 mm ahead pitches it nose down (+y)."""
+    reference = start(ReferenceExtras(com_offset=(5e-3, 0.0, 0.0)))
+    np.testing.assert_allclose(reference.state.pos_w, [[0.0, 0.0, 1.5]], atol=1e-15)
+    assert hover(reference, 3).rate_b[0, 1] > 0.05
+
+
+def test_thrust_gain_lifts_by_its_share():
+    state = hover(start(ReferenceExtras(thrust_gain_error=0.1)), 1)
+    assert state.vel_w[0, 2] == pytest.approx(0.1 * GRAVITY * 0.02, rel=1e-3)
+
+
+def test_motors_differ():
+    reference = start(ReferenceExtras(motor_gain_sigma=0.05), count=200)
+    assert reference._errors.thrust_gain.std() == pytest.approx(0.05, rel=0.1)
+    assert np.abs(hover(reference, 1).rate_b).max() > 0.01
+
+
+def test_delay_jitter_moves_the_switch():
+    """Commands are due 22 +- 3 ms after they were given and never overtake each other."""
+    reference = start(ReferenceExtras(delay_jitter=3e-3), count=100)
+    reference.step(np.array([WEIGHT, 0.0, 0.0, 0.0]))
+    due = reference._queue_times[-1]
+    assert due.min() > 0.019
+    assert due.max() < 0.025
+    assert due.std() == pytest.approx(3e-3 / np.sqrt(3.0), rel=0.15)
+
+
+def test_release_lag_jitter_moves_the_separation():
+    reference = start(ReferenceExtras(release_lag_jitter=1e-2), count=100)
+    hover(reference, 7, True)
+    opened = reference.landing.separation_time
+    assert opened.min() > 0.1
+    assert opened.max() < 0.12
+    assert opened.std() == pytest.approx(1e-2 / np.sqrt(3.0), rel=0.15)
+
+
+def test_measured_is_the_state_of_before_with_noise():
+    reference = start(ReferenceExtras(mocap_latency=0.03), speed=1.0)
+    assert reference.measured().pos_w[0, 0] == 0.0
+    for _ in range(4):
+        hover(reference, 1)
+    late = reference.measured()
+    assert late.time == pytest.approx(0.05, abs=1e-12)
+    assert late.pos_w[0, 0] == pytest.approx(0.05, abs=1e-6)
+    noisy = start(ReferenceExtras(mocap_position_sigma=1e-3, mocap_angle_sigma=1e-2, gyro_sigma=0.1), count=500)
+    measured = noisy.measured()
+    assert (measured.pos_w - noisy.state.pos_w).std() == pytest.approx(1e-3, rel=0.1)
+    assert (2.0 * measured.quat_wb[:, :3]).std() == pytest.approx(1e-2, rel=0.1)
+    assert measured.rate_b.std() == pytest.approx(0.1, rel=0.1)
+    np.testing.assert_array_equal(start(ReferenceExtras()).measured().pos_w, [[0.0, 0.0, 1.5]])
+
+
+def test_battery_starts_used():
+    reference = start(ReferenceExtras(battery_start_used=0.5), paper_plant(), count=100)
+    voltage = reference.state.battery_voltage
+    assert np.ptp(voltage) > 0.5
+    assert voltage.max() < 16.8
+
+
+def test_payload_and_rope_vary():
+    reference = start(ReferenceExtras(payload_mass_sigma=0.02, rope_length_sigma=0.01), count=200)
+    below = 1.5 - reference.state.payload_pos_w[:, 2] - 0.053
+    assert below.std() == pytest.approx(0.0033, rel=0.2)
+    assert reference._payload_mass.std() == pytest.approx(0.02 * 0.058, rel=0.2)
+
+
+def test_same_seed_same_flight():
+    realistic = load_extras(config.find("vehicle", "reference_realistic"))
+    ends = [hover(start(realistic, paper_plant(), 3, seed=seed), 2).payload_pos_w for seed in (1, 1, 2)]
+    np.testing.assert_array_equal(ends[0], ends[1])
+    assert np.all(ends[0] != ends[2])
+
+
+def test_realistic_plant_throws_and_lands():
+    """All extras together, 15 segments, a swing and a release: the payload lands near the plain plant's point."""
+    points = []
+    for extras in (ReferenceExtras(), load_extras(config.find("vehicle", "reference_realistic"))):
+        reference = ReferencePlant(paper_plant(), extras, count=4)
+        pose = (
+            np.tile([0.0, 0.0, 0.8], (4, 1)),
+            np.tile(LEVEL, (4, 1)),
+            np.tile([2.0, 0.0, 0.5], (4, 1)),
+            np.zeros((4, 3)),
+        )
+        reference.reset(*pose)
+        hover(reference, 26, True)
+        assert reference.landing.landed.all()
+        points.append(reference.landing.point_w)
+    assert 0.005 < np.linalg.norm(points[0] - points[1], axis=1).mean() < 0.15
+
+
+def test_bad_extras_are_refused(tmp_path):
+    with pytest.raises(ValueError, match="gyro_sigma is -1"):
+        ReferenceExtras(gyro_sigma=-1.0)
+    path = tmp_path / "extras.toml"
+    path.write_text("gyro_sigmas = 0.1\n")
+    with pytest.raises(ValueError, match=r"unknown keys \['gyro_sigmas'\]"):
+        load_extras(path)

@@ -1,0 +1,31 @@
+"""Plants that the tests of the reference share: the paper's, and ones reduced to what a closed form knows."""
+
+import dataclasses
+from pathlib import Path
+
+from sim.params import PlantParams, ReleaseParams, RopeParams, VehicleParams
+from visthrow import config
+
+SCENES = Path(__file__).parent / "data" / "scenes"
+
+
+def paper_plant() -> PlantParams:
+    """Return the paper's vehicle, rope and release."""
+    parts = {
+        name: config.load(schema, config.find(name, "paper"))
+        for name, schema in (("vehicle", VehicleParams), ("rope", RopeParams), ("release", ReleaseParams))
+    }
+    return PlantParams(**parts)
+
+
+def plain_vehicle(vehicle: VehicleParams, **kinds: str) -> VehicleParams:
+    """Return a vehicle without aerodynamics and with an ideal battery, unless ``kinds`` says otherwise."""
+    chosen = {"aero": "none", "battery": "ideal", **kinds}
+    parts = {name: dataclasses.replace(getattr(vehicle, name), kind=kind) for name, kind in chosen.items()}
+    return dataclasses.replace(vehicle, **parts)
+
+
+def plain_plant() -> PlantParams:
+    """Return the paper's plant without aerodynamics and with an ideal battery."""
+    plant = paper_plant()
+    return dataclasses.replace(plant, vehicle=plain_vehicle(plant.vehicle))
