@@ -10,15 +10,14 @@ from sim.params import GRAVITY, PlantParams, RandomizationParams, RopeParams, Ve
 from sim.quadrotor.queue import queue_depth
 from sim.randomize import build_reset
 from sim.step import build_step
-from sim.structs import pack, pack_rope, pack_vehicle, types
+from sim.structs import kinds_of, pack, pack_rope, pack_vehicle, types
 
 wp.config.log_level = wp.LOG_WARNING
 _BUILDS: dict = {}
 
 
 def _kinds(params: PlantParams, direct: bool) -> tuple:
-    v = params.vehicle
-    return (params.sim.precision, params.rope.segments, v.controller.kind, v.motor.kind, v.battery.kind, v.aero.kind, direct)
+    return (params.sim.precision, params.rope.segments, kinds_of(params.vehicle), direct)
 
 
 def _kernels(params: PlantParams, direct: bool):
@@ -60,6 +59,7 @@ class HybridSim:
     def __init__(
         self, params: PlantParams, count: int, device: str = "cpu", seed: int = 0, *, vehicles: list[VehicleParams] | None = None,
         ropes: list[RopeParams] | None = None, direct: bool = False,
+        gravity: float = GRAVITY,
     ):
         """Allocate ``count`` plants.
 
@@ -71,6 +71,7 @@ class HybridSim:
             vehicles: parameters of environment e at ``e % len(vehicles)``; default ``[params.vehicle]``.
             ropes: likewise; all with the same number of segments.
             direct: by-pass the blocks: commands are thrust [N] and torque [N m].
+            gravity: acceleration of free fall, along -z [m/s^2].
 
         Raises:
             ValueError: no environment, ropes of different segment counts, or an unphysical parameter.
@@ -82,9 +83,10 @@ class HybridSim:
         if {r.segments for r in ropes} != {params.rope.segments}:
             raise ValueError(f"ropes of {sorted({r.segments for r in ropes})} segments in one batch of {params.rope.segments}")
         self.params, self.count, self.device, self.seed = params, count, device, seed
+        self.gravity = gravity
         self.types, self._step, self._reset = _kernels(params, direct)
         t = self.types
-        self._vehicles = wp.array(pack_vehicle(t, vehicles), dtype=t.Vehicle, device=device)
+        self._vehicles = wp.array(pack_vehicle(t, vehicles, kinds_of(params.vehicle)), dtype=t.Vehicle, device=device)
         self._ropes = wp.array(pack_rope(t, ropes), dtype=t.Rope, device=device)
         self._release = wp.array(pack(t.Release, params.release), dtype=t.Release, device=device)
         segments, period = params.rope.segments, params.sim.control_period
@@ -99,7 +101,6 @@ class HybridSim:
         self.episode = wp.zeros(count, dtype=wp.int32, device=device)
         self._all = wp.full(count, 1, dtype=wp.int32, device=device)
         self._used = wp.zeros(count, dtype=t.real, device=device)
-        self._ideal = vehicles[0].battery.reference_voltage if vehicles[0].battery.kind == "ideal" else -1.0
         self._spreads: tuple[RandomizationParams, wp.array] | None = None
         self.place(pos_w=np.zeros((count, 3)))
 
@@ -108,7 +109,7 @@ class HybridSim:
         s = self.params.sim
         wp.launch(
             self._step.step, self.count,
-            [self._vehicles, self._ropes, self._release, s.control_period, s.substep, s.gamma, s.max_turn, GRAVITY,
+            [self._vehicles, self._ropes, self._release, s.control_period, s.substep, s.gamma, s.max_turn, self.gravity,
              self.state, self.command, self.release, self.out],
             device=self.device, block_dim=64,
         )
@@ -121,7 +122,7 @@ class HybridSim:
         mask = self._all if mask is None else mask
         wp.launch(
             self._reset.randomize, self.count,
-            [self._vehicles, self._ropes, self._spreads[1], self._ideal, GRAVITY, self.seed, self.state, self.episode, mask, self.goal_w],
+            [self._vehicles, self._ropes, self._spreads[1], self.gravity, self.seed, self.state, self.episode, mask, self.goal_w],
             device=self.device,
         )
         self._update_payload()
@@ -161,7 +162,7 @@ class HybridSim:
         self._used.fill_(battery_used)
         wp.launch(
             self._reset.place, self.count,
-            [self._vehicles, self._ropes, self._ideal, GRAVITY, self.state, self._all, self._used], device=self.device,
+            [self._vehicles, self._ropes, self.gravity, self.state, self._all, self._used], device=self.device,
         )
         self._update_payload()
 

@@ -5,11 +5,11 @@ leaves all others untouched and a batch draws what its members alone would draw.
 """
 
 from dataclasses import dataclass
+
 import warp as wp
 
 from sim.params import PlantParams
-from sim.quadrotor.battery import open_circuit_voltage
-from sim.quadrotor.controller import speed_of_thrust
+from sim.quadrotor.start import build_start
 from sim.structs import Types
 
 
@@ -23,26 +23,16 @@ class ResetKernels:
 
 def build_reset(t: Types, params: PlantParams, State: type) -> ResetKernels:
     """Build the reset kernels for a number of segments."""
-    real, vec3, vec4, quat = t.real, t.vec3, t.vec4, t.quat
+    real, vec3, quat = t.real, t.vec3, t.quat
     Vehicle, Rope, Randomization = t.Vehicle, t.Rope, t.Randomization
     L = params.rope.segments
+    start = build_start(t, params.vehicle, State)
 
     @wp.func
     def rest(p: Vehicle, rope: Rope, state: State, env: int, used: real, gravity: real):
         """Motors, controller, battery and queue as in hover; nothing of the last episode stays."""
         mass = p.body.mass * state.mass_scale[env] + rope.total_mass
-        thrust = mass * gravity
-        speed = speed_of_thrust(p, thrust / real(4.0))
-        state.motor_speed[env] = vec4(speed, speed, speed, speed)
-        state.integral[env] = vec3()
-        state.setpoint[env] = state.rate_b[env]
-        state.gyro[env] = state.rate_b[env]
-        state.charge_used[env] = used
-        power = p.battery.idle_power + thrust * speed * p.thrust.torque_ratio / p.battery.efficiency
-        open_voltage = open_circuit_voltage(p, used)
-        state.voltage[env] = open_voltage - p.battery.resistance * power / open_voltage
-        for k in range(state.queue.shape[0]):
-            state.queue[k, env] = vec4(thrust, real(0.0), real(0.0), real(0.0))
+        start(p, state, env, mass * gravity, used)
         below = rope.last_mass * rope.last_center
         state.stiffness[L - 1, env] = below * gravity
         hanging = rope.last_mass
@@ -59,7 +49,6 @@ def build_reset(t: Types, params: PlantParams, State: type) -> ResetKernels:
         # Params:
         vehicle: wp.array(dtype=Vehicle),
         ropes: wp.array(dtype=Rope),
-        ideal_voltage: real,
         gravity: real,
         # State in:
         state: State,
@@ -71,8 +60,6 @@ def build_reset(t: Types, params: PlantParams, State: type) -> ResetKernels:
         if mask[env] != 0:
             p = vehicle[env % vehicle.shape[0]]
             rest(p, ropes[env % ropes.shape[0]], state, env, used[env], gravity)
-            if ideal_voltage > real(0.0):
-                state.voltage[env] = ideal_voltage
 
     @wp.kernel(module="unique", enable_backward=False)
     def randomize_kernel(
@@ -80,7 +67,6 @@ def build_reset(t: Types, params: PlantParams, State: type) -> ResetKernels:
         vehicle: wp.array(dtype=Vehicle),
         ropes: wp.array(dtype=Rope),
         spreads: wp.array(dtype=Randomization),
-        ideal_voltage: real,
         gravity: real,
         seed: int,
         # State in:
@@ -146,7 +132,5 @@ def build_reset(t: Types, params: PlantParams, State: type) -> ResetKernels:
             angle = real(wp.randf(rng)) * real(6.283185307179586)
             goal_w[env] = vec3(radius * wp.cos(angle), radius * wp.sin(angle), real(0.0))
             rest(p, rope, state, env, real(wp.randf(rng)) * z.battery_used, gravity)
-            if ideal_voltage > real(0.0):
-                state.voltage[env] = ideal_voltage
 
     return ResetKernels(place_kernel, randomize_kernel)

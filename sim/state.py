@@ -17,10 +17,14 @@ COLLISION = 4
 ROPE_IN_ROTOR = 8
 """Status bit: a joint of the rope passed through a propeller disc."""
 
-STATE_FIELDS = {  # name: (type, also by segment)
+QUAD_FIELDS = {  # name: (type, also by row); the fields of t.QuadState in its order
     "pos_w": ("vec3", False), "quat_wb": ("quat", False), "vel_w": ("vec3", False), "rate_b": ("vec3", False),
     "motor_speed": ("vec4", False), "integral": ("vec3", False), "setpoint": ("vec3", False), "gyro": ("vec3", False),
-    "charge_used": ("real", False), "voltage": ("real", False), "mass_scale": ("real", False),
+    "charge_used": ("real", False), "voltage": ("real", False),
+}
+
+STATE_FIELDS = QUAD_FIELDS | {  # those by row have a row a segment, the queue a row a slot
+    "mass_scale": ("real", False),
     "cable_dir_w": ("vec3", True), "cable_vel_w": ("vec3", True), "stiffness": ("real", True),
     "queue": ("vec4", True),  # (D, E) commands, newest first
     "release_timer": ("real", False),  # time to separation [s]; negative: not latched
@@ -49,3 +53,38 @@ def allocate(t: Types, struct: type, fields: dict[str, tuple[str, bool]], count:
         shape = (rows[name], count) if by_row else count
         setattr(out, name, wp.zeros(shape, dtype=scalar[kind], device=device))
     return out
+
+
+def build_access(t: Types, State: type):
+    """Return Warp functions ``load(state, env) -> t.QuadState`` and ``store(state, env, s)`` for a struct of arrays."""
+    QuadState = t.QuadState
+
+    @wp.func
+    def load(state: State, env: int):
+        s = QuadState()
+        s.pos_w = state.pos_w[env]
+        s.quat_wb = state.quat_wb[env]
+        s.vel_w = state.vel_w[env]
+        s.rate_b = state.rate_b[env]
+        s.motor_speed = state.motor_speed[env]
+        s.integral = state.integral[env]
+        s.setpoint = state.setpoint[env]
+        s.gyro = state.gyro[env]
+        s.charge_used = state.charge_used[env]
+        s.voltage = state.voltage[env]
+        return s
+
+    @wp.func
+    def store(state: State, env: int, s: QuadState):
+        state.pos_w[env] = s.pos_w
+        state.quat_wb[env] = s.quat_wb
+        state.vel_w[env] = s.vel_w
+        state.rate_b[env] = s.rate_b
+        state.motor_speed[env] = s.motor_speed
+        state.integral[env] = s.integral
+        state.setpoint[env] = s.setpoint
+        state.gyro[env] = s.gyro
+        state.charge_used[env] = s.charge_used
+        state.voltage[env] = s.voltage
+
+    return load, store

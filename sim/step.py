@@ -12,7 +12,7 @@ from sim import release as rel
 from sim import state as st
 from sim.coupling import build_coupled_step
 from sim.params import PlantParams
-from sim.quadrotor.queue import split_delay
+from sim.quadrotor.queue import push, split_delay
 from sim.quadrotor.rigid_body import build_direct_flow, build_flow
 from sim.rope.chain import build_chain
 from sim.structs import Types
@@ -50,35 +50,8 @@ def build_step(t: Types, params: PlantParams, direct: bool = False) -> StepKerne
         flow = build_direct_flow(t)
     chain = build_chain(t, L)
     coupled = build_coupled_step(t, flow, rate, motor_advance, chain)
+    load, store = st.build_access(t, State)
     vec3_limit = real(SPEED_LIMIT)
-
-    @wp.func
-    def load(state: State, env: int):
-        s = QuadState()
-        s.pos_w = state.pos_w[env]
-        s.quat_wb = state.quat_wb[env]
-        s.vel_w = state.vel_w[env]
-        s.rate_b = state.rate_b[env]
-        s.motor_speed = state.motor_speed[env]
-        s.integral = state.integral[env]
-        s.setpoint = state.setpoint[env]
-        s.gyro = state.gyro[env]
-        s.charge_used = state.charge_used[env]
-        s.voltage = state.voltage[env]
-        return s
-
-    @wp.func
-    def store(state: State, env: int, s: QuadState):
-        state.pos_w[env] = s.pos_w
-        state.quat_wb[env] = s.quat_wb
-        state.vel_w[env] = s.vel_w
-        state.rate_b[env] = s.rate_b
-        state.motor_speed[env] = s.motor_speed
-        state.integral[env] = s.integral
-        state.setpoint[env] = s.setpoint
-        state.gyro[env] = s.gyro
-        state.charge_used[env] = s.charge_used
-        state.voltage[env] = s.voltage
 
     @wp.func
     def sane(s: QuadState, u: wp.array(dtype=vec3), n: wp.array(dtype=vec3)):
@@ -156,10 +129,8 @@ def build_step(t: Types, params: PlantParams, direct: bool = False) -> StepKerne
             stiffness[i] = state.stiffness[i, env]
         s = load(state, env)
 
+        push(state.queue, env, command[env])
         depth = state.queue.shape[0]
-        for k in range(depth - 1):
-            state.queue[depth - 1 - k, env] = state.queue[depth - 2 - k, env]
-        state.queue[0, env] = command[env]
         whole, switch = split_delay(p, period)
         timer = state.release_timer[env]
         attached = state.attached[env]

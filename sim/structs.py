@@ -5,6 +5,7 @@ struct of each from its annotations, so a field added there reaches the kernels 
 """
 
 import dataclasses
+import math
 import typing
 from functools import lru_cache
 from types import SimpleNamespace
@@ -98,14 +99,32 @@ def mixer_columns(rotors: P.RotorParams, torque_ratio: float) -> SimpleNamespace
     return SimpleNamespace(roll=y / (4 * np.mean(y**2)), pitch=-x / (4 * np.mean(x**2)), yaw=s / (4 * torque_ratio))
 
 
-def pack_vehicle(t: Types, vehicles: list[P.VehicleParams]) -> np.ndarray:
+def kinds_of(vehicle: P.VehicleParams) -> tuple[str, str, str, str]:
+    """Kinds of controller, motor, battery and aerodynamics: what a kernel is built for."""
+    return vehicle.controller.kind, vehicle.motor.kind, vehicle.battery.kind, vehicle.aero.kind
+
+
+def pack_vehicle(t: Types, vehicles: list[P.VehicleParams], kinds: tuple[str, str, str, str]) -> np.ndarray:
     """Structured array of shape (1,) or (E,) for ``wp.array(dtype=t.Vehicle)``.
 
+    Args:
+        t: types of the wanted precision.
+        vehicles: one for all environments, or one each.
+        kinds: of the blocks that the kernel was built for.
+
     Raises:
-        ValueError: a rotor geometry that cannot make a torque about each axis.
+        ValueError: other kinds of blocks, a mass, inertia or thrust coefficient that is not positive, or a rotor geometry
+            that cannot make a torque about each axis.
     """
     rows = np.zeros(len(vehicles), dtype=t.Vehicle.numpy_dtype())
     for row, vehicle in zip(rows, vehicles, strict=True):
+        if kinds_of(vehicle) != kinds:
+            raise ValueError(f"vehicle of the kinds {kinds_of(vehicle)} in a batch of {kinds}: expected the same blocks")
+        body = vehicle.body
+        positive = {"body.mass": body.mass, "body.inertia": min(body.inertia), "thrust.k_f": vehicle.thrust.k_f}
+        for name, value in positive.items():
+            if not (math.isfinite(value) and value > 0):
+                raise ValueError(f"{name} {value}: expected a finite, positive value")
         _fill(row, vehicle)
         if not (np.any(vehicle.rotors.x) and np.any(vehicle.rotors.y)) or abs(sum(vehicle.rotors.spin)) > 0:
             raise ValueError(

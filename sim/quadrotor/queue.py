@@ -27,3 +27,12 @@ def split_delay(p: Any, period: Any):
     if rest < tiny:
         rest = period - period
     return int(whole), rest
+
+
+@wp.func
+def push(queue: wp.array2d(dtype=Any), env: int, command: Any):
+    """Put a command into slot 0 of an environment's queue, shape (D, E); the others move on by one."""
+    depth = queue.shape[0]
+    for k in range(depth - 1):
+        queue[depth - 1 - k, env] = queue[depth - 2 - k, env]
+    queue[0, env] = command
