@@ -59,7 +59,7 @@ def largest_accurate_step(scene: Scene, tolerance: float = 1e-3) -> float:
     """
     truth = converged(scene)
     for microseconds in CANDIDATES:
-        step = microseconds * 1e-6
+        step = microseconds / 1e6
         if any(abs(t - step * round(t / step)) > 1e-9 for t in (scene.duration, *(w.t_start for w in scene.schedule))):
             continue
         run = converged(scene, step)

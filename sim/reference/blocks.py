@@ -44,7 +44,7 @@ def _motor_shares(torque: np.ndarray, rotors: RotorParams, torque_ratio: float) 
 
 def mixer(
     thrust: np.ndarray, torque: np.ndarray, rotors: RotorParams, torque_ratio: float, f_min: float, f_max: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Share collective thrust and torque out to the motors; yaw gives way first, then roll and pitch.
 
     Args:
@@ -56,7 +56,7 @@ def mixer(
         f_max: largest thrust a motor [N], shape (E,).
 
     Returns:
-        Thrusts [N], shape (E, 4); whether a limit acted, shape (E,).
+        Thrusts [N], shape (E, 4); delivered share of roll and pitch and of yaw, 0 to 1, shapes (E,).
 
     Convention: yaw takes the largest part of what is asked for that keeps the spread of the four within the limits.
     """
@@ -76,8 +76,8 @@ def mixer(
     wanted = thrust[:, None] / 4.0 + tilt + clipped_yaw
     raise_by = np.maximum(f_min - wanted.min(axis=1), 0.0)
     lower_by = np.maximum(wanted.max(axis=1) - f_max, 0.0)
-    saturated = (scale < 1.0) | (clipped != amount) | (raise_by > 0.0) | (lower_by > 0.0)
-    return wanted + (raise_by - lower_by)[:, None], saturated
+    yaw_share = np.where(clipped == amount, 1.0, np.abs(clipped) / np.maximum(np.abs(amount), 1e-300))
+    return wanted + (raise_by - lower_by)[:, None], scale, yaw_share
 
 
 def betaflight(
@@ -110,13 +110,14 @@ def betaflight(
     torque = torque - np.array(gains.d_gain) * gyro_dot + np.array(gains.feedforward_gain) * setpoint_dot
     relative = voltage / vehicle.battery.reference_voltage
     f_max = gains.max_thrust * relative**2
-    thrusts, saturated = mixer(
+    thrusts, tilt_share, yaw_share = mixer(
         command[:, 0], torque, vehicle.rotors, vehicle.thrust.torque_ratio, gains.min_thrust, f_max
     )
     integral_dot = np.array(gains.i_gain) * (setpoint - rate)
     growing = integral_dot * integral > 0.0
     full = np.abs(integral) >= np.array(gains.integral_limit)
-    integral_dot = np.where(growing & (full | saturated[:, None]), 0.0, integral_dot)
+    delivered = np.where(full, 0.0, np.stack((tilt_share, tilt_share, yaw_share), -1))
+    integral_dot = np.where(growing, delivered * integral_dot, integral_dot)
     correction = 1.0 + (1.0 - gains.voltage_compensation) * (relative - 1.0)
     return np.sqrt(thrusts / vehicle.thrust.k_f) * correction[:, None], setpoint_dot, gyro_dot, integral_dot
 

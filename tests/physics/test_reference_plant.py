@@ -136,8 +136,8 @@ def test_separation_is_exact_and_continuous():
     after = reference.state
     assert not after.attached[0]
     assert abs(reference.landing.separation_time[0] - plant.release.lag) < 1e-12
-    # Half-way through the step the rope opens: over 20 ms no point jumps, all move on with their velocity, but for gravity
-    # and the swing's centripetal acceleration.
+    # Half-way through the step the rope opens: over 20 ms no point jumps, all move on with their velocity, but for
+    # gravity and the swing's centripetal acceleration.
     moved = after.payload_pos_w - before.payload_pos_w - 0.02 * before.payload_vel_w
     assert np.linalg.norm(moved) < 0.5 * 3 * GRAVITY * 0.02**2
     lengths = np.linalg.norm(np.diff(after.cable_points_w, axis=1), axis=-1)
