@@ -50,91 +50,78 @@ def build_coupled_step(t: Types, flow, rate, motor_advance, chain: SimpleNamespa
     Where a rod turns more than ``max_turn`` in the step, the first stage alone (linearly implicit Euler) is kept.
 
     Returns:
-        Warp function ``step(p, rope, state, command, n, u, stiffness, work..., gravity, gamma, max_turn, h)`` ->
-        new state, whether it fell back. The arrays n (directions), u (their rates) and stiffness change in place.
+        Namespace of Warp functions ``step`` (new state, new total momentum, whether it fell back; the arrays n, u and
+        stiffness change in place), ``step_alone`` (the vehicle after the payload has left), ``momentum`` (total linear
+        momentum [N s]) and ``mount_velocity`` [m/s].
     """
     vec3, vec4, real = t.vec3, t.vec4, t.real
-    Vehicle, Rope, QuadState, QuadRate, Flow = t.Vehicle, t.Rope, t.QuadState, t.QuadRate, t.Flow
+    Vehicle, Rope, QuadState = t.Vehicle, t.Rope, t.QuadState
     vec2 = chain.vec2
     L = chain.segments
     root = build_root(t)
-
-    @wp.func
-    def stage(
-        p: Vehicle, rope: Rope, s: QuadState, f: Flow,
-        n: wp.array(dtype=vec3), u: wp.array(dtype=vec3), k1: wp.array(dtype=vec3), stiffness: wp.array(dtype=real),
-        next_stiffness: wp.array(dtype=real), c1: wp.array(dtype=vec3), c2: wp.array(dtype=vec3), hs: wp.array(dtype=vec2),
-        acc: wp.array(dtype=vec3), gravity: vec3, gamma: real, h: real, index: int,
-    ):
-        rate_w = wp.quat_rotate(s.quat_wb, s.rate_b)
-        d, o, b = chain.up(rope, n, u, k1, stiffness, rate_w, gravity, gamma, h, index, c1, c2, hs)
-        drag_w = rope.joint_damping * (wp.cross(n[0], u[0]) - rate_w)
-        torque = f.torque_b + wp.quat_rotate_inv(s.quat_wb, drag_w)
-        acc_w, alpha_b, mount_acc, pull = root(p, rope, s, f.force_b, torque, d, o, b, gravity)
-        chain.down(rope, n, u, mount_acc, pull, gravity, c1, c2, hs, acc, next_stiffness)
-        return rate(p, s, f, acc_w, alpha_b)
 
     @wp.func
     def mount_velocity(rope: Rope, s: QuadState):
         return s.vel_w + wp.quat_rotate(s.quat_wb, wp.cross(s.rate_b, rope.mount))
 
     @wp.func
+    def momentum(p: Vehicle, rope: Rope, s: QuadState, u: wp.array(dtype=vec3)):
+        return p.body.mass * s.vel_w + rope.total_mass * mount_velocity(rope, s) + chain.momentum(rope, u)
+
+    @wp.func
+    def root_velocity(p: Vehicle, rope: Rope, s: QuadState, total: vec3, relative: vec3):
+        """Velocity of the vehicle from the total momentum and the chain's own relative to the mount."""
+        turn = wp.quat_rotate(s.quat_wb, wp.cross(s.rate_b, rope.mount))
+        return (total - rope.total_mass * turn - relative) / (p.body.mass + rope.total_mass)
+
+    @wp.func
+    def damping_torque(rope: Rope, s: QuadState, rate_w: vec3, n: vec3, u: vec3):
+        """Couple of the uppermost joint on the vehicle [N m], body frame."""
+        return rope.joint_damping * wp.quat_rotate_inv(s.quat_wb, wp.cross(n, u) - rate_w)
+
+    @wp.func
     def step(
-        p: Vehicle, rope: Rope, s: QuadState, command: vec4,
+        p: Vehicle, rope: Rope, s: QuadState, total: vec3, command: vec4,
         n: wp.array(dtype=vec3), u: wp.array(dtype=vec3), stiffness: wp.array(dtype=real),
         gravity: vec3, gamma: real, max_turn: real, h: real,
     ):
         k1 = wp.zeros(shape=(L,), dtype=vec3)
-        k2 = wp.zeros(shape=(L,), dtype=vec3)
         n2 = wp.zeros(shape=(L,), dtype=vec3)
-        u2 = wp.zeros(shape=(L,), dtype=vec3)
         c1 = wp.zeros(shape=(L,), dtype=vec3)
         c2 = wp.zeros(shape=(L,), dtype=vec3)
         hs = wp.zeros(shape=(L,), dtype=vec2)
-        new_stiffness = wp.zeros(shape=(L,), dtype=real)
         half = real(0.5)
-        gh = gamma * h
-        total_mass = p.body.mass + rope.total_mass
+        weight = (p.body.mass + rope.total_mass) * gravity
 
         f1 = flow(p, s, command)
-        r1 = stage(p, rope, s, f1, n, u, k1, stiffness, new_stiffness, c1, c2, hs, k2, gravity, gamma, h, 0)
-        momentum = p.body.mass * s.vel_w + rope.total_mass * mount_velocity(rope, s) + chain.momentum(rope, u)
-        fastest = real(0.0)
-        for i in range(L):
-            k1[i] = k2[i]
-            u2[i] = u[i] + h * k1[i]
-            n2[i] = wp.normalize(n[i] + h * (u[i] + gh * k1[i]))
-            fastest = wp.max(fastest, wp.max(wp.dot(u[i], u[i]), wp.dot(u2[i], u2[i])))
+        rate_w = wp.quat_rotate(s.quat_wb, s.rate_b)
+        d, o, b = chain.up_first(rope, n, u, n2, k1, stiffness, rate_w, gravity, gamma, h, c1, c2, hs)
+        torque = f1.torque_b + damping_torque(rope, s, rate_w, n[0], u[0])
+        acc_w, alpha_b, mount_acc, pull = root(p, rope, s, f1.force_b, torque, d, o, b, gravity)
+        fastest = chain.down_first(rope, n, u, mount_acc, gamma, h, c1, c2, hs, n2, k1)
+        r1 = rate(p, s, f1, acc_w, alpha_b)
+        push1 = wp.quat_rotate(s.quat_wb, f1.force_b)
         s2 = advance(s, r1, h)
         s2.motor_speed = motor_advance(s2.motor_speed, f1.motor_speed)
         fell_back = fastest * h * h > max_turn * max_turn
         if fell_back:
-            for i in range(L):
-                n[i] = n2[i]
-                u[i] = u2[i] - n2[i] * wp.dot(n2[i], u2[i])
-                stiffness[i] = new_stiffness[i]
-            s2.vel_w = (
-                momentum + h * (wp.quat_rotate(s.quat_wb, f1.force_b) + total_mass * gravity)
-                - rope.total_mass * wp.quat_rotate(s2.quat_wb, wp.cross(s2.rate_b, rope.mount)) - chain.momentum(rope, u)
-            ) / total_mass
-            return s2, fell_back
+            chain.fall_back(n, u, h, n2, k1)
+            new_total = total + h * (push1 + weight)
+            s2.vel_w = root_velocity(p, rope, s2, new_total, chain.momentum(rope, u))
+            return s2, new_total, fell_back
 
         f2 = flow(p, s2, command)
-        r2 = stage(p, rope, s2, f2, n2, u2, k1, stiffness, new_stiffness, c1, c2, hs, k2, gravity, gamma, h, 1)
+        rate_w = wp.quat_rotate(s2.quat_wb, s2.rate_b)
+        d, o, b = chain.up_second(rope, n, u, n2, k1, stiffness, rate_w, gravity, gamma, h, c1, c2, hs)
+        torque = f2.torque_b + damping_torque(rope, s2, rate_w, n2[0], u[0] + h * k1[0])
+        acc_w, alpha_b, mount_acc, pull = root(p, rope, s2, f2.force_b, torque, d, o, b, gravity)
+        relative = chain.down_second(rope, n, u, stiffness, mount_acc, pull, gravity, gamma, h, c1, c2, hs, n2, k1)
+        r2 = rate(p, s2, f2, acc_w, alpha_b)
         out = advance(s, blend(r1, half, r2, half), h)
         out.motor_speed = motor_advance(out.motor_speed, f2.motor_speed)
-        for i in range(L):
-            ni = wp.normalize(n[i] + (half * h) * (u[i] + u2[i] + gh * (k2[i] - k1[i])))
-            ui = u[i] + (half * h) * (k1[i] + k2[i])
-            n[i] = ni
-            u[i] = ui - ni * wp.dot(ni, ui)
-            stiffness[i] = new_stiffness[i]
-        push = wp.quat_rotate(s.quat_wb, f1.force_b) + wp.quat_rotate(s2.quat_wb, f2.force_b)
-        momentum += (half * h) * push + (h * total_mass) * gravity
-        out.vel_w = (
-            momentum - rope.total_mass * wp.quat_rotate(out.quat_wb, wp.cross(out.rate_b, rope.mount)) - chain.momentum(rope, u)
-        ) / total_mass
-        return out, fell_back
+        new_total = total + (half * h) * (push1 + wp.quat_rotate(s2.quat_wb, f2.force_b)) + h * weight
+        out.vel_w = root_velocity(p, rope, out, new_total, relative)
+        return out, new_total, fell_back
 
     @wp.func
     def step_alone(p: Vehicle, s: QuadState, command: vec4, gravity: vec3, h: real):
@@ -152,4 +139,4 @@ def build_coupled_step(t: Types, flow, rate, motor_advance, chain: SimpleNamespa
         out.motor_speed = motor_advance(out.motor_speed, f2.motor_speed)
         return out
 
-    return SimpleNamespace(step=step, step_alone=step_alone, mount_velocity=mount_velocity)
+    return SimpleNamespace(step=step, step_alone=step_alone, mount_velocity=mount_velocity, momentum=momentum)

@@ -140,6 +140,7 @@ def build_step(t: Types, params: PlantParams, direct: bool = False) -> StepKerne
         status = int(0)
         out.separated[env] = 0
 
+        total = coupled.momentum(p, rope, s, u)
         time = real(0.0)
         if attached != 0 and timer >= real(0.0) and timer < tiny:
             separate(p, rope, r, s, n, u, gravity, out, env, time)
@@ -157,7 +158,7 @@ def build_step(t: Types, params: PlantParams, direct: bool = False) -> StepKerne
             active = state.queue[wp.min(slot, depth - 1), env]
             for k in range(count):
                 if attached != 0:
-                    s, fell_back = coupled.step(p, rope, s, active, n, u, stiffness, g, gamma, max_turn, h)
+                    s, total, fell_back = coupled.step(p, rope, s, total, active, n, u, stiffness, g, gamma, max_turn, h)
                     if fell_back:
                         status = status | 2
                 else:

@@ -16,8 +16,11 @@ with ``b_k = B e_k`` and the 2x2 inverse q, ``c_k = sum_j q_kj b_j`` gives ``B Q
 
 Time integration (ROS2 of Verwer et al., SIAM J. Sci. Comput. 20, 1999, as a W-method): the Jacobian is approximated rod
 by rod by its geometric stiffness K (tension times arm) and its joint damping D, which only adds
-``gamma h D + gamma^2 h^2 K`` to J; any approximation keeps second order. With k1 the first stage and z the solution of
-the same recursion at the predicted state plus the terms of :func:`implicit_terms`, ``u+ = u + h/2 (k1 + z)``.
+``gamma h D + gamma^2 h^2 K`` to J; any approximation keeps second order. With k1 the first stage, ``n2 = n + h (u + gamma h
+k1)``, ``u2 = u + h k1`` the predicted state and z the solution of the same recursion there with the right-hand side of
+:func:`second_stage_terms`::
+
+    u+ = u + h/2 (k1 + z),   n+ = n + h/2 (u + u2 + gamma h (z - k1))
 """
 
 from types import SimpleNamespace
@@ -25,7 +28,6 @@ from typing import Any
 
 import warp as wp
 
-from sim.params import GRAVITY
 from sim.structs import Types
 
 
@@ -50,30 +52,37 @@ def tangent_basis(n: Any):
 
 
 @wp.func
-def implicit_terms(stiffness: Any, damping: Any, u: Any, k1: Any, gh: Any, h: Any, stage: int):
-    """Right-hand side that the W-method adds to a rod's moment balance; ``gh`` is gamma h, k1 the first stage.
+def viscous(n: Any, neighbour_n: Any, neighbour_u: Any):
+    """Angular velocity ``n' x u'`` of a neighbouring rod, crossed into n."""
+    return neighbour_u * wp.dot(neighbour_n, n) - neighbour_n * wp.dot(neighbour_u, n)
 
-    First stage: ``-gh K u``. Second, from ``(I - gh J) k2 = f2 - 2 k1`` with ``z = k2 + 2 k1``:
-    ``gh K u2 + (2 gh K (2 gh - h) + 2 gh D) k1``.
-    """
+
+@wp.func
+def first_stage_terms(stiffness: Any, damping: Any, u: Any, k1: Any, gh: Any, h: Any):
+    """Right-hand side that the W-method adds to a rod's moment balance in the first stage: ``-gh K u``, gh = gamma h."""
+    return -gh * stiffness * u
+
+
+@wp.func
+def second_stage_terms(stiffness: Any, damping: Any, u2: Any, k1: Any, gh: Any, h: Any):
+    """The same for the second stage, from ``(I - gh J) k2 = f2 - 2 k1`` with ``z = k2 + 2 k1``."""
     two = type(h)(2.0)
-    if stage == 0:
-        return -gh * stiffness * u
-    return gh * stiffness * u + two * gh * (stiffness * (two * gh - h) + damping) * k1
+    return gh * stiffness * u2 + two * gh * (stiffness * (two * gh - h) + damping) * k1
 
 
 def build_chain(t: Types, segments: int) -> SimpleNamespace:
     """Recursion for a fixed number of segments.
 
     Returns:
-        Namespace of Warp functions ``up`` (leaf to root: apparent mass and force of the whole chain at the mount), ``down``
-        (root to leaf: accelerations and the rods' stiffness), ``payload`` (position and velocity of the payload's
-        centre), ``momentum`` (linear momentum relative to the mount).
+        Namespace of Warp functions. ``up_first``, ``up_second`` (leaf to root: apparent mass and force of the whole chain
+        at the mount, at the state and at the predicted state), ``down_first`` (root to leaf: first stage k1 and predicted
+        directions n2), ``down_second`` (new n, u and stiffness in place, and the new momentum), ``fall_back`` (the
+        first stage alone), ``payload`` (position and velocity of the payload's centre), ``momentum`` (linear momentum
+        relative to the mount).
     """
     L = segments
     real, vec3, Rope = t.real, t.vec3, t.Rope
     vec2 = wp.types.vector(2, real)
-    weight = vec3(0.0, 0.0, -GRAVITY)
 
     @wp.func
     def rod(rope: Rope, i: int):
@@ -83,92 +92,171 @@ def build_chain(t: Types, segments: int) -> SimpleNamespace:
         return rope.segment_mass, real(0.5) * rope.segment_length, rope.segment_inertia
 
     @wp.func
-    def joint_couple(
-        rope: Rope, n: wp.array(dtype=vec3), u: wp.array(dtype=vec3), root_rate_w: vec3, i: int
-    ):
-        """Viscous couples of rod i's joints, crossed into n, and the rod's own damping coefficient."""
-        above = root_rate_w
-        if i > 0:
-            above = wp.cross(n[i - 1], u[i - 1])
-        d = rope.joint_damping
-        couple = d * (wp.cross(above, n[i]) - u[i])
-        own = d
-        if i < L - 1:
-            couple += d * (wp.cross(wp.cross(n[i + 1], u[i + 1]), n[i]) - u[i])
-            own += d
-        return couple, own
+    def below(rope: Rope, i: int):
+        """Mass hanging at the lower joint of rod i [kg]; none at the last one."""
+        if i == L - 1:
+            return real(0.0)
+        return rope.last_mass + real(float(L - 2 - i)) * rope.segment_mass
 
     @wp.func
-    def up(
-        rope: Rope, n: wp.array(dtype=vec3), u: wp.array(dtype=vec3), k1: wp.array(dtype=vec3),
-        stiffness: wp.array(dtype=real), root_rate_w: vec3, gravity: vec3, gamma: real, h: real, stage: int,
+    def direction_first(n: wp.array(dtype=vec3), n2: wp.array(dtype=vec3), i: int):
+        return n[i]
+
+    @wp.func
+    def direction_second(n: wp.array(dtype=vec3), n2: wp.array(dtype=vec3), i: int):
+        return n2[i]
+
+    @wp.func
+    def rate_first(u: wp.array(dtype=vec3), k1: wp.array(dtype=vec3), h: real, i: int):
+        return u[i]
+
+    @wp.func
+    def rate_second(u: wp.array(dtype=vec3), k1: wp.array(dtype=vec3), h: real, i: int):
+        return u[i] + h * k1[i]
+
+    def build_up(direction, rate, terms):
+        @wp.func
+        def up(
+            rope: Rope, n: wp.array(dtype=vec3), u: wp.array(dtype=vec3), n2: wp.array(dtype=vec3), k1: wp.array(dtype=vec3),
+            stiffness: wp.array(dtype=real), root_rate_w: vec3, gravity: vec3, gamma: real, h: real,
+            c1: wp.array(dtype=vec3), c2: wp.array(dtype=vec3), hs: wp.array(dtype=vec2),
+        ):
+            l = rope.segment_length
+            l2 = l * l
+            gh = gamma * h
+            d = vec3()  # apparent mass of what hangs below: diagonal
+            o = vec3()  # and off-diagonal (xy, xz, yz)
+            b = vec3()
+            ni = direction(n, n2, L - 1)
+            ui = rate(u, k1, h, L - 1)
+            n_below = ni
+            u_below = ui
+            for step in range(L):
+                i = L - 1 - step
+                m, c, inertia = rod(rope, i)
+                n_above = ni
+                u_above = ui
+                damping = rope.joint_damping
+                couple = wp.cross(root_rate_w, ni) - ui
+                if i > 0:
+                    n_above = direction(n, n2, i - 1)
+                    u_above = rate(u, k1, h, i - 1)
+                    couple = viscous(ni, n_above, u_above) - ui
+                if i < L - 1:
+                    couple += viscous(ni, n_below, u_below) - ui
+                    damping += rope.joint_damping
+                speed2 = wp.dot(ui, ui)
+                a_n = sym_mul(d, o, ni)
+                f = m * gravity
+                cm = c * m
+                g = c * f - l * b + (l2 * speed2) * a_n + rope.joint_damping * couple
+                g += terms(stiffness[i], damping, ui, k1[i], gh, h)
+                e1, e2 = tangent_basis(ni)
+                a_e1 = sym_mul(d, o, e1)
+                a_e2 = sym_mul(d, o, e2)
+                effective = inertia + gh * (damping + gh * stiffness[i])
+                s11 = effective + l2 * wp.dot(e1, a_e1)
+                s12 = l2 * wp.dot(e1, a_e2)
+                s22 = effective + l2 * wp.dot(e2, a_e2)
+                inv = real(1.0) / (s11 * s22 - s12 * s12)
+                s11 *= inv
+                s12 *= inv
+                s22 *= inv
+                b1 = cm * e1 + l * a_e1
+                b2 = cm * e2 + l * a_e2
+                q1 = s22 * b1 - s12 * b2
+                q2 = s11 * b2 - s12 * b1
+                g1 = wp.dot(e1, g)
+                g2 = wp.dot(e2, g)
+                h1 = s22 * g1 - s12 * g2
+                h2 = s11 * g2 - s12 * g1
+                b = b - f - speed2 * (cm * ni + l * a_n) + h1 * b1 + h2 * b2
+                d = d + vec3(m, m, m) - wp.cw_mul(b1, q1) - wp.cw_mul(b2, q2)
+                o = o - vec3(
+                    b1[0] * q1[1] + b2[0] * q2[1], b1[0] * q1[2] + b2[0] * q2[2], b1[1] * q1[2] + b2[1] * q2[2]
+                )
+                c1[i] = q1
+                c2[i] = q2
+                hs[i] = vec2(h1, h2)
+                n_below = ni
+                u_below = ui
+                ni = n_above
+                ui = u_above
+            return d, o, b
+
+        return up
+
+    up_first = build_up(direction_first, rate_first, first_stage_terms)
+    up_second = build_up(direction_second, rate_second, second_stage_terms)
+
+    @wp.func
+    def acceleration(ni: vec3, ui: vec3, a: vec3, c1: vec3, c2: vec3, hs: vec2):
+        """du/dt of a rod from the acceleration of its upper joint."""
+        e1, e2 = tangent_basis(ni)
+        return e1 * (hs[0] - wp.dot(c1, a)) + e2 * (hs[1] - wp.dot(c2, a)) - wp.dot(ui, ui) * ni
+
+    @wp.func
+    def down_first(
+        rope: Rope, n: wp.array(dtype=vec3), u: wp.array(dtype=vec3), mount_acc_w: vec3, gamma: real, h: real,
         c1: wp.array(dtype=vec3), c2: wp.array(dtype=vec3), hs: wp.array(dtype=vec2),
+        n2: wp.array(dtype=vec3), k1: wp.array(dtype=vec3),
     ):
-        l = rope.segment_length
-        gh = gamma * h
-        d = vec3()  # apparent mass of what hangs below: diagonal
-        o = vec3()  # and off-diagonal (xy, xz, yz)
-        b = vec3()
-        for step in range(L):
-            i = L - 1 - step
-            m, c, inertia = rod(rope, i)
+        """Fill k1 and n2; return the largest squared rate [1/s^2] of the state and the predicted state."""
+        a = mount_acc_w
+        fastest = real(0.0)
+        for i in range(L):
             ni = n[i]
-            couple, damping = joint_couple(rope, n, u, root_rate_w, i)
-            speed2 = wp.dot(u[i], u[i])
-            a_n = sym_mul(d, o, ni)
-            f = m * gravity
-            g = c * f - l * b + (l * l * speed2) * a_n + couple
-            g += implicit_terms(stiffness[i], damping, u[i], k1[i], gh, h, stage)
-            e1, e2 = tangent_basis(ni)
-            a_e1 = sym_mul(d, o, e1)
-            a_e2 = sym_mul(d, o, e2)
-            effective = inertia + gh * damping + gh * gh * stiffness[i]
-            s11 = effective + l * l * wp.dot(e1, a_e1)
-            s12 = l * l * wp.dot(e1, a_e2)
-            s22 = effective + l * l * wp.dot(e2, a_e2)
-            inv = real(1.0) / (s11 * s22 - s12 * s12)
-            b1 = (c * m) * e1 + l * a_e1
-            b2 = (c * m) * e2 + l * a_e2
-            q1 = inv * (s22 * b1 - s12 * b2)
-            q2 = inv * (s11 * b2 - s12 * b1)
-            g1 = wp.dot(e1, g)
-            g2 = wp.dot(e2, g)
-            h1 = inv * (s22 * g1 - s12 * g2)
-            h2 = inv * (s11 * g2 - s12 * g1)
-            b = b - f - speed2 * ((c * m) * ni + l * a_n) + h1 * b1 + h2 * b2
-            d = d + vec3(m, m, m) - wp.cw_mul(b1, q1) - wp.cw_mul(b2, q2)
-            o = o - vec3(
-                b1[0] * q1[1] + b2[0] * q2[1], b1[0] * q1[2] + b2[0] * q2[2], b1[1] * q1[2] + b2[1] * q2[2]
-            )
-            c1[i] = q1
-            c2[i] = q2
-            hs[i] = vec2(h1, h2)
-        return d, o, b
+            ui = u[i]
+            k = acceleration(ni, ui, a, c1[i], c2[i], hs[i])
+            u2 = ui + h * k
+            k1[i] = k
+            n2[i] = wp.normalize(ni + h * (ui + (gamma * h) * k))
+            fastest = wp.max(fastest, wp.max(wp.dot(ui, ui), wp.dot(u2, u2)))
+            a = a + rope.segment_length * k
+        return fastest
 
     @wp.func
-    def down(
-        rope: Rope, n: wp.array(dtype=vec3), u: wp.array(dtype=vec3), mount_acc_w: vec3, mount_force_w: vec3, gravity: vec3,
+    def down_second(
+        rope: Rope, n: wp.array(dtype=vec3), u: wp.array(dtype=vec3), stiffness: wp.array(dtype=real),
+        mount_acc_w: vec3, mount_force_w: vec3, gravity: vec3, gamma: real, h: real,
         c1: wp.array(dtype=vec3), c2: wp.array(dtype=vec3), hs: wp.array(dtype=vec2),
-        acc: wp.array(dtype=vec3), stiffness: wp.array(dtype=real),
+        n2: wp.array(dtype=vec3), k1: wp.array(dtype=vec3),
     ):
-        """Fill ``acc`` with du/dt of every rod; ``stiffness`` with its geometric stiffness for the next step.
-
-        ``mount_force_w`` is the force that the vehicle exerts on the chain.
-        """
+        """Advance n, u, stiffness; ``mount_force_w`` is the vehicle's force on the chain. Return the new momentum."""
         a = mount_acc_w
         pull = mount_force_w
         l = rope.segment_length
+        gh = gamma * h
+        half = real(0.5) * h
+        total = vec3()
         for i in range(L):
             m, c, inertia = rod(rope, i)
-            ni = n[i]
-            e1, e2 = tangent_basis(ni)
-            beta = e1 * (hs[i][0] - wp.dot(c1[i], a)) + e2 * (hs[i][1] - wp.dot(c2[i], a))
-            k = beta - wp.dot(u[i], u[i]) * ni
+            ni = n2[i]
+            old_u = u[i]
+            first = k1[i]
+            ui = old_u + h * first
+            k = acceleration(ni, ui, a, c1[i], c2[i], hs[i])
             f = m * gravity
             pull = pull + f - m * (a + c * k)
             stiffness[i] = wp.max(wp.dot(ni, c * (f - m * a) - l * pull), real(0.0))
-            acc[i] = k
             a = a + l * k
+            new_n = wp.normalize(n[i] + half * (old_u + ui + gh * (k - first)))
+            new_u = old_u + half * (first + k)
+            new_u = new_u - new_n * wp.dot(new_n, new_u)
+            n[i] = new_n
+            u[i] = new_u
+            total += (below(rope, i) * l + c * m) * new_u
+        return total
+
+    @wp.func
+    def fall_back(
+        n: wp.array(dtype=vec3), u: wp.array(dtype=vec3), h: real, n2: wp.array(dtype=vec3), k1: wp.array(dtype=vec3)
+    ):
+        """Advance n and u by the first stage alone, linearly implicit Euler; the stiffness stays."""
+        for i in range(L):
+            new_u = u[i] + h * k1[i]
+            n[i] = n2[i]
+            u[i] = new_u - n2[i] * wp.dot(n2[i], new_u)
 
     @wp.func
     def payload(rope: Rope, mount_pos_w: vec3, mount_vel_w: vec3, n: wp.array(dtype=vec3), u: wp.array(dtype=vec3)):
@@ -182,12 +270,13 @@ def build_chain(t: Types, segments: int) -> SimpleNamespace:
     @wp.func
     def momentum(rope: Rope, u: wp.array(dtype=vec3)):
         """Linear momentum [N s] of the chain in a frame that moves with the mount."""
-        below = rope.last_mass
-        total = rope.last_mass * rope.last_center * u[L - 1]
-        for step in range(L - 1):
-            i = L - 2 - step
-            total += (below * rope.segment_length + real(0.5) * rope.segment_mass * rope.segment_length) * u[i]
-            below += rope.segment_mass
+        total = vec3()
+        for i in range(L):
+            m, c, inertia = rod(rope, i)
+            total += (below(rope, i) * rope.segment_length + c * m) * u[i]
         return total
 
-    return SimpleNamespace(up=up, down=down, payload=payload, momentum=momentum, weight=weight, segments=L, vec2=vec2)
+    return SimpleNamespace(
+        up_first=up_first, up_second=up_second, down_first=down_first, down_second=down_second, fall_back=fall_back,
+        payload=payload, momentum=momentum, segments=L, vec2=vec2,
+    )
