@@ -96,7 +96,8 @@ class PPOParams:
     minibatches: int
     learning_rate: float
     schedule: Literal["adaptive", "fixed"]
-    desired_kl: float
+    desired_kl: float  # at the first iteration
+    final_kl: float  # at the last one; linear between
     discount: float
     gae_lambda: float
     clip: float

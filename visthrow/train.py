@@ -129,6 +129,9 @@ class Trainer:
         return [m.obs_normalizer for m in models if m.obs_normalization]
 
     def _learn(self) -> dict[str, float]:
+        p = self.experiment.ppo
+        done = min(self.iteration / p.iterations, 1.0)
+        self.alg.desired_kl = (1.0 - done) * p.desired_kl + done * p.final_kl
         figures = self.alg.update()
         if self._graph is not None:  # rsl_rl makes a new tensor of the spread; the graph reads the one it was captured with
             for normalizer, captured in self._captured_std:
