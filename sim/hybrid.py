@@ -182,10 +182,10 @@ class HybridSim:
     def get(self, name: str) -> np.ndarray:
         """Copy of a state or output array by name, environment first: shape (E, ...) or (E, L, ...)."""
         if name in st.STATE_FIELDS:
-            value = getattr(self.state, name).numpy()
-            return np.swapaxes(value, 0, 1) if st.STATE_FIELDS[name][1] else value
+            value = getattr(self.state, name).numpy()  # on the CPU a view of the simulator's memory
+            return np.array(np.swapaxes(value, 0, 1) if st.STATE_FIELDS[name][1] else value)
         if name in st.OUTPUT_FIELDS:
-            return getattr(self.out, name).numpy()
+            return np.array(getattr(self.out, name).numpy())
         raise ValueError(f"no array {name!r}; there are {sorted(st.STATE_FIELDS | st.OUTPUT_FIELDS)}")
 
     def cable_points_w(self) -> np.ndarray:

@@ -263,5 +263,5 @@ class QuadSim:
         """Copy of a state array by name, shape (E, ...); the queue (E, D, 4). Raises ValueError for an unknown name."""
         if name not in FIELDS:
             raise ValueError(f"no array {name!r}; there are {sorted(FIELDS)}")
-        value = getattr(self.state, name).numpy()
-        return np.swapaxes(value, 0, 1) if FIELDS[name][1] else value
+        value = getattr(self.state, name).numpy()  # on the CPU a view of the simulator's memory
+        return np.array(np.swapaxes(value, 0, 1) if FIELDS[name][1] else value)
