@@ -1,0 +1,142 @@
+"""``visthrow compare``: throw many times with each policy and print landing errors and durations."""
+
+import argparse
+import math
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from visthrow.cli import add_common
+from visthrow.errors import ConfigError
+
+DEFAULT_POLICIES = ("state", "vision")
+DEFAULT_TARGETS = (1.5, 2.0, 2.5)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.epilog = (
+        "examples:\n"
+        "  visthrow compare                               state against vision, 200 throws at each of three targets\n"
+        "  visthrow compare vision runs/v2/policy.npz     a shipped policy against one of your own\n"
+        "  visthrow compare --plant reference-realistic --throws 50   on the stand-in for a real vehicle (minutes)\n"
+        "\nA throw starts in hover with the payload near z = 0.95 m. The landing error is the horizontal distance from the\n"
+        "target, the duration counts from the policy's start to the landing, smoothness is the root mean square change of\n"
+        "the normalised commands from step to step.\n"
+    )
+    parser.add_argument("policies", metavar="POLICY", nargs="*", help="shipped names or policy files (default: state vision)")
+    parser.add_argument("--targets", type=float, nargs="+", default=list(DEFAULT_TARGETS), metavar="M", help="distances along x [m]")
+    parser.add_argument("--throws", type=int, default=200, metavar="N", help="for each policy and target (default: 200)")
+    parser.add_argument("--plant", default="hybrid", metavar="NAME", help="hybrid (the training simulator, with all its noise), "
+                        "reference, or reference-realistic")  # fmt: skip
+    parser.add_argument("--seed", type=int, default=0, help="of starts and noise (default: 0)")
+    parser.add_argument("--config", metavar="NAME", help="fly in this train config instead of each policy's own")
+    parser.add_argument("--out", default="out/compare", metavar="FOLDER", help="for table, CSV and plot (default: out/compare)")
+    add_common(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Throw, print, write."""
+    check(args.targets, args.throws)
+    from visthrow.device import resolve
+    from visthrow.loading import load_policy, unique_names
+    from visthrow.plants import PLANTS
+    from visthrow.errors import suggest
+
+    if args.plant not in PLANTS:
+        raise ConfigError(f"no plant '{args.plant}'; {suggest(args.plant, PLANTS)}")
+    loaded = [load_policy(name, args.config, args.overrides) for name in args.policies or DEFAULT_POLICIES]
+    names = unique_names(loaded)
+    if args.plant == "hybrid":
+        throws = throw_hybrid(loaded, args.targets, args.throws, resolve(args.device), args.seed)
+    else:
+        from visthrow.reference_protocol import Throwing
+
+        with Throwing(loaded, args.targets, args.throws, args.plant, args.seed) as throwing:
+            throws = throwing.results()
+    title, rows = title_of(args.plant, args.seed), rows_of(loaded, names, throws)
+    print(report(title, rows))
+    for path in write(Path(args.out), list(zip(names, throws)), rows, args.plant, title):
+        print(path)
+    if args.json:
+        from visthrow.storage import write_json
+
+        write_json(args.json, {"plant": args.plant, "seed": args.seed, "rows": rows})
+    return 0
+
+
+def check(targets: Sequence[float], throws: int) -> None:
+    """Refuse what cannot be thrown.
+
+    Raises:
+        ConfigError: no throws, or a target that is no distance or further than a vehicle may fly.
+    """
+    if throws < 1:
+        raise ConfigError(f"--throws {throws}; expected 1 or more")
+    for target in targets:
+        if not (math.isfinite(target) and 0.0 <= target <= 3.0):
+            raise ConfigError(f"--targets {target:g}; expected distances from 0 to 3 m, policies are trained on goals within 2 m")
+    if len(set(targets)) < len(targets):
+        raise ConfigError(f"--targets {' '.join(f'{x:g}' for x in targets)}: the same one twice")
+
+
+def throw_hybrid(loaded: Sequence, targets: Sequence[float], count: int, device: str, seed: int, show: bool = True) -> list[list]:
+    """Throw in the training simulator; for each policy a `Throws` a target."""
+    from visthrow.protocol import throw
+
+    rows, total = [], len(loaded) * len(targets)
+    for item in loaded:
+        policy = item.policy.to(device)
+        row = []
+        for target in targets:
+            if show and sys.stderr.isatty():
+                done = len(rows) * len(targets) + len(row)
+                print(f"\rthrows in the training simulator: {done} of {total} sets   ", end="", file=sys.stderr, flush=True)
+            row.append(throw(item.experiment, policy.act, target, count, device, seed))
+        rows.append(row)
+    if show and sys.stderr.isatty():
+        print(f"\r{' ' * 60}\r", end="", file=sys.stderr, flush=True)
+    return rows
+
+
+def title_of(plant: str, seed: int) -> str:
+    """Heading of a table: which plant, which noise, which seed."""
+    meaning = {
+        "hybrid": "the training simulator with all its noise and randomisation",
+        "reference": "the reference plant (MuJoCo) without extras: ideal measurements, still air",
+        "reference-realistic": "the reference plant (MuJoCo) with the pinned wind, drag, stretch, build errors and mocap noise",
+    }[plant]
+    return f"Throws from hover on {meaning} (`{plant}`, seed {seed})"
+
+
+def rows_of(loaded: Sequence, names: Sequence[str], throws: Sequence[Sequence]) -> list[dict]:
+    """Summaries, target after target, policies side by side."""
+    rows = []
+    for column in range(len(throws[0])):
+        for item, name, row in zip(loaded, names, throws):
+            layout = item.policy.contract["observation"]["layout"]
+            rows.append({"policy": name, "layout": layout, **row[column].summary()})
+    return rows
+
+
+def report(title: str, rows: Sequence[dict]) -> str:
+    """Table with its note on the paper's figures."""
+    from visthrow.tables import PAPER_NOTE, markdown
+
+    return f"{markdown(rows, title)}\n{PAPER_NOTE}\n"
+
+
+def write(folder: Path, throws: Sequence[tuple[str, Sequence]], rows: Sequence[dict], plant: str, title: str) -> list[Path]:
+    """Write Markdown, CSV and scatter plot; returns their paths."""
+    from visthrow import scatter, tables
+    from visthrow.storage import atomic_write
+
+    stem = f"compare-{plant}"
+    paths = [folder / f"{stem}.md", folder / f"{stem}.csv", folder / f"{stem}.png"]
+    atomic_write(paths[0], report(title, rows))
+    atomic_write(paths[1], tables.csv_text([(name, plant, of) for name, row in throws for of in row]))
+    from visthrow.plants import PLANTS
+
+    count = len(throws[0][1][0].success)
+    scatter.draw(paths[2], throws, f"{count} throws each, {PLANTS[plant].split(' with ')[0]}")
+    return paths

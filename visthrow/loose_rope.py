@@ -1,0 +1,107 @@
+"""The rope after the release, for drawing: it flies with the ball, and sinks to the ground once the ball lies there.
+
+The training simulator's landing is that of a lone ball in closed form, so here the ball is not pulled by the rope's 4 g:
+the joints are equal point masses on rigid links, the last link ends in the ball. Positions are kept from the ball, in
+whose free-falling frame gravity vanishes. The reference plant has its own rope in flight; only the sinking is drawn here.
+
+Source: Verlet steps with all links solved for at once (SHAKE; Ryckaert, Ciccotti, Berendsen, J. Comput. Phys. 23, 1977).
+"""
+
+import numpy as np
+
+GRAVITY = 9.81  # [m/s^2]
+STEP = 1e-3  # [s]
+ITERATIONS = 4
+"""Newton steps for the links; from one step of 1 ms to the next they are off by less than 1 % and converge at once."""
+
+SINKING_STEP = 4e-3  # [s]
+SINKING_DAMPING = 6.0
+"""Of the rope on the ground [1/s]; a picture's taste, no measurement."""
+
+
+class LooseRope:
+    """One rope that hangs on nothing but the ball.
+
+    Attributes:
+        offset_w: joints from the ball's centre, mount end first [m], shape (L, 3). velocity_w: [m/s], shape (L, 3).
+    """
+
+    def __init__(self, points_w: np.ndarray, velocity_w: np.ndarray, ball_w: np.ndarray, ball_vel_w: np.ndarray) -> None:
+        """Take over a rope.
+
+        Args:
+            points_w: joints, upper end first, lower end last [m], shape (L + 1, 3).
+            velocity_w: theirs [m/s], shape (L + 1, 3).
+            ball_w: the ball's centre [m], shape (3,). ball_vel_w: [m/s], shape (3,).
+        """
+        self.offset_w = np.array(points_w[:-1], dtype=float) - ball_w
+        self.velocity_w = np.array(velocity_w[:-1], dtype=float) - ball_vel_w
+        ends = np.vstack((self.offset_w, np.zeros(3)))
+        self._lengths = np.linalg.norm(np.diff(ends, axis=0), axis=1)
+        last = np.linalg.norm(np.asarray(points_w[-1]) - points_w[-2])
+        self._knot = 1.0 - last / self._lengths[-1]  # where the rope ends on the last link, from the ball
+
+    def fly(self, duration: float) -> None:
+        """Fly on with the ball for a time [s]."""
+        count = max(1, round(duration / STEP))
+        h = duration / count
+        for _ in range(count):
+            moved = self._with_links(self.offset_w + h * self.velocity_w)
+            self.velocity_w, self.offset_w = (moved - self.offset_w) / h, moved
+
+    def sink(self, duration: float, ground: float) -> None:
+        """Fall and come to rest while the ball lies still.
+
+        From the ball outwards each joint goes to its link's length from the one before (Mueller, Kim, Chentanez, Fast
+        simulation of inextensible hair and fur, 2012): not accurate, but it rests on the ground whatever it starts from.
+
+        Args:
+            duration: [s].
+            ground: height of the ground from the ball's centre [m].
+        """
+        count = max(1, round(duration / SINKING_STEP))
+        h = duration / count
+        for _ in range(count):
+            self.velocity_w[:, 2] -= GRAVITY * h
+            moved = self.offset_w + h * np.exp(-SINKING_DAMPING * h) * self.velocity_w
+            end = np.zeros(3)
+            for i in range(len(moved) - 1, -1, -1):
+                end = moved[i] = _on_link(moved[i], end, self._lengths[i], ground)
+            self.velocity_w, self.offset_w = (moved - self.offset_w) / h, moved
+
+    def _with_links(self, moved: np.ndarray) -> np.ndarray:
+        """Put positions back onto the links, along the links' directions before the step."""
+        before = np.diff(np.vstack((self.offset_w, np.zeros(3))), axis=0)
+        size = len(before)
+        for _ in range(ITERATIONS):
+            now = np.diff(np.vstack((moved, np.zeros(3))), axis=0)
+            excess = np.sum(now * now, axis=1) - self._lengths**2
+            jacobian = np.zeros((size, size))
+            index = np.arange(size)
+            weight = np.full(size, 2.0)
+            weight[-1] = 1.0  # the ball does not give way
+            jacobian[index, index] = 2.0 * weight * np.sum(now * before, axis=1)
+            jacobian[index[1:], index[:-1]] = -2.0 * np.sum(now[1:] * before[:-1], axis=1)
+            jacobian[index[:-1], index[1:]] = -2.0 * np.sum(now[:-1] * before[1:], axis=1)
+            push = np.linalg.solve(jacobian, excess)[:, None] * before
+            moved = moved + push
+            moved[1:] -= push[:-1]
+        return moved
+
+    def points_w(self, ball_w: np.ndarray) -> np.ndarray:
+        """Joints and lower end of the rope [m], shape (L + 1, 3), for a ball at ``ball_w``, shape (3,)."""
+        knot = self._knot * self.offset_w[-1:]
+        return np.vstack((self.offset_w, knot)) + ball_w
+
+
+def _on_link(joint: np.ndarray, end: np.ndarray, length: float, ground: float) -> np.ndarray:
+    """Put a joint to ``length`` from the link's other end, above the ground; all from the ball's centre [m], shape (3,)."""
+    away = joint - end
+    away *= length / max(float(np.linalg.norm(away)), 1e-9)
+    lowest = max(ground - end[2], -length)
+    if away[2] >= lowest:
+        return end + away
+    flat = max(float(np.hypot(away[0], away[1])), 1e-9)
+    away[:2] *= np.sqrt(max(length**2 - lowest**2, 0.0)) / flat
+    away[2] = lowest
+    return end + away

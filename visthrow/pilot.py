@@ -1,0 +1,153 @@
+"""The policy in flight: from poses of vehicle, payload and goal to a command. Onboard-safe.
+
+The same functions of :mod:`visthrow.observations` and :mod:`visthrow.actions` that the training environment calls, with
+a batch of one on board; only the noise is missing.
+"""
+
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from camera.keypoints import KeypointCamera
+from camera.params import CameraParams
+from visthrow import actions as act
+from visthrow import config
+from visthrow import observations as ob
+from visthrow.errors import PolicyError
+from visthrow.hover import GRAVITY
+from visthrow.policy import Policy
+
+
+@dataclass(frozen=True)
+class PilotOutput:
+    """What one control step decided, and what it saw. NumPy, shape (E, ...)."""
+
+    action: np.ndarray  # normalised, clipped, shape (E, 5)
+    command: np.ndarray  # collective thrust [N] and body rates [rad/s], shape (E, 4)
+    release: np.ndarray  # whether the latch is to trip, shape (E,), bool
+    observation: np.ndarray  # shape (E, D)
+    keypoints: np.ndarray | None  # normalised image coordinates, shape (E, 8, 2); None without a camera
+    valid: np.ndarray | None  # which of them are seen, shape (E, 8), bool
+
+
+def camera_conditions(params: CameraParams) -> dict[str, Any]:
+    """Return what a vision policy's contract says of the camera: lens, mount and sizes, without noise."""
+    camera = config.to_dict(params)
+    return {
+        "fisheye": camera["fisheye"],
+        "mount": {key: camera["mount"][key] for key in ("position_b", "rpy_deg")},
+        "goal_side": camera["goal_side"],
+        "payload_radius": camera["payload_radius"],
+        "invalid_reads": camera["noise"]["invalid_reads"],
+    }
+
+
+class Pilot:
+    """Flies E vehicles with one policy; remembers the previous action and the payload's history.
+
+    Attributes:
+        policy: the policy. layout: of its observation. period: between two calls [s]. lag: from latch to separation [s].
+        camera: None where the policy looks at none and no camera was given.
+    """
+
+    def __init__(self, policy: Policy, camera_params: CameraParams | None = None, count: int = 1) -> None:
+        """Read the conditions of the policy's contract.
+
+        Args:
+            policy: on the CPU.
+            camera_params: a vision policy's camera; with a state policy keypoints are computed for whoever draws them.
+            count: E.
+
+        Raises:
+            PolicyError: The contract lacks an entry, or a vision policy is given no camera.
+            MismatchError: The camera is not the one that the policy was trained with.
+            ValueError: count below 1.
+        """
+        if count < 1:
+            raise ValueError(f"pilot of {count} vehicles; expected 1 or more")
+        contract = policy.contract
+        try:
+            self.layout = ob.layout_of(SimpleNamespace(**contract["observation"]))
+            self._max_thrust = float(contract["action"]["max_thrust"])
+            self._max_rate = torch.tensor(contract["action"]["max_rate"], dtype=torch.float32)
+            self._threshold = float(contract["release"]["threshold"])
+            self.lag = float(contract["release"]["lag"])
+            self.period = float(contract["control_period"])
+            rope = contract["rope"]
+            mass = contract["vehicle"]["body"]["mass"] + rope["rope_mass"] + rope["payload_mass"]
+        except (KeyError, AttributeError, TypeError) as error:
+            raise PolicyError(f"the policy's contract is incomplete: {error!r}; it was not written by visthrow train") from error
+        if self.layout.dimension != policy.obs_dim:
+            raise PolicyError(f"layout '{self.layout.name}' has {self.layout.dimension} numbers, the network {policy.obs_dim}")
+        if self.layout.name == "vision":
+            if camera_params is None:
+                raise PolicyError("a vision policy needs a camera; got none")
+            policy.require({"camera": camera_conditions(camera_params)}, sections={"camera"})
+        self.policy, self.count = policy, count
+        self.camera = None if camera_params is None else KeypointCamera(camera_params)
+        self._first = torch.tensor([act.hover_action(GRAVITY * mass, self._max_thrust)], dtype=torch.float32)
+        self.start()
+
+    def start(self) -> None:
+        """Begin a throw from hover: the next call fills the history."""
+        self._previous = self._first.repeat(self.count, 1)
+        self._history = torch.zeros(self.count, 1 + self.layout.history, self.layout.payload)
+        self._fresh = torch.ones(self.count, dtype=torch.bool)
+
+    @property
+    def previous_action(self) -> np.ndarray:
+        """Clipped action of the last call, hover before the first one, shape (E, 5)."""
+        return self._previous.numpy()
+
+    @torch.inference_mode()
+    def act(
+        self, pos_w: np.ndarray, quat_wb: np.ndarray, vel_w: np.ndarray, rate_b: np.ndarray, payload_w: np.ndarray,
+        goal_w: np.ndarray, attached: np.ndarray | bool = True,
+    ) -> PilotOutput:
+        """Decide one control step.
+
+        Args:
+            pos_w: of the vehicle's centre of mass [m], shape (E, 3), world frame.
+            quat_wb: attitude, xyzw, shape (E, 4).
+            vel_w: [m/s], shape (E, 3). rate_b: [rad/s], shape (E, 3).
+            payload_w: of the payload's centre [m], shape (E, 3).
+            goal_w: [m], shape (E, 3) or (3,).
+            attached: whether the payload hangs on the vehicle, shape (E,) or one for all.
+
+        Raises:
+            ValueError: An array of another shape.
+        """
+        pos, vel = self._tensor("pos_w", pos_w, 3), self._tensor("vel_w", vel_w, 3)
+        rot = ob.rotation_from_quat(self._tensor("quat_wb", quat_wb, 4))
+        rate, payload = self._tensor("rate_b", rate_b, 3), self._tensor("payload_w", payload_w, 3)
+        goal = self._tensor("goal_w", np.broadcast_to(np.asarray(goal_w), (self.count, 3)), 3)
+        hangs = torch.from_numpy(np.broadcast_to(np.asarray(attached), (self.count,)).astype(np.float32))
+        points = valid = None
+        if self.camera is not None:
+            points, valid = ob.vision_part(self.camera, pos, rot, goal, payload)
+        seen = points.flatten(1) if self.layout.name == "vision" else ob.state_part(pos, goal, payload)
+        frame = torch.cat([ob.vehicle_part(pos, vel, rate, rot), seen], dim=-1)
+        observation, self._history = ob.observe(
+            self.layout, frame, valid, self._previous, hangs, self._history, self._fresh
+        )
+        raw = self.policy.act(observation)
+        action = act.clip_action(raw)
+        self._previous, self._fresh = action, torch.zeros_like(self._fresh)
+        return PilotOutput(
+            action.numpy(),
+            act.command_from_action(action, self._max_thrust, self._max_rate).numpy(),
+            act.release_asked(raw, self._threshold).numpy(),
+            observation.numpy(),
+            None if points is None else points.numpy(),
+            None if valid is None else valid.numpy(),
+        )
+
+    def _tensor(self, name: str, value: np.ndarray, width: int) -> Tensor:
+        array = np.asarray(value, dtype=np.float32)
+        if array.shape != (self.count, width):
+            raise ValueError(f"{name} has shape {array.shape}; expected ({self.count}, {width})")
+        return torch.from_numpy(np.ascontiguousarray(array))

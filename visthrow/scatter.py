@@ -1,0 +1,88 @@
+"""Landing points from above, one panel a target, as in the paper's figure."""
+
+import io
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from visthrow import style
+from visthrow.storage import atomic_write
+
+RADII = (0.1, 0.2)
+"""Circles about the goal [m]."""
+
+LEAST_HALF_WIDTH, MOST_HALF_WIDTH = 0.25, 0.6
+"""Of a panel [m]."""
+
+
+def draw(path: str | Path, throws: Sequence[tuple[str, Sequence]], subtitle: str) -> None:
+    """Draw the landing scatter.
+
+    Args:
+        path: PNG file.
+        throws: for each policy its name and one :class:`visthrow.protocol.Throws` a target, the same targets for all.
+        subtitle: plant and number of throws.
+
+    Raises:
+        StorageError: the place cannot be written.
+    """
+    style.use()
+    import matplotlib.pyplot as plt
+
+    targets = [of.target for of in throws[0][1]]
+    half = _half_width(throws)
+    size = 3.1
+    figure, axes = plt.subplots(1, len(targets), figsize=(max(size * len(targets), 6.2) + 0.5, size + 1.35), squeeze=False)
+    for column, (axis, target) in enumerate(zip(axes[0], targets)):
+        _goal(axis, half)
+        for index, (name, row) in enumerate(throws):
+            _points(axis, row[column], index, half, f"{name}" if column == 0 else None)
+        axis.set(xlim=(-half, half), ylim=(-half, half), aspect="equal")
+        axis.set_title(f"target {target:.1f} m")
+        axis.set_xlabel("lateral error, to the right [m]")
+        if column == 0:
+            axis.set_ylabel("error along the throw [m]")
+    handles, labels = axes[0][0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="upper center", ncols=max(len(labels), 1), bbox_to_anchor=(0.5, 0.925), columnspacing=1.6)
+    figure.suptitle(f"Landing points from above: {subtitle}", fontsize=11, y=0.985)
+    figure.tight_layout(rect=(0, 0, 1, 0.89))
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png")
+    plt.close(figure)
+    atomic_write(path, buffer.getvalue())
+
+
+def _half_width(throws) -> float:
+    off = [np.abs(of.landing_w - (of.target, 0.0)) for _, row in throws for of in row]
+    largest = np.nanmax(np.concatenate([*off, [[0.0, 0.0]]]))
+    return float(np.clip(1.08 * largest, LEAST_HALF_WIDTH, MOST_HALF_WIDTH))
+
+
+def _goal(axis, half: float) -> None:
+    from matplotlib.patches import Circle
+
+    for radius in RADII:
+        if radius < half:
+            axis.add_patch(Circle((0, 0), radius, fill=False, color=style.QUIET, lw=0.9, ls=(0, (4, 3)), zorder=1))
+            axis.annotate(
+                f"{radius:g} m", (radius * 0.7071, -radius * 0.7071), xytext=(2, -2), textcoords="offset points", color=style.QUIET,
+                fontsize=8, ha="left", va="top", zorder=5,
+            )  # fmt: skip
+    axis.plot(0, 0, "+", color=style.INK, ms=13, mew=1.6, zorder=4)
+    axis.grid(True, zorder=0)
+    axis.set_axisbelow(True)
+
+
+def _points(axis, of, index: int, half: float, label: str | None) -> None:
+    """Error along x upwards, y to the left as seen from above. Points outside the panel stand at its edge, hollow."""
+    good = of.landing_w[of.success] - (of.target, 0.0)
+    shown = np.clip(good, -half, half)
+    inside = np.all(shown == good, axis=1)
+    colour, marker = style.COLOURS[index % len(style.COLOURS)], style.MARKERS[index % len(style.MARKERS)]
+    alpha = 0.75 if len(good) <= 60 else 0.5
+    axis.scatter(
+        -good[inside, 1], good[inside, 0], s=20, marker=marker, color=colour, alpha=alpha, lw=0.3, edgecolor="white", zorder=3,
+        label=label,
+    )  # fmt: skip
+    axis.scatter(-shown[~inside, 1], shown[~inside, 0], s=24, marker=marker, facecolor="none", edgecolor=colour, zorder=3, clip_on=False)

@@ -1,0 +1,27 @@
+"""One look for all pictures: sizes, greys, and colours that are told apart by colour-blind readers.
+
+Source: Okabe and Ito, Color Universal Design, 2008, for the eight colours.
+"""
+
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+"""Of compared things, in order."""
+
+MARKERS = ("o", "^", "s", "D", "v", "P")
+"""Beside the colour, so that it never stands alone."""
+
+INK, QUIET, FAINT = "#222222", "#767676", "#D9D9D9"
+VEHICLE, ROPE, PAYLOAD, GOAL = "#3A3F47", "#8A6D3B", "#D55E00", "#009E73"
+
+
+def use() -> None:
+    """Set matplotlib to draw files in this style; call it before the first figure."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    matplotlib.rcParams.update({
+        "font.family": "DejaVu Sans", "font.size": 10, "axes.titlesize": 11, "axes.labelsize": 10, "legend.fontsize": 9.5,
+        "axes.edgecolor": QUIET, "axes.labelcolor": INK, "text.color": INK, "xtick.color": QUIET, "ytick.color": QUIET,
+        "xtick.labelcolor": INK, "ytick.labelcolor": INK, "axes.spines.top": False, "axes.spines.right": False,
+        "axes.linewidth": 0.8, "grid.color": FAINT, "grid.linewidth": 0.7, "savefig.dpi": 160, "figure.facecolor": "white",
+        "legend.frameon": False,
+    })  # fmt: skip

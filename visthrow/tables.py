@@ -1,0 +1,77 @@
+"""Tables of throws: Markdown for people, CSV for programs. Every table says which plant it was measured on."""
+
+import csv
+import io
+from collections.abc import Sequence
+
+import numpy as np
+
+PAPER = {
+    ("state", 1.5): (0.082, 0.035, 1.090, 0.009),
+    ("state", 2.0): (0.105, 0.099, 1.154, 0.015),
+    ("state", 2.5): (0.133, 0.082, 1.188, 0.015),
+    ("vision", 1.5): (0.101, 0.058, 1.051, 0.011),
+    ("vision", 2.0): (0.101, 0.106, 1.125, 0.029),
+}
+"""Layout and target -> landing error [m] and duration [s], mean and deviation, of the paper's vehicle (ten throws each)."""
+
+PAPER_NOTE = (
+    "The paper's figures are ten throws a target of a real vehicle; ours are simulated. No vehicle was flown for this "
+    "project, so the two columns do not measure the same thing."
+)
+
+COLUMNS = (
+    "policy", "target [m]", "throws", "landing error [m]", "duration [s]", "released and landed", "bias x / y [m]", "smoothness",
+    "paper, real vehicle: error [m], duration [s]",
+)  # fmt: skip
+
+
+def markdown(rows: Sequence[dict], title: str) -> str:
+    """Table of summaries.
+
+    Args:
+        rows: :meth:`visthrow.protocol.Throws.summary` with ``policy`` and ``layout`` added.
+        title: what was measured where.
+    """
+    cells = [COLUMNS, *map(_cells, rows)]
+    widths = [max(len(row[i]) for row in cells) for i in range(len(COLUMNS))]
+    left = {0}
+
+    def line(row: Sequence[str]) -> str:
+        padded = (cell.ljust(w) if i in left else cell.rjust(w) for i, (cell, w) in enumerate(zip(row, widths)))
+        return "| " + " | ".join(padded) + " |"
+
+    rule = "|" + "|".join("-" * (w + 2) if i in left else "-" * (w + 1) + ":" for i, w in enumerate(widths)) + "|"
+    return "\n".join([title, "", line(cells[0]), rule, *map(line, cells[1:]), ""])
+
+
+def _cells(row: dict) -> tuple[str, ...]:
+    paper = PAPER.get((row["layout"], row["target"]))
+    beside = "-" if paper is None else f"{paper[0]:.3f} ± {paper[1]:.3f}, {paper[2]:.3f} ± {paper[3]:.3f}"
+    head = (row["policy"], f"{row['target']:.1f}", str(row["throws"]))
+    success = f"{100 * row['success']:.1f} %"
+    if not row["success"]:
+        return (*head, "-", "-", success, "-", "-", beside)
+    return (
+        *head, f"{row['error_mean']:.3f} ± {row['error_std']:.3f}", f"{row['duration_mean']:.3f} ± {row['duration_std']:.3f}",
+        success, f"{row['bias_x']:+.3f} / {row['bias_y']:+.3f}", f"{row['smoothness']:.3f}", beside,
+    )  # fmt: skip
+
+
+def csv_text(throws: Sequence[tuple[str, str, object]]) -> str:
+    """One row a throw.
+
+    Args:
+        throws: policy's name, plant's name and :class:`visthrow.protocol.Throws`.
+    """
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow([
+        "policy", "plant", "target [m]", "throw", "success", "landing x [m]", "landing y [m]", "landing error [m]",
+        "duration [s]", "clearance [m]", "smoothness",
+    ])  # fmt: skip
+    for policy, plant, of in throws:
+        for i in range(len(of.success)):
+            numbers = (*of.landing_w[i], of.error[i], of.duration[i], of.clearance[i], of.smoothness[i])
+            writer.writerow([policy, plant, of.target, i, int(of.success[i]), *("" if np.isnan(x) else f"{x:.6g}" for x in numbers)])
+    return text.getvalue()
