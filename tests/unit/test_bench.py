@@ -1,0 +1,195 @@
+"""Benchmarks run with tiny sizes, count what the kernel does, and keep well-formed records; no time is judged."""
+
+import dataclasses
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sim import state as st
+from sim.reference.scene import load_scene
+from visthrow import cli, config
+from visthrow.bench import commands, flops, records, sim_cpu, sim_gpu
+from visthrow.bench.scenes import HARD_THROW
+from visthrow.errors import StorageError, VisthrowError
+from visthrow.task import Experiment, plant_of
+
+SCENES = Path(__file__).resolve().parents[1] / "data" / "scenes"
+ROUND_OFF = 1e-12
+"""Relative; the counted run and the compiled kernel do the same float64 arithmetic, but for contractions."""
+
+
+@pytest.fixture(scope="module")
+def experiment() -> Experiment:
+    return config.load(Experiment, config.find("train", "state"))
+
+
+@pytest.fixture
+def kept(tmp_path, monkeypatch) -> Path:
+    monkeypatch.setattr(records, "FOLDER", tmp_path)
+    return tmp_path
+
+
+def test_hard_throw_is_the_scene_of_the_tests():
+    filed = dataclasses.asdict(load_scene(SCENES / "hard_throw.toml"))
+    for name, value in dataclasses.asdict(HARD_THROW).items():
+        if name == "schedule":
+            assert len(value) == len(filed[name]) == 1
+            assert value[0]["torque_b"] == filed[name][0]["torque_b"]
+            assert np.allclose(value[0]["force_b"], filed[name][0]["force_b"], rtol=1e-9)
+        else:
+            assert np.allclose(value, filed[name], rtol=1e-9), name
+
+
+def test_counted_step_equals_the_compiled_one(experiment):
+    """The operations are counted on the code that runs: same state after a step at hover, to round-off."""
+    plant = plant_of(experiment)
+    plant = dataclasses.replace(plant, sim=dataclasses.replace(plant.sim, precision="float64"))
+    sim = flops.hovering(plant)
+    before = sim.get("pos_w").copy()
+    state, count = flops.run_counted(sim)
+    assert np.array_equal(sim.get("pos_w"), before), "counting must leave the simulator as it is"
+    sim.step()
+    for name in st.STATE_FIELDS:
+        value = getattr(sim.state, name).numpy()
+        value = value[:, 0] if st.STATE_FIELDS[name][1] else value
+        counted = np.array(
+            [[float(c) for c in x.c] if hasattr(x, "c") else float(x) for x in getattr(state, name)._rows]
+        )
+        assert np.allclose(counted, value, rtol=ROUND_OFF, atol=ROUND_OFF), name
+    stages = 2 * round(plant.sim.control_period / plant.sim.substep)
+    assert count > 100 * plant.rope.segments * stages, "a rod costs hundreds of operations a stage"
+
+
+def test_traffic_counts_state_once_each_way(experiment):
+    size = flops.traffic(plant_of(experiment))
+    assert 2 * size["state"] < size["traffic"] < 2 * size["environment"]
+
+
+def test_longest_accurate_step_finds_the_last_good_one():
+    def error(step: float) -> float:
+        return 0.0 if step <= 0.0007 else float("nan")
+
+    found = sim_cpu.longest_accurate_step(error, 0.5, 1e-3)
+    count = round(0.5 / found)
+    assert error(found) == 0.0
+    assert np.isnan(error(0.5 / (count - 1)))
+    with pytest.raises(VisthrowError, match="too long already"):
+        sim_cpu.longest_accurate_step(lambda _: 1.0, 0.5, 1e-3)
+
+
+def test_pinning_restores_the_cores():
+    before = os.sched_getaffinity(0)
+    with sim_cpu.on_one_core() as core:
+        assert os.sched_getaffinity(0) == {core}
+    assert os.sched_getaffinity(0) == before
+    with pytest.raises(VisthrowError, match="expected one of"), sim_cpu.on_one_core(10**6):
+        pass
+
+
+def test_commands_stay_within_limits(experiment):
+    limits, plant = experiment.task.action, plant_of(experiment)
+    full = commands.draw("full", plant, limits, 5, 200)
+    assert full[..., 0].min() >= 0.0
+    assert full[..., 0].max() <= limits.max_thrust
+    assert (np.abs(full[..., 1:]) <= np.float32(limits.max_rate)).all()
+    assert not np.array_equal(full[0], full[1])
+
+
+def test_graph_replays_every_command(experiment):
+    """Two replays from a start equal the same steps one by one."""
+    graph = sim_gpu.Graph(experiment, 3, "full", "cpu", steps=2)
+    graph.rate(replays=2)
+    replayed = graph.sim.get("pos_w").copy()
+    by_hand = sim_gpu.Graph(experiment, 3, "full", "cpu", steps=2)
+    by_hand.sim.randomize(by_hand.spreads)
+    for _ in range(2):
+        by_hand._advance()
+    assert np.array_equal(by_hand.sim.get("pos_w"), replayed)
+
+
+def test_bench_sim_against_mujoco_writes_a_record(kept, tmp_path, capsys):
+    out = tmp_path / "figures.json"
+    arguments = [
+        "bench",
+        "sim",
+        "--batch",
+        "4",
+        "--seconds",
+        "1e-3",
+        "--repeats",
+        "1",
+        "--json",
+        str(out),
+        "--record",
+        "tiny",
+    ]
+    assert cli.main(arguments) == 0
+    figures = json.loads(out.read_text())["figures"]
+    assert figures["errors_m"]["ours"][0] < 1e-3
+    assert figures["errors_m"]["RK4"][0] <= 1e-3 < figures["errors_m"]["implicitfast"][0]
+    assert "MuJoCo C, RK4" in capsys.readouterr().out
+    assert cli.main(["bench", "records"]) == 0
+    printed = capsys.readouterr().out
+    assert "## tiny" in printed
+    assert "hard throw" in printed
+
+
+def test_bench_camera_runs(kept, capsys):
+    assert (
+        cli.main(["bench", "camera", "--environments", "16", "--repeats", "1", "--device", "cpu", "--record", "c"]) == 0
+    )
+    exact = records.load(kept / "c.json")["figures"]["accuracy"]
+    assert max(exact["kornia_px"], exact["opencv_px"]) < 1e-9  # px; the bar of the camera
+    assert "OpenCV" in capsys.readouterr().out
+
+
+def test_bench_train_splits_an_iteration(kept, capsys):
+    small = ["ppo.environments=8", "ppo.steps=2", "ppo.hidden=[8]", "ppo.minibatches=2"]
+    arguments = ["bench", "train", "state", "--device", "cpu", "--iterations", "1", "--repeats", "1", "--record", "t"]
+    assert cli.main([*arguments, *(word for s in small for word in ("--set", s))]) == 0
+    figures = records.load(kept / "t.json")["figures"]
+    assert figures["samples"] == 16
+    assert set(figures["seconds"]) == {"simulation", "environment", "inference", "storage", "learning"}
+    capsys.readouterr()
+
+
+@pytest.mark.parametrize("path", sorted(records.FOLDER.glob("*.json")), ids=lambda path: path.stem)
+def test_shipped_records_are_well_formed(path):
+    record = records.load(path)
+    for table in record["tables"]:
+        assert table["rows"]
+        assert all(len(row) == len(table["header"]) for row in table["rows"])
+    assert record["provenance"]["commit"]
+    assert record["provenance"]["versions"]["warp-lang"]
+    assert records.body(record).startswith(f"### {record['title']}")
+    assert records.origin(record)
+
+
+def test_records_refuse_what_they_are_not(kept):
+    (kept / "half.json").write_text('{"bench": "sim"')
+    with pytest.raises(StorageError, match=r"half\.json: not a readable record"):
+        records.load(kept / "half.json")
+    (kept / "other.json").write_text("{}")
+    with pytest.raises(StorageError, match="missing"):
+        records.load(kept / "other.json")
+    with pytest.raises(StorageError, match="expected lower-case"):
+        records.record_path("../x")
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["sim", "--batch", "0"], "expected positive"),
+        (["sim", "--batch", "4", "8"], "one batch size"),
+        (["sim", "--core", "4096", "--without-mujoco", "--seconds", "1e-3", "--batch", "1"], "expected one of"),
+        (["camera", "--environments", "0"], "expected positive"),
+        (["train", "no_such"], "no train config"),
+        (["records", "no_such_record"], "no record"),
+    ],
+)
+def test_mistakes_are_told(words, message, capsys):
+    assert cli.main(["bench", *words]) == 2
+    assert message in capsys.readouterr().err

@@ -1,0 +1,71 @@
+"""``visthrow bench``: speed of the simulator, of the camera and of a training iteration; what was recorded before."""
+
+import argparse
+
+from visthrow.cli import add_common
+
+KINDS = {
+    "sim": ("the simulator: on a CPU core against MuJoCo C, on a GPU against MuJoCo Warp", "visthrow.bench.sim"),
+    "camera": ("keypoints of thousands of environments against kornia and OpenCV", "visthrow.bench.camera"),
+    "train": ("where the wall time of a training iteration goes", "visthrow.bench.iteration"),
+    "records": ("print the recorded measurements as Markdown", "visthrow.bench.records"),
+}
+"""Name -> (help, module). The module has ``run(args) -> int``; it is imported only when chosen."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.epilog = (
+        "examples:\n"
+        "  visthrow bench sim                             one CPU core against MuJoCo C on the same rope\n"
+        "  visthrow bench sim --device cuda               steps a second over batch sizes on a GPU\n"
+        "  visthrow bench camera                          keypoints on the CPU, and on the GPU if there is one\n"
+        "  visthrow bench train state --device cuda       simulation, environment, inference and learning\n"
+        "  visthrow bench records                         what was measured before, on which machine and commit\n"
+    )
+    kinds = parser.add_subparsers(dest="bench", metavar="WHAT", title="what to measure", required=True)
+    sim, camera, train, records = (
+        kinds.add_parser(name, help=text, description=text) for name, (text, _) in KINDS.items()
+    )
+    _add_sim(sim)
+    camera.add_argument("--environments", type=int, default=16384, metavar="N", help="batch size (default: 16384)")
+    train.add_argument(
+        "config", metavar="CONFIG", nargs="?", default="state", help="training configuration (default: state)"
+    )
+    train.add_argument("--iterations", type=int, default=5, metavar="N", help="iterations measured (default: 5)")
+    for kind in (sim, camera, train):
+        kind.add_argument(
+            "--repeats", type=int, default=5, metavar="N", help="measurements; the median counts (default: 5)"
+        )
+        kind.add_argument("--record", metavar="NAME", help="keep the result in the package's records under this name")
+        add_common(kind)
+    sim.set_defaults(device="cpu")
+    records.add_argument("names", metavar="NAME", nargs="*", help="records to print (default: all)")
+
+
+def _add_sim(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--config",
+        default="state",
+        metavar="NAME",
+        help="training configuration whose plant is measured (default: state)",
+    )
+    parser.add_argument(
+        "--batch",
+        type=int,
+        nargs="+",
+        metavar="N",
+        help="environments; several on a GPU (default: 1024 on the CPU, 4096 to 524288 on a GPU)",
+    )
+    parser.add_argument(
+        "--seconds", type=float, default=1.0, metavar="S", help="wall time of one measurement, about (default: 1)"
+    )
+    parser.add_argument("--core", type=int, metavar="N", help="CPU core to stay on (default: the last one)")
+    parser.add_argument("--without-mujoco", action="store_true", help="measure this simulator alone")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure."""
+    import importlib
+
+    return importlib.import_module(KINDS[args.bench][1]).run(args)
