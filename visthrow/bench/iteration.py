@@ -152,9 +152,9 @@ def measure(experiment: Any, name: str, device: str, iterations: int, repeats: i
     p = experiment.ppo
     title = f"{name}: {p.environments:,} environments x {p.steps} steps on {card.name(device)}"
     notes = (
-        f"Rollout and learning are medians of {iterations} iterations of training itself, after {WARM_UP} that warm up. "
-        "Simulation, environment step and policy were then run alone, from CUDA graphs on a GPU; environment is the step "
-        "less the simulation, storage what is left of the rollout.",
+        f"Rollout and learning are medians of {iterations} iterations of training itself, after {WARM_UP} that warm "
+        "up. Simulation, environment step and policy were then run alone, from CUDA graphs on a GPU; environment is "
+        "the step less the simulation, storage what is left of the rollout.",
         f"The paper's 2e8 environment steps at this speed: {2e8 / samples * wall:.0f} s.",
     )
     figures = {

@@ -14,7 +14,8 @@ THRUST_WEIGHTS = 2.2
 HARD_THROW = Scene(
     mass=0.21, inertia=(2.5e-4, 2.5e-4, 4.0e-4),
     pos_w=(0.0, 0.0, 1.5), quat_wb=(0.0, 0.0, 0.0, 1.0),
-    vel_w=(0.4, -0.2, 0.1), rate_b=(0.0, 0.0, 0.0), mount=(0.0, 0.0, -0.02), segments=15, segment_length=0.022, segment_mass=0.004 / 15,
+    vel_w=(0.4, -0.2, 0.1), rate_b=(0.0, 0.0, 0.0), mount=(0.0, 0.0, -0.02),
+    segments=15, segment_length=0.022, segment_mass=0.004 / 15,
     ball_mass=0.058, ball_inertia=4.2108e-5, ball_offset=0.033, direction=(1.2, -0.15, -1.0),
     cable_rate_w=(0.0, 0.0, 0.0), joint_damping=1.0e-5, duration=0.5,
     schedule=(Wrench(0.0, (0.0, 0.0, THRUST_WEIGHTS * TOTAL_MASS * 9.81), (0.0, 0.0, 0.0)),),
