@@ -53,8 +53,8 @@ class _Recording:
         extra: dict[str, Any] = {"command": command[0], "release_command": float(release), "mode": mode}
         if seen is not None:
             extra |= {"action": seen.action[0], "observation": seen.observation[0]}
-        if seen is not None and seen.keypoints is not None:
-            extra |= {"keypoints": seen.keypoints[0], "keypoints_valid": seen.valid[0]}
+        points, valid = self.pilot.see(measured.pos_w, measured.quat_wb, measured.payload_pos_w, self.goal_w)
+        extra |= {"keypoints": points[0], "keypoints_valid": valid[0]}
         self.recorder.add(time, goal_w=self.goal_w, **extra)
         self.plant.step(command, np.array([release]))
 

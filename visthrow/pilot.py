@@ -146,6 +146,22 @@ class Pilot:
             None if valid is None else valid.numpy(),
         )
 
+    @torch.inference_mode()
+    def see(self, pos_w: np.ndarray, quat_wb: np.ndarray, payload_w: np.ndarray, goal_w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Keypoints alone, as in :meth:`act`, without a decision: shape (E, 8, 2) and validity, shape (E, 8).
+
+        Raises:
+            PolicyError: There is no camera.
+            ValueError: An array of another shape.
+        """
+        if self.camera is None:
+            raise PolicyError("this pilot has no camera")
+        rot = ob.rotation_from_quat(self._tensor("quat_wb", quat_wb, 4))
+        goal = self._tensor("goal_w", np.broadcast_to(np.asarray(goal_w), (self.count, 3)), 3)
+        payload = self._tensor("payload_w", payload_w, 3)
+        points, valid = ob.vision_part(self.camera, self._tensor("pos_w", pos_w, 3), rot, goal, payload)
+        return points.numpy(), valid.numpy()
+
     def _tensor(self, name: str, value: np.ndarray, width: int) -> Tensor:
         array = np.asarray(value, dtype=np.float32)
         if array.shape != (self.count, width):

@@ -1,0 +1,172 @@
+"""The picture of one throw: the paper's strip of side views, and what the camera saw at the same instants."""
+
+import io
+from pathlib import Path
+
+import numpy as np
+
+from camera.keypoints import KeypointCamera
+from camera.overlay import draw_overlay
+from camera.params import CameraParams
+from visthrow import style
+from visthrow.errors import LogError
+from visthrow.flightlog import FlightLog
+from visthrow.hover import rot_from_quat
+from visthrow.storage import atomic_write
+
+MARGIN = 0.35  # about what is seen [m]
+ARM = 0.097  # half the motor-to-motor diagonal, for drawing only [m]
+ROTOR = 0.0381  # propeller radius, for drawing only [m]
+BLADE_HEIGHT = 0.018  # of the rotor plane, for drawing only [m]
+GHOST_EVERY = 0.06  # between the faint earlier poses [s]
+
+
+def instants(log: FlightLog) -> list[tuple[str, float]]:
+    """Captions and times [s] of the four views.
+
+    Raises:
+        LogError: the flight has no release or landing.
+    """
+    times = log.meta["times"]
+    if "separation" not in times or "landing" not in times:
+        raise LogError(f"the flight has no release and landing to draw: {log.meta['result'].get('failure') or 'it was cut short'}")
+    start, separation = times["policy_start"], times["separation"]
+    return [
+        ("Hover", start),
+        ("Accelerate", start + 0.55 * (separation - start)),
+        ("Release", separation),
+        ("Landing", times["landing"]),
+    ]
+
+
+def draw(path: str | Path, log: FlightLog, camera: CameraParams) -> None:
+    """Draw the strip.
+
+    Args:
+        path: PNG file.
+        log: a flight with release and landing.
+        camera: whose keypoints the log holds.
+
+    Raises:
+        LogError: the flight has no release or landing.
+        StorageError: the place cannot be written.
+    """
+    views = instants(log)
+    style.use()
+    import matplotlib.pyplot as plt
+
+    side = _bounds(log)
+    figure = plt.figure(figsize=(13.6, 7.4))
+    grid = figure.add_gridspec(2, 4, height_ratios=(1.0, 1.05), left=0.045, right=0.992, top=0.865, bottom=0.03, wspace=0.06, hspace=0.2)
+    lens = KeypointCamera(camera)
+    for column, (caption, time) in enumerate(views):
+        axis = figure.add_subplot(grid[0, column])
+        _side_view(axis, log, time, side, column)
+        axis.set_title(f"{'abcd'[column]}) {caption}   t = {time - views[0][1]:.2f} s", loc="left")
+        below = figure.add_subplot(grid[1, column])
+        below.imshow(_camera_view(log, lens, time), interpolation="antialiased")
+        below.set_axis_off()
+    figure.suptitle(_headline(log), x=0.045, y=0.965, ha="left", fontsize=12.5, fontweight="bold")
+    figure.text(0.045, 0.912, _subline(log), ha="left", fontsize=10, color=style.QUIET)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png")
+    plt.close(figure)
+    atomic_write(path, buffer.getvalue())
+
+
+def _headline(log: FlightLog) -> str:
+    result, goal = log.meta["result"], log.meta["goal_w"]
+    return (
+        f"A throw at {np.hypot(goal[0], goal[1]):.1f} m by the {log.meta['policy']} policy: landed "
+        f"{100 * result['error']:.1f} cm from the target, {result['duration']:.2f} s after the start"
+    )
+
+
+def _subline(log: FlightLog) -> str:
+    return (
+        f"Simulated on {log.meta['plant_meaning'].split(' with ')[0]}. Above: seen from the side, with the ball's path. Below: "
+        "keypoints on the fisheye image, target green, payload red; crosses lie outside the field of view (220°)."
+    )
+
+
+def _bounds(log: FlightLog) -> tuple[float, float, float]:
+    """Left, right and top of the side views [m]."""
+    times = log.meta["times"]
+    during = (log["pos_w"].time >= times["policy_start"]) & (log["pos_w"].time <= times["landing"] + 0.02)
+    x = np.concatenate([log["pos_w"].values[during, 0], log["payload_pos_w"].values[during, 0], [log.meta["goal_w"][0]]])
+    top = max(log["pos_w"].values[during, 2].max(), log["payload_pos_w"].values[during, 2].max())
+    return float(x.min() - MARGIN), float(x.max() + MARGIN), float(top + 0.6 * MARGIN)
+
+
+def _at(log: FlightLog, name: str, time: float) -> np.ndarray:
+    """Value at a time, linear between samples."""
+    channel = log[name]
+    flat = channel.values.reshape(len(channel.time), -1)
+    at = [np.interp(time, channel.time, flat[:, i]) for i in range(flat.shape[1])]
+    return np.array(at).reshape(channel.values.shape[1:])
+
+
+def _side_view(axis, log: FlightLog, time: float, side: tuple[float, float, float], column: int) -> None:
+    from matplotlib.patches import Rectangle
+
+    left, right, top = side
+    times, goal = log.meta["times"], log.meta["goal_w"]
+    axis.set(xlim=(left, right), ylim=(-0.13, top), aspect="equal", yticks=np.arange(0.0, top, 0.5))
+    axis.add_patch(Rectangle((left, -0.13), right - left, 0.13, color="#EFEDE8", lw=0, zorder=0))
+    axis.axhline(0.0, color=style.QUIET, lw=1.0, zorder=1)
+    axis.plot([goal[0] - 0.125, goal[0] + 0.125], [0, 0], color=style.GOAL, lw=5, solid_capstyle="butt", zorder=2)
+    if column:
+        axis.tick_params(labelleft=False)
+    else:
+        axis.set_ylabel("height [m]")
+        axis.annotate("target", (goal[0], -0.03), xytext=(0, -4), textcoords="offset points", ha="center", va="top", color=style.GOAL, fontsize=9)
+    axis.tick_params(length=2.5)
+    for past in np.arange(times["policy_start"], time - 0.03, GHOST_EVERY):
+        _vehicle(axis, log, past, 0.16)
+    payload = log["payload_pos_w"]
+    seen = (payload.time >= times["policy_start"]) & (payload.time < time)
+    path = np.vstack([payload.values[seen], _at(log, "payload_pos_w", time)])
+    when = np.append(payload.time[seen], time)
+    carried, flown = when <= times["separation"] + 1e-6, when >= times["separation"] - 0.02
+    axis.plot(path[carried, 0], path[carried, 2], color=style.PAYLOAD, lw=1.3, alpha=0.45, zorder=3)
+    if np.count_nonzero(flown) > 1:
+        axis.plot(path[flown, 0], path[flown, 2], color=style.PAYLOAD, lw=1.8, ls=(0, (4, 1.6)), zorder=3)
+    rope = _at(log, "cable_points_w", time)
+    axis.plot(rope[:, 0], rope[:, 2], color=style.ROPE, lw=1.3, zorder=4)
+    _vehicle(axis, log, time, 1.0)
+    ball = _at(log, "payload_pos_w", time)
+    from matplotlib.patches import Circle
+
+    axis.add_patch(Circle((ball[0], ball[2]), 0.033, color=style.PAYLOAD, lw=0, zorder=6))
+
+
+def _vehicle(axis, log: FlightLog, time: float, alpha: float) -> None:
+    """Arms and rotor discs as seen along y."""
+    pos = _at(log, "pos_w", time)
+    rot = rot_from_quat(_at(log, "quat_wb", time)[None])[0]
+    reach = ARM / np.sqrt(2.0)
+    for sx in (1.0, -1.0):
+        hub = pos + rot @ np.array([sx * reach, 0.0, BLADE_HEIGHT])
+        foot = pos + rot @ np.array([sx * reach, 0.0, 0.0])
+        ends = [hub + rot @ np.array([s * ROTOR, 0.0, 0.0]) for s in (-1.0, 1.0)]
+        line = {"color": style.VEHICLE, "alpha": alpha, "zorder": 5, "solid_capstyle": "round"}
+        axis.plot([pos[0], foot[0]], [pos[2], foot[2]], lw=2.4, **line)
+        if alpha == 1.0:
+            axis.plot([foot[0], hub[0]], [foot[2], hub[2]], lw=1.2, **line)
+            axis.plot([ends[0][0], ends[1][0]], [ends[0][2], ends[1][2]], lw=1.8, **line)
+
+
+def _camera_view(log: FlightLog, camera: KeypointCamera, time: float) -> np.ndarray:
+    """Keypoints of the true poses at a time on the image plane, RGB, cut to the circle's square."""
+    import torch
+
+    from camera.keypoints import keypoints
+
+    def one(name: str) -> torch.Tensor:
+        return torch.tensor(_at(log, name, time)[None], dtype=torch.float32)
+
+    rot = torch.tensor(rot_from_quat(one("quat_wb").numpy().astype(float)), dtype=torch.float32)
+    goal = torch.tensor([log.meta["goal_w"]], dtype=torch.float32)
+    points, valid = keypoints(camera, one("pos_w"), rot, goal, one("payload_pos_w"))
+    picture = draw_overlay(camera, points[0], valid[0])[:, :, ::-1]
+    return np.ascontiguousarray(picture)
