@@ -15,7 +15,9 @@ KINDS = {
 
 def draw(kind: str, plant: PlantParams, limits: ActionParams, steps: int, count: int, seed: int = 0) -> np.ndarray:
     """Collective thrust [N] and body rates [rad/s], float32, shape (steps, count, 4)."""
-    a = np.random.default_rng(seed).uniform(-1.0, 1.0, (steps, count, 4)).astype(np.float32)
+    a = np.random.default_rng(seed).random((steps, count, 4), dtype=np.float32)
+    a *= 2.0
+    a -= 1.0
     if kind == "hover":
         weight = GRAVITY * (plant.vehicle.body.mass + plant.rope.rope_mass + plant.rope.payload_mass)
         a[..., 0] = weight * (1.0 + 0.1 * a[..., 0])
