@@ -24,14 +24,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "target, the duration counts from the policy's start to the landing, smoothness is the root mean square change of\n"
         "the normalised commands from step to step.\n"
     )
-    parser.add_argument("policies", metavar="POLICY", nargs="*", help="shipped names or policy files (default: state vision)")
-    parser.add_argument("--targets", type=float, nargs="+", default=list(DEFAULT_TARGETS), metavar="M", help="distances along x [m]")
-    parser.add_argument("--throws", type=int, default=200, metavar="N", help="for each policy and target (default: 200)")
+    parser.add_argument(
+        "policies", metavar="POLICY", nargs="*", help="shipped names or policy files (default: state vision)"
+    )
+    parser.add_argument(
+        "--targets", type=float, nargs="+", default=list(DEFAULT_TARGETS), metavar="M", help="distances along x [m]"
+    )
+    parser.add_argument(
+        "--throws", type=int, default=200, metavar="N", help="for each policy and target (default: 200)"
+    )
     parser.add_argument("--plant", default="hybrid", metavar="NAME", help="hybrid (the training simulator, with all its noise), "
                         "reference, or reference-realistic")  # fmt: skip
     parser.add_argument("--seed", type=int, default=0, help="of starts and noise (default: 0)")
     parser.add_argument("--config", metavar="NAME", help="fly in this train config instead of each policy's own")
-    parser.add_argument("--out", default="out/compare", metavar="FOLDER", help="for table, CSV and plot (default: out/compare)")
+    parser.add_argument(
+        "--out", default="out/compare", metavar="FOLDER", help="for table, CSV and plot (default: out/compare)"
+    )
     add_common(parser)
 
 
@@ -39,9 +47,9 @@ def run(args: argparse.Namespace) -> int:
     """Throw, print, write."""
     check(args.targets, args.throws)
     from visthrow.device import resolve
+    from visthrow.errors import suggest
     from visthrow.loading import load_policy, unique_names
     from visthrow.plants import PLANTS
-    from visthrow.errors import suggest
 
     if args.plant not in PLANTS:
         raise ConfigError(f"no plant '{args.plant}'; {suggest(args.plant, PLANTS)}")
@@ -75,12 +83,16 @@ def check(targets: Sequence[float], throws: int) -> None:
         raise ConfigError(f"--throws {throws}; expected 1 or more")
     for target in targets:
         if not (math.isfinite(target) and 0.0 <= target <= 3.0):
-            raise ConfigError(f"--targets {target:g}; expected distances from 0 to 3 m, policies are trained on goals within 2 m")
+            raise ConfigError(
+                f"--targets {target:g}; expected distances from 0 to 3 m, policies are trained on goals within 2 m"
+            )
     if len(set(targets)) < len(targets):
         raise ConfigError(f"--targets {' '.join(f'{x:g}' for x in targets)}: the same one twice")
 
 
-def throw_hybrid(loaded: Sequence, targets: Sequence[float], count: int, device: str, seed: int, show: bool = True) -> list[list]:
+def throw_hybrid(
+    loaded: Sequence, targets: Sequence[float], count: int, device: str, seed: int, show: bool = True
+) -> list[list]:
     """Throw in the training simulator; for each policy a `Throws` a target."""
     from visthrow.protocol import throw
 
@@ -91,7 +103,12 @@ def throw_hybrid(loaded: Sequence, targets: Sequence[float], count: int, device:
         for target in targets:
             if show and sys.stderr.isatty():
                 done = len(rows) * len(targets) + len(row)
-                print(f"\rthrows in the training simulator: {done} of {total} sets   ", end="", file=sys.stderr, flush=True)
+                print(
+                    f"\rthrows in the training simulator: {done} of {total} sets   ",
+                    end="",
+                    file=sys.stderr,
+                    flush=True,
+                )
             row.append(throw(item.experiment, policy.act, target, count, device, seed))
         rows.append(row)
     if show and sys.stderr.isatty():
@@ -126,7 +143,9 @@ def report(title: str, rows: Sequence[dict]) -> str:
     return f"{markdown(rows, title)}\n{PAPER_NOTE}\n"
 
 
-def write(folder: Path, throws: Sequence[tuple[str, Sequence]], rows: Sequence[dict], plant: str, title: str) -> list[Path]:
+def write(
+    folder: Path, throws: Sequence[tuple[str, Sequence]], rows: Sequence[dict], plant: str, title: str
+) -> list[Path]:
     """Write Markdown, CSV and scatter plot; returns their paths."""
     from visthrow import scatter, tables
     from visthrow.storage import atomic_write

@@ -19,7 +19,9 @@ SEED = 0
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.epilog = "Takes less than a minute on two CPU cores. No GPU is needed and none is used.\n"
-    parser.add_argument("--out", default="out/demo", metavar="FOLDER", help="for pictures, tables and recording (default: out/demo)")
+    parser.add_argument(
+        "--out", default="out/demo", metavar="FOLDER", help="for pictures, tables and recording (default: out/demo)"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -38,9 +40,14 @@ def run(args: argparse.Namespace) -> int:
         from visthrow.reference_protocol import Throwing
 
         # The reference plant flies in a process of its own meanwhile.
-        with Throwing(loaded, REFERENCE_TARGETS, REFERENCE_THROWS, "reference-realistic", SEED, 1, together=True) as throwing:
+        with Throwing(
+            loaded, REFERENCE_TARGETS, REFERENCE_THROWS, "reference-realistic", SEED, 1, together=True
+        ) as throwing:
             paths = _here(loaded, folder)
-            print(f"{REFERENCE_THROWS} throws a policy on the reference plant, which stands in for a real vehicle ...", flush=True)
+            print(
+                f"{REFERENCE_THROWS} throws a policy on the reference plant, which stands in for a real vehicle ...",
+                flush=True,
+            )
             paths += _told(loaded, throwing.results(), "reference-realistic", folder)
     print("Files:")
     for path in paths:

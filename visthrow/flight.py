@@ -61,7 +61,17 @@ class _Recording:
     def sample(self, measured: Snapshot) -> None:
         """Record the true and the measured state now."""
         now = self.plant.state
-        names = ("pos_w", "quat_wb", "vel_w", "rate_b", "payload_pos_w", "payload_vel_w", "motor_speed", "battery_voltage", "attached")
+        names = (
+            "pos_w",
+            "quat_wb",
+            "vel_w",
+            "rate_b",
+            "payload_pos_w",
+            "payload_vel_w",
+            "motor_speed",
+            "battery_voltage",
+            "attached",
+        )
         values = {name: getattr(now, name)[0] for name in names}
         values["cable_points_w"] = self._rope(now)
         self.recorder.add(now.time, **values, **{f"measured_{name}": getattr(measured, name)[0] for name in MEASURED})
@@ -83,7 +93,9 @@ class _Recording:
         return self._resting.points_w(now.payload_pos_w[0])
 
 
-def fly(loaded: Loaded, goal_w: np.ndarray, plant_name: str = "hybrid", seed: int = 0, device: str = "cpu") -> FlightLog:
+def fly(
+    loaded: Loaded, goal_w: np.ndarray, plant_name: str = "hybrid", seed: int = 0, device: str = "cpu"
+) -> FlightLog:
     """Hover until the swing is quiet, throw, and hover again at the start.
 
     The throw ends at separation; from there the hover controller has the vehicle. Keypoints are those that the pilot
@@ -108,7 +120,10 @@ def fly(loaded: Loaded, goal_w: np.ndarray, plant_name: str = "hybrid", seed: in
     pilot = Pilot(loaded.policy, experiment.camera)
     home = np.array([0.0, 0.0, experiment.task.start.spawn_height])
     rng = np.random.default_rng(seed)
-    plant.reset(home[None] + START_SPREAD * rng.uniform(-1, 1, (1, 3)), random_ropes(rng, 1, experiment.rope.segments, START_SWING))
+    plant.reset(
+        home[None] + START_SPREAD * rng.uniform(-1, 1, (1, 3)),
+        random_ropes(rng, 1, experiment.rope.segments, START_SWING),
+    )
     recording = _Recording(plant, np.asarray(goal_w, dtype=float), pilot, _meta(loaded, plant_name, goal_w, seed))
     ends = _Ends()
     _hover(recording, experiment, home)
@@ -154,7 +169,9 @@ def _hover(recording: _Recording, experiment, home: np.ndarray) -> None:
     quiet = 0.0
     while plant.time < HOVER_LEAST - 1e-9 or (quiet < QUIET_TIME and plant.time < HOVER_MOST):
         seen = plant.measured()
-        command = controller.step(seen.pos_w, seen.quat_wb, seen.vel_w, home, body.mass + rope.rope_mass + rope.payload_mass)
+        command = controller.step(
+            seen.pos_w, seen.quat_wb, seen.vel_w, home, body.mass + rope.rope_mass + rope.payload_mass
+        )
         recording.step(command, False, 0, seen, None)
         now = plant.state
         off = np.linalg.norm(now.pos_w[0] - home)
@@ -170,7 +187,9 @@ def _throw(recording: _Recording, experiment, ends: _Ends) -> None:
     pilot.start()
     while True:
         seen = plant.measured()
-        out = pilot.act(seen.pos_w, seen.quat_wb, seen.vel_w, seen.rate_b, seen.payload_pos_w, recording.goal_w, seen.attached)
+        out = pilot.act(
+            seen.pos_w, seen.quat_wb, seen.vel_w, seen.rate_b, seen.payload_pos_w, recording.goal_w, seen.attached
+        )
         if out.release[0] and ends.latch is None:
             ends.latch = plant.time
         recording.step(out.command, bool(out.release[0]), 1, seen, out)

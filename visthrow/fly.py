@@ -23,8 +23,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "  visthrow fly --plant reference-realistic       on the stand-in for a real vehicle (about a minute)\n"
         "\nThe vehicle hovers until the swing is quiet, the policy throws, and the hover controller brings the vehicle back.\n"
     )
-    parser.add_argument("--policy", default="vision", metavar="POLICY", help="a shipped name or a policy file (default: vision)")
-    parser.add_argument("--target", type=float, nargs="+", default=[2.0], metavar="M", help="distance ahead, or x and y [m] (default: 2.0)")
+    parser.add_argument(
+        "--policy", default="vision", metavar="POLICY", help="a shipped name or a policy file (default: vision)"
+    )
+    parser.add_argument(
+        "--target",
+        type=float,
+        nargs="+",
+        default=[2.0],
+        metavar="M",
+        help="distance ahead, or x and y [m] (default: 2.0)",
+    )
     parser.add_argument("--plant", default="hybrid", metavar="NAME", help="hybrid (the training simulator, the default), reference, or "
                         "reference-realistic")  # fmt: skip
     parser.add_argument("--seed", type=int, default=0, help="of start, measurements and plant (default: 0)")
@@ -35,7 +44,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Fly, write, tell."""
-    from visthrow import config
     from visthrow.device import resolve
     from visthrow.errors import ConfigError, suggest
     from visthrow.flight import fly

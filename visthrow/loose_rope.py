@@ -26,7 +26,9 @@ class LooseRope:
         offset_w: joints from the ball's centre, mount end first [m], shape (L, 3). velocity_w: [m/s], shape (L, 3).
     """
 
-    def __init__(self, points_w: np.ndarray, velocity_w: np.ndarray, ball_w: np.ndarray, ball_vel_w: np.ndarray) -> None:
+    def __init__(
+        self, points_w: np.ndarray, velocity_w: np.ndarray, ball_w: np.ndarray, ball_vel_w: np.ndarray
+    ) -> None:
         """Take over a rope.
 
         Args:

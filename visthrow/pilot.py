@@ -80,9 +80,13 @@ class Pilot:
             rope = contract["rope"]
             mass = contract["vehicle"]["body"]["mass"] + rope["rope_mass"] + rope["payload_mass"]
         except (KeyError, AttributeError, TypeError) as error:
-            raise PolicyError(f"the policy's contract is incomplete: {error!r}; it was not written by visthrow train") from error
+            raise PolicyError(
+                f"the policy's contract is incomplete: {error!r}; it was not written by visthrow train"
+            ) from error
         if self.layout.dimension != policy.obs_dim:
-            raise PolicyError(f"layout '{self.layout.name}' has {self.layout.dimension} numbers, the network {policy.obs_dim}")
+            raise PolicyError(
+                f"layout '{self.layout.name}' has {self.layout.dimension} numbers, the network {policy.obs_dim}"
+            )
         if self.layout.name == "vision":
             if camera_params is None:
                 raise PolicyError("a vision policy needs a camera; got none")
@@ -105,8 +109,14 @@ class Pilot:
 
     @torch.inference_mode()
     def act(
-        self, pos_w: np.ndarray, quat_wb: np.ndarray, vel_w: np.ndarray, rate_b: np.ndarray, payload_w: np.ndarray,
-        goal_w: np.ndarray, attached: np.ndarray | bool = True,
+        self,
+        pos_w: np.ndarray,
+        quat_wb: np.ndarray,
+        vel_w: np.ndarray,
+        rate_b: np.ndarray,
+        payload_w: np.ndarray,
+        goal_w: np.ndarray,
+        attached: np.ndarray | bool = True,
     ) -> PilotOutput:
         """Decide one control step.
 
@@ -147,7 +157,9 @@ class Pilot:
         )
 
     @torch.inference_mode()
-    def see(self, pos_w: np.ndarray, quat_wb: np.ndarray, payload_w: np.ndarray, goal_w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def see(
+        self, pos_w: np.ndarray, quat_wb: np.ndarray, payload_w: np.ndarray, goal_w: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Keypoints alone, as in :meth:`act`, without a decision: shape (E, 8, 2) and validity, shape (E, 8).
 
         Raises:
@@ -163,7 +175,7 @@ class Pilot:
         return points.numpy(), valid.numpy()
 
     def _tensor(self, name: str, value: np.ndarray, width: int) -> Tensor:
-        array = np.asarray(value, dtype=np.float32)
+        array = np.array(value, dtype=np.float32)  # a copy: torch warns of read-only memory
         if array.shape != (self.count, width):
             raise ValueError(f"{name} has shape {array.shape}; expected ({self.count}, {width})")
-        return torch.from_numpy(np.ascontiguousarray(array))
+        return torch.from_numpy(array)

@@ -78,7 +78,12 @@ class HybridPlant:
     name = "hybrid"
 
     def __init__(
-        self, experiment: Experiment, count: int = 1, seed: int = 0, device: str = "cpu", noise: NoiseParams | None = None
+        self,
+        experiment: Experiment,
+        count: int = 1,
+        seed: int = 0,
+        device: str = "cpu",
+        noise: NoiseParams | None = None,
     ) -> None:
         """Build the simulator.
 

@@ -233,8 +233,14 @@ class Throwing:
     """
 
     def __init__(
-        self, loaded: Sequence[Loaded], targets: Sequence[float], throws: int, plant_name: str, seed: int,
-        processes: int | None = None, together: bool = False,
+        self,
+        loaded: Sequence[Loaded],
+        targets: Sequence[float],
+        throws: int,
+        plant_name: str,
+        seed: int,
+        processes: int | None = None,
+        together: bool = False,
     ) -> None:
         """Start.
 
@@ -286,7 +292,12 @@ class Throwing:
                 share = sum(self._progress) / len(self.jobs)
                 left = (time.monotonic() - begin) * (1 / share - 1) if share > 0.02 else math.nan
                 note = f", about {left:.0f} s left" if math.isfinite(left) else ""
-                print(f"\rthrows on the reference plant: {100 * share:3.0f} %{note}   ", end="", file=sys.stderr, flush=True)
+                print(
+                    f"\rthrows on the reference plant: {100 * share:3.0f} %{note}   ",
+                    end="",
+                    file=sys.stderr,
+                    flush=True,
+                )
         if show and sys.stderr.isatty():
             print(f"\r{' ' * 70}\r", end="", file=sys.stderr, flush=True)
         parts = self._pending.get()
@@ -311,7 +322,12 @@ def _plain(item: Loaded) -> tuple:
     def array(tensor):
         return None if tensor is None else tensor.cpu().numpy()
 
-    network = ([array(w) for w in policy.weights], [array(b) for b in policy.biases], policy.activation, policy.contract)
+    network = (
+        [array(w) for w in policy.weights],
+        [array(b) for b in policy.biases],
+        policy.activation,
+        policy.contract,
+    )
     return network, (array(policy.mean), array(policy.std), policy.eps), item.experiment
 
 
@@ -332,7 +348,16 @@ def _begin(policies: list[bytes], plant_name: str, progress: Any) -> None:
         def tensor(array):
             return None if array is None else torch.from_numpy(array)
 
-        policy = Policy(tuple(map(tensor, weights)), tuple(map(tensor, biases)), activation, contract, {}, tensor(mean), tensor(std), eps)
+        policy = Policy(
+            tuple(map(tensor, weights)),
+            tuple(map(tensor, biases)),
+            activation,
+            contract,
+            {},
+            tensor(mean),
+            tensor(std),
+            eps,
+        )
         loaded.append(Loaded(name, policy, experiment))
     _worker = (loaded, plant_name, progress)
 

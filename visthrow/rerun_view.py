@@ -70,7 +70,9 @@ def _scene(stream: rr.RecordingStream, log: FlightLog, experiment: Experiment, g
     stream.log("world/ground", floor, static=True)
     half = experiment.camera.goal_side / 2.0
     corners = goal + half * np.array([[1, 1, 0], [1, -1, 0], [-1, -1, 0], [-1, 1, 0], [1, 1, 0]])
-    stream.log("world/goal", rr.LineStrips3D([corners + [0, 0, 0.003]], radii=0.006, colors=[_colour(style.GOAL)]), static=True)
+    stream.log(
+        "world/goal", rr.LineStrips3D([corners + [0, 0, 0.003]], radii=0.006, colors=[_colour(style.GOAL)]), static=True
+    )
     stream.log("world/goal/centre", rr.Points3D([goal], radii=0.012, colors=[_colour(style.GOAL)]), static=True)
     _vehicle(stream, log, experiment)
     radius = experiment.rope.payload_radius
@@ -115,7 +117,9 @@ def _vehicle(stream: rr.RecordingStream, log: FlightLog, experiment: Experiment)
 def _trail(stream: rr.RecordingStream, log: FlightLog, name: str, entity: str, colour: str) -> None:
     """A line that grows from the policy's start to the landing."""
     times, channel = log.meta["times"], log[name]
-    rows = np.flatnonzero((channel.time >= times["policy_start"] - 1e-9) & (channel.time <= times.get("landing", np.inf) + 0.02))
+    rows = np.flatnonzero(
+        (channel.time >= times["policy_start"] - 1e-9) & (channel.time <= times.get("landing", np.inf) + 0.02)
+    )
     rows = rows[1:]
     if not len(rows):
         return
@@ -150,13 +154,17 @@ def _image(stream: rr.RecordingStream, log: FlightLog, camera: CameraParams) -> 
     _points(stream, log, "camera/invalid", points, ~valid, [170, 170, 170], 1.2)
 
 
-def _points(stream, log: FlightLog, entity: str, points: np.ndarray, shown: np.ndarray, colour: list[int], radius: float) -> None:
+def _points(
+    stream, log: FlightLog, entity: str, points: np.ndarray, shown: np.ndarray, colour: list[int], radius: float
+) -> None:
     stream.log(entity, rr.Points2D.from_fields(radii=radius, colors=[colour]), static=True)
     columns = rr.Points2D.columns(positions=points[shown].astype(np.float32)).partition(shown.sum(axis=1))
     stream.send_columns(entity, [_times(log, "keypoints")], columns)
 
 
-def _outline(stream, log: FlightLog, entity: str, points: np.ndarray, valid: np.ndarray, colour: list[int], box: bool) -> None:
+def _outline(
+    stream, log: FlightLog, entity: str, points: np.ndarray, valid: np.ndarray, colour: list[int], box: bool
+) -> None:
     """Closed outline of a group while all of it is seen; the payload's four are the midpoints of a box's edges."""
     whole = valid.all(axis=1)
     strips = []
@@ -179,14 +187,26 @@ def _signals(stream: rr.RecordingStream, log: FlightLog) -> None:
     command = log["command"].values
     series("signals/thrust", "command", command[:, 0], "collective thrust [N]", style.COLOURS[0])
     for i, axis in enumerate(AXES):
-        series(f"signals/rate_command/{axis}", "command", command[:, 1 + i], f"{axis} commanded [rad/s]", style.COLOURS[i])
-        series(f"signals/rate/{axis}", "rate_b", log["rate_b"].values[:, i], f"{axis} flown [rad/s]", _paler(style.COLOURS[i]))
+        series(
+            f"signals/rate_command/{axis}", "command", command[:, 1 + i], f"{axis} commanded [rad/s]", style.COLOURS[i]
+        )
+        series(
+            f"signals/rate/{axis}",
+            "rate_b",
+            log["rate_b"].values[:, i],
+            f"{axis} flown [rad/s]",
+            _paler(style.COLOURS[i]),
+        )
     for i, rotor in enumerate(ROTOR_NAMES):
-        series(f"signals/motors/{i}", "motor_speed", log["motor_speed"].values[:, i], f"{rotor} [rad/s]", style.COLOURS[i])
+        series(
+            f"signals/motors/{i}", "motor_speed", log["motor_speed"].values[:, i], f"{rotor} [rad/s]", style.COLOURS[i]
+        )
     series("signals/battery", "battery_voltage", log["battery_voltage"].values, "battery [V]", style.COLOURS[2])
     series("signals/phase/mode", "mode", log["mode"].values, "0 hover controller, 1 policy", style.COLOURS[0])
     series("signals/phase/attached", "attached", log["attached"].values, "payload attached", style.COLOURS[1])
-    series("signals/phase/release", "release_command", log["release_command"].values, "release command", style.COLOURS[3])
+    series(
+        "signals/phase/release", "release_command", log["release_command"].values, "release command", style.COLOURS[3]
+    )
 
 
 def _paler(colour: str) -> str:
@@ -197,7 +217,11 @@ def _blueprint(goal: np.ndarray) -> rrb.Blueprint:
     middle = np.array([0.5 * goal[0], 0.5 * goal[1], 0.9])
     eye = rrb.EyeControls3D(position=middle + [0.3, -3.4, 0.9], look_target=middle, eye_up=[0.0, 0.0, 1.0])
     scene = rrb.Spatial3DView(
-        origin="world", name="Throw", background=[245, 246, 248], eye_controls=eye, line_grid=rrb.LineGrid3D(visible=False)
+        origin="world",
+        name="Throw",
+        background=[245, 246, 248],
+        eye_controls=eye,
+        line_grid=rrb.LineGrid3D(visible=False),
     )
     bounds = rrb.VisualBounds2D(x_range=[-106, 106], y_range=[-106, 106])
     image = rrb.Spatial2DView(origin="camera", name="Fisheye keypoints", background=[12, 12, 14], visual_bounds=bounds)

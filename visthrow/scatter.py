@@ -33,7 +33,9 @@ def draw(path: str | Path, throws: Sequence[tuple[str, Sequence]], subtitle: str
     targets = [of.target for of in throws[0][1]]
     half = _half_width(throws)
     size = 3.1
-    figure, axes = plt.subplots(1, len(targets), figsize=(max(size * len(targets), 6.2) + 0.5, size + 1.35), squeeze=False)
+    figure, axes = plt.subplots(
+        1, len(targets), figsize=(max(size * len(targets), 6.2) + 0.5, size + 1.35), squeeze=False
+    )
     for column, (axis, target) in enumerate(zip(axes[0], targets)):
         _goal(axis, half)
         for index, (name, row) in enumerate(throws):
@@ -44,7 +46,9 @@ def draw(path: str | Path, throws: Sequence[tuple[str, Sequence]], subtitle: str
         if column == 0:
             axis.set_ylabel("error along the throw [m]")
     handles, labels = axes[0][0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="upper center", ncols=max(len(labels), 1), bbox_to_anchor=(0.5, 0.925), columnspacing=1.6)
+    figure.legend(
+        handles, labels, loc="upper center", ncols=max(len(labels), 1), bbox_to_anchor=(0.5, 0.925), columnspacing=1.6
+    )
     figure.suptitle(f"Landing points from above: {subtitle}", fontsize=11, y=0.985)
     figure.tight_layout(rect=(0, 0, 1, 0.89))
     buffer = io.BytesIO()
@@ -85,4 +89,13 @@ def _points(axis, of, index: int, half: float, label: str | None) -> None:
         -good[inside, 1], good[inside, 0], s=20, marker=marker, color=colour, alpha=alpha, lw=0.3, edgecolor="white", zorder=3,
         label=label,
     )  # fmt: skip
-    axis.scatter(-shown[~inside, 1], shown[~inside, 0], s=24, marker=marker, facecolor="none", edgecolor=colour, zorder=3, clip_on=False)
+    axis.scatter(
+        -shown[~inside, 1],
+        shown[~inside, 0],
+        s=24,
+        marker=marker,
+        facecolor="none",
+        edgecolor=colour,
+        zorder=3,
+        clip_on=False,
+    )

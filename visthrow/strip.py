@@ -29,7 +29,9 @@ def instants(log: FlightLog) -> list[tuple[str, float]]:
     """
     times = log.meta["times"]
     if "separation" not in times or "landing" not in times:
-        raise LogError(f"the flight has no release and landing to draw: {log.meta['result'].get('failure') or 'it was cut short'}")
+        raise LogError(
+            f"the flight has no release and landing to draw: {log.meta['result'].get('failure') or 'it was cut short'}"
+        )
     start, separation = times["policy_start"], times["separation"]
     return [
         ("Hover", start),
@@ -57,7 +59,9 @@ def draw(path: str | Path, log: FlightLog, camera: CameraParams) -> None:
 
     side = _bounds(log)
     figure = plt.figure(figsize=(13.6, 7.4))
-    grid = figure.add_gridspec(2, 4, height_ratios=(1.0, 1.05), left=0.045, right=0.992, top=0.865, bottom=0.03, wspace=0.06, hspace=0.2)
+    grid = figure.add_gridspec(
+        2, 4, height_ratios=(1.0, 1.05), left=0.045, right=0.992, top=0.865, bottom=0.03, wspace=0.06, hspace=0.2
+    )
     lens = KeypointCamera(camera)
     for column, (caption, time) in enumerate(views):
         axis = figure.add_subplot(grid[0, column])
@@ -93,7 +97,9 @@ def _bounds(log: FlightLog) -> tuple[float, float, float]:
     """Left, right and top of the side views [m]."""
     times = log.meta["times"]
     during = (log["pos_w"].time >= times["policy_start"]) & (log["pos_w"].time <= times["landing"] + 0.02)
-    x = np.concatenate([log["pos_w"].values[during, 0], log["payload_pos_w"].values[during, 0], [log.meta["goal_w"][0]]])
+    x = np.concatenate(
+        [log["pos_w"].values[during, 0], log["payload_pos_w"].values[during, 0], [log.meta["goal_w"][0]]]
+    )
     top = max(log["pos_w"].values[during, 2].max(), log["payload_pos_w"].values[during, 2].max())
     return float(x.min() - MARGIN), float(x.max() + MARGIN), float(top + 0.6 * MARGIN)
 
@@ -119,7 +125,16 @@ def _side_view(axis, log: FlightLog, time: float, side: tuple[float, float, floa
         axis.tick_params(labelleft=False)
     else:
         axis.set_ylabel("height [m]")
-        axis.annotate("target", (goal[0], -0.03), xytext=(0, -4), textcoords="offset points", ha="center", va="top", color=style.GOAL, fontsize=9)
+        axis.annotate(
+            "target",
+            (goal[0], -0.03),
+            xytext=(0, -4),
+            textcoords="offset points",
+            ha="center",
+            va="top",
+            color=style.GOAL,
+            fontsize=9,
+        )
     axis.tick_params(length=2.5)
     for past in np.arange(times["policy_start"], time - 0.03, GHOST_EVERY):
         _vehicle(axis, log, past, 0.16)

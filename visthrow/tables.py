@@ -73,5 +73,7 @@ def csv_text(throws: Sequence[tuple[str, str, object]]) -> str:
     for policy, plant, of in throws:
         for i in range(len(of.success)):
             numbers = (*of.landing_w[i], of.error[i], of.duration[i], of.clearance[i], of.smoothness[i])
-            writer.writerow([policy, plant, of.target, i, int(of.success[i]), *("" if np.isnan(x) else f"{x:.6g}" for x in numbers)])
+            writer.writerow(
+                [policy, plant, of.target, i, int(of.success[i]), *("" if np.isnan(x) else f"{x:.6g}" for x in numbers)]
+            )
     return text.getvalue()

@@ -10,7 +10,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("camera", "sim", "visthrow", "hil")
 
-ONBOARD = ("config", "errors", "observations", "actions", "policy", "flightlog", "hover")
+ONBOARD = ("config", "errors", "observations", "actions", "policy", "pilot", "flightlog", "hover")
 """Modules of visthrow that fly on board, and those that these are allowed to rest on."""
 ONBOARD_SUPPORT = ("schema", "toml_text", "storage", "logexport")
 

@@ -1,0 +1,148 @@
+"""The pilot shows the actor what the training environment showed it, bit for bit, with a batch of one."""
+
+import dataclasses
+import time
+
+import numpy as np
+import pytest
+import torch
+
+from camera.keypoints import KeypointCamera
+from visthrow import config
+from visthrow.env import ThrowEnv
+from visthrow.errors import MismatchError, PolicyError
+from visthrow.pilot import Pilot, camera_conditions
+from visthrow.policy import Policy
+from visthrow.task import Experiment, contract_of
+
+STEPS = 200
+SLOWEST_CALL = 4e-3
+"""Median of a call [s]; 0.5 ms on an idle core, with room for a busy machine. A control period is 20 ms."""
+
+
+def quiet(name: str) -> Experiment:
+    """An experiment without any noise."""
+    experiment = config.load(Experiment, config.find("train", name))
+    noise = dataclasses.replace(
+        experiment.task.noise, observation_step=0.0, observation_bias=0.0, command_step=0.0, command_bias=0.0
+    )
+    camera = dataclasses.replace(
+        experiment.camera,
+        noise=dataclasses.replace(
+            experiment.camera.noise, step_std=0.0, bias_std=0.0, drop_probability=0.0, latency=0.0
+        ),
+        mount=dataclasses.replace(experiment.camera.mount, rotation_error_std=0.0, position_error_std=0.0),
+    )
+    return dataclasses.replace(experiment, task=dataclasses.replace(experiment.task, noise=noise), camera=camera)
+
+
+def random_policy(experiment: Experiment, seed: int = 0) -> Policy:
+    """A small network with outputs all over the range, release included, that reacts to every input."""
+    torch.manual_seed(seed)
+    contract = contract_of(experiment)
+    width = contract["observation"]["dimension"]
+    weights = (0.5 * torch.randn(16, width), 0.8 * torch.randn(5, 16))
+    bias = torch.tensor([0.2, 0.0, 0.0, 0.0, -0.5])
+    return Policy(weights, (torch.randn(16), bias), "tanh", contract)
+
+
+@pytest.mark.parametrize("name", ["state", "vision"])
+def test_observation_equals_the_environments(name):
+    experiment, count = quiet(name), 3
+    policy = random_policy(experiment)
+    env = ThrowEnv(experiment, "cpu", seed=1, count=count)
+    pilots = [Pilot(policy, experiment.camera) for _ in range(count)]
+    shown = env.get_observations()["actor"]
+    starts = released = 0
+    for _ in range(STEPS):
+        state, goal = {key: value.numpy() for key, value in env.views.state.items()}, env.views.goal_w.numpy()
+        payload = env.views.out["payload_pos_w"].numpy()
+        outs = []
+        for e, pilot in enumerate(pilots):
+            one = slice(e, e + 1)
+            views = (state[key][one] for key in ("pos_w", "quat_wb", "vel_w", "rate_b"))
+            outs.append(pilot.act(*views, payload[one], goal[one], state["attached"][one]))
+        seen = np.concatenate([out.observation for out in outs])
+        np.testing.assert_array_equal(seen, shown.numpy())
+        action = torch.from_numpy(np.concatenate([out.action for out in outs]))
+        observations, _, done, _ = env.step(action)
+        shown = observations["actor"].clone()
+        released += int(env.last["released"].sum())
+        for e in torch.nonzero(done).flatten().tolist():
+            pilots[e].start()
+            starts += 1
+    assert starts > 3, "episodes must end and start within the test"
+    assert released > 0, "some must end by a release"
+
+
+def test_command_equals_the_environments():
+    experiment = quiet("state")
+    policy = random_policy(experiment)
+    env = ThrowEnv(experiment, "cpu", seed=2, count=1)
+    pilot = Pilot(policy)
+    state = {key: value.numpy().copy() for key, value in env.views.state.items()}
+    out = pilot.act(
+        *(state[key] for key in ("pos_w", "quat_wb", "vel_w", "rate_b")), env.views.out["payload_pos_w"].numpy().copy(),
+        env.views.goal_w.numpy().copy(),
+    )  # fmt: skip
+    env.step(policy.act(env.get_observations()["actor"]))
+    np.testing.assert_array_equal(out.command, env.views.command.numpy())
+    assert out.release[0] == bool(env.views.release[0])
+
+
+def test_a_call_fits_many_times_into_a_control_period():
+    experiment = quiet("vision")
+    pilot = Pilot(random_policy(experiment), experiment.camera)
+    still = np.zeros((1, 3))
+    views = (still + [0, 0, 1.3], np.array([[0.0, 0.0, 0.0, 1.0]]), still, still, still + [0, 0, 0.95], [2.0, 0.0, 0.0])
+    taken = []
+    for _ in range(60):
+        begin = time.perf_counter()
+        pilot.act(*views)
+        taken.append(time.perf_counter() - begin)
+    assert np.median(taken) < SLOWEST_CALL
+
+
+def test_camera_conditions_are_those_of_the_contract():
+    experiment = quiet("vision")
+    assert camera_conditions(experiment.camera) == contract_of(experiment)["camera"]
+
+
+def test_another_camera_is_refused():
+    experiment = quiet("vision")
+    other = dataclasses.replace(experiment.camera, goal_side=0.3)
+    with pytest.raises(MismatchError, match=r"goal_side: trained with 0\.25, here 0\.3"):
+        Pilot(random_policy(experiment), other)
+    with pytest.raises(PolicyError, match="needs a camera"):
+        Pilot(random_policy(experiment))
+
+
+def test_wrong_shapes_and_contracts_are_refused():
+    experiment = quiet("state")
+    policy = random_policy(experiment)
+    still = np.zeros((1, 3))
+    with pytest.raises(ValueError, match=r"pos_w has shape \(2, 3\); expected \(1, 3\)"):
+        Pilot(policy).act(np.zeros((2, 3)), np.array([[0, 0, 0, 1.0]]), still, still, still, still)
+    contract = {key: value for key, value in policy.contract.items() if key != "release"}
+    with pytest.raises(PolicyError, match="release"):
+        Pilot(dataclasses.replace(policy, contract=contract))
+    with pytest.raises(PolicyError, match="no camera"):
+        Pilot(policy).see(still, np.array([[0, 0, 0, 1.0]]), still, still)
+
+
+def test_keypoints_beside_a_state_policy_leave_its_observation_alone():
+    experiment = quiet("state")
+    policy = random_policy(experiment)
+    views = (
+        np.array([[0.1, 0, 1.3]]),
+        np.array([[0, 0.1, 0, 0.995]]),
+        np.ones((1, 3)),
+        np.ones((1, 3)),
+        np.array([[0, 0, 0.95]]),
+    )
+    with_camera = Pilot(policy, experiment.camera).act(*views, [2.0, 0.0, 0.0])
+    without = Pilot(policy).act(*views, [2.0, 0.0, 0.0])
+    np.testing.assert_array_equal(with_camera.observation, without.observation)
+    assert without.keypoints is None
+    assert with_camera.keypoints.shape == (1, 8, 2)
+    assert isinstance(Pilot(policy, experiment.camera).camera, KeypointCamera)

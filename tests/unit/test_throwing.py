@@ -1,0 +1,311 @@
+"""Plants, flights, the protocol on the reference plant, and the commands that fly and compare."""
+
+import csv
+import dataclasses
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from visthrow import compare, config, reference_protocol
+from visthrow.cli import main
+from visthrow.errors import ConfigError, MismatchError, PolicyError
+from visthrow.flight import fly
+from visthrow.flightlog import STANDARD_CHANNELS, FlightLog
+from visthrow.loading import load_policy, unique_names
+from visthrow.loose_rope import LooseRope
+from visthrow.plants import HybridPlant, make_plant
+from visthrow.policy import Policy
+from visthrow.protocol import Throws
+from visthrow.tables import csv_text, markdown
+from visthrow.task import Experiment, contract_of
+
+LINK_ERROR = 1e-5  # of a link's length [m]: Newton's last step
+ENERGY_DRIFT = 0.02  # of a swinging rope in half a second: first-order velocity of Verlet steps of 1 ms
+JOIN = 2e-3  # [m]: what the ball moves at most between two samples beyond v dt, half g dt^2
+
+
+def dropping_policy(name: str = "state", release: float = 1.0) -> Policy:
+    """A policy that hovers with fixed thrust and asks for the release at once."""
+    experiment = config.load(Experiment, config.find("train", name))
+    contract = contract_of(experiment)
+    weight = 9.81 * (experiment.vehicle.body.mass + experiment.rope.rope_mass + experiment.rope.payload_mass)
+    throttle = 2.0 * (weight / experiment.task.action.max_thrust) ** 0.5 - 1.0
+    width = contract["observation"]["dimension"]
+    bias = torch.tensor([throttle, 0.0, 0.0, 0.0, release])
+    made_by = {"config": config.to_dict(experiment)}
+    return Policy((torch.zeros(5, width),), (bias,), "relu", contract, made_by)
+
+
+@pytest.fixture
+def dropper(tmp_path):
+    path = tmp_path / "dropper.npz"
+    dropping_policy().save(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory) -> FlightLog:
+    path = tmp_path_factory.mktemp("policies") / "dropper.npz"
+    dropping_policy().save(path)
+    return fly(load_policy(path), [0.5, 0.1, 0.0])
+
+
+def test_loose_rope_keeps_its_links_and_its_energy():
+    rng = np.random.default_rng(0)
+    links = np.column_stack((rng.normal(0, 0.3, 8), rng.normal(0, 0.3, 8), -np.ones(8)))
+    links *= 0.03 / np.linalg.norm(links, axis=1, keepdims=True)
+    points = np.vstack((np.zeros(3), np.cumsum(links, axis=0)))
+    ball = points[-1] + links[-1]
+    turn = np.cross([0.0, 6.0, 2.0], points - ball)  # a rigid turn stretches no link
+    velocity = np.array([3.0, 0.0, 2.0])
+    rope = LooseRope(points, velocity + turn, ball, velocity)
+    energy = np.sum(rope.velocity_w**2)
+    rope.fly(0.5)
+    ends = rope.points_w(np.zeros(3))
+    lengths = np.linalg.norm(np.diff(ends, axis=0), axis=1)
+    assert np.abs(lengths - 0.03).max() < LINK_ERROR
+    assert abs(np.sum(rope.velocity_w**2) / energy - 1.0) < ENERGY_DRIFT
+    assert np.linalg.norm(ends[0] - (points[0] - ball)) > 0.1, "it must have turned"
+
+
+def test_loose_rope_ends_on_the_ground():
+    points = np.column_stack((np.zeros(9), np.zeros(9), np.linspace(0.3, 0.07, 9)))
+    rope = LooseRope(points, np.tile([0.3, 0.0, -4.0], (9, 1)), np.array([0.0, 0.0, 0.04]), np.zeros(3))
+    rope.sink(2.0, 0.003 - 0.04)
+    resting = rope.points_w(np.array([0.0, 0.0, 0.04]))
+    assert resting[:-1, 2].min() > 0.0
+    assert resting[0, 2] < 0.02
+    assert np.linalg.norm(rope.velocity_w, axis=1).max() < 0.2
+
+
+def test_ball_and_rope_fly_on_from_the_hybrid_plants_release():
+    experiment = config.load(Experiment, config.find("train", "state"))
+    plant = HybridPlant(experiment, 2)
+    tilt = np.tile([0.5, 0.0, -0.866], (2, experiment.rope.segments, 1))
+    plant.reset(np.tile([0.0, 0.0, 1.5], (2, 1)), tilt)
+    hover = np.tile([2.668, 0.0, 0.0, 0.0], (2, 1))
+    before = plant.state
+    for _ in range(60):
+        plant.step(hover, np.array([True, False]))
+        now = plant.state
+        expected = before.payload_pos_w + 0.02 * 0.5 * (before.payload_vel_w + now.payload_vel_w)
+        airborne = ~plant.landing.landed
+        assert np.abs(now.payload_pos_w - expected)[airborne].max() < JOIN
+        gap = np.linalg.norm(now.cable_points_w[:, -1] - now.payload_pos_w, axis=1)
+        assert np.abs(gap - experiment.rope.payload_offset).max() < JOIN
+        before = now
+    landing = plant.landing
+    assert landing.landed.tolist() == [True, False]
+    assert landing.separation_time[0] == pytest.approx(experiment.release.lag, abs=1e-6)
+    np.testing.assert_allclose(now.payload_pos_w[0], landing.point_w[0])
+    assert landing.point_w[0, 2] == pytest.approx(experiment.release.landing_height, abs=1e-5)
+    assert np.isnan(landing.time[1])
+    assert now.attached.tolist() == [False, True]
+
+
+def test_measurements_of_the_hybrid_plant_have_the_tasks_noise():
+    experiment = config.load(Experiment, config.find("train", "state"))
+    plant = make_plant("hybrid", experiment, 400)
+    truth, seen = plant.state, plant.measured()
+    for name in ("pos_w", "vel_w", "rate_b", "payload_pos_w"):
+        spread = (getattr(seen, name) - getattr(truth, name)).std()
+        assert spread == pytest.approx(experiment.task.noise.observation_step, rel=0.1)
+    np.testing.assert_allclose(np.linalg.norm(seen.quat_wb, axis=1), 1.0)
+    angle = 2.0 * np.linalg.norm(seen.quat_wb[:, :3], axis=1)
+    assert angle.mean() == pytest.approx(1.6 * 0.01, rel=0.1)  # mean length of three normal deviates: 1.596
+    with pytest.raises(ConfigError, match="did you mean 'hybrid'"):
+        make_plant("hybird", experiment)
+
+
+def test_a_flight_goes_from_hover_to_hover(flown):
+    times, result = flown.meta["times"], flown.meta["result"]
+    assert result["success"]
+    assert result["hovering_again"]
+    assert times["latch"] == pytest.approx(times["policy_start"])
+    assert times["separation"] - times["latch"] == pytest.approx(0.11, abs=1e-6)
+    assert result["error"] == pytest.approx(np.hypot(*(np.array(result["landing_w"][:2]) - [0.5, 0.1])))
+    fall = np.sqrt(2 * (flown["separation"].values[0, 2] - 0.04) / 9.81)
+    assert times["landing"] - times["separation"] == pytest.approx(fall, abs=0.05), "it is dropped, nearly at rest"
+    assert set(STANDARD_CHANNELS) <= set(flown.channels)
+    assert "measured_pos_w" in flown
+
+
+def test_a_flights_modes_and_commands(flown):
+    times = flown.meta["times"]
+    mode = flown["mode"]
+    flying = (mode.time >= times["policy_start"] - 1e-9) & (mode.time < times["recovery"] - 1e-9)
+    np.testing.assert_array_equal(mode.values == 1, flying)
+    assert len(flown["action"].time) == np.count_nonzero(flying)
+    assert flown["command"].time[0] == 0.0
+    assert np.abs(flown["pos_w"].values[-1] - [0, 0, 1.333]).max() < 0.1
+    assert flown["cable_points_w"].values[-1][:, 2].max() < 0.03, "the rope lies on the ground at last"
+
+
+def test_a_flight_without_release_fails_and_recovers(tmp_path):
+    path = tmp_path / "holder.npz"
+    dropping_policy(release=-1.0).save(path)
+    loaded = load_policy(path)
+    bounds = dataclasses.replace(loaded.experiment.task.bounds, time_limit=0.3)
+    task = dataclasses.replace(loaded.experiment.task, bounds=bounds)
+    log = fly(
+        dataclasses.replace(loaded, experiment=dataclasses.replace(loaded.experiment, task=task)), [1.0, 0.0, 0.0]
+    )
+    assert not log.meta["result"]["success"]
+    assert "no release within 0.3 s" in log.meta["result"]["failure"]
+    assert "landing" not in log
+    assert bool(log["attached"].values[-1])
+
+
+def test_fly_writes_its_files(dropper, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert (
+        main(["fly", "--policy", str(dropper), "--target", "0.5", "--out", str(out), "--json", str(out / "r.json")])
+        == 0
+    )
+    told = capsys.readouterr().out
+    assert "landing at x" in told
+    assert {p.name for p in out.iterdir()} == {"flight.npz", "throw.rrd", "throw.png", "r.json"}
+    result = json.loads((out / "r.json").read_text())["result"]
+    assert f"{result['error']:.3f} m from the target" in told
+    verified = subprocess.run(
+        [sys.executable, "-m", "rerun", "rrd", "verify", str(out / "throw.rrd")], capture_output=True, text=True
+    )
+    assert verified.returncode == 0, verified.stderr
+
+
+def test_compare_prints_and_writes(dropper, tmp_path, capsys):
+    out = tmp_path / "out"
+    words = [
+        "compare",
+        str(dropper),
+        "--targets",
+        "0.5",
+        "1.0",
+        "--throws",
+        "5",
+        "--out",
+        str(out),
+        "--json",
+        str(out / "c.json"),
+    ]
+    assert main([*words, "--device", "cpu"]) == 0
+    told = capsys.readouterr().out
+    assert "`hybrid`, seed 0" in told
+    assert "No vehicle was flown" in told
+    rows = list(csv.DictReader((out / "compare-hybrid.csv").open()))
+    assert len(rows) == 10
+    assert {row["plant"] for row in rows} == {"hybrid"}
+    first = [float(row["landing error [m]"]) for row in rows[:5]]
+    summary = json.loads((out / "c.json").read_text())["rows"][0]
+    assert summary["error_mean"] == pytest.approx(np.mean(first), rel=1e-4)
+    assert f"{summary['error_mean']:.3f} ± {summary['error_std']:.3f}" in told
+    assert (out / "compare-hybrid.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_protocol_on_the_reference_plant(dropper, monkeypatch):
+    """A drop from hover lands below the hover point, so far from the target as that is; in parts or as a whole."""
+    pytest.importorskip("mujoco")
+    monkeypatch.setattr(reference_protocol, "HOVER_TIME", 0.1)
+    loaded = load_policy(dropper)
+    got = reference_protocol.fly_batch([loaded], "reference-realistic", reference_protocol.Job((0,), 1.0, 0, 2, 7))
+    assert got["success"].all()
+    assert np.abs(got["landing_w"]).max() < 0.25
+    np.testing.assert_allclose(got["error"], np.linalg.norm(got["landing_w"] - [1.0, 0.0], axis=1))
+    assert np.all((got["duration"] > 0.4) & (got["duration"] < 0.7))
+    assert np.all(got["clearance"] > 0.2)
+    assert np.all(got["smoothness"] < 0.6), "one jump of the release does not count, the four commands stand still"
+    assert np.ptp(got["landing_w"][:, 0]) > 0.0
+
+
+def test_plan_covers_every_throw_once():
+    jobs = reference_protocol.plan(2, (1.5, 2.0), 120, seed=3)
+    for policy in range(2):
+        for target in (1.5, 2.0):
+            assert sum(job.count for job in jobs if job.policies == (policy,) and job.target == target) == 120
+    together = reference_protocol.plan(2, (2.0,), 6, seed=3, together=True)
+    assert [job.policies for job in together] == [(0, 1)]
+
+
+def test_failures_name_their_cause():
+    experiment = config.load(Experiment, config.find("train", "state"))
+    now = HybridPlant(experiment, 5).state
+    pos = now.pos_w.copy()
+    pos[1, 2], pos[2, 0] = 3.5, 3.5
+    payload = now.payload_pos_w.copy()
+    payload[2, 0], payload[3] = 3.5, pos[3] + [0, 0, 0.05]
+    quat = now.quat_wb.copy()
+    quat[4] = [1.0, 0.0, 0.0, 0.0]
+    now = dataclasses.replace(now, pos_w=pos, payload_pos_w=payload, quat_wb=quat)
+    found = reference_protocol.failures(experiment, now, 0.1)
+    assert found[0] is None
+    for message, cause in zip(found[1:], ("altitude", "further than", "hit", "tilted"), strict=True):
+        assert cause in message
+    latched = dataclasses.replace(now, latched=np.ones(5, bool))
+    assert reference_protocol.failures(experiment, latched, 0.1)[4] is None
+
+
+def throws(error: float, success: int = 4) -> Throws:
+    good = np.arange(4) < success
+    blank = np.where(good, 1.0, np.nan)
+    landing = np.column_stack((np.full(4, 2.0 + error), np.zeros(4))) * blank[:, None]
+    return Throws(2.0, good, landing, error * blank, 1.1 * blank, 0.4 * blank, 0.3 * blank)
+
+
+def test_table_says_success_rate_and_leaves_failures_blank():
+    rows = [{"policy": n, "layout": "state", **throws(0.1, s).summary()} for n, s in (("a", 4), ("b", 3), ("c", 0))]
+    text = markdown(rows, "title")
+    lines = text.splitlines()
+    assert len({len(line) for line in lines[2:]}) == 1, "columns line up"
+    assert "75.0 %" in lines[5]
+    assert "0.100 ± 0.000" in lines[5]
+    assert "0.105 ± 0.099" in lines[4], "the paper's figure beside ours"
+    assert "0.0 %" in lines[6]
+    assert "nan" not in text
+    assert csv_text([("b", "hybrid", throws(0.1, 3))]).splitlines()[-1] == "b,hybrid,2.0,3,0,,,,,,"
+
+
+def test_names_are_made_unique(dropper):
+    loaded = load_policy(dropper)
+    assert unique_names([loaded, loaded]) == ["dropper 1", "dropper 2"]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["fly", "--policy", "visoin"], "no policy 'visoin'"),
+        (["fly", "--policy", "DROPPER", "--target", "7"], "the goal lies 7 m away"),
+        (["fly", "--policy", "DROPPER", "--target", "nan"], "three finite numbers"),
+        (["fly", "--policy", "DROPPER", "--target", "1", "2", "3"], "a distance, or x and y"),
+        (["fly", "--policy", "DROPPER", "--plant", "real"], "no plant 'real'"),
+        (["fly", "--policy", "DROPPER", "--config", "vision"], "trained under other conditions"),
+        (["fly", "--policy", "DROPPER", "--set", "release.lag=0.2"], "release.lag: trained with 0.11, here 0.2"),
+        (["compare", "DROPPER", "--throws", "0"], "--throws 0"),
+        (["compare", "DROPPER", "--targets", "9"], "from 0 to 3 m"),
+        (["compare", "DROPPER", "--targets", "1", "1"], "twice"),
+        (["compare", "DROPPER", "--plant", "real"], "no plant 'real'"),
+    ],
+)
+def test_bad_input_is_refused_in_one_line(words, message, dropper, tmp_path, capsys):
+    words = [str(dropper) if word == "DROPPER" else word for word in words]
+    assert main([*words, "--out", str(tmp_path / "out")]) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_policy_without_its_config_asks_for_one(tmp_path):
+    policy = dataclasses.replace(dropping_policy(), made_by={})
+    policy.save(tmp_path / "bare.npz")
+    with pytest.raises(PolicyError, match="--config"):
+        load_policy(tmp_path / "bare.npz")
+    assert load_policy(tmp_path / "bare.npz", "state").experiment.task.observation.layout == "state"
+    with pytest.raises(MismatchError):
+        load_policy(tmp_path / "bare.npz", "state", ["vehicle.body.mass=0.3"])
+
+
+def test_targets_must_differ_from_each_other():
+    with pytest.raises(ConfigError):
+        compare.check([2.0, 2.0], 10)
