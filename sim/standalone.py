@@ -155,7 +155,7 @@ class QuadSim:
     """
 
     def __init__(
-        self, vehicle: VehicleParams, count: int, integrator: str = "rk4", step: float = 0.0005,
+        self, vehicle: VehicleParams, count: int, integrator: str = "rk4", step: float = 0.002,
         control_period: float = 0.02, device: str = "cpu", precision: str = "float32", *, vehicles: list[VehicleParams] | None = None,
         gravity: float = GRAVITY,
     ):
@@ -165,8 +165,8 @@ class QuadSim:
             vehicle: its kinds of blocks hold for all.
             count: number of environments E.
             integrator: "euler" or "rk4".
-            step: largest integration step [s]; steps end on command switches. Full-range commands saturate the mixer: RK4 is
-                then 15 mm off after a second at 2 ms, 1.6 mm at 0.5 ms, 0.5 mm at 0.25 ms.
+            step: largest integration step [s]; steps end on command switches. Full-range commands keep the mixer at its
+                limits: after a second of them RK4 is 0.6 mm off at 2 ms, 0.04 mm at 0.5 ms.
             control_period: time that :meth:`step` advances [s].
             device: Warp device, "cpu" or "cuda:0".
             precision: "float32" or "float64".

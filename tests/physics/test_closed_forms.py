@@ -1,0 +1,258 @@
+"""The simulator's blocks and rope where mechanics has a formula."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.optimize import root
+from scipy.special import ellipk
+
+from sim.hybrid import HybridSim
+from sim.params import GRAVITY, BodyParams, PlantParams, QueueParams
+from sim.standalone import QuadSim
+from sim.state import NONFINITE
+from tests.plants import paper_plant, plain_vehicle
+from tests.simulators import numerics, rods
+
+PERIOD = 1e-4
+"""Of a pendulum's period; order 2 at 2 ms leaves (w h)^2 = 2e-4 of the phase, less by the method's constant."""
+SHAPE = 1e-4
+"""Distance from the shape of equilibrium [m]: the start is exact to round-off, so this is what the step adds."""
+HELD = 2e3
+"""Mass of a vehicle that the rope hardly moves [kg]: by 3e-5 of its own motion."""
+
+
+def held(plant: PlantParams, substep: float = 0.002, **rope) -> HybridSim:
+    """Rope under a vehicle too heavy to move, carried by a force of its own weight and the load's."""
+    body = BodyParams(HELD, (HELD, HELD, HELD))
+    vehicle = dataclasses.replace(plant.vehicle, body=body, queue=QueueParams(0.0))
+    changed = dataclasses.replace(plant.rope, mount=(0.0, 0.0, 0.0), **rope)
+    sim = HybridSim(
+        PlantParams(vehicle, changed, plant.release, numerics(substep, "float64")), 1, direct=True
+    )
+    load = HELD + changed.rope_mass + changed.payload_mass
+    sim.set_command([[load * GRAVITY, 0.0, 0.0, 0.0]])
+    return sim
+
+
+def advance(sim, steps: int) -> None:
+    """Step, and see to it that no step was undone."""
+    for _ in range(steps):
+        sim.step()
+        assert not np.any(sim.get("status") & NONFINITE)
+
+
+@pytest.mark.parametrize("amplitude", [0.05, 1.2])
+def test_pendulum_period(amplitude):
+    """One rigid segment swings as a physical pendulum: ``T = 4 sqrt(I / (m g c)) K(sin^2(amplitude / 2))``."""
+    sim = held(paper_plant(), segments=1, joint_damping=0.0)
+    rope = sim.params.rope
+    reach = rope.length + rope.payload_offset
+    inertia = rope.rope_mass * rope.length**2 / 3.0 + rope.payload_inertia + rope.payload_mass * reach**2
+    moment = rope.rope_mass * rope.length / 2.0 + rope.payload_mass * reach
+    expected = 4.0 * np.sqrt(inertia / (moment * GRAVITY)) * ellipk(np.sin(amplitude / 2.0) ** 2)
+    sim.place(np.zeros((1, 3)), cable_dir_w=np.array([[[np.sin(amplitude), 0.0, -np.cos(amplitude)]]]))
+    times, angles = [], []
+    for k in range(200):
+        advance(sim, 1)
+        n = sim.get("cable_dir_w")[0, 0]
+        times.append(0.02 * (k + 1))
+        angles.append(np.arctan2(n[0], -n[2]))
+    times, angles = np.array(times), np.array(angles)
+    down = np.flatnonzero((angles[:-1] > 0.0) & (angles[1:] <= 0.0))
+    crossings = []
+    for k in down:  # a cubic through four samples finds the crossing to (w dt)^4
+        window = slice(max(k - 1, 0), k + 3)
+        crossings.append(np.polyval(np.polyfit(angles[window], times[window], 3), 0.0))
+    period = np.mean(np.diff(crossings))
+    assert period == pytest.approx(expected, rel=PERIOD)
+    assert np.linalg.norm(sim.get("pos_w")) < 1e-3, "the vehicle was to be held"
+
+
+def test_hanging_rope_stays_at_rest_and_bears_what_is_below():
+    """At rest a rope that hangs from one end is straight; each joint carries the weight below it."""
+    sim = held(paper_plant())
+    advance(sim, 50)
+    rope = sim.params.rope
+    assert np.abs(sim.get("cable_dir_w") - [0.0, 0.0, -1.0]).max() < 1e-9
+    length, mass = rope.length / rope.segments, rope.rope_mass / rope.segments
+    below = rope.payload_mass + mass * np.arange(rope.segments - 1, -1, -1)
+    stiffness = (below + 0.5 * mass) * GRAVITY * length
+    stiffness[-1] += rope.payload_mass * GRAVITY * rope.payload_offset
+    np.testing.assert_allclose(sim.get("stiffness")[0], stiffness, rtol=1e-6)
+
+
+def turning_shape(rope, rate: float) -> np.ndarray:
+    """Angles off the vertical [rad], shape (L,), of a rope that turns steadily about the vertical through its mount.
+
+    In the turning frame each rod balances its weight and its centrifugal forces about its upper joint; forces below a
+    joint add up. Rods turn about the vertical, so their transverse inertia J adds ``J rate^2 sin cos``.
+    """
+    count, length, mass = rope.segments, rope.length / rope.segments, rope.rope_mass / rope.segments
+
+    def unbalanced(angles):
+        sin, cos = np.sin(angles), np.cos(angles)
+        ends = length * np.cumsum(sin)
+        centres = ends - 0.5 * length * sin
+        ball = ends[-1] + rope.payload_offset * sin[-1]
+        outwards = np.append(mass * rate**2 * centres, rope.payload_mass * rate**2 * ball)
+        weights = np.append(np.full(count, mass), rope.payload_mass) * GRAVITY
+        moments = []
+        for i in range(count):
+            out, down = outwards[i + 1 :].sum(), weights[i + 1 :].sum()
+            moment = length * (out * cos[i] - down * sin[i])
+            moment += 0.5 * length * (outwards[i] * cos[i] - weights[i] * sin[i])
+            moment += mass * length**2 / 12.0 * rate**2 * sin[i] * cos[i]
+            if i == count - 1:
+                arm = rope.payload_offset
+                moment += arm * (outwards[-1] * cos[i] - weights[-1] * sin[i])
+                moment += rope.payload_inertia * rate**2 * sin[i] * cos[i]
+            moments.append(moment)
+        return np.array(moments)
+
+    found = root(unbalanced, np.linspace(0.7, 1.0, count), tol=1e-13)
+    assert np.abs(found.fun).max() < 1e-12
+    assert found.x.min() > 0.1, "not the straight solution"
+    return found.x
+
+
+def test_turning_rope_keeps_its_curve():
+    """The shape of a rope in steady rotation, with weight and centrifugal force as the load of a catenary.
+
+    A rope that hangs from one end has no catenary at rest; this is its curve of equilibrium in a turning frame, found
+    here by balancing moments.
+    """
+    rate, steps = 6.5, 50
+    sim = held(paper_plant(), substep=0.0005, joint_damping=0.0, rope_mass=0.05)
+    angles = turning_shape(sim.params.rope, rate)
+    assert np.ptp(angles) > 0.02, "the rope is to be bent"
+
+    def directions(azimuth):
+        sin, cos = np.sin(angles), np.cos(angles)
+        return np.stack((sin * np.cos(azimuth), sin * np.sin(azimuth), -cos), -1)
+
+    start = directions(0.0)
+    sim.place(np.zeros((1, 3)), cable_dir_w=start[None], cable_vel_w=np.cross([0.0, 0.0, rate], start)[None])
+    sim.set_command([[(HELD + sim.params.rope.rope_mass + sim.params.rope.payload_mass) * GRAVITY, 0.0, 0.0, 0.0]])
+    advance(sim, steps)
+    expected = directions(rate * 0.02 * steps)
+    reach = sim.params.rope.length / sim.params.rope.segments
+    apart = reach * np.cumsum(sim.get("cable_dir_w")[0] - expected, axis=0)
+    assert np.abs(apart).max() < SHAPE
+
+
+def test_motor_step():
+    """A step of the set-point: ``1 - exp(-t / T)``; the set-point itself is the root of the thrust over k_f."""
+    vehicle = plain_vehicle(paper_plant().vehicle, controller="geometric")
+    vehicle = dataclasses.replace(vehicle, queue=QueueParams(0.0))
+    sim = QuadSim(vehicle, 1, "rk4", 0.001, precision="float64")
+    first = sim.get("motor_speed")[0, 0]
+    sim.set_command([[8.0, 0.0, 0.0, 0.0]])
+    last = np.sqrt(2.0 / vehicle.thrust.k_f)
+    for k in range(1, 6):
+        advance(sim, 1)
+        expected = last + (first - last) * np.exp(-0.02 * k / vehicle.motor.time_constant)
+        np.testing.assert_allclose(sim.get("motor_speed")[0], expected, rtol=1e-8)
+
+
+def test_battery_sags_to_where_source_and_load_meet():
+    """At a steady load the voltage is the upper root of ``u^2 - u_oc u + R P = 0``."""
+    vehicle = paper_plant().vehicle
+    vehicle = dataclasses.replace(vehicle, aero=dataclasses.replace(vehicle.aero, kind="none"))
+    endless = dataclasses.replace(vehicle.battery, capacity=1e9)
+    vehicle = dataclasses.replace(vehicle, battery=endless, queue=QueueParams(0.0))
+    sim = QuadSim(vehicle, 1, "rk4", 0.002, precision="float64")
+    start = sim.get("voltage")[0]
+    sim.set_command([[10.0, 0.0, 0.0, 0.0]])
+    advance(sim, 100)
+    voltage, speed = sim.get("voltage")[0], sim.get("motor_speed")[0]
+    cell, thrust = vehicle.battery, vehicle.thrust
+    lift = thrust.k_f * speed**2 * (1.0 + thrust.voltage_coefficient * (voltage - cell.reference_voltage))
+    power = cell.idle_power + np.sum(thrust.torque_ratio * lift * speed) / cell.efficiency
+    source = cell.ocv[0]
+    assert voltage == pytest.approx((source + np.sqrt(source**2 - 4.0 * cell.resistance * power)) / 2.0, abs=1e-6)
+    assert voltage < start - 0.3, "ten newtons must sag more than hover"
+
+
+def test_battery_counts_its_charge():
+    """The used fraction grows by the current: power over voltage over capacity, in hover steady but for the sag."""
+    sim = QuadSim(dataclasses.replace(paper_plant().vehicle, queue=QueueParams(0.0)), 1, precision="float64")
+    vehicle = sim.vehicle
+    weight = vehicle.body.mass * GRAVITY
+    sim.set_command([[weight, 0.0, 0.0, 0.0]])
+    voltage, speed = sim.get("voltage")[0], sim.get("motor_speed")[0, 0]
+    power = vehicle.battery.idle_power + weight * vehicle.thrust.torque_ratio * speed / vehicle.battery.efficiency
+    advance(sim, 50)
+    expected = power / voltage / 3600.0 / vehicle.battery.capacity
+    assert sim.get("charge_used")[0] == pytest.approx(expected, rel=0.05)
+
+
+def test_gyroscopic_torques_do_no_work():
+    """Unpowered rotors on a tumbling body: its kinetic energy stays while the rotors bend its path.
+
+    Rotors at equal speeds would cancel; here two stand still. No thrust coefficient that matters, no air: only Euler's
+    equation and the rotors' momentum are left.
+    """
+    base = plain_vehicle(paper_plant().vehicle, controller="geometric", motor="first_order")
+    still = dataclasses.replace(base.motor, time_constant=1e30)
+    # No thrust worth the name, and motors that never reach a set-point; hover needs none because gravity is off.
+    weak = dataclasses.replace(base.thrust, k_f=1e-30)
+    idle = dataclasses.replace(base.controller, min_thrust=0.0, geometric_gain=0.0)
+    vehicle = dataclasses.replace(base, motor=still, thrust=weak, controller=idle)
+    rate = np.array([[6.0, -9.0, 4.0]])
+    inertia = np.array(vehicle.body.inertia)
+
+    def run(speeds):
+        sim = QuadSim(vehicle, 1, "rk4", 0.0005, precision="float64", gravity=0.0)
+        sim.place(np.zeros((1, 3)), rate_b=rate)
+        sim.state.motor_speed.assign(np.array([speeds]))
+        advance(sim, 50)
+        return sim.get("rate_b")[0]
+
+    spun, plain = run([4000.0, 0.0, 0.0, 4000.0]), run([0.0, 0.0, 0.0, 0.0])
+    energy = 0.5 * np.sum(inertia * rate[0] ** 2)
+    for end in (spun, plain):
+        assert 0.5 * np.sum(inertia * end**2) == pytest.approx(energy, rel=1e-8)
+    assert np.linalg.norm(spun - plain) > 1.0, "the rotors must have turned the rate"
+
+
+def test_hover_is_an_equilibrium():
+    """What a reset leaves is steady where the battery is ideal; with a real one the voltage's compensation is not."""
+    plant = paper_plant()
+    ideal = dataclasses.replace(plant.vehicle, battery=dataclasses.replace(plant.vehicle.battery, kind="ideal"))
+    sim = HybridSim(dataclasses.replace(plant, vehicle=ideal, sim=numerics(precision="float64")), 1)
+    sim.place(np.array([[0.0, 0.0, 2.0]]))
+    weight = GRAVITY * (ideal.body.mass + plant.rope.rope_mass + plant.rope.payload_mass)
+    sim.set_command([[weight, 0.0, 0.0, 0.0]])
+    advance(sim, 50)
+    np.testing.assert_allclose(sim.get("pos_w")[0], [0.0, 0.0, 2.0], atol=1e-9)
+    np.testing.assert_allclose(sim.get("vel_w")[0], 0.0, atol=1e-9)
+    _, _, centres, velocities, _ = rods(sim)
+    assert np.abs(velocities).max() < 1e-9
+    assert centres[0, -1, 2] == pytest.approx(2.0 - 0.02 - 0.33 - 0.033, abs=1e-9)
+
+
+def test_quadrotor_without_thrust_falls_freely():
+    """No gravity-free hover thrust, no air: ``z = -g t^2 / 2`` and the rate stays."""
+    vehicle = plain_vehicle(paper_plant().vehicle, controller="geometric", motor="instant")
+    idle = dataclasses.replace(vehicle.controller, min_thrust=0.0)
+    vehicle = dataclasses.replace(vehicle, controller=idle, queue=QueueParams(0.0))
+    sim = QuadSim(vehicle, 1, "rk4", 0.002, precision="float64")
+    advance(sim, 25)
+    np.testing.assert_allclose(sim.get("pos_w")[0], [0.0, 0.0, -0.5 * GRAVITY * 0.25], atol=1e-12)
+
+
+def test_external_wrench():
+    """Force over mass and torque over inertia, added to a vehicle in free fall."""
+    vehicle = plain_vehicle(paper_plant().vehicle, controller="geometric", motor="instant")
+    idle = dataclasses.replace(vehicle.controller, min_thrust=0.0, geometric_gain=0.0)
+    vehicle = dataclasses.replace(vehicle, controller=idle, queue=QueueParams(0.0))
+    sim = QuadSim(vehicle, 2, "rk4", 0.002, precision="float64", gravity=0.0)
+    sim.set_wrench([[0.3, -0.2, 0.1], [0.0, 0.0, 0.0]], [[0.0, 0.0, 0.0], [0.0, 0.0, 1e-4]])
+    advance(sim, 10)
+    time = 0.2
+    expected = np.array([0.3, -0.2, 0.1]) / vehicle.body.mass * time
+    np.testing.assert_allclose(sim.get("vel_w"), [expected, np.zeros(3)], atol=1e-12)
+    np.testing.assert_allclose(sim.get("pos_w")[0], expected * time / 2.0, atol=1e-12)
+    spun = [0.0, 0.0, 1e-4 / vehicle.body.inertia[2] * time]
+    np.testing.assert_allclose(sim.get("rate_b"), [np.zeros(3), spun], atol=1e-12)

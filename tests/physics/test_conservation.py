@@ -1,0 +1,98 @@
+"""What a free chain of vehicle, rope and ball must keep: energy, linear momentum, its centre of mass in free fall."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from sim.params import GRAVITY
+from sim.reference.scene import Wrench, load_scene
+from tests.plants import SCENES
+from tests.simulators import energy, momentum, rotate, scene_sim
+
+DRIFT = 5e-3
+"""Of the energy in 1.2 s at 2 ms."""
+FALLS = 4.0
+"""A step half as long loses at least so much less: order 2."""
+ROUND_OFF = {"float32": 1e-5, "float64": 1e-12}
+"""Momentum [kg m/s]; the rates below give 0.24 kg m/s."""
+ENERGY_ROUND_OFF = {"float32": 5e-6, "float64": 1e-12}
+"""Of the energy; float32 states hold seven digits."""
+DISSIPATION = 0.01
+"""Of the dissipated energy; the integrator's own loss at 0.25 ms is a few millionths of the whole energy."""
+STEPS = 60
+"""Of 20 ms."""
+
+
+def free(**changes):
+    """The hard throw's bodies, undamped, unpushed, the vehicle tumbling and the rope swinging fast."""
+    scene = load_scene(SCENES / "hard_throw.toml")
+    nothing = (Wrench(0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),)
+    start = {"schedule": nothing, "joint_damping": 0.0, "rate_b": (5.0, -8.0, 3.0), "cable_rate_w": (2.0, 15.0, 1.0)}
+    return dataclasses.replace(scene, **{**start, **changes})
+
+
+def history(scene, substep, precision, **options):
+    """Energy, shape (T+1,), and momentum, shape (T+1, 3), at every control step."""
+    sim = scene_sim(scene, substep, precision, 0.02, **options)
+    sim.set_command(np.zeros((1, 4)))
+    energies, momenta = [energy(sim)[0]], [momentum(sim)[0]]
+    for _ in range(STEPS):
+        sim.step()
+        energies.append(energy(sim)[0])
+        momenta.append(momentum(sim)[0])
+    return np.array(energies), np.array(momenta)
+
+
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+def test_free_chain_keeps_energy_and_momentum(precision):
+    scene = free()
+    energies, momenta = history(scene, 2e-3, precision, gravity=0.0)
+    lost = 1.0 - energies / energies[0]
+    assert np.abs(lost).max() < DRIFT
+    assert lost.min() > -ENERGY_ROUND_OFF[precision], "energy grew"
+    assert np.abs(momenta - momenta[0]).max() < ROUND_OFF[precision]
+
+
+def test_energy_drift_falls_with_the_step():
+    ends = [history(free(), h, "float64", gravity=0.0)[0] for h in (2e-3, 1e-3, 5e-4)]
+    drifts = [np.abs(e / e[0] - 1.0).max() for e in ends]
+    assert drifts[0] > FALLS * drifts[1] > FALLS**2 * drifts[2] > 0.0
+
+
+def test_a_rope_that_moves_as_one_body_keeps_everything():
+    """Straight, at rest against the vehicle: nothing may happen, in float64 not even in the last digits."""
+    energies, momenta = history(free(rate_b=(0.0,) * 3, cable_rate_w=(0.0,) * 3), 2e-3, "float64", gravity=0.0)
+    assert np.abs(energies / energies[0] - 1.0).max() < 1e-13
+    assert np.abs(momenta - momenta[0]).max() < 1e-15
+
+
+def relative_rates(sim):
+    """Angular velocity of every rod against what it hangs from [rad/s], shape (L, 3)."""
+    rate_w = rotate(sim.get("quat_wb"), sim.get("rate_b"))
+    rods = np.cross(sim.get("cable_dir_w"), sim.get("cable_vel_w"))[0]
+    return np.diff(np.concatenate((rate_w, rods)), axis=0)
+
+
+def test_joint_damping_takes_what_its_law_says():
+    """Power of the couples -d (w_i - w_(i-1)) is -d |w_i - w_(i-1)|^2; integrated by the trapezoidal rule."""
+    damping, period = 1e-5, 5e-4
+    sim = scene_sim(free(joint_damping=damping), 2.5e-4, "float64", period, gravity=0.0)
+    sim.set_command(np.zeros((1, 4)))
+    energies, powers = [energy(sim)[0]], [damping * np.square(relative_rates(sim)).sum()]
+    for _ in range(400):
+        sim.step()
+        energies.append(energy(sim)[0])
+        powers.append(damping * np.square(relative_rates(sim)).sum())
+    expected = period * (np.sum(powers) - 0.5 * (powers[0] + powers[-1]))
+    assert energies[0] - energies[-1] == pytest.approx(expected, rel=DISSIPATION)
+
+
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+def test_free_fall(precision):
+    """Whatever rope and vehicle do, the total momentum grows by m g t."""
+    scene = free()
+    _, momenta = history(scene, 2e-3, precision)
+    expected = momenta[0] - scene.total_mass * GRAVITY * 0.02 * np.arange(STEPS + 1)[:, None] * np.array([0, 0, 1.0])
+    # It is carried through the step as one sum of up to 3 kg m/s, so its round-off is that of the sum.
+    np.testing.assert_allclose(momenta, expected, rtol=0.0, atol=3.0 * ROUND_OFF[precision])
