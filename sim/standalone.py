@@ -73,7 +73,8 @@ def build_kernels(t: Types, vehicle: VehicleParams, integrator: str):
     def sane(s: QuadState):
         """Finite and below the speed limit; a comparison with NaN is false."""
         total = wp.length(s.vel_w) + wp.length(s.rate_b) + wp.length(s.quat_wb) + wp.length(s.pos_w) * real(1.0e-3)
-        return total + wp.abs(s.voltage) + wp.length(s.motor_speed) * real(1.0e-3) < limit
+        total += wp.abs(s.voltage) + wp.length(s.motor_speed) * real(1.0e-3) + wp.length(s.integral)
+        return total + wp.length(s.setpoint) + wp.length(s.gyro) + wp.abs(s.charge_used) < limit
 
     @wp.kernel(module="unique", enable_backward=False)
     def quad_step_kernel(
@@ -93,7 +94,7 @@ def build_kernels(t: Types, vehicle: VehicleParams, integrator: str):
         p = vehicle[env % vehicle.shape[0]]
         g = vec3(real(0.0), real(0.0), -gravity)
         s = load(state, env)
-        push(state.queue, env, command[env])
+        taken = push(state.queue, env, command[env])
         depth = state.queue.shape[0]
         whole, switch = split_delay(p, period)
         tiny = real(1.0e-6)
@@ -110,11 +111,14 @@ def build_kernels(t: Types, vehicle: VehicleParams, integrator: str):
             for _k in range(count):
                 s = integrate(p, s, active, force_w[env], torque_b[env], g, h)
             time = until
+        status = int(0)
         if sane(s):
             store(state, env, s)
-            state.status[env] = 0
         else:
-            state.status[env] = 1
+            status = 1
+        if not taken:
+            status = 1
+        state.status[env] = status
 
     @wp.kernel(module="unique", enable_backward=False)
     def quad_reset_kernel(
@@ -144,7 +148,8 @@ class QuadSim:
     """Batched quadrotor: command queue, rate controller, motors, battery, aerodynamics, external wrench.
 
     All arrays live on the device and keep their addresses for life, so a captured graph of ``step`` or ``reset`` stays
-    valid. Bit :data:`sim.state.NONFINITE` of ``state.status`` tells that a step led to a bad state and was undone.
+    valid. Bit :data:`sim.state.NONFINITE` of ``state.status`` tells that a step led to a bad state and was undone, or
+    that its command was not finite and the last one was held.
 
     Attributes:
         command: collective thrust [N] and body rates [rad/s] of the next step, shape (E,) of vec4.

@@ -9,7 +9,8 @@ import warp as wp
 from sim.structs import Types, make_struct
 
 NONFINITE = 1
-"""Status bit: a state became non-finite or faster than any physical one; the environment was put back to its last good state."""
+"""Status bit: a state became non-finite or faster than any physical one; the environment was put back to its last good state.
+Or the command was not finite, and the last one was held."""
 FALLBACK = 2
 """Status bit: a rod turned faster than a substep resolves; the first-order stage was kept there."""
 COLLISION = 4

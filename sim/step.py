@@ -58,6 +58,7 @@ def build_step(t: Types, params: PlantParams, direct: bool = False) -> StepKerne
         """Finite and below the speed limit; a comparison with NaN is false."""
         total = wp.length(s.vel_w) + wp.length(s.rate_b) + wp.length(s.quat_wb) + wp.length(s.pos_w) * real(1.0e-3)
         total += wp.abs(s.voltage) + wp.length(s.motor_speed) * real(1.0e-3)
+        total += wp.length(s.setpoint) + wp.length(s.gyro) + wp.length(s.integral) + wp.abs(s.charge_used)
         for i in range(L):
             total += wp.length(u[i]) * real(1.0e-1) + wp.length(n[i])
         return total < vec3_limit
@@ -129,7 +130,7 @@ def build_step(t: Types, params: PlantParams, direct: bool = False) -> StepKerne
             stiffness[i] = state.stiffness[i, env]
         s = load(state, env)
 
-        push(state.queue, env, command[env])
+        taken = push(state.queue, env, command[env])
         depth = state.queue.shape[0]
         whole, switch = split_delay(p, period)
         timer = state.release_timer[env]
@@ -138,6 +139,8 @@ def build_step(t: Types, params: PlantParams, direct: bool = False) -> StepKerne
             timer = r.lag
         tiny = real(1.0e-6)
         status = int(0)
+        if not taken:
+            status = 1
         out.separated[env] = 0
 
         total = coupled.momentum(p, rope, s, u)

@@ -31,8 +31,15 @@ def split_delay(p: Any, period: Any):
 
 @wp.func
 def push(queue: wp.array2d(dtype=Any), env: int, command: Any):
-    """Put a command into slot 0 of an environment's queue, shape (D, E); the others move on by one."""
+    """Put a command into slot 0 of an environment's queue, shape (D, E); the others move on by one.
+
+    Returns:
+        Whether the command was finite. One that is not is left out: the last one is held in its place.
+    """
     depth = queue.shape[0]
     for k in range(depth - 1):
         queue[depth - 1 - k, env] = queue[depth - 2 - k, env]
-    queue[0, env] = command
+    taken = wp.isfinite(command)
+    if taken:
+        queue[0, env] = command
+    return taken

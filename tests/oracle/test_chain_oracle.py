@@ -1,7 +1,7 @@
 """The rope's recursion and its integrator against converged MuJoCo runs of the same bodies.
 
-MuJoCo's joints are universal: they pass the twist of a turning vehicle on and damp it, a string and our recursion do not.
-With the damping of the scenes that is worth 0.03 mm; the tests of the order leave the damping out.
+MuJoCo's joints are universal: they pass the twist of a turning vehicle on and damp it, a string and our recursion do
+not. With the damping of the scenes that is worth 0.03 mm; the tests of the order leave the damping out.
 """
 
 import dataclasses
