@@ -20,9 +20,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "  visthrow compare                               state against vision, 200 throws at each of three targets\n"
         "  visthrow compare vision runs/v2/policy.npz     a shipped policy against one of your own\n"
         "  visthrow compare --plant reference-realistic --throws 50   on the stand-in for a real vehicle (minutes)\n"
-        "\nA throw starts in hover with the payload near z = 0.95 m. The landing error is the horizontal distance from the\n"
-        "target, the duration counts from the policy's start to the landing, smoothness is the root mean square change of\n"
-        "the normalised commands from step to step.\n"
+        "\nA throw starts in hover with the payload near z = 0.95 m. The landing error is the horizontal distance\n"
+        "from the target, the duration counts from the policy's start to the landing, smoothness is the root mean\n"
+        "square change of the normalised commands from step to step.\n"
     )
     parser.add_argument(
         "policies", metavar="POLICY", nargs="*", help="shipped names or policy files (default: state vision)"
@@ -33,8 +33,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--throws", type=int, default=200, metavar="N", help="for each policy and target (default: 200)"
     )
-    parser.add_argument("--plant", default="hybrid", metavar="NAME", help="hybrid (the training simulator, with all its noise), "
-                        "reference, or reference-realistic")  # fmt: skip
+    plants = "hybrid (the training simulator, with all its noise), reference, or reference-realistic"
+    parser.add_argument("--plant", default="hybrid", metavar="NAME", help=plants)
     parser.add_argument("--seed", type=int, default=0, help="of starts and noise (default: 0)")
     parser.add_argument("--config", metavar="NAME", help="fly in this train config instead of each policy's own")
     parser.add_argument(
@@ -121,7 +121,7 @@ def title_of(plant: str, seed: int) -> str:
     meaning = {
         "hybrid": "the training simulator with all its noise and randomisation",
         "reference": "the reference plant (MuJoCo) without extras: ideal measurements, still air",
-        "reference-realistic": "the reference plant (MuJoCo) with the pinned wind, drag, stretch, build errors and mocap noise",
+        "reference-realistic": "the reference plant (MuJoCo) with pinned wind, drag, build errors and mocap noise",
     }[plant]
     return f"Throws from hover on {meaning} (`{plant}`, seed {seed})"
 

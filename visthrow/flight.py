@@ -20,6 +20,9 @@ HOVER_LEAST, HOVER_MOST = 1.5, 6.0  # time in hover before the throw [s]
 QUIET_OFFSET, QUIET_SPEED = 0.03, 0.12  # vehicle off its hover point [m]; payload against the world [m/s]
 QUIET_TIME = 0.4  # for which it must last [s]
 RECOVERY_MOST = 8.0  # [s]
+ROPE_ON_GROUND = (
+    0.003  # height at which the rope is drawn where it would pass through the ground; no plant knows it [m]
+)
 MEASURED = ("pos_w", "quat_wb", "vel_w", "rate_b", "payload_pos_w")
 """Channels that are recorded a second time as measured, under ``measured_<name>``."""
 
@@ -74,13 +77,14 @@ class _Recording:
         )
         values = {name: getattr(now, name)[0] for name in names}
         values["cable_points_w"] = self._rope(now)
+        values["cable_points_w"][:, 2] = np.maximum(values["cable_points_w"][:, 2], ROPE_ON_GROUND)
         self.recorder.add(now.time, **values, **{f"measured_{name}": getattr(measured, name)[0] for name in MEASURED})
         self._before = now
 
     def _rope(self, now: Snapshot) -> np.ndarray:
         """Rope now; after the landing it sinks to the ground instead of standing still as the plants leave it."""
         if not self.plant.landing.landed[0]:
-            return now.cable_points_w[0]
+            return now.cable_points_w[0].copy()
         before, period = self._before, self.plant.period
         if self._resting is None:
             age = max(self.plant.landing.time[0] - before.time, 1e-3)
@@ -89,7 +93,7 @@ class _Recording:
             self._resting = LooseRope(points, np.clip(speed, -20.0, 20.0), ball, np.zeros(3))
             period = now.time - self.plant.landing.time[0]
         if period > 1e-6:
-            self._resting.sink(period, 0.003 - now.payload_pos_w[0, 2])
+            self._resting.sink(period, ROPE_ON_GROUND - now.payload_pos_w[0, 2])
         return self._resting.points_w(now.payload_pos_w[0])
 
 
@@ -109,7 +113,7 @@ def fly(
         device: of the training simulator.
 
     Returns:
-        The flight with all standard channels; ``meta["result"]`` says how it ended, ``meta["times"]`` when what happened.
+        The flight with all standard channels; ``meta["result"]`` says how it ended, ``meta["times"]`` when.
 
     Raises:
         ConfigError: the goal is not a point in reach of the vehicle's bounds.
@@ -146,8 +150,8 @@ def check_goal(loaded: Loaded, goal_w: np.ndarray) -> None:
     trained = loaded.experiment.task.start.goal_radius
     if distance > limit:
         raise ConfigError(
-            f"the goal lies {distance:g} m away; the vehicle may not leave {limit:g} m, and '{loaded.name}' was trained "
-            f"on goals within {trained:g} m"
+            f"the goal lies {distance:g} m away; the vehicle may not leave {limit:g} m, and '{loaded.name}' was "
+            f"trained on goals within {trained:g} m"
         )
 
 

@@ -21,7 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "  visthrow fly --policy state --target 1.5\n"
         "  visthrow fly --target 1.2 0.8                  a target 1.2 m ahead and 0.8 m to the left\n"
         "  visthrow fly --plant reference-realistic       on the stand-in for a real vehicle (about a minute)\n"
-        "\nThe vehicle hovers until the swing is quiet, the policy throws, and the hover controller brings the vehicle back.\n"
+        "\nThe vehicle hovers until the swing is quiet, the policy throws, the hover controller brings it back.\n"
     )
     parser.add_argument(
         "--policy", default="vision", metavar="POLICY", help="a shipped name or a policy file (default: vision)"
@@ -34,8 +34,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="M",
         help="distance ahead, or x and y [m] (default: 2.0)",
     )
-    parser.add_argument("--plant", default="hybrid", metavar="NAME", help="hybrid (the training simulator, the default), reference, or "
-                        "reference-realistic")  # fmt: skip
+    plants = "hybrid (the training simulator, the default), reference, or reference-realistic"
+    parser.add_argument("--plant", default="hybrid", metavar="NAME", help=plants)
     parser.add_argument("--seed", type=int, default=0, help="of start, measurements and plant (default: 0)")
     parser.add_argument("--config", metavar="NAME", help="fly in this train config instead of the policy's own")
     parser.add_argument("--out", default="out/fly", metavar="FOLDER", help="for the files (default: out/fly)")
@@ -86,21 +86,22 @@ def story(log) -> str:
     """What happened, in a few lines."""
     times, result, goal = log.meta["times"], log.meta["result"], log.meta["goal_w"]
     start = times["policy_start"]
+    plant = f"{log.meta['plant_meaning']} (plant {log.meta['plant']}, seed {log.meta['seed']})"
     lines = [
-        f"policy '{log.meta['policy']}' on {log.meta['plant_meaning']} (plant {log.meta['plant']}, seed {log.meta['seed']})",
+        f"policy '{log.meta['policy']}' on {plant}",
         f"hover   {start:.2f} s until the swing was quiet",
     ]
     if "separation" in times:
         at = log["separation"].values[0]
         lines.append(
-            f"throw   release asked for {times['latch'] - start:.2f} s and done {times['separation'] - start:.2f} s after the "
-            f"start, payload at x {at[0]:.2f} m, z {at[2]:.2f} m"
+            f"throw   release asked for {times['latch'] - start:.2f} s and done {times['separation'] - start:.2f} s "
+            f"after the start, payload at x {at[0]:.2f} m, z {at[2]:.2f} m"
         )
     if "landing" in log:
         x, y, _ = log["landing"].values[0]
         lines.append(
-            f"landing at x {x:.3f} m, y {y:+.3f} m: {result['error']:.3f} m from the target ({goal[0]:g}, {goal[1]:g}), "
-            f"{result['duration']:.2f} s after the start"
+            f"landing at x {x:.3f} m, y {y:+.3f} m: {result['error']:.3f} m from the target "
+            f"({goal[0]:g}, {goal[1]:g}), {result['duration']:.2f} s after the start"
         )
     if result["failure"]:
         lines.append(f"failed: {result['failure']}")

@@ -1,10 +1,12 @@
 """The rope after the release, for drawing: it flies with the ball, and sinks to the ground once the ball lies there.
 
-The training simulator's landing is that of a lone ball in closed form, so here the ball is not pulled by the rope's 4 g:
-the joints are equal point masses on rigid links, the last link ends in the ball. Positions are kept from the ball, in
-whose free-falling frame gravity vanishes. The reference plant has its own rope in flight; only the sinking is drawn here.
+The training simulator's landing is that of a lone ball in closed form, so here the ball is not pulled by the rope's
+4 g: the joints are equal point masses on rigid links, the last link ends in the ball. Positions are kept from the ball,
+in whose free-falling frame gravity vanishes. The reference plant has its own rope in flight; of it only the sinking is
+drawn here.
 
-Source: Verlet steps with all links solved for at once (SHAKE; Ryckaert, Ciccotti, Berendsen, J. Comput. Phys. 23, 1977).
+Source: Verlet steps with all links solved for at once (SHAKE; Ryckaert, Ciccotti, Berendsen, J. Comput. Phys. 23,
+1977).
 """
 
 import numpy as np
@@ -55,7 +57,7 @@ class LooseRope:
         """Fall and come to rest while the ball lies still.
 
         From the ball outwards each joint goes to its link's length from the one before (Mueller, Kim, Chentanez, Fast
-        simulation of inextensible hair and fur, 2012): not accurate, but it rests on the ground whatever it starts from.
+        simulation of inextensible hair and fur, 2012): not accurate, but it rests on the ground wherever it starts.
 
         Args:
             duration: [s].
@@ -97,7 +99,7 @@ class LooseRope:
 
 
 def _on_link(joint: np.ndarray, end: np.ndarray, length: float, ground: float) -> np.ndarray:
-    """Put a joint to ``length`` from the link's other end, above the ground; all from the ball's centre [m], shape (3,)."""
+    """Put a joint to ``length`` from the link's other end, above the ground; all from the ball's centre [m]."""
     away = joint - end
     away *= length / max(float(np.linalg.norm(away)), 1e-9)
     lowest = max(ground - end[2], -length)

@@ -50,7 +50,8 @@ class Pilot:
     """Flies E vehicles with one policy; remembers the previous action and the payload's history.
 
     Attributes:
-        policy: the policy. layout: of its observation. period: between two calls [s]. lag: from latch to separation [s].
+        policy: the policy. layout: of its observation. period: between two calls [s].
+        lag: from latch to separation [s].
         camera: None where the policy looks at none and no camera was given.
     """
 

@@ -167,8 +167,8 @@ class HybridPlant:
         body = {name: sim.get(name).astype(float) for name in ("pos_w", "quat_wb", "vel_w", "rate_b", "motor_speed")}
         return Snapshot(
             self.time, payload_pos_w=ball, payload_vel_w=ball_vel, cable_points_w=points,
-            battery_voltage=sim.get("voltage").astype(float), attached=sim.get("attached") != 0, latched=self._latched.copy(),
-            **body,
+            battery_voltage=sim.get("voltage").astype(float), attached=sim.get("attached") != 0,
+            latched=self._latched.copy(), **body,
         )  # fmt: skip
 
     def measured(self) -> Snapshot:

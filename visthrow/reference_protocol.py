@@ -2,8 +2,8 @@
 
 Each throw hovers first under the hover controller, so that battery, integrals and swing are those of a hover, and sees
 the plant's own measurements. Keypoints come from measured poses, as in the paper's hardware-in-the-loop tests. Throws
-fly in batches of :data:`BATCH`, each with a seed of its own made of seed, target and number of the batch: results do not
-depend on the number of processes, and every policy meets the same vehicles, winds and starts.
+fly in batches of :data:`BATCH`, each with a seed of its own made of seed, target and number of the batch: results do
+not depend on the number of processes, and every policy meets the same vehicles, winds and starts.
 """
 
 import math

@@ -105,9 +105,8 @@ def _vehicle(stream: rr.RecordingStream, log: FlightLog, experiment: Experiment)
     hub_size = [[0.028, 0.018, 0.014]]
     stream.log("world/vehicle/body", rr.Boxes3D(half_sizes=hub_size, colors=[dark], fill_mode="solid"), static=True)
     discs = rr.Ellipsoids3D(
-        centers=hubs + [0, 0, 0.008], half_sizes=[[rotors.radius, rotors.radius, 0.002]] * 4,
-        colors=[_colour(style.COLOURS[0])] * 2 + [_colour("#9AA5B1")] * 2 if hubs[0, 0] > 0 else [_colour("#9AA5B1")] * 4,
-        fill_mode="solid",
+        centers=hubs + [0, 0, 0.008], half_sizes=[[rotors.radius, rotors.radius, 0.002]] * 4, fill_mode="solid",
+        colors=[_colour(style.COLOURS[0] if hub[0] > 0 else "#9AA5B1") for hub in hubs],  # the front ones stand out
     )  # fmt: skip
     stream.log("world/vehicle/rotors", discs, static=True)
     pose = rr.Transform3D.columns(translation=log["pos_w"].values, quaternion=log["quat_wb"].values)

@@ -34,7 +34,7 @@ def draw(path: str | Path, throws: Sequence[tuple[str, Sequence]], subtitle: str
     half = _half_width(throws)
     size = 3.1
     figure, axes = plt.subplots(
-        1, len(targets), figsize=(max(size * len(targets), 6.2) + 0.5, size + 1.35), squeeze=False
+        1, len(targets), figsize=(max(size * len(targets), 5.2) + 0.5, size + 1.35), squeeze=False
     )
     for column, (axis, target) in enumerate(zip(axes[0], targets)):
         _goal(axis, half)
@@ -70,8 +70,8 @@ def _goal(axis, half: float) -> None:
         if radius < half:
             axis.add_patch(Circle((0, 0), radius, fill=False, color=style.QUIET, lw=0.9, ls=(0, (4, 3)), zorder=1))
             axis.annotate(
-                f"{radius:g} m", (radius * 0.7071, -radius * 0.7071), xytext=(2, -2), textcoords="offset points", color=style.QUIET,
-                fontsize=8, ha="left", va="top", zorder=5,
+                f"{radius:g} m", (radius * 0.7071, -radius * 0.7071), xytext=(2, -2), textcoords="offset points",
+                color=style.QUIET, fontsize=8, ha="left", va="top", zorder=5,
             )  # fmt: skip
     axis.plot(0, 0, "+", color=style.INK, ms=13, mew=1.6, zorder=4)
     axis.grid(True, zorder=0)
@@ -85,17 +85,8 @@ def _points(axis, of, index: int, half: float, label: str | None) -> None:
     inside = np.all(shown == good, axis=1)
     colour, marker = style.COLOURS[index % len(style.COLOURS)], style.MARKERS[index % len(style.MARKERS)]
     alpha = 0.75 if len(good) <= 60 else 0.5
-    axis.scatter(
-        -good[inside, 1], good[inside, 0], s=20, marker=marker, color=colour, alpha=alpha, lw=0.3, edgecolor="white", zorder=3,
-        label=label,
-    )  # fmt: skip
-    axis.scatter(
-        -shown[~inside, 1],
-        shown[~inside, 0],
-        s=24,
-        marker=marker,
-        facecolor="none",
-        edgecolor=colour,
-        zorder=3,
-        clip_on=False,
-    )
+    common = {"marker": marker, "zorder": 3}
+    filled = {"s": 20, "color": colour, "alpha": alpha, "lw": 0.3, "edgecolor": "white", "label": label}
+    hollow = {"s": 24, "facecolor": "none", "edgecolor": colour, "clip_on": False}
+    axis.scatter(-good[inside, 1], good[inside, 0], **common, **filled)
+    axis.scatter(-shown[~inside, 1], shown[~inside, 0], **common, **hollow)

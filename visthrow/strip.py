@@ -1,11 +1,13 @@
 """The picture of one throw: the paper's strip of side views, and what the camera saw at the same instants."""
 
+import dataclasses
 import io
 from pathlib import Path
 
 import numpy as np
+import torch
 
-from camera.keypoints import KeypointCamera
+from camera.keypoints import GOAL_KEYPOINTS, KeypointCamera, keypoints
 from camera.overlay import draw_overlay
 from camera.params import CameraParams
 from visthrow import style
@@ -18,6 +20,7 @@ MARGIN = 0.35  # about what is seen [m]
 ARM = 0.097  # half the motor-to-motor diagonal, for drawing only [m]
 ROTOR = 0.0381  # propeller radius, for drawing only [m]
 BLADE_HEIGHT = 0.018  # of the rotor plane, for drawing only [m]
+PIXELS = 480  # of the camera's picture as drawn
 GHOST_EVERY = 0.06  # between the faint earlier poses [s]
 
 
@@ -58,20 +61,20 @@ def draw(path: str | Path, log: FlightLog, camera: CameraParams) -> None:
     import matplotlib.pyplot as plt
 
     side = _bounds(log)
-    figure = plt.figure(figsize=(13.6, 7.4))
-    grid = figure.add_gridspec(
-        2, 4, height_ratios=(1.0, 1.05), left=0.045, right=0.992, top=0.865, bottom=0.03, wspace=0.06, hspace=0.2
-    )
-    lens = KeypointCamera(camera)
+    figure = plt.figure(figsize=(13.6, 7.7))
+    grid = figure.add_gridspec(2, 4, height_ratios=(1.0, 1.0), left=0.045, right=0.992, top=0.85, bottom=0.012)
+    grid.update(wspace=0.06, hspace=0.33)
+    lens = KeypointCamera(drawn_larger(camera))
     for column, (caption, time) in enumerate(views):
         axis = figure.add_subplot(grid[0, column])
         _side_view(axis, log, time, side, column)
-        axis.set_title(f"{'abcd'[column]}) {caption}   t = {time - views[0][1]:.2f} s", loc="left")
-        below = figure.add_subplot(grid[1, column])
-        below.imshow(_camera_view(log, lens, time), interpolation="antialiased")
-        below.set_axis_off()
-    figure.suptitle(_headline(log), x=0.045, y=0.965, ha="left", fontsize=12.5, fontweight="bold")
-    figure.text(0.045, 0.912, _subline(log), ha="left", fontsize=10, color=style.QUIET)
+        axis.set_title(f"({'abcd'[column]})  {caption},  t = {time - views[0][1]:.2f} s", loc="left")
+        _camera_view(figure.add_subplot(grid[1, column]), log, lens, time, first=column == 0)
+    figure.suptitle(_headline(log), x=0.045, y=0.97, ha="left", fontsize=13.5, fontweight="bold")
+    figure.text(0.045, 0.908, _subline(log), ha="left", fontsize=10.5, color=style.QUIET)
+    field = f"{camera.fisheye.fov_deg:g}°"
+    note = f"The same instants on the fisheye image ({field}): corners of the target square, box of the ball"
+    figure.text(0.045, 0.408, note, ha="left", fontsize=10.5, color=style.QUIET)
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png")
     plt.close(figure)
@@ -81,16 +84,31 @@ def draw(path: str | Path, log: FlightLog, camera: CameraParams) -> None:
 def _headline(log: FlightLog) -> str:
     result, goal = log.meta["result"], log.meta["goal_w"]
     return (
-        f"A throw at {np.hypot(goal[0], goal[1]):.1f} m by the {log.meta['policy']} policy: landed "
-        f"{100 * result['error']:.1f} cm from the target, {result['duration']:.2f} s after the start"
+        f"{log.meta['policy'].capitalize()} policy, target {np.hypot(goal[0], goal[1]):.1f} m: the ball lands "
+        f"{100 * result['error']:.1f} cm from it, {result['duration']:.2f} s after the start"
     )
 
 
 def _subline(log: FlightLog) -> str:
-    return (
-        f"Simulated on {log.meta['plant_meaning'].split(' with ')[0]}. Above: seen from the side, with the ball's path. Below: "
-        "keypoints on the fisheye image, target green, payload red; crosses lie outside the field of view (220°)."
+    plant = log.meta["plant_meaning"].split(" with ")[0]
+    drawn = f"Faint: the vehicle every {GHOST_EVERY:g} s. Dashed: the ball in free flight."
+    return f"Simulated on {plant}, seen from the side. {drawn}"
+
+
+def drawn_larger(camera: CameraParams) -> CameraParams:
+    """The same lens on fewer pixels, on which the overlay's strokes are thicker."""
+    lens = camera.fisheye
+    scale = PIXELS / max(lens.width, lens.height)
+    fewer = dataclasses.replace(
+        lens,
+        width=round(scale * lens.width),
+        height=round(scale * lens.height),
+        fx=scale * lens.fx,
+        fy=scale * lens.fy,
+        cx=scale * (lens.cx + 0.5) - 0.5,
+        cy=scale * (lens.cy + 0.5) - 0.5,
     )
+    return dataclasses.replace(camera, fisheye=fewer)
 
 
 def _bounds(log: FlightLog) -> tuple[float, float, float]:
@@ -125,13 +143,14 @@ def _side_view(axis, log: FlightLog, time: float, side: tuple[float, float, floa
         axis.tick_params(labelleft=False)
     else:
         axis.set_ylabel("height [m]")
+        axis.set_xlabel("distance ahead [m]")
         axis.annotate(
             "target",
-            (goal[0], -0.03),
-            xytext=(0, -4),
+            (goal[0], 0.0),
+            xytext=(0, 6),
             textcoords="offset points",
             ha="center",
-            va="top",
+            va="bottom",
             color=style.GOAL,
             fontsize=9,
         )
@@ -171,11 +190,8 @@ def _vehicle(axis, log: FlightLog, time: float, alpha: float) -> None:
             axis.plot([ends[0][0], ends[1][0]], [ends[0][2], ends[1][2]], lw=1.8, **line)
 
 
-def _camera_view(log: FlightLog, camera: KeypointCamera, time: float) -> np.ndarray:
-    """Keypoints of the true poses at a time on the image plane, RGB, cut to the circle's square."""
-    import torch
-
-    from camera.keypoints import keypoints
+def _camera_view(axis, log: FlightLog, camera: KeypointCamera, time: float, first: bool) -> None:
+    """Keypoints of the true poses at a time on the image plane; names in the first view."""
 
     def one(name: str) -> torch.Tensor:
         return torch.tensor(_at(log, name, time)[None], dtype=torch.float32)
@@ -184,4 +200,23 @@ def _camera_view(log: FlightLog, camera: KeypointCamera, time: float) -> np.ndar
     goal = torch.tensor([log.meta["goal_w"]], dtype=torch.float32)
     points, valid = keypoints(camera, one("pos_w"), rot, goal, one("payload_pos_w"))
     picture = draw_overlay(camera, points[0], valid[0])[:, :, ::-1]
-    return np.ascontiguousarray(picture)
+    lens = camera.fisheye
+    from matplotlib.patches import Ellipse
+
+    size = (2.0 * lens.params.fx * lens.edge_radius, 2.0 * lens.params.fy * lens.edge_radius)
+    circle = Ellipse((lens.params.cx, lens.params.cy), *size, transform=axis.transData)
+    axis.imshow(picture, interpolation="antialiased").set_clip_path(circle)
+    axis.set_axis_off()
+    if not first:
+        return
+    pixels = lens.denormalize(points[0].double()).numpy()
+    for name, part in (("target", slice(0, GOAL_KEYPOINTS)), ("ball", slice(GOAL_KEYPOINTS, None))):
+        right, middle = pixels[part, 0].max(), pixels[part, 1].mean()
+        axis.annotate(
+            name, (right, middle), xytext=(7, 0), textcoords="offset points", color="white", va="center", fontsize=9
+        )  # fmt: skip
+    quarter = float(lens.radius_from_angle(torch.tensor(np.pi / 2))) * lens.params.fy
+    axis.annotate(
+        "90° off the axis", (lens.params.cx, lens.params.cy + quarter), xytext=(0, 4), textcoords="offset points",
+        color="#B5B5B5", ha="center", va="bottom", fontsize=8,
+    )  # fmt: skip

@@ -13,7 +13,7 @@ PAPER = {
     ("vision", 1.5): (0.101, 0.058, 1.051, 0.011),
     ("vision", 2.0): (0.101, 0.106, 1.125, 0.029),
 }
-"""Layout and target -> landing error [m] and duration [s], mean and deviation, of the paper's vehicle (ten throws each)."""
+"""Layout and target -> landing error [m] and duration [s], mean and deviation: the paper's vehicle, ten throws each."""
 
 PAPER_NOTE = (
     "The paper's figures are ten throws a target of a real vehicle; ours are simulated. No vehicle was flown for this "
@@ -21,8 +21,8 @@ PAPER_NOTE = (
 )
 
 COLUMNS = (
-    "policy", "target [m]", "throws", "landing error [m]", "duration [s]", "released and landed", "bias x / y [m]", "smoothness",
-    "paper, real vehicle: error [m], duration [s]",
+    "policy", "target [m]", "throws", "landing error [m]", "duration [s]", "landed", "bias x / y [m]", "smoothness",
+    "paper's vehicle: error [m], duration [s]",
 )  # fmt: skip
 
 
@@ -53,9 +53,13 @@ def _cells(row: dict) -> tuple[str, ...]:
     if not row["success"]:
         return (*head, "-", "-", success, "-", "-", beside)
     return (
-        *head, f"{row['error_mean']:.3f} ± {row['error_std']:.3f}", f"{row['duration_mean']:.3f} ± {row['duration_std']:.3f}",
-        success, f"{row['bias_x']:+.3f} / {row['bias_y']:+.3f}", f"{row['smoothness']:.3f}", beside,
+        *head, _spread(row, "error"), _spread(row, "duration"), success,
+        f"{row['bias_x']:+.3f} / {row['bias_y']:+.3f}", f"{row['smoothness']:.3f}", beside,
     )  # fmt: skip
+
+
+def _spread(row: dict, name: str) -> str:
+    return f"{row[f'{name}_mean']:.3f} ± {row[f'{name}_std']:.3f}"
 
 
 def csv_text(throws: Sequence[tuple[str, str, object]]) -> str:
