@@ -25,6 +25,10 @@ RESULTS = ("episodes", "released", "landing_error", "duration", "steps", "cleara
 """Sums over finished episodes; landing error [m], duration [s] and lost clearance over the released ones."""
 
 
+POSE = ob.VEHICLE + 3
+"""Width of a pose sample: vehicle's part of a frame and the payload's position."""
+
+
 class ThrowEnv(VecEnv):
     """Batch of throws. Observation groups: ``actor`` and ``critic``.
 
@@ -73,6 +77,8 @@ class ThrowEnv(VecEnv):
             "keypoint_bias": torch.zeros(E, KEYPOINTS, 2, **make),
             "extrinsic_rotation": torch.zeros(E, 3, **make),
             "extrinsic_offset": torch.zeros(E, 3, **make),
+            "pose_age": torch.zeros(E, **make),
+            "last_pose": torch.zeros(E, POSE, **make),
             "late_points": torch.zeros(E, latency, KEYPOINTS, 2, **make),
             "late_valid": torch.zeros(E, latency, KEYPOINTS, device=device, dtype=torch.bool),
             "totals": torch.zeros(len(RESULTS), device=device, dtype=torch.float64),
@@ -205,6 +211,20 @@ class ThrowEnv(VecEnv):
                 old = memory[name]
                 mask = fresh.view(-1, *(1,) * (old.dim() - 1))
                 old.copy_(torch.where(mask, torch.randn_like(old) * std, old))
+        low, high = self.cfg.task.observation.latency
+        if high > 0.0:
+            age = memory["pose_age"]
+            age.copy_(torch.where(fresh, low + (high - low) * torch.rand_like(age), age))
+
+    def _late(self, pose: Tensor, fresh: Tensor) -> Tensor:
+        """Pose sample as old as the episode's latency, linear between the last two control steps."""
+        memory = self._memory
+        if self.cfg.task.observation.latency[1] == 0.0:
+            return pose
+        last = torch.where(fresh[:, None], pose, memory["last_pose"])
+        late = pose + (last - pose) * (memory["pose_age"] / self.cfg.sim.control_period)[:, None]
+        memory["last_pose"].copy_(pose)
+        return late
 
     def _observe(self, fresh: Tensor) -> TensorDict:
         """Actor's and critic's view of the current state."""
@@ -214,10 +234,15 @@ class ThrowEnv(VecEnv):
         vehicle = ob.vehicle_part(state["pos_w"], state["vel_w"], state["rate_b"], rot_wb)
         exact = torch.cat([vehicle, ob.state_part(state["pos_w"], goal, payload)], dim=-1)
         attached = state["attached"].to(torch.float32)
-        measured = exact + torch.randn_like(exact) * noise.observation_step + memory["frame_bias"]
+        pose = self._late(torch.cat([vehicle, payload], dim=-1), fresh)
+        seen = torch.cat([pose[:, : ob.VEHICLE], ob.state_part(pose[:, :3], goal, pose[:, ob.VEHICLE :])], dim=-1)
+        measured = seen + torch.randn_like(seen) * noise.observation_step + memory["frame_bias"]
         valid = None
         if self.layout.name == "vision":
-            points, valid = self._see(rot_wb, fresh)
+            if self.cfg.task.observation.latency[1] > 0.0:
+                x_axis, y_axis = pose[:, 9:12], pose[:, 12:15]
+                rot_wb = torch.stack([x_axis, y_axis, torch.linalg.cross(x_axis, y_axis)], dim=-1)
+            points, valid = self._see(pose[:, :3], rot_wb, pose[:, ob.VEHICLE :], fresh)
             measured = torch.cat([measured[:, : ob.VEHICLE], points.flatten(1)], dim=-1)
         actor, history = ob.observe(self.layout, measured, valid, memory["previous"], attached, memory["history"], fresh)
         memory["history"].copy_(history)
@@ -231,14 +256,14 @@ class ThrowEnv(VecEnv):
         )
         return TensorDict({"actor": actor, "critic": critic}, batch_size=[self.num_envs], device=self.device)
 
-    def _see(self, rot_wb: Tensor, fresh: Tensor) -> tuple[Tensor, Tensor]:
+    def _see(self, pos_w: Tensor, rot_wb: Tensor, payload_w: Tensor, fresh: Tensor) -> tuple[Tensor, Tensor]:
         """Keypoints as the detector reports them: extrinsic error, latency, noise, drop-out."""
         memory, camera = self._memory, self.cfg.camera
         extrinsics = None
         if camera.mount.rotation_error_std > 0.0 or camera.mount.position_error_std > 0.0:
             extrinsics = self.camera.extrinsics(memory["extrinsic_rotation"], memory["extrinsic_offset"])
         points, valid = ob.vision_part(
-            self.camera, self.views.state["pos_w"], rot_wb, self.views.goal_w, self.views.out["payload_pos_w"], extrinsics
+            self.camera, pos_w, rot_wb, self.views.goal_w, payload_w, extrinsics
         )
         if camera.noise.latency > 0.0:
             memory["late_points"].copy_(hist.push(memory["late_points"], points, fresh))

@@ -27,6 +27,7 @@ class ObservationParams:
     layout: Literal["state", "vision"]
     history: int  # earlier payload measurements beside the current one
     validity: bool  # vision: whether the actor is told which keypoints are valid
+    latency: tuple[float, float]  # age of all that is measured, drawn per episode from this range [s]
 
 
 @dataclass(frozen=True)
@@ -123,6 +124,12 @@ class Experiment:
             raise ConfigError(
                 f"ppo: {self.ppo.environments} environments, {self.ppo.steps} steps, {self.ppo.iterations} iterations; "
                 "expected 1 or more of each"
+            )
+        low, high = self.task.observation.latency
+        if not 0.0 <= low <= high <= self.sim.control_period:
+            raise ConfigError(
+                f"task.observation.latency is {low} to {high} s; expected an ascending range within one control period "
+                f"of {self.sim.control_period} s"
             )
         if abs(self.camera.payload_radius - self.rope.payload_radius) > 1e-9:
             raise ConfigError(
