@@ -120,7 +120,7 @@ def title_of(plant: str, seed: int) -> str:
     """Heading of a table: which plant, which noise, which seed."""
     meaning = {
         "hybrid": "the training simulator with all its noise and randomisation",
-        "reference": "the reference plant (MuJoCo) without extras: ideal measurements, still air",
+        "reference": "the reference plant (MuJoCo) without extras: measurements late but exact, still air",
         "reference-realistic": "the reference plant (MuJoCo) with pinned wind, drag, build errors and mocap noise",
     }[plant]
     return f"Throws from hover on {meaning} (`{plant}`, seed {seed})"

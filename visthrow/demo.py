@@ -29,6 +29,7 @@ def run(args: argparse.Namespace) -> int:
     import importlib.util
 
     from visthrow.loading import load_policy
+    from visthrow.tables import PAPER_NOTE
 
     begin = time.perf_counter()
     loaded = [load_policy(name) for name in POLICIES]
@@ -49,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
                 flush=True,
             )
             paths += _told(loaded, throwing.results(), "reference-realistic", folder)
-    print("Files:")
+    print(PAPER_NOTE + "\n\nFiles:")
     for path in paths:
         print(f"  {path}")
     print(f"\nAll of it took {time.perf_counter() - begin:.0f} s.")
@@ -70,6 +71,8 @@ def _here(loaded: list, folder: Path) -> list[Path]:
 
 def _told(loaded: list, throws: list, plant: str, folder: Path) -> list[Path]:
     """Print the table and write it with its plot."""
+    from visthrow.tables import markdown
+
     title, rows = compare.title_of(plant, SEED), compare.rows_of(loaded, POLICIES, throws)
-    print(compare.report(title, rows), flush=True)
+    print(markdown(rows, title), flush=True)
     return compare.write(folder, list(zip(POLICIES, throws)), rows, plant, title)

@@ -84,6 +84,7 @@ class HybridPlant:
         seed: int = 0,
         device: str = "cpu",
         noise: NoiseParams | None = None,
+        latency: tuple[float, float] = (0.0, 0.0),
     ) -> None:
         """Build the simulator.
 
@@ -93,10 +94,11 @@ class HybridPlant:
             seed: of the measurements' noise.
             device: "cpu" or "cuda:0".
             noise: of the measurements, in each quantity's SI unit as in training; None for none.
+            latency: range that each vehicle's age of measurements is drawn from at a reset [s].
         """
         from sim.hybrid import HybridSim
 
-        self.params, self.count, self.noise = plant_of(experiment), count, noise
+        self.params, self.count, self.noise, self.latency = plant_of(experiment), count, noise, latency
         self.period = self.params.sim.control_period
         self._sim = HybridSim(self.params, count, device)
         self._rng = np.random.default_rng(seed)
@@ -111,10 +113,13 @@ class HybridPlant:
         self._ropes: list[LooseRope | None] = [None] * count
         bias = 0.0 if self.noise is None else self.noise.observation_bias
         self._bias = bias * self._rng.standard_normal((5, count, 3))
+        self._age = self._rng.uniform(*self.latency, count)
+        self._before = self.state
 
     def step(self, command: np.ndarray, release: np.ndarray | bool = False) -> None:
         """See `Plant`."""
         release = np.broadcast_to(np.asarray(release, dtype=bool), (self.count,))
+        self._before = self.state
         self._sim.set_command(command, release)
         self._sim.step()
         self._latched = self._latched | release
@@ -172,8 +177,8 @@ class HybridPlant:
         )  # fmt: skip
 
     def measured(self) -> Snapshot:
-        """The truth with the training's observation noise on position, velocity, rate, attitude [rad] and payload."""
-        now = self.state
+        """The truth, late and with the training's observation noise, which on the attitude is an angle [rad]."""
+        now = _late(self._before, self.state, self._age / self.period)
         if self.noise is None:
             return now
         error = self._bias + self.noise.observation_step * self._rng.standard_normal((5, self.count, 3))
@@ -193,7 +198,7 @@ class HybridPlant:
 
 
 class ReferenceAdapter:
-    """The reference plant, with or without the pinned extras."""
+    """The reference plant, with the pinned extras or with none but the latency that the policy was trained for."""
 
     def __init__(self, experiment: Experiment, count: int = 1, seed: int = 0, realistic: bool = True) -> None:
         """Build the plant.
@@ -207,7 +212,8 @@ class ReferenceAdapter:
         from sim.reference.extras import ReferenceExtras, load_extras
         from sim.reference.plant import ReferencePlant
 
-        extras = load_extras(config.find("vehicle", "reference_realistic")) if realistic else ReferenceExtras()
+        trained = ReferenceExtras(mocap_latency=float(np.mean(experiment.task.observation.latency)))
+        extras = load_extras(config.find("vehicle", "reference_realistic")) if realistic else trained
         self.name = "reference-realistic" if realistic else "reference"
         self.params, self.count = plant_of(experiment), count
         self.period = self.params.sim.control_period
@@ -245,16 +251,27 @@ class ReferenceAdapter:
 
 
 def make_plant(name: str, experiment: Experiment, count: int = 1, seed: int = 0, device: str = "cpu") -> Plant:
-    """Build a plant by its name in :data:`PLANTS`; the training simulator with the task's observation noise.
+    """Build a plant by its name in :data:`PLANTS`; the training simulator with the task's noise and latency.
 
     Raises:
         ConfigError: no plant of that name.
     """
     if name == "hybrid":
-        return HybridPlant(experiment, count, seed, device, experiment.task.noise)
+        return HybridPlant(experiment, count, seed, device, experiment.task.noise, experiment.task.observation.latency)
     if name in PLANTS:
         return ReferenceAdapter(experiment, count, seed, realistic=name == "reference-realistic")
     raise ConfigError(f"no plant '{name}'; {suggest(name, PLANTS)}")
+
+
+def _late(before: Snapshot, now: Snapshot, share: np.ndarray) -> Snapshot:
+    """What is measured, linear from now (0) to one control period ago (1); share: shape (E,)."""
+    if not np.any(share):
+        return now
+    names = ("pos_w", "quat_wb", "vel_w", "rate_b", "payload_pos_w", "payload_vel_w")
+    late = {name: getattr(now, name) for name in names}
+    late = {name: value + share[:, None] * (getattr(before, name) - value) for name, value in late.items()}
+    late["quat_wb"] /= np.linalg.norm(late["quat_wb"], axis=1, keepdims=True)
+    return replace(now, **late)
 
 
 def _quat_times_vector(quat: np.ndarray, vector: np.ndarray) -> np.ndarray:

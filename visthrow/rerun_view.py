@@ -228,7 +228,7 @@ def _blueprint(goal: np.ndarray) -> rrb.Blueprint:
 
     def plot(name: str, *entities: str) -> rrb.TimeSeriesView:
         return rrb.TimeSeriesView(
-            name=name, origin="signals", contents=[f"signals/{e}/**" for e in entities], axis_x=axis,
+            name=name, origin="signals", contents=[f"/signals/{e}/**" for e in entities], axis_x=axis,
             plot_legend=rrb.PlotLegend(visible=True),
         )  # fmt: skip
 

@@ -21,7 +21,7 @@ SLOWEST_CALL = 4e-3
 
 
 def quiet(name: str) -> Experiment:
-    """An experiment without any noise."""
+    """An experiment without any noise or latency."""
     experiment = config.load(Experiment, config.find("train", name))
     noise = dataclasses.replace(
         experiment.task.noise, observation_step=0.0, observation_bias=0.0, command_step=0.0, command_bias=0.0
@@ -33,7 +33,9 @@ def quiet(name: str) -> Experiment:
         ),
         mount=dataclasses.replace(experiment.camera.mount, rotation_error_std=0.0, position_error_std=0.0),
     )
-    return dataclasses.replace(experiment, task=dataclasses.replace(experiment.task, noise=noise), camera=camera)
+    observation = dataclasses.replace(experiment.task.observation, latency=(0.0, 0.0))
+    task = dataclasses.replace(experiment.task, noise=noise, observation=observation)
+    return dataclasses.replace(experiment, task=task, camera=camera)
 
 
 def random_policy(experiment: Experiment, seed: int = 0) -> Policy:

@@ -110,7 +110,7 @@ def test_ball_and_rope_fly_on_from_the_hybrid_plants_release():
 def test_measurements_of_the_hybrid_plant_have_the_tasks_noise():
     experiment = config.load(Experiment, config.find("train", "state"))
     plant = make_plant("hybrid", experiment, 400)
-    truth, seen = plant.state, plant.measured()
+    truth, seen = plant.state, plant.measured()  # right after a reset nothing has moved yet, so nothing is late
     for name in ("pos_w", "vel_w", "rate_b", "payload_pos_w"):
         spread = (getattr(seen, name) - getattr(truth, name)).std()
         assert spread == pytest.approx(experiment.task.noise.observation_step, rel=0.1)
@@ -119,6 +119,19 @@ def test_measurements_of_the_hybrid_plant_have_the_tasks_noise():
     assert angle.mean() == pytest.approx(1.6 * 0.01, rel=0.1)  # mean length of three normal deviates: 1.596
     with pytest.raises(ConfigError, match="did you mean 'hybrid'"):
         make_plant("hybird", experiment)
+
+
+def test_measurements_of_the_hybrid_plant_are_late():
+    experiment = config.load(Experiment, config.find("train", "state"))
+    plant = HybridPlant(experiment, 2, latency=(0.01, 0.01))
+    for _ in range(5):
+        before = plant.state
+        plant.step(np.tile([8.0, 2.0, 0.0, 0.0], (2, 1)))
+    now, seen = plant.state, plant.measured()
+    for name in ("pos_w", "vel_w", "rate_b", "payload_pos_w"):
+        middle = 0.5 * (getattr(before, name) + getattr(now, name))
+        np.testing.assert_allclose(getattr(seen, name), middle, atol=1e-12)
+    np.testing.assert_array_equal(HybridPlant(experiment, 2).measured().pos_w, HybridPlant(experiment, 2).state.pos_w)
 
 
 def test_a_flight_goes_from_hover_to_hover(flown):
