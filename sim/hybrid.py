@@ -6,6 +6,7 @@ import numpy as np
 import warp as wp
 
 from sim import state as st
+from sim.checks import check_numerics, check_release
 from sim.params import GRAVITY, PlantParams, RandomizationParams, RopeParams, VehicleParams
 from sim.quadrotor.queue import queue_depth
 from sim.randomize import build_reset
@@ -78,6 +79,8 @@ class HybridSim:
         """
         if count < 1:
             raise ValueError(f"HybridSim of {count} environments: expected 1 or more")
+        check_numerics(params.sim)
+        check_release(params.release)
         ropes = ropes or [params.rope]
         vehicles = vehicles or [params.vehicle]
         if {r.segments for r in ropes} != {params.rope.segments}:
@@ -174,10 +177,18 @@ class HybridSim:
         wp.launch(self._step.payload, self.count, [self._ropes, self.state, self.out], device=self.device)
 
     def set_command(self, command: np.ndarray, release: np.ndarray | None = None) -> None:
-        """Copy commands [N, rad/s], shape (E, 4), and release requests, shape (E,), to the device."""
-        self.command.assign(np.asarray(command, dtype=self._numpy).reshape(self.count, 4))
+        """Copy commands [N, rad/s], shape (E, 4), and release requests, shape (E,), to the device.
+
+        Raises:
+            ValueError: another shape.
+        """
+        command = np.asarray(command, dtype=self._numpy)
         asked = np.zeros(self.count) if release is None else np.asarray(release)
-        self.release.assign(asked.astype(np.int32).reshape(self.count))
+        for name, value, shape in (("command", command, (self.count, 4)), ("release", asked, (self.count,))):
+            if value.shape != shape:
+                raise ValueError(f"{name} of shape {value.shape}: expected {shape}")
+        self.command.assign(command)
+        self.release.assign(asked.astype(np.int32))
 
     def get(self, name: str) -> np.ndarray:
         """Copy of a state or output array by name, environment first: shape (E, ...) or (E, L, ...)."""

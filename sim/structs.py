@@ -5,7 +5,6 @@ struct of each from its annotations, so a field added there reaches the kernels 
 """
 
 import dataclasses
-import math
 import typing
 from functools import lru_cache
 from types import SimpleNamespace
@@ -14,6 +13,7 @@ import numpy as np
 import warp as wp
 
 from sim import params as P
+from sim.checks import check_rope, check_vehicle
 
 
 def make_struct(name: str, fields: dict[str, type]) -> type:
@@ -113,24 +113,14 @@ def pack_vehicle(t: Types, vehicles: list[P.VehicleParams], kinds: tuple[str, st
         kinds: of the blocks that the kernel was built for.
 
     Raises:
-        ValueError: other kinds of blocks, a mass, inertia or thrust coefficient that is not positive, or a rotor geometry
-            that cannot make a torque about each axis.
+        ValueError: other kinds of blocks, or a vehicle that :func:`sim.checks.check_vehicle` refuses.
     """
     rows = np.zeros(len(vehicles), dtype=t.Vehicle.numpy_dtype())
     for row, vehicle in zip(rows, vehicles, strict=True):
         if kinds_of(vehicle) != kinds:
             raise ValueError(f"vehicle of the kinds {kinds_of(vehicle)} in a batch of {kinds}: expected the same blocks")
-        body = vehicle.body
-        positive = {"body.mass": body.mass, "body.inertia": min(body.inertia), "thrust.k_f": vehicle.thrust.k_f}
-        for name, value in positive.items():
-            if not (math.isfinite(value) and value > 0):
-                raise ValueError(f"{name} {value}: expected a finite, positive value")
+        check_vehicle(vehicle)
         _fill(row, vehicle)
-        if not (np.any(vehicle.rotors.x) and np.any(vehicle.rotors.y)) or abs(sum(vehicle.rotors.spin)) > 0:
-            raise ValueError(
-                f"rotors at x={vehicle.rotors.x}, y={vehicle.rotors.y} with spin {vehicle.rotors.spin}: expected four "
-                "rotors spread along x and y, two turning each way"
-            )
         columns = mixer_columns(vehicle.rotors, vehicle.thrust.torque_ratio)
         for name in ("roll", "pitch", "yaw"):
             row["mixer"][name] = getattr(columns, name)
@@ -150,16 +140,11 @@ def pack_rope(t: Types, ropes: list[P.RopeParams]) -> np.ndarray:
     The last rod carries the payload: its mass, centre and transverse inertia about its upper joint are combined here.
 
     Raises:
-        ValueError: a number of segments outside 1 to 64, or a mass or length that is not positive.
+        ValueError: a rope that :func:`sim.checks.check_rope` refuses.
     """
     rows = np.zeros(len(ropes), dtype=t.Rope.numpy_dtype())
     for row, rope in zip(rows, ropes, strict=True):
-        if not 1 <= rope.segments <= 64:
-            raise ValueError(f"rope of {rope.segments} segments: expected 1 to 64")
-        if min(rope.length, rope.rope_mass, rope.payload_mass) <= 0:
-            raise ValueError(
-                f"rope of length {rope.length} m, mass {rope.rope_mass} kg, payload {rope.payload_mass} kg: expected positive values"
-            )
+        check_rope(rope)
         length, mass = rope.length / rope.segments, rope.rope_mass / rope.segments
         ball = length + rope.payload_offset
         last_mass = mass + rope.payload_mass

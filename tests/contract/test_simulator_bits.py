@@ -1,4 +1,4 @@
-"""Equal bits: alone or in a batch, from a graph or launched, after a masked reset, from one seed, from one parameter."""
+"""Equal bits: alone or in a batch, from a graph or launched, after a masked reset, from one seed or parameter."""
 
 import dataclasses
 

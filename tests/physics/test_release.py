@@ -1,0 +1,188 @@
+"""Release: latch, lag at substep resolution, and what follows from the state at separation, against plain NumPy."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from sim.hybrid import HybridSim
+from sim.params import GRAVITY, PlantParams, QueueParams
+from tests.plants import paper_plant
+from tests.simulators import numerics, random_commands, rotate
+
+CLOCK = 1e-6
+"""Times are sums of float32 periods [s]."""
+SAME_STATE = 1e-12
+"""Two runs in float64 whose substeps are equal up to round-off [m], [m/s]."""
+ROUND_OFF = 2e-5
+"""Of positions of some metres in float32 [m]."""
+PERIOD = 0.02
+
+
+def plant(lag: float, precision: str = "float32", control_period: float = PERIOD, **vehicle) -> PlantParams:
+    base = paper_plant()
+    changed = dataclasses.replace(base.vehicle, **vehicle)
+    release = dataclasses.replace(base.release, lag=lag)
+    return PlantParams(changed, base.rope, release, numerics(precision=precision, control_period=control_period))
+
+
+def thrown(sim: HybridSim, commands: np.ndarray, asked_at: int) -> list[dict]:
+    """Outputs of every step; the release is asked for at one step only."""
+    rows = []
+    for k, command in enumerate(commands):
+        sim.set_command(command, np.full(sim.count, k == asked_at))
+        sim.step()
+        names = ("separated", "attached", "separation_time", "release_timer", "payload_pos_w", "payload_vel_w")
+        rows.append({name: sim.get(name) for name in names})
+    return rows
+
+
+@pytest.mark.parametrize("lag", [0.0, 0.004, 0.02, 0.1037, 0.11])
+def test_the_latch_keeps_and_the_lag_is_exact(lag):
+    """Asked for once, at the start of step 3; separation follows by itself, in the right step and at the right time."""
+    asked_at, count = 3, 2
+    sim = HybridSim(plant(lag), count)
+    rows = thrown(sim, np.tile([3.0, 0.5, 0.0, 0.0], (14, count, 1)), asked_at)
+    times = [k for k, row in enumerate(rows) if np.any(row["separated"])]
+    assert len(times) == 1
+    (step,) = times
+    since = (step - asked_at) * PERIOD + rows[step]["separation_time"]
+    np.testing.assert_allclose(since, lag, atol=CLOCK)
+    for k, row in enumerate(rows):
+        assert np.all(row["attached"] == (k < step))
+        assert np.all(row["release_timer"] < 0.0) == (k < asked_at)
+
+
+def test_asking_again_or_no_more_changes_nothing():
+    once, often = HybridSim(plant(0.07), 1), HybridSim(plant(0.07), 1)
+    command = [[3.0, 0.5, 0.0, 0.0]]
+    for k in range(8):
+        once.set_command(command, [k == 1])
+        often.set_command(command, [k >= 1])
+        once.step()
+        often.step()
+        for name in ("payload_pos_w", "pos_w", "attached", "separated", "release_timer"):
+            np.testing.assert_array_equal(once.get(name), often.get(name))
+
+
+def test_nothing_separates_unasked():
+    sim = HybridSim(plant(0.11), 3)
+    rows = thrown(sim, random_commands(0, 20, 3), asked_at=-1)
+    assert all(np.all(row["attached"] == 1) and not np.any(row["separated"]) for row in rows)
+
+
+@pytest.mark.parametrize("lag", [0.11, 0.104])
+def test_separation_is_the_state_of_a_run_that_ends_there(lag):
+    """A second simulator with periods of 2 ms is stopped at the separation: same substeps, same state."""
+    command, count = np.array([[4.0, 2.0, -3.0, 1.0]]), 1
+    without_delay = QueueParams(0.0)
+    sim = HybridSim(plant(lag, "float64", queue=without_delay), count)
+    for _ in range(round(lag / PERIOD + 0.5)):
+        sim.set_command(command, [1])
+        sim.step()
+    assert sim.get("separated")[0] == 1
+    stopped = HybridSim(plant(lag, "float64", 0.002, queue=without_delay), count)
+    for _ in range(round(lag / 0.002)):
+        stopped.set_command(command)
+        stopped.step()
+    np.testing.assert_allclose(sim.get("payload_pos_w"), stopped.get("payload_pos_w"), atol=SAME_STATE)
+    np.testing.assert_allclose(sim.get("payload_vel_w"), stopped.get("payload_vel_w"), atol=100 * SAME_STATE)
+    np.testing.assert_allclose(sim.get("release_pos_w"), stopped.get("pos_w"), atol=SAME_STATE)
+
+
+def test_a_lag_inside_a_substep_lies_between_its_neighbours():
+    """0.1037 s is no multiple of 2 ms: the state is that of 0.1037 s, not of a substep beside it."""
+    command = np.array([[4.0, 2.0, -3.0, 1.0]])
+
+    def at(lag):
+        sim = HybridSim(plant(lag, "float64"), 1)
+        for _ in range(6):
+            sim.set_command(command, [1])
+            sim.step()
+        return sim.get("payload_pos_w")[0], sim.get("payload_vel_w")[0]
+
+    (before, vel), (inside, _), (after, vel_after) = at(0.1030), at(0.1037), at(0.1044)
+    middle = 0.5 * (before + after) - 0.0007 * (vel_after - vel) / 4.0
+    np.testing.assert_allclose(inside, middle, atol=2e-6)
+    assert np.linalg.norm(inside - before) > 1e-4
+
+
+def test_landing_flight_and_clearance():
+    """The projectile's formulas, written again, over many throws."""
+    count, asked_at = 64, 10
+    params = plant(0.11)
+    sim = HybridSim(params, count)
+    rng = np.random.default_rng(1)
+    height = rng.uniform(0.8, 3.0, count)
+    sim.place(np.column_stack((rng.normal(size=(count, 2)), height)), vel_w=rng.normal(size=(count, 3)))
+    commands = random_commands(2, 20, count) * [0.5, 0.3, 0.3, 0.3]
+    for k, command in enumerate(commands):
+        sim.set_command(command, np.full(count, k == asked_at))
+        sim.step()
+    assert not np.any(sim.get("attached"))
+    pos, vel = sim.get("payload_pos_w").astype(float), sim.get("payload_vel_w").astype(float)
+    drop = pos[:, 2] - params.release.landing_height
+    assert drop.min() > 0.0
+    time = (vel[:, 2] + np.sqrt(vel[:, 2] ** 2 + 2.0 * GRAVITY * drop)) / GRAVITY
+    landing = pos + time[:, None] * vel
+    landing[:, 2] = params.release.landing_height
+    np.testing.assert_allclose(sim.get("time_to_impact"), time, atol=ROUND_OFF)
+    np.testing.assert_allclose(sim.get("landing_w"), landing, atol=5 * ROUND_OFF)
+    fractions = np.linspace(0.0, 1.0, params.release.clearance_samples)[:, None]
+    flight = pos + (fractions * time)[..., None] * vel
+    flight[..., 2] -= 0.5 * GRAVITY * (fractions * time) ** 2
+    least = np.linalg.norm(flight - sim.get("release_pos_w"), axis=-1).min(axis=0)
+    np.testing.assert_allclose(sim.get("clearance"), least, atol=ROUND_OFF)
+    assert np.ptp(time) > 0.1, "the throws must differ"
+
+
+def test_outputs_stay_after_the_landing_step():
+    """What a release put out stays until the next one: the learner may read it a step later."""
+    sim = HybridSim(plant(0.02), 1)
+    command = [[3.0, 0.5, 0.0, 0.0]]
+    kept = None
+    for k in range(6):
+        sim.set_command(command, [k == 0])
+        sim.step()
+        if kept is not None:
+            for name, value in kept.items():
+                np.testing.assert_array_equal(sim.get(name), value)
+            assert sim.get("separated")[0] == 0
+        if sim.get("separated")[0]:
+            kept = {name: sim.get(name) for name in ("landing_w", "time_to_impact", "clearance", "payload_pos_w")}
+    assert kept is not None
+
+
+def test_the_vehicle_flies_on_alone():
+    """After separation it climbs by its own thrust over its own mass: no rope pulls, drag off."""
+    calm = dataclasses.replace(paper_plant().vehicle.aero, kind="none")
+    ideal = dataclasses.replace(paper_plant().vehicle.battery, kind="ideal")
+    params = plant(0.0, "float64", aero=calm, battery=ideal)
+    sim = HybridSim(params, 1)
+    weight = (params.vehicle.body.mass + params.rope.rope_mass + params.rope.payload_mass) * GRAVITY
+    speeds = []
+    for k in range(10):
+        sim.set_command([[weight, 0.0, 0.0, 0.0]], [k == 0])
+        sim.step()
+        speeds.append(sim.get("vel_w")[0, 2])
+    np.testing.assert_allclose(np.diff(speeds) / PERIOD, weight / params.vehicle.body.mass - GRAVITY, rtol=1e-9)
+
+
+def test_payload_of_the_outputs_is_the_end_of_the_rope():
+    sim = HybridSim(plant(0.11), 8)
+    for command in random_commands(3, 10, 8):
+        sim.set_command(command)
+        sim.step()
+    rope = sim.params.rope
+    mount = np.tile(rope.mount, (8, 1))
+    quat, rate = sim.get("quat_wb").astype(float), sim.get("rate_b").astype(float)
+    reach = np.full(rope.segments, rope.length / rope.segments)
+    reach[-1] += rope.payload_offset
+    n, u = sim.get("cable_dir_w").astype(float), sim.get("cable_vel_w").astype(float)
+    pos = sim.get("pos_w") + rotate(quat, mount) + np.einsum("l,elx->ex", reach, n)
+    vel = sim.get("vel_w") + rotate(quat, np.cross(rate, mount)) + np.einsum("l,elx->ex", reach, u)
+    np.testing.assert_allclose(sim.get("payload_pos_w"), pos, atol=ROUND_OFF)
+    np.testing.assert_allclose(sim.get("payload_vel_w"), vel, atol=10 * ROUND_OFF)
+    points = sim.cable_points_w()
+    np.testing.assert_allclose(points[:, 0], sim.get("pos_w") + rotate(quat, mount), atol=ROUND_OFF)
+    np.testing.assert_allclose(points[:, -1] + rope.payload_offset * n[:, -1], pos, atol=ROUND_OFF)

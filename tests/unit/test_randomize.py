@@ -1,0 +1,179 @@
+"""The start of an episode: every range and distribution of the paper's randomisation, recovered from the states."""
+
+import dataclasses
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from scipy.stats import kstest
+
+from sim.hybrid import HybridSim, tether_lengths
+from tests.plants import paper_plant
+from tests.simulators import rotate
+from visthrow import config
+from visthrow.task import TaskParams
+
+COUNT = 6000
+SIGNIFICANCE = 1e-4
+"""Of a Kolmogorov-Smirnov test; the seed is fixed, so the outcome is too."""
+EDGE = 1e-5
+"""Round-off of float32 at a bound."""
+
+
+@lru_cache
+def spreads():
+    """The paper's, as the tasks load them."""
+    return config.load(TaskParams, config.find("task", "state")).start
+
+
+@lru_cache
+def started() -> HybridSim:
+    plant = paper_plant()
+    sim = HybridSim(plant, COUNT, seed=5, ropes=tether_lengths(plant.rope, spreads()))
+    sim.randomize(spreads())
+    return sim
+
+
+def assert_uniform(values: np.ndarray, low: float, high: float) -> None:
+    """Within the bounds, close to both, and uniform between them."""
+    span = high - low
+    assert values.min() >= low - EDGE * span
+    assert values.max() <= high + EDGE * span
+    assert np.ptp(values) > 0.99 * span
+    assert kstest((values - low) / span, "uniform").pvalue > SIGNIFICANCE
+
+
+def test_the_file_holds_the_numbers_of_the_paper():
+    """Sec. III-C: +-0.5/0.5/0.3 m and m/s, 20 deg, 30 deg/s, mass 5 %, six cables over 6 %, 15 deg and deg/s."""
+    z = spreads()
+    assert z.position == z.velocity == (0.5, 0.5, 0.3)
+    assert z.attitude_deg == (20.0,) * 3
+    assert z.rate_deg == (30.0,) * 3
+    assert (z.mass, z.tether_variants, z.tether_spread) == (0.05, 6, 0.06)
+    assert (z.cable_angle_deg, z.cable_rate_deg, z.goal_radius) == (15.0, 15.0, 2.0)
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_position_velocity_and_rates(axis):
+    sim, z = started(), spreads()
+    home = np.array([0.0, 0.0, z.spawn_height])[axis]
+    assert_uniform(sim.get("pos_w")[:, axis].astype(float) - home, -z.position[axis], z.position[axis])
+    assert_uniform(sim.get("vel_w")[:, axis].astype(float), -z.velocity[axis], z.velocity[axis])
+    assert_uniform(np.degrees(sim.get("rate_b")[:, axis].astype(float)), -z.rate_deg[axis], z.rate_deg[axis])
+
+
+def test_attitude():
+    """Roll, pitch and yaw of the rotation Rz(yaw) Ry(pitch) Rx(roll)."""
+    x, y, z, w = sim_quat = started().get("quat_wb").astype(float).T
+    np.testing.assert_allclose(np.linalg.norm(sim_quat, axis=0), 1.0, atol=1e-6)
+    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    pitch = np.arcsin(2 * (w * y - z * x))
+    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    for angle, bound in zip((roll, pitch, yaw), spreads().attitude_deg):
+        assert_uniform(np.degrees(angle), -bound, bound)
+
+
+def cable_angles() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Azimuth and tilt [rad] of the cable in the body frame and the cable's own velocity there [1/s]."""
+    sim = started()
+    quat = sim.get("quat_wb").astype(float)
+    back = quat * [-1.0, -1.0, -1.0, 1.0]
+    down = rotate(back, sim.get("cable_dir_w")[:, 0].astype(float))
+    swing = rotate(back, sim.get("cable_vel_w")[:, 0].astype(float)) - np.cross(sim.get("rate_b"), down)
+    azimuth = np.arctan2(-down[:, 0], down[:, 1])
+    azimuth = np.where(np.cos(azimuth) < 0.0, azimuth + np.pi, azimuth)
+    azimuth = np.arctan2(np.sin(azimuth), np.cos(azimuth))
+    tilt = np.arctan2(-down[:, 0] * np.sin(azimuth) + down[:, 1] * np.cos(azimuth), -down[:, 2])
+    return azimuth, tilt, down, swing
+
+
+def test_cable_hangs_yawed_then_rolled():
+    """``Rz(azimuth) Rx(tilt) (0, 0, -1)``; an azimuth can be read off where there is a tilt."""
+    azimuth, tilt, down, _ = cable_angles()
+    bound = spreads().cable_angle_deg
+    rebuilt = np.stack((-np.sin(azimuth) * np.sin(tilt), np.cos(azimuth) * np.sin(tilt), -np.cos(tilt)), -1)
+    np.testing.assert_allclose(rebuilt, down, atol=1e-6)
+    assert_uniform(np.degrees(tilt), -bound, bound)
+    assert_uniform(np.degrees(azimuth[np.abs(tilt) > 0.01]), -bound, bound)
+
+
+def test_cable_rates_come_on_top_of_the_bodys():
+    azimuth, tilt, down, swing = cable_angles()
+    bound = spreads().cable_rate_deg
+    by_azimuth = np.cross([0.0, 0.0, 1.0], down)
+    axis = np.stack((np.cos(azimuth), np.sin(azimuth), np.zeros(COUNT)), -1)
+    by_tilt = np.cross(axis, down)
+    tilt_rate = np.sum(swing * by_tilt, -1)  # unit vectors, perpendicular to each other's
+    assert_uniform(np.degrees(tilt_rate), -bound, bound)
+    seen = np.abs(tilt) > 0.05
+    azimuth_rate = np.sum(swing * by_azimuth, -1) / np.maximum(np.sum(by_azimuth**2, -1), 1e-12)
+    assert_uniform(np.degrees(azimuth_rate[seen]), -bound, bound)
+
+
+def test_every_segment_starts_alike():
+    sim = started()
+    assert np.all(sim.get("cable_dir_w") == sim.get("cable_dir_w")[:, :1])
+    assert np.all(sim.get("cable_vel_w") == sim.get("cable_vel_w")[:, :1])
+
+
+def test_mass_and_battery():
+    sim, z = started(), spreads()
+    assert_uniform(sim.get("mass_scale").astype(float), 1.0 - z.mass, 1.0 + z.mass)
+    assert_uniform(sim.get("charge_used").astype(float), 0.0, z.battery_used)
+
+
+def test_six_cables_for_good():
+    """The length belongs to the environment: it is there before and after a reset, each as often as the others."""
+    sim, z = started(), spreads()
+    lengths = np.linalg.norm(np.diff(sim.cable_points_w(), axis=1), axis=-1).sum(axis=1)
+    nominal = paper_plant().rope.length
+    expected = nominal * np.linspace(1.0 - z.tether_spread, 1.0 + z.tether_spread, z.tether_variants)
+    np.testing.assert_allclose(lengths, expected[np.arange(COUNT) % z.tether_variants], rtol=1e-5)
+    densities = {round(r.rope_mass / r.length, 12) for r in tether_lengths(paper_plant().rope, z)}
+    assert len(densities) == 1, "the mass per metre is kept"
+
+
+def test_goals_fill_the_disk_evenly():
+    """Uniform on a disk: the squared radius and the angle are uniform and independent."""
+    goal = started().goal_w.numpy().astype(float)
+    radius, angle = np.hypot(goal[:, 0], goal[:, 1]), np.arctan2(goal[:, 1], goal[:, 0])
+    assert_uniform(radius**2, 0.0, spreads().goal_radius ** 2)
+    assert_uniform(angle, -np.pi, np.pi)
+    assert abs(np.corrcoef(radius, np.cos(angle))[0, 1]) < 0.05
+    assert np.all(goal[:, 2] == 0.0)
+
+
+def test_draws_are_independent():
+    sim = started()
+    columns = np.column_stack(
+        [sim.get(k).reshape(COUNT, -1)[:, :3] for k in ("pos_w", "vel_w", "rate_b", "mass_scale", "charge_used")]
+        + [sim.goal_w.numpy()[:, :2]]
+    )
+    apart = np.corrcoef(columns.T) - np.eye(columns.shape[1])
+    assert np.abs(apart).max() < 5.0 / np.sqrt(COUNT)
+
+
+def test_every_reset_draws_anew():
+    plant = paper_plant()
+    sim = HybridSim(plant, 4, seed=1)
+    seen = []
+    for _ in range(5):
+        sim.randomize(spreads())
+        seen.append(sim.get("pos_w"))
+    assert len(np.unique(np.array(seen)[..., 0])) == 20
+
+
+def test_without_spreads_the_start_is_exact():
+    names = ("position", "velocity", "attitude_deg", "rate_deg")
+    still = dataclasses.replace(
+        spreads(), mass=0.0, cable_angle_deg=0.0, cable_rate_deg=0.0, battery_used=0.0, goal_radius=0.0,
+        **{name: (0.0, 0.0, 0.0) for name in names},
+    )
+    sim = HybridSim(paper_plant(), 2)
+    sim.randomize(still)
+    np.testing.assert_allclose(sim.get("pos_w"), [[0.0, 0.0, still.spawn_height]] * 2, atol=1e-7)
+    np.testing.assert_allclose(sim.get("quat_wb"), [[0.0, 0.0, 0.0, 1.0]] * 2, atol=1e-7)
+    np.testing.assert_allclose(sim.get("cable_dir_w")[:, 0], [[0.0, 0.0, -1.0]] * 2, atol=1e-7)
+    assert not np.any(sim.get("vel_w"))
+    assert not np.any(sim.get("cable_vel_w"))
+    np.testing.assert_allclose(sim.goal_w.numpy(), 0.0)

@@ -1,0 +1,165 @@
+"""What the simulators refuse, and that the message names what came, what was expected and where."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from sim.hybrid import HybridSim, tether_lengths
+from sim.params import PlantParams
+from sim.standalone import QuadSim
+from sim.structs import types
+from tests.plants import paper_plant
+from visthrow import config
+from visthrow.task import TaskParams
+
+
+def changed(path: str, value) -> PlantParams:
+    """The paper's plant with one field, dotted, changed."""
+    plant = paper_plant()
+    names = path.split(".")
+    owners = [plant]
+    for name in names[:-1]:
+        owners.append(getattr(owners[-1], name))
+    for owner, name in zip(reversed(owners), reversed(names)):
+        value = dataclasses.replace(owner, **{name: value})
+    return value
+
+
+NAN = float("nan")
+VEHICLE = [
+    ("vehicle.body.mass", 0.0, "vehicle.body.mass is 0.0"),
+    ("vehicle.body.mass", NAN, "vehicle.body.mass is nan"),
+    ("vehicle.body.inertia", (1e-4, -1e-4, 1e-4), "vehicle.body.inertia is -0.0001"),
+    ("vehicle.thrust.k_f", -1.0, "vehicle.thrust.k_f"),
+    ("vehicle.motor.time_constant", 0.0, "vehicle.motor.time_constant"),
+    ("vehicle.controller.gyro_time_constant", 0.0, "vehicle.controller.gyro_time_constant"),
+    ("vehicle.controller.min_thrust", 4.0, "less than max_thrust"),
+    ("vehicle.battery.capacity", 0.0, "vehicle.battery.capacity"),
+    ("vehicle.rotors.x", (0.0, 0.0, 0.0, 0.0), "spread along x and y"),
+    ("vehicle.rotors.spin", (1.0, 1.0, 1.0, -1.0), "two turning each way"),
+    ("vehicle.queue.delay", -0.001, "command delay -0.001"),
+    ("vehicle.queue.delay", float("inf"), "command delay inf"),
+]
+PLANT = [
+    ("rope.segments", 0, "0 segments: expected 1 to 64"),
+    ("rope.segments", 65, "65 segments: expected 1 to 64"),
+    ("rope.length", -0.3, "rope.length is -0.3"),
+    ("rope.payload_mass", 0.0, "rope.payload_mass is 0.0"),
+    ("rope.joint_damping", -1e-5, "rope.joint_damping is -1e-05"),
+    ("release.lag", -0.1, "release.lag is -0.1"),
+    ("release.clearance_samples", 1, "release.clearance_samples is 1"),
+    ("sim.substep", 0.0, "sim.substep is 0.0"),
+    ("sim.control_period", -0.02, "sim.control_period is -0.02"),
+    ("sim.gamma", NAN, "sim.gamma is nan"),
+    ("sim.precision", "float16", "'float16': expected 'float32' or 'float64'"),
+]
+
+
+@pytest.mark.parametrize(("path", "value", "message"), VEHICLE + PLANT)
+def test_bad_plants_are_refused(path, value, message):
+    with pytest.raises(ValueError, match=message):
+        HybridSim(changed(path, value), 1)
+
+
+@pytest.mark.parametrize(("path", "value", "message"), VEHICLE)
+def test_bad_vehicles_are_refused_alone_too(path, value, message):
+    with pytest.raises(ValueError, match=message):
+        QuadSim(changed(path, value).vehicle, 1)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"count": 0}, "0 environments: expected 1 or more"),
+        ({"integrator": "rk5"}, r"'rk5': expected one of \('euler', 'rk4'\)"),
+        ({"step": 0.0}, "step 0.0 s"),
+        ({"control_period": NAN}, "control_period nan s"),
+        ({"precision": "half"}, "'half': expected 'float32' or 'float64'"),
+    ],
+)
+def test_bad_options_of_the_quadrotor(options, message):
+    with pytest.raises(ValueError, match=message):
+        QuadSim(paper_plant().vehicle, **{"count": 1, **options})
+
+
+def test_a_batch_of_no_environments():
+    with pytest.raises(ValueError, match="0 environments: expected 1 or more"):
+        HybridSim(paper_plant(), 0)
+
+
+def test_other_kinds_of_blocks_in_one_batch():
+    """A kernel is built for one choice of blocks; a vehicle of another would silently fly with the wrong ones."""
+    other = changed("vehicle.aero.kind", "none").vehicle
+    plant = paper_plant()
+    with pytest.raises(ValueError, match=r"'none'.*expected the same blocks"):
+        HybridSim(plant, 2, vehicles=[plant.vehicle, other])
+    with pytest.raises(ValueError, match=r"'none'.*expected the same blocks"):
+        QuadSim(plant.vehicle, 2, vehicles=[plant.vehicle, other])
+
+
+def test_ropes_of_different_segments_in_one_batch():
+    plant = paper_plant()
+    short = dataclasses.replace(plant.rope, segments=3)
+    with pytest.raises(ValueError, match=r"\[3, 15\] segments in one batch of 15"):
+        HybridSim(plant, 2, ropes=[plant.rope, short])
+
+
+def test_no_tethers():
+    z = config.load(TaskParams, config.find("task", "state")).start
+    with pytest.raises(ValueError, match="tether_variants 0"):
+        tether_lengths(paper_plant().rope, dataclasses.replace(z, tether_variants=0))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"pos_w": np.zeros((2, 3))}, r"pos_w of shape \(2, 3\): expected \(3, 3\)"),
+        ({"pos_w": np.zeros((3, 3)), "quat_wb": np.zeros((3, 3))}, r"quat_wb of shape \(3, 3\): expected \(3, 4\)"),
+        ({"pos_w": np.zeros((3, 3)), "rate_b": np.zeros(3)}, r"rate_b of shape \(3,\)"),
+    ],
+)
+def test_shapes_of_poses(arguments, message):
+    for sim in (HybridSim(paper_plant(), 3), QuadSim(paper_plant().vehicle, 3)):
+        with pytest.raises(ValueError, match=message):
+            sim.place(**arguments)
+
+
+def test_shape_of_the_cable():
+    with pytest.raises(ValueError, match=r"cable_dir_w of shape \(3, 14, 3\): expected \(3, 15, 3\)"):
+        HybridSim(paper_plant(), 3).place(np.zeros((3, 3)), cable_dir_w=np.zeros((3, 14, 3)))
+
+
+def test_shapes_of_commands():
+    """Twelve numbers are no command of three environments just because they fit."""
+    sim, quad = HybridSim(paper_plant(), 3), QuadSim(paper_plant().vehicle, 3)
+    for target in (sim, quad):
+        with pytest.raises(ValueError, match=r"command of shape \(4, 3\): expected \(3, 4\)"):
+            target.set_command(np.zeros((4, 3)))
+    with pytest.raises(ValueError, match=r"release of shape \(2,\): expected \(3,\)"):
+        sim.set_command(np.zeros((3, 4)), np.zeros(2))
+    with pytest.raises(ValueError, match=r"force_w of shape \(3,\): expected \(3, 3\)"):
+        quad.set_wrench(np.zeros(3), np.zeros((3, 3)))
+
+
+def test_unknown_names():
+    for sim in (HybridSim(paper_plant(), 1), QuadSim(paper_plant().vehicle, 1)):
+        with pytest.raises(ValueError, match=r"no array 'position'; there are .*pos_w"):
+            sim.get("position")
+    with pytest.raises(ValueError, match="expected 'float32' or 'float64'"):
+        types("double")
+
+
+def test_get_is_a_copy():
+    """On the CPU an array's NumPy view is live memory: what was got must not change with the next step."""
+    both = ("pos_w", "queue")
+    cases = {HybridSim(paper_plant(), 2): (*both, "cable_dir_w", "payload_pos_w"), QuadSim(paper_plant().vehicle, 2): both}
+    for sim, names in cases.items():
+        sim.set_command(np.tile([12.0, 3.0, -3.0, 1.0], (2, 1)))
+        got = {name: sim.get(name) for name in names}
+        kept = {name: value.copy() for name, value in got.items()}
+        for _ in range(3):
+            sim.step()
+        for name in names:
+            np.testing.assert_array_equal(got[name], kept[name])
+            assert np.any(sim.get(name) != kept[name]), name
