@@ -157,5 +157,5 @@ def write(
     from visthrow.plants import PLANTS
 
     count = len(throws[0][1][0].success)
-    scatter.draw(paths[2], throws, f"{count} throws each, {PLANTS[plant].split(' with ')[0]}")
+    scatter.draw(paths[2], throws, f"{count} throws each, {PLANTS[plant]}")
     return paths

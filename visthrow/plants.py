@@ -12,10 +12,10 @@ from visthrow.task import Experiment, NoiseParams, plant_of
 
 PLANTS = {
     "hybrid": "the training simulator",
-    "reference": "the reference plant on MuJoCo without extras",
-    "reference-realistic": "the reference plant on MuJoCo with wind, drag, stretch, errors and mocap noise",
+    "reference": "the reference plant without extras",
+    "reference-realistic": "the realistic reference plant",
 }
-"""Name -> what tables call it."""
+"""Name -> what pictures call it."""
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,9 @@ from visthrow.storage import atomic_write
 RADII = (0.1, 0.2)
 """Circles about the goal [m]."""
 
+PANEL = 2.6
+"""Side of a panel [inch]."""
+
 LEAST_HALF_WIDTH, MOST_HALF_WIDTH = 0.25, 0.6
 """Of a panel [m]."""
 
@@ -32,25 +35,25 @@ def draw(path: str | Path, throws: Sequence[tuple[str, Sequence]], subtitle: str
 
     targets = [of.target for of in throws[0][1]]
     half = _half_width(throws)
-    size = 3.1
-    figure, axes = plt.subplots(
-        1, len(targets), figsize=(max(size * len(targets), 5.2) + 0.5, size + 1.35), squeeze=False
-    )
-    for column, (axis, target) in enumerate(zip(axes[0], targets)):
+    panel = PANEL if len(targets) > 1 else 1.25 * PANEL
+    width = max(0.95 + len(targets) * (panel + 0.6), 6.4)
+    height = panel + 1.6
+    figure = plt.figure(figsize=(width, height))
+    first = 0.5 * (width - len(targets) * (panel + 0.6) + 0.6) + 0.2
+    for column, target in enumerate(targets):
+        left = first + column * (panel + 0.6)
+        axis = figure.add_axes((left / width, 0.58 / height, panel / width, panel / height))
         _goal(axis, half)
         for index, (name, row) in enumerate(throws):
-            _points(axis, row[column], index, half, f"{name}" if column == 0 else None)
+            _points(axis, row[column], index, half, name if column == 0 else None)
         axis.set(xlim=(-half, half), ylim=(-half, half), aspect="equal")
         axis.set_title(f"target {target:.1f} m")
         axis.set_xlabel("lateral error, to the right [m]")
         if column == 0:
             axis.set_ylabel("error along the throw [m]")
-    handles, labels = axes[0][0].get_legend_handles_labels()
-    figure.legend(
-        handles, labels, loc="upper center", ncols=max(len(labels), 1), bbox_to_anchor=(0.5, 0.925), columnspacing=1.6
-    )
-    figure.suptitle(f"Landing points from above: {subtitle}", fontsize=11, y=0.985)
-    figure.tight_layout(rect=(0, 0, 1, 0.89))
+    top = {"loc": "upper center", "bbox_to_anchor": (0.5, 1.0 - 0.3 / height), "columnspacing": 1.6}
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), ncols=len(throws), **top)
+    figure.suptitle(f"Landing points from above: {subtitle}", fontsize=11.5, y=1.0 - 0.1 / height, va="top")
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png")
     plt.close(figure)
@@ -71,7 +74,8 @@ def _goal(axis, half: float) -> None:
             axis.add_patch(Circle((0, 0), radius, fill=False, color=style.QUIET, lw=0.9, ls=(0, (4, 3)), zorder=1))
             axis.annotate(
                 f"{radius:g} m", (radius * 0.7071, -radius * 0.7071), xytext=(2, -2), textcoords="offset points",
-                color=style.QUIET, fontsize=8, ha="left", va="top", zorder=5,
+                color=style.QUIET, fontsize=8, ha="left", va="top", zorder=2,
+                bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.6, "alpha": 0.85},
             )  # fmt: skip
     axis.plot(0, 0, "+", color=style.INK, ms=13, mew=1.6, zorder=4)
     axis.grid(True, zorder=0)

@@ -90,7 +90,7 @@ def _headline(log: FlightLog) -> str:
 
 
 def _subline(log: FlightLog) -> str:
-    plant = log.meta["plant_meaning"].split(" with ")[0]
+    plant = log.meta["plant_meaning"]
     drawn = f"Faint: the vehicle every {GHOST_EVERY:g} s. Dashed: the ball in free flight."
     return f"Simulated on {plant}, seen from the side. {drawn}"
 
