@@ -2,12 +2,13 @@
 
 import argparse
 import math
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 from visthrow.cli import add_common
-from visthrow.errors import ConfigError
+from visthrow.errors import ConfigError, StorageError
 
 DEFAULT_POLICIES = ("state", "vision")
 DEFAULT_TARGETS = (1.5, 2.0, 2.5)
@@ -55,6 +56,7 @@ def run(args: argparse.Namespace) -> int:
         raise ConfigError(f"no plant '{args.plant}'; {suggest(args.plant, PLANTS)}")
     loaded = [load_policy(name, args.config, args.overrides) for name in args.policies or DEFAULT_POLICIES]
     names = unique_names(loaded)
+    writable(Path(args.out))
     if args.plant == "hybrid":
         throws = throw_hybrid(loaded, args.targets, args.throws, resolve(args.device), args.seed)
     else:
@@ -88,6 +90,20 @@ def check(targets: Sequence[float], throws: int) -> None:
             )
     if len(set(targets)) < len(targets):
         raise ConfigError(f"--targets {' '.join(f'{x:g}' for x in targets)}: the same one twice")
+
+
+def writable(folder: Path) -> None:
+    """Make the folder of the results now, so that no work is done for results that could not be written.
+
+    Raises:
+        StorageError: it cannot be made or written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StorageError(f"cannot make the folder {folder}: {error.strerror or error}") from error
+    if not os.access(folder, os.W_OK):
+        raise StorageError(f"the folder {folder} cannot be written")
 
 
 def throw_hybrid(

@@ -34,6 +34,7 @@ def run(args: argparse.Namespace) -> int:
     begin = time.perf_counter()
     loaded = [load_policy(name) for name in POLICIES]
     folder = Path(args.out)
+    compare.writable(folder)
     if importlib.util.find_spec("mujoco") is None:
         paths = _here(loaded, folder)
         print("The reference plant is left out: it needs MuJoCo, pip install 'visthrow[reference]'\n")

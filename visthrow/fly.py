@@ -46,7 +46,8 @@ def run(args: argparse.Namespace) -> int:
     """Fly, write, tell."""
     from visthrow.device import resolve
     from visthrow.errors import ConfigError, suggest
-    from visthrow.flight import fly
+    from visthrow.compare import writable
+    from visthrow.flight import check_goal, fly
     from visthrow.loading import load_policy
     from visthrow.plants import PLANTS
     from visthrow.storage import write_json
@@ -57,6 +58,8 @@ def run(args: argparse.Namespace) -> int:
         raise ConfigError(f"--target {' '.join(f'{x:g}' for x in args.target)}; expected a distance, or x and y")
     loaded = load_policy(args.policy, args.config, args.overrides)
     goal = [args.target[0], args.target[1] if len(args.target) == 2 else 0.0, 0.0]
+    check_goal(loaded, goal)
+    writable(Path(args.out))
     if args.plant != "hybrid":
         print("flying on the reference plant; this takes about a minute", file=sys.stderr)
     log = fly(loaded, goal, args.plant, args.seed, resolve(args.device))

@@ -309,6 +309,15 @@ def test_bad_input_is_refused_in_one_line(words, message, dropper, tmp_path, cap
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("command", ["fly", "compare"])
+def test_a_folder_that_cannot_be_made_is_refused_before_the_work(command, dropper, tmp_path, capsys, monkeypatch):
+    (tmp_path / "file").write_text("in the way")
+    monkeypatch.setattr("sim.hybrid.HybridSim.step", None)  # nothing may fly
+    policy = ["--policy", str(dropper)] if command == "fly" else [str(dropper)]
+    assert main([command, *policy, "--out", str(tmp_path / "file" / "out")]) == 2
+    assert "cannot make the folder" in capsys.readouterr().err
+
+
 def test_a_policy_without_its_config_asks_for_one(tmp_path):
     policy = dataclasses.replace(dropping_policy(), made_by={})
     policy.save(tmp_path / "bare.npz")
