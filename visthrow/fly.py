@@ -44,9 +44,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Fly, write, tell."""
+    from visthrow.compare import writable
     from visthrow.device import resolve
     from visthrow.errors import ConfigError, suggest
-    from visthrow.compare import writable
     from visthrow.flight import check_goal, fly
     from visthrow.loading import load_policy
     from visthrow.plants import PLANTS

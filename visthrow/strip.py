@@ -17,6 +17,10 @@ from visthrow.hover import rot_from_quat
 from visthrow.storage import atomic_write
 
 MARGIN = 0.35  # about what is seen [m]
+GROUND = 0.13  # of it seen below z = 0 [m]
+WIDTH, LEFT, PANEL, GAP = 13.6, 0.62, 3.06, 0.22
+"""Of the picture, its left margin, a panel, and the gap between two [inch]."""
+
 ARM = 0.097  # half the motor-to-motor diagonal, for drawing only [m]
 ROTOR = 0.0381  # propeller radius, for drawing only [m]
 BLADE_HEIGHT = 0.018  # of the rotor plane, for drawing only [m]
@@ -61,20 +65,26 @@ def draw(path: str | Path, log: FlightLog, camera: CameraParams) -> None:
     import matplotlib.pyplot as plt
 
     side = _bounds(log)
-    figure = plt.figure(figsize=(13.6, 7.7))
-    grid = figure.add_gridspec(2, 4, height_ratios=(1.0, 1.0), left=0.045, right=0.992, top=0.85, bottom=0.012)
-    grid.update(wspace=0.06, hspace=0.33)
+    upper = PANEL * (side[2] + GROUND) / (side[1] - side[0])  # heights from here on in inches
+    height = 1.18 + upper + 0.98 + PANEL + 0.08
+    figure = plt.figure(figsize=(WIDTH, height))
     lens = KeypointCamera(drawn_larger(camera))
+    all_seen = True
     for column, (caption, time) in enumerate(views):
-        axis = figure.add_subplot(grid[0, column])
+        left = LEFT + column * (PANEL + GAP)
+        axis = figure.add_axes((left / WIDTH, (PANEL + 1.06) / height, PANEL / WIDTH, upper / height))
         _side_view(axis, log, time, side, column)
         axis.set_title(f"({'abcd'[column]})  {caption},  t = {time - views[0][1]:.2f} s", loc="left")
-        _camera_view(figure.add_subplot(grid[1, column]), log, lens, time, first=column == 0)
-    figure.suptitle(_headline(log), x=0.045, y=0.97, ha="left", fontsize=13.5, fontweight="bold")
-    figure.text(0.045, 0.908, _subline(log), ha="left", fontsize=10.5, color=style.QUIET)
+        axis = figure.add_axes((left / WIDTH, 0.08 / height, PANEL / WIDTH, PANEL / height))
+        all_seen &= _camera_view(axis, log, lens, time, first=column == 0)
+    texts = {"x": LEFT / WIDTH, "ha": "left", "va": "top"}
+    figure.suptitle(_headline(log), y=1.0 - 0.2 / height, fontsize=13.5, fontweight="bold", **texts)
+    quiet = {"fontsize": 10.5, "color": style.QUIET, **texts}
+    figure.text(y=1.0 - 0.54 / height, s=_subline(log), **quiet)
+    unseen = "" if all_seen else "; a cross: outside the field of view"
     field = f"{camera.fisheye.fov_deg:g}°"
-    note = f"The same instants on the fisheye image ({field}): corners of the target square, box of the ball"
-    figure.text(0.045, 0.408, note, ha="left", fontsize=10.5, color=style.QUIET)
+    note = f"The same instants on the fisheye image ({field}): corners of the target square, box of the ball{unseen}"
+    figure.text(y=(PANEL + 0.42) / height, s=note, **quiet)
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png")
     plt.close(figure)
@@ -135,8 +145,8 @@ def _side_view(axis, log: FlightLog, time: float, side: tuple[float, float, floa
 
     left, right, top = side
     times, goal = log.meta["times"], log.meta["goal_w"]
-    axis.set(xlim=(left, right), ylim=(-0.13, top), aspect="equal", yticks=np.arange(0.0, top, 0.5))
-    axis.add_patch(Rectangle((left, -0.13), right - left, 0.13, color="#EFEDE8", lw=0, zorder=0))
+    axis.set(xlim=(left, right), ylim=(-GROUND, top), aspect="equal", yticks=np.arange(0.0, top, 0.5))
+    axis.add_patch(Rectangle((left, -GROUND), right - left, GROUND, color="#EFEDE8", lw=0, zorder=0))
     axis.axhline(0.0, color=style.QUIET, lw=1.0, zorder=1)
     axis.plot([goal[0] - 0.125, goal[0] + 0.125], [0, 0], color=style.GOAL, lw=5, solid_capstyle="butt", zorder=2)
     if column:
@@ -190,8 +200,8 @@ def _vehicle(axis, log: FlightLog, time: float, alpha: float) -> None:
             axis.plot([ends[0][0], ends[1][0]], [ends[0][2], ends[1][2]], lw=1.8, **line)
 
 
-def _camera_view(axis, log: FlightLog, camera: KeypointCamera, time: float, first: bool) -> None:
-    """Keypoints of the true poses at a time on the image plane; names in the first view."""
+def _camera_view(axis, log: FlightLog, camera: KeypointCamera, time: float, first: bool) -> bool:
+    """Keypoints of the true poses at a time, named in the first view; returns whether all are seen."""
 
     def one(name: str) -> torch.Tensor:
         return torch.tensor(_at(log, name, time)[None], dtype=torch.float32)
@@ -207,8 +217,9 @@ def _camera_view(axis, log: FlightLog, camera: KeypointCamera, time: float, firs
     circle = Ellipse((lens.params.cx, lens.params.cy), *size, transform=axis.transData)
     axis.imshow(picture, interpolation="antialiased").set_clip_path(circle)
     axis.set_axis_off()
+    seen = bool(valid.all())
     if not first:
-        return
+        return seen
     pixels = lens.denormalize(points[0].double()).numpy()
     for name, part in (("target", slice(0, GOAL_KEYPOINTS)), ("ball", slice(GOAL_KEYPOINTS, None))):
         right, middle = pixels[part, 0].max(), pixels[part, 1].mean()
@@ -220,3 +231,4 @@ def _camera_view(axis, log: FlightLog, camera: KeypointCamera, time: float, firs
         "90° off the axis", (lens.params.cx, lens.params.cy + quarter), xytext=(0, 4), textcoords="offset points",
         color="#B5B5B5", ha="center", va="bottom", fontsize=8,
     )  # fmt: skip
+    return seen

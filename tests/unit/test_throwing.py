@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from visthrow import compare, config, reference_protocol
+from visthrow import compare, config, demo, reference_protocol
 from visthrow.cli import main
 from visthrow.errors import ConfigError, MismatchError, PolicyError
 from visthrow.flight import fly
@@ -232,6 +232,34 @@ def test_protocol_on_the_reference_plant(dropper, monkeypatch):
     assert np.all(got["clearance"] > 0.2)
     assert np.all(got["smoothness"] < 0.6), "one jump of the release does not count, the four commands stand still"
     assert np.ptp(got["landing_w"][:, 0]) > 0.0
+
+
+@pytest.mark.slow
+def test_processes_throw_what_one_process_throws(dropper, tmp_path):
+    pytest.importorskip("mujoco")
+    dropping_policy("vision").save(tmp_path / "other.npz")
+    loaded = [load_policy(dropper), load_policy(tmp_path / "other.npz")]
+    with reference_protocol.Throwing(loaded, (1.0,), 2, "reference-realistic", 7, together=True) as throwing:
+        rows = throwing.results(show=False)
+    alone = reference_protocol.fly_batch(loaded, "reference-realistic", reference_protocol.Job((0, 1), 1.0, 0, 2, 7))
+    for policy, row in enumerate(rows):
+        part = slice(2 * policy, 2 * policy + 2)
+        np.testing.assert_array_equal(row[0].landing_w, alone["landing_w"][part])
+        np.testing.assert_array_equal(row[0].duration, alone["duration"][part])
+
+
+def test_demo_without_mujoco(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("visthrow.policy.SHIPPED", tmp_path)
+    for name in demo.POLICIES:
+        dropping_policy(name).save(tmp_path / f"{name}.npz")
+    monkeypatch.setattr(demo, "THROWS", 3)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    assert main(["demo", "--out", str(tmp_path / "out")]) == 0
+    told = capsys.readouterr().out
+    assert "needs MuJoCo" in told
+    listed = [line.strip() for line in told.partition("Files:")[2].splitlines() if line.startswith("  ")]
+    assert sorted(listed) == sorted(str(path) for path in (tmp_path / "out").iterdir())
+    assert len(listed) == 6
 
 
 def test_plan_covers_every_throw_once():
