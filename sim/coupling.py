@@ -19,7 +19,9 @@ def build_root(t: Types):
     real = t.real
 
     @wp.func
-    def root(p: Vehicle, rope: Rope, s: QuadState, force_b: vec3, torque_b: vec3, d: vec3, o: vec3, b: vec3, gravity: vec3):
+    def root(
+        p: Vehicle, rope: Rope, s: QuadState, force_b: vec3, torque_b: vec3, d: vec3, o: vec3, b: vec3, gravity: vec3
+    ):
         r = rope.mount
         rot = wp.quat_to_matrix(s.quat_wb)
         inv_mass = real(1.0) / p.body.mass
@@ -27,9 +29,7 @@ def build_root(t: Types):
         acc = inv_mass * (rot * force_b) + gravity
         free = acc + rot * (wp.cross(alpha, r) + wp.cross(s.rate_b, wp.cross(s.rate_b, r)))
         arm = rot * wp.skew(r)
-        inv_inertia = vec3(
-            real(1.0) / p.body.inertia[0], real(1.0) / p.body.inertia[1], real(1.0) / p.body.inertia[2]
-        )
+        inv_inertia = vec3(real(1.0) / p.body.inertia[0], real(1.0) / p.body.inertia[1], real(1.0) / p.body.inertia[2])
         mobility = wp.diag(vec3(inv_mass, inv_mass, inv_mass)) + arm * wp.diag(inv_inertia) * wp.transpose(arm)
         mass = mat33(d[0], o[0], o[1], o[0], d[1], o[2], o[1], o[2], d[2])
         eye = wp.diag(vec3(real(1.0), real(1.0), real(1.0)))
@@ -81,9 +81,18 @@ def build_coupled_step(t: Types, flow, rate, motor_advance, chain: SimpleNamespa
 
     @wp.func
     def step(
-        p: Vehicle, rope: Rope, s: QuadState, total: vec3, command: vec4,
-        n: wp.array(dtype=vec3), u: wp.array(dtype=vec3), stiffness: wp.array(dtype=real),
-        gravity: vec3, gamma: real, max_turn: real, h: real,
+        p: Vehicle,
+        rope: Rope,
+        s: QuadState,
+        total: vec3,
+        command: vec4,
+        n: wp.array(dtype=vec3),
+        u: wp.array(dtype=vec3),
+        stiffness: wp.array(dtype=real),
+        gravity: vec3,
+        gamma: real,
+        max_turn: real,
+        h: real,
     ):
         k1 = wp.zeros(shape=(L,), dtype=vec3)
         n2 = wp.zeros(shape=(L,), dtype=vec3)

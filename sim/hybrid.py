@@ -13,7 +13,6 @@ from sim.randomize import build_reset
 from sim.step import build_step
 from sim.structs import kinds_of, pack, pack_rope, pack_vehicle, types
 
-wp.config.log_level = wp.LOG_WARNING
 _BUILDS: dict = {}
 
 
@@ -38,7 +37,9 @@ def tether_lengths(rope: RopeParams, z: RandomizationParams) -> list[RopeParams]
     """
     if z.tether_variants < 1:
         raise ValueError(f"tether_variants {z.tether_variants}: expected 1 or more")
-    factors = [1.0] if z.tether_variants == 1 else np.linspace(1 - z.tether_spread, 1 + z.tether_spread, z.tether_variants)
+    factors = (
+        [1.0] if z.tether_variants == 1 else np.linspace(1 - z.tether_spread, 1 + z.tether_spread, z.tether_variants)
+    )
     return [
         dataclasses.replace(rope, length=rope.length * float(f), rope_mass=rope.rope_mass * float(f)) for f in factors
     ]
@@ -58,8 +59,15 @@ class HybridSim:
     """
 
     def __init__(
-        self, params: PlantParams, count: int, device: str = "cpu", seed: int = 0, *, vehicles: list[VehicleParams] | None = None,
-        ropes: list[RopeParams] | None = None, direct: bool = False,
+        self,
+        params: PlantParams,
+        count: int,
+        device: str = "cpu",
+        seed: int = 0,
+        *,
+        vehicles: list[VehicleParams] | None = None,
+        ropes: list[RopeParams] | None = None,
+        direct: bool = False,
         gravity: float = GRAVITY,
     ):
         """Allocate ``count`` plants.
@@ -84,7 +92,9 @@ class HybridSim:
         ropes = ropes or [params.rope]
         vehicles = vehicles or [params.vehicle]
         if {r.segments for r in ropes} != {params.rope.segments}:
-            raise ValueError(f"ropes of {sorted({r.segments for r in ropes})} segments in one batch of {params.rope.segments}")
+            raise ValueError(
+                f"ropes of {sorted({r.segments for r in ropes})} segments in one batch of {params.rope.segments}"
+            )
         self.params, self.count, self.device, self.seed = params, count, device, seed
         self.gravity = gravity
         self.types, self._step, self._reset = _kernels(params, direct)
@@ -111,10 +121,24 @@ class HybridSim:
         """Advance every plant by one control period under ``command`` and ``release``."""
         s = self.params.sim
         wp.launch(
-            self._step.step, self.count,
-            [self._vehicles, self._ropes, self._release, s.control_period, s.substep, s.gamma, s.max_turn, self.gravity,
-             self.state, self.command, self.release, self.out],
-            device=self.device, block_dim=64,
+            self._step.step,
+            self.count,
+            [
+                self._vehicles,
+                self._ropes,
+                self._release,
+                s.control_period,
+                s.substep,
+                s.gamma,
+                s.max_turn,
+                self.gravity,
+                self.state,
+                self.command,
+                self.release,
+                self.out,
+            ],
+            device=self.device,
+            block_dim=64,
         )
 
     def randomize(self, spreads: RandomizationParams, mask: wp.array | None = None) -> None:
@@ -124,15 +148,31 @@ class HybridSim:
             self._spreads = (spreads, wp.array(packed, dtype=self.types.Randomization, device=self.device))
         mask = self._all if mask is None else mask
         wp.launch(
-            self._reset.randomize, self.count,
-            [self._vehicles, self._ropes, self._spreads[1], self.gravity, self.seed, self.state, self.episode, mask, self.goal_w],
+            self._reset.randomize,
+            self.count,
+            [
+                self._vehicles,
+                self._ropes,
+                self._spreads[1],
+                self.gravity,
+                self.seed,
+                self.state,
+                self.episode,
+                mask,
+                self.goal_w,
+            ],
             device=self.device,
         )
         self._update_payload()
 
     def place(
-        self, pos_w: np.ndarray, quat_wb: np.ndarray | None = None, vel_w: np.ndarray | None = None,
-        rate_b: np.ndarray | None = None, cable_dir_w: np.ndarray | None = None, cable_vel_w: np.ndarray | None = None,
+        self,
+        pos_w: np.ndarray,
+        quat_wb: np.ndarray | None = None,
+        vel_w: np.ndarray | None = None,
+        rate_b: np.ndarray | None = None,
+        cable_dir_w: np.ndarray | None = None,
+        cable_vel_w: np.ndarray | None = None,
         battery_used: float = 0.0,
     ) -> None:
         """Put every plant into a stated pose, actuators at hover, command queue filled with hover.
@@ -151,12 +191,17 @@ class HybridSim:
         E, L = self.count, self.params.rope.segments
         level, down = np.tile([0.0, 0.0, 0.0, 1.0], (E, 1)), np.tile([0.0, 0.0, -1.0], (E, L, 1))
         given = {
-            "pos_w": (pos_w, (E, 3), None), "quat_wb": (quat_wb, (E, 4), level), "vel_w": (vel_w, (E, 3), None),
-            "rate_b": (rate_b, (E, 3), None), "cable_dir_w": (cable_dir_w, (E, L, 3), down),
+            "pos_w": (pos_w, (E, 3), None),
+            "quat_wb": (quat_wb, (E, 4), level),
+            "vel_w": (vel_w, (E, 3), None),
+            "rate_b": (rate_b, (E, 3), None),
+            "cable_dir_w": (cable_dir_w, (E, L, 3), down),
             "cable_vel_w": (cable_vel_w, (E, L, 3), None),
         }
         for name, (value, shape, default) in given.items():
-            value = (np.zeros(shape) if default is None else default) if value is None else np.asarray(value, dtype=float)
+            value = (
+                (np.zeros(shape) if default is None else default) if value is None else np.asarray(value, dtype=float)
+            )
             if value.shape != shape:
                 raise ValueError(f"{name} of shape {value.shape}: expected {shape}")
             target = getattr(self.state, name)
@@ -164,8 +209,10 @@ class HybridSim:
         self.state.mass_scale.fill_(1.0)
         self._used.fill_(battery_used)
         wp.launch(
-            self._reset.place, self.count,
-            [self._vehicles, self._ropes, self.gravity, self.state, self._all, self._used], device=self.device,
+            self._reset.place,
+            self.count,
+            [self._vehicles, self._ropes, self.gravity, self.state, self._all, self._used],
+            device=self.device,
         )
         self._update_payload()
 

@@ -65,7 +65,8 @@ class ControllerParams:
     ``pitch_i = -tau_y x_i / (4 xbar^2)``, ``yaw_i = tau_z s_i / (4 kappa)`` (``ybar^2`` mean of y_i^2, ``xbar^2`` of x_i^2,
     kappa the nominal torque-to-thrust ratio). With D = f_max - f_min: roll+pitch are scaled by D / range where their range
     exceeds D; then yaw is clipped to what range D leaves; then the collective is shifted so that every f_i lies in
-    [f_min, f_max]. ``f_max = max_thrust (u / u_ref)^2`` follows the battery voltage u. Motor-speed set-point: ``Omega* = sqrt(f_i / k_f) (1 + (1 - voltage_compensation) (u / u_ref - 1))``.
+    [f_min, f_max]. ``f_max = max_thrust (u / u_ref)^2`` follows the battery voltage u. Motor-speed set-point:
+    ``Omega* = sqrt(f_i / k_f) (1 + (1 - voltage_compensation) (u / u_ref - 1))``.
 
     ``geometric`` (the ablation): ``tau = geometric_gain J (w_cmd - w) + w x J w`` without filters, integral or
     voltage; f_i clipped one by one to [f_min, max_thrust]; ``Omega* = sqrt(f_i / k_f)``.

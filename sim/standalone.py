@@ -160,8 +160,16 @@ class QuadSim:
     """
 
     def __init__(
-        self, vehicle: VehicleParams, count: int, integrator: str = "rk4", step: float = 0.002,
-        control_period: float = 0.02, device: str = "cpu", precision: str = "float32", *, vehicles: list[VehicleParams] | None = None,
+        self,
+        vehicle: VehicleParams,
+        count: int,
+        integrator: str = "rk4",
+        step: float = 0.002,
+        control_period: float = 0.02,
+        device: str = "cpu",
+        precision: str = "float32",
+        *,
+        vehicles: list[VehicleParams] | None = None,
         gravity: float = GRAVITY,
     ):
         """Allocate ``count`` quadrotors at the origin, in hover.
@@ -211,9 +219,18 @@ class QuadSim:
     def step(self) -> None:
         """Advance every quadrotor by one control period under ``command``, ``force_w`` and ``torque_b``."""
         wp.launch(
-            self._step, self.count,
-            [self._vehicles, self.control_period, self.integration_step, self.gravity, self.state, self.command,
-             self.force_w, self.torque_b],
+            self._step,
+            self.count,
+            [
+                self._vehicles,
+                self.control_period,
+                self.integration_step,
+                self.gravity,
+                self.state,
+                self.command,
+                self.force_w,
+                self.torque_b,
+            ],
             device=self.device,
         )
 
@@ -225,8 +242,12 @@ class QuadSim:
         )
 
     def place(
-        self, pos_w: np.ndarray, quat_wb: np.ndarray | None = None, vel_w: np.ndarray | None = None,
-        rate_b: np.ndarray | None = None, battery_used: float = 0.0,
+        self,
+        pos_w: np.ndarray,
+        quat_wb: np.ndarray | None = None,
+        vel_w: np.ndarray | None = None,
+        rate_b: np.ndarray | None = None,
+        battery_used: float = 0.0,
     ) -> None:
         """Set ``start`` for every environment and reset all.
 

@@ -19,23 +19,37 @@ ROPE_IN_ROTOR = 8
 """Status bit: a joint of the rope passed through a propeller disc."""
 
 QUAD_FIELDS = {  # name: (type, also by row); the fields of t.QuadState in its order
-    "pos_w": ("vec3", False), "quat_wb": ("quat", False), "vel_w": ("vec3", False), "rate_b": ("vec3", False),
-    "motor_speed": ("vec4", False), "integral": ("vec3", False), "setpoint": ("vec3", False), "gyro": ("vec3", False),
-    "charge_used": ("real", False), "voltage": ("real", False),
+    "pos_w": ("vec3", False),
+    "quat_wb": ("quat", False),
+    "vel_w": ("vec3", False),
+    "rate_b": ("vec3", False),
+    "motor_speed": ("vec4", False),
+    "integral": ("vec3", False),
+    "setpoint": ("vec3", False),
+    "gyro": ("vec3", False),
+    "charge_used": ("real", False),
+    "voltage": ("real", False),
 }
 
 STATE_FIELDS = QUAD_FIELDS | {  # those by row have a row a segment, the queue a row a slot
     "mass_scale": ("real", False),
-    "cable_dir_w": ("vec3", True), "cable_vel_w": ("vec3", True), "stiffness": ("real", True),
+    "cable_dir_w": ("vec3", True),
+    "cable_vel_w": ("vec3", True),
+    "stiffness": ("real", True),
     "queue": ("vec4", True),  # (D, E) commands, newest first
     "release_timer": ("real", False),  # time to separation [s]; negative: not latched
-    "attached": ("int", False), "status": ("int", False),
+    "attached": ("int", False),
+    "status": ("int", False),
 }
 
 OUTPUT_FIELDS = {
-    "payload_pos_w": "vec3", "payload_vel_w": "vec3",  # at the end of the step, or at separation once released
+    "payload_pos_w": "vec3",
+    "payload_vel_w": "vec3",  # at the end of the step, or at separation once released
     "separated": "int",  # separation happened within this step
-    "landing_w": "vec3", "time_to_impact": "real", "clearance": "real", "separation_time": "real",  # valid once released
+    "landing_w": "vec3",
+    "time_to_impact": "real",
+    "clearance": "real",
+    "separation_time": "real",  # valid once released
     "release_pos_w": "vec3",  # vehicle at separation
 }
 
@@ -43,10 +57,14 @@ OUTPUT_FIELDS = {
 def array_struct(t: Types, name: str, fields: dict[str, tuple[str, bool]]) -> type:
     """Warp struct that holds one array per field."""
     scalar = {"real": t.real, "int": wp.int32, "vec3": t.vec3, "vec4": t.vec4, "quat": t.quat}
-    return make_struct(name, {k: wp.array(dtype=scalar[kind], ndim=2 if rows else 1) for k, (kind, rows) in fields.items()})
+    return make_struct(
+        name, {k: wp.array(dtype=scalar[kind], ndim=2 if rows else 1) for k, (kind, rows) in fields.items()}
+    )
 
 
-def allocate(t: Types, struct: type, fields: dict[str, tuple[str, bool]], count: int, rows: dict[str, int], device: str):
+def allocate(
+    t: Types, struct: type, fields: dict[str, tuple[str, bool]], count: int, rows: dict[str, int], device: str
+):
     """Zeroed arrays of shape (E,), or (rows[name], E), in an instance of ``struct``."""
     scalar = {"real": t.real, "int": wp.int32, "vec3": t.vec3, "vec4": t.vec4, "quat": t.quat}
     out = struct()

@@ -18,8 +18,6 @@ from sim.rope.chain import build_chain
 from sim.structs import Types
 
 SPEED_LIMIT = 1000.0  # [m/s], [rad/s]: beyond it a state is broken, not fast
-wp.config.enable_backward = False
-wp.config.max_unroll = 4  # longer unrolled loops cost half a minute of compile time and gain nothing
 
 
 @dataclass(frozen=True)
@@ -80,8 +78,16 @@ def build_step(t: Types, params: PlantParams, direct: bool = False) -> StepKerne
 
     @wp.func
     def separate(
-        p: Vehicle, rope: Rope, r: Release, s: QuadState, n: wp.array(dtype=vec3), u: wp.array(dtype=vec3),
-        gravity: real, out: Output, env: int, elapsed: real,
+        p: Vehicle,
+        rope: Rope,
+        r: Release,
+        s: QuadState,
+        n: wp.array(dtype=vec3),
+        u: wp.array(dtype=vec3),
+        gravity: real,
+        out: Output,
+        env: int,
+        elapsed: real,
     ):
         """Write what follows from the payload's state at separation."""
         mount = s.pos_w + wp.quat_rotate(s.quat_wb, rope.mount)
@@ -161,7 +167,9 @@ def build_step(t: Types, params: PlantParams, direct: bool = False) -> StepKerne
             active = state.queue[wp.min(slot, depth - 1), env]
             for k in range(count):
                 if attached != 0:
-                    s, total, fell_back = coupled.step(p, rope, s, total, active, n, u, stiffness, g, gamma, max_turn, h)
+                    s, total, fell_back = coupled.step(
+                        p, rope, s, total, active, n, u, stiffness, g, gamma, max_turn, h
+                    )
                     if fell_back:
                         status = status | 2
                 else:

@@ -13,6 +13,7 @@ import numpy as np
 import warp as wp
 
 from sim import params as P
+from sim import runtime  # noqa: F401  starts Warp
 from sim.checks import check_rope, check_vehicle
 
 
@@ -40,22 +41,50 @@ class Types:
         self.Vehicle = self._from_dataclass(P.VehicleParams, {"mixer": self.Mixer})
         self.Release = self._from_dataclass(P.ReleaseParams, {})
         self.Randomization = self._from_dataclass(P.RandomizationParams, {})
-        self.Rope = make_struct("Rope", {
-            "mount": self.vec3, "segment_length": real, "segment_mass": real, "segment_inertia": real,
-            "last_mass": real, "last_center": real, "last_inertia": real, "payload_offset": real,
-            "payload_radius": real, "joint_damping": real, "total_mass": real,
-        })
+        self.Rope = make_struct(
+            "Rope",
+            {
+                "mount": self.vec3,
+                "segment_length": real,
+                "segment_mass": real,
+                "segment_inertia": real,
+                "last_mass": real,
+                "last_center": real,
+                "last_inertia": real,
+                "payload_offset": real,
+                "payload_radius": real,
+                "joint_damping": real,
+                "total_mass": real,
+            },
+        )
         fields = {
-            "pos_w": self.vec3, "quat_wb": self.quat, "vel_w": self.vec3, "rate_b": self.vec3, "motor_speed": self.vec4,
-            "integral": self.vec3, "setpoint": self.vec3, "gyro": self.vec3, "charge_used": real, "voltage": real,
+            "pos_w": self.vec3,
+            "quat_wb": self.quat,
+            "vel_w": self.vec3,
+            "rate_b": self.vec3,
+            "motor_speed": self.vec4,
+            "integral": self.vec3,
+            "setpoint": self.vec3,
+            "gyro": self.vec3,
+            "charge_used": real,
+            "voltage": real,
         }
         self.QuadState = make_struct("QuadState", fields)
         self.QuadRate = make_struct("QuadRate", dict(fields))
-        self.Flow = make_struct("Flow", {
-            "force_b": self.vec3, "torque_b": self.vec3, "motor_speed": self.vec4, "motor_rate": self.vec4,
-            "integral_rate": self.vec3, "setpoint_rate": self.vec3, "gyro_rate": self.vec3,
-            "charge_rate": real, "voltage_rate": real,
-        })
+        self.Flow = make_struct(
+            "Flow",
+            {
+                "force_b": self.vec3,
+                "torque_b": self.vec3,
+                "motor_speed": self.vec4,
+                "motor_rate": self.vec4,
+                "integral_rate": self.vec3,
+                "setpoint_rate": self.vec3,
+                "gyro_rate": self.vec3,
+                "charge_rate": real,
+                "voltage_rate": real,
+            },
+        )
 
     def _field_type(self, annotation) -> type | None:
         if annotation is float:
@@ -118,7 +147,9 @@ def pack_vehicle(t: Types, vehicles: list[P.VehicleParams], kinds: tuple[str, st
     rows = np.zeros(len(vehicles), dtype=t.Vehicle.numpy_dtype())
     for row, vehicle in zip(rows, vehicles, strict=True):
         if kinds_of(vehicle) != kinds:
-            raise ValueError(f"vehicle of the kinds {kinds_of(vehicle)} in a batch of {kinds}: expected the same blocks")
+            raise ValueError(
+                f"vehicle of the kinds {kinds_of(vehicle)} in a batch of {kinds}: expected the same blocks"
+            )
         check_vehicle(vehicle)
         _fill(row, vehicle)
         columns = mixer_columns(vehicle.rotors, vehicle.thrust.torque_ratio)

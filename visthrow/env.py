@@ -56,7 +56,9 @@ class ThrowEnv(VecEnv):
         self.num_actions = act.ACTIONS
         self.device = device
         self.max_episode_length = round(task.bounds.time_limit / experiment.sim.control_period)
-        self.sim = HybridSim(plant_of(experiment), self.num_envs, device, seed, ropes=tether_lengths(experiment.rope, task.start))
+        self.sim = HybridSim(
+            plant_of(experiment), self.num_envs, device, seed, ropes=tether_lengths(experiment.rope, task.start)
+        )
         self.views = TorchViews(self.sim)
         self.layout = ob.layout_of(task.observation)
         self.camera = KeypointCamera(experiment.camera, device)
@@ -164,7 +166,14 @@ class ThrowEnv(VecEnv):
         time = self.episode_length_buf * period
         payload = out["payload_pos_w"]
         negative = ~released & terminations.negative(
-            task.bounds, state["pos_w"], rot_wb, payload, state["status"], latched, time, self.cfg.release.landing_height
+            task.bounds,
+            state["pos_w"],
+            rot_wb,
+            payload,
+            state["status"],
+            latched,
+            time,
+            self.cfg.release.landing_height,
         )
         error = (out["landing_w"] - self.views.goal_w)[:, :2].square().sum(-1).sqrt()
         carry = (
@@ -194,7 +203,14 @@ class ThrowEnv(VecEnv):
         last = self.last
         hit = last["released"].to(torch.float64)
         lost = (self.cfg.release.clearance_margin - last["clearance"]).clamp(min=0.0)
-        sums = [done.to(torch.float64), hit, last["landing_error"] * hit, last["duration"] * hit, self.episode_length_buf * done, lost * hit]
+        sums = [
+            done.to(torch.float64),
+            hit,
+            last["landing_error"] * hit,
+            last["duration"] * hit,
+            self.episode_length_buf * done,
+            lost * hit,
+        ]
         self._memory["totals"] += torch.stack([s.sum() for s in sums])
 
     def _begin(self, fresh: Tensor) -> None:
@@ -203,8 +219,11 @@ class ThrowEnv(VecEnv):
         self.episode_length_buf.masked_fill_(fresh, 0)
         memory["previous"].copy_(torch.where(fresh[:, None], self._start_action, memory["previous"]))
         spreads = {
-            "frame_bias": noise.observation_bias, "command_bias": noise.command_bias, "keypoint_bias": camera.noise.bias_std,
-            "extrinsic_rotation": camera.mount.rotation_error_std, "extrinsic_offset": camera.mount.position_error_std,
+            "frame_bias": noise.observation_bias,
+            "command_bias": noise.command_bias,
+            "keypoint_bias": camera.noise.bias_std,
+            "extrinsic_rotation": camera.mount.rotation_error_std,
+            "extrinsic_offset": camera.mount.position_error_std,
         }
         for name, std in spreads.items():
             if std > 0.0:
@@ -244,7 +263,9 @@ class ThrowEnv(VecEnv):
                 rot_wb = torch.stack([x_axis, y_axis, torch.linalg.cross(x_axis, y_axis)], dim=-1)
             points, valid = self._see(pose[:, :3], rot_wb, pose[:, ob.VEHICLE :], fresh)
             measured = torch.cat([measured[:, : ob.VEHICLE], points.flatten(1)], dim=-1)
-        actor, history = ob.observe(self.layout, measured, valid, memory["previous"], attached, memory["history"], fresh)
+        actor, history = ob.observe(
+            self.layout, measured, valid, memory["previous"], attached, memory["history"], fresh
+        )
         memory["history"].copy_(history)
         goal_offset, relative = exact[:, ob.VEHICLE : ob.VEHICLE + 2], exact[:, ob.VEHICLE + 2 :]
         true_history = hist.push(memory["true_history"], relative, fresh)
@@ -252,7 +273,8 @@ class ThrowEnv(VecEnv):
         time = self.episode_length_buf.to(torch.float32) * self.cfg.sim.control_period
         inner = torch.stack([state["release_timer"], time, state["mass_scale"], state["voltage"], attached], dim=-1)
         critic = torch.cat(
-            [vehicle, memory["previous"], goal_offset, true_history.flatten(1), self.views.out["payload_vel_w"], inner], dim=-1
+            [vehicle, memory["previous"], goal_offset, true_history.flatten(1), self.views.out["payload_vel_w"], inner],
+            dim=-1,
         )
         return TensorDict({"actor": actor, "critic": critic}, batch_size=[self.num_envs], device=self.device)
 
@@ -262,9 +284,7 @@ class ThrowEnv(VecEnv):
         extrinsics = None
         if camera.mount.rotation_error_std > 0.0 or camera.mount.position_error_std > 0.0:
             extrinsics = self.camera.extrinsics(memory["extrinsic_rotation"], memory["extrinsic_offset"])
-        points, valid = ob.vision_part(
-            self.camera, pos_w, rot_wb, self.views.goal_w, payload_w, extrinsics
-        )
+        points, valid = ob.vision_part(self.camera, pos_w, rot_wb, self.views.goal_w, payload_w, extrinsics)
         if camera.noise.latency > 0.0:
             memory["late_points"].copy_(hist.push(memory["late_points"], points, fresh))
             memory["late_valid"].copy_(hist.push(memory["late_valid"], valid, fresh))
@@ -274,9 +294,17 @@ class ThrowEnv(VecEnv):
 
     def _tensors(self) -> dict[str, Tensor]:
         """All that the next step depends on, besides torch's generators."""
-        found = {f"sim.{k}": v for k, v in self.views.state.items()} | {f"out.{k}": v for k, v in self.views.out.items()}
-        found |= {f"memory.{k}": v for k, v in self._memory.items()} | {f"obs.{k}": v for k, v in self._observations.items()}
-        return found | {"episode": wp.to_torch(self.sim.episode), "goal_w": self.views.goal_w, "length": self.episode_length_buf}
+        found = {f"sim.{k}": v for k, v in self.views.state.items()} | {
+            f"out.{k}": v for k, v in self.views.out.items()
+        }
+        found |= {f"memory.{k}": v for k, v in self._memory.items()} | {
+            f"obs.{k}": v for k, v in self._observations.items()
+        }
+        return found | {
+            "episode": wp.to_torch(self.sim.episode),
+            "goal_w": self.views.goal_w,
+            "length": self.episode_length_buf,
+        }
 
     def state_dict(self) -> dict[str, Tensor]:
         """Copy of all that the next step depends on, besides torch's generators."""

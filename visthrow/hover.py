@@ -33,7 +33,7 @@ class HoverParams:
     max_speed: float = 1.5  # of the velocity asked for [m/s]
     max_acceleration: float = 6.0  # up and down, asked for besides gravity [m/s^2]
     max_tilt: float = 0.6  # of the thrust asked for [rad]
-    attitude_gain: float = 10.0  # [1/s]
+    attitude_gain: float = 9.0  # [1/s]
     yaw_gain: float = 2.0  # [1/s]
     max_rate: tuple[float, float, float] = (8.0, 8.0, 2.0)  # [rad/s]
     min_thrust: float = 0.2  # [N]

@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from camera.history import push
-from camera.keypoints import GOAL_KEYPOINTS, KEYPOINTS, KeypointCamera, keypoints
+from camera.keypoints import KEYPOINTS, KeypointCamera, keypoints
 
 VEHICLE = 15
 """Width of the vehicle's own part."""

@@ -111,6 +111,11 @@ def _fly(env: ThrowEnv, policy, target: float, count: int) -> Throws:
     array = {k: v.cpu().numpy().astype(np.float64) for k, v in kept.items()}
     smoothness = (change / steps.clamp(min=1)).sqrt().cpu().numpy().astype(np.float64)
     return Throws(
-        target, success, array["landing_w"][:, :2] * blank[:, None], array["landing_error"] * blank, array["duration"] * blank,
-        array["clearance"] * blank, smoothness * blank,
+        target,
+        success,
+        array["landing_w"][:, :2] * blank[:, None],
+        array["landing_error"] * blank,
+        array["duration"] * blank,
+        array["clearance"] * blank,
+        smoothness * blank,
     )

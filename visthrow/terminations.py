@@ -40,8 +40,16 @@ def collided(status: Tensor) -> Tensor:
     return torch.bitwise_and(status, COLLISION) != 0
 
 
-def negative(p: BoundsParams, pos_w: Tensor, rot_wb: Tensor, payload_w: Tensor, status: Tensor, latched: Tensor, time: Tensor,
-             landing_height: float) -> Tensor:
+def negative(
+    p: BoundsParams,
+    pos_w: Tensor,
+    rot_wb: Tensor,
+    payload_w: Tensor,
+    status: Tensor,
+    latched: Tensor,
+    time: Tensor,
+    landing_height: float,
+) -> Tensor:
     """All negative ends. Once the latch has tripped only collision and leaving the bounds end an episode early.
 
     Args:
@@ -53,7 +61,9 @@ def negative(p: BoundsParams, pos_w: Tensor, rot_wb: Tensor, payload_w: Tensor, 
     """
     always = out_of_bounds(p, pos_w) | collided(status) | broken(status)
     carrying = (
-        tilted(p, rot_wb) | payload_above(pos_w, payload_w) | payload_on_ground(payload_w, landing_height)
+        tilted(p, rot_wb)
+        | payload_above(pos_w, payload_w)
+        | payload_on_ground(payload_w, landing_height)
         | (time > p.time_limit - 1e-6)
     )
     return always | (carrying & ~latched)

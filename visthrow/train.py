@@ -39,18 +39,34 @@ class CapturableGaussian(GaussianDistribution):
 def rsl_rl_config(p: PPOParams, ranks: dict | None) -> dict:
     """Configuration dictionary of rsl_rl 5.5 for our parameters; both observation groups are named."""
     network = {
-        "class_name": "MLPModel", "hidden_dims": list(p.hidden), "activation": p.activation, "obs_normalization": p.normalize,
+        "class_name": "MLPModel",
+        "hidden_dims": list(p.hidden),
+        "activation": p.activation,
+        "obs_normalization": p.normalize,
     }
     spread = {"class_name": CapturableGaussian, "init_std": p.initial_std, "std_type": "log"}
     algorithm = {
-        "class_name": "PPO", "num_learning_epochs": p.epochs, "num_mini_batches": p.minibatches, "learning_rate": p.learning_rate,
-        "schedule": p.schedule, "desired_kl": p.desired_kl, "gamma": p.discount, "lam": p.gae_lambda, "clip_param": p.clip,
-        "entropy_coef": p.entropy, "value_loss_coef": p.value_coefficient, "max_grad_norm": p.max_grad_norm,
+        "class_name": "PPO",
+        "num_learning_epochs": p.epochs,
+        "num_mini_batches": p.minibatches,
+        "learning_rate": p.learning_rate,
+        "schedule": p.schedule,
+        "desired_kl": p.desired_kl,
+        "gamma": p.discount,
+        "lam": p.gae_lambda,
+        "clip_param": p.clip,
+        "entropy_coef": p.entropy,
+        "value_loss_coef": p.value_coefficient,
+        "max_grad_norm": p.max_grad_norm,
         "use_clipped_value_loss": True,
     }
     return {
-        "num_steps_per_env": p.steps, "actor": {**network, "distribution_cfg": spread}, "critic": network, "algorithm": algorithm,
-        "obs_groups": {"actor": ["actor"], "critic": ["critic"]}, "multi_gpu": ranks,
+        "num_steps_per_env": p.steps,
+        "actor": {**network, "distribution_cfg": spread},
+        "critic": network,
+        "algorithm": algorithm,
+        "obs_groups": {"actor": ["actor"], "critic": ["critic"]},
+        "multi_gpu": ranks,
     }
 
 
@@ -73,7 +89,9 @@ class Trainer:
         """
         p = experiment.ppo
         if (p.environments * p.steps) % p.minibatches:
-            raise ConfigError(f"ppo: {p.environments} x {p.steps} samples do not divide into {p.minibatches} minibatches")
+            raise ConfigError(
+                f"ppo: {p.environments} x {p.steps} samples do not divide into {p.minibatches} minibatches"
+            )
         rank = ranks["global_rank"] if ranks else 0
         torch.manual_seed(seed * 1000 + rank)
         if device.startswith("cuda"):
@@ -93,7 +111,11 @@ class Trainer:
     @property
     def samples_per_iteration(self) -> int:
         """Environment steps an iteration, over all ranks."""
-        return self.experiment.ppo.environments * self.experiment.ppo.steps * (self.ranks["world_size"] if self.ranks else 1)
+        return (
+            self.experiment.ppo.environments
+            * self.experiment.ppo.steps
+            * (self.ranks["world_size"] if self.ranks else 1)
+        )
 
     def _rollout(self) -> None:
         obs = self._obs
@@ -133,7 +155,9 @@ class Trainer:
         done = min(self.iteration / p.iterations, 1.0)
         self.alg.desired_kl = (1.0 - done) * p.desired_kl + done * p.final_kl
         figures = self.alg.update()
-        if self._graph is not None:  # rsl_rl makes a new tensor of the spread; the graph reads the one it was captured with
+        if (
+            self._graph is not None
+        ):  # rsl_rl makes a new tensor of the spread; the graph reads the one it was captured with
             for normalizer, captured in self._captured_std:
                 captured.copy_(normalizer._std)
                 normalizer._std = captured
@@ -155,9 +179,14 @@ class Trainer:
         totals = self.env.totals
         released, episodes = max(totals["released"], 1.0), max(totals["episodes"], 1.0)
         figures |= {
-            "iteration": self.iteration, "released": totals["released"] / episodes, "landing_error": totals["landing_error"] / released,
-            "duration": totals["duration"] / released, "episodes": totals["episodes"], "learning_rate": self.alg.learning_rate,
-            "rollout_s": middle - start, "learning_s": end - middle,
+            "iteration": self.iteration,
+            "released": totals["released"] / episodes,
+            "landing_error": totals["landing_error"] / released,
+            "duration": totals["duration"] / released,
+            "episodes": totals["episodes"],
+            "learning_rate": self.alg.learning_rate,
+            "rollout_s": middle - start,
+            "learning_s": end - middle,
         }
         return figures
 
@@ -178,8 +207,13 @@ class Trainer:
     def save(self, path: Path) -> None:
         """Write a checkpoint that a resumed run goes on from as if it had not stopped; all or nothing."""
         content = {
-            "algorithm": self.alg.save(), "iteration": self.iteration, "env": self.env.state_dict(), "seed": self.seed,
-            "obs": {k: v.clone() for k, v in self._obs.items()}, "config": config.dumps(self.experiment), "rng": torch.get_rng_state(),
+            "algorithm": self.alg.save(),
+            "iteration": self.iteration,
+            "env": self.env.state_dict(),
+            "seed": self.seed,
+            "obs": {k: v.clone() for k, v in self._obs.items()},
+            "config": config.dumps(self.experiment),
+            "rng": torch.get_rng_state(),
             "cuda_rng": torch.cuda.get_rng_state(self.device) if self.device.startswith("cuda") else None,
         }
         buffer = io.BytesIO()
@@ -199,7 +233,9 @@ class Trainer:
         except Exception as error:
             raise CheckpointError(f"{path}: not a readable checkpoint ({error})") from error
         if saved["config"] != config.dumps(self.experiment) or saved["seed"] != self.seed:
-            raise CheckpointError(f"{path}: written by a run of another configuration or seed; resume with the same ones")
+            raise CheckpointError(
+                f"{path}: written by a run of another configuration or seed; resume with the same ones"
+            )
         self.alg.load(saved["algorithm"], None, True)
         self.env.load_state_dict(saved["env"])
         for key, value in saved["obs"].items():
@@ -212,7 +248,11 @@ class Trainer:
 
 def finish(trainer: Trainer, folder: Path, figures: dict) -> Policy:
     """Write the policy file and the run's summary into its folder."""
-    made_by = provenance.collect() | {"seed": trainer.seed, "config": config.to_dict(trainer.experiment), "figures": figures}
+    made_by = provenance.collect() | {
+        "seed": trainer.seed,
+        "config": config.to_dict(trainer.experiment),
+        "figures": figures,
+    }
     policy = trainer.export(made_by)
     policy.save(folder / POLICY)
     write_json(folder / "summary.json", {k: v for k, v in made_by.items() if k != "config"})

@@ -1,7 +1,6 @@
 """``visthrow train``: train a policy, with progress, evaluation on the way, checkpoints, resume."""
 
 import argparse
-import csv
 import os
 import sys
 import time
@@ -27,8 +26,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", metavar="FOLDER", help="folder of the run (default: runs/CONFIG-SEED)")
     parser.add_argument("--iterations", type=int, help="stop after this many iterations (default: the configuration's)")
     parser.add_argument("--minutes", type=float, help="stop, with a checkpoint, after this many minutes")
-    parser.add_argument("--evaluate-every", type=int, default=0, metavar="N", help="throw 200 times every N iterations (default: at the end only)")
-    parser.add_argument("--checkpoint-every", type=int, default=100, metavar="N", help="iterations between checkpoints (default: 100)")
+    parser.add_argument(
+        "--evaluate-every",
+        type=int,
+        default=0,
+        metavar="N",
+        help="throw 200 times every N iterations (default: at the end only)",
+    )
+    parser.add_argument(
+        "--checkpoint-every", type=int, default=100, metavar="N", help="iterations between checkpoints (default: 100)"
+    )
     parser.add_argument("--resume", action="store_true", help="go on from the folder's checkpoint")
     add_common(parser)
 
@@ -50,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
     from visthrow import config, device, provenance
     from visthrow.errors import CheckpointError
     from visthrow.task import Experiment
-    from visthrow.train import CHECKPOINT, Trainer, finish
+    from visthrow.train import CHECKPOINT, Trainer
 
     path = config.find("train", args.config)
     experiment = config.load(Experiment, path, args.overrides)
@@ -66,95 +73,92 @@ def run(args: argparse.Namespace) -> int:
     trainer = Trainer(experiment, name, args.seed, ranks)
     if args.resume:
         trainer.load(folder / CHECKPOINT)
-    last = args.iterations or experiment.ppo.iterations
-    log = Log(folder / "progress.csv", trainer.samples_per_iteration, last, start, quiet=not lead, resume=args.resume)
-    interrupted = False
-    try:
-        while trainer.iteration < last:
-            figures = trainer.step()
-            if lead and args.evaluate_every and trainer.iteration % args.evaluate_every == 0:
-                evaluated = trainer.evaluate(EVALUATION_TARGET)
-                nan = float("nan")
-                figures |= {"error_2m": evaluated.get("error_mean", nan), "duration_2m": evaluated.get("duration_mean", nan)}
-            log.row(figures)
-            if lead and trainer.iteration % args.checkpoint_every == 0:
-                trainer.save(folder / CHECKPOINT)
-            if args.minutes and time.perf_counter() - start > 60 * args.minutes and trainer.iteration < last:
-                interrupted = True
-                break
-    except KeyboardInterrupt:
-        interrupted = True
-    log.close()
+    finished = _loop(args, trainer, folder) if lead else _follow(args, trainer)
     if not lead:
         return 0
     trainer.save(folder / CHECKPOINT)
-    if interrupted:
-        print(f"\nstopped after iteration {trainer.iteration} of {last}; go on with: visthrow train {args.config} --seed {args.seed} "
-              f"--out {folder} --resume", file=sys.stderr)
+    if not finished:
+        print(
+            f"\nstopped after iteration {trainer.iteration} of {_last(args, trainer)}; go on with: visthrow train {args.config} "
+            f"--seed {args.seed} --out {folder} --resume",
+            file=sys.stderr,
+        )
         return 130
-    return _report(args, trainer, folder, finish, time.perf_counter() - start)
+    return _report(args, trainer, folder, time.perf_counter() - start)
 
 
-def _report(args: argparse.Namespace, trainer, folder: Path, finish, wall: float) -> int:
+def _last(args: argparse.Namespace, trainer) -> int:
+    return args.iterations or trainer.experiment.ppo.iterations
+
+
+def _follow(args: argparse.Namespace, trainer) -> bool:
+    """Train as one of several ranks that only the first reports on."""
+    while trainer.iteration < _last(args, trainer):
+        trainer.step()
+    return True
+
+
+def _loop(args: argparse.Namespace, trainer, folder: Path) -> bool:
+    """Train with log, evaluation and checkpoints; return whether the end was reached.
+
+    Raises:
+        TrainError: A file cannot be written; what the last checkpoint holds is not lost.
+    """
+    from visthrow.errors import StorageError, TrainError
+    from visthrow.train import CHECKPOINT
+    from visthrow.train_log import TrainLog
+
+    start, kept = time.perf_counter(), trainer.iteration
+    try:
+        with TrainLog(folder / "progress.csv", trainer.samples_per_iteration, _last(args, trainer), kept) as log:
+            while trainer.iteration < _last(args, trainer):
+                figures = trainer.step()
+                if args.evaluate_every and trainer.iteration % args.evaluate_every == 0:
+                    row = trainer.evaluate(EVALUATION_TARGET)
+                    nan = float("nan")
+                    figures |= {"error_2m": row.get("error_mean", nan), "duration_2m": row.get("duration_mean", nan)}
+                log.row(figures)
+                if trainer.iteration % args.checkpoint_every == 0:
+                    trainer.save(folder / CHECKPOINT)
+                    kept = trainer.iteration
+                if args.minutes and time.perf_counter() - start > 60 * args.minutes:
+                    return trainer.iteration >= _last(args, trainer)
+    except KeyboardInterrupt:
+        return False
+    except (OSError, StorageError) as error:
+        state = (
+            f"the checkpoint of iteration {kept} is whole; make room and go on with --resume"
+            if kept
+            else "no checkpoint yet"
+        )
+        raise TrainError(f"{folder}: cannot write ({error}) in iteration {trainer.iteration}; {state}") from error
+    return True
+
+
+def _report(args: argparse.Namespace, trainer, folder: Path, wall: float) -> int:
     from visthrow.protocol import TARGETS
     from visthrow.storage import write_json
+    from visthrow.train import finish
 
     rows = [trainer.evaluate(target) for target in TARGETS]
     figures = {
-        "throws": rows, "wall_s": wall, "iterations": trainer.iteration, "env_steps": trainer.iteration * trainer.samples_per_iteration,
+        "throws": rows,
+        "wall_s": wall,
+        "iterations": trainer.iteration,
+        "env_steps": trainer.iteration * trainer.samples_per_iteration,
         "seconds": dict(trainer.seconds),
     }
     finish(trainer, folder, figures)
     print(f"\n{trainer.iteration} iterations, {figures['env_steps'] / 1e6:.1f} M environment steps, {wall:.1f} s")
     for row in rows:
         if row["success"] > 0:
-            print(f"target {row['target']:.1f} m: error {row['error_mean']:.3f} +- {row['error_std']:.3f} m, duration "
-                  f"{row['duration_mean']:.3f} s, success {100 * row['success']:.1f} %")
+            print(
+                f"target {row['target']:.1f} m: error {row['error_mean']:.3f} +- {row['error_std']:.3f} m, duration "
+                f"{row['duration_mean']:.3f} s, success {100 * row['success']:.1f} %"
+            )
         else:
             print(f"target {row['target']:.1f} m: no throw succeeded")
     print(f"policy: {folder / 'policy.npz'}")
     if args.json:
         write_json(args.json, figures)
     return 0
-
-
-class Log:
-    """Progress line on the terminal and one CSV row an iteration."""
-
-    def __init__(self, path: Path, samples: int, last: int, start: float, quiet: bool, resume: bool):
-        self.samples, self.last, self.start, self.quiet = samples, last, start, quiet
-        self._file = None if quiet else open(path, "a" if resume else "w", newline="", encoding="utf-8")
-        self._writer = None
-        self._header = not (resume and path.stat().st_size > 0) if not quiet else False
-
-    def row(self, figures: dict) -> None:
-        """Write one iteration's figures."""
-        if self.quiet:
-            return
-        wall = time.perf_counter() - self.start
-        names = [
-            "iteration", "released", "landing_error", "duration", "episodes", "value", "surrogate", "entropy", "learning_rate",
-            "rollout_s", "learning_s", "wall_s", "error_2m", "duration_2m",
-        ]
-        if self._writer is None:
-            self._writer = csv.DictWriter(self._file, names, extrasaction="ignore")
-            if self._header:
-                self._writer.writeheader()
-        self._writer.writerow(figures | {"wall_s": wall})
-        self._file.flush()
-        speed = self.samples / (figures["rollout_s"] + figures["learning_s"])
-        text = (
-            f"iteration {figures['iteration']}/{self.last}  {speed / 1e6:.2f} M steps/s  released {100 * figures['released']:.0f} %  "
-            f"landing error {figures['landing_error']:.3f} m  {wall:.0f} s"
-        )
-        if "error_2m" in figures:
-            print(f"\r{text}  at 2.0 m: {figures['error_2m']:.4f} m, {figures['duration_2m']:.3f} s", flush=True)
-        elif sys.stdout.isatty():
-            print(f"\r{text}   ", end="", flush=True)
-        elif figures["iteration"] % 25 == 0:
-            print(text, flush=True)
-
-    def close(self) -> None:
-        """Close the CSV file."""
-        if self._file is not None:
-            self._file.close()

@@ -68,7 +68,9 @@ def mix(p: Any, collective: Any, torque_b: Any, max_thrust: Any):
 
 
 @wp.func
-def rate_controller_betaflight(p: Any, command: Any, rate_b: Any, integral: Any, setpoint: Any, gyro: Any, voltage: Any):
+def rate_controller_betaflight(
+    p: Any, command: Any, rate_b: Any, integral: Any, setpoint: Any, gyro: Any, voltage: Any
+):
     """PID with feed-forward, filtered gyro and smoothed set-point, after Betaflight.
 
     Returns:
@@ -80,7 +82,10 @@ def rate_controller_betaflight(p: Any, command: Any, rate_b: Any, integral: Any,
     gyro_rate = (rate_b - gyro) / c.gyro_time_constant
     error = setpoint - rate_b
     torque = (
-        wp.cw_mul(c.p_gain, error) + integral - wp.cw_mul(c.d_gain, gyro_rate) + wp.cw_mul(c.feedforward_gain, setpoint_rate)
+        wp.cw_mul(c.p_gain, error)
+        + integral
+        - wp.cw_mul(c.d_gain, gyro_rate)
+        + wp.cw_mul(c.feedforward_gain, setpoint_rate)
     )
     ratio = voltage / p.battery.reference_voltage
     f, share, yaw_share = mix(p, command[0], torque, c.max_thrust * ratio * ratio)

@@ -35,7 +35,9 @@ from sim.structs import Types
 def sym_mul(d: Any, o: Any, v: Any):
     """Product of the symmetric matrix with diagonal ``d`` and off-diagonals ``o = (xy, xz, yz)`` and a vector."""
     return type(v)(
-        d[0] * v[0] + o[0] * v[1] + o[1] * v[2], o[0] * v[0] + d[1] * v[1] + o[2] * v[2], o[1] * v[0] + o[2] * v[1] + d[2] * v[2]
+        d[0] * v[0] + o[0] * v[1] + o[1] * v[2],
+        o[0] * v[0] + d[1] * v[1] + o[2] * v[2],
+        o[1] * v[0] + o[2] * v[1] + d[2] * v[2],
     )
 
 
@@ -117,9 +119,19 @@ def build_chain(t: Types, segments: int) -> SimpleNamespace:
     def build_up(direction, rate, terms):
         @wp.func
         def up(
-            rope: Rope, n: wp.array(dtype=vec3), u: wp.array(dtype=vec3), n2: wp.array(dtype=vec3), k1: wp.array(dtype=vec3),
-            stiffness: wp.array(dtype=real), root_rate_w: vec3, gravity: vec3, gamma: real, h: real,
-            c1: wp.array(dtype=vec3), c2: wp.array(dtype=vec3), hs: wp.array(dtype=vec2),
+            rope: Rope,
+            n: wp.array(dtype=vec3),
+            u: wp.array(dtype=vec3),
+            n2: wp.array(dtype=vec3),
+            k1: wp.array(dtype=vec3),
+            stiffness: wp.array(dtype=real),
+            root_rate_w: vec3,
+            gravity: vec3,
+            gamma: real,
+            h: real,
+            c1: wp.array(dtype=vec3),
+            c2: wp.array(dtype=vec3),
+            hs: wp.array(dtype=vec2),
         ):
             l = rope.segment_length
             l2 = l * l
@@ -197,9 +209,17 @@ def build_chain(t: Types, segments: int) -> SimpleNamespace:
 
     @wp.func
     def down_first(
-        rope: Rope, n: wp.array(dtype=vec3), u: wp.array(dtype=vec3), mount_acc_w: vec3, gamma: real, h: real,
-        c1: wp.array(dtype=vec3), c2: wp.array(dtype=vec3), hs: wp.array(dtype=vec2),
-        n2: wp.array(dtype=vec3), k1: wp.array(dtype=vec3),
+        rope: Rope,
+        n: wp.array(dtype=vec3),
+        u: wp.array(dtype=vec3),
+        mount_acc_w: vec3,
+        gamma: real,
+        h: real,
+        c1: wp.array(dtype=vec3),
+        c2: wp.array(dtype=vec3),
+        hs: wp.array(dtype=vec2),
+        n2: wp.array(dtype=vec3),
+        k1: wp.array(dtype=vec3),
     ):
         """Fill k1 and n2; return the largest squared rate [1/s^2] of the state and the predicted state."""
         a = mount_acc_w
@@ -217,10 +237,20 @@ def build_chain(t: Types, segments: int) -> SimpleNamespace:
 
     @wp.func
     def down_second(
-        rope: Rope, n: wp.array(dtype=vec3), u: wp.array(dtype=vec3), stiffness: wp.array(dtype=real),
-        mount_acc_w: vec3, mount_force_w: vec3, gravity: vec3, gamma: real, h: real,
-        c1: wp.array(dtype=vec3), c2: wp.array(dtype=vec3), hs: wp.array(dtype=vec2),
-        n2: wp.array(dtype=vec3), k1: wp.array(dtype=vec3),
+        rope: Rope,
+        n: wp.array(dtype=vec3),
+        u: wp.array(dtype=vec3),
+        stiffness: wp.array(dtype=real),
+        mount_acc_w: vec3,
+        mount_force_w: vec3,
+        gravity: vec3,
+        gamma: real,
+        h: real,
+        c1: wp.array(dtype=vec3),
+        c2: wp.array(dtype=vec3),
+        hs: wp.array(dtype=vec2),
+        n2: wp.array(dtype=vec3),
+        k1: wp.array(dtype=vec3),
     ):
         """Advance n, u, stiffness; ``mount_force_w`` is the vehicle's force on the chain. Return the new momentum."""
         a = mount_acc_w
@@ -277,6 +307,13 @@ def build_chain(t: Types, segments: int) -> SimpleNamespace:
         return total
 
     return SimpleNamespace(
-        up_first=up_first, up_second=up_second, down_first=down_first, down_second=down_second, fall_back=fall_back,
-        payload=payload, momentum=momentum, segments=L, vec2=vec2,
+        up_first=up_first,
+        up_second=up_second,
+        down_first=down_first,
+        down_second=down_second,
+        fall_back=fall_back,
+        payload=payload,
+        momentum=momentum,
+        segments=L,
+        vec2=vec2,
     )

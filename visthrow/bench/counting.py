@@ -262,6 +262,10 @@ def _vector(size: int, _dtype: Any) -> type:
     return _VECTORS.setdefault(size, type(f"Vec{size}", (Vec,), {"size": size}))
 
 
+def _isfinite(x) -> bool:
+    return all(math.isfinite(_raw(c)) for c in (x.c if hasattr(x, "c") else [x]))
+
+
 _VECTORS: dict[int, type] = {}
 
 
@@ -278,7 +282,7 @@ warp = SimpleNamespace(
     array=lambda *_, **__: lambda: None, array2d=lambda *_, **__: lambda: None, config=SimpleNamespace(), tid=lambda: 0,
     types=SimpleNamespace(vector=_vector, matrix=lambda shape, _: Mat33, quaternion=lambda _: Quat),
     zeros=lambda shape, dtype: [dtype() for _ in range(shape[0])],
-    abs=lambda x: Real(abs(_raw(x))), sqrt=_sqrt,
+    abs=lambda x: Real(abs(_raw(x))), sqrt=_sqrt, isfinite=_isfinite,
     ceil=_rounded(math.ceil), floor=_rounded(math.floor), max=_max, min=_min,
     clamp=lambda x, low, high: _min(_max(x, low), high), dot=lambda a, b: _dot(a.c, b.c), cross=_cross, length=_length,
     normalize=_normalize, cw_mul=lambda a, b: type(a)(*[x * y for x, y in zip(a.c, b.c)]),

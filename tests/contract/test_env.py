@@ -1,0 +1,168 @@
+"""The environment as rsl_rl's VecEnv: fresh tensors, groups, ends, what the actor may not see, the reward by hand."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from visthrow import actions, config, observations, rewards, terminations
+from visthrow.env import ThrowEnv
+from visthrow.task import Experiment
+
+PERIOD = 0.02
+
+
+def experiment(kind="state", noise=True):
+    """A shipped experiment; without noise every measurement is exact and current."""
+    e = config.load(Experiment, config.find("train", kind))
+    if noise:
+        return e
+    quiet = dataclasses.replace(
+        e.task.noise, observation_step=0.0, observation_bias=0.0, command_step=0.0, command_bias=0.0
+    )
+    seen = dataclasses.replace(e.task.observation, latency=(0.0, 0.0))
+    lens = dataclasses.replace(e.camera, noise=dataclasses.replace(e.camera.noise, step_std=0.0, bias_std=0.0))
+    return dataclasses.replace(e, camera=lens, task=dataclasses.replace(e.task, noise=quiet, observation=seen))
+
+
+@pytest.fixture(scope="module")
+def env():
+    torch.manual_seed(0)
+    return ThrowEnv(experiment(noise=False), count=16)
+
+
+def test_layouts_have_the_papers_sizes():
+    params = experiment("vision").task.observation
+    assert observations.layout_of(experiment().task.observation).dimension == 35
+    assert observations.layout_of(params).dimension == 69
+    assert observations.layout_of(dataclasses.replace(params, validity=False)).dimension == 61
+    with pytest.raises(ValueError, match="expected 'state' or 'vision'"):
+        observations.layout_of(dataclasses.replace(params, layout="lidar"))
+
+
+def test_groups_shapes_and_fresh_tensors(env):
+    first, _, _, extras = env.step(torch.zeros(16, 5))
+    kept = first["actor"].clone()
+    second, reward, done, _ = env.step(torch.zeros(16, 5))
+    assert set(first.keys()) == {"actor", "critic"}
+    assert second["actor"].shape == (16, 35) and second["critic"].shape == (16, 42)
+    assert reward.shape == done.shape == (16,)
+    assert first["actor"].data_ptr() != second["actor"].data_ptr()
+    torch.testing.assert_close(first["actor"], kept, rtol=0, atol=0)
+    assert extras == {}, "the time limit is a negative end; time_outs would bootstrap it"
+
+
+def test_actor_does_not_see_what_only_the_critic_may(env):
+    """Mass, voltage, timer and payload velocity change the critic's view alone."""
+    still = torch.zeros(16, dtype=torch.bool)
+    before = env._observe(still)
+    changed = {"mass_scale": 1.3, "voltage": 12.0, "release_timer": 0.05}
+    saved = {name: env.views.state[name].clone() for name in changed}
+    for name, value in changed.items():
+        env.views.state[name].fill_(value)
+    env.views.out["payload_vel_w"] += 1.0
+    after = env._observe(still)
+    for name, value in saved.items():
+        env.views.state[name].copy_(value)
+    env.views.out["payload_vel_w"] -= 1.0
+    now = observations.VEHICLE + 5 + 2  # the payload's history moved on by one entry of the same value
+    torch.testing.assert_close(after["actor"][:, :now], before["actor"][:, :now], rtol=0, atol=0)
+    torch.testing.assert_close(after["actor"][:, -1], before["actor"][:, -1], rtol=0, atol=0)
+    assert (after["critic"] - before["critic"]).abs().amax(0).count_nonzero() >= 6
+
+
+def test_release_ends_an_episode_after_the_lag_and_is_paid_by_hand():
+    torch.manual_seed(0)
+    env = ThrowEnv(experiment(noise=False), count=4)
+    ask = torch.zeros(4, 5)
+    ask[:, 4] = 1.0
+    action = actions.clip_action(ask)
+    for step in range(1, 7):  # 0.11 s of lag end within the sixth period
+        previous = env.previous_action.clone()
+        _, reward, done, _ = env.step(ask)
+        assert bool(done.all()) == (step == 6)
+    last, p = env.last, env.cfg.task.reward
+    duration = 5 * PERIOD + 0.01  # separation lies 10 ms into the sixth period
+    np.testing.assert_allclose((last["duration"] - env.views.out["time_to_impact"]).numpy(), duration, atol=1e-5)
+    landing = 500.0 * torch.exp(-2.5 * last["landing_error"])
+    flight = -2.0 * env.views.out["time_to_impact"]
+    near = -100.0 * (0.25 - last["clearance"]).clamp(min=0.0)
+    delta = action[:, :4] - previous[:, :4]
+    smooth = -0.5 * (torch.tensor([0.15, 0.025, 0.025, 0.025]) * (0.2 * delta.abs() + delta.square())).sum(-1)
+    rest = reward / p.scale - (landing + flight + near + smooth - 2.0 * PERIOD)
+    assert (rest < 0).all() and (rest > -0.2).all(), "what is left is the small kinetic term"
+
+
+def test_reward_terms_by_hand():
+    p = experiment().task.reward
+    one = torch.ones(1, 3)
+    # 1e-3 * 3 + 1e-3 * 3 + 3e-3 * |2 - 1|^2 * 3, all negative
+    assert rewards.kinetic(p, one, one, 2 * one).item() == pytest.approx(-(3e-3 + 3e-3 + 9e-3), rel=1e-6)
+    # 0.5 * 0.05 * (1 + 0.25 + 0)
+    command = torch.tensor([[0.7, 1.0, -0.5, 0.0, 0.0]])
+    assert rewards.command(p, command, torch.tensor(p.rate_command)).item() == pytest.approx(-0.03125, rel=1e-6)
+    # 0.5 * (0.15 (0.2 * 0.1 + 0.01) + 0.025 (0.2 * 0.4 + 0.16))
+    a, b = torch.tensor([[0.1, 0.4, 0, 0, 0.0]]), torch.zeros(1, 5)
+    assert rewards.change(p, a, b, torch.tensor(p.command_change)).item() == pytest.approx(-0.00525, rel=1e-5)
+    assert rewards.landing(p, torch.tensor([0.4])).item() == pytest.approx(500 * math.exp(-1.0), rel=1e-6)
+    assert rewards.proximity(p, torch.tensor([0.15]), 0.25).item() == pytest.approx(-10.0, rel=1e-5)
+    assert rewards.proximity(p, torch.tensor([0.35]), 0.25).item() == 0.0
+
+
+def test_ends_of_an_episode():
+    bounds = experiment().task.bounds
+    pos = torch.tensor([[0, 0, 1.3], [0, 0, 0.4], [0, 0, 3.1], [2.5, 2.5, 1.3], [0, 0, 1.3]])
+    assert terminations.out_of_bounds(bounds, pos).tolist() == [False, True, True, True, False]
+    level = torch.eye(3).expand(5, 3, 3)
+    low = pos - torch.tensor([0.0, 0.0, 0.4])
+    status = torch.tensor([0, 0, 0, 0, 4], dtype=torch.int32)
+    free = torch.zeros(5, dtype=torch.bool)
+    ended = terminations.negative(bounds, pos, level, low, status, free, torch.full((5,), 1.0), 0.04)
+    assert ended.tolist() == [False, True, True, True, True]
+    above = pos + torch.tensor([0.0, 0.0, 0.1])
+    fine = torch.zeros(5, dtype=torch.int32)
+    for latched, expected in ((free, True), (~free, False)):  # once latched, only collision and bounds count
+        got = terminations.negative(
+            bounds, pos[:1], level[:1], above[:1], fine[:1], latched[:1], torch.tensor([5.0]), 0.04
+        )
+        assert got.item() is expected
+
+
+def test_commands_and_their_inverse():
+    rate = torch.tensor([10.0, 10.0, 4.0])
+    action = torch.rand(100, 4) * 2 - 1
+    command = actions.command_from_action(action, 14.0, rate)
+    torch.testing.assert_close(actions.action_from_command(command, 14.0, rate), action, rtol=1e-5, atol=1e-5)
+    edge = actions.command_from_action(torch.tensor([[9.0, 9, -9, 9], [-9.0, 0, 0, 0]]), 14.0, rate)
+    assert edge.tolist() == [[14.0, 10.0, -10.0, 4.0], [0.0, 0.0, 0.0, 0.0]]
+    hover = torch.tensor([actions.hover_action(2.7, 14.0)])
+    assert actions.command_from_action(hover, 14.0, rate)[0, 0].item() == pytest.approx(2.7, rel=1e-5)
+    assert not actions.release_asked(hover, 0.95).item()
+
+
+def test_measurements_are_as_old_as_the_latency():
+    """With half a period of latency the actor sees the mean of the last two steps."""
+    e = experiment(noise=False)
+    late = dataclasses.replace(e.task.observation, latency=(PERIOD / 2, PERIOD / 2))
+    env = ThrowEnv(dataclasses.replace(e, task=dataclasses.replace(e.task, observation=late)), count=8)
+    env.step(torch.zeros(8, 5))
+    before = env.views.state["pos_w"].clone()
+    obs, _, done, _ = env.step(torch.zeros(8, 5))
+    assert not done.any()
+    torch.testing.assert_close(obs["actor"][:, :3], (before + env.views.state["pos_w"]) / 2, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["state", "vision"])
+def test_same_seed_same_bits(kind):
+    def run():
+        torch.manual_seed(3)
+        env = ThrowEnv(experiment(kind), count=8, seed=5)
+        for _ in range(20):
+            obs, reward, _, _ = env.step(torch.randn(8, 5))
+        return obs["actor"], reward
+
+    first, second = run(), run()
+    for a, b in zip(first, second, strict=True):
+        np.testing.assert_array_equal(a.numpy(), b.numpy())
