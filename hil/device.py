@@ -1,0 +1,211 @@
+"""Device strings: which are allowed, and the ports behind them. Nothing here is ever executed or looked up elsewhere.
+
+``udp:HOST:PORT`` listens, ``udpout:HOST:PORT`` sends first, ``tcp:HOST:PORT`` connects, ``serial:/dev/NAME:BAUD`` opens a
+port. HOST is a numeric address; other than loopback ones only where the config says so.
+"""
+
+import ipaddress
+import re
+import socket
+from dataclasses import dataclass
+from typing import Protocol
+
+from hil.errors import LinkError
+
+_NETWORK = re.compile(r"(udp|udpout|tcp):([0-9.]+|\[[0-9a-fA-F:]+\]|localhost):([0-9]{1,5})")
+_SERIAL = re.compile(r"serial:(/dev/(?:tty[A-Za-z0-9]+|serial/by-id/[\w.:+-]+|cu\.[\w-]+)):([0-9]{4,7})")
+LARGEST_DATAGRAM = 65536
+
+
+@dataclass(frozen=True)
+class Device:
+    """A checked device string."""
+
+    kind: str  # "udp", "udpout", "tcp" or "serial"
+    host: str  # numeric address, or the path of the serial port
+    port: int  # network port, or the baud rate
+
+
+def check_device(text: str, *, remote: bool = False) -> Device:
+    """Read a device string against the whitelist.
+
+    Args:
+        text: as described at the head of this module.
+        remote: whether addresses other than loopback ones are allowed.
+
+    Raises:
+        LinkError: anything else, and what is allowed.
+    """
+    found = _SERIAL.fullmatch(text)
+    if found:
+        return Device("serial", found[1], int(found[2]))
+    found = _NETWORK.fullmatch(text)
+    if not found:
+        raise LinkError(
+            f"device {text[:80]!r} is refused; expected udp:127.0.0.1:14550 (listen), udpout:127.0.0.1:14550 (send "
+            "first), tcp:127.0.0.1:5760 or serial:/dev/ttyACM0:921600"
+        )
+    host = "127.0.0.1" if found[2] == "localhost" else found[2].strip("[]")
+    try:
+        address, port = ipaddress.ip_address(host), int(found[3])
+    except ValueError as error:
+        raise LinkError(f"device {text!r}: {error}; expected a numeric address such as 127.0.0.1") from None
+    if not 0 < port < 65536:
+        raise LinkError(f"device {text!r}: port {port}; expected 1 to 65535")
+    if not address.is_loopback and not remote:
+        raise LinkError(
+            f"device {text!r} leaves this machine; set link.remote = true in the config where that is what you want"
+        )
+    return Device(found[1], host, port)
+
+
+class Port(Protocol):
+    """Where bytes come from and go to; neither call ever waits."""
+
+    whole: bool  # whether each chunk is a whole datagram
+
+    def read(self) -> bytes | None:
+        """The next chunk; None where there is none."""
+
+    def write(self, data: bytes) -> bool:
+        """Whether the bytes were taken."""
+
+    def close(self) -> None:
+        """Give the port back."""
+
+
+class UdpPort:
+    """A UDP socket; one that listens answers whoever spoke to it first, and hears nobody else from then on."""
+
+    whole = True
+
+    def __init__(self, device: Device) -> None:
+        """Open it.
+
+        Raises:
+            LinkError: the address is taken or not this machine's.
+        """
+        family = socket.AF_INET6 if ":" in device.host else socket.AF_INET
+        self._socket = socket.socket(family, socket.SOCK_DGRAM)
+        self._socket.setblocking(False)
+        self._peer = None
+        try:
+            if device.kind == "udp":
+                self._socket.bind((device.host, device.port))
+            else:
+                self._peer = (device.host, device.port)
+        except OSError as error:
+            self._socket.close()
+            raise LinkError(f"cannot open {device.kind}:{device.host}:{device.port}: {error.strerror}") from error
+
+    def read(self) -> bytes | None:
+        """See `Port`."""
+        while True:
+            try:
+                data, sender = self._socket.recvfrom(LARGEST_DATAGRAM)
+            except (BlockingIOError, InterruptedError):
+                return None
+            except OSError:  # the peer's port is closed: ICMP, reported here
+                return None
+            if self._peer is None:
+                self._peer = sender[:2]
+            if sender[:2] == self._peer:
+                return data
+
+    def write(self, data: bytes) -> bool:
+        """See `Port`."""
+        if self._peer is None:
+            return False
+        try:
+            return self._socket.sendto(data, self._peer) == len(data)
+        except OSError:
+            return False
+
+    def close(self) -> None:
+        """See `Port`."""
+        self._socket.close()
+
+
+class TcpPort:
+    """A TCP connection, opened within two seconds or not at all."""
+
+    whole = False
+
+    def __init__(self, device: Device) -> None:
+        """Connect.
+
+        Raises:
+            LinkError: nobody answers.
+        """
+        try:
+            self._socket = socket.create_connection((device.host, device.port), timeout=2.0)
+        except OSError as error:
+            raise LinkError(f"cannot connect to tcp:{device.host}:{device.port}: {error.strerror or error}") from error
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._socket.setblocking(False)
+
+    def read(self) -> bytes | None:
+        """See `Port`."""
+        try:
+            return self._socket.recv(LARGEST_DATAGRAM) or None
+        except OSError:
+            return None
+
+    def write(self, data: bytes) -> bool:
+        """See `Port`."""
+        try:
+            return self._socket.send(data) == len(data)
+        except OSError:
+            return False
+
+    def close(self) -> None:
+        """See `Port`."""
+        self._socket.close()
+
+
+class SerialPort:
+    """A serial port."""
+
+    whole = False
+
+    def __init__(self, device: Device) -> None:
+        """Open it.
+
+        Raises:
+            LinkError: pyserial is missing, or the port cannot be opened.
+        """
+        try:
+            import serial
+        except ModuleNotFoundError:
+            raise LinkError("a serial port needs the package pyserial; install it with: pip install pyserial") from None
+        try:
+            self._port = serial.Serial(device.host, device.port, timeout=0, write_timeout=0)
+        except (serial.SerialException, ValueError) as error:
+            raise LinkError(f"cannot open {device.host}: {error}") from error
+
+    def read(self) -> bytes | None:
+        """See `Port`."""
+        try:
+            return self._port.read(self._port.in_waiting or 1) or None
+        except OSError:
+            return None
+
+    def write(self, data: bytes) -> bool:
+        """See `Port`."""
+        try:
+            return self._port.write(data) == len(data)
+        except OSError:
+            return False
+
+    def close(self) -> None:
+        """See `Port`."""
+        self._port.close()
+
+
+def open_port(device: Device) -> Port:
+    """Open the port of a checked device string.
+
+    Raises:
+        LinkError: it cannot be opened.
+    """
+    return {"udp": UdpPort, "udpout": UdpPort, "tcp": TcpPort, "serial": SerialPort}[device.kind](device)

@@ -1,0 +1,42 @@
+"""The one place that imports pymavlink, after MAVLink 2 was asked for."""
+
+import os
+
+os.environ["MAVLINK20"] = "1"  # pymavlink speaks version 1 without it, which cannot carry ODOMETRY
+
+from pymavlink.dialects.v20 import ardupilotmega as mav
+
+__all__ = ["Parser", "mav"]
+
+
+class Parser:
+    """Bytes to messages. No byte string makes it raise."""
+
+    def __init__(self) -> None:
+        """Start empty."""
+        self.errors = 0  # byte strings that were no message, or only in part
+        self._fresh()
+
+    def _fresh(self) -> None:
+        self._mav = mav.MAVLink(None)
+        self._mav.robust_parsing = True
+
+    def parse(self, data: bytes, whole: bool = True) -> list:
+        """Messages in a byte string.
+
+        Args:
+            data: what arrived.
+            whole: a datagram: nothing of it is kept for the next one. Else a piece of a stream.
+        """
+        try:
+            found = self._mav.parse_buffer(data) or []
+        except Exception:  # whatever pymavlink stumbles over, its state is not to be trusted afterwards
+            self.errors += 1
+            self._fresh()
+            return []
+        messages = [message for message in found if message.get_msgId() >= 0]
+        self.errors += len(found) - len(messages)
+        if whole and self._mav.buf_len():
+            self.errors += 1
+            self._mav.buf, self._mav.buf_index, self._mav.expected_length = bytearray(), 0, mav.HEADER_LEN_V1 + 2
+        return messages

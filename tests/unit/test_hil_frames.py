@@ -1,0 +1,122 @@
+"""Frames of pose sources: all 24 axis cases both ways, against SciPy's rotations."""
+
+from itertools import permutations, product
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from hil.errors import FrameError
+from hil.frames import FrameParams, Frames, proper_axes, rotation_of
+from hil.pose import Pose
+
+AXES = proper_axes()
+EXACT = 1e-14
+"""Rounding of a few float64 products of numbers near 1."""
+
+
+def frames(axes="x,y,z", body_axes="x,y,z", quaternion="xyzw", yaw=0.0, offset=(0.0, 0.0, 0.0)) -> Frames:
+    return Frames(FrameParams(axes, body_axes, quaternion, yaw, offset))
+
+
+def random_pose(rng) -> Pose:
+    quat = rng.normal(size=4)
+    vectors = (tuple(map(float, rng.normal(size=3))) for _ in range(3))
+    pos, vel, rate = vectors
+    return Pose(0.0, 0.0, "vehicle", pos, tuple(map(float, quat / np.linalg.norm(quat))), vel, rate)
+
+
+def same_turn(a, b) -> bool:
+    return min(np.abs(np.subtract(a, b)).max(), np.abs(np.add(a, b)).max()) < EXACT
+
+
+def test_there_are_24_turns_and_24_mirrors_are_refused():
+    assert len(set(AXES)) == 24
+    every = {
+        ",".join(s + a for s, a in zip(signs, order))
+        for order in permutations("xyz")
+        for signs in product(("", "-"), repeat=3)
+    }
+    for axes in every - set(AXES):
+        with pytest.raises(FrameError, match="mirror the world"):
+            rotation_of(axes)
+
+
+@pytest.mark.parametrize("axes", ["x,y", "x,x,z", "a,b,c", "", "x,y,z,x", "xy,z,x", "--x,y,z", "x,,z"])
+def test_what_is_no_set_of_axes_is_refused(axes):
+    with pytest.raises(FrameError, match="expected x, y and z once each"):
+        frames(axes)
+
+
+@pytest.mark.parametrize("axes", AXES)
+@pytest.mark.parametrize("order", ["xyzw", "wxyz"])
+def test_every_case_both_ways(axes, order):
+    rng = np.random.default_rng(AXES.index(axes))
+    body_axes, yaw = AXES[(7 * AXES.index(axes) + 3) % 24], float(rng.uniform(-180, 180))
+    convert = frames(axes, body_axes, order, yaw, tuple(map(float, rng.normal(size=3))))
+    for _ in range(20):
+        ours = random_pose(rng)
+        back = convert.pose_from_source(convert.source_from_pose(ours))
+        for name in ("pos", "vel", "rate"):
+            np.testing.assert_allclose(getattr(back, name), getattr(ours, name), atol=20 * EXACT)
+        assert same_turn(back.quat, ours.quat)
+        source = random_pose(rng)
+        again = convert.source_from_pose(convert.pose_from_source(source))
+        np.testing.assert_allclose(again.pos, source.pos, atol=20 * EXACT)
+        assert same_turn(again.quat, source.quat)
+
+
+@pytest.mark.parametrize("axes", AXES)
+def test_every_case_against_matrices(axes):
+    """``R_ours = Yaw A R_source B^T`` and the like, in SciPy."""
+    rng = np.random.default_rng(1)
+    body_axes, yaw = AXES[-1 - AXES.index(axes)], 33.0
+    convert = frames(axes, body_axes, "wxyz", yaw)
+    world = Rotation.from_euler("z", yaw, degrees=True).as_matrix() @ rotation_of(axes)
+    body = rotation_of(body_axes)
+    for _ in range(10):
+        pose = random_pose(rng)
+        rot = Rotation.from_quat([*pose.quat[1:], pose.quat[0]]).as_matrix()
+        ours = convert.pose_from_source(pose)
+        np.testing.assert_allclose(Rotation.from_quat(ours.quat).as_matrix(), world @ rot @ body.T, atol=10 * EXACT)
+        np.testing.assert_allclose(ours.pos, world @ pose.pos, atol=10 * EXACT)
+        np.testing.assert_allclose(ours.vel, world @ pose.vel, atol=10 * EXACT)
+        np.testing.assert_allclose(ours.rate, body @ pose.rate, atol=10 * EXACT)
+
+
+def test_our_own_frame_changes_no_bit():
+    rng = np.random.default_rng(2)
+    for _ in range(50):
+        pose = random_pose(rng)
+        assert frames().pose_from_source(pose) == pose
+
+
+def test_level_and_north_in_mavlink_is_level_and_ahead_here():
+    level = Pose(0.0, 0.0, "vehicle", (1.0, 2.0, -3.0), (1.0, 0.0, 0.0, 0.0), (0.5, 0.0, 0.0), (0.1, 0.2, 0.3))
+    ahead = frames("x,-y,-z", "x,-y,-z", "wxyz").pose_from_source(level)
+    assert ahead.pos == (1.0, -2.0, 3.0)
+    assert same_turn(ahead.quat, (0.0, 0.0, 0.0, 1.0))
+    np.testing.assert_allclose(ahead.rate, (0.1, -0.2, -0.3), atol=EXACT)
+    east = frames("y,x,-z", "x,-y,-z", "wxyz").pose_from_source(level)
+    np.testing.assert_allclose(east.pos, (2.0, 1.0, 3.0), atol=EXACT)
+    turn = Rotation.from_quat(east.quat) * Rotation.from_quat(ahead.quat).inv()
+    np.testing.assert_allclose(turn.as_rotvec(degrees=True), (0.0, 0.0, 90.0), atol=1e-12)
+
+
+def test_marker_offset_follows_the_attitude():
+    """Marker 0.1 m above the centre of mass; rolled by 90 deg to the right it lies 0.1 m to the right of it."""
+    right = tuple(map(float, Rotation.from_euler("x", 90, degrees=True).as_quat()))
+    convert = frames(offset=(0.0, 0.0, 0.1))
+    pose = convert.pose_from_source(
+        Pose(0.0, 0.0, "vehicle", (0.0, -0.1, 1.0), right, (0.0, 0.0, 0.2), (2.0, 0.0, 0.0))
+    )
+    np.testing.assert_allclose(pose.pos, (0.0, 0.0, 1.0), atol=EXACT)
+    # Turning with 2 rad/s on an arm of 0.1 m to the right the marker sinks at 0.2 m/s against the centre of mass.
+    np.testing.assert_allclose(pose.vel, (0.0, 0.0, 0.4), atol=EXACT)
+
+
+def test_wrong_order_and_numbers_are_refused():
+    with pytest.raises(FrameError, match="expected 'xyzw' or 'wxyz'"):
+        frames(quaternion="zyxw")
+    with pytest.raises(FrameError, match="expected finite numbers"):
+        frames(yaw=float("nan"))
