@@ -1,0 +1,136 @@
+"""Time: the monotonic clock, ticks on it, and the offset of a peer's clock."""
+
+import time
+from collections import deque
+from dataclasses import dataclass
+from typing import Protocol
+
+
+class Clock(Protocol):
+    """A clock that never goes back."""
+
+    def now(self) -> float:
+        """[s]."""
+
+    def sleep_until(self, when: float) -> None:
+        """Wait until a time [s]; at once where it has passed."""
+
+
+class MonotonicClock:
+    """The machine's monotonic clock; at ``speed`` 0.5 its second takes two."""
+
+    def __init__(self, speed: float = 1.0) -> None:
+        """Set the speed.
+
+        Raises:
+            ValueError: a speed of 0 or less.
+        """
+        if not speed > 0.0:
+            raise ValueError(f"clock speed {speed}; expected above 0")
+        self._speed = speed
+
+    def now(self) -> float:
+        """See `Clock`."""
+        return time.monotonic() * self._speed
+
+    def sleep_until(self, when: float) -> None:
+        """See `Clock`."""
+        left = (when - self.now()) / self._speed
+        if left > 0.0:
+            time.sleep(left)
+
+
+class ManualClock:
+    """A clock that is where it was put: for tests and replay."""
+
+    def __init__(self, start: float = 0.0) -> None:
+        """Begin at a time [s]."""
+        self.time = start
+
+    def now(self) -> float:
+        """See `Clock`."""
+        return self.time
+
+    def sleep_until(self, when: float) -> None:
+        """See `Clock`."""
+        self.time = max(self.time, when)
+
+
+@dataclass
+class Ticker:
+    """Ticks at fixed times, start + n period; a tick that comes more than a period late skips those it missed.
+
+    Attributes:
+        index: number of the current tick, missed ones counted. missed: ticks that were skipped.
+        late: how late the current tick is, after those it skipped [s]. worst: the longest wait of any tick [s].
+    """
+
+    clock: Clock
+    period: float
+    index: int = -1
+    missed: int = 0
+    late: float = 0.0
+    worst: float = 0.0
+    _start: float | None = None
+
+    def due(self) -> float:
+        """Time of the next tick [s]."""
+        if self._start is None:
+            self._start = self.clock.now()
+        return self._start + (self.index + 1) * self.period
+
+    def take(self) -> float:
+        """Begin the tick that is due; returns the time now [s]."""
+        due, now = self.due(), self.clock.now()
+        behind = max(0.0, now - due)
+        skipped = int(behind / self.period)
+        self.late = behind - skipped * self.period
+        self.index += 1 + skipped
+        self.missed += skipped
+        self.worst = max(self.worst, behind)
+        return now
+
+    def wait(self) -> float:
+        """Wait for the next tick and begin it; returns the time now [s]."""
+        self.clock.sleep_until(self.due())
+        return self.take()
+
+
+class TimeSync:
+    """Offset of a peer's clock by TIMESYNC, from the exchange with the shortest round trip of the last ones.
+
+    The peer answers ``tc1`` (its time) to ``ts1`` (ours). The true offset lies within half the round trip of
+    ``tc1 - (sent + received) / 2``, so the shortest exchange is the best one.
+    """
+
+    def __init__(self, window: int = 20) -> None:
+        """Remember the last ``window`` exchanges."""
+        self._exchanges: deque[tuple[float, float]] = deque(maxlen=window)
+        self._asked: set[int] = set()
+
+    def request(self, now: float) -> int:
+        """``ts1`` of a request sent now [ns]; ``tc1`` is 0 in it."""
+        stamp = int(now * 1e9)
+        if len(self._asked) > 100:  # answers that never came
+            self._asked.clear()
+        self._asked.add(stamp)
+        return stamp
+
+    def feed(self, tc1: int, ts1: int, now: float) -> bool:
+        """Take an answer; whether it was one to a request of ours."""
+        if tc1 == 0 or ts1 not in self._asked:
+            return False
+        self._asked.discard(ts1)
+        sent = ts1 / 1e9
+        self._exchanges.append((now - sent, tc1 / 1e9 - 0.5 * (sent + now)))
+        return True
+
+    @property
+    def offset(self) -> float | None:
+        """Peer's clock less ours [s]; None before the first answer."""
+        return min(self._exchanges)[1] if self._exchanges else None
+
+    @property
+    def round_trip(self) -> float | None:
+        """Shortest round trip [s]."""
+        return min(self._exchanges)[0] if self._exchanges else None

@@ -1,0 +1,129 @@
+"""The gate that every pose passes, one for each body with its own timer.
+
+A motion-capture system that has lost a body goes on sending its *last* pose, so staleness is judged on content: the
+time since a pose last *differed* from the one before. A body that jumps is refused and stays refused: two bodies that the
+system has swapped never become right again by waiting, so their timers run out and the runner ends the throw.
+"""
+
+import math
+from dataclasses import dataclass
+
+from hil.pose import Pose, Vector
+
+OK, WARN, HOLD, ABORT = range(4)
+"""Levels of staleness."""
+
+
+@dataclass(frozen=True)
+class GateParams:
+    """Limits of one body.
+
+    Raises:
+        ValueError: limits that are not above 0 or not ascending.
+    """
+
+    quat_tolerance: float  # of a quaternion's norm from 1 [-]
+    max_jump: float  # from where the last pose and velocity put the body [m]
+    max_speed: float  # [m/s]
+    max_turn: float  # between two poses, beyond max_turn_rate times their distance in time [rad]
+    max_turn_rate: float  # [rad/s]
+    clock_step: float  # stamps that leave the arrivals by more than this are a step of the source's clock [s]
+    warn: float  # content age [s]
+    hold: float  # content age [s]
+    abort: float  # content age [s]
+
+    def __post_init__(self) -> None:
+        if min(vars(self).values()) <= 0.0:
+            raise ValueError(f"gate {vars(self)}: expected every limit above 0")
+        if not self.warn < self.hold < self.abort:
+            raise ValueError(f"gate: warn {self.warn}, hold {self.hold}, abort {self.abort} s; expected them ascending")
+
+
+class Gate:
+    """Decides about the poses of one body.
+
+    Attributes:
+        refused: number of refused poses by reason.
+        jumped: the source's reset counter has changed since the last :meth:`restart`.
+    """
+
+    def __init__(self, params: GateParams) -> None:
+        """Start without a pose."""
+        self.params = params
+        self.refused: dict[str, int] = {}
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget all: the next good pose is taken wherever it is. On the ground only, at the operator's word."""
+        self.last: Pose | None = None
+        self.jumped = False
+        self._changed = -math.inf  # arrival of the last new content [s]
+
+    def check(self, pose: Pose, velocity: Vector | None = None) -> str | None:
+        """Judge a pose, in our frames.
+
+        Args:
+            pose: with a stamp of the source's clock.
+            velocity: of the body at its last accepted pose [m/s].
+
+        Returns:
+            Why it is refused, or None where it is accepted: "finite", "quaternion", "old" (reordered or doubled),
+            "repeated" (the content of the last one), "jump", "speed", "turn", "reset".
+        """
+        reason = self._reason(pose, velocity)
+        if reason is not None:
+            self.refused[reason] = self.refused.get(reason, 0) + 1
+            return reason
+        self.last, self._changed = pose, pose.arrival
+        return None
+
+    def stepped(self, pose: Pose) -> bool:
+        """Whether the source's clock was set between the last accepted pose and this one."""
+        last = self.last
+        return last is not None and (
+            abs((pose.stamp - last.stamp) - (pose.arrival - last.arrival)) > self.params.clock_step
+        )
+
+    def _reason(self, pose: Pose, velocity: Vector | None) -> str | None:
+        p, last = self.params, self.last
+        numbers = (pose.stamp, pose.arrival, *pose.pos, *(pose.quat or ()), *(pose.vel or ()), *(pose.rate or ()))
+        if not all(map(math.isfinite, numbers)):
+            return "finite"
+        if pose.quat is not None and abs(math.hypot(*pose.quat) - 1.0) > p.quat_tolerance:
+            return "quaternion"
+        if pose.vel is not None and math.hypot(*pose.vel) > p.max_speed:
+            return "speed"
+        if last is None:
+            return None
+        if self.jumped or pose.reset != last.reset:
+            self.jumped = True
+            return "reset"
+        stepped = self.stepped(pose)
+        if pose.stamp <= last.stamp and not stepped:
+            return "old"
+        if pose.pos == last.pos and pose.quat == last.quat:
+            return "repeated"
+        # A clock that was set says nothing of how long ago the last pose was; the arrivals do.
+        age = max(pose.arrival - last.arrival if stepped else pose.stamp - last.stamp, 0.0)
+        moved = math.dist(pose.pos, last.pos)
+        if moved > p.max_jump + p.max_speed * age:
+            return "speed"
+        if velocity is not None:
+            expected = tuple(x + age * v for x, v in zip(last.pos, velocity))
+            # Beyond 0.1 s the last velocity says little of where the body is; the speed limit alone holds then.
+            if age <= 0.1 and math.dist(pose.pos, expected) > p.max_jump:
+                return "jump"
+        if pose.quat is not None and last.quat is not None:
+            cosine = min(1.0, abs(sum(a * b for a, b in zip(pose.quat, last.quat))))
+            if 2.0 * math.acos(cosine) > p.max_turn + p.max_turn_rate * age:
+                return "turn"
+        return None
+
+    def age(self, now: float) -> float:
+        """Time since the content last changed [s]; infinite before the first pose."""
+        return now - self._changed
+
+    def level(self, now: float) -> int:
+        """:data:`OK`, :data:`WARN`, :data:`HOLD` or :data:`ABORT` by the content's age."""
+        age = self.age(now)
+        return (age > self.params.warn) + (age > self.params.hold) + (age > self.params.abort)

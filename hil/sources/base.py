@@ -1,0 +1,54 @@
+"""What the runner needs of a source, and the source that plays recorded poses."""
+
+from collections.abc import Iterable
+from typing import Protocol
+
+from hil.errors import SourceError
+from hil.pose import Pose
+
+
+class Source(Protocol):
+    """Where poses come from; polling never waits and never raises."""
+
+    ended: bool  # nothing will come any more
+
+    def poll(self, now: float) -> list[Pose]:
+        """Raw poses that have arrived by ``now`` [s] on the runner's clock, in order of arrival."""
+
+    def close(self) -> None:
+        """Give the port or file back."""
+
+
+class Recorded:
+    """Recorded poses, each handed on when the runner's clock has reached its arrival."""
+
+    def __init__(self, poses: Iterable[Pose]) -> None:
+        """Sort by arrival; poses that arrived together keep their order.
+
+        Raises:
+            SourceError: there is none.
+        """
+        self.poses = sorted(poses, key=lambda pose: pose.arrival)
+        if not self.poses:
+            raise SourceError("the recording holds no pose of a body that the config names")
+        self._next = 0
+
+    @property
+    def ended(self) -> bool:
+        """See `Source`."""
+        return self._next >= len(self.poses)
+
+    @property
+    def start(self) -> float:
+        """Arrival of the first pose [s]."""
+        return self.poses[0].arrival
+
+    def poll(self, now: float) -> list[Pose]:
+        """See `Source`."""
+        first = self._next
+        while self._next < len(self.poses) and self.poses[self._next].arrival <= now:
+            self._next += 1
+        return self.poses[first : self._next]
+
+    def close(self) -> None:
+        """See `Source`."""

@@ -1,0 +1,159 @@
+"""Poses from MAVLink messages, over a link or out of a .tlog: one decoder for both."""
+
+import math
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from hil.errors import SourceError
+from hil.link import Link, pose_from_message
+from hil.mavlink import Parser
+from hil.pose import BODIES, Pose
+
+POSE_MESSAGES = ("ATT_POS_MOCAP", "VISION_POSITION_ESTIMATE", "ODOMETRY", "LOCAL_POSITION_NED")
+PAIR_AGE = 0.05
+"""An attitude older than this against the position that it is to be paired with is none [s]."""
+
+
+@dataclass(frozen=True)
+class BodyIds:
+    """Which sender speaks of which body, and in which message.
+
+    Raises:
+        SourceError: ids out of range, or an unknown body or message.
+    """
+
+    body: str  # "vehicle", "payload" or "goal"
+    message: str  # one of POSE_MESSAGES; LOCAL_POSITION_NED is paired with ATTITUDE_QUATERNION
+    system: int  # MAVLink system id, 1 to 255
+    component: int  # MAVLink component id; 0 for any
+
+    def __post_init__(self) -> None:
+        if self.body not in BODIES or self.message not in POSE_MESSAGES:
+            raise SourceError(
+                f"body '{self.body}' in {self.message}; expected one of {', '.join(BODIES)} in one of "
+                f"{', '.join(POSE_MESSAGES)}"
+            )
+        if not (1 <= self.system <= 255 and 0 <= self.component <= 255):
+            raise SourceError(
+                f"system {self.system}, component {self.component}; expected 1 to 255, and 0 (any) to 255"
+            )
+
+
+class MavlinkDecoder:
+    """Messages to poses; bodies told apart by their senders."""
+
+    def __init__(self, bodies: tuple[BodyIds, ...]) -> None:
+        """Take the senders.
+
+        Raises:
+            SourceError: none, or the same sender and message for two bodies.
+        """
+        keys = [(ids.message, ids.system, ids.component) for ids in bodies]
+        clash = any(
+            a != b and a[:2] == b[:2] and (a[2] == b[2] or 0 in (a[2], b[2])) for a in keys for b in keys
+        ) or len(set(keys)) != len(keys)
+        if not bodies or clash:
+            raise SourceError(
+                f"senders {keys}; expected at least one, and no two bodies with the same message, system and component"
+            )
+        self._bodies = bodies
+        self._attitudes: dict[tuple[int, int], Any] = {}
+
+    def feed(self, message: Any, arrival: float) -> Pose | None:
+        """The pose in a message, if it is one of ours."""
+        kind, sender = message.get_type(), (message.get_srcSystem(), message.get_srcComponent())
+        if kind == "ATTITUDE_QUATERNION":
+            self._attitudes[sender] = message
+            return None
+        for ids in self._bodies:
+            if ids.message == kind and ids.system == sender[0] and ids.component in (0, sender[1]):
+                return self._paired(message, sender, ids.body, arrival) if kind == "LOCAL_POSITION_NED" else (
+                    pose_from_message(message, ids.body, arrival)
+                )  # fmt: skip
+        return None
+
+    def _paired(self, message: Any, sender: tuple[int, int], body: str, arrival: float) -> Pose | None:
+        """LOCAL_POSITION_NED with the sender's last attitude."""
+        attitude = self._attitudes.get(sender)
+        if attitude is None or abs(message.time_boot_ms - attitude.time_boot_ms) > 1e3 * PAIR_AGE:
+            return None
+        return Pose(
+            message.time_boot_ms / 1e3,
+            arrival,
+            body,
+            (message.x, message.y, message.z),
+            (attitude.q1, attitude.q2, attitude.q3, attitude.q4),
+            (message.vx, message.vy, message.vz),
+            (attitude.rollspeed, attitude.pitchspeed, attitude.yawspeed),
+        )
+
+
+class MavlinkSource:
+    """Poses of a link. Polling it also serves the link's other listeners."""
+
+    ended = False
+
+    def __init__(self, link: Link, bodies: tuple[BodyIds, ...], clock: Callable[[], float]) -> None:
+        """Listen to a link; ``clock`` gives the arrivals."""
+        self._link, self._clock, self._decoder = link, clock, MavlinkDecoder(bodies)
+        self._waiting: list[Pose] = []
+        link.listen(self._hear)
+
+    def _hear(self, message: Any, arrival: float) -> None:
+        pose = self._decoder.feed(message, arrival)
+        if pose is not None:
+            self._waiting.append(pose)
+
+    def poll(self, now: float) -> list[Pose]:
+        """See `hil.sources.base.Source`."""
+        self._link.pump(self._clock)
+        poses, self._waiting = self._waiting, []
+        return poses
+
+    def close(self) -> None:
+        """See `hil.sources.base.Source`."""
+        self._link.close()
+
+
+def read_tlog(path: str | Path, bodies: tuple[BodyIds, ...]) -> list[Pose]:
+    """Poses of a .tlog; arrivals are seconds from its first message.
+
+    Raises:
+        SourceError: no such file, or nothing in it is a message.
+    """
+    path = Path(path)
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise SourceError(f"{path}: cannot be read: {error.strerror}; expected a .tlog") from error
+    decoder, parser, poses = MavlinkDecoder(bodies), Parser(), []
+    at, first, messages = 0, None, 0
+    while at + 8 < len(data):
+        length = _length(data, at + 8)
+        if length is None:
+            at += 1  # damaged here: look for the next message
+            continue
+        stamp = struct.unpack_from(">Q", data, at)[0] / 1e6
+        found = parser.parse(data[at + 8 : at + 8 + length])
+        at += 8 + length if found else 1
+        for message in found:
+            messages += 1
+            first = stamp if first is None else first
+            pose = decoder.feed(message, stamp - first)
+            if pose is not None and math.isfinite(stamp):
+                poses.append(pose)
+    if not messages:
+        raise SourceError(f"{path}: {len(data)} bytes without a single MAVLink message; expected a .tlog")
+    return poses
+
+
+def _length(data: bytes, at: int) -> int | None:
+    """Length of the message that begins at a place, or None where none does or it is cut short."""
+    head = data[at : at + 3]
+    if len(head) < 3 or head[0] not in (0xFE, 0xFD):
+        return None
+    length = head[1] + 8 if head[0] == 0xFE else head[1] + 12 + 13 * (head[2] & 1)
+    return length if at + length <= len(data) else None

@@ -1,0 +1,81 @@
+"""One tracked body: frames, gate, filter and age, from raw poses to a state at a time."""
+
+from dataclasses import dataclass, replace
+
+from hil.estimate import EstimateParams, SlopeFilter
+from hil.frames import FrameParams, Frames, multiply
+from hil.gate import Gate, GateParams
+from hil.pose import Pose, Quaternion, Vector
+
+MOST_PREDICTION = 0.1
+"""Poses are carried forward by no more than this [s]; older ones are the timers' affair."""
+
+
+@dataclass(frozen=True)
+class BodyState:
+    """State of a body in our frames, at the time that it stands for."""
+
+    pos: Vector  # [m], world frame
+    quat: Quaternion | None  # body to world, xyzw
+    vel: Vector  # [m/s], world frame
+    rate: Vector  # [rad/s], body frame
+    age: float  # since the content last changed [s]
+
+
+class Track:
+    """Follows one body.
+
+    Attributes:
+        gate: with the counts of what was refused. filter: with its lag.
+        accepted: number of poses taken.
+    """
+
+    def __init__(self, frames: FrameParams, gate: GateParams, estimate: EstimateParams) -> None:
+        """Start without a pose."""
+        self.frames, self.gate, self.filter = Frames(frames), Gate(gate), SlopeFilter(estimate)
+        self.accepted = 0
+        self._pose: Pose | None = None
+        self._vel: Vector = (0.0, 0.0, 0.0)
+        self._rate: Vector = (0.0, 0.0, 0.0)
+        self._shift = 0.0  # added to the stamps, so that a step of the source's clock leaves the filter's window whole
+
+    def restart(self) -> None:
+        """Forget all; see `hil.gate.Gate.restart`."""
+        self.gate.restart()
+        self.filter.reset()
+        self._pose = None
+
+    def update(self, raw: Pose) -> str | None:
+        """Take a raw pose; why it was refused, or None."""
+        pose = self.frames.pose_from_source(raw)
+        before, stepped = self.gate.last, self.gate.stepped(pose)
+        reason = self.gate.check(pose, self._vel if self._pose is not None else None)
+        if reason is not None:
+            return reason
+        if stepped and before is not None:
+            self._shift -= (pose.stamp - before.stamp) - (pose.arrival - before.arrival)
+        self.accepted += 1
+        self._vel, self._rate = self.filter.update(replace(pose, stamp=pose.stamp + self._shift))
+        self._pose = pose
+        return None
+
+    def state(self, now: float, ahead: float = 0.0) -> BodyState | None:
+        """State by the last accepted pose, carried forward at constant velocity and rate.
+
+        Args:
+            now: on the runner's clock [s].
+            ahead: by how much to carry it [s]; see :data:`MOST_PREDICTION`.
+        """
+        pose = self._pose
+        if pose is None:
+            return None
+        pos, quat, age = pose.pos, pose.quat, self.gate.age(now)
+        ahead = min(max(ahead, 0.0), MOST_PREDICTION)
+        if ahead > 0.0:
+            pos = tuple(x + ahead * v for x, v in zip(pos, self._vel))
+            if quat is not None:
+                half = 0.5 * ahead
+                turn = multiply(quat, (*(half * r for r in self._rate), 1.0))
+                norm = sum(x * x for x in turn) ** 0.5
+                quat = tuple(x / norm for x in turn)
+        return BodyState(pos, quat, self._vel, self._rate, age)

@@ -1,0 +1,74 @@
+"""Velocity and rate from poses: closed forms of lag and noise, uneven stamps, gaps."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from hil.estimate import EstimateParams, SlopeFilter, slope_weights
+from hil.pose import Pose
+
+PERIOD = 0.01
+ROUNDING = 1e-9
+
+
+def run(params, times, position, attitude=None):
+    """Estimates at each time of a motion that is given in closed form."""
+    slopes = SlopeFilter(params)
+    out = []
+    for t in times:
+        quat = None if attitude is None else tuple(map(float, attitude(t).as_quat()))
+        out.append(slopes.update(Pose(float(t), float(t), "vehicle", tuple(map(float, position(t))), quat)))
+    return slopes, out
+
+
+@pytest.mark.parametrize("samples", [2, 3, 5, 8])
+def test_a_lines_lag_is_half_its_window(samples):
+    acceleration = np.array([3.0, -1.0, 5.0])
+    slopes, out = run(EstimateParams(samples, 1), PERIOD * np.arange(30), lambda t: 0.5 * acceleration * t * t)
+    lag = (samples - 1) * PERIOD / 2
+    assert slopes.lag == pytest.approx(lag, abs=ROUNDING)
+    np.testing.assert_allclose(out[-1][0], acceleration * (29 * PERIOD - lag), atol=ROUNDING)
+
+
+@pytest.mark.parametrize("samples", [3, 5, 8])
+def test_a_parabola_is_not_late_on_uneven_stamps_either(samples):
+    times = np.cumsum(np.random.default_rng(0).uniform(0.003, 0.02, 30))
+    slopes, out = run(EstimateParams(samples, 2), times, lambda t: np.array([1.0, t, 0.5 * t * t]))
+    assert slopes.lag == pytest.approx(0.0, abs=ROUNDING)
+    np.testing.assert_allclose(out[-1][0], (0.0, 1.0, times[-1]), atol=1e-6)
+
+
+def test_noise_is_what_the_weights_say():
+    """A line over n even samples: sigma sqrt(12 / (n (n^2 - 1))) / T."""
+    n = 5
+    weights = slope_weights([i * PERIOD for i in range(n)], 1)
+    assert np.sqrt(np.sum(np.square(weights))) == pytest.approx(np.sqrt(12 / (n * (n * n - 1))) / PERIOD)
+
+
+def test_body_rate_of_a_steady_turn():
+    rate_b = np.array([1.0, -2.0, 0.5])
+    start = Rotation.from_euler("xyz", [0.3, -0.2, 1.0])
+    for order in (1, 2):
+        _, out = run(
+            EstimateParams(4, order),
+            PERIOD * np.arange(10),
+            lambda t: np.zeros(3),
+            lambda t: start * Rotation.from_rotvec(rate_b * t),
+        )
+        np.testing.assert_allclose(out[-1][1], rate_b, atol=1e-6)
+
+
+def test_what_the_source_gives_is_taken_and_a_gap_empties_the_window():
+    slopes = SlopeFilter(EstimateParams(3, 1))
+    given = Pose(0.0, 0.0, "vehicle", (0.0,) * 3, (0.0, 0.0, 0.0, 1.0), (1.0, 2.0, 3.0), (4.0, 5.0, 6.0))
+    assert slopes.update(given) == ((1.0, 2.0, 3.0), (4.0, 5.0, 6.0))
+    assert slopes.lag == 0.0
+    bare = Pose(0.01, 0.01, "vehicle", (0.01, 0.0, 0.0))
+    np.testing.assert_allclose(slopes.update(bare)[0], (1.0, 0.0, 0.0))
+    assert slopes.update(Pose(1.0, 1.0, "vehicle", (5.0, 0.0, 0.0)))[0] == (0.0, 0.0, 0.0)
+
+
+def test_wrong_parameters():
+    for samples, order in ((1, 1), (2, 2), (5, 3), (51, 1)):
+        with pytest.raises(ValueError, match="expected 1 or 2"):
+            EstimateParams(samples, order)

@@ -1,0 +1,160 @@
+"""The gate, the track and the clock: what is refused, what goes stale and when, and what a step of a clock does."""
+
+import math
+
+import numpy as np
+import pytest
+
+from hil.clock import ManualClock, MonotonicClock, Ticker, TimeSync
+from hil.estimate import EstimateParams
+from hil.frames import FrameParams
+from hil.gate import ABORT, HOLD, OK, WARN, Gate, GateParams
+from hil.pose import Pose
+from hil.track import Track
+
+PARAMS = GateParams(0.02, 0.12, 8.0, 0.3, 15.0, 0.5, 0.04, 0.1, 0.25)
+LEVEL = (0.0, 0.0, 0.0, 1.0)
+TURNED = (0.0, 0.0, 1.0, 0.0)
+
+
+def pose(time=0.0, x=0.0, quat=LEVEL, arrival=None, **more) -> Pose:
+    return Pose(time, time if arrival is None else arrival, "vehicle", (x, 0.0, 1.0), quat, **more)
+
+
+@pytest.mark.parametrize(
+    ("second", "reason"),
+    [
+        (pose(0.01, 0.01), None),
+        (pose(0.01, math.nan), "finite"),
+        (pose(0.01, math.inf), "finite"),
+        (pose(0.01, quat=(0.0, 0.0, math.nan, 1.0)), "finite"),
+        (pose(0.01, 0.01, (0.0, 0.0, 0.0, 0.0)), "quaternion"),
+        (pose(0.01, 0.01, (0.0, 0.0, 0.0, 1.05)), "quaternion"),
+        (pose(0.01, 0.15), "jump"),
+        (pose(0.01, 0.5), "speed"),
+        (pose(0.01, 0.01, vel=(9.0, 0.0, 0.0)), "speed"),
+        (pose(0.01, 0.01, vel=(math.nan, 0.0, 0.0)), "finite"),
+        (pose(0.01, 0.01, TURNED), "turn"),
+        (pose(0.01), "repeated"),
+        (pose(0.0, 0.01), "old"),
+        (pose(-0.02, 0.01), "old"),
+        (pose(0.01, 0.01, reset=1), "reset"),
+    ],
+)
+def test_each_reason(second, reason):
+    gate = Gate(PARAMS)
+    assert gate.check(pose()) is None
+    assert gate.check(second, (0.0, 0.0, 0.0)) == reason
+    assert gate.refused == ({} if reason is None else {reason: 1})
+
+
+def test_a_swapped_body_is_never_taken_back_by_waiting():
+    gate = Gate(PARAMS)
+    gate.check(pose())
+    reasons = {gate.check(pose(0.01 * i, 0.4), (0.0, 0.0, 0.0)) for i in range(1, 3)}
+    assert reasons <= {"jump", "speed"}
+    gate = Gate(PARAMS)
+    gate.check(pose(), None)
+    assert gate.check(pose(0.01, 0.01, reset=1)) == "reset"
+    assert gate.check(pose(0.02, 0.02)) == "reset", "also when the counter goes back"
+    gate.restart()
+    assert gate.check(pose(0.03, 0.03)) is None
+
+
+def test_staleness_is_of_content_not_of_arrival():
+    gate = Gate(PARAMS)
+    assert gate.level(0.0) == ABORT
+    gate.check(pose(1.0))
+    levels = []
+    for i in range(1, 40):
+        now = 1.0 + 0.01 * i
+        assert gate.check(pose(now)) == "repeated"
+        levels.append(gate.level(now))
+    first = {level: 0.01 * (levels.index(level) + 1) for level in (OK, WARN, HOLD, ABORT)}
+    assert first[OK] == 0.01
+    for level, limit in ((WARN, 0.04), (HOLD, 0.10), (ABORT, 0.25)):
+        assert limit <= first[level] <= limit + 0.011
+
+
+def test_a_marker_has_no_attitude():
+    gate = Gate(PARAMS)
+    assert gate.check(pose(quat=None)) is None
+    assert gate.check(pose(0.01, 0.01, None)) is None
+
+
+def test_wrong_limits():
+    with pytest.raises(ValueError, match="ascending"):
+        GateParams(0.02, 0.12, 8.0, 0.3, 15.0, 0.5, 0.1, 0.04, 0.25)
+    with pytest.raises(ValueError, match="above 0"):
+        GateParams(0.0, 0.12, 8.0, 0.3, 15.0, 0.5, 0.04, 0.1, 0.25)
+
+
+def track() -> Track:
+    return Track(FrameParams("x,y,z", "x,y,z", "xyzw", 0.0, (0.0, 0.0, 0.0)), PARAMS, EstimateParams(3, 1))
+
+
+@pytest.mark.parametrize("step", [1.0, -1.0])
+def test_a_step_of_the_sources_clock_costs_nothing(step):
+    body = track()
+    for i in range(60):
+        time = 0.01 * i
+        stamp = time + (step if i >= 30 else 0.0)
+        assert body.update(pose(stamp, 0.5 * time, arrival=time)) is None
+        if i > 2:
+            np.testing.assert_allclose(body.state(time).vel, (0.5, 0.0, 0.0), atol=1e-9)
+    assert body.accepted == 60
+
+
+def test_reordered_and_doubled_poses_are_dropped():
+    body = track()
+    order = [0, 1, 2, 4, 3, 5, 5, 6]
+    reasons = [body.update(pose(0.01 * i, 0.01 * i, arrival=0.01 * n)) for n, i in enumerate(order)]
+    assert reasons == [None, None, None, None, "old", None, "old", None]
+
+
+def test_a_state_is_carried_forward():
+    body = track()
+    for i in range(5):
+        half = 0.01 * i / 2
+        body.update(pose(0.01 * i, 0.02 * i, (0.0, 0.0, math.sin(half), math.cos(half))))
+    state = body.state(0.05, ahead=0.02)
+    np.testing.assert_allclose(state.pos, (0.08 + 0.04, 0.0, 1.0), atol=1e-9)
+    np.testing.assert_allclose(2 * math.asin(state.quat[2]), 0.06, atol=1e-5)
+    assert state.age == pytest.approx(0.01)
+    assert track().state(0.0) is None
+
+
+def test_late_ticks_are_counted_and_keep_their_grid():
+    clock = ManualClock(5.0)
+    ticker = Ticker(clock, 0.02)
+    assert [ticker.wait() for _ in range(3)] == pytest.approx([5.0, 5.02, 5.04])
+    clock.time += 0.07
+    assert ticker.wait() == pytest.approx(5.11)
+    assert (ticker.index, ticker.missed) == (5, 2)
+    assert ticker.late == pytest.approx(0.01)
+    assert ticker.wait() == pytest.approx(5.12)
+    assert ticker.worst == pytest.approx(0.05)
+
+
+def test_the_monotonic_clock_keeps_its_speed():
+    clock = MonotonicClock(4.0)
+    start = clock.now()
+    clock.sleep_until(start + 0.08)
+    assert 0.08 <= clock.now() - start < 1.0
+    with pytest.raises(ValueError, match="above 0"):
+        MonotonicClock(0.0)
+
+
+def test_timesync_takes_the_shortest_round_trip():
+    """Delays of 1 to 12 ms, uneven both ways; the error is at most half the shortest round trip."""
+    rng, sync, offset = np.random.default_rng(0), TimeSync(), 1234.5
+    assert sync.offset is None
+    for i in range(60):
+        there, back = rng.exponential(2e-3, 2) + 3e-4
+        stamp = sync.request(float(i))
+        peer = int((i + there + offset) * 1e9)
+        assert sync.feed(peer, stamp, i + there + back)
+    assert abs(sync.offset - offset) <= 0.5 * sync.round_trip
+    assert sync.round_trip < 3e-3
+    assert not sync.feed(5, 12345, 0.0), "no request of ours"
+    assert not sync.feed(0, 0, 0.0)

@@ -1,0 +1,151 @@
+"""Sources: senders told apart, pairs, .tlog and CSV read as the live link does, wrong files told."""
+
+import gzip
+import math
+
+import numpy as np
+import pytest
+
+from hil.errors import SourceError
+from hil.link import TlogWriter
+from hil.mavlink import Parser, mav
+from hil.pose import Pose
+from hil.sources import BodyIds, Column, CsvParams, MavlinkDecoder, Recorded, read_csv, read_tlog
+
+BODIES = (BodyIds("vehicle", "ATT_POS_MOCAP", 1, 0), BodyIds("payload", "ODOMETRY", 2, 1))
+
+
+def wired(message, system=1, component=1):
+    """A message as it comes out of the wire, with its sender."""
+    (got,) = Parser().parse(message.pack(mav.MAVLink(None, system, component)))
+    return got
+
+
+def mocap(time_us=1_000_000, x=1.0):
+    return mav.MAVLink_att_pos_mocap_message(time_us, [1.0, 0.0, 0.0, 0.0], x, 2.0, 3.0)
+
+
+def odometry():
+    return mav.MAVLink_odometry_message(
+        7, 20, 12, 1.0, 2.0, 3.0, [1.0, 0.0, 0.0, 0.0], 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, [0.0] * 21, [0.0] * 21
+    )
+
+
+def test_bodies_are_told_apart_by_their_senders():
+    decoder = MavlinkDecoder(BODIES)
+    assert decoder.feed(wired(mocap(), 1, 9), 0.0).body == "vehicle"
+    assert decoder.feed(wired(mocap(), 2, 1), 0.0) is None
+    assert decoder.feed(wired(odometry(), 2, 1), 0.0).body == "payload"
+    assert decoder.feed(wired(odometry(), 2, 2), 0.0) is None
+    assert decoder.feed(wired(mav.MAVLink_heartbeat_message(2, 3, 0, 0, 0, 3)), 0.0) is None
+
+
+def test_a_local_position_takes_the_attitude_of_its_sender():
+    decoder = MavlinkDecoder((BodyIds("vehicle", "LOCAL_POSITION_NED", 1, 1),))
+    local = wired(mav.MAVLink_local_position_ned_message(1000, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0))
+    assert decoder.feed(local, 0.0) is None, "no attitude yet"
+    attitude = mav.MAVLink_attitude_quaternion_message(990, 1.0, 0.0, 0.0, 0.0, 0.25, 0.5, 0.75)
+    decoder.feed(wired(attitude, 3, 1), 0.0)
+    assert decoder.feed(local, 0.0) is None, "another sender's"
+    decoder.feed(wired(attitude), 0.0)
+    pose = decoder.feed(local, 0.5)
+    assert pose == Pose(1.0, 0.5, "vehicle", (1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0), (4.0, 5.0, 6.0), (0.25, 0.5, 0.75))
+    late = wired(mav.MAVLink_local_position_ned_message(1100, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0))
+    assert decoder.feed(late, 0.0) is None, "too old an attitude"
+
+
+def test_senders_that_clash_are_refused():
+    with pytest.raises(SourceError, match="no two bodies"):
+        MavlinkDecoder((BodyIds("vehicle", "ODOMETRY", 1, 0), BodyIds("payload", "ODOMETRY", 1, 2)))
+    with pytest.raises(SourceError, match="at least one"):
+        MavlinkDecoder(())
+    with pytest.raises(SourceError, match="expected one of vehicle"):
+        BodyIds("drone", "ODOMETRY", 1, 0)
+    with pytest.raises(SourceError, match="expected 1 to 255"):
+        BodyIds("vehicle", "ODOMETRY", 0, 0)
+
+
+def test_a_tlog_gives_what_the_link_gave_past_damage(tmp_path):
+    path = tmp_path / "a.tlog"
+    writer, decoder, live = TlogWriter(path), MavlinkDecoder(BODIES), []
+    for i in range(20):
+        message = wired(mocap(1000 * i, 0.1 * i))
+        writer.write(message, 100.0 + 0.01 * i)
+        live.append(decoder.feed(message, 0.01 * i))
+    writer.close()
+    read = read_tlog(path, BODIES)
+    assert [(p.stamp, p.pos, p.quat) for p in read] == [(p.stamp, p.pos, p.quat) for p in live]
+    np.testing.assert_allclose([p.arrival for p in read], [p.arrival for p in live], atol=2e-6)
+    data = path.read_bytes()
+    length = len(data) // 20
+    path.write_bytes(data[: 5 * length + 11] + b"rubbish" + data[7 * length : -9])
+    assert len(read_tlog(path, BODIES)) == 17
+
+
+def test_files_that_are_no_tlog(tmp_path):
+    path = tmp_path / "x.tlog"
+    with pytest.raises(SourceError, match="cannot be read"):
+        read_tlog(path, BODIES)
+    path.write_bytes(b"\x00" * 500)
+    with pytest.raises(SourceError, match="500 bytes without a single"):
+        read_tlog(path, BODIES)
+
+
+CSV = "t,x,y,z,roll,pitch,yaw\n1000,1,2,3,0,0,90\n1010,1.5,2,3,0,0,90\n\n1020,,2,3,0,0,90\n"
+PARAMS = CsvParams(
+    "vehicle", Column(("x", "y", "z"), "mm"), Column(("t",), "ms"), euler=Column(("roll", "pitch", "yaw"), "deg")
+)
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_csv_with_units(tmp_path, packed):
+    path = tmp_path / ("a.csv.gz" if packed else "a.csv")
+    path.write_bytes(gzip.compress(CSV.encode()) if packed else CSV.encode())
+    poses = read_csv(path, (PARAMS,))
+    assert [pose.stamp for pose in poses] == pytest.approx([1.0, 1.01, 1.02])
+    assert [pose.arrival for pose in poses] == pytest.approx([0.0, 0.01, 0.02])
+    assert poses[1].pos == pytest.approx((1.5e-3, 2e-3, 3e-3))
+    half = math.sqrt(0.5)
+    assert poses[0].quat == pytest.approx((0.0, 0.0, half, half))
+    assert read_csv(path, (PARAMS,), "wxyz")[0].quat == pytest.approx((half, 0.0, 0.0, half))
+    assert math.isnan(poses[2].pos[0]), "an empty cell is for the gate to refuse"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("t,x,y\n1,2,3\n", "no column 'z'"),
+        (CSV.replace("1.5", "one"), "line 3: could not convert"),
+        (CSV.replace("1010,1.5", "1010"), "line 3 has 6 cells; the header has 7"),
+    ],
+)
+def test_wrong_csv(tmp_path, text, message):
+    path = tmp_path / "a.csv"
+    path.write_text(text)
+    with pytest.raises(SourceError, match=message):
+        read_csv(path, (PARAMS,))
+    with pytest.raises(SourceError, match="cannot be read"):
+        read_csv(tmp_path / "b.csv", (PARAMS,))
+
+
+def test_wrong_mappings():
+    with pytest.raises(SourceError, match="pos in 'ft'; expected one of: m, cm, mm"):
+        CsvParams("vehicle", Column(("x", "y", "z"), "ft"), row_period=0.01)
+    with pytest.raises(SourceError, match="expected 3"):
+        CsvParams("vehicle", Column(("x", "y"), "m"), row_period=0.01)
+    with pytest.raises(SourceError, match="row_period"):
+        CsvParams("vehicle", Column(("x", "y", "z"), "m"))
+    with pytest.raises(SourceError, match="did you mean 'vehicle'"):
+        CsvParams("vehicel", Column(("x", "y", "z"), "m"), row_period=0.01)
+
+
+def test_recorded_poses_come_when_their_time_has_come():
+    source = Recorded(Pose(0.0, t, "vehicle", (t, 0.0, 0.0)) for t in (0.3, 0.1, 0.2))
+    assert source.start == 0.1
+    assert [pose.arrival for pose in source.poll(0.25)] == [0.1, 0.2]
+    assert not source.ended
+    assert source.poll(0.25) == []
+    assert len(source.poll(1.0)) == 1
+    assert source.ended
+    with pytest.raises(SourceError, match="holds no pose"):
+        Recorded([])
