@@ -150,6 +150,7 @@ def contract_of(experiment: Experiment) -> dict:
     """
     from visthrow import config
     from visthrow.observations import layout_of
+    from visthrow.pilot import camera_conditions
 
     layout = layout_of(experiment.task.observation)
     contract = {
@@ -161,12 +162,5 @@ def contract_of(experiment: Experiment) -> dict:
         "rope": config.to_dict(experiment.rope),
     }
     if experiment.task.observation.layout == "vision":
-        camera = config.to_dict(experiment.camera)
-        contract["camera"] = {
-            "fisheye": camera["fisheye"],
-            "mount": {k: camera["mount"][k] for k in ("position_b", "rpy_deg")},
-            "goal_side": camera["goal_side"],
-            "payload_radius": camera["payload_radius"],
-            "invalid_reads": camera["noise"]["invalid_reads"],
-        }
+        contract["camera"] = camera_conditions(experiment.camera)
     return contract
