@@ -139,9 +139,12 @@ def _image(stream: rr.RecordingStream, log: FlightLog, camera: CameraParams) -> 
     right = float(lens.radius_from_angle(torch.tensor(np.pi / 2)) / lens.edge_radius)
     rings = rr.LineStrips2D(
         [100 * circle, 100 * right * circle], colors=[[150, 150, 150], [80, 80, 80]], radii=[0.7, 0.4],
-        labels=[f"{camera.fisheye.fov_deg / 2:g}° off the axis", "90°"],
+        show_labels=False,
     )  # fmt: skip
     stream.log("camera/field_of_view", rings, static=True)
+    places = [[0.0, 103.0], [0.0, 100.0 * right - 4.0]]  # a strip's own label would stand in the middle, on the ball
+    names = [f"{camera.fisheye.fov_deg / 2:g}° off the axis", "90°"]
+    stream.log("camera/angles", rr.Points2D(places, labels=names, radii=0.1, colors=[150, 150, 150]), static=True)
     points, valid = 100.0 * log["keypoints"].values, log["keypoints_valid"].values.astype(bool)
     groups = {
         "goal": (slice(0, GOAL_KEYPOINTS), [60, 200, 80]),
@@ -226,15 +229,16 @@ def _blueprint(goal: np.ndarray) -> rrb.Blueprint:
     image = rrb.Spatial2DView(origin="camera", name="Fisheye keypoints", background=[12, 12, 14], visual_bounds=bounds)
     axis = rrb.TimeAxis(link=rrb.components.LinkAxis.LinkToGlobal)
 
-    def plot(name: str, *entities: str) -> rrb.TimeSeriesView:
+    def plot(name: str, low: float, high: float, *entities: str) -> rrb.TimeSeriesView:
         return rrb.TimeSeriesView(
             name=name, origin="signals", contents=[f"/signals/{e}/**" for e in entities], axis_x=axis,
-            plot_legend=rrb.PlotLegend(visible=True),
+            axis_y=rrb.ScalarAxis(range=(low, high), zoom_lock=False), plot_legend=rrb.PlotLegend(visible=True),
         )  # fmt: skip
 
     plots = rrb.Grid(
-        plot("Phase", "phase"), plot("Collective thrust", "thrust"), plot("Body rates", "rate_command", "rate"),
-        plot("Motors", "motors"), plot("Battery", "battery"), grid_columns=3,
+        plot("Phase", -0.1, 1.1, "phase"), plot("Collective thrust [N]", 0.0, 14.0, "thrust"),
+        plot("Body rates [rad/s]", -11.0, 11.0, "rate_command", "rate"),
+        plot("Motor speeds [rad/s]", 0.0, 4000.0, "motors"), plot("Battery [V]", 13.0, 17.0, "battery"), grid_columns=3,
     )  # fmt: skip
     top = rrb.Horizontal(scene, image, column_shares=[2.2, 1.0])
     return rrb.Blueprint(rrb.Vertical(top, plots, row_shares=[1.7, 1.0]), collapse_panels=True)
