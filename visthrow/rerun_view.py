@@ -142,7 +142,7 @@ def _image(stream: rr.RecordingStream, log: FlightLog, camera: CameraParams) -> 
         show_labels=False,
     )  # fmt: skip
     stream.log("camera/field_of_view", rings, static=True)
-    places = [[0.0, 103.0], [0.0, 100.0 * right - 4.0]]  # a strip's own label would stand in the middle, on the ball
+    places = [[0.0, 95.0], [0.0, 100.0 * right - 4.0]]  # a strip's own label would stand in the middle, on the ball
     names = [f"{camera.fisheye.fov_deg / 2:g}° off the axis", "90°"]
     stream.log("camera/angles", rr.Points2D(places, labels=names, radii=0.1, colors=[150, 150, 150]), static=True)
     points, valid = 100.0 * log["keypoints"].values, log["keypoints_valid"].values.astype(bool)
