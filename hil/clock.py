@@ -1,9 +1,10 @@
 """Time: the monotonic clock, ticks on it, and the offset of a peer's clock."""
 
+import select
 import time
 from collections import deque
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 
 class Clock(Protocol):
@@ -14,6 +15,9 @@ class Clock(Protocol):
 
     def sleep_until(self, when: float) -> None:
         """Wait until a time [s]; at once where it has passed."""
+
+    def wait_for(self, file: Any, when: float) -> None:
+        """Wait until there is something to read from a file (anything with ``fileno``), or until a time [s]."""
 
 
 class MonotonicClock:
@@ -39,6 +43,12 @@ class MonotonicClock:
         if left > 0.0:
             time.sleep(left)
 
+    def wait_for(self, file: Any, when: float) -> None:
+        """See `Clock`."""
+        left = (when - self.now()) / self._speed
+        if left > 0.0:
+            select.select([file], [], [], left)
+
 
 class ManualClock:
     """A clock that is where it was put: for tests and replay."""
@@ -54,6 +64,10 @@ class ManualClock:
     def sleep_until(self, when: float) -> None:
         """See `Clock`."""
         self.time = max(self.time, when)
+
+    def wait_for(self, file: Any, when: float) -> None:
+        """See `Clock`."""
+        self.sleep_until(when)
 
 
 @dataclass

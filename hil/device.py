@@ -70,6 +70,9 @@ class Port(Protocol):
     def write(self, data: bytes) -> bool:
         """Whether the bytes were taken."""
 
+    def fileno(self) -> int:
+        """For waiting until there is something to read."""
+
     def close(self) -> None:
         """Give the port back."""
 
@@ -121,6 +124,10 @@ class UdpPort:
         except OSError:
             return False
 
+    def fileno(self) -> int:
+        """See `Port`."""
+        return self._socket.fileno()
+
     def close(self) -> None:
         """See `Port`."""
         self._socket.close()
@@ -157,6 +164,10 @@ class TcpPort:
             return self._socket.send(data) == len(data)
         except OSError:
             return False
+
+    def fileno(self) -> int:
+        """See `Port`."""
+        return self._socket.fileno()
 
     def close(self) -> None:
         """See `Port`."""
@@ -196,6 +207,10 @@ class SerialPort:
             return self._port.write(data) == len(data)
         except OSError:
             return False
+
+    def fileno(self) -> int:
+        """See `Port`."""
+        return self._port.fileno()
 
     def close(self) -> None:
         """See `Port`."""

@@ -1,14 +1,19 @@
 """One tracked body: frames, gate, filter and age, from raw poses to a state at a time."""
 
+import math
+from collections import deque
 from dataclasses import dataclass, replace
 
-from hil.estimate import EstimateParams, SlopeFilter
+from hil.estimate import EstimateParams, SlopeFilter, slope_weights
 from hil.frames import FrameParams, Frames, multiply
 from hil.gate import Gate, GateParams
 from hil.pose import Pose, Quaternion, Vector
 
 MOST_PREDICTION = 0.1
 """Poses are carried forward by no more than this [s]; older ones are the timers' affair."""
+
+CALM_SAMPLES = 20
+"""Poses over which :meth:`Track.calm_speed` is taken: enough that noise of millimetres does not count as motion."""
 
 
 @dataclass(frozen=True)
@@ -37,12 +42,14 @@ class Track:
         self._pose: Pose | None = None
         self._vel: Vector = (0.0, 0.0, 0.0)
         self._rate: Vector = (0.0, 0.0, 0.0)
+        self._slow: deque[tuple[float, Vector]] = deque(maxlen=CALM_SAMPLES)
         self._shift = 0.0  # added to the stamps, so that a step of the source's clock leaves the filter's window whole
 
     def restart(self) -> None:
         """Forget all; see `hil.gate.Gate.restart`."""
         self.gate.restart()
         self.filter.reset()
+        self._slow.clear()
         self._pose = None
 
     def update(self, raw: Pose) -> str | None:
@@ -57,7 +64,16 @@ class Track:
         self.accepted += 1
         self._vel, self._rate = self.filter.update(replace(pose, stamp=pose.stamp + self._shift))
         self._pose = pose
+        self._slow.appendleft((pose.arrival, pose.pos))
         return None
+
+    def calm_speed(self) -> float:
+        """Speed by a line through the last poses [m/s]: late, but free of noise; infinite with too few of them."""
+        if len(self._slow) < CALM_SAMPLES:
+            return math.inf
+        newest = self._slow[0][0]
+        weights = slope_weights([newest - time for time, _ in self._slow], 1)
+        return math.hypot(*(sum(c * pos[i] for c, (_, pos) in zip(weights, self._slow)) for i in range(3)))
 
     def state(self, now: float, ahead: float = 0.0) -> BodyState | None:
         """State by the last accepted pose, carried forward at constant velocity and rate.

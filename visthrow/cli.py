@@ -15,6 +15,8 @@ COMMANDS = {
     "train": ("train a throwing policy from scratch", "visthrow.train_cli"),
     "fly": ("fly one throw and write a 3D recording and a picture of it", "visthrow.fly"),
     "compare": ("throw many times with each policy and print landing errors and durations", "visthrow.compare"),
+    "hil": ("fly a policy on motion-capture poses, live or recorded", "hil.cli"),
+    "baseline": ("throw with trajectory optimisation and MPC; its front against the policies", "visthrow.baseline.command"),
     "bench": ("measure the speed of the simulator and of the camera", "visthrow.bench"),
     "config": ("print a configuration with all its values filled in", "visthrow.config_cli"),
 }
@@ -24,7 +26,7 @@ TRACEBACK_VARIABLE = "VISTHROW_TRACEBACK"
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
 
-_EXTRAS = {"mujoco": "reference"}
+_EXTRAS = {"mujoco": "reference", "piqp": "baseline"}
 """Optional packages by import name, and the extra of visthrow that installs them."""
 
 _DESCRIPTION = """\

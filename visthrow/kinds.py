@@ -14,6 +14,7 @@ SCHEMAS = {
     "task": "visthrow.task:TaskParams",
     "start": "sim.params:RandomizationParams",
     "train": "visthrow.task:Experiment",
+    "hil": "hil.params:HilParams",
     "vehicle/reference_realistic": "sim.reference.extras:ReferenceExtras",
 }
 """``kind`` or ``kind/name`` -> ``module:class``; the longer key wins."""

@@ -3,6 +3,7 @@
 from collections.abc import Iterable
 from typing import Protocol
 
+from hil.clock import Clock
 from hil.errors import SourceError
 from hil.pose import Pose
 
@@ -14,6 +15,9 @@ class Source(Protocol):
 
     def poll(self, now: float) -> list[Pose]:
         """Raw poses that have arrived by ``now`` [s] on the runner's clock, in order of arrival."""
+
+    def wait(self, clock: Clock, until: float) -> None:
+        """Wait until a time [s], taking in what comes in the meantime, so that its arrival is known."""
 
     def close(self) -> None:
         """Give the port or file back."""
@@ -49,6 +53,10 @@ class Recorded:
         while self._next < len(self.poses) and self.poses[self._next].arrival <= now:
             self._next += 1
         return self.poses[first : self._next]
+
+    def wait(self, clock: Clock, until: float) -> None:
+        """See `Source`."""
+        clock.sleep_until(until)
 
     def close(self) -> None:
         """See `Source`."""

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from hil.clock import Clock
 from hil.errors import SourceError
 from hil.link import Link, pose_from_message
 from hil.mavlink import Parser
@@ -112,6 +113,14 @@ class MavlinkSource:
         self._link.pump(self._clock)
         poses, self._waiting = self._waiting, []
         return poses
+
+    def wait(self, clock: Clock, until: float) -> None:
+        """See `hil.sources.base.Source`."""
+        while clock.now() < until:
+            clock.wait_for(self._link.port, until)
+            if not self._link.pump(self._clock):
+                break
+        clock.sleep_until(until)
 
     def close(self) -> None:
         """See `hil.sources.base.Source`."""
