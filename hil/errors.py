@@ -1,9 +1,9 @@
 """Errors of the onboard side that a user can cause and mend."""
 
-from visthrow.errors import VisthrowError
+from visthrow.errors import ConfigError, VisthrowError
 
 
-class FrameError(VisthrowError):
+class FrameError(ConfigError):
     """The axes, the quaternion order or an offset of a pose source describe no frame."""
 
 

@@ -1,8 +1,10 @@
 """The gate that every pose passes, one for each body with its own timer.
 
 A motion-capture system that has lost a body goes on sending its *last* pose, so staleness is judged on content: the
-time since a pose last *differed* from the one before. A body that jumps is refused and stays refused: two bodies that the
-system has swapped never become right again by waiting, so their timers run out and the runner ends the throw.
+time since a pose last *differed* from the one before. A body that jumps is refused and stays refused: a pose must lie
+where the last accepted one and its velocity put the body, within a room that grows with the time in which *nothing* came,
+not with the time in which wrong poses came. So two bodies that the system has swapped never become right again by waiting;
+their timers run out and the runner ends the throw.
 """
 
 import math
@@ -12,6 +14,9 @@ from hil.pose import Pose, Vector
 
 OK, WARN, HOLD, ABORT = range(4)
 """Levels of staleness."""
+
+MOST_ACCELERATION = 40.0
+"""By which a body may have changed its velocity while nothing came [m/s^2]."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +30,7 @@ class GateParams:
     quat_tolerance: float  # of a quaternion's norm from 1 [-]
     max_jump: float  # from where the last pose and velocity put the body [m]
     max_speed: float  # [m/s]
-    max_turn: float  # between two poses, beyond max_turn_rate times their distance in time [rad]
+    max_turn: float  # between two poses, beyond max_turn_rate times the time in which nothing came [rad]
     max_turn_rate: float  # [rad/s]
     clock_step: float  # stamps that leave the arrivals by more than this are a step of the source's clock [s]
     warn: float  # content age [s]
@@ -57,6 +62,7 @@ class Gate:
         """Forget all: the next good pose is taken wherever it is. On the ground only, at the operator's word."""
         self.last: Pose | None = None
         self.jumped = False
+        self._came: Pose | None = None  # last pose in order, accepted or not
         self._changed = -math.inf  # arrival of the last new content [s]
 
     def check(self, pose: Pose, velocity: Vector | None = None) -> str | None:
@@ -74,7 +80,8 @@ class Gate:
         if reason is not None:
             self.refused[reason] = self.refused.get(reason, 0) + 1
             return reason
-        self.last, self._changed = pose, pose.arrival
+        self.last = self._came = pose
+        self._changed = pose.arrival
         return None
 
     def stepped(self, pose: Pose) -> bool:
@@ -101,21 +108,22 @@ class Gate:
         stepped = self.stepped(pose)
         if pose.stamp <= last.stamp and not stepped:
             return "old"
+        came, self._came = self._came or last, pose
         if pose.pos == last.pos and pose.quat == last.quat:
             return "repeated"
         # A clock that was set says nothing of how long ago the last pose was; the arrivals do.
-        age = max(pose.arrival - last.arrival if stepped else pose.stamp - last.stamp, 0.0)
-        moved = math.dist(pose.pos, last.pos)
-        if moved > p.max_jump + p.max_speed * age:
+        age, gap = (
+            max(pose.arrival - then.arrival if stepped else pose.stamp - then.stamp, 0.0) for then in (last, came)
+        )
+        if math.dist(pose.pos, last.pos) > p.max_jump + p.max_speed * age:
             return "speed"
         if velocity is not None:
             expected = tuple(x + age * v for x, v in zip(last.pos, velocity))
-            # Beyond 0.1 s the last velocity says little of where the body is; the speed limit alone holds then.
-            if age <= 0.1 and math.dist(pose.pos, expected) > p.max_jump:
+            if math.dist(pose.pos, expected) > p.max_jump + 0.5 * MOST_ACCELERATION * gap * gap:
                 return "jump"
         if pose.quat is not None and last.quat is not None:
             cosine = min(1.0, abs(sum(a * b for a, b in zip(pose.quat, last.quat))))
-            if 2.0 * math.acos(cosine) > p.max_turn + p.max_turn_rate * age:
+            if 2.0 * math.acos(cosine) > p.max_turn + p.max_turn_rate * gap:
                 return "turn"
         return None
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from hil.errors import SourceError
 from hil.pose import BODIES, Pose
-from visthrow.errors import suggest
+from visthrow.errors import ConfigError, suggest
 
 UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "m": 1.0, "cm": 1e-2, "mm": 1e-3, "m/s": 1.0, "mm/s": 1e-3,
          "rad": 1.0, "deg": math.pi / 180, "rad/s": 1.0, "deg/s": math.pi / 180, "1": 1.0}  # fmt: skip
@@ -42,7 +42,7 @@ class CsvParams:
     """Mapping of one body's columns.
 
     Raises:
-        SourceError: a unit or a number of columns that the quantity cannot have.
+        ConfigError: a unit or a number of columns that the quantity cannot have.
     """
 
     body: str  # "vehicle", "payload" or "goal"
@@ -56,21 +56,21 @@ class CsvParams:
 
     def __post_init__(self) -> None:
         if self.body not in BODIES:
-            raise SourceError(f"body '{self.body}'; {suggest(self.body, BODIES)}")
+            raise ConfigError(f"body '{self.body}'; {suggest(self.body, BODIES)}")
         for name, units in _ALLOWED.items():
             column = getattr(self, name)
             if column is None:
                 continue
             if column.unit not in units:
-                raise SourceError(f"{name} in '{column.unit}'; expected one of: {', '.join(units)}")
+                raise ConfigError(f"{name} in '{column.unit}'; expected one of: {', '.join(units)}")
             if len(column.names) != _WIDTH.get(name, 3):
-                raise SourceError(
+                raise ConfigError(
                     f"{name} of {len(column.names)} columns {list(column.names)}; expected {_WIDTH.get(name, 3)}"
                 )
         if (self.time is None) != (self.row_period > 0.0):
-            raise SourceError("give either a time column or a row_period above 0 s")
+            raise ConfigError("give either a time column or a row_period above 0 s")
         if self.quat is not None and self.euler is not None:
-            raise SourceError("give either quat or euler, not both")
+            raise ConfigError("give either quat or euler, not both")
 
 
 def read_csv(path: str | Path, bodies: tuple[CsvParams, ...], quaternion: str = "xyzw") -> list[Pose]:

@@ -12,6 +12,7 @@ from hil.errors import SourceError
 from hil.link import Link, pose_from_message
 from hil.mavlink import Parser
 from hil.pose import BODIES, Pose
+from visthrow.errors import ConfigError
 
 POSE_MESSAGES = ("ATT_POS_MOCAP", "VISION_POSITION_ESTIMATE", "ODOMETRY", "LOCAL_POSITION_NED")
 PAIR_AGE = 0.05
@@ -23,7 +24,7 @@ class BodyIds:
     """Which sender speaks of which body, and in which message.
 
     Raises:
-        SourceError: ids out of range, or an unknown body or message.
+        ConfigError: ids out of range, or an unknown body or message.
     """
 
     body: str  # "vehicle", "payload" or "goal"
@@ -33,12 +34,12 @@ class BodyIds:
 
     def __post_init__(self) -> None:
         if self.body not in BODIES or self.message not in POSE_MESSAGES:
-            raise SourceError(
+            raise ConfigError(
                 f"body '{self.body}' in {self.message}; expected one of {', '.join(BODIES)} in one of "
                 f"{', '.join(POSE_MESSAGES)}"
             )
         if not (1 <= self.system <= 255 and 0 <= self.component <= 255):
-            raise SourceError(
+            raise ConfigError(
                 f"system {self.system}, component {self.component}; expected 1 to 255, and 0 (any) to 255"
             )
 

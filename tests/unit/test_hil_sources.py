@@ -11,6 +11,7 @@ from hil.link import TlogWriter
 from hil.mavlink import Parser, mav
 from hil.pose import Pose
 from hil.sources import BodyIds, Column, CsvParams, MavlinkDecoder, Recorded, read_csv, read_tlog
+from visthrow.errors import ConfigError
 
 BODIES = (BodyIds("vehicle", "ATT_POS_MOCAP", 1, 0), BodyIds("payload", "ODOMETRY", 2, 1))
 
@@ -59,9 +60,9 @@ def test_senders_that_clash_are_refused():
         MavlinkDecoder((BodyIds("vehicle", "ODOMETRY", 1, 0), BodyIds("payload", "ODOMETRY", 1, 2)))
     with pytest.raises(SourceError, match="at least one"):
         MavlinkDecoder(())
-    with pytest.raises(SourceError, match="expected one of vehicle"):
+    with pytest.raises(ConfigError, match="expected one of vehicle"):
         BodyIds("drone", "ODOMETRY", 1, 0)
-    with pytest.raises(SourceError, match="expected 1 to 255"):
+    with pytest.raises(ConfigError, match="expected 1 to 255"):
         BodyIds("vehicle", "ODOMETRY", 0, 0)
 
 
@@ -129,13 +130,13 @@ def test_wrong_csv(tmp_path, text, message):
 
 
 def test_wrong_mappings():
-    with pytest.raises(SourceError, match="pos in 'ft'; expected one of: m, cm, mm"):
+    with pytest.raises(ConfigError, match="pos in 'ft'; expected one of: m, cm, mm"):
         CsvParams("vehicle", Column(("x", "y", "z"), "ft"), row_period=0.01)
-    with pytest.raises(SourceError, match="expected 3"):
+    with pytest.raises(ConfigError, match="expected 3"):
         CsvParams("vehicle", Column(("x", "y"), "m"), row_period=0.01)
-    with pytest.raises(SourceError, match="row_period"):
+    with pytest.raises(ConfigError, match="row_period"):
         CsvParams("vehicle", Column(("x", "y", "z"), "m"))
-    with pytest.raises(SourceError, match="did you mean 'vehicle'"):
+    with pytest.raises(ConfigError, match="did you mean 'vehicle'"):
         CsvParams("vehicel", Column(("x", "y", "z"), "m"), row_period=0.01)
 
 

@@ -1,0 +1,249 @@
+"""``visthrow hil``: poses of a motion-capture system in, commands of a trained policy out."""
+
+import argparse
+import json
+import select
+import signal
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+ACTIONS = {
+    "run": "fly, or run dry, by a config of configs/hil",
+    "replay": "run a recorded run again and compare every action, bit for bit",
+    "check": "look at the poses that come, and at what speaks against a throw",
+    "record": "record the poses that come, without a policy's say",
+    "fake": "a fake autopilot with the simulator's vehicle, to throw over the wire",
+}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.epilog = (
+        "examples:\n"
+        "  visthrow hil run                              dry run: poses on udp port 14560, nothing is sent\n"
+        "  visthrow hil run --config fake --auto-arm     with `visthrow hil fake` in another terminal: a throw\n"
+        "  visthrow hil run --config mine.toml --out runs/monday\n"
+        "  visthrow hil replay runs/monday               the same actions again?\n"
+        "  visthrow hil check --seconds 5                what comes, how old, how often, and the checks\n"
+        "\nWhile a run goes on, type 'arm' (one throw), 'land' or 'abort' and Enter; Ctrl-C aborts.\n"
+    )
+    actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
+    subs = {name: actions.add_parser(name, help=text, description=text) for name, text in ACTIONS.items()}
+    for name in ("run", "check", "record"):
+        sub = subs[name]
+        sub.add_argument("--config", default="dry_run", metavar="NAME", help="of configs/hil, or a file")
+        sub.add_argument("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE")
+        sub.add_argument("--seconds", type=float, default=None, help="end after this time")
+        sub.add_argument("--speed", type=float, default=1.0, help="of the clock; below 1 with a fake of the same speed")
+    for name in ("run", "record"):
+        subs[name].add_argument(
+            "--out", default=None, metavar="FOLDER", help="of the run (default: a new one in runs/hil)"
+        )
+        subs[name].add_argument(
+            "--auto-arm", action="store_true", help="arm whenever ready; for simulated vehicles only"
+        )
+    subs["replay"].add_argument("folder", metavar="FOLDER", help="of a run")
+    fake = subs["fake"]
+    fake.add_argument("--device", default="udpout:127.0.0.1:14560", help="the runner's port")
+    fake.add_argument("--policy", default="vision", metavar="POLICY", help="whose plant is flown")
+    fake.add_argument("--plant", default="visthrow.wire_plant:make", metavar="MODULE:FUNCTION", help="that makes it")
+    fake.add_argument("--seed", type=int, default=0, help="of start, noise and loss")
+    fake.add_argument("--seconds", type=float, default=60.0, help="end after this time")
+    fake.add_argument("--speed", type=float, default=1.0, help="of the clock")
+    fake.add_argument(
+        "--answer", default="accepted", help="to the release: accepted, in-progress, denied, silent, stuck"
+    )
+    fake.add_argument("--out", default=None, metavar="FILE", help="write the report here")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Do what was asked."""
+    return {"run": _run, "record": _run, "replay": _replay, "check": _check, "fake": _fake}[args.action](args)
+
+
+class Keyboard:
+    """The operator at the terminal: lines of standard input, and Ctrl-C."""
+
+    def __init__(self, auto_arm: bool) -> None:
+        """Take over Ctrl-C."""
+        self._auto, self._stop = auto_arm, False
+        try:
+            self._open = sys.stdin.fileno() >= 0
+        except (AttributeError, OSError, ValueError):  # there is no terminal
+            self._open = False
+        signal.signal(signal.SIGINT, self._interrupt)
+
+    def _interrupt(self, *_: Any) -> None:
+        if self._stop:
+            raise KeyboardInterrupt
+        self._stop = True
+
+    def words(self, state: str) -> Any:
+        """See `hil.flight.Operator`."""
+        from hil.runner import Words
+
+        said = set()
+        while self._open and select.select([sys.stdin], [], [], 0)[0]:
+            line = sys.stdin.readline()
+            self._open = bool(line)
+            said.add(line.strip().lower())
+        return Words("arm" in said or (self._auto and state == "ready"), "land" in said, "abort" in said or self._stop)
+
+
+def _params(args: argparse.Namespace) -> Any:
+    from hil.params import HilParams
+    from visthrow import config
+
+    return config.load(HilParams, config.find("hil", args.config), args.overrides)
+
+
+def _run(args: argparse.Namespace) -> int:
+    started = time.monotonic()
+    from hil.backends import ArduPilot, DryRun
+    from hil.clock import ManualClock, MonotonicClock
+    from hil.flight import fly
+    from hil.record import Recorder
+    from hil.runner import Runner
+    from visthrow.policy import Policy, find_policy
+
+    params = _params(args)
+    folder = Path(args.out or f"runs/hil/{time.strftime('%Y%m%d-%H%M%S')}")
+    policy = Policy.load(find_policy(params.policy))
+    source, link, recorded = _source(params, folder, args.speed)
+    clock = ManualClock(source.start) if recorded else MonotonicClock(args.speed)
+    backend: Any = DryRun()
+    if params.backend == "ardupilot" and args.action == "run":
+        backend = ArduPilot(link, params.ardupilot)
+    runner = Runner(params, policy, backend, params.ardupilot.mechanism_lag if link is not None else 0.0)
+    warm_up(runner)
+    recorder = Recorder(folder, params)
+    operator = Keyboard(args.auto_arm and args.action == "run")
+    print(f"ready after {time.monotonic() - started:.2f} s; waiting for poses", file=sys.stderr, flush=True)
+    summary = fly(runner, source, clock, operator, recorder, args.seconds or float("inf"), _tell)
+    source.close()
+    recorder.close(summary)
+    print(story(summary, folder))
+    return 0 if summary["state"] != "abort" and not summary["errors"] else 1
+
+
+def warm_up(runner: Any) -> None:
+    """Call the policy once on the ground: first calls are slow."""
+    import numpy as np
+
+    still = np.zeros((1, 3))
+    for _ in range(3):
+        runner.pilot.act(still, np.array([[0.0, 0.0, 0.0, 1.0]]), still, still, still - [0, 0, 0.4], still[0])
+    runner.pilot.start()
+
+
+def _source(params: Any, folder: Path, speed: float) -> tuple[Any, Any, bool]:
+    """Source of poses, the link where there is one, and whether the poses are recorded ones."""
+    from hil.clock import MonotonicClock
+    from hil.device import check_device, open_port
+    from hil.link import Link, TlogWriter
+    from hil.pose import VEHICLE
+    from hil.sources import MavlinkSource, Recorded, read_csv, read_tlog
+
+    wanted = params.source
+    if wanted.kind == "tlog":
+        return Recorded(read_tlog(wanted.file, wanted.senders)), None, True
+    if wanted.kind == "csv":
+        return Recorded(read_csv(wanted.file, wanted.columns, params.frames[VEHICLE].quaternion)), None, True
+    port = open_port(check_device(params.link.device, remote=params.link.remote))
+    folder.mkdir(parents=True, exist_ok=True)
+    link = Link(port, params.link.system, params.link.component, TlogWriter(folder / "link.tlog"))
+    return MavlinkSource(link, wanted.senders, MonotonicClock(speed).now), link, False
+
+
+def _tell(decision: Any) -> None:
+    """Say each change of state."""
+    print(f"{decision.time:12.3f} s  {decision.state:8} {decision.reason}", file=sys.stderr, flush=True)
+
+
+def story(summary: dict[str, Any], folder: Path) -> str:
+    """A run in a few lines."""
+    lines = [f"ended in {summary['state']}: {summary['reason']}"]
+    lines.append(f"throws {summary['throws']}, released {summary['latches']}, cancelled {summary['cancelled']}")
+    for landing in summary.get("landings", []):
+        lines.append(
+            f"landing at x {landing['landing_w'][0]:.3f} m, y {landing['landing_w'][1]:+.3f} m by the payload's own poses: "
+            f"{landing['error']:.3f} m from the goal, {landing['duration']:.2f} s after the throw began"
+        )
+    for name, body in summary["bodies"].items():
+        refused = ", ".join(f"{n} {why}" for why, n in body["refused"].items()) or "none"
+        lines.append(f"{name}: {body['accepted']} poses taken; refused: {refused}")
+    lines.append(f"ticks {summary['ticks']}, missed {summary['missed']}; milliseconds a stage:")
+    lines.append("          p50     p95     p99     max")
+    for name, values in summary["latency"].items():
+        if values:
+            lines.append(f"{name:7}" + "".join(f" {values[k]:7.3f}" for k in ("p50_ms", "p95_ms", "p99_ms", "max_ms")))
+    lines += [f"error: {text.strip().splitlines()[-1]}" for text in summary["errors"]]
+    return "\n".join([*lines, f"{folder}  the run; `visthrow hil replay {folder}` runs it again"])
+
+
+def _replay(args: argparse.Namespace) -> int:
+    from hil.flight import replay
+
+    found = replay(args.folder)
+    for n, name, was, now in found["differences"][:10]:
+        print(f"tick {n}: {name} was {was}, is {now}")
+    same = "all bit for bit the same" if not found["differences"] else f"{len(found['differences'])} DIFFERENCES"
+    print(f"{found['ticks']} ticks, {found['actions']} actions of the policy: {same}")
+    return 0 if not found["differences"] else 1
+
+
+def _check(args: argparse.Namespace) -> int:
+    from hil.backends import DryRun
+    from hil.clock import ManualClock, MonotonicClock
+    from hil.runner import Runner, Words
+    from visthrow.policy import Policy, find_policy
+
+    params = _params(args)
+    import tempfile
+
+    with tempfile.TemporaryDirectory() as folder:
+        source, _, recorded = _source(params, Path(folder), args.speed)
+        clock = ManualClock(source.start) if recorded else MonotonicClock(args.speed)
+        runner = Runner(params, Policy.load(find_policy(params.policy)), DryRun())
+        begin, seconds = clock.now(), args.seconds or 5.0
+        while clock.now() - begin < seconds and not source.ended:
+            now = clock.now()
+            runner.tick(now, source.poll(now), runner.backend.status(now), Words())
+            clock.sleep_until(now + runner.pilot.period)
+        now = clock.now()
+        source.close()
+    for name, track in runner.tracks.items():
+        state = track.state(now)
+        if state is None:
+            print(f"{name}: no pose; refused: {track.gate.refused or 'none'}")
+            continue
+        x, y, z = state.pos
+        print(
+            f"{name}: {track.accepted / (now - begin):.0f} poses/s, age {1e3 * state.age:.0f} ms, at ({x:+.3f}, {y:+.3f}, "
+            f"{z:+.3f}) m, refused: {json.dumps(track.gate.refused) if track.gate.refused else 'none'}, "
+            f"velocity late by {max(0.0, 1e3 * track.filter.lag):.0f} ms"
+        )
+    problems = runner.problems()
+    print("\n".join(f"FAIL  {text}" for text in problems) or "PASS  all checks")
+    return 1 if problems else 0
+
+
+def _fake(args: argparse.Namespace) -> int:
+    from hil.clock import MonotonicClock
+    from hil.device import check_device, open_port
+    from hil.errors import RunError
+    from hil.fake import ANSWERS, VEHICLE_ID, FakeAutopilot, MocapParams, load_plant, serve
+    from hil.link import Link
+    from visthrow.errors import suggest
+
+    if args.answer not in ANSWERS:
+        raise RunError(f"answer '{args.answer}'; {suggest(args.answer, ANSWERS)}")
+    plant = load_plant(args.plant, args.policy, args.seed)
+    link = Link(open_port(check_device(args.device)), *VEHICLE_ID)
+    fake = FakeAutopilot(plant, link, MocapParams(), args.seed, args.answer)
+    print("the fake autopilot flies", file=sys.stderr, flush=True)
+    report = serve(fake, MonotonicClock(args.speed), args.seconds, None if args.out is None else Path(args.out))
+    print(json.dumps(report, indent=2))
+    return 0

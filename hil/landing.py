@@ -1,0 +1,80 @@
+"""Where a released payload came down, by its own poses."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hil.pose import Vector
+from visthrow.hover import GRAVITY
+
+NEAR = 8
+"""Poses before the ground that the landing is carried forward from: free fall needs no model of drag over 0.1 s."""
+
+
+@dataclass(frozen=True)
+class Landing:
+    """One throw as the payload's poses tell it; times on the runner's clock."""
+
+    goal_w: Vector  # [m]
+    start: float  # of the throw [s]
+    latch: float  # of the release [s]
+    time: float  # of the landing [s]
+    landing_w: Vector  # payload's centre [m]
+    error: float  # horizontal distance from the goal [m]
+    duration: float  # from the throw's start to the landing [s]
+
+
+class Flight:
+    """Collects a payload's poses from the latch on until it is down."""
+
+    def __init__(self, goal_w: Vector, start: float, latch: float, height: float) -> None:
+        """Begin at the latch.
+
+        Args:
+            goal_w: [m]. start: of the throw [s]. latch: of the release [s].
+            height: of the payload's centre as it lands [m].
+        """
+        self.goal_w, self.start, self.latch, self.height = goal_w, start, latch, height
+        self._times: list[float] = []
+        self._points: list[Vector] = []
+
+    def add(self, time: float, pos: Vector) -> Landing | None:
+        """Take a pose of the payload, in our frames.
+
+        Args:
+            time: of its measurement [s].
+            pos: [m].
+
+        Returns:
+            The landing, once the payload has come down.
+        """
+        self._times.append(time)
+        self._points.append(pos)
+        # The ball may be measured for the last time some centimetres above the ground, or bounce in between.
+        if len(self._times) < NEAR or pos[2] > self.height + 0.05 or self._rising():
+            return None
+        return self._landing()
+
+    def _rising(self) -> bool:
+        return self._points[-1][2] > self._points[-2][2]
+
+    def _landing(self) -> Landing:
+        times, points = np.array(self._times), np.array(self._points)
+        last = times[-1]
+        near = slice(max(0, len(times) - NEAR), len(times))
+        x, vx = _parabola(times[near] - last, points[near])
+        drop = x[2] - self.height
+        fall = (vx[2] + np.sqrt(max(vx[2] ** 2 + 2.0 * GRAVITY * drop, 0.0))) / GRAVITY
+        point = x + fall * vx
+        point[2] = self.height
+        when = float(last + fall)
+        landed = tuple(point.tolist())
+        error = float(np.hypot(landed[0] - self.goal_w[0], landed[1] - self.goal_w[1]))
+        return Landing(self.goal_w, self.start, self.latch, when, landed, error, when - self.start)
+
+
+def _parabola(times: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Position and velocity at time 0 of the free fall that fits poses best, shape (3,) each."""
+    lifted = points + [0.0, 0.0, 0.5 * GRAVITY] * times[:, None] ** 2
+    fit = np.linalg.lstsq(np.column_stack((np.ones_like(times), times)), lifted, rcond=None)[0]
+    return fit[0], fit[1]

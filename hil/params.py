@@ -1,0 +1,84 @@
+"""Configuration of a run: one file of ``configs/hil``. SI units; nothing about frames has a default."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from camera.params import CameraParams
+from hil.backends.ardupilot import ArduPilotParams
+from hil.estimate import EstimateParams
+from hil.frames import FrameParams
+from hil.gate import GateParams
+from hil.pose import BODIES, PAYLOAD, VEHICLE
+from hil.safety import CheckParams, FenceParams, GuardParams
+from hil.sources import BodyIds, CsvParams
+from hil.states import StateParams
+from visthrow.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class LinkParams:
+    """The MAVLink link of source and autopilot."""
+
+    device: str  # see hil.device
+    remote: bool  # whether the device may leave this machine
+    system: int  # our own id, 1 to 255
+    component: int  # likewise
+
+
+@dataclass(frozen=True)
+class SourceParams:
+    """Where poses come from."""
+
+    kind: Literal["mavlink", "tlog", "csv"]
+    file: str | None  # of a tlog or csv
+    senders: tuple[BodyIds, ...]  # of mavlink and tlog
+    columns: tuple[CsvParams, ...]  # of csv
+
+
+@dataclass(frozen=True)
+class DelayParams:
+    """Ages of poses, and their compensation."""
+
+    source: float  # of a pose when it arrives [s]
+    compensate: bool  # carry poses forward to the age that the policy was trained with
+
+
+@dataclass(frozen=True)
+class HilParams:
+    """A run.
+
+    Raises:
+        ConfigError: a body without frames, or parts that contradict each other.
+    """
+
+    policy: str  # name of a shipped policy, or a file
+    camera: CameraParams
+    backend: Literal["dry-run", "ardupilot"]
+    observe: bool  # show the policy every tick, not only those of a throw; what it says then is recorded, never sent
+    throws: int  # after which the run lands
+    goal_w: tuple[float, float, float]  # target where no body is the goal [m]
+    home_w: tuple[float, float, float]  # hover point [m]
+    landing_height: float  # of the payload's centre as it lands [m]
+    link: LinkParams
+    source: SourceParams
+    frames: dict[str, FrameParams]  # by body: vehicle, payload and, if it moves, goal
+    gate: GateParams
+    estimate: EstimateParams
+    delay: DelayParams
+    fence: FenceParams
+    guard: GuardParams
+    check: CheckParams
+    states: StateParams
+    ardupilot: ArduPilotParams
+
+    def __post_init__(self) -> None:
+        if not {VEHICLE, PAYLOAD} <= set(self.frames) <= set(BODIES):
+            raise ConfigError(f"frames of {', '.join(self.frames)}; expected vehicle and payload, goal if it moves")
+        if self.throws < 1:
+            raise ConfigError(f"throws {self.throws}; expected 1 or more")
+        if self.source.kind != "mavlink" and self.source.file is None:
+            raise ConfigError(f"source.file is none; expected the file of the {self.source.kind} source")
+        if self.backend != "dry-run" and self.source.kind != "mavlink":
+            raise ConfigError(f"backend {self.backend} with recorded poses ({self.source.kind}); a recording flies dry")
+        if not 0.0 <= self.delay.source <= 0.5:
+            raise ConfigError(f"delay.source {self.delay.source} s; expected 0 to 0.5")

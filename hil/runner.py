@@ -1,0 +1,323 @@
+"""The runner: each tick from poses to a command. Nothing raises past it; what goes wrong ends in the abort state.
+
+A tick depends on its time, the poses that came, the back-end's status and the operator's words, and on nothing else;
+these are recorded, so that a replay decides alike to the last bit.
+"""
+
+import math
+import traceback
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from hil.backends.base import FAILED, Backend, Status
+from hil.errors import RunError
+from hil.gate import HOLD
+from hil.landing import Flight, Landing
+from hil.params import HilParams
+from hil.pose import GOAL, PAYLOAD, VEHICLE, Pose, Vector
+from hil.safety import Guard, failed_checks, fence_broken, outside
+from hil.states import FLYING, Inputs, Machine, State
+from hil.track import BodyState, Track
+from visthrow.hover import GRAVITY, HoverController, HoverParams
+from visthrow.pilot import Pilot, PilotOutput
+from visthrow.policy import Policy
+
+LAG_TOLERANCE = 5e-3
+"""What the mechanism may take longer than the trained lag [s]."""
+
+STILL_OFFSET, STILL_SPEED = 0.05, 0.15
+"""Vehicle off its hover point [m], vehicle and payload speed [m/s] that count as quiet, velocities over 0.2 s."""
+
+REACQUIRE = 1.0
+"""Before the vehicle is ours, a body that was refused or gone for this long is taken wherever it is [s]."""
+
+DESCENT = 0.4
+"""Of the hover point while landing [m/s]."""
+
+GROUND = 0.12
+"""Height of the vehicle that counts as landed [m]."""
+
+LEVEL_TIME = 0.5
+"""An aborted run without poses levels the vehicle for this long and then falls silent: the autopilot's failsafes act [s]."""
+
+
+@dataclass(frozen=True)
+class Words:
+    """What the operator said since the last tick."""
+
+    arm: bool = False
+    land: bool = False
+    abort: bool = False
+
+
+@dataclass
+class Decision:
+    """All that one tick saw and decided; plain values, as they are recorded."""
+
+    time: float
+    state: str
+    reason: str
+    command: tuple[float, ...] | None = None  # as sent [N, rad/s]
+    action: list[float] | None = None  # of the policy, normalised
+    observation: list[float] | None = None
+    keypoints: list | None = None
+    valid: list | None = None
+    release: bool = False  # the policy asked for it and it was done
+    note: str = ""
+
+
+class Runner:
+    """Flies one vehicle.
+
+    Attributes:
+        machine: the state. pilot: the policy. guard: with its counts.
+        tracks: by body. lag: trained time from latch to separation [s]. latches: releases so far.
+        landings: of the throws so far. errors: tracebacks of what was caught.
+    """
+
+    def __init__(self, params: HilParams, policy: Policy, backend: Backend, mechanism_lag: float = 0.0) -> None:
+        """Build all parts.
+
+        Args:
+            params: the run.
+            policy: on the CPU.
+            backend: where commands go.
+            mechanism_lag: of the release mechanism, from its command to separation [s].
+
+        Raises:
+            MismatchError: the camera is not the one that the policy was trained with.
+            PolicyError: the policy is incomplete.
+            RunError: the mechanism is slower than the policy was trained for.
+        """
+        self.params, self.backend = params, backend
+        self.pilot = Pilot(policy, params.camera)
+        self.lag = self.pilot.lag
+        if mechanism_lag > self.lag + LAG_TOLERANCE:
+            raise RunError(
+                f"the mechanism takes {mechanism_lag:g} s from command to separation, the policy was trained with "
+                f"{self.lag:g} s; train one for the slower mechanism"
+            )
+        self._wait = max(0.0, self.lag - mechanism_lag)
+        contract = policy.contract
+        rope, body, action = contract["rope"], contract["vehicle"]["body"], contract["action"]
+        self._alone, self._full = body["mass"], body["mass"] + rope["rope_mass"] + rope["payload_mass"]
+        self.hang = -rope["mount"][2] + rope["length"] + rope["payload_offset"]
+        self.guard = Guard(params.guard, float(action["max_thrust"]), tuple(map(float, action["max_rate"])))
+        self.tracks = {name: Track(frames, params.gate, params.estimate) for name, frames in params.frames.items()}
+        self.machine = Machine(params.states, params.throws)
+        self._hover = HoverController(HoverParams(max_thrust=float(action["max_thrust"])), self.pilot.period)
+        self._latency = contract["observation"]["latency"]
+        self._latch: float | None = None
+        self._hold_w: Vector = params.home_w
+        self._flying = False  # whether this run has ever commanded the vehicle
+        self._begun = 0.0
+        self._flight: Flight | None = None
+        self.landings: list[Landing] = []
+        self.latches = 0
+        self.errors: list[str] = []
+
+    def tick(self, now: float, poses: list[Pose], status: Status, words: Words, recording: bool = True) -> Decision:
+        """Decide one tick and send its command.
+
+        Args:
+            now: on the runner's clock [s].
+            poses: raw, that have come since the last tick.
+            status: of the back-end, at this tick.
+            words: of the operator.
+            recording: whether all was recorded so far.
+        """
+        try:
+            return self._tick(now, poses, status, words, recording)
+        except Exception as error:  # in flight nothing raises past the runner
+            if len(self.errors) < 100:
+                self.errors.append(traceback.format_exc())
+            self.machine.step(now, Inputs(3, 3, failure=f"{type(error).__name__}: {error}"))
+            self.backend.stop_release()
+            if self._flying:
+                self.backend.abort(now)
+            return Decision(now, self.machine.state.value, self.machine.reason, note="exception")
+
+    def _tick(self, now: float, poses: list[Pose], status: Status, words: Words, recording: bool) -> Decision:
+        for pose in poses:
+            track = self.tracks.get(pose.body)
+            if track is not None and track.update(pose) is None and pose.body == PAYLOAD and self._flight is not None:
+                landing = self._flight.add(pose.arrival - self.params.delay.source, track.gate.last.pos)
+                if landing is not None:
+                    self.landings.append(landing)
+                    self._flight = None
+        if self.machine.state in (State.IDLE, State.CHECK):
+            for track in self.tracks.values():
+                # On the ground a body may be carried about out of sight; in flight what has jumped stays refused.
+                if REACQUIRE < track.gate.age(now) < math.inf:
+                    track.restart()
+        bodies = {name: self._state(track, now) for name, track in self.tracks.items()}
+        vehicle, payload = bodies[VEHICLE], bodies[PAYLOAD]
+        goal_w = self._goal(bodies)
+        before = self.machine.state
+        state = self.machine.step(now, self._inputs(now, vehicle, payload, goal_w, status, words, recording))
+        if state is not before:
+            self._entered(now, before, state, vehicle)
+        decision = Decision(now, state.value, self.machine.reason)
+        wanted = self._command(now, state, vehicle, payload, goal_w, decision)
+        self._flying |= state in FLYING
+        if state is State.ABORT and not (status.connected and self._flying):
+            wanted = None  # it has taken over, or hears nothing, or was never ours
+        if self.params.observe and decision.action is None and None not in (vehicle, payload, goal_w) and vehicle.quat:
+            self._show(vehicle, payload, goal_w, decision)
+        if wanted is None:
+            self.guard.reset()
+        else:
+            decision.command = self.guard.check(wanted)
+            if decision.command is None:
+                self.machine.step(now, Inputs(3, 3, failure=f"command {wanted} is not finite"))
+                decision.state, decision.reason = self.machine.state.value, self.machine.reason
+                self.backend.stop_release()
+            else:
+                self.backend.send(decision.command, now)
+        if decision.release:
+            self._latch, self.latches = now, self.latches + 1
+            self._flight = Flight(goal_w, self._begun, now, self.params.landing_height)
+            self.backend.release(now + self._wait)
+        if state is State.ABORT and self._flying:
+            self.backend.abort(now)
+        return decision
+
+    def _state(self, track: Track, now: float) -> BodyState | None:
+        """State of a body, carried forward to the age that the policy was trained with where the config says so."""
+        delay = self.params.delay
+        age = track.gate.age(now) + delay.source
+        ahead = age - 0.5 * (self._latency[0] + self._latency[1]) if delay.compensate and math.isfinite(age) else 0.0
+        return track.state(now, ahead)
+
+    def _goal(self, bodies: dict[str, BodyState | None]) -> Vector | None:
+        if GOAL not in self.tracks:
+            return self.params.goal_w
+        goal = bodies[GOAL]
+        return None if goal is None else goal.pos
+
+    def _inputs(
+        self, now: float, vehicle: BodyState | None, payload: BodyState | None, goal_w: Vector | None, status: Status,
+        words: Words, recording: bool,
+    ) -> Inputs:  # fmt: skip
+        p, state = self.params, self.machine.state
+        known = vehicle is not None and payload is not None and goal_w is not None
+        hanging = payload if self._latch is None else None
+        failure = "the release was refused or not answered" if status.release == FAILED else None
+        checks = ["a body has no pose yet"]
+        # After a throw the payload may have been hung on again; only the operator's next word makes the latch new.
+        if known and (self._latch is None or state is State.READY):
+            checks = failed_checks(p.check, p.fence, vehicle, payload, goal_w, p.home_w, self.hang)
+            if GOAL in self.tracks and self.tracks[GOAL].gate.level(now) >= HOLD:
+                checks.append("the goal's pose is stale")
+        return Inputs(
+            self.tracks[VEHICLE].gate.level(now),
+            self.tracks[PAYLOAD].gate.level(now),
+            status.connected,
+            tuple(checks),
+            # While landing the fence's floor is left on purpose.
+            fence_broken(p.fence, vehicle, hanging) if vehicle is not None and state is not State.LAND else None,
+            vehicle is not None and self._still(vehicle, payload),
+            self._latch is not None and now - self._latch >= self.lag - 1e-9,
+            self._latch is not None,
+            vehicle is not None and vehicle.pos[2] < GROUND,
+            failure if state is State.THROW else None,
+            words.arm,
+            words.land,
+            words.abort,
+            recording,
+        )
+
+    def _still(self, vehicle: BodyState, payload: BodyState | None) -> bool:
+        if math.dist(vehicle.pos, self.params.home_w) > STILL_OFFSET:
+            return False
+        moving = [VEHICLE] + ([PAYLOAD] if self._latch is None and payload is not None else [])
+        return all(self.tracks[name].calm_speed() < STILL_SPEED for name in moving)
+
+    def _entered(self, now: float, before: State, state: State, vehicle: BodyState | None) -> None:
+        """What a change of state brings with it."""
+        if before is State.THROW:
+            self.backend.stop_release()
+        if state is State.ARMED:
+            self._latch = None
+        if state is State.THROW:
+            self.pilot.start()
+            self._begun = now
+        if state in (State.READY, State.RECOVER) and before in (State.CHECK, State.THROW):
+            self._hover.reset()
+            self._hold_w = self.params.home_w
+        if state in (State.LAND, State.ABORT) and vehicle is not None:
+            self._hover.reset()
+            self._hold_w = vehicle.pos
+
+    def _command(
+        self, now: float, state: State, vehicle: BodyState | None, payload: BodyState | None, goal_w: Vector | None,
+        decision: Decision,
+    ) -> tuple[float, ...] | None:  # fmt: skip
+        """What to send in a state, before the guard; None for nothing."""
+        if state not in FLYING and state is not State.ABORT:
+            return None
+        mass = self._full if self._latch is None else self._alone
+        if vehicle is None or vehicle.quat is None or self.tracks[VEHICLE].gate.level(now) >= HOLD:
+            if state is State.ABORT and now - self.machine.since > LEVEL_TIME:
+                return None
+            decision.note = "level: no fresh pose"
+            return (mass * GRAVITY, 0.0, 0.0, 0.0)
+        if state is State.THROW:
+            return self._throw(vehicle, payload, goal_w, decision)
+        if state in (State.LAND, State.ABORT):
+            x, y, z = self._hold_w
+            self._hold_w = (x, y, max(z - DESCENT * self.pilot.period, 0.0))
+        command = self._hover.step(
+            np.array([vehicle.pos]), np.array([vehicle.quat]), np.array([vehicle.vel]), np.array(self._hold_w), mass,
+            math.radians(self.params.check.heading_deg),
+        )  # fmt: skip
+        return tuple(command[0].tolist())
+
+    def _throw(self, vehicle: BodyState, payload: BodyState, goal_w: Vector, decision: Decision) -> tuple[float, ...]:
+        out = self._show(vehicle, payload, goal_w, decision)
+        if out.release[0] and self._latch is None:
+            fence = self.params.fence
+            beyond = outside(payload.pos, fence.payload_low, fence.payload_high)
+            decision.release = beyond is None
+            decision.note = "" if beyond is None else f"release refused: payload {beyond}"
+        return tuple(map(float, out.command[0]))
+
+    def _show(self, vehicle: BodyState, payload: BodyState, goal_w: Vector, decision: Decision) -> PilotOutput:
+        """Show the policy what there is to see, and note what it makes of it."""
+        attached = self._latch is None or decision.time - self._latch < self.lag - 1e-9
+        views = [np.array([v]) for v in (vehicle.pos, vehicle.quat, vehicle.vel, vehicle.rate, payload.pos)]
+        out: PilotOutput = self.pilot.act(*views, np.array(goal_w), attached)
+        decision.action = out.action[0].tolist()
+        decision.observation = out.observation[0].tolist()
+        if out.keypoints is not None:
+            decision.keypoints, decision.valid = out.keypoints[0].tolist(), out.valid[0].tolist()
+        return out
+
+    def problems(self) -> list[str]:
+        """What speaks against a throw as of the last poses."""
+        bodies = {name: track.state(0.0) for name, track in self.tracks.items()}
+        goal_w = self._goal(bodies)
+        missing = [f"no good pose of the {name}" for name, state in bodies.items() if state is None]
+        if missing:
+            return missing
+        p = self.params
+        return failed_checks(p.check, p.fence, bodies[VEHICLE], bodies[PAYLOAD], goal_w, p.home_w, self.hang)
+
+    def summary(self) -> dict[str, Any]:
+        """Counts of the run so far."""
+        return {
+            "state": self.machine.state.value,
+            "reason": self.machine.reason,
+            "throws": self.machine.throws,
+            "cancelled": self.machine.cancelled,
+            "latches": self.latches,
+            "landings": [asdict(landing) for landing in self.landings],
+            "guard": {k: getattr(self.guard, k) for k in ("clipped", "slewed", "refused")},
+            "bodies": {
+                name: {"accepted": track.accepted, "refused": track.gate.refused, "filter_lag": track.filter.lag}
+                for name, track in self.tracks.items()
+            },
+            "errors": self.errors,
+        }

@@ -1,0 +1,195 @@
+"""The state machine of a run: pure logic, a time-out in every state.
+
+    idle -> check -> ready -> armed -> throw -> recover -> ready (more throws) or land -> done
+    any -> abort -> done
+
+``idle`` waits for poses and the autopilot, ``check`` for the checks to hold for a while. From ``ready`` on the runner
+commands: its hover controller holds the vehicle. Each throw needs its own word of the operator.
+"""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+from hil.gate import ABORT, HOLD
+
+
+class State(StrEnum):
+    """Where a run is."""
+
+    IDLE = "idle"
+    CHECK = "check"
+    READY = "ready"
+    ARMED = "armed"
+    THROW = "throw"
+    RECOVER = "recover"
+    LAND = "land"
+    ABORT = "abort"
+    DONE = "done"
+
+
+FLYING = (State.READY, State.ARMED, State.THROW, State.RECOVER, State.LAND)
+"""States in which the runner commands the vehicle."""
+
+
+@dataclass(frozen=True)
+class StateParams:
+    """Time-outs and durations [s].
+
+    Raises:
+        ValueError: one of them is 0 or less.
+    """
+
+    idle: float  # for poses and autopilot to appear; then abort
+    check: float  # for the checks to pass; then abort
+    check_hold: float  # for which all checks must hold
+    ready: float  # for the operator; then land
+    armed: float  # for the swing to become quiet; then back to ready, not armed
+    armed_least: float  # in armed before the throw
+    quiet: float  # for which vehicle and payload must be quiet
+    throw: float  # for the policy to release; then recover with the payload
+    recover: float  # for the hover to become quiet again; then land
+    land: float  # for the descent; then done
+    abort: float  # after which an aborted run ends
+
+    def __post_init__(self) -> None:
+        if min(vars(self).values()) <= 0.0:
+            raise ValueError(f"states {vars(self)}: expected times above 0 s")
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """What one tick knows. Levels are those of `hil.gate`."""
+
+    vehicle: int
+    payload: int
+    connected: bool = True  # the autopilot is there, in the mode and armed as it must be
+    failed_checks: tuple[str, ...] = ()
+    fence: str | None = None  # which fence is broken
+    still: bool = False  # vehicle at home and vehicle and payload slow
+    separated: bool = False  # latch plus trained lag has passed in this throw
+    released: bool = False  # the latch has tripped in this throw
+    grounded: bool = False  # the descent has arrived
+    failure: str | None = None  # of policy, guard, release or of the runner itself
+    arm: bool = False  # the operator's words
+    land: bool = False
+    abort: bool = False
+    recording: bool = True  # all could be recorded so far
+
+
+class Machine:
+    """The state, since when, and why.
+
+    Attributes:
+        state: now. reason: of the last change. since: time of it [s].
+        throws: throws begun. cancelled: throws that ended without a release.
+    """
+
+    def __init__(self, params: StateParams, throws: int) -> None:
+        """Begin in idle; ``throws`` is the number after which the run lands."""
+        self.params, self.most = params, throws
+        self.state, self.reason = State.IDLE, "start"
+        self.since: float | None = None
+        self.throws = self.cancelled = 0
+        self._held: float | None = None  # since when what must last has lasted
+
+    def step(self, now: float, seen: Inputs) -> State:
+        """Move on by one tick; returns the state to act in."""
+        if self.since is None:
+            self.since = now
+        urgent = self._urgent(seen)
+        if self.state is State.ABORT:
+            if now - self.since > self.params.abort:
+                self._go(now, State.DONE, self.reason)
+        elif self.state is not State.DONE:
+            if urgent is not None:
+                self._go(now, State.ABORT, urgent)
+            else:
+                getattr(self, f"_{self.state.value}")(now, seen)
+        return self.state
+
+    def _urgent(self, seen: Inputs) -> str | None:
+        if seen.abort:
+            return "the operator said abort"
+        if seen.failure is not None:
+            return seen.failure
+        if self.state not in FLYING:
+            return None
+        if seen.vehicle >= ABORT:
+            return "no new pose of the vehicle"
+        if seen.fence is not None:
+            return f"fence: {seen.fence}"
+        if not seen.connected:
+            return "the autopilot is silent, disarmed or in another mode"
+        return None
+
+    def _go(self, now: float, state: State, reason: str) -> None:
+        if self.state is State.THROW and state is not State.THROW and reason != "separated":
+            self.cancelled += 1
+        self.state, self.reason, self.since, self._held = state, reason, now, None
+        self.throws += state is State.THROW
+
+    def _lasted(self, now: float, holds: bool, time: float) -> bool:
+        """Whether a condition has now held for a time."""
+        if not holds:
+            self._held = None
+            return False
+        if self._held is None:
+            self._held = now
+        return now - self._held >= time - 1e-9
+
+    def _late(self, now: float) -> bool:
+        return now - self.since > getattr(self.params, self.state.value)
+
+    def _idle(self, now: float, seen: Inputs) -> None:
+        if max(seen.vehicle, seen.payload) < HOLD and seen.connected:
+            self._go(now, State.CHECK, "poses and autopilot are there")
+        elif self._late(now):
+            missing = [n for n, bad in (("vehicle", seen.vehicle >= HOLD), ("payload", seen.payload >= HOLD)) if bad]
+            missing += [] if seen.connected else ["autopilot ready"]
+            self._go(now, State.ABORT, f"no {', no '.join(missing)} within {self.params.idle:g} s")
+
+    def _check(self, now: float, seen: Inputs) -> None:
+        good = not seen.failed_checks and max(seen.vehicle, seen.payload) < HOLD and seen.connected
+        if self._lasted(now, good, self.params.check_hold):
+            self._go(now, State.READY, "checks passed")
+        elif self._late(now):
+            failed = "; ".join(seen.failed_checks) or "poses or autopilot come and go"
+            self._go(now, State.ABORT, f"checks: {failed}")
+
+    def _ready(self, now: float, seen: Inputs) -> None:
+        if seen.land or self._late(now):
+            self._go(now, State.LAND, "the operator said land" if seen.land else "nobody armed a throw")
+        elif seen.arm and seen.recording and not seen.failed_checks and seen.payload < HOLD:
+            self._go(now, State.ARMED, "the operator armed this throw")
+
+    def _armed(self, now: float, seen: Inputs) -> None:
+        long = now - self.since >= self.params.armed_least
+        if seen.land:
+            self._go(now, State.LAND, "the operator said land")
+        elif max(seen.vehicle, seen.payload) >= HOLD or not seen.recording:
+            self._go(now, State.READY, "disarmed: stale poses, or the recording failed")
+        elif self._lasted(now, seen.still and not seen.failed_checks, self.params.quiet) and long:
+            self._go(now, State.THROW, "quiet")
+        elif self._late(now):
+            self._go(now, State.READY, "disarmed: the swing did not become quiet")
+
+    def _throw(self, now: float, seen: Inputs) -> None:
+        if seen.separated:
+            self._go(now, State.RECOVER, "separated")
+        elif seen.released:
+            return  # what is latched cannot be taken back: fly on until it is off
+        elif max(seen.vehicle, seen.payload) >= HOLD:
+            self._go(now, State.RECOVER, "stale poses")
+        elif self._late(now):
+            self._go(now, State.RECOVER, "the policy did not release in time")
+
+    def _recover(self, now: float, seen: Inputs) -> None:
+        if self._lasted(now, seen.still, self.params.quiet):
+            more = self.throws < self.most
+            self._go(now, State.READY if more else State.LAND, "hovering again")
+        elif seen.land or self._late(now):
+            self._go(now, State.LAND, "the operator said land" if seen.land else "not quiet again in time")
+
+    def _land(self, now: float, seen: Inputs) -> None:
+        if seen.grounded or self._late(now):
+            self._go(now, State.DONE, "landed" if seen.grounded else "landing took too long")

@@ -1,0 +1,130 @@
+"""A vehicle of a few lines for tests of the runner: rates and thrust are followed at once, the payload hangs straight."""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import torch
+
+from hil.backends import DryRun, Status
+from hil.frames import multiply, rotate
+from hil.params import HilParams
+from hil.pose import Pose
+from hil.runner import Decision, Runner, Words
+from visthrow import config
+from visthrow.policy import Policy, find_policy
+
+TICK, SUBSTEPS = 0.02, 2  # poses at 100 Hz
+OURS = tuple(
+    f"frames.{body}.{key}"
+    for body in ("vehicle", "payload")
+    for key in ('axes="x,y,z"', 'body_axes="x,y,z"', 'quaternion="xyzw"')
+)
+"""Overrides that make the source's frames ours."""
+
+
+def params(*overrides: str) -> HilParams:
+    """The shipped dry run, in our frames and without a delay."""
+    given = (*OURS, "policy=state", "observe=false", "delay.source=0.0", *overrides)
+    return config.load(HilParams, config.find("hil", "dry_run"), given)
+
+
+def simple_policy(action=(0.0, 0.0, 0.0, 0.0, 1.0), layout="state") -> Policy:
+    """A network that always says the same; hover needs a first number of about -0.13."""
+    shipped = Policy.load(find_policy(layout))
+    return Policy((torch.zeros(5, shipped.obs_dim),), (torch.tensor(action),), "relu", shipped.contract)
+
+
+class Vehicle:
+    """Vehicle, payload and a perfect motion capture."""
+
+    def __init__(self) -> None:
+        self.time, self.pos, self.vel = 0.0, np.array([0.0, 0.0, 1.333]), np.zeros(3)
+        self.quat, self.rate = (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.0)
+        self.payload: np.ndarray | None = None
+        self.payload_vel = np.zeros(3)
+        self.rng = np.random.default_rng(0)
+
+    def step(self, command, released: bool, hang: float, mass: tuple[float, float]) -> None:
+        """Half a tick."""
+        dt = TICK / SUBSTEPS
+        thrust, *rates = command
+        if released and self.payload is None:
+            self.payload, self.payload_vel = self.pos - [0.0, 0.0, hang], self.vel.copy()
+        up = np.array(rotate(self.quat, (0.0, 0.0, 1.0)))
+        self.vel = self.vel + dt * (thrust / mass[released] * up - [0.0, 0.0, 9.81])
+        self.pos = self.pos + dt * self.vel
+        turned = multiply(self.quat, (*(0.5 * dt * r for r in rates), 1.0))
+        self.quat = tuple(x / math.hypot(*turned) for x in turned)
+        self.time += dt
+        if self.payload is not None and self.payload[2] > 0.04:
+            self.payload = self.payload + dt * self.payload_vel - [0.0, 0.0, 0.5 * 9.81 * dt * dt]
+            self.payload_vel = self.payload_vel - [0.0, 0.0, 9.81 * dt]
+
+    def poses(self, hang: float) -> list[Pose]:
+        """Both bodies; a tenth of a millimetre of noise keeps their content fresh."""
+        noise = 1e-4 * self.rng.standard_normal((2, 3))
+        ball = self.pos - [0.0, 0.0, hang] if self.payload is None else self.payload
+        return [
+            Pose(self.time, self.time, name, tuple((pos + noise[i]).tolist()), self.quat)
+            for i, (name, pos) in enumerate((("vehicle", self.pos), ("payload", ball)))
+        ]
+
+
+class Spy(DryRun):
+    """A back-end that keeps what it is given."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.sent: list[tuple[float, tuple[float, ...]]] = []
+        self.release_times: list[float] = []
+        self.aborts = 0
+
+    def send(self, command, now) -> bool:
+        self.sent.append((now, command))
+        return super().send(command, now)
+
+    def release(self, when: float) -> None:
+        self.release_times.append(when)
+        super().release(when)
+
+    def abort(self, now: float) -> None:
+        self.aborts += 1
+
+
+def fly(
+    runner: Runner,
+    seconds: float,
+    poses: Callable[[float, list[Pose]], list[Pose]] = lambda time, poses: poses,
+    status: Callable[[float], Status] = lambda time: Status(True),
+    words: Callable[[float, str], Words] = lambda time, state: Words(arm=state == "ready"),
+    late: Callable[[float], float] = lambda time: 0.0,
+    watch: Callable[[float, Decision], None] | None = None,
+    recording: Callable[[float], bool] = lambda time: True,
+) -> list[Decision]:
+    """Fly for a time; ``poses``, ``status``, ``words``, ``late`` and ``recording`` spoil what the runner is told."""
+    vehicle, decisions, command = Vehicle(), [], None
+    waiting: list[Pose] = []
+    mass = (runner._full, runner._alone)
+    while vehicle.time < seconds and runner.machine.state != "done":
+        now = vehicle.time + late(vehicle.time)
+        decision = runner.tick(now, waiting, status(now), words(now, runner.machine.state), recording(now))
+        decisions.append(decision)
+        if watch is not None:
+            watch(now, decision)
+        command = decision.command or (command if decision.state == "abort" else None) or (mass[0] * 9.81, 0, 0, 0)
+        released = bool(runner.backend.release_times) and now >= runner.backend.release_times[0]
+        waiting = []
+        for _ in range(SUBSTEPS):
+            vehicle.step(command, released, runner.hang, mass)
+            waiting += poses(vehicle.time, vehicle.poses(runner.hang))
+    return decisions
+
+
+def changes(decisions: list[Decision]) -> list[tuple[str, str]]:
+    """States passed through, with the reason of each change."""
+    out = [(decisions[0].state, decisions[0].reason)]
+    for decision in decisions:
+        if decision.state != out[-1][0]:
+            out.append((decision.state, decision.reason))
+    return out

@@ -1,0 +1,195 @@
+"""The folder of a run, its replay, and the commands; without a wire."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from hil.backends import Status
+from hil.errors import RunError
+from hil.record import Recorder, lines, load_run, percentiles
+from hil.runner import Runner, Words
+from tests.hil_flight import Spy, fly, params
+from visthrow.cli import main
+from visthrow.errors import StorageError
+from visthrow.policy import Policy, find_policy
+
+
+def recorded(folder, policy="state", seconds=8.0, spoil=lambda time, poses: poses):
+    """A run of a shipped policy on the simple vehicle, recorded tick by tick."""
+    wanted = params(f"policy={policy}", "observe=true")
+    runner = Runner(wanted, Policy.load(find_policy(policy)), Spy())
+    recorder = Recorder(folder, wanted)
+    inputs = []
+
+    def keep(time, poses, status, words, recording=True):
+        decision = type(runner).tick(runner, time, poses, status, words, recording)
+        recorder.tick(len(inputs), poses, status, words, recording, decision, {})
+        inputs.append(decision)
+        return decision
+
+    runner.tick = keep
+    fly(runner, seconds, poses=spoil)
+    recorder.close(runner.summary())
+    return inputs
+
+
+@pytest.fixture(scope="module")
+def run_folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run") / "a"
+
+    def spoil(time, poses):
+        """A few poses that no gate lets through: these must read back as well."""
+        if int(time * 100) % 50 == 7:
+            return [type(p)(p.stamp, p.arrival, p.body, (math.nan, math.inf, 0.0), p.quat) for p in poses]
+        return poses
+
+    recorded(folder, "vision", spoil=spoil)
+    return folder
+
+
+def test_a_replay_gives_the_same_bits(run_folder, capsys):
+    assert main(["hil", "replay", str(run_folder)]) == 0
+    out = capsys.readouterr().out
+    assert "all bit for bit the same" in out
+    assert int(out.split(" actions")[0].split()[-1]) > 300
+
+
+def test_one_bit_that_differs_is_found(run_folder, tmp_path, capsys):
+    for path in run_folder.iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    rows = list(lines(tmp_path / "ticks.jsonl"))
+    changed = next(row for row in rows if row["action"] is not None)
+    changed["action"][1] = float(np.nextafter(np.float32(changed["action"][1]), np.float32(1.0)))
+    (tmp_path / "ticks.jsonl").write_text("\n".join(map(json.dumps, rows)))
+    assert main(["hil", "replay", str(tmp_path)]) == 1
+    assert f"tick {changed['n']}: action was" in capsys.readouterr().out
+
+
+def test_a_folder_cut_short_by_a_kill_replays(run_folder, tmp_path, capsys):
+    for path in run_folder.iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    for name in ("ticks.jsonl", "poses.jsonl"):
+        data = (tmp_path / name).read_bytes()
+        (tmp_path / name).write_bytes(data[: len(data) // 2])
+    (tmp_path / "summary.json").unlink()
+    assert main(["hil", "replay", str(tmp_path)]) == 0
+    count = int(capsys.readouterr().out.split()[0])
+    assert 150 < count < 250
+
+
+def test_what_is_no_run(run_folder, tmp_path, capsys):
+    with pytest.raises(RunError, match="no folder of a run; expected config"):
+        load_run(tmp_path)
+    assert main(["hil", "replay", str(tmp_path / "none")]) == 2
+    assert "no folder of a run" in capsys.readouterr().err
+    for path in run_folder.iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    (tmp_path / "ticks.jsonl").write_text('{"n": 0\n{"n": 1}\n')
+    with pytest.raises(RunError, match="line 1 is damaged"):
+        load_run(tmp_path)
+
+
+def test_the_folder_holds_config_policy_and_hash(run_folder):
+    wanted, policy, ticks, poses = load_run(run_folder)
+    assert wanted == params("policy=vision", "observe=true")
+    assert policy.obs_dim == 69
+    record = json.loads((run_folder / "provenance.json").read_text())
+    assert record["policy"] == "vision"
+    assert len(record["policy_sha256"]) == 64
+    assert {pose.body for group in poses.values() for pose in group} == {"vehicle", "payload"}
+    assert len(ticks) >= 400
+    with pytest.raises(StorageError, match="holds a run already"):
+        Recorder(run_folder, wanted)
+
+
+def test_a_full_disk_fails_the_recording_and_nothing_else(tmp_path):
+    class Full:
+        def write(self, text):
+            raise OSError(28, "No space left on device")
+
+        def flush(self):
+            pass
+
+        def close(self):
+            pass
+
+    recorder = Recorder(tmp_path / "a", params())
+    recorder._files["poses.jsonl"].close()
+    recorder._files["ticks.jsonl"].close()
+    recorder._files.update({"ticks.jsonl": Full(), "poses.jsonl": Full()})
+    runner = Runner(params(), Policy.load(find_policy("state")), Spy())
+    for n in range(3):
+        status, words = Status(True), Words()
+        recorder.tick(n, [], status, words, True, runner.tick(0.02 * n, [], status, words), {})
+    recorder.close({})
+    assert "No space left" in recorder.failed
+    assert json.loads((tmp_path / "a" / "summary.json").read_text())["recording_failed"] == recorder.failed
+
+
+def test_percentiles():
+    assert percentiles([]) == {}
+    found = percentiles([0.001] * 99 + [0.1])
+    assert found["p50_ms"] == pytest.approx(1.0)
+    assert found["max_ms"] == pytest.approx(100.0)
+
+
+CSV = "t,x,y,z,qx,qy,qz,qw,px,py,pz\n" + "".join(
+    f"{0.01 * i:.3f},{0.3 * i:.2f},0,1333,0,0,0,1,{0.3 * i:.2f},0,950\n" for i in range(300)
+)
+MAPPING = """
+base = "{base}"
+[source]
+kind = "csv"
+file = "{file}"
+senders = []
+[[source.columns]]
+body = "vehicle"
+time = {{ names = ["t"], unit = "s" }}
+pos = {{ names = ["x", "y", "z"], unit = "mm" }}
+quat = {{ names = ["qx", "qy", "qz", "qw"], unit = "1" }}
+[[source.columns]]
+body = "payload"
+time = {{ names = ["t"], unit = "s" }}
+pos = {{ names = ["px", "py", "pz"], unit = "mm" }}
+[frames.vehicle]
+axes = "x,y,z"
+body_axes = "x,y,z"
+quaternion = "xyzw"
+[frames.payload]
+axes = "x,y,z"
+"""
+
+
+def test_the_policy_on_a_csv_file(tmp_path, monkeypatch, capsys):
+    """``hil run`` on recorded poses: as fast as it goes, the policy asked at every tick, nothing released."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "poses.csv").write_text(CSV)
+    (tmp_path / "mine.toml").write_text(MAPPING.format(base="hil/dry_run.toml", file="poses.csv"))
+    assert main(["hil", "run", "--config", "mine.toml", "--out", "run"]) == 0
+    text = capsys.readouterr()
+    assert "vehicle: 300 poses taken; refused: none" in text.out
+    assert "throws 0, released 0" in text.out
+    _, _, ticks, _ = load_run("run")
+    asked = [line for line in ticks if line["action"] is not None]
+    assert len(asked) > 140
+    assert len(asked[0]["keypoints"]) == 8
+    vel = np.array(asked[-1]["observation"][3:6])
+    np.testing.assert_allclose(vel, (0.03, 0.0, 0.0), atol=1e-4)
+    assert main(["hil", "replay", "run"]) == 0
+    assert main(["hil", "check", "--config", "mine.toml", "--seconds", "2"]) == 0
+    out = capsys.readouterr().out
+    assert "PASS  all checks" in out
+    assert "vehicle: 99 poses/s" in out
+    assert main(["hil", "check", "--config", "mine.toml", "--set", "check.heading_deg=90.0"]) == 1
+    assert "FAIL  heading" in capsys.readouterr().out
+    assert main(["hil", "run", "--config", "mine.toml", "--out", "run"]) == 2
+    assert "holds a run already" in capsys.readouterr().err
+
+
+def test_a_device_string_that_would_be_executed_is_refused(tmp_path, capsys):
+    for device in ("/bin/true", "a.elf", "udp:0.0.0.0:14560"):
+        assert main(["hil", "run", "--set", f'link.device="{device}"', "--out", str(tmp_path / "x")]) == 2
+        assert "device" in capsys.readouterr().err
+    assert not (tmp_path / "x").exists()

@@ -1,0 +1,318 @@
+"""The runner on a vehicle of a few lines: a throw, and every fault with what was done and how soon."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from hil.backends import Status
+from hil.errors import RunError
+from hil.params import HilParams
+from hil.runner import Runner, Words
+from tests.hil_flight import TICK, Spy, changes, fly, params, simple_policy
+from visthrow import config
+from visthrow.actions import hover_action
+from visthrow.errors import ConfigError, MismatchError
+
+HOVER = hover_action(9.81 * 0.272, 14.0)[0]
+NEVER = (HOVER, 0.0, 0.0, 0.0, -1.0)
+AT_ONCE = (HOVER, 0.0, 0.0, 0.0, 1.0)
+LAG = 0.11
+
+
+def runner(action=AT_ONCE, *overrides, mechanism=0.0, **kwargs) -> Runner:
+    return Runner(params(*overrides), simple_policy(action), Spy(), mechanism, **kwargs)
+
+
+def safe(pilot: Runner, decisions) -> None:
+    """What must hold whatever happened: finite, clipped commands, and at most one release, and that in a throw."""
+    for _, command in pilot.backend.sent:
+        assert all(map(math.isfinite, command))
+        assert 0.0 <= command[0] <= 14.0
+        assert np.all(np.abs(command[1:]) <= (10.0, 10.0, 4.0))
+    assert len(pilot.backend.release_times) <= 1
+    assert all(d.state == "throw" for d in decisions if d.release)
+
+
+def thrown(*args, action=AT_ONCE, overrides=(), seconds=12.0, **kwargs):
+    pilot = runner(action, *overrides)
+    decisions = fly(pilot, seconds, **kwargs)
+    safe(pilot, decisions)
+    return pilot, decisions
+
+
+def when(decisions, state: str) -> float:
+    return next(d.time for d in decisions if d.state == state)
+
+
+def test_a_throw_from_idle_to_done():
+    pilot, decisions = thrown(seconds=20.0)
+    assert [state for state, _ in changes(decisions)] == [
+        "idle", "check", "ready", "armed", "throw", "recover", "land", "done",
+    ]  # fmt: skip
+    latch = next(d.time for d in decisions if d.release)
+    assert pilot.backend.release_times == [pytest.approx(latch + LAG)], "no mechanism: the runner waits the trained lag"
+    assert when(decisions, "recover") == pytest.approx(latch + LAG, abs=TICK)
+    (landing,) = pilot.landings
+    np.testing.assert_allclose(landing.landing_w, (0.0, 0.0, 0.04), atol=0.02)
+    assert landing.error == pytest.approx(2.0, abs=0.02)
+    fall = math.sqrt(2 * (1.333 - pilot.hang - 0.04) / 9.81)
+    assert landing.duration == pytest.approx(LAG + fall, abs=0.02)
+    assert not pilot.errors
+
+
+def test_the_mechanisms_own_time_is_taken_off_and_a_slow_one_is_refused():
+    pilot = runner(mechanism=0.08)
+    decisions = fly(pilot, 6.0)
+    latch = next(d.time for d in decisions if d.release)
+    assert pilot.backend.release_times == [pytest.approx(latch + 0.03)]
+    assert runner(mechanism=0.114)._wait == 0.0
+    with pytest.raises(RunError, match=r"takes 0\.12 s .* trained with 0\.11 s"):
+        runner(mechanism=0.12)
+
+
+def test_nothing_is_released_without_the_operators_word():
+    pilot, decisions = thrown(words=lambda time, state: Words(), seconds=8.0)
+    assert changes(decisions)[-1][0] == "ready"
+    assert not pilot.backend.release_times
+    pilot, decisions = thrown(
+        overrides=("throws=2",), seconds=20.0, words=lambda t, s: Words(arm=s == "ready" and t < 3)
+    )
+    assert decisions[-1].state == "ready", "one word, one throw"
+
+
+def test_a_policy_that_never_releases_is_stopped():
+    _, decisions = thrown(action=NEVER, seconds=9.0)
+    assert ("recover", "the policy did not release in time") in changes(decisions)
+
+
+def test_operators_abort_in_mid_throw():
+    pilot, decisions = thrown(
+        action=NEVER, words=lambda t, s: Words(arm=s == "ready", abort=s == "throw" and t > 3.0), seconds=8.0
+    )
+    assert ("abort", "the operator said abort") in changes(decisions)
+    assert pilot.backend.aborts > 0
+
+
+START = 3.0  # the policy that never releases throws from about 2.1 s to 7.1 s
+
+
+def lost(bodies, repeat=False, until=99.0):
+    last = {}
+
+    def spoil(time, poses):
+        out = []
+        for pose in poses:
+            gone = START < time < until and pose.body in bodies
+            if not gone:
+                last[pose.body] = pose
+                out.append(pose)
+            elif repeat:
+                out.append(dataclasses.replace(last[pose.body], stamp=pose.stamp, arrival=pose.arrival))
+        return out
+
+    return spoil
+
+
+@pytest.mark.parametrize("repeat", [False, True])
+def test_motion_capture_stops_or_repeats_its_last_pose(repeat):
+    _, decisions = thrown(action=NEVER, poses=lost({"vehicle", "payload"}, repeat), seconds=6.0)
+    assert changes(decisions)[-2:] == [("recover", "stale poses"), ("abort", "no new pose of the vehicle")]
+    assert when(decisions, "recover") == pytest.approx(START + 0.10, abs=1.5 * TICK)
+    assert when(decisions, "abort") == pytest.approx(START + 0.25, abs=1.5 * TICK)
+    levelled = [d for d in decisions if d.note.startswith("level")]
+    assert levelled[0].command[1:] == (0.0, 0.0, 0.0)
+    assert decisions[-1].command is None, "silent in the end: the autopilot's failsafes act"
+
+
+def test_payload_lost_but_not_the_vehicle():
+    _, decisions = thrown(action=NEVER, poses=lost({"payload"}), seconds=6.0)
+    assert ("recover", "stale poses") in changes(decisions)
+    assert "abort" not in [state for state, _ in changes(decisions)]
+    assert when(decisions, "recover") == pytest.approx(START + 0.10, abs=1.5 * TICK)
+
+
+def test_a_short_gap_is_flown_through():
+    _, decisions = thrown(action=NEVER, poses=lost({"vehicle", "payload"}, until=START + 0.08), seconds=6.0)
+    assert decisions[-1].state == "throw"
+
+
+def spoiled(change, until=99.0):
+    return lambda time, poses: [change(p) if START < time < until else p for p in poses]
+
+
+SWAP = {"vehicle": "payload", "payload": "vehicle"}
+BAD = {
+    "swapped": lambda p: dataclasses.replace(p, body=SWAP[p.body]),
+    "jump": lambda p: dataclasses.replace(p, pos=(p.pos[0] + 0.5, *p.pos[1:])),
+    "wxyz": lambda p: dataclasses.replace(p, quat=(p.quat[3], *p.quat[:3])),
+    "zero quaternion": lambda p: dataclasses.replace(p, quat=(0.0,) * 4),
+    "nan quaternion": lambda p: dataclasses.replace(p, quat=(math.nan,) * 4),
+    "infinite": lambda p: dataclasses.replace(p, pos=(math.inf, 0.0, 0.0)),
+    "reset counter": lambda p: dataclasses.replace(p, reset=3),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_poses_are_no_poses(name):
+    """Each ends as if none came: the throw is over after 0.1 s, the run after 0.25 s."""
+    pilot, decisions = thrown(action=NEVER, poses=spoiled(BAD[name]), seconds=6.0)
+    assert when(decisions, "recover") == pytest.approx(START + 0.10, abs=1.5 * TICK)
+    assert when(decisions, "abort") == pytest.approx(START + 0.25, abs=1.5 * TICK)
+    assert sum(pilot.tracks["vehicle"].gate.refused.values()) > 10
+
+
+HARMLESS = {
+    "clock step": lambda time, poses: [dataclasses.replace(p, stamp=p.stamp + (time > START)) for p in poses],
+    "clock step back": lambda time, poses: [dataclasses.replace(p, stamp=p.stamp - (time > START)) for p in poses],
+    "doubled": lambda time, poses: [p for p in poses for _ in range(2)],
+    "one bad": spoiled(BAD["jump"], START + 0.02),
+}
+
+
+@pytest.mark.parametrize("name", HARMLESS)
+def test_harmless_faults_end_no_throw(name):
+    _, decisions = thrown(action=NEVER, poses=HARMLESS[name], seconds=6.0)
+    assert decisions[-1].state == "throw"
+
+
+def test_poses_at_5_hz_never_start_a_throw():
+    kept = {}
+
+    def slow(time, poses):
+        out = [p for p in poses if time - kept.get(p.body, -1.0) >= 0.2 - 1e-9]
+        kept.update({p.body: time for p in out})
+        return out
+
+    pilot, decisions = thrown(poses=slow, seconds=8.0)
+    assert "throw" not in {d.state for d in decisions}
+    assert not pilot.backend.release_times
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (('frames.vehicle.quaternion="wxyz"', 'frames.payload.quaternion="wxyz"'), "heading|tilted"),
+        (('frames.vehicle.axes="y,-x,z"', 'frames.payload.axes="y,-x,z"'), "heading"),
+        (("goal_w=[9.0, 0.0, 0.0]",), "goal x 9.00 m beyond"),
+        (("home_w=[1.0, 0.0, 1.333]",), "from its hover point"),
+    ],
+)
+def test_the_checks_before_a_throw(overrides, message):
+    pilot, decisions = thrown(overrides=(*overrides, "states.check=1.5"), seconds=4.0)
+    state, reason = changes(decisions)[2]
+    assert state == "abort"
+    assert any(word in reason for word in message.split("|")), reason
+    assert not pilot.backend.sent, "nothing was ever sent"
+
+
+def test_bodies_exchanged_from_the_start_are_noticed():
+    swap = BAD["swapped"]
+    _, decisions = thrown(poses=lambda t, poses: [swap(p) for p in poses], overrides=("states.check=1.5",), seconds=4.0)
+    assert "bodies exchanged" in changes(decisions)[2][1]
+
+
+@pytest.mark.parametrize(
+    ("status", "reason"),
+    [
+        (lambda t: Status(t < START, "silent"), "the autopilot is silent, disarmed or in another mode"),
+        (lambda t: Status(True, "", "failed" if t > START else "idle"), "the release was refused or not answered"),
+    ],
+)
+def test_an_autopilot_that_goes(status, reason):
+    _, decisions = thrown(action=NEVER, status=status, seconds=5.0)
+    assert changes(decisions)[-1] == ("abort", reason)
+    assert when(decisions, "abort") == pytest.approx(START, abs=1.5 * TICK)
+
+
+def test_an_autopilot_in_another_mode_never_leads_to_a_throw():
+    pilot, decisions = thrown(status=lambda t: Status(False, "mode"), overrides=("states.idle=2.0",), seconds=5.0)
+    assert changes(decisions)[-1] == ("abort", "no autopilot ready within 2 s")
+    assert not pilot.backend.sent
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_a_policy_that_puts_out_no_numbers(value):
+    pilot = runner(NEVER)
+    act = pilot.pilot.act
+
+    def broken(*args):
+        out = act(*args)
+        return dataclasses.replace(out, command=np.full((1, 4), value, np.float32))
+
+    decisions = fly(pilot, 5.0, watch=lambda t, d: setattr(pilot.pilot, "act", broken) if t > START else None)
+    safe(pilot, decisions)
+    assert "is not finite" in changes(decisions)[-1][1]
+    assert when(decisions, "abort") == pytest.approx(START, abs=2 * TICK)
+    assert not pilot.errors
+
+
+def test_a_policy_that_saturates_stays_within_its_limits_and_the_fence_ends_it():
+    _, decisions = thrown(action=(1.0, 1.0, -1.0, 1.0, -1.0), seconds=6.0)
+    assert changes(decisions)[-1][0] == "abort"
+    assert changes(decisions)[-1][1].startswith("fence: ")
+
+
+def test_no_exception_leaves_the_runner():
+    pilot = runner(NEVER)
+
+    def broken(*args):
+        raise ZeroDivisionError("in flight")
+
+    decisions = fly(pilot, 5.0, watch=lambda t, d: setattr(pilot.pilot, "act", broken) if t > START else None)
+    safe(pilot, decisions)
+    assert changes(decisions)[-1] == ("abort", "ZeroDivisionError: in flight")
+    assert "in flight" in pilot.errors[0]
+
+
+def test_a_release_outside_of_the_fence_is_refused():
+    """The payload hangs outside of its own fence from the moment that the policy asks."""
+    pilot = runner(AT_ONCE)
+    tight = dataclasses.replace(pilot.params.fence, payload_low=(-3.0, -3.0, 1.2))
+
+    def watch(time, decision):
+        if decision.state == "armed":
+            object.__setattr__(pilot.params, "fence", tight)
+
+    decisions = fly(pilot, 5.0, watch=watch)
+    safe(pilot, decisions)
+    assert not pilot.backend.release_times
+
+
+def test_a_failed_recording_prevents_the_next_throw_only():
+    pilot, decisions = thrown(recording=lambda t: t < 0.5, seconds=5.0)
+    assert decisions[-1].state == "ready"
+    assert not pilot.backend.release_times
+    _, decisions = thrown(action=NEVER, recording=lambda t: t < START, seconds=5.0)
+    assert decisions[-1].state == "throw"
+
+
+def test_a_tick_overrun_in_mid_throw():
+    """A tick that comes 0.15 s late: poses have waited, content is as old as it is."""
+    _, decisions = thrown(action=NEVER, late=lambda t: 0.03 if START < t < START + 0.02 else 0.0, seconds=5.0)
+    assert decisions[-1].state == "throw"
+
+
+def test_another_camera_is_refused():
+    with pytest.raises(MismatchError, match="goal_side"):
+        Runner(params("camera.goal_side=0.3"), simple_policy(layout="vision"), Spy())
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("gate.hold=0.01", "ascending"),
+        ("throws=0", "expected 1 or more"),
+        ('source.kind="csv"', "expected the file of the csv source"),
+        ('frames.vehicle.axes="x,y,-z"', "mirror the world"),
+        ('backend="px4"', "one of 'dry-run', 'ardupilot'"),
+        ("gaol_w=[1.0]", "did you mean 'goal_w'"),
+        ("guard.slew_thrust=0.0", "above 0"),
+        ("fence.vehicle_low=[9.0, 0.0, 0.0]", "ascending corners"),
+        ("states.armed=-1.0", "above 0 s"),
+    ],
+)
+def test_wrong_configs(override, message):
+    with pytest.raises(ConfigError, match=message):
+        config.load(HilParams, config.find("hil", "dry_run"), [override])
