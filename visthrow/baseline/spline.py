@@ -1,0 +1,392 @@
+"""Payload's path from hover to release: a septic spline, jointly optimised waypoints and segment times, and its flatness.
+
+Segments of degree 7 meet with derivatives up to the fifth, so that the body rates of the flat vehicle are continuous.
+The path starts at rest with the vehicle level (all derivatives 0) and ends with the release's velocity and no
+acceleration or higher derivative, so that it goes on as flight at constant velocity: the reference of a controller whose
+horizon looks past the release. With four segments and given waypoints the conditions fix every coefficient.
+
+The optimisation is over the waypoints and times: ``rho int |snap|^2 dt + w_t T`` plus penalties on speed, acceleration and
+workspace (the paper, Sec. IV-A; bounds and penalties' weights are ours). Two more penalties are ours, on the thrust
+vector and its turning: without them short plans flip the vehicle in ways that no quadrotor follows.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from sim.params import GRAVITY
+from visthrow.baseline.pendulum import Pendulum
+from visthrow.errors import VisthrowError
+
+SEGMENTS, ORDER = 4, 8
+SMOOTH = 6
+"""Derivatives 0 to 5 agree where two segments meet, and are given at the start."""
+
+END = 5
+"""Derivatives 0 to 4 are given at the release."""
+
+SAMPLES = 20
+"""Of a segment, for penalties and energy."""
+
+
+class PlanError(VisthrowError):
+    """A trajectory that cannot be planned."""
+
+
+LONGEST, SHORTEST, COARSE = (2.4, 1.8, 1.4, 1.1, 0.9), 0.4, 0.1
+"""Durations that are tried first: several starts, the shortest, the step [s]. The best result is taken."""
+
+EVEN = 0.02
+"""Weight of the squared logarithm of a segment's share over the first one's, relative to the duration's [s]: without it
+the segments grow so uneven that the path rings."""
+
+STIFF = 5.0
+"""Factor on the excess of the thrust's vertical part: past zero the vehicle turns over and the path is lost."""
+
+DIFFERENCE = 1e-6
+"""Step of the objective's slopes, in m and in logarithms of time."""
+
+EVALUATIONS = 100
+"""Of the objective at each duration, which starts from the path of the one before."""
+
+HOPELESS = 2.0
+"""Ratio of objectives at which shortening ends."""
+
+
+@dataclass(frozen=True)
+class PlanParams:
+    """Weights and soft bounds. Weights ``duration`` and ``energy`` as in the paper's table; the rest is ours."""
+
+    duration: float = 30e3  # w_t [1/s]
+    energy: float = 0.005  # rho [s^7/m^2]
+    max_speed: float = 4.5  # of the payload [m/s]
+    max_acceleration: float = 12.0  # of the payload [m/s^2]
+    floor: float = 0.5  # lowest height of the payload [m]
+    ceiling: float = 2.2  # highest height of the payload [m]
+    backward: float = 0.4  # how far behind the start the payload may swing out [m]
+    max_thrust: float = 12.0  # of the vehicle [N]
+    least_lift: float = 0.8  # vertical part of the thrust [N]
+    least_pull: float = 0.4  # vertical part of the cable's pull, in the payload's weights [-]
+    max_turn: float = 9.0  # of the thrust's direction [rad/s]
+    penalty: float = 1e5  # of squared excess, integrated over time; relative to the bound, or in m [1/s]
+
+
+@dataclass(frozen=True)
+class Spline:
+    """Piecewise polynomial of the payload; constant velocity after its end, rest before its start."""
+
+    times: np.ndarray  # of the segments [s], shape (S,)
+    coefficients: np.ndarray  # of t^0 to t^7 in each segment's own time, shape (S, 8, 3)
+
+    @property
+    def duration(self) -> float:
+        """[s]."""
+        return float(self.times.sum())
+
+    def sample(self, time: np.ndarray, derivatives: int = 6) -> np.ndarray:
+        """Payload's position and derivatives.
+
+        Args:
+            time: since the start [s], shape (T,).
+            derivatives: how many, the position included; 2 or more.
+
+        Returns:
+            In m/s^n, shape (T, derivatives, 3).
+        """
+        time = np.atleast_1d(np.asarray(time, dtype=float))
+        inside = np.clip(time, 0.0, self.duration)
+        starts = np.concatenate([[0.0], np.cumsum(self.times)])
+        segment = np.clip(np.searchsorted(starts, inside, side="right") - 1, 0, len(self.times) - 1)
+        local = inside - starts[segment]
+        out = np.einsum("tdk,tkc->tdc", _rows(local, derivatives), self.coefficients[segment])
+        past = (time - inside)[:, None]
+        out[:, 0] += past * out[:, 1]
+        out[:, 2:][past[:, 0] > 0.0] = 0.0
+        return out
+
+
+@lru_cache(maxsize=16)
+def _factors(derivatives: int) -> tuple[np.ndarray, np.ndarray]:
+    """Factor and power of t in the n-th derivative of t^k, shape (derivatives, 8) each."""
+    n, k = np.arange(derivatives)[:, None], np.arange(ORDER)[None, :]
+    factor = np.ones((derivatives, ORDER))
+    for i in range(derivatives - 1):
+        factor = np.where(n > i, factor * (k - i), factor)
+    return np.maximum(factor, 0.0), np.maximum(k - n, 0)
+
+
+def _rows(time: np.ndarray, derivatives: int) -> np.ndarray:
+    """Derivatives of the monomials at times, shape (T, derivatives, 8)."""
+    factor, power = _factors(derivatives)
+    return factor * (time[:, None] ** np.arange(ORDER))[:, power]
+
+
+def through(
+    start: np.ndarray, waypoints: np.ndarray, end: np.ndarray, velocity: np.ndarray, times: np.ndarray
+) -> Spline:
+    """Spline from rest through waypoints to the release.
+
+    Args:
+        start: [m], shape (D,); D is the dimension of space.
+        waypoints: [m], shape (3, D).
+        end: [m], shape (D,).
+        velocity: at the end [m/s], shape (D,).
+        times: of the four segments [s], shape (4,).
+
+    Raises:
+        PlanError: A time is not positive.
+    """
+    times = np.asarray(times, dtype=float)
+    if times.shape != (SEGMENTS,) or not np.all(times > 0.0):
+        raise PlanError(f"segment times {times}; expected {SEGMENTS} above 0 s")
+    solved = _coefficients(start, np.asarray(waypoints, dtype=float)[None], end, velocity, times[None])[0]
+    return Spline(times, solved / (times[:, None] ** np.arange(ORDER))[:, :, None])
+
+
+def _coefficients(
+    start: np.ndarray, waypoints: np.ndarray, end: np.ndarray, velocity: np.ndarray, times: np.ndarray
+) -> np.ndarray:
+    """Coefficients in units of each segment's time, which keeps the matrix well conditioned; B paths at once.
+
+    Waypoints (B, 3, D), times (B, 4); returns (B, 4, 8, D).
+    """
+    ends, begins = _unit_rows()
+    size, count = SEGMENTS * ORDER, len(times)
+    matrix, right = np.zeros((count, size, size)), np.zeros((count, size, len(start)))
+    matrix[:, :SMOOTH, :ORDER], right[:, 0] = begins, start
+    row = SMOOTH
+    for i in range(SEGMENTS - 1):
+        here, there = slice(i * ORDER, (i + 1) * ORDER), slice((i + 1) * ORDER, (i + 2) * ORDER)
+        matrix[:, row, here], right[:, row] = ends[0], waypoints[:, i]
+        matrix[:, row + 1 : row + 1 + SMOOTH, here] = ends[:SMOOTH]
+        ratio = (times[:, i] / times[:, i + 1])[:, None] ** np.arange(SMOOTH)
+        matrix[:, row + 1 : row + 1 + SMOOTH, there] = -ratio[:, :, None] * begins
+        row += 1 + SMOOTH
+    matrix[:, row:, -ORDER:] = ends[:END]
+    right[:, row], right[:, row + 1] = end, velocity * times[:, -1:]
+    return np.linalg.solve(matrix, right).reshape(count, SEGMENTS, ORDER, -1)
+
+
+@lru_cache(maxsize=1)
+def _unit_rows() -> tuple[np.ndarray, np.ndarray]:
+    return _rows(np.array([1.0]), SMOOTH)[0], _rows(np.array([0.0]), SMOOTH)[0]
+
+
+@lru_cache(maxsize=1)
+def _sample_rows() -> np.ndarray:
+    return _rows((np.arange(SAMPLES) + 0.5) / SAMPLES, SMOOTH)
+
+
+def residuals(unit: np.ndarray, times: np.ndarray, params: PlanParams, model: Pendulum) -> dict[str, np.ndarray]:
+    """Objective of B planar paths (along the throw, up) as sums of squares.
+
+    Args:
+        unit: coefficients in units of each segment's time, shape (B, 4, 8, 2).
+        times: of the segments [s], shape (B, 4).
+        params: weights and bounds.
+        model: whose thrust is bounded.
+
+    Returns:
+        ``duration``, ``energy``, ``penalty``: arrays (B, ...) whose squares add up to each part of the objective.
+    """
+    count = len(times)
+    path = np.einsum("tdk,bskc->dbstc", _sample_rows(), unit)
+    path /= (times[None] ** np.arange(SMOOTH)[:, None, None])[:, :, :, None, None]
+    path = path.reshape(SMOOTH, -1, 2)
+    weight = np.sqrt(np.repeat(times / SAMPLES, SAMPLES, axis=1)).reshape(-1)
+    force, change = _thrust(model, path, np.array([0.0, GRAVITY]))[:2]
+    size = np.linalg.norm(force, axis=1)
+    turn = np.abs(force[:, 0] * change[:, 1] - force[:, 1] * change[:, 0]) / np.maximum(size, 0.05) ** 2
+    begin = np.repeat(unit[:, 0, 0, 0], SEGMENTS * SAMPLES)
+    excess = np.array([
+        np.linalg.norm(path[1], axis=1) / params.max_speed - 1.0,
+        np.linalg.norm(path[2], axis=1) / params.max_acceleration - 1.0,
+        path[0, :, 1] - params.ceiling,
+        params.floor - path[0, :, 1],
+        begin - path[0, :, 0] - params.backward,
+        size / params.max_thrust - 1.0,
+        STIFF * (1.0 - force[:, 1] / params.least_lift),
+        1.0 - (1.0 + path[2, :, 1] / GRAVITY) / params.least_pull,
+        np.minimum(turn / params.max_turn - 1.0, 20.0),
+    ])  # fmt: skip
+    penalty = np.sqrt(params.penalty) * weight * np.maximum(excess, 0.0)
+    return {
+        "duration": np.sqrt(params.duration * times.sum(1, keepdims=True)),
+        "energy": (np.sqrt(params.energy) * weight[:, None] * path[4]).reshape(count, -1),
+        "penalty": penalty.reshape(len(excess), count, -1).transpose(1, 0, 2).reshape(count, -1),
+    }
+
+
+def optimise(
+    model: Pendulum,
+    start_w: np.ndarray,
+    end_w: np.ndarray,
+    velocity_w: np.ndarray,
+    params: PlanParams,
+    tick: tuple[float, float] = (0.02, 0.0),
+) -> Spline:
+    """Plan the payload's path.
+
+    Args:
+        model: whose thrust the bounds are on.
+        start_w: hover [m], shape (3,).
+        end_w: release [m], shape (3,), in the vertical plane of start and velocity.
+        velocity_w: at release [m/s], shape (3,), not vertical.
+        params: weights and bounds.
+        tick: period and offset [s]: the duration is the offset and a whole number of periods, so that a controller of that
+            period can release at its end.
+
+    Raises:
+        PlanError: No horizontal velocity, a release beside the plane, or the optimisation does not find a path.
+    """
+    along = np.array([*velocity_w[:2], 0.0])
+    speed = float(np.linalg.norm(along))
+    if not speed > 1e-6:
+        raise PlanError(f"release velocity {velocity_w}; expected a horizontal part")
+    basis = np.stack([along / speed, [0.0, 0.0, 1.0]])  # (2, 3)
+    aside = np.linalg.norm((end_w - start_w) - basis.T @ (basis @ (end_w - start_w)))
+    if not aside < 1e-6:
+        raise PlanError(f"the release lies {aside:g} m beside the plane of start and velocity; expected it within")
+    end, velocity = basis @ (end_w - start_w), basis @ velocity_w
+    height = np.array([0.0, start_w[2]])
+    begin, end = height, end + height
+
+    def build(x: np.ndarray, total: float) -> tuple[np.ndarray, np.ndarray]:
+        ratio = np.exp(np.concatenate([np.zeros((len(x), 1)), x[:, -(SEGMENTS - 1) :]], axis=1))
+        middle = _base(begin, end, velocity, total) + x[:, : -(SEGMENTS - 1)].reshape(len(x), -1, 2)
+        times = total * ratio / ratio.sum(1, keepdims=True)
+        return _coefficients(begin, middle, end, velocity, times), times
+
+    def objective(x: np.ndarray, total: float) -> np.ndarray:
+        parts = residuals(*build(x, total), params, model).values()
+        uneven = np.sqrt(EVEN * params.duration) * x[:, -(SEGMENTS - 1) :]
+        return np.concatenate([*parts, uneven], axis=1) / np.sqrt(params.duration)
+
+    value, total, x = _search(objective, tick)
+    if not np.isfinite(value):
+        raise PlanError(f"no path from {start_w} to {end_w} at {velocity_w} m/s")
+    unit, times = (item[0] for item in build(x[None], total))
+    lifted = (unit / (times[:, None] ** np.arange(ORDER))[:, :, None]) @ basis
+    lifted[:, 0] += [*start_w[:2], 0.0]
+    return Spline(times, lifted)
+
+
+def _search(objective: Callable, tick: tuple[float, float]) -> tuple[float, float, np.ndarray]:
+    """Least squares at each duration, from several starts on a coarse grid, then on the fine one about the best.
+
+    Returns:
+        Objective, duration and variables of the best.
+    """
+
+    def improve(x: np.ndarray, total: float):
+        def slope(x: np.ndarray) -> np.ndarray:
+            near = objective(x + DIFFERENCE * np.vstack([0.0 * x, np.eye(len(x))]), total)
+            return (near[1:] - near[0]).T / DIFFERENCE
+
+        return least_squares(lambda x: objective(x[None], total)[0], x, slope, method="lm", max_nfev=EVALUATIONS)
+
+    blank = np.zeros(3 * (SEGMENTS - 1))
+    tried = (_descend(improve, blank, np.arange(top, SHORTEST, -COARSE)) for top in LONGEST)
+    best = min(tried, key=lambda found: found[0])
+    return _descend(improve, best[2], _ticks(best[1] + COARSE, max(best[1] - COARSE, SHORTEST), *tick))
+
+
+def _descend(improve, x: np.ndarray, totals: np.ndarray) -> tuple[float, float, np.ndarray]:
+    """Shorten a path step by step, each from the one before, until the objective is :data:`HOPELESS` times the best.
+
+    From a long path down, the vehicle never turns over: short plans have local optima in which it does.
+
+    Returns:
+        Objective, duration and variables of the best.
+    """
+    best = (np.inf, float(totals[0]), x)
+    for total in totals:
+        found = improve(x, float(total))
+        x = found.x
+        if found.cost < best[0]:
+            best = (float(found.cost), float(total), x)
+        elif found.cost > HOPELESS * best[0]:
+            break
+    return best
+
+
+def _ticks(high: float, low: float, period: float, offset: float) -> np.ndarray:
+    """Offset plus whole periods between two durations, falling."""
+    first, last = np.floor((high - offset) / period + 1e-6), np.ceil((low - offset) / period - 1e-6)
+    return offset + period * np.arange(first, last - 1, -1)
+
+
+def _base(begin: np.ndarray, end: np.ndarray, velocity: np.ndarray, total: float) -> np.ndarray:
+    """Waypoints on the single septic with the same ends, up to the third derivative, that takes a total time [s]."""
+    begins, ends = _unit_rows()[1][:4], _unit_rows()[0][:4]
+    right = np.zeros((ORDER, len(begin)))
+    right[0], right[4], right[5] = begin, end, velocity * total
+    unit = np.linalg.solve(np.concatenate([begins, ends]), right)
+    return _rows(np.arange(1, SEGMENTS) / SEGMENTS, 1)[:, 0] @ unit
+
+
+def flat_reference(model: Pendulum, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Whole state and input of the pendulum along a payload's path.
+
+    The attitude is the shortest turn from level to the thrust's direction.
+
+    Args:
+        model: masses and length.
+        path: position and five derivatives, shape (T, 6, 3).
+
+    Returns:
+        States (T, 16) and inputs (T, 4).
+
+    Raises:
+        PlanError: The payload falls freely, where the cable has no direction.
+
+    Source: Sreenath, Lee, Kumar, CDC 2013, Lemma 1: payload position and heading are flat outputs.
+    """
+    chain = np.moveaxis(path, 1, 0)
+    up = np.array([0.0, 0.0, GRAVITY])
+    if np.any(np.linalg.norm(chain[2] + up, axis=1) < 1e-3 * GRAVITY):
+        raise PlanError("the planned payload falls freely; expected a taut cable all along the path")
+    force, change, direction, first = _thrust(model, chain, up)
+    axis, turn = _unit(force, change)
+    half = np.column_stack([-axis[:, 1], axis[:, 0], 0.0 * axis[:, 0], 1.0 + axis[:, 2]])
+    quat, spin = _unit(half, np.column_stack([-turn[:, 1], turn[:, 0], 0.0 * turn[:, 0], turn[:, 2]]))
+    v, w, dv, dw = quat[:, :3], quat[:, 3:], spin[:, :3], spin[:, 3:]
+    rates = 2.0 * (w * dv - dw * v - np.cross(v, dv))
+    state = np.concatenate([chain[0], chain[1], direction, np.cross(direction, first), quat], axis=1)
+    return state, np.column_stack([np.linalg.norm(force, axis=1), rates])
+
+
+def _thrust(
+    model: Pendulum, chain: np.ndarray, up: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Thrust vector [N], its rate of change, cable direction and its rate of change, from a path (6, T, D)."""
+    _, _, acc, jerk, snap, crackle = chain
+    unit = _unit(acc + up, jerk, snap, crackle)
+    direction, first, second, third = (-x for x in unit)
+    both = model.vehicle_mass + model.payload_mass
+    force = both * (acc + up) - model.vehicle_mass * model.length * second
+    return force, both * jerk - model.vehicle_mass * model.length * third, direction, first
+
+
+def _unit(*chain: np.ndarray) -> list[np.ndarray]:
+    """Unit vector of the first and its derivatives, from a vector and its derivatives, shape (T, D) each; up to the third."""
+
+    def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return (a * b).sum(1, keepdims=True)
+
+    vector = chain[0]
+    norm = np.sqrt(dot(vector, vector))
+    out = [vector / norm]
+    if len(chain) > 1:
+        n1 = dot(out[0], chain[1])
+        out.append((chain[1] - n1 * out[0]) / norm)
+    if len(chain) > 2:
+        n2 = dot(out[1], chain[1]) + dot(out[0], chain[2])
+        out.append((chain[2] - 2.0 * n1 * out[1] - n2 * out[0]) / norm)
+    if len(chain) > 3:
+        n3 = dot(out[2], chain[1]) + 2.0 * dot(out[1], chain[2]) + dot(out[0], chain[3])
+        out.append((chain[3] - 3.0 * n2 * out[1] - 3.0 * n1 * out[2] - n3 * out[0]) / norm)
+    return out
