@@ -166,7 +166,9 @@ def story(summary: dict[str, Any], folder: Path) -> str:
     """A run in a few lines."""
     lines = [f"ended in {summary['state']}: {summary['reason']}"]
     lines.append(f"throws {summary['throws']}, released {summary['latches']}, cancelled {summary['cancelled']}")
-    for landing in summary.get("landings", []):
+    if summary["stuck"]:
+        lines.append(f"{summary['stuck']} released payload still hung on the vehicle: look at the mechanism")
+    for landing in summary["landings"]:
         lines.append(
             f"landing at x {landing['landing_w'][0]:.3f} m, y {landing['landing_w'][1]:+.3f} m by the payload's own poses: "
             f"{landing['error']:.3f} m from the goal, {landing['duration']:.2f} s after the throw began"

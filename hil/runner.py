@@ -30,6 +30,9 @@ LAG_TOLERANCE = 5e-3
 STILL_OFFSET, STILL_SPEED = 0.05, 0.15
 """Vehicle off its hover point [m], vehicle and payload speed [m/s] that count as quiet, velocities over 0.2 s."""
 
+STUCK_AFTER = 0.6
+"""A payload that still hangs this long after it should have separated was not released, whatever was answered [s]."""
+
 REACQUIRE = 1.0
 """Before the vehicle is ours, a body that was refused or gone for this long is taken wherever it is [s]."""
 
@@ -73,7 +76,8 @@ class Runner:
 
     Attributes:
         machine: the state. pilot: the policy. guard: with its counts.
-        tracks: by body. lag: trained time from latch to separation [s]. latches: releases so far.
+        tracks: by body. lag: trained time from latch to separation [s].
+        latches: releases so far. stuck: payloads that stayed on.
         landings: of the throws so far. errors: tracebacks of what was caught.
     """
 
@@ -115,7 +119,7 @@ class Runner:
         self._begun = 0.0
         self._flight: Flight | None = None
         self.landings: list[Landing] = []
-        self.latches = 0
+        self.latches = self.stuck = 0
         self.errors: list[str] = []
 
     def tick(self, now: float, poses: list[Pose], status: Status, words: Words, recording: bool = True) -> Decision:
@@ -258,7 +262,7 @@ class Runner:
         """What to send in a state, before the guard; None for nothing."""
         if state not in FLYING and state is not State.ABORT:
             return None
-        mass = self._full if self._latch is None else self._alone
+        mass = self._full if self._carries(now, vehicle, payload) else self._alone
         if vehicle is None or vehicle.quat is None or self.tracks[VEHICLE].gate.level(now) >= HOLD:
             if state is State.ABORT and now - self.machine.since > LEVEL_TIME:
                 return None
@@ -274,6 +278,18 @@ class Runner:
             math.radians(self.params.check.heading_deg),
         )  # fmt: skip
         return tuple(command[0].tolist())
+
+    def _carries(self, now: float, vehicle: BodyState | None, payload: BodyState | None) -> bool:
+        """Whether the payload hangs on the vehicle, by the latch and by its own poses."""
+        if self._latch is None:
+            return True
+        if now - self._latch < self.lag + STUCK_AFTER or None in (vehicle, payload):
+            return False
+        fresh = self.tracks[PAYLOAD].gate.level(now) < HOLD
+        hangs = abs(math.dist(vehicle.pos, payload.pos) - self.hang) < self.params.check.rope_tolerance
+        if fresh and hangs and self._flight is not None:
+            self.stuck, self._flight = self.stuck + 1, None
+        return fresh and hangs
 
     def _throw(self, vehicle: BodyState, payload: BodyState, goal_w: Vector, decision: Decision) -> tuple[float, ...]:
         out = self._show(vehicle, payload, goal_w, decision)
@@ -313,6 +329,7 @@ class Runner:
             "throws": self.machine.throws,
             "cancelled": self.machine.cancelled,
             "latches": self.latches,
+            "stuck": self.stuck,
             "landings": [asdict(landing) for landing in self.landings],
             "guard": {k: getattr(self.guard, k) for k in ("clipped", "slewed", "refused")},
             "bodies": {

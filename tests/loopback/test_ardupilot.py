@@ -1,0 +1,159 @@
+"""The ArduPilot back-end against the fake autopilot: what is followed, what is answered, what is never sent."""
+
+import math
+
+import numpy as np
+import pytest
+
+from hil.backends import ArduPilot, ArduPilotParams
+from hil.backends.ardupilot import GUIDED, LAND
+from hil.errors import RunError
+from hil.fake import VEHICLE_ID, FakeAutopilot, MocapParams, load_plant
+from hil.link import Link, attitude_target
+from hil.mavlink import mav
+from tests.hil_flight import simple_policy
+from tests.loopback.wire import LevelPlant, pipe, throw
+
+PARAMS = ArduPilotParams(1, 1, 14.0, 1, 0.11, 0.5, 3.0, LAND)
+AT_ONCE = simple_policy((-0.1269, 0.0, 0.0, 0.0, 1.0))
+
+
+def pair(answer="accepted"):
+    here, there = pipe()
+    fake = FakeAutopilot(LevelPlant(), Link(there, *VEHICLE_ID), MocapParams(loss=0.0), 0, answer)
+    link = Link(here)
+    return ArduPilot(link, PARAMS), link, fake
+
+
+def turn(backend, link, fake, periods=1):
+    for _ in range(periods):
+        fake.step()
+        link.pump(lambda: fake.plant.time)
+        backend.service(fake.plant.time)
+
+
+def test_connected_by_its_heartbeat_until_it_falls_silent():
+    backend, link, fake = pair()
+    assert backend.status(0.0).note == "no heartbeat"
+    turn(backend, link, fake)
+    assert backend.status(0.0).connected
+    assert backend.status(3.1).note.startswith("no heartbeat for 3.1")
+    fake.mode = 5
+    turn(backend, link, fake, 250)
+    assert "in mode 5; expected GUIDED" in backend.status(fake.plant.time).note
+
+
+def test_units_and_axes_of_the_command():
+    backend, link, fake = pair()
+    turn(backend, link, fake)
+    assert backend.send((7.0, 1.0, 2.0, 3.0), 0.1)
+    turn(backend, link, fake)
+    np.testing.assert_allclose(fake.plant.commands[-1], (7.0, 1.0, 2.0, 3.0), rtol=1e-6)
+    assert fake.followed == 1
+
+
+@pytest.mark.parametrize("change", [{"type_mask": 132}, {"type_mask": 192}, {"type_mask": 0}, {"target_system": 2}, {}])
+def test_the_fake_ignores_what_the_real_one_ignores(change):
+    _, link, fake = pair()
+    message = attitude_target(0.0, (1, 1), 0.5, (0.0, 0.0, 0.0))
+    for name, value in change.items():
+        setattr(message, name, value)
+    if not change:
+        fake.mode = LAND
+    link.send(message)
+    fake.step()
+    assert (fake.followed, fake.ignored) == (0, 1)
+
+
+def test_silence_levels_the_fake():
+    _, link, fake = pair()
+    link.send(attitude_target(0.0, (1, 1), 0.9, (1.0, 0.0, 0.0)))
+    for _ in range(590):
+        fake.step()
+    assert fake.plant.commands[-1][1] == pytest.approx(1.0)
+    for _ in range(20):
+        fake.step()
+    np.testing.assert_allclose(fake.plant.commands[-1], (0.272 * 9.81, 0.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("answer", "state", "sends"),
+    [("accepted", "accepted", 1), ("in-progress", "failed", 1), ("denied", "failed", 1), ("silent", "failed", 13)],
+)
+def test_release_and_its_answers(answer, state, sends):
+    backend, link, fake = pair(answer)
+    turn(backend, link, fake)
+    backend.release(0.1)
+    assert backend.due() == 0.1
+    backend.release(0.2), backend.release(0.0)
+    while fake.plant.time < 0.1:
+        assert fake.grippers == 0
+        turn(backend, link, fake)
+    turn(backend, link, fake, 4)
+    if answer == "in-progress":
+        assert backend.status(fake.plant.time).release == "pending"
+    turn(backend, link, fake, 200)
+    assert backend.status(fake.plant.time).release == state
+    assert fake.grippers == pytest.approx(sends, abs=1 if sends > 1 else 0)
+    assert backend.due() is None
+
+
+def test_a_release_that_was_stopped_is_not_sent_again():
+    backend, link, fake = pair("silent")
+    turn(backend, link, fake)
+    backend.release(0.0)
+    turn(backend, link, fake, 10)
+    sent = fake.grippers
+    backend.stop_release()
+    turn(backend, link, fake, 100)
+    assert 0 < fake.grippers <= sent + 1, "one may be on its way"
+
+
+def test_an_abort_asks_for_the_mode_until_it_is_there():
+    backend, link, fake = pair()
+    turn(backend, link, fake)
+    assert fake.mode == GUIDED
+    for _ in range(50):
+        backend.abort(fake.plant.time)
+        turn(backend, link, fake)
+    assert fake.mode == LAND
+    assert link.sent <= 6, "asked at most every 0.1 s"
+
+
+def test_timesync_is_answered():
+    backend, link, fake = pair()
+    heard = []
+    fake.link.listen(lambda message, arrival: heard.append(message))
+    fake.link.send(mav.MAVLink_timesync_message(0, 777))
+    turn(backend, link, fake, 2)
+    answers = [m for m in heard if m.get_type() == "TIMESYNC" and m.ts1 == 777]
+    assert len(answers) == 1
+
+
+@pytest.mark.parametrize("answer", ["in-progress", "denied", "silent", "stuck"])
+def test_a_release_that_does_not_happen_ends_the_throw_without_a_second_one(answer):
+    plant = LevelPlant()
+    summary, _, told = throw(plant, answer=answer, loaded=AT_ONCE, seconds=9.0)
+    assert (summary["latches"], summary["landings"]) == (1, [])
+    assert summary["stuck"] == 1, "seen in the payload's own poses"
+    assert plant.released is None
+    assert all(np.isfinite(plant.commands).ravel())
+    if answer == "denied":
+        assert ("abort", "the release was refused or not answered") in [(d.state, d.reason) for d in told]
+
+
+def test_a_throw_with_a_plain_plant_releases_in_time():
+    plant = LevelPlant()
+    summary, fake, _ = throw(plant, loaded=AT_ONCE, seconds=9.0)
+    assert (fake.grippers, summary["latches"], len(summary["landings"])) == (1, 1, 1)
+    (latch,) = summary["latch_times"]
+    assert abs(plant.released - latch) <= 5e-3, "latch to separation is the trained lag within 5 ms"
+    assert summary["missed"] == 0
+    down = math.sqrt(2 * (1.333 - 0.383 - 0.04) / 9.81)
+    assert summary["landings"][0]["time"] == pytest.approx(plant.released + 0.11 + down, abs=6e-3)
+
+
+def test_plants_that_are_none():
+    for target in ("nowhere:make", "visthrow.wire_plant:none", "visthrow.wire_plant", ""):
+        with pytest.raises(RunError, match="expected module:function"):
+            load_plant(target, "state", 0)

@@ -1,0 +1,115 @@
+"""Runner and fake autopilot in one process, in lock step: no waiting, the same bits on every machine."""
+
+from collections import deque
+
+import numpy as np
+
+from hil.backends import ArduPilot
+from hil.fake import VEHICLE_ID, FakeAutopilot, MocapParams
+from hil.flight import AutoOperator, fly
+from hil.link import Link
+from hil.runner import Runner
+from hil.sources import MavlinkSource
+from visthrow import config
+from visthrow.hover import GRAVITY
+from visthrow.policy import Policy, find_policy
+
+
+class MemoryPort:
+    """One end of a pipe of datagrams."""
+
+    whole = True
+
+    def __init__(self) -> None:
+        self.inbox: deque[bytes] = deque()
+        self.other: MemoryPort | None = None
+
+    def read(self) -> bytes | None:
+        return self.inbox.popleft() if self.inbox else None
+
+    def write(self, data: bytes) -> bool:
+        self.other.inbox.append(bytes(data))
+        return True
+
+    def fileno(self) -> int:
+        return -1
+
+    def close(self) -> None:
+        pass
+
+
+def pipe() -> tuple[MemoryPort, MemoryPort]:
+    """Both ends."""
+    a, b = MemoryPort(), MemoryPort()
+    a.other, b.other = b, a
+    return a, b
+
+
+class PlantClock:
+    """The plant's time; waiting flies on."""
+
+    def __init__(self, fake: FakeAutopilot) -> None:
+        self._fake = fake
+
+    def now(self) -> float:
+        return self._fake.plant.time
+
+    def sleep_until(self, when: float) -> None:
+        while self._fake.plant.time < when - 1e-9:
+            self._fake.step()
+
+    def wait_for(self, port: MemoryPort, when: float) -> None:
+        while self._fake.plant.time < when - 1e-9 and not port.inbox:
+            self._fake.step()
+
+
+class LevelPlant:
+    """A plant of a few lines for tests of the protocol: hovers, turns as told, drops the payload at its feet."""
+
+    period, home_w, mass, max_thrust = 0.005, np.array([0.0, 0.0, 1.333]), (0.272, 0.21), 14.0
+
+    def __init__(self) -> None:
+        self.time, self.released, self.commands = 0.0, None, []
+
+    def step(self, command: np.ndarray, release: bool) -> None:
+        self.commands.append(tuple(command))
+        if release and self.released is None:
+            self.released = self.time
+        self.time += self.period
+
+    @property
+    def state(self) -> dict:
+        hangs = self.released is None or self.time < self.released + 0.11
+        fall = 0.0 if hangs else 0.5 * GRAVITY * (self.time - self.released - 0.11) ** 2
+        ball = np.array([0.0, 0.0, max(self.home_w[2] - 0.383 - fall, 0.04)])
+        level = np.array([0.0, 0.0, 0.0, 1.0])
+        return {
+            "pos_w": self.home_w, "quat_wb": level, "vel_w": np.zeros(3), "rate_b": np.zeros(3), "payload_pos_w": ball,
+            "attached": np.array(hangs),
+        }  # fmt: skip
+
+    @property
+    def landing(self) -> dict:
+        return {"landing_w": None, "landing_time": None, "separation_time": None}
+
+
+def peers(plant, seed=0, answer="accepted", overrides=(), mocap=None, policy="state", loaded=None):
+    """Runner and fake at the ends of a pipe: runner, source, clock, fake."""
+    from hil.params import HilParams
+
+    params = config.load(HilParams, config.find("hil", "fake"), [f"policy={policy}", *overrides])
+    here, there = pipe()
+    fake = FakeAutopilot(plant, Link(there, *VEHICLE_ID), mocap or MocapParams(), seed, answer)
+    clock, link = PlantClock(fake), Link(here, params.link.system, params.link.component)
+    source = MavlinkSource(link, params.source.senders, clock.now)
+    backend = ArduPilot(link, params.ardupilot)
+    runner = Runner(params, loaded or Policy.load(find_policy(policy)), backend, params.ardupilot.mechanism_lag)
+    return runner, source, clock, fake
+
+
+def throw(plant, seconds=20.0, recorder=None, **kwargs):
+    """A run in lock step: summary, fake, decisions."""
+    runner, source, clock, fake = peers(plant, **kwargs)
+    told = []
+    summary = fly(runner, source, clock, AutoOperator(), recorder, seconds, told.append)
+    return summary, fake, told
