@@ -41,19 +41,28 @@ def slope_weights(ages: list[float], order: int) -> list[float]:
 
     With too few samples for the order the order is lowered; with one sample the slope is 0.
     """
-    order = min(order, len(ages) - 1)
+    return fit_weights(ages, order)[0]
+
+
+def fit_weights(ages: list[float], order: int) -> tuple[list[float], list[float]]:
+    """Weights of the samples in the slope at age 0 [1/s], and in the second derivative [1/s^2] (0 for a line)."""
+    order, none = min(order, len(ages) - 1), [0.0] * len(ages)
     if order < 1:
-        return [0.0] * len(ages)
+        return none, none
     times = [-age for age in ages]
     n, s1, s2 = float(len(times)), sum(times), sum(t * t for t in times)
     if order == 1:
         det = n * s2 - s1 * s1
-        return [(n * t - s1) / det for t in times] if det > 0.0 else [0.0] * len(times)
+        return ([(n * t - s1) / det for t in times] if det > 0.0 else none), none
     s3, s4 = sum(t**3 for t in times), sum(t**4 for t in times)
-    # The middle row of the inverse of the normal matrix [[n, s1, s2], [s1, s2, s3], [s2, s3, s4]].
+    # The middle and the last row of the inverse of the normal matrix [[n, s1, s2], [s1, s2, s3], [s2, s3, s4]].
     row = (s2 * s3 - s1 * s4, n * s4 - s2 * s2, s1 * s2 - n * s3)
+    last = (s1 * s3 - s2 * s2, s1 * s2 - n * s3, n * s2 - s1 * s1)
     det = row[0] * s1 + row[1] * s2 + row[2] * s3
-    return [(row[0] + row[1] * t + row[2] * t * t) / det for t in times] if det > 0.0 else [0.0] * len(times)
+    if not det > 0.0:
+        return none, none
+    slope = [(row[0] + row[1] * t + row[2] * t * t) / det for t in times]
+    return slope, [2.0 * (last[0] + last[1] * t + last[2] * t * t) / det for t in times]
 
 
 class SlopeFilter:
@@ -61,11 +70,13 @@ class SlopeFilter:
 
     Attributes:
         lag: of the last estimate under constant acceleration [s]; 0 where the source gave both itself.
+        acceleration: of the last estimate [m/s^2], world frame; 0 for a line.
     """
 
     def __init__(self, params: EstimateParams) -> None:
         """Start empty."""
         self.params, self.lag = params, 0.0
+        self.acceleration: Vector = (0.0, 0.0, 0.0)
         self._window: deque[Pose] = deque(maxlen=params.samples)
 
     def reset(self) -> None:
@@ -83,11 +94,12 @@ class SlopeFilter:
             window.clear()
         window.appendleft(pose)
         vel, rate = pose.vel, pose.rate
+        ages = [pose.stamp - sample.stamp for sample in window]
+        weights, bends = fit_weights(ages, self.params.order)
+        self.acceleration = _sum(bends, [sample.pos for sample in window])
         self.lag = 0.0
         if vel is not None and (rate is not None or pose.quat is None):
             return vel, rate or (0.0, 0.0, 0.0)
-        ages = [pose.stamp - sample.stamp for sample in window]
-        weights = slope_weights(ages, self.params.order)
         self.lag = -0.5 * sum(c * a * a for c, a in zip(weights, ages))
         if vel is None:
             vel = _sum(weights, [sample.pos for sample in window])

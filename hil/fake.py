@@ -170,13 +170,16 @@ class FakeAutopilot:
         views = [now[name].astype(float)[None] for name in ("pos_w", "quat_wb", "vel_w")]
         return self._hover.step(*views, home, self.plant.mass[alone])[0]
 
-    def step(self) -> None:
-        """One period: hear, fly, measure, send."""
+    def fly(self) -> None:
+        """Hear what has come, and fly one period."""
         self.link.pump(lambda: self.plant.time)
-        now = self.plant.state
+        self.plant.step(self._flown(self.plant.state), self._release)
+
+    def emit(self) -> None:
+        """Measure and send what is due now."""
         if self.plant.time >= self._next_pose - 1e-9:
             self._next_pose += 1.0 / self.mocap.rate
-            self._measure(now)
+            self._measure(self.plant.state)
         while self._waiting and self._waiting[0][0] <= self.plant.time + 1e-9:
             _, _, message, payload = heapq.heappop(self._waiting)
             if payload:
@@ -186,9 +189,12 @@ class FakeAutopilot:
                 self.link.send(message)
         if self.plant.time >= self._next_beat:
             self._next_beat = self.plant.time + 1.0
-            flags = ARMED | CUSTOM
-            self.link.send(mav.MAVLink_heartbeat_message(2, 3, flags, self.mode, 4, 3))
-        self.plant.step(self._flown(now), self._release)
+            self.link.send(mav.MAVLink_heartbeat_message(2, 3, ARMED | CUSTOM, self.mode, 4, 3))
+
+    def step(self) -> None:
+        """One period."""
+        self.fly()
+        self.emit()
 
     def _measure(self, now: dict[str, np.ndarray]) -> None:
         """Poses of this instant, on their way."""
@@ -219,14 +225,15 @@ def serve(fake: FakeAutopilot, clock: Clock, most: float, out: Path | None = Non
     """Fly in real time until some seconds after the landing, or for ``most`` seconds.
 
     Returns:
-        The report, with the number of periods that began late by more than one.
+        The report, with the number of periods that took longer than real time has.
     """
     start, begun, late = clock.now(), fake.plant.time, 0
     while fake.plant.time - begun < most:
+        fake.fly()
         due = start + (fake.plant.time - begun)
+        late += clock.now() > due
         clock.sleep_until(due)
-        late += clock.now() - due > fake.plant.period
-        fake.step()
+        fake.emit()
         landed = fake.plant.landing["landing_time"]
         if landed is not None and fake.plant.time > landed + AFTER_LANDING:
             break

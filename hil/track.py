@@ -76,7 +76,7 @@ class Track:
         return math.hypot(*(sum(c * pos[i] for c, (_, pos) in zip(weights, self._slow)) for i in range(3)))
 
     def state(self, now: float, ahead: float = 0.0) -> BodyState | None:
-        """State by the last accepted pose, carried forward at constant velocity and rate.
+        """State by the last accepted pose, carried forward at constant acceleration and rate.
 
         Args:
             now: on the runner's clock [s].
@@ -85,13 +85,14 @@ class Track:
         pose = self._pose
         if pose is None:
             return None
-        pos, quat, age = pose.pos, pose.quat, self.gate.age(now)
+        pos, quat, vel, age = pose.pos, pose.quat, self._vel, self.gate.age(now)
         ahead = min(max(ahead, 0.0), MOST_PREDICTION)
         if ahead > 0.0:
-            pos = tuple(x + ahead * v for x, v in zip(pos, self._vel))
+            pos = tuple(x + ahead * v for x, v in zip(pos, vel))
+            vel = tuple(v + ahead * a for v, a in zip(vel, self.filter.acceleration))
             if quat is not None:
                 half = 0.5 * ahead
                 turn = multiply(quat, (*(half * r for r in self._rate), 1.0))
                 norm = sum(x * x for x in turn) ** 0.5
                 quat = tuple(x / norm for x in turn)
-        return BodyState(pos, quat, self._vel, self._rate, age)
+        return BodyState(pos, quat, vel, self._rate, age)

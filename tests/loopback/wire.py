@@ -107,9 +107,11 @@ def peers(plant, seed=0, answer="accepted", overrides=(), mocap=None, policy="st
     return runner, source, clock, fake
 
 
-def throw(plant, seconds=20.0, recorder=None, **kwargs):
-    """A run in lock step: summary, fake, decisions."""
+def throw(plant, seconds=20.0, recorder=None, phase=0, **kwargs):
+    """A run in lock step, its ticks ``phase`` of the plant's periods after the poses: summary, fake, decisions."""
     runner, source, clock, fake = peers(plant, **kwargs)
+    for _ in range(phase):
+        fake.step()
     told = []
     summary = fly(runner, source, clock, AutoOperator(), recorder, seconds, told.append)
     return summary, fake, told

@@ -36,6 +36,7 @@ def test_a_parabola_is_not_late_on_uneven_stamps_either(samples):
     slopes, out = run(EstimateParams(samples, 2), times, lambda t: np.array([1.0, t, 0.5 * t * t]))
     assert slopes.lag == pytest.approx(0.0, abs=ROUNDING)
     np.testing.assert_allclose(out[-1][0], (0.0, 1.0, times[-1]), atol=1e-6)
+    np.testing.assert_allclose(slopes.acceleration, (0.0, 0.0, 1.0), atol=1e-4)
 
 
 def test_noise_is_what_the_weights_say():
