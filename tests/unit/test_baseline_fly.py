@@ -137,9 +137,9 @@ def test_delays_by_name(experiment):
     assert delays_of(experiment, "none") == Delays()
     assert delays_of(experiment, "release") == Delays(release=0.11)
     both = delays_of(experiment)
-    assert both.command == pytest.approx(0.022 + 0.033)
+    assert both.command == pytest.approx(0.022 + 0.008 + 0.033)
     instant = replace(experiment.vehicle, motor=replace(experiment.vehicle.motor, kind="instant"))
-    assert delays_of(replace(experiment, vehicle=instant)).command == pytest.approx(0.022)
+    assert delays_of(replace(experiment, vehicle=instant)).command == pytest.approx(0.022 + 0.008)
     with pytest.raises(ConfigError, match="did you mean 'delay'"):
         delays_of(experiment, "delays")
 

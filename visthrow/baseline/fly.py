@@ -173,7 +173,7 @@ COMPENSATIONS = ("none", "release", "delay", "both")
 
 
 def delays_of(experiment: Experiment, compensation: str = "both") -> Delays:
-    """Known delays of a plant: mean age of measurements, command queue and motors, lag of the release.
+    """Known delays of a plant: mean age of measurements; command queue, set-point filter and motors; release.
 
     Raises:
         ConfigError: no compensation of that name.
@@ -182,7 +182,9 @@ def delays_of(experiment: Experiment, compensation: str = "both") -> Delays:
         raise ConfigError(f"no compensation '{compensation}'; {suggest(compensation, COMPENSATIONS)}")
     vehicle, told = experiment.vehicle, experiment.task.observation.latency
     motors = vehicle.motor.time_constant if vehicle.motor.kind == "first_order" else 0.0
-    across = (float(np.mean(told)), vehicle.queue.delay + motors) if compensation in ("delay", "both") else (0.0, 0.0)
+    setpoint = vehicle.controller.setpoint_time_constant if vehicle.controller.kind == "betaflight" else 0.0
+    effect = vehicle.queue.delay + setpoint + motors
+    across = (float(np.mean(told)), effect) if compensation in ("delay", "both") else (0.0, 0.0)
     return Delays(*across, experiment.release.lag if compensation in ("release", "both") else 0.0)
 
 

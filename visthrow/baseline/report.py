@@ -105,11 +105,11 @@ def draw(path: str | Path, swept: Sequence[dict], policies: Sequence[dict], thro
         if not len(points):
             continue
         front = points[pareto(points)]
-        label = f"TO+MPC, {SHORT.get(plant, plant)}"
+        label = f"TO+MPC, {SHORT.get(plant, plant)}" + ("" if plant == "pendulum" else ",\nall delays made up for")
         axis.plot(*points.T, style.MARKERS[i], color=style.COLOURS[i], ms=5, alpha=0.4, mew=0)
         axis.plot(*front.T, style.MARKERS[i] + "-", color=style.COLOURS[i], ms=5.5, lw=1.4, label=label)
     paper = np.array([(row[4], row[3]) for row in PAPER_FRONT])
-    axis.plot(*paper.T, "x--", color=style.QUIET, ms=6, lw=1.2, label="TO+MPC, the paper's pendulum")
+    axis.plot(*paper.T, "x--", color=style.QUIET, ms=6, lw=1.2, label="TO+MPC, the paper's own pendulum")
     for i, row in enumerate(policies):
         colour = style.COLOURS[3 + i % 3]
         label = f"learnt {row['policy']} policy, {SHORT.get(row['plant'], row['plant'])}"

@@ -11,7 +11,7 @@ vector and its turning: without them short plans flip the vehicle in ways that n
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -28,8 +28,8 @@ SMOOTH = 6
 END = 5
 """Derivatives 0 to 4 are given at the release."""
 
-SAMPLES = 20
-"""Of a segment, for penalties and energy."""
+SAMPLES, DENSE = 30, 300
+"""Of a segment, for penalties and energy: while improving a path, and to judge it, as thrust has narrow peaks."""
 
 
 class PlanError(VisthrowError):
@@ -43,8 +43,11 @@ EVEN = 0.02
 """Weight of the squared logarithm of a segment's share over the first one's, relative to the duration's [s]: without it
 the segments grow so uneven that the path rings."""
 
-STIFF = 5.0
-"""Factor on the excess of the thrust's vertical part: past zero the vehicle turns over and the path is lost."""
+MOST_UNEVEN = float(np.log(2.0))
+"""That logarithm past which the penalty acts: a segment of a few milliseconds would slip between the samples."""
+
+STIFF = 6.0
+"""Factor on what the thrust's vertical part lacks [1/N]: past zero the vehicle turns over and the path is lost."""
 
 DIFFERENCE = 1e-6
 """Step of the objective's slopes, in m and in logarithms of time."""
@@ -71,7 +74,12 @@ class PlanParams:
     least_lift: float = 0.8  # vertical part of the thrust [N]
     least_pull: float = 0.4  # vertical part of the cable's pull, in the payload's weights [-]
     max_turn: float = 9.0  # of the thrust's direction [rad/s]
-    penalty: float = 1e5  # of squared excess, integrated over time; relative to the bound, or in m [1/s]
+    penalty: float = 1e5  # of squared excess, integrated over time; relative to the bound, or in m and weights [1/s]
+
+
+def payload_bounds_only(params: PlanParams) -> PlanParams:
+    """The same without our bounds on the thrust: the paper's plan, which a vehicle need not be able to follow."""
+    return replace(params, max_thrust=np.inf, least_lift=-np.inf, max_turn=np.inf)
 
 
 @dataclass(frozen=True)
@@ -175,12 +183,14 @@ def _unit_rows() -> tuple[np.ndarray, np.ndarray]:
     return _rows(np.array([1.0]), SMOOTH)[0], _rows(np.array([0.0]), SMOOTH)[0]
 
 
-@lru_cache(maxsize=1)
-def _sample_rows() -> np.ndarray:
-    return _rows((np.arange(SAMPLES) + 0.5) / SAMPLES, SMOOTH)
+@lru_cache(maxsize=4)
+def _sample_rows(samples: int) -> np.ndarray:
+    return _rows((np.arange(samples) + 0.5) / samples, SMOOTH)
 
 
-def residuals(unit: np.ndarray, times: np.ndarray, params: PlanParams, model: Pendulum) -> dict[str, np.ndarray]:
+def residuals(
+    unit: np.ndarray, times: np.ndarray, params: PlanParams, model: Pendulum, samples: int = SAMPLES
+) -> dict[str, np.ndarray]:
     """Objective of B planar paths (along the throw, up) as sums of squares.
 
     Args:
@@ -188,19 +198,20 @@ def residuals(unit: np.ndarray, times: np.ndarray, params: PlanParams, model: Pe
         times: of the segments [s], shape (B, 4).
         params: weights and bounds.
         model: whose thrust is bounded.
+        samples: of each segment.
 
     Returns:
         ``duration``, ``energy``, ``penalty``: arrays (B, ...) whose squares add up to each part of the objective.
     """
     count = len(times)
-    path = np.einsum("tdk,bskc->dbstc", _sample_rows(), unit)
+    path = np.einsum("tdk,bskc->dbstc", _sample_rows(samples), unit)
     path /= (times[None] ** np.arange(SMOOTH)[:, None, None])[:, :, :, None, None]
     path = path.reshape(SMOOTH, -1, 2)
-    weight = np.sqrt(np.repeat(times / SAMPLES, SAMPLES, axis=1)).reshape(-1)
+    weight = np.sqrt(np.repeat(times / samples, samples, axis=1)).reshape(-1)
     force, change = _thrust(model, path, np.array([0.0, GRAVITY]))[:2]
     size = np.linalg.norm(force, axis=1)
     turn = np.abs(force[:, 0] * change[:, 1] - force[:, 1] * change[:, 0]) / np.maximum(size, 0.05) ** 2
-    begin = np.repeat(unit[:, 0, 0, 0], SEGMENTS * SAMPLES)
+    begin = np.repeat(unit[:, 0, 0, 0], SEGMENTS * samples)
     excess = np.array([
         np.linalg.norm(path[1], axis=1) / params.max_speed - 1.0,
         np.linalg.norm(path[2], axis=1) / params.max_acceleration - 1.0,
@@ -208,8 +219,8 @@ def residuals(unit: np.ndarray, times: np.ndarray, params: PlanParams, model: Pe
         params.floor - path[0, :, 1],
         begin - path[0, :, 0] - params.backward,
         size / params.max_thrust - 1.0,
-        STIFF * (1.0 - force[:, 1] / params.least_lift),
-        1.0 - (1.0 + path[2, :, 1] / GRAVITY) / params.least_pull,
+        STIFF * (params.least_lift - force[:, 1]),
+        (params.least_pull - 1.0 - path[2, :, 1] / GRAVITY),
         np.minimum(turn / params.max_turn - 1.0, 20.0),
     ])  # fmt: skip
     penalty = np.sqrt(params.penalty) * weight * np.maximum(excess, 0.0)
@@ -260,10 +271,12 @@ def optimise(
         times = total * ratio / ratio.sum(1, keepdims=True)
         return _coefficients(begin, middle, end, velocity, times), times
 
-    def objective(x: np.ndarray, total: float) -> np.ndarray:
-        parts = residuals(*build(x, total), params, model).values()
-        uneven = np.sqrt(EVEN * params.duration) * x[:, -(SEGMENTS - 1) :]
-        return np.concatenate([*parts, uneven], axis=1) / np.sqrt(params.duration)
+    def objective(x: np.ndarray, total: float, samples: int = SAMPLES) -> np.ndarray:
+        parts = residuals(*build(x, total), params, model, samples).values()
+        uneven = x[:, -(SEGMENTS - 1) :]
+        limited = np.sqrt(params.penalty) * np.maximum(np.abs(uneven) - MOST_UNEVEN, 0.0)
+        even = np.sqrt(EVEN * params.duration) * uneven
+        return np.concatenate([*parts, even, limited], axis=1) / np.sqrt(params.duration)
 
     value, total, x = _search(objective, tick)
     if not np.isfinite(value):
@@ -281,12 +294,13 @@ def _search(objective: Callable, tick: tuple[float, float]) -> tuple[float, floa
         Objective, duration and variables of the best.
     """
 
-    def improve(x: np.ndarray, total: float):
+    def improve(x: np.ndarray, total: float) -> tuple[np.ndarray, float]:
         def slope(x: np.ndarray) -> np.ndarray:
             near = objective(x + DIFFERENCE * np.vstack([0.0 * x, np.eye(len(x))]), total)
             return (near[1:] - near[0]).T / DIFFERENCE
 
-        return least_squares(lambda x: objective(x[None], total)[0], x, slope, method="lm", max_nfev=EVALUATIONS)
+        found = least_squares(lambda x: objective(x[None], total)[0], x, slope, method="lm", max_nfev=EVALUATIONS)
+        return found.x, float((objective(found.x[None], total, DENSE) ** 2).sum())
 
     blank = np.zeros(3 * (SEGMENTS - 1))
     tried = (_descend(improve, blank, np.arange(top, SHORTEST, -COARSE)) for top in LONGEST)
@@ -304,11 +318,10 @@ def _descend(improve, x: np.ndarray, totals: np.ndarray) -> tuple[float, float, 
     """
     best = (np.inf, float(totals[0]), x)
     for total in totals:
-        found = improve(x, float(total))
-        x = found.x
-        if found.cost < best[0]:
-            best = (float(found.cost), float(total), x)
-        elif found.cost > HOPELESS * best[0]:
+        x, value = improve(x, float(total))
+        if value < best[0]:
+            best = (value, float(total), x)
+        elif value > HOPELESS * best[0]:
             break
     return best
 
