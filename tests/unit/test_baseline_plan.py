@@ -127,6 +127,15 @@ def test_a_heavier_duration_weight_makes_shorter_plans(monkeypatch):
     assert durations[1] < durations[0] - 0.2
 
 
+def test_with_bounds_on_the_payload_alone_plans_outrun_the_vehicle(plan, monkeypatch):
+    monkeypatch.setattr(sp, "LONGEST", (1.4,))  # one start of the optimisation instead of five
+    free = plan_throw(MODEL, 2.0, 1.13, 2.2, sp.payload_bounds_only(plan.params), 0.04, lag=0.11)
+    assert free.path.duration < plan.path.duration - 0.05
+    turns = [np.abs(one.reference(0.0, 0.005, 130)[1][:, 1:]).max() for one in (plan, free)]
+    assert turns[0] < 1.2 * plan.params.max_turn
+    assert turns[1] > 1.5 * plan.params.max_turn
+
+
 def test_bad_plans_are_refused():
     with pytest.raises(PlanError, match="horizontal"):
         sp.optimise(MODEL, np.zeros(3), np.ones(3), np.array([0.0, 0.0, 1.0]), PlanParams())

@@ -37,6 +37,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--policies", nargs="*", default=["state", "vision"], metavar="POLICY", help="points on the front"
     )
+    parser.add_argument(
+        "--payload-bounds",
+        action="store_true",
+        help="bound the payload's path alone, as the paper does, not the vehicle's thrust: plans that tracking fails on",
+    )
     parser.add_argument("--no-sweep", action="store_true", help="tables by target only")
     parser.add_argument("--quick", action="store_true", help="two throws, one speed and two weights, own model alone")
     parser.add_argument("--seed", type=int, default=0, help="of starts and noise (default: 0)")
@@ -51,6 +56,7 @@ def run(args: argparse.Namespace) -> int:
     """Plan, throw, print, write."""
     from visthrow import compare, config
     from visthrow.baseline import front
+    from visthrow.baseline.spline import PlanParams, payload_bounds_only
     from visthrow.errors import suggest
     from visthrow.plants import PLANTS
     from visthrow.task import Experiment
@@ -62,7 +68,8 @@ def run(args: argparse.Namespace) -> int:
     compare.writable(Path(args.out))
     experiment = config.load(Experiment, config.find("train", args.config), args.overrides)
     plants = [] if args.quick else args.plants
-    study = front.Study(experiment, min(args.throws, 2) if args.quick else args.throws, args.seed)
+    params = payload_bounds_only(PlanParams()) if args.payload_bounds else PlanParams()
+    study = front.Study(experiment, min(args.throws, 2) if args.quick else args.throws, args.seed, params)
     targets = front.by_target(study, args.targets, plants, front.COMPENSATIONS, _say, _releases(args))
     swept, policies = [], []
     if not args.no_sweep:
@@ -105,10 +112,12 @@ def _write(args: argparse.Namespace, throws: int, targets: list[dict], swept: li
     from visthrow.storage import atomic_write, write_json
 
     sums = front.summary(swept, policies) if swept else {}
-    text, folder = report.markdown(targets, swept, policies, sums, throws), Path(args.out)
+    bounds = "payload" if args.payload_bounds else "payload and thrust"
+    text, folder = report.markdown(targets, swept, policies, sums, throws, bounds), Path(args.out)
     print(text)
     value = {
         "targets": targets, "sweep": swept, "policies": policies, "front": sums, "throws": throws, "seed": args.seed,
+        "bounds": bounds,
         "paper": {"table": {str(k): v for k, v in front.PAPER_TABLE.items()}, "front": front.PAPER_FRONT},
         "provenance": provenance.collect(),
     }  # fmt: skip
@@ -117,7 +126,7 @@ def _write(args: argparse.Namespace, throws: int, targets: list[dict], swept: li
     write_json(folder / "baseline.json", value)
     written = ["baseline.md", "baseline.csv", "baseline.json"]
     if swept:
-        report.draw(folder / "baseline.png", swept, policies, throws)
+        report.draw(folder / "baseline.png", swept, policies, throws, bounds)
         written.append("baseline.png")
     for name in written:
         print(folder / name)

@@ -48,9 +48,16 @@ _HEAD = ("plant", "made up for", "v [m/s]", "w_t", "rho", "error [m]", "duration
          "landed", "step p50 / p99 [ms]")  # fmt: skip
 
 
-def markdown(targets: Sequence[dict], swept: Sequence[dict], policies: Sequence[dict], sums: dict, throws: int) -> str:
-    """All tables."""
-    parts = [f"# Trajectory optimisation and MPC: {throws} throws a row", NOTE, "## By target"]
+def markdown(
+    targets: Sequence[dict],
+    swept: Sequence[dict],
+    policies: Sequence[dict],
+    sums: dict,
+    throws: int,
+    bounds: str = "payload and thrust",
+) -> str:
+    """All tables; ``bounds`` says what the plans bound."""
+    parts = [f"# Trajectory optimisation and MPC: {throws} throws a row, bounds on {bounds}", NOTE, "## By target"]
     rows = []
     for row in targets:
         paper = PAPER_TABLE.get(row["target"]) if row["plant"] == "pendulum" else None
@@ -90,7 +97,9 @@ def csv_text(rows: Sequence[dict]) -> str:
     return text.getvalue()
 
 
-def draw(path: str | Path, swept: Sequence[dict], policies: Sequence[dict], throws: int) -> None:
+def draw(
+    path: str | Path, swept: Sequence[dict], policies: Sequence[dict], throws: int, bounds: str = "payload and thrust"
+) -> None:
     """Draw duration against landing error of the sweep on each plant, with fronts, learnt policies and the paper's.
 
     Raises:
@@ -135,7 +144,10 @@ def draw(path: str | Path, swept: Sequence[dict], policies: Sequence[dict], thro
     axis.minorticks_off()
     axis.set(xlabel="from start to landing [s]", ylabel="mean landing error [m]")
     axis.grid(True)
-    axis.set_title(f"Agility against accuracy at 2.0 m: {throws} throws a point; lines join the best", loc="left")
+    axis.set_title(
+        f"Agility against accuracy at 2.0 m: {throws} throws a point, plans bound {bounds};\nlines join the best",
+        loc="left",
+    )
     axis.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=8.5)
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png")
