@@ -51,6 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     fake.add_argument("--plant", default="visthrow.wire_plant:make", metavar="MODULE:FUNCTION", help="that makes it")
     fake.add_argument("--seed", type=int, default=0, help="of start, noise and loss")
     fake.add_argument("--seconds", type=float, default=60.0, help="end after this time")
+    fake.add_argument("--after", type=float, default=10.0, help="end this long after the payload's landing [s]")
     fake.add_argument("--speed", type=float, default=1.0, help="of the clock")
     fake.add_argument(
         "--answer", default="accepted", help="to the release: accepted, in-progress, denied, silent, stuck"
@@ -125,7 +126,7 @@ def _run(args: argparse.Namespace) -> int:
     source.close()
     recorder.close(summary)
     print(story(summary, folder))
-    return 0 if summary["state"] != "abort" and not summary["errors"] else 1
+    return 1 if summary["aborted"] or summary["errors"] else 0
 
 
 def warm_up(runner: Any) -> None:
@@ -164,7 +165,7 @@ def _tell(decision: Any) -> None:
 
 def story(summary: dict[str, Any], folder: Path) -> str:
     """A run in a few lines."""
-    lines = [f"ended in {summary['state']}: {summary['reason']}"]
+    lines = [f"{'ABORTED' if summary['aborted'] else 'ended in ' + summary['state']}: {summary['reason']}"]
     lines.append(f"throws {summary['throws']}, released {summary['latches']}, cancelled {summary['cancelled']}")
     if summary["stuck"]:
         lines.append(f"{summary['stuck']} released payload still hung on the vehicle: look at the mechanism")
@@ -246,6 +247,8 @@ def _fake(args: argparse.Namespace) -> int:
     link = Link(open_port(check_device(args.device)), *VEHICLE_ID)
     fake = FakeAutopilot(plant, link, MocapParams(), args.seed, args.answer)
     print("the fake autopilot flies", file=sys.stderr, flush=True)
-    report = serve(fake, MonotonicClock(args.speed), args.seconds, None if args.out is None else Path(args.out))
+    report = serve(
+        fake, MonotonicClock(args.speed), args.seconds, None if args.out is None else Path(args.out), args.after
+    )
     print(json.dumps(report, indent=2))
     return 0

@@ -221,8 +221,10 @@ class FakeAutopilot:
         return {**self.plant.landing, **counts, "end_w": self.plant.state["pos_w"].tolist(), "time": self.plant.time}
 
 
-def serve(fake: FakeAutopilot, clock: Clock, most: float, out: Path | None = None) -> dict[str, Any]:
-    """Fly in real time until some seconds after the landing, or for ``most`` seconds.
+def serve(
+    fake: FakeAutopilot, clock: Clock, most: float, out: Path | None = None, after: float = AFTER_LANDING
+) -> dict[str, Any]:  # fmt: skip
+    """Fly in real time until ``after`` seconds after the payload's landing, or for ``most`` seconds.
 
     Returns:
         The report, with the number of periods that took longer than real time has.
@@ -235,7 +237,7 @@ def serve(fake: FakeAutopilot, clock: Clock, most: float, out: Path | None = Non
         clock.sleep_until(due)
         fake.emit()
         landed = fake.plant.landing["landing_time"]
-        if landed is not None and fake.plant.time > landed + AFTER_LANDING:
+        if landed is not None and fake.plant.time > landed + after:
             break
     report = {**fake.report(), "late_periods": late}
     if out is not None:

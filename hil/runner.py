@@ -116,7 +116,6 @@ class Runner:
         self._latency = contract["observation"]["latency"]
         self._latch: float | None = None
         self._hold_w: Vector = params.home_w
-        self._flying = False  # whether this run has ever commanded the vehicle
         self._begun = 0.0
         self._flight: Flight | None = None
         self.landings: list[Landing] = []
@@ -140,7 +139,7 @@ class Runner:
                 self.errors.append(traceback.format_exc())
             self.machine.step(now, Inputs(3, 3, failure=f"{type(error).__name__}: {error}"))
             self.backend.stop_release()
-            if self._flying:
+            if self.machine.flown:
                 self.backend.abort(now)
             return Decision(now, self.machine.state.value, self.machine.reason, note="exception")
 
@@ -166,8 +165,7 @@ class Runner:
             self._entered(now, before, state, vehicle)
         decision = Decision(now, state.value, self.machine.reason)
         wanted = self._command(now, state, vehicle, payload, goal_w, decision)
-        self._flying |= state in FLYING
-        if state is State.ABORT and not (status.connected and self._flying):
+        if state is State.ABORT and not (status.connected and self.machine.flown):
             wanted = None  # it has taken over, or hears nothing, or was never ours
         if self.params.observe and decision.action is None and None not in (vehicle, payload, goal_w) and vehicle.quat:
             self._show(vehicle, payload, goal_w, decision)
@@ -185,7 +183,7 @@ class Runner:
             self._latch, self.latches = now, self.latches + 1
             self._flight = Flight(goal_w, self._begun, now, self.params.landing_height)
             self.backend.release(now + self._wait)
-        if state is State.ABORT and self._flying:
+        if state is State.ABORT and self.machine.flown:
             self.backend.abort(now)
         return decision
 
@@ -327,6 +325,7 @@ class Runner:
         return {
             "state": self.machine.state.value,
             "reason": self.machine.reason,
+            "aborted": self.machine.aborted,
             "throws": self.machine.throws,
             "cancelled": self.machine.cancelled,
             "latches": self.latches,

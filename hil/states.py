@@ -82,6 +82,7 @@ class Machine:
     Attributes:
         state: now. reason: of the last change. since: time of it [s].
         throws: throws begun. cancelled: throws that ended without a release.
+        flown: whether this run has ever commanded the vehicle. aborted: whether it was ended by an abort.
     """
 
     def __init__(self, params: StateParams, throws: int) -> None:
@@ -90,6 +91,7 @@ class Machine:
         self.state, self.reason = State.IDLE, "start"
         self.since: float | None = None
         self.throws = self.cancelled = 0
+        self.flown = self.aborted = False
         self._held: float | None = None  # since when what must last has lasted
 
     def step(self, now: float, seen: Inputs) -> State:
@@ -98,7 +100,8 @@ class Machine:
             self.since = now
         urgent = self._urgent(seen)
         if self.state is State.ABORT:
-            if now - self.since > self.params.abort:
+            # What was never ours needs no descent.
+            if not self.flown or now - self.since > self.params.abort:
                 self._go(now, State.DONE, self.reason)
         elif self.state is not State.DONE:
             if urgent is not None:
@@ -127,6 +130,8 @@ class Machine:
             self.cancelled += 1
         self.state, self.reason, self.since, self._held = state, reason, now, None
         self.throws += state is State.THROW
+        self.flown |= state in FLYING
+        self.aborted |= state is State.ABORT
 
     def _lasted(self, now: float, holds: bool, time: float) -> bool:
         """Whether a condition has now held for a time."""

@@ -67,7 +67,7 @@ def test_a_throw_over_udp_against_a_process_of_its_own(tmp_path):
     # The fake goes away in mid flight, which ends the run: half a second later it is done.
     command = [sys.executable, "-m", "visthrow.cli", "hil", "fake", "--device", f"udpout:{device}"]
     fake = subprocess.Popen(
-        [*command, "--seconds", "5", "--out", str(tmp_path / "fake.json")], stdout=subprocess.DEVNULL
+        [*command, "--seconds", "20", "--after", "0.2", "--out", str(tmp_path / "fake.json")], stdout=subprocess.DEVNULL
     )
     try:
         summary = fly(runner, source, clock, AutoOperator(), recorder)
