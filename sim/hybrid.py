@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import warp as wp
 
+from sim import runtime  # noqa: F401  starts Warp
 from sim import state as st
 from sim.checks import check_numerics, check_release
 from sim.params import GRAVITY, PlantParams, RandomizationParams, RopeParams, VehicleParams

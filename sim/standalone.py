@@ -8,6 +8,7 @@ import math
 import numpy as np
 import warp as wp
 
+from sim import runtime  # noqa: F401  starts Warp
 from sim import state as st
 from sim.params import GRAVITY, VehicleParams
 from sim.quadrotor.queue import push, queue_depth, split_delay

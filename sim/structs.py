@@ -13,7 +13,6 @@ import numpy as np
 import warp as wp
 
 from sim import params as P
-from sim import runtime  # noqa: F401  starts Warp
 from sim.checks import check_rope, check_vehicle
 
 
