@@ -1,6 +1,7 @@
 """``visthrow hil``: poses of a motion-capture system in, commands of a trained policy out."""
 
 import argparse
+import dataclasses
 import json
 import select
 import signal
@@ -13,7 +14,7 @@ ACTIONS = {
     "run": "fly, or run dry, by a config of configs/hil",
     "replay": "run a recorded run again and compare every action, bit for bit",
     "check": "look at the poses that come, and at what speaks against a throw",
-    "record": "record the poses that come, without a policy's say",
+    "record": "record the poses that come and what the policy would make of them; never arms, sends nothing",
     "fake": "a fake autopilot with the simulator's vehicle, to throw over the wire",
 }
 
@@ -41,9 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         subs[name].add_argument(
             "--out", default=None, metavar="FOLDER", help="of the run (default: a new one in runs/hil)"
         )
-        subs[name].add_argument(
-            "--auto-arm", action="store_true", help="arm whenever ready; for simulated vehicles only"
-        )
+    subs["run"].add_argument("--auto-arm", action="store_true", help="arm whenever ready; for simulated vehicles only")
     subs["replay"].add_argument("folder", metavar="FOLDER", help="of a run")
     fake = subs["fake"]
     fake.add_argument("--device", default="udpout:127.0.0.1:14560", help="the runner's port")
@@ -110,17 +109,19 @@ def _run(args: argparse.Namespace) -> int:
     from visthrow.policy import Policy, find_policy
 
     params = _params(args)
+    if args.action == "record":
+        params = dataclasses.replace(params, backend="dry-run", observe=True)
     folder = Path(args.out or f"runs/hil/{time.strftime('%Y%m%d-%H%M%S')}")
     policy = Policy.load(find_policy(params.policy))
     source, link, recorded = _source(params, folder, args.speed)
     clock = ManualClock(source.start) if recorded else MonotonicClock(args.speed)
     backend: Any = DryRun()
-    if params.backend == "ardupilot" and args.action == "run":
+    if params.backend == "ardupilot":
         backend = ArduPilot(link, params.ardupilot)
     runner = Runner(params, policy, backend, params.ardupilot.mechanism_lag if link is not None else 0.0)
     warm_up(runner)
     recorder = Recorder(folder, params)
-    operator = Keyboard(args.auto_arm and args.action == "run")
+    operator = Keyboard(args.action == "run" and args.auto_arm)
     print(f"ready after {time.monotonic() - started:.2f} s; waiting for poses", file=sys.stderr, flush=True)
     summary = fly(runner, source, clock, operator, recorder, args.seconds or float("inf"), _tell)
     source.close()

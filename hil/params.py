@@ -54,7 +54,9 @@ class HilParams:
     policy: str  # name of a shipped policy, or a file
     camera: CameraParams
     backend: Literal["dry-run", "ardupilot"]
-    observe: bool  # show the policy every tick, not only those of a throw; what it says then is recorded, never sent
+    # Show the policy every tick, not only those of a throw; what it says then is recorded, never sent. Such a run waits
+    # for poses and checks for ever.
+    observe: bool
     throws: int  # after which the run lands
     goal_w: tuple[float, float, float]  # target where no body is the goal [m]
     home_w: tuple[float, float, float]  # hover point [m]

@@ -111,7 +111,7 @@ class Runner:
         self.hang = -rope["mount"][2] + rope["length"] + rope["payload_offset"]
         self.guard = Guard(params.guard, float(action["max_thrust"]), tuple(map(float, action["max_rate"])))
         self.tracks = {name: Track(frames, params.gate, params.estimate) for name, frames in params.frames.items()}
-        self.machine = Machine(params.states, params.throws)
+        self.machine = Machine(params.states, params.throws, params.observe)
         self._hover = HoverController(HoverParams(max_thrust=float(action["max_thrust"])), self.pilot.period)
         self._latency = contract["observation"]["latency"]
         self._latch: float | None = None

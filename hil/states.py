@@ -85,9 +85,15 @@ class Machine:
         flown: whether this run has ever commanded the vehicle. aborted: whether it was ended by an abort.
     """
 
-    def __init__(self, params: StateParams, throws: int) -> None:
-        """Begin in idle; ``throws`` is the number after which the run lands."""
-        self.params, self.most = params, throws
+    def __init__(self, params: StateParams, throws: int, patient: bool = False) -> None:
+        """Begin in idle.
+
+        Args:
+            params: time-outs.
+            throws: number after which the run lands.
+            patient: whether idle and check may last for ever, as where poses are only looked at.
+        """
+        self.params, self.most, self.patient = params, throws, patient
         self.state, self.reason = State.IDLE, "start"
         self.since: float | None = None
         self.throws = self.cancelled = 0
@@ -148,7 +154,7 @@ class Machine:
     def _idle(self, now: float, seen: Inputs) -> None:
         if max(seen.vehicle, seen.payload) < HOLD and seen.connected:
             self._go(now, State.CHECK, "poses and autopilot are there")
-        elif self._late(now):
+        elif self._late(now) and not self.patient:
             missing = [n for n, bad in (("vehicle", seen.vehicle >= HOLD), ("payload", seen.payload >= HOLD)) if bad]
             missing += [] if seen.connected else ["autopilot ready"]
             self._go(now, State.ABORT, f"no {', no '.join(missing)} within {self.params.idle:g} s")
@@ -157,7 +163,7 @@ class Machine:
         good = not seen.failed_checks and max(seen.vehicle, seen.payload) < HOLD and seen.connected
         if self._lasted(now, good, self.params.check_hold):
             self._go(now, State.READY, "checks passed")
-        elif self._late(now):
+        elif self._late(now) and not self.patient:
             failed = "; ".join(seen.failed_checks) or "poses or autopilot come and go"
             self._go(now, State.ABORT, f"checks: {failed}")
 

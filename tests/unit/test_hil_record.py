@@ -182,8 +182,12 @@ def test_the_policy_on_a_csv_file(tmp_path, monkeypatch, capsys):
     out = capsys.readouterr().out
     assert "PASS  all checks" in out
     assert "vehicle: 99 poses/s" in out
-    assert main(["hil", "check", "--config", "mine.toml", "--set", "check.heading_deg=90.0"]) == 1
+    wrong = ["--config", "mine.toml", "--set", "check.heading_deg=90.0"]
+    assert main(["hil", "check", *wrong]) == 1
     assert "FAIL  heading" in capsys.readouterr().out
+    assert main(["hil", "record", *wrong, "--set", "states.check=0.5", "--out", "looked"]) == 0
+    assert "throws 0" in capsys.readouterr().out, "recorded to the end although the checks fail"
+    assert len(load_run("looked")[2]) == len(ticks)
     assert main(["hil", "run", "--config", "mine.toml", "--out", "run"]) == 2
     assert "holds a run already" in capsys.readouterr().err
 
