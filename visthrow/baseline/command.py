@@ -40,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--payload-bounds",
         action="store_true",
-        help="bound the payload's path alone, as the paper does, not the vehicle's thrust: plans that tracking fails on",
+        help="bound the payload's path alone, as the paper does, not the vehicle's thrust: plans that tracking may fail on",
     )
     parser.add_argument("--no-sweep", action="store_true", help="tables by target only")
     parser.add_argument("--quick", action="store_true", help="two throws, one speed and two weights, own model alone")
