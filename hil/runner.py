@@ -176,6 +176,7 @@ class Runner:
             if decision.command is None:
                 self.machine.step(now, Inputs(3, 3, failure=f"command {wanted} is not finite"))
                 decision.state, decision.reason = self.machine.state.value, self.machine.reason
+                decision.release = False
                 self.backend.stop_release()
             else:
                 self.backend.send(decision.command, now)

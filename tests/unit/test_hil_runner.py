@@ -240,11 +240,12 @@ def test_a_policy_that_puts_out_no_numbers(value):
 
     def broken(*args):
         out = act(*args)
-        return dataclasses.replace(out, command=np.full((1, 4), value, np.float32))
+        return dataclasses.replace(out, command=np.full((1, 4), value, np.float32), release=np.array([True]))
 
     decisions = fly(pilot, 5.0, watch=lambda t, d: setattr(pilot.pilot, "act", broken) if t > START else None)
     safe(pilot, decisions)
     assert "is not finite" in changes(decisions)[-1][1]
+    assert not pilot.backend.release_times, "what it says of the release counts for nothing either"
     assert when(decisions, "abort") == pytest.approx(START, abs=2 * TICK)
     assert not pilot.errors
 
