@@ -116,6 +116,7 @@ class Runner:
         self._latency = contract["observation"]["latency"]
         self._latch: float | None = None
         self._hold_w: Vector = params.home_w
+        self._acted = State.IDLE
         self._begun = 0.0
         self._flight: Flight | None = None
         self.landings: list[Landing] = []
@@ -159,8 +160,9 @@ class Runner:
         bodies = {name: self._state(track, now) for name, track in self.tracks.items()}
         vehicle, payload = bodies[VEHICLE], bodies[PAYLOAD]
         goal_w = self._goal(bodies)
-        before = self.machine.state
         state = self.machine.step(now, self._inputs(now, vehicle, payload, goal_w, status, words, recording))
+        # The last tick may itself have ended in another state than it acted in: a command refused, an exception.
+        before, self._acted = self._acted, state
         if state is not before:
             self._entered(now, before, state, vehicle)
         decision = Decision(now, state.value, self.machine.reason)

@@ -250,6 +250,27 @@ def test_a_policy_that_puts_out_no_numbers(value):
     assert not pilot.errors
 
 
+def test_an_abort_in_mid_throw_holds_the_place_where_it_happened():
+    """Pitching slowly, the vehicle has gone some way ahead when the policy's numbers end."""
+    pilot = runner((HOVER, 0.0, 0.02, 0.0, -1.0))
+    act = pilot.pilot.act
+
+    def broken(*args):
+        return dataclasses.replace(act(*args), command=np.full((1, 4), math.nan, np.float32))
+
+    places = []
+
+    def watch(time, decision):
+        if time > START:
+            pilot.pilot.act = broken
+        if decision.state == "abort":
+            places.append((pilot.tracks["vehicle"].state(time).pos[0], pilot._hold_w[0]))
+
+    fly(pilot, START + 0.2, watch=watch)
+    assert places[0][0] > 0.15
+    assert places[1][1] == pytest.approx(places[1][0], abs=0.02)
+
+
 def test_a_policy_that_saturates_stays_within_its_limits_and_the_fence_ends_it():
     _, decisions = thrown(action=(1.0, 1.0, -1.0, 1.0, -1.0), seconds=6.0)
     assert changes(decisions)[-1][0] == "abort"
