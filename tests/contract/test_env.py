@@ -47,7 +47,8 @@ def test_groups_shapes_and_fresh_tensors(env):
     kept = first["actor"].clone()
     second, reward, done, _ = env.step(torch.zeros(16, 5))
     assert set(first.keys()) == {"actor", "critic"}
-    assert second["actor"].shape == (16, 35) and second["critic"].shape == (16, 42)
+    assert second["actor"].shape == (16, 35)
+    assert second["critic"].shape == (16, 42)
     assert reward.shape == done.shape == (16,)
     assert first["actor"].data_ptr() != second["actor"].data_ptr()
     torch.testing.assert_close(first["actor"], kept, rtol=0, atol=0)

@@ -104,7 +104,8 @@ def test_full_disk_says_so_and_loses_nothing(whole, tmp_path, monkeypatch, capsy
     monkeypatch.setattr(storage.os, "fsync", full)
     assert train(folder) == 2
     message = capsys.readouterr().err
-    assert "No space left" in message and "iteration 2 is whole" in message
+    assert "No space left" in message
+    assert "iteration 2 is whole" in message
     assert not [p for p in folder.iterdir() if p.name.endswith(".tmp")]
     monkeypatch.setattr(storage.os, "fsync", fsync)
     assert train(folder, "--resume") == 0
