@@ -77,7 +77,21 @@ class Port(Protocol):
         """Give the port back."""
 
 
-class UdpPort:
+class _SocketPort:
+    """What both kinds of socket share."""
+
+    _socket: socket.socket
+
+    def fileno(self) -> int:
+        """See `Port`."""
+        return self._socket.fileno()
+
+    def close(self) -> None:
+        """See `Port`."""
+        self._socket.close()
+
+
+class UdpPort(_SocketPort):
     """A UDP socket; one that listens answers whoever spoke to it first, and hears nobody else from then on."""
 
     whole = True
@@ -124,16 +138,8 @@ class UdpPort:
         except OSError:
             return False
 
-    def fileno(self) -> int:
-        """See `Port`."""
-        return self._socket.fileno()
 
-    def close(self) -> None:
-        """See `Port`."""
-        self._socket.close()
-
-
-class TcpPort:
+class TcpPort(_SocketPort):
     """A TCP connection, opened within two seconds or not at all."""
 
     whole = False
@@ -164,14 +170,6 @@ class TcpPort:
             return self._socket.send(data) == len(data)
         except OSError:
             return False
-
-    def fileno(self) -> int:
-        """See `Port`."""
-        return self._socket.fileno()
-
-    def close(self) -> None:
-        """See `Port`."""
-        self._socket.close()
 
 
 class SerialPort:

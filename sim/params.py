@@ -6,7 +6,7 @@ independently, in float64. Every value below is documented as ``[unit]``; vector
 y left, z up) with the origin at the vehicle's centre of mass unless said otherwise.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal
 
 GRAVITY = 9.81
@@ -228,7 +228,7 @@ class PlantParams:
     vehicle: VehicleParams
     rope: RopeParams
     release: ReleaseParams
-    sim: SimParams = field(default_factory=lambda: SimParams(0.02, 0.002, 1.3, 0.2))
+    sim: SimParams
 
 
 @dataclass(frozen=True)

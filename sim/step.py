@@ -41,6 +41,7 @@ def build_step(t: Types, params: PlantParams, direct: bool = False) -> StepKerne
     real, vec3, vec4 = t.real, t.vec3, t.vec4
     Vehicle, Rope, Release, QuadState = t.Vehicle, t.Rope, t.Release, t.QuadState
     L = params.rope.segments
+    nonfinite, fallback, collision, in_rotor = st.NONFINITE, st.FALLBACK, st.COLLISION, st.ROPE_IN_ROTOR
     State = st.array_struct(t, "State", st.STATE_FIELDS)
     Output = st.array_struct(t, "Output", {k: (v, False) for k, v in st.OUTPUT_FIELDS.items()})
     flow, rate, motor_advance = build_flow(t, params.vehicle)
@@ -146,7 +147,7 @@ def build_step(t: Types, params: PlantParams, direct: bool = False) -> StepKerne
         tiny = real(1.0e-6)
         status = int(0)
         if not taken:
-            status = 1
+            status = status | nonfinite
         out.separated[env] = 0
 
         total = coupled.momentum(p, rope, s, u)
@@ -171,7 +172,7 @@ def build_step(t: Types, params: PlantParams, direct: bool = False) -> StepKerne
                         p, rope, s, total, active, n, u, stiffness, g, gamma, max_turn, h
                     )
                     if fell_back:
-                        status = status | 2
+                        status = status | fallback
                 else:
                     s = coupled.step_alone(p, s, active, g, h)
             time = until
@@ -190,7 +191,7 @@ def build_step(t: Types, params: PlantParams, direct: bool = False) -> StepKerne
                 state.cable_vel_w[i, env] = u[i]
                 state.stiffness[i, env] = stiffness[i]
         else:
-            status = status | 1
+            status = status | nonfinite
             s = load(state, env)
             for i in range(L):
                 n[i] = state.cable_dir_w[i, env]
@@ -201,9 +202,9 @@ def build_step(t: Types, params: PlantParams, direct: bool = False) -> StepKerne
             out.payload_pos_w[env] = pos
             out.payload_vel_w[env] = vel
             if wp.length(pos - s.pos_w) < rope.payload_radius + p.collision_radius:
-                status = status | 4
+                status = status | collision
             if rope_in_rotor(p, rope, s, n):
-                status = status | 8
+                status = status | in_rotor
         state.status[env] = status
 
     @wp.kernel(module="unique", enable_backward=False)

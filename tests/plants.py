@@ -3,19 +3,16 @@
 import dataclasses
 from pathlib import Path
 
-from sim.params import PlantParams, ReleaseParams, RopeParams, VehicleParams
+from sim.params import PlantParams, ReleaseParams, RopeParams, SimParams, VehicleParams
 from visthrow import config
 
 SCENES = Path(__file__).parent / "data" / "scenes"
 
 
 def paper_plant() -> PlantParams:
-    """Return the paper's vehicle, rope and release."""
-    parts = {
-        name: config.load(schema, config.find(name, "paper"))
-        for name, schema in (("vehicle", VehicleParams), ("rope", RopeParams), ("release", ReleaseParams))
-    }
-    return PlantParams(**parts)
+    """Return the paper's vehicle, rope, release and numerics."""
+    schemas = {"vehicle": VehicleParams, "rope": RopeParams, "release": ReleaseParams, "sim": SimParams}
+    return PlantParams(**{name: config.load(schema, config.find(name, "paper")) for name, schema in schemas.items()})
 
 
 def plain_vehicle(vehicle: VehicleParams, **kinds: str) -> VehicleParams:

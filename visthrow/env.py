@@ -21,9 +21,8 @@ from visthrow import observations as ob
 from visthrow import rewards, terminations
 from visthrow.task import Experiment, plant_of
 
-RESULTS = ("episodes", "released", "landing_error", "duration", "steps", "clearance_lost")
-"""Sums over finished episodes; landing error [m], duration [s] and lost clearance over the released ones."""
-
+RESULTS = ("episodes", "released", "landing_error", "duration")
+"""Sums over finished episodes; landing error [m] and duration [s] over the released ones."""
 
 POSE = ob.VEHICLE + 3
 """Width of a pose sample: vehicle's part of a frame and the payload's position."""
@@ -200,17 +199,8 @@ class ThrowEnv(VecEnv):
         return p.scale * reward, released | negative
 
     def _tally(self, done: Tensor) -> None:
-        last = self.last
-        hit = last["released"].to(torch.float64)
-        lost = (self.cfg.release.clearance_margin - last["clearance"]).clamp(min=0.0)
-        sums = [
-            done.to(torch.float64),
-            hit,
-            last["landing_error"] * hit,
-            last["duration"] * hit,
-            self.episode_length_buf * done,
-            lost * hit,
-        ]
+        hit = self.last["released"].to(torch.float64)
+        sums = [done.to(torch.float64), hit, self.last["landing_error"] * hit, self.last["duration"] * hit]
         self._memory["totals"] += torch.stack([s.sum() for s in sums])
 
     def _begin(self, fresh: Tensor) -> None:

@@ -221,7 +221,7 @@ class Trainer:
         atomic_write(path, buffer.getvalue())
 
     def load(self, path: Path) -> None:
-        """Take up a checkpoint.
+        """Take up a checkpoint. In a distributed run the further ranks start new episodes under new seeds.
 
         Raises:
             CheckpointError: a broken file, or one of another configuration or seed.
@@ -237,10 +237,16 @@ class Trainer:
                 f"{path}: written by a run of another configuration or seed; resume with the same ones"
             )
         self.alg.load(saved["algorithm"], None, True)
+        self.iteration = saved["iteration"]
+        rank = self.ranks["global_rank"] if self.ranks else 0
+        if (
+            rank > 0
+        ):  # the checkpoint holds the first rank's environments; with them every rank would collect the same data
+            torch.manual_seed((self.seed * 1000 + rank) * 100_003 + self.iteration)
+            return
         self.env.load_state_dict(saved["env"])
         for key, value in saved["obs"].items():
             self._obs[key].copy_(value)
-        self.iteration = saved["iteration"]
         torch.set_rng_state(saved["rng"].cpu())
         if saved["cuda_rng"] is not None and self.device.startswith("cuda"):
             torch.cuda.set_rng_state(saved["cuda_rng"].cpu(), self.device)

@@ -55,7 +55,7 @@ def _ranks() -> dict | None:
 def run(args: argparse.Namespace) -> int:
     """Train."""
     from visthrow import config, device, provenance
-    from visthrow.errors import CheckpointError
+    from visthrow.errors import CheckpointError, TrainError
     from visthrow.task import Experiment
     from visthrow.train import CHECKPOINT, Trainer
 
@@ -65,6 +65,8 @@ def run(args: argparse.Namespace) -> int:
     ranks = _ranks()
     lead = ranks is None or ranks["global_rank"] == 0
     name = f"cuda:{ranks['local_rank']}" if ranks else device.resolve(args.device)
+    if ranks and args.minutes:
+        raise TrainError("--minutes would stop one of several processes and leave the others waiting; use --iterations")
     start = time.perf_counter()
     if args.resume and not (folder / CHECKPOINT).exists():
         raise CheckpointError(f"{folder}: no {CHECKPOINT} to resume from")

@@ -58,7 +58,7 @@ def test_no_machine_paths():
     ("line", "caught"),
     [
         ("/home/me/x", True), ("see /root/x", True), ("--index-url x", True), ("https://pypi.org/simple", True),
-        ("a/work/b", False), ("../shared", False), ("/dev/null", False), ("#!/usr/bin/env bash", False),
+        ("../shared", False), ("/dev/null", False), ("#!/usr/bin/env bash", False),
         ("N m/rad", False), ("/proc/cpuinfo", False),
     ],
 )  # fmt: skip
