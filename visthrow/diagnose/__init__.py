@@ -1,0 +1,1 @@
+"""From measured flights to what the simulation gets wrong: the named cause, the extended model, the measured gain."""
