@@ -9,9 +9,7 @@ this module knows no simulator.
 import heapq
 import importlib
 import json
-import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -20,10 +18,11 @@ import numpy as np
 from hil.backends.ardupilot import ARMED, CUSTOM, GUIDED, GUIDED_NOGPS, LAND
 from hil.clock import Clock
 from hil.errors import RunError
-from hil.frames import FrameParams, Frames, multiply
+from hil.frames import FrameParams, Frames
 from hil.link import IGNORE_ATTITUDE, Link
 from hil.mavlink import mav
-from hil.pose import Pose
+from hil.mocap import Mocap, MocapParams
+from hil.pose import PAYLOAD, Pose
 from visthrow.hover import GRAVITY, HoverController, HoverParams
 
 VEHICLE_ID, PAYLOAD_ID = (1, 1), (1, 25)
@@ -80,25 +79,6 @@ def load_plant(target: str, policy: str, seed: int) -> WirePlant:
     return make(policy, seed)
 
 
-@dataclass(frozen=True)
-class MocapParams:
-    """What the motion capture makes of the truth.
-
-    Raises:
-        ValueError: a negative number, no rate, or a loss of 1 or more.
-    """
-
-    rate: float = 100.0  # poses a second of each body [Hz]
-    position_noise: float = 1e-3  # standard deviation [m]
-    angle_noise_deg: float = 0.2  # standard deviation about each axis
-    latency: float = 0.01  # from the instant of a pose to its sending [s]
-    loss: float = 0.02  # share of poses that never come
-
-    def __post_init__(self) -> None:
-        if min(vars(self).values()) < 0.0 or not self.rate > 0.0 or not self.loss < 1.0:
-            raise ValueError(f"mocap {vars(self)}: expected numbers of 0 or more, a rate above 0, a loss below 1")
-
-
 class FakeAutopilot:
     """The vehicle, its autopilot's protocol and the motion capture of both bodies."""
 
@@ -115,8 +95,8 @@ class FakeAutopilot:
             answer: of :data:`ANSWERS`.
             mode: custom mode that the pilot has chosen.
         """
-        self.plant, self.link, self.mocap, self.answer, self.mode = plant, link, mocap, answer, mode
-        self._rng = np.random.default_rng(seed)
+        self.plant, self.link, self.answer, self.mode = plant, link, answer, mode
+        self.mocap = Mocap(mocap, seed)
         # Out there the world is x north, y east, z down, the body forward, right, down, quaternions w first.
         ned = Frames(FrameParams("x,-y,-z", "x,-y,-z", "wxyz", 0.0, (0.0, 0.0, 0.0)))
         self._to_source: Callable[[Pose], Pose] = ned.source_from_pose
@@ -126,7 +106,7 @@ class FakeAutopilot:
         self._told = 0.0
         self._release = False
         self._waiting: list[tuple[float, int, Any, bool]] = []
-        self._count, self._next_pose, self._next_beat = 0, 0.0, 0.0
+        self._count, self._next_beat = 0, 0.0
         self.followed = self.ignored = self.grippers = 0
         self.gripper_time: float | None = None
         link.listen(self._hear)
@@ -177,9 +157,9 @@ class FakeAutopilot:
 
     def emit(self) -> None:
         """Measure and send what is due now."""
-        if self.plant.time >= self._next_pose - 1e-9:
-            self._next_pose += 1.0 / self.mocap.rate
-            self._measure(self.plant.state)
+        if self.mocap.due(self.plant.time):
+            for pose in self.mocap.measure(self.plant.time, self.plant.state):
+                self._post(pose)
         while self._waiting and self._waiting[0][0] <= self.plant.time + 1e-9:
             _, _, message, payload = heapq.heappop(self._waiting)
             if payload:
@@ -196,24 +176,12 @@ class FakeAutopilot:
         self.fly()
         self.emit()
 
-    def _measure(self, now: dict[str, np.ndarray]) -> None:
-        """Poses of this instant, on their way."""
-        p, rng, time = self.mocap, self._rng, self.plant.time
-        noise = p.position_noise * rng.standard_normal((2, 3))
-        turn = 0.5 * math.radians(p.angle_noise_deg) * rng.standard_normal(3)
-        lost = rng.random(2) < p.loss
-        quat = multiply(tuple(now["quat_wb"].astype(float)), (*turn.tolist(), 1.0))
-        norm = math.hypot(*quat)
-        true = (
-            ("vehicle", now["pos_w"] + noise[0], tuple(q / norm for q in quat)),
-            ("payload", now["payload_pos_w"] + noise[1], (0.0, 0.0, 0.0, 1.0)),
-        )
-        for i, (body, pos, attitude) in enumerate(true):
-            pose = self._to_source(Pose(time, time, body, tuple(map(float, pos)), attitude))
-            if not lost[i]:
-                message = mav.MAVLink_att_pos_mocap_message(int(time * 1e6), list(pose.quat), *pose.pos)
-                self._count += 1
-                heapq.heappush(self._waiting, (time + p.latency, self._count, message, body == "payload"))
+    def _post(self, pose: Pose) -> None:
+        """Put a pose on its way."""
+        out = self._to_source(pose)
+        message = mav.MAVLink_att_pos_mocap_message(int(pose.stamp * 1e6), list(out.quat), *out.pos)
+        self._count += 1
+        heapq.heappush(self._waiting, (pose.arrival, self._count, message, pose.body == PAYLOAD))
 
     def report(self) -> dict[str, Any]:
         """What happened to the payload, on the plant's clock, and to the messages."""
