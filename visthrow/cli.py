@@ -17,6 +17,7 @@ COMMANDS = {
     "compare": ("throw many times with each policy and print landing errors and durations", "visthrow.compare"),
     "hil": ("fly a policy on motion-capture poses, live or recorded", "hil.cli"),
     "baseline": ("throw with trajectory optimisation and MPC; its front against the policies", "visthrow.baseline.command"),
+    "diagnose": ("say what the simulation gets wrong, from measured flights", "visthrow.diagnose.cli"),
     "bench": ("measure the speed of the simulator and of the camera", "visthrow.bench"),
     "config": ("print a configuration with all its values filled in", "visthrow.config_cli"),
 }
