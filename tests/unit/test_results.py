@@ -1,0 +1,113 @@
+"""Units of work: keys, files, records, and that a killed run loses and repeats nothing."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from visthrow import results
+from visthrow.errors import StorageError
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def unit(number: int = 0) -> dict:
+    return results.policy_unit("state", "ab", "state", "hybrid", 2.0, 3, number)
+
+
+def columns(number: int = 0) -> dict:
+    return {
+        "success": np.array([True, True, False]),
+        "landing_w": np.array([[2.1, 0.0], [1.9, 0.2], [np.nan, np.nan]]),
+        "error": np.array([0.1, number + 0.1234567, np.nan]),
+    }
+
+
+def test_key_depends_on_every_entry_and_not_on_their_order():
+    base = unit()
+    assert results.key_of(dict(reversed(base.items()))) == results.key_of(base)
+    changed = {name: {**base, name: "other"} for name in base}
+    assert len({results.key_of(u) for u in changed.values()} | {results.key_of(base)}) == len(base) + 1
+
+
+def test_result_survives_its_file(tmp_path):
+    path = results.save(tmp_path, results.Result(unit(), columns(), {"commit": "c"}, {"n": 1}))
+    assert "NaN" not in path.read_text()
+    (again,) = results.load(path)
+    assert again.unit == unit()
+    assert again.extra == {"n": 1}
+    assert again.good.tolist() == [True, True, False]
+    assert np.isnan(again.columns["error"][2])
+    assert again.of("error") == pytest.approx([0.1, 0.12346])
+    assert again.miss == pytest.approx(np.array([[0.1, 0.0], [-0.1, 0.2]]))
+
+
+def test_packed_record_does_not_depend_on_the_order(tmp_path):
+    made = [results.Result(unit(n), columns(n)) for n in range(3)]
+    results.pack(made, tmp_path / "a" / "x.json")
+    results.pack(reversed(made), tmp_path / "b" / "x.json")
+    assert (tmp_path / "a/x.json").read_bytes() == (tmp_path / "b/x.json").read_bytes()
+    assert set(results.load_all([tmp_path / "a"])) == {r.key for r in made}
+
+
+@pytest.mark.parametrize("text", ["", "[1]", '{"results": [{"unit": 1}]}', '{"unit": {}}'])
+def test_a_file_that_is_no_record_is_named(tmp_path, text):
+    path = tmp_path / "x.json"
+    path.write_text(text)
+    with pytest.raises(StorageError, match=r"x\.json: expected throws"):
+        results.load(path)
+
+
+def test_work_does_only_what_is_missing(tmp_path):
+    calls = []
+
+    def function(u):
+        calls.append(u["seed"])
+        return columns(u["seed"]), {}
+
+    results.work([unit(0)], tmp_path, function)
+    known = {results.key_of(unit(1)): results.Result(unit(1), columns(1))}
+    found = results.work([unit(0), unit(1), unit(2), unit(2)], tmp_path, function, known)
+    assert calls == [0, 2]
+    assert [found[results.key_of(unit(n))].of("error")[1] for n in range(3)] == pytest.approx([0.12346, 1.12346, 2.12346], abs=1e-5)
+
+
+WORKER = """
+import sys, time, numpy as np
+from visthrow import results
+def function(u):
+    with open(sys.argv[2], "a") as log:
+        log.write(f"{u['seed']}\\n")
+    time.sleep(0.1)
+    return {"success": np.ones(1, bool), "error": np.array([float(u["seed"])])}, {}
+units = [results.policy_unit("state", "ab", "state", "hybrid", 2.0, 1, n) for n in range(12)]
+found = results.work(units, sys.argv[1], function)
+print(sum(r.of("error")[0] for r in found.values()))
+"""
+
+
+def test_killed_and_started_again_it_loses_and_repeats_nothing(tmp_path):
+    """SIGKILL in the middle: what was finished is not done again, only the unit in hand is."""
+    folder, log = tmp_path / "units", tmp_path / "log"
+    command = [sys.executable, "-c", WORKER, str(folder), str(log)]
+    first = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE)
+    deadline = time.monotonic() + 60.0
+    while time.monotonic() < deadline and len(list(folder.glob("*.json"))) < 3:
+        time.sleep(0.01)
+    os.kill(first.pid, signal.SIGKILL)
+    first.wait()
+    first.stdout.close()
+    finished = {json.loads(path.read_text())["unit"]["seed"] for path in folder.glob("*.json")}
+    assert 3 <= len(finished) < 12
+    before = log.read_text().split()
+    again = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True, timeout=60)
+    assert float(again.stdout) == sum(range(12))
+    after = [int(x) for x in log.read_text().split()[len(before) :]]
+    assert not finished & set(after)
+    assert finished | set(after) == set(range(12))
