@@ -64,8 +64,12 @@ class Result:
 
     @property
     def miss(self) -> np.ndarray:
-        """Landing points of the successful throws relative to the target [m], shape (N, 2): along the throw, to the left."""
-        return self.of("landing_w") - np.array([self.unit["target"], 0.0])
+        """Landing points of the successful throws relative to the target [m], shape (N, 2): along x, to the left.
+
+        Where the target moves it is meant where it was at impact (column ``goal_w``).
+        """
+        goal = self.of("goal_w") if "goal_w" in self.columns else np.array([self.unit["target"], 0.0])
+        return self.of("landing_w") - goal
 
 
 def key_of(unit: dict[str, Any]) -> str:
@@ -152,6 +156,25 @@ def load_all(places: Iterable[str | Path]) -> dict[str, Result]:
         for path in files:
             found.update({result.key: result for result in load(path)})
     return found
+
+
+def join(found: Iterable[Result]) -> list[Result]:
+    """Put the batches of one set of throws together: units that differ in nothing but ``batch``, in its order."""
+    groups: dict[str, list[Result]] = {}
+    for result in found:
+        whole = {name: value for name, value in result.unit.items() if name not in ("batch", "throws")}
+        groups.setdefault(key_of(whole), []).append(result)
+    return [_joined(sorted(group, key=lambda r: r.unit.get("batch", 0))) for group in groups.values()]
+
+
+def _joined(group: list[Result]) -> Result:
+    if len(group) == 1:
+        return group[0]
+    unit = {name: value for name, value in group[0].unit.items() if name != "batch"}
+    unit["throws"] = sum(result.unit["throws"] for result in group)
+    columns = {name: np.concatenate([result.columns[name] for result in group]) for name in group[0].columns}
+    seconds = sum(result.provenance.get("seconds", 0.0) for result in group)
+    return Result(unit, columns, {**group[0].provenance, "seconds": seconds}, group[0].extra)
 
 
 def pack(results: Iterable[Result], path: str | Path) -> None:

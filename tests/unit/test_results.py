@@ -48,6 +48,15 @@ def test_result_survives_its_file(tmp_path):
     assert again.miss == pytest.approx(np.array([[0.1, 0.0], [-0.1, 0.2]]))
 
 
+def test_batches_are_joined_in_order_and_moving_goals_count():
+    made = [results.Result({**unit(), "batch": b}, columns(b)) for b in (1, 0)]
+    made.append(results.Result(unit(5), {**columns(), "goal_w": np.array([[2.1, 0.1], [2.0, 0.2], [np.nan, np.nan]])}))
+    whole, moving = results.join(made)
+    assert whole.unit == {**unit(), "throws": 6}
+    assert whole.columns["error"][[1, 4]] == pytest.approx([0.1234567, 1.1234567])
+    assert moving.miss == pytest.approx(np.array([[0.0, -0.1], [-0.1, 0.0]]))
+
+
 def test_packed_record_does_not_depend_on_the_order(tmp_path):
     made = [results.Result(unit(n), columns(n)) for n in range(3)]
     results.pack(made, tmp_path / "a" / "x.json")
