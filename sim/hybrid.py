@@ -46,6 +46,26 @@ def tether_lengths(rope: RopeParams, z: RandomizationParams) -> list[RopeParams]
     ]
 
 
+def rope_variants(rope: RopeParams, z: RandomizationParams) -> list[RopeParams]:
+    """:func:`tether_lengths`, each with ``payload_variants`` masses of the payload that span +-``payload_spread``.
+
+    The payload keeps its size, so its inertia goes with its mass. Entry e has cable ``e % tether_variants``.
+    """
+    if z.payload_variants < 1 or not 0.0 <= z.payload_spread < 1.0:
+        raise ValueError(
+            f"payload_variants {z.payload_variants}, payload_spread {z.payload_spread}: expected 1 or more, and 0 to below 1"
+        )
+    ropes = tether_lengths(rope, z)
+    if z.payload_variants == 1:
+        return ropes
+    factors = np.linspace(1 - z.payload_spread, 1 + z.payload_spread, z.payload_variants)
+    return [
+        dataclasses.replace(r, payload_mass=r.payload_mass * float(f), payload_inertia=r.payload_inertia * float(f))
+        for f in factors
+        for r in ropes
+    ]
+
+
 class HybridSim:
     """Batched plant: command queue, rate controller, motors, battery, aerodynamics, rope, payload, release.
 

@@ -22,6 +22,7 @@ class BodyParams:
 
     mass: float  # [kg]
     inertia: tuple[float, float, float]  # principal moments about the centre of mass [kg m^2]
+    com: tuple[float, float, float] = (0.0, 0.0, 0.0)  # see VehicleParams [m]
 
 
 @dataclass(frozen=True)
@@ -88,10 +89,14 @@ class ControllerParams:
 
 @dataclass(frozen=True)
 class MotorParams:
-    """Motor speed: ``Omega' = (Omega* - Omega) / time_constant`` (``first_order``) or ``Omega = Omega*`` (``instant``)."""
+    """Motor speed: ``Omega' = (Omega* - Omega) / time_constant`` (``first_order``) or ``Omega = Omega*`` (``instant``).
 
-    kind: Literal["first_order", "instant"]
+    ``asymmetric``: first order with ``time_constant_down`` where the set-point lies below the speed.
+    """
+
+    kind: Literal["first_order", "instant", "asymmetric"]
     time_constant: float  # [s]
+    time_constant_down: float = 0.0  # of slowing down [s]; ``asymmetric`` alone reads it
 
 
 @dataclass(frozen=True)
@@ -118,18 +123,21 @@ class BatteryParams:
 class ThrustParams:
     """Thrust and torque of rotor i from its speed and the battery voltage.
 
-    ``f_i = (k_f Omega_i^2 + k_1 Omega_i) (1 + voltage_coefficient (u - u_ref))``, ``tau_i = torque_ratio f_i``.
+    ``f_i = gain_i (k_f Omega_i^2 + k_1 Omega_i) (1 + voltage_coefficient (u - u_ref))``,
+    ``tau_i = torque_ratio torque_gain f_i``. The controller knows of neither gain.
     """
 
     k_f: float  # thrust coefficient [N s^2/rad^2]
     k_1: float  # linear term [N s/rad]
     voltage_coefficient: float  # [1/V]
     torque_ratio: float  # kappa [m]
+    gain: tuple[float, float, float, float] = (1.0, 1.0, 1.0, 1.0)  # of each rotor against the controller's map [-]
+    torque_gain: float = 1.0  # of the drag torque likewise [-]
 
 
 @dataclass(frozen=True)
 class AeroParams:
-    """Aerodynamics of the vehicle in still air, from the body velocity v_b of the centre of mass and the rate w.
+    """Aerodynamics of the vehicle, from the velocity v_b of the centre of mass through the air and the rate w.
 
     - rotor drag: ``dF = -(drag_x v_x, drag_y v_y, drag_z v_z)``
     - body drag: ``dF += -parasitic |v| v``
@@ -160,6 +168,9 @@ class VehicleParams:
     ``tau_b = sum_i r_i x (0, 0, f_i + df_i) + e_z sum_i s_i (tau_i + dtau_i + J_r Omega_i') - w x e_z h + dtau``
     with the rotors' momentum ``h = -J_r sum_i s_i Omega_i`` (the gyroscopic torque does no work). A rotor that turns
     clockwise from above (s_i = +1) has angular momentum along -z and pushes the body towards +z.
+
+    Rotors and mount are stated from the frame's origin, where the centre of mass is meant to be. Where ``body.com`` says
+    that it is elsewhere, they act with their arms about it, while the controller's mixer keeps to the frame.
     """
 
     body: BodyParams
@@ -180,7 +191,9 @@ class RopeParams:
     Segment i has length ``length / segments`` and mass ``rope_mass / segments``, its centre of mass in the middle,
     transverse inertia ``m l^2 / 12`` about it, none about its axis. The payload's centre lies ``payload_offset`` past
     the end of the last segment, on its axis. Viscous joint torque ``-joint_damping (w_i - w_(i-1))`` in every joint, the
-    one on the vehicle included.
+    one on the vehicle included; in the uppermost one ``mount_damping`` besides.
+
+    Air on the payload, with its velocity v_p through the air: ``-payload_drag |v_p| v_p``.
     """
 
     segments: int  # L, 1 to 64
@@ -192,15 +205,30 @@ class RopeParams:
     payload_radius: float  # of the ball, for drawing, keypoints and collisions [m]
     joint_damping: float  # [N m s]
     mount: tuple[float, float, float]  # rope attachment in the body frame [m]
+    payload_drag: float = 0.0  # 1/2 rho C_d A of the payload, on the rope and in flight [kg/m]
+    mount_damping: float = 0.0  # of the uppermost joint, besides joint_damping [N m s]
+
+
+@dataclass(frozen=True)
+class AirParams:
+    """The air that vehicle and payload move in: ``v_air = v - wind_w``, in the place of v in every force of the air.
+
+    Near the ground every rotor gains thrust: ``f_i`` times ``1 + ground_effect (1 / (1 - (R / 4 z)^2) - 1)`` with R the
+    propeller's radius and z the height of the vehicle's centre of mass, not below R / 2 (Cheeseman and Bennett 1955 for
+    ``ground_effect`` 1).
+    """
+
+    wind_w: tuple[float, float, float] = (0.0, 0.0, 0.0)  # constant wind, world frame [m/s]
+    ground_effect: float = 0.0  # [-]
 
 
 @dataclass(frozen=True)
 class ReleaseParams:
-    """Release mechanism and the closed-form flight that follows.
+    """Release mechanism and the flight that follows.
 
     The latch trips when the release command exceeds ``threshold`` and does not untrip; the payload separates ``lag``
     later. From the payload's position p and velocity v at separation:
-    ``t_hit = (v_z + sqrt(v_z^2 + 2 g (p_z - landing_height))) / g``.
+    ``t_hit = (v_z + sqrt(v_z^2 + 2 g (p_z - landing_height))) / g``; under drag the flight is integrated by RK4.
     """
 
     threshold: float  # [-]
@@ -229,6 +257,7 @@ class PlantParams:
     rope: RopeParams
     release: ReleaseParams
     sim: SimParams
+    air: AirParams = AirParams()
 
 
 @dataclass(frozen=True)
@@ -251,3 +280,5 @@ class RandomizationParams:
     tether_spread: float  # the lengths span +- this fraction
     battery_used: float  # fraction of charge used is drawn from 0 to this
     goal_radius: float  # goals are uniform on a ground disk of this radius about the spawn point [m]
+    payload_variants: int = 1  # number of payload masses, in every combination with the cable lengths
+    payload_spread: float = 0.0  # the masses span +- this fraction

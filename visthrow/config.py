@@ -114,15 +114,20 @@ def available(kind: str) -> list[str]:
     return sorted(path.stem for path in (configs_root() / kind).glob("*.toml"))
 
 
-def to_dict(config: Any) -> dict[str, Any]:
+def to_dict(config: Any, *, defaults: bool = True) -> dict[str, Any]:
     """Turn a config into nested dictionaries of plain values (tuples become lists), for JSON, TOML or a comparison.
+
+    Args:
+        config: Instance of a dataclass.
+        defaults: Whether fields that hold their default are written too.
 
     Raises:
         TypeError: If ``config`` is no dataclass instance.
     """
     if not dataclasses.is_dataclass(config) or isinstance(config, type):
         raise TypeError(f"got {config!r}; expected an instance of a dataclass")
-    return {f.name: _plain(getattr(config, f.name)) for f in dataclasses.fields(config) if f.init}
+    values = {f: getattr(config, f.name) for f in dataclasses.fields(config) if f.init}
+    return {f.name: _plain(value, defaults) for f, value in values.items() if defaults or not _is_default(f, value)}
 
 
 def dumps(config: Any) -> str:
@@ -130,13 +135,19 @@ def dumps(config: Any) -> str:
     return toml_text.dumps(_without_none(to_dict(config)))
 
 
-def _plain(value: Any) -> Any:
+def _is_default(field: dataclasses.Field, value: Any) -> bool:
+    if field.default_factory is not dataclasses.MISSING:
+        return value == field.default_factory()
+    return field.default is not dataclasses.MISSING and value == field.default
+
+
+def _plain(value: Any, defaults: bool) -> Any:
     if dataclasses.is_dataclass(value):
-        return to_dict(value)
+        return to_dict(value, defaults=defaults)
     if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
+        return {key: _plain(item, defaults) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
+        return [_plain(item, defaults) for item in value]
     return value
 
 

@@ -4,6 +4,8 @@ A step is a chain of device operations without branches on data, allocations on 
 host, so a whole rollout can be captured in one CUDA graph (:mod:`visthrow.train`). Every observation is a fresh tensor.
 """
 
+import math
+
 import torch
 import warp as wp
 from rsl_rl.env import VecEnv
@@ -13,12 +15,12 @@ from torch import Tensor
 from camera import history as hist
 from camera.keypoints import KEYPOINTS, KeypointCamera
 from camera.noise import StepDraw, apply_latency, apply_noise
-from sim.hybrid import HybridSim, tether_lengths
+from sim.hybrid import HybridSim, rope_variants
 from sim.params import GRAVITY
 from sim.torch_bridge import TorchViews, on_torch_stream
 from visthrow import actions as act
+from visthrow import goal_motion, rewards, terminations
 from visthrow import observations as ob
-from visthrow import rewards, terminations
 from visthrow.task import Experiment, plant_of
 
 RESULTS = ("episodes", "released", "landing_error", "duration")
@@ -32,11 +34,13 @@ class ThrowEnv(VecEnv):
     """Batch of throws. Observation groups: ``actor`` and ``critic``.
 
     The critic sees the vehicle, goal offset, payload history and payload velocity without noise, and further the time to
-    separation, the time since start, the vehicle's mass and the battery's voltage.
+    separation, the time since start, the vehicle's mass and the battery's voltage; where the task has them, the goal's
+    velocity and the scales of payload mass and cable length too.
 
     Attributes:
         last: what the last step ended: ``released``, ``negative`` (bool), ``landing_error`` [m], ``duration`` [s] from the
-            policy's start to the payload's landing, ``landing_w`` [m], ``clearance`` [m]; each over (E,).
+            policy's start to the payload's landing, ``landing_w`` [m], ``clearance`` [m]; each over (E,). Where goals move,
+            ``goal_w`` [m] too, where the goal is at impact.
         totals: running sums of :data:`RESULTS`.
     """
 
@@ -55,9 +59,8 @@ class ThrowEnv(VecEnv):
         self.num_actions = act.ACTIONS
         self.device = device
         self.max_episode_length = round(task.bounds.time_limit / experiment.sim.control_period)
-        self.sim = HybridSim(
-            plant_of(experiment), self.num_envs, device, seed, ropes=tether_lengths(experiment.rope, task.start)
-        )
+        ropes = rope_variants(experiment.rope, task.start)
+        self.sim = HybridSim(plant_of(experiment), self.num_envs, device, seed, ropes=ropes)
         self.views = TorchViews(self.sim)
         self.layout = ob.layout_of(task.observation)
         self.camera = KeypointCamera(experiment.camera, device)
@@ -85,6 +88,14 @@ class ThrowEnv(VecEnv):
             "totals": torch.zeros(len(RESULTS), device=device, dtype=torch.float64),
         }
         self._latency = torch.tensor(experiment.camera.noise.latency, **make)
+        if task.target.moves:
+            self._memory["goal_vel"] = torch.zeros(E, 3, **make)
+        if self.layout.motion:
+            self._memory["goal_fit"] = goal_motion.empty_sums(E, device)
+        self._cargo: Tensor | None = None
+        if task.start.payload_variants > 1:
+            scales = [[r.payload_mass / experiment.rope.payload_mass, r.length / experiment.rope.length] for r in ropes]
+            self._cargo = torch.tensor([scales[e % len(ropes)] for e in range(E)], **make)
         self.last: dict[str, Tensor] = {}
         self._goal: Tensor | None = None
         self.reset()
@@ -140,6 +151,8 @@ class ThrowEnv(VecEnv):
         self.views.release.copy_(act.release_asked(actions, self.cfg.release.threshold))
         with on_torch_stream(self.device):
             self.sim.step()
+        if task.target.moves:
+            self.views.goal_w.add_(memory["goal_vel"] * self.cfg.sim.control_period)
         self.episode_length_buf += 1
         reward, done = self._judge(action)
         self._tally(done)
@@ -174,7 +187,8 @@ class ThrowEnv(VecEnv):
             time,
             self.cfg.release.landing_height,
         )
-        error = (out["landing_w"] - self.views.goal_w)[:, :2].square().sum(-1).sqrt()
+        goal = self._goal_at_impact()
+        error = (out["landing_w"] - goal)[:, :2].square().sum(-1).sqrt()
         carry = (
             rewards.kinetic(p, state["vel_w"], state["rate_b"], out["payload_vel_w"])
             + rewards.command(p, action, self._rate_weights)
@@ -196,7 +210,17 @@ class ThrowEnv(VecEnv):
             "clearance": out["clearance"].clone(),
             "action": action,
         }
+        if task.target.moves:
+            self.last["goal_w"] = goal
         return p.scale * reward, released | negative
+
+    def _goal_at_impact(self) -> Tensor:
+        """Goal [m], shape (E, 3), where it is when a payload released in the last step lands."""
+        if not self.cfg.task.target.moves:
+            return self.views.goal_w
+        out = self.views.out
+        left = out["separation_time"] + out["time_to_impact"] - self.cfg.sim.control_period
+        return self.views.goal_w + self._memory["goal_vel"] * left[:, None]
 
     def _tally(self, done: Tensor) -> None:
         hit = self.last["released"].to(torch.float64)
@@ -224,6 +248,13 @@ class ThrowEnv(VecEnv):
         if high > 0.0:
             age = memory["pose_age"]
             age.copy_(torch.where(fresh, low + (high - low) * torch.rand_like(age), age))
+        slow, fast = self.cfg.task.target.speed
+        if fast > 0.0:
+            velocity = memory["goal_vel"]
+            drawn = torch.rand_like(velocity[:, :2])
+            speed, heading = slow + (fast - slow) * drawn[:, 0], 2.0 * math.pi * drawn[:, 1]
+            new = torch.stack([speed * heading.cos(), speed * heading.sin(), torch.zeros_like(speed)], dim=-1)
+            velocity.copy_(torch.where(fresh[:, None], new, velocity))
 
     def _late(self, pose: Tensor, fresh: Tensor) -> Tensor:
         """Pose sample as old as the episode's latency, linear between the last two control steps."""
@@ -244,37 +275,53 @@ class ThrowEnv(VecEnv):
         exact = torch.cat([vehicle, ob.state_part(state["pos_w"], goal, payload)], dim=-1)
         attached = state["attached"].to(torch.float32)
         pose = self._late(torch.cat([vehicle, payload], dim=-1), fresh)
-        seen = torch.cat([pose[:, : ob.VEHICLE], ob.state_part(pose[:, :3], goal, pose[:, ob.VEHICLE :])], dim=-1)
+        late_goal = self._late_goal()
+        seen = torch.cat([pose[:, : ob.VEHICLE], ob.state_part(pose[:, :3], late_goal, pose[:, ob.VEHICLE :])], dim=-1)
         measured = seen + torch.randn_like(seen) * noise.observation_step + memory["frame_bias"]
         valid = None
         if self.layout.name == "vision":
             if self.cfg.task.observation.latency[1] > 0.0:
                 x_axis, y_axis = pose[:, 9:12], pose[:, 12:15]
                 rot_wb = torch.stack([x_axis, y_axis, torch.linalg.cross(x_axis, y_axis)], dim=-1)
-            points, valid = self._see(pose[:, :3], rot_wb, pose[:, ob.VEHICLE :], fresh)
+            points, valid = self._see(pose[:, :3], rot_wb, late_goal, pose[:, ob.VEHICLE :], fresh)
             measured = torch.cat([measured[:, : ob.VEHICLE], points.flatten(1)], dim=-1)
+        time = self.episode_length_buf.to(torch.float32) * self.cfg.sim.control_period
+        goal_vel = None
+        if self.layout.motion:
+            place, weight = goal_motion.measured_goal(self.layout, measured, valid, self.camera)
+            sums, goal_vel = goal_motion.fit(memory["goal_fit"], time, place, weight, fresh)
+            memory["goal_fit"].copy_(sums)
         actor, history = ob.observe(
-            self.layout, measured, valid, memory["previous"], attached, memory["history"], fresh
+            self.layout, measured, valid, memory["previous"], attached, memory["history"], fresh, goal_vel
         )
         memory["history"].copy_(history)
         goal_offset, relative = exact[:, ob.VEHICLE : ob.VEHICLE + 2], exact[:, ob.VEHICLE + 2 :]
         true_history = hist.push(memory["true_history"], relative, fresh)
         memory["true_history"].copy_(true_history)
-        time = self.episode_length_buf.to(torch.float32) * self.cfg.sim.control_period
         inner = torch.stack([state["release_timer"], time, state["mass_scale"], state["voltage"], attached], dim=-1)
-        critic = torch.cat(
-            [vehicle, memory["previous"], goal_offset, true_history.flatten(1), self.views.out["payload_vel_w"], inner],
-            dim=-1,
-        )
-        return TensorDict({"actor": actor, "critic": critic}, batch_size=[self.num_envs], device=self.device)
+        parts = [vehicle, memory["previous"], goal_offset, true_history.flatten(1), self.views.out["payload_vel_w"], inner]
+        if self.cfg.task.target.moves:
+            parts.append(memory["goal_vel"][:, :2])
+        if self._cargo is not None:
+            parts.append(self._cargo)
+        observed = {"actor": actor, "critic": torch.cat(parts, dim=-1)}
+        return TensorDict(observed, batch_size=[self.num_envs], device=self.device)
 
-    def _see(self, pos_w: Tensor, rot_wb: Tensor, payload_w: Tensor, fresh: Tensor) -> tuple[Tensor, Tensor]:
+    def _late_goal(self) -> Tensor:
+        """Goal [m], shape (E, 3), where it was when what is measured now was measured."""
+        if not self.cfg.task.target.moves:
+            return self.views.goal_w
+        return self.views.goal_w - self._memory["goal_vel"] * self._memory["pose_age"][:, None]
+
+    def _see(
+        self, pos_w: Tensor, rot_wb: Tensor, goal_w: Tensor, payload_w: Tensor, fresh: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """Keypoints as the detector reports them: extrinsic error, latency, noise, drop-out."""
         memory, camera = self._memory, self.cfg.camera
         extrinsics = None
         if camera.mount.rotation_error_std > 0.0 or camera.mount.position_error_std > 0.0:
             extrinsics = self.camera.extrinsics(memory["extrinsic_rotation"], memory["extrinsic_offset"])
-        points, valid = ob.vision_part(self.camera, pos_w, rot_wb, self.views.goal_w, payload_w, extrinsics)
+        points, valid = ob.vision_part(self.camera, pos_w, rot_wb, goal_w, payload_w, extrinsics)
         if camera.noise.latency > 0.0:
             memory["late_points"].copy_(hist.push(memory["late_points"], points, fresh))
             memory["late_valid"].copy_(hist.push(memory["late_valid"], valid, fresh))

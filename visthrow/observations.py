@@ -13,6 +13,8 @@ pushes the payload's part into the history and assembles the actor's input. With
     position 3 | velocity 3 | body rates 3 | rotation 6 | previous action 5 | goal corners 8
     | payload keypoints, now and H steps back 8 (1 + H) | attached 1 | validity of goal and payload keypoints 8
 
+and either one, where goals move, has the fit of the goal's velocity 2 (:mod:`visthrow.goal_motion`) at its end.
+
 The rotation is the first two columns of rot_wb (Zhou et al., CVPR 2019), column after column.
 """
 
@@ -37,6 +39,7 @@ class Layout:
     payload: int  # width of the payload's part, once
     history: int  # H
     validity: int  # width of the validity bits
+    motion: int = 0  # width of the goal's velocity
 
     @property
     def frame(self) -> int:
@@ -46,7 +49,7 @@ class Layout:
     @property
     def dimension(self) -> int:
         """Width of the actor's input."""
-        return VEHICLE + 5 + self.goal + self.payload * (1 + self.history) + 1 + self.validity
+        return VEHICLE + 5 + self.goal + self.payload * (1 + self.history) + 1 + self.validity + self.motion
 
 
 def layout_of(params) -> Layout:
@@ -57,10 +60,11 @@ def layout_of(params) -> Layout:
     """
     if params.history < 0:
         raise ValueError(f"observation history {params.history}: expected 0 or more")
+    motion = 2 if getattr(params, "goal_velocity", False) else 0  # contracts from before lack it
     if params.layout == "state":
-        return Layout("state", 2, 3, params.history, 0)
+        return Layout("state", 2, 3, params.history, 0, motion)
     if params.layout == "vision":
-        return Layout("vision", 8, 8, params.history, KEYPOINTS if params.validity else 0)
+        return Layout("vision", 8, 8, params.history, KEYPOINTS if params.validity else 0, motion)
     raise ValueError(f"observation layout {params.layout!r}: expected 'state' or 'vision'")
 
 
@@ -102,6 +106,7 @@ def observe(
     attached: Tensor,
     history: Tensor,
     fresh: Tensor,
+    goal_vel_w: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Assemble the actor's input and move the payload's history on.
 
@@ -113,6 +118,7 @@ def observe(
         attached: 1 while the payload hangs on the vehicle, shape (E,), float.
         history: payload parts now and earlier, newest first, shape (E, 1 + H, payload).
         fresh: episodes that begin here, bool, shape (E,): their history is filled with the current value.
+        goal_vel_w: fit of the goal's horizontal velocity [m/s], shape (E, 2); None where the layout has none.
 
     Returns:
         Observation, shape (E, layout.dimension), and the new history.
@@ -128,4 +134,6 @@ def observe(
     ]
     if layout.validity:
         parts.append(valid.to(frame.dtype))
+    if layout.motion:
+        parts.append(goal_vel_w)
     return torch.cat(parts, dim=-1), history

@@ -15,7 +15,7 @@ from torch import Tensor
 from camera.keypoints import KeypointCamera
 from camera.params import CameraParams
 from visthrow import actions as act
-from visthrow import config
+from visthrow import config, goal_motion
 from visthrow import observations as ob
 from visthrow.errors import PolicyError
 from visthrow.hover import GRAVITY
@@ -102,6 +102,7 @@ class Pilot:
         self._previous = self._first.repeat(self.count, 1)
         self._history = torch.zeros(self.count, 1 + self.layout.history, self.layout.payload)
         self._fresh = torch.ones(self.count, dtype=torch.bool)
+        self._goal_fit, self._steps = goal_motion.empty_sums(self.count), 0
 
     @property
     def previous_action(self) -> np.ndarray:
@@ -143,7 +144,7 @@ class Pilot:
         seen = points.flatten(1) if self.layout.name == "vision" else ob.state_part(pos, goal, payload)
         frame = torch.cat([ob.vehicle_part(pos, vel, rate, rot), seen], dim=-1)
         observation, self._history = ob.observe(
-            self.layout, frame, valid, self._previous, hangs, self._history, self._fresh
+            self.layout, frame, valid, self._previous, hangs, self._history, self._fresh, self._goal_velocity(frame, valid)
         )
         raw = self.policy.act(observation)
         action = act.clip_action(raw)
@@ -156,6 +157,16 @@ class Pilot:
             None if points is None else points.numpy(),
             None if valid is None else valid.numpy(),
         )
+
+    def _goal_velocity(self, frame: Tensor, valid: Tensor | None) -> Tensor | None:
+        """Fit of the goal's velocity [m/s], shape (E, 2), with this step's frame; None where the layout has none."""
+        if not self.layout.motion:
+            return None
+        place, weight = goal_motion.measured_goal(self.layout, frame, valid, self.camera)
+        time = torch.full((self.count,), self._steps * self.period)
+        self._steps += 1
+        self._goal_fit, velocity = goal_motion.fit(self._goal_fit, time, place, weight, self._fresh)
+        return velocity
 
     @torch.inference_mode()
     def see(

@@ -29,6 +29,7 @@ class Throws:
         success: shape (N,), bool.
         landing_w: [m], shape (N, 2). error: [m], shape (N,). duration: [s], shape (N,). clearance: [m], shape (N,).
         smoothness: root mean square change of the normalised commands from step to step, shape (N,).
+        goal_w: where a moving goal is at impact [m], shape (N, 2); None where goals stand still.
     """
 
     target: float
@@ -38,12 +39,15 @@ class Throws:
     duration: np.ndarray
     clearance: np.ndarray
     smoothness: np.ndarray
+    goal_w: np.ndarray | None = None
 
     def summary(self) -> dict[str, float]:
         """Mean and deviation of the successful throws, with the success rate."""
         if not self.success.any():
             return {"target": self.target, "throws": len(self.success), "success": 0.0}
         good = self.success
+        goal = np.array([[self.target, 0.0]]) if self.goal_w is None else self.goal_w[good]
+        bias = (self.landing_w[good] - goal).mean(axis=0)
         return {
             "target": self.target,
             "throws": len(good),
@@ -52,16 +56,18 @@ class Throws:
             "error_std": float(self.error[good].std()),
             "duration_mean": float(self.duration[good].mean()),
             "duration_std": float(self.duration[good].std()),
-            "bias_x": float(self.landing_w[good, 0].mean() - self.target),
-            "bias_y": float(self.landing_w[good, 1].mean()),
+            "bias_x": float(bias[0]),
+            "bias_y": float(bias[1]),
             "clearance_min": float(self.clearance[good].min()),
             "smoothness": float(self.smoothness[good].mean()),
         }
 
 
 def hover_start(experiment: Experiment) -> Experiment:
-    """The experiment with its episodes started from hover."""
+    """The experiment with its episodes started from hover; cables and payloads vary as in the experiment."""
     start = config.load(RandomizationParams, config.find("start", "hover"))
+    kept = ("tether_variants", "tether_spread", "payload_variants", "payload_spread")
+    start = dataclasses.replace(start, **{name: getattr(experiment.task.start, name) for name in kept})
     return dataclasses.replace(experiment, task=dataclasses.replace(experiment.task, start=start))
 
 
@@ -118,4 +124,5 @@ def _fly(env: ThrowEnv, policy, target: float, count: int) -> Throws:
         array["duration"] * blank,
         array["clearance"] * blank,
         smoothness * blank,
+        array["goal_w"][:, :2] * blank[:, None] if "goal_w" in array else None,
     )

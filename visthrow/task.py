@@ -28,6 +28,7 @@ class ObservationParams:
     history: int  # earlier payload measurements beside the current one
     validity: bool  # vision: whether the actor is told which keypoints are valid
     latency: tuple[float, float]  # age of all that is measured, drawn per episode from this range [s]
+    goal_velocity: bool = False  # whether the actor is given a fit of the goal's velocity; see visthrow.goal_motion
 
 
 @dataclass(frozen=True)
@@ -71,6 +72,22 @@ class RewardParams:
 
 
 @dataclass(frozen=True)
+class TargetParams:
+    """Motion of the target: a constant horizontal velocity, its heading uniform; the landing counts where it is at impact."""
+
+    speed: tuple[float, float] = (0.0, 0.0)  # uniform in this range, drawn per episode [m/s]
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.speed[0] <= self.speed[1]:
+            raise ValueError(f"target.speed is {self.speed} m/s; expected an ascending range from 0 or more")
+
+    @property
+    def moves(self) -> bool:
+        """Whether any target does."""
+        return self.speed[1] > 0.0
+
+
+@dataclass(frozen=True)
 class TaskParams:
     """The throwing task."""
 
@@ -80,6 +97,7 @@ class TaskParams:
     start: RandomizationParams
     bounds: BoundsParams
     reward: RewardParams
+    target: TargetParams = TargetParams()
 
 
 @dataclass(frozen=True)
@@ -146,7 +164,8 @@ def plant_of(experiment: Experiment) -> PlantParams:
 def contract_of(experiment: Experiment) -> dict:
     """What whoever flies a policy must share with its training; see :mod:`visthrow.policy`.
 
-    The camera enters for vision policies only. Noise and randomisation are training matters and stay out.
+    The camera enters for vision policies only. Noise and randomisation are training matters and stay out. An entry whose
+    field has a default enters where it differs from that: a policy from before the field was there fits what it is off in.
     """
     from visthrow import config
     from visthrow.observations import layout_of
@@ -154,12 +173,12 @@ def contract_of(experiment: Experiment) -> dict:
 
     layout = layout_of(experiment.task.observation)
     contract = {
-        "observation": {**config.to_dict(experiment.task.observation), "dimension": layout.dimension},
-        "action": {**config.to_dict(experiment.task.action), "dimension": 5},
+        "observation": {**config.to_dict(experiment.task.observation, defaults=False), "dimension": layout.dimension},
+        "action": {**config.to_dict(experiment.task.action, defaults=False), "dimension": 5},
         "control_period": experiment.sim.control_period,
         "release": {"lag": experiment.release.lag, "threshold": experiment.release.threshold},
-        "vehicle": config.to_dict(experiment.vehicle),
-        "rope": config.to_dict(experiment.rope),
+        "vehicle": config.to_dict(experiment.vehicle, defaults=False),
+        "rope": config.to_dict(experiment.rope, defaults=False),
     }
     if experiment.task.observation.layout == "vision":
         contract["camera"] = camera_conditions(experiment.camera)
