@@ -27,6 +27,10 @@ class LogError(VisthrowError):
     """A flight log cannot be read or its channels contradict each other."""
 
 
+class DiagnoseError(VisthrowError):
+    """A diagnosis cannot be made of what was given."""
+
+
 class TrainError(VisthrowError):
     """Training cannot start, go on or resume."""
 
