@@ -1,10 +1,11 @@
 """Velocity and body rate where the source gives none: a causal polynomial fit over the last poses.
 
-Over the last N samples a line (order 1) or a parabola (order 2) is fitted by least squares, with the samples' own time
-stamps, and its slope is taken at the newest one. Under constant acceleration a line's slope is late by half the window,
-``(N - 1) T / 2`` at an even spacing T; a parabola's is not late at all, but noisier. For slopes ``v = sum c_i p(t - a_i)``
-of samples of age a_i the lag is ``-sum c_i a_i^2 / 2`` [s] (the response to ``p = t^2 / 2`` is ``t`` less the lag), which is
-what :attr:`SlopeFilter.lag` reports. The slope's noise is ``sqrt(sum c_i^2)`` times that of a sample.
+Over the N samples of a window of time, whatever the source's rate, a line (order 1) or a parabola (order 2) is fitted by
+least squares, with the samples' own time stamps, and its slope is taken at the newest one. Under constant acceleration a
+line's slope is late by half the window, ``(N - 1) T / 2`` at an even spacing T; a parabola's is not late at all, but noisier.
+For slopes ``v = sum c_i p(t - a_i)`` of samples of age a_i the lag is ``-sum c_i a_i^2 / 2`` [s] (the response to
+``p = t^2 / 2`` is ``t`` less the lag), which is what :attr:`SlopeFilter.lag` reports. The slope's noise is ``sqrt(sum c_i^2)``
+times that of a sample.
 """
 
 import math
@@ -17,22 +18,25 @@ from hil.pose import Pose, Quaternion, Vector
 MOST_GAP = 0.1
 """A gap longer than this empties the window: what lies before it says nothing of now [s]."""
 
+MOST_SAMPLES = 32
+"""In a window, whatever the source's rate: the fit's cost stays bounded."""
+
 
 @dataclass(frozen=True)
 class EstimateParams:
     """The filter.
 
     Raises:
-        ValueError: an order other than 1 or 2, or fewer samples than it needs.
+        ValueError: an order other than 1 or 2, or a window that is empty or longer than :data:`MOST_GAP`.
     """
 
-    samples: int  # N
+    window: float  # age of the oldest sample, where there are enough younger ones [s]
     order: int  # 1: line, 2: parabola
 
     def __post_init__(self) -> None:
-        if self.order not in (1, 2) or not self.order < self.samples <= 50:
+        if self.order not in (1, 2) or not 0.0 < self.window <= MOST_GAP:
             raise ValueError(
-                f"order {self.order} over {self.samples} samples; expected 1 or 2 over more samples than that, 50 at most"
+                f"order {self.order} over a window of {self.window} s; expected 1 or 2, and above 0 to {MOST_GAP} s"
             )
 
 
@@ -77,7 +81,7 @@ class SlopeFilter:
         """Start empty."""
         self.params, self.lag = params, 0.0
         self.acceleration: Vector = (0.0, 0.0, 0.0)
-        self._window: deque[Pose] = deque(maxlen=params.samples)
+        self._window: deque[Pose] = deque(maxlen=MOST_SAMPLES)
 
     def reset(self) -> None:
         """Forget all samples."""
@@ -93,6 +97,8 @@ class SlopeFilter:
         if window and not 0.0 < pose.stamp - window[0].stamp <= MOST_GAP:
             window.clear()
         window.appendleft(pose)
+        while len(window) > self.params.order + 1 and pose.stamp - window[-1].stamp > self.params.window:
+            window.pop()
         vel, rate = pose.vel, pose.rate
         ages = [pose.stamp - sample.stamp for sample in window]
         weights, bends = fit_weights(ages, self.params.order)
