@@ -106,6 +106,7 @@ def _run(args: argparse.Namespace) -> int:
     from hil.flight import fly
     from hil.record import Recorder
     from hil.runner import Runner
+    from hil.sources.opening import open_source
     from visthrow.policy import Policy, find_policy
 
     params = _params(args)
@@ -113,7 +114,7 @@ def _run(args: argparse.Namespace) -> int:
         params = dataclasses.replace(params, backend="dry-run", observe=True)
     folder = Path(args.out or f"runs/hil/{time.strftime('%Y%m%d-%H%M%S')}")
     policy = Policy.load(find_policy(params.policy))
-    source, link, recorded = _source(params, folder, args.speed)
+    source, link, recorded = open_source(params, folder, args.speed)
     clock = ManualClock(source.start) if recorded else MonotonicClock(args.speed)
     backend: Any = DryRun()
     if params.backend == "ardupilot":
@@ -138,25 +139,6 @@ def warm_up(runner: Any) -> None:
     for _ in range(3):
         runner.pilot.act(still, np.array([[0.0, 0.0, 0.0, 1.0]]), still, still, still - [0, 0, 0.4], still[0])
     runner.pilot.start()
-
-
-def _source(params: Any, folder: Path, speed: float) -> tuple[Any, Any, bool]:
-    """Source of poses, the link where there is one, and whether the poses are recorded ones."""
-    from hil.clock import MonotonicClock
-    from hil.device import check_device, open_port
-    from hil.link import Link, TlogWriter
-    from hil.pose import VEHICLE
-    from hil.sources import MavlinkSource, Recorded, read_csv, read_tlog
-
-    wanted = params.source
-    if wanted.kind == "tlog":
-        return Recorded(read_tlog(wanted.file, wanted.senders)), None, True
-    if wanted.kind == "csv":
-        return Recorded(read_csv(wanted.file, wanted.columns, params.frames[VEHICLE].quaternion)), None, True
-    port = open_port(check_device(params.link.device, remote=params.link.remote))
-    folder.mkdir(parents=True, exist_ok=True)
-    link = Link(port, params.link.system, params.link.component, TlogWriter(folder / "link.tlog"))
-    return MavlinkSource(link, wanted.senders, MonotonicClock(speed).now), link, False
 
 
 def _tell(decision: Any) -> None:
@@ -202,13 +184,14 @@ def _check(args: argparse.Namespace) -> int:
     from hil.backends import DryRun
     from hil.clock import ManualClock, MonotonicClock
     from hil.runner import Runner, Words
+    from hil.sources.opening import open_source
     from visthrow.policy import Policy, find_policy
 
     params = _params(args)
     import tempfile
 
     with tempfile.TemporaryDirectory() as folder:
-        source, _, recorded = _source(params, Path(folder), args.speed)
+        source, _, recorded = open_source(params, Path(folder), args.speed)
         clock = ManualClock(source.start) if recorded else MonotonicClock(args.speed)
         runner = Runner(params, Policy.load(find_policy(params.policy)), DryRun())
         begin, seconds = clock.now(), args.seconds or 5.0

@@ -10,9 +10,15 @@ from hil.frames import FrameParams
 from hil.gate import GateParams
 from hil.pose import BODIES, PAYLOAD, VEHICLE
 from hil.safety import CheckParams, FenceParams, GuardParams
-from hil.sources import BodyIds, CsvParams
+from hil.sources import BodyIds, CsvParams, LogBody, MocapParams, RigidBody
 from hil.states import StateParams
 from visthrow.errors import ConfigError
+
+LIVE = ("mavlink", "mocap")
+"""Kinds of source that are no recording."""
+
+ORDERS = {"bin": "wxyz", "ulg": "wxyz", "mocap": "xyzw"}
+"""Order of quaternions of the sources that know only one."""
 
 
 @dataclass(frozen=True)
@@ -29,10 +35,13 @@ class LinkParams:
 class SourceParams:
     """Where poses come from."""
 
-    kind: Literal["mavlink", "tlog", "csv"]
-    file: str | None  # of a tlog or csv
+    kind: Literal["mavlink", "tlog", "csv", "bin", "ulg", "mocap"]
+    file: str | None  # of a recording: tlog, csv, bin or ulg
     senders: tuple[BodyIds, ...]  # of mavlink and tlog
     columns: tuple[CsvParams, ...]  # of csv
+    logs: tuple[LogBody, ...] = ()  # of bin and ulg
+    bodies: tuple[RigidBody, ...] = ()  # of mocap
+    mocap: MocapParams | None = None
 
 
 @dataclass(frozen=True)
@@ -78,9 +87,17 @@ class HilParams:
             raise ConfigError(f"frames of {', '.join(self.frames)}; expected vehicle and payload, goal if it moves")
         if self.throws < 1:
             raise ConfigError(f"throws {self.throws}; expected 1 or more")
-        if self.source.kind != "mavlink" and self.source.file is None:
+        if self.source.kind not in LIVE and self.source.file is None:
             raise ConfigError(f"source.file is none; expected the file of the {self.source.kind} source")
-        if self.backend != "dry-run" and self.source.kind != "mavlink":
+        if self.backend != "dry-run" and self.source.kind not in LIVE:
             raise ConfigError(f"backend {self.backend} with recorded poses ({self.source.kind}); a recording flies dry")
+        if self.source.kind == "mocap" and self.source.mocap is None:
+            raise ConfigError("source.mocap is missing; expected its system and host")
+        written = ORDERS.get(self.source.kind)
+        for name, frames in self.frames.items():
+            if written is not None and frames.quaternion != written:
+                raise ConfigError(
+                    f"frames.{name}.quaternion is '{frames.quaternion}'; a source of kind {self.source.kind} writes '{written}'"
+                )
         if not 0.0 <= self.delay.source <= 0.5:
             raise ConfigError(f"delay.source {self.delay.source} s; expected 0 to 0.5")

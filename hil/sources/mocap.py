@@ -1,0 +1,226 @@
+"""Live poses of motion-capture systems: ``motioncapture`` (Vicon, OptiTrack, Qualisys, VRPN, ...) and ``natnet`` (Motive).
+
+Both packages wait for frames, so each is listened to in a thread of its own, which notes the arrival and hands the poses
+over; polling never waits. Axes are those of the system: Vicon and Qualisys z up, OptiTrack y up; quaternions are xyzw.
+"""
+
+import sys
+import threading
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from hil.clock import Clock
+from hil.device import check_device
+from hil.errors import SourceError
+from hil.link import Link
+from hil.pose import BODIES, Pose
+from hil.sources.logs import load_extra
+from visthrow.errors import ConfigError, suggest
+
+MOST_WAITING = 2000
+"""Poses that are kept between two polls; older ones are dropped."""
+
+
+@dataclass(frozen=True)
+class RigidBody:
+    """What the motion-capture system calls a body.
+
+    Raises:
+        ConfigError: an unknown body, or an empty name.
+    """
+
+    body: str  # "vehicle", "payload" or "goal"
+    name: str  # of the rigid body; for natnet its streaming id
+
+    def __post_init__(self) -> None:
+        if self.body not in BODIES or not self.name:
+            raise ConfigError(f"body '{self.body}' named '{self.name}'; expected one of {', '.join(BODIES)} and a name")
+
+
+@dataclass(frozen=True)
+class MocapParams:
+    """Where the motion-capture system is."""
+
+    # "natnet" through the package natnet, all others through motioncapture; "mock" sends nothing and is for tests.
+    system: Literal[
+        "vicon", "optitrack", "optitrack_closed_source", "qualisys", "nokov", "vrpn", "motionanalysis", "natnet", "mock"
+    ]
+    host: str  # numeric address of the system's computer; link.remote must allow one that is not this machine
+    local: str = "127.0.0.1"  # natnet: address of our own network card
+    multicast: bool = True  # natnet: as Motive's transmission type
+    timeout: float = 5.0  # to connect [s]
+    settings: dict[str, str] = field(default_factory=dict)  # further options of motioncapture.connect
+
+
+class MocapSource:
+    """Poses that a thread hands over; serves the autopilot's link as well where there is one.
+
+    Attributes:
+        failure: what ended the thread, or None; the bodies go stale then, which the runner acts on.
+    """
+
+    ended = False
+
+    def __init__(self, clock: Callable[[], float], link: Link | None = None) -> None:
+        """Take the clock that arrivals are told by, and the link to serve."""
+        self._clock, self._link = clock, link
+        self._waiting: deque[Pose] = deque(maxlen=MOST_WAITING)
+        self.failure: str | None = None
+
+    def hand_over(self, pose: Pose) -> None:
+        """Take a pose; from any thread."""
+        self._waiting.append(pose)
+
+    def poll(self, now: float) -> list[Pose]:
+        """See `hil.sources.base.Source`."""
+        if self._link is not None:
+            self._link.pump(self._clock)
+        return [self._waiting.popleft() for _ in range(len(self._waiting))]
+
+    def wait(self, clock: Clock, until: float) -> None:
+        """See `hil.sources.base.Source`."""
+        while self._link is not None and clock.now() < until:
+            clock.wait_for(self._link.port, until)
+            if not self._link.pump(self._clock):
+                break
+        clock.sleep_until(until)
+
+    def close(self) -> None:
+        """See `hil.sources.base.Source`."""
+        if self._link is not None:
+            self._link.close()
+
+
+class MotionCaptureSource(MocapSource):
+    """Rigid bodies of the package motioncapture, by name. It tells no time: stamps are arrivals."""
+
+    def __init__(
+        self, params: MocapParams, bodies: tuple[RigidBody, ...], clock: Callable[[], float], link: Link | None = None,
+        module: Any = None,
+    ) -> None:  # fmt: skip
+        """Connect.
+
+        Args:
+            params: which system. bodies: names. clock: of the arrivals. link: to serve.
+            module: with the package's ``connect``; left out, the package itself.
+
+        Raises:
+            SourceError: the package is missing, no body is named, or the system does not answer.
+        """
+        super().__init__(clock, link)
+        self._names = _names(bodies)
+        connect = (module or load_extra("motioncapture", "motioncapture")).connect
+        self._stop, self._ready = threading.Event(), threading.Event()
+        # A daemon: waiting for a frame of a system that has gone silent cannot be called off.
+        threading.Thread(target=self._listen, args=(connect, params), name="motioncapture", daemon=True).start()
+        if not self._ready.wait(params.timeout) or self.failure is not None:
+            self._stop.set()
+            raise SourceError(
+                f"{params.system} at {params.host}: {self.failure or f'no answer within {params.timeout:g} s'}; "
+                "expected a motion-capture system that streams"
+            )
+
+    def _listen(self, connect: Callable[[str, dict[str, str]], Any], params: MocapParams) -> None:
+        try:
+            system = connect(params.system, {"hostname": params.host, **params.settings})
+            self._ready.set()
+            while not self._stop.is_set():
+                system.waitForNextFrame()
+                arrival = self._clock()
+                for name, found in system.rigidBodies.items():
+                    if name in self._names:
+                        q = found.rotation
+                        position = tuple(float(x) for x in found.position)
+                        self.hand_over(Pose(arrival, arrival, self._names[name], position, (q.x, q.y, q.z, q.w)))
+        except Exception as error:  # whatever the package raises, the runner sees poses that stop
+            _failed(self, error)
+            self._ready.set()
+
+    def close(self) -> None:
+        """See `hil.sources.base.Source`."""
+        self._stop.set()
+        super().close()
+
+
+class NatNetSource(MocapSource):
+    """Rigid bodies of Motive by streaming id, through the package natnet; stamps are Motive's.
+
+    Attributes:
+        untracked: poses that Motive itself calls not tracked, which it sends on with the last position; dropped.
+    """
+
+    def __init__(
+        self, params: MocapParams, bodies: tuple[RigidBody, ...], clock: Callable[[], float], link: Link | None = None,
+        module: Any = None,
+    ) -> None:  # fmt: skip
+        """Connect; arguments and errors as `MotionCaptureSource`.
+
+        Raises:
+            SourceError: as there; or a name that is no number.
+        """
+        super().__init__(clock, link)
+        wrong = [body.name for body in bodies if not body.name.isdecimal()]
+        if wrong:
+            raise SourceError(f"natnet bodies {', '.join(wrong)}; expected streaming ids, which are numbers")
+        self._names = {int(name): body for name, body in _names(bodies).items()}
+        self.untracked = 0
+        module = module or load_extra("natnet", "natnet")
+        self._client = module.NatNetClient(
+            server_ip_address=params.host, local_ip_address=params.local, use_multicast=params.multicast
+        )
+        self._client.on_data_frame_received_event.handlers.append(self._frame)
+        try:
+            self._client.connect(timeout=params.timeout)
+            self._client.run_async()
+        except Exception as error:  # sockets, time-outs, and the package's own
+            raise SourceError(
+                f"natnet at {params.host} (our address {params.local}, {'multi' if params.multicast else 'uni'}cast): "
+                f"{str(error) or f'no answer within {params.timeout:g} s'}; expected Motive that streams"
+            ) from error
+
+    def _frame(self, frame: Any) -> None:
+        arrival = self._clock()
+        for found in frame.rigid_bodies:
+            body = self._names.get(found.id_num)
+            if body is None:
+                continue
+            if found.tracking_valid is False:  # None before NatNet 2.6, which does not say
+                self.untracked += 1
+                continue
+            self.hand_over(Pose(float(frame.suffix.timestamp), arrival, body, tuple(found.pos), tuple(found.rot)))
+
+    def close(self) -> None:
+        """See `hil.sources.base.Source`."""
+        self._client.shutdown()
+        super().close()
+
+
+def open_mocap(
+    params: MocapParams, bodies: tuple[RigidBody, ...], clock: Callable[[], float], remote: bool, link: Link | None = None
+) -> MocapSource:
+    """Connect to a system.
+
+    Raises:
+        LinkError: the host is no numeric address, or leaves this machine where the config does not allow it.
+        SourceError: see the sources.
+    """
+    check_device(f"tcp:{params.host}:1", remote=remote)
+    kind = NatNetSource if params.system == "natnet" else MotionCaptureSource
+    return kind(params, bodies, clock, link)
+
+
+def _names(bodies: tuple[RigidBody, ...]) -> dict[str, str]:
+    names = {body.name: body.body for body in bodies}
+    if not names or len(names) != len(bodies) or len(set(names.values())) != len(bodies):
+        raise SourceError(
+            f"source.bodies {[(b.body, b.name) for b in bodies]}; expected each body once, with a name of its own. "
+            f"{suggest('', BODIES)}"
+        )
+    return names
+
+
+def _failed(source: MocapSource, error: Exception) -> None:
+    source.failure = f"{type(error).__name__}: {error}"
+    print(f"motion capture stopped: {source.failure}", file=sys.stderr, flush=True)

@@ -1,0 +1,59 @@
+"""Opens the source that a config names."""
+
+from pathlib import Path
+from typing import Any
+
+from hil.clock import MonotonicClock
+from hil.device import check_device, open_port
+from hil.link import Link, TlogWriter
+from hil.params import LIVE, HilParams
+from hil.pose import VEHICLE, Pose
+from hil.sources.base import Recorded
+from hil.sources.csv_file import read_csv
+from hil.sources.dataflash import read_bin
+from hil.sources.mavlink import MavlinkSource, read_tlog
+from hil.sources.mocap import open_mocap
+from hil.sources.ulog import read_ulg
+
+
+def read_poses(params: HilParams) -> list[Pose]:
+    """All raw poses of the recording that a config names.
+
+    Raises:
+        SourceError: the file cannot be read, or is not what the config says.
+    """
+    source = params.source
+    if source.kind == "tlog":
+        return read_tlog(source.file, source.senders)
+    if source.kind == "bin":
+        return read_bin(source.file, source.logs)
+    if source.kind == "ulg":
+        return read_ulg(source.file, source.logs)
+    return read_csv(source.file, source.columns, params.frames[VEHICLE].quaternion)
+
+
+def open_source(params: HilParams, folder: Path, speed: float) -> tuple[Any, Link | None, bool]:
+    """Open a source.
+
+    Args:
+        params: the run.
+        folder: of the run, where a link's .tlog goes.
+        speed: of the clock.
+
+    Returns:
+        Source of poses, the autopilot's link where there is one, and whether the poses are recorded ones.
+
+    Raises:
+        SourceError, LinkError: it cannot be opened; the message says what was expected.
+    """
+    source = params.source
+    if source.kind not in LIVE:
+        return Recorded(read_poses(params)), None, True
+    clock, link = MonotonicClock(speed).now, None
+    if source.kind == "mavlink" or params.backend != "dry-run":
+        port = open_port(check_device(params.link.device, remote=params.link.remote))
+        folder.mkdir(parents=True, exist_ok=True)
+        link = Link(port, params.link.system, params.link.component, TlogWriter(folder / "link.tlog"))
+    if source.kind == "mavlink":
+        return MavlinkSource(link, source.senders, clock), link, False
+    return open_mocap(source.mocap, source.bodies, clock, params.link.remote, link), link, False

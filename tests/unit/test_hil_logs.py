@@ -1,0 +1,177 @@
+"""Autopilot logs as sources: files written byte by byte, each message that carries a pose, damage and wrong files."""
+
+import math
+
+import pytest
+
+from hil.errors import SourceError
+from hil.params import HilParams
+from hil.sources import LogBody, read_bin, read_ulg
+from tests import logfiles as files
+from visthrow import config
+from visthrow.errors import ConfigError
+
+VEHICLE = (LogBody("vehicle", "VISP"),)
+QUARTER = math.sqrt(0.5)
+YAWED = (QUARTER, 0.0, 0.0, QUARTER)
+"""A quarter turn about down, wxyz."""
+
+
+def vision(i, reset=0):
+    return ("VISP", (1_000_000 + 20_000 * i, 5_000_000, 990 + 20 * i, 0.1 * i, 2.0, -1.5, 0.0, 0.0, 90.0, 0, 0, reset, 0, 100))
+
+
+def test_vision_poses_of_a_bin_with_stamps_of_their_own(tmp_path):
+    path = tmp_path / "a.BIN"
+    files.write_bin(path, {"VISP": files.VISP}, [vision(i, int(i >= 3)) for i in range(5)])
+    poses = read_bin(path, VEHICLE)
+    assert [pose.stamp for pose in poses] == pytest.approx([0.99, 1.01, 1.03, 1.05, 1.07])
+    assert [pose.arrival for pose in poses] == pytest.approx([0.0, 0.02, 0.04, 0.06, 0.08])
+    assert poses[2].pos == pytest.approx((0.2, 2.0, -1.5))
+    assert poses[2].quat == pytest.approx(YAWED)
+    assert [pose.reset for pose in poses] == [0, 0, 0, 1, 1]
+    files.write_bin(path, {"VISP": files.VISP_OLD}, [(name, values[:-1]) for name, values in (vision(i) for i in range(2))])
+    assert read_bin(path, VEHICLE)[1].quat == pytest.approx(YAWED), "names of before 4.3"
+
+
+def test_an_estimate_is_that_of_one_core(tmp_path):
+    path = tmp_path / "a.BIN"
+    rows = [
+        ("XKF1", (1000 * i, core, 0.0, 0.0, 90.0, 1.0, 2.0, 3.0, 0.0, 0.5 + core, 0.25, -1.0, 0, 0, 0, 0))
+        for i in range(4) for core in (0, 1)
+    ]  # fmt: skip
+    files.write_bin(path, {"XKF1": files.XKF1}, rows)
+    poses = read_bin(path, (LogBody("vehicle", "XKF1", instance=1),))
+    assert len(poses) == 4
+    assert (poses[0].pos, poses[0].vel) == ((1.5, 0.25, -1.0), (1.0, 2.0, 3.0))
+    assert poses[0].quat == pytest.approx(YAWED)
+    with pytest.raises(SourceError, match=r"XKF1 \(instance 2\) holds no pose"):
+        read_bin(path, (LogBody("vehicle", "XKF1", instance=2),))
+    with pytest.raises(SourceError, match="no VISP in this log; of the messages with poses it has: XKF1"):
+        read_bin(path, VEHICLE)
+    with pytest.raises(SourceError, match="'ATT' of the vehicle carries no pose; known: NKF1, POS, VISP, XKF1"):
+        read_bin(path, (LogBody("vehicle", "ATT"),))
+
+
+def test_a_place_on_the_globe_becomes_metres_from_the_origin(tmp_path):
+    path = tmp_path / "a.BIN"
+    metre = math.degrees(1.0 / 6378100.0)
+    rows = [
+        ("POS", (900_000, 47.0, 8.0, 500.0, 1.0, 1.5)),  # before any attitude: no pose
+        ("ORGN", (950_000, 1, 46.0, 8.0, 400.0)),  # home is not the origin
+        ("ORGN", (960_000, 0, 47.0, 8.0, 498.5)),
+        ("ATT", (990_000, 0.0, 0.0, 0.0, 0.0, 0.0, 90.0)),
+        ("POS", (1_000_000, 47.0 + 3 * metre, 8.0 + 2 * metre / math.cos(math.radians(47.0)), 500.0, 1.0, 1.5)),
+        ("POS", (1_200_000, 47.0, 8.0, 500.0, 1.0, 1.5)),  # the attitude is too old
+    ]
+    files.write_bin(path, {"POS": files.POS, "ATT": files.ATT, "ORGN": files.ORGN}, rows)
+    (pose,) = read_bin(path, (LogBody("vehicle", "POS"),))
+    assert pose.pos == pytest.approx((3.0, 2.0, -1.5), abs=0.02), "1e-7 deg are 11 mm"
+    assert pose.quat == pytest.approx(YAWED)
+
+
+def test_damage_in_a_bin_costs_a_few_messages(tmp_path):
+    path = tmp_path / "a.BIN"
+    files.write_bin(path, {"VISP": files.VISP}, [vision(i) for i in range(50)])
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2 : len(data) // 2 + 40] = b"\x00" * 40
+    path.write_bytes(data[:-20])
+    assert 40 <= len(read_bin(path, VEHICLE)) < 50
+
+
+def test_loggers_of_two_bodies_are_joined_by_a_stated_offset(tmp_path):
+    one, two = tmp_path / "a.BIN", tmp_path / "b.BIN"
+    for path in (one, two):
+        files.write_bin(path, {"VISP": files.VISP}, [vision(i) for i in range(3)])
+    bodies = (LogBody("vehicle", "VISP"), LogBody("payload", "VISP", file=str(two), time_offset=-0.5))
+    poses = read_bin(one, bodies)
+    assert {p.body: round(p.arrival, 6) for p in reversed(poses)} == {"payload": 0.0, "vehicle": 0.5}
+
+
+ODOMETRY = ["uint64_t timestamp", "uint64_t timestamp_sample", "float[3] position", "float[4] q", "float[3] velocity",
+            "float[3] angular_velocity", "uint8_t velocity_frame", "uint8_t reset_counter"]  # fmt: skip
+NAN = math.nan
+
+
+def odometry(i, velocity=(1.0, 0.0, 0.0), frame=3, quat=YAWED):
+    stamp = 1_000_000 + 10_000 * i
+    return (stamp + 4_000, stamp, 0.5 * i, 2.0, -1.0, *quat, *velocity, 0.1, 0.2, 0.3, frame, 7)
+
+
+def test_external_poses_of_a_ulg(tmp_path):
+    pytest.importorskip("pyulog")
+    path = tmp_path / "a.ulg"
+    rows = [odometry(0), odometry(1, frame=1), odometry(2, (NAN,) * 3), odometry(3, quat=(NAN,) * 4)]
+    files.write_ulg(path, {("vehicle_visual_odometry", 0): (ODOMETRY, rows)})
+    poses = read_ulg(path, (LogBody("vehicle", "vehicle_visual_odometry"),))
+    assert [pose.stamp for pose in poses] == pytest.approx([1.0, 1.01, 1.02, 1.03])
+    assert [pose.arrival for pose in poses] == pytest.approx([0.0, 0.01, 0.02, 0.03])
+    assert poses[1].pos == pytest.approx((0.5, 2.0, -1.0))
+    assert poses[0].quat == pytest.approx(YAWED, abs=1e-6)
+    assert poses[0].vel == pytest.approx((0.0, 1.0, 0.0), abs=1e-6), "of the body, turned into the world"
+    assert poses[1].vel == pytest.approx((1.0, 0.0, 0.0)), "of the world already"
+    assert (poses[2].vel, poses[3].quat) == (None, None), "NaN is PX4's word for unknown"
+    assert poses[0].rate == pytest.approx((0.1, 0.2, 0.3))
+    assert poses[0].reset == 7
+
+
+def test_the_estimate_of_a_ulg_takes_the_attitude_before_it(tmp_path):
+    pytest.importorskip("pyulog")
+    path = tmp_path / "a.ulg"
+    local = ["uint64_t timestamp", "float x", "float y", "float z", "float vx", "float vy", "float vz",
+             "uint8_t xy_reset_counter", "uint8_t z_reset_counter"]  # fmt: skip
+    places = [(1_000_000 + 20_000 * i, 0.1 * i, 2.0, -1.0, 5.0, 0.0, 0.0, 1, i // 2) for i in range(4)]
+    turns = [(990_000, *YAWED), (1_018_000, 1.0, 0.0, 0.0, 0.0)]
+    rates = [(1_015_000, 0.1, 0.2, 0.3)]
+    topics = {
+        ("vehicle_local_position", 0): (local, places),
+        ("vehicle_attitude", 0): (["uint64_t timestamp", "float[4] q"], turns),
+        ("vehicle_angular_velocity", 0): (["uint64_t timestamp", "float[3] xyz"], rates),
+    }
+    files.write_ulg(path, topics)
+    poses = read_ulg(path, (LogBody("vehicle", "vehicle_local_position"),))
+    assert [pose.quat[0] for pose in poses] == pytest.approx([QUARTER, 1.0, 1.0, 1.0])
+    assert [pose.rate is None for pose in poses] == [True, False, False, False]
+    assert [pose.reset for pose in poses] == [1, 1, 2, 2]
+    with pytest.raises(SourceError, match=r"no vehicle_odometry 0 in this log.*vehicle_local_position 0"):
+        read_ulg(path, (LogBody("vehicle", "vehicle_odometry"),))
+    del topics["vehicle_attitude", 0]
+    files.write_ulg(path, topics)
+    with pytest.raises(SourceError, match="gives no attitude"):
+        read_ulg(path, (LogBody("vehicle", "vehicle_local_position"),))
+
+
+@pytest.mark.parametrize("content", [b"", b"\x00" * 500, b"ULog\x01\x12\x35\x01" + b"\xff" * 40, b"t,x\n1,2\n"])
+def test_files_that_are_no_log(tmp_path, content, capfd):
+    path = tmp_path / "x"
+    path.write_bytes(content)
+    with pytest.raises(SourceError, match=r"expected a dataflash log \(\.BIN\)"):
+        read_bin(path, VEHICLE)
+    with pytest.raises(SourceError, match="cannot be read"):
+        read_bin(tmp_path / "none.BIN", VEHICLE)
+    pytest.importorskip("pyulog")
+    with pytest.raises(SourceError, match=r"\.ulg|no vehicle_odometry 0 in this log"):
+        read_ulg(path, (LogBody("vehicle", "vehicle_odometry"),))
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_missing_package_names_its_extra(tmp_path, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "pyulog", None)
+    with pytest.raises(SourceError, match=r"pip install 'visthrow\[logs\]'"):
+        read_ulg(tmp_path / "a.ulg", (LogBody("vehicle", "vehicle_odometry"),))
+
+
+LOG = ('source.kind="bin"', 'source.file="a.BIN"', 'source.logs=[{body="vehicle", message="VISP"}]')
+
+
+def test_configs_of_logs():
+    loaded = config.load(HilParams, config.find("hil", "dry_run"), LOG)
+    assert loaded.source.logs == VEHICLE
+    for overrides, message in (
+        ((*LOG, 'frames.vehicle.quaternion="xyzw"'), "kind bin writes 'wxyz'"),
+        ((*LOG, 'backend="ardupilot"'), "a recording flies dry"),
+        (LOG[:1], "expected the file of the bin source"),
+        ((*LOG[:2], 'source.logs=[{body="drone", message="VISP"}]'), "known: goal, payload, vehicle"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            config.load(HilParams, config.find("hil", "dry_run"), overrides)

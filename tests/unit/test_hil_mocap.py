@@ -1,0 +1,178 @@
+"""Motion-capture packages: stand-ins with the packages' own faces, and these faces against the packages where they are."""
+
+import threading
+import time
+from types import SimpleNamespace
+
+import pytest
+
+from hil.errors import LinkError, SourceError
+from hil.params import HilParams
+from hil.sources import MocapParams, RigidBody, open_mocap
+from hil.sources.mocap import MotionCaptureSource, NatNetSource
+from visthrow import config
+from visthrow.errors import ConfigError
+
+BODIES = (RigidBody("vehicle", "quad"), RigidBody("payload", "ball"))
+PARAMS = MocapParams("vicon", "127.0.0.1", timeout=1.0)
+
+
+def body(x, y=0.0):
+    """As motioncapture.RigidBody; its position is an array, its rotation has x, y, z, w."""
+    return SimpleNamespace(name="", position=[x, y, 1.0], rotation=SimpleNamespace(x=0.1, y=0.2, z=0.3, w=0.9))
+
+
+class System:
+    """As motioncapture.MotionCapture: frames come when the test says so."""
+
+    def __init__(self, frames):
+        self._frames, self.rigidBodies, self.next = iter(frames), {}, threading.Semaphore(0)
+
+    def waitForNextFrame(self):
+        self.next.acquire()
+        self.rigidBodies = next(self._frames)
+
+
+def eventually(condition):
+    deadline = time.monotonic() + 20.0
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.002)
+
+
+def test_rigid_bodies_by_name_from_a_thread_of_their_own():
+    frames = [{"quad": body(1.0), "other": body(9.0)}, {"ball": body(2.0), "quad": body(1.5)}]
+    system, asked, now = System(frames), [], [5.0]
+    module = SimpleNamespace(connect=lambda *args: asked.append(args) or system)
+    params = MocapParams("qualisys", "127.0.0.1", settings={"port": "22223"})
+    source = MotionCaptureSource(params, BODIES, lambda: now[0], module=module)
+    assert asked == [("qualisys", {"hostname": "127.0.0.1", "port": "22223"})]
+    assert source.poll(0.0) == [], "polling never waits"
+    system.next.release()
+    eventually(lambda: source._waiting)
+    now[0] = 6.0
+    system.next.release()
+    eventually(lambda: len(source._waiting) == 3)
+    first, *second = source.poll(0.0)
+    assert (first.body, first.pos, first.quat) == ("vehicle", (1.0, 0.0, 1.0), (0.1, 0.2, 0.3, 0.9))
+    assert first.stamp == first.arrival == 5.0
+    assert [(pose.body, pose.arrival) for pose in second] == [("payload", 6.0), ("vehicle", 6.0)]
+    system.next.release()  # the third frame does not exist: the package raises
+    eventually(lambda: source.failure)
+    assert "StopIteration" in source.failure
+    assert source.poll(0.0) == []
+    source.close()
+
+
+def test_a_system_that_does_not_answer_or_refuses():
+    hanging = SimpleNamespace(connect=lambda *args: time.sleep(5.0))
+    quick = MocapParams("vicon", "127.0.0.1", timeout=0.05)
+    with pytest.raises(SourceError, match=r"vicon at 127.0.0.1: no answer within 0.05 s"):
+        MotionCaptureSource(quick, BODIES, time.monotonic, module=hanging)
+
+    def refuse(*args):
+        raise RuntimeError("Unknown motion capture type!")
+
+    with pytest.raises(SourceError, match="Unknown motion capture type"):
+        MotionCaptureSource(PARAMS, BODIES, time.monotonic, module=SimpleNamespace(connect=refuse))
+
+
+class Client:
+    """As natnet.NatNetClient."""
+
+    def __init__(self, server_ip_address="", local_ip_address="", use_multicast=True, answers=True):
+        self.address, self.answers, self.running = (server_ip_address, local_ip_address, use_multicast), answers, False
+        self.on_data_frame_received_event = SimpleNamespace(handlers=[])
+
+    def connect(self, timeout=5.0):
+        if not self.answers:
+            raise TimeoutError
+
+    def run_async(self):
+        self.running = True
+
+    def shutdown(self):
+        self.running = False
+
+
+def frame(*rows, stamp=3.5):
+    """As natnet.DataFrame."""
+    bodies = [SimpleNamespace(id_num=i, pos=(x, 1.0, 0.0), rot=(0.0, 0.0, 0.0, 1.0), tracking_valid=ok) for i, x, ok in rows]
+    return SimpleNamespace(rigid_bodies=tuple(bodies), suffix=SimpleNamespace(timestamp=stamp))
+
+
+IDS = (RigidBody("vehicle", "7"), RigidBody("payload", "8"))
+
+
+def test_natnet_by_streaming_id_drops_what_motive_does_not_track():
+    clients = []
+    module = SimpleNamespace(NatNetClient=lambda **kwargs: clients.append(Client(**kwargs)) or clients[-1])
+    source = NatNetSource(MocapParams("natnet", "127.0.0.1", multicast=False), IDS, lambda: 9.0, module=module)
+    (client,) = clients
+    assert client.running
+    assert client.address == ("127.0.0.1", "127.0.0.1", False)
+    (hear,) = client.on_data_frame_received_event.handlers
+    hear(frame((7, 0.5, True), (8, 0.7, False), (9, 3.0, True)))
+    hear(frame((8, 0.8, None)))
+    assert [(p.body, p.pos, p.stamp, p.arrival) for p in source.poll(0.0)] == [
+        ("vehicle", (0.5, 1.0, 0.0), 3.5, 9.0), ("payload", (0.8, 1.0, 0.0), 3.5, 9.0),
+    ]  # fmt: skip
+    assert source.untracked == 1
+    source.close()
+    assert not client.running
+
+
+def test_natnet_that_does_not_answer():
+    module = SimpleNamespace(NatNetClient=lambda **kwargs: Client(**kwargs, answers=False))
+    with pytest.raises(SourceError, match=r"natnet at 127.0.0.1 .*multicast\): no answer within 1 s"):
+        NatNetSource(MocapParams("natnet", "127.0.0.1", timeout=1.0), IDS, time.monotonic, module=module)
+    with pytest.raises(SourceError, match="natnet bodies quad, ball; expected streaming ids"):
+        NatNetSource(MocapParams("natnet", "127.0.0.1"), BODIES, time.monotonic, module=module)
+
+
+def test_wrong_names_hosts_and_missing_packages(monkeypatch):
+    with pytest.raises(SourceError, match="expected each body once"):
+        open_mocap(PARAMS, (BODIES[0], RigidBody("payload", "quad")), time.monotonic, False)
+    with pytest.raises(LinkError, match="leaves this machine; set link"):
+        open_mocap(MocapParams("vicon", "192.168.1.9"), BODIES, time.monotonic, False)
+    with pytest.raises(LinkError, match="refused"):
+        open_mocap(MocapParams("vicon", "vicon.local"), BODIES, time.monotonic, True)
+    for system, package, bodies in (("vicon", "motioncapture", BODIES), ("natnet", "natnet", IDS)):
+        monkeypatch.setitem(__import__("sys").modules, package, None)
+        with pytest.raises(SourceError, match=rf"pip install 'visthrow\[{package}\]'"):
+            open_mocap(MocapParams(system, "127.0.0.1"), bodies, time.monotonic, False)
+
+
+def test_configs_of_mocap():
+    mocap = 'source.mocap={system="vicon", host="127.0.0.1"}'
+    overrides = ['source.kind="mocap"', *(f'frames.{name}.quaternion="xyzw"' for name in ("vehicle", "payload"))]
+    bodies = 'source.bodies=[{body="vehicle", name="quad"}]'
+    loaded = config.load(HilParams, config.find("hil", "dry_run"), [*overrides, mocap, bodies, 'backend="ardupilot"'])
+    assert loaded.source.mocap.host == "127.0.0.1"
+    assert config.loads(HilParams, config.dumps(loaded)) == loaded
+    for wrong, message in (
+        (overrides, "source.mocap is missing"),
+        (overrides[:1] + [mocap], "kind mocap writes 'xyzw'"),
+        ([*overrides, mocap.replace("vicon", "kinect")], "one of 'vicon'"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            config.load(HilParams, config.find("hil", "dry_run"), wrong)
+
+
+def test_the_stand_in_has_the_face_of_motioncapture():
+    real = pytest.importorskip("motioncapture")
+    assert {"waitForNextFrame", "rigidBodies"} <= set(dir(real.MotionCapture))
+    assert {"name", "position", "rotation"} <= set(dir(real.RigidBody))
+    assert {"x", "y", "z", "w"} <= set(dir(real.Quaternion))
+    source = open_mocap(MocapParams("mock", "127.0.0.1"), BODIES, time.monotonic, False)
+    assert source.poll(0.0) == []
+    source.close()
+
+
+def test_the_stand_in_has_the_face_of_natnet():
+    real = pytest.importorskip("natnet")
+    client = real.NatNetClient(server_ip_address="127.0.0.1", local_ip_address="127.0.0.1", use_multicast=False)
+    assert client.on_data_frame_received_event.handlers == []
+    assert {"connect", "run_async", "shutdown"} <= set(dir(client))
+    fields = real.DataFrame.__dataclass_fields__
+    assert {"rigid_bodies", "suffix"} <= set(fields)
