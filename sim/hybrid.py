@@ -47,22 +47,28 @@ def tether_lengths(rope: RopeParams, z: RandomizationParams) -> list[RopeParams]
 
 
 def rope_variants(rope: RopeParams, z: RandomizationParams) -> list[RopeParams]:
-    """:func:`tether_lengths`, each with ``payload_variants`` masses of the payload that span +-``payload_spread``.
+    """:func:`tether_lengths` with every combination of ``payload_variants`` masses and as many drags of the payload.
 
-    The payload keeps its size, so its inertia goes with its mass. Entry e has cable ``e % tether_variants``.
+    They span +-``payload_spread`` and +-``drag_spread``; a spread of 0 leaves one. The payload keeps its size, so its
+    inertia goes with its mass. Environment e gets entry ``e % len(...)``, whose cable is ``e % tether_variants``.
     """
-    if z.payload_variants < 1 or not 0.0 <= z.payload_spread < 1.0:
-        raise ValueError(
-            f"payload_variants {z.payload_variants}, payload_spread {z.payload_spread}: expected 1 or more, and 0 to below 1"
-        )
-    ropes = tether_lengths(rope, z)
-    if z.payload_variants == 1:
-        return ropes
-    factors = np.linspace(1 - z.payload_spread, 1 + z.payload_spread, z.payload_variants)
+    spreads = {"payload_spread": z.payload_spread, "drag_spread": z.drag_spread}
+    if z.payload_variants < 1 or not all(0.0 <= spread < 1.0 for spread in spreads.values()):
+        raise ValueError(f"payload_variants {z.payload_variants}, {spreads}: expected 1 or more, and 0 to below 1")
+    masses, drags = (
+        [1.0] if spread == 0.0 or z.payload_variants == 1 else np.linspace(1 - spread, 1 + spread, z.payload_variants)
+        for spread in spreads.values()
+    )
     return [
-        dataclasses.replace(r, payload_mass=r.payload_mass * float(f), payload_inertia=r.payload_inertia * float(f))
-        for f in factors
-        for r in ropes
+        dataclasses.replace(
+            r,
+            payload_mass=r.payload_mass * float(m),
+            payload_inertia=r.payload_inertia * float(m),
+            payload_drag=r.payload_drag * float(d),
+        )
+        for d in drags
+        for m in masses
+        for r in tether_lengths(rope, z)
     ]
 
 

@@ -280,5 +280,6 @@ class RandomizationParams:
     tether_spread: float  # the lengths span +- this fraction
     battery_used: float  # fraction of charge used is drawn from 0 to this
     goal_radius: float  # goals are uniform on a ground disk of this radius about the spawn point [m]
-    payload_variants: int = 1  # number of payload masses, in every combination with the cable lengths
+    payload_variants: int = 1  # number of payload masses, and of drags, in every combination with the cable lengths
     payload_spread: float = 0.0  # the masses span +- this fraction
+    drag_spread: float = 0.0  # the payload's drags span +- this fraction

@@ -1,8 +1,9 @@
 """A policy together with the experiment that it is flown in."""
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from visthrow import config, toml_text
 from visthrow.errors import PolicyError
@@ -12,20 +13,28 @@ from visthrow.task import Experiment, contract_of
 
 @dataclass(frozen=True)
 class Loaded:
-    """A policy, what to call it, and the experiment (plant, camera, task) that it is flown in."""
+    """A policy, what to call it, and the experiment (plant, camera, task) that it is flown in.
+
+    Attributes:
+        departures: where that experiment breaks the policy's contract by allowance: dotted key -> the value flown with.
+    """
 
     name: str
     policy: Policy
     experiment: Experiment
+    departures: dict[str, Any] = field(default_factory=dict)
 
 
-def load_policy(name: str | Path, config_name: str | None = None, overrides: Iterable[str] = ()) -> Loaded:
+def load_policy(
+    name: str | Path, config_name: str | None = None, overrides: Iterable[str] = (), allow: Collection[str] = ()
+) -> Loaded:
     """Load a policy and the experiment that it was trained in, or another one that fits its contract.
 
     Args:
         name: of a shipped policy, or a file.
         config_name: a config of ``configs/train`` to fly in instead of the policy's own.
         overrides: ``key=value`` changes of that config.
+        allow: parts of the contract that may be broken, as of :meth:`visthrow.policy.Policy.require`.
 
     Raises:
         PolicyError: no such policy, or it does not carry its config and none was named.
@@ -41,8 +50,8 @@ def load_policy(name: str | Path, config_name: str | None = None, overrides: Ite
         experiment = config.loads(Experiment, text, overrides, name=f"{path} (the config it was trained with)")
     else:
         raise PolicyError(f"{path} does not carry the config it was trained with; name one with --config")
-    policy.require(contract_of(experiment))
-    return Loaded(path.stem if path.stem != "policy" else path.resolve().parent.name, policy, experiment)
+    departures = policy.require(contract_of(experiment), allow=allow)
+    return Loaded(path.stem if path.stem != "policy" else path.resolve().parent.name, policy, experiment, departures)
 
 
 def _learning(policy: Policy) -> dict:

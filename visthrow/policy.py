@@ -12,6 +12,7 @@ and figures; nothing depends on it.
 
 import json
 import math
+import re
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -126,24 +127,36 @@ class Policy:
             self.eps,
         )
 
-    def require(self, contract_now: Mapping[str, Any], sections: Collection[str] | None = None) -> None:
+    def require(
+        self, contract_now: Mapping[str, Any], sections: Collection[str] | None = None, allow: Collection[str] = ()
+    ) -> dict[str, Any]:
         """Refuse to serve under other conditions than those of the training.
 
         Args:
             contract_now: The conditions here, as the training wrote them.
             sections: Top-level keys to compare; all if None.
+            allow: Keys of tables or values that may differ, ``("vehicle", "observation.latency")``: an experiment's
+                stated departures from the training.
+
+        Returns:
+            What differs by allowance: dotted key -> the value here, None where there is nothing.
 
         Raises:
-            MismatchError: Naming every key that differs, with both values.
+            MismatchError: Naming every key that differs without allowance, with both values.
         """
         trained, now = _flat(self.contract, sections), _flat(contract_now, sections)
-        differences = [
-            f"  {key}: trained with {_show(trained, key)}, here {_show(now, key)}"
+        differing = [
+            key
             for key in sorted(trained.keys() | now.keys())
             if not _same(trained.get(key, _ABSENT), now.get(key, _ABSENT))
         ]
-        if differences:
-            raise MismatchError("the policy was trained under other conditions:\n" + "\n".join(differences))
+        allowed = [key for key in differing if any(re.match(rf"{re.escape(name)}(?![^.\[])", key) for name in allow)]
+        refused = [
+            f"  {key}: trained with {_show(trained, key)}, here {_show(now, key)}" for key in differing if key not in allowed
+        ]
+        if refused:
+            raise MismatchError("the policy was trained under other conditions:\n" + "\n".join(refused))
+        return {key: now.get(key) for key in allowed}
 
     def save(self, path: str | Path) -> None:
         """Write the policy file, whole or not at all.

@@ -66,7 +66,7 @@ class Throws:
 def hover_start(experiment: Experiment) -> Experiment:
     """The experiment with its episodes started from hover; cables and payloads vary as in the experiment."""
     start = config.load(RandomizationParams, config.find("start", "hover"))
-    kept = ("tether_variants", "tether_spread", "payload_variants", "payload_spread")
+    kept = ("tether_variants", "tether_spread", "payload_variants", "payload_spread", "drag_spread")
     start = dataclasses.replace(start, **{name: getattr(experiment.task.start, name) for name in kept})
     return dataclasses.replace(experiment, task=dataclasses.replace(experiment.task, start=start))
 
