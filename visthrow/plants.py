@@ -5,6 +5,7 @@ from typing import Protocol
 
 import numpy as np
 
+from sim.params import RandomizationParams
 from visthrow import config
 from visthrow.errors import ConfigError, suggest
 from visthrow.loose_rope import LooseRope
@@ -85,6 +86,7 @@ class HybridPlant:
         device: str = "cpu",
         noise: NoiseParams | None = None,
         latency: tuple[float, float] = (0.0, 0.0),
+        start: RandomizationParams | None = None,
     ) -> None:
         """Build the simulator.
 
@@ -95,18 +97,32 @@ class HybridPlant:
             device: "cpu" or "cuda:0".
             noise: of the measurements, in each quantity's SI unit as in training; None for none.
             latency: range that each vehicle's age of measurements is drawn from at a reset [s].
+            start: with it, vehicles, ropes and starts are those of :func:`visthrow.protocol.throw` with the same seed and
+                start, and commands are disturbed as in training.
         """
-        from sim.hybrid import HybridSim
+        from sim.hybrid import HybridSim, tether_lengths
 
         self.params, self.count, self.noise, self.latency = plant_of(experiment), count, noise, latency
         self.period = self.params.sim.control_period
-        self._sim = HybridSim(self.params, count, device)
+        self._start, self._action = start, experiment.task.action
+        ropes = None if start is None else tether_lengths(self.params.rope, start)
+        self._sim = HybridSim(self.params, count, device, seed, ropes=ropes)
         self._rng = np.random.default_rng(seed)
-        self.reset(np.tile([0.0, 0.0, experiment.task.start.spawn_height], (count, 1)))
+        self._command_bias = np.zeros((count, 4))
+        if start is None:
+            self.reset(np.tile([0.0, 0.0, experiment.task.start.spawn_height], (count, 1)))
+        else:
+            self._sim.randomize(start)
+            self._sim.randomize(start)  # as ThrowEnv, which draws once when it is built and once when it is reset
+            self._command_bias = noise.command_bias * self._rng.standard_normal((count, 4))
+            self._begin()
 
     def reset(self, pos_w: np.ndarray, cable_dir_w: np.ndarray | None = None) -> None:
         """See `Plant`."""
         self._sim.place(pos_w=pos_w, cable_dir_w=cable_dir_w)
+        self._begin()
+
+    def _begin(self) -> None:
         self.time = 0.0
         count = self.count
         self._latched, self._separation = np.zeros(count, bool), np.full(count, np.nan)
@@ -120,7 +136,7 @@ class HybridPlant:
         """See `Plant`."""
         release = np.broadcast_to(np.asarray(release, dtype=bool), (self.count,))
         self._before = self.state
-        self._sim.set_command(command, release)
+        self._sim.set_command(command if self._start is None else self._disturbed(command), release)
         self._sim.step()
         self._latched = self._latched | release
         separated = self._sim.get("separated") != 0
@@ -135,6 +151,17 @@ class HybridPlant:
                 if self.period - inside > 1e-6:
                     self._ropes[e].fly(self.period - inside)
         self.time += self.period
+
+    def _disturbed(self, command: np.ndarray) -> np.ndarray:
+        """Commands with the training's noise, which is on their normalised form."""
+        import torch
+
+        from visthrow import actions as act
+
+        most, rates = self._action.max_thrust, torch.tensor(self._action.max_rate, dtype=torch.float64)
+        action = act.action_from_command(torch.from_numpy(np.asarray(command, dtype=float)), most, rates)
+        error = self._command_bias + self.noise.command_step * self._rng.standard_normal((self.count, 4))
+        return act.command_from_action(action + torch.from_numpy(error), most, rates).numpy()
 
     def _let_go(self, e: int) -> LooseRope:
         """Rope of one plant at separation: the simulator keeps its directions and rates of that instant."""

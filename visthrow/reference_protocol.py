@@ -20,12 +20,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sim.params import RandomizationParams
 from visthrow import config
 from visthrow.errors import ConfigError
 from visthrow.hover import HoverController, HoverParams
 from visthrow.loading import Loaded
 from visthrow.pilot import Pilot
-from visthrow.plants import Snapshot, make_plant, random_ropes
+from visthrow.plants import Plant, Snapshot, make_plant, random_ropes
 from visthrow.task import Experiment, plant_of
 
 if TYPE_CHECKING:
@@ -93,6 +94,25 @@ def failures(experiment: Experiment, now: Snapshot, elapsed: float) -> list[str 
     return found
 
 
+def batch_plant(
+    experiment: Experiment, plant_name: str, target: float, batch: int, count: int, seed: int
+) -> tuple[Plant, np.random.Generator]:
+    """Plant of one batch, and the generator of its starts: the same for whoever throws."""
+    seeds = np.random.SeedSequence([seed, round(1000 * target), batch])
+    return make_plant(plant_name, experiment, count, int(seeds.generate_state(1)[0])), np.random.default_rng(seeds)
+
+
+def place_in_hover(
+    plant: Plant, experiment: Experiment, start: RandomizationParams, rng: np.random.Generator
+) -> np.ndarray:
+    """Put the vehicles where a pilot's hover holds them; returns the place they are held at [m], shape (3,)."""
+    home = np.array([0.0, 0.0, start.spawn_height])
+    spread = np.array(start.position) * rng.uniform(-1.0, 1.0, (plant.count, 3))
+    ropes = random_ropes(rng, plant.count, experiment.rope.segments, math.radians(start.cable_angle_deg))
+    plant.reset(home + spread, ropes)
+    return home
+
+
 def fly_batch(loaded: Sequence[Loaded], plant_name: str, job: Job, tick: Any = None) -> dict[str, np.ndarray]:
     """Fly one batch.
 
@@ -107,9 +127,7 @@ def fly_batch(loaded: Sequence[Loaded], plant_name: str, job: Job, tick: Any = N
     """
     flown = [loaded[i] for i in job.policies]
     experiment, count = flown[0].experiment, job.count * len(flown)
-    seed = np.random.SeedSequence([job.seed, round(1000 * job.target), job.batch])
-    rng = np.random.default_rng(seed)
-    plant = make_plant(plant_name, experiment, count, int(seed.generate_state(1)[0]))
+    plant, rng = batch_plant(experiment, plant_name, job.target, job.batch, count, job.seed)
     flight = _Batch(flown, plant, job.target, rng)
     steps = round(HOVER_TIME / plant.period)
     expected = steps + round(1.3 / plant.period)
@@ -133,15 +151,10 @@ class _Batch:
 
     def __init__(self, loaded: list[Loaded], plant, target: float, rng: np.random.Generator) -> None:
         experiment = self.experiment = loaded[0].experiment
-        from sim.params import RandomizationParams
-
         start = config.load(RandomizationParams, config.find("start", "hover"))
         self.plant, self.count = plant, plant.count
-        self.home = np.array([0.0, 0.0, start.spawn_height])
+        self.home = place_in_hover(plant, experiment, start, rng)
         self.goal_w = np.tile([target, 0.0, 0.0], (self.count, 1))
-        spread = np.array(start.position) * rng.uniform(-1.0, 1.0, (self.count, 3))
-        ropes = random_ropes(rng, self.count, experiment.rope.segments, math.radians(start.cable_angle_deg))
-        plant.reset(self.home + spread, ropes)
         share = self.count // len(loaded)
         self.slices = [slice(i * share, (i + 1) * share) for i in range(len(loaded))]
         self.pilots = [Pilot(item.policy, _camera_of(item), share) for item in loaded]

@@ -9,6 +9,7 @@ motors) through its own model under the commands on their way, and trips the lat
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,9 +22,12 @@ from visthrow.baseline.plan import Plan
 from visthrow.baseline.release import landing_point
 from visthrow.errors import ConfigError, suggest
 from visthrow.hover import HoverController, HoverParams, rot_from_quat
-from visthrow.plants import Snapshot, make_plant, random_ropes
-from visthrow.reference_protocol import FALL_TIME, HOVER_TIME, failures
+from visthrow.plants import HybridPlant, Plant, Snapshot
+from visthrow.reference_protocol import FALL_TIME, FIELDS, HOVER_TIME, batch_plant, failures, place_in_hover
 from visthrow.task import Experiment, plant_of
+
+if TYPE_CHECKING:
+    from visthrow.protocol import Throws
 
 FINE = 4
 """Runge-Kutta steps of the flown pendulum in one control period; the controller predicts with one."""
@@ -43,6 +47,8 @@ class Flown:
         position_error: of the payload at separation against the planned release [m], shape (N,).
         velocity_error: the same [m/s], shape (N,).
         tracking: root mean square distance of the payload from the path until the release [m], shape (N,).
+        smoothness: root mean square change of the normalised commands from step to step, shape (N,).
+        clearance: least distance of the payload from the vehicle after separation [m], shape (N,); NaN in the own model.
         step_times: of all steps of the controller [s], shape (K,).
     """
 
@@ -53,7 +59,15 @@ class Flown:
     position_error: np.ndarray
     velocity_error: np.ndarray
     tracking: np.ndarray
+    smoothness: np.ndarray
+    clearance: np.ndarray
     step_times: np.ndarray
+
+    def throws(self, target: float) -> "Throws":
+        """The same as learnt policies are scored."""
+        from visthrow.protocol import Throws
+
+        return Throws(target, **{name: getattr(self, name) for name in FIELDS})
 
     def summary(self) -> dict[str, float]:
         """Mean and deviation of the successful throws; times of a step in ms."""
@@ -67,14 +81,42 @@ class Flown:
         return out
 
 
-def _flown(plan: Plan, good: np.ndarray, pos_w, vel_w, landing_w, duration, tracking, step_times) -> Flown:
+def _flown(
+    plan: Plan, good: np.ndarray, pos_w, vel_w, landing_w, duration, tracking, smoothness, clearance, step_times
+) -> Flown:
     blank = np.where(good, 1.0, np.nan)
     landing = landing_w * blank[:, None]
     return Flown(
         good, landing, np.linalg.norm(landing - [plan.target, 0.0], axis=1), duration * blank,
         np.linalg.norm(pos_w - plan.release.pos_w, axis=1) * blank,
-        np.linalg.norm(vel_w - plan.release.vel_w, axis=1) * blank, tracking * blank, np.array(step_times),
+        np.linalg.norm(vel_w - plan.release.vel_w, axis=1) * blank, tracking * blank, smoothness * blank,
+        clearance * blank, np.array(step_times),
     )  # fmt: skip
+
+
+class _Smoothness:
+    """Root mean square change of normalised commands, as :mod:`visthrow.protocol` measures it."""
+
+    def __init__(self, params: MPCParams, first: np.ndarray) -> None:
+        self._most, self._rate = params.max_thrust, np.array(params.max_rate)
+        self._last = self._normalised(first)
+        self._sum, self._steps = np.zeros(len(first)), np.zeros(len(first))
+
+    def _normalised(self, command: np.ndarray) -> np.ndarray:
+        throttle = np.sqrt(np.clip(command[:, :1], 0.0, self._most) / self._most)
+        return np.hstack([2.0 * throttle - 1.0, command[:, 1:] / self._rate])
+
+    def add(self, command: np.ndarray, active: np.ndarray | bool = True) -> None:
+        """Count the commands (E, 4) of vehicles that are being flown."""
+        now = self._normalised(command)
+        self._sum += active * ((now - self._last) ** 2).mean(1)
+        self._steps += active
+        self._last = now
+
+    @property
+    def value(self) -> np.ndarray:
+        """Shape (E,)."""
+        return np.sqrt(self._sum / np.maximum(self._steps, 1))
 
 
 def random_starts(plan: Plan, count: int, seed: int) -> np.ndarray:
@@ -121,30 +163,28 @@ def fly_pendulum(
     reference = plan.reference(0.0, params.period, steps + horizon)
     state = random_starts(plan, count, seed)
     good, tracking, times = np.ones(count, bool), np.zeros(count), []
+    smoothness = np.full(count, np.nan)
     for e in range(count):
         controller.reset()
+        change = _Smoothness(params, pm.hover(plan.model, state[e : e + 1, pm.POS])[1])
         try:
             for k in range(steps):
                 off = state[e, pm.POS] - reference[0][k, pm.POS]
                 tracking[e] += off @ off
                 command = controller.step(state[e], (reference[0][k : k + horizon + 1], reference[1][k : k + horizon]))
                 times.append(controller.step_time)
+                change.add(command[None])
                 good[e] &= pm.tension(plan.model, state[e], command) > 0.0
                 state[e] = pm.step(plan.model, state[e], command, params.period if k < steps - 1 else last, FINE)
         except SolverError:
             good[e] = False
+        smoothness[e] = change.value[0]
     point, fall = landing_point(state[:, pm.POS], state[:, pm.VEL], landing_height)
     good &= np.isfinite(fall)
     return _flown(
-        plan,
-        good,
-        state[:, pm.POS],
-        state[:, pm.VEL],
-        point,
-        plan.path.duration + fall,
-        np.sqrt(tracking / steps),
-        times,
-    )
+        plan, good, state[:, pm.POS], state[:, pm.VEL], point, plan.path.duration + fall, np.sqrt(tracking / steps),
+        smoothness, np.full(count, np.nan), times,
+    )  # fmt: skip
 
 
 def pendulum_state(snapshot: Snapshot, mount_b: np.ndarray) -> np.ndarray:
@@ -212,31 +252,40 @@ def _under(model: Pendulum, state: np.ndarray, sent: np.ndarray, period: float, 
     return state
 
 
+def _started(
+    name: str, experiment: Experiment, start: RandomizationParams, target: float, count: int, seed: int
+) -> Plant:
+    """Plant at the start of the throws that learnt policies meet."""
+    task = experiment.task
+    if name == "hybrid":
+        return HybridPlant(experiment, count, seed, noise=task.noise, latency=task.observation.latency, start=start)
+    plant, rng = batch_plant(experiment, name, target, 0, count, seed)
+    place_in_hover(plant, experiment, start, rng)
+    return plant
+
+
 class _PlantFlight:
     """State of a batch of throws on a plant."""
 
     def __init__(
         self, plan: Plan, plant_name: str, experiment: Experiment, delays: Delays, count: int, seed: int
     ) -> None:
-        rng = np.random.default_rng([seed, 1])
         start = config.load(RandomizationParams, config.find("start", "hover"))
         self.plan, self.experiment, self.delays, self.count = plan, experiment, delays, count
-        self.plant = make_plant(plant_name, experiment, count, seed)
+        self.plant = _started(plant_name, experiment, start, plan.target, count, seed)
         self.params = MPCParams(period=self.plant.period, max_thrust=experiment.task.action.max_thrust,
                                 max_rate=experiment.task.action.max_rate)  # fmt: skip
-        rope = plant_of(experiment).rope
-        self.mount = np.array(rope.mount)
+        self.mount = np.array(plant_of(experiment).rope.mount)
         self.home = np.array([0.0, 0.0, start.spawn_height])
-        spread = np.array(start.position) * rng.uniform(-1.0, 1.0, (count, 3))
-        self.plant.reset(
-            self.home + spread, random_ropes(rng, count, rope.segments, math.radians(start.cable_angle_deg))
-        )
         self.controllers = [MPC(plan.model, self.params) for _ in range(count)]
         self.hovering = HoverController(HoverParams(), self.plant.period, count)
-        self.sent = np.zeros((8, count, 4))
+        hover = pm.hover(plan.model, np.zeros((count, 3)))[1]
+        self.sent = np.tile(hover, (8, 1, 1))
+        self.change = _Smoothness(self.params, hover)
         self.estimate: np.ndarray | None = None
         self.failed, self.flying = np.zeros(count, bool), np.ones(count, bool)
         self.separated = np.full((2, count, 3), np.nan)
+        self.clearance = np.full(count, np.inf)
         self.tracking, self.tracked, self.times = np.zeros(count), np.zeros(count), []
 
     def hold(self, seen: Snapshot) -> np.ndarray:
@@ -264,6 +313,7 @@ class _PlantFlight:
             except SolverError:
                 self.failed[e] = True
         before = self.plant.state.attached
+        self.change.add(command, active)
         self.send(command, active & (k >= latch))
         self._watch(k, before)
 
@@ -296,6 +346,9 @@ class _PlantFlight:
             back = plant.time - landing.separation_time[e]
             vel = now.payload_vel_w[e] + np.array([0.0, 0.0, 9.81 * back])
             self.separated[:, e] = now.payload_pos_w[e] - back * 0.5 * (vel + now.payload_vel_w[e]), vel
+        apart = np.linalg.norm(now.payload_pos_w - now.pos_w, axis=1)
+        away = ~now.attached & ~landing.landed
+        self.clearance = np.where(away, np.minimum(self.clearance, apart), self.clearance)
         messages = failures(self.experiment, now, elapsed)
         self.failed |= np.array([message is not None for message in messages]) & now.attached & self.flying
         gone = ~now.attached & ~landing.landed & (plant.time - np.nan_to_num(landing.separation_time) > FALL_TIME)
@@ -306,7 +359,11 @@ class _PlantFlight:
 def fly_plant(
     plan: Plan, plant_name: str, experiment: Experiment, delays: Delays, count: int = 10, seed: int = 0
 ) -> Flown:
-    """Fly a plan on a plant of :data:`visthrow.plants.PLANTS`, from hover under the hover controller.
+    """Fly a plan on a plant of :data:`visthrow.plants.PLANTS`.
+
+    The throws are those that learnt policies meet with the same count and seed: in the training simulator the same vehicles,
+    ropes and starts as :func:`visthrow.protocol.throw`, on a reference plant the same vehicles, winds and starts as
+    :mod:`visthrow.reference_protocol`, from hover under the hover controller.
 
     Args:
         plan: of the throw.
@@ -318,8 +375,9 @@ def fly_plant(
     """
     flight = _PlantFlight(plan, plant_name, experiment, delays, count, seed)
     plant, period = flight.plant, flight.plant.period
-    for _ in range(round(HOVER_TIME / period)):
-        flight.send(flight.hold(plant.measured()), np.zeros(count, bool))
+    if plant_name != "hybrid":
+        for _ in range(round(HOVER_TIME / period)):
+            flight.send(flight.hold(plant.measured()), np.zeros(count, bool))
     began = plant.time
     latch = round((plan.path.duration - delays.release) / period)
     limit = latch + round((experiment.release.lag + FALL_TIME) / period) + 2
@@ -331,4 +389,7 @@ def fly_plant(
     landing = plant.landing
     good = landing.landed & ~flight.failed
     tracking = np.sqrt(flight.tracking / np.maximum(flight.tracked, 1))
-    return _flown(plan, good, *flight.separated, landing.point_w[:, :2], landing.time - began, tracking, flight.times)
+    return _flown(
+        plan, good, *flight.separated, landing.point_w[:, :2], landing.time - began, tracking, flight.change.value,
+        flight.clearance, flight.times,
+    )  # fmt: skip
