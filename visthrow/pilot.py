@@ -4,6 +4,7 @@ The same functions of :mod:`visthrow.observations` and :mod:`visthrow.actions` t
 a batch of one on board; only the noise is missing.
 """
 
+import time
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
@@ -20,6 +21,7 @@ from visthrow import observations as ob
 from visthrow.errors import PolicyError
 from visthrow.hover import GRAVITY
 from visthrow.policy import Policy
+from visthrow.traced import Traced
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,7 @@ class Pilot:
         policy: the policy. layout: of its observation. period: between two calls [s].
         lag: from latch to separation [s].
         camera: None where the policy looks at none and no camera was given.
+        spent: time that the last call took for the observation and for the policy [s].
     """
 
     def __init__(self, policy: Policy, camera_params: CameraParams | None = None, count: int = 1) -> None:
@@ -94,6 +97,8 @@ class Pilot:
             policy.require({"camera": camera_conditions(camera_params)}, sections={"camera"})
         self.policy, self.count = policy, count
         self.camera = None if camera_params is None else KeypointCamera(camera_params)
+        self._look, self._observe, self._decide = Traced(self._frame), Traced(self._assemble), Traced(self._decision)
+        self.spent = (0.0, 0.0)
         self._first = torch.tensor([act.hover_action(GRAVITY * mass, self._max_thrust)], dtype=torch.float32)
         self.start()
 
@@ -133,30 +138,56 @@ class Pilot:
         Raises:
             ValueError: An array of another shape.
         """
-        pos, vel = self._tensor("pos_w", pos_w, 3), self._tensor("vel_w", vel_w, 3)
-        rot = ob.rotation_from_quat(self._tensor("quat_wb", quat_wb, 4))
-        rate, payload = self._tensor("rate_b", rate_b, 3), self._tensor("payload_w", payload_w, 3)
-        goal = self._tensor("goal_w", np.broadcast_to(np.asarray(goal_w), (self.count, 3)), 3)
+        begin = time.perf_counter()
+        goal_w = np.broadcast_to(np.asarray(goal_w), (self.count, 3))
+        views = [self._tensor(*view) for view in (
+            ("pos_w", pos_w, 3), ("quat_wb", quat_wb, 4), ("vel_w", vel_w, 3), ("rate_b", rate_b, 3),
+            ("payload_w", payload_w, 3), ("goal_w", goal_w, 3),
+        )]  # fmt: skip
         hangs = torch.from_numpy(np.broadcast_to(np.asarray(attached), (self.count,)).astype(np.float32))
-        points = valid = None
-        if self.camera is not None:
-            points, valid = ob.vision_part(self.camera, pos, rot, goal, payload)
-        seen = points.flatten(1) if self.layout.name == "vision" else ob.state_part(pos, goal, payload)
-        frame = torch.cat([ob.vehicle_part(pos, vel, rate, rot), seen], dim=-1)
-        observation, self._history = ob.observe(
-            self.layout, frame, valid, self._previous, hangs, self._history, self._fresh, self._goal_velocity(frame, valid)
+        frame, *seen = self._look(*views)
+        points, valid = seen or (None, None)
+        further = [t for t in (valid, self._goal_velocity(frame, valid)) if t is not None]
+        observation, self._history = self._observe(
+            frame, self._previous, hangs, self._history, self._fresh, *further
         )
-        raw = self.policy.act(observation)
-        action = act.clip_action(raw)
+        decided = time.perf_counter()
+        action, command, release = self._decide(observation)
         self._previous, self._fresh = action, torch.zeros_like(self._fresh)
-        return PilotOutput(
+        out = PilotOutput(
             action.numpy(),
-            act.command_from_action(action, self._max_thrust, self._max_rate).numpy(),
-            act.release_asked(raw, self._threshold).numpy(),
+            command.numpy(),
+            release.numpy(),
             observation.numpy(),
             None if points is None else points.numpy(),
             None if valid is None else valid.numpy(),
         )
+        self.spent = (decided - begin, time.perf_counter() - decided)
+        return out
+
+    def _frame(
+        self, pos: Tensor, quat: Tensor, vel: Tensor, rate: Tensor, payload: Tensor, goal: Tensor
+    ) -> tuple[Tensor, ...]:
+        """Frame of the measurements, shape (E, layout.frame), and with a camera keypoints and their validity."""
+        rot = ob.rotation_from_quat(quat)
+        seen = () if self.camera is None else ob.vision_part(self.camera, pos, rot, goal, payload)
+        part = seen[0].flatten(1) if self.layout.name == "vision" else ob.state_part(pos, goal, payload)
+        return torch.cat([ob.vehicle_part(pos, vel, rate, rot), part], dim=-1), *seen
+
+    def _assemble(
+        self, frame: Tensor, previous: Tensor, hangs: Tensor, history: Tensor, fresh: Tensor, *further: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """See `visthrow.observations.observe`; ``further`` are validity and goal velocity, where there are any."""
+        valid = further[0] if self.camera is not None else None
+        motion = further[-1] if self.layout.motion else None
+        return ob.observe(self.layout, frame, valid, previous, hangs, history, fresh, motion)
+
+    def _decision(self, observation: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Clipped action, command and whether a release is asked for."""
+        raw = self.policy.act(observation)
+        action = act.clip_action(raw)
+        command = act.command_from_action(action, self._max_thrust, self._max_rate)
+        return action, command, act.release_asked(raw, self._threshold)
 
     def _goal_velocity(self, frame: Tensor, valid: Tensor | None) -> Tensor | None:
         """Fit of the goal's velocity [m/s], shape (E, 2), with this step's frame; None where the layout has none."""
