@@ -1,0 +1,165 @@
+"""The byte level of Betaflight's blackbox: variable-length integers, packed groups, and predictions of fields.
+
+Source: Betaflight, "Blackbox logging internals" (docs/development/Blackbox Internals.md), data version 2.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+
+SIGNED_VB, UNSIGNED_VB, NEG_14BIT, TAG8_8SVB, TAG2_3S32, TAG8_4S16, NULL, TAG2_3SVARIABLE = 0, 1, 3, 6, 7, 8, 9, 10
+ENCODINGS = (SIGNED_VB, UNSIGNED_VB, NEG_14BIT, TAG8_8SVB, TAG2_3S32, TAG8_4S16, NULL, TAG2_3SVARIABLE)
+_GROUP = {TAG8_8SVB: 8, TAG2_3S32: 3, TAG8_4S16: 4, TAG2_3SVARIABLE: 3}
+"""Encoding -> largest number of fields packed together."""
+
+_LONGEST_VB = 5  # bytes of a 32-bit number, seven bits a byte
+
+
+class EndOfLog(Exception):
+    """The bytes end within a frame."""
+
+
+class Corrupt(Exception):
+    """The bytes cannot be what they should be."""
+
+
+class Reader:
+    """A position in the bytes of one log."""
+
+    def __init__(self, data: bytes, pos: int = 0) -> None:
+        """Stand at ``pos``."""
+        self.data, self.pos, self.end = data, pos, len(data)
+
+    def byte(self) -> int:
+        """Next byte.
+
+        Raises:
+            EndOfLog: There is none.
+        """
+        if self.pos >= self.end:
+            raise EndOfLog
+        self.pos += 1
+        return self.data[self.pos - 1]
+
+    def unsigned(self) -> int:
+        """Variable-length number, low bits first.
+
+        Raises:
+            Corrupt: Longer than 32 bits.
+        """
+        value = 0
+        for shift in range(0, 7 * _LONGEST_VB, 7):
+            byte = self.byte()
+            value |= (byte & 0x7F) << shift
+            if byte < 0x80:
+                return value & 0xFFFFFFFF
+        raise Corrupt
+
+    def signed(self) -> int:
+        """Variable-length number, zig-zag."""
+        value = self.unsigned()
+        return (value >> 1) ^ -(value & 1)
+
+    def little(self, size: int) -> int:
+        """Signed little-endian number of so many bytes."""
+        return extend(sum(self.byte() << (8 * i) for i in range(size)), 8 * size)
+
+    def float32(self) -> float:
+        """Little-endian float."""
+        return float(np.frombuffer(bytes(self.byte() for _ in range(4)), "<f4")[0])
+
+
+def extend(value: int, bits: int) -> int:
+    """Read the lowest bits as a two's complement number."""
+    value &= (1 << bits) - 1
+    return value - (1 << bits) if value >> (bits - 1) else value
+
+
+def _tag8_8svb(r: Reader, count: int) -> list[int]:
+    if count == 1:  # one field alone has no tag
+        return [r.signed()]
+    tag = r.byte()
+    return [r.signed() if tag >> i & 1 else 0 for i in range(count)]
+
+
+def _tagged_bytes(r: Reader, lead: int) -> list[int]:
+    return [r.little((lead >> shift & 3) + 1) for shift in (0, 2, 4)]
+
+
+def _tag2_3s32(r: Reader, count: int) -> list[int]:
+    lead = r.byte()
+    selector = lead >> 6
+    if selector == 0:
+        return [extend(lead >> shift, 2) for shift in (4, 2, 0)]
+    if selector == 1:
+        second = r.byte()
+        return [extend(lead, 4), extend(second >> 4, 4), extend(second, 4)]
+    if selector == 2:
+        return [extend(lead, 6), extend(r.byte(), 6), extend(r.byte(), 6)]
+    return _tagged_bytes(r, lead)
+
+
+def _tag2_3svariable(r: Reader, count: int) -> list[int]:
+    lead = r.byte()
+    selector = lead >> 6
+    if selector == 0:
+        return [extend(lead >> shift, 2) for shift in (4, 2, 0)]
+    if selector == 1:  # 5, 5 and 4 bits
+        bits = lead << 8 | r.byte()
+        return [extend(bits >> 9, 5), extend(bits >> 4, 5), extend(bits, 4)]
+    if selector == 2:  # 8, 7 and 7 bits
+        bits = lead << 16 | r.byte() << 8 | r.byte()
+        return [extend(bits >> 14, 8), extend(bits >> 7, 7), extend(bits, 7)]
+    return _tagged_bytes(r, lead)
+
+
+def _tag8_4s16(r: Reader, count: int) -> list[int]:
+    """Four fields of 0, 4, 8 or 16 bits each, packed nibble to nibble."""
+    tag, values = r.byte(), []
+    rest, have = 0, 0  # bits read and not used yet
+    for i in range(4):
+        need = (0, 4, 8, 16)[tag >> (2 * i) & 3]
+        while have < need:
+            rest, have = rest << 8 | r.byte(), have + 8
+        have -= need
+        values.append(extend(rest >> have, need) if need else 0)
+        rest &= (1 << have) - 1
+    return values
+
+
+_DECODERS: dict[int, Callable[[Reader, int], list[int]]] = {
+    SIGNED_VB: lambda r, n: [r.signed()],
+    UNSIGNED_VB: lambda r, n: [r.unsigned()],
+    NEG_14BIT: lambda r, n: [-extend(r.unsigned(), 14)],
+    NULL: lambda r, n: [0],
+    TAG8_8SVB: _tag8_8svb,
+    TAG2_3S32: _tag2_3s32,
+    TAG8_4S16: _tag8_4s16,
+    TAG2_3SVARIABLE: _tag2_3svariable,
+}
+
+
+def plan(encodings: list[int], skipped: list[bool]) -> list[tuple[Callable[[Reader, int], list[int]], int, int]]:
+    """Group the fields of a frame as they are packed.
+
+    Args:
+        encodings: Of each field.
+        skipped: Fields that take no bytes at all (those counted up by one).
+
+    Returns:
+        Decoder, first field and number of fields of each group.
+    """
+    groups, i = [], 0
+    while i < len(encodings):
+        if skipped[i]:
+            i += 1
+            continue
+        code, count = encodings[i], 1
+        if code == TAG8_8SVB:
+            while count < _GROUP[code] and i + count < len(encodings) and encodings[i + count] == code:
+                count += 1
+        elif code in _GROUP:
+            count = min(_GROUP[code], len(encodings) - i)
+        groups.append((_DECODERS[code], i, count))
+        i += count
+    return groups
