@@ -6,14 +6,16 @@ these are recorded, so that a replay decides alike to the last bit.
 
 import math
 import traceback
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from time import perf_counter
 from typing import Any
 
 import numpy as np
 
 from hil.backends.base import FAILED, Backend, Status
 from hil.errors import RunError
-from hil.gate import HOLD
+from hil.gate import HOLD, Tether
 from hil.landing import Flight, Landing
 from hil.params import HilParams
 from hil.pose import GOAL, PAYLOAD, VEHICLE, Pose, Vector
@@ -80,6 +82,8 @@ class Runner:
         tracks: by body. lag: trained time from latch to separation [s].
         latches: releases so far. stuck: payloads that stayed on.
         landings: of the throws so far. errors: tracebacks of what was caught.
+        spent: time that parts of the last tick took [s]; those that it did not do are missing.
+        watcher: called with each pose's body and track once it was taken; None for nobody.
     """
 
     def __init__(self, params: HilParams, policy: Policy, backend: Backend, mechanism_lag: float = 0.0) -> None:
@@ -109,6 +113,7 @@ class Runner:
         rope, body, action = contract["rope"], contract["vehicle"]["body"], contract["action"]
         self._alone, self._full = body["mass"], body["mass"] + rope["rope_mass"] + rope["payload_mass"]
         self.hang = -rope["mount"][2] + rope["length"] + rope["payload_offset"]
+        self._reach = math.hypot(*rope["mount"]) + rope["length"] + rope["payload_offset"] + params.check.rope_tolerance
         self.guard = Guard(params.guard, float(action["max_thrust"]), tuple(map(float, action["max_rate"])))
         self.tracks = {name: Track(frames, params.gate, params.estimate) for name, frames in params.frames.items()}
         self.machine = Machine(params.states, params.throws, params.observe)
@@ -122,6 +127,8 @@ class Runner:
         self.landings: list[Landing] = []
         self.latches = self.stuck = 0
         self.errors: list[str] = []
+        self.spent: dict[str, float] = {}
+        self.watcher: Callable[[str, Track], None] | None = None
 
     def tick(self, now: float, poses: list[Pose], status: Status, words: Words, recording: bool = True) -> Decision:
         """Decide one tick and send its command.
@@ -133,6 +140,7 @@ class Runner:
             words: of the operator.
             recording: whether all was recorded so far.
         """
+        self.spent = {}
         try:
             return self._tick(now, poses, status, words, recording)
         except Exception as error:  # in flight nothing raises past the runner
@@ -145,9 +153,13 @@ class Runner:
             return Decision(now, self.machine.state.value, self.machine.reason, note="exception")
 
     def _tick(self, now: float, poses: list[Pose], status: Status, words: Words, recording: bool) -> Decision:
+        begin = perf_counter()
         for pose in poses:
             track = self.tracks.get(pose.body)
-            if track is not None and track.update(pose) is None and pose.body == PAYLOAD and self._flight is not None:
+            took = track is not None and track.update(pose, self._tether(pose)) is None
+            if took and self.watcher is not None:
+                self.watcher(pose.body, track)
+            if took and pose.body == PAYLOAD and self._flight is not None:
                 landing = self._flight.add(pose.arrival - self.params.delay.source, track.gate.last.pos)
                 if landing is not None:
                     self.landings.append(landing)
@@ -166,6 +178,7 @@ class Runner:
         if state is not before:
             self._entered(now, before, state, vehicle)
         decision = Decision(now, state.value, self.machine.reason)
+        self.spent["estimate"] = perf_counter() - begin
         wanted = self._command(now, state, vehicle, payload, goal_w, decision)
         if state is State.ABORT and not (status.connected and self.machine.flown):
             wanted = None  # it has taken over, or hears nothing, or was never ours
@@ -181,7 +194,10 @@ class Runner:
                 decision.release = False
                 self.backend.stop_release()
             else:
+                ready = perf_counter()
                 self.backend.send(decision.command, now)
+                self.spent["send"] = perf_counter() - ready
+                self.spent["total"] = perf_counter() - begin
         if decision.release:
             self._latch, self.latches = now, self.latches + 1
             self._flight = Flight(goal_w, self._begun, now, self.params.landing_height)
@@ -189,6 +205,15 @@ class Runner:
         if state is State.ABORT and self.machine.flown:
             self.backend.abort(now)
         return decision
+
+    def _tether(self, pose: Pose) -> Tether | None:
+        """The cable's other end for a pose of vehicle or payload while the payload hangs; None on the ground and after."""
+        other = {VEHICLE: PAYLOAD, PAYLOAD: VEHICLE}.get(pose.body)
+        if other is None or self._latch is not None or self.machine.state not in FLYING:
+            return None
+        pos = self.tracks[other].expected(pose.arrival)
+        fresh = self.tracks[other].gate.level(pose.arrival) < HOLD
+        return None if pos is None else Tether(pos, self._reach if fresh else math.inf)
 
     def _state(self, track: Track, now: float) -> BodyState | None:
         """State of a body, carried forward to the age that the policy was trained with where the config says so."""
@@ -307,6 +332,7 @@ class Runner:
         attached = self._latch is None or decision.time - self._latch < self.lag - 1e-9
         views = [np.array([v]) for v in (vehicle.pos, vehicle.quat, vehicle.vel, vehicle.rate, payload.pos)]
         out: PilotOutput = self.pilot.act(*views, np.array(goal_w), attached)
+        self.spent["observation"], self.spent["policy"] = self.pilot.spent
         decision.action = out.action[0].tolist()
         decision.observation = out.observation[0].tolist()
         if out.keypoints is not None:

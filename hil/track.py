@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 from hil.estimate import EstimateParams, SlopeFilter, slope_weights
 from hil.frames import FrameParams, Frames, multiply
-from hil.gate import Gate, GateParams
+from hil.gate import Gate, GateParams, Tether
 from hil.pose import Pose, Quaternion, Vector
 
 MOST_PREDICTION = 0.1
@@ -52,11 +52,11 @@ class Track:
         self._slow.clear()
         self._pose = None
 
-    def update(self, raw: Pose) -> str | None:
-        """Take a raw pose; why it was refused, or None."""
+    def update(self, raw: Pose, tether: Tether | None = None) -> str | None:
+        """Take a raw pose; why it was refused, or None. ``tether``: the cable's other end, where one hangs."""
         pose = self.frames.pose_from_source(raw)
         before, stepped = self.gate.last, self.gate.stepped(pose)
-        reason = self.gate.check(pose, self._vel if self._pose is not None else None)
+        reason = self.gate.check(pose, self._vel if self._pose is not None else None, tether)
         if reason is not None:
             return reason
         if stepped and before is not None:
@@ -66,6 +66,24 @@ class Track:
         self._pose = pose
         self._slow.appendleft((pose.arrival, pose.pos))
         return None
+
+    def expected(self, time: float) -> Vector | None:
+        """Where the last pose and velocity put the body at a time of arrival [s]; None before the first pose."""
+        pose = self._pose
+        if pose is None:
+            return None
+        age = time - pose.arrival
+        return tuple(x + age * v for x, v in zip(pose.pos, self._vel))
+
+    def sample(self) -> tuple[Pose, Vector, Vector]:
+        """Last pose taken, its stamp freed of steps of the source's clock, with the estimates of velocity and body rate.
+
+        Raises:
+            ValueError: there is none yet.
+        """
+        if self._pose is None:
+            raise ValueError("no pose was taken yet; sample() is for after the first one")
+        return replace(self._pose, stamp=self._pose.stamp + self._shift), self._vel, self._rate
 
     def calm_speed(self) -> float:
         """Speed by a line through the last poses [m/s]: late, but free of noise; infinite with too few of them."""

@@ -8,7 +8,7 @@ import pytest
 from hil.clock import ManualClock, MonotonicClock, Ticker, TimeSync
 from hil.estimate import EstimateParams
 from hil.frames import FrameParams
-from hil.gate import ABORT, HOLD, OK, WARN, Gate, GateParams
+from hil.gate import ABORT, HOLD, OK, WARN, Gate, GateParams, Tether
 from hil.pose import Pose
 from hil.track import Track
 
@@ -61,6 +61,41 @@ def test_a_swapped_body_is_never_taken_back_by_waiting():
     assert gate.check(pose(0.03, 0.03)) is None
 
 
+@pytest.mark.parametrize("gap", [0.01, 0.13, 0.2])
+def test_bodies_swapped_after_a_gap_are_known_by_the_cable(gap):
+    """After 0.13 s without poses the room for a jump is wider than the cable is long."""
+    still, tether = (0.0, 0.0, 0.0), Tether((0.43, 0.0, 1.0), 0.6)
+    gate = Gate(PARAMS)
+    gate.check(pose())
+    swapped = pose(gap, 0.43)
+    assert gate.check(swapped, still, tether) == "swapped"
+    assert gate.check(pose(gap + 0.01, 0.431), still, tether) == "swapped", "nor by waiting"
+    assert gate.check(pose(gap + 0.02, 0.02), still, tether) is None, "back in its own place"
+    if gap > 0.1:
+        gate = Gate(PARAMS)
+        gate.check(pose())
+        assert gate.check(swapped, still) is None, "without the cable it would have been taken"
+
+
+def test_a_body_farther_off_than_the_cable_is_long():
+    gate = Gate(PARAMS)
+    gate.check(pose())
+    assert gate.check(pose(0.01, 0.05), (0.0, 0.0, 0.0), Tether((-0.5, 0.0, 1.0), 0.54)) == "cable"
+    assert gate.check(pose(0.02, 0.05), (0.0, 0.0, 0.0), Tether((-0.5, 0.0, 1.0), 0.56)) is None
+
+
+def test_rare_poses_are_as_good_as_none():
+    gate = Gate(PARAMS)
+    times = [0.01 * i for i in range(10)] + [0.09 + 0.2 * i for i in range(1, 5)]
+    levels = []
+    for i, time in enumerate(times):
+        assert gate.check(pose(time, 0.001 * i), (0.0, 0.0, 0.0)) is None
+        levels.append(gate.level(time))
+    assert levels == [OK] * 12 + [ABORT] * 2, "5 Hz from 0.09 s on: the third gap ends it"
+    assert gate.check(pose(times[-1] + 0.01, 0.02), (0.0, 0.0, 0.0)) is None
+    assert gate.level(times[-1] + 0.01) == OK
+
+
 def test_staleness_is_of_content_not_of_arrival():
     gate = Gate(PARAMS)
     assert gate.level(0.0) == ABORT
@@ -90,7 +125,7 @@ def test_wrong_limits():
 
 
 def track() -> Track:
-    return Track(FrameParams("x,y,z", "x,y,z", "xyzw", 0.0, (0.0, 0.0, 0.0)), PARAMS, EstimateParams(3, 1))
+    return Track(FrameParams("x,y,z", "x,y,z", "xyzw", 0.0, (0.0, 0.0, 0.0)), PARAMS, EstimateParams(0.025, 1))
 
 
 @pytest.mark.parametrize("step", [1.0, -1.0])

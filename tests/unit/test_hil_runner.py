@@ -190,6 +190,35 @@ def test_poses_at_5_hz_never_start_a_throw():
     assert not pilot.backend.release_times
 
 
+def test_poses_at_5_hz_from_mid_throw_on_end_the_run():
+    kept = {}
+
+    def slow(time, poses):
+        out = [p for p in poses if time < START or time - kept.get(p.body, -1.0) >= 0.2 - 1e-9]
+        kept.update({p.body: time for p in out})
+        return out
+
+    _, decisions = thrown(action=NEVER, poses=slow, seconds=8.0)
+    assert when(decisions, "recover") == pytest.approx(START + 0.10, abs=1.5 * TICK)
+    assert changes(decisions)[-1] == ("abort", "no new pose of the vehicle")
+    assert when(decisions, "abort") == pytest.approx(START + 0.6, abs=1.5 * TICK)
+
+
+@pytest.mark.parametrize("gap", [0.0, 0.15])
+def test_bodies_swapped_in_mid_throw_after_a_gap(gap):
+    """While nothing comes the room for a jump grows beyond the cable's length; the cable tells the two apart."""
+
+    def spoil(time, poses):
+        if time <= START:
+            return poses
+        return [] if time <= START + gap else [BAD["swapped"](p) for p in poses]
+
+    pilot, decisions = thrown(action=NEVER, poses=spoil, seconds=6.0)
+    assert when(decisions, "recover") == pytest.approx(START + 0.10, abs=1.5 * TICK)
+    assert when(decisions, "abort") == pytest.approx(START + 0.25, abs=1.5 * TICK)
+    assert all(track.gate.refused["swapped"] > 10 for track in pilot.tracks.values())
+
+
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
