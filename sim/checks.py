@@ -2,7 +2,7 @@
 
 import math
 
-from sim.params import ReleaseParams, RopeParams, SimParams, VehicleParams
+from sim.params import AirParams, ReleaseParams, RopeParams, SimParams, VehicleParams
 
 
 def require_positive(owner: str, **values: float) -> None:
@@ -25,6 +25,9 @@ def check_vehicle(vehicle: VehicleParams) -> None:
     require_positive("vehicle.body", mass=body.mass, inertia=min(body.inertia))
     require_positive("vehicle.thrust", k_f=vehicle.thrust.k_f, torque_ratio=vehicle.thrust.torque_ratio)
     require_positive("vehicle.motor", time_constant=vehicle.motor.time_constant)
+    if vehicle.motor.kind == "asymmetric":
+        require_positive("vehicle.motor", time_constant_down=vehicle.motor.time_constant_down)
+    require_positive("vehicle.thrust", gain=min(vehicle.thrust.gain), torque_gain=vehicle.thrust.torque_gain)
     require_positive(
         "vehicle.controller", setpoint_time_constant=c.setpoint_time_constant, gyro_time_constant=c.gyro_time_constant,
         max_thrust=c.max_thrust,
@@ -53,6 +56,7 @@ def check_rope(rope: RopeParams) -> None:
     require_positive("rope", length=rope.length, rope_mass=rope.rope_mass, payload_mass=rope.payload_mass)
     require_not_negative("rope", payload_inertia=rope.payload_inertia, payload_offset=rope.payload_offset)
     require_not_negative("rope", joint_damping=rope.joint_damping)
+    require_not_negative("rope", payload_drag=rope.payload_drag, mount_damping=rope.mount_damping)
 
 
 def check_numerics(sim: SimParams) -> None:
@@ -66,3 +70,10 @@ def check_release(release: ReleaseParams) -> None:
     require_not_negative("release", lag=release.lag)
     if release.clearance_samples < 2:
         raise ValueError(f"release.clearance_samples is {release.clearance_samples}: expected 2 or more")
+
+
+def check_air(air: AirParams) -> None:
+    """Raise ValueError for wind or a ground effect that is not finite."""
+    for name, value in (("wind_w", sum(air.wind_w)), ("ground_effect", air.ground_effect)):
+        if not math.isfinite(value):
+            raise ValueError(f"air.{name} is {getattr(air, name)}: expected finite values")

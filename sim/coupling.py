@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from sim.quadrotor.rigid_body import advance, angular_acceleration, blend
+from sim.rope.payload import LOADS
 from sim.structs import Types
 
 
@@ -42,7 +43,44 @@ def build_root(t: Types):
     return root
 
 
-def build_coupled_step(t: Types, flow, rate, motor_advance, chain: SimpleNamespace):
+def build_load(t: Types, chain: SimpleNamespace, payload: SimpleNamespace, mount_velocity, extensions: frozenset[str]):
+    """Force on the payload in both stages of a step, and the momentum that it brings.
+
+    Returns:
+        Warp functions ``first``, ``second`` (``(rope, air, state, u, k1, h)`` -> force [N, world]) and
+        ``impulse(momentum, h, force, force)`` -> momentum [N s] after h of the forces' mean. Without any they do nothing.
+    """
+    vec3, real, Rope, Air, QuadState = t.vec3, t.real, t.Rope, t.Air, t.QuadState
+
+    @wp.func
+    def none(rope: Rope, air: Air, s: QuadState, u: wp.array(dtype=vec3), k1: wp.array(dtype=vec3), h: real):
+        return vec3()
+
+    @wp.func
+    def no_impulse(momentum: vec3, h: real, force1: vec3, force2: vec3):
+        return momentum
+
+    @wp.func
+    def impulse(momentum: vec3, h: real, force1: vec3, force2: vec3):
+        return momentum + (real(0.5) * h) * (force1 + force2)
+
+    if not extensions & LOADS:
+        return none, none, no_impulse
+
+    @wp.func
+    def first(rope: Rope, air: Air, s: QuadState, u: wp.array(dtype=vec3), k1: wp.array(dtype=vec3), h: real):
+        return payload.force(rope, air, chain.speed_first(rope, mount_velocity(rope, s), u, k1, h))
+
+    @wp.func
+    def second(rope: Rope, air: Air, s: QuadState, u: wp.array(dtype=vec3), k1: wp.array(dtype=vec3), h: real):
+        return payload.force(rope, air, chain.speed_second(rope, mount_velocity(rope, s), u, k1, h))
+
+    return first, second, impulse
+
+
+def build_coupled_step(
+    t: Types, flow, rate, motor_advance, chain: SimpleNamespace, payload: SimpleNamespace, extensions: frozenset[str]
+):
     """One step of h seconds of vehicle and chain.
 
     The vehicle advances by Heun's method, the chain by ROS2, both from the same two solves. The velocity of the root
@@ -55,14 +93,17 @@ def build_coupled_step(t: Types, flow, rate, motor_advance, chain: SimpleNamespa
         momentum [N s]) and ``mount_velocity`` [m/s].
     """
     vec3, vec4, real = t.vec3, t.vec4, t.real
-    Vehicle, Rope, QuadState = t.Vehicle, t.Rope, t.QuadState
+    Vehicle, Rope, Air, QuadState = t.Vehicle, t.Rope, t.Air, t.QuadState
     vec2 = chain.vec2
+    upper_damping = chain.upper_damping
     L = chain.segments
     root = build_root(t)
 
     @wp.func
     def mount_velocity(rope: Rope, s: QuadState):
         return s.vel_w + wp.quat_rotate(s.quat_wb, wp.cross(s.rate_b, rope.mount))
+
+    load_first, load_second, add_impulse = build_load(t, chain, payload, mount_velocity, extensions)
 
     @wp.func
     def momentum(p: Vehicle, rope: Rope, s: QuadState, u: wp.array(dtype=vec3)):
@@ -77,12 +118,13 @@ def build_coupled_step(t: Types, flow, rate, motor_advance, chain: SimpleNamespa
     @wp.func
     def damping_torque(rope: Rope, s: QuadState, rate_w: vec3, n: vec3, u: vec3):
         """Couple of the uppermost joint on the vehicle [N m], body frame."""
-        return rope.joint_damping * wp.quat_rotate_inv(s.quat_wb, wp.cross(n, u) - rate_w)
+        return upper_damping(rope, 0) * wp.quat_rotate_inv(s.quat_wb, wp.cross(n, u) - rate_w)
 
     @wp.func
     def step(
         p: Vehicle,
         rope: Rope,
+        air: Air,
         s: QuadState,
         total: vec3,
         command: vec4,
@@ -102,9 +144,10 @@ def build_coupled_step(t: Types, flow, rate, motor_advance, chain: SimpleNamespa
         half = real(0.5)
         weight = (p.body.mass + rope.total_mass) * gravity
 
-        f1 = flow(p, s, command)
+        f1 = flow(p, air, s, command)
         rate_w = wp.quat_rotate(s.quat_wb, s.rate_b)
-        d, o, b = chain.up_first(rope, n, u, n2, k1, stiffness, rate_w, gravity, gamma, h, c1, c2, hs)
+        load1 = load_first(rope, air, s, u, k1, h)
+        d, o, b = chain.up_first(rope, n, u, n2, k1, stiffness, rate_w, gravity, load1, gamma, h, c1, c2, hs)
         torque = f1.torque_b + damping_torque(rope, s, rate_w, n[0], u[0])
         acc_w, alpha_b, mount_acc, pull = root(p, rope, s, f1.force_b, torque, d, o, b, gravity)
         fastest = chain.down_first(rope, n, u, mount_acc, gamma, h, c1, c2, hs, n2, k1)
@@ -115,33 +158,37 @@ def build_coupled_step(t: Types, flow, rate, motor_advance, chain: SimpleNamespa
         fell_back = fastest * h * h > max_turn * max_turn
         if fell_back:
             chain.fall_back(n, u, h, n2, k1)
-            new_total = total + h * (push1 + weight)
+            new_total = add_impulse(total + h * (push1 + weight), h, load1, load1)
             s2.vel_w = root_velocity(p, rope, s2, new_total, chain.momentum(rope, u))
             return s2, new_total, fell_back
 
-        f2 = flow(p, s2, command)
+        f2 = flow(p, air, s2, command)
         rate_w = wp.quat_rotate(s2.quat_wb, s2.rate_b)
-        d, o, b = chain.up_second(rope, n, u, n2, k1, stiffness, rate_w, gravity, gamma, h, c1, c2, hs)
+        load2 = load_second(rope, air, s2, u, k1, h)
+        d, o, b = chain.up_second(rope, n, u, n2, k1, stiffness, rate_w, gravity, load2, gamma, h, c1, c2, hs)
         torque = f2.torque_b + damping_torque(rope, s2, rate_w, n2[0], u[0] + h * k1[0])
         acc_w, alpha_b, mount_acc, pull = root(p, rope, s2, f2.force_b, torque, d, o, b, gravity)
-        relative = chain.down_second(rope, n, u, stiffness, mount_acc, pull, gravity, gamma, h, c1, c2, hs, n2, k1)
+        relative = chain.down_second(
+            rope, n, u, stiffness, mount_acc, pull, gravity, load2, gamma, h, c1, c2, hs, n2, k1
+        )
         r2 = rate(p, s2, f2, acc_w, alpha_b)
         out = advance(s, blend(r1, half, r2, half), h)
         out.motor_speed = motor_advance(out.motor_speed, f2.motor_speed)
         new_total = total + (half * h) * (push1 + wp.quat_rotate(s2.quat_wb, f2.force_b)) + h * weight
+        new_total = add_impulse(new_total, h, load1, load2)
         out.vel_w = root_velocity(p, rope, out, new_total, relative)
         return out, new_total, fell_back
 
     @wp.func
-    def step_alone(p: Vehicle, s: QuadState, command: vec4, gravity: vec3, h: real):
+    def step_alone(p: Vehicle, air: Air, s: QuadState, command: vec4, gravity: vec3, h: real):
         """Heun step of the vehicle after the payload has left."""
-        f1 = flow(p, s, command)
+        f1 = flow(p, air, s, command)
         inv_mass = real(1.0) / p.body.mass
         acc1 = inv_mass * wp.quat_rotate(s.quat_wb, f1.force_b) + gravity
         r1 = rate(p, s, f1, acc1, angular_acceleration(p, s.rate_b, f1.torque_b))
         s2 = advance(s, r1, h)
         s2.motor_speed = motor_advance(s2.motor_speed, f1.motor_speed)
-        f2 = flow(p, s2, command)
+        f2 = flow(p, air, s2, command)
         acc2 = inv_mass * wp.quat_rotate(s2.quat_wb, f2.force_b) + gravity
         r2 = rate(p, s2, f2, acc2, angular_acceleration(p, s2.rate_b, f2.torque_b))
         out = advance(s, blend(r1, real(0.5), r2, real(0.5)), h)

@@ -7,26 +7,22 @@ import warp as wp
 
 from sim import runtime  # noqa: F401  starts Warp
 from sim import state as st
-from sim.checks import check_numerics, check_release
-from sim.params import GRAVITY, PlantParams, RandomizationParams, RopeParams, VehicleParams
+from sim.checks import check_air, check_numerics, check_release
+from sim.params import GRAVITY, AirParams, PlantParams, RandomizationParams, RopeParams, VehicleParams
 from sim.quadrotor.queue import queue_depth
 from sim.randomize import build_reset
 from sim.step import build_step
-from sim.structs import kinds_of, pack, pack_rope, pack_vehicle, types
+from sim.structs import extensions_of, kinds_of, pack, pack_rope, pack_vehicle, ropes_on, types
 
 _BUILDS: dict = {}
 
 
-def _kinds(params: PlantParams, direct: bool) -> tuple:
-    return (params.sim.precision, params.rope.segments, kinds_of(params.vehicle), direct)
-
-
-def _kernels(params: PlantParams, direct: bool):
+def _kernels(params: PlantParams, direct: bool, extensions: frozenset[str]):
     """Kernels of one choice of blocks; built once a process."""
-    key = _kinds(params, direct)
+    key = (params.sim.precision, params.rope.segments, kinds_of(params.vehicle), direct, extensions)
     if key not in _BUILDS:
         t = types(params.sim.precision)
-        step = build_step(t, params, direct)
+        step = build_step(t, params, direct, extensions)
         _BUILDS[key] = (t, step, build_reset(t, params, step.State))
     return _BUILDS[key]
 
@@ -94,7 +90,9 @@ class HybridSim:
         *,
         vehicles: list[VehicleParams] | None = None,
         ropes: list[RopeParams] | None = None,
+        airs: list[AirParams] | None = None,
         direct: bool = False,
+        extensions: frozenset[str] = frozenset(),
         gravity: float = GRAVITY,
     ):
         """Allocate ``count`` plants.
@@ -106,7 +104,9 @@ class HybridSim:
             seed: of :meth:`randomize`.
             vehicles: parameters of environment e at ``e % len(vehicles)``; default ``[params.vehicle]``.
             ropes: likewise; all with the same number of segments.
+            airs: likewise; default ``[params.air]``.
             direct: by-pass the blocks: commands are thrust [N] and torque [N m].
+            extensions: of :data:`sim.structs.EXTENSIONS`, to build in besides those that the parameters need.
             gravity: acceleration of free fall, along -z [m/s^2].
 
         Raises:
@@ -118,16 +118,21 @@ class HybridSim:
         check_release(params.release)
         ropes = ropes or [params.rope]
         vehicles = vehicles or [params.vehicle]
+        airs = airs or [params.air]
+        for air in airs:
+            check_air(air)
         if {r.segments for r in ropes} != {params.rope.segments}:
             raise ValueError(
                 f"ropes of {sorted({r.segments for r in ropes})} segments in one batch of {params.rope.segments}"
             )
         self.params, self.count, self.device, self.seed = params, count, device, seed
         self.gravity = gravity
-        self.types, self._step, self._reset = _kernels(params, direct)
+        self.extensions = extensions_of(vehicles, ropes, airs) | extensions
+        self.types, self._step, self._reset = _kernels(params, direct, self.extensions)
         t = self.types
         self._vehicles = wp.array(pack_vehicle(t, vehicles, kinds_of(params.vehicle)), dtype=t.Vehicle, device=device)
-        self._ropes = wp.array(pack_rope(t, ropes), dtype=t.Rope, device=device)
+        self._ropes = wp.array(pack_rope(t, ropes_on(vehicles, ropes)), dtype=t.Rope, device=device)
+        self._airs = wp.array(pack(t.Air, *airs), dtype=t.Air, device=device)
         self._release = wp.array(pack(t.Release, params.release), dtype=t.Release, device=device)
         segments, period = params.rope.segments, params.sim.control_period
         depth = max(queue_depth(v.queue.delay, period) for v in vehicles)
@@ -154,6 +159,7 @@ class HybridSim:
                 self._vehicles,
                 self._ropes,
                 self._release,
+                self._airs,
                 s.control_period,
                 s.substep,
                 s.gamma,

@@ -3,9 +3,17 @@
 Source: the paper, Sec. III-B (projectile without drag) and Eq. 5 (clearance at K fractions of the flight).
 """
 
+from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
+
+from sim.structs import Types
+
+FLIGHT_STEP = 0.02
+"""Largest step of a flight under drag [s]: RK4 is 1e-8 m off a tennis ball's path after a second of them (a test shows it)."""
+FLIGHT_STEPS = 500
+"""Steps after which a payload that has not come down counts as one that never will."""
 
 
 @wp.func
@@ -36,3 +44,99 @@ def clearance(pos_w: Any, vel_w: Any, gravity: Any, time: Any, vehicle_w: Any, s
         s = time * type(time)(float(k)) / type(time)(float(samples - 1))
         least = wp.min(least, wp.length(projectile(pos_w, vel_w, gravity, s) - vehicle_w))
     return least
+
+
+def build_ballistic(t: Types, acceleration, dragging: bool) -> SimpleNamespace:
+    """Flight of the payload alone: in closed form in still, thin air, by RK4 under drag.
+
+    Args:
+        t: types of the wanted precision.
+        acceleration: ``(rope, air, vel_w, gravity)`` -> [m/s^2], world frame.
+        dragging: whether the air counts.
+
+    Returns:
+        Namespace of Warp functions ``time_to_height(rope, air, pos, vel, height, gravity)`` [s],
+        ``after(rope, air, pos, vel, gravity, time)`` [m], ``clearance(rope, air, pos, vel, gravity, time, vehicle_w,
+        samples)`` [m], each with the arguments of the functions of the same names in this module.
+    """
+    real, vec3, Rope, Air = t.real, t.vec3, t.Rope, t.Air
+
+    @wp.func
+    def closed_time(rope: Rope, air: Air, pos_w: vec3, vel_w: vec3, height: real, gravity: real):
+        return time_to_height(pos_w, vel_w, height, gravity)
+
+    @wp.func
+    def closed_after(rope: Rope, air: Air, pos_w: vec3, vel_w: vec3, gravity: real, time: real):
+        return projectile(pos_w, vel_w, gravity, time)
+
+    @wp.func
+    def closed_clearance(
+        rope: Rope, air: Air, pos_w: vec3, vel_w: vec3, gravity: real, time: real, vehicle_w: vec3, samples: int
+    ):
+        return clearance(pos_w, vel_w, gravity, time, vehicle_w, samples)
+
+    if not dragging:
+        return SimpleNamespace(time_to_height=closed_time, after=closed_after, clearance=closed_clearance)
+
+    @wp.func
+    def fly(rope: Rope, air: Air, pos_w: vec3, vel_w: vec3, gravity: real, h: real):
+        """One RK4 step of h seconds."""
+        half = real(0.5) * h
+        g = vec3(real(0.0), real(0.0), -gravity)
+        a1 = acceleration(rope, air, vel_w, g)
+        v2 = vel_w + half * a1
+        a2 = acceleration(rope, air, v2, g)
+        v3 = vel_w + half * a2
+        a3 = acceleration(rope, air, v3, g)
+        v4 = vel_w + h * a3
+        a4 = acceleration(rope, air, v4, g)
+        sixth = h / real(6.0)
+        two = real(2.0)
+        pos = pos_w + sixth * (vel_w + two * v2 + two * v3 + v4)
+        return pos, vel_w + sixth * (a1 + two * a2 + two * a3 + a4)
+
+    @wp.func
+    def after(rope: Rope, air: Air, pos_w: vec3, vel_w: vec3, gravity: real, time: real):
+        count = int(wp.ceil(wp.max(time, real(0.0)) / real(FLIGHT_STEP)))
+        pos = pos_w
+        vel = vel_w
+        for _ in range(count):
+            pos, vel = fly(rope, air, pos, vel, gravity, time / real(float(count)))
+        return pos
+
+    @wp.func
+    def drag_time(rope: Rope, air: Air, pos_w: vec3, vel_w: vec3, height: real, gravity: real):
+        """Steps until the height is passed, then Newton's method from the last step's start."""
+        pos = pos_w
+        vel = vel_w
+        h = real(FLIGHT_STEP)
+        time = real(0.0)
+        next_pos, next_vel = fly(rope, air, pos, vel, gravity, h)
+        count = int(0)
+        while (next_pos[2] > height or next_vel[2] > real(0.0)) and count < FLIGHT_STEPS:
+            pos = next_pos
+            vel = next_vel
+            time = time + h
+            count = count + 1
+            next_pos, next_vel = fly(rope, air, pos, vel, gravity, h)
+        share = time_to_height(pos, vel, height, gravity)
+        for _ in range(3):
+            next_pos, next_vel = fly(rope, air, pos, vel, gravity, share)
+            if next_vel[2] < real(0.0):
+                share = wp.max(share - (next_pos[2] - height) / next_vel[2], real(0.0))
+        return time + share
+
+    @wp.func
+    def drag_clearance(
+        rope: Rope, air: Air, pos_w: vec3, vel_w: vec3, gravity: real, time: real, vehicle_w: vec3, samples: int
+    ):
+        least = wp.length(pos_w - vehicle_w)
+        pos = pos_w
+        vel = vel_w
+        h = time / real(float(samples - 1))
+        for _ in range(samples - 1):
+            pos, vel = fly(rope, air, pos, vel, gravity, h)
+            least = wp.min(least, wp.length(pos - vehicle_w))
+        return least
+
+    return SimpleNamespace(time_to_height=drag_time, after=after, clearance=drag_clearance)

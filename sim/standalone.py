@@ -10,12 +10,13 @@ import warp as wp
 
 from sim import runtime  # noqa: F401  starts Warp
 from sim import state as st
-from sim.params import GRAVITY, VehicleParams
+from sim.checks import check_air
+from sim.params import GRAVITY, AirParams, VehicleParams
 from sim.quadrotor.queue import push, queue_depth, split_delay
 from sim.quadrotor.rigid_body import advance, angular_acceleration, blend, build_flow
 from sim.quadrotor.start import build_start
 from sim.step import SPEED_LIMIT
-from sim.structs import Types, kinds_of, pack_vehicle, types
+from sim.structs import Types, extensions_of, kinds_of, pack, pack_vehicle, types
 
 INTEGRATORS = ("euler", "rk4")
 FIELDS = st.QUAD_FIELDS | {"queue": ("vec4", True), "status": ("int", False)}
@@ -24,33 +25,33 @@ _BUILDS: dict = {}
 
 
 def build_quad_step(t: Types, flow, rate, motor_advance, integrator: str):
-    """Return ``step(p, s, command, force_w, torque_b, gravity, h) -> state`` of one integrator.
+    """Return ``step(p, air, s, command, force_w, torque_b, gravity, h) -> state`` of one integrator.
 
     Source: Hairer, Norsett, Wanner, *Solving Ordinary Differential Equations I*, II.1 (the classical method of order 4).
     """
-    Vehicle, QuadState, vec3, vec4, real = t.Vehicle, t.QuadState, t.vec3, t.vec4, t.real
+    Vehicle, Air, QuadState, vec3, vec4, real = t.Vehicle, t.Air, t.QuadState, t.vec3, t.vec4, t.real
 
     @wp.func
-    def slope(p: Vehicle, s: QuadState, command: vec4, force_w: vec3, torque_b: vec3, gravity: vec3):
-        f = flow(p, s, command)
+    def slope(p: Vehicle, air: Air, s: QuadState, command: vec4, force_w: vec3, torque_b: vec3, gravity: vec3):
+        f = flow(p, air, s, command)
         acc = (wp.quat_rotate(s.quat_wb, f.force_b) + force_w) / p.body.mass + gravity
         return rate(p, s, f, acc, angular_acceleration(p, s.rate_b, f.torque_b + torque_b)), f.motor_speed
 
     @wp.func
-    def euler(p: Vehicle, s: QuadState, command: vec4, force_w: vec3, torque_b: vec3, gravity: vec3, h: real):
-        r, acting = slope(p, s, command, force_w, torque_b, gravity)
+    def euler(p: Vehicle, air: Air, s: QuadState, command: vec4, force_w: vec3, torque_b: vec3, gravity: vec3, h: real):
+        r, acting = slope(p, air, s, command, force_w, torque_b, gravity)
         out = advance(s, r, h)
         out.motor_speed = motor_advance(out.motor_speed, acting)
         return out
 
     @wp.func
-    def rk4(p: Vehicle, s: QuadState, command: vec4, force_w: vec3, torque_b: vec3, gravity: vec3, h: real):
+    def rk4(p: Vehicle, air: Air, s: QuadState, command: vec4, force_w: vec3, torque_b: vec3, gravity: vec3, h: real):
         half = real(0.5)
         one = real(1.0)
-        r1, _a1 = slope(p, s, command, force_w, torque_b, gravity)
-        r2, _a2 = slope(p, advance(s, r1, half * h), command, force_w, torque_b, gravity)
-        r3, _a3 = slope(p, advance(s, r2, half * h), command, force_w, torque_b, gravity)
-        r4, acting = slope(p, advance(s, r3, h), command, force_w, torque_b, gravity)
+        r1, _a1 = slope(p, air, s, command, force_w, torque_b, gravity)
+        r2, _a2 = slope(p, air, advance(s, r1, half * h), command, force_w, torque_b, gravity)
+        r3, _a3 = slope(p, air, advance(s, r2, half * h), command, force_w, torque_b, gravity)
+        r4, acting = slope(p, air, advance(s, r3, h), command, force_w, torque_b, gravity)
         outer = blend(r1, one, r4, one)
         inner = blend(r2, one, r3, one)
         out = advance(s, blend(outer, one / real(6.0), inner, one / real(3.0)), h)
@@ -60,14 +61,14 @@ def build_quad_step(t: Types, flow, rate, motor_advance, integrator: str):
     return {"euler": euler, "rk4": rk4}[integrator]
 
 
-def build_kernels(t: Types, vehicle: VehicleParams, integrator: str):
+def build_kernels(t: Types, vehicle: VehicleParams, integrator: str, extensions: frozenset[str]):
     """Step and reset kernels for one choice of blocks, and their structs of state and start arrays."""
-    real, vec3, vec4, Vehicle, QuadState = t.real, t.vec3, t.vec4, t.Vehicle, t.QuadState
+    real, vec3, vec4, Vehicle, Air, QuadState = t.real, t.vec3, t.vec4, t.Vehicle, t.Air, t.QuadState
     State = st.array_struct(t, "QuadArrays", FIELDS)
     Start = st.array_struct(t, "QuadStart", START_FIELDS)
     load, store = st.build_access(t, State)
     begin = build_start(t, vehicle, State)
-    integrate = build_quad_step(t, *build_flow(t, vehicle), integrator)
+    integrate = build_quad_step(t, *build_flow(t, vehicle, extensions), integrator)
     limit = real(SPEED_LIMIT)
 
     @wp.func
@@ -81,6 +82,7 @@ def build_kernels(t: Types, vehicle: VehicleParams, integrator: str):
     def quad_step_kernel(
         # Params:
         vehicle: wp.array(dtype=Vehicle),
+        airs: wp.array(dtype=Air),
         period: real,
         largest_step: real,
         gravity: real,
@@ -93,6 +95,7 @@ def build_kernels(t: Types, vehicle: VehicleParams, integrator: str):
     ):
         env = wp.tid()
         p = vehicle[env % vehicle.shape[0]]
+        air = airs[env % airs.shape[0]]
         g = vec3(real(0.0), real(0.0), -gravity)
         s = load(state, env)
         taken = push(state.queue, env, command[env])
@@ -110,7 +113,7 @@ def build_kernels(t: Types, vehicle: VehicleParams, integrator: str):
             h = (until - time) / real(float(count))
             active = state.queue[wp.min(slot, depth - 1), env]
             for _k in range(count):
-                s = integrate(p, s, active, force_w[env], torque_b[env], g, h)
+                s = integrate(p, air, s, active, force_w[env], torque_b[env], g, h)
             time = until
         status = int(0)
         if sane(s):
@@ -171,6 +174,7 @@ class QuadSim:
         precision: str = "float32",
         *,
         vehicles: list[VehicleParams] | None = None,
+        air: AirParams = AirParams(),
         gravity: float = GRAVITY,
     ):
         """Allocate ``count`` quadrotors at the origin, in hover.
@@ -185,6 +189,7 @@ class QuadSim:
             device: Warp device, "cpu" or "cuda:0".
             precision: "float32" or "float64".
             vehicles: parameters of environment e at ``e % len(vehicles)``; default ``[vehicle]``.
+            air: wind and ground effect, for all.
             gravity: acceleration of free fall, along -z [m/s^2].
 
         Raises:
@@ -199,15 +204,18 @@ class QuadSim:
             if not (math.isfinite(value) and value > 0):
                 raise ValueError(f"{name} {value} s: expected a finite, positive time")
         vehicles = vehicles or [vehicle]
+        check_air(air)
         t = types(precision)
         rows = pack_vehicle(t, vehicles, kinds_of(vehicle))
         self.vehicle, self.count, self.device, self.types = vehicle, count, device, t
         self.integration_step, self.control_period, self.gravity = step, control_period, gravity
-        key = (precision, integrator, kinds_of(vehicle))
+        extensions = extensions_of(vehicles, airs=[air])
+        key = (precision, integrator, kinds_of(vehicle), extensions)
         if key not in _BUILDS:
-            _BUILDS[key] = build_kernels(t, vehicle, integrator)
+            _BUILDS[key] = build_kernels(t, vehicle, integrator, extensions)
         self._step, self._reset, State, Start = _BUILDS[key]
         self._vehicles = wp.array(rows, dtype=t.Vehicle, device=device)
+        self._airs = wp.array(pack(t.Air, air), dtype=t.Air, device=device)
         depth = max(queue_depth(v.queue.delay, control_period) for v in vehicles)
         self.state = st.allocate(t, State, FIELDS, count, {"queue": depth}, device)
         self.start = st.allocate(t, Start, START_FIELDS, count, {}, device)
@@ -224,6 +232,7 @@ class QuadSim:
             self.count,
             [
                 self._vehicles,
+                self._airs,
                 self.control_period,
                 self.integration_step,
                 self.gravity,

@@ -15,6 +15,7 @@ from sim.params import PlantParams
 from sim.quadrotor.queue import push, split_delay
 from sim.quadrotor.rigid_body import build_direct_flow, build_flow
 from sim.rope.chain import build_chain
+from sim.rope.payload import build_payload
 from sim.structs import Types
 
 SPEED_LIMIT = 1000.0  # [m/s], [rad/s]: beyond it a state is broken, not fast
@@ -30,25 +31,30 @@ class StepKernels:
     Output: type
 
 
-def build_step(t: Types, params: PlantParams, direct: bool = False) -> StepKernels:
+def build_step(
+    t: Types, params: PlantParams, direct: bool = False, extensions: frozenset[str] = frozenset()
+) -> StepKernels:
     """Compose the kernel for the kinds and the number of segments of ``params``.
 
     Args:
         t: types of the wanted precision.
         params: kinds and segment count are read here; all numbers are read by the kernel at run time.
         direct: by-pass the blocks; see :func:`sim.quadrotor.rigid_body.build_direct_flow`.
+        extensions: names of :data:`sim.structs.EXTENSIONS` to build in; the others cost nothing.
     """
     real, vec3, vec4 = t.real, t.vec3, t.vec4
-    Vehicle, Rope, Release, QuadState = t.Vehicle, t.Rope, t.Release, t.QuadState
+    Vehicle, Rope, Release, Air, QuadState = t.Vehicle, t.Rope, t.Release, t.Air, t.QuadState
     L = params.rope.segments
     nonfinite, fallback, collision, in_rotor = st.NONFINITE, st.FALLBACK, st.COLLISION, st.ROPE_IN_ROTOR
     State = st.array_struct(t, "State", st.STATE_FIELDS)
     Output = st.array_struct(t, "Output", {k: (v, False) for k, v in st.OUTPUT_FIELDS.items()})
-    flow, rate, motor_advance = build_flow(t, params.vehicle)
+    flow, rate, motor_advance = build_flow(t, params.vehicle, extensions)
     if direct:
         flow = build_direct_flow(t)
-    chain = build_chain(t, L)
-    coupled = build_coupled_step(t, flow, rate, motor_advance, chain)
+    chain = build_chain(t, L, extensions)
+    payload = build_payload(t, extensions)
+    coupled = build_coupled_step(t, flow, rate, motor_advance, chain, payload, extensions)
+    ballistic = rel.build_ballistic(t, payload.flight_acceleration, "payload_drag" in extensions)
     load, store = st.build_access(t, State)
     vec3_limit = real(SPEED_LIMIT)
 
@@ -82,6 +88,7 @@ def build_step(t: Types, params: PlantParams, direct: bool = False) -> StepKerne
         p: Vehicle,
         rope: Rope,
         r: Release,
+        air: Air,
         s: QuadState,
         n: wp.array(dtype=vec3),
         u: wp.array(dtype=vec3),
@@ -93,13 +100,13 @@ def build_step(t: Types, params: PlantParams, direct: bool = False) -> StepKerne
         """Write what follows from the payload's state at separation."""
         mount = s.pos_w + wp.quat_rotate(s.quat_wb, rope.mount)
         pos, vel = chain.payload(rope, mount, coupled.mount_velocity(rope, s), n, u)
-        time = rel.time_to_height(pos, vel, r.landing_height, gravity)
+        time = ballistic.time_to_height(rope, air, pos, vel, r.landing_height, gravity)
         out.payload_pos_w[env] = pos
         out.payload_vel_w[env] = vel
         out.separated[env] = 1
-        out.landing_w[env] = rel.projectile(pos, vel, gravity, time)
+        out.landing_w[env] = ballistic.after(rope, air, pos, vel, gravity, time)
         out.time_to_impact[env] = time
-        out.clearance[env] = rel.clearance(pos, vel, gravity, time, s.pos_w, r.clearance_samples)
+        out.clearance[env] = ballistic.clearance(rope, air, pos, vel, gravity, time, s.pos_w, r.clearance_samples)
         out.separation_time[env] = elapsed
         out.release_pos_w[env] = s.pos_w
 
@@ -109,6 +116,7 @@ def build_step(t: Types, params: PlantParams, direct: bool = False) -> StepKerne
         vehicle: wp.array(dtype=Vehicle),
         ropes: wp.array(dtype=Rope),
         releases: wp.array(dtype=Release),
+        airs: wp.array(dtype=Air),
         period: real,
         substep: real,
         gamma: real,
@@ -126,6 +134,7 @@ def build_step(t: Types, params: PlantParams, direct: bool = False) -> StepKerne
         p = vehicle[env % vehicle.shape[0]]
         rope = ropes[env % ropes.shape[0]]
         r = releases[env % releases.shape[0]]
+        air = airs[env % airs.shape[0]]
         p.body.mass = p.body.mass * state.mass_scale[env]
         g = vec3(real(0.0), real(0.0), -gravity)
         n = wp.zeros(shape=(L,), dtype=vec3)
@@ -153,7 +162,7 @@ def build_step(t: Types, params: PlantParams, direct: bool = False) -> StepKerne
         total = coupled.momentum(p, rope, s, u)
         time = real(0.0)
         if attached != 0 and timer >= real(0.0) and timer < tiny:
-            separate(p, rope, r, s, n, u, gravity, out, env, time)
+            separate(p, rope, r, air, s, n, u, gravity, out, env, time)
             attached = int(0)
         while time < period - tiny:
             until = period
@@ -169,15 +178,15 @@ def build_step(t: Types, params: PlantParams, direct: bool = False) -> StepKerne
             for k in range(count):
                 if attached != 0:
                     s, total, fell_back = coupled.step(
-                        p, rope, s, total, active, n, u, stiffness, g, gamma, max_turn, h
+                        p, rope, air, s, total, active, n, u, stiffness, g, gamma, max_turn, h
                     )
                     if fell_back:
                         status = status | fallback
                 else:
-                    s = coupled.step_alone(p, s, active, g, h)
+                    s = coupled.step_alone(p, air, s, active, g, h)
             time = until
             if attached != 0 and timer >= real(0.0) and time > timer - tiny:
-                separate(p, rope, r, s, n, u, gravity, out, env, time)
+                separate(p, rope, r, air, s, n, u, gravity, out, env, time)
                 attached = int(0)
 
         if timer >= real(0.0):

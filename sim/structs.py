@@ -6,6 +6,7 @@ struct of each from its annotations, so a field added there reaches the kernels 
 
 import dataclasses
 import typing
+from collections.abc import Iterable
 from functools import lru_cache
 from types import SimpleNamespace
 
@@ -27,6 +28,8 @@ class Types:
         real, vec3, vec4, mat33, quat: Warp types.
         Vehicle: struct of :class:`sim.params.VehicleParams`, with the mixer's columns added under ``mixer``.
         Rope: struct of :class:`sim.params.RopeParams` per segment (``segment_length``, ``segment_mass``, ...).
+        Air: struct of :class:`sim.params.AirParams`, and what pushes from outside during a step: ``push_w`` [N] on the
+            vehicle, ``twist_b`` [N m] about its centre of mass, ``payload_push_w`` [N].
         QuadState, QuadRate: state of the quadrotor alone and its time derivative.
     """
 
@@ -40,6 +43,8 @@ class Types:
         self.Vehicle = self._from_dataclass(P.VehicleParams, {"mixer": self.Mixer})
         self.Release = self._from_dataclass(P.ReleaseParams, {})
         self.Randomization = self._from_dataclass(P.RandomizationParams, {})
+        pushes = {"push_w": self.vec3, "twist_b": self.vec3, "payload_push_w": self.vec3}
+        self.Air = self._from_dataclass(P.AirParams, pushes)
         self.Rope = make_struct(
             "Rope",
             {
@@ -52,7 +57,11 @@ class Types:
                 "last_inertia": real,
                 "payload_offset": real,
                 "payload_radius": real,
+                "payload_arm": real,
+                "payload_mass": real,
+                "payload_drag": real,
                 "joint_damping": real,
+                "mount_damping": real,
                 "total_mass": real,
             },
         )
@@ -132,6 +141,31 @@ def kinds_of(vehicle: P.VehicleParams) -> tuple[str, str, str, str]:
     return vehicle.controller.kind, vehicle.motor.kind, vehicle.battery.kind, vehicle.aero.kind
 
 
+EXTENSIONS = {
+    "gain": "thrust gains of single rotors",
+    "wind": "wind",
+    "ground_effect": "thrust near the ground",
+    "payload_drag": "air drag of the payload",
+    "mount_damping": "friction of the rope's mount",
+    "push": "forces from outside",
+}
+"""Parts of the blocks that a kernel holds only if it was built for them, and what they are."""
+
+
+def extensions_of(
+    vehicles: Iterable[P.VehicleParams], ropes: Iterable[P.RopeParams] = (), airs: Iterable[P.AirParams] = ()
+) -> frozenset[str]:
+    """Names of :data:`EXTENSIONS` without which one of these plants would not be simulated in full."""
+    needed = set()
+    for v in vehicles:
+        needed |= {"gain"} if any(g != 1.0 for g in v.thrust.gain) else set()
+    for r in ropes:
+        needed |= {name for name in ("payload_drag", "mount_damping") if getattr(r, name) != 0.0}
+    for a in airs:
+        needed |= ({"wind"} if any(a.wind_w) else set()) | ({"ground_effect"} if a.ground_effect else set())
+    return frozenset(needed)
+
+
 def pack_vehicle(t: Types, vehicles: list[P.VehicleParams], kinds: tuple[str, str, str, str]) -> np.ndarray:
     """Structured array of shape (1,) or (E,) for ``wp.array(dtype=t.Vehicle)``.
 
@@ -151,17 +185,49 @@ def pack_vehicle(t: Types, vehicles: list[P.VehicleParams], kinds: tuple[str, st
             )
         check_vehicle(vehicle)
         _fill(row, vehicle)
+        _place_rotors(row, vehicle)
         columns = mixer_columns(vehicle.rotors, vehicle.thrust.torque_ratio)
         for name in ("roll", "pitch", "yaw"):
             row["mixer"][name] = getattr(columns, name)
     return rows
 
 
-def pack(struct: type, value) -> np.ndarray:
-    """Structured array of shape (1,) for ``wp.array(dtype=struct)``, filled from the dataclass it was derived from."""
-    rows = np.zeros(1, dtype=struct.numpy_dtype())
-    _fill(rows[0], value)
+def _place_rotors(row: np.void, vehicle: P.VehicleParams) -> None:
+    """Arms about the centre of mass, and the drag torque as the rotors have it, not as the controller knows it."""
+    com = np.asarray(vehicle.body.com)
+    row["rotors"]["x"] = np.asarray(vehicle.rotors.x) - com[0]
+    row["rotors"]["y"] = np.asarray(vehicle.rotors.y) - com[1]
+    row["rotors"]["z"] = vehicle.rotors.z - com[2]
+    row["thrust"]["torque_ratio"] = vehicle.thrust.torque_ratio * vehicle.thrust.torque_gain
+
+
+def pack(struct: type, *values) -> np.ndarray:
+    """Structured array for ``wp.array(dtype=struct)``, a row filled from each of the dataclasses it was derived from."""
+    rows = np.zeros(len(values), dtype=struct.numpy_dtype())
+    for row, value in zip(rows, values, strict=True):
+        _fill(row, value)
     return rows
+
+
+def ropes_on(vehicles: list[P.VehicleParams], ropes: list[P.RopeParams]) -> list[P.RopeParams]:
+    """The ropes with their mounts stated from the centre of mass of the vehicle that each hangs on.
+
+    Raises:
+        ValueError: vehicles whose centres of mass differ, and ropes that cannot be paired with them.
+    """
+    coms = [v.body.com for v in vehicles]
+    if len(set(coms)) > 1:
+        if len(ropes) not in (1, len(vehicles)):
+            raise ValueError(
+                f"{len(ropes)} ropes on {len(vehicles)} vehicles of different centres of mass: expected one rope, or one each"
+            )
+        ropes = ropes * len(vehicles) if len(ropes) == 1 else ropes
+    else:
+        coms = coms[:1] * len(ropes)
+    return [
+        dataclasses.replace(rope, mount=tuple(m - c for m, c in zip(rope.mount, com)))
+        for rope, com in zip(ropes, coms, strict=True)
+    ]
 
 
 def pack_rope(t: Types, ropes: list[P.RopeParams]) -> np.ndarray:
@@ -182,6 +248,7 @@ def pack_rope(t: Types, ropes: list[P.RopeParams]) -> np.ndarray:
         row["last_mass"], row["last_center"] = last_mass, (mass * length / 2 + rope.payload_mass * ball) / last_mass
         row["last_inertia"] = mass * length**2 / 3 + rope.payload_inertia + rope.payload_mass * ball**2
         row["payload_offset"], row["payload_radius"] = rope.payload_offset, rope.payload_radius
-        row["joint_damping"], row["mount"] = rope.joint_damping, rope.mount
+        row["payload_arm"], row["payload_mass"], row["payload_drag"] = ball, rope.payload_mass, rope.payload_drag
+        row["joint_damping"], row["mount_damping"], row["mount"] = rope.joint_damping, rope.mount_damping, rope.mount
         row["total_mass"] = rope.rope_mass + rope.payload_mass
     return rows

@@ -4,11 +4,11 @@ One experiment file of ``configs/train`` names the files of vehicle, rope, camer
 parameters; :func:`plant_of` gives what the simulator needs of it.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 from camera.params import CameraParams
-from sim.params import PlantParams, RandomizationParams, ReleaseParams, RopeParams, SimParams, VehicleParams
+from sim.params import AirParams, PlantParams, RandomizationParams, ReleaseParams, RopeParams, SimParams, VehicleParams
 from visthrow.errors import ConfigError
 
 
@@ -136,6 +136,7 @@ class Experiment:
     camera: CameraParams
     task: TaskParams
     ppo: PPOParams
+    air: AirParams = field(default_factory=AirParams)
 
     def __post_init__(self) -> None:
         if self.ppo.environments < 1 or self.ppo.steps < 1 or self.ppo.iterations < 1:
@@ -158,7 +159,7 @@ class Experiment:
 
 def plant_of(experiment: Experiment) -> PlantParams:
     """The plant of an experiment."""
-    return PlantParams(experiment.vehicle, experiment.rope, experiment.release, experiment.sim)
+    return PlantParams(experiment.vehicle, experiment.rope, experiment.release, experiment.sim, experiment.air)
 
 
 def contract_of(experiment: Experiment) -> dict:

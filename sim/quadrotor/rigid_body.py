@@ -16,6 +16,7 @@ CONTROLLERS = {"betaflight": controller.rate_controller_betaflight, "geometric":
 MOTORS = {
     "first_order": (motor.motor_rate_first_order, motor.motor_advance_first_order),
     "instant": (motor.motor_rate_instant, motor.motor_advance_instant),
+    "asymmetric": (motor.motor_rate_asymmetric, motor.motor_advance_first_order),
 }
 BATTERIES = {"sag": battery.battery_sag, "ideal": battery.battery_ideal}
 AEROS = {"rotor_drag": aero.aero_rotor_drag, "none": aero.aero_none}
@@ -69,33 +70,56 @@ def blend(a: Any, wa: Any, b: Any, wb: Any):
     return out
 
 
-def build_flow(t: Types, vehicle: VehicleParams):
+@wp.func
+def not_pushed(air: Any, quat_wb: Any, force: Any, torque: Any):
+    """Wrench without anything from outside."""
+    return force, torque
+
+
+@wp.func
+def pushed(air: Any, quat_wb: Any, force: Any, torque: Any):
+    """Wrench with what pushes from outside [N], [N m], body frame."""
+    return force + wp.quat_rotate_inv(quat_wb, air.push_w), torque + air.twist_b
+
+
+def build_flow(t: Types, vehicle: VehicleParams, extensions: frozenset[str] = frozenset()):
     """Compose the blocks of a vehicle's kinds.
 
+    Args:
+        t: types of the wanted precision.
+        vehicle: its kinds are read here.
+        extensions: names of :data:`sim.structs.EXTENSIONS` to build in.
+
     Returns:
-        ``flow(p, state, command) -> t.Flow`` (body wrench and the derivatives of all internal states),
+        ``flow(p, air, state, command) -> t.Flow`` (body wrench and the derivatives of all internal states),
         ``rate(p, state, flow, acc_w, angular_acc_b) -> t.QuadRate``, and ``motor_advance``.
     """
     rate_controller = CONTROLLERS[vehicle.controller.kind]
     motor_rate, motor_advance = MOTORS[vehicle.motor.kind]
     battery_rate = BATTERIES[vehicle.battery.kind]
     aerodynamics = AEROS[vehicle.aero.kind]
+    rotor_thrust = thrust.rotor_thrust_scaled if "gain" in extensions else thrust.rotor_thrust
+    by_height = thrust.near_ground if "ground_effect" in extensions else thrust.out_of_ground
+    air_velocity = aero.in_wind if "wind" in extensions else aero.still_air
+    from_outside = pushed if "push" in extensions else not_pushed
     Vehicle, QuadState, QuadRate, Flow, vec3, vec4 = t.Vehicle, t.QuadState, t.QuadRate, t.Flow, t.vec3, t.vec4
+    Air = t.Air
 
     @wp.func
-    def flow(p: Vehicle, s: QuadState, command: vec4):
+    def flow(p: Vehicle, air: Air, s: QuadState, command: vec4):
         out = Flow()
         target, integral_rate, setpoint_rate, gyro_rate = rate_controller(
             p, command, s.rate_b, s.integral, s.setpoint, s.gyro, s.voltage
         )
         speed, speed_rate = motor_rate(p, s.motor_speed, target)
-        f = thrust.rotor_thrust(p, speed, s.voltage)
+        f = by_height(p, air, s.pos_w[2], rotor_thrust(p, speed, s.voltage))
         charge_rate, voltage_rate = battery_rate(p, s.charge_used, s.voltage, speed, f)
-        vel_b = wp.quat_rotate_inv(s.quat_wb, s.vel_w)
+        vel_b = wp.quat_rotate_inv(s.quat_wb, air_velocity(air, s.vel_w))
         aero_force, aero_torque = aerodynamics(p, vel_b, s.rate_b, f)
         force, torque = composer.compose(
             p, s.rate_b, f, thrust.rotor_torque(p, f), speed, speed_rate, aero_force, aero_torque
         )
+        force, torque = from_outside(air, s.quat_wb, force, torque)
         out.force_b = force
         out.torque_b = torque
         out.motor_speed = speed
@@ -130,10 +154,10 @@ def build_direct_flow(t: Types):
 
     What the bare-dynamics scenes of the tests fly, and an idealised vehicle for whoever wants one.
     """
-    Vehicle, QuadState, Flow, vec3, vec4, real = t.Vehicle, t.QuadState, t.Flow, t.vec3, t.vec4, t.real
+    Vehicle, Air, QuadState, Flow, vec3, vec4, real = t.Vehicle, t.Air, t.QuadState, t.Flow, t.vec3, t.vec4, t.real
 
     @wp.func
-    def flow(p: Vehicle, s: QuadState, command: vec4):
+    def flow(p: Vehicle, air: Air, s: QuadState, command: vec4):
         out = Flow()
         out.force_b = vec3(real(0.0), real(0.0), command[0])
         out.torque_b = vec3(command[1], command[2], command[3])

@@ -13,6 +13,27 @@ def rotor_thrust(p: Any, motor_speed: Any, voltage: Any):
 
 
 @wp.func
+def rotor_thrust_scaled(p: Any, motor_speed: Any, voltage: Any):
+    """Thrust of each rotor [N], shape (4,), with a gain of its own."""
+    return wp.cw_mul(p.thrust.gain, rotor_thrust(p, motor_speed, voltage))
+
+
+@wp.func
+def near_ground(p: Any, air: Any, height: Any, thrust: Any):
+    """Thrust of each rotor [N], shape (4,), at a height [m] of the vehicle. Equation: :class:`sim.params.AirParams`."""
+    quarter = type(height)(0.25)
+    one = type(height)(1.0)
+    ratio = quarter * p.rotors.radius / wp.max(height, type(height)(0.5) * p.rotors.radius)
+    return thrust * (one + air.ground_effect * (one / (one - ratio * ratio) - one))
+
+
+@wp.func
+def out_of_ground(p: Any, air: Any, height: Any, thrust: Any):
+    """Thrust of each rotor [N], shape (4,), without the ground."""
+    return thrust
+
+
+@wp.func
 def rotor_torque(p: Any, thrust: Any):
     """Magnitude of each rotor's drag torque [N m], shape (4,)."""
     return p.thrust.torque_ratio * thrust

@@ -28,6 +28,7 @@ from typing import Any
 
 import warp as wp
 
+from sim.rope.payload import LOADS
 from sim.structs import Types
 
 
@@ -72,8 +73,55 @@ def second_stage_terms(stiffness: Any, damping: Any, u2: Any, k1: Any, gh: Any, 
     return gh * stiffness * u2 + two * gh * (stiffness * (two * gh - h) + damping) * k1
 
 
-def build_chain(t: Types, segments: int) -> SimpleNamespace:
+@wp.func
+def no_load(i: int, last: int, at: Any, arm: Any, load: Any):
+    """Force or moment on rod i where nothing but gravity acts on the rods."""
+    return at
+
+
+@wp.func
+def last_load(i: int, last: int, at: Any, arm: Any, load: Any):
+    """Force (arm 1) or moment (arm [m]) on rod i with what acts on the payload, at the last rod alone."""
+    if i == last:
+        return at + arm * load
+    return at
+
+
+@wp.func
+def joint_alike(rope: Any, i: int):
+    """Damping of the upper joint of rod i [N m s]."""
+    return rope.joint_damping
+
+
+@wp.func
+def joint_and_mount(rope: Any, i: int):
+    """Damping of the upper joint of rod i [N m s], with the mount's friction in the uppermost."""
+    if i == 0:
+        return rope.joint_damping + rope.mount_damping
+    return rope.joint_damping
+
+
+@wp.func
+def frictionless_mount(rope: Any, i: int, moment: Any, couple: Any):
+    """Moment on rod i; the mount adds nothing."""
+    return moment
+
+
+@wp.func
+def rubbing_mount(rope: Any, i: int, moment: Any, couple: Any):
+    """Moment on rod i with the mount's friction on the uppermost one; ``couple``: rate of the vehicle against the rod."""
+    if i == 0:
+        return moment + rope.mount_damping * couple
+    return moment
+
+
+def build_chain(t: Types, segments: int, extensions: frozenset[str] = frozenset()) -> SimpleNamespace:
     """Recursion for a fixed number of segments.
+
+    Args:
+        t: types of the wanted precision.
+        segments: L.
+        extensions: names of :data:`sim.structs.EXTENSIONS` to build in.
 
     Returns:
         Namespace of Warp functions. ``up_first``, ``up_second`` (leaf to root: apparent mass and force of the whole chain
@@ -85,6 +133,10 @@ def build_chain(t: Types, segments: int) -> SimpleNamespace:
     L = segments
     real, vec3, Rope = t.real, t.vec3, t.Rope
     vec2 = wp.types.vector(2, real)
+    last = L - 1
+    loaded = last_load if extensions & LOADS else no_load
+    upper_damping = joint_and_mount if "mount_damping" in extensions else joint_alike
+    at_mount = rubbing_mount if "mount_damping" in extensions else frictionless_mount
 
     @wp.func
     def rod(rope: Rope, i: int):
@@ -127,6 +179,7 @@ def build_chain(t: Types, segments: int) -> SimpleNamespace:
             stiffness: wp.array(dtype=real),
             root_rate_w: vec3,
             gravity: vec3,
+            load: vec3,
             gamma: real,
             h: real,
             c1: wp.array(dtype=vec3),
@@ -148,8 +201,9 @@ def build_chain(t: Types, segments: int) -> SimpleNamespace:
                 m, c, inertia = rod(rope, i)
                 n_above = ni
                 u_above = ui
-                damping = rope.joint_damping
+                damping = upper_damping(rope, i)
                 couple = wp.cross(root_rate_w, ni) - ui
+                above = couple
                 if i > 0:
                     n_above = direction(n, n2, i - 1)
                     u_above = rate(u, k1, h, i - 1)
@@ -163,6 +217,7 @@ def build_chain(t: Types, segments: int) -> SimpleNamespace:
                 cm = c * m
                 g = c * f - l * b + (l2 * speed2) * a_n + rope.joint_damping * couple
                 g += terms(stiffness[i], damping, ui, k1[i], gh, h)
+                g = at_mount(rope, i, loaded(i, last, g, rope.payload_arm, load), above)
                 e1, e2 = tangent_basis(ni)
                 a_e1 = sym_mul(d, o, e1)
                 a_e2 = sym_mul(d, o, e2)
@@ -182,7 +237,7 @@ def build_chain(t: Types, segments: int) -> SimpleNamespace:
                 g2 = wp.dot(e2, g)
                 h1 = s22 * g1 - s12 * g2
                 h2 = s11 * g2 - s12 * g1
-                b = b - f - speed2 * (cm * ni + l * a_n) + h1 * b1 + h2 * b2
+                b = b - loaded(i, last, f, real(1.0), load) - speed2 * (cm * ni + l * a_n) + h1 * b1 + h2 * b2
                 d = d + vec3(m, m, m) - wp.cw_mul(b1, q1) - wp.cw_mul(b2, q2)
                 o = o - vec3(
                     b1[0] * q1[1] + b2[0] * q2[1], b1[0] * q1[2] + b2[0] * q2[2], b1[1] * q1[2] + b2[1] * q2[2]
@@ -244,6 +299,7 @@ def build_chain(t: Types, segments: int) -> SimpleNamespace:
         mount_acc_w: vec3,
         mount_force_w: vec3,
         gravity: vec3,
+        load: vec3,
         gamma: real,
         h: real,
         c1: wp.array(dtype=vec3),
@@ -267,8 +323,9 @@ def build_chain(t: Types, segments: int) -> SimpleNamespace:
             ui = old_u + h * first
             k = acceleration(ni, ui, a, c1[i], c2[i], hs[i])
             f = m * gravity
-            pull = pull + f - m * (a + c * k)
-            stiffness[i] = wp.max(wp.dot(ni, c * (f - m * a) - l * pull), real(0.0))
+            pull = pull + loaded(i, last, f, real(1.0), load) - m * (a + c * k)
+            moment = loaded(i, last, c * (f - m * a) - l * pull, rope.payload_arm, load)
+            stiffness[i] = wp.max(wp.dot(ni, moment), real(0.0))
             a = a + l * k
             new_n = wp.normalize(n[i] + half * (old_u + ui + gh * (k - first)))
             new_u = old_u + half * (first + k)
@@ -298,6 +355,22 @@ def build_chain(t: Types, segments: int) -> SimpleNamespace:
         return pos + rope.payload_offset * n[L - 1], vel + rope.payload_offset * u[L - 1]
 
     @wp.func
+    def speed_first(rope: Rope, mount_vel_w: vec3, u: wp.array(dtype=vec3), k1: wp.array(dtype=vec3), h: real):
+        """Velocity of the payload's centre at the state [m/s], world frame."""
+        vel = mount_vel_w
+        for i in range(L):
+            vel += rope.segment_length * u[i]
+        return vel + rope.payload_offset * u[L - 1]
+
+    @wp.func
+    def speed_second(rope: Rope, mount_vel_w: vec3, u: wp.array(dtype=vec3), k1: wp.array(dtype=vec3), h: real):
+        """The same at the predicted state."""
+        vel = mount_vel_w
+        for i in range(L):
+            vel += rope.segment_length * (u[i] + h * k1[i])
+        return vel + rope.payload_offset * (u[L - 1] + h * k1[L - 1])
+
+    @wp.func
     def momentum(rope: Rope, u: wp.array(dtype=vec3)):
         """Linear momentum [N s] of the chain in a frame that moves with the mount."""
         total = vec3()
@@ -313,7 +386,10 @@ def build_chain(t: Types, segments: int) -> SimpleNamespace:
         down_second=down_second,
         fall_back=fall_back,
         payload=payload,
+        speed_first=speed_first,
+        speed_second=speed_second,
         momentum=momentum,
+        upper_damping=upper_damping,
         segments=L,
         vec2=vec2,
     )

@@ -102,7 +102,7 @@ def run_counted(sim: HybridSim) -> tuple[SimpleNamespace, int]:
     """
     source = _Source()
     t = source.load("sim.structs").types(sim.params.sim.precision)
-    kernels = source.load("sim.step").build_step(t, sim.params)
+    kernels = source.load("sim.step").build_step(t, sim.params, extensions=sim.extensions)
     with mock.patch.object(wp, "launch") as launch:  # what the simulator would launch with, whatever it is
         sim.step()
     translation = _Translation(sim, t)
