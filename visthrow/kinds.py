@@ -14,7 +14,9 @@ SCHEMAS = {
     "task": "visthrow.task:TaskParams",
     "start": "sim.params:RandomizationParams",
     "train": "visthrow.task:Experiment",
+    "sweep": "visthrow.sweep.lists:SweepList",
     "hil": "hil.params:HilParams",
+    "diagnose": "visthrow.diagnose.setup:Setup",
     "vehicle/reference_realistic": "sim.reference.extras:ReferenceExtras",
 }
 """``kind`` or ``kind/name`` -> ``module:class``; the longer key wins."""

@@ -5,7 +5,7 @@ import importlib
 from typing import Any
 
 ACTIONS = {
-    "check": ("look at logs: clocks, units, frames, gaps, what is excited, what they can answer", "visthrow.diagnose.check_cli"),
+    "check": ("look at logs: clocks, units, frames, gaps, what is excited, what they can answer", "visthrow.diagnose.check.cli"),
 }
 """Name -> (help, module). The module has ``add_arguments(parser)`` and ``run(args) -> int``."""
 

@@ -1,0 +1,1 @@
+"""What can be said of logs before any model is asked."""

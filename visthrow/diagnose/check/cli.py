@@ -1,0 +1,47 @@
+"""``visthrow diagnose check``: whether logs can answer anything, before a model is asked."""
+
+import argparse
+from pathlib import Path
+
+DEFAULT_OUT = "out/check"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the action."""
+    parser.epilog = (
+        "examples:\n"
+        "  visthrow diagnose check flight.npz                     a log of ours\n"
+        "  visthrow diagnose check LOG00001.BFL                   Betaflight's blackbox, as it comes\n"
+        "  visthrow diagnose check monday/*.csv --config mine.toml    tables, with a mapping of their columns\n"
+        "\nExit status: 0 all logs ok or with warnings, 1 at least one is bad.\n"
+    )
+    parser.add_argument("logs", metavar="LOG", nargs="+", help="files, or folders of runs")
+    parser.add_argument("--config", metavar="NAME", help="of configs/diagnose, or a file: how a table's columns are read")
+    parser.add_argument("--all", action="store_true", help="print every row, fine ones too")
+    parser.add_argument("--out", default=DEFAULT_OUT, metavar="FOLDER", help=f"of the pictures (default: {DEFAULT_OUT})")
+    parser.add_argument("--no-pictures", action="store_true", help="draw none")
+    parser.add_argument("--json", metavar="FILE", help="write all rows to this file")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Read, look, print."""
+    from visthrow.diagnose.check.picture import draw
+    from visthrow.diagnose.check.run import check, table
+    from visthrow.diagnose.setup import read_logs
+    from visthrow.storage import write_json
+
+    logs = read_logs(args.logs, args.config)
+    results = check(logs)
+    for number, (log, checked) in enumerate(zip(logs, results), start=1):
+        print(table(checked, args.all) + "\n")
+        if not args.no_pictures:
+            draw(log, checked, Path(args.out) / f"{number:02d}-{_file_name(checked.name)}.png")
+    if not args.no_pictures:
+        print(f"{len(logs)} picture(s) in {args.out}")
+    if args.json:
+        write_json(args.json, {"logs": [checked.as_dict() for checked in results]})
+    return 1 if any(checked.verdict == "bad" for checked in results) else 0
+
+
+def _file_name(text: str) -> str:
+    return "".join(c if c.isalnum() or c in "-_." else "_" for c in text)

@@ -1,0 +1,185 @@
+"""What a log excites, and what it can therefore answer."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from visthrow.diagnose.check import relations
+from visthrow.diagnose.check.rows import Row
+from visthrow.flightlog import FlightLog
+
+POSITIONS = ("pos_w", "est_pos_w", "mocap_pos_w")
+ATTITUDES = ("quat_wb", "est_quat_wb", "mocap_quat_wb")
+THRUSTS = ("command", "thrust_command", "motor_command", "motor_speed", "pwm")
+
+STILL = 0.01
+"""A vehicle whose position keeps within this [m] for the whole log has not flown, if its motors stood or nothing tells."""
+
+
+@dataclass(frozen=True)
+class Question:
+    """Something that logs can answer, and what it takes."""
+
+    name: str
+    needs: tuple[tuple[str, ...], ...]  # each: any one of these channels
+    excited: str  # figure of the excitation that must reach a size; "": none
+    least: float = 0.0
+
+
+QUESTIONS = (
+    Question("thrust gain against mass", (THRUSTS, POSITIONS + ("acc_b",)), "seconds_flown", 3.0),
+    Question("thrust curve", (THRUSTS, POSITIONS + ("acc_b",)), "thrust_range", 0.3),
+    Question("battery sag", (THRUSTS, ("battery_voltage",), POSITIONS + ("acc_b",)), "voltage_range", 0.1),
+    Question("rotor drag", (POSITIONS, ATTITUDES), "speed_p95_m_s", 0.7),
+    Question("wind or frame tilt", (POSITIONS, ATTITUDES), "seconds_flown", 5.0),
+    Question("wind against frame tilt", (POSITIONS, ATTITUDES), "yaw_range_deg", 60.0),
+    Question("centre of mass, motor by motor gain", (("motor_command", "motor_speed", "pwm"), ("rate_b", *ATTITUDES)), "seconds_flown", 3.0),
+    Question("motor lag and command delay", (("command", "motor_command", "rate_setpoint_b"), ("rate_b",)), "rate_p95_rad_s", 0.3),
+    Question("rope length", (("payload_pos_w",),), "swing_deg", 2.0),
+    Question("payload drag", (("payload_pos_w",),), "payload_speed_p95_m_s", 1.5),
+    Question("release lag", (("payload_pos_w",), ("release_command",)), "releases", 1.0),
+    Question("camera against motion capture", (("marker_pos_c", "keypoints"), POSITIONS, ("payload_pos_w",)), "seconds", 5.0),
+    Question("ground effect", (THRUSTS, POSITIONS), "seconds_low", 2.0),
+)  # fmt: skip
+
+
+def look(log: FlightLog) -> list[Row]:
+    """Say what is excited, and which questions the log can answer."""
+    figures = excitation(log)
+    rows = [Row("excited", "", "ok", _words(figures), figures)]
+    if figures.get("still"):
+        text = "the vehicle never left its place: nothing about its flight can be answered"
+        rows.append(Row("excited", "", "bad", text, {"still": 1}))
+    elif figures.get("idle"):
+        text = "no sign of flight: the throttle stays at zero, or the motors hardly above idle"
+        rows.append(Row("excited", "", "bad", text, {"idle": 1}))
+    return rows + [_answer(question, log, figures) for question in QUESTIONS if _concerns(question, log)]
+
+
+def _words(figures: dict) -> str:
+    units = {
+        "seconds": "s", "seconds_flown": "s flown", "seconds_hover": "s of hover", "speed_p95_m_s": "m/s (95 %)",
+        "yaw_range_deg": "deg of yaw", "swing_deg": "deg of swing", "releases": "releases", "height_range_m": "m of height",
+        "thrust_range": "of thrust (95 to 5 %, relative)", "voltage_range": "V of battery",
+    }  # fmt: skip
+    return ", ".join(f"{figures[key]:.3g} {word}" for key, word in units.items() if key in figures)
+
+
+def _concerns(question: Question, log: FlightLog) -> bool:
+    """Leave out questions about things of which the log holds nothing at all."""
+    return any(name in log for name in question.needs[0])
+
+
+def _answer(question: Question, log: FlightLog, figures: dict) -> Row:
+    missing = [" or ".join(group) for group in question.needs if not any(name in log for name in group)]
+    if missing:
+        return Row("answers", question.name, "warn", f"cannot be answered: no {', no '.join(missing)}")
+    if figures.get("still") or figures.get("idle"):
+        return Row("answers", question.name, "warn", "cannot be answered: the vehicle did not fly")
+    reached = figures.get(question.excited)
+    if question.excited and (reached is None or reached < question.least):
+        came = "nothing" if reached is None else f"{reached:.3g}"
+        text = f"cannot be answered: {question.excited} is {came}, at least {question.least:g} is needed"
+        return Row("answers", question.name, "warn", text)
+    return Row("answers", question.name, "ok", "can be answered")
+
+
+def excitation(log: FlightLog) -> dict[str, float]:
+    """Figures of what a log excites; what no channel tells is left out."""
+    figures: dict[str, float] = {}
+    spans = [float(np.ptp(channel.time)) for channel in log.channels.values() if len(channel.time) > 1]
+    figures["seconds"] = max(spans, default=0.0)
+    flown = _flown(log, figures)
+    _motion(log, figures, flown)
+    _thrust(log, figures, flown)
+    _payload(log, figures)
+    _standing(log, figures)
+    return figures
+
+
+def _flown(log: FlightLog, figures: dict) -> tuple[float, float]:
+    """First and last time in the air, by height or by thrust."""
+    name = next((n for n in POSITIONS if n in log and len(log[n].time) > 20), None)
+    if name is None:
+        return -np.inf, np.inf
+    channel = log[name]
+    height = channel.values[channel.valid][:, 2] - np.percentile(channel.values[channel.valid][:, 2], 1)
+    time = channel.time[channel.valid]
+    up = height > 0.15 * np.max(height) if np.max(height) > 0.3 else np.ones(len(height), bool)
+    figures["seconds_flown"] = float(np.sum(up) * np.median(np.diff(time)))
+    figures["height_range_m"] = float(np.ptp(channel.values[channel.valid][:, 2]))
+    low = up & (channel.values[channel.valid][:, 2] < 0.3)
+    figures["seconds_low"] = float(np.sum(low) * np.median(np.diff(time)))
+    return (float(time[up][0]), float(time[up][-1])) if np.any(up) else (-np.inf, np.inf)
+
+
+def _motion(log: FlightLog, figures: dict, flown: tuple[float, float]) -> None:
+    name = next((n for n in POSITIONS if n in log and np.sum(log[n].valid) > 50), None)
+    if name is not None:
+        channel = log[name]
+        time, vel = relations.derivative(channel.time[channel.valid], channel.values[channel.valid].astype(float), 0.1)
+        inside = (time >= flown[0]) & (time <= flown[1])
+        speed = np.linalg.norm(vel[inside], axis=1)
+        if len(speed):
+            figures["speed_p95_m_s"] = float(np.percentile(speed, 95))
+            figures["seconds_hover"] = float(np.sum(speed < 0.15) * np.median(np.diff(time)))
+    name = next((n for n in ATTITUDES if n in log and len(log[n].time) > 20), None)
+    if name is not None:
+        x, y, z, w = log[name].values[log[name].valid].astype(float).T
+        yaw = np.unwrap(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
+        figures["yaw_range_deg"] = float(np.degrees(np.percentile(yaw, 98) - np.percentile(yaw, 2)))
+    if "rate_b" in log and len(log["rate_b"].time) > 20:
+        figures["rate_p95_rad_s"] = float(np.percentile(np.linalg.norm(log["rate_b"].values, axis=1), 95))
+
+
+def _thrust(log: FlightLog, figures: dict, flown: tuple[float, float]) -> None:
+    name = next((n for n in THRUSTS if n in log and len(log[n].time) > 20), None)
+    if name is not None:
+        channel = log[name]
+        inside = channel.valid & (channel.time >= flown[0]) & (channel.time <= flown[1])
+        values = channel.values[inside].astype(float).reshape(int(np.sum(inside)), -1)
+        thrust = values[:, 0] if name in ("command", "thrust_command") else np.mean(values, axis=1)
+        thrust = thrust**2 if name == "motor_speed" else thrust
+        if len(thrust):
+            low, middle, high = np.percentile(thrust, [5, 50, 95])
+            figures["thrust_range"] = float((high - low) / max(middle, 1e-9))
+    if "battery_voltage" in log:
+        volts = log["battery_voltage"].values[log["battery_voltage"].valid]
+        if len(volts):
+            figures["voltage_range"] = float(np.percentile(volts, 95) - np.percentile(volts, 5))
+
+
+def _payload(log: FlightLog, figures: dict) -> None:
+    if "payload_pos_w" not in log or np.sum(log["payload_pos_w"].valid) < 50:
+        return
+    payload = log["payload_pos_w"]
+    time, pos = payload.time[payload.valid], payload.values[payload.valid].astype(float)
+    _, vel = relations.derivative(time, pos, 0.1)
+    if len(vel):
+        figures["payload_speed_p95_m_s"] = float(np.percentile(np.linalg.norm(vel, axis=1), 95))
+    if "pos_w" in log and np.sum(log["pos_w"].valid) > 50:
+        vehicle = log["pos_w"]
+        gap = pos - relations.on_grid(vehicle.time[vehicle.valid], vehicle.values[vehicle.valid].astype(float), time)
+        angle = np.degrees(np.arctan2(np.linalg.norm(gap[:, :2], axis=1), -gap[:, 2]))
+        figures["swing_deg"] = float(np.percentile(angle, 95))
+    if "release_command" in log:
+        pressed = log["release_command"].values.astype(float).ravel() > 0.0
+        figures["releases"] = float(np.sum(np.diff(pressed.astype(int)) > 0))
+
+
+def _standing(log: FlightLog, figures: dict) -> None:
+    name = next((n for n in POSITIONS if n in log and np.sum(log[n].valid) > 20), None)
+    thrust = next((n for n in ("motor_command", "pwm", "throttle", "motor_speed") if n in log), None)
+    idle = False
+    if thrust is not None and len(log[thrust].time):
+        values = log[thrust].values.astype(float)
+        top = float(np.percentile(values, 95))
+        idle = top < (100.0 if thrust == "motor_speed" else 0.12)
+    if "throttle" in log and np.ptp(log["throttle"].values) == 0.0:
+        idle = True
+    if name is not None:
+        pos = log[name].values[log[name].valid].astype(float)
+        if float(np.max(np.percentile(pos, 98, axis=0) - np.percentile(pos, 2, axis=0))) < STILL and (idle or thrust is None):
+            figures["still"] = 1.0
+    elif idle:
+        figures["idle"] = 1.0

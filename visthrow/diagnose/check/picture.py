@@ -1,0 +1,52 @@
+"""One picture a log: its channels over time, gaps left open, with the verdicts beside them."""
+
+from pathlib import Path
+
+import numpy as np
+
+from visthrow import style
+from visthrow.diagnose.check.rows import worst
+from visthrow.diagnose.check.run import Checked
+from visthrow.flightlog import FlightLog
+
+MOST = 10
+"""Channels in a picture."""
+_FIRST = ("pos_w", "vel_w", "quat_wb", "rate_b", "acc_b", "payload_pos_w", "command", "motor_command", "battery_voltage")
+_POINTS = 4000
+_SHADE = {"ok": style.COLOURS[2], "warn": style.COLOURS[4], "bad": style.COLOURS[1]}
+
+
+def draw(log: FlightLog, checked: Checked, path: str | Path) -> None:
+    """Write the picture."""
+    style.use()
+    import matplotlib.pyplot as plt
+
+    names = [name for name in _FIRST if name in log] + [name for name in log.channels if name not in _FIRST]
+    names = [name for name in names if len(log[name].time) > 1][:MOST]
+    figure, axes = plt.subplots(max(len(names), 1), 1, figsize=(9, 1.1 + 1.25 * max(len(names), 1)), sharex=True, squeeze=False)
+    for axis, name in zip(axes[:, 0], names):
+        _channel(axis, log, name)
+        verdict = worst([row for row in checked.rows if name in row.channel.replace(",", " ").split()])
+        axis.set_ylabel(f"{name}\n[{log[name].unit}]", rotation=0, ha="right", va="center", fontsize=8)
+        axis.spines["left"].set_color(_SHADE[verdict])
+        axis.spines["left"].set_linewidth(4)
+    axes[-1, 0].set_xlabel("time [s]")
+    axes[0, 0].set_title(f"{checked.name}: {checked.verdict} (bar at the left: green ok, yellow warn, red bad)", loc="left")
+    figure.tight_layout()
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path)
+    plt.close(figure)
+
+
+def _channel(axis, log: FlightLog, name: str) -> None:
+    channel = log[name]
+    values = channel.values.reshape(len(channel.values), -1).astype(float)
+    values = np.where(channel.valid[:, None], values, np.nan)
+    step = max(1, len(values) // _POINTS)
+    time, values = channel.time[::step], values[::step]
+    wide = np.flatnonzero(np.diff(time) > 5 * np.median(np.diff(time)))
+    time, values = np.insert(time, wide + 1, np.nan), np.insert(values, wide + 1, np.nan, axis=0)
+    for i, column in enumerate(values.T[:4]):
+        axis.plot(time, column, lw=0.8, color=style.COLOURS[i])
+    axis.grid(True, axis="y")
+    axis.tick_params(labelsize=8)

@@ -1,0 +1,121 @@
+"""All checks of several logs; their verdict, table and picture."""
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from visthrow.diagnose.check import excitation, physics, signals
+from visthrow.diagnose.check.rows import Row, Verdict, worst
+from visthrow.flightlog import FlightLog
+
+_ALIKE = 0.2
+"""Logs that share a larger part of their samples are copies of one another."""
+_MOVING = ("pos", "rate", "acc", "quat", "vel", "angle", "thrust", "motor")
+
+
+@dataclass(frozen=True)
+class Checked:
+    """What was found in one log."""
+
+    name: str
+    rows: tuple[Row, ...]
+
+    @property
+    def verdict(self) -> Verdict:
+        """The worst row's; what cannot be answered is no fault of the log."""
+        return worst([row for row in self.rows if row.topic != "answers"])
+
+    def as_dict(self) -> dict:
+        """For JSON."""
+        return {"log": self.name, "verdict": self.verdict, "rows": [asdict(row) for row in self.rows]}
+
+
+def check(logs: Sequence[FlightLog]) -> list[Checked]:
+    """Look at logs one by one, and at what they have in common."""
+    copies = _copies(logs)
+    return [Checked(label(log, i), (*_look(log), *copies.get(i, ()))) for i, log in enumerate(logs)]
+
+
+def label(log: FlightLog, number: int) -> str:
+    """Name of a log for people."""
+    source = Path(str(log.meta.get("source", f"log {number + 1}"))).name
+    part = log.meta.get("part")
+    return f"{source}:{part}" if part else source
+
+
+def _look(log: FlightLog) -> list[Row]:
+    if not log.channels:
+        return [Row("clock", "", "bad", "no channel at all")]
+    rows = _reader(log)
+    for name, channel in log.channels.items():
+        rows += signals.look(name, channel, signals.notes_of(log, name))
+    rows += _clocks(log)
+    return rows + physics.look(log) + excitation.look(log)
+
+
+def _reader(log: FlightLog) -> list[Row]:
+    """What the reader of a binary log noted."""
+    rows = []
+    corrupt, dropped = log.meta.get("corrupt", 0), log.meta.get("dropped", 0)
+    if corrupt or dropped:
+        text = f"{corrupt} damaged stretches, {dropped} frames lost with them"
+        rows.append(Row("gaps", "", "warn", text, {"corrupt": corrupt, "dropped": dropped}))
+    if log.meta.get("complete") is False:
+        rows.append(Row("gaps", "", "warn", "ends without its end marker: cut short", {}))
+    if log.meta.get("damaged"):
+        rows.append(Row("gaps", "", "warn", "damaged stretches in the file", {}))
+    return rows
+
+
+def _clocks(log: FlightLog) -> list[Row]:
+    clocks: dict[str, list[str]] = {}
+    for name in log.channels:
+        clocks.setdefault(str(signals.notes_of(log, name).get("clock", "main")), []).append(name)
+    spans = [(c.time[0], c.time[-1]) for c in log.channels.values() if len(c.time) > 1]
+    rows = []
+    if len(clocks) > 1:
+        text = f"{len(clocks)} clocks: " + "; ".join(f"{name}: {', '.join(of)}" for name, of in clocks.items())
+        rows.append(Row("clock", "", "ok", text, {"clocks": len(clocks)}))
+    if spans and max(start for start, _ in spans) > min(end for _, end in spans):
+        rows.append(Row("clock", "", "bad", "channels that never overlap in time: different clocks, or different flights"))
+    return rows
+
+
+def _copies(logs: Sequence[FlightLog]) -> dict[int, list[Row]]:
+    prints = [_prints(log) for log in logs]
+    found: dict[int, list[Row]] = {}
+    for j in range(len(logs)):
+        for i in range(j):
+            shared = len(prints[i] & prints[j]) / max(min(len(prints[i]), len(prints[j])), 1)
+            if shared > _ALIKE and prints[i]:
+                text = f"shares {100 * shared:.0f} % of its samples with {label(logs[i], i)}: a copy counts once"
+                found.setdefault(j, []).append(Row("duplicates", "", "bad", text, {"copy_of": i, "shared": shared}))
+    return found
+
+
+def _prints(log: FlightLog) -> set[bytes]:
+    """Fingerprints of short runs of samples, whatever their time stamps."""
+    prints: set[bytes] = set()
+    for name, channel in log.channels.items():
+        if not any(word in name for word in _MOVING) or len(channel.values) < 8 or channel.values.dtype.kind == "b":
+            continue
+        rows = np.ascontiguousarray(channel.values.reshape(len(channel.values), -1), dtype=np.float64)
+        moving = np.flatnonzero(np.any(rows[1:] != rows[:-1], axis=1))
+        for at in moving[:: max(1, len(moving) // 2000)]:
+            if at + 4 <= len(rows) and len(np.unique(rows[at : at + 4])) > 3:
+                prints.add(hashlib.blake2b(rows[at : at + 4].tobytes(), digest_size=8).digest())
+    return prints
+
+
+def table(checked: Checked, every: bool = False) -> str:
+    """Print a log's rows; noise and clocks that are fine only on demand."""
+    marks = {"ok": "ok  ", "warn": "WARN", "bad": "BAD "}
+    lines = [f"{checked.name}: {checked.verdict}"]
+    shown = [row for row in checked.rows if every or row.verdict != "ok" or row.topic not in ("noise", "clock", "gaps")]
+    width = max((len(row.channel) for row in shown), default=0)
+    for row in shown:
+        lines.append(f"  {marks[row.verdict]} {row.topic:<10} {row.channel:<{min(width, 34)}}  {row.text}")
+    return "\n".join(lines)

@@ -1,0 +1,193 @@
+"""Checks of one channel by itself: its clock, gaps, stuck and saturated values, jumps, and the noise of its sensor."""
+
+import numpy as np
+
+from visthrow.diagnose.check.rows import Row
+from visthrow.flightlog import Channel, FlightLog
+
+FEW_SAMPLES = 20
+FEW_STEPS, SLOW_PERIOD = 5, 0.5
+"""Values that come more slowly [s] are settled ones, as a stand's, and fewer of them suffice."""
+SHORT = 0.5
+"""Shorter channels answer nothing [s]."""
+LONG = 1800.0
+"""Longer logs are looked at, but cut before they are simulated [s]."""
+
+_GAP_PERIODS = 3.0
+_JITTER_WARN = 0.25  # of a period, 95th percentile
+_STUCK_TIME = 0.25  # [s]; a moving vehicle's pose does not stand still to the last digit for so long
+_RAIL_SHARE = 0.01
+_RAILED = ("command", "motor_command", "motor_output", "pwm", "acc_b", "rate_b", "throttle", "motor_speed")
+_NEVER_STUCK = ("pos", "quat", "vel", "rate", "acc", "payload", "angle")
+_STOPS_AT_ZERO = ("throttle", "motor_command", "command", "motor_output", "pwm", "motor_speed")
+
+
+def noise(channel: Channel) -> np.ndarray:
+    """Standard deviation of the sensor's noise, from third differences of evenly spaced samples.
+
+    Third differences of a motion that is smooth over four samples vanish; those of white noise have 20 times its variance.
+    The median of their size ignores what is rare.
+
+    Returns:
+        One value a component, in the channel's unit; NaN where there are too few samples.
+    """
+    values = channel.values.reshape(len(channel.values), -1).astype(float)
+    if len(values) < FEW_SAMPLES:
+        return np.full(values.shape[1], np.nan)
+    period = np.median(np.diff(channel.time))
+    even = np.abs(np.diff(channel.time) - period) < 0.5 * period
+    good = channel.valid[:-3] & channel.valid[3:] & even[:-2] & even[1:-1] & even[2:]
+    third = np.diff(values, 3, axis=0)[good]
+    if len(third) < FEW_SAMPLES:
+        return np.full(values.shape[1], np.nan)
+    spread = np.median(np.abs(third), axis=0) / 0.6745 / np.sqrt(20.0)
+    return np.maximum(spread, _resolution(values) / np.sqrt(12.0))
+
+
+def _resolution(values: np.ndarray) -> np.ndarray:
+    """Smallest step between values, where they come in steps."""
+    steps = np.zeros(values.shape[1])
+    for i, column in enumerate(values.T):
+        distinct = np.unique(column)
+        if 1 < len(distinct) < 0.5 * len(column):
+            steps[i] = np.min(np.diff(distinct))
+    return steps
+
+
+def look(name: str, channel: Channel, notes: dict) -> list[Row]:
+    """All checks of one channel.
+
+    Args:
+        name: Of the channel.
+        channel: Its samples.
+        notes: What the reader left out; see :func:`visthrow.diagnose.ingest.table.make_channel`.
+    """
+    count = len(channel.time)
+    span = float(np.ptp(channel.time)) if count else 0.0
+    if count >= FEW_STEPS and span > SLOW_PERIOD * count:
+        return [Row("clock", name, "ok", f"{count} settled values over {span:.0f} s", {"samples": count, "seconds": span})]
+    if count < FEW_SAMPLES or span < SHORT:
+        text = f"{count} samples over {span:.2f} s; at least {FEW_SAMPLES} over {SHORT} s are needed"
+        event = name in ("separation", "landing", "goal_w", "release_command", "attached", "mode")
+        return [Row("clock", name, "ok" if event else "bad", text, {"samples": count, "seconds": span})]
+    return [_clock(name, channel, notes), *_gaps(name, channel), *_values(name, channel), *_noise(name, channel)]
+
+
+def _clock(name: str, channel: Channel, notes: dict) -> Row:
+    steps = np.diff(channel.time)
+    period, span = float(np.median(steps)), float(np.ptp(channel.time))
+    jitter = float(np.percentile(np.abs(steps - period), 95)) / period
+    figures = {"samples": len(channel.time), "seconds": span, "rate_hz": 1.0 / period, "jitter_of_period": jitter}
+    text = f"{len(channel.time)} samples, {span:.1f} s, {1.0 / period:.4g} Hz, jitter {100 * jitter:.0f} % of a period"
+    verdict = "warn" if jitter > _JITTER_WARN else "ok"
+    for key, words in (("repeated", "stamps repeated"), ("backwards", "stamps going back"), ("unstamped", "rows unstamped")):
+        if notes.get(key):
+            verdict, text = "warn", f"{text}; {notes[key]} {words}"
+            figures[key] = notes[key]
+            if key != "unstamped" and notes[key] > 0.05 * notes.get("rows", len(steps)):
+                verdict = "bad"
+    if notes.get("held"):
+        text += f"; {notes['held']} repetitions of a held value left out"
+        figures["held"] = notes["held"]
+    if span > LONG:
+        verdict = "warn" if verdict == "ok" else verdict
+        text += f"; long: only windows of {LONG / 60:.0f} minutes in all are simulated"
+    return Row("clock", name, verdict, text, figures)
+
+
+def _gaps(name: str, channel: Channel) -> list[Row]:
+    steps = np.diff(channel.time)
+    period = float(np.median(steps))
+    wide = steps > _GAP_PERIODS * period
+    lost = float(np.sum(steps[wide] - period))
+    invalid = float(np.mean(~channel.valid))
+    share = lost / float(np.ptp(channel.time))
+    figures = {"gaps": int(np.sum(wide)), "longest_s": float(np.max(steps)), "lost_share": share, "invalid_share": invalid}
+    if not np.any(wide) and invalid == 0.0:
+        return []
+    verdict = "bad" if invalid + share > 0.5 else "warn" if invalid + share > 0.02 or np.max(steps) > 0.5 else "ok"
+    text = f"{int(np.sum(wide))} gaps, the longest {np.max(steps):.3f} s; {100 * share:.1f} % of the time, "
+    return [Row("gaps", name, verdict, text + f"{100 * invalid:.1f} % of the samples not valid", figures)]
+
+
+def _values(name: str, channel: Channel) -> list[Row]:
+    values = channel.values.reshape(len(channel.values), -1).astype(float)
+    values, time = values[channel.valid], channel.time[channel.valid]
+    if len(values) < FEW_SAMPLES:
+        return [Row("values", name, "bad", f"{len(values)} valid samples")]
+    rows = []
+    if any(word in name for word in _NEVER_STUCK) and "setpoint" not in name:
+        rows += _stuck(name, values, time)
+    if any(word in name for word in _RAILED) and "setpoint" not in name:
+        rows += _railed(name, values)
+    if "pos" in name or "quat" in name:
+        rows += _jumps(name, values, time)
+    return rows
+
+
+def _stuck(name: str, values: np.ndarray, time: np.ndarray) -> list[Row]:
+    same = np.all(np.diff(values, axis=0) == 0.0, axis=1)
+    if not np.any(same):
+        return []
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]).astype(int)))
+    starts, ends = edges[::2], edges[1::2]
+    lengths = time[np.minimum(ends, len(time) - 1)] - time[starts]
+    longest, at = float(np.max(lengths)), float(time[starts[np.argmax(lengths)]])
+    total, share = float(np.sum(lengths[lengths > _STUCK_TIME])), float(np.mean(same))
+    figures = {"longest_s": longest, "at_s": at, "stuck_s": total, "repeated_share": share}
+    if np.all(same):
+        return [Row("values", name, "bad", "one value from beginning to end", figures)]
+    if longest > _STUCK_TIME:
+        verdict = "bad" if total > 0.3 * float(np.ptp(time)) else "warn"
+        return [Row("values", name, verdict, f"stands still to the last digit for {longest:.2f} s at {at:.2f} s", figures)]
+    if share > 0.2:
+        text = f"{100 * share:.0f} % of the samples repeat the one before: measured more slowly than logged, or rounded"
+        return [Row("values", name, "warn", text, figures)]
+    return []
+
+
+def _railed(name: str, values: np.ndarray) -> list[Row]:
+    worst, where = 0.0, ""
+    for column in values.T:
+        low, high = np.min(column), np.max(column)
+        if high == low:
+            continue
+        for rail, words in ((low, "lowest"), (high, "highest")):
+            if rail == low and any(word in name for word in _STOPS_AT_ZERO):
+                continue  # switched off is no rail
+            share = float(np.mean(column == rail))
+            if share > worst:
+                worst, where = share, f"its {words} value {rail:.6g}"
+    if worst <= _RAIL_SHARE:
+        return []
+    return [Row("values", name, "warn", f"{100 * worst:.1f} % of the samples at {where}: saturated", {"share": worst})]
+
+
+def _jumps(name: str, values: np.ndarray, time: np.ndarray) -> list[Row]:
+    if "quat" in name:
+        signs = np.sign(np.sum(values[1:] * values[:-1], axis=1))
+        values = values * np.cumprod(np.concatenate([[1.0], np.where(signs == 0.0, 1.0, signs)]))[:, None]
+    size = np.linalg.norm(np.diff(values, axis=0), axis=1)
+    steps = np.diff(time)
+    usual = np.maximum(np.percentile(size, 99), 1e-9)
+    far = (size > 5.0 * usual) & (size / steps > (20.0 if "quat" in name else 30.0)) & (steps < 5 * np.median(steps))
+    if not np.any(far):
+        return []
+    at = int(np.argmax(np.where(far, size, 0.0)))
+    unit = "" if "quat" in name else " m"
+    text = f"{int(np.sum(far))} jumps, the largest {size[at]:.3g}{unit} at {time[at]:.2f} s"
+    return [Row("values", name, "warn" if np.mean(far) < 0.02 else "bad", text, {"jumps": int(np.sum(far))})]
+
+
+def _noise(name: str, channel: Channel) -> list[Row]:
+    sigma = noise(channel)
+    if channel.values.dtype.kind == "b" or not np.all(np.isfinite(sigma)) or not np.any(sigma > 0.0):
+        return []
+    text = f"sd of the noise {', '.join(f'{s:.3g}' for s in sigma[:4])} {channel.unit}"
+    return [Row("noise", name, "ok", text, {"sigma": sigma.tolist(), "unit": channel.unit})]
+
+
+def notes_of(log: FlightLog, name: str) -> dict:
+    """What the reader noted on a channel, or nothing."""
+    found = log.meta.get("ingest", {})
+    return found.get(name, {}) if isinstance(found, dict) else {}
