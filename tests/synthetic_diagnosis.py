@@ -1,0 +1,164 @@
+"""Flights of two point masses with effects whose truth is known: a model to be diagnosed without any simulator.
+
+Vehicle and payload are moved by smooth random forces; positions of both are measured. Effects are force shapes on either mass or
+shifts of a measured position, so the linearisation is exact unless ``curvature`` says otherwise.
+"""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from visthrow.diagnose.model import Effect, Window
+
+MASS = (0.21, 0.058)  # [kg]
+SIGMA = (5e-4, 8e-4)  # [m]
+RATE, LENGTH, KNOTS = 100, 1.0, 11
+CHANNELS = ("pos_w", "payload_pos_w")
+GUST = (0.015, 6e-4)  # deviation of the gusts on either mass [N]
+GUST_TIME = 0.6  # [s]
+
+
+def _response(time: np.ndarray, knots: np.ndarray) -> np.ndarray:
+    """Position after a unit force on a unit mass at each knot (triangles), shape (T, knots)."""
+    fine = np.linspace(0.0, LENGTH, 501)
+    step = fine[1]
+    shapes = np.array([np.interp(fine, knots, row) for row in np.eye(len(knots))]).T
+    speed = np.cumsum(shapes, axis=0) * step
+    place = np.cumsum(speed, axis=0) * step
+    return np.array([np.interp(time, fine, column) for column in place.T]).T
+
+
+def catalogue(count: int = 20) -> tuple[Effect, ...]:
+    """Effects: two thirds are forces, one third are shifts of a measured position."""
+    blocks = ("thrust map", "rope", "aero", "payload aero", "release")
+    effects = []
+    for i in range(count):
+        sensing = i % 3 == 2
+        effects.append(Effect(
+            name=f"effect_{i:02d}", cause=f"cause {i}", equation=f"F += theta phi_{i}", unit="m" if sensing else "N",
+            block="sensing" if sensing else blocks[i % len(blocks)], bounds=(-2e-2, 2e-2) if sensing else (-1.0, 1.0),
+            prior_sd=5e-3 if sensing else 0.2 if i % 2 else 0.05, floor=1e-4 if sensing else 4e-3 if i % 2 else 1e-3,
+            channels=("payload_pos_w",) if i % 2 == 0 else ("pos_w",), source="made up", manoeuvres=("swing",),
+        ))  # fmt: skip
+    return tuple(effects)
+
+
+@dataclass
+class SyntheticModel:
+    """Implements :class:`visthrow.diagnose.model.Model`; ``truth`` is in floors."""
+
+    effects: tuple[Effect, ...] = field(default_factory=catalogue)
+    truth: dict[str, float] = field(default_factory=dict)
+    seed: int = 0
+    throws: int = 6
+    free: int = 2
+    noise: float = 1.0
+    gust: float = 1.0
+    curvature: float = 0.0  # of the response, a 30 floors' size bends it by this share
+    same: dict[str, tuple[str, float]] = field(default_factory=dict)  # effect -> (of which it is a multiple, factor)
+    law: str = ""  # a hidden force outside the catalogue: "speed" or "swirl" or "thrust"
+    law_size: float = 0.0
+    channels: tuple[str, ...] = CHANNELS
+    fresh: int = 0  # seed of noise and gusts alone
+    calls: int = 0
+
+    def __post_init__(self) -> None:
+        self._rng = np.random.default_rng(self.seed)
+        self._draw = np.random.default_rng([self.seed, self.fresh])
+        self._at = {e.name: j for j, e in enumerate(self.effects)}
+        self._time = np.arange(0.0, LENGTH, 1.0 / RATE)
+        self._knots = np.linspace(0.0, LENGTH, KNOTS)
+        self._placed = _response(self._time, self._knots)
+        self._windows = [w for flight in range(self.free + self.throws) for w in self._flight(flight)]
+
+    def _flight(self, flight: int) -> list[Window]:
+        if flight < self.free:
+            return [self._window(flight, "flight", k * LENGTH, 1.0) for k in range(6)]
+        return [self._window(flight, "hover", 0.0, 0.3), self._window(flight, "throw", LENGTH, 2.0)]
+
+    def _smooth(self, size: int, scale: float) -> np.ndarray:
+        phase, speed = self._rng.uniform(0, 2 * np.pi, (3, size)), self._rng.uniform(2.0, 9.0, (3, size))
+        waves = np.sin(speed[..., None] * self._knots + phase[..., None]) * self._rng.normal(size=(3, size))[..., None]
+        return scale * waves.sum(0).T / 1.7  # (knots, size)
+
+    def _motion(self, vigour: float) -> dict[str, np.ndarray]:
+        velocity = self._smooth(3, 1.5 * vigour)
+        return {
+            "time": self._knots, "pos_w": self._smooth(3, 0.5) + [0, 0, 1.5], "vel_w": velocity,
+            "quat_wb": np.tile([0.0, 0.0, 0.0, 1.0], (KNOTS, 1)), "rate_b": self._smooth(3, vigour),
+            "thrust": 2.63 + self._smooth(1, 0.8 * vigour)[:, 0], "payload_pos_w": self._smooth(3, 0.5) + [0, 0, 1.2],
+            "payload_vel_w": velocity + self._smooth(3, 0.7 * vigour),
+            "cable_dir_w": np.tile([0.0, 0.0, -1.0], (KNOTS, 1)), "tension": 0.57 + self._smooth(1, 0.1)[:, 0],
+        }  # fmt: skip
+
+    def _window(self, flight: int, phase: str, start: float, vigour: float) -> Window:
+        n = len(self._time)
+        motion = self._motion(vigour)
+        effects = np.zeros((6 * n, len(self.effects)))
+        for j, e in enumerate(self.effects):
+            on_payload = e.channels == ("payload_pos_w",)
+            rows = slice(3 * n, 6 * n) if on_payload else slice(0, 3 * n)
+            if e.unit == "m":
+                shape = np.array([np.interp(self._time, self._knots, c) for c in self._smooth(3, vigour).T]).T
+            else:
+                shape = self._placed @ self._smooth(3, vigour) / MASS[on_payload]
+            effects[rows, j] = shape.ravel()
+        for name, (of, factor) in self.same.items():
+            effects[:, self._at[name]] = factor * effects[:, self._at[of]]
+        nuisance, latent = np.zeros((6 * n, 12)), np.zeros((6 * n, 6 * KNOTS))
+        for m in range(2):
+            for axis in range(3):
+                rows = m * 3 * n + 3 * np.arange(n) + axis
+                nuisance[rows, m * 6 + axis], nuisance[rows, m * 6 + 3 + axis] = 1.0, self._time
+                at = (m * 3 + axis) * KNOTS
+                latent[rows, at : at + KNOTS] = self._placed / MASS[m]
+        forces = self._gusts()
+        if self.law:
+            forces = forces + self._law(motion)
+        sigma = np.repeat(SIGMA, 3 * n)
+        measured = latent @ forces + self._answer(effects, self.truth) + sigma * self.noise * self._draw.normal(size=6 * n)
+        measured += nuisance @ self._draw.normal(0.0, 0.02, 12)
+        return Window(
+            flight, phase, start + np.tile(np.repeat(self._time, 3), 2), np.repeat([0, 1], 3 * n), measured, sigma, effects,
+            nuisance, np.full(12, 0.1), latent, np.repeat([0, 2], 3 * KNOTS), np.tile(np.repeat([0, 1, 2], KNOTS), 2),
+            np.tile(start + self._knots, 6), {**motion, "time": start + self._knots},
+        )  # fmt: skip
+
+    def _gusts(self) -> np.ndarray:
+        root = np.linalg.cholesky(np.exp(-np.abs(self._knots[:, None] - self._knots) / GUST_TIME))
+        white = self._draw.normal(size=(2, 3, KNOTS)) * self.gust * np.array(GUST)[:, None, None]
+        return (white @ root.T).ravel()
+
+    def _law(self, motion: dict[str, np.ndarray]) -> np.ndarray:
+        force = np.zeros((2, 3, KNOTS))
+        if self.law == "speed":  # drag of the vehicle that grows with the square of its speed
+            force[0] = -self.law_size * (np.linalg.norm(motion["vel_w"], axis=1)[:, None] * motion["vel_w"]).T
+        elif self.law == "swirl":  # a force across the payload's velocity
+            force[1] = self.law_size * np.cross([0.0, 0.0, 1.0], motion["payload_vel_w"]).T
+        else:  # thrust grows with the square of the speed across its axis
+            across = (motion["vel_w"][:, :2] ** 2).sum(1)
+            force[0, 2] = self.law_size * motion["thrust"] * across
+        return force.ravel()
+
+    def _floors(self, sizes: dict[str, float]) -> np.ndarray:
+        theta = np.zeros(len(self.effects))
+        for name, size in sizes.items():
+            theta[self._at[name]] = size
+        return theta
+
+    def _answer(self, effects: np.ndarray, sizes: dict[str, float]) -> np.ndarray:
+        theta, floor = self._floors(sizes), np.array([e.floor for e in self.effects])
+        return effects @ (floor * (theta + self.curvature * theta * np.abs(theta) / 30.0))
+
+    def _sizes(self, theta: dict[str, float]) -> dict[str, float]:
+        return {name: value / self.effects[self._at[name]].floor for name, value in theta.items()}
+
+    def windows(self, theta: dict[str, float]) -> list[Window]:
+        self.calls += 1
+        slope = 1.0 + 2.0 * self.curvature * np.abs(self._floors(self._sizes(theta))) / 30.0
+        left = self.residuals(theta)
+        return [replace(w, residual=r, effects=w.effects * slope) for w, r in zip(self._windows, left)]
+
+    def residuals(self, theta: dict[str, float]) -> list[np.ndarray]:
+        sizes = self._sizes(theta)
+        return [w.residual - self._answer(w.effects, sizes) for w in self._windows]

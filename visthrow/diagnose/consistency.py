@@ -1,0 +1,100 @@
+"""Whether all flights tell the same: an effect of one flight is an event, and a flight that was copied counts once."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from visthrow.diagnose.evidence import Priors, additions
+from visthrow.diagnose.model import Window
+from visthrow.diagnose.point import Point
+
+LEAST_FLIGHTS = 4
+"""Fewer cannot outvote one."""
+
+CONTRADICTION = 16.0
+"""Squared distance of one flight from the others, in their joint deviation (4 sigma), from which it contradicts them."""
+
+SHARE = 0.3
+"""Part of an effect by which flights may differ: the effect's form is never exact."""
+
+MANY = 0.3
+"""Share of the information in flights of the wrong sign from which an effect is no property of the vehicle."""
+
+
+@dataclass(frozen=True)
+class Consistency:
+    """Why an effect is no cause."""
+
+    flight: int | None  # the flight in which alone something happened; None where the flights differ from one another
+
+
+def across_flights(
+    before: Point, after: Point, priors: Priors, active: Sequence[int], added: int, least: float
+) -> Consistency | None:
+    """Look whether the flights agree on an effect that was added.
+
+    Args:
+        before: without it.
+        after: with it.
+        priors: of the effects.
+        active: effects named before.
+        added: the effect.
+        least: threshold [nats].
+
+    Returns:
+        None where they agree or too few can say.
+    """
+    statistics = after.statistics
+    own = statistics.information[:, added, added]
+    size = after.theta[added]
+    if len(own) < LEAST_FLIGHTS or own.sum() <= 0.0:
+        return None
+    estimates = size + np.divide(statistics.score[:, added], own, out=np.zeros_like(own), where=own > 0.0)
+    certain = own * size**2 > CONTRADICTION  # flights that would show it
+    against = certain & (np.sign(estimates) != np.sign(size)) & (own * estimates**2 > CONTRADICTION)
+    if own[against].sum() > MANY * own.sum():
+        return Consistency(None)
+    f = int(np.argmax(own * np.abs(estimates) * np.sign(estimates) * np.sign(size)))
+    others = np.arange(len(own)) != f
+    weight = own[others].sum()
+    if weight <= 0.0 or certain[others].sum() < LEAST_FLIGHTS - 1:
+        return None
+    rest = (own[others] @ estimates[others]) / weight
+    distance = (estimates[f] - rest) ** 2 / (1.0 / own[f] + 1.0 / weight + (SHARE * estimates[f]) ** 2 + 1.0)
+    base = before.statistics
+    information, score = base.information[others].sum(0), base.absolute[others].sum(0)
+    alone = additions(information, score, priors, active)[added]
+    expected = additions(information, information[:, added] * estimates[f], priors, active)[added]
+    if distance > CONTRADICTION and alone < least and expected > 2.0 * least:
+        return Consistency(int(statistics.flights[f]))
+    return None
+
+
+def repeated_flights(windows: Sequence[Window]) -> dict[int, int]:
+    """Find flights whose windows repeat those of an earlier flight, whatever their clocks say.
+
+    Returns:
+        Flight -> the earlier flight.
+    """
+    by_flight: dict[int, list[Window]] = {}
+    for window in windows:
+        by_flight.setdefault(window.flight, []).append(window)
+    repeats: dict[int, int] = {}
+    for flight, own in by_flight.items():
+        for earlier, others in by_flight.items():
+            if earlier >= flight:
+                break
+            if earlier not in repeats and len(own) == len(others) and all(map(_same, own, others)):
+                repeats[flight] = earlier
+                break
+    return repeats
+
+
+def _same(a: Window, b: Window) -> bool:
+    """Noise of two flights never agrees to a thousandth of its deviation."""
+    if a.residual.shape != b.residual.shape or not len(a.residual):
+        return False
+    if np.median(np.abs(a.residual) / a.sigma) < 0.1:  # a simulation's record without noise
+        return False
+    return bool(np.median(np.abs(a.residual - b.residual) / a.sigma) < 1e-3)

@@ -1,0 +1,156 @@
+"""Evidence for sets of effects, with floors: whatever is not named may still be there below its floor.
+
+In floors, an effect that is not named has the prior N(0, 1) (the spike), a named one N(0, prior^2) within its bounds (the slab):
+
+    log Z = -1/2 log |1 + D^1/2 I D^1/2| + 1/2 s' (I + D^-1)^-1 s + log of the prior's and posterior's mass within the bounds
+
+All functions take information I, shape (K, K), and scores s about theta = 0, shape (K,), or (n, K) for n draws at once.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+from scipy.special import log_ndtr
+
+from visthrow.diagnose.marginal import Statistics
+from visthrow.diagnose.model import Effect
+from visthrow.errors import DiagnoseError
+
+CALIBRATION_DRAWS = 4000
+CALIBRATION_QUANTILE = 0.995
+
+
+@dataclass(frozen=True)
+class Priors:
+    """What is believed of each effect before the flights, in floors; arrays of shape (K,)."""
+
+    floor: np.ndarray  # in the effects' units
+    slab: np.ndarray  # deviation of a named effect
+    low: np.ndarray
+    high: np.ndarray
+    visible: np.ndarray  # bool: all its channels are there
+
+    @staticmethod
+    def of(effects: list[Effect] | tuple[Effect, ...], channels: list[str] | tuple[str, ...]) -> "Priors":
+        """Read them off the catalogue.
+
+        Raises:
+            DiagnoseError: A floor or prior is not above 0, or bounds do not hold 0.
+        """
+        for e in effects:
+            if not (e.floor > 0.0 and e.prior_sd > 0.0 and e.bounds[0] <= 0.0 <= e.bounds[1]):
+                raise DiagnoseError(
+                    f"effect '{e.name}' has floor {e.floor}, prior_sd {e.prior_sd}, bounds {e.bounds}; expected both above 0, "
+                    "and bounds about 0"
+                )
+        names = [e.name for e in effects]
+        if len(set(names)) < len(names):
+            raise DiagnoseError(f"two effects share a name: {', '.join(sorted({n for n in names if names.count(n) > 1}))}")
+        floor = np.array([e.floor for e in effects], dtype=float)
+        bounds = np.array([e.bounds for e in effects], dtype=float).reshape(-1, 2) / floor[:, None]
+        slab = np.array([e.prior_sd for e in effects], dtype=float) / floor
+        visible = np.array([set(e.channels) <= set(channels) for e in effects], dtype=bool)
+        return Priors(floor, np.maximum(slab, 1.5), bounds[:, 0], bounds[:, 1], visible)
+
+    def deviation(self, active: list[int] | tuple[int, ...]) -> np.ndarray:
+        """Prior deviations with these effects named, shape (K,)."""
+        spread = np.ones(len(self.floor))
+        spread[list(active)] = self.slab[list(active)]
+        return spread
+
+
+def _log_mass(mean: np.ndarray, sd: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Logarithm of a normal distribution's mass within bounds, accurate far in the tails."""
+    a, b = (low - mean) / sd, (high - mean) / sd
+    flip = a > 0.0  # use the tail that does not round to 1
+    a, b = np.where(flip, -b, a), np.where(flip, -a, b)
+    upper, lower = log_ndtr(b), log_ndtr(a)
+    return upper + np.log1p(-np.exp(np.minimum(lower - upper, -1e-12)))
+
+
+def covariance(information: np.ndarray, deviation: np.ndarray) -> np.ndarray:
+    """Posterior covariance (I + D^-1)^-1, shape (K, K)."""
+    scaled = information * np.outer(deviation, deviation)
+    scaled.flat[:: len(scaled) + 1] += 1.0
+    return cho_solve(cho_factor(scaled, lower=True), np.eye(len(scaled))) * np.outer(deviation, deviation)
+
+
+def log_evidence(information: np.ndarray, score: np.ndarray, priors: Priors, active: list[int] | tuple[int, ...]) -> float:
+    """log Z of one set of named effects."""
+    deviation = priors.deviation(active)
+    scaled = information * np.outer(deviation, deviation)
+    scaled.flat[:: len(scaled) + 1] += 1.0
+    factor = cho_factor(scaled, lower=True)
+    half = score * deviation
+    mean = cho_solve(factor, half)
+    value = 0.5 * half @ mean - np.log(np.diag(factor[0])).sum()
+    if len(active):
+        at = list(active)
+        spread = cho_solve(factor, np.eye(len(scaled))[:, at])[at].diagonal()
+        mean, spread = mean[at] * deviation[at], np.sqrt(spread) * deviation[at]
+        low, high = priors.low[at], priors.high[at]
+        value += (_log_mass(mean, spread, low, high) - _log_mass(np.zeros(len(at)), deviation[at], low, high)).sum()
+    return float(value)
+
+
+def additions(information: np.ndarray, score: np.ndarray, priors: Priors, active: list[int] | tuple[int, ...]) -> np.ndarray:
+    """Gain of log Z by naming one more effect, for each effect; -inf for those named already or not visible.
+
+    A change of one prior is a rank-one update, so all candidates and all draws cost one factorisation.
+
+    Args:
+        information: shape (K, K).
+        score: shape (K,) or (n, K).
+        priors: of the effects.
+        active: named already.
+
+    Returns:
+        Nats, of the score's shape.
+    """
+    sigma = covariance(information, priors.deviation(active))
+    mean, variance = score @ sigma, np.diag(sigma)
+    out = ~priors.visible
+    out[list(active)] = True
+    change = priors.slab**-2.0 - 1.0
+    left = np.where(out, 1.0, 1.0 + change * variance)
+    gain = -np.log(priors.slab) - 0.5 * np.log(left) - 0.5 * change * mean**2 / left
+    wide_mean, wide_sd = mean / left, np.sqrt(variance / left)
+    inside = _log_mass(wide_mean, wide_sd, priors.low, priors.high)
+    gain = gain + inside - _log_mass(np.zeros_like(priors.low), priors.slab, priors.low, priors.high)
+    return np.where(out, -np.inf, gain)
+
+
+def estimate(information: np.ndarray, score: np.ndarray, priors: Priors, active: list[int] | tuple[int, ...]) -> np.ndarray:
+    """Most probable sizes of the named effects within their bounds, all others at 0; in floors, shape (K,)."""
+    from scipy.optimize import lsq_linear
+
+    theta = np.zeros(len(score))
+    if len(active):
+        at = list(active)
+        normal = information[np.ix_(at, at)] + np.diag(priors.slab[at] ** -2.0)
+        factor = np.linalg.cholesky(normal)
+        right = np.linalg.solve(factor, score[at])
+        theta[at] = lsq_linear(factor.T, right, (priors.low[at], priors.high[at]), method="bvls").x
+    return theta
+
+
+def null_draws(information: np.ndarray, draws: int, rng: np.random.Generator) -> np.ndarray:
+    """Scores of worlds in which every effect is at plus or minus its floor and nothing else is wrong, shape (draws, K)."""
+    values, vectors = np.linalg.eigh(information)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    floors = rng.choice((-1.0, 1.0), size=(draws, len(information)))
+    return rng.standard_normal((draws, len(information))) @ root.T + floors @ information
+
+
+def threshold(statistics: Statistics, priors: Priors, rng: np.random.Generator, draws: int = CALIBRATION_DRAWS) -> float:
+    """Nats that the best of all effects exceeds in half a per cent of null worlds, and at least the log of their number.
+
+    The null worlds have these flights' information, noise as fitted, and every effect at its floor.
+    """
+    information = statistics.information.sum(0)
+    candidates = int(priors.visible.sum())
+    if not candidates:
+        raise DiagnoseError("none of the effects can be seen in the channels of these logs")
+    best = additions(information, null_draws(information, draws, rng), priors, ()).max(axis=1)
+    return float(max(np.quantile(best, CALIBRATION_QUANTILE), np.log(candidates)))

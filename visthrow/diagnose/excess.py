@@ -1,0 +1,105 @@
+"""Latent forces by block and phase: what still moves the vehicle after the causes were named, and whether that is too much.
+
+Gusts and draught do not know what the vehicle is doing. A latent force that is several times stronger in throws than in the
+quietest phase is no gust but something that the model lacks.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from visthrow.diagnose.marginal import posterior
+from visthrow.diagnose.model import LATENT_BLOCKS
+from visthrow.diagnose.point import Point
+from visthrow.diagnose.result import Level
+
+UNKNOWN_RATIO = 3.0
+"""Latent forces above this many times the quietest phase's are no gusts."""
+
+LIMIT_NATS = 2.0
+"""Loss of log-likelihood that marks the upper limit of a level (one-sided 97.5 %)."""
+
+GRID = np.geomspace(1.0, 32.0, 11)
+"""Factors above the best level among which its upper limit is looked for."""
+
+
+def levels(before: Point, after: Point, least: float) -> tuple[Level, ...]:
+    """Compare the latent forces of each block and phase with the block's quietest phase.
+
+    Args:
+        before: the model as it stands.
+        after: with what was named.
+        least: nats from which a level counts as excessive.
+    """
+    found = []
+    blocks = sorted({block for block, _ in after.noise.latent_sd})
+    for block in blocks:
+        phases = [phase for b, phase in after.noise.latent_sd if b == block]
+        limits = {phase: _upper_limit(after, block, phase) for phase in phases}
+        quiet_phase = min(limits, key=limits.get)
+        quiet = limits[quiet_phase]
+        for phase in phases:
+            level = after.noise.latent_sd[block, phase]
+            nats = 0.0
+            if level > UNKNOWN_RATIO * quiet:
+                nats = _likelihood(after, block, phase, level) - _likelihood(after, block, phase, UNKNOWN_RATIO * quiet)
+            earlier = before.noise.latent_sd.get((block, phase), float("nan"))
+            found.append(Level(LATENT_BLOCKS[block], phase, earlier, level, quiet, float(nats), bool(nats > least)))
+    return tuple(found)
+
+
+def _windows(point: Point, block: int, phase: str) -> list[int]:
+    return [w for w, g in enumerate(point.grams) if g.phase == phase and np.any(g.latent_block == block)]
+
+
+def _likelihood(point: Point, block: int, phase: str, level: float) -> float:
+    noise = replace(point.noise, latent_sd={**point.noise.latent_sd, (block, phase): level})
+    return sum(posterior(point.grams[w], noise, w).log_likelihood for w in _windows(point, block, phase))
+
+
+def _upper_limit(point: Point, block: int, phase: str) -> float:
+    best = point.noise.latent_sd[block, phase]
+    top = _likelihood(point, block, phase, best)
+    for factor in GRID[1:]:
+        if _likelihood(point, block, phase, best * factor) < top - LIMIT_NATS:
+            return float(best * factor)
+    return float(best * GRID[-1])
+
+
+def acts_on(point: Point, j: int) -> str:
+    """Latent block through which an effect moves things, or "" where it moves measurements alone.
+
+    Its column is laid over the columns of each block's latent forces; the block that explains most of it, and at least half, is it.
+    """
+    weight = point.noise.scale**-2.0
+    total, by_block = 0.0, np.zeros(len(LATENT_BLOCKS))
+    for gram in point.grams:
+        inner, size = np.tensordot(weight, gram.inner, 1), gram.nuisances + gram.latents
+        column = size + j
+        free = np.arange(gram.nuisances)
+        own = _explained(inner, free, column)
+        total += inner[column, column] - own
+        for block in np.unique(gram.latent_block):
+            with_block = np.concatenate((free, gram.nuisances + np.flatnonzero(gram.latent_block == block)))
+            by_block[block] += _explained(inner, with_block, column) - own
+    best = int(np.argmax(by_block))
+    return LATENT_BLOCKS[best] if total > 0.0 and by_block[best] > 0.5 * total else ""
+
+
+def _explained(inner: np.ndarray, columns: Sequence[int], target: int) -> float:
+    """Part of a column's square that other columns explain."""
+    normal, right = inner[np.ix_(columns, columns)], inner[columns, target]
+    normal = normal + np.diag(1e-9 * np.diag(normal) + 1e-12)
+    return float(right @ np.linalg.solve(normal, right))
+
+
+def too_strong(point: Point, share: float) -> tuple[str, ...]:
+    """Phases in which the latent force on the vehicle exceeds a share of the thrust that carries it."""
+    thrusts: dict[str, list[float]] = {}
+    for window in point.windows:
+        if "thrust" in window.knots and len(window.knots["thrust"]):
+            thrusts.setdefault(window.phase, []).append(float(np.median(np.abs(window.knots["thrust"]))))
+    block = LATENT_BLOCKS.index("vehicle force")
+    weight = max((float(np.median(v)) for v in thrusts.values()), default=np.inf)
+    return tuple(p for (b, p), level in point.noise.latent_sd.items() if b == block and level > share * weight)

@@ -1,0 +1,272 @@
+"""From windows of residuals to what they say about the effects: information and score of every flight.
+
+Initial states b and latent forces a are integrated out. With U = [X, G], prior covariance P of (b, a) and sensor noise W^-1,
+
+    V = W^-1 + U P U',   V^-1 = W - W U (P^-1 + U'W U)^-1 U'W   (Woodbury)
+
+so a window of thousands of samples becomes a few inner products (:class:`Gram`), and a change of noise levels costs one small
+factorisation. The latent forces of one block and axis are an Ornstein-Uhlenbeck process at the knots; its Cholesky factor is
+multiplied into G once, after which P is diagonal.
+
+Effects are measured in floors throughout: theta = 1 is the size below which an effect does not matter.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import lapack
+
+from visthrow.diagnose.model import LATENT_BLOCKS, Window
+from visthrow.errors import DiagnoseError
+
+
+@dataclass(frozen=True)
+class Gram:
+    """Weighted inner products of one window's columns, by channel; D nuisances, L latents, K effects, P = D + L + K.
+
+    The columns stand in the order nuisances (times their prior deviation), latents, effects (times their floors).
+    """
+
+    flight: int
+    phase: str
+    count: np.ndarray  # samples of each of the model's C channels, shape (C,)
+    inner: np.ndarray  # Z' Z / sigma^2, shape (C, P, P)
+    cross: np.ndarray  # Z' r / sigma^2, shape (C, P)
+    square: np.ndarray  # r' r / sigma^2, shape (C,)
+    nuisances: int
+    latent_block: np.ndarray  # shape (L,)
+    factor: np.ndarray  # what stands between unit latents and knots: G_used = G @ factor, shape (L, L)
+
+    @property
+    def latents(self) -> int:
+        """Number of latent-force coefficients."""
+        return len(self.latent_block)
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Levels of sensor noise and latent forces."""
+
+    scale: np.ndarray  # of each channel's sigma, shape (C,)
+    latent_sd: Mapping[tuple[int, str], float]  # (block, phase) -> deviation [N, N m, N]
+    correlation_time: float  # of the latent forces [s]
+    inflation: np.ndarray  # of each window's latent deviations, shape (windows,); 1 but in bad windows
+
+    def deviation(self, gram: Gram, window: int) -> np.ndarray:
+        """Prior deviation of the columns [X, G] of a window, shape (D + L,)."""
+        levels = np.ones(gram.nuisances + gram.latents)
+        for block in np.unique(gram.latent_block):
+            level = self.latent_sd[int(block), gram.phase] * self.inflation[window]
+            levels[gram.nuisances :][gram.latent_block == block] = level
+        return levels
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """Everything that F flights say about K effects, in floors, about the linearisation point ``theta``."""
+
+    flights: np.ndarray  # their numbers, shape (F,)
+    information: np.ndarray  # S' V^-1 S, shape (F, K, K)
+    score: np.ndarray  # S' V^-1 r, shape (F, K)
+    square: np.ndarray  # r' V^-1 r + log det V, shape (F,)
+    samples: np.ndarray  # shape (F,)
+    theta: np.ndarray  # shape (K,)
+
+    @property
+    def absolute(self) -> np.ndarray:
+        """Scores about theta = 0, shape (F, K)."""
+        return self.score + self.information @ self.theta
+
+    @property
+    def absolute_square(self) -> np.ndarray:
+        """``square`` of the residuals extrapolated to theta = 0, shape (F,)."""
+        return self.square + 2.0 * self.score @ self.theta + (self.information @ self.theta) @ self.theta
+
+    def only(self, keep: np.ndarray) -> "Statistics":
+        """The same of some flights; ``keep`` is a mask or indices into ``flights``."""
+        return replace(self, flights=self.flights[keep], information=self.information[keep], score=self.score[keep],
+                       square=self.square[keep], samples=self.samples[keep])  # fmt: skip
+
+
+def columns(window: Window, floors: np.ndarray) -> np.ndarray:
+    """The columns [X, G, S] of a window as :class:`Gram` scales them, shape (N, P)."""
+    latent = window.latent if window.latent.size else np.zeros((len(window.residual), 0))
+    return np.hstack((window.nuisance * window.nuisance_sd, latent, window.effects * floors))
+
+
+def gram_of(window: Window, floors: np.ndarray, channels: int) -> Gram:
+    """Reduce a window to its inner products.
+
+    Args:
+        window: with finite residuals and derivatives.
+        floors: of the effects, shape (K,).
+        channels: number C of the model's channels.
+
+    Raises:
+        DiagnoseError: The window's arrays do not fit together, or hold NaN or infinity.
+    """
+    _check(window, len(floors), channels)
+    z = columns(window, floors) / window.sigma[:, None]
+    r = window.residual / window.sigma
+    inner = np.zeros((channels, z.shape[1], z.shape[1]))
+    cross, square, count = np.zeros((channels, z.shape[1])), np.zeros(channels), np.zeros(channels)
+    for c in np.unique(window.channel):
+        rows = window.channel == c
+        inner[c], cross[c], square[c] = z[rows].T @ z[rows], z[rows].T @ r[rows], r[rows] @ r[rows]
+        count[c] = rows.sum()
+    blocks = np.asarray(window.latent_block, dtype=int)
+    return Gram(window.flight, window.phase, count, inner, cross, square, window.nuisance.shape[1], blocks, np.eye(len(blocks)))
+
+
+def _check(window: Window, effects: int, channels: int) -> None:
+    n = len(window.residual)
+    where = f"window of flight {window.flight}, phase {window.phase}"
+    shapes = {"time": window.time.shape[:1], "channel": window.channel.shape, "sigma": window.sigma.shape,
+              "effects": window.effects.shape[:1], "nuisance": window.nuisance.shape[:1]}  # fmt: skip
+    wrong = {name: shape for name, shape in shapes.items() if shape != (n,)}
+    if wrong or window.effects.shape[1] != effects:
+        raise DiagnoseError(f"{where}: {n} residuals and {effects} effects, but {wrong or window.effects.shape}")
+    if n and (window.channel.max() >= channels or not np.all(window.sigma > 0.0)):
+        raise DiagnoseError(f"{where}: a channel index above {channels - 1}, or a sigma that is not above 0")
+    if not all(np.all(np.isfinite(a)) for a in (window.residual, window.effects, window.nuisance, window.latent)):
+        raise DiagnoseError(f"{where}: a residual or a derivative is not finite")
+
+
+def correlated(gram: Gram, window: Window, time: float) -> Gram:
+    """Multiply the Cholesky factor of Ornstein-Uhlenbeck latents into a Gram whose factor is still the identity.
+
+    Args:
+        gram: of the window.
+        window: for the knots.
+        time: correlation time [s]; latent forces at knots dt apart correlate by exp(-dt/time).
+    """
+    if not gram.latents:
+        return gram
+    factor = np.zeros((gram.latents, gram.latents))
+    key = window.latent_block.astype(int) * 3 + window.latent_axis.astype(int)
+    for group in np.unique(key):
+        at = np.flatnonzero(key == group)
+        lag = np.abs(window.latent_time[at, None] - window.latent_time[at])
+        factor[np.ix_(at, at)] = np.linalg.cholesky(np.exp(-lag / time) + 1e-9 * np.eye(len(at)))
+    inner, cross, part = gram.inner.copy(), gram.cross.copy(), slice(gram.nuisances, gram.nuisances + gram.latents)
+    inner[:, part] = factor.T @ inner[:, part]
+    inner[:, :, part] = inner[:, :, part] @ factor
+    cross[:, part] = cross[:, part] @ factor
+    return replace(gram, inner=inner, cross=cross, factor=factor)
+
+
+def with_residual(gram: Gram, window: Window, floors: np.ndarray, residual: np.ndarray) -> Gram:
+    """The same derivatives with the residuals of another size of the effects."""
+    z, r = columns(window, floors) / window.sigma[:, None], residual / window.sigma
+    part = slice(gram.nuisances, gram.nuisances + gram.latents)
+    cross, square = np.zeros_like(gram.cross), np.zeros_like(gram.square)
+    for c in np.unique(window.channel):
+        rows = window.channel == c
+        cross[c], square[c] = z[rows].T @ r[rows], r[rows] @ r[rows]
+    cross[:, part] = cross[:, part] @ gram.factor
+    return replace(gram, cross=cross, square=square)
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """Initial state and latent forces of one window given its data."""
+
+    mean: np.ndarray  # of [b, a] in prior deviations, shape (D + L,)
+    covariance: np.ndarray  # shape (D + L, D + L)
+    factor: np.ndarray  # lower Cholesky factor of its inverse
+    log_likelihood: float  # of the residuals, up to a constant
+
+
+def posterior(gram: Gram, noise: Noise, window: int) -> Posterior:
+    """Condition initial state and latent forces on the window's residuals.
+
+    Raises:
+        DiagnoseError: The normal equations are not positive definite, which only broken derivatives can cause.
+    """
+    weight, level = noise.scale**-2.0, noise.deviation(gram, window)
+    size = len(level)
+    normal = np.tensordot(weight, gram.inner[:, :size, :size], 1) * np.outer(level, level)
+    normal.flat[:: size + 1] += 1.0
+    right = (weight @ gram.cross[:, :size]) * level
+    lower, failed = lapack.dpotrf(normal, lower=1, clean=1)
+    if failed:
+        raise DiagnoseError(f"window of flight {gram.flight}, phase {gram.phase}: the normal equations are singular")
+    inverse, _ = lapack.dpotri(lower, lower=1)
+    covariance = np.tril(inverse) + np.tril(inverse, -1).T
+    mean = covariance @ right
+    quadratic = weight @ gram.square - right @ mean
+    log_det = 2.0 * np.log(np.diag(lower)).sum() + 2.0 * gram.count @ np.log(noise.scale)
+    return Posterior(mean, covariance, lower, -0.5 * float(quadratic + log_det))
+
+
+@dataclass(frozen=True)
+class WindowStatistics:
+    """One window's share of :class:`Statistics`, and the same for its latent forces as if they were effects."""
+
+    information: np.ndarray  # shape (K, K)
+    score: np.ndarray  # shape (K,)
+    square: float
+    latent_information: np.ndarray  # G' V^-1 G, shape (L, L)
+    latent_score: np.ndarray  # G' V^-1 r, shape (L,)
+    latent_effects: np.ndarray  # G' V^-1 S, shape (L, K)
+
+
+def window_statistics(gram: Gram, noise: Noise, window: int) -> WindowStatistics:
+    """Integrate initial state and latent forces out of one window."""
+    weight, level = noise.scale**-2.0, noise.deviation(gram, window)
+    size, begin = len(level), gram.nuisances
+    state = posterior(gram, noise, window)
+    inner, cross = np.tensordot(weight, gram.inner, 1), weight @ gram.cross
+    half, _ = lapack.dtrtrs(state.factor, level[:, None] * inner[:size, begin:], lower=1)  # L^-1 P^1/2 U'W [G, S]
+    reduced = inner[begin:, begin:] - half.T @ half
+    along, _ = lapack.dtrtrs(state.factor, level * cross[:size], lower=1)
+    score = cross[begin:] - half.T @ np.ravel(along)
+    reduced = 0.5 * (reduced + reduced.T)
+    latents = gram.latents
+    back = np.linalg.inv(gram.factor) if latents else gram.factor  # from unit latents to knots
+    return WindowStatistics(
+        reduced[latents:, latents:], score[latents:], -2.0 * state.log_likelihood,
+        back.T @ reduced[:latents, :latents] @ back, back.T @ score[:latents], back.T @ reduced[:latents, latents:],
+    )  # fmt: skip
+
+
+def gather(
+    grams: Sequence[Gram], parts: Sequence[WindowStatistics], theta: np.ndarray, weights: Mapping[int, float] | None = None
+) -> Statistics:
+    """Add up windows by flight.
+
+    Args:
+        grams: of the windows.
+        parts: of the windows.
+        theta: linearisation point in floors, shape (K,).
+        weights: flight -> weight; flights not named count 1, flights of weight 0 are left out.
+
+    Raises:
+        DiagnoseError: No flight is left, or information came out negative beyond rounding.
+    """
+    weights = weights or {}
+    flights = [f for f in sorted({gram.flight for gram in grams}) if weights.get(f, 1.0) > 0.0]
+    if not flights:
+        raise DiagnoseError("no flight is left to look at")
+    size = len(theta)
+    information, score = np.zeros((len(flights), size, size)), np.zeros((len(flights), size))
+    square, samples = np.zeros(len(flights)), np.zeros(len(flights))
+    at = {flight: i for i, flight in enumerate(flights)}
+    for gram, part in zip(grams, parts):
+        if gram.flight in at:
+            i, w = at[gram.flight], weights.get(gram.flight, 1.0)
+            information[i] += w * part.information
+            score[i] += w * part.score
+            square[i] += w * part.square
+            samples[i] += w * gram.count.sum()
+    scale = 1.0 / np.sqrt(np.maximum(np.diagonal(information.sum(0)), 1e-300))
+    lowest = np.linalg.eigvalsh(information.sum(0) * np.outer(scale, scale)).min() if size else 0.0
+    if lowest < -1e-5:
+        raise DiagnoseError(f"information has the eigenvalue {lowest:.1e} relative to its diagonal; the derivatives are broken")
+    return Statistics(np.array(flights), information, score, square, samples, np.array(theta, dtype=float))
+
+
+def block_names(grams: Sequence[Gram]) -> list[str]:
+    """Names of the latent blocks that occur."""
+    return [LATENT_BLOCKS[b] for b in sorted({int(b) for gram in grams for b in gram.latent_block})]

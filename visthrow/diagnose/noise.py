@@ -1,0 +1,186 @@
+"""Noise levels: sensor noise from differences of neighbours, latent forces from the likelihood of all windows.
+
+A pure fit of everything by maximum likelihood is pulled away by one bad window; hence three guards, each tested by a planted
+fault: single samples far outside lose weight (Huber), a window whose latent forces are far above those of its phase gets a
+level of its own, and every level is bounded.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from visthrow.diagnose.marginal import Gram, Noise, columns, correlated, posterior
+from visthrow.diagnose.model import Window
+
+MAD_TO_SIGMA = 1.4826
+THIRD_DIFFERENCE = np.sqrt(20.0)
+"""Deviation of a third difference of white noise, in sigmas: the root of 1 + 9 + 9 + 1."""
+
+CORRELATION_TIMES = (0.15, 0.6, 2.4)
+"""Of latent forces [s]: from one knot to longer than a window, the candidates of :func:`fit`."""
+
+SCALE_BOUNDS = (0.3, 10.0)
+"""Of a channel's sigma against what the model said."""
+
+LEVEL_RANGE = 1e4
+"""Latent deviations stay within this factor of the level at which they become visible, both ways."""
+
+HUBER = 6.0
+"""Sigmas from which a sample loses weight."""
+
+HUBER_SHARE = 0.02
+"""More samples than this beyond ``HUBER`` are no outliers but a misfit, which must stay visible."""
+
+BAD_WINDOW = 6.0
+"""A window's latent energy, in that of its phase, from which it gets a level of its own."""
+
+ITERATIONS = 40
+ROUNDS = 4
+
+
+def highpass_sigma(values: np.ndarray) -> np.ndarray:
+    """Standard deviation of white sensor noise on a smooth signal, unmoved by outliers.
+
+    Third differences remove motion up to second order within four samples; their median absolute deviation is scaled to a
+    normal distribution's sigma.
+
+    Args:
+        values: evenly sampled, shape (T,) or (T, D), T >= 4.
+
+    Returns:
+        Sigma in the values' unit, shape () or (D,).
+
+    Source: diagnosis by high-pass differences; Rousseeuw and Croux 1993 for the median absolute deviation.
+    """
+    third = np.diff(np.asarray(values, dtype=float), n=3, axis=0)
+    return MAD_TO_SIGMA * np.median(np.abs(third - np.median(third, axis=0)), axis=0) / THIRD_DIFFERENCE
+
+
+def fit(windows: Sequence[Window], grams: Sequence[Gram], start: Noise | None = None) -> tuple[Noise, list[Gram]]:
+    """Estimate sensor scales, latent deviations by block and phase, and their correlation time.
+
+    Args:
+        windows: for the knots of the latent forces.
+        grams: of the windows, with ``factor`` the identity.
+        start: an earlier estimate: its correlation time is kept, its levels are where the search starts.
+
+    Returns:
+        The levels, and the grams with correlated latent forces that belong to them.
+    """
+    times = CORRELATION_TIMES if start is None else (start.correlation_time,)
+    if not any(gram.latents for gram in grams):
+        times = times[:1]
+    best: tuple[float, Noise, list[Gram]] | None = None
+    for time in times:
+        shaped = [correlated(gram, window, time) for gram, window in zip(grams, windows)]
+        noise = start or (best[1] if best else _first_guess(shaped))
+        noise, value = _maximise(shaped, replace(noise, correlation_time=time))
+        if best is None or value > best[0]:
+            best = value, noise, shaped
+    _, noise, shaped = best
+    for _ in range(ROUNDS):
+        inflation = _inflation(shaped, noise)
+        if np.allclose(inflation, noise.inflation, rtol=0.1):
+            break
+        noise, _ = _maximise(shaped, replace(noise, inflation=inflation))
+    return noise, shaped
+
+
+def _first_guess(grams: Sequence[Gram]) -> Noise:
+    """Sensor noise as stated, latent forces where they just become visible."""
+    scale = np.ones(len(grams[0].count))
+    visible: dict[tuple[int, str], list[float]] = {}
+    for gram in grams:
+        part = slice(gram.nuisances, gram.nuisances + gram.latents)
+        curvature = np.diagonal(gram.inner.sum(0))[part]
+        for block in np.unique(gram.latent_block):
+            seen = curvature[gram.latent_block == block]
+            visible.setdefault((int(block), gram.phase), []).append(1.0 / np.sqrt(max(np.median(seen), 1e-300)))
+    return Noise(scale, {key: float(np.median(v)) for key, v in visible.items()}, CORRELATION_TIMES[0], np.ones(len(grams)))
+
+
+def _maximise(grams: Sequence[Gram], noise: Noise) -> tuple[Noise, float]:
+    """Maximum likelihood of the logarithms of all levels, with exact gradients and explicit limits."""
+    from scipy.optimize import minimize
+
+    keys = sorted(noise.latent_sd)
+    seen = np.flatnonzero(sum(gram.count for gram in grams) > 0)
+    guess = _first_guess(grams).latent_sd
+    start = np.log([noise.latent_sd[key] for key in keys] + [noise.scale[c] for c in seen])
+    reach = np.log(LEVEL_RANGE)
+    bounds = [(np.log(guess[key]) - reach, np.log(guess[key]) + reach) for key in keys]
+    bounds += [tuple(np.log(SCALE_BOUNDS))] * len(seen)
+    start = np.clip(start, [low for low, _ in bounds], [high for _, high in bounds])
+
+    def levels(x: np.ndarray) -> Noise:
+        scale = noise.scale.copy()
+        scale[seen] = np.exp(x[len(keys) :])
+        return replace(noise, scale=scale, latent_sd=dict(zip(keys, np.exp(x[: len(keys)]).tolist())))
+
+    def cost(x: np.ndarray) -> tuple[float, np.ndarray]:
+        value, by_level, by_scale = _likelihood(grams, levels(x), keys)
+        return -value, -np.concatenate((by_level, by_scale[seen]))
+
+    options = {"maxiter": ITERATIONS, "maxcor": 10, "ftol": 1e-7, "gtol": 0.05, "maxls": 20}
+    result = minimize(cost, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+    return levels(result.x), -float(result.fun)
+
+
+def _likelihood(grams: Sequence[Gram], noise: Noise, keys: Sequence[tuple[int, str]]) -> tuple[float, np.ndarray, np.ndarray]:
+    """Log-likelihood and its gradients by the logarithms of latent deviations and of sensor scales."""
+    value, by_level, by_scale = 0.0, np.zeros(len(keys)), np.zeros(len(noise.scale))
+    index = {key: i for i, key in enumerate(keys)}
+    for w, gram in enumerate(grams):
+        state = posterior(gram, noise, w)
+        value += state.log_likelihood
+        second = np.outer(state.mean, state.mean) + state.covariance
+        excess = np.diagonal(second)[gram.nuisances :] - 1.0
+        for block in np.unique(gram.latent_block):
+            by_level[index[int(block), gram.phase]] += excess[gram.latent_block == block].sum()
+        level, size = noise.deviation(gram, w), len(state.mean)
+        second *= np.outer(level, level)
+        left = gram.square - 2.0 * gram.cross[:, :size] @ (level * state.mean)
+        left += gram.inner[:, :size, :size].reshape(len(left), -1) @ second.ravel()
+        by_scale += left / noise.scale**2 - gram.count
+    return value, by_level, by_scale
+
+
+def _inflation(grams: Sequence[Gram], noise: Noise) -> np.ndarray:
+    """Factor on the latent deviations of windows whose latent energy stands far above their phase's."""
+    energy = np.ones(len(grams))
+    for w, gram in enumerate(grams):
+        if gram.latents:
+            state = posterior(gram, noise, w)
+            second = (state.mean**2 + np.diagonal(state.covariance))[gram.nuisances :]
+            energy[w] = max(second[gram.latent_block == block].mean() for block in np.unique(gram.latent_block))
+    bad = energy * noise.inflation**2 > BAD_WINDOW
+    for phase in {gram.phase for gram in grams}:
+        of_phase = np.array([gram.phase == phase for gram in grams])
+        if bad[of_phase].sum() > 0.25 * of_phase.sum():  # what most windows have is the phase's own level
+            bad[of_phase] = False
+    return np.where(bad, np.sqrt(np.maximum(energy, 1e-12)) * noise.inflation, 1.0)
+
+
+def without_outliers(windows: Sequence[Window], grams: Sequence[Gram], noise: Noise, floors: np.ndarray) -> list[Window]:
+    """Give single samples far outside a larger sigma; windows with none are returned as they are.
+
+    Args:
+        windows: of the flights.
+        grams: of the windows, for these noise levels.
+        noise: levels.
+        floors: of the effects, shape (K,).
+    """
+    mended = []
+    for w, (window, gram) in enumerate(zip(windows, grams)):
+        state, level = posterior(gram, noise, w), noise.deviation(gram, w)
+        size = len(level)
+        fitted = level * state.mean
+        fitted[gram.nuisances :] = gram.factor @ fitted[gram.nuisances :]
+        left = window.residual - columns(window, floors)[:, :size] @ fitted
+        far = np.abs(left) / (window.sigma * noise.scale[window.channel]) / HUBER
+        outliers = far > 1.0
+        if outliers.any() and outliers.mean() <= HUBER_SHARE:
+            window = replace(window, sigma=window.sigma * np.sqrt(np.maximum(far, 1.0)))
+        mended.append(window)
+    return mended

@@ -1,0 +1,172 @@
+"""The state of a search: the model linearised at some sizes of its effects, with the noise levels that belong there."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from visthrow.diagnose import noise as levels
+from visthrow.diagnose.evidence import Priors, estimate, log_evidence
+from visthrow.diagnose.marginal import Gram, Noise, Statistics, gather, gram_of, window_statistics, with_residual
+from visthrow.diagnose.model import Model, Window
+
+STEPS = 3
+"""Gauss-Newton steps between two linearisations."""
+
+SMALL_STEP = 0.05
+"""In floors: a step that is not worth a simulation."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What stays the same during a search."""
+
+    model: Model
+    priors: Priors
+    kept: tuple[int, ...]  # windows that are looked at
+
+    def sizes(self, theta: np.ndarray) -> dict[str, float]:
+        """Sizes in the effects' units, of those that are not 0; ``theta`` is in floors."""
+        return {e.name: float(t * e.floor) for e, t in zip(self.model.effects, theta) if t != 0.0}
+
+
+@dataclass(frozen=True)
+class Point:
+    """Windows and statistics at one theta (in floors, shape (K,))."""
+
+    theta: np.ndarray
+    windows: Sequence[Window]
+    raw: Sequence[Gram]  # latents at the knots
+    grams: Sequence[Gram]  # latents correlated
+    noise: Noise
+    statistics: Statistics
+
+    @property
+    def information(self) -> np.ndarray:
+        """Of all flights, shape (K, K)."""
+        return self.statistics.information.sum(0)
+
+    @property
+    def score(self) -> np.ndarray:
+        """Of all flights, about theta = 0, shape (K,)."""
+        return self.statistics.absolute.sum(0)
+
+    def evidence(self, priors: Priors, active: Sequence[int]) -> float:
+        """log Z of a set of effects, comparable between points with other noise levels."""
+        own = log_evidence(self.information, self.score, priors, list(active))
+        return own - 0.5 * float(self.statistics.absolute_square.sum())
+
+
+def _point(theta: np.ndarray, windows: Sequence[Window], raw: Sequence[Gram], grams: Sequence[Gram], noise: Noise) -> Point:
+    parts = [window_statistics(gram, noise, w) for w, gram in enumerate(grams)]
+    return Point(np.array(theta, dtype=float), windows, raw, grams, noise, gather(grams, parts, theta))
+
+
+def linearise(problem: Problem, theta: np.ndarray, start: Noise | None = None, windows: Sequence[Window] | None = None) -> Point:
+    """Simulate and linearise at ``theta``, estimate the noise levels, gather.
+
+    Args:
+        problem: of the search.
+        theta: in floors, shape (K,).
+        start: noise levels to start from.
+        windows: what the model gave there, if it was asked already.
+    """
+    windows = problem.model.windows(problem.sizes(theta)) if windows is None else windows
+    kept, channels = [windows[i] for i in problem.kept], len(problem.model.channels)
+    raw = [gram_of(w, problem.priors.floor, channels) for w in kept]
+    noise, grams = levels.fit(kept, raw, start)
+    mended = levels.without_outliers(kept, grams, noise, problem.priors.floor)
+    changed = [i for i, (a, b) in enumerate(zip(kept, mended)) if a is not b]
+    for i in changed:
+        raw[i] = gram_of(mended[i], problem.priors.floor, channels)
+    if changed:
+        noise, grams = levels.fit(mended, raw, noise)
+    return _point(theta, mended, raw, grams, noise)
+
+
+def moved(problem: Problem, point: Point, theta: np.ndarray) -> Point | None:
+    """Simulate at ``theta`` but keep the derivatives and noise levels of ``point``; None where the simulation fails there."""
+    residuals = problem.model.residuals(problem.sizes(theta))
+    residuals = [residuals[i] for i in problem.kept]
+    if not all(np.all(np.isfinite(r)) for r in residuals):
+        return None
+    windows = [replace(w, residual=r) for w, r in zip(point.windows, residuals)]
+    floor = problem.priors.floor
+    raw = [with_residual(g, w, floor, w.residual) for g, w in zip(point.raw, windows)]
+    grams = [with_residual(g, w, floor, w.residual) for g, w in zip(point.grams, windows)]
+    return _point(theta, windows, raw, grams, point.noise)
+
+
+def advantage(priors: Priors, first: tuple[Point, Sequence[int]], second: tuple[Point, Sequence[int]]) -> float:
+    """Nats by which the first set of effects is ahead, each set at whichever of both points suits it better.
+
+    The noise levels of a point were estimated without the floors; a set may do better with the levels of another set.
+    """
+    points = first[0], second[0]
+    ahead, behind = (max(point.evidence(priors, active) for point in points) for active in (first[1], second[1]))
+    return ahead - behind
+
+
+def with_fitted_noise(point: Point) -> Point:
+    """The same with noise levels estimated from its residuals."""
+    noise, grams = levels.fit(point.windows, point.raw, point.noise)
+    return _point(point.theta, point.windows, point.raw, grams, noise)
+
+
+def with_all_effects_noise(problem: Problem, point: Point) -> Point:
+    """The same with the noise levels that remain when every effect may have its linear estimate.
+
+    A large missing effect is taken for noise as long as it is not named; these levels show what may be hidden under it.
+    """
+    visible = np.flatnonzero(problem.priors.visible)
+    change = estimate(point.information, point.score, problem.priors, visible) - point.theta
+    noise, _ = levels.fit(point.windows, [_shifted(gram, change) for gram in point.raw], point.noise)
+    return _point(point.theta, point.windows, point.raw, point.grams, noise)
+
+
+def _shifted(gram: Gram, change: np.ndarray) -> Gram:
+    """Inner products of r - S change."""
+    begin = gram.nuisances + gram.latents
+    part = gram.inner[:, :, begin:] @ change
+    square = gram.square - 2.0 * gram.cross[:, begin:] @ change + part[:, begin:] @ change
+    return replace(gram, cross=gram.cross - part, square=np.maximum(square, 0.0))
+
+
+def fitted(problem: Problem, point: Point, active: Sequence[int]) -> Point:
+    """Gauss-Newton with the derivatives of ``point`` and the simulation's own residuals; a step that does not help is halved.
+
+    Args:
+        problem: of the search.
+        point: where the derivatives were taken.
+        active: effects that may move; all others go to 0.
+    """
+    inside = np.isin(np.arange(len(point.theta)), list(active))
+    best = point if np.all(point.theta[~inside] == 0.0) else moved(problem, point, np.where(inside, point.theta, 0.0))
+    if best is None:
+        return point
+    for _ in range(STEPS):
+        goal = estimate(best.information, best.score, problem.priors, active)
+        trial = _step(problem, best, goal)
+        if trial is None:
+            break
+        best = trial
+        left = estimate(best.information, best.score, problem.priors, active) - best.theta
+        if left @ best.information @ left < 0.1:  # nats still to be gained by a step without noise
+            break
+    return best
+
+
+def _step(problem: Problem, point: Point, goal: np.ndarray) -> Point | None:
+    """The largest part of a step that fits better; None where there is none."""
+    share = 1.0
+    while share > 0.1 and np.abs(share * (goal - point.theta)).max() > SMALL_STEP:
+        trial = moved(problem, point, point.theta + share * (goal - point.theta))
+        if trial is not None and _misfit(problem, trial) < _misfit(problem, point):
+            return trial
+        share /= 2.0
+    return None
+
+
+def _misfit(problem: Problem, point: Point) -> float:
+    prior = (point.theta / problem.priors.slab)[point.theta != 0.0]
+    return float(point.statistics.square.sum() + prior @ prior)

@@ -1,0 +1,229 @@
+"""The search for causes: forward with the simulation run again for each serious candidate, backward after each addition.
+
+Selection is on the evidence of :mod:`visthrow.diagnose.evidence`, with the noise levels estimated anew for each set of causes, so
+that a cause is not excused as noise. The threshold comes from null worlds of the very flights.
+"""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import combinations
+
+import numpy as np
+
+from visthrow.diagnose.consistency import Consistency, across_flights, repeated_flights
+from visthrow.diagnose.evidence import Priors, additions, log_evidence, threshold
+from visthrow.diagnose.model import Model
+from visthrow.diagnose.point import (
+    Point,
+    Problem,
+    advantage,
+    fitted,
+    linearise,
+    with_all_effects_noise,
+    with_fitted_noise,
+)
+from visthrow.diagnose.result import Diagnosis, Step
+from visthrow.errors import DiagnoseError
+
+MOST_NAMES = 6
+"""A longer list of causes is a wrong form, not a finding."""
+
+SHORTLIST = 3
+"""Candidates whose simulation is run again in each step."""
+
+CLOSE = 3.0
+"""Sets of causes within this many nats of the best are reported as equally possible."""
+
+DOUBT = 15.0
+"""Linear statistics this close [nats] are settled by running the simulation."""
+
+JOINT_BEST, JOINT_SIZE = 8, 3
+"""All sets of up to so many of the best effects are compared at the end."""
+
+
+@dataclass
+class Search:
+    """One search; :func:`explain` is the door to it."""
+
+    problem: Problem
+    nominal: Point
+    least: float  # threshold [nats]
+    progress: Callable[[str], None]
+    active: list[int] = field(default_factory=list)
+    point: Point | None = None
+    steps: list[Step] = field(default_factory=list)
+    refused: set[int] = field(default_factory=set)  # effects that are not the same in all flights
+    events: list[int] = field(default_factory=list)
+    sets: list[tuple[tuple[int, ...], float]] = field(default_factory=list)
+
+    @property
+    def priors(self) -> Priors:
+        """Of the effects."""
+        return self.problem.priors
+
+    def name(self, j: int) -> str:
+        """Of an effect."""
+        return self.problem.model.effects[j].name
+
+    def run(self) -> None:
+        """Search until nothing exceeds the threshold."""
+        self.point = self.nominal
+        while len(self.active) < MOST_NAMES and self._forward():
+            self._backward()
+        self._joint()
+
+    def _screen(self, point: Point) -> np.ndarray:
+        gain = additions(point.information, point.score, self.priors, self.active)
+        gain[list(self.refused)] = -np.inf
+        return gain
+
+    def _forward(self) -> bool:
+        """Add the best candidate; False where none is good enough."""
+        free = with_all_effects_noise(self.problem, self.point)
+        screened, under_free = self._screen(self.point), self._screen(free)
+        least = min(self.least, 0.5 * self.least + 0.5 * under_free.max())
+        short = [j for j in np.argsort(-under_free)[:SHORTLIST] if under_free[j] > max(least, 0.3 * under_free.max())]
+        short += [j for j in np.argsort(-screened)[:2] if screened[j] > self.least and j not in short]
+        if not short or max(screened.max(), under_free.max()) <= self.least:
+            return False
+        base = self.point, self.active
+        tried = {int(j): self._candidate(free, [*self.active, int(j)]) for j in short}
+        nats = {j: advantage(self.priors, (point, [*self.active, j]), base) for j, point in tried.items()}
+        best = max(nats, key=nats.get)
+        if nats[best] <= self.least:
+            return False
+        verdict = across_flights(self.point, tried[best], self.priors, self.active, best, self.least)
+        if verdict is not None:
+            return self._set_aside(best, verdict)
+        ladder = {self.name(j): float(max(screened[j], under_free[j])) for j in np.argsort(-under_free)[:10]}
+        again = {self.name(j): float(n) for j, n in sorted(nats.items(), key=lambda item: -item[1])}
+        self.steps.append(Step(self.name(best), float(nats[best]), ladder, again))
+        self.progress(f"{self.name(best)} named, {nats[best]:.1f} nats above the next simpler model")
+        self.active.append(best)
+        self.point = self._settle(tried[best], self.active)
+        return True
+
+    def _candidate(self, point: Point, active: Sequence[int]) -> Point:
+        return with_fitted_noise(fitted(self.problem, point, active))
+
+    def _settle(self, point: Point, active: Sequence[int]) -> Point:
+        """Linearise where the search stands, and step once more where that moved the optimum."""
+        point = linearise(self.problem, point.theta, point.noise)
+        better = fitted(self.problem, point, active)
+        if np.abs(better.theta - point.theta).max() > 0.5:
+            point = linearise(self.problem, better.theta, point.noise)
+        return point
+
+    def _set_aside(self, best: int, verdict: Consistency) -> bool:
+        """An effect of one flight alone: that flight is left out; one that differs from flight to flight is refused."""
+        if verdict.flight is None:
+            self.progress(f"{self.name(best)} is not the same in all flights; it is no cause")
+            self.refused.add(best)
+            return True
+        self.progress(f"event in flight {verdict.flight}: something happened there that the other flights deny")
+        self.events.append(verdict.flight)
+        flights = np.array([w.flight for w in self.point.windows])
+        kept = tuple(i for i, flight in zip(self.problem.kept, flights) if flight != verdict.flight)
+        self.problem = replace(self.problem, kept=kept)
+        self.nominal = linearise(self.problem, np.zeros_like(self.point.theta))
+        self.point = self.nominal if not self.active else linearise(self.problem, self.point.theta)
+        return True
+
+    def _backward(self) -> None:
+        """Drop what a later addition made superfluous."""
+        while len(self.active) > 1:
+            whole = self.point.evidence(self.priors, self.active)
+            worth = {j: whole - self.point.evidence(self.priors, [k for k in self.active if k != j]) for j in self.active}
+            weakest = min(worth, key=worth.get)
+            if worth[weakest] > self.least:
+                return
+            rest = [k for k in self.active if k != weakest]
+            without = self._candidate(self.point, rest)
+            if advantage(self.priors, (self.point, self.active), (without, rest)) > self.least:
+                return
+            self.progress(f"{self.name(weakest)} dropped again")
+            self.active = rest
+            self.point = self._settle(without, rest)
+
+    def _joint(self) -> None:
+        """Compare the set found with all small sets of the best effects, and with itself with one effect exchanged."""
+        for _ in range(2):
+            ranked = self._rivals()
+            self.sets = [(tuple(self.active), 0.0)]
+            winner: tuple[float, list[int], Point] | None = None
+            for rival, _ in ranked:
+                point = self._candidate(self.point, rival)
+                ahead = advantage(self.priors, (point, rival), (self.point, self.active))
+                ahead += self._toll(self.active) - self._toll(rival)
+                if ahead > -CLOSE:
+                    self.sets.append((tuple(rival), float(-ahead)))
+                if ahead > 1.0 and (winner is None or ahead > winner[0]):
+                    winner = ahead, list(rival), point
+            if winner is None:
+                return
+            self.progress(f"exchanged for {', '.join(map(self.name, winner[1])) or 'nothing'}")
+            self.active = winner[1]
+            self.point = self._settle(winner[2], self.active)
+
+    def _toll(self, active: Sequence[int]) -> float:
+        """Every name costs the threshold."""
+        return self.least * len(active)
+
+    def _rivals(self) -> list[tuple[list[int], float]]:
+        """Sets within ``DOUBT`` nats of the present one by the linear statistics, best first, six at most."""
+        if not self.active:
+            return []
+        information, score = self.point.information, self.point.score
+        own = log_evidence(information, score, self.priors, self.active) - self._toll(self.active)
+        gain = additions(self.nominal.information, self.nominal.score, self.priors, ())
+        gain[list(self.refused)] = -np.inf
+        best = {int(j) for j in np.argsort(-gain)[:JOINT_BEST] if np.isfinite(gain[j])} | set(self.active)
+        sets = {tuple(sorted(c)) for size in range(1, JOINT_SIZE + 1) for c in combinations(sorted(best), size)}
+        usable = [int(k) for k in np.flatnonzero(np.isfinite(gain)) if k not in self.active]
+        sets |= {tuple(sorted([k if i == j else i for i in self.active])) for j in self.active for k in usable}
+        sets -= {tuple(sorted(self.active))}
+        sets = {s for s in sets if not set(s) > set(self.active)}  # additions were tried already
+        values = [(list(s), log_evidence(information, score, self.priors, s) - self._toll(s) - own) for s in sets]
+        return sorted((v for v in values if v[1] > -DOUBT), key=lambda v: -v[1])[:6]
+
+
+def explain(
+    model: Model, *, seed: int = 0, without: Sequence[int] = (), laws: bool = True, progress: Callable[[str], None] | None = None
+) -> Diagnosis:
+    """Say what the model gets wrong about its flights.
+
+    Args:
+        model: a simulation of measured flights with its catalogue of effects.
+        seed: of the null worlds that the threshold is calibrated on.
+        without: flights to leave out.
+        laws: whether to look for laws outside the catalogue where it does not suffice.
+        progress: is told each step in a sentence.
+
+    Returns:
+        One verdict for every effect, and one overall.
+
+    Raises:
+        DiagnoseError: The model gives no window, or contradicts itself.
+    """
+    from visthrow.diagnose.verdicts import conclude, out_of_domain
+
+    begun, say = time.monotonic(), progress or (lambda _: None)
+    priors = Priors.of(tuple(model.effects), tuple(model.channels))
+    windows = model.windows({})
+    if not windows:
+        raise DiagnoseError("the model found no stretch of flight to look at in these logs")
+    finite = [all(np.all(np.isfinite(a)) for a in (w.residual, w.effects, w.nuisance, w.latent)) for w in windows]
+    duplicates = repeated_flights(windows)
+    left_out = {*without, *duplicates}
+    kept = tuple(i for i, w in enumerate(windows) if finite[i] and w.flight not in left_out)
+    if len(kept) < 0.5 * sum(w.flight not in left_out for w in windows) or not kept:
+        return out_of_domain(model, windows, sum(finite), seed)
+    problem = Problem(model, priors, kept)
+    nominal = linearise(problem, np.zeros(len(model.effects)), windows=windows)
+    least = threshold(nominal.statistics, priors, np.random.default_rng(seed))
+    say(f"{len(kept)} windows of {len(nominal.statistics.flights)} flights; a cause needs {least:.1f} nats")
+    search = Search(problem, nominal, least, say)
+    search.run()
+    diagnosis = conclude(search, laws=laws)
+    return replace(diagnosis, duplicates=duplicates, seconds=time.monotonic() - begun, seed=seed)
