@@ -12,6 +12,7 @@ from typing import Any
 
 ACTIONS = {
     "run": "fly, or run dry, by a config of configs/hil",
+    "view": "look at a run in 3D: live, or from its folder as a recording, pictures and flight logs",
     "replay": "run a recorded run again and compare every action, bit for bit",
     "check": "look at the poses that come, and at what speaks against a throw",
     "record": "record the poses that come and what the policy would make of them; never arms, sends nothing",
@@ -27,6 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "  visthrow hil run --config fake --auto-arm     with `visthrow hil fake` in another terminal: a throw\n"
         "  visthrow hil run --config mine.toml --out runs/monday\n"
         "  visthrow hil replay runs/monday               the same actions again?\n"
+        "  visthrow hil view runs/monday                 a recording for rerun, a picture and a flight log a throw\n"
         "  visthrow hil check --seconds 5                what comes, how old, how often, and the checks\n"
         "\nWhile a run goes on, type 'arm' (one throw), 'land' or 'abort' and Enter; Ctrl-C aborts.\n"
     )
@@ -42,8 +44,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         subs[name].add_argument(
             "--out", default=None, metavar="FOLDER", help="of the run (default: a new one in runs/hil)"
         )
+        subs[name].add_argument("--view", action="store_true", help="serve a live view to this machine's browser")
     subs["run"].add_argument("--auto-arm", action="store_true", help="arm whenever ready; for simulated vehicles only")
-    subs["replay"].add_argument("folder", metavar="FOLDER", help="of a run")
+    for name in ("replay", "view"):
+        subs[name].add_argument("folder", metavar="FOLDER", help="of a run")
+    subs["view"].add_argument("--live", action="store_true", help="serve the run while it goes on, on 127.0.0.1 alone")
+    subs["view"].add_argument("--out", default=None, metavar="FILE", help="of the recording (default: run.rrd in the folder)")
+    subs["view"].add_argument("--web-port", type=int, default=9090, metavar="N", help="of the live view (default: 9090)")
+    subs["view"].add_argument("--data-port", type=int, default=9876, metavar="N", help="of its data (default: 9876)")
     fake = subs["fake"]
     fake.add_argument("--device", default="udpout:127.0.0.1:14560", help="the runner's port")
     fake.add_argument("--policy", default="vision", metavar="POLICY", help="whose plant is flown")
@@ -60,7 +68,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Do what was asked."""
-    return {"run": _run, "record": _run, "replay": _replay, "check": _check, "fake": _fake}[args.action](args)
+    return {"run": _run, "record": _run, "view": _view, "replay": _replay, "check": _check, "fake": _fake}[args.action](args)
+
+
+SWITCH = 5e-4
+"""After which the recorder's thread gives way to the flying one [s]; Python's 5 ms are a quarter of a tick."""
 
 
 class Keyboard:
@@ -104,9 +116,12 @@ def _run(args: argparse.Namespace) -> int:
     from hil.backends import ArduPilot, DryRun
     from hil.clock import ManualClock, MonotonicClock
     from hil.flight import fly
+    from hil.latency import Stages
     from hil.record import Recorder
+    from hil.report import finish, story
     from hil.runner import Runner
     from hil.sources.opening import open_source
+    from hil.view import beside
     from visthrow.policy import Policy, find_policy
 
     params = _params(args)
@@ -124,17 +139,24 @@ def _run(args: argparse.Namespace) -> int:
     recorder = Recorder(folder, params)
     operator = Keyboard(args.action == "run" and args.auto_arm)
     print(f"ready after {time.monotonic() - started:.2f} s; waiting for poses", file=sys.stderr, flush=True)
-    summary = fly(runner, source, clock, operator, recorder, args.seconds or float("inf"), _tell)
+    viewer, stages = beside(folder) if args.view else None, Stages()
+    summary = fly(runner, source, clock, operator, recorder, args.seconds or float("inf"), _tell, stages)
     source.close()
     recorder.close(summary)
+    if viewer is not None:
+        viewer.terminate()
     print(story(summary, folder))
+    print("\n".join(finish(folder, stages)))
     return 1 if summary["aborted"] or summary["errors"] else 0
 
 
 def warm_up(runner: Any) -> None:
-    """Call the policy once on the ground: first calls are slow."""
+    """Call the policy a few times on the ground: first calls are slow. One thread: more only wait for each other."""
     import numpy as np
+    import torch
 
+    torch.set_num_threads(1)
+    sys.setswitchinterval(SWITCH)
     still = np.zeros((1, 3))
     for _ in range(3):
         runner.pilot.act(still, np.array([[0.0, 0.0, 0.0, 1.0]]), still, still, still - [0, 0, 0.4], still[0])
@@ -146,31 +168,8 @@ def _tell(decision: Any) -> None:
     print(f"{decision.time:12.3f} s  {decision.state:8} {decision.reason}", file=sys.stderr, flush=True)
 
 
-def story(summary: dict[str, Any], folder: Path) -> str:
-    """A run in a few lines."""
-    lines = [f"{'ABORTED' if summary['aborted'] else 'ended in ' + summary['state']}: {summary['reason']}"]
-    lines.append(f"throws {summary['throws']}, released {summary['latches']}, cancelled {summary['cancelled']}")
-    if summary["stuck"]:
-        lines.append(f"{summary['stuck']} released payload still hung on the vehicle: look at the mechanism")
-    for landing in summary["landings"]:
-        lines.append(
-            f"landing at x {landing['landing_w'][0]:.3f} m, y {landing['landing_w'][1]:+.3f} m by the payload's own poses: "
-            f"{landing['error']:.3f} m from the goal, {landing['duration']:.2f} s after the throw began"
-        )
-    for name, body in summary["bodies"].items():
-        refused = ", ".join(f"{n} {why}" for why, n in body["refused"].items()) or "none"
-        lines.append(f"{name}: {body['accepted']} poses taken; refused: {refused}")
-    lines.append(f"ticks {summary['ticks']}, missed {summary['missed']}; milliseconds a stage:")
-    lines.append("          p50     p95     p99     max")
-    for name, values in summary["latency"].items():
-        if values:
-            lines.append(f"{name:7}" + "".join(f" {values[k]:7.3f}" for k in ("p50_ms", "p95_ms", "p99_ms", "max_ms")))
-    lines += [f"error: {text.strip().splitlines()[-1]}" for text in summary["errors"]]
-    return "\n".join([*lines, f"{folder}  the run; `visthrow hil replay {folder}` runs it again"])
-
-
 def _replay(args: argparse.Namespace) -> int:
-    from hil.flight import replay
+    from hil.playback import replay
 
     found = replay(args.folder)
     for n, name, was, now in found["differences"][:10]:
@@ -178,6 +177,12 @@ def _replay(args: argparse.Namespace) -> int:
     same = "all bit for bit the same" if not found["differences"] else f"{len(found['differences'])} DIFFERENCES"
     print(f"{found['ticks']} ticks, {found['actions']} actions of the policy: {same}")
     return 0 if not found["differences"] else 1
+
+
+def _view(args: argparse.Namespace) -> int:
+    from hil import view
+
+    return view.run(Path(args.folder), args.live, args.out, args.web_port, args.data_port)
 
 
 def _check(args: argparse.Namespace) -> int:

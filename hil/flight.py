@@ -1,20 +1,22 @@
-"""The loop of a run, and its replay."""
+"""The loop of a run."""
 
+import gc
+import math
 import time
-from collections.abc import Callable
-from pathlib import Path
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any, Protocol
 
-from hil.backends.base import Backend, DryRun, Status
+from hil.backends.base import Backend
 from hil.clock import Clock, Ticker
-from hil.pose import GOAL, PAYLOAD
-from hil.record import Recorder, load_run, percentiles
+from hil.latency import Stages
+from hil.record import Recorder
 from hil.runner import Decision, Runner, Words
 from hil.sources import Source
 from hil.states import State
 
-STAGES = ("late", "poll", "decide")
-"""How late a tick began, how long it took to take in poses, and from there to the command sent."""
+COLLECT_ALL = 50
+"""Ticks between two looks of the garbage collector at all that was made since the start; the others see the last tick's."""
 
 
 class Operator(Protocol):
@@ -34,7 +36,7 @@ class AutoOperator:
 
 def fly(
     runner: Runner, source: Source, clock: Clock, operator: Operator, recorder: Recorder | None = None,
-    most: float = float("inf"), tell: Callable[[Decision], None] | None = None,
+    most: float = float("inf"), tell: Callable[[Decision], None] | None = None, stages: Stages | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """Run until the state machine is done, the recorded poses have ended, or for ``most`` seconds.
 
@@ -43,36 +45,62 @@ def fly(
         recorder: of the run's folder; None records nothing.
         most: [s].
         tell: called with the first decision of each state.
+        stages: filled with the times of each stage.
 
     Returns:
-        The runner's summary with ticks, misses and the times of each stage.
+        The runner's summary with ticks, misses (those that a tick of ours caused by taking too long, and all), and the
+        times of each stage.
     """
-    ticker, backend = Ticker(clock, runner.pilot.period), runner.backend
-    stages: dict[str, list[float]] = {name: [] for name in STAGES}
-    begin, throws, told = clock.now(), [], None
-    while runner.machine.state is not State.DONE and clock.now() - begin < most and not source.ended:
-        _wait(clock, ticker, backend, source)
-        now, start = ticker.take(), time.perf_counter()
-        poses = source.poll(now)
-        polled = time.perf_counter()
-        status, words = backend.status(now), operator.words(runner.machine.state.value)
-        recording = recorder is None or recorder.failed is None
-        decision = runner.tick(now, poses, status, words, recording)
-        backend.service(now)
-        times = {"late": ticker.late, "poll": polled - start, "decide": time.perf_counter() - polled}
-        for name, value in times.items():
-            stages[name].append(value)
-        if decision.release:
-            throws.append(now)
-        if tell is not None and decision.state != told:
-            told = decision.state
-            tell(decision)
-        if recorder is not None:
-            recorder.tick(ticker.index, poses, status, words, recording, decision, times)
+    ticker, backend, stages = Ticker(clock, runner.pilot.period), runner.backend, stages or Stages()
+    begin, throws, told, ended, ours, ticks = clock.now(), [], None, -math.inf, 0, 0
+    with _collected():
+        while runner.machine.state is not State.DONE and clock.now() - begin < most and not source.ended:
+            _wait(clock, ticker, backend, source)
+            due, missed = ticker.due(), ticker.missed
+            now, start = ticker.take(), time.perf_counter()
+            ours += (ticker.missed - missed) * (ended > due)
+            poses = source.poll(now)
+            polled = time.perf_counter()
+            status, words = backend.status(now), operator.words(runner.machine.state.value)
+            recording = recorder is None or recorder.failed is None
+            asked = time.perf_counter()
+            decision = runner.tick(now, poses, status, words, recording)
+            times = {"late": ticker.late, "poll": polled - start, **stages.poses(poses, now), **runner.spent}
+            if "total" in times:
+                times["total"] += asked - start
+            backend.service(now)
+            stages.add(times)
+            if decision.release:
+                throws.append(now)
+            if tell is not None and decision.state != told:
+                told = decision.state
+                tell(decision)
+            if recorder is not None:
+                recorder.tick(ticker.index, poses, status, words, recording, decision, times)
+            ticks += 1
+            gc.collect(1 if ticks % COLLECT_ALL == 0 else 0)
+            ended = clock.now()
+    record = getattr(backend, "release_record", None)  # a dry run has none
+    for delay in record.answers if record is not None else ():
+        stages.add({"ack": delay})
     return {
-        **runner.summary(), "ticks": len(stages["late"]), "missed": ticker.missed, "worst_late_s": ticker.worst,
-        "latency": {name: percentiles(values) for name, values in stages.items()}, "latch_times": throws,
+        **runner.summary(), "ticks": ticks, "missed": ticker.missed, "missed_ours": ours,
+        "worst_late_s": ticker.worst, "latency": stages.summary(), "latch_times": throws,
     }  # fmt: skip
+
+
+@contextmanager
+def _collected() -> Iterator[None]:
+    """Leave all that exists by now out of garbage collection, which is then ours to call."""
+    was = gc.isenabled()
+    gc.freeze()
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.unfreeze()
+        if was:
+            gc.enable()
 
 
 def _wait(clock: Clock, ticker: Ticker, backend: Backend, source: Source) -> None:
@@ -86,40 +114,3 @@ def _wait(clock: Clock, ticker: Ticker, backend: Backend, source: Source) -> Non
         if backend.due() == due:
             break
     source.wait(clock, ticker.due())
-
-
-COMPARED = ("state", "command", "action", "observation", "keypoints", "valid", "release")
-"""What a replay must give again, bit for bit."""
-
-
-def replay(folder: str | Path) -> dict[str, Any]:
-    """Run the recorded poses, statuses and words of a run through the runner again.
-
-    Returns:
-        Number of ticks and actions compared, and the differences: tick, name, recorded value, value now.
-
-    Raises:
-        RunError: no folder of a run, or a damaged one.
-    """
-    params, policy, ticks, poses = load_run(folder)
-    runner = Runner(params, policy, DryRun())
-    differences: list[tuple[int, str, Any, Any]] = []
-    actions = 0
-    for line in ticks:
-        connected, note, release = line["status"]
-        decision = runner.tick(
-            line["time"], poses.get(line["n"], []), Status(connected, note, release), Words(*line["words"]),
-            line["recording"],
-        )  # fmt: skip
-        actions += decision.action is not None
-        for name in COMPARED:
-            was, now = line[name], getattr(decision, name)
-            now = list(now) if isinstance(now, tuple) else now
-            if was != now:
-                differences.append((line["n"], name, was, now))
-    return {
-        "ticks": len(ticks),
-        "actions": actions,
-        "bodies": sorted({pose.body for group in poses.values() for pose in group} & {PAYLOAD, GOAL, "vehicle"}),
-        "differences": differences,
-    }

@@ -1,4 +1,4 @@
-"""Where a released payload came down, by its own poses."""
+"""Where a released payload let go and came down, by its own poses."""
 
 from dataclasses import dataclass
 
@@ -6,6 +6,14 @@ import numpy as np
 
 from hil.pose import Vector
 from visthrow.hover import GRAVITY
+
+FREE_AFTER, FREE_LEAST, FREE_LONG = 0.02, 5, 0.12
+"""The free fall that a separation is looked for before: poses from this long after the expected one [s], so many at least,
+and over so long [s], in which the air takes a few millimetres."""
+
+BENT, BENT_MOST = 5e-3, 0.1
+"""Distance from the free fall carried backwards, from which on poses say when the rope held [m]; noise stays below. Poses up
+to so long before the expected separation are looked at [s]."""
 
 NEAR = 8
 """Poses before the ground that the landing is carried forward from: free fall needs no model of drag over 0.1 s."""
@@ -22,19 +30,23 @@ class Landing:
     landing_w: Vector  # payload's centre [m]
     error: float  # horizontal distance from the goal [m]
     duration: float  # from the throw's start to the landing [s]
+    lag: float = 0.0  # trained, from latch to separation [s]
+    separation: float | None = None  # by the poses [s]; None where they do not tell
+    separation_w: Vector | None = None  # payload's centre at that time [m]
 
 
 class Flight:
     """Collects a payload's poses from the latch on until it is down."""
 
-    def __init__(self, goal_w: Vector, start: float, latch: float, height: float) -> None:
+    def __init__(self, goal_w: Vector, start: float, latch: float, height: float, lag: float = 0.0) -> None:
         """Begin at the latch.
 
         Args:
             goal_w: [m]. start: of the throw [s]. latch: of the release [s].
             height: of the payload's centre as it lands [m].
+            lag: expected from latch to separation [s].
         """
-        self.goal_w, self.start, self.latch, self.height = goal_w, start, latch, height
+        self.goal_w, self.start, self.latch, self.height, self.lag = goal_w, start, latch, height, lag
         self._times: list[float] = []
         self._points: list[Vector] = []
 
@@ -70,7 +82,40 @@ class Flight:
         when = float(last + fall)
         landed = tuple(point.tolist())
         error = float(np.hypot(landed[0] - self.goal_w[0], landed[1] - self.goal_w[1]))
-        return Landing(self.goal_w, self.start, self.latch, when, landed, error, when - self.start)
+        found = separation(times, points, self.latch + self.lag)
+        return Landing(
+            self.goal_w, self.start, self.latch, when, landed, error, when - self.start, self.lag, *(found or (None, None))
+        )
+
+
+def separation(times: np.ndarray, points: np.ndarray, expected: float) -> tuple[float, Vector] | None:
+    """When and where the rope let go: where the poses leave the free fall after it, carried backwards.
+
+    While the rope holds, its pull bends the path away from the free fall by ``a (t_s - t)^2 / 2``; the root of the distance is
+    a line in time that ends at the separation.
+
+    Args:
+        times: of the poses [s], shape (N,). points: [m], shape (N, 3).
+        expected: about when [s].
+
+    Returns:
+        Time [s] and the payload's centre [m]; None where too few poses were seen on either side.
+    """
+    free = (times > expected + FREE_AFTER) & (times < expected + FREE_AFTER + FREE_LONG)
+    if np.count_nonzero(free) < FREE_LEAST:
+        return None
+    x, v = _parabola(times[free] - expected, points[free])
+    when = times - expected
+    off = np.linalg.norm(points + [0.0, 0.0, 0.5 * GRAVITY] * when[:, None] ** 2 - x - when[:, None] * v, axis=1)
+    bent = (when > -BENT_MOST) & (when < FREE_AFTER) & (off > BENT)
+    if np.count_nonzero(bent) < 3:
+        return None
+    slope, offset = np.polyfit(when[bent], np.sqrt(off[bent]), 1)
+    if not slope < 0.0 or not -BENT_MOST < -offset / slope < BENT_MOST:
+        return None
+    at = -offset / slope
+    point = x + at * v - [0.0, 0.0, 0.5 * GRAVITY * at * at]
+    return float(expected + at), tuple(point.tolist())
 
 
 def _parabola(times: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

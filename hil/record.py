@@ -12,8 +12,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from hil.backends.base import Status
 from hil.errors import RunError
 from hil.params import HilParams
@@ -24,9 +22,13 @@ from visthrow.errors import StorageError
 from visthrow.policy import Policy, find_policy
 from visthrow.storage import atomic_write, write_json
 
-POLICY, CONFIG, POSES, TICKS, TLOG, SUMMARY = (
-    "policy.npz", "config.toml", "poses.jsonl", "ticks.jsonl", "link.tlog", "summary.json",
+POLICY, CONFIG, POSES, TICKS, TLOG, SUMMARY, PROVENANCE = (
+    "policy.npz", "config.toml", "poses.jsonl", "ticks.jsonl", "link.tlog", "summary.json", "provenance.json",
 )  # fmt: skip
+
+
+MOST_WAITING = 50_000
+"""Lines that may wait for a slow disk, some minutes' worth; beyond them the recording has failed."""
 
 
 class Recorder:
@@ -63,12 +65,16 @@ class Recorder:
         times: dict[str, float],
     ) -> None:  # fmt: skip
         """Record one tick; never raises and never waits."""
+        if self._queue.qsize() > MOST_WAITING:
+            self.failed = self.failed or "the disk is too slow"
+            return
         for p in poses:
-            values = (index, p.stamp, p.arrival, p.body, p.pos, p.quat, p.vel, p.rate, p.reset)
+            values = (index, p.stamp, p.arrival, p.body, p.pos, p.quat, p.vel, p.rate, p.reset, p.measured)
             self._queue.put((POSES, json.dumps(values)))
         line = {
-            "n": index, "status": [status.connected, status.note, status.release],
+            "n": index, "status": list(vars(status).values()),
             "words": [words.arm, words.land, words.abort], "recording": recording, **vars(decision), "times": times,
+            "poses": len(poses),
         }  # fmt: skip
         self._queue.put((TICKS, json.dumps(line)))
 
@@ -120,6 +126,13 @@ def lines(path: Path) -> Iterator[Any]:
                 raise RunError(f"{path}: line {number} is damaged: {error}") from error
 
 
+def pose_of(row: list) -> tuple[int, Pose]:
+    """Number of the tick and the raw pose of a line of :data:`POSES`."""
+    index, stamp, arrival, body, *vectors, reset = row
+    pos, quat, vel, rate = (None if v is None else tuple(v) for v in vectors)
+    return index, Pose(stamp, arrival, body, pos, quat, vel, rate, reset)
+
+
 def read_poses(folder: Path) -> dict[int, list[Pose]]:
     """Raw poses of a run by tick.
 
@@ -128,9 +141,9 @@ def read_poses(folder: Path) -> dict[int, list[Pose]]:
     """
     found: dict[int, list[Pose]] = {}
     try:
-        for index, stamp, arrival, body, *vectors, reset in lines(folder / POSES):
-            pos, quat, vel, rate = (None if v is None else tuple(v) for v in vectors)
-            found.setdefault(index, []).append(Pose(stamp, arrival, body, pos, quat, vel, rate, reset))
+        for row in lines(folder / POSES):
+            index, pose = pose_of(row)
+            found.setdefault(index, []).append(pose)
     except (TypeError, ValueError) as error:
         raise RunError(f"{folder / POSES}: not a list of poses: {error}") from error
     return found
@@ -153,12 +166,3 @@ def load_run(folder: str | Path) -> tuple[HilParams, Policy, list[dict[str, Any]
     if not (folder / SUMMARY).is_file():  # killed: the two files may end at different ticks, with half of its poses
         ticks = [line for line in ticks if line["n"] < max(poses, default=0)]
     return params, policy, ticks, poses
-
-
-def percentiles(values: list[float]) -> dict[str, float]:
-    """p50, p95, p99 and max of times, in milliseconds."""
-    if not values:
-        return {}
-    array = 1e3 * np.asarray(values)
-    p50, p95, p99 = (float(x) for x in np.percentile(array, (50, 95, 99)))
-    return {"p50_ms": p50, "p95_ms": p95, "p99_ms": p99, "max_ms": float(array.max())}

@@ -12,9 +12,10 @@ from hil.backends import ArduPilot
 from hil.cli import warm_up
 from hil.clock import MonotonicClock
 from hil.device import check_device, open_port
-from hil.flight import AutoOperator, fly, replay
+from hil.flight import AutoOperator, fly
 from hil.link import Link, TlogWriter
 from hil.params import HilParams
+from hil.playback import replay
 from hil.record import Recorder
 from hil.runner import Runner
 from hil.sources import MavlinkSource, read_tlog

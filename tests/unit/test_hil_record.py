@@ -8,7 +8,7 @@ import pytest
 
 from hil.backends import Status
 from hil.errors import RunError
-from hil.record import Recorder, lines, load_run, percentiles
+from hil.record import Recorder, lines, load_run
 from hil.runner import Runner, Words
 from tests.hil_flight import Spy, fly, params
 from visthrow.cli import main
@@ -126,13 +126,6 @@ def test_a_full_disk_fails_the_recording_and_nothing_else(tmp_path):
     recorder.close({})
     assert "No space left" in recorder.failed
     assert json.loads((tmp_path / "a" / "summary.json").read_text())["recording_failed"] == recorder.failed
-
-
-def test_percentiles():
-    assert percentiles([]) == {}
-    found = percentiles([0.001] * 99 + [0.1])
-    assert found["p50_ms"] == pytest.approx(1.0)
-    assert found["max_ms"] == pytest.approx(100.0)
 
 
 CSV = "t,x,y,z,qx,qy,qz,qw,px,py,pz\n" + "".join(

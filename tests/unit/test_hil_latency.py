@@ -1,0 +1,57 @@
+"""Percentiles a stage, the report and its picture."""
+
+import cv2
+import numpy as np
+import pytest
+
+from hil.latency import STAGES, Stage, Stages, draw, table
+from hil.pose import PAYLOAD, VEHICLE, Pose
+
+BIN = 0.011
+"""Relative width of a bin and a little: what a percentile may be off."""
+
+
+def test_percentiles_of_many_times():
+    rng = np.random.default_rng(0)
+    times = np.exp(rng.normal(np.log(3e-4), 0.8, 20_000))
+    stage = Stage()
+    for t in times:
+        stage.add(float(t))
+    for share in (0.5, 0.95, 0.99):
+        assert stage.percentile(share) == pytest.approx(np.quantile(times, share), rel=BIN)
+    found = stage.summary()
+    assert found["max_ms"] == pytest.approx(1e3 * times.max(), rel=1e-12)
+    assert found["count"] == 20_000
+
+
+def test_nothing_zero_and_very_long_times():
+    assert Stage().summary() == {}
+    stage = Stage()
+    for t in (0.0, -1.0, 1e9):
+        stage.add(t)
+    assert stage.counts.sum() == 3
+    assert stage.summary()["max_ms"] == 1e12
+
+
+def test_transport_is_counted_from_the_fastest_pose_and_starts_anew_at_a_step():
+    stages = Stages()
+    pose = lambda stamp, arrival, body=VEHICLE: Pose(stamp, arrival, body, (0.0, 0.0, 0.0))  # noqa: E731
+    assert stages.poses([pose(0.0, 100.01), pose(0.01, 100.03)], 100.035) == {"arrival": pytest.approx(0.005)}
+    assert stages.stages["transport"].most == pytest.approx(0.01)
+    stages.poses([pose(5.0, 100.05)], 100.06)
+    assert stages.stages["transport"].most == pytest.approx(0.01), "a step of the clock is no transport"
+    assert stages.poses([pose(5.0, 100.06, PAYLOAD), pose(float("nan"), 100.06)], 100.07) == {}
+
+
+def test_report_and_picture(tmp_path):
+    stages, rng = Stages(), np.random.default_rng(0)
+    for _ in range(500):
+        stages.add({name: float(x) for name, x in zip(("poll", "observation", "total"), rng.gamma(4.0, 1e-4, 3))})
+    lines = table(stages.summary())
+    assert [line.split()[0] for line in lines[1:]] == ["poll", "observation", "total"]
+    assert STAGES["observation"] in lines[2]
+    draw(tmp_path / "latency.png", stages, "a run")
+    picture = cv2.imread(str(tmp_path / "latency.png"))
+    assert picture.shape[1] > 1000
+    assert np.ptp(picture) > 200
+    draw(tmp_path / "empty.png", Stages(), "nothing flown")
