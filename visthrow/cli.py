@@ -18,6 +18,7 @@ COMMANDS = {
     "hil": ("fly a policy on motion-capture poses, live or recorded", "hil.cli"),
     "baseline": ("throw with trajectory optimisation and MPC; its front against the policies", "visthrow.baseline.command"),
     "diagnose": ("say what the simulation gets wrong, from measured flights", "visthrow.diagnose.cli"),
+    "sweep": ("work a list of training runs and throws, on several GPUs or a cluster", "visthrow.sweep.cli"),
     "bench": ("measure the speed of the simulator and of the camera", "visthrow.bench"),
     "config": ("print a configuration with all its values filled in", "visthrow.config_cli"),
 }
@@ -27,7 +28,7 @@ TRACEBACK_VARIABLE = "VISTHROW_TRACEBACK"
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
 
-_EXTRAS = {"mujoco": "reference", "piqp": "baseline"}
+_EXTRAS = {"submitit": "slurm", "mujoco": "reference", "piqp": "baseline"}
 """Optional packages by import name, and the extra of visthrow that installs them."""
 
 _DESCRIPTION = """\

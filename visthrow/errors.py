@@ -39,6 +39,10 @@ class CheckpointError(TrainError):
     """A checkpoint is missing, cut short or of another run."""
 
 
+class BusyError(VisthrowError):
+    """Another process is at the same work."""
+
+
 class DeviceError(VisthrowError):
     """The compute device asked for is not there."""
 

@@ -2,6 +2,7 @@
 
 import argparse
 import os
+import signal
 import sys
 import time
 from pathlib import Path
@@ -100,6 +101,31 @@ def _follow(args: argparse.Namespace, trainer) -> bool:
     return True
 
 
+class StopRequest:
+    """Ctrl-C and SIGTERM taken down while it is entered, so that no iteration is cut in two; a second Ctrl-C interrupts.
+
+    Attributes:
+        asked: whether one came.
+    """
+
+    def __init__(self) -> None:
+        self.asked = False
+
+    def __enter__(self) -> "StopRequest":
+        self._before = {number: signal.signal(number, self._take) for number in (signal.SIGINT, signal.SIGTERM)}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def _take(self, number: int, frame: object) -> None:
+        if self.asked:
+            raise KeyboardInterrupt
+        self.asked = True
+        print("\nstopping after this iteration", file=sys.stderr)
+
+
 def _loop(args: argparse.Namespace, trainer, folder: Path) -> bool:
     """Train with log, evaluation and checkpoints; return whether the end was reached.
 
@@ -112,7 +138,10 @@ def _loop(args: argparse.Namespace, trainer, folder: Path) -> bool:
 
     start, kept = time.perf_counter(), trainer.iteration
     try:
-        with TrainLog(folder / "progress.csv", trainer.samples_per_iteration, _last(args, trainer), kept) as log:
+        with (
+            TrainLog(folder / "progress.csv", trainer.samples_per_iteration, _last(args, trainer), kept) as log,
+            StopRequest() as stop,
+        ):
             while trainer.iteration < _last(args, trainer):
                 figures = trainer.step()
                 if args.evaluate_every and trainer.iteration % args.evaluate_every == 0:
@@ -123,10 +152,8 @@ def _loop(args: argparse.Namespace, trainer, folder: Path) -> bool:
                 if trainer.iteration % args.checkpoint_every == 0:
                     trainer.save(folder / CHECKPOINT)
                     kept = trainer.iteration
-                if args.minutes and time.perf_counter() - start > 60 * args.minutes:
+                if stop.asked or (args.minutes and time.perf_counter() - start > 60 * args.minutes):
                     return trainer.iteration >= _last(args, trainer)
-    except KeyboardInterrupt:
-        return False
     except (OSError, StorageError) as error:
         state = (
             f"the checkpoint of iteration {kept} is whole; make room and go on with --resume"

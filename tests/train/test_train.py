@@ -2,6 +2,7 @@
 
 import errno
 import os
+import signal
 
 import numpy as np
 import pytest
@@ -75,17 +76,18 @@ def test_resume_goes_on_bit_for_bit(whole, tmp_path):
 
 def test_ctrl_c_keeps_what_was_done(whole, tmp_path, monkeypatch, capsys):
     folder = tmp_path / "run"
-    step = Trainer.step
+    learn = Trainer._learn
 
     def interrupted(self):
-        if self.iteration == 2:
-            raise KeyboardInterrupt
-        return step(self)
+        if self.iteration == 1:
+            os.kill(os.getpid(), signal.SIGINT)  # in the middle of the second iteration
+        return learn(self)
 
-    monkeypatch.setattr(Trainer, "step", interrupted)
+    monkeypatch.setattr(Trainer, "_learn", interrupted)
     assert train(folder) == 130
     assert "--resume" in capsys.readouterr().err
-    monkeypatch.setattr(Trainer, "step", step)
+    assert (folder / "progress.csv").read_text().count("\n") == 1 + 2
+    monkeypatch.setattr(Trainer, "_learn", learn)
     assert train(folder, "--resume") == 0
     for a, b in zip(weights(whole), weights(folder), strict=True):
         np.testing.assert_array_equal(a, b)

@@ -1,0 +1,81 @@
+"""Tasks as jobs of a Slurm cluster, through submitit; its local executor runs the same jobs as processes, for a test."""
+
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from visthrow.errors import ConfigError
+from visthrow.sweep.pool import Task
+
+SLACK = 5
+"""Minutes that a job is granted beyond its piece: start of the process, last checkpoint."""
+
+
+class Job:
+    """One submitted task."""
+
+    def __init__(self, job: Any) -> None:
+        self._job = job
+
+    def poll(self) -> int | None:
+        """See `visthrow.sweep.pool.Running`."""
+        if not self._job.done():
+            return None
+        return int(self._job.result()) if self._job.exception() is None else 1
+
+    def stop(self) -> None:
+        """Cancel it: Slurm's signal lets a training write its checkpoint."""
+        self._job.cancel()
+
+    def kill(self) -> None:
+        """See `stop`."""
+        self._job.cancel()
+
+
+@dataclass
+class Cluster:
+    """Submits tasks.
+
+    Attributes:
+        executor: "slurm", or "local" for processes of this machine.
+        minutes: length of a piece; what is not done then is submitted again.
+        options: of submitit's executor, for instance ``slurm_partition``.
+    """
+
+    list_name: str
+    out: Path
+    executor: str
+    gpus: int
+    jobs: int
+    minutes: float
+    changes: tuple[str, ...] = ()
+    options: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        import submitit
+
+        self.devices = [f"job {i}" for i in range(self.gpus)]
+        self._executor = submitit.AutoExecutor(self.out / "logs", cluster=self.executor)
+        try:
+            self._executor.update_parameters(timeout_min=int(self.minutes) + 1 + SLACK, **self.options)
+        except (NameError, ValueError, TypeError) as error:
+            raise ConfigError(f"options of the cluster {self.options}: {error}") from error
+
+    def start(self, task: Task, device: str, minutes: float | None) -> Job:
+        """See `visthrow.sweep.pool.Starter`."""
+        self._executor.update_parameters(name=task.name, gpus_per_node=1 if task.gpu and self.executor == "slurm" else 0)
+        piece = self.minutes if minutes is None else min(minutes, self.minutes)
+        where = (self.list_name, str(self.out.resolve()), self.changes, os.getcwd())
+        return Job(self._executor.submit(do, *where, task.ids, "auto" if task.gpu else "cpu", piece))
+
+
+def do(
+    list_name: str, out: str, changes: tuple[str, ...], folder: str, ids: tuple[str, ...], device: str, minutes: float
+) -> int:
+    """Do a task's units in a job; returns the exit status of ``visthrow sweep work``."""
+    from visthrow.sweep.cli import load_list
+    from visthrow.sweep.work import work
+
+    os.chdir(folder)
+    return work(load_list(list_name, changes), Path(out), ids, device, minutes)
