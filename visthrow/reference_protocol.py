@@ -9,7 +9,6 @@ not depend on the number of processes, and every policy meets the same vehicles,
 import importlib
 import math
 import multiprocessing as mp
-import os
 import pickle
 import signal
 import sys
@@ -22,6 +21,7 @@ import numpy as np
 
 from sim.params import RandomizationParams
 from visthrow import config
+from visthrow.device import cores
 from visthrow.errors import ConfigError
 from visthrow.hover import HoverController, HoverParams
 from visthrow.loading import Loaded
@@ -123,7 +123,8 @@ def fly_batch(loaded: Sequence[Loaded], plant_name: str, job: Job, tick: Any = N
         tick: called after each control step with the share of the batch that is done.
 
     Returns:
-        :data:`FIELDS` of :class:`visthrow.protocol.Throws`, the first policy's throws first; NaN where a throw failed.
+        :data:`FIELDS` of :class:`visthrow.protocol.Throws`, the first policy's throws first, and ``goal_w`` where goals
+        move; NaN where a throw failed.
     """
     flown = [loaded[i] for i in job.policies]
     experiment, count = flown[0].experiment, job.count * len(flown)
@@ -155,6 +156,7 @@ class _Batch:
         self.plant, self.count = plant, plant.count
         self.home = place_in_hover(plant, experiment, start, rng)
         self.goal_w = np.tile([target, 0.0, 0.0], (self.count, 1))
+        self.goal_vel_w = _goal_velocities(experiment, self.count, rng)
         share = self.count // len(loaded)
         self.slices = [slice(i * share, (i + 1) * share) for i in range(len(loaded))]
         self.pilots = [Pilot(item.policy, _camera_of(item), share) for item in loaded]
@@ -180,12 +182,16 @@ class _Batch:
         self.begin = self.plant.time
         self.previous = np.vstack([pilot.previous_action for pilot in self.pilots])
 
+    def _goal_at(self, time: float | np.ndarray) -> np.ndarray:
+        """Goals [m], shape (E, 3), at a time or a time each on the plant's clock [s]."""
+        return self.goal_w + np.reshape(time - self.begin, (-1, 1)) * self.goal_vel_w
+
     def _decided(self, seen: Snapshot) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Actions, commands and release requests of all pilots."""
-        outs = []
+        outs, goal_w = [], self._goal_at(seen.time)
         for pilot, part in zip(self.pilots, self.slices):
             views = (getattr(seen, name)[part] for name in ("pos_w", "quat_wb", "vel_w", "rate_b", "payload_pos_w"))
-            outs.append(pilot.act(*views, self.goal_w[part], seen.attached[part]))
+            outs.append(pilot.act(*views, goal_w[part], seen.attached[part]))
         return tuple(np.concatenate([getattr(out, name) for out in outs]) for name in ("action", "command", "release"))
 
     def throw(self) -> None:
@@ -216,14 +222,24 @@ class _Batch:
         success = landing.landed & ~self.failed
         blank = np.where(success, 1.0, np.nan)
         point = landing.point_w[:, :2] * blank[:, None]
+        goal = self._goal_at(landing.time)[:, :2]
+        moving = {"goal_w": goal * blank[:, None]} if self.experiment.task.target.moves else {}
         return {
             "success": success,
             "landing_w": point,
-            "error": np.linalg.norm(point - self.goal_w[:, :2], axis=1),
+            "error": np.linalg.norm(point - goal, axis=1),
             "duration": (landing.time - self.begin) * blank,
             "clearance": np.where(success, self.clearance, np.nan),
             "smoothness": np.sqrt(self.change / np.maximum(self.steps, 1.0)) * blank,
-        }
+        } | moving
+
+
+def _goal_velocities(experiment: Experiment, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Velocities of the task's goals [m/s], shape (E, 3); nothing is drawn where they stand still."""
+    if not experiment.task.target.moves:
+        return np.zeros((count, 3))
+    speed, heading = rng.uniform(*experiment.task.target.speed, count), rng.uniform(0.0, 2.0 * math.pi, count)
+    return np.column_stack((speed * np.cos(heading), speed * np.sin(heading), np.zeros(count)))
 
 
 def _camera_of(loaded: Loaded):
@@ -277,12 +293,11 @@ class Throwing:
         if together and any(plant_of(item.experiment) != plant_of(loaded[0].experiment) for item in loaded):
             raise ConfigError("policies of different plants cannot fly in one batch")
         self.jobs = plan(len(loaded), targets, throws, seed, together)
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         context = mp.get_context("spawn")
         self._progress = context.Array("d", len(self.jobs))
         policies = [pickle.dumps((item.name, _plain(item))) for item in loaded]
         self._pool = context.Pool(
-            min(processes or cores, len(self.jobs)), _begin, (policies, plant_name, self._progress)
+            min(processes or cores(), len(self.jobs)), _begin, (policies, plant_name, self._progress)
         )
         self._count = len(loaded)
         self._targets = list(targets)
@@ -319,6 +334,7 @@ class Throwing:
         if show and sys.stderr.isatty():
             print(f"\r{' ' * 70}\r", end="", file=sys.stderr, flush=True)
         parts = self._pending.get()
+        fields = [*FIELDS, "goal_w"] if "goal_w" in parts[0] else FIELDS
         rows: list[list[Throws]] = []
         for policy in range(self._count):
             row = []
@@ -327,8 +343,8 @@ class Throwing:
                 for job, part in zip(self.jobs, parts):
                     if job.target == target and policy in job.policies:
                         first = job.policies.index(policy) * job.count
-                        of.append({name: part[name][first : first + job.count] for name in FIELDS})
-                row.append(Throws(target, **{name: np.concatenate([part[name] for part in of]) for name in FIELDS}))
+                        of.append({name: part[name][first : first + job.count] for name in fields})
+                row.append(Throws(target, **{name: np.concatenate([part[name] for part in of]) for name in fields}))
             rows.append(row)
         return rows
 
