@@ -45,6 +45,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             "--out", default=None, metavar="FOLDER", help="of the run (default: a new one in runs/hil)"
         )
         subs[name].add_argument("--view", action="store_true", help="serve a live view to this machine's browser")
+    subs["run"].add_argument(
+        "--write-parameters", action="store_true", help="set the autopilot's parameters that the audit finds wrong"
+    )
     subs["run"].add_argument("--auto-arm", action="store_true", help="arm whenever ready; for simulated vehicles only")
     for name in ("replay", "view"):
         subs[name].add_argument("folder", metavar="FOLDER", help="of a run")
@@ -62,6 +65,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     fake.add_argument("--speed", type=float, default=1.0, help="of the clock")
     fake.add_argument(
         "--answer", default="accepted", help="to the release: accepted, in-progress, denied, silent, stuck"
+    )
+    fake.add_argument("--kind", default="ardupilot", help="of autopilot: ardupilot, px4, betaflight")
+    fake.add_argument("--msp-port", type=int, default=14561, help="where the fake Betaflight listens")
+    fake.add_argument(
+        "--option", dest="overrides", action="append", default=[], metavar="KEY=VALUE",
+        help="of hil.fakes.Options: silent_after=12, command_delay=0.03, parameters.GUID_OPTIONS=0, ...",
     )
     fake.add_argument("--out", default=None, metavar="FILE", help="write the report here")
 
@@ -113,7 +122,7 @@ def _params(args: argparse.Namespace) -> Any:
 
 def _run(args: argparse.Namespace) -> int:
     started = time.monotonic()
-    from hil.backends import ArduPilot, DryRun
+    from hil.backends import make_backend, mechanism_lag, require_reach
     from hil.clock import ManualClock, MonotonicClock
     from hil.flight import fly
     from hil.latency import Stages
@@ -131,16 +140,16 @@ def _run(args: argparse.Namespace) -> int:
     policy = Policy.load(find_policy(params.policy))
     source, link, recorded = open_source(params, folder, args.speed)
     clock = ManualClock(source.start) if recorded else MonotonicClock(args.speed)
-    backend: Any = DryRun()
-    if params.backend == "ardupilot":
-        backend = ArduPilot(link, params.ardupilot)
-    runner = Runner(params, policy, backend, params.ardupilot.mechanism_lag if link is not None else 0.0)
+    require_reach(params, policy.contract)
+    backend = make_backend(params, link, getattr(args, "write_parameters", False), _tell_parameters)
+    runner = Runner(params, policy, backend, mechanism_lag(params))
     warm_up(runner)
     recorder = Recorder(folder, params)
     operator = Keyboard(args.action == "run" and args.auto_arm)
     print(f"ready after {time.monotonic() - started:.2f} s; waiting for poses", file=sys.stderr, flush=True)
     viewer, stages = beside(folder) if args.view else None, Stages()
     summary = fly(runner, source, clock, operator, recorder, args.seconds or float("inf"), _tell, stages)
+    backend.close()
     source.close()
     recorder.close(summary)
     if viewer is not None:
@@ -161,6 +170,11 @@ def warm_up(runner: Any) -> None:
     for _ in range(3):
         runner.pilot.act(still, np.array([[0.0, 0.0, 0.0, 1.0]]), still, still, still - [0, 0, 0.4], still[0])
     runner.pilot.start()
+
+
+def _tell_parameters(table: str) -> None:
+    """Show the audit of the autopilot's parameters."""
+    print(table, file=sys.stderr, flush=True)
 
 
 def _tell(decision: Any) -> None:
@@ -225,17 +239,15 @@ def _check(args: argparse.Namespace) -> int:
 def _fake(args: argparse.Namespace) -> int:
     from hil.clock import MonotonicClock
     from hil.device import check_device, open_port
-    from hil.errors import RunError
-    from hil.fake import ANSWERS, VEHICLE_ID, FakeAutopilot, MocapParams, load_plant, serve
+    from hil.fake import VEHICLE_ID, ListeningPort, load_plant, make_fake, read_options, serve
     from hil.link import Link
-    from visthrow.errors import suggest
 
-    if args.answer not in ANSWERS:
-        raise RunError(f"answer '{args.answer}'; {suggest(args.answer, ANSWERS)}")
+    options = read_options([*args.overrides, f"answer={args.answer}"])
     plant = load_plant(args.plant, args.policy, args.seed)
     link = Link(open_port(check_device(args.device)), *VEHICLE_ID)
-    fake = FakeAutopilot(plant, link, MocapParams(), args.seed, args.answer)
-    print("the fake autopilot flies", file=sys.stderr, flush=True)
+    port = ListeningPort(args.msp_port) if args.kind == "betaflight" else None
+    fake = make_fake(args.kind, plant, link, None, args.seed, options, port)
+    print(f"the fake {args.kind} flies", file=sys.stderr, flush=True)
     report = serve(
         fake, MonotonicClock(args.speed), args.seconds, None if args.out is None else Path(args.out), args.after
     )

@@ -114,30 +114,47 @@ class TimeSync:
     """Offset of a peer's clock by TIMESYNC, from the exchange with the shortest round trip of the last ones.
 
     The peer answers ``tc1`` (its time) to ``ts1`` (ours). The true offset lies within half the round trip of
-    ``tc1 - (sent + received) / 2``, so the shortest exchange is the best one.
+    ``tc1 - (sent + received) / 2``, so the shortest exchange is the best one. Exchanges that contradict it, by more than both
+    round trips and some drift allow, are set aside; several in a row say that a clock was set, and begin anew.
+
+    Attributes:
+        steps: how often a clock was set.
     """
+
+    DRIFT = 1e-3
+    """That clocks may part by within the window: 500 parts in a million over 2 s [s]."""
+
+    STEP_AFTER = 3
+    """Contradicting exchanges in a row that make a step."""
 
     def __init__(self, window: int = 20) -> None:
         """Remember the last ``window`` exchanges."""
         self._exchanges: deque[tuple[float, float]] = deque(maxlen=window)
-        self._asked: set[int] = set()
+        self._odd = 0
+        self.steps = 0
 
-    def request(self, now: float) -> int:
-        """``ts1`` of a request sent now [ns]; ``tc1`` is 0 in it."""
-        stamp = int(now * 1e9)
-        if len(self._asked) > 100:  # answers that never came
-            self._asked.clear()
-        self._asked.add(stamp)
-        return stamp
+    @staticmethod
+    def stamp(now: float) -> int:
+        """A time [s] as TIMESYNC has it [ns]."""
+        return int(now * 1e9)
 
-    def feed(self, tc1: int, ts1: int, now: float) -> bool:
-        """Take an answer; whether it was one to a request of ours."""
-        if tc1 == 0 or ts1 not in self._asked:
-            return False
-        self._asked.discard(ts1)
+    def take(self, tc1: int, ts1: int, now: float) -> None:
+        """Take the answer to a request of ours.
+
+        Args:
+            tc1: the peer's time [ns]. ts1: of our request [ns].
+            now: of the answer's arrival [s].
+        """
         sent = ts1 / 1e9
-        self._exchanges.append((now - sent, tc1 / 1e9 - 0.5 * (sent + now)))
-        return True
+        trip, offset = now - sent, tc1 / 1e9 - 0.5 * (sent + now)
+        if self._exchanges and abs(offset - self.offset) > 0.5 * (trip + self.round_trip) + self.DRIFT:
+            self._odd += 1
+            if self._odd < self.STEP_AFTER:
+                return
+            self._exchanges.clear()
+            self.steps += 1
+        self._odd = 0
+        self._exchanges.append((trip, offset))
 
     @property
     def offset(self) -> float | None:

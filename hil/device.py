@@ -15,6 +15,8 @@ from hil.errors import LinkError
 _NETWORK = re.compile(r"(udp|udpout|tcp):([0-9.]+|\[[0-9a-fA-F:]+\]|localhost):([0-9]{1,5})")
 _SERIAL = re.compile(r"serial:(/dev/(?:tty[A-Za-z0-9]+|serial/by-id/[\w.:+-]+|cu\.[\w-]+)):([0-9]{4,7})")
 LARGEST_DATAGRAM = 65536
+MOST_CHUNKS = 256
+"""Datagrams, or pieces of a stream, read in one go: a flood must not hold up the tick."""
 
 
 @dataclass(frozen=True)

@@ -83,6 +83,8 @@ def fly(
     record = getattr(backend, "release_record", None)  # a dry run has none
     for delay in record.answers if record is not None else ():
         stages.add({"ack": delay})
+    if runner.machine.state is State.DONE and not runner.machine.aborted:
+        backend.finish(clock.now())
     return {
         **runner.summary(), "ticks": ticks, "missed": ticker.missed, "missed_ours": ours,
         "worst_late_s": ticker.worst, "latency": stages.summary(), "latch_times": throws,

@@ -11,14 +11,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from hil.device import Port
+from hil.device import MOST_CHUNKS, Port
 from hil.errors import LinkError
 from hil.frames import rotate
 from hil.mavlink import Parser, mav
 from hil.pose import Pose, Quaternion, Vector
-
-MOST_CHUNKS = 256
-"""Datagrams read in one go: a flood must not hold up the tick."""
 
 LOCAL_FRAMES = (mav.MAV_FRAME_LOCAL_NED, mav.MAV_FRAME_LOCAL_FRD)
 BODY_FRAMES = (mav.MAV_FRAME_BODY_FRD, mav.MAV_FRAME_BODY_NED)
@@ -70,6 +67,7 @@ class Link:
     Attributes:
         received, sent, dropped: messages that came, went, and could not be sent.
         parser: counts what was no message.
+        on_pump: called with the time [s] whenever arrivals were taken in. sync: `hil.sync.LinkSync`, where there is one.
     """
 
     def __init__(self, port: Port, system: int = 245, component: int = 191, tlog: TlogWriter | None = None) -> None:
@@ -83,6 +81,8 @@ class Link:
         self.port, self.parser, self._tlog = port, Parser(), tlog
         self._mav = mav.MAVLink(None, system, component)
         self._listeners: list[Callable[[Any, float], None]] = []
+        self.on_pump: list[Callable[[float], None]] = []
+        self.sync: Any = None
         self.received = self.sent = self.dropped = 0
 
     @property
@@ -109,6 +109,8 @@ class Link:
                     listener(message, arrival)
                 count += 1
         self.received += count
+        for call in self.on_pump:
+            call(clock())
         return count
 
     def send(self, message: Any) -> bool:

@@ -5,6 +5,8 @@ from typing import Literal
 
 from camera.params import CameraParams
 from hil.backends.ardupilot import ArduPilotParams
+from hil.backends.betaflight import BetaflightParams
+from hil.backends.px4 import Px4Params
 from hil.estimate import EstimateParams
 from hil.frames import FrameParams
 from hil.gate import GateParams
@@ -48,7 +50,8 @@ class SourceParams:
 class DelayParams:
     """Ages of poses, and their compensation."""
 
-    source: float  # of a pose when it arrives [s]
+    source: float  # of a pose when it arrives [s], where its sender's clock is not known
+    synchronise: bool  # ask the senders of poses for their clock by TIMESYNC, and take ages from it where they answer
     compensate: bool  # carry poses forward to the age that the policy was trained with
 
 
@@ -62,7 +65,7 @@ class HilParams:
 
     policy: str  # name of a shipped policy, or a file
     camera: CameraParams
-    backend: Literal["dry-run", "ardupilot"]
+    backend: Literal["dry-run", "ardupilot", "px4", "betaflight"]
     # Show the policy every tick, not only those of a throw; what it says then is recorded, never sent. Such a run waits
     # for poses and checks for ever.
     observe: bool
@@ -81,6 +84,8 @@ class HilParams:
     check: CheckParams
     states: StateParams
     ardupilot: ArduPilotParams
+    px4: Px4Params
+    betaflight: BetaflightParams
 
     def __post_init__(self) -> None:
         if not {VEHICLE, PAYLOAD} <= set(self.frames) <= set(BODIES):

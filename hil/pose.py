@@ -22,6 +22,7 @@ class Pose:
         vel: [m/s], world frame; None where the source gives none.
         rate: [rad/s], body frame; None where the source gives none.
         reset: counter of the source's estimator; a change says that it jumped.
+        measured: on the runner's clock [s], where the source's clock is known; else None.
     """
 
     stamp: float
@@ -32,3 +33,8 @@ class Pose:
     vel: Vector | None = None
     rate: Vector | None = None
     reset: int = 0
+    measured: float | None = None
+
+    def transit(self, usual: float) -> float:
+        """Time from measurement to arrival [s]: known, or what is usual."""
+        return usual if self.measured is None else self.arrival - self.measured

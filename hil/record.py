@@ -128,9 +128,9 @@ def lines(path: Path) -> Iterator[Any]:
 
 def pose_of(row: list) -> tuple[int, Pose]:
     """Number of the tick and the raw pose of a line of :data:`POSES`."""
-    index, stamp, arrival, body, *vectors, reset = row
+    index, stamp, arrival, body, *vectors, reset, measured = row
     pos, quat, vel, rate = (None if v is None else tuple(v) for v in vectors)
-    return index, Pose(stamp, arrival, body, pos, quat, vel, rate, reset)
+    return index, Pose(stamp, arrival, body, pos, quat, vel, rate, reset, measured)
 
 
 def read_poses(folder: Path) -> dict[int, list[Pose]]:

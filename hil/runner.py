@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from hil.backends.base import FAILED, Backend, Status
+from hil.backends.base import FAILED, FOLLOW, LAND, Backend, Status
+from hil.backends.base import HOLD as HELD
 from hil.errors import RunError
 from hil.gate import HOLD, Tether
 from hil.landing import Flight, Landing
@@ -39,6 +40,9 @@ STUCK_AFTER = 0.6
 REACQUIRE = 1.0
 """Before the vehicle is ours, a body that was refused or gone for this long is taken wherever it is [s]."""
 
+HAND_OVER_SPEED, HAND_OVER_TILT = 1.0, math.radians(20.0)
+"""Below these the autopilot's own hold takes over after a throw: braking out of 60 deg is done on poses [m/s, rad]."""
+
 DESCENT = 0.4
 """Of the hover point while landing [m/s]."""
 
@@ -47,6 +51,12 @@ GROUND = 0.12
 
 LEVEL_TIME = 0.5
 """An aborted run without poses levels the vehicle for this long and then falls silent: the autopilot's failsafes act [s]."""
+
+
+def calm(vehicle: BodyState) -> bool:
+    """Whether a vehicle is slow and level enough to be handed over."""
+    x, y, _, _ = vehicle.quat or (0.0, 0.0, 0.0, 1.0)
+    return math.hypot(*vehicle.vel) < HAND_OVER_SPEED and 1.0 - 2.0 * (x * x + y * y) > math.cos(HAND_OVER_TILT)
 
 
 @dataclass(frozen=True)
@@ -82,6 +92,7 @@ class Runner:
         tracks: by body. lag: trained time from latch to separation [s].
         latches: releases so far. stuck: payloads that stayed on.
         landings: of the throws so far. errors: tracebacks of what was caught.
+        mount_b: where the rope hangs on the vehicle [m]. seen_goal_w: target as of the last tick [m].
         spent: time that parts of the last tick took [s]; those that it did not do are missing.
         watcher: called with each pose's body and track once it was taken; None for nobody.
     """
@@ -127,6 +138,8 @@ class Runner:
         self.landings: list[Landing] = []
         self.latches = self.stuck = 0
         self.errors: list[str] = []
+        self.mount_b: Vector = tuple(map(float, rope["mount"]))
+        self.seen_goal_w: Vector | None = None
         self.spent: dict[str, float] = {}
         self.watcher: Callable[[str, Track], None] | None = None
 
@@ -160,7 +173,7 @@ class Runner:
             if took and self.watcher is not None:
                 self.watcher(pose.body, track)
             if took and pose.body == PAYLOAD and self._flight is not None:
-                landing = self._flight.add(pose.arrival - self.params.delay.source, track.gate.last.pos)
+                landing = self._flight.add(pose.arrival - pose.transit(self.params.delay.source), track.gate.last.pos)
                 if landing is not None:
                     self.landings.append(landing)
                     self._flight = None
@@ -171,7 +184,7 @@ class Runner:
                     track.restart()
         bodies = {name: self._state(track, now) for name, track in self.tracks.items()}
         vehicle, payload = bodies[VEHICLE], bodies[PAYLOAD]
-        goal_w = self._goal(bodies)
+        goal_w = self.seen_goal_w = self._goal(bodies)
         state = self.machine.step(now, self._inputs(now, vehicle, payload, goal_w, status, words, recording))
         # The last tick may itself have ended in another state than it acted in: a command refused, an exception.
         before, self._acted = self._acted, state
@@ -180,6 +193,9 @@ class Runner:
         decision = Decision(now, state.value, self.machine.reason)
         self.spent["estimate"] = perf_counter() - begin
         wanted = self._command(now, state, vehicle, payload, goal_w, decision)
+        self._ask(now, state, vehicle, status)
+        if status.mode in (HELD, LAND) and state not in (State.READY, State.ARMED):
+            wanted = None  # handed over
         if state is State.ABORT and not (status.connected and self.machine.flown):
             wanted = None  # it has taken over, or hears nothing, or was never ours
         if self.params.observe and decision.action is None and None not in (vehicle, payload, goal_w) and vehicle.quat:
@@ -200,7 +216,7 @@ class Runner:
                 self.spent["total"] = perf_counter() - begin
         if decision.release:
             self._latch, self.latches = now, self.latches + 1
-            self._flight = Flight(goal_w, self._begun, now, self.params.landing_height)
+            self._flight = Flight(goal_w, self._begun, now, self.params.landing_height, self.lag)
             self.backend.release(now + self._wait)
         if state is State.ABORT and self.machine.flown:
             self.backend.abort(now)
@@ -215,10 +231,24 @@ class Runner:
         fresh = self.tracks[other].gate.level(pose.arrival) < HOLD
         return None if pos is None else Tether(pos, self._reach if fresh else math.inf)
 
+    def _ask(self, now: float, state: State, vehicle: BodyState | None, status: Status) -> None:
+        """Tell the autopilot what it is to do: follow, or hold and land by itself where it can."""
+        if state in (State.READY, State.ARMED, State.THROW):
+            self.backend.ask(FOLLOW, now)
+            if status.mode != FOLLOW:
+                self._hover.reset()  # nothing of what was commanded came about
+        elif state is State.RECOVER and self.backend.holds:
+            stale = vehicle is None or self.tracks[VEHICLE].gate.level(now) >= HOLD
+            if stale or calm(vehicle) or status.mode == HELD:
+                self.backend.ask(HELD, now)
+        elif state is State.LAND and self.backend.holds:
+            self.backend.ask(LAND, now)
+
     def _state(self, track: Track, now: float) -> BodyState | None:
         """State of a body, carried forward to the age that the policy was trained with where the config says so."""
         delay = self.params.delay
-        age = track.gate.age(now) + delay.source
+        last = track.gate.last
+        age = track.gate.age(now) + (delay.source if last is None else last.transit(delay.source))
         ahead = age - 0.5 * (self._latency[0] + self._latency[1]) if delay.compensate and math.isfinite(age) else 0.0
         return track.state(now, ahead)
 
@@ -235,7 +265,9 @@ class Runner:
         p, state = self.params, self.machine.state
         known = vehicle is not None and payload is not None and goal_w is not None
         hanging = payload if self._latch is None else None
-        failure = "the release was refused or not answered" if status.release == FAILED else None
+        failure = status.fault
+        if status.release == FAILED and state in (State.THROW, State.RECOVER):
+            failure = "the release was refused or not answered"
         checks = ["a body has no pose yet"]
         # After a throw the payload may have been hung on again; only the operator's next word makes the latch new.
         if known and (self._latch is None or state is State.READY):
@@ -249,19 +281,21 @@ class Runner:
             tuple(checks),
             # While landing the fence's floor is left on purpose.
             fence_broken(p.fence, vehicle, hanging) if vehicle is not None and state is not State.LAND else None,
-            vehicle is not None and self._still(vehicle, payload),
+            vehicle is not None and self._still(vehicle, payload, status.mode == HELD),
             self._latch is not None and now - self._latch >= self.lag - 1e-9,
             self._latch is not None,
             vehicle is not None and vehicle.pos[2] < GROUND,
-            failure if state is State.THROW else None,
+            failure,
             words.arm,
             words.land,
             words.abort,
             recording,
+            status.mode == FOLLOW,
         )
 
-    def _still(self, vehicle: BodyState, payload: BodyState | None) -> bool:
-        if math.dist(vehicle.pos, self.params.home_w) > STILL_OFFSET:
+    def _still(self, vehicle: BodyState, payload: BodyState | None, held: bool) -> bool:
+        """Whether all is quiet, at the hover point or where the autopilot holds the vehicle."""
+        if not held and math.dist(vehicle.pos, self.params.home_w) > STILL_OFFSET:
             return False
         moving = [VEHICLE] + ([PAYLOAD] if self._latch is None and payload is not None else [])
         return all(self.tracks[name].calm_speed() < STILL_SPEED for name in moving)
@@ -272,6 +306,7 @@ class Runner:
             self.backend.stop_release()
         if state is State.ARMED:
             self._latch = None
+            self.backend.rearm()
         if state is State.THROW:
             self.pilot.start()
             self._begun = now

@@ -74,6 +74,7 @@ class Inputs:
     land: bool = False
     abort: bool = False
     recording: bool = True  # all could be recorded so far
+    following: bool = True  # the autopilot follows commands
 
 
 class Machine:
@@ -170,15 +171,15 @@ class Machine:
     def _ready(self, now: float, seen: Inputs) -> None:
         if seen.land or self._late(now):
             self._go(now, State.LAND, "the operator said land" if seen.land else "nobody armed a throw")
-        elif seen.arm and seen.recording and not seen.failed_checks and seen.payload < HOLD:
+        elif seen.arm and seen.following and seen.recording and not seen.failed_checks and seen.payload < HOLD:
             self._go(now, State.ARMED, "the operator armed this throw")
 
     def _armed(self, now: float, seen: Inputs) -> None:
         long = now - self.since >= self.params.armed_least
         if seen.land:
             self._go(now, State.LAND, "the operator said land")
-        elif max(seen.vehicle, seen.payload) >= HOLD or not seen.recording:
-            self._go(now, State.READY, "disarmed: stale poses, or the recording failed")
+        elif max(seen.vehicle, seen.payload) >= HOLD or not (seen.recording and seen.following):
+            self._go(now, State.READY, "disarmed: stale poses, not followed, or the recording failed")
         elif self._lasted(now, seen.still and not seen.failed_checks, self.params.quiet) and long:
             self._go(now, State.THROW, "quiet")
         elif self._late(now):

@@ -1,6 +1,85 @@
-"""Back-ends: where commands go. ``dry-run`` (the default) sends nothing, ``ardupilot`` speaks MAVLink."""
+"""Back-ends: where commands go. ``dry-run`` (the default) sends nothing, ``ardupilot`` and ``px4`` speak MAVLink on the link
+that the poses may share, ``betaflight`` speaks MSP on a port of its own."""
+
+from collections.abc import Callable
+from typing import Any
 
 from hil.backends.ardupilot import ArduPilot, ArduPilotParams
 from hil.backends.base import Backend, DryRun, Status
+from hil.backends.betaflight import Betaflight, BetaflightParams
+from hil.backends.px4 import Px4, Px4Params
+from hil.device import check_device, open_port
+from hil.errors import RunError
 
-__all__ = ["ArduPilot", "ArduPilotParams", "Backend", "DryRun", "Status"]
+THRUST_SHORT = 0.98
+"""Of the thrust, and of the rates, that the policy was trained with: what a vehicle must reach at least."""
+
+
+def mechanism_lag(params: Any) -> float:
+    """Time from the release command to separation [s] of the mechanism of a run's back-end; 0 for a dry run."""
+    return 0.0 if params.backend == "dry-run" else getattr(params, params.backend).mechanism_lag
+
+
+def make_backend(
+    params: Any, link: Any = None, write: bool = False, tell: Callable[[str], None] | None = None
+) -> Backend:  # fmt: skip
+    """The back-end of a run.
+
+    Args:
+        params: `hil.params.HilParams`.
+        link: MAVLink link of the run; None where poses are recorded ones.
+        write: whether wrong parameters of the autopilot are written.
+        tell: is handed the audit's table.
+
+    Raises:
+        LinkError: the port of the flight controller cannot be opened.
+        RunError: a MAVLink back-end without a link.
+    """
+    if params.backend == "dry-run":
+        return DryRun()
+    if params.backend == "betaflight":
+        device = check_device(params.betaflight.device, remote=params.betaflight.remote)
+        if device.kind not in ("tcp", "serial"):
+            raise RunError(f"betaflight.device {params.betaflight.device}: MSP is a stream; expected tcp:... or serial:...")
+        return Betaflight(open_port(device), params.betaflight, write, tell)
+    if link is None:
+        raise RunError(f"backend {params.backend} without a MAVLink link; expected source.kind mavlink")
+    kind = {"ardupilot": ArduPilot, "px4": Px4}[params.backend]
+    return kind(link, getattr(params, params.backend), write, tell)
+
+
+def require_reach(params: Any, contract: dict[str, Any]) -> None:
+    """Refuse a vehicle that cannot do what the policy was trained to command.
+
+    Args:
+        params: `hil.params.HilParams`.
+        contract: of the policy.
+
+    Raises:
+        RunError: thrust or rates fall short, by the calibration and the rate profile of the config.
+    """
+    if params.backend == "dry-run":
+        return
+    vehicle, action = getattr(params, params.backend), contract["action"]
+    most, wanted = vehicle.thrust.most, float(action["max_thrust"])
+    if most < THRUST_SHORT * wanted:
+        raise RunError(
+            f"{params.backend}.thrust gives {most:.2f} N at most, the policy was trained with {wanted:g} N; check weight, hover "
+            "and slope, or train a policy for this vehicle"
+        )
+    if params.backend == "betaflight":
+        from hil.backends.rates import Sticks
+
+        ends = Sticks(vehicle.rates).most
+        short = [i for i, r in enumerate(action["max_rate"]) if ends[i] < THRUST_SHORT * r]
+        if short:
+            raise RunError(
+                f"betaflight.rates reach {', '.join(f'{r:.1f}' for r in ends)} rad/s on roll, pitch, yaw, the policy was trained "
+                f"with {', '.join(f'{r:g}' for r in action['max_rate'])}; raise rates"
+            )
+
+
+__all__ = [
+    "ArduPilot", "ArduPilotParams", "Backend", "Betaflight", "BetaflightParams", "DryRun", "Px4", "Px4Params", "Status",
+    "make_backend", "mechanism_lag", "require_reach",
+]  # fmt: skip

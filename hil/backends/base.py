@@ -1,25 +1,32 @@
 """What the runner needs of a back-end, and the one that sends nothing."""
 
 from dataclasses import dataclass
-from typing import Protocol
+from time import perf_counter
+from typing import Any, Protocol
 
 IDLE, PENDING, ACCEPTED, FAILED = "idle", "pending", "accepted", "failed"
 """How far a release has come."""
+
+WAIT, FOLLOW, HOLD, LAND = "wait", "follow", "hold", "land"
+"""What the autopilot does: it is in other hands, follows commands, holds its place by itself, lands by itself."""
 
 
 @dataclass(frozen=True)
 class Status:
     """What a back-end knows of its autopilot at a tick; recorded, so that a replay decides alike."""
 
-    connected: bool  # heard from lately, armed, and in a mode that follows commands
+    connected: bool  # heard from lately, armed, audited, and in a mode that it was asked for or may be taken from
     note: str = ""  # why not, for people
     release: str = IDLE  # IDLE, PENDING, ACCEPTED or FAILED
+    mode: str = FOLLOW  # WAIT, FOLLOW, HOLD or LAND
+    fault: str | None = None  # what ends the run, whatever else is well: a parameter audit that failed
 
 
 class Backend(Protocol):
     """Where commands go; no call waits or raises."""
 
     name: str
+    holds: bool  # whether the autopilot has modes of its own that hold a place and land
 
     def status(self, now: float) -> Status:
         """What is known now."""
@@ -27,11 +34,17 @@ class Backend(Protocol):
     def send(self, command: tuple[float, ...], now: float) -> bool:
         """Send collective thrust [N] and body rates [rad/s], body frame x forward, y left, z up; whether it was taken."""
 
+    def ask(self, mode: str, now: float) -> None:
+        """Ask for FOLLOW, HOLD or LAND; called at every tick while it is wanted. Does nothing where there is none."""
+
     def release(self, when: float) -> None:
         """Open the mechanism at a time [s] on the runner's clock; called once a throw."""
 
     def stop_release(self) -> None:
-        """Send no (further) release of this throw."""
+        """Send no (further) release of this throw; one that was sent may still be answered."""
+
+    def rearm(self) -> None:
+        """Forget the last throw's release: the operator has armed the next one."""
 
     def service(self, now: float) -> None:
         """Do what is due: heartbeats, the release, its repetition."""
@@ -40,13 +53,103 @@ class Backend(Protocol):
         """When :meth:`service` is to be called at the latest [s]; None for the next tick."""
 
     def abort(self, now: float) -> None:
-        """Ask the autopilot to take over; called at every tick of an aborted run."""
+        """Ask the autopilot to land; called at every tick of an aborted run. A pilot who has taken over is left alone."""
+
+    def finish(self, now: float) -> None:
+        """The run is over: put the autopilot at rest as far as that is ours."""
+
+    def close(self) -> None:
+        """Give back ports of its own."""
+
+
+class Release:
+    """One release: sent at its time, repeated until it is answered, never again once it was answered or stopped.
+
+    Attributes:
+        state: IDLE, PENDING, ACCEPTED or FAILED. sends: of this throw. note: how it ended.
+        answers: of all throws, from the first send to the first answer [s].
+    """
+
+    REPEAT = 0.04
+    """Between two sends that have no answer yet [s]; answers take 1 to 3 ms."""
+
+    def __init__(self, timeout: float, read_back: bool = False) -> None:
+        """Start at rest.
+
+        Args:
+            timeout: without a final answer, and a movement where it is read back, the release has failed [s].
+            read_back: whether an acceptance counts only when the mechanism was seen to move.
+        """
+        self.timeout, self.read_back = timeout, read_back
+        self.answers: list[float] = []
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the last throw."""
+        self.state, self.note, self.sends = IDLE, "", 0
+        self.at: float | None = None  # of the next send [s]
+        self._first = 0.0
+        self._sent: float | None = None  # until the first answer
+        self._answered = self._moved = False
+
+    def start(self, when: float) -> None:
+        """Open at a time [s]."""
+        if self.state == IDLE:
+            self.state, self.at, self._first = PENDING, when, when
+
+    def stop(self) -> None:
+        """Send no more; what was never sent never happened."""
+        self.at = None
+        if self.state == PENDING and not self.sends:
+            self.state = IDLE
+
+    def answer(self, accepted: bool | None, text: str = "") -> None:
+        """Take an answer: True accepted, False refused, None at work on it."""
+        if self.state != PENDING or not self.sends:
+            return
+        self.at = None  # heard: not to be told again
+        if self._sent is not None:
+            self.answers.append(perf_counter() - self._sent)
+            self._sent = None
+        if accepted is False:
+            self._end(FAILED, text or "refused")
+        elif accepted:
+            self._answered = True
+            self._judge()
+
+    def moved(self) -> None:
+        """The mechanism was seen to have moved."""
+        if self.state == PENDING and self.sends:
+            self._moved = True
+            self._judge()
+
+    def due(self, now: float) -> bool:
+        """Whether to send it now; the caller does."""
+        if self.state != PENDING:
+            return False
+        if now - self._first > self.timeout:
+            why = "accepted, but nothing moved" if self._answered else "no final answer"
+            self._end(FAILED, f"{why} within {self.timeout:g} s")
+        elif self.at is not None and now >= self.at:
+            if not self.sends:
+                self._sent = perf_counter()
+            self.sends, self.at = self.sends + 1, now + self.REPEAT
+            return True
+        return False
+
+    def _judge(self) -> None:
+        if self._answered and (self._moved or not self.read_back):
+            self._end(ACCEPTED, "")
+
+    def _end(self, state: str, note: str) -> None:
+        self.state, self.note, self.at = state, note, None
 
 
 class DryRun:
     """Sends nothing; counts what it was given."""
 
     name = "dry-run"
+    holds = False
 
     def __init__(self) -> None:
         """Start with nothing sent."""
@@ -67,16 +170,15 @@ class DryRun:
         self.releases += 1
         self._release = ACCEPTED
 
-    def stop_release(self) -> None:
+    def rearm(self) -> None:
         """See `Backend`."""
         self._release = IDLE
-
-    def service(self, now: float) -> None:
-        """See `Backend`."""
 
     def due(self) -> float | None:
         """See `Backend`."""
         return None
 
-    def abort(self, now: float) -> None:
+    def _nothing(self, *_: Any) -> None:
         """See `Backend`."""
+
+    ask = stop_release = service = abort = finish = close = _nothing

@@ -107,7 +107,8 @@ class MavlinkSource:
     def _hear(self, message: Any, arrival: float) -> None:
         pose = self._decoder.feed(message, arrival)
         if pose is not None:
-            self._waiting.append(pose)
+            sync = self._link.sync
+            self._waiting.append(pose if sync is None else sync.dated(pose, message.get_srcSystem()))
 
     def poll(self, now: float) -> list[Pose]:
         """See `hil.sources.base.Source`."""

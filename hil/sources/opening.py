@@ -14,6 +14,7 @@ from hil.sources.dataflash import read_bin
 from hil.sources.mavlink import MavlinkSource, read_tlog
 from hil.sources.mocap import open_mocap
 from hil.sources.ulog import read_ulg
+from hil.sync import LinkSync
 
 
 def read_poses(params: HilParams) -> list[Pose]:
@@ -50,10 +51,12 @@ def open_source(params: HilParams, folder: Path, speed: float) -> tuple[Any, Lin
     if source.kind not in LIVE:
         return Recorded(read_poses(params)), None, True
     clock, link = MonotonicClock(speed).now, None
-    if source.kind == "mavlink" or params.backend != "dry-run":
+    if source.kind == "mavlink" or params.backend in ("ardupilot", "px4"):
         port = open_port(check_device(params.link.device, remote=params.link.remote))
         folder.mkdir(parents=True, exist_ok=True)
         link = Link(port, params.link.system, params.link.component, TlogWriter(folder / "link.tlog"))
+        if params.delay.synchronise:
+            LinkSync(link)
     if source.kind == "mavlink":
         return MavlinkSource(link, source.senders, clock), link, False
     return open_mocap(source.mocap, source.bodies, clock, params.link.remote, link), link, False

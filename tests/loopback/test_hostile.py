@@ -99,7 +99,7 @@ def test_a_flood_in_mid_throw_neither_commands_nor_releases():
         summary, fake, _ = throw(plant, loaded=simple_policy((-0.1269, 0, 0, 0, 1.0)), seconds=6.0)
     finally:
         wire.peers = made
-    assert (summary["latches"], fake.grippers, fake.ignored) == (1, 1, 0)
+    assert (summary["latches"], fake.witness.releases, fake.ignored) == (1, 1, 0)
     assert np.all(np.isfinite(plant.commands))
 
 

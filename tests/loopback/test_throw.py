@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from hil.backends import ArduPilot
+from hil.backends import make_backend, mechanism_lag
 from hil.cli import warm_up
 from hil.clock import MonotonicClock
 from hil.device import check_device, open_port
@@ -44,7 +44,7 @@ def test_throws_in_lock_step(policy):
         errors.append(np.hypot(true[0] - 2.0, true[1]))
         (landing,) = summary["landings"]
         assert np.linalg.norm(np.subtract(landing["landing_w"], true)) < READ_BACK
-        assert (summary["cancelled"], fake.grippers, summary["guard"]["refused"]) == (0, 1, 0)
+        assert (summary["cancelled"], fake.witness.releases, summary["guard"]["refused"]) == (0, 1, 0)
     assert np.mean(errors) < LANDING
 
 
@@ -62,8 +62,8 @@ def test_a_throw_over_udp_against_a_process_of_its_own(tmp_path):
     recorder = Recorder(tmp_path / "run", params)
     link = Link(open_port(check_device(params.link.device)), tlog=TlogWriter(tmp_path / "run" / "link.tlog"))
     source = MavlinkSource(link, params.source.senders, clock.now)
-    backend = ArduPilot(link, params.ardupilot)
-    runner = Runner(params, Policy.load(find_policy(params.policy)), backend, params.ardupilot.mechanism_lag)
+    backend = make_backend(params, link)
+    runner = Runner(params, Policy.load(find_policy(params.policy)), backend, mechanism_lag(params))
     warm_up(runner)
     # The fake goes away in mid flight, which ends the run: half a second later it is done.
     command = [sys.executable, "-m", "visthrow.cli", "hil", "fake", "--device", f"udpout:{device}"]
@@ -81,7 +81,7 @@ def test_a_throw_over_udp_against_a_process_of_its_own(tmp_path):
     true = report["landing_w"]
     assert true is not None, (summary["reason"], report)
     assert np.hypot(true[0] - 2.0, true[1]) < ONE_THROW
-    assert (report["grippers"], report["ignored"], summary["latches"]) == (1, 0, 1)
+    assert (report["releases"], report["breaches"], summary["latches"]) == (1, [], 1)
     (landing,) = summary["landings"]
     assert np.linalg.norm(np.subtract(landing["landing_w"], true)) < READ_BACK
     found = replay(tmp_path / "run")

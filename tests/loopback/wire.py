@@ -4,12 +4,14 @@ from collections import deque
 
 import numpy as np
 
-from hil.backends import ArduPilot
-from hil.fake import VEHICLE_ID, FakeAutopilot, MocapParams
+from hil.backends import Betaflight, make_backend, mechanism_lag
+from hil.fake import VEHICLE_ID, MocapParams, Options, make_fake
+from hil.fakes import Fake
 from hil.flight import AutoOperator, fly
 from hil.link import Link
 from hil.runner import Runner
 from hil.sources import MavlinkSource
+from hil.sync import LinkSync
 from visthrow import config
 from visthrow.hover import GRAVITY
 from visthrow.policy import Policy, find_policy
@@ -48,7 +50,7 @@ def pipe() -> tuple[MemoryPort, MemoryPort]:
 class PlantClock:
     """The plant's time; waiting flies on."""
 
-    def __init__(self, fake: FakeAutopilot) -> None:
+    def __init__(self, fake: Fake) -> None:
         self._fake = fake
 
     def now(self) -> float:
@@ -93,25 +95,39 @@ class LevelPlant:
         return {"landing_w": None, "landing_time": None, "separation_time": None}
 
 
-def peers(plant, seed=0, answer="accepted", overrides=(), mocap=None, policy="state", loaded=None):
+CONFIGS = {"ardupilot": "fake", "px4": "fake_px4", "betaflight": "fake_betaflight"}
+
+
+def peers(
+    plant, seed=0, answer="accepted", overrides=(), mocap=None, policy="state", loaded=None, kind="ardupilot", tell=None,
+    write=False, **options,
+):
     """Runner and fake at the ends of a pipe: runner, source, clock, fake."""
     from hil.params import HilParams
 
-    params = config.load(HilParams, config.find("hil", "fake"), [f"policy={policy}", *overrides])
+    params = config.load(HilParams, config.find("hil", CONFIGS[kind]), [f"policy={policy}", *overrides])
     here, there = pipe()
-    fake = FakeAutopilot(plant, Link(there, *VEHICLE_ID), mocap or MocapParams(), seed, answer)
+    mine, its = pipe()
+    mine.whole = its.whole = False
+    more = Options(answer=answer, **options)
+    fake = make_fake(kind, plant, Link(there, *VEHICLE_ID), mocap or MocapParams(), seed, more, its)
     clock, link = PlantClock(fake), Link(here, params.link.system, params.link.component)
+    if params.delay.synchronise:
+        LinkSync(link)
     source = MavlinkSource(link, params.source.senders, clock.now)
-    backend = ArduPilot(link, params.ardupilot)
-    runner = Runner(params, loaded or Policy.load(find_policy(policy)), backend, params.ardupilot.mechanism_lag)
-    return runner, source, clock, fake
+    if kind == "betaflight":
+        backend = Betaflight(mine, params.betaflight, write, tell)
+    else:
+        backend = make_backend(params, link, write, tell)
+    loaded = loaded or Policy.load(find_policy(policy))
+    return Runner(params, loaded, backend, mechanism_lag(params)), source, clock, fake
 
 
-def throw(plant, seconds=20.0, recorder=None, phase=0, **kwargs):
+def throw(plant, seconds=20.0, recorder=None, phase=0, operator=None, **kwargs):
     """A run in lock step, its ticks ``phase`` of the plant's periods after the poses: summary, fake, decisions."""
     runner, source, clock, fake = peers(plant, **kwargs)
     for _ in range(phase):
         fake.step()
     told = []
-    summary = fly(runner, source, clock, AutoOperator(), recorder, seconds, told.append)
+    summary = fly(runner, source, clock, operator or AutoOperator(), recorder, seconds, told.append)
     return summary, fake, told

@@ -1,0 +1,121 @@
+"""Parameter audit at connect: what was found, what is expected, why; a mismatch refuses to fly, and nothing is written
+unless the operator said so."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+ASK_AGAIN = 0.2
+"""Between two questions for a value that has not come [s]."""
+
+GIVE_UP = 5.0
+"""A value that has not come within this time is missing [s]."""
+
+
+@dataclass(frozen=True)
+class Rule:
+    """What one parameter has to be."""
+
+    name: str
+    expected: str  # in words
+    why: str
+    good: Callable[[float], bool]
+    value: Callable[[float], float] | None = None  # what is written where the operator asked for it; None: nothing can be
+
+
+def equal(name: str, value: float, why: str, writable: bool = True) -> Rule:
+    """A parameter that must have a value."""
+    return Rule(name, f"{value:g}", why, lambda v: abs(v - value) < 1e-6, (lambda _: value) if writable else None)
+
+
+def bits(name: str, mask: int, why: str) -> Rule:
+    """A parameter some of whose bits must be set."""
+    return Rule(name, f"with the bits of {mask} set", why, lambda v: int(v) & mask == mask, lambda v: int(v) | mask)
+
+
+def within(name: str, low: float, high: float, value: float, why: str) -> Rule:
+    """A parameter above ``low`` and not above ``high``; ``value`` is written."""
+    return Rule(name, f"above {low:g}, at most {high:g}", why, lambda v: low < v <= high + 1e-6, lambda _: value)
+
+
+class Audit:
+    """Asks for parameters one by one and judges them.
+
+    Attributes:
+        found: values by name. written: names that were changed.
+    """
+
+    def __init__(
+        self, rules: Iterable[Rule], ask: Callable[[str], None], write: Callable[[str, float], None] | None = None,
+        tell: Callable[[str], None] | None = None,
+    ) -> None:  # fmt: skip
+        """Begin with nothing asked.
+
+        Args:
+            rules: of the back-end.
+            ask: sends a question for a parameter.
+            write: sends a new value; None: nothing is ever written.
+            tell: is handed the table, once.
+        """
+        self.rules, self._ask, self._write, self._tell = tuple(rules), ask, write, tell
+        self.found: dict[str, float] = {}
+        self.written: list[str] = []
+        self._asked: dict[str, float] = {}
+        self._begun: float | None = None
+        self.done = not self.rules
+
+    def feed(self, name: str, value: float) -> None:
+        """Take an answer."""
+        rule = next((rule for rule in self.rules if rule.name == name), None)
+        if self.done or rule is None:
+            return
+        self.found[name] = value
+        wrong = not rule.good(value)
+        if wrong and self._write is not None and rule.value is not None and name not in self.written:
+            self.written.append(name)
+            self._write(name, rule.value(value))
+            del self.found[name]  # it counts when it was read back
+            self._asked.pop(name, None)
+
+    def service(self, now: float) -> None:
+        """Ask for what is missing."""
+        if self.done:
+            return
+        if self._begun is None:
+            self._begun = now
+        missing = [rule.name for rule in self.rules if rule.name not in self.found]
+        if not missing or now - self._begun > GIVE_UP:
+            self.done = True
+            if self._tell is not None:
+                self._tell(self.table())
+            return
+        for name in missing:
+            if now - self._asked.get(name, -1e9) >= ASK_AGAIN:
+                self._asked[name] = now
+                self._ask(name)
+
+    @property
+    def problems(self) -> list[str]:
+        """Mismatches in words, once the audit is done."""
+        out = []
+        for rule in self.rules if self.done else ():
+            value = self.found.get(rule.name)
+            if value is None:
+                out.append(f"{rule.name} was not told; expected {rule.expected}")
+            elif not rule.good(value):
+                out.append(f"{rule.name} is {value:g}; expected {rule.expected}")
+        return out
+
+    def table(self) -> str:
+        """Parameter, found, expected, why, a line each."""
+        rows = [("", "parameter", "found", "expected", "why")]
+        for rule in self.rules:
+            value = self.found.get(rule.name)
+            good = value is not None and rule.good(value)
+            mark = "ok" if good else "WRONG"
+            shown = "no answer" if value is None else f"{value:g}" + (" (written)" if rule.name in self.written else "")
+            rows.append((mark, rule.name, shown, rule.expected, rule.why))
+        widths = [max(len(row[i]) for row in rows) for i in range(4)]
+        lines = ["  ".join([*(cell.ljust(w) for cell, w in zip(row, widths)), row[4]]).rstrip() for row in rows]
+        if any(row[0] == "WRONG" for row in rows):
+            lines.append("The runner does not fly with these; set them, or let it write them with --write-parameters.")
+        return "\n".join(lines)

@@ -1,0 +1,304 @@
+"""What ArduPilot and PX4 share: heartbeat, modes, set-points, release, parameters, over one MAVLink link.
+
+Who flies is decided by the pilot. A mode that the runner did not ask for counts as a pilot who has taken over: the runner
+stops commanding and asks for nothing any more, an abort included.
+"""
+
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from hil.backends.audit import Audit, Rule
+from hil.backends.base import FOLLOW, HOLD, LAND, WAIT, Release, Status
+from hil.backends.thrust import ThrustParams
+from hil.link import Link, attitude_target
+from hil.mavlink import mav
+
+ASK_AGAIN = 0.1
+"""Between two requests for a mode or for arming [s]."""
+
+STREAM = ((mav.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW, 5_000), (mav.MAVLINK_MSG_ID_ATTITUDE_TARGET, 50_000))
+"""Messages asked for at connect and their periods [us]: read-back of the mechanism, share of thrust in hover."""
+
+SERVO_NEAR = 50
+"""An output this near to where the mechanism is open counts as open [us]."""
+
+ARMED = mav.MAV_MODE_FLAG_SAFETY_ARMED
+CUSTOM = mav.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+
+
+@dataclass(frozen=True)
+class AutopilotParams:
+    """A vehicle that speaks MAVLink.
+
+    Raises:
+        ValueError: a number out of its range.
+    """
+
+    system: int  # MAVLink id of the vehicle
+    component: int  # of its autopilot
+    thrust: ThrustParams
+    mechanism_lag: float  # from the release command to separation [s]
+    release_timeout: float  # without a final answer the release has failed [s]
+    heartbeat_timeout: float  # silence after which the autopilot counts as lost [s]
+    take: bool  # take the vehicle out of its holding mode when all is ready; else the pilot's switch hands it over
+    arm: bool  # arm it when it is taken: bench and software only; else the pilot arms
+    audit: bool  # read parameters at connect and refuse to fly on a mismatch
+    servo_output: int  # output of SERVO_OUTPUT_RAW that the mechanism hangs on, from 1; 0: not read back
+    servo_open_us: int  # there, with the mechanism open [us]
+
+    def __post_init__(self) -> None:
+        if min(self.release_timeout, self.heartbeat_timeout) <= 0.0 or self.mechanism_lag < 0.0:
+            raise ValueError(
+                f"autopilot: release_timeout {self.release_timeout}, heartbeat_timeout {self.heartbeat_timeout}, mechanism_lag "
+                f"{self.mechanism_lag} s; expected time-outs above 0, a lag of 0 or more"
+            )
+        if not (1 <= self.system <= 255 and 0 <= self.component <= 255):
+            raise ValueError(f"autopilot system {self.system}, component {self.component}; expected 1 to 255, 0 to 255")
+        if not (0 <= self.servo_output <= 16 and 500 <= self.servo_open_us <= 2500):
+            raise ValueError(
+                f"servo_output {self.servo_output}, servo_open_us {self.servo_open_us}; expected 0 to 16, 500 to 2500"
+            )
+
+
+class MavlinkAutopilot:
+    """See `hil.backends.base.Backend`; the children say which modes there are and what the parameters must be.
+
+    Attributes:
+        audit: of the parameters. release_record: of this throw. texts: STATUSTEXTs, the newest last.
+        share: last share of thrust that the autopilot reported, 0 to 1. voltage: of its battery [V].
+    """
+
+    name = "autopilot"
+    holds = True
+
+    def __init__(
+        self, link: Link, params: AutopilotParams, write: bool = False, tell: Callable[[str], None] | None = None
+    ) -> None:  # fmt: skip
+        """Listen to the vehicle on a link.
+
+        Args:
+            link: shared with the pose source.
+            params: the vehicle.
+            write: whether wrong parameters are written.
+            tell: is handed the table of parameters.
+        """
+        self.params, self._link = params, link
+        self._heartbeat: Any = None
+        self._heard = self._told = self._asked_at = self._streamed = -1e9
+        self._wanted: str | None = None
+        self._last_role: str | None = None  # the last role that was ours
+        self._reached = False
+        self._taken_over = False
+        self._ours = False  # whether it has ever followed
+        self._was_armed = False  # since the runner took the vehicle
+        self._arm_refused = ""
+        self._kinds: dict[str, int] = {}  # of parameters, as MAV_PARAM_TYPE
+        self.release_record = Release(params.release_timeout, params.servo_output > 0)
+        rules = self._rules() if params.audit else ()
+        self.audit = Audit(rules, self._ask_parameter, self._write_parameter if write else None, tell)
+        self.texts: list[str] = []
+        self.share: float | None = None
+        self.voltage: float | None = None
+        link.listen(self._hear)
+
+    def _rules(self) -> list[Rule]:
+        raise NotImplementedError
+
+    def _role(self, beat: Any) -> str | None:
+        """FOLLOW, HOLD or LAND by a heartbeat's mode; None for another one."""
+        raise NotImplementedError
+
+    def _mode_numbers(self, mode: str) -> tuple[float, float]:
+        """Second and third parameter of DO_SET_MODE."""
+        raise NotImplementedError
+
+    def _release_command(self) -> tuple[int, tuple[float, ...]]:
+        """Command that opens the mechanism, and its parameters."""
+        raise NotImplementedError
+
+    def _stored(self, value: float, kind: int) -> float:
+        """A parameter's value out of a PARAM_VALUE's field."""
+        return value
+
+    def _field(self, value: float, kind: int) -> float:
+        """A PARAM_SET's field for a value; inverse of :meth:`_stored`."""
+        return value
+
+    def _hear(self, message: Any, arrival: float) -> None:
+        p, kind = self.params, message.get_type()
+        if message.get_srcSystem() != p.system or message.get_srcComponent() != p.component:
+            return
+        if kind == "HEARTBEAT":
+            self._heartbeat, self._heard = message, arrival
+            self._judge_mode()
+        elif kind == "COMMAND_ACK":
+            self._acknowledged(message)
+        elif kind == "STATUSTEXT" and len(self.texts) < 1000:
+            self.texts.append(str(message.text))
+        elif kind == "SERVO_OUTPUT_RAW" and 1 <= p.servo_output <= 16:
+            value = getattr(message, f"servo{p.servo_output}_raw", 0)
+            if value and abs(value - p.servo_open_us) <= SERVO_NEAR:
+                self.release_record.moved()
+        elif kind == "PARAM_VALUE":
+            self._kinds[message.param_id] = message.param_type
+            self.audit.feed(message.param_id, self._stored(message.param_value, message.param_type))
+        elif kind == "ATTITUDE_TARGET":
+            self.share = message.thrust
+        elif kind == "VFR_HUD" and self.share is None:
+            self.share = 0.01 * message.throttle
+        elif kind == "SYS_STATUS" and 0 < message.voltage_battery < 65535:
+            self.voltage = 1e-3 * message.voltage_battery
+
+    def _judge_mode(self) -> None:
+        """Whether the mode is still one of ours."""
+        role = self._role(self._heartbeat)
+        if self._wanted is None:
+            return
+        self._was_armed |= bool(self._heartbeat.base_mode & ARMED)
+        if role == self._wanted:
+            self._reached, self._taken_over, self._last_role = True, False, role
+            self._ours |= role == FOLLOW
+        elif self._reached or role != self._last_role:
+            self._taken_over = True
+
+    def _acknowledged(self, message: Any) -> None:
+        result = message.result
+        if message.command == self._release_command()[0]:
+            if result == mav.MAV_RESULT_ACCEPTED:
+                self.release_record.answer(True)
+            elif result == mav.MAV_RESULT_IN_PROGRESS:
+                self.release_record.answer(None)
+            elif result != mav.MAV_RESULT_TEMPORARILY_REJECTED:
+                self.release_record.answer(False, f"refused with result {result}")
+        elif message.command == mav.MAV_CMD_COMPONENT_ARM_DISARM and result != mav.MAV_RESULT_ACCEPTED:
+            self._arm_refused = f"arming refused with result {result}" + (f": {self.texts[-1]}" if self.texts else "")
+
+    def _note(self, now: float) -> tuple[str, str]:
+        """What is wrong, or nothing; and what the autopilot does."""
+        p, beat = self.params, self._heartbeat
+        if beat is None or now - self._heard > p.heartbeat_timeout:
+            return "no heartbeat" if beat is None else f"no heartbeat for {now - self._heard:.1f} s", WAIT
+        if not self.audit.done:
+            return "parameters are being read", WAIT
+        role, armed = self._role(beat), bool(beat.base_mode & ARMED)
+        if self._wanted is None:
+            if not armed and not p.arm:
+                return "disarmed", WAIT
+            ready = role == FOLLOW or (p.take and role == HOLD)
+            return ("", role) if ready else (f"in mode {self._mode_text(beat)}; expected {self._expected_modes()}", WAIT)
+        if self._taken_over:
+            return f"in mode {self._mode_text(beat)}, which the runner did not ask for: pilot or failsafe has it", WAIT
+        if armed or self._wanted == LAND:  # on the ground it disarms itself
+            return "", role or WAIT
+        if self._was_armed or self._arm_refused or not p.arm:
+            return self._arm_refused or "disarmed", WAIT
+        return "", WAIT
+
+    def _mode_text(self, beat: Any) -> str:
+        return str(beat.custom_mode)
+
+    def _expected_modes(self) -> str:
+        raise NotImplementedError
+
+    def status(self, now: float) -> Status:
+        """See `Backend`."""
+        note, mode = self._note(now)
+        problems = self.audit.problems
+        fault = f"parameter audit: {'; '.join(problems)}" if problems else None
+        return Status(not note and not problems, note or self.release_record.note, self.release_record.state, mode, fault)
+
+    def send(self, command: tuple[float, ...], now: float) -> bool:
+        """See `Backend`."""
+        p = self.params
+        thrust, x, y, z = command
+        share = p.thrust.share(thrust, self.voltage)
+        return self._link.send(attitude_target(now, (p.system, p.component), share, (x, -y, -z)))
+
+    def ask(self, mode: str, now: float) -> None:
+        """See `Backend`: asks until the heartbeat shows the mode."""
+        if mode != self._wanted:
+            # The first mode that is ours may be one that the pilot has chosen.
+            self._last_role = self._last_role if self._wanted is not None else self._current()
+            self._wanted, self._reached, self._asked_at = mode, False, -1e9
+            if self._heartbeat is not None:
+                self._judge_mode()
+        if self._taken_over or now - self._asked_at < ASK_AGAIN:
+            return
+        beat = self._heartbeat
+        if beat is None or self._role(beat) != mode:
+            self._asked_at = now
+            self._command(mav.MAV_CMD_DO_SET_MODE, 0, CUSTOM, *self._mode_numbers(mode))
+        elif mode == FOLLOW and self.params.arm and not beat.base_mode & ARMED:
+            self._asked_at = now
+            self._command(mav.MAV_CMD_COMPONENT_ARM_DISARM, 0, 1.0)
+
+    def _current(self) -> str | None:
+        return None if self._heartbeat is None else self._role(self._heartbeat)
+
+    def release(self, when: float) -> None:
+        """See `Backend`."""
+        self.release_record.start(when)
+
+    def stop_release(self) -> None:
+        """See `Backend`."""
+        self.release_record.stop()
+
+    def rearm(self) -> None:
+        """See `Backend`."""
+        self.release_record.reset()
+
+    def service(self, now: float) -> None:
+        """See `Backend`."""
+        if now - self._told >= 1.0:
+            self._told = now
+            self._link.send(mav.MAVLink_heartbeat_message(mav.MAV_TYPE_ONBOARD_CONTROLLER, 8, 0, 0, 4, 3))
+        if self._heartbeat is not None:
+            self.audit.service(now)
+            if self.params.servo_output and now - self._streamed > 10.0 and self._wanted is None:
+                self._streamed = now
+                for number, period in STREAM:
+                    self._command(mav.MAV_CMD_SET_MESSAGE_INTERVAL, 0, number, period)
+        if self.release_record.due(now):
+            number, values = self._release_command()
+            self._command(number, self.release_record.sends - 1, *values)
+
+    def due(self) -> float | None:
+        """See `Backend`."""
+        return self.release_record.at
+
+    def abort(self, now: float) -> None:
+        """See `Backend`."""
+        self.ask(LAND, now)
+
+    def finish(self, now: float) -> None:
+        """See `Backend`: its landing mode disarms it."""
+
+    def close(self) -> None:
+        """See `Backend`: the link is the source's."""
+
+    def _command(self, number: int, confirmation: int, *values: float) -> None:
+        p = self.params
+        seven = [*map(float, values), *([0.0] * (7 - len(values)))]
+        message = mav.MAVLink_command_long_message(p.system, p.component, number, min(confirmation, 255), *seven)
+        self._link.send(message)
+
+    def _ask_parameter(self, name: str) -> None:
+        p = self.params
+        self._link.send(mav.MAVLink_param_request_read_message(p.system, p.component, name.encode(), -1))
+
+    def _write_parameter(self, name: str, value: float) -> None:
+        p, kind = self.params, self._kinds.get(name, mav.MAV_PARAM_TYPE_REAL32)
+        field = self._field(value, kind)
+        self._link.send(mav.MAVLink_param_set_message(p.system, p.component, name.encode(), field, kind))
+
+
+def bytes_to_integer(value: float) -> float:
+    """The integer whose bytes stand in a float field, as PX4 writes them."""
+    return float(struct.unpack("<i", struct.pack("<f", value))[0])
+
+
+def integer_to_bytes(value: float) -> float:
+    """The float field whose bytes are those of an integer."""
+    return struct.unpack("<f", struct.pack("<i", int(value)))[0]

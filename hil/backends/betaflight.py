@@ -1,0 +1,383 @@
+"""Betaflight over MSP: rates and thrust as stick positions, release on an AUX channel.
+
+The flight controller has no hold of its own and hears no poses; the runner's hover controller flies before and after the
+throw. Two ways to be heard: MSP OVERRIDE (``arm_channel = 0``): a real receiver supplies all channels, and while the pilot
+holds a switch the four sticks and the release channel are ours; and RX_MSP (``arm_channel`` an AUX): all channels are ours, for
+benches and software only. Silence: the motors idle after 0.36 s, disarming follows at 1.6 s.
+
+Source: betaflight.com, Controlling Betaflight From a Companion Computer Over MSP; src/main/msp/msp.c (payloads), rx.c, rc.c,
+msp_box.c (permanent ids).
+"""
+
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from hil import msp
+from hil.backends.audit import Audit, Rule, equal
+from hil.backends.base import ACCEPTED, FOLLOW, PENDING, WAIT, Release, Status
+from hil.backends.rates import MIDDLE, RATES_TYPES, RatesParams, Sticks
+from hil.backends.thrust import ThrustParams
+from hil.device import MOST_CHUNKS, Port
+
+BOX_ARM, BOX_OVERRIDE = 0, 50
+"""Permanent ids of flight modes."""
+
+STICKS = 4
+"""Channels before the first AUX."""
+
+LOW, HIGH = 1000, 2000
+"""Ends of a channel [us]."""
+
+NEAR = 50
+"""A channel or output this near to its target has arrived [us]."""
+
+KEEP_ALIVE = 0.02
+"""Between two frames while nothing is commanded yet: a receiver that is silent cannot be armed [s]."""
+
+OPEN_TIME = 2.0
+"""After which the mechanism closes again, so that the next payload can be hung on [s]."""
+
+POLLS = {msp.STATUS: 0.1, msp.RC: 0.1, msp.ANALOG: 1.0}
+"""What is asked for all the time, and how often [s]."""
+
+AXES = ("roll", "pitch", "yaw")
+
+
+@dataclass(frozen=True)
+class BetaflightParams:
+    """The vehicle on the other side.
+
+    Raises:
+        ValueError: a number out of its range.
+    """
+
+    device: str  # of MSP, see hil.device
+    remote: bool  # whether the device may leave this machine
+    thrust: ThrustParams
+    rates: RatesParams
+    minimum_us: int  # min_check: throttle that counts as 0 [us]
+    arm_channel: int  # AUX that arms, from 1; 0: the pilot arms and hands over by MSP OVERRIDE
+    release_channel: int  # AUX that opens the mechanism, from 1
+    servo_output: int  # of MSP_SERVO that the mechanism hangs on, from 1; 0: not read back
+    servo_open_us: int  # there, with the mechanism open [us]
+    mechanism_lag: float  # from the AUX's change to separation [s]
+    release_timeout: float  # without a read-back the release has failed [s]
+    silence: float  # after which the flight controller counts as lost [s]
+    audit: bool  # read settings at connect and refuse to fly on a mismatch
+
+    def __post_init__(self) -> None:
+        if min(self.release_timeout, self.silence) <= 0.0 or self.mechanism_lag < 0.0 or not 900 <= self.minimum_us <= 1200:
+            raise ValueError(
+                f"betaflight: release_timeout {self.release_timeout}, silence {self.silence}, mechanism_lag "
+                f"{self.mechanism_lag} s, minimum_us {self.minimum_us}; expected times above 0, a lag of 0 or more, 900 to 1200"
+            )
+        if not (0 <= self.arm_channel <= 12 and 1 <= self.release_channel <= 12 and self.arm_channel != self.release_channel):
+            raise ValueError(
+                f"arm_channel {self.arm_channel}, release_channel {self.release_channel}; expected AUX 0 to 12 and 1 to 12, "
+                "not the same"
+            )
+
+
+class Betaflight:
+    """See `hil.backends.base.Backend`.
+
+    Attributes:
+        audit: of the settings. release_record: of this throw. refused: commands that the flight controller did not know.
+        share: last share of thrust by its own channels, 0 to 1. voltage: of its battery [V].
+    """
+
+    name = "betaflight"
+    holds = False
+
+    def __init__(
+        self, port: Port, params: BetaflightParams, write: bool = False, tell: Callable[[str], None] | None = None
+    ) -> None:  # fmt: skip
+        """Speak MSP on an open port.
+
+        Args:
+            port: of the flight controller.
+            params: the vehicle.
+            write: whether wrong rates are written.
+            tell: is handed the table of settings.
+        """
+        self.params, self._port, self.parser = params, port, msp.Parser()
+        self.sticks = Sticks(params.rates)
+        self.release_record = Release(params.release_timeout, params.servo_output > 0)
+        rules = self._rules() if params.audit else ()
+        self.audit = Audit(rules, self._ask_setting, self._write_setting if write else None, tell)
+        self._order = [0, 1, 3, 2]  # rcmap AETR: where roll, pitch, yaw, throttle stand in a frame
+        self._boxes: tuple[int, ...] = ()
+        self._tuning = b""
+        self._polled = dict.fromkeys(POLLS, -1e9)
+        self._heard = self._framed = self._boxed = -1e9
+        self._flags = self._blocks = 0
+        self._taken = self._over = self._raised = False
+        self._sticks_us = (MIDDLE, MIDDLE, MIDDLE, LOW)  # roll, pitch, yaw, throttle
+        self._opened: float | None = None
+        self.share: float | None = None
+        self.voltage: float | None = None
+        self.refused = self.dropped = 0
+
+    def _rules(self) -> list[Rule]:
+        p = self.params
+        rules = [
+            Rule("api_version", "1.43 or newer", "older ones do not tell their rates type", lambda v: v >= 1.43),
+            equal("rates_type", RATES_TYPES[p.rates.type], "the curve that sticks are computed by"),
+        ]
+        for i, axis in enumerate(AXES):
+            rules.append(equal(f"{axis}_rc_rate", p.rates.rc_rates[i], "as above"))
+            rules.append(equal(f"{axis}_rate", p.rates.rates[i], "as above"))
+            rules.append(equal(f"{axis}_expo", p.rates.expo[i], "as above"))
+        rules += [
+            equal("throttle_limit_type", 0.0, "else full throttle is not full", False),
+            equal("throttle_expo", 0.0, "thrust is computed for a straight line", False),
+            equal("deadband", 0.0, "small rates would be lost", False),
+            equal("yaw_deadband", 0.0, "as above", False),
+            equal("min_check", p.minimum_us, "throttle that counts as 0 [us]", False),
+            equal("mid_rc", MIDDLE, "middle of the sticks [us]", False),
+            Rule("failsafe_delay", "above 0, at most 1.5 s", "motors stop so late when the runner is gone",
+                 lambda v: 0.0 < v <= 1.5),
+        ]  # fmt: skip
+        if p.arm_channel:
+            rules.append(equal("arm_aux", p.arm_channel, "AUX of the ARM mode", False))
+        else:
+            rules.append(Rule("override_aux", "any AUX", "the pilot's switch of MSP OVERRIDE", lambda v: v > 0.0))
+        return rules
+
+    def status(self, now: float) -> Status:
+        """See `Backend`."""
+        problems = self.audit.problems
+        fault = f"parameter audit: {'; '.join(problems)}" if problems else None
+        note, mode = self._note(now)
+        return Status(not note and not problems, note or self.release_record.note, self.release_record.state, mode, fault)
+
+    def _note(self, now: float) -> tuple[str, str]:
+        p = self.params
+        if now - self._heard > p.silence:
+            return "no answer by MSP" if self._heard < 0.0 else f"no answer by MSP for {now - self._heard:.1f} s", WAIT
+        if not (self.audit.done and self._boxes):
+            return "settings are being read", WAIT
+        armed, ours = self._box(BOX_ARM), p.arm_channel > 0 or self._box(BOX_OVERRIDE)
+        if armed and ours and self._taken:
+            return "", FOLLOW
+        if self._taken and self._raised:
+            return ("disarmed" if not armed else "MSP OVERRIDE is off: the pilot has it"), WAIT
+        if p.arm_channel:
+            return (f"arming disabled, flags {self._blocks:#x}" if self._blocks else ""), WAIT
+        if not armed:
+            return "disarmed", WAIT
+        return ("MSP OVERRIDE is on before the runner is ready: switch it off" if ours and not self._taken else ""), WAIT
+
+    def _box(self, number: int) -> bool:
+        return number in self._boxes and bool(self._flags >> self._boxes.index(number) & 1)
+
+    def send(self, command: tuple[float, ...], now: float) -> bool:
+        """See `Backend`."""
+        thrust, *rates = command
+        share = self.params.thrust.share(thrust, self.voltage)
+        low = self.params.minimum_us
+        waiting = self.params.arm_channel and not self._box(BOX_ARM)  # arming wants the throttle low
+        throttle = LOW if waiting else round(low + share * (HIGH - low))
+        self._sticks_us = (*(self.sticks.position(i, r) for i, r in enumerate(rates)), throttle)
+        return self._frame(now)
+
+    def _frame(self, now: float) -> bool:
+        p = self.params
+        channels = [LOW] * (STICKS + max(4, p.arm_channel, p.release_channel))
+        for i, value in enumerate(self._sticks_us):
+            channels[self._order[i]] = value
+        if p.arm_channel:
+            channels[STICKS + p.arm_channel - 1] = HIGH if self._taken and not self._over else LOW
+        channels[STICKS + p.release_channel - 1] = LOW if self._opened is None else HIGH
+        self._framed = now
+        return self._write(msp.SET_RAW_RC, struct.pack(f"<{len(channels)}H", *channels))
+
+    def ask(self, mode: str, now: float) -> None:
+        """See `Backend`: takes the vehicle; it neither holds nor lands by itself."""
+        if mode == FOLLOW and not self._blocks:
+            self._taken = True
+
+    def release(self, when: float) -> None:
+        """See `Backend`."""
+        self.release_record.start(when)
+
+    def stop_release(self) -> None:
+        """See `Backend`: a channel that was not read back goes back, so that nothing opens later."""
+        self.release_record.stop()
+        if self.release_record.state != ACCEPTED:
+            self._opened = None
+
+    def rearm(self) -> None:
+        """See `Backend`."""
+        self.release_record.reset()
+        self._opened = None
+
+    def service(self, now: float) -> None:
+        """See `Backend`."""
+        self._pump(now)
+        for command, period in POLLS.items():
+            if now - self._polled[command] >= period:
+                self._polled[command] = now
+                self._write(command)
+        if not self._boxes and now - self._boxed >= 0.5:
+            self._boxed = now
+            self._write(msp.BOXIDS)
+            self._write(msp.RX_MAP)
+        self.audit.service(now)
+        if self.release_record.due(now) and self._opened is None:
+            self._opened = now
+            self._frame(now)
+        if self.release_record.state == PENDING and self._opened is not None:
+            self._write(msp.SERVO if self.params.servo_output else msp.RC)
+            self._write(msp.RC)
+        if self._opened is not None and now - self._opened > OPEN_TIME:
+            self._opened = None
+        if self.params.arm_channel and not self._taken and not self._over and now - self._framed >= KEEP_ALIVE:
+            self._frame(now)
+
+    def due(self) -> float | None:
+        """See `Backend`."""
+        return self.release_record.at
+
+    def abort(self, now: float) -> None:
+        """See `Backend`: nothing to ask for; where the runner falls silent, the flight controller's failsafe acts."""
+
+    def finish(self, now: float) -> None:
+        """See `Backend`: disarms where the arming channel is ours."""
+        self._over = True
+        self._sticks_us = (MIDDLE, MIDDLE, MIDDLE, LOW)
+        if self.params.arm_channel:
+            self._frame(now)
+
+    def close(self) -> None:
+        """See `Backend`."""
+        self._port.close()
+
+    def _write(self, command: int, payload: bytes = b"") -> bool:
+        taken = self._port.write(msp.pack(msp.Frame(command, payload)))
+        self.dropped += not taken
+        return taken
+
+    def _pump(self, now: float) -> None:
+        for _ in range(MOST_CHUNKS):
+            data = self._port.read()
+            if data is None:
+                return
+            for frame in self.parser.parse(data):
+                if frame.direction == msp.ANSWER:
+                    self._hear(frame, now)
+                elif frame.direction == msp.REFUSAL:
+                    self.refused += 1
+
+    def _hear(self, frame: msp.Frame, now: float) -> None:
+        readers: dict[int, Callable[[msp.Frame], Any]] = {
+            msp.STATUS: self._hear_status, msp.RC: self._hear_channels, msp.ANALOG: self._hear_analog,
+            msp.SERVO: self._hear_servo, msp.BOXIDS: self._hear_boxes, msp.RX_MAP: self._hear_map,
+        }  # fmt: skip
+        if frame.command == msp.STATUS:
+            self._heard = now
+        if frame.command in readers:
+            readers[frame.command](frame)
+        for name, value in settings(frame, self.params).items():
+            self.audit.feed(name, value)
+        if frame.command == msp.RC_TUNING:
+            self._tuning = frame.payload
+
+    def _hear_status(self, frame: msp.Frame) -> None:
+        flags = frame.u32(6)
+        count = frame.u8(15)  # bytes of further flags, in the low half
+        if flags is None or count is None:
+            return
+        more = frame.payload[16 : 16 + (count & 15)]
+        self._flags = flags | int.from_bytes(more, "little") << 32
+        blocks = frame.u32(17 + (count & 15))
+        self._blocks = 0 if blocks is None else blocks
+        self._raised |= self._taken and self._box(BOX_ARM) and (self.params.arm_channel > 0 or self._box(BOX_OVERRIDE))
+
+    def _hear_channels(self, frame: msp.Frame) -> None:
+        """MSP_RC tells roll, pitch, yaw, throttle, AUX 1 and on, whatever the map."""
+        channels, p = frame.words(), self.params
+        if len(channels) < STICKS:
+            return
+        self.share = min(max((channels[3] - p.minimum_us) / (HIGH - p.minimum_us), 0.0), 1.0)
+        at = STICKS + p.release_channel - 1
+        if at < len(channels) and abs(channels[at] - HIGH) <= NEAR:
+            self.release_record.answer(True)
+
+    def _hear_analog(self, frame: msp.Frame) -> None:
+        volts = frame.u16(7)
+        self.voltage = 0.01 * volts if volts else self.voltage
+
+    def _hear_servo(self, frame: msp.Frame) -> None:
+        outputs, at = frame.words(), self.params.servo_output - 1
+        if 0 <= at < len(outputs) and abs(outputs[at] - self.params.servo_open_us) <= NEAR:
+            self.release_record.moved()
+
+    def _hear_boxes(self, frame: msp.Frame) -> None:
+        self._boxes = tuple(frame.payload)
+
+    def _hear_map(self, frame: msp.Frame) -> None:
+        first = list(frame.payload[:STICKS])
+        if sorted(first) == list(range(STICKS)):
+            self._order = first
+
+    def _ask_setting(self, name: str) -> None:
+        self._write(next((command for command, names in TOLD.items() if name in names), msp.MODE_RANGES))
+
+    def _write_setting(self, name: str, value: float) -> None:
+        """Write a number of the rate profile, and keep it; never while armed."""
+        if name not in TUNING or len(self._tuning) <= TUNING[name] or self._box(BOX_ARM):
+            return
+        changed = bytearray(self._tuning)
+        changed[TUNING[name]] = int(value)
+        self._tuning = bytes(changed)
+        self._write(msp.SET_RC_TUNING, self._tuning)
+        self._write(msp.EEPROM_WRITE)
+
+
+TUNING = {
+    "roll_rc_rate": 0, "roll_expo": 1, "roll_rate": 2, "pitch_rate": 3, "yaw_rate": 4, "throttle_expo": 7, "yaw_expo": 10,
+    "yaw_rc_rate": 11, "pitch_rc_rate": 12, "pitch_expo": 13, "throttle_limit_type": 14, "rates_type": 22,
+}  # fmt: skip
+"""Places in MSP_RC_TUNING."""
+
+TOLD = {
+    msp.API_VERSION: ("api_version",), msp.RC_TUNING: tuple(TUNING), msp.RC_DEADBAND: ("deadband", "yaw_deadband"),
+    msp.RX_CONFIG: ("mid_rc", "min_check"), msp.FAILSAFE_CONFIG: ("failsafe_delay",),
+    msp.MODE_RANGES: ("arm_aux", "override_aux"),
+}  # fmt: skip
+"""Which answer tells which setting."""
+
+
+def settings(frame: msp.Frame, params: BetaflightParams) -> dict[str, float]:
+    """Settings that an answer tells; what is cut short tells nothing."""
+    raw: dict[str, float | None] = {}
+    if frame.command == msp.API_VERSION:
+        major, minor = frame.u8(1), frame.u8(2)
+        raw["api_version"] = None if major is None or minor is None else major + 0.01 * minor
+    elif frame.command == msp.RC_TUNING:
+        raw = {name: frame.u8(at) for name, at in TUNING.items()}
+    elif frame.command == msp.RC_DEADBAND:
+        raw = {"deadband": frame.u8(0), "yaw_deadband": frame.u8(1)}
+    elif frame.command == msp.RX_CONFIG:
+        raw = {"mid_rc": frame.u16(3), "min_check": frame.u16(5)}
+    elif frame.command == msp.FAILSAFE_CONFIG:
+        tenths = frame.u8(0)
+        raw["failsafe_delay"] = None if tenths is None else 0.1 * tenths
+    elif frame.command == msp.MODE_RANGES:
+        raw = {"arm_aux": _aux(frame, BOX_ARM, params.arm_channel), "override_aux": _aux(frame, BOX_OVERRIDE, 0)}
+    return {name: float(value) for name, value in raw.items() if value is not None}
+
+
+def _aux(frame: msp.Frame, box: int, preferred: int) -> float:
+    """AUX, from 1, of a flight mode by MSP_MODE_RANGES: box, channel, first and last step of 25 us; 0: none."""
+    found = [
+        frame.payload[i + 1] + 1
+        for i in range(0, len(frame.payload) - 3, 4)
+        if frame.payload[i] == box and frame.payload[i + 2] < frame.payload[i + 3]
+    ]
+    return float(preferred if preferred in found else found[0] if found else 0)
+
+

@@ -1,0 +1,121 @@
+"""PX4: SET_ATTITUDE_TARGET in OFFBOARD, DO_GRIPPER or DO_SET_ACTUATOR, Hold (AUTO.LOITER), Land (AUTO.LAND).
+
+OFFBOARD is refused until set-points have come for a second, and left when they cease for COM_OF_LOSS_T; so the runner streams
+first and asks then. DO_GRIPPER is answered IN_PROGRESS first. Integer parameters travel as bytes in a float field.
+
+Source: docs.px4.io, Offboard Mode and Parameter Reference (COM_OF_LOSS_T, COM_OBL_RC_ACT, EKF2_EV_CTRL, PD_GRIPPER_EN); the
+output functions (Peripheral via Actuator Set 1 is 301, Gripper 430) are those of Actuator Configuration.
+"""
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from hil.backends.audit import Rule, bits, equal, within
+from hil.backends.autopilot import AutopilotParams, MavlinkAutopilot, bytes_to_integer, integer_to_bytes
+from hil.backends.base import FOLLOW, HOLD, LAND
+from hil.mavlink import mav
+
+MAIN_POSCTL, MAIN_AUTO, MAIN_OFFBOARD = 3, 4, 6
+"""Main modes, bits 16 to 23 of a heartbeat's custom mode."""
+
+AUTO_LOITER, AUTO_LAND = 3, 6
+"""Sub-modes of AUTO, bits 24 to 31."""
+
+STREAM_FIRST = 1.2
+"""Set-points are streamed for this long before OFFBOARD is asked for; PX4 wants more than 1 s [s]."""
+
+STREAM_GAP = 0.3
+"""A longer pause begins the stream anew: PX4 counts on at least 2 Hz [s]."""
+
+LAND_OR_HOLD = (4.0, 5.0)
+"""Values of COM_OBL_RC_ACT: Land, Hold."""
+
+POSITION_BITS = 3
+"""Of EKF2_EV_CTRL: horizontal and vertical position."""
+
+
+@dataclass(frozen=True)
+class Px4Params(AutopilotParams):
+    """The vehicle on the other side.
+
+    Raises:
+        ValueError: a number out of its range.
+    """
+
+    release: Literal["gripper", "actuator"]  # DO_GRIPPER or DO_SET_ACTUATOR
+    gripper: int  # number of the gripper, or of the actuator set from 1 to 6
+    actuator_open: float  # value of DO_SET_ACTUATOR that opens, -1 to 1
+    output_parameter: str  # that says what drives the mechanism's output, such as PWM_AUX_FUNC1; "" to leave it unread
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not (1 <= self.gripper <= 6 and -1.0 <= self.actuator_open <= 1.0):
+            raise ValueError(f"gripper {self.gripper}, actuator_open {self.actuator_open}; expected 1 to 6, -1 to 1")
+
+
+class Px4(MavlinkAutopilot):
+    """See `hil.backends.base.Backend`."""
+
+    name = "px4"
+    params: Px4Params
+    _stream_since = _sent_at = -1e9
+
+    def _role(self, beat: Any) -> str | None:
+        main, sub = beat.custom_mode >> 16 & 255, beat.custom_mode >> 24 & 255
+        if main == MAIN_OFFBOARD:
+            return FOLLOW
+        if main == MAIN_POSCTL and not self._ours:
+            return HOLD  # the pilot holds it by hand, until it is taken
+        return {AUTO_LOITER: HOLD, AUTO_LAND: LAND}.get(sub) if main == MAIN_AUTO else None
+
+    def _mode_text(self, beat: Any) -> str:
+        return f"{beat.custom_mode >> 16 & 255}.{beat.custom_mode >> 24 & 255}"
+
+    def _mode_numbers(self, mode: str) -> tuple[float, float]:
+        return {FOLLOW: (MAIN_OFFBOARD, 0), HOLD: (MAIN_AUTO, AUTO_LOITER), LAND: (MAIN_AUTO, AUTO_LAND)}[mode]
+
+    def _expected_modes(self) -> str:
+        return "OFFBOARD (6.0)" + (", or Hold (4.3) or Position (3.0) to take it" if self.params.take else "")
+
+    def send(self, command: tuple[float, ...], now: float) -> bool:
+        """See `Backend`."""
+        if now - self._sent_at > STREAM_GAP:
+            self._stream_since = now
+        self._sent_at = now
+        return super().send(command, now)
+
+    def ask(self, mode: str, now: float) -> None:
+        """See `Backend`; for OFFBOARD set-points are streamed first."""
+        streamed = now - self._stream_since >= STREAM_FIRST and now - self._sent_at <= STREAM_GAP
+        if mode != FOLLOW or streamed:
+            super().ask(mode, now)
+
+    def _release_command(self) -> tuple[int, tuple[float, ...]]:
+        p = self.params
+        if p.release == "gripper":
+            return mav.MAV_CMD_DO_GRIPPER, (p.gripper, mav.GRIPPER_ACTION_RELEASE)
+        nan = float("nan")  # leaves the other actuators of the set alone
+        values = [nan] * 6
+        values[p.gripper - 1] = p.actuator_open
+        return mav.MAV_CMD_DO_SET_ACTUATOR, (*values, 0.0)
+
+    def _stored(self, value: float, kind: int) -> float:
+        return bytes_to_integer(value) if kind == mav.MAV_PARAM_TYPE_INT32 else value
+
+    def _field(self, value: float, kind: int) -> float:
+        return integer_to_bytes(value) if kind == mav.MAV_PARAM_TYPE_INT32 else value
+
+    def _rules(self) -> list[Rule]:
+        p = self.params
+        rules = [
+            within("COM_OF_LOSS_T", 0.0, 1.0, 0.5, "so long the last rates are flown when the runner is gone [s]"),
+            Rule("COM_OBL_RC_ACT", "4 (Land) or 5 (Hold)", "what follows when the runner is gone",
+                 lambda v: v in LAND_OR_HOLD, lambda _: LAND_OR_HOLD[0]),
+            bits("EKF2_EV_CTRL", POSITION_BITS, "holding after the throw needs the hall's position"),
+        ]  # fmt: skip
+        if p.release == "gripper":
+            rules.append(equal("PD_GRIPPER_EN", 1.0, "DO_GRIPPER is not answered without it"))
+        if p.output_parameter:
+            function = 430.0 if p.release == "gripper" else 300.0 + p.gripper
+            rules.append(equal(p.output_parameter, function, "what drives the output that the mechanism hangs on"))
+        return rules

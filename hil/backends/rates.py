@@ -1,0 +1,95 @@
+"""Betaflight's rate curves and their inverse: which stick gives a body rate.
+
+Source: betaflight, src/main/fc/rc.c, applyBetaflightRates and applyActualRates; RC_RATE_INCREMENTAL, SETPOINT_RATE_LIMIT.
+"""
+
+import math
+from bisect import bisect_left
+from dataclasses import dataclass
+from typing import Literal
+
+RATES_TYPES = {"betaflight": 0, "actual": 3}
+"""Numbers of rates_type; Raceflight (1), KISS (2) and Quick (4) are not spoken here."""
+
+RATE_LIMIT = 1998.0
+"""Of any set-point [deg/s]."""
+
+TRAVEL = 500
+"""From the middle of a stick to its end [us]."""
+
+MIDDLE = 1500
+"""Of a stick [us]."""
+
+
+@dataclass(frozen=True)
+class RatesParams:
+    """A rate profile, in the numbers that the flight controller stores; roll, pitch, yaw.
+
+    Raises:
+        ValueError: a number that a byte cannot hold, or a curve that does not rise.
+    """
+
+    type: Literal["betaflight", "actual"]
+    rc_rates: tuple[int, int, int]  # betaflight: RC rate in hundredths; actual: rate around the middle in 10 deg/s
+    rates: tuple[int, int, int]  # betaflight: super rate in hundredths; actual: rate at the end in 10 deg/s
+    expo: tuple[int, int, int]  # in hundredths
+
+    def __post_init__(self) -> None:
+        if not all(0 <= v <= 255 for v in (*self.rc_rates, *self.rates)) or not all(0 <= v <= 100 for v in self.expo):
+            raise ValueError(f"rates {vars(self)}: expected rc_rates and rates of 0 to 255, expo of 0 to 100")
+        if min(self.rc_rates) < 1:
+            raise ValueError(f"rates: rc_rates {self.rc_rates}; expected 1 or more, else the curve is flat in the middle")
+
+    def rate(self, axis: int, stick: float) -> float:
+        """Body rate [rad/s], in the stick's direction.
+
+        Args:
+            axis: 0 roll, 1 pitch, 2 yaw.
+            stick: -1 to 1.
+        """
+        size = abs(stick)
+        curve = self._betaflight if self.type == "betaflight" else self._actual
+        return math.copysign(math.radians(min(curve(axis, size), RATE_LIMIT)), stick)
+
+    def _betaflight(self, axis: int, size: float) -> float:
+        expo, gain = self.expo[axis] / 100.0, self.rc_rates[axis] / 100.0
+        bent = size**4 * expo + size * (1.0 - expo)
+        if gain > 2.0:
+            gain += 14.54 * (gain - 2.0)
+        return 200.0 * gain * bent / min(max(1.0 - size * self.rates[axis] / 100.0, 0.01), 1.0)
+
+    def _actual(self, axis: int, size: float) -> float:
+        expo, middle = self.expo[axis] / 100.0, 10.0 * self.rc_rates[axis]
+        bent = size * (size**5 * expo + size * (1.0 - expo))
+        return size * middle + max(0.0, 10.0 * self.rates[axis] - middle) * bent
+
+
+class Sticks:
+    """Body rates to stick positions, by the curve at every microsecond.
+
+    Convention: ours are x forward, y left, z up; a stick to the right rolls right (+x), one pushed forward pitches the nose
+    down (+y), one to the right yaws right (-z). So pitch keeps its sign, unlike in forward, right, down axes.
+    """
+
+    SIGNS = (1.0, 1.0, -1.0)
+
+    def __init__(self, params: RatesParams) -> None:
+        """Tabulate the curves."""
+        self._tables = [[params.rate(axis, us / TRAVEL) for us in range(TRAVEL + 1)] for axis in range(3)]
+
+    @property
+    def most(self) -> tuple[float, float, float]:
+        """Rates at the ends of the sticks [rad/s]."""
+        return tuple(table[-1] for table in self._tables)
+
+    def position(self, axis: int, rate: float) -> int:
+        """Position [us] that gives a body rate [rad/s] about our axis, as near as whole microseconds allow."""
+        table, wanted = self._tables[axis], abs(rate)
+        above = min(bisect_left(table, wanted), TRAVEL)
+        near = above if above == 0 or table[above] - wanted <= wanted - table[above - 1] else above - 1
+        return MIDDLE + int(math.copysign(near, self.SIGNS[axis] * rate))
+
+    def rate(self, axis: int, us: float) -> float:
+        """Body rate [rad/s] about our axis at a position [us]."""
+        stick = min(max((us - MIDDLE) / TRAVEL, -1.0), 1.0)
+        return self.SIGNS[axis] * math.copysign(self._tables[axis][round(abs(stick) * TRAVEL)], stick)

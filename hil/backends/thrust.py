@@ -1,0 +1,100 @@
+"""Thrust calibration: from newtons to the share of full thrust that an autopilot takes, and its measurement in hover.
+
+Around hover the thrust of a vehicle is ``T = W (1 + s (u / h - 1))``: weight W [N] at the share h, with a slope s relative
+to a straight line through the origin. Vehicles in software hovered at shares of 0.37 and 0.49, with slopes of 0.70 to 0.92.
+"""
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+from visthrow.hover import GRAVITY
+
+LEAST_SHARES = 50
+"""Values that a mean share of hover is taken over: 5 s at 10 Hz."""
+
+VOLTAGE_RANGE = (0.8, 1.25)
+"""Voltages further from the calibration's are no battery's, but a wrong reading; the correction stops there."""
+
+
+@dataclass(frozen=True)
+class ThrustParams:
+    """The calibration of one vehicle.
+
+    Raises:
+        ValueError: a number out of its range.
+    """
+
+    weight: float  # thrust of the hover that was measured [N]
+    hover: float  # share of full thrust in that hover, 0 to 1
+    slope: float  # of the thrust over the share around hover, relative to weight / hover
+    tolerance: float  # of a measured share of hover, relative; beyond it the runner does not fly
+    voltage: float  # of the battery in that hover [V]; 0: no correction for its voltage
+
+    def __post_init__(self) -> None:
+        if not (self.weight > 0.0 and 0.0 < self.hover < 1.0 and 0.3 <= self.slope <= 2.0):
+            raise ValueError(
+                f"thrust: weight {self.weight} N, hover {self.hover}, slope {self.slope}; expected a weight above 0, a share "
+                "of hover between 0 and 1, and a slope of 0.3 to 2"
+            )
+        if not 0.0 < self.tolerance < 1.0 or self.voltage < 0.0:
+            raise ValueError(
+                f"thrust: tolerance {self.tolerance}, voltage {self.voltage} V; expected above 0 and below 1, and 0 or more"
+            )
+
+    def share(self, thrust: float, voltage: float | None = None) -> float:
+        """Share of full thrust, 0 to 1, for a thrust [N], at the battery's voltage [V] where it is known."""
+        share = self.hover * (1.0 + (thrust / self.weight - 1.0) / self.slope)
+        if self.voltage > 0.0 and voltage is not None:
+            low, high = VOLTAGE_RANGE
+            # Thrust goes with the square of the rotor's speed, and that with the voltage.
+            share *= min(max(self.voltage / max(voltage, 1e-6), low), high) ** 2
+        return min(max(share, 0.0), 1.0)
+
+    def thrust(self, share: float) -> float:
+        """Thrust [N] at a share, at the calibration's voltage; 0 or more."""
+        return max(0.0, self.weight * (1.0 + self.slope * (share / self.hover - 1.0)))
+
+    @property
+    def most(self) -> float:
+        """Thrust at full share [N]."""
+        return self.thrust(1.0)
+
+
+class HoverMeter:
+    """Mean share of thrust while the vehicle hovers by itself."""
+
+    def __init__(self, params: ThrustParams) -> None:
+        """Start empty."""
+        self.params = params
+        self._shares: deque[float] = deque(maxlen=20 * LEAST_SHARES)
+
+    def add(self, share: float | None, still: bool) -> None:
+        """Take a share; None where the autopilot has said none since the last call, and only those of a still vehicle count."""
+        if share is not None and still and math.isfinite(share):
+            self._shares.append(share)
+
+    @property
+    def share(self) -> float | None:
+        """Mean share; None with too few values."""
+        return sum(self._shares) / len(self._shares) if len(self._shares) >= LEAST_SHARES else None
+
+    def story(self, mass: float) -> tuple[bool, str]:
+        """Compare with the calibration.
+
+        Args:
+            mass: that hovered [kg].
+
+        Returns:
+            Whether it agrees, or was not measured; and that in words.
+        """
+        if self.share is None:
+            return True, f"hover share not measured: {len(self._shares)} of {LEAST_SHARES} values in steady hover"
+        want = self.params.share(mass * GRAVITY)
+        off = self.share / want - 1.0
+        text = (
+            f"hover share measured {self.share:.3f}, by the config {want:.3f} ({100 * off:+.1f} %, "
+            f"{100 * self.params.tolerance:g} % allowed)"
+        )
+        good = abs(off) <= self.params.tolerance
+        return good, text if good else f"{text}; calibrate thrust.hover, or look at battery and propellers"

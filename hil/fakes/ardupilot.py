@@ -1,0 +1,102 @@
+"""A fake ArduCopter.
+
+It follows SET_ATTITUDE_TARGET only in GUIDED or GUIDED_NOGPS, armed, for its own system id and with a type mask of 128 alone,
+and ignores all else without a word; it takes a NaN thrust and falls; without bit 3 of GUID_OPTIONS thrust is a climb rate; with
+ATC_ANGLE_BOOST it grows with tilt; silence of GUID_TIMEOUT levels it; DO_SET_SERVO is accepted on an output that has a
+function, and moves nothing. Until the first command it holds its place.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from hil.backends.ardupilot import (
+    BRAKE,
+    GUIDED,
+    GUIDED_NOGPS,
+    LAND_MODE,
+    LOITER,
+    SERVO_GRIPPER,
+    THRUST_AS_THRUST,
+)
+from hil.backends.thrust import ThrustParams
+from hil.fakes.mavlink import SERVO, FakeMavlink
+from hil.mavlink import mav
+from visthrow.hover import rot_from_quat
+
+FULL_CLIMB = 2.5
+"""Climb rate at full thrust where thrust is read as one: PILOT_SPEED_UP's default [m/s]."""
+
+CLIMB_GAIN = 5.0
+"""Of the climb rate's loop, PSC_VELZ_P's default [1/s]."""
+
+
+class FakeArduPilot(FakeMavlink):
+    """See the head of this module."""
+
+    autopilot = mav.MAV_AUTOPILOT_ARDUPILOTMEGA
+    usual_mode = GUIDED
+    thrust_map = ThrustParams(2.668, 0.1906, 1.0, 0.1, 0.0)
+    defaults = {  # noqa: RUF012 - copied by each instance
+        "GUID_OPTIONS": 8.0, "ATC_ANGLE_BOOST": 0.0, "GUID_TIMEOUT": 0.5, "EK3_SRC1_POSXY": 6.0, "GRIP_ENABLE": 1.0,
+        f"SERVO{SERVO}_FUNCTION": float(SERVO_GRIPPER),
+    }  # fmt: skip
+
+    def listens(self) -> bool:
+        """See `FakeMavlink`."""
+        return self.armed and self.mode in (GUIDED, GUIDED_NOGPS)
+
+    def enter(self, mode: int) -> int:
+        """See `FakeMavlink`."""
+        if mode not in (GUIDED, GUIDED_NOGPS, LOITER, BRAKE, LAND_MODE):
+            return mav.MAV_RESULT_FAILED
+        if mode != self.mode:
+            self.mode, self._place, self._target = mode, self.plant.state["pos_w"].astype(float), None
+            self._hover.reset()
+        return mav.MAV_RESULT_ACCEPTED
+
+    def is_release(self, message: Any) -> bool:
+        """See `FakeMavlink`."""
+        servo = message.command == mav.MAV_CMD_DO_SET_SERVO and message.param1 == SERVO
+        return servo or super().is_release(message)
+
+    def answer_release(self, message: Any) -> None:
+        """See `FakeMavlink`."""
+        answer, result = self.options.answer, mav.MAV_RESULT_ACCEPTED
+        function = self.parameters[f"SERVO{SERVO}_FUNCTION"]
+        if message.command == mav.MAV_CMD_DO_SET_SERVO:
+            moves = function == 0.0
+        else:
+            moves = function == SERVO_GRIPPER
+            if not self.parameters["GRIP_ENABLE"]:
+                moves, result = False, mav.MAV_RESULT_FAILED
+        if answer == "denied":
+            result = mav.MAV_RESULT_DENIED
+        elif answer == "in-progress":
+            result = mav.MAV_RESULT_IN_PROGRESS
+        if moves:
+            self.open_mechanism()
+        self.acknowledge(message.command, result)
+
+    def flown(self) -> np.ndarray:
+        """See `Fake`."""
+        if self.mode == LAND_MODE:
+            return self.descend()
+        if self.mode not in (GUIDED, GUIDED_NOGPS) or self._target is None:
+            return self.hold(self._place)
+        if self.plant.time - self._told > self.parameters["GUID_TIMEOUT"]:
+            return np.array([self.weight(), 0.0, 0.0, 0.0])
+        return self._meant(self._target)
+
+    def _meant(self, target: np.ndarray) -> np.ndarray:
+        """The set-point as the parameters make it mean."""
+        out = target.copy()
+        now = self.plant.state
+        up = rot_from_quat(now["quat_wb"][None].astype(float))[0, 2, 2]
+        if not int(self.parameters["GUID_OPTIONS"]) & THRUST_AS_THRUST:
+            climb = FULL_CLIMB * (2.0 * target[0] / self.plant.max_thrust - 1.0)
+            out[0] = self.weight() * (1.0 + CLIMB_GAIN * (climb - now["vel_w"][2]) / 9.81)
+        elif self.parameters["ATC_ANGLE_BOOST"]:
+            out[0] /= max(up, 0.5)
+        out[0] = min(max(out[0], 0.0), self.plant.max_thrust)
+        return out

@@ -1,0 +1,239 @@
+"""What all fakes share: plant, motion capture on the wire, a queue of things that take their time, a hold of their own."""
+
+import heapq
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+
+from hil.backends.thrust import ThrustParams
+from hil.fakes.witness import Witness
+from hil.frames import FrameParams, Frames
+from hil.link import Link
+from hil.mavlink import mav
+from hil.mocap import Mocap, MocapParams
+from hil.pose import PAYLOAD, Pose
+from visthrow.hover import GRAVITY, HoverController, HoverParams
+
+VEHICLE_ID, PAYLOAD_ID = (1, 1), (1, 25)
+"""MAVLink system and component that poses of vehicle and payload come from."""
+
+ANSWERS = ("accepted", "in-progress", "denied", "silent", "stuck")
+"""What a release is answered; "stuck" says accepted and moves nothing, and so does nobody but "accepted"."""
+
+MAX_RATES = (10.0, 10.0, 4.0)
+"""Largest body rates that the policies were trained with [rad/s]."""
+
+DESCENT, TOUCH = 0.4, 0.12
+"""Of a landing below the vehicle [m]; height that counts as down [m]."""
+
+
+class WirePlant(Protocol):
+    """What flies behind the wire."""
+
+    period: float
+    time: float
+    home_w: np.ndarray
+    mass: tuple[float, float]
+    max_thrust: float
+
+    def step(self, command: np.ndarray, release: bool) -> None:
+        """Advance one period under collective thrust [N] and body rates [rad/s]."""
+
+    @property
+    def state(self) -> dict[str, np.ndarray]:
+        """pos_w, quat_wb, vel_w, rate_b, payload_pos_w, attached."""
+
+    @property
+    def landing(self) -> dict[str, Any]:
+        """landing_w, landing_time, separation_time."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """How a fake behaves.
+
+    Raises:
+        ValueError: an unknown answer, or a negative time.
+    """
+
+    answer: str = "accepted"  # of ANSWERS: to a release
+    armed: bool = True  # at the start
+    arming: bool = True  # whether it can be armed
+    mode: int | None = None  # custom mode at the start, where there are modes; None: the usual one
+    parameters: dict[str, float] = field(default_factory=dict)  # that differ from a well set-up vehicle's
+    command_delay: float = 0.0  # from a set-point's arrival to its effect [s]
+    answer_delay: float = 0.002  # 1 to 3 ms were measured [s]
+    servo_delay: float = 0.002  # from a release to the output's movement; 1 to 3 ms were measured [s]
+    mechanism: float = 0.0  # from the output's movement to the latch of the plant, whose own lag follows [s]
+    clock_offset: float = 0.0  # of its clock [s]
+    silent_after: float = float("inf")  # it says nothing any more from this time on [s]
+    all_channels: bool = False  # Betaflight: all channels come by MSP, the arming one as well
+
+    def __post_init__(self) -> None:
+        times = (self.command_delay, self.answer_delay, self.servo_delay, self.mechanism)
+        if self.answer not in ANSWERS or min(times) < 0.0:
+            raise ValueError(f"fake {vars(self)}: expected an answer of {', '.join(ANSWERS)}, times of 0 s or more")
+
+
+class Fake:
+    """The vehicle and the motion capture of both bodies; the children add an autopilot's protocol.
+
+    Attributes:
+        witness: of what came. followed, ignored: set-points. release_time: when the mechanism's output moved.
+    """
+
+    thrust_map: ThrustParams
+
+    def __init__(
+        self, plant: WirePlant, link: Link, mocap: MocapParams | None = None, seed: int = 0, options: Options | None = None
+    ) -> None:  # fmt: skip
+        """Begin in the hands of a pilot.
+
+        Args:
+            plant: what flies.
+            link: that the poses go out on, with the vehicle's ids.
+            mocap: its faults.
+            seed: of noise and loss.
+            options: see `Options`.
+        """
+        self.plant, self.link, self.options = plant, link, options or Options()
+        self.mocap = Mocap(mocap or MocapParams(), seed)
+        self.witness = Witness((plant.max_thrust, *MAX_RATES))
+        # Out there the world is x north, y east, z down, the body forward, right, down, quaternions w first.
+        ned = Frames(FrameParams("x,-y,-z", "x,-y,-z", "wxyz", 0.0, (0.0, 0.0, 0.0)))
+        self._to_source: Callable[[Pose], Pose] = ned.source_from_pose
+        self._hover = HoverController(HoverParams(max_thrust=plant.max_thrust), plant.period)
+        self._payload_sender = mav.MAVLink(None, *PAYLOAD_ID)
+        self._later: list[tuple[float, int, Callable[[], None]]] = []
+        self._count = 0
+        self.armed = self.options.armed
+        self._place = np.array(plant.home_w, dtype=float)
+        self._target: np.ndarray | None = None
+        self._told = -np.inf
+        self._open = False
+        self.followed = self.ignored = 0
+        self.release_time: float | None = None
+
+    def later(self, delay: float, what: Callable[[], None]) -> None:
+        """Do something after a delay [s]; at once, still within this period, where it is 0."""
+        if delay <= 0.0:
+            what()
+            return
+        self._count += 1
+        heapq.heappush(self._later, (self.plant.time + delay, self._count, what))
+
+    def clock(self) -> float:
+        """Time on the vehicle's own clock [s]."""
+        return self.plant.time + self.options.clock_offset
+
+    @property
+    def silent(self) -> bool:
+        """Whether the autopilot has fallen silent; the motion capture goes on."""
+        return self.plant.time >= self.options.silent_after
+
+    def steer(self, command: tuple[float, ...]) -> None:
+        """Follow a set-point, thrust [N] and body rates [rad/s], from now on; a number that is none is 0 and the vehicle falls."""
+        self.followed += 1
+        self._told = self.plant.time
+        target = np.nan_to_num(np.array(command))
+
+        def follow() -> None:
+            self._target = target
+
+        self.later(self.options.command_delay, follow)
+
+    def open_mechanism(self) -> None:
+        """The output moves, and what hangs on it lets go some time later; with "accepted" alone."""
+        if self.options.answer not in ("accepted",) or self.release_time is not None:
+            return
+        self.release_time = self.plant.time + self.options.servo_delay
+
+        def trip() -> None:
+            self._open = True
+
+        self.later(self.options.servo_delay + self.options.mechanism, trip)
+
+    @property
+    def moved(self) -> bool:
+        """Whether the mechanism's output has moved."""
+        return self.release_time is not None and self.plant.time >= self.release_time
+
+    def note_release(self) -> None:
+        """A release command has come."""
+        self.witness.release(self.plant.time, self.armed, self.plant.state["payload_pos_w"])
+
+    def weight(self) -> float:
+        """Of what flies now [N]."""
+        return self.plant.mass[0 if self.plant.state["attached"] else 1] * GRAVITY
+
+    def hold(self, goal_w: np.ndarray) -> np.ndarray:
+        """Command that holds a place [m]: of the autopilot, or of the pilot's hands."""
+        now = self.plant.state
+        views = [now[name].astype(float)[None] for name in ("pos_w", "quat_wb", "vel_w")]
+        return self._hover.step(*views, goal_w, self.weight() / GRAVITY)[0]
+
+    def descend(self) -> np.ndarray:
+        """Command that lands where the vehicle is; it disarms once it is down."""
+        pos = self.plant.state["pos_w"]
+        if pos[2] < TOUCH:
+            self.armed = False
+        return self.hold(np.array([self._place[0], self._place[1], max(pos[2] - DESCENT, 0.05)]))
+
+    def flown(self) -> np.ndarray:
+        """Command of this period, by whoever flies."""
+        raise NotImplementedError
+
+    def speak(self) -> None:
+        """Say what is due: heartbeats, streams."""
+        raise NotImplementedError
+
+    def fly(self) -> None:
+        """Hear what has come, and fly one period."""
+        self.link.pump(lambda: self.plant.time)
+        while self._later and self._later[0][0] <= self.plant.time + 1e-9:
+            heapq.heappop(self._later)[2]()
+        self.plant.step(self.flown(), self._open)
+
+    def emit(self) -> None:
+        """Measure and send what is due now."""
+        if self.mocap.due(self.plant.time):
+            for pose in self.mocap.measure(self.plant.time, self.plant.state):
+                self._post(pose)
+        while self._later and self._later[0][0] <= self.plant.time + 1e-9:
+            heapq.heappop(self._later)[2]()
+        if not self.silent:
+            self.speak()
+
+    def step(self) -> None:
+        """One period."""
+        self.fly()
+        self.emit()
+
+    def _post(self, pose: Pose) -> None:
+        """Put a pose on its way."""
+        out = self._to_source(pose)
+        stamp = int((pose.stamp + self.options.clock_offset) * 1e6)
+        message = mav.MAVLink_att_pos_mocap_message(stamp, list(out.quat), *out.pos)
+        self.later(pose.arrival - self.plant.time, lambda: self._send_pose(message, pose.body))
+
+    def _send_pose(self, message: Any, body: str) -> None:
+        if body == PAYLOAD:
+            self.link.port.write(message.pack(self._payload_sender))
+            self._payload_sender.seq = (self._payload_sender.seq + 1) % 256
+        else:
+            self.link.send(message)
+
+    def report(self) -> dict[str, Any]:
+        """What happened to the payload, on the plant's clock, and to the messages."""
+        w = self.witness
+        return {
+            **self.plant.landing, "followed": self.followed, "ignored": self.ignored, "releases": w.releases,
+            "release_time": self.release_time, "armed": self.armed, "commands": w.commands, "worst": w.worst,
+            "breaches": w.breaches, "end_w": self.plant.state["pos_w"].tolist(), "time": self.plant.time,
+        }  # fmt: skip
+
+    def close(self) -> None:
+        """Give the ports back."""
+        self.link.close()

@@ -1,0 +1,213 @@
+"""A fake Betaflight on an MSP port; the poses come from the motion capture's bridge, a MAVLink peer beside it.
+
+A pilot holds it until stick frames come; then the override switch goes on (or, with all channels by MSP, the arming channel
+takes it). Silence of 0.36 s idles the motors, of 1.6 s disarms. Pitch stick forward is nose down. It hears no poses.
+"""
+
+import struct
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from hil import msp
+from hil.backends.betaflight import BOX_ARM, BOX_OVERRIDE, HIGH, LOW, STICKS, TUNING
+from hil.backends.rates import RATES_TYPES, RatesParams, Sticks
+from hil.backends.thrust import ThrustParams
+from hil.device import MOST_CHUNKS, Port
+from hil.fakes.base import Fake, Options, WirePlant
+from hil.link import Link
+from hil.mocap import MocapParams
+
+IDLE_AFTER, DISARM_AFTER = 0.36, 1.6
+"""Silence after which the motors idle, and after which it disarms [s]."""
+
+REACTION = 0.5
+"""Of the pilot, from the first stick frame to the override switch [s]."""
+
+BOXES = (BOX_ARM, 1, 27, BOX_OVERRIDE)
+"""Permanent ids in the order of the flags: arm, angle, failsafe, MSP override."""
+
+ORDER = (0, 1, 3, 2)
+"""rcmap AETR: where roll, pitch, yaw, throttle stand in a frame."""
+
+RELEASE_AUX, ARM_AUX, MINIMUM = 4, 1, 1050
+
+
+class FakeBetaflight(Fake):
+    """See the head of this module."""
+
+    thrust_map = ThrustParams(2.668, 0.1906, 1.0, 0.1, 0.0)
+
+    def __init__(
+        self, plant: WirePlant, link: Link, mocap: MocapParams | None = None, seed: int = 0, options: Options | None = None,
+        port: Port | None = None,
+    ) -> None:  # fmt: skip
+        """See `Fake`.
+
+        Args:
+            plant, link, mocap, seed, options: see `Fake`.
+            port: that MSP comes on.
+        """
+        super().__init__(plant, link, mocap, seed, options)
+        self.port, self.parser = port, msp.Parser()
+        if self.options.all_channels:
+            self.armed = False
+        tuning = {"rates_type": RATES_TYPES["actual"], "roll_rc_rate": 60, "pitch_rc_rate": 60, "yaw_rc_rate": 30,
+                  "roll_rate": 60, "pitch_rate": 60, "yaw_rate": 30, "roll_expo": 0, "pitch_expo": 0, "yaw_expo": 0}  # fmt: skip
+        self.parameters: dict[str, float] = {"deadband": 0, "yaw_deadband": 0, "min_check": MINIMUM, "mid_rc": 1500,
+                                             "failsafe_delay": 0.4, **tuning, **self.options.parameters}  # fmt: skip
+        self._set_rates()
+        self.channels: list[int] = []
+        self.override = False
+        self._first: float | None = None
+        self._heard = -np.inf
+        self._asked_open = False
+
+    def _set_rates(self) -> None:
+        p, axes = self.parameters, ("roll", "pitch", "yaw")
+        kinds = {number: name for name, number in RATES_TYPES.items()}
+        three = ([int(p[f"{axis}_{what}"]) for axis in axes] for what in ("rc_rate", "rate", "expo"))
+        self._sticks = Sticks(RatesParams(kinds[int(p["rates_type"])], *map(tuple, three)))
+
+    def fly(self) -> None:
+        """See `Fake`."""
+        for _ in range(MOST_CHUNKS):
+            data = None if self.port is None else self.port.read()
+            if data is None:
+                break
+            for frame in self.parser.parse(data):
+                if frame.direction == msp.TO_CONTROLLER and not self.silent:
+                    self._hear(frame)
+        super().fly()
+
+    def _hear(self, frame: msp.Frame) -> None:
+        answers: dict[int, Callable[[], bytes]] = {
+            msp.API_VERSION: lambda: bytes([0, 1, 47]), msp.FC_VARIANT: lambda: b"BTFL", msp.STATUS: self._status,
+            msp.RX_MAP: lambda: bytes([*ORDER, 4, 5, 6, 7]), msp.BOXIDS: lambda: bytes(BOXES), msp.RC: self._rc,
+            msp.SERVO: self._servo, msp.ANALOG: lambda: struct.pack("<BHHhH", 111, 0, 0, 0, 1110),
+            msp.RC_TUNING: self._tuning, msp.RC_DEADBAND: self._deadband, msp.RX_CONFIG: self._rx_config,
+            msp.FAILSAFE_CONFIG: self._failsafe, msp.MODE_RANGES: self._ranges, msp.EEPROM_WRITE: lambda: b"",
+        }  # fmt: skip
+        if frame.command == msp.SET_RAW_RC:
+            self._sticks_came(list(frame.words()))
+            answer = b""
+        elif frame.command == msp.SET_RC_TUNING and not self.armed:
+            self.parameters.update({name: frame.payload[at] for name, at in TUNING.items() if at < len(frame.payload)})
+            self._set_rates()
+            answer = b""
+        elif frame.command in answers:
+            answer = answers[frame.command]()
+        else:
+            self._answer(msp.Frame(frame.command, b"", msp.REFUSAL))
+            return
+        self._answer(msp.Frame(frame.command, answer, msp.ANSWER))
+
+    def _answer(self, frame: msp.Frame) -> None:
+        self.later(self.options.answer_delay, lambda: self.port.write(msp.pack(frame)))
+
+    def _sticks_came(self, channels: list[int]) -> None:
+        if len(channels) < STICKS:
+            return
+        if any(not 885 <= c <= 2115 for c in channels):
+            self.witness.command(self.plant.time, (float("nan"),) * 4)
+            return
+        roll, pitch, yaw, throttle = (channels[at] for at in ORDER)
+        rates = tuple(self._sticks.rate(i, us) for i, us in enumerate((roll, pitch, yaw)))
+        share = min(max((throttle - MINIMUM) / (HIGH - MINIMUM), 0.0), 1.0)
+        idle = throttle <= MINIMUM
+        command = (0.0 if idle else self.thrust_map.thrust(share), *rates)
+        self.witness.command(self.plant.time, command)
+        self.channels, self._heard = channels, self.plant.time
+        self._first = self.plant.time if self._first is None else self._first
+        self._arm_channel(throttle)
+        if self.override:
+            self.steer(command)
+        else:
+            self.ignored += 1
+        self._release_channel()
+
+    def _arm_channel(self, throttle: int) -> None:
+        if not self.options.all_channels:
+            return
+        high = self.channels[STICKS + ARM_AUX - 1] > 1700
+        if high and not self.armed and throttle <= MINIMUM and self.options.arming:
+            self.armed = self.override = True
+        elif not high:
+            self.armed = self.override = False
+
+    def _release_channel(self) -> None:
+        """Only while the channels are ours, and on the change to open."""
+        at = STICKS + RELEASE_AUX - 1
+        opened = self.override and at < len(self.channels) and self.channels[at] > 1700
+        if opened and not self._asked_open:
+            self.note_release()
+            if self.options.answer not in ("silent", "denied"):
+                self.witness.answered()
+            self.open_mechanism()
+        self._asked_open = opened
+
+    def _status(self) -> bytes:
+        failsafe = self.plant.time - self._heard > IDLE_AFTER
+        on = {BOX_ARM: self.armed, BOX_OVERRIDE: self.override, 27: failsafe and self.armed}
+        flags = sum(1 << i for i, box in enumerate(BOXES) if on.get(box, False))
+        blocks = 0 if self.armed or self.options.arming else 1 << 8
+        return struct.pack("<HHHIBHHBBI", 125, 0, 33, flags, 0, 10, 0, 0, 29, blocks)
+
+    def _rc(self) -> bytes:
+        pilot = [1500, 1500, 1500, 1200, *([LOW] * 8)]
+        channels = list(pilot)
+        if self.override and self.channels:
+            channels = [self.channels[at] for at in ORDER] + self.channels[STICKS:]
+        if self.options.answer in ("silent", "denied"):  # the channel is not in the mask: it never arrives
+            channels[STICKS + RELEASE_AUX - 1] = LOW
+        return struct.pack(f"<{len(channels)}H", *channels)
+
+    def _servo(self) -> bytes:
+        return struct.pack("<8H", HIGH if self.moved else LOW, *([1500] * 7))
+
+    def _tuning(self) -> bytes:
+        out = bytearray(24)
+        out[6] = 50  # throttle's middle
+        for name, at in TUNING.items():
+            out[at] = int(self.parameters.get(name, 0))
+        return bytes(out)
+
+    def _deadband(self) -> bytes:
+        return bytes([int(self.parameters["deadband"]), int(self.parameters["yaw_deadband"]), 0, 0, 0])
+
+    def _rx_config(self) -> bytes:
+        return struct.pack("<BHHH", 0, 1900, int(self.parameters["mid_rc"]), int(self.parameters["min_check"]))
+
+    def _failsafe(self) -> bytes:
+        return struct.pack("<BBHBHB", round(10 * self.parameters["failsafe_delay"]), 10, 1000, 0, 100, 1)
+
+    def _ranges(self) -> bytes:
+        arm = [BOX_ARM, ARM_AUX - 1, 28, 48]
+        switch = [] if self.options.all_channels else [BOX_OVERRIDE, 2, 28, 48]
+        return bytes([*arm, *switch, 0, 0, 0, 0])
+
+    def flown(self) -> np.ndarray:
+        """See `Fake`."""
+        quiet = self.plant.time - self._heard
+        if not self.options.all_channels and self._first is not None and self.plant.time - self._first >= REACTION:
+            self.override = self.armed
+        if not self.override or self._target is None:
+            gone = self._first is not None and not self.armed and not self.options.all_channels
+            return np.zeros(4) if gone else self.hold(self._place)
+        if quiet > DISARM_AFTER:
+            self.armed = self.override = False
+        return np.zeros(4) if quiet > IDLE_AFTER else self._target
+
+    def speak(self) -> None:
+        """See `Fake`: it speaks when it is asked."""
+
+    def report(self) -> dict[str, Any]:
+        """See `Fake`."""
+        return {**super().report(), "override": self.override, "parameters": self.parameters}
+
+    def close(self) -> None:
+        """See `Fake`."""
+        super().close()
+        if self.port is not None:
+            self.port.close()

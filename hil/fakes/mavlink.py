@@ -1,0 +1,155 @@
+"""What the fakes of ArduPilot and PX4 share: commands and their answers, parameters, TIMESYNC, heartbeats, streams."""
+
+from typing import Any
+
+import numpy as np
+
+from hil.backends.autopilot import ARMED, CUSTOM
+from hil.fakes.base import VEHICLE_ID, Fake, Options, WirePlant
+from hil.link import IGNORE_ATTITUDE, Link
+from hil.mavlink import mav
+from hil.mocap import MocapParams
+
+FORCE = 21196
+"""Second parameter of COMPONENT_ARM_DISARM that disarms in flight."""
+
+SERVO, CLOSED_US, OPEN_US = 9, 1100, 1900
+"""Output of the mechanism, from 1, and its ends [us]."""
+
+STREAM_PERIOD = 0.005
+"""Between two SERVO_OUTPUT_RAW once they were asked for [s]."""
+
+
+class FakeMavlink(Fake):
+    """An autopilot on the poses' link."""
+
+    autopilot = mav.MAV_AUTOPILOT_GENERIC
+    usual_mode = 0
+    defaults: dict[str, float]  # parameters of a vehicle that is set up well
+
+    def __init__(
+        self, plant: WirePlant, link: Link, mocap: MocapParams | None = None, seed: int = 0, options: Options | None = None
+    ) -> None:  # fmt: skip
+        """See `Fake`."""
+        super().__init__(plant, link, mocap, seed, options)
+        self.mode = self.usual_mode if self.options.mode is None else self.options.mode
+        self.parameters = {**self.defaults, **self.options.parameters}
+        self._next_beat = 0.0
+        self._stream = float("inf")  # time of the next SERVO_OUTPUT_RAW [s]
+        self.refusals: list[str] = []
+        link.listen(self._hear)
+
+    def _hear(self, message: Any, arrival: float) -> None:
+        kind = message.get_type()
+        if self.silent:
+            return
+        if kind == "SET_ATTITUDE_TARGET":
+            self._set_point(message)
+        elif kind == "COMMAND_LONG" and message.target_system == VEHICLE_ID[0]:
+            self._command(message)
+        elif kind == "TIMESYNC" and message.tc1 == 0:
+            self.say(mav.MAVLink_timesync_message(int(self.clock() * 1e9), message.ts1))
+        elif kind == "PARAM_REQUEST_READ" and message.target_system == VEHICLE_ID[0]:
+            self._tell_parameter(message.param_id)
+        elif kind == "PARAM_SET" and message.param_id in self.parameters:
+            self.parameters[message.param_id] = self.value(message.param_value, message.param_type)
+            self._tell_parameter(message.param_id)
+
+    def say(self, message: Any, delay: float = 0.0) -> None:
+        """Send a message after a delay [s]."""
+        self.later(delay, lambda: self.link.send(message))
+
+    def acknowledge(self, command: int, result: int, delay: float | None = None) -> None:
+        """Answer a command."""
+        self.say(mav.MAVLink_command_ack_message(command, result), self.options.answer_delay if delay is None else delay)
+
+    def _set_point(self, message: Any) -> None:
+        rates = (message.body_roll_rate, -message.body_pitch_rate, -message.body_yaw_rate)
+        thrust = self.thrust_map.thrust(message.thrust) if np.isfinite(message.thrust) else message.thrust
+        command = (thrust, *rates)
+        self.witness.command(self.plant.time, command)
+        ours = message.target_system == VEHICLE_ID[0] and message.type_mask == IGNORE_ATTITUDE
+        if ours and self.listens():
+            self.steer(command)
+        else:
+            self.ignored += 1
+
+    def listens(self) -> bool:
+        """Whether set-points are followed now."""
+        raise NotImplementedError
+
+    def enter(self, mode: int) -> int:
+        """Enter a custom mode; the result of the command."""
+        raise NotImplementedError
+
+    def _command(self, message: Any) -> None:
+        number, answer = message.command, self.options.answer
+        if number == mav.MAV_CMD_DO_SET_MODE:
+            self.acknowledge(number, self.enter(self.custom_mode(message)))
+            self._next_beat = 0.0
+        elif number == mav.MAV_CMD_COMPONENT_ARM_DISARM:
+            self._arm(message)
+        elif number == mav.MAV_CMD_SET_MESSAGE_INTERVAL:
+            if message.param1 == mav.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW:
+                self._stream = self.plant.time
+            self.acknowledge(number, mav.MAV_RESULT_ACCEPTED)
+        elif self.is_release(message):
+            self.note_release()
+            if answer != "silent":
+                self.witness.answered()
+                self.answer_release(message)
+
+    def custom_mode(self, message: Any) -> int:
+        """Custom mode that DO_SET_MODE names."""
+        return int(message.param2)
+
+    def is_release(self, message: Any) -> bool:
+        """Whether a command opens the mechanism."""
+        return message.command == mav.MAV_CMD_DO_GRIPPER and message.param2 == mav.GRIPPER_ACTION_RELEASE
+
+    def answer_release(self, message: Any) -> None:
+        """Answer and do it, each as the options say."""
+        raise NotImplementedError
+
+    def _arm(self, message: Any) -> None:
+        wanted = message.param1 == 1.0
+        flying = self.plant.state["pos_w"][2] > 0.3
+        if wanted and not self.options.arming:
+            self.say(mav.MAVLink_statustext_message(mav.MAV_SEVERITY_CRITICAL, b"Arm: battery below minimum"))
+            self.acknowledge(message.command, mav.MAV_RESULT_FAILED)
+        elif not wanted and flying and message.param2 != FORCE:
+            self.acknowledge(message.command, mav.MAV_RESULT_FAILED)
+        else:
+            self.armed = wanted
+            self._next_beat = 0.0
+            self.acknowledge(message.command, mav.MAV_RESULT_ACCEPTED)
+
+    def field(self, name: str) -> tuple[float, int]:
+        """Field and type of a PARAM_VALUE."""
+        return self.parameters[name], mav.MAV_PARAM_TYPE_REAL32
+
+    def value(self, field: float, kind: int) -> float:
+        """Value in a PARAM_SET's field."""
+        return field
+
+    def _tell_parameter(self, name: str) -> None:
+        if name in self.parameters:  # an unknown one is answered with silence, as by ArduPilot
+            field, kind = self.field(name)
+            self.say(mav.MAVLink_param_value_message(name.encode(), field, kind, 1, 0), self.options.answer_delay)
+
+    def speak(self) -> None:
+        """See `Fake`."""
+        time = self.plant.time
+        if time >= self._next_beat:
+            self._next_beat = time + 1.0
+            flags = CUSTOM | (ARMED if self.armed else 0)
+            self.link.send(mav.MAVLink_heartbeat_message(mav.MAV_TYPE_QUADROTOR, self.autopilot, flags, self.mode, 4, 3))
+        if time >= self._stream - 1e-9:
+            self._stream += STREAM_PERIOD
+            outputs = [0] * 16
+            outputs[SERVO - 1] = OPEN_US if self.moved else CLOSED_US
+            self.link.send(mav.MAVLink_servo_output_raw_message(int(self.clock() * 1e6) & 0xFFFFFFFF, 0, *outputs))
+
+    def report(self) -> dict[str, Any]:
+        """See `Fake`."""
+        return {**super().report(), "mode": self.mode, "parameters": self.parameters}

@@ -1,0 +1,116 @@
+"""A fake PX4.
+
+OFFBOARD is refused until set-points have come for a second without a gap, and left for what COM_OBL_RC_ACT says when they cease
+for COM_OF_LOSS_T; DO_GRIPPER is answered IN_PROGRESS, and ACCEPTED when the gripper's time is over; integer parameters travel
+as bytes. Out of OFFBOARD set-points vanish without a word. Until it is taken the pilot holds it in Position mode.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from hil.backends.autopilot import bytes_to_integer, integer_to_bytes
+from hil.backends.px4 import AUTO_LAND, AUTO_LOITER, LAND_OR_HOLD, MAIN_AUTO, MAIN_OFFBOARD, MAIN_POSCTL
+from hil.backends.thrust import ThrustParams
+from hil.fakes.mavlink import FakeMavlink
+from hil.mavlink import mav
+
+STREAM_FIRST, STREAM_GAP = 1.0, 0.5
+"""Set-points before OFFBOARD, and the longest gap in them: 2 Hz [s]."""
+
+GRIPPER_TIME = 1.0
+"""From IN_PROGRESS to ACCEPTED [s]."""
+
+INTEGERS = ("COM_OBL_RC_ACT", "EKF2_EV_CTRL", "PD_GRIPPER_EN", "PWM_AUX_FUNC1")
+
+
+def custom(main: int, sub: int = 0) -> int:
+    """Custom mode of a heartbeat."""
+    return main << 16 | sub << 24
+
+
+OFFBOARD, POSCTL = custom(MAIN_OFFBOARD), custom(MAIN_POSCTL)
+HOLD, LAND = custom(MAIN_AUTO, AUTO_LOITER), custom(MAIN_AUTO, AUTO_LAND)
+
+
+class FakePx4(FakeMavlink):
+    """See the head of this module."""
+
+    autopilot = mav.MAV_AUTOPILOT_PX4
+    usual_mode = POSCTL
+    thrust_map = ThrustParams(2.668, 0.1585, 0.8, 0.1, 0.0)
+    defaults = {  # noqa: RUF012 - copied by each instance
+        "COM_OF_LOSS_T": 0.5, "COM_OBL_RC_ACT": 5.0, "EKF2_EV_CTRL": 11.0, "PD_GRIPPER_EN": 1.0, "PWM_AUX_FUNC1": 430.0,
+    }  # fmt: skip
+    _stream_since = _last = -np.inf
+
+    def _set_point(self, message: Any) -> None:
+        time = self.plant.time
+        if time - self._last > STREAM_GAP:
+            self._stream_since = time
+        self._last = time
+        super()._set_point(message)
+
+    def listens(self) -> bool:
+        """See `FakeMavlink`."""
+        return self.armed and self.mode == OFFBOARD
+
+    def custom_mode(self, message: Any) -> int:
+        """See `FakeMavlink`."""
+        return custom(int(message.param2), int(message.param3))
+
+    def enter(self, mode: int) -> int:
+        """See `FakeMavlink`."""
+        time = self.plant.time
+        streamed = time - self._stream_since > STREAM_FIRST and time - self._last <= STREAM_GAP
+        if mode not in (OFFBOARD, HOLD, LAND, POSCTL):
+            return mav.MAV_RESULT_DENIED
+        if mode == OFFBOARD and not streamed:
+            self.refusals.append(f"{time:.3f} s: OFFBOARD before the stream")
+            return mav.MAV_RESULT_TEMPORARILY_REJECTED
+        if mode != self.mode:
+            self.mode, self._place, self._target = mode, self.plant.state["pos_w"].astype(float), None
+            self._hover.reset()
+        return mav.MAV_RESULT_ACCEPTED
+
+    def is_release(self, message: Any) -> bool:
+        """See `FakeMavlink`."""
+        set_one = message.command == mav.MAV_CMD_DO_SET_ACTUATOR and np.isfinite(message.param1)
+        return set_one or super().is_release(message)
+
+    def answer_release(self, message: Any) -> None:
+        """See `FakeMavlink`."""
+        answer, number = self.options.answer, message.command
+        gripper = number == mav.MAV_CMD_DO_GRIPPER
+        if answer == "denied" or (gripper and not self.parameters["PD_GRIPPER_EN"]):
+            self.acknowledge(number, mav.MAV_RESULT_DENIED)
+            return
+        if self.parameters["PWM_AUX_FUNC1"] == (430.0 if gripper else 301.0):
+            self.open_mechanism()
+        if gripper:
+            self.acknowledge(number, mav.MAV_RESULT_IN_PROGRESS)
+            if answer != "in-progress":
+                self.acknowledge(number, mav.MAV_RESULT_ACCEPTED, GRIPPER_TIME)
+        elif answer != "in-progress":
+            self.acknowledge(number, mav.MAV_RESULT_ACCEPTED)
+
+    def field(self, name: str) -> tuple[float, int]:
+        """See `FakeMavlink`."""
+        if name in INTEGERS:
+            return integer_to_bytes(self.parameters[name]), mav.MAV_PARAM_TYPE_INT32
+        return super().field(name)
+
+    def value(self, field: float, kind: int) -> float:
+        """See `FakeMavlink`."""
+        return bytes_to_integer(field) if kind == mav.MAV_PARAM_TYPE_INT32 else field
+
+    def flown(self) -> np.ndarray:
+        """See `Fake`."""
+        if self.mode == OFFBOARD and self.plant.time - self._last > self.parameters["COM_OF_LOSS_T"]:
+            self.enter(LAND if self.parameters["COM_OBL_RC_ACT"] == LAND_OR_HOLD[0] else HOLD)
+            self._next_beat = 0.0
+        if self.mode == LAND:
+            return self.descend()
+        if self.mode == OFFBOARD and self._target is not None:
+            return self._target
+        return self.hold(self._place)

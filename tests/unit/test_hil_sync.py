@@ -1,0 +1,114 @@
+"""Clocks of peers by TIMESYNC: offset, drift, a clock that is set; poses dated by them, and stamps of another clock."""
+
+import numpy as np
+import pytest
+
+from hil.clock import TimeSync
+from hil.fake import VEHICLE_ID, FakeAutopilot, MocapParams, Options
+from hil.link import Link
+from hil.mavlink import mav
+from hil.sources import BodyIds, MavlinkSource
+from hil.sync import LATE, LinkSync
+from tests.loopback.wire import LevelPlant, pipe
+
+RATE = 10.0
+"""Exchanges a second."""
+
+
+def exchanges(sync, clock, seconds, start=0.0, least=1e-3, most=12e-3, seed=0):
+    """Exchanges with uneven delays of 1 to 12 ms each way; the errors of the offset after each."""
+    rng, errors = np.random.default_rng(seed), []
+    for i in range(int(seconds * RATE)):
+        sent = start + i / RATE
+        there, back = rng.uniform(least, most, 2)
+        now = sent + there + back
+        sync.take(int(clock(sent + there) * 1e9), TimeSync.stamp(sent), now)
+        errors.append(sync.offset - (clock(now) - now))
+    return np.array(errors)
+
+
+def test_the_shortest_round_trip_is_taken():
+    sync = TimeSync()
+    errors = exchanges(sync, lambda t: t + 1234.5, 10.0)
+    assert np.all(np.abs(errors[20:]) <= 0.5 * sync.round_trip + 12e-3)
+    assert abs(errors[-1]) <= 0.5 * sync.round_trip
+    assert sync.round_trip < 8e-3, "of 20 exchanges the best"
+    assert (TimeSync().offset, TimeSync().round_trip) == (None, None)
+
+
+@pytest.mark.parametrize("drift", [100e-6, -100e-6])
+def test_a_drifting_clock_is_followed(drift):
+    """100 parts in a million: without forgetting, 60 s would be 6 ms off."""
+    sync = TimeSync()
+    errors = exchanges(sync, lambda t: 77.0 + (1 + drift) * t, 60.0, most=2e-3)
+    assert np.max(np.abs(errors[20:])) < 1.2e-3
+    assert sync.steps == 0
+
+
+@pytest.mark.parametrize("step", [1.0, -1.0])
+def test_a_clock_that_is_set_is_noticed(step):
+    sync = TimeSync()
+    exchanges(sync, lambda t: t + 5.0, 5.0)
+    errors = exchanges(sync, lambda t: t + 5.0 + step, 2.0, start=5.0)
+    assert np.all(np.abs(errors[:2]) > 0.9), "two contradictions may be chance"
+    assert np.all(np.abs(errors[2:]) < 0.02), "the third within 0.3 s is a step"
+    assert sync.steps == 1
+
+
+def test_one_wild_exchange_changes_nothing():
+    sync = TimeSync()
+    exchanges(sync, lambda t: t + 5.0, 3.0)
+    before = sync.offset
+    sync.take(int(99e9), TimeSync.stamp(3.0), 3.002)
+    assert (sync.offset, sync.steps) == (before, 0)
+
+
+def dated(offset, seconds=2.0, stamp_offset=None):
+    """Poses of the fake over a pipe whose clock is off; with ``stamp_offset`` its stamps are of yet another clock."""
+    here, there = pipe()
+    fake = FakeAutopilot(LevelPlant(), Link(there, *VEHICLE_ID), MocapParams(loss=0.0), 0, Options(clock_offset=offset))
+    if stamp_offset is not None:
+        plain = fake.clock
+        fake.clock = lambda: plain() + stamp_offset
+    link = Link(here)
+    sync = LinkSync(link)
+    source = MavlinkSource(link, (BodyIds("vehicle", "ATT_POS_MOCAP", 1, 1),), lambda: fake.plant.time)
+    poses = []
+    for _ in range(round(seconds / fake.plant.period)):
+        fake.step()
+        poses += source.poll(fake.plant.time)
+    return poses, sync, fake
+
+
+@pytest.mark.parametrize("offset", [0.0, 1.7e9, 333.25])
+def test_poses_are_dated_by_their_senders_clock(offset):
+    poses, sync, _ = dated(offset)
+    known = [pose for pose in poses if pose.measured is not None]
+    assert len(known) > 150
+    # One period of the lock step passes between question and answer.
+    assert all(abs(pose.transit(9.9) - 0.01) <= 0.005 for pose in known[20:])
+    assert sync.peers[1].steps == 0
+
+
+def test_stamps_of_another_clock_are_not_believed():
+    poses, sync, _ = dated(0.0, stamp_offset=55.0)
+    assert all(pose.measured is None and pose.transit(0.01) == 0.01 for pose in poses)
+    assert sync.foreign > 100
+    assert LATE < 1.0, "a clock that was set by a second is another clock"
+
+
+def test_a_peer_that_asks_is_answered_with_our_time():
+    here, there = pipe()
+    ours, peer = Link(here), Link(there, *VEHICLE_ID)
+    LinkSync(ours)
+    heard = []
+    peer.listen(lambda message, arrival: heard.append(message))
+    peer.send(mav.MAVLink_timesync_message(0, 777))
+    ours.pump(lambda: 12.5)
+    peer.pump(lambda: 0.0)
+    answers = [m for m in heard if m.ts1 == 777]
+    assert [m.tc1 for m in answers] == [12_500_000_000]
+    # An answer that nobody asked for, and one to an old question, set no clock.
+    peer.send(mav.MAVLink_timesync_message(5, 42))
+    ours.pump(lambda: 13.0)
+    assert not ours.sync.peers
