@@ -1,10 +1,12 @@
 """``visthrow compare``: throw many times with each policy and print landing errors and durations."""
 
 import argparse
+import importlib
 import math
 import os
 import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from visthrow.cli import add_common
@@ -20,14 +22,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "examples:\n"
         "  visthrow compare                               state against vision, 200 throws at each of three targets\n"
         "  visthrow compare vision runs/v2/policy.npz     a shipped policy against one of your own\n"
+        "  visthrow compare state baseline --throws 50    against trajectory optimisation and MPC on the same throws\n"
         "  visthrow compare --plant reference-realistic --throws 50   on the stand-in for a real vehicle (minutes)\n"
         "\nA throw starts in hover with the payload near z = 0.95 m. The landing error is the horizontal distance\n"
         "from the target, the duration counts from the policy's start to the landing, smoothness is the root mean\n"
-        "square change of the normalised commands from step to step.\n"
+        "square change of the normalised commands from step to step. The policy 'baseline' stands for four rows: in the\n"
+        "controller's own model, an idealised bound, and on the plant with no, most or all of the known delays\n"
+        "made up for.\n"
     )
-    parser.add_argument(
-        "policies", metavar="POLICY", nargs="*", help="shipped names or policy files (default: state vision)"
-    )
+    kinds = "shipped names, policy files, or baseline (default: state vision)"
+    parser.add_argument("policies", metavar="POLICY", nargs="*", help=kinds)
     parser.add_argument(
         "--targets", type=float, nargs="+", default=list(DEFAULT_TARGETS), metavar="M", help="distances along x [m]"
     )
@@ -47,6 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Throw, print, write."""
     check(args.targets, args.throws)
+    from visthrow.baseline.thrower import NAME
     from visthrow.device import resolve
     from visthrow.errors import suggest
     from visthrow.loading import load_policy, unique_names
@@ -54,25 +59,75 @@ def run(args: argparse.Namespace) -> int:
 
     if args.plant not in PLANTS:
         raise ConfigError(f"no plant '{args.plant}'; {suggest(args.plant, PLANTS)}")
-    loaded = [load_policy(name, args.config, args.overrides) for name in args.policies or DEFAULT_POLICIES]
-    names = unique_names(loaded)
+    wanted = args.policies or DEFAULT_POLICIES
+    loaded = [load_policy(name, args.config, args.overrides) for name in wanted if name != NAME]
     writable(Path(args.out))
-    if args.plant == "hybrid":
+    if NAME in wanted:
+        importlib.import_module("piqp")  # said here rather than after all policies have thrown
+    if not loaded:
+        throws = []
+    elif args.plant == "hybrid":
         throws = throw_hybrid(loaded, args.targets, args.throws, resolve(args.device), args.seed)
     else:
         from visthrow.reference_protocol import Throwing
 
         with Throwing(loaded, args.targets, args.throws, args.plant, args.seed) as throwing:
             throws = throwing.results()
-    title, rows = title_of(args.plant, args.seed), rows_of(loaded, names, throws)
+    entries = entries_of(loaded, unique_names(loaded), throws)
+    if NAME in wanted:
+        entries += throw_baseline(args)
+    title, rows = title_of(args.plant, args.seed), rows_of(entries)
     print(report(title, rows))
-    for path in write(Path(args.out), list(zip(names, throws)), rows, args.plant, title):
+    for path in write(Path(args.out), entries, rows, args.plant, title):
         print(path)
     if args.json:
         from visthrow.storage import write_json
 
         write_json(args.json, {"plant": args.plant, "seed": args.seed, "rows": rows})
     return 0
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One row's thrower: what it is called, what it sees ("state", "vision") or is, and its throws a target."""
+
+    name: str
+    layout: str
+    throws: Sequence
+
+
+def entries_of(loaded: Sequence, names: Sequence[str], throws: Sequence[Sequence]) -> list[Entry]:
+    """Entries of learnt policies."""
+    layouts = (item.policy.contract["observation"]["layout"] for item in loaded)
+    return [Entry(*parts) for parts in zip(names, layouts, throws)]
+
+
+def throw_baseline(args: argparse.Namespace) -> list[Entry]:
+    """Throw with trajectory optimisation and MPC: in its own model, and on the plant under each compensation."""
+    import tempfile
+
+    from visthrow.baseline import thrower
+    from visthrow.device import cores
+    from visthrow.protocol import Throws
+    from visthrow.reference_protocol import FIELDS
+
+    def say(text: str) -> None:
+        if sys.stderr.isatty():
+            print(f"\rTO+MPC: {text:<60}", end="", file=sys.stderr, flush=True)
+
+    with tempfile.TemporaryDirectory() as folder:
+        found = thrower.compared(
+            args.plant, args.targets, args.throws, args.seed, folder, cores(), args.config or "state", args.overrides, say
+        )
+    say("")
+    own = thrower.title_of(thrower.OWN, "none")
+    return [
+        Entry(
+            name, "TO+MPC" if name == own else "",
+            [Throws(of.unit["target"], **{field: of.columns[field] for field in FIELDS}) for of in row],
+        )
+        for name, row in found.items()
+    ]  # fmt: skip
 
 
 def check(targets: Sequence[float], throws: int) -> None:
@@ -142,14 +197,14 @@ def title_of(plant: str, seed: int) -> str:
     return f"Throws from hover on {meaning} (`{plant}`, seed {seed})"
 
 
-def rows_of(loaded: Sequence, names: Sequence[str], throws: Sequence[Sequence]) -> list[dict]:
-    """Summaries, target after target, policies side by side."""
-    rows = []
-    for column in range(len(throws[0])):
-        for item, name, row in zip(loaded, names, throws):
-            layout = item.policy.contract["observation"]["layout"]
-            rows.append({"policy": name, "layout": layout, **row[column].summary()})
-    return rows
+def rows_of(entries: Sequence[Entry]) -> list[dict]:
+    """Summaries, target after target, throwers side by side."""
+    count = len(entries[0].throws)
+    return [
+        {"policy": entry.name, "layout": entry.layout, **entry.throws[column].summary()}
+        for column in range(count)
+        for entry in entries
+    ]
 
 
 def report(title: str, rows: Sequence[dict]) -> str:
@@ -159,9 +214,7 @@ def report(title: str, rows: Sequence[dict]) -> str:
     return f"{markdown(rows, title)}\n{PAPER_NOTE}\n"
 
 
-def write(
-    folder: Path, throws: Sequence[tuple[str, Sequence]], rows: Sequence[dict], plant: str, title: str
-) -> list[Path]:
+def write(folder: Path, entries: Sequence[Entry], rows: Sequence[dict], plant: str, title: str) -> list[Path]:
     """Write Markdown, CSV and scatter plot; returns their paths."""
     from visthrow import scatter, tables
     from visthrow.storage import atomic_write
@@ -169,9 +222,9 @@ def write(
     stem = f"compare-{plant}"
     paths = [folder / f"{stem}.md", folder / f"{stem}.csv", folder / f"{stem}.png"]
     atomic_write(paths[0], report(title, rows))
-    atomic_write(paths[1], tables.csv_text([(name, plant, of) for name, row in throws for of in row]))
+    atomic_write(paths[1], tables.csv_text([(entry.name, plant, of) for entry in entries for of in entry.throws]))
     from visthrow.plants import PLANTS
 
-    count = len(throws[0][1][0].success)
-    scatter.draw(paths[2], throws, f"{count} throws each, {PLANTS[plant]}")
+    count = len(entries[0].throws[0].success)
+    scatter.draw(paths[2], [(e.name, e.throws) for e in entries], f"{count} throws each, {PLANTS[plant]}")
     return paths

@@ -74,6 +74,7 @@ def _told(loaded: list, throws: list, plant: str, folder: Path) -> list[Path]:
     """Print the table and write it with its plot."""
     from visthrow.tables import markdown
 
-    title, rows = compare.title_of(plant, SEED), compare.rows_of(loaded, POLICIES, throws)
+    entries = compare.entries_of(loaded, POLICIES, throws)
+    title, rows = compare.title_of(plant, SEED), compare.rows_of(entries)
     print(markdown(rows, title), flush=True)
-    return compare.write(folder, list(zip(POLICIES, throws)), rows, plant, title)
+    return compare.write(folder, entries, rows, plant, title)

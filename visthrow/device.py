@@ -1,6 +1,13 @@
 """Choice of the compute device."""
 
+import os
+
 from visthrow.errors import DeviceError
+
+
+def cores() -> int:
+    """CPU cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def resolve(name: str = "auto") -> str:

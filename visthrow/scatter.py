@@ -1,6 +1,7 @@
 """Landing points from above, one panel a target, as in the paper's figure."""
 
 import io
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,6 +15,9 @@ RADII = (0.1, 0.2)
 
 PANEL = 2.6
 """Side of a panel [inch]."""
+
+LEGEND = 2.4
+"""Width of an entry of the legend [inch]."""
 
 LEAST_HALF_WIDTH, MOST_HALF_WIDTH = 0.25, 0.6
 """Of a panel [m]."""
@@ -37,7 +41,8 @@ def draw(path: str | Path, throws: Sequence[tuple[str, Sequence]], subtitle: str
     half = _half_width(throws)
     panel = PANEL if len(targets) > 1 else 1.25 * PANEL
     width = max(0.95 + len(targets) * (panel + 0.6), 6.4)
-    height = panel + 1.6
+    abreast = max(1, min(len(throws), int(width / LEGEND)))
+    height = panel + 1.6 + 0.22 * (math.ceil(len(throws) / abreast) - 1)
     figure = plt.figure(figsize=(width, height))
     first = 0.5 * (width - len(targets) * (panel + 0.6) + 0.6) + 0.2
     for column, target in enumerate(targets):
@@ -52,7 +57,7 @@ def draw(path: str | Path, throws: Sequence[tuple[str, Sequence]], subtitle: str
         if column == 0:
             axis.set_ylabel("error along the throw [m]")
     top = {"loc": "upper center", "bbox_to_anchor": (0.5, 1.0 - 0.3 / height), "columnspacing": 1.6}
-    figure.legend(*figure.axes[0].get_legend_handles_labels(), ncols=len(throws), **top)
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), ncols=abreast, **top)
     figure.suptitle(f"Landing points from above: {subtitle}", fontsize=11.5, y=1.0 - 0.1 / height, va="top")
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png")

@@ -253,13 +253,13 @@ def _under(model: Pendulum, state: np.ndarray, sent: np.ndarray, period: float, 
 
 
 def _started(
-    name: str, experiment: Experiment, start: RandomizationParams, target: float, count: int, seed: int
+    name: str, experiment: Experiment, start: RandomizationParams, target: float, batch: int, count: int, seed: int
 ) -> Plant:
     """Plant at the start of the throws that learnt policies meet."""
     task = experiment.task
     if name == "hybrid":
         return HybridPlant(experiment, count, seed, noise=task.noise, latency=task.observation.latency, start=start)
-    plant, rng = batch_plant(experiment, name, target, 0, count, seed)
+    plant, rng = batch_plant(experiment, name, target, batch, count, seed)
     place_in_hover(plant, experiment, start, rng)
     return plant
 
@@ -268,11 +268,18 @@ class _PlantFlight:
     """State of a batch of throws on a plant."""
 
     def __init__(
-        self, plan: Plan, plant_name: str, experiment: Experiment, delays: Delays, count: int, seed: int
+        self,
+        plan: Plan,
+        plant_name: str,
+        experiment: Experiment,
+        delays: Delays,
+        count: int,
+        seed: int,
+        batch: int = 0,
     ) -> None:
         start = config.load(RandomizationParams, config.find("start", "hover"))
         self.plan, self.experiment, self.delays, self.count = plan, experiment, delays, count
-        self.plant = _started(plant_name, experiment, start, plan.target, count, seed)
+        self.plant = _started(plant_name, experiment, start, plan.target, batch, count, seed)
         self.params = MPCParams(period=self.plant.period, max_thrust=experiment.task.action.max_thrust,
                                 max_rate=experiment.task.action.max_rate)  # fmt: skip
         self.mount = np.array(plant_of(experiment).rope.mount)
@@ -357,7 +364,7 @@ class _PlantFlight:
 
 
 def fly_plant(
-    plan: Plan, plant_name: str, experiment: Experiment, delays: Delays, count: int = 10, seed: int = 0
+    plan: Plan, plant_name: str, experiment: Experiment, delays: Delays, count: int = 10, seed: int = 0, batch: int = 0
 ) -> Flown:
     """Fly a plan on a plant of :data:`visthrow.plants.PLANTS`.
 
@@ -372,8 +379,9 @@ def fly_plant(
         delays: that the controller makes up for; ``Delays()`` for none.
         count: throws, flown as one batch.
         seed: of everything random.
+        batch: number of the batch on a reference plant, as :mod:`visthrow.reference_protocol` counts them.
     """
-    flight = _PlantFlight(plan, plant_name, experiment, delays, count, seed)
+    flight = _PlantFlight(plan, plant_name, experiment, delays, count, seed, batch)
     plant, period = flight.plant, flight.plant.period
     if plant_name != "hybrid":
         for _ in range(round(HOVER_TIME / period)):

@@ -16,6 +16,7 @@ from visthrow.baseline.pendulum import Pendulum, pendulum_of
 from visthrow.baseline.plan import Plan, plan_throw
 from visthrow.baseline.release import default_release
 from visthrow.baseline.spline import PlanParams
+from visthrow.tables import PAPER
 from visthrow.task import Experiment, plant_of
 
 SPEEDS = (1.7, 2.2, 2.5, 2.9)
@@ -24,7 +25,7 @@ SPEEDS = (1.7, 2.2, 2.5, 2.9)
 WEIGHTS = ((1e6, 0.005), (200e3, 0.005), (50e3, 0.005), (30e3, 0.01), (3e3, 0.3))
 """Duration and energy weights of the sweep; the last three are the paper's."""
 
-PAPER_TABLE = {1.5: (0.127, 0.019, 1.546, 0.010), 2.0: (0.167, 0.033, 1.605, 0.016), 2.5: (0.285, 0.026, 1.648, 0.012)}
+PAPER_TABLE = {target: figures for (layout, target), figures in PAPER.items() if layout == "TO+MPC"}
 """Target -> landing error [m] and duration [s], mean and deviation: the paper's TO+MPC in its own model (Table III)."""
 
 PAPER_FRONT = (

@@ -1,0 +1,140 @@
+"""The baseline as one more thrower: sets of throws as units of work, for ``visthrow compare`` and ``visthrow report``."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from visthrow import config
+from visthrow.baseline.fly import delays_of, fly_pendulum, fly_plant
+from visthrow.baseline.pendulum import pendulum_of
+from visthrow.baseline.plan import Plan, plan_throw
+from visthrow.baseline.release import default_release
+from visthrow.baseline.spline import PlanParams, payload_bounds_only
+from visthrow.reference_protocol import BATCH
+from visthrow.results import PROTOCOL, Result, columns_of, join, key_of, work
+from visthrow.task import Experiment, contract_of, plant_of
+
+NAME = "baseline"
+"""What compare calls it beside the policies."""
+
+OWN = "pendulum"
+"""The controller's own model, beside the plants of :data:`visthrow.plants.PLANTS`."""
+
+MADE_UP = {
+    "none": "nothing made up for",
+    "delay": "all delays but the release's lag made up for",
+    "both": "all delays made up for",
+}
+"""Compensations that are compared, of :data:`visthrow.baseline.fly.COMPENSATIONS`."""
+
+
+def title_of(plant: str, compensation: str) -> str:
+    """What a row is called: plant and condition never go unsaid."""
+    return "TO+MPC, own model (ideal)" if plant == OWN else f"TO+MPC, {MADE_UP[compensation]}"
+
+
+def unit(
+    plant: str, compensation: str, target: float, throws: int, seed: int = 0, *,
+    speed: float | None = None, w_t: float | None = None, rho: float | None = None, bounds: str = "payload and thrust",
+    config_name: str = "state", overrides: Sequence[str] = (), batch: int = 0,
+) -> dict[str, Any]:  # fmt: skip
+    """Unit of throws with the baseline.
+
+    Args:
+        plant: :data:`OWN`, or of :data:`visthrow.plants.PLANTS`.
+        compensation: of :data:`visthrow.baseline.fly.COMPENSATIONS`; "none" in the own model.
+        target: [m] along x.
+        throws: how many.
+        seed: of starts and noise.
+        speed: at release [m/s]; default the learnt policy's.
+        w_t: duration weight; rho: energy weight; default those of :class:`visthrow.baseline.spline.PlanParams`.
+        bounds: "payload and thrust", or "payload" as in the paper.
+        config_name: train config whose plant is flown; overrides: its changes.
+        batch: number of the batch on a reference plant.
+    """
+    height, default_speed = default_release(target)
+    params = PlanParams()
+    return {
+        "kind": NAME, "protocol": PROTOCOL, "plant": plant, "compensation": compensation, "target": float(target),
+        "height": round(height, 6), "speed": round(speed or default_speed, 6), "w_t": float(w_t or params.duration),
+        "rho": float(rho or params.energy), "bounds": bounds, "throws": int(throws), "seed": int(seed),
+        "config": config_name, "overrides": list(overrides), "batch": int(batch),
+        "conditions": key_of(contract_of(_experiment(config_name, tuple(overrides)))),
+    }  # fmt: skip
+
+
+def units(plant: str, compensation: str, target: float, throws: int, seed: int = 0, **how: Any) -> list[dict[str, Any]]:
+    """:func:`unit`, cut into the batches in which reference plants are flown."""
+    if plant in (OWN, "hybrid"):
+        return [unit(plant, compensation, target, throws, seed, **how)]
+    sizes = [min(BATCH, throws - first) for first in range(0, throws, BATCH)]
+    return [unit(plant, compensation, target, size, seed, batch=i, **how) for i, size in enumerate(sizes)]
+
+
+@lru_cache(maxsize=8)
+def _experiment(name: str, overrides: tuple[str, ...]) -> Experiment:
+    return config.load(Experiment, config.find("train", name), overrides)
+
+
+@lru_cache(maxsize=64)
+def _plan(
+    name: str, overrides: tuple[str, ...], target: float, height: float, speed: float, w_t: float, rho: float, bounds: str
+) -> Plan:
+    experiment = _experiment(name, overrides)
+    params = replace(PlanParams(), duration=w_t, energy=rho)
+    params = params if bounds == "payload and thrust" else payload_bounds_only(params)
+    return plan_throw(
+        pendulum_of(plant_of(experiment)), target, height, speed, params, experiment.release.landing_height,
+        experiment.sim.control_period, experiment.release.lag,
+    )  # fmt: skip
+
+
+def fly_unit(wanted: dict[str, Any]) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Plan and fly a unit; returns columns of the throws, and the planned duration [s] and times of the controller's steps [ms]."""
+    name, overrides = wanted["config"], tuple(wanted["overrides"])
+    experiment = _experiment(name, overrides)
+    how = (wanted[key] for key in ("target", "height", "speed", "w_t", "rho", "bounds"))
+    plan = _plan(name, overrides, *how)
+    count, seed = wanted["throws"], wanted["seed"]
+    if wanted["plant"] == OWN:
+        flown = fly_pendulum(plan, count, seed, experiment.release.landing_height)
+    else:
+        delays = delays_of(experiment, wanted["compensation"])
+        flown = fly_plant(plan, wanted["plant"], experiment, delays, count, seed, wanted["batch"])
+    columns = columns_of(flown)
+    columns.pop("step_times", None)  # as many as throws by chance
+    extra = {"planned": round(plan.duration, 6)}
+    if len(flown.step_times):
+        extra["step_ms"] = [round(1e3 * float(t), 3) for t in np.percentile(flown.step_times, (50, 99))]
+    return columns, extra
+
+
+def compared(
+    plant: str, targets: Sequence[float], throws: int, seed: int, folder: str, processes: int = 1,
+    config_name: str = "state", overrides: Sequence[str] = (), say=lambda text: None,
+) -> dict[str, list[Result]]:  # fmt: skip
+    """Throws in the own model and on a plant under each compensation.
+
+    Args:
+        plant: of :data:`visthrow.plants.PLANTS`.
+        targets: [m] along x.
+        throws: a row.
+        seed: of starts and noise.
+        folder: of the units' results while they are made.
+        processes: that work at once.
+        config_name: train config whose plant is flown; overrides: its changes.
+        say: told of the progress.
+
+    Returns:
+        Row's name -> a result a target.
+    """
+    how = {"config_name": config_name, "overrides": overrides}
+    rows = {
+        title_of(*row): [units(*row, target, throws, seed, **how) for target in targets]
+        for row in [(OWN, "none"), *((plant, compensation) for compensation in MADE_UP)]
+    }
+    found = work([u for row in rows.values() for part in row for u in part], folder, fly_unit, None, processes, say)
+    return {name: [join(found[key_of(u)] for u in part)[0] for part in row] for name, row in rows.items()}
