@@ -30,6 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "  visthrow hil replay runs/monday               the same actions again?\n"
         "  visthrow hil view runs/monday                 a recording for rerun, a picture and a flight log a throw\n"
         "  visthrow hil check --seconds 5                what comes, how old, how often, and the checks\n"
+        "  visthrow hil check --hand-carry               carry the vehicle about: which axes fit?\n"
         "\nWhile a run goes on, type 'arm' (one throw), 'land' or 'abort' and Enter; Ctrl-C aborts.\n"
     )
     actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
@@ -48,6 +49,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     subs["run"].add_argument(
         "--write-parameters", action="store_true", help="set the autopilot's parameters that the audit finds wrong"
     )
+    check = subs["check"]
+    check.add_argument("--hand-carry", action="store_true", help="carry the vehicle about by hand: are the axes right?")
+    check.add_argument(
+        "--against-camera", nargs="+", metavar="FILE", help="recordings of a camera's detections; the first is fitted"
+    )
+    check.add_argument("--out", default="out/against_camera", metavar="FOLDER", help="of --against-camera")
     subs["run"].add_argument("--auto-arm", action="store_true", help="arm whenever ready; for simulated vehicles only")
     for name in ("replay", "view"):
         subs[name].add_argument("folder", metavar="FOLDER", help="of a run")
@@ -200,6 +207,12 @@ def _view(args: argparse.Namespace) -> int:
 
 
 def _check(args: argparse.Namespace) -> int:
+    if args.against_camera:
+        from hil import camera_report
+
+        figures = camera_report.against_camera(_params(args), args.against_camera, args.out)
+        print(camera_report.story(figures, args.out))
+        return 0
     from hil.backends import DryRun
     from hil.clock import ManualClock, MonotonicClock
     from hil.runner import Runner, Words

@@ -7,6 +7,7 @@ from camera.params import CameraParams
 from hil.backends.ardupilot import ArduPilotParams
 from hil.backends.betaflight import BetaflightParams
 from hil.backends.px4 import Px4Params
+from hil.camera_log import CameraLogParams
 from hil.estimate import EstimateParams
 from hil.frames import FrameParams
 from hil.gate import GateParams
@@ -44,6 +45,7 @@ class SourceParams:
     logs: tuple[LogBody, ...] = ()  # of bin and ulg
     bodies: tuple[RigidBody, ...] = ()  # of mocap
     mocap: MocapParams | None = None
+    check_units: bool = True  # refuse recordings whose numbers no vehicle makes: a unit of the mapping is wrong
 
 
 @dataclass(frozen=True)
@@ -86,6 +88,7 @@ class HilParams:
     ardupilot: ArduPilotParams
     px4: Px4Params
     betaflight: BetaflightParams
+    against: CameraLogParams | None = None  # a camera's own detections in the source's file
 
     def __post_init__(self) -> None:
         if not {VEHICLE, PAYLOAD} <= set(self.frames) <= set(BODIES):

@@ -85,6 +85,25 @@ def read_csv(path: str | Path, bodies: tuple[CsvParams, ...], quaternion: str = 
         SourceError: no such file, no such column, or a cell that is no number (an empty one reads as NaN).
     """
     path = Path(path)
+    header, table = _read(path)
+    poses: list[Pose] = []
+    for params in bodies:
+        poses += _poses(params, header, table, path, quaternion)
+    return poses
+
+
+def read_columns(path: str | Path, column: Column) -> np.ndarray:
+    """Columns of a CSV file in our unit, shape (rows, len(column.names)).
+
+    Raises:
+        SourceError: as `read_csv`.
+    """
+    header, table = _read(Path(path))
+    return _columns(column, header, table, Path(path))
+
+
+def _read(path: Path) -> tuple[list[str], np.ndarray]:
+    """Header and numbers of a file."""
     try:
         data = path.read_bytes()
         text = (gzip.decompress(data) if path.suffix == ".gz" else data).decode("utf-8")
@@ -93,10 +112,7 @@ def read_csv(path: str | Path, bodies: tuple[CsvParams, ...], quaternion: str = 
     rows = csv.reader(io.StringIO(text))
     header = [name.strip() for name in next(rows, [])]
     table = np.array(list(_numbers(rows, len(header), path)), dtype=float).reshape(-1, len(header))
-    poses: list[Pose] = []
-    for params in bodies:
-        poses += _poses(params, header, table, path, quaternion)
-    return poses
+    return header, table
 
 
 def _numbers(rows: Iterator[list[str]], width: int, path: Path) -> Iterator[list[float]]:
@@ -111,14 +127,16 @@ def _numbers(rows: Iterator[list[str]], width: int, path: Path) -> Iterator[list
             raise SourceError(f"{path}: line {number}: {error}; expected numbers") from error
 
 
+def _columns(column: Column, header: list[str], table: np.ndarray, path: Path) -> np.ndarray:
+    for name in column.names:
+        if name not in header:
+            raise SourceError(f"{path}: no column '{name}'; {suggest(name, header)}")
+    return table[:, [header.index(name) for name in column.names]] * UNITS[column.unit]
+
+
 def _poses(params: CsvParams, header: list[str], table: np.ndarray, path: Path, quaternion: str) -> Iterator[Pose]:
     def columns(column: Column | None) -> np.ndarray | None:
-        if column is None:
-            return None
-        for name in column.names:
-            if name not in header:
-                raise SourceError(f"{path}: no column '{name}'; {suggest(name, header)}")
-        return table[:, [header.index(name) for name in column.names]] * UNITS[column.unit]
+        return None if column is None else _columns(column, header, table, path)
 
     count = len(table)
     time = params.row_period * np.arange(count) if params.time is None else columns(params.time)[:, 0]

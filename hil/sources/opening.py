@@ -5,8 +5,10 @@ from typing import Any
 
 from hil.clock import MonotonicClock
 from hil.device import check_device, open_port
+from hil.errors import SourceError
 from hil.link import Link, TlogWriter
 from hil.params import LIVE, HilParams
+from hil.plausible import unit_problems
 from hil.pose import VEHICLE, Pose
 from hil.sources.base import Recorded
 from hil.sources.csv_file import read_csv
@@ -49,7 +51,11 @@ def open_source(params: HilParams, folder: Path, speed: float) -> tuple[Any, Lin
     """
     source = params.source
     if source.kind not in LIVE:
-        return Recorded(read_poses(params)), None, True
+        poses = read_poses(params)
+        problems = unit_problems(poses, params.frames) if source.check_units else []
+        if problems:
+            raise SourceError(f"{source.file}: {'; '.join(problems)} (source.check_units=false lets it pass)")
+        return Recorded(poses), None, True
     clock, link = MonotonicClock(speed).now, None
     if source.kind == "mavlink" or params.backend in ("ardupilot", "px4"):
         port = open_port(check_device(params.link.device, remote=params.link.remote))

@@ -1,0 +1,119 @@
+"""Units by physics: recorded flights as they are, and with each unit of the mapping wrong."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hil.errors import SourceError
+from hil.params import HilParams
+from hil.plausible import unit_problems
+from hil.pose import Pose
+from hil.sources import Column
+from hil.sources.opening import open_source, read_poses
+from visthrow import config
+from visthrow.cli import main
+from visthrow.errors import ConfigError
+
+DATA = Path(__file__).parents[1] / "data"
+FLIGHTS = {
+    "crazyflie_log": "payload_cf_single/log201.csv.gz",
+    "crazyflie_pair_log": "payload_cf_two_drones/coltrans_02_cf3.csv.gz",
+    "slungload_log": "slungload_camera/rosbag_16.csv.gz",
+}
+
+
+def flight(name: str, **units: str) -> HilParams:
+    """The config of a recorded flight, some units of its mapping replaced."""
+    params = config.load(HilParams, config.find("hil", name), [f'source.file="{DATA / FLIGHTS[name]}"'])
+
+    def changed(columns):
+        found = {key: Column(getattr(columns, key).names, unit) for key, unit in units.items() if getattr(columns, key)}
+        return dataclasses.replace(columns, **found)
+
+    columns = tuple(map(changed, params.source.columns))
+    return dataclasses.replace(params, source=dataclasses.replace(params.source, columns=columns))
+
+
+def problems(params: HilParams) -> str:
+    return "; ".join(unit_problems(read_poses(params), params.frames))
+
+
+@pytest.mark.parametrize("name", FLIGHTS)
+def test_flights_as_they_are(name):
+    assert problems(flight(name)) == ""
+
+
+@pytest.mark.parametrize(
+    ("name", "units", "message"),
+    [
+        ("crazyflie_log", {"pos": "m"}, "are they millimetres given as 'm'"),
+        ("crazyflie_log", {"time": "ms"}, "is the unit of time wrong"),
+        ("crazyflie_log", {"vel": "m/s"}, "velocity is 1000 times the change"),
+        ("crazyflie_log", {"rate": "deg/s"}, "body rates are 1/57.3 times the turning"),
+        ("crazyflie_log", {"euler": "deg"}, "body rates are 57.3 times the turning"),
+        ("crazyflie_pair_log", {"pos": "m"}, "are they millimetres given as 'm'"),
+        ("crazyflie_pair_log", {"rate": "rad/s"}, "body rates are 57.3 times the turning"),
+        ("slungload_log", {"pos": "mm"}, "apart, expected 0.01 to 30"),
+    ],
+)
+def test_each_wrong_unit_is_named(name, units, message):
+    assert message in problems(flight(name, **units))
+
+
+def flown(angle: float) -> list[Pose]:
+    """A vehicle that swings to and fro, tilting as it must, its angles multiplied by a factor."""
+    poses = []
+    for i in range(600):
+        t = 0.01 * i
+        x, push = 0.5 * np.cos(3 * t), -0.5 * 9 * np.cos(3 * t)
+        half = 0.5 * angle * np.arctan2(push, 9.81)
+        poses.append(Pose(t, t, "vehicle", (float(x), 0.0, 1.0), (0.0, float(np.sin(half)), 0.0, float(np.cos(half)))))
+    return poses
+
+
+def test_a_multirotor_tilts_where_it_accelerates():
+    frames = flight("slungload_log").frames
+    assert unit_problems(flown(1.0), frames) == []
+    assert "tilts 1/57.3 times" in unit_problems(flown(np.pi / 180), frames)[0]
+    assert "degrees given as 'rad'" in unit_problems(flown(180 / np.pi), frames)[0]
+
+
+def test_little_data_and_a_still_vehicle_say_nothing():
+    frames = flight("slungload_log").frames
+    rng = np.random.default_rng(0)
+    still = [Pose(0.01 * i, 0.01 * i, "vehicle", tuple(1e-3 * rng.standard_normal(3)), (0.0, 0.0, 0.0, 1.0)) for i in range(300)]
+    assert unit_problems(still, frames) == []
+    assert unit_problems(still[:5], frames) == []
+    assert unit_problems([], frames) == []
+
+
+def test_a_recording_in_wrong_units_is_refused_unless_told(tmp_path, capsys):
+    params = flight("crazyflie_log", vel="m/s")
+    with pytest.raises(SourceError, match=r"velocity is 1000 times .* \(source\.check_units=false lets it pass\)"):
+        open_source(params, tmp_path, 1.0)
+    lax = dataclasses.replace(params, source=dataclasses.replace(params.source, check_units=False))
+    assert open_source(lax, tmp_path, 1.0)[2]
+    wrong = 'source.columns=[{body="vehicle", row_period=0.004, pos={names=["t_s", "t_s", "acc"], unit="mm"}}]'
+    file = f"source.file={DATA / FLIGHTS['crazyflie_log']}"
+    assert main(["hil", "check", "--config", "crazyflie_log", "--set", file, "--set", wrong]) == 2
+    assert "no column 'acc'; " in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", FLIGHTS)
+def test_recorded_flights_replay(name, tmp_path, capsys):
+    """Each is recorded with the vision policy looking on, and the recording gives the same actions again."""
+    file = f"source.file={DATA / FLIGHTS[name]}"
+    out = str(tmp_path / "run")
+    assert main(["hil", "record", "--config", name, "--set", file, "--seconds", "4", "--out", out]) == 0
+    capsys.readouterr()
+    assert main(["hil", "replay", out]) == 0
+    told = capsys.readouterr().out
+    assert "all bit for bit the same" in told
+    assert int(told.split(" actions")[0].split()[-1]) > 150, "of 200 ticks"
+
+
+def test_wrong_schema_of_the_camera_log():
+    with pytest.raises(ConfigError, match="mirror the world"):
+        config.load(HilParams, config.find("hil", "slungload_log"), ['against.axes="z,x,-y"'])
