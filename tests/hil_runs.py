@@ -1,0 +1,44 @@
+"""Folders of runs for tests: the vehicle of `tests.hil_flight`, recorded tick by tick as the command records them."""
+
+from pathlib import Path
+
+from hil.record import Recorder
+from hil.runner import Decision, Runner
+from tests.hil_flight import Spy, fly, params, simple_policy
+from visthrow.actions import hover_action
+from visthrow.policy import Policy, find_policy
+
+HOVER = hover_action(9.81 * 0.272, 14.0)[0]
+AT_ONCE = (HOVER, 0.0, 0.0, 0.0, 1.0)
+"""Of a policy that hovers and releases at once: the payload falls straight down."""
+
+
+def saved_policy(folder: Path, action=AT_ONCE, layout="vision") -> str:
+    """File of a policy that always says the same, as an override of a config."""
+    path = folder / "always.npz"
+    simple_policy(action, layout).save(path)
+    return f'policy="{path}"'
+
+
+def record_run(folder: Path, *overrides: str, seconds: float = 8.0, close: bool = True, **spoiled) -> list[Decision]:
+    """Fly and record; see `tests.hil_flight.fly` for what can be spoiled. Without ``close`` the run ends as if killed."""
+    wanted = params(*overrides)
+    runner = Runner(wanted, Policy.load(find_policy(wanted.policy)), Spy())
+    recorder, decisions = Recorder(folder, wanted), []
+    tick = runner.tick
+
+    def keep(time, poses, status, words, recording=True):
+        decision = tick(time, poses, status, words, recording)
+        times = {"late": 1e-4, "poll": 2e-4, **runner.spent}
+        recorder.tick(len(decisions), poses, status, words, recording, decision, times)
+        decisions.append(decision)
+        return decision
+
+    runner.tick = keep
+    fly(runner, seconds, **spoiled)
+    if close:
+        recorder.close(runner.summary())
+    else:
+        recorder.close({})
+        (folder / "summary.json").unlink()
+    return decisions

@@ -1,0 +1,209 @@
+"""Flight logs made of run folders: channels, times, release and landing; the view of them, live and recorded."""
+
+import math
+import subprocess
+import sys
+import threading
+import time
+
+import cv2
+import numpy as np
+import pytest
+
+from hil import flightlogs, view
+from hil.errors import RunError
+from hil.landing import separation
+from hil.record import load_run
+from hil.report import finish, throw_logs
+from tests.hil_flight import TICK
+from tests.hil_runs import record_run, saved_policy
+from visthrow.flightlog import FlightLog
+from visthrow.logexport import columns
+
+LAG = 0.11
+CLOCK = 3e-3
+"""Of a time that is found in poses of a tenth of a millimetre of noise [s]."""
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("flown")
+    decisions = record_run(folder / "a", saved_policy(folder), seconds=6.0)
+    return folder / "a", decisions
+
+
+@pytest.fixture(scope="module")
+def logs(run):
+    return throw_logs(run[0])
+
+
+def test_a_log_a_throw_with_what_was_decided(run, logs):
+    _, decisions = run
+    latches = [d for d in decisions if d.release]
+    assert len(logs) == len(latches) == 1
+    for log, latch in zip(logs, latches):
+        times, result = log.meta["times"], log.meta["result"]
+        assert result["success"]
+        assert times["latch"] == latch.time
+        assert times["policy_start"] <= latch.time
+        assert times["separation"] == pytest.approx(latch.time + LAG, abs=TICK)
+        throw = [d for d in decisions if d.action is not None and d.state == "throw"]
+        shown = log["action"].values[np.searchsorted(log["action"].time, latch.time)]
+        np.testing.assert_array_equal(shown, next(d for d in throw if d.time == latch.time).action)
+        assert result["error"] == pytest.approx(2.0, abs=0.02), "it falls at its feet, the goal is 2 m away"
+        fall = math.sqrt(2 * (1.333 - 0.383 - 0.04) / 9.81)
+        assert result["duration"] == pytest.approx(latch.time - times["policy_start"] + LAG + fall, abs=0.03)
+        assert log["landing"].values[0][2] == pytest.approx(0.04)
+        attached = log["attached"]
+        assert attached.values[attached.time < times["separation"]].all()
+        assert not attached.values[attached.time > times["separation"]].any()
+        assert log["cable_points_w"].time[-1] < times["separation"]
+        length = np.linalg.norm(np.diff(log["cable_points_w"].values, axis=1)[:, 0], axis=1)
+        np.testing.assert_allclose(length, length[0], atol=0.01)
+
+
+def test_what_the_other_tools_read_of_it(run, logs, tmp_path):
+    log = logs[0]
+    for name in ("pos_w", "quat_wb", "vel_w", "rate_b", "payload_pos_w", "command", "observation", "keypoints", "goal_w"):
+        assert len(log[name].time) > (5 if name in ("observation", "keypoints") else 50), name
+    assert np.median(np.diff(log["pos_w"].time)) == pytest.approx(TICK / 2, abs=1e-6)
+    assert np.median(np.diff(log["command"].time)) == pytest.approx(TICK, abs=1e-6)
+    log.save(tmp_path / "log.npz")
+    again = FlightLog.load(tmp_path / "log.npz")
+    assert again.meta["events"] == log.meta["events"]
+    assert [state for _, state, _ in again.meta["events"]][-3:-1] == ["throw", "recover"]
+    assert "pos_w[0] [m, world]" in columns(again)
+
+
+def test_the_end_of_a_run_writes_logs_and_pictures(run):
+    folder = run[0]
+    said = finish(folder)
+    assert "throw 1: 2.0" in said[0]
+    assert len(list(folder.glob("throw-*.npz"))) == 1
+    picture = cv2.imread(str(folder / "throw-01.png"))
+    assert picture.shape[1] > 1500
+    assert len(throw_logs(folder)) == 1
+
+
+def test_throws_without_a_landing_say_why(tmp_path):
+    never = saved_policy(tmp_path, (-0.1269, 0, 0, 0, -1.0))
+    record_run(tmp_path / "a", never, "throws=2", "states.throw=0.5", seconds=7.0)
+    logs = throw_logs(tmp_path / "a")
+    assert len(logs) == 2
+    assert logs[0]["command"].time[-1] < logs[1]["command"].time[0], "no tick belongs to two throws"
+    for log in logs:
+        assert log.meta["result"]["failure"] == "the policy did not release in time"
+        assert "landing" not in log
+    assert "no landing counted" in finish(tmp_path / "a")[0]
+
+
+def test_a_killed_run_and_no_run(tmp_path):
+    record_run(tmp_path / "a", saved_policy(tmp_path), seconds=6.0, close=False)
+    (log,) = throw_logs(tmp_path / "a")
+    assert log.meta["result"]["success"]
+    with pytest.raises(RunError, match="no folder of a run"):
+        throw_logs(tmp_path)
+
+
+def test_where_the_rope_let_go_is_found_in_noisy_poses():
+    """A payload pulled with three times its weight until 0.113 s, then free; 1 mm of noise, 100 Hz, 2 % lost."""
+    rng, found = np.random.default_rng(0), []
+    for _ in range(40):
+        let_go, start, vel = 0.113 + 0.01 * rng.random(), np.array([0.5, 0.0, 1.1]), np.array([4.0, 0.0, 2.0])
+        pull = np.array([15.0, 0.0, 20.0])
+        times = np.arange(-0.05, 0.5, 0.01) + 0.01 * rng.random()
+        times = times[rng.random(len(times)) > 0.02]
+        held = np.minimum(times - let_go, 0.0)[:, None]
+        free = (times - let_go)[:, None]
+        points = start + free * vel + [0, 0, -0.5 * 9.81] * free**2 + 0.5 * pull * held**2
+        points = points + 1e-3 * rng.standard_normal(points.shape)
+        when, where = separation(times, points, 0.11)
+        found.append(when - let_go)
+        assert np.linalg.norm(np.subtract(where, start)) < 0.03
+    assert abs(np.mean(found)) < CLOCK
+    assert np.std(found) < 2 * CLOCK
+
+
+def test_no_separation_where_the_poses_do_not_tell():
+    times = np.arange(0.0, 0.1, 0.01)
+    assert separation(times, np.zeros((10, 3)), 0.11) is None
+    times = np.arange(0.0, 0.5, 0.01)
+    fall = np.column_stack((times, 0 * times, -0.5 * 9.81 * times**2))
+    assert separation(times, fall, 0.11) is None, "nothing ever held it"
+
+
+def test_the_recording_of_a_run_holds_all(run, tmp_path):
+    view.write(run[0], tmp_path / "run.rrd")
+    data = (tmp_path / "run.rrd").read_bytes()
+    assert data[:4] == b"RRF2"
+    entities = stored_entities(tmp_path / "run.rrd")
+    for entity in ("/world/vehicle", "/world/ball", "/world/trail/ball", "/camera/goal", "/camera/payload", "/events",
+                   "/camera/body_axes", "/signals/age/vehicle", "/signals/tick/observation", "/signals/phase/state"):  # fmt: skip
+        assert entity in entities, entity
+
+
+def stored_entities(path) -> str:
+    """What rerun itself lists of a recording."""
+    command = [sys.executable, "-m", "rerun", "rrd", "print", str(path)]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout
+
+
+class Stream:
+    """Stands for a stream of rerun: counts what is sent to each entity."""
+
+    def __init__(self):
+        self.sent = {}
+
+    def log(self, entity, *what, static=False):
+        self.sent[entity] = self.sent.get(entity, 0) + 1
+
+    def send_columns(self, entity, indexes, columns):
+        self.sent[entity] = self.sent.get(entity, 0) + 1
+
+    def set_time(self, *args, **kwargs):
+        pass
+
+
+def test_the_live_view_follows_a_run_that_is_being_written(run, tmp_path, monkeypatch):
+    """Lines come bit by bit, cut anywhere; all ticks are played back and the run's end ends the view."""
+    monkeypatch.setattr(view, "EVERY", 0.01)
+    source, folder = run[0], tmp_path / "live"
+    folder.mkdir()
+    for name in ("config.toml", "policy.npz", "provenance.json"):
+        (folder / name).write_bytes((source / name).read_bytes())
+    texts = {name: (source / name).read_text() for name in ("poses.jsonl", "ticks.jsonl")}
+
+    def write():
+        rng, places = np.random.default_rng(0), dict.fromkeys(texts, 0)
+        files = {name: (folder / name).open("w") for name in texts}
+        while any(places[name] < len(text) for name, text in texts.items()):
+            for name, text in texts.items():
+                step = int(rng.integers(0, 40_000 if name == "ticks.jsonl" else 20_000))
+                files[name].write(text[places[name] : places[name] + step])
+                files[name].flush()
+                places[name] += step
+                time.sleep(0.004)
+        for file in files.values():
+            file.close()
+        (folder / "summary.json").write_text("{}")
+
+    stream, played = Stream(), []
+    take = view.Show.take
+    monkeypatch.setattr(view.Show, "take", lambda show, ticks: (played.extend(ticks), take(show, ticks)))
+    writer = threading.Thread(target=write)
+    writer.start()
+    dropped = view.follow(folder, stream)
+    writer.join()
+    ticks = load_run(source)[2]
+    assert len(played) + dropped == len(ticks)
+    assert stream.sent["signals/phase/state"] > 2
+    assert stream.sent["world/trail/ball"] > 2
+    assert stream.sent["events"] >= 5
+    np.testing.assert_array_equal(
+        [t.decision.command or () for t in played[-5:]], [line["command"] or () for line in ticks[-5:]]
+    )
+
+
+def test_states_of_the_machine_are_all_named():
+    assert flightlogs.STATES[0] == "idle"
+    assert len(flightlogs.STATES) == 9
