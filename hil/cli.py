@@ -213,6 +213,8 @@ def _check(args: argparse.Namespace) -> int:
         figures = camera_report.against_camera(_params(args), args.against_camera, args.out)
         print(camera_report.story(figures, args.out))
         return 0
+    if args.hand_carry:
+        return _hand_carry(args)
     from hil.backends import DryRun
     from hil.clock import ManualClock, MonotonicClock
     from hil.runner import Runner, Words
@@ -247,6 +249,26 @@ def _check(args: argparse.Namespace) -> int:
     problems = runner.problems()
     print("\n".join(f"FAIL  {text}" for text in problems) or "PASS  all checks")
     return 1 if problems else 0
+
+
+def _hand_carry(args: argparse.Namespace) -> int:
+    import tempfile
+
+    from hil import handcarry
+    from hil.clock import ManualClock, MonotonicClock
+    from hil.pose import VEHICLE
+    from hil.sources.opening import open_source
+
+    params = _params(args)
+    params = dataclasses.replace(params, source=dataclasses.replace(params.source, check_units=False))
+    with tempfile.TemporaryDirectory() as folder:
+        source, _, recorded = open_source(params, Path(folder), args.speed)
+        clock = ManualClock(source.start) if recorded else MonotonicClock(args.speed)
+        steps = handcarry.collect(source, clock, args.seconds or 180.0, lambda text: print(text, flush=True), recorded)
+        source.close()
+    finding = handcarry.judge(steps, params.frames[VEHICLE])
+    print(handcarry.story(finding, params.frames[VEHICLE]))
+    return 0 if finding.passed else 1
 
 
 def _fake(args: argparse.Namespace) -> int:

@@ -1,0 +1,159 @@
+"""The hand-carry check on synthetic recordings: every axis case, both quaternion orders, and carelessness of the carrier."""
+
+import math
+
+import numpy as np
+import pytest
+
+from hil.clock import ManualClock
+from hil.errors import RunError
+from hil.frames import FrameParams, Frames, multiply, proper_axes
+from hil.handcarry import MOVES, Step, collect, find_steps, judge, story
+from hil.pose import Pose
+from hil.sources import Recorded
+from visthrow.cli import main
+
+OURS = FrameParams("x,y,z", "x,y,z", "xyzw", 0.0, (0.0, 0.0, 0.0))
+RATE = 100.0
+TURNS = [(3, 1, 0.8), (4, 1, -0.8), (5, 0, 0.8), (6, 0, -0.8), (7, 2, 1.5)]
+
+
+def smooth(n):
+    return 0.5 - 0.5 * np.cos(np.pi * np.arange(n) / n)
+
+
+def about(axis, angle):
+    vector = [0.0, 0.0, 0.0]
+    vector[axis] = math.sin(angle / 2)
+    return (*vector, math.cos(angle / 2))
+
+
+def carried(frames: FrameParams, seed=0, moves=8, rest=1.2) -> list[Pose]:
+    """What a source with these frames says of a vehicle that is carried about, not quite straight."""
+    rng = np.random.default_rng(seed)
+    pos, quat, track = np.array([0.3, -0.2, 1.0]), about(2, math.radians(rng.uniform(-5, 5))), []
+    ways = {i: 0.5 * np.eye(3)[i] + rng.normal(0, 0.05, 3) for i in range(3)}
+    turned = {i: (axis, angle) for i, axis, angle in TURNS}
+    for i in range(moves):
+        track += [(pos, quat)] * int(rest * RATE)
+        for part in smooth(100):
+            axis, angle = turned.get(i, (0, 0.0))
+            track.append((pos + part * ways.get(i, np.zeros(3)), multiply(quat, about(axis, part * angle))))
+        pos, quat = track[-1]
+    track += [(pos, quat)] * int(rest * RATE)
+    poses = []
+    for n, (place, attitude) in enumerate(track):
+        jittered = multiply(attitude, (*rng.normal(0, 5e-4, 3), 1.0))
+        unit = tuple(x / math.hypot(*jittered) for x in jittered)
+        noisy = tuple((place + rng.normal(0, 5e-4, 3)).tolist())
+        poses.append(Frames(frames).source_from_pose(Pose(n / RATE, n / RATE, "vehicle", noisy, unit)))
+    return poses
+
+
+def made(axes="x,y,z", body_axes="x,y,z", quaternion="xyzw", yaw=0.0) -> FrameParams:
+    return FrameParams(axes, body_axes, quaternion, yaw, (0.0, 0.0, 0.0))
+
+
+@pytest.fixture(scope="module")
+def track():
+    """Poses in our frames."""
+    return carried(OURS)
+
+
+@pytest.fixture(scope="module")
+def steps(track):
+    """Moves in our frames; each case writes them as its source would."""
+    return find_steps(track)
+
+
+def check(steps, true: FrameParams, config: FrameParams):
+    source = Frames(true).source_from_pose
+    return judge([Step(source(step.before), source(step.after)) for step in steps], config)
+
+
+@pytest.mark.parametrize("axes", proper_axes())
+def test_every_axis_case_is_named(steps, axes):
+    for true in (made(axes=axes), made(body_axes=axes), made(axes=axes, body_axes="x,-y,-z", quaternion="wxyz")):
+        right = check(steps, true, true)
+        assert right.passed
+        assert right.fitting == true
+        wrong = check(steps, true, OURS)
+        assert wrong.passed == (true == OURS)
+        assert wrong.fitting == true
+        assert not wrong.mirrored
+
+
+def test_any_mixture_is_named(steps):
+    rng = np.random.default_rng(1)
+    for _ in range(25):
+        true, config = (
+            made(*rng.choice(proper_axes(), 2), rng.choice(["xyzw", "wxyz"]), float(rng.choice([0.0, 30.0, -40.0])))
+            for _ in range(2)
+        )
+        found = check(steps, true, config)
+        assert (found.fitting.axes, found.fitting.body_axes, found.fitting.quaternion) == (
+            true.axes, true.body_axes, true.quaternion,
+        )  # fmt: skip
+        assert found.fitting.yaw_offset_deg == pytest.approx(true.yaw_offset_deg, abs=8.0)
+
+
+def test_each_line_says_which_axis_failed(steps):
+    found = check(steps, made(axes="y,x,-z", body_axes="x,-y,-z", quaternion="wxyz"), made("x,-y,-z", "x,-y,-z", "wxyz"))
+    assert [line.passed for line in found.lines] == [False, False, True, True, True, True, False], "a yaw of 90 deg"
+    told = story(found, made("x,-y,-z", "x,-y,-z", "wxyz"))
+    assert 'would fit: axes = "y,x,-z"  (config: "x,-y,-z")' in told
+    assert "quaternion" not in told.split("would fit", 1)[1]
+    assert told.count("FAIL") == 3
+
+
+def test_a_left_handed_world_is_told(track):
+    mirrored = [Pose(p.stamp, p.arrival, p.body, (p.pos[0], -p.pos[1], p.pos[2]), p.quat) for p in track]
+    found = judge(find_steps(mirrored), OURS)
+    assert found.mirrored
+    assert not found.passed
+    assert "mirrored world" in story(found, OURS)
+
+
+def test_moves_that_were_left_out_are_counted():
+    with pytest.raises(RunError, match=r"5 moves between rests; expected 8.*8\. turn it to the left"):
+        judge(find_steps(carried(OURS, moves=5)), OURS)
+    with pytest.raises(RunError, match="expected 8"):
+        judge(find_steps(carried(OURS, rest=0.2)), OURS)
+    assert find_steps([]) == []
+    with pytest.raises(RunError, match="gives no attitude"):
+        find_steps([Pose(0.0, 0.0, "vehicle", (0.0, 0.0, 0.0))])
+    assert len(MOVES) == 8
+
+
+def test_a_live_source_is_told_the_next_move_and_left_when_all_are_made(track):
+    told, clock = [], ManualClock()
+    steps = collect(Recorded([*track, Pose(99.0, 99.0, "vehicle", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))]), clock, 60.0, told.append)
+    assert judge(steps, OURS).passed
+    assert [text.split(":")[0] for text in told] == [f"{i} of 8" for i in range(1, 9)]
+    assert clock.time < 20.0
+    clock = ManualClock()
+    assert len(collect(Recorded(track), clock, 8.0)) < 8
+    assert clock.time == pytest.approx(8.0, abs=0.3)
+
+
+@pytest.mark.parametrize("seed", range(1, 3))
+def test_other_carriers(seed):
+    true = made("z,x,y", "z,x,y")
+    assert judge(find_steps(carried(true, seed)), true).passed
+
+
+@pytest.mark.parametrize(("axes", "status"), [("y,x,-z", 0), ("x,-y,-z", 1)])
+def test_the_command_on_a_recording(tmp_path, capsys, axes, status):
+    path = tmp_path / "carried.csv"
+    rows = [(p.stamp, *p.pos, *p.quat) for p in carried(made("y,x,-z", "x,-y,-z", "wxyz"))]
+    path.write_text("t,x,y,z,qw,qx,qy,qz\n" + "\n".join(",".join(map(str, row)) for row in rows))
+    columns = (
+        '[{body="vehicle", time={names=["t"], unit="s"}, pos={names=["x", "y", "z"], unit="m"}, '
+        'quat={names=["qw", "qx", "qy", "qz"], unit="1"}}]'
+    )
+    settings = ("source.kind=csv", f"source.file={path}", f"source.columns={columns}", f'frames.vehicle.axes="{axes}"')
+    command = ["hil", "check", "--hand-carry", *(word for setting in settings for word in ("--set", setting))]
+    assert main(command) == status
+    out = capsys.readouterr().out
+    assert ("FAIL" in out) == bool(status)
+    assert ('would fit: axes = "y,x,-z"' in out) == bool(status)
