@@ -1,0 +1,98 @@
+"""The worlds of the tests: they import nothing of the package, and without a hidden effect they move as the simulator does."""
+
+import ast
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sim.hybrid import HybridSim
+from tests.plants import paper_plant
+from tests.worlds.fly import fly
+from tests.worlds.numbers import CHANGES, nominal
+from tests.worlds.pilot import Throw, Tracker
+from tests.worlds.world import Recipe, draw, fly_recipe, recorded
+
+WORLDS = Path(__file__).resolve().parents[1] / "worlds"
+PACKAGES = {"sim", "camera", "visthrow", "hil"}
+AGREEMENT = {
+    "rod": 1e-5,  # the same equations for one rod, solved otherwise; RK4 at 0.5 ms
+    "string": 1e-3,  # 24 point masses stand for 15 slender rods; a hard throw bends them differently
+    "chain": 3e-4,  # MuJoCo at 0.5 ms, actuators by the midpoint rule
+}
+"""Largest distance to the simulator at 0.25 ms [m], vehicle or ball, until the separation of a hard throw."""
+
+
+def imported(source: str) -> set[str]:
+    """Top-level packages that a module imports."""
+    out = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            out |= {name.name.split(".")[0] for name in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            out.add(node.module.split(".")[0])
+    return out
+
+
+def test_the_worlds_share_no_code_with_the_package():
+    for path in WORLDS.glob("*.py"):
+        assert not imported(path.read_text()) & PACKAGES, path.name
+        inside = {line for line in path.read_text().splitlines() if line.startswith("from tests.")}
+        assert all(line.startswith("from tests.worlds") for line in inside), path.name
+
+
+def test_the_check_of_imports_finds_one():
+    assert imported("def f():\n    from sim.hybrid import HybridSim\n") & PACKAGES
+
+
+@pytest.mark.parametrize("plant", sorted(AGREEMENT))
+def test_a_world_without_effect_moves_as_the_simulator(plant):
+    rng = np.random.default_rng(0)
+    throws = [Throw(rng, speed, heading) for speed, heading in ((7.0, 0.4), (11.0, -2.0))]
+    world = nominal()
+    world.ball_inertia = 0.0 if plant == "string" else world.ball_inertia
+    pilot = Tracker(throws, world.mass, world.ball_mass + world.rope_mass, rng)
+    flown = fly(plant, [world] * 2, pilot.command, throws, 1.9, (0.0, 0.0, 0.0), 0, np.full(2, 0.1))
+
+    params = paper_plant()
+    rope = dataclasses.replace(
+        params.rope, segments=1 if plant == "rod" else 15, payload_inertia=max(world.ball_inertia, 1e-9)
+    )
+    numerics = dataclasses.replace(params.sim, substep=2.5e-4, precision="float64")
+    sim = HybridSim(dataclasses.replace(params, rope=rope, sim=numerics), 2)
+    sim.place(np.array([throw.at(0.0)[0] for throw in throws]), battery_used=0.1)
+    worst = 0.0
+    for k in range(flown.commands.shape[1]):
+        sim.set_command(flown.commands[:, k], flown.release_at <= k * 0.02 + 1e-9)
+        sim.step()
+        hangs = sim.get("attached") != 0
+        now = (k + 1) * 20
+        both = np.maximum(
+            np.linalg.norm(sim.get("pos_w") - flown.pos[:, now], axis=1),
+            np.linalg.norm(sim.get("payload_pos_w") - flown.ball[:, now], axis=1),
+        )
+        worst = max([worst, *both[hangs]])
+    assert 0.0 < worst < AGREEMENT[plant]
+    np.testing.assert_allclose(flown.separated_at - flown.release_at, 0.11, atol=1e-9)
+
+
+def test_every_hidden_effect_shows_in_the_flight():
+    """A change that moves nothing would make a world that cannot be diagnosed count as one that was missed."""
+    large = {"motor_tau": 0.01, "cmd_delay": 0.01, "release_lag": 0.02, "mount_x": 0.01, "mass_quad": 0.01}
+    quiet = fly_recipe(Recipe(3, "rod", {}, free=2, free_seconds=3.0, throws=2))
+    for name in ("thrust_gain", "com_x", "rope_length", "payload_drag", "wind_y", "lag_tension", "kick_x", *large):
+        theta = large.get(name, 0.02)
+        flown = fly_recipe(Recipe(3, "rod", {name: theta}, free=2, free_seconds=3.0, throws=2))
+        moved = max(np.abs(a.ball - b.ball).max() for a, b in zip(quiet, flown))
+        assert moved > 1e-3, name
+    assert set(large) <= set(CHANGES)
+
+
+def test_a_world_follows_from_its_seed_and_its_digest_from_its_truth():
+    recipe = draw(7, 1, 15.0, plants=("rod",), free=1, free_seconds=1.0, throws=1)
+    once, again = (recorded(recipe, fly_recipe(recipe)) for _ in range(2))
+    for a, b in zip(once, again):
+        np.testing.assert_array_equal(a["pos"], b["pos"])
+    other = dataclasses.replace(recipe, effects={k: -v for k, v in recipe.effects.items()})
+    assert recipe.digest() != other.digest() and recipe.digest() == dataclasses.replace(recipe).digest()

@@ -1,0 +1,153 @@
+"""Draw a world, hide something in it, fly it, and put down what a motion-capture hall would have recorded.
+
+A world is a plant, hidden effects with their sizes in floors, gusts, sensor noise and flights: free flights that together
+last a minute, and throws. Everything follows from one seed.
+"""
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass, field
+
+import numpy as np
+
+from tests.worlds.fly import Flights, fly
+from tests.worlds.numbers import LANDING_HEIGHT, hide
+from tests.worlds.pilot import PERIOD, FreeFlight, Throw, Tracker
+
+FLOORS = {
+    "rope_length": 5e-4, "cmd_delay": 1e-3, "motor_tau": 1e-3, "release_lag": 2e-3, "payload_drag": 1e-4,
+    "wind_x": 0.03, "wind_y": 0.03, "rotor_drag": 2e-3, "com_x": 1e-4, "com_y": 1e-4, "mount_x": 5e-4,
+    "frame_tilt_x": 4e-4, "frame_tilt_y": 4e-4, "marker_rot_x": 6e-4, "marker_rot_y": 6e-4, "thrust_gain": 2e-3,
+    "mass_quad": 3e-4, "mass_payload": 3e-4, "rate_gain": 1e-2, "inertia_x": 6e-3, "inertia_y": 6e-3,
+    "motor_1": 2e-3, "motor_2": 2e-3, "motor_3": 2e-3, "motor_4": 2e-3, "mocap_delay_quad": 5e-4,
+    "mocap_delay_payload": 5e-4, "translational_lift": 3e-4, "lag_tension": 2e-3, "rope_mass": 3e-4,
+}  # fmt: skip
+"""Size below which an effect does not matter: SI units, relative for gains and inertias (5 mm of landing, or a tenth of the noise)."""
+PLANTS = ("chain", "string", "rod")
+GUSTS = (0.015, 1.5e-4, 6e-4)
+NOISE = {"pos": 5e-4, "att": np.radians(0.2), "ball": 8e-4}
+RATE = 200.0
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """What a world is made of; ``effects`` is the truth."""
+
+    seed: int
+    plant: str
+    effects: dict[str, float] = field(default_factory=dict)
+    floors: float = 0.0
+    noise: float = 1.0
+    gusts: float = 1.0
+    dropouts: float = 0.0
+    free: int = 6
+    free_seconds: float = 10.0
+    throws: int = 10
+    low: bool = False  # free flights near the ground
+
+    def digest(self) -> str:
+        """SHA-256 of the truth, to be published before a verdict is read."""
+        return hashlib.sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()
+
+
+def draw(seed: int, count: int, floors: float, names=tuple(FLOORS), plants=PLANTS, **options) -> Recipe:
+    """A world with ``count`` effects of ``floors`` times their floor, of random sign."""
+    rng = np.random.default_rng(seed)
+    plant = str(rng.choice(plants))
+    chosen = rng.choice(names, size=count, replace=False) if count else []
+    sizes = rng.uniform(0.9, 1.1, len(chosen)) * floors * rng.choice([-1.0, 1.0], len(chosen))
+    return Recipe(
+        seed, plant, {str(n): float(s * FLOORS[n]) for n, s in zip(chosen, sizes)}, floors if count else 0.0, **options
+    )
+
+
+def world_of(recipe: Recipe):
+    """Numbers of the recipe's world. The string's ball is a point."""
+    world = hide(recipe.effects)
+    if recipe.plant == "string":
+        world.ball_inertia = 0.0
+    return world
+
+
+def lanes_of(recipe: Recipe, rng: np.random.Generator):
+    """References of all flights: free ones first, then throws at rising speeds."""
+    free = [FreeFlight(rng, height=0.75 if recipe.low else 1.9, speed=0.5 if recipe.low else 1.0) for _ in range(recipe.free)]
+    speeds = np.linspace(5.0, 11.0, max(recipe.throws, 1))
+    throws = [Throw(rng, s, rng.uniform(-np.pi, np.pi)) for s in speeds[: recipe.throws]]
+    return free, throws
+
+
+def fly_recipe(recipe: Recipe) -> list[Flights]:
+    """Fly the world: one :class:`Flights` of the free flights, one of the throws."""
+    rng = np.random.default_rng(recipe.seed + 1)
+    world, known = world_of(recipe), hide({})
+    out = []
+    for lanes, seconds in zip(lanes_of(recipe, rng), (recipe.free_seconds, 2.6)):
+        if lanes:
+            pilot = Tracker(lanes, known.mass, known.ball_mass + known.rope_mass, rng)
+            gusts = [recipe.gusts * g for g in GUSTS]
+            used = rng.uniform(0.0, 0.4, len(lanes))
+            out.append(fly(recipe.plant, [world] * len(lanes), pilot.command, lanes, seconds, gusts, recipe.seed + 2, used))
+    return out
+
+
+def small_turn(v: np.ndarray) -> np.ndarray:
+    """Rotation matrices of rotation vectors, shape (..., 3) to (..., 3, 3)."""
+    angle = np.linalg.norm(v, axis=-1)[..., None, None]
+    k = np.zeros((*v.shape[:-1], 3, 3))
+    k[..., 0, 1], k[..., 0, 2], k[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
+    k -= np.swapaxes(k, -1, -2)
+    safe = np.where(angle > 1e-12, angle, 1.0)
+    return np.eye(3) + np.sin(angle) / safe * k + (1 - np.cos(angle)) / safe**2 * (k @ k)
+
+
+def matrix(q: np.ndarray) -> np.ndarray:
+    """Rotation matrices of quaternions wxyz, shape (T, 4) to (T, 3, 3)."""
+    w, v = q[..., :1, None], q[..., 1:]
+    k = np.zeros((*v.shape[:-1], 3, 3))
+    k[..., 0, 1], k[..., 0, 2], k[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
+    k -= np.swapaxes(k, -1, -2)
+    return np.eye(3) + 2 * w * k + 2 * (k @ k)
+
+
+def quaternion(r: np.ndarray) -> np.ndarray:
+    """Quaternions wxyz of rotation matrices far from half turns about x or y, shape (T, 3, 3) to (T, 4)."""
+    w = 0.5 * np.sqrt(np.maximum(1 + r[:, 0, 0] + r[:, 1, 1] + r[:, 2, 2], 1e-12))
+    return np.stack(
+        [w, (r[:, 2, 1] - r[:, 1, 2]) / (4 * w), (r[:, 0, 2] - r[:, 2, 0]) / (4 * w), (r[:, 1, 0] - r[:, 0, 1]) / (4 * w)], -1
+    )
+
+
+def recorded(recipe: Recipe, flights: list[Flights]) -> list[dict]:
+    """What was recorded of each flight: plain arrays, SI units, quaternions wxyz; NaN where a frame was lost.
+
+    Keys: ``time``, ``pos``, ``quat``, ``ball`` (200 Hz); ``sent_time``, ``sent`` (N, rad/s), ``release`` (its time or None);
+    ``truth_landing`` is what the world knows and no log tells.
+    """
+    rng = np.random.default_rng(recipe.seed + 3)
+    w = world_of(recipe)
+    tilt, turn = small_turn(w.frame_tilt), small_turn(w.marker_turn)
+    out = []
+    for f in flights:
+        for e in range(len(f.pos)):
+            t = np.arange(0.02, f.time[-1] - 1e-9, 1 / RATE)
+            at = lambda series, late: np.stack([np.interp(t - late, f.time, c) for c in series.T], -1)  # noqa: E731
+            rot = matrix(at(f.quat[e], w.quad_stamp) / np.linalg.norm(at(f.quat[e], w.quad_stamp), axis=1, keepdims=True))
+            pos = (1 + w.frame_scale) * (at(f.pos[e], w.quad_stamp) + rot @ w.marker_off) @ tilt.T
+            ball = (1 + w.frame_scale) * at(f.ball[e], w.ball_stamp) @ tilt.T
+            noise = small_turn(recipe.noise * NOISE["att"] * rng.normal(size=(len(t), 3)))
+            quat = quaternion(tilt @ rot @ turn @ noise)
+            pos = pos + recipe.noise * NOISE["pos"] * rng.normal(size=pos.shape)
+            ball = ball + recipe.noise * NOISE["ball"] * rng.normal(size=ball.shape)
+            down = np.flatnonzero(f.ball[e][:, 2] <= LANDING_HEIGHT)
+            landed = f.time[down[0]] if len(down) else np.inf
+            ball[t > landed] = np.nan
+            lost = rng.random(len(t)) < recipe.dropouts
+            pos[lost], quat[lost], ball[lost] = np.nan, np.nan, np.nan
+            release = f.release_at[e] if np.isfinite(f.release_at[e]) else None
+            out.append(
+                {"time": t, "pos": pos, "quat": quat, "ball": ball, "sent_time": np.arange(f.commands.shape[1]) * PERIOD,
+                 "sent": f.commands[e], "release": release, "volt": f.volt[e],
+                 "truth_landing": f.ball[e][down[0]] if len(down) else None}
+            )  # fmt: skip
+    return out
