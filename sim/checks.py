@@ -67,7 +67,12 @@ def check_numerics(sim: SimParams) -> None:
 
 def check_release(release: ReleaseParams) -> None:
     """Raise ValueError for a negative lag or fewer than two samples of the flight."""
-    require_not_negative("release", lag=release.lag)
+    require_not_negative("release", lag=release.lag, rope_tail=release.rope_tail)
+    for name in ("lag_tension", "kick_up", "kick_along"):
+        if not math.isfinite(getattr(release, name)):
+            raise ValueError(f"release.{name} is {getattr(release, name)}: expected a finite value")
+    if release.rope_tail > 1.0:
+        raise ValueError(f"release.rope_tail is {release.rope_tail}: expected a share from 0 to 1")
     if release.clearance_samples < 2:
         raise ValueError(f"release.clearance_samples is {release.clearance_samples}: expected 2 or more")
 

@@ -127,7 +127,7 @@ class HybridSim:
             )
         self.params, self.count, self.device, self.seed = params, count, device, seed
         self.gravity = gravity
-        self.extensions = extensions_of(vehicles, ropes, airs) | extensions
+        self.extensions = extensions_of(vehicles, ropes, airs, [params.release]) | extensions
         self.types, self._step, self._reset = _kernels(params, direct, self.extensions)
         t = self.types
         self._vehicles = wp.array(pack_vehicle(t, vehicles, kinds_of(params.vehicle)), dtype=t.Vehicle, device=device)

@@ -227,8 +227,12 @@ class ReleaseParams:
     """Release mechanism and the flight that follows.
 
     The latch trips when the release command exceeds ``threshold`` and does not untrip; the payload separates ``lag``
-    later. From the payload's position p and velocity v at separation:
+    later; with ``lag_tension``, ``lag + lag_tension (pull - m_p g)`` later, not below 0, with the rope's pull at the latch.
+    From the payload's position p and velocity v at separation:
     ``t_hit = (v_z + sqrt(v_z^2 + 2 g (p_z - landing_height))) / g``; under drag the flight is integrated by RK4.
+
+    A rope that leaves with the payload shares its momentum: in the mean the payload flies on with
+    ``v + rope_tail (v_c - v)``, v_c the velocity of the common centre of mass. The replay flies the loose rope itself.
     """
 
     threshold: float  # [-]
@@ -236,6 +240,10 @@ class ReleaseParams:
     landing_height: float  # z of the payload's centre at impact [m]
     clearance_samples: int  # K points of the flight at which the distance to the vehicle is taken
     clearance_margin: float  # d_m [m]
+    lag_tension: float = 0.0  # more lag for every newton of the rope's pull at the latch above the payload's weight [s/N]
+    kick_up: float = 0.0  # speed that the mechanism gives the payload as it lets go, along world z [m/s]
+    kick_along: float = 0.0  # along the rope's last segment, away from the vehicle [m/s]
+    rope_tail: float = 0.0  # share of the rope that leaves with the payload [-]
 
 
 @dataclass(frozen=True)

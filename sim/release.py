@@ -46,6 +46,48 @@ def clearance(pos_w: Any, vel_w: Any, gravity: Any, time: Any, vehicle_w: Any, s
     return least
 
 
+def build_letting_go(t: Types, extensions: frozenset[str]) -> SimpleNamespace:
+    """How the payload leaves. Equations: :class:`sim.params.ReleaseParams`.
+
+    Returns:
+        Namespace of Warp functions ``lag(r, rope, pull, gravity)`` [s] from the rope's pull at the latch [N], and
+        the payload's velocity [m/s] after ``kick(r, vel_w, along_w)`` along world z and the last segment's direction and
+        after ``tail(r, vel_w, com_vel_w)`` with the velocity of the common centre of mass of payload and rope.
+        Each does only what ``extensions`` name.
+    """
+    real, vec3, Rope, Release = t.real, t.vec3, t.Rope, t.Release
+
+    @wp.func
+    def fixed_lag(r: Release, rope: Rope, pull: real, gravity: real):
+        return r.lag
+
+    @wp.func
+    def lag_by_pull(r: Release, rope: Rope, pull: real, gravity: real):
+        return wp.max(r.lag + r.lag_tension * (pull - rope.payload_mass * gravity), real(0.0))
+
+    @wp.func
+    def no_kick(r: Release, vel_w: vec3, along_w: vec3):
+        return vel_w
+
+    @wp.func
+    def kick(r: Release, vel_w: vec3, along_w: vec3):
+        return vel_w + r.kick_along * along_w + vec3(real(0.0), real(0.0), r.kick_up)
+
+    @wp.func
+    def no_tail(r: Release, vel_w: vec3, com_vel_w: vec3):
+        return vel_w
+
+    @wp.func
+    def tail(r: Release, vel_w: vec3, com_vel_w: vec3):
+        return vel_w + r.rope_tail * (com_vel_w - vel_w)
+
+    return SimpleNamespace(
+        lag=lag_by_pull if "lag_tension" in extensions else fixed_lag,
+        kick=kick if "kick" in extensions else no_kick,
+        tail=tail if "rope_tail" in extensions else no_tail,
+    )
+
+
 def build_ballistic(t: Types, acceleration, dragging: bool) -> SimpleNamespace:
     """Flight of the payload alone: in closed form in still, thin air, by RK4 under drag.
 

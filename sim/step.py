@@ -55,6 +55,7 @@ def build_step(
     payload = build_payload(t, extensions)
     coupled = build_coupled_step(t, flow, rate, motor_advance, chain, payload, extensions)
     ballistic = rel.build_ballistic(t, payload.flight_acceleration, "payload_drag" in extensions)
+    leaving = rel.build_letting_go(t, extensions)
     load, store = st.build_access(t, State)
     vec3_limit = real(SPEED_LIMIT)
 
@@ -99,7 +100,9 @@ def build_step(
     ):
         """Write what follows from the payload's state at separation."""
         mount = s.pos_w + wp.quat_rotate(s.quat_wb, rope.mount)
-        pos, vel = chain.payload(rope, mount, coupled.mount_velocity(rope, s), n, u)
+        mount_vel = coupled.mount_velocity(rope, s)
+        pos, vel = chain.payload(rope, mount, mount_vel, n, u)
+        vel = leaving.kick(r, leaving.tail(r, vel, chain.com_velocity(rope, mount_vel, u)), n[L - 1])
         time = ballistic.time_to_height(rope, air, pos, vel, r.landing_height, gravity)
         out.payload_pos_w[env] = pos
         out.payload_vel_w[env] = vel
@@ -152,7 +155,7 @@ def build_step(
         timer = state.release_timer[env]
         attached = state.attached[env]
         if release[env] != 0 and timer < real(0.0) and attached != 0:
-            timer = r.lag
+            timer = leaving.lag(r, rope, chain.pull(rope, stiffness), gravity)
         tiny = real(1.0e-6)
         status = int(0)
         if not taken:

@@ -40,11 +40,11 @@ class Types:
         self.mat33 = wp.types.matrix((3, 3), real)
         self.quat = wp.types.quaternion(real)
         self.Mixer = make_struct("Mixer", {"roll": self.vec4, "pitch": self.vec4, "yaw": self.vec4})
-        self.Vehicle = self._from_dataclass(P.VehicleParams, {"mixer": self.Mixer})
-        self.Release = self._from_dataclass(P.ReleaseParams, {})
-        self.Randomization = self._from_dataclass(P.RandomizationParams, {})
+        self.Vehicle = self.from_dataclass(P.VehicleParams, {"mixer": self.Mixer})
+        self.Release = self.from_dataclass(P.ReleaseParams, {})
+        self.Randomization = self.from_dataclass(P.RandomizationParams, {})
         pushes = {"push_w": self.vec3, "twist_b": self.vec3, "payload_push_w": self.vec3}
-        self.Air = self._from_dataclass(P.AirParams, pushes)
+        self.Air = self.from_dataclass(P.AirParams, pushes)
         self.Rope = make_struct(
             "Rope",
             {
@@ -102,10 +102,10 @@ class Types:
         if typing.get_origin(annotation) is tuple:
             return {3: self.vec3, 4: self.vec4}[len(typing.get_args(annotation))]
         if dataclasses.is_dataclass(annotation):
-            return self._from_dataclass(annotation, {})
+            return self.from_dataclass(annotation, {})
         return None  # kinds are chosen when the kernel is built; they are no run-time parameters
 
-    def _from_dataclass(self, schema: type, extra: dict[str, type]) -> type:
+    def from_dataclass(self, schema: type, extra: dict[str, type]) -> type:
         hints = typing.get_type_hints(schema)
         fields = {f.name: self._field_type(hints[f.name]) for f in dataclasses.fields(schema)}
         return make_struct(schema.__name__, {k: v for k, v in fields.items() if v is not None} | extra)
@@ -147,13 +147,19 @@ EXTENSIONS = {
     "ground_effect": "thrust near the ground",
     "payload_drag": "air drag of the payload",
     "mount_damping": "friction of the rope's mount",
+    "lag_tension": "release lag that depends on the rope's pull",
+    "kick": "speed given to the payload at the release",
+    "rope_tail": "rope that leaves with the payload",
     "push": "forces from outside",
 }
 """Parts of the blocks that a kernel holds only if it was built for them, and what they are."""
 
 
 def extensions_of(
-    vehicles: Iterable[P.VehicleParams], ropes: Iterable[P.RopeParams] = (), airs: Iterable[P.AirParams] = ()
+    vehicles: Iterable[P.VehicleParams],
+    ropes: Iterable[P.RopeParams] = (),
+    airs: Iterable[P.AirParams] = (),
+    releases: Iterable[P.ReleaseParams] = (),
 ) -> frozenset[str]:
     """Names of :data:`EXTENSIONS` without which one of these plants would not be simulated in full."""
     needed = set()
@@ -163,6 +169,9 @@ def extensions_of(
         needed |= {name for name in ("payload_drag", "mount_damping") if getattr(r, name) != 0.0}
     for a in airs:
         needed |= ({"wind"} if any(a.wind_w) else set()) | ({"ground_effect"} if a.ground_effect else set())
+    for x in releases:
+        needed |= {name for name in ("lag_tension", "rope_tail") if getattr(x, name) != 0.0}
+        needed |= {"kick"} if x.kick_up or x.kick_along else set()
     return frozenset(needed)
 
 

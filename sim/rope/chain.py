@@ -355,6 +355,35 @@ def build_chain(t: Types, segments: int, extensions: frozenset[str] = frozenset(
         return pos + rope.payload_offset * n[L - 1], vel + rope.payload_offset * u[L - 1]
 
     @wp.func
+    def momentum(rope: Rope, u: wp.array(dtype=vec3)):
+        """Linear momentum [N s] of the chain in a frame that moves with the mount."""
+        total = vec3()
+        for i in range(L):
+            m, c, inertia = rod(rope, i)
+            total += (below(rope, i) * rope.segment_length + c * m) * u[i]
+        return total
+
+    @wp.func
+    def lower_joint(rope: Rope):
+        return rope.segment_length
+
+    @wp.func
+    def payload_center(rope: Rope):
+        return rope.last_center
+
+    first_arm = payload_center if L == 1 else lower_joint
+
+    @wp.func
+    def com_velocity(rope: Rope, mount_vel_w: vec3, u: wp.array(dtype=vec3)):
+        """Velocity [m/s] of the centre of mass of rope and payload, world frame."""
+        return mount_vel_w + momentum(rope, u) * (real(1.0) / rope.total_mass)
+
+    @wp.func
+    def pull(rope: Rope, stiffness: wp.array(dtype=real)):
+        """Force [N] along the rope at the mount, from the geometric stiffness of the first rod (tension times arm)."""
+        return stiffness[0] / first_arm(rope)
+
+    @wp.func
     def speed_first(rope: Rope, mount_vel_w: vec3, u: wp.array(dtype=vec3), k1: wp.array(dtype=vec3), h: real):
         """Velocity of the payload's centre at the state [m/s], world frame."""
         vel = mount_vel_w
@@ -370,15 +399,6 @@ def build_chain(t: Types, segments: int, extensions: frozenset[str] = frozenset(
             vel += rope.segment_length * (u[i] + h * k1[i])
         return vel + rope.payload_offset * (u[L - 1] + h * k1[L - 1])
 
-    @wp.func
-    def momentum(rope: Rope, u: wp.array(dtype=vec3)):
-        """Linear momentum [N s] of the chain in a frame that moves with the mount."""
-        total = vec3()
-        for i in range(L):
-            m, c, inertia = rod(rope, i)
-            total += (below(rope, i) * rope.segment_length + c * m) * u[i]
-        return total
-
     return SimpleNamespace(
         up_first=up_first,
         up_second=up_second,
@@ -390,6 +410,8 @@ def build_chain(t: Types, segments: int, extensions: frozenset[str] = frozenset(
         speed_second=speed_second,
         momentum=momentum,
         upper_damping=upper_damping,
+        com_velocity=com_velocity,
+        pull=pull,
         segments=L,
         vec2=vec2,
     )

@@ -1,0 +1,419 @@
+"""The replay as one kernel: a lane flies one window of a recorded flight from a state of its own with parameters of its own.
+
+Every switch of the command, the latch, the separation and the knots of the latent forces end a step exactly; measured
+stamps lie inside steps and are read from the cubic through both ends. One thread a lane, no atomics.
+"""
+
+from dataclasses import dataclass
+
+import warp as wp
+
+from sim import state as st
+from sim.coupling import build_coupled_step
+from sim.params import VehicleParams
+from sim.quadrotor.rigid_body import build_flow, quat_rate
+from sim.quadrotor.thrust import rotor_thrust
+from sim.release import build_letting_go
+from sim.rope.chain import build_chain
+from sim.rope.loose import build_loose_step
+from sim.rope.payload import build_payload
+from sim.sensing import SensingParams, build_sensing
+from sim.structs import EXTENSIONS, Types, make_struct
+
+EVERYTHING = frozenset(EXTENSIONS)
+"""The replay has every extension built in, so that lanes may differ in all of them."""
+
+ATTACHED, LOOSE, NO_PAYLOAD = 1, 0, 2
+"""How the payload starts: on the rope, flying, or not there."""
+
+STATE_FIELDS = st.QUAD_FIELDS | {
+    "cable_dir_w": ("vec3", True),
+    "cable_vel_w": ("vec3", True),
+    "stiffness": ("real", True),
+    "payload_pos_w": ("vec3", False),  # where it starts loose, and where it is at the end
+    "payload_vel_w": ("vec3", False),
+}
+
+WINDOW_FIELDS = {
+    "start": ("real", False),  # [s], clock of the flight
+    "end": ("real", False),
+    "first_knot": ("real", False),  # of the latent forces
+    "knots": ("int", False),
+    "payload": ("int", False),  # ATTACHED, LOOSE or NO_PAYLOAD
+    "latch": ("real", False),  # of the release, any time after the end if none
+    "separated": ("real", False),  # when a loose payload left
+    "clock_zero": ("real", False),  # start of the flight
+    "command_first": ("int", False),  # range of the flight's commands
+    "command_last": ("int", False),
+    "vehicle_first": ("int", False),  # ranges of the measured stamps of this window
+    "vehicle_count": ("int", False),
+    "payload_first": ("int", False),
+    "payload_count": ("int", False),
+    "gyro_first": ("int", False),
+    "gyro_count": ("int", False),
+}
+
+LANE_FIELDS = {
+    "window": ("int", False),
+    "plant": ("int", False),  # row of the parameters
+    "state": ("int", False),  # row of the initial states
+    "axis": ("int", False),  # of its latent force: 0-2 vehicle force, 3-5 vehicle torque, 6-8 payload force, or -1
+    "knot": ("int", False),
+    "size": ("real", False),  # of the latent force at its knot [N], [N m]
+    "substep": ("real", False),  # largest step [s]
+    "keep": ("int", False),  # first row of its knots' states in the knot arrays, or -1
+}
+
+KNOT_FIELDS = {
+    "pos_w": ("vec3", False),
+    "vel_w": ("vec3", False),
+    "quat_wb": ("quat", False),
+    "rate_b": ("vec3", False),
+    "thrust": ("real", False),
+    "payload_pos_w": ("vec3", False),
+    "payload_vel_w": ("vec3", False),
+    "tension": ("real", False),
+}
+
+DATA_FIELDS = {
+    "command_time": ("real", False),
+    "command": ("vec4", False),
+    "vehicle_time": ("real", False),
+    "vehicle_quat": ("quat", False),  # measured; attitudes are told against them
+    "payload_time": ("real", False),
+    "gyro_time": ("real", False),
+}
+
+
+@dataclass(frozen=True)
+class ReplayKernel:
+    """The kernel of one choice of blocks and the structs that it takes."""
+
+    replay: wp.Kernel
+    State: type
+    Windows: type
+    Lanes: type
+    Knots: type
+    Data: type
+    Sensing: type
+
+
+def build_replay(t: Types, vehicle: VehicleParams, segments: int) -> ReplayKernel:
+    """Compose the kernel.
+
+    Args:
+        t: types of the wanted precision.
+        vehicle: its kinds are read here.
+        segments: of the rope.
+    """
+    real, vec3, quat = t.real, t.vec3, t.quat
+    Vehicle, Rope, Release, Air, QuadState = t.Vehicle, t.Rope, t.Release, t.Air, t.QuadState
+    L = segments
+    State = st.array_struct(t, "ReplayState", STATE_FIELDS)
+    Windows = st.array_struct(t, "Windows", WINDOW_FIELDS)
+    Lanes = st.array_struct(t, "Lanes", LANE_FIELDS)
+    Knots = st.array_struct(t, "Knots", KNOT_FIELDS)
+    Data = st.array_struct(t, "Recorded", DATA_FIELDS)
+    Sensing = t.from_dataclass(SensingParams, {})
+    flow, rate, motor_advance = build_flow(t, vehicle, EVERYTHING)
+    chain = build_chain(t, L, EVERYTHING)
+    payload = build_payload(t, EVERYTHING)
+    coupled = build_coupled_step(t, flow, rate, motor_advance, chain, payload, EVERYTHING)
+    loose_step = build_loose_step(t, chain, payload)
+    leaving = build_letting_go(t, EVERYTHING)
+    see_pose, see_point, see_rate = build_sensing(t, Sensing)
+    load_quad, store_quad = st.build_access(t, State)
+    Ball = make_struct("Ball", {"pos": vec3, "vel": vec3, "root": vec3, "root_vel": vec3, "tail": vec3, "tail_vel": vec3})
+    Steps = make_struct("Steps", {"t0": real, "t1": real, "h": real})
+    Pointers = make_struct("Pointers", {"vehicle": wp.int32, "payload": wp.int32, "gyro": wp.int32})
+    attached_code, loose_code = ATTACHED, LOOSE
+
+    @wp.func
+    def blend_vec(a: vec3, va: vec3, b: vec3, vb: vec3, s: real, h: real):
+        """Cubic through two points with their derivatives."""
+        d = b - a
+        bend = s * (real(1.0) - s)
+        return a + s * d + bend * ((real(1.0) - s) * (h * va - d) - s * (h * vb - d))
+
+    @wp.func
+    def blend_quat(a: quat, va: quat, b: quat, vb: quat, s: real, h: real):
+        d = b - a
+        bend = s * (real(1.0) - s)
+        q = a + d * s + ((va * h - d) * (real(1.0) - s) - (vb * h - d) * s) * bend
+        return wp.normalize(q)
+
+    @wp.func
+    def late(x: Sensing, windows: Windows, w: int, stamp: real, delay: real):
+        """Time of the state that a stamp shows."""
+        return stamp - delay - x.clock_rate * (stamp - windows.clock_zero[w])
+
+    @wp.func
+    def tell(
+        p: Vehicle, x: Sensing, data: Data, windows: Windows, w: int, a: QuadState, b: QuadState, before: vec3,
+        pa: vec3, va: vec3, pb: vec3, vb: vec3, k: Steps, last: bool, at: Pointers, out: wp.array2d(dtype=vec3), lane: int,
+    ):  # fmt: skip
+        """Write every measured stamp that falls into a step; the window's last step tells all that is left."""
+        next = at
+        vehicles = windows.vehicle_count[w]
+        payloads = windows.payload_count[w]
+        span = k.h
+        while next.vehicle < vehicles:
+            i = windows.vehicle_first[w] + next.vehicle
+            time = late(x, windows, w, data.vehicle_time[i], x.vehicle_delay)
+            if time > k.t1 and not last:
+                break
+            s = (time - k.t0) / span
+            pos = blend_vec(a.pos_w, a.vel_w, b.pos_w, b.vel_w, s, span)
+            q = blend_quat(
+                a.quat_wb, quat_rate(a.quat_wb, a.rate_b), b.quat_wb, quat_rate(b.quat_wb, b.rate_b), s, span
+            )
+            seen, turn = see_pose(x, p.body.com, pos, q, data.vehicle_quat[i])
+            out[2 * next.vehicle, lane] = seen
+            out[2 * next.vehicle + 1, lane] = turn
+            next.vehicle = next.vehicle + 1
+        while next.payload < payloads:
+            time = late(
+                x, windows, w, data.payload_time[windows.payload_first[w] + next.payload], x.vehicle_delay + x.payload_delay
+            )
+            if time > k.t1 and not last:
+                break
+            s = (time - k.t0) / span
+            out[2 * vehicles + next.payload, lane] = see_point(x, a.quat_wb, blend_vec(pa, va, pb, vb, s, span))
+            next.payload = next.payload + 1
+        while next.gyro < windows.gyro_count[w]:
+            time = late(x, windows, w, data.gyro_time[windows.gyro_first[w] + next.gyro], x.gyro_delay)
+            if time > k.t1 and not last:
+                break
+            s = (time - k.t0) / span
+            bend = b.rate_b - a.rate_b - (a.rate_b - before)  # a parabola through three ends of steps
+            turning = a.rate_b + s * (b.rate_b - a.rate_b) - real(0.5) * s * (real(1.0) - s) * bend
+            out[2 * vehicles + payloads + next.gyro, lane] = see_rate(x, turning)
+            next.gyro = next.gyro + 1
+        return next
+
+    @wp.func
+    def push_at(air: Air, axis: int, size: real, share: real):
+        """The latent force of a lane at a share of its peak."""
+        out = air
+        force = vec3()
+        if axis >= 0:
+            force[axis % 3] = size * wp.max(share, real(0.0))
+        if axis >= 6:
+            out.payload_push_w = force
+        elif axis >= 3:
+            out.twist_b = force
+        else:
+            out.push_w = force
+        return out
+
+    @wp.func
+    def payload_now(r: Release, ball: Ball):
+        return ball.pos + r.rope_tail * (ball.tail - ball.pos), ball.vel + r.rope_tail * (ball.tail_vel - ball.vel)
+
+    @wp.func
+    def fly_ball(rope: Rope, air: Air, ball: Ball, g: vec3, h: real):
+        """RK4 step of the payload alone."""
+        out = ball
+        half = real(0.5) * h
+        a1 = payload.flight_acceleration(rope, air, ball.vel, g)
+        v2 = ball.vel + half * a1
+        a2 = payload.flight_acceleration(rope, air, v2, g)
+        v3 = ball.vel + half * a2
+        a3 = payload.flight_acceleration(rope, air, v3, g)
+        v4 = ball.vel + h * a3
+        a4 = payload.flight_acceleration(rope, air, v4, g)
+        two = real(2.0)
+        out.pos = ball.pos + (h / real(6.0)) * (ball.vel + two * v2 + two * v3 + v4)
+        out.vel = ball.vel + (h / real(6.0)) * (a1 + two * a2 + two * a3 + a4)
+        return out
+
+    @wp.func
+    def let_go(r: Release, rope: Rope, s: QuadState, n: wp.array(dtype=vec3), u: wp.array(dtype=vec3)):
+        """The payload and the loose rope at the separation."""
+        ball = Ball()
+        ball.root = s.pos_w + wp.quat_rotate(s.quat_wb, rope.mount)
+        ball.root_vel = coupled.mount_velocity(rope, s)
+        pos, vel = chain.payload(rope, ball.root, ball.root_vel, n, u)
+        ball.pos = pos
+        ball.vel = leaving.kick(r, vel, n[L - 1])
+        ball.root_vel = ball.root_vel + (ball.vel - vel)
+        ball.tail = pos
+        ball.tail_vel = ball.vel
+        return ball
+
+    @wp.func
+    def knot_of(knots: Knots, row: int, p: Vehicle, rope: Rope, s: QuadState, pos: vec3, vel: vec3, pull: real):
+        knots.pos_w[row] = s.pos_w
+        knots.vel_w[row] = s.vel_w
+        knots.quat_wb[row] = s.quat_wb
+        knots.rate_b[row] = s.rate_b
+        f = rotor_thrust(p, s.motor_speed, s.voltage)
+        knots.thrust[row] = f[0] + f[1] + f[2] + f[3]
+        knots.payload_pos_w[row] = pos
+        knots.payload_vel_w[row] = vel
+        knots.tension[row] = pull
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def replay_kernel(
+        # Params:
+        vehicles: wp.array(dtype=Vehicle),
+        ropes: wp.array(dtype=Rope),
+        releases: wp.array(dtype=Release),
+        airs: wp.array(dtype=Air),
+        sensings: wp.array(dtype=Sensing),
+        knot_spacing: real,
+        gamma: real,
+        max_turn: real,
+        gravity: real,
+        # State in:
+        starts: State,
+        # In:
+        windows: Windows,
+        lanes: Lanes,
+        data: Data,
+        first_lane: int,
+        # State out:
+        ends: State,
+        knots: Knots,
+        # Out:
+        out: wp.array2d(dtype=vec3),
+    ):
+        lane = wp.tid() + first_lane
+        w = lanes.window[lane]
+        row = lanes.plant[lane]
+        p = vehicles[row]
+        rope = ropes[row]
+        r = releases[row]
+        air = airs[row]
+        x = sensings[row]
+        g = vec3(real(0.0), real(0.0), -gravity)
+        start = lanes.state[lane]
+        s = load_quad(starts, start)
+        n = wp.zeros(shape=(L,), dtype=vec3)
+        u = wp.zeros(shape=(L,), dtype=vec3)
+        stiffness = wp.zeros(shape=(L,), dtype=real)
+        for i in range(L):
+            n[i] = starts.cable_dir_w[i, start]
+            u[i] = starts.cable_vel_w[i, start]
+            stiffness[i] = starts.stiffness[i, start]
+        mode = windows.payload[w]
+        ball = Ball()
+        if mode != attached_code:
+            ball.pos = starts.payload_pos_w[start]
+            ball.vel = starts.payload_vel_w[start]
+            arm, arm_vel = chain.payload(rope, vec3(), vec3(), n, u)
+            ball.root = ball.pos - arm
+            ball.root_vel = ball.vel - arm_vel
+            ball.tail = ball.pos
+            ball.tail_vel = ball.vel
+
+        tiny = real(1.0e-9)
+        time = windows.start[w]
+        end = windows.end[w]
+        command = windows.command_first[w]
+        delay = p.queue.delay
+        while command + 1 < windows.command_last[w] and data.command_time[command + 1] + delay <= time + tiny:
+            command = command + 1
+        latch = windows.latch[w]
+        separation = end + real(1.0)
+        latched = mode != attached_code
+        if mode == attached_code and latch <= time:
+            separation = wp.max(latch + r.lag, time)  # the pull at the latch lies before this window
+            latched = True
+        knot = int(0)
+        at = Pointers()
+        total = coupled.momentum(p, rope, s, u)
+        before = s.rate_b
+        pay = ball.pos
+        pay_vel = ball.vel
+        if mode == attached_code:
+            pos0, vel0 = chain.payload(
+                rope, s.pos_w + wp.quat_rotate(s.quat_wb, rope.mount), coupled.mount_velocity(rope, s), n, u
+            )
+            pay = pos0
+            pay_vel = vel0
+        while time < end - tiny:
+            until = end
+            while command + 1 < windows.command_last[w] and data.command_time[command + 1] + delay <= time + tiny:
+                command = command + 1
+            if command + 1 < windows.command_last[w]:
+                until = wp.min(until, data.command_time[command + 1] + delay)
+            if mode == attached_code and latch > time + tiny:
+                until = wp.min(until, latch)
+            if mode == attached_code and latch <= time + tiny and not latched:
+                separation = latch + leaving.lag(r, rope, chain.pull(rope, stiffness), gravity)
+                latched = True
+            if mode == attached_code and separation <= time + tiny:
+                ball = let_go(r, rope, s, n, u)
+                mode = int(loose_code)
+                pay = ball.pos
+                pay_vel = ball.vel
+            if mode == attached_code:
+                until = wp.min(until, separation)
+            knot_time = windows.first_knot[w] + real(float(knot)) * knot_spacing
+            if knot < windows.knots[w]:
+                if knot_time <= time + tiny:
+                    if lanes.keep[lane] >= 0:
+                        knot_of(
+                            knots, lanes.keep[lane] + knot, p, rope, s, pay, pay_vel, chain.pull(rope, stiffness)
+                        )
+                    knot = knot + 1
+                    knot_time = knot_time + knot_spacing
+                until = wp.min(until, wp.max(knot_time, time + tiny))
+            count = wp.max(int(wp.ceil((until - time) / lanes.substep[lane] - real(1.0e-3))), 1)
+            h = (until - time) / real(float(count))
+            active = data.command[command]
+            peak = windows.first_knot[w] + real(float(lanes.knot[lane])) * knot_spacing
+            for j in range(count):
+                t0 = time + real(float(j)) * h
+                away = wp.abs(t0 + real(0.5) * h - peak) / knot_spacing
+                pushed = push_at(air, lanes.axis[lane], lanes.size[lane], real(1.0) - away)
+                old = s
+                old_pay = pay
+                old_pay_vel = pay_vel
+                if mode == attached_code:
+                    s, total, fell_back = coupled.step(
+                        p, rope, pushed, s, total, active, n, u, stiffness, g, gamma, max_turn, h
+                    )
+                    pos1, vel1 = chain.payload(
+                        rope, s.pos_w + wp.quat_rotate(s.quat_wb, rope.mount), coupled.mount_velocity(rope, s), n, u
+                    )
+                    pay = pos1
+                    pay_vel = vel1
+                else:
+                    s = coupled.step_alone(p, pushed, s, active, g, h)
+                    if mode == loose_code:
+                        ball = fly_ball(rope, pushed, ball, g, h)
+                        if r.rope_tail > real(0.0):
+                            root, root_vel = loose_step(
+                                rope, pushed, ball.root, ball.root_vel, n, u, stiffness, g, gamma, max_turn, h
+                            )
+                            tail_pos, tail_vel = chain.payload(rope, root, root_vel, n, u)
+                            ball.root = root
+                            ball.root_vel = root_vel
+                            ball.tail = tail_pos
+                            ball.tail_vel = tail_vel
+                        pos2, vel2 = payload_now(r, ball)
+                        pay = pos2
+                        pay_vel = vel2
+                k = Steps()
+                k.t0 = t0
+                k.t1 = t0 + h
+                k.h = h
+                last = j == count - 1 and until >= end - tiny
+                at = tell(
+                    p, x, data, windows, w, old, s, before, old_pay, old_pay_vel, pay, pay_vel, k, last, at, out, lane
+                )
+                before = old.rate_b
+            time = until
+
+        if lanes.keep[lane] >= 0:
+            store_quad(ends, lane, s)
+            ends.payload_pos_w[lane] = pay
+            ends.payload_vel_w[lane] = pay_vel
+            for i in range(L):
+                ends.cable_dir_w[i, lane] = n[i]
+                ends.cable_vel_w[i, lane] = u[i]
+                ends.stiffness[i, lane] = stiffness[i]
+
+    return ReplayKernel(replay_kernel, State, Windows, Lanes, Knots, Data, Sensing)

@@ -1,0 +1,157 @@
+"""Launching the replay: parameters, windows, lanes and recorded data as arrays, split over the cores of a CPU."""
+
+import os
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from sim import runtime  # noqa: F401  starts Warp
+from sim import state as st
+from sim.checks import check_air, check_numerics, check_release
+from sim.params import GRAVITY, PlantParams
+from sim.replay import kernel as rk
+from sim.sensing import SensingParams
+from sim.structs import kinds_of, pack, pack_rope, pack_vehicle, ropes_on, types
+
+
+@dataclass(frozen=True)
+class Replayed:
+    """What the lanes saw.
+
+    With Nv, Np and Ng measured stamps of the vehicle, the payload and the gyro in a lane's window, its first
+    ``2 Nv + Np + Ng`` rows hold: position [m] and attitude against the measured one (rotation vector [rad]) in turns,
+    payload [m], rate [rad/s]. The rest is undefined.
+    """
+
+    seen: np.ndarray  # shape (rows, lanes, 3)
+    ends: dict[str, np.ndarray]  # states at the end of the windows of lanes that keep, as ``starts``; others undefined
+    knots: dict[str, np.ndarray]  # fields of KNOT_FIELDS at the knots of lanes that keep, by the rows of ``keep``
+
+
+_BUILDS: dict = {}
+
+
+class Replay:
+    """Replays windows of recorded flights with perturbed parameters, initial states and forces.
+
+    Args:
+        plants: parameters of the rows that lanes choose from; one choice of blocks and one number of segments.
+        sensings: of the same rows.
+        device: Warp device, "cpu" or "cuda:0".
+        precision: "float64", in which differences of lanes do not drown in rounding, or "float32".
+        gravity: [m/s^2].
+
+    Raises:
+        ValueError: plants of different blocks or segments, or an unphysical parameter.
+    """
+
+    def __init__(
+        self,
+        plants: Sequence[PlantParams],
+        sensings: Sequence[SensingParams],
+        device: str = "cpu",
+        precision: str = "float64",
+        gravity: float = GRAVITY,
+    ):
+        first = plants[0]
+        if len(sensings) != len(plants) or {p.rope.segments for p in plants} != {first.rope.segments}:
+            raise ValueError(
+                f"{len(plants)} plants of {sorted({p.rope.segments for p in plants})} segments with {len(sensings)} sensings: "
+                "expected one number of segments and a sensing each"
+            )
+        check_numerics(first.sim)
+        for plant in plants:
+            check_release(plant.release)
+            check_air(plant.air)
+        self.device, self.gravity, self.segments, self._sim = device, gravity, first.rope.segments, first.sim
+        self.types = t = types(precision)
+        kinds = kinds_of(first.vehicle)
+        key = (precision, kinds, self.segments)
+        if key not in _BUILDS:
+            _BUILDS[key] = rk.build_replay(t, first.vehicle, self.segments)
+        self.kernel = _BUILDS[key]
+        vehicles = [p.vehicle for p in plants]
+        rows = {
+            t.Vehicle: pack_vehicle(t, vehicles, kinds),
+            t.Rope: pack_rope(t, ropes_on(vehicles, [p.rope for p in plants])),
+            t.Release: pack(t.Release, *[p.release for p in plants]),
+            t.Air: pack(t.Air, *[p.air for p in plants]),
+            self.kernel.Sensing: pack(self.kernel.Sensing, *sensings),
+        }
+        self._plants = [wp.array(value, dtype=struct, device=device) for struct, value in rows.items()]
+
+    def run(
+        self,
+        starts: Mapping[str, np.ndarray],
+        windows: Mapping[str, np.ndarray],
+        lanes: Mapping[str, np.ndarray],
+        data: Mapping[str, np.ndarray],
+        knot_spacing: float,
+        knots: int = 1,
+    ) -> Replayed:
+        """Fly all lanes.
+
+        Args:
+            starts: fields of ``kernel.STATE_FIELDS``, shape (S, ...), rope fields (S, L, ...).
+            windows: fields of ``kernel.WINDOW_FIELDS``, shape (W,).
+            lanes: fields of ``kernel.LANE_FIELDS``, shape (lanes,).
+            data: fields of ``kernel.DATA_FIELDS``, flights one after the other.
+            knot_spacing: between knots of the latent forces [s].
+            knots: rows of the knot arrays.
+        """
+        k = self.kernel
+        count = len(lanes["window"])
+        w = np.asarray(lanes["window"])
+        rows = 2 * windows["vehicle_count"] + windows["payload_count"] + windows["gyro_count"]
+        height = max(int(np.max(rows[w])), 1)
+        segments = {"cable_dir_w": self.segments, "cable_vel_w": self.segments, "stiffness": self.segments}
+        keeping = count if np.any(np.asarray(lanes["keep"]) >= 0) else 1
+        ends = st.allocate(self.types, k.State, rk.STATE_FIELDS, keeping, segments, self.device)
+        held = st.allocate(self.types, k.Knots, rk.KNOT_FIELDS, knots, {}, self.device)
+        out = wp.empty((height, count), dtype=self.types.vec3, device=self.device)
+        numerics = [knot_spacing, self._sim.gamma, self._sim.max_turn, self.gravity]
+        given = [
+            self._struct(k.State, rk.STATE_FIELDS, starts), self._struct(k.Windows, rk.WINDOW_FIELDS, windows),
+            self._struct(k.Lanes, rk.LANE_FIELDS, lanes), self._struct(k.Data, rk.DATA_FIELDS, data),
+        ]  # fmt: skip
+        self._launch(count, [*self._plants, *numerics, *given], [ends, held, out])
+        return Replayed(out.numpy(), self._read(ends, rk.STATE_FIELDS), self._read(held, rk.KNOT_FIELDS))
+
+    def _launch(self, count: int, before: list, after: list) -> None:
+        """One launch, or one for each core: a launch on the CPU runs on one thread and leaves the others free."""
+        if self.device != "cpu":
+            wp.launch(self.kernel.replay, count, [*before, 0, *after], device=self.device, block_dim=64)
+            wp.synchronize_device(self.device)
+            return
+        self.kernel.replay.module.load("cpu")
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        pieces = np.linspace(0, count, min(4 * cores, count) + 1).astype(int)
+
+        def launch(first: int, last: int) -> None:
+            wp.launch(self.kernel.replay, last - first, [*before, int(first), *after], device="cpu")
+
+        with ThreadPoolExecutor(cores) as pool:
+            for done in [pool.submit(launch, a, b) for a, b in zip(pieces[:-1], pieces[1:])]:
+                done.result()
+
+    def _struct(self, struct: type, fields: Mapping, values: Mapping[str, np.ndarray]):
+        t = self.types
+        scalar = {"real": t.real, "int": wp.int32, "vec3": t.vec3, "vec4": t.vec4, "quat": t.quat}
+        numpy = {"int": np.int32}
+        real = np.float32 if t.real is wp.float32 else np.float64
+        out = struct()
+        for name, (kind, by_row) in fields.items():
+            value = np.asarray(values[name], dtype=numpy.get(kind, real))
+            value = np.ascontiguousarray(np.swapaxes(value, 0, 1) if by_row else value)
+            setattr(out, name, wp.array(value, dtype=scalar[kind], device=self.device))
+        return out
+
+    @staticmethod
+    def _read(struct, fields: Mapping) -> dict[str, np.ndarray]:
+        return {
+            name: np.swapaxes(getattr(struct, name).numpy(), 0, 1) if by_row else getattr(struct, name).numpy()
+            for name, (_, by_row) in fields.items()
+        }
