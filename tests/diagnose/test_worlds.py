@@ -10,7 +10,7 @@ import pytest
 from sim.hybrid import HybridSim
 from tests.plants import paper_plant
 from tests.worlds.fly import fly
-from tests.worlds.numbers import CHANGES, nominal
+from tests.worlds.numbers import nominal
 from tests.worlds.pilot import Throw, Tracker
 from tests.worlds.world import Recipe, draw, fly_recipe, recorded
 
@@ -86,7 +86,6 @@ def test_every_hidden_effect_shows_in_the_flight():
         flown = fly_recipe(Recipe(3, "rod", {name: theta}, free=2, free_seconds=3.0, throws=2))
         moved = max(np.abs(a.ball - b.ball).max() for a, b in zip(quiet, flown))
         assert moved > 1e-3, name
-    assert set(large) <= set(CHANGES)
 
 
 def test_a_world_follows_from_its_seed_and_its_digest_from_its_truth():
@@ -95,4 +94,5 @@ def test_a_world_follows_from_its_seed_and_its_digest_from_its_truth():
     for a, b in zip(once, again):
         np.testing.assert_array_equal(a["pos"], b["pos"])
     other = dataclasses.replace(recipe, effects={k: -v for k, v in recipe.effects.items()})
-    assert recipe.digest() != other.digest() and recipe.digest() == dataclasses.replace(recipe).digest()
+    assert recipe.digest() != other.digest()
+    assert recipe.digest() == dataclasses.replace(recipe).digest()

@@ -1,8 +1,8 @@
 """World P1: the rope as fifteen rods on ball joints in MuJoCo, RK4; the vehicle's actuators beside it.
 
 The actuators advance by the midpoint rule with the motion that MuJoCo finds; their wrench acts in the body frame through
-actuators on the centre of mass, so that MuJoCo turns it with the vehicle within a step. Armature 0; the rods' inertia about their axes is so small that the twist
-that the joints' damping passes on matters to nothing.
+actuators on the centre of mass, so that MuJoCo turns it with the vehicle within a step. Armature 0; the rods' inertia about
+their axes is so small that the twist that the joints' damping passes on matters to nothing.
 """
 
 import mujoco
@@ -40,7 +40,7 @@ def midpoint(
     i = wp.tid()
     p, b = numbers[i], bodies[i]
     if last == 0:
-        f0, t0, thrust0, d0 = vehicle_load(p, b, commands[i], V3(), V3())
+        _f, _t, _thrust, d0 = vehicle_load(p, b, commands[i], V3(), V3())
         middle[i] = inner(middle[i], along(b, d0, REAL(0.5) * h))
     m = middle[i]
     f, t, thrust, d = vehicle_load(p, m, commands[i], push[i], twist[i])

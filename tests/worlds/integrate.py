@@ -85,7 +85,7 @@ def build(kind: str):
             mark = marks[k]
             while t < mark - tiny:
                 stop = mark
-                now = int(0)
+                now = int(0)  # noqa: UP018, RUF046  a dynamic variable of the kernel
                 for j in range(QUEUE):  # newest last
                     at = stamps[lane, j] + delays[lane]
                     if at <= t + tiny:
@@ -107,7 +107,7 @@ def build(kind: str):
                         dx[i] = V3()
                         dv[i] = V3()
                     ball_dx, ball_dv, first_pull = V3(), V3(), r.tension + REAL(0.0)
-                    ball_xs, ball_vs = r.ball_x + V3(), r.ball_v + V3()
+                    ball_vs = r.ball_v + V3()
                     for s in range(4):
                         weight = REAL(2.0)
                         if s == 0 or s == 3:
@@ -138,7 +138,6 @@ def build(kind: str):
                             ball_dx += weight * ball_vs
                             ball_dv += weight * ball_a
                             if s < 3:
-                                ball_xs = r.ball_x + ahead * ball_vs
                                 ball_vs = r.ball_v + ahead * ball_a
                         total = along(total, d, weight)
                         if s == 0 and r.hanging == 1:

@@ -67,7 +67,7 @@ class Throw:
         return self.lift * (self._bump(t, 1.25, 1.6) - self._bump(t, 1.85, 2.2))
 
     def at(self, t: float):
-        i = min(int(round(t / 0.005)), len(self.grid) - 1)
+        i = min(round(t / 0.005), len(self.grid) - 1)
         return self.p[i], self.v[i], self.a[i], 0.0
 
 

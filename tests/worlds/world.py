@@ -22,7 +22,8 @@ FLOORS = {
     "motor_1": 2e-3, "motor_2": 2e-3, "motor_3": 2e-3, "motor_4": 2e-3, "mocap_delay_quad": 5e-4,
     "mocap_delay_payload": 5e-4, "translational_lift": 3e-4, "lag_tension": 2e-3, "rope_mass": 3e-4,
 }  # fmt: skip
-"""Size below which an effect does not matter: SI units, relative for gains and inertias (5 mm of landing, or a tenth of the noise)."""
+"""Size below which an effect does not matter, in SI units, relative for gains and inertias: 5 mm of landing, or a tenth of
+the noise."""
 PLANTS = ("chain", "string", "rod")
 GUSTS = (0.015, 1.5e-4, 6e-4)
 NOISE = {"pos": 5e-4, "att": np.radians(0.2), "ball": 8e-4}
@@ -118,6 +119,11 @@ def quaternion(r: np.ndarray) -> np.ndarray:
     )
 
 
+def sampled(time: np.ndarray, series: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """A series of shape (T, n) at other times, linear between milliseconds."""
+    return np.stack([np.interp(at, time, column) for column in series.T], -1)
+
+
 def recorded(recipe: Recipe, flights: list[Flights]) -> list[dict]:
     """What was recorded of each flight: plain arrays, SI units, quaternions wxyz; NaN where a frame was lost.
 
@@ -131,10 +137,10 @@ def recorded(recipe: Recipe, flights: list[Flights]) -> list[dict]:
     for f in flights:
         for e in range(len(f.pos)):
             t = np.arange(0.02, f.time[-1] - 1e-9, 1 / RATE)
-            at = lambda series, late: np.stack([np.interp(t - late, f.time, c) for c in series.T], -1)  # noqa: E731
-            rot = matrix(at(f.quat[e], w.quad_stamp) / np.linalg.norm(at(f.quat[e], w.quad_stamp), axis=1, keepdims=True))
-            pos = (1 + w.frame_scale) * (at(f.pos[e], w.quad_stamp) + rot @ w.marker_off) @ tilt.T
-            ball = (1 + w.frame_scale) * at(f.ball[e], w.ball_stamp) @ tilt.T
+            q = sampled(f.time, f.quat[e], t - w.quad_stamp)
+            rot = matrix(q / np.linalg.norm(q, axis=1, keepdims=True))
+            pos = (1 + w.frame_scale) * (sampled(f.time, f.pos[e], t - w.quad_stamp) + rot @ w.marker_off) @ tilt.T
+            ball = (1 + w.frame_scale) * sampled(f.time, f.ball[e], t - w.ball_stamp) @ tilt.T
             noise = small_turn(recipe.noise * NOISE["att"] * rng.normal(size=(len(t), 3)))
             quat = quaternion(tilt @ rot @ turn @ noise)
             pos = pos + recipe.noise * NOISE["pos"] * rng.normal(size=pos.shape)
