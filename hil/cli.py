@@ -17,6 +17,7 @@ ACTIONS = {
     "check": "look at the poses that come, and at what speaks against a throw",
     "record": "record the poses that come and what the policy would make of them; never arms, sends nothing",
     "fake": "a fake autopilot with the simulator's vehicle, to throw over the wire",
+    "direct": "the fake's throws without wire, autopilot and real time: what the wire costs is measured against them",
 }
 
 
@@ -55,6 +56,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--against-camera", nargs="+", metavar="FILE", help="recordings of a camera's detections; the first is fitted"
     )
     check.add_argument("--out", default="out/against_camera", metavar="FOLDER", help="of --against-camera")
+    subs["check"].add_argument(
+        "--hover-of", metavar="FOLDER", default=None, help="of a run: was its hover's thrust the weight by the calibration?"
+    )
     subs["run"].add_argument("--auto-arm", action="store_true", help="arm whenever ready; for simulated vehicles only")
     for name in ("replay", "view"):
         subs[name].add_argument("folder", metavar="FOLDER", help="of a run")
@@ -62,10 +66,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     subs["view"].add_argument("--out", default=None, metavar="FILE", help="of the recording (default: run.rrd in the folder)")
     subs["view"].add_argument("--web-port", type=int, default=9090, metavar="N", help="of the live view (default: 9090)")
     subs["view"].add_argument("--data-port", type=int, default=9876, metavar="N", help="of its data (default: 9876)")
+    direct = subs["direct"]
+    direct.add_argument("--config", default="fake", metavar="NAME", help="of configs/hil, or a file")
+    direct.add_argument("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE")
+    direct.add_argument("--seeds", type=int, nargs="+", default=[0], metavar="N", help="of starts, noise and loss; a throw each")
     fake = subs["fake"]
+    fake.add_argument("--rate", type=float, default=100.0, metavar="HZ", help="poses a second of each body")
+    for name in ("fake", "direct"):
+        subs[name].add_argument(
+            "--plant", default="visthrow.wire_plant:make", metavar="MODULE:FUNCTION", help="that makes the vehicle"
+        )
     fake.add_argument("--device", default="udpout:127.0.0.1:14560", help="the runner's port")
     fake.add_argument("--policy", default="vision", metavar="POLICY", help="whose plant is flown")
-    fake.add_argument("--plant", default="visthrow.wire_plant:make", metavar="MODULE:FUNCTION", help="that makes it")
     fake.add_argument("--seed", type=int, default=0, help="of start, noise and loss")
     fake.add_argument("--seconds", type=float, default=60.0, help="end after this time")
     fake.add_argument("--after", type=float, default=10.0, help="end this long after the payload's landing [s]")
@@ -84,7 +96,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Do what was asked."""
-    return {"run": _run, "record": _run, "view": _view, "replay": _replay, "check": _check, "fake": _fake}[args.action](args)
+    does = {
+        "run": _run, "record": _run, "view": _view, "replay": _replay, "check": _check, "fake": _fake, "direct": _direct,
+    }  # fmt: skip
+    return does[args.action](args)
 
 
 SWITCH = 5e-4
@@ -215,6 +230,13 @@ def _check(args: argparse.Namespace) -> int:
         return 0
     if args.hand_carry:
         return _hand_carry(args)
+    if args.hover_of is not None:
+        from hil.autopilot_check import hover_of_run
+
+        good, text = hover_of_run(args.hover_of)
+        print(f"{'PASS' if good else 'FAIL'}  {text}")
+        return 0 if good else 1
+    from hil.autopilot_check import AutopilotCheck
     from hil.backends import DryRun
     from hil.clock import ManualClock, MonotonicClock
     from hil.runner import Runner, Words
@@ -225,15 +247,18 @@ def _check(args: argparse.Namespace) -> int:
     import tempfile
 
     with tempfile.TemporaryDirectory() as folder:
-        source, _, recorded = open_source(params, Path(folder), args.speed)
+        source, link, recorded = open_source(params, Path(folder), args.speed)
         clock = ManualClock(source.start) if recorded else MonotonicClock(args.speed)
-        runner = Runner(params, Policy.load(find_policy(params.policy)), DryRun())
+        runner, autopilot = Runner(params, Policy.load(find_policy(params.policy)), DryRun()), AutopilotCheck(params, link)
         begin, seconds = clock.now(), args.seconds or 5.0
         while clock.now() - begin < seconds and not source.ended:
             now = clock.now()
             runner.tick(now, source.poll(now), runner.backend.status(now), Words())
+            autopilot.tick(now, runner)
             clock.sleep_until(now + runner.pilot.period)
         now = clock.now()
+        found = autopilot.results(now, runner.mass)
+        autopilot.backend.close()
         source.close()
     for name, track in runner.tracks.items():
         state = track.state(now)
@@ -246,7 +271,8 @@ def _check(args: argparse.Namespace) -> int:
             f"{z:+.3f}) m, refused: {json.dumps(track.gate.refused) if track.gate.refused else 'none'}, "
             f"velocity late by {max(0.0, 1e3 * track.filter.lag):.0f} ms"
         )
-    problems = runner.problems()
+    problems = runner.problems() + [text for good, text in found if not good]
+    print("".join(f"{text}\n" for good, text in found if good), end="")
     print("\n".join(f"FAIL  {text}" for text in problems) or "PASS  all checks")
     return 1 if problems else 0
 
@@ -271,17 +297,31 @@ def _hand_carry(args: argparse.Namespace) -> int:
     return 0 if finding.passed else 1
 
 
+def _direct(args: argparse.Namespace) -> int:
+    from hil.direct import Direct, scored
+    from hil.fake import load_plant
+    from hil.mocap import MocapParams
+    from visthrow.policy import Policy, find_policy
+
+    params = _params(args)
+    policy, mocap = Policy.load(find_policy(params.policy)), MocapParams()
+    for seed in args.seeds:
+        report = Direct(load_plant(args.plant, params.policy, seed), policy, params, mocap, seed).throw()
+        print(json.dumps({"seed": seed, **scored(report, params, report["start"]), **report}), flush=True)
+    return 0
+
+
 def _fake(args: argparse.Namespace) -> int:
     from hil.clock import MonotonicClock
     from hil.device import check_device, open_port
-    from hil.fake import VEHICLE_ID, ListeningPort, load_plant, make_fake, read_options, serve
+    from hil.fake import VEHICLE_ID, ListeningPort, MocapParams, load_plant, make_fake, read_options, serve
     from hil.link import Link
 
     options = read_options([*args.overrides, f"answer={args.answer}"])
     plant = load_plant(args.plant, args.policy, args.seed)
     link = Link(open_port(check_device(args.device)), *VEHICLE_ID)
     port = ListeningPort(args.msp_port) if args.kind == "betaflight" else None
-    fake = make_fake(args.kind, plant, link, None, args.seed, options, port)
+    fake = make_fake(args.kind, plant, link, MocapParams(rate=args.rate), args.seed, options, port)
     print(f"the fake {args.kind} flies", file=sys.stderr, flush=True)
     report = serve(
         fake, MonotonicClock(args.speed), args.seconds, None if args.out is None else Path(args.out), args.after

@@ -1,7 +1,8 @@
 """Flight logs of a run, made of its folder: what later tools read of a flight on poses as they read a simulated one.
 
 Times are those of the measurements, on the runner's clock: a source's stamps, moved by the median of what lies between them
-and the arrivals, less the delay that the config states. Where the payload let go and came down is found in its own poses.
+and the arrivals less the transit (known by TIMESYNC, or the delay that the config states). Where the payload let go and came
+down is found in its own poses.
 """
 
 import json
@@ -64,8 +65,10 @@ class Course:
         apart: dict[str, list[float]] = {}
         for tick in self.ticks:
             for sample in tick.samples:
-                apart.setdefault(sample.body, []).append(sample.pose.arrival - sample.pose.stamp)
-        self.offsets = {body: float(np.median(values)) - self.params.delay.source for body, values in apart.items()}
+                pose = sample.pose
+                measured = pose.arrival - pose.transit(self.params.delay.source)
+                apart.setdefault(sample.body, []).append(measured - pose.stamp)
+        self.offsets = {body: float(np.median(values)) for body, values in apart.items()}
 
 
 AFTERWARDS = (State.THROW, State.RECOVER, State.ABORT)
@@ -130,7 +133,7 @@ class Samples:
     def _time(self, sample: Sample) -> float:
         pose = sample.pose
         if self._offsets is None:
-            return pose.arrival - self.params.delay.source
+            return pose.arrival - pose.transit(self.params.delay.source)
         return pose.stamp + self._offsets[sample.body]
 
     def _later(self, name: str, time: float) -> float:

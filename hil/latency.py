@@ -10,7 +10,7 @@ import numpy as np
 from hil.pose import VEHICLE, Pose
 
 STAGES = {
-    "transport": "from measurement to arrival, beyond the fastest pose of the run",
+    "transport": "from measurement to arrival; beyond the fastest pose where the source's clock is not known",
     "arrival": "from the newest pose's arrival to the tick",
     "late": "how late the tick began",
     "poll": "taking in what came since the last look",
@@ -77,12 +77,15 @@ class Stages:
         for pose in poses:
             if pose.body != VEHICLE or not (math.isfinite(pose.stamp) and math.isfinite(pose.arrival)):
                 continue
+            newest = pose.arrival
+            if pose.measured is not None:
+                self.stages["transport"].add(pose.arrival - pose.measured)
+                continue
             apart = pose.arrival - pose.stamp
             if self._fastest is None or abs(apart - self._fastest) > CLOCK_STEP:
                 self._fastest = apart
             self._fastest = min(self._fastest, apart)
             self.stages["transport"].add(apart - self._fastest)
-            newest = pose.arrival
         return {} if newest is None else {"arrival": now - newest}
 
     def summary(self) -> dict[str, dict[str, float]]:

@@ -1,0 +1,111 @@
+"""The throw of the fake autopilot without a wire: what the wire costs is measured against it.
+
+Plant, start, motion capture, estimator and policy are those of a throw over the wire, with the same seeds; link, autopilot,
+state machine, processes and real time are left out. The motion capture's poses arrive when they do, and ticks come when the
+first of them does, so that the age of a pose at a tick is the latency alone.
+"""
+
+import math
+from collections import deque
+from typing import Any
+
+import numpy as np
+
+from hil.fakes import WirePlant
+from hil.frames import FrameParams
+from hil.mocap import Mocap, MocapParams
+from hil.params import HilParams
+from hil.pose import PAYLOAD, VEHICLE, Pose
+from hil.track import BodyState, Track
+from visthrow.hover import HoverController, HoverParams
+from visthrow.pilot import Pilot
+from visthrow.policy import Policy
+
+HOVER = 3.0
+"""Before the throw [s]: about what checks and arming take over the wire."""
+
+MOST = 8.0
+"""After which a throw is given up [s]."""
+
+OURS = FrameParams("x,y,z", "x,y,z", "xyzw", 0.0, (0.0, 0.0, 0.0))
+SLACK = 1e-9
+
+
+class Direct:
+    """One vehicle, from poses to commands in one loop."""
+
+    def __init__(self, plant: WirePlant, policy: Policy, params: HilParams, mocap: MocapParams, seed: int) -> None:
+        """Begin at the plant's start.
+
+        Args:
+            plant: what flies. policy: on the CPU. params: of the run whose estimator, delay and goal are used.
+            mocap: its faults. seed: of noise and loss.
+        """
+        self.plant, self.params = plant, params
+        self.pilot = Pilot(policy, params.camera)
+        self.mocap = Mocap(mocap, seed)
+        self._tracks = {body: Track(OURS, params.gate, params.estimate) for body in (VEHICLE, PAYLOAD)}
+        self._hover = HoverController(HoverParams(max_thrust=plant.max_thrust), self.pilot.period)
+        self._aim = 0.5 * sum(policy.contract["observation"]["latency"])
+        self._latency = mocap.latency
+        self._coming: deque[Pose] = deque()
+
+    def _state(self, body: str, now: float) -> BodyState | None:
+        track = self._tracks[body]
+        age = track.gate.age(now) + self._latency
+        ahead = age - self._aim if self.params.delay.compensate and math.isfinite(age) else 0.0
+        return track.state(now, ahead)
+
+    def _take(self) -> None:
+        now = self.plant.time
+        if self.mocap.due(now):
+            self._coming.extend(self.mocap.measure(now, self.plant.state))
+        while self._coming and self._coming[0].arrival <= now + SLACK:
+            pose = self._coming.popleft()
+            self._tracks[pose.body].update(pose)
+
+    def throw(self) -> dict[str, Any]:
+        """Hover, throw, and wait for the landing.
+
+        Returns:
+            The plant's landing, the start of the throw and its latch [s].
+        """
+        command, latch, start, tick = None, None, None, 0.0
+        level = np.array([self.plant.mass[0] * 9.81, 0.0, 0.0, 0.0])
+        while self.plant.time < MOST:
+            self._take()
+            now = self.plant.time
+            if now >= tick - SLACK:
+                tick += self.pilot.period
+                if start is None and now >= HOVER - SLACK:
+                    start = now
+                    self.pilot.start()
+                command, asked = self._decide(now, start is not None, latch)
+                if asked and latch is None:
+                    latch = now
+            self.plant.step(level if command is None else command, latch is not None)
+            if self.plant.landing["landing_time"] is not None:
+                break
+        return {**self.plant.landing, "start": start, "latch": latch}
+
+    def _decide(self, now: float, throwing: bool, latch: float | None) -> tuple[np.ndarray | None, bool]:
+        vehicle, payload = self._state(VEHICLE, now), self._state(PAYLOAD, now)
+        if vehicle is None or payload is None:
+            return None, False
+        apart = latch is not None and now - latch >= self.pilot.lag - SLACK
+        if not throwing or apart:
+            views = [np.array([v]) for v in (vehicle.pos, vehicle.quat, vehicle.vel)]
+            mass = self.plant.mass[1 if apart else 0]
+            return self._hover.step(*views, np.array(self.params.home_w), mass)[0], False
+        views = [np.array([v]) for v in (vehicle.pos, vehicle.quat, vehicle.vel, vehicle.rate, payload.pos)]
+        out = self.pilot.act(*views, np.array(self.params.goal_w), True)
+        return out.command[0].astype(float), bool(out.release[0])
+
+
+def scored(report: dict[str, Any], params: HilParams, start: float | None) -> dict[str, Any]:
+    """Error [m] and duration [s] of a plant's true landing; both None where there is none."""
+    landed, when = report["landing_w"], report["landing_time"]
+    if landed is None:
+        return {"error": None, "duration": None}
+    error = math.hypot(landed[0] - params.goal_w[0], landed[1] - params.goal_w[1])
+    return {"error": error, "duration": None if start is None else when - start}
