@@ -120,11 +120,11 @@ def with_all_effects_noise(problem: Problem, point: Point) -> Point:
     """
     visible = np.flatnonzero(problem.priors.visible)
     change = estimate(point.information, point.score, problem.priors, visible) - point.theta
-    noise, _ = levels.fit(point.windows, [_shifted(gram, change) for gram in point.raw], point.noise)
+    noise, _ = levels.fit(point.windows, [shifted(gram, change) for gram in point.raw], point.noise)
     return _point(point.theta, point.windows, point.raw, point.grams, noise)
 
 
-def _shifted(gram: Gram, change: np.ndarray) -> Gram:
+def shifted(gram: Gram, change: np.ndarray) -> Gram:
     """Inner products of r - S change."""
     begin = gram.nuisances + gram.latents
     part = gram.inner[:, :, begin:] @ change

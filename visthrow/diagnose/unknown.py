@@ -1,9 +1,281 @@
-"""Laws outside the catalogue."""
+"""Laws outside the catalogue: which term of the grammar explains what is left, and whether it beats the catalogue's names.
+
+A term needs no simulation: its column is G phi, with G the derivatives by the latent forces and phi the term at their knots. So
+thousands of terms are screened with the statistics at hand; the best are then weighed with noise levels of their own.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from visthrow.diagnose import grammar
+from visthrow.diagnose import noise as noise_levels
+from visthrow.diagnose.evidence import Priors, covariance, estimate
+from visthrow.diagnose.marginal import Gram, gather, window_statistics
+from visthrow.diagnose.model import LATENT_BLOCKS
+from visthrow.diagnose.point import Point, advantage, shifted
+from visthrow.diagnose.result import Law
+
+if TYPE_CHECKING:
+    from visthrow.diagnose.search import Search
+
+MARGIN = 6.0
+"""Nats by which a term must be ahead of the catalogue's best."""
+
+WEIGHED = 5
+"""Terms that are weighed with noise levels of their own."""
+
+REACH = 3.0
+"""Prior deviation of a term's root mean square force, in the block's strongest latent force."""
+
+NARROW = 1e-3
+"""Floor of a term in its prior deviation: a term is there or it is not."""
 
 
-def find_laws(search):
-    return ()
+@dataclass(frozen=True)
+class Hypothesis:
+    """One or two terms beside the names of a set."""
+
+    terms: tuple[grammar.Term, ...]
+    scale: tuple[float, ...]  # coefficient of each term at its prior deviation times NARROW
+    point: Point  # extended by the terms as last effects
+    priors: Priors
+    active: tuple[int, ...]  # with the terms
+    nats: float  # over the same set without the last term, less the last term's price
+    catalogue: Priors  # without the terms
+    price: float  # sum over the terms of the log of the number of terms as simple as it
+
+    @property
+    def value(self) -> float:
+        """Evidence, comparable with that of a set of names; every term pays its price."""
+        return self.point.evidence(self.priors, self.active) - self.price
+
+    @property
+    def names(self) -> tuple[int, ...]:
+        """Effects of the catalogue beside the terms."""
+        return self.active[: len(self.active) - len(self.terms)]
+
+    def laws(self) -> tuple[Law, ...]:
+        """Coefficients and their deviations."""
+        sigma = covariance(self.point.information, self.priors.deviation(self.active))
+        mean = sigma @ self.point.score
+        last = slice(len(mean) - len(self.terms), None)
+        sizes, sds = mean[last] * self.scale, np.sqrt(np.diag(sigma)[last]) * self.scale
+        return tuple(
+            Law(t.formula, t.block, t.factors, t.vector, float(size), float(sd), t.unit, float(self.nats))
+            for t, size, sd in zip(self.terms, sizes, sds)
+        )
+
+    def without_terms(self) -> Point:
+        """The point with the terms at their best coefficients, their residuals taken out, for the catalogue's effects."""
+        count = len(self.point.theta) - len(self.terms)
+        best = (covariance(self.point.information, self.priors.deviation(self.active)) @ self.point.score)[count:]
+        statistics = self.point.statistics
+        taken = statistics.information[:, :count, count:] @ best
+        inner = replace(statistics, information=statistics.information[:, :count, :count],
+                        score=statistics.score[:, :count] - taken, theta=statistics.theta[:count])  # fmt: skip
+        theta = estimate(inner.information.sum(0), inner.absolute.sum(0), self.catalogue, self.names)
+        return replace(self.point, theta=theta, statistics=inner)
 
 
-def beats_the_catalogue(search, terms):
-    return ""
+@lru_cache(maxsize=32)
+def _terms(block: str, known: tuple[str, ...]) -> tuple[grammar.Term, ...]:
+    return tuple(grammar.terms(block, known))
+
+
+@dataclass
+class _Screen:
+    """Information of all terms about one point, summed over windows."""
+
+    terms: list[grammar.Term]
+    size: np.ndarray  # root mean square over the knots, shape (T,)
+    own: np.ndarray  # shape (T,)
+    score: np.ndarray
+    cross: np.ndarray  # with the effects, shape (T, K)
+
+
+def _columns(point: Point, window: int, block: str, terms_: Sequence[grammar.Term]) -> np.ndarray:
+    w = point.windows[window]
+    values = grammar.table_of(terms_, w.knots)
+    return grammar.coefficients(w.latent_block, w.latent_axis, w.latent_time, w.knots["time"], block, values)
+
+
+def _screen(point: Point, block: str) -> _Screen | None:
+    """Gather what each term of a block says; None where the windows carry no knots for any."""
+    known = sorted(set.intersection(*(set(w.knots) for w in point.windows)))
+    terms_ = _terms(block, tuple(known)) if {"time"} <= set(known) else ()
+    index = LATENT_BLOCKS.index(block)
+    if not terms_ or not any(np.any(g.latent_block == index) for g in point.grams):
+        return None
+    count, effects = len(terms_), len(point.theta)
+    own, score, cross, square = np.zeros(count), np.zeros(count), np.zeros((count, effects)), np.zeros(count)
+    knots = 0
+    for w, gram in enumerate(point.grams):
+        if not np.any(gram.latent_block == index):
+            continue
+        part = window_statistics(gram, point.noise, w)
+        columns = _columns(point, w, block, terms_)
+        own += np.einsum("lt,lm,mt->t", columns, part.latent_information, columns, optimize=True)
+        score += columns.T @ (part.latent_score + part.latent_effects @ point.theta)
+        cross += columns.T @ part.latent_effects
+        square += (columns**2).sum(0)
+        knots += int((gram.latent_block == index).sum()) // 3
+    return _Screen(list(terms_), np.sqrt(square / max(knots, 1)), own, score, cross)
+
+
+def _gains(point: Point, priors: Priors, active: Sequence[int], screen: _Screen, reach: float) -> tuple[np.ndarray, np.ndarray]:
+    """Nats of each term, and its prior deviation."""
+    sigma = covariance(point.information, priors.deviation(list(active)))
+    own = np.maximum(screen.own - np.einsum("tk,kl,tl->t", screen.cross, sigma, screen.cross, optimize=True), 0.0)
+    score = screen.score - screen.cross @ (sigma @ point.score)
+    prior = reach / np.maximum(screen.size, 1e-12 * screen.size.max() + 1e-300)
+    gain = -0.5 * np.log1p(prior**2 * own) + 0.5 * score**2 / (own + prior**-2.0)
+    gain[screen.size <= 1e-9 * screen.size.max()] = -np.inf
+    return gain, prior
+
+
+def _extended(point: Point, priors: Priors, term: grammar.Term, prior: float) -> tuple[Point, Priors]:
+    """The same point with the term as its last effect, measured in NARROW of its prior deviation."""
+    scale = NARROW * prior
+    raw = [_with_column(g, scale * _columns(point, w, term.block, [term])[:, 0]) for w, g in enumerate(point.raw)]
+    wide = Priors(
+        np.append(priors.floor, scale), np.append(priors.slab, 1.0 / NARROW), np.append(priors.low, -np.inf),
+        np.append(priors.high, np.inf), np.append(priors.visible, True),
+    )  # fmt: skip
+    return _rebuilt(replace(point, raw=raw, theta=np.append(point.theta, 0.0)), point.noise), wide
+
+
+def _with_column(gram: Gram, column: np.ndarray) -> Gram:
+    """Append G column as an effect; only for a gram whose latents are still at the knots."""
+    part = slice(gram.nuisances, gram.nuisances + gram.latents)
+    along = gram.inner[:, :, part] @ column
+    own = along[:, part] @ column
+    inner = np.concatenate((gram.inner, along[:, :, None]), axis=2)
+    last = np.concatenate((along, own[:, None]), axis=1)
+    cross = np.concatenate((gram.cross, (gram.cross[:, part] @ column)[:, None]), axis=1)
+    return replace(gram, inner=np.concatenate((inner, last[:, None, :]), axis=1), cross=cross)
+
+
+def _rebuilt(point: Point, noise) -> Point:
+    from visthrow.diagnose.marginal import correlated
+
+    grams = [correlated(g, w, noise.correlation_time) for g, w in zip(point.raw, point.windows)]
+    parts = [window_statistics(gram, noise, w) for w, gram in enumerate(grams)]
+    return replace(point, grams=grams, noise=noise, statistics=gather(grams, parts, point.theta))
+
+
+def _weigh(point: Point, priors: Priors, active: Sequence[int], term: grammar.Term, prior: float, price: float,
+           beside: Hypothesis | None = None) -> Hypothesis:  # fmt: skip
+    """Give a term noise levels of its own and compare with the set without it."""
+    base, wide = _extended(point, priors, term, prior)
+    named = [*active, len(point.theta)]
+    catalogue = beside.catalogue if beside else priors
+    change = estimate(base.information, base.score, wide, named) - base.theta
+    noise, _ = noise_levels.fit(base.windows, [shifted(g, change) for g in base.raw], base.noise)
+    own = _rebuilt(base, noise)
+    nats = advantage(wide, (own, named), (base, list(active))) - price
+    terms_, scales, paid = (beside.terms, beside.scale, beside.price) if beside else ((), (), 0.0)
+    return Hypothesis((*terms_, term), (*scales, NARROW * prior), own, wide, tuple(named), float(nats), catalogue, paid + price)
+
+
+def hypotheses(point: Point, priors: Priors, active: Sequence[int], strongest: dict[str, float], least: float,
+               beside: Hypothesis | None = None) -> list[Hypothesis]:  # fmt: skip
+    """The best terms beside a set of names, best first.
+
+    Args:
+        point: of the set.
+        priors: of the effects.
+        active: the set.
+        strongest: latent force of each block where the model stood alone [N or N m].
+        least: nats below which no term is weighed.
+        beside: a first term that ``point`` already holds.
+    """
+    screens = {block: screen for block in strongest if (screen := _screen(point, block)) is not None}
+    depths = [term.depth for screen in screens.values() for term in screen.terms]
+    price = {depth: float(np.log(sum(d <= depth for d in depths))) for depth in set(depths)}
+    found: list[tuple[float, grammar.Term, float]] = []
+    for block, screen in screens.items():
+        gain, prior = _gains(point, priors, active, screen, REACH * strongest[block])
+        gain -= [price[term.depth] for term in screen.terms]
+        found += [(float(gain[i]), screen.terms[i], float(prior[i])) for i in _distinct(gain, screen)]
+    found = sorted((f for f in found if f[0] > least), key=lambda f: -f[0])[:WEIGHED]
+    weighed = [_weigh(point, priors, active, term, prior, price[term.depth], beside) for _, term, prior in found]
+    return sorted(weighed, key=lambda h: -h.nats)
+
+
+def _distinct(gain: np.ndarray, screen: _Screen) -> list[int]:
+    """The best terms, without those that are a simpler one in other words in these flights."""
+    kept: list[int] = []
+    unit = screen.score / np.maximum(screen.size, 1e-300)
+    for i in np.argsort(-gain, kind="stable")[: 8 * WEIGHED]:
+        if len(kept) == WEIGHED or not np.isfinite(gain[i]):
+            break
+        if not any(np.isclose(abs(unit[i]), abs(unit[k]), rtol=1e-3) for k in kept):
+            kept.append(int(i))
+    return kept
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What the grammar has to say."""
+
+    alone: tuple[Hypothesis, ...] = ()  # beside no name
+    beside: tuple[Hypothesis, ...] = ()  # beside the names found
+    strongest: tuple[Hypothesis, ...] = ()  # the better of both, its best possibly of two terms
+
+
+def find_laws(search: "Search") -> Answer:
+    """Look for terms that explain the flights instead of the names found, and beside them."""
+    strongest: dict[str, float] = {}
+    for (block, _), level in search.nominal.noise.latent_sd.items():
+        name = LATENT_BLOCKS[block]
+        strongest[name] = max(strongest.get(name, 0.0), level)
+    if not all(w.knots for w in search.nominal.windows) or not strongest:
+        return Answer()
+    priors, least = search.priors, search.least
+    alone = hypotheses(search.nominal, priors, (), strongest, least)
+    beside = hypotheses(search.point, priors, search.active, strongest, least) if search.active else alone
+    best = beside if not alone or (beside and beside[0].value >= alone[0].value - least * len(search.active)) else alone
+    if best and best[0].nats > least + MARGIN:
+        first = best[0]
+        pairs = hypotheses(first.point, first.priors, first.active, strongest, least + MARGIN, first)
+        if pairs and pairs[0].nats > least + MARGIN:
+            best = [pairs[0], *best]
+    return Answer(tuple(alone), tuple(beside), tuple(best))
+
+
+def beats_the_catalogue(search: "Search", answer: Answer) -> tuple[Hypothesis | None, set[int], str]:
+    """Whether a term must replace or join the catalogue's names.
+
+    Returns:
+        The hypothesis, the names that are withdrawn for it, and the reason in words; None, nothing and "" where none must.
+    """
+    if not answer.strongest:
+        return None, set(), ""
+    best = answer.strongest[0]
+    if search.active and not best.names:
+        names = search.point.evidence(search.priors, search.active) - search.least * len(search.active)
+        ahead = best.value - names
+        if ahead > MARGIN:
+            return best, set(search.active), f"{_text(best)} explains the flights better than {_names(search)}, by {ahead:.0f} nats"
+    if best.nats > search.least + MARGIN and best.names == tuple(search.active):
+        idle = {j for j in best.names if _worth(best, j) < search.least}
+        return best, idle, f"{_text(best)} is missing besides what the catalogue holds ({best.nats:.0f} nats)"
+    return None, set(), ""
+
+
+def _worth(hypothesis: Hypothesis, j: int) -> float:
+    """Nats that a name is still worth beside the terms."""
+    whole = hypothesis.point.evidence(hypothesis.priors, hypothesis.active)
+    return whole - hypothesis.point.evidence(hypothesis.priors, [k for k in hypothesis.active if k != j])
+
+
+def _names(search: "Search") -> str:
+    return ", ".join(search.name(j) for j in search.active)
+
+
+def _text(hypothesis: Hypothesis) -> str:
+    return " and ".join(f"{law.formula}, c = {law.coefficient:.3g} ± {law.sd:.2g} {law.unit}" for law in hypothesis.laws())

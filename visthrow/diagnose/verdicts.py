@@ -15,6 +15,7 @@ from visthrow.diagnose.work import Work
 
 if TYPE_CHECKING:
     from visthrow.diagnose.search import Search
+    from visthrow.diagnose.unknown import Hypothesis
 
 HALF_PRIOR = 0.5
 """An effect whose posterior deviation exceeds this share of its prior's was not seen."""
@@ -38,15 +39,19 @@ def conclude(search: "Search", *, laws: bool) -> Diagnosis:
         search: that has run.
         laws: whether to look for laws outside the catalogue.
     """
-    from visthrow.diagnose.unknown import beats_the_catalogue, find_laws
+    from visthrow.diagnose.unknown import Answer, beats_the_catalogue, find_laws
 
     point, model = search.point, search.problem.model
     found = levels(search.nominal, point, search.least)
-    terms = find_laws(search) if laws else ()
-    overall, block, reasons, withdrawn = _overall(search, found, beats_the_catalogue(search, terms))
+    answer = find_laws(search) if laws else Answer()
+    law = beats_the_catalogue(search, answer)
+    overall, block, reasons, withdrawn = _overall(search, found, *law)
+    terms = [term for hypothesis in answer.strongest for term in hypothesis.laws()]
     active = [j for j in search.active if j not in withdrawn]
     if not active and search.active:
         point = search.nominal
+    elif law[0] is not None and active:
+        point = law[0].without_terms()
     spread = covariance(point.information, search.priors.deviation(active))
     findings = tuple(_finding(search, point, j, active, spread, withdrawn) for j in range(len(model.effects)))
     floor = search.priors.floor
@@ -75,7 +80,9 @@ def out_of_domain(model: Model, windows: Sequence[Window], usable: int, seed: in
                      seed=seed)  # fmt: skip
 
 
-def _overall(search: "Search", found: Sequence[Level], law: str) -> tuple[str, str, list[str], set[int]]:
+def _overall(
+    search: "Search", found: Sequence[Level], law: "Hypothesis | None", idle: set[int], said: str
+) -> tuple[str, str, list[str], set[int]]:
     """Overall verdict, block of an unknown effect, reasons, and the names that are withdrawn for it."""
     point, every = search.point, set(search.active)
     strong = too_strong(point, IMPLAUSIBLE_FORCE)
@@ -88,10 +95,9 @@ def _overall(search: "Search", found: Sequence[Level], law: str) -> tuple[str, s
         return result.INCONSISTENT, "", [f"what looks like {names} changes its sign from flight to flight"], every
     excessive = [level for level in found if level.excessive]
     reasons = [_excess(level) for level in excessive]
-    if law:
-        reasons.append(law)
-        excessive_block = law.split(":")[0]
-        return result.UNKNOWN, excessive_block, reasons, _withdrawn(search, {excessive_block}, always=True)
+    if law is not None:
+        reasons.insert(0, said)
+        return result.UNKNOWN, law.terms[0].block, reasons, idle
     stuck = [j for j in search.active if _on_bound(search, j)]
     if stuck:
         names = ", ".join(map(search.name, stuck))
@@ -111,11 +117,11 @@ def _excess(level: Level) -> str:
             f"quietest phase ({level.nats:.0f} nats)")  # fmt: skip
 
 
-def _withdrawn(search: "Search", blocks: set[str], *, always: bool = False) -> set[int]:
+def _withdrawn(search: "Search", blocks: set[str]) -> set[int]:
     """Names that stand for the unknown effect's wrong form: a chain of them in its block, or one that left it as it was."""
     through = {j: acts_on(search.point, j) for j in search.active}
     inside = {j for j, block in through.items() if block in blocks}
-    if always or len(inside) > CHAIN:
+    if len(inside) > CHAIN:
         return inside
     eased = {
         level.block: level.after < 0.5 * level.before
