@@ -6,6 +6,7 @@ these are recorded, so that a replay decides alike to the last bit.
 
 import math
 import traceback
+from collections import deque
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from time import perf_counter
@@ -42,6 +43,9 @@ REACQUIRE = 1.0
 
 HAND_OVER_SPEED, HAND_OVER_TILT = 1.0, math.radians(20.0)
 """Below these the autopilot's own hold takes over after a throw: braking out of 60 deg is done on poses [m/s, rad]."""
+
+HOVERED = 50
+"""Ticks over which the thrust of the hover before a throw is taken: a second."""
 
 DESCENT = 0.4
 """Of the hover point while landing [m/s]."""
@@ -92,6 +96,7 @@ class Runner:
         tracks: by body. lag: trained time from latch to separation [s].
         latches: releases so far. stuck: payloads that stayed on.
         landings: of the throws so far. errors: tracebacks of what was caught.
+        mass: of vehicle, rope and payload [kg].
         mount_b: where the rope hangs on the vehicle [m]. seen_goal_w: target as of the last tick [m].
         spent: time that parts of the last tick took [s]; those that it did not do are missing.
         watcher: called with each pose's body and track once it was taken; None for nobody.
@@ -122,7 +127,7 @@ class Runner:
         self._wait = max(0.0, self.lag - mechanism_lag)
         contract = policy.contract
         rope, body, action = contract["rope"], contract["vehicle"]["body"], contract["action"]
-        self._alone, self._full = body["mass"], body["mass"] + rope["rope_mass"] + rope["payload_mass"]
+        self._alone, self.mass = body["mass"], body["mass"] + rope["rope_mass"] + rope["payload_mass"]
         self.hang = -rope["mount"][2] + rope["length"] + rope["payload_offset"]
         self._reach = math.hypot(*rope["mount"]) + rope["length"] + rope["payload_offset"] + params.check.rope_tolerance
         self.guard = Guard(params.guard, float(action["max_thrust"]), tuple(map(float, action["max_rate"])))
@@ -131,6 +136,7 @@ class Runner:
         self._hover = HoverController(HoverParams(max_thrust=float(action["max_thrust"])), self.pilot.period)
         self._latency = contract["observation"]["latency"]
         self._latch: float | None = None
+        self._hovered: deque[float] = deque(maxlen=HOVERED)  # thrust over weight
         self._hold_w: Vector = params.home_w
         self._acted = State.IDLE
         self._begun = 0.0
@@ -214,6 +220,10 @@ class Runner:
                 self.backend.send(decision.command, now)
                 self.spent["send"] = perf_counter() - ready
                 self.spent["total"] = perf_counter() - begin
+        if state in (State.READY, State.ARMED) and status.mode == FOLLOW and decision.command is not None:
+            self._hovered.append(decision.command[0] / (self.mass * GRAVITY))
+        else:
+            self._hovered.clear()
         if decision.release:
             self._latch, self.latches = now, self.latches + 1
             self._flight = Flight(goal_w, self._begun, now, self.params.landing_height, self.lag)
@@ -274,6 +284,7 @@ class Runner:
             checks = failed_checks(p.check, p.fence, vehicle, payload, goal_w, p.home_w, self.hang)
             if GOAL in self.tracks and self.tracks[GOAL].gate.level(now) >= HOLD:
                 checks.append("the goal's pose is stale")
+            checks += self._thrust_off()
         return Inputs(
             self.tracks[VEHICLE].gate.level(now),
             self.tracks[PAYLOAD].gate.level(now),
@@ -292,6 +303,16 @@ class Runner:
             recording,
             status.mode == FOLLOW,
         )
+
+    def _thrust_off(self) -> list[str]:
+        """Whether hovering takes another thrust than the weight: then the calibration is wrong, or the battery low."""
+        p = self.params
+        if p.backend == "dry-run" or len(self._hovered) < HOVERED:
+            return []
+        allowed, ratio = getattr(p, p.backend).thrust.tolerance, sum(self._hovered) / len(self._hovered)
+        if abs(ratio - 1.0) <= allowed:
+            return []
+        return [f"hovering takes {ratio:.2f} times the weight, within {allowed:g} of 1 expected: calibrate the thrust"]
 
     def _still(self, vehicle: BodyState, payload: BodyState | None, held: bool) -> bool:
         """Whether all is quiet, at the hover point or where the autopilot holds the vehicle."""
@@ -324,7 +345,7 @@ class Runner:
         """What to send in a state, before the guard; None for nothing."""
         if state not in FLYING and state is not State.ABORT:
             return None
-        mass = self._full if self._carries(now, vehicle, payload) else self._alone
+        mass = self.mass if self._carries(now, vehicle, payload) else self._alone
         if vehicle is None or vehicle.quat is None or self.tracks[VEHICLE].gate.level(now) >= HOLD:
             if state is State.ABORT and now - self.machine.since > LEVEL_TIME:
                 return None

@@ -100,6 +100,7 @@ class MavlinkAutopilot:
         self.audit = Audit(rules, self._ask_parameter, self._write_parameter if write else None, tell)
         self.texts: list[str] = []
         self.share: float | None = None
+        self._exact = False
         self.voltage: float | None = None
         link.listen(self._hear)
 
@@ -145,8 +146,8 @@ class MavlinkAutopilot:
             self._kinds[message.param_id] = message.param_type
             self.audit.feed(message.param_id, self._stored(message.param_value, message.param_type))
         elif kind == "ATTITUDE_TARGET":
-            self.share = message.thrust
-        elif kind == "VFR_HUD" and self.share is None:
+            self.share, self._exact = message.thrust, True
+        elif kind == "VFR_HUD" and not self._exact:  # in whole percent
             self.share = 0.01 * message.throttle
         elif kind == "SYS_STATUS" and 0 < message.voltage_battery < 65535:
             self.voltage = 1e-3 * message.voltage_battery
@@ -256,7 +257,7 @@ class MavlinkAutopilot:
             self._link.send(mav.MAVLink_heartbeat_message(mav.MAV_TYPE_ONBOARD_CONTROLLER, 8, 0, 0, 4, 3))
         if self._heartbeat is not None:
             self.audit.service(now)
-            if self.params.servo_output and now - self._streamed > 10.0 and self._wanted is None:
+            if now - self._streamed > 10.0 and self._wanted is None:
                 self._streamed = now
                 for number, period in STREAM:
                     self._command(mav.MAV_CMD_SET_MESSAGE_INTERVAL, 0, number, period)

@@ -81,6 +81,7 @@ class Fake:
     """The vehicle and the motion capture of both bodies; the children add an autopilot's protocol.
 
     Attributes:
+        last_thrust: of the last period [N].
         witness: of what came. followed, ignored: set-points. release_time: when the mechanism's output moved.
     """
 
@@ -115,6 +116,7 @@ class Fake:
         self._open = False
         self.followed = self.ignored = 0
         self.release_time: float | None = None
+        self.last_thrust = 0.0
 
     def later(self, delay: float, what: Callable[[], None]) -> None:
         """Do something after a delay [s]; at once, still within this period, where it is 0."""
@@ -153,7 +155,8 @@ class Fake:
         def trip() -> None:
             self._open = True
 
-        self.later(self.options.servo_delay + self.options.mechanism, trip)
+        # The plant takes a release at the beginning of a period: the nearest one.
+        self.later(self.options.servo_delay + self.options.mechanism - 0.5 * self.plant.period, trip)
 
     @property
     def moved(self) -> bool:
@@ -194,7 +197,9 @@ class Fake:
         self.link.pump(lambda: self.plant.time)
         while self._later and self._later[0][0] <= self.plant.time + 1e-9:
             heapq.heappop(self._later)[2]()
-        self.plant.step(self.flown(), self._open)
+        command = self.flown()
+        self.last_thrust = command[0]
+        self.plant.step(command, self._open)
 
     def emit(self) -> None:
         """Measure and send what is due now."""

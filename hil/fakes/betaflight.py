@@ -155,8 +155,8 @@ class FakeBetaflight(Fake):
         return struct.pack("<HHHIBHHBBI", 125, 0, 33, flags, 0, 10, 0, 0, 29, blocks)
 
     def _rc(self) -> bytes:
-        pilot = [1500, 1500, 1500, 1200, *([LOW] * 8)]
-        channels = list(pilot)
+        throttle = round(MINIMUM + self.thrust_map.share(self.last_thrust) * (HIGH - MINIMUM))
+        channels = [1500, 1500, 1500, throttle, *([LOW] * 8)]  # the pilot's
         if self.override and self.channels:
             channels = [self.channels[at] for at in ORDER] + self.channels[STICKS:]
         if self.options.answer in ("silent", "denied"):  # the channel is not in the mask: it never arrives

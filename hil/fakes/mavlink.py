@@ -16,9 +16,6 @@ FORCE = 21196
 SERVO, CLOSED_US, OPEN_US = 9, 1100, 1900
 """Output of the mechanism, from 1, and its ends [us]."""
 
-STREAM_PERIOD = 0.005
-"""Between two SERVO_OUTPUT_RAW once they were asked for [s]."""
-
 
 class FakeMavlink(Fake):
     """An autopilot on the poses' link."""
@@ -35,7 +32,7 @@ class FakeMavlink(Fake):
         self.mode = self.usual_mode if self.options.mode is None else self.options.mode
         self.parameters = {**self.defaults, **self.options.parameters}
         self._next_beat = 0.0
-        self._stream = float("inf")  # time of the next SERVO_OUTPUT_RAW [s]
+        self._streams: dict[int, tuple[float, float]] = {}  # by message: time of the next one, and period [s]
         self.refusals: list[str] = []
         link.listen(self._hear)
 
@@ -90,8 +87,7 @@ class FakeMavlink(Fake):
         elif number == mav.MAV_CMD_COMPONENT_ARM_DISARM:
             self._arm(message)
         elif number == mav.MAV_CMD_SET_MESSAGE_INTERVAL:
-            if message.param1 == mav.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW:
-                self._stream = self.plant.time
+            self._streams[int(message.param1)] = (self.plant.time, 1e-6 * message.param2)
             self.acknowledge(number, mav.MAV_RESULT_ACCEPTED)
         elif self.is_release(message):
             self.note_release()
@@ -144,11 +140,20 @@ class FakeMavlink(Fake):
             self._next_beat = time + 1.0
             flags = CUSTOM | (ARMED if self.armed else 0)
             self.link.send(mav.MAVLink_heartbeat_message(mav.MAV_TYPE_QUADROTOR, self.autopilot, flags, self.mode, 4, 3))
-        if time >= self._stream - 1e-9:
-            self._stream += STREAM_PERIOD
+        for number, (due, period) in self._streams.items():
+            if time >= due - 1e-9:
+                self._streams[number] = (due + period, period)
+                self._stream(number)
+
+    def _stream(self, number: int) -> None:
+        """Send one of the messages that were asked for."""
+        if number == mav.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW:
             outputs = [0] * 16
             outputs[SERVO - 1] = OPEN_US if self.moved else CLOSED_US
             self.link.send(mav.MAVLink_servo_output_raw_message(int(self.clock() * 1e6) & 0xFFFFFFFF, 0, *outputs))
+        elif number == mav.MAVLINK_MSG_ID_ATTITUDE_TARGET:
+            share, boot = self.thrust_map.share(self.last_thrust), int(self.clock() * 1e3) & 0xFFFFFFFF
+            self.link.send(mav.MAVLink_attitude_target_message(boot, 0, [1.0, 0.0, 0.0, 0.0], 0.0, 0.0, 0.0, share))
 
     def report(self) -> dict[str, Any]:
         """See `Fake`."""

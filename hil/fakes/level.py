@@ -1,0 +1,53 @@
+"""A plant of a few lines: it stands in the air whatever it is told, and drops the payload at its feet.
+
+For what concerns protocol, faults and time alone: no simulator is needed for it.
+"""
+
+from collections import deque
+from typing import Any
+
+import numpy as np
+
+from visthrow.hover import GRAVITY
+
+MOST_KEPT = 10_000
+"""Commands that are remembered."""
+
+
+class LevelPlant:
+    """See `hil.fakes.base.WirePlant`.
+
+    Attributes:
+        released: when the release came [s]. commands: all that it was told, the last ones of a long flight.
+    """
+
+    period, home_w, mass, max_thrust = 0.005, np.array([0.0, 0.0, 1.333]), (0.272, 0.21), 14.0
+
+    def __init__(self) -> None:
+        self.time, self.released, self.commands = 0.0, None, []
+
+    def step(self, command: np.ndarray, release: bool) -> None:
+        self.commands.append(tuple(command))
+        if release and self.released is None:
+            self.released = self.time
+        self.time += self.period
+
+    @property
+    def state(self) -> dict:
+        hangs = self.released is None or self.time < self.released + 0.11
+        fall = 0.0 if hangs else 0.5 * GRAVITY * (self.time - self.released - 0.11) ** 2
+        ball = np.array([0.0, 0.0, max(self.home_w[2] - 0.383 - fall, 0.04)])
+        level = np.array([0.0, 0.0, 0.0, 1.0])
+        return {
+            "pos_w": self.home_w, "quat_wb": level, "vel_w": np.zeros(3), "rate_b": np.zeros(3), "payload_pos_w": ball,
+            "attached": np.array(hangs),
+        }  # fmt: skip
+
+    @property
+    def landing(self) -> dict:
+        return {"landing_w": None, "landing_time": None, "separation_time": None}
+
+
+def make(policy: str, seed: int) -> LevelPlant:
+    """The plant, for any policy and seed; see `hil.fake.load_plant`."""
+    return LevelPlant()
