@@ -95,6 +95,7 @@ class Trainer:
         rank = ranks["global_rank"] if ranks else 0
         torch.manual_seed(seed * 1000 + rank)
         if device.startswith("cuda"):
+            torch.cuda.set_device(device)  # captures and synchronisation go to the current device
             torch.backends.cuda.matmul.allow_tf32 = True
         self.experiment, self.device, self.seed, self.ranks = experiment, device, seed, ranks
         self.env = ThrowEnv(experiment, device, seed * 1000 + rank)

@@ -18,6 +18,8 @@ from typing import Protocol
 from visthrow.sweep.units import Source, ThrowUnit, Work
 from visthrow.sweep.work import EXIT_BUSY, EXIT_STOPPED
 
+VISIBLE = "CUDA_VISIBLE_DEVICES"
+THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 POLL = 0.3  # between two looks at what runs [s]
 GRACE = 90.0  # for a stopped process to write its checkpoint [s]
 BUSY_PAUSE = 5.0  # before a unit that another process has is looked at again [s]
@@ -62,11 +64,9 @@ class Starter(Protocol):
 class Process:
     """A task in a process of this machine; it stops by itself when this one dies (see ``visthrow sweep work``)."""
 
-    def __init__(self, words: Sequence[str], log: Path, threads: int | None) -> None:
+    def __init__(self, words: Sequence[str], log: Path, environment: dict[str, str]) -> None:
         log.parent.mkdir(parents=True, exist_ok=True)
-        environment = dict(os.environ, PYTHONUNBUFFERED="1")
-        if threads:
-            environment |= {name: str(threads) for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")}
+        environment = {**os.environ, "PYTHONUNBUFFERED": "1", **environment}
         with log.open("ab") as file:
             self._process = subprocess.Popen(
                 words, stdin=subprocess.DEVNULL, stdout=file, stderr=subprocess.STDOUT, env=environment, start_new_session=True
@@ -98,11 +98,17 @@ class Local:
     def start(self, task: Task, device: str, minutes: float | None) -> Process:
         """See `Starter`."""
         words = [sys.executable, "-m", "visthrow.cli", "sweep", "work", self.list_name, "--out", str(self.out)]
-        words += ["--units", ",".join(task.ids), "--device", device, "--parent", str(os.getpid())]
+        words += ["--units", ",".join(task.ids), "--parent", str(os.getpid())]
+        if device.startswith("cuda"):  # the process sees its own GPU alone, and puts no context on the others
+            seen = [item for item in os.environ.get(VISIBLE, "").split(",") if item]
+            index = int(device.removeprefix("cuda:"))
+            words, environment = [*words, "--device", "cuda:0"], {VISIBLE: seen[index] if seen else str(index)}
+        else:
+            words, environment = [*words, "--device", device], dict.fromkeys(THREADS, "1") if not task.gpu else {}
         words += ["--minutes", f"{minutes:.3f}"] if minutes is not None else []
         for change in self.changes:
             words += ["--set", change]
-        return Process(words, task.log(self.out), None if device.startswith("cuda") else 1)
+        return Process(words, task.log(self.out), environment)
 
 
 @dataclass

@@ -186,8 +186,8 @@ def differences(own: dict, flown: dict, path: str = "") -> dict[str, Any]:
 
 
 def _trained(name: str, changes: tuple[str, ...], seed: int, commit: str) -> Source:
-    text = config.dumps(_experiment(name, changes))
-    key = results.key_of({"config": text, "seed": seed, **({"commit": commit} if commit else {})})
+    stated = config.to_dict(_experiment(name, changes), defaults=False)  # a field that is added later changes no key
+    key = results.key_of({"config": stated, "seed": seed, **({"commit": commit} if commit else {})})
     return Source(f"{Path(name).stem}-{seed}", name, changes, seed, key)
 
 
