@@ -196,7 +196,8 @@ class Machine:
             self._go(now, State.RECOVER, "the policy did not release in time")
 
     def _recover(self, now: float, seen: Inputs) -> None:
-        if self._lasted(now, seen.still, self.params.quiet):
+        # An old pose is always quiet: what stands still there is the motion capture.
+        if self._lasted(now, seen.still and seen.vehicle < HOLD, self.params.quiet):
             more = self.throws < self.most
             self._go(now, State.READY if more else State.LAND, "hovering again")
         elif seen.land or self._late(now):

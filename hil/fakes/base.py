@@ -3,7 +3,7 @@
 import heapq
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from hil.frames import FrameParams, Frames
 from hil.link import Link
 from hil.mavlink import mav
 from hil.mocap import Mocap, MocapParams
+from hil.mocap_faults import MocapFault
 from hil.pose import PAYLOAD, Pose
 from visthrow.hover import GRAVITY, HoverController, HoverParams
 
@@ -69,6 +70,9 @@ class Options:
     mechanism: float = 0.0  # from the output's movement to the latch of the plant, whose own lag follows [s]
     clock_offset: float = 0.0  # of its clock [s]
     silent_after: float = float("inf")  # it says nothing any more from this time on [s]
+    pose_message: Literal["ATT_POS_MOCAP", "ODOMETRY"] = "ATT_POS_MOCAP"  # ODOMETRY carries a reset counter
+    mocap_fault: str = "none"  # of hil.mocap_faults
+    fault_time: float = float("inf")  # from which it happens [s]
     all_channels: bool = False  # Betaflight: all channels come by MSP, the arming one as well
 
     def __post_init__(self) -> None:
@@ -101,6 +105,7 @@ class Fake:
         """
         self.plant, self.link, self.options = plant, link, options or Options()
         self.mocap = Mocap(mocap or MocapParams(), seed)
+        self.mocap_fault = MocapFault(self.options.mocap_fault, self.options.fault_time, seed)
         self.witness = Witness((plant.max_thrust, *MAX_RATES))
         # Out there the world is x north, y east, z down, the body forward, right, down, quaternions w first.
         ned = Frames(FrameParams("x,-y,-z", "x,-y,-z", "wxyz", 0.0, (0.0, 0.0, 0.0)))
@@ -204,7 +209,8 @@ class Fake:
     def emit(self) -> None:
         """Measure and send what is due now."""
         if self.mocap.due(self.plant.time):
-            for pose in self.mocap.measure(self.plant.time, self.plant.state):
+            written = [self._to_source(pose) for pose in self.mocap.measure(self.plant.time, self.plant.state)]
+            for pose in self.mocap_fault.spoil(written, self.plant.time):
                 self._post(pose)
         while self._later and self._later[0][0] <= self.plant.time + 1e-9:
             heapq.heappop(self._later)[2]()
@@ -217,10 +223,16 @@ class Fake:
         self.emit()
 
     def _post(self, pose: Pose) -> None:
-        """Put a pose on its way."""
-        out = self._to_source(pose)
+        """Put a pose, as the source writes it, on its way."""
         stamp = int((pose.stamp + self.options.clock_offset) * 1e6)
-        message = mav.MAVLink_att_pos_mocap_message(stamp, list(out.quat), *out.pos)
+        if self.options.pose_message == "ODOMETRY":
+            unknown = [float("nan")] * 6
+            message = mav.MAVLink_odometry_message(
+                stamp, mav.MAV_FRAME_LOCAL_FRD, mav.MAV_FRAME_BODY_FRD, *pose.pos, list(pose.quat), *unknown,
+                [float("nan")] * 21, [float("nan")] * 21, pose.reset % 256,
+            )  # fmt: skip
+        else:
+            message = mav.MAVLink_att_pos_mocap_message(stamp, list(pose.quat), *pose.pos)
         self.later(pose.arrival - self.plant.time, lambda: self._send_pose(message, pose.body))
 
     def _send_pose(self, message: Any, body: str) -> None:

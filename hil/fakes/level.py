@@ -24,16 +24,21 @@ class LevelPlant:
     period, home_w, mass, max_thrust = 0.005, np.array([0.0, 0.0, 1.333]), (0.272, 0.21), 14.0
 
     def __init__(self) -> None:
-        self.time, self.released, self.commands = 0.0, None, []
+        """Start at time 0."""
+        self.time: float = 0.0
+        self.released: float | None = None
+        self.commands: deque[tuple[float, ...]] = deque(maxlen=MOST_KEPT)
 
     def step(self, command: np.ndarray, release: bool) -> None:
+        """See `WirePlant`."""
         self.commands.append(tuple(command))
         if release and self.released is None:
             self.released = self.time
         self.time += self.period
 
     @property
-    def state(self) -> dict:
+    def state(self) -> dict[str, np.ndarray]:
+        """See `WirePlant`."""
         hangs = self.released is None or self.time < self.released + 0.11
         fall = 0.0 if hangs else 0.5 * GRAVITY * (self.time - self.released - 0.11) ** 2
         ball = np.array([0.0, 0.0, max(self.home_w[2] - 0.383 - fall, 0.04)])
@@ -44,7 +49,8 @@ class LevelPlant:
         }  # fmt: skip
 
     @property
-    def landing(self) -> dict:
+    def landing(self) -> dict[str, Any]:
+        """See `WirePlant`; what falls at its feet is not reported."""
         return {"landing_w": None, "landing_time": None, "separation_time": None}
 
 

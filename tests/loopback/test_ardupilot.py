@@ -9,10 +9,11 @@ from hil.backends import ArduPilot
 from hil.backends.ardupilot import GUIDED, LAND_MODE
 from hil.errors import RunError
 from hil.fake import VEHICLE_ID, FakeAutopilot, MocapParams, Options, load_plant
+from hil.fakes.level import LevelPlant
 from hil.link import Link, attitude_target
 from hil.params import HilParams
 from tests.hil_flight import simple_policy
-from tests.loopback.wire import LevelPlant, pipe, throw
+from tests.loopback.wire import pipe, throw
 from visthrow import config
 
 PARAMS = config.load(HilParams, config.find("hil", "fake"), ["ardupilot.audit=false"]).ardupilot

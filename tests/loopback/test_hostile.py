@@ -12,10 +12,11 @@ import pytest
 from pymavlink.generator.mavcrc import x25crc
 
 from hil.backends.base import FAILED
+from hil.fakes.level import LevelPlant
 from hil.flight import AutoOperator
 from hil.mavlink import mav
 from tests.hil_flight import simple_policy
-from tests.loopback.wire import LevelPlant, peers, throw
+from tests.loopback.wire import peers, throw
 
 READY = 8.0
 """From the call to waiting for poses on a busy machine [s]; 1.5 s on a free core, 3 s are asked for."""

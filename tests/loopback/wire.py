@@ -2,8 +2,6 @@
 
 from collections import deque
 
-import numpy as np
-
 from hil.backends import Betaflight, make_backend, mechanism_lag
 from hil.fake import VEHICLE_ID, MocapParams, Options, make_fake
 from hil.fakes import Fake
@@ -13,7 +11,6 @@ from hil.runner import Runner
 from hil.sources import MavlinkSource
 from hil.sync import LinkSync
 from visthrow import config
-from visthrow.hover import GRAVITY
 from visthrow.policy import Policy, find_policy
 
 
@@ -63,36 +60,6 @@ class PlantClock:
     def wait_for(self, port: MemoryPort, when: float) -> None:
         while self._fake.plant.time < when - 1e-9 and not port.inbox:
             self._fake.step()
-
-
-class LevelPlant:
-    """A plant of a few lines for tests of the protocol: hovers, turns as told, drops the payload at its feet."""
-
-    period, home_w, mass, max_thrust = 0.005, np.array([0.0, 0.0, 1.333]), (0.272, 0.21), 14.0
-
-    def __init__(self) -> None:
-        self.time, self.released, self.commands = 0.0, None, []
-
-    def step(self, command: np.ndarray, release: bool) -> None:
-        self.commands.append(tuple(command))
-        if release and self.released is None:
-            self.released = self.time
-        self.time += self.period
-
-    @property
-    def state(self) -> dict:
-        hangs = self.released is None or self.time < self.released + 0.11
-        fall = 0.0 if hangs else 0.5 * GRAVITY * (self.time - self.released - 0.11) ** 2
-        ball = np.array([0.0, 0.0, max(self.home_w[2] - 0.383 - fall, 0.04)])
-        level = np.array([0.0, 0.0, 0.0, 1.0])
-        return {
-            "pos_w": self.home_w, "quat_wb": level, "vel_w": np.zeros(3), "rate_b": np.zeros(3), "payload_pos_w": ball,
-            "attached": np.array(hangs),
-        }  # fmt: skip
-
-    @property
-    def landing(self) -> dict:
-        return {"landing_w": None, "landing_time": None, "separation_time": None}
 
 
 CONFIGS = {"ardupilot": "fake", "px4": "fake_px4", "betaflight": "fake_betaflight"}

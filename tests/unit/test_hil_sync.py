@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 
 from hil.clock import TimeSync
+from hil.fakes.level import LevelPlant
 from hil.fake import VEHICLE_ID, FakeAutopilot, MocapParams, Options
 from hil.link import Link
 from hil.mavlink import mav
 from hil.sources import BodyIds, MavlinkSource
 from hil.sync import LATE, LinkSync
-from tests.loopback.wire import LevelPlant, pipe
+from tests.loopback.wire import pipe
 
 RATE = 10.0
 """Exchanges a second."""

@@ -1,0 +1,133 @@
+"""What goes wrong with motion capture, injected over the wire: what the runner does, and how soon.
+
+In lock step the whole chain runs on MAVLink bytes, on the plant's clock, the same on every machine.
+"""
+
+import math
+
+import pytest
+
+from hil.errors import RunError
+from hil.fakes.level import LevelPlant
+from hil.flight import fly
+from hil.mocap_faults import FAULTS, MocapFault
+from hil.pose import VEHICLE, Pose
+from hil.runner import Words
+from tests.hil_flight import simple_policy
+from tests.loopback.wire import peers
+from visthrow.actions import hover_action
+
+HOVER = hover_action(9.81 * 0.272, 14.0)[0]
+NEVER = simple_policy((HOVER, 0.0, 0.0, 0.0, -1.0))
+START = 2.0
+"""When the fault begins [s]: in a throw that the policy never releases."""
+
+QUICK = ("states.check_hold=0.2", "states.armed_least=0.1", "states.quiet=0.1", "states.abort=0.5")
+ODOMETRY = (
+    'source.senders=[{ body = "vehicle", message = "ODOMETRY", system = 1, component = 1 }, '
+    '{ body = "payload", message = "ODOMETRY", system = 1, component = 25 }]',
+)
+
+HOLD, ABORT, TICK = 0.10, 0.25, 0.02
+"""Content ages that end a throw and a run, and the runner's period [s]."""
+
+ROOM = 2 * TICK
+"""From the last good pose's measurement to the fault, by its latency, and to the next tick [s]."""
+
+ENDS = {"stop", "repeat", "swap", "jump", "order", "zero-quaternion", "nan-quaternion", "reset"}
+"""Faults after which no pose is to be trusted any more."""
+
+FLOWN_THROUGH = {"none", "clock-forth", "clock-back", "shuffle", "double"}
+
+
+class OneWord:
+    """Arms one throw."""
+
+    def words(self, state: str) -> Words:
+        return Words(arm=state == "ready")
+
+
+def spoiled(name: str, seconds: float = 1.2, loaded=NEVER):
+    """A run in which a fault happens in mid throw: runner, fake, and the first decision of each state."""
+    more = ODOMETRY if name == "reset" else ()
+    plant, told = LevelPlant(), []
+    runner, source, clock, fake = peers(
+        plant, overrides=(*QUICK, *more), loaded=loaded, mocap_fault=name, fault_time=START,
+        pose_message="ODOMETRY" if more else "ATT_POS_MOCAP",
+    )  # fmt: skip
+    fly(runner, source, clock, OneWord(), None, START + seconds, told.append)
+    return runner, fake, [(d.state, d.reason, d.time) for d in told]
+
+
+def when(told, state: str, after: float = 0.0) -> float:
+    return next(time for name, _, time in told if name == state and time > after)
+
+
+@pytest.mark.parametrize("name", sorted(FAULTS))
+def test_a_fault_in_mid_throw(name):
+    runner, fake, told = spoiled(name)
+    assert when(told, "throw") < START - 0.3, "the throw goes on when the fault begins"
+    after = [(state, reason) for state, reason, time in told if time > START]
+    if name in ENDS:
+        assert after[0] == ("recover", "stale poses")
+        assert when(told, "recover") == pytest.approx(START + HOLD, abs=ROOM)
+        assert after[1][0] == "abort"
+        assert "no new pose of the vehicle" in after[1][1]
+        assert when(told, "abort") == pytest.approx(START + ABORT, abs=ROOM)
+    elif name == "payload-lost":
+        assert after[0] == ("recover", "stale poses")
+        assert when(told, "recover") == pytest.approx(START + HOLD, abs=ROOM)
+        assert "abort" not in [state for state, _ in after]
+    elif name == "rare":
+        assert after[0][0] == "recover"
+        assert when(told, "recover") <= START + 0.2 + HOLD + ROOM
+        assert "throw" not in [state for state, _ in after]
+    else:
+        assert name in FLOWN_THROUGH
+        assert after == [], "the throw goes on"
+    assert fake.witness.breaches == []
+    assert fake.witness.releases == 0
+    assert fake.witness.commands > 50
+    assert not runner.errors
+
+
+def test_every_fault_is_accounted_for():
+    assert ENDS | FLOWN_THROUGH | {"payload-lost", "rare"} == set(FAULTS)
+
+
+@pytest.mark.parametrize("name", ["swap", "order", "jump", "shuffle", "clock-forth"])
+def test_a_fault_as_the_policy_asks_for_the_release(name):
+    """It asks from the first tick of the throw on; the fault is there from the start of the check: nothing is released
+    unless the poses passed all checks, and then once."""
+    at_once = simple_policy((HOVER, 0.0, 0.0, 0.0, 1.0))
+    plant = LevelPlant()
+    runner, source, clock, fake = peers(
+        plant, overrides=(*QUICK, "states.check=1.0"), loaded=at_once, mocap_fault=name, fault_time=0.0
+    )
+    fly(runner, source, clock, OneWord(), None, 3.0)
+    assert fake.witness.breaches == []
+    assert fake.witness.releases == (1 if name in FLOWN_THROUGH else 0), runner.machine.reason
+    assert runner.latches == fake.witness.releases
+    if name not in FLOWN_THROUGH and name != "jump":
+        assert fake.witness.commands == 0, "what fails the checks is never flown"
+
+
+def test_faults_themselves():
+    good = [Pose(0.01 * i, 0.01 * i, VEHICLE, (0.0, 0.0, 1.0 + i), (1.0, 0.0, 0.0, 0.0)) for i in range(50)]
+
+    def made(name):
+        fault = MocapFault(name, 0.1)
+        return [p for pose in good for p in fault.spoil([pose], pose.stamp)]
+
+    for name in FAULTS:
+        assert made(name)[:10] == good[:10], "before its time nothing happens"
+    assert len(made("stop")) == 10
+    assert {p.pos for p in made("repeat")[10:]} == {good[9].pos}
+    assert made("order")[10].quat == (0.0, 0.0, 0.0, 1.0)
+    assert all(math.isnan(x) for x in made("nan-quaternion")[10].quat)
+    assert [p.stamp for p in made("rare")[10:]] == pytest.approx([0.1, 0.3])
+    assert len(made("double")) == 90
+    arrivals = [p.arrival for p in made("shuffle")]
+    assert arrivals != sorted(arrivals)
+    with pytest.raises(RunError, match="did you mean 'swap'"):
+        MocapFault("swop", 0.0)
