@@ -63,7 +63,7 @@ def conclude(search: "Search", *, laws: bool) -> Diagnosis:
         tuple((tuple(map(search.name, s)), n) for s, n in search.sets), found, tuple(terms), tuple(search.events),
         sensor_scale={name: float(point.noise.scale[c]) for c, name in enumerate(model.channels)},
         flights=len(point.statistics.flights), windows=len(point.windows), samples=int(point.statistics.samples.sum()),
-        work=Work(search.problem, search.nominal, point, tuple(active)),
+        work=Work(search.problem, search.nominal, search.point if active else search.nominal, tuple(active)),
     )  # fmt: skip
 
 
