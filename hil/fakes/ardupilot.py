@@ -51,6 +51,7 @@ class FakeArduPilot(FakeMavlink):
         if mode not in (GUIDED, GUIDED_NOGPS, LOITER, BRAKE, LAND_MODE):
             return mav.MAV_RESULT_FAILED
         if mode != self.mode:
+            self.happened(f"mode {mode}")
             self.mode, self._place, self._target = mode, self.plant.state["pos_w"].astype(float), None
             self._hover.reset()
         return mav.MAV_RESULT_ACCEPTED
@@ -85,6 +86,7 @@ class FakeArduPilot(FakeMavlink):
         if self.mode not in (GUIDED, GUIDED_NOGPS) or self._target is None:
             return self.hold(self._place)
         if self.plant.time - self._told > self.parameters["GUID_TIMEOUT"]:
+            self.happened("levelled: no set-points")
             return np.array([self.weight(), 0.0, 0.0, 0.0])
         return self._meant(self._target)
 

@@ -26,6 +26,8 @@ ANSWERS = ("accepted", "in-progress", "denied", "silent", "stuck")
 MAX_RATES = (10.0, 10.0, 4.0)
 """Largest body rates that the policies were trained with [rad/s]."""
 
+MOST_EVENTS = 200
+
 DESCENT, TOUCH = 0.4, 0.12
 """Of a landing below the vehicle [m]; height that counts as down [m]."""
 
@@ -85,7 +87,7 @@ class Fake:
     """The vehicle and the motion capture of both bodies; the children add an autopilot's protocol.
 
     Attributes:
-        last_thrust: of the last period [N].
+        last_thrust: of the last period [N]. events: times and what happened.
         witness: of what came. followed, ignored: set-points. release_time: when the mechanism's output moved.
     """
 
@@ -117,11 +119,17 @@ class Fake:
         self.armed = self.options.armed
         self._place = np.array(plant.home_w, dtype=float)
         self._target: np.ndarray | None = None
-        self._told = -np.inf
+        self._told = float("-inf")  # when the last set-point was followed [s]
         self._open = False
         self.followed = self.ignored = 0
         self.release_time: float | None = None
         self.last_thrust = 0.0
+        self.events: list[tuple[float, str]] = []
+
+    def happened(self, text: str) -> None:
+        """Note something that the autopilot did by itself, or was told; the same again at once is no news."""
+        if len(self.events) < MOST_EVENTS and (not self.events or self.events[-1][1] != text):
+            self.events.append((round(self.plant.time, 3), text))
 
     def later(self, delay: float, what: Callable[[], None]) -> None:
         """Do something after a delay [s]; at once, still within this period, where it is 0."""
@@ -187,6 +195,7 @@ class Fake:
         pos = self.plant.state["pos_w"]
         if pos[2] < TOUCH:
             self.armed = False
+            self.happened("landed, disarmed")
         return self.hold(np.array([self._place[0], self._place[1], max(pos[2] - DESCENT, 0.05)]))
 
     def flown(self) -> np.ndarray:
@@ -248,7 +257,7 @@ class Fake:
         return {
             **self.plant.landing, "followed": self.followed, "ignored": self.ignored, "releases": w.releases,
             "release_time": self.release_time, "armed": self.armed, "commands": w.commands, "worst": w.worst,
-            "breaches": w.breaches, "end_w": self.plant.state["pos_w"].tolist(), "time": self.plant.time,
+            "breaches": w.breaches, "events": self.events, "last_command": self._told, "end_w": self.plant.state["pos_w"].tolist(), "time": self.plant.time,
         }  # fmt: skip
 
     def close(self) -> None:

@@ -195,8 +195,11 @@ class FakeBetaflight(Fake):
         if not self.override or self._target is None:
             gone = self._first is not None and not self.armed and not self.options.all_channels
             return np.zeros(4) if gone else self.hold(self._place)
+        if quiet > IDLE_AFTER:
+            self.happened("failsafe: motors idle")
         if quiet > DISARM_AFTER:
             self.armed = self.override = False
+            self.happened("failsafe: disarmed")
         return np.zeros(4) if quiet > IDLE_AFTER else self._target
 
     def speak(self) -> None:

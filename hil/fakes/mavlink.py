@@ -117,6 +117,7 @@ class FakeMavlink(Fake):
             self.acknowledge(message.command, mav.MAV_RESULT_FAILED)
         else:
             self.armed = wanted
+            self.happened("armed" if wanted else "disarmed")
             self._next_beat = 0.0
             self.acknowledge(message.command, mav.MAV_RESULT_ACCEPTED)
 

@@ -69,6 +69,7 @@ class FakePx4(FakeMavlink):
             self.refusals.append(f"{time:.3f} s: OFFBOARD before the stream")
             return mav.MAV_RESULT_TEMPORARILY_REJECTED
         if mode != self.mode:
+            self.happened(f"mode {mode >> 16 & 255}.{mode >> 24}")
             self.mode, self._place, self._target = mode, self.plant.state["pos_w"].astype(float), None
             self._hover.reset()
         return mav.MAV_RESULT_ACCEPTED
@@ -107,6 +108,7 @@ class FakePx4(FakeMavlink):
     def flown(self) -> np.ndarray:
         """See `Fake`."""
         if self.mode == OFFBOARD and self.plant.time - self._last > self.parameters["COM_OF_LOSS_T"]:
+            self.happened("left OFFBOARD: no set-points")
             self.enter(LAND if self.parameters["COM_OBL_RC_ACT"] == LAND_OR_HOLD[0] else HOLD)
             self._next_beat = 0.0
         if self.mode == LAND:

@@ -358,7 +358,7 @@ def test_another_camera_is_refused():
         ("throws=0", "expected 1 or more"),
         ('source.kind="csv"', "expected the file of the csv source"),
         ('frames.vehicle.axes="x,y,-z"', "mirror the world"),
-        ('backend="px4"', "one of 'dry-run', 'ardupilot'"),
+        ('backend="px5"', "one of 'dry-run', 'ardupilot', 'px4', 'betaflight'"),
         ("gaol_w=[1.0]", "did you mean 'goal_w'"),
         ("guard.slew_thrust=0.0", "above 0"),
         ("fence.vehicle_low=[9.0, 0.0, 0.0]", "ascending corners"),

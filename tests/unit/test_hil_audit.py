@@ -1,0 +1,154 @@
+"""The parameter audit: asked for until told, judged, written only where the operator said so, and the release's book-keeping."""
+
+import pytest
+
+from hil.backends.audit import GIVE_UP, Audit, Rule, bits, equal, within
+from hil.backends.base import ACCEPTED, FAILED, IDLE, PENDING, Release
+
+RULES = (
+    bits("GUID_OPTIONS", 8, "thrust"),
+    equal("ATC_ANGLE_BOOST", 0.0, "tilt"),
+    within("GUID_TIMEOUT", 0.0, 1.0, 0.5, "silence"),
+    Rule("FIXED", "7", "cannot be written", lambda v: v == 7),
+)
+GOOD = {"GUID_OPTIONS": 13.0, "ATC_ANGLE_BOOST": 0.0, "GUID_TIMEOUT": 1.0, "FIXED": 7.0}
+
+
+def audit(values, write=False):
+    """An audit of a vehicle with these parameters: the audit, what was asked and written, the tables shown."""
+    values, asked, written, tables = dict(values), [], [], []
+    box = []
+
+    def ask(name):
+        asked.append(name)
+        if name in values:
+            box[0].feed(name, values[name])
+
+    def put(name, value):
+        written.append((name, value))
+        values[name] = value
+
+    box.append(Audit(RULES, ask, put if write else None, tables.append))
+    now = 0.0
+    while not box[0].done:
+        box[0].service(now)
+        now += 0.02
+    return box[0], asked, written, tables, now
+
+
+def test_good_parameters_pass_at_once():
+    found, asked, written, tables, now = audit(GOOD, write=True)
+    assert (found.problems, written, len(tables)) == ([], [], 1)
+    assert (sorted(asked), now < 0.1) == (sorted(GOOD), True)
+    assert "WRONG" not in tables[0]
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "text"),
+    [
+        ("GUID_OPTIONS", 5.0, "GUID_OPTIONS is 5; expected with the bits of 8 set"),
+        ("ATC_ANGLE_BOOST", 1.0, "ATC_ANGLE_BOOST is 1; expected 0"),
+        ("GUID_TIMEOUT", 3.0, "GUID_TIMEOUT is 3; expected above 0, at most 1"),
+        ("GUID_TIMEOUT", 0.0, "GUID_TIMEOUT is 0; expected above 0, at most 1"),
+        ("FIXED", float("nan"), "FIXED is nan; expected 7"),
+    ],
+)
+def test_a_mismatch_is_named(name, value, text):
+    found, _, written, tables, _ = audit({**GOOD, name: value})
+    assert (found.problems, written) == ([text], []), "and nothing is written unasked"
+    (line,) = [line for line in tables[0].splitlines() if line.startswith("WRONG")]
+    assert name in line
+    assert "--write-parameters" in tables[0]
+
+
+def test_a_parameter_that_is_not_told_is_a_mismatch():
+    values = {k: v for k, v in GOOD.items() if k != "ATC_ANGLE_BOOST"}
+    found, asked, _, tables, now = audit(values)
+    assert found.problems == ["ATC_ANGLE_BOOST was not told; expected 0"]
+    assert GIVE_UP < now < GIVE_UP + 0.1
+    assert 20 <= asked.count("ATC_ANGLE_BOOST") <= 27, "asked again and again"
+    assert "no answer" in tables[0]
+
+
+def test_writing_keeps_other_bits_and_is_read_back():
+    found, _, written, tables, _ = audit({**GOOD, "GUID_OPTIONS": 5.0, "GUID_TIMEOUT": 3.0}, write=True)
+    assert (found.problems, sorted(written)) == ([], [("GUID_OPTIONS", 13), ("GUID_TIMEOUT", 0.5)])
+    assert tables[0].count("(written)") == 2
+
+
+def test_what_cannot_be_written_stays_wrong():
+    found, _, written, _, _ = audit({**GOOD, "FIXED": 1.0}, write=True)
+    assert (found.problems, written) == (["FIXED is 1; expected 7"], [])
+
+
+def test_a_vehicle_that_does_not_take_the_value_is_not_written_for_ever():
+    sent = []
+    stubborn = Audit(RULES[1:2], lambda name: stubborn.feed(name, 1.0), lambda name, value: sent.append(value))
+    for i in range(400):
+        stubborn.service(0.02 * i)
+    assert (sent, stubborn.problems) == ([0.0], ["ATC_ANGLE_BOOST is 1; expected 0"])
+
+
+def sends(release, until, start=0.0):
+    """Times at which it is to be sent."""
+    out, now = [], start
+    while now < until:
+        if release.due(now):
+            out.append(round(now, 3))
+        now += 0.005
+    return out
+
+
+def test_a_release_is_sent_at_its_time_and_repeated_until_it_is_answered():
+    release = Release(0.5)
+    release.start(0.1)
+    release.start(0.2)
+    assert sends(release, 0.2) == pytest.approx([0.1, 0.14, 0.18], abs=0.006)
+    release.answer(True)
+    assert (release.state, sends(release, 2.0, 0.2)) == (ACCEPTED, [])
+    release.start(3.0)
+    assert sends(release, 4.0, 3.0) == [], "never twice"
+
+
+def test_in_progress_is_pending_and_ends_by_the_time_out():
+    release = Release(0.5)
+    release.start(0.0)
+    release.due(0.0)
+    release.answer(None)
+    assert (sends(release, 0.49, 0.01), release.state) == ([], PENDING)
+    assert (sends(release, 0.6, 0.49), release.state, release.note) == ([], FAILED, "no final answer within 0.5 s")
+    release.answer(True)
+    assert release.state == FAILED, "too late is too late"
+
+
+def test_an_acceptance_without_a_movement_fails_where_it_is_read_back():
+    release = Release(0.5, read_back=True)
+    release.start(0.0)
+    release.moved()
+    release.due(0.0)
+    release.answer(True)
+    assert release.state == PENDING, "a movement before the release says nothing"
+    sends(release, 0.6)
+    assert (release.state, release.note) == (FAILED, "accepted, but nothing moved within 0.5 s")
+    release.reset()
+    release.start(1.0)
+    release.due(1.0)
+    release.moved()
+    release.answer(True)
+    assert release.state == ACCEPTED
+
+
+def test_what_was_stopped_before_its_time_never_happened():
+    release = Release(0.5)
+    release.start(0.1)
+    release.stop()
+    assert (release.state, sends(release, 1.0)) == (IDLE, [])
+    release.start(2.0)
+    release.due(2.0)
+    release.stop()
+    assert sends(release, 2.4, 2.01) == [], "one that was sent is not repeated"
+    release.answer(True)
+    assert release.state == ACCEPTED, "but its answer counts"
+    release.reset()
+    release.answer(False, "late")
+    assert release.state == IDLE, "an answer to nothing is none"

@@ -1,0 +1,93 @@
+"""MSP frames: against published bytes, whole and in pieces, and a flood of anything."""
+
+import struct
+
+import numpy as np
+import pytest
+
+from hil import msp
+from hil.backends import Betaflight
+from hil.params import HilParams
+from tests.loopback.wire import pipe
+from visthrow import config
+
+HELLO = msp.Frame(msp.STATUS, struct.pack("<HHHIBHHBBI", 125, 0, 33, 1, 0, 10, 0, 0, 29, 0), msp.ANSWER)
+PARAMS = config.load(HilParams, config.find("hil", "fake_betaflight")).betaflight
+
+
+def test_published_bytes():
+    """MSP_API_VERSION asked for in version 1, and MSP_IDENT (100) in version 2 as in INAV's description of it."""
+    assert msp.pack(msp.Frame(msp.API_VERSION)) == bytes.fromhex("244d3c000101")
+    assert msp.pack(msp.Frame(100, version=2)) == bytes.fromhex("24583c00640000008f")
+
+
+@pytest.mark.parametrize("version", [1, 2])
+@pytest.mark.parametrize("payload", [b"", b"\x00", b"$M<$X>", bytes(range(200))])
+def test_there_and_back_in_any_pieces(version, payload):
+    frame = msp.Frame(105, payload, msp.ANSWER, version)
+    data = b"noise$" + msp.pack(frame) + b"$M>" + msp.pack(frame)
+    for size in (1, 2, 3, 7, len(data)):
+        parser, found = msp.Parser(), []
+        for at in range(0, len(data), size):
+            found += parser.parse(data[at : at + size])
+        assert frame in found
+        assert all(f == frame for f in found), "nothing else is made of it"
+
+
+def test_a_flipped_bit_is_noticed():
+    good = msp.pack(HELLO)
+    for at in range(3, len(good)):
+        for bit in range(8):
+            data = bytearray(good)
+            data[at] ^= 1 << bit
+            assert HELLO not in msp.Parser().parse(bytes(data))
+
+
+def test_what_does_not_fit_is_not_packed():
+    for frame in (msp.Frame(300), msp.Frame(1, bytes(255)), msp.Frame(70_000, version=2), msp.Frame(1, bytes(2000), version=2)):
+        with pytest.raises(ValueError, match="expected at most"):
+            msp.pack(frame)
+
+
+def test_numbers_beyond_the_end_are_none():
+    frame = msp.Frame(1, b"\x01\x02\x03")
+    assert (frame.u8(2), frame.u8(3), frame.u8(-1), frame.u16(1), frame.u16(2), frame.u32(0)) == (3, None, None, 770, None, None)
+    assert frame.words() == (513,)
+
+
+def fuzz(count: int) -> None:
+    """Random bytes, mutated frames and whole answers of every command with any content, into parser and back-end."""
+    here, there = pipe()
+    backend = Betaflight(here, PARAMS)
+    rng, sent, parsed = np.random.default_rng(0), [], msp.Parser()
+    seeds = [msp.pack(msp.Frame(int(c), rng.bytes(int(rng.integers(0, 60))), msp.ANSWER)) for c in range(256)]
+    seeds += [msp.pack(msp.Frame(int(c), rng.bytes(20), msp.ANSWER, 2)) for c in rng.integers(0, 65536, 50)]
+    for i in range(count):
+        data = bytearray(seeds[rng.integers(len(seeds))] if rng.random() < 0.8 else rng.bytes(int(rng.integers(0, 80))))
+        if data and rng.random() < 0.5:
+            data[rng.integers(len(data))] = rng.integers(256)
+        if data and rng.random() < 0.2:
+            data = data[: rng.integers(len(data))]
+        here.inbox.append(bytes(data))
+        if i % 50 == 0:
+            backend.service(0.01 * i)
+            backend.status(0.01 * i)
+            while there.inbox:
+                sent += [f.command for f in parsed.parse(there.inbox.popleft())]
+    assert backend.parser.errors > count // 50, "some must be no frames"
+    assert {msp.SET_RAW_RC, msp.SET_RC_TUNING, msp.EEPROM_WRITE}.isdisjoint(sent), "nothing of it commands or writes"
+    assert backend.release_record.state == "idle"
+    assert len(backend.parser._buffer) < 4096, "and nothing piles up"
+    answers = backend._heard
+    here.inbox.extend([bytes(300), msp.pack(HELLO)])
+    backend.service(1e6)
+    assert backend._heard == 1e6 > answers, "and the parser works on"
+
+
+def test_no_bytes_make_the_back_end_raise_or_command():
+    fuzz(30_000)
+
+
+@pytest.mark.slow
+def test_a_million_byte_strings():
+    fuzz(1_000_000)

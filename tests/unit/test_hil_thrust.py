@@ -1,0 +1,85 @@
+"""Thrust to shares and back, its measurement in hover, and the vehicles that are refused."""
+
+import pytest
+
+from hil.backends import require_reach
+from hil.backends.thrust import LEAST_SHARES, HoverMeter, ThrustParams
+from hil.errors import RunError
+from hil.params import HilParams
+from tests.hil_flight import simple_policy
+from visthrow import config
+from visthrow.hover import GRAVITY
+
+BENT = ThrustParams(2.668, 0.37, 0.8, 0.08, 0.0)
+
+
+def test_there_and_back():
+    for thrust in (0.6, 1.0, 2.668, 4.0, 6.0):
+        assert BENT.thrust(BENT.share(thrust)) == pytest.approx(thrust)
+    assert BENT.share(2.668) == pytest.approx(0.37)
+    assert BENT.share(3.668) - BENT.share(2.668) == pytest.approx(0.37 / 2.668 / 0.8), "a flatter vehicle needs more share"
+    assert (BENT.share(-5.0), BENT.share(50.0)) == (0.0, 1.0)
+    assert BENT.thrust(0.0) == pytest.approx(0.2 * 2.668)
+
+
+def test_a_lower_battery_gets_more_share():
+    params = ThrustParams(2.668, 0.2, 1.0, 0.08, 12.0)
+    assert params.share(2.668, 12.0) == pytest.approx(0.2)
+    assert params.share(2.668, 10.8) == pytest.approx(0.2 / 0.81)
+    assert params.share(2.668, None) == pytest.approx(0.2), "unknown: not corrected"
+    assert params.share(2.668, 0.0) == pytest.approx(0.2 * 1.25**2), "a wrong reading does not run away"
+    assert BENT.share(2.668, 5.0) == pytest.approx(0.37), "not corrected where the config says so"
+
+
+@pytest.mark.parametrize(
+    "wrong", [(0.0, 0.3, 1.0, 0.1, 0.0), (1.0, 1.2, 1.0, 0.1, 0.0), (1.0, 0.3, 0.1, 0.1, 0.0), (1.0, 0.3, 1.0, 0.0, 0.0),
+              (1.0, 0.3, 1.0, 0.1, -1.0)],
+)  # fmt: skip
+def test_calibrations_that_are_none(wrong):
+    with pytest.raises(ValueError, match="thrust: "):
+        ThrustParams(*wrong)
+
+
+@pytest.mark.parametrize(("off", "good"), [(0.0, True), (0.07, True), (-0.07, True), (0.09, False), (-0.2, False)])
+def test_the_measured_hover_is_held_against_the_calibration(off, good):
+    meter = HoverMeter(BENT)
+    for _ in range(LEAST_SHARES):
+        meter.add(0.37 * (1.0 + off), True)
+        meter.add(0.9, False)
+        meter.add(None, True)
+        meter.add(float("nan"), True)
+    found, text = meter.story(2.668 / GRAVITY)
+    assert found == good
+    assert f"measured {0.37 * (1 + off):.3f}, by the config 0.370" in text
+    assert ("calibrate" in text) == (not good)
+
+
+def test_too_few_values_measure_nothing():
+    meter = HoverMeter(BENT)
+    meter.add(0.9, True)
+    assert meter.share is None
+    assert meter.story(0.272) == (True, "hover share not measured: 1 of 50 values in steady hover")
+
+
+@pytest.mark.parametrize(
+    ("name", "override", "message"),
+    [
+        ("fake", "ardupilot.thrust.hover=0.37", r"gives 7\.\d+ N at most, the policy was trained with 14 N"),
+        ("fake_px4", "px4.thrust.slope=0.7", "gives 12.* N at most"),
+        ("fake_betaflight", "betaflight.rates.rc_rates=[40, 60, 30]", None),
+        ("fake_betaflight", "betaflight.rates.rates=[60, 60, 20]", None),
+    ],
+)
+def test_a_vehicle_that_cannot_do_it_is_refused(name, override, message):
+    contract = simple_policy().contract
+    require_reach(config.load(HilParams, config.find("hil", name)), contract)
+    params = config.load(HilParams, config.find("hil", name), [override])
+    if message is None:  # with actual rates the end counts, and is never below the middle's slope
+        require_reach(params, contract)
+        slow = config.load(HilParams, config.find("hil", name), ["betaflight.rates.rc_rates=[30, 60, 30]",
+                                                                 "betaflight.rates.rates=[30, 60, 30]"])  # fmt: skip
+        with pytest.raises(RunError, match=r"reach 5\.2, 10\.5, 5\.2 rad/s on roll, pitch, yaw"):
+            require_reach(slow, contract)
+    else:
+        with pytest.raises(RunError, match=message):
+            require_reach(params, contract)
