@@ -19,6 +19,7 @@ COMMANDS = {
     "baseline": ("throw with trajectory optimisation and MPC; its front against the policies", "visthrow.baseline.command"),
     "diagnose": ("say what the simulation gets wrong, from measured flights", "visthrow.diagnose.cli"),
     "sweep": ("work a list of training runs and throws, on several GPUs or a cluster", "visthrow.sweep.cli"),
+    "report": ("write one page with the paper's tables and figures beside ours", "visthrow.report.command"),
     "bench": ("measure the speed of the simulator and of the camera", "visthrow.bench"),
     "config": ("print a configuration with all its values filled in", "visthrow.config_cli"),
 }

@@ -19,6 +19,16 @@ PAPER = {
 """Layout and target -> landing error [m] and duration [s], mean and deviation, ten throws each (Tables III and VI): policies on
 the paper's vehicle, the model-based TO+MPC in its own simulated pendulum."""
 
+PAPER_ABLATIONS = {
+    "full": (0.105, 0.099, 1.154, 0.015, "groups about the target"),
+    "no_aerodynamics": (0.342, 0.085, 1.069, 0.008, "undershoots"),
+    "no_motor_lag": (0.254, 0.134, 1.109, 0.032, "undershoots"),
+    "simple_controller": (0.386, 0.103, 1.115, 0.042, "overshoots, lateral bias"),
+    "rigid_cable": (0.306, 0.051, 1.049, 0.009, "undershoots"),
+}
+"""Variant -> landing error [m] and duration [s], mean and deviation, and where the throws land: five throws each of the paper's
+vehicle at 2.0 m, ten for the full model (Table V and the scatter beside it)."""
+
 PAPER_NOTE = (
     "The paper's figures are ten throws a target, of a real vehicle for policies and in its own pendulum model for TO+MPC; ours "
     "are simulated. No vehicle was flown for this project, so the two columns do not measure the same thing."

@@ -1,0 +1,65 @@
+"""What a section is made of, the same for the page and for Markdown."""
+
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True)
+class Text:
+    """A paragraph; ``**bold**`` and ``code`` in backticks are marked in both outputs."""
+
+    text: str
+    kind: str = "plain"  # "plain", "finding": said by the figures; "missing": what is not there; "why": written beside the data
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A table: every cell is text; the first ``heads`` columns stand left, the others right."""
+
+    title: str
+    header: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    note: str = ""
+    heads: int = 1
+
+    def markdown(self) -> str:
+        """Text of the table, columns aligned."""
+        lines = [self.header, *self.rows]
+        width = [max(len(line[i]) for line in lines) for i in range(len(self.header))]
+
+        def line(cells: Sequence[str]) -> str:
+            padded = (c.ljust(w) if i < self.heads else c.rjust(w) for i, (c, w) in enumerate(zip(cells, width)))
+            return "| " + " | ".join(padded) + " |"
+
+        rule = "|" + "|".join("-" * (w + 2) if i < self.heads else "-" * (w + 1) + ":" for i, w in enumerate(width)) + "|"
+        body = "\n".join([line(self.header), rule, *map(line, self.rows)])
+        return f"**{self.title}**\n\n{body}" + (f"\n\n{self.note}" if self.note else "")
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A figure as PNG; ``name`` is its file beside the Markdown."""
+
+    name: str
+    png: bytes
+    caption: str
+
+
+@dataclass(frozen=True)
+class Section:
+    """A part of the report; ``name`` is its anchor and the stem of its findings."""
+
+    name: str
+    title: str
+    parts: tuple[Text | Grid | Picture, ...] = field(default=())
+
+
+def png_of(figure) -> bytes:
+    """Bytes of a matplotlib figure, which is closed."""
+    import matplotlib.pyplot as plt
+
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=150)
+    plt.close(figure)
+    return buffer.getvalue()
