@@ -6,7 +6,7 @@ they depend on, the policy file's content included.
 """
 
 import json
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -124,7 +124,8 @@ class Work:
 
     name: str
     sources: tuple[Source, ...]
-    throws: dict[str, tuple[ThrowUnit, ...]] = field(default_factory=dict)  # by the policy's name
+    throws: dict[str, tuple[ThrowUnit, ...]]  # by the policy's id
+    checkpoint_every: int  # iterations
 
     def source(self, name: str) -> Source:
         """The training of that id.
@@ -170,7 +171,7 @@ def expand(name: str, params: SweepList) -> Work:
                 count = throw.count if params.most_throws is None else min(throw.count, params.most_throws)
                 fresh = _throws(source, wanted, replace(throw, count=count))
                 listed.extend(unit for unit in fresh if unit not in listed)
-    return Work(name, tuple(sources.values()), {key: tuple(units) for key, units in throws.items()})
+    return Work(name, tuple(sources.values()), {key: tuple(units) for key, units in throws.items()}, params.checkpoint_every)
 
 
 def differences(own: dict, flown: dict, path: str = "") -> dict[str, Any]:

@@ -15,9 +15,6 @@ from visthrow.storage import write_json
 from visthrow.sweep.lock import Lock
 from visthrow.sweep.units import Source, ThrowUnit, Work, throws_folder
 
-CHECKPOINT_EVERY = 100
-"""Iterations: what a killed process loses at most, about 14 s of one H200."""
-
 PIECES = "pieces"
 """Folder of a run with one file a piece."""
 
@@ -52,7 +49,7 @@ def work(work: Work, out: Path, ids: Sequence[str], device: str, minutes: float 
                 if unit.done(out):
                     continue
                 if isinstance(unit, Source):
-                    status = train(unit, out, device, left)
+                    status = train(unit, out, device, left, work.checkpoint_every)
                 elif unit.source.done(out):
                     fly(unit, out, device)
         except BusyError as error:
@@ -63,7 +60,7 @@ def work(work: Work, out: Path, ids: Sequence[str], device: str, minutes: float 
     return status
 
 
-def train(source: Source, out: Path, device: str, minutes: float | None) -> int:
+def train(source: Source, out: Path, device: str, minutes: float | None, checkpoint_every: int) -> int:
     """Train, or go on, to the end or for some minutes; returns the exit status of ``visthrow train``."""
     from visthrow import train_cli
     from visthrow.train import CHECKPOINT
@@ -75,7 +72,7 @@ def train(source: Source, out: Path, device: str, minutes: float | None) -> int:
     parser = argparse.ArgumentParser()
     train_cli.add_arguments(parser)
     words = [source.config, "--seed", str(source.seed), "--out", str(folder), "--device", device]
-    words += ["--checkpoint-every", str(CHECKPOINT_EVERY), *(["--resume"] if resume else [])]
+    words += ["--checkpoint-every", str(checkpoint_every), *(["--resume"] if resume else [])]
     words += ["--minutes", f"{minutes:.3f}"] if minutes is not None else []
     for change in source.changes:
         words += ["--set", change]
