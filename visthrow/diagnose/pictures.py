@@ -1,0 +1,167 @@
+"""Pictures of a diagnosis, in the style of :mod:`visthrow.style`; each function returns a PNG."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from visthrow import style
+from visthrow.diagnose import result
+from visthrow.diagnose.blind import Blind
+from visthrow.diagnose.evidence import covariance
+from visthrow.diagnose.gain import Gain
+from visthrow.diagnose.marginal import Noise
+from visthrow.diagnose.model import Window
+from visthrow.diagnose.result import Diagnosis
+from visthrow.diagnose.work import Work
+from visthrow.flightlog import STANDARD_CHANNELS
+from visthrow.report.parts import png_of
+
+WIDTH = 9.2
+"""[inch]"""
+BEFORE, AFTER = style.COLOURS[1], style.COLOURS[0]
+SHOWN_WINDOWS = 3
+SHOWN_EFFECTS = 14
+"""Rows and columns of the confusion picture, curves of the completeness picture."""
+READABLE = {"m": (1e3, "mm"), "rad": (180.0 / np.pi, "deg"), "m/s": (1e3, "mm/s")}
+"""Unit -> factor and unit in pictures, where residuals are small."""
+
+
+def _figure(rows: int, columns: int, height: float, **more):
+    import matplotlib.pyplot as plt
+
+    style.use()
+    return plt.subplots(rows, columns, figsize=(WIDTH, height), constrained_layout=True, squeeze=False, **more)
+
+
+def left_over(window: Window, noise: Noise) -> np.ndarray:
+    """Residuals with the initial state fitted to the whole window, in the channels' units, shape (N,)."""
+    weight = 1.0 / (window.sigma * noise.scale[window.channel])
+    states = window.nuisance * window.nuisance_sd * weight[:, None]
+    normal = states.T @ states + np.eye(states.shape[1])
+    fitted = np.linalg.solve(normal, states.T @ (window.residual * weight))
+    return window.residual - window.nuisance * window.nuisance_sd @ fitted
+
+
+def residuals(work: Work, channel: int) -> bytes:
+    """Residuals of one channel before and after, laid over each other, in the windows where most was gained, and in a usual one."""
+    name = work.problem.model.channels[channel]
+    spec = STANDARD_CHANNELS.get(name)
+    factor, unit = READABLE.get(spec.unit if spec else "", (1.0, spec.unit if spec else ""))
+    pairs = []
+    for before, after in zip(work.before.windows, work.after.windows):
+        rows = before.channel == channel
+        if rows.any():
+            pairs.append((before, after, rows, left_over(before, work.after.noise)[rows], left_over(after, work.after.noise)[rows]))
+    gained = np.argsort([np.mean(b**2) - np.mean(a**2) for *_, b, a in pairs])[::-1]
+    chosen = [*gained[: SHOWN_WINDOWS - 1], gained[len(gained) // 2]] if len(gained) >= SHOWN_WINDOWS else list(gained)
+    figure, axes = _figure(1, len(chosen), 2.9, sharey=True)
+    for axis, i in zip(axes[0], chosen):
+        before, _, rows, old, new = pairs[i]
+        time, noise = before.time[rows], factor * 2.0 * np.median(before.sigma[rows] * work.after.noise.scale[channel])
+        axis.axhspan(-noise, noise, color=style.FAINT, lw=0, label="noise, 2 sigma")
+        axis.plot(time, factor * old, ".", ms=2.2, color=BEFORE, label="model as it stands")
+        axis.plot(time, factor * new, ".", ms=2.2, color=AFTER, label="with what was named")
+        axis.set(title=f"flight {before.flight}, {before.phase}", xlabel="time [s]")
+    axes[0, 0].set_ylabel(f"measured - simulated [{unit}]")
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncol=3, markerscale=4)
+    return png_of(figure)
+
+
+def ladder(diagnosis: Diagnosis) -> bytes:
+    """Nats of each step's candidates, screened and with the simulation run again, and the threshold."""
+    steps = diagnosis.steps
+    rows = max(len(step.screened) for step in steps)
+    figure, axes = _figure(1, len(steps), 0.55 + 0.27 * rows)
+    for axis, (number, step) in zip(axes[0], enumerate(steps, start=1)):
+        names = list(step.screened)[::-1]
+        screened = [max(step.screened[n], 0.0) for n in names]
+        axis.barh(names, screened, height=0.62, color=style.FAINT)
+        for y, name in enumerate(names):
+            if name in step.refitted:
+                won = name == step.named
+                axis.plot(max(step.refitted[name], 0.0), y, marker="o" if won else "^", ms=6, color=AFTER if won else style.QUIET)
+        axis.axvline(diagnosis.threshold, color=BEFORE, lw=1)
+        axis.set(xscale="symlog", xlabel="nats", title=f"step {number}: {step.named}")
+        axis.set_xlim(0.0, 1.4 * max([diagnosis.threshold, *screened, *step.refitted.values()]))
+        axis.tick_params(axis="y", labelsize=8)
+    return png_of(figure)
+
+
+def verdicts(diagnosis: Diagnosis) -> bytes:
+    """Every effect's interval in its floors, by verdict."""
+    colours = {result.FOUND: AFTER, result.CLASS: style.COLOURS[3], result.BOUNDED: style.QUIET,
+               result.NOT_IDENTIFIABLE: style.COLOURS[4]}  # fmt: skip
+    shown = [f for f in diagnosis.findings if f.verdict in colours][::-1]
+    figure, axes = _figure(1, 1, 0.8 + 0.19 * len(shown))
+    axis, seen = axes[0, 0], set()
+    axis.axvspan(-1.0, 1.0, color=style.FAINT, lw=0)
+    for y, f in enumerate(shown):
+        label = None if f.verdict in seen else f.verdict
+        seen.add(f.verdict)
+        middle = f.estimate if f.verdict in (result.FOUND, result.CLASS) else 0.5 * (f.low + f.high)
+        axis.plot(np.array([f.low, f.high]) / f.floor, [y, y], color=colours[f.verdict], lw=2.4, solid_capstyle="butt")
+        axis.plot(middle / f.floor, y, "o" if f.estimate else "|", color=colours[f.verdict], ms=6, label=label)
+    axis.axvline(0.0, color=style.QUIET, lw=0.8)
+    axis.set(xscale="symlog", xlabel="size in floors (grey: within the floor)", yticks=range(len(shown)), ylim=(-1, len(shown)))
+    axis.set_yticklabels([f.name for f in shown], fontsize=8)
+    figure.legend(loc="outside upper center", ncol=4)
+    return png_of(figure)
+
+
+def horizons(gain: Gain) -> bytes:
+    """Prediction error over the horizon on held-out flights."""
+    figure, axes = _figure(1, len(gain.channels), 2.9)
+    for axis, channel in zip(axes[0], gain.channels):
+        h, before, after, floor = np.array(channel.horizons).T
+        axis.plot(h, before, marker="^", color=BEFORE, label="model as it stands")
+        axis.plot(h, after, marker="o", color=AFTER, label="with what was named")
+        axis.plot(h, floor, ":", color=style.INK, label="noise alone")
+        axis.set(title=channel.channel, xlabel="horizon [s]", xscale="log", yscale="log")
+    axes[0, 0].set_ylabel("error [sigma of the sensor]")
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncol=3)
+    return png_of(figure)
+
+
+def confusion(diagnosis: Diagnosis) -> bytes:
+    """Correlations of the effects' estimates with all of them free: what these flights cannot tell apart."""
+    work = diagnosis.work
+    visible = np.flatnonzero(work.problem.priors.visible)
+    sigma = covariance(work.after.information, work.problem.priors.deviation(visible))
+    deviation = np.sqrt(np.diag(sigma))
+    correlation = sigma / np.outer(deviation, deviation)
+    off = np.abs(correlation - np.eye(len(correlation)))
+    off[~work.problem.priors.visible] = 0.0
+    strongest = np.argsort(-np.where(np.isin(np.arange(len(off)), work.active), 2.0, off.max(axis=1)))
+    at = np.sort([j for j in strongest if work.problem.priors.visible[j]][:SHOWN_EFFECTS])
+    names = [work.problem.model.effects[j].name for j in at]
+    figure, axes = _figure(1, 1, 1.6 + 0.3 * len(at))
+    axis = axes[0, 0]
+    image = axis.imshow(correlation[np.ix_(at, at)], vmin=-1.0, vmax=1.0, cmap="RdBu_r")
+    for i in range(len(at)):
+        for j in range(len(at)):
+            value = correlation[at[i], at[j]]
+            if i != j and abs(value) > 0.3:
+                colour = "white" if abs(value) > 0.7 else style.INK
+                axis.text(j, i, f"{value:.2f}", ha="center", va="center", fontsize=7, color=colour)
+    axis.set_xticks(range(len(at)), names, rotation=60, ha="right", fontsize=8)
+    axis.set_yticks(range(len(at)), names, fontsize=8)
+    figure.colorbar(image, ax=axis, shrink=0.7, label="correlation")
+    return png_of(figure)
+
+
+def completeness(blind: Blind, floors: Sequence[float]) -> bytes:
+    """Share of worlds in which a hidden effect is named, over its size in floors."""
+    pairs = [(c, f) for c, f in zip(blind.curves, floors) if c.sizes]
+    last = {c.name: c.limit / f if np.isfinite(c.limit) else np.inf for c, f in pairs}
+    pairs = sorted(pairs, key=lambda p: last[p[0].name])
+    half = (len(pairs) + 1) // 2
+    figure, axes = _figure(1, 2, 4.4, sharey=True)
+    for axis, group in zip(axes[0], (pairs[:half], pairs[half:])):
+        for i, (curve, floor) in enumerate(group):
+            look = {"color": style.COLOURS[i % 6], "marker": style.MARKERS[i % 6], "ls": ("-", "--", ":", "-.")[i // 6 % 4]}
+            axis.plot(np.array(curve.sizes) / floor, curve.up_to_class, ms=3.5, lw=1.1, label=curve.name, **look)
+        axis.axhline(0.9, color=style.FAINT)
+        axis.set(xscale="log", xlabel="hidden size [floors]", ylim=(-0.02, 1.02))
+        axis.legend(fontsize=6.5, ncol=2)
+    axes[0, 0].set_ylabel("named, up to its class")
+    return png_of(figure)

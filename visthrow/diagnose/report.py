@@ -1,0 +1,224 @@
+"""The report of a diagnosis: one page with a sentence a finding, what it rests on and what to fly next; and the same as JSON."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from visthrow.diagnose import pictures, result
+from visthrow.diagnose.blind import Blind
+from visthrow.diagnose.gain import Gain
+from visthrow.diagnose.result import Diagnosis, Finding
+from visthrow.report.parts import Grid, Picture, Section, Text
+
+if TYPE_CHECKING:
+    from visthrow.diagnose.plan import Proposal
+
+
+def sentence_of(diagnosis: Diagnosis) -> str:
+    """The overall verdict in a sentence."""
+    where = f" in the {diagnosis.block}" if diagnosis.block else ""
+    return f"{diagnosis.overall}{where}: {result.OVERALL[diagnosis.overall]}."
+
+
+def summary(diagnosis: Diagnosis, gain: Gain | None = None) -> str:
+    """What the command line prints."""
+    lines = [sentence_of(diagnosis), *(f"  {reason}" for reason in diagnosis.reasons), ""]
+    for f in diagnosis.findings:
+        if f.verdict in (result.FOUND, result.CLASS):
+            lines.append(f"{f.verdict:6} {f.sentence}")
+    lines += [f"EVENT  something happened in flight {flight} that the other flights deny" for flight in diagnosis.events]
+    lines += [f"COPY   flight {flight} repeats flight {of} and was left out" for flight, of in diagnosis.duplicates.items()]
+    counted = {v: sum(f.verdict == v for f in diagnosis.findings) for v in result.VERDICTS}
+    lines.append(", ".join(f"{count} {verdict.lower()}" for verdict, count in counted.items() if count))
+    if gain is not None and diagnosis.theta:
+        lines += [_gain_line(c) for c in gain.channels]
+    lines.append(f"{diagnosis.windows} windows of {diagnosis.flights} flights, {diagnosis.seconds:.1f} s")
+    return "\n".join(lines)
+
+
+def _gain_line(c) -> str:
+    return (f"held-out error of {c.channel}: {c.before:.3g} -> {c.after:.3g} {c.unit}, {100 * c.gain:.0f} % less "
+            f"[{100 * c.low:.0f}, {100 * c.high:.0f}]; noise alone {c.floor:.3g}, black box {c.blackbox:.3g}")  # fmt: skip
+
+
+def to_json(
+    diagnosis: Diagnosis, gain: Gain | None = None, blind: Blind | None = None, proposals: Sequence["Proposal"] = (),
+    extra: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:  # fmt: skip
+    """Everything the page says, as plain data."""
+    value = diagnosis.to_dict()
+    for name, part in (("gain", gain), ("blind", blind)):
+        if part is not None:
+            value[name] = dataclasses.asdict(part)
+    if proposals:
+        value["plan"] = [dataclasses.asdict(p) for p in proposals]
+    return {**value, **(extra or {})}
+
+
+def sections(
+    diagnosis: Diagnosis, gain: Gain | None = None, blind: Blind | None = None, proposals: Sequence["Proposal"] = (),
+    step_check: Mapping[str, float] | None = None, about: Mapping[str, Any] | None = None,
+) -> list[Section]:  # fmt: skip
+    """All sections of the page.
+
+    Args:
+        diagnosis: of the flights.
+        gain: measured on held-out flights.
+        blind: detection limits.
+        proposals: what to fly next.
+        step_check: channel -> largest difference between the replay and one with finer steps, in sigmas.
+        about: provenance.
+    """
+    made = [_verdict(diagnosis, gain)]
+    work = diagnosis.work
+    if work is not None and diagnosis.theta:
+        drawn = tuple(
+            Picture(f"residual_{name}", pictures.residuals(work, c),
+                    f"{name}: residuals before and after, with each window's initial state fitted.")
+            for c, name in enumerate(work.problem.model.channels)
+            if any(np.any(w.channel == c) for w in work.after.windows)
+        )  # fmt: skip
+        made.append(Section("residuals", "Residuals before and after", drawn))
+    if gain is not None:
+        made.append(_gain(gain, diagnosis))
+    if diagnosis.steps:
+        text = Text("Nats of evidence that each candidate would bring, the threshold as a line; marks: with the simulation run "
+                    "again (circle: taken, triangle: beaten).")  # fmt: skip
+        made.append(Section("ladder", "Candidates", (text, Picture("ladder", pictures.ladder(diagnosis), "Ladder of candidates."),
+                                                     *_alternatives(diagnosis))))  # fmt: skip
+    if diagnosis.levels:
+        made.append(_levels(diagnosis))
+    if diagnosis.laws:
+        made.append(_laws(diagnosis))
+    if work is not None:
+        made.append(_catalogue(diagnosis))
+        made.append(Section("confusion", "What looks alike", (Picture(
+            "confusion", pictures.confusion(diagnosis), "Correlation of the estimates with every effect free."),)))  # fmt: skip
+    if blind is not None:
+        made.append(_blind(blind, diagnosis))
+    if proposals:
+        made.append(_plan(proposals))
+    made.append(_ground(diagnosis, step_check, about))
+    return made
+
+
+def write(folder: str | Path, made: Sequence[Section], diagnosis: Diagnosis, title: str) -> list[Path]:
+    """Write ``report.html``, ``report.md`` and the pictures.
+
+    Raises:
+        StorageError: The place cannot be written.
+        ModuleNotFoundError: jinja2 is not installed.
+    """
+    from visthrow.report import page
+
+    return page.write(Path(folder), title, sentence_of(diagnosis), made)
+
+
+def _verdict(diagnosis: Diagnosis, gain: Gain | None) -> Section:
+    parts: list[Text] = [Text(reason, "finding") for reason in diagnosis.reasons]
+    parts += [Text(f"**{f.verdict}.** {f.sentence}{_next(f)}", "finding")
+              for f in diagnosis.findings if f.verdict in (result.FOUND, result.CLASS)]  # fmt: skip
+    if diagnosis.overall == result.UNKNOWN and diagnosis.laws:
+        law = diagnosis.laws[0]
+        parts.append(Text(f"**Law.** {law.formula} with c = {law.coefficient:.3g} ± {law.sd:.2g} {law.unit}.", "finding"))
+    parts += [Text(f"**Event in flight {flight}.** Something happened there that the other flights deny; it was left out.",
+                   "finding") for flight in diagnosis.events]  # fmt: skip
+    parts += [Text(f"Flight {flight} repeats flight {of} and counts once.", "finding")
+              for flight, of in diagnosis.duplicates.items()]  # fmt: skip
+    if gain is not None and gain.landing is not None:
+        before, after = (1e3 * value for value in gain.landing)
+        parts.append(Text(f"**Landing.** The replayed throws land {before:.0f} mm off with the model as it stands and "
+                          f"{after:.0f} mm with what was named.", "finding"))  # fmt: skip
+    return Section("verdict", "Verdict", tuple(parts))
+
+
+def _next(finding: Finding) -> str:
+    return f" To tell them apart: {'; '.join(finding.manoeuvres)}." if finding.partners and finding.manoeuvres else ""
+
+
+def _gain(gain: Gain, diagnosis: Diagnosis) -> Section:
+    rows = tuple(
+        (c.channel, c.unit, f"{c.before:.3g}", f"{c.after:.3g}", f"{100 * c.gain:.1f} % [{100 * c.low:.0f}, {100 * c.high:.0f}]",
+         f"{c.floor:.3g}", "-" if np.isnan(c.blackbox) else f"{c.blackbox:.3g}", "worse" if c.harmed else "")
+        for c in gain.channels
+    )  # fmt: skip
+    named = ", ".join(f"{name} in {100 * share:.0f} %" for name, share in gain.named_in.items()) or "nothing in any"
+    note = (f"Root mean square errors of predictions from the first 0.2 s of each window, {gain.left_out} left out in {gain.folds} "
+            f"folds, the selection repeated in each ({named}). Interval: 95 %, bootstrap over flights. Log-likelihood: "
+            f"{gain.nats_per_sample:+.3f} nats a sample.")  # fmt: skip
+    header = ("channel", "unit", "as it stands", "with what was named", "less", "noise alone", "black box", "")
+    parts = (Grid("Held-out prediction error", header, rows, note),
+             Picture("horizons", pictures.horizons(gain), "Error over the horizon of the prediction."))  # fmt: skip
+    return Section("gain", "Gain on flights that were not used", parts)
+
+
+def _alternatives(diagnosis: Diagnosis) -> tuple[Grid, ...]:
+    if len(diagnosis.sets) < 2:
+        return ()
+    rows = tuple((", ".join(names) or "nothing", f"{behind:.1f}") for names, behind in diagnosis.sets)
+    return (Grid("Sets of causes that explain the flights as well", ("set", "nats behind"), rows),)
+
+
+def _levels(diagnosis: Diagnosis) -> Section:
+    rows = tuple(
+        (level.block, level.phase, f"{level.before:.3g}", f"{level.after:.3g}", f"{level.after / level.quiet:.1f}",
+         "more than gusts" if level.excessive else "")
+        for level in diagnosis.levels
+    )  # fmt: skip
+    header = ("what", "phase", "as it stands", "with what was named", "in the quietest phase's", "")
+    note = "Deviation of what moves the vehicle besides the model [N; N m]. Gusts do not know the phase of the flight."
+    return Section("levels", "Forces that nothing explains", (Grid("Latent forces", header, rows, note, heads=2),))
+
+
+def _laws(diagnosis: Diagnosis) -> Section:
+    rows = tuple(
+        (law.formula, law.block, f"{law.coefficient:.4g} ± {law.sd:.2g}", law.unit, f"{law.nats:.1f}") for law in diagnosis.laws
+    )
+    note = "Nats over the same causes without the term, less the log of the number of terms as simple as it."
+    return Section("laws", "Laws outside the catalogue", (Grid("Terms", ("law", "on", "c", "unit", "nats"), rows, note),))
+
+
+def _catalogue(diagnosis: Diagnosis) -> Section:
+    rows = tuple(
+        (f.name, f.verdict, f.block, f"{f.estimate:.3g}" if f.estimate else "", f"{f.low:.3g}", f"{f.high:.3g}", f"{f.floor:.3g}",
+         f.unit, "; ".join(f.missing or (f.manoeuvres if f.verdict in (result.CLASS, result.NOT_IDENTIFIABLE) else ())))
+        for f in diagnosis.findings
+    )  # fmt: skip
+    header = ("effect", "verdict", "block", "size", "from", "to", "floor", "unit", "needs")
+    note = " ".join(f"**{verdict}**: {meaning}." for verdict, meaning in result.VERDICTS.items())
+    parts = (Picture("verdicts", pictures.verdicts(diagnosis), "95 % intervals of all effects in their floors."),
+             Grid("All effects", header, rows, note, heads=3))  # fmt: skip
+    return Section("catalogue", "Every effect of the catalogue", parts)
+
+
+def _blind(blind: Blind, diagnosis: Diagnosis) -> Section:
+    rows = tuple((c.name, "-" if np.isnan(c.limit) else f"{c.limit:.3g}", c.unit) for c in blind.curves)
+    floors = [f.floor for f in diagnosis.findings]
+    note = (f"Size that would be named, up to its class, in 90 % of worlds; noise: {blind.noise}. False alarms without a hidden "
+            f"effect: {100 * blind.false_alarms:.2f} % of {blind.worlds} worlds.")  # fmt: skip
+    parts = (Picture("completeness", pictures.completeness(blind, floors), "Hidden effects named, over their size."),
+             Grid("Detection limits in these flights", ("effect", "limit", "unit"), rows, note))  # fmt: skip
+    return Section("blind", "What these flights can detect", parts)
+
+
+def _plan(proposals: Sequence["Proposal"]) -> Section:
+    rows = tuple(
+        (p.name, f"{p.seconds:.0f}", f"{p.nats:.1f}", ", ".join(" / ".join(pair) for pair in p.separates), p.limits)
+        for p in proposals
+    )
+    header = ("manoeuvre", "seconds", "nats", "separates", "abort at")
+    note = "Expected nats between the members of the class that is hardest to separate, after flying it once more."
+    return Section("plan", "What to fly next", (Grid("Manoeuvres", header, rows, note),))
+
+
+def _ground(diagnosis: Diagnosis, step_check: Mapping[str, float] | None, about: Mapping[str, Any] | None) -> Section:
+    rows = [("flights, windows, samples", f"{diagnosis.flights}, {diagnosis.windows}, {diagnosis.samples}"),
+            ("threshold", f"{diagnosis.threshold:.2f} nats, exceeded by the best of all effects in 0.5 % of null worlds"),
+            ("seed of the null worlds", str(diagnosis.seed)), ("seconds", f"{diagnosis.seconds:.1f}")]  # fmt: skip
+    rows += [(f"noise of {name} in what was stated", f"{scale:.2f}") for name, scale in diagnosis.sensor_scale.items()]
+    rows += [(f"replay against finer steps, {name}", f"{value:.2g} sigma") for name, value in (step_check or {}).items()]
+    rows += [(str(key), str(value)) for key, value in (about or {}).items()]
+    return Section("ground", "What this rests on", (Grid("Numbers", ("what", "value"), tuple(rows), heads=2),))
