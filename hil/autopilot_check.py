@@ -7,7 +7,6 @@ VFR_HUD, the throttle channel of Betaflight). After a run the runner's own hover
 from pathlib import Path
 from typing import Any
 
-from hil.backends import make_backend
 from hil.backends.base import FOLLOW
 from hil.backends.thrust import LEAST_SHARES, HoverMeter
 from hil.errors import RunError
@@ -29,17 +28,14 @@ SETTLING = 50
 class AutopilotCheck:
     """Listens to an autopilot without commanding it."""
 
-    def __init__(self, params: Any, link: Any) -> None:
-        """Connect.
+    def __init__(self, params: Any, backend: Any) -> None:
+        """Begin with nothing heard.
 
         Args:
             params: `hil.params.HilParams`; a dry run has no autopilot.
-            link: of the run.
-
-        Raises:
-            LinkError, RunError: as :func:`hil.backends.make_backend`.
+            backend: of the run.
         """
-        self.backend = make_backend(params, link)
+        self.backend = backend
         self.meter = None if params.backend == "dry-run" else HoverMeter(getattr(params, params.backend).thrust)
 
     def tick(self, now: float, runner: Any) -> None:

@@ -237,7 +237,7 @@ def _check(args: argparse.Namespace) -> int:
         print(f"{'PASS' if good else 'FAIL'}  {text}")
         return 0 if good else 1
     from hil.autopilot_check import AutopilotCheck
-    from hil.backends import DryRun
+    from hil.backends import DryRun, make_backend
     from hil.clock import ManualClock, MonotonicClock
     from hil.runner import Runner, Words
     from hil.sources.opening import open_source
@@ -249,7 +249,8 @@ def _check(args: argparse.Namespace) -> int:
     with tempfile.TemporaryDirectory() as folder:
         source, link, recorded = open_source(params, Path(folder), args.speed)
         clock = ManualClock(source.start) if recorded else MonotonicClock(args.speed)
-        runner, autopilot = Runner(params, Policy.load(find_policy(params.policy)), DryRun()), AutopilotCheck(params, link)
+        runner = Runner(params, Policy.load(find_policy(params.policy)), DryRun())
+        autopilot = AutopilotCheck(params, make_backend(params, link))
         begin, seconds = clock.now(), args.seconds or 5.0
         while clock.now() - begin < seconds and not source.ended:
             now = clock.now()

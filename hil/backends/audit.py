@@ -7,6 +7,9 @@ from dataclasses import dataclass
 ASK_AGAIN = 0.2
 """Between two questions for a value that has not come [s]."""
 
+SETTLE = 0.5
+"""After a value was written, answers may still be on their way that were given before; then it is read back [s]."""
+
 GIVE_UP = 5.0
 """A value that has not come within this time is missing [s]."""
 
@@ -60,24 +63,30 @@ class Audit:
         self.found: dict[str, float] = {}
         self.written: list[str] = []
         self._asked: dict[str, float] = {}
+        self._written_at: dict[str, float] = {}
+        self._now = 0.0
         self._begun: float | None = None
         self.done = not self.rules
 
     def feed(self, name: str, value: float) -> None:
         """Take an answer."""
         rule = next((rule for rule in self.rules if rule.name == name), None)
-        if self.done or rule is None:
+        if self.done or rule is None or self._settling(name):
             return
         self.found[name] = value
         wrong = not rule.good(value)
         if wrong and self._write is not None and rule.value is not None and name not in self.written:
             self.written.append(name)
-            self._write(name, rule.value(value))
+            self._written_at[name] = self._now
             del self.found[name]  # it counts when it was read back
-            self._asked.pop(name, None)
+            self._write(name, rule.value(value))
+
+    def _settling(self, name: str) -> bool:
+        return self._now - self._written_at.get(name, -1e9) < SETTLE
 
     def service(self, now: float) -> None:
         """Ask for what is missing."""
+        self._now = now
         if self.done:
             return
         if self._begun is None:
@@ -89,7 +98,7 @@ class Audit:
                 self._tell(self.table())
             return
         for name in missing:
-            if now - self._asked.get(name, -1e9) >= ASK_AGAIN:
+            if now - self._asked.get(name, -1e9) >= ASK_AGAIN and not self._settling(name):
                 self._asked[name] = now
                 self._ask(name)
 

@@ -11,6 +11,10 @@ WAIT, FOLLOW, HOLD, LAND = "wait", "follow", "hold", "land"
 """What the autopilot does: it is in other hands, follows commands, holds its place by itself, lands by itself."""
 
 
+ROUNDING = 1e-6
+"""Of times that are sums [s]: a microsecond early is in time."""
+
+
 @dataclass(frozen=True)
 class Status:
     """What a back-end knows of its autopilot at a tick; recorded, so that a replay decides alike."""
@@ -130,7 +134,7 @@ class Release:
         if now - self._first > self.timeout:
             why = "accepted, but nothing moved" if self._answered else "no final answer"
             self._end(FAILED, f"{why} within {self.timeout:g} s")
-        elif self.at is not None and now >= self.at:
+        elif self.at is not None and now >= self.at - ROUNDING:
             if not self.sends:
                 self._sent = perf_counter()
             self.sends, self.at = self.sends + 1, now + self.REPEAT

@@ -225,7 +225,8 @@ class Betaflight:
             self._boxed = now
             self._write(msp.BOXIDS)
             self._write(msp.RX_MAP)
-        self.audit.service(now)
+        if self._boxes and self._heard > 0.0:  # whether it is armed must be known: then nothing is written
+            self.audit.service(now)
         if self.release_record.due(now) and self._opened is None:
             self._opened = now
             self._frame(now)
@@ -280,10 +281,10 @@ class Betaflight:
             self._heard = now
         if frame.command in readers:
             readers[frame.command](frame)
+        if frame.command == msp.RC_TUNING and not self.audit.written:
+            self._tuning = frame.payload
         for name, value in settings(frame, self.params).items():
             self.audit.feed(name, value)
-        if frame.command == msp.RC_TUNING:
-            self._tuning = frame.payload
 
     def _hear_status(self, frame: msp.Frame) -> None:
         flags = frame.u32(6)

@@ -23,9 +23,13 @@ class LevelPlant:
 
     period, home_w, mass, max_thrust = 0.005, np.array([0.0, 0.0, 1.333]), (0.272, 0.21), 14.0
 
-    def __init__(self) -> None:
-        """Start at time 0."""
-        self.time: float = 0.0
+    def __init__(self, lag: float = 0.11) -> None:
+        """Start at time 0.
+
+        Args:
+            lag: from the release to separation [s].
+        """
+        self.time, self.lag = 0.0, lag
         self.released: float | None = None
         self.commands: deque[tuple[float, ...]] = deque(maxlen=MOST_KEPT)
 
@@ -39,8 +43,8 @@ class LevelPlant:
     @property
     def state(self) -> dict[str, np.ndarray]:
         """See `WirePlant`."""
-        hangs = self.released is None or self.time < self.released + 0.11
-        fall = 0.0 if hangs else 0.5 * GRAVITY * (self.time - self.released - 0.11) ** 2
+        hangs = self.released is None or self.time < self.released + self.lag
+        fall = 0.0 if hangs else 0.5 * GRAVITY * (self.time - self.released - self.lag) ** 2
         ball = np.array([0.0, 0.0, max(self.home_w[2] - 0.383 - fall, 0.04)])
         level = np.array([0.0, 0.0, 0.0, 1.0])
         return {
@@ -51,7 +55,8 @@ class LevelPlant:
     @property
     def landing(self) -> dict[str, Any]:
         """See `WirePlant`; what falls at its feet is not reported."""
-        return {"landing_w": None, "landing_time": None, "separation_time": None}
+        apart = None if self.released is None else self.released + self.lag
+        return {"landing_w": None, "landing_time": None, "separation_time": apart}
 
 
 def make(policy: str, seed: int) -> LevelPlant:

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from hil.clock import TimeSync
-from hil.fakes.level import LevelPlant
 from hil.fake import VEHICLE_ID, FakeAutopilot, MocapParams, Options
+from hil.fakes.level import LevelPlant
 from hil.link import Link
 from hil.mavlink import mav
 from hil.sources import BodyIds, MavlinkSource

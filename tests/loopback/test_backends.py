@@ -1,0 +1,350 @@
+"""Each back-end against its fake, in lock step: commands, modes, hand-over, parameters, release, and whose hands it is in."""
+
+import numpy as np
+import pytest
+
+from hil import msp
+from hil.autopilot_check import AutopilotCheck
+from hil.backends.base import FOLLOW, HOLD, LAND, WAIT
+from hil.fakes.level import LevelPlant
+from hil.fakes.px4 import LAND as PX4_LAND
+from hil.fakes.px4 import OFFBOARD, POSCTL
+from hil.flight import fly
+from hil.runner import Words
+from tests.hil_flight import simple_policy
+from tests.loopback.wire import peers, throw
+
+KINDS = ("ardupilot", "px4", "betaflight")
+QUICK = ("states.check_hold=0.2", "states.armed_least=0.1", "states.quiet=0.1", "states.abort=0.5", "states.land=0.5")
+AT_ONCE = simple_policy((-0.1269, 0.0, 0.0, 0.0, 1.0))
+HOVER = (2.668, 0.0, 0.0, 0.0)
+
+SEPARATION = 5e-3
+"""Latch to separation against the trained lag [s]: the bound asked for."""
+
+
+class Desk:
+    """A back-end without a runner: it is asked and told by hand."""
+
+    def __init__(self, kind, *overrides, **options):
+        found = peers(LevelPlant(), kind=kind, loaded=AT_ONCE, overrides=overrides, **options)
+        self.runner, self.source, self.clock, self.fake = found
+        self.backend = self.runner.backend
+
+    @property
+    def now(self):
+        return self.fake.plant.time
+
+    @property
+    def status(self):
+        return self.backend.status(self.now)
+
+    def turn(self, seconds, command=None, ask=None):
+        end = self.now + seconds
+        while self.now < end - 1e-9:
+            for _ in range(4):
+                self.fake.step()
+            self.source.poll(self.now)
+            if command is not None:
+                self.backend.send(command, self.now)
+            if ask is not None:
+                self.backend.ask(ask, self.now)
+            self.backend.service(self.now)
+
+    def follow(self):
+        """Until commands are followed."""
+        self.turn(0.5)
+        for _ in range(100):
+            if self.status.mode == FOLLOW:
+                return self
+            self.turn(0.02, HOVER, FOLLOW)
+        raise AssertionError(self.status)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_units_and_axes_of_commands(kind):
+    """A quarter of a turn a second about each axis alone, and a thrust, arrive as they were meant."""
+    desk = Desk(kind).follow()
+    for command in ((7.0, 1.0, 0.0, 0.0), (1.0, 0.0, 2.0, 0.0), (2.668, 0.0, 0.0, -3.0), (13.0, -9.0, 8.0, 2.0)):
+        desk.turn(0.06, command)
+        np.testing.assert_allclose(desk.fake.plant.commands[-1], command, atol=0.012, rtol=2e-3)
+    assert desk.fake.witness.breaches == []
+
+
+def test_what_the_fakes_make_of_a_positive_rate_stands_in_their_own_axes():
+    """Nose down is stick forward for Betaflight: the raw channels, in the order aileron, elevator, throttle, rudder."""
+    desk = Desk("betaflight").follow()
+    desk.turn(0.06, (2.668, 1.0, 2.0, 1.0))
+    roll, pitch, throttle, yaw = desk.fake.channels[:4]
+    assert (roll - 1500, pitch - 1500, yaw - 1500) == (round(500 * 57.2958 / 600), round(500 * 114.5916 / 600), -95)
+    assert throttle == round(1050 + 0.1906 * 950)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_hands(kind):
+    """Pilot, runner, the autopilot's own hold and landing; then the pilot again, who is not fought."""
+    desk = Desk(kind).follow()
+    assert desk.status.connected
+    if not desk.backend.holds:
+        desk.fake.armed = False
+        desk.turn(0.3, HOVER, FOLLOW)
+        assert (desk.status.connected, desk.status.mode) == (False, WAIT)
+        assert desk.status.note == "disarmed"
+        return
+    desk.turn(0.3, HOVER, HOLD)
+    assert (desk.status.connected, desk.status.mode) == (True, HOLD)
+    desk.turn(1.6, HOVER, FOLLOW)
+    assert (desk.status.connected, desk.status.mode) == (True, FOLLOW)
+    desk.fake.mode, desk.fake._next_beat = (2 if kind == "ardupilot" else POSCTL), 0.0
+    desk.turn(0.1, HOVER, FOLLOW)
+    assert (desk.status.connected, desk.status.mode) == (False, WAIT)
+    assert "did not ask for: pilot or failsafe has it" in desk.status.note
+    mode = desk.fake.mode
+    for _ in range(20):
+        desk.turn(0.02)
+        desk.backend.abort(desk.now)
+    assert desk.fake.mode == mode, "an abort does not take it out of the pilot's hands"
+
+
+@pytest.mark.parametrize("kind", ["ardupilot", "px4"])
+def test_an_abort_lands(kind):
+    desk = Desk(kind).follow()
+    for _ in range(20):
+        desk.turn(0.02)
+        desk.backend.abort(desk.now)
+    assert desk.status.mode == LAND
+    assert desk.fake.mode == (9 if kind == "ardupilot" else PX4_LAND)
+
+
+def test_px4_is_asked_for_offboard_only_after_a_second_of_set_points():
+    desk = Desk("px4")
+    desk.turn(0.5)
+    assert (desk.status.connected, desk.status.mode) == (True, HOLD), "in Position mode it may be taken"
+    start = desk.now
+    while desk.status.mode != FOLLOW:
+        desk.turn(0.02, HOVER, FOLLOW)
+        assert desk.now - start < 2.0
+    assert 1.0 < desk.now - start < 1.5
+    assert desk.fake.refusals == []
+    assert desk.fake.mode == OFFBOARD
+
+
+def test_px4_left_without_a_stream_is_not_asked():
+    desk = Desk("px4")
+    desk.turn(2.0, None, FOLLOW)
+    assert desk.fake.mode == POSCTL
+    assert desk.fake.refusals == []
+
+
+def test_betaflight_waits_for_the_pilots_switch_and_refuses_one_that_is_on_too_early():
+    desk = Desk("betaflight")
+    desk.turn(0.5)
+    assert (desk.status.connected, desk.status.mode) == (True, WAIT)
+    desk.fake.override = True
+    desk.turn(0.2)
+    assert desk.status.note.startswith("MSP OVERRIDE is on before the runner is ready")
+    assert not desk.status.connected
+
+
+def test_betaflight_with_all_channels_arms_with_the_throttle_low_and_disarms_in_the_end():
+    desk = Desk("betaflight", "betaflight.arm_channel=1", all_channels=True)
+    desk.turn(0.5)
+    assert not desk.fake.armed
+    assert desk.fake.witness.commands > 10, "it is spoken to before it is taken: a silent receiver cannot be armed"
+    desk.follow()
+    assert desk.fake.armed
+    desk.turn(0.1, HOVER)
+    np.testing.assert_allclose(desk.fake.plant.commands[-1][0], HOVER[0], rtol=2e-3)
+    desk.backend.finish(desk.now)
+    desk.turn(0.05)
+    assert not desk.fake.armed
+
+
+TRAPS = {
+    "ardupilot": {"GUID_OPTIONS": 0.0, "ATC_ANGLE_BOOST": 1.0, "GUID_TIMEOUT": 3.0, "EK3_SRC1_POSXY": 3.0,
+                  "GRIP_ENABLE": 0.0, "SERVO9_FUNCTION": 33.0},
+    "px4": {"COM_OF_LOSS_T": 5.0, "COM_OBL_RC_ACT": 0.0, "EKF2_EV_CTRL": 0.0, "PD_GRIPPER_EN": 0.0, "PWM_AUX_FUNC1": 301.0},
+    "betaflight": {"rates_type": 0, "roll_rc_rate": 7, "pitch_rate": 67, "yaw_expo": 50, "deadband": 5, "min_check": 1000,
+                   "mid_rc": 1510, "failsafe_delay": 2.0},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("kind", "name"), [(kind, name) for kind in KINDS for name in TRAPS[kind]])
+def test_a_wrong_parameter_is_found_over_the_wire(kind, name):
+    tables = []
+    desk = Desk(kind, parameters={name: TRAPS[kind][name]}, tell=tables.append)
+    desk.turn(0.5)
+    (table,) = tables
+    wrong = [line for line in table.splitlines() if line.startswith("WRONG")]
+    assert len(wrong) == 1
+    assert name in wrong[0]
+    assert not desk.status.connected
+    assert f"parameter audit: {name} is " in desk.status.fault
+    assert desk.fake.parameters[name] == TRAPS[kind][name], "nothing is written unasked"
+
+
+@pytest.mark.parametrize(
+    ("kind", "names"),
+    [("ardupilot", set(TRAPS["ardupilot"])), ("px4", set(TRAPS["px4"])),
+     ("betaflight", {"rates_type", "roll_rc_rate", "pitch_rate", "yaw_expo"})],
+)  # fmt: skip
+def test_write_parameters_mends_them(kind, names):
+    desk = Desk(kind, parameters={name: TRAPS[kind][name] for name in names}, write=True)
+    if kind == "betaflight":
+        desk.fake.armed = False
+    desk.turn(3.0)
+    assert desk.status.fault is None
+    assert set(desk.backend.audit.written) == names
+
+
+def test_betaflight_is_not_written_while_it_is_armed():
+    desk = Desk("betaflight", parameters={"roll_rc_rate": 7}, write=True)
+    desk.turn(6.0)
+    assert desk.fake.parameters["roll_rc_rate"] == 7
+    assert "roll_rc_rate" in desk.status.fault
+
+
+def test_a_run_ends_at_once_on_a_wrong_parameter():
+    summary, fake, told = throw(LevelPlant(), loaded=AT_ONCE, seconds=5.0, parameters={"GUID_OPTIONS": 0.0})
+    assert (summary["aborted"], fake.witness.commands) == (True, 0)
+    assert summary["reason"].startswith("parameter audit: GUID_OPTIONS is 0; expected with the bits of 8 set")
+    assert told[-1].time < 1.0
+
+
+def test_without_the_audit_the_traps_are_what_they_are():
+    """What the audit is for: thrust as a climb rate, thrust that grows with tilt, a servo that is acknowledged and stays."""
+    desk = Desk("ardupilot", "ardupilot.audit=false", parameters={"GUID_OPTIONS": 0.0}).follow()
+    desk.turn(0.1, (7.0, 0.0, 0.0, 0.0))
+    assert desk.fake.plant.commands[-1][0] == pytest.approx(2.668, rel=1e-3), "half thrust: no climb"
+    desk = Desk("ardupilot", "ardupilot.audit=false", 'ardupilot.release="servo"').follow()
+    desk.backend.release(desk.now)
+    desk.turn(0.7, HOVER)
+    assert (desk.status.release, desk.fake.release_time) == ("failed", None)
+    assert desk.backend.release_record.note == "accepted, but nothing moved within 0.5 s"
+
+
+@pytest.mark.parametrize(
+    ("kind", "overrides", "parameters"),
+    [
+        ("ardupilot", (), {}),
+        ("ardupilot", ('ardupilot.release="servo"',), {"SERVO9_FUNCTION": 0.0}),
+        ("px4", (), {}),
+        ("px4", ('px4.release="actuator"',), {"PWM_AUX_FUNC1": 301.0}),
+        ("betaflight", (), {}),
+        ("betaflight", ("betaflight.servo_output=0",), {}),
+    ],
+)
+def test_every_way_to_release(kind, overrides, parameters):
+    desk = Desk(kind, *overrides, parameters=parameters).follow()
+    when = desk.now + 0.05
+    desk.backend.release(when)
+    while desk.status.release == "idle" or desk.fake.release_time is None:
+        desk.turn(0.02, HOVER)
+        assert desk.now < when + 0.2
+    assert desk.fake.release_time == pytest.approx(when, abs=0.025)
+    desk.turn(1.5, HOVER)
+    assert desk.status.release == "accepted"
+    assert (desk.fake.witness.releases, desk.fake.witness.breaches) == (1, [])
+
+
+def test_px4_says_in_progress_first_and_that_is_pending():
+    desk = Desk("px4").follow()
+    desk.backend.release(desk.now)
+    desk.turn(0.5, HOVER)
+    assert (desk.status.release, desk.fake.witness.releases) == ("pending", 1)
+    desk.turn(0.8, HOVER)
+    assert desk.status.release == "accepted"
+
+
+def test_a_release_before_its_hour_is_not_sent_when_it_was_stopped():
+    for kind in KINDS:
+        desk = Desk(kind).follow()
+        desk.backend.release(desk.now + 0.1)
+        desk.turn(0.04, HOVER)
+        desk.backend.stop_release()
+        desk.turn(1.0, HOVER)
+        assert (desk.fake.witness.releases, desk.status.release) == (0, "idle")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("mechanism", [0.11, 0.06, 0.002])
+def test_latch_to_separation_is_the_trained_lag(kind, mechanism):
+    """Measured by the fake, which knows the true separation; a faster mechanism waits for the difference."""
+    plant = LevelPlant(lag=mechanism)
+    summary, fake, _ = throw(
+        plant, kind=kind, loaded=AT_ONCE, seconds=3.5, overrides=(*QUICK, f"{kind}.mechanism_lag={mechanism}")
+    )
+    (latch,) = summary["latch_times"]
+    assert abs(fake.report()["separation_time"] - latch - 0.11) <= SEPARATION
+    assert (summary["latches"], fake.witness.breaches) == (1, [])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_complete_throw(kind):
+    plant = LevelPlant()
+    summary, fake, told = throw(plant, kind=kind, loaded=AT_ONCE, seconds=4.5, overrides=QUICK)
+    assert (summary["latches"], len(summary["landings"]), summary["stuck"], summary["errors"]) == (1, 1, 0, [])
+    assert (fake.witness.releases, fake.witness.breaches) == (1, [])
+    assert [d.state for d in told][:7] == ["idle", "check", "ready", "armed", "throw", "recover", "land"]
+    if kind == "betaflight":
+        assert fake.override, "it is flown by the runner to the end"
+    else:
+        modes = [text for _, text in fake.events if text.startswith("mode")]
+        assert modes == (["mode 17", "mode 9"] if kind == "ardupilot" else ["mode 6.0", "mode 4.3", "mode 4.6"])
+
+
+def test_two_throws_with_the_autopilots_own_hold_between_them():
+    """From the hold the runner takes the vehicle back for the next throw, and the release is new."""
+    plant = LevelPlant()
+
+    class HangOn:
+        """Arms, and hangs the payload on again once the vehicle is held."""
+
+        def words(self, state):
+            if state == "ready" and plant.released is not None:
+                plant.released, fake._open, fake.release_time = None, False, None
+                fake.witness._answered = False
+            return Words(arm=state == "ready")
+
+    runner, source, clock, fake = peers(plant, kind="ardupilot", loaded=AT_ONCE, overrides=(*QUICK, "throws=2"))
+    summary = fly(runner, source, clock, HangOn(), None, 9.0)
+    assert (summary["latches"], fake.witness.releases, fake.witness.breaches) == (2, 2, [])
+    assert [text for _, text in fake.events] == ["mode 17", "mode 4", "mode 17", "mode 9"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(("factor", "good"), [(1.0, True), (1.15, False)])
+def test_the_hover_share_is_measured_before_a_flight(kind, factor, good):
+    """The vehicle hovers in other hands; its share of thrust is held against the config's."""
+    hover = {"ardupilot": 0.1906, "px4": 0.1585, "betaflight": 0.1906}[kind]
+    desk = Desk(kind, f"{kind}.thrust.hover={hover * factor}")
+    check = AutopilotCheck(desk.runner.params, desk.backend)
+    desk.fake.flown = lambda: np.array([2.668, 0.0, 0.0, 0.0])
+    for _ in range(400):
+        for _ in range(4):
+            desk.fake.step()
+        for pose in desk.source.poll(desk.now):
+            desk.runner.tracks[pose.body].update(pose)
+        check.tick(desk.now, desk.runner)
+    (found, text) = check.results(desk.now, desk.runner.mass)[-1]
+    assert found == good, text
+    assert check.meter.share == pytest.approx(hover, rel=0.01)
+
+
+def test_a_hover_that_does_not_take_the_weight_arms_no_throw():
+    """The vehicle needs a tenth more than its weight by the config: the hover controller finds out, and no throw begins."""
+    from visthrow.wire_plant import make
+
+    summary, fake, told = throw(make("state", 0), loaded=AT_ONCE, seconds=6.0,
+                                overrides=("ardupilot.thrust.hover=0.169", *QUICK[:1], "states.armed=2.5"))  # fmt: skip
+    assert (summary["throws"], fake.witness.releases) == (0, 0)
+    reasons = [d.reason for d in told]
+    assert "disarmed: the swing did not become quiet" in reasons or told[-1].state in ("ready", "armed")
+
+
+def test_an_answer_that_nobody_asked_for_changes_nothing():
+    desk = Desk("betaflight").follow()
+    for frame in (msp.Frame(msp.SERVO, b"\xd0\x07", msp.ANSWER), msp.Frame(msp.RC, bytes([0xD0, 7] * 12), msp.ANSWER)):
+        desk.fake.port.write(msp.pack(frame))
+    desk.turn(0.1, HOVER)
+    assert desk.status.release == "idle"
