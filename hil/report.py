@@ -58,6 +58,8 @@ def finish(folder: str | Path, stages: Stages | None = None) -> list[str]:
         if stages is not None:
             draw(folder / LATENCY_PICTURE, stages, f"Times of each stage, run {folder.name}")
             said.append(f"{folder / LATENCY_PICTURE}  times of each stage")
+        if _throws_flown(folder) == 0:
+            return said
         course = read(folder)
         for number, log in enumerate(throws(course), start=1):
             path = throw_path(folder, number, ".npz")

@@ -1,0 +1,132 @@
+"""Runs and fakes as processes of their own: what is measured is what is flown, the command itself."""
+
+import contextlib
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from visthrow.errors import VisthrowError
+
+READY, ENDED = 60.0, 30.0
+"""Most that a start, and that an end, may take [s]."""
+
+COMMAND = (sys.executable, "-m", "visthrow.cli", "hil")
+
+
+def free_port() -> int:
+    """A UDP port of this machine that nobody listens on."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+@dataclass(frozen=True)
+class Pair:
+    """A run against a fake.
+
+    Attributes:
+        run: further arguments of ``visthrow hil run``. fake: of ``visthrow hil fake``.
+        core: that the run is kept on; None leaves it to the system.
+    """
+
+    run: tuple[str, ...]
+    fake: tuple[str, ...]
+    core: int | None = None
+
+    def fly(self, folder: Path, watch: Callable[[int], None] | None = None) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Start both, wait until the fake is done, end the run.
+
+        Args:
+            folder: of the run; not there yet.
+            watch: called twice a second with the run's process id.
+
+        Returns:
+            The run's summary and the fake's report.
+
+        Raises:
+            VisthrowError: one of them did not start, or did not end; the message holds what it said.
+        """
+        port, report = free_port(), folder.with_suffix(".fake.json")
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        run = [*COMMAND, "run", "--set", f'link.device="udp:127.0.0.1:{port}"', "--out", str(folder), "--auto-arm", *self.run]
+        fake = [*COMMAND, "fake", "--device", f"udpout:127.0.0.1:{port}", "--out", str(report), *self.fake]
+        with self._started(run, self.core) as runner:
+            said = _first_line(runner)
+            with self._started(fake, None) as other:
+                _until(other, watch, runner)
+            _end(runner, said)
+        try:
+            summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+            return summary, json.loads(report.read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            raise VisthrowError(f"a process of the pair ended without its report: {error}") from error
+        finally:
+            report.unlink(missing_ok=True)
+
+    @staticmethod
+    @contextlib.contextmanager
+    def _started(command: list[str], core: int | None) -> Iterator[subprocess.Popen]:
+        pinned = None if core is None else (lambda: os.sched_setaffinity(0, {core}))
+        process = subprocess.Popen(
+            command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, preexec_fn=pinned
+        )
+        try:
+            yield process
+        finally:
+            if process.poll() is None:
+                process.kill()
+            process.wait()
+
+
+def _first_line(process: subprocess.Popen) -> str:
+    """What a run says when it is ready."""
+    line = process.stderr.readline()
+    if not line.startswith("ready after"):
+        raise VisthrowError(f"the run did not start: {line}{process.stderr.read()}")
+    return line
+
+
+def _until(fake: subprocess.Popen, watch: Callable[[int], None] | None, runner: subprocess.Popen) -> None:
+    while fake.poll() is None:
+        if runner.poll() is not None:
+            return
+        if watch is not None:
+            watch(runner.pid)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            fake.wait(0.5)
+    if fake.returncode:
+        raise VisthrowError(f"the fake failed: {fake.stderr.read()}")
+
+
+def _end(runner: subprocess.Popen, said: str) -> None:
+    """The fake is gone; what is still flying is told to stop."""
+    if runner.poll() is None:
+        runner.send_signal(signal.SIGINT)
+    try:
+        _, text = runner.communicate(timeout=ENDED)
+    except subprocess.TimeoutExpired as error:
+        raise VisthrowError(f"the run did not end within {ENDED:g} s after it was told to: {said}") from error
+    if runner.returncode not in (0, 1):  # 1: aborted, as it was told
+        raise VisthrowError(f"the run failed: {text}")
+
+
+class Memory:
+    """Resident memory of a process over time."""
+
+    def __init__(self) -> None:
+        """Start without a sample."""
+        self.samples: list[tuple[float, float]] = []  # [s], [bytes]
+
+    def __call__(self, pid: int) -> None:
+        """Take a sample; nothing where the system does not tell."""
+        with contextlib.suppress(OSError, ValueError, IndexError):
+            pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
+            self.samples.append((time.monotonic(), float(pages * os.sysconf("SC_PAGE_SIZE"))))
