@@ -109,11 +109,12 @@ class ThrowEnv(VecEnv):
         """Use one goal [m], shape (3,), for all episodes from the next reset on, or drawn ones again (None)."""
         self._goal = goal_w
 
-    def _start(self, mask=None) -> None:
+    def _start(self, fresh: Tensor) -> None:
+        """Start episodes where ``fresh``, bool, shape (E,)."""
         with on_torch_stream(self.device):
-            self.sim.randomize(self.cfg.task.start, mask)
+            self.sim.randomize(self.cfg.task.start, self._mask(fresh))
         if self._goal is not None:
-            self.views.goal_w.copy_(self._goal.expand_as(self.views.goal_w))
+            self.views.goal_w.copy_(torch.where(fresh[:, None], self._goal, self.views.goal_w))
 
     @property
     def totals(self) -> dict[str, float]:
@@ -127,7 +128,7 @@ class ThrowEnv(VecEnv):
     def reset(self) -> TensorDict:
         """Start a new episode everywhere."""
         fresh = torch.ones(self.num_envs, device=self.device, dtype=torch.bool)
-        self._start()
+        self._start(fresh)
         self._begin(fresh)
         self._observations = self._observe(fresh)
         return self._observations
@@ -156,7 +157,7 @@ class ThrowEnv(VecEnv):
         self.episode_length_buf += 1
         reward, done = self._judge(action)
         self._tally(done)
-        self._start(self._mask(done))
+        self._start(done)
         memory["previous"].copy_(action)
         self._begin(done)
         self._observations = self._observe(done)

@@ -1,7 +1,7 @@
 """Fit of a moving goal's velocity from what the actor measures anyway. Onboard-safe.
 
 A history of a few goal measurements cannot serve: with the paper's noise (0.01 m a step) the slope through four of them,
-20 ms apart, is known to 0.3 m/s, which is 0.2 m at the landing. So every control step yields one measured goal position in
+20 ms apart, is known to 0.2 m/s, which is 0.15 m at the landing. So every control step yields one measured goal position in
 the world, and the actor is given the slope of the weighted least-squares line through all of them since the throw began,
 drawn to zero by a prior that matters for the first few steps. The state layout adds up its measured positions; the vision
 layout sends each seen corner's ray to the ground, a corner counting by the accuracy that its distance leaves.

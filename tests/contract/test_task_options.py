@@ -1,0 +1,142 @@
+"""What the task can do beyond the paper: moving goals, varied payloads; and flying under stated departures from a contract."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from sim.hybrid import rope_variants, tether_lengths
+from visthrow import config, protocol
+from visthrow.env import ThrowEnv
+from visthrow.errors import MismatchError
+from visthrow.loading import load_policy
+from visthrow.reference_protocol import Job, fly_batch
+from visthrow.task import Experiment, TargetParams, contract_of
+
+PERIOD = 0.02
+
+
+def experiment(name: str, *changes: str) -> Experiment:
+    return config.load(Experiment, config.find("train", name), changes)
+
+
+def test_goals_move_as_drawn_and_the_landing_counts_where_they_are_at_impact():
+    torch.manual_seed(0)
+    env = ThrowEnv(experiment("state_moving", "task.target.speed=[0.5,1.0]"), count=64)
+    start, velocity = env.views.goal_w.clone(), env._memory["goal_vel"].clone()
+    speed = velocity.norm(dim=1)
+    assert speed.min() >= 0.5
+    assert speed.max() <= 1.0
+    assert speed.std() > 0.1
+    ask = torch.zeros(64, 5)
+    ask[:, 4] = 1.0
+    for step in range(1, 7):  # 0.11 s of lag end within the sixth period
+        _, _, done, _ = env.step(ask)
+        if step < 6:
+            np.testing.assert_allclose(env.views.goal_w, start + step * PERIOD * velocity, atol=1e-6)
+    assert bool(done.all())
+    landed_at = env.last["duration"]  # from the throw's start to the landing
+    goal = start + landed_at[:, None] * velocity
+    np.testing.assert_allclose(env.last["goal_w"], goal, atol=1e-5)
+    miss = (env.last["landing_w"] - goal)[:, :2].norm(dim=1)
+    np.testing.assert_allclose(env.last["landing_error"], miss, atol=1e-5)
+
+
+def test_a_moving_goal_is_seen_late_and_its_velocity_is_learnt():
+    """Without noise the actor's offset is to the goal of 10 ms ago, and the fit reaches the true velocity."""
+    quiet = ["task.noise.observation_step=0.0", "task.noise.observation_bias=0.0", "task.noise.command_step=0.0"]
+    env = ThrowEnv(experiment("state_moving", *quiet, "task.observation.latency=[0.01,0.01]"), count=32)
+    hover = env.previous_action.clone()
+    alive = torch.ones(32, dtype=torch.bool)
+    for _ in range(12):
+        obs, _, done, _ = env.step(hover)
+        alive &= done == 0
+    assert alive.sum() > 20
+    actor, velocity = obs["actor"][alive], env._memory["goal_vel"][alive]
+    np.testing.assert_allclose(actor[:, -2:], velocity[:, :2], rtol=0.05, atol=0.01)  # the prior still pulls a little
+    pose = env._memory["last_pose"][alive]
+    goal_seen = actor[:, 20:22] + actor[:, 22:24] + actor[:, :2]
+    expected = (env.views.goal_w[alive] - 0.01 * velocity)[:, :2]
+    np.testing.assert_allclose(goal_seen, expected, atol=1e-5)
+    assert (obs["critic"][alive][:, -2:] == velocity[:, :2]).all()
+    assert pose.shape[1] == 18
+
+
+def test_goals_that_stand_still_cost_nothing():
+    """No numbers are drawn, nothing is added to the state: the shipped policies' throws keep their bits."""
+    env = ThrowEnv(experiment("state"), count=4)
+    assert not {"goal_vel", "goal_fit"} & env._memory.keys()
+    assert env.get_observations()["critic"].shape == (4, 42)
+    assert "goal_w" not in env.last
+
+
+def test_throws_at_moving_goals_keep_where_the_goal_was():
+    loaded = load_policy("state", overrides=["task.target.speed=[0.5,0.5]"])
+    throws = protocol.throw(loaded.experiment, loaded.policy.act, 1.5, 8, "cpu", 0)
+    good = throws.success
+    assert good.all()
+    moved = np.linalg.norm(throws.goal_w - [1.5, 0.0], axis=1)
+    np.testing.assert_allclose(moved, 0.5 * throws.duration, rtol=1e-4)
+    np.testing.assert_allclose(np.linalg.norm(throws.landing_w - throws.goal_w, axis=1), throws.error, atol=1e-5)
+    assert throws.summary()["error_mean"] > 0.2, "a policy for goals that stand still throws to where it saw them"
+
+
+@pytest.mark.slow
+def test_goals_move_on_the_reference_plant_too():
+    loaded = load_policy("state", overrides=["task.target.speed=[0.5,0.5]"])
+    result = fly_batch([loaded], "reference", Job((0,), 1.5, 0, 2, 0))
+    assert result["success"].all()
+    moved = np.linalg.norm(result["goal_w"] - [1.5, 0.0], axis=1)
+    np.testing.assert_allclose(moved, 0.5 * result["duration"], rtol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(result["landing_w"] - result["goal_w"], axis=1), result["error"])
+
+
+def test_payloads_vary_in_every_combination():
+    params = experiment("state_payload")
+    ropes = rope_variants(params.rope, params.task.start)
+    assert len(ropes) == 6 * 5 * 5
+    seen = {(round(r.length, 6), round(r.payload_mass, 6), round(r.payload_drag, 9)) for r in ropes}
+    assert len(seen) == len(ropes)
+    masses = np.array([r.payload_mass for r in ropes]) / params.rope.payload_mass
+    assert (masses.min(), masses.max()) == pytest.approx((0.8, 1.2))
+    gyration = [r.payload_inertia / r.payload_mass for r in ropes]
+    np.testing.assert_allclose(gyration, params.rope.payload_inertia / params.rope.payload_mass)
+    assert [r.length for r in ropes[:6]] == [r.length for r in tether_lengths(params.rope, params.task.start)]
+    env = ThrowEnv(params, count=300)
+    hanging = (env.views.out["payload_pos_w"] - env.views.state["pos_w"]).norm(dim=1)
+    assert hanging.max() - hanging.min() > 0.05, "cables of 0.297 to 0.363 m"
+    assert env.get_observations()["actor"].shape == (300, 35), "the actor is told nothing"
+    assert env.get_observations()["critic"].shape == (300, 44)
+
+
+def test_what_varies_in_training_varies_in_its_throws():
+    start = protocol.hover_start(experiment("state_payload")).task.start
+    assert (start.payload_variants, start.payload_spread, start.tether_spread) == (5, 0.2, 0.1)
+    assert start.position == (0.03, 0.03, 0.03)
+    with pytest.raises(ValueError, match="expected 1 or more, and 0 to below 1"):
+        rope_variants(experiment("state").rope, dataclasses.replace(start, payload_spread=1.0))
+
+
+def test_departures_are_refused_unless_allowed_and_then_named():
+    change = ["vehicle.motor.time_constant=0.05", "rope.length=0.4"]
+    with pytest.raises(MismatchError, match=r"rope\.length"):
+        load_policy("state", "state", change, allow=["vehicle"])
+    with pytest.raises(MismatchError, match=r"vehicle\.motor\.time_constant"):
+        load_policy("state", "state", change, allow=["rope.length", "vehicle.mot"])
+    loaded = load_policy("state", "state", change, allow=["rope.length", "vehicle.motor"])
+    assert loaded.departures == {"rope.length": 0.4, "vehicle.motor.time_constant": 0.05}
+    assert load_policy("state").departures == {}
+
+
+def test_a_field_with_a_default_enters_the_contract_only_where_it_differs():
+    plain, moving = contract_of(experiment("state")), contract_of(experiment("state_moving"))
+    assert "goal_velocity" not in plain["observation"]
+    assert moving["observation"]["goal_velocity"] is True
+    assert "payload_drag" not in plain["rope"]
+    assert contract_of(experiment("state_drag"))["rope"]["payload_drag"] == pytest.approx(1.04e-3)
+
+
+def test_speeds_that_make_no_range_are_refused():
+    with pytest.raises(ValueError, match="ascending range"):
+        TargetParams((0.5, 0.2))

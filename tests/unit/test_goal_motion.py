@@ -1,0 +1,107 @@
+"""The fit of a moving goal's velocity: the line through exact positions, its accuracy under noise, and both layouts' geometry."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from camera.keypoints import KeypointCamera
+from visthrow import config, goal_motion
+from visthrow import observations as ob
+from visthrow.task import Experiment
+
+PERIOD = 0.02
+
+
+def fitted(positions: torch.Tensor, sigma: float) -> torch.Tensor:
+    """Velocity after all steps; positions: (T, E, 2)."""
+    sums = goal_motion.empty_sums(positions.shape[1])
+    fresh = torch.ones(positions.shape[1], dtype=torch.bool)
+    for step, place in enumerate(positions):
+        time = torch.full((len(place),), step * PERIOD)
+        sums, velocity = goal_motion.fit(sums, time, place, torch.full_like(time, sigma**-2), fresh)
+        fresh = torch.zeros_like(fresh)
+    return velocity
+
+
+def test_equals_the_least_squares_line_with_a_prior():
+    rng = np.random.default_rng(0)
+    times = np.arange(12) * PERIOD
+    places = 1.0 + 0.5 * times + 0.01 * rng.standard_normal(12)
+    sigma = 0.02
+    # (A^T A / sigma^2 + P) x = A^T y / sigma^2, with a prior on the slope alone
+    design = np.column_stack((np.ones_like(times), times))
+    normal = design.T @ design / sigma**2 + np.diag([0.0, goal_motion.SPEED_SIGMA**-2])
+    slope = np.linalg.solve(normal, design.T @ places / sigma**2)[1]
+    moving = torch.tensor(np.column_stack((places, -places)), dtype=torch.float32)[:, None]
+    np.testing.assert_allclose(fitted(moving, sigma)[0].numpy(), [slope, -slope], rtol=2e-3)
+
+
+def test_a_new_throw_forgets_the_last_one_and_an_unseen_goal_changes_nothing():
+    sums = goal_motion.empty_sums(2)
+    no = torch.zeros(2, dtype=torch.bool)
+    for step in range(10):
+        place = torch.tensor([[step * PERIOD, 0.0]] * 2)
+        time, weight = torch.full((2,), step * PERIOD), torch.full((2,), 1e6)
+        sums, velocity = goal_motion.fit(sums, time, place, weight, no)
+    np.testing.assert_allclose(velocity.numpy(), [[1.0, 0.0]] * 2, atol=2e-3)
+    blind = torch.tensor([1e6, 0.0])
+    fresh = torch.tensor([True, False])
+    sums, velocity = goal_motion.fit(sums, torch.tensor([0.0, 0.2]), torch.full((2, 2), 9.0), blind, fresh)
+    np.testing.assert_allclose(velocity.numpy(), [[0.0, 0.0], [1.0, 0.0]], atol=2e-3)
+
+
+@pytest.mark.parametrize("kind", ["state", "vision"])
+def test_both_layouts_find_the_goal_where_it_is(kind):
+    """Exact frames of random attitudes and places give the goal exactly; the camera's rays meet the ground there."""
+    params = config.load(Experiment, config.find("train", f"{kind}_moving"))
+    layout, camera = ob.layout_of(params.task.observation), KeypointCamera(params.camera)
+    rng = np.random.default_rng(1)
+    count = 64
+    angle = 0.4 * rng.standard_normal((count, 3))
+    quat = np.concatenate((np.sin(angle / 2), np.ones((count, 1))), axis=1)
+    quat = torch.tensor(quat / np.linalg.norm(quat, axis=1, keepdims=True), dtype=torch.float32)
+    pos = torch.tensor(rng.uniform(-0.3, 0.3, (count, 3)) + [0, 0, 1.3], dtype=torch.float32)
+    goal = torch.tensor(np.pad(rng.uniform(-2.0, 2.0, (count, 2)), ((0, 0), (0, 1))), dtype=torch.float32)
+    payload, zero = pos - torch.tensor([0.0, 0.0, 0.4]), torch.zeros(count, 3)
+    rot, valid = ob.rotation_from_quat(quat), None
+    seen = ob.state_part(pos, goal, payload)
+    if kind == "vision":
+        points, valid = ob.vision_part(camera, pos, rot, goal, payload)
+        seen = points.flatten(1)
+    frame = torch.cat([ob.vehicle_part(pos, zero, zero, rot), seen], dim=-1)
+    place, weight = goal_motion.measured_goal(layout, frame, valid, camera)
+    known = weight > 0
+    assert known.float().mean() > 0.9
+    np.testing.assert_allclose(place[known].numpy(), goal[known, :2].numpy(), atol=2e-4)  # float32 at grazing rays
+    if kind == "vision":  # 1 / (sigma reach^2 / height)^2 for each of four corners, seen from straight above
+        above = torch.cat([frame[:1, :6] * 0, frame[:1, 6:9] * 0, torch.tensor([[1.0, 0, 0, 0, 1, 0]])], dim=1)
+        above[0, 2] = 2.0
+        over = torch.tensor([[0.03, 0.0, 0.0]])
+        points, valid = ob.vision_part(camera, above[:, :3], torch.eye(3)[None], over, torch.tensor([[0.0, 0.0, 1.5]]))
+        _, weight = goal_motion.measured_goal(layout, torch.cat([above, points.flatten(1)], dim=1), valid, camera)
+        assert weight.item() == pytest.approx(4 / (goal_motion.ANGLE_SIGMA * 2.0) ** 2, rel=0.05)
+
+
+def test_accuracy_is_what_the_docstring_promises():
+    """Four measurements of 0.01 m, 20 ms apart, leave 0.2 m/s; the fit over half a second leaves a tenth of it."""
+    rng = np.random.default_rng(2)
+    truth = np.array([0.5, 0.0])
+
+    def spread(steps: int) -> float:
+        times = np.arange(steps)[:, None, None] * PERIOD
+        noisy = times * truth + 0.01 * rng.standard_normal((steps, 4000, 2))
+        velocity = fitted(torch.tensor(noisy, dtype=torch.float32), 0.01).numpy()
+        return float(np.sqrt(np.mean((velocity - truth) ** 2)))
+
+    free = 0.01 / (PERIOD * math.sqrt(5.0))  # slope of four points without the prior: 0.22 m/s
+    assert 0.5 * free < spread(4) < free
+    assert spread(25) < 0.02
+
+
+def test_layout_and_contract_grow_by_the_velocity_alone():
+    params = config.load(Experiment, config.find("train", "state_moving")).task.observation
+    still = dataclasses.replace(params, goal_velocity=False)
+    assert ob.layout_of(params).dimension == ob.layout_of(still).dimension + 2
