@@ -57,6 +57,7 @@ def check_rope(rope: RopeParams) -> None:
     require_not_negative("rope", payload_inertia=rope.payload_inertia, payload_offset=rope.payload_offset)
     require_not_negative("rope", joint_damping=rope.joint_damping)
     require_not_negative("rope", payload_drag=rope.payload_drag, mount_damping=rope.mount_damping)
+    require_not_negative("rope", swing_damping=rope.swing_damping, downwash=rope.downwash)
 
 
 def check_numerics(sim: SimParams) -> None:
@@ -68,9 +69,9 @@ def check_numerics(sim: SimParams) -> None:
 def check_release(release: ReleaseParams) -> None:
     """Raise ValueError for a negative lag or fewer than two samples of the flight."""
     require_not_negative("release", lag=release.lag, rope_tail=release.rope_tail)
-    for name in ("lag_tension", "kick_up", "kick_along"):
-        if not math.isfinite(getattr(release, name)):
-            raise ValueError(f"release.{name} is {getattr(release, name)}: expected a finite value")
+    for name, value in (("lag_tension", release.lag_tension), ("kick_w", sum(release.kick_w)), ("kick_along", release.kick_along)):
+        if not math.isfinite(value):
+            raise ValueError(f"release.{name} is {getattr(release, name)}: expected finite values")
     if release.rope_tail > 1.0:
         raise ValueError(f"release.rope_tail is {release.rope_tail}: expected a share from 0 to 1")
     if release.clearance_samples < 2:

@@ -47,13 +47,17 @@ def build_load(t: Types, chain: SimpleNamespace, payload: SimpleNamespace, mount
     """Force on the payload in both stages of a step, and the momentum that it brings.
 
     Returns:
-        Warp functions ``first``, ``second`` (``(rope, air, state, u, k1, h)`` -> force [N, world]) and
+        Warp functions ``first``, ``second`` (``(rope, air, state, flow, n, u, k1, h)`` -> force [N, world]) and
         ``impulse(momentum, h, force, force)`` -> momentum [N s] after h of the forces' mean. Without any they do nothing.
     """
-    vec3, real, Rope, Air, QuadState = t.vec3, t.real, t.Rope, t.Air, t.QuadState
+    vec3, real, Rope, Air, QuadState, Flow = t.vec3, t.real, t.Rope, t.Air, t.QuadState, t.Flow
+    last = chain.segments - 1
 
     @wp.func
-    def none(rope: Rope, air: Air, s: QuadState, u: wp.array(dtype=vec3), k1: wp.array(dtype=vec3), h: real):
+    def none(
+        rope: Rope, air: Air, s: QuadState, f: Flow, n: wp.array(dtype=vec3), u: wp.array(dtype=vec3),
+        k1: wp.array(dtype=vec3), h: real,
+    ):  # fmt: skip
         return vec3()
 
     @wp.func
@@ -67,15 +71,18 @@ def build_load(t: Types, chain: SimpleNamespace, payload: SimpleNamespace, mount
     if not extensions & LOADS:
         return none, none, no_impulse
 
-    @wp.func
-    def first(rope: Rope, air: Air, s: QuadState, u: wp.array(dtype=vec3), k1: wp.array(dtype=vec3), h: real):
-        return payload.force(rope, air, chain.speed_first(rope, mount_velocity(rope, s), u, k1, h))
+    def build(speed):
+        @wp.func
+        def load(
+            rope: Rope, air: Air, s: QuadState, f: Flow, n: wp.array(dtype=vec3), u: wp.array(dtype=vec3),
+            k1: wp.array(dtype=vec3), h: real,
+        ):  # fmt: skip
+            jet = wp.quat_rotate(s.quat_wb, vec3(real(0.0), real(0.0), -f.force_b[2]))
+            return payload.hanging(rope, air, speed(rope, mount_velocity(rope, s), u, k1, h), n[last], jet)
 
-    @wp.func
-    def second(rope: Rope, air: Air, s: QuadState, u: wp.array(dtype=vec3), k1: wp.array(dtype=vec3), h: real):
-        return payload.force(rope, air, chain.speed_second(rope, mount_velocity(rope, s), u, k1, h))
+        return load
 
-    return first, second, impulse
+    return build(chain.speed_first), build(chain.speed_second), impulse
 
 
 def build_coupled_step(
@@ -146,7 +153,7 @@ def build_coupled_step(
 
         f1 = flow(p, air, s, command)
         rate_w = wp.quat_rotate(s.quat_wb, s.rate_b)
-        load1 = load_first(rope, air, s, u, k1, h)
+        load1 = load_first(rope, air, s, f1, n, u, k1, h)
         d, o, b = chain.up_first(rope, n, u, n2, k1, stiffness, rate_w, gravity, load1, gamma, h, c1, c2, hs)
         torque = f1.torque_b + damping_torque(rope, s, rate_w, n[0], u[0])
         acc_w, alpha_b, mount_acc, pull = root(p, rope, s, f1.force_b, torque, d, o, b, gravity)
@@ -164,7 +171,7 @@ def build_coupled_step(
 
         f2 = flow(p, air, s2, command)
         rate_w = wp.quat_rotate(s2.quat_wb, s2.rate_b)
-        load2 = load_second(rope, air, s2, u, k1, h)
+        load2 = load_second(rope, air, s2, f2, n2, u, k1, h)
         d, o, b = chain.up_second(rope, n, u, n2, k1, stiffness, rate_w, gravity, load2, gamma, h, c1, c2, hs)
         torque = f2.torque_b + damping_torque(rope, s2, rate_w, n2[0], u[0] + h * k1[0])
         acc_w, alpha_b, mount_acc, pull = root(p, rope, s2, f2.force_b, torque, d, o, b, gravity)

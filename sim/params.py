@@ -193,7 +193,9 @@ class RopeParams:
     the end of the last segment, on its axis. Viscous joint torque ``-joint_damping (w_i - w_(i-1))`` in every joint, the
     one on the vehicle included; in the uppermost one ``mount_damping`` besides.
 
-    Air on the payload, with its velocity v_p through the air: ``-payload_drag |v_p| v_p``.
+    Air on the payload, with its velocity v_p through the air: ``-payload_drag |v_p| v_p``. While it hangs, the rotors' jet
+    pushes it with the share ``downwash`` of their force, against that force, and friction holds it back by
+    ``-swing_damping`` times its velocity v across the rope's last segment.
     """
 
     segments: int  # L, 1 to 64
@@ -207,6 +209,8 @@ class RopeParams:
     mount: tuple[float, float, float]  # rope attachment in the body frame [m]
     payload_drag: float = 0.0  # 1/2 rho C_d A of the payload, on the rope and in flight [kg/m]
     mount_damping: float = 0.0  # of the uppermost joint, besides joint_damping [N m s]
+    swing_damping: float = 0.0  # [N s/m]
+    downwash: float = 0.0  # [-]
 
 
 @dataclass(frozen=True)
@@ -241,8 +245,8 @@ class ReleaseParams:
     clearance_samples: int  # K points of the flight at which the distance to the vehicle is taken
     clearance_margin: float  # d_m [m]
     lag_tension: float = 0.0  # more lag for every newton of the rope's pull at the latch above the payload's weight [s/N]
-    kick_up: float = 0.0  # speed that the mechanism gives the payload as it lets go, along world z [m/s]
-    kick_along: float = 0.0  # along the rope's last segment, away from the vehicle [m/s]
+    kick_w: tuple[float, float, float] = (0.0, 0.0, 0.0)  # speed that the mechanism gives the payload, world frame [m/s]
+    kick_along: float = 0.0  # the same along the rope's last segment, away from the vehicle [m/s]
     rope_tail: float = 0.0  # share of the rope that leaves with the payload [-]
 
 

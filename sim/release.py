@@ -51,8 +51,8 @@ def build_letting_go(t: Types, extensions: frozenset[str]) -> SimpleNamespace:
 
     Returns:
         Namespace of Warp functions ``lag(r, rope, pull, gravity)`` [s] from the rope's pull at the latch [N], and
-        the payload's velocity [m/s] after ``kick(r, vel_w, along_w)`` along world z and the last segment's direction and
-        after ``tail(r, vel_w, com_vel_w)`` with the velocity of the common centre of mass of payload and rope.
+        the payload's velocity [m/s] after ``kick(r, vel_w, along_w)`` with the last segment's direction and after
+        ``tail(r, vel_w, com_vel_w)`` with the velocity of the common centre of mass of payload and rope.
         Each does only what ``extensions`` name.
     """
     real, vec3, Rope, Release = t.real, t.vec3, t.Rope, t.Release
@@ -71,7 +71,7 @@ def build_letting_go(t: Types, extensions: frozenset[str]) -> SimpleNamespace:
 
     @wp.func
     def kick(r: Release, vel_w: vec3, along_w: vec3):
-        return vel_w + r.kick_along * along_w + vec3(real(0.0), real(0.0), r.kick_up)
+        return vel_w + r.kick_w + r.kick_along * along_w
 
     @wp.func
     def no_tail(r: Release, vel_w: vec3, com_vel_w: vec3):

@@ -16,7 +16,7 @@ class SensingParams:
 
     With the frame's rotation F of the rotation vector ``frame_tilt``, the marker body's M of ``marker_rotation`` and the
     body's attitude R, a sample that carries the stamp t shows the state at
-    ``t - delay - clock_rate (t - start of the flight)``:
+    ``t - delay - clock_rate (t - start of the flight)``, with the delay of its channel:
 
     - vehicle: ``p = (1 + scale) F (p_origin + R marker_offset)``, ``R_measured = F R M``; the origin is that of the frame
       the vehicle's parameters are stated in, not the centre of mass
@@ -24,8 +24,8 @@ class SensingParams:
     - gyro: ``w = w_b + gyro_bias``
     """
 
-    vehicle_delay: float = 0.0  # of pose stamps [s]
-    payload_delay: float = 0.0  # of the payload's, beside that of the vehicle [s]
+    vehicle_delay: float = 0.0  # of the vehicle's stamps [s]
+    payload_delay: float = 0.0  # of the payload's stamps [s]
     gyro_delay: float = 0.0  # [s]
     clock_rate: float = 0.0  # of the sensors' clock against the commands' [-]
     scale: float = 0.0  # of measured lengths [-]

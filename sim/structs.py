@@ -62,6 +62,8 @@ class Types:
                 "payload_drag": real,
                 "joint_damping": real,
                 "mount_damping": real,
+                "swing_damping": real,
+                "downwash": real,
                 "total_mass": real,
             },
         )
@@ -147,12 +149,18 @@ EXTENSIONS = {
     "ground_effect": "thrust near the ground",
     "payload_drag": "air drag of the payload",
     "mount_damping": "friction of the rope's mount",
+    "swing_damping": "friction across the rope",
+    "downwash": "the rotors' jet on the payload",
     "lag_tension": "release lag that depends on the rope's pull",
     "kick": "speed given to the payload at the release",
     "rope_tail": "rope that leaves with the payload",
     "push": "forces from outside",
 }
 """Parts of the blocks that a kernel holds only if it was built for them, and what they are."""
+
+
+ROPE_EXTENSIONS = ("payload_drag", "mount_damping", "swing_damping", "downwash")
+"""Those that are fields of :class:`sim.params.RopeParams` of the same name."""
 
 
 def extensions_of(
@@ -166,12 +174,12 @@ def extensions_of(
     for v in vehicles:
         needed |= {"gain"} if any(g != 1.0 for g in v.thrust.gain) else set()
     for r in ropes:
-        needed |= {name for name in ("payload_drag", "mount_damping") if getattr(r, name) != 0.0}
+        needed |= {name for name in ROPE_EXTENSIONS if getattr(r, name) != 0.0}
     for a in airs:
         needed |= ({"wind"} if any(a.wind_w) else set()) | ({"ground_effect"} if a.ground_effect else set())
     for x in releases:
         needed |= {name for name in ("lag_tension", "rope_tail") if getattr(x, name) != 0.0}
-        needed |= {"kick"} if x.kick_up or x.kick_along else set()
+        needed |= {"kick"} if any(x.kick_w) or x.kick_along else set()
     return frozenset(needed)
 
 
@@ -258,6 +266,8 @@ def pack_rope(t: Types, ropes: list[P.RopeParams]) -> np.ndarray:
         row["last_inertia"] = mass * length**2 / 3 + rope.payload_inertia + rope.payload_mass * ball**2
         row["payload_offset"], row["payload_radius"] = rope.payload_offset, rope.payload_radius
         row["payload_arm"], row["payload_mass"], row["payload_drag"] = ball, rope.payload_mass, rope.payload_drag
-        row["joint_damping"], row["mount_damping"], row["mount"] = rope.joint_damping, rope.mount_damping, rope.mount
+        row["joint_damping"], row["mount"] = rope.joint_damping, rope.mount
+        row["mount_damping"], row["swing_damping"] = rope.mount_damping, rope.swing_damping
+        row["downwash"] = rope.downwash
         row["total_mass"] = rope.rope_mass + rope.payload_mass
     return rows

@@ -172,9 +172,7 @@ def build_replay(t: Types, vehicle: VehicleParams, segments: int) -> ReplayKerne
             out[2 * next.vehicle + 1, lane] = turn
             next.vehicle = next.vehicle + 1
         while next.payload < payloads:
-            time = late(
-                x, windows, w, data.payload_time[windows.payload_first[w] + next.payload], x.vehicle_delay + x.payload_delay
-            )
+            time = late(x, windows, w, data.payload_time[windows.payload_first[w] + next.payload], x.payload_delay)
             if time > k.t1 and not last:
                 break
             s = (time - k.t0) / span
@@ -408,6 +406,8 @@ def build_replay(t: Types, vehicle: VehicleParams, segments: int) -> ReplayKerne
             time = until
 
         if lanes.keep[lane] >= 0:
+            if knot < windows.knots[w]:
+                knot_of(knots, lanes.keep[lane] + knot, p, rope, s, pay, pay_vel, chain.pull(rope, stiffness))
             store_quad(ends, lane, s)
             ends.payload_pos_w[lane] = pay
             ends.payload_vel_w[lane] = pay_vel

@@ -8,7 +8,7 @@ import warp as wp
 from sim.quadrotor import aero
 from sim.structs import Types
 
-LOADS = frozenset({"payload_drag", "push"})
+LOADS = frozenset({"payload_drag", "swing_damping", "downwash", "push"})
 """Extensions that push at the payload."""
 
 
@@ -19,36 +19,53 @@ def drag_force(rope: Any, air_vel_w: Any):
 
 
 def build_payload(t: Types, extensions: frozenset[str]) -> SimpleNamespace:
-    """Functions of the payload's air for a choice of extensions.
+    """Functions of the payload's forces for a choice of extensions.
 
     Returns:
-        Namespace of Warp functions ``force(rope, air, vel_w)`` [N] (zero, and not to be called, without any of
-        :data:`LOADS`) and ``flight_acceleration(rope, air, vel_w, gravity)`` [m/s^2] of the payload alone in flight.
+        Namespace of Warp functions ``hanging(rope, air, vel_w, along_w, jet_w)`` [N] (``along_w`` the last segment's
+        direction, ``jet_w`` the force of the rotors on the air [N]), ``free(rope, air, vel_w)`` [N] and
+        ``flight_acceleration(rope, air, vel_w, gravity)`` [m/s^2] of the payload alone.
     """
     Rope, Air, vec3, real = t.Rope, t.Air, t.vec3, t.real
     air_velocity = aero.in_wind if "wind" in extensions else aero.still_air
 
     @wp.func
-    def none(rope: Rope, air: Air, vel_w: vec3):
-        return vec3()
+    def nothing(rope: Rope, air: Air, force: vec3, vel_w: vec3, along_w: vec3, jet_w: vec3):
+        return force
 
     @wp.func
-    def drag(rope: Rope, air: Air, vel_w: vec3):
-        return drag_force(rope, air_velocity(air, vel_w))
+    def add_drag(rope: Rope, air: Air, force: vec3, vel_w: vec3, along_w: vec3, jet_w: vec3):
+        return force + drag_force(rope, air_velocity(air, vel_w))
 
     @wp.func
-    def push(rope: Rope, air: Air, vel_w: vec3):
-        return air.payload_push_w
+    def add_friction(rope: Rope, air: Air, force: vec3, vel_w: vec3, along_w: vec3, jet_w: vec3):
+        return force - rope.swing_damping * (vel_w - wp.dot(vel_w, along_w) * along_w)
 
     @wp.func
-    def drag_and_push(rope: Rope, air: Air, vel_w: vec3):
-        return drag_force(rope, air_velocity(air, vel_w)) + air.payload_push_w
+    def add_jet(rope: Rope, air: Air, force: vec3, vel_w: vec3, along_w: vec3, jet_w: vec3):
+        return force + rope.downwash * jet_w
 
-    choice = ("payload_drag" in extensions, "push" in extensions)
-    force = {(False, False): none, (True, False): drag, (False, True): push, (True, True): drag_and_push}[choice]
+    @wp.func
+    def add_push(rope: Rope, air: Air, force: vec3, vel_w: vec3, along_w: vec3, jet_w: vec3):
+        return force + air.payload_push_w
+
+    drag = add_drag if "payload_drag" in extensions else nothing
+    friction = add_friction if "swing_damping" in extensions else nothing
+    jet = add_jet if "downwash" in extensions else nothing
+    push = add_push if "push" in extensions else nothing
+
+    @wp.func
+    def hanging(rope: Rope, air: Air, vel_w: vec3, along_w: vec3, jet_w: vec3):
+        force = push(rope, air, drag(rope, air, vec3(), vel_w, along_w, jet_w), vel_w, along_w, jet_w)
+        return jet(rope, air, friction(rope, air, force, vel_w, along_w, jet_w), vel_w, along_w, jet_w)
+
+    @wp.func
+    def free(rope: Rope, air: Air, vel_w: vec3):
+        none = vec3()
+        return push(rope, air, drag(rope, air, none, vel_w, none, none), vel_w, none, none)
 
     @wp.func
     def flight_acceleration(rope: Rope, air: Air, vel_w: vec3, gravity: vec3):
-        return gravity + force(rope, air, vel_w) * (real(1.0) / rope.payload_mass)
+        return gravity + free(rope, air, vel_w) * (real(1.0) / rope.payload_mass)
 
-    return SimpleNamespace(force=force, flight_acceleration=flight_acceleration)
+    return SimpleNamespace(hanging=hanging, free=free, flight_acceleration=flight_acceleration)

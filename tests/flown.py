@@ -1,0 +1,115 @@
+"""Logs of flights in the project's own simulator, for tests of what replays them: free flights and throws, 200 Hz."""
+
+import dataclasses
+
+import numpy as np
+
+from sim.hybrid import HybridSim
+from sim.params import PlantParams
+from sim.structs import EXTENSIONS
+from tests.plants import paper_plant
+from tests.worlds.pilot import FreeFlight, Throw, Tracker
+from visthrow.diagnose.catalogue import ALL, Setting, apply
+from visthrow.flightlog import Channel, FlightLog
+
+FINE = 5e-4  # integration step of the flights [s]
+TICK = 0.005  # between samples [s]
+RATIO = 4  # samples a command
+NOISE = {"pos_w": 5e-4, "quat_wb": np.radians(0.2), "payload_pos_w": 8e-4}
+
+
+def setting_with(theta: dict[str, float], plant: PlantParams | None = None) -> Setting:
+    """The paper's plant with effects of the catalogue."""
+    return apply(ALL, Setting(plant or paper_plant()), theta)
+
+
+def fly(setting: Setting, seed: int = 0, free: int = 2, throws: int = 2, seconds: float = 4.0, noise: float = 1.0) -> list[FlightLog]:
+    """Fly a plant and record it as motion capture would.
+
+    Args:
+        setting: plant and sensors; delays of sensors are not simulated here, frames and markers are not either.
+        seed: of references and noise.
+        free: number of free flights.
+        throws: of throws.
+        seconds: of a free flight [s].
+        noise: times :data:`NOISE`.
+    """
+    rng = np.random.default_rng(seed)
+    references = [FreeFlight(rng) for _ in range(free)]
+    references += [Throw(rng, speed, rng.uniform(-np.pi, np.pi)) for speed in np.linspace(6.0, 10.0, throws)]
+    plant = setting.plant
+    steps = dataclasses.replace(plant.sim, control_period=TICK, substep=FINE, precision="float64")
+    sim = HybridSim(dataclasses.replace(plant, sim=steps), len(references), extensions=frozenset(EXTENSIONS) - {"push"})
+    known = paper_plant()
+    pilot = Tracker(references, known.vehicle.body.mass, known.rope.payload_mass + known.rope.rope_mass, rng)
+    sim.place(np.array([r.at(0.0)[0] for r in references]), battery_used=0.2)
+    tracks: dict[str, list] = {name: [] for name in ("pos_w", "quat_wb", "payload_pos_w", "command", "voltage")}
+    separated = np.full(len(references), np.inf)
+    left = [None] * len(references)
+    ticks = round(max(seconds, 2.4) / TICK)
+    for k in range(ticks):
+        t = k * TICK
+        if k % RATIO == 0:
+            quat = sim.get("quat_wb")[:, [3, 0, 1, 2]]
+            command = pilot.command(t, sim.get("pos_w"), sim.get("vel_w"), quat, sim.get("attached") != 0)
+            tracks["command"].append(command)
+            tracks["voltage"].append(sim.get("voltage"))
+            sim.set_command(command, np.array([t >= r.release - 1e-9 for r in references]))
+        sim.step()
+        ball = sim.get("payload_pos_w").copy()
+        for e in np.flatnonzero(sim.get("separated")):
+            separated[e] = t + sim.get("separation_time")[e]
+            left[e] = (sim.get("payload_pos_w")[e], sim.get("payload_vel_w")[e])
+        for e in np.flatnonzero(np.isfinite(separated)):
+            ball[e] = _flown(plant, *left[e], t + TICK - separated[e])
+        for name, value in (("pos_w", sim.get("pos_w")), ("quat_wb", sim.get("quat_wb")), ("payload_pos_w", ball)):
+            tracks[name].append(value.copy())
+    times = TICK * np.arange(1, ticks + 1)
+    return [_log(setting, references[e], {n: np.array(v)[:, e] for n, v in tracks.items()}, times, noise, rng)
+            for e in range(len(references))]  # fmt: skip
+
+
+def _flown(plant: PlantParams, pos: np.ndarray, vel: np.ndarray, time: float) -> np.ndarray:
+    """Payload some time after separation, by RK4 under drag and wind."""
+
+    def rates(y):
+        air = y[3:] - np.array(plant.air.wind_w)
+        drag = -plant.rope.payload_drag / plant.rope.payload_mass * np.linalg.norm(air) * air
+        return np.concatenate((y[3:], drag + [0.0, 0.0, -9.81]))
+
+    y, count = np.concatenate((pos, vel)), max(int(np.ceil(time / 0.02)), 1)
+    h = time / count
+    for _ in range(count):
+        a = rates(y)
+        b = rates(y + 0.5 * h * a)
+        c = rates(y + 0.5 * h * b)
+        y = y + h / 6 * (a + 2 * b + 2 * c + rates(y + h * c))
+    return y[:3]
+
+
+def _log(setting: Setting, reference, track: dict, times: np.ndarray, noise: float, rng) -> FlightLog:
+    from scipy.spatial.transform import Rotation
+
+    x, com = setting.sensing, np.array(setting.plant.vehicle.body.com)
+    turned = Rotation.from_quat(track["quat_wb"])
+    frame, marker = Rotation.from_rotvec(x.frame_tilt), Rotation.from_rotvec(x.marker_rotation)
+    pos = frame.apply(track["pos_w"] + turned.apply(np.array(x.marker_offset) - com)) * (1 + x.scale)
+    ball = frame.apply(track["payload_pos_w"] + np.array(x.payload_offset)) * (1 + x.scale)
+    seen = frame * turned * marker
+    count = len(times)
+    pos = pos + noise * NOISE["pos_w"] * rng.normal(size=pos.shape)
+    seen = seen * Rotation.from_rotvec(noise * NOISE["quat_wb"] * rng.normal(size=(count, 3)))
+    ball = ball + noise * NOISE["payload_pos_w"] * rng.normal(size=ball.shape)
+    flying = track["payload_pos_w"][:, 2] > setting.plant.release.landing_height
+    flying = np.logical_and.accumulate(flying)
+    commands = track["command"]
+    sent = TICK * RATIO * np.arange(len(commands))
+    channels = {
+        "pos_w": Channel(times + x.vehicle_delay, pos, "m", "world"),
+        "quat_wb": Channel(times + x.vehicle_delay, seen.as_quat(), "1", "world"),
+        "payload_pos_w": Channel(times + x.payload_delay, ball, "m", "world", flying),
+        "command": Channel(sent, commands, "N, rad/s", "body"),
+        "battery_voltage": Channel(sent, track["voltage"], "V"),
+        "release_command": Channel(sent, (sent >= reference.release - 1e-9).astype(float), "1"),
+    }
+    return FlightLog(channels, {})

@@ -1,0 +1,84 @@
+"""Flights cut into windows of about a second at changes of phase."""
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from sim.replay.kernel import ATTACHED, LOOSE, NO_PAYLOAD
+from visthrow.diagnose.recorded import NEVER, Recorded
+
+LENGTH = 1.0  # of a window, about [s]
+LEAST = 0.25  # of a window [s]
+BEFORE, AFTER = 0.55, 0.45  # of the separation, that the window of the throw reaches [s]
+QUIET_SPEED = 0.35  # of hover [m/s]
+GROUND_MARGIN = 0.05  # above the landing height, below which a payload is left alone [m]
+POSES_LEAST = 8  # measured poses without which a window says nothing
+
+
+@dataclass(frozen=True)
+class Cut:
+    """One window of one flight."""
+
+    flight: int
+    phase: str  # hover, flight, throw or ballistic
+    start: float  # [s]
+    end: float  # [s]
+    payload: int  # ATTACHED, LOOSE or NO_PAYLOAD, at its start
+
+
+def _split(first: float, last: float) -> list[tuple[float, float]]:
+    """Equal pieces of about :data:`LENGTH`."""
+    if last - first < LEAST:
+        return []
+    edges = np.linspace(first, last, max(round((last - first) / LENGTH), 1) + 1)
+    return list(pairwise(edges))
+
+
+def _phase(flight: Recorded, first: float, last: float) -> str:
+    pos = flight.vehicle.values[flight.vehicle.between(first, last)]
+    if len(pos) < 2:
+        return "flight"
+    reach = np.ptp(pos, axis=0) / (last - first)
+    return "hover" if np.linalg.norm(reach) < QUIET_SPEED else "flight"
+
+
+def payload_down(flight: Recorded, landing_height: float) -> float:
+    """When the payload is about to come down, or NEVER [s]."""
+    if flight.payload is None or flight.latch == NEVER:
+        return flight.landing
+    after = flight.payload.time > flight.latch
+    low = after & (flight.payload.values[:, 2] < landing_height + GROUND_MARGIN)
+    return min(flight.landing, float(flight.payload.time[low][0])) if np.any(low) else flight.landing
+
+
+def cut(flight: Recorded, number: int, lag: float, landing_height: float, carries: bool) -> list[Cut]:
+    """Cut one flight.
+
+    Args:
+        flight: what was recorded.
+        number: of the flight.
+        lag: of the release, as far as known [s].
+        landing_height: of the payload's centre [m].
+        carries: whether the flight carries a payload.
+    """
+    first, last = flight.start, flight.end
+    separation = flight.latch + lag
+    hanging = ATTACHED if carries else NO_PAYLOAD
+    down = payload_down(flight, landing_height)
+    if not carries or separation > last:
+        spans = [(a, b, "", hanging) for a, b in _split(first, last)]
+    else:
+        before, after = max(first, separation - BEFORE), min(last, separation + AFTER, down)
+        spans = [(a, b, "", hanging) for a, b in _split(first, before)]
+        spans.append((before, after, "throw", ATTACHED))
+        end = min(down, last)
+        spans += [(a, b, "ballistic", LOOSE) for a, b in _split(after, end)]
+        spans += [(a, b, "", NO_PAYLOAD) for a, b in _split(max(end, after), last)]
+    cuts = [Cut(number, phase or _phase(flight, a, b), a, b, mode) for a, b, phase, mode in spans]
+    return [c for c in cuts if _seen(flight, c)]
+
+
+def _seen(flight: Recorded, c: Cut) -> bool:
+    span = flight.vehicle.between(c.start, c.end)
+    return span.stop - span.start >= POSES_LEAST

@@ -1,0 +1,193 @@
+"""Initial states of replay windows: from smoothed measurements, and the directions in which they are not known."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from sim.params import GRAVITY, PlantParams
+from sim.replay.kernel import ATTACHED, LOOSE, STATE_FIELDS
+from visthrow.diagnose.catalogue import Setting
+from visthrow.diagnose.recorded import Recorded, Samples
+
+SMOOTH_BEFORE, SMOOTH_AFTER = 0.06, 0.08  # of a window's start, over which measurements are smoothed [s]
+LEAST_SAMPLES = 6
+
+States = dict[str, np.ndarray]
+"""Fields of ``STATE_FIELDS``, shape (S, ...)."""
+
+
+@dataclass(frozen=True)
+class Direction:
+    """A way in which an initial state may be wrong."""
+
+    field: str
+    axis: int
+    sd: float  # vague prior, in the field's unit (attitude: angle [rad])
+    step: float  # for the derivative
+    part: str = ""  # of the rope: "all" segments or the "last"
+
+
+def directions(plant: PlantParams) -> tuple[Direction, ...]:
+    """Directions, vague in whatever a sensing effect can move."""
+    hover = np.sqrt(plant.vehicle.body.mass * GRAVITY / 4.0 / plant.vehicle.thrust.k_f)
+    gain = plant.vehicle.controller.i_gain
+    found = [Direction("pos_w", i, 0.1, 1e-4) for i in range(3)]
+    found += [Direction("quat_wb", i, 0.1, 1e-4) for i in range(3)]
+    found += [Direction("vel_w", i, 1.0, 1e-3) for i in range(3)]
+    found += [Direction("rate_b", i, 3.0, 1e-3) for i in range(3)]
+    if plant.vehicle.controller.kind == "betaflight":
+        found += [Direction("integral", i, 0.3 * gain[i], 1e-3 * gain[i]) for i in range(3) if gain[i] > 0.0]
+    if plant.vehicle.motor.kind != "instant":
+        found += [Direction("motor_speed", i, 0.15 * hover, 1e-4 * hover) for i in range(4)]
+    found += [Direction("cable_dir_w", i, 0.1, 1e-4, "all") for i in range(2)]
+    found += [Direction("cable_vel_w", i, 1.5, 1e-3, "all") for i in range(2)]
+    if plant.rope.segments > 1:
+        found += [Direction("cable_dir_w", i, 0.1, 1e-4, "last") for i in range(2)]
+        found += [Direction("cable_vel_w", i, 1.5, 1e-3, "last") for i in range(2)]
+    found += [Direction("payload_pos_w", i, 0.1, 1e-4) for i in range(3)]
+    return (*found, *[Direction("payload_vel_w", i, 1.0, 1e-3) for i in range(3)])
+
+
+def concerns(direction: Direction, payload: int) -> bool:
+    """Whether a window that starts with the payload in this way has the direction."""
+    if direction.field.startswith("cable"):
+        return payload == ATTACHED
+    return payload == LOOSE if direction.field.startswith("payload") else True
+
+
+def _tangents(n: np.ndarray) -> np.ndarray:
+    """Two unit vectors normal to each direction, shape (..., 2, 3)."""
+    away = np.where(np.abs(n[..., :1]) < 0.7, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
+    first = np.cross(n, away)
+    first /= np.linalg.norm(first, axis=-1, keepdims=True)
+    return np.stack((first, np.cross(n, first)), axis=-2)
+
+
+def moved(states: States, direction: Direction, size: np.ndarray | float) -> States:
+    """States moved along one direction by ``size`` (shape (S,) or a number)."""
+    out = dict(states)
+    size = np.broadcast_to(np.asarray(size, dtype=float), (len(states["pos_w"]),))
+    value = states[direction.field].copy()
+    if direction.field == "quat_wb":
+        turn = np.zeros((len(value), 3))
+        turn[:, direction.axis] = size
+        value = (Rotation.from_quat(value) * Rotation.from_rotvec(turn)).as_quat()
+    elif direction.field.startswith("cable"):
+        n = states["cable_dir_w"]
+        rows = slice(None) if direction.part == "all" else slice(-1, None)
+        # one plane for the whole rope: that of its mean direction
+        frame = _tangents(n[:, -1])[:, direction.axis][:, None]
+        across = frame - np.sum(frame * n, axis=-1, keepdims=True) * n
+        value[:, rows] += (size[:, None, None] * across)[:, rows]
+        if direction.field == "cable_dir_w":
+            value /= np.linalg.norm(value, axis=-1, keepdims=True)
+            u = states["cable_vel_w"]
+            out["cable_vel_w"] = u - np.sum(u * value, axis=-1, keepdims=True) * value
+    else:
+        value[:, direction.axis] += size
+    out[direction.field] = value
+    return out
+
+
+def rows_of(states: States, rows: np.ndarray) -> States:
+    """Some of the states."""
+    return {name: value[rows] for name, value in states.items()}
+
+
+def stacked(parts: list[States]) -> States:
+    """States one after the other."""
+    return {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}
+
+
+def smoothed(samples: Samples, at: float) -> tuple[np.ndarray, np.ndarray] | None:
+    """Value and derivative at a time from a local cubic through the samples about it; None without enough of them."""
+    for reach in (1.0, 2.0, 4.0):
+        span = samples.between(at - reach * SMOOTH_BEFORE, at + reach * SMOOTH_AFTER)
+        if span.stop - span.start >= LEAST_SAMPLES:
+            time, values = samples.time[span] - at, samples.values[span]
+            if values.shape[1] == 4:
+                return _smoothed_turn(time, values)
+            fit = np.polynomial.polynomial.polyfit(time, values, 2 if len(time) < 12 else 3)
+            return fit[0], fit[1]
+    return None
+
+
+def _smoothed_turn(time: np.ndarray, quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Attitude at time 0 (xyzw) and the body rate there [rad/s]."""
+    middle = Rotation.from_quat(quats[np.argmin(np.abs(time))])
+    turn = (middle.inv() * Rotation.from_quat(quats)).as_rotvec()
+    fit = np.polynomial.polynomial.polyfit(time, turn, 2 if len(time) < 12 else 3)
+    return (middle * Rotation.from_rotvec(fit[0])).as_quat(), fit[1]
+
+
+def measured_state(flight: Recorded, at: float, setting: Setting, payload: int, inner: States) -> States:
+    """One state at a time of a flight: measured where it is measured, the rest from ``inner`` (one state).
+
+    The measurements are taken back through the setting's delays, frame and markers.
+    """
+    out = {name: value.copy() for name, value in inner.items()}
+    x, plant = setting.sensing, setting.plant
+    frame, marker = Rotation.from_rotvec(x.frame_tilt), Rotation.from_rotvec(x.marker_rotation)
+    pos, vel = smoothed(flight.vehicle, at + x.vehicle_delay) or (flight.vehicle.values[0], np.zeros(3))
+    quat, rate = smoothed(flight.attitude, at + x.vehicle_delay) or (flight.attitude.values[0], np.zeros(3))
+    attitude = frame.inv() * Rotation.from_quat(quat) * marker.inv()
+    rate = marker.apply(rate)
+    if flight.gyro is not None and (seen := smoothed(flight.gyro, at + x.gyro_delay)) is not None:
+        rate = seen[0] - np.array(x.gyro_bias)
+    off = np.array(x.marker_offset) - np.array(plant.vehicle.body.com)
+    pos, vel = frame.inv().apply(pos) / (1.0 + x.scale), frame.inv().apply(vel) / (1.0 + x.scale)
+    out["pos_w"][0], out["quat_wb"][0] = pos - attitude.apply(off), attitude.as_quat()
+    out["vel_w"][0], out["rate_b"][0] = vel - attitude.apply(np.cross(rate, off)), rate
+    if payload in (ATTACHED, LOOSE) and flight.payload is not None:
+        seen = smoothed(flight.payload, at + x.payload_delay)
+        if seen is not None:
+            point = frame.inv().apply(seen[0]) / (1.0 + x.scale) - np.array(x.payload_offset)
+            speed = frame.inv().apply(seen[1]) / (1.0 + x.scale)
+            out["payload_pos_w"][0], out["payload_vel_w"][0] = point, speed
+            if payload == ATTACHED:
+                _straighten(out, plant, attitude, point, speed)
+    return out
+
+
+def _straighten(state: States, plant: PlantParams, attitude: Rotation, point: np.ndarray, speed: np.ndarray) -> None:
+    """Lay the rope straight from the mount to the payload, turning as their velocities say."""
+    arm = np.array(plant.rope.mount) - np.array(plant.vehicle.body.com)
+    mount = state["pos_w"][0] + attitude.apply(arm)
+    mount_vel = state["vel_w"][0] + attitude.apply(np.cross(state["rate_b"][0], arm))
+    reach = point - mount
+    length = max(float(np.linalg.norm(reach)), 1e-3)
+    n = reach / length
+    u = (speed - mount_vel) / length
+    state["cable_dir_w"][0], state["cable_vel_w"][0] = n, u - (u @ n) * n
+
+
+def hover_state(flight: Recorded, plant: PlantParams, payload: int) -> States:
+    """A state in hover at the flight's start: what the first window's measurements do not tell."""
+    v, rope, L = plant.vehicle, plant.rope, plant.rope.segments
+    thrust = max(float(flight.command[0, 0]), 0.05)
+    speed = np.sqrt(thrust / 4.0 / v.thrust.k_f)
+    power = v.battery.idle_power + thrust * speed * v.thrust.torque_ratio / v.battery.efficiency
+    used = _charge(flight, plant, power)
+    open_volts = float(np.polynomial.polynomial.polyval(used, v.battery.ocv))
+    sagged = 0.5 * (open_volts + np.sqrt(max(open_volts**2 - 4.0 * v.battery.resistance * power, 0.0)))
+    down = np.array([0.0, 0.0, -1.0])
+    state = {name: np.zeros((1, L, 3) if rows else (1, 3)) for name, (_, rows) in STATE_FIELDS.items()}
+    below = rope.payload_mass + rope.rope_mass * (np.arange(L, 0, -1) - 0.5) / L
+    state |= {
+        "quat_wb": np.array([[0.0, 0.0, 0.0, 1.0]]), "motor_speed": np.full((1, 4), speed),
+        "setpoint": flight.command[:1, 1:].copy(), "gyro": np.zeros((1, 3)), "charge_used": np.array([used]),
+        "voltage": np.array([sagged if v.battery.kind == "sag" else v.battery.reference_voltage]),
+        "cable_dir_w": np.tile(down, (1, L, 1)), "stiffness": below[None] * GRAVITY * rope.length / L,
+    }  # fmt: skip
+    return state
+
+
+def _charge(flight: Recorded, plant: PlantParams, power: float) -> float:
+    """Fraction of the charge used at the start, from the first voltage under load; a fifth where none was logged."""
+    cell = plant.vehicle.battery
+    if flight.voltage is None or cell.kind != "sag":
+        return 0.2 if cell.kind == "sag" else 0.0
+    grid = np.linspace(0.0, 1.0, 201)
+    open_volts = flight.voltage + cell.resistance * power / flight.voltage
+    return float(np.interp(-open_volts, -np.polynomial.polynomial.polyval(grid, cell.ocv), grid))

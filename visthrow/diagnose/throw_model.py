@@ -1,0 +1,328 @@
+"""The whole throw as a model to diagnose: vehicle, rope, payload and release replayed from recorded commands."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from sim.params import PlantParams
+from sim.replay.kernel import NO_PAYLOAD
+from sim.replay.lanes import Replay
+from sim.sensing import SensingParams
+from visthrow.diagnose.catalogue import Entry, Setting, apply, entries_for
+from visthrow.diagnose.cutting import cut
+from visthrow.diagnose.model import Window
+from visthrow.diagnose.opened import opened
+from visthrow.diagnose.recorded import NEVER, record_of
+from visthrow.diagnose.replay import BATCH, KNOT_SPACING, Flights, Lane, carried
+from visthrow.diagnose.states import States, concerns, directions, hover_state, measured_state, moved, stacked
+from visthrow.errors import DiagnoseError
+from visthrow.flightlog import FlightLog
+
+LATENT_SIZES = (0.05, 0.05, 0.05, 1e-3, 1e-3, 1e-3, 0.01, 0.01, 0.01)
+"""Of the latent forces' derivatives: force [N], torque [N m], force on the payload [N]."""
+DAMPING = (1e-3, 1.0, 1e3)
+"""Of the Levenberg-Marquardt steps, from trusting the linearisation to hardly moving."""
+HUBER = 30.0  # deviations, beyond which a sample counts less
+SETTLED = 0.02  # relative fall of the cost below which an initial state is settled
+
+
+class ThrowModel:
+    """Flights of a vehicle, with or without a payload, against the simulator that training uses.
+
+    Attributes:
+        effects: of the catalogue that concern this plant and these logs.
+        channels: measured ones.
+        entries: name -> entry of the catalogue.
+        setting: what the residuals at theta = 0 are simulated with.
+    """
+
+    def __init__(
+        self,
+        logs: Sequence[FlightLog],
+        plant: PlantParams,
+        *,
+        sensing: SensingParams | None = None,
+        device: str = "cpu",
+        substep: float = 0.002,
+        stride: int = 1,
+        only: Sequence[str] | None = None,
+        carries: bool | None = None,
+    ):
+        """Cut the flights and find the windows' initial states.
+
+        Args:
+            logs: flights.
+            plant: the diagnosed one.
+            sensing: what is known of the sensors.
+            device: "cpu" or "cuda:0".
+            substep: largest integration step [s].
+            stride: use every so many measured samples.
+            only: names of the effects to consider; default all that apply.
+            carries: whether a payload hangs below; default: if one was measured or released.
+
+        Raises:
+            DiagnoseError: no flight can be replayed, or ``only`` names what does not exist.
+        """
+        self.setting = opened(Setting(plant, sensing or SensingParams()))
+        self.device, self.substep = device, substep
+        flights = [record_of(log, i) for i, log in enumerate(logs)]
+        carries = any(f.payload is not None or f.latch != NEVER for f in flights) if carries is None else carries
+        release = plant.release
+        cuts = [c for i, f in enumerate(flights) for c in cut(f, i, release.lag, release.landing_height, carries)]
+        if not cuts:
+            raise DiagnoseError(f"{len(flights)} flights hold no stretch of poses and commands long enough to replay")
+        x = self.setting.sensing
+        self.flights = Flights(flights, cuts, (x.vehicle_delay, x.payload_delay, x.gyro_delay), stride)
+        self.channels = ["pos_w", "quat_wb"]
+        self.channels += ["payload_pos_w"] if carries and any(f.payload for f in flights) else []
+        self.channels += ["rate_b"] if any(f.gyro for f in flights) else []
+        thrown = any(f.latch != NEVER for f in flights)
+        self.entries: dict[str, Entry] = entries_for(self.setting, set(self.channels), carries, thrown)
+        if only is not None:
+            unknown = [name for name in only if name not in self.entries]
+            if unknown:
+                raise DiagnoseError(f"no effects {unknown} for these flights; there are {', '.join(self.entries)}")
+            self.entries = {name: self.entries[name] for name in only}
+        self.effects = tuple(e.effect for e in self.entries.values())
+        self._directions = directions(self.setting.plant)
+        self._states = self._settle(self.setting, self._begin(), rounds=4)
+
+    def windows(self, theta: Mapping[str, float]) -> list[Window]:
+        """See :class:`visthrow.diagnose.model.Model`."""
+        setting = apply(self.entries, self.setting, theta)
+        states = self._states if setting == self.setting else self._settle(setting, self._states, rounds=1)
+        steps = [self._step(e, theta.get(name, 0.0)) for name, e in self.entries.items()]
+        settings = [setting, *[e.apply(setting, step) for e, step in zip(self.entries.values(), steps)]]
+        replay = self._replay(settings)
+        found: list[Window] = []
+        for batch in self._batches():
+            found += self._linearised(replay, settings, np.array(steps), states, batch)
+        return found
+
+    def residuals(self, theta: Mapping[str, float]) -> list[np.ndarray]:
+        """See :class:`visthrow.diagnose.model.Model`."""
+        setting = apply(self.entries, self.setting, theta)
+        replay = self._replay([setting])
+        lanes = [Lane(w, 0, w) for w in range(len(self.flights.cuts))]
+        seen = self.flights.fly(replay, [setting], self._states, lanes, self.substep).seen
+        return [self._residual(seen, w, w) for w in range(len(lanes))]
+
+    def step_error(self, finer: int = 4) -> dict[str, float]:
+        """Largest change of any sample of each channel when the step is so many times finer, in its noise."""
+        fine = dataclasses.replace(self.setting, step_square=1.0 / finer**2)
+        settings = [self.setting, fine]
+        count = len(self.flights.cuts)
+        lanes = [Lane(w, s, w) for s in range(2) for w in range(count)]
+        seen = self.flights.fly(self._replay(settings), settings, self._states, lanes, self.substep).seen
+        worst = dict.fromkeys(self.channels, 0.0)
+        for w in range(count):
+            off = np.abs(self._residual(seen, w, w) - self._residual(seen, w, count + w)) / self._sigma(w)
+            for i, name in enumerate(self.channels):
+                here = off[self._channel(w) == i]
+                worst[name] = max(worst[name], float(here.max())) if len(here) else worst[name]
+        return worst
+
+    def _replay(self, settings: Sequence[Setting]) -> Replay:
+        return Replay([s.plant for s in settings], [s.sensing for s in settings], self.device)
+
+    def _begin(self) -> States:
+        def begin(flight, c, inner):
+            start = hover_state(flight, self.setting.plant, c.payload) if inner is None else inner
+            state = measured_state(flight, c.start, self.setting, c.payload, start)
+            if inner is None:
+                state["gyro"] = state["rate_b"].copy()
+            return state
+
+        return carried(self.flights, self._replay([self.setting]), self.setting, begin, self.substep)
+
+    @staticmethod
+    def _step(e: Entry, theta: float) -> float:
+        """Step of theta for the derivative: upwards, unless that leaves the bounds."""
+        step = e.step * e.effect.floor
+        return -step if theta + step > e.effect.bounds[1] else step
+
+    def _batches(self) -> list[list[int]]:
+        """Windows in groups whose lanes fit a run."""
+        batches, room = [], 0
+        for w in range(len(self.flights.cuts)):
+            lanes = 1 + len(self.entries) + len(self._directions) + 9 * int(self.flights.knots[w])
+            if not batches or room < lanes:
+                batches.append([])
+                room = BATCH
+            batches[-1].append(w)
+            room -= lanes
+        return batches
+
+    def _nuisances(self, w: int) -> list[int]:
+        return [d for d, x in enumerate(self._directions) if concerns(x, self.flights.cuts[w].payload)]
+
+    def _latents(self, w: int) -> list[tuple[int, int]]:
+        axes = 6 if self.flights.cuts[w].payload == NO_PAYLOAD else 9
+        return [(axis, knot) for axis in range(axes) for knot in range(int(self.flights.knots[w]))]
+
+    def _moved(self, states: States) -> States:
+        """The states, and after them each direction's perturbed ones: row ``(1 + d) W + w``."""
+        return stacked([states, *[moved(states, d, d.step) for d in self._directions]])
+
+    def _linearised(
+        self, replay: Replay, settings: list[Setting], steps: np.ndarray, states: States, batch: list[int]
+    ) -> list[Window]:
+        count = len(self.flights.cuts)
+        lanes: list[Lane] = []
+        keep = 0
+        for w in batch:
+            lanes.append(Lane(w, 0, w, keep=keep))
+            keep += int(self.flights.knots[w])
+            lanes += [Lane(w, 1 + k, w) for k in range(len(self.entries))]
+            lanes += [Lane(w, 0, (1 + d) * count + w) for d in self._nuisances(w)]
+            lanes += [Lane(w, 0, w, axis, knot, LATENT_SIZES[axis]) for axis, knot in self._latents(w)]
+        flown = self.flights.fly(replay, settings, self._moved(states), lanes, self.substep)
+        out, at, keep = [], 0, 0
+        for w in batch:
+            nuisances, latents = self._nuisances(w), self._latents(w)
+            size = 1 + len(self.entries) + len(nuisances) + len(latents)
+            knots = {name: value[keep : keep + self.flights.knots[w]] for name, value in flown.knots.items()}
+            out.append(self._window(flown.seen[:, at : at + size], settings[0], steps, w, nuisances, latents, knots))
+            at, keep = at + size, keep + int(self.flights.knots[w])
+        return out
+
+    def _window(
+        self, seen: np.ndarray, setting: Setting, steps: np.ndarray, w: int, nuisances: list[int], latents: list, knots: dict
+    ) -> Window:
+        """One window from its lanes: nominal, effects, initial states, latent forces."""
+        rows, c = int(self.flights.rows[w]), self.flights.cuts[w]
+        flat = np.ascontiguousarray(np.swapaxes(seen[:rows], 1, 2)).reshape(3 * rows, -1)
+        K, D = len(steps), len(nuisances)
+        sizes = [*steps, *[self._directions[d].step for d in nuisances], *[LATENT_SIZES[axis] for axis, _ in latents]]
+        slopes = (flat[:, 1:] - flat[:, :1]) / np.array(sizes)
+        return Window(
+            c.flight, c.phase, self._time(w), self._channel(w), self._residual(seen, w, 0), self._sigma(w), slopes[:, :K],
+            slopes[:, K : K + D], np.array([self._directions[d].sd for d in nuisances]), slopes[:, K + D :],
+            np.array([axis // 3 for axis, _ in latents]), np.array([axis % 3 for axis, _ in latents]),
+            np.array([c.start + KNOT_SPACING * knot for _, knot in latents]), self._told(setting, w, knots),
+        )  # fmt: skip
+
+    def _told(self, setting: Setting, w: int, knots: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Simulated quantities at the knots, those of the payload where there is one."""
+        c = self.flights.cuts[w]
+        time = c.start + KNOT_SPACING * np.arange(len(knots["thrust"]))
+        told = {"time": np.minimum(time, c.end)} | {name: value.copy() for name, value in knots.items()}
+        if c.payload == NO_PAYLOAD:
+            return {name: value for name, value in told.items() if not name.startswith("payload") and name != "tension"}
+        arm = np.array(setting.plant.rope.mount) - np.array(setting.plant.vehicle.body.com)
+        reach = told["payload_pos_w"] - told["pos_w"] - Rotation.from_quat(told["quat_wb"]).apply(arm)
+        told["cable_dir_w"] = reach / np.linalg.norm(reach, axis=1, keepdims=True)
+        f = self.flights.flights[c.flight]
+        if f.latch != NEVER:
+            told["tension"][told["time"] > f.latch + setting.plant.release.lag] = 0.0
+        return told
+
+    def _residual(self, seen: np.ndarray, w: int, lane: int) -> np.ndarray:
+        """Measured minus simulated, shape (N,); of an attitude the rotation vector from the simulated to the measured."""
+        f = self.flights
+        nv, rows = int(f.windows["vehicle_count"][w]), int(f.rows[w])
+        measured = np.zeros((rows, 3))
+        measured[0 : 2 * nv : 2] = f.samples["vehicle"][w].values
+        measured[2 * nv :] = np.concatenate((f.samples["payload"][w].values, f.samples["gyro"][w].values))
+        return (measured - seen[:rows, lane]).ravel()
+
+    def _rows(self, w: int, vehicle, attitude, payload, gyro) -> np.ndarray:
+        """A number for every sample of a window, from one for each row of its groups."""
+        s = self.flights.samples
+        pairs = np.stack(np.broadcast_arrays(vehicle, attitude), axis=-1).ravel()
+        counts = len(s["vehicle"][w].time), len(s["payload"][w].time), len(s["gyro"][w].time)
+        if pairs.size == 2:
+            pairs = np.tile(pairs, counts[0])
+        rest = [np.broadcast_to(value, count) for value, count in zip((payload, gyro), counts[1:])]
+        return np.repeat(np.concatenate((pairs, *rest)), 3)
+
+    def _time(self, w: int) -> np.ndarray:
+        s = self.flights.samples
+        return self._rows(w, s["vehicle"][w].time, s["vehicle"][w].time, s["payload"][w].time, s["gyro"][w].time)
+
+    def _channel(self, w: int) -> np.ndarray:
+        at = {name: i for i, name in enumerate(self.channels)}
+        return self._rows(w, 0, 1, at.get("payload_pos_w", -1), at.get("rate_b", -1)).astype(int)
+
+    def _sigma(self, w: int) -> np.ndarray:
+        s = self.flights.samples
+        return self._rows(w, *[s[name][w].sigma for name in ("vehicle", "attitude", "payload", "gyro")])
+
+    def _settle(self, setting: Setting, states: States, rounds: int) -> States:
+        """Fit each window's initial state to its samples; a step that does not help is damped, or not taken."""
+        replay, count = self._replay([setting]), len(self.flights.cuts)
+        moves = np.zeros((count, len(self._directions)))
+        lanes = [Lane(w, 0, w) for w in range(count)]
+        cost = self._costs(replay, setting, states, lanes)
+        open_windows = np.ones(count, dtype=bool)
+        for _ in range(rounds):
+            slopes, residuals = self._state_slopes(replay, setting, states, np.flatnonzero(open_windows))
+            waiting = open_windows.copy()
+            for damping in DAMPING:
+                trial = np.zeros_like(moves)
+                for w in np.flatnonzero(waiting):
+                    trial[w] = self._increment(w, slopes[w], residuals[w], moves[w], damping)
+                there = states
+                for d, direction in enumerate(self._directions):
+                    there = moved(there, direction, trial[:, d])
+                tried = self._costs(replay, setting, there, lanes)
+                better = waiting & (tried < cost)
+                states = {name: np.where(_like(better, v), there[name], v) for name, v in states.items()}
+                moves[better] += trial[better]
+                open_windows &= ~better | (tried < (1.0 - SETTLED) * cost)
+                cost = np.where(better, tried, cost)
+                waiting &= ~better
+                if not waiting.any():
+                    break
+            open_windows &= ~waiting
+            if not open_windows.any():
+                break
+        return states
+
+    def _costs(self, replay: Replay, setting: Setting, states: States, lanes: list[Lane]) -> np.ndarray:
+        """Huber's cost of each window."""
+        seen = self.flights.fly(replay, [setting], states, lanes, self.substep).seen
+        costs = np.zeros(len(lanes))
+        for w in range(len(lanes)):
+            off = np.abs(self._residual(seen, w, w) / self._sigma(w))
+            cost = np.sum(np.where(off < HUBER, 0.5 * off**2, HUBER * (off - 0.5 * HUBER)))
+            costs[w] = cost if np.isfinite(cost) else np.inf
+        return costs
+
+    def _state_slopes(self, replay: Replay, setting: Setting, states: States, which: np.ndarray) -> tuple[dict, dict]:
+        """Derivatives of windows' samples by their initial states, and residuals, both in the noise."""
+        count, all_states = len(self.flights.cuts), self._moved(states)
+        lanes, first = [], {}
+        for w in which:
+            first[w] = len(lanes)
+            lanes += [Lane(w, 0, w), *[Lane(w, 0, (1 + d) * count + w) for d in self._nuisances(w)]]
+        seen = self.flights.fly(replay, [setting], all_states, lanes, self.substep).seen
+        slopes, residuals = {}, {}
+        for w in which:
+            ds, rows, sigma = self._nuisances(w), int(self.flights.rows[w]), self._sigma(w)
+            mine = seen[:rows, first[w] : first[w] + 1 + len(ds)]
+            flat = np.swapaxes(mine, 1, 2).reshape(3 * rows, -1)
+            steps = np.array([self._directions[d].step for d in ds])
+            slopes[w] = (flat[:, 1:] - flat[:, :1]) / steps / sigma[:, None]
+            residuals[w] = self._residual(seen, w, first[w]) / sigma
+        return slopes, residuals
+
+    def _increment(self, w: int, slopes: np.ndarray, residual: np.ndarray, done: np.ndarray, damping: float) -> np.ndarray:
+        """Levenberg-Marquardt step of a window's state, with its vague prior; shape (directions,)."""
+        ds = self._nuisances(w)
+        sd = np.array([self._directions[d].sd for d in ds])
+        weight = np.minimum(1.0, HUBER / np.maximum(np.abs(residual), 1e-12))
+        scaled = slopes * sd
+        normal = scaled.T @ (scaled * weight[:, None]) + np.eye(len(ds))
+        normal += damping * np.diag(np.diag(normal))
+        wanted = scaled.T @ (residual * weight) - done[ds] / sd
+        out = np.zeros(len(done))
+        out[ds] = np.linalg.solve(normal, wanted) * sd
+        return out
+
+
+def _like(mask: np.ndarray, value: np.ndarray) -> np.ndarray:
+    """The mask with as many axes as a value."""
+    return mask.reshape(-1, *[1] * (value.ndim - 1))
