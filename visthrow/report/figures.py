@@ -52,7 +52,7 @@ class Trade:
     """Durations and errors on one plant."""
 
     title: str
-    fronts: tuple[tuple[str, np.ndarray], ...]  # label, points (N, 2): duration [s], error [m]
+    fronts: tuple[tuple[int, str, np.ndarray], ...]  # series, label, points (N, 2): duration [s], error [m]
     stars: tuple[tuple[str, Interval, Interval], ...]  # label, duration [s], error [m]
     crosses: tuple[tuple[str, np.ndarray], ...] = ()  # the paper's
 
@@ -76,20 +76,16 @@ def marks(rows: Sequence[Mark], xlabel: str, series: Sequence[str], zero: float 
 
     names = list(dict.fromkeys(row.label for row in rows))
     count = len({row.series for row in rows})
-    figure, axis = plt.subplots(figsize=(WIDTH, 1.25 + 0.3 * len(names) * max(1.0, 0.62 * count)), layout="constrained")
-    used = set()
+    figure, axis = plt.subplots(figsize=(WIDTH, 1.2 + 0.26 * len(names) * max(1.0, 0.55 * count)), layout="constrained")
+    shown = {}
     for row in rows:
         colour, marker = _look(row.series)
         y = -names.index(row.label) - 0.2 * (row.series - 0.5 * (count - 1))
         value = row.interval
-        label = None if row.series in used else series[row.series]
-        used.add(row.series)
         axis.plot([value.low, value.high], [y, y], "-", color=colour, lw=2.2, solid_capstyle="butt", alpha=0.55)
-        axis.plot(value.value, y, marker, color=colour, ms=6.5, mec="white", mew=0.6, label=label, zorder=3)
+        shown[row.series] = axis.plot(value.value, y, marker, color=colour, ms=6.5, mec="white", mew=0.6, zorder=3)[0]
         if row.paper is not None:
-            first = None if "paper" in used else "the paper's vehicle"
-            used.add("paper")
-            axis.plot(row.paper, y, "x", color=style.INK, ms=7, mew=1.5, label=first, zorder=4)
+            shown[len(series)] = axis.plot(row.paper, y, "x", color=style.INK, ms=7, mew=1.5, zorder=4)[0]
     if zero is not None:
         axis.axvline(zero, color=style.QUIET, lw=1.0, ls=(0, (4, 3)), zorder=1)
     if log:
@@ -100,8 +96,10 @@ def marks(rows: Sequence[Mark], xlabel: str, series: Sequence[str], zero: float 
     axis.grid(True, axis="x")
     axis.set_axisbelow(True)
     axis.set_xlabel(xlabel)
-    if count > 1 or "paper" in used:
-        axis.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    if len(shown) > 1:
+        names = [*series, "the paper's vehicle"]
+        keys = sorted(shown)
+        figure.legend([shown[key] for key in keys], [names[key] for key in keys], loc="outside right upper")
     return png_of(figure)
 
 
@@ -139,7 +137,7 @@ def scatter(panels: Sequence[tuple[str, Sequence[tuple[str, np.ndarray]]]], colu
         for i, (label, points) in enumerate(series):
             _landings(axis, points, half, i, label)
         axis.set(xlim=(-half, half), ylim=(-half, half), aspect="equal")
-        axis.set_title(title, fontsize=10.5)
+        axis.set_title(title, fontsize=10.5 if columns <= 3 else 9)
     for axis in axes[-1]:
         axis.set_xlabel("lateral, to the right [m]")
     for axis in axes[:, 0]:
@@ -176,7 +174,7 @@ def _landings(axis, points: np.ndarray, half: float, series: int, label: str) ->
     axis.scatter(-out[:, 1], out[:, 0], s=18, facecolor="none", edgecolor=colour, marker=marker, clip_on=False, zorder=3)
     if len(points):
         center = points.mean(0)
-        axis.plot(-center[1], center[0], marker, color=colour, ms=9, mec="white", mew=1.3, zorder=6)
+        axis.plot(-center[1], center[0], marker, color=colour, ms=7, mec="white", mew=1.2, zorder=6)
 
 
 def trades(panels: Sequence[Trade]) -> bytes:
@@ -187,32 +185,35 @@ def trades(panels: Sequence[Trade]) -> bytes:
     from visthrow.baseline.front import pareto
 
     figure, axes = plt.subplots(
-        1, len(panels), figsize=(max(WIDTH, 3.6 * len(panels)), 5.0), layout="constrained", sharex=True, sharey=True, squeeze=False
+        1, len(panels), figsize=(WIDTH, 5.2), layout="constrained", sharex=True, sharey=True, squeeze=False
     )
+    labels: dict[str, object] = {}
     for axis, panel in zip(axes[0], panels):
-        for i, (label, points) in enumerate(panel.fronts):
-            colour, marker = _look(i)
-            if len(points):
-                best = points[pareto(points)]
-                axis.plot(*points.T, marker, color=colour, ms=4.5, alpha=0.35, mew=0)
-                axis.plot(*best.T, marker + "-", color=colour, ms=5.5, lw=1.4, label=label)
-            else:
-                axis.plot([], [], marker + "-", color=colour, label=f"{label}: no setting landed all")
+        for series, label, points in panel.fronts:
+            colour, marker = _look(series)
+            best = points[pareto(points)] if len(points) else points
+            axis.plot(*points.T, marker, color=colour, ms=4.5, alpha=0.35, mew=0)
+            labels[label] = axis.plot(*best.T, marker + "-", color=colour, ms=5.5, lw=1.4)[0]
         for label, points in panel.crosses:
             starred = len(points) <= 2
             look = {"marker": "*", "ms": 11, "ls": "none", "mec": "white"} if starred else {"marker": "x", "ms": 6, "ls": "--"}
-            axis.plot(*points.T, color=style.QUIET, lw=1.1, label=label, **look)
+            labels[label] = axis.plot(*points.T, color=style.QUIET, lw=1.1, **look)[0]
         for i, (label, duration, error) in enumerate(panel.stars):
             colour = style.COLOURS[3 + i]
             axis.plot([duration.value] * 2, [error.low, error.high], "-", color=colour, lw=2.0, alpha=0.6)
             axis.plot([duration.low, duration.high], [error.value] * 2, "-", color=colour, lw=2.0, alpha=0.6)
-            axis.plot(duration.value, error.value, "*", color=colour, ms=15, mec="white", mew=0.7, label=label, zorder=5)
+            star = {"color": colour, "ms": 14, "mec": "white", "mew": 0.7, "ls": "none", "zorder": 5}
+            labels[label] = axis.plot(duration.value, error.value, "*", **star)[0]
+        empty = [label for _, label, points in panel.fronts if not len(points)]
+        if empty or not panel.fronts:
+            said = "no setting landed all its throws:\n" + "\n".join(empty) if empty else "not swept yet"
+            axis.text(0.03, 0.02, said, transform=axis.transAxes, fontsize=7.5, color=style.QUIET, va="bottom")
         axis.set_title(panel.title, fontsize=10.5)
         axis.set_xlabel("from start to landing [s]")
         _log_axis(axis.yaxis, "y", axis)
         axis.grid(True, which="major")
-        axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), fontsize=8.5)
     axes[0, 0].set_ylabel("mean landing error [m]")
+    figure.legend(labels.values(), labels.keys(), loc="outside lower center", ncols=2, fontsize=9)
     return png_of(figure)
 
 
@@ -243,7 +244,7 @@ def curves(panels: Sequence[Panel], ylabel: str, columns: int = 3) -> bytes:
     for axis in axes[:, 0]:
         axis.set_ylabel(ylabel)
     if len(labels) > 1:
-        figure.legend(labels.values(), labels.keys(), loc="outside upper center", ncols=len(labels))
+        figure.legend(labels.values(), labels.keys(), loc="outside upper center", ncols=min(len(labels), 4 if columns > 1 else 2))
     return png_of(figure)
 
 

@@ -1,0 +1,190 @@
+"""The report: questions to the book, statistics in its tables, what it says where something is missing, and the page."""
+
+import re
+
+import numpy as np
+import pytest
+
+from tests import made_up_results as made_up
+from visthrow import cli, results
+from visthrow.report import ablations, beyond, book, command, gap, page, throws, trade, wanted
+from visthrow.report.parts import Grid, Picture, Text
+from visthrow.results import Result
+
+
+@pytest.fixture(scope="module")
+def full():
+    return made_up.everything()
+
+
+@pytest.fixture(scope="module")
+def written(full, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("report")
+    sections = command.sections(full)
+    page.write(folder, command.TITLE, command.lead(full), sections)
+    return folder, sections
+
+
+def grids(section) -> list[Grid]:
+    return [part for part in section.parts if isinstance(part, Grid)]
+
+
+def texts(section, kind: str) -> str:
+    return "\n".join(part.text for part in section.parts if isinstance(part, Text) and part.kind == kind)
+
+
+def only(*found) -> book.Book:
+    return book.Book(tuple(found))
+
+
+def test_of_alike_results_the_one_with_most_throws_counts():
+    rng = np.random.default_rng(0)
+    few, many = (made_up.policy(rng, "state", "state", "hybrid", 2.0, count=n) for n in (5, 50))
+    changed = made_up.policy(rng, "state", "state", "hybrid", 2.0, count=99, departures={"a.b": 1})
+    found = only(few, many, changed)
+    assert found.shipped("state", "hybrid", 2.0) is many
+    assert found.by_departure("state", "a.b") == [(1, changed)]
+    assert found.seeds("state", "full", "hybrid", 2.0, {}) == []
+
+
+def test_records_and_folders_are_read_and_batches_joined(tmp_path, full):
+    rng = np.random.default_rng(0)
+    parts = []
+    for batch in (0, 1):
+        one = made_up.policy(rng, "state", "state", "reference", 2.0, count=4)
+        parts.append(Result({**one.unit, "batch": batch}, one.columns, made_up.MADE))
+    results.pack(parts, tmp_path / "throws" / "x.json")
+    (tmp_path / "findings").mkdir()
+    (tmp_path / "findings" / "front.md").write_text("Why.\n")
+    found = book.read([tmp_path])
+    assert [len(r.good) for r in found.results] == [8]
+    assert found.findings == {"front": "Why."}
+
+
+def test_every_section_is_complete_when_everything_was_thrown(written):
+    _, sections = written
+    assert [s.name for s in sections] == [
+        "throws", "vision", "ablations", "baseline", "front", "gap", "beyond", "training", "origin",
+    ]  # fmt: skip
+    allowed = ("realistic reference plant", "drag")  # the made-up baseline does not fly there, nobody trained with drag
+    for section in sections:
+        for part in texts(section, "missing").split("; "):
+            assert not part or any(word in part for word in allowed), (section.name, part)
+
+
+def test_an_empty_book_says_everything_that_is_missing(tmp_path):
+    sections = command.sections(book.Book(()))
+    for section in sections:
+        assert texts(section, "missing"), section.name
+        assert not any(isinstance(part, Picture) for part in section.parts), section.name
+    html = page.html_of("t", "l", sections)
+    assert html.count('class="missing"') == len(sections)
+
+
+def test_policies_stand_beside_the_papers_vehicle(full):
+    rows = [row for row in grids(throws.throws_section(full))[0].rows if row[:3] == ("state", "2.0", "training simulator")]
+    ours = full.shipped("state", "hybrid", 2.0).of("error").mean()
+    assert rows[0][5].startswith(f"{ours:.3f} [")
+    assert rows[0][-1] == "0.105 ± 0.099, 1.154 ± 0.015"
+
+
+def test_difference_of_vision_has_the_right_sign():
+    rng = np.random.default_rng(1)
+    near = made_up.policy(rng, "vision", "vision", "hybrid", 2.0, 0.01)
+    far = made_up.policy(rng, "state", "state", "hybrid", 2.0, 0.05)
+    (row,) = grids(throws.vision_section(only(near, far)))[0].rows
+    assert row[3].startswith("-0.0")
+    assert row[4] == "vision nearer"
+    assert row[6] == "-0.004, -0.029"
+
+
+def test_ablation_ratio_bias_and_the_verdict():
+    """Twice the spread is twice the error; a shift along the throw is told as overshoot; equal spread as no effect."""
+    rng = np.random.default_rng(2)
+
+    def trained(variant: str, spread: float, offset=(0.0, 0.0)) -> list[Result]:
+        return [made_up.policy(rng, f"{variant}-{seed}", "state", "reference-realistic", 2.0, spread, offset, variant=variant,
+                               train_seed=seed, count=200) for seed in (1, 2, 3)]  # fmt: skip
+
+    cable = trained("rigid_cable", 0.02, (0.1, 0.0))
+    found = only(*trained("full", 0.02), *trained("no_motor_lag", 0.04), *cable, *trained("no_aerodynamics", 0.02))
+    section = ablations.section(found)
+    rows = {row[0]: row for row in grids(section)[0].rows}
+    assert float(rows["no motor lag"][5].split(" [")[0]) == pytest.approx(2.0, abs=0.15)
+    assert rows["no motor lag"][6] == "2.42"
+    assert rows["rigid cable"][10] == "overshoots"
+    assert rows["rigid cable"][11] == "undershoots"
+    said = texts(section, "finding")
+    assert re.search(r"no aerodynamics\*\*.*no effect shows; the paper: 3\.26 times, outside our interval", said)
+    assert re.search(r"no motor lag\*\*.*the component matters; the paper: 2\.42 times, outside", said)
+
+
+def test_front_tells_honestly_who_beats_whom(full):
+    rng = np.random.default_rng(3)
+    policy = made_up.policy(rng, "state", "state", "hybrid", 2.0, 0.02, duration=1.05)
+
+    def told(**setting) -> str:
+        found = made_up.baseline(rng, "hybrid", "both", 2.0, speed=2.2, **setting)
+        return texts(trade.front_section(only(policy, found)), "finding")
+
+    assert "no setting is both as accurate and as fast; the policy is faster than every setting" in told(error=0.03, duration=1.5)
+    assert "1 of 1 settings are both as accurate and as fast" in told(error=0.004, duration=1.0)
+    assert "none of 1 settings landed all its throws" in told(error=0.004, duration=1.0, lost=1)
+
+
+def test_hypervolume_of_one_setting_is_its_rectangle():
+    rng = np.random.default_rng(4)
+    found = made_up.baseline(rng, "hybrid", "both", 2.0, 0.05, 1.5, speed=2.2)
+    volume = trade.hypervolume([found])
+    expected = (2.5 - found.of("duration").mean()) * (0.5 - found.of("error").mean())
+    assert volume.value == pytest.approx(expected)
+    assert expected in volume
+
+
+def test_curves_hold_the_policys_own_value(full):
+    points = gap.curve(full, gap.SWEEPS[2], "vision")
+    assert [value for value, _ in points][:2] == [0.0, pytest.approx(0.4)]
+    assert points[0][1] is full.shipped("vision", "hybrid", 2.0)
+
+
+def test_bars_are_judged_by_the_mean(full):
+    said = "\n".join(part.text for part in beyond.section(full).parts if isinstance(part, Text) and part.kind == "finding")
+    assert re.search(r"state_moving-1 at targets.*under 0\.12 m, reached", said)
+    high = only(made_up.policy(np.random.default_rng(5), "state_payload-1", "state", "hybrid", 2.0, 0.2, variant="payload"))
+    assert "missed by" in texts(beyond.section(high), "finding")
+
+
+def test_the_page_stands_alone(written):
+    folder, sections = written
+    html = (folder / "report.html").read_text(encoding="utf-8")
+    pictures = [part for section in sections for part in section.parts if isinstance(part, Picture)]
+    assert len(pictures) >= 8
+    assert html.count("data:image/png;base64,") == len(pictures)
+    assert not re.search(r'(?:src|href)="(?!data:|#)', html)
+    assert "<script" not in html
+    assert 'class="why">Because <b>this</b> was so.' in html
+    assert "&lt;b&gt;" not in html
+    text = (folder / "report.md").read_text(encoding="utf-8")
+    for picture in pictures:
+        assert (folder / f"{picture.name}.png").read_bytes() == picture.png
+        assert f"({picture.name}.png)" in text
+
+
+def test_the_command_reports_from_records(tmp_path, full, capsys):
+    results.pack(full.results[:18], tmp_path / "records" / "throws" / "shipped.json")
+    out = tmp_path / "out"
+    assert cli.main(["report", "--records", str(tmp_path / "records"), "--out", str(out)]) == 0
+    printed = capsys.readouterr().out
+    assert "realistic reference plant" in printed
+    assert "0 trainings" in printed
+    assert (out / "report.html").stat().st_size > 50_000
+    assert cli.main(["report", "--quick", "--measure", "--out", str(out)]) == 2
+    assert cli.main(["report", "--results", str(tmp_path / "none"), "--out", str(out)]) == 2
+    assert "no such folder" in capsys.readouterr().err
+
+
+def test_what_the_report_stands_on_is_stated_once():
+    keys = [results.key_of(unit) for unit in wanted.full()]
+    assert len(set(keys)) == len(keys)
+    assert {unit["target"] for unit in wanted.full()} == {1.5, 2.0, 2.5}
+    assert len(wanted.quick()) == 5
