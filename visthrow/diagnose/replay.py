@@ -14,6 +14,8 @@ from visthrow.diagnose.states import States, rows_of
 
 KNOT_SPACING = 0.1  # of the latent forces [s]
 EARLY = 0.004  # after a window's start, before which no stamp is used: delays may move there [s]
+FINENESS = {"throw": 0.5}
+"""Step in a phase against the one asked for: the rope whips in throws."""
 BATCH = 4096  # lanes of one run, which bounds its memory
 
 
@@ -48,6 +50,7 @@ class Flights:
         """
         self.flights, self.cuts, self.stride = list(flights), list(cuts), stride
         self.knots = np.array([int(np.ceil((c.end - c.start) / KNOT_SPACING - 1e-6)) + 1 for c in cuts])
+        self._fineness = np.array([FINENESS.get(c.phase, 1.0) for c in cuts])
         lengths = np.cumsum([0] + [len(f.command_time) for f in self.flights])
         self.windows = {name: np.zeros(len(self.cuts)) for name in WINDOW_FIELDS}
         empty = np.zeros((0, 3))
@@ -106,7 +109,8 @@ class Flights:
             "window": np.array([x.window for x in lanes]), "plant": np.array([x.plant for x in lanes]),
             "state": np.array([x.state for x in lanes]), "axis": np.array([x.axis for x in lanes]),
             "knot": np.array([x.knot for x in lanes]), "size": np.array([x.size for x in lanes]),
-            "keep": np.array([x.keep for x in lanes]), "substep": step[[x.plant for x in lanes]],
+            "keep": np.array([x.keep for x in lanes]),
+            "substep": step[[x.plant for x in lanes]] * self._fineness[[x.window for x in lanes]],
         }  # fmt: skip
         knots = max([1, *[x.keep + int(self.knots[x.window]) for x in lanes if x.keep >= 0]])
         return replay.run(states, self.windows, given, self.data, KNOT_SPACING, knots)

@@ -25,7 +25,7 @@ class Direction:
     axis: int
     sd: float  # vague prior, in the field's unit (attitude: angle [rad])
     step: float  # for the derivative
-    part: str = ""  # of the rope: "all" segments or the "last"
+    part: str = ""  # of the rope: "all" segments, the "last", or a "bend" of the first against the second half
 
 
 def directions(plant: PlantParams) -> tuple[Direction, ...]:
@@ -42,9 +42,10 @@ def directions(plant: PlantParams) -> tuple[Direction, ...]:
         found += [Direction("motor_speed", i, 0.15 * hover, 1e-4 * hover) for i in range(4)]
     found += [Direction("cable_dir_w", i, 0.1, 1e-4, "all") for i in range(2)]
     found += [Direction("cable_vel_w", i, 1.5, 1e-3, "all") for i in range(2)]
-    if plant.rope.segments > 1:
-        found += [Direction("cable_dir_w", i, 0.1, 1e-4, "last") for i in range(2)]
-        found += [Direction("cable_vel_w", i, 1.5, 1e-3, "last") for i in range(2)]
+    parts = ("last", "bend") if plant.rope.segments > 2 else ("last",) if plant.rope.segments == 2 else ()
+    for part in parts:
+        found += [Direction("cable_dir_w", i, 0.1, 1e-4, part) for i in range(2)]
+        found += [Direction("cable_vel_w", i, 1.5, 1e-3, part) for i in range(2)]
     found += [Direction("payload_pos_w", i, 0.1, 1e-4) for i in range(3)]
     return (*found, *[Direction("payload_vel_w", i, 1.0, 1e-3) for i in range(3)])
 
@@ -75,11 +76,10 @@ def moved(states: States, direction: Direction, size: np.ndarray | float) -> Sta
         value = (Rotation.from_quat(value) * Rotation.from_rotvec(turn)).as_quat()
     elif direction.field.startswith("cable"):
         n = states["cable_dir_w"]
-        rows = slice(None) if direction.part == "all" else slice(-1, None)
         # one plane for the whole rope: that of its mean direction
         frame = _tangents(n[:, -1])[:, direction.axis][:, None]
         across = frame - np.sum(frame * n, axis=-1, keepdims=True) * n
-        value[:, rows] += (size[:, None, None] * across)[:, rows]
+        value += size[:, None, None] * _shape(direction.part, n.shape[1])[:, None] * across
         if direction.field == "cable_dir_w":
             value /= np.linalg.norm(value, axis=-1, keepdims=True)
             u = states["cable_vel_w"]
@@ -88,6 +88,13 @@ def moved(states: States, direction: Direction, size: np.ndarray | float) -> Sta
         value[:, direction.axis] += size
     out[direction.field] = value
     return out
+
+
+def _shape(part: str, segments: int) -> np.ndarray:
+    """How far each segment turns, shape (L,)."""
+    if part == "bend":
+        return np.cos(np.pi * (np.arange(segments) + 0.5) / segments)
+    return np.ones(segments) if part == "all" else (np.arange(segments) == segments - 1).astype(float)
 
 
 def rows_of(states: States, rows: np.ndarray) -> States:
@@ -146,20 +153,29 @@ def measured_state(flight: Recorded, at: float, setting: Setting, payload: int, 
             speed = frame.inv().apply(seen[1]) / (1.0 + x.scale)
             out["payload_pos_w"][0], out["payload_vel_w"][0] = point, speed
             if payload == ATTACHED:
-                _straighten(out, plant, attitude, point, speed)
+                _hang(out, plant, attitude, point, speed)
     return out
 
 
-def _straighten(state: States, plant: PlantParams, attitude: Rotation, point: np.ndarray, speed: np.ndarray) -> None:
-    """Lay the rope straight from the mount to the payload, turning as their velocities say."""
+def _hang(state: States, plant: PlantParams, attitude: Rotation, point: np.ndarray, speed: np.ndarray) -> None:
+    """Turn the rope, in the shape that it has, so that it reaches from the mount to the payload and follows both."""
     arm = np.array(plant.rope.mount) - np.array(plant.vehicle.body.com)
     mount = state["pos_w"][0] + attitude.apply(arm)
     mount_vel = state["vel_w"][0] + attitude.apply(np.cross(state["rate_b"][0], arm))
     reach = point - mount
-    length = max(float(np.linalg.norm(reach)), 1e-3)
-    n = reach / length
-    u = (speed - mount_vel) / length
-    state["cable_dir_w"][0], state["cable_vel_w"][0] = n, u - (u @ n) * n
+    distance = max(float(np.linalg.norm(reach)), 1e-3)
+    n, u = state["cable_dir_w"][0], state["cable_vel_w"][0]
+    link = np.full((len(n), 1), plant.rope.length / len(n))
+    link[-1] += plant.rope.payload_offset
+    chord = np.sum(link * n, axis=0)
+    chord /= np.linalg.norm(chord)
+    axis = np.cross(chord, reach / distance)
+    sine, cosine = float(np.linalg.norm(axis)), float(chord @ reach / distance)
+    turn = Rotation.from_rotvec(axis * (np.arctan2(sine, cosine) / sine if sine > 1e-12 else 0.0))
+    n, u = turn.apply(n), turn.apply(u)
+    lacking = speed - mount_vel - np.sum(link * u, axis=0)
+    spin = np.cross(reach, lacking) / distance**2
+    state["cable_dir_w"][0], state["cable_vel_w"][0] = n, u + np.cross(spin, n)
 
 
 def hover_state(flight: Recorded, plant: PlantParams, payload: int) -> States:

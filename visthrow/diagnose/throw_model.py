@@ -1,7 +1,7 @@
 """The whole throw as a model to diagnose: vehicle, rope, payload and release replayed from recorded commands."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -22,8 +22,8 @@ from visthrow.flightlog import FlightLog
 
 LATENT_SIZES = (0.05, 0.05, 0.05, 1e-3, 1e-3, 1e-3, 0.01, 0.01, 0.01)
 """Of the latent forces' derivatives: force [N], torque [N m], force on the payload [N]."""
-DAMPING = (1e-3, 1.0, 1e3)
-"""Of the Levenberg-Marquardt steps, from trusting the linearisation to hardly moving."""
+DAMPING, DAMPING_MOST = 1e-3, 1e5
+"""Of the Levenberg-Marquardt steps: at first, and where a window counts as settled."""
 HUBER = 30.0  # deviations, beyond which a sample counts less
 SETTLED = 0.02  # relative fall of the cost below which an initial state is settled
 
@@ -87,12 +87,12 @@ class ThrowModel:
             self.entries = {name: self.entries[name] for name in only}
         self.effects = tuple(e.effect for e in self.entries.values())
         self._directions = directions(self.setting.plant)
-        self._states = self._settle(self.setting, self._begin(), rounds=4)
+        self._states = self._settle(self.setting, self._begin(), rounds=14)
 
     def windows(self, theta: Mapping[str, float]) -> list[Window]:
         """See :class:`visthrow.diagnose.model.Model`."""
         setting = apply(self.entries, self.setting, theta)
-        states = self._states if setting == self.setting else self._settle(setting, self._states, rounds=1)
+        states = self._states if setting == self.setting else self._settle(setting, self._states, rounds=2)
         steps = [self._step(e, theta.get(name, 0.0)) for name, e in self.entries.items()]
         settings = [setting, *[e.apply(setting, step) for e, step in zip(self.entries.values(), steps)]]
         replay = self._replay(settings)
@@ -251,63 +251,61 @@ class ThrowModel:
         return self._rows(w, *[s[name][w].sigma for name in ("vehicle", "attitude", "payload", "gyro")])
 
     def _settle(self, setting: Setting, states: States, rounds: int) -> States:
-        """Fit each window's initial state to its samples; a step that does not help is damped, or not taken."""
+        """Fit each window's initial state to its samples by Levenberg and Marquardt; no step that does not help is taken."""
         replay, count = self._replay([setting]), len(self.flights.cuts)
-        moves = np.zeros((count, len(self._directions)))
-        lanes = [Lane(w, 0, w) for w in range(count)]
-        cost = self._costs(replay, setting, states, lanes)
-        open_windows = np.ones(count, dtype=bool)
+        moves, damping = np.zeros((count, len(self._directions))), np.full(count, DAMPING)
+        cost = self._costs(replay, setting, states, np.arange(count))
+        left, stale = np.arange(count), np.ones(count, dtype=bool)
+        slopes: dict[int, np.ndarray] = {}
+        residuals: dict[int, np.ndarray] = {}
         for _ in range(rounds):
-            slopes, residuals = self._state_slopes(replay, setting, states, np.flatnonzero(open_windows))
-            waiting = open_windows.copy()
-            for damping in DAMPING:
-                trial = np.zeros_like(moves)
-                for w in np.flatnonzero(waiting):
-                    trial[w] = self._increment(w, slopes[w], residuals[w], moves[w], damping)
-                there = states
-                for d, direction in enumerate(self._directions):
-                    there = moved(there, direction, trial[:, d])
-                tried = self._costs(replay, setting, there, lanes)
-                better = waiting & (tried < cost)
-                states = {name: np.where(_like(better, v), there[name], v) for name, v in states.items()}
-                moves[better] += trial[better]
-                open_windows &= ~better | (tried < (1.0 - SETTLED) * cost)
-                cost = np.where(better, tried, cost)
-                waiting &= ~better
-                if not waiting.any():
-                    break
-            open_windows &= ~waiting
-            if not open_windows.any():
+            for w, slope, residual in self._state_slopes(replay, setting, states, left[stale[left]]):
+                slopes[w], residuals[w] = slope, residual
+            trial = np.zeros_like(moves)
+            for w in left:
+                trial[w] = self._increment(w, slopes[w], residuals[w], moves[w], damping[w])
+            there = states
+            for d, direction in enumerate(self._directions):
+                there = moved(there, direction, trial[:, d])
+            tried = np.full(count, np.inf)
+            tried[left] = self._costs(replay, setting, there, left)
+            better = tried < cost
+            states = {name: np.where(_like(better, v), there[name], v) for name, v in states.items()}
+            moves[better] += trial[better]
+            settled = better & (tried > (1.0 - SETTLED) * cost)
+            cost, stale = np.where(better, tried, cost), better
+            damping = np.where(better, damping / 10.0, damping * 10.0)
+            left = left[~settled[left] & (damping[left] < DAMPING_MOST)]
+            if not len(left):
                 break
         return states
 
-    def _costs(self, replay: Replay, setting: Setting, states: States, lanes: list[Lane]) -> np.ndarray:
-        """Huber's cost of each window."""
-        seen = self.flights.fly(replay, [setting], states, lanes, self.substep).seen
-        costs = np.zeros(len(lanes))
-        for w in range(len(lanes)):
-            off = np.abs(self._residual(seen, w, w) / self._sigma(w))
+    def _costs(self, replay: Replay, setting: Setting, states: States, which: np.ndarray) -> np.ndarray:
+        """Huber's cost of windows."""
+        seen = self.flights.fly(replay, [setting], states, [Lane(w, 0, w) for w in which], self.substep).seen
+        costs = np.zeros(len(which))
+        for lane, w in enumerate(which):
+            off = np.abs(self._residual(seen, w, lane) / self._sigma(w))
             cost = np.sum(np.where(off < HUBER, 0.5 * off**2, HUBER * (off - 0.5 * HUBER)))
-            costs[w] = cost if np.isfinite(cost) else np.inf
+            costs[lane] = cost if np.isfinite(cost) else np.inf
         return costs
 
-    def _state_slopes(self, replay: Replay, setting: Setting, states: States, which: np.ndarray) -> tuple[dict, dict]:
+    def _state_slopes(
+        self, replay: Replay, setting: Setting, states: States, which: np.ndarray
+    ) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
         """Derivatives of windows' samples by their initial states, and residuals, both in the noise."""
-        count, all_states = len(self.flights.cuts), self._moved(states)
-        lanes, first = [], {}
+        if not len(which):
+            return
+        count, lanes, first = len(self.flights.cuts), [], []
         for w in which:
-            first[w] = len(lanes)
+            first.append(len(lanes))
             lanes += [Lane(w, 0, w), *[Lane(w, 0, (1 + d) * count + w) for d in self._nuisances(w)]]
-        seen = self.flights.fly(replay, [setting], all_states, lanes, self.substep).seen
-        slopes, residuals = {}, {}
-        for w in which:
+        seen = self.flights.fly(replay, [setting], self._moved(states), lanes, self.substep).seen
+        for at, w in zip(first, which):
             ds, rows, sigma = self._nuisances(w), int(self.flights.rows[w]), self._sigma(w)
-            mine = seen[:rows, first[w] : first[w] + 1 + len(ds)]
-            flat = np.swapaxes(mine, 1, 2).reshape(3 * rows, -1)
+            flat = np.swapaxes(seen[:rows, at : at + 1 + len(ds)], 1, 2).reshape(3 * rows, -1)
             steps = np.array([self._directions[d].step for d in ds])
-            slopes[w] = (flat[:, 1:] - flat[:, :1]) / steps / sigma[:, None]
-            residuals[w] = self._residual(seen, w, first[w]) / sigma
-        return slopes, residuals
+            yield w, (flat[:, 1:] - flat[:, :1]) / steps / sigma[:, None], self._residual(seen, w, at) / sigma
 
     def _increment(self, w: int, slopes: np.ndarray, residual: np.ndarray, done: np.ndarray, damping: float) -> np.ndarray:
         """Levenberg-Marquardt step of a window's state, with its vague prior; shape (directions,)."""
