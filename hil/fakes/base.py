@@ -257,7 +257,8 @@ class Fake:
         return {
             **self.plant.landing, "followed": self.followed, "ignored": self.ignored, "releases": w.releases,
             "release_time": self.release_time, "armed": self.armed, "commands": w.commands, "worst": w.worst,
-            "breaches": w.breaches, "events": self.events, "last_command": self._told, "end_w": self.plant.state["pos_w"].tolist(), "time": self.plant.time,
+            "breaches": w.breaches, "events": self.events, "last_command": self._told,
+            "end_w": self.plant.state["pos_w"].tolist(), "time": self.plant.time,
         }  # fmt: skip
 
     def close(self) -> None:

@@ -267,7 +267,7 @@ def test_a_release_before_its_hour_is_not_sent_when_it_was_stopped():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("mechanism", [0.11, 0.06, 0.002])
+@pytest.mark.parametrize("mechanism", [0.11, 0.06, pytest.param(0.002, marks=pytest.mark.slow)])
 def test_latch_to_separation_is_the_trained_lag(kind, mechanism):
     """Measured by the fake, which knows the true separation; a faster mechanism waits for the difference."""
     plant = LevelPlant(lag=mechanism)
@@ -331,6 +331,7 @@ def test_the_hover_share_is_measured_before_a_flight(kind, factor, good):
     assert check.meter.share == pytest.approx(hover, rel=0.01)
 
 
+@pytest.mark.slow
 def test_a_hover_that_does_not_take_the_weight_arms_no_throw():
     """The vehicle needs a tenth more than its weight by the config: the hover controller finds out, and no throw begins."""
     from visthrow.wire_plant import make

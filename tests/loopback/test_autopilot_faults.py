@@ -1,0 +1,309 @@
+"""What goes wrong on the autopilot's side, over the wire: what the runner did, and how soon; what the vehicle did without it.
+
+In every one the fake watches that no command arrives that is not finite or within limits, and that the release comes once at
+most, from an armed vehicle inside its fence.
+"""
+
+import dataclasses
+import errno
+import math
+
+import numpy as np
+import pytest
+
+from hil.fakes.level import LevelPlant
+from hil.fakes.px4 import POSCTL
+from hil.flight import fly
+from hil.record import Recorder
+from hil.runner import Words
+from tests.hil_flight import simple_policy
+from tests.loopback.wire import peers
+from visthrow.actions import hover_action
+
+KINDS = ("ardupilot", "px4", "betaflight")
+QUICK = ("states.check_hold=0.2", "states.armed_least=0.1", "states.quiet=0.1", "states.abort=0.5", "states.land=0.5")
+HOVER = hover_action(9.81 * 0.272, 14.0)[0]
+NEVER = simple_policy((HOVER, 0.0, 0.0, 0.0, -1.0))
+AT_ONCE = simple_policy((HOVER, 0.0, 0.0, 0.0, 1.0))
+START = 2.2
+"""When the fault begins [s]: in a throw that the policy never releases."""
+
+TICK = 0.02
+BEAT = {"ardupilot": 1.0, "px4": 1.0, "betaflight": 0.1}
+"""Between two signs of life of the autopilot [s]."""
+
+
+class OneWord:
+    """Arms whenever it is ready, and says abort from a time on [s]."""
+
+    def __init__(self, abort: float = math.inf):
+        self.abort, self.clock = abort, None
+
+    def words(self, state: str) -> Words:
+        return Words(arm=state == "ready", abort=self.clock.now() >= self.abort)
+
+
+def run(kind, seconds, loaded=NEVER, watch=None, operator=None, overrides=(), plant=None, recorder=None, **options):
+    """A run in lock step; ``watch(now, runner, fake)`` is called before every tick. Fake, summary, changes of state."""
+    made = peers(plant or LevelPlant(), kind=kind, loaded=loaded, overrides=(*QUICK, *overrides), **options)
+    runner, source, clock, fake = made
+    operator = operator or OneWord()
+    operator.clock, told, tick = clock, [], runner.tick
+
+    def ticked(now, *args, **kwargs):
+        if watch is not None:
+            watch(now, runner, fake)
+        return tick(now, *args, **kwargs)
+
+    runner.tick = ticked
+    summary = fly(runner, source, clock, operator, recorder, seconds, told.append)
+    assert fake.witness.breaches == []
+    return fake, summary, [(d.state, d.reason, d.time) for d in told]
+
+
+def when(told, state: str) -> float:
+    return next(time for name, _, time in told if name == state)
+
+
+def reason(told, state: str) -> str:
+    return next(text for name, text, _ in told if name == state)
+
+
+GONE = "the autopilot is silent, disarmed or in another mode"
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_silent(kind):
+    """Abort after the heartbeat's time-out, counted from the last sign of life."""
+    limit = 0.5 if kind == "betaflight" else 1.5
+    override = () if kind == "betaflight" else (f"{kind}.heartbeat_timeout=1.5",)
+    _, _, told = run(kind, START + 2.2, silent_after=START, overrides=override)
+    assert reason(told, "abort") == GONE
+    assert START + limit - BEAT[kind] - TICK <= when(told, "abort") <= START + limit + 2 * TICK
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_pilot_takes_over(kind):
+    """Abort at the next sign of life; from then on not one command is sent, no mode is asked for."""
+
+    def take(now, runner, fake):
+        if now >= START and not state:
+            state.append(runner.backend)
+            if kind == "betaflight":
+                fake.override, fake.options = False, dataclasses.replace(fake.options, all_channels=True)
+            else:
+                fake.mode, fake._next_beat = (0 if kind == "ardupilot" else POSCTL), 0.0
+        if state and now >= START + 0.3:
+            state.append(fake.witness.commands)
+            modes.append(getattr(fake, "mode", None))
+
+    state, modes = [], []
+    _, _, told = run(kind, START + 1.0, watch=take)
+    assert reason(told, "abort") == GONE
+    assert when(told, "abort") <= START + BEAT["betaflight"] + 3 * TICK
+    assert len(set(state[1:])) == 1, "silent: the pilot has it"
+    assert len(set(modes)) == 1
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_disarmed_and_not_ours_to_arm(kind):
+    fake, _, told = run(kind, 4.0, armed=False, overrides=("states.idle=1.5",))
+    assert reason(told, "abort") == "no autopilot ready within 1.5 s"
+    assert fake.witness.commands == 0
+
+
+@pytest.mark.parametrize(("kind", "override"), [("ardupilot", "ardupilot.arm=true"), ("px4", "px4.arm=true")])
+def test_refuses_arming(kind, override):
+    """Asked to arm it is in READY; the refusal ends the run, with what the autopilot said."""
+    notes = []
+
+    def listen(now, runner, fake):
+        notes.append(runner.backend.status(now).note)
+
+    fake, _, told = run(kind, 5.0, armed=False, arming=False, overrides=(override,), watch=listen)
+    assert reason(told, "abort") == GONE
+    assert when(told, "abort") - when(told, "ready") < 1.6
+    assert any("arming refused with result 4: Arm: battery below minimum" in note for note in notes)
+    assert not fake.armed
+    assert fake.witness.releases == 0
+
+
+@pytest.mark.parametrize("kind", ["ardupilot", "px4"])
+def test_arms_where_it_was_told_to(kind):
+    fake, _, told = run(kind, 4.0, armed=False, overrides=(f"{kind}.arm=true",))
+    assert "throw" in [state for state, _, _ in told]
+    assert "armed" in [text for _, text in fake.events]
+
+
+def test_betaflight_refuses_arming():
+    fake, _, told = run("betaflight", 4.0, armed=False, arming=False, all_channels=True,
+                        overrides=("betaflight.arm_channel=1", "states.idle=1.5"))  # fmt: skip
+    assert reason(told, "abort") == "no autopilot ready within 1.5 s"
+    assert not fake.armed
+
+
+RELEASES = {
+    ("ardupilot", "stuck"): 0.5, ("px4", "stuck"): 1.5, ("betaflight", "stuck"): 0.5,
+    ("ardupilot", "in-progress"): 0.5, ("px4", "in-progress"): 1.5,
+    ("ardupilot", "silent"): 0.5, ("px4", "silent"): 1.5, ("betaflight", "silent"): 0.5,
+    ("ardupilot", "denied"): 0.0, ("px4", "denied"): 0.0,
+}  # fmt: skip
+"""By kind and answer: the time after the latch at which the release has failed [s]; "denied" at once."""
+
+
+@pytest.mark.parametrize(("kind", "answer"), RELEASES)
+def test_a_release_that_does_not_happen(kind, answer):
+    """ACK without movement, IN_PROGRESS for ever, silence, refusal: the run is aborted, and it is never sent again."""
+    limit = RELEASES[kind, answer]
+    last = []
+
+    def watch(now, runner, fake):
+        if fake.witness.releases > len(last):
+            last.extend([now] * (fake.witness.releases - len(last)))
+
+    fake, summary, told = run(
+        kind, 6.0, AT_ONCE, watch, answer=answer,
+        overrides=("px4.release_timeout=1.5", "states.quiet=2.0", "states.armed=5.0"),
+    )  # fmt: skip
+    (latch,) = summary["latch_times"]
+    assert reason(told, "abort") == "the release was refused or not answered"
+    assert latch + limit <= when(told, "abort") <= latch + limit + 3 * TICK
+    assert (summary["latches"], summary["landings"], fake.release_time) == (1, [], None)
+    if answer != "silent":
+        assert fake.witness.releases == 1
+    assert last[-1] <= latch + 0.11 + 2 * TICK, "none is sent after the time of separation"
+
+
+@pytest.mark.parametrize(
+    ("kind", "value"),
+    [(kind, math.nan) for kind in KINDS] + [pytest.param(kind, math.inf, marks=pytest.mark.slow) for kind in KINDS],
+)
+def test_a_policy_that_puts_out_no_numbers(kind, value):
+    def spoil(now, runner, fake):
+        if now >= START and not spoiled:
+            act = runner.pilot.act
+            runner.pilot.act = lambda *args: dataclasses.replace(
+                act(*args), command=np.full((1, 4), value, np.float32), release=np.array([True])
+            )
+            spoiled.append(now)
+
+    spoiled = []
+    fake, summary, told = run(kind, START + 0.5, watch=spoil)
+    assert "is not finite" in reason(told, "abort")
+    assert when(told, "abort") <= START + 2 * TICK
+    assert (fake.witness.releases, summary["guard"]["refused"]) == (0, 1)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_policy_at_its_limits_stays_within_them(kind):
+    """All of thrust and rates: as much arrives and no more; on a vehicle that obeyed, the fence would end it."""
+    fake, _, _ = run(kind, START + 0.5, loaded=simple_policy((1.0, 1.0, -1.0, 1.0, -1.0)))
+    np.testing.assert_allclose(fake.witness.worst, (14.0, 10.0, 10.0, 4.0), rtol=3e-3)
+
+
+@pytest.mark.slow
+def test_the_fence_ends_a_policy_at_its_limits():
+    from visthrow.wire_plant import make
+
+    fake, _, told = run("ardupilot", 4.0, loaded=simple_policy((1.0, 1.0, -1.0, 1.0, -1.0)), plant=make("state", 0),
+                        overrides=("states.quiet=0.02",))  # fmt: skip
+    assert reason(told, "abort").startswith("fence: ")
+    assert when(told, "abort") - when(told, "throw") < 0.6
+    assert fake.witness.releases == 0
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(("length", "event"), [(0.15, None), (0.8, {"ardupilot": "levelled: no set-points",
+                         "px4": "left OFFBOARD: no set-points", "betaflight": "failsafe: motors idle"})])  # fmt: skip
+def test_a_tick_overrun(kind, length, event):
+    """A short one is flown through with ticks counted as missed; a long one finds the autopilot's own failsafe at work."""
+
+    def dawdle(now, runner, fake):
+        if now >= START and not late:
+            late.append(now)
+            while fake.plant.time < now + length:
+                fake.step()
+
+    late = []
+    fake, summary, told = run(kind, START + 1.2, watch=dawdle)
+    assert summary["missed"] == pytest.approx(length / TICK, abs=2)
+    events = [text for _, text in fake.events]
+    if event is None:
+        assert told[-1][0] == "throw"
+        assert not any(word in text for text in events for word in ("levelled", "left", "failsafe"))
+    else:
+        assert event[kind] in events
+        if kind == "px4":
+            assert reason(told, "abort") == GONE, "out of OFFBOARD by a failsafe: it is not taken back in mid throw"
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_ctrl_c_in_mid_throw(kind):
+    """The operator's abort: the autopilot's landing is asked for within a tick; Betaflight is brought down by the runner."""
+    fake, summary, told = run(kind, START + 0.6, operator=OneWord(abort=START))
+    assert reason(told, "abort") == "the operator said abort"
+    assert when(told, "abort") <= START + 2 * TICK
+    assert summary["aborted"]
+    if kind == "betaflight":
+        assert fake.override
+    else:
+        assert fake.events[-1][1] == ("mode 9" if kind == "ardupilot" else "mode 4.6")
+        assert fake.events[-1][0] <= START + 3 * TICK
+
+
+KILLED = {
+    "ardupilot": [(0.5, "levelled: no set-points")],
+    "px4": [(0.5, "left OFFBOARD: no set-points"), (0.5, "mode 4.3")],
+    "betaflight": [(0.36, "failsafe: motors idle"), (1.6, "failsafe: disarmed")],
+}
+"""What the vehicle does by itself, and how long after the last set-point [s]."""
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_runner_is_killed_in_mid_throw(kind):
+    """It falls silent between two ticks and never comes back; the fake flies on and shows what its failsafes do."""
+    fake, _, told = run(kind, START)
+    assert told[-1][0] == "throw"
+    fake.step()  # hears the last one
+    last, before = fake._told, len(fake.events)
+    for _ in range(round(2.5 / fake.plant.period)):
+        fake.step()
+    after = [(time - last, text) for time, text in fake.events[before:]]
+    assert [text for _, text in after] == [text for _, text in KILLED[kind]]
+    for (found, _), (wanted, _) in zip(after, KILLED[kind]):
+        assert found == pytest.approx(wanted, abs=0.02)
+    command = fake.plant.commands[-1]
+    assert command[0] == pytest.approx(0.0 if kind == "betaflight" else 2.668, rel=0.02)
+    assert fake.witness.breaches == []
+    assert fake.witness.releases == 0
+
+
+@pytest.mark.parametrize("full_at", [0.0, START])
+def test_the_disk_is_full(tmp_path, full_at):
+    """Before the throw: none is armed. In mid throw: it is flown to its end, and said in the summary."""
+    params = peers(LevelPlant(), loaded=NEVER, overrides=QUICK)[0].params
+    recorder = Recorder(tmp_path / "run", params)
+
+    class Full:
+        def write(self, text):
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+        def flush(self):
+            pass
+
+        def close(self):
+            pass
+
+    def fill(now, runner, fake):
+        if now >= full_at and not isinstance(recorder._files["ticks.jsonl"], Full):
+            recorder._files = dict.fromkeys(recorder._files, Full())
+
+    fake, summary, told = run("ardupilot", START + 0.5, watch=fill, recorder=recorder)
+    states = [state for state, _, _ in told]
+    if full_at == 0.0:
+        assert "throw" not in states
+    else:
+        assert states[-1] == "throw"
+    recorder.close(summary)
+    assert "No space left on device" in recorder.failed
+    assert fake.witness.releases == 0
