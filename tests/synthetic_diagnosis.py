@@ -12,7 +12,7 @@ from visthrow.diagnose.model import Effect, Window
 
 MASS = (0.21, 0.058)  # [kg]
 SIGMA = (5e-4, 8e-4)  # [m]
-RATE, LENGTH, KNOTS = 100, 1.0, 11
+LENGTH, KNOTS = 1.0, 11
 CHANNELS = ("pos_w", "payload_pos_w")
 GUST = (0.015, 6e-4)  # deviation of the gusts on either mass [N]
 GUST_TIME = 0.6  # [s]
@@ -51,7 +51,7 @@ class SyntheticModel:
     truth: dict[str, float] = field(default_factory=dict)
     seed: int = 0
     throws: int = 6
-    free: int = 2
+    free: int = 1
     noise: float = 1.0
     gust: float = 1.0
     curvature: float = 0.0  # of the response, a 30 floors' size bends it by this share
@@ -59,6 +59,8 @@ class SyntheticModel:
     law: str = ""  # a hidden force outside the catalogue: "speed" or "swirl" or "thrust"
     law_size: float = 0.0
     channels: tuple[str, ...] = CHANNELS
+    rate: int = 50  # of the measurements [Hz]
+    bump: int = -1  # flight in which something pushes once
     fresh: int = 0  # seed of noise and gusts alone
     calls: int = 0
 
@@ -66,7 +68,7 @@ class SyntheticModel:
         self._rng = np.random.default_rng(self.seed)
         self._draw = np.random.default_rng([self.seed, self.fresh])
         self._at = {e.name: j for j, e in enumerate(self.effects)}
-        self._time = np.arange(0.0, LENGTH, 1.0 / RATE)
+        self._time = np.arange(0.0, LENGTH, 1.0 / self.rate)
         self._knots = np.linspace(0.0, LENGTH, KNOTS)
         self._placed = _response(self._time, self._knots)
         self._windows = [w for flight in range(self.free + self.throws) for w in self._flight(flight)]

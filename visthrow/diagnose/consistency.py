@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import chi2
 
 from visthrow.diagnose.evidence import Priors, additions
 from visthrow.diagnose.model import Window
@@ -18,8 +19,16 @@ CONTRADICTION = 16.0
 SHARE = 0.3
 """Part of an effect by which flights may differ: the effect's form is never exact."""
 
-MANY = 0.3
-"""Share of the information in flights of the wrong sign from which an effect is no property of the vehicle."""
+CHANCE = 0.1
+"""Probability that random signs of the flights would say as much, from which an effect is no property of the vehicle."""
+
+EFFECTIVE = 5.0
+"""Number of equally informative flights from which signs can be tested; the least probability is then 1/16."""
+
+MOST_SIGNS = 4096
+
+HETEROGENEOUS = 1e-4
+"""Probability of the flights' estimates lying so far apart (Cochran's Q) from which an effect is no property of the vehicle."""
 
 
 @dataclass(frozen=True)
@@ -50,15 +59,25 @@ def across_flights(
     size = after.theta[added]
     if len(own) < LEAST_FLIGHTS or own.sum() <= 0.0:
         return None
-    estimates = size + np.divide(statistics.score[:, added], own, out=np.zeros_like(own), where=own > 0.0)
-    certain = own * size**2 > CONTRADICTION  # flights that would show it
-    against = certain & (np.sign(estimates) != np.sign(size)) & (own * estimates**2 > CONTRADICTION)
-    if own[against].sum() > MANY * own.sum():
+    if _by_chance(own, statistics.score[:, added] + own * size):
         return Consistency(None)
+    estimates = size + np.divide(statistics.score[:, added], own, out=np.zeros_like(own), where=own > 0.0)
+    variance = 1.0 / np.maximum(own, 1e-12) + (SHARE * size) ** 2 + 1.0
+    single = _single(before, after, priors, active, added, least, estimates)
+    if single is not None:
+        return Consistency(single)
+    spread = float((((estimates - size) ** 2) / variance).sum())
+    return Consistency(None) if spread > chi2.isf(HETEROGENEOUS, len(own) - 1) else None
+
+
+def _single(before: Point, after: Point, priors: Priors, active: Sequence[int], added: int, least: float,
+            estimates: np.ndarray) -> int | None:  # fmt: skip
+    """The flight that alone asks for an effect which the others, who would show it, deny."""
+    own, size = after.statistics.information[:, added, added], after.theta[added]
     f = int(np.argmax(own * np.abs(estimates) * np.sign(estimates) * np.sign(size)))
     others = np.arange(len(own)) != f
     weight = own[others].sum()
-    if weight <= 0.0 or certain[others].sum() < LEAST_FLIGHTS - 1:
+    if weight <= 0.0 or (own[others] * estimates[f] ** 2 > CONTRADICTION).sum() < LEAST_FLIGHTS - 1:
         return None
     rest = (own[others] @ estimates[others]) / weight
     distance = (estimates[f] - rest) ** 2 / (1.0 / own[f] + 1.0 / weight + (SHARE * estimates[f]) ** 2 + 1.0)
@@ -66,9 +85,20 @@ def across_flights(
     information, score = base.information[others].sum(0), base.absolute[others].sum(0)
     alone = additions(information, score, priors, active)[added]
     expected = additions(information, information[:, added] * estimates[f], priors, active)[added]
-    if distance > CONTRADICTION and alone < least and expected > 2.0 * least:
-        return Consistency(int(statistics.flights[f]))
-    return None
+    denied = distance > CONTRADICTION and alone < least and expected > 2.0 * least
+    return int(after.statistics.flights[f]) if denied else None
+
+
+def _by_chance(information: np.ndarray, score: np.ndarray) -> bool:
+    """Sign-flip test: whether the flights' scores would add up to as much if each had a random sign."""
+    if information.sum() ** 2 < EFFECTIVE * (information**2).sum():
+        return False
+    count = min(2 ** len(score), MOST_SIGNS)
+    if count == 2 ** len(score):
+        signs = 1.0 - 2.0 * ((np.arange(count)[:, None] >> np.arange(len(score))) & 1)
+    else:
+        signs = np.random.default_rng(0).choice((-1.0, 1.0), (count, len(score)))
+    return bool(np.mean(np.abs(signs @ score) >= abs(score.sum()) * (1.0 - 1e-12)) > CHANCE)
 
 
 def repeated_flights(windows: Sequence[Window]) -> dict[int, int]:

@@ -51,13 +51,13 @@ class Noise:
     scale: np.ndarray  # of each channel's sigma, shape (C,)
     latent_sd: Mapping[tuple[int, str], float]  # (block, phase) -> deviation [N, N m, N]
     correlation_time: float  # of the latent forces [s]
-    inflation: np.ndarray  # of each window's latent deviations, shape (windows,); 1 but in bad windows
+    inflation: np.ndarray  # of each window's latent deviations by block, shape (windows, 3); 1 but in bad windows
 
     def deviation(self, gram: Gram, window: int) -> np.ndarray:
         """Prior deviation of the columns [X, G] of a window, shape (D + L,)."""
         levels = np.ones(gram.nuisances + gram.latents)
         for block in np.unique(gram.latent_block):
-            level = self.latent_sd[int(block), gram.phase] * self.inflation[window]
+            level = self.latent_sd[int(block), gram.phase] * self.inflation[window, block]
             levels[gram.nuisances :][gram.latent_block == block] = level
         return levels
 

@@ -10,8 +10,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from visthrow.diagnose.marginal import Gram, Noise, columns, correlated, posterior
-from visthrow.diagnose.model import Window
+from visthrow.diagnose.marginal import Gram, Noise, columns, correlated, gram_of, posterior
+from visthrow.diagnose.model import LATENT_BLOCKS, Window
 
 MAD_TO_SIGMA = 1.4826
 THIRD_DIFFERENCE = np.sqrt(20.0)
@@ -32,11 +32,24 @@ HUBER = 6.0
 HUBER_SHARE = 0.02
 """More samples than this beyond ``HUBER`` are no outliers but a misfit, which must stay visible."""
 
-BAD_WINDOW = 6.0
-"""A window's latent energy, in that of its phase, from which it gets a level of its own."""
+BAD_WINDOW = 2.5
+"""Factor on the latent forces of its phase from which a window gets a level of its own."""
+
+BAD_NATS = 8.0
+"""Log-likelihood that a window's own level must gain; that of chance stays below 4 in a hundred windows."""
+
+INFLATIONS = (2.5, 4.0, 6.5, 10.0, 20.0, 60.0, 200.0, 1000.0, 5000.0)
+"""Factors that are tried for a bad window."""
+
+CLEANINGS = 4
+"""Rounds in which outliers lose weight."""
+
+WIDE = 30.0
+"""Latent forces while outliers are looked for, in the level at which they become visible."""
 
 ITERATIONS = 40
-ROUNDS = 4
+ROUNDS = 10
+"""Of levels of bad windows in turn with those of their phases; mostly one or two are needed."""
 
 
 def highpass_sigma(values: np.ndarray) -> np.ndarray:
@@ -97,7 +110,8 @@ def _first_guess(grams: Sequence[Gram]) -> Noise:
         for block in np.unique(gram.latent_block):
             seen = curvature[gram.latent_block == block]
             visible.setdefault((int(block), gram.phase), []).append(1.0 / np.sqrt(max(np.median(seen), 1e-300)))
-    return Noise(scale, {key: float(np.median(v)) for key, v in visible.items()}, CORRELATION_TIMES[0], np.ones(len(grams)))
+    return Noise(scale, {key: float(np.median(v)) for key, v in visible.items()}, CORRELATION_TIMES[0],
+                 np.ones((len(grams), len(LATENT_BLOCKS))))  # fmt: skip
 
 
 def _maximise(grams: Sequence[Gram], noise: Noise) -> tuple[Noise, float]:
@@ -147,40 +161,62 @@ def _likelihood(grams: Sequence[Gram], noise: Noise, keys: Sequence[tuple[int, s
 
 
 def _inflation(grams: Sequence[Gram], noise: Noise) -> np.ndarray:
-    """Factor on the latent deviations of windows whose latent energy stands far above their phase's."""
-    energy = np.ones(len(grams))
+    """Factor on the latent deviations of windows whose latent forces stand far above their phase's, shape (windows, 3)."""
+    factor = np.ones_like(noise.inflation)
     for w, gram in enumerate(grams):
-        if gram.latents:
-            state = posterior(gram, noise, w)
-            second = (state.mean**2 + np.diagonal(state.covariance))[gram.nuisances :]
-            energy[w] = max(second[gram.latent_block == block].mean() for block in np.unique(gram.latent_block))
-    bad = energy * noise.inflation**2 > BAD_WINDOW
+        for block in np.unique(gram.latent_block):
+            factor[w, block] = _own_factor(gram, noise, w, int(block))
     for phase in {gram.phase for gram in grams}:
         of_phase = np.array([gram.phase == phase for gram in grams])
-        if bad[of_phase].sum() > 0.25 * of_phase.sum():  # what most windows have is the phase's own level
-            bad[of_phase] = False
-    return np.where(bad, np.sqrt(np.maximum(energy, 1e-12)) * noise.inflation, 1.0)
+        many = (factor[of_phase] > 1.0).sum(0) > 0.25 * of_phase.sum()  # what many windows have is the phase's own level
+        factor[np.ix_(of_phase, many)] = 1.0
+    return factor
 
 
-def without_outliers(windows: Sequence[Window], grams: Sequence[Gram], noise: Noise, floors: np.ndarray) -> list[Window]:
-    """Give single samples far outside a larger sigma; windows with none are returned as they are.
+def _own_factor(gram: Gram, noise: Noise, window: int, block: int) -> float:
+    def likelihood(factor: float) -> float:
+        inflation = noise.inflation.copy()
+        inflation[window, block] = factor
+        return posterior(gram, replace(noise, inflation=inflation), window).log_likelihood
+
+    plain = likelihood(1.0)
+    best, chosen = plain + BAD_NATS, 1.0
+    for factor in INFLATIONS:
+        value = likelihood(factor)
+        if value > best:
+            best, chosen = value, factor
+        elif value < plain:
+            break
+    return chosen
+
+
+def without_outliers(windows: Sequence[Window], floors: np.ndarray, channels: int) -> list[Window]:
+    """Give single samples far outside a sigma that puts them at HUBER; windows with none are returned as they are.
+
+    Latent forces have a wide prior here, so that a missing effect is followed and only what no force can do stands out.
 
     Args:
         windows: of the flights.
-        grams: of the windows, for these noise levels.
-        noise: levels.
         floors: of the effects, shape (K,).
+        channels: number of the model's channels.
     """
-    mended = []
-    for w, (window, gram) in enumerate(zip(windows, grams)):
-        state, level = posterior(gram, noise, w), noise.deviation(gram, w)
-        size = len(level)
-        fitted = level * state.mean
-        fitted[gram.nuisances :] = gram.factor @ fitted[gram.nuisances :]
-        left = window.residual - columns(window, floors)[:, :size] @ fitted
-        far = np.abs(left) / (window.sigma * noise.scale[window.channel]) / HUBER
-        outliers = far > 1.0
-        if outliers.any() and outliers.mean() <= HUBER_SHARE:
-            window = replace(window, sigma=window.sigma * np.sqrt(np.maximum(far, 1.0)))
-        mended.append(window)
-    return mended
+    return [_mended(window, floors, channels) for window in windows]
+
+
+def _mended(window: Window, floors: np.ndarray, channels: int) -> Window:
+    sigma = window.sigma
+    for _ in range(CLEANINGS):
+        gram = gram_of(replace(window, sigma=sigma), floors, channels)
+        guess = _first_guess([gram])
+        wide = replace(guess, latent_sd={key: WIDE * level for key, level in guess.latent_sd.items()})
+        shaped = correlated(gram, window, wide.correlation_time)
+        fitted = wide.deviation(shaped, 0) * posterior(shaped, wide, 0).mean
+        fitted[gram.nuisances :] = shaped.factor @ fitted[gram.nuisances :]
+        left = window.residual - columns(window, floors)[:, : len(fitted)] @ fitted
+        normal = np.abs(left) / window.sigma
+        far = normal / (HUBER * np.maximum(1.0, MAD_TO_SIGMA * np.median(normal)))
+        if not np.any(far > 1.0):
+            break
+        sigma = window.sigma * np.maximum(far, 1.0)
+    outliers = sigma > window.sigma
+    return replace(window, sigma=sigma) if 0.0 < outliers.mean() <= HUBER_SHARE else window

@@ -72,16 +72,11 @@ def linearise(problem: Problem, theta: np.ndarray, start: Noise | None = None, w
         windows: what the model gave there, if it was asked already.
     """
     windows = problem.model.windows(problem.sizes(theta)) if windows is None else windows
-    kept, channels = [windows[i] for i in problem.kept], len(problem.model.channels)
+    channels = len(problem.model.channels)
+    kept = levels.without_outliers([windows[i] for i in problem.kept], problem.priors.floor, channels)
     raw = [gram_of(w, problem.priors.floor, channels) for w in kept]
     noise, grams = levels.fit(kept, raw, start)
-    mended = levels.without_outliers(kept, grams, noise, problem.priors.floor)
-    changed = [i for i, (a, b) in enumerate(zip(kept, mended)) if a is not b]
-    for i in changed:
-        raw[i] = gram_of(mended[i], problem.priors.floor, channels)
-    if changed:
-        noise, grams = levels.fit(mended, raw, noise)
-    return _point(theta, mended, raw, grams, noise)
+    return _point(theta, kept, raw, grams, noise)
 
 
 def moved(problem: Problem, point: Point, theta: np.ndarray) -> Point | None:

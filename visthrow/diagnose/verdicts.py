@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from visthrow.diagnose import result
-from visthrow.diagnose.evidence import covariance
+from visthrow.diagnose.evidence import Priors, covariance
 from visthrow.diagnose.excess import acts_on, levels, too_strong
 from visthrow.diagnose.model import Model, Window
+from visthrow.diagnose.point import Point
 from visthrow.diagnose.result import Diagnosis, Finding, Level
 from visthrow.diagnose.work import Work
 
@@ -60,11 +61,17 @@ def conclude(search: "Search", *, laws: bool) -> Diagnosis:
     return Diagnosis(
         overall, block, tuple(reasons), findings, {search.name(j): float(point.theta[j] * floor[j]) for j in active},
         tuple(tuple(map(float, row)) for row in scaled), search.least, tuple(search.steps),
-        tuple((tuple(map(search.name, s)), n) for s, n in search.sets), found, tuple(terms), tuple(search.events),
+        tuple((tuple(map(search.name, s)), n) for s, n in search.sets), found, tuple(terms), _events(search, point),
         sensor_scale={name: float(point.noise.scale[c]) for c, name in enumerate(model.channels)},
         flights=len(point.statistics.flights), windows=len(point.windows), samples=int(point.statistics.samples.sum()),
         work=Work(search.problem, search.nominal, search.point if active else search.nominal, tuple(active)),
     )  # fmt: skip
+
+
+def _events(search: "Search", point: Point) -> tuple[int, ...]:
+    """Flights that were left out for what happened there, and flights with a window far rougher than its phase."""
+    rough = {window.flight for window, factor in zip(point.windows, point.noise.inflation) if factor.max() > 1.0}
+    return tuple(sorted({*search.events, *rough}))
 
 
 def out_of_domain(model: Model, windows: Sequence[Window], usable: int, seed: int) -> Diagnosis:
@@ -139,7 +146,7 @@ def _on_bound(search: "Search", j: int) -> bool:
     return bool(at and push * point.theta[j] > 0.0 and 0.5 * push**2 / point.information[j, j] > search.least)
 
 
-def _finding(search: "Search", point, j: int, active: list[int], spread: np.ndarray, withdrawn: set[int]) -> Finding:
+def _finding(search: "Search", point: Point, j: int, active: list[int], spread: np.ndarray, withdrawn: set[int]) -> Finding:
     effect, priors = search.problem.model.effects[j], search.priors
     blank = Finding(effect.name, result.UNOBSERVABLE, effect.block, effect.cause, effect.equation, effect.unit, 0.0,
                     effect.prior_sd, *effect.bounds, effect.floor, 0.0, manoeuvres=tuple(effect.manoeuvres))  # fmt: skip
@@ -165,13 +172,13 @@ def _finding(search: "Search", point, j: int, active: list[int], spread: np.ndar
     return replace(blank, verdict=result.BOUNDED, sentence=text)
 
 
-def _wide(point, priors, j: int, active: Sequence[int]) -> tuple[float, float]:
+def _wide(point: Point, priors: Priors, j: int, active: Sequence[int]) -> tuple[float, float]:
     """Posterior mean and deviation of one effect as if it were named beside the others, in floors."""
     sigma = covariance(point.information, priors.deviation([*active, j]))
     return float(sigma[j] @ point.score), float(np.sqrt(sigma[j, j]))
 
 
-def _worth(point, priors, j: int, active: Sequence[int]) -> float:
+def _worth(point: Point, priors: Priors, j: int, active: Sequence[int]) -> float:
     rest = [k for k in active if k != j]
     return point.evidence(priors, [*rest, j]) - point.evidence(priors, rest)
 
@@ -189,7 +196,7 @@ def _class_of(search: "Search", j: int, active: Sequence[int]) -> tuple[tuple[in
     return (), j
 
 
-def _named(search: "Search", point, blank: Finding, j: int, home: int, partners: tuple[int, ...], active: list[int],
+def _named(search: "Search", point: Point, blank: Finding, j: int, home: int, partners: tuple[int, ...], active: list[int],
            spread: np.ndarray) -> Finding:  # fmt: skip
     priors, floor = search.priors, blank.floor
     if j in active:
@@ -214,7 +221,7 @@ def _named(search: "Search", point, blank: Finding, j: int, home: int, partners:
     return replace(blank, verdict=result.CLASS, partners=names, joint=joint, sentence=sentence)
 
 
-def _joint(search: "Search", point, members: list[int], rest: list[int]) -> str:
+def _joint(search: "Search", point: Point, members: list[int], rest: list[int]) -> str:
     """The best known combination of a class: first eigenvector of its members' information in prior deviations."""
     priors, effects = search.priors, search.problem.model.effects
     others = np.setdiff1d(np.arange(len(effects)), members)
