@@ -53,69 +53,95 @@ def fit_weights(ages: list[float], order: int) -> tuple[list[float], list[float]
     order, none = min(order, len(ages) - 1), [0.0] * len(ages)
     if order < 1:
         return none, none
-    times = [-age for age in ages]
-    n, s1, s2 = float(len(times)), sum(times), sum(t * t for t in times)
+    n, s1, s2, s3, s4 = float(len(ages)), 0.0, 0.0, 0.0, 0.0
+    for age in ages:
+        square = age * age
+        s1 -= age
+        s2 += square
+        s3 -= age * square
+        s4 += square * square
     if order == 1:
         det = n * s2 - s1 * s1
-        return ([(n * t - s1) / det for t in times] if det > 0.0 else none), none
-    s3, s4 = sum(t**3 for t in times), sum(t**4 for t in times)
+        return ([(-n * age - s1) / det for age in ages] if det > 0.0 else none), none
     # The middle and the last row of the inverse of the normal matrix [[n, s1, s2], [s1, s2, s3], [s2, s3, s4]].
-    row = (s2 * s3 - s1 * s4, n * s4 - s2 * s2, s1 * s2 - n * s3)
-    last = (s1 * s3 - s2 * s2, s1 * s2 - n * s3, n * s2 - s1 * s1)
-    det = row[0] * s1 + row[1] * s2 + row[2] * s3
+    r0, r1, r2 = s2 * s3 - s1 * s4, n * s4 - s2 * s2, s1 * s2 - n * s3
+    det = r0 * s1 + r1 * s2 + r2 * s3
     if not det > 0.0:
         return none, none
-    slope = [(row[0] + row[1] * t + row[2] * t * t) / det for t in times]
-    return slope, [2.0 * (last[0] + last[1] * t + last[2] * t * t) / det for t in times]
+    l0, l2, scale, double = s1 * s3 - s2 * s2, n * s2 - s1 * s1, 1.0 / det, 2.0 / det
+    slope = [(r0 - r1 * age + r2 * age * age) * scale for age in ages]
+    return slope, [(l0 - r2 * age + l2 * age * age) * double for age in ages]
 
 
 class SlopeFilter:
     """Velocity and body rate of one body.
 
+    The rate is worked out when it is asked for: many poses may come between two ticks, and a bare ball's is never asked for.
+
     Attributes:
-        lag: of the last estimate under constant acceleration [s]; 0 where the source gave both itself.
         acceleration: of the last estimate [m/s^2], world frame; 0 for a line.
     """
 
     def __init__(self, params: EstimateParams) -> None:
         """Start empty."""
-        self.params, self.lag = params, 0.0
+        self.params = params
         self.acceleration: Vector = (0.0, 0.0, 0.0)
         self._window: deque[Pose] = deque(maxlen=MOST_SAMPLES)
+        self._ages: list[float] = []
+        self._weights: list[float] = []
+        self._rate: Vector | None = None  # until it is asked for
 
     def reset(self) -> None:
         """Forget all samples."""
         self._window.clear()
 
-    def update(self, pose: Pose) -> tuple[Vector, Vector]:
-        """Velocity, world frame [m/s], and rate, body frame [rad/s], at a new pose; the source's own where it gives them.
+    def update(self, pose: Pose) -> Vector:
+        """Velocity, world frame [m/s], at a new pose; the source's own where it gives one.
 
         Args:
             pose: in our frames, its stamp above the last one's.
         """
-        window = self._window
-        if window and not 0.0 < pose.stamp - window[0].stamp <= MOST_GAP:
+        window, params, stamp = self._window, self.params, pose.stamp
+        if window and not 0.0 < stamp - window[0].stamp <= MOST_GAP:
             window.clear()
         window.appendleft(pose)
-        while len(window) > self.params.order + 1 and pose.stamp - window[-1].stamp > self.params.window:
+        while len(window) > params.order + 1 and stamp - window[-1].stamp > params.window:
             window.pop()
-        vel, rate = pose.vel, pose.rate
-        ages = [pose.stamp - sample.stamp for sample in window]
-        weights, bends = fit_weights(ages, self.params.order)
-        self.acceleration = _sum(bends, [sample.pos for sample in window])
-        self.lag = 0.0
-        if vel is not None and (rate is not None or pose.quat is None):
-            return vel, rate or (0.0, 0.0, 0.0)
-        self.lag = -0.5 * sum(c * a * a for c, a in zip(weights, ages))
-        if vel is None:
-            vel = _sum(weights, [sample.pos for sample in window])
-        if rate is None and pose.quat is not None:
-            rate = _sum(weights, [_turn(pose.quat, sample.quat) for sample in window])
-        return vel, rate or (0.0, 0.0, 0.0)
+        self._ages = [stamp - sample.stamp for sample in window]
+        self._weights, bends = fit_weights(self._ages, params.order)
+        places = [sample.pos for sample in window]
+        self.acceleration, self._rate = _sum(bends, places), None
+        return _sum(self._weights, places) if pose.vel is None else pose.vel
+
+    @property
+    def rate(self) -> Vector:
+        """Body rate at the last pose, body frame [rad/s]; the source's own where it gives one, 0 without an attitude."""
+        if self._rate is None:
+            pose = self._window[0] if self._window else None
+            if pose is None or pose.rate is not None or pose.quat is None:
+                self._rate = pose.rate if pose is not None and pose.rate is not None else (0.0, 0.0, 0.0)
+            else:
+                self._rate = _sum(self._weights, [_turn(pose.quat, sample.quat) for sample in self._window])
+        return self._rate
+
+    @property
+    def lag(self) -> float:
+        """Of the last estimates under constant acceleration [s]; 0 where the source gave both itself."""
+        if not self._window:
+            return 0.0
+        pose = self._window[0]
+        if pose.vel is not None and (pose.rate is not None or pose.quat is None):
+            return 0.0
+        return -0.5 * sum(c * a * a for c, a in zip(self._weights, self._ages))
 
 
 def _sum(weights: list[float], vectors: list[Vector]) -> Vector:
-    return tuple(sum(c * v[i] for c, v in zip(weights, vectors)) for i in range(3))
+    x = y = z = 0.0
+    for c, (a, b, d) in zip(weights, vectors):
+        x += c * a
+        y += c * b
+        z += c * d
+    return (x, y, z)
 
 
 def _turn(now: Quaternion, then: Quaternion | None) -> Vector:

@@ -15,6 +15,9 @@ from hil.runner import Decision, Runner, Words
 from hil.sources import Source
 from hil.states import State
 
+AHEAD = 2e-3
+"""Before a tick the poses that have come are taken in [s], so that the tick finds the last one or two alone."""
+
 COLLECT_ALL = 50
 """Ticks between two looks of the garbage collector at all that was made since the start; the others see the last tick's."""
 
@@ -55,16 +58,20 @@ def fly(
     begin, throws, told, ended, ours, ticks = clock.now(), [], None, -math.inf, 0, 0
     with _collected():
         while runner.machine.state is not State.DONE and clock.now() - begin < most and not source.ended:
-            _wait(clock, ticker, backend, source)
+            _wait(clock, ticker.due() - AHEAD, backend, source)
+            early = source.poll(clock.now())
+            runner.take(early)
+            _wait(clock, ticker.due(), backend, source)
             due, missed = ticker.due(), ticker.missed
             now, start = ticker.take(), time.perf_counter()
             ours += (ticker.missed - missed) * (ended > due)
-            poses = source.poll(now)
+            late = source.poll(now)
             polled = time.perf_counter()
             status, words = backend.status(now), operator.words(runner.machine.state.value)
             recording = recorder is None or recorder.failed is None
             asked = time.perf_counter()
-            decision = runner.tick(now, poses, status, words, recording)
+            decision = runner.tick(now, late, status, words, recording)
+            poses = early + late
             times = {"late": ticker.late, "poll": polled - start, **stages.poses(poses, now), **runner.spent}
             if "total" in times:
                 times["total"] += asked - start
@@ -105,14 +112,14 @@ def _collected() -> Iterator[None]:
             gc.enable()
 
 
-def _wait(clock: Clock, ticker: Ticker, backend: Backend, source: Source) -> None:
-    """Wait for the next tick; in between do what the back-end has to do at a time of its own."""
+def _wait(clock: Clock, until: float, backend: Backend, source: Source) -> None:
+    """Wait until a time [s]; in between do what the back-end has to do at a time of its own."""
     while True:
         due = backend.due()
-        if due is None or due >= ticker.due():
+        if due is None or due >= until:
             break
         source.wait(clock, due)
         backend.service(clock.now())
         if backend.due() == due:
             break
-    source.wait(clock, ticker.due())
+    source.wait(clock, until)

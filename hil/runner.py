@@ -131,7 +131,7 @@ class Runner:
         self.hang = -rope["mount"][2] + rope["length"] + rope["payload_offset"]
         self._reach = math.hypot(*rope["mount"]) + rope["length"] + rope["payload_offset"] + params.check.rope_tolerance
         self.guard = Guard(params.guard, float(action["max_thrust"]), tuple(map(float, action["max_rate"])))
-        self.tracks = {name: Track(frames, params.gate, params.estimate) for name, frames in params.frames.items()}
+        self.tracks = {name: Track(frames, params.gate, params.estimate, name == VEHICLE) for name, frames in params.frames.items()}
         self.machine = Machine(params.states, params.throws, params.observe)
         self._hover = HoverController(HoverParams(max_thrust=float(action["max_thrust"])), self.pilot.period)
         self._latency = contract["observation"]["latency"]
@@ -147,6 +147,7 @@ class Runner:
         self.mount_b: Vector = tuple(map(float, rope["mount"]))
         self.seen_goal_w: Vector | None = None
         self.spent: dict[str, float] = {}
+        self._untaken: Exception | None = None
         self.watcher: Callable[[str, Track], None] | None = None
 
     def tick(self, now: float, poses: list[Pose], status: Status, words: Words, recording: bool = True) -> Decision:
@@ -171,8 +172,18 @@ class Runner:
                 self.backend.abort(now)
             return Decision(now, self.machine.state.value, self.machine.reason, note="exception")
 
-    def _tick(self, now: float, poses: list[Pose], status: Status, words: Words, recording: bool) -> Decision:
-        begin = perf_counter()
+    def take(self, poses: list[Pose]) -> None:
+        """Take in poses that have come before the tick that they belong to, so that the tick has less to do.
+
+        A tick of the rest decides as one of all of them would: what goes wrong here comes up there.
+        """
+        try:
+            if self._untaken is None:
+                self._take(poses)
+        except Exception as error:  # as in tick
+            self._untaken = error
+
+    def _take(self, poses: list[Pose]) -> None:
         for pose in poses:
             track = self.tracks.get(pose.body)
             took = track is not None and track.update(pose, self._tether(pose)) is None
@@ -183,6 +194,13 @@ class Runner:
                 if landing is not None:
                     self.landings.append(landing)
                     self._flight = None
+
+    def _tick(self, now: float, poses: list[Pose], status: Status, words: Words, recording: bool) -> Decision:
+        begin = perf_counter()
+        if self._untaken is not None:
+            error, self._untaken = self._untaken, None
+            raise error
+        self._take(poses)
         if self.machine.state in (State.IDLE, State.CHECK):
             for track in self.tracks.values():
                 # On the ground a body may be carried about out of sight; in flight what has jumped stays refused.
@@ -280,7 +298,7 @@ class Runner:
             failure = "the release was refused or not answered"
         checks = ["a body has no pose yet"]
         # After a throw the payload may have been hung on again; only the operator's next word makes the latch new.
-        if known and (self._latch is None or state is State.READY):
+        if known and state is not State.THROW and (self._latch is None or state is State.READY):
             checks = failed_checks(p.check, p.fence, vehicle, payload, goal_w, p.home_w, self.hang)
             if GOAL in self.tracks and self.tracks[GOAL].gate.level(now) >= HOLD:
                 checks.append("the goal's pose is stale")
@@ -292,7 +310,7 @@ class Runner:
             tuple(checks),
             # While landing the fence's floor is left on purpose.
             fence_broken(p.fence, vehicle, hanging) if vehicle is not None and state is not State.LAND else None,
-            vehicle is not None and self._still(vehicle, payload, status.mode == HELD),
+            vehicle is not None and state in (State.ARMED, State.RECOVER) and self._still(vehicle, payload, status.mode == HELD),
             self._latch is not None and now - self._latch >= self.lag - 1e-9,
             self._latch is not None,
             vehicle is not None and vehicle.pos[2] < GROUND,

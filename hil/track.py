@@ -35,13 +35,13 @@ class Track:
         accepted: number of poses taken.
     """
 
-    def __init__(self, frames: FrameParams, gate: GateParams, estimate: EstimateParams) -> None:
-        """Start without a pose."""
+    def __init__(self, frames: FrameParams, gate: GateParams, estimate: EstimateParams, turns: bool = True) -> None:
+        """Start without a pose; ``turns``: whether the body rate is wanted, which a bare ball does without."""
+        self._turns = turns
         self.frames, self.gate, self.filter = Frames(frames), Gate(gate), SlopeFilter(estimate)
         self.accepted = 0
         self._pose: Pose | None = None
         self._vel: Vector = (0.0, 0.0, 0.0)
-        self._rate: Vector = (0.0, 0.0, 0.0)
         self._slow: deque[tuple[float, Vector]] = deque(maxlen=CALM_SAMPLES)
         self._shift = 0.0  # added to the stamps, so that a step of the source's clock leaves the filter's window whole
 
@@ -62,7 +62,7 @@ class Track:
         if stepped and before is not None:
             self._shift -= (pose.stamp - before.stamp) - (pose.arrival - before.arrival)
         self.accepted += 1
-        self._vel, self._rate = self.filter.update(replace(pose, stamp=pose.stamp + self._shift))
+        self._vel = self.filter.update(replace(pose, stamp=pose.stamp + self._shift))
         self._pose = pose
         self._slow.appendleft((pose.arrival, pose.pos))
         return None
@@ -83,7 +83,7 @@ class Track:
         """
         if self._pose is None:
             raise ValueError("no pose was taken yet; sample() is for after the first one")
-        return replace(self._pose, stamp=self._pose.stamp + self._shift), self._vel, self._rate
+        return replace(self._pose, stamp=self._pose.stamp + self._shift), self._vel, self.filter.rate
 
     def calm_speed(self) -> float:
         """Speed by a line through the last poses [m/s]: late, but free of noise; infinite with too few of them."""
@@ -104,13 +104,14 @@ class Track:
         if pose is None:
             return None
         pos, quat, vel, age = pose.pos, pose.quat, self._vel, self.gate.age(now)
+        rate = self.filter.rate if self._turns else (0.0, 0.0, 0.0)
         ahead = min(max(ahead, 0.0), MOST_PREDICTION)
         if ahead > 0.0:
             pos = tuple(x + ahead * v for x, v in zip(pos, vel))
             vel = tuple(v + ahead * a for v, a in zip(vel, self.filter.acceleration))
             if quat is not None:
                 half = 0.5 * ahead
-                turn = multiply(quat, (*(half * r for r in self._rate), 1.0))
+                turn = multiply(quat, (*(half * r for r in rate), 1.0))
                 norm = sum(x * x for x in turn) ** 0.5
                 quat = tuple(x / norm for x in turn)
-        return BodyState(pos, quat, vel, self._rate, age)
+        return BodyState(pos, quat, vel, rate, age)

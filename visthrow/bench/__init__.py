@@ -7,7 +7,9 @@ from visthrow.cli import add_common
 KINDS = {
     "sim": ("the simulator: on a CPU core against MuJoCo C, on a GPU against MuJoCo Warp", "visthrow.bench.sim"),
     "camera": ("keypoints of thousands of environments against kornia and OpenCV", "visthrow.bench.camera"),
+    "detector": ("recall, precision and pixel error of the keypoint detector on rendered frames", "visthrow.bench.detector"),
     "train": ("where the wall time of a training iteration goes", "visthrow.bench.iteration"),
+    "hil": ("the HIL runner over loopback: latency and soak, throws over the wire, faults", "visthrow.bench.hil"),
     "records": ("print the recorded measurements as Markdown", "visthrow.bench.records"),
 }
 """Name -> (help, module). The module has ``run(args) -> int``; it is imported only when chosen."""
@@ -20,27 +22,50 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "  visthrow bench sim                             one CPU core against MuJoCo C on the same rope\n"
         "  visthrow bench sim --device cuda               steps a second over batch sizes on a GPU\n"
         "  visthrow bench camera                          keypoints on the CPU, and on the GPU if there is one\n"
+        "  visthrow bench detector --out out/sheet.png    the ball and goal detector by nuisance, 15 minutes\n"
         "  visthrow bench train state --device cuda       simulation, environment, inference and learning\n"
+        "  visthrow bench hil --minutes 1                 message in to command out, missed ticks, memory\n"
+        "  visthrow bench hil --throws 60 --policy state  throws over the wire, and the same without it\n"
         "  visthrow bench records                         what was measured before, on which machine and commit\n"
     )
     kinds = parser.add_subparsers(dest="bench", metavar="WHAT", title="what to measure", required=True)
-    sim, camera, train, records = (
+    sim, camera, detector, train, hil, records = (
         kinds.add_parser(name, help=text, description=text) for name, (text, _) in KINDS.items()
     )
     _add_sim(sim)
     camera.add_argument("--environments", type=int, default=16384, metavar="N", help="batch size (default: 16384)")
+    detector.add_argument("--frames", type=int, default=100, metavar="N", help="scenes a level (default: 100)")
+    detector.add_argument("--seed", type=int, default=0, help="of the scenes")
+    detector.add_argument("--out", metavar="FILE", help="write a contact sheet of the first scenes there, .png")
     train.add_argument(
         "config", metavar="CONFIG", nargs="?", default="state", help="training configuration (default: state)"
     )
     train.add_argument("--iterations", type=int, default=5, metavar="N", help="iterations measured (default: 5)")
+    _add_hil(hil)
     for kind in (sim, camera, train):
         kind.add_argument(
             "--repeats", type=int, default=5, metavar="N", help="measurements; the median counts (default: 5)"
         )
-        kind.add_argument("--record", metavar="NAME", help="keep the result in the package's records under this name")
+    for kind in (sim, camera, detector, train):
         add_common(kind)
+    for kind in (sim, camera, train, hil):
+        kind.add_argument("--record", metavar="NAME", help="keep the result in the package's records under this name")
     sim.set_defaults(device="cpu")
     records.add_argument("names", metavar="NAME", nargs="*", help="records to print (default: all)")
+
+
+def _add_hil(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--policy", default="vision", metavar="POLICY", help="a shipped name or a file (default: vision)")
+    parser.add_argument("--minutes", type=float, default=1.0, metavar="N", help="of the soak, in real time (default: 1)")
+    parser.add_argument("--rate", type=float, default=200.0, metavar="HZ", help="of poses in the soak (default: 200)")
+    parser.add_argument("--core", type=int, metavar="N", help="CPU core that the runner is kept on in the soak")
+    parser.add_argument("--keep", metavar="FOLDER", help="keep the soak's run here")
+    parser.add_argument("--throws", type=int, default=0, metavar="N", help="throw so often instead; may be interrupted")
+    parser.add_argument("--seed", type=int, default=0, help="of the first throw (default: 0)")
+    parser.add_argument("--out", default="out/hil", metavar="FOLDER", help="of the series (default: out/hil)")
+    parser.add_argument("--keep-runs", action="store_true", help="keep the run folder of each throw")
+    parser.add_argument("--faults", action="store_true", help="inject each fault of motion capture instead")
+    parser.add_argument("--json", metavar="FILE", help="write the printed figures to this file as well")
 
 
 def _add_sim(parser: argparse.ArgumentParser) -> None:
