@@ -103,7 +103,8 @@ def runs() -> tuple[dict, ...]:
     """Training runs with learning curves."""
     curve = [[2e6 * k, 0.9 * k, 0.5 / (1 + k)] for k in range(1, 60)]
     base = {"layout": "state", "steps": 2e8, "iterations": 600, "environments": 16384, "seconds": 80.0, "wall_s": 90.0,
-            "pieces": 1, "device": "H200", "commit": "0" * 40, "final": {"error_mean": 0.025, "duration_mean": 1.05}, "curve": curve}  # fmt: skip
+            "pieces": 1, "device": "H200", "commit": "0" * 40,
+            "final": {"error_mean": 0.025, "duration_mean": 1.05}, "curve": curve}  # fmt: skip
     names = ("state", "vision", *(f"state_{v}" for v in PAPER_FOUR))
     return tuple({"name": f"{n}-{s}", "run": n, "variant": "full", "train_seed": s, **base} for n in names for s in (1, 2))
 

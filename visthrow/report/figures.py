@@ -217,7 +217,7 @@ def trades(panels: Sequence[Trade]) -> bytes:
     return png_of(figure)
 
 
-def curves(panels: Sequence[Panel], ylabel: str, columns: int = 3) -> bytes:
+def curves(panels: Sequence[Panel], ylabel: str, columns: int = 3, log: bool = False) -> bytes:
     """Curves with bands of their intervals, one scale for all panels; a ring marks the policy's own value."""
     style.use()
     import matplotlib.pyplot as plt
@@ -240,7 +240,10 @@ def curves(panels: Sequence[Panel], ylabel: str, columns: int = 3) -> bytes:
         axis.set_xlabel(panel.xlabel)
         axis.grid(True)
         axis.set_axisbelow(True)
-        axis.set_ylim(bottom=0.0)
+        if log:
+            _log_axis(axis.yaxis, "y", axis)
+        else:
+            axis.set_ylim(bottom=0.0)
     for axis in axes[:, 0]:
         axis.set_ylabel(ylabel)
     if len(labels) > 1:

@@ -42,7 +42,8 @@ SWEEPS = (
 TRAINED = {
     "no_validity": "no validity bits", "history_0": "no history", "history_1": "history of 1", "history_2": "history of 2",
     "full": "full: history of 3, 220 deg, validity", "history_6": "history of 6", "fov_120": "field of view 120 deg",
-    "fov_150": "field of view 150 deg", "fov_180": "field of view 180 deg",
+    "fov_150": "field of view 150 deg", "fov_180": "field of view 180 deg", "no_latency": "poses without age",
+    "dropout": "drop-out of keypoints", "turned": "camera turned and displaced", "late": "late keypoints",
 }  # fmt: skip
 """Variant of a vision training -> its name, in the order of the table."""
 
@@ -68,7 +69,7 @@ def section(book: Book) -> Section:
     ]  # fmt: skip
     if rows:
         text = "Mean landing error of the throws that landed, against one imperfection at a time."
-        parts.append(Picture("gap", figures.curves(panels, "landing error [m]"), text))
+        parts.append(Picture("gap", figures.curves(panels, "landing error [m]", log=True), text))
         head = ("imperfection", "value", "policy", "throws", "landed", "landing error [m]", "added to its own [m]")
         parts.append(Grid("The curves in figures", head, tuple(rows), heads=1))
     parts += _trained(book, missing)
@@ -97,7 +98,7 @@ def _rows(sweep: Sweep, policy: str, points: list[tuple[float, Result]]) -> list
     rows = []
     for value, r in points:
         added = "its own" if r is own else "-" if own is None else st.difference(errors([r]), errors([own])).text(sign=True)
-        rows.append((f"{sweep.title}, {sweep.xlabel}", f"{value:g}", policy, str(len(r.good)), f"{100 * landed([r]):.1f} %",
+        rows.append((f"{sweep.title}, {sweep.xlabel}", f"{value:.3g}", policy, str(len(r.good)), f"{100 * landed([r]):.1f} %",
                      st.mean(r.of("error")).text(), added))  # fmt: skip
     return rows
 

@@ -12,7 +12,7 @@ def section(book: Book) -> Section:
     groups: dict[tuple[str, ...], list] = defaultdict(list)
     for r in book.results:
         made = r.provenance
-        groups[(made.get("command", "-"), str(made.get("commit", "-"))[:12], SHORT[r.unit["plant"]])].append(r)
+        groups[(made.get("command", "-").split(" (")[0], str(made.get("commit", "-"))[:12], SHORT[r.unit["plant"]])].append(r)
     rows = []
     for (command, commit, plant), found in sorted(groups.items()):
         times = sorted(str(r.provenance.get("time", "-"))[:10] for r in found)
