@@ -5,6 +5,7 @@ the same one flown without a wire. With ``--faults`` what the runner does when m
 """
 
 import argparse
+import dataclasses
 import json
 import math
 import shutil
@@ -42,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def soak(args: argparse.Namespace) -> Report:
-    """Latency, misses and memory of a run that shows the policy every tick.
+    """Latency, misses and memory of a throw that lasts.
 
     Raises:
         VisthrowError: a time or rate out of range.
@@ -50,17 +51,31 @@ def soak(args: argparse.Namespace) -> Report:
     if not (args.minutes > 0.0 and 1.0 <= args.rate <= 1000.0):
         raise VisthrowError(f"--minutes {args.minutes}, --rate {args.rate}; expected above 0, and 1 to 1000 Hz")
     seconds, memory = 60.0 * args.minutes, Memory()
-    run = (
-        "--config", "fake", "--set", f"policy={args.policy}", "--set", "observe=true", "--set", "states.ready=1e6",
-        "--set", "states.armed=1e6", "--set", "states.armed_least=1e6", "--set", "states.abort=0.5",
-    )  # fmt: skip
-    fake = (*STILL, "--rate", str(args.rate), "--seconds", str(seconds))
     with tempfile.TemporaryDirectory() as folder:
+        policy = never_releasing(args.policy, Path(folder) / "policy.npz")
+        run = ("--config", "fake", "--set", f'policy="{policy}"', "--set", "states.throw=1e6", "--set", "states.abort=0.5")
+        fake = (*STILL, "--rate", str(args.rate), "--seconds", str(seconds))
         summary, report = Pair(run, fake, args.core).fly(Path(folder) / "run", memory)
         size = sum(path.stat().st_size for path in (Path(folder) / "run").iterdir())
         if args.keep is not None:
             shutil.copytree(Path(folder) / "run", args.keep)
     return _soaked(summary, report, memory, seconds, size, args)
+
+
+def never_releasing(name: str, path: Path) -> Path:
+    """Write a policy that is another one in all but its release, which it never asks for: a throw that lasts.
+
+    Args:
+        name: of a shipped policy, or a file. path: to write.
+    """
+    from visthrow.policy import Policy, find_policy
+
+    policy = Policy.load(find_policy(name))
+    weights, biases = policy.weights[-1].clone(), policy.biases[-1].clone()
+    weights[-1], biases[-1] = 0.0, -1.0
+    changed = {"weights": (*policy.weights[:-1], weights), "biases": (*policy.biases[:-1], biases)}
+    dataclasses.replace(policy, **changed).save(path)
+    return path
 
 
 def slope(samples: list[tuple[float, float]]) -> float | None:
@@ -104,8 +119,8 @@ def _soaked(summary: dict, report: dict, memory: Memory, seconds: float, size: i
     notes = (
         f"total, from the look for messages to the command's bytes out: p50 {total['p50_ms']:.3f} ms and "
         f"p99 {total['p99_ms']:.3f} ms, {verdict} the bars of {P50} and {P99} ms",
-        f"policy '{args.policy}', every tick: gate, filter, state machine, projection, network, hover controller, guard, link, "
-        "recording to disk; the fake autopilot and its motion capture in a process of their own, UDP on loopback",
+        f"policy '{args.policy}' in a throw that it never ends, every tick: gate, filter, state machine, projection, network, "
+        "guard, link, recording to disk; the fake autopilot and its motion capture in a process of their own, UDP on loopback",
         "the run is kept on one core" if args.core is not None else "the system chooses the cores",
         "a missed tick counts as ours where the tick before it was not done when it was due, for whatever reason",
     )

@@ -7,10 +7,9 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from visthrow.bench.hil import STILL, json_lines
+from visthrow.bench.hil import STILL, json_lines, never_releasing
 from visthrow.bench.hil_processes import Pair
 from visthrow.bench.records import Report, Table
-from visthrow.policy import Policy, find_policy
 
 START, LENGTH = 2.5, 1.2
 """When a fault begins, and how long it is watched [s]."""
@@ -23,27 +22,12 @@ ODOMETRY = (
 """The message that carries a reset counter."""
 
 
-def hovering(path: Path) -> None:
-    """Write a policy that hovers and never releases: a throw that lasts."""
-    import torch
-
-    from visthrow.actions import hover_action
-    from visthrow.hover import GRAVITY
-
-    shipped = Policy.load(find_policy("state"))
-    body, rope = shipped.contract["vehicle"]["body"], shipped.contract["rope"]
-    weight = GRAVITY * (body["mass"] + rope["rope_mass"] + rope["payload_mass"])
-    action = torch.tensor(hover_action(weight, shipped.contract["action"]["max_thrust"]))
-    Policy((torch.zeros(5, shipped.obs_dim),), (action,), "relu", shipped.contract).save(path)
-
-
 def faults(args: argparse.Namespace) -> Report:
     """Inject each fault in turn."""
     known = import_module("hil.mocap_faults").FAULTS  # the onboard side is not imported by name: it must not need this one
     rows, figures = [], {}
     with tempfile.TemporaryDirectory() as folder:
-        policy = Path(folder) / "hover.npz"
-        hovering(policy)
+        policy = never_releasing("state", Path(folder) / "policy.npz")
         for name, (text, _) in known.items():
             found = _one(name, policy, Path(folder) / name)
             figures[name] = found
@@ -51,7 +35,7 @@ def faults(args: argparse.Namespace) -> Report:
             rows.append((name, text, done, str(found["commands"]), str(found["releases"]), str(len(found["breaches"]))))
             print(f"{name}: {done}", flush=True)
     notes = (
-        f"each fault begins in mid throw, {START:g} s after the first pose, of a policy that hovers and never releases; times "
+        f"each fault begins in mid throw, {START:g} s after the first pose, of a policy that never releases; times "
         "count from the first pose that the fault spoiled",
         "a breach is a command that is not finite or beyond the limits of training, or a release that was not armed, was outside "
         "of the fence or came twice, as seen by the vehicle",
