@@ -10,7 +10,7 @@ from visthrow.report import figures
 from visthrow.report.book import SHIPPED, Book, landed
 from visthrow.report.parts import Grid, Picture, Section, Text
 from visthrow.report.throws import SHORT
-from visthrow.report.wanted import BOUNDS, FRONT_TARGET, TARGETS
+from visthrow.report.wanted import BOUNDS, FRONT_TARGET, FRONT_THROWS, TARGETS
 from visthrow.results import Result
 from visthrow.tables import PAPER
 
@@ -97,7 +97,7 @@ def front_section(book: Book) -> Section:
         drawn = []
         for compensation, bounds in kinds:
             found = [r for r in book.baseline(plant, compensation, target=FRONT_TARGET, bounds=bounds)
-                     if r.unit["throws"] <= 10 or not _default(r)]  # fmt: skip
+                     if r.unit["throws"] <= FRONT_THROWS or not _default(r)]  # fmt: skip
             label = _label(plant, compensation, bounds)
             if not found:
                 if (plant, bounds) != ("reference-realistic", BOUNDS[1]):
@@ -215,7 +215,7 @@ def _verdicts(
 
 def _breakdown(book: Book) -> list[Grid]:
     """The paper's table of settings, and ours of the own model."""
-    found = [r for r in book.baseline(thrower.OWN, target=FRONT_TARGET) if r.unit["throws"] <= 10 or not _default(r)]
+    found = [r for r in book.baseline(thrower.OWN, target=FRONT_TARGET) if r.unit["throws"] <= FRONT_THROWS or not _default(r)]
     if not found:
         return []
     rows = [

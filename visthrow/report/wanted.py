@@ -12,6 +12,9 @@ TARGETS = tuple(sorted({target for _, target in PAPER}))
 FRONT_TARGET = 2.0
 """Of the sweep (the paper, Table IV) [m]."""
 
+FRONT_THROWS = 10
+"""A setting of the sweep, as in the paper."""
+
 BOUNDS = ("payload and thrust", "payload")
 """What plans bound: ours, and the payload alone as the paper's do."""
 
@@ -23,7 +26,7 @@ QUICK_LIST = "quick"
 
 def full() -> list[dict[str, Any]]:
     """Units of the committed record ``baseline``: the cheap and telling ones first."""
-    return [*_by_target(50, 20), *_front(10)]
+    return [*_by_target(50), *_front(FRONT_THROWS), *_on_reference(20)]
 
 
 def quick() -> list[dict[str, Any]]:
@@ -37,28 +40,30 @@ def _own(targets: tuple[float, ...], throws: int) -> Iterator[dict[str, Any]]:
         yield from thrower.units(thrower.OWN, "none", target, throws)
 
 
-def _by_target(throws: int, on_reference: int) -> Iterator[dict[str, Any]]:
+def _by_target(throws: int) -> Iterator[dict[str, Any]]:
     yield from _own(TARGETS, throws)
     for compensation in reversed(thrower.MADE_UP):
         for target in TARGETS:
             yield from thrower.units("hybrid", compensation, target, throws)
+
+
+def _on_reference(throws: int) -> Iterator[dict[str, Any]]:
+    """By target and a part of the front: a throw takes seconds there."""
     for compensation in ("both", "delay"):
-        for target in TARGETS:
-            yield from thrower.units("reference-realistic", compensation, target, on_reference)
+        for target in (FRONT_TARGET, *(target for target in TARGETS if target != FRONT_TARGET)):
+            yield from thrower.units("reference-realistic", compensation, target, throws)
+        for speed in front.SPEEDS[1::2] if compensation == "both" else front.SPEEDS[1:2]:
+            for w_t, rho in front.WEIGHTS:
+                how = {"speed": speed, "w_t": w_t, "rho": rho}
+                yield from thrower.units("reference-realistic", compensation, FRONT_TARGET, FRONT_THROWS, **how)
 
 
 def _front(throws: int) -> Iterator[dict[str, Any]]:
-    settings = [(speed, w_t, rho) for speed in front.SPEEDS for w_t, rho in front.WEIGHTS]
-
-    def all_settings(plant: str, compensation: str, bounds: str, speeds=front.SPEEDS) -> Iterator[dict[str, Any]]:
-        for speed, w_t, rho in settings:
-            if speed in speeds:
+    for bounds in BOUNDS[::-1]:
+        for speed in front.SPEEDS:
+            for w_t, rho in front.WEIGHTS:
                 how = {"speed": speed, "w_t": w_t, "rho": rho, "bounds": bounds}
-                yield from thrower.units(plant, compensation, FRONT_TARGET, throws, **how)
-
-    for bounds in BOUNDS:
-        yield from all_settings(thrower.OWN, "none", bounds)
-        yield from all_settings("hybrid", "both", bounds)
-    yield from all_settings("hybrid", "delay", BOUNDS[0])
-    yield from all_settings("reference-realistic", "both", BOUNDS[0], speeds=front.SPEEDS[1::2])
-    yield from all_settings("reference-realistic", "delay", BOUNDS[0], speeds=front.SPEEDS[1:2])
+                yield from thrower.units(thrower.OWN, "none", FRONT_TARGET, throws, **how)
+                yield from thrower.units("hybrid", "both", FRONT_TARGET, throws, **how)
+                if bounds == BOUNDS[0]:
+                    yield from thrower.units("hybrid", "delay", FRONT_TARGET, throws, **how)
