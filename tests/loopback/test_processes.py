@@ -1,0 +1,171 @@
+"""Runner and fake as two processes in real time: whole throws with each kind, Ctrl-C, SIGKILL, a full disk."""
+
+import json
+import os
+import re
+import resource
+import signal
+import socket
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from hil.playback import replay
+from tests.hil_flight import simple_policy
+from tests.loopback.wire import CONFIGS
+from visthrow.actions import hover_action
+
+HOVER = hover_action(9.81 * 0.272, 14.0)[0]
+QUICK = ("states.check_hold=0.2", "states.armed_least=0.1", "states.quiet=0.1", "states.throw=30.0")
+COMMAND = [sys.executable, "-m", "visthrow.cli", "hil"]
+PATIENCE = 60.0
+"""For anything to happen on a busy machine [s]."""
+
+ONE_THROW = 0.25
+"""A single throw on a busy machine [m]: late periods of the fake are late commands."""
+
+FULL_DISK = 60_000
+"""Bytes that a file may have: some hundred ticks."""
+
+
+def free_port(kind=socket.SOCK_DGRAM) -> int:
+    with socket.socket(socket.AF_INET, kind) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+class Pair:
+    """A fake and a runner, each in a process of its own."""
+
+    def __init__(self, folder, kind, policy, plant=("--plant", "hil.fakes.level:make"), seconds=8.0, limit=None, overrides=()):
+        self.folder, poses, msp = folder, free_port(), free_port(socket.SOCK_STREAM)
+        self.device, self.msp, self.limit = f"127.0.0.1:{poses}", msp, limit
+        self.fake = self.runner = None
+        if kind == "betaflight":  # listens itself, so that it must be there first, and stay for the runner's start
+            self._start_fake(kind, plant, seconds + 15.0)
+            self._start_runner(kind, policy, overrides)
+        else:
+            self._start_runner(kind, policy, overrides)
+            self._start_fake(kind, plant, seconds)
+
+    def _start_fake(self, kind, plant, seconds):
+        self.fake = subprocess.Popen(
+            [*COMMAND, "fake", "--kind", kind, "--device", f"udpout:{self.device}", "--msp-port", str(self.msp), *plant,
+             "--seconds", str(seconds), "--after", "1.5", "--out", str(self.folder / "fake.json")],
+            stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        assert "flies" in self.fake.stderr.readline()
+
+    def _start_runner(self, kind, policy, overrides):
+        sets = [f'link.device="udp:{self.device}"', f'betaflight.device="tcp:127.0.0.1:{self.msp}"', f'policy="{policy}"']
+        limits = (self.limit, self.limit)
+        self.runner = subprocess.Popen(
+            [*COMMAND, "run", "--config", CONFIGS[kind], "--auto-arm", "--out", str(self.folder / "run"),
+             *(part for text in (*sets, *overrides) for part in ("--set", text))],
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, stdin=subprocess.DEVNULL, text=True,
+            preexec_fn=None if self.limit is None else (lambda: resource.setrlimit(resource.RLIMIT_FSIZE, limits)),
+        )  # fmt: skip
+        assert self.runner.stderr.readline().startswith("ready after")
+
+    def wait_for(self, state: str) -> None:
+        """Until the runner says that it is in a state."""
+        end = time.monotonic() + PATIENCE
+        while time.monotonic() < end:
+            line = self.runner.stderr.readline()
+            assert line, "the runner has ended"
+            if re.match(rf" *[0-9.]+ s  {state} ", line):
+                return
+        raise AssertionError(f"no {state} within {PATIENCE} s")
+
+    def report(self) -> dict:
+        """The fake's, when it has ended."""
+        assert self.fake.wait(PATIENCE) == 0
+        return json.loads((self.folder / "fake.json").read_text())
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        for process in (self.fake, self.runner):
+            if process is not None:
+                process.kill()
+                process.communicate()
+
+
+@pytest.fixture
+def never(tmp_path):
+    """A policy that hovers and never releases, as a file."""
+    path = tmp_path / "never.npz"
+    simple_policy((HOVER, 0.0, 0.0, 0.0, -1.0)).save(path)
+    return path
+
+
+OWN = {"ardupilot": "levelled: no set-points", "px4": "left OFFBOARD: no set-points", "betaflight": "failsafe: motors idle"}
+"""What the vehicle does by itself when nobody speaks any more."""
+
+KINDS = ("ardupilot", pytest.param("px4", marks=pytest.mark.slow), pytest.param("betaflight", marks=pytest.mark.slow))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_runner_is_killed_in_mid_throw(tmp_path, kind, never):
+    with Pair(tmp_path, kind, never, overrides=QUICK) as pair:
+        pair.wait_for("throw")
+        time.sleep(0.3)
+        os.kill(pair.runner.pid, signal.SIGKILL)
+        pair.runner.wait(PATIENCE)
+        report = pair.report()
+    assert OWN[kind] in [text for _, text in report["events"]]
+    happened = next(at for at, text in report["events"] if text == OWN[kind] and at > report["last_command"])
+    assert 0.3 < happened - report["last_command"] < 0.6
+    assert (report["breaches"], report["releases"]) == ([], 0)
+    found = replay(tmp_path / "run")
+    assert found["differences"] == [], "what was written until then runs again to the bit"
+    assert found["actions"] > 5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["ardupilot", "px4", "betaflight"])
+def test_ctrl_c_in_mid_throw(tmp_path, kind, never):
+    with Pair(tmp_path, kind, never, overrides=(*QUICK, "states.abort=1.0")) as pair:
+        pair.wait_for("throw")
+        time.sleep(0.3)
+        os.kill(pair.runner.pid, signal.SIGINT)
+        out, err = pair.runner.communicate(timeout=PATIENCE)
+        report = pair.report()
+    assert "ABORTED: the operator said abort" in out
+    assert "Traceback" not in err
+    assert (report["breaches"], report["releases"]) == ([], 0)
+    landing = {"ardupilot": "mode 9", "px4": "mode 4.6", "betaflight": OWN["betaflight"]}[kind]
+    assert landing in [text for _, text in report["events"]]
+
+
+@pytest.mark.slow
+def test_the_disk_fills_up_in_mid_throw(tmp_path, never):
+    """The throw is flown to its end, the next one is not armed, the end of the run says so."""
+    with Pair(tmp_path, "ardupilot", never, limit=FULL_DISK, overrides=(*QUICK[:3], "states.throw=4.0", "states.ready=2.0",
+                                                                       "states.land=1.0", "throws=2")) as pair:  # fmt: skip
+        out, err = pair.runner.communicate(timeout=PATIENCE)
+        report = pair.report()
+    assert "the policy did not release in time" in err
+    assert err.count("armed") == 1, "the next one is not armed"
+    assert "File too large" in out + err
+    assert (report["breaches"], report["releases"]) == ([], 0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("policy", ["state", "vision"])
+@pytest.mark.parametrize("kind", ["ardupilot", "px4", "betaflight"])
+def test_a_throw_with_each_kind(tmp_path, kind, policy):
+    """In real time, with the simulator's vehicle and the shipped policies."""
+    with Pair(tmp_path, kind, policy, plant=("--policy", policy), seconds=40.0, overrides=("states.abort=0.5",)) as pair:
+        out, _ = pair.runner.communicate(timeout=PATIENCE)
+        report = pair.report()
+    assert report["landing_w"] is not None, out
+    assert np.hypot(report["landing_w"][0] - 2.0, report["landing_w"][1]) < ONE_THROW
+    assert (report["breaches"], report["releases"]) == ([], 1)
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert (summary["latches"], summary["errors"]) == (1, [])
+    assert replay(tmp_path / "run")["differences"] == []
