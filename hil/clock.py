@@ -122,12 +122,12 @@ class TimeSync:
     """
 
     DRIFT = 1e-3
-    """That clocks may part by within the window: 500 parts in a million over 2 s [s]."""
+    """That clocks may part by within the window: 200 parts in a million over 5 s [s]."""
 
     STEP_AFTER = 3
     """Contradicting exchanges in a row that make a step."""
 
-    def __init__(self, window: int = 20) -> None:
+    def __init__(self, window: int = 50) -> None:
         """Remember the last ``window`` exchanges."""
         self._exchanges: deque[tuple[float, float]] = deque(maxlen=window)
         self._odd = 0

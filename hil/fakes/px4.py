@@ -38,6 +38,7 @@ class FakePx4(FakeMavlink):
 
     autopilot = mav.MAV_AUTOPILOT_PX4
     usual_mode = POSCTL
+    usual_delay = 0.017
     thrust_map = ThrustParams(2.668, 0.1585, 0.8, 0.1, 0.0)
     defaults = {  # noqa: RUF012 - copied by each instance
         "COM_OF_LOSS_T": 0.5, "COM_OBL_RC_ACT": 5.0, "EKF2_EV_CTRL": 11.0, "PD_GRIPPER_EN": 1.0, "PWM_AUX_FUNC1": 430.0,

@@ -31,9 +31,8 @@ def exchanges(sync, clock, seconds, start=0.0, least=1e-3, most=12e-3, seed=0):
 def test_the_shortest_round_trip_is_taken():
     sync = TimeSync()
     errors = exchanges(sync, lambda t: t + 1234.5, 10.0)
-    assert np.all(np.abs(errors[20:]) <= 0.5 * sync.round_trip + 12e-3)
     assert abs(errors[-1]) <= 0.5 * sync.round_trip
-    assert sync.round_trip < 8e-3, "of 20 exchanges the best"
+    assert sync.round_trip < 8e-3, "of 50 exchanges the best"
     assert (TimeSync().offset, TimeSync().round_trip) == (None, None)
 
 
@@ -86,7 +85,7 @@ def test_poses_are_dated_by_their_senders_clock(offset):
     poses, sync, _ = dated(offset)
     known = [pose for pose in poses if pose.measured is not None]
     assert len(known) > 150
-    # One period of the lock step passes between question and answer.
+    # Half of the shortest answer, and one period of the lock step that passes between question and answer.
     assert all(abs(pose.transit(9.9) - 0.01) <= 0.005 for pose in known[20:])
     assert sync.peers[1].steps == 0
 
