@@ -10,6 +10,7 @@ from visthrow.flightlog import FlightLog
 
 POSITIONS = ("pos_w", "est_pos_w", "mocap_pos_w")
 ATTITUDES = ("quat_wb", "est_quat_wb", "mocap_quat_wb")
+MOTORS = ("motor_command", "motor_speed", "pwm")
 THRUSTS = ("command", "thrust_command", "motor_command", "motor_speed", "pwm")
 
 STILL = 0.01
@@ -33,7 +34,7 @@ QUESTIONS = (
     Question("rotor drag", (POSITIONS, ATTITUDES), "speed_p95_m_s", 0.7),
     Question("wind or frame tilt", (POSITIONS, ATTITUDES), "seconds_flown", 5.0),
     Question("wind against frame tilt", (POSITIONS, ATTITUDES), "yaw_range_deg", 60.0),
-    Question("centre of mass, motor by motor gain", (("motor_command", "motor_speed", "pwm"), ("rate_b", *ATTITUDES)), "seconds_flown", 3.0),
+    Question("centre of mass, motor by motor gain", (MOTORS, POSITIONS + ("rate_b",)), "seconds_flown", 3.0),
     Question("motor lag and command delay", (("command", "motor_command", "rate_setpoint_b"), ("rate_b",)), "rate_p95_rad_s", 0.3),
     Question("rope length", (("payload_pos_w",),), "swing_deg", 2.0),
     Question("payload drag", (("payload_pos_w",),), "payload_speed_p95_m_s", 1.5),

@@ -179,7 +179,8 @@ def _followed(found: relations.Relation, name: str) -> list[Row]:
         text = f"the rates do not follow the commands (best correlation {found.axes_correlation:.2f}): not the same flight?"
         return [Row("frames", both, "bad", text, figures)]
     if found.axes_correlation > found.correlation + _CLEARLY:
-        text = f"the rates follow the commands as ({found.axes}): correlation {found.axes_correlation:.2f}, not {found.correlation:.2f}"
+        text = f"the rates follow the commands as ({found.axes}): "
+        text += f"correlation {found.axes_correlation:.2f}, not {found.correlation:.2f}"
         return [Row("frames", both, "bad", text, figures | {"axes": found.axes})]
     late = found.delay < -0.005
     hint = relations.unit_hint(found.scale)
@@ -199,7 +200,8 @@ def _thrust(log: FlightLog) -> list[Row]:
     mass = float(np.median(command[:, 0]) / max(np.median(acc[:, 2]), 1e-6))
     figures = {"correlation": found.correlation, "delay_s": found.delay, "mass_kg": mass}
     good = found.correlation > _BELONGS and mass > 0.0
-    text = f"the force follows {1e3 * found.delay:.1f} ms later, correlation {found.correlation:.2f}; thrust over force {mass:.4g} kg"
+    text = f"the force follows {1e3 * found.delay:.1f} ms later, correlation {found.correlation:.2f}; "
+    text += f"thrust over force {mass:.4g} kg"
     return [Row("delay", "command, acc_b", "ok" if good else "warn", text, figures)]
 
 

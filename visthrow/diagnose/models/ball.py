@@ -1,0 +1,152 @@
+"""A ball in free flight under motion capture: drag, spin, wind, and what a camera system gets wrong about gravity.
+
+The log holds no mass: forces are per kilogram, which is what a path can tell.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from visthrow.diagnose.check.relations import derivative
+from visthrow.diagnose.check.signals import noise
+from visthrow.diagnose.model import Effect
+from visthrow.diagnose.models.numeric import (
+    Lanes,
+    NumericModel,
+    Stretch,
+    cross,
+    hermite,
+    integrate,
+    latent_force,
+    latent_layout,
+)
+from visthrow.flightlog import FlightLog
+
+CHANNEL = "payload_pos_w"
+STEPS = 80
+"""Of a free flight's integration: about 10 ms, at which the path is exact to a thousandth of a millimetre."""
+KNOTS = 9
+"""Of the latent force over a free flight."""
+
+
+@dataclass(frozen=True)
+class BallParams:
+    """The ball that is assumed before anything is found."""
+
+    gravity: float  # [m/s^2]
+    drag: float  # k / m of the quadratic drag k |v| v [1/m]
+    edge: float  # cut off at either end of a free flight [s]
+    shortest: float  # free flights [s]
+    every: int = 1  # the samples taken: each so-manieth
+
+
+def effects(params: BallParams) -> list[Effect]:
+    """Catalogue of the ball."""
+    seen = (CHANNEL,)
+    flight = "payload aero"
+    return [
+        Effect("ball_drag", "air drag on the ball", "a -= theta |v| v", "1/m", flight, (-0.2, 0.5), 0.03, 5e-4, seen,
+               "Cross and Lindsey 2014; table tennis ball 0.1, tennis ball 0.02", ("wind_z",), ("throw at two speeds",)),
+        Effect("linear_drag", "drag in proportion to speed", "a -= theta v", "1/s", flight, (-0.5, 1.0), 0.1, 3e-3, seen,
+               "viscous flow", ("ball_drag",), ("throw at two speeds",)),
+        Effect("top_spin", "the ball spins about the horizontal axis across its path", "a += theta e_across x v", "1/s", flight,
+               (-2.0, 2.0), 0.1, 2e-3, seen, "Cross and Lindsey 2014, lift", ("frame_tilt_x", "frame_tilt_y", "wind_x", "wind_y"),
+               ("throw in two directions",)),
+        Effect("side_spin", "the ball spins about the vertical", "a += theta e_z x v", "1/s", flight, (-2.0, 2.0), 0.1, 5e-3, seen,
+               "Cross and Lindsey 2014, side force", (), ("throw in two directions",)),
+        *(Effect(f"wind_{axis}", f"wind along {axis}", "v relative to air that moves with theta", "m/s", "environment", (-3.0, 3.0),
+                 0.3, 0.03, seen, "draught of a hall", ("frame_tilt_x", "frame_tilt_y"), ("throw in two directions",))
+          for axis in "xy"),
+        *(Effect(f"frame_tilt_{axis}", f"the capture's frame is turned about {axis}", f"y = R_{axis}(theta) x", "rad", "sensing",
+                 (-0.1, 0.1), 0.0175, 4e-4, seen, "wand calibration", ("wind_x", "wind_y", "top_spin"),
+                 ("throw in two directions", "a plumb line")) for axis in "xy"),
+        Effect("clock_rate", "the capture's clock runs at another rate", "dt = (1 + theta) dt_stated", "1", "sensing",
+               (-0.05, 0.05), 0.003, 2e-4, seen, "frame rate setting", ("length_scale", "ball_drag"), ("a scale bar",)),
+        Effect("length_scale", "the capture's unit of length", "y = (1 + theta) x", "1", "sensing", (-0.05, 0.05), 0.003, 4e-4,
+               seen, "wand length", ("clock_rate",), ("a scale bar",)),
+    ]  # fmt: skip
+
+
+class BallModel(NumericModel):
+    """Free flights of a ball, one window each."""
+
+    def __init__(self, logs: Sequence[FlightLog], params: BallParams) -> None:
+        """Cut the free flights out of the logs.
+
+        Raises:
+            LogError: There is none.
+        """
+        self.params = params
+        stretches = [s for i, log in enumerate(logs) if CHANNEL in log for s in _flights(log, i, params)]
+        super().__init__(effects(params), (CHANNEL,), stretches)
+        self._across = np.array([s.data["across"] for s in self.stretches])
+        self._span = np.array([np.ptp(s.data["time"]) for s in self.stretches])
+
+    def simulate(self, lanes: Lanes) -> np.ndarray:
+        """See the base class; the unknowns are position and velocity at the first stamp. Returns them over the grid."""
+        drag, linear, top, side, wind_x, wind_y, _, _, clock, _ = lanes.theta.T
+        wind = np.stack([wind_x, wind_y, 0.0 * wind_x], 1)
+        spin = top[:, None] * self._across[lanes.owner] + side[:, None] * np.array([0.0, 0.0, 1.0])
+        push = latent_force(lanes.latent, STEPS, 1)[:, 0]
+        gravity = np.array([0.0, 0.0, -self.params.gravity])
+        quadratic, linear = (self.params.drag + drag)[:, None], linear[:, None]
+
+        def slope(at: int, state: np.ndarray) -> np.ndarray:
+            vel = state[:, 3:]
+            air = vel - wind
+            speed = np.sqrt(np.sum(air * air, 1, keepdims=True))
+            acc = gravity - (quadratic * speed + linear) * air + cross(spin, air) + push[at]
+            return np.concatenate([vel, acc], 1)
+
+        step = self._span[lanes.owner, None] / STEPS * (1.0 + clock[:, None])
+        return integrate(slope, lanes.nuisance.copy(), STEPS, step)
+
+    def measure(self, stretch: Stretch, path: np.ndarray, lanes: Lanes) -> np.ndarray:
+        """See the base class."""
+        tilt_x, tilt_y, clock, scale = lanes.theta.T[6:]
+        time = stretch.data["time"]
+        step = np.ptp(time) / STEPS
+        rate = path[..., 3:] * (1.0 + clock[:, None, None])
+        pos = hermite(time, time[0], step, path[..., :3], rate)
+        first = pos[:, :1]
+        turned = pos + cross(np.stack([tilt_x, tilt_y, 0.0 * tilt_x], 1)[:, None], pos - first)
+        return (first + (turned - first) * (1.0 + scale)[:, None, None]).reshape(len(path), -1)
+
+
+def _flights(log: FlightLog, number: int, params: BallParams) -> list[Stretch]:
+    channel = log[CHANNEL]
+    time, pos = channel.time[channel.valid], channel.values[channel.valid].astype(float)
+    if len(time) < 40:
+        return []
+    sigma = np.maximum(noise(channel), 1e-5)
+    found = []
+    for start, end in _free(time, pos, params):
+        inside = np.flatnonzero((time >= start) & (time <= end))[:: params.every]
+        found.append(_stretch(time[inside], pos[inside], sigma, number))
+    return found
+
+
+def _free(time: np.ndarray, pos: np.ndarray, params: BallParams) -> list[tuple[float, float]]:
+    """First and last time of the stretches that fall: acceleration near gravity, over a tenth of a second each way."""
+    at, vel = derivative(time, pos, 0.05)
+    if len(at) < 20:
+        return []
+    at, acc = derivative(at, vel, 0.05)
+    off = np.linalg.norm(acc + np.array([0.0, 0.0, params.gravity]), axis=1)
+    falls = off < 0.35 * params.gravity
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], falls, [False]]).astype(int)))
+    spans = [(at[a] + params.edge, at[b - 1] - params.edge) for a, b in zip(edges[::2], edges[1::2])]
+    return [(a, b) for a, b in spans if b - a >= params.shortest]
+
+
+def _stretch(time: np.ndarray, pos: np.ndarray, sigma: np.ndarray, number: int) -> Stretch:
+    relative = time - time[0]
+    fit = np.polynomial.polynomial.polyfit(relative, pos, 3)
+    along = fit[1] * np.array([1.0, 1.0, 0.0])
+    along = along / max(np.linalg.norm(along), 1e-6)
+    return Stretch(
+        number, "ballistic", np.repeat(time, 3), np.zeros(3 * len(time), dtype=int), pos.ravel(), np.tile(sigma, len(time)),
+        np.concatenate([fit[0], fit[1]]), np.array([0.1, 0.1, 0.1, 1.0, 1.0, 1.0]),
+        {"time": time, "across": np.array([-along[1], along[0], 0.0])}, **latent_layout(time[0], time[-1], KNOTS, (2,)),
+    )  # fmt: skip

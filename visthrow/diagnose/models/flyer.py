@@ -1,0 +1,277 @@
+"""A quadrotor alone, or with a payload on a cable, driven by its logged commands and its measured attitude.
+
+Where the attitude is measured, the path of the centre of mass follows from thrust, drag and gravity alone, whatever controller
+flies; where each motor's command is logged, the rates follow too. No controller has to be known.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from visthrow.diagnose.models.flyer_effects import effects_of
+from visthrow.diagnose.models.flyer_windows import stretches_of
+from visthrow.diagnose.models.numeric import Lanes, NumericModel, Stretch, cross, hermite, integrate, latent_force
+from visthrow.errors import ConfigError
+from visthrow.flightlog import FlightLog
+
+
+@dataclass(frozen=True)
+class CableParams:
+    """Payload on a massless cable at the vehicle's centre of mass."""
+
+    length: float  # to the payload's centre [m]
+    mass: float  # of the payload [kg]
+
+
+@dataclass(frozen=True)
+class TorqueParams:
+    """What turns commands of single motors into rates."""
+
+    inertia: tuple[float, float, float]  # [kg m^2]
+    arm_x: float  # of each rotor from the centre of mass, along x and along y [m]
+    arm_y: float
+    torque_ratio: float  # drag torque over thrust [m]
+    spin: tuple[float, float, float, float]  # +1 turns clockwise seen from above; order of the rotors as everywhere
+
+
+@dataclass(frozen=True)
+class FlyerParams:
+    """The vehicle that is assumed before anything is found.
+
+    Raises:
+        ConfigError: ``input`` names no channel that commands come from, or the thrust map does not rise.
+    """
+
+    input: Literal["motor_command", "motor_speed", "thrust_command", "command"]  # channel of the commands
+    position: str  # channel of the measured position
+    attitude: str  # channel of the measured attitude
+    mass: float  # of the vehicle alone [kg]
+    gravity: float  # [m/s^2]
+    thrust_map: tuple[float, float, float]  # thrust of a motor (of all, for a thrust command) by powers 0, 1, 2 of its input [N]
+    motor_time_constant: float  # [s]
+    command_delay: float  # [s]
+    reference_voltage: float  # at which the map holds [V]
+    voltage_coefficient: float  # thrust changes by this share a volt [1/V]
+    drag_xy: float  # rotor drag [kg/s]
+    drag_z: float  # [kg/s]
+    lowest: float  # windows keep above this height [m]
+    window: float  # [s]
+    step: float  # of the integration [s]
+    every: int  # the position samples taken: each so-manieth
+    most_windows: int  # spread evenly over all logs
+    torque: TorqueParams | None = None  # None: rates are not simulated
+    cable: CableParams | None = None  # None: no payload
+
+    def __post_init__(self) -> None:
+        if self.torque is not None and self.input not in ("motor_command", "motor_speed"):
+            raise ConfigError(f"torque needs commands of single motors; the input is '{self.input}'")
+        if self.thrust_map[1] <= 0.0 and self.thrust_map[2] <= 0.0:
+            raise ConfigError(f"thrust_map {self.thrust_map} does not rise")
+
+
+class FlyerModel(NumericModel):
+    """Windows of flights of one vehicle."""
+
+    latent_step = 1e-2
+
+    def __init__(self, logs: Sequence[FlightLog], params: FlyerParams) -> None:
+        """Cut the flights into windows.
+
+        Raises:
+            LogError: No log has the channels, or none flies.
+        """
+        self.params = params
+        self.has_voltage = all("battery_voltage" in log for log in logs)
+        channels = [params.position]
+        if params.cable is not None:
+            channels.append("payload_pos_w")
+        if params.torque is not None:
+            channels.append("rate_b")
+        stretches = stretches_of(logs, params, channels)
+        inputs = [params.attitude, params.input, *(["battery_voltage"] if self.has_voltage else [])]
+        super().__init__(effects_of(params), channels, stretches, inputs)
+        self.steps = round(params.window / params.step)
+        self._names = {effect.name: i for i, effect in enumerate(self.effects)}
+        self._rot = np.array([s.data["rot"] for s in stretches])  # (S, half steps, 3, 3)
+        self._input = np.array([s.data["input"] for s in stretches])  # (S, fine, motors)
+        self._volts = np.array([s.data["volts"] for s in stretches])  # (S,)
+        self._direction = np.array([s.data["direction"] for s in stretches])  # (S, 3)
+        self._blocks = 1 + (params.cable is not None) + (params.torque is not None)
+        self._rate_at = 12 if params.cable is not None else 6
+
+    def _theta(self, lanes: Lanes, name: str) -> np.ndarray:
+        """Sizes of one effect, shape (B,); zeros where the catalogue leaves it out."""
+        return lanes.theta[:, self._names[name]] if name in self._names else np.zeros(len(lanes.owner))
+
+    def _wanted(self, lanes: Lanes, half: int, delay: np.ndarray) -> np.ndarray:
+        """Thrust each motor is told at a half step [N], shape (B, motors)."""
+        p = self.params
+        at = (p.window + half * 0.5 * p.step - delay) / (0.5 * p.step)  # tables begin one window early
+        left = np.clip(at.astype(int), 0, self._input.shape[1] - 2)
+        share = (at - left)[:, None]
+        told = (1.0 - share) * self._input[lanes.owner, left] + share * self._input[lanes.owner, left + 1]
+        return p.thrust_map[0] + p.thrust_map[1] * told + p.thrust_map[2] * told * told
+
+    def simulate(self, lanes: Lanes) -> np.ndarray:
+        """See the base class.
+
+        The state: position and velocity of the vehicle, with a cable its vector to the payload and that one's rate, with
+        torques the body rates, and the thrust of each motor.
+        """
+        p, get = self.params, lambda name: self._theta(lanes, name)
+        delay, tau = p.command_delay + get("cmd_delay"), np.maximum(p.motor_time_constant + get("motor_tau"), 1e-3)[:, None]
+        forces = latent_force(lanes.latent, self.steps, self._blocks)
+        scale = self._scale(lanes)
+        curve, hover = get("thrust_curve")[:, None], self._hover()
+        mass = (p.mass + get("mass_quad"))[:, None]
+        dynamics = _Dynamics(self, lanes, mass)
+
+        def slope(half: int, state: np.ndarray) -> np.ndarray:
+            thrust = state[:, -self._input.shape[2] :]
+            told = self._wanted(lanes, half, delay)
+            lag = (told - thrust) / tau
+            real = thrust * scale * (1.0 + curve * (thrust / hover - 1.0))
+            return np.concatenate([dynamics(half, state, real, forces[half]), lag], 1)
+
+        start = np.concatenate([dynamics.start(lanes), self._wanted(lanes, 0, delay)], 1)
+        return integrate(slope, start, self.steps, np.full((len(start), 1), p.step))
+
+    def _hover(self) -> float:
+        """Thrust of one input channel in hover [N]."""
+        load = self.params.mass + (self.params.cable.mass if self.params.cable is not None else 0.0)
+        return load * self.params.gravity / self._input.shape[2]
+
+    def _scale(self, lanes: Lanes) -> np.ndarray:
+        """Thrust over what the map says, shape (B, motors)."""
+        p = self.params
+        volts = (self._volts[lanes.owner] - p.reference_voltage) if self.has_voltage else np.zeros(len(lanes.owner))
+        sag = p.voltage_coefficient + self._theta(lanes, "battery_sag")
+        scale = (1.0 + self._theta(lanes, "thrust_gain")) * (1.0 + sag * volts)
+        motors = self._input.shape[2]
+        if motors == 1 or p.torque is None:
+            return np.repeat(scale[:, None], motors, 1)
+        own = np.stack([self._theta(lanes, f"motor_{name}") for name in ("fl", "fr", "rl", "rr")], 1)
+        return scale[:, None] * (1.0 + own)
+
+    def measure(self, stretch: Stretch, path: np.ndarray, lanes: Lanes) -> np.ndarray:
+        """See the base class."""
+        p, start = self.params, stretch.data["start"]
+        delays = {0: self._theta(lanes, "pose_delay"), 1: self._theta(lanes, "payload_delay"), 2: np.zeros(len(path))}
+        out = np.empty((len(path), len(stretch.time)))
+        for channel, name in enumerate(self.channels):
+            own = stretch.channel == channel
+            if not np.any(own):
+                continue
+            time = stretch.time[own].reshape(-1, 3)[:, 0]
+            if name == "rate_b":
+                at = self._rate_at
+                grid = start + p.step * np.arange(path.shape[1])
+                lane = [np.column_stack([np.interp(time, grid, x[:, at + i]) for i in range(3)]) for x in path]
+                out[:, own] = np.array(lane).reshape(len(path), -1)
+                continue
+            late = time[None] - delays[channel][:, None]
+            value, rate = path[..., 0:3], path[..., 3:6]
+            if name == "payload_pos_w":
+                value, rate = value + path[..., 6:9], rate + path[..., 9:12]
+            pos = hermite(late, start, p.step, value, rate)
+            if channel == 0 and "marker_z" in self._names:
+                pos = pos + self._marker(lanes, stretch, time)
+            out[:, own] = pos.reshape(len(path), -1)
+        return out
+
+    def _marker(self, lanes: Lanes, stretch: Stretch, time: np.ndarray) -> np.ndarray:
+        """Shift of the measured point by the marker's lever, shape (B, N, 3)."""
+        lever = np.stack([self._theta(lanes, f"marker_{axis}") for axis in "xyz"], 1)
+        at = np.clip(((time - stretch.data["start"]) / (0.5 * self.params.step)).round().astype(int), 0, 2 * self.steps)
+        return np.einsum("nij,bj->bni", stretch.data["rot"][at], lever)
+
+
+class _Dynamics:
+    """Forces and torques of lanes, without the motors' lag."""
+
+    def __init__(self, model: FlyerModel, lanes: Lanes, mass: np.ndarray) -> None:
+        p = model.params
+        self.model, self.p, self.mass, self.owner = model, p, mass, lanes.owner
+
+        def get(name: str) -> np.ndarray:
+            return model._theta(lanes, name)
+
+        self.turn = np.stack([get("marker_rot_x"), get("marker_rot_y"), 0.0 * mass[:, 0]], 1)
+        tilt = np.stack([get("frame_tilt_y"), -get("frame_tilt_x"), 0.0 * mass[:, 0] - 1.0], 1)
+        self.gravity = p.gravity * tilt
+        self.drag = np.stack([p.drag_xy + get("rotor_drag_xy")] * 2 + [p.drag_z + get("rotor_drag_z")], 1)
+        self.parasitic, self.lift = get("parasitic")[:, None], get("translational_lift")[:, None]
+        if p.cable is not None:
+            self.length = (p.cable.length + get("rope_length"))[:, None]
+            self.payload = (p.cable.mass + get("mass_payload"))[:, None]
+            self.payload_drag = get("payload_drag")[:, None]
+        if p.torque is not None:
+            self.inertia = np.array(p.torque.inertia) * (1.0 + np.stack([get("inertia_xy")] * 2 + [get("inertia_z")], 1))
+            self.com = np.stack([get("com_x"), get("com_y")], 1)
+
+    def start(self, lanes: Lanes) -> np.ndarray:
+        """States from the unknowns at the window's start."""
+        parts = [lanes.nuisance[:, :6]]
+        at = 6
+        if self.p.cable is not None:
+            down = self.model._direction[lanes.owner]
+            side = np.stack([lanes.nuisance[:, 6], lanes.nuisance[:, 7], 0.0 * lanes.nuisance[:, 6]], 1)
+            direction = down + side - down * np.sum(down * side, 1, keepdims=True)
+            direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+            swing = np.stack([lanes.nuisance[:, 8], lanes.nuisance[:, 9], 0.0 * lanes.nuisance[:, 6]], 1)
+            swing = swing - direction * np.sum(direction * swing, 1, keepdims=True)
+            parts += [self.length * direction, self.length * swing]
+            at = 10
+        if self.p.torque is not None:
+            parts.append(lanes.nuisance[:, at : at + 3])
+        return np.concatenate(parts, 1)
+
+    def __call__(self, half: int, state: np.ndarray, thrust: np.ndarray, latent: np.ndarray) -> np.ndarray:
+        """Derivative of all but the motors' thrusts."""
+        rot = self.model._rot[self.owner, half]
+        vel = state[:, 3:6]
+        vel_b = np.einsum("bji,bj->bi", rot, vel)
+        total = np.sum(thrust, 1, keepdims=True)
+        level = vel_b[:, :1] ** 2 + vel_b[:, 1:2] ** 2
+        speed = np.sqrt(level + vel_b[:, 2:3] ** 2)
+        force_b = -(self.drag + self.parasitic * speed) * vel_b
+        force_b[:, 2:3] += total * (1.0 + self.lift * level)
+        force_b = force_b + cross(self.turn, force_b)
+        force = np.einsum("bij,bj->bi", rot, force_b) + latent[0]
+        parts = [vel]
+        if self.p.cable is None:
+            parts.append(force / self.mass + self.gravity)
+        else:
+            parts += self._with_cable(state, vel, force, latent[1])
+        if self.p.torque is not None:
+            parts.append(self._turning(state[:, self.model._rate_at : self.model._rate_at + 3], thrust, total, latent[-1]))
+        return np.concatenate(parts, 1)
+
+    def _with_cable(self, state: np.ndarray, vel: np.ndarray, force: np.ndarray, latent: np.ndarray) -> list[np.ndarray]:
+        """Acceleration of the vehicle, rate of the cable's vector, its acceleration; a cable pulls and never pushes."""
+        gap, gap_rate = state[:, 6:9], state[:, 9:12]
+        vel_p = vel + gap_rate
+        drag = -self.payload_drag * np.linalg.norm(vel_p, axis=1, keepdims=True) * vel_p
+        free_q, free_p = force / self.mass + self.gravity, (drag + latent) / self.payload + self.gravity
+        length = np.linalg.norm(gap, axis=1, keepdims=True)
+        along = gap / length
+        relative = np.sum(along * (free_p - free_q), 1, keepdims=True) + np.sum(gap_rate**2, 1, keepdims=True) / length
+        pull = np.maximum(relative / (1.0 / self.payload + 1.0 / self.mass), 0.0)
+        acc_q, acc_p = free_q + pull * along / self.mass, free_p - pull * along / self.payload
+        return [acc_q, gap_rate, acc_p - acc_q]
+
+    def _turning(self, rate: np.ndarray, thrust: np.ndarray, total: np.ndarray, latent: np.ndarray) -> np.ndarray:
+        """Angular acceleration from the motors' thrusts and the offset of the centre of mass."""
+        of = self.p.torque
+        front_left, front_right, rear_left, rear_right = thrust.T
+        torque = np.stack(
+            [
+                of.arm_y * (front_left + rear_left - front_right - rear_right) - self.com[:, 1] * total[:, 0],
+                of.arm_x * (rear_left + rear_right - front_left - front_right) + self.com[:, 0] * total[:, 0],
+                of.torque_ratio * thrust @ np.array(of.spin),
+            ],
+            1,
+        )
+        return (torque - cross(rate, self.inertia * rate) + latent) / self.inertia

@@ -1,0 +1,142 @@
+"""Cuts logs of a quadrotor into windows: measurements, inputs on a grid, first guesses of the state."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sim.reference.rotations import rotation_from_quat
+from visthrow.diagnose.check.signals import noise
+from visthrow.diagnose.models.numeric import Stretch, latent_layout
+from visthrow.errors import LogError
+from visthrow.flightlog import Channel, FlightLog
+
+if TYPE_CHECKING:
+    from visthrow.diagnose.models.flyer import FlyerParams
+
+KNOTS = 8
+"""Of the latent forces over a window."""
+_GUESS = 0.25
+"""First guesses are straight lines through so much of a window [s]."""
+_MOST_MISSING = 0.25
+"""Largest gap in an input within a window [s]."""
+_IDLE = 0.3
+"""Windows in which the thrust falls below this share of the weight are on the ground."""
+
+
+def stretches_of(logs: Sequence[FlightLog], params: "FlyerParams", channels: Sequence[str]) -> list[Stretch]:
+    """Windows of all logs, at most ``most_windows``, spread evenly.
+
+    Raises:
+        LogError: No log has the channels.
+    """
+    needed = [params.position, params.attitude, params.input, *channels[1:]]
+    usable = [(i, log) for i, log in enumerate(logs) if all(name in log for name in needed)]
+    if not usable:
+        lacking = [name for name in needed if not any(name in log for log in logs)]
+        raise LogError(f"no log has all of {', '.join(needed)}; missing everywhere: {', '.join(lacking) or 'none'}")
+    found = [s for number, log in usable for s in _windows(log, number, params, channels)]
+    if len(found) > params.most_windows:
+        found = [found[i] for i in np.linspace(0, len(found) - 1, params.most_windows).round().astype(int)]
+    return found
+
+
+def _windows(log: FlightLog, number: int, params: "FlyerParams", channels: Sequence[str]) -> list[Stretch]:
+    sigma = {name: np.maximum(noise(log[name]), _least(name)) for name in channels}
+    position, attitude, told = log[params.position], log[params.attitude], log[params.input]
+    first = max(c.time[0] for c in (position, attitude, told))
+    last = min(c.time[-1] for c in (position, attitude, told))
+    found = []
+    for start in np.arange(first + params.window, last - params.window, params.window):
+        if all(_covered(c, start, start + params.window) for c in (position, attitude, told)):
+            stretch = _window(log, number, params, channels, sigma, float(start))
+            if stretch is not None:
+                found.append(stretch)
+    return found
+
+
+def _least(name: str) -> float:
+    """Noise below which none is believed [m] or [rad/s]."""
+    return 2e-3 if name == "rate_b" else 1e-4
+
+
+def _covered(channel: Channel, start: float, end: float) -> bool:
+    inside = channel.time[channel.valid & (channel.time >= start) & (channel.time <= end)]
+    return len(inside) > 5 and float(np.max(np.diff(np.concatenate([[start], inside, [end]])))) < _MOST_MISSING
+
+
+def _window(log, number: int, params: "FlyerParams", channels, sigma, start: float) -> Stretch | None:
+    end = start + params.window
+    rows = [_samples(log[name], start, end, params.every) for name in channels]
+    if any(len(time) < 5 for time, _ in rows[:1]):
+        return None
+    if np.min(rows[0][1][:, 2]) < params.lowest:
+        return None
+    inputs = _inputs(log[params.input], params, start)
+    thrust = sum(c * inputs**power for power, c in enumerate(params.thrust_map)).sum(axis=1)
+    if np.min(thrust[len(thrust) // 2 :]) < _IDLE * params.mass * params.gravity:
+        return None
+    halves = start + 0.5 * params.step * np.arange(2 * round(params.window / params.step) + 1)
+    volts = log["battery_voltage"].hold(np.array([start + 0.5 * params.window]))[0] if "battery_voltage" in log else 0.0
+    guess, spread, direction = _guess(rows, channels, params)
+    blocks = [0, *([2] if params.cable is not None else []), *([1] if params.torque is not None else [])]
+    return Stretch(
+        number, "flight", np.concatenate([np.repeat(time, 3) for time, _ in rows]),
+        np.concatenate([np.full(3 * len(time), i) for i, (time, _) in enumerate(rows)]),
+        np.concatenate([values.ravel() for _, values in rows]),
+        np.concatenate([np.tile(sigma[name], len(time)) for name, (time, _) in zip(channels, rows)]), guess, spread,
+        {"start": start, "rot": _attitudes(log[params.attitude], halves), "input": inputs, "volts": float(volts),
+         "direction": direction}, **latent_layout(start, end, KNOTS, blocks),
+    )  # fmt: skip
+
+
+def _samples(channel: Channel, start: float, end: float, every: int) -> tuple[np.ndarray, np.ndarray]:
+    inside = np.flatnonzero(channel.valid & (channel.time >= start) & (channel.time < end))[::every]
+    return channel.time[inside], channel.values[inside].astype(float)
+
+
+def _inputs(channel: Channel, params: "FlyerParams", start: float) -> np.ndarray:
+    """Held commands on half steps from one window before the start to its end, shape (half steps, motors)."""
+    count = 2 * round(params.window / params.step)
+    times = start - params.window + 0.5 * params.step * np.arange(2 * count + 1)
+    held = channel.hold(times).astype(float).reshape(len(times), -1)
+    return held[:, :1] if params.input == "command" else held
+
+
+def _attitudes(channel: Channel, times: np.ndarray) -> np.ndarray:
+    """Rotations at the half steps, shape (half steps, 3, 3): quaternions interpolated and brought to unit length."""
+    time, quat = channel.time[channel.valid], channel.values[channel.valid].astype(float)
+    near = slice(max(np.searchsorted(time, times[0]) - 2, 0), np.searchsorted(time, times[-1]) + 2)
+    time, quat = time[near], quat[near]
+    signs = np.sign(np.sum(quat[1:] * quat[:-1], axis=1))
+    quat = quat * np.cumprod(np.concatenate([[1.0], np.where(signs == 0.0, 1.0, signs)]))[:, None]
+    return rotation_from_quat(np.column_stack([np.interp(times, time, column) for column in quat.T]))
+
+
+def _line(time: np.ndarray, values: np.ndarray, start: float) -> tuple[np.ndarray, np.ndarray]:
+    early = time <= max(start + _GUESS, time[min(3, len(time) - 1)])
+    slope, value = np.polynomial.polynomial.polyfit(time[early] - start, values[early], 1)[::-1]
+    return value, slope
+
+
+def _guess(rows, channels, params: "FlyerParams") -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Unknowns at the start, their spread, and the cable's direction there."""
+    start = float(rows[0][0][0])
+    pos, vel = _line(*rows[0], start)
+    guess, spread, direction = [*pos, *vel], [0.1] * 3 + [1.0] * 3, np.array([0.0, 0.0, -1.0])
+    if params.cable is not None:
+        at = rows[channels.index("payload_pos_w")]
+        if len(at[0]) >= 4:
+            pos_p, vel_p = _line(*at, start)
+            direction = (pos_p - pos) / np.linalg.norm(pos_p - pos)
+            rate = (vel_p - vel) / params.cable.length
+            swing = (rate - direction * np.dot(direction, rate))[:2]
+        else:
+            swing = np.zeros(2)
+        guess += [0.0, 0.0, *swing]
+        spread += [0.1, 0.1, 1.0, 1.0]
+    if params.torque is not None:
+        time, rate = rows[channels.index("rate_b")]
+        guess += list(rate[0]) if len(time) else [0.0] * 3
+        spread += [1.0] * 3
+    return np.array(guess), np.array(spread), direction

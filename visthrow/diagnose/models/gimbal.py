@@ -1,0 +1,160 @@
+"""A camera that sees a marker on the payload, against motion capture of vehicle and payload.
+
+Convention: a gimbal under the vehicle turns about its x axis, then about its own y axis; the camera stands off along the
+gimbal's x axis; its optical axis is that x axis, its image's x to the right, y down.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sim.reference.rotations import rotation_from_quat
+from visthrow.diagnose.model import Effect
+from visthrow.diagnose.models.numeric import Lanes, NumericModel, Stretch, cross, latent_layout, triangles
+from visthrow.flightlog import FlightLog
+
+CHANNEL = "marker_pos_c"
+NEEDED = (CHANNEL, "pos_w", "quat_wb", "payload_pos_w")
+KNOTS = 11
+"""Of the slow wander of detections over a window."""
+MARGIN = 1.0
+"""Poses are kept this long before and after a window [s], so that a delay can look them up."""
+
+
+@dataclass(frozen=True)
+class GimbalParams:
+    """Where the camera is assumed to be before anything is found."""
+
+    base_b: tuple[float, float, float]  # the gimbal's centre in the body frame [m]
+    camera_offset: float  # of the camera along the gimbal's x axis [m]
+    camera_axes_deg: tuple[float, float, float]  # gimbal to camera: turns about fixed x, y, z in this order [deg]
+    marker_z: float  # the marker over the payload's tracked centre, along the vertical [m]
+    sigma_across: float  # of the marker's direction times distance [m]
+    sigma_along: float  # of its distance [m]
+    stabilised: bool  # whether the gimbal's angles are against the horizon (then only the vehicle's yaw turns it)
+    window: float  # [s]
+    every: int  # the samples taken: each so-manieth
+    largest: float  # detections further than this from the prediction are of something else [m]
+
+
+def effects(params: GimbalParams) -> list[Effect]:
+    """Catalogue of camera and motion capture."""
+    look = ("fly both ways, yaw half a turn",)
+    found = [
+        Effect(f"camera_tilt_{axis}", f"the camera is turned about its own {axis} axis", f"p_c = R_{axis}(theta) p", "rad",
+               "camera", (-0.6, 0.6), 0.0175, 1.7e-3, NEEDED, "assembly", (f"marker_rot_{other}",), look)
+        for axis, other in zip("xyz", "zyx")
+    ]  # fmt: skip
+    found += [
+        Effect(f"camera_lever_{axis}", f"the camera stands off along its own {axis} axis", "p_c -= theta", "m", "camera",
+               (-0.5, 0.5), 0.02, 2e-3, NEEDED, "assembly", (), ("vary the distance",)) for axis in "xyz"
+    ]  # fmt: skip
+    found += [
+        Effect("camera_delay", "the camera's image is older than the pose beside it", "p_c(t - theta)", "s", "camera",
+               (-0.6, 0.6), 0.05, 2e-3, NEEDED, "exposure, transport and detection", (), ("swing",)),
+        Effect("focal_scale", "the focal length", "(x, y) (1 + theta)", "1", "camera", (-0.3, 0.3), 0.02, 2e-3, NEEDED,
+               "calibration", ("range_scale",), ("vary the distance",)),
+        Effect("range_scale", "the marker's size", "z (1 + theta)", "1", "camera", (-0.5, 0.5), 0.05, 2e-3, NEEDED,
+               "calibration", ("focal_scale",), ("vary the distance",)),
+        *(Effect(f"marker_rot_{axis}", f"the tracked attitude is turned about the body's {axis} axis",
+                 f"R_meas = R R_{axis}(theta)", "rad", "sensing", (-0.3, 0.3), 0.0175, 1.7e-3, NEEDED, "marker placement",
+                 (f"camera_tilt_{other}",), ("turn the gimbal", "dynamics of the flight")) for axis, other in zip("xyz", "zyx")),
+    ]  # fmt: skip
+    return found
+
+
+class GimbalModel(NumericModel):
+    """Windows of the marker's positions in the camera's frame."""
+
+    def __init__(self, logs: Sequence[FlightLog], params: GimbalParams) -> None:
+        """Cut the logs.
+
+        Raises:
+            LogError: None of them has poses of both bodies and the marker.
+        """
+        from scipy.spatial.transform import Rotation
+
+        self.params = params
+        self.camera = Rotation.from_euler("xyz", params.camera_axes_deg, degrees=True).as_matrix().T
+        stretches = [s for i, log in enumerate(logs) if all(n in log for n in NEEDED) for s in _cut(log, i, params, self.camera)]
+        super().__init__(effects(params), (CHANNEL,), stretches, NEEDED)
+
+    def measure(self, stretch: Stretch, path: np.ndarray, lanes: Lanes) -> np.ndarray:
+        """See the base class."""
+        names = [effect.name for effect in self.effects]
+        get = {name: lanes.theta[:, i] for i, name in enumerate(names)}
+        tilt = np.stack([get[f"camera_tilt_{a}"] for a in "xyz"], 1)
+        lever = np.stack([get[f"camera_lever_{a}"] for a in "xyz"], 1)
+        turn = np.stack([get[f"marker_rot_{a}"] for a in "xyz"], 1)
+        table, data = stretch.data["table"], stretch.data
+        time = stretch.time.reshape(-1, 3)[:, 0]
+        late = time[None] - get["camera_delay"][:, None]
+        gap = _looked_up(late, data["table_time"], table["gap"])  # payload from vehicle
+        axes = _looked_up(late, data["table_time"], table["rot"].reshape(-1, 9))
+        body = np.einsum("bnji,bnj->bni", axes.reshape(*late.shape, 3, 3), gap)
+        body = body + cross(turn[:, None], body)
+        level = _looked_up(late, data["table_time"], table["gimbal"].reshape(-1, 9))
+        seen = np.einsum("bnji,bnj->bni", level.reshape(*late.shape, 3, 3), body - np.array(self.params.base_b))
+        seen = seen - np.array([self.params.camera_offset, 0.0, 0.0])
+        point = np.einsum("ij,bnj->bni", self.camera, seen)
+        point = point + cross(tilt[:, None], point) - lever[:, None]
+        point = point + _wander(lanes.latent, stretch.latent_time, time)
+        scale = np.stack([1 + get["focal_scale"], 1 + get["focal_scale"], 1 + get["range_scale"]], 1)
+        return (point * scale[:, None]).reshape(len(lanes.owner), -1)
+
+
+def _looked_up(time: np.ndarray, table_time: np.ndarray, table: np.ndarray) -> np.ndarray:
+    """Columns of a table at times, linear between its rows, shape (B, N, columns)."""
+    return np.stack([np.interp(time, table_time, column) for column in table.T], -1)
+
+
+def _wander(latent: np.ndarray, knots: np.ndarray, time: np.ndarray) -> np.ndarray:
+    """What gimbal and detection err by, slowly [m], shape (B, N, 3)."""
+    weights = triangles(time, np.unique(knots))
+    return np.einsum("bak,nk->bna", latent.reshape(len(latent), 3, -1), weights)
+
+
+def _tables(log: FlightLog, params: GimbalParams) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Poses at the vehicle's stamps: payload's marker from the vehicle, attitude, gimbal to body."""
+    from scipy.spatial.transform import Rotation
+
+    vehicle, attitude, payload = log["pos_w"], log["quat_wb"], log["payload_pos_w"]
+    good = vehicle.valid & attitude.valid & payload.valid if len(vehicle.time) == len(payload.time) else vehicle.valid
+    time = vehicle.time[good]
+    pos = np.column_stack([np.interp(time, payload.time[payload.valid], c) for c in payload.values[payload.valid].T])
+    gap = pos + np.array([0.0, 0.0, params.marker_z]) - vehicle.values[good]
+    rot = rotation_from_quat(attitude.values[good])
+    angles = log["gimbal"].values[good] if "gimbal" in log else np.zeros((len(time), 2))
+    gimbal = Rotation.from_euler("XY", angles).as_matrix()
+    if params.stabilised:
+        yaw = np.arctan2(rot[:, 1, 0], rot[:, 0, 0])
+        level = Rotation.from_euler("z", yaw[:, None]).as_matrix()
+        gimbal = np.swapaxes(rot, 1, 2) @ level @ gimbal
+    return time, {"gap": gap, "rot": rot, "gimbal": gimbal}
+
+
+def _cut(log: FlightLog, number: int, params: GimbalParams, camera: np.ndarray) -> list[Stretch]:
+    marker = log[CHANNEL]
+    table_time, tables = _tables(log, params)
+    found = []
+    for start in np.arange(marker.time[0] + MARGIN, marker.time[-1] - MARGIN - params.window, params.window):
+        inside = np.flatnonzero(marker.valid & (marker.time >= start) & (marker.time < start + params.window))[:: params.every]
+        if len(inside) < 10:
+            continue
+        near = (table_time > start - MARGIN) & (table_time < start + params.window + MARGIN)
+        time, point = marker.time[inside], marker.values[inside].astype(float)
+        distance = np.linalg.norm(tables["gap"][near], axis=1)
+        fits = np.abs(np.linalg.norm(point, axis=1) - np.median(distance)) < params.largest
+        if np.sum(fits) < 10 or np.sum(near) < 20:
+            continue
+        time, point = time[fits], point[fits]
+        sigma = np.tile([params.sigma_across, params.sigma_across, params.sigma_along], len(time))
+        found.append(
+            Stretch(
+                number, "view", np.repeat(time, 3), np.zeros(3 * len(time), dtype=int), point.ravel(), sigma, np.zeros(0),
+                np.zeros(0), {"table_time": table_time[near], "table": {k: v[near] for k, v in tables.items()}},
+                **latent_layout(start, start + params.window, KNOTS, (2,)),
+            )
+        )  # fmt: skip
+    return found

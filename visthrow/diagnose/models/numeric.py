@@ -1,0 +1,331 @@
+"""A model that is simulated in NumPy and linearised by central differences, all windows and all lanes at once.
+
+A lane is one simulation of one window with sizes of effects, unknowns at its start and latent forces of its own. What is not
+known at the start is fitted before the linearisation, so that the linearisation is about a path near the measured one.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from visthrow.diagnose.model import Effect, Window
+from visthrow.errors import LogError, suggest
+
+EFFECT_STEP = 0.05
+"""Step of the differences by effects, in their prior deviations: errors of curvature cancel, those of rounding do not matter."""
+NUISANCE_STEP = 1e-3
+"""Step of the differences by unknowns at the start, in their prior deviations."""
+SETTLE_STEPS = 5
+SETTLED = 1e-3
+"""A Gauss-Newton step on the unknowns at the start that gains less than this [nats] is the last."""
+MOST_LANES = 6000
+"""Simulated in one batch."""
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """One window's measurements, before any simulation. All stretches of a model have the same D and G."""
+
+    flight: int
+    phase: str
+    time: np.ndarray  # [s], shape (N,)
+    channel: np.ndarray  # index into the model's channels, shape (N,)
+    measured: np.ndarray  # shape (N,)
+    sigma: np.ndarray  # shape (N,)
+    nuisance: np.ndarray  # first guess of what is not known at the start, shape (D,)
+    nuisance_sd: np.ndarray  # vague, shape (D,)
+    data: Mapping[str, Any] = field(default_factory=dict)  # what simulation and sensors read: inputs, stamps
+    latent_block: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))
+    latent_axis: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))
+    latent_time: np.ndarray = field(default_factory=lambda: np.zeros(0))
+
+
+@dataclass(frozen=True)
+class Lanes:
+    """Simulations of one batch."""
+
+    owner: np.ndarray  # index of the stretch, shape (B,)
+    theta: np.ndarray  # sizes of the effects, shape (B, K)
+    nuisance: np.ndarray  # unknowns at the start, shape (B, D)
+    latent: np.ndarray  # coefficients of the latent forces, shape (B, G)
+
+    def part(self, rows: Any) -> "Lanes":
+        """Some of them."""
+        return Lanes(self.owner[rows], self.theta[rows], self.nuisance[rows], self.latent[rows])
+
+
+class NumericModel:
+    """Implements :class:`visthrow.diagnose.model.Model` on :meth:`simulate` and :meth:`measure`."""
+
+    latent_step = 1.0  # of the differences by latent forces [N or N m]
+
+    def __init__(
+        self, effects: Sequence[Effect], channels: Sequence[str], stretches: Sequence[Stretch], inputs: Sequence[str] = ()
+    ) -> None:
+        """Take effects, channels and windows.
+
+        Args:
+            effects: Catalogue; an entry that needs a channel that is neither measured nor an input cannot be seen.
+            channels: That residuals are taken of.
+            stretches: Windows.
+            inputs: Channels that are there and drive the simulation.
+
+        Raises:
+            LogError: There is no window: nothing in the logs that the model could be held against.
+        """
+        if not stretches:
+            raise LogError(f"no stretch of these logs shows {', '.join(channels)} in a way that this model explains")
+        given = set(inputs) - set(channels)
+        self.effects = tuple(replace(e, channels=tuple(c for c in e.channels if c not in given)) for e in effects)
+        self.channels, self.stretches = tuple(channels), list(stretches)
+        self._start = np.array([stretch.nuisance for stretch in self.stretches], dtype=float)
+        self._slopes: list[np.ndarray] | None = None
+
+    def simulate(self, lanes: Lanes) -> np.ndarray:
+        """Simulate lanes; the result has the lane as its first axis. Models without a state need not override it."""
+        return np.empty((len(lanes.owner), 0))
+
+    def measure(self, stretch: Stretch, path: np.ndarray, lanes: Lanes) -> np.ndarray:
+        """What the sensors would have measured in lanes of one stretch, shape (L, N)."""
+        raise NotImplementedError
+
+    def knots(self, stretch: Stretch, path: np.ndarray) -> Mapping[str, np.ndarray]:
+        """Simulated quantities at the knots of the latent forces, for laws outside the catalogue; none by default."""
+        return {}
+
+    def size(self, theta: Mapping[str, float]) -> np.ndarray:
+        """Sizes of all effects in order, shape (K,).
+
+        Raises:
+            LogError: An effect that the model does not know.
+        """
+        names = [effect.name for effect in self.effects]
+        for name in theta:
+            if name not in names:
+                raise LogError(f"no effect '{name}'; {suggest(name, names)}")
+        return np.array([float(theta.get(name, 0.0)) for name in names])
+
+    def windows(self, theta: Mapping[str, float]) -> list[Window]:
+        """See :class:`visthrow.diagnose.model.Model`."""
+        size = self.size(theta)
+        residuals = self._settle(size, fresh=True)
+        slopes, effects, latent = self._by_nuisance(size), self._by_effect(size), self._by_latent(size)
+        self._slopes = slopes
+        path = self.simulate(self._lanes(size))
+        return [
+            Window(
+                s.flight, s.phase, s.time, s.channel, residuals[i], s.sigma, effects[i], slopes[i], s.nuisance_sd, latent[i],
+                s.latent_block, s.latent_axis, s.latent_time, self.knots(s, path[i]),
+            )
+            for i, s in enumerate(self.stretches)
+        ]  # fmt: skip
+
+    def residuals(self, theta: Mapping[str, float]) -> list[np.ndarray]:
+        """See :class:`visthrow.diagnose.model.Model`."""
+        return self._settle(self.size(theta))
+
+    def _lanes(self, size: np.ndarray, start: np.ndarray | None = None) -> Lanes:
+        """One lane a stretch."""
+        count = len(self.stretches)
+        start = self._start if start is None else start
+        return Lanes(np.arange(count), np.tile(size, (count, 1)), start, np.zeros((count, len(self.stretches[0].latent_block))))
+
+    def _run(self, lanes: Lanes) -> list[np.ndarray]:
+        """Measurements of all lanes, in batches; lane by lane, as windows differ in their number of samples."""
+        out: list[np.ndarray] = [np.empty(0)] * len(lanes.owner)
+        for first in range(0, len(lanes.owner), MOST_LANES):
+            rows = np.arange(first, min(first + MOST_LANES, len(lanes.owner)))
+            part = lanes.part(rows)
+            path = self.simulate(part)
+            for i in np.unique(part.owner):
+                own = np.flatnonzero(part.owner == i)
+                for row, samples in zip(rows[own], self.measure(self.stretches[i], path[own], part.part(own))):
+                    out[row] = samples
+        return out
+
+    def _off(self, size: np.ndarray, start: np.ndarray) -> list[np.ndarray]:
+        return [s.measured - out for s, out in zip(self.stretches, self._run(self._lanes(size, start)))]
+
+    def _settle(self, size: np.ndarray, fresh: bool = False) -> list[np.ndarray]:
+        """Fit what is not known at the start, window by window; returns the residuals."""
+        residuals = self._off(size, self._start)
+        if not self._start.shape[1]:
+            return residuals
+        if self._slopes is None or fresh:
+            self._slopes = self._by_nuisance(size)
+        costs = self._costs(residuals, self._start)
+        for _ in range(SETTLE_STEPS):
+            steps = np.array([self._newton(i, residual) for i, residual in enumerate(residuals)])
+            before = costs.copy()
+            for shrink in (1.0, 0.3):
+                trial = self._start + shrink * steps
+                after = self._off(size, trial)
+                found = self._costs(after, trial)
+                better = found < costs
+                self._start = np.where(better[:, None], trial, self._start)
+                residuals = [new if yes else old for new, old, yes in zip(after, residuals, better)]
+                costs = np.where(better, found, costs)
+                steps = np.where(better[:, None], 0.0, steps)
+                if np.all(better | (np.max(np.abs(steps), 1) == 0.0)):
+                    break
+            if np.max(before - costs) < 2 * SETTLED:
+                break
+        return residuals
+
+    def _costs(self, residuals: list[np.ndarray], start: np.ndarray) -> np.ndarray:
+        costs = []
+        for s, residual, at in zip(self.stretches, residuals, start):
+            value = np.sum((residual / s.sigma) ** 2) + np.sum(((at - s.nuisance) / s.nuisance_sd) ** 2)
+            costs.append(value if np.isfinite(value) else np.inf)
+        return np.array(costs)
+
+    def _newton(self, i: int, residual: np.ndarray) -> np.ndarray:
+        s, slope = self.stretches[i], self._slopes[i]
+        weight, prior = 1.0 / s.sigma, 1.0 / s.nuisance_sd
+        rows = np.concatenate([slope * weight[:, None], np.diag(prior)])
+        aim = np.concatenate([residual * weight, (s.nuisance - self._start[i]) * prior])
+        return np.linalg.lstsq(rows, aim, rcond=None)[0]
+
+    def _differences(self, size: np.ndarray, theta: np.ndarray, nuisance: np.ndarray, latent: np.ndarray) -> list[np.ndarray]:
+        """Half the difference between going along and against each direction, one (directions, N) a stretch.
+
+        Args:
+            size: Where it is taken.
+            theta: Steps of the effects, shape (directions, K).
+            nuisance: Of the unknowns, shape (stretches, directions, D).
+            latent: Of the latent forces, shape (directions, G).
+        """
+        count, directions = len(self.stretches), len(theta)
+        owner = np.repeat(np.arange(count), directions)
+        base = np.repeat(self._start, directions, axis=0)
+        step = nuisance.reshape(count * directions, -1)
+        tiled, forces = np.tile(theta, (count, 1)), np.tile(latent, (count, 1))
+        plus = self._run(Lanes(owner, size + tiled, base + step, forces))
+        minus = self._run(Lanes(owner, size - tiled, base - step, -forces))
+        half = [0.5 * (a - b) for a, b in zip(plus, minus)]
+        return [np.array(half[i * directions : (i + 1) * directions]) for i in range(count)]
+
+    def _zero(self, directions: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        s = self.stretches[0]
+        shape = (len(self.stretches), directions, len(s.nuisance))
+        return np.zeros((directions, len(self.effects))), np.zeros(shape), np.zeros((directions, len(s.latent_block)))
+
+    def _by_nuisance(self, size: np.ndarray) -> list[np.ndarray]:
+        count = len(self.stretches[0].nuisance)
+        if not count:
+            return [np.zeros((len(s.measured), 0)) for s in self.stretches]
+        theta, nuisance, latent = self._zero(count)
+        steps = NUISANCE_STEP * np.array([s.nuisance_sd for s in self.stretches])
+        nuisance += steps[:, :, None] * np.eye(count)
+        return [(half / step[:, None]).T for half, step in zip(self._differences(size, theta, nuisance, latent), steps)]
+
+    def _by_effect(self, size: np.ndarray) -> list[np.ndarray]:
+        steps = EFFECT_STEP * np.array([effect.prior_sd for effect in self.effects])
+        _, nuisance, latent = self._zero(len(steps))
+        return [(half / steps[:, None]).T for half in self._differences(size, np.diag(steps), nuisance, latent)]
+
+    def _by_latent(self, size: np.ndarray) -> list[np.ndarray]:
+        count = len(self.stretches[0].latent_block)
+        if not count:
+            return [np.zeros((len(s.measured), 0)) for s in self.stretches]
+        theta, nuisance, _ = self._zero(count)
+        steps = self.latent_step * np.eye(count)
+        return [(half / self.latent_step).T for half in self._differences(size, theta, nuisance, steps)]
+
+
+def rk4(slope: Callable[[int, np.ndarray], np.ndarray], state: np.ndarray, at: int, step: np.ndarray) -> np.ndarray:
+    """One Runge-Kutta step of fourth order.
+
+    Args:
+        slope: Of the half step counted from the start, and the state.
+        state: Shape (B, S).
+        at: Number of the half step at which it begins.
+        step: [s], shape (B, 1).
+    """
+    half = 0.5 * step
+    k1 = slope(at, state)
+    k2 = slope(at + 1, state + half * k1)
+    k3 = slope(at + 1, state + half * k2)
+    k4 = slope(at + 2, state + step * k3)
+    return state + step / 6.0 * (k1 + 2.0 * (k2 + k3) + k4)
+
+
+def integrate(slope: Callable[[int, np.ndarray], np.ndarray], state: np.ndarray, steps: int, step: np.ndarray) -> np.ndarray:
+    """Path of lanes on their grids, shape (B, steps + 1, S)."""
+    path = np.empty((len(state), steps + 1, state.shape[1]))
+    path[:, 0] = state
+    for i in range(steps):
+        state = rk4(slope, state, 2 * i, step)
+        path[:, i + 1] = state
+    return path
+
+
+def hermite(time: np.ndarray, start: float, step: float, value: np.ndarray, rate: np.ndarray) -> np.ndarray:
+    """Values at stamps from values and rates on an even grid, cubic.
+
+    Args:
+        time: [s], shape (N,), or one set of stamps a lane, (L, N).
+        start: Of the grid [s].
+        step: Of the grid [s].
+        value: Shape (L, T, C).
+        rate: Their derivatives, shape (L, T, C).
+
+    Returns:
+        Shape (L, N, C).
+    """
+    at = np.broadcast_to((np.asarray(time) - start) / step, (len(value), np.shape(time)[-1]))
+    left = np.clip(at.astype(int), 0, value.shape[1] - 2)
+    s = (at - left)[..., None]
+    lane = np.arange(len(value))[:, None]
+    a, b, da, db = value[lane, left], value[lane, left + 1], rate[lane, left], rate[lane, left + 1]
+    out = (1 + 2 * s) * (1 - s) ** 2 * a + s**2 * (3 - 2 * s) * b
+    return out + step * (s * (1 - s) ** 2 * da + s**2 * (s - 1) * db)
+
+
+def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Cross product over the last axis, in the way that is fast for many short vectors."""
+    from sim.reference.rotations import cross as fast
+
+    return fast(a, b)
+
+
+def triangles(time: np.ndarray, knots: np.ndarray) -> np.ndarray:
+    """Weights of the knots at each time: linear between neighbours, shape (T, knots)."""
+    return np.column_stack([np.interp(time, knots, row) for row in np.eye(len(knots))])
+
+
+def latent_layout(
+    start: float, end: float, count: int, blocks: Sequence[int], axes: Sequence[int] = (0, 1, 2)
+) -> dict[str, np.ndarray]:
+    """Knots of latent forces over a stretch: arguments of :class:`Stretch`.
+
+    Args:
+        start: [s].
+        end: [s].
+        count: Of the knots, the same in all stretches.
+        blocks: Indices into :data:`visthrow.diagnose.model.LATENT_BLOCKS`.
+        axes: Of each block.
+    """
+    times = np.linspace(start, end, count)
+    layout = [(block, axis, time) for block in blocks for axis in axes for time in times]
+    block, axis, time = (np.array(column) for column in zip(*layout))
+    return {"latent_block": block.astype(int), "latent_axis": axis.astype(int), "latent_time": time.astype(float)}
+
+
+def latent_force(latent: np.ndarray, steps: int, blocks: int, axes: int = 3) -> np.ndarray:
+    """Latent forces at the half steps of the grid.
+
+    Args:
+        latent: Coefficients, shape (B, G), ordered by :func:`latent_layout`.
+        steps: Of the grid.
+        blocks: Number of blocks in the layout.
+        axes: Of each block.
+
+    Returns:
+        Shape (2 steps + 1, blocks, B, axes).
+    """
+    knots = latent.shape[1] // (blocks * axes)
+    weights = triangles(np.linspace(0.0, 1.0, 2 * steps + 1), np.linspace(0.0, 1.0, knots))
+    return np.einsum("xbak,tk->tbxa", latent.reshape(len(latent), blocks, axes, knots), weights)

@@ -1,0 +1,122 @@
+"""A pendulum on an encoder: natural frequency, friction of three kinds, and errors of the encoder."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from visthrow.diagnose.check.signals import noise
+from visthrow.diagnose.model import Effect
+from visthrow.diagnose.models.numeric import (
+    Lanes,
+    NumericModel,
+    Stretch,
+    hermite,
+    integrate,
+    latent_force,
+    latent_layout,
+)
+from visthrow.flightlog import FlightLog
+
+CHANNEL = "angle"
+KNOTS = 11
+"""Of the latent torque per inertia over a window; told as one axis of the payload's force."""
+SMOOTH = 0.02
+"""Dry friction changes its sign over this rate [rad/s]: narrower than any swing, wide enough for the integrator."""
+
+
+@dataclass(frozen=True)
+class PendulumParams:
+    """The pendulum that is assumed before anything is found."""
+
+    gravity: float  # [m/s^2]
+    length: float  # of the equivalent simple pendulum, inertia about the pivot over mass times lever [m]
+    hanging: float  # what the encoder says where it hangs [rad]
+    viscous: float  # friction in proportion to the rate, per inertia [1/s]
+    coulomb: float  # dry friction per inertia [rad/s^2]
+    quadratic: float  # air drag per inertia [1/rad]
+    window: float  # [s]
+    step: float  # of the integration [s]
+    every: int  # the samples taken: each so-manieth
+
+
+def effects(params: PendulumParams) -> list[Effect]:
+    """Catalogue of the pendulum."""
+    seen, joint = (CHANNEL,), "rope"
+    spread = 0.05 * params.length
+    return [
+        Effect("pendulum_length", "the pendulum's equivalent length", "a = -g / (l + theta) sin(angle)", "m", joint,
+               (-0.5 * params.length, params.length), spread, 2e-4 * params.length, seen, "inertia about the pivot", (),
+               ("swing at two amplitudes",)),
+        Effect("viscous_friction", "friction in proportion to the rate", "a -= theta rate", "1/s", joint, (-0.5, 2.0), 0.1, 5e-4,
+               seen, "bearing grease", ("quadratic_drag", "coulomb_friction"), ("swing from large to small amplitude",)),
+        Effect("coulomb_friction", "dry friction", "a -= theta sign(rate)", "rad/s^2", joint, (-0.5, 2.0), 0.1, 2e-3, seen,
+               "bearing", ("viscous_friction",), ("swing until it stops",)),
+        Effect("quadratic_drag", "air drag", "a -= theta |rate| rate", "1/rad", "payload aero", (-0.2, 0.5), 0.02, 1e-4, seen,
+               "drag of a bluff body", ("viscous_friction",), ("swing from large to small amplitude",)),
+        Effect("encoder_offset", "the encoder's zero", "y = angle + theta", "rad", "sensing", (-0.5, 0.5), 0.03, 5e-4, seen,
+               "mounting", (), ("let it hang",)),
+        Effect("encoder_scale", "the encoder's scale", "y = (1 + theta) angle", "1", "sensing", (-0.3, 0.3), 0.02, 5e-4, seen,
+               "lines a turn", (), ("swing at two amplitudes",)),
+        Effect("clock_rate", "the logger's clock", "dt = (1 + theta) dt_stated", "1", "sensing", (-0.05, 0.05), 1e-3, 1e-4, seen,
+               "logger", ("pendulum_length",), ("another clock",)),
+    ]  # fmt: skip
+
+
+class PendulumModel(NumericModel):
+    """Free swings, cut into windows."""
+
+    def __init__(self, logs: Sequence[FlightLog], params: PendulumParams) -> None:
+        """Cut the logs.
+
+        Raises:
+            LogError: None of them holds an angle.
+        """
+        self.params = params
+        stretches = [s for i, log in enumerate(logs) if CHANNEL in log for s in _windows(log, i, params)]
+        self._steps = round(params.window / params.step)
+        super().__init__(effects(params), (CHANNEL,), stretches)
+
+    def simulate(self, lanes: Lanes) -> np.ndarray:
+        """See the base class; the unknowns are angle from hanging and rate at the window's start. Returns them over the grid."""
+        p = self.params
+        length, viscous, coulomb, quadratic, _, _, clock = lanes.theta.T
+        stiffness = p.gravity / (p.length + length)
+        viscous, coulomb, quadratic = p.viscous + viscous, p.coulomb + coulomb, p.quadratic + quadratic
+        push = latent_force(lanes.latent, self._steps, 1, 1)[:, 0, :, 0]
+
+        def slope(at: int, state: np.ndarray) -> np.ndarray:
+            angle, rate = state.T
+            friction = viscous * rate + coulomb * np.tanh(rate / SMOOTH) + quadratic * np.abs(rate) * rate
+            return np.stack([rate, -stiffness * np.sin(angle) - friction + push[at]], 1)
+
+        step = p.window / self._steps * (1.0 + clock[:, None])
+        return integrate(slope, lanes.nuisance.copy(), self._steps, step)
+
+    def measure(self, stretch: Stretch, path: np.ndarray, lanes: Lanes) -> np.ndarray:
+        """See the base class."""
+        offset, scale, clock = lanes.theta.T[4:]
+        rate = path[..., 1:] * (1.0 + clock[:, None, None])
+        angle = hermite(stretch.time, stretch.data["start"], self.params.window / self._steps, path[..., :1], rate)[..., 0]
+        return angle * (1.0 + scale)[:, None] + offset[:, None] + self.params.hanging
+
+
+def _windows(log: FlightLog, number: int, params: PendulumParams) -> list[Stretch]:
+    channel = log[CHANNEL]
+    time, angle = channel.time[channel.valid], channel.values[channel.valid].astype(float)
+    sigma = max(float(noise(channel)[0]), 1e-5)
+    found = []
+    for start in np.arange(time[0], time[-1] - 0.5 * params.window, params.window):
+        inside = np.flatnonzero((time >= start) & (time < start + params.window))[:: params.every]
+        if len(inside) < 20:
+            continue
+        t, y = time[inside], angle[inside]
+        fit = np.polynomial.polynomial.polyfit(t[:12] - start, y[:12] - params.hanging, 2)
+        found.append(
+            Stretch(
+                number, "swing", t, np.zeros(len(t), dtype=int), y, np.full(len(t), sigma), fit[:2], np.array([0.2, 1.0]),
+                {"start": start}, **latent_layout(start, start + params.window, KNOTS, (2,), (0,)),
+            )
+        )  # fmt: skip
+    return found
+

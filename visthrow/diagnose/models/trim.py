@@ -1,0 +1,155 @@
+"""Mean commands of the four motors in slow flight: what feedback had to do so that forces and torques balance.
+
+Where neither attitude nor rates are logged, the balance still tells: thrusts must carry the weight and turn nothing.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from visthrow.diagnose.check.relations import derivative
+from visthrow.diagnose.model import Effect
+from visthrow.diagnose.models.numeric import Lanes, NumericModel, Stretch, latent_layout
+from visthrow.flightlog import FlightLog
+
+MOTORS = ("fl", "fr", "rl", "rr")
+WORDS = {"fl": "front left", "fr": "front right", "rl": "rear left", "rr": "rear right"}
+
+
+@dataclass(frozen=True)
+class TrimParams:
+    """The vehicle as it was before: from its own unharmed flights."""
+
+    command: str  # channel of the motors' commands
+    position: str  # channel of the measured position
+    velocity: str  # channel of the measured velocity
+    mass: float  # [kg]
+    gravity: float  # [m/s^2]
+    thrust_map: tuple[float, float, float]  # thrust of a motor by powers of its command [N]
+    reference_voltage: float  # [V]
+    voltage_coefficient: float  # [1/V]
+    motor_scale: tuple[float, float, float, float]  # each motor's thrust over the map
+    arm: float  # of each rotor along x and along y [m]
+    torque_ratio: float  # [m]
+    spin: tuple[float, float, float, float]
+    lowest: float  # [m]
+    slowest_window: float  # windows' length [s]
+    fastest: float  # mean speed of a window [m/s]
+    spread: float  # of a window's mean command, by draught and control [1]
+
+
+def effects(params: TrimParams) -> list[Effect]:
+    """Catalogue of the balance."""
+    seen, arm = (params.command, params.position), params.arm
+    found = [
+        Effect(f"motor_{key}", f"the {words} propeller's thrust", "f_i (1 + theta)", "1", "thrust map", (-0.7, 0.7), 0.1, 1e-2,
+               seen, "fault detection literature", ("added_mass",), ("yaw response",)) for key, words in WORDS.items()
+    ]  # fmt: skip
+    found += [
+        Effect(f"added_{key}", f"a weight near the {words} motor", "m + theta at the rotor", "kg", "rigid body",
+               (0.0, 0.3 * params.mass), 0.05 * params.mass, 4e-3 * params.mass, seen, "a scale", (f"motor_{key}",),
+               ("weigh the vehicle",)) for key, words in WORDS.items()
+    ]  # fmt: skip
+    found += [
+        Effect("mass_quad", "the vehicle's mass", "m + theta", "kg", "rigid body", (-0.3 * params.mass, 0.5 * params.mass),
+               0.05 * params.mass, 4e-3 * params.mass, seen, "a scale", ("thrust_gain",), ("weigh the vehicle",)),
+        Effect("thrust_gain", "all motors' thrust", "f (1 + theta)", "1", "thrust map", (-0.6, 0.6), 0.1, 4e-3, seen,
+               "Agilicious 2022", ("mass_quad",), ("weigh the vehicle",)),
+        Effect("battery_sag", "the thrust's dependence on the battery voltage", "f (1 + theta (u - u_ref))", "1/V", "battery",
+               (-1.0, 1.0), 0.1, 5e-3, (*seen, "battery_voltage"), "Bauersfeld and Scaramuzza 2022", ("thrust_gain",),
+               ("fresh and empty pack",)),
+        *(Effect(f"com_{axis}", f"the centre of mass lies off along {axis}", "torque = r x T", "m", "rigid body",
+                 (-0.5 * arm, 0.5 * arm), 0.05 * arm, 5e-3 * arm, seen, "build", (), ()) for axis in "xy"),
+        Effect("yaw_trim", "one turning sense's drag torque", "torque_z += theta kappa T / 4", "1", "thrust map", (-0.7, 0.7), 0.05,
+               1e-2, seen, "propeller wear", ("motor_fl", "motor_fr", "motor_rl", "motor_rr"), ("yaw doublets",)),
+    ]  # fmt: skip
+    return found
+
+
+class TrimModel(NumericModel):
+    """Means over windows of slow level flight."""
+
+    def __init__(self, logs: Sequence[FlightLog], params: TrimParams) -> None:
+        """Cut the logs.
+
+        Raises:
+            LogError: None of them flies slowly with motor commands logged.
+        """
+        self.params = params
+        usable = [(i, log) for i, log in enumerate(logs) if params.command in log and params.position in log]
+        stretches = [s for i, log in usable for s in _cut(log, i, params)]
+        super().__init__(effects(params), (params.command,), stretches, (params.position, "battery_voltage"))
+
+    def measure(self, stretch: Stretch, path: np.ndarray, lanes: Lanes) -> np.ndarray:
+        """See the base class: the commands at which everything balances, shape (B, 4)."""
+        p, theta = self.params, lanes.theta
+        motors, added = theta[:, :4], theta[:, 4:8]
+        mass, gain, sag, com_x, com_y, yaw = theta[:, 8:].T
+        x, y = p.arm * np.array([1.0, 1.0, -1.0, -1.0]), p.arm * np.array([1.0, -1.0, 1.0, -1.0])
+        weight = (p.mass + mass + added.sum(1)) * p.gravity
+        total = p.mass + mass + added.sum(1)
+        off_x = ((p.mass + mass) * com_x + added @ x) / total
+        off_y = ((p.mass + mass) * com_y + added @ y) / total
+        spin = np.array(p.spin)
+        lift = stretch.data["lift"]
+        push, roll, pitch, turn = lanes.latent.reshape(len(theta), 4, 2).mean(2).T  # the last three are torques
+        share = np.outer(off_x, x) / p.arm**2 + np.outer(off_y, y) / p.arm**2 - np.outer(yaw, spin)
+        thrust = 0.25 * (1.0 + share) * (weight * lift)[:, None] - 0.25 * push[:, None]
+        thrust = thrust - 0.25 * (np.outer(roll, y) - np.outer(pitch, x)) / p.arm**2 - 0.25 * np.outer(turn, spin) / p.torque_ratio
+        volts = 1.0 + (p.voltage_coefficient + sag) * (stretch.data["volts"] - p.reference_voltage)
+        per_map = thrust / (np.array(p.motor_scale) * (1.0 + motors) * ((1.0 + gain) * volts)[:, None])
+        return command_of(p.thrust_map, per_map)
+
+
+def command_of(thrust_map: Sequence[float], thrust: np.ndarray) -> np.ndarray:
+    """Command at which the map gives a thrust."""
+    c0, c1, c2 = thrust_map
+    if c2 == 0.0:
+        return (thrust - c0) / c1
+    return (-c1 + np.sqrt(np.maximum(c1 * c1 - 4.0 * c2 * (c0 - thrust), 0.0))) / (2.0 * c2)
+
+
+def _latent(start: float, end: float) -> dict[str, np.ndarray]:
+    """Draught in a window: a push along the vertical and three torques."""
+    push, torque = latent_layout(start, end, 2, (0,), (2,)), latent_layout(start, end, 2, (1,))
+    return {name: np.concatenate([push[name], torque[name]]) for name in push}
+
+
+def _cut(log: FlightLog, number: int, params: TrimParams) -> list[Stretch]:
+    position, command = log[params.position], log[params.command]
+    time_v, vel = derivative(position.time[position.valid], position.values[position.valid].astype(float), 0.2)
+    if params.velocity in log:
+        channel = log[params.velocity]
+        time_v, vel = channel.time[channel.valid], channel.values[channel.valid].astype(float)
+    found = []
+    for start in np.arange(command.time[0], command.time[-1] - params.slowest_window, params.slowest_window):
+        end = start + params.slowest_window
+        inside = command.valid & (command.time >= start) & (command.time < end)
+        near = (position.time >= start) & (position.time < end) & position.valid
+        moving = (time_v >= start) & (time_v < end)
+        if np.sum(inside) < 20 or np.sum(near) < 20 or np.sum(moving) < 20:
+            continue
+        speed = float(np.mean(np.linalg.norm(vel[moving], axis=1)))
+        if np.min(position.values[near][:, 2]) < params.lowest or speed > params.fastest:
+            continue
+        climb = (vel[moving][-5:, 2].mean() - vel[moving][:5, 2].mean()) / params.slowest_window
+        volts = _volts(log, start, end)
+        mean = np.mean(command.values[inside].astype(float), axis=0)
+        found.append(
+            Stretch(
+                number, "hover", np.full(4, start), np.zeros(4, dtype=int), mean, np.full(4, params.spread),
+                np.zeros(0), np.zeros(0),
+                {"volts": params.reference_voltage if volts is None else volts, "lift": 1.0 + climb / params.gravity},
+                **_latent(start, end),
+            )
+        )  # fmt: skip
+    return found
+
+
+def _volts(log: FlightLog, start: float, end: float) -> float | None:
+    if "battery_voltage" not in log:
+        return None
+    channel = log["battery_voltage"]
+    inside = channel.valid & (channel.time >= start) & (channel.time < end)
+    return float(np.mean(channel.values[inside])) if np.any(inside) else None
