@@ -214,3 +214,21 @@ def test_records_refuse_what_they_are_not(kept):
 def test_mistakes_are_told(words, message, capsys):
     assert cli.main(["bench", *words]) == 2
     assert message in capsys.readouterr().err
+
+
+def test_mpc_steps_are_timed_and_recorded(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("piqp")
+    from visthrow.baseline import spline
+    from visthrow.bench import mpc
+
+    monkeypatch.setattr(spline, "LONGEST", (1.4,))  # one start of the optimisation instead of five
+    monkeypatch.setattr(mpc, "TARGETS", (1.5,))
+    monkeypatch.setattr(records, "FOLDER", tmp_path)
+    assert cli.main(["bench", "mpc", "--throws", "1", "--record", "mpc-test"]) == 0
+    rows = records.load(tmp_path / "mpc-test.json")["figures"]["rows"]
+    assert [row["plant"] for row in rows] == ["pendulum", "hybrid"]
+    for row in rows:
+        assert 0.0 < row["p50_ms"] <= row["p99_ms"] <= row["max_ms"]
+        assert row["steps"] > 40
+    assert "| 1.5 m" in capsys.readouterr().out
+    assert cli.main(["bench", "mpc", "--throws", "0"]) == 2

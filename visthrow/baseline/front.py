@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from visthrow.baseline.fly import COMPENSATIONS as COMPENSATIONS
-from visthrow.baseline.fly import delays_of, fly_pendulum, fly_plant
+from visthrow.baseline.fly import Flown, delays_of, fly_pendulum, fly_plant
 from visthrow.baseline.pendulum import Pendulum, pendulum_of
 from visthrow.baseline.plan import Plan, plan_throw
 from visthrow.baseline.release import default_release
@@ -60,19 +60,20 @@ class Study:
         period = self.experiment.sim.control_period
         return plan_throw(self.model, target, height, speed, weights, release.landing_height, period, release.lag)
 
+    def flown(self, plan: Plan, plant: str, compensation: str) -> Flown:
+        """Fly a plan."""
+        if plant == "pendulum":
+            return fly_pendulum(plan, self.throws, self.seed, self.experiment.release.landing_height)
+        return fly_plant(plan, plant, self.experiment, delays_of(self.experiment, compensation), self.throws, self.seed)
+
     def fly(self, plan: Plan, plant: str, compensation: str) -> dict:
         """Fly a plan and describe the result as one row."""
-        if plant == "pendulum":
-            flown = fly_pendulum(plan, self.throws, self.seed, self.experiment.release.landing_height)
-        else:
-            delays = delays_of(self.experiment, compensation)
-            flown = fly_plant(plan, plant, self.experiment, delays, self.throws, self.seed)
         settings = {
             "plant": plant, "compensation": compensation, "target": plan.target, "planned": plan.duration,
             "speed": float(plan.release.vel_w[0]), "height": float(plan.release.pos_w[2]),
             "w_t": plan.params.duration, "rho": plan.params.energy,
         }  # fmt: skip
-        return {**settings, **flown.summary()}
+        return {**settings, **self.flown(plan, plant, compensation).summary()}
 
 
 Progress = Callable[[str], None]

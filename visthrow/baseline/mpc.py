@@ -89,8 +89,8 @@ class MPC:
         settings.eps_abs, settings.eps_rel = 1e-6, 1e-8
         settings.check_duality_gap = False
         self._solved = piqp.PIQP_SOLVED
-        self._ready = False
         self.reset()
+        self._set_up(np.zeros(size), np.zeros(self._matrix.shape[0]))
 
     def reset(self) -> None:
         """Forget the last solution."""
@@ -163,15 +163,19 @@ class MPC:
         if self._ready:
             self._solver.update(c=linear, A=self._matrix, b=right)
         else:
-            low, high = self._bounds
-            cost = sparse.diags(self._weights, format="csc")
-            self._solver.setup(cost, linear, self._matrix, right, x_l=low, x_u=high)
-            self._ready = True
+            self._set_up(linear, right)
         status = self._solver.solve()
         if status != self._solved:
             self._ready = False
             raise SolverError(f"the controller's quadratic programme ended with {status}; expected {self._solved}")
         return np.asarray(self._solver.result.x)
+
+    def _set_up(self, linear: np.ndarray, right: np.ndarray) -> None:
+        """Hand the whole programme over, with its pattern; after that only its numbers change."""
+        low, high = self._bounds
+        cost = sparse.diags(self._weights, format="csc")
+        self._solver.setup(cost, linear, self._matrix, right, x_l=low, x_u=high)
+        self._ready = True
 
     def _moved_on(self, states: np.ndarray, inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The solution one period later, its last input held; directions and quaternions back at unit length."""

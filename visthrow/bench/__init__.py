@@ -10,6 +10,7 @@ KINDS = {
     "detector": ("recall, precision and pixel error of the keypoint detector on rendered frames", "visthrow.bench.detector"),
     "train": ("where the wall time of a training iteration goes", "visthrow.bench.iteration"),
     "hil": ("the HIL runner over loopback: latency and soak, throws over the wire, faults", "visthrow.bench.hil"),
+    "mpc": ("a step of the baseline's controller, and its tracking error", "visthrow.bench.mpc"),
     "records": ("print the recorded measurements as Markdown", "visthrow.bench.records"),
 }
 """Name -> (help, module). The module has ``run(args) -> int``; it is imported only when chosen."""
@@ -26,10 +27,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "  visthrow bench train state --device cuda       simulation, environment, inference and learning\n"
         "  visthrow bench hil --minutes 1                 message in to command out, missed ticks, memory\n"
         "  visthrow bench hil --throws 60 --policy state  throws over the wire, and the same without it\n"
+        "  visthrow bench mpc                             a step of the baseline's controller; needs piqp\n"
         "  visthrow bench records                         what was measured before, on which machine and commit\n"
     )
     kinds = parser.add_subparsers(dest="bench", metavar="WHAT", title="what to measure", required=True)
-    sim, camera, detector, train, hil, records = (
+    sim, camera, detector, train, hil, mpc, records = (
         kinds.add_parser(name, help=text, description=text) for name, (text, _) in KINDS.items()
     )
     _add_sim(sim)
@@ -46,9 +48,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         kind.add_argument(
             "--repeats", type=int, default=5, metavar="N", help="measurements; the median counts (default: 5)"
         )
+    mpc.add_argument("--throws", type=int, default=10, metavar="N", help="a target and plant (default: 10)")
+    for kind in (sim, mpc):
+        kind.add_argument("--core", type=int, metavar="N", help="CPU core to stay on (default: the last one)")
+        kind.add_argument(
+            "--config", default="state", metavar="NAME", help="training configuration whose plant is measured (default: state)"
+        )
     for kind in (sim, camera, detector, train):
         add_common(kind)
-    for kind in (sim, camera, train, hil):
+    add_common(mpc, device=False)
+    for kind in (sim, camera, train, hil, mpc):
         kind.add_argument("--record", metavar="NAME", help="keep the result in the package's records under this name")
     sim.set_defaults(device="cpu")
     records.add_argument("names", metavar="NAME", nargs="*", help="records to print (default: all)")
@@ -70,12 +79,6 @@ def _add_hil(parser: argparse.ArgumentParser) -> None:
 
 def _add_sim(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--config",
-        default="state",
-        metavar="NAME",
-        help="training configuration whose plant is measured (default: state)",
-    )
-    parser.add_argument(
         "--batch",
         type=int,
         nargs="+",
@@ -85,7 +88,6 @@ def _add_sim(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--seconds", type=float, default=1.0, metavar="S", help="wall time of one measurement, about (default: 1)"
     )
-    parser.add_argument("--core", type=int, metavar="N", help="CPU core to stay on (default: the last one)")
     parser.add_argument("--without-mujoco", action="store_true", help="measure this simulator alone")
 
 
