@@ -24,6 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "  visthrow compare vision runs/v2/policy.npz     a shipped policy against one of your own\n"
         "  visthrow compare state baseline --throws 50    against trajectory optimisation and MPC on the same throws\n"
         "  visthrow compare --plant reference-realistic --throws 50   on the stand-in for a real vehicle (minutes)\n"
+        "  visthrow compare --from runs/hil/*              throws of HIL runs, from their folders\n"
         "\nA throw starts in hover with the payload near z = 0.95 m. The landing error is the horizontal distance\n"
         "from the target, the duration counts from the policy's start to the landing, smoothness is the root mean\n"
         "square change of the normalised commands from step to step. The policy 'baseline' stands for four rows: in the\n"
@@ -32,6 +33,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     kinds = "shipped names, policy files, or baseline (default: state vision)"
     parser.add_argument("policies", metavar="POLICY", nargs="*", help=kinds)
+    parser.add_argument(
+        "--from", dest="runs", nargs="+", metavar="RUN", help="throw nothing: take the throws of HIL runs from their folders"
+    )
     parser.add_argument(
         "--targets", type=float, nargs="+", default=list(DEFAULT_TARGETS), metavar="M", help="distances along x [m]"
     )
@@ -50,6 +54,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Throw, print, write."""
+    if args.runs:
+        return _from_runs(args)
     check(args.targets, args.throws)
     from visthrow.baseline.thrower import NAME
     from visthrow.device import resolve
@@ -84,6 +90,31 @@ def run(args: argparse.Namespace) -> int:
         from visthrow.storage import write_json
 
         write_json(args.json, {"plant": args.plant, "seed": args.seed, "rows": rows})
+    return 0
+
+
+def _from_runs(args: argparse.Namespace) -> int:
+    """The same table and files from the folders of HIL runs.
+
+    Raises:
+        ConfigError: policies were named as well.
+    """
+    from visthrow import from_runs
+    from visthrow.storage import write_json
+
+    if args.policies:
+        raise ConfigError(f"--from with policies {' '.join(args.policies)}; the runs say which policies were flown")
+    writable(Path(args.out))
+    logs = from_runs.logs_of(args.runs)
+    entries = from_runs.entries(logs)
+    rows = [row for row in rows_of(entries) if row["throws"]]
+    how = ", ".join(sorted({log.meta["plant_meaning"] for log in logs}))
+    title = f"Throws from hover on {how}: {len(logs)} throws of {len(args.runs)} runs"
+    print(report(title, rows, from_runs.NOTE))
+    for path in write(Path(args.out), entries, rows, "runs", title, f"{len(logs)} throws of HIL runs", from_runs.NOTE):
+        print(path)
+    if args.json:
+        write_json(args.json, {"plant": "runs", "runs": args.runs, "rows": rows})
     return 0
 
 
@@ -207,24 +238,28 @@ def rows_of(entries: Sequence[Entry]) -> list[dict]:
     ]
 
 
-def report(title: str, rows: Sequence[dict]) -> str:
+def report(title: str, rows: Sequence[dict], note: str | None = None) -> str:
     """Table with its note on the paper's figures."""
     from visthrow.tables import PAPER_NOTE, markdown
 
-    return f"{markdown(rows, title)}\n{PAPER_NOTE}\n"
+    return f"{markdown(rows, title)}\n{note or PAPER_NOTE}\n"
 
 
-def write(folder: Path, entries: Sequence[Entry], rows: Sequence[dict], plant: str, title: str) -> list[Path]:
+def write(
+    folder: Path, entries: Sequence[Entry], rows: Sequence[dict], plant: str, title: str, subtitle: str | None = None,
+    note: str | None = None,
+) -> list[Path]:  # fmt: skip
     """Write Markdown, CSV and scatter plot; returns their paths."""
     from visthrow import scatter, tables
     from visthrow.storage import atomic_write
 
     stem = f"compare-{plant}"
     paths = [folder / f"{stem}.md", folder / f"{stem}.csv", folder / f"{stem}.png"]
-    atomic_write(paths[0], report(title, rows))
+    atomic_write(paths[0], report(title, rows, note))
     atomic_write(paths[1], tables.csv_text([(entry.name, plant, of) for entry in entries for of in entry.throws]))
     from visthrow.plants import PLANTS
 
-    count = len(entries[0].throws[0].success)
-    scatter.draw(paths[2], [(e.name, e.throws) for e in entries], f"{count} throws each, {PLANTS[plant]}")
+    if subtitle is None:
+        subtitle = f"{len(entries[0].throws[0].success)} throws each, {PLANTS[plant]}"
+    scatter.draw(paths[2], [(e.name, e.throws) for e in entries], subtitle)
     return paths

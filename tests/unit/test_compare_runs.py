@@ -1,0 +1,98 @@
+"""The table of throws from HIL run folders: several policies, targets and throws a folder, failed throws, wrong folders."""
+
+import json
+
+import numpy as np
+import pytest
+
+from hil.report import finish
+from tests.hil_runs import record_run, saved_policy
+from visthrow import from_runs
+from visthrow.cli import main
+from visthrow.errors import LogError
+from visthrow.flightlog import FlightLog, FlightRecorder
+from visthrow.protocol import Throws
+
+
+def log(policy="vision", goal=(2.0, 0.0, 0.0), landed=(2.1, 0.05, 0.04), sha="a", home=(0.0, 0.0, 1.333)) -> FlightLog:
+    """A throw of five ticks whose commands change by 0.1 each."""
+    result = {"success": landed is not None, "failure": None if landed else "stale poses"}
+    if landed:
+        error = float(np.hypot(landed[0] - goal[0], landed[1] - goal[1]))
+        result |= {"landing_w": list(landed), "error": error, "duration": 1.05}
+    recorder = FlightRecorder({
+        "policy": policy, "policy_sha256": sha * 64, "layout": "vision", "plant": "poses", "plant_meaning": "poses of mavlink",
+        "goal_w": list(goal), "home_w": list(home), "times": {"policy_start": 1.0, "recovery": 1.1}, "result": result,
+    })  # fmt: skip
+    for n in range(5):
+        before, now = np.full(5, 0.1 * n), np.full(5, 0.1 * (n + 1))
+        observation = np.zeros(69)
+        observation[15:20] = before
+        recorder.add(1.0 + 0.02 * n, action=now, observation=observation)
+    return recorder.log()
+
+
+def test_a_row_a_policy_and_target():
+    logs = [log(landed=(2.0 + x, 0.0, 0.04)) for x in (-0.1, 0.1, 0.3)] + [log(landed=None)]
+    logs += [log(goal=(1.5, 0.0, 0.0), landed=(1.5, 0.2, 0.04)), log("state", landed=(2.0, 0.0, 0.04), sha="b")]
+    first, second = from_runs.entries(logs)
+    assert (first.name, second.name) == ("state", "vision")
+    at_15, at_2 = second.throws
+    assert (at_15.target, at_2.target) == (1.5, 2.0)
+    found = at_2.summary()
+    assert (found["throws"], found["success"]) == (4, 0.75)
+    assert found["error_mean"] == pytest.approx(0.5 / 3)
+    assert found["bias_x"] == pytest.approx(0.1)
+    assert at_15.summary()["bias_y"] == pytest.approx(0.2)
+    assert first.throws[0].summary()["throws"] == 0, "the state policy did not throw at 1.5 m"
+
+
+def test_a_goal_to_the_side_of_another_hover_point():
+    (entry,) = from_runs.entries([log(goal=(1.0, 4.0, 0.0), home=(1.0, 2.0, 1.3), landed=(0.9, 4.1, 0.04))])
+    (throws,) = entry.throws
+    assert throws.target == 2.0
+    np.testing.assert_allclose(throws.landing_w, [[2.1, 0.1]], atol=1e-9)
+
+
+def test_two_policies_of_one_name_are_told_apart():
+    names = [entry.name for entry in from_runs.entries([log(sha="a"), log(sha="b")])]
+    assert names == ["vision aaaaaaaa", "vision bbbbbbbb"]
+
+
+def test_smoothness_is_that_of_simulated_throws():
+    assert from_runs.smoothness(log()) == pytest.approx(0.1)
+
+
+def test_the_command(tmp_path, capsys):
+    folder = tmp_path / "flown"
+    record_run(folder, saved_policy(tmp_path), seconds=6.0)
+    finish(folder)
+    other = tmp_path / "other"
+    other.mkdir()
+    log().save(other / "throw-01.npz")
+    log(landed=None).save(other / "throw-02.npz")
+    out = tmp_path / "out"
+    runs = ["--from", str(folder), str(other)]
+    assert main(["compare", *runs, "--out", str(out), "--json", str(tmp_path / "t.json")]) == 0
+    text = capsys.readouterr().out
+    assert "3 throws of 2 runs" in text
+    assert "0.101 ± 0.106, 1.125 ± 0.029" in text, "the paper's figures beside ours"
+    assert "do not say" in text
+    assert {path.name for path in out.iterdir()} == {"compare-runs.md", "compare-runs.csv", "compare-runs.png"}
+    rows = json.loads((tmp_path / "t.json").read_text())["rows"]
+    flown = next(row for row in rows if row["policy"] == "always")
+    assert flown["error_mean"] == pytest.approx(2.0, abs=0.02)
+    assert isinstance(from_runs.entries([FlightLog.load(folder / "throw-01.npz")])[0].throws[0], Throws)
+
+
+def test_what_holds_no_throws(tmp_path, capsys):
+    assert main(["compare", "--from", str(tmp_path / "none")]) == 2
+    assert "no such folder" in capsys.readouterr().err
+    (tmp_path / "summary.json").write_text("{}")
+    with pytest.raises(LogError, match=r"no throw-\*.npz in it \(summary.json\).*visthrow hil view"):
+        from_runs.logs_of([tmp_path])
+    bare = FlightLog({}, {"policy": "x"})
+    with pytest.raises(LogError, match="holds no throw of a run"):
+        from_runs.entries([bare])
+    assert main(["compare", "vision", "--from", str(tmp_path)]) == 2
+    assert "the runs say which policies" in capsys.readouterr().err
