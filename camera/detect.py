@@ -42,8 +42,8 @@ class DetectorParams:
     brightness: float = 0.06  # least value of a pixel [-]
     ball_distance: tuple[float, float] = (0.15, 4.0)  # of the ball from the lens [m]
     field_share: float = 0.84  # side of the goal's coloured field over that of the square with its rim [-]
-    coverage: float = 0.45  # share of the ball's outline that must be seen
-    misfit: float = 0.14  # largest RMS of the outline from its cone, in half-angles
+    coverage: float = 0.35  # share of the ball's outline that must be seen
+    misfit: float = 0.1  # largest RMS of the outline from its cone, in half-angles
     side_tolerance: float = 0.3  # of the goal's sides from what they must be where height and attitude are known [-]
 
 
@@ -125,19 +125,34 @@ class Detector:
         """The blob whose edge is the best cone."""
         best: BallSeen | None = None
         for centre, radius in circles_of(mask):
+            found = self._cone(level, centre, radius)
+            if found is None or not self._in_place(found.ray_c, found.half_angle, known):
+                continue
+            score = found.score
+            if known.ball_ray_c is not None:
+                score -= 0.5 * math.acos(min(1.0, float(found.ray_c @ known.ball_ray_c))) / known.within
+            if best is None or score > best.score:
+                best = BallSeen(found.ray_c, found.half_angle, score)
+        return best
+
+    def _cone(self, level: np.ndarray, centre: np.ndarray, radius: float) -> BallSeen | None:
+        """The cone about a circle [px]; looked for again from where it was found, as part of a ball may hide."""
+        found = None
+        for _ in range(2):
             edge = polar_edge(level, centre, radius)
             if len(edge.points) < 8:
-                continue
+                return None
             ray, half_angle, misfit, share = cone_fit(rays_of(self.lens, edge.points))
             seen = edge.share * share
-            if seen < self.params.coverage or misfit > self.params.misfit or not self._in_place(ray, half_angle, known):
-                continue
-            score = seen - misfit
-            if known.ball_ray_c is not None:
-                score -= 0.5 * math.acos(min(1.0, float(ray @ known.ball_ray_c))) / known.within
-            if best is None or score > best.score:
-                best = BallSeen(ray, half_angle, score)
-        return best
+            if seen < 0.5 * self.params.coverage or not half_angle > 0.0:
+                return None
+            found = BallSeen(ray, half_angle, seen - misfit) if seen >= self.params.coverage else None
+            middle, inside = self.lens.project(torch.from_numpy(ray[None]))
+            if misfit > self.params.misfit or not bool(inside):
+                return None
+            centre = middle[0].numpy()
+            radius = float(np.median(np.linalg.norm(edge.points - centre, axis=1)))
+        return found
 
     def _in_place(self, ray: np.ndarray, half_angle: float, known: Known) -> bool:
         """Whether a ball can be where a cone puts it: its true radius says how far off it is."""

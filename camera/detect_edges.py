@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Literal
 
 import numpy as np
@@ -11,13 +12,17 @@ from camera.fisheye import Fisheye
 
 LEAST_AREA = 14
 """Blobs smaller than this are noise [px]."""
+MOST_PAIRED = 12
+"""Largest blobs that are looked at in pairs."""
+OUTSIDE = 3.0
+"""How far beyond the goal's side its edge is looked for at least [px]."""
 ANGLES = 64
 """Directions in which a ball's edge is looked for."""
 STEP = 0.25
 """Between two samples across an edge [px]."""
 MOST_BENT = 0.12
 """RMS of the goal's edge from its line, over the side."""
-LEAST_RIM = 0.06
+LEAST_RIM = 0.05
 """By which the goal's rim is brighter than what lies beyond, of that: blurred over its width by far frames."""
 OVEREXPOSED = 245.0
 """Above this a pixel says nothing of how bright it is, of 255."""
@@ -87,11 +92,24 @@ def outlines_of(mask: np.ndarray) -> list[np.ndarray]:
 
 
 def circles_of(mask: np.ndarray) -> list[tuple[np.ndarray, float]]:
-    """Circles about the blobs of a mask: centre [px], shape (2,), and radius [px]."""
+    """Circles about the blobs of a mask, and about pairs of near ones, which may be one thing with something across it.
+
+    Returns:
+        Centre [px], shape (2,), and radius [px] of each.
+    """
     import cv2
 
-    circles = (cv2.minEnclosingCircle(outline.astype(np.float32)) for outline in outlines_of(mask))
-    return [(np.array(centre), float(radius)) for centre, radius in circles]
+    outlines = sorted(outlines_of(mask), key=len, reverse=True)
+    circles = [cv2.minEnclosingCircle(outline.astype(np.float32)) for outline in outlines]
+    single = [(np.array(centre), float(radius)) for centre, radius in circles]
+    pairs = []
+    for i, j in combinations(range(min(len(single), MOST_PAIRED)), 2):
+        (first, one), (second, two) = single[i], single[j]
+        if np.linalg.norm(first - second) < one + two:
+            both = np.concatenate([outlines[i], outlines[j]]).astype(np.float32)
+            centre, radius = cv2.minEnclosingCircle(both)
+            pairs.append((np.array(centre), float(radius)))
+    return single + pairs
 
 
 @dataclass(frozen=True)
@@ -224,6 +242,8 @@ def _refined(
             return None
         way = end - start
         length = np.linalg.norm(way, axis=1)
+        way *= (1.0 + np.maximum(0.0, OUTSIDE / np.maximum(length, 1e-9) - 0.35 / 0.75))[:, None]
+        length = np.linalg.norm(way, axis=1)
         reach = np.linspace(0.0, 1.0, max(8, math.ceil(float(length.max()) / STEP)))
         values = _sample(level, start[:, 0, None] + way[:, 0, None] * reach, start[:, 1, None] + way[:, 1, None] * reach)
         found, at = _first_crossing(values, reach)
@@ -349,7 +369,7 @@ def _last_crossing(values: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, n
 
 def _first_crossing(values: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """First fall of each row through half of its level at the start; whether there is one, and where."""
-    plateau = np.median(values[:, : max(2, len(reach) // 4)], axis=1)
+    plateau = np.median(values[:, : max(2, len(reach) // 5)], axis=1)
     falls = (values[:, :-1] > 0.5 * plateau[:, None]) & (values[:, 1:] <= 0.5 * plateau[:, None])
     found = falls.any(axis=1) & (plateau > LEAST_LEVEL)
     return found, _between(values, reach, np.argmax(falls, axis=1), 0.5 * plateau)

@@ -91,7 +91,7 @@ def draw_scene(rng: np.random.Generator, clutter: int) -> Scene:
     thrown = rng.random() < 0.3
     ball = pos + way * (rng.uniform(0.5, 1.5) if thrown else ROPE)
     ball[2] = max(ball[2], 0.05)
-    things = tuple(_clutter(rng, pos, goal, i % 2 == 0) for i in range(clutter))
+    things = tuple(_clutter(rng, pos, goal, ball, i % 2 == 0) for i in range(clutter))
     tensors = [torch.tensor(v[None], dtype=torch.float64) for v in (pos, goal, ball)]
     return Scene(tensors[0], rot, tensors[1], tensors[2], not thrown, things)
 
@@ -101,8 +101,8 @@ def _direction(rng: np.random.Generator) -> np.ndarray:
     return np.array([math.cos(angle), math.sin(angle)])
 
 
-def _clutter(rng: np.random.Generator, pos: np.ndarray, goal: np.ndarray, alike: bool) -> Clutter:
-    """Something of any colour, or of one like the ball's or the goal's, not on the goal itself."""
+def _clutter(rng: np.random.Generator, pos: np.ndarray, goal: np.ndarray, ball: np.ndarray, alike: bool) -> Clutter:
+    """Something of any colour, or of one like the ball's or the goal's; not on the goal, and not before the ball."""
     similar = (np.array([0.75, 0.80, 0.25]), np.array([0.20, 0.50, 0.28]), np.array([0.85, 0.75, 0.20]))
     colour = similar[rng.integers(3)] + rng.uniform(-0.06, 0.06, 3) if alike else rng.uniform(0.05, 0.95, 3)
     shape = ("disc", "rectangle", "ball")[rng.integers(3)]
@@ -110,6 +110,8 @@ def _clutter(rng: np.random.Generator, pos: np.ndarray, goal: np.ndarray, alike:
         place = pos[:2] + rng.uniform(0.0, 3.0) * _direction(rng)
         if np.linalg.norm(place - goal) > 0.45:
             break
+    if shape == "ball" and np.linalg.norm(pos - ball) > ROPE + 0.01:
+        shape = "disc"  # it might stand before a ball in flight
     size = rng.uniform(0.03, 0.25, 2) if shape == "rectangle" else np.repeat(rng.uniform(0.02, 0.15), 2)
     height = float(rng.uniform(size[0], 0.4)) if shape == "ball" else 0.0
     return Clutter(shape, (*place.tolist(), height), tuple(size.tolist()), float(rng.uniform(0, math.pi)),
