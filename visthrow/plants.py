@@ -100,12 +100,12 @@ class HybridPlant:
             start: with it, vehicles, ropes and starts are those of :func:`visthrow.protocol.throw` with the same seed and
                 start, and commands are disturbed as in training.
         """
-        from sim.hybrid import HybridSim, tether_lengths
+        from sim.hybrid import HybridSim, rope_variants
 
         self.params, self.count, self.noise, self.latency = plant_of(experiment), count, noise, latency
         self.period = self.params.sim.control_period
         self._start, self._action = start, experiment.task.action
-        ropes = None if start is None else tether_lengths(self.params.rope, start)
+        ropes = None if start is None else rope_variants(self.params.rope, start)
         self._sim = HybridSim(self.params, count, device, seed, ropes=ropes)
         self._rng = np.random.default_rng(seed)
         self._command_bias = np.zeros((count, 4))
