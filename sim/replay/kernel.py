@@ -32,7 +32,12 @@ STATE_FIELDS = st.QUAD_FIELDS | {
     "stiffness": ("real", True),
     "payload_pos_w": ("vec3", False),  # where it starts loose, and where it is at the end
     "payload_vel_w": ("vec3", False),
+    "slack_first": ("real", False),  # at the end alone: first and last time at which the hanging payload hardly pulled
+    "slack_last": ("real", False),  # [s]; before the window's start if it always did
 }
+
+SLACK = 0.15
+"""Share of the payload's weight below which the rope counts as slack: its shape is then anyone's guess."""
 
 WINDOW_FIELDS = {
     "start": ("real", False),  # [s], clock of the flight
@@ -319,6 +324,8 @@ def build_replay(t: Types, vehicle: VehicleParams, segments: int) -> ReplayKerne
             separation = wp.max(latch + r.lag, time)  # the pull at the latch lies before this window
             latched = True
         knot = int(0)
+        slack_first = time - real(1.0)
+        slack_last = time - real(1.0)
         at = Pointers()
         total = coupled.momentum(p, rope, s, u)
         before = s.rate_b
@@ -378,6 +385,10 @@ def build_replay(t: Types, vehicle: VehicleParams, segments: int) -> ReplayKerne
                     )
                     pay = pos1
                     pay_vel = vel1
+                    if chain.pull(rope, stiffness) < real(SLACK) * rope.payload_mass * gravity:
+                        slack_last = t0 + h
+                        if slack_first < windows.start[w]:
+                            slack_first = t0
                 else:
                     s = coupled.step_alone(p, pushed, s, active, g, h)
                     if mode == loose_code:
@@ -411,6 +422,8 @@ def build_replay(t: Types, vehicle: VehicleParams, segments: int) -> ReplayKerne
             store_quad(ends, lane, s)
             ends.payload_pos_w[lane] = pay
             ends.payload_vel_w[lane] = pay_vel
+            ends.slack_first[lane] = slack_first
+            ends.slack_last[lane] = slack_last
             for i in range(L):
                 ends.cable_dir_w[i, lane] = n[i]
                 ends.cable_vel_w[i, lane] = u[i]

@@ -1,6 +1,6 @@
 """Flights cut into windows of about a second at changes of phase."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -25,6 +25,8 @@ class Cut:
     start: float  # [s]
     end: float  # [s]
     payload: int  # ATTACHED, LOOSE or NO_PAYLOAD, at its start
+    shaken: bool = False  # whether the rope has just come taut
+    told: bool = True  # whether its residuals count; otherwise it is only flown through
 
 
 def _split(first: float, last: float) -> list[tuple[float, float]]:
@@ -77,6 +79,16 @@ def cut(flight: Recorded, number: int, lag: float, landing_height: float, carrie
         spans += [(a, b, "", NO_PAYLOAD) for a, b in _split(max(end, after), last)]
     cuts = [Cut(number, phase or _phase(flight, a, b), a, b, mode) for a, b, phase, mode in spans]
     return [c for c in cuts if _seen(flight, c)]
+
+
+def around_slack(c: Cut, first: float, last: float) -> list[Cut]:
+    """A window cut about the time in which the rope was slack: that is only flown through."""
+    pieces = [
+        replace(c, end=first, phase="flight" if c.phase == "throw" else c.phase),
+        replace(c, start=first, end=last, told=False),
+        replace(c, start=last, shaken=True),
+    ]
+    return [replace(p, told=p.told and p.end - p.start > LEAST) for p in pieces if p.end - p.start > 1e-6]
 
 
 def _seen(flight: Recorded, c: Cut) -> bool:

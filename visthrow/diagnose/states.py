@@ -8,10 +8,12 @@ from scipy.spatial.transform import Rotation
 from sim.params import GRAVITY, PlantParams
 from sim.replay.kernel import ATTACHED, LOOSE, STATE_FIELDS
 from visthrow.diagnose.catalogue import Setting
+from visthrow.diagnose.cutting import Cut
 from visthrow.diagnose.recorded import Recorded, Samples
 
 SMOOTH_BEFORE, SMOOTH_AFTER = 0.06, 0.08  # of a window's start, over which measurements are smoothed [s]
 LEAST_SAMPLES = 6
+MODES = 4  # half waves of a bent rope
 
 States = dict[str, np.ndarray]
 """Fields of ``STATE_FIELDS``, shape (S, ...)."""
@@ -25,7 +27,7 @@ class Direction:
     axis: int
     sd: float  # vague prior, in the field's unit (attitude: angle [rad])
     step: float  # for the derivative
-    part: str = ""  # of the rope: "all" segments, the "last", or a "bend" of the first against the second half
+    part: str | int = ""  # of the rope: "all" segments, the "last", or the half waves of a bend
 
 
 def directions(plant: PlantParams) -> tuple[Direction, ...]:
@@ -42,19 +44,18 @@ def directions(plant: PlantParams) -> tuple[Direction, ...]:
         found += [Direction("motor_speed", i, 0.15 * hover, 1e-4 * hover) for i in range(4)]
     found += [Direction("cable_dir_w", i, 0.1, 1e-4, "all") for i in range(2)]
     found += [Direction("cable_vel_w", i, 1.5, 1e-3, "all") for i in range(2)]
-    parts = ("last", "bend") if plant.rope.segments > 2 else ("last",) if plant.rope.segments == 2 else ()
-    for part in parts:
+    for part in ("last", *range(1, MODES + 1))[: plant.rope.segments - 1]:
         found += [Direction("cable_dir_w", i, 0.1, 1e-4, part) for i in range(2)]
         found += [Direction("cable_vel_w", i, 1.5, 1e-3, part) for i in range(2)]
     found += [Direction("payload_pos_w", i, 0.1, 1e-4) for i in range(3)]
     return (*found, *[Direction("payload_vel_w", i, 1.0, 1e-3) for i in range(3)])
 
 
-def concerns(direction: Direction, payload: int) -> bool:
-    """Whether a window that starts with the payload in this way has the direction."""
+def concerns(direction: Direction, c: Cut) -> bool:
+    """Whether the state at the start of a window has the direction: higher bends only a rope that has just come taut."""
     if direction.field.startswith("cable"):
-        return payload == ATTACHED
-    return payload == LOOSE if direction.field.startswith("payload") else True
+        return c.payload == ATTACHED and (c.shaken or direction.part in ("all", "last", 1))
+    return c.payload == LOOSE if direction.field.startswith("payload") else True
 
 
 def _tangents(n: np.ndarray) -> np.ndarray:
@@ -90,10 +91,10 @@ def moved(states: States, direction: Direction, size: np.ndarray | float) -> Sta
     return out
 
 
-def _shape(part: str, segments: int) -> np.ndarray:
+def _shape(part: str | int, segments: int) -> np.ndarray:
     """How far each segment turns, shape (L,)."""
-    if part == "bend":
-        return np.cos(np.pi * (np.arange(segments) + 0.5) / segments)
+    if isinstance(part, int):
+        return np.cos(part * np.pi * (np.arange(segments) + 0.5) / segments)
     return np.ones(segments) if part == "all" else (np.arange(segments) == segments - 1).astype(float)
 
 
@@ -189,6 +190,7 @@ def hover_state(flight: Recorded, plant: PlantParams, payload: int) -> States:
     sagged = 0.5 * (open_volts + np.sqrt(max(open_volts**2 - 4.0 * v.battery.resistance * power, 0.0)))
     down = np.array([0.0, 0.0, -1.0])
     state = {name: np.zeros((1, L, 3) if rows else (1, 3)) for name, (_, rows) in STATE_FIELDS.items()}
+    state |= {"slack_first": np.zeros(1), "slack_last": np.zeros(1)}
     below = rope.payload_mass + rope.rope_mass * (np.arange(L, 0, -1) - 0.5) / L
     state |= {
         "quat_wb": np.array([[0.0, 0.0, 0.0, 1.0]]), "motor_speed": np.full((1, 4), speed),

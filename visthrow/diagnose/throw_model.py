@@ -11,12 +11,20 @@ from sim.replay.kernel import NO_PAYLOAD
 from sim.replay.lanes import Replay
 from sim.sensing import SensingParams
 from visthrow.diagnose.catalogue import Entry, Setting, apply, entries_for
-from visthrow.diagnose.cutting import cut
+from visthrow.diagnose.cutting import Cut, around_slack, cut
 from visthrow.diagnose.model import Window
 from visthrow.diagnose.opened import opened
 from visthrow.diagnose.recorded import NEVER, record_of
 from visthrow.diagnose.replay import BATCH, KNOT_SPACING, Flights, Lane, carried
-from visthrow.diagnose.states import States, concerns, directions, hover_state, measured_state, moved, stacked
+from visthrow.diagnose.states import (
+    States,
+    concerns,
+    directions,
+    hover_state,
+    measured_state,
+    moved,
+    stacked,
+)
 from visthrow.errors import DiagnoseError
 from visthrow.flightlog import FlightLog
 
@@ -24,6 +32,8 @@ LATENT_SIZES = (0.05, 0.05, 0.05, 1e-3, 1e-3, 1e-3, 0.01, 0.01, 0.01)
 """Of the latent forces' derivatives: force [N], torque [N m], force on the payload [N]."""
 DAMPING, DAMPING_MOST = 1e-3, 1e5
 """Of the Levenberg-Marquardt steps: at first, and where a window counts as settled."""
+ROUNDS = 14
+AFTER_SLACK = 0.03  # that a rope is given to come taut [s]
 HUBER = 30.0  # deviations, beyond which a sample counts less
 SETTLED = 0.02  # relative fall of the cost below which an initial state is settled
 
@@ -73,8 +83,6 @@ class ThrowModel:
         cuts = [c for i, f in enumerate(flights) for c in cut(f, i, release.lag, release.landing_height, carries)]
         if not cuts:
             raise DiagnoseError(f"{len(flights)} flights hold no stretch of poses and commands long enough to replay")
-        x = self.setting.sensing
-        self.flights = Flights(flights, cuts, (x.vehicle_delay, x.payload_delay, x.gyro_delay), stride)
         self.channels = ["pos_w", "quat_wb"]
         self.channels += ["payload_pos_w"] if carries and any(f.payload for f in flights) else []
         self.channels += ["rate_b"] if any(f.gyro for f in flights) else []
@@ -87,12 +95,20 @@ class ThrowModel:
             self.entries = {name: self.entries[name] for name in only}
         self.effects = tuple(e.effect for e in self.entries.values())
         self._directions = directions(self.setting.plant)
-        self._states = self._settle(self.setting, self._begin(), rounds=14)
+        x = self.setting.sensing
+        delays = (x.vehicle_delay, x.payload_delay, x.gyro_delay)
+        self.flights = Flights(flights, cuts, delays, stride)
+        states = self._begin()
+        if (without_slack := self._without_slack(states)) != cuts:
+            self.flights = Flights(flights, without_slack, delays, stride)
+            states = self._begin()
+        self._told = np.array([w for w, c in enumerate(self.flights.cuts) if c.told])
+        self._states = self._settle(self.setting, states)
 
     def windows(self, theta: Mapping[str, float]) -> list[Window]:
         """See :class:`visthrow.diagnose.model.Model`."""
         setting = apply(self.entries, self.setting, theta)
-        states = self._states if setting == self.setting else self._settle(setting, self._states, rounds=2)
+        states = self._states if setting == self.setting else self._settle(setting, self._states)
         steps = [self._step(e, theta.get(name, 0.0)) for name, e in self.entries.items()]
         settings = [setting, *[e.apply(setting, step) for e, step in zip(self.entries.values(), steps)]]
         replay = self._replay(settings)
@@ -104,21 +120,20 @@ class ThrowModel:
     def residuals(self, theta: Mapping[str, float]) -> list[np.ndarray]:
         """See :class:`visthrow.diagnose.model.Model`."""
         setting = apply(self.entries, self.setting, theta)
-        replay = self._replay([setting])
-        lanes = [Lane(w, 0, w) for w in range(len(self.flights.cuts))]
-        seen = self.flights.fly(replay, [setting], self._states, lanes, self.substep).seen
-        return [self._residual(seen, w, w) for w in range(len(lanes))]
+        lanes = [Lane(w, 0, w) for w in self._told]
+        seen = self.flights.fly(self._replay([setting]), [setting], self._states, lanes, self.substep).seen
+        return [self._residual(seen, w, lane) for lane, w in enumerate(self._told)]
 
     def step_error(self, finer: int = 4) -> dict[str, float]:
         """Largest change of any sample of each channel when the step is so many times finer, in its noise."""
         fine = dataclasses.replace(self.setting, step_square=1.0 / finer**2)
         settings = [self.setting, fine]
-        count = len(self.flights.cuts)
-        lanes = [Lane(w, s, w) for s in range(2) for w in range(count)]
+        count = len(self._told)
+        lanes = [Lane(w, s, w) for s in range(2) for w in self._told]
         seen = self.flights.fly(self._replay(settings), settings, self._states, lanes, self.substep).seen
         worst = dict.fromkeys(self.channels, 0.0)
-        for w in range(count):
-            off = np.abs(self._residual(seen, w, w) - self._residual(seen, w, count + w)) / self._sigma(w)
+        for lane, w in enumerate(self._told):
+            off = np.abs(self._residual(seen, w, lane) - self._residual(seen, w, count + lane)) / self._sigma(w)
             for i, name in enumerate(self.channels):
                 here = off[self._channel(w) == i]
                 worst[name] = max(worst[name], float(here.max())) if len(here) else worst[name]
@@ -146,7 +161,7 @@ class ThrowModel:
     def _batches(self) -> list[list[int]]:
         """Windows in groups whose lanes fit a run."""
         batches, room = [], 0
-        for w in range(len(self.flights.cuts)):
+        for w in self._told:
             lanes = 1 + len(self.entries) + len(self._directions) + 9 * int(self.flights.knots[w])
             if not batches or room < lanes:
                 batches.append([])
@@ -156,7 +171,7 @@ class ThrowModel:
         return batches
 
     def _nuisances(self, w: int) -> list[int]:
-        return [d for d, x in enumerate(self._directions) if concerns(x, self.flights.cuts[w].payload)]
+        return [d for d, x in enumerate(self._directions) if concerns(x, self.flights.cuts[w])]
 
     def _latents(self, w: int) -> list[tuple[int, int]]:
         axes = 6 if self.flights.cuts[w].payload == NO_PAYLOAD else 9
@@ -201,10 +216,10 @@ class ThrowModel:
             c.flight, c.phase, self._time(w), self._channel(w), self._residual(seen, w, 0), self._sigma(w), slopes[:, :K],
             slopes[:, K : K + D], np.array([self._directions[d].sd for d in nuisances]), slopes[:, K + D :],
             np.array([axis // 3 for axis, _ in latents]), np.array([axis % 3 for axis, _ in latents]),
-            np.array([c.start + KNOT_SPACING * knot for _, knot in latents]), self._told(setting, w, knots),
+            np.array([c.start + KNOT_SPACING * knot for _, knot in latents]), self._at_knots(setting, w, knots),
         )  # fmt: skip
 
-    def _told(self, setting: Setting, w: int, knots: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    def _at_knots(self, setting: Setting, w: int, knots: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Simulated quantities at the knots, those of the payload where there is one."""
         c = self.flights.cuts[w]
         time = c.start + KNOT_SPACING * np.arange(len(knots["thrust"]))
@@ -250,15 +265,26 @@ class ThrowModel:
         s = self.flights.samples
         return self._rows(w, *[s[name][w].sigma for name in ("vehicle", "attitude", "payload", "gyro")])
 
-    def _settle(self, setting: Setting, states: States, rounds: int) -> States:
+    def _without_slack(self, states: States) -> list[Cut]:
+        """The windows, with the time in which the rope is slack cut out."""
+        count = len(self.flights.cuts)
+        lanes = [Lane(w, 0, w, keep=0) for w in range(count)]
+        ends = self.flights.fly(self._replay([self.setting]), [self.setting], states, lanes, self.substep).ends
+        cuts: list[Cut] = []
+        for w, c in enumerate(self.flights.cuts):
+            first, last = float(ends["slack_first"][w]), float(ends["slack_last"][w])
+            cuts += [c] if first < c.start else around_slack(c, first, last + AFTER_SLACK)
+        return cuts
+
+    def _settle(self, setting: Setting, states: States) -> States:
         """Fit each window's initial state to its samples by Levenberg and Marquardt; no step that does not help is taken."""
         replay, count = self._replay([setting]), len(self.flights.cuts)
         moves, damping = np.zeros((count, len(self._directions))), np.full(count, DAMPING)
-        cost = self._costs(replay, setting, states, np.arange(count))
-        left, stale = np.arange(count), np.ones(count, dtype=bool)
+        left, stale, cost = self._told, np.ones(count, dtype=bool), np.full(count, np.inf)
+        cost[left] = self._costs(replay, setting, states, left)
         slopes: dict[int, np.ndarray] = {}
         residuals: dict[int, np.ndarray] = {}
-        for _ in range(rounds):
+        for _ in range(ROUNDS):
             for w, slope, residual in self._state_slopes(replay, setting, states, left[stale[left]]):
                 slopes[w], residuals[w] = slope, residual
             trial = np.zeros_like(moves)
