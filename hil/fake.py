@@ -1,5 +1,6 @@
 """The fake autopilot's process: builds one of `hil.fakes` around an injected plant and flies it in real time."""
 
+import contextlib
 import importlib
 import json
 import socket
@@ -126,21 +127,22 @@ def read_options(overrides: list[str]) -> Options:
 def serve(
     fake: Fake, clock: Clock, most: float, out: Path | None = None, after: float = AFTER_LANDING
 ) -> dict[str, Any]:  # fmt: skip
-    """Fly in real time until ``after`` seconds after the payload's landing, or for ``most`` seconds.
+    """Fly in real time until ``after`` seconds after the payload's landing, for ``most`` seconds, or until Ctrl-C.
 
     Returns:
         The report, with the number of periods that took longer than real time has.
     """
     start, begun, late = clock.now(), fake.plant.time, 0
-    while fake.plant.time - begun < most:
-        fake.fly()
-        due = start + (fake.plant.time - begun)
-        late += clock.now() > due
-        clock.sleep_until(due)
-        fake.emit()
-        landed = fake.plant.landing["landing_time"]
-        if landed is not None and fake.plant.time > landed + after:
-            break
+    with contextlib.suppress(KeyboardInterrupt):
+        while fake.plant.time - begun < most:
+            fake.fly()
+            due = start + (fake.plant.time - begun)
+            late += clock.now() > due
+            clock.sleep_until(due)
+            fake.emit()
+            landed = fake.plant.landing["landing_time"]
+            if landed is not None and fake.plant.time > landed + after:
+                break
     report = {**fake.report(), "late_periods": late}
     if out is not None:
         out.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")

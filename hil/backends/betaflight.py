@@ -113,7 +113,7 @@ class Betaflight:
         self._polled = dict.fromkeys(POLLS, -1e9)
         self._heard = self._framed = self._boxed = -1e9
         self._flags = self._blocks = 0
-        self._taken = self._over = self._raised = False
+        self._taken = self._over = self._raised = False  # asked for; over; has followed
         self._sticks_us = (MIDDLE, MIDDLE, MIDDLE, LOW)  # roll, pitch, yaw, throttle
         self._opened: float | None = None
         self.share: float | None = None
@@ -161,6 +161,7 @@ class Betaflight:
             return "settings are being read", WAIT
         armed, ours = self._box(BOX_ARM), p.arm_channel > 0 or self._box(BOX_OVERRIDE)
         if armed and ours and self._taken:
+            self._raised = True
             return "", FOLLOW
         if self._taken and self._raised:
             return ("disarmed" if not armed else "MSP OVERRIDE is off: the pilot has it"), WAIT
@@ -295,7 +296,6 @@ class Betaflight:
         self._flags = flags | int.from_bytes(more, "little") << 32
         blocks = frame.u32(17 + (count & 15))
         self._blocks = 0 if blocks is None else blocks
-        self._raised |= self._taken and self._box(BOX_ARM) and (self.params.arm_channel > 0 or self._box(BOX_OVERRIDE))
 
     def _hear_channels(self, frame: msp.Frame) -> None:
         """MSP_RC tells roll, pitch, yaw, throttle, AUX 1 and on, whatever the map."""

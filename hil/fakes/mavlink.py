@@ -153,6 +153,9 @@ class FakeMavlink(Fake):
             outputs = [0] * 16
             outputs[SERVO - 1] = OPEN_US if self.moved else CLOSED_US
             self.link.send(mav.MAVLink_servo_output_raw_message(int(self.clock() * 1e6) & 0xFFFFFFFF, 0, *outputs))
+        elif number == mav.MAVLINK_MSG_ID_ATTITUDE:
+            x, y, z = map(float, self.plant.state["rate_b"])
+            self.link.send(mav.MAVLink_attitude_message(int(self.clock() * 1e3) & 0xFFFFFFFF, 0.0, 0.0, 0.0, x, -y, -z))
         elif number == mav.MAVLINK_MSG_ID_ATTITUDE_TARGET:
             share, boot = self.thrust_map.share(self.last_thrust), int(self.clock() * 1e3) & 0xFFFFFFFF
             self.link.send(mav.MAVLink_attitude_target_message(boot, 0, [1.0, 0.0, 0.0, 0.0], 0.0, 0.0, 0.0, share))

@@ -40,21 +40,21 @@ def free_port(kind=socket.SOCK_DGRAM) -> int:
 class Pair:
     """A fake and a runner, each in a process of its own."""
 
-    def __init__(self, folder, kind, policy, plant=("--plant", "hil.fakes.level:make"), seconds=8.0, limit=None, overrides=()):
+    def __init__(self, folder, kind, policy, plant=("--plant", "hil.fakes.level:make"), limit=None, overrides=()):
         self.folder, poses, msp = folder, free_port(), free_port(socket.SOCK_STREAM)
         self.device, self.msp, self.limit = f"127.0.0.1:{poses}", msp, limit
         self.fake = self.runner = None
-        if kind == "betaflight":  # listens itself, so that it must be there first, and stay for the runner's start
-            self._start_fake(kind, plant, seconds + 15.0)
+        if kind == "betaflight":  # listens itself, so that it must be there first
+            self._start_fake(kind, plant)
             self._start_runner(kind, policy, overrides)
         else:
             self._start_runner(kind, policy, overrides)
-            self._start_fake(kind, plant, seconds)
+            self._start_fake(kind, plant)
 
-    def _start_fake(self, kind, plant, seconds):
+    def _start_fake(self, kind, plant):
         self.fake = subprocess.Popen(
             [*COMMAND, "fake", "--kind", kind, "--device", f"udpout:{self.device}", "--msp-port", str(self.msp), *plant,
-             "--seconds", str(seconds), "--after", "1.5", "--out", str(self.folder / "fake.json")],
+             "--seconds", "300", "--after", "1.5", "--out", str(self.folder / "fake.json")],
             stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
         )  # fmt: skip
         assert "flies" in self.fake.stderr.readline()
@@ -72,16 +72,19 @@ class Pair:
 
     def wait_for(self, state: str) -> None:
         """Until the runner says that it is in a state."""
-        end = time.monotonic() + PATIENCE
+        end, said = time.monotonic() + PATIENCE, ""
         while time.monotonic() < end:
             line = self.runner.stderr.readline()
-            assert line, "the runner has ended"
+            said += line
+            assert line, f"the runner has ended: {said}"
             if re.match(rf" *[0-9.]+ s  {state} ", line):
                 return
         raise AssertionError(f"no {state} within {PATIENCE} s")
 
-    def report(self) -> dict:
-        """The fake's, when it has ended."""
+    def report(self, end=True) -> dict:
+        """The fake's, when it has ended, by Ctrl-C or by itself."""
+        if end:
+            self.fake.send_signal(signal.SIGINT)
         assert self.fake.wait(PATIENCE) == 0
         return json.loads((self.folder / "fake.json").read_text())
 
@@ -116,6 +119,7 @@ def test_the_runner_is_killed_in_mid_throw(tmp_path, kind, never):
         time.sleep(0.3)
         os.kill(pair.runner.pid, signal.SIGKILL)
         pair.runner.wait(PATIENCE)
+        time.sleep(2.5)
         report = pair.report()
     assert OWN[kind] in [text for _, text in report["events"]]
     happened = next(at for at, text in report["events"] if text == OWN[kind] and at > report["last_command"])
@@ -134,6 +138,7 @@ def test_ctrl_c_in_mid_throw(tmp_path, kind, never):
         time.sleep(0.3)
         os.kill(pair.runner.pid, signal.SIGINT)
         out, err = pair.runner.communicate(timeout=PATIENCE)
+        time.sleep(1.0)
         report = pair.report()
     assert "ABORTED: the operator said abort" in out
     assert "Traceback" not in err
@@ -160,9 +165,9 @@ def test_the_disk_fills_up_in_mid_throw(tmp_path, never):
 @pytest.mark.parametrize("kind", ["ardupilot", "px4", "betaflight"])
 def test_a_throw_with_each_kind(tmp_path, kind, policy):
     """In real time, with the simulator's vehicle and the shipped policies."""
-    with Pair(tmp_path, kind, policy, plant=("--policy", policy), seconds=40.0, overrides=("states.abort=0.5",)) as pair:
+    with Pair(tmp_path, kind, policy, plant=("--policy", policy), overrides=("states.abort=0.5",)) as pair:
         out, _ = pair.runner.communicate(timeout=PATIENCE)
-        report = pair.report()
+        report = pair.report(end=False)
     assert report["landing_w"] is not None, out
     assert np.hypot(report["landing_w"][0] - 2.0, report["landing_w"][1]) < ONE_THROW
     assert (report["breaches"], report["releases"]) == ([], 1)

@@ -1,5 +1,7 @@
 """Thrust to shares and back, its measurement in hover, and the vehicles that are refused."""
 
+import dataclasses
+
 import pytest
 
 from hil.backends import require_reach
@@ -8,6 +10,7 @@ from hil.errors import RunError
 from hil.params import HilParams
 from tests.hil_flight import simple_policy
 from visthrow import config
+from visthrow.errors import ConfigError
 from visthrow.hover import GRAVITY
 
 BENT = ThrustParams(2.668, 0.37, 0.8, 0.08, 0.0)
@@ -83,3 +86,18 @@ def test_a_vehicle_that_cannot_do_it_is_refused(name, override, message):
     else:
         with pytest.raises(RunError, match=message):
             require_reach(params, contract)
+
+
+@pytest.mark.parametrize("name", ["ardupilot", "px4", "betaflight"])
+def test_the_configs_of_real_vehicles_can_do_what_the_shipped_policies_ask(name):
+    """They differ from those of the fakes in device, calibration and mechanism alone."""
+    real = config.load(HilParams, config.find("hil", name))
+    fake = config.load(HilParams, config.find("hil", "fake" if name == "ardupilot" else f"fake_{name}"))
+    require_reach(real, simple_policy().contract)
+    assert (real.backend, getattr(real, name).audit) == (name, True)
+    swapped = dataclasses.replace(
+        real, link=fake.link, ardupilot=fake.ardupilot, px4=fake.px4, betaflight=fake.betaflight
+    )  # fmt: skip
+    assert swapped == fake
+    with pytest.raises(ConfigError, match="a recording flies dry"):
+        config.load(HilParams, config.find("hil", name), ['source.kind="tlog"', 'source.file="a.tlog"'])

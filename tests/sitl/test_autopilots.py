@@ -1,0 +1,220 @@
+"""The same suite against real autopilots in software: connect, audit, arm, a step of a body rate, the release, the hold.
+
+Each is run where its address stands in the environment, and skipped where nothing answers:
+
+    VISTHROW_SITL_ARDUPILOT=tcp:127.0.0.1:5760     arducopter --model quad, or sim_vehicle.py
+    VISTHROW_SITL_PX4=udp:127.0.0.1:14540          PX4's offboard port, make px4_sitl sihsim_quadx
+    VISTHROW_SITL_BETAFLIGHT=tcp:127.0.0.1:5761    betaflight_SITL.elf, first serial port, feature RX_MSP
+
+They prove protocol, order and failsafes; nothing of aerodynamics, cable or policy.
+"""
+
+import os
+import time
+
+import pytest
+
+from hil.backends import Betaflight, make_backend
+from hil.backends.autopilot import ARMED
+from hil.backends.base import FOLLOW, HOLD
+from hil.device import check_device, open_port
+from hil.errors import LinkError
+from hil.link import Link
+from hil.mavlink import mav
+from hil.params import HilParams
+from hil.sync import LinkSync
+from visthrow import config
+
+pytestmark = pytest.mark.sitl
+
+ANSWER = 15.0
+"""Time in which an autopilot that runs says something [s]."""
+
+STEP, HALF_STEP = 1.5, 0.25
+"""Body rate that is asked for [rad/s], and the time in which half of it must be there [s]: 55 to 98 ms were measured."""
+
+PERIOD = 0.02
+"""Between two commands [s]."""
+
+
+class Bench:
+    """An autopilot in software, spoken to by hand."""
+
+    def __init__(self, kind: str, *overrides: str):
+        address = os.environ.get(f"VISTHROW_SITL_{kind.upper()}")
+        if not address:
+            pytest.skip(f"VISTHROW_SITL_{kind.upper()} is not set")
+        names = {"ardupilot": "fake", "px4": "fake_px4", "betaflight": "fake_betaflight"}
+        self.kind, self.params = kind, config.load(HilParams, config.find("hil", names[kind]), overrides)
+        try:
+            port = open_port(check_device(address))
+        except LinkError as error:
+            pytest.skip(str(error))
+        self.link, self.rates = None, []
+        self.tables: list[str] = []
+        if kind == "betaflight":
+            self.backend = Betaflight(port, self.params.betaflight, False, self.tables.append)
+        else:
+            self.link = Link(port, 245, 191)
+            LinkSync(self.link)
+            self.link.listen(self._hear)
+            self.backend = make_backend(self.params, self.link, True, self.tables.append)
+
+    def _hear(self, message, arrival):
+        if message.get_type() == "ATTITUDE":
+            self.rates.append((arrival, message.rollspeed))
+
+    @property
+    def status(self):
+        return self.backend.status(time.monotonic())
+
+    def turn(self, seconds, command=None, ask=None, until=None):
+        """Run for a time, or until something holds."""
+        end = time.monotonic() + seconds
+        while (now := time.monotonic()) < end:
+            if self.link is not None:
+                self.link.pump(time.monotonic)
+            if command is not None:
+                self.backend.send(command, now)
+            if ask is not None:
+                self.backend.ask(ask, now)
+            self.backend.service(now)
+            if until is not None and until():
+                return True
+            time.sleep(PERIOD)
+        return until is None
+
+    def heard(self) -> bool:
+        if self.kind == "betaflight":
+            return self.backend._heard > 0.0
+        return self.backend._heartbeat is not None
+
+    def connect(self):
+        if not self.turn(ANSWER, until=self.heard):
+            pytest.skip("nothing answers")
+        if self.link is not None:
+            for number in (mav.MAVLINK_MSG_ID_ATTITUDE, mav.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW):
+                values = (mav.MAV_CMD_SET_MESSAGE_INTERVAL, 0, number, 10_000.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+                self.link.send(mav.MAVLink_command_long_message(1, 1, *values))
+        self.turn(ANSWER, until=lambda: self.backend.audit.done)
+        return self
+
+    def close(self):
+        self.backend.close()
+        if self.link is not None:
+            self.link.close()
+
+
+@pytest.fixture
+def bench():
+    made = []
+
+    def make(kind, *overrides):
+        made.append(Bench(kind, *overrides))
+        return made[-1].connect()
+
+    yield make
+    for each in made:
+        each.close()
+
+
+KINDS = ("ardupilot", "px4", "betaflight")
+NO_MECHANISM = {
+    "ardupilot": ("ardupilot.servo_output=9", 'ardupilot.release="servo"'),
+    "px4": ("px4.servo_output=0", 'px4.release="actuator"', 'px4.output_parameter=""'),
+    "betaflight": ("betaflight.servo_output=0", "betaflight.arm_channel=1"),
+}
+"""Software has no gripper: a bare servo output, an actuator set, the channel's own read-back."""
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_parameter_of_the_audit_exists(bench, kind):
+    """Names are those of this firmware: each is answered."""
+    desk = bench(kind, *NO_MECHANISM[kind])
+    assert desk.tables, "the table is shown"
+    assert "no answer" not in desk.tables[0], desk.tables[0]
+
+
+@pytest.mark.parametrize("kind", ["ardupilot", "px4"])
+def test_clocks_are_known(bench, kind):
+    desk = bench(kind, *NO_MECHANISM[kind])
+    desk.turn(3.0)
+    peer = desk.link.sync.peers[1]
+    assert peer.offset is not None
+    assert peer.round_trip < 0.05
+
+
+def flying(desk):
+    """Taken over and armed, commands followed; on the ground, with a thrust that does not lift."""
+    params = getattr(desk.params, desk.kind)
+    idle = (0.3 * params.thrust.weight, 0.0, 0.0, 0.0)
+    desk.turn(30.0, idle, FOLLOW, until=lambda: desk.status.mode == FOLLOW)
+    status = desk.status
+    assert status.mode == FOLLOW, (status, getattr(desk.backend, "texts", [])[-5:])
+    return params
+
+
+TAKE = {
+    "ardupilot": ("ardupilot.take=true", "ardupilot.arm=true", "ardupilot.follow_mode=20", "ardupilot.audit=false"),
+    "px4": ("px4.arm=true", "px4.audit=false"),
+    "betaflight": ("betaflight.audit=false",),
+}
+"""Bench settings: the runner arms; GUIDED_NOGPS needs no position."""
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_it_is_taken_and_armed(bench, kind):
+    desk = bench(kind, *NO_MECHANISM[kind], *TAKE[kind])
+    flying(desk)
+    if desk.link is not None:
+        assert desk.backend._heartbeat.base_mode & ARMED
+
+
+@pytest.mark.parametrize("kind", ["ardupilot", "px4"])
+def test_a_step_of_the_roll_rate(bench, kind):
+    desk = bench(kind, *NO_MECHANISM[kind], *TAKE[kind])
+    params = flying(desk)
+    lift = (1.3 * params.thrust.weight, 0.0, 0.0, 0.0)
+    desk.turn(1.5, lift)
+    start, before = time.monotonic(), len(desk.rates)
+    desk.turn(0.4, (*lift[:1], STEP, 0.0, 0.0))
+    desk.turn(0.4, (*lift[:1], -STEP, 0.0, 0.0))
+    half = [at - start for at, rate in desk.rates[before:] if rate > 0.5 * STEP]
+    assert half, "ATTITUDE is to be streamed, and the rate to be followed"
+    assert half[0] < HALF_STEP
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_release_is_answered_and_moves(bench, kind):
+    desk = bench(kind, *NO_MECHANISM[kind], *TAKE[kind])
+    params = flying(desk)
+    idle = (0.3 * params.thrust.weight, 0.0, 0.0, 0.0)
+    desk.backend.release(time.monotonic())
+    desk.turn(5.0, idle, FOLLOW, until=lambda: desk.status.release in ("accepted", "failed"))
+    record = desk.backend.release_record
+    assert desk.status.release == "accepted", (record.note, record.sends)
+
+
+@pytest.mark.parametrize("kind", ["ardupilot", "px4"])
+def test_the_autopilots_own_hold_takes_over(bench, kind):
+    """It needs a position: in ArduPilot's software the simulated GPS, in PX4's whatever its estimator is fed with."""
+    more = ("ardupilot.hold_mode=5", "ardupilot.follow_mode=4") if kind == "ardupilot" else ()
+    desk = bench(kind, *NO_MECHANISM[kind], *TAKE[kind], *more)
+    params = flying(desk)
+    lift = (1.3 * params.thrust.weight, 0.0, 0.0, 0.0)
+    desk.turn(2.0, lift)
+    desk.turn(5.0, lift, HOLD, until=lambda: desk.status.mode == HOLD)
+    assert desk.status.mode == HOLD, (desk.status, desk.backend.texts[-5:])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_silence_ends_in_the_autopilots_own_hands(bench, kind):
+    """PX4 leaves OFFBOARD, Betaflight disarms; ArduPilot stays in its mode and levels."""
+    desk = bench(kind, *NO_MECHANISM[kind], *TAKE[kind])
+    flying(desk)
+    desk.turn(4.5)
+    if kind == "ardupilot":
+        assert desk.status.mode == FOLLOW
+        assert abs(desk.rates[-1][1]) < 0.2
+    else:
+        assert not desk.status.connected
