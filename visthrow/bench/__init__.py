@@ -71,6 +71,10 @@ def _add_hil(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--keep", metavar="FOLDER", help="keep the soak's run here")
     parser.add_argument("--throws", type=int, default=0, metavar="N", help="throw so often instead; may be interrupted")
     parser.add_argument("--seed", type=int, default=0, help="of the first throw (default: 0)")
+    parser.add_argument(
+        "--speed", type=float, default=1.0, metavar="X",
+        help="of both clocks in throws; below 1 on a machine too slow for real time",
+    )  # fmt: skip
     parser.add_argument("--out", default="out/hil", metavar="FOLDER", help="of the series (default: out/hil)")
     parser.add_argument("--keep-runs", action="store_true", help="keep the run folder of each throw")
     parser.add_argument("--faults", action="store_true", help="inject each fault of motion capture instead")

@@ -33,8 +33,8 @@ def series(args: argparse.Namespace) -> Report:
     Raises:
         VisthrowError: a number out of range, or a process that fails.
     """
-    if not 2 <= args.throws <= 10_000:
-        raise VisthrowError(f"--throws {args.throws}; expected 2 to 10000")
+    if not (2 <= args.throws <= 10_000 and 0.05 <= args.speed <= 1.0):
+        raise VisthrowError(f"--throws {args.throws}, --speed {args.speed}; expected 2 to 10000, and 0.05 to 1")
     folder = Path(args.out)
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"throws-{args.policy.replace(os.sep, '_')}.jsonl"
@@ -77,8 +77,9 @@ def _direct(seeds: list[int], args: argparse.Namespace) -> Any:
 
 def _over_the_wire(seed: int, folder: Path, args: argparse.Namespace) -> dict[str, Any]:
     shutil.rmtree(folder, ignore_errors=True)  # half a run of an interrupted series
-    run = ("--config", "fake", "--set", f"policy={args.policy}", "--set", "states.abort=0.3")
-    fake = ("--policy", args.policy, "--seed", str(seed), "--seconds", str(LONGEST), "--after", str(AFTER))
+    speed = ("--speed", str(args.speed))
+    run = ("--config", "fake", "--set", f"policy={args.policy}", "--set", "states.abort=0.3", *speed)
+    fake = ("--policy", args.policy, "--seed", str(seed), "--seconds", str(LONGEST), "--after", str(AFTER), *speed)
     summary, report = Pair(run, fake).fly(folder)
     landed = report["landing_w"]
     seen = (summary["landings"] or [{}])[0]
@@ -86,7 +87,7 @@ def _over_the_wire(seed: int, folder: Path, args: argparse.Namespace) -> dict[st
         "way": "wire", "seed": seed, "error": None, "duration": None, "landing_w": landed, "seen": seen.get("error"),
         "reason": summary["reason"], "missed": summary["missed"], "missed_ours": summary["missed_ours"],
         "late_periods": report["late_periods"], "breaches": report["breaches"], "releases": report["releases"],
-        "latency_ms": summary["latency"], "separation_lag": _apart(report),
+        "latency_ms": summary["latency"], "speed": args.speed, "separation_lag": _apart(report),
     }  # fmt: skip
     if landed is not None:
         goal_w = seen.get("goal_w", (2.0, 0.0, 0.0))
@@ -134,6 +135,7 @@ def _report(pairs: list[tuple[dict, dict]], args: argparse.Namespace) -> Report:
         "Hz, 1 mm, 0.2 deg, 10 ms, 2 % lost; the landing is the plant's true one",
         "without the wire: the same plant, motion capture, estimator and policy in one loop, without link, autopilot, state "
         "machine and real time (visthrow hil direct)",
+        "in real time" if args.speed == 1.0 else f"both clocks at {args.speed:g} of real time: the machine was too slow for more",
         f"{figures['missed']} ticks missed, {figures['missed_ours']} of them ours; {late} periods of the fake were late; "
         f"{len(figures['breaches'])} breaches noted by the vehicle",
     )

@@ -1,0 +1,132 @@
+"""What ``visthrow bench hil`` makes of its measurements; and, slow, the measurements themselves over UDP."""
+
+import argparse
+import json
+import sys
+import time
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from hil.mocap_faults import FAULTS
+from visthrow.bench import hil, hil_throws
+from visthrow.bench.hil_processes import Pair
+from visthrow.cli import main
+from visthrow.errors import VisthrowError
+from visthrow.policy import Policy, find_policy
+
+SOAK_MINUTES = 1.0
+MOST_GROWTH = 100e3
+"""Of the runner's memory [bytes/s]: 6 MB a minute; a list of every tick's record would grow by more. A minute is short for a
+line, the recorder's buffers breathe."""
+
+
+def test_upper_bound_of_a_ratio_of_pairs():
+    """Against the delta method, for pairs that go along with each other."""
+    rng = np.random.default_rng(0)
+    base = 0.03 + 0.01 * rng.random(400)
+    pairs = np.column_stack((1.1 * base + 0.004 * rng.standard_normal(400), base + 0.004 * rng.standard_normal(400)))
+    value, upper = hil.bootstrap_upper(pairs)
+    rest = pairs[:, 0] - value * pairs[:, 1]
+    deviation = rest.std() / pairs[:, 1].mean() / np.sqrt(len(pairs))
+    assert value == pytest.approx(1.1, abs=0.02)
+    assert upper - value == pytest.approx(stats.norm.ppf(0.9) * deviation, rel=0.15)
+
+
+def test_growth_of_memory():
+    rising = [(float(t), 1e6 + 500.0 * t + (1e5 if t < 20 else 0.0)) for t in range(200)]
+    assert hil.slope(rising) == pytest.approx(500.0)
+    assert hil.slope(rising[:5]) is None
+
+
+def test_a_policy_that_never_releases_is_the_same_otherwise(tmp_path):
+    import torch
+
+    shipped = Policy.load(find_policy("vision"))
+    made = Policy.load(hil.never_releasing("vision", tmp_path / "p.npz"))
+    seen = torch.randn(200, shipped.obs_dim)
+    torch.testing.assert_close(made.act(seen)[:, :4], shipped.act(seen)[:, :4], rtol=0, atol=0)
+    assert (made.act(seen)[:, 4] == -1.0).all()
+
+
+def test_an_interrupted_series_goes_on_where_it_was(tmp_path, monkeypatch):
+    flown = []
+
+    def direct(seeds, args):
+        for seed in seeds:
+            yield {"way": "direct", "seed": seed, "error": 0.02 + 0.001 * seed, "duration": 1.0}
+
+    def wire(seed, folder, args):
+        flown.append(seed)
+        if seed == 2 and len(flown) == 3:
+            raise KeyboardInterrupt
+        return {
+            "way": "wire", "seed": seed, "error": None if seed == 3 else 0.022 + 0.001 * seed, "duration": 1.0, "missed": 0,
+            "missed_ours": 0, "late_periods": 0, "breaches": [],
+        }  # fmt: skip
+
+    monkeypatch.setattr(hil_throws, "_direct", direct)
+    monkeypatch.setattr(hil_throws, "_over_the_wire", wire)
+    args = argparse.Namespace(throws=4, seed=0, policy="state", out=str(tmp_path), keep_runs=False, speed=1.0)
+    with pytest.raises(KeyboardInterrupt):
+        hil_throws.series(args)
+    with (tmp_path / "throws-state.jsonl").open("a") as file:
+        file.write('{"way": "wire", "seed": 2, "err')  # cut short
+    report = hil_throws.series(args)
+    assert flown == [0, 1, 2, 2, 3], "what was flown is not flown again"
+    assert len(hil.json_lines(tmp_path / "throws-state.jsonl")) == 8
+    assert report.tables[0].rows[0][1] == "3 of 4"
+    assert report.figures["ratio"] == pytest.approx(np.mean([0.022, 0.023, 0.024]) / np.mean([0.02, 0.021, 0.022]))
+    assert "NOT met" in report.notes[0], "one did not land"
+
+
+@pytest.mark.parametrize("words", [["--throws", "1"], ["--minutes", "0"], ["--rate", "0.1"], ["--throws", "5", "--speed", "3"]])
+def test_what_cannot_be_measured(words, tmp_path, capsys):
+    assert main(["bench", "hil", *words, "--out", str(tmp_path)]) == 2
+    assert "expected" in capsys.readouterr().err
+
+
+def test_a_run_that_does_not_start_says_why(tmp_path):
+    with pytest.raises(VisthrowError, match=r"did not start.*no policy 'nobody'"):
+        Pair(("--config", "fake", "--set", "policy=nobody"), hil.STILL).fly(tmp_path / "run")
+
+
+def test_a_short_soak_over_udp(tmp_path, capsys):
+    """Three seconds: everything is counted, and the fake saw nothing that it should not. Times are for a quiet machine."""
+    out = tmp_path / "soak.json"
+    assert main(["bench", "hil", "--minutes", "0.05", "--json", str(out), "--keep", str(tmp_path / "run")]) == 0
+    figures = json.loads(out.read_text())["figures"]
+    assert figures["ticks"] > 50
+    assert figures["breaches"] == []
+    assert {"poll", "estimate", "observation", "policy", "send", "total"} <= set(figures["latency_ms"])
+    assert "within the bars" in capsys.readouterr().out.replace("NOT ", "")
+    assert main(["hil", "replay", str(tmp_path / "run")]) == 0
+
+
+@pytest.mark.slow
+def test_a_minute_at_200_hz():
+    """No tick of ours is missed and memory stays flat; how long a tick takes is for a quiet machine to say."""
+    args = argparse.Namespace(minutes=SOAK_MINUTES, rate=200.0, policy="vision", core=None, keep=None)
+    figures = hil.soak(args).figures
+    assert figures["ticks"] + figures["missed"] >= 60 * 50 * SOAK_MINUTES
+    assert figures["missed_ours"] == 0
+    assert figures["breaches"] == []
+    if figures["memory_bytes_per_s"] is not None:
+        assert abs(figures["memory_bytes_per_s"]) < MOST_GROWTH
+
+
+@pytest.mark.slow
+def test_every_mocap_fault_over_udp(tmp_path):
+    """The same outcomes in real time as in lock step (tests/loopback/test_mocap_faults.py); times are the machine's."""
+    out, start = tmp_path / "faults.json", time.monotonic()
+    assert main(["bench", "hil", "--faults", "--json", str(out)]) == 0
+    figures = json.loads(out.read_text())["figures"]
+    assert set(figures) == set(FAULTS)
+    for name, found in figures.items():
+        assert found["breaches"] == [], name
+        assert found["releases"] == 0, name
+        assert found["in_throw"], name
+    assert figures["none"]["states"] == []
+    assert [s["state"] for s in figures["stop"]["states"]][:2] == ["recover", "abort"]
+    print(f"{time.monotonic() - start:.0f} s", file=sys.stderr)
