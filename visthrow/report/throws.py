@@ -3,7 +3,7 @@
 from visthrow import statistics as st
 from visthrow.plants import PLANTS
 from visthrow.report import figures
-from visthrow.report.book import SHIPPED, Book, durations, errors, landed, misses
+from visthrow.report.book import SHIPPED, Book, errors, landed, misses
 from visthrow.report.parts import Grid, Picture, Section, Text
 from visthrow.report.wanted import TARGETS
 from visthrow.results import Result
@@ -82,15 +82,15 @@ def vision_section(book: Book) -> Section:
                 missing.append(f"{target:g} m on the {SHORT[plant]}")
                 continue
             (vision, state), runs = pair
-            gap = st.difference(errors(vision), errors(state))
-            faster = st.difference(durations(vision), durations(state))
+            gap, faster = (_minus(vision, state, name) for name in ("error", "duration"))
             paper = _paper(target)
             beside = "-" if paper is None else f"{paper[0]:+.3f}, {paper[1]:+.3f}"
             rows.append((SHORT[plant], f"{target:.1f}", runs, gap.text(sign=True), _said(gap), faster.text(sign=True), beside))
             marks.append(figures.Mark(f"{target:.1f} m", gap, i, None if paper is None or i else paper[0]))
     parts: list = [
         Text("Vision minus state: positive means that vision lands further off. Where several trainings of both are recorded, "
-             "the interval covers trainings and throws; else it speaks of the two shipped policies alone.")
+             "the interval covers trainings and throws; else it speaks of the two shipped policies alone, throw by throw: both "
+             "met the same vehicles, starts and winds.")
     ]  # fmt: skip
     if rows:
         head = ("plant", "target [m]", "policies", "error: vision - state [m]", "in words", "duration: vision - state [s]",
@@ -103,6 +103,14 @@ def vision_section(book: Book) -> Section:
     if missing:
         parts.append(Text("Not thrown by both: " + "; ".join(missing) + ".", "missing"))
     return Section("vision", "Vision against state", tuple(parts))
+
+
+def _minus(vision: list[Result], state: list[Result], name: str) -> st.Interval:
+    """Difference of means: throw by throw where one policy of each met the same vehicles and starts."""
+    alike = all(vision[0].unit[key] == state[0].unit[key] for key in ("throws", "seed", "plant", "target"))
+    if len(vision) == len(state) == 1 and alike:
+        return st.paired(vision[0].columns[name], state[0].columns[name])
+    return st.difference([r.of(name) for r in vision], [r.of(name) for r in state])
 
 
 def _groups(book: Book, plant: str, target: float) -> tuple[tuple[list[Result], list[Result]], str] | None:

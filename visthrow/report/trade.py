@@ -57,6 +57,7 @@ def baseline_section(book: Book) -> Section:
                 "distance from the planned path until the release.")  # fmt: skip
         parts.append(Grid("The baseline by target", head, tuple(rows), note, heads=3))
         parts.append(Text(_bar(book), "finding"))
+    parts += _steps()
     if missing:
         parts.append(Text("Not thrown: " + "; ".join(missing) + ".", "missing"))
     return Section("baseline", "The model-based baseline", tuple(parts))
@@ -73,6 +74,22 @@ def _row(found: Result) -> tuple[str, ...]:
         return (*head, "-", "-", "-", "-", "-", beside)
     means = (f"{100 * found.of(name).mean():.1f}" for name in ("position_error", "velocity_error", "tracking"))
     return (*head, st.mean(found.of("error")).text(), f"{found.of('duration').mean():.3f}", *means, beside)
+
+
+def _steps() -> list[Grid | Text]:
+    """Step times of the controller, from the records of ``visthrow bench mpc``."""
+    from visthrow.bench import records
+
+    found = [records.load(path) for path in sorted(records.FOLDER.glob("mpc*.json"))]
+    if not found:
+        return [Text("No step times of the controller: `visthrow bench mpc --record mpc-cpu`.", "missing")]
+    grids = []
+    for record in found:
+        cpu, (table,) = record["provenance"]["processors"]["cpu"], record["tables"]
+        note = f"`{record['provenance']['command']}`, commit {record['provenance']['commit'][:12]}. {record['notes'][0]}"
+        rows = tuple(map(tuple, table["rows"]))
+        grids.append(Grid(f"Step of the controller, one core of an {cpu}", tuple(table["header"]), rows, note, heads=2))
+    return grids
 
 
 def _bar(book: Book) -> str:
