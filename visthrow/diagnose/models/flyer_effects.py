@@ -44,11 +44,11 @@ def _aero(params: "FlyerParams", seen: tuple[str, ...]) -> list[Effect]:
     weight = params.mass / 0.21  # the table's priors are those of a 0.21 kg vehicle
     return [
         Effect("rotor_drag_xy", "rotor drag across the shafts", "F -= theta (v_x, v_y, 0)", "kg/s", "aero",
-               (-0.3 * weight, 1.5 * weight), 0.05 * weight, 2e-3 * weight, seen, "Faessler et al. 2018", ("parasitic",),
+               (-params.drag_xy, 1.5 * weight), 0.05 * weight, 2e-3 * weight, seen, "Faessler et al. 2018", ("parasitic",),
                ("fly there and back", "speed sweep")),
         Effect("rotor_drag_z", "rotor drag along the shafts", "F -= theta (0, 0, v_z)", "kg/s", "aero",
-               (-0.3 * weight, 1.5 * weight), 0.05 * weight, 5e-3 * weight, seen, "Faessler et al. 2018", (), ("vertical sine",)),
-        Effect("parasitic", "the body's air drag", "F -= theta |v| v", "kg/m", "aero", (-0.05 * weight, 0.2 * weight),
+               (-params.drag_z, 1.5 * weight), 0.05 * weight, 5e-3 * weight, seen, "Faessler et al. 2018", (), ("vertical sine",)),
+        Effect("parasitic", "the body's air drag", "F -= theta |v| v", "kg/m", "aero", (0.0, 0.2 * weight),
                0.01 * weight, 1e-3 * weight, seen, "NeuroBEM 2021", ("rotor_drag_xy",), ("speed sweep",)),
         Effect("translational_lift", "more thrust in level flight", "T (1 + theta v_xy^2)", "s^2/m^2", "aero", (-0.2, 0.2), 0.01,
                1e-3, seen, "Svacha et al. 2017", (), ("level passes at several speeds",)),
@@ -100,7 +100,7 @@ def _cable(params: "FlyerParams", seen: tuple[str, ...]) -> list[Effect]:
                0.06 * of.length, 1.5e-3 * of.length, seen, "tape measure", ("marker_z",), ("swing",)),
         Effect("mass_payload", "the payload's mass", "m_p + theta", "kg", "rope", (-0.9 * of.mass, 5.0 * of.mass), 0.1 * of.mass,
                1e-2 * of.mass, seen, "a scale", ("thrust_gain", "mass_quad"), _SCALE),
-        Effect("payload_drag", "the payload's air drag", "F_p -= theta |v| v", "kg/m", "payload aero", (-1e-3, 2e-2), 1e-3, 1e-4,
+        Effect("payload_drag", "the payload's air drag", "F_p -= theta |v| v", "kg/m", "payload aero", (0.0, 2e-2), 1e-3, 1e-4,
                seen, "Cross and Lindsey 2014", (), ("fast swing",)),
         Effect("payload_delay", "the delay of the payload's pose", "y(t) = x(t - theta)", "s", "sensing", (-0.1, 0.1), 1e-2, 1e-3,
                seen, "motion capture pipelines", ("pose_delay",), ("swing",)),

@@ -44,7 +44,7 @@ def effects(params: GimbalParams) -> list[Effect]:
     found = [
         Effect(f"camera_tilt_{axis}", f"the camera is turned about its own {axis} axis", f"p_c = R_{axis}(theta) p", "rad",
                "camera", (-0.6, 0.6), 0.0175, 1.7e-3, NEEDED, "assembly", (f"marker_rot_{other}",), look)
-        for axis, other in zip("xyz", "zyx")
+        for axis, other in zip("xyz", "yxz")
     ]  # fmt: skip
     found += [
         Effect(f"camera_lever_{axis}", f"the camera stands off along its own {axis} axis", "p_c -= theta", "m", "camera",
@@ -59,7 +59,7 @@ def effects(params: GimbalParams) -> list[Effect]:
                "calibration", ("focal_scale",), ("vary the distance",)),
         *(Effect(f"marker_rot_{axis}", f"the tracked attitude is turned about the body's {axis} axis",
                  f"R_meas = R R_{axis}(theta)", "rad", "sensing", (-0.3, 0.3), 0.0175, 1.7e-3, NEEDED, "marker placement",
-                 (f"camera_tilt_{other}",), ("turn the gimbal", "dynamics of the flight")) for axis, other in zip("xyz", "zyx")),
+                 (f"camera_tilt_{other}",), ("turn the gimbal", "dynamics of the flight")) for axis, other in zip("xyz", "yxz")),
     ]  # fmt: skip
     return found
 

@@ -1,0 +1,387 @@
+"""Readers of logs: every format, what is wrong with files, and the raw blackbox against another decoder."""
+
+import gzip
+import math
+import random
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from tests import logfiles
+from visthrow import config
+from visthrow.diagnose import setup as setups
+from visthrow.diagnose.ingest import blackbox, blackbox_codec, read
+from visthrow.diagnose.ingest.mapping import ChannelMap, Split, TableMap, TimeColumn, signed_axes
+from visthrow.errors import ConfigError, LogError
+from visthrow.flightlog import Channel, FlightLog
+from visthrow.logexport import export
+
+REAL = Path(__file__).resolve().parents[1] / "data" / "real"
+BBL = REAL / "betaflight_bbl" / "btfl_001_start.bbl"
+
+
+def signed_vb(value: int) -> bytes:
+    return unsigned_vb((value << 1 ^ value >> 31) & 0xFFFFFFFF)
+
+
+def unsigned_vb(value: int) -> bytes:
+    out = bytearray()
+    while value > 127:
+        out.append(value & 127 | 128)
+        value >>= 7
+    return bytes([*out, value])
+
+
+def bits(value: int, count: int) -> str:
+    return format(value & (1 << count) - 1, f"0{count}b")
+
+
+def packed(text: str) -> bytes:
+    text += "0" * (-len(text) % 8)
+    return bytes(int(text[i : i + 8], 2) for i in range(0, len(text), 8))
+
+
+class TestCodec:
+    """Each packing, written by the test from the format's description."""
+
+    def test_numbers_of_variable_length(self):
+        for value in (0, 1, -1, 63, -64, 64, 8191, -70000, 2**31 - 1, -(2**31)):
+            assert blackbox_codec.Reader(signed_vb(value)).signed() == value
+        assert blackbox_codec.Reader(unsigned_vb(2**32 - 1)).unsigned() == 2**32 - 1
+        with pytest.raises(blackbox_codec.Corrupt):
+            blackbox_codec.Reader(b"\xff" * 6).unsigned()
+        with pytest.raises(blackbox_codec.EndOfLog):
+            blackbox_codec.Reader(b"\xff").unsigned()
+
+    def decode(self, code: int, data: bytes, fields: int) -> list[int]:
+        reader, values = blackbox_codec.Reader(data), []
+        for decoder, _, count in blackbox_codec.plan([code] * fields, [False] * fields):
+            values += decoder(reader, count)[:count]
+        assert reader.pos == len(data)
+        return values
+
+    def test_eight_fields_with_a_mask(self):
+        assert self.decode(blackbox_codec.TAG8_8SVB, bytes([0b101]) + signed_vb(-3) + signed_vb(500), 3) == [-3, 0, 500]
+        assert self.decode(blackbox_codec.TAG8_8SVB, signed_vb(-3), 1) == [-3]
+        nine = bytes([0b10000000]) + signed_vb(7) + signed_vb(8)
+        assert self.decode(blackbox_codec.TAG8_8SVB, nine, 9) == [0] * 7 + [7, 8]
+
+    @pytest.mark.parametrize(
+        ("data", "values"),
+        [
+            (packed("00" + bits(1, 2) + bits(-2, 2) + bits(-1, 2)), [1, -2, -1]),
+            (packed("01" + "00" + bits(7, 4) + bits(-8, 4) + bits(-1, 4)), [7, -8, -1]),
+            (packed("10" + bits(31, 6) + "00" + bits(-32, 6) + "00" + bits(-1, 6)), [31, -32, -1]),
+            (bytes([0b11_11_01_00]) + struct.pack("<bhi", -5, -300, -(2**31)), [-5, -300, -(2**31)]),
+        ],
+    )
+    def test_three_fields_with_a_selector(self, data, values):
+        assert self.decode(blackbox_codec.TAG2_3S32, data, 3) == values
+
+    @pytest.mark.parametrize(
+        ("data", "values"),
+        [
+            (packed("00" + bits(1, 2) + bits(-2, 2) + bits(-1, 2)), [1, -2, -1]),
+            (packed("01" + bits(15, 5) + bits(-16, 5) + bits(-8, 4)), [15, -16, -8]),
+            (packed("10" + bits(-128, 8) + bits(63, 7) + bits(-64, 7)), [-128, 63, -64]),
+        ],
+    )
+    def test_three_fields_of_uneven_width(self, data, values):
+        assert self.decode(blackbox_codec.TAG2_3SVARIABLE, data, 3) == values
+
+    def test_four_fields_of_nibbles(self):
+        chance, widths = random.Random(3), (0, 4, 8, 16)
+        for _ in range(200):
+            kinds = [chance.randrange(4) for _ in range(4)]
+            values = [chance.randrange(-(1 << w - 1), 1 << w - 1) if w else 0 for w in (widths[k] for k in kinds)]
+            tag = sum(kind << 2 * i for i, kind in enumerate(kinds))
+            data = bytes([tag]) + packed("".join(bits(v, widths[k]) for v, k in zip(values, kinds) if k))
+            assert self.decode(blackbox_codec.TAG8_4S16, data, 4) == values
+
+    def test_fourteen_bits_negated(self):
+        assert self.decode(blackbox_codec.NEG_14BIT, unsigned_vb(-25 & 0x3FFF), 1) == [25]
+
+
+class TestBlackbox:
+    """A real raw file: two logs, the second cut within a frame."""
+
+    def test_equals_another_decoder(self):
+        logs, other = blackbox.read_blackbox(BBL), np.load(BBL.with_suffix(".orangebox.npz"))
+        assert [len(log.main) for log in logs] == [98, 1930]
+        for i, log in enumerate(logs, start=1):
+            assert log.names == other[f"names{i}"].tolist()
+            assert np.array_equal(log.main, other[f"log{i}"])
+            assert np.all(np.diff(log.column("loopIteration")) == 16)
+            assert log.corrupt == log.dropped == 0
+        assert logs[0].complete
+        assert not logs[1].complete
+        assert logs[0].events[-1] == ("end of log", ())
+
+    def test_units_and_axes(self):
+        log = read(BBL)[0]
+        assert np.linalg.norm(log["acc_b"].values.mean(0)) == pytest.approx(9.81, rel=0.02)
+        assert log["battery_voltage"].values.mean() == pytest.approx(24.6, abs=0.1)
+        assert log["motor_command"].values.shape == (98, 4)
+        raw = blackbox.read_blackbox(BBL)[0]
+        front_left = (raw.column("motor[3]") - 158) / (2047 - 158)
+        assert log["motor_command"].values[:, 0] == pytest.approx(front_left)
+        assert log["rate_b"].values[:, 2] == pytest.approx(np.radians(raw.column("gyroADC[2]")))
+
+    def test_decoded_csv_is_known_without_a_mapping(self):
+        (log,) = read(REAL / "betaflight_bbl" / "LOG00037_start.csv.gz")
+        assert np.median(np.diff(log["rate_b"].time)) == pytest.approx(1e-3, rel=0.02)
+        assert log["throttle"].values.max() < 1.0
+
+    def test_damage_costs_frames_and_nothing_else(self):
+        data = bytearray(BBL.read_bytes())
+        clean = blackbox.read_blackbox(BBL)[1].main
+        data[40_000:40_030] = bytes(30)
+        log = self.of(bytes(data))[1]
+        assert log.corrupt >= 1
+        assert len(clean) - 40 < len(log.main) < len(clean)
+        known = {row.tobytes() for row in clean}
+        assert sum(row.tobytes() not in known for row in log.main) <= 1  # a damaged frame may still look like one
+
+    def of(self, data: bytes):
+        starts = [0, data.find(blackbox.MARKER, 1), len(data)]
+        return [blackbox._Decoder(data[a:b]).decode() for a, b in zip(starts, starts[1:])]
+
+    def test_cut_anywhere(self, tmp_path):
+        data = BBL.read_bytes()
+        whole = blackbox.read_blackbox(BBL)[1].main
+        path = tmp_path / "cut.bbl"
+        for end in (30, 500, 3000, 6100, 9000, 15_003, 15_004, 15_005, 33_333):
+            path.write_bytes(data[:end])
+            try:
+                logs = blackbox.read_blackbox(path)
+            except LogError as error:
+                assert end < 6172, error
+                continue
+            if len(logs) > 1:
+                assert np.array_equal(logs[1].main, whole[: len(logs[1].main)])
+
+    def test_no_blackbox(self, tmp_path):
+        path = tmp_path / "a.bbl"
+        path.write_bytes(bytes(range(256)) * 20)
+        with pytest.raises(LogError, match="no blackbox log"):
+            read(path)
+        path.write_bytes(blackbox.MARKER + b"\nH Data version:2\n")
+        with pytest.raises(LogError, match="no definition of I and P frames"):
+            read(path)
+        path.write_bytes(BBL.read_bytes().replace(b"encoding:1,1,0", b"encoding:1,4,0"))
+        with pytest.raises(LogError, match="encoding 4"):
+            read(path)
+
+
+def mapping(*channels: ChannelMap, **more) -> TableMap:
+    return TableMap(TimeColumn("t", "ms"), channels, **more)
+
+
+def written(tmp_path: Path, rows: list[str], name: str = "a.csv") -> Path:
+    path = tmp_path / name
+    text = "\n".join(rows) + "\n"
+    path.write_bytes(gzip.compress(text.encode()) if name.endswith(".gz") else text.encode())
+    return path
+
+
+class TestTables:
+    """CSV and parquet by a mapping."""
+
+    def test_units_axes_and_quaternion_order(self, tmp_path):
+        turn = Rotation.from_euler("ZYX", [0.5, -0.2, 0.1])  # forward-right-down in north-east-down
+        x, y, z, w = turn.as_quat()
+        rows = ["t,n,e,d,qw,qx,qy,qz,r", *(f"{10 * i},{i},2,-3,{w},{x},{y},{z},90" for i in range(5))]
+        (log,) = read(
+            written(tmp_path, rows, "a.csv.gz"),
+            mapping(
+                ChannelMap("pos_w", ("n", "e", "d"), "cm", axes="x,-y,-z"),
+                ChannelMap("quat_wb", ("qw", "qx", "qy", "qz"), "1", "quaternion", "wxyz", "x,-y,-z", "x,-y,-z"),
+                ChannelMap("turn", ("r",), "deg/s", frame="body"),
+            ),
+        )
+        assert log["pos_w"].time == pytest.approx([0, 0.01, 0.02, 0.03, 0.04])
+        assert log["pos_w"].values[4] == pytest.approx([0.04, -0.02, 0.03])
+        assert log["turn"].values[0] == pytest.approx(math.pi / 2)
+        vector = np.array([0.3, -0.7, 0.2])  # of the body, ours
+        flip = np.array([1.0, -1.0, -1.0])
+        expected = flip * turn.apply(flip * vector)
+        assert Rotation.from_quat(log["quat_wb"].values[0]).apply(vector) == pytest.approx(expected)
+
+    def test_angles_turn_yaw_first(self, tmp_path):
+        (log,) = read(
+            written(tmp_path, ["t,r,p,y", *(f"{i},10,20,30" for i in range(3))]),
+            mapping(ChannelMap("quat_wb", ("r", "p", "y"), "deg", "euler")),
+        )
+        yaw, pitch, roll = (Rotation.from_euler(axis, angle, degrees=True) for axis, angle in (("z", 30), ("y", 20), ("x", 10)))
+        expected = (yaw * pitch * roll).as_matrix()
+        assert Rotation.from_quat(log["quat_wb"].values[0]).as_matrix() == pytest.approx(expected)
+
+    def test_what_a_clock_does_wrong_is_counted_and_left_out(self, tmp_path):
+        rows = ["t,v", "0,1", "10,2", "10,3", "20,4", "5,5", "30,", ",7", "40,8"]
+        (log,) = read(written(tmp_path, rows), mapping(ChannelMap("x", ("v",), "m")))
+        notes = log.meta["ingest"]["x"]
+        assert log["x"].time == pytest.approx([0, 0.01, 0.02, 0.03, 0.04])
+        assert log["x"].valid.tolist() == [True, True, True, False, True]
+        assert (notes["repeated"], notes["backwards"], notes["unstamped"], notes["invalid"]) == (1, 1, 1, 1)
+
+    def test_held_values_are_one_measurement(self, tmp_path):
+        rows = ["t,v", *(f"{10 * i},{i // 4}" for i in range(12))]
+        (log,) = read(written(tmp_path, rows), mapping(ChannelMap("x", ("v",), "m", held=True)))
+        assert log["x"].time == pytest.approx([0, 0.04, 0.08])
+
+    def test_clocks_of_their_own_and_splits(self, tmp_path):
+        rows = ["t,u,b,v", *(f"{10 * i},{2 * i},{'ab'[i // 50]},{i}" for i in range(100))]
+        logs = read(
+            written(tmp_path, rows),
+            mapping(
+                ChannelMap("x", ("v",), "m", clock="other"), ChannelMap("y", ("v",), "m"),
+                clocks={"other": TimeColumn("u", "s")}, split=Split("b"),
+            ),
+        )  # fmt: skip
+        assert [log.meta["part"] for log in logs] == ["a", "b"]
+        assert logs[1]["x"].time[0] == 100.0
+        assert logs[1]["y"].time[0] == pytest.approx(0.5)
+
+    def test_export_comes_back(self, tmp_path):
+        time = np.arange(30) * 0.01
+        log = FlightLog(
+            {
+                "pos_w": Channel(time, np.random.default_rng(0).normal(size=(30, 3)), "m", "world"),
+                "command": Channel(time[::3], np.ones((10, 4)), "N, rad/s", "body"),
+                "attached": Channel(time[::2], np.arange(15) < 9, "bool"),
+            },
+            {"who": "me"},
+        )
+        for ending in ("csv", "parquet"):
+            export(log, tmp_path / f"a.{ending}")
+            (back,) = read(tmp_path / f"a.{ending}")
+            for name in log.channels:
+                assert back[name].values == pytest.approx(log[name].values.astype(float))
+                assert back[name].time == pytest.approx(log[name].time)
+        assert back.meta["who"] == "me"
+
+    @pytest.mark.parametrize(
+        ("rows", "message"),
+        [
+            (["t,v", "0,1", "1,2,3", "2,2"], "row 2 has 3 cells"),
+            (["t,v"], "no rows"),
+            ([""], "no header"),
+            (["t,w", "0,1"], "no column 'v'"),
+            (["t,v", "0,fast"], "holds text such as 'fast'"),
+            (["t,v,v", "0,1,1"], "stands twice"),
+        ],
+    )
+    def test_bad_tables(self, tmp_path, rows, message):
+        with pytest.raises(LogError, match=message):
+            read(written(tmp_path, rows), mapping(ChannelMap("x", ("v",), "m")))
+
+    def test_a_table_cut_while_written_loses_its_last_row(self, tmp_path):
+        (log,) = read(written(tmp_path, ["t,v", "0,1", "1,2", "2"]), mapping(ChannelMap("x", ("v",), "m")))
+        assert len(log["x"].time) == 2
+
+    def test_damaged_files(self, tmp_path):
+        path = written(tmp_path, ["t,v", *(f"{i},{i}" for i in range(999))], "a.csv.gz")
+        path.write_bytes(path.read_bytes()[:200])
+        with pytest.raises(LogError, match="cannot be read"):
+            read(path, mapping(ChannelMap("x", ("v",), "m")))
+        (tmp_path / "a.parquet").write_bytes(b"PAR1 no")
+        with pytest.raises(LogError, match="parquet"):
+            read(tmp_path / "a.parquet")
+        with pytest.raises(LogError, match="needs a mapping"):
+            read(written(tmp_path, ["t,v", "0,1"]))
+        with pytest.raises(LogError, match="no such file; in that folder"):
+            read(tmp_path / "b.csv")
+        with pytest.raises(LogError, match="ending '.doc'"):
+            read(written(tmp_path, ["t,v"], "a.doc"))
+        with pytest.raises(LogError, match="a folder without"):
+            (tmp_path / "run").mkdir()
+            read(tmp_path / "run")
+
+    @pytest.mark.parametrize(
+        ("change", "message"),
+        [
+            ({"unit": "parsec"}, "unit 'parsec'"),
+            ({"unit": "deg"}, "is of the kind 'rad'"),
+            ({"columns": ()}, "no columns"),
+            ({"axes": "x,y"}, "expected three"),
+            ({"axes": "x,y,-z"}, "mirror image"),
+            ({"axes": "x,x,z"}, "names? one axis twice"),
+            ({"kind": "quaternion"}, "quaternion of 3 columns"),
+        ],
+    )
+    def test_bad_mappings(self, change, message):
+        with pytest.raises(ConfigError, match=message):
+            ChannelMap(**({"name": "pos_w", "columns": ("x", "y", "z"), "unit": "m"} | change))
+
+    def test_axes(self):
+        assert signed_axes("y,-x,z", "") == [(1, 1.0), (0, -1.0), (2, 1.0)]
+
+
+class TestAutopilots:
+    """Files written byte by byte."""
+
+    def test_ulog(self, tmp_path):
+        path, quarter = tmp_path / "a.ulg", math.sqrt(0.5)
+        logfiles.write_ulg(
+            path,
+            {
+                ("vehicle_local_position", 0): (
+                    ["uint64_t timestamp", "float x", "float y", "float z", "float vx", "float vy", "float vz"],
+                    [(1_000_000 + 20_000 * i, 1.0, 2.0, -3.0 - i, 0.1, 0.2, -0.3) for i in range(5)],
+                ),
+                ("vehicle_attitude", 0): (
+                    ["uint64_t timestamp", "float[4] q"],
+                    [(1_000_000 + 10_000 * i, quarter, 0.0, 0.0, quarter) for i in range(10)],
+                ),
+            },
+        )
+        (log,) = read(path)
+        assert log["pos_w"].values[2] == pytest.approx([1.0, -2.0, 5.0])
+        assert log["vel_w"].values[2] == pytest.approx([0.1, -0.2, 0.3])
+        assert log["pos_w"].time[1] == pytest.approx(0.02)
+        nose = Rotation.from_quat(log["quat_wb"].values[0]).apply([1.0, 0.0, 0.0])
+        assert nose == pytest.approx([0.0, -1.0, 0.0], abs=1e-6)  # a quarter turn to the right, east is our -y
+
+    def test_dataflash(self, tmp_path):
+        path = tmp_path / "a.BIN"
+        imu = ("QBffffff", "TimeUS,I,GyrX,GyrY,GyrZ,AccX,AccY,AccZ")
+        rows = [("IMU", (1000 * i, i % 2, 0.1, 0.2, 0.3, 0.0, 0.0, -9.81)) for i in range(10)]
+        rows += [("ATT", (1000 * i, 0, 0.0, 0, 0.0, 0, 90.0)) for i in range(5)]
+        logfiles.write_bin(path, {"IMU": imu, "ATT": logfiles.ATT}, rows)
+        (log,) = read(path)
+        assert log["rate_b"].values == pytest.approx(np.tile([0.1, -0.2, -0.3], (5, 1)))  # the first IMU alone
+        assert log["acc_b"].values[0] == pytest.approx([0.0, 0.0, 9.81], rel=1e-6)
+        nose = Rotation.from_quat(log["quat_wb"].values[0]).apply([1.0, 0.0, 0.0])
+        assert nose == pytest.approx([0.0, -1.0, 0.0], abs=1e-6)
+
+    def test_telemetry(self, tmp_path):
+        from pymavlink.dialects.v20 import common
+
+        sender, data = common.MAVLink(None), b""
+        for i in range(5):
+            message = common.MAVLink_local_position_ned_message(20 * i, 1.0, 2.0, -3.0, 0.0, 0.0, 0.5)
+            data += struct.pack(">Q", 1_700_000_000_000_000 + 20_000 * i) + message.pack(sender)
+        path = tmp_path / "a.tlog"
+        path.write_bytes(data)
+        (log,) = read(path)
+        assert log["pos_w"].values[0] == pytest.approx([1.0, -2.0, 3.0])
+        assert np.diff(log["pos_w"].time) == pytest.approx(0.02)
+
+    @pytest.mark.parametrize("ending", ["ulg", "BIN", "tlog", "bbl", "npz"])
+    @pytest.mark.parametrize("data", [b"", b"nonsense" * 50, bytes(2000)])
+    def test_no_such_log(self, tmp_path, ending, data):
+        path = tmp_path / f"a.{ending}"
+        path.write_bytes(data)
+        with pytest.raises(LogError, match=rf"a\.{ending}"):
+            read(path)
+
+
+@pytest.mark.parametrize("path", sorted((config.configs_root() / "diagnose").glob("*.toml")), ids=lambda p: p.stem)
+def test_shipped_mappings_name_channels_with_a_meaning_where_there_is_one(path):
+    setup = setups.load(path.stem)
+    names = [channel.name for channel in setup.table.channels]
+    assert len(set(names)) == len(names)
+    assert len(setup.named()) <= 1
