@@ -46,6 +46,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--plant", default="hybrid", metavar="NAME", help=plants)
     parser.add_argument("--seed", type=int, default=0, help="of starts and noise (default: 0)")
     parser.add_argument("--config", metavar="NAME", help="fly in this train config instead of each policy's own")
+    allow = "part of a policy's contract that --config and --set may break (vehicle, rope.length); told above the table"
+    parser.add_argument("--allow", action="append", default=[], metavar="KEY", help=f"{allow}; may be repeated")
     parser.add_argument(
         "--out", default="out/compare", metavar="FOLDER", help="for table, CSV and plot (default: out/compare)"
     )
@@ -66,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
     if args.plant not in PLANTS:
         raise ConfigError(f"no plant '{args.plant}'; {suggest(args.plant, PLANTS)}")
     wanted = args.policies or DEFAULT_POLICIES
-    loaded = [load_policy(name, args.config, args.overrides) for name in wanted if name != NAME]
+    loaded = [load_policy(name, args.config, args.overrides, args.allow) for name in wanted if name != NAME]
     writable(Path(args.out))
     if NAME in wanted:
         importlib.import_module("piqp")  # said here rather than after all policies have thrown
@@ -82,14 +84,15 @@ def run(args: argparse.Namespace) -> int:
     entries = entries_of(loaded, unique_names(loaded), throws)
     if NAME in wanted:
         entries += throw_baseline(args)
-    title, rows = title_of(args.plant, args.seed), rows_of(entries)
+    title, rows = title_of(args.plant, args.seed) + departures_note(loaded), rows_of(entries)
     print(report(title, rows))
     for path in write(Path(args.out), entries, rows, args.plant, title):
         print(path)
     if args.json:
         from visthrow.storage import write_json
 
-        write_json(args.json, {"plant": args.plant, "seed": args.seed, "rows": rows})
+        departures = {item.name: item.departures for item in loaded if item.departures}
+        write_json(args.json, {"plant": args.plant, "seed": args.seed, "rows": rows, "departures": departures})
     return 0
 
 
@@ -226,6 +229,16 @@ def title_of(plant: str, seed: int) -> str:
         "reference-realistic": "the reference plant (MuJoCo) with pinned wind, drag, build errors and mocap noise",
     }[plant]
     return f"Throws from hover on {meaning} (`{plant}`, seed {seed})"
+
+
+def departures_note(loaded: Sequence) -> str:
+    """End of a heading that says under which other conditions than its training's each policy was flown."""
+    notes = [
+        f"{item.name} flown with {', '.join(f'{key} = {value!r}' for key, value in item.departures.items())}, trained otherwise"
+        for item in loaded
+        if item.departures
+    ]
+    return "".join(f"; {note}" for note in notes)
 
 
 def rows_of(entries: Sequence[Entry]) -> list[dict]:

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from sim.hybrid import rope_variants, tether_lengths
-from visthrow import config, protocol
+from visthrow import cli, config, protocol
 from visthrow.env import ThrowEnv
 from visthrow.errors import MismatchError
 from visthrow.loading import load_policy
@@ -127,6 +127,15 @@ def test_departures_are_refused_unless_allowed_and_then_named():
     loaded = load_policy("state", "state", change, allow=["rope.length", "vehicle.motor"])
     assert loaded.departures == {"rope.length": 0.4, "vehicle.motor.time_constant": 0.05}
     assert load_policy("state").departures == {}
+
+
+def test_the_table_of_a_departing_policy_says_so(tmp_path, capsys):
+    words = ["compare", "state", "--config", "state", "--set", "rope.length=0.34", "--throws", "2", "--targets", "2.0"]
+    words += ["--device", "cpu", "--out", str(tmp_path)]
+    assert cli.main(words) == 2
+    assert cli.main([*words, "--allow", "rope"]) == 0
+    assert "flown with rope.length = 0.34" in capsys.readouterr().out
+    assert "flown with rope.length = 0.34" in (tmp_path / "compare-hybrid.md").read_text()
 
 
 def test_a_field_with_a_default_enters_the_contract_only_where_it_differs():
