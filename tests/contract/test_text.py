@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-BINARY = {".bbl", ".png", ".jpg", ".gif", ".npz", ".rrd", ".parquet", ".onnx", ".ulg", ".pdf"}
+BINARY = {".bbl", ".gz", ".png", ".jpg", ".gif", ".npz", ".rrd", ".parquet", ".onnx", ".ulg", ".pdf"}
 LONGEST = 500
 """Lines of a Python file."""
 
