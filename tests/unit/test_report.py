@@ -69,7 +69,8 @@ def test_every_section_is_complete_when_everything_was_thrown(written):
     assert [s.name for s in sections] == [
         "throws", "vision", "ablations", "baseline", "front", "gap", "beyond", "training", "origin",
     ]  # fmt: skip
-    allowed = ("realistic reference plant", "drag")  # the made-up baseline does not fly there, nobody trained with drag
+    # The made-up baseline does not fly there, nobody trained with drag, and step times come from the records of bench.
+    allowed = ("realistic reference plant", "drag", "step times")
     for section in sections:
         for part in texts(section, "missing").split("; "):
             assert not part or any(word in part for word in allowed), (section.name, part)
@@ -81,7 +82,7 @@ def test_an_empty_book_says_everything_that_is_missing(tmp_path):
         assert texts(section, "missing"), section.name
         assert not any(isinstance(part, Picture) for part in section.parts), section.name
     html = page.html_of("t", "l", sections)
-    assert html.count('class="missing"') == len(sections)
+    assert html.count('class="missing"') >= len(sections)
 
 
 def test_policies_stand_beside_the_papers_vehicle(full):
