@@ -1,6 +1,7 @@
 """Bytes and messages from anywhere, signals, and the start: nothing of it makes the runner command."""
 
 import os
+import resource
 import signal
 import socket
 import subprocess
@@ -19,7 +20,8 @@ from tests.hil_flight import simple_policy
 from tests.loopback.wire import peers, throw
 
 READY = 8.0
-"""From the call to waiting for poses on a busy machine [s]; 1.5 s on a free core, 3 s are asked for."""
+"""Processor time of a run that waits for poses, from its call to its end [s]; its start takes 1.5 s on a free core, 3 s are
+asked for. Wall time says nothing on a busy machine."""
 
 
 def random_messages(rng, count: int) -> list[bytes]:
@@ -44,10 +46,10 @@ def framed(kind, body: bytes) -> bytes:
     return bytes([mav.PROTOCOL_MARKER_V2]) + head + body + crc.crc.to_bytes(2, "little")
 
 
-def flood(count: int) -> None:
-    runner, source, clock, fake = peers(LevelPlant(), loaded=simple_policy((-0.1269, 0, 0, 0, 1.0)))
+def flood(count: int, kind: str = "ardupilot") -> None:
+    runner, source, clock, fake = peers(LevelPlant(), kind=kind, write=True, loaded=simple_policy((-0.1269, 0, 0, 0, 1.0)))
     rng, inbox, commands = np.random.default_rng(0), source._link.port.inbox, []
-    fake.link.listen(lambda message, arrival: commands.append(message.get_type()))
+    fake.link.listen(lambda message, arrival: commands.append((message.get_type(), getattr(message, "command", None))))
     strings = random_messages(rng, min(count, 5000))
     said = 0
     while said < count:
@@ -60,12 +62,15 @@ def flood(count: int) -> None:
         fake.link.pump(clock.now)
     assert source._link.received > count // 2, "most must reach the listeners"
     assert not runner.errors
-    assert {"SET_ATTITUDE_TARGET", "COMMAND_LONG"}.isdisjoint(commands)
+    harmless = ("COMMAND_LONG", mav.MAV_CMD_SET_MESSAGE_INTERVAL)
+    told = {kind for kind, number in commands if (kind, number) != harmless}
+    assert {"SET_ATTITUDE_TARGET", "COMMAND_LONG", "PARAM_SET"}.isdisjoint(told)
     assert runner.backend.status(now).release != FAILED
 
 
-def test_messages_of_every_kind_command_nothing():
-    flood(20_000)
+@pytest.mark.parametrize("kind", ["ardupilot", "px4"])
+def test_messages_of_every_kind_command_nothing(kind):
+    flood(10_000, kind)
 
 
 @pytest.mark.slow
@@ -100,7 +105,7 @@ def test_a_flood_in_mid_throw_neither_commands_nor_releases():
         summary, fake, _ = throw(plant, loaded=simple_policy((-0.1269, 0, 0, 0, 1.0)), seconds=6.0)
     finally:
         wire.peers = made
-    assert (summary["latches"], fake.witness.releases, fake.ignored) == (1, 1, 0)
+    assert (summary["latches"], fake.witness.releases, fake.witness.breaches) == (1, 1, [])
     assert np.all(np.isfinite(plant.commands))
 
 
@@ -113,18 +118,19 @@ def free_port() -> int:
 def test_the_start_is_quick_and_ctrl_c_ends_a_waiting_run(tmp_path):
     device = f'link.device="udp:127.0.0.1:{free_port()}"'
     command = [sys.executable, "-m", "visthrow.cli", "hil", "run", "--set", device, "--out", str(tmp_path / "run")]
-    start = time.monotonic()
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
     process = subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, stdin=subprocess.DEVNULL, text=True
     )
     try:
         assert process.stderr.readline().startswith("ready after")
-        assert time.monotonic() - start < READY
         time.sleep(0.3)
         os.kill(process.pid, signal.SIGINT)
-        out, err = process.communicate(timeout=20)
+        out, err = process.communicate(timeout=60)
     finally:
         process.kill()
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    assert after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime < READY
     assert "ABORTED: the operator said abort" in out
     assert "Traceback" not in err
     assert process.returncode == 1
