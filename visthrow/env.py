@@ -111,8 +111,9 @@ class ThrowEnv(VecEnv):
 
     def _start(self, fresh: Tensor) -> None:
         """Start episodes where ``fresh``, bool, shape (E,)."""
+        mask = self._mask(fresh)
         with on_torch_stream(self.device):
-            self.sim.randomize(self.cfg.task.start, self._mask(fresh))
+            self.sim.randomize(self.cfg.task.start, mask)
         if self._goal is not None:
             self.views.goal_w.copy_(torch.where(fresh[:, None], self._goal, self.views.goal_w))
 
