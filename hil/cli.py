@@ -147,6 +147,7 @@ def _run(args: argparse.Namespace) -> int:
     from hil.backends import make_backend, mechanism_lag, require_reach
     from hil.clock import ManualClock, MonotonicClock
     from hil.flight import fly
+    from hil.images import open_images
     from hil.latency import Stages
     from hil.record import Recorder
     from hil.report import finish, story
@@ -170,7 +171,10 @@ def _run(args: argparse.Namespace) -> int:
     operator = Keyboard(args.action == "run" and args.auto_arm)
     print(f"ready after {time.monotonic() - started:.2f} s; waiting for poses", file=sys.stderr, flush=True)
     viewer, stages = beside(folder) if args.view else None, Stages()
-    summary = fly(runner, source, clock, operator, recorder, args.seconds or float("inf"), _tell, stages)
+    eyes = open_images(params.images, params.camera, clock.now) if params.keypoints == "detector" else None
+    summary = fly(runner, source, clock, operator, recorder, args.seconds or float("inf"), _tell, stages, eyes)
+    if eyes is not None:
+        eyes.close()
     backend.close()
     source.close()
     recorder.close(summary)

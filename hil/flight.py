@@ -9,6 +9,7 @@ from typing import Any, Protocol
 
 from hil.backends.base import Backend
 from hil.clock import Clock, Ticker
+from hil.images import Eyes
 from hil.latency import Stages
 from hil.record import Recorder
 from hil.runner import Decision, Runner, Words
@@ -40,6 +41,7 @@ class AutoOperator:
 def fly(
     runner: Runner, source: Source, clock: Clock, operator: Operator, recorder: Recorder | None = None,
     most: float = float("inf"), tell: Callable[[Decision], None] | None = None, stages: Stages | None = None,
+    eyes: Eyes | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """Run until the state machine is done, the recorded poses have ended, or for ``most`` seconds.
 
@@ -49,6 +51,7 @@ def fly(
         most: [s].
         tell: called with the first decision of each state.
         stages: filled with the times of each stage.
+        eyes: a camera, where keypoints are a detector's.
 
     Returns:
         The runner's summary with ticks, misses (those that a tick of ours caused by taking too long, and all), and the
@@ -70,6 +73,9 @@ def fly(
             status, words = backend.status(now), operator.words(runner.machine.state.value)
             recording = recorder is None or recorder.failed is None
             asked = time.perf_counter()
+            if eyes is not None:
+                eyes.tell(runner.hint(now))
+                runner.look(eyes.poll(now))
             decision = runner.tick(now, late, status, words, recording)
             poses = early + late
             times = {"late": ticker.late, "poll": polled - start, **stages.poses(poses, now), **runner.spent}

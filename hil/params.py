@@ -11,6 +11,7 @@ from hil.camera_log import CameraLogParams
 from hil.estimate import EstimateParams
 from hil.frames import FrameParams
 from hil.gate import GateParams
+from hil.images import ImageParams
 from hil.pose import BODIES, PAYLOAD, VEHICLE
 from hil.safety import CheckParams, FenceParams, GuardParams
 from hil.sources import BodyIds, CsvParams, LogBody, MocapParams, RigidBody
@@ -88,11 +89,15 @@ class HilParams:
     ardupilot: ArduPilotParams
     px4: Px4Params
     betaflight: BetaflightParams
+    keypoints: Literal["projection", "detector"] = "projection"  # of the poses, or of what a camera sees
+    images: ImageParams | None = None  # of the detector
     against: CameraLogParams | None = None  # a camera's own detections in the source's file
 
     def __post_init__(self) -> None:
         if not {VEHICLE, PAYLOAD} <= set(self.frames) <= set(BODIES):
             raise ConfigError(f"frames of {', '.join(self.frames)}; expected vehicle and payload, goal if it moves")
+        if self.keypoints == "detector" and self.images is None:
+            raise ConfigError("keypoints of a detector, but no table [images]; expected its kind and path or device")
         if self.throws < 1:
             raise ConfigError(f"throws {self.throws}; expected 1 or more")
         if self.source.kind not in LIVE and self.source.file is None:

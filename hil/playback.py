@@ -12,6 +12,7 @@ from hil.params import HilParams
 from hil.pose import Pose, Vector
 from hil.record import load_run
 from hil.runner import Decision, Runner, Words
+from hil.sight import Sight
 from hil.track import Track
 from visthrow.policy import Policy
 
@@ -45,6 +46,8 @@ class Playback:
     def feed(self, line: dict[str, Any], poses: list[Pose]) -> tuple[Decision, list[Sample]]:
         """Run one recorded tick; returns what was decided, and the poses that were taken in it."""
         self._samples = []
+        if line.get("seen") is not None:
+            self.runner.look([Sight.of(line["seen"])])
         decision = self.runner.tick(line["time"], poses, Status(*line["status"]), Words(*line["words"]), line["recording"])
         return decision, self._samples
 

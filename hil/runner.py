@@ -18,10 +18,12 @@ from hil.backends.base import FAILED, FOLLOW, LAND, Backend, Status
 from hil.backends.base import HOLD as HELD
 from hil.errors import RunError
 from hil.gate import HOLD, Tether
+from hil.images import Hint
 from hil.landing import Flight, Landing
 from hil.params import HilParams
 from hil.pose import GOAL, PAYLOAD, VEHICLE, Pose, Vector
 from hil.safety import Guard, failed_checks, fence_broken, outside
+from hil.sight import Sight, Sights
 from hil.states import FLYING, Inputs, Machine, State
 from hil.track import BodyState, Track
 from visthrow.hover import GRAVITY, HoverController, HoverParams
@@ -86,6 +88,7 @@ class Decision:
     valid: list | None = None
     release: bool = False  # the policy asked for it and it was done
     note: str = ""
+    seen: list | None = None  # of a camera's newest frame since the last tick; see `hil.sight.Sight`
 
 
 class Runner:
@@ -149,6 +152,8 @@ class Runner:
         self.spent: dict[str, float] = {}
         self._untaken: Exception | None = None
         self.watcher: Callable[[str, Track], None] | None = None
+        self.sights = Sights(self.pilot.camera, params.images.hold) if params.keypoints == "detector" else None
+        self._sight: Sight | None = None
 
     def tick(self, now: float, poses: list[Pose], status: Status, words: Words, recording: bool = True) -> Decision:
         """Decide one tick and send its command.
@@ -171,6 +176,19 @@ class Runner:
             if self.machine.flown:
                 self.backend.abort(now)
             return Decision(now, self.machine.state.value, self.machine.reason, note="exception")
+
+    def look(self, sights: list[Sight]) -> None:
+        """Take in what a camera saw since the last tick; of several frames the newest counts."""
+        if sights:
+            self._sight = sights[-1]
+
+    def hint(self, now: float) -> Hint | None:
+        """What a detector is told before it looks: vehicle and, while the payload hangs, how far off it can be."""
+        vehicle = self.tracks[VEHICLE].state(now)
+        if vehicle is None or vehicle.quat is None or self.tracks[VEHICLE].gate.level(now) >= HOLD:
+            return None
+        hangs = self._latch is None
+        return Hint(vehicle.pos, vehicle.quat, (0.5 * self.hang, 1.4 * self.hang) if hangs else None)
 
     def take(self, poses: list[Pose]) -> None:
         """Take in poses that have come before the tick that they belong to, so that the tick has less to do.
@@ -215,6 +233,11 @@ class Runner:
         if state is not before:
             self._entered(now, before, state, vehicle)
         decision = Decision(now, state.value, self.machine.reason)
+        if self._sight is not None and self.sights is not None:
+            decision.seen = self._sight.values()
+            if vehicle is not None and vehicle.quat is not None:
+                self.sights.take(self._sight, vehicle.quat)
+            self._sight = None
         self.spent["estimate"] = perf_counter() - begin
         wanted = self._command(now, state, vehicle, payload, goal_w, decision)
         self._ask(now, state, vehicle, status)
@@ -405,7 +428,8 @@ class Runner:
         """Show the policy what there is to see, and note what it makes of it."""
         attached = self._latch is None or decision.time - self._latch < self.lag - 1e-9
         views = [np.array([v]) for v in (vehicle.pos, vehicle.quat, vehicle.vel, vehicle.rate, payload.pos)]
-        out: PilotOutput = self.pilot.act(*views, np.array(goal_w), attached)
+        keypoints = None if self.sights is None else self.sights.keypoints(decision.time)
+        out: PilotOutput = self.pilot.act(*views, np.array(goal_w), attached, keypoints)
         self.spent["observation"], self.spent["policy"] = self.pilot.spent
         decision.action = out.action[0].tolist()
         decision.observation = out.observation[0].tolist()

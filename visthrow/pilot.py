@@ -97,6 +97,7 @@ class Pilot:
             policy.require({"camera": camera_conditions(camera_params)}, sections={"camera"})
         self.policy, self.count = policy, count
         self.camera = None if camera_params is None else KeypointCamera(camera_params)
+        self._look_given = Traced(self._frame_given)
         self._look, self._observe, self._decide = Traced(self._frame), Traced(self._assemble), Traced(self._decision)
         self.spent = (0.0, 0.0)
         self._first = torch.tensor([act.hover_action(GRAVITY * mass, self._max_thrust)], dtype=torch.float32)
@@ -124,6 +125,7 @@ class Pilot:
         payload_w: np.ndarray,
         goal_w: np.ndarray,
         attached: np.ndarray | bool = True,
+        keypoints: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> PilotOutput:
         """Decide one control step.
 
@@ -134,6 +136,8 @@ class Pilot:
             payload_w: of the payload's centre [m], shape (E, 3).
             goal_w: [m], shape (E, 3) or (3,).
             attached: whether the payload hangs on the vehicle, shape (E,) or one for all.
+            keypoints: what a detector saw, normalised, shape (E, 8, 2), and validity, shape (E, 8), in place of what payload
+                and goal project to; only with a camera.
 
         Raises:
             ValueError: An array of another shape.
@@ -145,7 +149,10 @@ class Pilot:
             ("payload_w", payload_w, 3), ("goal_w", goal_w, 3),
         )]  # fmt: skip
         hangs = torch.from_numpy(np.broadcast_to(np.asarray(attached), (self.count,)).astype(np.float32))
-        frame, *seen = self._look(*views)
+        if keypoints is None:
+            frame, *seen = self._look(*views)
+        else:
+            frame, *seen = self._look_given(*views, *(torch.from_numpy(np.array(given)) for given in keypoints))
         points, valid = seen or (None, None)
         further = [t for t in (valid, self._goal_velocity(frame, valid)) if t is not None]
         observation, self._history = self._observe(
@@ -173,6 +180,15 @@ class Pilot:
         seen = () if self.camera is None else ob.vision_part(self.camera, pos, rot, goal, payload)
         part = seen[0].flatten(1) if self.layout.name == "vision" else ob.state_part(pos, goal, payload)
         return torch.cat([ob.vehicle_part(pos, vel, rate, rot), part], dim=-1), *seen
+
+    def _frame_given(
+        self, pos: Tensor, quat: Tensor, vel: Tensor, rate: Tensor, payload: Tensor, goal: Tensor, points: Tensor,
+        valid: Tensor,
+    ) -> tuple[Tensor, ...]:  # fmt: skip
+        """As `_frame`, with keypoints that were seen and not projected."""
+        rot = ob.rotation_from_quat(quat)
+        part = points.flatten(1) if self.layout.name == "vision" else ob.state_part(pos, goal, payload)
+        return torch.cat([ob.vehicle_part(pos, vel, rate, rot), part], dim=-1), points, valid
 
     def _assemble(
         self, frame: Tensor, previous: Tensor, hangs: Tensor, history: Tensor, fresh: Tensor, *further: Tensor

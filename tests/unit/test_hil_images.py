@@ -1,0 +1,258 @@
+"""Pictures as a source of keypoints: a rendered flight looked at by the detector and flown by the runner, live and recorded."""
+
+import dataclasses
+import json
+import math
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from camera import Fisheye, FisheyeParams, KeypointCamera, keypoints
+from camera.mount import rotation_from_vector
+from camera.render import render_scene
+from hil.errors import SourceError
+from hil.images import STAMPS, Hint, ImageParams, LiveImages, Looker, RecordedImages
+from hil.params import HilParams
+from hil.record import lines
+from hil.sight import Sight, Sights
+from visthrow import config
+from visthrow.cli import main
+from visthrow.errors import ConfigError
+
+SMALL = FisheyeParams(280, 280, 72.9, 72.9, 139.5, 139.5)
+"""The lens of the pictures: the field of view of training's, a fifth of its pixels."""
+GOAL = (0.9, 0.1)
+PERIOD = 0.05
+FRAMES = 4
+
+
+def training():
+    return config.load(HilParams, config.find("hil", "dry_run")).camera
+
+
+def pose(i):
+    """Vehicle and ball at a picture: pitching forward, the ball swinging."""
+    t = PERIOD * i
+    pos = np.array([0.05 + 0.2 * t, 0.0, 1.3])
+    vector = torch.tensor([[0.02, 0.1 + 0.3 * t, 0.05]], dtype=torch.float64)
+    ball = pos + [0.05 - 0.3 * t, 0.03, -0.42]
+    return pos, vector, ball
+
+
+def picture(i) -> np.ndarray:
+    """BGR frame of a moment."""
+    pos, vector, ball = pose(i)
+    camera = KeypointCamera(training(), dtype=torch.float64)
+    rot = rotation_from_vector(vector)[0]
+    eye = torch.tensor(pos) + rot @ camera.position_b
+    frame = render_scene(Fisheye(SMALL), eye, rot @ camera.rot_cb.T, torch.tensor(GOAL), torch.tensor(ball), 0.033)
+    return np.round(frame.numpy()[..., ::-1] * 255).astype(np.uint8)
+
+
+def quaternion(vector) -> tuple[float, ...]:
+    v = vector[0].numpy()
+    angle = np.linalg.norm(v)
+    return (*(v / angle * math.sin(angle / 2)).tolist(), math.cos(angle / 2))
+
+
+@pytest.fixture(scope="module")
+def pictures():
+    return [picture(i) for i in range(FRAMES)]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory, pictures):
+    """A folder of pictures, and the poses of the same flight as CSV."""
+    import cv2
+
+    path = tmp_path_factory.mktemp("flight")
+    names = [f"{i:03d}.png" for i in range(FRAMES)]
+    for name, frame in zip(names, pictures):
+        assert cv2.imwrite(str(path / name), frame)
+    (path / STAMPS).write_text("file,time_s\n" + "\n".join(f"{n},{PERIOD * i:.3f}" for i, n in enumerate(names)) + "\n")
+    rows = ["t,x,y,z,qx,qy,qz,qw,bx,by,bz"]
+    for j in range(5 * FRAMES):
+        pos, vector, ball = pose(j / 5)
+        rows.append(",".join(map(repr, (PERIOD * j / 5, *pos.tolist(), *quaternion(vector), *ball.tolist()))))
+    (path / "poses.csv").write_text("\n".join(rows) + "\n")
+    return path
+
+
+def params(path: Path, **more) -> ImageParams:
+    return dataclasses.replace(ImageParams("folder", str(path), fisheye=SMALL), **more)
+
+
+def true_keypoints(i):
+    pos, vector, ball = pose(i)
+    tensors = [torch.tensor(v)[None] for v in (pos, np.array([*GOAL, 0.0]), ball)]
+    camera = KeypointCamera(training(), dtype=torch.float64)
+    return keypoints(camera, tensors[0], rotation_from_vector(vector), tensors[1], tensors[2])[0][0].numpy()
+
+
+PIXEL = 1.0 / (SMALL.fx * math.radians(110))
+"""A pixel of the pictures in normalised coordinates."""
+WORST = 1.2 * PIXEL
+"""Of any keypoint: the goal is a dozen pixels wide in pictures as small as these."""
+
+
+def test_pictures_of_another_lens_give_the_keypoints_of_training(folder):
+    source = RecordedImages(params(folder), training())
+    camera = KeypointCamera(training())
+    for i in range(FRAMES):
+        pos, vector, _ = pose(i)
+        quat = quaternion(vector)
+        source.tell(Hint(tuple(pos.tolist()), quat, (0.2, 0.6)))
+        (sight,) = source.poll(PERIOD * i + 1e-9)
+        assert sight.stamp == pytest.approx(PERIOD * i)
+        again = Sight.of(json.loads(json.dumps(sight.values())))
+        assert again == sight
+        sights = Sights(camera, 0.1)
+        sights.take(sight, quat)
+        points, valid = sights.keypoints(sight.stamp)
+        assert valid.all()
+        assert np.abs(points[0] - true_keypoints(i)).max() < WORST
+    assert source.poll(99.0) == []
+
+
+def test_only_the_newest_of_several_pictures_is_looked_at(folder):
+    source = RecordedImages(params(folder, delay=0.03), training())
+    assert source.poll(0.02) == [], "it takes its time to arrive"
+    (sight,) = source.poll(PERIOD * 2 + 0.031)
+    assert sight.stamp == pytest.approx(PERIOD * 2)
+
+
+def test_what_is_not_seen_any_more():
+    camera = KeypointCamera(training())
+    sights, level = Sights(camera, 0.1), (0.0, 0.0, 0.0, 1.0)
+    points, valid = sights.keypoints(0.0)
+    assert not valid.any()
+    assert not points.any()
+    below = Sight(1.0, None, (0.0, 0.1, math.sqrt(0.99), 0.08))
+    sights.take(below, level)
+    assert sights.keypoints(1.09)[1].tolist() == [[False] * 4 + [True] * 4]
+    points, valid = sights.keypoints(1.11)
+    assert not valid.any()
+    assert not points.any(), "gone from the middle: dropped out"
+    ahead = Sight(2.0, None, (0.0, -math.sin(1.75), math.cos(1.75), 0.08))
+    sights.take(ahead, level)
+    points, valid = sights.keypoints(2.2)
+    assert not valid.any()
+    np.testing.assert_allclose(np.linalg.norm(points[0, 4:], axis=-1), 1.0, atol=1e-6)
+    assert (points[0, 4:, 1] < -0.9).all(), "gone over the upper edge, it reads there"
+    sights.take(Sight(1.5, None, below.ball), level)
+    again, _ = sights.keypoints(2.2)
+    np.testing.assert_array_equal(again, points, "an older frame changes nothing")
+
+
+def test_a_live_camera_is_read_in_a_thread_of_its_own(pictures):
+    class Capture:
+        def __init__(self):
+            self.frames, self.released = iter(pictures[:2]), False
+
+        def isOpened(self):
+            return True
+
+        def read(self):
+            frame = next(self.frames, None)
+            return frame is not None, frame
+
+        def release(self):
+            self.released = True
+
+    capture = Capture()
+    eyes = LiveImages(ImageParams("camera", fisheye=SMALL, delay=0.02), training(), lambda: 7.0, capture)
+    deadline = time.monotonic() + 60.0
+    while eyes.failure is None and time.monotonic() < deadline:
+        time.sleep(0.01)
+    (sight,) = eyes.poll(0.0)
+    assert sight.stamp == pytest.approx(6.98)
+    assert sight.ball is not None
+    assert eyes.poll(0.0) == []
+    assert "gave no picture" in eyes.failure
+    eyes.close()
+    assert capture.released
+
+
+def test_the_runner_flies_on_what_the_detector_saw(folder, tmp_path, capsys):
+    """The vision policy's observations hold the detections, and a replay without the pictures gives the same actions."""
+    fisheye = ", ".join(f"{key}={value}" for key, value in dataclasses.asdict(SMALL).items())
+    columns = (
+        '[{body="vehicle", time={names=["t"], unit="s"}, pos={names=["x","y","z"], unit="m"}, '
+        'quat={names=["qx","qy","qz","qw"], unit="1"}}, '
+        '{body="payload", time={names=["t"], unit="s"}, pos={names=["bx","by","bz"], unit="m"}}]'
+    )
+    frames = '{axes="x,y,z", body_axes="x,y,z", quaternion="xyzw", yaw_offset_deg=0.0, marker_offset_b=[0.0, 0.0, 0.0]}'
+    settings = (
+        "source.kind=csv", f"source.file={folder / 'poses.csv'}", f"source.columns={columns}", "keypoints=detector",
+        f'images={{kind="folder", path="{folder}", fisheye={{{fisheye}}}}}', f"frames.vehicle={frames}",
+        f"frames.payload={frames}", f"goal_w=[{GOAL[0]}, {GOAL[1]}, 0.0]", "delay.source=0.0",
+    )  # fmt: skip
+    out = tmp_path / "run"
+    command = ["hil", "record", "--out", str(out)]
+    assert main([*command, *(word for setting in settings for word in ("--set", setting))]) == 0
+    ticks = list(lines(out / "ticks.jsonl"))
+    looked = [line for line in ticks if line["seen"] is not None]
+    assert len(looked) == FRAMES
+    for line in looked[1:]:
+        index = round(line["seen"][0] / PERIOD)
+        assert all(line["valid"])
+        off = np.abs(np.array(line["keypoints"]) - true_keypoints(index))
+        assert off.max() < WORST
+        assert np.array(line["keypoints"]).ravel()[:8].tolist() == line["observation"][20:28], "the goal's part"
+    capsys.readouterr()
+    (folder / STAMPS).rename(folder / "away")
+    try:
+        assert main(["hil", "replay", str(out)]) == 0
+        assert "all bit for bit the same" in capsys.readouterr().out
+        assert main([*command[:-1], str(tmp_path / "b"), *(w for s in settings for w in ("--set", s))]) == 2
+        assert "expected lines of file,time_s" in capsys.readouterr().err
+    finally:
+        (folder / "away").rename(folder / STAMPS)
+
+
+def test_wrong_pictures(folder, tmp_path):
+    import cv2
+
+    with pytest.raises(SourceError, match="size is not that of images"):
+        RecordedImages(params(folder, fisheye=None), training()).poll(1.0)
+    mount = dataclasses.replace(training().mount, position_b=(0.07, 0.0, -0.02))
+    with pytest.raises(ConfigError, match="40 mm from that of training"):
+        Looker(params(folder, mount=mount), training())
+    with pytest.raises(ConfigError, match=r"images\.path is none"):
+        ImageParams("folder")
+    with pytest.raises(ConfigError, match=r"no table \[images\]"):
+        config.load(HilParams, config.find("hil", "dry_run"), ["keypoints=detector"])
+    (tmp_path / STAMPS).write_text("file,time_s\na.png,0.0\n")
+    with pytest.raises(SourceError, match=r"names a\.png, which is not there"):
+        RecordedImages(params(tmp_path), training())
+    (tmp_path / "a.png").write_bytes(b"none")
+    with pytest.raises(SourceError, match="no picture that OpenCV can read"):
+        RecordedImages(params(tmp_path), training()).poll(1.0)
+    (tmp_path / STAMPS).write_text("file,time_s\na.png,1.0\na.png,0.5\n")
+    with pytest.raises(SourceError, match="ascending"):
+        RecordedImages(params(tmp_path), training())
+    with pytest.raises(SourceError, match="no video that OpenCV can open"):
+        RecordedImages(params(tmp_path / "a.mp4", kind="video"), training())
+    assert cv2.imread(str(folder / "000.png")).shape == (280, 280, 3)
+
+
+def test_a_video_with_stamps_beside_it(folder, pictures, tmp_path):
+    import cv2
+
+    path = tmp_path / "flight.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 20.0, (280, 280))
+    if not writer.isOpened():
+        pytest.skip("this OpenCV writes no video")
+    for frame in pictures:
+        writer.write(frame)
+    writer.release()
+    source = RecordedImages(params(path, kind="video"), training())
+    (sight,) = source.poll(PERIOD * 2 + 1e-6)
+    assert sight.stamp == pytest.approx(PERIOD * 2), "by the video's own rate"
+    path.with_suffix(f".{STAMPS}").write_text("frame,time_s\n" + "\n".join(f"{i},{1.0 + i}" for i in range(FRAMES)) + "\n")
+    (sight,) = RecordedImages(params(path, kind="video"), training()).poll(3.5)
+    assert sight.stamp == pytest.approx(3.0)
+    assert sight.ball is not None
