@@ -6,7 +6,7 @@ from typing import Any
 
 ACTIONS = {
     "check": ("look at logs: clocks, units, frames, gaps, what is excited, what they can answer", "visthrow.diagnose.check.cli"),
-    "explain": ("say what the simulation gets wrong about measured flights, and what that is worth", "visthrow.diagnose.explain_cli"),
+    "explain": ("say what the simulation gets wrong about flights, and what that is worth", "visthrow.diagnose.explain_cli"),
     "fit": ("make the first configuration of your own vehicle or motor, from flights without payload", "visthrow.diagnose.fit_cli"),
     "blind": ("hide effects in your own noise: which sizes would be named", "visthrow.diagnose.blind_cli"),
 }

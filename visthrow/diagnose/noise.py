@@ -38,7 +38,7 @@ BAD_WINDOW = 2.5
 BAD_NATS = 8.0
 """Log-likelihood that a window's own level must gain; that of chance stays below 4 in a hundred windows."""
 
-INFLATIONS = (2.5, 4.0, 6.5, 10.0, 20.0, 60.0, 200.0, 1000.0, 5000.0)
+INFLATIONS = tuple(2.5 * 1.6**k for k in range(18))
 """Factors that are tried for a bad window."""
 
 CLEANINGS = 4

@@ -1,0 +1,61 @@
+"""``visthrow diagnose explain``: what the model gets wrong about measured flights."""
+
+import argparse
+from pathlib import Path
+
+DEFAULT_OUT = "out/explain"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the action."""
+    from visthrow.diagnose.opening import add_arguments as shared
+
+    parser.epilog = (
+        "examples:\n"
+        "  visthrow diagnose explain monday/*.npz                      throws of ours, against the training simulator\n"
+        "  visthrow diagnose explain flights --plant mine.toml         against a vehicle and rope of your own\n"
+        "  visthrow diagnose explain swing.csv --config pendulum       another model, tables read by its mapping\n"
+    )
+    shared(parser)
+    parser.add_argument("--out", default=DEFAULT_OUT, metavar="FOLDER", help=f"of the report (default: {DEFAULT_OUT})")
+    parser.add_argument("--no-report", action="store_true", help="print the verdicts only; no gain, no page, no recording")
+    parser.add_argument("--no-blind", action="store_true", help="leave the detection limits out of the report")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Read, search, print, write."""
+    from visthrow.diagnose import opening, report, search
+    from visthrow.storage import write_json
+
+    model, logs = opening.open_model(args)
+    print(f"{len(logs)} log(s), {len(model.effects)} effects on {', '.join(model.channels)}", flush=True)
+    without = opening.numbers(args.without)
+    diagnosis = search.explain(model, seed=args.seed, without=without, progress=lambda line: print(f"  {line}", flush=True))
+    gain = None
+    if not args.no_report and diagnosis.work is not None:
+        gain = _report(args, diagnosis, model, logs)
+    print("\n" + report.summary(diagnosis, gain))
+    if not args.no_report and diagnosis.work is not None:
+        print(f"page, JSON, pictures and recording: {args.out}")
+    if args.json:
+        write_json(args.json, report.to_json(diagnosis, gain))
+    return 0
+
+
+def _report(args: argparse.Namespace, diagnosis, model, logs):
+    from visthrow import provenance
+    from visthrow.diagnose import blind, gain, recording, report
+    from visthrow.storage import write_json
+
+    measured = gain.measure(diagnosis, seed=args.seed)
+    hidden = None if args.no_blind else blind.hide(diagnosis, seed=args.seed)
+    steps = model.step_error() if hasattr(model, "step_error") else None
+    origin = provenance.collect()
+    about = {"logs": len(logs), "command": origin["command"], "commit": origin["commit"], "time": origin["time"]}
+    made = report.sections(diagnosis, measured, hidden, step_check=steps, about=about)
+    folder = Path(args.out)
+    report.write(folder, made, diagnosis, "What the simulation gets wrong about these flights")
+    whole = report.to_json(diagnosis, measured, hidden, extra={"step_error_sigma": steps, "provenance": origin})
+    write_json(folder / "diagnosis.json", whole)
+    recording.write(folder / "diagnosis.rrd", diagnosis, logs)
+    return measured

@@ -1,0 +1,93 @@
+"""From command line arguments to a model: which logs, read how, held against which simulation."""
+
+import argparse
+from collections.abc import Sequence
+
+from visthrow.diagnose.model import Model
+from visthrow.errors import ConfigError, DiagnoseError, suggest
+from visthrow.flightlog import FlightLog
+
+DEFAULT_PLANT = "state"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments that explain, plan and blind share."""
+    from visthrow.cli import add_common
+
+    parser.add_argument("logs", metavar="LOG", nargs="+", help="files, or folders of runs")
+    parser.add_argument("--config", metavar="NAME", help="of configs/diagnose, or a file: how tables are read, and which model")
+    parser.add_argument(
+        "--plant", metavar="NAME", default=DEFAULT_PLANT,
+        help=f"of configs/train, or a file: vehicle, rope and release of the model that is diagnosed (default: {DEFAULT_PLANT})",
+    )  # fmt: skip
+    parser.add_argument("--only", metavar="NAMES", help="consider these effects alone, separated by commas")
+    parser.add_argument("--without", metavar="FLIGHTS", default="", help="numbers of flights to leave out, from 0, by commas")
+    parser.add_argument("--seed", type=int, default=0, help="of the null worlds and bootstraps (default: 0)")
+    add_common(parser)
+
+
+def open_model(args: argparse.Namespace) -> tuple[Model, list[FlightLog]]:
+    """Read the logs and build the model.
+
+    Raises:
+        ConfigError, LogError, DiagnoseError: As what is read and built; ``--set`` with a setup's own model.
+    """
+    from visthrow.diagnose import setup
+
+    logs = setup.read_logs(args.logs, args.config)
+    chosen = setup.load(args.config) if args.config else None
+    if chosen is not None and chosen.named():
+        if args.overrides:
+            raise ConfigError(f"--set changes the throw's plant; the setup '{args.config}' has the model {chosen.named()[0]}")
+        model = setup.model_of(chosen, logs)
+        return (_only(model, args.only.split(",")) if args.only else model), logs
+    return throw_model(args, logs), logs
+
+
+def throw_model(args: argparse.Namespace, logs: Sequence[FlightLog]) -> Model:
+    """The whole throw, with the plant of an experiment."""
+    from visthrow import config
+    from visthrow.device import resolve
+    from visthrow.diagnose.throw_model import ThrowModel
+    from visthrow.task import Experiment, plant_of
+
+    experiment = config.load(Experiment, config.find("train", args.plant), args.overrides)
+    only = args.only.split(",") if args.only else None
+    return ThrowModel(logs, plant_of(experiment), device=resolve(args.device), only=only)
+
+
+class _Part:
+    """A model with some of its effects."""
+
+    def __init__(self, model: Model, keep: Sequence[int]) -> None:
+        self._model, self._keep = model, list(keep)
+        self.effects, self.channels = [model.effects[j] for j in keep], model.channels
+
+    def __getattr__(self, name: str):
+        return getattr(self._model, name)
+
+    def windows(self, theta):
+        """See :class:`visthrow.diagnose.model.Model`."""
+        from dataclasses import replace
+
+        return [replace(w, effects=w.effects[:, self._keep]) for w in self._model.windows(theta)]
+
+
+def _only(model: Model, names: Sequence[str]) -> Model:
+    known = [e.name for e in model.effects]
+    for name in names:
+        if name not in known:
+            raise DiagnoseError(f"no effect '{name}' for these logs; {suggest(name, known)}")
+    return _Part(model, [known.index(name) for name in names])
+
+
+def numbers(text: str) -> tuple[int, ...]:
+    """Flights named on the command line.
+
+    Raises:
+        DiagnoseError: Something else than numbers between commas.
+    """
+    try:
+        return tuple(int(part) for part in text.split(",") if part.strip())
+    except ValueError as error:
+        raise DiagnoseError(f"--without {text}: expected numbers of flights between commas, such as 0,3") from error
