@@ -16,8 +16,12 @@ from hil.runner import Decision, Runner, Words
 from hil.sources import Source
 from hil.states import State
 
-AHEAD = 2e-3
-"""Before a tick the poses that have come are taken in [s], so that the tick finds the last one or two alone."""
+AHEAD, AHEAD_SPREAD = 1e-3, 5e-3
+"""Before a tick the poses that have come are taken in [s], so that the tick finds the last one or two alone; earlier by a share of
+the second number that goes round from tick to tick, so that the link is looked at, and peers are asked for their time, at any
+point of their periods."""
+
+GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
 
 COLLECT_ALL = 50
 """Ticks between two looks of the garbage collector at all that was made since the start; the others see the last tick's."""
@@ -61,7 +65,7 @@ def fly(
     begin, throws, told, ended, ours, ticks = clock.now(), [], None, -math.inf, 0, 0
     with _collected():
         while runner.machine.state is not State.DONE and clock.now() - begin < most and not source.ended:
-            _wait(clock, ticker.due() - AHEAD, backend, source)
+            _wait(clock, ticker.due() - AHEAD - AHEAD_SPREAD * (ticks * GOLDEN % 1.0), backend, source)
             early = source.poll(clock.now())
             runner.take(early)
             _wait(clock, ticker.due(), backend, source)

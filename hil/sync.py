@@ -1,5 +1,6 @@
 """TIMESYNC on a link, both ways: peers are answered and asked, and poses are dated by their senders' clocks."""
 
+import random
 from dataclasses import replace
 from typing import Any
 
@@ -8,8 +9,9 @@ from hil.link import Link
 from hil.mavlink import mav
 from hil.pose import Pose
 
-ASK_EVERY = 0.1
-"""Between two questions [s]."""
+ASK_EVERY = (0.05, 0.15)
+"""Between two questions [s], drawn anew for each: a peer that works in periods of its own answers a question that comes at the same
+point of its period always with the same delay, which no shortest round trip would betray."""
 
 EARLY, LATE = 0.005, 0.2
 """A pose that seems to arrive earlier than it was measured by more than this, or later by more, bears another clock [s]."""
@@ -25,7 +27,7 @@ class LinkSync:
     def __init__(self, link: Link) -> None:
         """Listen to a link, and ask from its pump."""
         self._link = link
-        self._asked = -1e9
+        self._asked, self._pause, self._random = -1e9, 0.0, random.Random(0)
         self.peers: dict[int, TimeSync] = {}
         self._pending: list[int] = []
         self.foreign = 0
@@ -35,8 +37,8 @@ class LinkSync:
 
     def service(self, now: float) -> None:
         """Ask where it is time; nobody is asked before anybody was heard."""
-        if self._link.received and now - self._asked >= ASK_EVERY:
-            self._asked = now
+        if self._link.received and now - self._asked >= self._pause:
+            self._asked, self._pause = now, self._random.uniform(*ASK_EVERY)
             stamp = TimeSync.stamp(now)
             self._pending = [*self._pending[-50:], stamp]
             self._link.send(mav.MAVLink_timesync_message(0, stamp))
