@@ -88,7 +88,7 @@ class Fake:
     """The vehicle and the motion capture of both bodies; the children add an autopilot's protocol.
 
     Attributes:
-        last_thrust: of the last period [N]. events: times and what happened.
+        last_thrust: of the last period [N]. wall: the time now, between two periods as well [s]. events: times and what happened.
         witness: of what came. followed, ignored: set-points. release_time: when the mechanism's output moved.
     """
 
@@ -128,6 +128,8 @@ class Fake:
         self.followed = self.ignored = 0
         self.release_time: float | None = None
         self.last_thrust = 0.0
+        # In lock step what is heard in a period came in the middle of it.
+        self.wall: Callable[[], float] = lambda: self.plant.time + 0.5 * self.plant.period
         self.events: list[tuple[float, str]] = []
         self._going_on: dict[str, float] = {}
 

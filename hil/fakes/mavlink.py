@@ -45,7 +45,8 @@ class FakeMavlink(Fake):
         elif kind == "COMMAND_LONG" and message.target_system == VEHICLE_ID[0]:
             self._command(message)
         elif kind == "TIMESYNC" and message.tc1 == 0:
-            answer = mav.MAVLink_timesync_message(int(self.clock() * 1e9), message.ts1)
+            now = self.wall() + self.options.clock_offset
+            answer = mav.MAVLink_timesync_message(int(now * 1e9), message.ts1)
             self.say(answer, self.options.timesync_delay)
         elif kind == "PARAM_REQUEST_READ" and message.target_system == VEHICLE_ID[0]:
             self._tell_parameter(message.param_id)

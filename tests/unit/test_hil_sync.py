@@ -68,8 +68,8 @@ def dated(offset, seconds=2.0, stamp_offset=None):
     here, there = pipe()
     fake = FakeAutopilot(LevelPlant(), Link(there, *VEHICLE_ID), MocapParams(loss=0.0), 0, Options(clock_offset=offset))
     if stamp_offset is not None:
-        plain = fake.clock
-        fake.clock = lambda: plain() + stamp_offset
+        plain = fake.wall
+        fake.wall = lambda: plain() + stamp_offset
     link = Link(here)
     sync = LinkSync(link)
     source = MavlinkSource(link, (BodyIds("vehicle", "ATT_POS_MOCAP", 1, 1),), lambda: fake.plant.time)
@@ -85,8 +85,7 @@ def test_poses_are_dated_by_their_senders_clock(offset):
     poses, sync, _ = dated(offset)
     known = [pose for pose in poses if pose.measured is not None]
     assert len(known) > 150
-    # Half of the shortest answer, and one period of the lock step that passes between question and answer.
-    assert all(abs(pose.transit(9.9) - 0.01) <= 0.005 for pose in known[20:])
+    assert all(abs(pose.transit(9.9) - 0.01) <= 1e-5 for pose in known[20:])
     assert sync.peers[1].steps == 0
 
 
