@@ -4,6 +4,7 @@ import gzip
 import math
 import random
 import struct
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -147,7 +148,7 @@ class TestBlackbox:
 
     def of(self, data: bytes):
         starts = [0, data.find(blackbox.MARKER, 1), len(data)]
-        return [blackbox._Decoder(data[a:b]).decode() for a, b in zip(starts, starts[1:])]
+        return [blackbox._Decoder(data[a:b]).decode() for a, b in pairwise(starts)]
 
     def test_cut_anywhere(self, tmp_path):
         data = BBL.read_bytes()
@@ -155,11 +156,11 @@ class TestBlackbox:
         path = tmp_path / "cut.bbl"
         for end in (30, 500, 3000, 6100, 9000, 15_003, 15_004, 15_005, 33_333):
             path.write_bytes(data[:end])
-            try:
-                logs = blackbox.read_blackbox(path)
-            except LogError as error:
-                assert end < 6172, error
+            if end < 5000:  # within the header of the first log
+                with pytest.raises(LogError, match="frame"):
+                    blackbox.read_blackbox(path)
                 continue
+            logs = blackbox.read_blackbox(path)
             if len(logs) > 1:
                 assert np.array_equal(logs[1].main, whole[: len(logs[1].main)])
 
@@ -294,10 +295,10 @@ class TestTables:
             read(written(tmp_path, ["t,v", "0,1"]))
         with pytest.raises(LogError, match="no such file; in that folder"):
             read(tmp_path / "b.csv")
-        with pytest.raises(LogError, match="ending '.doc'"):
+        with pytest.raises(LogError, match=r"ending '\.doc'"):
             read(written(tmp_path, ["t,v"], "a.doc"))
+        (tmp_path / "run").mkdir()
         with pytest.raises(LogError, match="a folder without"):
-            (tmp_path / "run").mkdir()
             read(tmp_path / "run")
 
     @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ MOVES = 0.05
 
 _PREFIXES = ("", "est_", "mocap_", "payload_")
 _FASTEST, _FARTHEST = 60.0, 2000.0  # of vehicles that throw [m/s], [m]
-_BELONGS, _CLEARLY = 0.35, 0.12
+_BELONGS, _FIRMLY, _CLEARLY = 0.35, 0.7, 0.12
 _DELAY_WARN, _DELAY_KNOWN = 0.02, 0.003  # [s]
 
 
@@ -63,7 +63,7 @@ def _plausible(log: FlightLog) -> Iterator[Row]:
 
 def _velocity(log: FlightLog, pos: str, vel: str) -> list[Row]:
     (time_p, p), (time_v, v) = _valid(log[pos]), _valid(log[vel])
-    if not (_usable(time_p, p, 0.02) and _usable(time_v, v, MOVES)):
+    if not (_usable(time_p, p, 0.02) and _usable(time_v, v, 0.0)):
         return []
     time_d, derived = relations.derivative(time_p, p)
     return _compared(relations.relate(time_d, derived, time_v, v), f"d({pos})/dt", vel)
@@ -76,7 +76,7 @@ def _rates(log: FlightLog, quat: str) -> list[Row]:
     if len(time_q) < 50 or len(time_w) < 50:
         return []
     time_d, derived = relations.rates_of(time_q, q)
-    if not (_usable(time_d, derived, MOVES) and _usable(time_w, w, MOVES)):
+    if not (_usable(time_d, derived, MOVES) and _usable(time_w, w, 0.0)):
         return []
     return _compared(relations.relate(time_d, derived, time_w, w), f"rate of {quat}", "rate_b")
 
@@ -127,8 +127,8 @@ def _gravity(log: FlightLog, quat: str, pos: str) -> list[Row]:
     both = f"acc_b, {quat}"
     hint = relations.unit_hint(size / GRAVITY)
     if not 0.85 < size / GRAVITY < 1.15:
-        text = f"the mean force is {size:.4g} m/s^2, not 9.81: {hint or 'gravity is missing or the unit is wrong'}"
-        return [Row("units", both, "bad", text, figures)]
+        text = f"the mean force is {size:.4g} m/s^2, not 9.81: {hint or 'axes are exchanged, or gravity is missing'}"
+        return [Row("units" if hint else "frames", both, "bad", text, figures)]
     if tilt > 30.0:
         text = f"the mean force points {tilt:.0f} deg off up: turned or mirrored axes"
         return [Row("frames", both, "bad", text, figures)]
@@ -184,9 +184,10 @@ def _followed(found: relations.Relation, name: str) -> list[Row]:
         return [Row("frames", both, "bad", text, figures | {"axes": found.axes})]
     late = found.delay < -0.005
     hint = relations.unit_hint(found.scale)
-    verdict = "bad" if hint else "warn" if late else "ok"
+    weak = found.correlation < _FIRMLY
+    verdict = "bad" if hint else "warn" if late or weak else "ok"
     text = f"the rates follow {1e3 * found.delay:.1f} ms later, correlation {found.correlation:.2f}, gain {found.scale:.2f}"
-    text += ": before they were commanded" if late else f": {hint}" if hint else ""
+    text += ": before they were commanded" if late else f": {hint}" if hint else ": weakly" if weak else ""
     return [Row("delay", both, verdict, text, figures)]
 
 

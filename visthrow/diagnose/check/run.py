@@ -53,7 +53,9 @@ def _look(log: FlightLog) -> list[Row]:
     for name, channel in log.channels.items():
         rows += signals.look(name, channel, signals.notes_of(log, name))
     rows += _clocks(log)
-    return rows + physics.look(log) + excitation.look(log)
+    known = {name: channel for name, channel in log.channels.items() if np.sum(channel.valid) >= signals.FEW_SAMPLES}
+    usable = FlightLog(known, log.meta)
+    return rows + physics.look(usable) + excitation.look(usable)
 
 
 def _reader(log: FlightLog) -> list[Row]:

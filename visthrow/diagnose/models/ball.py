@@ -48,8 +48,8 @@ def effects(params: BallParams) -> list[Effect]:
     return [
         Effect("ball_drag", "air drag on the ball", "a -= theta |v| v", "1/m", flight, (-params.drag, 0.5), 0.03, 5e-4, seen,
                "Cross and Lindsey 2014; table tennis ball 0.1, tennis ball 0.02", ("wind_z",), ("throw at two speeds",)),
-        Effect("linear_drag", "drag in proportion to speed", "a -= theta v", "1/s", flight, (0.0, 1.0), 0.1, 3e-3, seen,
-               "viscous flow", ("ball_drag",), ("throw at two speeds",)),
+        Effect("linear_drag", "drag whose coefficient falls with speed", "a -= theta v", "1/s", flight, (0.0, 1.0), 0.1, 3e-3, seen,
+               "drag crisis of rough balls, Achenbach 1974", ("ball_drag",), ("throw at two speeds",)),
         Effect("top_spin", "the ball spins about the horizontal axis across its path", "a += theta e_across x v", "1/s", flight,
                (-2.0, 2.0), 0.1, 2e-3, seen, "Cross and Lindsey 2014, lift", ("frame_tilt_x", "frame_tilt_y", "wind_x", "wind_y"),
                ("throw in two directions",)),

@@ -1,0 +1,260 @@
+"""`visthrow diagnose check`: a flight made of closed forms, and everything that can be wrong with its log."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from visthrow import cli
+from visthrow.diagnose.check.relations import relate
+from visthrow.diagnose.check.run import check, table
+from visthrow.diagnose.check.signals import noise
+from visthrow.flightlog import Channel, FlightLog
+
+G = 9.81
+DELAY = 0.04
+"""Of the rates behind the commands [s]."""
+
+
+def flight(seconds: float = 12.0, rate: float = 100.0, seed: int = 0, scale: float = 1.0) -> dict[str, np.ndarray]:
+    """Columns of a flight along a smooth path, attitude along the thrust that it takes; noise of a good motion capture."""
+    rng = np.random.default_rng(seed)
+    time = np.arange(0.0, seconds, 1.0 / rate)
+    tones = [(axis, a, w, rng.uniform(0, 6)) for axis in range(3) for a, w in ((0.6, 1.3 + 0.4 * axis), (0.08, 5.1 + axis))]
+    pos, vel, acc = (np.zeros((len(time), 3)) for _ in range(3))
+    for axis, a, w, phase in tones:
+        a, w = a * scale, w * rng.uniform(0.75, 1.25)
+        pos[:, axis] += a * np.sin(w * time + phase)
+        vel[:, axis] += a * w * np.cos(w * time + phase)
+        acc[:, axis] -= a * w * w * np.sin(w * time + phase)
+    force = acc + [0, 0, G]
+    up = force / np.linalg.norm(force, axis=1, keepdims=True)
+    yaw = np.sin(rng.uniform(0.5, 0.9) * time + rng.uniform(0, 6))
+    heading = np.column_stack([np.cos(yaw), np.sin(yaw), 0 * yaw])
+    side = np.cross(up, heading)
+    side /= np.linalg.norm(side, axis=1, keepdims=True)
+    turn = Rotation.from_matrix(np.stack([np.cross(side, up), side, up], axis=2))
+    step = 1e-3
+    later = Rotation.from_matrix(turn.as_matrix())
+    rates = np.gradient(np.zeros(len(time)))[:, None] * np.zeros(3)
+    rates[1:-1] = (later[:-2].inv() * later[2:]).as_rotvec() * rate / 2.0
+    rates[0], rates[-1] = rates[1], rates[-2]
+    ahead = np.column_stack([np.interp(time + DELAY, time, column) for column in rates.T])
+    thrust = 0.2 * np.linalg.norm(force, axis=1)
+    quat = (turn * Rotation.from_rotvec(rng.normal(0, step, (len(time), 3)))).as_quat()
+    return {
+        "time": time, "pos_w": pos + [0, 0, 3.0] + rng.normal(0, 3e-4, pos.shape), "vel_w": vel + rng.normal(0, 5e-3, vel.shape),
+        "quat_wb": quat, "rate_b": rates + rng.normal(0, 0.02, rates.shape),
+        "acc_b": turn.inv().apply(force) + rng.normal(0, 0.1, force.shape),
+        "command": np.column_stack([thrust, ahead]) + rng.normal(0, 1e-3, (len(time), 4)),
+    }  # fmt: skip
+
+
+UNITS = {
+    "pos_w": ("m", "world"), "vel_w": ("m/s", "world"), "quat_wb": ("1", "world"), "rate_b": ("rad/s", "body"),
+    "acc_b": ("m/s^2", "body"), "command": ("N, rad/s", "body"), "payload_pos_w": ("m", "world"),
+    "motor_command": ("1", "none"), "est_pos_w": ("m", "world"),
+}  # fmt: skip
+
+
+def log_of(columns: dict[str, np.ndarray], **channels: Channel) -> FlightLog:
+    time = columns["time"]
+    made = {name: Channel(time, values, *UNITS[name]) for name, values in columns.items() if name != "time"}
+    return FlightLog({**made, **channels})
+
+
+def faults(log: FlightLog, verdict: str = "bad") -> str:
+    """Topics, channels and words of all rows with a verdict."""
+    (checked,) = check([log])
+    return " | ".join(f"{r.topic} {r.channel}: {r.text}" for r in checked.rows if r.verdict == verdict and r.topic != "answers")
+
+
+def test_a_good_flight_has_nothing_wrong():
+    (checked,) = check([log_of(flight())])
+    assert checked.verdict == "ok", table(checked)
+    answers = {row.channel: row.verdict for row in checked.rows if row.topic == "answers"}
+    assert answers["rotor drag"] == answers["wind against frame tilt"] == "ok"
+    assert answers["battery sag"] == "warn"
+    (delay,) = [r for r in checked.rows if r.topic == "delay" and r.channel == "command, rate_b"]
+    assert delay.figures["delay_s"] == pytest.approx(DELAY, abs=0.003)
+
+
+def test_noise_is_measured_beside_motion():
+    log = log_of(flight())
+    assert noise(log["pos_w"]) == pytest.approx([3e-4] * 3, rel=0.15)
+    assert noise(log["acc_b"]) == pytest.approx([0.1] * 3, rel=0.15)
+
+
+@pytest.mark.parametrize(
+    ("channel", "factor", "words"),
+    [
+        ("rate_b", 180 / np.pi, "degrees"), ("rate_b", np.pi / 180, "degrees"), ("acc_b", 1 / 9.80665, "in g"),
+        ("vel_w", 1000.0, "thousandths"), ("pos_w", 1000.0, "thousandths"), ("pos_w", 1e-3, ""),
+    ],
+)  # fmt: skip
+def test_wrong_units(channel, factor, words):
+    columns = flight()
+    columns[channel] = columns[channel] * factor
+    found = faults(log_of(columns))
+    assert "units" in found or (channel, factor) == ("pos_w", 1e-3), found
+    assert words in found, found
+    assert found
+
+
+@pytest.mark.parametrize("channel", ["rate_b", "vel_w", "acc_b"])
+@pytest.mark.parametrize(("order", "signs"), [((1, 0, 2), (1, 1, 1)), ((0, 1, 2), (1, -1, -1)), ((0, 2, 1), (1, 1, 1))])
+def test_wrong_axes(channel, order, signs):
+    columns = flight()
+    columns[channel] = columns[channel][:, order] * signs
+    found = faults(log_of(columns))
+    if channel == "acc_b" and order == (1, 0, 2):
+        return  # gravity alone does not tell x from y
+    assert "frames" in found, found
+    assert channel in found
+
+
+def test_axes_are_named():
+    columns = flight()
+    columns["rate_b"] = columns["rate_b"][:, (0, 1, 2)] * [1, -1, -1]
+    assert "(x,-y,-z)" in faults(log_of(columns))
+    columns = flight()
+    columns["command"][:, 1:] = columns["command"][:, (2, 1, 3)]
+    assert "command, rate_b: the rates follow the commands as (y,x,z)" in faults(log_of(columns))
+
+
+def test_quaternion_turned_around_is_caught():
+    columns = flight()
+    columns["quat_wb"] = columns["quat_wb"] * [-1, -1, -1, 1]
+    assert "frames" in faults(log_of(columns))
+    columns = flight()
+    columns["quat_wb"] = columns["quat_wb"][:, [3, 0, 1, 2]]  # wxyz taken for xyzw
+    assert "frames" in faults(log_of(columns))
+
+
+def test_scrambled_commands_are_caught():
+    columns = flight()
+    columns["command"] = flight(seed=5)["command"]
+    assert "command, rate_b: the rates do not follow" in faults(log_of(columns))
+
+
+def test_a_pose_stream_of_another_clock_is_told():
+    columns = flight()
+    late = np.column_stack([np.interp(columns["time"] - 0.035, columns["time"], c) for c in columns["pos_w"].T])
+    columns["est_pos_w"] = late
+    (checked,) = check([log_of(columns)])
+    (row,) = [r for r in checked.rows if r.channel == "pos_w, est_pos_w" and r.topic == "delay" and "delay_s" in r.figures]
+    assert row.verdict == "warn"
+    assert row.figures["delay_s"] == pytest.approx(0.035, abs=0.002)
+
+
+def test_a_drifting_clock_is_told():
+    columns = flight(40.0)
+    stretched = columns["time"] * 1.001
+    columns["est_pos_w"] = np.column_stack([np.interp(stretched, columns["time"], c) for c in columns["pos_w"].T])
+    found = faults(log_of(columns), "warn")
+    assert "the delay runs from -3" in found, found
+
+
+def test_frozen_jumping_and_saturated_values():
+    columns = flight()
+    columns["pos_w"][500:600] = columns["pos_w"][500]
+    assert "stands still to the last digit for 0.99 s" in faults(log_of(columns), "warn")
+    columns = flight()
+    columns["pos_w"][700] += 2.0
+    assert "2 jumps, the largest" in faults(log_of(columns), "warn")
+    columns = flight()
+    columns["acc_b"] = np.clip(columns["acc_b"], -3, 11)
+    assert "saturated" in faults(log_of(columns), "warn")
+
+
+def test_gaps_and_clocks():
+    columns = flight()
+    keep = np.ones(len(columns["time"]), bool)
+    keep[300:420] = False
+    found = faults(log_of({name: values[keep] for name, values in columns.items()}), "warn")
+    assert "the longest 1.21" in found
+    columns = flight()
+    columns["time"] = columns["time"] + np.random.default_rng(0).uniform(-0.004, 0.004, len(columns["time"]))
+    assert "clock" in faults(log_of(columns), "warn")
+    pose = flight()
+    other = Channel(pose["time"] + 500.0, pose["pos_w"], "m", "world")
+    assert "never overlap" in faults(log_of(flight(), est_pos_w=other))
+
+
+def test_copies_are_found_whatever_their_stamps():
+    first, second = flight(), flight(seed=1)
+    copy = dict(first, time=first["time"] + 7.0)
+    part = {name: values[400:1200] for name, values in first.items()}
+    results = check([log_of(first), log_of(second), log_of(copy), log_of(part)])
+    marked = [any(r.topic == "duplicates" for r in result.rows) for result in results]
+    assert marked == [False, False, True, True]
+
+
+def test_a_standing_vehicle_answers_nothing():
+    columns = flight(scale=1e-6)
+    (checked,) = check([log_of(dict(columns, motor_command=np.zeros((len(columns["time"]), 4))))])
+    assert "never left its place" in table(checked)
+    assert all(r.verdict == "warn" for r in checked.rows if r.topic == "answers")
+
+
+def test_bodies_exchanged():
+    columns = flight()
+    columns["payload_pos_w"] = columns["pos_w"] + [0.0, 0.0, 0.4]
+    assert "bodies exchanged" in faults(log_of(columns))
+    columns["payload_pos_w"] = columns["pos_w"] - [0.0, 0.0, 0.4]
+    assert "bodies exchanged" not in faults(log_of(columns))
+
+
+def test_order_of_motors():
+    columns = flight()
+    turning = np.gradient(columns["rate_b"], columns["time"], axis=0)
+    roll, pitch = 0.01 * turning[:, :1], 0.01 * turning[:, 1:2]
+    right = 0.5 + np.hstack([roll - pitch, -roll - pitch, roll + pitch, -roll + pitch])
+    good = dict(columns, motor_command=right)
+    assert "order of the motors" not in faults(log_of(good))
+    swapped = dict(columns, motor_command=right[:, [1, 0, 3, 2]])
+    assert "roll turns against the motors" in faults(log_of(swapped))
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 19])
+def test_too_short(count):
+    columns = {name: values[:count] for name, values in flight().items()}
+    assert "at least 20" in faults(log_of(columns))
+
+
+def test_long_and_constant_logs():
+    time = np.arange(0.0, 7200.0, 0.1)
+    zero = np.zeros((len(time), 3))
+    log = FlightLog({"pos_w": Channel(time, zero, "m", "world"), "rate_b": Channel(time, zero, "rad/s", "body")})
+    assert "one value from beginning to end" in faults(log)
+    assert "long" in faults(log, "warn")
+
+
+def test_invalid_channels_do_not_stop_it():
+    columns = flight()
+    none = Channel(columns["time"], columns["pos_w"], "m", "world", np.zeros(len(columns["time"]), bool))
+    assert "valid" in faults(log_of(columns, est_pos_w=none))
+    assert check([FlightLog({})])[0].verdict == "bad"
+
+
+def test_relate_finds_delay_and_scale():
+    time = np.arange(0, 20, 0.01)
+    a = np.column_stack([np.sin(1.1 * time) + np.sin(3.7 * time), np.cos(2.3 * time), np.sin(0.9 * time + 1)])
+    b = 2.0 * np.column_stack([np.interp(time - 0.0234, time, c) for c in a.T])
+    found = relate(time, a, time, b)
+    assert found.delay == pytest.approx(0.0234, abs=5e-4)
+    assert found.scale == pytest.approx(2.0, rel=0.01)
+    assert found.axes == "x,y,z"
+    turned = relate(time, a, time, b[:, [1, 0, 2]] * [1, -1, 1])
+    assert turned.axes == "y,-x,z"
+    assert not turned.mirror
+
+
+def test_command_line(tmp_path, capsys):
+    log_of(flight(6.0)).save(tmp_path / "a.npz")
+    assert cli.main(["diagnose", "check", str(tmp_path / "a.npz"), "--out", str(tmp_path), "--json", str(tmp_path / "a.json")]) == 0
+    assert "a.npz: ok" in capsys.readouterr().out
+    assert (tmp_path / "01-a.npz.png").stat().st_size > 10_000
+    assert json.loads((tmp_path / "a.json").read_text())["logs"][0]["verdict"] == "ok"
+    assert cli.main(["diagnose", "check", str(tmp_path / "b.npz")]) == 2
