@@ -1,4 +1,4 @@
-"""The autopilot's part of ``hil check``: parameters, and the share of thrust in hover against the calibration.
+"""The autopilot's part of ``hil check`` and of a run's summary: parameters, and the share of thrust in hover.
 
 The share is the one that the autopilot itself reports while the vehicle hovers in its hands or a pilot's (ATTITUDE_TARGET or
 VFR_HUD, the throttle channel of Betaflight). After a run the runner's own hover says it as well: see :func:`hover_of_run`.
@@ -7,7 +7,7 @@ VFR_HUD, the throttle channel of Betaflight). After a run the runner's own hover
 from pathlib import Path
 from typing import Any
 
-from hil.backends.base import FOLLOW
+from hil.backends.base import FOLLOW, Status
 from hil.backends.thrust import LEAST_SHARES, HoverMeter
 from hil.errors import RunError
 from hil.pose import VEHICLE
@@ -66,6 +66,24 @@ class AutopilotCheck:
         return [*out, self.meter.story(mass)]
 
 
+def told(backend: Any, link: Any) -> dict[str, Any]:
+    """What a run's summary keeps of its autopilot: parameters, the last release, texts, clocks of the link's peers.
+
+    Args:
+        backend: of the run.
+        link: of the run, or None.
+    """
+    out: dict[str, Any] = {"backend": backend.name}
+    if hasattr(backend, "audit"):
+        audit, release = backend.audit, backend.release_record
+        out["parameters"] = {"found": audit.found, "written": audit.written, "problems": audit.problems}
+        out["release"] = {"state": release.state, "note": release.note, "sends": release.sends}
+        out["texts"] = getattr(backend, "texts", [])[-50:]
+    if link is not None and link.sync is not None:
+        out["clocks"] = link.sync.summary()
+    return out
+
+
 def hover_of_run(folder: str | Path) -> tuple[bool, str]:
     """Whether the hover of a recorded run took the weight, by what the runner commanded before its throws.
 
@@ -87,7 +105,8 @@ def hover_of_run(folder: str | Path) -> tuple[bool, str]:
     mass = contract["vehicle"]["body"]["mass"] + contract["rope"]["rope_mass"] + contract["rope"]["payload_mass"]
     thrusts, hovering = [], 0
     for line in lines(folder / TICKS):
-        follows = line["state"] in (State.READY, State.ARMED) and line["command"] and line["status"][3] == FOLLOW
+        mode = Status(*line["status"]).mode
+        follows = line["state"] in (State.READY, State.ARMED) and line["command"] and mode == FOLLOW
         hovering = hovering + 1 if follows else 0
         if hovering > SETTLING:
             thrusts.append(line["command"][0])

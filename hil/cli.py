@@ -144,6 +144,7 @@ def _params(args: argparse.Namespace) -> Any:
 
 def _run(args: argparse.Namespace) -> int:
     started = time.monotonic()
+    from hil.autopilot_check import told
     from hil.backends import make_backend, mechanism_lag, require_reach
     from hil.clock import ManualClock, MonotonicClock
     from hil.flight import fly
@@ -173,6 +174,7 @@ def _run(args: argparse.Namespace) -> int:
     viewer, stages = beside(folder) if args.view else None, Stages()
     eyes = open_images(params.images, params.camera, clock.now) if params.keypoints == "detector" else None
     summary = fly(runner, source, clock, operator, recorder, args.seconds or float("inf"), _tell, stages, eyes)
+    summary["autopilot"] = told(backend, link)
     if eyes is not None:
         eyes.close()
     backend.close()

@@ -173,4 +173,8 @@ def test_a_throw_with_each_kind(tmp_path, kind, policy):
     assert (report["breaches"], report["releases"]) == ([], 1)
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert (summary["latches"], summary["errors"]) == (1, [])
+    autopilot = summary["autopilot"]
+    assert (autopilot["backend"], autopilot["parameters"]["problems"]) == (kind, [])
+    assert autopilot["release"]["state"] == "accepted"
+    assert autopilot["clocks"]["foreign_stamps"] == 0 or kind == "betaflight"
     assert replay(tmp_path / "run")["differences"] == []

@@ -1,0 +1,80 @@
+"""What a recorded run says of its hover, and what its summary keeps of the autopilot."""
+
+import json
+
+import pytest
+
+from hil.autopilot_check import hover_of_run, told
+from hil.backends import DryRun
+from hil.errors import RunError
+from hil.fakes.level import LevelPlant
+from hil.flight import fly
+from hil.record import CONFIG, TICKS, Recorder
+from hil.runner import Words
+from tests.hil_flight import simple_policy
+from tests.loopback.wire import peers
+
+QUICK = ("states.check_hold=0.2",)
+NEVER = simple_policy((-0.1269, 0.0, 0.0, 0.0, -1.0))
+
+
+class Nobody:
+    """Never arms: the vehicle hovers."""
+
+    def words(self, state):
+        return Words()
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """The folder of a run that hovers for some seconds, and what its summary keeps."""
+    folder = tmp_path_factory.mktemp("hover") / "run"
+    runner, source, clock, _ = peers(LevelPlant(), loaded=NEVER, overrides=QUICK)
+    recorder = Recorder(folder, runner.params)
+    summary = fly(runner, source, clock, Nobody(), recorder, 4.0)
+    summary["autopilot"] = told(runner.backend, source._link)
+    recorder.close(summary)
+    return folder
+
+
+def test_the_hover_of_a_run_is_its_weight(run):
+    good, text = hover_of_run(run)
+    assert good
+    assert text.startswith("hover took 1.0")
+
+
+@pytest.mark.parametrize(("factor", "good"), [(1.05, True), (1.12, False), (0.85, False)])
+def test_a_hover_that_took_another_thrust_gives_the_share_to_write_down(run, tmp_path, factor, good):
+    lines = [json.loads(line) for line in (run / TICKS).read_text().splitlines()]
+    for line in lines:
+        if line["command"]:
+            line["command"][0] *= factor
+    for name in (CONFIG, "policy.npz"):
+        (tmp_path / name).write_bytes((run / name).read_bytes())
+    (tmp_path / TICKS).write_text("\n".join(map(json.dumps, lines)) + "\n")
+    found, text = hover_of_run(tmp_path)
+    assert found == good
+    ratio = float(text.split()[2])
+    assert ratio == pytest.approx(factor, rel=0.01)
+    share = float(text.split("the hover share is ")[1].split(",")[0])
+    assert share == pytest.approx(0.1906 * ratio, rel=2e-3), "a straight line: as much more share"
+
+
+def test_runs_that_say_nothing_of_a_hover(run, tmp_path):
+    for name in (CONFIG, "policy.npz"):
+        (tmp_path / name).write_bytes((run / name).read_bytes())
+    with pytest.raises(RunError, match="expected the folder of a run"):
+        hover_of_run(tmp_path)
+    (tmp_path / TICKS).write_text("")
+    with pytest.raises(RunError, match="0 ticks of steady hover before throws; expected 50 or more"):
+        hover_of_run(tmp_path)
+
+
+def test_the_summary_keeps_what_the_autopilot_said(run):
+    kept = json.loads((run / "summary.json").read_text())["autopilot"]
+    assert kept["backend"] == "ardupilot"
+    assert kept["parameters"]["found"]["GUID_OPTIONS"] == 8
+    assert kept["parameters"]["problems"] == kept["parameters"]["written"] == []
+    assert kept["release"] == {"state": "idle", "note": "", "sends": 0}
+    assert kept["clocks"]["peers"]["1"]["steps"] == 0
+    assert told(DryRun(), None) == {"backend": "dry-run"}
