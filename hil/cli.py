@@ -245,6 +245,7 @@ def _check(args: argparse.Namespace) -> int:
     from hil.autopilot_check import AutopilotCheck
     from hil.backends import DryRun, make_backend
     from hil.clock import ManualClock, MonotonicClock
+    from hil.plausible import unit_problems
     from hil.runner import Runner, Words
     from hil.sources.opening import open_source
     from visthrow.policy import Policy, find_policy
@@ -257,10 +258,12 @@ def _check(args: argparse.Namespace) -> int:
         clock = ManualClock(source.start) if recorded else MonotonicClock(args.speed)
         runner = Runner(params, Policy.load(find_policy(params.policy)), DryRun())
         autopilot = AutopilotCheck(params, make_backend(params, link))
-        begin, seconds = clock.now(), args.seconds or 5.0
+        begin, seconds, poses = clock.now(), args.seconds or 5.0, []
         while clock.now() - begin < seconds and not source.ended:
             now = clock.now()
-            runner.tick(now, source.poll(now), runner.backend.status(now), Words())
+            came = source.poll(now)
+            poses += came
+            runner.tick(now, came, runner.backend.status(now), Words())
             autopilot.tick(now, runner)
             clock.sleep_until(now + runner.pilot.period)
         now = clock.now()
@@ -278,7 +281,7 @@ def _check(args: argparse.Namespace) -> int:
             f"{z:+.3f}) m, refused: {json.dumps(track.gate.refused) if track.gate.refused else 'none'}, "
             f"velocity late by {max(0.0, 1e3 * track.filter.lag):.0f} ms"
         )
-    problems = runner.problems() + [text for good, text in found if not good]
+    problems = runner.problems() + unit_problems(poses, params.frames) + [text for good, text in found if not good]
     print("".join(f"{text}\n" for good, text in found if good), end="")
     print("\n".join(f"FAIL  {text}" for text in problems) or "PASS  all checks")
     return 1 if problems else 0

@@ -50,9 +50,12 @@ def _read(path: Path, body: LogBody) -> list[Pose]:
         names = ", ".join(f"{name} {i}" for name, i in sorted(topics) if name in TOPICS) or "none"
         raise SourceError(f"{path}: no {body.message} {body.instance} in this log; of those with poses it has: {names}")
     try:
-        return _local(data, topics, body) if body.message == LOCAL else _odometry(data, body)
-    except KeyError as error:
-        raise SourceError(f"{path}: {body.message} has no field {error}; it has {', '.join(sorted(data))}") from None
+        with parsing(path, f"fields of {body.message} as PX4 writes them"):
+            return _local(data, topics, body) if body.message == LOCAL else _odometry(data, body)
+    except SourceError as error:
+        if isinstance(error.__cause__, KeyError):
+            raise SourceError(f"{path}: no field {error.__cause__}; {body.message} has {', '.join(sorted(data))}") from None
+        raise
 
 
 def _times(data: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:

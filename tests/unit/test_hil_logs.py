@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 
 from hil.errors import SourceError
@@ -139,6 +140,52 @@ def test_the_estimate_of_a_ulg_takes_the_attitude_before_it(tmp_path):
     files.write_ulg(path, topics)
     with pytest.raises(SourceError, match="gives no attitude"):
         read_ulg(path, (LogBody("vehicle", "vehicle_local_position"),))
+
+
+def spoiled(data: bytes, rng) -> bytes:
+    """A file with some bytes changed, cut out or doubled."""
+    out = bytearray(data)
+    for _ in range(rng.integers(1, 8)):
+        at = int(rng.integers(0, len(out) - 1))
+        kind = rng.integers(3)
+        if kind == 0:
+            out[at] = int(rng.integers(256))
+        elif kind == 1:
+            del out[at : at + int(rng.integers(1, 30))]
+        else:
+            out[at:at] = out[at : at + int(rng.integers(1, 30))]
+        if len(out) < 2:
+            break
+    return bytes(out)
+
+
+def test_spoiled_logs_raise_nothing_else(tmp_path):
+    """150 damaged copies of each kind: poses, or one kind of error."""
+    pytest.importorskip("pyulog")
+    rng = np.random.default_rng(0)
+    bin_path, ulg_path, copy = tmp_path / "a.BIN", tmp_path / "a.ulg", tmp_path / "copy"
+    files.write_bin(bin_path, {"VISP": files.VISP}, [vision(i) for i in range(20)])
+    files.write_ulg(ulg_path, {("vehicle_visual_odometry", 0): (ODOMETRY, [odometry(i) for i in range(20)])})
+    told = 0
+    for path, read, body in (
+        (bin_path, read_bin, VEHICLE), (ulg_path, read_ulg, (LogBody("vehicle", "vehicle_visual_odometry"),)),
+    ):  # fmt: skip
+        data = path.read_bytes()
+        for _ in range(150):
+            copy.write_bytes(spoiled(data, rng))
+            try:
+                assert read(copy, body)
+            except SourceError:
+                told += 1
+    assert told > 20, "some are past reading"
+
+
+def test_a_topic_without_a_field_says_which(tmp_path):
+    pytest.importorskip("pyulog")
+    path = tmp_path / "a.ulg"
+    files.write_ulg(path, {("vehicle_odometry", 0): (["uint64_t timestamp", "float[3] position"], [(1, 0.0, 0.0, 0.0)])})
+    with pytest.raises(SourceError, match=r"no field 'q\[0\]'; vehicle_odometry has position"):
+        read_ulg(path, (LogBody("vehicle", "vehicle_odometry"),))
 
 
 @pytest.mark.parametrize("content", [b"", b"\x00" * 500, b"ULog\x01\x12\x35\x01" + b"\xff" * 40, b"t,x\n1,2\n"])
