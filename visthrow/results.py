@@ -159,12 +159,21 @@ def load_all(places: Iterable[str | Path]) -> dict[str, Result]:
 
 
 def join(found: Iterable[Result]) -> list[Result]:
-    """Put the batches of one set of throws together: units that differ in nothing but ``batch``, in its order."""
-    groups: dict[str, list[Result]] = {}
+    """Put the batches of one set of throws together: units that differ in nothing but ``batch`` and its size, in order.
+
+    Of two results for one batch the larger counts. Units without a batch stay as they are.
+    """
+    whole: list[Result] = []
+    groups: dict[str, dict[int, Result]] = {}
     for result in found:
-        whole = {name: value for name, value in result.unit.items() if name not in ("batch", "throws")}
-        groups.setdefault(key_of(whole), []).append(result)
-    return [_joined(sorted(group, key=lambda r: r.unit.get("batch", 0))) for group in groups.values()]
+        if "batch" not in result.unit:
+            whole.append(result)
+            continue
+        rest = {name: value for name, value in result.unit.items() if name not in ("batch", "throws")}
+        group, batch = groups.setdefault(key_of(rest), {}), result.unit["batch"]
+        if batch not in group or result.unit["throws"] > group[batch].unit["throws"]:
+            group[batch] = result
+    return whole + [_joined([group[batch] for batch in sorted(group)]) for group in groups.values()]
 
 
 def _joined(group: list[Result]) -> Result:

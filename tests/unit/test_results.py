@@ -51,7 +51,8 @@ def test_result_survives_its_file(tmp_path):
 def test_batches_are_joined_in_order_and_moving_goals_count():
     made = [results.Result({**unit(), "batch": b}, columns(b)) for b in (1, 0)]
     made.append(results.Result(unit(5), {**columns(), "goal_w": np.array([[2.1, 0.1], [2.0, 0.2], [np.nan, np.nan]])}))
-    whole, moving = results.join(made)
+    made.append(results.Result({**unit(), "batch": 1, "throws": 2}, columns(9)))
+    moving, whole = results.join(made)
     assert whole.unit == {**unit(), "throws": 6}
     assert whole.columns["error"][[1, 4]] == pytest.approx([0.1234567, 1.1234567])
     assert moving.miss == pytest.approx(np.array([[0.0, -0.1], [-0.1, 0.0]]))

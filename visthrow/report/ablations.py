@@ -1,5 +1,7 @@
 """Section on the ablations: what each component of the simulator is worth on the reference plants."""
 
+import math
+
 from visthrow import statistics as st
 from visthrow.report import figures
 from visthrow.report.book import ANY, Book, durations, errors, landed, misses
@@ -12,6 +14,14 @@ TARGET = 2.0
 """Of Table V [m]."""
 
 PAPER_FOUR = tuple(name for name in PAPER_ABLATIONS if name != "full")
+PAPER_THROWS, PAPER_FULL_THROWS = 5, 10
+"""Of each ablation and of the full model (the paper's figure of landing points)."""
+
+NOTE = (
+    "Scatter: root mean square distance from the mean landing point of all trainings; what is left of the error is bias. "
+    "The paper's interval is ours, from its deviations and numbers of throws."
+)
+
 FURTHER = ("no_delay", "no_battery", "no_release_lag")
 """What the paper leaves out."""
 
@@ -42,9 +52,9 @@ def section(book: Book) -> Section:
             rows = _rows(book, layout, plant, marks, missing, said)
             if rows:
                 head = ("configuration", "trainings", "throws", "landed", "landing error [m]", "ratio to full", "the paper's ratio",
-                        "duration [s]", "bias along [m]", "bias left [m]", "lands", "the paper: lands")  # fmt: skip
-                title = f"{SHORT_LAYOUT[layout].capitalize()} at {TARGET:g} m on the {SHORT[plant]}"
-                parts.append(Grid(title, head, tuple(rows)))
+                        "scatter [m]", "duration [s]", "bias along [m]", "bias left [m]", "lands", "the paper: lands")  # fmt: skip
+                title = f"{SHORT_LAYOUT[layout].capitalize()} at {TARGET:.1f} m on the {SHORT[plant]}"
+                parts.append(Grid(title, head, tuple(rows), NOTE))
     if marks:
         series = [f"{SHORT_LAYOUT[layout]},\n{SHORT[plant]}" for layout in SHORT_LAYOUT for plant in PLANTS]
         picture = figures.marks(marks, "mean landing error over the full model's", series, zero=1.0, log=True)
@@ -74,37 +84,46 @@ def _rows(book: Book, layout: str, plant: str, marks: list, missing: list, said:
         rows.append(_row(variant, found, full))
         ratio = st.ratio(errors(found), errors(full))
         series = list(SHORT_LAYOUT).index(layout) * len(PLANTS) + PLANTS.index(plant)
-        paper = _paper_ratio(variant) if not series else None
+        paper = paper_ratio(variant) if not series else None
         marks.append(figures.Mark(TITLES[variant], ratio, series, paper))
         if layout == "state" and plant == PLANTS[0]:
             said.append(_said(variant, ratio, found))
     return rows
 
 
-def _paper_ratio(variant: str) -> float | None:
-    return PAPER_ABLATIONS[variant][0] / PAPER_ABLATIONS["full"][0] if variant in PAPER_ABLATIONS else None
+def paper_ratio(variant: str) -> st.Interval | None:
+    """The paper's ratio with a normal interval from its deviations and numbers of throws; None for what it leaves out."""
+    if variant not in PAPER_ABLATIONS:
+        return None
+    (mean, std), (full, full_std) = PAPER_ABLATIONS[variant][:2], PAPER_ABLATIONS["full"][:2]
+    relative = math.hypot(std / mean / math.sqrt(PAPER_THROWS), full_std / full / math.sqrt(PAPER_FULL_THROWS))
+    ratio, half = mean / full, 1.96 * relative * mean / full
+    return st.Interval(ratio, ratio - half, ratio + half, "throws")
 
 
 def _row(variant: str, found: list[Result], full: list[Result]) -> tuple[str, ...]:
-    paper, bias = _paper_ratio(variant), st.bias(misses(found))
+    paper, bias = paper_ratio(variant), st.bias(misses(found))
     ratio = "1" if variant == "full" else st.ratio(errors(found), errors(full)).text(2)
+    along, aside = (of.text(sign=True) for of in (bias.along, bias.aside))
     return (
         TITLES[variant], str(len(found)), str(sum(len(r.good) for r in found)), f"{100 * landed(found):.1f} %",
-        st.mean(errors(found)).text(), ratio, "-" if paper is None else f"{paper:.2f}",
-        f"{st.mean(durations(found)).value:.3f}", bias.along.text(sign=True), bias.aside.text(sign=True), bias.words,
+        st.mean(errors(found)).text(), ratio, "-" if paper is None or variant == "full" else paper.text(1),
+        f"{bias.scatter:.3f}", f"{st.mean(durations(found)).value:.3f}", along, aside, bias.words,
         PAPER_ABLATIONS[variant][4] if variant in PAPER_ABLATIONS else "-",
     )  # fmt: skip
 
 
 def _said(variant: str, ratio: st.Interval, found: list[Result]) -> str:
     """One sentence: whether the component matters here as the paper says."""
-    paper = _paper_ratio(variant)
+    paper = paper_ratio(variant)
     head = f"**{TITLES[variant]}**: {ratio.text(2)} times the full model's error"
     if 1.0 in ratio:
         verdict = "no effect shows"
     else:
         verdict = "the component matters" if ratio.value > 1.0 else "leaving it out did not harm, it helped"
-    beside = "" if paper is None else f"; the paper: {paper:.2f} times" + ("" if paper in ratio else ", outside our interval")
+    apart = paper is not None and (paper.low > ratio.high or paper.high < ratio.low)
+    agree = "apart from ours" if apart else "within which ours may lie"
+    beside = "" if paper is None else f"; the paper: {paper.text(2)}, {agree}"
     words = PAPER_ABLATIONS[variant][4] if variant in PAPER_ABLATIONS else ""
     bias = st.bias(misses(found)).words
     signs = f" Bias here: {bias}" + (f"; the paper's throws: {words}." if words else ".")
@@ -118,12 +137,12 @@ def _scatter(book: Book) -> Picture | None:
         found = book.seeds("state", variant, plant, TARGET, {} if variant == "full" else ANY)
         if found:
             words = PAPER_ABLATIONS.get(variant)
-            title = TITLES[variant] + ("" if words is None else f"\nthe paper: {words[4]}")
+            title = TITLES[variant] + ("" if words is None else f"\npaper: {words[4]}")
             panels.append((title, [(f"training {r.unit['train_seed']}", r.miss) for r in found]))
     if len(panels) < 2:
         return None
     text = (
-        f"Landing points of state policies on the {SHORT[plant]} at {TARGET:g} m, a colour a training; large marks: means. Above "
-        "the target is too far."
+        f"Landing points of state policies on the {SHORT[plant]} at {TARGET:.1f} m, a colour a training; large marks: means. "
+        "Above the target is too far."
     )
     return Picture("ablation_scatter", figures.scatter(panels, 4), text)

@@ -66,7 +66,13 @@ def _rows(found: list[Result]) -> list[tuple[str, ...]]:
 
 
 def _changes(departures: dict) -> str:
-    """The changed keys without their tables, and their values."""
+    """What was changed, in words where the whole payload was, else keys without their tables."""
+    values = {key.split(".")[-1]: value for key, value in departures.items()}
+    if "payload_spread" in values and values["payload_spread"] > 0.0:
+        drag = ", drag varied" if values.get("drag_spread", 0.0) > 0.0 else ""
+        return f"payload ±{100 * values['payload_spread']:.0f} %, cable ±{100 * values.get('tether_spread', 0.06):.0f} %{drag}"
+    if "payload_spread" in values:
+        return "one payload, no drag"
     return ", ".join(f"{key.split('.')[-1]} {json.dumps(value)}" for key, value in departures.items()) or "its own"
 
 

@@ -23,7 +23,7 @@ class Mark:
     label: str
     interval: Interval
     series: int = 0  # which colour and marker
-    paper: float | None = None
+    paper: Interval | None = None
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,10 @@ def marks(rows: Sequence[Mark], xlabel: str, series: Sequence[str], zero: float 
         axis.plot([value.low, value.high], [y, y], "-", color=colour, lw=2.2, solid_capstyle="butt", alpha=0.55)
         shown[row.series] = axis.plot(value.value, y, marker, color=colour, ms=6.5, mec="white", mew=0.6, zorder=3)[0]
         if row.paper is not None:
-            shown[len(series)] = axis.plot(row.paper, y, "x", color=style.INK, ms=7, mew=1.5, zorder=4)[0]
+            above = y + 0.14
+            ends = [max(row.paper.low, 0.1 * row.paper.value) if log else row.paper.low, row.paper.high]
+            axis.plot(ends, [above, above], "-", color=style.QUIET, lw=1.0)
+            shown[len(series)] = axis.plot(row.paper.value, above, "x", color=style.INK, ms=7, mew=1.5, zorder=4)[0]
     if zero is not None:
         axis.axvline(zero, color=style.QUIET, lw=1.0, ls=(0, (4, 3)), zorder=1)
     if log:
@@ -137,7 +140,7 @@ def scatter(panels: Sequence[tuple[str, Sequence[tuple[str, np.ndarray]]]], colu
         for i, (label, points) in enumerate(series):
             _landings(axis, points, half, i, label)
         axis.set(xlim=(-half, half), ylim=(-half, half), aspect="equal")
-        axis.set_title(title, fontsize=10.5 if columns <= 3 else 9)
+        axis.set_title(title, fontsize=10.5 if columns <= 3 else 8.5)
     for axis in axes[-1]:
         axis.set_xlabel("lateral, to the right [m]")
     for axis in axes[:, 0]:
@@ -154,6 +157,7 @@ def _target(axis, half: float) -> None:
     for radius in CIRCLES:
         if radius < half:
             axis.add_patch(Circle((0, 0), radius, fill=False, color=style.QUIET, lw=0.8, ls=(0, (4, 3)), zorder=1))
+        if 0.3 * half < radius < half:
             axis.annotate(
                 f"{radius:g} m", (0.7071 * radius, -0.7071 * radius), fontsize=7.5, color=style.QUIET, xytext=(2, -2),
                 textcoords="offset points", ha="left", va="top", zorder=2,
@@ -266,21 +270,22 @@ def learning(groups: Sequence[tuple[str, Sequence[np.ndarray]]]) -> bytes:
     style.use()
     import matplotlib.pyplot as plt
 
-    columns = min(4, len(groups))
+    columns = min(6, len(groups))
     rows = -(-len(groups) // columns)
     figure, axes = plt.subplots(
-        rows, columns, figsize=(WIDTH, 2.1 * rows + 0.3), layout="constrained", squeeze=False, sharex=True, sharey=True
+        rows, columns, figsize=(WIDTH, 1.5 * rows + 0.3), layout="constrained", squeeze=False, sharex=True, sharey=True
     )
     for axis in axes.flat[len(groups) :]:
         axis.set_visible(False)
     for axis, (title, runs) in zip(axes.flat, groups):
         for i, run in enumerate(runs):
-            axis.plot(run[0] / 1e6, run[1], color=style.COLOURS[i % len(style.COLOURS)], lw=1.3)
+            axis.plot(run[0] / 1e6, run[1], color=style.COLOURS[i % len(style.COLOURS)], lw=1.2)
         _log_axis(axis.yaxis, "y", axis)
-        axis.set_title(title, fontsize=9.5)
+        axis.set_title(title, fontsize=7.5)
+        axis.tick_params(labelsize=7.5)
         axis.grid(True, which="major")
     for axis in axes[-1]:
-        axis.set_xlabel("million steps")
+        axis.set_xlabel("million steps", fontsize=8)
     for axis in axes[:, 0]:
-        axis.set_ylabel("landing error [m]")
+        axis.set_ylabel("error [m]", fontsize=8)
     return png_of(figure)

@@ -1,5 +1,7 @@
 """Sections on the learnt policies: their throws on each plant, and vision against state."""
 
+import math
+
 from visthrow import statistics as st
 from visthrow.plants import PLANTS
 from visthrow.report import figures
@@ -86,7 +88,7 @@ def vision_section(book: Book) -> Section:
             paper = _paper(target)
             beside = "-" if paper is None else f"{paper[0]:+.3f}, {paper[1]:+.3f}"
             rows.append((SHORT[plant], f"{target:.1f}", runs, gap.text(sign=True), _said(gap), faster.text(sign=True), beside))
-            marks.append(figures.Mark(f"{target:.1f} m", gap, i, None if paper is None or i else paper[0]))
+            marks.append(figures.Mark(f"{target:.1f} m", gap, i, None if paper is None or i else _paper_gap(target)))
     parts: list = [
         Text("Vision minus state: positive means that vision lands further off. Where several trainings of both are recorded, "
              "the interval covers trainings and throws; else it speaks of the two shipped policies alone, throw by throw: both "
@@ -127,6 +129,13 @@ def _groups(book: Book, plant: str, target: float) -> tuple[tuple[list[Result], 
 def _paper(target: float) -> tuple[float, float] | None:
     vision, state = PAPER.get(("vision", target)), PAPER.get(("state", target))
     return None if vision is None or state is None else (vision[0] - state[0], vision[2] - state[2])
+
+
+def _paper_gap(target: float) -> st.Interval:
+    """The paper's difference of errors [m] with a normal interval from its deviations, ten throws each."""
+    (vision, vision_std), (state, state_std) = (PAPER[(name, target)][:2] for name in ("vision", "state"))
+    half = 1.96 * math.hypot(vision_std, state_std) / math.sqrt(10.0)
+    return st.Interval(vision - state, vision - state - half, vision - state + half, "throws")
 
 
 def _said(gap: st.Interval) -> str:

@@ -212,22 +212,26 @@ def _verdicts(
         own = np.array([result.of("duration").mean(), result.of("error").mean()])
         head = f"**{title}**, {label} against the {name} policy on the {SHORT[policies_on]} ({own[0]:.3f} s, {own[1]:.3f} m): "
         if not len(points):
-            said.append(head + f"none of {len(found)} settings landed all its throws.")
+            said.append(head + f"none of {_count(found)} landed all its throws.")
             continue
         beating = points[np.all(points <= own, axis=1)]
         faster, nearer = points[points[:, 0] < own[0]], points[points[:, 1] < own[1]]
         if len(beating):
             best = beating[np.argmin(beating[:, 0])]
-            claim = f"{len(beating)} of {len(points)} settings are both as accurate and as fast"
+            claim = f"{len(beating)} of {_count(points)} as accurate and as fast at once"
             claim += f", the fastest with {best[0]:.3f} s and {best[1]:.3f} m"
         else:
             claim = "no setting is both as accurate and as fast"
-        speed = "the policy is faster than every setting" if not len(faster) else f"{len(faster)} settings are faster"
-        accuracy = f"{len(nearer)} of {len(points)} are more accurate" + (
-            f", the fastest of those takes {nearer[:, 0].min() / own[0]:.2f} times as long" if len(nearer) else ""
+        speed = "the policy is faster than every setting" if not len(faster) else f"faster than the policy: {_count(faster)}"
+        accuracy = f"more accurate: {len(nearer)} of {_count(points)}" + (
+            f", the fastest of which takes {nearer[:, 0].min() / own[0]:.2f} times as long" if len(nearer) else ""
         )
         said.append(f"{head}{claim}; {speed}; {accuracy}.")
     return said
+
+
+def _count(points: Sequence) -> str:
+    return f"{len(points)} setting" + ("" if len(points) == 1 else "s")
 
 
 def _breakdown(book: Book) -> list[Grid]:
