@@ -1,0 +1,184 @@
+"""Which flight to fly next: the manoeuvre that separates what these flights could not, with the evidence it promises.
+
+Each manoeuvre is simulated with the model as found; its expected information is added to that at hand. For two members of a class
+the promise is the expected gap of their evidence with either as the truth, the smaller of both.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from visthrow.diagnose import result
+from visthrow.diagnose.evidence import Priors, covariance, log_evidence
+from visthrow.diagnose.manoeuvres import PERIOD, Manoeuvre, Reference
+from visthrow.diagnose.marginal import Noise, correlated, gram_of, window_statistics
+from visthrow.diagnose.model import Model
+from visthrow.diagnose.result import Diagnosis
+from visthrow.flightlog import Channel, FlightLog
+
+DECISIVE = 5.0
+"""Nats that tell two members of a class apart."""
+
+MOST_REPEATS = 10
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """One manoeuvre and what it promises."""
+
+    name: str
+    purpose: str
+    seconds: float
+    nats: float  # of the pair that is hardest to separate, or the logarithm by which a deviation shrinks
+    separates: tuple[tuple[str, ...], ...]  # pairs beyond DECISIVE after ``repeats`` flights
+    repeats: int  # flights until the hardest pair is beyond DECISIVE; 0 where MOST_REPEATS do not suffice
+    limits: str
+    reference: str = ""  # file of its reference
+
+
+def pairs_of(diagnosis: Diagnosis) -> list[tuple[str, str]]:
+    """Members of classes, two by two: the named one against each partner."""
+    found = []
+    for f in diagnosis.findings:
+        if f.verdict == result.CLASS and f.name in diagnosis.theta:
+            found += [(f.name, partner) for partner in f.partners]
+    return found
+
+
+def unclear(diagnosis: Diagnosis) -> list[str]:
+    """Effects that the flights could not show."""
+    return [f.name for f in diagnosis.findings if f.verdict == result.NOT_IDENTIFIABLE]
+
+
+def propose(
+    diagnosis: Diagnosis, manoeuvres: Sequence[Manoeuvre], simulate: Callable[[Sequence[Manoeuvre]], Sequence[Model | None]]
+) -> list[Proposal]:
+    """Rank manoeuvres, best first.
+
+    Args:
+        diagnosis: whose classes, or else whose effects that could not be identified, are to be separated.
+        manoeuvres: to choose among.
+        simulate: gives for each manoeuvre a model of its simulated flight with the same catalogue; None where it cannot be flown.
+    """
+    work = diagnosis.work
+    names = [e.name for e in work.problem.model.effects]
+    base, priors = work.after, work.problem.priors
+    pairs = [(names.index(a), names.index(b)) for a, b in pairs_of(diagnosis)]
+    vague = [names.index(name) for name in unclear(diagnosis)]
+    proposals = []
+    for manoeuvre, model in zip(manoeuvres, simulate(manoeuvres)):
+        if model is None:
+            continue
+        new = expected_information(model, diagnosis.theta, base.noise, names, priors)
+        gaps = [_gap(diagnosis, base.information, base.score, new, priors, pair) for pair in pairs]
+        if pairs:
+            nats, separated, repeats = _classes(diagnosis, new, pairs, gaps)
+        else:
+            nats, separated = _shrinking(base.information, new, priors, vague, work.active)
+            repeats = 1 if separated else 0
+        told = tuple(tuple(names[j] for j in group) for group in separated)
+        proposals.append(Proposal(manoeuvre.name, manoeuvre.purpose, manoeuvre.seconds, nats, told, repeats,
+                                  manoeuvre.reference().limits()))  # fmt: skip
+    return sorted(proposals, key=lambda p: -p.nats / np.sqrt(p.seconds))
+
+
+def expected_information(
+    model: Model, theta: Mapping[str, float], noise: Noise, names: Sequence[str], priors: Priors
+) -> np.ndarray:
+    """Information of simulated flights about the diagnosis' effects, in its floors, shape (K, K); 0 for what they hide."""
+    known = {e.name for e in model.effects}
+    windows = model.windows({name: value for name, value in theta.items() if name in known})
+    floors = np.array([e.floor for e in model.effects])
+    at = np.array([names.index(e.name) for e in model.effects if e.name in names])
+    own = np.array([i for i, e in enumerate(model.effects) if e.name in names])
+    total = np.zeros((len(names), len(names)))
+    loudest = {block: max(v for (b, _), v in noise.latent_sd.items() if b == block) for block, _ in noise.latent_sd}
+    for window in windows:
+        gram = correlated(gram_of(window, floors, len(model.channels)), window, noise.correlation_time)
+        levels = {(int(b), window.phase): noise.latent_sd.get((int(b), window.phase), loudest.get(int(b), 1.0))
+                  for b in np.unique(gram.latent_block)}  # fmt: skip
+        expected = replace(noise, scale=np.ones(len(model.channels)), latent_sd=levels, inflation=np.ones((1, 3)))
+        part = window_statistics(gram, expected, 0).information
+        total[np.ix_(at, at)] += part[np.ix_(own, own)]
+    return total * np.outer(*[_ratio(model, names, priors)] * 2)
+
+
+def _ratio(model: Model, names: Sequence[str], priors: Priors) -> np.ndarray:
+    """The diagnosis' floors in the model's: both catalogues name the same effect, the floors may differ."""
+    floor = {e.name: e.floor for e in model.effects}
+    return np.array([priors.floor[i] / floor[name] if name in floor else 1.0 for i, name in enumerate(names)])
+
+
+def _gap(diagnosis: Diagnosis, information: np.ndarray, score: np.ndarray, new: np.ndarray, priors: Priors,
+         pair: tuple[int, int]) -> float:  # fmt: skip
+    """Expected nats between two members after the new flight, with either as the truth; the smaller one."""
+    findings = {f.name: f for f in diagnosis.findings}
+    names = [f.name for f in diagnosis.findings]
+    rest = [j for j in diagnosis.work.active if j not in pair]
+    gaps = []
+    for truth, other in (pair, pair[::-1]):
+        theta = np.zeros(len(priors.floor))
+        for j in [*rest, truth]:
+            theta[j] = findings[names[j]].estimate / priors.floor[j]
+        after = score + new @ theta
+        total = information + new
+        gaps.append(log_evidence(total, after, priors, [*rest, truth]) - log_evidence(total, after, priors, [*rest, other]))
+    return float(min(gaps))
+
+
+def _classes(diagnosis: Diagnosis, new: np.ndarray, pairs, gaps) -> tuple[float, list[tuple[int, int]], int]:
+    base, priors = diagnosis.work.after, diagnosis.work.problem.priors
+    hardest = pairs[int(np.argmin(gaps))]
+    repeats = 0
+    for count in range(1, MOST_REPEATS + 1):
+        if _gap(diagnosis, base.information, base.score, count * new, priors, hardest) > DECISIVE:
+            repeats = count
+            break
+    apart = [_gap(diagnosis, base.information, base.score, max(repeats, 1) * new, priors, pair) for pair in pairs]
+    return float(min(gaps)), [pair for pair, gap in zip(pairs, apart) if gap > DECISIVE], repeats
+
+
+def _shrinking(information: np.ndarray, new: np.ndarray, priors: Priors, vague: Sequence[int], active: Sequence[int]):
+    """Mean logarithm by which the deviations of effects shrink, and those that become identifiable."""
+    logs, shown = [], []
+    for j in vague:
+        deviation = priors.deviation([*active, j])
+        before, after = (np.sqrt(covariance(i, deviation)[j, j]) for i in (information, information + new))
+        logs.append(np.log(before / after))
+        if after < 0.5 * priors.slab[j]:
+            shown.append((j,))
+    return float(np.mean(logs)) if logs else 0.0, shown
+
+
+def write_references(folder: str | Path, manoeuvres: Sequence[Manoeuvre], proposals: Sequence[Proposal]) -> list[Proposal]:
+    """Write each proposal's reference as CSV; returns the proposals with their files' names."""
+    from visthrow.storage import atomic_write
+
+    by_name, told = {m.name: m for m in manoeuvres}, []
+    for p in proposals:
+        name = "".join(c if c.isalnum() else "_" for c in p.name) + ".csv"
+        atomic_write(Path(folder) / name, by_name[p.name].reference().csv())
+        told.append(replace(p, reference=name))
+    return told
+
+
+def log_of(reference: Reference, sampled: Mapping[str, np.ndarray], commands: np.ndarray, *, payload: bool) -> FlightLog:
+    """A simulated flight as a log: poses as sampled, commands as sent.
+
+    Args:
+        reference: whose stamps the commands have.
+        sampled: ``time``, ``pos_w``, ``quat_wb`` and, with a payload, ``payload_pos_w``.
+        commands: [N, rad/s], shape (N, 4).
+        payload: whether it is carried.
+    """
+    time = sampled["time"]
+    channels = {
+        "pos_w": Channel(time, sampled["pos_w"], "m", "world"), "quat_wb": Channel(time, sampled["quat_wb"], "1", "world"),
+        "command": Channel(reference.time, commands, "N, rad/s", "body"),
+    }  # fmt: skip
+    if payload:
+        channels["payload_pos_w"] = Channel(time, sampled["payload_pos_w"], "m", "world")
+        channels["release_command"] = Channel(reference.time, reference.release.astype(float), "1")
+    return FlightLog(channels, {"period": PERIOD})
