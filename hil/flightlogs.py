@@ -231,7 +231,8 @@ def _judge(recorder: FlightRecorder, landing: Landing | None, latch: float | Non
     ended = next((tick for tick in after if tick.decision.state != State.THROW), after[-1])
     times: dict[str, Any] = {"policy_start": start, "latch": latch, "recovery": ended.line["time"]}
     times["end"] = ticks[-1].line["time"]
-    stopped = next((t.decision.reason for t in after if t.decision.state == State.ABORT), None)
+    over = np.inf if landing is None else landing.time  # what happens once it is down takes nothing from the throw
+    stopped = next((t.decision.reason for t in after if t.decision.state == State.ABORT and t.line["time"] < over), None)
     failure = stopped or (None if latch is not None else ended.decision.reason)
     result: dict[str, Any] = {"success": landing is not None and stopped is None, "failure": failure}
     if landing is not None:

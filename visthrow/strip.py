@@ -124,11 +124,12 @@ def drawn_larger(camera: CameraParams) -> CameraParams:
 def _bounds(log: FlightLog) -> tuple[float, float, float]:
     """Left, right and top of the side views [m]."""
     times = log.meta["times"]
-    during = (log["pos_w"].time >= times["policy_start"]) & (log["pos_w"].time <= times["landing"] + 0.02)
-    x = np.concatenate(
-        [log["pos_w"].values[during, 0], log["payload_pos_w"].values[during, 0], [log.meta["goal_w"][0]]]
-    )
-    top = max(log["pos_w"].values[during, 2].max(), log["payload_pos_w"].values[during, 2].max())
+    paths = []
+    for name in ("pos_w", "payload_pos_w"):
+        time = log[name].time
+        paths.append(log[name].values[(time >= times["policy_start"]) & (time <= times["landing"] + 0.02)])
+    x = np.concatenate([*(path[:, 0] for path in paths), [log.meta["goal_w"][0]]])
+    top = max(path[:, 2].max() for path in paths)
     return float(x.min() - MARGIN), float(x.max() + MARGIN), float(top + 0.6 * MARGIN)
 
 
