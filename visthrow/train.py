@@ -257,7 +257,7 @@ def finish(trainer: Trainer, folder: Path, figures: dict) -> Policy:
     """Write the policy file and the run's summary into its folder."""
     made_by = provenance.collect() | {
         "seed": trainer.seed,
-        "config": config.to_dict(trainer.experiment),
+        "config": config.to_dict(trainer.experiment, defaults=False),  # readable when fields come and go
         "figures": figures,
     }
     policy = trainer.export(made_by)

@@ -116,6 +116,8 @@ def load(unit: ThrowUnit, out: Path) -> Loaded:
     Raises:
         MismatchError: the list does not allow what differs.
     """
-    path, changes = unit.source.policy(out), unit.params.changes
-    layout = unit.experiments(out)[0]["task"]["observation"]["layout"]
-    return load_policy(path, unit.flown_in(layout), changes, unit.params.allow)
+    source, changes = unit.source, unit.params.changes
+    flown_in = unit.flown_in(unit.experiments(out)[0]["task"]["observation"]["layout"])
+    if flown_in is None and source.config:  # the list's config: that of the file may have fields of another version
+        flown_in, changes = source.config, source.changes + changes
+    return load_policy(source.policy(out), flown_in, changes, unit.params.allow)
