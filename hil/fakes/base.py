@@ -76,6 +76,7 @@ class Options:
     pose_message: Literal["ATT_POS_MOCAP", "ODOMETRY"] = "ATT_POS_MOCAP"  # ODOMETRY carries a reset counter
     mocap_fault: str = "none"  # of hil.mocap_faults
     fault_time: float = float("inf")  # from which it happens [s]
+    prompt: bool = True  # a heartbeat follows a change of mode at once; else up to a second later
     all_channels: bool = False  # Betaflight: all channels come by MSP, the arming one as well
 
     def __post_init__(self) -> None:

@@ -54,6 +54,11 @@ class FakeMavlink(Fake):
             self.parameters[message.param_id] = self.value(message.param_value, message.param_type)
             self._tell_parameter(message.param_id)
 
+    def beat_soon(self) -> None:
+        """Mode or arming have changed."""
+        if self.options.prompt:
+            self._next_beat = 0.0
+
     def say(self, message: Any, delay: float = 0.0) -> None:
         """Send a message after a delay [s]."""
         self.later(delay, lambda: self.link.send(message))
@@ -85,7 +90,7 @@ class FakeMavlink(Fake):
         number, answer = message.command, self.options.answer
         if number == mav.MAV_CMD_DO_SET_MODE:
             self.acknowledge(number, self.enter(self.custom_mode(message)))
-            self._next_beat = 0.0
+            self.beat_soon()
         elif number == mav.MAV_CMD_COMPONENT_ARM_DISARM:
             self._arm(message)
         elif number == mav.MAV_CMD_SET_MESSAGE_INTERVAL:
@@ -120,7 +125,7 @@ class FakeMavlink(Fake):
         else:
             self.armed = wanted
             self.happened("armed" if wanted else "disarmed")
-            self._next_beat = 0.0
+            self.beat_soon()
             self.acknowledge(message.command, mav.MAV_RESULT_ACCEPTED)
 
     def field(self, name: str) -> tuple[float, int]:

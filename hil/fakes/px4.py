@@ -111,7 +111,7 @@ class FakePx4(FakeMavlink):
         if self.mode == OFFBOARD and self.plant.time - self._last > self.parameters["COM_OF_LOSS_T"]:
             self.happened("left OFFBOARD: no set-points")
             self.enter(LAND if self.parameters["COM_OBL_RC_ACT"] == LAND_OR_HOLD[0] else HOLD)
-            self._next_beat = 0.0
+            self.beat_soon()
         if self.mode == LAND:
             return self.descend()
         if self.mode == OFFBOARD and self._target is not None:

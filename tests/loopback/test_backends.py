@@ -279,10 +279,12 @@ def test_latch_to_separation_is_the_trained_lag(kind, mechanism):
     assert (summary["latches"], fake.witness.breaches) == (1, [])
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_complete_throw(kind):
+@pytest.mark.parametrize(("kind", "prompt"), [*((kind, True) for kind in KINDS), ("ardupilot", False), ("px4", False)])
+def test_a_complete_throw(kind, prompt):
+    """Also where a change of mode is seen in a heartbeat up to a second later."""
     plant = LevelPlant()
-    summary, fake, told = throw(plant, kind=kind, loaded=AT_ONCE, seconds=4.5, overrides=QUICK)
+    quick = QUICK if prompt else (*QUICK[:-1], "states.land=2.0", "states.quiet=1.2")
+    summary, fake, told = throw(plant, kind=kind, loaded=AT_ONCE, seconds=9.5, overrides=quick, prompt=prompt)
     assert (summary["latches"], len(summary["landings"]), summary["stuck"], summary["errors"]) == (1, 1, 0, [])
     assert (fake.witness.releases, fake.witness.breaches) == (1, [])
     assert [d.state for d in told][:7] == ["idle", "check", "ready", "armed", "throw", "recover", "land"]
