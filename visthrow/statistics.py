@@ -8,7 +8,7 @@ Source: Efron and Tibshirani, "An Introduction to the Bootstrap", 1993, ch. 13 (
 Hinkley, "Bootstrap Methods and their Application", 1997, sec. 3.8 (hierarchical data).
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -90,21 +90,6 @@ def mean(groups: Groups | np.ndarray, seed: int = 0, draws: int = DRAWS) -> Inte
     found = _checked(groups)
     samples = _resampled(found, np.random.default_rng(seed), draws)
     return _interval(float(_mean(found)), samples, len(found))
-
-
-def function(
-    groups: Groups | np.ndarray, of: Callable[[np.ndarray], np.ndarray], seed: int = 0, draws: int = DRAWS
-) -> Interval:
-    """Function of the mean of vectors, with its interval; for instance the length of a mean miss.
-
-    Args:
-        groups: throws of each run, shape (N, D).
-        of: of means, shape (..., D) to (...).
-        seed: of the bootstrap.
-        draws: bootstrap samples.
-    """
-    found = _checked(groups)
-    return _interval(float(of(_mean(found))), of(_resampled(found, np.random.default_rng(seed), draws)), len(found))
 
 
 def difference(a: Groups | np.ndarray, b: Groups | np.ndarray, seed: int = 0, draws: int = DRAWS) -> Interval:

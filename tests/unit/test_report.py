@@ -10,6 +10,7 @@ import pytest
 
 from tests import made_up_results as made_up
 from visthrow import cli, results
+from visthrow.baseline import spline, thrower
 from visthrow.report import ablations, beyond, book, command, gap, page, throws, trade, wanted
 from visthrow.report.parts import Grid, Picture, Text
 from visthrow.results import Result
@@ -185,6 +186,22 @@ def test_the_command_reports_from_records(tmp_path, full, capsys):
     assert cli.main(["report", "--quick", "--measure", "--out", str(out)]) == 2
     assert cli.main(["report", "--results", str(tmp_path / "none"), "--out", str(out)]) == 2
     assert "no such folder" in capsys.readouterr().err
+
+
+def test_what_no_record_holds_is_flown_once(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("piqp")
+    monkeypatch.setattr(spline, "LONGEST", (1.4,))  # one start of the optimisation instead of five
+    monkeypatch.setattr(wanted, "full", lambda: [thrower.unit(thrower.OWN, "none", target, 1) for target in (1.5, 2.0)])
+    words = ["report", "--measure", "--jobs", "1", "--records", str(tmp_path / "records"), "--out", str(tmp_path / "out")]
+    record = tmp_path / "records" / "throws" / "baseline.json"
+    results.pack([], record)
+    assert cli.main(words) == 0
+    made = record.read_bytes()
+    assert {r.unit["target"] for r in results.load(record)} == {1.5, 2.0}
+    monkeypatch.setattr(thrower, "fly_unit", lambda unit: pytest.fail("flown again"))
+    assert cli.main(words) == 0
+    assert record.read_bytes() == made
+    assert "2 sets of throws" in capsys.readouterr().out
 
 
 def test_what_the_report_stands_on_is_stated_once():

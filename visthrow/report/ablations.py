@@ -125,8 +125,9 @@ def _said(variant: str, ratio: st.Interval, found: list[Result]) -> str:
     agree = "apart from ours" if apart else "within which ours may lie"
     beside = "" if paper is None else f"; the paper: {paper.text(2)}, {agree}"
     words = PAPER_ABLATIONS[variant][4] if variant in PAPER_ABLATIONS else ""
-    bias = st.bias(misses(found)).words
-    signs = f" Bias here: {bias}" + (f"; the paper's throws: {words}." if words else ".")
+    bias = st.bias(misses(found))
+    signs = f" Bias here: {bias.words}, {100 * bias.share:.0f} % of the mean square miss"
+    signs += f"; the paper's throws: {words}." if words else "."
     seeds = "" if len(found) > 1 else " One training: the interval covers throws, not trainings."
     return f"{head}: {verdict}{beside}.{signs}{seeds}"
 
