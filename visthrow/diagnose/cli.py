@@ -8,6 +8,7 @@ ACTIONS = {
     "check": ("look at logs: clocks, units, frames, gaps, what is excited, what they can answer", "visthrow.diagnose.check.cli"),
     "explain": ("say what the simulation gets wrong about flights, and what that is worth", "visthrow.diagnose.explain_cli"),
     "fit": ("make the first configuration of your own vehicle or motor, from flights without payload", "visthrow.diagnose.fit_cli"),
+    "plan": ("propose the manoeuvre that separates what could not be separated", "visthrow.diagnose.plan_cli"),
     "blind": ("hide effects in your own noise: which sizes would be named", "visthrow.diagnose.blind_cli"),
 }
 """Name -> (help, module). The module has ``add_arguments(parser)`` and ``run(args) -> int``."""
