@@ -32,8 +32,8 @@ STATE_FIELDS = st.QUAD_FIELDS | {
     "stiffness": ("real", True),
     "payload_pos_w": ("vec3", False),  # where it starts loose, and where it is at the end
     "payload_vel_w": ("vec3", False),
-    "slack_first": ("real", False),  # at the end alone: first and last time at which the hanging payload hardly pulled
-    "slack_last": ("real", False),  # [s]; before the window's start if it always did
+    "slack_first": ("real", False),  # at the end alone: when the rope first went slack [s]
+    "slack_last": ("real", False),  # and when it last came taut again; before the window's start if it did not
 }
 
 SLACK = 0.15
@@ -324,6 +324,7 @@ def build_replay(t: Types, vehicle: VehicleParams, segments: int) -> ReplayKerne
             separation = wp.max(latch + r.lag, time)  # the pull at the latch lies before this window
             latched = True
         knot = int(0)
+        slack = bool(False)
         slack_first = time - real(1.0)
         slack_last = time - real(1.0)
         at = Pointers()
@@ -386,9 +387,12 @@ def build_replay(t: Types, vehicle: VehicleParams, segments: int) -> ReplayKerne
                     pay = pos1
                     pay_vel = vel1
                     if chain.pull(rope, stiffness) < real(SLACK) * rope.payload_mass * gravity:
-                        slack_last = t0 + h
+                        slack = True
                         if slack_first < windows.start[w]:
                             slack_first = t0
+                    elif slack:
+                        slack = False
+                        slack_last = t0 + h
                 else:
                     s = coupled.step_alone(p, pushed, s, active, g, h)
                     if mode == loose_code:

@@ -13,6 +13,7 @@ LEAST = 0.25  # of a window [s]
 BEFORE, AFTER = 0.55, 0.45  # of the separation, that the window of the throw reaches [s]
 QUIET_SPEED = 0.35  # of hover [m/s]
 GROUND_MARGIN = 0.05  # above the landing height, below which a payload is left alone [m]
+LEAST_TAUT = 0.05  # before the separation, without which the release cannot be judged [s]
 POSES_LEAST = 8  # measured poses without which a window says nothing
 
 
@@ -81,13 +82,19 @@ def cut(flight: Recorded, number: int, lag: float, landing_height: float, carrie
     return [c for c in cuts if _seen(flight, c)]
 
 
-def around_slack(c: Cut, first: float, last: float) -> list[Cut]:
-    """A window cut about the time in which the rope was slack: that is only flown through."""
-    pieces = [
-        replace(c, end=first, phase="flight" if c.phase == "throw" else c.phase),
-        replace(c, start=first, end=last, told=False),
-        replace(c, start=last, shaken=True),
-    ]
+def around_slack(c: Cut, first: float, last: float, separation: float) -> list[Cut]:
+    """A window cut about the time in which the rope was slack: that is only flown through.
+
+    Args:
+        c: the window.
+        first, last: of that time [s].
+        separation: of the payload [s]; a rope that comes taut no sooner leaves a window of the flight after it.
+    """
+    free = c.start < separation < min(last + LEAST_TAUT, c.end)
+    last = min(max(last, separation + 1e-3), c.end) if free else min(last, c.end)
+    rest = replace(c, start=last, payload=LOOSE, phase="ballistic") if free else replace(c, start=last, shaken=True)
+    before = replace(c, end=first, phase="flight" if c.phase == "throw" else c.phase)
+    pieces = [before, replace(c, start=first, end=last, told=False), rest]
     return [replace(p, told=p.told and p.end - p.start > LEAST) for p in pieces if p.end - p.start > 1e-6]
 
 

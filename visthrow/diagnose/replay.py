@@ -14,7 +14,7 @@ from visthrow.diagnose.states import States, rows_of
 
 KNOT_SPACING = 0.1  # of the latent forces [s]
 EARLY = 0.004  # after a window's start, before which no stamp is used: delays may move there [s]
-FINENESS = {"throw": 0.5}
+FINENESS = {"throw": 0.25}
 """Step in a phase against the one asked for: the rope whips in throws."""
 BATCH = 4096  # lanes of one run, which bounds its memory
 

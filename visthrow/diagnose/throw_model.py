@@ -33,9 +33,9 @@ LATENT_SIZES = (0.05, 0.05, 0.05, 1e-3, 1e-3, 1e-3, 0.01, 0.01, 0.01)
 DAMPING, DAMPING_MOST = 1e-3, 1e5
 """Of the Levenberg-Marquardt steps: at first, and where a window counts as settled."""
 ROUNDS = 14
-AFTER_SLACK = 0.03  # that a rope is given to come taut [s]
+AFTER_SLACK = 0.05  # that a rope is given to come taut [s]
 HUBER = 30.0  # deviations, beyond which a sample counts less
-SETTLED = 0.02  # relative fall of the cost below which an initial state is settled
+SETTLED = 0.003  # relative fall of the cost below which an initial state is settled
 
 
 class ThrowModel:
@@ -273,7 +273,8 @@ class ThrowModel:
         cuts: list[Cut] = []
         for w, c in enumerate(self.flights.cuts):
             first, last = float(ends["slack_first"][w]), float(ends["slack_last"][w])
-            cuts += [c] if first < c.start else around_slack(c, first, last + AFTER_SLACK)
+            separation = self.flights.flights[c.flight].latch + self.setting.plant.release.lag
+            cuts += [c] if last < c.start else around_slack(c, first, last + AFTER_SLACK, separation)
         return cuts
 
     def _settle(self, setting: Setting, states: States) -> States:
