@@ -26,7 +26,8 @@ QUICK_LIST = "quick"
 
 def full() -> list[dict[str, Any]]:
     """Units of the committed record ``baseline``: the cheap and telling ones first."""
-    return [*_by_target(50), *_front(FRONT_THROWS), *_on_reference(20)]
+    made_up = [*_front(), *_on_reference("both", 20, front.SPEEDS[1::2])]
+    return [*_by_target(50), *made_up, *_late_front(), *_on_reference("delay", 20, front.SPEEDS[1:2])]
 
 
 def quick() -> list[dict[str, Any]]:
@@ -47,23 +48,29 @@ def _by_target(throws: int) -> Iterator[dict[str, Any]]:
             yield from thrower.units("hybrid", compensation, target, throws)
 
 
-def _on_reference(throws: int) -> Iterator[dict[str, Any]]:
-    """By target and a part of the front: a throw takes seconds there."""
-    for compensation in ("both", "delay"):
-        for target in (FRONT_TARGET, *(target for target in TARGETS if target != FRONT_TARGET)):
-            yield from thrower.units("reference-realistic", compensation, target, throws)
-        for speed in front.SPEEDS[1::2] if compensation == "both" else front.SPEEDS[1:2]:
-            for w_t, rho in front.WEIGHTS:
-                how = {"speed": speed, "w_t": w_t, "rho": rho}
-                yield from thrower.units("reference-realistic", compensation, FRONT_TARGET, FRONT_THROWS, **how)
+def _settings(speeds: tuple[float, ...] = front.SPEEDS) -> Iterator[dict[str, float]]:
+    for speed in speeds:
+        for w_t, rho in front.WEIGHTS:
+            yield {"speed": speed, "w_t": w_t, "rho": rho}
 
 
-def _front(throws: int) -> Iterator[dict[str, Any]]:
+def _front() -> Iterator[dict[str, Any]]:
+    """The sweep in the own model and, all delays made up for, in the training simulator."""
     for bounds in BOUNDS[::-1]:
-        for speed in front.SPEEDS:
-            for w_t, rho in front.WEIGHTS:
-                how = {"speed": speed, "w_t": w_t, "rho": rho, "bounds": bounds}
-                yield from thrower.units(thrower.OWN, "none", FRONT_TARGET, throws, **how)
-                yield from thrower.units("hybrid", "both", FRONT_TARGET, throws, **how)
-                if bounds == BOUNDS[0]:
-                    yield from thrower.units("hybrid", "delay", FRONT_TARGET, throws, **how)
+        for how in _settings():
+            yield from thrower.units(thrower.OWN, "none", FRONT_TARGET, FRONT_THROWS, bounds=bounds, **how)
+            yield from thrower.units("hybrid", "both", FRONT_TARGET, FRONT_THROWS, bounds=bounds, **how)
+
+
+def _late_front() -> Iterator[dict[str, Any]]:
+    """The sweep where the release's lag is not made up for."""
+    for how in _settings():
+        yield from thrower.units("hybrid", "delay", FRONT_TARGET, FRONT_THROWS, **how)
+
+
+def _on_reference(compensation: str, throws: int, speeds: tuple[float, ...]) -> Iterator[dict[str, Any]]:
+    """By target and a part of the sweep: a throw takes seconds there."""
+    for target in (FRONT_TARGET, *(target for target in TARGETS if target != FRONT_TARGET)):
+        yield from thrower.units("reference-realistic", compensation, target, throws)
+    for how in _settings(speeds):
+        yield from thrower.units("reference-realistic", compensation, FRONT_TARGET, FRONT_THROWS, **how)
