@@ -1,8 +1,10 @@
 """The throw of the fake autopilot without a wire: what the wire costs is measured against it.
 
 Plant, start, motion capture, estimator and policy are those of a throw over the wire, with the same seeds; link, autopilot,
-state machine, processes and real time are left out. The motion capture's poses arrive when they do, and ticks come when the
-first of them does, so that the age of a pose at a tick is the latency alone.
+state machine, processes and real time are left out. Over the wire the runner's ticks and the motion capture know nothing of
+each other, so that at a tick the newest pose is as old as the latency and up to a period of the motion capture more. So here:
+the seed says by how many of the plant's periods ticks follow poses, and whether one that arrives at the instant of a tick is in
+time.
 """
 
 import math
@@ -46,6 +48,9 @@ class Direct:
         self.mocap = Mocap(mocap, seed)
         self._tracks = {body: Track(OURS, params.gate, params.estimate) for body in (VEHICLE, PAYLOAD)}
         self._hover = HoverController(HoverParams(max_thrust=plant.max_thrust), self.pilot.period)
+        share = round(1.0 / (mocap.rate * plant.period))
+        draw = np.random.default_rng([seed, 1])
+        self._phase, self._in_time = int(draw.integers(max(share, 1))), bool(draw.integers(2))
         self._aim = 0.5 * sum(policy.contract["observation"]["latency"])
         self._latency = mocap.latency
         self._coming: deque[Pose] = deque()
@@ -60,7 +65,7 @@ class Direct:
         now = self.plant.time
         if self.mocap.due(now):
             self._coming.extend(self.mocap.measure(now, self.plant.state))
-        while self._coming and self._coming[0].arrival <= now + SLACK:
+        while self._coming and self._coming[0].arrival <= now + (SLACK if self._in_time else -SLACK):
             pose = self._coming.popleft()
             self._tracks[pose.body].update(pose)
 
@@ -70,7 +75,8 @@ class Direct:
         Returns:
             The plant's landing, the start of the throw and its latch [s].
         """
-        command, latch, start, tick = None, None, None, 0.0
+        command, latch, start = None, None, None
+        tick = self._phase * self.plant.period
         level = np.array([self.plant.mass[0] * 9.81, 0.0, 0.0, 0.0])
         while self.plant.time < MOST:
             self._take()

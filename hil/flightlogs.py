@@ -1,8 +1,8 @@
 """Flight logs of a run, made of its folder: what later tools read of a flight on poses as they read a simulated one.
 
-Times are those of the measurements, on the runner's clock: a source's stamps, moved by the median of what lies between them
-and the arrivals less the transit (known by TIMESYNC, or the delay that the config states). Where the payload let go and came
-down is found in its own poses.
+Times are those of the measurements, on the runner's clock: a source's stamps, moved by what lies between them and the arrivals
+less the transit (known by TIMESYNC, or the delay that the config states), as the median over some poses about each.
+Where the payload let go and came down is found in its own poses.
 """
 
 import json
@@ -54,7 +54,6 @@ class Course:
     ticks: list[Tick]
     provenance: dict[str, Any]
     throws: list[tuple[int, int]] = field(default_factory=list)  # first tick in throw, last tick of its recovery
-    offsets: dict[str, float] = field(default_factory=dict)  # runner's clock less the source's, by body [s]
 
     def __post_init__(self) -> None:
         states = [tick.decision.state for tick in self.ticks]
@@ -62,13 +61,26 @@ class Course:
             if state == State.THROW and (n == 0 or states[n - 1] != State.THROW):
                 end = next((k for k in range(n, len(states)) if states[k] not in AFTERWARDS), len(states) - 1)
                 self.throws.append((n, end))
-        apart: dict[str, list[float]] = {}
+        by_body: dict[str, list[Sample]] = {}
         for tick in self.ticks:
             for sample in tick.samples:
-                pose = sample.pose
-                measured = pose.arrival - pose.transit(self.params.delay.source)
-                apart.setdefault(sample.body, []).append(measured - pose.stamp)
-        self.offsets = {body: float(np.median(values)) for body, values in apart.items()}
+                by_body.setdefault(sample.body, []).append(sample)
+        for samples in by_body.values():
+            stamps = np.array([sample.pose.stamp for sample in samples])
+            apart = np.array([measured(sample, self.params) for sample in samples]) - stamps
+            around = np.pad(apart, ABOUT, mode="edge")
+            offset = np.median(np.lib.stride_tricks.sliding_window_view(around, 2 * ABOUT + 1), axis=1)
+            for sample, time in zip(samples, stamps + offset):
+                sample.time = float(time)
+
+
+ABOUT = 25
+"""Poses on either side that a clock's offset is the median of: jitter of the transport goes, drift stays."""
+
+
+def measured(sample: Sample, params: HilParams) -> float:
+    """When a pose was measured by its arrival alone [s]."""
+    return sample.pose.arrival - sample.pose.transit(params.delay.source)
 
 
 AFTERWARDS = (State.THROW, State.RECOVER, State.ABORT)
@@ -105,15 +117,13 @@ def read(folder: str | Path) -> Course:
 class Samples:
     """Fills a recorder with ticks."""
 
-    def __init__(self, course_params: HilParams, playback: Playback, offsets: dict[str, float] | None, meta: dict) -> None:
+    def __init__(self, params: HilParams, playback: Playback, meta: dict) -> None:
         """Begin.
 
         Args:
-            course_params: of the run. playback: whose ticks come.
-            offsets: of the sources' clocks [s]; None takes the arrivals, as while a run goes on.
-            meta: of the log.
+            params: of the run. playback: whose ticks come. meta: of the log.
         """
-        self.params, self.runner, self._offsets = course_params, playback.runner, offsets
+        self.params, self.runner = params, playback.runner
         self.recorder = FlightRecorder(meta)
         self._declare()
         self._last: dict[str, float] = {}
@@ -129,12 +139,6 @@ class Samples:
         for name in (VEHICLE, PAYLOAD, GOAL):
             self.recorder.declare(f"age_{name}", "s")
         self.recorder.declare("state", "1")
-
-    def _time(self, sample: Sample) -> float:
-        pose = sample.pose
-        if self._offsets is None:
-            return pose.arrival - pose.transit(self.params.delay.source)
-        return pose.stamp + self._offsets[sample.body]
 
     def _later(self, name: str, time: float) -> float:
         """The time, or a moment after the channel's last sample."""
@@ -165,7 +169,8 @@ class Samples:
         self.recorder.add(now, **values)
 
     def _pose(self, sample: Sample, attached: bool) -> None:
-        pose, time = sample.pose, self._later(sample.body, self._time(sample))
+        pose = sample.pose
+        time = self._later(sample.body, measured(sample, self.params) if sample.time is None else sample.time)
         if sample.body == PAYLOAD:
             self.recorder.add(time, payload_pos_w=pose.pos, payload_vel_w=sample.vel_w)
             vehicle = self._vehicle
@@ -206,8 +211,7 @@ def log_of(course: Course, first: int, last: int, throw: int | None = None) -> F
     """Log of the ticks from ``first`` to ``last``, both included; of one throw where its number is given."""
     ticks, runner = course.ticks[first : last + 1], course.playback.runner
     start = course.ticks[course.throws[throw][0]].line["time"] if throw is not None else ticks[0].line["time"]
-    samples = Samples(course.params, course.playback, course.offsets, meta_of(
-        course.params, course.playback, course.provenance, start))  # fmt: skip
+    samples = Samples(course.params, course.playback, meta_of(course.params, course.playback, course.provenance, start))
     landing = None if throw is None else _landing(runner.landings, start)
     latch = next((t.line["time"] for t in ticks if t.decision.release and t.line["time"] >= start), None)
     apart = np.inf if latch is None else (landing.separation if landing and landing.separation else latch + runner.lag)

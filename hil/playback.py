@@ -17,7 +17,7 @@ from hil.track import Track
 from visthrow.policy import Policy
 
 
-@dataclass(frozen=True)
+@dataclass
 class Sample:
     """A pose that the gate let through, in our frames, with what was estimated from it."""
 
@@ -25,6 +25,7 @@ class Sample:
     pose: Pose  # stamp on the source's clock, freed of its steps
     vel_w: Vector  # [m/s]
     rate_b: Vector  # [rad/s]
+    time: float | None = None  # of the measurement on the runner's clock [s], once it was worked out from the whole run
 
 
 class Playback:

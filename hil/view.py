@@ -59,7 +59,7 @@ class Show:
 
         self._stream, self._view, self._playback = stream, rerun_view, playback
         self._meta = meta_of(params, playback, provenance, start)
-        self._samples = Samples(params, playback, None, self._meta)
+        self._samples = Samples(params, playback, self._meta)
         self._trails: dict[str, deque] = {name: deque(maxlen=TRAIL) for name in BODY_CHANNELS}
         self._latch: float | None = None
         self._said: list | None = None

@@ -176,7 +176,7 @@ def _side_view(axis, log: FlightLog, time: float, side: tuple[float, float, floa
     axis.plot(path[carried, 0], path[carried, 2], color=style.PAYLOAD, lw=1.3, alpha=0.45, zorder=3)
     if np.count_nonzero(flown) > 1:
         axis.plot(path[flown, 0], path[flown, 2], color=style.PAYLOAD, lw=1.8, ls=(0, (4, 1.6)), zorder=3)
-    if log["cable_points_w"].time[-1] > time - 0.02:  # poses tell nothing of a rope that has let go
+    if log["cable_points_w"].time[-1] > time - 0.05:  # poses tell nothing of a rope that has let go
         rope = _at(log, "cable_points_w", time)
         axis.plot(rope[:, 0], rope[:, 2], color=style.ROPE, lw=1.3, zorder=4)
     _vehicle(axis, log, time, 1.0)
