@@ -165,7 +165,7 @@ def _run(args: argparse.Namespace) -> int:
     source, link, recorded = open_source(params, folder, args.speed)
     clock = ManualClock(source.start) if recorded else MonotonicClock(args.speed)
     require_reach(params, policy.contract)
-    backend = make_backend(params, link, getattr(args, "write_parameters", False), _tell_parameters)
+    backend = make_backend(params, link, getattr(args, "write_parameters", False), _tell_parameters, folder)
     runner = Runner(params, policy, backend, mechanism_lag(params))
     warm_up(runner)
     recorder = Recorder(folder, params)

@@ -188,7 +188,7 @@ class SerialPort:
         try:
             import serial
         except ModuleNotFoundError:
-            raise LinkError("a serial port needs the package pyserial; install it with: pip install pyserial") from None
+            raise LinkError("a serial port needs pyserial; install it with: pip install 'visthrow[serial]'") from None
         try:
             self._port = serial.Serial(device.host, device.port, timeout=0, write_timeout=0)
         except (serial.SerialException, ValueError) as error:

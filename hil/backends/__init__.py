@@ -2,6 +2,7 @@
 that the poses may share, ``betaflight`` speaks MSP on a port of its own."""
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from hil.backends.ardupilot import ArduPilot, ArduPilotParams
@@ -10,6 +11,10 @@ from hil.backends.betaflight import Betaflight, BetaflightParams
 from hil.backends.px4 import Px4, Px4Params
 from hil.device import check_device, open_port
 from hil.errors import RunError
+from hil.msp_log import LoggedPort
+
+MSP_LOG = "link.msp"
+"""In a run's folder."""
 
 THRUST_SHORT = 0.98
 """Of the thrust, and of the rates, that the policy was trained with: what a vehicle must reach at least."""
@@ -21,7 +26,8 @@ def mechanism_lag(params: Any) -> float:
 
 
 def make_backend(
-    params: Any, link: Any = None, write: bool = False, tell: Callable[[str], None] | None = None
+    params: Any, link: Any = None, write: bool = False, tell: Callable[[str], None] | None = None,
+    folder: Path | None = None,
 ) -> Backend:  # fmt: skip
     """The back-end of a run.
 
@@ -30,6 +36,7 @@ def make_backend(
         link: MAVLink link of the run; None where poses are recorded ones.
         write: whether wrong parameters of the autopilot are written.
         tell: is handed the audit's table.
+        folder: of the run, where MSP is written down as the link's messages are in its .tlog.
 
     Raises:
         LinkError: the port of the flight controller cannot be opened.
@@ -41,7 +48,9 @@ def make_backend(
         device = check_device(params.betaflight.device, remote=params.betaflight.remote)
         if device.kind not in ("tcp", "serial"):
             raise RunError(f"betaflight.device {params.betaflight.device}: MSP is a stream; expected tcp:... or serial:...")
-        return Betaflight(open_port(device), params.betaflight, write, tell)
+        port = open_port(device)
+        port = port if folder is None else LoggedPort(port, folder / MSP_LOG)
+        return Betaflight(port, params.betaflight, write, tell)
     if link is None:
         raise RunError(f"backend {params.backend} without a MAVLink link; expected source.kind mavlink")
     kind = {"ardupilot": ArduPilot, "px4": Px4}[params.backend]

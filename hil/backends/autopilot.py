@@ -54,8 +54,8 @@ class AutopilotParams:
                 f"autopilot: release_timeout {self.release_timeout}, heartbeat_timeout {self.heartbeat_timeout}, mechanism_lag "
                 f"{self.mechanism_lag} s; expected time-outs above 0, a lag of 0 or more"
             )
-        if not (1 <= self.system <= 255 and 0 <= self.component <= 255):
-            raise ValueError(f"autopilot system {self.system}, component {self.component}; expected 1 to 255, 0 to 255")
+        if not (1 <= self.system <= 255 and 1 <= self.component <= 255):
+            raise ValueError(f"autopilot system {self.system}, component {self.component}; expected 1 to 255 each")
         if not (0 <= self.servo_output <= 16 and 500 <= self.servo_open_us <= 2500):
             raise ValueError(
                 f"servo_output {self.servo_output}, servo_open_us {self.servo_open_us}; expected 0 to 16, 500 to 2500"

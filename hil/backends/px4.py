@@ -42,6 +42,7 @@ class Px4Params(AutopilotParams):
         ValueError: a number out of its range.
     """
 
+    hold: Literal["hold", "position"]  # who holds after the throw: Hold (AUTO.LOITER), or Position with the pilot's sticks
     release: Literal["gripper", "actuator"]  # DO_GRIPPER or DO_SET_ACTUATOR
     gripper: int  # number of the gripper, or of the actuator set from 1 to 6
     actuator_open: float  # value of DO_SET_ACTUATOR that opens, -1 to 1
@@ -64,15 +65,16 @@ class Px4(MavlinkAutopilot):
         main, sub = beat.custom_mode >> 16 & 255, beat.custom_mode >> 24 & 255
         if main == MAIN_OFFBOARD:
             return FOLLOW
-        if main == MAIN_POSCTL and not self._ours:
-            return HOLD  # the pilot holds it by hand, until it is taken
+        if main == MAIN_POSCTL and (self.params.hold == "position" or not self._ours):
+            return HOLD  # the pilot holds it by hand: until it is taken, or when it is given back
         return {AUTO_LOITER: HOLD, AUTO_LAND: LAND}.get(sub) if main == MAIN_AUTO else None
 
     def _mode_text(self, beat: Any) -> str:
         return f"{beat.custom_mode >> 16 & 255}.{beat.custom_mode >> 24 & 255}"
 
     def _mode_numbers(self, mode: str) -> tuple[float, float]:
-        return {FOLLOW: (MAIN_OFFBOARD, 0), HOLD: (MAIN_AUTO, AUTO_LOITER), LAND: (MAIN_AUTO, AUTO_LAND)}[mode]
+        hold = (MAIN_AUTO, AUTO_LOITER) if self.params.hold == "hold" else (MAIN_POSCTL, 0)
+        return {FOLLOW: (MAIN_OFFBOARD, 0), HOLD: hold, LAND: (MAIN_AUTO, AUTO_LAND)}[mode]
 
     def _expected_modes(self) -> str:
         return "OFFBOARD (6.0)" + (", or Hold (4.3) or Position (3.0) to take it" if self.params.take else "")

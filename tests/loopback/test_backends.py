@@ -129,6 +129,16 @@ def test_px4_is_asked_for_offboard_only_after_a_second_of_set_points():
     assert desk.fake.mode == OFFBOARD
 
 
+def test_px4_gives_the_vehicle_back_in_position_mode_where_the_config_says_so():
+    desk = Desk("px4", 'px4.hold="position"').follow()
+    desk.turn(0.3, HOVER, HOLD)
+    assert (desk.status.connected, desk.status.mode, desk.fake.mode) == (True, HOLD, POSCTL)
+    desk.turn(1.6, HOVER, FOLLOW)
+    desk.fake.mode, desk.fake._next_beat = POSCTL, 0.0
+    desk.turn(0.1, HOVER, FOLLOW)
+    assert not desk.status.connected, "unasked it is the pilot's"
+
+
 def test_px4_left_without_a_stream_is_not_asked():
     desk = Desk("px4")
     desk.turn(2.0, None, FOLLOW)

@@ -1,0 +1,95 @@
+"""MSP on a serial port (a pseudo-terminal), and what is written down of it."""
+
+import os
+import struct
+import tty
+
+import pytest
+
+from hil import msp
+from hil.backends import Betaflight
+from hil.device import Device, SerialPort
+from hil.errors import LinkError, RunError
+from hil.msp_log import LoggedPort, read_log
+from hil.params import HilParams
+from visthrow import config
+
+PARAMS = config.load(HilParams, config.find("hil", "fake_betaflight"), ["betaflight.audit=false"]).betaflight
+STATUS = struct.pack("<HHHIBHHBBI", 125, 0, 33, 1, 0, 10, 0, 0, 29, 0)
+
+
+@pytest.fixture
+def wire():
+    """The flight controller's end of a line, and a port at the other."""
+    pytest.importorskip("serial")
+    controller, line = os.openpty()
+    tty.setraw(controller)
+    tty.setraw(line)
+    os.set_blocking(controller, False)
+    port = SerialPort(Device("serial", os.ttyname(line), 115200))
+    yield controller, port
+    port.close()
+    os.close(controller)
+    os.close(line)
+
+
+def asked(controller):
+    """Commands that have come to the flight controller."""
+    try:
+        return [frame.command for frame in msp.Parser().parse(os.read(controller, 65536))]
+    except BlockingIOError:
+        return []
+
+
+def test_a_back_end_on_a_serial_port(wire):
+    controller, port = wire
+    backend = Betaflight(port, PARAMS)
+    assert port.read() is None, "reading never waits"
+    backend.service(0.0)
+    assert msp.STATUS in asked(controller)
+    assert not backend.status(0.1).connected
+    answer = msp.pack(msp.Frame(msp.STATUS, STATUS, msp.ANSWER))
+    os.write(controller, answer[:7])
+    backend.service(0.2)
+    os.write(controller, answer[7:] + msp.pack(msp.Frame(msp.BOXIDS, bytes([0, 1, 27, 50]), msp.ANSWER)))
+    backend.service(0.3)
+    assert backend.status(0.3).connected
+    backend.ask("follow", 0.3)
+    assert backend.send((2.668, 0.0, 0.0, 0.0), 0.3)
+    assert msp.SET_RAW_RC in asked(controller)
+
+
+def test_a_port_that_is_none():
+    pytest.importorskip("serial")
+    with pytest.raises(LinkError, match="cannot open /dev/ttyNONE"):
+        SerialPort(Device("serial", "/dev/ttyNONE", 115200))
+
+
+def test_what_went_over_the_port_is_written_down(wire, tmp_path):
+    controller, port = wire
+    logged = LoggedPort(port, tmp_path / "run" / "link.msp")
+    logged.write(b"abc")
+    os.write(controller, b"defg")
+    assert logged.read() == b"defg"
+    assert logged.read() is None
+    assert logged.fileno() == port.fileno()
+    logged.close()
+    path = tmp_path / "run" / "link.msp"
+    assert [(way, data) for _, way, data in read_log(path)] == [(b"<", b"abc"), (b">", b"defg")]
+    path.write_bytes(path.read_bytes()[:-1])
+    assert [data for _, _, data in read_log(path)] == [b"abc"], "a killed run: what was cut short is left out"
+    path.write_bytes(b"x" * 100)
+    with pytest.raises(RunError, match="damaged at byte 0"):
+        list(read_log(path))
+    with pytest.raises(RunError, match="expected the MSP log of a run"):
+        list(read_log(tmp_path / "none"))
+    with pytest.raises(LinkError, match="cannot write"):
+        LoggedPort(port, tmp_path)
+
+
+def test_a_full_disk_troubles_nobody(wire, tmp_path):
+    _, port = wire
+    logged = LoggedPort(port, tmp_path / "link.msp")
+    logged._file.close()
+    assert logged.write(b"abc")
+    assert logged.failed == 1
