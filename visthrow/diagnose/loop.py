@@ -1,0 +1,225 @@
+"""The loop closed: an effect hidden in the reference plant, flights, diagnosis, training in the extended model, flights again.
+
+Every stage leaves a file in the folder of its effect and is skipped where the file is there, so a loop that was interrupted
+goes on. Three policies meet on the same throws of the plant: the one that knew nothing, the one that was trained anew in the
+model extended by the diagnosis, and the oracle, trained in a model that has the hidden effect itself.
+"""
+
+import concurrent.futures
+import dataclasses
+import json
+import multiprocessing as mp
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from visthrow import config, toml_text
+from visthrow.diagnose import catalogue
+from visthrow.errors import DiagnoseError
+from visthrow.storage import atomic_write, write_json
+from visthrow.task import Experiment, plant_of
+
+PLANT = "reference"
+"""The reference plant without extras: what the diagnosis finds is what was hidden, or a mistake."""
+
+THROW_SEED = 20_000
+"""Of the throws that judge; the flights that are diagnosed have the seeds from 0."""
+
+CONTRACT = ("vehicle", "rope", "release", "observation.latency")
+"""Parts of a policy's contract that a hidden effect breaks."""
+
+
+@dataclass(frozen=True)
+class Loop:
+    """One hidden effect, from flights to flights.
+
+    Attributes:
+        hidden: effect of the catalogue -> its size.
+        base: config of ``configs/train`` that the policy was trained with and that is diagnosed.
+        policy: shipped name or file of the policy that knows nothing.
+        flights: to be diagnosed.
+        throws: of each policy on the plant, in the end.
+        target: of those throws, along x [m].
+        device: of diagnosis and trainings.
+        processes: for flights and throws.
+        changes: ``key=value`` of the trainings, such as fewer iterations for a trial.
+    """
+
+    hidden: Mapping[str, float]
+    folder: Path
+    base: str = "state"
+    policy: str = "state"
+    flights: int = 12
+    throws: int = 200
+    target: float = 2.0
+    device: str = "cpu"
+    processes: int = 2
+    changes: tuple[str, ...] = ()
+
+    def run(self, say: Callable[[str], None]) -> dict[str, Any]:
+        """Go round, or on from where an earlier run stopped; returns the record."""
+        begin = time.perf_counter()
+        nominal = config.load(Experiment, config.find("train", self.base))
+        truth = extended(nominal, self.hidden)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        self._config("hidden", truth)
+        oracle = self._train("oracle")
+        logs = self._flights(truth, say)
+        verdict = self._diagnose(logs, say)
+        theta = named(verdict)
+        say(f"named: {', '.join(f'{n} {v:.4g}' for n, v in theta.items()) or 'nothing'}")
+        self._config("extended", extended(nominal, theta))
+        anew = self._train("extended")
+        self._wait(oracle, "oracle", say)
+        self._wait(anew, "extended", say)
+        throws = {
+            name: self._throws(name, policy, say)
+            for name, policy in {
+                "before": self.policy,
+                "after": str(self.folder / "extended" / "policy.npz"),
+                "oracle": str(self.folder / "oracle" / "policy.npz"),
+            }.items()
+        }
+        record = {"hidden": dict(self.hidden), "named": theta, "overall": verdict["overall"], "target": self.target}
+        record |= {"flights": self.flights, "throws": throws, "seconds": round(time.perf_counter() - begin, 1)}
+        record["recovered"] = recovered(throws)
+        write_json(self.folder / "record.json", record)
+        return record
+
+    def _config(self, name: str, experiment: Experiment) -> None:
+        text = toml_text.dumps(config.to_dict(experiment, defaults=False))
+        atomic_write(self.folder / f"{name}.toml", text)
+
+    def _train(self, name: str) -> subprocess.Popen | None:
+        """Begin a training beside what else is done; the oracle's model is the hidden one."""
+        if (self.folder / name / "policy.npz").exists():
+            return None
+        source = self.folder / ("hidden.toml" if name == "oracle" else f"{name}.toml")
+        command = [sys.executable, "-m", "visthrow.cli", "train", str(source), "--out", str(self.folder / name)]
+        command += ["--device", self.device, "--seed", "1"]
+        if (self.folder / name / "checkpoint.pt").exists():
+            command.append("--resume")
+        for change in self.changes:
+            command += ["--set", change]
+        log = (self.folder / f"{name}.log").open("w")
+        return subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT)
+
+    def _wait(self, process: subprocess.Popen | None, name: str, say: Callable[[str], None]) -> None:
+        if process is not None:
+            if process.wait() != 0:
+                tail = (self.folder / f"{name}.log").read_text()[-600:]
+                raise DiagnoseError(f"the training '{name}' failed: {tail}")
+            say(f"trained: {name}")
+
+    def _flights(self, truth: Experiment, say: Callable[[str], None]) -> list[Path]:
+        """Throws of the policy at targets all around, on the plant with the hidden effect."""
+        folder = self.folder / "flights"
+        paths = [folder / f"flight_{i:02d}.npz" for i in range(self.flights)]
+        todo = [(i, path) for i, path in enumerate(paths) if not path.exists()]
+        text = toml_text.dumps(config.to_dict(truth, defaults=False))
+        with concurrent.futures.ProcessPoolExecutor(self.processes, mp.get_context("spawn")) as pool:
+            done = [pool.submit(_fly_one, self.policy, text, i, path) for i, path in todo]
+            for i, future in enumerate(concurrent.futures.as_completed(done)):
+                future.result()
+                say(f"flown: {i + 1} of {len(todo)}")
+        return paths
+
+    def _diagnose(self, logs: list[Path], say: Callable[[str], None]) -> dict[str, Any]:
+        answer = self.folder / "verdict.json"
+        if not answer.exists():
+            command = [sys.executable, "-m", "visthrow.cli", "diagnose", "explain", *map(str, logs)]
+            command += ["--plant", self.base, "--no-report", "--device", self.device, "--json", str(answer)]
+            done = subprocess.run(command, capture_output=True, text=True, check=False)
+            if done.returncode != 0 or not answer.exists():
+                raise DiagnoseError(f"the diagnosis failed: {(done.stdout + done.stderr)[-600:]}")
+        verdict = json.loads(answer.read_text())
+        say(f"diagnosed: {verdict['overall']}")
+        return verdict
+
+    def _throws(self, name: str, policy: str, say: Callable[[str], None]) -> dict[str, Any]:
+        from visthrow.loading import load_policy
+        from visthrow.reference_protocol import Throwing
+
+        path = self.folder / f"throws_{name}.json"
+        if not path.exists():
+            loaded = [load_policy(policy, str(self.folder / "hidden.toml"), allow=CONTRACT)]
+            with Throwing(loaded, (self.target,), self.throws, PLANT, THROW_SEED, self.processes) as throwing:
+                result = throwing.results(show=False)[0][0]
+            kept = {"error": result.error, "success": result.success, "duration": result.duration}
+            write_json(path, {k: np.asarray(v).tolist() for k, v in kept.items()})
+        found = json.loads(path.read_text())
+        say(f"thrown: {name}, {np.mean(landed(found)):.3f} m")
+        return found
+
+
+def landed(throws: Mapping[str, Any]) -> np.ndarray:
+    """Landing errors of the throws that came down [m]."""
+    return np.array(throws["error"], dtype=float)[np.array(throws["success"], dtype=bool)]
+
+
+def recovered(throws: Mapping[str, Any], draws: int = 4000, seed: int = 0) -> dict[str, float]:
+    """Share of the landing error that the hidden effect costs which the diagnosis wins back, with its 95 % interval.
+
+    ``(before - after) / (before - oracle)`` of the mean errors; bootstrap over throws, each policy by itself.
+    """
+    rng = np.random.default_rng(seed)
+    errors = {name: landed(throws[name]) for name in ("before", "after", "oracle")}
+    if any(len(e) < 2 for e in errors.values()):
+        return {"share": float("nan"), "low": float("nan"), "high": float("nan")}
+
+    def share(mean: Mapping[str, Any]) -> Any:
+        return (mean["before"] - mean["after"]) / (mean["before"] - mean["oracle"])
+
+    again = {n: e[rng.integers(0, len(e), (draws, len(e)))].mean(1) for n, e in errors.items()}
+    low, high = np.quantile(share(again), [0.025, 0.975])
+    return {"share": float(share({n: e.mean() for n, e in errors.items()})), "low": float(low), "high": float(high)}
+
+
+def extended(experiment: Experiment, theta: Mapping[str, float]) -> Experiment:
+    """The experiment with these effects of the catalogue in its plant; what only sensors have stays out.
+
+    Raises:
+        DiagnoseError: no effect of that name.
+    """
+    changed = catalogue.apply(catalogue.ALL, catalogue.Setting(plant_of(experiment)), theta).plant
+    return dataclasses.replace(
+        experiment, vehicle=changed.vehicle, rope=changed.rope, release=changed.release, air=changed.air
+    )
+
+
+def named(verdict: Mapping[str, Any]) -> dict[str, float]:
+    """What a verdict says to set in the model."""
+    return {name: float(value) for name, value in verdict.get("theta", {}).items()}
+
+
+def _fly_one(policy: str, text: str, number: int, path: Path) -> None:
+    """Fly one throw and keep what was measured of it."""
+    from visthrow.flight import fly
+    from visthrow.loading import Loaded, load_policy
+
+    shipped = load_policy(policy)
+    truth = config.loads(Experiment, text, (), name="the hidden world")
+    rng = np.random.default_rng(number)
+    angle, distance = rng.uniform(-np.pi, np.pi), rng.uniform(1.0, 1.9)
+    goal = np.array([distance * np.cos(angle), distance * np.sin(angle), 0.0])
+    log = fly(Loaded(shipped.name, shipped.policy, truth), goal, PLANT, number)
+    log.save(path)
+
+
+def table(records: list[dict[str, Any]]) -> str:
+    """Markdown table of loops."""
+    lines = ["| hidden | named | before | after | oracle | won back |", "|---|---|---:|---:|---:|---:|"]
+    for r in records:
+        means = [f"{np.mean(landed(r['throws'][n])):.3f} m" for n in ("before", "after", "oracle")]
+        share = r["recovered"]
+        hidden = ", ".join(f"{n} {v:+.4g}" for n, v in r["hidden"].items())
+        found = ", ".join(f"{n} {v:+.4g}" for n, v in r["named"].items()) or "nothing"
+        won = f"{100 * share['share']:.0f} % [{100 * share['low']:.0f}, {100 * share['high']:.0f}]"
+        lines.append(f"| {hidden} | {found} | {' | '.join(means)} | {won} |")
+    return "\n".join(lines)

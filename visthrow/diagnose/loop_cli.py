@@ -1,0 +1,56 @@
+"""``visthrow diagnose loop``: hide an effect in the reference plant, find it in flights, train with it, fly again."""
+
+import argparse
+from pathlib import Path
+
+DEFAULT_OUT = "runs/loop"
+RECORDS = Path(__file__).parent / "records" / "loop.json"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the action."""
+    parser.epilog = (
+        "examples:\n"
+        "  visthrow diagnose loop --shipped                     the table of the loops that were run before\n"
+        "  visthrow diagnose loop --hide motor_tau=0.02         a slower motor; minutes on a GPU, hours on a CPU\n"
+    )
+    parser.add_argument("--hide", action="append", default=[], metavar="EFFECT=SIZE", help="of the catalogue; may be repeated")
+    parser.add_argument("--shipped", action="store_true", help="run nothing, show the committed record")
+    parser.add_argument("--flights", type=int, default=12, help="that are diagnosed (default: 12)")
+    parser.add_argument("--throws", type=int, default=200, help="of each policy in the end (default: 200)")
+    parser.add_argument("--processes", type=int, help="for flights and throws (default: one a core)")
+    parser.add_argument("--device", default="auto", metavar="NAME", help="of diagnosis and training")
+    parser.add_argument("--set", action="append", default=[], dest="changes", metavar="KEY=VALUE", help="in the trainings")
+    parser.add_argument("--out", default=DEFAULT_OUT, metavar="FOLDER", help=f"(default: {DEFAULT_OUT})")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Go round for the effects, all hidden at once, or show what was run."""
+    from visthrow.diagnose import loop
+    from visthrow.errors import ConfigError
+
+    if args.shipped:
+        import json
+
+        if not RECORDS.exists():
+            raise ConfigError(f"no record {RECORDS}; expected one that `visthrow diagnose loop --hide ...` made")
+        print(loop.table(json.loads(RECORDS.read_text())))
+        return 0
+    hidden = {}
+    for item in args.hide:
+        name, _, size = item.partition("=")
+        try:
+            hidden[name] = float(size)
+        except ValueError:
+            raise ConfigError(f"--hide {item}; expected EFFECT=SIZE, such as motor_tau=0.02") from None
+    if not hidden:
+        raise ConfigError("nothing to hide; name an effect, such as --hide motor_tau=0.02, or say --shipped")
+    from visthrow.device import cores, resolve
+
+    folder = Path(args.out) / "-".join(f"{n}_{v:g}" for n, v in hidden.items())
+    record = loop.Loop(
+        hidden, folder, flights=args.flights, throws=args.throws, device=resolve(args.device),
+        processes=args.processes or cores(), changes=tuple(args.changes),
+    ).run(lambda line: print(f"  {line}", flush=True))  # fmt: skip
+    print("\n" + loop.table([record]))
+    return 0
