@@ -7,7 +7,7 @@ from visthrow.plants import PLANTS
 from visthrow.report import figures
 from visthrow.report.book import SHIPPED, Book, errors, landed, misses
 from visthrow.report.parts import Grid, Picture, Section, Text
-from visthrow.report.wanted import TARGETS
+from visthrow.report.wanted import FRONT_TARGET, TARGETS
 from visthrow.results import Result
 from visthrow.tables import PAPER, PAPER_NOTE
 
@@ -26,7 +26,8 @@ def throws_section(book: Book) -> Section:
             for plant in PLANTS:
                 found = book.shipped(name, plant, target)
                 if found is None:
-                    missing.append(f"{name} at {target:g} m on the {SHORT[plant]}")
+                    if wanted_there(plant, target):
+                        missing.append(f"{name} at {target:g} m on the {SHORT[plant]}")
                     continue
                 rows.append(_row(name, target, plant, found))
     parts: list = [
@@ -45,6 +46,11 @@ def throws_section(book: Book) -> Section:
     if missing:
         parts.append(Text("Not thrown: " + "; ".join(missing) + ".", "missing"))
     return Section("throws", "What the policies do", tuple(parts))
+
+
+def wanted_there(plant: str, target: float) -> bool:
+    """Whether the report wants policies thrown there: on the plain reference plant at one target alone."""
+    return plant != "reference" or target == FRONT_TARGET
 
 
 def _row(name: str, target: float, plant: str, found: Result) -> tuple[str, ...]:
@@ -81,7 +87,8 @@ def vision_section(book: Book) -> Section:
         for target in TARGETS:
             pair = _groups(book, plant, target)
             if pair is None:
-                missing.append(f"{target:g} m on the {SHORT[plant]}")
+                if wanted_there(plant, target):
+                    missing.append(f"{target:g} m on the {SHORT[plant]}")
                 continue
             (vision, state), runs = pair
             gap, faster = (_minus(vision, state, name) for name in ("error", "duration"))
