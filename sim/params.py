@@ -273,6 +273,32 @@ class PlantParams:
 
 
 @dataclass(frozen=True)
+class SensingParams:
+    """Motion capture and gyro, as a log holds them. Zero everywhere is an ideal sensor.
+
+    With the frame's rotation F of the rotation vector ``frame_tilt``, the marker body's M of ``marker_rotation`` and the
+    body's attitude R, a sample that carries the stamp t shows the state at
+    ``t - delay - clock_rate (t - start of the flight)``, with the delay of its channel:
+
+    - vehicle: ``p = (1 + scale) F (p_origin + R marker_offset)``, ``R_measured = F R M``; the origin is that of the frame
+      the vehicle's parameters are stated in, not the centre of mass
+    - payload: ``p = (1 + scale) F (p_payload + payload_offset)``
+    - gyro: ``w = w_b + gyro_bias``
+    """
+
+    vehicle_delay: float = 0.0  # of the vehicle's stamps [s]
+    payload_delay: float = 0.0  # of the payload's stamps [s]
+    gyro_delay: float = 0.0  # [s]
+    clock_rate: float = 0.0  # of the sensors' clock against the commands' [-]
+    scale: float = 0.0  # of measured lengths [-]
+    frame_tilt: tuple[float, float, float] = (0.0, 0.0, 0.0)  # world against the measured frame [rad]
+    marker_rotation: tuple[float, float, float] = (0.0, 0.0, 0.0)  # [rad]
+    marker_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)  # body frame [m]
+    payload_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)  # world frame [m]
+    gyro_bias: tuple[float, float, float] = (0.0, 0.0, 0.0)  # [rad/s]
+
+
+@dataclass(frozen=True)
 class RandomizationParams:
     """Uniform distributions of an episode's start (the paper, Sec. III-C, "Domain randomization").
 

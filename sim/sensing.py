@@ -1,39 +1,10 @@
-"""What sensors make of the state: delays, frames, markers. Equations: :class:`SensingParams`."""
+"""What sensors make of the state: delays, frames, markers. Equations: :class:`sim.params.SensingParams`."""
 
-from dataclasses import dataclass
 from typing import Any
 
 import warp as wp
 
 from sim.structs import Types
-
-Vector = tuple[float, float, float]
-
-
-@dataclass(frozen=True)
-class SensingParams:
-    """Motion capture and gyro, as a log holds them. Zero everywhere is an ideal sensor.
-
-    With the frame's rotation F of the rotation vector ``frame_tilt``, the marker body's M of ``marker_rotation`` and the
-    body's attitude R, a sample that carries the stamp t shows the state at
-    ``t - delay - clock_rate (t - start of the flight)``, with the delay of its channel:
-
-    - vehicle: ``p = (1 + scale) F (p_origin + R marker_offset)``, ``R_measured = F R M``; the origin is that of the frame
-      the vehicle's parameters are stated in, not the centre of mass
-    - payload: ``p = (1 + scale) F (p_payload + payload_offset)``
-    - gyro: ``w = w_b + gyro_bias``
-    """
-
-    vehicle_delay: float = 0.0  # of the vehicle's stamps [s]
-    payload_delay: float = 0.0  # of the payload's stamps [s]
-    gyro_delay: float = 0.0  # [s]
-    clock_rate: float = 0.0  # of the sensors' clock against the commands' [-]
-    scale: float = 0.0  # of measured lengths [-]
-    frame_tilt: Vector = (0.0, 0.0, 0.0)  # world against the measured frame [rad]
-    marker_rotation: Vector = (0.0, 0.0, 0.0)  # [rad]
-    marker_offset: Vector = (0.0, 0.0, 0.0)  # body frame [m]
-    payload_offset: Vector = (0.0, 0.0, 0.0)  # world frame [m]
-    gyro_bias: Vector = (0.0, 0.0, 0.0)  # [rad/s]
 
 
 @wp.func

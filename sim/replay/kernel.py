@@ -10,14 +10,14 @@ import warp as wp
 
 from sim import state as st
 from sim.coupling import build_coupled_step
-from sim.params import VehicleParams
+from sim.params import SensingParams, VehicleParams
 from sim.quadrotor.rigid_body import build_flow, quat_rate
 from sim.quadrotor.thrust import rotor_thrust
 from sim.release import build_letting_go
 from sim.rope.chain import build_chain
 from sim.rope.loose import build_loose_step
 from sim.rope.payload import build_payload
-from sim.sensing import SensingParams, build_sensing
+from sim.sensing import build_sensing
 from sim.structs import EXTENSIONS, Types, make_struct
 
 EVERYTHING = frozenset(EXTENSIONS)
@@ -46,7 +46,6 @@ WINDOW_FIELDS = {
     "knots": ("int", False),
     "payload": ("int", False),  # ATTACHED, LOOSE or NO_PAYLOAD
     "latch": ("real", False),  # of the release, any time after the end if none
-    "separated": ("real", False),  # when a loose payload left
     "clock_zero": ("real", False),  # start of the flight
     "command_first": ("int", False),  # range of the flight's commands
     "command_last": ("int", False),

@@ -11,9 +11,8 @@ import warp as wp
 from sim import runtime  # noqa: F401  starts Warp
 from sim import state as st
 from sim.checks import check_air, check_numerics, check_release
-from sim.params import GRAVITY, PlantParams
+from sim.params import GRAVITY, PlantParams, SensingParams
 from sim.replay import kernel as rk
-from sim.sensing import SensingParams
 from sim.structs import kinds_of, pack, pack_rope, pack_vehicle, ropes_on, types
 
 

@@ -6,10 +6,9 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sim.params import PlantParams
+from sim.params import PlantParams, SensingParams
 from sim.replay.kernel import NO_PAYLOAD
 from sim.replay.lanes import Replay
-from sim.sensing import SensingParams
 from visthrow.diagnose.catalogue import Entry, Setting, apply, entries_for
 from visthrow.diagnose.cutting import Cut, around_slack, cut
 from visthrow.diagnose.model import Window

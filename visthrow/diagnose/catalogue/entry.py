@@ -5,8 +5,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from sim.params import PlantParams
-from sim.sensing import SensingParams
+from sim.params import PlantParams, SensingParams
 from visthrow.diagnose.model import Effect
 from visthrow.errors import DiagnoseError, suggest
 
