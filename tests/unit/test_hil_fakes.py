@@ -1,0 +1,114 @@
+"""The parts of the fakes: the witness catches what it is there for, options are checked, the MSP port takes peer after peer."""
+
+import math
+import socket
+
+import numpy as np
+import pytest
+
+from hil.device import check_device, open_port
+from hil.errors import LinkError, RunError
+from hil.fake import ListeningPort, make_fake, read_options
+from hil.fakes.level import LevelPlant
+from hil.fakes.witness import Witness
+from hil.link import Link, attitude_target
+from hil.mavlink import mav
+from tests.loopback.wire import pipe
+from visthrow.errors import ConfigError
+
+LIMITS = (14.0, 10.0, 10.0, 4.0)
+INSIDE = np.array([0.0, 0.0, 1.0])
+
+
+@pytest.mark.parametrize(
+    ("command", "text"),
+    [
+        ((math.nan, 0.0, 0.0, 0.0), "is not finite"),
+        ((5.0, 0.0, math.inf, 0.0), "is not finite"),
+        ((14.2, 0.0, 0.0, 0.0), "beyond"),
+        ((-0.1, 0.0, 0.0, 0.0), "beyond"),
+        ((5.0, 10.2, 0.0, 0.0), "beyond"),
+        ((5.0, 0.0, 0.0, -4.1), "beyond"),
+    ],
+)
+def test_the_witness_catches_commands(command, text):
+    witness = Witness(LIMITS)
+    witness.command(1.5, (14.0, 10.0, -10.0, 4.0))
+    assert (witness.breaches, witness.worst) == ([], [14.0, 10.0, 10.0, 4.0])
+    witness.command(2.5, command)
+    assert len(witness.breaches) == 1
+    assert witness.breaches[0].startswith("2.500 s: command")
+    assert text in witness.breaches[0]
+
+
+@pytest.mark.parametrize(
+    ("armed", "payload_w", "answered", "text"),
+    [
+        (False, INSIDE, False, "disarmed"),
+        (True, np.array([3.5, 0.0, 1.0]), False, "outside of its fence"),
+        (True, INSIDE, True, "again after the answer"),
+    ],
+)
+def test_the_witness_catches_releases(armed, payload_w, answered, text):
+    witness = Witness(LIMITS)
+    witness.release(1.0, True, INSIDE)
+    witness.release(1.04, True, INSIDE)
+    assert witness.breaches == [], "a repetition before the answer is one release"
+    if answered:
+        witness.answered()
+    witness.release(1.08, armed, payload_w)
+    assert [text in breach for breach in witness.breaches] == [True]
+    assert witness.releases == 3
+
+
+def test_a_fake_reports_what_its_witness_saw():
+    """Over the wire, a thrust that is none: taken, as by the real ones, and the vehicle falls."""
+    here, there = pipe()
+    fake = make_fake("ardupilot", LevelPlant(), Link(there, 1, 1))
+    link = Link(here)
+    link.send(attitude_target(0.0, (1, 1), math.nan, (0.0, 0.0, 0.0)))
+    gripper = (mav.MAV_CMD_DO_GRIPPER, 0, 1.0, mav.GRIPPER_ACTION_RELEASE, 0.0, 0.0, 0.0, 0.0, 0.0)
+    for _ in range(2):
+        link.send(mav.MAVLink_command_long_message(1, 1, *gripper))
+        for _ in range(4):
+            fake.step()
+    assert fake.plant.commands[-1][0] == 0.0
+    report = fake.report()
+    assert len(report["breaches"]) == 2
+    assert "is not finite" in report["breaches"][0]
+    assert "again after the answer" in report["breaches"][1]
+
+
+def test_options_of_a_fake():
+    options = read_options(["silent_after=12", "parameters.GUID_OPTIONS=0", "answer=silent"])
+    assert (options.silent_after, options.parameters, options.answer) == (12.0, {"GUID_OPTIONS": 0.0}, "silent")
+    with pytest.raises(ConfigError, match="did you mean 'silent_after'"):
+        read_options(["silent_aftr=12"])
+    with pytest.raises(ConfigError, match="expected an answer of accepted, in-progress"):
+        read_options(["answer=maybe"])
+    with pytest.raises(ConfigError, match="times of 0 s or more"):
+        read_options(["servo_delay=-0.1"])
+    with pytest.raises(RunError, match="did you mean 'px4'"):
+        make_fake("px5", LevelPlant(), None)
+
+
+def test_the_msp_port_serves_one_peer_after_another():
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        number = probe.getsockname()[1]
+    port = ListeningPort(number)
+    with pytest.raises(LinkError, match="cannot listen"):
+        ListeningPort(number)
+    assert port.read() is None
+    assert not port.write(b"nobody there")
+    for word in (b"one", b"two"):
+        peer, heard = open_port(check_device(f"tcp:127.0.0.1:{number}")), None
+        peer.write(word)
+        for _ in range(1000):
+            heard = heard or port.read()
+        assert heard == word
+        assert port.write(word[::-1])
+        peer.close()
+        for _ in range(1000):
+            port.read()
+    port.close()
