@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 
 from visthrow.diagnose.models.flyer_effects import effects_of
-from visthrow.diagnose.models.flyer_windows import stretches_of
+from visthrow.diagnose.models.flyer_windows import FINE, stretches_of
 from visthrow.diagnose.models.numeric import Lanes, NumericModel, Stretch, cross, hermite, integrate, latent_force
 from visthrow.errors import ConfigError
 from visthrow.flightlog import FlightLog
@@ -95,7 +95,7 @@ class FlyerModel(NumericModel):
         self.steps = round(params.window / params.step)
         self._names = {effect.name: i for i, effect in enumerate(self.effects)}
         self._rot = np.array([s.data["rot"] for s in stretches])  # (S, half steps, 3, 3)
-        self._input = np.array([s.data["input"] for s in stretches])  # (S, fine, motors)
+        self._input = np.array([s.data["input"] for s in stretches])  # (S, fine steps, motors)
         self._volts = np.array([s.data["volts"] for s in stretches])  # (S,)
         self._direction = np.array([s.data["direction"] for s in stretches])  # (S, 3)
         self._blocks = 1 + (params.cable is not None) + (params.torque is not None)
@@ -108,7 +108,7 @@ class FlyerModel(NumericModel):
     def _wanted(self, lanes: Lanes, half: int, delay: np.ndarray) -> np.ndarray:
         """Thrust each motor is told at a half step [N], shape (B, motors)."""
         p = self.params
-        at = (p.window + half * 0.5 * p.step - delay) / (0.5 * p.step)  # tables begin one window early
+        at = (p.window + half * 0.5 * p.step - delay) * (FINE / p.step)  # tables begin one window early
         left = np.clip(at.astype(int), 0, self._input.shape[1] - 2)
         share = (at - left)[:, None]
         told = (1.0 - share) * self._input[lanes.owner, left] + share * self._input[lanes.owner, left + 1]

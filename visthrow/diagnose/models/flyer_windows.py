@@ -14,6 +14,8 @@ from visthrow.flightlog import Channel, FlightLog
 if TYPE_CHECKING:
     from visthrow.diagnose.models.flyer import FlyerParams
 
+FINE = 16
+"""Steps of the commands' table in a step of the integration: commands switch at their own times."""
 KNOTS = 8
 """Of the latent forces over a window."""
 _GUESS = 0.25
@@ -96,9 +98,9 @@ def _samples(channel: Channel, start: float, end: float, every: int) -> tuple[np
 
 
 def _inputs(channel: Channel, params: "FlyerParams", start: float) -> np.ndarray:
-    """Held commands on half steps from one window before the start to its end, shape (half steps, motors)."""
-    count = 2 * round(params.window / params.step)
-    times = start - params.window + 0.5 * params.step * np.arange(2 * count + 1)
+    """Held commands on fine steps from one window before the start to its end, shape (fine steps, motors)."""
+    count = FINE * round(params.window / params.step)
+    times = start - params.window + params.step / FINE * np.arange(2 * count + 1)
     held = channel.hold(times).astype(float).reshape(len(times), -1)
     return held[:, :1] if params.input == "command" else held
 

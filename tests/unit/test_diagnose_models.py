@@ -1,0 +1,370 @@
+"""The small models against physics of another hand: scipy's integrator, closed forms, and planted parameters found again."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
+
+from visthrow.diagnose import fit as fitting
+from visthrow.diagnose import setup as setups
+from visthrow.diagnose.models.ball import BallModel, BallParams
+from visthrow.diagnose.models.flyer import CableParams, FlyerModel, FlyerParams, TorqueParams
+from visthrow.diagnose.models.gimbal import GimbalModel, GimbalParams
+from visthrow.diagnose.models.pendulum import PendulumModel, PendulumParams
+from visthrow.diagnose.models.stand import StandModel, StandParams
+from visthrow.diagnose.models.trim import TrimModel, TrimParams
+from visthrow.errors import ConfigError, DiagnoseError, LogError
+from visthrow.flightlog import Channel, FlightLog
+
+G = 9.81
+TIGHT = {"rtol": 1e-10, "atol": 1e-12}
+
+BALL = BallParams(G, 0.0, 0.02, 0.3, 1)
+SWING = PendulumParams(G, 0.2, 0.0, 0.0, 0.0, 0.0, 2.0, 0.01, 2)
+STAND = StandParams(1.5e-6, 2e-8, 0.0, 0.1, 11.0, 0.02, 0.01, 0.05, 0.02, 100.0)
+FLYER = FlyerParams(
+    "motor_command", "pos_w", "quat_wb", 0.03, G, (0.0, 0.06, 0.1), 0.03, 0.0, 3.8, 0.0, 0.0, 0.0, -10.0, 1.0, 0.02, 1, 40
+)
+
+
+def ball_log(drag=0.0, wind=(0.0, 0.0), spin=(0.0, 0.0, 0.0), noise=1e-4, seed=0, heading=0.0) -> FlightLog:
+    """A throw, held before and after: scipy's integrator."""
+    rng = np.random.default_rng(seed)
+    speed = rng.uniform(2.5, 4.0)
+    start = np.array([0, 0, 1.5, speed * np.cos(heading), speed * np.sin(heading), 2.5])
+
+    def slope(_, state):
+        air = state[3:] - [*wind, 0.0]
+        return [*state[3:], *(-drag * np.linalg.norm(air) * air + np.cross(spin, air) + [0, 0, -G])]
+
+    time = np.arange(0.0, 0.8, 1 / 240)
+    path = solve_ivp(slope, (0, 0.8), start, t_eval=time, **TIGHT).y[:3].T
+    rest = np.arange(1, 60) / 240
+    time = np.concatenate([time, 0.8 + rest])
+    path = np.concatenate([path, np.tile(path[-1], (len(rest), 1))])
+    return FlightLog({"payload_pos_w": Channel(time, path + rng.normal(0, noise, path.shape), "m", "world")})
+
+
+def swing_log(length=0.2, viscous=0.0, coulomb=0.0, quadratic=0.0, offset=0.0, noise=2e-4, seconds=12.0) -> FlightLog:
+    def slope(_, state):
+        angle, rate = state
+        friction = viscous * rate + coulomb * np.tanh(rate / 0.02) + quadratic * abs(rate) * rate
+        return [rate, -G / length * np.sin(angle) - friction]
+
+    time = np.arange(0.0, seconds, 0.005)
+    angle = solve_ivp(slope, (0, seconds), [1.2, 0.0], t_eval=time, max_step=0.005, rtol=1e-9, atol=1e-10).y[0]
+    return FlightLog({"angle": Channel(time, angle + offset + np.random.default_rng(1).normal(0, noise, len(time)), "rad")})
+
+
+def found(model, names) -> dict[str, tuple[float, float]]:
+    """Estimates and deviations."""
+    result = fitting.fit(model, names)
+    return {n: (float(result.theta[i]), float(np.sqrt(result.covariance[i, i]))) for i, n in enumerate(names)}
+
+
+def near(estimates, name, truth, sigmas=3.0) -> bool:
+    value, sd = estimates[name]
+    return abs(value - truth) < sigmas * sd
+
+
+class TestBall:
+    def test_parabola_is_exact(self):
+        model = BallModel([ball_log(noise=1e-9)], BALL)
+        (residual,) = model.residuals({})
+        assert np.max(np.abs(residual)) < 1e-6
+
+    def test_what_flies_is_found(self):
+        logs = [ball_log(drag=0.04, seed=i, heading=2.1 * i) for i in range(4)]
+        assert len(BallModel(logs, BALL).stretches) == 4
+        estimates = found(BallModel(logs, BALL), ["ball_drag", "frame_tilt_x", "frame_tilt_y", "top_spin"])
+        assert estimates["ball_drag"][0] == pytest.approx(0.04, rel=0.03)
+        assert near(estimates, "ball_drag", 0.04)
+        assert near(estimates, "top_spin", 0.0)
+
+    def test_spin_is_found(self):
+        logs = [ball_log(spin=(0.0, 0.0, 0.3), seed=i, heading=2.1 * i) for i in range(3)]
+        estimates = found(BallModel(logs, BALL), ["side_spin", "ball_drag"])
+        assert estimates["side_spin"][0] == pytest.approx(0.3, rel=0.05)
+
+    def test_nothing_that_falls(self):
+        time = np.arange(0, 3, 0.01)
+        still = FlightLog({"payload_pos_w": Channel(time, np.zeros((len(time), 3)), "m", "world")})
+        with pytest.raises(LogError, match="no stretch"):
+            BallModel([still], BALL)
+
+
+class TestPendulum:
+    def test_small_swings_have_the_period_of_theory(self):
+        model = PendulumModel([swing_log(noise=1e-9)], SWING)
+        assert max(np.max(np.abs(r)) for r in model.residuals({})) < 1e-5
+
+    def test_frictions_are_told_apart(self):
+        log = swing_log(0.21, viscous=0.05, coulomb=0.1, quadratic=0.02, offset=0.01)
+        names = ["pendulum_length", "viscous_friction", "coulomb_friction", "quadratic_drag", "encoder_offset"]
+        estimates = found(PendulumModel([log], SWING), names)
+        truth = {"pendulum_length": 0.01, "viscous_friction": 0.05, "coulomb_friction": 0.1, "quadratic_drag": 0.02,
+                 "encoder_offset": 0.01}  # fmt: skip
+        assert all(near(estimates, name, truth[name]) for name in names), estimates
+        assert estimates["pendulum_length"][0] == pytest.approx(0.01, rel=0.02)
+
+
+class TestStand:
+    def log(self, k_f=1.4e-6, k_1=0.0, volts=11.0, zero=0.0, seed=0) -> FlightLog:
+        speed = np.linspace(300, 1800, 12)
+        thrust = k_f * speed**2 + k_1 * speed + zero
+        power = 2e-8 * speed**3
+        current = (volts - np.sqrt(volts**2 - 0.4 * power)) / 0.2
+        time = 2.0 * np.arange(12)
+        rng = np.random.default_rng(seed)
+        values = {"thrust": (thrust * (1 + rng.normal(0, 0.005, 12)), "N"), "rotor_speed": (speed, "rad/s"),
+                  "supply_voltage": (np.full(12, volts), "V"), "current": (current, "A")}  # fmt: skip
+        return FlightLog({name: Channel(time, column, unit) for name, (column, unit) in values.items()})
+
+    def test_curve_and_zero_are_found(self):
+        logs = [self.log(k_1=3e-4, zero=0.1, seed=i) for i in range(4)]
+        model = StandModel(logs, STAND)
+        result = fitting.fit(model, ["thrust_gain", "thrust_linear", "load_cell_zero"])
+        base = fitting.config.load(fitting.VehicleParams, fitting.config.find("vehicle", "paper"))
+        vehicle = fitting.vehicle_of(setups.Setup("", stand=STAND), result, base)
+        speed = np.array([600.0, 1200.0, 1700.0])
+        told = vehicle.thrust.k_f * speed**2 + vehicle.thrust.k_1 * speed
+        assert told == pytest.approx(1.4e-6 * speed**2 + 3e-4 * speed, rel=0.02)
+
+    def test_residual_is_zero_where_it_is_right(self):
+        model = StandModel([self.log(k_f=1.5e-6, seed=0)], STAND)
+        (residual,) = model.residuals({})
+        assert np.max(np.abs(residual[12:])) < 1e-9  # currents
+        assert np.max(np.abs(residual[:12]) / model.stretches[0].sigma[:12]) < 3.0
+
+
+LATE = -0.005
+"""The test's motors follow a smooth command; its samples, held, come half a sample late [s]."""
+
+
+def attitude(time: np.ndarray) -> Rotation:
+    angles = np.column_stack([0.6 * np.sin(0.5 * time), 0.35 * np.sin(2.3 * time + 1), 0.35 * np.sin(1.7 * time)])
+    return Rotation.from_euler("ZYX", angles)
+
+
+def fly(seconds=6.0, gain=1.0, drag=0.0, cable=None, payload_drag=0.0, volts_slope=0.0, noise=2e-4, seed=0) -> FlightLog:
+    """A vehicle with an attitude of closed form and motors that hold it up; equations and integrator of the test's own."""
+    rng = np.random.default_rng(seed)
+    mass, payload, step = 0.03, 0.008, 0.005
+    load = mass + (payload if cable else 0.0)
+    phases = rng.uniform(0, 6, 2)
+    half = np.arange(0.0, seconds + step, 0.5 * step)
+    rot = attitude(half).as_matrix()
+    told = load * G / rot[:, 2, 2] * (1.0 + 0.15 * np.sin(3.1 * half + phases[0]) + 0.1 * np.sin(1.3 * half + phases[1]))
+    volts = 4.1 - 0.05 * half
+    level = gain * (1.0 + volts_slope * (volts - 3.8))
+
+    def slope(i, state):
+        p, v, thrust = state[:3], state[3:6], state[6]
+        body = rot[i].T @ v
+        force = rot[i] @ np.array([-drag * body[0], -drag * body[1], thrust * level[i]]) - [0, 0, mass * G]
+        lag = [(told[i] - thrust) / 0.03]
+        if cable is None:
+            return np.concatenate([v, force / mass, lag])
+        vp = state[10:13]
+        along = (state[7:10] - p) / np.sqrt(np.sum((state[7:10] - p) ** 2))
+        weight = -payload_drag * np.sqrt(vp @ vp) * vp - [0, 0, payload * G]
+        pull = (along @ (weight / payload - force / mass) + (vp - v) @ (vp - v) / cable) / (1 / mass + 1 / payload)
+        return np.concatenate([v, (force + pull * along) / mass, lag, vp, (weight - pull * along) / payload])
+
+    state = np.array([0, 0, 5.0, 0, 0, 0, told[0]] + ([0.1 * cable, 0, 5.0 - cable * np.sqrt(0.99), 0, 0, 0] if cable else []))
+    path = [state]
+    for i in range(0, len(half) - 2, 2):
+        k1 = slope(i, state)
+        k2 = slope(i + 1, state + 0.5 * step * k1)
+        k3 = slope(i + 1, state + 0.5 * step * k2)
+        state = state + step / 6 * (k1 + 2 * k2 + 2 * k3 + slope(i + 2, state + step * k3))
+        path.append(state)
+    path, time = np.array(path)[::2], half[::4][: len(path[::2])]
+    thrust = told[::4][: len(time)] / 4.0
+    command = (-0.06 + np.sqrt(0.06**2 + 0.4 * thrust)) / 0.2
+
+    def seen(columns):
+        return Channel(time, columns + rng.normal(0, noise, (len(time), 3)), "m", "world")
+
+    channels = {
+        "pos_w": seen(path[:, :3]), "quat_wb": Channel(time, attitude(time).as_quat(), "1", "world"),
+        "motor_command": Channel(time, np.tile(command[:, None], 4), "1"),
+        "battery_voltage": Channel(time, 4.1 - 0.05 * time, "V"),
+    }  # fmt: skip
+    return FlightLog(channels | ({"payload_pos_w": seen(path[:, 7:10])} if cable else {}))
+
+
+class TestFlyer:
+    def test_the_truth_leaves_noise(self):
+        model = FlyerModel([fly(6.0, drag=0.02)], FLYER)
+        residual = np.concatenate(model.residuals({"rotor_drag_xy": 0.02, "cmd_delay": LATE}))
+        assert np.sqrt(np.mean(residual**2)) == pytest.approx(2e-4, rel=0.1)  # the noise
+        wrong = np.concatenate(model.residuals({}))
+        assert np.sqrt(np.mean(wrong**2)) > 1e-3
+
+    @pytest.mark.slow
+    def test_gain_drag_and_battery_are_found(self):
+        names = ["thrust_gain", "rotor_drag_xy", "battery_sag", "cmd_delay", "frame_tilt_x"]
+        estimates = found(FlyerModel([fly(8.0, gain=1.05, drag=0.02, volts_slope=0.08)], FLYER), names)
+        assert near(estimates, "thrust_gain", 0.05), estimates
+        assert near(estimates, "rotor_drag_xy", 0.02), estimates
+        assert near(estimates, "battery_sag", 0.08), estimates
+        assert near(estimates, "frame_tilt_x", 0.0), estimates
+        assert near(estimates, "cmd_delay", LATE), estimates
+
+    @pytest.mark.slow
+    def test_cable_length_and_payload(self):
+        params = FlyerParams(**{**vars(FLYER), "cable": CableParams(0.5, 0.008)})
+        names = ["rope_length", "payload_drag", "thrust_gain", "cmd_delay"]
+        estimates = found(FlyerModel([fly(6.0, cable=0.47, payload_drag=5e-4)], params), names)
+        assert estimates["rope_length"][0] == pytest.approx(-0.03, abs=1e-3)
+        assert near(estimates, "rope_length", -0.03)
+        assert near(estimates, "payload_drag", 5e-4), estimates
+
+    def test_derivatives_are_those_of_the_residuals(self):
+        torque = TorqueParams((2e-5, 2e-5, 3e-5), 0.03, 0.03, 0.006, (1.0, -1.0, -1.0, 1.0))
+        params = FlyerParams(**{**vars(FLYER), "cable": CableParams(0.5, 0.008), "torque": torque})
+        log = fly(4.0, cable=0.5)
+        rates = Channel(log["pos_w"].time, np.zeros((len(log["pos_w"].time), 3)), "rad/s", "body")
+        model = FlyerModel([FlightLog({**log.channels, "rate_b": rates})], params)
+        window = model.windows({})[0]
+        size, start = np.zeros(len(model.effects)), model._start[0]
+        for k, effect in enumerate(model.effects):
+            step = 0.02 * effect.prior_sd
+            sides = []
+            for sign in (1.0, -1.0):
+                moved = size.copy()
+                moved[k] = sign * step
+                sides.append(model._off(moved, np.array([start] + list(model._start[1:])))[0])
+            slope = -(sides[0] - sides[1]) / (2 * step)
+            scale = np.max(np.abs(slope)) + 1e-12
+            assert window.effects[:, k] / scale == pytest.approx(slope / scale, abs=0.02), effect.name
+        assert window.latent.shape[1] == len(window.latent_block) == len(window.latent_time)
+
+    def test_motor_gains_from_rates(self):
+        """Rates of closed form: one motor weaker by a tenth turns the vehicle as rigid-body mechanics says."""
+        torque = TorqueParams((2e-5, 2e-5, 3e-5), 0.03, 0.03, 0.006, (1.0, -1.0, -1.0, 1.0))
+        params = FlyerParams(**{**vars(FLYER), "torque": torque})
+        log = fly(5.0)
+        time = log["pos_w"].time
+        u = log["motor_command"].values[:, 0]
+        lost = 0.1 * (0.06 * u + 0.1 * u * u)  # of the front left motor
+        spin = np.cumsum(np.column_stack([-0.03 * lost / 2e-5, 0.03 * lost / 2e-5, -0.006 * lost / 3e-5]), axis=0) * 0.01
+        rates = Channel(time, 1e-4 * spin, "rad/s", "body")  # small: gyroscopic terms vanish
+        weak = FlyerParams(**{**vars(params), "torque": TorqueParams((0.2, 0.2, 0.3), 0.03, 0.03, 0.006, (1.0, -1.0, -1.0, 1.0))})
+        model = FlyerModel([FlightLog({**log.channels, "rate_b": rates})], weak)
+        right = [s.channel == 1 for s in model.stretches]
+        truth, nothing = model.residuals({"motor_fl": -0.1}), model.residuals({})
+        good = np.sqrt(np.mean(np.concatenate([r[own] for r, own in zip(truth, right)]) ** 2))
+        bad = np.sqrt(np.mean(np.concatenate([r[own] for r, own in zip(nothing, right)]) ** 2))
+        assert good < 0.1 * bad
+
+    def test_missing_channels_are_named(self):
+        with pytest.raises(LogError, match="missing everywhere: quat_wb"):
+            FlyerModel([FlightLog({k: v for k, v in fly(3.0).channels.items() if k != "quat_wb"})], FLYER)
+        with pytest.raises(ConfigError, match="single motors"):
+            FlyerParams(**{**vars(FLYER), "input": "thrust_command", "torque": TorqueParams((1, 1, 1), 1, 1, 1, (1, 1, 1, 1))})
+
+    def test_without_voltage_the_battery_cannot_be_seen(self):
+        log = fly(3.0)
+        dark = FlightLog({k: v for k, v in log.channels.items() if k != "battery_voltage"})
+        missing = {e.name: set(e.channels) - {"pos_w"} for e in FlyerModel([dark], FLYER).effects}
+        assert missing["battery_sag"] == {"battery_voltage"}
+        assert not missing["thrust_gain"]
+
+
+TRIM = TrimParams(
+    "motor_command", "pos_w", "vel_w", 0.03, G, (0.0, 0.15, 0.0), 3.8, 0.0, (1.0, 1.0, 1.0, 1.0), 0.03, 0.006,
+    (1.0, -1.0, -1.0, 1.0), 0.2, 0.5, 0.5, 0.003,
+)  # fmt: skip
+
+
+def hover_log(shares=(1.0, 1.0, 1.0, 1.0), seed=0) -> FlightLog:
+    """Hover in which each motor is told its share of the weight's quarter."""
+    rng = np.random.default_rng(seed)
+    time = np.arange(0, 8, 0.01)
+    command = 0.03 * G / 4 / 0.15 * np.array(shares) + rng.normal(0, 0.004, (len(time), 4))
+    pos = np.tile([0, 0, 0.6], (len(time), 1)) + rng.normal(0, 1e-3, (len(time), 3))
+    return FlightLog({
+        "pos_w": Channel(time, pos, "m", "world"), "vel_w": Channel(time, rng.normal(0, 0.01, (len(time), 3)), "m/s", "world"),
+        "motor_command": Channel(time, command, "1"),
+    })  # fmt: skip
+
+
+class TestTrim:
+    def test_one_weak_motor(self):
+        estimates = found(TrimModel([hover_log((1.0, 1.0, 1.25, 1.0))], TRIM), ["motor_fl", "motor_fr", "motor_rl", "motor_rr"])
+        assert estimates["motor_rl"][0] == pytest.approx(-0.2, abs=0.02)
+        assert all(near(estimates, f"motor_{name}", 0.0) for name in ("fl", "fr", "rr"))
+
+    def test_a_weight_at_a_motor(self):
+        """2 g at a rotor of a 30 g vehicle: levers give 3/4 of it to that motor, -1/4 to the opposite one, 1/4 to the others."""
+        extra = 2.0 / 30.0
+        log = hover_log((1 + extra, 1 - extra, 1 + 3 * extra, 1 + extra))
+        estimates = found(TrimModel([log], TRIM), ["added_rl"])
+        assert estimates["added_rl"][0] == pytest.approx(0.002, abs=2e-4)
+        residual = np.concatenate(TrimModel([log], TRIM).residuals({"added_rl": 0.002}))
+        assert np.abs(np.mean(residual)) < 0.002
+
+
+class TestGimbal:
+    PARAMS = GimbalParams((0.0, 0.0, -0.1), 0.02, (-90.0, 0.0, -90.0), 0.0, 0.01, 0.02, False, 4.0, 1, 1.0)
+
+    def logs(self, tilt=(0.0, 0.0, 0.0), focal=1.0, delay=0.0) -> list[FlightLog]:
+        """A payload that swings below a vehicle that looks down; the marker by a chain of rotations of scipy's."""
+        rng = np.random.default_rng(2)
+        time = np.arange(0, 20, 1 / 30)
+
+        def seen(t):
+            turn = Rotation.from_euler("ZYX", np.column_stack([0.3 * np.sin(0.4 * t), 0.1 * np.sin(t), 0.12 * np.cos(1.3 * t)]))
+            gap = np.column_stack([0.5 * np.sin(1.8 * t), 0.4 * np.cos(1.7 * t), -3.0 + 0.1 * np.sin(t)])
+            gimbal = Rotation.from_euler("XY", [0.05, np.pi / 2])
+            local = gimbal.inv().apply(turn.inv().apply(gap) - [0, 0, -0.1]) - [0.02, 0, 0]
+            return turn, gap, np.column_stack([-local[:, 1], -local[:, 2], local[:, 0]])
+
+        turn, gap, _ = seen(time)
+        point = Rotation.from_rotvec(tilt).apply(seen(time - delay)[2]) * [focal, focal, 1.0]
+        gimbal = np.tile([0.05, np.pi / 2], (len(time), 1))
+        return [FlightLog({
+            "pos_w": Channel(time, np.tile([0, 0, 4.0], (len(time), 1)), "m", "world"),
+            "quat_wb": Channel(time, turn.as_quat(), "1", "world"), "payload_pos_w": Channel(time, gap + [0, 0, 4], "m", "world"),
+            "marker_pos_c": Channel(time, point + rng.normal(0, 0.005, point.shape), "m", "camera"),
+            "gimbal": Channel(time, gimbal, "rad", "body"),
+        })]  # fmt: skip
+
+    def test_geometry(self):
+        residual = np.concatenate(GimbalModel(self.logs(), self.PARAMS).residuals({}))
+        assert np.std(residual) < 0.006
+        assert abs(np.mean(residual)) < 0.001
+
+    def test_tilt_delay_and_focal_length_are_found(self):
+        model = GimbalModel(self.logs((0.02, -0.015, 0.01), 0.97, 0.06), self.PARAMS)
+        estimates = found(model, ["camera_tilt_x", "camera_tilt_y", "camera_tilt_z", "camera_delay", "focal_scale"])
+        truth = {"camera_tilt_x": 0.02, "camera_tilt_y": -0.015, "camera_tilt_z": 0.01, "camera_delay": 0.06, "focal_scale": -0.03}
+        assert all(abs(estimates[name][0] - value) < 0.003 for name, value in truth.items()), estimates
+
+    def test_camera_tilt_and_marker_rotation_are_one(self):
+        """With the gimbal at rest a turned camera and a turned marker frame are the same to the last digit."""
+        window = GimbalModel(self.logs(), self.PARAMS).windows({})[0]
+        names = [e.name for e in GimbalModel(self.logs(), self.PARAMS).effects]
+        tilts = window.effects[:, [names.index(f"camera_tilt_{a}") for a in "xyz"]]
+        turns = window.effects[:, [names.index(f"marker_rot_{a}") for a in "xyz"]]
+        left = turns - tilts @ np.linalg.lstsq(tilts, turns, rcond=None)[0]
+        assert np.linalg.norm(left) < 0.06 * np.linalg.norm(turns)  # the rest is the gimbal's lever
+
+
+class TestSetups:
+    def test_one_model_a_setup(self):
+        with pytest.raises(ConfigError, match="ball and stand: a setup has one model"):
+            setups.Setup("", ball=BALL, stand=STAND)
+        with pytest.raises(ConfigError, match="has no model"):
+            setups.model_of(setups.Setup("bare"), [])
+
+    def test_fit_refuses_what_is_not_there(self):
+        model = BallModel([ball_log()], BALL)
+        with pytest.raises(DiagnoseError, match="did you mean 'ball_drag'"):
+            fitting.fit(model, ["bal_drag"])
+        with pytest.raises(DiagnoseError, match="nothing to fit"):
+            fitting.fit(model, [])
+        with pytest.raises(LogError, match="no effect 'x'"):
+            model.residuals({"x": 1.0})
