@@ -89,7 +89,9 @@ class SlopeFilter:
         self._window: deque[Pose] = deque(maxlen=MOST_SAMPLES)
         self._ages: list[float] = []
         self._weights: list[float] = []
+        self._bends: list[float] = []
         self._rate: Vector | None = None  # until it is asked for
+        self._spin: Vector = (0.0, 0.0, 0.0)
 
     def reset(self) -> None:
         """Forget all samples."""
@@ -108,9 +110,9 @@ class SlopeFilter:
         while len(window) > params.order + 1 and stamp - window[-1].stamp > params.window:
             window.pop()
         self._ages = [stamp - sample.stamp for sample in window]
-        self._weights, bends = fit_weights(self._ages, params.order)
+        self._weights, self._bends = fit_weights(self._ages, params.order)
         places = [sample.pos for sample in window]
-        self.acceleration, self._rate = _sum(bends, places), None
+        self.acceleration, self._rate, self._spin = _sum(self._bends, places), None, (0.0, 0.0, 0.0)
         return _sum(self._weights, places) if pose.vel is None else pose.vel
 
     @property
@@ -121,8 +123,15 @@ class SlopeFilter:
             if pose is None or pose.rate is not None or pose.quat is None:
                 self._rate = pose.rate if pose is not None and pose.rate is not None else (0.0, 0.0, 0.0)
             else:
-                self._rate = _sum(self._weights, [_turn(pose.quat, sample.quat) for sample in self._window])
+                turns = [_turn(pose.quat, sample.quat) for sample in self._window]
+                self._rate, self._spin = _sum(self._weights, turns), _sum(self._bends, turns)
         return self._rate
+
+    @property
+    def spin(self) -> Vector:
+        """Change of the body rate at the last pose, body frame [rad/s^2]; 0 for a line, and where the source gives rates."""
+        _ = self.rate  # works it out along with itself
+        return self._spin
 
     @property
     def lag(self) -> float:

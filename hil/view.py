@@ -240,10 +240,10 @@ def web_viewer(goal_w: tuple[float, float, float], web_port: int = WEB_PORT, dat
 
 
 def _answers(server: subprocess.Popen, port: int) -> bool:
-    """Whether a server of ours listens on a port within ten seconds."""
+    """Whether a server of ours listens on a port within half a minute."""
     import socket
 
-    for _ in range(100):
+    for _ in range(300):
         time.sleep(0.1)
         if server.poll() is not None:
             return False

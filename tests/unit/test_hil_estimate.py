@@ -5,7 +5,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hil.estimate import EstimateParams, SlopeFilter, slope_weights
+from hil.frames import FrameParams
+from hil.gate import GateParams
 from hil.pose import Pose
+from hil.track import TRUST, Track
 
 PERIOD = 0.01
 ROUNDING = 1e-9
@@ -89,3 +92,34 @@ def test_wrong_parameters():
     for seconds, order in ((0.0, 1), (0.2, 2), (0.05, 3), (float("nan"), 1)):
         with pytest.raises(ValueError, match="expected 1 or 2"):
             EstimateParams(seconds, order)
+
+
+def test_spin_of_a_turn_that_quickens():
+    """About a fixed axis at 3 + 20 t rad/s a parabola finds both exactly; a line knows no change."""
+    slopes, out = run(
+        EstimateParams(window(6), 2), PERIOD * np.arange(8), lambda t: np.zeros(3),
+        lambda t: Rotation.from_rotvec([0.0, 3.0 * t + 10.0 * t * t, 0.0]),
+    )  # fmt: skip
+    np.testing.assert_allclose(out[-1][1], (0.0, 3.0 + 20.0 * 7 * PERIOD, 0.0), atol=1e-6)
+    np.testing.assert_allclose(slopes.spin, (0.0, 20.0, 0.0), atol=1e-4)
+    slopes, _ = run(EstimateParams(window(6), 1), PERIOD * np.arange(8), lambda t: np.zeros(3), lambda t: Rotation.identity())
+    assert slopes.spin == (0.0, 0.0, 0.0)
+
+
+def test_a_state_is_carried_forward_with_a_share_of_its_accelerations():
+    """A body that falls and turns ever faster: place and attitude with its velocities, these with half of what they change by."""
+    frames = FrameParams("x,y,z", "x,y,z", "xyzw", 0.0, (0.0, 0.0, 0.0))
+    gate = GateParams(0.02, 10.0, 50.0, 3.0, 50.0, 0.3, 0.04, 0.1, 0.25)
+    track, bare = (Track(frames, gate, EstimateParams(window(6), 2), turns) for turns in (True, False))
+    for i in range(8):
+        t = i * PERIOD
+        quat = tuple(Rotation.from_rotvec([0.0, 3.0 * t + 10.0 * t * t, 0.0]).as_quat())
+        for one in (track, bare):
+            assert one.update(Pose(t, t, "vehicle", (0.0, 0.0, 5.0 - 5.0 * t * t), quat)) is None
+    now, ahead = 7 * PERIOD, 0.02
+    state = track.state(now, ahead)
+    np.testing.assert_allclose(state.vel, (0.0, 0.0, -10.0 * (now + TRUST * ahead)), atol=1e-6)
+    np.testing.assert_allclose(state.rate, (0.0, 3.0 + 20.0 * (now + TRUST * ahead), 0.0), atol=1e-4)
+    np.testing.assert_allclose(state.pos, (0.0, 0.0, 5.0 - 5.0 * now**2 - 10.0 * now * ahead), atol=1e-6)
+    assert bare.state(now, ahead).rate == (0.0, 0.0, 0.0)
+    assert track.state(now, 0.0).vel == pytest.approx((0.0, 0.0, -10.0 * now))
