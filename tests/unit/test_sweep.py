@@ -317,3 +317,29 @@ def test_shipped_lists_name_what_exists():
     for name in ("state", "vision", *(f"state_{ablation}" for ablation in ablations)):
         assert sorted(s.seed for s in paper if s.config == name) == [1, 2, 3], name
     assert sum(s.iterations * (0.142 if s.config.startswith("state") else 0.153) for s in paper) < 3 * 3600, "hours of one H200"
+
+
+def test_a_job_that_vanishes_is_submitted_again_but_not_for_ever():
+    utils = pytest.importorskip("submitit.core.utils")
+    from collections import Counter
+
+    from visthrow.sweep import cluster
+
+    class Ended:
+        def __init__(self, outcome):
+            self.outcome = outcome
+
+        def done(self):
+            return self.outcome is not None
+
+        def result(self):
+            if isinstance(self.outcome, Exception):
+                raise self.outcome
+            return self.outcome
+
+    lost = Counter()
+    assert cluster.Job(Ended(None), "a", lost).poll() is None
+    assert cluster.Job(Ended(0), "a", lost).poll() == 0
+    assert cluster.Job(Ended(utils.FailedJobError("raised")), "a", lost).poll() == 1
+    gone = [cluster.Job(Ended(utils.UncompletedJobError("preempted")), "a", lost).poll() for _ in range(4)]
+    assert gone == [pool.EXIT_STOPPED] * cluster.LOST_AT_MOST + [1]

@@ -1,28 +1,41 @@
 """Tasks as jobs of a Slurm cluster, through submitit; its local executor runs the same jobs as processes, for a test."""
 
 import os
+from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from visthrow.errors import ConfigError
 from visthrow.sweep.pool import Task
+from visthrow.sweep.work import EXIT_STOPPED
 
 SLACK = 5
 """Minutes that a job is granted beyond its piece: start of the process, last checkpoint."""
+
+LOST_AT_MOST = 3
+"""Times that a task's job may vanish (preempted, out of time, its node down) before the task counts as failed."""
 
 
 class Job:
     """One submitted task."""
 
-    def __init__(self, job: Any) -> None:
-        self._job = job
+    def __init__(self, job: Any, task: str, lost: Counter[str]) -> None:
+        self._job, self._task, self._lost = job, task, lost
 
     def poll(self) -> int | None:
         """See `visthrow.sweep.pool.Running`."""
+        from submitit.core.utils import FailedJobError, UncompletedJobError
+
         if not self._job.done():
             return None
-        return int(self._job.result()) if self._job.exception() is None else 1
+        try:
+            return int(self._job.result())
+        except FailedJobError:  # the work raised; what it printed tells why
+            return 1
+        except UncompletedJobError:
+            self._lost[self._task] += 1
+            return EXIT_STOPPED if self._lost[self._task] <= LOST_AT_MOST else 1
 
     def stop(self) -> None:
         """Cancel it: Slurm's signal lets a training write its checkpoint."""
@@ -56,6 +69,7 @@ class Cluster:
         import submitit
 
         self.devices = [f"job {i}" for i in range(self.gpus)]
+        self._lost: Counter[str] = Counter()
         self._executor = submitit.AutoExecutor(self.out / "logs", cluster=self.executor)
         try:
             self._executor.update_parameters(timeout_min=int(self.minutes) + 1 + SLACK, **self.options)
@@ -67,7 +81,8 @@ class Cluster:
         self._executor.update_parameters(name=task.name, gpus_per_node=1 if task.gpu and self.executor == "slurm" else 0)
         piece = self.minutes if minutes is None else min(minutes, self.minutes)
         where = (self.list_name, str(self.out.resolve()), self.changes, os.getcwd())
-        return Job(self._executor.submit(do, *where, task.ids, "auto" if task.gpu else "cpu", piece))
+        job = self._executor.submit(do, *where, task.ids, "auto" if task.gpu else "cpu", piece)
+        return Job(job, task.name, self._lost)
 
 
 def do(
