@@ -37,32 +37,33 @@ class TrimParams:
     slowest_window: float  # windows' length [s]
     fastest: float  # mean speed of a window [m/s]
     spread: float  # of a window's mean command, by draught and control [1]
+    flight_spread: float  # of an unharmed vehicle's motors from one flight to the next: the floor of all that shifts them [1]
 
 
 def effects(params: TrimParams) -> list[Effect]:
     """Catalogue of the balance."""
-    seen, arm = (params.command, params.position), params.arm
+    seen, arm, usual = (params.command, params.position), params.arm, params.flight_spread
     found = [
-        Effect(f"motor_{key}", f"the {words} propeller's thrust", "f_i (1 + theta)", "1", "thrust map", (-0.7, 0.7), 0.1, 1e-2,
-               seen, "fault detection literature", ("added_mass",), ("yaw response",)) for key, words in WORDS.items()
+        Effect(f"motor_{key}", f"the {words} propeller's thrust", "f_i (1 + theta)", "1", "thrust map", (-0.7, 0.7), 0.15,
+               usual, seen, "fault detection literature", ("added_mass",), ("yaw response",)) for key, words in WORDS.items()
     ]  # fmt: skip
     found += [
         Effect(f"added_{key}", f"a weight near the {words} motor", "m + theta at the rotor", "kg", "rigid body",
-               (0.0, 0.3 * params.mass), 0.05 * params.mass, 4e-3 * params.mass, seen, "a scale", (f"motor_{key}",),
+               (0.0, 0.3 * params.mass), 0.05 * params.mass, 0.25 * usual * params.mass, seen, "a scale", (f"motor_{key}",),
                ("weigh the vehicle",)) for key, words in WORDS.items()
     ]  # fmt: skip
     found += [
         Effect("mass_quad", "the vehicle's mass", "m + theta", "kg", "rigid body", (-0.3 * params.mass, 0.5 * params.mass),
-               0.05 * params.mass, 4e-3 * params.mass, seen, "a scale", ("thrust_gain",), ("weigh the vehicle",)),
-        Effect("thrust_gain", "all motors' thrust", "f (1 + theta)", "1", "thrust map", (-0.6, 0.6), 0.1, 4e-3, seen,
+               0.05 * params.mass, 0.5 * usual * params.mass, seen, "a scale", ("thrust_gain",), ("weigh the vehicle",)),
+        Effect("thrust_gain", "all motors' thrust", "f (1 + theta)", "1", "thrust map", (-0.6, 0.6), 0.1, 0.5 * usual, seen,
                "Agilicious 2022", ("mass_quad",), ("weigh the vehicle",)),
         Effect("battery_sag", "the thrust's dependence on the battery voltage", "f (1 + theta (u - u_ref))", "1/V", "battery",
                (-1.0, 1.0), 0.1, 5e-3, (*seen, "battery_voltage"), "Bauersfeld and Scaramuzza 2022", ("thrust_gain",),
                ("fresh and empty pack",)),
         *(Effect(f"com_{axis}", f"the centre of mass lies off along {axis}", "torque = r x T", "m", "rigid body",
-                 (-0.5 * arm, 0.5 * arm), 0.05 * arm, 5e-3 * arm, seen, "build", (), ()) for axis in "xy"),
-        Effect("yaw_trim", "one turning sense's drag torque", "torque_z += theta kappa T / 4", "1", "thrust map", (-0.7, 0.7), 0.05,
-               1e-2, seen, "propeller wear", ("motor_fl", "motor_fr", "motor_rl", "motor_rr"), ("yaw doublets",)),
+                 (-0.5 * arm, 0.5 * arm), 0.1 * arm, usual * arm, seen, "build", (), ()) for axis in "xy"),
+        Effect("yaw_trim", "one turning sense's drag torque", "torque_z += theta kappa T / 4", "1", "thrust map", (-0.7, 0.7), 0.1,
+               usual, seen, "propeller wear", ("motor_fl", "motor_fr", "motor_rl", "motor_rr"), ("yaw doublets",)),
     ]  # fmt: skip
     return found
 
