@@ -55,11 +55,8 @@ class Noise:
 
     def deviation(self, gram: Gram, window: int) -> np.ndarray:
         """Prior deviation of the columns [X, G] of a window, shape (D + L,)."""
-        levels = np.ones(gram.nuisances + gram.latents)
-        for block in np.unique(gram.latent_block):
-            level = self.latent_sd[int(block), gram.phase] * self.inflation[window, block]
-            levels[gram.nuisances :][gram.latent_block == block] = level
-        return levels
+        by_block = [self.latent_sd.get((b, gram.phase), 0.0) for b in range(len(LATENT_BLOCKS))] * self.inflation[window]
+        return np.concatenate((np.ones(gram.nuisances), by_block[gram.latent_block]))
 
 
 @dataclass(frozen=True)
@@ -193,7 +190,8 @@ def posterior(gram: Gram, noise: Noise, window: int) -> Posterior:
     if failed:
         raise DiagnoseError(f"window of flight {gram.flight}, phase {gram.phase}: the normal equations are singular")
     inverse, _ = lapack.dpotri(lower, lower=1)
-    covariance = np.tril(inverse) + np.tril(inverse, -1).T
+    covariance = inverse + inverse.T  # its upper half is 0
+    covariance.flat[:: size + 1] *= 0.5
     mean = covariance @ right
     quadratic = weight @ gram.square - right @ mean
     log_det = 2.0 * np.log(np.diag(lower)).sum() + 2.0 * gram.count @ np.log(noise.scale)

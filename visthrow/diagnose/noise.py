@@ -48,6 +48,9 @@ WIDE = 30.0
 """Latent forces while outliers are looked for, in the level at which they become visible."""
 
 ITERATIONS = 40
+ENOUGH_NATS, ENOUGH_SLOPE = 0.02, 0.3
+"""A step that gains less, or a slope below [nats by the logarithm of a level], ends the search for the levels."""
+
 ROUNDS = 10
 """Of levels of bad windows in turn with those of their phases; mostly one or two are needed."""
 
@@ -136,7 +139,8 @@ def _maximise(grams: Sequence[Gram], noise: Noise) -> tuple[Noise, float]:
         value, by_level, by_scale = _likelihood(grams, levels(x), keys)
         return -value, -np.concatenate((by_level, by_scale[seen]))
 
-    options = {"maxiter": ITERATIONS, "maxcor": 10, "ftol": 1e-7, "gtol": 0.05, "maxls": 20}
+    tolerance = ENOUGH_NATS / max(1.0, abs(cost(start)[0]))
+    options = {"maxiter": ITERATIONS, "maxcor": 10, "ftol": tolerance, "gtol": ENOUGH_SLOPE, "maxls": 20}
     result = minimize(cost, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
     return levels(result.x), -float(result.fun)
 
@@ -149,9 +153,10 @@ def _likelihood(grams: Sequence[Gram], noise: Noise, keys: Sequence[tuple[int, s
         state = posterior(gram, noise, w)
         value += state.log_likelihood
         second = np.outer(state.mean, state.mean) + state.covariance
-        excess = np.diagonal(second)[gram.nuisances :] - 1.0
-        for block in np.unique(gram.latent_block):
-            by_level[index[int(block), gram.phase]] += excess[gram.latent_block == block].sum()
+        excess = np.bincount(gram.latent_block, np.diagonal(second)[gram.nuisances :] - 1.0, len(LATENT_BLOCKS))
+        for block in range(len(LATENT_BLOCKS)):
+            if (block, gram.phase) in index:
+                by_level[index[block, gram.phase]] += excess[block]
         level, size = noise.deviation(gram, w), len(state.mean)
         second *= np.outer(level, level)
         left = gram.square - 2.0 * gram.cross[:, :size] @ (level * state.mean)

@@ -7,7 +7,16 @@ import numpy as np
 
 from visthrow.diagnose import noise as levels
 from visthrow.diagnose.evidence import Priors, estimate, log_evidence
-from visthrow.diagnose.marginal import Gram, Noise, Statistics, gather, gram_of, window_statistics, with_residual
+from visthrow.diagnose.marginal import (
+    Gram,
+    Noise,
+    Statistics,
+    gather,
+    gram_of,
+    posterior,
+    window_statistics,
+    with_residual,
+)
 from visthrow.diagnose.model import Model, Window
 
 STEPS = 3
@@ -100,6 +109,23 @@ def advantage(priors: Priors, first: tuple[Point, Sequence[int]], second: tuple[
     points = first[0], second[0]
     ahead, behind = (max(point.evidence(priors, active) for point in points) for active in (first[1], second[1]))
     return ahead - behind
+
+
+def curvature(problem: Problem, origin: Point, there: Point) -> float:
+    """How far the simulation at another theta is from the linearisation: d' V^-1 d with d the difference of the residuals.
+
+    Args:
+        problem: of the search.
+        origin: where the derivatives were taken.
+        there: a point moved from it, with the same derivatives.
+    """
+    floor, total = problem.priors.floor, 0.0
+    change = floor * (there.theta - origin.theta)
+    for w, (old, new, gram) in enumerate(zip(origin.windows, there.windows, there.grams)):
+        bent = new.residual - (old.residual - old.effects @ change)
+        values = [posterior(with_residual(gram, new, floor, r), there.noise, w).log_likelihood for r in (bent, 0.0 * bent)]
+        total += 2.0 * (values[1] - values[0])
+    return total
 
 
 def with_fitted_noise(point: Point) -> Point:

@@ -18,6 +18,7 @@ from visthrow.diagnose.point import (
     Point,
     Problem,
     advantage,
+    curvature,
     fitted,
     linearise,
     with_all_effects_noise,
@@ -38,6 +39,12 @@ CLOSE = 3.0
 DOUBT = 15.0
 """Linear statistics this close [nats] are settled by running the simulation."""
 
+CONTRADICTED = 0.5
+"""Share of the evidence of an effect that the flights contradict which any other effect must then exceed."""
+
+STRAIGHT = 1.0
+"""Squared distance of the simulation from its linearisation, in noise, up to which the derivatives are not taken anew."""
+
 JOINT_BEST, JOINT_SIZE = 8, 3
 """All sets of up to so many of the best effects are compared at the end."""
 
@@ -52,8 +59,9 @@ class Search:
     progress: Callable[[str], None]
     active: list[int] = field(default_factory=list)
     point: Point | None = None
+    origin: Point | None = None  # where the derivatives were taken last
     steps: list[Step] = field(default_factory=list)
-    refused: set[int] = field(default_factory=set)  # effects that are not the same in all flights
+    refused: dict[int, float] = field(default_factory=dict)  # effects that are not the same in all flights, with their nats
     events: list[int] = field(default_factory=list)
     sets: list[tuple[tuple[int, ...], float]] = field(default_factory=list)
 
@@ -68,7 +76,7 @@ class Search:
 
     def run(self) -> None:
         """Search until nothing exceeds the threshold."""
-        self.point = self.nominal
+        self.point = self.origin = self.nominal
         while len(self.active) < MOST_NAMES and self._forward():
             self._backward()
         self._joint()
@@ -82,20 +90,19 @@ class Search:
         """Add the best candidate; False where none is good enough."""
         free = with_all_effects_noise(self.problem, self.point)
         screened, under_free = self._screen(self.point), self._screen(free)
-        least = min(self.least, 0.5 * self.least + 0.5 * under_free.max())
-        short = [j for j in np.argsort(-under_free)[:SHORTLIST] if under_free[j] > max(least, 0.3 * under_free.max())]
+        short = [j for j in np.argsort(-under_free)[:SHORTLIST] if under_free[j] > max(self.least, 0.3 * under_free.max())]
         short += [j for j in np.argsort(-screened)[:2] if screened[j] > self.least and j not in short]
-        if not short or max(screened.max(), under_free.max()) <= self.least:
+        if not short:
             return False
         base = self.point, self.active
         tried = {int(j): self._candidate(free, [*self.active, int(j)]) for j in short}
         nats = {j: advantage(self.priors, (point, [*self.active, j]), base) for j, point in tried.items()}
         best = max(nats, key=nats.get)
-        if nats[best] <= self.least:
+        if nats[best] <= max([self.least, *(CONTRADICTED * n for n in self.refused.values())]):
             return False
         verdict = across_flights(self.point, tried[best], self.priors, self.active, best, self.least)
         if verdict is not None:
-            return self._set_aside(best, verdict)
+            return self._set_aside(best, nats[best], verdict)
         ladder = {self.name(j): float(max(screened[j], under_free[j])) for j in np.argsort(-under_free)[:10]}
         again = {self.name(j): float(n) for j, n in sorted(nats.items(), key=lambda item: -item[1])}
         self.steps.append(Step(self.name(best), float(nats[best]), ladder, again))
@@ -108,18 +115,20 @@ class Search:
         return with_fitted_noise(fitted(self.problem, point, active))
 
     def _settle(self, point: Point, active: Sequence[int]) -> Point:
-        """Linearise where the search stands, and step once more where that moved the optimum."""
-        point = linearise(self.problem, point.theta, point.noise)
-        better = fitted(self.problem, point, active)
-        if np.abs(better.theta - point.theta).max() > 0.5:
-            point = linearise(self.problem, better.theta, point.noise)
-        return point
+        """Linearise where the search stands, unless the last derivatives still hold, and step on where that moved the optimum."""
+        if curvature(self.problem, self.origin, point) < STRAIGHT:
+            return point
+        self.origin = linearise(self.problem, point.theta, point.noise)
+        better = fitted(self.problem, self.origin, active)
+        if np.abs(better.theta - point.theta).max() > 0.5 and curvature(self.problem, self.origin, better) > STRAIGHT:
+            self.origin = better = linearise(self.problem, better.theta, point.noise)
+        return better
 
-    def _set_aside(self, best: int, verdict: Consistency) -> bool:
+    def _set_aside(self, best: int, nats: float, verdict: Consistency) -> bool:
         """An effect of one flight alone: that flight is left out; one that differs from flight to flight is refused."""
         if verdict.flight is None:
             self.progress(f"{self.name(best)} is not the same in all flights; it is no cause")
-            self.refused.add(best)
+            self.refused[best] = nats
             return True
         self.progress(f"event in flight {verdict.flight}: something happened there that the other flights deny")
         self.events.append(verdict.flight)
@@ -128,6 +137,7 @@ class Search:
         self.problem = replace(self.problem, kept=kept)
         self.nominal = linearise(self.problem, np.zeros_like(self.point.theta))
         self.point = self.nominal if not self.active else linearise(self.problem, self.point.theta)
+        self.origin = self.point
         return True
 
     def _backward(self) -> None:

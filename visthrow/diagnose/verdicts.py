@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from visthrow.diagnose import result
-from visthrow.diagnose.evidence import Priors, covariance
+from visthrow.diagnose.evidence import Priors, covariance, estimate
 from visthrow.diagnose.excess import acts_on, levels, too_strong
 from visthrow.diagnose.model import Model, Window
 from visthrow.diagnose.point import Point
@@ -53,6 +53,7 @@ def conclude(search: "Search", *, laws: bool) -> Diagnosis:
         point = search.nominal
     elif law[0] is not None and active:
         point = law[0].without_terms()
+    point = replace(point, theta=estimate(point.information, point.score, search.priors, active))
     spread = covariance(point.information, search.priors.deviation(active))
     findings = tuple(_finding(search, point, j, active, spread, withdrawn) for j in range(len(model.effects)))
     floor = search.priors.floor
@@ -159,9 +160,9 @@ def _finding(search: "Search", point: Point, j: int, active: list[int], spread: 
     wide = _wide(point, priors, j, active)
     mean, sd = (value * effect.floor for value in wide)
     own = float(np.hypot(sd, effect.floor))
-    low, high = max(effect.bounds[0], mean - NORMAL_95 * own), min(effect.bounds[1], mean + NORMAL_95 * own)
+    low, high = (float(np.clip(mean + side * NORMAL_95 * own, *effect.bounds)) for side in (-1.0, 1.0))
     gain = _worth(point, priors, j, active)
-    blank = replace(blank, sd=own, low=min(low, high), high=max(low, high), nats=gain)
+    blank = replace(blank, sd=own, low=low, high=high, nats=gain)
     if j in withdrawn:
         text = f"{effect.name}: explains a part of what is missing, but not its form; the name is withdrawn."
         return replace(blank, verdict=result.NOT_IDENTIFIABLE, sentence=text)

@@ -1,0 +1,149 @@
+"""Sufficient statistics of windows against dense linear algebra, noise levels against planted ones."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.synthetic_diagnosis import GUST, SyntheticModel, catalogue
+from visthrow.diagnose import marginal, noise
+from visthrow.diagnose.evidence import Priors
+from visthrow.diagnose.model import Window
+from visthrow.errors import DiagnoseError
+
+EFFECTS = catalogue(6)
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    model = SyntheticModel(effects=EFFECTS, throws=4)
+    windows, floors = model.windows({}), Priors.of(model.effects, model.channels).floor
+    levels, grams = noise.fit(windows, [marginal.gram_of(w, floors, 2) for w in windows])
+    return model, windows, floors, levels, grams
+
+
+def dense(window, gram, levels, floors, at):
+    """V and S of a window, written out."""
+    deviation = levels.deviation(gram, at)
+    columns = marginal.columns(window, floors)
+    states = columns[:, : gram.nuisances] * deviation[: gram.nuisances]
+    latents = columns[:, gram.nuisances : len(deviation)] @ gram.factor * deviation[gram.nuisances :]
+    sensor = (window.sigma * levels.scale[window.channel]) ** 2
+    return np.diag(sensor) + states @ states.T + latents @ latents.T, columns[:, len(deviation) :]
+
+
+def test_information_and_score_are_those_of_the_dense_covariance(fitted):
+    _, windows, floors, levels, grams = fitted
+    for at in (0, 7):
+        v, s = dense(windows[at], grams[at], levels, floors, at)
+        part = marginal.window_statistics(grams[at], levels, at)
+        inverse = np.linalg.inv(v)
+        np.testing.assert_allclose(part.information, s.T @ inverse @ s, rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(part.score, s.T @ inverse @ windows[at].residual, rtol=1e-6, atol=1e-6)
+        g = windows[at].latent
+        whole = g.T @ inverse @ g
+        np.testing.assert_allclose(part.latent_information, whole, rtol=1e-5, atol=1e-4 * np.abs(whole).max())
+        np.testing.assert_allclose(part.latent_score, g.T @ inverse @ windows[at].residual, rtol=1e-5, atol=1e-3)
+
+
+def test_likelihood_is_that_of_the_dense_covariance_up_to_a_constant(fitted):
+    """Differences between noise levels: the constants are the same."""
+    _, windows, floors, levels, grams = fitted
+    other = replace(levels, scale=1.3 * levels.scale, latent_sd={k: 2.0 * v for k, v in levels.latent_sd.items()})
+    values = []
+    for choice in (levels, other):
+        v, _ = dense(windows[0], grams[0], choice, floors, 0)
+        sign, log_det = np.linalg.slogdet(v)
+        assert sign > 0
+        r = windows[0].residual
+        dense_value = -0.5 * (log_det + r @ np.linalg.solve(v, r))
+        values.append((marginal.posterior(grams[0], choice, 0).log_likelihood, dense_value))
+    assert values[0][0] - values[1][0] == pytest.approx(values[0][1] - values[1][1], rel=1e-6)
+
+
+def test_a_single_huge_state_does_not_leak_into_the_effects(fitted):
+    """Initial states are vague: a shift of 0.1 m changes the score by rounding alone."""
+    _, windows, floors, levels, grams = fitted
+    shifted = windows[0].residual + windows[0].nuisance @ np.full(12, 0.1)
+    plain = marginal.window_statistics(grams[0], levels, 0)
+    moved = marginal.window_statistics(marginal.with_residual(grams[0], windows[0], floors, shifted), levels, 0)
+    own = np.sqrt(np.diag(plain.information))
+    assert np.max(np.abs(moved.score - plain.score) / own) < 0.1
+
+
+def test_gradients_of_the_likelihood_are_its_differences(fitted):
+    _, _, _, levels, grams = fitted
+    keys = sorted(levels.latent_sd)
+    _, by_level, by_scale = noise._likelihood(grams, levels, keys)
+    step = 1e-3
+
+    def slope(change) -> float:
+        return (noise._likelihood(grams, change(step), keys)[0] - noise._likelihood(grams, change(-step), keys)[0]) / (2 * step)
+
+    for i, key in enumerate(keys):
+        level = levels.latent_sd[key]
+        found = slope(lambda h, k=key, v=level: replace(levels, latent_sd={**levels.latent_sd, k: v * np.exp(h)}))
+        assert found == pytest.approx(by_level[i], abs=1e-3)
+    for c in range(2):
+        found = slope(lambda h, c=c: replace(levels, scale=levels.scale * np.where(np.arange(2) == c, np.exp(h), 1.0)))
+        assert found == pytest.approx(by_scale[c], abs=1e-2)
+
+
+@pytest.mark.parametrize(("sensor", "gust"), [(1.0, 1.0), (2.0, 0.5)])
+def test_noise_levels_are_found_again(sensor, gust):
+    model = SyntheticModel(effects=EFFECTS, throws=8, noise=sensor, gust=gust, seed=3)
+    windows = model.windows({})
+    levels, _ = noise.fit(windows, [marginal.gram_of(w, np.ones(6), 2) for w in windows])
+    np.testing.assert_allclose(levels.scale, sensor, rtol=0.1)
+    found = np.mean([levels.latent_sd[0, p] for p in ("flight", "hover", "throw")])
+    assert found == pytest.approx(gust * GUST[0], rel=0.5)
+
+
+def test_highpass_sigma_sees_noise_and_neither_motion_nor_outliers():
+    rng = np.random.default_rng(0)
+    t = np.arange(2000) / 200.0
+    signal = np.sin(3.0 * t)[:, None] + rng.normal(0.0, 5e-4, (2000, 2))
+    signal[::97] += 0.05
+    np.testing.assert_allclose(noise.highpass_sigma(signal), 5e-4, rtol=0.1)
+
+
+def test_outliers_lose_their_weight_and_good_windows_are_left_alone(fitted):
+    _, windows, floors, _, _ = fitted
+    spoilt = windows[0].residual.copy()
+    spoilt[[40, 201]] += 0.2
+    first, second = noise.without_outliers([replace(windows[0], residual=spoilt), windows[1]], floors, 2)
+    assert set(np.flatnonzero(first.sigma > windows[0].sigma)) == {40, 201}
+    assert second is windows[1]
+
+
+def test_one_bad_window_does_not_raise_the_level_of_its_phase(fitted):
+    _, windows, floors, levels, _ = fitted
+    bad = next(i for i, w in enumerate(windows) if w.phase == "throw")
+    push = windows[bad].latent @ np.random.default_rng(0).normal(0.0, 1.0, windows[bad].latent.shape[1])
+    spoilt = [replace(w, residual=w.residual + push) if i == bad else w for i, w in enumerate(windows)]
+    again, _ = noise.fit(spoilt, [marginal.gram_of(w, floors, 2) for w in spoilt])
+    assert again.inflation[bad].max() > 5.0
+    assert np.delete(again.inflation, bad, axis=0).max() == 1.0
+    assert again.latent_sd[0, "throw"] < 5.0 * levels.latent_sd[0, "throw"]
+
+
+@pytest.mark.parametrize("spoil", [
+    lambda w: replace(w, residual=np.full_like(w.residual, np.nan)), lambda w: replace(w, sigma=np.zeros_like(w.sigma)),
+    lambda w: replace(w, channel=w.channel + 2), lambda w: replace(w, time=w.time[:-1]),
+    lambda w: replace(w, effects=w.effects[:, :-1]),
+])  # fmt: skip
+def test_broken_windows_are_named(fitted, spoil):
+    _, windows, floors, _, _ = fitted
+    with pytest.raises(DiagnoseError, match="window of flight 0"):
+        marginal.gram_of(spoil(windows[0]), floors, 2)
+
+
+def test_a_model_without_latent_forces_works():
+    rng = np.random.default_rng(0)
+    n = 50
+    s, x = rng.normal(size=(n, 2)), np.ones((n, 1))
+    window = Window(0, "swing", np.arange(n) / 50.0, np.zeros(n, dtype=int), s @ [0.3, 0.0] + rng.normal(size=n) * 0.1,
+                    np.full(n, 0.1), s, x, np.ones(1), latent=np.zeros((n, 0)))  # fmt: skip
+    levels, grams = noise.fit([window], [marginal.gram_of(window, np.ones(2), 1)])
+    part = marginal.window_statistics(grams[0], levels, 0)
+    assert np.linalg.solve(part.information, part.score) == pytest.approx([0.3, 0.0], abs=0.05)

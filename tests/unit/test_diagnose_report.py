@@ -1,0 +1,212 @@
+"""Gain on held-out flights, effects hidden in the flights' own noise, the plan, and the report."""
+
+import json
+
+import numpy as np
+import pytest
+
+from tests.synthetic_diagnosis import SyntheticModel, catalogue
+from visthrow.diagnose import blind, forms, gain, manoeuvres, plan, report, result, search
+from visthrow.storage import write_json
+
+EFFECTS = catalogue(12)
+TRUTH = {"effect_03": 12.0, "effect_04": -9.0}
+
+
+@pytest.fixture(scope="module")
+def found():
+    model = SyntheticModel(effects=EFFECTS, truth=TRUTH, seed=1)
+    return model, search.explain(model, laws=False)
+
+
+@pytest.fixture(scope="module")
+def measured(found):
+    return gain.measure(found[1], draws=2000)
+
+
+def test_gain_comes_near_what_knowing_the_truth_would_bring(found, measured):
+    model, diagnosis = found
+    work = diagnosis.work
+    floors = {e.name: e.floor for e in EFFECTS}
+    oracle = [w.residual[:, None] for w in model.windows({n: s * floors[n] for n, s in TRUTH.items()})]
+    best = forms.forms(work.after.windows, [w.flight for w in work.after.windows], work.after.noise, oracle, 2)
+    for c, channel in enumerate(measured.channels):
+        sigma = np.median(work.after.windows[0].sigma[work.after.windows[0].channel == c])
+        own = np.sqrt(best.error(np.ones(1))[:, c].sum() / best.count[:, c].sum()) * sigma
+        assert channel.before > channel.after > channel.floor * 0.9
+        assert (channel.before - channel.after) > 0.9 * (channel.before - own)
+        assert channel.low < channel.gain < channel.high
+        assert channel.low > 0.0
+        assert not channel.harmed
+        assert channel.after < channel.blackbox
+    assert measured.nats_per_sample > 0.0
+    assert measured.named_in == {"effect_03": 1.0, "effect_04": 1.0}
+    assert measured.left_out == "flights"
+
+
+def test_errors_grow_with_the_horizon(measured):
+    for channel in measured.channels:
+        floor = [row[3] for row in channel.horizons]
+        assert floor == sorted(floor)
+        assert channel.horizons[-1][1] > channel.horizons[0][1]
+
+
+def test_forms_are_the_errors_written_out(found):
+    """The quadratic form at some sizes against the same prediction made sample by sample."""
+    _, diagnosis = found
+    point = diagnosis.work.after
+    window = point.windows[0]
+    columns = np.hstack((window.residual[:, None], window.effects))
+    own = forms.forms([window], [0], point.noise, [columns], 2)
+    v = np.concatenate(([1.0], np.linspace(-1e-3, 1e-3, len(EFFECTS))))
+    left, _, horizon = forms._predicted(window, point.noise, columns @ v[:, None])
+    for c in range(2):
+        rows = (window.channel == c) & (horizon >= 0)
+        assert own.error(v)[0, c].sum() == pytest.approx((left[rows] ** 2).sum(), rel=1e-9)
+
+
+def test_prediction_does_not_look_at_what_it_predicts(found):
+    _, diagnosis = found
+    point = diagnosis.work.after
+    window = point.windows[0]
+    late = window.time > window.time.min() + 0.5
+    plain, spoilt = (forms._predicted(window, point.noise, column[:, None])[0]
+                     for column in (window.residual, window.residual + late))  # fmt: skip
+    np.testing.assert_allclose(spoilt[~late], plain[~late])
+    np.testing.assert_allclose((spoilt - plain)[late, 0], 1.0 / window.sigma[late])
+
+
+def test_two_flights_are_halved_instead():
+    model = SyntheticModel(effects=EFFECTS, truth={"effect_03": 15.0}, throws=0, free=2, seed=2)
+    measured = gain.measure(search.explain(model, laws=False), draws=500)
+    assert measured.left_out == "parts of flights"
+    assert measured.folds == 6
+    assert measured["pos_w"].gain > 0.0
+
+
+def test_studentised_intervals_hold_what_they_promise():
+    """Ratios of sums over ten flights with lognormal sizes, as flights have; 95 % intervals cover 90 to 99 %."""
+    rng = np.random.default_rng(0)
+    inside = 0
+    for _ in range(200):
+        before = rng.lognormal(0.0, 0.5, 10)
+        after = before * 0.25 * rng.lognormal(-0.5 * 0.4**2, 0.4, 10)
+        _, low, high = gain.studentised(before, after, rng, 400)
+        inside += low < 1.0 - np.sqrt(0.25) < high
+    assert 0.88 < inside / 200 < 0.995
+
+
+def test_bootstrapped_sizes_agree_with_their_posterior(found):
+    _, diagnosis = found
+    work = diagnosis.work
+    draws = gain.bootstrap_sizes(work.after.statistics, work.problem.priors, work.active, np.random.default_rng(0), 2000)
+    names = [EFFECTS[j].name for j in work.active]
+    for name, column in zip(names, draws.T):
+        assert abs(np.median(column) - TRUTH[name]) < 1.0
+
+
+@pytest.fixture(scope="module")
+def hidden(found):
+    return blind.hide(found[1], draws=60)
+
+
+def test_completeness_rises_and_noise_is_not_named(hidden):
+    assert hidden.false_alarms < 0.01
+    for curve in hidden.curves:
+        assert curve.up_to_class[-1] == 1.0
+        assert curve.exact[0] < 0.1
+        assert max(curve.wrong) < 0.05
+        assert 2.0 < curve.limit / curve.sizes[0] < 20.0
+
+
+def test_limits_hold_for_effects_hidden_in_the_measurements(hidden):
+    """Twice the limit is found by the whole search, half of it is not: the statistics' promise, kept by the simulation."""
+    model = SyntheticModel(effects=EFFECTS, seed=7)
+    limit = blind.hide(search.explain(model, laws=False), draws=60)["effect_09"].limit
+    assert search.explain(blind.Hidden(model, {"effect_09": 2.0 * limit}), laws=False).named == ("effect_09",)
+    assert not search.explain(blind.Hidden(model, {"effect_09": 0.4 * limit}), laws=False).theta
+
+
+def test_what_is_hidden_besides_what_was_found_is_told(found):
+    trial = blind.verify(found[1], 1, floors=12.0, only=("effect_00",))[0]
+    assert trial.name == "effect_00"
+    assert set(trial.named) == {*TRUTH, "effect_00"}
+    assert trial.estimate == pytest.approx(trial.expected, abs=2 * EFFECTS[0].floor)
+
+
+@pytest.fixture(scope="module")
+def degenerate():
+    same = {"effect_07": ("effect_03", 0.5)}
+    model = SyntheticModel(effects=EFFECTS, truth={"effect_03": 12.0}, same=same, seed=2)
+    return search.explain(model, laws=False)
+
+
+def test_the_plan_prefers_the_manoeuvre_that_separates(degenerate):
+    apart = SyntheticModel(effects=EFFECTS, truth={"effect_03": 12.0}, throws=1, free=0, seed=9)
+    alike = SyntheticModel(effects=EFFECTS, same={"effect_07": ("effect_03", 0.5)}, throws=1, free=0, seed=9)
+    chosen = [m for m in manoeuvres.catalogue() if m.name in ("hover", "circle", "thrust steps")]
+    models = {"hover": alike, "circle": apart, "thrust steps": None}
+    ranked = plan.propose(degenerate, chosen, lambda ms: [models[m.name] for m in ms])
+    assert [p.name for p in ranked] == ["circle", "hover"]
+    assert ranked[0].nats > plan.DECISIVE > ranked[1].nats
+    assert ranked[0].repeats == 1
+    assert ranked[0].separates
+    assert ranked[1].repeats == 0
+
+
+def test_the_promise_of_the_plan_is_kept(degenerate):
+    """Flown together with the manoeuvre that separates, the class becomes a name."""
+    first = SyntheticModel(effects=EFFECTS, truth={"effect_03": 12.0}, same={"effect_07": ("effect_03", 0.5)}, seed=2)
+    more = SyntheticModel(effects=EFFECTS, truth={"effect_03": 12.0}, throws=1, free=0, seed=9)
+    from dataclasses import replace
+
+    first._windows += [replace(w, flight=50) for w in more._windows]
+    again = search.explain(first, laws=False)
+    assert degenerate["effect_03"].verdict == result.CLASS
+    assert again["effect_03"].verdict == result.FOUND
+    assert again.named == ("effect_03",)
+
+
+@pytest.mark.parametrize("manoeuvre", manoeuvres.catalogue(), ids=lambda m: m.name)
+def test_manoeuvres_are_smooth_bounded_and_begin_at_rest(manoeuvre):
+    r = manoeuvre.reference()
+    assert r.time[-1] == pytest.approx(manoeuvre.seconds, abs=0.05)
+    assert np.abs(r.vel_w[[0, -1]]).max() < 1e-6
+    assert np.abs(r.acc_w).max() < 12.0
+    assert r.pos_w[:, 2].min() > (0.5 if manoeuvre.payload else 0.08)
+    assert np.abs(r.pos_w[:, :2]).max() < 2.6
+    assert np.linalg.norm(r.vel_w, axis=1).max() < 5.5
+    assert len(r.csv().splitlines()) == 1 + len(r.time)
+
+
+def test_the_report_holds_sentences_pictures_and_numbers(tmp_path, found, measured, hidden, degenerate):
+    _, diagnosis = found
+    proposals = [plan.Proposal("circle", "drag", 10.0, 7.0, (("a", "b"),), 1, "z 1..2 m", "circle.csv")]
+    made = report.sections(diagnosis, measured, hidden, proposals, step_check={"pos_w": 0.03}, about={"logs": 7})
+    paths = report.write(tmp_path, made, diagnosis, "A report")
+    page = paths[0].read_text(encoding="utf-8")
+    for text in ("KNOWN", "effect_03", "cause 4", "Held-out prediction error", "noise alone", "circle", "finer steps"):
+        assert text in page
+    assert page.count("data:image/png;base64") >= 6
+    assert "http" not in page.replace("http-equiv", "")  # self-contained
+    write_json(tmp_path / "d.json", report.to_json(diagnosis, measured, hidden, proposals))
+    data = json.loads((tmp_path / "d.json").read_text(encoding="utf-8"))
+    assert {f["verdict"] for f in data["findings"]} <= set(result.VERDICTS)
+    assert set(data["theta"]) == set(TRUTH)
+    assert data["gain"]["channels"][0]["channel"] == "pos_w"
+    text = report.summary(degenerate)
+    assert "CLASS" in text
+    assert "cannot tell it from" in text
+
+
+def test_the_report_of_nothing_is_whole_too(tmp_path):
+    diagnosis = search.explain(SyntheticModel(effects=EFFECTS, throws=3))
+    paths = report.write(tmp_path, report.sections(diagnosis), diagnosis, "Nothing")
+    assert "NO EFFECT" in paths[0].read_text(encoding="utf-8")
+
+
+def test_the_recording_is_written(tmp_path, found):
+    from visthrow.diagnose import recording
+
+    recording.write(tmp_path / "d.rrd", found[1], [])
+    assert (tmp_path / "d.rrd").stat().st_size > 10_000

@@ -1,0 +1,316 @@
+"""The search on flights whose truth is known: names, sizes, classes, events, copies; and that each guard is needed."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.synthetic_diagnosis import SyntheticModel, catalogue
+from visthrow.diagnose import evidence, result, search
+from visthrow.diagnose.evidence import Priors
+from visthrow.errors import DiagnoseError
+
+EFFECTS = catalogue(12)
+
+
+def world(**options) -> SyntheticModel:
+    return SyntheticModel(effects=EFFECTS, **options)
+
+
+def sizes(model, diagnosis) -> dict[str, float]:
+    floor = {e.name: e.floor for e in model.effects}
+    return {name: value / floor[name] for name, value in diagnosis.theta.items()}
+
+
+class Altered(SyntheticModel):
+    """The same flights after something was done to their windows."""
+
+    change = staticmethod(lambda model, window: window)
+
+    def __post_init__(self):
+        super().__post_init__()
+        self._windows = [type(self).change(self, w) for w in self._windows]
+
+
+def altered(change, **options) -> SyntheticModel:
+    return type("Altered", (Altered,), {"change": staticmethod(change)})(effects=EFFECTS, **options)
+
+
+def pushed(model, window, size: float):
+    return replace(window, residual=window.residual + model._answer(window.effects, {"effect_03": size}))
+
+
+def test_nothing_is_found_where_nothing_is():
+    diagnosis = search.explain(world())
+    assert diagnosis.overall == result.NO_EFFECT
+    assert not diagnosis.theta
+    assert not diagnosis.events
+    assert not diagnosis.duplicates
+    assert {f.verdict for f in diagnosis.findings} <= {result.BOUNDED, result.NOT_IDENTIFIABLE}
+    assert len(diagnosis.findings) == len(EFFECTS)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_one_effect_is_named_with_its_size_and_interval(sign):
+    model = world(truth={"effect_03": 10.0 * sign}, curvature=0.2, seed=4)
+    diagnosis = search.explain(model, laws=False)
+    assert diagnosis.overall == result.KNOWN
+    found = diagnosis["effect_03"]
+    assert found.verdict == result.FOUND
+    assert found.low < 10.0 * sign * found.floor < found.high
+    assert abs(sizes(model, diagnosis)["effect_03"] - 10.0 * sign) < 1.0  # a floor
+    assert diagnosis.named == ("effect_03",)
+    assert "cause 3" in found.sentence
+    assert found.nats > diagnosis.threshold
+
+
+def test_three_effects_are_named_together():
+    truth = {"effect_03": 12.0, "effect_04": -9.0, "effect_02": 15.0}
+    model = world(truth=truth, seed=1)
+    diagnosis = search.explain(model, laws=False)
+    assert set(diagnosis.named) == set(truth)
+    for name, size in sizes(model, diagnosis).items():
+        assert abs(size - truth[name]) < 1.5
+
+
+def test_mirror_config_is_wrong_instead_of_the_world():
+    """A model that has what the world lacks gets the opposite correction."""
+    right = search.explain(world(truth={"effect_04": 10.0}, seed=6), laws=False)
+    mirrored = search.explain(world(truth={"effect_04": -10.0}, seed=6), laws=False)
+    assert right.named == mirrored.named == ("effect_04",)
+    assert right.theta["effect_04"] == pytest.approx(-mirrored.theta["effect_04"], abs=2 * EFFECTS[4].floor)
+
+
+def test_idempotence_what_was_found_is_not_found_again():
+    model = world(truth={"effect_04": 10.0}, seed=6)
+    first = search.explain(model, laws=False)
+
+    class Applied:
+        effects, channels = model.effects, model.channels
+
+        def windows(self, theta):
+            return model.windows(self._sum(theta))
+
+        def residuals(self, theta):
+            return model.residuals(self._sum(theta))
+
+        def _sum(self, theta):
+            return {name: first.theta.get(name, 0.0) + theta.get(name, 0.0) for name in {*first.theta, *theta}}
+
+    assert search.explain(Applied(), laws=False).overall == result.NO_EFFECT
+
+
+def test_effects_that_do_the_same_are_a_class_with_their_known_combination():
+    model = world(truth={"effect_03": 12.0}, same={"effect_07": ("effect_03", 0.5)}, seed=2)
+    diagnosis = search.explain(model, laws=False)
+    group = [f for f in diagnosis.findings if f.verdict == result.CLASS]
+    assert {f.name for f in group} == {"effect_03", "effect_07"}
+    assert all(set(f.partners) == {"effect_03", "effect_07"} - {f.name} for f in group)
+    assert len(diagnosis.theta) == 1
+    assert diagnosis["effect_03"].estimate == pytest.approx(12.0 * EFFECTS[3].floor, rel=0.1)
+    assert diagnosis["effect_07"].estimate == pytest.approx(24.0 * EFFECTS[7].floor, rel=0.15)
+    assert "effect_03 + 0.5 N/(N) effect_07 = 0.04" in diagnosis["effect_03"].joint
+    assert diagnosis["effect_03"].manoeuvres
+
+
+def test_a_missing_channel_makes_effects_unobservable_and_names_it():
+    model = world(truth={"effect_03": 12.0}, seed=2)
+    model.effects = tuple(replace(e, channels=("battery_voltage",)) if e.name == "effect_05" else e for e in EFFECTS)
+    diagnosis = search.explain(model, laws=False)
+    assert diagnosis["effect_05"].verdict == result.UNOBSERVABLE
+    assert diagnosis["effect_05"].missing == ("battery_voltage",)
+    assert diagnosis.named == ("effect_03",)
+
+
+def test_an_effect_that_was_not_excited_is_not_identifiable():
+    quiet = altered(lambda m, w: replace(w, effects=w.effects * np.where(np.arange(12) == 6, 1e-5, 1.0)))
+    diagnosis = search.explain(quiet, laws=False)
+    assert diagnosis["effect_06"].verdict == result.NOT_IDENTIFIABLE
+    assert diagnosis["effect_06"].manoeuvres == ("swing",)
+    assert diagnosis["effect_03"].verdict == result.BOUNDED
+
+
+def test_what_happened_in_one_flight_is_an_event_and_no_cause():
+    model = altered(lambda m, w: pushed(m, w, 40.0) if w.flight == 4 else w, throws=9)
+    diagnosis = search.explain(model, laws=False)
+    assert not diagnosis.theta
+    assert diagnosis.events == (4,)
+
+
+def test_signs_that_change_from_flight_to_flight_are_no_cause():
+    model = altered(lambda m, w: pushed(m, w, 15.0 * (-1) ** w.flight), throws=9)
+    diagnosis = search.explain(model, laws=False)
+    assert not diagnosis.theta
+    assert diagnosis.overall == result.INCONSISTENT
+
+
+def test_a_copied_flight_counts_once():
+    model = world(truth={"effect_03": 10.0})
+    single = search.explain(model, laws=False)
+    model._windows += [replace(w, flight=w.flight + 100, time=w.time + 5.0) for w in model._windows]
+    double = search.explain(model, laws=False)
+    assert double.duplicates == {flight + 100: flight for flight in range(7)}
+    assert double["effect_03"].sd == pytest.approx(single["effect_03"].sd, rel=1e-3)
+
+
+def test_commands_of_other_flights_are_inconsistent_data():
+    """Poses that have nothing to do with the commands leave forces of the order of the thrust."""
+    diagnosis = search.explain(world(gust=80.0))
+    assert diagnosis.overall == result.INCONSISTENT
+    assert not diagnosis.theta
+
+
+def test_a_simulation_that_fails_is_out_of_domain():
+    failing = altered(lambda m, w: replace(w, residual=np.full_like(w.residual, np.nan)))
+    diagnosis = search.explain(failing)
+    assert diagnosis.overall == result.OUT_OF_DOMAIN
+    assert not diagnosis.theta
+    assert len(diagnosis.findings) == 12
+
+
+def test_a_few_windows_that_fail_are_left_out():
+    some = altered(lambda m, w: replace(w, residual=w.residual * np.nan) if w.flight == 5 else w, truth={"effect_03": 10.0})
+    assert search.explain(some, laws=False).named == ("effect_03",)
+
+
+def test_an_estimate_stays_within_its_physical_bounds():
+    model = world(truth={"effect_03": 12.0}, seed=2)
+    floor = EFFECTS[3].floor
+    model.effects = tuple(replace(e, bounds=(-5 * floor, 8 * floor)) if e.name == "effect_03" else e for e in EFFECTS)
+    diagnosis = search.explain(model, laws=False)
+    assert all(f.low >= -5 * floor - 1e-12 and f.high <= 8 * floor + 1e-12 for f in diagnosis.findings if f.name == "effect_03")
+    assert abs(diagnosis.theta.get("effect_03", 0.0)) <= 8 * floor + 1e-12
+    assert diagnosis.overall == result.UNKNOWN  # it pushes on against its bound: the form is another
+
+
+def test_the_same_seed_gives_the_same_answer():
+    one, two = (search.explain(world(truth={"effect_03": 8.0}), seed=5, laws=False) for _ in range(2))
+    assert one.theta == two.theta
+    assert one.threshold == two.threshold
+
+
+def test_no_window_is_an_error_that_says_so():
+    empty = world()
+    empty._windows = []
+    with pytest.raises(DiagnoseError, match="no stretch of flight"):
+        search.explain(empty)
+
+
+def test_catalogues_that_contradict_themselves_are_refused():
+    twice = (*EFFECTS, EFFECTS[0])
+    with pytest.raises(DiagnoseError, match="share a name: effect_00"):
+        Priors.of(twice, ("pos_w", "payload_pos_w"))
+    with pytest.raises(DiagnoseError, match="floor 0"):
+        Priors.of((replace(EFFECTS[0], floor=0.0),), ("pos_w",))
+
+
+def small_causes(seed: int) -> SyntheticModel:
+    """Every effect at its floor: nothing that matters."""
+    signs = np.random.default_rng(seed).choice((-1.0, 1.0), len(EFFECTS))
+    return world(truth={e.name: s for e, s in zip(EFFECTS, signs)}, seed=seed, gust=0.3, noise=0.5)
+
+
+def test_causes_at_their_floors_are_not_named():
+    assert not search.explain(small_causes(3), laws=False).theta
+
+
+def test_mutation_without_floors_causes_at_their_floors_would_be_named(monkeypatch):
+    """The spike of an inactive effect taken away: the guard of the test above."""
+    monkeypatch.setattr(Priors, "deviation", lambda self, active: np.where(
+        np.isin(np.arange(len(self.floor)), list(active)), self.slab, 1e-3))  # fmt: skip
+    original = evidence.additions
+
+    def without_floors(information, score, priors, active):
+        base = evidence.log_evidence(information, np.atleast_2d(score)[0], priors, list(active))
+        if score.ndim > 1:
+            return original(information, score, priors, active)
+        gain = [
+            -np.inf if j in active else evidence.log_evidence(information, score, priors, [*active, j]) - base
+            for j in range(len(priors.floor))
+        ]
+        return np.array(gain)
+
+    monkeypatch.setattr(search, "additions", without_floors)
+    assert search.explain(small_causes(3), laws=False).theta
+
+
+def test_mutation_without_latent_forces_gusts_would_be_named():
+    """Windows whose latent forces were dropped: gusts then look like causes."""
+
+    def dropped(model, window):
+        none = np.zeros(0)
+        return replace(window, latent=np.zeros((len(window.residual), 0)), latent_block=none.astype(int),
+                       latent_axis=none.astype(int), latent_time=none)  # fmt: skip
+
+    assert search.explain(altered(dropped, gust=2.0, seed=5), laws=False).theta
+    assert not search.explain(world(gust=2.0, seed=5), laws=False).theta
+
+
+def test_mutation_swapped_names_would_be_noticed():
+    """A catalogue whose columns are swapped names the wrong one: what the tests of names rest on."""
+
+    def swapped(model, window):
+        order = np.arange(12)
+        order[[3, 9]] = 9, 3
+        return replace(window, effects=window.effects[:, order])
+
+    model = altered(swapped)
+    for i, w in enumerate(model._windows):
+        model._windows[i] = replace(w, residual=w.residual + 12.0 * EFFECTS[3].floor * w.effects[:, 9])
+    assert search.explain(model, laws=False).named == ("effect_09",)
+
+
+def test_threshold_rises_with_the_number_of_candidates_and_holds_in_null_worlds():
+    rng = np.random.default_rng(0)
+    few, many = (_threshold(count) for count in (4, 40))
+    assert few < many
+    information, priors, least = _information(40), _priors(40), _threshold(40)
+    best = evidence.additions(information, evidence.null_draws(information, 2000, rng), priors, ()).max(axis=1)
+    assert np.mean(best > least) < 0.012  # half a per cent, with the scatter of two finite samples
+
+
+def _information(count: int) -> np.ndarray:
+    root = np.random.default_rng(count).normal(size=(count, 3 * count))
+    return root @ root.T / 50.0
+
+
+def _priors(count: int) -> Priors:
+    return Priors(np.ones(count), np.full(count, 10.0), np.full(count, -np.inf), np.full(count, np.inf), np.ones(count, bool))
+
+
+def _threshold(count: int) -> float:
+    from visthrow.diagnose.marginal import Statistics
+
+    information = _information(count)[None]
+    one = np.zeros((1, count))
+    return evidence.threshold(Statistics(np.arange(1), information, one, one[:, 0], one[:, 0], one[0]), _priors(count),
+                              np.random.default_rng(1))  # fmt: skip
+
+
+def test_additions_are_differences_of_the_evidence():
+    rng = np.random.default_rng(2)
+    information, priors = _information(8), replace(_priors(8), low=np.full(8, -4.0), high=np.full(8, 30.0))
+    score = rng.normal(size=8) * 20.0
+    gain = evidence.additions(information, score, priors, [2])
+    assert gain[2] == -np.inf
+    own = np.arange(8) == 2  # the named one's bounds stay out of it: its marginal mass changes with every addition
+    free = replace(priors, low=np.where(own, -np.inf, priors.low), high=np.where(own, np.inf, priors.high))
+    base = evidence.log_evidence(information, score, free, [2])
+    for j in (0, 5):
+        assert gain[j] == pytest.approx(evidence.log_evidence(information, score, free, [2, j]) - base, abs=1e-8)
+
+
+def test_evidence_is_the_integral():
+    """One effect: closed form against quadrature, bounds and floor included."""
+    from scipy.integrate import quad
+
+    information, score = np.array([[0.3]]), np.array([1.7])
+    priors = Priors(np.ones(1), np.array([6.0]), np.array([-1.0]), np.array([9.0]), np.ones(1, bool))
+
+    def integral(sd, low, high):
+        weight = lambda x: np.exp(score[0] * x - 0.5 * information[0, 0] * x * x - 0.5 * (x / sd) ** 2)  # noqa: E731
+        mass = lambda x: np.exp(-0.5 * (x / sd) ** 2)  # noqa: E731
+        return np.log(quad(weight, low, high)[0] / quad(mass, low, high)[0])
+
+    assert evidence.log_evidence(information, score, priors, []) == pytest.approx(integral(1.0, -12, 12), abs=1e-6)
+    assert evidence.log_evidence(information, score, priors, [0]) == pytest.approx(integral(6.0, -1.0, 9.0), abs=1e-6)
