@@ -66,14 +66,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     subs["view"].add_argument("--out", default=None, metavar="FILE", help="of the recording (default: run.rrd in the folder)")
     subs["view"].add_argument("--web-port", type=int, default=9090, metavar="N", help="of the live view (default: 9090)")
     subs["view"].add_argument("--data-port", type=int, default=9876, metavar="N", help="of its data (default: 9876)")
-    direct = subs["direct"]
+    _add_simulated(subs["fake"], subs["direct"])
+
+
+def _add_simulated(fake: argparse.ArgumentParser, direct: argparse.ArgumentParser) -> None:
+    """Add the arguments of what flies a simulated vehicle."""
     direct.add_argument("--config", default="fake", metavar="NAME", help="of configs/hil, or a file")
     direct.add_argument("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE")
     direct.add_argument("--seeds", type=int, nargs="+", default=[0], metavar="N", help="of starts, noise and loss; a throw each")
-    fake = subs["fake"]
     fake.add_argument("--rate", type=float, default=100.0, metavar="HZ", help="poses a second of each body")
-    for name in ("fake", "direct"):
-        subs[name].add_argument(
+    for parser in (fake, direct):
+        parser.add_argument(
             "--plant", default="visthrow.wire_plant:make", metavar="MODULE:FUNCTION", help="that makes the vehicle"
         )
     fake.add_argument("--device", default="udpout:127.0.0.1:14560", help="the runner's port")

@@ -88,7 +88,7 @@ class MavlinkAutopilot:
         self._heartbeat: Any = None
         self._heard = self._told = self._asked_at = self._streamed = -1e9
         self._wanted: str | None = None
-        self._last_role: str | None = None  # the last role that was ours
+        self._may: set[str | None] = set()  # the last role that was ours, and those asked for since
         self._reached = False
         self._taken_over = False
         self._ours = False  # whether it has ever followed
@@ -159,9 +159,9 @@ class MavlinkAutopilot:
             return
         self._was_armed |= bool(self._heartbeat.base_mode & ARMED)
         if role == self._wanted:
-            self._reached, self._taken_over, self._last_role = True, False, role
+            self._reached, self._taken_over, self._may = True, False, {role}
             self._ours |= role == FOLLOW
-        elif self._reached or role != self._last_role:
+        elif self._reached or role not in self._may:
             self._taken_over = True
 
     def _acknowledged(self, message: Any) -> None:
@@ -220,8 +220,9 @@ class MavlinkAutopilot:
     def ask(self, mode: str, now: float) -> None:
         """See `Backend`: asks until the heartbeat shows the mode."""
         if mode != self._wanted:
-            # The first mode that is ours may be one that the pilot has chosen.
-            self._last_role = self._last_role if self._wanted is not None else self._current()
+            if self._wanted is None and self._heartbeat is not None:  # the first one that is ours was the pilot's
+                self._may.add(self._role(self._heartbeat))
+            self._may.add(mode)
             self._wanted, self._reached, self._asked_at = mode, False, -1e9
             if self._heartbeat is not None:
                 self._judge_mode()
@@ -234,9 +235,6 @@ class MavlinkAutopilot:
         elif mode == FOLLOW and self.params.arm and not beat.base_mode & ARMED:
             self._asked_at = now
             self._command(mav.MAV_CMD_COMPONENT_ARM_DISARM, 0, 1.0)
-
-    def _current(self) -> str | None:
-        return None if self._heartbeat is None else self._role(self._heartbeat)
 
     def release(self, when: float) -> None:
         """See `Backend`."""

@@ -8,7 +8,7 @@ from hil.autopilot_check import AutopilotCheck
 from hil.backends.base import FOLLOW, HOLD, LAND, WAIT
 from hil.fakes.level import LevelPlant
 from hil.fakes.px4 import LAND as PX4_LAND
-from hil.fakes.px4 import OFFBOARD, POSCTL
+from hil.fakes.px4 import OFFBOARD, POSCTL, custom
 from hil.flight import fly
 from hil.runner import Words
 from tests.hil_flight import simple_policy
@@ -114,6 +114,21 @@ def test_an_abort_lands(kind):
         desk.backend.abort(desk.now)
     assert desk.status.mode == LAND
     assert desk.fake.mode == (9 if kind == "ardupilot" else PX4_LAND)
+
+
+@pytest.mark.parametrize("kind", ["ardupilot", "px4"])
+def test_an_abort_right_after_the_hold_was_asked_for_still_lands(kind):
+    """The heartbeat shows the hold when landing is wanted already: that is no pilot."""
+    desk = Desk(kind).follow()
+    desk.backend.ask(HOLD, desk.now)
+    desk.backend.abort(desk.now)
+    hold = 17 if kind == "ardupilot" else custom(4, 3)
+    desk.fake.enter(hold)
+    desk.fake._next_beat = 0.0
+    for _ in range(20):
+        desk.turn(0.02)
+        desk.backend.abort(desk.now)
+    assert desk.status.mode == LAND
 
 
 def test_px4_is_asked_for_offboard_only_after_a_second_of_set_points():
