@@ -6,17 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from visthrow.diagnose import noise as levels
-from visthrow.diagnose.evidence import Priors, estimate, log_evidence
-from visthrow.diagnose.marginal import (
-    Gram,
-    Noise,
-    Statistics,
-    gather,
-    gram_of,
-    posterior,
-    window_statistics,
-    with_residual,
-)
+from visthrow.diagnose.evidence import Priors, covariance, estimate, log_evidence
+from visthrow.diagnose.marginal import Gram, Noise, Statistics, gather, gram_of, window_statistics, with_residual
 from visthrow.diagnose.model import Model, Window
 
 STEPS = 3
@@ -112,20 +103,20 @@ def advantage(priors: Priors, first: tuple[Point, Sequence[int]], second: tuple[
 
 
 def curvature(problem: Problem, origin: Point, there: Point) -> float:
-    """How far the simulation at another theta is from the linearisation: d' V^-1 d with d the difference of the residuals.
+    """What the simulation's distance from its linearisation would be taken for: the largest size of any effect, in floors.
 
     Args:
         problem: of the search.
         origin: where the derivatives were taken.
         there: a point moved from it, with the same derivatives.
     """
-    floor, total = problem.priors.floor, 0.0
+    floor = problem.priors.floor
     change = floor * (there.theta - origin.theta)
+    total = np.zeros(len(floor))
     for w, (old, new, gram) in enumerate(zip(origin.windows, there.windows, there.grams)):
         bent = new.residual - (old.residual - old.effects @ change)
-        values = [posterior(with_residual(gram, new, floor, r), there.noise, w).log_likelihood for r in (bent, 0.0 * bent)]
-        total += 2.0 * (values[1] - values[0])
-    return total
+        total += window_statistics(with_residual(gram, new, floor, bent), there.noise, w).score
+    return float(np.abs(covariance(there.information, np.ones(len(floor))) @ total).max(initial=0.0))
 
 
 def with_fitted_noise(point: Point) -> Point:

@@ -42,8 +42,8 @@ DOUBT = 15.0
 CONTRADICTED = 0.5
 """Share of the evidence of an effect that the flights contradict which any other effect must then exceed."""
 
-STRAIGHT = 1.0
-"""Squared distance of the simulation from its linearisation, in noise, up to which the derivatives are not taken anew."""
+STRAIGHT = 0.5
+"""Size in floors that the simulation's distance from its linearisation may fake before the derivatives are taken anew."""
 
 JOINT_BEST, JOINT_SIZE = 8, 3
 """All sets of up to so many of the best effects are compared at the end."""
