@@ -253,12 +253,13 @@ def _under(model: Pendulum, state: np.ndarray, sent: np.ndarray, period: float, 
 
 
 def _started(
-    name: str, experiment: Experiment, start: RandomizationParams, target: float, batch: int, count: int, seed: int
-) -> Plant:
+    name: str, experiment: Experiment, start: RandomizationParams, target: float, batch: int, count: int, seed: int,
+    device: str,
+) -> Plant:  # fmt: skip
     """Plant at the start of the throws that learnt policies meet."""
     task = experiment.task
     if name == "hybrid":
-        return HybridPlant(experiment, count, seed, noise=task.noise, latency=task.observation.latency, start=start)
+        return HybridPlant(experiment, count, seed, device, task.noise, task.observation.latency, start)
     plant, rng = batch_plant(experiment, name, target, batch, count, seed)
     place_in_hover(plant, experiment, start, rng)
     return plant
@@ -276,10 +277,11 @@ class _PlantFlight:
         count: int,
         seed: int,
         batch: int = 0,
+        device: str = "cpu",
     ) -> None:
         start = config.load(RandomizationParams, config.find("start", "hover"))
         self.plan, self.experiment, self.delays, self.count = plan, experiment, delays, count
-        self.plant = _started(plant_name, experiment, start, plan.target, batch, count, seed)
+        self.plant = _started(plant_name, experiment, start, plan.target, batch, count, seed, device)
         self.params = MPCParams(period=self.plant.period, max_thrust=experiment.task.action.max_thrust,
                                 max_rate=experiment.task.action.max_rate)  # fmt: skip
         self.mount = np.array(plant_of(experiment).rope.mount)
@@ -364,8 +366,9 @@ class _PlantFlight:
 
 
 def fly_plant(
-    plan: Plan, plant_name: str, experiment: Experiment, delays: Delays, count: int = 10, seed: int = 0, batch: int = 0
-) -> Flown:
+    plan: Plan, plant_name: str, experiment: Experiment, delays: Delays, count: int = 10, seed: int = 0, batch: int = 0,
+    device: str = "cpu",
+) -> Flown:  # fmt: skip
     """Fly a plan on a plant of :data:`visthrow.plants.PLANTS`.
 
     The throws are those that learnt policies meet with the same count and seed: in the training simulator the same vehicles,
@@ -380,8 +383,9 @@ def fly_plant(
         count: throws, flown as one batch.
         seed: of everything random.
         batch: number of the batch on a reference plant, as :mod:`visthrow.reference_protocol` counts them.
+        device: of the training simulator.
     """
-    flight = _PlantFlight(plan, plant_name, experiment, delays, count, seed, batch)
+    flight = _PlantFlight(plan, plant_name, experiment, delays, count, seed, batch, device)
     plant, period = flight.plant, flight.plant.period
     if plant_name != "hybrid":
         for _ in range(round(HOVER_TIME / period)):

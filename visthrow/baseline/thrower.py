@@ -13,6 +13,7 @@ from visthrow.baseline.pendulum import pendulum_of
 from visthrow.baseline.plan import Plan, plan_throw
 from visthrow.baseline.release import default_release
 from visthrow.baseline.spline import PlanParams, payload_bounds_only
+from visthrow.device import resolve
 from visthrow.reference_protocol import BATCH
 from visthrow.results import PROTOCOL, Result, columns_of, join, key_of, work
 from visthrow.task import Experiment, contract_of, plant_of
@@ -103,7 +104,8 @@ def fly_unit(wanted: dict[str, Any]) -> tuple[dict[str, np.ndarray], dict[str, A
         flown = fly_pendulum(plan, count, seed, experiment.release.landing_height)
     else:
         delays = delays_of(experiment, wanted["compensation"])
-        flown = fly_plant(plan, wanted["plant"], experiment, delays, count, seed, wanted["batch"])
+        device = resolve("auto") if wanted["plant"] == "hybrid" else "cpu"
+        flown = fly_plant(plan, wanted["plant"], experiment, delays, count, seed, wanted["batch"], device)
     columns = columns_of(flown)
     columns.pop("step_times", None)  # as many as throws by chance
     extra = {"planned": round(plan.duration, 6)}
