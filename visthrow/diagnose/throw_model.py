@@ -102,12 +102,12 @@ class ThrowModel:
             self.flights = Flights(flights, without_slack, delays, stride)
             states = self._begin()
         self._told = np.array([w for w, c in enumerate(self.flights.cuts) if c.told])
-        self._states = self._settle(self.setting, states)
+        self._states = self._latest = self._settle(self.setting, states)
 
     def windows(self, theta: Mapping[str, float]) -> list[Window]:
         """See :class:`visthrow.diagnose.model.Model`."""
         setting = apply(self.entries, self.setting, theta)
-        states = self._states if setting == self.setting else self._settle(setting, self._states)
+        states = self._latest = self._states if setting == self.setting else self._settle(setting, self._states)
         steps = [self._step(e, theta.get(name, 0.0)) for name, e in self.entries.items()]
         settings = [setting, *[e.apply(setting, step) for e, step in zip(self.entries.values(), steps)]]
         replay = self._replay(settings)
@@ -117,10 +117,10 @@ class ThrowModel:
         return found
 
     def residuals(self, theta: Mapping[str, float]) -> list[np.ndarray]:
-        """See :class:`visthrow.diagnose.model.Model`."""
+        """See :class:`visthrow.diagnose.model.Model`; from the initial states of the last :meth:`windows`."""
         setting = apply(self.entries, self.setting, theta)
         lanes = [Lane(w, 0, w) for w in self._told]
-        seen = self.flights.fly(self._replay([setting]), [setting], self._states, lanes, self.substep).seen
+        seen = self.flights.fly(self._replay([setting]), [setting], self._latest, lanes, self.substep).seen
         return [self._residual(seen, w, lane) for lane, w in enumerate(self._told)]
 
     def step_error(self, finer: int = 4) -> dict[str, float]:
