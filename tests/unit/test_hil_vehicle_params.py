@@ -1,0 +1,69 @@
+"""Wrong vehicles in a config, and ports that a back-end must not open."""
+
+import pytest
+
+from hil.backends import Betaflight, DryRun, make_backend, mechanism_lag
+from hil.errors import LinkError, RunError
+from hil.params import HilParams
+from visthrow import config
+from visthrow.errors import ConfigError
+
+
+def load(*overrides, name="dry_run"):
+    return config.load(HilParams, config.find("hil", name), overrides)
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("ardupilot.follow_mode=5", r"expected GUIDED \(4\) or GUIDED_NOGPS \(20\)"),
+        ("ardupilot.hold_mode=0", r"LOITER \(5\) or BRAKE \(17\)"),
+        ("ardupilot.component=0", "expected 1 to 255 each"),
+        ("ardupilot.release_timeout=0.0", "expected time-outs above 0"),
+        ("ardupilot.mechanism_lag=-0.01", "a lag of 0 or more"),
+        ("ardupilot.servo_open_us=190", "expected 0 to 16, 500 to 2500"),
+        ('ardupilot.release="magnet"', "one of 'gripper', 'servo'"),
+        ("px4.gripper=7", "expected 1 to 6, -1 to 1"),
+        ("px4.actuator_open=2.0", "expected 1 to 6, -1 to 1"),
+        ('px4.hold="loiter"', "one of 'hold', 'position'"),
+        ("betaflight.release_channel=0", "expected AUX 0 to 12 and 1 to 12"),
+        ("betaflight.arm_channel=4", "not the same"),
+        ("betaflight.minimum_us=1500", "900 to 1200"),
+        ('betaflight.rates.type="kiss"', "one of 'betaflight', 'actual'"),
+        ("betaflight.rates.expo=[0, 0, 101]", "expo of 0 to 100"),
+        ("betaflight.thrust.hover=1.5", "a share of hover between 0 and 1"),
+        ("px4.thurst.hover=0.2", "did you mean 'thrust'"),
+    ],
+)
+def test_wrong_vehicles(override, message):
+    with pytest.raises(ConfigError, match=message):
+        load(override)
+
+
+def test_a_servo_release_needs_its_output():
+    with pytest.raises(ConfigError, match="expected the output that the mechanism hangs on"):
+        load('ardupilot.release="servo"', "ardupilot.servo_output=0")
+
+
+@pytest.mark.parametrize(
+    ("device", "error", "message"),
+    [
+        ("/bin/sh", LinkError, "is refused"),
+        ("betaflight_SITL.elf", LinkError, "is refused"),
+        ("tcp:192.168.1.7:5761", LinkError, "leaves this machine"),
+        ("udp:127.0.0.1:5761", RunError, "MSP is a stream; expected tcp:... or serial:..."),
+        ("tcp:127.0.0.1:9", LinkError, "cannot connect"),
+    ],
+)
+def test_ports_of_msp(device, error, message):
+    with pytest.raises(error, match=message):
+        make_backend(load(f'betaflight.device="{device}"', name="fake_betaflight"))
+
+
+def test_which_back_end():
+    assert isinstance(make_backend(load()), DryRun)
+    assert mechanism_lag(load()) == 0.0
+    assert mechanism_lag(load("px4.mechanism_lag=0.07", name="fake_px4")) == 0.07
+    with pytest.raises(RunError, match="backend px4 without a MAVLink link"):
+        make_backend(load(name="fake_px4"))
+    assert Betaflight.holds is False
