@@ -39,6 +39,16 @@ def check(logs: Sequence[FlightLog]) -> list[Checked]:
     return [Checked(label(log, i), (*_look(log), *copies.get(i, ()))) for i, log in enumerate(logs)]
 
 
+def contradictions(results: Sequence[Checked]) -> list[str]:
+    """Why no cause may be named from logs: their channels contradict each other, or nothing moved."""
+    return [
+        f"{checked.name}: {row.channel + ': ' if row.channel else ''}{row.text}"
+        for checked in results
+        for row in checked.rows
+        if row.verdict == "bad" and (row.topic in ("frames", "units", "excited") or "never overlap" in row.text)
+    ]
+
+
 def label(log: FlightLog, number: int) -> str:
     """Name of a log for people."""
     source = Path(str(log.meta.get("source", f"log {number + 1}"))).name

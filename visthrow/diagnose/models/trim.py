@@ -37,12 +37,13 @@ class TrimParams:
     slowest_window: float  # windows' length [s]
     fastest: float  # mean speed of a window [m/s]
     spread: float  # of a window's mean command, by draught and control [1]
-    flight_spread: float  # of an unharmed vehicle's motors from one flight to the next: the floor of all that shifts them [1]
+    motor_spread: float  # of an unharmed vehicle's thrusts from one flight to the next [1]
+    com_spread: float  # of its centre of mass: the pack is not where it was [m]
 
 
 def effects(params: TrimParams) -> list[Effect]:
     """Catalogue of the balance."""
-    seen, arm, usual = (params.command, params.position), params.arm, params.flight_spread
+    seen, arm, usual = (params.command, params.position), params.arm, params.motor_spread
     found = [
         Effect(f"motor_{key}", f"the {words} propeller's thrust", "f_i (1 + theta)", "1", "thrust map", (-0.7, 0.7), 0.15,
                usual, seen, "fault detection literature", ("added_mass",), ("yaw response",)) for key, words in WORDS.items()
@@ -61,7 +62,7 @@ def effects(params: TrimParams) -> list[Effect]:
                (-1.0, 1.0), 0.1, 5e-3, (*seen, "battery_voltage"), "Bauersfeld and Scaramuzza 2022", ("thrust_gain",),
                ("fresh and empty pack",)),
         *(Effect(f"com_{axis}", f"the centre of mass lies off along {axis}", "torque = r x T", "m", "rigid body",
-                 (-0.5 * arm, 0.5 * arm), 0.1 * arm, usual * arm, seen, "build", (), ()) for axis in "xy"),
+                 (-0.5 * arm, 0.5 * arm), 0.1 * arm, params.com_spread, seen, "build", (), ()) for axis in "xy"),
         Effect("yaw_trim", "one turning sense's drag torque", "torque_z += theta kappa T / 4", "1", "thrust map", (-0.7, 0.7), 0.1,
                usual, seen, "propeller wear", ("motor_fl", "motor_fr", "motor_rl", "motor_rr"), ("yaw doublets",)),
     ]  # fmt: skip
