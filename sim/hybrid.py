@@ -8,7 +8,7 @@ import warp as wp
 from sim import runtime  # noqa: F401  starts Warp
 from sim import state as st
 from sim.checks import check_air, check_numerics, check_release
-from sim.params import GRAVITY, AirParams, PlantParams, RandomizationParams, RopeParams, VehicleParams
+from sim.params import GRAVITY, AirParams, PlantParams, RandomizationParams, ReleaseParams, RopeParams, VehicleParams
 from sim.quadrotor.queue import queue_depth
 from sim.randomize import build_reset
 from sim.step import build_step
@@ -91,6 +91,7 @@ class HybridSim:
         vehicles: list[VehicleParams] | None = None,
         ropes: list[RopeParams] | None = None,
         airs: list[AirParams] | None = None,
+        releases: list[ReleaseParams] | None = None,
         direct: bool = False,
         extensions: frozenset[str] = frozenset(),
         gravity: float = GRAVITY,
@@ -105,6 +106,7 @@ class HybridSim:
             vehicles: parameters of environment e at ``e % len(vehicles)``; default ``[params.vehicle]``.
             ropes: likewise; all with the same number of segments.
             airs: likewise; default ``[params.air]``.
+            releases: likewise; default ``[params.release]``.
             direct: by-pass the blocks: commands are thrust [N] and torque [N m].
             extensions: of :data:`sim.structs.EXTENSIONS`, to build in besides those that the parameters need.
             gravity: acceleration of free fall, along -z [m/s^2].
@@ -115,7 +117,9 @@ class HybridSim:
         if count < 1:
             raise ValueError(f"HybridSim of {count} environments: expected 1 or more")
         check_numerics(params.sim)
-        check_release(params.release)
+        releases = releases or [params.release]
+        for release in releases:
+            check_release(release)
         ropes = ropes or [params.rope]
         vehicles = vehicles or [params.vehicle]
         airs = airs or [params.air]
@@ -127,13 +131,13 @@ class HybridSim:
             )
         self.params, self.count, self.device, self.seed = params, count, device, seed
         self.gravity = gravity
-        self.extensions = extensions_of(vehicles, ropes, airs, [params.release]) | extensions
+        self.extensions = extensions_of(vehicles, ropes, airs, releases) | extensions
         self.types, self._step, self._reset = _kernels(params, direct, self.extensions)
         t = self.types
         self._vehicles = wp.array(pack_vehicle(t, vehicles, kinds_of(params.vehicle)), dtype=t.Vehicle, device=device)
         self._ropes = wp.array(pack_rope(t, ropes_on(vehicles, ropes)), dtype=t.Rope, device=device)
         self._airs = wp.array(pack(t.Air, *airs), dtype=t.Air, device=device)
-        self._release = wp.array(pack(t.Release, params.release), dtype=t.Release, device=device)
+        self._release = wp.array(pack(t.Release, *releases), dtype=t.Release, device=device)
         segments, period = params.rope.segments, params.sim.control_period
         depth = max(queue_depth(v.queue.delay, period) for v in vehicles)
         rows = {"cable_dir_w": segments, "cable_vel_w": segments, "stiffness": segments, "queue": depth}

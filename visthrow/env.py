@@ -21,6 +21,7 @@ from sim.torch_bridge import TorchViews, on_torch_stream
 from visthrow import actions as act
 from visthrow import goal_motion, rewards, terminations
 from visthrow import observations as ob
+from visthrow.posterior import drawn_plants
 from visthrow.task import Experiment, plant_of
 
 RESULTS = ("episodes", "released", "landing_error", "duration")
@@ -59,8 +60,12 @@ class ThrowEnv(VecEnv):
         self.num_actions = act.ACTIONS
         self.device = device
         self.max_episode_length = round(task.bounds.time_limit / experiment.sim.control_period)
-        ropes = rope_variants(experiment.rope, task.start)
-        self.sim = HybridSim(plant_of(experiment), self.num_envs, device, seed, ropes=ropes)
+        plants = drawn_plants(experiment, seed)
+        ropes = [rope for plant in plants for rope in rope_variants(plant.rope, task.start)]
+        share = len(ropes) // len(plants)
+        each = {name: [getattr(plant, name) for plant in plants for _ in range(share)] for name in ("vehicle", "air", "release")}
+        many = {f"{name}s": parts for name, parts in each.items()} if len(plants) > 1 else {}
+        self.sim = HybridSim(plant_of(experiment), self.num_envs, device, seed, ropes=ropes, **many)
         self.views = TorchViews(self.sim)
         self.layout = ob.layout_of(task.observation)
         self.camera = KeypointCamera(experiment.camera, device)

@@ -8,7 +8,16 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from camera.params import CameraParams
-from sim.params import AirParams, PlantParams, RandomizationParams, ReleaseParams, RopeParams, SimParams, VehicleParams
+from sim.params import (
+    AirParams,
+    PlantParams,
+    RandomizationParams,
+    ReleaseParams,
+    RopeParams,
+    SensingParams,
+    SimParams,
+    VehicleParams,
+)
 from visthrow.errors import ConfigError
 
 
@@ -126,6 +135,29 @@ class PPOParams:
 
 
 @dataclass(frozen=True)
+class DiagnosedParams:
+    """What a diagnosis leaves uncertain about the plant (``visthrow diagnose apply`` writes it).
+
+    Training draws ``plants`` plants from the joint posterior: deviations theta of the effects, normal with this covariance
+    about the configuration as it stands, so that what is pinned together stays so. Environment e flies plant
+    ``e % plants``. With 1 all fly the configuration.
+    """
+
+    effects: tuple[str, ...] = ()  # of the catalogue
+    covariance: tuple[tuple[float, ...], ...] = ()  # of their deviations, in their units
+    plants: int = 1
+
+    def __post_init__(self) -> None:
+        if self.plants < 1:
+            raise ConfigError(f"diagnosed.plants is {self.plants}; expected 1 or more")
+        if len(self.covariance) != len(self.effects) or any(len(row) != len(self.effects) for row in self.covariance):
+            raise ConfigError(
+                f"diagnosed.covariance has rows of {[len(row) for row in self.covariance]} for {len(self.effects)} effects; "
+                "expected one row and one column for each"
+            )
+
+
+@dataclass(frozen=True)
 class Experiment:
     """All that a training run depends on; written beside its results."""
 
@@ -137,6 +169,8 @@ class Experiment:
     task: TaskParams
     ppo: PPOParams
     air: AirParams = field(default_factory=AirParams)
+    sensing: SensingParams = field(default_factory=SensingParams)  # of the hall; the diagnosis alone reads it
+    diagnosed: DiagnosedParams = field(default_factory=DiagnosedParams)
 
     def __post_init__(self) -> None:
         if self.ppo.environments < 1 or self.ppo.steps < 1 or self.ppo.iterations < 1:

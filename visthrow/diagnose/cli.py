@@ -7,6 +7,7 @@ from typing import Any
 ACTIONS = {
     "check": ("look at logs: clocks, units, frames, gaps, what is excited, what they can answer", "visthrow.diagnose.check.cli"),
     "explain": ("say what the simulation gets wrong about flights, and what that is worth", "visthrow.diagnose.explain_cli"),
+    "apply": ("write the configuration that a diagnosis asks for, ready to train in", "visthrow.diagnose.apply_cli"),
     "fit": ("make the first configuration of your own vehicle or motor, from flights without payload", "visthrow.diagnose.fit_cli"),
     "plan": ("propose the manoeuvre that separates what could not be separated", "visthrow.diagnose.plan_cli"),
     "loop": ("hide an effect in the reference plant, find it, train with it, fly again", "visthrow.diagnose.loop_cli"),

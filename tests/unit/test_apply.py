@@ -1,0 +1,129 @@
+"""The diagnosis put into a configuration: what is written is what training and the next diagnosis read."""
+
+import json
+
+import numpy as np
+import pytest
+
+from visthrow import cli, config
+from visthrow.diagnose import patch
+from visthrow.diagnose.catalogue import ALL
+from visthrow.errors import ConfigError
+from visthrow.posterior import drawn_plants
+from visthrow.task import DiagnosedParams, Experiment, contract_of, plant_of
+
+THETA = {"thrust_gain": 0.03, "mass_quad": 0.006, "rope_length": -0.004, "wind_x": 0.2, "frame_tilt_x": 0.01}
+COVARIANCE = np.diag([0.01, 0.002, 0.0005, 0.02, 0.001]) ** 2
+COVARIANCE[0, 1] = COVARIANCE[1, 0] = 0.99 * 0.01 * 0.002
+
+
+def shipped() -> Experiment:
+    return config.load(Experiment, config.find("train", "state"))
+
+
+@pytest.fixture
+def diagnosis(tmp_path):
+    """A diagnosis as explain writes it; a function that changes entries."""
+
+    def write(**changes):
+        value = {"theta": THETA, "covariance": COVARIANCE.tolist(), "overall": "KNOWN", "flights": 12,
+                 "gain": {"channels": [{"channel": "pos_w", "before": 2.0, "after": 1.0}], "nats_per_sample": 0.4}}  # fmt: skip
+        path = tmp_path / "diagnosis.json"
+        path.write_text(json.dumps(value | changes))
+        return str(path)
+
+    return write
+
+
+def test_apply_writes_what_training_reads(diagnosis, tmp_path, capsys):
+    out = tmp_path / "mine.toml"
+    assert cli.main(["diagnose", "apply", diagnosis(), "--out", str(out), "--plants", "8"]) == 0
+    capsys.readouterr()
+    after, before = config.load(Experiment, out), shipped()
+    np.testing.assert_allclose(after.vehicle.thrust.gain, 1.03)
+    assert after.vehicle.body.mass == pytest.approx(before.vehicle.body.mass + 0.006)
+    assert after.rope.length == pytest.approx(before.rope.length - 0.004)
+    assert after.air.wind_w == (0.2, 0.0, 0.0)
+    assert after.sensing.frame_tilt == (0.01, 0.0, 0.0)
+    assert after.diagnosed.effects == ("thrust_gain", "mass_quad", "rope_length", "wind_x")  # a tilted frame is no plant's
+    np.testing.assert_allclose(after.diagnosed.covariance, COVARIANCE[:4, :4])
+    assert after.vehicle.motor == before.vehicle.motor
+    assert after.ppo == before.ppo
+    text = out.read_text()
+    assert 'base = "train/state.toml"' in text
+    for line in text.splitlines():
+        assert " = " not in line or "#" in line or line.startswith("base"), line
+
+
+def test_applied_twice_is_applied_once_more(diagnosis, tmp_path, capsys):
+    """A second diagnosis goes on top of the first."""
+    first, second = tmp_path / "first.toml", tmp_path / "second.toml"
+    assert cli.main(["diagnose", "apply", diagnosis(), "--out", str(first)]) == 0
+    more = diagnosis(theta={"rope_length": 0.001}, covariance=[[1e-8]])
+    assert cli.main(["diagnose", "apply", more, "--plant", str(first), "--out", str(second)]) == 0
+    capsys.readouterr()
+    after = config.load(Experiment, second)
+    assert after.rope.length == pytest.approx(shipped().rope.length - 0.003)
+    np.testing.assert_allclose(after.vehicle.thrust.gain, 1.03)
+
+
+def test_every_effect_can_be_written():
+    before = shipped()
+    for name, e in ALL.items():
+        if e.applies(patch.opened(patch.Setting(plant_of(before)))):
+            theta = {name: min(e.effect.floor, e.effect.bounds[1])}
+            content = patch.text("train/state.toml", before, theta, [[1e-12]], 1, ["test"])
+            after = config.loads(Experiment, content)
+            assert after != before, name
+            assert patch.extended(before, theta).vehicle == after.vehicle, name
+
+
+def test_draws_keep_what_is_pinned_together():
+    before = shipped()
+    loose = DiagnosedParams(("thrust_gain", "mass_quad"), tuple(map(tuple, COVARIANCE[:2, :2])), 400)
+    from dataclasses import replace
+
+    plants = drawn_plants(replace(before, diagnosed=loose), 1)
+    gain = np.array([p.vehicle.thrust.gain[0] for p in plants]) - 1.0
+    mass = np.array([p.vehicle.body.mass for p in plants]) - before.vehicle.body.mass
+    assert np.std(gain) == pytest.approx(0.01, rel=0.15)
+    assert np.corrcoef(gain, mass)[0, 1] > 0.97
+    assert drawn_plants(before, 1) == [plant_of(before)]
+    assert drawn_plants(replace(before, diagnosed=loose), 1) == plants
+
+
+def test_a_config_without_diagnosis_keeps_its_contract():
+    before = shipped()
+    assert "payload_drag" not in contract_of(before)["rope"]
+    assert "com" not in contract_of(before)["vehicle"]["body"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"theta": {"no_such": 1.0}, "covariance": [[1.0]]}, "no effects of the throw"),
+        ({"covariance": [[1.0]]}, "expected one each"),
+        ({"theta": None}, "no diagnosis"),
+        ({"gain": {"channels": [{"channel": "pos_w", "before": 1.0, "after": 1.5}]}}, "do not bear this out"),
+    ],
+)
+def test_mistakes_are_told(diagnosis, changes, message, tmp_path, capsys):
+    out = tmp_path / "x.toml"
+    assert cli.main(["diagnose", "apply", diagnosis(**changes), "--out", str(out)]) == 2
+    assert message in capsys.readouterr().err
+    assert not out.exists()
+
+
+def test_nothing_named_writes_nothing(diagnosis, tmp_path, capsys):
+    assert cli.main(["diagnose", "apply", diagnosis(theta={}, covariance=[]), "--out", str(tmp_path / "x.toml")]) == 0
+    assert "nothing was named" in capsys.readouterr().out
+
+
+def test_a_broken_covariance_is_refused():
+    with pytest.raises(ConfigError, match="one row and one column"):
+        DiagnosedParams(("rope_length",), ((1.0, 2.0),), 2)
+    from dataclasses import replace
+
+    bad = DiagnosedParams(("rope_length", "mass_quad"), ((1e-6, 1e-5), (1e-5, 1e-6)), 4)
+    with pytest.raises(ConfigError, match="no covariance"):
+        drawn_plants(replace(shipped(), diagnosed=bad), 0)

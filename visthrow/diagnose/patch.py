@@ -1,0 +1,111 @@
+"""A diagnosis put into the configuration: a TOML on top of the diagnosed one, that training and the next diagnosis read."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from visthrow import config
+from visthrow.diagnose.catalogue import ALL, Setting, apply
+from visthrow.diagnose.opened import closed, opened
+from visthrow.errors import DiagnoseError
+from visthrow.task import Experiment, plant_of
+from visthrow.toml_text import dumps
+
+
+def extended(experiment: Experiment, theta: Mapping[str, float]) -> Experiment:
+    """The experiment whose plant and sensors have these effects.
+
+    Raises:
+        DiagnoseError: An effect that the catalogue does not hold.
+    """
+    base = opened(Setting(plant_of(experiment), experiment.sensing))
+    found = apply(ALL, base, theta)
+    plant = closed(found.plant, plant_of(experiment))
+    return dataclasses.replace(
+        experiment, vehicle=plant.vehicle, rope=plant.rope, release=plant.release, air=plant.air, sensing=found.sensing
+    )
+
+
+def differences(before: Any, after: Any) -> dict[str, Any]:
+    """Nested entries of ``after`` that differ from ``before``."""
+    out = {}
+    for key, value in after.items():
+        old = before.get(key)
+        if isinstance(value, dict):
+            inner = differences(old or {}, value)
+            out |= {key: inner} if inner else {}
+        elif value != old:
+            out[key] = value
+    return out
+
+
+def touched(theta: Mapping[str, float]) -> dict[str, list[str]]:
+    """Dotted key of an experiment -> effects that change it."""
+    keys: dict[str, list[str]] = {}
+    for name in theta:
+        for key in ALL[name].keys:
+            path = key.path.removeprefix("plant.")
+            keys.setdefault(path, []).append(name)
+    return keys
+
+
+def text(
+    base: str, experiment: Experiment, theta: Mapping[str, float], covariance: Sequence[Sequence[float]], plants: int,
+    provenance: Sequence[str],
+) -> str:  # fmt: skip
+    """The TOML file.
+
+    Args:
+        base: path of the diagnosed configuration, as ``base =`` is to name it.
+        experiment: that configuration.
+        theta: sizes of the named effects.
+        covariance: of theta, in its order.
+        plants: to draw in training from the joint posterior.
+        provenance: lines that say where it comes from.
+    """
+    after = dataclasses.replace(
+        extended(experiment, theta),
+        diagnosed=_diagnosed(experiment, theta, covariance, plants),
+    )
+    changed = differences(config.to_dict(experiment), config.to_dict(after))
+    lines = [f"# {line}" for line in provenance] + [dumps({"base": base}).strip(), ""]
+    about = touched(theta)
+    sd = {name: covariance[i][i] ** 0.5 for i, name in enumerate(theta)}
+    section = ""
+    for line in dumps(changed).splitlines():
+        section = line.strip("[]") if line.startswith("[") else section
+        path = f"{section}.{line.split(' = ')[0]}" if " = " in line else ""
+        words = [f"{n} {theta[n]:+.4g} +- {sd[n]:.2g} {ALL[n].effect.unit}" for n in about.get(path, [])]
+        if section == "diagnosed" and " = " in line:
+            words = ["of the diagnosis above"]
+        lines.append(f"{line}  # {'; '.join(words)}" if words else line)
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def _diagnosed(experiment: Experiment, theta: Mapping[str, float], covariance: Sequence[Sequence[float]], plants: int):
+    """The joint posterior of the plant's effects; those of the sensors are no plant's."""
+    own = [i for i, name in enumerate(theta) if not all(k.path.startswith("sensing") for k in ALL[name].keys)]
+    names = list(theta)
+    rows = tuple(tuple(float(covariance[i][j]) for j in own) for i in own)
+    return dataclasses.replace(experiment.diagnosed, effects=tuple(names[i] for i in own), covariance=rows, plants=plants)
+
+
+def read(report: Mapping[str, Any], path: str) -> tuple[dict[str, float], list[list[float]]]:
+    """Sizes and covariance from the JSON that ``explain`` wrote.
+
+    Raises:
+        DiagnoseError: Something is missing, or effects of another model than the throw.
+    """
+    try:
+        theta = {str(name): float(size) for name, size in report["theta"].items()}
+        covariance = [[float(x) for x in row] for row in report["covariance"]]
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise DiagnoseError(f"{path}: no diagnosis that `visthrow diagnose explain` wrote: {error!r}") from error
+    if len(covariance) != len(theta) or any(len(row) != len(theta) for row in covariance):
+        raise DiagnoseError(f"{path}: {len(theta)} effects and a covariance of {len(covariance)} rows; expected one each")
+    strange = [name for name in theta if name not in ALL]
+    if strange:
+        raise DiagnoseError(
+            f"{path}: {', '.join(strange)} are no effects of the throw's simulator; apply writes configurations of that alone"
+        )
+    return theta, covariance
