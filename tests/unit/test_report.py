@@ -14,6 +14,7 @@ from visthrow.baseline import spline, thrower
 from visthrow.report import ablations, beyond, book, command, gap, page, throws, trade, wanted
 from visthrow.report.parts import Grid, Picture, Text
 from visthrow.results import Result
+from visthrow.sweep.cli import load_list
 
 
 @pytest.fixture(scope="module")
@@ -209,6 +210,14 @@ def test_what_the_report_stands_on_is_stated_once():
     assert len(set(keys)) == len(keys)
     assert {unit["target"] for unit in wanted.full()} == {1.5, 2.0, 2.5}
     assert len(wanted.quick()) == 5
+
+
+def test_the_quick_list_can_do_without_the_reference_plant():
+    plants = {}
+    for changes in ((), command.NO_REFERENCE):
+        units = load_list(wanted.QUICK_LIST, changes).throws.values()
+        plants[changes] = {unit.params.plant for row in units for unit in row}
+    assert plants == {(): {"hybrid", "reference-realistic"}, command.NO_REFERENCE: {"hybrid"}}
 
 
 QUICK = """

@@ -11,6 +11,9 @@ TITLE = "Throwing with a quadrotor: the paper's evidence and ours"
 UNITS = "throws"
 """Folder of single results, in the output folder."""
 
+NO_REFERENCE = ('runs.shipped.throws=["own"]',)
+"""Changes of the quick list where MuJoCo is not installed."""
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
@@ -87,15 +90,19 @@ def quick(out: Path, jobs: int) -> None:
     from visthrow.sweep.cli import load_list
     from visthrow.sweep.pool import Local, Pool
 
-    folder = out / "quick"
-    outcome = Pool(load_list(wanted.QUICK_LIST), folder, Local(wanted.QUICK_LIST, folder, ["cpu"], jobs), _say).run(None)
+    folder, changes = out / "quick", ()
+    if find_spec("mujoco") is None:
+        changes = NO_REFERENCE
+        _say("the reference plant is left out: it needs MuJoCo, pip install 'visthrow[reference]'")
+    local = Local(wanted.QUICK_LIST, folder, ["cpu"], jobs, changes)
+    outcome = Pool(load_list(wanted.QUICK_LIST, changes), folder, local, _say).run(None)
     if outcome.failed:
         told = "; ".join(f"{name}: {reason}" for name, reason in outcome.failed.items())
         raise VisthrowError(f"throws failed: {told}; all that was printed is in {folder / 'logs'}")
     if outcome.stopped:
         raise KeyboardInterrupt
     if find_spec("piqp") is None:
-        print("the baseline is left out: it needs piqp, pip install 'visthrow[baseline]'", file=sys.stderr)
+        _say("the baseline is left out: it needs piqp, pip install 'visthrow[baseline]'")
         return
     from visthrow.baseline.thrower import fly_unit
 
