@@ -26,7 +26,7 @@ class Book:
         results: sets of throws, batches joined.
         runs: training runs as the records hold them.
         findings: section -> text that somebody wrote beside the data.
-        throws: "all", or a note that these are few.
+        note: on the number of throws, where these are few.
     """
 
     results: tuple[Result, ...]

@@ -18,10 +18,8 @@ FRONT_THROWS = 10
 BOUNDS = ("payload and thrust", "payload")
 """What plans bound: ours, and the payload alone as the paper's do."""
 
-POLICY_LISTS = ("paper", "gap")
-"""Lists of ``configs/sweep`` that the full report reads; QUICK_LIST that of ``--quick``."""
-
 QUICK_LIST = "quick"
+"""List of ``configs/sweep`` for ``--quick``; the full report reads what the lists ``paper`` and ``gap`` made."""
 
 
 def full() -> list[dict[str, Any]]:
