@@ -58,7 +58,8 @@ def test_records_and_folders_are_read_and_batches_joined(tmp_path, full):
     for batch in (0, 1):
         one = made_up.policy(rng, "state", "state", "reference", 2.0, count=4)
         parts.append(Result({**one.unit, "batch": batch}, one.columns, made_up.MADE))
-    results.pack(parts, tmp_path / "throws" / "x.json")
+    old = Result({**parts[0].unit, "batch": 2, "protocol": results.PROTOCOL - 1}, parts[0].columns, made_up.MADE)
+    results.pack([*parts, old], tmp_path / "throws" / "x.json")
     (tmp_path / "findings").mkdir()
     (tmp_path / "findings" / "front.md").write_text("Why.\n")
     found = book.read([tmp_path])

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from visthrow.errors import StorageError
-from visthrow.results import RECORDS, Result, join, load_all
+from visthrow.results import PROTOCOL, RECORDS, Result, join, load_all
 
 SHIPPED = ("state", "vision")
 """Policies that come with the package."""
@@ -90,7 +90,7 @@ def _first(value: Any) -> float:
 
 
 def read(records: Iterable[Path] = (RECORDS,), folders: Iterable[Path] = (), note: str = "") -> Book:
-    """Read committed records, and folders of single results.
+    """Read committed records, and folders of single results; what an older protocol flew is left out.
 
     Args:
         records: folders with ``throws``, ``training`` and ``findings``; a later one counts over an earlier one.
@@ -101,7 +101,7 @@ def read(records: Iterable[Path] = (RECORDS,), folders: Iterable[Path] = (), not
         StorageError: a record that cannot be read.
     """
     records = [Path(place) for place in records]
-    found = load_all([*(place / "throws" for place in records), *folders])
+    found = load_all([*(place / "throws" for place in records), *folders]).values()
     runs: dict[str, dict] = {}
     findings: dict[str, str] = {}
     for place in records:
@@ -109,7 +109,8 @@ def read(records: Iterable[Path] = (RECORDS,), folders: Iterable[Path] = (), not
             runs.update({run.get("name", f"{run['run']}-{run['train_seed']}"): run for run in _runs(path)})
         for path in sorted((place / "findings").glob("*.md")):
             findings[path.stem] = path.read_text(encoding="utf-8").strip()
-    return Book(tuple(join(found.values())), tuple(runs.values()), findings, note)
+    today = [result for result in found if result.unit.get("protocol") == PROTOCOL]
+    return Book(tuple(join(today)), tuple(runs.values()), findings, note)
 
 
 def _runs(path: Path) -> list[dict[str, Any]]:
