@@ -133,8 +133,8 @@ def test_quaternion_turned_around_is_caught():
 
 
 def test_scrambled_commands_are_caught():
-    columns = flight()
-    columns["command"] = flight(seed=5)["command"]
+    columns = flight(40.0)
+    columns["command"] = flight(40.0, seed=5)["command"]
     assert "command, rate_b: the rates do not follow" in faults(log_of(columns))
 
 
@@ -196,6 +196,27 @@ def test_a_standing_vehicle_answers_nothing():
     (checked,) = check([log_of(dict(columns, motor_command=np.zeros((len(columns["time"]), 4))))])
     assert "never left its place" in table(checked)
     assert all(r.verdict == "warn" for r in checked.rows if r.topic == "answers")
+
+
+def test_a_payload_on_the_floor_is_not_frozen_and_not_on_the_cable():
+    columns = flight()
+    payload = columns["pos_w"] - [0.0, 0.0, 0.4]
+    payload[600:] = payload[600]
+    time = columns["time"]
+    landing = Channel(time[600:601], payload[600:601], "m", "world")
+    attached = Channel(time, time < time[550], "bool")
+    log = log_of(dict(columns, payload_pos_w=payload), landing=landing, attached=attached)
+    assert not faults(log)
+    assert "stands still" in faults(log_of(dict(columns, payload_pos_w=payload)))
+
+
+def test_explain_names_nothing_where_channels_contradict_each_other(tmp_path, capsys):
+    columns = flight()
+    columns["rate_b"] = columns["rate_b"] * 57.3
+    log_of(columns).save(tmp_path / "a.npz")
+    cli.main(["diagnose", "explain", str(tmp_path / "a.npz"), "--no-report", "--json", str(tmp_path / "a.json")])
+    assert "DATA INCONSISTENT" in capsys.readouterr().out
+    assert json.loads((tmp_path / "a.json").read_text())["overall"] == "DATA INCONSISTENT"
 
 
 def test_bodies_exchanged():

@@ -3,6 +3,8 @@
 import argparse
 from pathlib import Path
 
+from visthrow.diagnose.result import INCONSISTENT, OVERALL
+
 DEFAULT_OUT = "out/explain"
 
 
@@ -28,9 +30,16 @@ def run(args: argparse.Namespace) -> int:
 
     single()
     from visthrow.diagnose import opening, report, search
+    from visthrow.diagnose.check.run import check, contradictions
     from visthrow.storage import write_json
 
     model, logs = opening.open_model(args)
+    reasons = contradictions(check(logs))
+    if reasons:
+        print(f"{INCONSISTENT}: {OVERALL[INCONSISTENT]}\n" + "\n".join(f"  {reason}" for reason in reasons))
+        if args.json:
+            write_json(args.json, {"overall": INCONSISTENT, "reasons": reasons, "findings": []})
+        return 0
     print(f"{len(logs)} log(s), {len(model.effects)} effects on {', '.join(model.channels)}", flush=True)
     without = opening.numbers(args.without)
     diagnosis = search.explain(model, seed=args.seed, without=without, progress=lambda line: print(f"  {line}", flush=True))

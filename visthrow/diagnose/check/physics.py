@@ -259,6 +259,8 @@ def _cable(log: FlightLog) -> list[Row]:
     if len(time_q) < 20 or len(time_p) < 20:
         return []
     inside = (time_p > time_q[0]) & (time_p < time_q[-1])
+    if "attached" in log:
+        inside &= log["attached"].hold(time_p).astype(bool)
     gap = p[inside] - relations.on_grid(time_q, q, time_p[inside])
     length = np.linalg.norm(gap, axis=1)
     if len(length) < 20:

@@ -31,7 +31,8 @@ def draw(log: FlightLog, checked: Checked, path: str | Path) -> None:
         axis.spines["left"].set_color(_SHADE[verdict])
         axis.spines["left"].set_linewidth(4)
     axes[-1, 0].set_xlabel("time [s]")
-    axes[0, 0].set_title(f"{checked.name}: {checked.verdict} (bar at the left: green ok, yellow warn, red bad)", loc="left")
+    legend = "left bar: green ok, yellow warn, red bad; x, y, z: blue, red, green"
+    axes[0, 0].set_title(f"{checked.name}: {checked.verdict} ({legend})", loc="left", fontsize=10)
     figure.tight_layout()
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path)

@@ -9,7 +9,7 @@ import numpy as np
 
 from visthrow.diagnose.check import excitation, physics, signals
 from visthrow.diagnose.check.rows import Row, Verdict, worst
-from visthrow.flightlog import FlightLog
+from visthrow.flightlog import Channel, FlightLog
 
 _ALIKE = 0.2
 """Logs that share a larger part of their samples are copies of one another."""
@@ -59,6 +59,7 @@ def label(log: FlightLog, number: int) -> str:
 def _look(log: FlightLog) -> list[Row]:
     if not log.channels:
         return [Row("clock", "", "bad", "no channel at all")]
+    log = _until_landing(log)
     rows = _reader(log)
     for name, channel in log.channels.items():
         rows += signals.look(name, channel, signals.notes_of(log, name))
@@ -66,6 +67,20 @@ def _look(log: FlightLog) -> list[Row]:
     known = {name: channel for name, channel in log.channels.items() if np.sum(channel.valid) >= signals.FEW_SAMPLES}
     usable = FlightLog(known, log.meta)
     return rows + physics.look(usable) + excitation.look(usable)
+
+
+def _until_landing(log: FlightLog) -> FlightLog:
+    """Without the payload's samples after its landing: what lies on the floor stands still."""
+    if "landing" not in log or not len(log["landing"].time):
+        return log
+    end = float(log["landing"].time[0])
+    channels = dict(log.channels)
+    for name in ("payload_pos_w", "payload_vel_w", "cable_points_w"):
+        if name in channels:
+            c = channels[name]
+            keep = c.time <= end
+            channels[name] = Channel(c.time[keep], c.values[keep], c.unit, c.frame, c.valid[keep])
+    return FlightLog(channels, log.meta)
 
 
 def _reader(log: FlightLog) -> list[Row]:
