@@ -47,6 +47,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             "--out", default=None, metavar="FOLDER", help="of the run (default: a new one in runs/hil)"
         )
         subs[name].add_argument("--view", action="store_true", help="serve a live view to this machine's browser")
+        subs[name].add_argument(
+            "--bare", action="store_true", help="leave out flight logs and pictures; `hil view` makes them later"
+        )
     subs["run"].add_argument(
         "--write-parameters", action="store_true", help="set the autopilot's parameters that the audit finds wrong"
     )
@@ -186,7 +189,8 @@ def _run(args: argparse.Namespace) -> int:
     if viewer is not None:
         viewer.terminate()
     print(story(summary, folder))
-    print("\n".join(finish(folder, stages)))
+    if not args.bare:
+        print("\n".join(finish(folder, stages)))
     return 1 if summary["aborted"] or summary["errors"] else 0
 
 

@@ -15,8 +15,8 @@ from typing import Any
 
 from visthrow.errors import VisthrowError
 
-READY, ENDED = 60.0, 30.0
-"""Most that a start, and that an end, may take [s]."""
+ENDED = 120.0
+"""Most that the end of a run may take once it was told to [s]."""
 
 COMMAND = (sys.executable, "-m", "visthrow.cli", "hil")
 
@@ -56,7 +56,8 @@ class Pair:
         """
         port, report = free_port(), folder.with_suffix(".fake.json")
         folder.parent.mkdir(parents=True, exist_ok=True)
-        run = [*COMMAND, "run", "--set", f'link.device="udp:127.0.0.1:{port}"', "--out", str(folder), "--auto-arm", *self.run]
+        run = [*COMMAND, "run", "--set", f'link.device="udp:127.0.0.1:{port}"', "--out", str(folder), "--auto-arm", "--bare"]
+        run += self.run
         fake = [*COMMAND, "fake", "--device", f"udpout:127.0.0.1:{port}", "--out", str(report), *self.fake]
         with self._started(run, self.core) as runner:
             said = _first_line(runner)
