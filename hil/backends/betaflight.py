@@ -107,7 +107,7 @@ class Betaflight:
         self.release_record = Release(params.release_timeout, params.servo_output > 0)
         rules = self._rules() if params.audit else ()
         self.audit = Audit(rules, self._ask_setting, self._write_setting if write else None, tell)
-        self._order = [0, 1, 3, 2]  # rcmap AETR: where roll, pitch, yaw, throttle stand in a frame
+        self._order: list[int] = []  # rcmap: where roll, pitch, yaw, throttle stand in a frame; empty: not told yet
         self._boxes: tuple[int, ...] = ()
         self._tuning = b""
         self._polled = dict.fromkeys(POLLS, -1e9)
@@ -157,7 +157,7 @@ class Betaflight:
         p = self.params
         if now - self._heard > p.silence:
             return "no answer by MSP" if self._heard < 0.0 else f"no answer by MSP for {now - self._heard:.1f} s", WAIT
-        if not (self.audit.done and self._boxes):
+        if not (self.audit.done and self._boxes and self._order):
             return "settings are being read", WAIT
         armed, ours = self._box(BOX_ARM), p.arm_channel > 0 or self._box(BOX_OVERRIDE)
         if armed and ours and self._taken:
@@ -186,6 +186,8 @@ class Betaflight:
 
     def _frame(self, now: float) -> bool:
         p = self.params
+        if not self._order:  # a stick in another's place is worse than none
+            return False
         channels = [LOW] * (STICKS + max(4, p.arm_channel, p.release_channel))
         for i, value in enumerate(self._sticks_us):
             channels[self._order[i]] = value
@@ -222,7 +224,7 @@ class Betaflight:
             if now - self._polled[command] >= period:
                 self._polled[command] = now
                 self._write(command)
-        if not self._boxes and now - self._boxed >= 0.5:
+        if not (self._boxes and self._order) and now - self._boxed >= 0.5:
             self._boxed = now
             self._write(msp.BOXIDS)
             self._write(msp.RX_MAP)

@@ -2,6 +2,7 @@
 
 import os
 import struct
+import time
 import tty
 
 import pytest
@@ -33,12 +34,23 @@ def wire():
     os.close(line)
 
 
-def asked(controller):
-    """Commands that have come to the flight controller."""
-    try:
-        return [frame.command for frame in msp.Parser().parse(os.read(controller, 65536))]
-    except BlockingIOError:
-        return []
+def asked(controller, command):
+    """Whether a command comes to the flight controller."""
+    parser, end = msp.Parser(), time.monotonic() + 30.0
+    while time.monotonic() < end:
+        try:
+            if any(frame.command == command for frame in parser.parse(os.read(controller, 65536))):
+                return True
+        except BlockingIOError:
+            time.sleep(0.005)
+    return False
+
+
+def serve(backend, now):
+    """For a while, at one time of the runner's: a pseudo-terminal hands on in pieces."""
+    for _ in range(20):
+        backend.service(now)
+        time.sleep(0.01)
 
 
 def test_a_back_end_on_a_serial_port(wire):
@@ -46,17 +58,21 @@ def test_a_back_end_on_a_serial_port(wire):
     backend = Betaflight(port, PARAMS)
     assert port.read() is None, "reading never waits"
     backend.service(0.0)
-    assert msp.STATUS in asked(controller)
+    assert asked(controller, msp.STATUS)
     assert not backend.status(0.1).connected
     answer = msp.pack(msp.Frame(msp.STATUS, STATUS, msp.ANSWER))
     os.write(controller, answer[:7])
-    backend.service(0.2)
+    serve(backend, 0.2)
     os.write(controller, answer[7:] + msp.pack(msp.Frame(msp.BOXIDS, bytes([0, 1, 27, 50]), msp.ANSWER)))
-    backend.service(0.3)
-    assert backend.status(0.3).connected
-    backend.ask("follow", 0.3)
-    assert backend.send((2.668, 0.0, 0.0, 0.0), 0.3)
-    assert msp.SET_RAW_RC in asked(controller)
+    serve(backend, 0.3)
+    assert not backend.send((2.668, 0.0, 0.0, 0.0), 0.3), "the order of the channels is not known yet"
+    assert not backend.status(0.3).connected
+    os.write(controller, msp.pack(msp.Frame(msp.RX_MAP, bytes([0, 1, 3, 2, 4, 5, 6, 7]), msp.ANSWER)))
+    serve(backend, 0.35)
+    assert backend.status(0.35).connected
+    backend.ask("follow", 0.4)
+    assert backend.send((2.668, 0.0, 0.0, 0.0), 0.4)
+    assert asked(controller, msp.SET_RAW_RC)
 
 
 def test_a_port_that_is_none():
@@ -70,14 +86,19 @@ def test_what_went_over_the_port_is_written_down(wire, tmp_path):
     logged = LoggedPort(port, tmp_path / "run" / "link.msp")
     logged.write(b"abc")
     os.write(controller, b"defg")
-    assert logged.read() == b"defg"
+    heard, end = b"", time.monotonic() + 30.0
+    while len(heard) < 4 and time.monotonic() < end:
+        heard += logged.read() or b""
+    assert heard == b"defg"
     assert logged.read() is None
     assert logged.fileno() == port.fileno()
     logged.close()
     path = tmp_path / "run" / "link.msp"
-    assert [(way, data) for _, way, data in read_log(path)] == [(b"<", b"abc"), (b">", b"defg")]
+    chunks = [(way, data) for _, way, data in read_log(path)]
+    assert chunks[0] == (b"<", b"abc")
+    assert b"".join(data for way, data in chunks if way == b">") == b"defg", "in pieces, as they came"
     path.write_bytes(path.read_bytes()[:-1])
-    assert [data for _, _, data in read_log(path)] == [b"abc"], "a killed run: what was cut short is left out"
+    assert [(w, d) for _, w, d in read_log(path)] == chunks[:-1], "a killed run: what was cut short is left out"
     path.write_bytes(b"x" * 100)
     with pytest.raises(RunError, match="damaged at byte 0"):
         list(read_log(path))
