@@ -9,6 +9,8 @@ import time
 from pathlib import Path
 
 DEFAULT_OUT = "runs/sweep"
+RELEASE_TARGET, RELEASE_COUNT = 2.0, 200  # as the throws of the ablations [m], and how many
+ACTIONS = ("run", "status", "collect", "releases", "work")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -20,11 +22,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "  visthrow sweep run paper --slurm partition=gpu --devices 8 --minutes 60    as jobs of a cluster\n"
         "  visthrow sweep status paper                                   a line a run\n"
         "  visthrow sweep collect paper --records out/records            what is committed of it\n"
+        "  visthrow sweep releases paper --units state-1,state_rigid_cable-1    how these policies let go, at 2 m\n"
         "\nWhat is done is not done again: a training run is known by its resolved config and seed, throws by the policy's\n"
         "content and everything else they depend on. Ctrl-C, a kill or a power cut lose what was not yet in a checkpoint.\n"
     )
     add = parser.add_argument
-    add("action", choices=("run", "status", "collect", "work"), help="work is what run starts processes with")
+    add("action", choices=ACTIONS, help="work is what run starts processes with")
     add("list", metavar="LIST", help="name of configs/sweep, or a TOML file of your own")
     add("--out", metavar="FOLDER", default=DEFAULT_OUT, help=f"of all results (default: {DEFAULT_OUT})")
     devices = "one training at once on each: cuda:0,cuda:1; with a cluster how many (default: auto)"
@@ -33,8 +36,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--minutes", type=float, help="end after so long with checkpoints; on a cluster the length of a job")
     add("--slurm", metavar="KEY=VALUE", action="append", help="submit jobs, with this option of sbatch; may be repeated")
     add("--records", metavar="FOLDER", help="collect: where to (default: records beside the results)")
-    add("--units", metavar="NAMES", help="work: what to do, with commas between")
-    add("--device", default="auto", help="work: where")
+    add("--units", metavar="NAMES", help="work and releases: which, with commas between")
+    add("--device", default="auto", help="work and releases: where")
     add("--parent", type=int, metavar="ID", help="work: process with which this one is to end")
     add(
         "--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE",
@@ -58,7 +61,8 @@ def load_list(name: str, overrides: tuple[str, ...] = ()):
 
 def run(args: argparse.Namespace) -> int:
     """Run, tell, collect."""
-    return {"run": _run, "status": _status, "collect": _collect, "work": _work}[args.action](args)
+    actions = {"run": _run, "status": _status, "collect": _collect, "releases": _releases, "work": _work}
+    return actions[args.action](args)
 
 
 def _run(args: argparse.Namespace) -> int:
@@ -148,4 +152,26 @@ def _collect(args: argparse.Namespace) -> int:
     out = Path(args.out)
     for path in collect(load_list(args.list, tuple(args.overrides)), out, Path(args.records or out / "records")):
         print(path)
+    return 0
+
+
+def _releases(args: argparse.Namespace) -> int:
+    from visthrow.device import resolve
+    from visthrow.errors import ConfigError, suggest
+    from visthrow.loading import load_policy
+    from visthrow.sweep.release import HEAD, releases, row
+
+    work, out, device = load_list(args.list, tuple(args.overrides)), Path(args.out), resolve(args.device)
+    known = {source.name: source for source in work.sources if source.config and source.done(out)}
+    print(HEAD)
+    for name in (args.units or ",".join(known)).split(","):
+        if name not in known:
+            raise ConfigError(f"no trained policy '{name}' in {out}; {suggest(name, known)}")
+        source = known[name]
+        layout = source.experiment().task.observation.layout
+        vehicle = ("vehicle", "rope", "release", "observation.latency")
+        for where, config_name, changes in (("its own", source.config, source.changes), ("the full", layout, ())):
+            if where == "its own" or source.config != layout:
+                loaded = load_policy(source.policy(out), config_name, changes, vehicle)
+                print(row(name, where, releases(loaded, RELEASE_TARGET, RELEASE_COUNT, device)), flush=True)
     return 0
