@@ -219,6 +219,17 @@ def test_explain_names_nothing_where_channels_contradict_each_other(tmp_path, ca
     assert json.loads((tmp_path / "a.json").read_text())["overall"] == "DATA INCONSISTENT"
 
 
+def test_two_vehicles_with_one_payload_tell_their_clocks():
+    first, other = flight(), flight(seed=3)
+    late = dict(other, time=other["time"] + 0.013)
+    first["payload_pos_w"] = first["pos_w"] - [0, 0, 0.4]
+    late["payload_pos_w"] = first["payload_pos_w"] + np.random.default_rng(0).normal(0, 2e-4, first["pos_w"].shape)
+    rows = [r for r in check([log_of(first), log_of(late)])[1].rows if "rms_m" in r.figures]
+    assert rows[0].figures["delay_s"] == pytest.approx(0.013, abs=1e-3)
+    second = dict(late, payload_pos_w=other["pos_w"])
+    assert not [r for r in check([log_of(first), log_of(second)])[1].rows if "rms_m" in r.figures]
+
+
 def test_bodies_exchanged():
     columns = flight()
     columns["payload_pos_w"] = columns["pos_w"] + [0.0, 0.0, 0.4]

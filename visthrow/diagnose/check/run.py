@@ -3,16 +3,20 @@
 import hashlib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 
-from visthrow.diagnose.check import excitation, physics, signals
+from visthrow.diagnose.check import excitation, physics, relations, signals
 from visthrow.diagnose.check.rows import Row, Verdict, worst
 from visthrow.flightlog import Channel, FlightLog
 
 _ALIKE = 0.2
 """Logs that share a larger part of their samples are copies of one another."""
+_ONE_PAYLOAD = 0.005
+"""Two logs whose payloads' paths agree to this [m] hold one payload."""
+_MOST_PAIRED = 12
 _MOVING = ("pos", "rate", "acc", "quat", "vel", "angle", "thrust", "motor")
 
 
@@ -35,8 +39,8 @@ class Checked:
 
 def check(logs: Sequence[FlightLog]) -> list[Checked]:
     """Look at logs one by one, and at what they have in common."""
-    copies = _copies(logs)
-    return [Checked(label(log, i), (*_look(log), *copies.get(i, ()))) for i, log in enumerate(logs)]
+    copies, shared = _copies(logs), _shared_payloads(logs)
+    return [Checked(label(log, i), (*_look(log), *copies.get(i, ()), *shared.get(i, ()))) for i, log in enumerate(logs)]
 
 
 def contradictions(results: Sequence[Checked]) -> list[str]:
@@ -120,6 +124,30 @@ def _copies(logs: Sequence[FlightLog]) -> dict[int, list[Row]]:
             if shared > _ALIKE and prints[i]:
                 text = f"shares {100 * shared:.0f} % of its samples with {label(logs[i], i)}: a copy counts once"
                 found.setdefault(j, []).append(Row("duplicates", "", "bad", text, {"copy_of": i, "shared": shared}))
+    return found
+
+
+def _shared_payloads(logs: Sequence[FlightLog]) -> dict[int, list[Row]]:
+    """Logs of several vehicles with one payload: how far their clocks are apart."""
+    found: dict[int, list[Row]] = {}
+    named = [i for i, log in enumerate(logs) if "payload_pos_w" in log and np.sum(log["payload_pos_w"].valid) > 100]
+    for first, second in combinations(named[:_MOST_PAIRED], 2):
+        both = (logs[i]["payload_pos_w"] for i in (first, second))
+        (time_a, a), (time_b, b) = ((c.time[c.valid], c.values[c.valid]) for c in both)
+        if max(np.max(np.std(a, axis=0)), np.max(np.std(b, axis=0))) < physics.MOVES:
+            continue
+        relation = relations.relate(time_a, a.astype(float), time_b, b.astype(float))
+        if relation is None or relation.correlation < 0.99:
+            continue
+        inside = (time_a > time_b[0] - relation.delay) & (time_a < time_b[-1] - relation.delay)
+        apart = a[inside] - relations.on_grid(time_b, b.astype(float), time_a[inside] + relation.delay)
+        off = float(np.sqrt(np.mean(apart**2))) if np.any(inside) else np.inf
+        if off < _ONE_PAYLOAD:
+            late, sd = 1e3 * relation.delay, 1e3 * relation.delay_sd
+            text = f"the payload of {label(logs[first], first)} to {1e3 * off:.1f} mm, "
+            text += f"this clock {late:+.1f} ms behind (sd {sd:.1f} ms)"
+            figures = {"with": first, "delay_s": relation.delay, "delay_sd_s": relation.delay_sd, "rms_m": off}
+            found.setdefault(second, []).append(Row("clock", "payload_pos_w", "warn", text, figures))
     return found
 
 

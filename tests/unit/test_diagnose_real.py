@@ -1,0 +1,129 @@
+"""Recorded data of others: what is said of each, and what is not. The reasons stand in visthrow/diagnose/real_data.md.
+
+With the environment variable VISTHROW_REAL_DATA naming a folder of the full data sets, all of their files are looked at.
+"""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from visthrow.diagnose import setup as setups
+from visthrow.diagnose.check.run import check, contradictions
+from visthrow.diagnose.ingest import read_all
+from visthrow.diagnose.result import CLASS, FOUND, KNOWN, NO_EFFECT
+from visthrow.diagnose.search import explain
+
+DATA = Path(__file__).resolve().parents[1] / "data"
+REAL = DATA / "real"
+FULL = Path(os.environ.get("VISTHROW_REAL_DATA", REAL))
+SETUPS = {
+    "betaflight_bbl": None, "crazypad_faults": "crazypad", "jugglebot_throws": "jugglebot", "motor_prop_stand": "motor_stand",
+    "nanobench_cf21": "nanobench_cf21", "payload_cf_single": "cf_payload", "payload_cf_two_drones": "cf_payload_pair",
+    "pendulum_single": "pendulum_encoder", "slungload_camera": "slungload_camera",
+}  # fmt: skip
+
+pytestmark = pytest.mark.slow
+
+
+def explained(setup: str, *paths: Path):
+    logs = setups.read_logs(paths, setup)
+    model = setups.model_of(setups.load(setup), logs)
+    diagnosis = explain(model, seed=0)
+    named = {f.name for f in diagnosis.findings if f.verdict in (FOUND, CLASS)}
+
+    def rms(theta, channel=0):
+        own = [s.channel == channel for s in model.stretches]
+        return float(np.sqrt(np.mean(np.concatenate([r[o] for r, o in zip(model.residuals(theta), own)]) ** 2)))
+
+    return diagnosis, named, rms
+
+
+@pytest.mark.parametrize("folder", list(SETUPS))
+def test_every_file_gets_a_verdict(folder):
+    root = FULL / folder if (FULL / folder).is_dir() else DATA / folder
+    files = sorted(p for p in root.iterdir() if p.name.endswith((".csv.gz", ".bbl")))
+    assert files
+    for path in files:
+        logs = setups.read_logs([path], SETUPS[folder]) if SETUPS[folder] else read_all([path])
+        for checked in check(logs):
+            assert checked.verdict in ("ok", "warn", "bad")
+            assert not [reason for reason in contradictions([checked]) if "idle" not in reason and "place" not in reason
+                        and "no sign of flight" not in reason]  # fmt: skip
+
+
+def test_the_raw_blackbox_never_flew():
+    first, second = check(read_all([REAL / "betaflight_bbl" / "btfl_001_start.bbl"]))
+    assert any("no sign of flight" in row.text for row in second.rows)
+    assert first.verdict == second.verdict == "bad"
+
+
+def test_two_drones_run_on_two_clocks():
+    folder = REAL / "payload_cf_two_drones"
+    rows = check(setups.read_logs(sorted(folder.glob("*.gz")), "cf_payload_pair"))[1].rows
+    (row,) = [row for row in rows if "rms_m" in row.figures]
+    assert row.figures["delay_s"] == pytest.approx(0.0054, abs=0.002)
+    assert row.figures["rms_m"] < 1e-3
+
+
+def test_streams_of_nanobench_are_not_aligned_to_half_a_millisecond():
+    (checked,) = check(setups.read_logs([REAL / "nanobench_cf21" / "B3_figure8_fast_rep1.csv.gz"], "nanobench_cf21"))
+    drift = [row for row in checked.rows if row.channel == "pos_w, est_pos_w" and "delays_s" in row.figures]
+    assert np.ptp(drift[0].figures["delays_s"]) > 5e-3
+
+
+def test_pendulum_has_three_frictions():
+    diagnosis, named, rms = explained("pendulum_encoder", REAL / "pendulum_single" / "single_pendulum_id.csv.gz")
+    assert diagnosis.overall == KNOWN
+    assert {"pendulum_length", "coulomb_friction", "quadratic_drag"} <= named
+    assert diagnosis["pendulum_length"].estimate == pytest.approx(-0.0167, abs=3e-4)
+    assert rms(diagnosis.theta) < 0.1 * rms({})
+
+
+def test_ball_has_drag_and_sideways_forces_cannot_be_told_apart():
+    diagnosis, named, rms = explained("jugglebot", REAL / "jugglebot_throws" / "session7.csv.gz")
+    assert named & {"ball_drag", "linear_drag"}
+    assert rms(diagnosis.theta) < 0.5 * rms({})
+
+
+def test_a_cut_propeller_is_found_and_tape_is_not():
+    folder = REAL / "crazypad_faults"
+    diagnosis, named, _ = explained("crazypad", folder / "cut_propeller_M3_2.5mm_2.5mm_42mm__E8_log00.csv.gz")
+    assert diagnosis.overall == KNOWN
+    assert "motor_rl" in named
+    assert diagnosis["motor_rl"].estimate == pytest.approx(-0.15, abs=0.04)
+    assert set(diagnosis.theta) <= {"motor_rl", "added_rl"}
+    diagnosis, named, _ = explained("crazypad", folder / "tape_on_propeller_M3__E8_log00.csv.gz")
+    assert diagnosis.overall == NO_EFFECT
+    assert not named
+
+
+def test_cable_is_ten_millimetres_longer_and_thrust_stronger():
+    flights = [REAL / "payload_cf_single" / f"log{number}.csv.gz" for number in (204, 205, 206)]
+    diagnosis, named, rms = explained("cf_payload", *flights)
+    assert named & {"rope_length", "marker_z"}
+    assert named & {"thrust_gain", "mass_quad"}
+    length = next(f for f in diagnosis.findings if f.name in ("rope_length", "marker_z") and f.verdict in (FOUND, CLASS))
+    assert length.estimate == pytest.approx(0.010, abs=2e-3)
+    assert rms(diagnosis.theta, 1) < 0.5 * rms({}, 1)
+
+
+def test_thrust_map_drag_and_battery_of_nanobench():
+    diagnosis, named, rms = explained("nanobench_cf21", REAL / "nanobench_cf21" / "B3_figure8_fast_rep1.csv.gz")
+    assert named & {"thrust_gain", "mass_quad"}
+    assert named & {"rotor_drag_xy", "parasitic"}
+    assert rms(diagnosis.theta) < 0.2 * rms({})
+
+
+def test_propellers_differ_and_the_supply_does_not_matter():
+    diagnosis, named, rms = explained("motor_stand", REAL / "motor_prop_stand" / "all_tests.csv.gz")
+    assert named & {"thrust_linear", "thrust_exponent"}
+    assert "thrust_voltage" not in named
+    assert rms(diagnosis.theta) < rms({})
+
+
+def test_the_camera_sees_the_load_nearer_the_axis():
+    diagnosis, named, rms = explained("slungload_camera", *sorted((DATA / "slungload_camera").glob("*.gz")))
+    assert "focal_scale" in named
+    assert rms(diagnosis.theta) < 0.6 * rms({})
