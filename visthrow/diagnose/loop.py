@@ -46,7 +46,8 @@ class Loop:
         flights: to be diagnosed.
         throws: of each policy on the plant, in the end.
         target: of those throws, along x [m].
-        device: of diagnosis and trainings.
+        device: of the trainings.
+        diagnose_on: device of the diagnosis.
         processes: for flights and throws.
         changes: ``key=value`` of the trainings, such as fewer iterations for a trial.
     """
@@ -59,6 +60,7 @@ class Loop:
     throws: int = 200
     target: float = 2.0
     device: str = "cpu"
+    diagnose_on: str = "cpu"
     processes: int = 2
     changes: tuple[str, ...] = ()
 
@@ -134,7 +136,7 @@ class Loop:
         answer = self.folder / "verdict.json"
         if not answer.exists():
             command = [sys.executable, "-m", "visthrow.cli", "diagnose", "explain", *map(str, logs)]
-            command += ["--plant", self.base, "--no-report", "--device", self.device, "--json", str(answer)]
+            command += ["--plant", self.base, "--no-report", "--device", self.diagnose_on, "--json", str(answer)]
             done = subprocess.run(command, capture_output=True, text=True, check=False)
             if done.returncode != 0 or not answer.exists():
                 raise DiagnoseError(f"the diagnosis failed: {(done.stdout + done.stderr)[-600:]}")

@@ -19,7 +19,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--flights", type=int, default=12, help="that are diagnosed (default: 12)")
     parser.add_argument("--throws", type=int, default=200, help="of each policy in the end (default: 200)")
     parser.add_argument("--processes", type=int, help="for flights and throws (default: one a core)")
-    parser.add_argument("--device", default="auto", metavar="NAME", help="of diagnosis and training")
+    parser.add_argument("--device", default="auto", metavar="NAME", help="of the trainings")
+    parser.add_argument("--diagnose-on", default="cpu", metavar="NAME", help="device of the diagnosis (default: cpu)")
     parser.add_argument("--set", action="append", default=[], dest="changes", metavar="KEY=VALUE", help="in the trainings")
     parser.add_argument("--out", default=DEFAULT_OUT, metavar="FOLDER", help=f"(default: {DEFAULT_OUT})")
 
@@ -50,6 +51,7 @@ def run(args: argparse.Namespace) -> int:
     folder = Path(args.out) / "-".join(f"{n}_{v:g}" for n, v in hidden.items())
     record = loop.Loop(
         hidden, folder, flights=args.flights, throws=args.throws, device=resolve(args.device),
+        diagnose_on=resolve(args.diagnose_on),
         processes=args.processes or cores(), changes=tuple(args.changes),
     ).run(lambda line: print(f"  {line}", flush=True))  # fmt: skip
     print("\n" + loop.table([record]))
