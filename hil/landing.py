@@ -19,6 +19,11 @@ NEAR = 8
 """Poses before the ground that the landing is carried forward from: free fall needs no model of drag over 0.1 s."""
 
 
+UNSEEN, MOST_BLIND = 0.1, 0.15
+"""A ball whose poses ended this long ago [s], and no longer than that before the ground [s], has landed where its fall leads: the
+impact itself looks like a jump to a gate that has missed the poses before it."""
+
+
 @dataclass(frozen=True)
 class Landing:
     """One throw as the payload's poses tell it; times on the runner's clock."""
@@ -66,6 +71,19 @@ class Flight:
         if len(self._times) < NEAR or pos[2] > self.height + 0.05 or self._rising():
             return None
         return self._landing()
+
+    def overdue(self, now: float) -> Landing | None:
+        """The landing of a ball that was lost from sight shortly before the ground.
+
+        Args:
+            now: [s].
+        """
+        seen = self._times
+        free = len(seen) >= NEAR and seen[-NEAR] > self.latch + self.lag
+        if not free or now - seen[-1] < UNSEEN:
+            return None
+        landing = self._landing()
+        return landing if landing.time - seen[-1] < MOST_BLIND and landing.time < now - UNSEEN else None
 
     def _rising(self) -> bool:
         return self._points[-1][2] > self._points[-2][2]

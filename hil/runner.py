@@ -208,10 +208,13 @@ class Runner:
             if took and self.watcher is not None:
                 self.watcher(pose.body, track)
             if took and pose.body == PAYLOAD and self._flight is not None:
-                landing = self._flight.add(pose.arrival - pose.transit(self.params.delay.source), track.gate.last.pos)
-                if landing is not None:
-                    self.landings.append(landing)
-                    self._flight = None
+                self._down(self._flight.add(pose.arrival - pose.transit(self.params.delay.source), track.gate.last.pos))
+
+    def _down(self, landing: Landing | None) -> None:
+        """Note a landing, where there is one."""
+        if landing is not None:
+            self.landings.append(landing)
+            self._flight = None
 
     def _tick(self, now: float, poses: list[Pose], status: Status, words: Words, recording: bool) -> Decision:
         begin = perf_counter()
@@ -219,6 +222,8 @@ class Runner:
             error, self._untaken = self._untaken, None
             raise error
         self._take(poses)
+        if self._flight is not None:
+            self._down(self._flight.overdue(now))
         if self.machine.state in (State.IDLE, State.CHECK):
             for track in self.tracks.values():
                 # On the ground a body may be carried about out of sight; in flight what has jumped stays refused.

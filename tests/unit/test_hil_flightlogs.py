@@ -12,7 +12,7 @@ import pytest
 
 from hil import flightlogs, view
 from hil.errors import RunError
-from hil.landing import separation
+from hil.landing import Flight, separation
 from hil.record import load_run
 from hil.report import finish, throw_logs
 from tests.hil_flight import TICK
@@ -122,6 +122,22 @@ def test_where_the_rope_let_go_is_found_in_noisy_poses():
         assert np.linalg.norm(np.subtract(where, start)) < 0.03
     assert abs(np.mean(found)) < CLOCK
     assert np.std(found) < 2 * CLOCK
+
+
+def test_a_ball_lost_from_sight_before_the_ground_has_landed_all_the_same():
+    """Let go at 0.11 s from 1.1 m at 4 m/s; it is seen until 60 ms, or 250 ms, before it comes down."""
+    fall = math.sqrt(2 * (1.1 - 0.04) / 9.81)
+    for before, found in ((0.06, True), (0.25, False)):
+        flight = Flight((2.0, 0.0, 0.0), 0.0, 0.0, 0.04, 0.11)
+        for t in np.arange(0.0, 0.11 + fall - before, 0.01):
+            free = max(t - 0.11, 0.0)
+            assert flight.add(t, (4.0 * free, 0.0, 1.1 - 0.5 * 9.81 * free * free)) is None
+        assert flight.overdue(0.11 + fall + 0.02) is None, "not yet"
+        landing = flight.overdue(0.11 + fall + 0.2)
+        assert (landing is not None) == found
+        if found:
+            assert landing.time == pytest.approx(0.11 + fall, abs=1e-6)
+            np.testing.assert_allclose(landing.landing_w, (4.0 * fall, 0.0, 0.04), atol=1e-6)
 
 
 def test_no_separation_where_the_poses_do_not_tell():
