@@ -225,7 +225,7 @@ class HybridPlant:
 
 
 class ReferenceAdapter:
-    """The reference plant, with the pinned extras or with none but the latency that the policy was trained for."""
+    """The reference plant, with the pinned extras or with none but the latency and drag that the policy was trained for."""
 
     def __init__(self, experiment: Experiment, count: int = 1, seed: int = 0, realistic: bool = True) -> None:
         """Build the plant.
@@ -239,7 +239,8 @@ class ReferenceAdapter:
         from sim.reference.extras import ReferenceExtras, load_extras
         from sim.reference.plant import ReferencePlant
 
-        trained = ReferenceExtras(mocap_latency=float(np.mean(experiment.task.observation.latency)))
+        known = {"payload_drag": experiment.rope.payload_drag}
+        trained = ReferenceExtras(mocap_latency=float(np.mean(experiment.task.observation.latency)), **known)
         extras = load_extras(config.find("vehicle", "reference_realistic")) if realistic else trained
         self.name = "reference-realistic" if realistic else "reference"
         self.params, self.count = plant_of(experiment), count

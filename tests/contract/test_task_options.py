@@ -11,6 +11,7 @@ from visthrow import cli, config, protocol
 from visthrow.env import ThrowEnv
 from visthrow.errors import MismatchError
 from visthrow.loading import load_policy
+from visthrow.plants import ReferenceAdapter
 from visthrow.reference_protocol import Job, fly_batch
 from visthrow.task import Experiment, TargetParams, contract_of
 
@@ -161,6 +162,13 @@ def test_a_field_with_a_default_enters_the_contract_only_where_it_differs():
     assert moving["observation"]["goal_velocity"] is True
     assert "payload_drag" not in plain["rope"]
     assert contract_of(experiment("state_drag"))["rope"]["payload_drag"] == pytest.approx(1.04e-3)
+
+
+def test_the_plain_reference_plant_has_the_drag_of_the_training_and_the_realistic_one_its_own():
+    params = experiment("state_drag")
+    assert ReferenceAdapter(params, realistic=False)._plant.extras.payload_drag == params.rope.payload_drag > 0.0
+    assert ReferenceAdapter(experiment("state"), realistic=False)._plant.extras.payload_drag == 0.0
+    assert ReferenceAdapter(params, realistic=True)._plant.extras.payload_drag == pytest.approx(1.044e-3)
 
 
 def test_speeds_that_make_no_range_are_refused():
