@@ -1,10 +1,13 @@
 """The small models against physics of another hand: scipy's integrator, closed forms, and planted parameters found again."""
 
+import json
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
+from visthrow import cli, config
 from visthrow.diagnose import fit as fitting
 from visthrow.diagnose import setup as setups
 from visthrow.diagnose.models.ball import BallModel, BallParams
@@ -15,6 +18,7 @@ from visthrow.diagnose.models.stand import StandModel, StandParams
 from visthrow.diagnose.models.trim import TrimModel, TrimParams
 from visthrow.errors import ConfigError, DiagnoseError, LogError
 from visthrow.flightlog import Channel, FlightLog
+from visthrow.logexport import export
 
 G = 9.81
 TIGHT = {"rtol": 1e-10, "atol": 1e-12}
@@ -130,6 +134,23 @@ class TestStand:
         told = vehicle.thrust.k_f * speed**2 + vehicle.thrust.k_1 * speed
         assert told == pytest.approx(1.4e-6 * speed**2 + 3e-4 * speed, rel=0.02)
 
+    def test_command_line_writes_a_vehicle(self, tmp_path, capsys):
+        for i in range(3):
+            export(self.log(k_1=3e-4, seed=i), tmp_path / f"{i}.csv")
+        setup = setups.Setup("a stand", stand=STAND)
+        (tmp_path / "mine.toml").write_text(config.dumps(setup))
+        logs = [str(tmp_path / f"{i}.csv") for i in range(3)]
+        out = tmp_path / "out"
+        assert cli.main(["diagnose", "fit", *logs, "--config", str(tmp_path / "mine.toml"), "--out", str(out)]) == 0
+        assert "thrust_gain" in capsys.readouterr().out
+        assert cli.main(["config", "vehicle", str(out / "vehicle.toml")]) == 0
+        vehicle = config.load(fitting.VehicleParams, out / "vehicle.toml")
+        speed = 1000.0
+        assert vehicle.thrust.k_f * speed**2 + vehicle.thrust.k_1 * speed == pytest.approx(1.7, rel=0.03)
+        record = json.loads((out / "fit.json").read_text())
+        assert np.shape(record["covariance"]) == (len(record["effects"]),) * 2
+        assert len(record["logs"]) == 3
+
     def test_residual_is_zero_where_it_is_right(self):
         model = StandModel([self.log(k_f=1.5e-6, seed=0)], STAND)
         (residual,) = model.residuals({})
@@ -220,6 +241,20 @@ class TestFlyer:
         assert estimates["rope_length"][0] == pytest.approx(-0.03, abs=1e-3)
         assert near(estimates, "rope_length", -0.03)
         assert near(estimates, "payload_drag", 5e-4), estimates
+
+    @pytest.mark.slow
+    def test_a_vehicle_fitted_alone_holds_with_a_payload_below(self):
+        """Fit of flights without payload; with the payload nothing of the vehicle needs to change."""
+        result = fitting.fit(FlyerModel([fly(8.0, gain=1.05, drag=0.02)], FLYER), ["thrust_gain", "rotor_drag_xy", "cmd_delay"])
+        gain, drag, delay = result.theta
+        scaled = tuple(float(c * (1.0 + gain)) for c in FLYER.thrust_map)
+        cable = CableParams(0.5, 0.008)
+        changes = {"thrust_map": scaled, "drag_xy": float(drag), "command_delay": float(delay), "cable": cable}
+        params = FlyerParams(**{**vars(FLYER), **changes})
+        estimates = found(FlyerModel([fly(6.0, gain=1.05, drag=0.02, cable=0.5, seed=4)], params), ["thrust_gain", "rotor_drag_xy"])
+        assert near(estimates, "thrust_gain", 0.0), estimates
+        assert near(estimates, "rotor_drag_xy", 0.0), estimates
+        assert estimates["thrust_gain"][1] < 0.01
 
     def test_derivatives_are_those_of_the_residuals(self):
         torque = TorqueParams((2e-5, 2e-5, 3e-5), 0.03, 0.03, 0.006, (1.0, -1.0, -1.0, 1.0))

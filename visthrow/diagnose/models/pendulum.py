@@ -46,7 +46,8 @@ def effects(params: PendulumParams) -> list[Effect]:
     spread = 0.05 * params.length
     return [
         Effect("pendulum_length", "the pendulum's equivalent length", "a = -g / (l + theta) sin(angle)", "m", joint,
-               (-0.5 * params.length, params.length), spread, 2e-4 * params.length, seen, "inertia about the pivot", (),
+               (-0.5 * params.length, params.length), spread, 1e-3 * params.length, seen,
+               "inertia about the pivot; gravity is known to 0.1 %", (),
                ("swing at two amplitudes",)),
         Effect("viscous_friction", "friction in proportion to the rate", "a -= theta rate", "1/s", joint,
                (-params.viscous, 2.0), 0.1, 5e-4, seen, "bearing grease", ("quadratic_drag", "coulomb_friction"),
@@ -60,8 +61,8 @@ def effects(params: PendulumParams) -> list[Effect]:
                "mounting", (), ("let it hang",)),
         Effect("encoder_scale", "the encoder's scale", "y = (1 + theta) angle", "1", "sensing", (-0.3, 0.3), 0.02, 5e-4, seen,
                "lines a turn", (), ("swing at two amplitudes",)),
-        Effect("clock_rate", "the logger's clock", "dt = (1 + theta) dt_stated", "1", "sensing", (-0.05, 0.05), 1e-3, 1e-4, seen,
-               "logger", ("pendulum_length",), ("another clock",)),
+        Effect("clock_rate", "the logger's clock", "dt = (1 + theta) dt_stated", "1", "sensing", (-0.05, 0.05), 1e-3, 5e-4, seen,
+               "crystal; gravity is known to 0.1 %", ("pendulum_length",), ("another clock",)),
     ]  # fmt: skip
 
 
