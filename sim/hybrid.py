@@ -8,18 +8,19 @@ import warp as wp
 from sim import runtime  # noqa: F401  starts Warp
 from sim import state as st
 from sim.checks import check_air, check_numerics, check_release
+from sim.laws import check_laws, structure
 from sim.params import GRAVITY, AirParams, PlantParams, RandomizationParams, ReleaseParams, RopeParams, VehicleParams
 from sim.quadrotor.queue import queue_depth
 from sim.randomize import build_reset
 from sim.step import build_step
-from sim.structs import extensions_of, kinds_of, pack, pack_rope, pack_vehicle, ropes_on, types
+from sim.structs import extensions_of, kinds_of, pack, pack_air, pack_rope, pack_vehicle, ropes_on, types
 
 _BUILDS: dict = {}
 
 
 def _kernels(params: PlantParams, direct: bool, extensions: frozenset[str]):
     """Kernels of one choice of blocks; built once a process."""
-    key = (params.sim.precision, params.rope.segments, kinds_of(params.vehicle), direct, extensions)
+    key = (params.sim.precision, params.rope.segments, kinds_of(params.vehicle), direct, extensions, structure(params.laws))
     if key not in _BUILDS:
         t = types(params.sim.precision)
         step = build_step(t, params, direct, extensions)
@@ -125,18 +126,19 @@ class HybridSim:
         airs = airs or [params.air]
         for air in airs:
             check_air(air)
+        check_laws(params.laws)
         if {r.segments for r in ropes} != {params.rope.segments}:
             raise ValueError(
                 f"ropes of {sorted({r.segments for r in ropes})} segments in one batch of {params.rope.segments}"
             )
         self.params, self.count, self.device, self.seed = params, count, device, seed
         self.gravity = gravity
-        self.extensions = extensions_of(vehicles, ropes, airs, releases) | extensions
+        self.extensions = extensions_of(vehicles, ropes, airs, releases, params.laws) | extensions
         self.types, self._step, self._reset = _kernels(params, direct, self.extensions)
         t = self.types
         self._vehicles = wp.array(pack_vehicle(t, vehicles, kinds_of(params.vehicle)), dtype=t.Vehicle, device=device)
         self._ropes = wp.array(pack_rope(t, ropes_on(vehicles, ropes)), dtype=t.Rope, device=device)
-        self._airs = wp.array(pack(t.Air, *airs), dtype=t.Air, device=device)
+        self._airs = wp.array(pack_air(t, airs, [params.laws] * len(airs)), dtype=t.Air, device=device)
         self._release = wp.array(pack(t.Release, *releases), dtype=t.Release, device=device)
         segments, period = params.rope.segments, params.sim.control_period
         depth = max(queue_depth(v.queue.delay, period) for v in vehicles)

@@ -262,6 +262,19 @@ class SimParams:
 
 
 @dataclass(frozen=True)
+class LawParams:
+    """A force or torque besides the blocks' own: coefficient times scalars times a vector, by the names of :mod:`sim.laws`.
+
+    It acts on the vehicle (force in the world frame, torque in the body's) or, while it hangs and after, on the payload.
+    """
+
+    block: Literal["vehicle force", "vehicle torque", "payload force"]
+    factors: tuple[str, ...]  # up to two scalars
+    vector: str
+    coefficient: float  # in the unit that makes the product N or N m
+
+
+@dataclass(frozen=True)
 class PlantParams:
     """All that defines one simulated plant."""
 
@@ -270,6 +283,7 @@ class PlantParams:
     release: ReleaseParams
     sim: SimParams
     air: AirParams = AirParams()
+    laws: tuple[LawParams, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -11,11 +11,12 @@ import warp as wp
 from sim import release as rel
 from sim import state as st
 from sim.coupling import build_coupled_step
+from sim.laws import build_laws
 from sim.params import PlantParams
 from sim.quadrotor.queue import push, split_delay
 from sim.quadrotor.rigid_body import build_direct_flow, build_flow
 from sim.rope.chain import build_chain
-from sim.rope.payload import build_payload
+from sim.rope.payload import build_flight, build_payload
 from sim.structs import Types
 
 SPEED_LIMIT = 1000.0  # [m/s], [rad/s]: beyond it a state is broken, not fast
@@ -54,7 +55,9 @@ def build_step(
     chain = build_chain(t, L, extensions)
     payload = build_payload(t, extensions)
     coupled = build_coupled_step(t, flow, rate, motor_advance, chain, payload, extensions)
-    ballistic = rel.build_ballistic(t, payload.flight_acceleration, "payload_drag" in extensions)
+    laws = build_laws(t, params.laws, flow, chain, coupled.mount_velocity)
+    through_air = "payload_drag" in extensions or any(law.block == "payload force" for law in params.laws)
+    ballistic = rel.build_ballistic(t, build_flight(t, payload, laws), through_air)
     leaving = rel.build_letting_go(t, extensions)
     load, store = st.build_access(t, State)
     vec3_limit = real(SPEED_LIMIT)
@@ -179,14 +182,15 @@ def build_step(
             h = (until - time) / real(float(count))
             active = state.queue[wp.min(slot, depth - 1), env]
             for k in range(count):
+                now = laws.on(p, rope, air, s, n, u, stiffness, active, attached)
                 if attached != 0:
                     s, total, fell_back = coupled.step(
-                        p, rope, air, s, total, active, n, u, stiffness, g, gamma, max_turn, h
+                        p, rope, now, s, total, active, n, u, stiffness, g, gamma, max_turn, h
                     )
                     if fell_back:
                         status = status | fallback
                 else:
-                    s = coupled.step_alone(p, air, s, active, g, h)
+                    s = coupled.step_alone(p, now, s, active, g, h)
             time = until
             if attached != 0 and timer >= real(0.0) and time > timer - tiny:
                 separate(p, rope, r, air, s, n, u, gravity, out, env, time)

@@ -28,8 +28,8 @@ class Types:
         real, vec3, vec4, mat33, quat: Warp types.
         Vehicle: struct of :class:`sim.params.VehicleParams`, with the mixer's columns added under ``mixer``.
         Rope: struct of :class:`sim.params.RopeParams` per segment (``segment_length``, ``segment_mass``, ...).
-        Air: struct of :class:`sim.params.AirParams`, and what pushes from outside during a step: ``push_w`` [N] on the
-            vehicle, ``twist_b`` [N m] about its centre of mass, ``payload_push_w`` [N].
+        Air: struct of :class:`sim.params.AirParams`, the coefficients of the plant's ``laws``, and what pushes from outside
+            during a step: ``push_w`` [N] on the vehicle, ``twist_b`` [N m] about its centre of mass, ``payload_push_w`` [N].
         QuadState, QuadRate: state of the quadrotor alone and its time derivative.
     """
 
@@ -43,7 +43,7 @@ class Types:
         self.Vehicle = self.from_dataclass(P.VehicleParams, {"mixer": self.Mixer})
         self.Release = self.from_dataclass(P.ReleaseParams, {})
         self.Randomization = self.from_dataclass(P.RandomizationParams, {})
-        pushes = {"push_w": self.vec3, "twist_b": self.vec3, "payload_push_w": self.vec3}
+        pushes = {"laws": self.vec4, "push_w": self.vec3, "twist_b": self.vec3, "payload_push_w": self.vec3}
         self.Air = self.from_dataclass(P.AirParams, pushes)
         self.Rope = make_struct(
             "Rope",
@@ -168,9 +168,10 @@ def extensions_of(
     ropes: Iterable[P.RopeParams] = (),
     airs: Iterable[P.AirParams] = (),
     releases: Iterable[P.ReleaseParams] = (),
+    laws: Iterable[P.LawParams] = (),
 ) -> frozenset[str]:
     """Names of :data:`EXTENSIONS` without which one of these plants would not be simulated in full."""
-    needed = set()
+    needed = {"push"} if any(True for _ in laws) else set()
     for v in vehicles:
         needed |= {"gain"} if any(g != 1.0 for g in v.thrust.gain) else set()
     for r in ropes:
@@ -223,6 +224,14 @@ def pack(struct: type, *values) -> np.ndarray:
     rows = np.zeros(len(values), dtype=struct.numpy_dtype())
     for row, value in zip(rows, values, strict=True):
         _fill(row, value)
+    return rows
+
+
+def pack_air(t: Types, airs: list[P.AirParams], laws: list[tuple[P.LawParams, ...]]) -> np.ndarray:
+    """Structured array for ``wp.array(dtype=t.Air)``: a row for each air, with the coefficients of its plant's laws."""
+    rows = pack(t.Air, *airs)
+    for row, own in zip(rows, laws, strict=True):
+        row["laws"][: len(own)] = [law.coefficient for law in own]
     return rows
 
 

@@ -10,6 +10,7 @@ from typing import Literal
 from camera.params import CameraParams
 from sim.params import (
     AirParams,
+    LawParams,
     PlantParams,
     RandomizationParams,
     ReleaseParams,
@@ -169,6 +170,7 @@ class Experiment:
     task: TaskParams
     ppo: PPOParams
     air: AirParams = field(default_factory=AirParams)
+    laws: tuple[LawParams, ...] = ()  # found by a diagnosis, besides the blocks' own
     sensing: SensingParams = field(default_factory=SensingParams)  # of the hall; the diagnosis alone reads it
     diagnosed: DiagnosedParams = field(default_factory=DiagnosedParams)
 
@@ -193,7 +195,7 @@ class Experiment:
 
 def plant_of(experiment: Experiment) -> PlantParams:
     """The plant of an experiment."""
-    return PlantParams(experiment.vehicle, experiment.rope, experiment.release, experiment.sim, experiment.air)
+    return PlantParams(experiment.vehicle, experiment.rope, experiment.release, experiment.sim, experiment.air, experiment.laws)
 
 
 def contract_of(experiment: Experiment) -> dict:

@@ -10,13 +10,14 @@ import warp as wp
 
 from sim import state as st
 from sim.coupling import build_coupled_step
-from sim.params import SensingParams, VehicleParams
+from sim.laws import build_laws
+from sim.params import LawParams, SensingParams, VehicleParams
 from sim.quadrotor.rigid_body import build_flow, quat_rate
 from sim.quadrotor.thrust import rotor_thrust
 from sim.release import build_letting_go
 from sim.rope.chain import build_chain
 from sim.rope.loose import build_loose_step
-from sim.rope.payload import build_payload
+from sim.rope.payload import build_flight, build_payload
 from sim.sensing import build_sensing
 from sim.structs import EXTENSIONS, Types, make_struct
 
@@ -102,13 +103,14 @@ class ReplayKernel:
     Sensing: type
 
 
-def build_replay(t: Types, vehicle: VehicleParams, segments: int) -> ReplayKernel:
+def build_replay(t: Types, vehicle: VehicleParams, segments: int, laws: tuple[LawParams, ...] = ()) -> ReplayKernel:
     """Compose the kernel.
 
     Args:
         t: types of the wanted precision.
         vehicle: its kinds are read here.
         segments: of the rope.
+        laws: of the plant; their coefficients are read at run time.
     """
     real, vec3, quat = t.real, t.vec3, t.quat
     Vehicle, Rope, Release, Air, QuadState = t.Vehicle, t.Rope, t.Release, t.Air, t.QuadState
@@ -123,6 +125,8 @@ def build_replay(t: Types, vehicle: VehicleParams, segments: int) -> ReplayKerne
     chain = build_chain(t, L, EVERYTHING)
     payload = build_payload(t, EVERYTHING)
     coupled = build_coupled_step(t, flow, rate, motor_advance, chain, payload, EVERYTHING)
+    extra = build_laws(t, laws, flow, chain, coupled.mount_velocity)
+    flight_acceleration = build_flight(t, payload, extra)
     loose_step = build_loose_step(t, chain, payload)
     leaving = build_letting_go(t, EVERYTHING)
     see_pose, see_point, see_rate = build_sensing(t, Sensing)
@@ -217,13 +221,13 @@ def build_replay(t: Types, vehicle: VehicleParams, segments: int) -> ReplayKerne
         """RK4 step of the payload alone."""
         out = ball
         half = real(0.5) * h
-        a1 = payload.flight_acceleration(rope, air, ball.vel, g)
+        a1 = flight_acceleration(rope, air, ball.vel, g)
         v2 = ball.vel + half * a1
-        a2 = payload.flight_acceleration(rope, air, v2, g)
+        a2 = flight_acceleration(rope, air, v2, g)
         v3 = ball.vel + half * a2
-        a3 = payload.flight_acceleration(rope, air, v3, g)
+        a3 = flight_acceleration(rope, air, v3, g)
         v4 = ball.vel + h * a3
-        a4 = payload.flight_acceleration(rope, air, v4, g)
+        a4 = flight_acceleration(rope, air, v4, g)
         two = real(2.0)
         out.pos = ball.pos + (h / real(6.0)) * (ball.vel + two * v2 + two * v3 + v4)
         out.vel = ball.vel + (h / real(6.0)) * (a1 + two * a2 + two * a3 + a4)
@@ -372,7 +376,11 @@ def build_replay(t: Types, vehicle: VehicleParams, segments: int) -> ReplayKerne
             for j in range(count):
                 t0 = time + real(float(j)) * h
                 away = wp.abs(t0 + real(0.5) * h - peak) / knot_spacing
+                hanging = int(0)
+                if mode == attached_code:
+                    hanging = 1
                 pushed = push_at(air, lanes.axis[lane], lanes.size[lane], real(1.0) - away)
+                pushed = extra.on(p, rope, pushed, s, n, u, stiffness, active, hanging)
                 old = s
                 old_pay = pay
                 old_pay_vel = pay_vel

@@ -11,9 +11,10 @@ import warp as wp
 from sim import runtime  # noqa: F401  starts Warp
 from sim import state as st
 from sim.checks import check_air, check_numerics, check_release
+from sim.laws import check_laws, structure
 from sim.params import GRAVITY, PlantParams, SensingParams
 from sim.replay import kernel as rk
-from sim.structs import kinds_of, pack, pack_rope, pack_vehicle, ropes_on, types
+from sim.structs import kinds_of, pack, pack_air, pack_rope, pack_vehicle, ropes_on, types
 
 
 @dataclass(frozen=True)
@@ -68,16 +69,17 @@ class Replay:
         self.device, self.gravity, self.segments, self._sim = device, gravity, first.rope.segments, first.sim
         self.types = t = types(precision)
         kinds = kinds_of(first.vehicle)
-        key = (precision, kinds, self.segments)
+        check_laws(first.laws)
+        key = (precision, kinds, self.segments, structure(first.laws))
         if key not in _BUILDS:
-            _BUILDS[key] = rk.build_replay(t, first.vehicle, self.segments)
+            _BUILDS[key] = rk.build_replay(t, first.vehicle, self.segments, first.laws)
         self.kernel = _BUILDS[key]
         vehicles = [p.vehicle for p in plants]
         rows = {
             t.Vehicle: pack_vehicle(t, vehicles, kinds),
             t.Rope: pack_rope(t, ropes_on(vehicles, [p.rope for p in plants])),
             t.Release: pack(t.Release, *[p.release for p in plants]),
-            t.Air: pack(t.Air, *[p.air for p in plants]),
+            t.Air: pack_air(t, [p.air for p in plants], [p.laws for p in plants]),
             self.kernel.Sensing: pack(self.kernel.Sensing, *sensings),
         }
         self._plants = [wp.array(value, dtype=struct, device=device) for struct, value in rows.items()]

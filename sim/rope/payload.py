@@ -18,15 +18,25 @@ def drag_force(rope: Any, air_vel_w: Any):
     return -(rope.payload_drag * wp.length(air_vel_w)) * air_vel_w
 
 
+def build_flight(t: Types, payload: SimpleNamespace, laws: SimpleNamespace):
+    """Return ``flight_acceleration(rope, air, vel_w, gravity)`` [m/s^2] of the payload alone, laws on it included."""
+    Rope, Air, vec3, real, in_flight = t.Rope, t.Air, t.vec3, t.real, laws.in_flight
+
+    @wp.func
+    def flight_acceleration(rope: Rope, air: Air, vel_w: vec3, gravity: vec3):
+        return gravity + (payload.free(rope, air, vel_w) + in_flight(air, vel_w)) * (real(1.0) / rope.payload_mass)
+
+    return flight_acceleration
+
+
 def build_payload(t: Types, extensions: frozenset[str]) -> SimpleNamespace:
     """Functions of the payload's forces for a choice of extensions.
 
     Returns:
         Namespace of Warp functions ``hanging(rope, air, vel_w, along_w, jet_w)`` [N] (``along_w`` the last segment's
-        direction, ``jet_w`` the force of the rotors on the air [N]), ``free(rope, air, vel_w)`` [N] and
-        ``flight_acceleration(rope, air, vel_w, gravity)`` [m/s^2] of the payload alone.
+        direction, ``jet_w`` the force of the rotors on the air [N]) and ``free(rope, air, vel_w)`` [N] in flight.
     """
-    Rope, Air, vec3, real = t.Rope, t.Air, t.vec3, t.real
+    Rope, Air, vec3 = t.Rope, t.Air, t.vec3
     air_velocity = aero.in_wind if "wind" in extensions else aero.still_air
 
     @wp.func
@@ -64,8 +74,4 @@ def build_payload(t: Types, extensions: frozenset[str]) -> SimpleNamespace:
         none = vec3()
         return push(rope, air, drag(rope, air, none, vel_w, none, none), vel_w, none, none)
 
-    @wp.func
-    def flight_acceleration(rope: Rope, air: Air, vel_w: vec3, gravity: vec3):
-        return gravity + free(rope, air, vel_w) * (real(1.0) / rope.payload_mass)
-
-    return SimpleNamespace(hanging=hanging, free=free, flight_acceleration=flight_acceleration)
+    return SimpleNamespace(hanging=hanging, free=free)

@@ -75,16 +75,17 @@ def text(
     for line in dumps(changed).splitlines():
         section = line.strip("[]") if line.startswith("[") else section
         path = f"{section}.{line.split(' = ')[0]}" if " = " in line else ""
+        switched = [n for n in theta if ALL[n].switch is not None]
         words = [f"{n} {theta[n]:+.4g} +- {sd[n]:.2g} {ALL[n].effect.unit}" for n in about.get(path, [])]
-        if section == "diagnosed" and " = " in line:
-            words = ["of the diagnosis above"]
+        if " = " in line and not words:
+            words = ["of the diagnosis above"] if section == "diagnosed" else switched
         lines.append(f"{line}  # {'; '.join(words)}" if words else line)
     return "\n".join(lines).rstrip() + "\n"
 
 
 def _diagnosed(experiment: Experiment, theta: Mapping[str, float], covariance: Sequence[Sequence[float]], plants: int):
-    """The joint posterior of the plant's effects; those of the sensors are no plant's."""
-    own = [i for i, name in enumerate(theta) if not all(k.path.startswith("sensing") for k in ALL[name].keys)]
+    """The joint posterior of the plant's own numbers: not of the sensors, the replay's step or which blocks there are."""
+    own = [i for i, name in enumerate(theta) if any(k.path.startswith("plant.") for k in ALL[name].keys)]
     names = list(theta)
     rows = tuple(tuple(float(covariance[i][j]) for j in own) for i in own)
     return dataclasses.replace(experiment.diagnosed, effects=tuple(names[i] for i in own), covariance=rows, plants=plants)

@@ -16,6 +16,7 @@ KNOT_SPACING = 0.1  # of the latent forces [s]
 EARLY = 0.004  # after a window's start, before which no stamp is used: delays may move there [s]
 FINENESS = {"throw": 0.25}
 """Step in a phase against the one asked for: the rope whips in throws."""
+FINEST = 0.01  # of the square of the step: a tenth of the step asked for
 BATCH = 4096  # lanes of one run, which bounds its memory
 
 
@@ -104,7 +105,7 @@ class Flights:
             lanes: at most some thousand, for the memory's sake.
             substep: largest integration step [s].
         """
-        step = substep * np.sqrt([s.step_square for s in settings])
+        step = substep * np.sqrt([max(s.step_square, FINEST) for s in settings])
         given = {
             "window": np.array([x.window for x in lanes]), "plant": np.array([x.plant for x in lanes]),
             "state": np.array([x.state for x in lanes]), "axis": np.array([x.axis for x in lanes]),

@@ -22,6 +22,7 @@ from visthrow.diagnose.states import (
     hover_state,
     measured_state,
     moved,
+    resampled,
     stacked,
 )
 from visthrow.errors import DiagnoseError
@@ -31,7 +32,7 @@ LATENT_SIZES = (0.05, 0.05, 0.05, 1e-3, 1e-3, 1e-3, 0.01, 0.01, 0.01)
 """Of the latent forces' derivatives: force [N], torque [N m], force on the payload [N]."""
 DAMPING, DAMPING_MOST = 1e-3, 1e5
 """Of the Levenberg-Marquardt steps: at first, and where a window counts as settled."""
-ROUNDS = 14
+ROUNDS = 25
 AFTER_SLACK = 0.05  # that a rope is given to come taut [s]
 HUBER = 30.0  # deviations, beyond which a sample counts less
 SETTLED = 0.003  # relative fall of the cost below which an initial state is settled
@@ -58,6 +59,7 @@ class ThrowModel:
         stride: int = 1,
         only: Sequence[str] | None = None,
         carries: bool | None = None,
+        simpler: bool = False,
     ):
         """Cut the flights and find the windows' initial states.
 
@@ -70,6 +72,7 @@ class ThrowModel:
             stride: use every so many measured samples.
             only: names of the effects to consider; default all that apply.
             carries: whether a payload hangs below; default: if one was measured or released.
+            simpler: consider also blocks simpler than the plant's, such as a rigid rope; each compiles a kernel.
 
         Raises:
             DiagnoseError: no flight can be replayed, or ``only`` names what does not exist.
@@ -86,41 +89,62 @@ class ThrowModel:
         self.channels += ["payload_pos_w"] if carries and any(f.payload for f in flights) else []
         self.channels += ["rate_b"] if any(f.gyro for f in flights) else []
         thrown = any(f.latch != NEVER for f in flights)
-        self.entries: dict[str, Entry] = entries_for(self.setting, set(self.channels), carries, thrown)
+        self.entries: dict[str, Entry] = entries_for(self.setting, set(self.channels), carries, thrown, simpler)
         if only is not None:
             unknown = [name for name in only if name not in self.entries]
             if unknown:
                 raise DiagnoseError(f"no effects {unknown} for these flights; there are {', '.join(self.entries)}")
             self.entries = {name: self.entries[name] for name in only}
+        self._graded = [e for e in self.entries.values() if e.switch is None]
+        self._switched = [e for e in self.entries.values() if e.switch is not None]
+        self.entries = {e.effect.name: e for e in (*self._graded, *self._switched)}
         self.effects = tuple(e.effect for e in self.entries.values())
         self._directions = directions(self.setting.plant)
         x = self.setting.sensing
         delays = (x.vehicle_delay, x.payload_delay, x.gyro_delay)
         self.flights = Flights(flights, cuts, delays, stride)
-        states = self._begin()
+        states = self._begin(self.setting)
         if (without_slack := self._without_slack(states)) != cuts:
             self.flights = Flights(flights, without_slack, delays, stride)
-            states = self._begin()
+            states = self._begin(self.setting)
         self._told = np.array([w for w, c in enumerate(self.flights.cuts) if c.told])
         self._states = self._latest = self._settle(self.setting, states)
 
     def windows(self, theta: Mapping[str, float]) -> list[Window]:
         """See :class:`visthrow.diagnose.model.Model`."""
         setting = apply(self.entries, self.setting, theta)
-        states = self._latest = self._states if setting == self.setting else self._settle(setting, self._states)
-        steps = [self._step(e, theta.get(name, 0.0)) for name, e in self.entries.items()]
-        settings = [setting, *[e.apply(setting, step) for e, step in zip(self.entries.values(), steps)]]
+        states = self._states if setting == self.setting else self._settle(setting, self._better_start(setting))
+        self._latest = states
+        steps = [self._step(e, theta.get(e.effect.name, 0.0)) for e in self._graded]
+        settings = [setting, *[e.apply(setting, step) for e, step in zip(self._graded, steps)]]
         replay = self._replay(settings)
         found: list[Window] = []
         for batch in self._batches():
             found += self._linearised(replay, settings, np.array(steps), states, batch)
+        columns = [self._secant(e, theta, states, found) for e in self._switched]
+        if columns:
+            found = [
+                dataclasses.replace(w, effects=np.hstack((w.effects, np.stack([c[i] for c in columns], axis=1))))
+                for i, w in enumerate(found)
+            ]
         return found
+
+    def _secant(self, e: Entry, theta: Mapping[str, float], states: States, windows: list[Window]) -> list[np.ndarray]:
+        """Samples with the other kind of block less those with this one, per theta; a column for each window."""
+        on = theta.get(e.effect.name, 0.0) > 0.5
+        other = apply(self.entries, self.setting, {**theta, e.effect.name: 0.0 if on else 1.0})
+        lanes = [Lane(w, 0, w) for w in self._told]
+        start = resampled(states, other.plant.rope.segments)
+        seen = self.flights.fly(self._replay([other]), [other], start, lanes, self.substep).seen
+        sign = -1.0 if on else 1.0
+        return [sign * (x.residual - self._residual(seen, w, lane)) for lane, (w, x) in enumerate(zip(self._told, windows))]
 
     def residuals(self, theta: Mapping[str, float]) -> list[np.ndarray]:
         """See :class:`visthrow.diagnose.model.Model`; from the initial states of the last :meth:`windows`."""
         setting = apply(self.entries, self.setting, theta)
         lanes = [Lane(w, 0, w) for w in self._told]
-        seen = self.flights.fly(self._replay([setting]), [setting], self._latest, lanes, self.substep).seen
+        states = resampled(self._latest, setting.plant.rope.segments)
+        seen = self.flights.fly(self._replay([setting]), [setting], states, lanes, self.substep).seen
         return [self._residual(seen, w, lane) for lane, w in enumerate(self._told)]
 
     def step_error(self, finer: int = 4) -> dict[str, float]:
@@ -141,15 +165,24 @@ class ThrowModel:
     def _replay(self, settings: Sequence[Setting]) -> Replay:
         return Replay([s.plant for s in settings], [s.sensing for s in settings], self.device)
 
-    def _begin(self) -> States:
+    def _begin(self, setting: Setting) -> States:
+        """Initial states from smoothed measurements and, for what nobody measures, from flying through the windows before."""
+
         def begin(flight, c, inner):
-            start = hover_state(flight, self.setting.plant, c.payload) if inner is None else inner
-            state = measured_state(flight, c.start, self.setting, c.payload, start)
+            start = hover_state(flight, setting.plant, c.payload) if inner is None else inner
+            state = measured_state(flight, c.start, setting, c.payload, start)
             if inner is None:
                 state["gyro"] = state["rate_b"].copy()
             return state
 
-        return carried(self.flights, self._replay([self.setting]), self.setting, begin, self.substep)
+        return carried(self.flights, self._replay([setting]), setting, begin, self.substep)
+
+    def _better_start(self, setting: Setting) -> States:
+        """For each window, the better of the states settled at theta = 0 and those that the setting itself begins with."""
+        fresh, which = self._begin(setting), np.arange(len(self.flights.cuts))
+        replay, settled = self._replay([setting]), resampled(self._states, setting.plant.rope.segments)
+        old, new = (self._costs(replay, setting, states, which) for states in (settled, fresh))
+        return {name: np.where(_like(new < old, value), fresh[name], value) for name, value in settled.items()}
 
     @staticmethod
     def _step(e: Entry, theta: float) -> float:
@@ -161,7 +194,7 @@ class ThrowModel:
         """Windows in groups whose lanes fit a run."""
         batches, room = [], 0
         for w in self._told:
-            lanes = 1 + len(self.entries) + len(self._directions) + 9 * int(self.flights.knots[w])
+            lanes = 1 + len(self._graded) + len(self._directions) + 9 * int(self.flights.knots[w])
             if not batches or room < lanes:
                 batches.append([])
                 room = BATCH
@@ -189,14 +222,14 @@ class ThrowModel:
         for w in batch:
             lanes.append(Lane(w, 0, w, keep=keep))
             keep += int(self.flights.knots[w])
-            lanes += [Lane(w, 1 + k, w) for k in range(len(self.entries))]
+            lanes += [Lane(w, 1 + k, w) for k in range(len(self._graded))]
             lanes += [Lane(w, 0, (1 + d) * count + w) for d in self._nuisances(w)]
             lanes += [Lane(w, 0, w, axis, knot, LATENT_SIZES[axis]) for axis, knot in self._latents(w)]
         flown = self.flights.fly(replay, settings, self._moved(states), lanes, self.substep)
         out, at, keep = [], 0, 0
         for w in batch:
             nuisances, latents = self._nuisances(w), self._latents(w)
-            size = 1 + len(self.entries) + len(nuisances) + len(latents)
+            size = 1 + len(self._graded) + len(nuisances) + len(latents)
             knots = {name: value[keep : keep + self.flights.knots[w]] for name, value in flown.knots.items()}
             out.append(self._window(flown.seen[:, at : at + size], settings[0], steps, w, nuisances, latents, knots))
             at, keep = at + size, keep + int(self.flights.knots[w])

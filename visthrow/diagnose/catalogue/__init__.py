@@ -4,16 +4,18 @@ The equation of an effect stands in the block of :mod:`sim` that it extends (or 
 numbers of the configuration that it changes, nothing more.
 """
 
-from visthrow.diagnose.catalogue import air, body, rope, sensing, thrust
+from visthrow.diagnose.catalogue import air, body, numerics, rope, sensing, structure, thrust
 from visthrow.diagnose.catalogue.entry import Entry, Key, Setting, apply
 
 ALL: dict[str, Entry] = {
-    e.effect.name: e for table in (thrust, body, air, rope, sensing) for e in table.ENTRIES
+    e.effect.name: e for table in (thrust, body, air, rope, sensing, numerics, structure) for e in table.ENTRIES
 }
 """Name -> entry."""
 
 
-def entries_for(setting: Setting, channels: set[str], payload: bool, releases: bool) -> dict[str, Entry]:
+def entries_for(
+    setting: Setting, channels: set[str], payload: bool, releases: bool, simpler: bool = False
+) -> dict[str, Entry]:
     """Entries that make sense in a setting and for logs with these channels, with bounds from the setting's own values.
 
     Args:
@@ -21,10 +23,13 @@ def entries_for(setting: Setting, channels: set[str], payload: bool, releases: b
         channels: of the logs.
         payload: whether a payload is flown.
         releases: whether one is thrown.
+        simpler: whether blocks simpler than the setting's are considered.
     """
     chosen = {}
     for name, e in ALL.items():
         about = e.effect.block
+        if e.simpler and not simpler:
+            continue
         if about in ("rope", "rope mount", "payload", "payload air") and not payload:
             continue
         if (about == "release" and not releases) or not e.applies(setting):

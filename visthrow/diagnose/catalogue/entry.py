@@ -62,10 +62,14 @@ class Entry:
     keys: tuple[Key, ...]
     step: float = 0.25  # of theta for derivatives, in floors
     applies: Callable[[Setting], bool] = lambda setting: True
+    switch: Callable[[Setting], Setting] | None = None  # to another kind of block, where theta is above a half
+    simpler: bool = False  # a switch to a simpler block
     most: Callable[[Setting], float] | None = None  # negated, a bound: how far the setting's own value can go down
 
     def apply(self, setting: Setting, theta: float) -> Setting:
         """The setting in which the effect has the size ``theta``."""
+        if self.switch is not None:
+            return self.switch(setting) if theta > 0.5 else setting
         for key in self.keys:
             setting = key.changed(setting, theta)
         return setting

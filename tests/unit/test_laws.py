@@ -1,0 +1,88 @@
+"""Laws as blocks: the kernel's factors are the grammar's, by name and by value; a law pushes as it says."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from sim.laws import BLOCKS, check_laws, names, structure
+from sim.params import LawParams
+from tests.plants import paper_plant
+from visthrow import config
+from visthrow.bench.flops import _filled, _Source, env_step
+from visthrow.diagnose import grammar
+from visthrow.task import Experiment
+
+SWIRL = LawParams("payload force", (), "vertical_cross_vel", 0.02)
+
+
+def knots(seed: int = 0) -> dict[str, np.ndarray]:
+    """One moment of a flight, as windows tell it; two knots, for slopes."""
+    rng = np.random.default_rng(seed)
+    quat, cable = rng.normal(size=4), rng.normal(size=3)
+    value = {
+        "time": np.array([0.0, 0.1]), "pos_w": rng.normal(size=3), "vel_w": rng.normal(size=3), "rate_b": rng.normal(size=3),
+        "quat_wb": quat / np.linalg.norm(quat), "payload_vel_w": rng.normal(size=3), "payload_pos_w": rng.normal(size=3),
+        "cable_dir_w": cable / np.linalg.norm(cable), "tension": 0.7,
+    }  # fmt: skip
+    out = {name: v if name == "time" else np.stack([v, v]) for name, v in value.items()}
+    return out | {"thrust": np.array([2.5, 2.9])}
+
+
+def counted_factors():
+    """The kernel's own factors, run as plain Python, and the moment that they see."""
+    source = _Source()
+    t = source.load("sim.structs").types("float64")
+    laws = source.load("sim.laws")
+    Around = source.load("sim.structs").make_struct("Around", laws._around(t))
+    k = knots()
+    row = {name: k[name][0] for name in laws._around(t) if name in k} | {"thrust_rate": 4.0}
+    return laws._factors(t, Around), _filled(Around, row), k
+
+
+def number(value):
+    return np.array([float(c) for c in value.c]) if hasattr(value, "c") else float(value)
+
+
+def test_factors_are_the_grammars():
+    (scalars, vectors), around, k = counted_factors()
+    assert set(scalars) == set(grammar.SCALARS)
+    for name, factor in grammar.SCALARS.items():
+        assert number(scalars[name](around)) == pytest.approx(factor.values(k)[0], rel=1e-12), name
+    assert set(vectors) == set(BLOCKS) == set(grammar.VECTORS)
+    for block, of in grammar.VECTORS.items():
+        assert set(vectors[block]) == set(of), block
+        for name, factor in of.items():
+            found = number(vectors[block][name](around))
+            np.testing.assert_allclose(found, factor.values(k)[0], atol=1e-12, err_msg=f"{block} {name}")
+    assert names() == (tuple(scalars), {block: tuple(of) for block, of in vectors.items()})
+
+
+def test_a_law_costs_only_where_it_is():
+    plain = paper_plant()
+    with_law = dataclasses.replace(plain, laws=(SWIRL,))
+    assert env_step(with_law)["total"] > env_step(plain)["total"] == env_step(dataclasses.replace(plain, laws=()))["total"]
+    assert structure((SWIRL,)) == structure((dataclasses.replace(SWIRL, coefficient=1.0),))
+
+
+def test_laws_are_part_of_the_configuration():
+    path = config.find("train", "state")
+    text = f'laws = [{{block = "payload force", factors = [], vector = "vertical_cross_vel", coefficient = 0.02}}]\nbase = "{path}"'
+    experiment = config.loads(Experiment, text)
+    assert experiment.laws == (SWIRL,)
+    assert config.loads(Experiment, config.dumps(experiment)) == experiment
+
+
+@pytest.mark.parametrize(
+    "law",
+    [
+        LawParams("payload force", ("no_such",), "cable", 1.0),
+        LawParams("payload force", (), "no_such", 1.0),
+        LawParams("vehicle force", ("speed", "speed", "speed"), "vel", 1.0),
+    ],
+)
+def test_laws_that_are_none_are_refused(law):
+    with pytest.raises(ValueError, match="expected a block"):
+        check_laws((law,))
+    with pytest.raises(ValueError, match="at most"):
+        check_laws((SWIRL,) * 5)

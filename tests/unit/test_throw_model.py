@@ -1,0 +1,141 @@
+"""The throw as a model to diagnose: silent at the truth, derivatives that are derivatives, planted effects recovered."""
+
+import numpy as np
+import pytest
+
+from sim.params import SensingParams
+from tests.flown import fly, setting_with
+from tests.plants import paper_plant
+from visthrow.diagnose.catalogue import ALL
+from visthrow.diagnose.opened import opened
+from visthrow.diagnose.throw_model import ThrowModel
+from visthrow.errors import DiagnoseError
+
+LATENT = np.array([5e-4, 5e-6, 5e-5])  # deviations of the latent forces of each block, which absorb what the step leaves
+PLANTED = {"rope_length": 0.006, "cmd_delay": 0.006, "mass_payload": 0.002, "wind_x": 0.25, "com_y": 8e-4, "release_lag": 0.015}
+"""Some 10 floors each, but the payload's mass: small enough for the linear estimate, of every block one."""
+
+
+def estimate(windows, keep):
+    """Linear estimate of some effects and its deviation, initial states and latent forces integrated out."""
+    information, score = np.zeros((len(keep), len(keep))), np.zeros(len(keep))
+    for w in windows:
+        known = np.hstack((w.nuisance * w.nuisance_sd, w.latent * LATENT[w.latent_block])) / w.sigma[:, None]
+        inner = np.linalg.inv(np.eye(known.shape[1]) + known.T @ known)
+        columns, residual = w.effects[:, keep] / w.sigma[:, None], w.residual / w.sigma
+        information += columns.T @ columns - (columns.T @ known) @ inner @ (known.T @ columns)
+        score += columns.T @ residual - (columns.T @ known) @ inner @ (known.T @ residual)
+    return np.linalg.solve(information, score), np.sqrt(np.diag(np.linalg.inv(information)))
+
+
+@pytest.fixture(scope="module")
+def planted():
+    """A free flight and a throw of a plant with some effects, and the model that lacks them."""
+    logs = fly(setting_with(PLANTED), noise=0.2, free=1, throws=1, seconds=2.0)
+    return logs, ThrowModel(logs, paper_plant(), only=list(PLANTED))
+
+
+def test_planted_effects_are_recovered(planted):
+    _, model = planted
+    names = [e.name for e in model.effects]
+    found = np.zeros(len(names))
+    for _ in range(3):  # Gauss and Newton
+        change, deviation = estimate(model.windows(dict(zip(names, found))), range(len(names)))
+        found = found + change
+    for name, size, sd in zip(names, found, deviation):
+        assert abs(size - PLANTED[name]) < 0.02 * abs(PLANTED[name]) + 4.0 * sd, (name, size, sd)
+
+
+def test_silent_at_the_truth(planted):
+    _, model = planted
+    for w in model.windows(PLANTED):
+        z = w.residual / w.sigma
+        assert np.mean(z**2) < 1.3, (w.phase, np.mean(z**2))
+        assert np.all(np.isfinite(w.effects))
+    wrong = model.residuals({})
+    right = model.residuals(PLANTED)
+    assert sum(np.sum(r**2) for r in right) < sum(np.sum(r**2) for r in wrong)
+
+
+def test_derivatives_are_derivatives(planted):
+    """Central differences of the residuals, with a step four times that of the columns: commands' switches make kinks."""
+    _, model = planted
+    windows = model.windows({})
+    for k, e in enumerate(model.effects):
+        step = e.floor
+        up, down = model.residuals({e.name: step}), model.residuals({e.name: -step})
+        for w, a, b in zip(windows, up, down):
+            slope = (b - a) / (2.0 * step)
+            scale = np.abs(slope).max()
+            assert np.abs(slope - w.effects[:, k]).max() < 0.15 * scale + 1e-9, (e.name, w.phase)
+
+
+def test_windows_are_whole(planted):
+    _, model = planted
+    windows = model.windows({})
+    assert {w.phase for w in windows} >= {"throw"}
+    for w in windows:
+        samples = len(w.residual)
+        assert w.time.shape == w.channel.shape == w.sigma.shape == (samples,)
+        assert w.nuisance.shape == (samples, len(w.nuisance_sd))
+        assert w.latent.shape == (samples, len(w.latent_block)) == (samples, len(w.latent_time))
+        assert set(w.channel) <= set(range(len(model.channels)))
+        assert {"time", "pos_w", "vel_w", "quat_wb", "rate_b", "thrust"} <= set(w.knots)
+        assert all(len(v) == len(w.knots["time"]) for v in w.knots.values())
+    assert max(model.step_error().values()) < 20.0
+
+
+def test_what_is_known_of_the_sensors_is_taken_off():
+    sensing = SensingParams(frame_tilt=(0.01, 0.0, 0.0), marker_offset=(0.02, 0.0, 0.01), vehicle_delay=0.01)
+    setting = setting_with({"frame_tilt_x": 0.01, "marker_off_x": 0.02, "marker_off_z": 0.01, "mocap_delay_quad": 0.01})
+    logs = fly(setting, noise=0.2, free=1, throws=0, seconds=2.0)
+    informed = ThrowModel(logs, paper_plant(), sensing=sensing, only=["rope_length"])
+    assert all(np.mean((w.residual / w.sigma) ** 2) < 1.3 for w in informed.windows({}))
+
+
+def test_the_catalogue_is_sound():
+    plant = opened(setting_with({}))
+    for name, e in ALL.items():
+        assert e.effect.bounds[0] <= 0.0 <= e.effect.bounds[1], name
+        assert 0.0 < e.effect.floor < 3.0 * e.effect.prior_sd, name
+        assert e.effect.channels, name
+        assert e.effect.source, name
+        if e.applies(plant):
+            low, high = e.bounded(plant).effect.bounds
+            assert low <= 0.0 < high, name
+            assert e.apply(plant, e.effect.bounds[1] if e.switch else e.step * e.effect.floor) != plant, name
+            assert e.apply(plant, 0.0) == plant, name
+
+
+def test_mistakes_are_told(planted):
+    logs, _ = planted
+    with pytest.raises(DiagnoseError, match="no effects"):
+        ThrowModel(logs, paper_plant(), only=["no_such"])
+    with pytest.raises(DiagnoseError, match="command"):
+        ThrowModel([type(logs[0])({k: v for k, v in logs[0].channels.items() if k != "command"}, {})], paper_plant())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("part", "kind", "name"),
+    [
+        ("aero", "none", "aerodynamics"),
+        ("controller", "geometric", "controller_kind"),
+        ("motor", "instant", "motor_lag"),
+        ("rope", None, "rope_flexible"),
+    ],
+)
+def test_what_a_simplified_simulator_lacks_stands_out(part, kind, name):
+    """The paper's ablations: flights of the whole plant, a model without one block; that block explains them best."""
+    import dataclasses
+
+    logs, plant = fly(setting_with({}), noise=1.0, free=1, throws=2, seconds=3.0), paper_plant()
+    if kind is None:
+        simple = dataclasses.replace(plant, rope=dataclasses.replace(plant.rope, segments=1))
+    else:
+        block = dataclasses.replace(getattr(plant.vehicle, part), kind=kind)
+        simple = dataclasses.replace(plant, vehicle=dataclasses.replace(plant.vehicle, **{part: block}))
+    model = ThrowModel(logs, simple)
+    wrong = sum(np.sum((w.residual / w.sigma) ** 2) for w in model.windows({}))
+    right = sum(np.sum((w.residual / w.sigma) ** 2) for w in model.windows({name: 1.0}))
+    assert right < 0.7 * wrong, (wrong, right)
