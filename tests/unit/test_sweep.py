@@ -343,3 +343,25 @@ def test_a_job_that_vanishes_is_submitted_again_but_not_for_ever():
     assert cluster.Job(Ended(utils.FailedJobError("raised")), "a", lost).poll() == 1
     gone = [cluster.Job(Ended(utils.UncompletedJobError("preempted")), "a", lost).poll() for _ in range(4)]
     assert gone == [pool.EXIT_STOPPED] * cluster.LOST_AT_MOST + [1]
+
+
+def test_a_slurm_job_asks_for_what_it_needs(path, tmp_path, monkeypatch, capsys):
+    """A stand-in for sbatch keeps the script that it is given; where there is no Slurm, that is said."""
+    pytest.importorskip("submitit")
+    from visthrow.sweep.cluster import Cluster
+
+    words = ["sweep", "run", path, "--out", str(tmp_path / "out"), "--slurm", "partition=gpu", "--devices", "2", "--minutes", "9"]
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert cli.main(words) == 2
+    assert "no jobs can be submitted from here" in capsys.readouterr().err
+    for name, text in (("srun", ""), ("sbatch", f"/bin/cat $1 >> {tmp_path}/script; echo Submitted batch job 7")):
+        (tmp_path / name).write_text(f"#!/bin/sh\n{text}\n")
+        (tmp_path / name).chmod(0o755)
+    cluster = Cluster(path, tmp_path / "out", "slurm", 2, 1, 9.0, options={"slurm_partition": "gpu"})
+    assert cluster.devices == ["job 0", "job 1"]
+    cluster.start(pool.Task("state-1", ("state-1",), gpu=True), "job 0", None)
+    script = (tmp_path / "script").read_text()
+    for wanted in ("--partition=gpu", "--time=15", "--gpus-per-node=1", "--job-name=state-1"):
+        assert wanted in script
+    with pytest.raises(ConfigError, match="partitoin"):
+        Cluster(path, tmp_path / "out", "slurm", 2, 1, 9.0, options={"slurm_partitoin": "gpu"})

@@ -70,7 +70,10 @@ class Cluster:
 
         self.devices = [f"job {i}" for i in range(self.gpus)]
         self._lost: Counter[str] = Counter()
-        self._executor = submitit.AutoExecutor(self.out / "logs", cluster=self.executor)
+        try:
+            self._executor = submitit.AutoExecutor(self.out / "logs", cluster=self.executor)
+        except RuntimeError as error:
+            raise ConfigError(f"no jobs can be submitted from here: {error}; expected the commands of {self.executor}") from error
         try:
             self._executor.update_parameters(timeout_min=int(self.minutes) + 1 + SLACK, **self.options)
         except (NameError, ValueError, TypeError) as error:
