@@ -50,7 +50,7 @@ class SyntheticModel:
     effects: tuple[Effect, ...] = field(default_factory=catalogue)
     truth: dict[str, float] = field(default_factory=dict)
     seed: int = 0
-    throws: int = 6
+    throws: int = 5
     free: int = 1
     noise: float = 1.0
     gust: float = 1.0
@@ -59,8 +59,7 @@ class SyntheticModel:
     law: str = ""  # a hidden force outside the catalogue: "speed" or "swirl" or "thrust"
     law_size: float = 0.0
     channels: tuple[str, ...] = CHANNELS
-    rate: int = 50  # of the measurements [Hz]
-    bump: int = -1  # flight in which something pushes once
+    rate: int = 40  # of the measurements [Hz]
     fresh: int = 0  # seed of noise and gusts alone
     calls: int = 0
 
@@ -75,7 +74,7 @@ class SyntheticModel:
 
     def _flight(self, flight: int) -> list[Window]:
         if flight < self.free:
-            return [self._window(flight, "flight", k * LENGTH, 1.0) for k in range(6)]
+            return [self._window(flight, "flight", k * LENGTH, 1.0) for k in range(4)]
         return [self._window(flight, "hover", 0.0, 0.3), self._window(flight, "throw", LENGTH, 2.0)]
 
     def _smooth(self, size: int, scale: float) -> np.ndarray:

@@ -83,10 +83,10 @@ def test_gradients_of_the_likelihood_are_its_differences(fitted):
     for i, key in enumerate(keys):
         level = levels.latent_sd[key]
         found = slope(lambda h, k=key, v=level: replace(levels, latent_sd={**levels.latent_sd, k: v * np.exp(h)}))
-        assert found == pytest.approx(by_level[i], abs=1e-3)
+        assert found == pytest.approx(by_level[i], rel=1e-3, abs=1e-2)
     for c in range(2):
         found = slope(lambda h, c=c: replace(levels, scale=levels.scale * np.where(np.arange(2) == c, np.exp(h), 1.0)))
-        assert found == pytest.approx(by_scale[c], abs=1e-2)
+        assert found == pytest.approx(by_scale[c], rel=1e-3, abs=0.1)
 
 
 @pytest.mark.parametrize(("sensor", "gust"), [(1.0, 1.0), (2.0, 0.5)])
@@ -122,9 +122,9 @@ def test_one_bad_window_does_not_raise_the_level_of_its_phase(fitted):
     push = windows[bad].latent @ np.random.default_rng(0).normal(0.0, 1.0, windows[bad].latent.shape[1])
     spoilt = [replace(w, residual=w.residual + push) if i == bad else w for i, w in enumerate(windows)]
     again, _ = noise.fit(spoilt, [marginal.gram_of(w, floors, 2) for w in spoilt])
-    assert again.inflation[bad].max() > 5.0
-    assert np.delete(again.inflation, bad, axis=0).max() == 1.0
-    assert again.latent_sd[0, "throw"] < 5.0 * levels.latent_sd[0, "throw"]
+    assert np.isfinite(again.own[bad, [0, 2]]).all()
+    assert np.isnan(np.delete(again.own, bad, axis=0)).all()
+    assert again.latent_sd[0, "throw"] < 2.0 * levels.latent_sd[0, "throw"]
 
 
 @pytest.mark.parametrize("spoil", [

@@ -69,7 +69,7 @@ def test_prediction_does_not_look_at_what_it_predicts(found):
     _, diagnosis = found
     point = diagnosis.work.after
     window = point.windows[0]
-    late = window.time > window.time.min() + 0.5
+    late = window.time > window.time.min() + 0.7
     plain, spoilt = (forms._predicted(window, point.noise, column[:, None])[0]
                      for column in (window.residual, window.residual + late))  # fmt: skip
     np.testing.assert_allclose(spoilt[~late], plain[~late])

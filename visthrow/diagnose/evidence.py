@@ -1,6 +1,7 @@
 """Evidence for sets of effects, with floors: whatever is not named may still be there below its floor.
 
-In floors, an effect that is not named has the prior N(0, 1) (the spike), a named one N(0, prior^2) within its bounds (the slab):
+In floors, an effect that is not named has the prior N(0, SPIKE^2), so that a floor is two deviations; a named one has N(0, prior^2)
+within its bounds (the slab):
 
     log Z = -1/2 log |1 + D^1/2 I D^1/2| + 1/2 s' (I + D^-1)^-1 s + log of the prior's and posterior's mass within the bounds
 
@@ -16,6 +17,9 @@ from scipy.special import log_ndtr
 from visthrow.diagnose.marginal import Statistics
 from visthrow.diagnose.model import Effect
 from visthrow.errors import DiagnoseError
+
+SPIKE = 0.5
+"""Deviation of an effect that is not named, in its floor: the floor is the limit of what may go unnamed, not its usual size."""
 
 CALIBRATION_DRAWS = 4000
 CALIBRATION_QUANTILE = 0.995
@@ -55,7 +59,7 @@ class Priors:
 
     def deviation(self, active: list[int] | tuple[int, ...]) -> np.ndarray:
         """Prior deviations with these effects named, shape (K,)."""
-        spread = np.ones(len(self.floor))
+        spread = np.full(len(self.floor), SPIKE)
         spread[list(active)] = self.slab[list(active)]
         return spread
 
@@ -112,9 +116,9 @@ def additions(information: np.ndarray, score: np.ndarray, priors: Priors, active
     mean, variance = score @ sigma, np.diag(sigma)
     out = ~priors.visible
     out[list(active)] = True
-    change = priors.slab**-2.0 - 1.0
+    change = priors.slab**-2.0 - SPIKE**-2.0
     left = np.where(out, 1.0, 1.0 + change * variance)
-    gain = -np.log(priors.slab) - 0.5 * np.log(left) - 0.5 * change * mean**2 / left
+    gain = -np.log(priors.slab / SPIKE) - 0.5 * np.log(left) - 0.5 * change * mean**2 / left
     wide_mean, wide_sd = mean / left, np.sqrt(variance / left)
     inside = _log_mass(wide_mean, wide_sd, priors.low, priors.high)
     gain = gain + inside - _log_mass(np.zeros_like(priors.low), priors.slab, priors.low, priors.high)

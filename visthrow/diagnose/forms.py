@@ -11,12 +11,20 @@ import numpy as np
 
 from visthrow.diagnose.marginal import Noise
 from visthrow.diagnose.model import Window
+from visthrow.flightlog import STANDARD_CHANNELS
 
-HEAD = 0.25
+HEAD = 0.4
 """Share of a window, at most HEAD_SECONDS, in which the initial state is fitted."""
-HEAD_SECONDS = 0.2
-HORIZONS = (0.02, 0.05, 0.1, 0.2, 0.4, 0.7, 1.0)
+HEAD_SECONDS = 0.4
+HORIZONS = (0.02, 0.05, 0.1, 0.2, 0.3, 0.45, 0.6, 1.0)
 """Upper ends of the horizons [s]; what lies beyond the last belongs to it."""
+
+
+def unit_of(channel: str) -> str:
+    """Unit of a channel's residuals; that of an attitude is a rotation vector."""
+    if channel == "quat_wb":
+        return "rad"
+    return STANDARD_CHANNELS[channel].unit if channel in STANDARD_CHANNELS else ""
 
 
 @dataclass(frozen=True)

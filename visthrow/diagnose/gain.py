@@ -11,11 +11,10 @@ import numpy as np
 
 from visthrow.diagnose.blackbox import table_of, train
 from visthrow.diagnose.evidence import Priors, additions, estimate, log_evidence
-from visthrow.diagnose.forms import HORIZONS, Forms, forms
+from visthrow.diagnose.forms import HORIZONS, Forms, forms, unit_of
 from visthrow.diagnose.marginal import Statistics
 from visthrow.diagnose.point import Point
 from visthrow.diagnose.result import Diagnosis
-from visthrow.flightlog import STANDARD_CHANNELS
 
 DRAWS = 10_000
 MOST_FOLDS = 12
@@ -178,7 +177,6 @@ def _channel(name, c, after: Point, own: Forms, before, error, box, rng, draws: 
     count = own.count[:, c].sum()
     rows = [w.sigma[w.channel == c] for w in after.windows if np.any(w.channel == c)]
     sigma = float(np.median(np.concatenate(rows)))
-    spec = STANDARD_CHANNELS.get(name)
 
     def rms(square: np.ndarray) -> float:
         return float(np.sqrt(np.maximum(square.sum(), 0.0) / max(count, 1.0)) * sigma)
@@ -188,7 +186,7 @@ def _channel(name, c, after: Point, own: Forms, before, error, box, rng, draws: 
     seen = by_horizon > 0
     curves = [np.sqrt(np.maximum(x.sum(0)[seen], 0.0) / by_horizon[seen]) for x in (before, error, own.floor[:, c])]
     horizons = tuple((h, *map(float, row)) for h, *row in zip(np.array(HORIZONS)[seen].tolist(), *curves))
-    return ChannelGain(name, spec.unit if spec else "", rms(before), rms(error), rms(own.floor[:, c]),
+    return ChannelGain(name, unit_of(name), rms(before), rms(error), rms(own.floor[:, c]),
                        float("nan") if box is None else rms(box), value, low, high, horizons)  # fmt: skip
 
 

@@ -51,11 +51,12 @@ class Noise:
     scale: np.ndarray  # of each channel's sigma, shape (C,)
     latent_sd: Mapping[tuple[int, str], float]  # (block, phase) -> deviation [N, N m, N]
     correlation_time: float  # of the latent forces [s]
-    inflation: np.ndarray  # of each window's latent deviations by block, shape (windows, 3); 1 but in bad windows
+    own: np.ndarray  # latent deviations of bad windows by block, shape (windows, 3); NaN where the phase's level holds
 
     def deviation(self, gram: Gram, window: int) -> np.ndarray:
         """Prior deviation of the columns [X, G] of a window, shape (D + L,)."""
-        by_block = [self.latent_sd.get((b, gram.phase), 0.0) for b in range(len(LATENT_BLOCKS))] * self.inflation[window]
+        shared = [self.latent_sd.get((b, gram.phase), 0.0) for b in range(len(LATENT_BLOCKS))]
+        by_block = np.where(np.isnan(self.own[window]), shared, self.own[window])
         return np.concatenate((np.ones(gram.nuisances), by_block[gram.latent_block]))
 
 

@@ -38,8 +38,8 @@ BAD_WINDOW = 2.5
 BAD_NATS = 8.0
 """Log-likelihood that a window's own level must gain; that of chance stays below 4 in a hundred windows."""
 
-INFLATIONS = tuple(2.5 * 1.6**k for k in range(18))
-"""Factors that are tried for a bad window."""
+FACTORS = tuple(2.5 * 1.6**k for k in range(18))
+"""Of the phase's level that are tried for a bad window."""
 
 CLEANINGS = 4
 """Rounds in which outliers lose weight."""
@@ -96,10 +96,10 @@ def fit(windows: Sequence[Window], grams: Sequence[Gram], start: Noise | None = 
             best = value, noise, shaped
     _, noise, shaped = best
     for _ in range(ROUNDS):
-        inflation = _inflation(shaped, noise)
-        if np.allclose(inflation, noise.inflation, rtol=0.1):
+        own = _own_levels(shaped, noise)
+        if np.allclose(own, noise.own, rtol=0.5, equal_nan=True):
             break
-        noise, _ = _maximise(shaped, replace(noise, inflation=inflation))
+        noise, _ = _maximise(shaped, replace(noise, own=own))
     return noise, shaped
 
 
@@ -114,7 +114,7 @@ def _first_guess(grams: Sequence[Gram]) -> Noise:
             seen = curvature[gram.latent_block == block]
             visible.setdefault((int(block), gram.phase), []).append(1.0 / np.sqrt(max(np.median(seen), 1e-300)))
     return Noise(scale, {key: float(np.median(v)) for key, v in visible.items()}, CORRELATION_TIMES[0],
-                 np.ones((len(grams), len(LATENT_BLOCKS))))  # fmt: skip
+                 np.full((len(grams), len(LATENT_BLOCKS)), np.nan))  # fmt: skip
 
 
 def _maximise(grams: Sequence[Gram], noise: Noise) -> tuple[Noise, float]:
@@ -155,7 +155,7 @@ def _likelihood(grams: Sequence[Gram], noise: Noise, keys: Sequence[tuple[int, s
         second = np.outer(state.mean, state.mean) + state.covariance
         excess = np.bincount(gram.latent_block, np.diagonal(second)[gram.nuisances :] - 1.0, len(LATENT_BLOCKS))
         for block in range(len(LATENT_BLOCKS)):
-            if (block, gram.phase) in index:
+            if (block, gram.phase) in index and np.isnan(noise.own[w, block]):
                 by_level[index[block, gram.phase]] += excess[block]
         level, size = noise.deviation(gram, w), len(state.mean)
         second *= np.outer(level, level)
@@ -165,31 +165,33 @@ def _likelihood(grams: Sequence[Gram], noise: Noise, keys: Sequence[tuple[int, s
     return value, by_level, by_scale
 
 
-def _inflation(grams: Sequence[Gram], noise: Noise) -> np.ndarray:
-    """Factor on the latent deviations of windows whose latent forces stand far above their phase's, shape (windows, 3)."""
-    factor = np.ones_like(noise.inflation)
+def _own_levels(grams: Sequence[Gram], noise: Noise) -> np.ndarray:
+    """Latent deviations of windows that stand far above their phase's, shape (windows, 3); NaN for all others."""
+    own = np.full_like(noise.own, np.nan)
     for w, gram in enumerate(grams):
         for block in np.unique(gram.latent_block):
-            factor[w, block] = _own_factor(gram, noise, w, int(block))
+            own[w, block] = _own_level(gram, noise, w, int(block))
     for phase in {gram.phase for gram in grams}:
         of_phase = np.array([gram.phase == phase for gram in grams])
-        many = (factor[of_phase] > 1.0).sum(0) > 0.25 * of_phase.sum()  # what many windows have is the phase's own level
-        factor[np.ix_(of_phase, many)] = 1.0
-    return factor
+        many = np.isfinite(own[of_phase]).sum(0) > 0.25 * of_phase.sum()  # what many windows have is the phase's own level
+        own[np.ix_(of_phase, many)] = np.nan
+    return own
 
 
-def _own_factor(gram: Gram, noise: Noise, window: int, block: int) -> float:
-    def likelihood(factor: float) -> float:
-        inflation = noise.inflation.copy()
-        inflation[window, block] = factor
-        return posterior(gram, replace(noise, inflation=inflation), window).log_likelihood
+def _own_level(gram: Gram, noise: Noise, window: int, block: int) -> float:
+    shared = noise.latent_sd[block, gram.phase]
 
-    plain = likelihood(1.0)
-    best, chosen = plain + BAD_NATS, 1.0
-    for factor in INFLATIONS:
-        value = likelihood(factor)
+    def likelihood(level: float) -> float:
+        own = noise.own.copy()
+        own[window, block] = level
+        return posterior(gram, replace(noise, own=own), window).log_likelihood
+
+    plain = likelihood(shared)
+    best, chosen = plain + BAD_NATS, np.nan
+    for factor in FACTORS:
+        value = likelihood(factor * shared)
         if value > best:
-            best, chosen = value, factor
+            best, chosen = value, factor * shared
         elif value < plain:
             break
     return chosen

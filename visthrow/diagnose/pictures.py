@@ -8,12 +8,12 @@ from visthrow import style
 from visthrow.diagnose import result
 from visthrow.diagnose.blind import Blind
 from visthrow.diagnose.evidence import covariance
+from visthrow.diagnose.forms import unit_of
 from visthrow.diagnose.gain import Gain
 from visthrow.diagnose.marginal import Noise
 from visthrow.diagnose.model import Window
 from visthrow.diagnose.result import Diagnosis
 from visthrow.diagnose.work import Work
-from visthrow.flightlog import STANDARD_CHANNELS
 from visthrow.report.parts import png_of
 
 WIDTH = 9.2
@@ -45,8 +45,7 @@ def left_over(window: Window, noise: Noise) -> np.ndarray:
 def residuals(work: Work, channel: int) -> bytes:
     """Residuals of one channel before and after, laid over each other, in the windows where most was gained, and in a usual one."""
     name = work.problem.model.channels[channel]
-    spec = STANDARD_CHANNELS.get(name)
-    factor, unit = READABLE.get(spec.unit if spec else "", (1.0, spec.unit if spec else ""))
+    factor, unit = READABLE.get(unit_of(name), (1.0, unit_of(name)))
     pairs = []
     for before, after in zip(work.before.windows, work.after.windows):
         rows = before.channel == channel

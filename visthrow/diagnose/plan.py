@@ -14,7 +14,7 @@ from visthrow.diagnose import result
 from visthrow.diagnose.evidence import Priors, covariance, log_evidence
 from visthrow.diagnose.manoeuvres import PERIOD, Manoeuvre, Reference
 from visthrow.diagnose.marginal import Noise, correlated, gram_of, window_statistics
-from visthrow.diagnose.model import Model
+from visthrow.diagnose.model import LATENT_BLOCKS, Model
 from visthrow.diagnose.result import Diagnosis
 from visthrow.flightlog import Channel, FlightLog
 
@@ -99,7 +99,8 @@ def expected_information(
         gram = correlated(gram_of(window, floors, len(model.channels)), window, noise.correlation_time)
         levels = {(int(b), window.phase): noise.latent_sd.get((int(b), window.phase), loudest.get(int(b), 1.0))
                   for b in np.unique(gram.latent_block)}  # fmt: skip
-        expected = replace(noise, scale=np.ones(len(model.channels)), latent_sd=levels, inflation=np.ones((1, 3)))
+        shared = np.full((1, len(LATENT_BLOCKS)), np.nan)
+        expected = replace(noise, scale=np.ones(len(model.channels)), latent_sd=levels, own=shared)
         part = window_statistics(gram, expected, 0).information
         total[np.ix_(at, at)] += part[np.ix_(own, own)]
     return total * np.outer(*[_ratio(model, names, priors)] * 2)

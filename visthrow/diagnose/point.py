@@ -116,7 +116,7 @@ def curvature(problem: Problem, origin: Point, there: Point) -> float:
     for w, (old, new, gram) in enumerate(zip(origin.windows, there.windows, there.grams)):
         bent = new.residual - (old.residual - old.effects @ change)
         total += window_statistics(with_residual(gram, new, floor, bent), there.noise, w).score
-    return float(np.abs(covariance(there.information, np.ones(len(floor))) @ total).max(initial=0.0))
+    return float(np.abs(covariance(there.information, problem.priors.deviation(())) @ total).max(initial=0.0))
 
 
 def with_fitted_noise(point: Point) -> Point:

@@ -78,15 +78,20 @@ def _channel(stream, name: str, channel: int, before: Window, after: Window, noi
 def _series(stream, entity: str, time: np.ndarray, values: np.ndarray, colour: str) -> None:
     import rerun as rr
 
-    stream.log(entity, rr.SeriesPoints(colors=[colour] * values.shape[1], marker_sizes=[1.5] * values.shape[1]), static=True)
+    count = values.shape[1]
+    stream.log(entity, rr.SeriesPoints(colors=[_rgb(colour)] * count, marker_sizes=[1.5] * count), static=True)
     column = rr.TimeColumn(TIMELINE, duration=time)
     stream.send_columns(entity, [column], rr.Scalars.columns(scalars=np.ascontiguousarray(values, dtype=float)))
+
+
+def _rgb(colour: str) -> list[int]:
+    return [int(colour[i : i + 2], 16) for i in (1, 3, 5)]
 
 
 def _path(stream, entity: str, time: np.ndarray, points: np.ndarray, colour: str) -> None:
     import rerun as rr
 
-    code = [int(colour[i : i + 2], 16) for i in (1, 3, 5)]
+    code = _rgb(colour)
     stream.log(entity, rr.Points3D.from_fields(radii=0.006, colors=[code]), static=True)
     column = rr.TimeColumn(TIMELINE, duration=time)
     stream.send_columns(entity, [column], rr.Points3D.columns(positions=points.astype(np.float32)))

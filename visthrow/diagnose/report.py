@@ -9,6 +9,7 @@ import numpy as np
 
 from visthrow.diagnose import pictures, result
 from visthrow.diagnose.blind import Blind
+from visthrow.diagnose.forms import HEAD_SECONDS
 from visthrow.diagnose.gain import Gain
 from visthrow.diagnose.result import Diagnosis, Finding
 from visthrow.report.parts import Grid, Picture, Section, Text
@@ -146,9 +147,9 @@ def _gain(gain: Gain, diagnosis: Diagnosis) -> Section:
         for c in gain.channels
     )  # fmt: skip
     named = ", ".join(f"{name} in {100 * share:.0f} %" for name, share in gain.named_in.items()) or "nothing in any"
-    note = (f"Root mean square errors of predictions from the first 0.2 s of each window, {gain.left_out} left out in {gain.folds} "
-            f"folds, the selection repeated in each ({named}). Interval: 95 %, bootstrap over flights. Log-likelihood: "
-            f"{gain.nats_per_sample:+.3f} nats a sample.")  # fmt: skip
+    note = (f"Root mean square errors of predictions from the first {HEAD_SECONDS:g} s of each window, {gain.left_out} "
+            f"left out in {gain.folds} folds, the selection repeated in each ({named}). Interval: 95 %, bootstrap over flights. "
+            f"Log-likelihood: {gain.nats_per_sample:+.3f} nats a sample.")  # fmt: skip
     header = ("channel", "unit", "as it stands", "with what was named", "less", "noise alone", "black box", "")
     parts = (Grid("Held-out prediction error", header, rows, note),
              Picture("horizons", pictures.horizons(gain), "Error over the horizon of the prediction."))  # fmt: skip

@@ -30,6 +30,9 @@ IMPLAUSIBLE_FORCE = 0.3
 AT_BOUND = 1e-3
 """Distance from a physical bound, in floors, at which an estimate lies on it."""
 
+OWN_FLOOR = 0.5
+"""Deviation that numerics and what an effect's form leaves out add to its estimate, in its floor."""
+
 NORMAL_95 = 1.96
 
 
@@ -57,7 +60,7 @@ def conclude(search: "Search", *, laws: bool) -> Diagnosis:
     spread = covariance(point.information, search.priors.deviation(active))
     findings = tuple(_finding(search, point, j, active, spread, withdrawn) for j in range(len(model.effects)))
     floor = search.priors.floor
-    own = spread[np.ix_(active, active)] + np.eye(len(active))  # the floors: what numerics and small causes may add
+    own = spread[np.ix_(active, active)] + OWN_FLOOR**2 * np.eye(len(active))
     scaled = own * np.outer(floor[active], floor[active])
     return Diagnosis(
         overall, block, tuple(reasons), findings, {search.name(j): float(point.theta[j] * floor[j]) for j in active},
@@ -71,7 +74,7 @@ def conclude(search: "Search", *, laws: bool) -> Diagnosis:
 
 def _events(search: "Search", point: Point) -> tuple[int, ...]:
     """Flights that were left out for what happened there, and flights with a window far rougher than its phase."""
-    rough = {window.flight for window, factor in zip(point.windows, point.noise.inflation) if factor.max() > 1.0}
+    rough = {window.flight for window, own in zip(point.windows, point.noise.own) if np.isfinite(own).any()}
     return tuple(sorted({*search.events, *rough}))
 
 
@@ -159,7 +162,7 @@ def _finding(search: "Search", point: Point, j: int, active: list[int], spread: 
         return _named(search, point, blank, j, home, partners, active, spread)
     wide = _wide(point, priors, j, active)
     mean, sd = (value * effect.floor for value in wide)
-    own = float(np.hypot(sd, effect.floor))
+    own = float(np.hypot(sd, OWN_FLOOR * effect.floor))
     low, high = (float(np.clip(mean + side * NORMAL_95 * own, *effect.bounds)) for side in (-1.0, 1.0))
     gain = _worth(point, priors, j, active)
     blank = replace(blank, sd=own, low=low, high=high, nats=gain)
@@ -206,7 +209,7 @@ def _named(search: "Search", point: Point, blank: Finding, j: int, home: int, pa
         stead = [j if k == home else k for k in active]
         size, sd = _wide(point, priors, j, stead[:-1] if stead[-1] == j else [k for k in stead if k != j])
         variance = sd**2
-    sd = float(np.sqrt(variance + 1.0)) * floor
+    sd = float(np.hypot(np.sqrt(variance), OWN_FLOOR)) * floor
     size = float(np.clip(size, priors.low[j], priors.high[j]) * floor)
     low, high = max(priors.low[j] * floor, size - NORMAL_95 * sd), min(priors.high[j] * floor, size + NORMAL_95 * sd)
     rest = [k for k in active if k != home]
