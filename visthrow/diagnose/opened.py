@@ -24,8 +24,9 @@ def closed(plant: PlantParams, before: PlantParams) -> PlantParams:
     """The plant with the kinds that it had before it was opened, wherever they still say the same."""
     vehicle: VehicleParams = plant.vehicle
     motor, aero = vehicle.motor, vehicle.aero
-    if before.vehicle.motor.kind == "first_order" and motor.time_constant == motor.time_constant_down:
-        vehicle = dataclasses.replace(vehicle, motor=dataclasses.replace(motor, kind="first_order", time_constant_down=0.0))
+    if before.vehicle.motor.kind != "asymmetric" and motor.time_constant == motor.time_constant_down:
+        kind = "first_order" if motor.kind == "asymmetric" else motor.kind
+        vehicle = dataclasses.replace(vehicle, motor=dataclasses.replace(motor, kind=kind, time_constant_down=0.0))
     if before.vehicle.aero.kind == "none" and not any(getattr(aero, name) for name in AIRLESS):
         vehicle = dataclasses.replace(vehicle, aero=before.vehicle.aero)
     return dataclasses.replace(plant, vehicle=vehicle)
