@@ -5,13 +5,13 @@ from pathlib import Path
 from typing import Any
 
 from hil.errors import RunError
-from hil.flightlogs import read, throws
+from hil.flightlogs import read, throws, whole
 from hil.latency import Stages, draw, table
 from hil.record import SUMMARY
 from visthrow.errors import VisthrowError
 from visthrow.flightlog import FlightLog
 
-LATENCY_PICTURE = "latency.png"
+LATENCY_PICTURE, WHOLE = "latency.png", "flight.npz"
 
 
 def story(summary: dict[str, Any], folder: Path) -> str:
@@ -44,7 +44,7 @@ def throw_path(folder: Path, number: int, ending: str) -> Path:
 
 
 def finish(folder: str | Path, stages: Stages | None = None) -> list[str]:
-    """Write latency picture, and a flight log and picture a throw.
+    """Write latency picture, and a flight log and picture a throw; of a run without throws one log of all of it.
 
     Args:
         folder: of a run that is over.
@@ -58,9 +58,10 @@ def finish(folder: str | Path, stages: Stages | None = None) -> list[str]:
         if stages is not None:
             draw(folder / LATENCY_PICTURE, stages, f"Times of each stage, run {folder.name}")
             said.append(f"{folder / LATENCY_PICTURE}  times of each stage")
-        if _throws_flown(folder) == 0:
-            return said
         course = read(folder)
+        if not course.throws:
+            whole(course).save(folder / WHOLE)
+            said.append(f"{folder / WHOLE}  flight log of the whole run")
         for number, log in enumerate(throws(course), start=1):
             path = throw_path(folder, number, ".npz")
             log.save(path)

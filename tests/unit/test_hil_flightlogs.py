@@ -97,6 +97,14 @@ def test_throws_without_a_landing_say_why(tmp_path):
     assert "no landing counted" in finish(tmp_path / "a")[0]
 
 
+def test_a_run_without_a_throw_is_logged_as_a_whole(tmp_path):
+    record_run(tmp_path / "a", saved_policy(tmp_path), seconds=0.6)
+    assert "flight log of the whole run" in finish(tmp_path / "a")[0]
+    log = FlightLog.load(tmp_path / "a" / "flight.npz")
+    assert len(log["pos_w"].time) == len(log["payload_pos_w"].time) > 50
+    assert log.meta["events"][-1][1] == "check"
+
+
 def test_a_killed_run_and_no_run(tmp_path):
     record_run(tmp_path / "a", saved_policy(tmp_path), seconds=6.0, close=False)
     (log,) = throw_logs(tmp_path / "a")
