@@ -126,6 +126,8 @@ def derivative(time: np.ndarray, values: np.ndarray, span: float = 0.06) -> tupl
     Returns:
         Times [s] and derivatives.
     """
+    if len(time) < 3:
+        return np.empty(0), np.empty((0, *values.shape[1:]))
     reach = max(1, round(0.5 * span / float(np.median(np.diff(time)))))
     width = time[2 * reach :] - time[: -2 * reach]
     rate = (values[2 * reach :] - values[: -2 * reach]) / width[:, None]
@@ -140,6 +142,8 @@ def rates_of(time: np.ndarray, quat: np.ndarray, span: float = 0.06) -> tuple[np
     Returns:
         Times [s] and rates [rad/s], shape (N, 3).
     """
+    if len(time) < 3:
+        return np.empty(0), np.empty((0, 3))
     from scipy.spatial.transform import Rotation
 
     reach = max(1, round(0.5 * span / float(np.median(np.diff(time)))))

@@ -105,7 +105,8 @@ def logs_of(table: Table, mapping: TableMap, source: str) -> list[FlightLog]:
     parts = _parts(table, mapping, count, source)
     logs = [_log(table, mapping, rows, label, source) for rows, label in parts]
     if not logs:
-        raise LogError(f"{source}: {count} rows, but no stretch as long as {mapping.split} asks for")
+        shortest = mapping.split.shortest if mapping.split else 0.0
+        raise LogError(f"{source}: {count} rows, but no stretch without a gap that lasts {shortest:g} s")
     return logs
 
 

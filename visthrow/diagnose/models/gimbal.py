@@ -140,13 +140,13 @@ def _cut(log: FlightLog, number: int, params: GimbalParams, camera: np.ndarray) 
     found = []
     for start in np.arange(marker.time[0] + MARGIN, marker.time[-1] - MARGIN - params.window, params.window):
         inside = np.flatnonzero(marker.valid & (marker.time >= start) & (marker.time < start + params.window))[:: params.every]
-        if len(inside) < 10:
-            continue
         near = (table_time > start - MARGIN) & (table_time < start + params.window + MARGIN)
+        if len(inside) < 10 or np.sum(near) < 20:
+            continue
         time, point = marker.time[inside], marker.values[inside].astype(float)
         distance = np.linalg.norm(tables["gap"][near], axis=1)
         fits = np.abs(np.linalg.norm(point, axis=1) - np.median(distance)) < params.largest
-        if np.sum(fits) < 10 or np.sum(near) < 20:
+        if np.sum(fits) < 10:
             continue
         time, point = time[fits], point[fits]
         sigma = np.tile([params.sigma_across, params.sigma_across, params.sigma_along], len(time))
