@@ -22,11 +22,18 @@ import numpy as np
 from visthrow import config, toml_text
 from visthrow.diagnose import catalogue
 from visthrow.errors import DiagnoseError
+from visthrow.flightlog import Channel, FlightLog
 from visthrow.storage import atomic_write, write_json
 from visthrow.task import Experiment, plant_of
 
 PLANT = "reference"
 """The reference plant without extras: what the diagnosis finds is what was hidden, or a mistake."""
+
+NOISE = {"pos_w": 5e-4, "quat_wb": np.radians(0.2), "payload_pos_w": 8e-4}
+"""Of the recordings: motion capture of a hall [m], [rad], [m]."""
+
+BEFORE, AFTER = 1.5, 0.6
+"""What is kept of a flight before the policy starts and after the landing [s]."""
 
 THROW_SEED = 20_000
 """Of the throws that judge; the flights that are diagnosed have the seeds from 0."""
@@ -210,8 +217,31 @@ def _fly_one(policy: str, text: str, number: int, path: Path) -> None:
     rng = np.random.default_rng(number)
     angle, distance = rng.uniform(-np.pi, np.pi), rng.uniform(1.0, 1.9)
     goal = np.array([distance * np.cos(angle), distance * np.sin(angle), 0.0])
-    log = fly(Loaded(shipped.name, shipped.policy, truth), goal, PLANT, number)
-    log.save(path)
+    recorded_in_a_hall(fly(Loaded(shipped.name, shipped.policy, truth), goal, PLANT, number), rng).save(path)
+
+
+def recorded_in_a_hall(log: FlightLog, rng: np.random.Generator) -> FlightLog:
+    """What motion capture and the radio's log would hold of a simulated flight: noisy poses, commands, nothing true."""
+    start = log.meta["times"]["policy_start"] - BEFORE
+    end = log.meta["times"].get("landing", log.meta["times"]["end"])
+    channels = {}
+    for name in ("command", "release_command"):
+        channels[name] = _between(log[name], start, end + AFTER)
+    for name in ("pos_w", "payload_pos_w"):
+        c = _between(log[name], start, end + AFTER if name == "pos_w" else end)
+        channels[name] = dataclasses.replace(c, values=c.values + NOISE[name] * rng.normal(size=c.values.shape))
+    q = _between(log["quat_wb"], start, end + AFTER)
+    turn = 0.5 * NOISE["quat_wb"] * rng.normal(size=(len(q.time), 3))
+    x, w = q.values[:, :3], q.values[:, 3:]
+    noisy = np.hstack((x + w * turn + np.cross(x, turn), w - np.sum(x * turn, axis=1, keepdims=True)))
+    noisy /= np.linalg.norm(noisy, axis=1, keepdims=True)
+    channels["quat_wb"] = dataclasses.replace(q, values=noisy)
+    return FlightLog(channels, {"policy": log.meta["policy"], "plant": log.meta["plant"]})
+
+
+def _between(channel: Channel, start: float, end: float) -> Channel:
+    keep = (channel.time >= start) & (channel.time <= end)
+    return dataclasses.replace(channel, time=channel.time[keep], values=channel.values[keep], valid=channel.valid[keep])
 
 
 def table(records: list[dict[str, Any]]) -> str:
