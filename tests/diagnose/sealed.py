@@ -1,0 +1,236 @@
+"""Sealed worlds: hide, fly, hand the logs over in a folder, read the verdict, and only then open the truth.
+
+The tool runs in a process of its own that cannot import the tests, in a folder that holds nothing but logs and the config of
+the model. The truth's SHA-256 is put down before, the verdict's after.
+
+    python -m tests.diagnose.sealed null=10 1x15=20 2x10=5 law=5 --jobs 8 --ledger ledger.jsonl
+"""
+
+import argparse
+import hashlib
+import json
+import multiprocessing as mp
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+
+from tests.worlds.world import Recipe, draw, fly_recipe, recorded
+from visthrow.flightlog import Channel, FlightLog
+
+WITHOUT_TESTS = """
+import sys
+class Blocker:
+    def find_spec(self, name, path=None, target=None):
+        if name == "tests" or name.startswith("tests."):
+            raise ImportError("the tool asked for the tests")
+sys.meta_path.insert(0, Blocker())
+from visthrow.cli import main
+sys.exit(main(sys.argv[1:]))
+"""
+
+ALIKE = (
+    {"thrust_gain", "mass_quad", "air_density"},  # only the ratio of thrust to weight shows, of a vehicle that nobody weighed
+    {"mass_payload", "rope_mass", "downwash"},  # all pull at the mount alike, but for a centimetre of lever
+    {"rope_length", "payload_offset", "payload_marker_z"},  # a few grams of rope apart
+)
+"""Effects that flights of this kind hardly separate."""
+
+
+LAWS = {
+    "law_ball_swirl": 0.02, "law_vehicle_swirl": 0.05, "law_speed_thrust": 0.02, "law_slew_thrust": 0.008,
+}  # fmt: skip
+"""Terms that no entry of the catalogue has, with sizes that show: see :class:`tests.worlds.vehicle.Numbers`."""
+
+
+def flight_log(record: dict) -> FlightLog:
+    """The recording of a world as the package's flight log."""
+    t = record["time"]
+    seen = np.isfinite(record["pos"][:, 0])
+    ball_seen = np.isfinite(record["ball"][:, 0])
+    channels = {
+        "pos_w": Channel(t, np.nan_to_num(record["pos"]), "m", "world", seen),
+        "quat_wb": Channel(t, np.nan_to_num(record["quat"][:, [1, 2, 3, 0]]), "1", "world", seen),
+        "payload_pos_w": Channel(t, np.nan_to_num(record["ball"]), "m", "world", ball_seen),
+        "command": Channel(record["sent_time"], record["sent"], "N, rad/s", "body"),
+    }
+    asked = np.zeros(len(record["sent_time"]))
+    if record["release"] is not None:
+        asked[record["sent_time"] >= record["release"] - 1e-9] = 1.0
+    channels["release_command"] = Channel(record["sent_time"], asked, "1")
+    return FlightLog(channels, {})
+
+
+def model_of(recipe: Recipe) -> list[str]:
+    """Overrides that make the model the plant's null: one rod for the rod, a point for the string's ball."""
+    return {"rod": ["rope.segments=1"], "string": ["rope.payload_inertia=1e-9"], "chain": []}[recipe.plant]
+
+
+def hand_over(recipe: Recipe, folder: Path) -> list[Path]:
+    """Fly a world and write its logs."""
+    paths = []
+    for i, record in enumerate(recorded(recipe, fly_recipe(recipe))):
+        paths.append(folder / f"flight_{i:02d}.npz")
+        flight_log(record).save(paths[-1])
+    return paths
+
+
+def ask(logs: list[Path], model: list[str], folder: Path, device: str = "cpu", timeout: float = 900.0) -> dict:
+    """Verdict of ``visthrow diagnose explain`` on logs, run apart; with ``error`` where it failed."""
+    answer = folder / "verdict.json"
+    command = [sys.executable, "-c", WITHOUT_TESTS, "diagnose", "explain", *(p.name for p in logs)]
+    command += ["--device", device, "--json", answer.name, "--out", "report", "--no-report"]
+    for item in model:
+        command += ["--set", item]
+    root = Path(__file__).resolve().parents[2]
+    known = os.environ | {"PYTHONPATH": os.pathsep.join([str(root), os.environ.get("PYTHONPATH", "")])}
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=timeout, env=known, check=False)
+    if not answer.exists():
+        return {"overall": "ERROR", "error": (done.stdout + done.stderr)[-2000:], "findings": []}
+    return json.loads(answer.read_text())
+
+
+def named_by(verdict: dict) -> list[set[str]]:
+    """Each cause that was named, as the set of names it may have: one for FOUND, several for a CLASS."""
+    out = []
+    for f in verdict["findings"]:
+        if f["verdict"] == "FOUND":
+            out.append({f["name"]})
+        elif f["verdict"] == "CLASS":
+            group = {f["name"], *f.get("partners", ())}
+            if group not in out:
+                out.append(group)
+    return out
+
+
+def judge(recipe: Recipe, verdict: dict) -> dict:
+    """Compare a verdict with the truth.
+
+    ``exact``: every hidden effect named alone and nothing else; ``class``: named alone or in a class of truly alike ones;
+    ``own_class``: the same with the classes that the tool makes; ``wrong``: names that are none of the hidden effects;
+    ``missed``: hidden effects that were not named. A law outside the catalogue has no name: it is ``unknown`` that is right.
+    """
+    truth = {n for n in recipe.effects if not n.startswith("law_")}
+    groups = named_by(verdict)
+    own = all(any(n in group for group in groups) for n in truth) and len(groups) == len(truth)
+    hits, exact, wrong = set(), 0, 0
+    for group in groups:
+        near = {n for n in truth if group & ({n} | set().union(*(a for a in ALIKE if n in a)))}
+        if near - hits:
+            exact += int(bool(group & truth) and len(group) == 1)
+            hits |= near
+        else:
+            wrong += 1
+    return {
+        "exact": exact == len(truth) == len(groups), "class": hits == truth and not wrong, "wrong": wrong,
+        "missed": len(truth - hits), "named": [sorted(g) for g in groups], "overall": verdict["overall"],
+        "extra": max(len(groups) - len(truth), 0), "own_class": own, "unknown": verdict["overall"].startswith("UNKNOWN"),
+        "laws": [law["formula"] for law in verdict.get("laws", ())[:3]],
+    }  # fmt: skip
+
+
+def errors_of(recipe: Recipe, verdict: dict) -> list[dict]:
+    """Estimate, interval and truth of each hidden effect that was named by its own name."""
+    out = []
+    for name, theta in recipe.effects.items():
+        for f in verdict["findings"]:
+            if f["name"] == name and f["verdict"] in ("FOUND", "CLASS"):
+                out.append({"name": name, "truth": theta, "estimate": f["estimate"], "low": f["low"], "high": f["high"]})
+    return out
+
+
+def run_world(recipe: Recipe, device: str = "cpu") -> dict:
+    """One sealed world from drawing to judgement: a line of the ledger."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        sealed = recipe.digest()
+        begin = time.perf_counter()
+        logs = hand_over(recipe, folder)
+        flown = time.perf_counter()
+        verdict = ask(logs, model_of(recipe), folder, device)
+        seconds = time.perf_counter() - flown
+        digest = hashlib.sha256(json.dumps(verdict, sort_keys=True).encode()).hexdigest()
+    line = {"truth_sha256": sealed, "verdict_sha256": digest, "recipe": asdict(recipe), "fly_s": round(flown - begin, 1)}
+    line |= {"explain_s": round(seconds, 1), "errors": errors_of(recipe, verdict)} | judge(recipe, verdict)
+    return line | ({"error": verdict["error"]} if "error" in verdict else {})
+
+
+def bank(seed: int, sizes: dict[str, int]) -> list[tuple[str, Recipe]]:
+    """Worlds of a bank, kinds mixed: nulls, single effects by floors, pairs, triples, laws outside the catalogue."""
+    out: list[tuple[float, str, Recipe]] = []
+    for k, (kind, count) in enumerate(sorted(sizes.items())):
+        for i in range(count):
+            number = seed + 100_000 * k + 100 * i
+            rng = np.random.default_rng(number + 7)
+            if kind == "null":
+                rough = {"noise": float(rng.choice([0.5, 1.0, 2.0])), "gusts": float(rng.choice([0.5, 1.0, 2.0]))}
+                recipe = draw(number, 0, 0.0, dropouts=float(rng.choice([0.0, 0.1])), **rough)
+            elif kind == "law":
+                recipe = draw(number, 0, 0.0, plants=("rod", "string"))
+                name = str(rng.choice(list(LAWS)))
+                recipe = replace(recipe, effects={name: LAWS[name] * float(rng.choice([-1.0, 1.0]))})
+            else:
+                effects, floors = kind.split("x")
+                recipe = draw(number, int(effects), float(floors))
+            out.append(((i + 0.5) / count, kind, recipe))
+    return [(kind, recipe) for _, kind, recipe in sorted(out, key=lambda item: item[:2])]
+
+
+def _alone(numbers) -> None:
+    """Give a worker a core of its own: what it starts counts that one only."""
+    cores = sorted(os.sched_getaffinity(0))
+    with numbers.get_lock():
+        mine, numbers.value = numbers.value, numbers.value + 1
+    os.sched_setaffinity(0, {cores[mine % len(cores)]})
+
+
+def _one(task: tuple[str, Recipe, float]) -> dict | None:
+    kind, recipe, until = task
+    if time.time() > until:
+        return None
+    try:
+        return {"kind": kind} | run_world(recipe)
+    except (RuntimeError, ValueError, subprocess.TimeoutExpired) as error:
+        return {"kind": kind, "recipe": asdict(recipe), "error": repr(error), "truth_sha256": recipe.digest()}
+
+
+def main() -> None:
+    """Run a bank of sealed worlds and add it to a ledger; worlds that are there are not run again."""
+    parser = argparse.ArgumentParser(description=main.__doc__)
+    parser.add_argument("worlds", nargs="+", metavar="KIND=COUNT", help="null, law, or EFFECTSxFLOORS: null=20 1x15=30")
+    parser.add_argument("--seed", type=int, help="of the first world; drawn by the system where not given")
+    parser.add_argument("--ledger", type=Path, default=Path("ledger.jsonl"))
+    parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--minutes", type=float, default=1e6, help="begin no world later than this")
+    args = parser.parse_args()
+    first = int.from_bytes(os.urandom(4), "little") if args.seed is None else args.seed
+    print(f"first seed {first}", flush=True)
+    done = set()
+    if args.ledger.exists():
+        done = {json.loads(line)["truth_sha256"] for line in args.ledger.read_text().splitlines()}
+    sizes = {kind: int(count) for kind, count in (item.split("=") for item in args.worlds)}
+    until = time.time() + 60.0 * args.minutes
+    tasks = [(kind, recipe, until) for kind, recipe in bank(first, sizes) if recipe.digest() not in done]
+    tally: dict[str, Counter] = {kind: Counter() for kind in sizes}
+    context = mp.get_context("spawn")
+    with context.Pool(args.jobs, _alone, (context.Value("i", 0),), maxtasksperchild=None) as pool:
+        for line in pool.imap_unordered(_one, tasks):
+            if line is None:
+                continue
+            with args.ledger.open("a") as out:
+                out.write(json.dumps(line) + "\n")
+            tally[line["kind"]].update(["worlds"] + [k for k in ("exact", "class", "own_class", "wrong", "missed") if line.get(k)])
+            told = {k: line.get(k) for k in ("overall", "named", "explain_s", "error") if k in line}
+            print(line["kind"], line["recipe"]["plant"], line["recipe"]["effects"], told, flush=True)
+    for kind, count in tally.items():
+        print(kind, dict(count))
+
+
+if __name__ == "__main__":
+    main()
