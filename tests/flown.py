@@ -9,6 +9,7 @@ from sim.params import PlantParams
 from sim.structs import EXTENSIONS
 from tests.plants import paper_plant
 from tests.worlds.pilot import FreeFlight, Throw, Tracker
+from visthrow.ballistics import flown
 from visthrow.diagnose.catalogue import ALL, Setting, apply
 from visthrow.flightlog import Channel, FlightLog
 
@@ -23,7 +24,9 @@ def setting_with(theta: dict[str, float], plant: PlantParams | None = None) -> S
     return apply(ALL, Setting(plant or paper_plant()), theta)
 
 
-def fly(setting: Setting, seed: int = 0, free: int = 2, throws: int = 2, seconds: float = 4.0, noise: float = 1.0) -> list[FlightLog]:
+def fly(
+    setting: Setting, seed: int = 0, free: int = 2, throws: int = 2, seconds: float = 4.0, noise: float = 1.0
+) -> list[FlightLog]:
     """Fly a plant and record it as motion capture would.
 
     Args:
@@ -61,30 +64,13 @@ def fly(setting: Setting, seed: int = 0, free: int = 2, throws: int = 2, seconds
             separated[e] = t + sim.get("separation_time")[e]
             left[e] = (sim.get("payload_pos_w")[e], sim.get("payload_vel_w")[e])
         for e in np.flatnonzero(np.isfinite(separated)):
-            ball[e] = _flown(plant, *left[e], t + TICK - separated[e])
+            gone = np.array([t + TICK - separated[e]])
+            ball[e] = flown(plant.rope, plant.air, *(x[None] for x in left[e]), gone)[0][0]
         for name, value in (("pos_w", sim.get("pos_w")), ("quat_wb", sim.get("quat_wb")), ("payload_pos_w", ball)):
             tracks[name].append(value.copy())
     times = TICK * np.arange(1, ticks + 1)
     return [_log(setting, references[e], {n: np.array(v)[:, e] for n, v in tracks.items()}, times, noise, rng)
             for e in range(len(references))]  # fmt: skip
-
-
-def _flown(plant: PlantParams, pos: np.ndarray, vel: np.ndarray, time: float) -> np.ndarray:
-    """Payload some time after separation, by RK4 under drag and wind."""
-
-    def rates(y):
-        air = y[3:] - np.array(plant.air.wind_w)
-        drag = -plant.rope.payload_drag / plant.rope.payload_mass * np.linalg.norm(air) * air
-        return np.concatenate((y[3:], drag + [0.0, 0.0, -9.81]))
-
-    y, count = np.concatenate((pos, vel)), max(int(np.ceil(time / 0.02)), 1)
-    h = time / count
-    for _ in range(count):
-        a = rates(y)
-        b = rates(y + 0.5 * h * a)
-        c = rates(y + 0.5 * h * b)
-        y = y + h / 6 * (a + 2 * b + 2 * c + rates(y + h * c))
-    return y[:3]
 
 
 def _log(setting: Setting, reference, track: dict, times: np.ndarray, noise: float, rng) -> FlightLog:

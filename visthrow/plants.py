@@ -7,6 +7,7 @@ import numpy as np
 
 from sim.params import RandomizationParams
 from visthrow import config
+from visthrow.ballistics import flown
 from visthrow.errors import ConfigError, suggest
 from visthrow.loose_rope import LooseRope
 from visthrow.task import Experiment, NoiseParams, plant_of
@@ -178,12 +179,10 @@ class HybridPlant:
         return LooseRope(upwards(ball, direction), upwards(ball_vel, turn), ball, ball_vel)
 
     def _ball(self) -> tuple[np.ndarray, np.ndarray]:
-        """Ball in closed form: position and velocity; at rest after landing."""
+        """Ball in flight: position and velocity; at rest after landing."""
         pos, vel = self._sim.get("payload_pos_w").astype(float), self._sim.get("payload_vel_w").astype(float)
         landing = self.landing
-        flown = np.nan_to_num(self.time - self._separation)[:, None]
-        gravity = np.array([0.0, 0.0, -9.81])
-        pos, vel = pos + flown * vel + 0.5 * flown**2 * gravity, vel + flown * gravity
+        pos, vel = flown(self.params.rope, self.params.air, pos, vel, np.nan_to_num(self.time - self._separation))
         down = landing.landed[:, None]
         return np.where(down, landing.point_w, pos), np.where(down, 0.0, vel)
 

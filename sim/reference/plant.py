@@ -4,7 +4,7 @@ Integration: classical RK4 over bodies, rope and block states together; MuJoCo g
 Command switches, the separation and the instants of motion-capture samples fall on step edges exactly.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import MISSING, dataclass, fields, replace
 
 import numpy as np
 
@@ -53,6 +53,26 @@ class Landing:
     separation_time: np.ndarray  # [s], shape (E,)
 
 
+KNOWN_EXTENSIONS = ("payload_drag", "precision")
+"""Parameters with a default that the plant has: drag among its extras, and what is no matter of physics."""
+
+
+def _refuse_unknown(params: PlantParams) -> None:
+    """Raise ValueError where the plant would fly something else than what the parameters say."""
+    vehicle = params.vehicle
+    parts = {"body": vehicle.body, "thrust": vehicle.thrust, "rope": params.rope, "release": params.release, "air": params.air}
+    unknown = [
+        f"{name}.{f.name}"
+        for name, part in parts.items()
+        for f in fields(part)
+        if f.default is not MISSING and f.name not in KNOWN_EXTENSIONS and getattr(part, f.name) != f.default
+    ]
+    unknown += ["motor.kind asymmetric"] if vehicle.motor.kind == "asymmetric" else []
+    unknown += ["laws"] if params.laws else []
+    if unknown:
+        raise ValueError(f"the reference plant does not know {', '.join(unknown)}; expected plants without")
+
+
 class ReferencePlant:
     """Vehicles with ropes.
 
@@ -64,7 +84,7 @@ class ReferencePlant:
         step: largest integration step [s].
 
     Raises:
-        ValueError: a step that is not positive.
+        ValueError: a step that is not positive, or a parameter that this plant does not know.
     """
 
     def __init__(
@@ -77,6 +97,7 @@ class ReferencePlant:
     ) -> None:
         if not step > 0.0:
             raise ValueError(f"plant: step is {step} s, expected more than 0")
+        _refuse_unknown(params)
         self.params, self.extras, self.count, self.step_size = params, extras, count, step
         self._rng = np.random.default_rng(seed)
         self._ropes = None

@@ -186,3 +186,9 @@ def test_off_costs_nothing():
 def test_unphysical_values_are_refused(part, message):
     with pytest.raises(ValueError, match=message):
         HybridSim(changed(paper_plant(), **part), 1)
+
+
+def test_the_reference_refuses_what_it_does_not_know():
+    for part in ({"body": {"com": (1e-3, 0.0, 0.0)}}, {"air": {"wind_w": (0.1, 0.0, 0.0)}}, {"release": {"rope_tail": 1.0}}):
+        with pytest.raises(ValueError, match="does not know"):
+            ReferencePlant(changed(paper_plant(), **part))
