@@ -157,7 +157,7 @@ class TestBlackbox:
         for end in (30, 500, 3000, 6100, 9000, 15_003, 15_004, 15_005, 33_333):
             path.write_bytes(data[:end])
             if end < 5000:  # within the header of the first log
-                with pytest.raises(LogError, match="blackbox log|frame"):
+                with pytest.raises(LogError, match=r"blackbox log|frame"):
                     blackbox.read_blackbox(path)
                 continue
             logs = blackbox.read_blackbox(path)
