@@ -12,7 +12,10 @@ PACKAGES = ("camera", "sim", "visthrow", "hil")
 
 ONBOARD = ("config", "errors", "observations", "actions", "policy", "pilot", "flightlog", "hover")
 """Modules of visthrow that fly on board, and those that these are allowed to rest on."""
-ONBOARD_SUPPORT = ("schema", "toml_text", "storage", "logexport", "provenance", "traced", "style", "strip", "rerun_view", "goal_motion")
+ONBOARD_SUPPORT = (
+    "schema", "toml_text", "storage", "logexport", "provenance", "traced", "style",
+    "strip", "rerun_view", "goal_motion",
+)  # fmt: skip
 
 MAY_USE = {
     "camera": {"camera"},
