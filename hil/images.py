@@ -103,7 +103,7 @@ class Looker:
         self._position_b = np.array(mount.position_b)
         # From the camera of the pictures to that of training.
         self._turn = nominal_rot_cb(training.mount).numpy() @ self._rot_cb.T
-        self._ball: np.ndarray | None = None
+        self._ball_w: np.ndarray | None = None  # ray to the ball a frame ago: a turn of the vehicle moves it little
 
     def look(self, picture: np.ndarray, stamp: float, hint: Hint | None) -> Sight:
         """Look at a picture, BGR, uint8, exposed at a time [s].
@@ -111,20 +111,28 @@ class Looker:
         Raises:
             ValueError: a picture of another size.
         """
-        seen = self.detector.detect(picture, self._known(hint))
-        self._ball = None if seen.ball is None else seen.ball.ray_c
+        seen = self.detector.detect(picture, self.known(hint))
+        rot_wc = None if hint is None else self._rot_wc(hint)
+        self._ball_w = None if seen.ball is None or rot_wc is None else rot_wc @ seen.ball.ray_c
         corners = None if seen.goal is None else tuple(map(tuple, (seen.goal.rays_c @ self._turn.T).tolist()))
         ball = None
         if seen.ball is not None:
             ball = (*(self._turn @ seen.ball.ray_c).tolist(), seen.ball.half_angle)
         return Sight(stamp, corners, ball)
 
-    def _known(self, hint: Hint | None) -> Known:
+    def known(self, hint: Hint | None) -> Known:
+        """What the detector is told: attitude, height and distance by the hint, and where the ball was a frame ago."""
         if hint is None:
-            return Known(ball_ray_c=self._ball)
+            return Known()
+        rot_wc = self._rot_wc(hint)
+        height = hint.pos_w[2] + float((rot_wc @ self._rot_cb)[2] @ self._position_b)
+        ball_c = None if self._ball_w is None else rot_wc.T @ self._ball_w
+        return Known(rot_wc[2], height, hint.ball_distance, ball_c)
+
+    def _rot_wc(self, hint: Hint) -> np.ndarray:
+        """Camera to world, shape (3, 3)."""
         rot_wb = rotation_from_quat(torch.tensor([hint.quat], dtype=torch.float64))[0].numpy()
-        height = hint.pos_w[2] + float(rot_wb[2] @ self._position_b)
-        return Known(self._rot_cb @ rot_wb[2], height, hint.ball_distance, self._ball)
+        return rot_wb @ self._rot_cb.T
 
 
 class RecordedImages:

@@ -117,6 +117,26 @@ def test_pictures_of_another_lens_give_the_keypoints_of_training(folder):
     assert source.poll(99.0) == []
 
 
+def test_a_turn_of_the_vehicle_does_not_lose_the_ball(folder, pictures):
+    """Where the ball was is kept in the world: after a turn of 40 deg it is looked for elsewhere in the picture."""
+    pos, vector, ball = pose(0)
+    looker = Looker(params(folder), training())
+    assert looker.known(None).ball_ray_c is None
+    hint = Hint(tuple(pos.tolist()), quaternion(vector), (0.2, 0.6))
+    assert looker.known(hint).ball_ray_c is None
+    assert looker.look(pictures[0], 0.0, hint).ball is not None
+    turned = torch.tensor([[0.0, 0.7, 0.0]], dtype=torch.float64)
+    known = looker.known(Hint(tuple(pos.tolist()), quaternion(turned), None))
+    camera = KeypointCamera(training(), dtype=torch.float64)
+    rot = rotation_from_vector(turned)[0]
+    eye = torch.tensor(pos) + rot @ camera.position_b
+    there = (camera.rot_cb @ rot.T @ (torch.tensor(ball) - eye)).numpy()
+    cosine = there @ known.ball_ray_c / np.linalg.norm(there)
+    assert math.acos(cosine) < known.within, "but for the lens's own way of 2 cm"
+    np.testing.assert_allclose(known.up_c, (camera.rot_cb @ rot.T)[:, 2].numpy(), atol=1e-6)
+    assert known.height == pytest.approx(float(eye[2]), abs=1e-6)
+
+
 def test_only_the_newest_of_several_pictures_is_looked_at(folder):
     source = RecordedImages(params(folder, delay=0.03), training())
     assert source.poll(0.02) == [], "it takes its time to arrive"
