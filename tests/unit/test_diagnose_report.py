@@ -210,3 +210,26 @@ def test_the_recording_is_written(tmp_path, found):
 
     recording.write(tmp_path / "d.rrd", found[1], [])
     assert (tmp_path / "d.rrd").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(("arguments", "said"), [
+    (["explain", "nothing.npz"], "nothing.npz"), (["blind", "nothing.npz"], "nothing.npz"),
+    (["plan", "nothing.npz"], "nothing.npz"),
+    (["explain", "nothing.npz", "--config", "nobody"], "nobody"),
+])  # fmt: skip
+def test_mistakes_on_the_command_line_are_told(capsys, tmp_path, monkeypatch, arguments, said):
+    from visthrow.cli import main
+
+    monkeypatch.chdir(tmp_path)
+    assert main(["diagnose", *arguments]) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_flights_are_numbers():
+    from visthrow.diagnose.opening import numbers
+    from visthrow.errors import DiagnoseError
+
+    assert numbers("0, 3") == (0, 3)
+    assert numbers("") == ()
+    with pytest.raises(DiagnoseError, match="such as 0,3"):
+        numbers("first")

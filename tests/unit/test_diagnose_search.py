@@ -216,21 +216,8 @@ def test_causes_at_their_floors_are_not_named():
 
 def test_mutation_without_floors_causes_at_their_floors_would_be_named(monkeypatch):
     """The spike of an inactive effect taken away: the guard of the test above."""
-    monkeypatch.setattr(Priors, "deviation", lambda self, active: np.where(
-        np.isin(np.arange(len(self.floor)), list(active)), self.slab, 1e-3))  # fmt: skip
-    original = evidence.additions
-
-    def without_floors(information, score, priors, active):
-        base = evidence.log_evidence(information, np.atleast_2d(score)[0], priors, list(active))
-        if score.ndim > 1:
-            return original(information, score, priors, active)
-        gain = [
-            -np.inf if j in active else evidence.log_evidence(information, score, priors, [*active, j]) - base
-            for j in range(len(priors.floor))
-        ]
-        return np.array(gain)
-
-    monkeypatch.setattr(search, "additions", without_floors)
+    monkeypatch.setattr(evidence, "SPIKE", 1e-3)
+    monkeypatch.setattr(search, "threshold", lambda *_: np.log(len(EFFECTS)))
     assert search.explain(small_causes(3), laws=False).theta
 
 

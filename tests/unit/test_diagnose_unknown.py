@@ -5,7 +5,7 @@ import pytest
 
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
 from visthrow.diagnose import grammar, result, search
-from visthrow.diagnose.blackbox import table_of, train
+from visthrow.diagnose.blackbox import Table, table_of, train, unexplained
 from visthrow.diagnose.model import LATENT_BLOCKS
 
 EFFECTS = catalogue(12)
@@ -117,10 +117,15 @@ def test_the_table_takes_up_what_no_name_explains():
     table = table_of(point, np.random.default_rng(0))
     flights = [w.flight for w in point.windows]
     trained = train(point, table, flights)
-    weights = trained.weights(trained.groups != 6)
-    index = next(i for i, w in enumerate(point.windows) if w.flight == 6 and w.phase == "throw")
+    weights = trained.weights(trained.groups != 5)
+    index = next(i for i, w in enumerate(point.windows) if w.flight == 5 and w.phase == "throw")
     window = point.windows[index]
     asked = (table.columns(window) @ weights)[: 3 * 11].reshape(3, 11).T
     velocity = window.knots["vel_w"]
     truth = -0.02 * np.linalg.norm(velocity, axis=1)[:, None] * velocity
     assert np.linalg.norm(asked - truth) < 0.6 * np.linalg.norm(truth)
+    data = unexplained(point, 0)
+    again = Table(*(np.array(data[k]) for k in ("mean", "deviation", "centres")), tuple(data["weights"]))
+    speeds = np.column_stack((velocity, window.knots["rate_b"], window.knots["thrust"]))
+    drag = again.radial(speeds) @ np.array(data["weights"]["vehicle force"]).T
+    assert np.linalg.norm(drag - truth) < 0.6 * np.linalg.norm(truth)

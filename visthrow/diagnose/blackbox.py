@@ -103,8 +103,16 @@ class Trained:
         return mean
 
 
-def train(point: Point, table: Table, groups: Sequence[int]) -> Trained:
-    """Gather what the windows say about the table's weights, with every effect at 0."""
+def train(point: Point, table: Table, groups: Sequence[int], theta: np.ndarray | None = None) -> Trained:
+    """Gather what the windows say about the table's weights.
+
+    Args:
+        point: linearised anywhere.
+        table: whose weights are asked for.
+        groups: of the windows.
+        theta: sizes of the effects beside the table, in floors, shape (K,); default 0.
+    """
+    back = point.statistics.theta - (0.0 if theta is None else theta)
     names = np.array(sorted(set(groups)))
     size = table.columns(point.windows[0]).shape[1]
     information, score = np.zeros((len(names), size, size)), np.zeros((len(names), size))
@@ -112,9 +120,26 @@ def train(point: Point, table: Table, groups: Sequence[int]) -> Trained:
         columns, part = table.columns(window), window_statistics(point.grams[w], point.noise, w)
         f = int(np.searchsorted(names, group))
         information[f] += columns.T @ part.latent_information @ columns
-        score[f] += columns.T @ (part.latent_score + part.latent_effects @ point.theta)
+        score[f] += columns.T @ (part.latent_score + part.latent_effects @ back)
     reach = np.concatenate([
         np.full(size // len(table.blocks), max(v for (b, _), v in point.noise.latent_sd.items() if LATENT_BLOCKS[b] == name))
         for name in table.blocks
     ])  # fmt: skip
     return Trained(names, information, score, reach)
+
+
+def unexplained(point: Point, seed: int) -> dict | None:
+    """A table of what is left at a point, as plain data; None where none can be made.
+
+    Force in body axes = sum over functions of weights times (1, inputs, radial functions of the inputs), inputs in deviations.
+    """
+    table = table_of(point, np.random.default_rng(seed))
+    if table is None:
+        return None
+    weights = train(point, table, [0] * len(point.windows), point.statistics.theta).weights(np.ones(1, dtype=bool))
+    by_block = weights.reshape(len(table.blocks), 3, -1)
+    return {
+        "label": "unexplained", "inputs": "body velocity [m/s], body rates [rad/s], thrust [N], as far as known",
+        "mean": table.mean.tolist(), "deviation": table.deviation.tolist(), "centres": table.centres.tolist(), "width": WIDTH,
+        "weights": dict(zip(table.blocks, by_block.tolist())),
+    }  # fmt: skip

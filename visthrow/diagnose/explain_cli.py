@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _report(args: argparse.Namespace, diagnosis, model, logs):
     from visthrow import provenance
-    from visthrow.diagnose import blind, gain, recording, report
+    from visthrow.diagnose import blackbox, blind, gain, recording, report, result
     from visthrow.storage import write_json
 
     measured = gain.measure(diagnosis, seed=args.seed)
@@ -67,7 +67,9 @@ def _report(args: argparse.Namespace, diagnosis, model, logs):
     made = report.sections(diagnosis, measured, hidden, step_check=steps, about=about)
     folder = Path(args.out)
     report.write(folder, made, diagnosis, "What the simulation gets wrong about these flights")
-    whole = report.to_json(diagnosis, measured, hidden, extra={"step_error_sigma": steps, "provenance": origin})
+    table = blackbox.unexplained(diagnosis.work.after, args.seed) if diagnosis.overall == result.UNKNOWN else None
+    extra = {"step_error_sigma": steps, "provenance": origin, "table": table}
+    whole = report.to_json(diagnosis, measured, hidden, extra=extra)
     write_json(folder / "diagnosis.json", whole)
     recording.write(folder / "diagnosis.rrd", diagnosis, logs)
     return measured

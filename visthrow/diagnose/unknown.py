@@ -99,20 +99,23 @@ class _Screen:
 
 def _columns(point: Point, window: int, block: str, terms_: Sequence[grammar.Term]) -> np.ndarray:
     w = point.windows[window]
+    if not np.any(w.latent_block == LATENT_BLOCKS.index(block)):
+        return np.zeros((len(w.latent_block), len(terms_)))
     values = grammar.table_of(terms_, w.knots)
     return grammar.coefficients(w.latent_block, w.latent_axis, w.latent_time, w.knots["time"], block, values)
 
 
 def _screen(point: Point, block: str) -> _Screen | None:
     """Gather what each term of a block says; None where the windows carry no knots for any."""
-    known = sorted(set.intersection(*(set(w.knots) for w in point.windows)))
-    terms_ = _terms(block, tuple(known)) if {"time"} <= set(known) else ()
     index = LATENT_BLOCKS.index(block)
-    if not terms_ or not any(np.any(g.latent_block == index) for g in point.grams):
+    knots = [set(w.knots) for w in point.windows if np.any(w.latent_block == index)]
+    known = set.intersection(*knots) if knots else set()
+    terms_ = _terms(block, tuple(sorted(known))) if "time" in known else ()
+    if not terms_:
         return None
     count, effects = len(terms_), len(point.theta)
     own, score, cross, square = np.zeros(count), np.zeros(count), np.zeros((count, effects)), np.zeros(count)
-    knots = 0
+    rows = 0
     for w, gram in enumerate(point.grams):
         if not np.any(gram.latent_block == index):
             continue
@@ -122,8 +125,8 @@ def _screen(point: Point, block: str) -> _Screen | None:
         score += columns.T @ (part.latent_score + part.latent_effects @ point.theta)
         cross += columns.T @ part.latent_effects
         square += (columns**2).sum(0)
-        knots += int((gram.latent_block == index).sum()) // 3
-    return _Screen(list(terms_), np.sqrt(square / max(knots, 1)), own, score, cross)
+        rows += int((gram.latent_block == index).sum()) // 3
+    return _Screen(list(terms_), np.sqrt(square / max(rows, 1)), own, score, cross)
 
 
 def _gains(point: Point, priors: Priors, active: Sequence[int], screen: _Screen, reach: float) -> tuple[np.ndarray, np.ndarray]:

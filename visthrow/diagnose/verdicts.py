@@ -50,7 +50,8 @@ def conclude(search: "Search", *, laws: bool) -> Diagnosis:
     answer = find_laws(search) if laws else Answer()
     law = beats_the_catalogue(search, answer)
     overall, block, reasons, withdrawn = _overall(search, found, *law)
-    terms = [term for hypothesis in answer.strongest for term in hypothesis.laws()]
+    known = overall != result.UNKNOWN  # a term that is weaker than the names says nothing
+    terms = [] if known else [term for hypothesis in answer.strongest for term in hypothesis.laws()]
     active = [j for j in search.active if j not in withdrawn]
     if not active and search.active:
         point = search.nominal
