@@ -29,7 +29,7 @@ ENTRIES: tuple[Entry, ...] = (
     ),
     entry(
         "rate_gain",
-        "The rate controller is stiffer or softer about roll and pitch",
+        "The rate controller is stiffer or softer",
         "p, i, d gains times (1 + theta)",
         "1",
         "rate controller",
@@ -38,7 +38,7 @@ ENTRIES: tuple[Entry, ...] = (
         1e-2,
         POSE,
         "Betaflight's tuning range",
-        [Key(f"{C}{name}", index=i, scale=True) for name in ("p_gain", "i_gain", "d_gain") for i in (0, 1)],
+        [Key(f"{C}{name}", scale=True) for name in ("p_gain", "i_gain", "d_gain")],
         confused=("inertia_x", "inertia_y"),
         manoeuvres=("add a bar of known inertia", "gyro in the log"),
         applies=lambda s: not _geometric(s),
