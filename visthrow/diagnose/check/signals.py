@@ -11,7 +11,7 @@ FEW_STEPS, SLOW_PERIOD = 5, 0.5
 SHORT = 0.5
 """Shorter channels answer nothing [s]."""
 LONG = 1800.0
-"""Longer logs are looked at, but cut before they are simulated [s]."""
+"""Of longer logs only windows spread over them are simulated [s]."""
 
 _GAP_PERIODS = 3.0
 _JITTER_WARN = 0.25  # of a period, 95th percentile
@@ -91,7 +91,7 @@ def _clock(name: str, channel: Channel, notes: dict) -> Row:
         figures["held"] = notes["held"]
     if span > LONG:
         verdict = "warn" if verdict == "ok" else verdict
-        text += f"; long: only windows of {LONG / 60:.0f} minutes in all are simulated"
+        text += "; long: models look at windows spread over it"
     return Row("clock", name, verdict, text, figures)
 
 

@@ -57,7 +57,7 @@ def read_all(paths: Sequence[str | Path], mapping: TableMap | None = None) -> li
 def _of_folder(path: Path) -> list[FlightLog]:
     if (path / RUN_LOG).is_file():
         return read(path / RUN_LOG)
-    logs = sorted(p for p in path.glob("*.npz"))
+    logs = sorted(p for p in path.glob("*.npz") if p.name != "policy.npz")
     if not logs:
         raise LogError(f"{path}: a folder without {RUN_LOG} or other .npz logs; name the files themselves")
     return read_all(logs)

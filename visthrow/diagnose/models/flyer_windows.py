@@ -49,7 +49,9 @@ def _windows(log: FlightLog, number: int, params: "FlyerParams", channels: Seque
     first = max(c.time[0] for c in (position, attitude, told))
     last = min(c.time[-1] for c in (position, attitude, told))
     found = []
-    for start in np.arange(first + params.window, last - params.window, params.window):
+    starts = np.arange(first + params.window, last - params.window, params.window)
+    starts = starts[:: max(1, len(starts) // (4 * params.most_windows))]  # hours are thinned before they are cut
+    for start in starts:
         if all(_covered(c, start, start + params.window) for c in (position, attitude, told)):
             stretch = _window(log, number, params, channels, sigma, float(start))
             if stretch is not None:
