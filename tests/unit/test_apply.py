@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+from sim.params import LawParams
 from visthrow import cli, config
 from visthrow.diagnose import patch
 from visthrow.diagnose.catalogue import ALL
@@ -65,6 +66,18 @@ def test_applied_twice_is_applied_once_more(diagnosis, tmp_path, capsys):
     after = config.load(Experiment, second)
     assert after.rope.length == pytest.approx(shipped().rope.length - 0.003)
     np.testing.assert_allclose(after.vehicle.thrust.gain, 1.03)
+
+
+def test_a_law_is_written_as_a_block(diagnosis, tmp_path, capsys):
+    law = {"formula": "F_p = c (z x v_p)", "block": "payload force", "factors": ["speed"], "vector": "vertical_cross_vel",
+           "coefficient": 0.02, "sd": 0.001, "unit": "kg m^-1", "nats": 40.0}  # fmt: skip
+    out = tmp_path / "law.toml"
+    arguments = ["diagnose", "apply", diagnosis(theta={}, covariance=[], laws=[law]), "--out", str(out)]
+    assert cli.main([*arguments, "--laws", "1"]) == 0
+    assert "vertical_cross_vel" in capsys.readouterr().out
+    assert config.load(Experiment, out).laws == (LawParams("payload force", ("speed",), "vertical_cross_vel", 0.02),)
+    assert cli.main([*arguments, "--laws", "2"]) == 2
+    assert "asks for 2" in capsys.readouterr().err
 
 
 def test_every_effect_can_be_written():

@@ -26,6 +26,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--plants", type=int, default=DEFAULT_PLANTS, metavar="N",
         help=f"plants that training draws from the joint posterior; 1: the estimate alone (default: {DEFAULT_PLANTS})",
     )  # fmt: skip
+    parser.add_argument(
+        "--laws", type=int, default=0, metavar="N", help="write the best N laws outside the catalogue as well (default: 0)"
+    )
     parser.add_argument("--anyway", action="store_true", help="write it even if held-out flights saw no gain")
 
 
@@ -44,7 +47,8 @@ def run(args: argparse.Namespace) -> int:
     except (OSError, ValueError) as error:
         raise DiagnoseError(f"{args.diagnosis}: not readable as a diagnosis: {error}") from error
     theta, covariance = patch.read(report, args.diagnosis)
-    if not theta:
+    laws = patch.laws_of(report, args.diagnosis, args.laws)
+    if not theta and not laws:
         print("nothing was named; the configuration stands as it is")
         return 0
     doubts = harm(report)
@@ -54,10 +58,11 @@ def run(args: argparse.Namespace) -> int:
     experiment = config.load(Experiment, path)
     shipped = path.is_relative_to(config.configs_root())
     base = path.relative_to(config.configs_root()).as_posix() if shipped else str(path.resolve())
-    content = patch.text(base, experiment, theta, covariance, args.plants, origin(report, args.diagnosis))
+    content = patch.text(base, experiment, theta, covariance, args.plants, origin(report, args.diagnosis), laws)
     atomic_write(args.out, content)
     config.load(Experiment, Path(args.out))  # what was written is what training will read
-    print(f"{args.out}: {', '.join(theta)} on top of {base}")
+    named = [*theta, *(f"{law.coefficient:.4g} {' '.join((*law.factors, law.vector))} ({law.block})" for law in laws)]
+    print(f"{args.out}: {', '.join(named)} on top of {base}")
     return 0
 
 

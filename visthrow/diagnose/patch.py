@@ -4,6 +4,8 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from sim.laws import check_laws
+from sim.params import LawParams
 from visthrow import config
 from visthrow.diagnose.catalogue import ALL, Setting, apply
 from visthrow.diagnose.opened import closed, opened
@@ -51,7 +53,7 @@ def touched(theta: Mapping[str, float]) -> dict[str, list[str]]:
 
 def text(
     base: str, experiment: Experiment, theta: Mapping[str, float], covariance: Sequence[Sequence[float]], plants: int,
-    provenance: Sequence[str],
+    provenance: Sequence[str], laws: Sequence[LawParams] = (),
 ) -> str:  # fmt: skip
     """The TOML file.
 
@@ -62,11 +64,14 @@ def text(
         covariance: of theta, in its order.
         plants: to draw in training from the joint posterior.
         provenance: lines that say where it comes from.
+        laws: terms outside the catalogue, to stand beside those that the configuration has.
     """
     after = dataclasses.replace(
         extended(experiment, theta),
         diagnosed=_diagnosed(experiment, theta, covariance, plants),
+        laws=(*experiment.laws, *laws),
     )
+    check_laws(after.laws)
     changed = differences(config.to_dict(experiment), config.to_dict(after))
     lines = [f"# {line}" for line in provenance] + [dumps({"base": base}).strip(), ""]
     about = touched(theta)
@@ -78,7 +83,7 @@ def text(
         switched = [n for n in theta if ALL[n].switch is not None]
         words = [f"{n} {theta[n]:+.4g} +- {sd[n]:.2g} {ALL[n].effect.unit}" for n in about.get(path, [])]
         if " = " in line and not words:
-            words = ["of the diagnosis above"] if section == "diagnosed" else switched
+            words = ["of the diagnosis above"] if section == "diagnosed" or line.startswith("laws") else switched
         lines.append(f"{line}  # {'; '.join(words)}" if words else line)
     return "\n".join(lines).rstrip() + "\n"
 
@@ -89,6 +94,18 @@ def _diagnosed(experiment: Experiment, theta: Mapping[str, float], covariance: S
     names = list(theta)
     rows = tuple(tuple(float(covariance[i][j]) for j in own) for i in own)
     return dataclasses.replace(experiment.diagnosed, effects=tuple(names[i] for i in own), covariance=rows, plants=plants)
+
+
+def laws_of(report: Mapping[str, Any], path: str, count: int) -> list[LawParams]:
+    """The best ``count`` laws of the JSON that ``explain`` wrote.
+
+    Raises:
+        DiagnoseError: It holds fewer.
+    """
+    told = report.get("laws") or []
+    if count > len(told):
+        raise DiagnoseError(f"{path}: {len(told)} laws outside the catalogue; --laws asks for {count}")
+    return [LawParams(x["block"], tuple(x["factors"]), x["vector"], float(x["coefficient"])) for x in told[:count]]
 
 
 def read(report: Mapping[str, Any], path: str) -> tuple[dict[str, float], list[list[float]]]:
