@@ -9,7 +9,8 @@ import pytest
 from visthrow import cli
 
 ROOT = Path(__file__).resolve().parents[2]
-TEXT = (ROOT / "README.md").read_text(encoding="utf-8")
+PAGES = [ROOT / name for name in ("README.md", "hil/README.md", "visthrow/diagnose/README.md")]
+TEXT = "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
 BLOCKS = re.findall(r"```(\w*)\n(.*?)```", TEXT, re.DOTALL)
 LINES = [line.split("#")[0].strip() for _, block in BLOCKS for line in block.splitlines() if line.startswith("visthrow ")]
 
@@ -29,7 +30,9 @@ def test_commands_parse(line):
 
 
 def test_links_lead_somewhere():
-    targets = re.findall(r"\]\(([^)]+)\)", TEXT) + re.findall(r"`((?:configs|tests)/[\w./]+)`", TEXT)
-    assert targets
-    missing = [t for t in targets if "://" not in t and not (ROOT / t).exists()]
+    targets = [(ROOT, t) for t in re.findall(r"`((?:configs|tests)/[\w./]+)`", TEXT)]
+    for page in PAGES:
+        targets += [(page.parent, t) for t in re.findall(r"\]\(([^)]+)\)", page.read_text(encoding="utf-8"))]
+    assert len(targets) > len(PAGES)
+    missing = [t for folder, t in targets if "://" not in t and not (folder / t).exists()]
     assert not missing
