@@ -76,6 +76,7 @@ def test_prediction_does_not_look_at_what_it_predicts(found):
     np.testing.assert_allclose((spoilt - plain)[late, 0], 1.0 / window.sigma[late])
 
 
+@pytest.mark.slow
 def test_two_flights_are_halved_instead():
     model = SyntheticModel(effects=EFFECTS, truth={"effect_03": 15.0}, throws=0, free=2, seed=2)
     measured = gain.measure(search.explain(model, laws=False), draws=500)
@@ -119,6 +120,7 @@ def test_completeness_rises_and_noise_is_not_named(hidden):
         assert 2.0 < curve.limit / curve.sizes[0] < 20.0
 
 
+@pytest.mark.slow
 def test_limits_hold_for_effects_hidden_in_the_measurements(hidden):
     """Twice the limit is found by the whole search, half of it is not: the statistics' promise, kept by the simulation."""
     model = SyntheticModel(effects=EFFECTS, seed=7)
@@ -127,6 +129,7 @@ def test_limits_hold_for_effects_hidden_in_the_measurements(hidden):
     assert not search.explain(blind.Hidden(model, {"effect_09": 0.4 * limit}), laws=False).theta
 
 
+@pytest.mark.slow
 def test_what_is_hidden_besides_what_was_found_is_told(found):
     trial = blind.verify(found[1], 1, floors=12.0, only=("effect_00",))[0]
     assert trial.name == "effect_00"

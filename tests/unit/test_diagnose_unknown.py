@@ -9,6 +9,7 @@ from visthrow.diagnose.blackbox import Table, table_of, train, unexplained
 from visthrow.diagnose.model import LATENT_BLOCKS
 
 EFFECTS = catalogue(12)
+LEFT = 0.7  # of a hidden force after a table learnt from a dozen throws, in a throw that it has not seen: a table is no formula
 KNOTS = (
     "time", "pos_w", "vel_w", "quat_wb", "rate_b", "thrust", "payload_pos_w", "payload_vel_w", "cable_dir_w", "tension",
 )  # fmt: skip
@@ -80,7 +81,8 @@ def test_terms_that_lack_their_knots_are_not_made():
 
 
 @pytest.mark.parametrize(("law", "size", "formula"), [
-    ("speed", -0.01, "F = c |v| v"), ("swirl", 0.01, "F_p = c (z x v_p)"), ("thrust", 0.012, "F = c T v_xy² e_z"),
+    ("speed", -0.01, "F = c |v| v"), pytest.param("swirl", 0.01, "F_p = c (z x v_p)", marks=pytest.mark.slow),
+    pytest.param("thrust", 0.012, "F = c T v_xy² e_z", marks=pytest.mark.slow),
 ])  # fmt: skip
 def test_hidden_laws_are_written_down(law, size, formula):
     model = SyntheticModel(effects=EFFECTS, law=law, law_size=abs(size), seed=3)
@@ -112,7 +114,7 @@ def test_known_causes_and_gusts_are_no_laws():
 
 def test_the_table_takes_up_what_no_name_explains():
     """Weights from some flights predict the hidden drag in a flight that they have not seen."""
-    model = SyntheticModel(effects=EFFECTS, law="speed", law_size=0.02, seed=3)
+    model = SyntheticModel(effects=EFFECTS, law="speed", law_size=0.02, seed=3, throws=12)
     point = search.explain(model, laws=False).work.before
     table = table_of(point, np.random.default_rng(0))
     flights = [w.flight for w in point.windows]
@@ -123,9 +125,9 @@ def test_the_table_takes_up_what_no_name_explains():
     asked = (table.columns(window) @ weights)[: 3 * 11].reshape(3, 11).T
     velocity = window.knots["vel_w"]
     truth = -0.02 * np.linalg.norm(velocity, axis=1)[:, None] * velocity
-    assert np.linalg.norm(asked - truth) < 0.6 * np.linalg.norm(truth)
+    assert np.linalg.norm(asked - truth) < LEFT * np.linalg.norm(truth)
     data = unexplained(point, 0)
     again = Table(*(np.array(data[k]) for k in ("mean", "deviation", "centres")), tuple(data["weights"]))
     speeds = np.column_stack((velocity, window.knots["rate_b"], window.knots["thrust"]))
     drag = again.radial(speeds) @ np.array(data["weights"]["vehicle force"]).T
-    assert np.linalg.norm(drag - truth) < 0.6 * np.linalg.norm(truth)
+    assert np.linalg.norm(drag - truth) < LEFT * np.linalg.norm(truth)

@@ -56,12 +56,13 @@ def across_flights(
     """
     statistics = after.statistics
     own = statistics.information[:, added, added]
-    size = after.theta[added]
     if len(own) < LEAST_FLIGHTS or own.sum() <= 0.0:
         return None
-    if _by_chance(own, statistics.score[:, added] + own * size):
+    score = statistics.score[:, added] + own * statistics.theta[added]
+    if _by_chance(own, score):
         return Consistency(None)
-    estimates = size + np.divide(statistics.score[:, added], own, out=np.zeros_like(own), where=own > 0.0)
+    estimates = np.divide(score, own, out=np.zeros_like(own), where=own > 0.0)
+    size = score.sum() / own.sum()
     variance = 1.0 / np.maximum(own, 1e-12) + (SHARE * size) ** 2 + 1.0
     single = _single(before, after, priors, active, added, least, estimates)
     if single is not None:
@@ -73,7 +74,8 @@ def across_flights(
 def _single(before: Point, after: Point, priors: Priors, active: Sequence[int], added: int, least: float,
             estimates: np.ndarray) -> int | None:  # fmt: skip
     """The flight that alone asks for an effect which the others, who would show it, deny."""
-    own, size = after.statistics.information[:, added, added], after.theta[added]
+    own = after.statistics.information[:, added, added]
+    size = (own @ estimates) / own.sum()
     f = int(np.argmax(own * np.abs(estimates) * np.sign(estimates) * np.sign(size)))
     others = np.arange(len(own)) != f
     weight = own[others].sum()
