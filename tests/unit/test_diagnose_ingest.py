@@ -243,6 +243,11 @@ class TestTables:
             ),
         )  # fmt: skip
         assert [log.meta["part"] for log in logs] == ["a", "b"]
+        path = tmp_path / "a.csv"
+        whole = mapping(ChannelMap("y", ("v",), "m"), split=Split("b"))
+        assert [log.meta["part"] for log in read(f"{path}:b*", whole)] == ["b"]
+        with pytest.raises(LogError, match="no part 'c' among 2"):
+            read(f"{path}:c", whole)
         assert logs[1]["x"].time[0] == 100.0
         assert logs[1]["y"].time[0] == pytest.approx(0.5)
 

@@ -29,7 +29,7 @@ SETUPS = {
 pytestmark = pytest.mark.slow
 
 
-def explained(setup: str, *paths: Path):
+def explained(setup: str, *paths: str | Path):
     logs = setups.read_logs(paths, setup)
     model = setups.model_of(setups.load(setup), logs)
     diagnosis = explain(model, seed=0)
@@ -158,11 +158,16 @@ def test_thrust_map_drag_and_battery_of_nanobench():
     assert rms(diagnosis.theta) < 0.2 * rms({})
 
 
-def test_propellers_differ_and_the_supply_does_not_matter():
-    diagnosis, named, rms = explained("motor_stand", REAL / "motor_prop_stand" / "all_tests.csv.gz")
-    assert named & {"thrust_linear", "thrust_exponent"}
+def test_a_motor_idles_and_a_hundred_motors_are_not_one():
+    table = REAL / "motor_prop_stand" / "all_tests.csv.gz"
+    for pair in ("a1", "c1", "g1"):  # one motor, one propeller, two supplies
+        diagnosis, named, _ = explained("motor_stand", f"{table}:{pair}_*")
+        assert diagnosis.overall == KNOWN
+        assert "idle_power" in named
+        assert 1.0 < diagnosis["idle_power"].estimate < 5.0
+    diagnosis, named, _ = explained("motor_stand", table)
+    assert diagnosis.overall != NO_EFFECT
     assert "thrust_voltage" not in named
-    assert rms(diagnosis.theta) < rms({})
 
 
 def test_the_camera_sees_the_load_nearer_the_axis():

@@ -8,13 +8,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
         "examples:\n"
         "  visthrow diagnose fit hover.csv circle.csv --config mine.toml --out runs/fit     a vehicle without payload\n"
-        "  visthrow diagnose fit stand.csv --config motor_stand --only a1_11 a1_7           a motor with one propeller\n"
+        "  visthrow diagnose fit stand.csv:a1_* --config motor_stand                          a motor with one propeller\n"
         "  visthrow config vehicle runs/fit/vehicle.toml                                    what came of it\n"
     )
     parser.add_argument("logs", metavar="LOG", nargs="+", help="files, or folders of runs")
     parser.add_argument("--config", required=True, metavar="NAME", help="of configs/diagnose, or a file; with a model in it")
     parser.add_argument("--free", nargs="+", default=[], metavar="EFFECT", help="what is fitted (default: by the model)")
-    parser.add_argument("--only", nargs="+", default=[], metavar="PART", help="of logs with several parts, only these")
     parser.add_argument("--vehicle", default="paper", metavar="NAME", help="lends all that is not fitted (default: paper)")
     parser.add_argument("--out", default="out/fit", metavar="FOLDER", help="for vehicle.toml and fit.json (default: out/fit)")
     parser.add_argument("--json", metavar="FILE", help="write the printed figures to this file as well")
@@ -27,17 +26,10 @@ def run(args: argparse.Namespace) -> int:
     from visthrow.diagnose import fit as fitting
     from visthrow.diagnose import setup as setups
     from visthrow.diagnose.check.run import check
-    from visthrow.errors import DiagnoseError, suggest
     from visthrow.storage import write_json
 
     setup = setups.load(args.config)
     logs = setups.read_logs(args.logs, args.config)
-    if args.only:
-        parts = {str(log.meta.get("part", "")) for log in logs}
-        for part in args.only:
-            if part not in parts:
-                raise DiagnoseError(f"no part '{part}' in these logs; {suggest(part, parts)}")
-        logs = [log for log in logs if str(log.meta.get("part", "")) in args.only]
     for checked in check(logs):
         for row in checked.rows:
             if row.verdict == "bad":

@@ -1,10 +1,11 @@
 """Logs of any kind into :class:`visthrow.flightlog.FlightLog`."""
 
 from collections.abc import Sequence
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 from visthrow.diagnose.ingest.mapping import TableMap
-from visthrow.errors import LogError
+from visthrow.errors import LogError, suggest
 from visthrow.flightlog import FlightLog
 
 ENDINGS = (".npz", ".csv", ".csv.gz", ".csv.xz", ".parquet", ".bbl", ".bfl", ".ulg", ".bin", ".tlog")
@@ -16,13 +17,17 @@ def read(path: str | Path, mapping: TableMap | None = None) -> list[FlightLog]:
     """Read a file, or the folder of a run, into flight logs; a file may hold several.
 
     Args:
-        path: Of one of :data:`ENDINGS`, or a folder that holds a ``flight.npz``.
+        path: Of one of :data:`ENDINGS`, or a folder that holds a ``flight.npz``. ``stand.csv:a1_*`` takes of the logs in a
+            file those whose part fits the pattern.
         mapping: Of a table's columns; not needed for our own exports and decoded blackbox logs.
 
     Raises:
         LogError: It cannot be read, or a table needs a mapping.
     """
     path = Path(path)
+    file, colon, pattern = str(path).rpartition(":")
+    if colon and not path.exists() and Path(file).is_file():
+        return _parts(read(file, mapping), file, pattern)
     if path.is_dir():
         return _of_folder(path)
     name = path.name.lower()
@@ -52,6 +57,14 @@ def read(path: str | Path, mapping: TableMap | None = None) -> list[FlightLog]:
 def read_all(paths: Sequence[str | Path], mapping: TableMap | None = None) -> list[FlightLog]:
     """Read several files; see :func:`read`."""
     return [log for path in paths for log in read(path, mapping)]
+
+
+def _parts(logs: list[FlightLog], file: str, pattern: str) -> list[FlightLog]:
+    names = [str(log.meta.get("part", "")) for log in logs]
+    chosen = [log for log, name in zip(logs, names) if fnmatchcase(name, pattern)]
+    if not chosen:
+        raise LogError(f"{file}: no part '{pattern}' among {len(names)}; {suggest(pattern, names)}")
+    return chosen
 
 
 def _of_folder(path: Path) -> list[FlightLog]:
