@@ -38,6 +38,9 @@ BAD_WINDOW = 2.5
 BAD_NATS = 8.0
 """Log-likelihood that a window's own level must gain; that of chance stays below 4 in a hundred windows."""
 
+BAD_SHARE = 0.34
+"""Share of a phase's windows that may be bad; where more are, the phase is rough."""
+
 FACTORS = tuple(2.5 * 1.6**k for k in range(18))
 """Of the phase's level that are tried for a bad window."""
 
@@ -173,7 +176,7 @@ def _own_levels(grams: Sequence[Gram], noise: Noise) -> np.ndarray:
             own[w, block] = _own_level(gram, noise, w, int(block))
     for phase in {gram.phase for gram in grams}:
         of_phase = np.array([gram.phase == phase for gram in grams])
-        many = np.isfinite(own[of_phase]).sum(0) > 0.25 * of_phase.sum()  # what many windows have is the phase's own level
+        many = np.isfinite(own[of_phase]).sum(0) > BAD_SHARE * of_phase.sum()  # what many windows have is the phase's own level
         own[np.ix_(of_phase, many)] = np.nan
     return own
 
