@@ -30,7 +30,7 @@ def summary(diagnosis: Diagnosis, gain: Gain | None = None) -> str:
     for f in diagnosis.findings:
         if f.verdict in (result.FOUND, result.CLASS):
             lines.append(f"{f.verdict:6} {f.sentence}")
-    lines += [f"EVENT  something happened in flight {flight} that the other flights deny" for flight in diagnosis.events]
+    lines += [f"EVENT  something happened in flight {flight} that the others do not show" for flight in diagnosis.events]
     lines += [f"COPY   flight {flight} repeats flight {of} and was left out" for flight, of in diagnosis.duplicates.items()]
     counted = {v: sum(f.verdict == v for f in diagnosis.findings) for v in result.VERDICTS}
     lines.append(", ".join(f"{count} {verdict.lower()}" for verdict, count in counted.items() if count))
@@ -125,7 +125,7 @@ def _verdict(diagnosis: Diagnosis, gain: Gain | None) -> Section:
     if diagnosis.overall == result.UNKNOWN and diagnosis.laws:
         law = diagnosis.laws[0]
         parts.append(Text(f"**Law.** {law.formula} with c = {law.coefficient:.3g} ± {law.sd:.2g} {law.unit}.", "finding"))
-    parts += [Text(f"**Event in flight {flight}.** Something happened there that the other flights deny; it was left out.",
+    parts += [Text(f"**Event in flight {flight}.** Something happened there that the others do not show; it was left out.",
                    "finding") for flight in diagnosis.events]  # fmt: skip
     parts += [Text(f"Flight {flight} repeats flight {of} and counts once.", "finding")
               for flight, of in diagnosis.duplicates.items()]  # fmt: skip
