@@ -56,6 +56,7 @@ class DelayParams:
     source: float  # of a pose when it arrives [s], where its sender's clock is not known
     synchronise: bool  # ask the senders of poses for their clock by TIMESYNC, and take ages from it where they answer
     compensate: bool  # carry poses forward to the age that the policy was trained with
+    command: float = 0.0  # by which commands act later than in the policy's training; poses are carried as much further [s]
 
 
 @dataclass(frozen=True)

@@ -305,7 +305,8 @@ class Runner:
         delay = self.params.delay
         last = track.gate.last
         age = track.gate.age(now) + (delay.source if last is None else last.transit(delay.source))
-        ahead = age - 0.5 * (self._latency[0] + self._latency[1]) if delay.compensate and math.isfinite(age) else 0.0
+        trained = 0.5 * (self._latency[0] + self._latency[1])
+        ahead = age - trained + delay.command if delay.compensate and math.isfinite(age) else 0.0
         return track.state(now, ahead)
 
     def _goal(self, bodies: dict[str, BodyState | None]) -> Vector | None:

@@ -171,7 +171,13 @@ class Flights:
         self.volt = volt  # at the start of each period, shape (E, ticks)
 
 
-def fly(kind, worlds, pilots, references, seconds, gusts, seed, used) -> Flights:
+def fly(*args, **options) -> Flights:
+    """Fly lanes of a plant, on the CPU whatever else there is; see :func:`_fly` for the arguments."""
+    with wp.ScopedDevice("cpu"):  # state is looked at and changed through views of the kernels' memory
+        return _fly(*args, **options)
+
+
+def _fly(kind, worlds, pilots, references, seconds, gusts, seed, used) -> Flights:
     """Fly lanes of a plant.
 
     Args:

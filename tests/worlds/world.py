@@ -24,6 +24,8 @@ FLOORS = {
 }  # fmt: skip
 """Size below which an effect does not matter, in SI units, relative for gains and inertias: 5 mm of landing, or a tenth of
 the noise."""
+ONE_SIDED = ("mocap_delay_quad", "mocap_delay_payload", "payload_drag")
+"""Nothing is measured before it happens, and the model's payload has no drag that reality could lack."""
 PLANTS = ("chain", "string", "rod")
 GUSTS = (0.015, 1.5e-4, 6e-4)
 NOISE = {"pos": 5e-4, "att": np.radians(0.2), "ball": 8e-4}
@@ -52,11 +54,12 @@ class Recipe:
 
 
 def draw(seed: int, count: int, floors: float, names=tuple(FLOORS), plants=PLANTS, **options) -> Recipe:
-    """A world with ``count`` effects of ``floors`` times their floor, of random sign."""
+    """A world with ``count`` effects of ``floors`` times their floor, of random sign where both are possible."""
     rng = np.random.default_rng(seed)
     plant = str(rng.choice(plants))
     chosen = rng.choice(names, size=count, replace=False) if count else []
-    sizes = rng.uniform(0.9, 1.1, len(chosen)) * floors * rng.choice([-1.0, 1.0], len(chosen))
+    signs = np.where(np.isin(chosen, ONE_SIDED), 1.0, rng.choice([-1.0, 1.0], len(chosen)))
+    sizes = rng.uniform(0.9, 1.1, len(chosen)) * floors * signs
     return Recipe(
         seed, plant, {str(n): float(s * FLOORS[n]) for n, s in zip(chosen, sizes)}, floors if count else 0.0, **options
     )

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from visthrow.cli import EXIT_INTERRUPTED
 from visthrow.errors import VisthrowError
 
 ENDED = 120.0
@@ -115,8 +116,9 @@ def _end(runner: subprocess.Popen, said: str) -> None:
         _, text = runner.communicate(timeout=ENDED)
     except subprocess.TimeoutExpired as error:
         raise VisthrowError(f"the run did not end within {ENDED:g} s after it was told to: {said}") from error
-    if runner.returncode not in (0, 1):  # 1: aborted, as it was told
-        raise VisthrowError(f"the run failed: {text}")
+    # 1: aborted, as it was told; interrupted: it had just ended by itself as the signal came. Its summary tells the rest.
+    if runner.returncode not in (0, 1, EXIT_INTERRUPTED, -signal.SIGINT):
+        raise VisthrowError(f"the run failed with status {runner.returncode}: {text}")
 
 
 class Memory:

@@ -20,6 +20,9 @@ from scipy.linalg import lapack
 from visthrow.diagnose.model import LATENT_BLOCKS, Window
 from visthrow.errors import DiagnoseError
 
+ROUNDING = 1e-10
+"""Relative growth of the normal equations' diagonal where they are positive definite but for rounding."""
+
 
 @dataclass(frozen=True)
 class Gram:
@@ -188,6 +191,10 @@ def posterior(gram: Gram, noise: Noise, window: int) -> Posterior:
     normal.flat[:: size + 1] += 1.0
     right = (weight @ gram.cross[:, :size]) * level
     lower, failed = lapack.dpotrf(normal, lower=1, clean=1)
+    if failed and np.all(np.isfinite(normal)):
+        # Levels of many orders of magnitude, as a search for them may try, leave the identity below rounding.
+        normal.flat[:: size + 1] *= 1.0 + ROUNDING
+        lower, failed = lapack.dpotrf(normal, lower=1, clean=1)
     if failed:
         raise DiagnoseError(f"window of flight {gram.flight}, phase {gram.phase}: the normal equations are singular")
     inverse, _ = lapack.dpotri(lower, lower=1)

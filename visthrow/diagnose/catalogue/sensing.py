@@ -3,6 +3,9 @@
 from visthrow.diagnose.catalogue.entry import PAYLOAD, POSE, Entry, Key, entry
 
 S = "sensing."
+CLOCK = 1e-3
+"""By which a stamp may lie before what it stamps: clocks are no better [s]. A pose is not measured before it is there."""
+
 TURN = ("hover turned by 180 deg",)
 
 ENTRIES: tuple[Entry, ...] = (
@@ -18,6 +21,7 @@ ENTRIES: tuple[Entry, ...] = (
         POSE,
         "crazyflie_ros issue 141; prior 5 ms",
         [Key(f"{S}vehicle_delay")],
+        most=lambda setting: setting.sensing.vehicle_delay + CLOCK,
         confused=("cmd_delay",),
         manoeuvres=("IMU or rotor speeds in the log",),
     ),
@@ -33,6 +37,7 @@ ENTRIES: tuple[Entry, ...] = (
         PAYLOAD,
         "crazyflie_ros issue 141; prior 5 ms",
         [Key(f"{S}payload_delay")],
+        most=lambda setting: setting.sensing.payload_delay + CLOCK,
         confused=("release_lag", "mocap_delay_quad"),
         manoeuvres=("throws",),
     ),
@@ -48,6 +53,7 @@ ENTRIES: tuple[Entry, ...] = (
         ("rate_b",),
         "prior 5 ms",
         [Key(f"{S}gyro_delay")],
+        most=lambda setting: setting.sensing.gyro_delay + CLOCK,
         confused=("mocap_delay_quad",),
     ),
     *(
