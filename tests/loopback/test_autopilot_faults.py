@@ -7,6 +7,7 @@ most, from an armed vehicle inside its fence.
 import dataclasses
 import errno
 import math
+import time
 
 import numpy as np
 import pytest
@@ -297,6 +298,10 @@ def test_the_disk_is_full(tmp_path, full_at):
     def fill(now, runner, fake):
         if now >= full_at and not isinstance(recorder._files["ticks.jsonl"], Full):
             recorder._files = dict.fromkeys(recorder._files, Full())
+        # The recorder writes in a thread of its own; lock step does not wait for it.
+        patience = time.monotonic() + 10.0
+        while now >= full_at + 0.2 and not recorder.failed and time.monotonic() < patience:
+            time.sleep(0.01)
 
     fake, summary, told = run("ardupilot", START + 0.5, watch=fill, recorder=recorder)
     states = [state for state, _, _ in told]

@@ -107,10 +107,9 @@ def never(tmp_path):
 OWN = {"ardupilot": "levelled: no set-points", "px4": "left OFFBOARD: no set-points", "betaflight": "failsafe: motors idle"}
 """What the vehicle does by itself when nobody speaks any more."""
 
-KINDS = ("ardupilot", pytest.param("px4", marks=pytest.mark.slow), pytest.param("betaflight", marks=pytest.mark.slow))
 
-
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["ardupilot", "px4", "betaflight"])
 def test_the_runner_is_killed_in_mid_throw(tmp_path, kind, never):
     with Pair(tmp_path, kind, never, overrides=QUICK) as pair:
         pair.wait_for("throw")
