@@ -10,6 +10,7 @@ from hil.link import Link, TlogWriter
 from hil.params import LIVE, HilParams
 from hil.plausible import unit_problems
 from hil.pose import VEHICLE, Pose
+from hil.record import TLOG
 from hil.sources.base import Recorded
 from hil.sources.csv_file import read_csv
 from hil.sources.dataflash import read_bin
@@ -60,7 +61,7 @@ def open_source(params: HilParams, folder: Path, speed: float) -> tuple[Any, Lin
     if source.kind == "mavlink" or params.backend in ("ardupilot", "px4"):
         port = open_port(check_device(params.link.device, remote=params.link.remote))
         folder.mkdir(parents=True, exist_ok=True)
-        link = Link(port, params.link.system, params.link.component, TlogWriter(folder / "link.tlog"))
+        link = Link(port, params.link.system, params.link.component, TlogWriter(folder / TLOG))
         if params.delay.synchronise:
             LinkSync(link)
     if source.kind == "mavlink":

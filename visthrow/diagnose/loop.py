@@ -12,7 +12,7 @@ import multiprocessing as mp
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -37,6 +37,9 @@ BEFORE, AFTER = 1.5, 0.6
 
 THROW_SEED = 20_000
 """Of the throws that judge; the flights that are diagnosed have the seeds from 0."""
+
+RECORD = "record.json"
+"""What a finished loop leaves in its folder."""
 
 CONTRACT = ("vehicle", "rope", "release", "observation.latency")
 """Parts of a policy's contract that a hidden effect breaks."""
@@ -98,7 +101,7 @@ class Loop:
         record = {"hidden": dict(self.hidden), "named": theta, "overall": verdict["overall"], "target": self.target}
         record |= {"flights": self.flights, "throws": throws, "seconds": round(time.perf_counter() - begin, 1)}
         record["recovered"] = recovered(throws)
-        write_json(self.folder / "record.json", record)
+        write_json(self.folder / RECORD, record)
         return record
 
     def _config(self, name: str, experiment: Experiment) -> None:
@@ -116,8 +119,8 @@ class Loop:
             command.append("--resume")
         for change in self.changes:
             command += ["--set", change]
-        log = (self.folder / f"{name}.log").open("w")
-        return subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT)
+        with (self.folder / f"{name}.log").open("w") as log:
+            return subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT)
 
     def _wait(self, process: subprocess.Popen | None, name: str, say: Callable[[str], None]) -> None:
         if process is not None:
@@ -165,6 +168,18 @@ class Loop:
         found = json.loads(path.read_text())
         say(f"thrown: {name}, {np.mean(landed(found)):.3f} m")
         return found
+
+
+def read(folders: Sequence[Path]) -> list[dict[str, Any]]:
+    """Records of finished loops.
+
+    Raises:
+        DiagnoseError: a folder without one.
+    """
+    for folder in folders:
+        if not (folder / RECORD).exists():
+            raise DiagnoseError(f"{folder}: no {RECORD}; expected the folder of a loop that went round, runs/loop/motor_tau_0.02")
+    return [json.loads((folder / RECORD).read_text()) for folder in folders]
 
 
 def landed(throws: Mapping[str, Any]) -> np.ndarray:
@@ -244,7 +259,7 @@ def _between(channel: Channel, start: float, end: float) -> Channel:
     return dataclasses.replace(channel, time=channel.time[keep], values=channel.values[keep], valid=channel.valid[keep])
 
 
-def table(records: list[dict[str, Any]]) -> str:
+def table(records: Sequence[Mapping[str, Any]]) -> str:
     """Markdown table of loops."""
     lines = ["| hidden | named | before | after | oracle | won back |", "|---|---|---:|---:|---:|---:|"]
     for r in records:

@@ -4,18 +4,17 @@ import argparse
 from pathlib import Path
 
 DEFAULT_OUT = "runs/loop"
-RECORDS = Path(__file__).parent / "records" / "loop.json"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the action."""
     parser.epilog = (
         "examples:\n"
-        "  visthrow diagnose loop --shipped                     the table of the loops that were run before\n"
         "  visthrow diagnose loop --hide motor_tau=0.02         a slower motor; minutes on a GPU, hours on a CPU\n"
+        "  visthrow diagnose loop --show runs/loop/*            the table of loops that went round\n"
     )
     parser.add_argument("--hide", action="append", default=[], metavar="EFFECT=SIZE", help="of the catalogue; may be repeated")
-    parser.add_argument("--shipped", action="store_true", help="run nothing, show the committed record")
+    parser.add_argument("--show", type=Path, nargs="+", metavar="FOLDER", help="run nothing, show finished loops")
     parser.add_argument("--flights", type=int, default=12, help="that are diagnosed (default: 12)")
     parser.add_argument("--throws", type=int, default=200, help="of each policy in the end (default: 200)")
     parser.add_argument("--processes", type=int, help="for flights and throws (default: one a core)")
@@ -30,12 +29,8 @@ def run(args: argparse.Namespace) -> int:
     from visthrow.diagnose import loop
     from visthrow.errors import ConfigError
 
-    if args.shipped:
-        import json
-
-        if not RECORDS.exists():
-            raise ConfigError(f"no record {RECORDS}; expected one that `visthrow diagnose loop --hide ...` made")
-        print(loop.table(json.loads(RECORDS.read_text())))
+    if args.show:
+        print(loop.table(loop.read(args.show)))
         return 0
     hidden = {}
     for item in args.hide:
@@ -45,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
         except ValueError:
             raise ConfigError(f"--hide {item}; expected EFFECT=SIZE, such as motor_tau=0.02") from None
     if not hidden:
-        raise ConfigError("nothing to hide; name an effect, such as --hide motor_tau=0.02, or say --shipped")
+        raise ConfigError("nothing to hide; name an effect, such as --hide motor_tau=0.02, or say --show")
     from visthrow.device import cores, resolve
 
     folder = Path(args.out) / "-".join(f"{n}_{v:g}" for n, v in hidden.items())

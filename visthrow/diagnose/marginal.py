@@ -271,8 +271,3 @@ def gather(
     if lowest < -1e-5:
         raise DiagnoseError(f"information has the eigenvalue {lowest:.1e} relative to its diagonal; the derivatives are broken")
     return Statistics(np.array(flights), information, score, square, samples, np.array(theta, dtype=float))
-
-
-def block_names(grams: Sequence[Gram]) -> list[str]:
-    """Names of the latent blocks that occur."""
-    return [LATENT_BLOCKS[b] for b in sorted({int(b) for gram in grams for b in gram.latent_block})]

@@ -32,9 +32,6 @@ HUBER = 6.0
 HUBER_SHARE = 0.02
 """More samples than this beyond ``HUBER`` are no outliers but a misfit, which must stay visible."""
 
-BAD_WINDOW = 2.5
-"""Factor on the latent forces of its phase from which a window gets a level of its own."""
-
 BAD_NATS = 8.0
 """Log-likelihood that a window's own level must gain; that of chance stays below 4 in a hundred windows."""
 
