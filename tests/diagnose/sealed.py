@@ -145,8 +145,8 @@ def errors_of(recipe: Recipe, verdict: dict) -> list[dict]:
     return out
 
 
-def run_world(recipe: Recipe, device: str = "cpu") -> dict:
-    """One sealed world from drawing to judgement: a line of the ledger."""
+def run_world(recipe: Recipe, device: str = "cpu", verdicts: Path | None = None) -> dict:
+    """One sealed world from drawing to judgement: a line of the ledger; the whole verdict goes into a folder if one is named."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         sealed = recipe.digest()
@@ -156,6 +156,9 @@ def run_world(recipe: Recipe, device: str = "cpu") -> dict:
         verdict = ask(logs, model_of(recipe), folder, device)
         seconds = time.perf_counter() - flown
         digest = hashlib.sha256(json.dumps(verdict, sort_keys=True).encode()).hexdigest()
+    if verdicts is not None:
+        verdicts.mkdir(parents=True, exist_ok=True)
+        (verdicts / f"{sealed[:12]}.json").write_text(json.dumps({"recipe": asdict(recipe)} | verdict))
     line = {"truth_sha256": sealed, "verdict_sha256": digest, "recipe": asdict(recipe), "fly_s": round(flown - begin, 1)}
     line |= {"explain_s": round(seconds, 1), "errors": errors_of(recipe, verdict)} | judge(recipe, verdict)
     return line | ({"error": verdict["error"]} if "error" in verdict else {})
@@ -190,12 +193,12 @@ def _alone(numbers) -> None:
     os.sched_setaffinity(0, {cores[mine % len(cores)]})
 
 
-def _one(task: tuple[str, Recipe, float]) -> dict | None:
-    kind, recipe, until = task
+def _one(task: tuple[str, Recipe, float, Path | None]) -> dict | None:
+    kind, recipe, until, verdicts = task
     if time.time() > until:
         return None
     try:
-        return {"kind": kind} | run_world(recipe)
+        return {"kind": kind} | run_world(recipe, verdicts=verdicts)
     except (RuntimeError, ValueError, subprocess.TimeoutExpired) as error:
         return {"kind": kind, "recipe": asdict(recipe), "error": repr(error), "truth_sha256": recipe.digest()}
 
@@ -206,6 +209,7 @@ def main() -> None:
     parser.add_argument("worlds", nargs="+", metavar="KIND=COUNT", help="null, law, or EFFECTSxFLOORS: null=20 1x15=30")
     parser.add_argument("--seed", type=int, help="of the first world; drawn by the system where not given")
     parser.add_argument("--ledger", type=Path, default=Path("ledger.jsonl"))
+    parser.add_argument("--verdicts", type=Path, metavar="FOLDER", help="where to keep whole verdicts")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--minutes", type=float, default=1e6, help="begin no world later than this")
     args = parser.parse_args()
@@ -216,7 +220,7 @@ def main() -> None:
         done = {json.loads(line)["truth_sha256"] for line in args.ledger.read_text().splitlines()}
     sizes = {kind: int(count) for kind, count in (item.split("=") for item in args.worlds)}
     until = time.time() + 60.0 * args.minutes
-    tasks = [(kind, recipe, until) for kind, recipe in bank(first, sizes) if recipe.digest() not in done]
+    tasks = [(kind, recipe, until, args.verdicts) for kind, recipe in bank(first, sizes) if recipe.digest() not in done]
     tally: dict[str, Counter] = {kind: Counter() for kind in sizes}
     context = mp.get_context("spawn")
     with context.Pool(args.jobs, _alone, (context.Value("i", 0),), maxtasksperchild=None) as pool:
