@@ -10,12 +10,12 @@ import time
 
 import numpy as np
 import pytest
-from pymavlink.generator.mavcrc import x25crc
 
 from hil.backends.base import FAILED
 from hil.fakes.level import LevelPlant
 from hil.flight import AutoOperator
 from hil.mavlink import mav
+from tests.fuzz import EACH, SEEDS, any_message, mutated, noise
 from tests.hil_flight import simple_policy
 from tests.loopback.wire import peers, throw
 
@@ -24,36 +24,16 @@ READY = 8.0
 asked for. Wall time says nothing on a busy machine."""
 
 
-def random_messages(rng, count: int) -> list[bytes]:
-    """Messages of every kind with any bits in their fields, and plain noise."""
-    kinds = sorted(mav.mavlink_map)
-    out: list[bytes] = []
-    while len(out) < count:
-        if rng.random() < 0.2:
-            out.append(rng.bytes(int(rng.integers(0, 300))))
-            continue
-        kind = mav.mavlink_map[kinds[rng.integers(len(kinds))]]
-        out.append(framed(kind, rng.bytes(kind.unpacker.size)))
-    return out
-
-
-def framed(kind, body: bytes) -> bytes:
-    """A message of the vehicle with a right checksum, so that its fields reach whoever listens."""
-    number = kind.id
-    head = bytes([len(body), 0, 0, 0, 1, 1])
-    head += bytes([number & 255, number >> 8 & 255, number >> 16 & 255])
-    crc = x25crc(head + body + bytes([kind.crc_extra]))
-    return bytes([mav.PROTOCOL_MARKER_V2]) + head + body + crc.crc.to_bytes(2, "little")
-
-
-def flood(count: int, kind: str = "ardupilot") -> None:
+def flood(count: int, kind: str, seed: int) -> None:
+    """Messages of every kind with any bits in their fields, spoiled poses, and noise, to a runner that nobody armed."""
     runner, source, clock, fake = peers(LevelPlant(), kind=kind, write=True, loaded=simple_policy((-0.1269, 0, 0, 0, 1.0)))
-    rng, inbox, commands = np.random.default_rng(0), source._link.port.inbox, []
+    rng, inbox, commands = np.random.default_rng(seed), source._link.port.inbox, []
     fake.link.listen(lambda message, arrival: commands.append((message.get_type(), getattr(message, "command", None))))
-    strings = random_messages(rng, min(count, 5000))
+    good = [any_message(rng) for _ in range(200)]
+    makers = (any_message, any_message, any_message, lambda rng: mutated(rng, good), noise)
     said = 0
     while said < count:
-        inbox.extend(strings[i] for i in rng.integers(len(strings), size=200))
+        inbox.extend(makers[rng.integers(len(makers))](rng) for _ in range(200))
         said += 200
         now = clock.now() + said * 1e-4
         # Nobody arms: whatever comes, nothing is thrown and nothing released.
@@ -70,20 +50,20 @@ def flood(count: int, kind: str = "ardupilot") -> None:
 
 @pytest.mark.parametrize("kind", ["ardupilot", "px4"])
 def test_messages_of_every_kind_command_nothing(kind):
-    flood(10_000, kind)
+    flood(10_000, kind, 0)
 
 
 @pytest.mark.slow
-def test_a_million_messages_command_nothing():
-    flood(1_000_000)
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_million_messages_command_nothing(seed):
+    flood(EACH, ("ardupilot", "px4")[seed % 2], seed)
 
 
 def test_a_flood_in_mid_throw_neither_commands_nor_releases():
     """Noise from the vehicle's own address beside its poses: commands stay finite, and nothing is released twice."""
     plant = LevelPlant()
     rng = np.random.default_rng(1)
-    strings = [s for s in random_messages(rng, 300) if len(s) < 10 or s[0] != mav.PROTOCOL_MARKER_V2]
-    strings += [bytes(rng.integers(0, 256, 40, dtype=np.uint8)) for _ in range(100)]
+    strings = [noise(rng) for _ in range(100)] + [mutated(rng, [any_message(rng)])[:-1] for _ in range(300)]
     step = plant.step
 
     def noisy(command, release):

@@ -8,6 +8,7 @@ import pytest
 from hil import msp
 from hil.backends import Betaflight
 from hil.params import HilParams
+from tests.fuzz import EACH, SEEDS
 from tests.loopback.wire import pipe
 from visthrow import config
 
@@ -55,11 +56,11 @@ def test_numbers_beyond_the_end_are_none():
     assert frame.words() == (513,)
 
 
-def fuzz(count: int) -> None:
+def fuzz(count: int, seed: int) -> None:
     """Random bytes, mutated frames and whole answers of every command with any content, into parser and back-end."""
     here, there = pipe()
     backend = Betaflight(here, PARAMS)
-    rng, sent, parsed = np.random.default_rng(0), [], msp.Parser()
+    rng, sent, parsed = np.random.default_rng(seed), [], msp.Parser()
     seeds = [msp.pack(msp.Frame(int(c), rng.bytes(int(rng.integers(0, 60))), msp.ANSWER)) for c in range(256)]
     seeds += [msp.pack(msp.Frame(int(c), rng.bytes(20), msp.ANSWER, 2)) for c in rng.integers(0, 65536, 50)]
     for i in range(count):
@@ -85,9 +86,10 @@ def fuzz(count: int) -> None:
 
 
 def test_no_bytes_make_the_back_end_raise_or_command():
-    fuzz(30_000)
+    fuzz(10_000, 0)
 
 
 @pytest.mark.slow
-def test_a_million_byte_strings():
-    fuzz(1_000_000)
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_million_byte_strings(seed):
+    fuzz(EACH, seed)
