@@ -10,7 +10,7 @@ import pytest
 from scipy import stats
 
 from hil.mocap_faults import FAULTS
-from visthrow.bench import hil, hil_throws
+from visthrow.bench import hil, hil_processes, hil_throws
 from visthrow.bench.hil_processes import Pair
 from visthrow.cli import main
 from visthrow.errors import VisthrowError
@@ -57,7 +57,7 @@ def test_an_interrupted_series_goes_on_where_it_was(tmp_path, monkeypatch):
         for seed in seeds:
             yield {"way": "direct", "seed": seed, "error": 0.02 + 0.001 * seed, "duration": 1.0}
 
-    def wire(seed, folder, args):
+    def wire(seed, folder, args, cores):
         flown.append(seed)
         if seed == 2 and len(flown) == 3:
             raise KeyboardInterrupt
@@ -68,7 +68,7 @@ def test_an_interrupted_series_goes_on_where_it_was(tmp_path, monkeypatch):
 
     monkeypatch.setattr(hil_throws, "_direct", direct)
     monkeypatch.setattr(hil_throws, "_over_the_wire", wire)
-    args = argparse.Namespace(throws=4, seed=0, policy="state", out=str(tmp_path), keep_runs=False, speed=1.0)
+    args = argparse.Namespace(throws=4, seed=0, policy="state", out=str(tmp_path), keep_runs=False, speed=1.0, jobs=1)
     with pytest.raises(KeyboardInterrupt):
         hil_throws.series(args)
     with (tmp_path / "throws-state.jsonl").open("a") as file:
@@ -81,9 +81,41 @@ def test_an_interrupted_series_goes_on_where_it_was(tmp_path, monkeypatch):
     assert "NOT met" in report.notes[0], "one did not land"
 
 
-@pytest.mark.parametrize("words", [["--throws", "1"], ["--minutes", "0"], ["--rate", "0.1"], ["--throws", "5", "--speed", "3"]])
+def test_throws_side_by_side_share_nothing(tmp_path, monkeypatch):
+    """Each seed once, never two at once on one core; after an error nothing more is begun."""
+    busy, flown, ports = set(), [], set()
+
+    def wire(seed, folder, args, cores):
+        assert not busy & set(cores)
+        busy.update(cores)
+        time.sleep(0.01)
+        busy.difference_update(cores)
+        flown.append(seed)
+        ports.add(hil_processes.free_port())
+        if seed == 11:
+            raise VisthrowError("no")
+        counts = {"missed": 0, "missed_ours": 0, "late_periods": 0, "breaches": []}
+        return {"way": "wire", "seed": seed, "error": 0.02, "duration": 1.0, **counts}
+
+    def direct(seeds, args):
+        return ({"way": "direct", "seed": seed, "error": 0.02, "duration": 1.0} for seed in seeds)
+
+    monkeypatch.setattr(hil_throws, "_direct", direct)
+    monkeypatch.setattr(hil_throws, "_over_the_wire", wire)
+    monkeypatch.setattr(hil_processes.os, "sched_getaffinity", lambda _: set(range(20)), raising=False)
+    args = argparse.Namespace(throws=10, seed=0, policy="state", out=str(tmp_path), keep_runs=False, speed=1.0, jobs=4)
+    assert hil_throws.series(args).figures["seeds"] == list(range(10))
+    assert (sorted(flown), len(ports)) == (list(range(10)), 10)
+    assert hil_processes.own_cores(10) == [(None, None)] * 10, "one core is to spare for whoever asks"
+    args.throws = 40
+    with pytest.raises(VisthrowError, match="no"):
+        hil_throws.series(args)
+    assert len(flown) < 20
+
+
+@pytest.mark.parametrize("words", ["--throws 1", "--minutes 0", "--rate 0.1", "--throws 5 --speed 3", "--throws 5 --jobs 0"])
 def test_what_cannot_be_measured(words, tmp_path, capsys):
-    assert main(["bench", "hil", *words, "--out", str(tmp_path)]) == 2
+    assert main(["bench", "hil", *words.split(), "--out", str(tmp_path)]) == 2
     assert "expected" in capsys.readouterr().err
 
 

@@ -38,6 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     camera.add_argument("--environments", type=int, default=16384, metavar="N", help="batch size (default: 16384)")
     detector.add_argument("--frames", type=int, default=100, metavar="N", help="scenes a level (default: 100)")
     detector.add_argument("--seed", type=int, default=0, help="of the scenes")
+    detector.add_argument("--jobs", type=int, metavar="N", help="processes at once (default: one a core)")
     detector.add_argument("--out", metavar="FILE", help="write a contact sheet of the first scenes there, .png")
     train.add_argument(
         "config", metavar="CONFIG", nargs="?", default="state", help="training configuration (default: state)"
@@ -71,6 +72,10 @@ def _add_hil(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--keep", metavar="FOLDER", help="keep the soak's run here")
     parser.add_argument("--throws", type=int, default=0, metavar="N", help="throw so often instead; may be interrupted")
     parser.add_argument("--seed", type=int, default=0, help="of the first throw (default: 0)")
+    parser.add_argument(
+        "--jobs", type=int, default=1, metavar="N",
+        help="throws at once, each with a core for the run and one for the fake where there are enough (default: 1)",
+    )  # fmt: skip
     parser.add_argument(
         "--speed", type=float, default=1.0, metavar="X",
         help="of both clocks in throws; below 1 on a machine too slow for real time",

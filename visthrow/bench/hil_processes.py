@@ -7,6 +7,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -22,11 +23,28 @@ ENDED = 120.0
 COMMAND = (sys.executable, "-m", "visthrow.cli", "hil")
 
 
+_given: set[int] = set()
+_giving = threading.Lock()
+
+
 def free_port() -> int:
-    """A UDP port of this machine that nobody listens on."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
+    """A UDP port of this machine that nobody listens on, and that this process was not given before."""
+    with _giving:
+        while True:
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+                probe.bind(("127.0.0.1", 0))
+                port = probe.getsockname()[1]
+            if port not in _given:
+                _given.add(port)
+                return port
+
+
+def own_cores(jobs: int) -> list[tuple[int | None, int | None]]:
+    """Cores of run and fake for each of so many pairs at once; None where there are too few for two each and one to spare."""
+    usable = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+    if len(usable) <= 2 * jobs:
+        return [(None, None)] * jobs
+    return [(usable[2 * job], usable[2 * job + 1]) for job in range(jobs)]
 
 
 @dataclass(frozen=True)
@@ -35,12 +53,13 @@ class Pair:
 
     Attributes:
         run: further arguments of ``visthrow hil run``. fake: of ``visthrow hil fake``.
-        core: that the run is kept on; None leaves it to the system.
+        core, fake_core: that each is kept on; None leaves it to the system.
     """
 
     run: tuple[str, ...]
     fake: tuple[str, ...]
     core: int | None = None
+    fake_core: int | None = None
 
     def fly(self, folder: Path, watch: Callable[[int], None] | None = None) -> tuple[dict[str, Any], dict[str, Any]]:
         """Start both, wait until the fake is done, end the run.
@@ -62,7 +81,7 @@ class Pair:
         fake = [*COMMAND, "fake", "--device", f"udpout:127.0.0.1:{port}", "--out", str(report), *self.fake]
         with self._started(run, self.core) as runner:
             said = _first_line(runner)
-            with self._started(fake, None) as other:
+            with self._started(fake, self.fake_core) as other:
                 _until(other, watch, runner)
             _end(runner, said)
         try:
@@ -76,11 +95,11 @@ class Pair:
     @staticmethod
     @contextlib.contextmanager
     def _started(command: list[str], core: int | None) -> Iterator[subprocess.Popen]:
-        pinned = None if core is None else (lambda: os.sched_setaffinity(0, {core}))
-        process = subprocess.Popen(
-            command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, preexec_fn=pinned
-        )
+        quiet = subprocess.DEVNULL
+        process = subprocess.Popen(command, stdin=quiet, stdout=quiet, stderr=subprocess.PIPE, text=True)
         try:
+            if core is not None:  # long before it has threads
+                os.sched_setaffinity(process.pid, {core})
             yield process
         finally:
             if process.poll() is None:

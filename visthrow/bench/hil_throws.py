@@ -6,6 +6,8 @@ import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable, Iterator
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +15,7 @@ import numpy as np
 
 from visthrow import statistics
 from visthrow.bench.hil import bootstrap_upper, finite, json_lines
-from visthrow.bench.hil_processes import COMMAND, Pair
+from visthrow.bench.hil_processes import COMMAND, Pair, own_cores
 from visthrow.bench.records import Report, Table
 from visthrow.errors import VisthrowError
 
@@ -22,6 +24,9 @@ MEAN, RATIO = 0.10, 1.3
 
 AFTER = 1.0
 """The fake flies on so long after the landing, so that the runner sees the ball come down [s]."""
+
+PART = 5
+"""Throws without a wire that one process flies; they are kept when it is done."""
 
 LONGEST = 30.0
 """A throw over the wire that has not landed by then is none [s]."""
@@ -33,8 +38,10 @@ def series(args: argparse.Namespace) -> Report:
     Raises:
         VisthrowError: a number out of range, or a process that fails.
     """
-    if not (2 <= args.throws <= 10_000 and 0.05 <= args.speed <= 1.0):
-        raise VisthrowError(f"--throws {args.throws}, --speed {args.speed}; expected 2 to 10000, and 0.05 to 1")
+    if not (2 <= args.throws <= 10_000 and 0.05 <= args.speed <= 1.0 and 1 <= args.jobs <= 256):
+        raise VisthrowError(
+            f"--throws {args.throws}, --speed {args.speed}, --jobs {args.jobs}; expected 2 to 10000, 0.05 to 1, and 1 to 256"
+        )
     folder = Path(args.out)
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"throws-{args.policy.replace(os.sep, '_')}.jsonl"
@@ -44,13 +51,39 @@ def series(args: argparse.Namespace) -> Report:
         for line in kept.values():
             print(json.dumps(line), file=file)
         file.flush()
-        for line in _direct([s for s in seeds if ("direct", s) not in kept], args):
+        left = [s for s in seeds if ("direct", s) not in kept]
+        parts = [left[first : first + PART] for first in range(0, len(left), PART)]
+        for lines in _side_by_side(lambda part, _: list(_direct(part, args)), parts, [(None, None)] * args.jobs):
+            for line in lines:
+                _keep(kept, line, file)
+        left = [s for s in seeds if ("wire", s) not in kept]
+
+        def fly(seed: int, cores: tuple[int | None, int | None]) -> dict[str, Any]:
+            return _over_the_wire(seed, folder / f"{args.policy.replace(os.sep, '_')}-{seed}", args, cores)
+
+        for count, line in enumerate(_side_by_side(fly, left, own_cores(args.jobs)), start=1 + args.throws - len(left)):
             _keep(kept, line, file)
-        for count, seed in enumerate(seeds, start=1):
-            if ("wire", seed) not in kept:
-                _keep(kept, _over_the_wire(seed, folder / f"{args.policy}-{seed}", args), file)
-            _progress(count, args.throws, kept[("wire", seed)], kept[("direct", seed)])
+            _progress(count, args.throws, line, kept[("direct", line["seed"])])
     return _report([(kept[("wire", s)], kept[("direct", s)]) for s in seeds], args)
+
+
+def _side_by_side(what: Callable[[Any, Any], Any], items: list, places: list) -> Iterator[Any]:
+    """What is made of each item, in the order in which it is done; as many at once as there are places, one a place.
+
+    After an error nothing more is begun.
+    """
+    free, todo, running = list(reversed(places)), iter(items), {}
+    with ThreadPoolExecutor(len(places)) as pool:
+        while True:
+            while free and (item := next(todo, None)) is not None:
+                place = free.pop()
+                running[pool.submit(what, item, place)] = place
+            if not running:
+                return
+            done, _ = wait(running, return_when=FIRST_COMPLETED)
+            for future in done:
+                free.append(running.pop(future))
+                yield future.result()
 
 
 def _keep(kept: dict, line: dict[str, Any], file: Any) -> None:
@@ -75,12 +108,14 @@ def _direct(seeds: list[int], args: argparse.Namespace) -> Any:
             raise VisthrowError(f"the throws without a wire failed: {process.stderr.read()}")
 
 
-def _over_the_wire(seed: int, folder: Path, args: argparse.Namespace) -> dict[str, Any]:
+def _over_the_wire(
+    seed: int, folder: Path, args: argparse.Namespace, cores: tuple[int | None, int | None]
+) -> dict[str, Any]:  # fmt: skip
     shutil.rmtree(folder, ignore_errors=True)  # half a run of an interrupted series
     speed = ("--speed", str(args.speed))
     run = ("--config", "fake", "--set", f"policy={args.policy}", "--set", "states.abort=0.3", *speed)
     fake = ("--policy", args.policy, "--seed", str(seed), "--seconds", str(LONGEST), "--after", str(AFTER), *speed)
-    summary, report = Pair(run, fake).fly(folder)
+    summary, report = Pair(run, fake, *cores).fly(folder)
     landed = report["landing_w"]
     seen = (summary["landings"] or [{}])[0]
     line = {
