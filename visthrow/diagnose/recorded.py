@@ -1,5 +1,6 @@
 """What a replay needs of a flight log: commands, release, and what was measured of vehicle, payload and gyro."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,6 +40,7 @@ class Recorded:
     payload: Samples | None
     gyro: Samples | None
     voltage: float | None  # first measured [V]
+    hung: bool | None = None  # whether the log says that a payload hung below at its start; None where it does not
 
     @property
     def start(self) -> float:
@@ -104,8 +106,25 @@ def record_of(log: FlightLog, number: int = 0) -> Recorded:
     return Recorded(
         command.time[command.valid], np.asarray(command.values, dtype=float)[command.valid], _latch(log), _landing(log),
         pos, quat, _payload(log), _samples(log, "rate_b"),
-        None if voltage is None else float(voltage.values[voltage.valid][0]),
+        None if voltage is None else float(voltage.values[voltage.valid][0]), _hung(log),
     )  # fmt: skip
+
+
+def carriers(flights: Sequence[Recorded]) -> list[bool]:
+    """Whether each flight carries a payload: as its log says, else if it was measured or released there.
+
+    Where no flight measured the payload, one release tells that it hung below in all.
+    """
+    measured_somewhere = any(f.payload is not None for f in flights)
+    released_somewhere = any(f.latch != NEVER for f in flights)
+    seen = [f.payload is not None or f.latch != NEVER if measured_somewhere else released_somewhere for f in flights]
+    return [own if f.hung is None else f.hung for f, own in zip(flights, seen)]
+
+
+def _hung(log: FlightLog) -> bool | None:
+    if "attached" not in log or not np.any(log["attached"].valid):
+        return None
+    return bool(log["attached"].values[log["attached"].valid][0])
 
 
 def _latch(log: FlightLog) -> float:

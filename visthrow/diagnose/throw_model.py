@@ -13,7 +13,7 @@ from visthrow.diagnose.catalogue import Entry, Setting, apply, entries_for
 from visthrow.diagnose.cutting import Cut, around_slack, cut
 from visthrow.diagnose.model import Window
 from visthrow.diagnose.opened import opened
-from visthrow.diagnose.recorded import NEVER, record_of
+from visthrow.diagnose.recorded import NEVER, carriers, record_of
 from visthrow.diagnose.replay import BATCH, KNOT_SPACING, Flights, Lane, carried
 from visthrow.diagnose.states import (
     States,
@@ -71,7 +71,7 @@ class ThrowModel:
             substep: largest integration step [s].
             stride: use every so many measured samples.
             only: names of the effects to consider; default all that apply.
-            carries: whether a payload hangs below; default: if one was measured or released.
+            carries: whether a payload hangs below in all flights; default: in those in which one was measured or released.
             simpler: consider also blocks simpler than the plant's, such as a rigid rope; each compiles a kernel.
 
         Raises:
@@ -80,9 +80,10 @@ class ThrowModel:
         self.setting = opened(Setting(plant, sensing or SensingParams()))
         self.device, self.substep = device, substep
         flights = [record_of(log, i) for i, log in enumerate(logs)]
-        carries = any(f.payload is not None or f.latch != NEVER for f in flights) if carries is None else carries
+        hangs = carriers(flights) if carries is None else [carries] * len(flights)
+        carries = any(hangs)
         release = plant.release
-        cuts = [c for i, f in enumerate(flights) for c in cut(f, i, release.lag, release.landing_height, carries)]
+        cuts = [c for i, f in enumerate(flights) for c in cut(f, i, release.lag, release.landing_height, hangs[i])]
         if not cuts:
             raise DiagnoseError(f"{len(flights)} flights hold no stretch of poses and commands long enough to replay")
         self.channels = ["pos_w", "quat_wb"]
