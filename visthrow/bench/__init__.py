@@ -58,7 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     for kind in (sim, camera, detector, train):
         add_common(kind)
     add_common(mpc, device=False)
-    for kind in (sim, camera, train, hil, mpc):
+    for kind in (sim, camera, detector, train, hil, mpc):
         kind.add_argument("--record", metavar="NAME", help="keep the result in the package's records under this name")
     sim.set_defaults(device="cpu")
     records.add_argument("names", metavar="NAME", nargs="*", help="records to print (default: all)")

@@ -1,7 +1,11 @@
 """``visthrow bench detector``: recall, precision and pixel error of the keypoint detector on rendered frames, by nuisance."""
 
 import argparse
+import concurrent.futures
+import functools
 import math
+import multiprocessing as mp
+import os
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -18,6 +22,7 @@ from camera.params import CameraParams
 from camera.render import Clutter, render_scene
 from visthrow import config
 from visthrow.bench.records import Report, Table, finish
+from visthrow.errors import VisthrowError
 
 LEVELS = {
     "clean": NuisanceParams(),
@@ -69,6 +74,13 @@ class Count:
     reports: int = 0
     errors: list[float] = field(default_factory=list)  # of each keypoint of the hits [px]
 
+    def add(self, other: "Count") -> None:
+        """Count what another one counted as well."""
+        self.there += other.there
+        self.hits += other.hits
+        self.reports += other.reports
+        self.errors += other.errors
+
     def figures(self) -> dict[str, float]:
         """Recall, precision, and RMS, median and 95th percentile of the pixel error."""
         errors = np.array(self.errors) if self.errors else np.array([math.nan])
@@ -77,6 +89,10 @@ class Count:
             "rms_px": float(np.sqrt(np.mean(errors**2))), "median_px": float(np.median(errors)),
             "p95_px": float(np.percentile(errors, 95)),
         }  # fmt: skip
+
+
+Counts = dict[str, dict[str, Count]]
+"""Of ball and goal by "level; told what"."""
 
 
 def draw_scene(rng: np.random.Generator, clutter: int) -> Scene:
@@ -194,15 +210,14 @@ class Measure:
                 tally.hits += 1
                 tally.errors += off[part].tolist()
 
-    def levels(self, count: int) -> dict[str, dict[str, dict[str, float]]]:
-        """Figures of ball and goal on every level, over a number of scenes; keys "level, told what"."""
-        counts: dict[str, dict[str, Count]] = {}
-        for index in range(count):
-            for name, scene, frame in self.frames(index):
-                for told in TOLD.get(name, KNOWN[-1:]):
-                    pair = counts.setdefault(f"{name}; {told}", {"ball": Count(), "goal": Count()})
-                    self.count(scene, frame, self.known(scene, told, index), pair)
-        return {name: {kind: tally.figures() for kind, tally in pair.items()} for name, pair in counts.items()}
+    def counted(self, index: int) -> tuple[Counts, list[float]]:
+        """What became of ball and goal of one scene on every level, and the times that its detections took [s]."""
+        counts, before = {}, len(self.spent)
+        for name, scene, frame in self.frames(index):
+            for told in TOLD.get(name, KNOWN[-1:]):
+                pair = counts.setdefault(f"{name}; {told}", {"ball": Count(), "goal": Count()})
+                self.count(scene, frame, self.known(scene, told, index), pair)
+        return counts, self.spent[before:]
 
     def sheet(self, path: Path, columns: int = 4) -> None:
         """Draw what was found on the first scenes of each level: true keypoints as white circles, found ones coloured."""
@@ -225,11 +240,50 @@ class Measure:
             raise OSError(f"cannot write {path}")
 
 
+def levels(measure: Measure, count: int, jobs: int = 1) -> dict[str, dict[str, dict[str, float]]]:
+    """Figures of ball and goal on every level; keys as in `Counts`.
+
+    Args:
+        measure: the camera; takes the times of all detections.
+        count: scenes a level. jobs: processes at once; the figures do not depend on it.
+    """
+    total: Counts = {}
+    for counts, spent in _all_counted(measure, count, min(jobs, count)):
+        measure.spent += spent
+        for name, pair in counts.items():
+            for kind, tally in pair.items():
+                total.setdefault(name, {}).setdefault(kind, Count()).add(tally)
+    return {name: {kind: tally.figures() for kind, tally in pair.items()} for name, pair in total.items()}
+
+
+def _all_counted(measure: Measure, count: int, jobs: int) -> Iterator[tuple[Counts, list[float]]]:
+    """`Measure.counted` of every scene, in order."""
+    if jobs <= 1:
+        for index in range(count):
+            counts, _ = measure.counted(index)
+            yield counts, []
+        return
+    work = functools.partial(_one, measure.camera.params, measure.seed)
+    with concurrent.futures.ProcessPoolExecutor(jobs, mp.get_context("spawn"), torch.set_num_threads, (1,)) as pool:
+        yield from pool.map(work, range(count))
+
+
+def _one(params: CameraParams, seed: int, index: int) -> tuple[Counts, list[float]]:
+    return Measure(params, seed).counted(index)
+
+
 def run(args: argparse.Namespace) -> int:
-    """Measure on every level."""
+    """Measure on every level.
+
+    Raises:
+        VisthrowError: a number of scenes or processes below one.
+    """
+    jobs = (os.cpu_count() or 1) if args.jobs is None else args.jobs
+    if min(args.frames, jobs) < 1:
+        raise VisthrowError(f"--frames {args.frames}, --jobs {jobs}; expected 1 or more of each")
     params = config.load(CameraParams, config.find("camera", "fisheye"), args.overrides)
     measure = Measure(params, args.seed)
-    figures = measure.levels(args.frames)
+    figures = levels(measure, args.frames, jobs)
     rows = [_row(name, kind, values) for name, pair in figures.items() for kind, values in pair.items()]
     table = Table(
         f"{args.frames} frames a level, {params.fisheye.width} x {params.fisheye.height} px",
