@@ -3,7 +3,10 @@
 The tool runs in a process of its own that cannot import the tests, in a folder that holds nothing but logs and the config of
 the model. The truth's SHA-256 is put down before, the verdict's after.
 
-    python -m tests.diagnose.sealed null=10 1x15=20 2x10=5 law=5 --jobs 8 --ledger ledger.jsonl
+Three more throws of each world are held back; the model with the verdict's sizes and the model with the true ones predict them.
+
+    python -m tests.diagnose.sealed null=10 1x15=20 2x10=5 curve=50 law=5 --jobs 8 --ledger ledger.jsonl
+    python -m tests.diagnose.ledger ledger.jsonl
 """
 
 import argparse
@@ -21,7 +24,9 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.worlds.world import Recipe, draw, fly_recipe, recorded
+from tests.worlds.world import PLANTS, Recipe, draw, fly_recipe, recorded
+from visthrow.diagnose.threads import single
+from visthrow.errors import VisthrowError
 from visthrow.flightlog import Channel, FlightLog
 
 WITHOUT_TESTS = """
@@ -42,11 +47,18 @@ ALIKE = (
 )
 """Effects that flights of this kind hardly separate."""
 
-
 LAWS = {
     "law_ball_swirl": 0.02, "law_vehicle_swirl": 0.05, "law_speed_thrust": 0.02, "law_slew_thrust": 0.008,
 }  # fmt: skip
 """Terms that no entry of the catalogue has, with sizes that show: see :class:`tests.worlds.vehicle.Numbers`."""
+
+CURVE = (
+    "rope_length", "cmd_delay", "motor_tau", "release_lag", "payload_drag", "wind_x", "com_x", "marker_rot_x", "frame_tilt_x",
+    "thrust_gain",
+)  # fmt: skip
+"""Effects whose detection limits are asked for."""
+SMALLEST, LARGEST = 3.0, 30.0
+"""Sizes of the completeness curves [floors]."""
 
 
 def flight_log(record: dict) -> FlightLog:
@@ -72,17 +84,21 @@ def model_of(recipe: Recipe) -> list[str]:
     return {"rod": ["rope.segments=1"], "string": ["rope.payload_inertia=1e-9"], "chain": []}[recipe.plant]
 
 
-def hand_over(recipe: Recipe, folder: Path) -> list[Path]:
-    """Fly a world and write its logs."""
+def hand_over(recipe: Recipe, folder: Path, held: Path | None = None) -> list[Path]:
+    """Fly a world and write its logs; those held back into a folder of their own."""
     paths = []
-    for i, record in enumerate(recorded(recipe, fly_recipe(recipe))):
-        paths.append(folder / f"flight_{i:02d}.npz")
-        flight_log(record).save(paths[-1])
+    records = recorded(recipe, fly_recipe(recipe))
+    shown = len(records) - recipe.held
+    for i, record in enumerate(records):
+        if i < shown or held is not None:
+            path = (folder if i < shown else held) / f"flight_{i:02d}.npz"
+            flight_log(record).save(path)
+            paths += [path] if i < shown else []
     return paths
 
 
 def ask(logs: list[Path], model: list[str], folder: Path, device: str = "cpu", timeout: float = 900.0) -> dict:
-    """Verdict of ``visthrow diagnose explain`` on logs, run apart; with ``error`` where it failed."""
+    """Verdict of ``visthrow diagnose explain`` on logs, run apart; with ``error`` where it failed or took longer [s]."""
     answer = folder / "verdict.json"
     command = [sys.executable, "-c", WITHOUT_TESTS, "diagnose", "explain", *(p.name for p in logs)]
     command += ["--device", device, "--json", answer.name, "--out", "report", "--no-report"]
@@ -90,10 +106,36 @@ def ask(logs: list[Path], model: list[str], folder: Path, device: str = "cpu", t
         command += ["--set", item]
     root = Path(__file__).resolve().parents[2]
     known = os.environ | {"PYTHONPATH": os.pathsep.join([str(root), os.environ.get("PYTHONPATH", "")])}
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=timeout, env=known, check=False)
+    try:
+        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=timeout, env=known, check=False)
+    except subprocess.TimeoutExpired:
+        return {"overall": "ERROR", "error": "timeout", "findings": []}
     if not answer.exists():
         return {"overall": "ERROR", "error": (done.stdout + done.stderr)[-2000:], "findings": []}
     return json.loads(answer.read_text())
+
+
+def predictions(recipe: Recipe, theta: dict[str, float], held: Path) -> dict[str, dict]:
+    """Errors on the throws held back of the model as it was, with the verdict's sizes, and with the truth (the oracle).
+
+    A law outside the catalogue has no size: there is no oracle then.
+    """
+    from visthrow import config
+    from visthrow.diagnose.gain import predicted
+    from visthrow.diagnose.throw_model import ThrowModel
+    from visthrow.task import Experiment, plant_of
+
+    sizes = {"before": {}, "after": theta}
+    if not any(name.startswith("law_") for name in recipe.effects):
+        sizes["oracle"] = recipe.effects
+    plant = plant_of(config.load(Experiment, config.find("train", "state"), model_of(recipe)))
+    logs = [FlightLog.load(path) for path in sorted(held.glob("*.npz"))]
+    model = ThrowModel(logs, plant, only=sorted(set().union(*sizes.values())))
+    told: dict[str, dict] = {}
+    for who, theta in sizes.items():
+        same = next((other for other in told if sizes[other] == theta), None)
+        told[who] = told[same] if same else predicted(model, theta)
+    return told
 
 
 def named_by(verdict: dict) -> list[set[str]]:
@@ -136,52 +178,75 @@ def judge(recipe: Recipe, verdict: dict) -> dict:
 
 
 def errors_of(recipe: Recipe, verdict: dict) -> list[dict]:
-    """Estimate, interval and truth of each hidden effect that was named by its own name."""
-    out = []
-    for name, theta in recipe.effects.items():
-        for f in verdict["findings"]:
-            if f["name"] == name and f["verdict"] in ("FOUND", "CLASS"):
-                out.append({"name": name, "truth": theta, "estimate": f["estimate"], "low": f["low"], "high": f["high"]})
-    return out
+    """Of each hidden effect, what its own finding says: named or not, estimate, deviation, interval, evidence."""
+    own = {f["name"]: f for f in verdict["findings"]}
+    kept = ("verdict", "estimate", "sd", "low", "high", "floor", "nats")
+    return [
+        {"name": name, "truth": theta, "named": own[name]["verdict"] in ("FOUND", "CLASS")} | {k: own[name].get(k) for k in kept}
+        for name, theta in recipe.effects.items()
+        if name in own
+    ]
 
 
-def run_world(recipe: Recipe, device: str = "cpu", verdicts: Path | None = None) -> dict:
-    """One sealed world from drawing to judgement: a line of the ledger; the whole verdict goes into a folder if one is named."""
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
+def run_world(recipe: Recipe, device: str = "cpu", verdicts: Path | None = None, until: float = np.inf) -> dict:
+    """One sealed world from drawing to judgement: a line of the ledger.
+
+    Args:
+        recipe: of the world.
+        device: of the diagnosis.
+        verdicts: folder for the whole verdict.
+        until: when the verdict must be there, by ``time.time()`` [s].
+    """
+    with tempfile.TemporaryDirectory() as name, tempfile.TemporaryDirectory() as apart:
+        folder, held = Path(name), Path(apart)
         sealed = recipe.digest()
         begin = time.perf_counter()
-        logs = hand_over(recipe, folder)
+        logs = hand_over(recipe, folder, held)
         flown = time.perf_counter()
-        verdict = ask(logs, model_of(recipe), folder, device)
+        verdict = ask(logs, model_of(recipe), folder, device, float(np.clip(until - time.time(), 1.0, 900.0)))
         seconds = time.perf_counter() - flown
         digest = hashlib.sha256(json.dumps(verdict, sort_keys=True).encode()).hexdigest()
-    if verdicts is not None:
-        verdicts.mkdir(parents=True, exist_ok=True)
-        (verdicts / f"{sealed[:12]}.json").write_text(json.dumps({"recipe": asdict(recipe)} | verdict))
-    line = {"truth_sha256": sealed, "verdict_sha256": digest, "recipe": asdict(recipe), "fly_s": round(flown - begin, 1)}
-    line |= {"explain_s": round(seconds, 1), "errors": errors_of(recipe, verdict)} | judge(recipe, verdict)
-    return line | ({"error": verdict["error"]} if "error" in verdict else {})
+        if verdicts is not None:
+            verdicts.mkdir(parents=True, exist_ok=True)
+            (verdicts / f"{sealed[:12]}.json").write_text(json.dumps({"recipe": asdict(recipe)} | verdict))
+        line = {"truth_sha256": sealed, "verdict_sha256": digest, "recipe": asdict(recipe), "fly_s": round(flown - begin, 1)}
+        line |= {"explain_s": round(seconds, 1), "errors": errors_of(recipe, verdict)} | judge(recipe, verdict)
+        if "error" in verdict:
+            return line | {"error": verdict["error"]}
+        if recipe.held and (recipe.effects or verdict.get("theta")):
+            try:
+                line["held"] = predictions(recipe, verdict.get("theta", {}), held)
+            except (VisthrowError, RuntimeError) as error:
+                line["held_error"] = repr(error)
+    return line
+
+
+def drawn(kind: str, number: int) -> Recipe:
+    """A world of a kind: ``null``, ``law``, ``curve``, ``flights``, or ``EFFECTSxFLOORS``."""
+    rng = np.random.default_rng(number + 7)
+    if kind == "null":
+        rough = {"noise": float(rng.choice([0.5, 1.0, 2.0])), "gusts": float(rng.choice([0.5, 1.0, 2.0]))}
+        return draw(number, 0, 0.0, dropouts=float(rng.choice([0.0, 0.1])), **rough)
+    if kind == "law":
+        name = str(rng.choice(list(LAWS)))
+        return replace(
+            draw(number, 0, 0.0, plants=("rod", "string")), effects={name: LAWS[name] * float(rng.choice([-1.0, 1.0]))}
+        )
+    if kind in ("curve", "flights"):
+        floors = float(np.exp(rng.uniform(np.log(SMALLEST), np.log(LARGEST))))
+        if kind == "curve":
+            return draw(number, 1, floors, names=(str(rng.choice(CURVE)),))
+        return draw(number, 1, floors, free=int(rng.integers(1, 9)), throws=int(rng.integers(2, 13)))
+    effects, _, floors = kind.partition("x")
+    return draw(number, int(effects), float(floors))
 
 
 def bank(seed: int, sizes: dict[str, int]) -> list[tuple[str, Recipe]]:
-    """Worlds of a bank, kinds mixed: nulls, single effects by floors, pairs, triples, laws outside the catalogue."""
+    """Worlds of a bank, kinds mixed."""
     out: list[tuple[float, str, Recipe]] = []
     for k, (kind, count) in enumerate(sorted(sizes.items())):
         for i in range(count):
-            number = seed + 100_000 * k + 100 * i
-            rng = np.random.default_rng(number + 7)
-            if kind == "null":
-                rough = {"noise": float(rng.choice([0.5, 1.0, 2.0])), "gusts": float(rng.choice([0.5, 1.0, 2.0]))}
-                recipe = draw(number, 0, 0.0, dropouts=float(rng.choice([0.0, 0.1])), **rough)
-            elif kind == "law":
-                recipe = draw(number, 0, 0.0, plants=("rod", "string"))
-                name = str(rng.choice(list(LAWS)))
-                recipe = replace(recipe, effects={name: LAWS[name] * float(rng.choice([-1.0, 1.0]))})
-            else:
-                effects, floors = kind.split("x")
-                recipe = draw(number, int(effects), float(floors))
-            out.append(((i + 0.5) / count, kind, recipe))
+            out.append(((i + 0.5) / count, kind, drawn(kind, seed + 100_000 * k + 100 * i)))
     return [(kind, recipe) for _, kind, recipe in sorted(out, key=lambda item: item[:2])]
 
 
@@ -193,34 +258,48 @@ def _alone(numbers) -> None:
     os.sched_setaffinity(0, {cores[mine % len(cores)]})
 
 
-def _one(task: tuple[str, Recipe, float, Path | None]) -> dict | None:
-    kind, recipe, until, verdicts = task
-    if time.time() > until:
+def _one(task: tuple[str, Recipe, float, float, Path | None]) -> dict | None:
+    kind, recipe, begin, until, verdicts = task
+    if time.time() > begin:
         return None
     try:
-        return {"kind": kind} | run_world(recipe, verdicts=verdicts)
-    except (RuntimeError, ValueError, subprocess.TimeoutExpired) as error:
+        return {"kind": kind} | run_world(recipe, verdicts=verdicts, until=until)
+    except (RuntimeError, ValueError) as error:
         return {"kind": kind, "recipe": asdict(recipe), "error": repr(error), "truth_sha256": recipe.digest()}
+
+
+def warm(plant: str) -> None:
+    """Compile what worlds of a plant need, by the smallest one."""
+    line = run_world(Recipe(5, plant, {"com_x": 0.002}, free=1, free_seconds=2.0, throws=1, held=1))
+    print(plant, line["overall"], line["fly_s"], line["explain_s"], line.get("error", ""), flush=True)
 
 
 def main() -> None:
     """Run a bank of sealed worlds and add it to a ledger; worlds that are there are not run again."""
     parser = argparse.ArgumentParser(description=main.__doc__)
-    parser.add_argument("worlds", nargs="+", metavar="KIND=COUNT", help="null, law, or EFFECTSxFLOORS: null=20 1x15=30")
+    kinds = "null, law, curve, flights, or EFFECTSxFLOORS: null=20 1x15=30"
+    parser.add_argument("worlds", nargs="*", metavar="KIND=COUNT", help=kinds)
     parser.add_argument("--seed", type=int, help="of the first world; drawn by the system where not given")
     parser.add_argument("--ledger", type=Path, default=Path("ledger.jsonl"))
     parser.add_argument("--verdicts", type=Path, metavar="FOLDER", help="where to keep whole verdicts")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--minutes", type=float, default=1e6, help="begin no world later than this")
+    parser.add_argument("--end", type=float, default=1e6, help="minutes after which a verdict that is not there is none")
+    parser.add_argument("--warm", choices=PLANTS, help="only compile what worlds of this plant need")
     args = parser.parse_args()
+    single()
+    if args.warm:
+        warm(args.warm)
+        return
     first = int.from_bytes(os.urandom(4), "little") if args.seed is None else args.seed
     print(f"first seed {first}", flush=True)
     done = set()
     if args.ledger.exists():
         done = {json.loads(line)["truth_sha256"] for line in args.ledger.read_text().splitlines()}
     sizes = {kind: int(count) for kind, count in (item.split("=") for item in args.worlds)}
-    until = time.time() + 60.0 * args.minutes
-    tasks = [(kind, recipe, until, args.verdicts) for kind, recipe in bank(first, sizes) if recipe.digest() not in done]
+    begin, end = (time.time() + 60.0 * minutes for minutes in (args.minutes, args.end))
+    worlds = [(kind, recipe) for kind, recipe in bank(first, sizes) if recipe.digest() not in done]
+    tasks = [(kind, recipe, begin, end, args.verdicts) for kind, recipe in worlds]
     tally: dict[str, Counter] = {kind: Counter() for kind in sizes}
     context = mp.get_context("spawn")
     with context.Pool(args.jobs, _alone, (context.Value("i", 0),), maxtasksperchild=None) as pool:

@@ -46,6 +46,7 @@ class Recipe:
     free: int = 6
     free_seconds: float = 10.0
     throws: int = 10
+    held: int = 3  # throws besides, which nobody is shown
     low: bool = False  # free flights near the ground
 
     def digest(self) -> str:
@@ -74,11 +75,11 @@ def world_of(recipe: Recipe):
 
 
 def lanes_of(recipe: Recipe, rng: np.random.Generator):
-    """References of all flights: free ones first, then throws at rising speeds."""
+    """References of all flights: free ones first, then throws at rising speeds, then those held back."""
     free = [FreeFlight(rng, height=0.75 if recipe.low else 1.9, speed=0.5 if recipe.low else 1.0) for _ in range(recipe.free)]
     speeds = np.linspace(5.0, 11.0, max(recipe.throws, 1))
-    throws = [Throw(rng, s, rng.uniform(-np.pi, np.pi)) for s in speeds[: recipe.throws]]
-    return free, throws
+    speeds = [*speeds[: recipe.throws], *rng.uniform(5.5, 10.5, recipe.held)]
+    return free, [Throw(rng, s, rng.uniform(-np.pi, np.pi)) for s in speeds]
 
 
 def fly_recipe(recipe: Recipe) -> list[Flights]:

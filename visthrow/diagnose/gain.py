@@ -4,7 +4,7 @@ Each flight is left out in turn; the search is repeated on the others by their s
 Beside it stand the noise floor, which cannot be beaten, and a black box trained on the same flights.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,7 +12,8 @@ import numpy as np
 from visthrow.diagnose.blackbox import table_of, train
 from visthrow.diagnose.evidence import Priors, additions, estimate, log_evidence
 from visthrow.diagnose.forms import HORIZONS, Forms, forms, unit_of
-from visthrow.diagnose.marginal import Statistics
+from visthrow.diagnose.marginal import Noise, Statistics
+from visthrow.diagnose.model import Model
 from visthrow.diagnose.point import Point
 from visthrow.diagnose.result import Diagnosis
 
@@ -106,6 +107,21 @@ def measure(diagnosis: Diagnosis, *, seed: int = 0, draws: int = DRAWS) -> Gain:
         if own.count[:, c].sum() > 0
     )
     return Gain(gains, nats, shares, len(folds), left_out, _landing(work, diagnosis))
+
+
+def predicted(model: Model, theta: Mapping[str, float]) -> dict[str, tuple[float, float, int]]:
+    """How well a model with stated sizes of its effects predicts flights: all of them, none is used for a fit.
+
+    Each window's initial state is fitted to its beginning, what follows is compared (see :mod:`visthrow.diagnose.forms`).
+
+    Returns:
+        Channel -> sum of squares in the stated noise, what noise and initial state alone would give, number of samples.
+    """
+    windows, channels = model.windows(theta), len(model.channels)
+    stated = Noise(np.ones(channels), {}, 1.0, np.zeros((len(windows), 3)))
+    own = forms(windows, [0] * len(windows), stated, [w.residual[:, None] for w in windows], channels)
+    sums = [part[0].sum(1) for part in (own.error(np.ones(1)), own.floor, own.count)]
+    return {name: (float(sums[0][c]), float(sums[1][c]), int(sums[2][c])) for c, name in enumerate(model.channels)}
 
 
 def _groups(point: Point, kept: Sequence[int]) -> tuple[list[int], str]:
