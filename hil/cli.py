@@ -131,7 +131,7 @@ class Keyboard:
 
     def words(self, state: str) -> Any:
         """See `hil.flight.Operator`."""
-        from hil.runner import Words
+        from hil.decision import Words
 
         said = set()
         while self._open and select.select([sys.stdin], [], [], 0)[0]:
@@ -252,8 +252,9 @@ def _check(args: argparse.Namespace) -> int:
     from hil.autopilot_check import AutopilotCheck
     from hil.backends import DryRun, make_backend
     from hil.clock import ManualClock, MonotonicClock
+    from hil.decision import Words
     from hil.plausible import unit_problems
-    from hil.runner import Runner, Words
+    from hil.runner import Runner
     from hil.sources.opening import open_source
     from visthrow.policy import Policy, find_policy
 

@@ -9,10 +9,11 @@ from typing import Any, Protocol
 
 from hil.backends.base import Backend
 from hil.clock import Clock, Ticker
+from hil.decision import Decision, Words
 from hil.images import Eyes
 from hil.latency import Stages
 from hil.record import Recorder
-from hil.runner import Decision, Runner, Words
+from hil.runner import Runner
 from hil.sources import Source
 from hil.states import State
 

@@ -12,13 +12,13 @@ from typing import Any
 
 import numpy as np
 
+from hil.decision import Decision
 from hil.errors import RunError
 from hil.landing import Landing
 from hil.params import HilParams
 from hil.playback import Playback, Sample
 from hil.pose import GOAL, PAYLOAD, VEHICLE, Pose
 from hil.record import PROVENANCE, load_run
-from hil.runner import Decision
 from hil.states import State
 from visthrow import config
 from visthrow.flightlog import FlightLog, FlightRecorder
@@ -212,9 +212,9 @@ def log_of(course: Course, first: int, last: int, throw: int | None = None) -> F
     ticks, runner = course.ticks[first : last + 1], course.playback.runner
     start = course.ticks[course.throws[throw][0]].line["time"] if throw is not None else ticks[0].line["time"]
     samples = Samples(course.params, course.playback, meta_of(course.params, course.playback, course.provenance, start))
-    landing = None if throw is None else _landing(runner.landings, start)
+    landing = None if throw is None else _landing(runner.latch.landings, start)
     latch = next((t.line["time"] for t in ticks if t.decision.release and t.line["time"] >= start), None)
-    apart = np.inf if latch is None else (landing.separation if landing and landing.separation else latch + runner.lag)
+    apart = np.inf if latch is None else (landing.separation if landing and landing.separation else latch + runner.latch.lag)
     for tick in ticks:
         samples.add(tick, tick.line["time"] < apart)
     meta = samples.recorder.meta

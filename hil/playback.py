@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from hil.backends.base import DryRun, Status
+from hil.decision import Decision, Words
 from hil.params import HilParams
 from hil.pose import Pose, Vector
 from hil.record import load_run
-from hil.runner import Decision, Runner, Words
+from hil.runner import Runner
 from hil.sight import Sight
 from hil.track import Track
 from visthrow.policy import Policy

@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Any
 
 from hil.backends.base import Status
+from hil.decision import Decision, Words
 from hil.errors import RunError
 from hil.params import HilParams
 from hil.pose import Pose
-from hil.runner import Decision, Words
 from visthrow import provenance
 from visthrow.errors import StorageError
 from visthrow.policy import Policy, find_policy

@@ -6,9 +6,8 @@ these are recorded, so that a replay decides alike to the last bit.
 
 import math
 import traceback
-from collections import deque
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from time import perf_counter
 from typing import Any
 
@@ -16,41 +15,30 @@ import numpy as np
 
 from hil.backends.base import FAILED, FOLLOW, LAND, Backend, Status
 from hil.backends.base import HOLD as HELD
-from hil.errors import RunError
+from hil.decision import Decision, Words
 from hil.gate import HOLD, Tether
+from hil.hovering import Hovering
 from hil.images import Hint
-from hil.landing import Flight, Landing
+from hil.latch import Latch
 from hil.params import HilParams
 from hil.pose import GOAL, PAYLOAD, VEHICLE, Pose, Vector
 from hil.safety import Guard, failed_checks, fence_broken, outside
 from hil.sight import Sight, Sights
 from hil.states import FLYING, Inputs, Machine, State
 from hil.track import BodyState, Track
-from visthrow.hover import GRAVITY, HoverController, HoverParams
+from visthrow.hover import GRAVITY
 from visthrow.pilot import Pilot, PilotOutput
 from visthrow.policy import Policy
-
-LAG_TOLERANCE = 5e-3
-"""What the mechanism may take longer than the trained lag [s]."""
 
 STILL_OFFSET, STILL_SPEED = 0.05, 0.25
 """Vehicle off its hover point [m], vehicle and payload speed over 0.2 s [m/s] that count as quiet: half of what the
 policies were trained to start from."""
-
-STUCK_AFTER = 0.6
-"""A payload that still hangs this long after it should have separated was not released, whatever was answered [s]."""
 
 REACQUIRE = 1.0
 """Before the vehicle is ours, a body that was refused or gone for this long is taken wherever it is [s]."""
 
 HAND_OVER_SPEED, HAND_OVER_TILT = 1.0, math.radians(20.0)
 """Below these the autopilot's own hold takes over after a throw: braking out of 60 deg is done on poses [m/s, rad]."""
-
-HOVERED = 50
-"""Ticks over which the thrust of the hover before a throw is taken: a second."""
-
-DESCENT = 0.4
-"""Of the hover point while landing [m/s]."""
 
 GROUND = 0.12
 """Height of the vehicle that counts as landed [m]."""
@@ -65,41 +53,14 @@ def calm(vehicle: BodyState) -> bool:
     return math.hypot(*vehicle.vel) < HAND_OVER_SPEED and 1.0 - 2.0 * (x * x + y * y) > math.cos(HAND_OVER_TILT)
 
 
-@dataclass(frozen=True)
-class Words:
-    """What the operator said since the last tick."""
-
-    arm: bool = False
-    land: bool = False
-    abort: bool = False
-
-
-@dataclass
-class Decision:
-    """All that one tick saw and decided; plain values, as they are recorded."""
-
-    time: float
-    state: str
-    reason: str
-    command: tuple[float, ...] | None = None  # as sent [N, rad/s]
-    action: list[float] | None = None  # of the policy, normalised
-    observation: list[float] | None = None
-    keypoints: list | None = None
-    valid: list | None = None
-    release: bool = False  # the policy asked for it and it was done
-    note: str = ""
-    seen: list | None = None  # of a camera's newest frame since the last tick; see `hil.sight.Sight`
-
-
 class Runner:
     """Flies one vehicle.
 
     Attributes:
         machine: the state. pilot: the policy. guard: with its counts.
-        tracks: by body. lag: trained time from latch to separation [s].
-        latches: releases so far. stuck: payloads that stayed on.
-        landings: of the throws so far. errors: tracebacks of what was caught.
-        mass: of vehicle, rope and payload [kg].
+        tracks: by body. latch: of the release, with the landings so far.
+        hovering: on poses, where no policy flies. errors: tracebacks of what was caught.
+        mass: of vehicle, rope and payload [kg]. alone: of the vehicle [kg].
         mount_b: where the rope hangs on the vehicle [m]. seen_goal_w: target as of the last tick [m].
         spent: time that parts of the last tick took [s]; those that it did not do are missing.
         watcher: called with each pose's body and track once it was taken; None for nobody.
@@ -121,31 +82,19 @@ class Runner:
         """
         self.params, self.backend = params, backend
         self.pilot = Pilot(policy, params.camera)
-        self.lag = self.pilot.lag
-        if mechanism_lag > self.lag + LAG_TOLERANCE:
-            raise RunError(
-                f"the mechanism takes {mechanism_lag:g} s from command to separation, the policy was trained with "
-                f"{self.lag:g} s; train one for the slower mechanism"
-            )
-        self._wait = max(0.0, self.lag - mechanism_lag)
         contract = policy.contract
         rope, body, action = contract["rope"], contract["vehicle"]["body"], contract["action"]
-        self._alone, self.mass = body["mass"], body["mass"] + rope["rope_mass"] + rope["payload_mass"]
+        self.alone, self.mass = body["mass"], body["mass"] + rope["rope_mass"] + rope["payload_mass"]
         self.hang = -rope["mount"][2] + rope["length"] + rope["payload_offset"]
+        self.latch = Latch(self.pilot.lag, mechanism_lag, self.hang, params.check.rope_tolerance, params.landing_height)
         self._reach = math.hypot(*rope["mount"]) + rope["length"] + rope["payload_offset"] + params.check.rope_tolerance
         self.guard = Guard(params.guard, float(action["max_thrust"]), tuple(map(float, action["max_rate"])))
         self.tracks = {name: Track(frames, params.gate, params.estimate, name == VEHICLE) for name, frames in params.frames.items()}
         self.machine = Machine(params.states, params.throws, params.observe)
-        self._hover = HoverController(HoverParams(max_thrust=float(action["max_thrust"])), self.pilot.period)
+        heading = math.radians(params.check.heading_deg)
+        self.hovering = Hovering(params.home_w, heading, float(action["max_thrust"]), self.pilot.period)
         self._latency = contract["observation"]["latency"]
-        self._latch: float | None = None
-        self._hovered: deque[float] = deque(maxlen=HOVERED)  # thrust over weight
-        self._hold_w: Vector = params.home_w
         self._acted = State.IDLE
-        self._begun = 0.0
-        self._flight: Flight | None = None
-        self.landings: list[Landing] = []
-        self.latches = self.stuck = 0
         self.errors: list[str] = []
         self.mount_b: Vector = tuple(map(float, rope["mount"]))
         self.seen_goal_w: Vector | None = None
@@ -187,7 +136,7 @@ class Runner:
         vehicle = self.tracks[VEHICLE].state(now)
         if vehicle is None or vehicle.quat is None or self.tracks[VEHICLE].gate.level(now) >= HOLD:
             return None
-        hangs = self._latch is None
+        hangs = self.latch.at is None
         return Hint(vehicle.pos, vehicle.quat, (0.5 * self.hang, 1.4 * self.hang) if hangs else None)
 
     def take(self, poses: list[Pose]) -> None:
@@ -207,14 +156,8 @@ class Runner:
             took = track is not None and track.update(pose, self._tether(pose)) is None
             if took and self.watcher is not None:
                 self.watcher(pose.body, track)
-            if took and pose.body == PAYLOAD and self._flight is not None:
-                self._down(self._flight.add(pose.arrival - pose.transit(self.params.delay.source), track.gate.last.pos))
-
-    def _down(self, landing: Landing | None) -> None:
-        """Note a landing, where there is one."""
-        if landing is not None:
-            self.landings.append(landing)
-            self._flight = None
+            if took and pose.body == PAYLOAD:
+                self.latch.follow(pose.arrival - pose.transit(self.params.delay.source), track.gate.last.pos)
 
     def _tick(self, now: float, poses: list[Pose], status: Status, words: Words, recording: bool) -> Decision:
         begin = perf_counter()
@@ -222,8 +165,7 @@ class Runner:
             error, self._untaken = self._untaken, None
             raise error
         self._take(poses)
-        if self._flight is not None:
-            self._down(self._flight.overdue(now))
+        self.latch.overdue(now)
         if self.machine.state in (State.IDLE, State.CHECK):
             for track in self.tracks.values():
                 # On the ground a body may be carried about out of sight; in flight what has jumped stays refused.
@@ -266,14 +208,10 @@ class Runner:
                 self.backend.send(decision.command, now)
                 self.spent["send"] = perf_counter() - ready
                 self.spent["total"] = perf_counter() - begin
-        if state in (State.READY, State.ARMED) and status.mode == FOLLOW and decision.command is not None:
-            self._hovered.append(decision.command[0] / (self.mass * GRAVITY))
-        else:
-            self._hovered.clear()
+        hovers = state in (State.READY, State.ARMED) and status.mode == FOLLOW and decision.command is not None
+        self.hovering.note(decision.command[0] / (self.mass * GRAVITY) if hovers else None)
         if decision.release:
-            self._latch, self.latches = now, self.latches + 1
-            self._flight = Flight(goal_w, self._begun, now, self.params.landing_height, self.lag)
-            self.backend.release(now + self._wait)
+            self.backend.release(self.latch.trip(now, goal_w))
         if state is State.ABORT and self.machine.flown:
             self.backend.abort(now)
         return decision
@@ -281,7 +219,7 @@ class Runner:
     def _tether(self, pose: Pose) -> Tether | None:
         """The cable's other end for a pose of vehicle or payload while the payload hangs; None on the ground and after."""
         other = {VEHICLE: PAYLOAD, PAYLOAD: VEHICLE}.get(pose.body)
-        if other is None or self._latch is not None or self.machine.state not in FLYING:
+        if other is None or self.latch.at is not None or self.machine.state not in FLYING:
             return None
         pos = self.tracks[other].expected(pose.arrival)
         fresh = self.tracks[other].gate.level(pose.arrival) < HOLD
@@ -292,7 +230,7 @@ class Runner:
         if state in (State.READY, State.ARMED, State.THROW):
             self.backend.ask(FOLLOW, now)
             if status.mode != FOLLOW:
-                self._hover.reset()  # nothing of what was commanded came about
+                self.hovering.reset()
         elif state is State.RECOVER and self.backend.holds:
             stale = vehicle is None or self.tracks[VEHICLE].gate.level(now) >= HOLD
             if stale or calm(vehicle) or status.mode == HELD:
@@ -321,13 +259,13 @@ class Runner:
     ) -> Inputs:  # fmt: skip
         p, state = self.params, self.machine.state
         known = vehicle is not None and payload is not None and goal_w is not None
-        hanging = payload if self._latch is None else None
+        hanging = payload if self.latch.at is None else None
         failure = status.fault
         if status.release == FAILED and state in (State.THROW, State.RECOVER):
             failure = "the release was refused or not answered"
         checks = ["a body has no pose yet"]
         # After a throw the payload may have been hung on again; only the operator's next word makes the latch new.
-        if known and state is not State.THROW and (self._latch is None or state is State.READY):
+        if known and state is not State.THROW and (self.latch.at is None or state is State.READY):
             checks = failed_checks(p.check, p.fence, vehicle, payload, goal_w, p.home_w, self.hang)
             if GOAL in self.tracks and self.tracks[GOAL].gate.level(now) >= HOLD:
                 checks.append("the goal's pose is stale")
@@ -340,8 +278,8 @@ class Runner:
             # While landing the fence's floor is left on purpose.
             fence_broken(p.fence, vehicle, hanging) if vehicle is not None and state is not State.LAND else None,
             vehicle is not None and state in (State.ARMED, State.RECOVER) and self._still(vehicle, payload, status.mode == HELD),
-            self._latch is not None and now - self._latch >= self.lag - 1e-9,
-            self._latch is not None,
+            self.latch.separated(now),
+            self.latch.at is not None,
             vehicle is not None and vehicle.pos[2] < GROUND,
             failure,
             words.arm,
@@ -353,10 +291,10 @@ class Runner:
 
     def _thrust_off(self) -> list[str]:
         """Whether hovering takes another thrust than the weight: then the calibration is wrong, or the battery low."""
-        p = self.params
-        if p.backend == "dry-run" or len(self._hovered) < HOVERED:
+        p, ratio = self.params, self.hovering.share()
+        if p.backend == "dry-run" or ratio is None:
             return []
-        allowed, ratio = getattr(p, p.backend).thrust.tolerance, sum(self._hovered) / len(self._hovered)
+        allowed = getattr(p, p.backend).thrust.tolerance
         if abs(ratio - 1.0) <= allowed:
             return []
         return [f"hovering takes {ratio:.2f} times the weight, within {allowed:g} of 1 expected: calibrate the thrust"]
@@ -365,7 +303,7 @@ class Runner:
         """Whether all is quiet, at the hover point or where the autopilot holds the vehicle."""
         if not held and math.dist(vehicle.pos, self.params.home_w) > STILL_OFFSET:
             return False
-        moving = [VEHICLE] + ([PAYLOAD] if self._latch is None and payload is not None else [])
+        moving = [VEHICLE] + ([PAYLOAD] if self.latch.at is None and payload is not None else [])
         return all(self.tracks[name].calm_speed() < STILL_SPEED for name in moving)
 
     def _entered(self, now: float, before: State, state: State, vehicle: BodyState | None) -> None:
@@ -373,17 +311,15 @@ class Runner:
         if before is State.THROW:
             self.backend.stop_release()
         if state is State.ARMED:
-            self._latch = None
+            self.latch.rearm()
             self.backend.rearm()
         if state is State.THROW:
             self.pilot.start()
-            self._begun = now
+            self.latch.begin(now)
         if state in (State.READY, State.RECOVER) and before in (State.CHECK, State.THROW):
-            self._hover.reset()
-            self._hold_w = self.params.home_w
+            self.hovering.hold(self.params.home_w)
         if state in (State.LAND, State.ABORT) and vehicle is not None:
-            self._hover.reset()
-            self._hold_w = vehicle.pos
+            self.hovering.hold(vehicle.pos)
 
     def _command(
         self, now: float, state: State, vehicle: BodyState | None, payload: BodyState | None, goal_w: Vector | None,
@@ -392,7 +328,7 @@ class Runner:
         """What to send in a state, before the guard; None for nothing."""
         if state not in FLYING and state is not State.ABORT:
             return None
-        mass = self.mass if self._carries(now, vehicle, payload) else self._alone
+        mass = self.mass if self._carries(now, vehicle, payload) else self.alone
         if vehicle is None or vehicle.quat is None or self.tracks[VEHICLE].gate.level(now) >= HOLD:
             if state is State.ABORT and now - self.machine.since > LEVEL_TIME:
                 return None
@@ -401,29 +337,19 @@ class Runner:
         if state is State.THROW:
             return self._throw(vehicle, payload, goal_w, decision)
         if state in (State.LAND, State.ABORT):
-            x, y, z = self._hold_w
-            self._hold_w = (x, y, max(z - DESCENT * self.pilot.period, 0.0))
-        command = self._hover.step(
-            np.array([vehicle.pos]), np.array([vehicle.quat]), np.array([vehicle.vel]), np.array(self._hold_w), mass,
-            math.radians(self.params.check.heading_deg),
-        )  # fmt: skip
-        return tuple(command[0].tolist())
+            self.hovering.descend()
+        return self.hovering.command(vehicle, mass)
 
     def _carries(self, now: float, vehicle: BodyState | None, payload: BodyState | None) -> bool:
         """Whether the payload hangs on the vehicle, by the latch and by its own poses."""
-        if self._latch is None:
-            return True
-        if now - self._latch < self.lag + STUCK_AFTER or None in (vehicle, payload):
-            return False
-        fresh = self.tracks[PAYLOAD].gate.level(now) < HOLD
-        hangs = abs(math.dist(vehicle.pos, payload.pos) - self.hang) < self.params.check.rope_tolerance
-        if fresh and hangs and self._flight is not None:
-            self.stuck, self._flight = self.stuck + 1, None
-        return fresh and hangs
+        fresh = payload is not None and self.tracks[PAYLOAD].gate.level(now) < HOLD
+        if vehicle is None:
+            return self.latch.at is None
+        return self.latch.hangs_still(now, vehicle.pos, payload.pos if fresh else None)
 
     def _throw(self, vehicle: BodyState, payload: BodyState, goal_w: Vector, decision: Decision) -> tuple[float, ...]:
         out = self._show(vehicle, payload, goal_w, decision)
-        if out.release[0] and self._latch is None:
+        if out.release[0] and self.latch.at is None:
             fence = self.params.fence
             beyond = outside(payload.pos, fence.payload_low, fence.payload_high)
             decision.release = beyond is None
@@ -432,7 +358,7 @@ class Runner:
 
     def _show(self, vehicle: BodyState, payload: BodyState, goal_w: Vector, decision: Decision) -> PilotOutput:
         """Show the policy what there is to see, and note what it makes of it."""
-        attached = self._latch is None or decision.time - self._latch < self.lag - 1e-9
+        attached = not self.latch.separated(decision.time)
         views = [np.array([v]) for v in (vehicle.pos, vehicle.quat, vehicle.vel, vehicle.rate, payload.pos)]
         keypoints = None if self.sights is None else self.sights.keypoints(decision.time)
         out: PilotOutput = self.pilot.act(*views, np.array(goal_w), attached, keypoints)
@@ -461,9 +387,9 @@ class Runner:
             "aborted": self.machine.aborted,
             "throws": self.machine.throws,
             "cancelled": self.machine.cancelled,
-            "latches": self.latches,
-            "stuck": self.stuck,
-            "landings": [asdict(landing) for landing in self.landings],
+            "latches": self.latch.count,
+            "stuck": self.latch.stuck,
+            "landings": [asdict(landing) for landing in self.latch.landings],
             "guard": {k: getattr(self.guard, k) for k in ("clipped", "slewed", "refused")},
             "bodies": {
                 name: {"accepted": track.accepted, "refused": track.gate.refused, "filter_lag": track.filter.lag}

@@ -67,7 +67,7 @@ class Show:
 
     def take(self, ticks: list[Tick]) -> None:
         """Send some ticks, in order."""
-        lag = self._playback.runner.lag
+        lag = self._playback.runner.latch.lag
         for tick in ticks:
             if tick.decision.release:
                 self._latch = tick.line["time"]

@@ -105,7 +105,7 @@ def fly(
     """Fly for a time; ``poses``, ``status``, ``words``, ``late`` and ``recording`` spoil what the runner is told."""
     vehicle, decisions, command = Vehicle(), [], None
     waiting: list[Pose] = []
-    mass = (runner.mass, runner._alone)
+    mass = (runner.mass, runner.alone)
     while vehicle.time < seconds and runner.machine.state != "done":
         now = vehicle.time + late(vehicle.time)
         decision = runner.tick(now, waiting, status(now), words(now, runner.machine.state), recording(now))

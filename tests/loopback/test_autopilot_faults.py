@@ -12,11 +12,11 @@ import time
 import numpy as np
 import pytest
 
+from hil.decision import Words
 from hil.fakes.level import LevelPlant
 from hil.fakes.px4 import POSCTL
 from hil.flight import fly
 from hil.record import Recorder
-from hil.runner import Words
 from tests.hil_flight import simple_policy
 from tests.loopback.wire import peers
 from visthrow.actions import hover_action

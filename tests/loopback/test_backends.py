@@ -6,11 +6,11 @@ import pytest
 from hil import msp
 from hil.autopilot_check import AutopilotCheck
 from hil.backends.base import FOLLOW, HOLD, LAND, WAIT
+from hil.decision import Words
 from hil.fakes.level import LevelPlant
 from hil.fakes.px4 import LAND as PX4_LAND
 from hil.fakes.px4 import OFFBOARD, POSCTL, custom
 from hil.flight import fly
-from hil.runner import Words
 from tests.hil_flight import simple_policy
 from tests.loopback.wire import peers, throw
 

@@ -7,12 +7,12 @@ import math
 
 import pytest
 
+from hil.decision import Words
 from hil.errors import RunError
 from hil.fakes.level import LevelPlant
 from hil.flight import fly
 from hil.mocap_faults import FAULTS, MocapFault
 from hil.pose import VEHICLE, Pose
-from hil.runner import Words
 from tests.hil_flight import simple_policy
 from tests.loopback.wire import peers
 from visthrow.actions import hover_action
@@ -107,7 +107,7 @@ def test_a_fault_as_the_policy_asks_for_the_release(name):
     fly(runner, source, clock, OneWord(), None, 3.0)
     assert fake.witness.breaches == []
     assert fake.witness.releases == (1 if name in FLOWN_THROUGH else 0), runner.machine.reason
-    assert runner.latches == fake.witness.releases
+    assert runner.latch.count == fake.witness.releases
     if name not in FLOWN_THROUGH and name != "jump":
         assert fake.witness.commands == 0, "what fails the checks is never flown"
 

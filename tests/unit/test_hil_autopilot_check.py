@@ -6,11 +6,11 @@ import pytest
 
 from hil.autopilot_check import hover_of_run, told
 from hil.backends import DryRun
+from hil.decision import Words
 from hil.errors import RunError
 from hil.fakes.level import LevelPlant
 from hil.flight import fly
 from hil.record import CONFIG, TICKS, Recorder
-from hil.runner import Words
 from tests.hil_flight import simple_policy
 from tests.loopback.wire import peers
 

@@ -54,7 +54,7 @@ def test_a_throw_from_idle_to_done():
     latch = next(d.time for d in decisions if d.release)
     assert pilot.backend.release_times == [pytest.approx(latch + LAG)], "no mechanism: the runner waits the trained lag"
     assert when(decisions, "recover") == pytest.approx(latch + LAG, abs=TICK)
-    (landing,) = pilot.landings
+    (landing,) = pilot.latch.landings
     np.testing.assert_allclose(landing.landing_w, (0.0, 0.0, 0.04), atol=0.02)
     assert landing.error == pytest.approx(2.0, abs=0.02)
     fall = math.sqrt(2 * (1.333 - pilot.hang - 0.04) / 9.81)
@@ -67,7 +67,7 @@ def test_the_mechanisms_own_time_is_taken_off_and_a_slow_one_is_refused():
     decisions = fly(pilot, 6.0)
     latch = next(d.time for d in decisions if d.release)
     assert pilot.backend.release_times == [pytest.approx(latch + 0.03)]
-    assert runner(mechanism=0.114)._wait == 0.0
+    assert runner(mechanism=0.114).latch.trip(1.0, (0.0, 0.0, 0.0)) == 1.0
     with pytest.raises(RunError, match=r"takes 0\.12 s .* trained with 0\.11 s"):
         runner(mechanism=0.12)
 
@@ -293,7 +293,7 @@ def test_an_abort_in_mid_throw_holds_the_place_where_it_happened():
         if time > START:
             pilot.pilot.act = broken
         if decision.state == "abort":
-            places.append((pilot.tracks["vehicle"].state(time).pos[0], pilot._hold_w[0]))
+            places.append((pilot.tracks["vehicle"].state(time).pos[0], pilot.hovering.place_w[0]))
 
     fly(pilot, START + 0.2, watch=watch)
     assert places[0][0] > 0.15
