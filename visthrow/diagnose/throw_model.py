@@ -1,5 +1,6 @@
 """The whole throw as a model to diagnose: vehicle, rope, payload and release replayed from recorded commands."""
 
+import copy
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 
@@ -11,6 +12,7 @@ from sim.replay.kernel import NO_PAYLOAD
 from sim.replay.lanes import Replay
 from visthrow.diagnose.catalogue import Entry, Setting, apply, entries_for
 from visthrow.diagnose.cutting import Cut, around_slack, cut
+from visthrow.diagnose.landing import Landings, landings
 from visthrow.diagnose.model import Window
 from visthrow.diagnose.opened import opened
 from visthrow.diagnose.recorded import NEVER, carriers, record_of
@@ -36,6 +38,9 @@ ROUNDS = 25
 AFTER_SLACK = 0.05  # that a rope is given to come taut [s]
 HUBER = 30.0  # deviations, beyond which a sample counts less
 SETTLED = 0.003  # relative fall of the cost below which an initial state is settled
+TRUSTED = ("motor_speed",)
+"""Fields that are linearised about where the commands left them. Fitted without gusts they would take the gusts' place: rotors
+far from their commands at the start of a window, and with them a law of the thrust's slope that is none."""
 
 
 class ThrowModel:
@@ -163,6 +168,27 @@ class ThrowModel:
                 worst[name] = max(worst[name], float(here.max())) if len(here) else worst[name]
         return worst
 
+    def landings(self, theta: Mapping[str, float], flights: Sequence[int] | None = None) -> Landings:
+        """See :func:`visthrow.diagnose.landing.landings`."""
+        return landings(self, theta, flights)
+
+    def landing_errors(self, theta: Mapping[str, float]) -> np.ndarray:
+        """Distance of each throw's predicted landing from the measured one [m], shape (throws,)."""
+        return self.landings(theta).errors
+
+    def beside(self, cuts: Sequence[Cut]) -> "ThrowModel":
+        """The same model of other windows of its flights."""
+        other, x = copy.copy(self), self.setting.sensing
+        delays = (x.vehicle_delay, x.payload_delay, x.gyro_delay)
+        other.flights = Flights(self.flights.flights, cuts, delays, self.flights.stride)
+        other._told = np.array([w for w, c in enumerate(cuts) if c.told])
+        return other
+
+    def begun(self, theta: Mapping[str, float]) -> tuple[Setting, States]:
+        """The setting with effects at ``theta``, and initial states fitted in it."""
+        setting = apply(self.entries, self.setting, theta)
+        return setting, self._settle(setting, self._begin(setting))
+
     def _replay(self, settings: Sequence[Setting]) -> Replay:
         return Replay([s.plant for s in settings], [s.sensing for s in settings], self.device)
 
@@ -205,6 +231,10 @@ class ThrowModel:
 
     def _nuisances(self, w: int) -> list[int]:
         return [d for d, x in enumerate(self._directions) if concerns(x, self.flights.cuts[w])]
+
+    def _fitted(self, w: int) -> list[int]:
+        """Directions in which a window's initial state is fitted."""
+        return [d for d in self._nuisances(w) if self._directions[d].field not in TRUSTED]
 
     def _latents(self, w: int) -> list[tuple[int, int]]:
         axes = 6 if self.flights.cuts[w].payload == NO_PAYLOAD else 9
@@ -359,17 +389,17 @@ class ThrowModel:
         count, lanes, first = len(self.flights.cuts), [], []
         for w in which:
             first.append(len(lanes))
-            lanes += [Lane(w, 0, w), *[Lane(w, 0, (1 + d) * count + w) for d in self._nuisances(w)]]
+            lanes += [Lane(w, 0, w), *[Lane(w, 0, (1 + d) * count + w) for d in self._fitted(w)]]
         seen = self.flights.fly(replay, [setting], self._moved(states), lanes, self.substep).seen
         for at, w in zip(first, which):
-            ds, rows, sigma = self._nuisances(w), int(self.flights.rows[w]), self._sigma(w)
+            ds, rows, sigma = self._fitted(w), int(self.flights.rows[w]), self._sigma(w)
             flat = np.swapaxes(seen[:rows, at : at + 1 + len(ds)], 1, 2).reshape(3 * rows, -1)
             steps = np.array([self._directions[d].step for d in ds])
             yield w, (flat[:, 1:] - flat[:, :1]) / steps / sigma[:, None], self._residual(seen, w, at) / sigma
 
     def _increment(self, w: int, slopes: np.ndarray, residual: np.ndarray, done: np.ndarray, damping: float) -> np.ndarray:
         """Levenberg-Marquardt step of a window's state, with its vague prior; shape (directions,)."""
-        ds = self._nuisances(w)
+        ds = self._fitted(w)
         sd = np.array([self._directions[d].sd for d in ds])
         weight = np.minimum(1.0, HUBER / np.maximum(np.abs(residual), 1e-12))
         scaled = slopes * sd
