@@ -36,6 +36,7 @@ class FakeArduPilot(FakeMavlink):
 
     autopilot = mav.MAV_AUTOPILOT_ARDUPILOTMEGA
     usual_mode = GUIDED
+    pilots_mode = LOITER
     thrust_map = ThrustParams(2.668, 0.1906, 1.0, 0.1, 0.0)
     defaults = {  # noqa: RUF012 - copied by each instance
         "GUID_OPTIONS": 8.0, "ATC_ANGLE_BOOST": 0.0, "GUID_TIMEOUT": 0.5, "EK3_SRC1_POSXY": 6.0, "GRIP_ENABLE": 1.0,

@@ -73,6 +73,7 @@ class Options:
     mechanism: float = 0.0  # from the output's movement to the latch of the plant, whose own lag follows [s]
     clock_offset: float = 0.0  # of its clock [s]
     silent_after: float = float("inf")  # it says nothing any more from this time on [s]
+    taken_after: float = float("inf")  # when the pilot takes the vehicle over [s]
     pose_message: Literal["ATT_POS_MOCAP", "ODOMETRY"] = "ATT_POS_MOCAP"  # ODOMETRY carries a reset counter
     mocap_fault: str = "none"  # of hil.mocap_faults
     fault_time: float = float("inf")  # from which it happens [s]
@@ -133,6 +134,7 @@ class Fake:
         self.wall: Callable[[], float] = lambda: self.plant.time + 0.5 * self.plant.period
         self.events: list[tuple[float, str]] = []
         self._going_on: dict[str, float] = {}
+        self.taken = False
 
     def happened(self, text: str) -> None:
         """Note something that the autopilot did by itself, or was told; what goes on from one period to the next is one event."""
@@ -209,6 +211,10 @@ class Fake:
             self.happened("landed, disarmed")
         return self.hold(np.array([self._place[0], self._place[1], max(pos[2] - DESCENT, 0.05)]))
 
+    def take(self) -> None:
+        """The pilot takes the vehicle over, and holds it."""
+        raise NotImplementedError
+
     def flown(self) -> np.ndarray:
         """Command of this period, by whoever flies."""
         raise NotImplementedError
@@ -222,6 +228,9 @@ class Fake:
         self.link.pump(lambda: self.plant.time)
         while self._later and self._later[0][0] <= self.plant.time + 1e-9:
             heapq.heappop(self._later)[2]()
+        if not self.taken and self.plant.time >= self.options.taken_after:
+            self.taken = True
+            self.take()
         command = self.flown()
         self.last_thrust = command[0]
         self.plant.step(command, self._open)

@@ -187,10 +187,16 @@ class FakeBetaflight(Fake):
         switch = [] if self.options.all_channels else [BOX_OVERRIDE, 2, 28, 48]
         return bytes([*arm, *switch, 0, 0, 0, 0])
 
+    def take(self) -> None:
+        """See `Fake`: the override switch goes off."""
+        self.override = False
+        self._place = self.plant.state["pos_w"].astype(float)
+        self.happened("override off")
+
     def flown(self) -> np.ndarray:
         """See `Fake`."""
         quiet = self.plant.time - self._heard
-        if not self.options.all_channels and self._first is not None and self.plant.time - self._first >= REACTION:
+        if not (self.options.all_channels or self.taken) and self._first is not None and self.plant.time - self._first >= REACTION:
             self.override = self.armed
         if not self.override or self._target is None:
             gone = self._first is not None and not self.armed and not self.options.all_channels

@@ -21,7 +21,7 @@ class FakeMavlink(Fake):
     """An autopilot on the poses' link."""
 
     autopilot = mav.MAV_AUTOPILOT_GENERIC
-    usual_mode = 0
+    usual_mode = pilots_mode = 0
     defaults: dict[str, float]  # parameters of a vehicle that is set up well
 
     def __init__(
@@ -81,6 +81,11 @@ class FakeMavlink(Fake):
     def listens(self) -> bool:
         """Whether set-points are followed now."""
         raise NotImplementedError
+
+    def take(self) -> None:
+        """See `Fake`."""
+        self.enter(self.pilots_mode)
+        self.beat_soon()
 
     def enter(self, mode: int) -> int:
         """Enter a custom mode; the result of the command."""

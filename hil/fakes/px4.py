@@ -37,7 +37,7 @@ class FakePx4(FakeMavlink):
     """See the head of this module."""
 
     autopilot = mav.MAV_AUTOPILOT_PX4
-    usual_mode = POSCTL
+    usual_mode = pilots_mode = POSCTL
     usual_delay = 0.017
     thrust_map = ThrustParams(2.668, 0.1585, 0.8, 0.1, 0.0)
     defaults = {  # noqa: RUF012 - copied by each instance

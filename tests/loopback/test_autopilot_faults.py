@@ -14,7 +14,6 @@ import pytest
 
 from hil.decision import Words
 from hil.fakes.level import LevelPlant
-from hil.fakes.px4 import POSCTL
 from hil.flight import fly
 from hil.record import Recorder
 from tests.hil_flight import simple_policy
@@ -87,23 +86,17 @@ def test_silent(kind):
 def test_the_pilot_takes_over(kind):
     """Abort at the next sign of life; from then on not one command is sent, no mode is asked for."""
 
-    def take(now, runner, fake):
-        if now >= START and not state:
-            state.append(runner.backend)
-            if kind == "betaflight":
-                fake.override, fake.options = False, dataclasses.replace(fake.options, all_channels=True)
-            else:
-                fake.mode, fake._next_beat = (0 if kind == "ardupilot" else POSCTL), 0.0
-        if state and now >= START + 0.3:
-            state.append(fake.witness.commands)
-            modes.append(getattr(fake, "mode", None))
+    def watch(now, runner, fake):
+        if now >= START + 0.3:
+            commands.add(fake.witness.commands)
+            modes.add(getattr(fake, "mode", None))
 
-    state, modes = [], []
-    _, _, told = run(kind, START + 1.0, watch=take)
+    commands, modes = set(), set()
+    fake, _, told = run(kind, START + 1.0, watch=watch, taken_after=START)
     assert reason(told, "abort") == GONE
     assert when(told, "abort") <= START + BEAT["betaflight"] + 3 * TICK
-    assert len(set(state[1:])) == 1, "silent: the pilot has it"
-    assert len(set(modes)) == 1
+    assert (len(commands), len(modes)) == (1, 1), "silent: the pilot has it"
+    assert fake.taken
 
 
 @pytest.mark.parametrize("kind", KINDS)
