@@ -7,6 +7,9 @@ STAMP := $(VENV)/.installed
 PYTHON ?= $(firstword $(foreach name,python3 python3.13 python3.12 python3.11,$(shell \
 	$(name) -c 'import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $(name))))
 
+# Test files at once, each with one thread; a file's tests stay in one process, which shares what it compiled and flew.
+JOBS ?= 2
+
 .PHONY: demo test test-all lint format clean install
 .DELETE_ON_ERROR:
 
@@ -14,7 +17,7 @@ demo: $(STAMP)
 	$(BIN)/visthrow demo
 
 test: $(STAMP)
-	$(BIN)/python -m pytest
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder
 
 test-all: $(STAMP)
 	$(BIN)/python -m pytest -m "not gpu and not sitl"
