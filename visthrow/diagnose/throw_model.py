@@ -119,6 +119,7 @@ class ThrowModel:
     def windows(self, theta: Mapping[str, float]) -> list[Window]:
         """See :class:`visthrow.diagnose.model.Model`."""
         setting = apply(self.entries, self.setting, theta)
+        self._directions = directions(setting.plant)  # another kind of block has other states
         states = self._states if setting == self.setting else self._settle(setting, self._better_start(setting))
         self._latest = states
         steps = [self._step(e, theta.get(e.effect.name, 0.0)) for e in self._graded]
