@@ -49,7 +49,8 @@ def tool(folder: Path, *arguments: str, timeout: float = 1500.0) -> str:
     return done.stdout
 
 
-def explained(folder: Path, logs: Sequence[FlightLog], recipe: Recipe, plant: str | None = None, action: str = "explain") -> dict:
+def explained(folder: Path, logs: Sequence[FlightLog], recipe: Recipe, plant: str | None = None, action: str = "explain",
+              more: Sequence[str] = ()) -> dict:  # fmt: skip
     """The tool's JSON about logs.
 
     Args:
@@ -58,6 +59,7 @@ def explained(folder: Path, logs: Sequence[FlightLog], recipe: Recipe, plant: st
         recipe: of the world, for the model that is its null.
         plant: a configuration file on top of which that is done; None for the shipped one.
         action: ``explain`` or ``plan``.
+        more: arguments; a plan's JSON gets the references' text under ``tables``, by file.
     """
     place = Path(tempfile.mkdtemp(dir=folder))
     for i, log in enumerate(logs):
@@ -66,8 +68,9 @@ def explained(folder: Path, logs: Sequence[FlightLog], recipe: Recipe, plant: st
     command += ["--out", "out", *(["--no-report"] if action == "explain" else []), *(["--plant", plant] if plant else [])]
     for item in model_of(recipe):
         command += ["--set", item]
-    tool(place, *command)
-    return json.loads((place / "said.json").read_text())
+    tool(place, *command, *more)
+    said = json.loads((place / "said.json").read_text())
+    return said | {"tables": {path.name: path.read_text() for path in place.glob("out/*.csv")}}
 
 
 def names(verdict: dict) -> set[str]:
@@ -219,10 +222,15 @@ class Task:
 
 
 def draw(kind: str, seed: int, floors: float = 15.0) -> Recipe:
-    """World of a case: an effect and a plant from a seed; a scrambled world hides nothing."""
+    """World of a case: an effect and a plant from a seed; a scrambled world hides nothing, a pair what belongs to it."""
+    from tests.diagnose import degenerate
+
     rng = np.random.default_rng(seed)
     if kind == "scramble":
         return Recipe(seed, str(rng.choice(PLANTS)), **SIZE)
+    if kind in degenerate.PAIRS:
+        pair = degenerate.PAIRS[kind]
+        return Recipe(seed, str(rng.choice(PLANTS)), {pair.effect: pair.size * float(rng.choice(pair.signs))}, **SIZE)
     name = str(rng.choice(list(FLOORS)))
     sign = 1.0 if name in ONE_SIDED else float(rng.choice([-1.0, 1.0]))
     return Recipe(seed, str(rng.choice(PLANTS)), {name: sign * floors * FLOORS[name]}, floors, **SIZE)
@@ -253,7 +261,9 @@ def run_case(task: Task) -> dict | None:
 
 def run_kind(kind: str) -> Callable[[Recipe, Path], dict]:
     """The function of a kind of case."""
-    return KINDS[kind]
+    from tests.diagnose import degenerate
+
+    return KINDS[kind] if kind in KINDS else degenerate.PAIRS[kind].run
 
 
 def main() -> None:

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from visthrow.diagnose.catalogue import apply
+from visthrow.diagnose.catalogue import apply, entries_for
 from visthrow.diagnose.manoeuvres import PERIOD, Manoeuvre, Reference
 from visthrow.diagnose.model import Model
 from visthrow.diagnose.plan import log_of
@@ -17,6 +17,9 @@ from visthrow.hover import HoverController, HoverParams
 
 SAMPLE_PERIOD = 0.005
 """Of the recorded poses [s]: motion capture at 200 Hz."""
+
+COARSE = 2.0
+"""Steps of a promise, in those of the search."""
 
 AWAY = 1.5
 """Time given to a dropped payload and to the vehicle before a manoeuvre without payload begins [s]."""
@@ -34,13 +37,16 @@ def simulator_of(model: ThrowModel, diagnosis: Diagnosis, *, seed: int = 0) -> C
         seed: of the noise.
     """
     noise = _sensor_noise(diagnosis)
+    asked = {e.name for e in model.effects}
 
     def simulate(manoeuvres: Sequence[Manoeuvre]) -> list[Model | None]:
         models: list[Model | None] = []
         for log, manoeuvre in zip(fly(model, diagnosis.theta, manoeuvres, noise, seed), manoeuvres):
+            there = entries_for(model.setting, set(log.channels), manoeuvre.payload, np.isfinite(manoeuvre.release))
             try:
                 models.append(ThrowModel([log], model.setting.plant, sensing=model.setting.sensing, device=model.device,
-                                         substep=model.substep, only=None, carries=manoeuvre.payload))  # fmt: skip
+                                         substep=COARSE * model.substep, only=[n for n in there if n in asked],
+                                         carries=manoeuvre.payload))  # fmt: skip
             except DiagnoseError:
                 models.append(None)
         return models

@@ -21,6 +21,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"of configs/train, or a file: vehicle, rope and release of the model that is diagnosed (default: {DEFAULT_PLANT})",
     )  # fmt: skip
     parser.add_argument("--only", metavar="NAMES", help="consider these effects alone, separated by commas")
+    parser.add_argument(
+        "--measured", metavar="NAME=SD", action="append", default=[],
+        help="the configured value behind this effect was measured with this deviation, such as mass_quad=0.0003 from a scale",
+    )  # fmt: skip
     parser.add_argument("--without", metavar="FLIGHTS", default="", help="numbers of flights to leave out, from 0, by commas")
     parser.add_argument("--seed", type=int, default=0, help="of the null worlds and bootstraps (default: 0)")
     add_common(parser)
@@ -32,6 +36,15 @@ def open_model(args: argparse.Namespace) -> tuple[Model, list[FlightLog]]:
     Raises:
         ConfigError, LogError, DiagnoseError: As what is read and built; ``--set`` with a setup's own model.
     """
+    from visthrow.diagnose import measures
+
+    model, logs = _opened(args)
+    if args.measured:
+        model.effects = measures.narrowed(model.effects, measures.parsed(args.measured))
+    return model, logs
+
+
+def _opened(args: argparse.Namespace) -> tuple[Model, list[FlightLog]]:
     from visthrow.diagnose import setup
 
     logs = setup.read_logs(args.logs, args.config)

@@ -14,19 +14,25 @@ from visthrow.diagnose import result
 from visthrow.diagnose.evidence import Priors, covariance, log_evidence
 from visthrow.diagnose.manoeuvres import PERIOD, Manoeuvre, Reference
 from visthrow.diagnose.marginal import Noise, correlated, gram_of, window_statistics
+from visthrow.diagnose.measures import MEASUREMENTS, Measurement, narrowed
 from visthrow.diagnose.model import LATENT_BLOCKS, Model
 from visthrow.diagnose.result import Diagnosis
+from visthrow.errors import DiagnoseError, suggest
 from visthrow.flightlog import Channel, FlightLog
 
-DECISIVE = 5.0
-"""Nats that tell two members of a class apart."""
+DECISIVE = 11.0
+"""Expected nats that tell two members of a class apart: those that come scatter with twice their mean as variance, and exceed
+the 3 nats of a class in 95 % of flights."""
+
+NAMEABLE = 0.2
+"""Deviation of an effect, in that of its prior, from which on its usual size is named."""
 
 MOST_REPEATS = 10
 
 
 @dataclass(frozen=True)
 class Proposal:
-    """One manoeuvre and what it promises."""
+    """One manoeuvre, or one measurement on the ground, and what it promises."""
 
     name: str
     purpose: str
@@ -53,35 +59,73 @@ def unclear(diagnosis: Diagnosis) -> list[str]:
 
 
 def propose(
-    diagnosis: Diagnosis, manoeuvres: Sequence[Manoeuvre], simulate: Callable[[Sequence[Manoeuvre]], Sequence[Model | None]]
-) -> list[Proposal]:
-    """Rank manoeuvres, best first.
+    diagnosis: Diagnosis, manoeuvres: Sequence[Manoeuvre], simulate: Callable[[Sequence[Manoeuvre]], Sequence[Model | None]],
+    about: Sequence[str] = (),
+) -> list[Proposal]:  # fmt: skip
+    """Rank manoeuvres and measurements, best first.
 
     Args:
         diagnosis: whose classes, or else whose effects that could not be identified, are to be separated.
         manoeuvres: to choose among.
         simulate: gives for each manoeuvre a model of its simulated flight with the same catalogue; None where it cannot be flown.
+        about: names of the effects to plan for; empty for all classes, or else all effects that the flights could not show.
+
+    Raises:
+        DiagnoseError: An effect that the diagnosis does not know.
     """
     work = diagnosis.work
     names = [e.name for e in work.problem.model.effects]
+    for name in about:
+        if name not in names:
+            raise DiagnoseError(f"no effect '{name}' in this diagnosis; {suggest(name, names)}")
     base, priors = work.after, work.problem.priors
-    pairs = [(names.index(a), names.index(b)) for a, b in pairs_of(diagnosis)]
-    vague = [names.index(name) for name in unclear(diagnosis)]
+    pairs = [(names.index(a), names.index(b)) for a, b in pairs_of(diagnosis) if not about or {a, b} & set(about)]
+    vague = [names.index(name) for name in about or unclear(diagnosis)]
     proposals = []
     for manoeuvre, model in zip(manoeuvres, simulate(manoeuvres)):
         if model is None:
             continue
         new = expected_information(model, diagnosis.theta, base.noise, names, priors)
-        gaps = [_gap(diagnosis, base.information, base.score, new, priors, pair) for pair in pairs]
         if pairs:
-            nats, separated, repeats = _classes(diagnosis, new, pairs, gaps)
+            nats, separated, repeats = _classes(diagnosis, new, pairs)
         else:
-            nats, separated = _shrinking(base.information, new, priors, vague, work.active)
-            repeats = 1 if separated else 0
+            nats, separated, repeats = _shrinking(base.information, new, priors, vague, work.active)
         told = tuple(tuple(names[j] for j in group) for group in separated)
         proposals.append(Proposal(manoeuvre.name, manoeuvre.purpose, manoeuvre.seconds, nats, told, repeats,
                                   manoeuvre.reference().limits()))  # fmt: skip
-    return sorted(proposals, key=lambda p: -p.nats / np.sqrt(p.seconds))
+    return sorted([*proposals, *_measured(diagnosis, names, pairs)], key=_worth, reverse=True)
+
+
+def _worth(p: Proposal) -> tuple[float, float]:
+    """What settles the most comes first, soonest; what settles nothing by its nats a second."""
+    return len(p.separates) / np.sqrt(p.seconds * max(p.repeats, 1)), p.nats / np.sqrt(p.seconds)
+
+
+def _measured(diagnosis: Diagnosis, names: Sequence[str], pairs: Sequence[tuple[int, int]]) -> list[Proposal]:
+    """Measurements on the ground that settle members of classes."""
+    findings = {f.name: f for f in diagnosis.findings}
+    out = []
+    for m in MEASUREMENTS:
+        own = [(a, b) for a, b in pairs if m.effect in (names[a], names[b])]
+        if not own:
+            continue
+        j = names.index(m.effect)
+        seen = 0.5 * (findings[m.effect].estimate / m.sd) ** 2  # if it is the cause, the measurement shows it
+        gaps = [min(seen, _denied(diagnosis, j, a + b - j, m)) for a, b in own]
+        apart = tuple((names[a], names[b]) for (a, b), gap in zip(own, gaps) if gap > DECISIVE)
+        out.append(Proposal(m.name, f"settles {m.effect}", m.seconds, min(gaps), apart, int(bool(apart)), ""))
+    return out
+
+
+def _denied(diagnosis: Diagnosis, j: int, truth: int, m: Measurement) -> float:
+    """Nats by which the other member is ahead once the measurement has found the configured value right."""
+    work = diagnosis.work
+    problem = work.problem
+    known = Priors.of(narrowed(problem.model.effects, {m.effect: m.sd}), tuple(problem.model.channels))
+    rest = [k for k in work.active if k not in (j, truth)]
+    sets = ([*rest, truth], [*rest, j])
+    ahead, behind = (log_evidence(work.after.information, work.after.score, known, s) for s in sets)
+    return ahead - behind
 
 
 def expected_information(
@@ -95,9 +139,10 @@ def expected_information(
     own = np.array([i for i, e in enumerate(model.effects) if e.name in names])
     total = np.zeros((len(names), len(names)))
     loudest = {block: max(v for (b, _), v in noise.latent_sd.items() if b == block) for block, _ in noise.latent_sd}
+    pushed = loudest.get(0, 1.0)  # of a payload that has not been flown: as strongly as the vehicle [N]
     for window in windows:
         gram = correlated(gram_of(window, floors, len(model.channels)), window, noise.correlation_time)
-        levels = {(int(b), window.phase): noise.latent_sd.get((int(b), window.phase), loudest.get(int(b), 1.0))
+        levels = {(int(b), window.phase): noise.latent_sd.get((int(b), window.phase), loudest.get(int(b), pushed))
                   for b in np.unique(gram.latent_block)}  # fmt: skip
         shared = np.full((1, len(LATENT_BLOCKS)), np.nan)
         expected = replace(noise, scale=np.ones(len(model.channels)), latent_sd=levels, own=shared)
@@ -129,28 +174,43 @@ def _gap(diagnosis: Diagnosis, information: np.ndarray, score: np.ndarray, new: 
     return float(min(gaps))
 
 
-def _classes(diagnosis: Diagnosis, new: np.ndarray, pairs, gaps) -> tuple[float, list[tuple[int, int]], int]:
+def _classes(diagnosis: Diagnosis, new: np.ndarray, pairs: Sequence[tuple[int, int]]):
+    """Nats of the pair that is hardest, pairs apart after ``repeats`` flights, and that number."""
     base, priors = diagnosis.work.after, diagnosis.work.problem.priors
-    hardest = pairs[int(np.argmin(gaps))]
-    repeats = 0
+
+    def gaps(count: int) -> list[float]:
+        return [_gap(diagnosis, base.information, base.score, count * new, priors, pair) for pair in pairs]
+
+    once = gaps(1)
+    best, apart, repeats = 0, [], 0
     for count in range(1, MOST_REPEATS + 1):
-        if _gap(diagnosis, base.information, base.score, count * new, priors, hardest) > DECISIVE:
-            repeats = count
+        now = [pair for pair, gap in zip(pairs, gaps(count)) if gap > DECISIVE]
+        if len(now) > best:
+            best, apart, repeats = len(now), now, count
+        if best == len(pairs):
             break
-    apart = [_gap(diagnosis, base.information, base.score, max(repeats, 1) * new, priors, pair) for pair in pairs]
-    return float(min(gaps)), [pair for pair, gap in zip(pairs, apart) if gap > DECISIVE], repeats
+    return float(min(once)), apart, repeats
 
 
 def _shrinking(information: np.ndarray, new: np.ndarray, priors: Priors, vague: Sequence[int], active: Sequence[int]):
-    """Mean logarithm by which the deviations of effects shrink, and those that become identifiable."""
-    logs, shown = [], []
-    for j in vague:
-        deviation = priors.deviation([*active, j])
-        before, after = (np.sqrt(covariance(i, deviation)[j, j]) for i in (information, information + new))
-        logs.append(np.log(before / after))
-        if after < 0.5 * priors.slab[j]:
-            shown.append((j,))
-    return float(np.mean(logs)) if logs else 0.0, shown
+    """Mean logarithm by which the deviations of effects shrink, those that can then be named, and the number of flights."""
+
+    def deviations(total: np.ndarray) -> np.ndarray:
+        return np.array([np.sqrt(covariance(total, priors.deviation([*active, j]))[j, j]) for j in vague])
+
+    if not vague:
+        return 0.0, [], 0
+    before, once = deviations(information), deviations(information + new)
+    able = np.array([priors.slab[j] for j in vague]) * NAMEABLE
+    best, shown, repeats = 0, [], 0
+    for count in range(1, MOST_REPEATS + 1):
+        after = deviations(information + count * new)
+        now = [(j,) for j, shows in zip(vague, (after < able) & (able < before)) if shows]
+        if len(now) > best:
+            best, shown, repeats = len(now), now, count
+        if best == len(vague):
+            break
+    return float(np.mean(np.log(before / once))), shown, repeats
 
 
 def write_references(folder: str | Path, manoeuvres: Sequence[Manoeuvre], proposals: Sequence[Proposal]) -> list[Proposal]:
@@ -159,6 +219,9 @@ def write_references(folder: str | Path, manoeuvres: Sequence[Manoeuvre], propos
 
     by_name, told = {m.name: m for m in manoeuvres}, []
     for p in proposals:
+        if p.name not in by_name:  # measured on the ground
+            told.append(p)
+            continue
         name = "".join(c if c.isalnum() else "_" for c in p.name) + ".csv"
         atomic_write(Path(folder) / name, by_name[p.name].reference().csv())
         told.append(replace(p, reference=name))

@@ -13,10 +13,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
         "examples:\n"
         "  visthrow diagnose plan monday/*.npz                                the next flight after these\n"
+        "  visthrow diagnose plan monday/*.npz --about ground_effect          what would show this effect\n"
         "  visthrow diagnose plan monday/*.npz --manoeuvres hover,circle      choose among some\n"
     )
     shared(parser)
     parser.add_argument("--manoeuvres", metavar="NAMES", help="choose among these, by commas; default all")
+    parser.add_argument("--about", metavar="NAMES", default="", help="plan for these effects, by commas; default: all unclear ones")
     parser.add_argument("--out", default=DEFAULT_OUT, metavar="FOLDER", help=f"of references and JSON (default: {DEFAULT_OUT})")
 
 
@@ -46,13 +48,14 @@ def run(args: argparse.Namespace) -> int:
     if diagnosis.work is None:
         raise DiagnoseError(f"{diagnosis.overall}: {'; '.join(diagnosis.reasons)}")
     flights = [known[name] for name in chosen]
-    ranked = plan.propose(diagnosis, flights, simulator_of(model, diagnosis, seed=args.seed))
+    about = tuple(name for name in args.about.split(",") if name)
+    ranked = plan.propose(diagnosis, flights, simulator_of(model, diagnosis, seed=args.seed), about)
     ranked = plan.write_references(args.out, flights, ranked)
-    print(f"{'manoeuvre':28} {'seconds':>7} {'nats':>8} {'flights':>7}  separates")
+    print(f"{'manoeuvre or measurement':28} {'seconds':>7} {'nats':>8} {'times':>7}  separates")
     for p in ranked:
         told = "; ".join(" from ".join(group) for group in p.separates) or "-"
         print(f"{p.name:28} {p.seconds:7.1f} {p.nats:8.1f} {p.repeats or '-':>7}  {told}")
-    value = {"overall": diagnosis.overall, "proposals": [dataclasses.asdict(p) for p in ranked]}
+    value = report.to_json(diagnosis, extra={"proposals": [dataclasses.asdict(p) for p in ranked]})
     write_json(Path(args.out) / "plan.json", value)
     print(f"references as CSV: {args.out}")
     if args.json:
