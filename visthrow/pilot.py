@@ -23,6 +23,9 @@ from visthrow.hover import GRAVITY
 from visthrow.policy import Policy
 from visthrow.traced import Traced
 
+VIEWS = {"pos_w": 3, "quat_wb": 4, "vel_w": 3, "rate_b": 3, "payload_w": 3, "goal_w": 3, "attached": 1}
+"""What one step is shown, and the width of each: the columns of one array."""
+
 
 @dataclass(frozen=True)
 class PilotOutput:
@@ -97,8 +100,9 @@ class Pilot:
             policy.require({"camera": camera_conditions(camera_params)}, sections={"camera"})
         self.policy, self.count = policy, count
         self.camera = None if camera_params is None else KeypointCamera(camera_params)
-        self._look_given = Traced(self._frame_given)
-        self._look, self._observe, self._decide = Traced(self._frame), Traced(self._assemble), Traced(self._decision)
+        self._views = np.zeros((count, sum(VIEWS.values())), dtype=np.float32)
+        self._observe, self._observe_given = Traced(self._observed), Traced(self._observed)
+        self._decide, self._later = Traced(self._decision), torch.zeros(count, dtype=torch.bool)
         self.spent = (0.0, 0.0)
         self._first = torch.tensor([act.hover_action(GRAVITY * mass, self._max_thrust)], dtype=torch.float32)
         self.start()
@@ -143,60 +147,69 @@ class Pilot:
             ValueError: An array of another shape.
         """
         begin = time.perf_counter()
-        goal_w = np.broadcast_to(np.asarray(goal_w), (self.count, 3))
-        views = [self._tensor(*view) for view in (
-            ("pos_w", pos_w, 3), ("quat_wb", quat_wb, 4), ("vel_w", vel_w, 3), ("rate_b", rate_b, 3),
-            ("payload_w", payload_w, 3), ("goal_w", goal_w, 3),
-        )]  # fmt: skip
-        hangs = torch.from_numpy(np.broadcast_to(np.asarray(attached), (self.count,)).astype(np.float32))
+        goal_w, attached = np.asarray(goal_w).reshape(-1, 3), np.asarray(attached).reshape(-1, 1)
+        views = self._measured(pos_w, quat_wb, vel_w, rate_b, payload_w, goal_w, attached)
+        carried = (self._previous, self._history, self._fresh)
+        if self.layout.motion:
+            carried += (self._goal_fit, torch.full((self.count,), self._steps * self.period))
         if keypoints is None:
-            frame, *seen = self._look(*views)
+            observation, *rest = self._observe(views, *carried)
         else:
-            frame, *seen = self._look_given(*views, *(torch.from_numpy(np.array(given)) for given in keypoints))
-        points, valid = seen or (None, None)
-        further = [t for t in (valid, self._goal_velocity(frame, valid)) if t is not None]
-        observation, self._history = self._observe(
-            frame, self._previous, hangs, self._history, self._fresh, *further
-        )
+            given = (torch.from_numpy(np.array(part)) for part in keypoints)
+            observation, *rest = self._observe_given(views, *carried, *given)
+        self._history, self._goal_fit, *seen = rest if self.layout.motion else (rest[0], self._goal_fit, *rest[1:])
         decided = time.perf_counter()
         action, command, release = self._decide(observation)
-        self._previous, self._fresh = action, torch.zeros_like(self._fresh)
-        out = PilotOutput(
-            action.numpy(),
-            command.numpy(),
-            release.numpy(),
-            observation.numpy(),
-            None if points is None else points.numpy(),
-            None if valid is None else valid.numpy(),
-        )
+        self._previous, self._fresh, self._steps = action, self._later, self._steps + 1
+        points, valid = (part.numpy() for part in seen) if seen else (None, None)
+        out = PilotOutput(action.numpy(), command.numpy(), release.numpy(), observation.numpy(), points, valid)
         self.spent = (decided - begin, time.perf_counter() - decided)
         return out
 
-    def _frame(
-        self, pos: Tensor, quat: Tensor, vel: Tensor, rate: Tensor, payload: Tensor, goal: Tensor
+    def _measured(self, *views: np.ndarray | bool) -> Tensor:
+        """The measurements of one step side by side, shape (E, 20): the columns of :data:`VIEWS`.
+
+        Raises:
+            ValueError: one of another shape.
+        """
+        at = 0
+        for (name, width), value in zip(VIEWS.items(), views):
+            array = np.asarray(value)
+            shared = array.shape == (1, width) and name in ("goal_w", "attached")
+            if array.shape != (self.count, width) and not shared:
+                raise ValueError(f"{name} has shape {array.shape}; expected ({self.count}, {width})")
+            self._views[:, at : at + width] = array
+            at += width
+        return torch.from_numpy(self._views)
+
+    def _observed(
+        self, views: Tensor, previous: Tensor, history: Tensor, fresh: Tensor, *further: Tensor
     ) -> tuple[Tensor, ...]:
-        """Frame of the measurements, shape (E, layout.frame), and with a camera keypoints and their validity."""
-        rot = ob.rotation_from_quat(quat)
-        seen = () if self.camera is None else ob.vision_part(self.camera, pos, rot, goal, payload)
-        part = seen[0].flatten(1) if self.layout.name == "vision" else ob.state_part(pos, goal, payload)
-        return torch.cat([ob.vehicle_part(pos, vel, rate, rot), part], dim=-1), *seen
+        """Assemble the observation, shape (E, D).
 
-    def _frame_given(
-        self, pos: Tensor, quat: Tensor, vel: Tensor, rate: Tensor, payload: Tensor, goal: Tensor, points: Tensor,
-        valid: Tensor,
-    ) -> tuple[Tensor, ...]:  # fmt: skip
-        """As `_frame`, with keypoints that were seen and not projected."""
-        rot = ob.rotation_from_quat(quat)
+        Args:
+            views: shape (E, 20). previous, history, fresh: see `visthrow.observations.observe`.
+            further: sums of the goal's fit and time [s], where the layout has its velocity; then keypoints and validity that
+                a detector saw, else what the camera sees of goal and payload is computed, where there is one.
+
+        Returns:
+            Observation, new history, new sums of the goal's fit, keypoints and validity; the latter where there are any.
+        """
+        pos, quat, vel, rate, payload, goal, attached = views.split(list(VIEWS.values()), -1)
+        rot, moving = ob.rotation_from_quat(quat), 2 if self.layout.motion else 0
+        seen = further[moving:]
+        if not seen and self.camera is not None:
+            seen = ob.vision_part(self.camera, pos, rot, goal, payload)
+        points, valid = seen or (None, None)
         part = points.flatten(1) if self.layout.name == "vision" else ob.state_part(pos, goal, payload)
-        return torch.cat([ob.vehicle_part(pos, vel, rate, rot), part], dim=-1), points, valid
-
-    def _assemble(
-        self, frame: Tensor, previous: Tensor, hangs: Tensor, history: Tensor, fresh: Tensor, *further: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """See `visthrow.observations.observe`; ``further`` are validity and goal velocity, where there are any."""
-        valid = further[0] if self.camera is not None else None
-        motion = further[-1] if self.layout.motion else None
-        return ob.observe(self.layout, frame, valid, previous, hangs, history, fresh, motion)
+        frame = torch.cat([ob.vehicle_part(pos, vel, rate, rot), part], dim=-1)
+        sums, velocity = (), None
+        if moving:
+            place, weight = goal_motion.measured_goal(self.layout, frame, valid, self.camera)
+            fitted, velocity = goal_motion.fit(*further[:2], place, weight, fresh)
+            sums = (fitted,)
+        observation, history = ob.observe(self.layout, frame, valid, previous, attached[:, 0], history, fresh, velocity)
+        return observation, history, *sums, *seen
 
     def _decision(self, observation: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Clipped action, command and whether a release is asked for."""
@@ -204,16 +217,6 @@ class Pilot:
         action = act.clip_action(raw)
         command = act.command_from_action(action, self._max_thrust, self._max_rate)
         return action, command, act.release_asked(raw, self._threshold)
-
-    def _goal_velocity(self, frame: Tensor, valid: Tensor | None) -> Tensor | None:
-        """Fit of the goal's velocity [m/s], shape (E, 2), with this step's frame; None where the layout has none."""
-        if not self.layout.motion:
-            return None
-        place, weight = goal_motion.measured_goal(self.layout, frame, valid, self.camera)
-        time = torch.full((self.count,), self._steps * self.period)
-        self._steps += 1
-        self._goal_fit, velocity = goal_motion.fit(self._goal_fit, time, place, weight, self._fresh)
-        return velocity
 
     @torch.inference_mode()
     def see(

@@ -1,7 +1,8 @@
 """A chain of small tensor operations without Python between them: the same operations, so the same bits. Onboard-safe.
 
 A batch of one costs some 100 operations of a few microseconds each, and Python as much again. The first call records the
-operations that a function makes (``torch.jit.trace``); later calls run the record. Nothing is fused or reordered on the CPU.
+operations that a function makes (``torch.jit.trace``) and takes what is constant out of the record (``torch.jit.freeze``);
+later calls run the record. Nothing is fused or reordered on the CPU.
 """
 
 import warnings
@@ -30,10 +31,14 @@ class Traced:
     def _recorded(self, tensors: tuple[Any, ...]) -> Callable[..., Any]:
         import torch
 
+        class Recorded(torch.nn.Module):
+            def forward(module, *given: Any) -> Any:
+                return self.plain(*given)
+
         with warnings.catch_warnings():
             # The shape of the input is asked for in checks of it, and the whole facility is called old.
             warnings.simplefilter("ignore")
             try:
-                return torch.jit.trace(self.plain, tensors, check_trace=False)
+                return torch.jit.freeze(torch.jit.trace(Recorded().eval(), tensors, check_trace=False))
             except (AttributeError, RuntimeError, NotImplementedError):
                 return self.plain
