@@ -1,7 +1,7 @@
 """``visthrow bench hil``: the runner against the fake autopilot, each in its own process, over loopback in real time.
 
 Latency and soak by default: times of each stage, ticks missed, memory. With ``--throws`` a series of throws, each paired with
-the same one flown without a wire. With ``--faults`` what the runner does when motion capture fails, and after how long.
+the same one flown without a wire. With ``--faults`` what the runner does when something fails, and after how long.
 """
 
 import argparse
@@ -35,7 +35,7 @@ def run(args: argparse.Namespace) -> int:
         from visthrow.bench.hil_throws import series
 
         return finish(series(args), args)
-    if args.faults:
+    if args.faults is not None:
         from visthrow.bench.hil_faults import faults
 
         return finish(faults(args), args)

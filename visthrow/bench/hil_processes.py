@@ -61,15 +61,18 @@ class Pair:
     core: int | None = None
     fake_core: int | None = None
 
-    def fly(self, folder: Path, watch: Callable[[int], None] | None = None) -> tuple[dict[str, Any], dict[str, Any]]:
+    def fly(
+        self, folder: Path, watch: Callable[[int], None] | None = None, alone: bool = False
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
         """Start both, wait until the fake is done, end the run.
 
         Args:
             folder: of the run; not there yet.
             watch: called twice a second with the run's process id.
+            alone: the fake flies on to its end where the run has ended, or was killed, before.
 
         Returns:
-            The run's summary and the fake's report.
+            The run's summary, empty where it was killed, and the fake's report.
 
         Raises:
             VisthrowError: one of them did not start, or did not end; the message holds what it said.
@@ -82,10 +85,10 @@ class Pair:
         with self._started(run, self.core) as runner:
             said = _first_line(runner)
             with self._started(fake, self.fake_core) as other:
-                _until(other, watch, runner)
-            _end(runner, said)
+                _until(other, watch, runner, alone)
+            killed = _end(runner, said, alone)
         try:
-            summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+            summary = {} if killed else json.loads((folder / "summary.json").read_text(encoding="utf-8"))
             return summary, json.loads(report.read_text(encoding="utf-8"))
         except (OSError, ValueError) as error:
             raise VisthrowError(f"a process of the pair ended without its report: {error}") from error
@@ -115,11 +118,12 @@ def _first_line(process: subprocess.Popen) -> str:
     return line
 
 
-def _until(fake: subprocess.Popen, watch: Callable[[int], None] | None, runner: subprocess.Popen) -> None:
+def _until(fake: subprocess.Popen, watch: Callable[[int], None] | None, runner: subprocess.Popen, alone: bool) -> None:
     while fake.poll() is None:
-        if runner.poll() is not None:
+        gone = runner.poll() is not None
+        if gone and not alone:
             return
-        if watch is not None:
+        if watch is not None and not gone:
             watch(runner.pid)
         with contextlib.suppress(subprocess.TimeoutExpired):
             fake.wait(0.5)
@@ -127,17 +131,21 @@ def _until(fake: subprocess.Popen, watch: Callable[[int], None] | None, runner: 
         raise VisthrowError(f"the fake failed: {fake.stderr.read()}")
 
 
-def _end(runner: subprocess.Popen, said: str) -> None:
-    """The fake is gone; what is still flying is told to stop."""
+def _end(runner: subprocess.Popen, said: str, alone: bool) -> bool:
+    """The fake is gone; what is still flying is told to stop. Whether the run had been killed, which it may where it was left
+    alone."""
     if runner.poll() is None:
         runner.send_signal(signal.SIGINT)
     try:
         _, text = runner.communicate(timeout=ENDED)
     except subprocess.TimeoutExpired as error:
         raise VisthrowError(f"the run did not end within {ENDED:g} s after it was told to: {said}") from error
+    if alone and runner.returncode == -signal.SIGKILL:
+        return True
     # 1: aborted, as it was told; interrupted: it had just ended by itself as the signal came. Its summary tells the rest.
     if runner.returncode not in (0, 1, EXIT_INTERRUPTED, -signal.SIGINT):
         raise VisthrowError(f"the run failed with status {runner.returncode}: {text}")
+    return False
 
 
 class Memory:
