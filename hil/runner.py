@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from hil.backends.base import FAILED, FOLLOW, LAND, Backend, Status
+from hil.backends.base import FAILED, FOLLOW, LAND, PENDING, Backend, Status
 from hil.backends.base import HOLD as HELD
 from hil.decision import Decision, Words
 from hil.gate import HOLD, Tether
@@ -277,7 +277,9 @@ class Runner:
             tuple(checks),
             # While landing the fence's floor is left on purpose.
             fence_broken(p.fence, vehicle, hanging) if vehicle is not None and state is not State.LAND else None,
-            vehicle is not None and state in (State.ARMED, State.RECOVER) and self._still(vehicle, payload, status.mode == HELD),
+            # What has not been answered is not over: the payload may yet come off.
+            vehicle is not None and state in (State.ARMED, State.RECOVER) and status.release != PENDING
+            and self._still(vehicle, payload, status.mode == HELD),
             self.latch.separated(now),
             self.latch.at is not None,
             vehicle is not None and vehicle.pos[2] < GROUND,
