@@ -132,19 +132,23 @@ def serve(
     Returns:
         The report, with the number of periods that took longer than real time has.
     """
-    start, begun, late = clock.now(), fake.plant.time, 0
-    # Where the machine is late the vehicle's clock is as late as the vehicle.
-    fake.wall = lambda: (
-        fake.plant.time - min(max(start + fake.plant.time - begun - clock.now(), 0.0), fake.plant.period)
-    )
+    start, begun, late = clock.now() - fake.plant.time, fake.plant.time, 0
+
+    def wall() -> float:
+        # Where the machine is late the vehicle's clock is as late as the vehicle.
+        return fake.plant.time + min(max(clock.now() - start - fake.plant.time, 0.0), fake.plant.period)
+
+    fake.wall, fake.question_lag = wall, 0.0
     with contextlib.suppress(KeyboardInterrupt):
         while fake.plant.time - begun < most:
-            fake.fly()
-            due = start + (fake.plant.time - begun)
+            time = fake.plant.time + fake.plant.period
+            due = start + time
             late += clock.now() > due
-            while clock.now() < due:  # what comes meanwhile is heard when it comes
-                clock.wait_for(fake.link.port, due)
-                fake.link.pump(fake.wall)
+            while clock.now() < due:  # what comes meanwhile acts from when it comes
+                clock.wait_for(fake.port, due)
+                fake.hear()
+            fake.deliver(time)  # poses leave before a period is worked out
+            fake.fly()
             fake.emit()
             landed = fake.plant.landing["landing_time"]
             if landed is not None and fake.plant.time > landed + after:

@@ -153,6 +153,12 @@ class HybridPlant:
                     self._ropes[e].fly(self.period - inside)
         self.time += self.period
 
+    def postpone(self, time: float) -> None:
+        """Let payloads that are latched and still hang separate so much later [s]: the latch tripped within the last period."""
+        timer = self._sim.get("release_timer")
+        waits = self._latched & (self._sim.get("attached") != 0) & (timer >= 0.0)
+        self._sim.state.release_timer.assign(np.where(waits, timer + time, timer).astype(timer.dtype))
+
     def _disturbed(self, command: np.ndarray) -> np.ndarray:
         """Commands with the training's noise, which is on their normalised form."""
         import torch

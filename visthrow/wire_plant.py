@@ -46,9 +46,18 @@ class WirePlant:
         rng = np.random.default_rng(seed)
         self._plant.reset(self.home_w + 0.1 * rng.uniform(-1, 1, (1, 3)), random_ropes(rng, 1, rope.segments, 0.05))
 
-    def step(self, command: np.ndarray, release: bool) -> None:
-        """Advance by one period under collective thrust [N] and body rates [rad/s], shape (4,)."""
+    def step(self, command: np.ndarray, release: bool, after: float = 0.0) -> None:
+        """Advance by one period under collective thrust [N] and body rates [rad/s], shape (4,).
+
+        Args:
+            command: see above.
+            release: whether the latch trips in this period, or has before.
+            after: from the period's beginning to that [s].
+        """
+        first = release and not self._plant.state.latched[0]
         self._plant.step(np.asarray(command)[None], np.array([release]))
+        if first and after > 0.0:
+            self._plant.postpone(after)
 
     @property
     def time(self) -> float:

@@ -53,7 +53,8 @@ class FakeArduPilot(FakeMavlink):
             return mav.MAV_RESULT_FAILED
         if mode != self.mode:
             self.happened(f"mode {mode}")
-            self.mode, self._place, self._target = mode, self.plant.state["pos_w"].astype(float), None
+            self.mode, self._place = mode, self.plant.state["pos_w"].astype(float)
+            self.forget()
             self._hover.reset()
         return mav.MAV_RESULT_ACCEPTED
 

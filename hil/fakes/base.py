@@ -1,6 +1,7 @@
 """What all fakes share: plant, motion capture on the wire, a queue of things that take their time, a hold of their own."""
 
 import heapq
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
@@ -12,7 +13,7 @@ from hil.fakes.witness import Witness
 from hil.frames import FrameParams, Frames
 from hil.link import Link
 from hil.mavlink import mav
-from hil.mocap import Mocap, MocapParams
+from hil.mocap import SLACK, Mocap, MocapParams
 from hil.mocap_faults import MocapFault
 from hil.pose import PAYLOAD, Pose
 from visthrow.hover import GRAVITY, HoverController, HoverParams
@@ -41,8 +42,8 @@ class WirePlant(Protocol):
     mass: tuple[float, float]
     max_thrust: float
 
-    def step(self, command: np.ndarray, release: bool) -> None:
-        """Advance one period under collective thrust [N] and body rates [rad/s]."""
+    def step(self, command: np.ndarray, release: bool, after: float = 0.0) -> None:
+        """Advance one period under collective thrust [N] and body rates [rad/s]; the first release trips so long into it [s]."""
 
     @property
     def state(self) -> dict[str, np.ndarray]:
@@ -90,8 +91,9 @@ class Fake:
     """The vehicle and the motion capture of both bodies; the children add an autopilot's protocol.
 
     Attributes:
-        last_thrust: of the last period [N]. wall: the time now, between two periods as well [s]. events: times and what happened.
-        witness: of what came. followed, ignored: set-points. release_time: when the mechanism's output moved.
+        last_thrust: of the last period [N]. wall: the time now, within a period as well [s]. events: times and what happened.
+        port: that commands come by. witness: of what came.
+        followed, ignored: set-points. release_time: when the mechanism's output moved.
     """
 
     thrust_map: ThrustParams
@@ -112,6 +114,7 @@ class Fake:
             options: see `Options`.
         """
         self.plant, self.link, self.options = plant, link, options or Options()
+        self.port: Any = link.port
         self.mocap = Mocap(mocap or MocapParams(), seed)
         self.mocap_fault = MocapFault(self.options.mocap_fault, self.options.fault_time, seed)
         self.witness = Witness((plant.max_thrust, *MAX_RATES))
@@ -121,17 +124,21 @@ class Fake:
         self._hover = HoverController(HoverParams(max_thrust=plant.max_thrust), plant.period)
         self._payload_sender = mav.MAVLink(None, *PAYLOAD_ID)
         self._later: list[tuple[float, int, Callable[[], None]]] = []
+        self._coming: deque[tuple[float, np.ndarray]] = deque()  # set-points, and from when on they act [s]
         self._count = 0
         self.armed = self.options.armed
         self._place = np.array(plant.home_w, dtype=float)
-        self._target: np.ndarray | None = None
+        self._acting: np.ndarray | None = None  # newest set-point that acts
+        self._target: np.ndarray | None = None  # mean of those that act in this period
         self._told = float("-inf")  # when the last set-point was followed [s]
-        self._open = False
+        self._trip: float | None = None  # when the latch of the plant trips [s]
         self.followed = self.ignored = 0
         self.release_time: float | None = None
         self.last_thrust = 0.0
-        # In lock step what is heard in a period came in the middle of it.
-        self.wall: Callable[[], float] = lambda: self.plant.time + 0.5 * self.plant.period
+        self.wall: Callable[[], float] = lambda: self.plant.time
+        self.heard = 0.0  # when the message that is being taken came [s]
+        # In lock step an answer is heard a period after its question: this makes the question come in the middle [s].
+        self.question_lag = 0.5 * plant.period
         self.events: list[tuple[float, str]] = []
         self._going_on: dict[str, float] = {}
         self.taken = False
@@ -161,28 +168,36 @@ class Fake:
         return self.plant.time >= self.options.silent_after
 
     def steer(self, command: tuple[float, ...]) -> None:
-        """Follow a set-point, thrust [N] and body rates [rad/s], from now on; a number that is none is 0 and the vehicle falls."""
+        """Follow a set-point that was just heard, thrust [N] and body rates [rad/s]; a number that is none is 0, and it falls."""
         self.followed += 1
         self._told = self.plant.time
-        target = np.nan_to_num(np.array(command))
-
-        def follow() -> None:
-            self._target = target
-
         delay = self.options.command_delay
-        self.later(self.usual_delay if delay is None else delay, follow)
+        self._coming.append((self.heard + (self.usual_delay if delay is None else delay), np.nan_to_num(np.array(command))))
+
+    def forget(self) -> None:
+        """Who flies from now on follows no set-point that came before."""
+        self._acting = self._target = None
+        self._coming.clear()
+
+    def _follow(self) -> None:
+        """Find what is to be flown in the period that begins: set-points that change within it count by their shares of it."""
+        begin, period = self.plant.time, self.plant.period
+        mean, since = np.zeros(4), begin
+        while self._coming and self._coming[0][0] < begin + period - SLACK:
+            when, target = self._coming.popleft()
+            if self._acting is not None:
+                mean += (max(when, begin) - since) / period * self._acting
+                since = max(when, begin)
+            self._acting = target
+        if self._acting is not None:
+            self._target = mean + (begin + period - since) / period * self._acting
 
     def open_mechanism(self) -> None:
         """The output moves, and what hangs on it lets go some time later; with "accepted" alone."""
         if self.options.answer not in ("accepted",) or self.release_time is not None:
             return
-        self.release_time = self.plant.time + self.options.servo_delay
-
-        def trip() -> None:
-            self._open = True
-
-        # The plant takes a release at the beginning of a period: the nearest one.
-        self.later(self.options.servo_delay + self.options.mechanism - 0.5 * self.plant.period, trip)
+        self.release_time = self.heard + self.options.servo_delay
+        self._trip = self.release_time + self.options.mechanism
 
     @property
     def moved(self) -> bool:
@@ -223,17 +238,28 @@ class Fake:
         """Say what is due: heartbeats, streams."""
         raise NotImplementedError
 
+    def hear(self) -> None:
+        """Take in what has come."""
+        self.link.pump(self.wall)
+
+    def deliver(self, time: float) -> None:
+        """Do what was put off until a time [s]."""
+        while self._later and self._later[0][0] <= time + SLACK:
+            heapq.heappop(self._later)[2]()
+
     def fly(self) -> None:
         """Hear what has come, and fly one period."""
-        self.link.pump(lambda: self.plant.time)
-        while self._later and self._later[0][0] <= self.plant.time + 1e-9:
-            heapq.heappop(self._later)[2]()
+        self.hear()
+        self.deliver(self.plant.time)
         if not self.taken and self.plant.time >= self.options.taken_after:
             self.taken = True
             self.take()
+        self._follow()
         command = self.flown()
         self.last_thrust = command[0]
-        self.plant.step(command, self._open)
+        after = 0.0 if self._trip is None else self._trip - self.plant.time
+        opens = self._trip is not None and after < self.plant.period - SLACK
+        self.plant.step(command, opens, max(after, 0.0) if opens else 0.0)
 
     def emit(self) -> None:
         """Measure and send what is due now."""
@@ -241,8 +267,7 @@ class Fake:
             written = [self._to_source(pose) for pose in self.mocap.measure(self.plant.time, self.plant.state)]
             for pose in self.mocap_fault.spoil(written, self.plant.time):
                 self._post(pose)
-        while self._later and self._later[0][0] <= self.plant.time + 1e-9:
-            heapq.heappop(self._later)[2]()
+        self.deliver(self.plant.time)
         if not self.silent:
             self.speak()
 

@@ -70,16 +70,17 @@ class FakeBetaflight(Fake):
         three = ([int(p[f"{axis}_{what}"]) for axis in axes] for what in ("rc_rate", "rate", "expo"))
         self._sticks = Sticks(RatesParams(kinds[int(p["rates_type"])], *map(tuple, three)))
 
-    def fly(self) -> None:
+    def hear(self) -> None:
         """See `Fake`."""
         for _ in range(MOST_CHUNKS):
             data = None if self.port is None else self.port.read()
             if data is None:
                 break
+            self.heard = self.wall()
             for frame in self.parser.parse(data):
                 if frame.direction == msp.TO_CONTROLLER and not self.silent:
                     self._hear(frame)
-        super().fly()
+        super().hear()
 
     def _hear(self, frame: msp.Frame) -> None:
         answers: dict[int, Callable[[], bytes]] = {

@@ -33,11 +33,11 @@ class LevelPlant:
         self.released: float | None = None
         self.commands: deque[tuple[float, ...]] = deque(maxlen=MOST_KEPT)
 
-    def step(self, command: np.ndarray, release: bool) -> None:
+    def step(self, command: np.ndarray, release: bool, after: float = 0.0) -> None:
         """See `WirePlant`."""
         self.commands.append(tuple(command))
         if release and self.released is None:
-            self.released = self.time
+            self.released = self.time + after
         self.time += self.period
 
     @property

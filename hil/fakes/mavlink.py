@@ -37,7 +37,7 @@ class FakeMavlink(Fake):
         link.listen(self._hear)
 
     def _hear(self, message: Any, arrival: float) -> None:
-        kind = message.get_type()
+        kind, self.heard = message.get_type(), arrival
         if self.silent:
             return
         if kind == "SET_ATTITUDE_TARGET":
@@ -45,7 +45,7 @@ class FakeMavlink(Fake):
         elif kind == "COMMAND_LONG" and message.target_system == VEHICLE_ID[0]:
             self._command(message)
         elif kind == "TIMESYNC" and message.tc1 == 0:
-            now = self.wall() + self.options.clock_offset
+            now = arrival + self.question_lag + self.options.clock_offset
             answer = mav.MAVLink_timesync_message(int(now * 1e9), message.ts1)
             self.say(answer, self.options.timesync_delay)
         elif kind == "PARAM_REQUEST_READ" and message.target_system == VEHICLE_ID[0]:

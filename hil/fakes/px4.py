@@ -71,7 +71,8 @@ class FakePx4(FakeMavlink):
             return mav.MAV_RESULT_TEMPORARILY_REJECTED
         if mode != self.mode:
             self.happened(f"mode {mode >> 16 & 255}.{mode >> 24}")
-            self.mode, self._place, self._target = mode, self.plant.state["pos_w"].astype(float), None
+            self.mode, self._place = mode, self.plant.state["pos_w"].astype(float)
+            self.forget()
             self._hover.reset()
         return mav.MAV_RESULT_ACCEPTED
 

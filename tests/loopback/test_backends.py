@@ -329,7 +329,7 @@ def test_two_throws_with_the_autopilots_own_hold_between_them():
 
         def words(self, state):
             if state == "ready" and plant.released is not None:
-                plant.released, fake._open, fake.release_time = None, False, None
+                plant.released, fake._trip, fake.release_time = None, None, None
                 fake.witness._answered = False
             return Words(arm=state == "ready")
 

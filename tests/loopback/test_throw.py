@@ -52,6 +52,18 @@ def test_throws_in_lock_step(policy):
     assert np.mean(errors) < LANDING
 
 
+@pytest.mark.parametrize("after", [0.0, 0.0017, 0.0049])
+def test_the_plant_lets_go_at_the_instant_that_it_is_told(after):
+    plant = make("state", 0)
+    level = np.array([9.81 * plant.mass[0], 0.0, 0.0, 0.0])
+    for _ in range(4):
+        plant.step(level, False)
+    tripped = plant.time + after
+    for _ in range(30):
+        plant.step(level, True, after)
+    assert plant.landing["separation_time"] == pytest.approx(tripped + 0.11, abs=1e-5)
+
+
 def free_port() -> int:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
