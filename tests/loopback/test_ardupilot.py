@@ -122,21 +122,17 @@ def test_an_abort_asks_for_the_mode_until_it_is_there():
     assert link.sent <= 6, "asked at most every 0.1 s"
 
 
-@pytest.mark.parametrize("answer", ["in-progress", "denied", "silent", "stuck"])
-def test_a_release_that_does_not_happen_ends_the_throw_without_a_second_one(answer):
+def test_a_payload_that_stayed_on_is_seen_in_its_own_poses():
     plant = LevelPlant()
-    summary, _, told = throw(plant, answer=answer, loaded=AT_ONCE, seconds=9.0)
-    assert (summary["latches"], summary["landings"]) == (1, [])
-    assert summary["stuck"] == 1, "seen in the payload's own poses"
+    summary, _, told = throw(plant, answer="stuck", loaded=AT_ONCE, seconds=5.0)
+    assert (summary["latches"], summary["landings"], summary["stuck"]) == (1, [], 1)
     assert plant.released is None
-    assert all(np.isfinite(plant.commands).ravel())
-    if answer == "denied":
-        assert ("abort", "the release was refused or not answered") in [(d.state, d.reason) for d in told]
+    assert ("abort", "the release was refused or not answered") in [(d.state, d.reason) for d in told]
 
 
 def test_a_throw_with_a_plain_plant_releases_in_time():
     plant = LevelPlant()
-    summary, fake, _ = throw(plant, loaded=AT_ONCE, seconds=9.0)
+    summary, fake, _ = throw(plant, loaded=AT_ONCE, seconds=5.0)
     assert (fake.witness.releases, summary["latches"], len(summary["landings"])) == (1, 1, 1)
     (latch,) = summary["latch_times"]
     assert abs(plant.released - latch) <= 5e-3, "latch to separation is the trained lag within 5 ms"
