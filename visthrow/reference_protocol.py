@@ -246,14 +246,16 @@ def _camera_of(loaded: Loaded):
     return loaded.experiment.camera if loaded.policy.contract["observation"]["layout"] == "vision" else None
 
 
-def plan(policies: int, targets: Sequence[float], throws: int, seed: int, together: bool = False) -> list[Job]:
+def plan(
+    policies: int, targets: Sequence[float], throws: int, seed: int, together: bool = False, size: int = BATCH
+) -> list[Job]:
     """Cut throws of each policy at each target into batches, with all policies in one batch or each in its own."""
     groups = [tuple(range(policies))] if together else [(i,) for i in range(policies)]
     return [
-        Job(group, target, batch, min(BATCH, throws - batch * BATCH), seed)
+        Job(group, target, batch, min(size, throws - batch * size), seed)
         for target in targets
         for group in groups
-        for batch in range(math.ceil(throws / BATCH))
+        for batch in range(math.ceil(throws / size))
     ]
 
 
@@ -273,6 +275,7 @@ class Throwing:
         seed: int,
         processes: int | None = None,
         together: bool = False,
+        size: int = BATCH,
     ) -> None:
         """Start.
 
@@ -284,6 +287,7 @@ class Throwing:
             seed: of everything random.
             processes: default one a core, and no more than there are batches.
             together: fly all policies in one batch, which is cheaper for a few throws; they must share a plant.
+            size: throws of a policy in a batch; fewer are sooner done where there are more cores. Other sizes, other draws.
 
         Raises:
             ConfigError: policies of different plants that are to fly together.
@@ -292,7 +296,7 @@ class Throwing:
         importlib.import_module("mujoco")  # said here rather than by every worker
         if together and any(plant_of(item.experiment) != plant_of(loaded[0].experiment) for item in loaded):
             raise ConfigError("policies of different plants cannot fly in one batch")
-        self.jobs = plan(len(loaded), targets, throws, seed, together)
+        self.jobs = plan(len(loaded), targets, throws, seed, together, size)
         context = mp.get_context("spawn")
         self._progress = context.Array("d", len(self.jobs))
         policies = [pickle.dumps((item.name, _plain(item))) for item in loaded]

@@ -1,8 +1,9 @@
 """The loop closed: an effect hidden in the reference plant, flights, diagnosis, training in the extended model, flights again.
 
 Every stage leaves a file in the folder of its effect and is skipped where the file is there, so a loop that was interrupted
-goes on. Three policies meet on the same throws of the plant: the one that knew nothing, the one that was trained anew in the
-model extended by the diagnosis, and the oracle, trained in a model that has the hidden effect itself.
+goes on; stages that do not need each other run side by side. Three policies meet on the same throws of the plant: the one
+that knew nothing, the one that was trained anew in the model extended by the diagnosis, and the oracle, trained in a model
+that has the hidden effect itself.
 """
 
 import concurrent.futures
@@ -35,8 +36,14 @@ NOISE = {"pos_w": 5e-4, "quat_wb": np.radians(0.2), "payload_pos_w": 8e-4}
 BEFORE, AFTER = 1.5, 0.6
 """What is kept of a flight before the policy starts and after the landing [s]."""
 
+BATCH = 13
+"""Throws that share a process: 200 are 16 batches, which 16 cores fly at once."""
+
 THROW_SEED = 20_000
 """Of the throws that judge; the flights that are diagnosed have the seeds from 0."""
+
+POLICY, CHECKPOINT = "policy.npz", "checkpoint.pt"
+"""Of a training's folder, as :mod:`visthrow.train` names them; that one is heavy to import."""
 
 RECORD = "record.json"
 """What a finished loop leaves in its folder."""
@@ -56,7 +63,7 @@ class Loop:
         flights: to be diagnosed.
         throws: of each policy on the plant, in the end.
         target: of those throws, along x [m].
-        device: of the trainings.
+        device: of the trainings; where the diagnosis names nothing or fails, there is none after it, and "after" is "before".
         diagnose_on: device of the diagnosis.
         processes: for flights and throws.
         changes: ``key=value`` of the trainings, such as fewer iterations for a trial.
@@ -76,30 +83,41 @@ class Loop:
 
     def run(self, say: Callable[[str], None]) -> dict[str, Any]:
         """Go round, or on from where an earlier run stopped; returns the record."""
-        begin = time.perf_counter()
         nominal = config.load(Experiment, config.find("train", self.base))
         truth = extended(nominal, self.hidden)
         self.folder.mkdir(parents=True, exist_ok=True)
         self._config("hidden", truth)
-        oracle = self._train("oracle")
-        logs = self._flights(truth, say)
-        verdict = self._diagnose(logs, say)
-        theta = named(verdict)
-        say(f"named: {', '.join(f'{n} {v:.4g}' for n, v in theta.items()) or 'nothing'}")
-        self._config("extended", extended(nominal, theta))
-        anew = self._train("extended")
-        self._wait(oracle, "oracle", say)
-        self._wait(anew, "extended", say)
-        throws = {
-            name: self._throws(name, policy, say)
-            for name, policy in {
-                "before": self.policy,
-                "after": str(self.folder / "extended" / "policy.npz"),
-                "oracle": str(self.folder / "oracle" / "policy.npz"),
-            }.items()
-        }
+        begin, seconds = time.perf_counter(), {}
+
+        def told(line: str) -> None:
+            say(f"{time.perf_counter() - begin:4.0f} s: {line}")
+
+        def timed(name: str, stage: Callable[..., Any], *args: Any) -> Any:
+            start = time.perf_counter()
+            result = stage(*args, told)
+            seconds[name] = round(time.perf_counter() - start, 1)
+            return result
+
+        def oracle() -> dict[str, Any]:
+            timed("training of the oracle", self._train, "oracle")
+            return timed("throws of the oracle", self._throws, "oracle", str(self.folder / "oracle" / POLICY))
+
+        with concurrent.futures.ThreadPoolExecutor(3) as stages:
+            knowing = stages.submit(oracle)
+            logs = timed("flights", self._flights, truth)
+            blind = stages.submit(timed, "throws before", self._throws, "before", self.policy)
+            verdict = timed("diagnosis", self._diagnose, logs)
+            theta = named(verdict)
+            told(f"named: {', '.join(f'{n} {v:.4g}' for n, v in theta.items()) or 'nothing'}")
+            throws = {"before": None, "after": None, "oracle": None}
+            if theta:
+                self._config("extended", extended(nominal, theta))
+                timed("training", self._train, "extended")
+                throws["after"] = timed("throws after", self._throws, "after", str(self.folder / "extended" / POLICY))
+            throws |= {"before": blind.result(), "oracle": knowing.result()}
+            throws["after"] = throws["after"] or throws["before"]
         record = {"hidden": dict(self.hidden), "named": theta, "overall": verdict["overall"], "target": self.target}
-        record |= {"flights": self.flights, "throws": throws, "seconds": round(time.perf_counter() - begin, 1)}
+        record |= {"flights": self.flights, "throws": throws, "seconds": seconds}
         record["recovered"] = recovered(throws)
         write_json(self.folder / RECORD, record)
         return record
@@ -108,26 +126,23 @@ class Loop:
         text = toml_text.dumps(config.to_dict(experiment, defaults=False))
         atomic_write(self.folder / f"{name}.toml", text)
 
-    def _train(self, name: str) -> subprocess.Popen | None:
-        """Begin a training beside what else is done; the oracle's model is the hidden one."""
-        if (self.folder / name / "policy.npz").exists():
-            return None
+    def _train(self, name: str, say: Callable[[str], None]) -> None:
+        """Train a policy in a process of its own; the oracle's model is the hidden one."""
+        if (self.folder / name / POLICY).exists():
+            return
         source = self.folder / ("hidden.toml" if name == "oracle" else f"{name}.toml")
         command = [sys.executable, "-m", "visthrow.cli", "train", str(source), "--out", str(self.folder / name)]
         command += ["--device", self.device, "--seed", "1"]
-        if (self.folder / name / "checkpoint.pt").exists():
+        if (self.folder / name / CHECKPOINT).exists():
             command.append("--resume")
         for change in self.changes:
             command += ["--set", change]
         with (self.folder / f"{name}.log").open("w") as log:
-            return subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT)
-
-    def _wait(self, process: subprocess.Popen | None, name: str, say: Callable[[str], None]) -> None:
-        if process is not None:
-            if process.wait() != 0:
-                tail = (self.folder / f"{name}.log").read_text()[-600:]
-                raise DiagnoseError(f"the training '{name}' failed: {tail}")
-            say(f"trained: {name}")
+            status = subprocess.run(command, stdout=log, stderr=subprocess.STDOUT, check=False).returncode
+        if status != 0:
+            tail = (self.folder / f"{name}.log").read_text()[-600:]
+            raise DiagnoseError(f"the training '{name}' failed: {tail}")
+        say(f"trained: {name}")
 
     def _flights(self, truth: Experiment, say: Callable[[str], None]) -> list[Path]:
         """Throws of the policy at targets all around, on the plant with the hidden effect."""
@@ -149,7 +164,8 @@ class Loop:
             command += ["--plant", self.base, "--no-report", "--device", self.diagnose_on, "--json", str(answer)]
             done = subprocess.run(command, capture_output=True, text=True, check=False)
             if done.returncode != 0 or not answer.exists():
-                raise DiagnoseError(f"the diagnosis failed: {(done.stdout + done.stderr)[-600:]}")
+                say(f"the diagnosis failed: {(done.stdout + done.stderr)[-600:]}")
+                return {"overall": "ERROR", "theta": {}}
         verdict = json.loads(answer.read_text())
         say(f"diagnosed: {verdict['overall']}")
         return verdict
@@ -161,7 +177,9 @@ class Loop:
         path = self.folder / f"throws_{name}.json"
         if not path.exists():
             loaded = [load_policy(policy, str(self.folder / "hidden.toml"), allow=CONTRACT)]
-            with Throwing(loaded, (self.target,), self.throws, PLANT, THROW_SEED, self.processes) as throwing:
+            with Throwing(
+                loaded, (self.target,), self.throws, PLANT, THROW_SEED, self.processes, size=BATCH
+            ) as throwing:
                 result = throwing.results(show=False)[0][0]
             kept = {"error": result.error, "success": result.success, "duration": result.duration}
             write_json(path, {k: np.asarray(v).tolist() for k, v in kept.items()})
