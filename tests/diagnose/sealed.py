@@ -57,6 +57,8 @@ CURVE = (
     "thrust_gain",
 )  # fmt: skip
 """Effects whose detection limits are asked for."""
+HELD = 3
+"""Throws held back."""
 SMALLEST, LARGEST = 3.0, 30.0
 """Sizes of the completeness curves [floors]."""
 
@@ -246,7 +248,8 @@ def bank(seed: int, sizes: dict[str, int]) -> list[tuple[str, Recipe]]:
     out: list[tuple[float, str, Recipe]] = []
     for k, (kind, count) in enumerate(sorted(sizes.items())):
         for i in range(count):
-            out.append(((i + 0.5) / count, kind, drawn(kind, seed + 100_000 * k + 100 * i)))
+            recipe = replace(drawn(kind, seed + 100_000 * k + 100 * i), held=HELD)
+            out.append(((i + 0.5) / count, kind, recipe))
     return [(kind, recipe) for _, kind, recipe in sorted(out, key=lambda item: item[:2])]
 
 

@@ -46,7 +46,7 @@ class Recipe:
     free: int = 6
     free_seconds: float = 10.0
     throws: int = 10
-    held: int = 3  # throws besides, which nobody is shown
+    held: int = 0  # throws besides, which nobody is shown
     low: bool = False  # free flights near the ground
 
     def digest(self) -> str:
