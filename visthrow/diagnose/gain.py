@@ -12,6 +12,7 @@ import numpy as np
 from visthrow.diagnose.blackbox import table_of, train
 from visthrow.diagnose.evidence import Priors, additions, estimate, log_evidence
 from visthrow.diagnose.forms import HORIZONS, Forms, forms, unit_of
+from visthrow.diagnose.landing import LandingGain, landing_gain
 from visthrow.diagnose.marginal import Noise, Statistics
 from visthrow.diagnose.model import Model
 from visthrow.diagnose.point import Point
@@ -56,7 +57,7 @@ class Gain:
     named_in: dict[str, float] = field(default_factory=dict)  # effect -> share of folds that named it
     folds: int = 0
     left_out: str = "flights"  # or "parts of flights"
-    landing: tuple[float, float] | None = None  # mean landing error of the open-loop replay before and after [m]
+    landing: LandingGain | None = None  # where the model has throws whose landing was seen
 
     def __getitem__(self, channel: str) -> ChannelGain:
         return next(c for c in self.channels if c.channel == channel)
@@ -106,7 +107,10 @@ def measure(diagnosis: Diagnosis, *, seed: int = 0, draws: int = DRAWS) -> Gain:
         for c, name in enumerate(work.problem.model.channels)
         if own.count[:, c].sum() > 0
     )
-    return Gain(gains, nats, shares, len(folds), left_out, _landing(work, diagnosis))
+    sizes = (after.theta - combination[:, 1:]) if left_out == "flights" and diagnosis.theta else ()
+    trained = {int(f): work.problem.sizes(size) for f, size in zip(own.groups, sizes)}
+    landing = landing_gain(work, diagnosis.theta, trained, seed)
+    return Gain(gains, nats, shares, len(folds), left_out, landing)
 
 
 def predicted(model: Model, theta: Mapping[str, float]) -> dict[str, tuple[float, float, int]]:
@@ -246,14 +250,3 @@ def bootstrap_sizes(statistics: Statistics, priors: Priors, active: Sequence[int
     own = statistics.information[:, at][:, :, at]
     normal = np.einsum("df,fij->dij", weights, own) + np.diag(priors.slab[at] ** -2.0)
     return np.linalg.solve(normal, (weights @ statistics.absolute[:, at])[:, :, None])[:, :, 0]
-
-
-def _landing(work, diagnosis: Diagnosis) -> tuple[float, float] | None:
-    """Mean landing error before and after, where the model can replay throws to the ground."""
-    replay = getattr(work.problem.model, "landing_errors", None)
-    if replay is None:
-        return None
-    before, after = (np.asarray(replay(theta), dtype=float) for theta in ({}, dict(diagnosis.theta)))
-    if not before.size or not (np.isfinite(before).any() and np.isfinite(after).any()):
-        return None
-    return float(np.nanmean(before)), float(np.nanmean(after))

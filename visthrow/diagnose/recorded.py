@@ -41,6 +41,7 @@ class Recorded:
     gyro: Samples | None
     voltage: float | None  # first measured [V]
     hung: bool | None = None  # whether the log says that a payload hung below at its start; None where it does not
+    landing_point: np.ndarray | None = None  # where the log says that the payload came down [m], shape (3,)
 
     @property
     def start(self) -> float:
@@ -106,7 +107,7 @@ def record_of(log: FlightLog, number: int = 0) -> Recorded:
     return Recorded(
         command.time[command.valid], np.asarray(command.values, dtype=float)[command.valid], _latch(log), _landing(log),
         pos, quat, _payload(log), _samples(log, "rate_b"),
-        None if voltage is None else float(voltage.values[voltage.valid][0]), _hung(log),
+        None if voltage is None else float(voltage.values[voltage.valid][0]), _hung(log), _landing_point(log),
     )  # fmt: skip
 
 
@@ -140,6 +141,12 @@ def _landing(log: FlightLog) -> float:
     if "landing" in log and np.any(log["landing"].valid):
         return float(log["landing"].time[log["landing"].valid][0])
     return NEVER
+
+
+def _landing_point(log: FlightLog) -> np.ndarray | None:
+    if "landing" in log and np.any(log["landing"].valid):
+        return np.asarray(log["landing"].values[log["landing"].valid][0], dtype=float)
+    return None
 
 
 def _payload(log: FlightLog) -> Samples | None:

@@ -11,6 +11,7 @@ from visthrow.diagnose import pictures, result
 from visthrow.diagnose.blind import Blind
 from visthrow.diagnose.forms import HEAD_SECONDS
 from visthrow.diagnose.gain import Gain
+from visthrow.diagnose.landing import LandingGain
 from visthrow.diagnose.result import Diagnosis, Finding
 from visthrow.report.parts import Grid, Picture, Section, Text
 
@@ -29,13 +30,15 @@ def summary(diagnosis: Diagnosis, gain: Gain | None = None) -> str:
     lines = [sentence_of(diagnosis), *(f"  {reason}" for reason in diagnosis.reasons), ""]
     for f in diagnosis.findings:
         if f.verdict in (result.FOUND, result.CLASS):
-            lines.append(f"{f.verdict:6} {f.sentence}")
+            lines.append(f"{f.verdict:6} {f.sentence}{_moves(f, gain)}")
     lines += [f"EVENT  something happened in flight {flight} that the others do not show" for flight in diagnosis.events]
     lines += [f"COPY   flight {flight} repeats flight {of} and was left out" for flight, of in diagnosis.duplicates.items()]
     counted = {v: sum(f.verdict == v for f in diagnosis.findings) for v in result.VERDICTS}
     lines.append(", ".join(f"{count} {verdict.lower()}" for verdict, count in counted.items() if count))
     if gain is not None and diagnosis.theta:
         lines += [_gain_line(c) for c in gain.channels]
+    if gain is not None and gain.landing is not None:
+        lines.append(landing_sentence(gain.landing))
     lines.append(f"{diagnosis.windows} windows of {diagnosis.flights} flights, {diagnosis.seconds:.1f} s")
     return "\n".join(lines)
 
@@ -43,6 +46,23 @@ def summary(diagnosis: Diagnosis, gain: Gain | None = None) -> str:
 def _gain_line(c) -> str:
     return (f"held-out error of {c.channel}: {c.before:.3g} -> {c.after:.3g} {c.unit}, {100 * c.gain:.0f} % less "
             f"[{100 * c.low:.0f}, {100 * c.high:.0f}]; noise alone {c.floor:.3g}, black box {c.blackbox:.3g}")  # fmt: skip
+
+
+def landing_sentence(landing: LandingGain) -> str:
+    """What the model's landings are worth, in millimetres."""
+    mm = [1e3 * x for x in (landing.before, landing.after, landing.low, landing.high)]
+    released = f"{1e3 * landing.released_before:.0f} to {1e3 * landing.released_after:.0f} mm"
+    if not landing.moved:
+        return (f"{landing.throws} throws, predicted open loop from before the throw, land {mm[0]:.0f} mm off where they were seen "
+                f"to; from the separation on {1e3 * landing.released_before:.0f} mm.")  # fmt: skip
+    whose = "held-out throws" if landing.held_out else "the same throws"
+    return (f"With what was named the landing error of {landing.throws} {whose} falls from {mm[0]:.0f} to {mm[1]:.0f} mm "
+            f"[{mm[2]:.0f}, {mm[3]:.0f}], open loop from before the throw; from the separation on {released}.")  # fmt: skip
+
+
+def _moves(finding: Finding, gain: Gain | None) -> str:
+    moved = gain.landing.moved if gain is not None and gain.landing is not None else {}
+    return f" It moves landings by {1e3 * moved[finding.name]:.0f} mm." if finding.name in moved else ""
 
 
 def to_json(
@@ -120,7 +140,7 @@ def write(folder: str | Path, made: Sequence[Section], diagnosis: Diagnosis, tit
 
 def _verdict(diagnosis: Diagnosis, gain: Gain | None) -> Section:
     parts: list[Text] = [Text(reason, "finding") for reason in diagnosis.reasons]
-    parts += [Text(f"**{f.verdict}.** {f.sentence}{_next(f)}", "finding")
+    parts += [Text(f"**{f.verdict}.** {f.sentence}{_moves(f, gain)}{_next(f)}", "finding")
               for f in diagnosis.findings if f.verdict in (result.FOUND, result.CLASS)]  # fmt: skip
     if diagnosis.overall == result.UNKNOWN and diagnosis.laws:
         law = diagnosis.laws[0]
@@ -130,9 +150,7 @@ def _verdict(diagnosis: Diagnosis, gain: Gain | None) -> Section:
     parts += [Text(f"Flight {flight} repeats flight {of} and counts once.", "finding")
               for flight, of in diagnosis.duplicates.items()]  # fmt: skip
     if gain is not None and gain.landing is not None:
-        before, after = (1e3 * value for value in gain.landing)
-        parts.append(Text(f"**Landing.** The replayed throws land {before:.0f} mm off with the model as it stands and "
-                          f"{after:.0f} mm with what was named.", "finding"))  # fmt: skip
+        parts.append(Text(f"**Landing.** {landing_sentence(gain.landing)}", "finding"))
     return Section("verdict", "Verdict", tuple(parts))
 
 
