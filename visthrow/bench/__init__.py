@@ -74,7 +74,7 @@ def _add_hil(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, default=0, help="of the first throw (default: 0)")
     parser.add_argument(
         "--jobs", type=int, default=1, metavar="N",
-        help="throws at once, each with a core for the run and one for the fake where there are enough (default: 1)",
+        help="throws or faults at once, each with a core for the run and one for the fake where there are enough (default: 1)",
     )  # fmt: skip
     parser.add_argument(
         "--speed", type=float, default=1.0, metavar="X",

@@ -5,10 +5,11 @@ import os
 import resource
 import signal
 import statistics
+import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -18,7 +19,8 @@ import torch
 
 from visthrow.actions import hover_action
 from visthrow.bench.hil import STILL, json_lines, never_releasing
-from visthrow.bench.hil_processes import ENDED, Pair
+from visthrow.bench.hil_processes import ENDED, Pair, own_cores
+from visthrow.bench.hil_throws import side_by_side
 from visthrow.bench.records import Report, Table
 from visthrow.errors import VisthrowError, suggest
 
@@ -186,8 +188,10 @@ def faults(args: argparse.Namespace) -> Report:
     """Inject each fault in turn.
 
     Raises:
-        VisthrowError: an unknown name.
+        VisthrowError: an unknown name, or no process at all.
     """
+    if args.jobs < 1:
+        raise VisthrowError(f"--jobs {args.jobs}; expected 1 or more")
     cases = known_cases()
     for name in args.faults:
         if name not in cases:
@@ -196,13 +200,18 @@ def faults(args: argparse.Namespace) -> Report:
     figures = {}
     with tempfile.TemporaryDirectory() as folder:
         made = policies(Path(folder))
-        for name in args.faults or cases:
-            case = cases[name]
-            found = figures[name] = _one(case, made[case.policy], Path(folder) / name)
+
+        def inject(name: str, cores: tuple[int | None, int | None]) -> tuple[str, dict[str, Any]]:
+            return name, _one(cases[name], made[cases[name].policy], Path(folder) / name, cores)
+
+        names = [name for name in cases if name in (args.faults or cases)]
+        done = dict(_announced(side_by_side(inject, names, own_cores(args.jobs))))
+        for name in names:
+            case, found = cases[name], done[name]
+            figures[name] = found
             row = (name, case.text, _told(found["states"]), _told(found["events"]) or "-")
             counts = tuple(str(found[key]) for key in ("missed", "commands", "releases")) + (str(len(found["breaches"])),)
             rows.setdefault(case.group, []).append((*row, *counts))
-            print(": ".join(row), flush=True)
     notes = (
         f"each fault begins in mid throw, {START:g} s after the first pose, of a policy that never releases, but where the "
         "release itself is what fails; times count from the first pose that the fault spoiled, from when it happened, from "
@@ -216,11 +225,17 @@ def faults(args: argparse.Namespace) -> Report:
     return Report("hil", "What the runner does when something fails", tables, notes, figures)
 
 
+def _announced(found: Iterator[tuple[str, dict[str, Any]]]) -> Iterator[tuple[str, dict[str, Any]]]:
+    for name, values in found:
+        print(f"{name}: {_told(values['states'])}", file=sys.stderr, flush=True)
+        yield name, values
+
+
 def _told(steps: list[dict[str, Any]]) -> str:
     return "; ".join(f"{s['what']} after {s['after']:.2f} s" for s in steps) or "-"
 
 
-def _one(case: Case, policy: Path, folder: Path) -> dict[str, Any]:
+def _one(case: Case, policy: Path, folder: Path, cores: tuple[int | None, int | None]) -> dict[str, Any]:
     length = LENGTHS[case.group]
     run = ["--config", "fake", "--set", f'policy="{policy}"']
     for setting in (*(f"{key}={value}" for key, value in QUICK.items()), *case.run):
@@ -228,7 +243,7 @@ def _one(case: Case, policy: Path, folder: Path) -> dict[str, Any]:
     fake = (*STILL, "--seconds", str(START + length), *case.fake)
     deed = None if case.act is None else Deed(case.act, folder)
     try:
-        summary, report = Pair(tuple(run), fake).fly(folder, deed, alone=True)
+        summary, report = Pair(tuple(run), fake, *cores).fly(folder, deed, alone=True)
     except VisthrowError as error:
         if not case.refused:
             raise

@@ -53,7 +53,7 @@ def series(args: argparse.Namespace) -> Report:
         file.flush()
         left = [s for s in seeds if ("direct", s) not in kept]
         parts = [left[first : first + PART] for first in range(0, len(left), PART)]
-        for lines in _side_by_side(lambda part, _: list(_direct(part, args)), parts, [(None, None)] * args.jobs):
+        for lines in side_by_side(lambda part, _: list(_direct(part, args)), parts, [(None, None)] * args.jobs):
             for line in lines:
                 _keep(kept, line, file)
         left = [s for s in seeds if ("wire", s) not in kept]
@@ -61,13 +61,13 @@ def series(args: argparse.Namespace) -> Report:
         def fly(seed: int, cores: tuple[int | None, int | None]) -> dict[str, Any]:
             return _over_the_wire(seed, folder / f"{args.policy.replace(os.sep, '_')}-{seed}", args, cores)
 
-        for count, line in enumerate(_side_by_side(fly, left, own_cores(args.jobs)), start=1 + args.throws - len(left)):
+        for count, line in enumerate(side_by_side(fly, left, own_cores(args.jobs)), start=1 + args.throws - len(left)):
             _keep(kept, line, file)
             _progress(count, args.throws, line, kept[("direct", line["seed"])])
     return _report([(kept[("wire", s)], kept[("direct", s)]) for s in seeds], args)
 
 
-def _side_by_side(what: Callable[[Any, Any], Any], items: list, places: list) -> Iterator[Any]:
+def side_by_side(what: Callable[[Any, Any], Any], items: list, places: list) -> Iterator[Any]:
     """What is made of each item, in the order in which it is done; as many at once as there are places, one a place.
 
     After an error nothing more is begun.
