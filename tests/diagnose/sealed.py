@@ -52,6 +52,15 @@ LAWS = {
 }  # fmt: skip
 """Terms that no entry of the catalogue has, with sizes that show: see :class:`tests.worlds.vehicle.Numbers`."""
 
+NOT_WAITED = "timeout"
+"""Error of a world whose verdict was not waited for."""
+
+TERMS = {
+    "law_ball_swirl": "F_p = c (z x v_p)", "law_vehicle_swirl": "F = c (e_z x v)", "law_speed_thrust": "F = c T v_xy e_z",
+    "law_slew_thrust": "F = c dT/dt e_z",
+}  # fmt: skip
+"""The same as the tool writes them."""
+
 CURVE = (
     "rope_length", "cmd_delay", "motor_tau", "release_lag", "payload_drag", "wind_x", "com_x", "marker_rot_x", "frame_tilt_x",
     "thrust_gain",
@@ -111,7 +120,7 @@ def ask(logs: list[Path], model: list[str], folder: Path, device: str = "cpu", t
     try:
         done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=timeout, env=known, check=False)
     except subprocess.TimeoutExpired:
-        return {"overall": "ERROR", "error": "timeout", "findings": []}
+        return {"overall": "ERROR", "error": NOT_WAITED, "findings": []}
     if not answer.exists():
         return {"overall": "ERROR", "error": (done.stdout + done.stderr)[-2000:], "findings": []}
     return json.loads(answer.read_text())
@@ -153,6 +162,11 @@ def named_by(verdict: dict) -> list[set[str]]:
     return out
 
 
+def near(group: set[str], truth: set[str]) -> set[str]:
+    """Hidden effects that a name, or a class of names, stands for: themselves, or what flights hardly tell from them."""
+    return {n for n in truth if group & ({n} | set().union(*(a for a in ALIKE if n in a)))}
+
+
 def judge(recipe: Recipe, verdict: dict) -> dict:
     """Compare a verdict with the truth.
 
@@ -165,10 +179,10 @@ def judge(recipe: Recipe, verdict: dict) -> dict:
     own = all(any(n in group for group in groups) for n in truth) and len(groups) == len(truth)
     hits, exact, wrong = set(), 0, 0
     for group in groups:
-        near = {n for n in truth if group & ({n} | set().union(*(a for a in ALIKE if n in a)))}
-        if near - hits:
+        meant = near(group, truth)
+        if meant - hits:
             exact += int(bool(group & truth) and len(group) == 1)
-            hits |= near
+            hits |= meant
         else:
             wrong += 1
     return {
