@@ -34,16 +34,29 @@ NEAR = 4.0
 BASE = "train/state.toml"
 
 
+def environment() -> dict[str, str]:
+    """Of a process that finds the package wherever it runs."""
+    root = Path(__file__).resolve().parents[2]
+    return os.environ | {"PYTHONPATH": os.pathsep.join([str(root), os.environ.get("PYTHONPATH", "")])}
+
+
+def command_for(count: int, recipe: Recipe, action: str = "explain", plant: str | None = None) -> list[str]:
+    """Arguments that ask about so many logs of a folder, with the model that is the world's null."""
+    command = ["diagnose", action, *[f"flight_{i:02d}.npz" for i in range(count)], "--device", "cpu", "--json", "said.json"]
+    command += ["--out", "out", *(["--no-report"] if action == "explain" else []), *(["--plant", plant] if plant else [])]
+    for item in model_of(recipe):
+        command += ["--set", item]
+    return command
+
+
 def tool(folder: Path, *arguments: str, timeout: float = 1500.0) -> str:
     """Run ``visthrow`` apart, in a folder, without access to the tests; its output.
 
     Raises:
         RuntimeError: It failed.
     """
-    root = Path(__file__).resolve().parents[2]
-    known = os.environ | {"PYTHONPATH": os.pathsep.join([str(root), os.environ.get("PYTHONPATH", "")])}
     done = subprocess.run([sys.executable, "-c", WITHOUT_TESTS, *arguments], cwd=folder, capture_output=True, text=True,
-                          timeout=timeout, env=known, check=False)  # fmt: skip
+                          timeout=timeout, env=environment(), check=False)  # fmt: skip
     if done.returncode:
         raise RuntimeError(f"visthrow {' '.join(arguments)} ended with {done.returncode}:\n{(done.stdout + done.stderr)[-2000:]}")
     return done.stdout
@@ -64,11 +77,7 @@ def explained(folder: Path, logs: Sequence[FlightLog], recipe: Recipe, plant: st
     place = Path(tempfile.mkdtemp(dir=folder))
     for i, log in enumerate(logs):
         log.save(place / f"flight_{i:02d}.npz")
-    command = ["diagnose", action, *[f"flight_{i:02d}.npz" for i in range(len(logs))], "--device", "cpu", "--json", "said.json"]
-    command += ["--out", "out", *(["--no-report"] if action == "explain" else []), *(["--plant", plant] if plant else [])]
-    for item in model_of(recipe):
-        command += ["--set", item]
-    tool(place, *command, *more)
+    tool(place, *command_for(len(logs), recipe, action, plant), *more)
     said = json.loads((place / "said.json").read_text())
     return said | {"tables": {path.name: path.read_text() for path in place.glob("out/*.csv")}}
 
@@ -222,14 +231,15 @@ class Task:
 
 
 def draw(kind: str, seed: int, floors: float = 15.0) -> Recipe:
-    """World of a case: an effect and a plant from a seed; a scrambled world hides nothing, a pair what belongs to it."""
-    from tests.diagnose import degenerate
+    """World of a case: an effect and a plant from a seed; nothing where logs are spoiled, in a pair what belongs to it."""
+    from tests.diagnose.bad import BAD
+    from tests.diagnose.degenerate import PAIRS
 
     rng = np.random.default_rng(seed)
-    if kind == "scramble":
+    if kind == "scramble" or kind in BAD:
         return Recipe(seed, str(rng.choice(PLANTS)), **SIZE)
-    if kind in degenerate.PAIRS:
-        pair = degenerate.PAIRS[kind]
+    if kind in PAIRS:
+        pair = PAIRS[kind]
         return Recipe(seed, str(rng.choice(PLANTS)), {pair.effect: pair.size * float(rng.choice(pair.signs))}, **SIZE)
     name = str(rng.choice(list(FLOORS)))
     sign = 1.0 if name in ONE_SIDED else float(rng.choice([-1.0, 1.0]))
@@ -261,9 +271,10 @@ def run_case(task: Task) -> dict | None:
 
 def run_kind(kind: str) -> Callable[[Recipe, Path], dict]:
     """The function of a kind of case."""
-    from tests.diagnose import degenerate
+    from tests.diagnose.bad import BAD
+    from tests.diagnose.degenerate import PAIRS
 
-    return KINDS[kind] if kind in KINDS else degenerate.PAIRS[kind].run
+    return KINDS[kind] if kind in KINDS else {**PAIRS, **BAD}[kind].run
 
 
 def main() -> None:

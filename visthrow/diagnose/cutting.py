@@ -14,6 +14,7 @@ BEFORE, AFTER = 0.55, 0.45  # of the separation, that the window of the throw re
 QUIET_SPEED = 0.35  # of hover [m/s]
 GROUND_MARGIN = 0.05  # above the landing height, below which a payload is left alone [m]
 LEAST_TAUT = 0.05  # before the separation, without which the release cannot be judged [s]
+MOST = 400  # windows; of longer flights these are spread evenly over all
 POSES_LEAST = 8  # measured poses without which a window says nothing
 
 
@@ -80,6 +81,16 @@ def cut(flight: Recorded, number: int, lag: float, landing_height: float, carrie
         spans += [(a, b, "", NO_PAYLOAD) for a, b in _split(max(end, after), last)]
     cuts = [Cut(number, phase or _phase(flight, a, b), a, b, mode) for a, b, phase, mode in spans]
     return [c for c in cuts if _seen(flight, c)]
+
+
+def thinned(cuts: list[Cut], most: int = MOST) -> list[Cut]:
+    """Of hours of flight, all throws and what follows them, and so many of the other windows that ``most`` are left."""
+    plain = [i for i, c in enumerate(cuts) if c.phase not in ("throw", "ballistic")]
+    room = max(most - len(cuts) + len(plain), most // 4)
+    if len(plain) <= room:
+        return cuts
+    dropped = set(plain) - {plain[i] for i in np.linspace(0, len(plain) - 1, room).astype(int)}
+    return [c for i, c in enumerate(cuts) if i not in dropped]
 
 
 def around_slack(c: Cut, first: float, last: float, separation: float) -> list[Cut]:

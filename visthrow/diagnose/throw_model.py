@@ -11,7 +11,7 @@ from sim.params import PlantParams, SensingParams
 from sim.replay.kernel import NO_PAYLOAD
 from sim.replay.lanes import Replay
 from visthrow.diagnose.catalogue import Entry, Setting, apply, entries_for
-from visthrow.diagnose.cutting import Cut, around_slack, cut
+from visthrow.diagnose.cutting import Cut, around_slack, cut, thinned
 from visthrow.diagnose.landing import Landings, landings
 from visthrow.diagnose.model import Window
 from visthrow.diagnose.opened import opened
@@ -88,7 +88,7 @@ class ThrowModel:
         hangs = carriers(flights) if carries is None else [carries] * len(flights)
         carries = any(hangs)
         release = plant.release
-        cuts = [c for i, f in enumerate(flights) for c in cut(f, i, release.lag, release.landing_height, hangs[i])]
+        cuts = thinned([c for i, f in enumerate(flights) for c in cut(f, i, release.lag, release.landing_height, hangs[i])])
         if not cuts:
             raise DiagnoseError(f"{len(flights)} flights hold no stretch of poses and commands long enough to replay")
         self.channels = ["pos_w", "quat_wb"]

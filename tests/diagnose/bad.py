@@ -1,0 +1,150 @@
+"""Logs that are wrong: a verdict without a name, or an error that says what; kinds of :mod:`tests.diagnose.cases`."""
+
+import json
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from tests.diagnose.altered import later, scrambled, with_values
+from tests.diagnose.cases import command_for, environment, logs_of
+from tests.diagnose.sealed import WITHOUT_TESTS
+from tests.worlds.world import Recipe
+from visthrow.flightlog import Channel, FlightLog
+
+Logs = list[FlightLog]
+HOURS = 2.0
+
+
+def each(change: Callable[[FlightLog], FlightLog]) -> Callable[[Logs], Logs]:
+    """The same change to all logs."""
+    return lambda logs: [change(log) for log in logs]
+
+
+def values(**changes) -> Callable[[Logs], Logs]:
+    """Channels' values changed in all logs."""
+    return each(lambda log: with_values(log, changes))
+
+
+def cut(log: FlightLog, count: int) -> FlightLog:
+    """The first samples of every channel."""
+    return FlightLog({n: replace(c, time=c.time[:count], values=c.values[:count], valid=c.valid[:count])
+                      for n, c in log.channels.items()}, {})  # fmt: skip
+
+
+def exchanged(log: FlightLog) -> FlightLog:
+    """Vehicle and payload taken for each other."""
+    channels = dict(log.channels)
+    channels["pos_w"], channels["payload_pos_w"] = channels["payload_pos_w"], channels["pos_w"]
+    return FlightLog(channels, {})
+
+
+def late_commands(log: FlightLog) -> FlightLog:
+    """Commands stamped half a second late."""
+    moved = later(FlightLog({n: log[n] for n in ("command", "release_command")}, {}), 0.5)
+    return FlightLog(dict(log.channels) | moved.channels, {})
+
+
+def frozen(log: FlightLog) -> FlightLog:
+    """A tracking system that stops in the middle of the flight."""
+
+    def hold(x: np.ndarray) -> np.ndarray:
+        half = len(x) // 2
+        return np.concatenate((x[:half], np.repeat(x[half : half + 1], len(x) - half, axis=0)))
+
+    return with_values(log, {"pos_w": hold, "quat_wb": hold, "payload_pos_w": hold})
+
+
+def still(seconds: float, thrust: float, height: float, rate: float = 100.0) -> FlightLog:
+    """A vehicle that does not move, for so long: noise about one place, one command."""
+    rng = np.random.default_rng(1)
+    t, sent = np.arange(0.0, seconds, 1.0 / rate), np.arange(0.0, seconds, 0.02)
+    turn = 5e-4 * rng.standard_normal((len(t), 3))
+    command = np.column_stack((np.full(len(sent), thrust), np.zeros((len(sent), 3))))
+    place = np.array([0.0, 0.0, height])
+    return FlightLog({
+        "pos_w": Channel(t, place + 5e-4 * rng.standard_normal((len(t), 3)), "m", "world"),
+        "quat_wb": Channel(t, np.column_stack((turn, np.ones(len(t)))), "1", "world"),
+        "command": Channel(sent, command, "N, rad/s", "body"),
+    }, {})  # fmt: skip
+
+
+def without(name: str) -> Callable[[Logs], Logs]:
+    """A channel that was not recorded."""
+    return each(lambda log: FlightLog({n: c for n, c in log.channels.items() if n != name}, {}))
+
+
+@dataclass(frozen=True)
+class Bad:
+    """One way in which logs can be wrong."""
+
+    spoil: Callable[[Logs], Logs]
+    cut_to: float = 1.0  # share of each file's bytes that is left
+    flown: bool = True  # whether it needs a world's flights
+
+    def run(self, recipe: Recipe, folder: Path) -> dict:
+        """Fly a world without effect, spoil its logs, ask."""
+        logs = self.spoil(logs_of(recipe) if self.flown else [])
+        place = Path(tempfile.mkdtemp(dir=folder))
+        for i, log in enumerate(logs):
+            path = place / f"flight_{i:02d}.npz"
+            log.save(path)
+            path.write_bytes(path.read_bytes()[: int(self.cut_to * path.stat().st_size)])
+        done = subprocess.run([sys.executable, "-c", WITHOUT_TESTS, *command_for(len(logs), recipe)], cwd=place,
+                              capture_output=True, text=True, timeout=1500.0, env=environment(), check=False)  # fmt: skip
+        answer = place / "said.json"
+        verdict = json.loads(answer.read_text()) if answer.exists() else {"overall": "ERROR", "findings": []}
+        return {"passed": fair(done, verdict), "said": verdict, "output": (done.stdout + done.stderr)[-600:]}
+
+
+def fair(done: subprocess.CompletedProcess, verdict: dict) -> bool:
+    """No traceback, no name; and either a verdict or an error of one sentence."""
+    if "Traceback" in done.stderr or verdict.get("theta"):
+        return False
+    return done.returncode == 2 and bool(done.stderr.strip()) if verdict["overall"] == "ERROR" else done.returncode == 0
+
+
+def doubled(logs: Logs) -> Logs:
+    """Every flight twice."""
+    return [*logs, *[later(log, 1000.0) for log in logs]]
+
+
+def as_they_are(logs: Logs) -> Logs:
+    """Unchanged."""
+    return logs
+
+
+def command_values(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Logs], Logs]:
+    """Commands changed in all logs."""
+    return values(command=change)
+
+
+def standing(_: Sequence[FlightLog]) -> Logs:
+    """On the floor for half a minute, motors idle."""
+    return [still(30.0, 0.3, 0.05)] * 2
+
+
+def hours(_: Sequence[FlightLog]) -> Logs:
+    """One hover of two hours."""
+    return [still(3600.0 * HOURS, 2.07, 1.5)]
+
+
+BAD = {
+    "millimetres": Bad(values(pos_w=lambda p: 1e3 * p, payload_pos_w=lambda p: 1e3 * p)),
+    "degrees": Bad(command_values(lambda u: u * [1.0, 57.3, 57.3, 57.3])),
+    "grams": Bad(command_values(lambda u: u * [101.97, 1.0, 1.0, 1.0])),
+    "share_of_thrust": Bad(command_values(lambda u: u * [1.0 / 13.0, 1.0, 1.0, 1.0])),
+    "roll_for_pitch": Bad(command_values(lambda u: u[:, [0, 2, 1, 3]])),
+    "pitch_reversed": Bad(command_values(lambda u: u * [1.0, 1.0, -1.0, 1.0])),
+    "east_for_north": Bad(values(pos_w=lambda p: p[:, [1, 0, 2]], payload_pos_w=lambda p: p[:, [1, 0, 2]])),
+    "scalar_first": Bad(values(quat_wb=lambda q: q[:, [3, 0, 1, 2]])),
+    "world_to_body": Bad(values(quat_wb=lambda q: q * [-1.0, -1.0, -1.0, 1.0])),
+    "bodies_exchanged": Bad(each(exchanged)), "late_commands": Bad(each(late_commands)), "frozen": Bad(each(frozen)),
+    "copied": Bad(doubled), "mixed_up": Bad(scrambled), "three_samples": Bad(each(lambda log: cut(log, 3))),
+    "no_commands": Bad(without("command")), "no_attitude": Bad(without("quat_wb")), "truncated": Bad(as_they_are, cut_to=0.6),
+    "empty_files": Bad(as_they_are, cut_to=0.0), "standing": Bad(standing, flown=False), "two_hours": Bad(hours, flown=False),
+}  # fmt: skip
