@@ -156,7 +156,9 @@ def _run(args: argparse.Namespace) -> int:
     from hil.flight import fly
     from hil.images import open_images
     from hil.latency import Stages
+    from hil.realtime import keep, prepare
     from hil.record import Recorder
+    from hil.rehearsal import Rehearsal
     from hil.report import finish, story
     from hil.runner import Runner
     from hil.sources.opening import open_source
@@ -174,12 +176,16 @@ def _run(args: argparse.Namespace) -> int:
     backend = make_backend(params, link, getattr(args, "write_parameters", False), _tell_parameters, folder)
     runner = Runner(params, policy, backend, mechanism_lag(params))
     warm_up(runner)
+    rehearsal = Rehearsal(runner) if params.realtime.rehearse and not recorded else None
+    refused = prepare(params.realtime)
     recorder = Recorder(folder, params)
+    for text in refused or keep(params.realtime):  # the recorder's thread holds what the flying one waits for; others do not
+        print(f"note: {text}", file=sys.stderr)
     operator = Keyboard(args.action == "run" and args.auto_arm)
     print(f"ready after {time.monotonic() - started:.2f} s; waiting for poses", file=sys.stderr, flush=True)
     viewer, stages = beside(folder) if args.view else None, Stages()
     eyes = open_images(params.images, params.camera, clock.now) if params.keypoints == "detector" else None
-    summary = fly(runner, source, clock, operator, recorder, args.seconds or float("inf"), _tell, stages, eyes)
+    summary = fly(runner, source, clock, operator, recorder, args.seconds or float("inf"), _tell, stages, eyes, rehearsal)
     summary["autopilot"] = told(backend, link)
     if eyes is not None:
         eyes.close()

@@ -141,6 +141,32 @@ class UdpPort(_SocketPort):
             return False
 
 
+class MutePort(_SocketPort):
+    """Takes all and lets nothing out: what is written goes through the system to this port itself, and is thrown away there."""
+
+    whole = True
+
+    def __init__(self) -> None:
+        """Open a socket that nobody else knows."""
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.setblocking(False)
+        self._socket.bind(("127.0.0.1", 0))
+        self._self = self._socket.getsockname()
+
+    def read(self) -> bytes | None:
+        """See `Port`: nothing."""
+        return None
+
+    def write(self, data: bytes) -> bool:
+        """See `Port`."""
+        try:
+            self._socket.sendto(data, self._self)
+            self._socket.recv(LARGEST_DATAGRAM)
+        except OSError:
+            return False
+        return True
+
+
 class TcpPort(_SocketPort):
     """A TCP connection, opened within two seconds or not at all."""
 

@@ -13,6 +13,7 @@ from hil.decision import Decision, Words
 from hil.images import Eyes
 from hil.latency import Stages
 from hil.record import Recorder
+from hil.rehearsal import BEGIN, Rehearsal
 from hil.runner import Runner
 from hil.sources import Source
 from hil.states import State
@@ -46,7 +47,7 @@ class AutoOperator:
 def fly(
     runner: Runner, source: Source, clock: Clock, operator: Operator, recorder: Recorder | None = None,
     most: float = float("inf"), tell: Callable[[Decision], None] | None = None, stages: Stages | None = None,
-    eyes: Eyes | None = None,
+    eyes: Eyes | None = None, rehearsal: Rehearsal | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """Run until the state machine is done, the recorded poses have ended, or for ``most`` seconds.
 
@@ -57,18 +58,25 @@ def fly(
         tell: called with the first decision of each state.
         stages: filled with the times of each stage.
         eyes: a camera, where keypoints are a detector's.
+        rehearsal: of this runner's ticks; None for none.
 
     Returns:
         The runner's summary with ticks, misses (those that a tick of ours caused by taking too long, and all), and the
         times of each stage.
     """
     ticker, backend, stages = Ticker(clock, runner.pilot.period), runner.backend, stages or Stages()
+    ahead = AHEAD if rehearsal is None else BEGIN
     begin, throws, told, ended, ours, ticks = clock.now(), [], None, -math.inf, 0, 0
     with _collected():
         while runner.machine.state is not State.DONE and clock.now() - begin < most and not source.ended:
-            _wait(clock, ticker.due() - AHEAD - AHEAD_SPREAD * (ticks * GOLDEN % 1.0), backend, source)
+            _wait(clock, ticker.due() - ahead - AHEAD_SPREAD * (ticks * GOLDEN % 1.0), backend, source)
             early = source.poll(clock.now())
             runner.take(early)
+            if rehearsal is not None:
+                for now in rehearsal.steps(clock, ticker.due()):
+                    came = source.poll(now)
+                    runner.take(came)
+                    early += came
             _wait(clock, ticker.due(), backend, source)
             due, missed = ticker.due(), ticker.missed
             now, start = ticker.take(), time.perf_counter()
@@ -106,6 +114,7 @@ def fly(
     return {
         **runner.summary(), "ticks": ticks, "missed": ticker.missed, "missed_ours": ours,
         "worst_late_s": ticker.worst, "latency": stages.summary(), "latch_times": throws,
+        **({} if rehearsal is None else {"rehearsals": rehearsal.count, "rehearsal_failed": rehearsal.failed}),
     }  # fmt: skip
 
 

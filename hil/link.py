@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from hil.device import MOST_CHUNKS, Port
+from hil.device import MOST_CHUNKS, MutePort, Port
 from hil.errors import LinkError
 from hil.frames import rotate
 from hil.mavlink import Parser, mav
@@ -127,6 +127,10 @@ class Link:
         self.sent += taken
         self.dropped += not taken
         return taken
+
+    def muted(self) -> "Link":
+        """A link of the same ids that packs messages and sends them nowhere."""
+        return Link(MutePort(), self._mav.srcSystem, self._mav.srcComponent)
 
     def close(self) -> None:
         """Close port and .tlog."""

@@ -13,6 +13,7 @@ from hil.frames import FrameParams
 from hil.gate import GateParams
 from hil.images import ImageParams
 from hil.pose import BODIES, PAYLOAD, VEHICLE
+from hil.realtime import RealtimeParams
 from hil.safety import CheckParams, FenceParams, GuardParams
 from hil.sources import BodyIds, CsvParams, LogBody, MocapParams, RigidBody
 from hil.states import StateParams
@@ -92,6 +93,7 @@ class HilParams:
     betaflight: BetaflightParams
     keypoints: Literal["projection", "detector"] = "projection"  # of the poses, or of what a camera sees
     images: ImageParams | None = None  # of the detector
+    realtime: RealtimeParams = RealtimeParams()
     against: CameraLogParams | None = None  # a camera's own detections in the source's file
 
     def __post_init__(self) -> None:

@@ -126,6 +126,18 @@ class Runner:
                 self.backend.abort(now)
             return Decision(now, self.machine.state.value, self.machine.reason, note="exception")
 
+    def rehearse(self, now: float, status: Status, words: Words) -> None:
+        """Tick on what has come so far, and look through the policy's eyes even where it is not flying. For copies alone.
+
+        Args:
+            now, status, words: see :meth:`tick`.
+        """
+        decision = self.tick(now, [], status, words)
+        bodies = {name: self._state(track, now) for name, track in self.tracks.items()}
+        vehicle, payload, goal_w = bodies[VEHICLE], bodies[PAYLOAD], self._goal(bodies)
+        if decision.action is None and None not in (vehicle, payload, goal_w) and vehicle.quat:
+            self._show(vehicle, payload, goal_w, decision)
+
     def look(self, sights: list[Sight]) -> None:
         """Take in what a camera saw since the last tick; of several frames the newest counts."""
         if sights:
@@ -147,6 +159,8 @@ class Runner:
         try:
             if self._untaken is None:
                 self._take(poses)
+                for track in self.tracks.values():
+                    track.settle()
         except Exception as error:  # as in tick
             self._untaken = error
 

@@ -72,6 +72,11 @@ class Track:
         self._slow.appendleft((pose.arrival, pose.pos))
         return None
 
+    def settle(self) -> None:
+        """Work out now what a state would work out when it is asked for."""
+        if self._turns:
+            _ = self.filter.rate
+
     def expected(self, time: float) -> Vector | None:
         """Where the last pose and velocity put the body at a time of arrival [s]; None before the first pose."""
         pose = self._pose

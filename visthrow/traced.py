@@ -39,6 +39,6 @@ class Traced:
             # The shape of the input is asked for in checks of it, and the whole facility is called old.
             warnings.simplefilter("ignore")
             try:
-                return torch.jit.freeze(torch.jit.trace(Recorded().eval(), tensors, check_trace=False))
+                return torch.jit.freeze(torch.jit.trace(Recorded().eval(), tensors, check_trace=False)).forward
             except (AttributeError, RuntimeError, NotImplementedError):
                 return self.plain

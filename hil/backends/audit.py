@@ -44,7 +44,7 @@ class Audit:
     """Asks for parameters one by one and judges them.
 
     Attributes:
-        found: values by name. written: names that were changed.
+        found: values by name. written: names that were changed. problems: mismatches in words, once the audit is done.
     """
 
     def __init__(
@@ -67,6 +67,7 @@ class Audit:
         self._now = 0.0
         self._begun: float | None = None
         self.done = not self.rules
+        self.problems: list[str] = []
 
     def feed(self, name: str, value: float) -> None:
         """Take an answer."""
@@ -93,7 +94,7 @@ class Audit:
             self._begun = now
         missing = [rule.name for rule in self.rules if rule.name not in self.found]
         if not missing or now - self._begun > GIVE_UP:
-            self.done = True
+            self.done, self.problems = True, self._mismatches()
             if self._tell is not None:
                 self._tell(self.table())
             return
@@ -102,11 +103,9 @@ class Audit:
                 self._asked[name] = now
                 self._ask(name)
 
-    @property
-    def problems(self) -> list[str]:
-        """Mismatches in words, once the audit is done."""
+    def _mismatches(self) -> list[str]:
         out = []
-        for rule in self.rules if self.done else ():
+        for rule in self.rules:
             value = self.found.get(rule.name)
             if value is None:
                 out.append(f"{rule.name} was not told; expected {rule.expected}")

@@ -53,6 +53,9 @@ class Backend(Protocol):
     def service(self, now: float) -> None:
         """Do what is due: heartbeats, the release, its repetition."""
 
+    def stand_ins(self) -> dict[int, Any]:
+        """What a deep copy is to have in the place of parts of this one, by their ``id``, so that it sends nothing."""
+
     def due(self) -> float | None:
         """When :meth:`service` is to be called at the latest [s]; None for the next tick."""
 
@@ -181,6 +184,10 @@ class DryRun:
     def due(self) -> float | None:
         """See `Backend`."""
         return None
+
+    def stand_ins(self) -> dict[int, Any]:
+        """See `Backend`."""
+        return {}
 
     def _nothing(self, *_: Any) -> None:
         """See `Backend`."""

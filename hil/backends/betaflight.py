@@ -19,7 +19,7 @@ from hil.backends.audit import Audit, Rule, equal
 from hil.backends.base import ACCEPTED, FOLLOW, PENDING, WAIT, Release, Status
 from hil.backends.rates import MIDDLE, RATES_TYPES, RatesParams, Sticks
 from hil.backends.thrust import ThrustParams
-from hil.device import MOST_CHUNKS, Port
+from hil.device import MOST_CHUNKS, MutePort, Port
 
 BOX_ARM, BOX_OVERRIDE = 0, 50
 """Permanent ids of flight modes."""
@@ -240,6 +240,10 @@ class Betaflight:
             self._opened = None
         if self.params.arm_channel and not self._taken and not self._over and now - self._framed >= KEEP_ALIVE:
             self._frame(now)
+
+    def stand_ins(self) -> dict[int, Any]:
+        """See `Backend`."""
+        return {id(self._port): MutePort(), id(self.params): self.params, id(self.sticks): self.sticks, id(self.audit): self.audit}
 
     def due(self) -> float | None:
         """See `Backend`."""
