@@ -10,9 +10,13 @@ import numpy as np
 
 from visthrow.errors import StorageError
 from visthrow.results import PROTOCOL, RECORDS, Result, join, load_all
+from visthrow.sweep.units import variant_of
 
 SHIPPED = ("state", "vision")
-"""Policies that come with the package."""
+"""The paper's two policies, as they come with the package."""
+
+HARDENED = "vision_dropout"
+"""Comes with the package too: trained with keypoints that drop out, for vehicles."""
 
 ANY = object()
 """Any departures."""
@@ -61,13 +65,13 @@ class Book:
 
     def shipped(self, name: str, plant: str, target: float, departures: Any = None) -> Result | None:
         """Throws of a shipped policy under its own conditions, or with departures."""
-        found = self.policies(plant, target, policy=name, departures=departures or {})
+        found = self.policies(plant, target, policy=name, variant=variant_of(name), departures=departures or {})
         return found[0] if found else None
 
     def seeds(self, layout: str, variant: str, plant: str, target: float, departures: Any = ANY) -> list[Result]:
         """Throws of runs that were trained for the comparison, shipped policies left out; one result a training seed."""
         found = self.policies(plant, target, layout=layout, variant=variant, departures=departures)
-        return [result for result in found if result.unit["policy"] not in SHIPPED and result.good.any()]
+        return [result for result in found if result.unit["policy"] not in (*SHIPPED, HARDENED) and result.good.any()]
 
     def matching(self, **wanted: Any) -> list[Result]:
         """Results whose unit has these entries."""
@@ -80,7 +84,7 @@ class Book:
 
     def by_departure(self, policy: str, key: str, plant: str = "hybrid", target: float = 2.0) -> list[tuple[Any, Result]]:
         """A shipped policy's throws with one value of the config changed: the value and the throws, ascending."""
-        found = [r for r in self.matching(kind="policy", policy=policy, plant=plant, target=target, variant="full")
+        found = [r for r in self.matching(kind="policy", policy=policy, plant=plant, target=target, variant=variant_of(policy))
                  if list(r.unit["departures"]) == [key]]  # fmt: skip
         return sorted(((r.unit["departures"][key], r) for r in found), key=lambda pair: _first(pair[0]))
 

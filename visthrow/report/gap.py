@@ -7,7 +7,7 @@ from typing import Any
 
 from visthrow import statistics as st
 from visthrow.report import figures
-from visthrow.report.book import ANY, SHIPPED, Book, errors, landed
+from visthrow.report.book import ANY, HARDENED, SHIPPED, Book, errors, landed
 from visthrow.report.parts import Grid, Picture, Section, Text
 from visthrow.report.throws import SHORT
 from visthrow.results import Result
@@ -15,7 +15,7 @@ from visthrow.results import Result
 PLANT, TARGET = "hybrid", 2.0
 
 
-HARDENED = ("dropout", "turned", "late")
+KNOWING = ("dropout", "turned", "late")
 """Variants of trainings that know of an imperfection; not part of the list ``paper`` at first."""
 
 
@@ -26,16 +26,21 @@ class Sweep:
     key: str
     title: str
     xlabel: str
-    own: float  # in the units of the axis; the policies' own value
+    own: float  # in the units of the axis; the value that both of the paper's policies were trained with
     scale: Callable[[Any], float] = float
     policies: tuple[str, ...] = ("vision",)
+    hardened: float | None = None  # own value of the hardened policy, where it was thrown too
+
+    def own_of(self, policy: str) -> float | None:
+        """Value that a policy was trained with."""
+        return self.hardened if policy == HARDENED else self.own
 
 
 SWEEPS = (
     Sweep("camera.noise.step_std", "keypoint noise", "per step, 1 at the edge of the image", 0.01),
     Sweep("camera.noise.bias_std", "keypoint bias", "per throw, 1 at the edge of the image", 0.001),
     Sweep("camera.noise.latency", "latency of the keypoints", "[ms] behind the vehicle's own pose", 0.0, lambda x: 20.0 * x),
-    Sweep("camera.noise.drop_probability", "drop-out", "share of keypoints lost", 0.0),
+    Sweep("camera.noise.drop_probability", "drop-out", "share of keypoints lost", 0.0, float, ("vision", HARDENED), 0.1),
     Sweep("camera.mount.rotation_error_std", "camera turned", "[deg] per axis, standard deviation", 0.0, math.degrees),
     Sweep("camera.mount.position_error_std", "camera displaced", "[mm] per axis, standard deviation", 0.0, lambda x: 1e3 * x),
     Sweep("task.observation.latency", "age of all poses", "[ms]", 10.0, lambda x: 500.0 * (x[0] + x[1]), SHIPPED),
@@ -57,7 +62,7 @@ def section(book: Book) -> Section:
     panels, rows, missing = [], [], []
     for sweep in SWEEPS:
         lines = []
-        for series, policy in enumerate(SHIPPED[::-1]):
+        for series, policy in enumerate((*SHIPPED[::-1], HARDENED)):
             if policy in sweep.policies:
                 points = curve(book, sweep, policy)
                 if len(points) > 1:
@@ -87,18 +92,18 @@ def curve(book: Book, sweep: Sweep, policy: str) -> list[tuple[float, Result]]:
     points = {round(sweep.scale(value), 9): r for value, r in book.by_departure(policy, sweep.key, PLANT, TARGET) if r.good.any()}
     own = book.shipped(policy, PLANT, TARGET)
     if own is not None and points:
-        points[sweep.own] = own
+        points[sweep.own_of(policy)] = own
     return sorted(points.items())
 
 
 def _line(sweep: Sweep, policy: str, points: list[tuple[float, Result]], series: int) -> figures.Line:
-    own = next((i for i, (value, _) in enumerate(points) if value == sweep.own), None)
+    own = next((i for i, (value, _) in enumerate(points) if value == sweep.own_of(policy)), None)
     intervals = [st.mean(r.of("error")) for _, r in points]
     return figures.Line(f"{policy} policy", [value for value, _ in points], intervals, series, own)
 
 
 def _rows(sweep: Sweep, policy: str, points: list[tuple[float, Result]]) -> list[tuple[str, ...]]:
-    own = dict(points).get(sweep.own)
+    own = dict(points).get(sweep.own_of(policy))
     rows = []
     for value, r in points:
         added = "its own" if r is own else "-" if own is None else st.difference(errors([r]), errors([own])).text(sign=True)
@@ -116,7 +121,7 @@ def _trained(book: Book, missing: list[str]) -> list:
             own = {} if plant == "hybrid" else ANY  # a reference plant is what it is, whatever the training had
             found = full if variant == "full" else book.seeds("vision", variant, plant, TARGET, own)
             if not found:
-                if variant in HARDENED:
+                if variant in KNOWING:
                     continue
                 missing.append(f"trained with {title} ({SHORT[plant]})")
                 continue
