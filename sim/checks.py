@@ -57,7 +57,10 @@ def check_rope(rope: RopeParams) -> None:
     require_not_negative("rope", payload_inertia=rope.payload_inertia, payload_offset=rope.payload_offset)
     require_not_negative("rope", joint_damping=rope.joint_damping)
     require_not_negative("rope", payload_drag=rope.payload_drag, mount_damping=rope.mount_damping)
-    require_not_negative("rope", swing_damping=rope.swing_damping, downwash=rope.downwash)
+    require_not_negative("rope", swing_damping=rope.swing_damping, downwash=rope.downwash, compliance=rope.compliance)
+    for name in ("payload_side", "payload_lift"):
+        if not math.isfinite(getattr(rope, name)):
+            raise ValueError(f"rope.{name} is {getattr(rope, name)}: expected a finite value")
 
 
 def check_numerics(sim: SimParams) -> None:

@@ -195,7 +195,13 @@ class RopeParams:
 
     Air on the payload, with its velocity v_p through the air: ``-payload_drag |v_p| v_p``. While it hangs, the rotors' jet
     pushes it with the share ``downwash`` of their force, against that force, and friction holds it back by
-    ``-swing_damping`` times its velocity v across the rope's last segment.
+    ``-swing_damping`` times its velocity v across the rope's last segment. In free flight a spinning or seamed ball is pushed
+    besides by ``|v_p| (payload_side e_z x v_p + payload_lift v_p x e_a)`` with ``e_a`` the horizontal direction across its
+    path, ``e_z x v_p`` normalised.
+
+    A rope that gives lengthens by ``compliance`` times its pull T at the mount, evenly along it:
+    ``l = l_0 (1 + compliance T / length)``. It does so at once: what swings is slow against the bounce of the payload on the
+    rope (20 Hz at 1 mm/N), whose own inertia is left out.
     """
 
     segments: int  # L, 1 to 64
@@ -211,6 +217,9 @@ class RopeParams:
     mount_damping: float = 0.0  # of the uppermost joint, besides joint_damping [N m s]
     swing_damping: float = 0.0  # [N s/m]
     downwash: float = 0.0  # [-]
+    payload_side: float = 0.0  # 1/2 rho C_L A across the path, in flight [kg/m]
+    payload_lift: float = 0.0  # the same upwards in the path's vertical plane [kg/m]
+    compliance: float = 0.0  # lengthening for every newton of pull [m/N]
 
 
 @dataclass(frozen=True)
@@ -298,6 +307,7 @@ class SensingParams:
       the vehicle's parameters are stated in, not the centre of mass
     - payload: ``p = (1 + scale) F (p_payload + payload_offset)``
     - gyro: ``w = w_b + gyro_bias``
+    - camera: keypoints with the stamp t show the scene at ``t - camera_delay + camera_line_time * row``
     """
 
     vehicle_delay: float = 0.0  # of the vehicle's stamps [s]
@@ -310,6 +320,8 @@ class SensingParams:
     marker_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)  # body frame [m]
     payload_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)  # world frame [m]
     gyro_bias: tuple[float, float, float] = (0.0, 0.0, 0.0)  # [rad/s]
+    camera_delay: float = 0.0  # of the keypoints' stamps [s]
+    camera_line_time: float = 0.0  # between two rows of the image [s]
 
 
 @dataclass(frozen=True)

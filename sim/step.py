@@ -56,7 +56,7 @@ def build_step(
     payload = build_payload(t, extensions)
     coupled = build_coupled_step(t, flow, rate, motor_advance, chain, payload, extensions)
     laws = build_laws(t, params.laws, flow, chain, coupled.mount_velocity)
-    through_air = "payload_drag" in extensions or any(law.block == "payload force" for law in params.laws)
+    through_air = bool({"payload_drag", "payload_spin"} & extensions) or any(law.block == "payload force" for law in params.laws)
     ballistic = rel.build_ballistic(t, build_flight(t, payload, laws), through_air)
     leaving = rel.build_letting_go(t, extensions)
     load, store = st.build_access(t, State)
@@ -138,7 +138,7 @@ def build_step(
     ):
         env = wp.tid()
         p = vehicle[env % vehicle.shape[0]]
-        rope = ropes[env % ropes.shape[0]]
+        natural = ropes[env % ropes.shape[0]]
         r = releases[env % releases.shape[0]]
         air = airs[env % airs.shape[0]]
         p.body.mass = p.body.mass * state.mass_scale[env]
@@ -150,6 +150,7 @@ def build_step(
             n[i] = state.cable_dir_w[i, env]
             u[i] = state.cable_vel_w[i, env]
             stiffness[i] = state.stiffness[i, env]
+        rope = chain.stretched(natural, natural, stiffness, real(0.0))
         s = load(state, env)
 
         taken = push(state.queue, env, command[env])
@@ -182,6 +183,8 @@ def build_step(
             h = (until - time) / real(float(count))
             active = state.queue[wp.min(slot, depth - 1), env]
             for k in range(count):
+                if attached != 0:
+                    rope = chain.stretched(natural, rope, stiffness, h)
                 now = laws.on(p, rope, air, s, n, u, stiffness, active, attached)
                 if attached != 0:
                     s, total, fell_back = coupled.step(
@@ -233,13 +236,16 @@ def build_step(
         out: Output,
     ):
         env = wp.tid()
-        rope = ropes[env % ropes.shape[0]]
+        natural = ropes[env % ropes.shape[0]]
         s = load(state, env)
         n = wp.zeros(shape=(L,), dtype=vec3)
         u = wp.zeros(shape=(L,), dtype=vec3)
+        stiffness = wp.zeros(shape=(L,), dtype=real)
         for i in range(L):
             n[i] = state.cable_dir_w[i, env]
             u[i] = state.cable_vel_w[i, env]
+            stiffness[i] = state.stiffness[i, env]
+        rope = chain.stretched(natural, natural, stiffness, real(0.0))
         if state.attached[env] != 0:
             mount = s.pos_w + wp.quat_rotate(s.quat_wb, rope.mount)
             pos, vel = chain.payload(rope, mount, coupled.mount_velocity(rope, s), n, u)

@@ -64,6 +64,12 @@ class Types:
                 "mount_damping": real,
                 "swing_damping": real,
                 "downwash": real,
+                "payload_side": real,
+                "payload_lift": real,
+                "compliance": real,
+                "strain": real,  # of a rope that gives, as it stands
+                "strain_rate": real,  # [1/s]
+                "stretched_share": real,  # of the last rod: how much of its lengthening its centre follows
                 "total_mass": real,
             },
         )
@@ -151,6 +157,8 @@ EXTENSIONS = {
     "mount_damping": "friction of the rope's mount",
     "swing_damping": "friction across the rope",
     "downwash": "the rotors' jet on the payload",
+    "payload_spin": "side force and lift of a payload in flight",
+    "compliance": "rope that gives",
     "lag_tension": "release lag that depends on the rope's pull",
     "kick": "speed given to the payload at the release",
     "rope_tail": "rope that leaves with the payload",
@@ -159,7 +167,7 @@ EXTENSIONS = {
 """Parts of the blocks that a kernel holds only if it was built for them, and what they are."""
 
 
-ROPE_EXTENSIONS = ("payload_drag", "mount_damping", "swing_damping", "downwash")
+ROPE_EXTENSIONS = ("payload_drag", "mount_damping", "swing_damping", "downwash", "compliance")
 """Those that are fields of :class:`sim.params.RopeParams` of the same name."""
 
 
@@ -176,6 +184,7 @@ def extensions_of(
         needed |= {"gain"} if any(g != 1.0 for g in v.thrust.gain) else set()
     for r in ropes:
         needed |= {name for name in ROPE_EXTENSIONS if getattr(r, name) != 0.0}
+        needed |= {"payload_spin"} if r.payload_side or r.payload_lift else set()
     for a in airs:
         needed |= ({"wind"} if any(a.wind_w) else set()) | ({"ground_effect"} if a.ground_effect else set())
     for x in releases:
@@ -277,6 +286,8 @@ def pack_rope(t: Types, ropes: list[P.RopeParams]) -> np.ndarray:
         row["payload_arm"], row["payload_mass"], row["payload_drag"] = ball, rope.payload_mass, rope.payload_drag
         row["joint_damping"], row["mount"] = rope.joint_damping, rope.mount
         row["mount_damping"], row["swing_damping"] = rope.mount_damping, rope.swing_damping
-        row["downwash"] = rope.downwash
+        row["downwash"], row["compliance"] = rope.downwash, rope.compliance
+        row["payload_side"], row["payload_lift"] = rope.payload_side, rope.payload_lift
+        row["stretched_share"] = (mass / 2 + rope.payload_mass) / last_mass
         row["total_mass"] = rope.rope_mass + rope.payload_mass
     return rows

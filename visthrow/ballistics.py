@@ -10,7 +10,7 @@ STEP = 0.02  # largest of RK4 [s]; 1e-8 m off a tennis ball's path after a secon
 def flown(
     rope: RopeParams, air: AirParams, pos_w: np.ndarray, vel_w: np.ndarray, time: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Position and velocity of payloads after ``time`` of flight under gravity, drag and wind.
+    """Position and velocity of payloads after ``time`` of flight under gravity, drag, side force, lift and wind.
 
     Args:
         rope: whose payload it is.
@@ -18,14 +18,18 @@ def flown(
         pos_w: [m], shape (E, 3). vel_w: [m/s], shape (E, 3). time: [s], shape (E,).
     """
     time = np.asarray(time, dtype=float)[:, None]
-    if rope.payload_drag == 0.0:
+    if not (rope.payload_drag or rope.payload_side or rope.payload_lift):
         fall = np.array([0.0, 0.0, -GRAVITY])
         return pos_w + time * vel_w + 0.5 * time**2 * fall, vel_w + time * fall
-    wind, share = np.array(air.wind_w), rope.payload_drag / rope.payload_mass
+    wind = np.array(air.wind_w)
+    share, side, lift = (x / rope.payload_mass for x in (rope.payload_drag, rope.payload_side, rope.payload_lift))
 
     def acceleration(v: np.ndarray) -> np.ndarray:
         through = v - wind
-        return -share * np.linalg.norm(through, axis=1, keepdims=True) * through - [0.0, 0.0, GRAVITY]
+        across = np.cross([0.0, 0.0, 1.0], through)
+        size = np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
+        turned = side * across + lift * np.cross(through, across / size)
+        return np.linalg.norm(through, axis=1, keepdims=True) * (turned - share * through) - [0.0, 0.0, GRAVITY]
 
     count = max(int(np.ceil(np.max(time, initial=0.0) / STEP)), 1)
     h, x, v = time / count, pos_w, vel_w

@@ -288,7 +288,7 @@ def build_replay(t: Types, vehicle: VehicleParams, segments: int, laws: tuple[La
         w = lanes.window[lane]
         row = lanes.plant[lane]
         p = vehicles[row]
-        rope = ropes[row]
+        natural = ropes[row]
         r = releases[row]
         air = airs[row]
         x = sensings[row]
@@ -302,9 +302,11 @@ def build_replay(t: Types, vehicle: VehicleParams, segments: int, laws: tuple[La
             n[i] = starts.cable_dir_w[i, start]
             u[i] = starts.cable_vel_w[i, start]
             stiffness[i] = starts.stiffness[i, start]
+        rope = chain.stretched(natural, natural, stiffness, real(0.0))
         mode = windows.payload[w]
         ball = Ball()
         if mode != attached_code:
+            rope = natural
             ball.pos = starts.payload_pos_w[start]
             ball.vel = starts.payload_vel_w[start]
             arm, arm_vel = chain.payload(rope, vec3(), vec3(), n, u)
@@ -355,6 +357,7 @@ def build_replay(t: Types, vehicle: VehicleParams, segments: int, laws: tuple[La
             if mode == attached_code and separation <= time + tiny:
                 ball = let_go(r, rope, s, n, u)
                 mode = int(loose_code)
+                rope = natural
                 pay = ball.pos
                 pay_vel = ball.vel
             if mode == attached_code:
@@ -379,6 +382,7 @@ def build_replay(t: Types, vehicle: VehicleParams, segments: int, laws: tuple[La
                 hanging = int(0)
                 if mode == attached_code:
                     hanging = 1
+                    rope = chain.stretched(natural, rope, stiffness, h)
                 pushed = push_at(air, lanes.axis[lane], lanes.size[lane], real(1.0) - away)
                 pushed = extra.on(p, rope, pushed, s, n, u, stiffness, active, hanging)
                 old = s

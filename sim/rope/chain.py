@@ -28,30 +28,10 @@ from typing import Any
 
 import warp as wp
 
+from sim.rope import stretch
+from sim.rope.algebra import sym_mul, tangent_basis
 from sim.rope.payload import LOADS
 from sim.structs import Types
-
-
-@wp.func
-def sym_mul(d: Any, o: Any, v: Any):
-    """Product of the symmetric matrix with diagonal ``d`` and off-diagonals ``o = (xy, xz, yz)`` and a vector."""
-    return type(v)(
-        d[0] * v[0] + o[0] * v[1] + o[1] * v[2],
-        o[0] * v[0] + d[1] * v[1] + o[2] * v[2],
-        o[1] * v[0] + o[2] * v[1] + d[2] * v[2],
-    )
-
-
-@wp.func
-def tangent_basis(n: Any):
-    """Two unit vectors that complete the unit vector n. Source: Duff et al., JCGT 6(1), 2017."""
-    one = type(n[0])(1.0)
-    sign = one
-    if n[2] < n[2] - n[2]:
-        sign = -one
-    a = -one / (sign + n[2])
-    b = n[0] * n[1] * a
-    return type(n)(one + sign * n[0] * n[0] * a, sign * b, -sign * n[0]), type(n)(b, sign + n[1] * n[1] * a, -n[1])
 
 
 @wp.func
@@ -137,6 +117,7 @@ def build_chain(t: Types, segments: int, extensions: frozenset[str] = frozenset(
     loaded = last_load if extensions & LOADS else no_load
     upper_damping = joint_and_mount if "mount_damping" in extensions else joint_alike
     at_mount = rubbing_mount if "mount_damping" in extensions else frictionless_mount
+    bias = stretch.of(extensions)
 
     @wp.func
     def rod(rope: Rope, i: int):
@@ -218,6 +199,7 @@ def build_chain(t: Types, segments: int, extensions: frozenset[str] = frozenset(
                 g = c * f - l * b + (l2 * speed2) * a_n + rope.joint_damping * couple
                 g += terms(stiffness[i], damping, ui, k1[i], gh, h)
                 g = at_mount(rope, i, loaded(i, last, g, rope.payload_arm, load), above)
+                g = bias.moment(rope, i, last, g, ui, d, o, cm)
                 e1, e2 = tangent_basis(ni)
                 a_e1 = sym_mul(d, o, e1)
                 a_e2 = sym_mul(d, o, e2)
@@ -237,6 +219,7 @@ def build_chain(t: Types, segments: int, extensions: frozenset[str] = frozenset(
                 g2 = wp.dot(e2, g)
                 h1 = s22 * g1 - s12 * g2
                 h2 = s11 * g2 - s12 * g1
+                b = bias.force(rope, i, last, b, ui, d, o, m)
                 b = b - loaded(i, last, f, real(1.0), load) - speed2 * (cm * ni + l * a_n) + h1 * b1 + h2 * b2
                 d = d + vec3(m, m, m) - wp.cw_mul(b1, q1) - wp.cw_mul(b2, q2)
                 o = o - vec3(
@@ -287,7 +270,7 @@ def build_chain(t: Types, segments: int, extensions: frozenset[str] = frozenset(
             k1[i] = k
             n2[i] = wp.normalize(ni + h * (ui + (gamma * h) * k))
             fastest = wp.max(fastest, wp.max(wp.dot(ui, ui), wp.dot(u2, u2)))
-            a = a + rope.segment_length * k
+            a = bias.tip(rope, a + rope.segment_length * k, ui)
         return fastest
 
     @wp.func
@@ -323,10 +306,10 @@ def build_chain(t: Types, segments: int, extensions: frozenset[str] = frozenset(
             ui = old_u + h * first
             k = acceleration(ni, ui, a, c1[i], c2[i], hs[i])
             f = m * gravity
-            pull = pull + loaded(i, last, f, real(1.0), load) - m * (a + c * k)
+            pull = pull + loaded(i, last, f, real(1.0), load) - m * bias.center(rope, i, last, a + c * k, ui)
             moment = loaded(i, last, c * (f - m * a) - l * pull, rope.payload_arm, load)
             stiffness[i] = wp.max(wp.dot(ni, moment), real(0.0))
-            a = a + l * k
+            a = bias.tip(rope, a + l * k, ui)
             new_n = wp.normalize(n[i] + half * (old_u + ui + gh * (k - first)))
             new_u = old_u + half * (first + k)
             new_u = new_u - new_n * wp.dot(new_n, new_u)
@@ -351,7 +334,7 @@ def build_chain(t: Types, segments: int, extensions: frozenset[str] = frozenset(
         vel = mount_vel_w
         for i in range(L):
             pos += rope.segment_length * n[i]
-            vel += rope.segment_length * u[i]
+            vel = bias.speed(rope, vel + rope.segment_length * u[i], n[i])
         return pos + rope.payload_offset * n[L - 1], vel + rope.payload_offset * u[L - 1]
 
     @wp.func
@@ -399,7 +382,7 @@ def build_chain(t: Types, segments: int, extensions: frozenset[str] = frozenset(
             vel += rope.segment_length * (u[i] + h * k1[i])
         return vel + rope.payload_offset * (u[L - 1] + h * k1[L - 1])
 
-    return SimpleNamespace(
+    chain = SimpleNamespace(
         up_first=up_first,
         up_second=up_second,
         down_first=down_first,
@@ -415,3 +398,5 @@ def build_chain(t: Types, segments: int, extensions: frozenset[str] = frozenset(
         segments=L,
         vec2=vec2,
     )
+    chain.stretched = stretch.build_stretch(t, chain, extensions)
+    return chain

@@ -18,6 +18,21 @@ def drag_force(rope: Any, air_vel_w: Any):
     return -(rope.payload_drag * wp.length(air_vel_w)) * air_vel_w
 
 
+@wp.func
+def no_spin(rope: Any, force: Any, air_vel_w: Any):
+    """Force on a payload that flies through the air without spin or seam."""
+    return force
+
+
+@wp.func
+def spin_force(rope: Any, force: Any, air_vel_w: Any):
+    """The same [N], world frame, with the side force and the lift of a ball that spins."""
+    zero = air_vel_w[0] - air_vel_w[0]
+    side = type(air_vel_w)(-air_vel_w[1], air_vel_w[0], zero)
+    across = wp.normalize(side)
+    return force + wp.length(air_vel_w) * (rope.payload_side * side + rope.payload_lift * wp.cross(air_vel_w, across))
+
+
 def build_flight(t: Types, payload: SimpleNamespace, laws: SimpleNamespace):
     """Return ``flight_acceleration(rope, air, vel_w, gravity)`` [m/s^2] of the payload alone, laws on it included."""
     Rope, Air, vec3, real, in_flight = t.Rope, t.Air, t.vec3, t.real, laws.in_flight
@@ -63,6 +78,7 @@ def build_payload(t: Types, extensions: frozenset[str]) -> SimpleNamespace:
     friction = add_friction if "swing_damping" in extensions else nothing
     jet = add_jet if "downwash" in extensions else nothing
     push = add_push if "push" in extensions else nothing
+    spin = spin_force if "payload_spin" in extensions else no_spin
 
     @wp.func
     def hanging(rope: Rope, air: Air, vel_w: vec3, along_w: vec3, jet_w: vec3):
@@ -72,6 +88,7 @@ def build_payload(t: Types, extensions: frozenset[str]) -> SimpleNamespace:
     @wp.func
     def free(rope: Rope, air: Air, vel_w: vec3):
         none = vec3()
-        return push(rope, air, drag(rope, air, none, vel_w, none, none), vel_w, none, none)
+        dragged = spin(rope, drag(rope, air, none, vel_w, none, none), air_velocity(air, vel_w))
+        return push(rope, air, dragged, vel_w, none, none)
 
     return SimpleNamespace(hanging=hanging, free=free)

@@ -20,12 +20,13 @@ def extended(experiment: Experiment, theta: Mapping[str, float]) -> Experiment:
     Raises:
         DiagnoseError: An effect that the catalogue does not hold.
     """
-    base = opened(Setting(plant_of(experiment), experiment.sensing))
+    base = opened(Setting(plant_of(experiment), experiment.sensing, camera=experiment.camera))
     found = apply(ALL, base, theta)
     plant = closed(found.plant, plant_of(experiment))
     return dataclasses.replace(
-        experiment, vehicle=plant.vehicle, rope=plant.rope, release=plant.release, air=plant.air, sensing=found.sensing
-    )
+        experiment, vehicle=plant.vehicle, rope=plant.rope, release=plant.release, air=plant.air, sensing=found.sensing,
+        camera=found.camera,
+    )  # fmt: skip
 
 
 def differences(before: Any, after: Any) -> dict[str, Any]:

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from camera.params import CameraParams
 from sim.params import PlantParams, SensingParams
 from sim.replay.kernel import NO_PAYLOAD
 from sim.replay.lanes import Replay
@@ -17,6 +18,7 @@ from visthrow.diagnose.model import Window
 from visthrow.diagnose.opened import opened
 from visthrow.diagnose.recorded import NEVER, carriers, record_of
 from visthrow.diagnose.replay import BATCH, KNOT_SPACING, Flights, Lane, carried
+from visthrow.diagnose.sightings import channels_of, needs_no_flight, sightings, with_sightings
 from visthrow.diagnose.states import (
     States,
     concerns,
@@ -65,6 +67,7 @@ class ThrowModel:
         only: Sequence[str] | None = None,
         carries: bool | None = None,
         simpler: bool = False,
+        camera: CameraParams | None = None,
     ):
         """Cut the flights and find the windows' initial states.
 
@@ -78,11 +81,12 @@ class ThrowModel:
             only: names of the effects to consider; default all that apply.
             carries: whether a payload hangs below in all flights; default: in those in which one was measured or released.
             simpler: consider also blocks simpler than the plant's, such as a rigid rope; each compiles a kernel.
+            camera: whose keypoints the logs hold.
 
         Raises:
             DiagnoseError: no flight can be replayed, or ``only`` names what does not exist.
         """
-        self.setting = opened(Setting(plant, sensing or SensingParams()))
+        self.setting = opened(Setting(plant, sensing or SensingParams(), camera=camera))
         self.device, self.substep = device, substep
         flights = [record_of(log, i) for i, log in enumerate(logs)]
         hangs = carriers(flights) if carries is None else [carries] * len(flights)
@@ -94,6 +98,7 @@ class ThrowModel:
         self.channels = ["pos_w", "quat_wb"]
         self.channels += ["payload_pos_w"] if carries and any(f.payload for f in flights) else []
         self.channels += ["rate_b"] if any(f.gyro for f in flights) else []
+        self.channels += channels_of(logs, flights, camera)
         thrown = any(f.latch != NEVER for f in flights)
         self.entries: dict[str, Entry] = entries_for(self.setting, set(self.channels), carries, thrown, simpler)
         if only is not None:
@@ -101,9 +106,10 @@ class ThrowModel:
             if unknown:
                 raise DiagnoseError(f"no effects {unknown} for these flights; there are {', '.join(self.entries)}")
             self.entries = {name: self.entries[name] for name in only}
-        self._graded = [e for e in self.entries.values() if e.switch is None]
+        self._sighted = [e for e in self.entries.values() if needs_no_flight(e)]
+        self._graded = [e for e in self.entries.values() if e.switch is None and e not in self._sighted]
         self._switched = [e for e in self.entries.values() if e.switch is not None]
-        self.entries = {e.effect.name: e for e in (*self._graded, *self._switched)}
+        self.entries = {e.effect.name: e for e in (*self._graded, *self._switched, *self._sighted)}
         self.effects = tuple(e.effect for e in self.entries.values())
         self._directions = directions(self.setting.plant)
         x = self.setting.sensing
@@ -115,6 +121,7 @@ class ThrowModel:
             states = self._begin(self.setting)
         self._told = np.array([w for w, c in enumerate(self.flights.cuts) if c.told])
         self._states = self._latest = self._settle(self.setting, states)
+        self._sightings = sightings(logs, flights, self.flights.cuts, self.setting)
 
     def windows(self, theta: Mapping[str, float]) -> list[Window]:
         """See :class:`visthrow.diagnose.model.Model`."""
@@ -134,7 +141,20 @@ class ThrowModel:
                 dataclasses.replace(w, effects=np.hstack((w.effects, np.stack([c[i] for c in columns], axis=1))))
                 for i, w in enumerate(found)
             ]
-        return found
+        return self._with_sightings(setting, theta, found)
+
+    def _with_sightings(self, setting: Setting, theta: Mapping[str, float], windows: list[Window]) -> list[Window]:
+        """Windows with what was seen besides poses, and columns of the effects that this alone shows."""
+        blank = [np.zeros((len(w.residual), len(self._sighted))) for w in windows]
+        whole = [dataclasses.replace(w, effects=np.hstack((w.effects, b))) for w, b in zip(windows, blank)]
+        if not self._sightings:
+            return whole
+        entries = list(self.entries.values())
+        steps = np.array([0.0 if e.switch else self._step(e, theta.get(e.effect.name, 0.0)) for e in entries])
+        settings = [setting, *[setting if e.switch else e.apply(setting, step) for e, step in zip(entries, steps)]]
+        return [
+            with_sightings(w, number, self._sightings, self.channels, settings, steps) for number, w in zip(self._told, whole)
+        ]
 
     def _secant(self, e: Entry, theta: Mapping[str, float], states: States, windows: list[Window]) -> list[np.ndarray]:
         """Samples with the other kind of block less those with this one, per theta; a column for each window."""
@@ -152,7 +172,12 @@ class ThrowModel:
         lanes = [Lane(w, 0, w) for w in self._told]
         states = resampled(self._latest, setting.plant.rope.segments)
         seen = self.flights.fly(self._replay([setting]), [setting], states, lanes, self.substep).seen
-        return [self._residual(seen, w, lane) for lane, w in enumerate(self._told)]
+        flown = [self._residual(seen, w, lane) for lane, w in enumerate(self._told)]
+        return [np.concatenate((r, *self._sighting_residuals(w, setting))) for r, w in zip(flown, self._told)]
+
+    def _sighting_residuals(self, w: int, setting: Setting) -> list[np.ndarray]:
+        held = [(kind, kind.samples(w)[1]) for kind in self._sightings]
+        return [values - kind.predicted(w, setting) for kind, values in held if len(values)]
 
     def step_error(self, finer: int = 4) -> dict[str, float]:
         """Largest change of any sample of each channel when the step is so many times finer, in its noise."""

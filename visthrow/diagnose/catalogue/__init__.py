@@ -4,11 +4,11 @@ The equation of an effect stands in the block of :mod:`sim` that it extends (or 
 numbers of the configuration that it changes, nothing more.
 """
 
-from visthrow.diagnose.catalogue import air, body, numerics, rope, sensing, structure, thrust
+from visthrow.diagnose.catalogue import air, body, camera, numerics, rope, sensing, structure, thrust
 from visthrow.diagnose.catalogue.entry import Entry, Key, Setting, apply
 
 ALL: dict[str, Entry] = {
-    e.effect.name: e for table in (thrust, body, air, rope, sensing, numerics, structure) for e in table.ENTRIES
+    e.effect.name: e for table in (thrust, body, air, rope, sensing, camera, numerics, structure) for e in table.ENTRIES
 }
 """Name -> entry."""
 
@@ -32,9 +32,9 @@ def entries_for(
             continue
         if about in ("rope", "rope mount", "payload", "payload air") and not payload:
             continue
-        if (about == "release" and not releases) or not e.applies(setting):
+        if (about in ("release", "ballistic") and not releases) or not e.applies(setting):
             continue
-        if e.effect.channels == ("rate_b",) and "rate_b" not in channels:
+        if any(c in e.effect.channels and c not in channels for c in ("rate_b", "keypoints", "landing")):
             continue
         if name.startswith(("payload_marker", "mocap_delay_payload")) and "payload_pos_w" not in channels:
             continue

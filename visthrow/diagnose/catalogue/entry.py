@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from camera.params import CameraParams
 from sim.params import PlantParams, SensingParams
 from visthrow.diagnose.model import Effect
 from visthrow.errors import DiagnoseError, suggest
@@ -20,6 +21,7 @@ class Setting:
     plant: PlantParams
     sensing: SensingParams = dataclasses.field(default_factory=SensingParams)
     step_square: float = 1.0  # of the integration step against the one asked for: errors grow with it
+    camera: CameraParams | None = None  # whose keypoints the logs hold
 
 
 @dataclass(frozen=True)

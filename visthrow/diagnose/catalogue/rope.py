@@ -166,6 +166,43 @@ ENTRIES: tuple[Entry, ...] = (
         manoeuvres=("long throws",),
         most=lambda s: s.plant.rope.payload_drag,
     ),
+    *(
+        entry(
+            name,
+            cause,
+            equation,
+            "kg/m",
+            "ballistic",
+            (-5e-3, 5e-3),
+            4e-4,
+            1e-4,
+            PAYLOAD,
+            "Cross and Lindsey 2014: lift even at low spin, C_L 0 +- 0.2 on a tennis ball; seams push aside",
+            [Key(f"{R}{name}")],
+            confused=confused,
+            manoeuvres=("mark the ball and film its spin", "throws in two directions"),
+        )
+        for name, cause, equation, confused in (
+            ("payload_side", "The ball is pushed aside in flight", "F = theta |v| e_z x v", ("wind_y", "wind_x")),
+            ("payload_lift", "The ball's spin lifts it in flight", "F = theta |v| v x e_across", ("payload_drag", "wind_z")),
+        )
+    ),
+    entry(
+        "rope_elastic",
+        "The rope gives under load",
+        "L + theta T",
+        "m/N",
+        "rope",
+        (-1.0, 0.05),
+        1e-3,
+        1e-4,
+        BOTH,
+        "RotorTM, Li et al. 2024; braided cords of 1 mm stretch by some per cent at a few newtons",
+        [Key(f"{R}compliance")],
+        confused=("rope_length", "payload_offset"),
+        manoeuvres=("hang two loads", "snap stop"),
+        most=lambda s: s.plant.rope.compliance,
+    ),
     entry(
         "downwash",
         "The rotors' jet pushes the payload",
@@ -244,6 +281,21 @@ ENTRIES: tuple[Entry, ...] = (
             manoeuvres=("throws at three speeds",),
         )
         for i, axis in enumerate("xyz")
+    ),
+    entry(
+        "plane_height",
+        "The payload comes down on a higher or lower plane",
+        "z_land + theta",
+        "m",
+        "ballistic",
+        (-0.5, 0.5),
+        0.03,
+        2e-3,
+        ("landing",),
+        "the paper leaves it open; a ball's radius over the ground, 0.04 +- 0.03 m",
+        [Key("plant.release.landing_height")],
+        confused=("payload_marker_z",),
+        manoeuvres=("put the payload down on the target",),
     ),
     entry(
         "rope_tail",
