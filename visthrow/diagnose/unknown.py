@@ -34,6 +34,13 @@ REACH = 3.0
 NARROW = 1e-3
 """Floor of a term in its prior deviation: a term is there or it is not."""
 
+MATERIAL = 0.5
+"""Root mean square force of a term, in the block's quietest latent force, below which it does not matter: that of a gust moves a
+landing by 5 mm within half a second."""
+
+REMAINDER = 0.05
+"""Share of a term's evidence below which a name beside it is what the term's form, weighed without a simulation, leaves over."""
+
 
 @dataclass(frozen=True)
 class Hypothesis:
@@ -52,6 +59,10 @@ class Hypothesis:
     def value(self) -> float:
         """Evidence, comparable with that of a set of names; every term pays its price."""
         return self.point.evidence(self.priors, self.active) - self.price
+
+    def net(self, least: float) -> float:
+        """Value, each name at the price of the threshold."""
+        return self.value - least * len(self.names)
 
     @property
     def names(self) -> tuple[int, ...]:
@@ -206,7 +217,19 @@ def hypotheses(point: Point, priors: Priors, active: Sequence[int], strongest: d
         found += [(float(gain[i]), screen.terms[i], float(prior[i])) for i in _distinct(gain, screen)]
     found = sorted((f for f in found if f[0] > least), key=lambda f: -f[0])[:WEIGHED]
     weighed = [_weigh(point, priors, active, term, prior, price[term.depth], beside) for _, term, prior in found]
-    return sorted(weighed, key=lambda h: -h.nats)
+    return sorted(filter(_matters, weighed), key=lambda h: -h.nats)
+
+
+def _matters(hypothesis: Hypothesis) -> bool:
+    """Whether the last term's force, in the phase where it is strongest, exceeds what does not matter."""
+    term, law, point = hypothesis.terms[-1], hypothesis.laws()[-1], hypothesis.point
+    index = LATENT_BLOCKS.index(term.block)
+    square: dict[str, list[float]] = {}
+    for w in point.windows:
+        if np.any(w.latent_block == index):
+            square.setdefault(w.phase, []).append(float((term.values(w.knots) ** 2).sum(1).mean()))
+    force = abs(law.coefficient) * np.sqrt(max(float(np.mean(values)) for values in square.values()))
+    return force > MATERIAL * min(level for (block, _), level in point.noise.latent_sd.items() if block == index)
 
 
 def _distinct(gain: np.ndarray, screen: _Screen) -> list[int]:
@@ -223,15 +246,13 @@ def _distinct(gain: np.ndarray, screen: _Screen) -> list[int]:
 
 @dataclass(frozen=True)
 class Answer:
-    """What the grammar has to say."""
+    """What the grammar has to say: sets of names and terms, the best first, each net of its prices."""
 
-    alone: tuple[Hypothesis, ...] = ()  # beside no name
-    beside: tuple[Hypothesis, ...] = ()  # beside the names found
-    strongest: tuple[Hypothesis, ...] = ()  # the better of both, its best possibly of two terms
+    strongest: tuple[Hypothesis, ...] = ()  # the first possibly of two terms
 
 
 def find_laws(search: "Search") -> Answer:
-    """Look for terms that explain the flights instead of the names found, and beside them."""
+    """Look for terms that explain the flights instead of the names found, instead of some of them, and beside them."""
     strongest: dict[str, float] = {}
     for (block, _), level in search.nominal.noise.latent_sd.items():
         name = LATENT_BLOCKS[block]
@@ -239,15 +260,30 @@ def find_laws(search: "Search") -> Answer:
     if not all(w.knots for w in search.nominal.windows) or not strongest:
         return Answer()
     priors, least = search.priors, search.least
-    alone = hypotheses(search.nominal, priors, (), strongest, least)
-    beside = hypotheses(search.point, priors, search.active, strongest, least) if search.active else alone
-    best = beside if not alone or (beside and beside[0].value >= alone[0].value - least * len(search.active)) else alone
-    if best and best[0].nats > least + MARGIN:
-        first = best[0]
+    found = hypotheses(search.nominal, priors, (), strongest, least)
+    if search.active:
+        found += [_pruned(h, least) for h in hypotheses(search.point, priors, search.active, strongest, least)]
+    found.sort(key=lambda h: -h.net(least))
+    if found and found[0].nats > least + MARGIN:
+        first = found[0]
         pairs = hypotheses(first.point, first.priors, first.active, strongest, least + MARGIN, first)
         if pairs and pairs[0].nats > least + MARGIN:
-            best = [pairs[0], *best]
-    return Answer(tuple(alone), tuple(beside), tuple(best))
+            found.insert(0, pairs[0])
+    return Answer(tuple(found))
+
+
+def _pruned(hypothesis: Hypothesis, least: float) -> Hypothesis:
+    """Without the names that are not worth their threshold beside the term, the weakest first."""
+    point, priors, active = hypothesis.point, hypothesis.priors, list(hypothesis.active)
+    count = len(hypothesis.terms)
+    while names := active[:-count]:
+        whole = point.evidence(priors, active)
+        worth = {j: whole - point.evidence(priors, [k for k in active if k != j]) for j in names}
+        weakest = min(worth, key=worth.get)
+        if worth[weakest] > max(least, REMAINDER * (whole - hypothesis.price - point.evidence(priors, names))):
+            break
+        active.remove(weakest)
+    return replace(hypothesis, active=tuple(active))
 
 
 def beats_the_catalogue(search: "Search", answer: Answer) -> tuple[Hypothesis | None, set[int], str]:
@@ -259,21 +295,14 @@ def beats_the_catalogue(search: "Search", answer: Answer) -> tuple[Hypothesis | 
     if not answer.strongest:
         return None, set(), ""
     best = answer.strongest[0]
-    if search.active and not best.names:
-        names = search.point.evidence(search.priors, search.active) - search.least * len(search.active)
-        ahead = best.value - names
+    withdrawn = set(search.active) - set(best.names)
+    if withdrawn:
+        ahead = best.net(search.least) - (search.point.evidence(search.priors, search.active) - search.least * len(search.active))
         if ahead > MARGIN:
-            return best, set(search.active), f"{_text(best)} explains the flights better than {_names(search)}, by {ahead:.0f} nats"
-    if best.nats > search.least + MARGIN and best.names == tuple(search.active):
-        idle = {j for j in best.names if _worth(best, j) < search.least}
-        return best, idle, f"{_text(best)} is missing besides what the catalogue holds ({best.nats:.0f} nats)"
+            return best, withdrawn, f"{_text(best)} explains the flights better than {_names(search)}, by {ahead:.0f} nats"
+    elif best.nats > search.least + MARGIN:
+        return best, set(), f"{_text(best)} is missing besides what the catalogue holds ({best.nats:.0f} nats)"
     return None, set(), ""
-
-
-def _worth(hypothesis: Hypothesis, j: int) -> float:
-    """Nats that a name is still worth beside the terms."""
-    whole = hypothesis.point.evidence(hypothesis.priors, hypothesis.active)
-    return whole - hypothesis.point.evidence(hypothesis.priors, [k for k in hypothesis.active if k != j])
 
 
 def _names(search: "Search") -> str:

@@ -11,7 +11,7 @@ from visthrow.diagnose.evidence import Priors, covariance, estimate
 from visthrow.diagnose.excess import acts_on, levels, too_strong
 from visthrow.diagnose.model import Model, Window
 from visthrow.diagnose.point import Point
-from visthrow.diagnose.result import Diagnosis, Finding, Level
+from visthrow.diagnose.result import Diagnosis, Finding, Law, Level
 from visthrow.diagnose.work import Work
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ def conclude(search: "Search", *, laws: bool) -> Diagnosis:
     law = beats_the_catalogue(search, answer)
     overall, block, reasons, withdrawn = _overall(search, found, *law)
     known = overall != result.UNKNOWN  # a term that is weaker than the names says nothing
-    terms = [] if known else [term for hypothesis in answer.strongest for term in hypothesis.laws()]
+    terms = [] if known else _different(answer.strongest)
     active = [j for j in search.active if j not in withdrawn]
     if not active and search.active:
         point = search.nominal
@@ -71,6 +71,14 @@ def conclude(search: "Search", *, laws: bool) -> Diagnosis:
         flights=len(point.statistics.flights), windows=len(point.windows), samples=int(point.statistics.samples.sum()),
         work=Work(search.problem, search.nominal, search.point if active else search.nominal, tuple(active)),
     )  # fmt: skip
+
+
+def _different(hypotheses: Sequence["Hypothesis"]) -> tuple[Law, ...]:
+    """Laws of hypotheses, each formula once, with the coefficient of the best."""
+    laws: dict[str, Law] = {}
+    for law in (law for hypothesis in hypotheses for law in hypothesis.laws()):
+        laws.setdefault(law.formula, law)
+    return tuple(laws.values())
 
 
 def _events(search: "Search", point: Point) -> tuple[int, ...]:
