@@ -74,6 +74,8 @@ class Throw:
 class Tracker:
     """Flies lanes along their references from position, velocity, attitude with the noise of a tracking system."""
 
+    gains = POSITION, VELOCITY, ATTITUDE
+
     def __init__(self, references: list, mass: float, ball_mass: float, rng: np.random.Generator):
         self.references, self.rng = references, rng
         self.with_ball, self.alone = mass + ball_mass, mass
@@ -85,7 +87,8 @@ class Tracker:
         yaw = np.array([w[3] for w in want])
         x = x + self.rng.normal(0, 1e-3, x.shape)
         v = v + self.rng.normal(0, 2e-2, v.shape)
-        a = a_r + POSITION * (p_r - x) + VELOCITY * (v_r - v)
+        position, velocity, attitude = self.gains
+        a = a_r + position * (p_r - x) + velocity * (v_r - v)
         a[:, 2] += GRAVITY
         a[:, 2] = np.maximum(a[:, 2], 2.0)
         mass = np.where(hanging, self.with_ball, self.alone)
@@ -100,6 +103,6 @@ class Tracker:
         front = np.cross(side, up)
         error = 0.5 * (np.cross(body_x, front) + np.cross(body_y, side) + np.cross(body_z, up))
         in_body = np.stack([(error * body_x).sum(1), (error * body_y).sum(1), (error * body_z).sum(1)], -1)
-        rates = np.clip(2 * ATTITUDE * in_body * [1, 1, 0.5], -RATE_LIMIT, RATE_LIMIT)
+        rates = np.clip(2 * attitude * in_body * [1, 1, 0.5], -RATE_LIMIT, RATE_LIMIT)
         thrust = np.clip(mass * (a * body_z).sum(1), 0.3, 13.0)
         return np.column_stack([thrust, rates])
