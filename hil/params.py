@@ -1,6 +1,6 @@
 """Configuration of a run: one file of ``configs/hil``. SI units; nothing about frames has a default."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 from camera.params import CameraParams
@@ -93,7 +93,7 @@ class HilParams:
     betaflight: BetaflightParams
     keypoints: Literal["projection", "detector"] = "projection"  # of the poses, or of what a camera sees
     images: ImageParams | None = None  # of the detector
-    realtime: RealtimeParams = RealtimeParams()
+    realtime: RealtimeParams = field(default_factory=RealtimeParams)
     against: CameraLogParams | None = None  # a camera's own detections in the source's file
 
     def __post_init__(self) -> None:

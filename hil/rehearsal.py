@@ -8,7 +8,7 @@ poses that have come so far. Its outcome is thrown away.
 import copy
 import dataclasses
 import traceback
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from hil.clock import Clock
@@ -68,24 +68,31 @@ class Rehearsal:
         if begin + self._longest[0] + self._longest[1] + SPARE > due:
             self._longest = [FORGET * longest for longest in self._longest]
             return
-        try:
-            twin = self.twin()
-        except Exception:  # a runner that cannot be copied flies all the same
-            self.failed = traceback.format_exc()
+        twin = self._kept(self.twin)
+        if twin is None:
             return
         self._longest[0] = max(clock.now() - begin, FORGET * self._longest[0])
         left = MOST
         while (begin := clock.now()) < due:
             yield begin
-            if left and begin + self._longest[1] + SPARE <= due:
-                self.once(twin, due)
+            if left and self.failed is None and begin + self._longest[1] + SPARE <= due:
+                self._kept(self.once, twin, due)
                 left -= 1
                 self._longest[1] = max(clock.now() - begin, FORGET * self._longest[1])
             elif clock.now() <= begin:
                 return  # a clock that stands still until it is told to go on
 
+    def _kept(self, act: Callable[..., Any], *given: Any) -> Any:
+        """Do something; where it goes wrong there are no more rehearsals, and the runner flies on."""
+        try:
+            return act(*given)
+        except Exception:
+            self.failed = traceback.format_exc()
+            return None
+
     def once(self, twin: Runner, due: float) -> None:
         """Tick a copy as the runner will be at a time [s]."""
+        twin.pilot = copy.copy(self._runner.pilot)  # as often as it is rehearsed it is the same step
         twin.rehearse(due, twin.backend.status(due), Words())
         self.count += 1
 

@@ -142,6 +142,12 @@ def test_a_runner_that_cannot_be_copied_flies_all_the_same():
     runner, source, clock, _ = peers(LevelPlant(), loaded=simple_policy(ACTION), overrides=QUICK)
     runner.guard.lock = threading.Lock()
     rehearsal = Rehearsal(runner)
-    summary = fly(runner, source, clock, AutoOperator(), None, 1.0, rehearsal=rehearsal)
+    summary = fly(runner, source, clock, AutoOperator(), None, 0.5, rehearsal=rehearsal)
     assert "cannot pickle" in summary["rehearsal_failed"]
     assert (summary["rehearsals"], summary["errors"]) == (0, [])
+    del runner.guard.lock
+    rehearsal = Rehearsal(runner)
+    rehearsal._runner = "none"
+    summary = fly(runner, source, clock, AutoOperator(), None, 0.5, rehearsal=rehearsal)
+    assert "has no" in summary["rehearsal_failed"]
+    assert summary["ticks"] > 20
