@@ -25,7 +25,9 @@ class Latch:
         landings: of the throws so far.
     """
 
-    def __init__(self, lag: float, mechanism_lag: float, hang: float, tolerance: float, height: float) -> None:
+    def __init__(
+        self, lag: float, mechanism_lag: float, hang: float, tolerance: float, height: float, later: float = 0.0
+    ) -> None:  # fmt: skip
         """Start with the payload hanging.
 
         Args:
@@ -34,16 +36,17 @@ class Latch:
             hang: of the payload's centre below the vehicle's at rest [m].
             tolerance: of that distance, within which the payload counts as hanging [m].
             height: of the payload's centre as it lands [m].
+            later: by which all that the policy decides comes about later than in its training [s], the separation as well.
 
         Raises:
             RunError: the mechanism is slower than the policy was trained for.
         """
-        if mechanism_lag > lag + LAG_TOLERANCE:
+        if mechanism_lag > lag + later + LAG_TOLERANCE:
             raise RunError(
                 f"the mechanism takes {mechanism_lag:g} s from command to separation, the policy was trained with "
                 f"{lag:g} s; train one for the slower mechanism"
             )
-        self.lag, self._wait = lag, max(0.0, lag - mechanism_lag)
+        self.lag, self._wait = lag, max(0.0, lag + later - mechanism_lag)
         self._hang, self._tolerance, self._height = hang, tolerance, height
         self.at: float | None = None
         self.count = self.stuck = 0

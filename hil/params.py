@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from camera.params import CameraParams
+from hil.aim import AimParams
 from hil.backends.ardupilot import ArduPilotParams
 from hil.backends.betaflight import BetaflightParams
 from hil.backends.px4 import Px4Params
@@ -94,6 +95,7 @@ class HilParams:
     keypoints: Literal["projection", "detector"] = "projection"  # of the poses, or of what a camera sees
     images: ImageParams | None = None  # of the detector
     realtime: RealtimeParams = field(default_factory=RealtimeParams)
+    aim: AimParams | None = None  # which releases are held back; None: none
     against: CameraLogParams | None = None  # a camera's own detections in the source's file
 
     def __post_init__(self) -> None:

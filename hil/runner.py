@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from hil.aim import Aim
 from hil.backends.base import FAILED, FOLLOW, LAND, PENDING, Backend, Status
 from hil.backends.base import HOLD as HELD
 from hil.decision import Decision, Words
@@ -86,14 +87,16 @@ class Runner:
         rope, body, action = contract["rope"], contract["vehicle"]["body"], contract["action"]
         self.alone, self.mass = body["mass"], body["mass"] + rope["rope_mass"] + rope["payload_mass"]
         self.hang = -rope["mount"][2] + rope["length"] + rope["payload_offset"]
-        self.latch = Latch(self.pilot.lag, mechanism_lag, self.hang, params.check.rope_tolerance, params.landing_height)
+        height, later = params.landing_height, params.delay.command if params.delay.compensate else 0.0
+        self.latch = Latch(self.pilot.lag, mechanism_lag, self.hang, params.check.rope_tolerance, height, later)
         self._reach = math.hypot(*rope["mount"]) + rope["length"] + rope["payload_offset"] + params.check.rope_tolerance
         self.guard = Guard(params.guard, float(action["max_thrust"]), tuple(map(float, action["max_rate"])))
         self.tracks = {name: Track(frames, params.gate, params.estimate, name == VEHICLE) for name, frames in params.frames.items()}
         self.machine = Machine(params.states, params.throws, params.observe)
         heading = math.radians(params.check.heading_deg)
         self.hovering = Hovering(params.home_w, heading, float(action["max_thrust"]), self.pilot.period)
-        self._latency = contract["observation"]["latency"]
+        self._aged = 0.5 * sum(contract["observation"]["latency"])
+        self.aim = Aim(params.aim, self._aged + self.latch.lag, height, rope)
         self._acted = State.IDLE
         self.errors: list[str] = []
         self.mount_b: Vector = tuple(map(float, rope["mount"]))
@@ -257,8 +260,7 @@ class Runner:
         delay = self.params.delay
         last = track.gate.last
         age = track.gate.age(now) + (delay.source if last is None else last.transit(delay.source))
-        trained = 0.5 * (self._latency[0] + self._latency[1])
-        ahead = age - trained + delay.command if delay.compensate and math.isfinite(age) else 0.0
+        ahead = age - self._aged + delay.command if delay.compensate and math.isfinite(age) else 0.0
         return track.state(now, ahead)
 
     def _goal(self, bodies: dict[str, BodyState | None]) -> Vector | None:
@@ -296,6 +298,7 @@ class Runner:
             and self._still(vehicle, payload, status.mode == HELD),
             self.latch.separated(now),
             self.latch.at is not None,
+            self.aim.given_up(now),
             vehicle is not None and vehicle.pos[2] < GROUND,
             failure,
             words.arm,
@@ -332,6 +335,7 @@ class Runner:
         if state is State.THROW:
             self.pilot.start()
             self.latch.begin(now)
+            self.aim.begin()
         if state in (State.READY, State.RECOVER) and before in (State.CHECK, State.THROW):
             self.hovering.hold(self.params.home_w)
         if state in (State.LAND, State.ABORT) and vehicle is not None:
@@ -368,8 +372,11 @@ class Runner:
         if out.release[0] and self.latch.at is None:
             fence = self.params.fence
             beyond = outside(payload.pos, fence.payload_low, fence.payload_high)
-            decision.release = beyond is None
-            decision.note = "" if beyond is None else f"release refused: payload {beyond}"
+            wrong = f"payload {beyond}" if beyond else self.aim.astray(decision.time, payload, goal_w)
+            decision.release = wrong is None
+            if wrong is not None:
+                decision.note = f"release refused: {wrong}"
+                self.pilot.not_released()
         return tuple(map(float, out.command[0]))
 
     def _show(self, vehicle: BodyState, payload: BodyState, goal_w: Vector, decision: Decision) -> PilotOutput:
@@ -377,7 +384,7 @@ class Runner:
         attached = not self.latch.separated(decision.time)
         views = [np.array([v]) for v in (vehicle.pos, vehicle.quat, vehicle.vel, vehicle.rate, payload.pos)]
         keypoints = None if self.sights is None else self.sights.keypoints(decision.time)
-        out: PilotOutput = self.pilot.act(*views, np.array(goal_w), attached, keypoints)
+        out: PilotOutput = self.pilot.act(*views, np.array(goal_w), attached, keypoints, decision.time)
         self.spent["observation"], self.spent["policy"] = self.pilot.spent
         decision.action = out.action[0].tolist()
         decision.observation = out.observation[0].tolist()
@@ -405,6 +412,7 @@ class Runner:
             "cancelled": self.machine.cancelled,
             "latches": self.latch.count,
             "stuck": self.latch.stuck,
+            "held_back": self.aim.held,
             "landings": [asdict(landing) for landing in self.latch.landings],
             "guard": {k: getattr(self.guard, k) for k in ("clipped", "slewed", "refused")},
             "bodies": {

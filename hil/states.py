@@ -68,6 +68,7 @@ class Inputs:
     still: bool = False  # vehicle at home and vehicle and payload slow
     separated: bool = False  # latch plus trained lag has passed in this throw
     released: bool = False  # the latch has tripped in this throw
+    astray: bool = False  # releases that were asked for were held back, and nothing better came
     grounded: bool = False  # the descent has arrived
     failure: str | None = None  # of policy, guard, release or of the runner itself
     arm: bool = False  # the operator's words
@@ -192,6 +193,8 @@ class Machine:
             return  # what is latched cannot be taken back: fly on until it is off
         elif max(seen.vehicle, seen.payload) >= HOLD:
             self._go(now, State.RECOVER, "stale poses")
+        elif seen.astray:
+            self._go(now, State.RECOVER, "the policy released where it would miss")
         elif self._late(now):
             self._go(now, State.RECOVER, "the policy did not release in time")
 

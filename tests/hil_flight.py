@@ -25,7 +25,7 @@ OURS = tuple(
 
 def params(*overrides: str) -> HilParams:
     """The shipped dry run, in our frames and without a delay."""
-    given = (*OURS, "policy=state", "observe=false", "delay.source=0.0", *overrides)
+    given = (*OURS, "policy=state", "observe=false", "delay.source=0.0", "aim.bound=9.0", *overrides)  # releases in hover
     return config.load(HilParams, config.find("hil", "dry_run"), given)
 
 

@@ -68,6 +68,27 @@ def layout_of(params) -> Layout:
     raise ValueError(f"observation layout {params.layout!r}: expected 'state' or 'vision'")
 
 
+def resampled(history: Tensor, newest: Tensor, ages: list[float], period: float) -> Tensor:
+    """Histories as they would be if a step had come each period before now, by straight lines between those that came.
+
+    Args:
+        history: payload parts of earlier steps, newest first, shape (E, 1 + H, payload).
+        newest: of this step, shape (E, payload).
+        ages: of the steps in the history, newest first, ascending [s]; rows beyond them are copies of the oldest.
+        period: [s].
+
+    Returns:
+        Rows that are 1, 2, ... periods old, shape (E, 1 + H, payload); what is older than all that came is the oldest.
+    """
+    knots, rows, out = [0.0, *ages], torch.cat([newest[:, None], history], dim=1), []
+    for k in range(1, 1 + history.shape[1]):
+        after = next((i for i, age in enumerate(knots) if age >= k * period), len(knots) - 1)
+        gap = knots[after] - knots[after - 1]
+        share = min((k * period - knots[after - 1]) / gap, 1.0)
+        out.append(torch.lerp(rows[:, after - 1], rows[:, after], share))
+    return torch.stack(out, dim=1)
+
+
 def rotation_from_quat(quat: Tensor) -> Tensor:
     """Rotation matrix, shape (E, 3, 3), of unit quaternions xyzw, shape (E, 4)."""
     x, y, z, w = quat.unbind(-1)

@@ -28,6 +28,10 @@ VIEWS = {"pos_w": 3, "quat_wb": 4, "vel_w": 3, "rate_b": 3, "payload_w": 3, "goa
 """What one step is shown, and the width of each: the columns of one array."""
 
 
+JITTER = 2e-3
+"""By which steps may be off their times without being counted as late [s]: the payload moves some millimetres in it."""
+
+
 @dataclass(frozen=True)
 class PilotOutput:
     """What one control step decided, and what it saw. NumPy, shape (E, ...)."""
@@ -118,6 +122,8 @@ class Pilot:
         self._history = torch.zeros(self.count, 1 + self.layout.history, self.layout.payload)
         self._fresh = torch.ones(self.count, dtype=torch.bool)
         self._goal_fit, self._steps = goal_motion.empty_sums(self.count), 0
+        self._times: tuple[float, ...] = ()  # of the history's rows, newest first; those beyond are copies of the oldest [s]
+        self._unasked = self._previous[:, 4]  # what the action before the last one said of the release
 
     @property
     def previous_action(self) -> np.ndarray:
@@ -135,6 +141,7 @@ class Pilot:
         goal_w: np.ndarray,
         attached: np.ndarray | bool = True,
         keypoints: tuple[np.ndarray, np.ndarray] | None = None,
+        now: float | None = None,
     ) -> PilotOutput:
         """Decide one control step.
 
@@ -147,6 +154,7 @@ class Pilot:
             attached: whether the payload hangs on the vehicle, shape (E,) or one for all.
             keypoints: what a detector saw, normalised, shape (E, 8, 2), and validity, shape (E, 8), in place of what payload
                 and goal project to; only with a camera.
+            now: time of this step on any clock [s], where steps may be late or missing; None: they come a period apart.
 
         Raises:
             ValueError: An array of another shape.
@@ -154,22 +162,47 @@ class Pilot:
         begin = time.perf_counter()
         goal_w, attached = np.asarray(goal_w).reshape(-1, 3), np.asarray(attached).reshape(-1, 1)
         views = self._measured(pos_w, quat_wb, vel_w, rate_b, payload_w, goal_w, attached)
-        carried = (self._previous, self._history, self._fresh)
-        if self.layout.motion:
-            carried += (self._goal_fit, torch.full((self.count,), self._steps * self.period))
-        if keypoints is None:
-            observation, *rest = self._observe(views, *carried)
-        else:
-            given = (torch.from_numpy(np.array(part)) for part in keypoints)
-            observation, *rest = self._observe_given(views, *carried, *given)
+        given = () if keypoints is None else tuple(torch.from_numpy(np.array(part)) for part in keypoints)
+        observation, *rest = self._seen(views, given)
+        if now is not None and self._bridged(now, rest[0][:, 0]):
+            observation, *rest = self._seen(views, given)
         self._history, self._goal_fit, *seen = rest if self.layout.motion else (rest[0], self._goal_fit, *rest[1:])
         decided = time.perf_counter()
         action, command, release = self._decide(observation)
+        self._unasked = self._previous[:, 4]
         self._previous, self._fresh, self._steps = action, self._later, self._steps + 1
         points, valid = (part.numpy() for part in seen) if seen else (None, None)
         out = PilotOutput(action.numpy(), command.numpy(), release.numpy(), observation.numpy(), points, valid)
         self.spent = (decided - begin, time.perf_counter() - decided)
         return out
+
+    def not_released(self) -> None:
+        """Say that the release which the last call asked for was not done: the next call is told of none, as in training."""
+        self._previous = torch.cat([self._previous[:, :4], self._unasked[:, None]], dim=-1)
+
+    def _seen(self, views: Tensor, given: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+        """What `_observed` makes of a step's measurements and all that was before; ``given``: keypoints of a detector."""
+        carried = (self._previous, self._history, self._fresh)
+        if self.layout.motion:
+            carried += (self._goal_fit, torch.full((self.count,), self._steps * self.period))
+        return (self._observe_given if given else self._observe)(views, *carried, *given)
+
+    def _bridged(self, now: float, newest: Tensor) -> bool:
+        """Make the history one of steps a period apart, as in training; whether steps before this one were late or missing.
+
+        Args:
+            now: of this step [s]. newest: its payload part, shape (E, layout.payload).
+        """
+        times, period, rows = self._times, self.period, 1 + self.layout.history
+        ages = [now - time for time in times]
+        due = [now - k * period for k in range(1, 1 + rows) if ages and k * period < ages[-1] + JITTER]
+        late = len(due) != len(times) or any(abs(time - when) > JITTER for time, when in zip(times, due))
+        if late:
+            self._history = ob.resampled(self._history, newest, ages, period)
+            self._steps += max(round(ages[0] / period) - 1, 0)
+            times = tuple(due)
+        self._times = (now, *times[: rows - 1])
+        return late
 
     def _measured(self, *views: np.ndarray | bool) -> Tensor:
         """The measurements of one step side by side, shape (E, 20): the columns of :data:`VIEWS`.

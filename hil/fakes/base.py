@@ -1,7 +1,6 @@
 """What all fakes share: plant, motion capture on the wire, a queue of things that take their time, a hold of their own."""
 
 import heapq
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
@@ -9,6 +8,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 
 from hil.backends.thrust import ThrustParams
+from hil.fakes.set_points import SetPoints
 from hil.fakes.witness import Witness
 from hil.frames import FrameParams, Frames
 from hil.link import Link
@@ -124,12 +124,11 @@ class Fake:
         self._hover = HoverController(HoverParams(max_thrust=plant.max_thrust), plant.period)
         self._payload_sender = mav.MAVLink(None, *PAYLOAD_ID)
         self._later: list[tuple[float, int, Callable[[], None]]] = []
-        self._coming: deque[tuple[float, np.ndarray]] = deque()  # set-points, and from when on they act [s]
+        self._set_points = SetPoints()
         self._count = 0
         self.armed = self.options.armed
         self._place = np.array(plant.home_w, dtype=float)
-        self._acting: np.ndarray | None = None  # newest set-point that acts
-        self._target: np.ndarray | None = None  # mean of those that act in this period
+        self._target: np.ndarray | None = None  # of the set-points that act in this period
         self._told = float("-inf")  # when the last set-point was followed [s]
         self._trip: float | None = None  # when the latch of the plant trips [s]
         self.followed = self.ignored = 0
@@ -172,25 +171,13 @@ class Fake:
         self.followed += 1
         self._told = self.plant.time
         delay = self.options.command_delay
-        self._coming.append((self.heard + (self.usual_delay if delay is None else delay), np.nan_to_num(np.array(command))))
+        delay = self.usual_delay if delay is None else delay
+        self._set_points.add(self.heard + delay, np.nan_to_num(np.array(command)))
 
     def forget(self) -> None:
         """Who flies from now on follows no set-point that came before."""
-        self._acting = self._target = None
-        self._coming.clear()
-
-    def _follow(self) -> None:
-        """Find what is to be flown in the period that begins: set-points that change within it count by their shares of it."""
-        begin, period = self.plant.time, self.plant.period
-        mean, since = np.zeros(4), begin
-        while self._coming and self._coming[0][0] < begin + period - SLACK:
-            when, target = self._coming.popleft()
-            if self._acting is not None:
-                mean += (max(when, begin) - since) / period * self._acting
-                since = max(when, begin)
-            self._acting = target
-        if self._acting is not None:
-            self._target = mean + (begin + period - since) / period * self._acting
+        self._target = None
+        self._set_points.forget()
 
     def open_mechanism(self) -> None:
         """The output moves, and what hangs on it lets go some time later; with "accepted" alone."""
@@ -254,7 +241,7 @@ class Fake:
         if not self.taken and self.plant.time >= self.options.taken_after:
             self.taken = True
             self.take()
-        self._follow()
+        self._target = self._set_points.flown(self.plant.time, self.plant.period)
         command = self.flown()
         self.last_thrust = command[0]
         after = 0.0 if self._trip is None else self._trip - self.plant.time

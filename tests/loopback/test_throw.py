@@ -1,5 +1,6 @@
 """Complete throws with the shipped policies: mocap in, thrust, rates and release out, payload lands."""
 
+import dataclasses
 import json
 import socket
 import subprocess
@@ -7,6 +8,7 @@ import sys
 
 import numpy as np
 import pytest
+import torch
 
 from hil.backends import make_backend, mechanism_lag
 from hil.cli import warm_up
@@ -21,6 +23,7 @@ from hil.runner import Runner
 from hil.sources import MavlinkSource, read_tlog
 from tests.loopback.wire import throw
 from visthrow import config
+from visthrow.pilot import Pilot
 from visthrow.policy import Policy, find_policy
 from visthrow.wire_plant import make
 
@@ -49,7 +52,27 @@ def test_throws_in_lock_step(policy):
         (landing,) = summary["landings"]
         assert np.linalg.norm(np.subtract(landing["landing_w"], true)) < READ_BACK
         assert (summary["cancelled"], fake.witness.releases, summary["guard"]["refused"]) == (0, 1, 0)
+        assert summary["held_back"] == 0, "a right throw is not delayed"
     assert np.mean(errors) < LANDING
+
+
+def test_a_policy_that_asks_too_early_is_held_back_and_throws_all_the_same(monkeypatch):
+    """Its first questions come in hover: none is passed on, and none is told to the policy as done; the throw then lands."""
+    loaded, asked, act = Policy.load(find_policy("vision")), [], Pilot.act
+
+    def hasty(pilot, *args):
+        out = act(pilot, *args)
+        if len(asked) < 8:
+            asked.append(args[-1])
+            pilot._previous = torch.cat([pilot._previous[:, :4], torch.ones(1, 1)], dim=-1)
+            out = dataclasses.replace(out, release=np.array([True]))
+        return out
+
+    monkeypatch.setattr(Pilot, "act", hasty)
+    summary, fake, _ = throw(make("vision", 0), policy="vision", loaded=loaded, seconds=4.5)
+    assert (summary["held_back"], summary["latches"], fake.witness.releases) == (8, 1, 1)
+    assert summary["latch_times"][0] > asked[-1] + 0.1
+    assert np.hypot(fake.plant.landing["landing_w"][0] - 2.0, fake.plant.landing["landing_w"][1]) < LANDING
 
 
 @pytest.mark.parametrize("after", [0.0, 0.0017, 0.0049])

@@ -1,0 +1,85 @@
+"""Where a payload is said to land: closed forms, and what is done about releases that lead astray."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from hil.aim import Aim, AimParams
+from hil.errors import ConfigError
+from hil.runner import Runner
+from hil.track import BodyState
+from tests.hil_flight import Spy, fly, params, simple_policy
+from visthrow.actions import hover_action
+
+ROPE = {"payload_mass": 0.058}
+AHEAD, HEIGHT = 0.12, 0.04
+HOVER = hover_action(9.81 * 0.272, 14.0)[0]
+
+
+def at(pos, vel) -> BodyState:
+    return BodyState(pos, None, vel, (0.0, 0.0, 0.0), 0.0)
+
+
+def fallen(pos, vel, drag):
+    """By an integrator with steps of its own; drag per mass [1/m]."""
+
+    def motion(_, y):
+        return [*y[3:], *(-drag * np.linalg.norm(y[3:]) * y[3:] - [0.0, 0.0, 9.81])]
+
+    def down(_, y):
+        return y[2] - HEIGHT
+
+    down.terminal, down.direction = True, -1.0
+    start = [*(np.array(pos) + AHEAD * np.array(vel)), *vel]
+    return solve_ivp(motion, (0.0, 5.0), start, events=down, rtol=1e-10, atol=1e-12).y_events[0][0, :2]
+
+
+@pytest.mark.parametrize("drag", [0.0, 1.04e-3])
+@pytest.mark.parametrize("vel", [(4.0, 0.3, 2.0), (-1.0, 2.0, -3.0), (0.0, 0.0, 0.0)])
+def test_prediction_against_an_integrator(vel, drag):
+    pos = (0.4, -0.1, 1.2)
+    found = Aim(None, AHEAD, HEIGHT, {**ROPE, "payload_drag": drag}).landing(at(pos, vel))
+    assert found == pytest.approx(fallen(pos, vel, drag / 0.058), abs=2e-3)
+
+
+def test_a_payload_below_the_ground_or_without_end_is_judged():
+    aim = Aim(None, AHEAD, HEIGHT, ROPE)
+    assert aim.landing(at((1.0, 2.0, -0.1), (0.0, 0.0, -1.0))) == pytest.approx((1.0, 2.0))
+    assert all(map(math.isfinite, aim.landing(at((1.0, 2.0, 1.0), (0.0, 0.0, 100.0)))))
+
+
+def test_what_is_held_back_and_when_it_is_given_up():
+    aim, goal = Aim(AimParams(bound=0.5, patience=0.4), AHEAD, HEIGHT, ROPE), (2.0, 0.0, 0.0)
+    good, bad = at((0.5, 0.0, 1.2), (2.4, 0.0, 1.5)), at((0.0, 0.0, 1.0), (0.0, 0.0, 0.0))
+    aim.begin()
+    assert aim.astray(1.0, good, goal) is None
+    assert "2.00 m from the goal, within 0.5 m expected" in aim.astray(1.1, bad, goal)
+    assert aim.astray(1.2, good, goal) is None, "the policy may ask again"
+    assert aim.astray(1.3, bad, goal)
+    assert (aim.given_up(1.49), aim.given_up(1.51), aim.held) == (False, True, 2)
+    aim.begin()
+    assert not aim.given_up(9.0)
+    assert Aim(None, AHEAD, HEIGHT, ROPE).astray(1.0, bad, goal) is None, "without a table all is let go"
+
+
+@pytest.mark.parametrize("wrong", [{"bound": 0.0, "patience": 0.4}, {"bound": 0.5, "patience": -1.0}])
+def test_numbers_that_hold_nothing_back(wrong):
+    with pytest.raises(ConfigError, match="expected both above 0"):
+        AimParams(**wrong)
+
+
+def test_a_policy_that_asks_in_hover_never_releases():
+    """It asks at every tick; the throw ends after the patience, and the vehicle hovers on with its payload."""
+    runner = Runner(params("aim.bound=0.8", "aim.patience=0.3"), simple_policy((HOVER, 0.0, 0.0, 0.0, 1.0)), Spy())
+    decisions = fly(runner, 5.0)
+    asked = [d for d in decisions if d.note.startswith("release refused: it would land at")]
+    assert runner.backend.release_times == []
+    assert asked[-1].time - asked[0].time == pytest.approx(0.28, abs=0.021)
+    assert all(d.observation[19] < 0.5 for d in asked), "the policy is told of no release: there was none"
+    states = [d.state for d in decisions]
+    assert states[decisions.index(asked[-1]) + 1] == "recover"
+    assert decisions[decisions.index(asked[-1]) + 1].reason == "the policy released where it would miss"
+    assert runner.summary()["held_back"] == len(asked)
+    assert "abort" not in states

@@ -1,0 +1,68 @@
+"""What a policy sees after steps that were late or missing: a history of steps a period apart, as in training."""
+
+import numpy as np
+import pytest
+import torch
+
+from tests.hil_flight import simple_policy
+from visthrow.observations import resampled
+from visthrow.pilot import Pilot
+
+PERIOD = 0.02
+LEVEL = np.array([[0.0, 0.0, 0.0, 1.0]])
+STILL, GOAL = np.zeros((1, 3)), np.array([2.0, 0.0, 0.0])
+
+
+def seen(pilot: Pilot, time: float, now: float | None):
+    """Observation of a payload that moves evenly."""
+    payload = np.array([[0.1 + 0.9 * time, -0.4 * time, -0.38 + 0.2 * time]])
+    return pilot.act(STILL, LEVEL, STILL, STILL, payload, GOAL, True, None, now).observation
+
+
+def flown(times, timed=True):
+    """Observations of a pilot whose steps come at some times [periods]."""
+    pilot = Pilot(simple_policy((-0.1, 0.0, 0.0, 0.0, -1.0)))
+    return [seen(pilot, PERIOD * t, PERIOD * t if timed else None) for t in times][-1]
+
+
+@pytest.mark.parametrize(
+    "times",
+    [
+        [0, 1, 2, 3, 4, 6],  # one missed
+        [0, 1, 2, 3, 6],  # two
+        [0, 1, 2, 6],  # more than the history is long
+        [0, 1, 2, 3.7, 4, 5, 6],  # one late, the next ones in time
+        [0, 1, 2, 3, 4, 5.9, 6],
+        [0, 2, 5, 6],
+    ],
+)
+def test_a_history_with_gaps_is_that_of_regular_steps(times):
+    even = flown(range(7), timed=False)
+    np.testing.assert_allclose(flown(times), even, atol=2e-6)
+    assert np.abs(flown(times, timed=False) - even).max() > 5e-3, "without the times it is not"
+
+
+def test_steps_in_time_are_the_same_bits():
+    times = np.arange(12) + 0.04 * np.sin(np.arange(12.0))
+    pilots = [Pilot(simple_policy((-0.1, 0.0, 0.0, 0.0, -1.0))) for _ in range(2)]
+    for t in times:
+        first, second = seen(pilots[0], PERIOD * t, PERIOD * t), seen(pilots[1], PERIOD * t, None)
+        assert np.array_equal(first, second)
+
+
+def test_what_is_older_than_the_throw_is_its_first_step():
+    history = torch.tensor([[[4.0], [1.0], [1.0], [1.0]]])
+    found = resampled(history, torch.tensor([[8.0]]), [0.04, 0.06], PERIOD)
+    assert found[0, :, 0].tolist() == pytest.approx([6.0, 4.0, 1.0, 1.0])
+
+
+def test_a_release_that_was_not_done_is_not_told():
+    pilot = Pilot(simple_policy((-0.1, 0.3, 0.0, 0.0, 1.0)))
+    before = pilot.previous_action[0, 4]
+    seen(pilot, 0.0, 0.0)
+    assert pilot.previous_action[0, 4] == 1.0
+    pilot.not_released()
+    assert pilot.previous_action[0].tolist() == pytest.approx([-0.1, 0.3, 0.0, 0.0, before])
+    seen(pilot, PERIOD, PERIOD)
+    pilot.not_released()
+    assert pilot.previous_action[0, 4] == before, "nor when it is asked for again"
