@@ -83,7 +83,7 @@ def test_a_law_is_written_as_a_block(diagnosis, tmp_path, capsys):
 def test_every_effect_can_be_written():
     before = shipped()
     for name, e in ALL.items():
-        if name != "step_error" and e.applies(patch.opened(patch.Setting(plant_of(before)))):  # whose step is the replay's
+        if name != "step_error" and e.applies(patch.opened(patch.Setting(plant_of(before), camera=before.camera))):  # whose step is the replay's
             theta = {name: 1.0 if e.switch else e.effect.floor}
             content = patch.text("train/state.toml", before, theta, [[1e-12]], 1, ["test"])
             after = config.loads(Experiment, content)

@@ -35,7 +35,8 @@ def nominal() -> SimpleNamespace:
         ground=0.0, wind=np.zeros(3), speed_thrust=0.0, slew_thrust=0.0, yaw_swirl=0.0,
         mount=np.array(r["mount"]), length=r["length"], rope_mass=r["rope_mass"], ball_mass=r["payload_mass"],
         ball_reach=r["payload_offset"], ball_inertia=r["payload_inertia"], joint_damping=r["joint_damping"],
-        joint_damping_square=0.0, bending=0.0, stretch=0.0, rope_drag=0.0, ball_drag=0.0, ball_swirl=0.0, jet_push=0.0,
+        joint_damping_square=0.0, bending=0.0, stretch=0.0, rope_drag=0.0, ball_drag=0.0, ball_side=0.0, ball_lift=0.0,
+        ball_swirl=0.0, jet_push=0.0,
         # Not in the equations of motion: queue, release, sensors.
         delay=v["queue"]["delay"], release_lag=release["lag"], lag_per_newton=0.0, lag_jitter=0.0, kick=np.zeros(3),
         quad_stamp=0.0, ball_stamp=0.0, frame_tilt=np.zeros(3), marker_turn=np.zeros(3), marker_off=np.zeros(3),
@@ -107,6 +108,8 @@ CHANGES = {
     "frame_tilt_y": _add("frame_tilt", 1), "marker_rot_x": _add("marker_turn", 0), "marker_rot_y": _add("marker_turn", 1),
     "marker_rot_z": _add("marker_turn", 2), "marker_off_x": _add("marker_off", 0), "marker_off_z": _add("marker_off", 2),
     "wind_x": _add("wind", 0), "wind_y": _add("wind", 1), "ground_effect": _add("ground"),
+    "rope_elastic": lambda w, t: _add("stretch")(w, t / w.length),
+    "payload_side": _add("ball_side"), "payload_lift": _add("ball_lift"), "lag_jitter": _add("lag_jitter"),
     # Laws outside the catalogue.
     "law_speed_thrust": _add("speed_thrust"), "law_slew_thrust": _add("slew_thrust"), "law_vehicle_swirl": _add("yaw_swirl"),
     "law_ball_swirl": _add("ball_swirl"), "law_joint_square": _add("joint_damping_square"), "law_bending": _add("bending"),

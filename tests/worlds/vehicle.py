@@ -79,6 +79,8 @@ class Numbers:
     stretch: REAL  # 1 / EA [1/N]
     rope_drag: REAL  # on the ball, against its velocity across the rope [N s/m]
     ball_drag: REAL  # 1/2 rho C_d A [kg/m]
+    ball_side: REAL  # in flight, |v| e_z x v [kg/m]
+    ball_lift: REAL  # in flight, |v|^2 upwards across the path [kg/m]
     ball_swirl: REAL  # e_z x v on the ball [N s/m]: outside the catalogue
     jet_push: REAL  # downwash on the ball, along body -z, share of the thrust [-]
 
@@ -274,6 +276,11 @@ def ball_force(p: Numbers, v: V3, rot: M3, thrust: REAL, hanging: wp.int32):
     """Air on the ball [N, world]; the vehicle's jet only while it hangs."""
     air = v - p.wind
     out = -p.ball_drag * wp.length(air) * air + p.ball_swirl * V3(-air[1], air[0], REAL(0.0))
+    if hanging == 0:
+        level = wp.sqrt(air[0] * air[0] + air[1] * air[1])
+        if level > REAL(0.0):
+            up = V3(-air[0] * air[2] / level, -air[1] * air[2] / level, level)
+            out += wp.length(air) * (p.ball_side * V3(-air[1], air[0], REAL(0.0)) + p.ball_lift * up)
     if hanging == 1:
         out -= p.jet_push * thrust * (rot * V3(REAL(0.0), REAL(0.0), REAL(1.0)))
     return out

@@ -46,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
         report = json.loads(Path(args.diagnosis).read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise DiagnoseError(f"{args.diagnosis}: not readable as a diagnosis: {error}") from error
-    theta, covariance = patch.read(report, args.diagnosis)
+    theta, covariance = patch.with_scatter(*patch.read(report, args.diagnosis), report)
     laws = patch.laws_of(report, args.diagnosis, args.laws)
     if not theta and not laws:
         print("nothing was named; the configuration stands as it is")

@@ -66,7 +66,8 @@ def throw_model(args: argparse.Namespace, logs: Sequence[FlightLog]) -> Model:
 
     experiment = config.load(Experiment, config.find("train", args.plant), args.overrides)
     only = args.only.split(",") if args.only else None
-    return ThrowModel(logs, plant_of(experiment), sensing=experiment.sensing, device=resolve(args.device), only=only)
+    known = {"sensing": experiment.sensing, "camera": experiment.camera}
+    return ThrowModel(logs, plant_of(experiment), device=resolve(args.device), only=only, **known)
 
 
 class _Part:

@@ -4,11 +4,14 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from sim.laws import check_laws
 from sim.params import LawParams
 from visthrow import config
 from visthrow.diagnose.catalogue import ALL, Setting, apply
 from visthrow.diagnose.opened import closed, opened
+from visthrow.diagnose.scatter import variances
 from visthrow.errors import DiagnoseError
 from visthrow.task import Experiment, plant_of
 from visthrow.toml_text import dumps
@@ -91,10 +94,23 @@ def text(
 
 def _diagnosed(experiment: Experiment, theta: Mapping[str, float], covariance: Sequence[Sequence[float]], plants: int):
     """The joint posterior of the plant's own numbers: not of the sensors, the replay's step or which blocks there are."""
-    own = [i for i, name in enumerate(theta) if any(k.path.startswith("plant.") for k in ALL[name].keys)]
+    own = [i for i, name in enumerate(theta) if ALL[name].keys and all(k.path.startswith("plant.") for k in ALL[name].keys)]
     names = list(theta)
     rows = tuple(tuple(float(covariance[i][j]) for j in own) for i in own)
     return dataclasses.replace(experiment.diagnosed, effects=tuple(names[i] for i in own), covariance=rows, plants=plants)
+
+
+def with_scatter(
+    theta: Mapping[str, float], covariance: Sequence[Sequence[float]], report: Mapping[str, Any]
+) -> tuple[dict[str, float], list[list[float]]]:
+    """Sizes and covariance with what varies from flight to flight: training draws it with the rest of the posterior."""
+    drawn = variances(report.get("scatter") or [])
+    names = [*theta, *[name for name in drawn if name not in theta]]
+    whole = np.zeros((len(names), len(names)))
+    whole[: len(theta), : len(theta)] = np.reshape(covariance, (len(theta), len(theta)))
+    for name, variance in drawn.items():
+        whole[names.index(name), names.index(name)] += variance
+    return {name: theta.get(name, 0.0) for name in names}, whole.tolist()
 
 
 def laws_of(report: Mapping[str, Any], path: str, count: int) -> list[LawParams]:

@@ -4,6 +4,8 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
+from visthrow.diagnose.scatter import Scatter
+
 FOUND, CLASS, BOUNDED = "FOUND", "CLASS", "BOUNDED"
 NOT_IDENTIFIABLE, UNOBSERVABLE = "NOT IDENTIFIABLE", "UNOBSERVABLE"
 VERDICTS = {
@@ -114,6 +116,7 @@ class Diagnosis:
     samples: int = 0
     seconds: float = 0.0
     seed: int = 0
+    scatter: tuple[Scatter, ...] = ()  # what may vary from flight to flight
     work: Any = field(default=None, repr=False, compare=False)
 
     def __getitem__(self, name: str) -> Finding:
@@ -128,5 +131,5 @@ class Diagnosis:
     def to_dict(self) -> dict[str, Any]:
         """All but ``work``, for JSON."""
         fields = {name: value for name, value in vars(self).items() if name != "work"}
-        plain = {name: [asdict(v) for v in fields[name]] for name in ("findings", "steps", "levels", "laws")}
+        plain = {name: [asdict(v) for v in fields[name]] for name in ("findings", "steps", "levels", "laws", "scatter")}
         return {**fields, **plain}

@@ -1,0 +1,67 @@
+"""What varies from flight to flight: found where it does, silent where it does not, and handed on to training."""
+
+import numpy as np
+
+from visthrow.diagnose import patch
+from visthrow.diagnose.catalogue import ALL
+from visthrow.diagnose.catalogue.scatter import VARYING
+from visthrow.diagnose.evidence import Priors
+from visthrow.diagnose.marginal import Statistics
+from visthrow.diagnose.scatter import varying
+
+NAMES = ("release_lag", "payload_drag", "wind_x", "wind_y", "wind_z")
+EFFECTS = tuple(ALL[name].effect for name in NAMES)
+PRIORS = Priors.of(EFFECTS, ("pos_w", "quat_wb", "payload_pos_w"))
+LEAST = 4.0
+
+
+def flights(rng, count=10, **deviation):
+    """Statistics of flights in which effects are drawn anew with these deviations, in their units; common sizes below floors."""
+    K, F = len(NAMES), np.arange(count)
+    mix = rng.normal(size=(count, K, K)) * 0.3 + np.eye(K)
+    information = 4.0 * np.einsum("fij,fkj->fik", mix, mix)
+    own = np.array([deviation.get(name, 0.0) for name in NAMES]) / PRIORS.floor
+    theta = rng.normal(size=(count, K)) * own + rng.uniform(-0.5, 0.5, K)
+    noise = np.einsum("fij,fj->fi", np.linalg.cholesky(information), rng.normal(size=(count, K)))
+    score = np.einsum("fij,fj->fi", information, theta) + noise
+    return Statistics(F, information, score, np.zeros(count), np.full(count, 500), np.zeros(K))
+
+
+def told(rng, **deviation):
+    return {s.name: s for s in varying(flights(rng, **deviation), np.zeros(len(NAMES)), PRIORS, NAMES, LEAST)}
+
+
+def test_deviations_are_found_with_their_size():
+    rng = np.random.default_rng(5)
+    worlds = [told(rng, release_lag=0.012) for _ in range(60)]
+    assert np.mean([w["lag_jitter"].found for w in worlds]) > 0.9
+    assert not any(w["gust"].found for w in worlds)
+    inside = np.mean([w["lag_jitter"].low <= 0.012 <= w["lag_jitter"].high for w in worlds])
+    assert inside > 0.85, inside  # 95 %, less three and a half deviations of 60 draws
+    gusts = [told(rng, wind_x=0.25, wind_y=0.25, wind_z=0.25) for _ in range(25)]
+    assert np.mean([w["gust"].found for w in gusts]) > 0.9
+    assert abs(np.median([w["gust"].size for w in gusts]) - 0.25) < 0.06
+
+
+def test_equal_flights_do_not_vary():
+    rng = np.random.default_rng(6)
+    worlds = [told(rng) for _ in range(150)]
+    assert not any(s.found for w in worlds for s in w.values())
+
+
+def test_three_flights_say_nothing():
+    statistics = flights(np.random.default_rng(7), count=3, release_lag=0.05)
+    assert varying(statistics, np.zeros(len(NAMES)), PRIORS, NAMES, LEAST) == ()
+
+
+def test_training_draws_what_varies():
+    for v in VARYING:
+        assert all(ALL[name].effect.unit == v.unit and ALL[name].effect.block == v.block for name in v.of)
+    report = {"scatter": [{"name": "lag_jitter", "found": True, "size": 0.01, "of": ["release_lag"]},
+                          {"name": "gust", "found": False, "size": 0.2, "of": ["wind_x"]}]}  # fmt: skip
+    theta, covariance = patch.with_scatter({"rope_length": 0.01}, [[1e-8]], report)
+    assert theta == {"rope_length": 0.01, "release_lag": 0.0}
+    np.testing.assert_allclose(covariance, np.diag([1e-8, 1e-4]))
+    theta, covariance = patch.with_scatter({"release_lag": 0.02}, [[1e-6]], report)
+    assert theta == {"release_lag": 0.02}
+    np.testing.assert_allclose(covariance, [[1.01e-4]])
