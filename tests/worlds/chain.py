@@ -15,6 +15,10 @@ SEGMENTS = 15
 TWIST = 2e-8
 """Inertia of a rod about its axis [kg m^2]: at rest relative to its neighbours within a few milliseconds."""
 STEP = 5e-4
+TAUT = 3.0
+"""Pull [N] up to which RK4 follows the chain's highest mode, sqrt(12 T / (m l)) for rods of mass m and length l, at ``STEP``."""
+SLACK = 0.2
+"""Pull [N] below which a snap may come within a millisecond, and share of the step that is then taken."""
 
 
 @wp.func
@@ -131,12 +135,18 @@ class Chain:
             self.tension[e] = (w.ball_mass + w.rope_mass) * np.linalg.norm(pull)
             self.ball_x[e], self.ball_v[e] = d.site_xpos[self.site[e]], out[3:]
 
+    def _step(self, lanes: np.ndarray) -> float:
+        """Integration step for the ropes' pull at the last look [s]."""
+        pull = self.tension[lanes]
+        share = np.where(pull < SLACK, SLACK, np.minimum(1.0, np.sqrt(TAUT / np.maximum(pull, SLACK))))
+        return STEP * float(share.min())
+
     def run(self, start: float, stop: float, commands: np.ndarray, push, twist, ball) -> None:
         """Advance the hanging lanes from ``start`` to ``stop`` under constant commands and gusts."""
         lanes = np.flatnonzero(self.hanging)
         if not len(lanes) or stop - start < 1e-9:
             return
-        count = max(1, int(np.ceil((stop - start) / STEP - 1e-9)))
+        count = max(1, int(np.ceil((stop - start) / self._step(lanes) - 1e-9)))
         h = (stop - start) / count
         v, b, m = self._view, self.bodies, self._view["middle"]
         v["commands"][:], v["push"][:], v["twist"][:] = commands, push, twist
@@ -177,3 +187,5 @@ class Chain:
             for name in ("x", "v", "w", "q"):
                 m[name] = 0.5 * (self._before[name] + b[name])
             wp.launch(midpoint, len(b), [*self._in, h, 1, *self._out])
+        if any(self.data[e].warning.number.any() for e in lanes):
+            raise RuntimeError(f"MuJoCo's chain became unstable at {stop:.4f} s with a pull of {self.tension[lanes].max():.1f} N")

@@ -24,8 +24,8 @@ FLOORS = {
 }  # fmt: skip
 """Size below which an effect does not matter, in SI units, relative for gains and inertias: 5 mm of landing, or a tenth of
 the noise."""
-ONE_SIDED = ("mocap_delay_quad", "mocap_delay_payload", "payload_drag")
-"""Nothing is measured before it happens, and the model's payload has no drag that reality could lack."""
+ONE_SIDED = ("mocap_delay_quad", "mocap_delay_payload", "payload_drag", "rope_mass")
+"""Nothing is measured before it happens, the model's payload has no drag that reality could lack, and its rope hardly any mass."""
 PLANTS = ("chain", "string", "rod")
 GUSTS = (0.015, 1.5e-4, 6e-4)
 NOISE = {"pos": 5e-4, "att": np.radians(0.2), "ball": 8e-4}
