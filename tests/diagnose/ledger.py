@@ -30,10 +30,10 @@ LIMITS = {
 """Effect -> limit that is asked for (SI; the payload's drag is that of 0.3 of a ball's coefficient), factor and unit to print."""
 
 LEVELS = (50, 80, 95)
-MATTERS = 0.05
-"""Share of a channel's squared error that the oracle must remove for the channel to count in the gain."""
-HARM = 1.01
-"""Growth of the error on unseen throws that counts as harm."""
+MATTERS = 5.0
+"""Nats on unseen throws that the truth must be worth for a gain to be counted."""
+HARM, HARM_NATS = 1.01, 3.0
+"""Growth of the error on unseen throws, per sample in its deviations, and fall of their log likelihood, that count as harm."""
 RIDGE = 0.05
 """Of the logistic curves, on both coefficients: a curve without a miss has no finite slope."""
 DRAWS = 1000
@@ -119,7 +119,8 @@ def accuracy(worlds: Sequence[dict]) -> list[str]:
         more = sum(int(c[0] > len(truth_of(w))) for c, w in zip(counts, group))
         overall = [sum(w["overall"].startswith(x) for w in told) for x in ("NO EFFECT", "KNOWN", "UNKNOWN", "DATA")]
         seconds = f"{np.median([w['explain_s'] for w in told]):.0f} ({max(w['explain_s'] for w in told):.0f})" if told else "-"
-        row = [kind, len(group), len(group) - len(told), len(begun) - len(group), share(found, hidden), share(right, given), share(exact, given)]
+        row = [kind, len(group), len(group) - len(told), len(begun) - len(group)]
+        row += [share(found, hidden), share(right, given), share(exact, given)]
         row += [share(more, len(group)), *overall, seconds]
         lines.append("| " + " | ".join(map(str, row)) + " |")
     return lines
@@ -192,33 +193,25 @@ def intervals(worlds: Sequence[dict]) -> list[str]:
 
 
 def gain_ratio(held: dict) -> float:
-    """Share of the oracle's gain on unseen throws: root sums of squares over the channels where the oracle gains; NaN without."""
-    if "oracle" not in held:
-        return math.nan
-    sums = np.array([[held[who][c][0] for who in ("before", "after", "oracle")] for c in held["before"]])
-    sums = sums[sums[:, 0] - sums[:, 2] > MATTERS * sums[:, 0]]
-    before, after, oracle = np.sqrt(sums.sum(0))
-    return float((before - after) / (before - oracle)) if len(sums) else math.nan
-
-
-def harmed(held: dict) -> bool:
-    """Whether the model with the verdict's sizes predicts unseen throws worse than the one without, all channels together."""
-    before, after = (sum(c[0] for c in held[who].values()) for who in ("before", "after"))
-    return bool(math.sqrt(after) > HARM * math.sqrt(before))
+    """Share of the oracle's nats on unseen throws; NaN where the truth gains next to nothing there."""
+    gained = held["before"] - held.get("oracle", math.inf)
+    return (held["before"] - held["after"]) / gained if gained > MATTERS else math.nan
 
 
 def gains(worlds: Sequence[dict]) -> list[str]:
-    """Gain on throws that were held back, in parts of what the truth gains there."""
-    lines = ["| kind | worlds | median, of the oracle's gain | worst tenth | where something was named: median | harm |",
-             "|---|---:|---:|---:|---:|---|"]  # fmt: skip
-    with_held = [w for w in worlds if "held" in w]
+    """Gain on throws that were held back, in parts of what the truth gains there, and harm."""
+    lines = ["| kind | worlds | median, of the oracle's gain | worst tenth | where something was named: median, worst tenth "
+             "| harm: worse than before by 3 nats | by 1 % of the error |", "|---|---:|---:|---:|---:|---|---|"]  # fmt: skip
+    with_held = [w for w in worlds if "samples" in w.get("held", {})]
     for kind, group in {**grouped(with_held, lambda w: w["kind"]), "all": with_held}.items():
         ratio = [(gain_ratio(w["held"]), bool(w["named"])) for w in group]
         every = [r for r, _ in ratio if math.isfinite(r)]
         named = [r for r, told in ratio if told and math.isfinite(r)]
-        changed = [w for w in group if w["held"]["after"] != w["held"]["before"]]
+        worse = [(h["after"] - h["before"], h["samples"]) for h in (w["held"] for w in group) if h["after"] != h["before"]]
         row = [kind, len(group), *(f"{np.quantile(every, q):.2f}" if every else "-" for q in (0.5, 0.1))]
-        row += [f"{np.median(named):.2f}" if named else "-", share(sum(harmed(w["held"]) for w in changed), len(changed))]
+        row += [f"{np.median(named):.2f}, {np.quantile(named, 0.1):.2f}" if named else "-"]
+        row += [share(sum(nats > HARM_NATS for nats, _ in worse), len(worse))]
+        row += [share(sum(2.0 * nats / samples > HARM**2 - 1.0 for nats, samples in worse), len(worse))]
         lines.append("| " + " | ".join(map(str, row)) + " |")
     return lines
 

@@ -126,27 +126,26 @@ def ask(logs: list[Path], model: list[str], folder: Path, device: str = "cpu", t
     return json.loads(answer.read_text())
 
 
-def predictions(recipe: Recipe, theta: dict[str, float], held: Path) -> dict[str, dict]:
-    """Errors on the throws held back of the model as it was, with the verdict's sizes, and with the truth (the oracle).
+def on_held_back(recipe: Recipe, theta: dict[str, float], held: Path) -> dict[str, float]:
+    """Nats by which the throws held back are explained worse by the model as it was, and by the verdict's sizes, than by the truth.
 
-    A law outside the catalogue has no size: there is no oracle then.
+    See :func:`visthrow.diagnose.gain.shortfalls`; the truth is the ``oracle``, with 0, and ``samples`` their number. A law outside
+    the catalogue has no size: it is the model as it was then that has 0.
     """
     from visthrow import config
-    from visthrow.diagnose.gain import predicted
+    from visthrow.diagnose.gain import shortfalls
     from visthrow.diagnose.throw_model import ThrowModel
     from visthrow.task import Experiment, plant_of
 
-    sizes = {"before": {}, "after": theta}
+    sizes = {"after": theta, "before": {}}
     if not any(name.startswith("law_") for name in recipe.effects):
-        sizes["oracle"] = recipe.effects
+        sizes["oracle"] = dict(recipe.effects)
     plant = plant_of(config.load(Experiment, config.find("train", "state"), model_of(recipe)))
     logs = [FlightLog.load(path) for path in sorted(held.glob("*.npz"))]
     model = ThrowModel(logs, plant, only=sorted(set().union(*sizes.values())))
-    told: dict[str, dict] = {}
-    for who, theta in sizes.items():
-        same = next((other for other in told if sizes[other] == theta), None)
-        told[who] = told[same] if same else predicted(model, theta)
-    return told
+    different = list({json.dumps(s, sort_keys=True): s for s in sizes.values()}.values())
+    nats, samples = shortfalls(model, different)
+    return {who: nats[different.index(s)] for who, s in sizes.items()} | {"samples": samples}
 
 
 def named_by(verdict: dict) -> list[set[str]]:
@@ -231,7 +230,7 @@ def run_world(recipe: Recipe, device: str = "cpu", verdicts: Path | None = None,
             return line | {"error": verdict["error"]}
         if recipe.held and (recipe.effects or verdict.get("theta")):
             try:
-                line["held"] = predictions(recipe, verdict.get("theta", {}), held)
+                line["held"] = on_held_back(recipe, verdict.get("theta", {}), held)
             except (VisthrowError, RuntimeError) as error:
                 line["held_error"] = repr(error)
     return line

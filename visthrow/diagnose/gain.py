@@ -5,15 +5,16 @@ Beside it stand the noise floor, which cannot be beaten, and a black box trained
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from visthrow.diagnose import noise as levels
 from visthrow.diagnose.blackbox import table_of, train
 from visthrow.diagnose.evidence import Priors, additions, estimate, log_evidence
 from visthrow.diagnose.forms import HORIZONS, Forms, forms, unit_of
 from visthrow.diagnose.landing import LandingGain, landing_gain
-from visthrow.diagnose.marginal import Noise, Statistics
+from visthrow.diagnose.marginal import Statistics, gather, gram_of, window_statistics
 from visthrow.diagnose.model import Model
 from visthrow.diagnose.point import Point
 from visthrow.diagnose.result import Diagnosis
@@ -113,19 +114,24 @@ def measure(diagnosis: Diagnosis, *, seed: int = 0, draws: int = DRAWS) -> Gain:
     return Gain(gains, nats, shares, len(folds), left_out, landing)
 
 
-def predicted(model: Model, theta: Mapping[str, float]) -> dict[str, tuple[float, float, int]]:
-    """How well a model with stated sizes of its effects predicts flights: all of them, none is used for a fit.
+def shortfalls(model: Model, sizes: Sequence[Mapping[str, float]]) -> tuple[list[float], int]:
+    """How much worse than by the last of some sizes flights are explained that none of them was found in.
 
-    Each window's initial state is fitted to its beginning, what follows is compared (see :mod:`visthrow.diagnose.forms`).
+    Initial states and gusts are integrated out (a forecast without gusts would mostly measure those); the levels of noise and
+    gusts are those of the last sizes.
 
     Returns:
-        Channel -> sum of squares in the stated noise, what noise and initial state alone would give, number of samples.
+        Nats by which each likelihood falls short of the last one, and the number of samples.
     """
-    windows, channels = model.windows(theta), len(model.channels)
-    stated = Noise(np.ones(channels), {}, 1.0, np.zeros((len(windows), 3)))
-    own = forms(windows, [0] * len(windows), stated, [w.residual[:, None] for w in windows], channels)
-    sums = [part[0].sum(1) for part in (own.error(np.ones(1)), own.floor, own.count)]
-    return {name: (float(sums[0][c]), float(sums[1][c]), int(sums[2][c])) for c, name in enumerate(model.channels)}
+    channels, priors = len(model.channels), Priors.of(model.effects, model.channels)
+    told = [model.windows(theta) for theta in sizes]
+    raw = [[gram_of(w, priors.floor, channels) for w in windows] for windows in told]
+    noise, _ = levels.fit(told[-1], raw[-1])
+    squares = []
+    for windows, grams in zip(told, raw):
+        shaped = [levels.correlated(gram, w, noise.correlation_time) for gram, w in zip(grams, windows)]
+        squares.append(sum(window_statistics(gram, noise, i).square for i, gram in enumerate(shaped)))
+    return [float(0.5 * (square - squares[-1])) for square in squares], sum(len(w.residual) for w in told[-1])
 
 
 def _groups(point: Point, kept: Sequence[int]) -> tuple[list[int], str]:
@@ -137,10 +143,6 @@ def _groups(point: Point, kept: Sequence[int]) -> tuple[list[int], str]:
 
 
 def _regrouped(point: Point, groups: Sequence[int]) -> Statistics:
-    from dataclasses import replace
-
-    from visthrow.diagnose.marginal import gather, window_statistics
-
     parts = [window_statistics(gram, point.noise, w) for w, gram in enumerate(point.grams)]
     return gather([replace(gram, flight=g) for gram, g in zip(point.grams, groups)], parts, point.theta)
 
