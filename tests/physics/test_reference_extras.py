@@ -20,8 +20,8 @@ def short(plant, segments=2):
     return dataclasses.replace(plant, rope=dataclasses.replace(plant.rope, segments=segments))
 
 
-def start(extras, plant=None, count=1, speed=0.0, height=1.5, seed=0):
-    reference = ReferencePlant(short(plant or plain_plant()), extras, seed, count)
+def start(extras, plant=None, count=1, speed=0.0, height=1.5, seed=0, segments=2):
+    reference = ReferencePlant(short(plant or plain_plant(), segments), extras, seed, count)
     velocity = np.tile([speed, 0.0, 0.0], (count, 1))
     reference.reset(np.tile([0.0, 0.0, height], (count, 1)), np.tile(LEVEL, (count, 1)), velocity, np.zeros((count, 3)))
     return reference
@@ -165,15 +165,8 @@ def test_realistic_plant_throws_and_lands():
     """All extras together, 15 segments, a swing and a release: the payload lands near the plain plant's point."""
     points = []
     for extras in (ReferenceExtras(), load_extras(config.find("vehicle", "reference_realistic"))):
-        reference = ReferencePlant(paper_plant(), extras, count=4)
-        pose = (
-            np.tile([0.0, 0.0, 0.8], (4, 1)),
-            np.tile(LEVEL, (4, 1)),
-            np.tile([2.0, 0.0, 0.5], (4, 1)),
-            np.zeros((4, 3)),
-        )
-        reference.reset(*pose)
-        hover(reference, 26, True)
+        reference = start(extras, paper_plant(), 2, 2.0, 0.6, segments=15)
+        hover(reference, 18, True)
         assert reference.landing.landed.all()
         points.append(reference.landing.point_w)
     assert 0.005 < np.linalg.norm(points[0] - points[1], axis=1).mean() < 0.15
