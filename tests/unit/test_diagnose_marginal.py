@@ -74,7 +74,7 @@ def test_a_single_huge_state_does_not_leak_into_the_effects(fitted):
 def test_gradients_of_the_likelihood_are_its_differences(fitted):
     _, _, _, levels, grams = fitted
     keys = sorted(levels.latent_sd)
-    _, by_level, by_scale = noise._likelihood(grams, levels, keys)
+    _, by_level, by_scale, _ = noise._likelihood(grams, levels, keys)
     step = 1e-3
 
     def slope(change) -> float:
@@ -108,10 +108,10 @@ def test_highpass_sigma_sees_noise_and_neither_motion_nor_outliers():
 
 
 def test_outliers_lose_their_weight_and_good_windows_are_left_alone(fitted):
-    _, windows, floors, _, _ = fitted
+    windows = fitted[1]
     spoilt = windows[0].residual.copy()
     spoilt[[40, 201]] += 0.2
-    first, second = noise.without_outliers([replace(windows[0], residual=spoilt), windows[1]], floors, 2)
+    first, second = noise.without_outliers([replace(windows[0], residual=spoilt), windows[1]], 2)
     assert set(np.flatnonzero(first.sigma > windows[0].sigma)) == {40, 201}
     assert second is windows[1]
 

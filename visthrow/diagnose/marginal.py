@@ -13,6 +13,7 @@ Effects are measured in floors throughout: theta = 1 is the size below which an 
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.linalg import lapack
@@ -45,6 +46,12 @@ class Gram:
     def latents(self) -> int:
         """Number of latent-force coefficients."""
         return len(self.latent_block)
+
+    @cached_property
+    def hidden(self) -> np.ndarray:
+        """``inner`` of nuisances and latents alone, a row a channel, shape (C, (D + L)^2)."""
+        size = self.nuisances + self.latents
+        return np.ascontiguousarray(self.inner[:, :size, :size]).reshape(len(self.inner), -1)
 
 
 @dataclass(frozen=True)
@@ -108,14 +115,35 @@ def gram_of(window: Window, floors: np.ndarray, channels: int) -> Gram:
         DiagnoseError: The window's arrays do not fit together, or hold NaN or infinity.
     """
     _check(window, len(floors), channels)
-    z = columns(window, floors) / window.sigma[:, None]
+    return _inner_products(window, columns(window, floors), channels)
+
+
+def hidden_gram(window: Window, channels: int) -> Gram:
+    """The same of a window whose effects are not asked for.
+
+    Raises:
+        DiagnoseError: As :func:`gram_of`.
+    """
+    _check(window, window.effects.shape[1], channels)
+    return _inner_products(window, columns(replace(window, effects=window.effects[:, :0]), np.zeros(0)), channels)
+
+
+def without_effects(gram: Gram) -> Gram:
+    """The same of nuisances and latents alone."""
+    size = gram.nuisances + gram.latents
+    return replace(gram, inner=gram.hidden.reshape(-1, size, size), cross=gram.cross[:, :size])
+
+
+def _inner_products(window: Window, z: np.ndarray, channels: int) -> Gram:
+    z /= window.sigma[:, None]
     r = window.residual / window.sigma
     inner = np.zeros((channels, z.shape[1], z.shape[1]))
     cross, square, count = np.zeros((channels, z.shape[1])), np.zeros(channels), np.zeros(channels)
     for c in np.unique(window.channel):
         rows = window.channel == c
-        inner[c], cross[c], square[c] = z[rows].T @ z[rows], z[rows].T @ r[rows], r[rows] @ r[rows]
-        count[c] = rows.sum()
+        own, left = z[rows], r[rows]
+        inner[c], cross[c], square[c] = own.T @ own, left @ own, left @ left
+        count[c] = len(left)
     blocks = np.asarray(window.latent_block, dtype=int)
     return Gram(window.flight, window.phase, count, inner, cross, square, window.nuisance.shape[1], blocks, np.eye(len(blocks)))
 
@@ -145,28 +173,40 @@ def correlated(gram: Gram, window: Window, time: float) -> Gram:
     if not gram.latents:
         return gram
     factor = np.zeros((gram.latents, gram.latents))
+    inner, cross = gram.inner.copy(), gram.cross.copy()
     key = window.latent_block.astype(int) * 3 + window.latent_axis.astype(int)
     for group in np.unique(key):
         at = np.flatnonzero(key == group)
         lag = np.abs(window.latent_time[at, None] - window.latent_time[at])
-        factor[np.ix_(at, at)] = np.linalg.cholesky(np.exp(-lag / time) + 1e-9 * np.eye(len(at)))
-    inner, cross, part = gram.inner.copy(), gram.cross.copy(), slice(gram.nuisances, gram.nuisances + gram.latents)
-    inner[:, part] = factor.T @ inner[:, part]
-    inner[:, :, part] = inner[:, :, part] @ factor
-    cross[:, part] = cross[:, part] @ factor
+        own = np.linalg.cholesky(np.exp(-lag / time) + 1e-9 * np.eye(len(at)))
+        factor[np.ix_(at, at)] = own
+        at += gram.nuisances
+        inner[:, at] = own.T @ inner[:, at]
+        cross[:, at] = cross[:, at] @ own
+    for group in np.unique(key):
+        at = np.flatnonzero(key == group)
+        own = factor[np.ix_(at, at)]
+        at += gram.nuisances
+        inner[:, :, at] = inner[:, :, at] @ own
     return replace(gram, inner=inner, cross=cross, factor=factor)
 
 
 def with_residual(gram: Gram, window: Window, floors: np.ndarray, residual: np.ndarray) -> Gram:
     """The same derivatives with the residuals of another size of the effects."""
-    z, r = columns(window, floors) / window.sigma[:, None], residual / window.sigma
-    part = slice(gram.nuisances, gram.nuisances + gram.latents)
-    cross, square = np.zeros_like(gram.cross), np.zeros_like(gram.square)
-    for c in np.unique(window.channel):
-        rows = window.channel == c
-        cross[c], square[c] = z[rows].T @ r[rows], r[rows] @ r[rows]
+    weighted = np.zeros((len(residual), len(gram.count)))
+    weighted[np.arange(len(residual)), window.channel] = residual / window.sigma**2
+    by_state = (window.nuisance.T @ weighted).T * window.nuisance_sd
+    by_latent = (window.latent.T @ weighted).T @ gram.factor if gram.latents else np.zeros((len(gram.count), 0))
+    by_effect = (window.effects.T @ weighted).T * floors
+    square = np.bincount(window.channel, (residual / window.sigma) ** 2, len(gram.count))
+    return replace(gram, cross=np.hstack((by_state, by_latent, by_effect)), square=square)
+
+
+def recorrelated(gram: Gram, raw: Gram) -> Gram:
+    """The residuals of a gram whose latents are at the knots, in one with the same derivatives whose latents are correlated."""
+    part, cross = slice(gram.nuisances, gram.nuisances + gram.latents), raw.cross.copy()
     cross[:, part] = cross[:, part] @ gram.factor
-    return replace(gram, cross=cross, square=square)
+    return replace(gram, cross=cross, square=raw.square)
 
 
 @dataclass(frozen=True)
@@ -175,21 +215,20 @@ class Posterior:
 
     mean: np.ndarray  # of [b, a] in prior deviations, shape (D + L,)
     covariance: np.ndarray  # shape (D + L, D + L)
-    factor: np.ndarray  # lower Cholesky factor of its inverse
     log_likelihood: float  # of the residuals, up to a constant
 
 
-def posterior(gram: Gram, noise: Noise, window: int) -> Posterior:
-    """Condition initial state and latent forces on the window's residuals.
+def _factor(gram: Gram, noise: Noise, level: np.ndarray) -> tuple[np.ndarray, float]:
+    """Lower Cholesky factor of 1 + P^1/2 U' W U P^1/2, and log det V up to a constant.
 
     Raises:
         DiagnoseError: The normal equations are not positive definite, which only broken derivatives can cause.
     """
-    weight, level = noise.scale**-2.0, noise.deviation(gram, window)
     size = len(level)
-    normal = np.tensordot(weight, gram.inner[:, :size, :size], 1) * np.outer(level, level)
+    normal = (noise.scale**-2.0 @ gram.hidden).reshape(size, size)
+    normal *= level[:, None]
+    normal *= level
     normal.flat[:: size + 1] += 1.0
-    right = (weight @ gram.cross[:, :size]) * level
     lower, failed = lapack.dpotrf(normal, lower=1, clean=1)
     if failed and np.all(np.isfinite(normal)):
         # Levels of many orders of magnitude, as a search for them may try, leave the identity below rounding.
@@ -197,48 +236,90 @@ def posterior(gram: Gram, noise: Noise, window: int) -> Posterior:
         lower, failed = lapack.dpotrf(normal, lower=1, clean=1)
     if failed:
         raise DiagnoseError(f"window of flight {gram.flight}, phase {gram.phase}: the normal equations are singular")
+    return lower, float(2.0 * np.log(np.diag(lower)).sum() + 2.0 * gram.count @ np.log(noise.scale))
+
+
+def posterior(gram: Gram, noise: Noise, window: int) -> Posterior:
+    """Condition initial state and latent forces on the window's residuals.
+
+    Raises:
+        DiagnoseError: As of broken derivatives.
+    """
+    weight, level = noise.scale**-2.0, noise.deviation(gram, window)
+    size = len(level)
+    lower, log_det = _factor(gram, noise, level)
+    right = (weight @ gram.cross[:, :size]) * level
     inverse, _ = lapack.dpotri(lower, lower=1)
     covariance = inverse + inverse.T  # its upper half is 0
     covariance.flat[:: size + 1] *= 0.5
     mean = covariance @ right
     quadratic = weight @ gram.square - right @ mean
-    log_det = 2.0 * np.log(np.diag(lower)).sum() + 2.0 * gram.count @ np.log(noise.scale)
-    return Posterior(mean, covariance, lower, -0.5 * float(quadratic + log_det))
+    return Posterior(mean, covariance, -0.5 * float(quadratic + log_det))
 
 
 @dataclass(frozen=True)
-class WindowStatistics:
-    """One window's share of :class:`Statistics`, and the same for its latent forces as if they were effects."""
+class Share:
+    """One window's share of :class:`Statistics`."""
 
     information: np.ndarray  # shape (K, K)
     score: np.ndarray  # shape (K,)
     square: float
+
+
+@dataclass(frozen=True)
+class WindowStatistics(Share):
+    """The same, and what the window says of its latent forces as if they were effects."""
+
     latent_information: np.ndarray  # G' V^-1 G, shape (L, L)
     latent_score: np.ndarray  # G' V^-1 r, shape (L,)
     latent_effects: np.ndarray  # G' V^-1 S, shape (L, K)
 
 
+@dataclass(frozen=True)
+class Integral:
+    """What is left of the last J columns of a window when initial state and latent forces are integrated out; of no residual."""
+
+    information: np.ndarray  # shape (J, J)
+    half: np.ndarray  # L^-1 P^1/2 U' W times the columns, with L of the posterior's precision, shape (D + L, J)
+    factor: np.ndarray  # L
+    level: np.ndarray  # prior deviation of [X, G], shape (D + L,)
+    log_det: float  # of V, up to a constant
+
+    def share(self, gram: Gram, noise: Noise) -> Share:
+        """With the residuals of a gram of the same derivatives."""
+        weight = noise.scale**-2.0
+        cross, size = weight @ gram.cross, len(self.level)
+        along = np.ravel(lapack.dtrtrs(self.factor, self.level * cross[:size], lower=1)[0])
+        score = cross[len(cross) - len(self.information) :] - self.half.T @ along
+        return Share(self.information, score, float(weight @ gram.square - along @ along + self.log_det))
+
+
+def integral(gram: Gram, noise: Noise, window: int, first: int | None = None) -> Integral:
+    """Integrate initial state and latent forces out of one window's columns from ``first`` on; default: of its effects."""
+    level = noise.deviation(gram, window)
+    size = len(level)
+    begin = size if first is None else first
+    factor, log_det = _factor(gram, noise, level)
+    inner = np.tensordot(noise.scale**-2.0, gram.inner[:, :, begin:], 1)
+    half, _ = lapack.dtrtrs(factor, level[:, None] * inner[:size], lower=1)
+    reduced = inner[begin:] - half.T @ half
+    return Integral(0.5 * (reduced + reduced.T), half, factor, level, log_det)
+
+
 def window_statistics(gram: Gram, noise: Noise, window: int) -> WindowStatistics:
     """Integrate initial state and latent forces out of one window."""
-    weight, level = noise.scale**-2.0, noise.deviation(gram, window)
-    size, begin = len(level), gram.nuisances
-    state = posterior(gram, noise, window)
-    inner, cross = np.tensordot(weight, gram.inner, 1), weight @ gram.cross
-    half, _ = lapack.dtrtrs(state.factor, level[:, None] * inner[:size, begin:], lower=1)  # L^-1 P^1/2 U'W [G, S]
-    reduced = inner[begin:, begin:] - half.T @ half
-    along, _ = lapack.dtrtrs(state.factor, level * cross[:size], lower=1)
-    score = cross[begin:] - half.T @ np.ravel(along)
-    reduced = 0.5 * (reduced + reduced.T)
-    latents = gram.latents
+    whole = integral(gram, noise, window, gram.nuisances)
+    share, latents = whole.share(gram, noise), gram.latents
     back = np.linalg.inv(gram.factor) if latents else gram.factor  # from unit latents to knots
     return WindowStatistics(
-        reduced[latents:, latents:], score[latents:], -2.0 * state.log_likelihood,
-        back.T @ reduced[:latents, :latents] @ back, back.T @ score[:latents], back.T @ reduced[:latents, latents:],
+        whole.information[latents:, latents:], share.score[latents:], share.square,
+        back.T @ whole.information[:latents, :latents] @ back, back.T @ share.score[:latents],
+        back.T @ whole.information[:latents, latents:],
     )  # fmt: skip
 
 
 def gather(
-    grams: Sequence[Gram], parts: Sequence[WindowStatistics], theta: np.ndarray, weights: Mapping[int, float] | None = None
+    grams: Sequence[Gram], parts: Sequence[Share], theta: np.ndarray, weights: Mapping[int, float] | None = None
 ) -> Statistics:
     """Add up windows by flight.
 

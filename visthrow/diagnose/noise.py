@@ -10,8 +10,18 @@ from dataclasses import replace
 
 import numpy as np
 
-from visthrow.diagnose.marginal import Gram, Noise, columns, correlated, gram_of, posterior
+from visthrow.diagnose.marginal import (
+    Gram,
+    Noise,
+    Posterior,
+    columns,
+    correlated,
+    hidden_gram,
+    posterior,
+    without_effects,
+)
 from visthrow.diagnose.model import LATENT_BLOCKS, Window
+from visthrow.diagnose.threads import each
 
 MAD_TO_SIGMA = 1.4826
 THIRD_DIFFERENCE = np.sqrt(20.0)
@@ -48,8 +58,13 @@ WIDE = 30.0
 """Latent forces while outliers are looked for, in the level at which they become visible."""
 
 ITERATIONS = 40
-ENOUGH_NATS, ENOUGH_SLOPE = 0.02, 0.3
-"""A step that gains less, or a slope below [nats by the logarithm of a level], ends the search for the levels."""
+ENOUGH_NATS = 0.02
+"""A step that promises or brings less ends the search for the levels."""
+LONGEST_STEP = 2.5
+"""Of the logarithm of a level: where it hardly shows, the likelihood is flat and a Newton step endless."""
+HALVINGS = 8
+STALLED = 1e-9
+"""Of the step: limits and levels count as met within this."""
 
 ROUNDS = 10
 """Of levels of bad windows in turn with those of their phases; mostly one or two are needed."""
@@ -87,20 +102,38 @@ def fit(windows: Sequence[Window], grams: Sequence[Gram], start: Noise | None = 
     times = CORRELATION_TIMES if start is None else (start.correlation_time,)
     if not any(gram.latents for gram in grams):
         times = times[:1]
+    bare = [without_effects(gram) for gram in grams]
     best: tuple[float, Noise, list[Gram]] | None = None
     for time in times:
-        shaped = [correlated(gram, window, time) for gram, window in zip(grams, windows)]
+        shaped = each(lambda w: correlated(bare[w], windows[w], time), range(len(bare)))  # noqa: B023  waits for the result
         noise = start or (best[1] if best else _first_guess(shaped))
         noise, value = _maximise(shaped, replace(noise, correlation_time=time))
         if best is None or value > best[0]:
             best = value, noise, shaped
-    _, noise, shaped = best
+    noise = _with_own_levels(best[2], best[1])
+    return noise, each(lambda w: correlated(grams[w], windows[w], noise.correlation_time), range(len(grams)))
+
+
+def refit(grams: Sequence[Gram], start: Noise) -> Noise:
+    """Estimate the levels anew, with the correlation time that the grams have been given.
+
+    Args:
+        grams: of the windows, with correlated latent forces.
+        start: where the search starts.
+    """
+    bare = [without_effects(gram) for gram in grams]
+    noise, _ = _maximise(bare, start)
+    return _with_own_levels(bare, noise)
+
+
+def _with_own_levels(grams: Sequence[Gram], noise: Noise) -> Noise:
+    """The levels with those of bad windows, in turn with those of their phases."""
     for _ in range(ROUNDS):
-        own = _own_levels(shaped, noise)
+        own = _own_levels(grams, noise)
         if np.allclose(own, noise.own, rtol=0.5, equal_nan=True):
             break
-        noise, _ = _maximise(shaped, replace(noise, own=own))
-    return noise, shaped
+        noise, _ = _maximise(grams, replace(noise, own=own))
+    return noise
 
 
 def _first_guess(grams: Sequence[Gram]) -> Noise:
@@ -118,59 +151,121 @@ def _first_guess(grams: Sequence[Gram]) -> Noise:
 
 
 def _maximise(grams: Sequence[Gram], noise: Noise) -> tuple[Noise, float]:
-    """Maximum likelihood of the logarithms of all levels, with exact gradients and explicit limits."""
-    from scipy.optimize import minimize
+    """Maximum likelihood of the logarithms of all levels, with exact gradients and explicit limits.
 
+    Quasi-Newton steps that begin with the expected curvature, so that a few looks at all windows suffice.
+    """
     keys = sorted(noise.latent_sd)
     seen = np.flatnonzero(sum(gram.count for gram in grams) > 0)
     guess = _first_guess(grams).latent_sd
-    start = np.log([noise.latent_sd[key] for key in keys] + [noise.scale[c] for c in seen])
+    x = np.log([noise.latent_sd[key] for key in keys] + [noise.scale[c] for c in seen])
     reach = np.log(LEVEL_RANGE)
-    bounds = [(np.log(guess[key]) - reach, np.log(guess[key]) + reach) for key in keys]
-    bounds += [tuple(np.log(SCALE_BOUNDS))] * len(seen)
-    start = np.clip(start, [low for low, _ in bounds], [high for _, high in bounds])
+    low = np.array([np.log(guess[key]) - reach for key in keys] + [np.log(SCALE_BOUNDS[0])] * len(seen))
+    high = np.array([np.log(guess[key]) + reach for key in keys] + [np.log(SCALE_BOUNDS[1])] * len(seen))
+    x = np.clip(x, low, high)
 
     def levels(x: np.ndarray) -> Noise:
         scale = noise.scale.copy()
         scale[seen] = np.exp(x[len(keys) :])
         return replace(noise, scale=scale, latent_sd=dict(zip(keys, np.exp(x[: len(keys)]).tolist())))
 
-    def cost(x: np.ndarray) -> tuple[float, np.ndarray]:
-        value, by_level, by_scale = _likelihood(grams, levels(x), keys)
-        return -value, -np.concatenate((by_level, by_scale[seen]))
+    def look(x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+        value, by_level, by_scale, curvature = _likelihood(grams, levels(x), keys)
+        chosen = np.concatenate((np.arange(len(keys)), len(keys) + seen))
+        return value, np.concatenate((by_level, by_scale))[chosen], curvature[np.ix_(chosen, chosen)]
 
-    tolerance = ENOUGH_NATS / max(1.0, abs(cost(start)[0]))
-    options = {"maxiter": ITERATIONS, "maxcor": 10, "ftol": tolerance, "gtol": ENOUGH_SLOPE, "maxls": 20}
-    result = minimize(cost, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
-    return levels(result.x), -float(result.fun)
+    value, slope, curvature = look(x)
+    for _ in range(ITERATIONS):
+        step = _newton_step(x, slope, curvature, low, high)
+        if slope @ step < ENOUGH_NATS:
+            break
+        for _ in range(HALVINGS):
+            tried, its_slope, expected = look(x + step)
+            if tried > value:
+                break
+            step = step / 3.0
+        else:
+            break
+        curvature = _updated(curvature, expected, step, slope - its_slope)
+        gained, x, value, slope = tried - value, x + step, tried, its_slope
+        if gained < ENOUGH_NATS:
+            break
+    return levels(x), value
 
 
-def _likelihood(grams: Sequence[Gram], noise: Noise, keys: Sequence[tuple[int, str]]) -> tuple[float, np.ndarray, np.ndarray]:
-    """Log-likelihood and its gradients by the logarithms of latent deviations and of sensor scales."""
-    value, by_level, by_scale = 0.0, np.zeros(len(keys)), np.zeros(len(noise.scale))
+def _newton_step(x: np.ndarray, slope: np.ndarray, curvature: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Step upwards within the limits; what a limit holds back stays there, and the others move without it."""
+    free = ~((x <= low + STALLED) & (slope < 0.0)) & ~((x >= high - STALLED) & (slope > 0.0))
+    step = np.zeros_like(x)
+    part = curvature[np.ix_(free, free)]
+    part = part + 1e-9 * np.diag(np.diag(part)) + 1e-12 * np.eye(len(part))
+    step[free] = np.clip(np.linalg.solve(part, slope[free]), -LONGEST_STEP, LONGEST_STEP)
+    if slope @ step <= 0.0:  # one that was cut off component by component
+        step[free] = np.clip(slope[free] / np.diag(part), -LONGEST_STEP, LONGEST_STEP)
+    return np.clip(x + step, low, high) - x
+
+
+def _updated(curvature: np.ndarray, expected: np.ndarray, step: np.ndarray, fall: np.ndarray) -> np.ndarray:
+    """The expected curvature at the new place, corrected by how the slope fell on the way (BFGS, skipped where it rose)."""
+    along = expected @ step
+    bend, known = step @ fall, step @ along
+    if bend <= 0.1 * known or known <= 0.0:
+        return expected
+    return expected - np.outer(along, along) / known + np.outer(fall, fall) / bend
+
+
+def _likelihood(
+    grams: Sequence[Gram], noise: Noise, keys: Sequence[tuple[int, str]]
+) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
+    """Log-likelihood, its gradients by the logarithms of latent deviations and of sensor scales, and its expected curvature.
+
+    The curvature (Fisher's, of [levels, scales]) is exact among the levels; what the scales share with the fitted columns is
+    given to the channels by their part in them.
+    """
     index = {key: i for i, key in enumerate(keys)}
-    for w, gram in enumerate(grams):
-        state = posterior(gram, noise, w)
-        value += state.log_likelihood
-        second = np.outer(state.mean, state.mean) + state.covariance
-        excess = np.bincount(gram.latent_block, np.diagonal(second)[gram.nuisances :] - 1.0, len(LATENT_BLOCKS))
-        for block in range(len(LATENT_BLOCKS)):
-            if (block, gram.phase) in index and np.isnan(noise.own[w, block]):
-                by_level[index[block, gram.phase]] += excess[block]
-        level, size = noise.deviation(gram, w), len(state.mean)
-        second *= np.outer(level, level)
-        left = gram.square - 2.0 * gram.cross[:, :size] @ (level * state.mean)
-        left += gram.inner[:, :size, :size].reshape(len(left), -1) @ second.ravel()
-        by_scale += left / noise.scale**2 - gram.count
-    return value, by_level, by_scale
+    count = len(keys)
+    value, slope, curvature = 0.0, np.zeros(count + len(noise.scale)), np.zeros((count + len(noise.scale),) * 2)
+    for gram, own, found in zip(grams, noise.own, each(lambda w: _window_likelihood(grams[w], noise, w), range(len(grams)))):
+        at = [index.get((b, gram.phase), -1) if np.isnan(own[b]) else -1 for b in range(len(LATENT_BLOCKS))]
+        blocks = np.flatnonzero(np.array(at) >= 0)
+        rows = np.array([at[b] for b in blocks] + list(range(count, len(slope))), dtype=int)
+        chosen = np.concatenate((blocks, len(LATENT_BLOCKS) + np.arange(len(noise.scale))))
+        value += found[0]
+        slope[rows] += found[1][chosen]
+        curvature[np.ix_(rows, rows)] += found[2][np.ix_(chosen, chosen)]
+    return value, slope[:count], slope[count:], curvature
+
+
+def _window_likelihood(gram: Gram, noise: Noise, window: int) -> tuple[float, np.ndarray, np.ndarray]:
+    """One window's share of :func:`_likelihood`: value, gradient and curvature by [blocks, scales]."""
+    state = posterior(gram, noise, window)
+    level, n, blocks = noise.deviation(gram, window), gram.nuisances, len(LATENT_BLOCKS)
+    second = np.outer(state.mean, state.mean)
+    second += state.covariance
+    by_block = np.bincount(gram.latent_block, np.diagonal(second)[n:] - 1.0, blocks)
+    scaled = state.covariance * level
+    scaled *= level[:, None]
+    second *= level
+    second *= level[:, None]
+    weight, size = noise.scale**-2.0, len(level)
+    left = gram.square - 2.0 * gram.cross[:, :size] @ (level * state.mean) + gram.hidden @ second.ravel()
+    taken = weight * (gram.hidden @ scaled.ravel())  # degrees of freedom that the columns take from each channel
+    member = gram.latent_block[:, None] == np.arange(blocks)
+    squared = state.covariance[n:] ** 2
+    known = np.eye(size)[n:, n:] - state.covariance[n:, n:]
+    curvature = np.zeros((blocks + len(weight),) * 2)
+    curvature[:blocks, :blocks] = 2.0 * member.T @ known**2 @ member
+    shared = member.T @ (np.diagonal(state.covariance)[n:] - squared.sum(1))
+    curvature[:blocks, blocks:] = 2.0 * np.outer(shared, taken / max(taken.sum(), 1e-300))
+    curvature[blocks:, :blocks] = curvature[:blocks, blocks:].T
+    curvature[blocks:, blocks:] = np.diag(2.0 * np.maximum(gram.count - taken, 0.0))
+    return state.log_likelihood, np.concatenate((by_block, left * weight - gram.count)), curvature
 
 
 def _own_levels(grams: Sequence[Gram], noise: Noise) -> np.ndarray:
     """Latent deviations of windows that stand far above their phase's, shape (windows, 3); NaN for all others."""
-    own = np.full_like(noise.own, np.nan)
-    for w, gram in enumerate(grams):
-        for block in np.unique(gram.latent_block):
-            own[w, block] = _own_level(gram, noise, w, int(block))
+    found = each(lambda w: _own_levels_of(grams[w], noise, w), range(len(grams)))
+    own = np.array(found).reshape(noise.own.shape)
     for phase in {gram.phase for gram in grams}:
         of_phase = np.array([gram.phase == phase for gram in grams])
         many = np.isfinite(own[of_phase]).sum(0) > BAD_SHARE * of_phase.sum()  # what many windows have is the phase's own level
@@ -178,48 +273,68 @@ def _own_levels(grams: Sequence[Gram], noise: Noise) -> np.ndarray:
     return own
 
 
-def _own_level(gram: Gram, noise: Noise, window: int, block: int) -> float:
-    shared = noise.latent_sd[block, gram.phase]
-
-    def likelihood(level: float) -> float:
-        own = noise.own.copy()
-        own[window, block] = level
-        return posterior(gram, replace(noise, own=own), window).log_likelihood
-
-    plain = likelihood(shared)
-    best, chosen = plain + BAD_NATS, np.nan
-    for factor in FACTORS:
-        value = likelihood(factor * shared)
-        if value > best:
-            best, chosen = value, factor * shared
-        elif value < plain:
-            break
-    return chosen
+def _own_levels_of(gram: Gram, noise: Noise, window: int) -> np.ndarray:
+    """Of one window, shape (3,)."""
+    own, state = np.full(len(LATENT_BLOCKS), np.nan), posterior(gram, noise, window)
+    level = noise.deviation(gram, window)[gram.nuisances :]
+    for block in np.unique(gram.latent_block):
+        at = gram.nuisances + np.flatnonzero(gram.latent_block == block)
+        used, shared = level[gram.latent_block == block][0], noise.latent_sd[int(block), gram.phase]
+        own[block] = _own_level(state, at, used, shared)
+    return own
 
 
-def without_outliers(windows: Sequence[Window], floors: np.ndarray, channels: int) -> list[Window]:
+def _own_level(state: Posterior, at: np.ndarray, used: float, shared: float) -> float:
+    """A level that explains one block of a window far better than its phase's; NaN where there is none.
+
+    The block's posterior precision is 1 + used^2 R, with R what the window says of unit forces: its eigenvalues give the
+    likelihood of every level at once.
+
+    Args:
+        state: of the window.
+        at: of the block's coefficients.
+        used: level that the posterior rests on.
+        shared: level of the phase.
+    """
+    precision = np.linalg.inv(state.covariance[np.ix_(at, at)])
+    said, turn = np.linalg.eigh(precision - np.eye(len(at)))
+    said = np.maximum(said, 0.0)
+    score = (turn.T @ (precision @ state.mean[at])) ** 2
+    share = (np.array([1.0, *FACTORS]) * shared / used)[:, None] ** 2
+    values = 0.5 * np.sum(share * score / (1.0 + share * said) - np.log1p(share * said), axis=1)
+    plain, values = values[0], values[1:]
+    below = np.flatnonzero(values < plain)
+    values = values[: below[0]] if len(below) else values
+    if not len(values) or values.max() <= plain + BAD_NATS:
+        return np.nan
+    return float(FACTORS[int(np.argmax(values))] * shared)
+
+
+def without_outliers(windows: Sequence[Window], channels: int) -> list[Window]:
     """Give single samples far outside a sigma that puts them at HUBER; windows with none are returned as they are.
 
     Latent forces have a wide prior here, so that a missing effect is followed and only what no force can do stands out.
 
     Args:
         windows: of the flights.
-        floors: of the effects, shape (K,).
         channels: number of the model's channels.
+
+    Raises:
+        DiagnoseError: As :func:`visthrow.diagnose.marginal.gram_of`.
     """
-    return [_mended(window, floors, channels) for window in windows]
+    return each(lambda window: _mended(window, channels), windows)
 
 
-def _mended(window: Window, floors: np.ndarray, channels: int) -> Window:
-    sigma = window.sigma
+def _mended(window: Window, channels: int) -> Window:
+    sigma, bare = window.sigma, replace(window, effects=window.effects[:, :0])
     for _ in range(CLEANINGS):
-        gram = gram_of(replace(window, sigma=sigma), floors, channels)
+        gram = hidden_gram(replace(window, sigma=sigma), channels)
         guess = _first_guess([gram])
         wide = replace(guess, latent_sd={key: WIDE * level for key, level in guess.latent_sd.items()})
         shaped = correlated(gram, window, wide.correlation_time)
         fitted = wide.deviation(shaped, 0) * posterior(shaped, wide, 0).mean
         fitted[gram.nuisances :] = shaped.factor @ fitted[gram.nuisances :]
-        left = window.residual - columns(window, floors)[:, : len(fitted)] @ fitted
+        left = window.residual - columns(bare, np.zeros(0)) @ fitted
         normal = np.abs(left) / window.sigma
         far = normal / (HUBER * np.maximum(1.0, MAD_TO_SIGMA * np.median(normal)))
         if not np.any(far > 1.0):

@@ -7,8 +7,19 @@ import numpy as np
 
 from visthrow.diagnose import noise as levels
 from visthrow.diagnose.evidence import Priors, covariance, estimate, log_evidence
-from visthrow.diagnose.marginal import Gram, Noise, Statistics, gather, gram_of, window_statistics, with_residual
+from visthrow.diagnose.marginal import (
+    Gram,
+    Integral,
+    Noise,
+    Statistics,
+    gather,
+    gram_of,
+    integral,
+    recorrelated,
+    with_residual,
+)
 from visthrow.diagnose.model import Model, Window
+from visthrow.diagnose.threads import each
 
 STEPS = 3
 """Gauss-Newton steps between two linearisations."""
@@ -40,6 +51,7 @@ class Point:
     grams: Sequence[Gram]  # latents correlated
     noise: Noise
     statistics: Statistics
+    integrals: Sequence[Integral]  # of the grams under these noise levels
 
     @property
     def information(self) -> np.ndarray:
@@ -57,9 +69,17 @@ class Point:
         return own - 0.5 * float(self.statistics.absolute_square.sum())
 
 
-def _point(theta: np.ndarray, windows: Sequence[Window], raw: Sequence[Gram], grams: Sequence[Gram], noise: Noise) -> Point:
-    parts = [window_statistics(gram, noise, w) for w, gram in enumerate(grams)]
-    return Point(np.array(theta, dtype=float), windows, raw, grams, noise, gather(grams, parts, theta))
+def _point(theta: np.ndarray, windows: Sequence[Window], raw: Sequence[Gram], grams: Sequence[Gram], noise: Noise,
+           integrals: Sequence[Integral] | None = None) -> Point:  # fmt: skip
+    """Gather; ``integrals`` are those of another point with the same derivatives and noise."""
+    integrals = integrals_of(grams, noise) if integrals is None else integrals
+    parts = [known.share(gram, noise) for known, gram in zip(integrals, grams)]
+    return Point(np.array(theta, dtype=float), windows, raw, grams, noise, gather(grams, parts, theta), integrals)
+
+
+def integrals_of(grams: Sequence[Gram], noise: Noise) -> list[Integral]:
+    """Integrate initial states and latent forces out of all windows."""
+    return each(lambda w: integral(grams[w], noise, w), range(len(grams)))
 
 
 def linearise(problem: Problem, theta: np.ndarray, start: Noise | None = None, windows: Sequence[Window] | None = None) -> Point:
@@ -73,8 +93,8 @@ def linearise(problem: Problem, theta: np.ndarray, start: Noise | None = None, w
     """
     windows = problem.model.windows(problem.sizes(theta)) if windows is None else windows
     channels = len(problem.model.channels)
-    kept = levels.without_outliers([windows[i] for i in problem.kept], problem.priors.floor, channels)
-    raw = [gram_of(w, problem.priors.floor, channels) for w in kept]
+    kept = levels.without_outliers([windows[i] for i in problem.kept], channels)
+    raw = each(lambda w: gram_of(w, problem.priors.floor, channels), kept)
     noise, grams = levels.fit(kept, raw, start)
     return _point(theta, kept, raw, grams, noise)
 
@@ -87,9 +107,9 @@ def moved(problem: Problem, point: Point, theta: np.ndarray) -> Point | None:
         return None
     windows = [replace(w, residual=r) for w, r in zip(point.windows, residuals)]
     floor = problem.priors.floor
-    raw = [with_residual(g, w, floor, w.residual) for g, w in zip(point.raw, windows)]
-    grams = [with_residual(g, w, floor, w.residual) for g, w in zip(point.grams, windows)]
-    return _point(theta, windows, raw, grams, point.noise)
+    raw = each(lambda w: with_residual(point.raw[w], windows[w], floor, residuals[w]), range(len(windows)))
+    grams = [recorrelated(g, r) for g, r in zip(point.grams, raw)]
+    return _point(theta, windows, raw, grams, point.noise, point.integrals)
 
 
 def advantage(priors: Priors, first: tuple[Point, Sequence[int]], second: tuple[Point, Sequence[int]]) -> float:
@@ -113,16 +133,15 @@ def curvature(problem: Problem, origin: Point, there: Point) -> float:
     floor = problem.priors.floor
     change = floor * (there.theta - origin.theta)
     total = np.zeros(len(floor))
-    for w, (old, new, gram) in enumerate(zip(origin.windows, there.windows, there.grams)):
+    for old, new, gram, known in zip(origin.windows, there.windows, there.grams, there.integrals):
         bent = new.residual - (old.residual - old.effects @ change)
-        total += window_statistics(with_residual(gram, new, floor, bent), there.noise, w).score
+        total += known.share(with_residual(gram, new, floor, bent), there.noise).score
     return float(np.abs(covariance(there.information, problem.priors.deviation(())) @ total).max(initial=0.0))
 
 
 def with_fitted_noise(point: Point) -> Point:
     """The same with noise levels estimated from its residuals."""
-    noise, grams = levels.fit(point.windows, point.raw, point.noise)
-    return _point(point.theta, point.windows, point.raw, grams, noise)
+    return _point(point.theta, point.windows, point.raw, point.grams, levels.refit(point.grams, point.noise))
 
 
 def with_all_effects_noise(problem: Problem, point: Point) -> Point:
@@ -132,7 +151,7 @@ def with_all_effects_noise(problem: Problem, point: Point) -> Point:
     """
     visible = np.flatnonzero(problem.priors.visible)
     change = estimate(point.information, point.score, problem.priors, visible) - point.theta
-    noise, _ = levels.fit(point.windows, [shifted(gram, change) for gram in point.raw], point.noise)
+    noise = levels.refit([shifted(gram, change) for gram in point.grams], point.noise)
     return _point(point.theta, point.windows, point.raw, point.grams, noise)
 
 
