@@ -54,20 +54,23 @@ def _opened(args: argparse.Namespace) -> tuple[Model, list[FlightLog]]:
             raise ConfigError(f"--set changes the throw's plant; the setup '{args.config}' has the model {chosen.named()[0]}")
         model = setup.model_of(chosen, logs)
         return (_only(model, args.only.split(",")) if args.only else model), logs
-    return throw_model(args, logs), logs
+    return throw_model(args, logs)
 
 
-def throw_model(args: argparse.Namespace, logs: Sequence[FlightLog]) -> Model:
-    """The whole throw, with the plant of an experiment."""
+def throw_model(args: argparse.Namespace, logs: Sequence[FlightLog]) -> tuple[Model, list[FlightLog]]:
+    """The whole throw, with the plant of an experiment, and its logs with their commands put right."""
     from visthrow import config
     from visthrow.device import resolve
+    from visthrow.diagnose.interface import put_right
     from visthrow.diagnose.throw_model import ThrowModel
     from visthrow.task import Experiment, plant_of
 
     experiment = config.load(Experiment, config.find("train", args.plant), args.overrides)
     only = args.only.split(",") if args.only else None
     known = {"sensing": experiment.sensing, "camera": experiment.camera}
-    return ThrowModel(logs, plant_of(experiment), device=resolve(args.device), only=only, **known)
+    right, mistakes = put_right(logs, plant_of(experiment))
+    known["mistakes"] = mistakes
+    return ThrowModel(right, plant_of(experiment), device=resolve(args.device), only=only, **known), right
 
 
 class _Part:

@@ -31,6 +31,7 @@ def summary(diagnosis: Diagnosis, gain: Gain | None = None) -> str:
     for f in diagnosis.findings:
         if f.verdict in (result.FOUND, result.CLASS):
             lines.append(f"{f.verdict:6} {f.sentence}{_moves(f, gain)}")
+    lines += [f"FOUND  {m.sentence}" for m in diagnosis.mistakes]
     lines += [f"VARIES {s.sentence}" for s in diagnosis.scatter if s.found]
     lines += [f"EVENT  something happened in flight {flight} that the others do not show" for flight in diagnosis.events]
     lines += [f"COPY   flight {flight} repeats flight {of} and was left out" for flight, of in diagnosis.duplicates.items()]
@@ -146,6 +147,7 @@ def _verdict(diagnosis: Diagnosis, gain: Gain | None) -> Section:
     if diagnosis.overall == result.UNKNOWN and diagnosis.laws:
         law = diagnosis.laws[0]
         parts.append(Text(f"**Law.** {law.formula} with c = {law.coefficient:.3g} ± {law.sd:.2g} {law.unit}.", "finding"))
+    parts += [Text(f"**FOUND.** {m.sentence}", "finding") for m in diagnosis.mistakes]
     parts += [Text(f"**VARIES.** {s.sentence}", "finding") for s in diagnosis.scatter if s.found]
     parts += [Text(f"**Event in flight {flight}.** Something happened there that the others do not show; it was left out.",
                    "finding") for flight in diagnosis.events]  # fmt: skip

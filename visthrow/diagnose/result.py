@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
+from visthrow.diagnose.interface import Mistake
 from visthrow.diagnose.scatter import Scatter
 
 FOUND, CLASS, BOUNDED = "FOUND", "CLASS", "BOUNDED"
@@ -117,6 +118,7 @@ class Diagnosis:
     seconds: float = 0.0
     seed: int = 0
     scatter: tuple[Scatter, ...] = ()  # what may vary from flight to flight
+    mistakes: tuple[Mistake, ...] = ()  # of the logs' interface, put right before anything was estimated
     work: Any = field(default=None, repr=False, compare=False)
 
     def __getitem__(self, name: str) -> Finding:
@@ -131,5 +133,5 @@ class Diagnosis:
     def to_dict(self) -> dict[str, Any]:
         """All but ``work``, for JSON."""
         fields = {name: value for name, value in vars(self).items() if name != "work"}
-        plain = {name: [asdict(v) for v in fields[name]] for name in ("findings", "steps", "levels", "laws", "scatter")}
+        plain = {name: [asdict(v) for v in fields[name]] for name in ("findings", "steps", "levels", "laws", "scatter", "mistakes")}
         return {**fields, **plain}

@@ -26,6 +26,8 @@ LANDING_SIGMA = 2e-3
 """Of a logged landing's height [m]: a ball is pressed in, and samples lie milliseconds apart."""
 GRID = 0.02
 """Between the smoothed poses that a camera's views are predicted from [s]."""
+NEAR = 0.025
+"""Reach of that smoothing [s]: attitudes change within 50 ms, which a wider one would show late."""
 LEAST_KEYPOINT_SIGMA = 2e-4  # normalised
 ACTS_ON = ("camera.", "plant.release.landing_height", "plant.rope.payload_radius", "sensing.camera_")
 """Numbers that nothing but these samples depends on: their effects need no simulation."""
@@ -204,7 +206,7 @@ def _view(log: FlightLog, flight: Recorded, c: Cut, x: SensingParams) -> dict | 
     if goal is None:
         seen[:, :4] = False
     grid = np.arange(stamps[0] - 3 * GRID, stamps[-1] + 4 * GRID, GRID)
-    table = {name: [smoothed(s, t) for t in grid] for name, s in _sources(flight, x).items()}
+    table = {name: [smoothed(s, t, NEAR, NEAR) for t in grid] for name, s in _sources(flight, x).items()}
     if any(row is None for rows in table.values() for row in rows):
         return None
     sigma = float(np.median(highpass_sigma(points[kept].reshape(len(kept), -1))))

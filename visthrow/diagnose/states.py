@@ -127,10 +127,12 @@ def resampled(states: States, segments: int) -> States:
     return states | out | {"stiffness": states["stiffness"][:, rows]}
 
 
-def smoothed(samples: Samples, at: float) -> tuple[np.ndarray, np.ndarray] | None:
+def smoothed(
+    samples: Samples, at: float, before: float = SMOOTH_BEFORE, after: float = SMOOTH_AFTER
+) -> tuple[np.ndarray, np.ndarray] | None:
     """Value and derivative at a time from a local cubic through the samples about it; None without enough of them."""
     for reach in (1.0, 2.0, 4.0):
-        span = samples.between(at - reach * SMOOTH_BEFORE, at + reach * SMOOTH_AFTER)
+        span = samples.between(at - reach * before, at + reach * after)
         if span.stop - span.start >= LEAST_SAMPLES:
             time, values = samples.time[span] - at, samples.values[span]
             if values.shape[1] == 4:

@@ -2,7 +2,7 @@
 
 import copy
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -13,11 +13,12 @@ from sim.replay.kernel import NO_PAYLOAD
 from sim.replay.lanes import Replay
 from visthrow.diagnose.catalogue import Entry, Setting, apply, entries_for
 from visthrow.diagnose.cutting import Cut, around_slack, cut, thinned
+from visthrow.diagnose.interface import Mistake
 from visthrow.diagnose.landing import Landings, landings
 from visthrow.diagnose.model import Window
 from visthrow.diagnose.opened import opened
 from visthrow.diagnose.recorded import NEVER, carriers, record_of
-from visthrow.diagnose.replay import BATCH, KNOT_SPACING, Flights, Lane, carried
+from visthrow.diagnose.replay import BATCH, CUDA_BATCH, KNOT_SPACING, Flights, Lane, carried
 from visthrow.diagnose.sightings import channels_of, needs_no_flight, sightings, with_sightings
 from visthrow.diagnose.states import (
     States,
@@ -40,6 +41,12 @@ ROUNDS = 25
 AFTER_SLACK = 0.05  # that a rope is given to come taut [s]
 HUBER = 30.0  # deviations, beyond which a sample counts less
 SETTLED = 0.003  # relative fall of the cost below which an initial state is settled
+MOVED = 0.2  # relative fall of the cost above which derivatives by the initial state are taken anew
+ROUGHER = 3.0
+"""Added to the square of the step, in the nominal one, where only differences of lanes count: twice as long steps.
+
+The integrators' errors cancel in differences but for their derivatives, a few thousandths of a column.
+"""
 TRUSTED = ("motor_speed",)
 """Fields that are linearised about where the commands left them. Fitted without gusts they would take the gusts' place: rotors
 far from their commands at the start of a window, and with them a law of the thrust's slope that is none."""
@@ -68,6 +75,7 @@ class ThrowModel:
         carries: bool | None = None,
         simpler: bool = False,
         camera: CameraParams | None = None,
+        mistakes: tuple[Mistake, ...] = (),
     ):
         """Cut the flights and find the windows' initial states.
 
@@ -82,12 +90,13 @@ class ThrowModel:
             carries: whether a payload hangs below in all flights; default: in those in which one was measured or released.
             simpler: consider also blocks simpler than the plant's, such as a rigid rope; each compiles a kernel.
             camera: whose keypoints the logs hold.
+            mistakes: of the logs' interface that were put right before.
 
         Raises:
             DiagnoseError: no flight can be replayed, or ``only`` names what does not exist.
         """
         self.setting = opened(Setting(plant, sensing or SensingParams(), camera=camera))
-        self.device, self.substep = device, substep
+        self.device, self.substep, self.mistakes = device, substep, mistakes
         flights = [record_of(log, i) for i, log in enumerate(logs)]
         hangs = carriers(flights) if carries is None else [carries] * len(flights)
         carries = any(hangs)
@@ -130,7 +139,8 @@ class ThrowModel:
         states = self._states if setting == self.setting else self._settle(setting, self._better_start(setting))
         self._latest = states
         steps = [self._step(e, theta.get(e.effect.name, 0.0)) for e in self._graded]
-        settings = [setting, *[e.apply(setting, step) for e, step in zip(self._graded, steps)]]
+        rough = _rougher(setting)
+        settings = [setting, rough, *[e.apply(rough, step) for e, step in zip(self._graded, steps)]]
         replay = self._replay(settings)
         found: list[Window] = []
         for batch in self._batches():
@@ -234,7 +244,9 @@ class ThrowModel:
         """For each window, the better of the states settled at theta = 0 and those that the setting itself begins with."""
         fresh, which = self._begin(setting), np.arange(len(self.flights.cuts))
         replay, settled = self._replay([setting]), resampled(self._states, setting.plant.rope.segments)
-        old, new = (self._costs(replay, setting, states, which) for states in (settled, fresh))
+        old, new = (
+            np.array([_huber(r) for r in self._residuals(replay, setting, states, which)]) for states in (settled, fresh)
+        )
         return {name: np.where(_like(new < old, value), fresh[name], value) for name, value in settled.items()}
 
     @staticmethod
@@ -247,10 +259,10 @@ class ThrowModel:
         """Windows in groups whose lanes fit a run."""
         batches, room = [], 0
         for w in self._told:
-            lanes = 1 + len(self._graded) + len(self._directions) + 9 * int(self.flights.knots[w])
+            lanes = 2 + len(self._graded) + len(self._directions) + 9 * int(self.flights.knots[w])
             if not batches or room < lanes:
                 batches.append([])
-                room = BATCH
+                room = BATCH if self.device == "cpu" else CUDA_BATCH
             batches[-1].append(w)
             room -= lanes
         return batches
@@ -279,14 +291,14 @@ class ThrowModel:
         for w in batch:
             lanes.append(Lane(w, 0, w, keep=keep))
             keep += int(self.flights.knots[w])
-            lanes += [Lane(w, 1 + k, w) for k in range(len(self._graded))]
-            lanes += [Lane(w, 0, (1 + d) * count + w) for d in self._nuisances(w)]
-            lanes += [Lane(w, 0, w, axis, knot, LATENT_SIZES[axis]) for axis, knot in self._latents(w)]
+            lanes += [Lane(w, 1 + k, w) for k in range(1 + len(self._graded))]
+            lanes += [Lane(w, 1, (1 + d) * count + w) for d in self._nuisances(w)]
+            lanes += [Lane(w, 1, w, axis, knot, LATENT_SIZES[axis]) for axis, knot in self._latents(w)]
         flown = self.flights.fly(replay, settings, self._moved(states), lanes, self.substep)
         out, at, keep = [], 0, 0
         for w in batch:
             nuisances, latents = self._nuisances(w), self._latents(w)
-            size = 1 + len(self._graded) + len(nuisances) + len(latents)
+            size = 2 + len(self._graded) + len(nuisances) + len(latents)
             knots = {name: value[keep : keep + self.flights.knots[w]] for name, value in flown.knots.items()}
             out.append(self._window(flown.seen[:, at : at + size], settings[0], steps, w, nuisances, latents, knots))
             at, keep = at + size, keep + int(self.flights.knots[w])
@@ -295,12 +307,12 @@ class ThrowModel:
     def _window(
         self, seen: np.ndarray, setting: Setting, steps: np.ndarray, w: int, nuisances: list[int], latents: list, knots: dict
     ) -> Window:
-        """One window from its lanes: nominal, effects, initial states, latent forces."""
+        """One window from its lanes: nominal; with rougher steps nominal, effects, initial states, latent forces."""
         rows, c = int(self.flights.rows[w]), self.flights.cuts[w]
         flat = np.ascontiguousarray(np.swapaxes(seen[:rows], 1, 2)).reshape(3 * rows, -1)
         K, D = len(steps), len(nuisances)
         sizes = [*steps, *[self._directions[d].step for d in nuisances], *[LATENT_SIZES[axis] for axis, _ in latents]]
-        slopes = (flat[:, 1:] - flat[:, :1]) / np.array(sizes)
+        slopes = (flat[:, 2:] - flat[:, 1:2]) / np.array(sizes)
         return Window(
             c.flight, c.phase, self._time(w), self._channel(w), self._residual(seen, w, 0), self._sigma(w), slopes[:, :K],
             slopes[:, K : K + D], np.array([self._directions[d].sd for d in nuisances]), slopes[:, K + D :],
@@ -370,58 +382,56 @@ class ThrowModel:
         """Fit each window's initial state to its samples by Levenberg and Marquardt; no step that does not help is taken."""
         replay, count = self._replay([setting]), len(self.flights.cuts)
         moves, damping = np.zeros((count, len(self._directions))), np.full(count, DAMPING)
-        left, stale, cost = self._told, np.ones(count, dtype=bool), np.full(count, np.inf)
-        cost[left] = self._costs(replay, setting, states, left)
+        left, cost = self._told, np.full(count, np.inf)
+        stale, aged = np.ones(count, dtype=bool), np.zeros(count, dtype=bool)
+        residuals = dict(zip(left, self._residuals(replay, setting, states, left)))
+        cost[left] = [_huber(residuals[w]) for w in left]
         slopes: dict[int, np.ndarray] = {}
-        residuals: dict[int, np.ndarray] = {}
         for _ in range(ROUNDS):
-            for w, slope, residual in self._state_slopes(replay, setting, states, left[stale[left]]):
-                slopes[w], residuals[w] = slope, residual
+            slopes |= self._state_slopes(replay, setting, states, left[stale[left]])
+            aged &= ~stale
             trial = np.zeros_like(moves)
             for w in left:
                 trial[w] = self._increment(w, slopes[w], residuals[w], moves[w], damping[w])
             there = states
             for d, direction in enumerate(self._directions):
                 there = moved(there, direction, trial[:, d])
-            tried = np.full(count, np.inf)
-            tried[left] = self._costs(replay, setting, there, left)
+            tried, seen = np.full(count, np.inf), dict(zip(left, self._residuals(replay, setting, there, left)))
+            tried[left] = [_huber(seen[w]) for w in left]
             better = tried < cost
+            residuals |= {w: seen[w] for w in left if better[w]}
             states = {name: np.where(_like(better, v), there[name], v) for name, v in states.items()}
             moves[better] += trial[better]
             settled = better & (tried > (1.0 - SETTLED) * cost)
-            cost, stale = np.where(better, tried, cost), better
-            damping = np.where(better, damping / 10.0, damping * 10.0)
+            stale = np.where(better, tried < (1.0 - MOVED) * cost, aged)
+            damping = np.where(better, damping / 10.0, np.where(aged, damping, damping * 10.0))
+            aged, cost = aged | better, np.where(better, tried, cost)
             left = left[~settled[left] & (damping[left] < DAMPING_MOST)]
             if not len(left):
                 break
         return states
 
-    def _costs(self, replay: Replay, setting: Setting, states: States, which: np.ndarray) -> np.ndarray:
-        """Huber's cost of windows."""
+    def _residuals(self, replay: Replay, setting: Setting, states: States, which: np.ndarray) -> list[np.ndarray]:
+        """Residuals of windows in the noise."""
         seen = self.flights.fly(replay, [setting], states, [Lane(w, 0, w) for w in which], self.substep).seen
-        costs = np.zeros(len(which))
-        for lane, w in enumerate(which):
-            off = np.abs(self._residual(seen, w, lane) / self._sigma(w))
-            cost = np.sum(np.where(off < HUBER, 0.5 * off**2, HUBER * (off - 0.5 * HUBER)))
-            costs[lane] = cost if np.isfinite(cost) else np.inf
-        return costs
+        return [self._residual(seen, w, lane) / self._sigma(w) for lane, w in enumerate(which)]
 
-    def _state_slopes(
-        self, replay: Replay, setting: Setting, states: States, which: np.ndarray
-    ) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
-        """Derivatives of windows' samples by their initial states, and residuals, both in the noise."""
+    def _state_slopes(self, replay: Replay, setting: Setting, states: States, which: np.ndarray) -> dict[int, np.ndarray]:
+        """Derivatives of windows' samples by their initial states, in the noise."""
         if not len(which):
-            return
+            return {}
         count, lanes, first = len(self.flights.cuts), [], []
         for w in which:
             first.append(len(lanes))
-            lanes += [Lane(w, 0, w), *[Lane(w, 0, (1 + d) * count + w) for d in self._fitted(w)]]
-        seen = self.flights.fly(replay, [setting], self._moved(states), lanes, self.substep).seen
+            lanes += [Lane(w, 0, w), *[Lane(w, 0, (1 + d) * count + w) for d in self._nuisances(w)]]
+        seen = self.flights.fly(replay, [_rougher(setting)], self._moved(states), lanes, self.substep).seen
+        slopes = {}
         for at, w in zip(first, which):
-            ds, rows, sigma = self._fitted(w), int(self.flights.rows[w]), self._sigma(w)
+            ds, rows = self._nuisances(w), int(self.flights.rows[w])
             flat = np.swapaxes(seen[:rows, at : at + 1 + len(ds)], 1, 2).reshape(3 * rows, -1)
             steps = np.array([self._directions[d].step for d in ds])
-            yield w, (flat[:, 1:] - flat[:, :1]) / steps / sigma[:, None], self._residual(seen, w, at) / sigma
+            slopes[w] = (flat[:, 1:] - flat[:, :1]) / steps / self._sigma(w)[:, None]
+        return slopes
 
     def _increment(self, w: int, slopes: np.ndarray, residual: np.ndarray, done: np.ndarray, damping: float) -> np.ndarray:
         """Levenberg-Marquardt step of a window's state, with its vague prior; shape (directions,)."""
@@ -440,3 +450,15 @@ class ThrowModel:
 def _like(mask: np.ndarray, value: np.ndarray) -> np.ndarray:
     """The mask with as many axes as a value."""
     return mask.reshape(-1, *[1] * (value.ndim - 1))
+
+
+def _rougher(setting: Setting) -> Setting:
+    """The setting with longer steps, for lanes that are only compared with each other."""
+    return dataclasses.replace(setting, step_square=setting.step_square + ROUGHER)
+
+
+def _huber(residual: np.ndarray) -> float:
+    """Huber's cost of residuals in the noise; infinite where one is not finite."""
+    off = np.abs(residual)
+    cost = float(np.sum(np.where(off < HUBER, 0.5 * off**2, HUBER * (off - 0.5 * HUBER))))
+    return cost if np.isfinite(cost) else np.inf

@@ -1,0 +1,74 @@
+"""Axes, signs and units of commands that a log has otherwise than the simulation: each hidden, named, put right."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from sim.params import GRAVITY
+from tests.plants import paper_plant
+from visthrow.diagnose.interface import put_right
+from visthrow.flightlog import Channel, FlightLog
+
+PLANT = paper_plant()
+WEIGHT = GRAVITY * (PLANT.vehicle.body.mass + PLANT.rope.payload_mass + PLANT.rope.rope_mass)
+
+
+def flown(seed: int, lag: float = 0.05) -> FlightLog:
+    """Attitudes of a vehicle whose rates follow its commands ``lag`` seconds later, and the commands."""
+    rng = np.random.default_rng(seed)
+    sent = np.arange(0.0, 8.0, 0.02)
+    bends = rng.normal(size=(3, 5)) * [1.2, 0.9, 0.7, 0.5, 0.3]
+    rates = sum(bends[:, k, None] * np.sin((k + 1) * 1.3 * sent + rng.uniform(0, 6, (3, 1))) for k in range(5)).T
+    thrust = WEIGHT * (1.0 + 0.1 * rng.normal(size=len(sent)))
+    time = np.arange(0.0, 8.0, 0.005)
+    real = np.column_stack([np.interp(time - lag, sent, c) for c in rates.T])
+    turn, quats = Rotation.identity(), []
+    for rate in real:
+        turn = turn * Rotation.from_rotvec(0.005 * rate)
+        quats.append((turn * Rotation.from_rotvec(3e-3 * rng.normal(size=3))).as_quat())
+    return FlightLog({
+        "quat_wb": Channel(time, np.array(quats), "1", "world"), "pos_w": Channel(time, np.zeros((len(time), 3)), "m", "world"),
+        "command": Channel(sent, np.column_stack((thrust, rates)), "N, rad/s", "body"),
+    }, {})  # fmt: skip
+
+
+LOGS = [flown(seed) for seed in range(3)]
+FULL = 4.0 * PLANT.vehicle.controller.max_thrust
+WRONG = {
+    "rate_axes": lambda u: u[:, [0, 2, 1, 3]],
+    "rate_sign": lambda u: u * [1.0, 1.0, -1.0, 1.0],
+    "rate_unit": lambda u: u * [1.0, 57.29578, 57.29578, 57.29578],
+    "thrust_unit": lambda u: u * [1.0 / 9.80665e-3, 1.0, 1.0, 1.0],
+    "thrust_unit of full": lambda u: u * [1.0 / FULL, 1.0, 1.0, 1.0],
+}
+
+
+def changed(log, change):
+    c = log["command"]
+    return FlightLog({**log.channels, "command": Channel(c.time, change(c.values), c.unit, c.frame)}, log.meta)
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_each_mistake_is_named_and_put_right(name):
+    logs, found = put_right([changed(log, WRONG[name]) for log in LOGS], PLANT)
+    assert [m.name for m in found] == [name.split(" ")[0]]
+    assert found[0].logs == 3
+    assert found[0].nats > 3.0
+    for mended, log in zip(logs, LOGS):
+        np.testing.assert_allclose(mended["command"].values, log["command"].values, rtol=1e-4, atol=1e-9)
+
+
+def test_two_mistakes_at_once():
+    wrong = [changed(log, lambda u: u[:, [0, 1, 3, 2]] * [101.97, -57.29578, 57.29578, 57.29578]) for log in LOGS]
+    _, found = put_right(wrong, PLANT)
+    assert [m.name for m in found] == ["rate_axes", "rate_unit", "thrust_unit"]
+
+
+def test_good_logs_and_logs_that_disagree_stay_as_they_are():
+    assert put_right(LOGS, PLANT) == (LOGS, ())
+    mixed = [changed(LOGS[0], WRONG["rate_axes"]), *LOGS[1:]]
+    assert put_right(mixed, PLANT)[1] == ()
+    strangers = [changed(log, lambda u, other=other: other["command"].values) for log, other in zip(LOGS, [*LOGS[1:], LOGS[0]])]
+    assert put_right(strangers, PLANT)[1] == ()
+    heavier = [changed(log, lambda u: u * [1.6, 1.0, 1.0, 1.0]) for log in LOGS]
+    assert put_right(heavier, PLANT)[1] == ()
