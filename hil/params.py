@@ -18,6 +18,7 @@ from hil.realtime import RealtimeParams
 from hil.safety import CheckParams, FenceParams, GuardParams
 from hil.sources import BodyIds, CsvParams, LogBody, MocapParams, RigidBody
 from hil.states import StateParams
+from hil.track import MOST_PREDICTION
 from visthrow.errors import ConfigError
 
 LIVE = ("mavlink", "mocap")
@@ -58,7 +59,8 @@ class DelayParams:
     source: float  # of a pose when it arrives [s], where its sender's clock is not known
     synchronise: bool  # ask the senders of poses for their clock by TIMESYNC, and take ages from it where they answer
     compensate: bool  # carry poses forward to the age that the policy was trained with
-    command: float = 0.0  # by which commands act later than in the policy's training; poses are carried as much further [s]
+    # By which commands and releases act later than in the policy's training; poses are carried as much further [s].
+    command: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -119,3 +121,5 @@ class HilParams:
                 )
         if not 0.0 <= self.delay.source <= 0.5:
             raise ConfigError(f"delay.source {self.delay.source} s; expected 0 to 0.5")
+        if not 0.0 <= self.delay.command <= MOST_PREDICTION:
+            raise ConfigError(f"delay.command {self.delay.command} s; expected 0 to {MOST_PREDICTION:g}: so far poses are carried")

@@ -45,21 +45,30 @@ def pipe() -> tuple[MemoryPort, MemoryPort]:
 
 
 class PlantClock:
-    """The plant's time; waiting flies on."""
+    """Simulated time; waiting flies on. What is sent is heard at that instant, which may lie within a period of the plant."""
 
     def __init__(self, fake: Fake) -> None:
-        self._fake = fake
+        self._fake, self._now = fake, fake.plant.time
+        fake.wall, fake.question_lag = self.now, 0.0
 
     def now(self) -> float:
-        return self._fake.plant.time
+        return max(self._now, self._fake.plant.time)
+
+    def _until(self, when: float, port: MemoryPort | None) -> None:
+        fake = self._fake
+        while self.now() < when - 1e-9:
+            fake.hear()
+            if port is not None and port.inbox:
+                return
+            self._now = min(fake.plant.time + fake.plant.period, when)
+            if self._now > fake.plant.time + fake.plant.period - 1e-9:
+                fake.step()
 
     def sleep_until(self, when: float) -> None:
-        while self._fake.plant.time < when - 1e-9:
-            self._fake.step()
+        self._until(when, None)
 
     def wait_for(self, port: MemoryPort, when: float) -> None:
-        while self._fake.plant.time < when - 1e-9 and not port.inbox:
-            self._fake.step()
+        self._until(when, port)
 
 
 CONFIGS = {"ardupilot": "fake", "px4": "fake_px4", "betaflight": "fake_betaflight"}
