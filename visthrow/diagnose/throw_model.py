@@ -423,11 +423,11 @@ class ThrowModel:
         count, lanes, first = len(self.flights.cuts), [], []
         for w in which:
             first.append(len(lanes))
-            lanes += [Lane(w, 0, w), *[Lane(w, 0, (1 + d) * count + w) for d in self._nuisances(w)]]
+            lanes += [Lane(w, 0, w), *[Lane(w, 0, (1 + d) * count + w) for d in self._fitted(w)]]
         seen = self.flights.fly(replay, [_rougher(setting)], self._moved(states), lanes, self.substep).seen
         slopes = {}
         for at, w in zip(first, which):
-            ds, rows = self._nuisances(w), int(self.flights.rows[w])
+            ds, rows = self._fitted(w), int(self.flights.rows[w])
             flat = np.swapaxes(seen[:rows, at : at + 1 + len(ds)], 1, 2).reshape(3 * rows, -1)
             steps = np.array([self._directions[d].step for d in ds])
             slopes[w] = (flat[:, 1:] - flat[:, :1]) / steps / self._sigma(w)[:, None]
