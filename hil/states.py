@@ -115,7 +115,7 @@ class Machine:
             if urgent is not None:
                 self._go(now, State.ABORT, urgent)
             else:
-                getattr(self, f"_{self.state.value}")(now, seen)
+                _STEPS[self.state](self, now, seen)
         return self.state
 
     def _urgent(self, seen: Inputs) -> str | None:
@@ -209,3 +209,10 @@ class Machine:
     def _land(self, now: float, seen: Inputs) -> None:
         if seen.grounded or self._late(now):
             self._go(now, State.DONE, "landed" if seen.grounded else "landing took too long")
+
+
+_STEPS = {
+    State.IDLE: Machine._idle, State.CHECK: Machine._check, State.READY: Machine._ready, State.ARMED: Machine._armed,
+    State.THROW: Machine._throw, State.RECOVER: Machine._recover, State.LAND: Machine._land,
+}  # fmt: skip
+"""By state. A name put together at each tick would stay in Python's cache of attributes, a new one for each."""

@@ -96,6 +96,7 @@ class MavlinkAutopilot:
         self._arm_refused = ""
         self._kinds: dict[str, int] = {}  # of parameters, as MAV_PARAM_TYPE
         self.release_record = Release(params.release_timeout, params.servo_output > 0)
+        self._servo = f"servo{params.servo_output}_raw"  # one string for good: Python's cache of attributes keeps each new one
         rules = self._rules() if params.audit else ()
         self.audit = Audit(rules, self._ask_parameter, self._write_parameter if write else None, tell)
         self.texts: list[str] = []
@@ -139,7 +140,7 @@ class MavlinkAutopilot:
         elif kind == "STATUSTEXT" and len(self.texts) < 1000:
             self.texts.append(str(message.text))
         elif kind == "SERVO_OUTPUT_RAW" and 1 <= p.servo_output <= 16:
-            value = getattr(message, f"servo{p.servo_output}_raw", 0)
+            value = getattr(message, self._servo, 0)
             if value and abs(value - p.servo_open_us) <= SERVO_NEAR:
                 self.release_record.moved()
         elif kind == "PARAM_VALUE":
