@@ -136,7 +136,8 @@ def motor(params: MotorParams, speed: np.ndarray, setpoint: np.ndarray) -> np.nd
     """Return the acceleration of the rotors [rad/s^2], shape (E, 4); zero where they follow at once."""
     if params.kind == "instant":
         return np.zeros_like(speed)
-    return (setpoint - speed) / params.time_constant
+    slowing = params.time_constant_down if params.kind == "asymmetric" else params.time_constant
+    return (setpoint - speed) / np.where(setpoint < speed, slowing, params.time_constant)
 
 
 def open_circuit_voltage(params: BatteryParams, used: np.ndarray) -> np.ndarray:
@@ -170,11 +171,22 @@ def thrust_map(
         reference_voltage: u_ref [V].
         speed: [rad/s], shape (E, 4).
         voltage: [V], shape (E,).
-        gain: error of each motor's thrust, 1 for none, shape (E, 4).
+        gain: error of each motor's thrust besides ``params.gain``, 1 for none, shape (E, 4).
     """
     factor = 1.0 + params.voltage_coefficient * (voltage - reference_voltage)
-    thrust = (params.k_f * speed**2 + params.k_1 * speed) * factor[:, None] * gain
-    return thrust, params.torque_ratio * thrust
+    thrust = (params.k_f * speed**2 + params.k_1 * speed) * factor[:, None] * np.array(params.gain) * gain
+    return thrust, drag_torque_ratio(params) * thrust
+
+
+def drag_torque_ratio(params: ThrustParams) -> float:
+    """Return a rotor's true ratio of drag torque to thrust [m]; the controller's mixer knows of the nominal one."""
+    return params.torque_ratio * params.torque_gain
+
+
+def near_ground(strength: float, radius: float, height: np.ndarray) -> np.ndarray:
+    """Return the factor on the rotors' thrust at heights of the centre of mass [m], shapes (E,). See ``AirParams``."""
+    ratio = radius / (4.0 * np.maximum(height, 0.5 * radius))
+    return 1.0 + strength * (1.0 / (1.0 - ratio**2) - 1.0)
 
 
 def aerodynamics(

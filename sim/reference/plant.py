@@ -9,7 +9,7 @@ from dataclasses import MISSING, dataclass, fields, replace
 import numpy as np
 
 from sim.params import GRAVITY, PlantParams
-from sim.reference import blocks
+from sim.reference import blocks, payload
 from sim.reference.extras import ReferenceExtras
 from sim.reference.flight import crossing, segments_of_period
 from sim.reference.model import RopeModel
@@ -53,8 +53,11 @@ class Landing:
     separation_time: np.ndarray  # [s], shape (E,)
 
 
-KNOWN_EXTENSIONS = ("payload_drag", "precision")
-"""Parameters with a default that the plant has: drag among its extras, and what is no matter of physics."""
+KNOWN_EXTENSIONS = {
+    "body.com", "thrust.gain", "thrust.torque_gain", "air.wind_w", "air.ground_effect", "rope.payload_drag", "rope.mount_damping",
+    "rope.swing_damping", "rope.downwash", "release.lag_tension", "release.kick_w", "release.kick_along",
+}  # fmt: skip
+"""Parameters with a default that the plant has; the payload's drag stands among its extras."""
 
 
 def _refuse_unknown(params: PlantParams) -> None:
@@ -65,9 +68,8 @@ def _refuse_unknown(params: PlantParams) -> None:
         f"{name}.{f.name}"
         for name, part in parts.items()
         for f in fields(part)
-        if f.default is not MISSING and f.name not in KNOWN_EXTENSIONS and getattr(part, f.name) != f.default
+        if f.default is not MISSING and f"{name}.{f.name}" not in KNOWN_EXTENSIONS and getattr(part, f.name) != f.default
     ]
-    unknown += ["motor.kind asymmetric"] if vehicle.motor.kind == "asymmetric" else []
     unknown += ["laws"] if params.laws else []
     if unknown:
         raise ValueError(f"the reference plant does not know {', '.join(unknown)}; expected plants without")
@@ -172,13 +174,13 @@ class ReferencePlant:
         extras, rope, vehicle, count, rng = self.extras, self.params.rope, self.params.vehicle, self.count, self._rng
         gain = 1.0 + extras.thrust_gain_error + extras.thrust_gain_sigma * rng.standard_normal((count, 1))
         gain = gain + extras.motor_gain_sigma * rng.standard_normal((count, 4))
-        com = np.array(extras.com_offset) + np.array(extras.com_offset_sigma) * rng.standard_normal((count, 3))
+        com = np.add(vehicle.body.com, extras.com_offset) + np.array(extras.com_offset_sigma) * rng.standard_normal((count, 3))
         self._errors = VehicleErrors(gain, com)
         self._payload_mass = rope.payload_mass * (1.0 + extras.payload_mass_sigma * rng.standard_normal(count))
         length = rope.length * (1.0 + extras.rope_length_sigma * rng.standard_normal(count))
         self._used = rng.uniform(0.0, 1.0, count) * extras.battery_start_used
         self._rope_mass = self._payload_mass + rope.rope_mass
-        self._wind = np.array(extras.wind_mean_w) + np.array(extras.wind_sigma_w) * rng.standard_normal((count, 3))
+        self._wind = self._mean_wind + np.array(extras.wind_sigma_w) * rng.standard_normal((count, 3))
         self._next_wind = self._wind
         # Compiling a model takes milliseconds; without these draws the ropes of the last episode serve on.
         if self._ropes is not None and not (
@@ -208,10 +210,15 @@ class ReferencePlant:
             for i in range(count)
         ]
         stretch = (extras.stretch_stiffness, extras.stretch_damping) if extras.stretch_stiffness > 0.0 else None
-        self._ropes = RopeDynamics(models, stretch)
+        self._ropes = RopeDynamics(models, stretch, rope.mount_damping)
         # The bending modes of light segments die out faster than RK4 bears, at rates up to 48 d / (m l^2).
-        fastest = 48.0 * base.joint_damping / (base.segment_mass * float(np.min(length) / rope.segments) ** 2)
+        damping = base.joint_damping + rope.mount_damping
+        fastest = 48.0 * damping / (base.segment_mass * float(np.min(length) / rope.segments) ** 2)
         self._step = min(self.step_size, LARGEST_DECAY / fastest) if fastest > 0.0 else self.step_size
+
+    @property
+    def _mean_wind(self) -> np.ndarray:
+        return np.array(self.params.air.wind_w) + np.array(self.extras.wind_mean_w)
 
     def _rope_of(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Directions, their derivatives, elongation and its rate."""
@@ -238,14 +245,19 @@ class ReferencePlant:
         rotation = rotation_from_quat(state[:, 3:7])
         body, rate_b = state[:, :BODY], state[:, 10:13]
         air_b = turned_back(rotation, body[:, 7:10] - wind_w)
-        force_b, torque_b, rates[:, BODY : BODY + BLOCKS] = vehicle_rates(
-            vehicle, self._errors, state[:, BODY : BODY + BLOCKS], command, air_b, rate_b
+        near_ground = blocks.near_ground(self.params.air.ground_effect, vehicle.rotors.radius, state[:, 2])
+        force_b, torque_b, rates[:, BODY : BODY + BLOCKS], thrust = vehicle_rates(
+            vehicle, self._errors, state[:, BODY : BODY + BLOCKS], command, air_b, rate_b, near_ground
         )
         force_w = turned(rotation, force_b)
         rates[:, :BODY] = rigid_body_rates(vehicle, body, force_w, torque_b)
         rope = self._rope_of(state)
         root = self._upper_end(state)
-        drag_w = self._payload_force(root, rope, wind_w)
+        lift_w = rotation[:, :, 2] * thrust.sum(axis=1, keepdims=True)
+        drag_w = payload.force(
+            self.params.rope, self.extras.payload_drag, self._ropes.points(*root, rope)[2], wind_w, rope[0][:, -1], lift_w,
+            self._attached,
+        )  # fmt: skip
         second = np.zeros_like(rope[0])
         stretch_dot = np.zeros(self.count)
         ids = np.flatnonzero(self._attached & moving)
@@ -270,14 +282,14 @@ class ReferencePlant:
         rates[:, -2], rates[:, -1] = rope[3] * airborne[:, 0], stretch_dot
         return rates
 
-    def _payload_force(
-        self, root: tuple[np.ndarray, np.ndarray], rope: tuple[np.ndarray, ...], wind_w: np.ndarray
-    ) -> np.ndarray:
-        """Drag of the payload [N], world frame, shape (E, 3)."""
-        if self.extras.payload_drag == 0.0:
-            return np.zeros((self.count, 3))
-        relative = self._ropes.points(*root, rope)[2] - wind_w
-        return -self.extras.payload_drag * np.linalg.norm(relative, axis=1, keepdims=True) * relative
+    def _pull(self) -> np.ndarray:
+        """Force of the rope along its first segment on the mount [N], shape (E,); of the vehicles' acceleration."""
+        command = blocks.command_queue(np.array(self._queue_times), np.array(self._queue_commands), np.full(self.count, self.time))
+        with_rope, without = (
+            self._rates(self._state, command, self._wind, np.full(self.count, moving))[:, 7:10] for moving in (True, False)
+        )
+        force_w = self.params.vehicle.body.mass * (with_rope - without)
+        return np.sum(force_w * self._rope_of(self._state)[0][:, 0], axis=1)
 
     def step(self, command: np.ndarray, release: np.ndarray | bool = False) -> None:
         """Give a command now and advance one control period.
@@ -291,12 +303,15 @@ class ReferencePlant:
         delay = self.params.vehicle.queue.delay + extras.delay_jitter * rng.uniform(-1.0, 1.0, self.count)
         self._queue_times.append(np.maximum(start + np.maximum(delay, 0.0), self._queue_times[-1]))
         self._queue_commands.append(np.broadcast_to(np.asarray(command, dtype=np.float64), (self.count, 4)).copy())
-        lag = self.params.release.lag + extras.release_lag_jitter * rng.uniform(-1.0, 1.0, self.count)
+        lag = self.params.release.lag
+        if self.params.release.lag_tension:
+            lag = payload.lag(self.params.release, self._pull(), self._payload_mass)
+        lag = lag + extras.release_lag_jitter * rng.uniform(-1.0, 1.0, self.count)
         tripped = np.broadcast_to(np.asarray(release, dtype=bool), (self.count,)) & ~self._latched
         self._separation = np.where(tripped, start + np.maximum(lag, 0.0), self._separation)
         self._latched = self._latched | tripped
         decay = np.exp(-period / extras.wind_time_constant)
-        mean, sigma = np.array(extras.wind_mean_w), np.array(extras.wind_sigma_w)
+        mean, sigma = self._mean_wind, np.array(extras.wind_sigma_w)
         self._next_wind = (
             mean + decay * (self._wind - mean) + np.sqrt(1 - decay**2) * sigma * rng.standard_normal((self.count, 3))
         )
@@ -338,6 +353,7 @@ class ReferencePlant:
         due = self._attached & (self._separation <= clock + blocks.TIME_TOLERANCE)
         if np.any(due):
             pos, vel = self._upper_end(self._state)
+            vel = vel + payload.kick(self.params.release, self._rope_of(self._state)[0][:, -1])
             self._state[due, BODY + BLOCKS : BODY + BLOCKS + 6] = np.hstack((pos, vel))[due]
             self._attached = self._attached & ~due
 
@@ -385,15 +401,15 @@ class ReferencePlant:
         state = self._state
         rotation = rotation_from_quat(state[:, 3:7])
         offset = self._errors.com_offset
-        points, payload, payload_vel = self._ropes.points(*self._upper_end(state), self._rope_of(state))
+        points, ball, ball_vel = self._ropes.points(*self._upper_end(state), self._rope_of(state))
         return PlantState(
             time=self.time,
             pos_w=state[:, 0:3] - turned(rotation, offset),
             quat_wb=state[:, 3:7].copy(),
             vel_w=state[:, 7:10] - turned(rotation, cross(state[:, 10:13], offset)),
             rate_b=state[:, 10:13].copy(),
-            payload_pos_w=np.where(self._landed[:, None], self._landing_point, payload),
-            payload_vel_w=np.where(self._landed[:, None], 0.0, payload_vel),
+            payload_pos_w=np.where(self._landed[:, None], self._landing_point, ball),
+            payload_vel_w=np.where(self._landed[:, None], 0.0, ball_vel),
             cable_points_w=points,
             motor_speed=state[:, BODY + 9 : BODY + 13].copy(),
             battery_voltage=state[:, BODY + 14].copy(),

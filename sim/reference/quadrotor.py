@@ -78,7 +78,8 @@ def vehicle_rates(
     command: np.ndarray,
     air_velocity_b: np.ndarray,
     rate_b: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    near_ground: np.ndarray | float = 1.0,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Run the seven blocks.
 
     Args:
@@ -88,9 +89,11 @@ def vehicle_rates(
         command: acting command, shape (E, 4).
         air_velocity_b: velocity relative to the air, body frame [m/s], shape (E, 3).
         rate_b: [rad/s], shape (E, 3).
+        near_ground: factor on the rotors' thrust, shape (E,).
 
     Returns:
-        Force [N] and torque [N m] about the centre of mass, body frame, shapes (E, 3), and the state's time derivative.
+        Force [N] and torque [N m] about the centre of mass, body frame, shapes (E, 3), the state's time derivative, and
+        the rotors' thrust [N], shape (E, 4).
     """
     used, voltage = state[:, 13], state[:, 14]
     rates = np.zeros_like(state)
@@ -105,11 +108,13 @@ def vehicle_rates(
     thrust, torque = blocks.thrust_map(
         vehicle.thrust, vehicle.battery.reference_voltage, speed, voltage, errors.thrust_gain
     )
+    thrust, torque = (np.reshape(near_ground, (-1, 1)) * part for part in (thrust, torque))
     rates[:, 13], rates[:, 14] = blocks.battery(vehicle.battery, used, voltage, speed, torque)
     arms = rotor_arms(vehicle, errors)
-    aero = blocks.aerodynamics(vehicle.aero, arms, vehicle.thrust.torque_ratio, thrust, air_velocity_b, rate_b)
+    ratio = blocks.drag_torque_ratio(vehicle.thrust)
+    aero = blocks.aerodynamics(vehicle.aero, arms, ratio, thrust, air_velocity_b, rate_b)
     force_b, torque_b = blocks.composer(vehicle.rotors, arms, thrust, torque, speed, rates[:, 9:13], rate_b, aero)
-    return force_b, torque_b, rates
+    return force_b, torque_b, rates, thrust
 
 
 def rigid_body_rates(vehicle: VehicleParams, body: np.ndarray, force_w: np.ndarray, torque_b: np.ndarray) -> np.ndarray:
@@ -155,7 +160,7 @@ class ReferenceQuadrotor:
     def _rates(self, state: np.ndarray, command: np.ndarray) -> np.ndarray:
         body, rotation = state[:, :BODY], rotation_from_quat(state[:, 3:7])
         air = turned_back(rotation, body[:, 7:10])
-        force, torque, block_rates = vehicle_rates(
+        force, torque, block_rates, _ = vehicle_rates(
             self.vehicle, self.errors, state[:, BODY:], command, air, body[:, 10:13]
         )
         force_w = turned(rotation, force) + self.force_w

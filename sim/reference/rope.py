@@ -21,12 +21,13 @@ class RopeDynamics:
     Args:
         ropes: one model an environment, all with the same number of segments.
         stretch: stiffness [N/m] and damping [N s/m] between last segment and payload, or None.
+        mount_damping: of the uppermost joint besides the ropes' own while it is on the vehicle [N m s].
 
     Raises:
         ValueError: models with different numbers of segments.
     """
 
-    def __init__(self, ropes: list[RopeModel], stretch: tuple[float, float] | None = None) -> None:
+    def __init__(self, ropes: list[RopeModel], stretch: tuple[float, float] | None = None, mount_damping: float = 0.0) -> None:
         self.segments = ropes[0].segments
         if any(rope.segments != self.segments for rope in ropes):
             raise ValueError(f"ropes have {sorted({rope.segments for rope in ropes})} segments, expected one number")
@@ -35,6 +36,7 @@ class RopeDynamics:
         self.offset = np.array([rope.payload_offset for rope in ropes])
         self.mount = np.array([rope.mount for rope in ropes])
         self.damping = np.array([rope.joint_damping for rope in ropes])
+        self.mount_damping = mount_damping
         self._attached_models = [build_attached(rope, "ball", stretch=stretch) for rope in ropes]
         self._free_models = [build_free(rope, stretch=stretch) for rope in ropes]
         self._attached = Batch(self._attached_models[0], self.count, nthread=1)
@@ -52,6 +54,7 @@ class RopeDynamics:
         """Damping couples on the rods [N m], shape (e, L, 3), and the one on the body above, shape (e, 3)."""
         relative = np.diff(rates, axis=1, prepend=rates[:, :1] if above is None else above[:, None])
         couples = -self.damping[ids][:, None, None] * relative
+        couples[:, 0] -= self.mount_damping * relative[:, 0]
         on_above = -couples[:, 0]
         couples[:, :-1] -= couples[:, 1:].copy()
         couples -= np.sum(couples * n, -1, keepdims=True) * n

@@ -150,7 +150,7 @@ def test_hover_is_an_equilibrium(vehicle, battery):
     weight = plain.body.mass * GRAVITY
     state = initial_blocks(plain, np.zeros((1, 3)), np.array([weight]), np.zeros(1))
     command = np.array([[weight, 0.0, 0.0, 0.0]])
-    force, torque, rates = vehicle_rates(
+    force, torque, rates, _ = vehicle_rates(
         plain, VehicleErrors.none(1), state, command, np.zeros((1, 3)), np.zeros((1, 3))
     )
     np.testing.assert_allclose(force[0], (0.0, 0.0, weight), atol=1e-9)
