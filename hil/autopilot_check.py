@@ -11,7 +11,7 @@ from hil.backends.base import FOLLOW, Status
 from hil.backends.thrust import LEAST_SHARES, HoverMeter
 from hil.errors import RunError
 from hil.pose import VEHICLE
-from hil.record import CONFIG, TICKS, lines
+from hil.record import CONFIG, TICKS, lines, require_run
 from hil.states import State
 from visthrow.hover import GRAVITY
 
@@ -98,6 +98,7 @@ def hover_of_run(folder: str | Path) -> tuple[bool, str]:
     from visthrow.policy import Policy
 
     folder = Path(folder)
+    require_run(folder)
     params = config.load(HilParams, folder / CONFIG)
     if params.backend == "dry-run":
         raise RunError(f"{folder} is a dry run: nothing followed its commands; expected a run with an autopilot")

@@ -21,6 +21,24 @@ ACTIONS = {
 }
 
 
+def above_zero(text: str) -> float:
+    """A number above 0 of the command line."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not value > 0.0:
+        raise argparse.ArgumentTypeError(f"'{text}'; expected a number above 0")
+    return value
+
+
+def seed(text: str) -> int:
+    """A whole number from 0 on of the command line."""
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"'{text}'; expected a whole number of 0 or more")
+    return int(text)
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.epilog = (
@@ -40,7 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         sub = subs[name]
         sub.add_argument("--config", default="dry_run", metavar="NAME", help="of configs/hil, or a file")
         sub.add_argument("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE")
-        sub.add_argument("--seconds", type=float, default=None, help="end after this time")
+        sub.add_argument("--seconds", type=above_zero, default=None, help="end after this time")
         sub.add_argument("--speed", type=float, default=1.0, help="of the clock; below 1 with a fake of the same speed")
     for name in ("run", "record"):
         subs[name].add_argument(
@@ -76,7 +94,7 @@ def _add_simulated(fake: argparse.ArgumentParser, direct: argparse.ArgumentParse
     """Add the arguments of what flies a simulated vehicle."""
     direct.add_argument("--config", default="fake", metavar="NAME", help="of configs/hil, or a file")
     direct.add_argument("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE")
-    direct.add_argument("--seeds", type=int, nargs="+", default=[0], metavar="N", help="of starts, noise and loss; a throw each")
+    direct.add_argument("--seeds", type=seed, nargs="+", default=[0], metavar="N", help="of starts, noise and loss; a throw each")
     fake.add_argument("--rate", type=float, default=100.0, metavar="HZ", help="poses a second of each body")
     for parser in (fake, direct):
         parser.add_argument(
@@ -84,9 +102,9 @@ def _add_simulated(fake: argparse.ArgumentParser, direct: argparse.ArgumentParse
         )
     fake.add_argument("--device", default="udpout:127.0.0.1:14560", help="the runner's port")
     fake.add_argument("--policy", default="vision", metavar="POLICY", help="whose plant is flown")
-    fake.add_argument("--seed", type=int, default=0, help="of start, noise and loss")
-    fake.add_argument("--seconds", type=float, default=60.0, help="end after this time")
-    fake.add_argument("--after", type=float, default=10.0, help="end this long after the payload's landing [s]")
+    fake.add_argument("--seed", type=seed, default=0, help="of start, noise and loss")
+    fake.add_argument("--seconds", type=above_zero, default=60.0, help="end after this time")
+    fake.add_argument("--after", type=above_zero, default=10.0, help="end this long after the payload's landing [s]")
     fake.add_argument("--speed", type=float, default=1.0, help="of the clock")
     fake.add_argument(
         "--answer", default="accepted", help="to the release: accepted, in-progress, denied, silent, stuck"

@@ -2,6 +2,7 @@
 
 import contextlib
 import importlib
+import inspect
 import json
 import socket
 from pathlib import Path
@@ -25,13 +26,16 @@ def load_plant(target: str, policy: str, seed: int) -> WirePlant:
     """Call ``module:function`` with policy and seed.
 
     Raises:
-        RunError: no such module or function.
+        RunError: no such module or function, or one that makes no plant of these two.
     """
     module, _, name = target.partition(":")
     try:
         make = getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise RunError(f"plant '{target}': {error}; expected module:function, as visthrow.wire_plant:make") from error
+        inspect.signature(make).bind(policy, seed)
+    except (ImportError, AttributeError, ValueError, TypeError) as error:
+        raise RunError(
+            f"plant '{target}': {error}; expected module:function, as visthrow.wire_plant:make, called with policy and seed"
+        ) from error
     return make(policy, seed)
 
 
@@ -44,8 +48,10 @@ class ListeningPort:
         """Listen on a port of the loopback address.
 
         Raises:
-            LinkError: it is taken.
+            LinkError: it is taken, or there is none of that number.
         """
+        if not 1 <= number <= 65535:
+            raise LinkError(f"tcp port {number}; expected 1 to 65535")
         self._server = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         self._server.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:

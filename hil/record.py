@@ -149,6 +149,16 @@ def read_poses(folder: Path) -> dict[int, list[Pose]]:
     return found
 
 
+def require_run(folder: Path) -> None:
+    """Refuse what is no folder of a run.
+
+    Raises:
+        RunError: with what was expected in it.
+    """
+    if not (folder / CONFIG).is_file() or not (folder / TICKS).is_file():
+        raise RunError(f"{folder}: no folder of a run; expected {CONFIG}, {POLICY}, {POSES} and {TICKS} in it")
+
+
 def load_run(folder: str | Path) -> tuple[HilParams, Policy, list[dict[str, Any]], dict[int, list[Pose]]]:
     """Config, policy, ticks and raw poses of a run.
 
@@ -159,8 +169,7 @@ def load_run(folder: str | Path) -> tuple[HilParams, Policy, list[dict[str, Any]
     from visthrow import config
 
     folder = Path(folder)
-    if not (folder / CONFIG).is_file() or not (folder / TICKS).is_file():
-        raise RunError(f"{folder}: no folder of a run; expected {CONFIG}, {POLICY}, {POSES} and {TICKS} in it")
+    require_run(folder)
     params, policy = config.load(HilParams, folder / CONFIG), Policy.load(folder / POLICY)
     ticks, poses = list(lines(folder / TICKS)), read_poses(folder)
     if not (folder / SUMMARY).is_file():  # killed: the two files may end at different ticks, with half of its poses

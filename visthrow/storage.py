@@ -92,7 +92,9 @@ def loadz(path: str | Path, error: type[Exception], what: str) -> dict[str, np.n
             return {name: archive[name] for name in archive.files}
     except Exception as cause:  # zipfile, zlib, numpy and the OS each have their own way to say it
         size = path.stat().st_size
-        raise error(f"{path}: cut short or damaged ({size} bytes: {cause}); expected {what}") from cause
+        # For what is no archive at all numpy recommends to unpickle it.
+        why = "no .npz archive" if "pickle" in str(cause) else cause
+        raise error(f"{path}: cut short or damaged ({size} bytes: {why}); expected {what}") from cause
 
 
 def json_array(value: Any) -> np.ndarray:

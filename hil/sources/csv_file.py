@@ -82,10 +82,15 @@ def read_csv(path: str | Path, bodies: tuple[CsvParams, ...], quaternion: str = 
         quaternion: order that quaternions made from angles are to be written in, that of the source's frames.
 
     Raises:
-        SourceError: no such file, no such column, or a cell that is no number (an empty one reads as NaN).
+        SourceError: no such file, no such column, no mapping at all, or a cell that is no number (an empty one reads as NaN).
     """
     path = Path(path)
     header, table = _read(path)
+    if not bodies:
+        raise SourceError(
+            f"{path}: source.columns is empty; expected which columns hold the poses of vehicle and payload, and in which units, "
+            f"as in configs/hil/crazyflie_log.toml. The file has: {', '.join(header)}"
+        )
     poses: list[Pose] = []
     for params in bodies:
         poses += _poses(params, header, table, path, quaternion)
@@ -111,6 +116,8 @@ def _read(path: Path) -> tuple[list[str], np.ndarray]:
         raise SourceError(f"{path}: cannot be read: {error}; expected a CSV file, plain or .gz") from error
     rows = csv.reader(io.StringIO(text))
     header = [name.strip() for name in next(rows, [])]
+    if not header:
+        raise SourceError(f"{path}: no line with the columns' names; expected a CSV file, plain or .gz")
     table = np.array(list(_numbers(rows, len(header), path)), dtype=float).reshape(-1, len(header))
     return header, table
 

@@ -4,6 +4,8 @@ Both packages wait for frames, so each is listened to in a thread of its own, wh
 over; polling never waits. Axes are those of the system: Vicon and Qualisys z up, OptiTrack y up; quaternions are xyzw.
 """
 
+import json
+import subprocess
 import sys
 import threading
 from collections import deque
@@ -21,6 +23,10 @@ from visthrow.errors import ConfigError, suggest
 
 MOST_WAITING = 2000
 """Poses that are kept between two polls; older ones are dropped."""
+
+
+PROBE = "import json, os, sys, motioncapture; motioncapture.connect(sys.argv[1], json.loads(sys.argv[2])); os._exit(0)"
+"""Connects once, in a process of its own."""
 
 
 @dataclass(frozen=True)
@@ -111,20 +117,20 @@ class MotionCaptureSource(MocapSource):
         """
         super().__init__(clock, link)
         self._names = _names(bodies)
-        connect = (module or load_extra("motioncapture", "motioncapture")).connect
+        if module is None:
+            module = load_extra("motioncapture", "motioncapture")
+            _probe(params)
+        connect = module.connect
         self._stop, self._ready = threading.Event(), threading.Event()
         # A daemon: waiting for a frame of a system that has gone silent cannot be called off.
         threading.Thread(target=self._listen, args=(connect, params), name="motioncapture", daemon=True).start()
         if not self._ready.wait(params.timeout) or self.failure is not None:
             self._stop.set()
-            raise SourceError(
-                f"{params.system} at {params.host}: {self.failure or f'no answer within {params.timeout:g} s'}; "
-                "expected a motion-capture system that streams"
-            )
+            raise _no_answer(params, self.failure)
 
     def _listen(self, connect: Callable[[str, dict[str, str]], Any], params: MocapParams) -> None:
         try:
-            system = connect(params.system, {"hostname": params.host, **params.settings})
+            system = connect(params.system, _options(params))
             self._ready.set()
             while not self._stop.is_set():
                 system.waitForNextFrame()
@@ -219,6 +225,32 @@ def _names(bodies: tuple[RigidBody, ...]) -> dict[str, str]:
             f"{suggest('', BODIES)}"
         )
     return names
+
+
+def _options(params: MocapParams) -> dict[str, str]:
+    return {"hostname": params.host, **params.settings}
+
+
+def _no_answer(params: MocapParams, why: str | None) -> SourceError:
+    return SourceError(
+        f"{params.system} at {params.host}: {why or f'no answer within {params.timeout:g} s'}; "
+        "expected a motion-capture system that streams"
+    )
+
+
+def _probe(params: MocapParams) -> None:
+    """Try whether the system answers. The package's connect holds the interpreter until it does: it would hold the run as well.
+
+    Raises:
+        SourceError: it does not, or refuses.
+    """
+    command = [sys.executable, "-c", PROBE, params.system, json.dumps(_options(params))]
+    try:
+        tried = subprocess.run(command, timeout=params.timeout, capture_output=True, text=True, check=False)
+    except subprocess.TimeoutExpired:
+        raise _no_answer(params, None) from None
+    if tried.returncode:
+        raise _no_answer(params, (tried.stderr.strip().splitlines() or [f"status {tried.returncode}"])[-1])
 
 
 def _failed(source: MocapSource, error: Exception) -> None:

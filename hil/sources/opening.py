@@ -5,7 +5,7 @@ from typing import Any
 
 from hil.clock import MonotonicClock
 from hil.device import check_device, open_port
-from hil.errors import SourceError
+from hil.errors import LinkError, SourceError
 from hil.link import Link, TlogWriter
 from hil.params import LIVE, HilParams
 from hil.plausible import unit_problems
@@ -60,7 +60,10 @@ def open_source(params: HilParams, folder: Path, speed: float) -> tuple[Any, Lin
     clock, link = MonotonicClock(speed).now, None
     if source.kind == "mavlink" or params.backend in ("ardupilot", "px4"):
         port = open_port(check_device(params.link.device, remote=params.link.remote))
-        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise LinkError(f"cannot make {folder}: {error.strerror}; expected a folder that can be written (--out)") from error
         link = Link(port, params.link.system, params.link.component, TlogWriter(folder / TLOG))
         if params.delay.synchronise:
             LinkSync(link)

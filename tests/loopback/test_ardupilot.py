@@ -142,6 +142,6 @@ def test_a_throw_with_a_plain_plant_releases_in_time():
 
 
 def test_plants_that_are_none():
-    for target in ("nowhere:make", "visthrow.wire_plant:none", "visthrow.wire_plant", ""):
+    for target in ("nowhere:make", "visthrow.wire_plant:none", "visthrow.wire_plant", "", "os:system", "math:pi"):
         with pytest.raises(RunError, match="expected module:function"):
             load_plant(target, "state", 0)

@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from camera import CameraParams
 from sim import state as st
 from sim.reference.scene import load_scene
-from visthrow import cli, config
-from visthrow.bench import commands, flops, records, sim_cpu, sim_gpu
+from visthrow import bench, cli, config
+from visthrow.bench import commands, detector, flops, records, sim_cpu, sim_gpu
 from visthrow.bench import mujoco_warp as bench_mujoco_warp
 from visthrow.bench.scenes import HARD_THROW
 from visthrow.errors import StorageError, VisthrowError
@@ -214,6 +215,31 @@ def test_records_refuse_what_they_are_not(kept):
 def test_mistakes_are_told(words, message, capsys):
     assert cli.main(["bench", *words]) == 2
     assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("kind", sorted(bench.KINDS.keys() - {"records"}))
+def test_every_measurement_can_be_kept(kind):
+    args = cli.build_parser("bench").parse_args(["bench", kind])
+    assert (args.json, args.record) == (None, None), "what the end of each one asks for"
+
+
+@pytest.mark.parametrize("words", ["--frames 0", "--jobs 0", "--out {}/sheet.jpg", "--out {}/file/sheet.png"])
+def test_a_detector_is_not_measured_for_nothing(words, tmp_path, capsys):
+    (tmp_path / "file").touch()
+    assert cli.main(["bench", "detector", *words.format(tmp_path).split()]) == 2
+    assert "expected" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_the_detector_counts_the_same_in_one_process_and_in_two():
+    params = config.load(CameraParams, config.find("camera", "fisheye"))
+    lens = dataclasses.replace(params.fisheye, width=200, height=200, fx=52.0, fy=52.0, cx=99.5, cy=99.5)
+    measure = detector.Measure(dataclasses.replace(params, fisheye=lens), 0)
+    alone = detector.levels(measure, 2)
+    assert len(measure.spent) == 2 * sum(len(detector.TOLD.get(name, ("",))) for name in detector.LEVELS)
+    both = detector.levels(measure, 2, jobs=2)
+    assert str(alone) == str(both), "NaN is NaN"
+    assert alone["clean; pose and track"]["ball"]["visible"] == 2
 
 
 def test_mpc_steps_are_timed_and_recorded(tmp_path, monkeypatch, capsys):

@@ -128,6 +128,8 @@ def test_the_msp_port_serves_one_peer_after_another():
     port = ListeningPort(number)
     with pytest.raises(LinkError, match="cannot listen"):
         ListeningPort(number)
+    with pytest.raises(LinkError, match="tcp port 99999; expected 1 to 65535"):
+        ListeningPort(99_999)
     assert port.read() is None
     assert not port.write(b"nobody there")
     for word in (b"one", b"two"):

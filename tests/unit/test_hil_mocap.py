@@ -1,5 +1,7 @@
 """Motion-capture packages: stand-ins with the packages' own faces, and these faces against the packages where they are."""
 
+import dataclasses
+import sys
 import threading
 import time
 from types import SimpleNamespace
@@ -75,6 +77,29 @@ def test_a_system_that_does_not_answer_or_refuses():
 
     with pytest.raises(SourceError, match="Unknown motion capture type"):
         MotionCaptureSource(PARAMS, BODIES, time.monotonic, module=SimpleNamespace(connect=refuse))
+
+
+BLOCKS = """
+import ctypes
+def connect(kind, options):
+    assert (kind, options["hostname"]) == ("vicon", "127.0.0.1")
+    ctypes.PyDLL(None).sleep(60)  # holds the interpreter, as the package does
+"""
+
+
+def test_a_package_that_holds_the_interpreter_holds_nothing_up(tmp_path, monkeypatch):
+    (tmp_path / "motioncapture.py").write_text(BLOCKS)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.delitem(sys.modules, "motioncapture", raising=False)
+    begin = time.monotonic()
+    with pytest.raises(SourceError, match=r"vicon at 127.0.0.1: no answer within 1 s"):
+        MotionCaptureSource(PARAMS, BODIES, time.monotonic)
+    assert time.monotonic() - begin < 30.0
+    (tmp_path / "motioncapture.py").write_text("def connect(*args):\n    raise RuntimeError('no such host')\n")
+    with pytest.raises(SourceError, match="RuntimeError: no such host"):
+        MotionCaptureSource(dataclasses.replace(PARAMS, timeout=60.0), BODIES, time.monotonic)
+    sys.modules.pop("motioncapture", None)
 
 
 class Client:

@@ -11,6 +11,7 @@ from hil.errors import RunError
 from hil.record import Recorder, lines, load_run
 from hil.runner import Runner, Words
 from tests.hil_flight import Spy, fly, params
+from visthrow.bench.hil_processes import free_port
 from visthrow.cli import main
 from visthrow.errors import StorageError
 from visthrow.policy import Policy, find_policy
@@ -82,13 +83,35 @@ def test_a_folder_cut_short_by_a_kill_replays(run_folder, tmp_path, capsys):
 def test_what_is_no_run(run_folder, tmp_path, capsys):
     with pytest.raises(RunError, match="no folder of a run; expected config"):
         load_run(tmp_path)
-    assert main(["hil", "replay", str(tmp_path / "none")]) == 2
-    assert "no folder of a run" in capsys.readouterr().err
+    for action in (["replay"], ["view"], ["check", "--hover-of"]):
+        assert main(["hil", *action, str(tmp_path / "none")]) == 2
+        assert "no folder of a run" in capsys.readouterr().err
     for path in run_folder.iterdir():
         (tmp_path / path.name).write_bytes(path.read_bytes())
     (tmp_path / "ticks.jsonl").write_text('{"n": 0\n{"n": 1}\n')
     with pytest.raises(RunError, match="line 1 is damaged"):
         load_run(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ("run --seconds 0", "expected a number above 0"), ("check --seconds nan", "expected a number above 0"),
+        ("fake --after -3", "expected a number above 0"), ("direct --seeds 0 -1", "expected a whole number of 0 or more"),
+    ],
+)  # fmt: skip
+def test_numbers_out_of_range_on_the_command_line(words, expected, capsys):
+    with pytest.raises(SystemExit):
+        main(["hil", *words.split()])
+    assert expected in capsys.readouterr().err
+
+
+def test_a_folder_that_cannot_be_made(tmp_path, capsys):
+    (tmp_path / "file").touch()
+    device = f'link.device="udp:127.0.0.1:{free_port()}"'
+    assert main(["hil", "run", "--out", str(tmp_path / "file" / "run"), "--set", device]) == 2
+    assert "cannot make" in (said := capsys.readouterr().err)
+    assert "--out" in said
 
 
 def test_the_folder_holds_config_policy_and_hash(run_folder):

@@ -129,6 +129,16 @@ def test_wrong_csv(tmp_path, text, message):
         read_csv(tmp_path / "b.csv", (PARAMS,))
 
 
+def test_csv_without_mapping_or_header(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text(CSV)
+    with pytest.raises(SourceError, match=r"source.columns is empty.*crazyflie_log.toml. The file has: t, x, y"):
+        read_csv(path, ())
+    path.write_text("")
+    with pytest.raises(SourceError, match="no line with the columns' names"):
+        read_csv(path, (PARAMS,))
+
+
 def test_wrong_mappings():
     with pytest.raises(ConfigError, match="pos in 'ft'; expected one of: m, cm, mm"):
         CsvParams("vehicle", Column(("x", "y", "z"), "ft"), row_period=0.01)

@@ -235,7 +235,6 @@ class Measure:
                     if there:
                         cv2.circle(picture, (round(u), round(v)), 6, (255, 255, 255), 1, cv2.LINE_AA)
                 pictures[name].append(picture)
-        path.parent.mkdir(parents=True, exist_ok=True)
         if not cv2.imwrite(str(path), np.vstack([np.hstack(row) for row in pictures.values()])):
             raise OSError(f"cannot write {path}")
 
@@ -276,11 +275,13 @@ def run(args: argparse.Namespace) -> int:
     """Measure on every level.
 
     Raises:
-        VisthrowError: a number of scenes or processes below one.
+        VisthrowError: a number of scenes or processes below one, or nowhere to write to.
     """
     jobs = (os.cpu_count() or 1) if args.jobs is None else args.jobs
     if min(args.frames, jobs) < 1:
         raise VisthrowError(f"--frames {args.frames}, --jobs {jobs}; expected 1 or more of each")
+    if args.out is not None:
+        _require_place(Path(args.out))
     params = config.load(CameraParams, config.find("camera", "fisheye"), args.overrides)
     measure = Measure(params, args.seed)
     figures = levels(measure, args.frames, jobs)
@@ -299,6 +300,20 @@ def run(args: argparse.Namespace) -> int:
         "frames are rendered by the project's own projection: no real lens, no real light",
     )
     return finish(Report("detector", "Keypoint detector on rendered frames", (table,), notes, figures), args)
+
+
+def _require_place(path: Path) -> None:
+    """Refuse a picture that could not be written, before a quarter of an hour is spent on it.
+
+    Raises:
+        VisthrowError: no .png, or a folder that cannot be made or written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise VisthrowError(f"--out {path}: {error.strerror}; expected a .png in a folder that can be written") from error
+    if path.suffix != ".png" or not os.access(path.parent, os.W_OK):
+        raise VisthrowError(f"--out {path}; expected a .png in a folder that can be written")
 
 
 def _row(level: str, kind: str, f: dict[str, float]) -> tuple[str, ...]:
