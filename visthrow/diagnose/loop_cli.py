@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 
 DEFAULT_OUT = "runs/loop"
+DEFAULT_BASE = "state"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -11,9 +12,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
         "examples:\n"
         "  visthrow diagnose loop --hide motor_tau=0.02         a slower motor; minutes on a GPU, hours on a CPU\n"
+        "  visthrow diagnose loop --base state_no_motor_lag --policy runs/state_no_motor_lag-1/policy.npz --hide motor_lag=1\n"
+        "                                                       a model that lacks a block, and the policy trained in it\n"
         "  visthrow diagnose loop --show runs/loop/*            the table of loops that went round\n"
     )
     parser.add_argument("--hide", action="append", default=[], metavar="EFFECT=SIZE", help="of the catalogue; may be repeated")
+    parser.add_argument("--base", default=DEFAULT_BASE, metavar="NAME", help="of configs/train: what is diagnosed (default: state)")
+    parser.add_argument("--policy", default=DEFAULT_BASE, metavar="NAME", help="trained in it: shipped, or a file (default: state)")
     parser.add_argument("--show", type=Path, nargs="+", metavar="FOLDER", help="run nothing, show finished loops")
     parser.add_argument("--flights", type=int, default=12, help="that are diagnosed (default: 12)")
     parser.add_argument("--throws", type=int, default=200, help="of each policy in the end (default: 200)")
@@ -43,9 +48,10 @@ def run(args: argparse.Namespace) -> int:
         raise ConfigError("nothing to hide; name an effect, such as --hide motor_tau=0.02, or say --show")
     from visthrow.device import cores, resolve
 
-    folder = Path(args.out) / "-".join(f"{n}_{v:g}" for n, v in hidden.items())
+    parts = [f"{n}_{v:g}" for n, v in hidden.items()]
+    folder = Path(args.out) / "-".join(parts if args.base == DEFAULT_BASE else [args.base, *parts])
     record = loop.Loop(
-        hidden, folder, flights=args.flights, throws=args.throws, device=resolve(args.device),
+        hidden, folder, args.base, args.policy, flights=args.flights, throws=args.throws, device=resolve(args.device),
         diagnose_on=resolve(args.diagnose_on),
         processes=args.processes or cores(), changes=tuple(args.changes),
     ).run(lambda line: print(f"  {line}", flush=True))  # fmt: skip
