@@ -33,8 +33,9 @@ CORRELATION_TIMES = (0.15, 0.6, 2.4)
 SCALE_BOUNDS = (0.3, 10.0)
 """Of a channel's sigma against what the model said."""
 
-LEVEL_RANGE = 1e4
-"""Latent deviations stay within this factor of the level at which they become visible, both ways."""
+LEVEL_LOW, LEVEL_HIGH = 1e-2, 1e4
+"""Latent deviations, in the level at which they become visible. A hundredth of it is as good as none: thousands of knots
+together do not show it, and far below it slopes are lost in rounding."""
 
 HUBER = 6.0
 """Sigmas from which a sample loses weight."""
@@ -60,8 +61,8 @@ WIDE = 30.0
 ITERATIONS = 40
 ENOUGH_NATS = 0.02
 """A step that promises or brings less ends the search for the levels."""
-LONGEST_STEP = 2.5
-"""Of the logarithm of a level: where it hardly shows, the likelihood is flat and a Newton step endless."""
+LONGEST_FALL = 1.0
+"""Of the logarithm of a level in one step: its variance may be predicted to fall below 0."""
 HALVINGS = 8
 STALLED = 1e-9
 """Of the step: limits and levels count as met within this."""
@@ -153,15 +154,14 @@ def _first_guess(grams: Sequence[Gram]) -> Noise:
 def _maximise(grams: Sequence[Gram], noise: Noise) -> tuple[Noise, float]:
     """Maximum likelihood of the logarithms of all levels, with exact gradients and explicit limits.
 
-    Quasi-Newton steps that begin with the expected curvature, so that a few looks at all windows suffice.
+    By Fisher scoring: the expected curvature costs nothing beside the gradient, and a few looks at all windows suffice.
     """
     keys = sorted(noise.latent_sd)
     seen = np.flatnonzero(sum(gram.count for gram in grams) > 0)
     guess = _first_guess(grams).latent_sd
     x = np.log([noise.latent_sd[key] for key in keys] + [noise.scale[c] for c in seen])
-    reach = np.log(LEVEL_RANGE)
-    low = np.array([np.log(guess[key]) - reach for key in keys] + [np.log(SCALE_BOUNDS[0])] * len(seen))
-    high = np.array([np.log(guess[key]) + reach for key in keys] + [np.log(SCALE_BOUNDS[1])] * len(seen))
+    low = np.array([np.log(LEVEL_LOW * guess[key]) for key in keys] + [np.log(SCALE_BOUNDS[0])] * len(seen))
+    high = np.array([np.log(LEVEL_HIGH * guess[key]) for key in keys] + [np.log(SCALE_BOUNDS[1])] * len(seen))
     x = np.clip(x, low, high)
 
     def levels(x: np.ndarray) -> Noise:
@@ -176,8 +176,8 @@ def _maximise(grams: Sequence[Gram], noise: Noise) -> tuple[Noise, float]:
 
     value, slope, curvature = look(x)
     for _ in range(ITERATIONS):
-        step = _newton_step(x, slope, curvature, low, high)
-        if slope @ step < ENOUGH_NATS:
+        step, promised = _scoring_step(x, slope, curvature, low, high)
+        if promised < ENOUGH_NATS:
             break
         for _ in range(HALVINGS):
             tried, its_slope, expected = look(x + step)
@@ -186,32 +186,31 @@ def _maximise(grams: Sequence[Gram], noise: Noise) -> tuple[Noise, float]:
             step = step / 3.0
         else:
             break
-        curvature = _updated(curvature, expected, step, slope - its_slope)
-        gained, x, value, slope = tried - value, x + step, tried, its_slope
+        gained, x, value, slope, curvature = tried - value, x + step, tried, its_slope, expected
         if gained < ENOUGH_NATS:
             break
     return levels(x), value
 
 
-def _newton_step(x: np.ndarray, slope: np.ndarray, curvature: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Step upwards within the limits; what a limit holds back stays there, and the others move without it."""
-    free = ~((x <= low + STALLED) & (slope < 0.0)) & ~((x >= high - STALLED) & (slope > 0.0))
+def _scoring_step(
+    x: np.ndarray, slope: np.ndarray, curvature: np.ndarray, low: np.ndarray, high: np.ndarray
+) -> tuple[np.ndarray, float]:
+    """Fisher's step of the variances within the limits, as logarithms of levels, and the nats that it promises.
+
+    What a limit holds back stays there, and the others move without it. A variance far too small shows in no likelihood's
+    logarithm, but its own step is finite.
+    """
+    known = np.diag(curvature)
+    free = (known > 0.0) & ~((x <= low + STALLED) & (slope < 0.0)) & ~((x >= high - STALLED) & (slope > 0.0))
     step = np.zeros_like(x)
-    part = curvature[np.ix_(free, free)]
-    part = part + 1e-9 * np.diag(np.diag(part)) + 1e-12 * np.eye(len(part))
-    step[free] = np.clip(np.linalg.solve(part, slope[free]), -LONGEST_STEP, LONGEST_STEP)
-    if slope @ step <= 0.0:  # one that was cut off component by component
-        step[free] = np.clip(slope[free] / np.diag(part), -LONGEST_STEP, LONGEST_STEP)
-    return np.clip(x + step, low, high) - x
-
-
-def _updated(curvature: np.ndarray, expected: np.ndarray, step: np.ndarray, fall: np.ndarray) -> np.ndarray:
-    """The expected curvature at the new place, corrected by how the slope fell on the way (BFGS, skipped where it rose)."""
-    along = expected @ step
-    bend, known = step @ fall, step @ along
-    if bend <= 0.1 * known or known <= 0.0:
-        return expected
-    return expected - np.outer(along, along) / known + np.outer(fall, fall) / bend
+    if not np.any(free):
+        return step, 0.0
+    size = np.sqrt(known[free])
+    part = curvature[np.ix_(free, free)] / np.outer(size, size)
+    step[free] = np.linalg.solve(part + 1e-6 * np.eye(len(part)), slope[free] / size) / size
+    promised = float(slope @ step)
+    step = np.where(step > 0.0, 0.5 * np.log1p(2.0 * np.maximum(step, 0.0)), np.maximum(step, -LONGEST_FALL))
+    return np.clip(x + step, low, high) - x, promised
 
 
 def _likelihood(
