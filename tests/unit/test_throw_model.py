@@ -1,15 +1,23 @@
 """The throw as a model to diagnose: silent at the truth, derivatives that are derivatives, planted effects recovered."""
 
+import dataclasses
+
 import numpy as np
 import pytest
+import torch
+from scipy.spatial.transform import Rotation, Slerp
 
+from camera.keypoints import KeypointCamera, keypoints
+from camera.params import CameraParams
 from sim.params import SensingParams
 from tests.flown import fly, setting_with
 from tests.plants import paper_plant
+from visthrow import config
 from visthrow.diagnose.catalogue import ALL
 from visthrow.diagnose.opened import opened
 from visthrow.diagnose.throw_model import ThrowModel
 from visthrow.errors import DiagnoseError
+from visthrow.flightlog import Channel, FlightLog
 
 LATENT = np.array([5e-4, 5e-6, 5e-5])  # deviations of the latent forces of each block, which absorb what the step leaves
 PLANTED = {"rope_length": 0.006, "cmd_delay": 0.006, "mass_payload": 0.002, "wind_x": 0.25, "com_y": 8e-4, "release_lag": 0.015}
@@ -94,7 +102,7 @@ def test_what_is_known_of_the_sensors_is_taken_off():
 
 
 def test_the_catalogue_is_sound():
-    plant = opened(setting_with({}))
+    plant = dataclasses.replace(opened(setting_with({})), camera=config.load(CameraParams, config.find("camera", "fisheye")))
     for name, e in ALL.items():
         assert e.effect.bounds[0] <= 0.0 <= e.effect.bounds[1], name
         assert 0.0 < e.effect.floor < 3.0 * e.effect.prior_sd, name
@@ -105,6 +113,66 @@ def test_the_catalogue_is_sound():
             assert low <= 0.0 < high, name
             assert e.apply(plant, e.effect.bounds[1] if e.switch else e.step * e.effect.floor) != plant, name
             assert e.apply(plant, 0.0) == plant, name
+
+
+HIDDEN = {"camera_tilt_x": 0.02, "camera_latency": 0.012, "camera_focal": 0.03, "camera_line_time": 1.2e-5, "plane_height": 0.025}
+
+
+def looked_at(log: FlightLog, camera: CameraParams) -> FlightLog:
+    """A log with what a camera with :data:`HIDDEN` saw of its poses, row by row, and where the payload landed."""
+    lens, turn = camera.fisheye, np.degrees(HIDDEN["camera_tilt_x"])
+    lens = dataclasses.replace(lens, fx=lens.fx * (1 + HIDDEN["camera_focal"]), fy=lens.fy * (1 + HIDDEN["camera_focal"]))
+    mount = dataclasses.replace(camera.mount, rpy_deg=tuple(np.add(camera.mount.rpy_deg, (turn, 0.0, 0.0))))
+    real = KeypointCamera(dataclasses.replace(camera, fisheye=lens, mount=mount), dtype=torch.float64)
+    goal = np.array([1.5, -1.0, 0.0])  # far from below, so that rows differ
+    pos, quat, ball = (log[name] for name in ("pos_w", "quat_wb", "payload_pos_w"))
+    slerp = Slerp(quat.time, Rotation.from_quat(quat.values))
+    last = ball.time[ball.valid][-1]
+    stamps = np.arange(pos.time[0] + 0.1, last - 0.05, 0.02)
+
+    def project(time):
+        where = [np.column_stack([np.interp(time, c.time, x) for x in c.values.T]) for c in (pos, ball)]
+        where[0] = where[0] + slerp(time).apply((0.0, PLANTED["com_y"], 0.0))
+        given = where[0], slerp(time).as_matrix(), np.tile(goal, (len(time), 1)), where[1]
+        points, valid = keypoints(real, *[torch.from_numpy(np.ascontiguousarray(x)) for x in given])
+        return points.numpy(), valid.numpy()
+
+    points, valid = project(stamps - HIDDEN["camera_latency"])
+    reach = lens.fy * np.radians(lens.fov_deg / 2.0)
+    for k in range(points.shape[1]):  # each row at its own time
+        row = lens.cy + points[:, k, 1] * reach
+        points[:, k] = project(stamps - HIDDEN["camera_latency"] + HIDDEN["camera_line_time"] * row)[0][:, k]
+    points *= 1 + HIDDEN["camera_focal"]  # pixels of this lens, in coordinates of the one that is believed
+    points += np.random.default_rng(1).normal(scale=2e-3, size=points.shape)
+    extra = {
+        "keypoints": Channel(stamps, points, "1", "image"), "keypoints_valid": Channel(stamps, valid, "bool"),
+        "goal_w": Channel(stamps, np.tile(goal, (len(stamps), 1)), "m", "world"),
+    }  # fmt: skip
+    if not ball.valid.all():
+        down = np.array([[*ball.values[ball.valid][-1][:2], paper_plant().release.landing_height + HIDDEN["plane_height"]]])
+        extra["landing"] = Channel(np.array([last]), down, "m", "world")
+    return FlightLog({**log.channels, **extra}, {})
+
+
+def test_camera_and_landing_plane_are_told_beside_the_poses(planted):
+    camera = config.load(CameraParams, config.find("camera", "fisheye"))
+    logs = [looked_at(log, camera) for log in planted[0]]
+    names = [*HIDDEN, "marker_rot_x"]
+    model = ThrowModel(logs, setting_with(PLANTED).plant, camera=camera, only=names)
+    assert {"keypoints", "landing"} <= set(model.channels)
+    windows = model.windows({})
+    for w, r in zip(windows, model.residuals({})):
+        assert w.effects.shape == (len(r), len(names))
+    sizes, deviation = estimate(windows, range(len(names)))
+    near = model.windows({e.name: float(x) for e, x in zip(model.effects, sizes)})
+    sizes, deviation = sizes + estimate(near, range(len(names)))[0], deviation  # Gauss and Newton
+    order = [e.name for e in model.effects]
+    for name, size in HIDDEN.items():
+        found, sd = sizes[order.index(name)], deviation[order.index(name)]
+        assert abs(found - size) < 0.1 * size + 4.0 * sd, (name, found, sd)
+        assert sd < 0.4 * size, name
+    projected = [FlightLog(log.channels, {"config": {"keypoints": "projection"}}) for log in logs]
+    assert "keypoints" not in ThrowModel(projected, paper_plant(), camera=camera, only=["plane_height"]).channels
 
 
 def test_mistakes_are_told(planted):
@@ -127,8 +195,6 @@ def test_mistakes_are_told(planted):
 )
 def test_what_a_simplified_simulator_lacks_stands_out(part, kind, name):
     """The paper's ablations: flights of the whole plant, a model without one block; that block explains them best."""
-    import dataclasses
-
     logs, plant = fly(setting_with({}), noise=1.0, free=1, throws=2, seconds=3.0), paper_plant()
     if kind is None:
         simple = dataclasses.replace(plant, rope=dataclasses.replace(plant.rope, segments=1))

@@ -28,6 +28,8 @@ GRID = 0.02
 """Between the smoothed poses that a camera's views are predicted from [s]."""
 NEAR = 0.025
 """Reach of that smoothing [s]: attitudes change within 50 ms, which a wider one would show late."""
+SHORT = 1e-3
+"""Over which the speed of a keypoint is taken [s]: its row differs from the others' by a few milliseconds at most."""
 LEAST_KEYPOINT_SIGMA = 2e-4  # normalised
 ACTS_ON = ("camera.", "plant.release.landing_height", "plant.rope.payload_radius", "sensing.camera_")
 """Numbers that nothing but these samples depends on: their effects need no simulation."""
@@ -172,12 +174,14 @@ class CameraView:
         """See :class:`Sighting`; NaN where the lens is none."""
         view, x = self._windows[window], setting.sensing
         try:
-            points = _seen(view, setting, self._nominal, view["time"] - x.camera_delay)
+            lens = self._nominal.camera
+            row = lens.fisheye.cy + view["points"][..., 1] * _reach(lens)[1]
+            middle = row.mean(axis=1)
+            time = view["time"] - x.camera_delay + x.camera_line_time * middle
+            points = _seen(view, setting, self._nominal, time)
             if x.camera_line_time != 0.0:
-                lens = self._nominal.camera
-                row = lens.fisheye.cy + view["points"][..., 1] * _reach(lens)[1]
-                soon = _seen(view, setting, self._nominal, view["time"] - x.camera_delay + 1e-3)
-                points = points + (soon - points) * 1e3 * (x.camera_line_time * row)[..., None]
+                slope = (_seen(view, setting, self._nominal, time + SHORT) - points) / SHORT
+                points = points + slope * (x.camera_line_time * (row - middle[:, None]))[..., None]
         except ValueError:
             return np.full(np.count_nonzero(view["valid"]), np.nan)
         return points[view["valid"]].ravel()
