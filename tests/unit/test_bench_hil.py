@@ -2,6 +2,8 @@
 
 import argparse
 import json
+import signal
+import subprocess
 import sys
 import time
 
@@ -10,7 +12,7 @@ import pytest
 from scipy import stats
 
 from hil.mocap_faults import FAULTS
-from visthrow.bench import hil, hil_processes, hil_throws
+from visthrow.bench import hil, hil_processes, hil_soak, hil_throws
 from visthrow.bench.hil_processes import Pair
 from visthrow.cli import main
 from visthrow.errors import VisthrowError
@@ -36,15 +38,15 @@ def test_upper_bound_of_a_ratio_of_pairs():
 
 def test_growth_of_memory():
     rising = [(float(t), 1e6 + 500.0 * t + (1e5 if t < 20 else 0.0)) for t in range(200)]
-    assert hil.slope(rising) == pytest.approx(500.0)
-    assert hil.slope(rising[:5]) is None
+    assert hil_soak.slope(rising) == pytest.approx(500.0)
+    assert hil_soak.slope(rising[:5]) is None
 
 
 def test_a_policy_that_never_releases_is_the_same_otherwise(tmp_path):
     import torch
 
     shipped = Policy.load(find_policy("vision"))
-    made = Policy.load(hil.never_releasing("vision", tmp_path / "p.npz"))
+    made = Policy.load(hil_soak.never_releasing("vision", tmp_path / "p.npz"))
     seen = torch.randn(200, shipped.obs_dim)
     torch.testing.assert_close(made.act(seen)[:, :4], shipped.act(seen)[:, :4], rtol=0, atol=0)
     assert (made.act(seen)[:, 4] == -1.0).all()
@@ -121,26 +123,49 @@ def test_what_cannot_be_measured(words, tmp_path, capsys):
 
 def test_a_run_that_does_not_start_says_why(tmp_path):
     with pytest.raises(VisthrowError, match=r"did not start.*no policy 'nobody'"):
-        Pair(("--config", "fake", "--set", "policy=nobody"), hil.STILL).fly(tmp_path / "run")
+        Pair(("--config", "fake", "--set", "policy=nobody"), hil_soak.STILL).fly(tmp_path / "run")
 
 
 def test_a_short_soak_over_udp(tmp_path, capsys):
-    """Three seconds: everything is counted, and the fake saw nothing that it should not. Times are for a quiet machine."""
-    out = tmp_path / "soak.json"
-    assert main(["bench", "hil", "--minutes", "0.05", "--json", str(out), "--keep", str(tmp_path / "run")]) == 0
+    """Three seconds each way: all is counted, and the fake saw nothing that it should not. Times are for a quiet machine."""
+    out, run = tmp_path / "soak.json", tmp_path / "run"
+    assert main(["bench", "hil", "--minutes", "0.05", "--json", str(out), "--keep", str(run), "--out", str(tmp_path)]) == 0
     figures = json.loads(out.read_text())["figures"]
     assert figures["ticks"] > 50
     assert figures["breaches"] == []
-    assert {"poll", "estimate", "observation", "policy", "send", "total"} <= set(figures["latency_ms"])
+    for latency in (figures["latency_ms"], figures["latency_without_rehearsal_ms"]):
+        assert all(latency[name] for name in ("poll", "estimate", "observation", "policy", "send", "total"))
+    assert figures["rehearsal_failed"] is None
+    assert figures["rehearsals"] > 20
+    assert not figures["interrupted"]
+    assert hil.json_lines(tmp_path / "soak.jsonl")[0]["memory_bytes"] > 50e6
     assert "within the bars" in capsys.readouterr().out.replace("NOT ", "")
-    assert main(["hil", "replay", str(tmp_path / "run")]) == 0
+    assert main(["hil", "replay", str(run)]) == 0
 
 
 @pytest.mark.slow
-def test_a_minute_at_200_hz():
+def test_an_interrupted_soak_tells_what_there_is(tmp_path):
+    out = tmp_path / "soak.json"
+    words = ["bench", "hil", "--minutes", "0.3", "--json", str(out), "--out", str(tmp_path)]
+    bench = subprocess.Popen([sys.executable, "-m", "visthrow.cli", *words], stdout=subprocess.PIPE, text=True)
+    end = time.monotonic() + 120.0
+    while not (tmp_path / "soak.jsonl").is_file() and time.monotonic() < end:
+        time.sleep(0.2)
+    time.sleep(6.0)
+    bench.send_signal(signal.SIGINT)
+    text, _ = bench.communicate(timeout=120.0)
+    figures = json.loads(out.read_text())["figures"]
+    assert figures["interrupted"]
+    assert 1.0 < figures["seconds"] < 17.0
+    assert figures["ticks"] > 50
+    assert "INTERRUPTED after" in text
+
+
+@pytest.mark.slow
+def test_a_minute_at_200_hz(tmp_path):
     """No tick of ours is missed and memory stays flat; how long a tick takes is for a quiet machine to say."""
-    args = argparse.Namespace(minutes=SOAK_MINUTES, rate=200.0, policy="vision", core=None, keep=None)
-    figures = hil.soak(args).figures
+    args = argparse.Namespace(minutes=SOAK_MINUTES, rate=200.0, policy="vision", core=None, keep=None, out=str(tmp_path))
+    figures = hil_soak.soak(args).figures
     assert figures["ticks"] + figures["missed"] >= 60 * 50 * SOAK_MINUTES
     assert figures["missed_ours"] == 0
     assert figures["breaches"] == []

@@ -18,8 +18,9 @@ from typing import Any
 import torch
 
 from visthrow.actions import hover_action
-from visthrow.bench.hil import STILL, json_lines, never_releasing
+from visthrow.bench.hil import json_lines
 from visthrow.bench.hil_processes import ENDED, Pair, own_cores
+from visthrow.bench.hil_soak import STILL, never_releasing
 from visthrow.bench.hil_throws import side_by_side
 from visthrow.bench.records import Report, Table
 from visthrow.errors import VisthrowError, suggest

@@ -54,12 +54,14 @@ class Pair:
     Attributes:
         run: further arguments of ``visthrow hil run``. fake: of ``visthrow hil fake``.
         core, fake_core: that each is kept on; None leaves it to the system.
+        orderly: Ctrl-C ends both in order, and what there is by then is returned.
     """
 
     run: tuple[str, ...]
     fake: tuple[str, ...]
     core: int | None = None
     fake_core: int | None = None
+    orderly: bool = False
 
     def fly(
         self, folder: Path, watch: Callable[[int], None] | None = None, alone: bool = False
@@ -72,7 +74,7 @@ class Pair:
             alone: the fake flies on to its end where the run has ended, or was killed, before.
 
         Returns:
-            The run's summary, empty where it was killed, and the fake's report.
+            The run's summary, with whether it was ``interrupted``, empty where it was killed, and the fake's report.
 
         Raises:
             VisthrowError: one of them did not start, or did not end; the message holds what it said.
@@ -85,21 +87,36 @@ class Pair:
         with self._started(run, self.core) as runner:
             said = _first_line(runner)
             with self._started(fake, self.fake_core) as other:
-                _until(other, watch, runner, alone)
+                interrupted = self._until(other, watch, runner, alone)
             killed = _end(runner, said, alone)
         try:
             summary = {} if killed else json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+            summary |= {} if killed else {"interrupted": interrupted}
             return summary, json.loads(report.read_text(encoding="utf-8"))
         except (OSError, ValueError) as error:
             raise VisthrowError(f"a process of the pair ended without its report: {error}") from error
         finally:
             report.unlink(missing_ok=True)
 
-    @staticmethod
+    def _until(self, fake: subprocess.Popen, watch: Callable[[int], None] | None, runner: subprocess.Popen, alone: bool) -> bool:
+        """Wait for the fake's end; whether Ctrl-C brought it about."""
+        try:
+            _until(fake, watch, runner, alone)
+        except KeyboardInterrupt:
+            if not self.orderly:
+                raise
+            fake.send_signal(signal.SIGINT)
+            fake.wait(ENDED)
+            return True
+        return False
+
     @contextlib.contextmanager
-    def _started(command: list[str], core: int | None) -> Iterator[subprocess.Popen]:
+    def _started(self, command: list[str], core: int | None) -> Iterator[subprocess.Popen]:
         quiet = subprocess.DEVNULL
-        process = subprocess.Popen(command, stdin=quiet, stdout=quiet, stderr=subprocess.PIPE, text=True)
+        process = subprocess.Popen(
+            command, stdin=quiet, stdout=quiet, stderr=subprocess.PIPE, text=True,
+            start_new_session=self.orderly,  # the terminal's Ctrl-C is for us alone
+        )  # fmt: skip
         try:
             if core is not None:  # long before it has threads
                 os.sched_setaffinity(process.pid, {core})
