@@ -3,6 +3,7 @@
 import argparse
 import dataclasses
 import json
+import os
 import shutil
 import sys
 import tempfile
@@ -74,7 +75,7 @@ def soak(args: argparse.Namespace) -> Report:
 
         def fly(minutes: float, name: str, *more: str, watch: Memory | None = None) -> tuple[dict[str, Any], dict[str, Any]]:
             fake = (*STILL, "--rate", str(args.rate), "--seconds", str(60.0 * minutes))
-            return Pair((*run, *more), fake, args.core, orderly=True).fly(place / name, watch)
+            return Pair((*run, *more), fake, args.core, _another(args.core), orderly=True).fly(place / name, watch)
 
         without, _ = fly(min(args.minutes, COMPARED), "without", "--set", "realtime.rehearse=false")
         summary, report = fly(args.minutes, "run", watch=progress)
@@ -85,6 +86,13 @@ def soak(args: argparse.Namespace) -> Report:
         if not found["latency"].get("total"):
             raise VisthrowError(f"no command was ever sent: {found['reason']}")
     return _report(summary, without, report, progress, size, args)
+
+
+def _another(core: int | None) -> int | None:
+    """A core for the fake beside that of the run; None where the system chooses, or has no other."""
+    if core is None or not hasattr(os, "sched_getaffinity"):
+        return None
+    return next((other for other in sorted(os.sched_getaffinity(0)) if other != core), None)
 
 
 def never_releasing(name: str, path: Path) -> Path:
