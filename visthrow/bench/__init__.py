@@ -11,6 +11,7 @@ KINDS = {
     "train": ("where the wall time of a training iteration goes", "visthrow.bench.iteration"),
     "hil": ("the HIL runner over loopback: latency and soak, throws over the wire, faults", "visthrow.bench.hil"),
     "mpc": ("a step of the baseline's controller, and its tracking error", "visthrow.bench.mpc"),
+    "effects": ("operations of a control step that each effect costs: none where it is off", "visthrow.bench.effects"),
     "records": ("print the recorded measurements as Markdown", "visthrow.bench.records"),
 }
 """Name -> (help, module). The module has ``run(args) -> int``; it is imported only when chosen."""
@@ -28,10 +29,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "  visthrow bench hil --minutes 1                 message in to command out, missed ticks, memory\n"
         "  visthrow bench hil --throws 60 --policy state  throws over the wire, and the same without it\n"
         "  visthrow bench mpc                             a step of the baseline's controller; needs piqp\n"
+        "  visthrow bench effects                         what each effect costs in the fused step, on and off\n"
         "  visthrow bench records                         what was measured before, on which machine and commit\n"
     )
     kinds = parser.add_subparsers(dest="bench", metavar="WHAT", title="what to measure", required=True)
-    sim, camera, detector, train, hil, mpc, records = (
+    sim, camera, detector, train, hil, mpc, effects, records = (
         kinds.add_parser(name, help=text, description=text) for name, (text, _) in KINDS.items()
     )
     _add_sim(sim)
@@ -52,13 +54,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     mpc.add_argument("--throws", type=int, default=10, metavar="N", help="a target and plant (default: 10)")
     for kind in (sim, mpc):
         kind.add_argument("--core", type=int, metavar="N", help="CPU core to stay on (default: the last one)")
+    for kind in (sim, mpc, effects):
         kind.add_argument(
             "--config", default="state", metavar="NAME", help="training configuration whose plant is measured (default: state)"
         )
     for kind in (sim, camera, detector, train):
         add_common(kind)
-    add_common(mpc, device=False)
-    for kind in (sim, camera, detector, train, hil, mpc):
+    for kind in (mpc, effects):
+        add_common(kind, device=False)
+    for kind in (sim, camera, detector, train, hil, mpc, effects):
         kind.add_argument("--record", metavar="NAME", help="keep the result in the package's records under this name")
     sim.set_defaults(device="cpu")
     records.add_argument("names", metavar="NAME", nargs="*", help="records to print (default: all)")

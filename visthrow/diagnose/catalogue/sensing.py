@@ -58,6 +58,24 @@ ENTRIES: tuple[Entry, ...] = (
     ),
     *(
         entry(
+            f"gyro_bias_{axis}",
+            f"The gyro shows a rate about {axis} that is none",
+            "w_measured = w + theta e",
+            "rad/s",
+            "sensing",
+            (-1.0, 1.0),
+            0.02,
+            1e-3,
+            ("rate_b",),
+            "MEMS gyros drift by a degree a second after switching on",
+            [Key(f"{S}gyro_bias", index=i)],
+            confused=(f"marker_rot_{axis}",),
+            manoeuvres=("stand still before the flight",),
+        )
+        for i, axis in enumerate("xyz")
+    ),
+    *(
+        entry(
             f"frame_tilt_{axis}",
             f"The measured frame is turned about {axis}: gravity looks tilted",
             "y = R(theta) h(x)",
