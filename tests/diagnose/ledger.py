@@ -16,7 +16,6 @@ from pathlib import Path
 from statistics import NormalDist
 
 import numpy as np
-from scipy.optimize import minimize
 
 from tests.diagnose.sealed import NOT_WAITED, TERMS, near
 from tests.worlds.world import FLOORS
@@ -34,9 +33,11 @@ MATTERS = 5.0
 """Nats on unseen throws that the truth must be worth for a gain to be counted."""
 HARM, HARM_NATS = 1.01, 3.0
 """Growth of the error on unseen throws, per sample in its deviations, and fall of their log likelihood, that count as harm."""
-RIDGE = 0.05
-"""Of the logistic curves, on both coefficients: a curve without a miss has no finite slope."""
-DRAWS = 1000
+RIDGE, STEPS = 0.05, 30
+"""Of the logistic curves: inverse variance of the prior of both coefficients, and Newton's steps."""
+DRAWS = 400
+FEWEST = 6
+"""Worlds of an effect for a curve of its own."""
 
 
 def wilson(k: int, n: int, level: float = 0.95) -> tuple[float, float, float]:
@@ -57,32 +58,46 @@ def share(k: int, n: int) -> str:
 
 
 def logistic(size: np.ndarray, named: np.ndarray) -> tuple[float, float]:
-    """Intercept and slope (0 or more) of ``log odds of being named = a + b log size``, with a weak ridge about its middle."""
-    x = np.log(size)
-    middle = x.mean()
+    """Intercept and slope (0 or more) of ``log odds of being named = a + b log size``, by Newton's steps.
 
-    def cost(p: np.ndarray) -> float:
-        odds = p[0] + p[1] * (x - middle)
-        return float(np.logaddexp(0.0, odds).sum() - odds[named].sum() + 0.5 * RIDGE * (p @ p))
-
-    a, b = minimize(cost, np.array([0.0, 1.0]), bounds=((None, None), (0.0, None))).x
-    return float(a - b * middle), float(b)
+    A weak normal prior on both, about the middle of the sizes, keeps a curve without a miss finite.
+    """
+    x = np.log(size) - np.log(size).mean()
+    columns, p = np.stack((np.ones_like(x), x), axis=1), np.zeros(2)
+    for _ in range(STEPS):
+        chance = 1.0 / (1.0 + np.exp(-columns @ p))
+        slope = columns.T @ (named - chance) - RIDGE * p
+        p = p + np.linalg.solve((columns.T * (chance * (1.0 - chance))) @ columns + RIDGE * np.eye(2), slope)
+    if p[1] <= 0.0:
+        share = (named.sum() + RIDGE) / (len(named) + 2.0 * RIDGE)
+        return math.log(share / (1.0 - share)), 0.0
+    return float(p[0] - p[1] * np.log(size).mean()), float(p[1])
 
 
 def at_share(curve: tuple[float, float], probability: float) -> float:
     """Size at which a curve reaches a probability."""
     a, b = curve
-    return math.exp((math.log(probability / (1.0 - probability)) - a) / b) if b > 1e-9 else math.inf
+    missing = math.log(probability / (1.0 - probability)) - a
+    if b < 1e-9:
+        return math.inf if missing > 0.0 else 0.0
+    return math.exp(min(missing / b, 700.0))
 
 
 def rho90(size: np.ndarray, named: np.ndarray, rng: np.random.Generator) -> tuple[float, float, float]:
     """Size that is named with 90 % probability, with its 95 % bootstrap interval."""
     draws = []
-    for _ in range(DRAWS // 4):
+    for _ in range(DRAWS):
         i = rng.integers(len(size), size=len(size))
         draws.append(at_share(logistic(size[i], named[i]), 0.9))
-    low, high = np.quantile(np.minimum(draws, 1e6), [0.025, 0.975])
+    low, high = np.quantile(np.minimum(draws, 1e9), [0.025, 0.975])
     return at_share(logistic(size, named), 0.9), float(low), float(high)
+
+
+def within(value: float, size: np.ndarray, scale: float = 1.0, digits: int = 2) -> str:
+    """A size as text, times ``scale``; what lies outside the sizes that were flown is told as that alone."""
+    least, most = size.min(), size.max()
+    sign = "<" if value < least else ">" if value > most else ""
+    return f"{sign}{float(np.clip(value, least, most)) * scale:.{digits}g}"
 
 
 def truth_of(world: dict) -> set[str]:
@@ -160,15 +175,13 @@ def completeness(worlds: Sequence[dict]) -> list[str]:
     for name in ["all", *sorted(curves, key=lambda n: (n not in LIMITS, n))]:
         size, named = whole if name == "all" else curves[name]
         row = [name, len(size), f"{size.min():.1f} to {size.max():.1f}", share(int(named.sum()), len(size))]
-        if len(size) >= 6:
-            value, low, high = rho90(size, named, rng)
-            row.append(f"{value:.1f} [{low:.1f}, {high:.1f}]")
-        else:
-            value = math.nan
-            row.append("-")
         limit, factor, unit = LIMITS.get(name, (math.nan, 1.0, ""))
-        scaled = value * FLOORS.get(name, math.nan) * factor
-        row += [f"{scaled:.2g} {unit}" if limit == limit and value == value else "-"]
+        if len(size) >= FEWEST:
+            found = rho90(size, named, rng)
+            row.append("{} [{}, {}]".format(*(within(x, size) for x in found)))
+            row.append(f"{within(found[0], size, FLOORS[name] * factor)} {unit}" if name in LIMITS else "-")
+        else:
+            row += ["-", "-"]
         row += [f"{limit * factor:.2g} {unit}" if limit == limit else "-"]
         lines.append("| " + " | ".join(map(str, row)) + " |")
     return lines
@@ -251,7 +264,7 @@ def draw(worlds: Sequence[dict], path: Path) -> None:
             axes[0].annotate(f"{len(here)}", (centre, 0.02), ha="center", fontsize=8, color="grey")
     drawn = {"all effects": logistic(size, named)}
     axes[0].plot(grid, _chance(grid, drawn["all effects"]), color="C0", label="all effects")
-    for i, name in enumerate(n for n in LIMITS if n in curves and len(curves[n][0]) >= 6):
+    for i, name in enumerate(n for n in LIMITS if n in curves and len(curves[n][0]) >= FEWEST):
         axes[1].plot(grid, _chance(grid, logistic(*curves[name])), color=f"C{i}", label=f"{name} ({len(curves[name][0])})")
         axes[1].plot(curves[name][0], curves[name][1] + 0.008 * (i - 4), ".", color=f"C{i}", alpha=0.6)
     for axis, title in zip(axes, ("all effects; worlds in grey, bars 95 %", "effects whose limits are asked for (worlds)")):

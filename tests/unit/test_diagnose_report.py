@@ -1,22 +1,59 @@
 """Gain on held-out flights, effects hidden in the flights' own noise, the plan, and the report."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
-from visthrow.diagnose import blind, forms, gain, manoeuvres, plan, report, result, search
+from visthrow.diagnose import blind, forms, gain, manoeuvres, plan, point, report, result, search
+from visthrow.diagnose.landing import Landings
 from visthrow.storage import write_json
 
 EFFECTS = catalogue(12)
 TRUTH = {"effect_03": 12.0, "effect_04": -9.0}
 
 
+ARMS = {"effect_03": 2.0, "effect_04": 5.0}
+"""Distance by which an effect moves landings, per its unit, along x and along y."""
+
+
+class Throwing(SyntheticModel):
+    """Also predicts where throws land: off by what the effects' sizes miss of the truth, and by 2 mm at random."""
+
+    def landings(self, theta, flights=None):
+        """See :meth:`visthrow.diagnose.throw_model.ThrowModel.landings`."""
+        numbers = np.array(sorted({w.flight for w in self._windows}) if flights is None else list(flights))
+        floors = {e.name: e.floor for e in self.effects}
+        missing = np.array([ARMS[n] * (size * floors[n] - theta.get(n, 0.0)) for n, size in self.truth.items()])
+        scatter = np.array([np.random.default_rng(int(n)).normal(0.0, 2e-3, 3) for n in numbers])
+        off = np.tile([*missing, 0.0], (len(numbers), 1)) + scatter
+        return Landings(numbers, np.zeros_like(off), off, 0.1 * off)
+
+
 @pytest.fixture(scope="module")
 def found():
-    model = SyntheticModel(effects=EFFECTS, truth=TRUTH, seed=1)
+    model = Throwing(effects=EFFECTS, truth=TRUTH, seed=1)
     return model, search.explain(model, laws=False)
+
+
+def test_landings_are_told_in_millimetres(found, measured):
+    """Before, after with causes sized by the other flights, and by each cause alone; in sentences too."""
+    floors = {e.name: e.floor for e in EFFECTS}
+    alone = {n: abs(ARMS[n] * size * floors[n]) for n, size in TRUTH.items()}
+    landing = measured.landing
+    assert landing.held_out
+    assert landing.throws == 6
+    assert landing.before == pytest.approx(np.hypot(*alone.values()), rel=0.1)
+    assert landing.low <= landing.after <= landing.high < 0.5 * landing.before
+    assert landing.released_before == pytest.approx(0.1 * landing.before)
+    for name, moved in landing.moved.items():
+        assert moved == pytest.approx(alone[name], rel=0.2)
+    text = report.summary(found[1], measured)
+    assert f"It moves landings by {1e3 * landing.moved['effect_03']:.0f} mm." in text
+    assert f"falls from {1e3 * landing.before:.0f} to {1e3 * landing.after:.0f} mm" in text
+    assert report.to_json(found[1], measured)["gain"]["landing"]["after"] == landing.after
 
 
 @pytest.fixture(scope="module")
@@ -42,6 +79,20 @@ def test_gain_comes_near_what_knowing_the_truth_would_bring(found, measured):
     assert measured.nats_per_sample > 0.0
     assert measured.named_in == {"effect_03": 1.0, "effect_04": 1.0}
     assert measured.left_out == "flights"
+
+
+def test_shortfall_is_the_likelihood_ratio_of_a_linear_model(found):
+    """Moving from the truth by d costs d' I d / 2 less d' s nats; the same by the statistics at the truth."""
+    model, diagnosis = found
+    problem = replace(diagnosis.work.problem, kept=tuple(range(len(model.windows({})))))
+    theta = np.array([TRUTH.get(e.name, 0.0) for e in EFFECTS])
+    there = point.linearise(problem, theta)
+    (nats, same), samples = gain.shortfalls(model, [{}, problem.sizes(theta)])
+    expected = 0.5 * theta @ there.information @ theta + theta @ there.statistics.score.sum(0)
+    assert same == 0.0
+    assert samples == there.statistics.samples.sum()
+    assert nats == pytest.approx(expected, rel=1e-6)
+    assert nats > 100.0
 
 
 def test_errors_grow_with_the_horizon(measured):
