@@ -252,7 +252,7 @@ def draw(worlds: Sequence[dict], path: Path) -> None:
 
     curves = singles(worlds)
     size, named = (np.concatenate([v[i] for v in curves.values()]) for i in range(2))
-    figure, axes = plt.subplots(1, 2, figsize=(11, 4.2), sharey=True, layout="constrained")
+    figure, axes = plt.subplots(1, 2, figsize=(11, 4.2), sharex=True, sharey=True, layout="constrained")
     edges = np.exp(np.linspace(np.log(0.98 * size.min()), np.log(1.02 * size.max()), 9))
     grid = np.geomspace(edges[0], edges[-1], 200)
     for low, high in pairwise(edges):
