@@ -30,12 +30,20 @@ ORDERS = {"bin": "wxyz", "ulg": "wxyz", "mocap": "xyzw"}
 
 @dataclass(frozen=True)
 class LinkParams:
-    """The MAVLink link of source and autopilot."""
+    """The MAVLink link of source and autopilot.
+
+    Raises:
+        ConfigError: an id that MAVLink does not have.
+    """
 
     device: str  # see hil.device
     remote: bool  # whether the device may leave this machine
     system: int  # our own id, 1 to 255
     component: int  # likewise
+
+    def __post_init__(self) -> None:
+        if not (1 <= self.system <= 255 and 1 <= self.component <= 255):
+            raise ConfigError(f"link.system {self.system}, component {self.component}; expected 1 to 255 each")
 
 
 @dataclass(frozen=True)
@@ -113,6 +121,14 @@ class HilParams:
             raise ConfigError(f"backend {self.backend} with recorded poses ({self.source.kind}); a recording flies dry")
         if self.source.kind == "mocap" and self.source.mocap is None:
             raise ConfigError("source.mocap is missing; expected its system and host")
+        f = self.fence
+        if not all(a <= x <= b for a, x, b in zip(f.vehicle_low, self.home_w, f.vehicle_high)):
+            raise ConfigError(f"home_w {self.home_w} m; expected within the vehicle's fence, {f.vehicle_low} to {f.vehicle_high} m")
+        if not f.payload_low[2] <= self.landing_height <= f.payload_high[2]:
+            raise ConfigError(
+                f"landing_height {self.landing_height} m; expected within the payload's fence, {f.payload_low[2]} to "
+                f"{f.payload_high[2]} m of height"
+            )
         written = ORDERS.get(self.source.kind)
         for name, frames in self.frames.items():
             if written is not None and frames.quaternion != written:

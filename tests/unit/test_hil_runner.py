@@ -363,6 +363,9 @@ def test_another_camera_is_refused():
         ("guard.slew_thrust=0.0", "above 0"),
         ("fence.vehicle_low=[9.0, 0.0, 0.0]", "ascending corners"),
         ("states.armed=-1.0", "above 0 s"),
+        ("home_w=[0.0, 0.0, 30.0]", "expected within the vehicle's fence"),
+        ("landing_height=-3.0", "expected within the payload's fence"),
+        ("link.system=300", "expected 1 to 255"),
     ],
 )
 def test_wrong_configs(override, message):
