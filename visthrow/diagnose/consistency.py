@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2
 
-from visthrow.diagnose.evidence import Priors, additions
+from visthrow.diagnose.evidence import Priors, additions, estimate
 from visthrow.diagnose.model import Window
 from visthrow.diagnose.point import Point
 
@@ -30,6 +30,12 @@ MOST_SIGNS = 4096
 HETEROGENEOUS = 1e-4
 """Probability of the flights' estimates lying so far apart (Cochran's Q) from which an effect is no property of the vehicle."""
 
+EDGE = 6
+"""Samples of one channel, of three components each, by which windows of a copied flight may differ."""
+
+NOISY, COPIED = 0.3, 0.2
+"""Median residual, in its deviation, without which nothing tells a copy; and the median difference of copies' residuals."""
+
 
 @dataclass(frozen=True)
 class Consistency:
@@ -52,23 +58,38 @@ def across_flights(
         least: threshold [nats].
 
     Returns:
-        None where they agree or too few can say.
+        None where they agree, too few can say, or other effects that are still missing may be why they differ.
     """
     statistics = after.statistics
     own = statistics.information[:, added, added]
     if len(own) < LEAST_FLIGHTS or own.sum() <= 0.0:
         return None
-    score = statistics.score[:, added] + own * statistics.theta[added]
-    if _by_chance(own, score):
-        return Consistency(None)
-    estimates = np.divide(score, own, out=np.zeros_like(own), where=own > 0.0)
-    size = score.sum() / own.sum()
-    variance = 1.0 / np.maximum(own, 1e-12) + (SHARE * size) ** 2 + 1.0
-    single = _single(before, after, priors, active, added, least, estimates)
-    if single is not None:
-        return Consistency(single)
+    everything = estimate(after.information, after.score, priors, np.flatnonzero(priors.visible).tolist())
+    verdicts = []
+    for theta in (statistics.theta, everything):
+        score = statistics.absolute[:, added] - statistics.information[:, added] @ theta + own * theta[added]
+        estimates = np.divide(score, own, out=np.zeros_like(own), where=own > 0.0)
+        single = None if by_chance(own, score) else _single(before, after, priors, active, added, least, estimates)
+        if single is None and not differ(own, score):
+            return None
+        verdicts.append(Consistency(single))
+    return verdicts[0]
+
+
+def differ(information: np.ndarray, score: np.ndarray) -> bool:
+    """Whether flights tell so different things of one effect that it is no property of the vehicle.
+
+    Args:
+        information: of each flight, shape (F,).
+        score: of each flight about 0, shape (F,).
+    """
+    if by_chance(information, score):
+        return True
+    estimates = np.divide(score, information, out=np.zeros_like(information), where=information > 0.0)
+    size = score.sum() / information.sum()
+    variance = 1.0 / np.maximum(information, 1e-12) + (SHARE * size) ** 2 + 1.0
     spread = float((((estimates - size) ** 2) / variance).sum())
-    return Consistency(None) if spread > chi2.isf(HETEROGENEOUS, len(own) - 1) else None
+    return spread > chi2.isf(HETEROGENEOUS, len(information) - 1)
 
 
 def _single(before: Point, after: Point, priors: Priors, active: Sequence[int], added: int, least: float,
@@ -91,7 +112,7 @@ def _single(before: Point, after: Point, priors: Priors, active: Sequence[int], 
     return int(after.statistics.flights[f]) if denied else None
 
 
-def _by_chance(information: np.ndarray, score: np.ndarray) -> bool:
+def by_chance(information: np.ndarray, score: np.ndarray) -> bool:
     """Sign-flip test: whether the flights' scores would add up to as much if each had a random sign."""
     if information.sum() ** 2 < EFFECTIVE * (information**2).sum():
         return False
@@ -124,9 +145,18 @@ def repeated_flights(windows: Sequence[Window]) -> dict[int, int]:
 
 
 def _same(a: Window, b: Window) -> bool:
-    """Noise of two flights never agrees to a thousandth of its deviation."""
-    if a.residual.shape != b.residual.shape or not len(a.residual):
+    """Whether two windows hold the same measurements: noise of two flights never agrees to a fifth of its deviation.
+
+    A clock set forward may move a sample at either end into or out of a window.
+    """
+    if abs(len(a.residual) - len(b.residual)) > EDGE * len(np.unique(a.channel)) or not len(a.residual):
         return False
-    if np.median(np.abs(a.residual) / a.sigma) < 0.1:  # a simulation's record without noise
+    return all(_alike(*[w.residual[w.channel == c] / w.sigma[w.channel == c] for w in (a, b)]) for c in np.unique(a.channel))
+
+
+def _alike(one: np.ndarray, other: np.ndarray) -> bool:
+    if min(len(one), len(other)) <= EDGE or np.median(np.abs(one)) < NOISY:  # a simulation's record without noise
         return False
-    return bool(np.median(np.abs(a.residual - b.residual) / a.sigma) < 1e-3)
+    pairs = [(one, other), *[(x[k:], y) for x, y in ((one, other), (other, one)) for k in range(3, EDGE + 1, 3)]]
+    lengths = [min(len(x), len(y)) for x, y in pairs]
+    return min(np.median(np.abs(x[:n] - y[:n])) for (x, y), n in zip(pairs, lengths)) < COPIED

@@ -13,6 +13,7 @@ LEAST = 0.25  # of a window [s]
 BEFORE, AFTER = 0.55, 0.45  # of the separation, that the window of the throw reaches [s]
 QUIET_SPEED = 0.35  # of hover [m/s]
 GROUND_MARGIN = 0.05  # above the landing height, below which a payload is left alone [m]
+LATE = 0.1  # by which the release may lag more than expected, before a payload counts as free where the rope was slack [s]
 LEAST_TAUT = 0.05  # before the separation, without which the release cannot be judged [s]
 MOST = 400  # windows; of longer flights these are spread evenly over all
 POSES_LEAST = 8  # measured poses without which a window says nothing
@@ -102,7 +103,7 @@ def around_slack(c: Cut, first: float, last: float, separation: float) -> list[C
         separation: of the payload [s]; a rope that comes taut no sooner leaves a window of the flight after it.
     """
     free = c.start < separation < min(last + LEAST_TAUT, c.end)
-    last = min(max(last, separation + 1e-3), c.end) if free else min(last, c.end)
+    last = min(max(last, separation + LATE), c.end) if free else min(last, c.end)
     rest = replace(c, start=last, payload=LOOSE, phase="ballistic") if free else replace(c, start=last, shaken=True)
     before = replace(c, end=first, phase="flight" if c.phase == "throw" else c.phase)
     pieces = [before, replace(c, start=first, end=last, told=False), rest]

@@ -21,6 +21,11 @@ from visthrow.errors import DiagnoseError
 SPIKE = 0.5
 """Deviation of an effect that is not named, in its floor: the floor is the limit of what may go unnamed, not its usual size."""
 
+OWN_FLOOR = 0.5
+"""Deviation that numerics and what an effect's form leaves out add to its estimate, in its floor."""
+
+NORMAL_95 = 1.96
+
 CALIBRATION_DRAWS = 4000
 CALIBRATION_QUANTILE = 0.995
 

@@ -1,11 +1,15 @@
 """``visthrow diagnose explain``: what the model gets wrong about measured flights."""
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 from visthrow.diagnose.result import INCONSISTENT, OVERALL
 
 DEFAULT_OUT = "out/explain"
+
+MOST_SPOILED = 0.25
+"""Share of the logs that may contradict themselves and be left out; where more do, nothing is to be learnt from any."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -34,15 +38,19 @@ def run(args: argparse.Namespace) -> int:
     from visthrow.storage import write_json
 
     model, logs = opening.open_model(args)
-    reasons = contradictions(check(logs))
-    if reasons:
+    checked = check(logs)
+    reasons, spoiled = contradictions(checked), tuple(i for i, log in enumerate(checked) if contradictions([log]))
+    if len(spoiled) > MOST_SPOILED * len(logs):
         print(f"{INCONSISTENT}: {OVERALL[INCONSISTENT]}\n" + "\n".join(f"  {reason}" for reason in reasons))
         if args.json:
             write_json(args.json, {"overall": INCONSISTENT, "reasons": reasons, "findings": []})
         return 0
     print(f"{len(logs)} log(s), {len(model.effects)} effects on {', '.join(model.channels)}", flush=True)
-    without = opening.numbers(args.without)
+    for reason in reasons:
+        print(f"  left out: {reason}", flush=True)
+    without = (*opening.numbers(args.without), *spoiled)
     diagnosis = search.explain(model, seed=args.seed, without=without, progress=lambda line: print(f"  {line}", flush=True))
+    diagnosis = replace(diagnosis, reasons=(*diagnosis.reasons, *(f"left out: {reason}" for reason in reasons)))
     gain = None
     if not args.no_report and diagnosis.work is not None:
         gain = _report(args, diagnosis, model, logs)

@@ -12,7 +12,7 @@ from itertools import combinations
 import numpy as np
 
 from visthrow.diagnose.consistency import Consistency, across_flights, repeated_flights
-from visthrow.diagnose.evidence import Priors, additions, log_evidence, threshold
+from visthrow.diagnose.evidence import NORMAL_95, OWN_FLOOR, Priors, additions, covariance, log_evidence, threshold
 from visthrow.diagnose.model import Model
 from visthrow.diagnose.point import (
     Point,
@@ -29,6 +29,9 @@ from visthrow.errors import DiagnoseError
 
 MOST_NAMES = 6
 """A longer list of causes is a wrong form, not a finding."""
+
+CHAIN = 3
+"""Names from which on a law outside the catalogue is looked for at once: a wrong form brings one name after the other."""
 
 SHORTLIST = 3
 """Candidates whose simulation is run again in each step."""
@@ -57,6 +60,7 @@ class Search:
     nominal: Point
     least: float  # threshold [nats]
     progress: Callable[[str], None]
+    laws: bool = True  # whether to look for laws outside the catalogue
     active: list[int] = field(default_factory=list)
     point: Point | None = None
     origin: Point | None = None  # where the derivatives were taken last
@@ -75,10 +79,15 @@ class Search:
         return self.problem.model.effects[j].name
 
     def run(self) -> None:
-        """Search until nothing exceeds the threshold."""
+        """Search until nothing exceeds the threshold, or until names follow one another in place of a law."""
+        from visthrow.diagnose.unknown import outside
+
         self.point = self.origin = self.nominal
         while len(self.active) < MOST_NAMES and self._forward():
             self._backward()
+            if self.laws and len(self.active) == CHAIN and outside(self):
+                self.progress("a law that the catalogue does not hold explains this better than one name after the other")
+                return
         self._joint()
 
     def _screen(self, point: Point) -> np.ndarray:
@@ -100,6 +109,9 @@ class Search:
         best = max(nats, key=nats.get)
         if nats[best] <= max([self.least, *(CONTRADICTED * n for n in self.refused.values())]):
             return False
+        if not self._sure(tried[best], best):
+            self.progress(f"{self.name(best)} would be no larger than what it cannot be told from; it is not named")
+            return False
         verdict = across_flights(self.point, tried[best], self.priors, self.active, best, self.least)
         if verdict is not None:
             return self._set_aside(best, nats[best], verdict)
@@ -109,7 +121,13 @@ class Search:
         self.progress(f"{self.name(best)} named, {nats[best]:.1f} nats above the next simpler model")
         self.active.append(best)
         self.point = self._settle(tried[best], self.active)
+        self.refused.clear()  # what differed from flight to flight may have been this one's share
         return True
+
+    def _sure(self, point: Point, j: int) -> bool:
+        """Whether the interval that an effect would be reported with leaves out 0."""
+        spread = covariance(point.information, self.priors.deviation([*self.active, j]))[j, j]
+        return bool(abs(point.theta[j]) > NORMAL_95 * np.hypot(np.sqrt(spread), OWN_FLOOR))
 
     def _candidate(self, point: Point, active: Sequence[int]) -> Point:
         return with_fitted_noise(fitted(self.problem, point, active))
@@ -233,7 +251,7 @@ def explain(
     nominal = linearise(problem, np.zeros(len(model.effects)), windows=windows)
     least = threshold(nominal.statistics, priors, np.random.default_rng(seed))
     say(f"{len(kept)} windows of {len(nominal.statistics.flights)} flights; a cause needs {least:.1f} nats")
-    search = Search(problem, nominal, least, say)
+    search = Search(problem, nominal, least, say, laws)
     search.run()
     diagnosis = conclude(search, laws=laws)
     return replace(diagnosis, duplicates=duplicates, seconds=time.monotonic() - begun, seed=seed)

@@ -13,8 +13,9 @@ import numpy as np
 
 from visthrow.diagnose import grammar
 from visthrow.diagnose import noise as noise_levels
+from visthrow.diagnose.consistency import LEAST_FLIGHTS, differ
 from visthrow.diagnose.evidence import Priors, covariance, estimate
-from visthrow.diagnose.marginal import Gram, gather, window_statistics
+from visthrow.diagnose.marginal import Gram, WindowStatistics, gather, window_statistics
 from visthrow.diagnose.model import LATENT_BLOCKS
 from visthrow.diagnose.point import Point, advantage, shifted
 from visthrow.diagnose.result import Law
@@ -37,6 +38,9 @@ NARROW = 1e-3
 MATERIAL = 0.5
 """Root mean square force of a term, in the block's quietest latent force, below which it does not matter: that of a gust moves a
 landing by 5 mm within half a second."""
+
+ROUGHER, ROUGHEST = 2.0, 10.0
+"""While terms are screened, no phase is rougher than so many times the calmest, unless that is calmer still than a tenth of it."""
 
 REMAINDER = 0.05
 """Share of a term's evidence below which a name beside it is what the term's form, weighed without a simulation, leaves over."""
@@ -116,7 +120,22 @@ def _columns(point: Point, window: int, block: str, terms_: Sequence[grammar.Ter
     return grammar.coefficients(w.latent_block, w.latent_axis, w.latent_time, w.knots["time"], block, values)
 
 
-def _screen(point: Point, block: str) -> _Screen | None:
+def _calm(point: Point) -> tuple[Point, list[WindowStatistics]]:
+    """The point as if no phase were much rougher than its block's calmest, and the statistics of its windows.
+
+    A force that the model lacks is taken for gusts in the phases in which it acts; there no term of it would stand out.
+    """
+    levels = point.noise.latent_sd
+    limits = {}
+    for block in {block for block, _ in levels}:
+        own = [level for (b, _), level in levels.items() if b == block]
+        limits[block] = max(ROUGHER * min(own), max(own) / ROUGHEST)
+    noise = replace(point.noise, latent_sd={key: min(level, limits[key[0]]) for key, level in levels.items()})
+    parts = [window_statistics(gram, noise, w) for w, gram in enumerate(point.grams)]
+    return replace(point, noise=noise, statistics=gather(point.grams, parts, point.theta)), parts
+
+
+def _screen(point: Point, parts: Sequence[WindowStatistics], block: str) -> _Screen | None:
     """Gather what each term of a block says; None where the windows carry no knots for any."""
     index = LATENT_BLOCKS.index(block)
     knots = [set(w.knots) for w in point.windows if np.any(w.latent_block == index)]
@@ -127,10 +146,9 @@ def _screen(point: Point, block: str) -> _Screen | None:
     count, effects = len(terms_), len(point.theta)
     own, score, cross, square = np.zeros(count), np.zeros(count), np.zeros((count, effects)), np.zeros(count)
     rows = 0
-    for w, gram in enumerate(point.grams):
+    for w, (gram, part) in enumerate(zip(point.grams, parts)):
         if not np.any(gram.latent_block == index):
             continue
-        part = window_statistics(gram, point.noise, w)
         columns = _columns(point, w, block, terms_)
         own += np.einsum("lt,lm,mt->t", columns, part.latent_information, columns, optimize=True)
         score += columns.T @ (part.latent_score + part.latent_effects @ point.theta)
@@ -207,17 +225,25 @@ def hypotheses(point: Point, priors: Priors, active: Sequence[int], strongest: d
         least: nats below which no term is weighed.
         beside: a first term that ``point`` already holds.
     """
-    screens = {block: screen for block in strongest if (screen := _screen(point, block)) is not None}
+    calm, parts = _calm(point)
+    screens = {block: screen for block in strongest if (screen := _screen(calm, parts, block)) is not None}
     depths = [term.depth for screen in screens.values() for term in screen.terms]
     price = {depth: float(np.log(sum(d <= depth for d in depths))) for depth in set(depths)}
     found: list[tuple[float, grammar.Term, float]] = []
     for block, screen in screens.items():
-        gain, prior = _gains(point, priors, active, screen, REACH * strongest[block])
+        gain, prior = _gains(calm, priors, active, screen, REACH * strongest[block])
         gain -= [price[term.depth] for term in screen.terms]
         found += [(float(gain[i]), screen.terms[i], float(prior[i])) for i in _distinct(gain, screen)]
     found = sorted((f for f in found if f[0] > least), key=lambda f: -f[0])[:WEIGHED]
     weighed = [_weigh(point, priors, active, term, prior, price[term.depth], beside) for _, term, prior in found]
-    return sorted(filter(_matters, weighed), key=lambda h: -h.nats)
+    return sorted((h for h in weighed if _matters(h) and not _differs(h)), key=lambda h: -h.nats)
+
+
+def _differs(hypothesis: Hypothesis) -> bool:
+    """Whether the flights tell different things of the last term."""
+    statistics = hypothesis.point.statistics
+    own = statistics.information[:, -1, -1]
+    return len(own) >= LEAST_FLIGHTS and differ(own, statistics.score[:, -1] + own * statistics.theta[-1])
 
 
 def _matters(hypothesis: Hypothesis) -> bool:
@@ -251,6 +277,11 @@ class Answer:
     strongest: tuple[Hypothesis, ...] = ()  # the first possibly of two terms
 
 
+def outside(search: "Search") -> bool:
+    """Whether a search that has come to several names follows a law that the catalogue does not hold."""
+    return beats_the_catalogue(search, find_laws(search))[0] is not None
+
+
 def find_laws(search: "Search") -> Answer:
     """Look for terms that explain the flights instead of the names found, instead of some of them, and beside them."""
     strongest: dict[str, float] = {}
@@ -260,16 +291,29 @@ def find_laws(search: "Search") -> Answer:
     if not all(w.knots for w in search.nominal.windows) or not strongest:
         return Answer()
     priors, least = search.priors, search.least
-    found = hypotheses(search.nominal, priors, (), strongest, least)
+    found = [(h, search.nominal) for h in hypotheses(search.nominal, priors, (), strongest, least)]
     if search.active:
-        found += [_pruned(h, least) for h in hypotheses(search.point, priors, search.active, strongest, least)]
-    found.sort(key=lambda h: -h.net(least))
-    if found and found[0].nats > least + MARGIN:
-        first = found[0]
-        pairs = hypotheses(first.point, first.priors, first.active, strongest, least + MARGIN, first)
-        if pairs and pairs[0].nats > least + MARGIN:
-            found.insert(0, pairs[0])
-    return Answer(tuple(found))
+        beside = hypotheses(search.point, priors, search.active, strongest, least)
+        found += [(_pruned(h, least), search.point) for h in beside]
+    found.sort(key=lambda h: -h[0].net(least))
+    best = [h for h, _ in found]
+    if best and best[0].nats > least + MARGIN:
+        best[:1] = _paired(search, *found[0], strongest)
+    return Answer(tuple(best))
+
+
+def _paired(search: "Search", first: Hypothesis, origin: Point, strongest: dict[str, float]) -> list[Hypothesis]:
+    """The best hypothesis, after it joined by a second term or replaced by one that makes it superfluous where there is such."""
+    least = search.least
+    pairs = hypotheses(first.point, first.priors, first.active, strongest, least + MARGIN, first)
+    if not pairs or pairs[0].nats <= least + MARGIN:
+        return [first]
+    pair = pairs[0]
+    second = [j for j in pair.active if j != len(pair.priors.floor) - 2]
+    if pair.point.evidence(pair.priors, pair.active) - pair.point.evidence(pair.priors, second) > least:
+        return [pair, first]
+    own = _weigh(origin, search.priors, first.names, pair.terms[-1], pair.scale[-1] / NARROW, pair.price - first.price)
+    return sorted((own, first), key=lambda h: -h.net(least))
 
 
 def _pruned(hypothesis: Hypothesis, least: float) -> Hypothesis:
@@ -292,17 +336,26 @@ def beats_the_catalogue(search: "Search", answer: Answer) -> tuple[Hypothesis | 
     Returns:
         The hypothesis, the names that are withdrawn for it, and the reason in words; None, nothing and "" where none must.
     """
-    if not answer.strongest:
-        return None, set(), ""
-    best = answer.strongest[0]
-    withdrawn = set(search.active) - set(best.names)
-    if withdrawn:
-        ahead = best.net(search.least) - (search.point.evidence(search.priors, search.active) - search.least * len(search.active))
-        if ahead > MARGIN:
-            return best, withdrawn, f"{_text(best)} explains the flights better than {_names(search)}, by {ahead:.0f} nats"
-    elif best.nats > search.least + MARGIN:
-        return best, set(), f"{_text(best)} is missing besides what the catalogue holds ({best.nats:.0f} nats)"
+    for best in answer.strongest:
+        withdrawn = set(search.active) - set(best.names)
+        if withdrawn:
+            ahead = best.net(search.least) - _catalogue(search, best)
+            if ahead > MARGIN:
+                said = f"{_text(best)} explains the flights better than {_names(search)}, by {ahead:.0f} nats"
+                return best, withdrawn, said
+        elif best.nats > search.least + MARGIN:
+            return best, set(), f"{_text(best)} is missing besides what the catalogue holds ({best.nats:.0f} nats)"
     return None, set(), ""
+
+
+def _catalogue(search: "Search", hypothesis: Hypothesis) -> float:
+    """Value of the names alone, where the search stands or with the residuals and noise levels of the hypothesis.
+
+    Outliers lose weight anew at each linearisation, so that the evidence at two of them is not quite of the same data.
+    """
+    own = search.point.evidence(search.priors, search.active)
+    there = hypothesis.point.evidence(hypothesis.priors, search.active)
+    return max(own, there) - search.least * len(search.active)
 
 
 def _names(search: "Search") -> str:

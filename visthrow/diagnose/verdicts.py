@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from visthrow.diagnose import result
-from visthrow.diagnose.evidence import Priors, covariance, estimate
+from visthrow.diagnose.evidence import NORMAL_95, OWN_FLOOR, Priors, covariance, estimate
 from visthrow.diagnose.excess import acts_on, levels, too_strong
 from visthrow.diagnose.model import Model, Window
 from visthrow.diagnose.point import Point
 from visthrow.diagnose.result import Diagnosis, Finding, Law, Level
+from visthrow.diagnose.scatter import varying
 from visthrow.diagnose.work import Work
 
 if TYPE_CHECKING:
@@ -30,10 +31,6 @@ IMPLAUSIBLE_FORCE = 0.3
 AT_BOUND = 1e-3
 """Distance from a physical bound, in floors, at which an estimate lies on it."""
 
-OWN_FLOOR = 0.5
-"""Deviation that numerics and what an effect's form leaves out add to its estimate, in its floor."""
-
-NORMAL_95 = 1.96
 
 
 def conclude(search: "Search", *, laws: bool) -> Diagnosis:
@@ -47,9 +44,17 @@ def conclude(search: "Search", *, laws: bool) -> Diagnosis:
 
     point, model = search.point, search.problem.model
     found = levels(search.nominal, point, search.least)
+    sizes = estimate(point.information, point.score, search.priors, search.active)
+    scatter = varying(point.statistics, sizes, search.priors, [e.name for e in model.effects], search.least)
+    drawn = {name for s in scatter if s.found for name in s.of}
+    search.refused = {j: nats for j, nats in search.refused.items() if search.name(j) not in drawn}
     answer = find_laws(search) if laws else Answer()
     law = beats_the_catalogue(search, answer)
     overall, block, reasons, withdrawn = _overall(search, found, *law)
+    mistakes = tuple(getattr(model, "mistakes", ()))
+    if overall == result.NO_EFFECT and (drawn or mistakes):
+        besides = [m.name for m in mistakes] + [s.name for s in scatter if s.found]
+        overall, reasons = result.KNOWN, [f"besides {' and '.join(besides)}, {reasons[0]}"]
     known = overall != result.UNKNOWN  # a term that is weaker than the names says nothing
     terms = [] if known else _different(answer.strongest)
     active = [j for j in search.active if j not in withdrawn]
@@ -68,6 +73,7 @@ def conclude(search: "Search", *, laws: bool) -> Diagnosis:
         tuple(tuple(map(float, row)) for row in scaled), search.least, tuple(search.steps),
         tuple((tuple(map(search.name, s)), n) for s, n in search.sets), found, tuple(terms), _events(search, point),
         sensor_scale={name: float(point.noise.scale[c]) for c, name in enumerate(model.channels)},
+        scatter=scatter, mistakes=mistakes,
         flights=len(point.statistics.flights), windows=len(point.windows), samples=int(point.statistics.samples.sum()),
         work=Work(search.problem, search.nominal, search.point if active else search.nominal, tuple(active)),
     )  # fmt: skip
@@ -110,7 +116,7 @@ def _overall(
         reason = (f"after everything the catalogue can do, forces above {IMPLAUSIBLE_FORCE:.0%} of the thrust are missing in the "
                   f"phases {', '.join(strong)}: commands and poses, units or axes do not belong together")  # fmt: skip
         return result.INCONSISTENT, "", [reason], every
-    if search.refused and not search.active:
+    if search.refused and not search.active and (law is None or law.nats < max(search.refused.values())):
         names = ", ".join(search.name(j) for j in sorted(search.refused))
         return result.INCONSISTENT, "", [f"what looks like {names} changes its sign from flight to flight"], every
     excessive = [level for level in found if level.excessive]
