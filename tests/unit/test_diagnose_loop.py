@@ -33,14 +33,37 @@ def test_throws_that_did_not_land_do_not_count():
     assert np.isnan(loop.recovered({"before": none, "after": throws(0.1), "oracle": throws(0.1)})["share"])
 
 
-def test_an_experiment_is_extended_by_plant_effects_alone():
-    nominal = config.load(Experiment, config.find("train", "state"))
-    changed = loop.extended(nominal, {"motor_tau": 0.01, "rope_length": -0.02, "frame_tilt_x": 0.01})
-    assert changed.vehicle.motor.time_constant == pytest.approx(nominal.vehicle.motor.time_constant + 0.01)
-    assert changed.rope.length == pytest.approx(nominal.rope.length - 0.02)
-    assert changed.task == nominal.task
-    with pytest.raises(DiagnoseError, match="motor_tua"):
-        loop.extended(nominal, {"motor_tua": 0.01})
+ABLATIONS = {
+    "no_aerodynamics": "aerodynamics", "no_motor_lag": "motor_lag", "rigid_cable": "rope_flexible",
+    "simple_controller": "controller_kind",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("base", "effect"), ABLATIONS.items())
+def test_a_model_that_lacks_a_block_becomes_the_whole_one_by_its_effect(base, effect):
+    """What is hidden from an ablated model is the paper's plant, to the last number."""
+    whole, ablated = (config.load(Experiment, config.find("train", name)) for name in ("state", f"state_{base}"))
+    assert ablated != whole
+    found = loop.extended(ablated, {effect: 1.0})
+    assert (found.vehicle, found.rope, found.task) == (whole.vehicle, whole.rope, whole.task)
+
+
+@pytest.mark.parametrize("theta", [{"motor_tau": 0.019}, {}], ids=["named", "failed"])
+def test_the_round(theta, tmp_path, monkeypatch):
+    """Stages in their order; the oracle is trained and flown whatever the diagnosis says, the other only if it names a cause."""
+    trained, errors = [], {"before": 0.10, "after": 0.04, "oracle": 0.02}
+    monkeypatch.setattr(loop.Loop, "_train", lambda self, name, say: trained.append(name))
+    monkeypatch.setattr(loop.Loop, "_flights", lambda self, truth, say: [truth.vehicle.motor.time_constant])
+    monkeypatch.setattr(loop.Loop, "_diagnose", lambda self, logs, say: {"overall": "KNOWN", "theta": theta, "logs": logs})
+    monkeypatch.setattr(loop.Loop, "_throws", lambda self, name, policy, say: throws(errors[name]))
+    record = loop.Loop({"motor_tau": 0.02}, tmp_path).run(lambda line: None)
+    nominal = config.load(Experiment, config.find("train", "state")).vehicle.motor.time_constant
+    hidden = config.load(Experiment, tmp_path / "hidden.toml").vehicle.motor
+    assert max(hidden.time_constant, hidden.time_constant_down) == pytest.approx(nominal + 0.02)
+    assert set(trained) == ({"oracle", "extended"} if theta else {"oracle"})
+    assert (tmp_path / "extended.toml").exists() == bool(theta)
+    assert record["recovered"]["share"] == pytest.approx(0.75 if theta else 0.0, abs=1e-9)
+    assert loop.read([tmp_path])[0] == json.loads(json.dumps(record))
 
 
 def test_a_hall_records_poses_with_its_noise_and_nothing_true():

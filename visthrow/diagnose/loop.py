@@ -21,11 +21,11 @@ from typing import Any
 import numpy as np
 
 from visthrow import config, toml_text
-from visthrow.diagnose import catalogue
+from visthrow.diagnose.patch import extended
 from visthrow.errors import DiagnoseError
 from visthrow.flightlog import Channel, FlightLog
 from visthrow.storage import atomic_write, write_json
-from visthrow.task import Experiment, plant_of
+from visthrow.task import Experiment
 
 PLANT = "reference"
 """The reference plant without extras: what the diagnosis finds is what was hidden, or a mistake."""
@@ -221,18 +221,6 @@ def recovered(throws: Mapping[str, Any], draws: int = 4000, seed: int = 0) -> di
     again = {n: e[rng.integers(0, len(e), (draws, len(e)))].mean(1) for n, e in errors.items()}
     low, high = np.quantile(share(again), [0.025, 0.975])
     return {"share": float(share({n: e.mean() for n, e in errors.items()})), "low": float(low), "high": float(high)}
-
-
-def extended(experiment: Experiment, theta: Mapping[str, float]) -> Experiment:
-    """The experiment with these effects of the catalogue in its plant; what only sensors have stays out.
-
-    Raises:
-        DiagnoseError: no effect of that name.
-    """
-    changed = catalogue.apply(catalogue.ALL, catalogue.Setting(plant_of(experiment)), theta).plant
-    return dataclasses.replace(
-        experiment, vehicle=changed.vehicle, rope=changed.rope, release=changed.release, air=changed.air
-    )
 
 
 def named(verdict: Mapping[str, Any]) -> dict[str, float]:
