@@ -36,8 +36,8 @@ NOISE = {"pos_w": 5e-4, "quat_wb": np.radians(0.2), "payload_pos_w": 8e-4}
 BEFORE, AFTER = 1.5, 0.6
 """What is kept of a flight before the policy starts and after the landing [s]."""
 
-BATCH = 13
-"""Throws that share a process: 200 are 16 batches, which 16 cores fly at once."""
+BATCH = 20
+"""Throws that share a process: of 200, ten cores fly each policy's at once. Other sizes would be other throws."""
 
 THROW_SEED = 20_000
 """Of the throws that judge; the flights that are diagnosed have the seeds from 0."""
