@@ -40,12 +40,11 @@ DAMPING, DAMPING_MOST = 1e-3, 1e5
 ROUNDS = 25
 AFTER_SLACK = 0.05  # that a rope is given to come taut [s]
 HUBER = 30.0  # deviations, beyond which a sample counts less
-SETTLED = 0.003  # relative fall of the cost below which an initial state is settled
+SETTLED = 0.01  # relative fall of the cost below which an initial state is settled
 MOVED = 0.2  # relative fall of the cost above which derivatives by the initial state are taken anew
 ROUGHER = 3.0
-"""Added to the square of the step, in the nominal one, where only differences of lanes count: twice as long steps.
-
-The integrators' errors cancel in differences but for their derivatives, a few thousandths of a column.
+"""Added to the square of the step, in the nominal one, for derivatives that only point the way to an initial state: twice as
+long steps. Columns keep the nominal step: twice as long ones changed those of rope and release in throws by up to their size.
 """
 TRUSTED = ("motor_speed",)
 """Fields that are linearised about where the commands left them. Fitted without gusts they would take the gusts' place: rotors
@@ -139,8 +138,7 @@ class ThrowModel:
         states = self._states if setting == self.setting else self._settle(setting, self._better_start(setting))
         self._latest = states
         steps = [self._step(e, theta.get(e.effect.name, 0.0)) for e in self._graded]
-        rough = _rougher(setting)
-        settings = [setting, rough, *[e.apply(rough, step) for e, step in zip(self._graded, steps)]]
+        settings = [setting, *[e.apply(setting, step) for e, step in zip(self._graded, steps)]]
         replay = self._replay(settings)
         found: list[Window] = []
         for batch in self._batches():
@@ -259,7 +257,7 @@ class ThrowModel:
         """Windows in groups whose lanes fit a run."""
         batches, room = [], 0
         for w in self._told:
-            lanes = 2 + len(self._graded) + len(self._directions) + 9 * int(self.flights.knots[w])
+            lanes = 1 + len(self._graded) + len(self._directions) + 9 * int(self.flights.knots[w])
             if not batches or room < lanes:
                 batches.append([])
                 room = BATCH if self.device == "cpu" else CUDA_BATCH
@@ -291,14 +289,14 @@ class ThrowModel:
         for w in batch:
             lanes.append(Lane(w, 0, w, keep=keep))
             keep += int(self.flights.knots[w])
-            lanes += [Lane(w, 1 + k, w) for k in range(1 + len(self._graded))]
-            lanes += [Lane(w, 1, (1 + d) * count + w) for d in self._nuisances(w)]
-            lanes += [Lane(w, 1, w, axis, knot, LATENT_SIZES[axis]) for axis, knot in self._latents(w)]
+            lanes += [Lane(w, 1 + k, w) for k in range(len(self._graded))]
+            lanes += [Lane(w, 0, (1 + d) * count + w) for d in self._nuisances(w)]
+            lanes += [Lane(w, 0, w, axis, knot, LATENT_SIZES[axis]) for axis, knot in self._latents(w)]
         flown = self.flights.fly(replay, settings, self._moved(states), lanes, self.substep)
         out, at, keep = [], 0, 0
         for w in batch:
             nuisances, latents = self._nuisances(w), self._latents(w)
-            size = 2 + len(self._graded) + len(nuisances) + len(latents)
+            size = 1 + len(self._graded) + len(nuisances) + len(latents)
             knots = {name: value[keep : keep + self.flights.knots[w]] for name, value in flown.knots.items()}
             out.append(self._window(flown.seen[:, at : at + size], settings[0], steps, w, nuisances, latents, knots))
             at, keep = at + size, keep + int(self.flights.knots[w])
@@ -307,12 +305,12 @@ class ThrowModel:
     def _window(
         self, seen: np.ndarray, setting: Setting, steps: np.ndarray, w: int, nuisances: list[int], latents: list, knots: dict
     ) -> Window:
-        """One window from its lanes: nominal; with rougher steps nominal, effects, initial states, latent forces."""
+        """One window from its lanes: nominal, effects, initial states, latent forces."""
         rows, c = int(self.flights.rows[w]), self.flights.cuts[w]
         flat = np.ascontiguousarray(np.swapaxes(seen[:rows], 1, 2)).reshape(3 * rows, -1)
         K, D = len(steps), len(nuisances)
         sizes = [*steps, *[self._directions[d].step for d in nuisances], *[LATENT_SIZES[axis] for axis, _ in latents]]
-        slopes = (flat[:, 2:] - flat[:, 1:2]) / np.array(sizes)
+        slopes = (flat[:, 1:] - flat[:, :1]) / np.array(sizes)
         return Window(
             c.flight, c.phase, self._time(w), self._channel(w), self._residual(seen, w, 0), self._sigma(w), slopes[:, :K],
             slopes[:, K : K + D], np.array([self._directions[d].sd for d in nuisances]), slopes[:, K + D :],
@@ -453,7 +451,7 @@ def _like(mask: np.ndarray, value: np.ndarray) -> np.ndarray:
 
 
 def _rougher(setting: Setting) -> Setting:
-    """The setting with longer steps, for lanes that are only compared with each other."""
+    """The setting with longer steps, for lanes that only point the way."""
     return dataclasses.replace(setting, step_square=setting.step_square + ROUGHER)
 
 
