@@ -10,6 +10,7 @@ import concurrent.futures
 import dataclasses
 import json
 import multiprocessing as mp
+import shutil
 import subprocess
 import sys
 import time
@@ -135,6 +136,8 @@ class Loop:
         command += ["--device", self.device, "--seed", "1"]
         if (self.folder / name / CHECKPOINT).exists():
             command.append("--resume")
+        else:  # one that was interrupted before its first checkpoint begins anew
+            shutil.rmtree(self.folder / name, ignore_errors=True)
         for change in self.changes:
             command += ["--set", change]
         with (self.folder / f"{name}.log").open("w") as log:
