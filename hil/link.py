@@ -6,7 +6,9 @@ the boundary between MAVLink's units and orders and ours.
 
 import math
 import struct
+import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -25,8 +27,18 @@ IGNORE_ATTITUDE = 128
 """type_mask of SET_ATTITUDE_TARGET: rates and thrust, no attitude. Other bits beside it are silently not followed."""
 
 
+MOST_WAITING = 100_000
+"""Messages that may wait for a slow disk, some minutes' worth; those beyond are lost, and counted."""
+
+
+WRITE_EVERY = 0.1
+"""Between two looks for messages to write [s]: woken by each one, the thread would take the core from the flying one."""
+
+
 class TlogWriter:
-    """Writes a .tlog: for each message the time [us, big-endian] and its bytes. A write that fails is counted."""
+    """Writes a .tlog: for each message the time [us, big-endian] and its bytes; by a thread of its own, so that a slow disk delays
+    no tick. A write that fails is counted.
+    """
 
     def __init__(self, path: str | Path) -> None:
         """Open the file.
@@ -39,22 +51,38 @@ class TlogWriter:
         except OSError as error:
             raise LinkError(f"cannot write {path}: {error.strerror}") from error
         self.failed = 0
+        self._waiting: deque[bytes] = deque()
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._write, name="tlog", daemon=True)
+        self._thread.start()
 
     def write(self, message: Any, unix_time: float | None = None) -> None:
-        """Append one message.
+        """Append one message; never raises and never waits.
 
         Args:
             message: as parsed or packed.
             unix_time: [s]; now where it is left out.
         """
         stamp = int((time.time() if unix_time is None else unix_time) * 1e6)
-        try:
-            self._file.write(struct.pack(">Q", stamp) + bytes(message.get_msgbuf()))
-        except (OSError, ValueError):
+        if len(self._waiting) >= MOST_WAITING:
             self.failed += 1
+            return
+        self._waiting.append(struct.pack(">Q", stamp) + bytes(message.get_msgbuf()))
+
+    def _write(self) -> None:
+        over = False
+        while not over:
+            over = self._over.wait(WRITE_EVERY)
+            while self._waiting:
+                try:
+                    self._file.write(self._waiting.popleft())
+                except (OSError, ValueError):
+                    self.failed += 1
 
     def close(self) -> None:
         """Write what is left and close."""
+        self._over.set()
+        self._thread.join()
         try:
             self._file.close()
         except OSError:

@@ -2,6 +2,7 @@
 
 import gzip
 import math
+import threading
 
 import numpy as np
 import pytest
@@ -64,6 +65,29 @@ def test_senders_that_clash_are_refused():
         BodyIds("drone", "ODOMETRY", 1, 0)
     with pytest.raises(ConfigError, match="expected 1 to 255"):
         BodyIds("vehicle", "ODOMETRY", 0, 0)
+
+
+def test_a_slow_disk_holds_up_no_message(tmp_path, monkeypatch):
+    monkeypatch.setattr("hil.link.MOST_WAITING", 30)
+    path, turning, message = tmp_path / "a.tlog", threading.Event(), wired(mocap(0, 0.0))
+    writer = TlogWriter(path)
+    file = writer._file
+
+    class Disk:
+        close = file.close
+
+        def write(self, data: bytes) -> int:
+            turning.wait(60.0)
+            return file.write(data)
+
+    writer._file = Disk()
+    for _ in range(200):  # from here on one of them is with the disk at most
+        writer.write(message, 1.0)
+    assert 200 - 31 <= writer.failed <= 200 - 30
+    assert not path.stat().st_size
+    turning.set()
+    writer.close()
+    assert len(read_tlog(path, BODIES)) == 200 - writer.failed
 
 
 def test_a_tlog_gives_what_the_link_gave_past_damage(tmp_path):
