@@ -63,6 +63,8 @@ class LandingGain:
     released_before: float  # the same from a state fitted up to the separation
     released_after: float
     moved: dict[str, float]  # named effect -> mean distance by which it moves the predicted landings
+    off_before: tuple[tuple[float, float], ...] = ()  # of each throw, prediction less measurement along world x and y
+    off_after: tuple[tuple[float, float], ...] = ()
 
 
 def seen_landing(flight: Recorded, height: float) -> tuple[float, np.ndarray] | None:
@@ -199,8 +201,9 @@ def landing_gain(
         moved[name] = float(np.nanmean(np.linalg.norm((named.predicted - without.predicted)[good, :2], axis=1)))
     after = mean(held.errors[good], seed=seed)
     released = [float(np.nanmean(found.released_errors[good])) for found in (plain, held)]
+    off = [tuple(map(tuple, (x.predicted - x.measured)[good, :2].tolist())) for x in (plain, held)]
     return LandingGain(
-        int(good.sum()), bool(trained), float(plain.errors[good].mean()), after.value, after.low, after.high, *released, moved
+        int(good.sum()), bool(trained), float(plain.errors[good].mean()), after.value, after.low, after.high, *released, moved, *off
     )
 
 

@@ -10,6 +10,7 @@ from visthrow.diagnose.blind import Blind
 from visthrow.diagnose.evidence import covariance
 from visthrow.diagnose.forms import unit_of
 from visthrow.diagnose.gain import Gain
+from visthrow.diagnose.landing import LandingGain
 from visthrow.diagnose.marginal import Noise
 from visthrow.diagnose.model import Window
 from visthrow.diagnose.result import Diagnosis
@@ -21,7 +22,11 @@ WIDTH = 9.2
 BEFORE, AFTER = style.COLOURS[1], style.COLOURS[0]
 SHOWN_WINDOWS = 3
 SHOWN_EFFECTS = 14
-"""Rows and columns of the confusion picture, curves of the completeness picture."""
+"""Rows and columns of the confusion picture."""
+MOST_CURVES = 24
+"""Of the completeness picture; of more effects it shows where their curves rise."""
+SHOWN_HORIZONS = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
+"""Ticks [s]."""
 READABLE = {"m": (1e3, "mm"), "rad": (180.0 / np.pi, "deg"), "m/s": (1e3, "mm/s")}
 """Unit -> factor and unit in pictures, where residuals are small."""
 
@@ -116,8 +121,25 @@ def horizons(gain: Gain) -> bytes:
         axis.plot(h, after, marker="o", color=AFTER, label="with what was named")
         axis.plot(h, floor, ":", color=style.INK, label="noise alone")
         axis.set(title=channel.channel, xlabel="horizon [s]", xscale="log", yscale="log")
+        axis.set_xticks(SHOWN_HORIZONS, [f"{x:g}" for x in SHOWN_HORIZONS])
+        axis.minorticks_off()
     axes[0, 0].set_ylabel("error [sigma of the sensor]")
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncol=3)
+    return png_of(figure)
+
+
+def landings(landing: LandingGain) -> bytes:
+    """Where each throw was predicted to land, seen from where it landed."""
+    figure, axes = _figure(1, 1, 3.6)
+    axis = axes[0, 0]
+    for off, colour, marker, label in ((landing.off_before, BEFORE, "^", "model as it stands"),
+                                       (landing.off_after, AFTER, "o", "with what was named")):  # fmt: skip
+        axis.plot(*(1e3 * np.array(off).T), marker, color=colour, label=label)
+    for before, after in zip(landing.off_before, landing.off_after):
+        axis.plot(*(1e3 * np.array((before, after)).T), color=style.FAINT, lw=1, zorder=0)
+    axis.plot(0.0, 0.0, "+", color=style.INK, ms=12, label="measured")
+    axis.set(xlabel="x [mm]", ylabel="y [mm]", aspect="equal")
+    figure.legend(loc="outside upper center", ncol=3)
     return png_of(figure)
 
 
@@ -149,10 +171,12 @@ def confusion(diagnosis: Diagnosis) -> bytes:
 
 
 def completeness(blind: Blind, floors: Sequence[float]) -> bytes:
-    """Share of worlds in which a hidden effect is named, over its size in floors."""
+    """Share of worlds in which a hidden effect is named, over its size in floors; of many effects where it rises."""
     pairs = [(c, f) for c, f in zip(blind.curves, floors) if c.sizes]
     last = {c.name: c.limit / f if np.isfinite(c.limit) else np.inf for c, f in pairs}
     pairs = sorted(pairs, key=lambda p: last[p[0].name])
+    if len(pairs) > MOST_CURVES:
+        return _rises(pairs)
     half = (len(pairs) + 1) // 2
     figure, axes = _figure(1, 2, 4.4, sharey=True)
     for axis, group in zip(axes[0], (pairs[:half], pairs[half:])):
@@ -163,4 +187,21 @@ def completeness(blind: Blind, floors: Sequence[float]) -> bytes:
         axis.set(xscale="log", xlabel="hidden size [floors]", ylim=(-0.02, 1.02))
         axis.legend(fontsize=6.5, ncol=2)
     axes[0, 0].set_ylabel("named, up to its class")
+    return png_of(figure)
+
+
+def _rises(pairs: Sequence[tuple]) -> bytes:
+    """Sizes from which each effect is named in half and in nine tenths of worlds, in floors; open to the right if never."""
+    figure, axes = _figure(1, 1, 0.8 + 0.17 * len(pairs))
+    axis = axes[0, 0]
+    for y, (curve, floor) in enumerate(pairs[::-1]):
+        sizes, share = np.array(curve.sizes) / floor, np.maximum.accumulate(curve.up_to_class)
+        half, most = (float(np.interp(q, share, sizes)) if share[-1] >= q else sizes[-1] for q in (0.5, 0.9))
+        axis.plot((half, most), (y, y), color=style.QUIET, lw=2.4, solid_capstyle="butt")
+        axis.plot(most, y, "o" if share[-1] >= 0.9 else ">", color=AFTER if share[-1] >= 0.9 else BEFORE, ms=5)
+    axis.set(xscale="log", xlabel="hidden size [floors] named in 50 % and (mark) 90 % of worlds; >: never within what was tried",
+             yticks=range(len(pairs)), ylim=(-1, len(pairs)))  # fmt: skip
+    axis.set_yticklabels([curve.name for curve, _ in pairs[::-1]], fontsize=7)
+    axis.set_xticks((1, 2, 5, 10, 20, 50), ("1", "2", "5", "10", "20", "50"))
+    axis.minorticks_off()
     return png_of(figure)

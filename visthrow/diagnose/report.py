@@ -122,8 +122,8 @@ def sections(
             "confusion", pictures.confusion(diagnosis), "Correlation of the estimates with every effect free."),)))  # fmt: skip
     if blind is not None:
         made.append(_blind(blind, diagnosis))
-    if proposals:
-        made.append(_plan(proposals))
+    following = _plan(proposals) if proposals else _next_flights(diagnosis)
+    made += [following] if following is not None else []
     made.append(_ground(diagnosis, step_check, about))
     return made
 
@@ -141,7 +141,7 @@ def write(folder: str | Path, made: Sequence[Section], diagnosis: Diagnosis, tit
 
 
 def _verdict(diagnosis: Diagnosis, gain: Gain | None) -> Section:
-    parts: list[Text] = [Text(reason, "finding") for reason in diagnosis.reasons]
+    parts: list[Text | Picture] = [Text(reason, "finding") for reason in diagnosis.reasons]
     parts += [Text(f"**{f.verdict}.** {f.sentence}{_moves(f, gain)}{_next(f)}", "finding")
               for f in diagnosis.findings if f.verdict in (result.FOUND, result.CLASS)]  # fmt: skip
     if diagnosis.overall == result.UNKNOWN and diagnosis.laws:
@@ -155,6 +155,8 @@ def _verdict(diagnosis: Diagnosis, gain: Gain | None) -> Section:
               for flight, of in diagnosis.duplicates.items()]  # fmt: skip
     if gain is not None and gain.landing is not None:
         parts.append(Text(f"**Landing.** {landing_sentence(gain.landing)}", "finding"))
+        if gain.landing.moved:
+            parts.append(Picture("landings", pictures.landings(gain.landing), "Predicted landings, seen from the measured ones."))
     return Section("verdict", "Verdict", tuple(parts))
 
 
@@ -235,6 +237,21 @@ def _plan(proposals: Sequence["Proposal"]) -> Section:
     header = ("manoeuvre", "seconds", "nats", "separates", "abort at")
     note = "Expected nats between the members of the class that is hardest to separate, after flying it once more."
     return Section("plan", "What to fly next", (Grid("Manoeuvres", header, rows, note),))
+
+
+def _next_flights(diagnosis: Diagnosis) -> Section | None:
+    """Manoeuvres that the catalogue names for what stays open; None where nothing does."""
+    open_ones = (result.CLASS, result.NOT_IDENTIFIABLE)
+    serves: dict[str, list[str]] = {}
+    for f in diagnosis.findings:
+        for manoeuvre in f.manoeuvres if f.verdict in open_ones else ():
+            serves.setdefault(manoeuvre, []).append(f.name)
+    if not serves:
+        return None
+    ranked = sorted(serves.items(), key=lambda item: -len(item[1]))
+    rows = tuple((manoeuvre, ", ".join(names)) for manoeuvre, names in ranked)
+    note = "`visthrow diagnose plan` simulates them in these flights' model and ranks them by what they would tell."
+    return Section("plan", "What to fly next", (Grid("Manoeuvres", ("manoeuvre", "would show or separate"), rows, note),))
 
 
 def _ground(diagnosis: Diagnosis, step_check: Mapping[str, float] | None, about: Mapping[str, Any] | None) -> Section:
