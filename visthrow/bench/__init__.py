@@ -12,6 +12,7 @@ KINDS = {
     "hil": ("the HIL runner over loopback: latency and soak, throws over the wire, faults", "visthrow.bench.hil"),
     "mpc": ("a step of the baseline's controller, and its tracking error", "visthrow.bench.mpc"),
     "effects": ("operations of a control step that each effect costs: none where it is off", "visthrow.bench.effects"),
+    "explain": ("seconds of a diagnosis and of its report, on logs of one's own", "visthrow.bench.explain"),
     "records": ("print the recorded measurements as Markdown", "visthrow.bench.records"),
 }
 """Name -> (help, module). The module has ``run(args) -> int``; it is imported only when chosen."""
@@ -19,6 +20,8 @@ KINDS = {
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
+    from visthrow.diagnose import opening
+
     parser.epilog = (
         "examples:\n"
         "  visthrow bench sim                             one CPU core against MuJoCo C on the same rope\n"
@@ -30,10 +33,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "  visthrow bench hil --throws 60 --policy state  throws over the wire, and the same without it\n"
         "  visthrow bench mpc                             a step of the baseline's controller; needs piqp\n"
         "  visthrow bench effects                         what each effect costs in the fused step, on and off\n"
+        "  visthrow bench explain monday/*.npz            seconds of a diagnosis and of its report\n"
         "  visthrow bench records                         what was measured before, on which machine and commit\n"
     )
     kinds = parser.add_subparsers(dest="bench", metavar="WHAT", title="what to measure", required=True)
-    sim, camera, detector, train, hil, mpc, effects, records = (
+    sim, camera, detector, train, hil, mpc, effects, explain, records = (
         kinds.add_parser(name, help=text, description=text) for name, (text, _) in KINDS.items()
     )
     _add_sim(sim)
@@ -47,7 +51,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     train.add_argument("--iterations", type=int, default=5, metavar="N", help="iterations measured (default: 5)")
     _add_hil(hil)
-    for kind in (sim, camera, train):
+    opening.add_arguments(explain)
+    explain.add_argument("--no-report", action="store_true", help="measure the verdicts only")
+    for kind in (sim, camera, train, explain):
         kind.add_argument(
             "--repeats", type=int, default=5, metavar="N", help="measurements; the median counts (default: 5)"
         )
@@ -62,9 +68,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         add_common(kind)
     for kind in (mpc, effects):
         add_common(kind, device=False)
-    for kind in (sim, camera, detector, train, hil, mpc, effects):
+    for kind in (sim, camera, detector, train, hil, mpc, effects, explain):
         kind.add_argument("--record", metavar="NAME", help="keep the result in the package's records under this name")
     sim.set_defaults(device="cpu")
+    explain.set_defaults(device="cpu", repeats=2)
     records.add_argument("names", metavar="NAME", nargs="*", help="records to print (default: all)")
 
 
@@ -82,7 +89,7 @@ def _add_hil(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--speed", type=float, default=1.0, metavar="X",
-        help="of both clocks in throws; below 1 on a machine too slow for real time",
+        help="of both clocks in throws and faults; below 1 on a machine too slow for real time",
     )  # fmt: skip
     parser.add_argument("--out", default="out/hil", metavar="FOLDER", help="of the series (default: out/hil)")
     parser.add_argument("--keep-runs", action="store_true", help="keep the run folder of each throw, for hil view")

@@ -53,7 +53,7 @@ def run(args: argparse.Namespace) -> int:
     diagnosis = replace(diagnosis, reasons=(*diagnosis.reasons, *(f"left out: {reason}" for reason in reasons)))
     gain = None
     if not args.no_report and diagnosis.work is not None:
-        gain = _report(args, diagnosis, model, logs)
+        gain = write_report(Path(args.out), diagnosis, model, logs, args.seed, not args.no_blind)
     print("\n" + report.summary(diagnosis, gain))
     if not args.no_report and diagnosis.work is not None:
         print(f"page, JSON, pictures and recording: {args.out}")
@@ -62,20 +62,20 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _report(args: argparse.Namespace, diagnosis, model, logs):
+def write_report(folder: Path, diagnosis, model, logs, seed: int, limits: bool = True):
+    """Write page, JSON, pictures and recording; returns the gain on held-out flights."""
     from visthrow import provenance
     from visthrow.diagnose import blackbox, blind, gain, recording, report, result
     from visthrow.storage import write_json
 
-    measured = gain.measure(diagnosis, seed=args.seed)
-    hidden = None if args.no_blind else blind.hide(diagnosis, seed=args.seed)
+    measured = gain.measure(diagnosis, seed=seed)
+    hidden = blind.hide(diagnosis, seed=seed) if limits else None
     steps = model.step_error() if hasattr(model, "step_error") else None
     origin = provenance.collect()
     about = {"logs": len(logs), "command": origin["command"], "commit": origin["commit"], "time": origin["time"]}
     made = report.sections(diagnosis, measured, hidden, step_check=steps, about=about)
-    folder = Path(args.out)
     report.write(folder, made, diagnosis, "What the simulation gets wrong about these flights")
-    table = blackbox.unexplained(diagnosis.work.after, args.seed) if diagnosis.overall == result.UNKNOWN else None
+    table = blackbox.unexplained(diagnosis.work.after, seed) if diagnosis.overall == result.UNKNOWN else None
     extra = {"step_error_sigma": steps, "provenance": origin, "table": table}
     whole = report.to_json(diagnosis, measured, hidden, extra=extra)
     write_json(folder / "diagnosis.json", whole)
