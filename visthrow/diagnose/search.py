@@ -112,7 +112,7 @@ class Search:
         if not self._sure(tried[best], best):
             self.progress(f"{self.name(best)} would be no larger than what it cannot be told from; it is not named")
             return False
-        verdict = across_flights(self.point, tried[best], self.priors, self.active, best, self.least)
+        verdict, found = self._agreed(tried[best], best)
         if verdict is not None:
             return self._set_aside(best, nats[best], verdict)
         ladder = {self.name(j): float(max(screened[j], under_free[j])) for j in np.argsort(-under_free)[:10]}
@@ -120,9 +120,21 @@ class Search:
         self.steps.append(Step(self.name(best), float(nats[best]), ladder, again))
         self.progress(f"{self.name(best)} named, {nats[best]:.1f} nats above the next simpler model")
         self.active.append(best)
-        self.point = self._settle(tried[best], self.active)
+        self.point = self._settle(found, self.active)
         self.refused.clear()  # what differed from flight to flight may have been this one's share
         return True
+
+    def _agreed(self, point: Point, j: int) -> tuple[Consistency | None, Point]:
+        """Why a candidate is no cause or None, and the candidate, linearised where it lies if the flights differ at first."""
+        verdict, origin = across_flights(self.point, point, self.priors, self.active, j, self.least), self.origin
+        if verdict is None:
+            return None, point
+        near = self._settle(point, [*self.active, j])
+        if near is not point:
+            verdict = across_flights(self.point, near, self.priors, self.active, j, self.least)
+        if verdict is not None:
+            self.origin = origin
+        return verdict, near
 
     def _sure(self, point: Point, j: int) -> bool:
         """Whether the interval that an effect would be reported with leaves out 0."""

@@ -278,8 +278,11 @@ class Answer:
 
 
 def outside(search: "Search") -> bool:
-    """Whether a search that has come to several names follows a law that the catalogue does not hold."""
-    return beats_the_catalogue(search, find_laws(search))[0] is not None
+    """Whether a search that has come to several names follows a law that the catalogue does not hold.
+
+    It does where a term makes at least two names superfluous.
+    """
+    return len(beats_the_catalogue(search, find_laws(search))[1]) > 1
 
 
 def find_laws(search: "Search") -> Answer:
