@@ -28,7 +28,8 @@ def diagnosis(tmp_path):
 
     def write(**changes):
         value = {"theta": THETA, "covariance": COVARIANCE.tolist(), "overall": "KNOWN", "flights": 12,
-                 "gain": {"channels": [{"channel": "pos_w", "before": 2.0, "after": 1.0}], "nats_per_sample": 0.4}}  # fmt: skip
+                 "gain": {"channels": [{"channel": "pos_w", "before": 2.0, "after": 1.0}], "nats_per_sample": 0.4,
+                          "landing": {"throws": 9, "before": 0.11, "after": 0.02}}}  # fmt: skip
         path = tmp_path / "diagnosis.json"
         path.write_text(json.dumps(value | changes))
         return str(path)
@@ -38,7 +39,8 @@ def diagnosis(tmp_path):
 
 def test_apply_writes_what_training_reads(diagnosis, tmp_path, capsys):
     out = tmp_path / "mine.toml"
-    assert cli.main(["diagnose", "apply", diagnosis(), "--out", str(out), "--plants", "8"]) == 0
+    scatter = [{"name": "lag_jitter", "found": True, "size": 0.01, "unit": "s", "of": ["release_lag"]}]
+    assert cli.main(["diagnose", "apply", diagnosis(scatter=scatter), "--out", str(out), "--plants", "8"]) == 0
     capsys.readouterr()
     after, before = config.load(Experiment, out), shipped()
     np.testing.assert_allclose(after.vehicle.thrust.gain, 1.03)
@@ -46,12 +48,17 @@ def test_apply_writes_what_training_reads(diagnosis, tmp_path, capsys):
     assert after.rope.length == pytest.approx(before.rope.length - 0.004)
     assert after.air.wind_w == (0.2, 0.0, 0.0)
     assert after.sensing.frame_tilt == (0.01, 0.0, 0.0)
-    assert after.diagnosed.effects == ("thrust_gain", "mass_quad", "rope_length", "wind_x")  # a tilted frame is no plant's
-    np.testing.assert_allclose(after.diagnosed.covariance, COVARIANCE[:4, :4])
+    assert after.diagnosed.effects == ("thrust_gain", "mass_quad", "rope_length", "wind_x", "release_lag")  # no tilted frame
+    np.testing.assert_allclose(np.array(after.diagnosed.covariance)[:4, :4], COVARIANCE[:4, :4])
+    lags = [plant.release.lag for plant in drawn_plants(after, 0)]  # what varies from throw to throw does so in training
+    assert np.std(lags) == pytest.approx(0.01, rel=0.5)
+    assert len(set(lags)) == 8
     assert after.vehicle.motor == before.vehicle.motor
     assert after.ppo == before.ppo
     text = out.read_text()
     assert 'base = "train/state.toml"' in text
+    assert "Landing error of 9 throws: 0.11 m before, 0.02 m after" in text
+    assert "lag_jitter 0.01 s" in text
     for line in text.splitlines():
         assert " = " not in line or "#" in line or line.startswith("base"), line
 
@@ -82,8 +89,9 @@ def test_a_law_is_written_as_a_block(diagnosis, tmp_path, capsys):
 
 def test_every_effect_can_be_written():
     before = shipped()
+    setting = patch.opened(patch.Setting(plant_of(before), camera=before.camera))
     for name, e in ALL.items():
-        if name != "step_error" and e.applies(patch.opened(patch.Setting(plant_of(before), camera=before.camera))):  # whose step is the replay's
+        if name != "step_error" and e.applies(setting):  # whose step is the replay's
             theta = {name: 1.0 if e.switch else e.effect.floor}
             content = patch.text("train/state.toml", before, theta, [[1e-12]], 1, ["test"])
             after = config.loads(Experiment, content)

@@ -78,6 +78,24 @@ def test_derivatives_are_derivatives(planted):
             assert np.abs(slope - w.effects[:, k]).max() < 0.15 * scale + 1e-9, (e.name, w.phase)
 
 
+def test_landings_are_predicted_from_before_the_throw(planted):
+    """Open loop over a second: right at the truth, and off by what the effects do to the throw without them."""
+    logs, model = planted
+    wrong, right = model.landings({}), model.landings(PLANTED)
+    assert list(right.flights) == [1]
+    ball = logs[1]["payload_pos_w"]
+    last, rate = ball.values[ball.valid][-1], np.diff(ball.values[ball.valid][-6::5], axis=0)[0] / 0.025
+    fall = (last[2] - paper_plant().release.landing_height) / -rate[2]
+    assert np.abs(right.measured[0] - (last + fall * rate)).max() < 4e-3  # a chord over five samples of the path
+    assert right.measured[0, 2] == pytest.approx(paper_plant().release.landing_height)
+    assert right.released_errors[0] < 5e-3
+    assert right.errors[0] < 0.02
+    assert wrong.errors[0] > 0.03
+    assert wrong.released_errors[0] > 0.02
+    np.testing.assert_array_equal(model.landing_errors(PLANTED), right.errors)
+    assert len(model.landings({}, [0]).flights) == 0  # a free flight has none
+
+
 def test_windows_are_whole(planted):
     _, model = planted
     windows = model.windows({})

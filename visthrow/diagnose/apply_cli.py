@@ -86,4 +86,9 @@ def origin(report: dict, path: str) -> list[str]:
     lines += [f"{name}: {made[name]}" for name in ("commit", "time", "command") if made.get(name)]
     for c in (report.get("gain") or {}).get("channels", []):
         lines.append(f"Held-out error of {c['channel']}: {c.get('before', 0.0):.3g} before, {c.get('after', 0.0):.3g} after.")
-    return lines
+    landing = (report.get("gain") or {}).get("landing")
+    if landing:
+        before, after = landing["before"], landing["after"]
+        lines.append(f"Landing error of {landing['throws']} throws: {before:.3g} m before, {after:.3g} m after.")
+    drawn = [s for s in report.get("scatter") or [] if s["found"]]
+    return lines + [f"Varies from flight to flight: {s['name']} {s['size']:.3g} {s['unit']}." for s in drawn]
