@@ -53,6 +53,10 @@ ODOMETRY = (
 """The message that carries a reset counter."""
 
 
+Act = Callable[[Path, int, float], None]
+"""Does something to a run, given its folder, its process and the speed of its clock."""
+
+
 @dataclass(frozen=True)
 class Case:
     """One fault, and how it is made to happen.
@@ -60,7 +64,7 @@ class Case:
     Attributes:
         text: what happens. group: of the table. policy: of `POLICIES`.
         run: settings of the run. fake: arguments of the fake.
-        act: done to the run's process in mid throw, of its folder and id. since: what times count from: `START` on the
+        act: done to the run's process in mid throw. since: what times count from: `START` on the
         vehicle's clock ("fault"), the deed ("act"), or the run's latch or first tick in a state.
         refused: whether the run does not even start.
     """
@@ -70,25 +74,25 @@ class Case:
     policy: str = "never"
     run: tuple[str, ...] = ()
     fake: tuple[str, ...] = ()
-    act: Callable[[Path, int], None] | None = None
+    act: Act | None = None
     since: str = "fault"
     refused: bool = False
 
 
-def _pause(seconds: float) -> Callable[[Path, int], None]:
-    def act(folder: Path, pid: int) -> None:
+def _pause(seconds: float) -> Act:
+    def act(folder: Path, pid: int, speed: float) -> None:
         os.kill(pid, signal.SIGSTOP)
-        time.sleep(seconds)
+        time.sleep(seconds / speed)
         os.kill(pid, signal.SIGCONT)
 
     return act
 
 
-def _signal(number: int) -> Callable[[Path, int], None]:
-    return lambda folder, pid: os.kill(pid, number)
+def _signal(number: int) -> Act:
+    return lambda folder, pid, speed: os.kill(pid, number)
 
 
-def _fill_disk(folder: Path, pid: int) -> None:
+def _fill_disk(folder: Path, pid: int, speed: float) -> None:
     room = max(path.stat().st_size for path in folder.iterdir()) + FULL
     resource.prlimit(pid, resource.RLIMIT_FSIZE, (room, room))
 
@@ -165,9 +169,9 @@ def policies(folder: Path) -> dict[str, Path]:
 class Deed:
     """Does something to the run's process, `START` after its first pose; the times are of the run's clock [s]."""
 
-    def __init__(self, act: Callable[[Path, int], None], folder: Path) -> None:
+    def __init__(self, act: Act, folder: Path, speed: float) -> None:
         """Wait to be called; see `Pair.fly`."""
-        self._act, self._folder, self.at = act, folder, float("nan")
+        self._act, self._folder, self._speed, self.at = act, folder, speed, float("nan")
         self._thread: threading.Thread | None = None
 
     def __call__(self, pid: int) -> None:
@@ -180,19 +184,19 @@ class Deed:
         poses, end = self._folder / "poses.jsonl", time.monotonic() + ENDED
         while not (poses.is_file() and poses.stat().st_size) and time.monotonic() < end:
             time.sleep(0.01)
-        time.sleep(START)
-        self.at = time.monotonic()
-        self._act(self._folder, pid)
+        time.sleep(START / self._speed)
+        self.at = time.monotonic() * self._speed
+        self._act(self._folder, pid, self._speed)
 
 
 def faults(args: argparse.Namespace) -> Report:
     """Inject each fault in turn.
 
     Raises:
-        VisthrowError: an unknown name, or no process at all.
+        VisthrowError: an unknown name, no process at all, or a speed out of range.
     """
-    if args.jobs < 1:
-        raise VisthrowError(f"--jobs {args.jobs}; expected 1 or more")
+    if not (args.jobs >= 1 and 0.05 <= args.speed <= 1.0):
+        raise VisthrowError(f"--jobs {args.jobs}, --speed {args.speed}; expected 1 or more, and 0.05 to 1")
     cases = known_cases()
     for name in args.faults:
         if name not in cases:
@@ -203,7 +207,7 @@ def faults(args: argparse.Namespace) -> Report:
         made = policies(Path(folder))
 
         def inject(name: str, cores: tuple[int | None, int | None]) -> tuple[str, dict[str, Any]]:
-            return name, _one(cases[name], made[cases[name].policy], Path(folder) / name, cores)
+            return name, _one(cases[name], made[cases[name].policy], Path(folder) / name, cores, args.speed)
 
         names = [name for name in cases if name in (args.faults or cases)]
         done = dict(_announced(side_by_side(inject, names, own_cores(args.jobs))))
@@ -220,6 +224,8 @@ def faults(args: argparse.Namespace) -> Report:
         "a breach is a command that is not finite or beyond the limits of training, or a release that was not armed, was outside "
         "of the fence or came twice, as seen by the vehicle",
     )
+    if args.speed < 1.0:
+        notes += (f"both clocks ran at {args.speed:g} of real time, and all times are theirs",)
     header = ("fault", "what happens", "what the runner did", "what the vehicle did", "missed ticks", "commands", "releases",
               "breaches")  # fmt: skip
     tables = tuple(Table(f"{group}, over UDP", header, tuple(lines)) for group, lines in rows.items())
@@ -236,34 +242,38 @@ def _told(steps: list[dict[str, Any]]) -> str:
     return "; ".join(f"{s['what']} after {s['after']:.2f} s" for s in steps) or "-"
 
 
-def _one(case: Case, policy: Path, folder: Path, cores: tuple[int | None, int | None]) -> dict[str, Any]:
-    length = LENGTHS[case.group]
-    run = ["--config", "fake", "--set", f'policy="{policy}"']
+def _one(
+    case: Case, policy: Path, folder: Path, cores: tuple[int | None, int | None], speed: float
+) -> dict[str, Any]:  # fmt: skip
+    length, clock = LENGTHS[case.group], ("--speed", str(speed))
+    run = ["--config", "fake", *clock, "--set", f'policy="{policy}"']
     for setting in (*(f"{key}={value}" for key, value in QUICK.items()), *case.run):
         run += ["--set", setting]
-    fake = (*STILL, "--seconds", str(START + length), *case.fake)
-    deed = None if case.act is None else Deed(case.act, folder)
+    fake = (*STILL, *clock, "--seconds", str(START + length), *case.fake)
+    deed = None if case.act is None else Deed(case.act, folder, speed)
     try:
         summary, report = Pair(tuple(run), fake, *cores).fly(folder, deed, alone=True)
     except VisthrowError as error:
         if not case.refused:
             raise
-        said = str(error).strip().splitlines()[0].removeprefix("the run did not start: ")
-        return {"states": [{"what": f"refused: {said}", "after": 0.0}], "events": [], "missed": 0, "commands": 0,
+        said = str(error).strip().splitlines()[0].removeprefix("the run did not start: visthrow: error: ")
+        return {"began_in": None, "states": [{"what": f"refused: {said}", "after": 0.0}], "events": [], "missed": 0, "commands": 0,
                 "releases": 0, "breaches": []}  # fmt: skip
     ticks = json_lines(folder / "ticks.jsonl")
     offset = _offset(folder)
     begin = _begin(case, summary, ticks, offset, deed)
     last = START + length - 0.1 + offset  # then the fake goes, which is none of these
-    states, before = [], next((tick["state"] for tick in reversed(ticks) if tick["time"] < begin), None)
+    began_in = before = next((tick["state"] for tick in reversed(ticks) if tick["time"] < begin), None)
+    states = []
     for tick in ticks:
         if begin <= tick["time"] < last and tick["state"] != before:
             before = tick["state"]
             states.append({"what": f"{before} ({tick['reason']})", "after": tick["time"] - begin})
     events = [{"what": text, "after": at + offset - LATENCY - begin} for at, text in report["events"]]
     return {
-        "states": states, "events": [event for event in events if event["after"] > -0.02], "missed": summary.get("missed", "?"),
-        "commands": report["commands"], "releases": report["releases"], "breaches": report["breaches"],
+        "began_in": began_in, "states": states, "events": [event for event in events if event["after"] > -0.02],
+        "missed": summary.get("missed", "?"), "commands": report["commands"], "releases": report["releases"],
+        "breaches": report["breaches"],
     }  # fmt: skip
 
 
