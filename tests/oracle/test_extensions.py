@@ -264,9 +264,9 @@ def test_off_costs_nothing():
     plain = env_step(plant)["total"]
     zero = changed(plant, rope={"payload_drag": 0.0, "mount_damping": 0.0}, air={"wind_w": (0.0, 0.0, 0.0)})
     assert env_step(zero)["total"] == plain
+    assert env_step(changed(plant, rope={"payload_lift": 1e-4}))["total"] == plain  # nothing as long as the payload hangs
     for part in ({"rope": {"payload_drag": 1e-3}}, {"air": {"wind_w": (0.1, 0.0, 0.0)}}, {"thrust": {"gain": (1.1,) * 4}},
-                 {"air": {"ground_effect": 1.0}}, {"rope": {"mount_damping": 1e-5}}, {"rope": {"compliance": 1e-3}},
-                 {"rope": {"payload_lift": 1e-4}}):  # fmt: skip
+                 {"air": {"ground_effect": 1.0}}, {"rope": {"mount_damping": 1e-5}}, {"rope": {"compliance": 1e-3}}):  # fmt: skip
         assert env_step(changed(plant, **part))["total"] > plain, part
     assert set(EXTENSIONS) >= {"gain", "wind", "ground_effect", "payload_drag", "mount_damping", "push"}
 
