@@ -3,7 +3,6 @@
 import os
 import resource
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -18,6 +17,7 @@ from hil.mavlink import mav
 from tests.fuzz import EACH, SEEDS, any_message, mutated, noise
 from tests.hil_flight import simple_policy
 from tests.loopback.wire import peers, throw
+from visthrow.bench.hil_processes import free_port
 
 READY = 8.0
 """Processor time of a run that waits for poses, from its call to its end [s]; its start takes 1.5 s on a free core, 3 s are
@@ -66,8 +66,8 @@ def test_a_flood_in_mid_throw_neither_commands_nor_releases():
     strings = [noise(rng) for _ in range(100)] + [mutated(rng, [any_message(rng)])[:-1] for _ in range(300)]
     step = plant.step
 
-    def noisy(command, release):
-        step(command, release)
+    def noisy(command, release, after=0.0):
+        step(command, release, after)
         noisy.port.inbox.extend(strings[i] for i in rng.integers(len(strings), size=3))
 
     plant.step = noisy
@@ -87,12 +87,6 @@ def test_a_flood_in_mid_throw_neither_commands_nor_releases():
         wire.peers = made
     assert (summary["latches"], fake.witness.releases, fake.witness.breaches) == (1, 1, [])
     assert np.all(np.isfinite(plant.commands))
-
-
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 def test_the_start_is_quick_and_ctrl_c_ends_a_waiting_run(tmp_path):
