@@ -48,7 +48,7 @@ ALIKE = (
 """Effects that flights of this kind hardly separate."""
 
 LAWS = {
-    "law_ball_swirl": 0.02, "law_vehicle_swirl": 0.05, "law_speed_thrust": 0.02, "law_slew_thrust": 0.008,
+    "law_ball_swirl": 0.02, "law_vehicle_swirl": 0.05, "law_speed_thrust": 0.02, "law_slew_thrust": 0.008, "law_joint_square": 2e-4,
 }  # fmt: skip
 """Terms that no entry of the catalogue has, with sizes that show: see :class:`tests.worlds.vehicle.Numbers`."""
 
@@ -57,7 +57,7 @@ NOT_WAITED = "timeout"
 
 TERMS = {
     "law_ball_swirl": "F_p = c (z x v_p)", "law_vehicle_swirl": "F = c (e_z x v)", "law_speed_thrust": "F = c T v_xy e_z",
-    "law_slew_thrust": "F = c dT/dt e_z",
+    "law_slew_thrust": "F = c dT/dt e_z", "law_joint_square": "F_p = c |v_s| v_s",
 }  # fmt: skip
 """The same as the tool writes them."""
 
@@ -247,9 +247,9 @@ def drawn(kind: str, number: int) -> Recipe:
         return draw(number, 0, 0.0, dropouts=float(rng.choice([0.0, 0.1])), **rough)
     if kind == "law":
         name = str(rng.choice(list(LAWS)))
-        return replace(
-            draw(number, 0, 0.0, plants=("rod", "string")), effects={name: LAWS[name] * float(rng.choice([-1.0, 1.0]))}
-        )
+        only_brakes = name == "law_joint_square"  # and makes the string's masses unstable
+        size = LAWS[name] * float(np.exp(rng.uniform(-0.3, 0.7))) * (1.0 if only_brakes else float(rng.choice([-1.0, 1.0])))
+        return replace(draw(number, 0, 0.0, plants=("rod",) if only_brakes else ("rod", "string")), effects={name: size})
     if kind in ("curve", "flights"):
         floors = float(np.exp(rng.uniform(np.log(SMALLEST), np.log(LARGEST))))
         if kind == "curve":
