@@ -12,6 +12,7 @@ from hil.clock import Clock, Ticker
 from hil.decision import Decision, Words
 from hil.images import Eyes
 from hil.latency import Stages
+from hil.pose import Pose
 from hil.record import Recorder
 from hil.rehearsal import BEGIN, Rehearsal
 from hil.runner import Runner
@@ -70,14 +71,7 @@ def fly(
     with _collected():
         while runner.machine.state is not State.DONE and clock.now() - begin < most and not source.ended:
             _wait(clock, ticker.due() - ahead - AHEAD_SPREAD * (ticks * GOLDEN % 1.0), backend, source)
-            early = source.poll(clock.now())
-            runner.take(early)
-            if rehearsal is not None:
-                for now in rehearsal.steps(clock, ticker.due()):
-                    came = source.poll(now)
-                    runner.take(came)
-                    early += came
-            _wait(clock, ticker.due(), backend, source)
+            early = _approach(runner, source, clock, ticker.due(), rehearsal)
             due, missed = ticker.due(), ticker.missed
             now, start = ticker.take(), time.perf_counter()
             ours += (ticker.missed - missed) * (ended > due)
@@ -116,6 +110,20 @@ def fly(
         "worst_late_s": ticker.worst, "latency": stages.summary(), "latch_times": throws,
         **({} if rehearsal is None else {"rehearsals": rehearsal.count, "rehearsal_failed": rehearsal.failed}),
     }  # fmt: skip
+
+
+def _approach(runner: Runner, source: Source, clock: Clock, due: float, rehearsal: Rehearsal | None) -> list[Pose]:
+    """Wait until a tick is due [s], and rehearse it; returns the poses that were taken in before it."""
+    poses = source.poll(clock.now())
+    runner.take(poses)
+    own = runner.backend.due()
+    if rehearsal is not None and (own is None or own >= due):  # what the back-end has to do to the millisecond goes first
+        for now in rehearsal.steps(clock, due):
+            came = source.poll(now)
+            runner.take(came)
+            poses += came
+    _wait(clock, due, runner.backend, source)
+    return poses
 
 
 @contextmanager

@@ -138,6 +138,22 @@ def test_no_rehearsal_begins_that_would_not_end_in_time(monkeypatch):
     assert list(rehearsal.steps(clock, 0.08)) == []
 
 
+def test_a_release_of_its_own_time_goes_before_a_rehearsal():
+    """The mechanism is told when what is left of the lag has passed: between two ticks, here 3 ms before one."""
+    overrides = (*QUICK, "ardupilot.mechanism_lag=0.033")
+    times = []
+    for rehearsed in (Rehearsal, Without):
+        runner, source, clock, fake = peers(LevelPlant(), loaded=simple_policy(ACTION), overrides=overrides)
+        told, due = [], runner.backend.release_record.due
+        runner.backend.release_record.due = lambda now, due=due, told=told: due(now) and not told.append(now)
+        rehearsal = rehearsed(runner)
+        rehearsal.once = lambda twin, due, fake=fake: fake.step()  # takes its time
+        fly(runner, source, clock, AutoOperator(), None, 2.5, rehearsal=rehearsal)
+        times.append((runner.latch.count, told))
+    assert times[0] == times[1]
+    assert times[0][0] == 1
+
+
 def test_a_runner_that_cannot_be_copied_flies_all_the_same():
     runner, source, clock, _ = peers(LevelPlant(), loaded=simple_policy(ACTION), overrides=QUICK)
     runner.guard.lock = threading.Lock()
