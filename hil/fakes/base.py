@@ -71,7 +71,7 @@ class Options:
     answer_delay: float = 0.002  # 1 to 3 ms were measured [s]
     servo_delay: float = 0.002  # from a release to the output's movement; 1 to 3 ms were measured [s]
     timesync_delay: float = 0.0  # of an answer to TIMESYNC; 1.3 to 10.5 ms were measured, of which the best counts [s]
-    mechanism: float = 0.0  # from the output's movement to the latch of the plant, whose own lag follows [s]
+    mechanism: float = 0.0  # from a release to the latch of the plant, whose own lag, the output's movement in it, follows [s]
     clock_offset: float = 0.0  # of its clock [s]
     silent_after: float = float("inf")  # it says nothing any more from this time on [s]
     taken_after: float = float("inf")  # when the pilot takes the vehicle over [s]
@@ -184,7 +184,7 @@ class Fake:
         if self.options.answer not in ("accepted",) or self.release_time is not None:
             return
         self.release_time = self.heard + self.options.servo_delay
-        self._trip = self.release_time + self.options.mechanism
+        self._trip = self.heard + self.options.mechanism
 
     @property
     def moved(self) -> bool:

@@ -298,9 +298,8 @@ def test_latch_to_separation_is_the_trained_lag(kind, mechanism):
 
     A latch counts from when the policy's commands of its tick act: the state that it decided on was carried forward to then.
     """
-    plant, servo = LevelPlant(lag=mechanism), 0.002
-    overrides = (*QUICK, f"{kind}.mechanism_lag={mechanism + servo}")
-    runner, source, clock, fake = peers(plant, kind=kind, loaded=AT_ONCE, overrides=overrides, servo_delay=servo)
+    plant, overrides = LevelPlant(lag=mechanism), (*QUICK, f"{kind}.mechanism_lag={mechanism}")
+    runner, source, clock, fake = peers(plant, kind=kind, loaded=AT_ONCE, overrides=overrides)
     summary = fly(runner, source, clock, AutoOperator(), None, 3.5)
     latch = summary["latch_times"][0] + runner.params.delay.command
     assert abs(fake.report()["separation_time"] - latch - 0.11) <= SEPARATION
