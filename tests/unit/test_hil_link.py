@@ -13,6 +13,7 @@ from hil.errors import LinkError
 from hil.link import Link, TlogWriter, attitude_target, pose_from_message, quaternion_from_euler
 from hil.mavlink import Parser, mav
 from tests.fuzz import EACH, SEEDS, any_message, mutated, noise
+from visthrow.bench.hil_processes import free_port
 
 FLOAT32 = 2e-7
 """What a quantity near 1 loses on the wire."""
@@ -135,12 +136,6 @@ def test_the_command_on_the_wire():
     assert (got.target_system, got.target_component, got.type_mask, got.q) == (1, 2, 128, [1.0, 0.0, 0.0, 0.0])
     assert (got.body_roll_rate, got.body_pitch_rate, got.body_yaw_rate, got.thrust) == (1.0, -2.0, 3.0, 0.5)
     assert got.time_boot_ms == 12345
-
-
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 def test_both_ways_over_loopback_and_the_tlog_reads_back(tmp_path):
