@@ -17,6 +17,8 @@ from visthrow.flightlog import Channel, FlightLog
 
 FIRMLY, CLEARLY = 0.8, 0.15
 """Correlation of commanded and measured rates that a hypothesis needs, and by how much it must beat the log as it stands."""
+WORSE = 0.05
+"""What a log whose own axes tell little may lose by the hypothesis."""
 MOVES = 0.3  # rates that say something about their axes [rad/s]
 AXES_NATS = float(np.log(48.0))  # so many ways to exchange and turn around three axes
 THRUST = {"N": 1.0, "g of thrust": 9.80665e-3, "mN": 1e-3, "kg of thrust": 9.80665}
@@ -46,12 +48,16 @@ def put_right(logs: Sequence[FlightLog], plant: PlantParams) -> tuple[list[Fligh
     found: list[Mistake] = []
     mended = list(logs)
     for look in (_axes, _rate_unit):
-        relation = [r for log in mended if (r := _followed(log)) is not None]
-        mistake = look(relation) if relation else None
-        if mistake is not None:
-            name, matrix = mistake
-            found.append(name)
-            mended = [_commanded(log, matrix=matrix) for log in mended]
+        relation = [_followed(log) for log in mended]
+        told = [r for r in relation if r is not None]
+        mistake = look(told) if told else None
+        if mistake is None:
+            continue
+        trial = [_commanded(log, matrix=mistake[1]) for log in mended]
+        again = [_followed(log) for log in trial]
+        if all(r is None or (s is not None and s.correlation > r.correlation - WORSE) for r, s in zip(relation, again)):
+            found.append(mistake[0])
+            mended = trial
     weight = GRAVITY * (plant.vehicle.body.mass + plant.rope.payload_mass + plant.rope.rope_mass)
     mistake = _thrust_unit(mended, weight, THRUST | {"shares of the full thrust": 4.0 * plant.vehicle.controller.max_thrust})
     if mistake is not None:
@@ -80,11 +86,12 @@ def _nats(better: np.ndarray, plain: np.ndarray) -> float:
 
 
 def _axes(relation: Sequence[relations.Relation]) -> tuple[Mistake, np.ndarray] | None:
-    """Exchanged or turned axes of the commanded rates, where all logs say the same."""
-    names = {r.axes for r in relation}
-    own, best = (np.array([getattr(r, n) for r in relation]) for n in ("correlation", "axes_correlation"))
+    """Exchanged or turned axes of the commanded rates, where all logs that can tell say the same, and they are most."""
+    clear = [r for r in relation if r.axes_correlation > r.correlation + CLEARLY]
+    names = {r.axes for r in clear}
+    own, best = (np.array([getattr(r, n) for r in clear]) for n in ("correlation", "axes_correlation"))
     nats = _nats(best, np.maximum(own, 0.0)) - AXES_NATS
-    if len(names) != 1 or names == {"x,y,z"} or np.any(best < own + CLEARLY) or nats < AXES_NATS:
+    if len(names) != 1 or 2 * len(clear) < len(relation) or nats < AXES_NATS:
         return None
     axes = names.pop().split(",")
     matrix = np.zeros((3, 3))
@@ -92,7 +99,7 @@ def _axes(relation: Sequence[relations.Relation]) -> tuple[Mistake, np.ndarray] 
         matrix[row, "xyz".index(axis[-1])] = -1.0 if axis.startswith("-") else 1.0
     turned = sorted(axis[-1] for axis in axes) == [axis[-1] for axis in axes]
     name, cause = ("rate_sign", "A commanded rate has the other sign") if turned else ("rate_axes", "Commanded rates are exchanged")
-    return Mistake(name, cause, f"x, y, z of the vehicle are ({','.join(axes)}) of the command", nats, len(relation)), matrix
+    return Mistake(name, cause, f"x, y, z of the vehicle are ({','.join(axes)}) of the command", nats, len(clear)), matrix
 
 
 def _rate_unit(relation: Sequence[relations.Relation]) -> tuple[Mistake, np.ndarray] | None:
