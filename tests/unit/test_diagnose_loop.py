@@ -86,13 +86,28 @@ def test_a_hall_records_poses_with_its_noise_and_nothing_true():
     assert 2.0 * seen["quat_wb"].values[:, :3].std() == pytest.approx(loop.NOISE["quat_wb"], rel=0.05)
 
 
-def test_finished_loops_are_shown_and_others_refused(tmp_path):
-    record = {
-        "hidden": {"motor_tau": 0.02}, "named": {"motor_tau": 0.019},
-        "throws": {"before": throws(0.10), "after": throws(0.04), "oracle": throws(0.02)},
-        "recovered": {"share": 0.75, "low": 0.7, "high": 0.8},
-    }  # fmt: skip
-    (tmp_path / loop.RECORD).write_text(json.dumps(record))
-    assert "| 75 % [70, 80] |" in loop.table(loop.read([tmp_path]))
-    with pytest.raises(DiagnoseError, match=r"no record\.json"):
+def record_of(errors: dict, **more) -> dict:
+    """A record of a loop."""
+    flown = {name: throws(error) for name, error in errors.items()}
+    told = {"hidden": {"motor_tau": 0.02}, "named": {"motor_tau": 0.019}, "throws": flown}
+    return told | {"recovered": loop.recovered(flown)} | more
+
+
+def test_finished_loops_are_shown_and_others_refused(tmp_path, monkeypatch):
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    (mine / loop.RECORD).write_text(json.dumps(record_of({"before": 0.10, "after": 0.04, "oracle": 0.02}, base="state_no_delay")))
+    text = loop.table(loop.read([mine]))
+    assert "| motor_tau +0.02 (state_no_delay) | motor_tau +0.019 | 100 [" in text
+    assert "| 75 % [" in text
+    harmless = record_of({"before": 0.02, "after": 0.02, "oracle": 0.02})
+    assert "nothing was lost" in loop.table([harmless])
+    assert loop.picture([harmless])[:4] == b"\x89PNG"
+    with pytest.raises(DiagnoseError, match="no such record"):
         loop.read([tmp_path / "elsewhere"])
+    monkeypatch.setattr(loop, "COMMITTED", tmp_path / "committed")
+    with pytest.raises(DiagnoseError, match="no records of loops"):
+        loop.read()
+    (tmp_path / "committed").mkdir()
+    (tmp_path / "committed" / "a.json").write_text(json.dumps(harmless))
+    assert loop.read()[0]["hidden"] == {"motor_tau": 0.02}

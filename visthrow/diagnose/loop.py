@@ -21,10 +21,11 @@ from typing import Any
 
 import numpy as np
 
-from visthrow import config, toml_text
+from visthrow import config, statistics, toml_text
 from visthrow.diagnose.patch import extended
 from visthrow.errors import DiagnoseError
 from visthrow.flightlog import Channel, FlightLog
+from visthrow.results import DIGITS, RECORDS
 from visthrow.storage import atomic_write, write_json
 from visthrow.task import Experiment
 
@@ -42,6 +43,12 @@ BATCH = 20
 
 THROW_SEED = 20_000
 """Of the throws that judge; the flights that are diagnosed have the seeds from 0."""
+
+COMMITTED = RECORDS / "loops"
+"""Records of the loops that are told of."""
+
+WHO = ("before", "after", "oracle")
+"""The policies that are compared."""
 
 POLICY, CHECKPOINT = "policy.npz", "checkpoint.pt"
 """Of a training's folder, as :mod:`visthrow.train` names them; that one is heavy to import."""
@@ -110,15 +117,15 @@ class Loop:
             verdict = timed("diagnosis", self._diagnose, logs)
             theta = named(verdict)
             told(f"named: {', '.join(f'{n} {v:.4g}' for n, v in theta.items()) or 'nothing'}")
-            throws = {"before": None, "after": None, "oracle": None}
+            throws = dict.fromkeys(WHO)
             if theta:
                 self._config("extended", extended(nominal, theta))
                 timed("training", self._train, "extended")
                 throws["after"] = timed("throws after", self._throws, "after", str(self.folder / "extended" / POLICY))
             throws |= {"before": blind.result(), "oracle": knowing.result()}
             throws["after"] = throws["after"] or throws["before"]
-        record = {"hidden": dict(self.hidden), "named": theta, "overall": verdict["overall"], "target": self.target}
-        record |= {"flights": self.flights, "throws": throws, "seconds": seconds}
+        record = {"base": self.base, "hidden": dict(self.hidden), "named": theta, "overall": verdict["overall"]}
+        record |= {"target": self.target, "flights": self.flights, "throws": throws, "seconds": seconds}
         record["recovered"] = recovered(throws)
         write_json(self.folder / RECORD, record)
         return record
@@ -185,22 +192,28 @@ class Loop:
             ) as throwing:
                 result = throwing.results(show=False)[0][0]
             kept = {"error": result.error, "success": result.success, "duration": result.duration}
-            write_json(path, {k: np.asarray(v).tolist() for k, v in kept.items()})
+            write_json(path, {k: np.round(np.asarray(v), DIGITS).tolist() for k, v in kept.items()})
         found = json.loads(path.read_text())
         say(f"thrown: {name}, {np.mean(landed(found)):.3f} m")
         return found
 
 
-def read(folders: Sequence[Path]) -> list[dict[str, Any]]:
+def read(places: Sequence[Path] = ()) -> list[dict[str, Any]]:
     """Records of finished loops.
 
+    Args:
+        places: folders of loops, or records; without any, the committed records.
+
     Raises:
-        DiagnoseError: a folder without one.
+        DiagnoseError: a folder without a record, or no committed ones.
     """
-    for folder in folders:
-        if not (folder / RECORD).exists():
-            raise DiagnoseError(f"{folder}: no {RECORD}; expected the folder of a loop that went round, runs/loop/motor_tau_0.02")
-    return [json.loads((folder / RECORD).read_text()) for folder in folders]
+    files = [place if place.suffix == ".json" else place / RECORD for place in places] or sorted(COMMITTED.glob("*.json"))
+    if not files:
+        raise DiagnoseError(f"{COMMITTED}: no records of loops; name folders of loops that went round, runs/loop/motor_tau_0.02")
+    for file in files:
+        if not file.exists():
+            raise DiagnoseError(f"{file}: no such record; expected the folder of a loop that went round, runs/loop/motor_tau_0.02")
+    return [json.loads(file.read_text()) for file in files]
 
 
 def landed(throws: Mapping[str, Any]) -> np.ndarray:
@@ -214,12 +227,13 @@ def recovered(throws: Mapping[str, Any], draws: int = 4000, seed: int = 0) -> di
     ``(before - after) / (before - oracle)`` of the mean errors; bootstrap over throws, each policy by itself.
     """
     rng = np.random.default_rng(seed)
-    errors = {name: landed(throws[name]) for name in ("before", "after", "oracle")}
+    errors = {name: landed(throws[name]) for name in WHO}
     if any(len(e) < 2 for e in errors.values()):
         return {"share": float("nan"), "low": float("nan"), "high": float("nan")}
 
     def share(mean: Mapping[str, Any]) -> Any:
-        return (mean["before"] - mean["after"]) / (mean["before"] - mean["oracle"])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.divide(mean["before"] - mean["after"], mean["before"] - mean["oracle"])
 
     again = {n: e[rng.integers(0, len(e), (draws, len(e)))].mean(1) for n, e in errors.items()}
     low, high = np.quantile(share(again), [0.025, 0.975])
@@ -268,14 +282,39 @@ def _between(channel: Channel, start: float, end: float) -> Channel:
     return dataclasses.replace(channel, time=channel.time[keep], values=channel.values[keep], valid=channel.valid[keep])
 
 
+def hidden_text(record: Mapping[str, Any]) -> str:
+    """What was hidden from which model, in words for tables."""
+    base = record.get("base", "state")
+    return ", ".join(f"{n} {v:+.4g}" for n, v in record["hidden"].items()) + ("" if base == "state" else f" ({base})")
+
+
 def table(records: Sequence[Mapping[str, Any]]) -> str:
-    """Markdown table of loops."""
-    lines = ["| hidden | named | before | after | oracle | won back |", "|---|---|---:|---:|---:|---:|"]
+    """Markdown table of loops: mean landing errors in millimetres with 95 % intervals."""
+    lines = ["| hidden | named | before [mm] | after [mm] | oracle [mm] | won back |", "|---|---|---|---|---|---|"]
     for r in records:
-        means = [f"{np.mean(landed(r['throws'][n])):.3f} m" for n in ("before", "after", "oracle")]
-        share = r["recovered"]
-        hidden = ", ".join(f"{n} {v:+.4g}" for n, v in r["hidden"].items())
         found = ", ".join(f"{n} {v:+.4g}" for n, v in r["named"].items()) or "nothing"
+        errors = {name: landed(throws) for name, throws in r["throws"].items()}
+        told = []
+        for name in WHO:
+            count = f" ({len(errors[name])} of {len(r['throws'][name]['error'])} landed)"
+            whole = len(errors[name]) == len(r["throws"][name]["error"])
+            told.append((statistics.mean(1e3 * errors[name]).text(0) if len(errors[name]) else "-") + ("" if whole else count))
+        share = r["recovered"]
         won = f"{100 * share['share']:.0f} % [{100 * share['low']:.0f}, {100 * share['high']:.0f}]"
-        lines.append(f"| {hidden} | {found} | {' | '.join(means)} | {won} |")
+        if all(len(e) for e in errors.values()) and statistics.difference(errors["before"], errors["oracle"]).low <= 0.0:
+            won = "nothing was lost"
+        lines.append(f"| {hidden_text(r)} | {found} | {' | '.join(told)} | {won} |")
     return "\n".join(lines)
+
+
+def picture(records: Sequence[Mapping[str, Any]]) -> bytes:
+    """Mean landing errors with intervals, a group a loop, as PNG."""
+    from visthrow.report.figures import Mark, marks
+
+    rows = [
+        Mark(hidden_text(r), statistics.mean(1e3 * landed(r["throws"][name])), WHO.index(name))
+        for r in records
+        for name in WHO
+        if len(landed(r["throws"][name]))
+    ]
+    return marks(rows, "landing error on the plant [mm]", WHO, log=True)

@@ -14,12 +14,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "  visthrow diagnose loop --hide motor_tau=0.02         a slower motor; minutes on a GPU, hours on a CPU\n"
         "  visthrow diagnose loop --base state_no_motor_lag --policy runs/state_no_motor_lag-1/policy.npz --hide motor_lag=1\n"
         "                                                       a model that lacks a block, and the policy trained in it\n"
-        "  visthrow diagnose loop --show runs/loop/*            the table of loops that went round\n"
+        "  visthrow diagnose loop --show                        the loops that are told of, from their committed records\n"
+        "  visthrow diagnose loop --show runs/loop/* --picture loops.png     loops of one's own\n"
     )
     parser.add_argument("--hide", action="append", default=[], metavar="EFFECT=SIZE", help="of the catalogue; may be repeated")
     parser.add_argument("--base", default=DEFAULT_BASE, metavar="NAME", help="of configs/train: what is diagnosed (default: state)")
     parser.add_argument("--policy", default=DEFAULT_BASE, metavar="NAME", help="trained in it: shipped, or a file (default: state)")
-    parser.add_argument("--show", type=Path, nargs="+", metavar="FOLDER", help="run nothing, show finished loops")
+    parser.add_argument("--show", type=Path, nargs="*", metavar="FOLDER", help="run nothing, show loops (default: those committed)")
+    parser.add_argument("--picture", type=Path, metavar="FILE", help="with --show: draw them, a PNG")
     parser.add_argument("--flights", type=int, default=12, help="that are diagnosed (default: 12)")
     parser.add_argument("--throws", type=int, default=200, help="of each policy in the end (default: 200)")
     parser.add_argument("--processes", type=int, help="for flights and throws (default: one a core)")
@@ -33,9 +35,13 @@ def run(args: argparse.Namespace) -> int:
     """Go round for the effects, all hidden at once, or show what was run."""
     from visthrow.diagnose import loop
     from visthrow.errors import ConfigError
+    from visthrow.storage import atomic_write
 
-    if args.show:
-        print(loop.table(loop.read(args.show)))
+    if args.show is not None:
+        records = loop.read(args.show)
+        print(loop.table(records))
+        if args.picture:
+            atomic_write(args.picture, loop.picture(records))
         return 0
     hidden = {}
     for item in args.hide:
