@@ -76,18 +76,19 @@ def across_flights(
     return verdicts[0]
 
 
-def differ(information: np.ndarray, score: np.ndarray) -> bool:
+def differ(information: np.ndarray, score: np.ndarray, share: float = SHARE) -> bool:
     """Whether flights tell so different things of one effect that it is no property of the vehicle.
 
     Args:
         information: of each flight, shape (F,).
         score: of each flight about 0, shape (F,).
+        share: of the effect, by which they may differ for its form alone.
     """
     if by_chance(information, score):
         return True
     estimates = np.divide(score, information, out=np.zeros_like(information), where=information > 0.0)
     size = score.sum() / information.sum()
-    variance = 1.0 / np.maximum(information, 1e-12) + (SHARE * size) ** 2 + 1.0
+    variance = 1.0 / np.maximum(information, 1e-12) + (share * size) ** 2 + 1.0
     spread = float((((estimates - size) ** 2) / variance).sum())
     return spread > chi2.isf(HETEROGENEOUS, len(information) - 1)
 

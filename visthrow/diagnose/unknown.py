@@ -42,6 +42,9 @@ landing by 5 mm within half a second."""
 ROUGHER, ROUGHEST = 2.0, 10.0
 """While terms are screened, no phase is rougher than so many times the calmest, unless that is calmer still than a tenth of it."""
 
+FORM = 1.0
+"""Share of a term by which flights may differ: at knots a tenth of a second apart a law of the thrust's slope is a rough one."""
+
 REMAINDER = 0.05
 """Share of a term's evidence below which a name beside it is what the term's form, weighed without a simulation, leaves over."""
 
@@ -243,7 +246,7 @@ def _differs(hypothesis: Hypothesis) -> bool:
     """Whether the flights tell different things of the last term."""
     statistics = hypothesis.point.statistics
     own = statistics.information[:, -1, -1]
-    return len(own) >= LEAST_FLIGHTS and differ(own, statistics.score[:, -1] + own * statistics.theta[-1])
+    return len(own) >= LEAST_FLIGHTS and differ(own, statistics.score[:, -1] + own * statistics.theta[-1], FORM)
 
 
 def _matters(hypothesis: Hypothesis) -> bool:
