@@ -242,7 +242,7 @@ def draw(kind: str, seed: int, floors: float = 15.0) -> Recipe:
         return Recipe(seed, str(rng.choice(PLANTS)), **SIZE)
     if kind in PAIRS:
         pair = PAIRS[kind]
-        return Recipe(seed, str(rng.choice(PLANTS)), {pair.effect: pair.size * float(rng.choice(pair.signs))}, **SIZE)
+        return Recipe(seed, str(rng.choice(("rod", "string"))), {pair.effect: pair.size * float(rng.choice(pair.signs))}, **SIZE)
     name = str(rng.choice(list(FLOORS)))
     sign = 1.0 if name in ONE_SIDED else float(rng.choice([-1.0, 1.0]))
     return Recipe(seed, str(rng.choice(PLANTS)), {name: sign * floors * FLOORS[name]}, floors, **SIZE)

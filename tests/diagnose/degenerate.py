@@ -45,7 +45,9 @@ class Pair:
         said = first = explained(folder, logs, recipe, action="plan", more=about)
         done, measured = [], []
         for number in range(1, ROUNDS + 1):
-            if self.named(said) or not (proposal := next((p for p in said["proposals"] if p["separates"]), None)):
+            if number > 1:
+                said = explained(folder, logs, recipe, action="plan", more=(*about, *measured))
+            if not (proposal := next((p for p in said["proposals"] if p["separates"]), None)):
                 break
             done.append((proposal["name"], proposal["repeats"]))
             effect = next((m for m in MEASUREMENTS if m.name == proposal["name"]), None)
@@ -56,7 +58,9 @@ class Pair:
                 measured += ["--measured", f"{effect.effect}={effect.sd}"]
             else:
                 logs += self.flown(recipe, said, proposal, known[proposal["name"]].payload, number)
-            said = explained(folder, logs, recipe, action="plan", more=(*about, *measured))
+            said = explained(folder, logs, recipe, more=measured)
+            if self.named(said):
+                break
         return self.line(first, said, done, self.named(said))
 
     def flown(self, recipe: Recipe, said: dict, proposal: dict, payload: bool, number: int) -> list[FlightLog]:

@@ -1,0 +1,117 @@
+"""The tool spoiled on purpose: for each mutation a test of the default run must fail. A suite that survives is no test."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.diagnose import sealed, test_cases
+from tests.unit import test_diagnose_report as reports
+from tests.unit import test_diagnose_search as searches
+from tests.worlds.world import Recipe
+from visthrow.diagnose import evidence, gain, marginal, point, search
+from visthrow.diagnose.evidence import Priors
+from visthrow.flightlog import FlightLog
+
+pytestmark = pytest.mark.slow
+
+
+def swapped_names(monkeypatch) -> None:
+    """Two effects are called by each other's names."""
+    names = {"effect_03": "effect_09", "effect_09": "effect_03"}
+    plain = search.Search.name
+    monkeypatch.setattr(search.Search, "name", lambda self, j: names.get(plain(self, j), plain(self, j)))
+
+
+def no_latent_forces(monkeypatch) -> None:
+    """Gusts are not in the model of the residuals: G is dropped."""
+    whole = marginal.gram_of
+
+    def gram(window, floors, channels):
+        none = np.zeros(0)
+        bare = replace(window, latent=np.zeros((len(window.residual), 0)), latent_block=none.astype(int),
+                       latent_axis=none.astype(int), latent_time=none)  # fmt: skip
+        return whole(bare, floors, channels)
+
+    monkeypatch.setattr(point, "gram_of", gram)
+
+
+def no_floors(monkeypatch) -> None:
+    """What is not named is not there at all: neither in the evidence nor in the null worlds."""
+    monkeypatch.setattr(evidence, "SPIKE", 1e-3)
+
+    def without(information, count, rng):
+        values, vectors = np.linalg.eigh(information)
+        return rng.standard_normal((count, len(information))) @ (vectors * np.sqrt(np.maximum(values, 0.0))).T
+
+    monkeypatch.setattr(evidence, "null_draws", without)
+
+
+def no_bounds(monkeypatch) -> None:
+    """Every size is possible."""
+    plain = Priors.of
+
+    def of(effects, channels):
+        wide = np.full(len(effects), np.inf)
+        return replace(plain(effects, channels), low=-wide, high=wide)
+
+    monkeypatch.setattr(Priors, "of", staticmethod(of))
+
+
+def bootstrap_of_one_flight(monkeypatch) -> None:
+    """Every resample holds one flight alone, many times: intervals of the gain are those of the scatter within it."""
+    plain = gain.studentised
+
+    def one(before, after, rng, draws):
+        return plain(np.repeat(before[:1], len(before)), np.repeat(after[:1], len(after)), rng, draws)
+
+    monkeypatch.setattr(gain, "studentised", one)
+
+
+def truth_in_the_log(monkeypatch) -> None:
+    """The recording gives away what is hidden: the seed from which the world was drawn."""
+    plain = sealed.flight_log
+    monkeypatch.setattr(test_cases.cases, "flight_log", lambda record: FlightLog(plain(record).channels, {"seed": 11}))
+
+
+def logs_are_clean() -> None:
+    """The test of the default run, on its own flights."""
+    logs = test_cases.cases.logs_of(Recipe(11, "rod", {"com_y": 1e-3}, **test_cases.SMALL))
+    test_cases.test_logs_hold_what_was_measured_and_nothing_of_the_truth(logs)
+
+
+def one_effect_is_named() -> None:
+    """Of the default run."""
+    searches.test_one_effect_is_named_with_its_size_and_interval(1.0)
+
+
+MUTATIONS = {
+    "swapped names": (swapped_names, one_effect_is_named),
+    "no latent forces": (no_latent_forces, searches.test_gusts_are_no_causes),
+    "no floors": (no_floors, searches.test_causes_at_their_floors_are_not_named),
+    "no bounds": (no_bounds, searches.test_an_estimate_stays_within_its_physical_bounds),
+    "bootstrap of one flight": (bootstrap_of_one_flight, reports.test_studentised_intervals_hold_what_they_promise),
+    "truth in the log": (truth_in_the_log, logs_are_clean),
+}
+"""What is spoiled, and the test that must fail for it."""
+
+
+@pytest.mark.parametrize("name", list(MUTATIONS))
+def test_a_mutation_is_noticed(name, monkeypatch):
+    mutate, guard = MUTATIONS[name]
+    guard()
+    mutate(monkeypatch)
+    with pytest.raises((AssertionError, KeyError)):
+        guard()
+
+
+def test_the_tool_cannot_ask_the_tests(tmp_path):
+    """The seed's leak: a tool that imports the tests, where truths are drawn, fails."""
+    import subprocess
+    import sys
+
+    spoiled = sealed.WITHOUT_TESTS.replace("from visthrow.cli import main", "import tests.worlds.world\nmain = lambda _: 0")
+    done = subprocess.run([sys.executable, "-c", spoiled], cwd=tmp_path, capture_output=True, text=True, check=False,
+                          env=test_cases.cases.environment())  # fmt: skip
+    assert done.returncode != 0
+    assert "the tool asked for the tests" in done.stderr
