@@ -187,9 +187,10 @@ def test_a_throw_with_each_kind(tmp_path, kind, policy):
     autopilot = summary["autopilot"]
     assert (autopilot["backend"], autopilot["parameters"]["problems"]) == (kind, [])
     assert autopilot["release"]["state"] == "accepted"
-    assert autopilot["clocks"]["foreign_stamps"] == 0 or kind == "betaflight"
     assert replay(tmp_path / "run")["differences"] == []
     if report["late_periods"] > MOST_LATE or summary["missed"] > FEW_MISSED:
         late = f"{report['late_periods']} late periods, {summary['missed']} missed ticks"
         pytest.skip(f"{late}: the machine is too busy for where the payload lands to say anything")
+    # A fake that is late has a clock that stands still and then hurries.
+    assert autopilot["clocks"]["foreign_stamps"] == 0 or kind == "betaflight"
     assert np.hypot(report["landing_w"][0] - 2.0, report["landing_w"][1]) < ONE_THROW
