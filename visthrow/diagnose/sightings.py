@@ -69,9 +69,11 @@ def needs_no_flight(e: Entry) -> bool:
 
 
 def seen_by_camera(log: FlightLog) -> bool:
-    """Whether a log holds keypoints that a camera saw: those projected from poses say nothing about it."""
-    made = log.meta.get("config", {}).get("keypoints", "") if isinstance(log.meta.get("config", {}), dict) else ""
-    return made != "projection" and measured(log, KEYPOINTS) is not None and "keypoints_valid" in log
+    """Whether a log holds keypoints that a camera saw: those that a policy's pilot projected from poses say nothing about it."""
+    config = log.meta.get("config")
+    made = config.get("keypoints", "") if isinstance(config, dict) else ""
+    seen = made == "detector" or (made == "" and "policy" not in log.meta)
+    return seen and measured(log, KEYPOINTS) is not None and "keypoints_valid" in log
 
 
 def with_sightings(
