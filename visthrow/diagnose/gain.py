@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.special import stdtrit
 
 from visthrow.diagnose import noise as levels
 from visthrow.diagnose.blackbox import table_of, train
@@ -24,6 +25,7 @@ MOST_FOLDS = 12
 FEWEST_FLIGHTS = 3
 """With fewer, parts of flights are left out instead, and the report says so."""
 PARTS = 3
+FEW_GROUPS = 8
 MOST_NAMES = 6
 HARM = 0.01
 
@@ -215,6 +217,8 @@ def _channel(name, c, after: Point, own: Forms, before, error, box, rng, draws: 
 def studentised(before: np.ndarray, after: np.ndarray, rng: np.random.Generator, draws: int) -> tuple[float, float, float]:
     """Gain 1 - sqrt(sum after / sum before) with a 95 % interval by the studentised bootstrap over groups.
 
+    Of few groups many resamples hold little else than one of them, and say nothing of the spread: there it is Student's interval.
+
     Args:
         before: sums of squares by group, shape (F,).
         after: the same afterwards.
@@ -229,16 +233,19 @@ def studentised(before: np.ndarray, after: np.ndarray, rng: np.random.Generator,
     value = np.log(after.sum() / before.sum())
     if n < 2:
         return float(1.0 - np.exp(0.5 * value)), float("nan"), float("nan")
-    weights = rng.multinomial(n, np.full(n, 1.0 / n), size=draws)
 
     def spread(w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         a, b = w @ after, w @ before
         influence = after / a[:, None] - before / b[:, None]
         return np.log(a / b), np.sqrt(n / (n - 1.0) * (w * influence**2).sum(1))
 
+    _, own = spread(np.ones((1, n)))
+    if n < FEW_GROUPS:
+        reach = 0.5 * stdtrit(n - 1, 0.975) * own[0]
+        return tuple(float(1.0 - np.exp(0.5 * value + side)) for side in (0.0, reach, -reach))
+    weights = rng.multinomial(n, np.full(n, 1.0 / n), size=draws)
     usable = weights @ before > 0.0
     ratio, error = spread(weights[usable])
-    _, own = spread(np.ones((1, n)))
     t = (ratio - value) / np.maximum(error, 1e-3 * own[0] + 1e-300)
     upper, lower = np.quantile(t, (0.025, 0.975))
     low, high = 1.0 - np.exp(0.5 * (value - upper * own[0])), 1.0 - np.exp(0.5 * (value - lower * own[0]))
