@@ -1,8 +1,8 @@
 """Where a payload would land if the latch tripped now, by its own poses: a release that leads astray is held back.
 
 What comes between now and the landing is not known better than this: until it separates the payload keeps the velocity that it has,
-then it flies freely. It is off by a fifth of a metre with a right throw, so that it tells a throw from none, and from a wild one,
-but not a good one from a better one.
+then it flies freely. For right throws of the shipped policies at 2 m that is off by 0.05 to 0.20 m: it tells a throw from none, and
+from a wild one, but not a good one from a better one.
 """
 
 import math
