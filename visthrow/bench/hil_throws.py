@@ -122,7 +122,7 @@ def _over_the_wire(
         "way": "wire", "seed": seed, "error": None, "duration": None, "landing_w": landed, "seen": seen.get("error"),
         "reason": summary["reason"], "missed": summary["missed"], "missed_ours": summary["missed_ours"],
         "late_periods": report["late_periods"], "breaches": report["breaches"], "releases": report["releases"],
-        "latency_ms": summary["latency"], "speed": args.speed, "separation_lag": _apart(report),
+        "held_back": summary["held_back"], "latency_ms": summary["latency"], "speed": args.speed, "separation_lag": _apart(report),
     }  # fmt: skip
     if landed is not None:
         goal_w = seen.get("goal_w", (2.0, 0.0, 0.0))
@@ -161,6 +161,7 @@ def _report(pairs: list[tuple[dict, dict]], args: argparse.Namespace) -> Report:
         "ratio": ratio, "ratio_upper_90": upper, "errors": errors.tolist(), "seeds": [wire["seed"] for wire, _ in good],
         "breaches": [b for wire in wires for b in wire["breaches"]], "missed": sum(w["missed"] for w in wires),
         "missed_ours": sum(w["missed_ours"] for w in wires), "late_periods": late,
+        "held_back": sum(w.get("held_back", 0) for w in wires),  # series from before lack it
     }  # fmt: skip
     met = errors[:, 0].mean() <= MEAN and upper < RATIO and len(good) == len(pairs)
     notes = (
@@ -172,7 +173,7 @@ def _report(pairs: list[tuple[dict, dict]], args: argparse.Namespace) -> Report:
         "machine and real time (visthrow hil direct)",
         "in real time" if args.speed == 1.0 else f"both clocks at {args.speed:g} of real time: the machine was too slow for more",
         f"{figures['missed']} ticks missed, {figures['missed_ours']} of them ours; {late} periods of the fake were late; "
-        f"{len(figures['breaches'])} breaches noted by the vehicle",
+        f"{len(figures['breaches'])} breaches noted by the vehicle; {figures['held_back']} questions for a release held back",
     )
     table = Table(
         "Landing error at 2.0 m, mean with its 95 % interval",
