@@ -59,12 +59,16 @@ def centre_share(rope: Any, i: int, last: int):
 
 @wp.func
 def giving_moment(rope: Any, i: int, last: int, moment: Any, u: Any, d: Any, o: Any, cm: Any):
+    if rope.compliance == type(rope.compliance)(0.0):  # lanes of a replay differ in it
+        return moment
     e = growing(rope, u)
     return moment - rope.segment_length * sym_mul(d, o, e) - (cm * centre_share(rope, i, last)) * e
 
 
 @wp.func
 def giving_force(rope: Any, i: int, last: int, force: Any, u: Any, d: Any, o: Any, m: Any):
+    if rope.compliance == type(rope.compliance)(0.0):
+        return force
     e = growing(rope, u)
     return force + sym_mul(d, o, e) + (m * centre_share(rope, i, last)) * e
 
@@ -106,6 +110,8 @@ def build_stretch(t: Types, chain: SimpleNamespace, extensions: frozenset[str]):
 
     @wp.func
     def stretched(natural: Rope, now: Rope, stiffness: wp.array(dtype=real), h: real):
+        if natural.compliance == real(0.0):
+            return now
         out = natural
         one = real(1.0)
         pull = wp.max(chain.pull(now, stiffness), real(0.0))
