@@ -161,7 +161,7 @@ class Loop:
         todo = [(i, path) for i, path in enumerate(paths) if not path.exists()]
         text = toml_text.dumps(config.to_dict(truth, defaults=False))
         with concurrent.futures.ProcessPoolExecutor(self.processes, mp.get_context("spawn")) as pool:
-            done = [pool.submit(_fly_one, self.policy, text, i, path) for i, path in todo]
+            done = [pool.submit(_fly_one, self.policy, self.base, text, i, path) for i, path in todo]
             for i, future in enumerate(concurrent.futures.as_completed(done)):
                 future.result()
                 say(f"flown: {i + 1} of {len(todo)}")
@@ -245,12 +245,12 @@ def named(verdict: Mapping[str, Any]) -> dict[str, float]:
     return {name: float(value) for name, value in verdict.get("theta", {}).items()}
 
 
-def _fly_one(policy: str, text: str, number: int, path: Path) -> None:
-    """Fly one throw and keep what was measured of it."""
+def _fly_one(policy: str, base: str, text: str, number: int, path: Path) -> None:
+    """Fly one throw of a policy that was trained in ``base`` and keep what was measured of it."""
     from visthrow.flight import fly
     from visthrow.loading import Loaded, load_policy
 
-    shipped = load_policy(policy)
+    shipped = load_policy(policy, base)
     truth = config.loads(Experiment, text, (), name="the hidden world")
     rng = np.random.default_rng(number)
     angle, distance = rng.uniform(-np.pi, np.pi), rng.uniform(1.0, 1.9)
