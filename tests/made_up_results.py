@@ -9,7 +9,6 @@ from visthrow.report.ablations import FURTHER, PAPER_FOUR
 from visthrow.report.book import HARDENED, SHIPPED, Book
 from visthrow.report.gap import SWEEPS, TRAINED
 from visthrow.results import Result
-from visthrow.sweep.units import variant_of
 
 MADE = {"commit": "0" * 40, "command": "made up", "time": "2020-01-01T00:00:00+00:00", "seconds": 1.0}
 PLANTS = ("hybrid", "reference", "reference-realistic")
@@ -78,8 +77,7 @@ def _gap(rng):
         for name in sweep.policies:
             for k in range(5):
                 value = [0.005 * k, 0.005 * k] if sweep.key == "task.observation.latency" else round(0.02 * (k + 1), 4)
-                how = {"departures": {sweep.key: value}, "variant": variant_of(name)}
-                yield policy(rng, name, name.partition("_")[0], "hybrid", 2.0, 0.02 * (1 + 0.3 * k), **how)
+                yield policy(rng, name, name.partition("_")[0], "hybrid", 2.0, 0.02 * (1 + 0.3 * k), departures={sweep.key: value})
     for plant in PLANTS[::2]:
         for variant in TRAINED:
             if variant != "full":
@@ -114,8 +112,8 @@ def runs() -> tuple[dict, ...]:
 def everything(seed: int = 0) -> Book:
     """A book with a result for every question of the report."""
     rng = np.random.default_rng(seed)
-    shipped = [policy(rng, name, name.partition("_")[0], plant, target, 0.02 if name == "state" else 0.024,
-                      variant=variant_of(name)) for name in (*SHIPPED, HARDENED) for plant in PLANTS
-               for target in wanted.TARGETS]  # fmt: skip
+    names = (*SHIPPED, HARDENED)
+    shipped = [policy(rng, name, name.partition("_")[0], plant, target, 0.02 if name == "state" else 0.024) for name in names
+               for plant in PLANTS for target in wanted.TARGETS]  # fmt: skip
     made = [*shipped, *_ablations(rng), *_baselines(rng), *_gap(rng), *_beyond(rng)]
     return Book(tuple({r.key: r for r in made}.values()), runs(), {"ablations": "Because **this** was so.\n\nAnd `that`."})

@@ -10,7 +10,6 @@ import numpy as np
 
 from visthrow.errors import StorageError
 from visthrow.results import PROTOCOL, RECORDS, Result, join, load_all
-from visthrow.sweep.units import variant_of
 
 SHIPPED = ("state", "vision")
 """The paper's two policies, as they come with the package."""
@@ -65,7 +64,7 @@ class Book:
 
     def shipped(self, name: str, plant: str, target: float, departures: Any = None) -> Result | None:
         """Throws of a shipped policy under its own conditions, or with departures."""
-        found = self.policies(plant, target, policy=name, variant=variant_of(name), departures=departures or {})
+        found = self.policies(plant, target, policy=name, departures=departures or {})
         return found[0] if found else None
 
     def seeds(self, layout: str, variant: str, plant: str, target: float, departures: Any = ANY) -> list[Result]:
@@ -84,7 +83,7 @@ class Book:
 
     def by_departure(self, policy: str, key: str, plant: str = "hybrid", target: float = 2.0) -> list[tuple[Any, Result]]:
         """A shipped policy's throws with one value of the config changed: the value and the throws, ascending."""
-        found = [r for r in self.matching(kind="policy", policy=policy, plant=plant, target=target, variant=variant_of(policy))
+        found = [r for r in self.matching(kind="policy", policy=policy, plant=plant, target=target, variant="full")
                  if list(r.unit["departures"]) == [key]]  # fmt: skip
         return sorted(((r.unit["departures"][key], r) for r in found), key=lambda pair: _first(pair[0]))
 
