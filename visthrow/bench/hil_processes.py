@@ -138,7 +138,9 @@ def _first_line(process: subprocess.Popen) -> str:
 def _until(fake: subprocess.Popen, watch: Callable[[int], None] | None, runner: subprocess.Popen, alone: bool) -> None:
     while fake.poll() is None:
         gone = runner.poll() is not None
-        if gone and not alone:
+        if gone and not alone:  # aborted, say: the fake tells what it has seen
+            fake.send_signal(signal.SIGINT)
+            fake.wait(ENDED)
             return
         if watch is not None and not gone:
             watch(runner.pid)
