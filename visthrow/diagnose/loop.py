@@ -191,8 +191,9 @@ class Loop:
                 loaded, (self.target,), self.throws, PLANT, THROW_SEED, self.processes, size=BATCH
             ) as throwing:
                 result = throwing.results(show=False)[0][0]
-            kept = {"error": result.error, "success": result.success, "duration": result.duration}
-            write_json(path, {k: np.round(np.asarray(v), DIGITS).tolist() for k, v in kept.items()})
+            kept = {"error": result.error, "duration": result.duration}
+            kept = {name: np.round(values, DIGITS).tolist() for name, values in kept.items()}
+            write_json(path, kept | {"success": np.asarray(result.success, dtype=bool).tolist()})
         found = json.loads(path.read_text())
         say(f"thrown: {name}, {np.mean(landed(found)):.3f} m")
         return found
