@@ -1,6 +1,7 @@
 """What closes the loop, but for flights and trainings: recording, extending, counting what was won back."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -64,6 +65,34 @@ def test_the_round(theta, tmp_path, monkeypatch):
     assert (tmp_path / "extended.toml").exists() == bool(theta)
     assert record["recovered"]["share"] == pytest.approx(0.75 if theta else 0.0, abs=1e-9)
     assert loop.read([tmp_path])[0] == json.loads(json.dumps(record))
+
+
+def test_throws_are_kept_and_not_flown_twice(tmp_path, monkeypatch):
+    """What the plant says goes into a file, failed throws with it; the second time it is read."""
+    flown = []
+
+    class Flown:
+        def __init__(self, loaded, targets, count, plant, seed, processes, size):
+            flown.append((targets, count, plant, size))
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_):
+            pass
+
+        def results(self, show):
+            error = np.array([0.123456, np.nan])
+            fields = {"success": np.array([True, False]), "error": error, "duration": error}
+            return [[SimpleNamespace(**fields)]]
+
+    monkeypatch.setattr("visthrow.reference_protocol.Throwing", Flown)
+    monkeypatch.setattr("visthrow.loading.load_policy", lambda *_, **__: None)
+    one = loop.Loop({}, tmp_path, throws=2)
+    found = [one._throws("before", "state", lambda line: None) for _ in range(2)]
+    assert flown == [((2.0,), 2, loop.PLANT, loop.BATCH)]
+    for throws_ in found:
+        np.testing.assert_array_equal(loop.landed(throws_), [0.1235])
 
 
 def test_a_hall_records_poses_with_its_noise_and_nothing_true():
