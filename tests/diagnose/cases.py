@@ -294,7 +294,8 @@ def main() -> None:
     until = time.time() + 60.0 * args.minutes
     tasks = []
     for k, (kind, count) in enumerate(item.split("=") for item in args.cases):
-        tasks += [Task(kind, draw(kind, first + 10_000 * k + 10 * i), until) for i in range(int(count))]
+        tasks += [(i, Task(kind, draw(kind, first + 10_000 * k + 10 * i), until)) for i in range(int(count))]
+    tasks = [task for _, task in sorted(tasks, key=lambda item: item[0])]  # one of each kind before the second of any
     tally: dict[str, Counter] = {}
     context = mp.get_context("spawn")
     with context.Pool(args.jobs, _alone, (context.Value("i", args.slot),)) as pool:

@@ -1,6 +1,8 @@
 """Symmetries, degenerate pairs and spoiled logs of sealed worlds; the default run tests what they are made of."""
 
+import argparse
 import os
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from tests.diagnose.bad import BAD
 from tests.diagnose.degenerate import PAIRS
 from tests.worlds.follow import ALONE, follow, table_of
 from tests.worlds.world import Recipe
+from visthrow.diagnose.cutting import ATTACHED, Cut, thinned
 from visthrow.diagnose.manoeuvres import catalogue
 from visthrow.diagnose.recorded import carriers, record_of
 from visthrow.flightlog import FlightLog
@@ -84,6 +87,25 @@ def test_added_rates_and_thrust_reach_the_commands():
     quiet, rates, thrust = follow(Recipe(5, "rod", {}), tables, 1)
     assert np.abs(rates["sent"][:, 1]).max() > np.abs(quiet["sent"][:, 1]).max() + 2.0
     assert thrust["sent"][:, 0].max() > 1.3 * quiet["sent"][:, 0].max()
+
+
+def test_what_the_configuration_knows_of_the_sensors_is_read(monkeypatch):
+    """A frame's tilt that was found and applied must not be found again."""
+    from visthrow.diagnose import opening, throw_model
+
+    monkeypatch.setattr(throw_model, "ThrowModel", lambda logs, plant, **options: options)
+    args = argparse.Namespace(plant="state", overrides=["sensing.frame_tilt=[0.01, 0.0, 0.0]"], only=None, device="cpu")
+    assert opening.throw_model(args, [])[0]["sensing"].frame_tilt == (0.01, 0.0, 0.0)
+
+
+def test_of_hours_of_flight_all_throws_are_looked_at():
+    hover = [Cut(0, "hover", float(i), i + 1.0, ATTACHED) for i in range(7200)]
+    throws = [Cut(1, "throw", float(i), i + 1.0, ATTACHED) for i in range(30)]
+    kept = thinned([*hover, *throws])
+    assert len(kept) == 400
+    assert [c for c in kept if c.flight == 1] == throws
+    assert max(b.start - a.start for a, b in pairwise(kept[:370])) < 25.0
+    assert thinned(throws) == throws
 
 
 def run_cases(kinds: list[str], count: int = 1) -> list[dict]:
