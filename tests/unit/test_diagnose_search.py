@@ -7,6 +7,7 @@ import pytest
 
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
 from visthrow.diagnose import evidence, result, search
+from visthrow.diagnose.consistency import differ
 from visthrow.diagnose.evidence import Priors
 from visthrow.errors import DiagnoseError
 
@@ -144,6 +145,16 @@ def test_signs_that_change_from_flight_to_flight_are_no_cause():
     diagnosis = search.explain(model, laws=False)
     assert not diagnosis.theta
     assert diagnosis.overall in (result.INCONSISTENT, result.NO_EFFECT)
+
+
+def test_flights_differ_by_more_than_form_and_noise():
+    own = np.full(8, 4.0)  # information: half a floor's deviation each
+    sizes = np.array([9.0, 11.0, 8.0, 12.0, 10.0, 9.5, 10.5, 10.0])
+    assert not differ(own, own * sizes)
+    assert differ(own, own * sizes * (-1.0) ** np.arange(8))
+    far = sizes + np.array([0.0, 0.0, 0.0, 25.0, 0.0, -18.0, 0.0, 0.0])
+    assert differ(own, own * far)
+    assert not differ(own, own * far, share=1.0)
 
 
 def test_a_copied_flight_counts_once():

@@ -104,6 +104,11 @@ def test_a_law_beside_a_known_cause_leaves_the_cause_its_name():
     assert diagnosis.block == "payload force"
     assert diagnosis.named == ("effect_03",)
     assert diagnosis["effect_03"].low < 12.0 * EFFECTS[3].floor < diagnosis["effect_03"].high
+    first = diagnosis.laws[0]  # the screen prefers S (z x v_p); joined by the right term it is worth nothing
+    assert first.formula == "F_p = c (z x v_p)"
+    assert first.interval[0] < 0.01 < first.interval[1]
+    formulas = [law.formula for law in diagnosis.laws]
+    assert len(set(formulas)) == len(formulas)
 
 
 def test_known_causes_and_gusts_are_no_laws():
