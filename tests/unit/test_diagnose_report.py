@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
-from visthrow.diagnose import blind, forms, gain, manoeuvres, plan, point, report, result, search
+from visthrow.diagnose import blind, forms, gain, manoeuvres, measures, plan, point, report, result, search
 from visthrow.diagnose.landing import Landings
+from visthrow.errors import DiagnoseError
 from visthrow.storage import write_json
 
 EFFECTS = catalogue(12)
@@ -222,6 +223,26 @@ def test_the_promise_of_the_plan_is_kept(degenerate):
     assert degenerate["effect_03"].verdict == result.CLASS
     assert again["effect_03"].verdict == result.FOUND
     assert again.named == ("effect_03",)
+
+
+def test_a_scale_settles_what_no_flight_separates(degenerate, monkeypatch):
+    """Weighed and found right, one member of a class is out, and the other has the name."""
+    floor = {e.name: e.floor for e in EFFECTS}
+    scale = measures.Measurement("weigh", "effect_07", floor["effect_07"], 60.0)
+    monkeypatch.setattr(plan, "MEASUREMENTS", (scale,))
+    (proposal,) = plan.propose(degenerate, [], lambda _: [], ("effect_03",))
+    assert proposal.name == "weigh"
+    assert {frozenset(pair) for pair in proposal.separates} == {frozenset(("effect_03", "effect_07"))}
+    assert not plan.propose(degenerate, [], lambda _: [], ("effect_00",))
+    model = SyntheticModel(effects=EFFECTS, truth={"effect_03": 12.0}, same={"effect_07": ("effect_03", 0.5)}, seed=2)
+    model.effects = measures.narrowed(EFFECTS, measures.parsed([f"effect_07={scale.sd}"]))
+    assert search.explain(model, laws=False)["effect_03"].verdict == result.FOUND
+
+
+@pytest.mark.parametrize("item", ["effect_07", "effect_07=much", "effect_07=-1", "nobody=1"])
+def test_measurements_that_are_none_are_refused(item):
+    with pytest.raises(DiagnoseError, match=item.split("=")[0]):
+        measures.narrowed(EFFECTS, measures.parsed([item]))
 
 
 @pytest.mark.parametrize("manoeuvre", manoeuvres.catalogue(), ids=lambda m: m.name)
