@@ -131,6 +131,8 @@ def test_finished_loops_are_shown_and_others_refused(tmp_path, monkeypatch):
     assert "| 75 % [" in text
     harmless = record_of({"before": 0.02, "after": 0.02, "oracle": 0.02})
     assert "nothing was lost" in loop.table([harmless])
+    lost = record_of({"before": 0.02, "after": 0.02, "oracle": 0.02}, recovered=dict.fromkeys(("share", "low", "high")))
+    assert loop.table([lost]).endswith("| - |")
     assert loop.picture([harmless])[:4] == b"\x89PNG"
     with pytest.raises(DiagnoseError, match="no such record"):
         loop.read([tmp_path / "elsewhere"])

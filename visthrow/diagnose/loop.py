@@ -195,7 +195,8 @@ class Loop:
             kept = {name: np.round(values, DIGITS).tolist() for name, values in kept.items()}
             write_json(path, kept | {"success": np.asarray(result.success, dtype=bool).tolist()})
         found = json.loads(path.read_text())
-        say(f"thrown: {name}, {np.mean(landed(found)):.3f} m")
+        error = landed(found)
+        say(f"thrown: {name}, {len(error)} landed" + (f", {np.mean(error):.3f} m" if len(error) else ""))
         return found
 
 
@@ -301,9 +302,12 @@ def table(records: Sequence[Mapping[str, Any]]) -> str:
             whole = len(errors[name]) == len(r["throws"][name]["error"])
             told.append((statistics.mean(1e3 * errors[name]).text(0) if len(errors[name]) else "-") + ("" if whole else count))
         share = r["recovered"]
-        won = f"{100 * share['share']:.0f} % [{100 * share['low']:.0f}, {100 * share['high']:.0f}]"
-        if all(len(e) for e in errors.values()) and statistics.difference(errors["before"], errors["oracle"]).low <= 0.0:
+        if share["share"] is None or np.isnan(share["share"]):  # JSON has no NaN
+            won = "-"
+        elif statistics.difference(errors["before"], errors["oracle"]).low <= 0.0:
             won = "nothing was lost"
+        else:
+            won = f"{100 * share['share']:.0f} % [{100 * share['low']:.0f}, {100 * share['high']:.0f}]"
         lines.append(f"| {hidden_text(r)} | {found} | {' | '.join(told)} | {won} |")
     return "\n".join(lines)
 
