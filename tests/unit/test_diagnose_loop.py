@@ -129,7 +129,7 @@ def test_finished_loops_are_shown_and_others_refused(tmp_path, monkeypatch):
     text = loop.table(loop.read([mine]))
     assert "| motor_tau +0.02 (state_no_delay) | motor_tau +0.019 | 100 [" in text
     assert "| 75 % [" in text
-    harmless = record_of({"before": 0.02, "after": 0.02, "oracle": 0.02})
+    harmless = record_of({"before": 0.0201, "after": 0.02, "oracle": 0.02})
     assert "nothing was lost" in loop.table([harmless])
     lost = record_of({"before": 0.02, "after": 0.02, "oracle": 0.02}, recovered=dict.fromkeys(("share", "low", "high")))
     assert loop.table([lost]).endswith("| - |")
