@@ -96,7 +96,7 @@ PAIRS = {
     "tilt_or_wind": Pair("frame_tilt_y", 8e-3, TILTED, BARE, False),
     "markers_or_wind": Pair("marker_rot_y", 9e-3, TILTED, BARE, False),
     "length_or_marker": Pair("rope_length", 8e-3, LONGER, HOVER, True),
-    "command_or_stamp": Pair("cmd_delay", 0.012, frozenset({"mocap_delay_quad", "motor_tau"}), DOUBLETS, False),
+    "command_or_stamp": Pair("cmd_delay", 0.006, frozenset({"mocap_delay_quad", "motor_tau"}), DOUBLETS, False),
     "stamp_or_command": Pair("mocap_delay_quad", 0.008, frozenset({"cmd_delay", "motor_tau"}), DOUBLETS, False, (1.0,)),
     "ground_from_afar": Pair("ground_effect", 1.5, frozenset(), HOVER, True, (1.0,)),
     "drag_at_rest": Pair("rotor_drag", 0.03, frozenset(), HOVER, True),
