@@ -111,6 +111,14 @@ def test_windows_are_whole(planted):
     assert max(model.step_error().values()) < 20.0
 
 
+def test_rotors_begin_a_window_where_the_commands_left_them(planted):
+    """Fitted without gusts they would take the gusts' place; they stay free to be told by the data."""
+    _, model = planted
+    model.windows({})
+    assert np.array_equal(model._latest["motor_speed"], model._begin(model.setting)["motor_speed"])
+    assert "motor_speed" in {d.field for d in model._directions}
+
+
 def test_what_is_known_of_the_sensors_is_taken_off():
     sensing = SensingParams(frame_tilt=(0.01, 0.0, 0.0), marker_offset=(0.02, 0.0, 0.01), vehicle_delay=0.01)
     setting = setting_with({"frame_tilt_x": 0.01, "marker_off_x": 0.02, "marker_off_z": 0.01, "mocap_delay_quad": 0.01})
@@ -220,6 +228,8 @@ def test_what_a_simplified_simulator_lacks_stands_out(part, kind, name):
         block = dataclasses.replace(getattr(plant.vehicle, part), kind=kind)
         simple = dataclasses.replace(plant, vehicle=dataclasses.replace(plant.vehicle, **{part: block}))
     model = ThrowModel(logs, simple)
-    wrong = sum(np.sum((w.residual / w.sigma) ** 2) for w in model.windows({}))
-    right = sum(np.sum((w.residual / w.sigma) ** 2) for w in model.windows({name: 1.0}))
+    plain, whole = model.windows({}), model.windows({name: 1.0})
+    wrong, right = (sum(np.sum((w.residual / w.sigma) ** 2) for w in windows) for windows in (plain, whole))
     assert right < 0.7 * wrong, (wrong, right)
+    states = {"aerodynamics": 0, "controller_kind": 3, "motor_lag": 4, "rope_flexible": 8}  # integrals, rotors, bends of the rope
+    assert whole[0].nuisance.shape[1] - plain[0].nuisance.shape[1] == states[name]

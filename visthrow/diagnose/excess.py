@@ -20,8 +20,8 @@ UNKNOWN_RATIO = 3.0
 LIMIT_NATS = 2.0
 """Loss of log-likelihood that marks the upper limit of a level (one-sided 97.5 %)."""
 
-GRID = np.geomspace(1.0, 32.0, 11)
-"""Factors above the best level among which its upper limit is looked for."""
+STEP, MOST_STEPS = 1.4, 60
+"""Factor from one level to the next above the best, until one is too high. A level that nothing holds up lies anywhere below."""
 
 
 def levels(before: Point, after: Point, least: float) -> tuple[Level, ...]:
@@ -61,10 +61,10 @@ def _likelihood(point: Point, block: int, phase: str, level: float) -> float:
 def _upper_limit(point: Point, block: int, phase: str) -> float:
     best = point.noise.latent_sd[block, phase]
     top = _likelihood(point, block, phase, best)
-    for factor in GRID[1:]:
-        if _likelihood(point, block, phase, best * factor) < top - LIMIT_NATS:
-            return float(best * factor)
-    return float(best * GRID[-1])
+    for step in range(1, MOST_STEPS):
+        if _likelihood(point, block, phase, best * STEP**step) < top - LIMIT_NATS:
+            break
+    return float(best * STEP**step)
 
 
 def acts_on(point: Point, j: int) -> str:

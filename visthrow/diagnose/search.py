@@ -48,6 +48,9 @@ CONTRADICTED = 0.5
 STRAIGHT = 0.5
 """Size in floors that the simulation's distance from its linearisation may fake before the derivatives are taken anew."""
 
+LINEARISATIONS = 3
+"""At most so many times in a row, each where the last led."""
+
 JOINT_BEST, JOINT_SIZE = 8, 3
 """All sets of up to so many of the best effects are compared at the end."""
 
@@ -148,11 +151,12 @@ class Search:
         """Linearise where the search stands, unless the last derivatives still hold, and step on where that moved the optimum."""
         if curvature(self.problem, self.origin, point) < STRAIGHT:
             return point
-        self.origin = linearise(self.problem, point.theta, point.noise)
-        better = fitted(self.problem, self.origin, active)
-        if np.abs(better.theta - point.theta).max() > 0.5 and curvature(self.problem, self.origin, better) > STRAIGHT:
-            self.origin = better = linearise(self.problem, better.theta, point.noise)
-        return better
+        for _ in range(LINEARISATIONS):
+            self.origin = linearise(self.problem, point.theta, point.noise)
+            before, point = point, fitted(self.problem, self.origin, active)
+            if np.abs(point.theta - before.theta).max() <= 0.5 or curvature(self.problem, self.origin, point) <= STRAIGHT:
+                break
+        return point
 
     def _set_aside(self, best: int, nats: float, verdict: Consistency) -> bool:
         """An effect of one flight alone: that flight is left out; one that differs from flight to flight is refused."""

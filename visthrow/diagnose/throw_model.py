@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from camera.params import CameraParams
 from sim.params import PlantParams, SensingParams
-from sim.replay.kernel import NO_PAYLOAD
+from sim.replay.kernel import ATTACHED, NO_PAYLOAD
 from sim.replay.lanes import Replay
 from visthrow.diagnose.catalogue import Entry, Setting, apply, entries_for
 from visthrow.diagnose.cutting import Cut, around_slack, cut, thinned
@@ -46,6 +46,8 @@ ROUGHER = 3.0
 """Added to the square of the step, in the nominal one, for derivatives that only point the way to an initial state: twice as
 long steps. Columns keep the nominal step: twice as long ones changed those of rope and release in throws by up to their size.
 """
+EARLIER = 0.05  # by which a payload may leave before it is expected to [s]
+SEEN = 0.25  # before that, without which an initial state is fitted to the whole window [s]
 TRUSTED = ("motor_speed",)
 """Fields that are linearised about where the commands left them. Fitted without gusts they would take the gusts' place: rotors
 far from their commands at the start of a window, and with them a law of the thrust's slope that is none."""
@@ -410,9 +412,17 @@ class ThrowModel:
         return states
 
     def _residuals(self, replay: Replay, setting: Setting, states: States, which: np.ndarray) -> list[np.ndarray]:
-        """Residuals of windows in the noise."""
+        """Residuals of windows in the noise, of what tells of their initial states."""
         seen = self.flights.fly(replay, [setting], states, [Lane(w, 0, w) for w in which], self.substep).seen
-        return [self._residual(seen, w, lane) / self._sigma(w) for lane, w in enumerate(which)]
+        return [self._tells_of_start(w) * self._residual(seen, w, lane) / self._sigma(w) for lane, w in enumerate(which)]
+
+    def _tells_of_start(self, w: int) -> np.ndarray:
+        """1 for samples before the payload may have left, 0 for later ones, which tell of the release; all 1 where few are left."""
+        c, time = self.flights.cuts[w], self._time(w)
+        left = self.flights.flights[c.flight].latch + self.setting.plant.release.lag - EARLIER
+        if c.payload != ATTACHED or not c.start + SEEN < left < c.end:
+            return np.ones(len(time))
+        return (time < left).astype(float)
 
     def _state_slopes(self, replay: Replay, setting: Setting, states: States, which: np.ndarray) -> dict[int, np.ndarray]:
         """Derivatives of windows' samples by their initial states, in the noise."""
@@ -428,7 +438,7 @@ class ThrowModel:
             ds, rows = self._fitted(w), int(self.flights.rows[w])
             flat = np.swapaxes(seen[:rows, at : at + 1 + len(ds)], 1, 2).reshape(3 * rows, -1)
             steps = np.array([self._directions[d].step for d in ds])
-            slopes[w] = (flat[:, 1:] - flat[:, :1]) / steps / self._sigma(w)[:, None]
+            slopes[w] = (flat[:, 1:] - flat[:, :1]) / steps * (self._tells_of_start(w) / self._sigma(w))[:, None]
         return slopes
 
     def _increment(self, w: int, slopes: np.ndarray, residual: np.ndarray, done: np.ndarray, damping: float) -> np.ndarray:

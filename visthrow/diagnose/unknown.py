@@ -4,7 +4,7 @@ A term needs no simulation: its column is G phi, with G the derivatives by the l
 thousands of terms are screened with the statistics at hand; the best are then weighed with noise levels of their own.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING
@@ -36,11 +36,11 @@ NARROW = 1e-3
 """Floor of a term in its prior deviation: a term is there or it is not."""
 
 MATERIAL = 0.5
-"""Root mean square force of a term, in the block's quietest latent force, below which it does not matter: that of a gust moves a
+"""Root mean square force of a term, in the block's usual latent force, below which it does not matter: that of a gust moves a
 landing by 5 mm within half a second."""
 
-ROUGHER, ROUGHEST = 2.0, 10.0
-"""While terms are screened, no phase is rougher than so many times the calmest, unless that is calmer still than a tenth of it."""
+ROUGHER = 2.0
+"""While terms are screened, no phase is rougher than so many times the usual."""
 
 FORM = 1.0
 """Share of a term by which flights may differ: at knots a tenth of a second apart a law of the thrust's slope is a rough one."""
@@ -124,18 +124,23 @@ def _columns(point: Point, window: int, block: str, terms_: Sequence[grammar.Ter
 
 
 def _calm(point: Point) -> tuple[Point, list[WindowStatistics]]:
-    """The point as if no phase were much rougher than its block's calmest, and the statistics of its windows.
+    """The point as if no phase were much rougher than is usual in its block, and the statistics of its windows.
 
     A force that the model lacks is taken for gusts in the phases in which it acts; there no term of it would stand out.
     """
     levels = point.noise.latent_sd
     limits = {}
     for block in {block for block, _ in levels}:
-        own = [level for (b, _), level in levels.items() if b == block]
-        limits[block] = max(ROUGHER * min(own), max(own) / ROUGHEST)
+        limits[block] = ROUGHER * _usual(levels, block)
     noise = replace(point.noise, latent_sd={key: min(level, limits[key[0]]) for key, level in levels.items()})
     parts = [window_statistics(gram, noise, w) for w, gram in enumerate(point.grams)]
     return replace(point, noise=noise, statistics=gather(point.grams, parts, point.theta)), parts
+
+
+def _usual(levels: Mapping[tuple[int, str], float], block: int) -> float:
+    """The lower median of a block's levels; the least of a phase with few windows may be anything."""
+    own = sorted(level for (b, _), level in levels.items() if b == block)
+    return own[(len(own) - 1) // 2]
 
 
 def _screen(point: Point, parts: Sequence[WindowStatistics], block: str) -> _Screen | None:
@@ -239,7 +244,7 @@ def hypotheses(point: Point, priors: Priors, active: Sequence[int], strongest: d
         found += [(float(gain[i]), screen.terms[i], float(prior[i])) for i in _distinct(gain, screen)]
     found = sorted((f for f in found if f[0] > least), key=lambda f: -f[0])[:WEIGHED]
     weighed = [_weigh(point, priors, active, term, prior, price[term.depth], beside) for _, term, prior in found]
-    return sorted((h for h in weighed if _matters(h) and not _differs(h)), key=lambda h: -h.nats)
+    return sorted((h for h in weighed if h.nats > least and _matters(h) and not _differs(h)), key=lambda h: -h.nats)
 
 
 def _differs(hypothesis: Hypothesis) -> bool:
@@ -258,7 +263,7 @@ def _matters(hypothesis: Hypothesis) -> bool:
         if np.any(w.latent_block == index):
             square.setdefault(w.phase, []).append(float((term.values(w.knots) ** 2).sum(1).mean()))
     force = abs(law.coefficient) * np.sqrt(max(float(np.mean(values)) for values in square.values()))
-    return force > MATERIAL * min(level for (block, _), level in point.noise.latent_sd.items() if block == index)
+    return force > MATERIAL * _usual(point.noise.latent_sd, index)
 
 
 def _distinct(gain: np.ndarray, screen: _Screen) -> list[int]:
