@@ -40,7 +40,7 @@ DAMPING, DAMPING_MOST = 1e-3, 1e5
 ROUNDS = 25
 AFTER_SLACK = 0.05  # that a rope is given to come taut [s]
 HUBER = 30.0  # deviations, beyond which a sample counts less
-SETTLED = 0.01  # relative fall of the cost below which an initial state is settled
+SETTLED = 0.003  # relative fall of the cost below which an initial state is settled
 MOVED = 0.2  # relative fall of the cost above which derivatives by the initial state are taken anew
 ROUGHER = 3.0
 """Added to the square of the step, in the nominal one, for derivatives that only point the way to an initial state: twice as
@@ -402,8 +402,9 @@ class ThrowModel:
             residuals |= {w: seen[w] for w in left if better[w]}
             states = {name: np.where(_like(better, v), there[name], v) for name, v in states.items()}
             moves[better] += trial[better]
-            settled = better & (tried > (1.0 - SETTLED) * cost)
-            stale = np.where(better, tried < (1.0 - MOVED) * cost, aged)
+            little = better & (tried > (1.0 - SETTLED) * cost)
+            settled = little & ~aged  # by derivatives from elsewhere a step may be short though the goal is far
+            stale = np.where(better, (tried < (1.0 - MOVED) * cost) | little, aged)
             damping = np.where(better, damping / 10.0, np.where(aged, damping, damping * 10.0))
             aged, cost = aged | better, np.where(better, tried, cost)
             left = left[~settled[left] & (damping[left] < DAMPING_MOST)]
