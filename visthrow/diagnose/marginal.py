@@ -41,6 +41,7 @@ class Gram:
     nuisances: int
     latent_block: np.ndarray  # shape (L,)
     factor: np.ndarray  # what stands between unit latents and knots: G_used = G @ factor, shape (L, L)
+    log_sigma: float = 0.0  # sum over all samples: grams whose outliers have other weights compare
 
     @property
     def latents(self) -> int:
@@ -145,7 +146,8 @@ def _inner_products(window: Window, z: np.ndarray, channels: int) -> Gram:
         inner[c], cross[c], square[c] = own.T @ own, left @ own, left @ left
         count[c] = len(left)
     blocks = np.asarray(window.latent_block, dtype=int)
-    return Gram(window.flight, window.phase, count, inner, cross, square, window.nuisance.shape[1], blocks, np.eye(len(blocks)))
+    return Gram(window.flight, window.phase, count, inner, cross, square, window.nuisance.shape[1], blocks, np.eye(len(blocks)),
+                float(np.log(window.sigma).sum()))  # fmt: skip
 
 
 def _check(window: Window, effects: int, channels: int) -> None:
@@ -215,11 +217,11 @@ class Posterior:
 
     mean: np.ndarray  # of [b, a] in prior deviations, shape (D + L,)
     covariance: np.ndarray  # shape (D + L, D + L)
-    log_likelihood: float  # of the residuals, up to a constant
+    log_likelihood: float  # of the residuals, but for the powers of 2 pi
 
 
 def _factor(gram: Gram, noise: Noise, level: np.ndarray) -> tuple[np.ndarray, float]:
-    """Lower Cholesky factor of 1 + P^1/2 U' W U P^1/2, and log det V up to a constant.
+    """Lower Cholesky factor of 1 + P^1/2 U' W U P^1/2, and log det V.
 
     Raises:
         DiagnoseError: The normal equations are not positive definite, which only broken derivatives can cause.
@@ -236,7 +238,8 @@ def _factor(gram: Gram, noise: Noise, level: np.ndarray) -> tuple[np.ndarray, fl
         lower, failed = lapack.dpotrf(normal, lower=1, clean=1)
     if failed:
         raise DiagnoseError(f"window of flight {gram.flight}, phase {gram.phase}: the normal equations are singular")
-    return lower, float(2.0 * np.log(np.diag(lower)).sum() + 2.0 * gram.count @ np.log(noise.scale))
+    sensor = gram.log_sigma + gram.count @ np.log(noise.scale)
+    return lower, 2.0 * float(np.log(np.diag(lower)).sum() + sensor)
 
 
 def posterior(gram: Gram, noise: Noise, window: int) -> Posterior:
@@ -283,7 +286,7 @@ class Integral:
     half: np.ndarray  # L^-1 P^1/2 U' W times the columns, with L of the posterior's precision, shape (D + L, J)
     factor: np.ndarray  # L
     level: np.ndarray  # prior deviation of [X, G], shape (D + L,)
-    log_det: float  # of V, up to a constant
+    log_det: float  # of V
 
     def share(self, gram: Gram, noise: Noise) -> Share:
         """With the residuals of a gram of the same derivatives."""

@@ -68,7 +68,7 @@ STALLED = 1e-9
 """Of the step: limits and levels count as met within this."""
 
 ROUNDS = 10
-"""Of levels of bad windows in turn with those of their phases; mostly one or two are needed."""
+"""In which the windows that count as bad may change; mostly one or two are needed."""
 
 
 def highpass_sigma(values: np.ndarray) -> np.ndarray:
@@ -128,11 +128,12 @@ def refit(grams: Sequence[Gram], start: Noise) -> Noise:
 
 
 def _with_own_levels(grams: Sequence[Gram], noise: Noise) -> Noise:
-    """The levels with those of bad windows, in turn with those of their phases."""
+    """The levels with those of bad windows, until the same windows count as bad: then all levels are at their best together."""
     for _ in range(ROUNDS):
         own = _own_levels(grams, noise)
-        if np.allclose(own, noise.own, rtol=0.5, equal_nan=True):
+        if np.all(np.isfinite(own) == np.isfinite(noise.own)):
             break
+        own = np.where(np.isfinite(own) & np.isfinite(noise.own), noise.own, own)  # these were found to more than a grid's step
         noise, _ = _maximise(grams, replace(noise, own=own))
     return noise
 
@@ -156,22 +157,26 @@ def _maximise(grams: Sequence[Gram], noise: Noise) -> tuple[Noise, float]:
 
     By Fisher scoring: the expected curvature costs nothing beside the gradient, and a few looks at all windows suffice.
     """
-    keys = sorted(noise.latent_sd)
+    keys, bad = sorted(noise.latent_sd), np.argwhere(np.isfinite(noise.own))
     seen = np.flatnonzero(sum(gram.count for gram in grams) > 0)
     guess = _first_guess(grams).latent_sd
-    x = np.log([noise.latent_sd[key] for key in keys] + [noise.scale[c] for c in seen])
-    low = np.array([np.log(LEVEL_LOW * guess[key]) for key in keys] + [np.log(SCALE_BOUNDS[0])] * len(seen))
-    high = np.array([np.log(LEVEL_HIGH * guess[key]) for key in keys] + [np.log(SCALE_BOUNDS[1])] * len(seen))
+    visible = np.log([guess[key] for key in keys] + [guess[int(block), grams[w].phase] for w, block in bad])
+    latents, first_own = len(visible), len(keys)
+    levels_now = [noise.latent_sd[key] for key in keys] + [noise.own[w, block] for w, block in bad]
+    x = np.log(levels_now + [noise.scale[c] for c in seen])
+    low = np.concatenate((np.log(LEVEL_LOW) + visible, np.full(len(seen), np.log(SCALE_BOUNDS[0]))))
+    high = np.concatenate((np.log(LEVEL_HIGH) + visible, np.full(len(seen), np.log(SCALE_BOUNDS[1]))))
     x = np.clip(x, low, high)
 
     def levels(x: np.ndarray) -> Noise:
-        scale = noise.scale.copy()
-        scale[seen] = np.exp(x[len(keys) :])
-        return replace(noise, scale=scale, latent_sd=dict(zip(keys, np.exp(x[: len(keys)]).tolist())))
+        scale, own = noise.scale.copy(), noise.own.copy()
+        scale[seen] = np.exp(x[latents:])
+        own[tuple(bad.T)] = np.exp(x[first_own:latents])
+        return replace(noise, scale=scale, latent_sd=dict(zip(keys, np.exp(x[:first_own]).tolist())), own=own)
 
     def look(x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
         value, by_level, by_scale, curvature = _likelihood(grams, levels(x), keys)
-        chosen = np.concatenate((np.arange(len(keys)), len(keys) + seen))
+        chosen = np.concatenate((np.arange(latents), latents + seen))
         return value, np.concatenate((by_level, by_scale))[chosen], curvature[np.ix_(chosen, chosen)]
 
     value, slope, curvature = look(x)
@@ -218,14 +223,17 @@ def _likelihood(
 ) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
     """Log-likelihood, its gradients by the logarithms of latent deviations and of sensor scales, and its expected curvature.
 
+    The deviations are those of ``keys`` and after them bad windows' own, in the order of ``np.argwhere(np.isfinite(noise.own))``.
     The curvature (Fisher's, of [levels, scales]) is exact among the levels; what the scales share with the fitted columns is
     given to the channels by their part in them.
     """
     index = {key: i for i, key in enumerate(keys)}
-    count = len(keys)
+    bad = np.isfinite(noise.own)
+    count = len(keys) + int(bad.sum())
+    own_at = len(keys) - 1 + np.cumsum(bad).reshape(bad.shape)
     value, slope, curvature = 0.0, np.zeros(count + len(noise.scale)), np.zeros((count + len(noise.scale),) * 2)
-    for gram, own, found in zip(grams, noise.own, each(lambda w: _window_likelihood(grams[w], noise, w), range(len(grams)))):
-        at = [index.get((b, gram.phase), -1) if np.isnan(own[b]) else -1 for b in range(len(LATENT_BLOCKS))]
+    for w, found in enumerate(each(lambda w: _window_likelihood(grams[w], noise, w), range(len(grams)))):
+        at = [own_at[w, b] if bad[w, b] else index.get((b, grams[w].phase), -1) for b in range(len(LATENT_BLOCKS))]
         blocks = np.flatnonzero(np.array(at) >= 0)
         rows = np.array([at[b] for b in blocks] + list(range(count, len(slope))), dtype=int)
         chosen = np.concatenate((blocks, len(LATENT_BLOCKS) + np.arange(len(noise.scale))))
