@@ -67,6 +67,8 @@ LANE_FIELDS = {
     "size": ("real", False),  # of the latent force at its knot [N], [N m]
     "substep": ("real", False),  # largest step [s]
     "keep": ("int", False),  # first row of its knots' states in the knot arrays, or -1
+    "resume": ("int", False),  # row of the knot arrays at which it leaves the lane that kept it, or -1
+    "parent": ("int", False),  # that lane, flown before, of the same window, plant and state
 }
 
 KNOT_FIELDS = {
@@ -101,6 +103,7 @@ class ReplayKernel:
     Knots: type
     Data: type
     Sensing: type
+    Moment: type
 
 
 def build_replay(t: Types, vehicle: VehicleParams, segments: int, laws: tuple[LawParams, ...] = ()) -> ReplayKernel:
@@ -134,6 +137,10 @@ def build_replay(t: Types, vehicle: VehicleParams, segments: int, laws: tuple[La
     Ball = make_struct("Ball", {"pos": vec3, "vel": vec3, "root": vec3, "root_vel": vec3, "tail": vec3, "tail_vel": vec3})
     Steps = make_struct("Steps", {"t0": real, "t1": real, "h": real})
     Pointers = make_struct("Pointers", {"vehicle": wp.int32, "payload": wp.int32, "gyro": wp.int32})
+    Moment = make_struct("Moment", {
+        "time": real, "quad": QuadState, "rope": Rope, "ball": Ball, "total": vec3, "before": vec3, "pay": vec3, "pay_vel": vec3,
+        "separation": real, "mode": wp.int32, "latched": wp.int32, "knot": wp.int32, "slack": wp.int32, "at": Pointers,
+    })  # fmt: skip
     attached_code, loose_code = ATTACHED, LOOSE
 
     @wp.func
@@ -259,6 +266,18 @@ def build_replay(t: Types, vehicle: VehicleParams, segments: int, laws: tuple[La
         knots.payload_vel_w[row] = vel
         knots.tension[row] = pull
 
+    @wp.func
+    def inherit(windows: Windows, w: int, at: Pointers, parent: int, lane: int, out: wp.array2d(dtype=vec3)):
+        """What was seen before a lane leaves another."""
+        vehicles = windows.vehicle_count[w]
+        for i in range(2 * at.vehicle):
+            out[i, lane] = out[i, parent]
+        for i in range(2 * vehicles, 2 * vehicles + at.payload):
+            out[i, lane] = out[i, parent]
+        first = 2 * vehicles + windows.payload_count[w]
+        for i in range(first, first + at.gyro):
+            out[i, lane] = out[i, parent]
+
     @wp.kernel(module="unique", enable_backward=False)
     def replay_kernel(
         # Params:
@@ -277,14 +296,19 @@ def build_replay(t: Types, vehicle: VehicleParams, segments: int, laws: tuple[La
         windows: Windows,
         lanes: Lanes,
         data: Data,
+        order: wp.array(dtype=wp.int32),
         first_lane: int,
         # State out:
         ends: State,
         knots: Knots,
+        moments: wp.array(dtype=Moment),
+        moment_dirs: wp.array2d(dtype=vec3),
+        moment_vels: wp.array2d(dtype=vec3),
+        moment_stiffness: wp.array2d(dtype=real),
         # Out:
         out: wp.array2d(dtype=vec3),
     ):
-        lane = wp.tid() + first_lane
+        lane = order[wp.tid() + first_lane]
         w = lanes.window[lane]
         row = lanes.plant[lane]
         p = vehicles[row]
@@ -343,6 +367,28 @@ def build_replay(t: Types, vehicle: VehicleParams, segments: int, laws: tuple[La
             )
             pay = pos0
             pay_vel = vel0
+        resume = lanes.resume[lane]
+        if resume >= 0:
+            m = moments[resume]
+            time = m.time
+            s = m.quad
+            rope = m.rope
+            ball = m.ball
+            total = m.total
+            before = m.before
+            pay = m.pay
+            pay_vel = m.pay_vel
+            separation = m.separation
+            mode = m.mode
+            latched = m.latched != 0
+            slack = m.slack != 0
+            knot = m.knot
+            at = m.at
+            for i in range(L):
+                n[i] = moment_dirs[resume, i]
+                u[i] = moment_vels[resume, i]
+                stiffness[i] = moment_stiffness[resume, i]
+            inherit(windows, w, at, lanes.parent[lane], lane, out)
         while time < end - tiny:
             until = end
             while command + 1 < windows.command_last[w] and data.command_time[command + 1] + delay <= time + tiny:
@@ -366,9 +412,29 @@ def build_replay(t: Types, vehicle: VehicleParams, segments: int, laws: tuple[La
             if knot < windows.knots[w]:
                 if knot_time <= time + tiny:
                     if lanes.keep[lane] >= 0:
-                        knot_of(
-                            knots, lanes.keep[lane] + knot, p, rope, s, pay, pay_vel, chain.pull(rope, stiffness)
-                        )
+                        kept = lanes.keep[lane] + knot
+                        knot_of(knots, kept, p, rope, s, pay, pay_vel, chain.pull(rope, stiffness))
+                        if kept < moments.shape[0]:
+                            now = Moment()
+                            now.time = time
+                            now.quad = s
+                            now.rope = rope
+                            now.ball = ball
+                            now.total = total
+                            now.before = before
+                            now.pay = pay
+                            now.pay_vel = pay_vel
+                            now.separation = separation
+                            now.mode = mode
+                            now.latched = int(latched)
+                            now.slack = int(slack)
+                            now.knot = knot
+                            now.at = at
+                            moments[kept] = now
+                            for i in range(L):
+                                moment_dirs[kept, i] = n[i]
+                                moment_vels[kept, i] = u[i]
+                                moment_stiffness[kept, i] = stiffness[i]
                     knot = knot + 1
                     knot_time = knot_time + knot_spacing
                 until = wp.min(until, wp.max(knot_time, time + tiny))
@@ -444,4 +510,4 @@ def build_replay(t: Types, vehicle: VehicleParams, segments: int, laws: tuple[La
                 ends.cable_vel_w[i, lane] = u[i]
                 ends.stiffness[i, lane] = stiffness[i]
 
-    return ReplayKernel(replay_kernel, State, Windows, Lanes, Knots, Data, Sensing)
+    return ReplayKernel(replay_kernel, State, Windows, Lanes, Knots, Data, Sensing, Moment)

@@ -113,23 +113,31 @@ class Replay:
         ends = st.allocate(self.types, k.State, rk.STATE_FIELDS, keeping, segments, self.device)
         held = st.allocate(self.types, k.Knots, rk.KNOT_FIELDS, knots, {}, self.device)
         out = wp.empty((height, count), dtype=self.types.vec3, device=self.device)
+        resumed = np.asarray(lanes["resume"]) >= 0
+        moments, vec3 = knots if np.any(resumed) else 0, self.types.vec3
+        ropes = [wp.empty((moments, self.segments), dtype=kind, device=self.device) for kind in (vec3, vec3, self.types.real)]
+        left_at = [wp.empty(moments, dtype=k.Moment, device=self.device), *ropes]
+        order = wp.array(np.argsort(resumed, kind="stable").astype(np.int32), dtype=wp.int32, device=self.device)
         numerics = [knot_spacing, self._sim.gamma, self._sim.max_turn, self.gravity]
         given = [
             self._struct(k.State, rk.STATE_FIELDS, starts), self._struct(k.Windows, rk.WINDOW_FIELDS, windows),
             self._struct(k.Lanes, rk.LANE_FIELDS, lanes), self._struct(k.Data, rk.DATA_FIELDS, data),
         ]  # fmt: skip
-        self._launch(count, [*self._plants, *numerics, *given], [ends, held, out])
+        for first, last in ((0, count - int(resumed.sum())), (count - int(resumed.sum()), count)):
+            self._launch(first, last, [*self._plants, *numerics, *given, order], [ends, held, *left_at, out])
         return Replayed(out.numpy(), self._read(ends, rk.STATE_FIELDS), self._read(held, rk.KNOT_FIELDS))
 
-    def _launch(self, count: int, before: list, after: list) -> None:
-        """One launch, or one for each core: a launch on the CPU runs on one thread and leaves the others free."""
+    def _launch(self, begin: int, end: int, before: list, after: list) -> None:
+        """Some of the lanes, in one launch or one for each core: on the CPU it runs on one thread and leaves the others free."""
+        if end <= begin:
+            return
         if self.device != "cpu":
-            wp.launch(self.kernel.replay, count, [*before, 0, *after], device=self.device, block_dim=64)
+            wp.launch(self.kernel.replay, end - begin, [*before, begin, *after], device=self.device, block_dim=64)
             wp.synchronize_device(self.device)
             return
         self.kernel.replay.module.load("cpu")
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        pieces = np.linspace(0, count, min(4 * cores, count) + 1).astype(int)
+        pieces = np.linspace(begin, end, min(4 * cores, end - begin) + 1).astype(int)
 
         def launch(first: int, last: int) -> None:
             wp.launch(self.kernel.replay, last - first, [*before, int(first), *after], device="cpu")

@@ -61,7 +61,8 @@ def replay(flight, plants, sensings=None, count=1, stamps=None, end=0.02 * PERIO
                "latch": 0.02 * RELEASED_AT, "clock_zero": 0.0, "command_first": 0, "command_last": len(times),
                "vehicle_first": 0, "vehicle_count": n, "payload_first": 0, "payload_count": m, "gyro_first": 0,
                "gyro_count": n}  # fmt: skip
-    lanes = {"window": 0, "plant": 0, "state": 0, "axis": -1, "knot": 0, "size": 0.0, "substep": 0.002, "keep": -1} | lane
+    lanes = {"window": 0, "plant": 0, "state": 0, "axis": -1, "knot": 0, "size": 0.0, "substep": 0.002, "keep": -1, "resume": -1,
+             "parent": -1} | lane  # fmt: skip
     lanes = {name: np.broadcast_to(value, count).copy() for name, value in lanes.items()}
     engine = Replay(plants, sensings or [SensingParams()] * len(plants))
     flown = engine.run(start, {k: one(v) for k, v in windows.items()}, lanes, data, 0.1, 9)
@@ -127,6 +128,19 @@ def test_latent_forces_push(flight):
     hanging = plant().rope.payload_mass + plant().rope.rope_mass
     low, high = 0.5 * force / (mass + hanging) * time**2, 0.5 * force / mass * time**2
     assert np.all((pushed[early, 2] > 0.9 * low) & (pushed[early, 2] < 1.1 * high))
+
+
+def test_latent_lanes_may_leave_the_nominal_one_at_a_knot(flight):
+    """To the bit what they see who fly the whole window, before the release and after it, with the rope still on or not."""
+    tail = dataclasses.replace(plant(), release=dataclasses.replace(plant().release, rope_tail=0.3))
+    pushed = np.arange(1, 9)
+    given = {"count": 9, "axis": np.append(-1, pushed % 9), "knot": np.append(0, pushed), "keep": np.append(0, np.full(8, -1)),
+             "size": np.append(0.0, np.full(8, 0.01))}  # fmt: skip
+    for p in (plant(), tail):
+        whole, _ = replay(flight, [p], **given)
+        left, _ = replay(flight, [p], **given, resume=np.append(-1, pushed - 1), parent=np.append(-1, np.zeros(8, dtype=int)))
+        for name, value in whole.items():
+            np.testing.assert_array_equal(left[name], value)
 
 
 def test_sensors(flight):

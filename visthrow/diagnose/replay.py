@@ -31,6 +31,8 @@ class Lane:
     knot: int = 0
     size: float = 0.0
     keep: int = -1
+    resume: int = -1  # row of what another lane keeps, at which this one leaves it
+    parent: int = -1  # that lane
 
 
 class Flights:
@@ -110,7 +112,8 @@ class Flights:
             "window": np.array([x.window for x in lanes]), "plant": np.array([x.plant for x in lanes]),
             "state": np.array([x.state for x in lanes]), "axis": np.array([x.axis for x in lanes]),
             "knot": np.array([x.knot for x in lanes]), "size": np.array([x.size for x in lanes]),
-            "keep": np.array([x.keep for x in lanes]),
+            "keep": np.array([x.keep for x in lanes]), "resume": np.array([x.resume for x in lanes]),
+            "parent": np.array([x.parent for x in lanes]),
             "substep": step[[x.plant for x in lanes]] * self._fineness[[x.window for x in lanes]],
         }  # fmt: skip
         knots = max([1, *[x.keep + int(self.knots[x.window]) for x in lanes if x.keep >= 0]])

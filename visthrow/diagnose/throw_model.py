@@ -289,11 +289,15 @@ class ThrowModel:
         lanes: list[Lane] = []
         keep = 0
         for w in batch:
+            parent, first = len(lanes), keep
             lanes.append(Lane(w, 0, w, keep=keep))
             keep += int(self.flights.knots[w])
             lanes += [Lane(w, 1 + k, w) for k in range(len(self._graded))]
             lanes += [Lane(w, 0, (1 + d) * count + w) for d in self._nuisances(w)]
-            lanes += [Lane(w, 0, w, axis, knot, LATENT_SIZES[axis]) for axis, knot in self._latents(w)]
+            lanes += [
+                Lane(w, 0, w, axis, knot, LATENT_SIZES[axis], resume=first + max(knot - 1, 0), parent=parent)
+                for axis, knot in self._latents(w)
+            ]
         flown = self.flights.fly(replay, settings, self._moved(states), lanes, self.substep)
         out, at, keep = [], 0, 0
         for w in batch:
