@@ -209,6 +209,8 @@ class Search:
             self.progress(f"exchanged for {', '.join(map(self.name, winner[1])) or 'nothing'}")
             self.active = winner[1]
             self.point = self._settle(winner[2], self.active)
+            distances = ((members, n + winner[0]) for members, n in self.sets if set(members) != set(self.active))
+            self.sets = [(tuple(self.active), 0.0), *((members, n) for members, n in distances if n < CLOSE)]
 
     def _toll(self, active: Sequence[int]) -> float:
         """Every name costs the threshold."""
