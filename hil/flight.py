@@ -3,8 +3,7 @@
 import gc
 import math
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import Any, Protocol
 
 from hil.backends.base import Backend
@@ -13,6 +12,7 @@ from hil.decision import Decision, Words
 from hil.images import Eyes
 from hil.latency import Stages
 from hil.pose import Pose
+from hil.realtime import collected
 from hil.record import Recorder
 from hil.rehearsal import BEGIN, Rehearsal
 from hil.runner import Runner
@@ -68,7 +68,7 @@ def fly(
     ticker, backend, stages = Ticker(clock, runner.pilot.period), runner.backend, stages or Stages()
     ahead = AHEAD if rehearsal is None else BEGIN
     begin, throws, told, ended, ours, ticks = clock.now(), [], None, -math.inf, 0, 0
-    with _collected():
+    with collected():
         while runner.machine.state is not State.DONE and clock.now() - begin < most and not source.ended:
             _wait(clock, ticker.due() - ahead - AHEAD_SPREAD * (ticks * GOLDEN % 1.0), backend, source)
             early = _approach(runner, source, clock, ticker.due(), rehearsal)
@@ -124,20 +124,6 @@ def _approach(runner: Runner, source: Source, clock: Clock, due: float, rehearsa
             poses += came
     _wait(clock, due, runner.backend, source)
     return poses
-
-
-@contextmanager
-def _collected() -> Iterator[None]:
-    """Leave all that exists by now out of garbage collection, which is then ours to call."""
-    was = gc.isenabled()
-    gc.freeze()
-    gc.disable()
-    try:
-        yield
-    finally:
-        gc.unfreeze()
-        if was:
-            gc.enable()
 
 
 def _wait(clock: Clock, until: float, backend: Backend, source: Source) -> None:

@@ -5,7 +5,10 @@ Both need rights: ``setcap cap_sys_nice,cap_ipc_lock+ep`` on the interpreter, or
 """
 
 import ctypes
+import gc
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 from visthrow.errors import ConfigError
@@ -29,6 +32,20 @@ class RealtimeParams:
     def __post_init__(self) -> None:
         if not 0 <= self.priority <= 99:
             raise ConfigError(f"realtime.priority {self.priority}; expected 0 (as any process) or 1 to 99 of SCHED_FIFO")
+
+
+@contextmanager
+def collected() -> Iterator[None]:
+    """Leave all that exists by now out of garbage collection, which is then ours to call."""
+    was = gc.isenabled()
+    gc.freeze()
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.unfreeze()
+        if was:
+            gc.enable()
 
 
 def prepare(params: RealtimeParams) -> list[str]:
