@@ -136,7 +136,8 @@ class Loop:
 
     def _train(self, name: str, say: Callable[[str], None]) -> None:
         """Train a policy in a process of its own; the oracle's model is the hidden one."""
-        if (self.folder / name / POLICY).exists():
+        flown = self.folder / f"throws_{'after' if name == 'extended' else name}.json"
+        if (self.folder / name / POLICY).exists() or flown.exists():
             return
         source = self.folder / ("hidden.toml" if name == "oracle" else f"{name}.toml")
         command = [sys.executable, "-m", "visthrow.cli", "train", str(source), "--out", str(self.folder / name)]
