@@ -69,6 +69,7 @@ class Search:
     origin: Point | None = None  # where the derivatives were taken last
     steps: list[Step] = field(default_factory=list)
     refused: dict[int, float] = field(default_factory=dict)  # effects that are not the same in all flights, with their nats
+    dropped: set[int] = field(default_factory=set)  # effects that a later one made superfluous; they are not tried again
     events: list[int] = field(default_factory=list)
     sets: list[tuple[tuple[int, ...], float]] = field(default_factory=list)
 
@@ -95,7 +96,7 @@ class Search:
 
     def _screen(self, point: Point) -> np.ndarray:
         gain = additions(point.information, point.score, self.priors, self.active)
-        gain[list(self.refused)] = -np.inf
+        gain[[*self.refused, *self.dropped]] = -np.inf
         return gain
 
     def _forward(self) -> bool:
@@ -188,6 +189,7 @@ class Search:
                 return
             self.progress(f"{self.name(weakest)} dropped again")
             self.active = rest
+            self.dropped.add(weakest)
             self.point = self._settle(without, rest)
 
     def _joint(self) -> None:
