@@ -69,6 +69,7 @@ LANE_FIELDS = {
     "keep": ("int", False),  # first row of its knots' states in the knot arrays, or -1
     "resume": ("int", False),  # row of the knot arrays at which it leaves the lane that kept it, or -1
     "parent": ("int", False),  # that lane, flown before, of the same window, plant and state
+    "rides": ("int", False),  # of a lane from a start: so many after it differ in how it is seen alone, and fly along with it
 }
 
 KNOT_FIELDS = {
@@ -104,6 +105,7 @@ class ReplayKernel:
     Data: type
     Sensing: type
     Moment: type
+    Pointers: type
 
 
 def build_replay(t: Types, vehicle: VehicleParams, segments: int, laws: tuple[LawParams, ...] = ()) -> ReplayKernel:
@@ -301,6 +303,7 @@ def build_replay(t: Types, vehicle: VehicleParams, segments: int, laws: tuple[La
         # State out:
         ends: State,
         knots: Knots,
+        marks: wp.array(dtype=Pointers),
         moments: wp.array(dtype=Moment),
         moment_dirs: wp.array2d(dtype=vec3),
         moment_vels: wp.array2d(dtype=vec3),
@@ -494,6 +497,11 @@ def build_replay(t: Types, vehicle: VehicleParams, segments: int, laws: tuple[La
                 at = tell(
                     p, x, data, windows, w, old, s, before, old_pay, old_pay_vel, pay, pay_vel, k, last, at, out, lane
                 )
+                for e in range(lane + 1, lane + 1 + lanes.rides[lane]):
+                    marks[e] = tell(
+                        p, sensings[lanes.plant[e]], data, windows, w, old, s, before, old_pay, old_pay_vel, pay, pay_vel, k, last,
+                        marks[e], out, e,
+                    )  # fmt: skip
                 before = old.rate_b
             time = until
 
@@ -510,4 +518,4 @@ def build_replay(t: Types, vehicle: VehicleParams, segments: int, laws: tuple[La
                 ends.cable_vel_w[i, lane] = u[i]
                 ends.stiffness[i, lane] = stiffness[i]
 
-    return ReplayKernel(replay_kernel, State, Windows, Lanes, Knots, Data, Sensing, Moment)
+    return ReplayKernel(replay_kernel, State, Windows, Lanes, Knots, Data, Sensing, Moment, Pointers)

@@ -117,14 +117,16 @@ class Replay:
         moments, vec3 = knots if np.any(resumed) else 0, self.types.vec3
         ropes = [wp.empty((moments, self.segments), dtype=kind, device=self.device) for kind in (vec3, vec3, self.types.real)]
         left_at = [wp.empty(moments, dtype=k.Moment, device=self.device), *ropes]
-        order = wp.array(np.argsort(resumed, kind="stable").astype(np.int32), dtype=wp.int32, device=self.device)
+        marks = wp.zeros(count, dtype=k.Pointers, device=self.device)
+        flown, resumed = _in_order(np.asarray(lanes["rides"]), resumed)
+        order = wp.array(np.concatenate((flown, resumed)), dtype=wp.int32, device=self.device)
         numerics = [knot_spacing, self._sim.gamma, self._sim.max_turn, self.gravity]
         given = [
             self._struct(k.State, rk.STATE_FIELDS, starts), self._struct(k.Windows, rk.WINDOW_FIELDS, windows),
             self._struct(k.Lanes, rk.LANE_FIELDS, lanes), self._struct(k.Data, rk.DATA_FIELDS, data),
         ]  # fmt: skip
-        for first, last in ((0, count - int(resumed.sum())), (count - int(resumed.sum()), count)):
-            self._launch(first, last, [*self._plants, *numerics, *given, order], [ends, held, *left_at, out])
+        for first, last in ((0, len(flown)), (len(flown), len(flown) + len(resumed))):
+            self._launch(first, last, [*self._plants, *numerics, *given, order], [ends, held, marks, *left_at, out])
         return Replayed(out.numpy(), self._read(ends, rk.STATE_FIELDS), self._read(held, rk.KNOT_FIELDS))
 
     def _launch(self, begin: int, end: int, before: list, after: list) -> None:
@@ -164,3 +166,11 @@ class Replay:
             name: np.swapaxes(getattr(struct, name).numpy(), 0, 1) if by_row else getattr(struct, name).numpy()
             for name, (_, by_row) in fields.items()
         }
+
+
+def _in_order(rides: np.ndarray, resumed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Lanes that fly, those from a start and those that leave another lane on its way; the rest ride along."""
+    flies, number = np.ones(len(rides), dtype=bool), np.arange(len(rides))
+    for lane in np.flatnonzero(rides > 0):
+        flies[lane + 1 : lane + 1 + rides[lane]] = False
+    return number[flies & ~resumed].astype(np.int32), number[flies & resumed].astype(np.int32)

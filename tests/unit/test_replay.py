@@ -62,7 +62,7 @@ def replay(flight, plants, sensings=None, count=1, stamps=None, end=0.02 * PERIO
                "vehicle_first": 0, "vehicle_count": n, "payload_first": 0, "payload_count": m, "gyro_first": 0,
                "gyro_count": n}  # fmt: skip
     lanes = {"window": 0, "plant": 0, "state": 0, "axis": -1, "knot": 0, "size": 0.0, "substep": 0.002, "keep": -1, "resume": -1,
-             "parent": -1} | lane  # fmt: skip
+             "parent": -1, "rides": 0} | lane  # fmt: skip
     lanes = {name: np.broadcast_to(value, count).copy() for name, value in lanes.items()}
     engine = Replay(plants, sensings or [SensingParams()] * len(plants))
     flown = engine.run(start, {k: one(v) for k, v in windows.items()}, lanes, data, 0.1, 9)
@@ -141,6 +141,20 @@ def test_latent_lanes_may_leave_the_nominal_one_at_a_knot(flight):
         left, _ = replay(flight, [p], **given, resume=np.append(-1, pushed - 1), parent=np.append(-1, np.zeros(8, dtype=int)))
         for name, value in whole.items():
             np.testing.assert_array_equal(left[name], value)
+
+
+def test_lanes_that_are_seen_otherwise_ride_along(flight):
+    """To the bit what they see who fly by themselves, with late and early stamps, while another lane leaves the nominal one."""
+    late = SensingParams(vehicle_delay=0.006, scale=0.01)
+    seen = [SensingParams(), late, SensingParams(payload_delay=-0.003, gyro_bias=(0.1, 0.0, 0.0))]
+    given = {"count": 4, "plant": np.array([0, 1, 2, 0]), "axis": np.array([-1, -1, -1, 2]), "size": 0.01, "knot": 4,
+             "keep": np.array([0, -1, -1, -1])}  # fmt: skip
+    alone, _ = replay(flight, [plant()] * 3, seen, **given)
+    riding, _ = replay(flight, [plant()] * 3, seen, **given, rides=np.array([2, 0, 0, 0]), resume=np.array([-1, -1, -1, 3]),
+                       parent=np.array([-1, -1, -1, 0]))  # fmt: skip
+    for name, value in alone.items():
+        np.testing.assert_array_equal(riding[name], value)
+        assert np.any(value[:, 0] != value[:, 1]) or np.any(value[:, 0] != value[:, 2])
 
 
 def test_sensors(flight):

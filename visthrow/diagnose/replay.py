@@ -1,11 +1,11 @@
 """Recorded flights cut into windows, ready to be replayed in any setting: the arrays that all lanes of a batch share."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sim.replay.kernel import ATTACHED, LOOSE, WINDOW_FIELDS
+from sim.replay.kernel import ATTACHED, LOOSE, NO_PAYLOAD, WINDOW_FIELDS
 from sim.replay.lanes import Replay, Replayed
 from visthrow.diagnose.catalogue import Setting
 from visthrow.diagnose.cutting import Cut
@@ -33,6 +33,7 @@ class Lane:
     keep: int = -1
     resume: int = -1  # row of what another lane keeps, at which this one leaves it
     parent: int = -1  # that lane
+    rides: int = 0  # lanes after it that fly alike and see it otherwise
 
 
 class Flights:
@@ -93,6 +94,17 @@ class Flights:
         span = source.between(c.start + delay + EARLY, c.end + delay)
         return np.arange(span.start, span.stop, self.stride)
 
+    def alike(self, w: int, setting: Setting, other: Setting) -> bool:
+        """Whether a window is flown alike in two settings, which may be seen otherwise: what differs does nothing in it."""
+        c, plant = self.cuts[w], other.plant
+        if setting.step_square != other.step_square:
+            return False
+        if c.payload == NO_PAYLOAD and not plant.laws:
+            plant = replace(plant, rope=setting.plant.rope, release=setting.plant.release)
+        elif c.payload == ATTACHED and self.flights[c.flight].latch >= c.end:
+            plant = replace(plant, release=setting.plant.release)
+        return plant == setting.plant
+
     def _joined(self, name: str) -> Samples:
         parts = self.samples[name]
         return Samples(np.concatenate([p.time for p in parts]), np.concatenate([p.values for p in parts]), 1.0)
@@ -113,7 +125,7 @@ class Flights:
             "state": np.array([x.state for x in lanes]), "axis": np.array([x.axis for x in lanes]),
             "knot": np.array([x.knot for x in lanes]), "size": np.array([x.size for x in lanes]),
             "keep": np.array([x.keep for x in lanes]), "resume": np.array([x.resume for x in lanes]),
-            "parent": np.array([x.parent for x in lanes]),
+            "parent": np.array([x.parent for x in lanes]), "rides": np.array([x.rides for x in lanes]),
             "substep": step[[x.plant for x in lanes]] * self._fineness[[x.window for x in lanes]],
         }  # fmt: skip
         knots = max([1, *[x.keep + int(self.knots[x.window]) for x in lanes if x.keep >= 0]])

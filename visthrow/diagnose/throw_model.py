@@ -287,12 +287,15 @@ class ThrowModel:
     ) -> list[Window]:
         count = len(self.flights.cuts)
         lanes: list[Lane] = []
-        keep = 0
+        keep, columns = 0, {}
         for w in batch:
+            alike = [self.flights.alike(w, settings[0], other) for other in settings[1:]]
+            effects = np.argsort(~np.array(alike, dtype=bool), kind="stable")
             parent, first = len(lanes), keep
-            lanes.append(Lane(w, 0, w, keep=keep))
+            lanes.append(Lane(w, 0, w, keep=keep, rides=sum(alike)))
             keep += int(self.flights.knots[w])
-            lanes += [Lane(w, 1 + k, w) for k in range(len(self._graded))]
+            lanes += [Lane(w, 1 + int(k), w) for k in effects]
+            columns[w] = np.argsort(effects)
             lanes += [Lane(w, 0, (1 + d) * count + w) for d in self._nuisances(w)]
             lanes += [
                 Lane(w, 0, w, axis, knot, LATENT_SIZES[axis], resume=first + max(knot - 1, 0), parent=parent)
@@ -304,7 +307,9 @@ class ThrowModel:
             nuisances, latents = self._nuisances(w), self._latents(w)
             size = 1 + len(self._graded) + len(nuisances) + len(latents)
             knots = {name: value[keep : keep + self.flights.knots[w]] for name, value in flown.knots.items()}
-            out.append(self._window(flown.seen[:, at : at + size], settings[0], steps, w, nuisances, latents, knots))
+            index = np.arange(at, at + size)
+            index[1 : 1 + len(steps)] = at + 1 + columns[w]
+            out.append(self._window(flown.seen[:, index], settings[0], steps, w, nuisances, latents, knots))
             at, keep = at + size, keep + int(self.flights.knots[w])
         return out
 
