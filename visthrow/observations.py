@@ -91,9 +91,8 @@ def resampled(history: Tensor, newest: Tensor, ages: list[float], period: float)
 
 def rotation_from_quat(quat: Tensor) -> Tensor:
     """Rotation matrix, shape (E, 3, 3), of unit quaternions xyzw, shape (E, 4)."""
-    x, y, z, w = quat.unbind(-1)
-    x2, y2, z2 = x + x, y + y, z + z
-    xx, yy, zz, xy, xz, yz, wx, wy, wz = x * x2, y * y2, z * z2, x * y2, x * z2, y * z2, w * x2, w * y2, w * z2
+    products = quat.unsqueeze(-1) * (quat + quat).unsqueeze(-2)  # of all pairs at once
+    xx, xy, xz, _, _, yy, yz, _, _, _, zz, _, wx, wy, wz, _ = products.flatten(-2).unbind(-1)
     rows = [1 - (yy + zz), xy - wz, xz + wy, xy + wz, 1 - (xx + zz), yz - wx, xz - wy, yz + wx, 1 - (xx + yy)]
     return torch.stack(rows, -1).unflatten(-1, (3, 3))
 
