@@ -12,13 +12,13 @@ from sim import state as st
 from sim.coupling import build_coupled_step
 from sim.laws import build_laws
 from sim.params import LawParams, SensingParams, VehicleParams
-from sim.quadrotor.rigid_body import build_flow, quat_rate
+from sim.quadrotor.rigid_body import build_flow
 from sim.quadrotor.thrust import rotor_thrust
 from sim.release import build_letting_go
+from sim.replay.telling import build_telling
 from sim.rope.chain import build_chain
 from sim.rope.loose import build_loose_step
 from sim.rope.payload import build_flight, build_payload
-from sim.sensing import build_sensing
 from sim.structs import EXTENSIONS, Types, make_struct
 
 EVERYTHING = frozenset(EXTENSIONS)
@@ -117,7 +117,7 @@ def build_replay(t: Types, vehicle: VehicleParams, segments: int, laws: tuple[La
         segments: of the rope.
         laws: of the plant; their coefficients are read at run time.
     """
-    real, vec3, quat = t.real, t.vec3, t.quat
+    real, vec3 = t.real, t.vec3
     Vehicle, Rope, Release, Air, QuadState = t.Vehicle, t.Rope, t.Release, t.Air, t.QuadState
     L = segments
     State = st.array_struct(t, "ReplayState", STATE_FIELDS)
@@ -134,77 +134,15 @@ def build_replay(t: Types, vehicle: VehicleParams, segments: int, laws: tuple[La
     flight_acceleration = build_flight(t, payload, extra)
     loose_step = build_loose_step(t, chain, payload)
     leaving = build_letting_go(t, EVERYTHING)
-    see_pose, see_point, see_rate = build_sensing(t, Sensing)
+    telling = build_telling(t, Sensing, Windows, Data)
+    Steps, Pointers, tell, inherit = telling.Steps, telling.Pointers, telling.tell, telling.inherit
     load_quad, store_quad = st.build_access(t, State)
     Ball = make_struct("Ball", {"pos": vec3, "vel": vec3, "root": vec3, "root_vel": vec3, "tail": vec3, "tail_vel": vec3})
-    Steps = make_struct("Steps", {"t0": real, "t1": real, "h": real})
-    Pointers = make_struct("Pointers", {"vehicle": wp.int32, "payload": wp.int32, "gyro": wp.int32})
     Moment = make_struct("Moment", {
         "time": real, "quad": QuadState, "rope": Rope, "ball": Ball, "total": vec3, "before": vec3, "pay": vec3, "pay_vel": vec3,
         "separation": real, "mode": wp.int32, "latched": wp.int32, "knot": wp.int32, "slack": wp.int32, "at": Pointers,
     })  # fmt: skip
     attached_code, loose_code = ATTACHED, LOOSE
-
-    @wp.func
-    def blend_vec(a: vec3, va: vec3, b: vec3, vb: vec3, s: real, h: real):
-        """Cubic through two points with their derivatives."""
-        d = b - a
-        bend = s * (real(1.0) - s)
-        return a + s * d + bend * ((real(1.0) - s) * (h * va - d) - s * (h * vb - d))
-
-    @wp.func
-    def blend_quat(a: quat, va: quat, b: quat, vb: quat, s: real, h: real):
-        d = b - a
-        bend = s * (real(1.0) - s)
-        q = a + d * s + ((va * h - d) * (real(1.0) - s) - (vb * h - d) * s) * bend
-        return wp.normalize(q)
-
-    @wp.func
-    def late(x: Sensing, windows: Windows, w: int, stamp: real, delay: real):
-        """Time of the state that a stamp shows."""
-        return stamp - delay - x.clock_rate * (stamp - windows.clock_zero[w])
-
-    @wp.func
-    def tell(
-        p: Vehicle, x: Sensing, data: Data, windows: Windows, w: int, a: QuadState, b: QuadState, before: vec3,
-        pa: vec3, va: vec3, pb: vec3, vb: vec3, k: Steps, last: bool, at: Pointers, out: wp.array2d(dtype=vec3), lane: int,
-    ):  # fmt: skip
-        """Write every measured stamp that falls into a step; the window's last step tells all that is left."""
-        next = at
-        vehicles = windows.vehicle_count[w]
-        payloads = windows.payload_count[w]
-        span = k.h
-        while next.vehicle < vehicles:
-            i = windows.vehicle_first[w] + next.vehicle
-            time = late(x, windows, w, data.vehicle_time[i], x.vehicle_delay)
-            if time > k.t1 and not last:
-                break
-            s = (time - k.t0) / span
-            pos = blend_vec(a.pos_w, a.vel_w, b.pos_w, b.vel_w, s, span)
-            q = blend_quat(
-                a.quat_wb, quat_rate(a.quat_wb, a.rate_b), b.quat_wb, quat_rate(b.quat_wb, b.rate_b), s, span
-            )
-            seen, turn = see_pose(x, p.body.com, pos, q, data.vehicle_quat[i])
-            out[2 * next.vehicle, lane] = seen
-            out[2 * next.vehicle + 1, lane] = turn
-            next.vehicle = next.vehicle + 1
-        while next.payload < payloads:
-            time = late(x, windows, w, data.payload_time[windows.payload_first[w] + next.payload], x.payload_delay)
-            if time > k.t1 and not last:
-                break
-            s = (time - k.t0) / span
-            out[2 * vehicles + next.payload, lane] = see_point(x, a.quat_wb, blend_vec(pa, va, pb, vb, s, span))
-            next.payload = next.payload + 1
-        while next.gyro < windows.gyro_count[w]:
-            time = late(x, windows, w, data.gyro_time[windows.gyro_first[w] + next.gyro], x.gyro_delay)
-            if time > k.t1 and not last:
-                break
-            s = (time - k.t0) / span
-            bend = b.rate_b - a.rate_b - (a.rate_b - before)  # a parabola through three ends of steps
-            turning = a.rate_b + s * (b.rate_b - a.rate_b) - real(0.5) * s * (real(1.0) - s) * bend
-            out[2 * vehicles + payloads + next.gyro, lane] = see_rate(x, turning)
-            next.gyro = next.gyro + 1
-        return next
 
     @wp.func
     def push_at(air: Air, axis: int, size: real, share: real):
@@ -267,18 +205,6 @@ def build_replay(t: Types, vehicle: VehicleParams, segments: int, laws: tuple[La
         knots.payload_pos_w[row] = pos
         knots.payload_vel_w[row] = vel
         knots.tension[row] = pull
-
-    @wp.func
-    def inherit(windows: Windows, w: int, at: Pointers, parent: int, lane: int, out: wp.array2d(dtype=vec3)):
-        """What was seen before a lane leaves another."""
-        vehicles = windows.vehicle_count[w]
-        for i in range(2 * at.vehicle):
-            out[i, lane] = out[i, parent]
-        for i in range(2 * vehicles, 2 * vehicles + at.payload):
-            out[i, lane] = out[i, parent]
-        first = 2 * vehicles + windows.payload_count[w]
-        for i in range(first, first + at.gyro):
-            out[i, lane] = out[i, parent]
 
     @wp.kernel(module="unique", enable_backward=False)
     def replay_kernel(

@@ -63,7 +63,7 @@ def test_a_hover_that_took_another_thrust_gives_the_share_to_write_down(run, tmp
 def test_runs_that_say_nothing_of_a_hover(run, tmp_path):
     for name in (CONFIG, "policy.npz"):
         (tmp_path / name).write_bytes((run / name).read_bytes())
-    with pytest.raises(RunError, match="expected the folder of a run"):
+    with pytest.raises(RunError, match="no folder of a run; expected"):
         hover_of_run(tmp_path)
     (tmp_path / TICKS).write_text("")
     with pytest.raises(RunError, match="0 ticks of steady hover before throws; expected 50 or more"):

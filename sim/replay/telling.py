@@ -1,0 +1,108 @@
+"""What measured stamps show of a flight: they lie inside steps, and are read from the cubic through both ends."""
+
+from dataclasses import dataclass
+
+import warp as wp
+
+from sim.quadrotor.rigid_body import quat_rate
+from sim.sensing import build_sensing
+from sim.structs import Types, make_struct
+
+
+@dataclass(frozen=True)
+class Telling:
+    """Functions of :func:`build_telling` and the structs that they take."""
+
+    tell: wp.Function
+    inherit: wp.Function
+    Steps: type  # a step's two ends and its length [s]
+    Pointers: type  # how many stamps of each sensor were told
+
+
+def build_telling(t: Types, Sensing: type, Windows: type, Data: type) -> Telling:
+    """Build what a lane does at the end of each step.
+
+    Args:
+        t: types of the wanted precision.
+        Sensing, Windows, Data: structs of the replay.
+    """
+    real, vec3, quat = t.real, t.vec3, t.quat
+    Vehicle, QuadState = t.Vehicle, t.QuadState
+    see_pose, see_point, see_rate = build_sensing(t, Sensing)
+    Steps = make_struct("Steps", {"t0": real, "t1": real, "h": real})
+    Pointers = make_struct("Pointers", {"vehicle": wp.int32, "payload": wp.int32, "gyro": wp.int32})
+
+    @wp.func
+    def blend_vec(a: vec3, va: vec3, b: vec3, vb: vec3, s: real, h: real):
+        """Cubic through two points with their derivatives."""
+        d = b - a
+        bend = s * (real(1.0) - s)
+        return a + s * d + bend * ((real(1.0) - s) * (h * va - d) - s * (h * vb - d))
+
+    @wp.func
+    def blend_quat(a: quat, va: quat, b: quat, vb: quat, s: real, h: real):
+        d = b - a
+        bend = s * (real(1.0) - s)
+        q = a + d * s + ((va * h - d) * (real(1.0) - s) - (vb * h - d) * s) * bend
+        return wp.normalize(q)
+
+    @wp.func
+    def late(x: Sensing, windows: Windows, w: int, stamp: real, delay: real):
+        """Time of the state that a stamp shows."""
+        return stamp - delay - x.clock_rate * (stamp - windows.clock_zero[w])
+
+    @wp.func
+    def tell(
+        p: Vehicle, x: Sensing, data: Data, windows: Windows, w: int, a: QuadState, b: QuadState, before: vec3,
+        pa: vec3, va: vec3, pb: vec3, vb: vec3, k: Steps, last: bool, at: Pointers, out: wp.array2d(dtype=vec3), lane: int,
+    ):  # fmt: skip
+        """Write every measured stamp that falls into a step; the window's last step tells all that is left."""
+        next = at
+        vehicles = windows.vehicle_count[w]
+        payloads = windows.payload_count[w]
+        span = k.h
+        while next.vehicle < vehicles:
+            i = windows.vehicle_first[w] + next.vehicle
+            time = late(x, windows, w, data.vehicle_time[i], x.vehicle_delay)
+            if time > k.t1 and not last:
+                break
+            s = (time - k.t0) / span
+            pos = blend_vec(a.pos_w, a.vel_w, b.pos_w, b.vel_w, s, span)
+            q = blend_quat(
+                a.quat_wb, quat_rate(a.quat_wb, a.rate_b), b.quat_wb, quat_rate(b.quat_wb, b.rate_b), s, span
+            )
+            seen, turn = see_pose(x, p.body.com, pos, q, data.vehicle_quat[i])
+            out[2 * next.vehicle, lane] = seen
+            out[2 * next.vehicle + 1, lane] = turn
+            next.vehicle = next.vehicle + 1
+        while next.payload < payloads:
+            time = late(x, windows, w, data.payload_time[windows.payload_first[w] + next.payload], x.payload_delay)
+            if time > k.t1 and not last:
+                break
+            s = (time - k.t0) / span
+            out[2 * vehicles + next.payload, lane] = see_point(x, a.quat_wb, blend_vec(pa, va, pb, vb, s, span))
+            next.payload = next.payload + 1
+        while next.gyro < windows.gyro_count[w]:
+            time = late(x, windows, w, data.gyro_time[windows.gyro_first[w] + next.gyro], x.gyro_delay)
+            if time > k.t1 and not last:
+                break
+            s = (time - k.t0) / span
+            bend = b.rate_b - a.rate_b - (a.rate_b - before)  # a parabola through three ends of steps
+            turning = a.rate_b + s * (b.rate_b - a.rate_b) - real(0.5) * s * (real(1.0) - s) * bend
+            out[2 * vehicles + payloads + next.gyro, lane] = see_rate(x, turning)
+            next.gyro = next.gyro + 1
+        return next
+
+    @wp.func
+    def inherit(windows: Windows, w: int, at: Pointers, parent: int, lane: int, out: wp.array2d(dtype=vec3)):
+        """What was seen before a lane leaves another."""
+        vehicles = windows.vehicle_count[w]
+        for i in range(2 * at.vehicle):
+            out[i, lane] = out[i, parent]
+        for i in range(2 * vehicles, 2 * vehicles + at.payload):
+            out[i, lane] = out[i, parent]
+        first = 2 * vehicles + windows.payload_count[w]
+        for i in range(first, first + at.gyro):
+            out[i, lane] = out[i, parent]
+
+    return Telling(tell, inherit, Steps, Pointers)
