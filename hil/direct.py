@@ -17,7 +17,7 @@ import numpy as np
 from hil.fakes import KINDS, WirePlant
 from hil.fakes.set_points import SetPoints
 from hil.frames import FrameParams
-from hil.mocap import Mocap, MocapParams
+from hil.mocap import SLACK, Mocap, MocapParams
 from hil.params import HilParams
 from hil.pose import PAYLOAD, VEHICLE, Pose
 from hil.track import BodyState, Track
@@ -33,7 +33,6 @@ MOST = 8.0
 """After which a throw is given up [s]."""
 
 OURS = FrameParams("x,y,z", "x,y,z", "xyzw", 0.0, (0.0, 0.0, 0.0))
-SLACK = 1e-9
 
 
 class Direct:

@@ -54,7 +54,7 @@ def centre_share(rope: Any, i: int, last: int):
     """Part of a rod's lengthening that its centre of mass follows."""
     if i == last:
         return rope.stretched_share
-    return rope.stretched_share - rope.stretched_share + type(rope.stretched_share)(0.5)
+    return type(rope.stretched_share)(0.5)
 
 
 @wp.func
