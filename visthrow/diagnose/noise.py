@@ -46,6 +46,10 @@ HUBER_SHARE = 0.02
 BAD_NATS = 8.0
 """Log-likelihood that a window's own level must gain; that of chance stays below 4 in a hundred windows."""
 
+GOOD_NATS = 2.0
+"""That a bad window's own level must still be worth, once the levels of all others have moved: less than it took, so that sets of
+bad windows do not follow each other in a circle."""
+
 BAD_SHARE = 0.34
 """Share of a phase's windows that may be bad; where more are, the phase is rough."""
 
@@ -129,11 +133,11 @@ def refit(grams: Sequence[Gram], start: Noise) -> Noise:
 
 def _with_own_levels(grams: Sequence[Gram], noise: Noise) -> Noise:
     """The levels with those of bad windows, until the same windows count as bad: then all levels are at their best together."""
+    common: set[tuple[str, int]] = set()
     for _ in range(ROUNDS):
-        own = _own_levels(grams, noise)
+        own = _own_levels(grams, noise, common)
         if np.all(np.isfinite(own) == np.isfinite(noise.own)):
             break
-        own = np.where(np.isfinite(own) & np.isfinite(noise.own), noise.own, own)  # these were found to more than a grid's step
         noise, _ = _maximise(grams, replace(noise, own=own))
     return noise
 
@@ -269,14 +273,23 @@ def _window_likelihood(gram: Gram, noise: Noise, window: int) -> tuple[float, np
     return state.log_likelihood, np.concatenate((by_block, left * weight - gram.count)), curvature
 
 
-def _own_levels(grams: Sequence[Gram], noise: Noise) -> np.ndarray:
-    """Latent deviations of windows that stand far above their phase's, shape (windows, 3); NaN for all others."""
+def _own_levels(grams: Sequence[Gram], noise: Noise, common: set[tuple[str, int]]) -> np.ndarray:
+    """Latent deviations of windows that stand far above their phase's, shape (windows, 3); NaN for all others.
+
+    Args:
+        grams: of the windows.
+        noise: levels so far. A window that counts as bad stays so unless its phase's level does nearly as well.
+        common: (phase, block)s whose windows have one level; those are added of which many windows stand out, for good: the
+            phase's level rises to theirs, and were they let out again it would fall.
+    """
     found = each(lambda w: _own_levels_of(grams[w], noise, w), range(len(grams)))
     own = np.array(found).reshape(noise.own.shape)
-    for phase in {gram.phase for gram in grams}:
+    for phase in sorted({gram.phase for gram in grams}):
         of_phase = np.array([gram.phase == phase for gram in grams])
-        many = np.isfinite(own[of_phase]).sum(0) > BAD_SHARE * of_phase.sum()  # what many windows have is the phase's own level
-        own[np.ix_(of_phase, many)] = np.nan
+        many = np.isfinite(own[of_phase]).sum(0) > BAD_SHARE * of_phase.sum()
+        common |= {(phase, int(block)) for block in np.flatnonzero(many)}
+        shared = [block for block in range(own.shape[1]) if (phase, block) in common]
+        own[np.ix_(of_phase, shared)] = np.nan
     return own
 
 
@@ -287,12 +300,14 @@ def _own_levels_of(gram: Gram, noise: Noise, window: int) -> np.ndarray:
     for block in np.unique(gram.latent_block):
         at = gram.nuisances + np.flatnonzero(gram.latent_block == block)
         used, shared = level[gram.latent_block == block][0], noise.latent_sd[int(block), gram.phase]
-        own[block] = _own_level(state, at, used, shared)
+        own[block] = _own_level(state, at, used, shared, bool(np.isfinite(noise.own[window, block])))
     return own
 
 
-def _own_level(state: Posterior, at: np.ndarray, used: float, shared: float) -> float:
+def _own_level(state: Posterior, at: np.ndarray, used: float, shared: float, bad: bool) -> float:
     """A level that explains one block of a window far better than its phase's; NaN where there is none.
+
+    A window that counts as bad keeps the level that was found for it unless its phase's is within ``GOOD_NATS``.
 
     The block's posterior precision is 1 + used^2 R, with R what the window says of unit forces: its eigenvalues give the
     likelihood of every level at once.
@@ -302,14 +317,17 @@ def _own_level(state: Posterior, at: np.ndarray, used: float, shared: float) -> 
         at: of the block's coefficients.
         used: level that the posterior rests on.
         shared: level of the phase.
+        bad: whether ``used`` is the window's own level.
     """
     precision = np.linalg.inv(state.covariance[np.ix_(at, at)])
     said, turn = np.linalg.eigh(precision - np.eye(len(at)))
     said = np.maximum(said, 0.0)
     score = (turn.T @ (precision @ state.mean[at])) ** 2
-    share = (np.array([1.0, *FACTORS]) * shared / used)[:, None] ** 2
+    share = (np.array([1.0, used / shared, *FACTORS]) * shared / used)[:, None] ** 2
     values = 0.5 * np.sum(share * score / (1.0 + share * said) - np.log1p(share * said), axis=1)
-    plain, values = values[0], values[1:]
+    plain, now, values = values[0], values[1], values[2:]
+    if bad:
+        return float(used) if used > shared and now > plain + GOOD_NATS else np.nan
     below = np.flatnonzero(values < plain)
     values = values[: below[0]] if len(below) else values
     if not len(values) or values.max() <= plain + BAD_NATS:
