@@ -71,7 +71,8 @@ def table_of(text: str, payload: bool) -> Table:
 class Follower(Tracker):
     """The tracking pilot, softer so that a vehicle without payload stays calm, who adds what the table asks for."""
 
-    gains = 2.0, 2.4, 8.0
+    gains = 2.0, 2.4, 4.5
+    lead = 0.0  # accelerations of a table are too rough to read off how to turn
 
     def command(self, t: float, x, v, q, hanging) -> np.ndarray:
         """See :meth:`tests.worlds.pilot.Tracker.command`."""

@@ -4,8 +4,14 @@ import numpy as np
 
 PERIOD = 0.02
 GRAVITY = 9.81
-POSITION, VELOCITY, ATTITUDE = 5.0, 3.6, 8.0
-"""Gains [1/s^2], [1/s], [1/s] of the tracking controller."""
+POSITION, VELOCITY, ATTITUDE = np.array([3.0, 3.0, 6.0]), np.array([2.8, 2.8, 4.0]), 4.5
+"""Gains [1/s^2], [1/s], [1/s] of the tracking controller: calm with 20 ms more of delay or motor lag, or 30 % less rate gain."""
+LEAD = 0.06
+"""How far ahead the pilot reads off the reference how to turn [s]: the delay and the motors' lag that he knows."""
+SHAKE = np.array([0.8, 0.8, 0.0])
+"""Deviation of rates that are added to free flights, to excite the vehicle [rad/s]."""
+TONES = 5
+"""Sines that this sums, of 0.8 to 4 Hz."""
 RATE_LIMIT = np.array([10.0, 10.0, 4.0])
 
 
@@ -31,6 +37,11 @@ class FreeFlight:
         self.centre = np.array([0.0, 0.0, height])
         self.yaw = rng.uniform(-0.8, 0.8), rng.uniform(0.2, 0.6)
         self.release = np.inf
+        self.tones, self.phases = rng.uniform(0.8, 4.0, (TONES, 3)) * 2 * np.pi, rng.uniform(0, 2 * np.pi, (TONES, 3))
+
+    def shaken(self, t: float) -> np.ndarray:
+        """Rates that are added [rad/s]."""
+        return SHAKE * gentle(t)[1] * np.sqrt(2 / TONES) * np.sin(self.tones * t + self.phases).sum(0)
 
     def at(self, t: float):
         tau, pace, change = gentle(t)
@@ -42,11 +53,11 @@ class FreeFlight:
 
 
 class Throw:
-    """Hover for a second, swing back, accelerate, release, brake."""
+    """Hover for a second, swing back, accelerate, release, brake; at ``push`` [m/s^2] for half a second."""
 
-    def __init__(self, rng: np.random.Generator, speed: float, heading: float):
+    def __init__(self, rng: np.random.Generator, push: float, heading: float):
         self.along = np.array([np.cos(heading), np.sin(heading), 0.0])
-        self.back, self.push = rng.uniform(1.5, 3.0), speed * rng.uniform(0.9, 1.1)
+        self.back, self.push = rng.uniform(1.5, 3.0), push * rng.uniform(0.9, 1.1)
         self.lift = rng.uniform(0.3, 1.2)
         self.home = np.array([rng.uniform(-0.3, 0.3), rng.uniform(-0.3, 0.3), rng.uniform(1.5, 2.0)])
         self.release = 1.0 + 0.70 + rng.uniform(-0.04, 0.06)
@@ -54,6 +65,10 @@ class Throw:
         a = np.outer(self._push(grid), self.along) + np.outer(self._rise(grid), [0.0, 0.0, 1.0])
         v = np.cumsum(a, 0) * 0.005
         self.grid, self.a, self.v, self.p = grid, a, v, self.home + np.cumsum(v, 0) * 0.005
+
+    def shaken(self, t: float) -> np.ndarray:
+        """Rates that are added [rad/s]: none, a throw excites by itself."""
+        return np.zeros(3)
 
     def _bump(self, t, start, stop):
         return smooth((t - start) / 0.1) * (1 - smooth((t - stop) / 0.1))
@@ -71,10 +86,18 @@ class Throw:
         return self.p[i], self.v[i], self.a[i], 0.0
 
 
+def turn_rate(reference, t: float, step: float = 0.01) -> np.ndarray:
+    """How fast the thrust that a reference asks for turns [rad/s], world frame."""
+    before, after = (np.asarray(reference.at(t + h)[2]) + [0.0, 0.0, GRAVITY] for h in (-step, step))
+    before, after = before / np.linalg.norm(before), after / np.linalg.norm(after)
+    return np.cross(before, after) / (2 * step)
+
+
 class Tracker:
     """Flies lanes along their references from position, velocity, attitude with the noise of a tracking system."""
 
     gains = POSITION, VELOCITY, ATTITUDE
+    lead = LEAD
 
     def __init__(self, references: list, mass: float, ball_mass: float, rng: np.random.Generator):
         self.references, self.rng = references, rng
@@ -103,6 +126,11 @@ class Tracker:
         front = np.cross(side, up)
         error = 0.5 * (np.cross(body_x, front) + np.cross(body_y, side) + np.cross(body_z, up))
         in_body = np.stack([(error * body_x).sum(1), (error * body_y).sum(1), (error * body_z).sum(1)], -1)
-        rates = np.clip(2 * attitude * in_body * [1, 1, 0.5], -RATE_LIMIT, RATE_LIMIT)
+        rates = 2 * attitude * in_body * [1, 1, 0.5]
+        if self.lead:
+            turning = np.array([turn_rate(r, t + self.lead) for r in self.references])
+            rates += np.stack([(turning * body).sum(1) for body in (body_x, body_y, body_z)], -1)
+            rates += np.array([r.shaken(t) for r in self.references])
+        rates = np.clip(rates, -RATE_LIMIT, RATE_LIMIT)
         thrust = np.clip(mass * (a * body_z).sum(1), 0.3, 13.0)
         return np.column_stack([thrust, rates])
