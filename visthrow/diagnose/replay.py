@@ -109,6 +109,33 @@ class Flights:
         parts = self.samples[name]
         return Samples(np.concatenate([p.time for p in parts]), np.concatenate([p.values for p in parts]), 1.0)
 
+    def time(self, w: int) -> np.ndarray:
+        """Stamps of a window's samples [s], shape (N,)."""
+        s = self.samples
+        return self.spread(w, s["vehicle"][w].time, s["vehicle"][w].time, s["payload"][w].time, s["gyro"][w].time)
+
+    def sigma(self, w: int) -> np.ndarray:
+        """Noise of a window's samples, shape (N,)."""
+        return self.spread(w, *[self.samples[name][w].sigma for name in ("vehicle", "attitude", "payload", "gyro")])
+
+    def spread(self, w: int, vehicle, attitude, payload, gyro) -> np.ndarray:
+        """A number for every sample of a window, from one for each row of its groups."""
+        s = self.samples
+        pairs = np.stack(np.broadcast_arrays(vehicle, attitude), axis=-1).ravel()
+        counts = len(s["vehicle"][w].time), len(s["payload"][w].time), len(s["gyro"][w].time)
+        if pairs.size == 2:
+            pairs = np.tile(pairs, counts[0])
+        rest = [np.broadcast_to(value, count) for value, count in zip((payload, gyro), counts[1:])]
+        return np.repeat(np.concatenate((pairs, *rest)), 3)
+
+    def residual(self, seen: np.ndarray, w: int, lane: int) -> np.ndarray:
+        """Measured minus simulated, shape (N,); of an attitude the rotation vector from the simulated to the measured."""
+        nv, rows = int(self.windows["vehicle_count"][w]), int(self.rows[w])
+        measured = np.zeros((rows, 3))
+        measured[0 : 2 * nv : 2] = self.samples["vehicle"][w].values
+        measured[2 * nv :] = np.concatenate((self.samples["payload"][w].values, self.samples["gyro"][w].values))
+        return (measured - seen[:rows, lane]).ravel()
+
     def fly(self, replay: Replay, settings: Sequence[Setting], states: States, lanes: Sequence[Lane], substep: float) -> Replayed:
         """Fly lanes; ``settings`` are those of the replay's rows.
 

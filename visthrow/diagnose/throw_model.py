@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from camera.params import CameraParams
 from sim.params import PlantParams, SensingParams
-from sim.replay.kernel import ATTACHED, NO_PAYLOAD
+from sim.replay.kernel import NO_PAYLOAD
 from sim.replay.lanes import Replay
 from visthrow.diagnose.catalogue import Entry, Setting, apply, entries_for
 from visthrow.diagnose.cutting import Cut, around_slack, cut, thinned
@@ -19,6 +19,7 @@ from visthrow.diagnose.model import Window
 from visthrow.diagnose.opened import opened
 from visthrow.diagnose.recorded import NEVER, carriers, record_of
 from visthrow.diagnose.replay import BATCH, CUDA_BATCH, KNOT_SPACING, Flights, Lane, carried
+from visthrow.diagnose.settling import Settling, perturbed
 from visthrow.diagnose.sightings import channels_of, needs_no_flight, sightings, with_sightings
 from visthrow.diagnose.states import (
     States,
@@ -26,31 +27,14 @@ from visthrow.diagnose.states import (
     directions,
     hover_state,
     measured_state,
-    moved,
     resampled,
-    stacked,
 )
 from visthrow.errors import DiagnoseError
 from visthrow.flightlog import FlightLog
 
 LATENT_SIZES = (0.05, 0.05, 0.05, 1e-3, 1e-3, 1e-3, 0.01, 0.01, 0.01)
 """Of the latent forces' derivatives: force [N], torque [N m], force on the payload [N]."""
-DAMPING, DAMPING_MOST = 1e-3, 1e5
-"""Of the Levenberg-Marquardt steps: at first, and where a window counts as settled."""
-ROUNDS = 25
 AFTER_SLACK = 0.05  # that a rope is given to come taut [s]
-HUBER = 30.0  # deviations, beyond which a sample counts less
-SETTLED = 0.003  # relative fall of the cost below which an initial state is settled
-MOVED = 0.2  # relative fall of the cost above which derivatives by the initial state are taken anew
-ROUGHER = 3.0
-"""Added to the square of the step, in the nominal one, for derivatives that only point the way to an initial state: twice as
-long steps. Columns keep the nominal step: twice as long ones changed those of rope and release in throws by up to their size.
-"""
-EARLIER = 0.05  # by which a payload may leave before it is expected to [s]
-SEEN = 0.25  # before that, without which an initial state is fitted to the whole window [s]
-TRUSTED = ("motor_speed",)
-"""Fields that are linearised about where the commands left them. Fitted without gusts they would take the gusts' place: rotors
-far from their commands at the start of a window, and with them a law of the thrust's slope that is none."""
 
 
 class ThrowModel:
@@ -130,14 +114,14 @@ class ThrowModel:
             self.flights = Flights(flights, without_slack, delays, stride)
             states = self._begin(self.setting)
         self._told = np.array([w for w, c in enumerate(self.flights.cuts) if c.told])
-        self._states = self._latest = self._settle(self.setting, states)
+        self._states = self._latest = self._settling(self.setting).fit(states)
         self._sightings = sightings(logs, flights, self.flights.cuts, self.setting)
 
     def windows(self, theta: Mapping[str, float]) -> list[Window]:
         """See :class:`visthrow.diagnose.model.Model`."""
         setting = apply(self.entries, self.setting, theta)
         self._directions = directions(setting.plant)  # another kind of block has other states
-        states = self._states if setting == self.setting else self._settle(setting, self._better_start(setting))
+        states = self._states if setting == self.setting else self._settled(setting)
         self._latest = states
         steps = [self._step(e, theta.get(e.effect.name, 0.0)) for e in self._graded]
         settings = [setting, *[e.apply(setting, step) for e, step in zip(self._graded, steps)]]
@@ -174,7 +158,7 @@ class ThrowModel:
         start = resampled(states, other.plant.rope.segments)
         seen = self.flights.fly(self._replay([other]), [other], start, lanes, self.substep).seen
         sign = -1.0 if on else 1.0
-        return [sign * (x.residual - self._residual(seen, w, lane)) for lane, (w, x) in enumerate(zip(self._told, windows))]
+        return [sign * (x.residual - self.flights.residual(seen, w, lane)) for lane, (w, x) in enumerate(zip(self._told, windows))]
 
     def residuals(self, theta: Mapping[str, float]) -> list[np.ndarray]:
         """See :class:`visthrow.diagnose.model.Model`; from the initial states of the last :meth:`windows`."""
@@ -182,7 +166,7 @@ class ThrowModel:
         lanes = [Lane(w, 0, w) for w in self._told]
         states = resampled(self._latest, setting.plant.rope.segments)
         seen = self.flights.fly(self._replay([setting]), [setting], states, lanes, self.substep).seen
-        flown = [self._residual(seen, w, lane) for lane, w in enumerate(self._told)]
+        flown = [self.flights.residual(seen, w, lane) for lane, w in enumerate(self._told)]
         return [np.concatenate((r, *self._sighting_residuals(w, setting))) for r, w in zip(flown, self._told)]
 
     def _sighting_residuals(self, w: int, setting: Setting) -> list[np.ndarray]:
@@ -193,12 +177,12 @@ class ThrowModel:
         """Largest change of any sample of each channel when the step is so many times finer, in its noise."""
         fine = dataclasses.replace(self.setting, step_square=1.0 / finer**2)
         settings = [self.setting, fine]
-        count = len(self._told)
+        count, f = len(self._told), self.flights
         lanes = [Lane(w, s, w) for s in range(2) for w in self._told]
-        seen = self.flights.fly(self._replay(settings), settings, self._states, lanes, self.substep).seen
+        seen = f.fly(self._replay(settings), settings, self._states, lanes, self.substep).seen
         worst = dict.fromkeys(self.channels, 0.0)
         for lane, w in enumerate(self._told):
-            off = np.abs(self._residual(seen, w, lane) - self._residual(seen, w, count + lane)) / self._sigma(w)
+            off = np.abs(f.residual(seen, w, lane) - f.residual(seen, w, count + lane)) / f.sigma(w)
             for i, name in enumerate(self.channels):
                 here = off[self._channel(w) == i]
                 worst[name] = max(worst[name], float(here.max())) if len(here) else worst[name]
@@ -223,7 +207,7 @@ class ThrowModel:
     def begun(self, theta: Mapping[str, float]) -> tuple[Setting, States]:
         """The setting with effects at ``theta``, and initial states fitted in it."""
         setting = apply(self.entries, self.setting, theta)
-        return setting, self._settle(setting, self._begin(setting))
+        return setting, self._settling(setting).fit(self._begin(setting))
 
     def _replay(self, settings: Sequence[Setting]) -> Replay:
         return Replay([s.plant for s in settings], [s.sensing for s in settings], self.device)
@@ -240,14 +224,17 @@ class ThrowModel:
 
         return carried(self.flights, self._replay([setting]), setting, begin, self.substep)
 
-    def _better_start(self, setting: Setting) -> States:
-        """For each window, the better of the states settled at theta = 0 and those that the setting itself begins with."""
-        fresh, which = self._begin(setting), np.arange(len(self.flights.cuts))
-        replay, settled = self._replay([setting]), resampled(self._states, setting.plant.rope.segments)
-        old, new = (
-            np.array([_huber(r) for r in self._residuals(replay, setting, states, which)]) for states in (settled, fresh)
-        )
-        return {name: np.where(_like(new < old, value), fresh[name], value) for name, value in settled.items()}
+    def _settling(self, setting: Setting) -> Settling:
+        """What fits initial states in a setting."""
+        return Settling(
+            self.flights, self._told, self._directions, setting, lag=self.setting.plant.release.lag, substep=self.substep,
+            device=self.device,
+        )  # fmt: skip
+
+    def _settled(self, setting: Setting) -> States:
+        """States fitted in a setting, from the better of those settled at theta = 0 and those that the setting begins with."""
+        settling = self._settling(setting)
+        return settling.fit(settling.better(resampled(self._states, setting.plant.rope.segments), self._begin(setting)))
 
     @staticmethod
     def _step(e: Entry, theta: float) -> float:
@@ -270,17 +257,9 @@ class ThrowModel:
     def _nuisances(self, w: int) -> list[int]:
         return [d for d, x in enumerate(self._directions) if concerns(x, self.flights.cuts[w])]
 
-    def _fitted(self, w: int) -> list[int]:
-        """Directions in which a window's initial state is fitted."""
-        return [d for d in self._nuisances(w) if self._directions[d].field not in TRUSTED]
-
     def _latents(self, w: int) -> list[tuple[int, int]]:
         axes = 6 if self.flights.cuts[w].payload == NO_PAYLOAD else 9
         return [(axis, knot) for axis in range(axes) for knot in range(int(self.flights.knots[w]))]
-
-    def _moved(self, states: States) -> States:
-        """The states, and after them each direction's perturbed ones: row ``(1 + d) W + w``."""
-        return stacked([states, *[moved(states, d, d.step) for d in self._directions]])
 
     def _linearised(
         self, replay: Replay, settings: list[Setting], steps: np.ndarray, states: States, batch: list[int]
@@ -301,7 +280,7 @@ class ThrowModel:
                 Lane(w, 0, w, axis, knot, LATENT_SIZES[axis], resume=first + max(knot - 1, 0), parent=parent)
                 for axis, knot in self._latents(w)
             ]
-        flown = self.flights.fly(replay, settings, self._moved(states), lanes, self.substep)
+        flown = self.flights.fly(replay, settings, perturbed(states, self._directions), lanes, self.substep)
         out, at, keep = [], 0, 0
         for w in batch:
             nuisances, latents = self._nuisances(w), self._latents(w)
@@ -317,13 +296,14 @@ class ThrowModel:
         self, seen: np.ndarray, setting: Setting, steps: np.ndarray, w: int, nuisances: list[int], latents: list, knots: dict
     ) -> Window:
         """One window from its lanes: nominal, effects, initial states, latent forces."""
-        rows, c = int(self.flights.rows[w]), self.flights.cuts[w]
+        f = self.flights
+        rows, c = int(f.rows[w]), f.cuts[w]
         flat = np.ascontiguousarray(np.swapaxes(seen[:rows], 1, 2)).reshape(3 * rows, -1)
         K, D = len(steps), len(nuisances)
         sizes = [*steps, *[self._directions[d].step for d in nuisances], *[LATENT_SIZES[axis] for axis, _ in latents]]
         slopes = (flat[:, 1:] - flat[:, :1]) / np.array(sizes)
         return Window(
-            c.flight, c.phase, self._time(w), self._channel(w), self._residual(seen, w, 0), self._sigma(w), slopes[:, :K],
+            c.flight, c.phase, f.time(w), self._channel(w), f.residual(seen, w, 0), f.sigma(w), slopes[:, :K],
             slopes[:, K : K + D], np.array([self._directions[d].sd for d in nuisances]), slopes[:, K + D :],
             np.array([axis // 3 for axis, _ in latents]), np.array([axis % 3 for axis, _ in latents]),
             np.array([c.start + KNOT_SPACING * knot for _, knot in latents]), self._at_knots(setting, w, knots),
@@ -344,36 +324,9 @@ class ThrowModel:
             told["tension"][told["time"] > f.latch + setting.plant.release.lag] = 0.0
         return told
 
-    def _residual(self, seen: np.ndarray, w: int, lane: int) -> np.ndarray:
-        """Measured minus simulated, shape (N,); of an attitude the rotation vector from the simulated to the measured."""
-        f = self.flights
-        nv, rows = int(f.windows["vehicle_count"][w]), int(f.rows[w])
-        measured = np.zeros((rows, 3))
-        measured[0 : 2 * nv : 2] = f.samples["vehicle"][w].values
-        measured[2 * nv :] = np.concatenate((f.samples["payload"][w].values, f.samples["gyro"][w].values))
-        return (measured - seen[:rows, lane]).ravel()
-
-    def _rows(self, w: int, vehicle, attitude, payload, gyro) -> np.ndarray:
-        """A number for every sample of a window, from one for each row of its groups."""
-        s = self.flights.samples
-        pairs = np.stack(np.broadcast_arrays(vehicle, attitude), axis=-1).ravel()
-        counts = len(s["vehicle"][w].time), len(s["payload"][w].time), len(s["gyro"][w].time)
-        if pairs.size == 2:
-            pairs = np.tile(pairs, counts[0])
-        rest = [np.broadcast_to(value, count) for value, count in zip((payload, gyro), counts[1:])]
-        return np.repeat(np.concatenate((pairs, *rest)), 3)
-
-    def _time(self, w: int) -> np.ndarray:
-        s = self.flights.samples
-        return self._rows(w, s["vehicle"][w].time, s["vehicle"][w].time, s["payload"][w].time, s["gyro"][w].time)
-
     def _channel(self, w: int) -> np.ndarray:
         at = {name: i for i, name in enumerate(self.channels)}
-        return self._rows(w, 0, 1, at.get("payload_pos_w", -1), at.get("rate_b", -1)).astype(int)
-
-    def _sigma(self, w: int) -> np.ndarray:
-        s = self.flights.samples
-        return self._rows(w, *[s[name][w].sigma for name in ("vehicle", "attitude", "payload", "gyro")])
+        return self.flights.spread(w, 0, 1, at.get("payload_pos_w", -1), at.get("rate_b", -1)).astype(int)
 
     def _without_slack(self, states: States) -> list[Cut]:
         """The windows, with the time in which the rope is slack cut out."""
@@ -386,97 +339,3 @@ class ThrowModel:
             separation = self.flights.flights[c.flight].latch + self.setting.plant.release.lag
             cuts += [c] if last < c.start else around_slack(c, first, last + AFTER_SLACK, separation)
         return cuts
-
-    def _settle(self, setting: Setting, states: States) -> States:
-        """Fit each window's initial state to its samples by Levenberg and Marquardt; no step that does not help is taken."""
-        replay, count = self._replay([setting]), len(self.flights.cuts)
-        moves, damping = np.zeros((count, len(self._directions))), np.full(count, DAMPING)
-        left, cost = self._told, np.full(count, np.inf)
-        stale, aged = np.ones(count, dtype=bool), np.zeros(count, dtype=bool)
-        residuals = dict(zip(left, self._residuals(replay, setting, states, left)))
-        cost[left] = [_huber(residuals[w]) for w in left]
-        slopes: dict[int, np.ndarray] = {}
-        for _ in range(ROUNDS):
-            slopes |= self._state_slopes(replay, setting, states, left[stale[left]])
-            aged &= ~stale
-            trial = np.zeros_like(moves)
-            for w in left:
-                trial[w] = self._increment(w, slopes[w], residuals[w], moves[w], damping[w])
-            there = states
-            for d, direction in enumerate(self._directions):
-                there = moved(there, direction, trial[:, d])
-            tried, seen = np.full(count, np.inf), dict(zip(left, self._residuals(replay, setting, there, left)))
-            tried[left] = [_huber(seen[w]) for w in left]
-            better = tried < cost
-            residuals |= {w: seen[w] for w in left if better[w]}
-            states = {name: np.where(_like(better, v), there[name], v) for name, v in states.items()}
-            moves[better] += trial[better]
-            little = better & (tried > (1.0 - SETTLED) * cost)
-            settled = little & ~aged  # by derivatives from elsewhere a step may be short though the goal is far
-            stale = np.where(better, (tried < (1.0 - MOVED) * cost) | little, aged)
-            damping = np.where(better, damping / 10.0, np.where(aged, damping, damping * 10.0))
-            aged, cost = aged | better, np.where(better, tried, cost)
-            left = left[~settled[left] & (damping[left] < DAMPING_MOST)]
-            if not len(left):
-                break
-        return states
-
-    def _residuals(self, replay: Replay, setting: Setting, states: States, which: np.ndarray) -> list[np.ndarray]:
-        """Residuals of windows in the noise, of what tells of their initial states."""
-        seen = self.flights.fly(replay, [setting], states, [Lane(w, 0, w) for w in which], self.substep).seen
-        return [self._tells_of_start(w) * self._residual(seen, w, lane) / self._sigma(w) for lane, w in enumerate(which)]
-
-    def _tells_of_start(self, w: int) -> np.ndarray:
-        """1 for samples before the payload may have left, 0 for later ones, which tell of the release; all 1 where few are left."""
-        c, time = self.flights.cuts[w], self._time(w)
-        left = self.flights.flights[c.flight].latch + self.setting.plant.release.lag - EARLIER
-        if c.payload != ATTACHED or not c.start + SEEN < left < c.end:
-            return np.ones(len(time))
-        return (time < left).astype(float)
-
-    def _state_slopes(self, replay: Replay, setting: Setting, states: States, which: np.ndarray) -> dict[int, np.ndarray]:
-        """Derivatives of windows' samples by their initial states, in the noise."""
-        if not len(which):
-            return {}
-        count, lanes, first = len(self.flights.cuts), [], []
-        for w in which:
-            first.append(len(lanes))
-            lanes += [Lane(w, 0, w), *[Lane(w, 0, (1 + d) * count + w) for d in self._fitted(w)]]
-        seen = self.flights.fly(replay, [_rougher(setting)], self._moved(states), lanes, self.substep).seen
-        slopes = {}
-        for at, w in zip(first, which):
-            ds, rows = self._fitted(w), int(self.flights.rows[w])
-            flat = np.swapaxes(seen[:rows, at : at + 1 + len(ds)], 1, 2).reshape(3 * rows, -1)
-            steps = np.array([self._directions[d].step for d in ds])
-            slopes[w] = (flat[:, 1:] - flat[:, :1]) / steps * (self._tells_of_start(w) / self._sigma(w))[:, None]
-        return slopes
-
-    def _increment(self, w: int, slopes: np.ndarray, residual: np.ndarray, done: np.ndarray, damping: float) -> np.ndarray:
-        """Levenberg-Marquardt step of a window's state, with its vague prior; shape (directions,)."""
-        ds = self._fitted(w)
-        sd = np.array([self._directions[d].sd for d in ds])
-        weight = np.minimum(1.0, HUBER / np.maximum(np.abs(residual), 1e-12))
-        scaled = slopes * sd
-        normal = scaled.T @ (scaled * weight[:, None]) + np.eye(len(ds))
-        normal += damping * np.diag(np.diag(normal))
-        wanted = scaled.T @ (residual * weight) - done[ds] / sd
-        out = np.zeros(len(done))
-        out[ds] = np.linalg.solve(normal, wanted) * sd
-        return out
-
-
-def _like(mask: np.ndarray, value: np.ndarray) -> np.ndarray:
-    """The mask with as many axes as a value."""
-    return mask.reshape(-1, *[1] * (value.ndim - 1))
-
-
-def _rougher(setting: Setting) -> Setting:
-    """The setting with longer steps, for lanes that only point the way."""
-    return dataclasses.replace(setting, step_square=setting.step_square + ROUGHER)
-
-
-def _huber(residual: np.ndarray) -> float:
-    """Huber's cost of residuals in the noise; infinite where one is not finite."""
-    off = np.abs(residual)
-    cost = float(np.sum(np.where(off < HUBER, 0.5 * off**2, HUBER * (off - 0.5 * HUBER))))
-    return cost if np.isfinite(cost) else np.inf
