@@ -1,15 +1,17 @@
 """What closes the loop, but for flights and trainings: recording, extending, counting what was won back."""
 
 import json
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from visthrow import config
-from visthrow.diagnose import loop
+from visthrow.diagnose import ablations, hall, loop, recorded
 from visthrow.errors import DiagnoseError
 from visthrow.flightlog import Channel, FlightLog
+from visthrow.loading import load_policy
 from visthrow.task import Experiment
 
 
@@ -142,3 +144,73 @@ def test_finished_loops_are_shown_and_others_refused(tmp_path, monkeypatch):
     (tmp_path / "committed").mkdir()
     (tmp_path / "committed" / "a.json").write_text(json.dumps(harmless))
     assert loop.read()[0]["hidden"] == {"motor_tau": 0.02}
+
+
+def test_throws_side_by_side_come_down_at_their_goals():
+    """Each of a batch flies to its own goal, asks for its own release, and is logged as one flight."""
+    goals = np.array([[1.4, 0.0, 0.0], [0.0, -1.2, 0.0]])
+    logs = hall.throws(load_policy("state"), "hybrid", goals, 0)
+    for goal, log in zip(goals, logs):
+        begin, landing = log.meta["times"]["policy_start"], log["landing"]
+        assert np.linalg.norm(landing.values[0, :2] - goal[:2]) < 0.1
+        asked = log["release_command"].values > 0.5
+        assert begin < log["release_command"].time[asked][0] < landing.time[0]
+        apart = np.linalg.norm(log["pos_w"].values - log["payload_pos_w"].values, axis=1)
+        assert np.ptp(apart[log["pos_w"].time < begin]) < 0.01  # hangs still
+        seen = loop.recorded_in_a_hall(log, np.random.default_rng(0))
+        assert "landing" not in seen
+        assert recorded.record_of(seen, 0).latch == pytest.approx(log["release_command"].time[asked][0])
+    assert np.linalg.norm(logs[0]["landing"].values - logs[1]["landing"].values) > 1.0
+
+
+def test_a_batch_that_does_not_come_down_is_an_error(monkeypatch):
+    monkeypatch.setattr(hall, "FALL_TIME", -10.0)
+    with pytest.raises(DiagnoseError, match="did not come down"):
+        hall.throws(load_policy("state"), "hybrid", np.array([[1.4, 0.0, 0.0]]), 0)
+
+
+@pytest.fixture
+def ablated(monkeypatch):
+    """A round without flights: every block is named but the rope's; what was asked for is counted."""
+    asked = []
+
+    def explained(logs, base, answer, device, say):
+        asked.append((base, len(logs)))
+        name = ablations.LACKS[base.removeprefix("state_")]
+        theta = {} if name == "rope_flexible" else {name: 1.0, **({"com_x": 1e-3} if name == "motor_lag" else {})}
+        findings = [{"name": n, "nats": 100.0} for n in theta]
+        return {"overall": "KNOWN", "theta": theta, "findings": findings, "seconds": 9.0, "reasons": [], "threshold": 10.0}
+
+    def held(base, theta, lacks, logs, device):
+        asked.append((lacks, len(logs)))
+        return {"before": 50.0, "after": 1.0 if theta else 50.0, "samples": 9} | {
+            f"landing_{who}": off for who, off in (("before", 0.08), ("after", 0.002), ("whole", None))
+        }
+
+    paths = lambda self, say: [Path(f"{i}.npz") for i in range(self.flights + self.held)]  # noqa: E731
+    monkeypatch.setattr(ablations.Ablations, "_flown", paths)
+    monkeypatch.setattr(ablations, "explained", explained)
+    monkeypatch.setattr(ablations, "on_held_back", held)
+    return asked
+
+
+def test_models_that_lack_a_block_are_held_against_the_same_flights(tmp_path, ablated):
+    record = ablations.Ablations(tmp_path, flights=4, held=2).run(lambda line: None)
+    for base, lacks in ablations.LACKS.items():
+        assert (f"state_{base}", 4) in ablated
+        assert (lacks, 2) in ablated
+    text = ablations.table(ablations.read(tmp_path))
+    assert "| controller_kind (state_simple_controller) | controller_kind +1 (100 nats) | KNOWN, named |" in text
+    assert "| 50 -> 1 | 80 -> 2 | 9 |" in text
+    assert "KNOWN, named, with others" in text
+    assert "nothing | KNOWN, not named" in text
+    assert record == ablations.read(tmp_path / "record.json")
+    ablations.Ablations(tmp_path, ["rigid_cable"], flights=4, held=2).run(lambda line: None)
+    assert ablated.count(("rope_flexible", 2)) == 1  # what is there is not weighed again
+
+
+def test_ablations_that_are_not_there_are_refused(tmp_path, ablated):
+    with pytest.raises(DiagnoseError, match="no ablation no_rope; there are no_aerodynamics"):
+        ablations.Ablations(tmp_path, ["no_rope"]).run(lambda line: None)
+    with pytest.raises(DiagnoseError, match="no such record"):
+        ablations.read(tmp_path / "nowhere")

@@ -157,29 +157,10 @@ class Loop:
 
     def _flights(self, truth: Experiment, say: Callable[[str], None]) -> list[Path]:
         """Throws of the policy at targets all around, on the plant with the hidden effect."""
-        folder = self.folder / "flights"
-        paths = [folder / f"flight_{i:02d}.npz" for i in range(self.flights)]
-        todo = [(i, path) for i, path in enumerate(paths) if not path.exists()]
-        text = toml_text.dumps(config.to_dict(truth, defaults=False))
-        with concurrent.futures.ProcessPoolExecutor(self.processes, mp.get_context("spawn")) as pool:
-            done = [pool.submit(_fly_one, self.policy, self.base, text, i, path) for i, path in todo]
-            for i, future in enumerate(concurrent.futures.as_completed(done)):
-                future.result()
-                say(f"flown: {i + 1} of {len(todo)}")
-        return paths
+        return fly_all(self.folder / "flights", self.policy, self.base, truth, self.flights, self.processes, say)
 
     def _diagnose(self, logs: list[Path], say: Callable[[str], None]) -> dict[str, Any]:
-        answer = self.folder / "verdict.json"
-        if not answer.exists():
-            command = [sys.executable, "-m", "visthrow.cli", "diagnose", "explain", *map(str, logs)]
-            command += ["--plant", self.base, "--no-report", "--device", self.diagnose_on, "--json", str(answer)]
-            done = subprocess.run(command, capture_output=True, text=True, check=False)
-            if done.returncode != 0 or not answer.exists():
-                say(f"the diagnosis failed: {(done.stdout + done.stderr)[-600:]}")
-                return {"overall": "ERROR", "theta": {}}
-        verdict = json.loads(answer.read_text())
-        say(f"diagnosed: {verdict['overall']}")
-        return verdict
+        return explained(logs, self.base, self.folder / "verdict.json", self.diagnose_on, say)
 
     def _throws(self, name: str, policy: str, say: Callable[[str], None]) -> dict[str, Any]:
         from visthrow.loading import load_policy
@@ -246,6 +227,37 @@ def recovered(throws: Mapping[str, Any], draws: int = 4000, seed: int = 0) -> di
 def named(verdict: Mapping[str, Any]) -> dict[str, float]:
     """What a verdict says to set in the model."""
     return {name: float(value) for name, value in verdict.get("theta", {}).items()}
+
+
+def fly_all(
+    folder: Path, policy: str, base: str, truth: Experiment, count: int, processes: int, say: Callable[[str], None]
+) -> list[Path]:
+    """Fly a policy that was trained in ``base`` on the reference plant of ``truth``; flights that are there are not flown again."""
+    paths = [folder / f"flight_{i:02d}.npz" for i in range(count)]
+    todo = [(i, path) for i, path in enumerate(paths) if not path.exists()]
+    text = toml_text.dumps(config.to_dict(truth, defaults=False))
+    with concurrent.futures.ProcessPoolExecutor(processes, mp.get_context("spawn")) as pool:
+        done = [pool.submit(_fly_one, policy, base, text, i, path) for i, path in todo]
+        for i, future in enumerate(concurrent.futures.as_completed(done)):
+            future.result()
+            say(f"flown: {i + 1} of {len(todo)}")
+    return paths
+
+
+def explained(
+    logs: Sequence[Path], plant: str, answer: Path, device: str, say: Callable[[str], None]
+) -> dict[str, Any]:
+    """Verdict of ``visthrow diagnose explain`` on logs, run apart and kept in ``answer``."""
+    if not answer.exists():
+        command = [sys.executable, "-m", "visthrow.cli", "diagnose", "explain", *map(str, logs)]
+        command += ["--plant", plant, "--no-report", "--device", device, "--json", str(answer)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode != 0 or not answer.exists():
+            say(f"the diagnosis failed: {(done.stdout + done.stderr)[-600:]}")
+            return {"overall": "ERROR", "theta": {}}
+    verdict = json.loads(answer.read_text())
+    say(f"diagnosed: {verdict['overall']}")
+    return verdict
 
 
 def _fly_one(policy: str, base: str, text: str, number: int, path: Path) -> None:

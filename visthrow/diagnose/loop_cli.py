@@ -14,15 +14,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "  visthrow diagnose loop --hide motor_tau=0.02         a slower motor; minutes on a GPU, hours on a CPU\n"
         "  visthrow diagnose loop --base state_no_motor_lag --policy runs/state_no_motor_lag-1/policy.npz --hide motor_lag=1\n"
         "                                                       a model that lacks a block, and the policy trained in it\n"
+        "  visthrow diagnose loop --ablations                   the paper's four: each model lacks a block; what is named?\n"
+        "                                                       nothing is trained; minutes on two cores\n"
+        "  visthrow diagnose loop --ablations no_motor_lag      one of them\n"
+        "  visthrow diagnose loop --ablations --show            what they were told of last, from the committed record\n"
         "  visthrow diagnose loop --show                        the loops that are told of, from their committed records\n"
         "  visthrow diagnose loop --show runs/loop/* --picture loops.png     loops of one's own\n"
     )
     parser.add_argument("--hide", action="append", default=[], metavar="EFFECT=SIZE", help="of the catalogue; may be repeated")
+    parser.add_argument("--ablations", nargs="*", metavar="NAME", help="hide blocks of the model and name them; train nothing")
     parser.add_argument("--base", default=DEFAULT_BASE, metavar="NAME", help="of configs/train: what is diagnosed (default: state)")
     parser.add_argument("--policy", default=DEFAULT_BASE, metavar="NAME", help="trained in it: shipped, or a file (default: state)")
     parser.add_argument("--show", type=Path, nargs="*", metavar="FOLDER", help="run nothing, show loops (default: those committed)")
     parser.add_argument("--picture", type=Path, metavar="FILE", help="with --show: draw them, a PNG")
     parser.add_argument("--flights", type=int, default=12, help="that are diagnosed (default: 12)")
+    parser.add_argument("--held", type=int, default=3, help="with --ablations: throws held back (default: 3)")
     parser.add_argument("--throws", type=int, default=200, help="of each policy in the end (default: 200)")
     parser.add_argument("--processes", type=int, help="for flights and throws (default: one a core)")
     parser.add_argument("--device", default="auto", metavar="NAME", help="of the trainings")
@@ -37,6 +43,8 @@ def run(args: argparse.Namespace) -> int:
     from visthrow.errors import ConfigError
     from visthrow.storage import atomic_write
 
+    if args.ablations is not None:
+        return _ablations(args)
     if args.show is not None:
         records = loop.read(args.show)
         print(loop.table(records))
@@ -62,4 +70,20 @@ def run(args: argparse.Namespace) -> int:
         processes=args.processes or cores(), changes=tuple(args.changes),
     ).run(lambda line: print(f"  {line}", flush=True))  # fmt: skip
     print("\n" + loop.table([record]))
+    return 0
+
+
+def _ablations(args: argparse.Namespace) -> int:
+    """Name the blocks that models lack, or show what was named."""
+    from visthrow.device import resolve
+    from visthrow.diagnose import ablations
+
+    if args.show is not None:
+        print("\n\n".join(ablations.table(ablations.read(place)) for place in args.show or (None,)))
+        return 0
+    names = tuple(args.ablations) or tuple(ablations.LACKS)
+    one = ablations.Ablations(
+        Path(args.out) / "ablations", names, args.policy, args.flights, args.held, resolve(args.diagnose_on)
+    )
+    print("\n" + ablations.table(one.run(lambda line: print(f"  {line}", flush=True))))
     return 0
