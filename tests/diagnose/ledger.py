@@ -11,6 +11,7 @@ import json
 import math
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from statistics import NormalDist
@@ -18,26 +19,30 @@ from statistics import NormalDist
 import numpy as np
 
 from tests.diagnose.sealed import NOT_WAITED, TERMS, near
-from tests.worlds.world import FLOORS
+from tests.worlds.world import ALL_FLOORS, CAMERA_FLOORS
 
+DRAG = 0.51 / 1.04e-3
+"""Drag coefficient of a payload over its drag k = rho C_d A / 2 [m/kg]: a tennis ball has 1.04e-3 kg/m."""
 LIMITS = {
     "rope_length": (3e-3, 1e3, "mm"), "cmd_delay": (4e-3, 1e3, "ms"), "motor_tau": (4e-3, 1e3, "ms"),
-    "release_lag": (8e-3, 1e3, "ms"), "payload_drag": (6.1e-4, 1e4, "1e-4 kg/m"), "wind_x": (0.15, 1.0, "m/s"),
+    "release_lag": (8e-3, 1e3, "ms"), "payload_drag": (0.3 / DRAG, DRAG, "of C_d"), "wind_x": (0.15, 1.0, "m/s"),
     "com_x": (5e-4, 1e3, "mm"), "marker_rot_x": (math.radians(0.2), math.degrees(1.0), "deg"),
     "frame_tilt_x": (math.radians(0.2), math.degrees(1.0), "deg"), "thrust_gain": (0.01, 100.0, "%"),
+    "camera_tilt_x": (math.radians(0.2), math.degrees(1.0), "deg"), "camera_latency": (1e-3, 1e3, "ms"),
 }  # fmt: skip
-"""Effect -> limit that is asked for (SI; the payload's drag is that of 0.3 of a ball's coefficient), factor and unit to print."""
+"""Effect -> limit that is asked for (SI), factor and unit to print."""
 
 LEVELS = (50, 80, 95)
 MATTERS = 5.0
 """Nats on unseen throws that the truth must be worth for a gain to be counted."""
 HARM, HARM_NATS = 1.01, 3.0
 """Growth of the error on unseen throws, per sample in its deviations, and fall of their log likelihood, that count as harm."""
-RIDGE, STEPS = 0.05, 30
-"""Of the logistic curves: inverse variance of the prior of both coefficients, and Newton's steps."""
-DRAWS = 400
-FEWEST = 6
-"""Worlds of an effect for a curve of its own."""
+NINE, DECADE = math.log(9.0), math.log(10.0)
+WIDTHS, GRID = (0.05, 3.0), 160
+"""From 50 to 90 % in log size: what is possible; points of the grid of curves."""
+FEWEST, BINNED = 6, 30
+"""Worlds of an effect for a curve of its own, and for counts in bins."""
+SEEN = ", camera"
 
 
 def wilson(k: int, n: int, level: float = 0.95) -> tuple[float, float, float]:
@@ -57,47 +62,57 @@ def share(k: int, n: int) -> str:
     return f"{k}/{n} = {100 * value:.0f} % [{100 * low:.0f}, {100 * high:.0f}]"
 
 
-def logistic(size: np.ndarray, named: np.ndarray) -> tuple[float, float]:
-    """Intercept and slope (0 or more) of ``log odds of being named = a + b log size``, by Newton's steps.
+@dataclass(frozen=True)
+class Curve:
+    """What worlds tell of ``log odds of being named = a + b log size``: points of a grid and how likely each is."""
 
-    A weak normal prior on both, about the middle of the sizes, keeps a curve without a miss finite.
+    half: np.ndarray  # log of the size that is named with 50 %
+    width: np.ndarray  # from there to 90 %, in log size
+    weight: np.ndarray
+
+    def size(self, probability: float) -> tuple[float, float, float]:
+        """Median and 95 % interval of the size that is named with a probability."""
+        at = self.half + self.width * math.log(probability / (1.0 - probability)) / NINE
+        order = np.argsort(at)
+        below = np.cumsum(self.weight[order])
+        return tuple(float(np.exp(at[order][min(np.searchsorted(below, q), len(at) - 1)])) for q in (0.5, 0.025, 0.975))
+
+    def chance(self, size: np.ndarray) -> np.ndarray:
+        """Mean, and ends of the 95 % interval, of the share that is named, shape (3, N)."""
+        p = 1.0 / (1.0 + np.exp(-NINE * (np.log(size)[:, None] - self.half) / self.width))
+        order = np.argsort(p, axis=1)
+        below = np.cumsum(self.weight[order], axis=1)
+        ends = [np.take_along_axis(p, np.take_along_axis(order, (below < q).sum(1)[:, None].clip(max=p.shape[1] - 1), 1), 1)[:, 0]
+                for q in (0.025, 0.975)]  # fmt: skip
+        return np.stack((p @ self.weight, *ends))
+
+
+def curve(size: np.ndarray, named: np.ndarray) -> Curve:
+    """Logistic curve of completeness over log size.
+
+    The prior is flat in the logarithms of the 50 % size (a decade beyond what was flown, either way) and of the width: sizes that
+    were all named, or none, leave a wide interval instead of a curve without an error.
     """
-    x = np.log(size) - np.log(size).mean()
-    columns, p = np.stack((np.ones_like(x), x), axis=1), np.zeros(2)
-    for _ in range(STEPS):
-        chance = 1.0 / (1.0 + np.exp(-columns @ p))
-        slope = columns.T @ (named - chance) - RIDGE * p
-        p = p + np.linalg.solve((columns.T * (chance * (1.0 - chance))) @ columns + RIDGE * np.eye(2), slope)
-    if p[1] <= 0.0:
-        share = (named.sum() + RIDGE) / (len(named) + 2.0 * RIDGE)
-        return math.log(share / (1.0 - share)), 0.0
-    return float(p[0] - p[1] * np.log(size).mean()), float(p[1])
+    ends = np.log(size.min()) - DECADE, np.log(size.max()) + DECADE
+    half, width = (x.ravel() for x in np.meshgrid(np.linspace(*ends, GRID), np.geomspace(*WIDTHS, GRID // 4)))
+    odds = NINE * (np.log(size)[:, None] - half) / width
+    likely = -np.logaddexp(0.0, np.where(named[:, None], -odds, odds)).sum(0)
+    weight = np.exp(likely - likely.max())
+    return Curve(half, width, weight / weight.sum())
 
 
-def at_share(curve: tuple[float, float], probability: float) -> float:
-    """Size at which a curve reaches a probability."""
-    a, b = curve
-    missing = math.log(probability / (1.0 - probability)) - a
-    if b < 1e-9:
-        return math.inf if missing > 0.0 else 0.0
-    return math.exp(min(missing / b, 700.0))
-
-
-def rho90(size: np.ndarray, named: np.ndarray, rng: np.random.Generator) -> tuple[float, float, float]:
-    """Size that is named with 90 % probability, with its 95 % bootstrap interval."""
-    draws = []
-    for _ in range(DRAWS):
-        i = rng.integers(len(size), size=len(size))
-        draws.append(at_share(logistic(size[i], named[i]), 0.9))
-    low, high = np.quantile(np.minimum(draws, 1e9), [0.025, 0.975])
-    return at_share(logistic(size, named), 0.9), float(low), float(high)
-
-
-def within(value: float, size: np.ndarray, scale: float = 1.0, digits: int = 2) -> str:
-    """A size as text, times ``scale``; what lies outside the sizes that were flown is told as that alone."""
+def within(found: tuple[float, float, float], size: np.ndarray, scale: float = 1.0) -> str:
+    """A size and its interval as text, times ``scale``; what lies outside the sizes that were flown is told as that alone."""
     least, most = size.min(), size.max()
-    sign = "<" if value < least else ">" if value > most else ""
-    return f"{sign}{float(np.clip(value, least, most)) * scale:.{digits}g}"
+    told = [f"{'<' if x < least else '>' if x > most else ''}{float(np.clip(x, least, most)) * scale:.2g}" for x in found]
+    return "{} [{}, {}]".format(*told)
+
+
+def met(found: tuple[float, float, float], limit: float) -> str:
+    """Whether a size and its interval keep to a limit."""
+    if math.isnan(limit):
+        return "-"
+    return "yes" if found[2] <= limit else "no" if found[1] > limit else "not resolved"
 
 
 def truth_of(world: dict) -> set[str]:
@@ -155,41 +170,49 @@ def grouped(items: Iterable[dict], key: Callable[[dict], str]) -> dict[str, list
 
 
 def singles(worlds: Sequence[dict]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Effect -> sizes in floors and whether they were named (up to class), of worlds with one hidden effect."""
+    """Effect -> sizes in floors and whether they were named (up to class), of worlds with one hidden effect.
+
+    What a camera helps to see, without being its own effect, stands apart, as "EFFECT, camera".
+    """
     out: dict[str, list] = defaultdict(list)
     for w in worlds:
         effects = w["recipe"]["effects"]
         if len(effects) == 1 and truth_of(w):
             (name, theta), = effects.items()
-            out[name].append((abs(theta) / FLOORS[name], names(w)[3] == 1))
+            seen = w["recipe"].get("camera", False) and name not in CAMERA_FLOORS
+            out[name + SEEN * seen].append((abs(theta) / ALL_FLOORS[name], names(w)[3] == 1))
     return {n: (np.array([s for s, _ in v]), np.array([k for _, k in v])) for n, v in sorted(out.items())}
 
 
 def completeness(worlds: Sequence[dict]) -> list[str]:
-    """Table of the sizes named with 90 % probability, the effects that are asked for first."""
-    rng, curves = np.random.default_rng(0), singles(worlds)
-    lines = ["| effect | worlds | sizes [floors] | named | rho90 [floors] | rho90 | asked for |", "|---|---:|---|---|---|---|---|"]
+    """Table of the sizes named with 50 and 90 % probability, the effects that are asked for first."""
+    curves = singles(worlds)
     if not curves:
         return []
+    head = "| effect | worlds | sizes | named | unit | 50 % | 90 % | asked for | kept |"
+    lines = [head, "|---|---:|---|---|---|---|---|---:|---|"]
     whole = tuple(np.concatenate([v[i] for v in curves.values()]) for i in range(2))
-    for name in ["all", *sorted(curves, key=lambda n: (n not in LIMITS, n))]:
-        size, named = whole if name == "all" else curves[name]
-        row = [name, len(size), f"{size.min():.1f} to {size.max():.1f}", share(int(named.sum()), len(size))]
-        limit, factor, unit = LIMITS.get(name, (math.nan, 1.0, ""))
+    for name in ["all", *sorted(curves, key=lambda n: (n not in LIMITS, n)), *(n for n in LIMITS if n not in curves)]:
+        size, named = whole if name == "all" else curves.get(name, (np.zeros(0), np.zeros(0, dtype=bool)))
+        limit, factor, unit = LIMITS.get(name, (math.nan, 1.0, "floors"))
+        floor = ALL_FLOORS[name] if name in LIMITS else 1.0
+        asked = f"{limit * factor:.2g}" if name in LIMITS else "-"
+        row = [name, len(size), f"{size.min() * floor * factor:.2g} to {size.max() * floor * factor:.2g}" if len(size) else "-"]
+        row += [share(int(named.sum()), len(size)), unit]
         if len(size) >= FEWEST:
-            found = rho90(size, named, rng)
-            row.append("{} [{}, {}]".format(*(within(x, size) for x in found)))
-            row.append(f"{within(found[0], size, FLOORS[name] * factor)} {unit}" if name in LIMITS else "-")
+            fitted = curve(size, named)
+            half, most = fitted.size(0.5), fitted.size(0.9)
+            row += [within(x, size, floor * factor) for x in (half, most)]
+            row += [asked, met(most, limit / floor)]
         else:
-            row += ["-", "-"]
-        row += [f"{limit * factor:.2g} {unit}" if limit == limit else "-"]
+            row += ["-", "-", asked, "too few worlds" if name in LIMITS else "-"]
         lines.append("| " + " | ".join(map(str, row)) + " |")
     return lines
 
 
 def intervals(worlds: Sequence[dict]) -> list[str]:
     """Coverage of the intervals and error of the estimates of the effects that were named by their own names."""
-    rows = [e for w in worlds for e in w.get("errors", ()) if e.get("named", True) and e["name"] in FLOORS]
+    rows = [e for w in worlds for e in w.get("errors", ()) if e.get("named", True) and e["name"] in ALL_FLOORS]
     rows = [e for e in rows if e.get("sd") or "sd" not in e]
     lines = []
     for level in LEVELS:
@@ -200,7 +223,7 @@ def intervals(worlds: Sequence[dict]) -> list[str]:
             inside = [abs(e["estimate"] - e["truth"]) <= z * e["sd"] for e in rows if "sd" in e]
         lines.append(f"- {level} % intervals hold the truth: {share(sum(inside), len(inside))}")
     if rows:
-        off = np.array([abs(e["estimate"] - e["truth"]) / FLOORS[e["name"]] for e in rows])
+        off = np.array([abs(e["estimate"] - e["truth"]) / ALL_FLOORS[e["name"]] for e in rows])
         lines.append(f"- error of the estimate: median {np.median(off):.2f} floors, nine of ten within {np.quantile(off, 0.9):.2f}")
     return lines
 
@@ -244,43 +267,60 @@ def laws(worlds: Sequence[dict]) -> list[str]:
 
 
 def draw(worlds: Sequence[dict], path: Path) -> None:
-    """Completeness by size: counts in bins with intervals, the logistic curve of all, and those of the effects asked for."""
+    """Completeness by size: a panel of all effects and one of each whose limit is asked for, with the curve and its 95 % band."""
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
     curves = singles(worlds)
-    size, named = (np.concatenate([v[i] for v in curves.values()]) for i in range(2))
-    figure, axes = plt.subplots(1, 2, figsize=(11, 4.2), sharex=True, sharey=True, layout="constrained")
-    edges = np.exp(np.linspace(np.log(0.98 * size.min()), np.log(1.02 * size.max()), 9))
-    grid = np.geomspace(edges[0], edges[-1], 200)
-    for low, high in pairwise(edges):
-        here = named[(size >= low) & (size < high)]
-        if len(here):
-            value, least, most = wilson(int(here.sum()), len(here))
-            centre = math.sqrt(low * high)
-            axes[0].errorbar(centre, value, [[max(value - least, 0.0)], [max(most - value, 0.0)]], fmt="o", color="C0", capsize=3)
-            axes[0].annotate(f"{len(here)}", (centre, 0.02), ha="center", fontsize=8, color="grey")
-    drawn = {"all effects": logistic(size, named)}
-    axes[0].plot(grid, _chance(grid, drawn["all effects"]), color="C0", label="all effects")
-    for i, name in enumerate(n for n in LIMITS if n in curves and len(curves[n][0]) >= FEWEST):
-        axes[1].plot(grid, _chance(grid, logistic(*curves[name])), color=f"C{i}", label=f"{name} ({len(curves[name][0])})")
-        axes[1].plot(curves[name][0], curves[name][1] + 0.008 * (i - 4), ".", color=f"C{i}", alpha=0.6)
-    for axis, title in zip(axes, ("all effects; worlds in grey, bars 95 %", "effects whose limits are asked for (worlds)")):
-        axis.axhline(0.9, color="grey", linewidth=0.8, linestyle=":")
-        axis.set(xscale="log", xlabel="hidden size [floors]", ylim=(-0.05, 1.06), title=title)
-        axis.set_xticks([3, 5, 10, 20, 30], ["3", "5", "10", "20", "30"])
-        axis.minorticks_off()
-    axes[0].set_ylabel("share that was named")
-    if axes[1].lines[1:]:
-        axes[1].legend(fontsize=8, loc="center right")
-    figure.savefig(path, dpi=130)
+    whole = tuple(np.concatenate([v[i] for v in curves.values()]) for i in range(2))
+    columns = 5
+    figure, axes = plt.subplots(-(-(len(LIMITS) + 1) // columns), columns, figsize=(15, 8), sharey=True, layout="constrained")
+    for axis, name in zip(axes.flat, ["all effects", *LIMITS]):
+        limit, factor, unit = LIMITS.get(name, (math.nan, 1.0, "floors"))
+        scale = ALL_FLOORS[name] * factor if name in LIMITS else 1.0
+        _panel(axis, whole if name == "all effects" else curves.get(name), limit * factor, scale)
+        axis.set(ylim=(-0.06, 1.06), xlabel=f"hidden size [{unit}]", title=name)
+    for axis in axes.flat[len(LIMITS) + 1 :]:
+        axis.axis("off")
+    for axis in axes[:, 0]:
+        axis.set_ylabel("share that was named")
+    figure.suptitle("Share named by size: worlds (ticks), bins and logistic curve with 95 % intervals; red: size asked for at 90 %")
+    figure.savefig(path, dpi=110)
     plt.close(figure)
 
 
-def _chance(size: np.ndarray, curve: tuple[float, float]) -> np.ndarray:
-    return 1.0 / (1.0 + np.exp(-(curve[0] + curve[1] * np.log(size))))
+def _panel(axis, worlds: tuple[np.ndarray, np.ndarray] | None, limit: float, scale: float) -> None:
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    axis.axhline(0.9, color="grey", linewidth=0.8, linestyle=":")
+    if math.isfinite(limit):
+        axis.axvline(limit, color="C3", linewidth=1.0)
+    axis.set_xscale("log")
+    axis.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
+    axis.xaxis.set_minor_formatter(NullFormatter())
+    if worlds is not None:
+        axis.plot(worlds[0] * scale, np.where(worlds[1], 1.03, -0.03), "|", color="C0", alpha=0.7)
+    if worlds is None or len(worlds[0]) < FEWEST:
+        told = f"{0 if worlds is None else len(worlds[0])} worlds"
+        axis.text(0.5, 0.5, told, ha="center", transform=axis.transAxes, color="grey")
+        if math.isfinite(limit) and worlds is None:
+            axis.set_xlim(0.2 * limit, 5.0 * limit)
+        return
+    size, named = worlds
+    grid = np.geomspace(0.9 * size.min(), 1.1 * size.max(), 100)
+    mean, low, high = curve(size, named).chance(grid)
+    axis.fill_between(grid * scale, low, high, color="C0", alpha=0.2, linewidth=0)
+    axis.plot(grid * scale, mean, color="C0")
+    if len(size) >= BINNED:
+        for first, last in pairwise(np.geomspace(0.99 * size.min(), 1.01 * size.max(), 7)):
+            here = named[(size >= first) & (size < last)]
+            if len(here):
+                value, least, most = wilson(int(here.sum()), len(here))
+                spread = [[max(value - least, 0.0)], [max(most - value, 0.0)]]
+                axis.errorbar(math.sqrt(first * last) * scale, value, spread, fmt="o", color="black", markersize=3, linewidth=0.8)
 
 
 def summary(worlds: Sequence[dict]) -> str:

@@ -5,7 +5,7 @@ the model. The truth's SHA-256 is put down before, the verdict's after.
 
 Three more throws of each world are held back; the model with the verdict's sizes and the model with the true ones predict them.
 
-    python -m tests.diagnose.sealed null=10 1x15=20 2x10=5 curve=50 law=5 --jobs 8 --ledger ledger.jsonl
+    python -m tests.diagnose.sealed null=10 1x15=20 2x10=5 curve=50 sight=20 law=5 --jobs 8 --ledger ledger.jsonl
     python -m tests.diagnose.ledger ledger.jsonl
 """
 
@@ -24,7 +24,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.worlds.world import PLANTS, Recipe, draw, fly_recipe, recorded
+from tests.worlds.world import CAMERA_FLOORS, PLANTS, Recipe, draw, fly_recipe, recorded
 from visthrow.diagnose.threads import single
 from visthrow.errors import VisthrowError
 from visthrow.flightlog import Channel, FlightLog
@@ -65,11 +65,15 @@ CURVE = (
     "rope_length", "cmd_delay", "motor_tau", "release_lag", "payload_drag", "wind_x", "com_x", "marker_rot_x", "frame_tilt_x",
     "thrust_gain",
 )  # fmt: skip
-"""Effects whose detection limits are asked for."""
+"""Effects whose detection limits are asked for, of plants without a camera."""
+SIGHT = ("camera_tilt_x", "camera_latency", "marker_rot_x", "mocap_delay_quad")
+"""Likewise with a camera, and what they may be taken for."""
 HELD = 3
 """Throws held back."""
 SMALLEST, LARGEST = 3.0, 30.0
 """Sizes of the completeness curves [floors]."""
+FAINTEST, PLAINEST = 1.0, 15.0
+"""Those of the curves with a camera, whose limits lie at 5 or 6 floors."""
 
 
 def flight_log(record: dict) -> FlightLog:
@@ -87,6 +91,11 @@ def flight_log(record: dict) -> FlightLog:
     if record["release"] is not None:
         asked[record["sent_time"] >= record["release"] - 1e-9] = 1.0
     channels["release_command"] = Channel(record["sent_time"], asked, "1")
+    if "look" in record:
+        kept, stamps = ~record["look_lost"], record["look_time"]
+        channels["keypoints"] = Channel(stamps, record["look"], "1", "image", kept)
+        channels["keypoints_valid"] = Channel(stamps, record["look_seen"], "bool")
+        channels["goal_w"] = Channel(np.zeros(1), record["goal"][None], "m", "world")
     return FlightLog(channels, {})
 
 
@@ -143,9 +152,10 @@ def on_held_back(recipe: Recipe, theta: dict[str, float], held: Path) -> dict[st
     sizes = {"after": theta, "before": {}}
     if not any(name.startswith("law_") for name in recipe.effects):
         sizes["oracle"] = dict(recipe.effects)
-    plant = plant_of(config.load(Experiment, config.find("train", "state"), model_of(recipe)))
+    experiment = config.load(Experiment, config.find("train", "state"), model_of(recipe))
     logs = [FlightLog.load(path) for path in sorted(held.glob("*.npz"))]
-    model = ThrowModel(logs, plant, only=sorted(set().union(*sizes.values())))
+    names = sorted(set().union(*sizes.values()))
+    model = ThrowModel(logs, plant_of(experiment), only=names, camera=experiment.camera if recipe.camera else None)
     different = list({json.dumps(s, sort_keys=True): s for s in sizes.values()}.values())
     nats, samples = shortfalls(model, different)
     return {who: nats[different.index(s)] for who, s in sizes.items()} | {"samples": samples}
@@ -240,8 +250,18 @@ def run_world(recipe: Recipe, device: str = "cpu", verdicts: Path | None = None,
 
 
 def drawn(kind: str, number: int) -> Recipe:
-    """A world of a kind: ``null``, ``law``, ``curve``, ``flights``, or ``EFFECTSxFLOORS``."""
+    """A world of a kind: ``null``, ``law``, ``curve``, ``flights`` or ``EFFECTSxFLOORS``; ``sight``, ``camera``, ``clear``.
+
+    The last three have a camera. ``curve`` and ``sight`` hide one of the effects whose limits are asked for, ``camera`` any of a
+    camera's, ``clear`` none.
+    """
     rng = np.random.default_rng(number + 7)
+    if kind == "clear":
+        return draw(number, 0, 0.0, camera=True, noise=float(rng.choice([0.5, 1.0, 2.0])), dropouts=float(rng.choice([0.0, 0.1])))
+    if kind in ("sight", "camera"):
+        ends, names = ((FAINTEST, PLAINEST), SIGHT) if kind == "sight" else ((SMALLEST, LARGEST), tuple(CAMERA_FLOORS))
+        floors = float(np.exp(rng.uniform(*np.log(ends))))
+        return draw(number, 1, floors, names=(str(rng.choice(names)),), camera=True)
     if kind == "null":
         rough = {"noise": float(rng.choice([0.5, 1.0, 2.0])), "gusts": float(rng.choice([0.5, 1.0, 2.0]))}
         return draw(number, 0, 0.0, dropouts=float(rng.choice([0.0, 0.1])), **rough)
@@ -296,7 +316,7 @@ def warm(plant: str) -> None:
 def main() -> None:
     """Run a bank of sealed worlds and add it to a ledger; worlds that are there are not run again."""
     parser = argparse.ArgumentParser(description=main.__doc__)
-    kinds = "null, law, curve, flights, or EFFECTSxFLOORS: null=20 1x15=30"
+    kinds = "null, law, curve, flights, EFFECTSxFLOORS; with a camera sight, camera, clear: null=20 1x15=30"
     parser.add_argument("worlds", nargs="*", metavar="KIND=COUNT", help=kinds)
     parser.add_argument("--seed", type=int, help="of the first world; drawn by the system where not given")
     parser.add_argument("--ledger", type=Path, default=Path("ledger.jsonl"))

@@ -7,7 +7,10 @@ import pytest
 
 from tests.diagnose import ledger
 from tests.diagnose.sealed import NOT_WAITED
-from tests.worlds.world import FLOORS
+from tests.worlds.world import ALL_FLOORS
+
+TRUTH = math.exp((math.log(9.0) + 6.0) / 3.5)
+"""Size of the made-up curve at 90 %."""
 
 
 def world(effects: dict, named: list, kind: str = "1x10", **more) -> dict:
@@ -23,15 +26,64 @@ def test_wilson_by_the_textbook():
     assert ledger.wilson(0, 150)[2] == pytest.approx(0.0250, abs=1e-4)
 
 
+def drawn_curve(rng, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Sizes of 3 to 30 floors, named by a curve that is at 90 % at :data:`TRUTH`."""
+    size = np.exp(rng.uniform(np.log(3), np.log(30), count))
+    return size, rng.random(count) < 1.0 / (1.0 + np.exp(-(-6.0 + 3.5 * np.log(size))))
+
+
 def test_a_completeness_curve_is_found_again():
-    rng = np.random.default_rng(3)
-    size = np.exp(rng.uniform(np.log(3), np.log(30), 600))
-    named = rng.random(600) < 1.0 / (1.0 + np.exp(-(-6.0 + 3.5 * np.log(size))))
-    truth = math.exp((math.log(9.0) + 6.0) / 3.5)
-    value, low, high = ledger.rho90(size, named, rng)
-    assert low < truth < high
-    assert value == pytest.approx(truth, rel=0.15)
+    curve = ledger.curve(*drawn_curve(np.random.default_rng(3), 600))
+    value, low, high = curve.size(0.9)
+    assert low < TRUTH < high
+    assert value == pytest.approx(TRUTH, rel=0.15)
     assert high / low < 1.5
+    assert curve.size(0.5)[0] == pytest.approx(math.exp(6.0 / 3.5), rel=0.15)
+    mean, least, most = curve.chance(np.array([TRUTH]))[:, 0]
+    assert least < 0.9 < most
+    assert mean == pytest.approx(0.9, abs=0.04)
+
+
+def test_intervals_of_limits_hold_the_truth_with_few_worlds():
+    rng = np.random.default_rng(0)
+    found = [ledger.curve(*drawn_curve(rng, 12)).size(0.9) for _ in range(200)]
+    assert sum(low <= TRUTH <= high for _, low, high in found) >= 180
+
+
+def test_sizes_that_were_all_named_leave_the_limit_open_below_and_few_worlds_leave_it_open():
+    size = np.geomspace(3.0, 30.0, 8)
+    value, low, high = ledger.curve(size, np.ones(8, dtype=bool)).size(0.9)
+    assert low < 3.0 < high
+    assert ledger.within((value, low, high), size).endswith("]")
+    assert ledger.within((1.0, 0.5, 40.0), size) == "<3 [<3, >30]"
+    assert ledger.met((5.0, 4.0, 6.0), 8.0) == "yes"
+    assert ledger.met((9.0, 8.5, 12.0), 8.0) == "no"
+    assert ledger.met((7.0, 5.0, 12.0), 8.0) == "not resolved"
+    none = ledger.curve(size, np.zeros(8, dtype=bool)).size(0.9)
+    assert none[1] > 20.0
+
+
+def test_limits_stand_in_the_unit_in_which_they_are_asked_for_and_worlds_with_a_camera_apart(tmp_path):
+    floors = np.geomspace(1.0, 15.0, 12)
+    sizes = {"camera_tilt_x": 1.0, "marker_rot_x": 1.0, "payload_drag": 2.0}
+    worlds = []
+    for name, scale in sizes.items():
+        for f in floors:
+            one = world({name: float(scale * f * ALL_FLOORS[name])}, [[name]] if f > 4.0 else [])
+            one["recipe"]["camera"] = name != "payload_drag"
+            worlds.append(one)
+    rows = {line.split(" | ")[0].strip("| "): line.split(" | ") for line in ledger.completeness(worlds)[2:]}
+    tilt = rows["camera_tilt_x"]
+    assert tilt[4] == "deg"
+    assert float(tilt[6].split()[0].strip("<>")) == pytest.approx(math.degrees(4.0 * ALL_FLOORS["camera_tilt_x"]), rel=0.4)
+    assert tilt[7] == "0.2"
+    assert rows["payload_drag"][7] == "0.3"
+    assert float(rows["payload_drag"][2].split()[0]) == pytest.approx(2e-4 * 0.51 / 1.04e-3, rel=0.02)
+    assert "marker_rot_x, camera" in rows
+    assert rows["marker_rot_x"][1] == "0"
+    assert rows["rope_length"][-1].startswith("too few worlds")
+    ledger.draw(worlds, tmp_path / "completeness.png")
+    assert (tmp_path / "completeness.png").stat().st_size > 10_000
 
 
 def test_names_are_counted_up_to_class_and_alone():
@@ -54,7 +106,7 @@ def test_a_failure_counts_as_a_miss_and_a_world_not_waited_for_as_nothing():
 
 def test_coverage_counts_what_the_intervals_hold():
     """Errors of a normal distribution of the stated deviation: each level must come out as itself."""
-    rng, floor = np.random.default_rng(0), FLOORS["wind_x"]
+    rng, floor = np.random.default_rng(0), ALL_FLOORS["wind_x"]
     rows = []
     for z in rng.standard_normal(2000):
         e = {"name": "wind_x", "truth": 0.3, "estimate": 0.3 + z * floor, "sd": floor, "named": True}

@@ -41,12 +41,15 @@ def nominal() -> SimpleNamespace:
         delay=v["queue"]["delay"], release_lag=release["lag"], lag_per_newton=0.0, lag_jitter=0.0, kick=np.zeros(3),
         quad_stamp=0.0, ball_stamp=0.0, frame_tilt=np.zeros(3), marker_turn=np.zeros(3), marker_off=np.zeros(3),
         ball_marker_off=np.zeros(3), frame_scale=0.0, clock_ppm=0.0,
+        camera_turn=np.zeros(3), camera_place=np.zeros(3), camera_focal=0.0, camera_centre=np.zeros(2), camera_k1=0.0,
+        camera_late=0.0, camera_row=0.0, camera_ball=0.0,
     )  # fmt: skip
 
 
 EXTRA = (
     "delay", "release_lag", "lag_per_newton", "lag_jitter", "kick", "quad_stamp", "ball_stamp", "frame_tilt",
     "marker_turn", "marker_off", "ball_marker_off", "frame_scale", "clock_ppm",
+    "camera_turn", "camera_place", "camera_focal", "camera_centre", "camera_k1", "camera_late", "camera_row", "camera_ball",
 )  # fmt: skip
 
 
@@ -110,6 +113,12 @@ CHANGES = {
     "wind_x": _add("wind", 0), "wind_y": _add("wind", 1), "ground_effect": _add("ground"),
     "rope_elastic": lambda w, t: _add("stretch")(w, t / w.length),
     "payload_side": _add("ball_side"), "payload_lift": _add("ball_lift"), "lag_jitter": _add("lag_jitter"),
+    # The camera.
+    "camera_tilt_x": _add("camera_turn", 0), "camera_tilt_y": _add("camera_turn", 1), "camera_tilt_z": _add("camera_turn", 2),
+    "camera_lever_x": _add("camera_place", 0), "camera_lever_y": _add("camera_place", 1),
+    "camera_lever_z": _add("camera_place", 2), "camera_focal": _add("camera_focal"), "camera_k1": _add("camera_k1"),
+    "camera_center_x": _add("camera_centre", 0), "camera_center_y": _add("camera_centre", 1),
+    "camera_latency": _add("camera_late"), "camera_line_time": _add("camera_row"), "keypoint_radius": _add("camera_ball"),
     # Laws outside the catalogue.
     "law_speed_thrust": _add("speed_thrust"), "law_slew_thrust": _add("slew_thrust"), "law_vehicle_swirl": _add("yaw_swirl"),
     "law_ball_swirl": _add("ball_swirl"), "law_joint_square": _add("joint_damping_square"), "law_bending": _add("bending"),

@@ -10,9 +10,11 @@ from dataclasses import asdict, dataclass, field
 
 import numpy as np
 
+from tests.worlds.camera import looked
 from tests.worlds.fly import Flights, fly
 from tests.worlds.numbers import LANDING_HEIGHT, hide
 from tests.worlds.pilot import PERIOD, FreeFlight, Throw, Tracker
+from tests.worlds.turns import matrix, quaternion, sampled, small_turn
 
 FLOORS = {
     "rope_length": 5e-4, "cmd_delay": 1e-3, "motor_tau": 1e-3, "release_lag": 2e-3, "payload_drag": 1e-4,
@@ -24,7 +26,14 @@ FLOORS = {
 }  # fmt: skip
 """Size below which an effect does not matter, in SI units, relative for gains and inertias: 5 mm of landing, or a tenth of
 the noise."""
-ONE_SIDED = ("mocap_delay_quad", "mocap_delay_payload", "payload_drag", "rope_mass")
+CAMERA_FLOORS = {
+    "camera_tilt_x": 6e-4, "camera_tilt_y": 6e-4, "camera_tilt_z": 6e-4, "camera_latency": 2e-4, "camera_line_time": 3e-6,
+    "camera_focal": 2e-3, "camera_center_x": 0.5, "camera_center_y": 0.5, "camera_k1": 1e-3, "camera_lever_x": 2e-3,
+    "camera_lever_y": 2e-3, "camera_lever_z": 2e-3, "keypoint_radius": 1e-2,
+}  # fmt: skip
+"""The same of the camera's effects, which show in worlds with a camera alone."""
+ALL_FLOORS = FLOORS | CAMERA_FLOORS
+ONE_SIDED = ("mocap_delay_quad", "mocap_delay_payload", "payload_drag", "rope_mass", "camera_latency")
 """Nothing is measured before it happens, the model's payload has no drag that reality could lack, and its rope hardly any mass."""
 PLANTS = ("chain", "string", "rod")
 GUSTS = (0.015, 1.5e-4, 6e-4)
@@ -48,6 +57,7 @@ class Recipe:
     throws: int = 10
     held: int = 0  # throws besides, which nobody is shown
     low: bool = False  # free flights near the ground
+    camera: bool = False  # a camera looks down and a detector marks the goal and the ball
 
     def digest(self) -> str:
         """SHA-256 of the truth, to be published before a verdict is read."""
@@ -62,7 +72,7 @@ def draw(seed: int, count: int, floors: float, names=tuple(FLOORS), plants=PLANT
     signs = np.where(np.isin(chosen, ONE_SIDED), 1.0, rng.choice([-1.0, 1.0], len(chosen)))
     sizes = rng.uniform(0.9, 1.1, len(chosen)) * floors * signs
     return Recipe(
-        seed, plant, {str(n): float(s * FLOORS[n]) for n, s in zip(chosen, sizes)}, floors if count else 0.0, **options
+        seed, plant, {str(n): float(s * ALL_FLOORS[n]) for n, s in zip(chosen, sizes)}, floors if count else 0.0, **options
     )
 
 
@@ -96,45 +106,13 @@ def fly_recipe(recipe: Recipe) -> list[Flights]:
     return out
 
 
-def small_turn(v: np.ndarray) -> np.ndarray:
-    """Rotation matrices of rotation vectors, shape (..., 3) to (..., 3, 3)."""
-    angle = np.linalg.norm(v, axis=-1)[..., None, None]
-    k = np.zeros((*v.shape[:-1], 3, 3))
-    k[..., 0, 1], k[..., 0, 2], k[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
-    k -= np.swapaxes(k, -1, -2)
-    safe = np.where(angle > 1e-12, angle, 1.0)
-    return np.eye(3) + np.sin(angle) / safe * k + (1 - np.cos(angle)) / safe**2 * (k @ k)
-
-
-def matrix(q: np.ndarray) -> np.ndarray:
-    """Rotation matrices of quaternions wxyz, shape (T, 4) to (T, 3, 3)."""
-    w, v = q[..., :1, None], q[..., 1:]
-    k = np.zeros((*v.shape[:-1], 3, 3))
-    k[..., 0, 1], k[..., 0, 2], k[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
-    k -= np.swapaxes(k, -1, -2)
-    return np.eye(3) + 2 * w * k + 2 * (k @ k)
-
-
-def quaternion(r: np.ndarray) -> np.ndarray:
-    """Quaternions wxyz of rotation matrices far from half turns about x or y, shape (T, 3, 3) to (T, 4)."""
-    w = 0.5 * np.sqrt(np.maximum(1 + r[:, 0, 0] + r[:, 1, 1] + r[:, 2, 2], 1e-12))
-    return np.stack(
-        [w, (r[:, 2, 1] - r[:, 1, 2]) / (4 * w), (r[:, 0, 2] - r[:, 2, 0]) / (4 * w), (r[:, 1, 0] - r[:, 0, 1]) / (4 * w)], -1
-    )
-
-
-def sampled(time: np.ndarray, series: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """A series of shape (T, n) at other times, linear between milliseconds."""
-    return np.stack([np.interp(at, time, column) for column in series.T], -1)
-
-
 def recorded(recipe: Recipe, flights: list[Flights]) -> list[dict]:
     """What was recorded of each flight: plain arrays, SI units, quaternions wxyz; NaN where a frame was lost.
 
     Keys: ``time``, ``pos``, ``quat``, ``ball`` (200 Hz); ``sent_time``, ``sent`` (N, rad/s), ``release`` (its time or None);
-    ``truth_landing`` is what the world knows and no log tells.
+    ``truth_landing`` is what the world knows and no log tells. With a camera, also what :func:`tests.worlds.camera.looked` tells.
     """
-    rng = np.random.default_rng(recipe.seed + 3)
+    rng, eye = np.random.default_rng(recipe.seed + 3), np.random.default_rng([recipe.seed, 4])
     w = world_of(recipe)
     tilt, turn = small_turn(w.frame_tilt), small_turn(w.marker_turn)
     out = []
@@ -160,4 +138,7 @@ def recorded(recipe: Recipe, flights: list[Flights]) -> list[dict]:
                  "sent": f.commands[e], "release": release, "volt": f.volt[e],
                  "truth_landing": f.ball[e][down[0]] if len(down) else None}
             )  # fmt: skip
+            if recipe.camera:
+                aim = (f.ball[e][down[0]] if len(down) else np.zeros(3)) + eye.uniform(-0.5, 0.5, 3)
+                out[-1] |= looked(f, e, aim * [1.0, 1.0, 0.0], landed, w, recipe.noise, recipe.dropouts, eye)
     return out

@@ -31,6 +31,8 @@ NEAR = 0.025
 SHORT = 1e-3
 """Over which the speed of a keypoint is taken [s]: its row differs from the others' by a few milliseconds at most."""
 LEAST_KEYPOINT_SIGMA = 2e-4  # normalised
+MEASURED = np.array([(1, 1)] * 4 + [(1, 0), (0, 1), (1, 0), (0, 1)], dtype=bool)
+"""Coordinates (8, 2) that a detector measures: corners, and where each side of a box is; the rest are middles of sides."""
 ACTS_ON = ("camera.", "plant.release.landing_height", "plant.rope.payload_radius", "sensing.camera_")
 """Numbers that nothing but these samples depends on: their effects need no simulation."""
 
@@ -215,11 +217,20 @@ def _view(log: FlightLog, flight: Recorded, c: Cut, x: SensingParams) -> dict | 
     table = {name: [smoothed(s, t, NEAR, NEAR) for t in grid] for name, s in _sources(flight, x).items()}
     if any(row is None for rows in table.values() for row in rows):
         return None
-    sigma = float(np.median(highpass_sigma(points[kept].reshape(len(kept), -1))))
-    view = {"time": stamps, "points": points[kept], "valid": np.repeat(seen[..., None], 2, axis=-1), "grid": grid,
+    seen = seen[..., None] & MEASURED
+    if not np.any(seen):
+        return None
+    view = {"time": stamps, "points": points[kept], "valid": seen, "grid": grid,
             "goal": np.zeros(3) if goal is None else np.asarray(goal, dtype=float)[:3],
-            "sigma": max(sigma, LEAST_KEYPOINT_SIGMA)}  # fmt: skip
+            "sigma": max(_noise(points[kept], seen), LEAST_KEYPOINT_SIGMA)}  # fmt: skip
     return view | {name: (np.array([r[0] for r in rows]), np.array([r[1] for r in rows])) for name, rows in table.items()}
+
+
+def _noise(points: np.ndarray, seen: np.ndarray) -> float:
+    """Of coordinates while they are seen: what stands in the log where they are not is none."""
+    tracks = [points[seen[:, k, i], k, i] for k, i in zip(*np.nonzero(MEASURED))]
+    sigmas = [highpass_sigma(track) for track in tracks if len(track) > 3]
+    return float(np.median(sigmas)) if sigmas else 0.0
 
 
 def _sources(flight: Recorded, x: SensingParams) -> dict[str, Samples]:
@@ -234,14 +245,14 @@ def _at(view: dict, name: str, time: np.ndarray) -> np.ndarray:
     grid, (values, slopes) = view["grid"], view[name]
     k = np.clip(np.searchsorted(grid, time) - 1, 0, len(grid) - 2)
     h = time - grid[k]
-    if name == "attitude":
-        bend = (slopes[k + 1] - slopes[k]) / GRID
-        turn = h[:, None] * slopes[k] + 0.5 * h[:, None] ** 2 * bend
-        return (Rotation.from_quat(values[k]) * Rotation.from_rotvec(turn)).as_quat()
     s = (h / GRID)[:, None]
-    chord = values[k + 1] - values[k]
+    turns = name == "attitude"
+    here = Rotation.from_quat(values[k]) if turns else None
+    chord = (here.inv() * Rotation.from_quat(values[k + 1])).as_rotvec() if turns else values[k + 1] - values[k]
+    # A cubic that meets both ends: a jump there, divided by a small delay, would pass for an effect of that delay.
     bend = s * (1.0 - s) * ((1.0 - s) * (GRID * slopes[k] - chord) - s * (GRID * slopes[k + 1] - chord))
-    return values[k] + s * chord + bend
+    way = s * chord + bend
+    return (here * Rotation.from_rotvec(way)).as_quat() if turns else values[k] + way
 
 
 def _seen(view: dict, setting: Setting, nominal: Setting, time: np.ndarray) -> np.ndarray:
@@ -254,7 +265,8 @@ def _seen(view: dict, setting: Setting, nominal: Setting, time: np.ndarray) -> n
     vehicle = time + (x.vehicle_delay - nominal.sensing.vehicle_delay)
     frame, marker = Rotation.from_rotvec(x.frame_tilt), Rotation.from_rotvec(x.marker_rotation)
     turned = frame.inv() * Rotation.from_quat(_at(view, "attitude", vehicle)) * marker.inv()
-    off = np.array(x.marker_offset) - np.array(setting.plant.vehicle.body.com)
+    # The mount is stated from the centre of mass as it was believed: where the weight really lies moves no lens.
+    off = np.array(x.marker_offset) - np.array(nominal.plant.vehicle.body.com)
     pos = _origin(x, _at(view, "vehicle", vehicle)) - turned.apply(off)
     ball = _origin(x, _at(view, "payload", time + (x.payload_delay - nominal.sensing.payload_delay))) - np.array(x.payload_offset)
     lens = KeypointCamera(camera, dtype=torch.float64)

@@ -78,9 +78,9 @@ ENTRIES: tuple[Entry, ...] = (
             "camera",
             (-0.5, 0.5),
             0.0175,
-            1.7e-3,
+            6e-4,
             SEEN,
-            "screwed on by hand; prior 1 deg, floor 0.1 deg",
+            "screwed on by hand; prior 1 deg, floor as of the markers' rotation",
             [Key("camera.mount.rpy_deg", index=i, factor=float(np.degrees(1.0)))],
             confused=(f"marker_rot_{axis}",),
             manoeuvres=DYNAMICS,
@@ -115,7 +115,7 @@ ENTRIES: tuple[Entry, ...] = (
         "camera",
         (-1e-3, 0.3),
         0.02,
-        5e-4,
+        2e-4,
         SEEN,
         "Kalibr, Furgale et al. 2013; exposure, transport and detection take 0 to 40 ms",
         [Key("sensing.camera_delay")],
@@ -157,4 +157,5 @@ ENTRIES: tuple[Entry, ...] = (
         applies=_looks,
     ),
 )
-"""Priors are one standard deviation; floors a tenth of a degree, half a pixel, half a millisecond."""
+"""Priors are one standard deviation. Floors of tilt and latency are a tenth of a pixel, the latter at 3 rad/s; those of lens and
+place what a calibration repeats to."""
