@@ -18,6 +18,11 @@ from visthrow.flightlog import Channel, FlightLog
 
 Logs = list[FlightLog]
 HOURS = 2.0
+GRAVITY = 9.81
+WANDER = 0.15
+"""Of a hover, to either side [m]."""
+FULL_THRUST = 14.0
+"""What the configured controller calls full: four times ``max_thrust`` of configs/vehicle [N]."""
 
 
 def each(change: Callable[[FlightLog], FlightLog]) -> Callable[[Logs], Logs]:
@@ -70,6 +75,28 @@ def still(seconds: float, thrust: float, height: float, rate: float = 100.0) -> 
         "pos_w": Channel(t, place + 5e-4 * rng.standard_normal((len(t), 3)), "m", "world"),
         "quat_wb": Channel(t, np.column_stack((turn, np.ones(len(t)))), "1", "world"),
         "command": Channel(sent, command, "N, rad/s", "body"),
+    }, {})  # fmt: skip
+
+
+def wandering(seconds: float, rate: float = 100.0) -> FlightLog:
+    """A hover that is never quite still, for so long: paths, attitudes and commands that belong together."""
+    rng = np.random.default_rng(1)
+    t, sent = np.arange(0.0, seconds, 1.0 / rate), np.arange(0.0, seconds, 0.02)
+    speed, phase = np.array([0.31, 0.47]), np.array([0.3, 1.1])  # of the wander along x and y [rad/s], [rad]
+
+    def lean(time: np.ndarray) -> np.ndarray:
+        """Acceleration over gravity along x and y."""
+        return -WANDER * speed**2 * np.sin(speed * time[:, None] + phase) / GRAVITY
+
+    x, y = lean(t).T
+    turn = 0.5 * np.column_stack((-y, x, np.zeros(len(t)))) + 2.5e-4 * rng.standard_normal((len(t), 3))
+    path = np.column_stack((WANDER * np.sin(speed * t[:, None] + phase), np.full(len(t), 1.5)))
+    rate_x, rate_y = (-WANDER * speed**3 * np.cos(speed * sent[:, None] + phase) / GRAVITY).T
+    thrust = 2.0601 * (1.0 + 0.5 * np.sum(lean(sent) ** 2, axis=1))
+    return FlightLog({
+        "pos_w": Channel(t, path + 5e-4 * rng.standard_normal((len(t), 3)), "m", "world"),
+        "quat_wb": Channel(t, np.column_stack((turn, np.ones(len(t)))), "1", "world"),
+        "command": Channel(sent, np.column_stack((thrust, -rate_y, rate_x, np.zeros(len(sent)))), "N, rad/s", "body"),
     }, {})  # fmt: skip
 
 
@@ -130,6 +157,11 @@ def standing(_: Sequence[FlightLog]) -> Logs:
 
 def hours(_: Sequence[FlightLog]) -> Logs:
     """One hover of two hours."""
+    return [wandering(3600.0 * HOURS)]
+
+
+def hours_still(_: Sequence[FlightLog]) -> Logs:
+    """One vehicle that stays in its place to the millimetre for two hours."""
     return [still(3600.0 * HOURS, 2.07, 1.5)]
 
 
@@ -137,7 +169,7 @@ BAD = {
     "millimetres": Bad(values(pos_w=lambda p: 1e3 * p, payload_pos_w=lambda p: 1e3 * p)),
     "degrees": Bad(command_values(lambda u: u * [1.0, 57.3, 57.3, 57.3])),
     "grams": Bad(command_values(lambda u: u * [101.97, 1.0, 1.0, 1.0])),
-    "share_of_thrust": Bad(command_values(lambda u: u * [1.0 / 13.0, 1.0, 1.0, 1.0])),
+    "share_of_thrust": Bad(command_values(lambda u: u * [1.0 / FULL_THRUST, 1.0, 1.0, 1.0])),
     "roll_for_pitch": Bad(command_values(lambda u: u[:, [0, 2, 1, 3]])),
     "pitch_reversed": Bad(command_values(lambda u: u * [1.0, 1.0, -1.0, 1.0])),
     "east_for_north": Bad(values(pos_w=lambda p: p[:, [1, 0, 2]], payload_pos_w=lambda p: p[:, [1, 0, 2]])),
@@ -147,4 +179,5 @@ BAD = {
     "copied": Bad(doubled), "mixed_up": Bad(scrambled), "three_samples": Bad(each(lambda log: cut(log, 3))),
     "no_commands": Bad(without("command")), "no_attitude": Bad(without("quat_wb")), "truncated": Bad(as_they_are, cut_to=0.6),
     "empty_files": Bad(as_they_are, cut_to=0.0), "standing": Bad(standing, flown=False), "two_hours": Bad(hours, flown=False),
+    "two_hours_still": Bad(hours_still, flown=False),
 }  # fmt: skip

@@ -69,6 +69,7 @@ def write_report(folder: Path, diagnosis, model, logs, seed: int, limits: bool =
     from visthrow.storage import write_json
 
     measured = gain.measure(diagnosis, seed=seed)
+    measured = measured if measured.channels else None  # windows of one sample have nothing ahead that could be predicted
     hidden = blind.hide(diagnosis, seed=seed) if limits else None
     steps = model.step_error() if hasattr(model, "step_error") else None
     origin = provenance.collect()

@@ -138,7 +138,7 @@ def _thrust(log: FlightLog, figures: dict, flown: tuple[float, float]) -> None:
     if name is not None:
         channel = log[name]
         inside = channel.valid & (channel.time >= flown[0]) & (channel.time <= flown[1])
-        values = channel.values[inside].astype(float).reshape(int(np.sum(inside)), -1)
+        values = channel.values[inside].astype(float).reshape(int(np.sum(inside)), int(np.prod(channel.values.shape[1:])))
         thrust = values[:, 0] if name in ("command", "thrust_command") else np.mean(values, axis=1)
         thrust = thrust**2 if name == "motor_speed" else thrust
         if len(thrust):

@@ -15,6 +15,9 @@ MOVES = 0.05
 
 _PREFIXES = ("", "est_", "mocap_", "payload_")
 _FASTEST, _FARTHEST = 60.0, 2000.0  # of vehicles that throw [m/s], [m]
+_SHARES = ("motor_command", "motor_wanted", "throttle")
+_LARGEST_SHARE = 2.0  # of a command whose full size is 1; what a controller asks for may exceed it, a wrong unit by far more
+_VOLTS = (0.5, 100.0)  # of any pack of such a vehicle [V]
 _BELONGS, _FIRMLY, _CLEARLY = 0.35, 0.7, 0.12
 _LIVELY = 0.2  # rates that noise and draught alone do not make [rad/s]
 _DELAY_WARN, _DELAY_KNOWN = 0.02, 0.003  # [s]
@@ -22,7 +25,7 @@ _DELAY_WARN, _DELAY_KNOWN = 0.02, 0.003  # [s]
 
 def _valid(channel: Channel) -> tuple[np.ndarray, np.ndarray]:
     values = channel.values.astype(float)
-    return channel.time[channel.valid], values[channel.valid].reshape(int(np.sum(channel.valid)), -1)
+    return channel.time[channel.valid], values[channel.valid].reshape(int(np.sum(channel.valid)), int(np.prod(values.shape[1:])))
 
 
 def look(log: FlightLog) -> list[Row]:
@@ -60,6 +63,22 @@ def _plausible(log: FlightLog) -> Iterator[Row]:
         if fast > _FASTEST or far > _FARTHEST:
             text = f"{fast:.3g} m/s and {far:.3g} m from the origin: no such vehicle; millimetres taken for metres?"
             yield Row("units", name, "bad", text, figures)
+    yield from _implausible_sizes(log)
+
+
+def _implausible_sizes(log: FlightLog) -> Iterator[Row]:
+    """Commands and voltages of a size that only another unit gives them."""
+    for name in _SHARES:
+        if name in log and log[name].unit == "1" and np.any(log[name].valid):
+            high = float(np.percentile(np.abs(_valid(log[name])[1]), 95))
+            if high > _LARGEST_SHARE:
+                text = f"95 % of the values reach {high:.3g}: no shares of the full command"
+                yield Row("units", name, "bad", text, {"p95": high})
+    for name in ("battery_voltage", "supply_voltage"):
+        if name in log and np.any(log[name].valid):
+            middle = float(np.median(_valid(log[name])[1]))
+            if middle > _VOLTS[1] or 0.0 < middle < _VOLTS[0]:
+                yield Row("units", name, "bad", f"{middle:.3g} V: no such pack; another unit?", {"median_v": middle})
 
 
 def _velocity(log: FlightLog, pos: str, vel: str) -> list[Row]:

@@ -3,8 +3,13 @@
 All of them are north-east-down and forward-right-down; ours become x north, y west, z up and forward, left, up.
 """
 
+import io
 import math
-from collections.abc import Iterable
+import os
+import tempfile
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -86,8 +91,34 @@ TELEMETRY = (
     _t("SERVO_OUTPUT_RAW", "servo3_raw servo1_raw servo2_raw servo4_raw", "motor_output", "1", flip=False),
 )
 
+_STDERR = 2
+MOST_RETURNS = 8
+"""Times that a reader may step back to one and the same byte; one that is led astray by a damaged length does so for ever."""
+
 Messages = dict[str, dict[str, np.ndarray]]
 """Message -> field -> values; ``time`` [s] among the fields."""
+
+
+class _Forward(io.BytesIO):
+    """Bytes of a file for a reader that looks for the next message of a damaged log by stepping back: never in a circle."""
+
+    def __init__(self, data: bytes) -> None:
+        super().__init__(data)
+        self._returns: Counter[int] = Counter()
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        """As of any file.
+
+        Raises:
+            LogError: It leads to a byte that was returned to too often.
+        """
+        before = self.tell()
+        after = super().seek(offset, whence)
+        if after < before:
+            self._returns[after] += 1
+            if self._returns[after] > MOST_RETURNS:
+                raise LogError(f"the length of a message leads nowhere, near byte {after}")
+        return after
 
 
 def log_of_ulog(path: str | Path) -> FlightLog:
@@ -102,12 +133,13 @@ def log_of_ulog(path: str | Path) -> FlightLog:
         raise LogError(f"{path}: reading ULog needs pyulog; install it with: pip install 'visthrow[logs]'") from error
     _expect_file(path)
     try:
-        read = ULog(str(path), list({tap.message for tap in ULOG}))
+        with _quietly():
+            read = ULog(_Forward(Path(path).read_bytes()), list({tap.message for tap in ULOG}))
     except Exception as error:  # pyulog has no errors of its own: struct, TypeError, IndexError, UnicodeDecodeError
         raise LogError(f"{path}: cannot be read: {error!r}; expected a ULog file") from error
     messages: Messages = {}
     for data in read.data_list:
-        if data.multi_id == 0:
+        if data.multi_id == 0 and "timestamp" in data.data:
             messages[data.name] = {**data.data, "time": data.data["timestamp"] * 1e-6}
     drops = [(drop.timestamp * 1e-6, drop.duration * 1e-3) for drop in read.dropouts]
     return _to_log(messages, ULOG, path, {"kind": "ulog", "dropouts": drops, "damaged": bool(read.file_corruption)})
@@ -156,22 +188,42 @@ def _read_messages(path, opened, taps: Iterable[Tap], kind: str, time_of) -> Fli
         wanted.setdefault(tap.message, set()).update(tap.fields)
     rows: dict[str, dict[str, list[float]]] = {}
     first_of: dict[str, int] = {}
+    complaints = []
     try:
-        source = opened()
-        while (message := source.recv_match(type=list(wanted))) is not None:
-            name = message.get_type()
-            instance = getattr(message, "I", getattr(message, "C", 0))
-            if first_of.setdefault(name, instance) != instance or not all(hasattr(message, f) for f in wanted[name]):
-                continue
-            row = rows.setdefault(name, {field: [] for field in ("time", *wanted[name])})
-            row["time"].append(time_of(message))
-            for field in wanted[name]:
-                row[field].append(float(getattr(message, field)))
+        with _quietly() as complaints:
+            source = opened()
+            while (message := source.recv_match(type=list(wanted))) is not None:
+                name = message.get_type()
+                instance = getattr(message, "I", getattr(message, "C", 0))
+                if first_of.setdefault(name, instance) != instance or not all(hasattr(message, f) for f in wanted[name]):
+                    continue
+                row = rows.setdefault(name, {field: [] for field in ("time", *wanted[name])})
+                row["time"].append(time_of(message))
+                for field in wanted[name]:
+                    row[field].append(float(getattr(message, field)))
     except Exception as error:  # pymavlink raises whatever struct, mmap and itself raise
         if not rows:
             raise LogError(f"{path}: cannot be read: {error!r}; expected a {kind} log") from error
     messages = {name: {f: np.array(v) for f, v in fields.items()} for name, fields in rows.items()}
-    return _to_log(messages, taps, path, {"kind": kind})
+    return _to_log(messages, taps, path, {"kind": kind, "damaged": bool(complaints)})
+
+
+@contextmanager
+def _quietly() -> Iterator[list[str]]:
+    """What readers of others print of damaged bytes, some of them a line a byte and past Python, in a list instead."""
+    said: list[str] = []
+    heard = io.StringIO()
+    with tempfile.TemporaryFile() as file:
+        kept = os.dup(_STDERR)
+        os.dup2(file.fileno(), _STDERR)
+        try:
+            with redirect_stdout(heard), redirect_stderr(heard):
+                yield said
+        finally:
+            os.dup2(kept, _STDERR)
+            os.close(kept)
+            file.seek(0)
+            said += [*heard.getvalue().splitlines(), *file.read().decode(errors="replace").splitlines()]
 
 
 def _expect_file(path: str | Path) -> None:
@@ -194,10 +246,11 @@ def _to_log(messages: Messages, taps: Iterable[Tap], path: str | Path, meta: dic
             tap.channel, tap.fields, tap.unit, kind=tap.kind, order="wxyz" if tap.kind == "quaternion" else "xyzw",
             axes=flip, body_axes=flip if tap.kind != "vector" else "", frame=tap.frame, scale=tap.scale,
         )  # fmt: skip
-        values = np.column_stack([fields[field] for field in tap.fields]).astype(float)
+        with np.errstate(invalid="ignore"):  # damaged floats
+            values = np.column_stack([fields[field] for field in tap.fields]).astype(float)
         channels[tap.channel], found = make_channel(np.asarray(fields["time"], float), values, entry, str(path))
         notes[tap.channel] = found | {"clock": "autopilot", "message": tap.message}
-    if not channels:
+    if not any(len(channel.time) for channel in channels.values()):
         known = ", ".join(sorted({tap.message for tap in taps}))
         raise LogError(f"{path}: no message of a vehicle's motion in it; known: {known}")
     start = min(float(channel.time[0]) for channel in channels.values() if len(channel.time))

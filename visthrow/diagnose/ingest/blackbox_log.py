@@ -47,7 +47,7 @@ def log_of_decoded(table: Table, path: str | Path) -> FlightLog:
     """Make a flight log of a decoded CSV; its units are those of the raw log, or stand in brackets behind the names.
 
     Raises:
-        LogError: A column has a unit in brackets that is not known.
+        LogError: A column has a unit in brackets that is not known, or the stamps are no numbers.
     """
     plain = {}
     for name, values in table.items():
@@ -83,6 +83,8 @@ def _raw_meta(log: BlackboxLog, path: str | Path, number: int) -> dict:
 
 
 def _flight(table: Table, header: dict[str, str], meta: dict) -> FlightLog:
+    if "time" not in table:
+        raise LogError(f"{meta['source']}: no numbers in a column 'time'; a flight needs stamps")
     stamps = table["time"].copy()
     turns = np.concatenate([[0], np.cumsum(np.diff(stamps) < -_CLOCK_TURN / 2)])
     time = (stamps + _CLOCK_TURN * turns) * 1e-6

@@ -7,6 +7,7 @@ import json
 import lzma
 import math
 import re
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,8 @@ Table = dict[str, np.ndarray]
 """Column -> values; numbers as float64 (NaN where the cell is empty), anything else as text."""
 
 _EXPORTED = re.compile(r"(?P<name>\w+?)(?:\[(?P<index>[\d,]+)\])? \[(?P<unit>.+?)(?:, (?P<frame>world|body|camera|image|mocap))?\]")
+_LARGEST = 1e100
+"""No number of a flight is as large, in whatever unit; its square is still a number."""
 _OPENERS = {".gz": gzip.decompress, ".xz": lzma.decompress}
 
 
@@ -38,9 +41,9 @@ def read_table(path: str | Path) -> Table:
         if path.suffix == ".parquet":
             return _parquet(data, path)
         text = _OPENERS.get(path.suffix, bytes)(data).decode("utf-8-sig")
-    except (OSError, EOFError, UnicodeDecodeError, lzma.LZMAError) as error:
+        rows = list(csv.reader(io.StringIO(text, newline="")))
+    except (OSError, EOFError, UnicodeDecodeError, lzma.LZMAError, zlib.error, csv.Error) as error:
         raise LogError(f"{path}: cannot be read: {error}; expected a CSV table, plain, .gz or .xz") from error
-    rows = list(csv.reader(io.StringIO(text)))
     header = [name.strip() for name in rows[0]] if rows else []
     body = [row for row in rows[1:] if row]
     if len(header) < 2:
@@ -189,7 +192,7 @@ def make_channel(time: np.ndarray, values: np.ndarray, entry: ChannelMap, source
         notes["repeated"] = int(np.sum(np.diff(time) == 0.0))
         notes["backwards"] = int(np.sum(np.diff(time) < 0.0))
     time, values = time[ahead], values[ahead]
-    valid = np.all(np.isfinite(values), axis=1)
+    valid = np.all(np.abs(values) < _LARGEST, axis=1)  # not where it is NaN
     if entry.held and len(values):
         fresh = np.ones(len(values), dtype=bool)
         fresh[1:] = np.any(values[1:] != values[:-1], axis=1)
@@ -258,7 +261,7 @@ def log_of_export(table: Table, source: str) -> FlightLog:
         if match and column != "time [s]":
             index = tuple(int(part) for part in match["index"].split(",")) if match["index"] else ()
             entry = found.setdefault(match["name"], {"unit": match["unit"], "frame": match["frame"] or "none", "at": {}})
-            entry["at"][index] = _as_numbers(table[column])
+            entry["at"][index] = _as_numbers(table, column, source)
     channels, time = {}, _numbers(table, "time [s]", source)
     for name, entry in found.items():
         if name in STANDARD_CHANNELS:  # its unit may hold a comma
@@ -269,16 +272,34 @@ def log_of_export(table: Table, source: str) -> FlightLog:
         values = np.full((len(time), *shape), np.nan)
         for index, cells in entry["at"].items():
             values[(slice(None), *index)] = cells
-        there = np.all(np.isfinite(values.reshape(len(time), -1)), axis=1)
-        channels[name] = Channel(time[there], values[there], entry["unit"], entry["frame"])
-    return FlightLog(channels, {"source": source})
+        there = np.all(np.abs(values.reshape(len(time), -1)) < _LARGEST, axis=1)  # not where it is NaN
+        try:
+            channels[name] = Channel(time[there], values[there], entry["unit"], entry["frame"])
+        except LogError as error:
+            raise LogError(f"{source}: channel '{name}': {error}") from error
+    try:
+        return FlightLog(channels, {"source": source})
+    except LogError as error:
+        raise LogError(f"{source}: {error}") from error
 
 
-def _as_numbers(cells: np.ndarray) -> np.ndarray:
+def _as_numbers(table: Table, column: str, source: str) -> np.ndarray:
+    cells = table[column]
     if cells.dtype.kind in "fiub":
         return cells.astype(float)
     words = {"True": 1.0, "False": 0.0, "": math.nan}
+    wrong = [cell for cell in cells.tolist() if cell not in words and not _is_number(cell)]
+    if wrong:
+        raise LogError(f"{source}: column '{column}' holds text such as '{wrong[0]}'; expected numbers, True or False")
     return np.array([words[cell] if cell in words else float(cell) for cell in cells.tolist()])
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
 
 
 def metadata_of(path: str | Path) -> dict:

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from visthrow.diagnose.check.relations import derivative
-from visthrow.diagnose.check.signals import noise
 from visthrow.diagnose.model import Effect
 from visthrow.diagnose.models.numeric import (
     Lanes,
@@ -20,6 +19,7 @@ from visthrow.diagnose.models.numeric import (
     integrate,
     latent_force,
     latent_layout,
+    sigma_of,
 )
 from visthrow.flightlog import FlightLog
 
@@ -119,7 +119,7 @@ def _flights(log: FlightLog, number: int, params: BallParams) -> list[Stretch]:
     time, pos = channel.time[channel.valid], channel.values[channel.valid].astype(float)
     if len(time) < 40:
         return []
-    sigma = np.maximum(noise(channel), 1e-5)
+    sigma = sigma_of(channel, 1e-5)
     found = []
     for start, end in _free(time, pos, params):
         inside = np.flatnonzero((time >= start) & (time <= end))[:: params.every]

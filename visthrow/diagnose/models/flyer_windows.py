@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sim.reference.rotations import rotation_from_quat
-from visthrow.diagnose.check.signals import noise
-from visthrow.diagnose.models.numeric import Stretch, latent_layout
+from visthrow.diagnose.models.numeric import Stretch, latent_layout, sigma_of
 from visthrow.errors import LogError
 from visthrow.flightlog import Channel, FlightLog
 
@@ -22,6 +21,8 @@ _GUESS = 0.25
 """First guesses are straight lines through so much of a window [s]."""
 _MOST_MISSING = 0.25
 """Largest gap in an input within a window [s]."""
+_MOST_THRUST = 5.0
+"""Median thrust over the weight, by the map: a map may be far off, a unit is off by more."""
 _IDLE = 0.3
 """Windows in which the thrust falls below this share of the weight are on the ground."""
 
@@ -30,21 +31,39 @@ def stretches_of(logs: Sequence[FlightLog], params: "FlyerParams", channels: Seq
     """Windows of all logs, at most ``most_windows``, spread evenly.
 
     Raises:
-        LogError: No log has the channels.
+        LogError: No log has the channels, or the commands are of another size than carries the vehicle.
     """
     needed = [params.position, params.attitude, params.input, *channels[1:]]
-    usable = [(i, log) for i, log in enumerate(logs) if all(name in log for name in needed)]
+    usable = [(i, log) for i, log in enumerate(logs) if all(_holds(log, name) for name in needed)]
     if not usable:
-        lacking = [name for name in needed if not any(name in log for log in logs)]
+        lacking = [name for name in needed if not any(_holds(log, name) for log in logs)]
         raise LogError(f"no log has all of {', '.join(needed)}; missing everywhere: {', '.join(lacking) or 'none'}")
     found = [s for number, log in usable for s in _windows(log, number, params, channels)]
+    if found:
+        _expect_thrust(found, params)
     if len(found) > params.most_windows:
         found = [found[i] for i in np.linspace(0, len(found) - 1, params.most_windows).round().astype(int)]
     return found
 
 
+def _holds(log: FlightLog, name: str) -> bool:
+    return name in log and bool(np.any(log[name].valid))
+
+
+def _expect_thrust(found: Sequence[Stretch], params: "FlyerParams") -> None:
+    """Refuse commands of another unit: they carry neither the vehicle nor anything like it."""
+    weight = params.gravity * (params.mass + (params.cable.mass if params.cable is not None else 0.0))
+    told = np.concatenate([s.data["input"] for s in found])
+    ratio = float(np.median(sum(c * told**power for power, c in enumerate(params.thrust_map)).sum(axis=1))) / weight
+    if ratio > _MOST_THRUST:
+        raise LogError(
+            f"the thrust by {params.input} and the setup's thrust_map is {ratio:.3g} times the weight of {weight:.3g} N: "
+            "another unit, or another vehicle's map"
+        )
+
+
 def _windows(log: FlightLog, number: int, params: "FlyerParams", channels: Sequence[str]) -> list[Stretch]:
-    sigma = {name: np.maximum(noise(log[name]), _least(name)) for name in channels}
+    sigma = {name: sigma_of(log[name], _least(name)) for name in channels}
     position, attitude, told = log[params.position], log[params.attitude], log[params.input]
     first = max(c.time[0] for c in (position, attitude, told))
     last = min(c.time[-1] for c in (position, attitude, told))

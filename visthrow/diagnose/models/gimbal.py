@@ -12,10 +12,13 @@ import numpy as np
 from sim.reference.rotations import rotation_from_quat
 from visthrow.diagnose.model import Effect
 from visthrow.diagnose.models.numeric import Lanes, NumericModel, Stretch, cross, latent_layout, triangles
+from visthrow.errors import LogError
 from visthrow.flightlog import FlightLog
 
 CHANNEL = "marker_pos_c"
 NEEDED = (CHANNEL, "pos_w", "quat_wb", "payload_pos_w")
+MOST_APART = 0.25
+"""Share of the detections that may be of something else than the payload."""
 KNOTS = 11
 """Of the slow wander of detections over a window."""
 MARGIN = 1.0
@@ -57,7 +60,7 @@ def effects(params: GimbalParams) -> list[Effect]:
                "calibration", ("range_scale",), ("vary the distance",)),
         Effect("range_scale", "the marker's size", "z (1 + theta)", "1", "camera", (-0.5, 0.5), 0.05, 2e-3, NEEDED,
                "calibration", ("focal_scale",), ("vary the distance",)),
-        *(Effect(f"marker_rot_{axis}", f"the tracked attitude is turned about the body's {axis} axis",
+        *(Effect(f"marker_rot_{axis}", f"the tracked attitude, or the gimbal's mount, is turned about the body's {axis} axis",
                  f"R_meas = R R_{axis}(theta)", "rad", "sensing", (-0.3, 0.3), 0.0175, 1.7e-3, NEEDED, "marker placement",
                  (f"camera_tilt_{other}",), ("turn the gimbal", "dynamics of the flight")) for axis, other in zip("xyz", "yxz")),
     ]  # fmt: skip
@@ -71,7 +74,7 @@ class GimbalModel(NumericModel):
         """Cut the logs.
 
         Raises:
-            LogError: None of them has poses of both bodies and the marker.
+            LogError: None of them has poses of both bodies and the marker, or the marker is seen elsewhere than the payload.
         """
         from scipy.spatial.transform import Rotation
 
@@ -136,8 +139,10 @@ def _tables(log: FlightLog, params: GimbalParams) -> tuple[np.ndarray, dict[str,
 
 def _cut(log: FlightLog, number: int, params: GimbalParams, camera: np.ndarray) -> list[Stretch]:
     marker = log[CHANNEL]
+    if not all(np.any(log[name].valid) for name in NEEDED):
+        return []
     table_time, tables = _tables(log, params)
-    found = []
+    found, apart, seen = [], 0, 0
     for start in np.arange(marker.time[0] + MARGIN, marker.time[-1] - MARGIN - params.window, params.window):
         inside = np.flatnonzero(marker.valid & (marker.time >= start) & (marker.time < start + params.window))[:: params.every]
         near = (table_time > start - MARGIN) & (table_time < start + params.window + MARGIN)
@@ -146,6 +151,8 @@ def _cut(log: FlightLog, number: int, params: GimbalParams, camera: np.ndarray) 
         time, point = marker.time[inside], marker.values[inside].astype(float)
         distance = np.linalg.norm(tables["gap"][near], axis=1)
         fits = np.abs(np.linalg.norm(point, axis=1) - np.median(distance)) < params.largest
+        apart += len(fits) - int(np.sum(fits))
+        seen += len(fits)
         if np.sum(fits) < 10:
             continue
         time, point = time[fits], point[fits]
@@ -157,4 +164,9 @@ def _cut(log: FlightLog, number: int, params: GimbalParams, camera: np.ndarray) 
                 **latent_layout(start, start + params.window, KNOTS, (2,)),
             )
         )  # fmt: skip
+    if apart > MOST_APART * seen:
+        raise LogError(
+            f"the marker's distance is more than {params.largest:g} m from the payload's in {apart} of {seen} detections: "
+            "other axes, another unit, or another marker"
+        )
     return found

@@ -10,8 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from visthrow.diagnose.check.signals import noise
 from visthrow.diagnose.model import Effect, Window
 from visthrow.errors import LogError, suggest
+from visthrow.flightlog import Channel
 
 EFFECT_STEP = 0.05
 """Step of the differences by effects, in their prior deviations: errors of curvature cancel, those of rounding do not matter."""
@@ -184,6 +186,8 @@ class NumericModel:
     def _newton(self, i: int, residual: np.ndarray) -> np.ndarray:
         s, slope = self.stretches[i], self._slopes[i]
         weight, prior = 1.0 / s.sigma, 1.0 / s.nuisance_sd
+        if not (np.all(np.isfinite(residual)) and np.all(np.isfinite(slope))):
+            return np.zeros(len(s.nuisance))  # no step mends that; the search says which window it is
         rows = np.concatenate([slope * weight[:, None], np.diag(prior)])
         aim = np.concatenate([residual * weight, (s.nuisance - self._start[i]) * prior])
         return np.linalg.lstsq(rows, aim, rcond=None)[0]
@@ -233,6 +237,17 @@ class NumericModel:
         theta, nuisance, _ = self._zero(count)
         steps = self.latent_step * np.eye(count)
         return [(half / self.latent_step).T for half in self._differences(size, theta, nuisance, steps)]
+
+
+def sigma_of(channel: Channel, least: float) -> np.ndarray:
+    """Noise of a channel's components as the samples show it.
+
+    Args:
+        channel: Of a log.
+        least: Below which none is believed; ten times that stands where too few samples tell.
+    """
+    seen = noise(channel)
+    return np.maximum(np.where(np.isfinite(seen), seen, 10.0 * least), least)
 
 
 def rk4(slope: Callable[[int, np.ndarray], np.ndarray], state: np.ndarray, at: int, step: np.ndarray) -> np.ndarray:

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visthrow.diagnose.check.signals import noise
 from visthrow.diagnose.model import Effect
 from visthrow.diagnose.models.numeric import (
     Lanes,
@@ -15,12 +14,18 @@ from visthrow.diagnose.models.numeric import (
     integrate,
     latent_force,
     latent_layout,
+    sigma_of,
 )
+from visthrow.errors import LogError
 from visthrow.flightlog import FlightLog
 
 CHANNEL = "angle"
 KNOTS = 11
 """Of the latent torque per inertia over a window; told as one axis of the payload's force."""
+FEWEST = 20
+"""Samples of a window."""
+FARTHEST = 2.0 * np.pi
+"""Median distance from where the pendulum hangs [rad]: no free swing goes round and round most of the time."""
 SMOOTH = 0.02
 """Dry friction changes its sign over this rate [rad/s]: narrower than any swing, wide enough for the integrator."""
 
@@ -63,6 +68,9 @@ def effects(params: PendulumParams) -> list[Effect]:
                "lines a turn", (), ("swing at two amplitudes",)),
         Effect("clock_rate", "the logger's clock", "dt = (1 + theta) dt_stated", "1", "sensing", (-0.05, 0.05), 1e-3, 5e-4, seen,
                "crystal; gravity is known to 0.1 %", ("pendulum_length",), ("another clock",)),
+        Effect("joint_stiffness", "a spring at the joint: the encoder's cable, or the bearing", "a -= theta angle", "1/s^2", joint,
+               (-0.1 * params.gravity / params.length, params.gravity / params.length), 0.5, 0.03, seen,
+               "period over amplitude, as the encoder's scale", ("encoder_scale",), ("swing from large to small amplitude",)),
     ]  # fmt: skip
 
 
@@ -73,7 +81,7 @@ class PendulumModel(NumericModel):
         """Cut the logs.
 
         Raises:
-            LogError: None of them holds an angle.
+            LogError: None of them holds an angle, or one holds angles that are no radians from where it hangs.
         """
         self.params = params
         stretches = [s for i, log in enumerate(logs) if CHANNEL in log for s in _windows(log, i, params)]
@@ -83,7 +91,7 @@ class PendulumModel(NumericModel):
     def simulate(self, lanes: Lanes) -> np.ndarray:
         """See the base class; the unknowns are angle from hanging and rate at the window's start. Returns them over the grid."""
         p = self.params
-        length, viscous, coulomb, quadratic, _, _, clock = lanes.theta.T
+        length, viscous, coulomb, quadratic, _, _, clock, spring = lanes.theta.T
         stiffness = p.gravity / (p.length + length)
         viscous, coulomb, quadratic = p.viscous + viscous, p.coulomb + coulomb, p.quadratic + quadratic
         push = latent_force(lanes.latent, self._steps, 1, 1)[:, 0, :, 0]
@@ -91,14 +99,14 @@ class PendulumModel(NumericModel):
         def slope(at: int, state: np.ndarray) -> np.ndarray:
             angle, rate = state.T
             friction = viscous * rate + coulomb * np.tanh(rate / SMOOTH) + quadratic * np.abs(rate) * rate
-            return np.stack([rate, -stiffness * np.sin(angle) - friction + push[at]], 1)
+            return np.stack([rate, -stiffness * np.sin(angle) - spring * angle - friction + push[at]], 1)
 
         step = p.window / self._steps * (1.0 + clock[:, None])
         return integrate(slope, lanes.nuisance.copy(), self._steps, step)
 
     def measure(self, stretch: Stretch, path: np.ndarray, lanes: Lanes) -> np.ndarray:
         """See the base class."""
-        offset, scale, clock = lanes.theta.T[4:]
+        offset, scale, clock = lanes.theta.T[4:7]
         rate = path[..., 1:] * (1.0 + clock[:, None, None])
         angle = hermite(stretch.time, stretch.data["start"], self.params.window / self._steps, path[..., :1], rate)[..., 0]
         return angle * (1.0 + scale)[:, None] + offset[:, None] + self.params.hanging
@@ -107,11 +115,18 @@ class PendulumModel(NumericModel):
 def _windows(log: FlightLog, number: int, params: PendulumParams) -> list[Stretch]:
     channel = log[CHANNEL]
     time, angle = channel.time[channel.valid], channel.values[channel.valid].astype(float)
-    sigma = max(float(noise(channel)[0]), 1e-5)
+    if len(time) < FEWEST:
+        return []
+    if np.median(np.abs(angle - params.hanging)) > FARTHEST:
+        raise LogError(
+            f"the pendulum is {np.median(np.abs(angle - params.hanging)):.3g} rad from where it hangs ({params.hanging:.3g} rad); "
+            "expected radians within a turn: degrees, or another zero?"
+        )
+    sigma = float(sigma_of(channel, 1e-5)[0])
     found = []
     for start in np.arange(time[0], time[-1] - 0.5 * params.window, params.window):
         inside = np.flatnonzero((time >= start) & (time < start + params.window))[:: params.every]
-        if len(inside) < 20:
+        if len(inside) < FEWEST:
             continue
         t, y = time[inside], angle[inside]
         fit = np.polynomial.polynomial.polyfit(t[:12] - start, y[:12] - params.hanging, 2)

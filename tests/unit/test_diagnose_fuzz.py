@@ -1,0 +1,266 @@
+"""Damaged log files of every format: a flight log that can be looked at, or an error that says what; nothing else, and soon."""
+
+import gzip
+import itertools
+import lzma
+import math
+import random
+import signal
+import struct
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests import logfiles
+from visthrow import cli
+from visthrow.diagnose import setup as setups
+from visthrow.diagnose.check.run import check, table
+from visthrow.diagnose.ingest import read
+from visthrow.errors import LogError, VisthrowError
+from visthrow.flightlog import Channel, FlightLog
+from visthrow.logexport import export
+
+REAL = Path(__file__).resolve().parents[1] / "data" / "real"
+PATIENCE = 20.0
+"""Seconds; the longest of these small files takes one on a busy machine."""
+DAMAGES = 12
+MANY = 300
+SAMPLES = 200
+
+pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
+
+
+@contextmanager
+def patience(seconds: float = PATIENCE) -> Iterator[None]:
+    """Raise TimeoutError where a reader goes round in circles."""
+
+    def late(*_: object) -> None:
+        raise TimeoutError(f"no end after {seconds:g} s")
+
+    before = signal.signal(signal.SIGALRM, late)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def ulog(path: Path) -> None:
+    """Position, attitude and rates."""
+    logfiles.write_ulg(path, {
+        ("vehicle_local_position", 0): (["uint64_t timestamp", *(f"float {n}" for n in ("x", "y", "z", "vx", "vy", "vz"))],
+         [(20_000 * i, math.sin(0.1 * i), 2.0, -3.0, 5.0 * math.cos(0.1 * i), 0.0, 0.0) for i in range(SAMPLES)]),
+        ("vehicle_attitude", 0): (["uint64_t timestamp", "float[4] q"],
+         [(10_000 * i, math.cos(0.05 * i), math.sin(0.05 * i), 0.0, 0.0) for i in range(SAMPLES)]),
+        ("vehicle_angular_velocity", 0): (["uint64_t timestamp", "float[3] xyz"],
+         [(10_000 * i, 10.0, 0.0, 0.0) for i in range(SAMPLES)]),
+    })  # fmt: skip
+
+
+def dataflash(path: Path) -> None:
+    """Rates, accelerations, attitude and position."""
+    imu = ("QBffffff", "TimeUS,I,GyrX,GyrY,GyrZ,AccX,AccY,AccZ")
+    rows = [("IMU", (10_000 * i, i % 2, math.sin(0.1 * i), 0.2, 0.3, 0.0, 0.0, -9.81)) for i in range(SAMPLES)]
+    rows += [("ATT", (10_000 * i, 0, 10.0 * math.sin(0.05 * i), 0, 5.0, 0, 90.0)) for i in range(SAMPLES)]
+    rows += [("XKF1", (10_000 * i, 0, 0, 0, 0, 1.0, 0, 0, 0, 0.01 * i, 1.0, -2.0, 0, 0, 0, 0)) for i in range(SAMPLES)]
+    logfiles.write_bin(path, {"IMU": imu, "ATT": logfiles.ATT, "XKF1": logfiles.XKF1}, rows)
+
+
+def telemetry(path: Path) -> None:
+    """Position and attitude."""
+    from pymavlink.dialects.v20 import common
+
+    sender, data = common.MAVLink(None), b""
+    for i in range(SAMPLES):
+        for message in (
+            common.MAVLink_local_position_ned_message(20 * i, math.sin(0.1 * i), 2.0, -3.0, 0.1, 0.0, 0.5),
+            common.MAVLink_attitude_message(20 * i, 0.1 * math.sin(0.1 * i), 0.0, 0.0, 0.1, 0.0, 0.0),
+        ):
+            data += struct.pack(">Q", 1_700_000_000_000_000 + 20_000 * i) + message.pack(sender)
+    path.write_bytes(data)
+
+
+def blackbox(path: Path) -> None:
+    """A whole log and the beginning of another."""
+    path.write_bytes((REAL / "betaflight_bbl" / "btfl_001_start.bbl").read_bytes()[:14_000])
+
+
+def own() -> FlightLog:
+    """A log of ours."""
+    time, rng = 0.01 * np.arange(SAMPLES), np.random.default_rng(0)
+    return FlightLog({
+        "pos_w": Channel(time, rng.normal(size=(SAMPLES, 3)), "m", "world"),
+        "command": Channel(time[::2], np.ones((SAMPLES // 2, 4)), "N, rad/s", "body"),
+        "attached": Channel(time, np.arange(SAMPLES) < SAMPLES // 2, "bool"),
+    })  # fmt: skip
+
+
+def lines_of(folder: str, name: str) -> bytes:
+    """The head of a real table."""
+    return b"".join(gzip.decompress((REAL / folder / name).read_bytes()).splitlines(keepends=True)[: SAMPLES + 1])
+
+
+def payload_table() -> bytes:
+    """A table that needs a mapping."""
+    return lines_of("payload_cf_single", "log206.csv.gz")
+
+
+FORMATS: dict[str, Callable[[Path], object]] = {
+    "a.ulg": ulog, "a.BIN": dataflash, "a.tlog": telemetry, "a.bbl": blackbox, "a.npz": lambda path: own().save(path),
+    "export.csv": lambda path: export(own(), path), "export.parquet": lambda path: export(own(), path),
+    "payload.csv": lambda path: path.write_bytes(payload_table()),
+    "payload.csv.gz": lambda path: path.write_bytes(gzip.compress(payload_table())),
+    "payload.csv.xz": lambda path: path.write_bytes(lzma.compress(payload_table())),
+    "decoded.csv": lambda path: path.write_bytes(lines_of("betaflight_bbl", "LOG00037_start.csv.gz")),
+}  # fmt: skip
+WORDS = (b"nan", b"inf", b"1e400", b"", b'"', b",", b"\n", b"\x00", b"\xff", b"abc", b"True", b"-", b"1e300", b"\r")
+
+
+def damaged(data: bytes, chance: random.Random) -> bytes:
+    """Bytes cut off, turned over, left out, doubled or replaced, now and then in the file's head."""
+    out = bytearray(data)
+    for _ in range(chance.choice((1, 1, 2, 5))):
+        at = chance.randrange(min(len(out), 2000) if chance.random() < 0.3 else len(out))
+        width = chance.choice((1, 2, 4, 16, 64, 500))
+        kind = chance.randrange(7)
+        if kind == 0:
+            del out[at:]
+        elif kind == 1:
+            out[at] ^= 1 << chance.randrange(8)
+        elif kind == 2:
+            del out[at : at + width]
+        elif kind == 3:
+            out[at : at + width] = bytes(len(out[at : at + width]))
+        elif kind == 4:
+            out[at : at + width] = chance.randbytes(len(out[at : at + width]))
+        elif kind == 5:
+            out[at:at] = out[max(0, at - width) : at]
+        else:
+            out[at : at + chance.choice((0, 1, 3, 8))] = chance.choice(WORDS)
+        if not out:
+            break
+    return bytes(out)
+
+
+def looked_at(path: Path) -> bool:
+    """Read and check a file; False where an error says why not."""
+    mapping = setups.load("cf_payload").table if path.name.startswith("payload") else None
+    said = ""
+    try:
+        with patience():
+            for checked in check(read(path, mapping)):
+                table(checked)
+    except VisthrowError as error:
+        said = str(error)
+    assert not said or path.name in said
+    return not said
+
+
+def all_of(name: str, folder: Path, count: int) -> list[bool]:
+    path, chance = folder / name, random.Random(name)
+    FORMATS[name](path)
+    whole = path.read_bytes()
+    assert looked_at(path)
+    said = []
+    for i in range(count):
+        cut = whole[: len(whole) * i // (count // 3)]  # a third of them cut short, evenly
+        path.write_bytes(cut if i < count // 3 else damaged(whole, chance))
+        said.append(looked_at(path))
+    return said
+
+
+@pytest.mark.parametrize("name", list(FORMATS))
+def test_damaged_files(name, tmp_path):
+    said = all_of(name, tmp_path, DAMAGES)
+    assert not said[0]  # nothing at all
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", list(FORMATS))
+def test_many_damaged_files(name, tmp_path):
+    said = all_of(name, tmp_path, MANY)
+    assert not all(said)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["a.ulg", "a.BIN", "a.tlog", "a.bbl"])
+def test_cut_at_many_places(name, tmp_path):
+    path = tmp_path / name
+    FORMATS[name](path)
+    whole = path.read_bytes()
+    said = []
+    for end in itertools.chain(range(0, 2000, 37), range(2000, len(whole), 211)):
+        path.write_bytes(whole[:end])
+        said.append(looked_at(path))
+    first = said.index(True)
+    assert all(said[first:])  # what was readable when less was there stays so
+
+
+def test_a_length_that_leads_back_is_no_circle(tmp_path):
+    path = tmp_path / "a.ulg"
+    ulog(path)
+    data = path.read_bytes()
+    first = data.index(b"A\x00\x00\x00vehicle_local_position") - 2  # the end of the definitions
+    astray = data[16:first] * 8 + struct.pack("<HB", 400, 0) + bytes(90)
+    path.write_bytes(data[:16] + astray)
+    with patience(), pytest.raises(LogError, match="leads nowhere"):
+        read(path)
+
+
+def test_damaged_bytes_are_reported_in_one_row(tmp_path, capfd):
+    path = tmp_path / "a.BIN"
+    dataflash(path)
+    data = bytearray(path.read_bytes())
+    data[9000:9300] = bytes(300)
+    path.write_bytes(data)
+    code = cli.main(["diagnose", "check", str(path), "--no-pictures", "--all"])
+    said = capfd.readouterr()
+    assert code in (0, 1)
+    assert "damaged stretches in the file" in said.out
+    assert not said.err
+
+
+def test_text_where_numbers_stood(tmp_path):
+    path = tmp_path / "export.csv"
+    export(own(), path)
+    path.write_bytes(path.read_bytes().replace(b"True", b"Tr", 1))
+    with pytest.raises(LogError, match="holds text such as 'Tr'"):
+        read(path)
+
+
+def test_stamps_that_are_text(tmp_path):
+    path = tmp_path / "decoded.csv"
+    rows = lines_of("betaflight_bbl", "LOG00037_start.csv.gz").decode().splitlines()
+    at = [name.split(" ")[0] for name in rows[0].split(",")].index("time")
+    cells = rows[5].split(",")
+    cells[at] = "late"
+    path.write_text("\n".join([*rows[:5], ",".join(cells), *rows[6:]]))
+    with pytest.raises(LogError, match="column 'time'"):
+        read(path)
+
+
+def test_bytes_that_do_not_inflate(tmp_path):
+    path = tmp_path / "payload.csv.gz"
+    data = bytearray(gzip.compress(payload_table()))
+    data[200:260] = b"\xff" * 60
+    path.write_bytes(data)
+    with pytest.raises(LogError, match="cannot be read"):
+        read(path, setups.load("cf_payload").table)
+
+
+@pytest.mark.parametrize(
+    ("channel", "words"),
+    [
+        (Channel(0.01 * np.arange(SAMPLES), np.full(SAMPLES, 3700.0), "V"), "no such pack"),
+        (Channel(0.01 * np.arange(SAMPLES), np.full((SAMPLES, 4), 40_000.0), "1"), "no shares of the full command"),
+    ],
+)
+def test_sizes_that_only_another_unit_gives(channel, words):
+    name = "battery_voltage" if channel.unit == "V" else "motor_command"
+    for factor, bad in ((1.0, True), (1e-3 if channel.unit == "V" else 1e-5, False)):
+        log = FlightLog({name: Channel(channel.time, factor * channel.values, channel.unit)})
+        assert any(words in row.text for row in check([log])[0].rows) == bad
