@@ -1,0 +1,23 @@
+"""Causes that only some of the flights ask for are marked on the printed page."""
+
+from types import SimpleNamespace
+
+from visthrow.diagnose.explain_cli import not_firm
+
+
+def diagnosis(**partners):
+    """Of causes that were named, with the other members of their classes."""
+    findings = [SimpleNamespace(name=name, partners=others) for name, others in partners.items()]
+    return SimpleNamespace(findings=[*findings, SimpleNamespace(name="other", partners=())], theta=dict.fromkeys(partners, 1.0))
+
+
+def test_a_cause_named_in_few_folds_is_marked():
+    gain = SimpleNamespace(folds=4, left_out="flights", named_in={"lag": 0.25, "drag": 1.0, "mass": 0.5, "thrust": 0.5})
+    said = not_firm(diagnosis(lag=(), drag=(), mass=("thrust",)), gain)
+    assert said == ["not firm: lag is named in 25 % of the 4 searches that leave flights out"]
+    assert not_firm(diagnosis(curve=()), gain) == ["not firm: curve is named in 0 % of the 4 searches that leave flights out"]
+
+
+def test_nothing_is_said_without_folds():
+    assert not_firm(diagnosis(lag=()), None) == []
+    assert not_firm(diagnosis(lag=()), SimpleNamespace(folds=0, left_out="flights", named_in={})) == []
