@@ -295,9 +295,11 @@ def _panel(axis, worlds: tuple[np.ndarray, np.ndarray] | None, limit: float, sca
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     axis.axhline(0.9, color="grey", linewidth=0.8, linestyle=":")
+    axis.set_xscale("log")
     if math.isfinite(limit):
         axis.axvline(limit, color="C3", linewidth=1.0)
-    axis.set_xscale("log")
+        flown = [] if worlds is None else worlds[0] * scale
+        axis.set_xlim(min([0.4 * limit, *flown]) / 1.2, max([5.0 * limit, *flown]) * 1.2)
     axis.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axis.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
     axis.xaxis.set_minor_formatter(NullFormatter())
@@ -306,8 +308,6 @@ def _panel(axis, worlds: tuple[np.ndarray, np.ndarray] | None, limit: float, sca
     if worlds is None or len(worlds[0]) < FEWEST:
         told = f"{0 if worlds is None else len(worlds[0])} worlds"
         axis.text(0.5, 0.5, told, ha="center", transform=axis.transAxes, color="grey")
-        if math.isfinite(limit) and worlds is None:
-            axis.set_xlim(0.2 * limit, 5.0 * limit)
         return
     size, named = worlds
     grid = np.geomspace(0.9 * size.min(), 1.1 * size.max(), 100)
