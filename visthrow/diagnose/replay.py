@@ -10,13 +10,16 @@ from sim.replay.lanes import Replay, Replayed
 from visthrow.diagnose.catalogue import Setting
 from visthrow.diagnose.cutting import Cut
 from visthrow.diagnose.recorded import NEVER, Recorded, Samples
-from visthrow.diagnose.states import States, rows_of
+from visthrow.diagnose.states import States, rows_of, stacked
 
 KNOT_SPACING = 0.1  # of the latent forces [s]
 EARLY = 0.004  # after a window's start, before which no stamp is used: delays may move there [s]
 FINENESS = {"throw": 0.25}
 """Step in a phase against the one asked for: the rope whips in throws."""
 FINEST = 0.01  # of the square of the step: a tenth of the step asked for
+ROUGHER = 3.0
+"""Added to the square of the step, in the nominal one, of rough lanes: twice as long steps."""
+STABLE = 1.75  # shortest lags of the vehicle's filters and rotors, above which a rough step may not go
 BATCH, CUDA_BATCH = 4096, 32768  # lanes of one run, which bounds its memory; on a GPU more lanes cost hardly more time
 
 
@@ -34,6 +37,7 @@ class Lane:
     resume: int = -1  # row of what another lane keeps, at which this one leaves it
     parent: int = -1  # that lane
     rides: int = 0  # lanes after it that fly alike and see it otherwise
+    rough: bool = False  # whether it flies with longer steps
 
 
 class Flights:
@@ -53,6 +57,7 @@ class Flights:
             stride: use every so many samples.
         """
         self.flights, self.cuts, self.stride = list(flights), list(cuts), stride
+        self._known: dict[tuple[str, int], np.ndarray] = {}
         self.knots = np.array([int(np.ceil((c.end - c.start) / KNOT_SPACING - 1e-6)) + 1 for c in cuts])
         self._fineness = np.array([FINENESS.get(c.phase, 1.0) for c in cuts])
         lengths = np.cumsum([0] + [len(f.command_time) for f in self.flights])
@@ -94,6 +99,11 @@ class Flights:
         span = source.between(c.start + delay + EARLY, c.end + delay)
         return np.arange(span.start, span.stop, self.stride)
 
+    def like(self, w: int) -> tuple[int, bool]:
+        """What :meth:`alike` depends on: the same of two windows, the same answer."""
+        c = self.cuts[w]
+        return c.payload, self.flights[c.flight].latch >= c.end
+
     def alike(self, w: int, setting: Setting, other: Setting) -> bool:
         """Whether a window is flown alike in two settings, which may be seen otherwise: what differs does nothing in it."""
         c, plant = self.cuts[w], other.plant
@@ -111,12 +121,18 @@ class Flights:
 
     def time(self, w: int) -> np.ndarray:
         """Stamps of a window's samples [s], shape (N,)."""
-        s = self.samples
-        return self.spread(w, s["vehicle"][w].time, s["vehicle"][w].time, s["payload"][w].time, s["gyro"][w].time)
+        return self._told("time", w)
 
     def sigma(self, w: int) -> np.ndarray:
         """Noise of a window's samples, shape (N,)."""
-        return self.spread(w, *[self.samples[name][w].sigma for name in ("vehicle", "attitude", "payload", "gyro")])
+        return self._told("sigma", w)
+
+    def _told(self, what: str, w: int) -> np.ndarray:
+        if (what, w) not in self._known:
+            names = ("vehicle", "vehicle" if what == "time" else "attitude", "payload", "gyro")
+            groups = [getattr(self.samples[name][w], what) for name in names]
+            self._known[what, w] = self.spread(w, *groups)
+        return self._known[what, w]
 
     def spread(self, w: int, vehicle, attitude, payload, gyro) -> np.ndarray:
         """A number for every sample of a window, from one for each row of its groups."""
@@ -130,13 +146,23 @@ class Flights:
 
     def residual(self, seen: np.ndarray, w: int, lane: int) -> np.ndarray:
         """Measured minus simulated, shape (N,); of an attitude the rotation vector from the simulated to the measured."""
-        nv, rows = int(self.windows["vehicle_count"][w]), int(self.rows[w])
-        measured = np.zeros((rows, 3))
-        measured[0 : 2 * nv : 2] = self.samples["vehicle"][w].values
-        measured[2 * nv :] = np.concatenate((self.samples["payload"][w].values, self.samples["gyro"][w].values))
-        return (measured - seen[:rows, lane]).ravel()
+        if ("measured", w) not in self._known:
+            nv = int(self.windows["vehicle_count"][w])
+            measured = np.zeros((int(self.rows[w]), 3))
+            measured[0 : 2 * nv : 2] = self.samples["vehicle"][w].values
+            measured[2 * nv :] = np.concatenate((self.samples["payload"][w].values, self.samples["gyro"][w].values))
+            self._known["measured", w] = measured
+        return (self._known["measured", w] - seen[: int(self.rows[w]), lane]).ravel()
 
-    def fly(self, replay: Replay, settings: Sequence[Setting], states: States, lanes: Sequence[Lane], substep: float) -> Replayed:
+    def fly(
+        self,
+        replay: Replay,
+        settings: Sequence[Setting],
+        states: States,
+        lanes: Sequence[Lane],
+        substep: float,
+        ends: np.ndarray | None = None,
+    ) -> Replayed:
         """Fly lanes; ``settings`` are those of the replay's rows.
 
         Args:
@@ -145,21 +171,31 @@ class Flights:
             states: initial states that the lanes choose from.
             lanes: at most some thousand, for the memory's sake.
             substep: largest integration step [s].
+            ends: of the windows [s], shape (W,), where they end earlier; what is seen afterwards says nothing.
         """
-        step = substep * np.sqrt([max(s.step_square, FINEST) for s in settings])
-        given = {
-            "window": np.array([x.window for x in lanes]), "plant": np.array([x.plant for x in lanes]),
-            "state": np.array([x.state for x in lanes]), "axis": np.array([x.axis for x in lanes]),
-            "knot": np.array([x.knot for x in lanes]), "size": np.array([x.size for x in lanes]),
-            "keep": np.array([x.keep for x in lanes]), "resume": np.array([x.resume for x in lanes]),
-            "parent": np.array([x.parent for x in lanes]), "rides": np.array([x.rides for x in lanes]),
-            "substep": step[[x.plant for x in lanes]] * self._fineness[[x.window for x in lanes]],
-        }  # fmt: skip
-        knots = max([1, *[x.keep + int(self.knots[x.window]) for x in lanes if x.keep >= 0]])
-        return replay.run(states, self.windows, given, self.data, KNOT_SPACING, knots)
+        names = "window", "plant", "state", "axis", "knot", "size", "keep", "resume", "parent", "rides"
+        given = {name: np.array([getattr(x, name) for x in lanes]) for name in names}
+        steps = np.array([(substep * np.sqrt(max(s.step_square, FINEST)), rough_step(s, substep)) for s in settings])
+        rough = np.array([x.rough for x in lanes], dtype=int)
+        given["substep"] = steps[given["plant"], rough] * self._fineness[given["window"]]
+        kept = given["keep"] >= 0
+        knots = max(1, int(np.max((given["keep"] + self.knots[given["window"]])[kept], initial=1)))
+        windows = self.windows if ends is None else self.windows | {"end": ends}
+        return replay.run(states, windows, given, self.data, KNOT_SPACING, knots)
 
 
-def carried(flights: Flights, replay: Replay, setting: Setting, begin, substep: float) -> States:
+def rough_step(setting: Setting, substep: float) -> float:
+    """Length of a rough lane's steps [s]: twice the nominal one, as far as the vehicle's shortest lag allows."""
+    controller, motor = setting.plant.vehicle.controller, setting.plant.vehicle.motor
+    lags = [controller.gyro_time_constant, controller.setpoint_time_constant] if controller.kind == "betaflight" else []
+    lags += [motor.time_constant] if motor.kind != "instant" else []
+    lags += [motor.time_constant_down] if motor.kind == "asymmetric" else []
+    nominal = substep * np.sqrt(max(setting.step_square, FINEST))
+    longer = substep * np.sqrt(max(setting.step_square, FINEST) + ROUGHER)
+    return max(nominal, min([longer, *[STABLE * lag for lag in lags]]))
+
+
+def carried(flights: Flights, replay: Replay, setting: Setting, begin, substep: float) -> tuple[States, States]:
     """Initial states of all windows: measured poses, and inner states carried through the windows before.
 
     Args:
@@ -168,22 +204,24 @@ def carried(flights: Flights, replay: Replay, setting: Setting, begin, substep: 
         setting: what is simulated.
         begin: function ``(flight, cut, inner or None)`` -> one state, with ``inner`` the end of the window before.
         substep: largest integration step [s].
+
+    Returns:
+        The states, and those at the windows' ends that they lead to.
     """
     by_flight: dict[int, list[int]] = {}
     for w, c in enumerate(flights.cuts):
         by_flight.setdefault(c.flight, []).append(w)
     states: list[States | None] = [None] * len(flights.cuts)
-    ends: dict[int, States | None] = dict.fromkeys(by_flight)
+    ends: list[States | None] = [None] * len(flights.cuts)
     for k in range(max(map(len, by_flight.values()))):
-        now = {f: ws[k] for f, ws in by_flight.items() if k < len(ws)}
-        for f, w in now.items():
-            inner = ends[f]
-            if k > 0 and flights.cuts[w].start > flights.cuts[by_flight[f][k - 1]].end + 1e-6:
-                inner = None  # a gap: the inner states have gone
-            states[w] = begin(flights.flights[f], flights.cuts[w], inner)
-        batch = {name: np.concatenate([states[w][name] for w in now.values()]) for name in states[next(iter(now.values()))]}
-        lanes = [Lane(w, 0, row, keep=0) for row, w in enumerate(now.values())]
-        flown = flights.fly(replay, [setting], batch, lanes, substep)
-        for row, f in enumerate(now):
-            ends[f] = {name: value.copy() for name, value in rows_of(flown.ends, np.array([row])).items()}
-    return {name: np.concatenate([s[name] for s in states]) for name in states[0]}
+        now = [ws[k] for ws in by_flight.values() if k < len(ws)]
+        for w in now:
+            c = flights.cuts[w]
+            before = by_flight[c.flight][k - 1] if k else None
+            gap = before is None or c.start > flights.cuts[before].end + 1e-6  # in which the inner states have gone
+            states[w] = begin(flights.flights[c.flight], c, None if gap else ends[before])
+        lanes = [Lane(w, 0, row, keep=0) for row, w in enumerate(now)]
+        flown = flights.fly(replay, [setting], stacked([states[w] for w in now]), lanes, substep)
+        for row, w in enumerate(now):
+            ends[w] = {name: value.copy() for name, value in rows_of(flown.ends, np.array([row])).items()}
+    return stacked(states), stacked(ends)

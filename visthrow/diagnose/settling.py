@@ -1,6 +1,10 @@
-"""Initial states of replay windows fitted to their samples by Levenberg and Marquardt, all windows at once."""
+"""Initial states of replay windows fitted to their samples by Levenberg and Marquardt, all windows at once.
 
-import dataclasses
+A simulation of every direction costs some thirty times one of the state itself. So derivatives are used for several steps, as
+long as each brings what it promised, and may come from another setting whose states were fitted before.
+"""
+
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -13,13 +17,17 @@ from visthrow.diagnose.states import Direction, States, concerns, moved, stacked
 DAMPING, DAMPING_MOST = 1e-3, 1e5
 """Of the Levenberg-Marquardt steps: at first, and where a window counts as settled."""
 ROUNDS = 25
+DRIFT = 0.02, 0.02, 0.02, 0.04
+"""Deviation that gusts bring a flight to in a second: position [m], attitude [rad], payload [m], rate [rad/s]. Fitted as though
+there were none, states took their place: bends of the rope of ten times their prior, after twenty steps."""
+CALMER = tuple(0.5**k for k in range(1, 11))  # of that, which windows may turn out to have had
+GROWTH = 1.5, 1.0, 1.5, 0.5  # powers of the time that they have had: forces act as noise, attitude and rate are controlled
 HUBER = 30.0  # deviations, beyond which a sample counts less
-SETTLED = 0.003  # relative fall of the cost below which an initial state is settled
-MOVED = 0.2  # relative fall of the cost above which derivatives by the initial state are taken anew
-ROUGHER = 3.0
-"""Added to the square of the step, in the nominal one, for derivatives that only point the way to an initial state: twice as
-long steps. Columns keep the nominal step: twice as long ones changed those of rope and release in throws by up to their size.
-"""
+SETTLED = 1.0, 0.003  # fall of the cost, and relative one, below which an initial state is settled
+SHRINKING = 0.1
+"""Of what the next step promises against what the last one did, below which derivatives from elsewhere lead to the goal."""
+TRUE = 0.5  # of what a step promised, that it must bring, for derivatives to be used further
+ONWARD = 0.1  # flown after the last sample that tells of the start: sensors may be early [s]
 EARLIER = 0.05  # by which a payload may leave before it is expected to [s]
 SEEN = 0.25  # before that, without which an initial state is fitted to the whole window [s]
 TRUSTED = ("motor_speed",)
@@ -53,42 +61,61 @@ class Settling:
             device: of the replay.
         """
         self.flights, self.told, self.directions, self.setting = flights, told, directions, setting
-        self.lag, self.substep = lag, substep
+        self.substep = substep
+        self.slopes: dict[int, np.ndarray] = {}  # of windows' samples by their states, where they were taken last
         self.replay = Replay([setting.plant], [setting.sensing], device)
+        since = [np.maximum(flights.time(w) - c.start, 0.0) for w, c in enumerate(flights.cuts)]
+        self._drift = [flights.spread(w, *DRIFT) * t ** flights.spread(w, *GROWTH) for w, t in enumerate(since)]
+        self._gusts = np.ones(len(flights.cuts))  # of each window, against the drift that is thought possible
+        self._tells, self._ends = zip(*[self._told_of_start(w, lag) for w in range(len(flights.cuts))])
 
     def better(self, settled: States, fresh: States) -> States:
         """For each window, the better of two initial states."""
         which = np.arange(len(self.flights.cuts))
-        old, new = (np.array([_huber(r) for r in self._residuals(states, which)]) for states in (settled, fresh))
-        return {name: np.where(_like(new < old, value), fresh[name], value) for name, value in settled.items()}
+        costs = [self._costs(dict(zip(which, self._residuals(states, which)))) for states in (settled, fresh)]
+        return {name: np.where(_like(costs[1] < costs[0], value), fresh[name], value) for name, value in settled.items()}
 
-    def fit(self, states: States) -> States:
-        """Fit each window's initial state to its samples; no step that does not help is taken."""
+    def fit(self, states: States, slopes: Mapping[int, np.ndarray] | None = None) -> States:
+        """Fit each window's initial state to its samples; no step that does not help is taken.
+
+        Args:
+            states: to begin with.
+            slopes: of windows' samples by their states, as :attr:`slopes` of another fit has them.
+        """
         count = len(self.flights.cuts)
         moves, damping = np.zeros((count, len(self.directions))), np.full(count, DAMPING)
-        left, cost = self.told, np.full(count, np.inf)
-        stale, aged = np.ones(count, dtype=bool), np.zeros(count, dtype=bool)
+        left, promised = self.told, np.full(count, np.inf)
+        self.slopes |= slopes or {}
+        aged = np.isin(np.arange(count), list(self.slopes))  # derivatives come from elsewhere
         residuals = dict(zip(left, self._residuals(states, left)))
-        cost[left] = [_huber(residuals[w]) for w in left]
-        slopes: dict[int, np.ndarray] = {}
+        cost = self._costs(residuals)
+        stale = ~aged
         for _ in range(ROUNDS):
-            slopes |= self._slopes(states, left[stale[left]])
+            self.slopes |= self._slopes(states, left[stale[left]])
             aged &= ~stale
-            trial = np.zeros_like(moves)
+            trial, hoped = np.zeros_like(moves), np.zeros(count)
             for w in left:
-                trial[w] = self._increment(w, slopes[w], residuals[w], moves[w], damping[w])
+                trial[w], hoped[w] = self._increment(w, residuals[w], moves[w], damping[w])
             there = self._moved(states, trial)
-            tried, seen = np.full(count, np.inf), dict(zip(left, self._residuals(there, left)))
-            tried[left] = [_huber(seen[w]) for w in left]
+            seen = dict(zip(left, self._residuals(there, left)))
+            tried = self._costs(seen)
             better = tried < cost
             residuals |= {w: seen[w] for w in left if better[w]}
             states = {name: np.where(_like(better, v), there[name], v) for name, v in states.items()}
             moves[better] += trial[better]
-            little = better & (tried > (1.0 - SETTLED) * cost)
-            settled = little & ~aged  # by derivatives from elsewhere a step may be short though the goal is far
-            stale = np.where(better, (tried < (1.0 - MOVED) * cost) | little, aged)
+            fall = np.subtract(cost, tried, out=np.zeros(count), where=better)
+            enough = np.maximum(SETTLED[0], SETTLED[1] * np.where(better, tried, cost))
+            little = better & (fall < enough)
+            settled = little & (~aged | (hoped < SHRINKING * promised)) | (hoped < enough) & (damping <= DAMPING)
+            true = fall > TRUE * hoped
+            stale = np.where(better, ~settled & (little | ~true), aged & ~settled)
             damping = np.where(better, damping / 10.0, np.where(aged, damping, damping * 10.0))
+            promised = np.where(better, hoped, promised)
             aged, cost = aged | better, np.where(better, tried, cost)
+            for w in left[settled[left]]:
+                if self._calmed(w, residuals[w]):
+                    settled[w], promised[w] = False, np.inf
+                    cost[w] = self._cost(w, residuals[w])
             left = left[~settled[left] & (damping[left] < DAMPING_MOST)]
             if not len(left):
                 break
@@ -101,18 +128,48 @@ class Settling:
         return states
 
     def _residuals(self, states: States, which: np.ndarray) -> list[np.ndarray]:
-        """Residuals of windows in the noise, of what tells of their initial states."""
+        """Residuals of windows, of what tells of their initial states."""
         f = self.flights
-        seen = f.fly(self.replay, [self.setting], states, [Lane(w, 0, w) for w in which], self.substep).seen
-        return [self._tells_of_start(w) * f.residual(seen, w, lane) / f.sigma(w) for lane, w in enumerate(which)]
+        seen = f.fly(self.replay, [self.setting], states, [Lane(w, 0, w) for w in which], self.substep, self._ends).seen
+        return [self._tells[w] * f.residual(seen, w, lane) for lane, w in enumerate(which)]
 
-    def _tells_of_start(self, w: int) -> np.ndarray:
-        """1 for samples before the payload may have left, 0 for later ones, which tell of the release; all 1 where few are left."""
+    def _costs(self, residuals: Mapping[int, np.ndarray]) -> np.ndarray:
+        """Costs of windows, infinite where there is no residual, shape (W,)."""
+        costs = np.full(len(self.flights.cuts), np.inf)
+        for w, residual in residuals.items():
+            costs[w] = self._cost(w, residual)
+        return costs
+
+    def _cost(self, w: int, residual: np.ndarray) -> float:
+        """Huber's cost of a window's residual; infinite where one is not finite."""
+        off = np.abs(residual) / self._spread(w)
+        cost = float(np.sum(np.where(off < HUBER, 0.5 * off**2, HUBER * (off - 0.5 * HUBER))))
+        return cost if np.isfinite(cost) else np.inf
+
+    def _spread(self, w: int) -> np.ndarray:
+        """Deviation of a window's samples from a flight without gusts: noise, and how far gusts may have led by then."""
+        return np.hypot(self.flights.sigma(w), self._gusts[w] * self._drift[w])
+
+    def _calmed(self, w: int, residual: np.ndarray) -> bool:
+        """Take a window's gusts for as strong as what is left of it says, if that is much less than was thought."""
+        square, noise, drift = residual**2, self.flights.sigma(w) ** 2, self._drift[w] ** 2
+        told = np.count_nonzero(self._tells[w])
+        calmer = [g for g in CALMER if g < self._gusts[w] and np.sum(square / (noise + g * g * drift)) < told]
+        if not calmer:
+            return False
+        self._gusts[w] = min(calmer)
+        return True
+
+    def _told_of_start(self, w: int, lag: float) -> tuple[np.ndarray, float]:
+        """Which samples tell of a window's start, and how long it is flown for their sake [s].
+
+        They are 1 before the payload may have left, 0 later, for these tell of the release; all 1 where few are left.
+        """
         c, time = self.flights.cuts[w], self.flights.time(w)
-        left = self.flights.flights[c.flight].latch + self.lag - EARLIER
+        left = self.flights.flights[c.flight].latch + lag - EARLIER
         if c.payload != ATTACHED or not c.start + SEEN < left < c.end:
-            return np.ones(len(time))
-        return (time < left).astype(float)
+            return np.ones(len(time)), c.end
+        return (time < left).astype(float), min(left + ONWARD, c.end)
 
     def _fitted(self, w: int) -> list[int]:
         """Directions in which a window's initial state is fitted."""
@@ -120,35 +177,38 @@ class Settling:
         return [d for d, x in enumerate(self.directions) if concerns(x, cut) and x.field not in TRUSTED]
 
     def _slopes(self, states: States, which: np.ndarray) -> dict[int, np.ndarray]:
-        """Derivatives of windows' samples by their initial states, in the noise."""
+        """Derivatives of windows' samples by their initial states."""
         if not len(which):
             return {}
         count, lanes, first = len(self.flights.cuts), [], []
         for w in which:
             first.append(len(lanes))
-            lanes += [Lane(w, 0, w), *[Lane(w, 0, (1 + d) * count + w) for d in self._fitted(w)]]
+            lanes += [Lane(w, 0, w, rough=True), *[Lane(w, 0, (1 + d) * count + w, rough=True) for d in self._fitted(w)]]
         there = perturbed(states, self.directions)
-        seen = self.flights.fly(self.replay, [_rougher(self.setting)], there, lanes, self.substep).seen
+        seen = self.flights.fly(self.replay, [self.setting], there, lanes, self.substep, self._ends).seen
         slopes = {}
         for at, w in zip(first, which):
             ds, rows = self._fitted(w), int(self.flights.rows[w])
             flat = np.swapaxes(seen[:rows, at : at + 1 + len(ds)], 1, 2).reshape(3 * rows, -1)
             steps = np.array([self.directions[d].step for d in ds])
-            slopes[w] = (flat[:, 1:] - flat[:, :1]) / steps * (self._tells_of_start(w) / self.flights.sigma(w))[:, None]
+            slopes[w] = (flat[:, 1:] - flat[:, :1]) / steps * self._tells[w][:, None]
         return slopes
 
-    def _increment(self, w: int, slopes: np.ndarray, residual: np.ndarray, done: np.ndarray, damping: float) -> np.ndarray:
-        """Levenberg-Marquardt step of a window's state, with its vague prior; shape (directions,)."""
-        ds = self._fitted(w)
+    def _increment(self, w: int, residual: np.ndarray, done: np.ndarray, damping: float) -> tuple[np.ndarray, float]:
+        """Levenberg-Marquardt step of a window's state with its vague prior, shape (directions,), and the fall that it promises."""
+        ds, spread = self._fitted(w), self._spread(w)
         sd = np.array([self.directions[d].sd for d in ds])
-        weight = np.minimum(1.0, HUBER / np.maximum(np.abs(residual), 1e-12))
-        scaled = slopes * sd
-        normal = scaled.T @ (scaled * weight[:, None]) + np.eye(len(ds))
+        off = residual / spread
+        weight = np.minimum(1.0, HUBER / np.maximum(np.abs(off), 1e-12))
+        scaled = self.slopes[w] * sd / spread[:, None]
+        bend = scaled.T @ (scaled * weight[:, None])
+        normal = bend + np.eye(len(ds))
         normal += damping * np.diag(np.diag(normal))
-        wanted = scaled.T @ (residual * weight) - done[ds] / sd
+        slope = scaled.T @ (off * weight)
+        step = np.linalg.solve(normal, slope - done[ds] / sd)
         out = np.zeros(len(done))
-        out[ds] = np.linalg.solve(normal, wanted) * sd
-        return out
+        out[ds] = step * sd
+        return out, float(slope @ step - 0.5 * step @ bend @ step)
 
 
 def perturbed(states: States, directions: tuple[Direction, ...]) -> States:
@@ -159,15 +219,3 @@ def perturbed(states: States, directions: tuple[Direction, ...]) -> States:
 def _like(mask: np.ndarray, value: np.ndarray) -> np.ndarray:
     """The mask with as many axes as a value."""
     return mask.reshape(-1, *[1] * (value.ndim - 1))
-
-
-def _rougher(setting: Setting) -> Setting:
-    """The setting with longer steps, for lanes that only point the way."""
-    return dataclasses.replace(setting, step_square=setting.step_square + ROUGHER)
-
-
-def _huber(residual: np.ndarray) -> float:
-    """Huber's cost of residuals in the noise; infinite where one is not finite."""
-    off = np.abs(residual)
-    cost = float(np.sum(np.where(off < HUBER, 0.5 * off**2, HUBER * (off - 0.5 * HUBER))))
-    return cost if np.isfinite(cost) else np.inf

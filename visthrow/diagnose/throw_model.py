@@ -5,35 +5,32 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from camera.params import CameraParams
 from sim.params import PlantParams, SensingParams
-from sim.replay.kernel import NO_PAYLOAD
 from sim.replay.lanes import Replay
 from visthrow.diagnose.catalogue import Entry, Setting, apply, entries_for
 from visthrow.diagnose.cutting import Cut, around_slack, cut, thinned
 from visthrow.diagnose.interface import Mistake
 from visthrow.diagnose.landing import Landings, landings
+from visthrow.diagnose.linearising import Plan, exact, lanes_of
 from visthrow.diagnose.model import Window
 from visthrow.diagnose.opened import opened
 from visthrow.diagnose.recorded import NEVER, carriers, record_of
-from visthrow.diagnose.replay import BATCH, CUDA_BATCH, KNOT_SPACING, Flights, Lane, carried
+from visthrow.diagnose.replay import BATCH, CUDA_BATCH, Flights, Lane, carried
 from visthrow.diagnose.settling import Settling, perturbed
 from visthrow.diagnose.sightings import channels_of, needs_no_flight, sightings, with_sightings
 from visthrow.diagnose.states import (
     States,
-    concerns,
     directions,
     hover_state,
     measured_state,
     resampled,
 )
+from visthrow.diagnose.threads import each
 from visthrow.errors import DiagnoseError
 from visthrow.flightlog import FlightLog
 
-LATENT_SIZES = (0.05, 0.05, 0.05, 1e-3, 1e-3, 1e-3, 0.01, 0.01, 0.01)
-"""Of the latent forces' derivatives: force [N], torque [N m], force on the payload [N]."""
 AFTER_SLACK = 0.05  # that a rope is given to come taut [s]
 
 
@@ -109,19 +106,20 @@ class ThrowModel:
         x = self.setting.sensing
         delays = (x.vehicle_delay, x.payload_delay, x.gyro_delay)
         self.flights = Flights(flights, cuts, delays, stride)
-        states = self._begin(self.setting)
-        if (without_slack := self._without_slack(states)) != cuts:
+        states, ends = self._through(self.setting)
+        if (without_slack := self._without_slack(ends)) != cuts:
             self.flights = Flights(flights, without_slack, delays, stride)
             states = self._begin(self.setting)
         self._told = np.array([w for w, c in enumerate(self.flights.cuts) if c.told])
-        self._states = self._latest = self._settling(self.setting).fit(states)
+        self._fits: dict[tuple[Cut, ...], tuple[States, dict[int, np.ndarray]]] = {}
+        self._latest = self._fitted(states)[0]
         self._sightings = sightings(logs, flights, self.flights.cuts, self.setting)
 
     def windows(self, theta: Mapping[str, float]) -> list[Window]:
         """See :class:`visthrow.diagnose.model.Model`."""
         setting = apply(self.entries, self.setting, theta)
         self._directions = directions(setting.plant)  # another kind of block has other states
-        states = self._states if setting == self.setting else self._settled(setting)
+        states = self._settled(setting)
         self._latest = states
         steps = [self._step(e, theta.get(e.effect.name, 0.0)) for e in self._graded]
         settings = [setting, *[e.apply(setting, step) for e, step in zip(self._graded, steps)]]
@@ -179,7 +177,7 @@ class ThrowModel:
         settings = [self.setting, fine]
         count, f = len(self._told), self.flights
         lanes = [Lane(w, s, w) for s in range(2) for w in self._told]
-        seen = f.fly(self._replay(settings), settings, self._states, lanes, self.substep).seen
+        seen = f.fly(self._replay(settings), settings, self._fitted()[0], lanes, self.substep).seen
         worst = dict.fromkeys(self.channels, 0.0)
         for lane, w in enumerate(self._told):
             off = np.abs(f.residual(seen, w, lane) - f.residual(seen, w, count + lane)) / f.sigma(w)
@@ -207,13 +205,21 @@ class ThrowModel:
     def begun(self, theta: Mapping[str, float]) -> tuple[Setting, States]:
         """The setting with effects at ``theta``, and initial states fitted in it."""
         setting = apply(self.entries, self.setting, theta)
-        return setting, self._settling(setting).fit(self._begin(setting))
+        return setting, self._settled(setting)
 
     def _replay(self, settings: Sequence[Setting]) -> Replay:
         return Replay([s.plant for s in settings], [s.sensing for s in settings], self.device)
 
     def _begin(self, setting: Setting) -> States:
-        """Initial states from smoothed measurements and, for what nobody measures, from flying through the windows before."""
+        """Initial states to start a fit from."""
+        return self._through(setting)[0]
+
+    def _through(self, setting: Setting) -> tuple[States, States]:
+        """Initial states from smoothed measurements and, for what nobody measures, from flying through the windows before.
+
+        Returns:
+            The states, and those at the windows' ends.
+        """
 
         def begin(flight, c, inner):
             start = hover_state(flight, setting.plant, c.payload) if inner is None else inner
@@ -227,14 +233,28 @@ class ThrowModel:
     def _settling(self, setting: Setting) -> Settling:
         """What fits initial states in a setting."""
         return Settling(
-            self.flights, self._told, self._directions, setting, lag=self.setting.plant.release.lag, substep=self.substep,
+            self.flights, self._told, directions(setting.plant), setting, lag=self.setting.plant.release.lag, substep=self.substep,
             device=self.device,
         )  # fmt: skip
 
+    def _fitted(self, states: States | None = None) -> tuple[States, dict[int, np.ndarray]]:
+        """States fitted at theta = 0, to begin with ``states``, and the samples' derivatives by them; of the same windows, once."""
+        cuts = tuple(self.flights.cuts)
+        if cuts not in self._fits:
+            settling = self._settling(self.setting)
+            fitted = settling.fit(self._begin(self.setting) if states is None else states)
+            self._fits[cuts] = fitted, settling.slopes
+        return self._fits[cuts]
+
     def _settled(self, setting: Setting) -> States:
-        """States fitted in a setting, from the better of those settled at theta = 0 and those that the setting begins with."""
+        """States fitted in a setting, from the better of those fitted at theta = 0 and those that the setting begins with."""
+        states, slopes = self._fitted()
+        if setting == self.setting:
+            return states
         settling = self._settling(setting)
-        return settling.fit(settling.better(resampled(self._states, setting.plant.rope.segments), self._begin(setting)))
+        start = settling.better(resampled(states, setting.plant.rope.segments), self._begin(setting))
+        ways = [[(x.field, x.axis, x.part) for x in found] for found in (settling.directions, directions(self.setting.plant))]
+        return settling.fit(start, slopes if ways[0] == ways[1] else None)
 
     @staticmethod
     def _step(e: Entry, theta: float) -> float:
@@ -246,7 +266,7 @@ class ThrowModel:
         """Windows in groups whose lanes fit a run."""
         batches, room = [], 0
         for w in self._told:
-            lanes = 1 + len(self._graded) + len(self._directions) + 9 * int(self.flights.knots[w])
+            lanes = 2 + len(self._graded) + len(self._directions) + 9 * int(self.flights.knots[w])
             if not batches or room < lanes:
                 batches.append([])
                 room = BATCH if self.device == "cpu" else CUDA_BATCH
@@ -254,85 +274,33 @@ class ThrowModel:
             room -= lanes
         return batches
 
-    def _nuisances(self, w: int) -> list[int]:
-        return [d for d, x in enumerate(self._directions) if concerns(x, self.flights.cuts[w])]
-
-    def _latents(self, w: int) -> list[tuple[int, int]]:
-        axes = 6 if self.flights.cuts[w].payload == NO_PAYLOAD else 9
-        return [(axis, knot) for axis in range(axes) for knot in range(int(self.flights.knots[w]))]
-
     def _linearised(
         self, replay: Replay, settings: list[Setting], steps: np.ndarray, states: States, batch: list[int]
     ) -> list[Window]:
-        count = len(self.flights.cuts)
-        lanes: list[Lane] = []
-        keep, columns = 0, {}
+        f, needs = self.flights, np.array([exact(e) for e in self._graded], dtype=bool)
+        plans, lanes, kept = [], [], 0
+        known: dict[tuple, np.ndarray] = {}
         for w in batch:
-            alike = [self.flights.alike(w, settings[0], other) for other in settings[1:]]
-            effects = np.argsort(~np.array(alike, dtype=bool), kind="stable")
-            parent, first = len(lanes), keep
-            lanes.append(Lane(w, 0, w, keep=keep, rides=sum(alike)))
-            keep += int(self.flights.knots[w])
-            lanes += [Lane(w, 1 + int(k), w) for k in effects]
-            columns[w] = np.argsort(effects)
-            lanes += [Lane(w, 0, (1 + d) * count + w) for d in self._nuisances(w)]
-            lanes += [
-                Lane(w, 0, w, axis, knot, LATENT_SIZES[axis], resume=first + max(knot - 1, 0), parent=parent)
-                for axis, knot in self._latents(w)
-            ]
-        flown = self.flights.fly(replay, settings, perturbed(states, self._directions), lanes, self.substep)
-        out, at, keep = [], 0, 0
-        for w in batch:
-            nuisances, latents = self._nuisances(w), self._latents(w)
-            size = 1 + len(self._graded) + len(nuisances) + len(latents)
-            knots = {name: value[keep : keep + self.flights.knots[w]] for name, value in flown.knots.items()}
-            index = np.arange(at, at + size)
-            index[1 : 1 + len(steps)] = at + 1 + columns[w]
-            out.append(self._window(flown.seen[:, index], settings[0], steps, w, nuisances, latents, knots))
-            at, keep = at + size, keep + int(self.flights.knots[w])
-        return out
+            if f.like(w) not in known:
+                known[f.like(w)] = np.array([f.alike(w, settings[0], other) for other in settings[1:]], dtype=bool)
+            plan, own = lanes_of(f, w, known[f.like(w)], needs, self._directions, len(lanes), kept)
+            plans.append(plan)
+            lanes += own
+            kept += 2 * int(f.knots[w])
+        flown = f.fly(replay, settings, perturbed(states, self._directions), lanes, self.substep)
 
-    def _window(
-        self, seen: np.ndarray, setting: Setting, steps: np.ndarray, w: int, nuisances: list[int], latents: list, knots: dict
-    ) -> Window:
-        """One window from its lanes: nominal, effects, initial states, latent forces."""
-        f = self.flights
-        rows, c = int(f.rows[w]), f.cuts[w]
-        flat = np.ascontiguousarray(np.swapaxes(seen[:rows], 1, 2)).reshape(3 * rows, -1)
-        K, D = len(steps), len(nuisances)
-        sizes = [*steps, *[self._directions[d].step for d in nuisances], *[LATENT_SIZES[axis] for axis, _ in latents]]
-        slopes = (flat[:, 1:] - flat[:, :1]) / np.array(sizes)
-        return Window(
-            c.flight, c.phase, f.time(w), self._channel(w), f.residual(seen, w, 0), f.sigma(w), slopes[:, :K],
-            slopes[:, K : K + D], np.array([self._directions[d].sd for d in nuisances]), slopes[:, K + D :],
-            np.array([axis // 3 for axis, _ in latents]), np.array([axis % 3 for axis, _ in latents]),
-            np.array([c.start + KNOT_SPACING * knot for _, knot in latents]), self._at_knots(setting, w, knots),
-        )  # fmt: skip
+        def window(plan: Plan) -> Window:
+            given = f, settings[0], steps, self._directions, self._channel(plan.window), flown.seen, flown.knots
+            return plan.window_of(*given)
 
-    def _at_knots(self, setting: Setting, w: int, knots: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Simulated quantities at the knots, those of the payload where there is one."""
-        c = self.flights.cuts[w]
-        time = c.start + KNOT_SPACING * np.arange(len(knots["thrust"]))
-        told = {"time": np.minimum(time, c.end)} | {name: value.copy() for name, value in knots.items()}
-        if c.payload == NO_PAYLOAD:
-            return {name: value for name, value in told.items() if not name.startswith("payload") and name != "tension"}
-        arm = np.array(setting.plant.rope.mount) - np.array(setting.plant.vehicle.body.com)
-        reach = told["payload_pos_w"] - told["pos_w"] - Rotation.from_quat(told["quat_wb"]).apply(arm)
-        told["cable_dir_w"] = reach / np.linalg.norm(reach, axis=1, keepdims=True)
-        f = self.flights.flights[c.flight]
-        if f.latch != NEVER:
-            told["tension"][told["time"] > f.latch + setting.plant.release.lag] = 0.0
-        return told
+        return each(window, plans)
 
     def _channel(self, w: int) -> np.ndarray:
         at = {name: i for i, name in enumerate(self.channels)}
         return self.flights.spread(w, 0, 1, at.get("payload_pos_w", -1), at.get("rate_b", -1)).astype(int)
 
-    def _without_slack(self, states: States) -> list[Cut]:
-        """The windows, with the time in which the rope is slack cut out."""
-        count = len(self.flights.cuts)
-        lanes = [Lane(w, 0, w, keep=0) for w in range(count)]
-        ends = self.flights.fly(self._replay([self.setting]), [self.setting], states, lanes, self.substep).ends
+    def _without_slack(self, ends: States) -> list[Cut]:
+        """The windows, with the time in which the rope was slack until their ends cut out."""
         cuts: list[Cut] = []
         for w, c in enumerate(self.flights.cuts):
             first, last = float(ends["slack_first"][w]), float(ends["slack_last"][w])

@@ -1,0 +1,84 @@
+"""Initial states and derivatives of replay windows: gusts do not enter states, long steps tell what nominal ones do."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from tests.flown import fly, setting_with
+from tests.plants import paper_plant
+from visthrow.diagnose import throw_model
+from visthrow.diagnose.linearising import exact
+from visthrow.diagnose.replay import rough_step
+from visthrow.diagnose.throw_model import ThrowModel
+from visthrow.flightlog import FlightLog
+
+SWAY = 0.02 * np.array([1.0, 1.0, 1.0]), np.array([0.7, 0.9, 0.5]), np.array([0.0, 1.0, 2.0])
+"""Of vehicle and payload alike, as slow gusts bring it: amplitude [m], frequency [Hz], phase [rad]."""
+RATE_KEPT = 0.2
+"""By which that sway may change the body rates of fitted states [rad/s], rms: 0.07 found, 0.64 if no gust is thought possible."""
+ROUGH = 0.01
+"""Of a column's norm, by which one of twice as long steps may differ in a free flight: 0.005 found, for the command delay."""
+NAMES = ["rope_length", "mass_payload", "cmd_delay", "motor_tau", "com_x", "release_lag", "wind_x", "mocap_delay_quad", "d_filter"]
+
+
+def swayed(log: FlightLog) -> FlightLog:
+    """The log with :data:`SWAY` added to what was measured."""
+    size, rate, phase = SWAY
+    moved = {
+        name: dataclasses.replace(c, values=c.values + size * np.sin(2.0 * np.pi * rate * c.time[:, None] + phase))
+        for name, c in log.channels.items()
+        if name in ("pos_w", "payload_pos_w")
+    }
+    return FlightLog({**log.channels, **moved}, {})
+
+
+@pytest.fixture(scope="module")
+def logs():
+    return fly(setting_with({}), noise=0.2, free=1, throws=1, seconds=2.0)
+
+
+def test_gusts_do_not_take_the_place_of_states(logs):
+    calm, shaken = (ThrowModel(found, paper_plant(), only=["rope_length"]).begun({})[1] for found in (logs, map(swayed, logs)))
+    away = shaken["rate_b"] - calm["rate_b"]
+    assert np.sqrt(np.mean(away**2)) < RATE_KEPT
+
+
+def test_states_do_not_depend_on_what_was_fitted_before(logs):
+    model = ThrowModel(logs, paper_plant(), only=["rope_length", "com_x"])
+    theta = {"com_x": 5e-4}
+    first = model.windows(theta)
+    model.windows({"rope_length": 2e-3})
+    model.landings({"com_x": -5e-4})
+    for a, b in zip(first, model.windows(theta)):
+        np.testing.assert_array_equal(a.residual, b.residual)
+
+
+def test_long_steps_tell_derivatives_as_well(logs, monkeypatch):
+    """Residuals are those of nominal steps, and every column stands where it belongs."""
+    model = ThrowModel(logs, paper_plant(), only=NAMES)
+    rough = model.windows({})
+    monkeypatch.setattr(throw_model, "exact", lambda e: True)
+    for a, b in zip(rough, model.windows({})):
+        np.testing.assert_array_equal(a.residual, b.residual)
+        for name in a.knots:
+            np.testing.assert_array_equal(a.knots[name], b.knots[name])
+        off = np.linalg.norm((a.effects - b.effects) / a.sigma[:, None], axis=0)
+        norm = np.linalg.norm(b.effects / a.sigma[:, None], axis=0)
+        assert np.all(off <= ROUGH * norm), dict(zip(NAMES, off / norm))
+        assert a.phase != "throw" or np.array_equal(a.effects, b.effects)
+
+
+def test_what_long_steps_do_not_tell_keeps_the_nominal_ones(logs):
+    model = ThrowModel(logs, paper_plant())
+    assert {name for name, e in model.entries.items() if exact(e)} == {"d_filter", "payload_inertia", "step_error"}
+
+
+def test_long_steps_stay_stable():
+    setting = setting_with({})
+    assert rough_step(setting, 0.002) == pytest.approx(0.004)
+    controller = dataclasses.replace(setting.plant.vehicle.controller, gyro_time_constant=0.0015)
+    vehicle = dataclasses.replace(setting.plant.vehicle, controller=controller)
+    quick = dataclasses.replace(setting, plant=dataclasses.replace(setting.plant, vehicle=vehicle))
+    assert 0.002 < rough_step(quick, 0.002) < 2.0 * 0.0015
+    assert rough_step(quick, 0.004) == pytest.approx(0.004)  # never below the nominal one
