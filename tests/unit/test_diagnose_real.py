@@ -120,6 +120,7 @@ def test_pendulum_has_three_frictions():
     assert diagnosis.overall == KNOWN
     assert {"pendulum_length", "coulomb_friction", "quadratic_drag"} <= named
     assert diagnosis["pendulum_length"].estimate == pytest.approx(-0.0167, abs=3e-4)
+    assert diagnosis["encoder_scale"].verdict != FOUND  # a spring at the joint does the same
     assert rms(diagnosis.theta) < 0.1 * rms({})
 
 
@@ -139,6 +140,14 @@ def test_a_cut_propeller_is_found_and_tape_is_not():
     diagnosis, named, _ = explained("crazypad", folder / "tape_on_propeller_M3__E8_log00.csv.gz")
     assert diagnosis.overall == NO_EFFECT
     assert not named
+
+
+def test_a_page_is_written_where_nothing_can_be_predicted(tmp_path, capsys):
+    flight = REAL / "crazypad_faults" / "tape_on_propeller_M3__E8_log00.csv.gz"
+    code = cli.main(["diagnose", "explain", str(flight), "--config", "crazypad", "--no-blind", "--out", str(tmp_path)])
+    assert code == 0
+    assert "NO EFFECT" in capsys.readouterr().out
+    assert (tmp_path / "report.html").is_file()
 
 
 def test_cable_is_ten_millimetres_longer_and_thrust_stronger():
@@ -173,4 +182,7 @@ def test_a_motor_idles_and_a_hundred_motors_are_not_one():
 def test_the_camera_sees_the_load_nearer_the_axis():
     diagnosis, named, rms = explained("slungload_camera", *sorted((DATA / "slungload_camera").glob("*.gz")))
     assert "focal_scale" in named
+    assert diagnosis["focal_scale"].estimate == pytest.approx(-0.12, abs=0.025)  # -0.11 in these pieces, -0.13 in the whole bags
+    assert named & {"camera_tilt_x", "marker_rot_y"}
+    assert named & {"camera_tilt_y", "marker_rot_x"}
     assert rms(diagnosis.theta) < 0.6 * rms({})
