@@ -182,6 +182,6 @@ BAD = {
     "bodies_exchanged": Bad(each(exchanged)), "late_commands": Bad(each(late_commands)), "frozen": Bad(each(frozen)),
     "copied": Bad(doubled), "mixed_up": Bad(scrambled), "three_samples": Bad(each(lambda log: cut(log, 3))),
     "no_commands": Bad(without("command")), "no_attitude": Bad(without("quat_wb")), "truncated": Bad(as_they_are, cut_to=0.6),
-    "empty_files": Bad(as_they_are, cut_to=0.0), "standing": Bad(standing, flown=False), "two_hours": Bad(hours, flown=False, right=frozenset({"flapping"})),
-    "two_hours_still": Bad(hours_still, flown=False),
+    "empty_files": Bad(as_they_are, cut_to=0.0), "standing": Bad(standing, flown=False),
+    "two_hours": Bad(hours, flown=False, right=frozenset({"flapping"})), "two_hours_still": Bad(hours_still, flown=False),
 }  # fmt: skip
