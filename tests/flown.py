@@ -49,7 +49,7 @@ def fly(
     tracks: dict[str, list] = {name: [] for name in ("pos_w", "quat_wb", "payload_pos_w", "command", "voltage")}
     separated = np.full(len(references), np.inf)
     left = [None] * len(references)
-    ticks = round(max(seconds, 2.4) / TICK)
+    ticks = round(max(seconds, 2.6) / TICK)
     for k in range(ticks):
         t = k * TICK
         if k % RATIO == 0:
