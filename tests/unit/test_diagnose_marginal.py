@@ -72,20 +72,19 @@ def test_a_single_huge_state_does_not_leak_into_the_effects(fitted):
 
 def test_gradients_of_the_likelihood_are_its_differences(fitted):
     _, _, _, levels, grams = fitted
-    keys = sorted(levels.latent_sd)
-    _, by_level, by_scale, _ = noise._likelihood(grams, levels, keys)
-    step = 1e-3
+    levels = replace(levels, share=levels.share * np.random.default_rng(0).uniform(0.7, 1.4, levels.share.shape))
+    layout = noise._Layout.of(grams, levels)
+    x = layout.pack(levels)
+    _, slope, _ = noise._likelihood(grams, levels, layout)
+    step, first = 1e-3, len(layout.keys)
 
-    def slope(change) -> float:
-        return (noise._likelihood(grams, change(step), keys)[0] - noise._likelihood(grams, change(-step), keys)[0]) / (2 * step)
+    def value(i: int, h: float) -> float:
+        moved = x.copy()
+        moved[i] += h
+        return noise._likelihood(grams, layout.unpack(moved, levels), layout)[0]
 
-    for i, key in enumerate(keys):
-        level = levels.latent_sd[key]
-        found = slope(lambda h, k=key, v=level: replace(levels, latent_sd={**levels.latent_sd, k: v * np.exp(h)}))
-        assert found == pytest.approx(by_level[i], rel=1e-3, abs=1e-2)
-    for c in range(2):
-        found = slope(lambda h, c=c: replace(levels, scale=levels.scale * np.where(np.arange(2) == c, np.exp(h), 1.0)))
-        assert found == pytest.approx(by_scale[c], rel=1e-3, abs=0.1)
+    for i in [*range(first), first, first + 7, len(x) - 2, len(x) - 1]:
+        assert (value(i, step) - value(i, -step)) / (2 * step) == pytest.approx(slope[i], rel=1e-3, abs=0.1)
 
 
 @pytest.mark.parametrize(("sensor", "gust"), [(1.0, 1.0), (2.0, 0.5)])
@@ -127,8 +126,8 @@ def bad_window(fitted):
 
 def test_one_bad_window_does_not_raise_the_level_of_its_phase(fitted, bad_window):
     levels, (bad, again, _) = fitted[3], bad_window
-    assert np.isfinite(again.own[bad, [0, 2]]).all()
-    assert np.isnan(np.delete(again.own, bad, axis=0)).all()
+    assert (again.share[bad, [0, 2]] > 4.0).all()
+    assert (np.delete(again.share, bad, axis=0) < 2.0).all()
     assert again.latent_sd[0, "throw"] < 2.0 * levels.latent_sd[0, "throw"]
 
 
@@ -137,11 +136,12 @@ def test_levels_do_not_depend_on_where_their_search_starts(bad_window):
     _, found, grams = bad_window
 
     def value(levels) -> float:
-        return sum(marginal.posterior(gram, levels, w).log_likelihood for w, gram in enumerate(grams))
+        return levels.log_prior + sum(marginal.posterior(gram, levels, w).log_likelihood for w, gram in enumerate(grams))
 
-    starts = [replace(found, own=share * found.own) for share in (0.7, np.nan)]
+    less = np.where(found.share == 1.0, 1.0, 0.7 * found.share)
+    starts = [replace(found, share=share) for share in (less, np.ones_like(found.share))]
     again = [value(noise.refit(grams, start)) for start in starts]
-    np.testing.assert_allclose(again, value(found), atol=3.0 * noise.ENOUGH_NATS)
+    np.testing.assert_allclose(again, value(found), atol=10.0 * noise.ENOUGH_NATS)
 
 
 @pytest.mark.parametrize("spoil", [

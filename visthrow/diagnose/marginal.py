@@ -21,6 +21,10 @@ from scipy.linalg import lapack
 from visthrow.diagnose.model import LATENT_BLOCKS, Window
 from visthrow.errors import DiagnoseError
 
+TAIL = 6.0
+"""Degrees of freedom of the latent forces' scale mixture: from window to window their deviation varies by some 30 %, and a window
+in which something happened may have ten times as much at the price of 11 nats."""
+
 ROUNDING = 1e-10
 """Relative growth of the normal equations' diagonal where they are positive definite but for rounding."""
 
@@ -62,13 +66,19 @@ class Noise:
     scale: np.ndarray  # of each channel's sigma, shape (C,)
     latent_sd: Mapping[tuple[int, str], float]  # (block, phase) -> deviation [N, N m, N]
     correlation_time: float  # of the latent forces [s]
-    own: np.ndarray  # latent deviations of bad windows by block, shape (windows, 3); NaN where the phase's level holds
+    share: np.ndarray  # latent deviation of each window and block in its phase's, shape (windows, 3)
 
     def deviation(self, gram: Gram, window: int) -> np.ndarray:
         """Prior deviation of the columns [X, G] of a window, shape (D + L,)."""
-        shared = [self.latent_sd.get((b, gram.phase), 0.0) for b in range(len(LATENT_BLOCKS))]
-        by_block = np.where(np.isnan(self.own[window]), shared, self.own[window])
+        shared = np.array([self.latent_sd.get((b, gram.phase), 0.0) for b in range(len(LATENT_BLOCKS))])
+        by_block = shared * self.share[window]
         return np.concatenate((np.ones(gram.nuisances), by_block[gram.latent_block]))
+
+    @property
+    def log_prior(self) -> float:
+        """Of the windows' shares: their squares follow an inverse gamma distribution; 0 where all are 1."""
+        square = self.share**2
+        return float(-0.5 * TAIL * (np.log(square) + 1.0 / square - 1.0).sum())
 
 
 @dataclass(frozen=True)

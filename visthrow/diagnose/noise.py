@@ -1,19 +1,19 @@
 """Noise levels: sensor noise from differences of neighbours, latent forces from the likelihood of all windows.
 
 A pure fit of everything by maximum likelihood is pulled away by one bad window; hence three guards, each tested by a planted
-fault: single samples far outside lose weight (Huber), a window whose latent forces are far above those of its phase gets a
-level of its own, and every level is bounded.
+fault: single samples far outside lose weight (Huber), a window's latent forces may be stronger or weaker than its phase's (their
+variance has an inverse gamma prior about it, so that the forces have Student's heavy tails), and every level is bounded.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from visthrow.diagnose.marginal import (
+    TAIL,
     Gram,
     Noise,
-    Posterior,
     columns,
     correlated,
     hidden_gram,
@@ -43,18 +43,14 @@ HUBER = 6.0
 HUBER_SHARE = 0.02
 """More samples than this beyond ``HUBER`` are no outliers but a misfit, which must stay visible."""
 
-BAD_NATS = 8.0
-"""Log-likelihood that a window's own level must gain; that of chance stays below 4 in a hundred windows."""
+LOST, LOST_SHARE = 10.0, 0.15
+"""Median residual in that of the usual window from which one is lost, and the share of windows beyond which none is."""
 
-GOOD_NATS = 2.0
-"""That a bad window's own level must still be worth, once the levels of all others have moved: less than it took, so that sets of
-bad windows do not follow each other in a circle."""
+SHARE_BOUNDS = (0.1, 1e3)
+"""Latent deviation of a window, in its phase's."""
 
-BAD_SHARE = 0.34
-"""Share of a phase's windows that may be bad; where more are, the phase is rough."""
-
-FACTORS = tuple(2.5 * 1.6**k for k in range(18))
-"""Of the phase's level that are tried for a bad window."""
+PRIOR_CURVATURE = (0.05, 2.0)
+"""Limits of the prior's curvature by the logarithm of a window's share, in that at 1: it falls where windows stand far out."""
 
 CLEANINGS = 4
 """Rounds in which outliers lose weight."""
@@ -63,16 +59,15 @@ WIDE = 30.0
 """Latent forces while outliers are looked for, in the level at which they become visible."""
 
 ITERATIONS = 40
-ENOUGH_NATS = 0.02
-"""A step that promises or brings less ends the search for the levels."""
+ENOUGH_NATS, ROUGHLY_NATS = 0.02, 1.0
+"""A step that promises or brings less ends the search for the levels; while correlation times are compared."""
 LONGEST_FALL = 1.0
 """Of the logarithm of a level in one step: its variance may be predicted to fall below 0."""
 HALVINGS = 8
+ALIGNED, LONGEST_SERIES = 0.9, 0.9
+"""Cosine of two steps that follow one line, and the most by which the second may be as long as the first."""
 STALLED = 1e-9
 """Of the step: limits and levels count as met within this."""
-
-ROUNDS = 10
-"""In which the windows that count as bad may change; mostly one or two are needed."""
 
 
 def highpass_sigma(values: np.ndarray) -> np.ndarray:
@@ -108,14 +103,17 @@ def fit(windows: Sequence[Window], grams: Sequence[Gram], start: Noise | None = 
     if not any(gram.latents for gram in grams):
         times = times[:1]
     bare = [without_effects(gram) for gram in grams]
-    best: tuple[float, Noise, list[Gram]] | None = None
+    best: tuple[float, Noise] | None = None
     for time in times:
         shaped = each(lambda w: correlated(bare[w], windows[w], time), range(len(bare)))  # noqa: B023  waits for the result
         noise = start or (best[1] if best else _first_guess(shaped))
-        noise, value = _maximise(shaped, replace(noise, correlation_time=time))
+        noise, value = _maximise(shaped, replace(noise, correlation_time=time), ROUGHLY_NATS if len(times) > 1 else ENOUGH_NATS)
         if best is None or value > best[0]:
-            best = value, noise, shaped
-    noise = _with_own_levels(best[2], best[1])
+            best = value, noise
+    noise = best[1]
+    if len(times) > 1:
+        shaped = each(lambda w: correlated(bare[w], windows[w], noise.correlation_time), range(len(bare)))
+        noise, _ = _maximise(shaped, noise)
     return noise, each(lambda w: correlated(grams[w], windows[w], noise.correlation_time), range(len(grams)))
 
 
@@ -126,20 +124,7 @@ def refit(grams: Sequence[Gram], start: Noise) -> Noise:
         grams: of the windows, with correlated latent forces.
         start: where the search starts.
     """
-    bare = [without_effects(gram) for gram in grams]
-    noise, _ = _maximise(bare, start)
-    return _with_own_levels(bare, noise)
-
-
-def _with_own_levels(grams: Sequence[Gram], noise: Noise) -> Noise:
-    """The levels with those of bad windows, until the same windows count as bad: then all levels are at their best together."""
-    common: set[tuple[str, int]] = set()
-    for _ in range(ROUNDS):
-        own = _own_levels(grams, noise, common)
-        if np.all(np.isfinite(own) == np.isfinite(noise.own)):
-            break
-        noise, _ = _maximise(grams, replace(noise, own=own))
-    return noise
+    return _maximise([without_effects(gram) for gram in grams], start)[0]
 
 
 def _first_guess(grams: Sequence[Gram]) -> Noise:
@@ -153,41 +138,78 @@ def _first_guess(grams: Sequence[Gram]) -> Noise:
             seen = curvature[gram.latent_block == block]
             visible.setdefault((int(block), gram.phase), []).append(1.0 / np.sqrt(max(np.median(seen), 1e-300)))
     return Noise(scale, {key: float(np.median(v)) for key, v in visible.items()}, CORRELATION_TIMES[0],
-                 np.full((len(grams), len(LATENT_BLOCKS)), np.nan))  # fmt: skip
+                 np.ones((len(grams), len(LATENT_BLOCKS))))  # fmt: skip
 
 
-def _maximise(grams: Sequence[Gram], noise: Noise) -> tuple[Noise, float]:
-    """Maximum likelihood of the logarithms of all levels, with exact gradients and explicit limits.
+@dataclass(frozen=True)
+class _Layout:
+    """Where each level stands among the parameters of the search: phases' levels, windows' shares of them, sensor scales."""
+
+    keys: list[tuple[int, str]]  # (block, phase)
+    pairs: np.ndarray  # (window, block) of each share, shape (S, 2)
+    seen: np.ndarray  # channels with samples
+    rows: list[np.ndarray]  # of each window: its parameters
+    parts: list[np.ndarray]  # and what they are in a window's own gradient: blocks, blocks again, scales
+
+    @staticmethod
+    def of(grams: Sequence[Gram], noise: Noise) -> "_Layout":
+        """Number the parameters."""
+        keys, blocks = sorted(noise.latent_sd), len(LATENT_BLOCKS)
+        index = {key: i for i, key in enumerate(keys)}
+        present = [[b for b in range(blocks) if (b, gram.phase) in index and np.any(gram.latent_block == b)] for gram in grams]
+        pairs = np.array([(w, b) for w, own in enumerate(present) for b in own], dtype=int).reshape(-1, 2)
+        seen = np.flatnonzero(sum(gram.count for gram in grams) > 0)
+        first = len(keys) + len(pairs)
+        rows, parts, at = [], [], len(keys)
+        for gram, own in zip(grams, present):
+            shared = [index[b, gram.phase] for b in own]
+            rows.append(np.array([*shared, *range(at, at + len(own)), *range(first, first + len(seen))], dtype=int))
+            parts.append(np.array([*own, *own, *(blocks + seen)], dtype=int))
+            at += len(own)
+        return _Layout(keys, pairs, seen, rows, parts)
+
+    def pack(self, noise: Noise) -> np.ndarray:
+        """Logarithms of all levels, shape (P,)."""
+        shared = [noise.latent_sd[key] for key in self.keys]
+        return np.log(np.concatenate((shared, noise.share[tuple(self.pairs.T)], noise.scale[self.seen])))
+
+    def unpack(self, x: np.ndarray, noise: Noise) -> Noise:
+        """The levels; ``noise`` tells all others."""
+        first, last = len(self.keys), len(self.keys) + len(self.pairs)
+        share, scale = noise.share.copy(), noise.scale.copy()
+        share[tuple(self.pairs.T)], scale[self.seen] = np.exp(x[first:last]), np.exp(x[last:])
+        return replace(noise, scale=scale, share=share, latent_sd=dict(zip(self.keys, np.exp(x[:first]).tolist())))
+
+    def limits(self, grams: Sequence[Gram]) -> tuple[np.ndarray, np.ndarray]:
+        """Lowest and highest values of the parameters."""
+        guess = _first_guess(grams).latent_sd
+        visible = np.log([guess[key] for key in self.keys])
+        sizes = len(self.pairs), len(self.seen)
+        bounds = ((np.log(low) + visible, np.full(sizes[0], np.log(share)), np.full(sizes[1], np.log(scale)))
+                  for low, share, scale in zip((LEVEL_LOW, LEVEL_HIGH), SHARE_BOUNDS, SCALE_BOUNDS))  # fmt: skip
+        low, high = map(np.concatenate, bounds)
+        return low, high
+
+
+def _maximise(grams: Sequence[Gram], noise: Noise, enough: float = ENOUGH_NATS) -> tuple[Noise, float]:
+    """Most probable logarithms of all levels, with exact gradients and explicit limits.
 
     By Fisher scoring: the expected curvature costs nothing beside the gradient, and a few looks at all windows suffice.
     """
-    keys, bad = sorted(noise.latent_sd), np.argwhere(np.isfinite(noise.own))
-    seen = np.flatnonzero(sum(gram.count for gram in grams) > 0)
-    guess = _first_guess(grams).latent_sd
-    visible = np.log([guess[key] for key in keys] + [guess[int(block), grams[w].phase] for w, block in bad])
-    latents, first_own = len(visible), len(keys)
-    levels_now = [noise.latent_sd[key] for key in keys] + [noise.own[w, block] for w, block in bad]
-    x = np.log(levels_now + [noise.scale[c] for c in seen])
-    low = np.concatenate((np.log(LEVEL_LOW) + visible, np.full(len(seen), np.log(SCALE_BOUNDS[0]))))
-    high = np.concatenate((np.log(LEVEL_HIGH) + visible, np.full(len(seen), np.log(SCALE_BOUNDS[1]))))
-    x = np.clip(x, low, high)
-
-    def levels(x: np.ndarray) -> Noise:
-        scale, own = noise.scale.copy(), noise.own.copy()
-        scale[seen] = np.exp(x[latents:])
-        own[tuple(bad.T)] = np.exp(x[first_own:latents])
-        return replace(noise, scale=scale, latent_sd=dict(zip(keys, np.exp(x[:first_own]).tolist())), own=own)
+    layout = _Layout.of(grams, noise)
+    low, high = layout.limits(grams)
+    x = np.clip(layout.pack(noise), low, high)
 
     def look(x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-        value, by_level, by_scale, curvature = _likelihood(grams, levels(x), keys)
-        chosen = np.concatenate((np.arange(latents), latents + seen))
-        return value, np.concatenate((by_level, by_scale))[chosen], curvature[np.ix_(chosen, chosen)]
+        return _likelihood(grams, layout.unpack(x, noise), layout)
 
     value, slope, curvature = look(x)
+    last = np.zeros_like(x)
     for _ in range(ITERATIONS):
-        step, promised = _scoring_step(x, slope, curvature, low, high)
-        if promised < ENOUGH_NATS:
+        plain, promised = _scoring_step(x, slope, curvature, low, high)
+        if promised < enough:
             break
+        step, last = np.clip(x + _stride(plain, last) * plain, low, high) - x, plain
         for _ in range(HALVINGS):
             tried, its_slope, expected = look(x + step)
             if tried > value:
@@ -196,9 +218,19 @@ def _maximise(grams: Sequence[Gram], noise: Noise) -> tuple[Noise, float]:
         else:
             break
         gained, x, value, slope, curvature = tried - value, x + step, tried, its_slope, expected
-        if gained < ENOUGH_NATS:
+        if gained < enough:
             break
-    return levels(x), value
+    return layout.unpack(x, noise), value
+
+
+def _stride(step: np.ndarray, last: np.ndarray) -> float:
+    """By how much to lengthen a step that repeats the last one, shortened: such steps shrink like a geometric series (Aitken)."""
+    square = last @ last
+    if square == 0.0:
+        return 1.0
+    ratio = float(step @ last / square)
+    alike = ratio * np.sqrt(square) > ALIGNED * np.linalg.norm(step)
+    return 1.0 / (1.0 - min(ratio, LONGEST_SERIES)) if alike and ratio > 0.0 else 1.0
 
 
 def _scoring_step(
@@ -222,29 +254,24 @@ def _scoring_step(
     return np.clip(x + step, low, high) - x, promised
 
 
-def _likelihood(
-    grams: Sequence[Gram], noise: Noise, keys: Sequence[tuple[int, str]]
-) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
-    """Log-likelihood, its gradients by the logarithms of latent deviations and of sensor scales, and its expected curvature.
+def _likelihood(grams: Sequence[Gram], noise: Noise, layout: _Layout) -> tuple[float, np.ndarray, np.ndarray]:
+    """Log-likelihood with the prior of the windows' shares, its gradient by the parameters, and its expected curvature.
 
-    The deviations are those of ``keys`` and after them bad windows' own, in the order of ``np.argwhere(np.isfinite(noise.own))``.
-    The curvature (Fisher's, of [levels, scales]) is exact among the levels; what the scales share with the fitted columns is
-    given to the channels by their part in them.
+    The curvature (Fisher's) is exact among the levels; what the scales share with the fitted columns is given to the channels by
+    their part in them.
     """
-    index = {key: i for i, key in enumerate(keys)}
-    bad = np.isfinite(noise.own)
-    count = len(keys) + int(bad.sum())
-    own_at = len(keys) - 1 + np.cumsum(bad).reshape(bad.shape)
-    value, slope, curvature = 0.0, np.zeros(count + len(noise.scale)), np.zeros((count + len(noise.scale),) * 2)
+    size = len(layout.keys) + len(layout.pairs) + len(layout.seen)
+    value, slope, curvature = noise.log_prior, np.zeros(size), np.zeros((size, size))
+    own = np.arange(len(layout.keys), len(layout.keys) + len(layout.pairs))
+    inverse = noise.share[tuple(layout.pairs.T)] ** -2.0
+    slope[own] = TAIL * (inverse - 1.0)
+    curvature[own, own] = 2.0 * TAIL * np.clip(inverse, *PRIOR_CURVATURE)
     for w, found in enumerate(each(lambda w: _window_likelihood(grams[w], noise, w), range(len(grams)))):
-        at = [own_at[w, b] if bad[w, b] else index.get((b, grams[w].phase), -1) for b in range(len(LATENT_BLOCKS))]
-        blocks = np.flatnonzero(np.array(at) >= 0)
-        rows = np.array([at[b] for b in blocks] + list(range(count, len(slope))), dtype=int)
-        chosen = np.concatenate((blocks, len(LATENT_BLOCKS) + np.arange(len(noise.scale))))
+        rows, parts = layout.rows[w], layout.parts[w]
         value += found[0]
-        slope[rows] += found[1][chosen]
-        curvature[np.ix_(rows, rows)] += found[2][np.ix_(chosen, chosen)]
-    return value, slope[:count], slope[count:], curvature
+        slope[rows] += found[1][parts]
+        curvature[np.ix_(rows, rows)] += found[2][np.ix_(parts, parts)]
+    return value, slope, curvature
 
 
 def _window_likelihood(gram: Gram, noise: Noise, window: int) -> tuple[float, np.ndarray, np.ndarray]:
@@ -273,68 +300,6 @@ def _window_likelihood(gram: Gram, noise: Noise, window: int) -> tuple[float, np
     return state.log_likelihood, np.concatenate((by_block, left * weight - gram.count)), curvature
 
 
-def _own_levels(grams: Sequence[Gram], noise: Noise, common: set[tuple[str, int]]) -> np.ndarray:
-    """Latent deviations of windows that stand far above their phase's, shape (windows, 3); NaN for all others.
-
-    Args:
-        grams: of the windows.
-        noise: levels so far. A window that counts as bad stays so unless its phase's level does nearly as well.
-        common: (phase, block)s whose windows have one level; those are added of which many windows stand out, for good: the
-            phase's level rises to theirs, and were they let out again it would fall.
-    """
-    found = each(lambda w: _own_levels_of(grams[w], noise, w), range(len(grams)))
-    own = np.array(found).reshape(noise.own.shape)
-    for phase in sorted({gram.phase for gram in grams}):
-        of_phase = np.array([gram.phase == phase for gram in grams])
-        many = np.isfinite(own[of_phase]).sum(0) > BAD_SHARE * of_phase.sum()
-        common |= {(phase, int(block)) for block in np.flatnonzero(many)}
-        shared = [block for block in range(own.shape[1]) if (phase, block) in common]
-        own[np.ix_(of_phase, shared)] = np.nan
-    return own
-
-
-def _own_levels_of(gram: Gram, noise: Noise, window: int) -> np.ndarray:
-    """Of one window, shape (3,)."""
-    own, state = np.full(len(LATENT_BLOCKS), np.nan), posterior(gram, noise, window)
-    level = noise.deviation(gram, window)[gram.nuisances :]
-    for block in np.unique(gram.latent_block):
-        at = gram.nuisances + np.flatnonzero(gram.latent_block == block)
-        used, shared = level[gram.latent_block == block][0], noise.latent_sd[int(block), gram.phase]
-        own[block] = _own_level(state, at, used, shared, bool(np.isfinite(noise.own[window, block])))
-    return own
-
-
-def _own_level(state: Posterior, at: np.ndarray, used: float, shared: float, bad: bool) -> float:
-    """A level that explains one block of a window far better than its phase's; NaN where there is none.
-
-    A window that counts as bad keeps the level that was found for it unless its phase's is within ``GOOD_NATS``.
-
-    The block's posterior precision is 1 + used^2 R, with R what the window says of unit forces: its eigenvalues give the
-    likelihood of every level at once.
-
-    Args:
-        state: of the window.
-        at: of the block's coefficients.
-        used: level that the posterior rests on.
-        shared: level of the phase.
-        bad: whether ``used`` is the window's own level.
-    """
-    precision = np.linalg.inv(state.covariance[np.ix_(at, at)])
-    said, turn = np.linalg.eigh(precision - np.eye(len(at)))
-    said = np.maximum(said, 0.0)
-    score = (turn.T @ (precision @ state.mean[at])) ** 2
-    share = (np.array([1.0, used / shared, *FACTORS]) * shared / used)[:, None] ** 2
-    values = 0.5 * np.sum(share * score / (1.0 + share * said) - np.log1p(share * said), axis=1)
-    plain, now, values = values[0], values[1], values[2:]
-    if bad:
-        return float(used) if used > shared and now > plain + GOOD_NATS else np.nan
-    below = np.flatnonzero(values < plain)
-    values = values[: below[0]] if len(below) else values
-    if not len(values) or values.max() <= plain + BAD_NATS:
-        return np.nan
-    return float(FACTORS[int(np.argmax(values))] * shared)
-
-
 def without_outliers(windows: Sequence[Window], channels: int) -> list[Window]:
     """Give single samples far outside a sigma that puts them at HUBER; windows with none are returned as they are.
 
@@ -350,20 +315,37 @@ def without_outliers(windows: Sequence[Window], channels: int) -> list[Window]:
     return each(lambda window: _mended(window, channels), windows)
 
 
+def lost(windows: Sequence[Window], channels: int) -> list[int]:
+    """Windows that the simulation does not follow, whatever forces may act: a crash, or a rope that whips beyond prediction.
+
+    Args:
+        windows: of the flights.
+        channels: number of the model's channels.
+    """
+    off = np.array(each(lambda window: float(np.median(_unexplained(window, window.sigma, channels))), windows))
+    far = np.flatnonzero(off > LOST * max(float(np.median(off)), MAD_TO_SIGMA**-1))
+    return far.tolist() if len(far) <= LOST_SHARE * len(windows) else []
+
+
 def _mended(window: Window, channels: int) -> Window:
-    sigma, bare = window.sigma, replace(window, effects=window.effects[:, :0])
+    sigma = window.sigma
     for _ in range(CLEANINGS):
-        gram = hidden_gram(replace(window, sigma=sigma), channels)
-        guess = _first_guess([gram])
-        wide = replace(guess, latent_sd={key: WIDE * level for key, level in guess.latent_sd.items()})
-        shaped = correlated(gram, window, wide.correlation_time)
-        fitted = wide.deviation(shaped, 0) * posterior(shaped, wide, 0).mean
-        fitted[gram.nuisances :] = shaped.factor @ fitted[gram.nuisances :]
-        left = window.residual - columns(bare, np.zeros(0)) @ fitted
-        normal = np.abs(left) / window.sigma
+        normal = _unexplained(window, sigma, channels)
         far = normal / (HUBER * np.maximum(1.0, MAD_TO_SIGMA * np.median(normal)))
         if not np.any(far > 1.0):
             break
         sigma = window.sigma * np.maximum(far, 1.0)
     outliers = sigma > window.sigma
     return replace(window, sigma=sigma) if 0.0 < outliers.mean() <= HUBER_SHARE else window
+
+
+def _unexplained(window: Window, sigma: np.ndarray, channels: int) -> np.ndarray:
+    """What strong latent forces leave of a window's residuals, in its noise; its initial state and forces fitted with ``sigma``."""
+    gram = hidden_gram(replace(window, sigma=sigma), channels)
+    guess = _first_guess([gram])
+    wide = replace(guess, latent_sd={key: WIDE * level for key, level in guess.latent_sd.items()})
+    shaped = correlated(gram, window, wide.correlation_time)
+    fitted = wide.deviation(shaped, 0) * posterior(shaped, wide, 0).mean
+    fitted[gram.nuisances :] = shaped.factor @ fitted[gram.nuisances :]
+    bare = replace(window, effects=window.effects[:, :0])
+    return np.abs(window.residual - columns(bare, np.zeros(0)) @ fitted) / window.sigma

@@ -144,8 +144,8 @@ def expected_information(
         gram = correlated(gram_of(window, floors, len(model.channels)), window, noise.correlation_time)
         levels = {(int(b), window.phase): noise.latent_sd.get((int(b), window.phase), loudest.get(int(b), pushed))
                   for b in np.unique(gram.latent_block)}  # fmt: skip
-        shared = np.full((1, len(LATENT_BLOCKS)), np.nan)
-        expected = replace(noise, scale=np.ones(len(model.channels)), latent_sd=levels, own=shared)
+        alike = np.ones((1, len(LATENT_BLOCKS)))
+        expected = replace(noise, scale=np.ones(len(model.channels)), latent_sd=levels, share=alike)
         part = window_statistics(gram, expected, 0).information
         total[np.ix_(at, at)] += part[np.ix_(own, own)]
     return total * np.outer(*[_ratio(model, names, priors)] * 2)

@@ -66,7 +66,7 @@ class Point:
     def evidence(self, priors: Priors, active: Sequence[int]) -> float:
         """log Z of a set of effects, comparable between points with other noise levels."""
         own = log_evidence(self.information, self.score, priors, list(active))
-        return own - 0.5 * float(self.statistics.absolute_square.sum())
+        return own - 0.5 * float(self.statistics.absolute_square.sum()) + self.noise.log_prior
 
 
 def _point(theta: np.ndarray, windows: Sequence[Window], raw: Sequence[Gram], grams: Sequence[Gram], noise: Noise,

@@ -14,6 +14,7 @@ import numpy as np
 from visthrow.diagnose.consistency import Consistency, across_flights, repeated_flights
 from visthrow.diagnose.evidence import NORMAL_95, OWN_FLOOR, Priors, additions, covariance, log_evidence, threshold
 from visthrow.diagnose.model import Model
+from visthrow.diagnose.noise import lost
 from visthrow.diagnose.point import (
     Point,
     Problem,
@@ -267,6 +268,8 @@ def explain(
     kept = tuple(i for i, w in enumerate(windows) if finite[i] and w.flight not in left_out)
     if len(kept) < 0.5 * sum(w.flight not in left_out for w in windows) or not kept:
         return out_of_domain(model, windows, sum(finite), seed)
+    gone = set(lost([windows[i] for i in kept], len(model.channels)))
+    kept = tuple(w for i, w in enumerate(kept) if i not in gone)
     problem = Problem(model, priors, kept)
     nominal = linearise(problem, np.zeros(len(model.effects)), windows=windows)
     least = threshold(nominal.statistics, priors, np.random.default_rng(seed))

@@ -28,6 +28,9 @@ CHAIN = 2
 IMPLAUSIBLE_FORCE = 0.3
 """Latent force, in the thrust that carries the vehicle, that no missing cause explains: the channels do not belong together."""
 
+ROUGH = 4.0
+"""Latent force of a window, in its phase's, from which something happened there."""
+
 AT_BOUND = 1e-3
 """Distance from a physical bound, in floors, at which an estimate lies on it."""
 
@@ -89,7 +92,7 @@ def _different(hypotheses: Sequence["Hypothesis"]) -> tuple[Law, ...]:
 
 def _events(search: "Search", point: Point) -> tuple[int, ...]:
     """Flights that were left out for what happened there, and flights with a window far rougher than its phase."""
-    rough = {window.flight for window, own in zip(point.windows, point.noise.own) if np.isfinite(own).any()}
+    rough = {window.flight for window, share in zip(point.windows, point.noise.share) if share.max() > ROUGH}
     return tuple(sorted({*search.events, *rough}))
 
 
