@@ -35,6 +35,7 @@ class Effect:
     source: str  # of equation and prior
     confused_with: tuple[str, ...] = ()  # effects that look alike in ordinary flights
     manoeuvres: tuple[str, ...] = ()  # manoeuvres that separate it from those
+    switch: bool = False  # theta is 0 or 1: another kind of block, of which a derivative says little
 
 
 @dataclass(frozen=True)

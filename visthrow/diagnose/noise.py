@@ -135,8 +135,9 @@ def _first_guess(grams: Sequence[Gram]) -> Noise:
         part = slice(gram.nuisances, gram.nuisances + gram.latents)
         curvature = np.diagonal(gram.inner.sum(0))[part]
         for block in np.unique(gram.latent_block):
-            seen = curvature[gram.latent_block == block]
-            visible.setdefault((int(block), gram.phase), []).append(1.0 / np.sqrt(max(np.median(seen), 1e-300)))
+            seen = float(np.median(curvature[gram.latent_block == block]))
+            if seen > 0.0:  # else these forces show nowhere in the window
+                visible.setdefault((int(block), gram.phase), []).append(1.0 / np.sqrt(seen))
     return Noise(scale, {key: float(np.median(v)) for key, v in visible.items()}, CORRELATION_TIMES[0],
                  np.ones((len(grams), len(LATENT_BLOCKS))))  # fmt: skip
 

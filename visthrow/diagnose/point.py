@@ -36,6 +36,11 @@ class Problem:
     priors: Priors
     kept: tuple[int, ...]  # windows that are looked at
 
+    @property
+    def switches(self) -> np.ndarray:
+        """Which effects are another kind of block, shape (K,), bool."""
+        return np.array([e.switch for e in self.model.effects], dtype=bool)
+
     def sizes(self, theta: np.ndarray) -> dict[str, float]:
         """Sizes in the effects' units, of those that are not 0; ``theta`` is in floors."""
         return {e.name: float(t * e.floor) for e, t in zip(self.model.effects, theta) if t != 0.0}
@@ -177,11 +182,13 @@ def fitted(problem: Problem, point: Point, active: Sequence[int]) -> Point:
         return point
     for _ in range(STEPS):
         goal = estimate(best.information, best.score, problem.priors, active)
+        goal[problem.switches] = best.theta[problem.switches]  # no step turns a block into another
         trial = _step(problem, best, goal)
         if trial is None:
             break
         best = trial
         left = estimate(best.information, best.score, problem.priors, active) - best.theta
+        left[problem.switches] = 0.0
         if left @ best.information @ left < 0.1:  # nats still to be gained by a step without noise
             break
     return best

@@ -147,11 +147,22 @@ class Search:
         return bool(abs(point.theta[j]) > NORMAL_95 * np.hypot(np.sqrt(spread), OWN_FLOOR))
 
     def _candidate(self, point: Point, active: Sequence[int]) -> Point:
-        return with_fitted_noise(fitted(self.problem, point, active))
+        return with_fitted_noise(fitted(self.problem, self._switched(point, active), active))
+
+    def _switched(self, point: Point, active: Sequence[int]) -> Point:
+        """The point, linearised with another kind of block on where a set asks for one that is off."""
+        off = [j for j in active if self.problem.switches[j] and point.theta[j] == 0.0]
+        if not off:
+            return point
+        theta = np.where(np.isin(np.arange(len(point.theta)), list(active)), point.theta, 0.0)
+        theta[off] = 1.0 / self.priors.floor[off]
+        return linearise(self.problem, theta, point.noise)
 
     def _settle(self, point: Point, active: Sequence[int]) -> Point:
         """Linearise where the search stands, unless the last derivatives still hold, and step on where that moved the optimum."""
-        if curvature(self.problem, self.origin, point) < STRAIGHT:
+        kinds = self.problem.switches
+        same = np.array_equal(self.origin.theta[kinds] != 0.0, point.theta[kinds] != 0.0)
+        if same and curvature(self.problem, self.origin, point) < STRAIGHT:
             return point
         for _ in range(LINEARISATIONS):
             self.origin = linearise(self.problem, point.theta, point.noise)

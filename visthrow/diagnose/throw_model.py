@@ -112,22 +112,21 @@ class ThrowModel:
             states = self._begin(self.setting)
         self._told = np.array([w for w, c in enumerate(self.flights.cuts) if c.told])
         self._fits: dict[tuple[Cut, ...], tuple[States, dict[int, np.ndarray]]] = {}
-        self._latest = self._fitted(states)[0]
+        self._latest: dict[frozenset[str], States] = {frozenset(): self._fitted(states)[0]}
         self._sightings = sightings(logs, flights, self.flights.cuts, self.setting)
 
     def windows(self, theta: Mapping[str, float]) -> list[Window]:
         """See :class:`visthrow.diagnose.model.Model`."""
         setting = apply(self.entries, self.setting, theta)
         self._directions = directions(setting.plant)  # another kind of block has other states
-        states = self._settled(setting)
-        self._latest = states
+        states = self._latest[self._switches(theta)] = self._settled(setting)
         steps = [self._step(e, theta.get(e.effect.name, 0.0)) for e in self._graded]
         settings = [setting, *[e.apply(setting, step) for e, step in zip(self._graded, steps)]]
         replay = self._replay(settings)
         found: list[Window] = []
         for batch in self._batches():
             found += self._linearised(replay, settings, np.array(steps), states, batch)
-        columns = [self._secant(e, theta, states, found) for e in self._switched]
+        columns = [self._secant(e, theta, found) for e in self._switched]
         if columns:
             found = [
                 dataclasses.replace(w, effects=np.hstack((w.effects, np.stack([c[i] for c in columns], axis=1))))
@@ -148,24 +147,33 @@ class ThrowModel:
             with_sightings(w, number, self._sightings, self.channels, settings, steps) for number, w in zip(self._told, whole)
         ]
 
-    def _secant(self, e: Entry, theta: Mapping[str, float], states: States, windows: list[Window]) -> list[np.ndarray]:
-        """Samples with the other kind of block less those with this one, per theta; a column for each window."""
+    def _secant(self, e: Entry, theta: Mapping[str, float], windows: list[Window]) -> list[np.ndarray]:
+        """Samples with the other kind of block less those with this one, per theta; a column for each window.
+
+        Each kind begins in initial states settled for it: a transient that the other's state brings would be taken for its effect.
+        """
         on = theta.get(e.effect.name, 0.0) > 0.5
-        other = apply(self.entries, self.setting, {**theta, e.effect.name: 0.0 if on else 1.0})
+        elsewhere = {**theta, e.effect.name: 0.0 if on else 1.0}
+        other = apply(self.entries, self.setting, elsewhere)
         lanes = [Lane(w, 0, w) for w in self._told]
-        start = resampled(states, other.plant.rope.segments)
+        start = self._latest[self._switches(elsewhere)] = self._settled(other)
         seen = self.flights.fly(self._replay([other]), [other], start, lanes, self.substep).seen
         sign = -1.0 if on else 1.0
         return [sign * (x.residual - self.flights.residual(seen, w, lane)) for lane, (w, x) in enumerate(zip(self._told, windows))]
 
     def residuals(self, theta: Mapping[str, float]) -> list[np.ndarray]:
-        """See :class:`visthrow.diagnose.model.Model`; from the initial states of the last :meth:`windows`."""
+        """See :class:`visthrow.diagnose.model.Model`; from the initial states settled last with the same kinds of blocks."""
         setting = apply(self.entries, self.setting, theta)
         lanes = [Lane(w, 0, w) for w in self._told]
-        states = resampled(self._latest, setting.plant.rope.segments)
+        states = self._latest.get(self._switches(theta), self._fitted()[0])
+        states = resampled(states, setting.plant.rope.segments)
         seen = self.flights.fly(self._replay([setting]), [setting], states, lanes, self.substep).seen
         flown = [self.flights.residual(seen, w, lane) for lane, w in enumerate(self._told)]
         return [np.concatenate((r, *self._sighting_residuals(w, setting))) for r, w in zip(flown, self._told)]
+
+    def _switches(self, theta: Mapping[str, float]) -> frozenset[str]:
+        """Which other kinds of blocks are on."""
+        return frozenset(e.effect.name for e in self._switched if theta.get(e.effect.name, 0.0) > 0.5)
 
     def _sighting_residuals(self, w: int, setting: Setting) -> list[np.ndarray]:
         held = [(kind, kind.samples(w)[1]) for kind in self._sightings]

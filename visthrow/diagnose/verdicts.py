@@ -9,8 +9,9 @@ import numpy as np
 from visthrow.diagnose import result
 from visthrow.diagnose.evidence import NORMAL_95, OWN_FLOOR, Priors, covariance, estimate
 from visthrow.diagnose.excess import acts_on, levels, too_strong
+from visthrow.diagnose.marginal import Statistics
 from visthrow.diagnose.model import Model, Window
-from visthrow.diagnose.point import Point
+from visthrow.diagnose.point import Point, moved
 from visthrow.diagnose.result import Diagnosis, Finding, Law, Level
 from visthrow.diagnose.scatter import varying
 from visthrow.diagnose.work import Work
@@ -48,7 +49,12 @@ def conclude(search: "Search", *, laws: bool) -> Diagnosis:
     point, model = search.point, search.problem.model
     found = levels(search.nominal, point, search.least)
     sizes = estimate(point.information, point.score, search.priors, search.active)
-    scatter = varying(point.statistics, sizes, search.priors, [e.name for e in model.effects], search.least)
+
+    def again(theta: np.ndarray) -> Statistics | None:
+        there = moved(search.problem, point, theta)
+        return None if there is None else there.statistics
+
+    scatter = varying(point.statistics, sizes, search.priors, [e.name for e in model.effects], search.least, again)
     drawn = {name for s in scatter if s.found for name in s.of}
     search.refused = {j: nats for j, nats in search.refused.items() if search.name(j) not in drawn}
     answer = find_laws(search) if laws else Answer()

@@ -91,7 +91,8 @@ def entry(
 ) -> Entry:  # fmt: skip
     """One line of a table of the catalogue."""
     effect = Effect(
-        name, cause, equation, unit, block, bounds, prior_sd, floor, channels, source, confused, manoeuvres
+        name, cause, equation, unit, block, bounds, prior_sd, floor, channels, source, confused, manoeuvres,
+        switch=options.get("switch") is not None,
     )
     return Entry(effect, tuple(keys), **options)
 
