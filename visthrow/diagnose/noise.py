@@ -43,9 +43,6 @@ HUBER = 6.0
 HUBER_SHARE = 0.02
 """More samples than this beyond ``HUBER`` are no outliers but a misfit, which must stay visible."""
 
-LOST, LOST_SHARE = 10.0, 0.15
-"""Median residual in that of the usual window from which one is lost, and the share of windows beyond which none is."""
-
 SHARE_BOUNDS = (0.1, 1e3)
 """Latent deviation of a window, in its phase's."""
 
@@ -316,37 +313,20 @@ def without_outliers(windows: Sequence[Window], channels: int) -> list[Window]:
     return each(lambda window: _mended(window, channels), windows)
 
 
-def lost(windows: Sequence[Window], channels: int) -> list[int]:
-    """Windows that the simulation does not follow, whatever forces may act: a crash, or a rope that whips beyond prediction.
-
-    Args:
-        windows: of the flights.
-        channels: number of the model's channels.
-    """
-    off = np.array(each(lambda window: float(np.median(_unexplained(window, window.sigma, channels))), windows))
-    far = np.flatnonzero(off > LOST * max(float(np.median(off)), MAD_TO_SIGMA**-1))
-    return far.tolist() if len(far) <= LOST_SHARE * len(windows) else []
-
-
 def _mended(window: Window, channels: int) -> Window:
-    sigma = window.sigma
+    sigma, bare = window.sigma, replace(window, effects=window.effects[:, :0])
     for _ in range(CLEANINGS):
-        normal = _unexplained(window, sigma, channels)
+        gram = hidden_gram(replace(window, sigma=sigma), channels)
+        guess = _first_guess([gram])
+        wide = replace(guess, latent_sd={key: WIDE * level for key, level in guess.latent_sd.items()})
+        shaped = correlated(gram, window, wide.correlation_time)
+        fitted = wide.deviation(shaped, 0) * posterior(shaped, wide, 0).mean
+        fitted[gram.nuisances :] = shaped.factor @ fitted[gram.nuisances :]
+        left = window.residual - columns(bare, np.zeros(0)) @ fitted
+        normal = np.abs(left) / window.sigma
         far = normal / (HUBER * np.maximum(1.0, MAD_TO_SIGMA * np.median(normal)))
         if not np.any(far > 1.0):
             break
         sigma = window.sigma * np.maximum(far, 1.0)
     outliers = sigma > window.sigma
     return replace(window, sigma=sigma) if 0.0 < outliers.mean() <= HUBER_SHARE else window
-
-
-def _unexplained(window: Window, sigma: np.ndarray, channels: int) -> np.ndarray:
-    """What strong latent forces leave of a window's residuals, in its noise; its initial state and forces fitted with ``sigma``."""
-    gram = hidden_gram(replace(window, sigma=sigma), channels)
-    guess = _first_guess([gram])
-    wide = replace(guess, latent_sd={key: WIDE * level for key, level in guess.latent_sd.items()})
-    shaped = correlated(gram, window, wide.correlation_time)
-    fitted = wide.deviation(shaped, 0) * posterior(shaped, wide, 0).mean
-    fitted[gram.nuisances :] = shaped.factor @ fitted[gram.nuisances :]
-    bare = replace(window, effects=window.effects[:, :0])
-    return np.abs(window.residual - columns(bare, np.zeros(0)) @ fitted) / window.sigma

@@ -24,6 +24,9 @@ from visthrow.diagnose.threads import each
 STEPS = 3
 """Gauss-Newton steps between two linearisations."""
 
+LOST, LOST_SHARE = 3.0, 0.15
+"""Squared residual a sample, in noise and latent forces, from which a window is lost; share of windows beyond which none is."""
+
 SMALL_STEP = 0.05
 """In floors: a step that is not worth a simulation."""
 
@@ -104,6 +107,17 @@ def linearise(problem: Problem, theta: np.ndarray, start: Noise | None = None, w
     return _point(theta, kept, raw, grams, noise)
 
 
+def lost(point: Point) -> list[int]:
+    """Numbers of windows that the simulation does not follow, whatever forces act: a crash, a rope that whips beyond prediction.
+
+    What they say of an effect is chance: their derivatives hold nowhere. Where many are so, none is lost, but something is missing.
+    """
+    misfit = [(known.share(gram, point.noise).square - known.log_det) / max(gram.count.sum(), 1.0)
+              for known, gram in zip(point.integrals, point.grams)]  # fmt: skip
+    far = np.flatnonzero(np.array(misfit) > LOST)
+    return far.tolist() if len(far) <= LOST_SHARE * len(misfit) else []
+
+
 def moved(problem: Problem, point: Point, theta: np.ndarray) -> Point | None:
     """Simulate at ``theta`` but keep the derivatives and noise levels of ``point``; None where the simulation fails there."""
     residuals = problem.model.residuals(problem.sizes(theta))
@@ -156,6 +170,16 @@ def with_all_effects_noise(problem: Problem, point: Point) -> Point:
     """
     visible = np.flatnonzero(problem.priors.visible)
     change = estimate(point.information, point.score, problem.priors, visible) - point.theta
+    noise = levels.refit([shifted(gram, change) for gram in point.grams], point.noise)
+    return _point(point.theta, point.windows, point.raw, point.grams, noise)
+
+
+def with_floors_noise(problem: Problem, point: Point, active: Sequence[int]) -> Point:
+    """The same with the noise levels that remain when every effect has its most probable size, those not named below their floors.
+
+    What a dozen effects below their floors leave is no gust, but it is nothing that is missing either.
+    """
+    change = covariance(point.information, problem.priors.deviation(list(active))) @ point.score - point.theta
     noise = levels.refit([shifted(gram, change) for gram in point.grams], point.noise)
     return _point(point.theta, point.windows, point.raw, point.grams, noise)
 

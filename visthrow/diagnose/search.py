@@ -12,9 +12,17 @@ from itertools import combinations
 import numpy as np
 
 from visthrow.diagnose.consistency import Consistency, across_flights, repeated_flights
-from visthrow.diagnose.evidence import NORMAL_95, OWN_FLOOR, Priors, additions, covariance, log_evidence, threshold
+from visthrow.diagnose.evidence import (
+    NORMAL_95,
+    OWN_FLOOR,
+    Priors,
+    additions,
+    covariance,
+    estimate,
+    log_evidence,
+    threshold,
+)
 from visthrow.diagnose.model import Model
-from visthrow.diagnose.noise import lost
 from visthrow.diagnose.point import (
     Point,
     Problem,
@@ -22,6 +30,7 @@ from visthrow.diagnose.point import (
     curvature,
     fitted,
     linearise,
+    lost,
     with_all_effects_noise,
     with_fitted_noise,
 )
@@ -49,8 +58,14 @@ CONTRADICTED = 0.5
 STRAIGHT = 0.5
 """Size in floors that the simulation's distance from its linearisation may fake before the derivatives are taken anew."""
 
+WHOLE = 0.7
+"""Of another kind of block that flights must ask for: of one that is not there, whose state has more freedom, a part is taken."""
+
 LINEARISATIONS = 3
 """At most so many times in a row, each where the last led."""
+
+LOSSES = 3
+"""Rounds in which windows are left out that the simulation does not follow: the worst hide others."""
 
 JOINT_BEST, JOINT_SIZE = 8, 3
 """All sets of up to so many of the best effects are compared at the end."""
@@ -111,12 +126,11 @@ class Search:
         base = self.point, self.active
         tried = {int(j): self._candidate(free, [*self.active, int(j)]) for j in short}
         nats = {j: advantage(self.priors, (point, [*self.active, j]), base) for j, point in tried.items()}
-        best = max(nats, key=nats.get)
-        if nats[best] <= max([self.least, *(CONTRADICTED * n for n in self.refused.values())]):
+        enough = max([self.least, *(CONTRADICTED * n for n in self.refused.values())])
+        usable = [j for j in sorted(nats, key=nats.get, reverse=True) if nats[j] > enough and self._stands(tried[j], j)]
+        if not usable:
             return False
-        if not self._sure(tried[best], best):
-            self.progress(f"{self.name(best)} would be no larger than what it cannot be told from; it is not named")
-            return False
+        best = usable[0]
         verdict, found = self._agreed(tried[best], best)
         if verdict is not None:
             return self._set_aside(best, nats[best], verdict)
@@ -141,10 +155,24 @@ class Search:
             self.origin = origin
         return verdict, near
 
+    def _stands(self, point: Point, j: int) -> bool:
+        """Whether a candidate could be named at all, however many nats it brings."""
+        if self.problem.switches[j] and self._share_of(point, j) < WHOLE:
+            self.progress(f"{self.name(j)} is there or not, and these flights ask for a part of it; it is not named")
+            return False
+        if not self._sure(point, j):
+            self.progress(f"{self.name(j)} would be no larger than what it cannot be told from; it is not named")
+            return False
+        return True
+
     def _sure(self, point: Point, j: int) -> bool:
         """Whether the interval that an effect would be reported with leaves out 0."""
         spread = covariance(point.information, self.priors.deviation([*self.active, j]))[j, j]
         return bool(abs(point.theta[j]) > NORMAL_95 * np.hypot(np.sqrt(spread), OWN_FLOOR))
+
+    def _share_of(self, point: Point, j: int) -> float:
+        """How much of another kind of block is asked for by a point that has it: about 1 if it is there."""
+        return float(estimate(point.information, point.score, self.priors, [*self.active, j])[j] * self.priors.floor[j])
 
     def _candidate(self, point: Point, active: Sequence[int]) -> Point:
         return with_fitted_noise(fitted(self.problem, self._switched(point, active), active))
@@ -279,12 +307,17 @@ def explain(
     kept = tuple(i for i, w in enumerate(windows) if finite[i] and w.flight not in left_out)
     if len(kept) < 0.5 * sum(w.flight not in left_out for w in windows) or not kept:
         return out_of_domain(model, windows, sum(finite), seed)
-    gone = set(lost([windows[i] for i in kept], len(model.channels)))
-    kept = tuple(w for i, w in enumerate(kept) if i not in gone)
     problem = Problem(model, priors, kept)
     nominal = linearise(problem, np.zeros(len(model.effects)), windows=windows)
+    for _ in range(LOSSES):
+        gone = set(lost(nominal))
+        if not gone:
+            break
+        say(f"{len(gone)} windows are left out, which the simulation does not follow")
+        problem = replace(problem, kept=tuple(w for i, w in enumerate(problem.kept) if i not in gone))
+        nominal = linearise(problem, np.zeros(len(model.effects)), windows=windows)
     least = threshold(nominal.statistics, priors, np.random.default_rng(seed))
-    say(f"{len(kept)} windows of {len(nominal.statistics.flights)} flights; a cause needs {least:.1f} nats")
+    say(f"{len(problem.kept)} windows of {len(nominal.statistics.flights)} flights; a cause needs {least:.1f} nats")
     search = Search(problem, nominal, least, say, laws)
     search.run()
     diagnosis = conclude(search, laws=laws)

@@ -11,7 +11,7 @@ from visthrow.diagnose.evidence import NORMAL_95, OWN_FLOOR, Priors, covariance,
 from visthrow.diagnose.excess import acts_on, levels, too_strong
 from visthrow.diagnose.marginal import Statistics
 from visthrow.diagnose.model import Model, Window
-from visthrow.diagnose.point import Point, moved
+from visthrow.diagnose.point import Point, moved, with_floors_noise
 from visthrow.diagnose.result import Diagnosis, Finding, Law, Level
 from visthrow.diagnose.scatter import varying
 from visthrow.diagnose.work import Work
@@ -47,7 +47,7 @@ def conclude(search: "Search", *, laws: bool) -> Diagnosis:
     from visthrow.diagnose.unknown import Answer, beats_the_catalogue, find_laws
 
     point, model = search.point, search.problem.model
-    found = levels(search.nominal, point, search.least)
+    found = levels(search.nominal, with_floors_noise(search.problem, point, search.active), search.least)
     sizes = estimate(point.information, point.score, search.priors, search.active)
 
     def again(theta: np.ndarray) -> Statistics | None:
@@ -140,7 +140,7 @@ def _overall(
         return result.UNKNOWN, acts_on(point, stuck[0]) or search.problem.model.effects[stuck[0]].block, reasons, every
     if excessive:
         worst = max(excessive, key=lambda level: level.nats)
-        return result.UNKNOWN, worst.block, reasons, _withdrawn(search, {level.block for level in excessive})
+        return result.UNKNOWN, worst.block, reasons, _withdrawn(search, excessive)
     if search.active:
         return result.KNOWN, "", [f"{len(search.active)} named, nothing excessive is left"], set()
     return result.NO_EFFECT, "", [f"no effect exceeds {search.least:.1f} nats, and nothing excessive is left"], set()
@@ -152,17 +152,13 @@ def _excess(level: Level) -> str:
             f"quietest phase ({level.nats:.0f} nats)")  # fmt: skip
 
 
-def _withdrawn(search: "Search", blocks: set[str]) -> set[int]:
+def _withdrawn(search: "Search", excessive: Sequence[Level]) -> set[int]:
     """Names that stand for the unknown effect's wrong form: a chain of them in its block, or one that left it as it was."""
     through = {j: acts_on(search.point, j) for j in search.active}
-    inside = {j for j, block in through.items() if block in blocks}
+    inside = {j for j, block in through.items() if block in {level.block for level in excessive}}
     if len(inside) > CHAIN:
         return inside
-    eased = {
-        level.block: level.after < 0.5 * level.before
-        for level in levels(search.nominal, search.point, search.least)
-        if level.excessive
-    }
+    eased = {level.block: level.after < 0.5 * level.before for level in excessive}
     return {j for j in inside if not eased.get(through[j], True)}
 
 
