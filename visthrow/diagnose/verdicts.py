@@ -132,7 +132,9 @@ def _overall(
     reasons = [_excess(level) for level in excessive]
     if law is not None:
         reasons.insert(0, said)
-        return result.UNKNOWN, law.terms[0].block, reasons, idle
+        blocks = {term.block for term in law.terms}
+        near = {j for j in search.active if acts_on(point, j) in blocks}  # what is named in its block may be a part of its form
+        return result.UNKNOWN, law.terms[0].block, reasons, idle | near
     stuck = [j for j in search.active if _on_bound(search, j)]
     if stuck:
         names = ", ".join(map(search.name, stuck))
