@@ -144,6 +144,19 @@ def test_levels_do_not_depend_on_where_their_search_starts(bad_window):
     np.testing.assert_allclose(again, value(found), atol=10.0 * noise.ENOUGH_NATS)
 
 
+def test_rounding_of_huge_derivatives_does_not_spoil_the_curvature(fitted):
+    """Columns of 1e5 deviations once took -50 degrees of freedom from three samples, and the levels' step had no solution."""
+    _, _, _, levels, grams = fitted
+    gram, deviation = grams[0], levels.deviation(grams[0], 0)
+    size = len(deviation)
+    largest = np.linalg.eigvalsh(gram.inner[0][:size, :size] * np.outer(deviation, deviation)).max()
+    square = 0.1 * gram.inner[0] / largest
+    weight = levels.scale**-2.0
+    spoilt = replace(gram, inner=np.stack((square / weight[0], -2.0 * square / weight[1])))
+    _, _, curvature = noise._window_likelihood(spoilt, levels, 0)
+    assert np.abs(curvature).max() <= 2.0 * max(gram.count.max(), gram.latents)
+
+
 @pytest.mark.parametrize("spoil", [
     lambda w: replace(w, residual=np.full_like(w.residual, np.nan)), lambda w: replace(w, sigma=np.zeros_like(w.sigma)),
     lambda w: replace(w, channel=w.channel + 2), lambda w: replace(w, time=w.time[:-1]),

@@ -14,7 +14,7 @@ RECORDS = 20
 """Recordings a control period: one a millisecond."""
 GUST_TIME = 0.3
 """Correlation time of gusts [s]."""
-STEPS = {"rod": 5e-4, "string": 2.5e-4}
+STEPS = {"rod": 5e-4, "string": 1.25e-4}
 """Largest integration step of each plant [s]."""
 
 

@@ -285,7 +285,8 @@ def _window_likelihood(gram: Gram, noise: Noise, window: int) -> tuple[float, np
     second *= level[:, None]
     weight, size = noise.scale**-2.0, len(level)
     left = gram.square - 2.0 * gram.cross[:, :size] @ (level * state.mean) + gram.hidden @ second.ravel()
-    taken = weight * (gram.hidden @ scaled.ravel())  # degrees of freedom that the columns take from each channel
+    # Degrees of freedom that the columns take from each channel; rounding of huge derivatives is kept from taking others.
+    taken = np.clip(weight * (gram.hidden @ scaled.ravel()), 0.0, gram.count)
     member = gram.latent_block[:, None] == np.arange(blocks)
     squared = state.covariance[n:] ** 2
     known = np.eye(size)[n:, n:] - state.covariance[n:, n:]
