@@ -177,3 +177,13 @@ def test_a_model_without_latent_forces_works():
     levels, grams = noise.fit([window], [marginal.gram_of(window, np.ones(2), 1)])
     part = marginal.window_statistics(grams[0], levels, 0)
     assert np.linalg.solve(part.information, part.score) == pytest.approx([0.3, 0.0], abs=0.05)
+
+
+def test_rounding_leaves_no_negative_information(fitted):
+    """Two effects that are one but for rounding: a wide prior would turn the negative eigenvalue into evidence."""
+    *_, levels, grams = fitted
+    part = marginal.window_statistics(grams[0], levels, 0)
+    nearly = np.array([[1.0, 1.0 + 1e-7], [1.0 + 1e-7, 1.0]])
+    statistics = marginal.gather(grams[:1], [replace(part, information=1e6 * nearly, score=np.zeros(2))], np.zeros(2))
+    assert np.linalg.eigvalsh(1e6 * nearly).min() < 0.0
+    assert np.linalg.eigvalsh(statistics.information.sum(0)).min() >= 0.0

@@ -287,3 +287,24 @@ def test_evidence_is_the_integral():
 
     assert evidence.log_evidence(information, score, priors, []) == pytest.approx(integral(evidence.SPIKE, -6, 6), abs=1e-6)
     assert evidence.log_evidence(information, score, priors, [0]) == pytest.approx(integral(6.0, -1.0, 9.0), abs=1e-6)
+
+
+def test_a_window_that_no_force_explains_is_left_out():
+    rng = np.random.default_rng(0)
+
+    def spoil(model, window):
+        if window is not model._windows[3]:
+            return window
+        return replace(window, residual=window.residual + 10.0 * window.sigma * rng.standard_normal(len(window.sigma)))
+
+    model = altered(spoil, truth={"effect_03": 10.0}, seed=4)
+    diagnosis = search.explain(model, laws=False)
+    assert diagnosis.windows == len(model.windows({})) - 1
+    assert tuple(diagnosis.theta) == ("effect_03",)
+
+
+def test_a_candidate_that_cannot_stand_does_not_end_the_search(monkeypatch):
+    sure = search.Search._sure
+    monkeypatch.setattr(search.Search, "_sure", lambda self, point, j: self.name(j) != "effect_03" and sure(self, point, j))
+    diagnosis = search.explain(world(truth={"effect_03": 12.0, "effect_07": 8.0}, seed=4), laws=False)
+    assert [step.named for step in diagnosis.steps][:1] == ["effect_07"]

@@ -7,7 +7,7 @@ import pytest
 
 from tests.flown import fly, setting_with
 from tests.plants import paper_plant
-from visthrow.diagnose import throw_model
+from visthrow.diagnose import linearising, throw_model
 from visthrow.diagnose.linearising import exact
 from visthrow.diagnose.replay import rough_step
 from visthrow.diagnose.throw_model import ThrowModel
@@ -19,6 +19,8 @@ RATE_KEPT = 0.2
 """By which that sway may change the body rates of fitted states [rad/s], rms: 0.07 found, 0.64 if no gust is thought possible."""
 ROUGH = 0.01
 """Of a column's norm, by which one of twice as long steps may differ in a free flight: 0.005 found, for the command delay."""
+EITHER_WAY = 1e-3
+"""Of a steady torque's column, by which pushes to either side may differ."""
 NAMES = ["rope_length", "mass_payload", "cmd_delay", "motor_tau", "com_x", "release_lag", "wind_x", "mocap_delay_quad", "d_filter"]
 
 
@@ -82,3 +84,15 @@ def test_long_steps_stay_stable():
     quick = dataclasses.replace(setting, plant=dataclasses.replace(setting.plant, vehicle=vehicle))
     assert 0.002 < rough_step(quick, 0.002) < 2.0 * 0.0015
     assert rough_step(quick, 0.004) == pytest.approx(0.004)  # never below the nominal one
+
+
+def test_derivatives_by_latent_torques_hold_either_way(logs, monkeypatch):
+    """A steady torque is controlled away; what a long step's second order leaves would look alike for all axes."""
+    model = ThrowModel(logs, paper_plant(), only=["rope_length"])
+    there = model.windows({})
+    monkeypatch.setattr(linearising, "LATENT_SIZES", tuple(-size for size in linearising.LATENT_SIZES))
+    for a, b in zip(there, model.windows({})):
+        for axis in range(3):
+            of = (a.latent_block == 1) & (a.latent_axis == axis)
+            steady, other = a.latent[:, of].sum(1), b.latent[:, of].sum(1)
+            assert np.linalg.norm(steady - other) < EITHER_WAY * np.linalg.norm(steady)

@@ -365,6 +365,5 @@ def gather(
     if lowest < -1e-5:
         raise DiagnoseError(f"information has the eigenvalue {lowest:.1e} relative to its diagonal; the derivatives are broken")
     if lowest < 0.0:  # rounding, which wide priors of several named effects would turn into evidence
-        spread = np.sqrt(np.maximum(np.diagonal(information.sum(0)), 1e-300))
-        information += (-2.0 * lowest / len(flights)) * np.diag(spread**2)
+        information += (-2.0 * lowest / len(flights)) * np.diag(scale**-2.0)
     return Statistics(np.array(flights), information, score, square, samples, np.array(theta, dtype=float))

@@ -100,17 +100,14 @@ def fit(windows: Sequence[Window], grams: Sequence[Gram], start: Noise | None = 
     if not any(gram.latents for gram in grams):
         times = times[:1]
     bare = [without_effects(gram) for gram in grams]
-    best: tuple[float, Noise] | None = None
+    best: tuple[float, Noise, list[Gram]] | None = None
     for time in times:
         shaped = each(lambda w: correlated(bare[w], windows[w], time), range(len(bare)))  # noqa: B023  waits for the result
         noise = start or (best[1] if best else _first_guess(shaped))
         noise, value = _maximise(shaped, replace(noise, correlation_time=time), ROUGHLY_NATS if len(times) > 1 else ENOUGH_NATS)
         if best is None or value > best[0]:
-            best = value, noise
-    noise = best[1]
-    if len(times) > 1:
-        shaped = each(lambda w: correlated(bare[w], windows[w], noise.correlation_time), range(len(bare)))
-        noise, _ = _maximise(shaped, noise)
+            best = value, noise, shaped
+    noise = best[1] if len(times) == 1 else _maximise(best[2], best[1])[0]
     return noise, each(lambda w: correlated(grams[w], windows[w], noise.correlation_time), range(len(grams)))
 
 

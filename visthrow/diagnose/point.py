@@ -169,9 +169,7 @@ def with_all_effects_noise(problem: Problem, point: Point) -> Point:
     A large missing effect is taken for noise as long as it is not named; these levels show what may be hidden under it.
     """
     visible = np.flatnonzero(problem.priors.visible)
-    change = estimate(point.information, point.score, problem.priors, visible) - point.theta
-    noise = levels.refit([shifted(gram, change) for gram in point.grams], point.noise)
-    return _point(point.theta, point.windows, point.raw, point.grams, noise)
+    return _with_noise_at(point, estimate(point.information, point.score, problem.priors, visible))
 
 
 def with_floors_noise(problem: Problem, point: Point, active: Sequence[int]) -> Point:
@@ -179,8 +177,12 @@ def with_floors_noise(problem: Problem, point: Point, active: Sequence[int]) -> 
 
     What a dozen effects below their floors leave is no gust, but it is nothing that is missing either.
     """
-    change = covariance(point.information, problem.priors.deviation(list(active))) @ point.score - point.theta
-    noise = levels.refit([shifted(gram, change) for gram in point.grams], point.noise)
+    return _with_noise_at(point, covariance(point.information, problem.priors.deviation(list(active))) @ point.score)
+
+
+def _with_noise_at(point: Point, theta: np.ndarray) -> Point:
+    """The same with noise levels estimated from the residuals that it would have at ``theta``."""
+    noise = levels.refit([shifted(gram, theta - point.theta) for gram in point.grams], point.noise)
     return _point(point.theta, point.windows, point.raw, point.grams, noise)
 
 
