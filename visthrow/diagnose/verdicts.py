@@ -185,7 +185,7 @@ def _finding(search: "Search", point: Point, j: int, active: list[int], spread: 
     wide = _wide(point, priors, j, active)
     mean, sd = (value * effect.floor for value in wide)
     own = float(np.hypot(sd, OWN_FLOOR * effect.floor))
-    low, high = (float(np.clip(mean + side * NORMAL_95 * own, *effect.bounds)) for side in (-1.0, 1.0))
+    low, high = (float(np.clip(mean + side * NORMAL_95 * own, *effect.bounds)) + 0.0 for side in (-1.0, 1.0))  # no -0
     gain = _worth(point, priors, j, active)
     blank = replace(blank, sd=own, low=low, high=high, nats=gain)
     if j in withdrawn:
@@ -195,6 +195,9 @@ def _finding(search: "Search", point: Point, j: int, active: list[int], spread: 
         text = f"{effect.name}: these flights say hardly more than was known ({own:.2g} of {effect.prior_sd:.2g} {effect.unit})."
         return replace(blank, verdict=result.NOT_IDENTIFIABLE, sentence=text)
     text = f"{effect.name}: between {low:.3g} and {high:.3g} {effect.unit}, if there at all."
+    if low == high:
+        beyond = "less" if mean < low else "more"
+        text = f"{effect.name}: on its bound of {low:.3g} {effect.unit}; these flights ask for {beyond} than is possible."
     return replace(blank, verdict=result.BOUNDED, sentence=text)
 
 
@@ -232,8 +235,9 @@ def _named(search: "Search", point: Point, blank: Finding, j: int, home: int, pa
         size, sd = _wide(point, priors, j, stead[:-1] if stead[-1] == j else [k for k in stead if k != j])
         variance = sd**2
     sd = float(np.hypot(np.sqrt(variance), OWN_FLOOR)) * floor
-    size = float(np.clip(size, priors.low[j], priors.high[j]) * floor)
-    low, high = max(priors.low[j] * floor, size - NORMAL_95 * sd), min(priors.high[j] * floor, size + NORMAL_95 * sd)
+    size = float(np.clip(size, priors.low[j], priors.high[j]) * floor) + 0.0  # no -0
+    low = max(priors.low[j] * floor, size - NORMAL_95 * sd) + 0.0
+    high = min(priors.high[j] * floor, size + NORMAL_95 * sd) + 0.0
     rest = [k for k in active if k != home]
     nats = _worth(point, priors, j, rest)
     text = f"{size:.3g} ± {sd:.2g} {blank.unit}"
