@@ -197,7 +197,6 @@ def test_an_estimate_stays_within_its_physical_bounds():
     assert diagnosis.overall == result.UNKNOWN  # it pushes on against its bound: the form is another
 
 
-@pytest.mark.slow
 def test_an_interval_that_shrinks_onto_a_bound_is_told_in_words():
     model = world(truth={"effect_03": -5.0}, seed=2)
     model.effects = tuple(replace(e, bounds=(-0.0, 1.0)) if e.name == "effect_03" else e for e in EFFECTS)
@@ -207,6 +206,7 @@ def test_an_interval_that_shrinks_onto_a_bound_is_told_in_words():
     assert found.sentence == "effect_03: on its bound of 0 N; these flights ask for less than is possible."
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_answer():
     one, two = (search.explain(world(truth={"effect_03": 8.0}), seed=5, laws=False) for _ in range(2))
     assert one.theta == two.theta
