@@ -24,6 +24,7 @@ from hil.frames import rotate
 from hil.pose import Pose, Vector
 from hil.sources.logs import LogBody, load_extra, parsing, read_logs
 from hil.sources.mavlink import PAIR_AGE
+from visthrow.damaged import Forward
 
 LOCAL, ATTITUDE, RATE = "vehicle_local_position", "vehicle_attitude", "vehicle_angular_velocity"
 TOPICS = (LOCAL, "vehicle_odometry", "vehicle_visual_odometry", "vehicle_mocap_odometry")
@@ -43,7 +44,7 @@ def read_ulg(path: str | Path, bodies: tuple[LogBody, ...]) -> list[Pose]:
 def _read(path: Path, body: LogBody) -> list[Pose]:
     core = load_extra("pyulog", "logs")
     with parsing(path, "a PX4 log (.ulg)"):
-        log = core.ULog(str(path), [*TOPICS, ATTITUDE, RATE])
+        log = core.ULog(Forward(path.read_bytes()), [*TOPICS, ATTITUDE, RATE])
     topics = {(data.name, data.multi_id): data.data for data in log.data_list}
     data = topics.get((body.message, body.instance))
     if data is None:
@@ -51,7 +52,7 @@ def _read(path: Path, body: LogBody) -> list[Pose]:
         raise SourceError(f"{path}: no {body.message} {body.instance} in this log; of those with poses it has: {names}")
     try:
         with parsing(path, f"fields of {body.message} as PX4 writes them"):
-            return _local(data, topics, body) if body.message == LOCAL else _odometry(data, body)
+            return _local(path, data, topics, body) if body.message == LOCAL else _odometry(data, body)
     except SourceError as error:
         if isinstance(error.__cause__, KeyError):
             raise SourceError(f"{path}: no field {error.__cause__}; {body.message} has {', '.join(sorted(data))}") from None
@@ -94,10 +95,10 @@ def _odometry(data: dict[str, np.ndarray], body: LogBody) -> list[Pose]:
     return poses
 
 
-def _local(data: dict[str, np.ndarray], topics: dict[tuple[str, int], Any], body: LogBody) -> list[Pose]:
+def _local(path: Path, data: dict[str, np.ndarray], topics: dict[tuple[str, int], Any], body: LogBody) -> list[Pose]:
     attitude, rates = topics.get((ATTITUDE, 0)), topics.get((RATE, 0))
     if attitude is None:
-        raise SourceError(f"{LOCAL} gives no attitude, and the log holds no {ATTITUDE}")
+        raise SourceError(f"{path}: {LOCAL} gives no attitude, and the log holds no {ATTITUDE}")
     stamps, arrivals = _times(data)
     pos, vel = _columns(data, "x", "y", "z"), _columns(data, "vx", "vy", "vz")
     turned = _columns(attitude, *(f"q[{i}]" for i in range(4)))

@@ -14,7 +14,7 @@ ONBOARD = ("config", "errors", "observations", "actions", "policy", "pilot", "fl
 """Modules of visthrow that fly on board, and those that these are allowed to rest on."""
 ONBOARD_SUPPORT = (
     "schema", "toml_text", "storage", "logexport", "provenance", "traced", "style",
-    "strip", "rerun_view", "goal_motion",
+    "strip", "rerun_view", "goal_motion", "damaged",
 )  # fmt: skip
 
 MAY_USE = {

@@ -1,6 +1,8 @@
 """Autopilot logs as sources: files written byte by byte, each message that carries a pose, damage and wrong files."""
 
 import math
+import random
+import struct
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from hil.params import HilParams
 from hil.record import lines
 from hil.sources import LogBody, read_bin, read_ulg
 from tests import logfiles as files
+from tests.unit.test_diagnose_fuzz import damaged, dataflash, patience, ulog
 from visthrow import config
 from visthrow.cli import main
 from visthrow.errors import ConfigError
@@ -180,6 +183,46 @@ def test_spoiled_logs_raise_nothing_else(tmp_path):
             except SourceError:
                 told += 1
     assert told > 20, "some are past reading"
+
+
+def test_a_length_that_leads_back_is_no_circle(tmp_path):
+    """A length of 400 where 90 bytes are left: pyulog steps back over them, and over them again."""
+    pytest.importorskip("pyulog")
+    path = tmp_path / "a.ulg"
+    files.write_ulg(path, {("vehicle_visual_odometry", 0): (ODOMETRY, [odometry(i) for i in range(20)])})
+    data = path.read_bytes()
+    first = data.index(b"A\x00\x00\x00vehicle_visual_odometry") - 2  # the end of the definitions
+    path.write_bytes(data[:first] + data[16:first] * 7 + struct.pack("<HB", 400, 0) + bytes(90))
+    with patience(), pytest.raises(SourceError, match=r"a\.ulg: cannot be read: .*leads nowhere.*expected a PX4 log"):
+        read_ulg(path, (LogBody("vehicle", "vehicle_visual_odometry"),))
+
+
+MANY = 300
+READERS = {
+    "a.BIN": (dataflash, read_bin, (LogBody("vehicle", "XKF1"),)),
+    "a.ulg": (ulog, read_ulg, (LogBody("vehicle", "vehicle_local_position"),)),
+}
+"""Kind -> who writes such a log, who reads it, and the bodies in it."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", list(READERS))
+def test_many_damaged_logs_end(name, tmp_path):
+    """Poses, or one error that names the file, and always an end."""
+    pytest.importorskip("pyulog")
+    write, read, bodies = READERS[name]
+    path, chance = tmp_path / name, random.Random(name)
+    write(path)
+    whole, told = path.read_bytes(), []
+    for i in range(MANY):
+        path.write_bytes(damaged(whole, chance) if i else whole)
+        with patience():
+            try:
+                assert read(path, bodies) or i
+            except SourceError as error:
+                told.append(str(error))
+    assert all(name in message for message in told)
+    assert 0 < len(told) < MANY
 
 
 def test_a_topic_without_a_field_says_which(tmp_path):

@@ -7,7 +7,6 @@ import io
 import math
 import os
 import tempfile
-from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from visthrow.damaged import Forward
 from visthrow.diagnose.ingest.mapping import ChannelMap
 from visthrow.diagnose.ingest.table import make_channel
 from visthrow.errors import LogError
@@ -92,33 +92,9 @@ TELEMETRY = (
 )
 
 _STDERR = 2
-MOST_RETURNS = 8
-"""Times that a reader may step back to one and the same byte; one that is led astray by a damaged length does so for ever."""
 
 Messages = dict[str, dict[str, np.ndarray]]
 """Message -> field -> values; ``time`` [s] among the fields."""
-
-
-class _Forward(io.BytesIO):
-    """Bytes of a file for a reader that looks for the next message of a damaged log by stepping back: never in a circle."""
-
-    def __init__(self, data: bytes) -> None:
-        super().__init__(data)
-        self._returns: Counter[int] = Counter()
-
-    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
-        """As of any file.
-
-        Raises:
-            LogError: It leads to a byte that was returned to too often.
-        """
-        before = self.tell()
-        after = super().seek(offset, whence)
-        if after < before:
-            self._returns[after] += 1
-            if self._returns[after] > MOST_RETURNS:
-                raise LogError(f"the length of a message leads nowhere, near byte {after}")
-        return after
 
 
 def log_of_ulog(path: str | Path) -> FlightLog:
@@ -134,7 +110,7 @@ def log_of_ulog(path: str | Path) -> FlightLog:
     _expect_file(path)
     try:
         with _quietly():
-            read = ULog(_Forward(Path(path).read_bytes()), list({tap.message for tap in ULOG}))
+            read = ULog(Forward(Path(path).read_bytes()), list({tap.message for tap in ULOG}))
     except Exception as error:  # pyulog has no errors of its own: struct, TypeError, IndexError, UnicodeDecodeError
         raise LogError(f"{path}: cannot be read: {error!r}; expected a ULog file") from error
     messages: Messages = {}
