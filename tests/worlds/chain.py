@@ -35,26 +35,52 @@ def inner(b: Body, of: Body):
 
 
 @wp.kernel(module="unique", enable_backward=False)
-def midpoint(
-    numbers: wp.array(dtype=Numbers), bodies: wp.array(dtype=Body), middle: wp.array(dtype=Body),
-    commands: wp.array(dtype=V4), push: wp.array(dtype=V3), twist: wp.array(dtype=V3), ball_v: wp.array(dtype=V3),
-    h: REAL, last: wp.int32, force: wp.array(dtype=V3), torque: wp.array(dtype=V3), on_ball: wp.array(dtype=V3),
+def ahead(
+    numbers: wp.array(dtype=Numbers), bodies: wp.array(dtype=Body), middle: wp.array(dtype=Body), before: wp.array(dtype=Body),
+    commands: wp.array(dtype=V4), push: wp.array(dtype=V3), twist: wp.array(dtype=V3), ball_v: wp.array(dtype=V3), h: REAL,
+    force: wp.array(dtype=V3), torque: wp.array(dtype=V3), on_ball: wp.array(dtype=V3),
 ):  # fmt: skip
-    """Wrench half a step ahead (``last`` 0), or the inner states over the whole step by their rate there (``last`` 1)."""
+    """Wrench half a step ahead, in the body frame: turning and moving as over the last step, actuators by their own rates."""
     i = wp.tid()
     p, b = numbers[i], bodies[i]
-    if last == 0:
-        _f, _t, _thrust, d0 = vehicle_load(p, b, commands[i], V3(), V3())
-        middle[i] = inner(middle[i], along(b, d0, REAL(0.5) * h))
-    m = middle[i]
-    f, t, thrust, d = vehicle_load(p, m, commands[i], push[i], twist[i])
-    if last == 0:
-        rot = rotation(m.q)
-        force[i] = wp.transpose(rot) * f
-        torque[i] = t
-        on_ball[i] = ball_force(p, ball_v[i], rot, thrust, 1)
-    else:
-        bodies[i] = inner(b, along(b, d, h))
+    m = inner(b, b)
+    m.v = b.v + REAL(0.5) * (b.v - before[i].v)
+    m.w = b.w + REAL(0.5) * (b.w - before[i].w)
+    m.x = b.x + REAL(0.5) * h * b.v
+    axis, turn = V3(b.q[1], b.q[2], b.q[3]), REAL(0.25) * h * m.w
+    side = axis + b.q[0] * turn + wp.cross(axis, turn)
+    m.q = wp.normalize(V4(b.q[0] - wp.dot(axis, turn), side[0], side[1], side[2]))
+    before[i] = b
+    _f, _t, _thrust, rates = vehicle_load(p, b, commands[i], V3(), V3())
+    m = inner(m, along(b, rates, REAL(0.5) * h))
+    middle[i] = m
+    f, t, thrust, _rates = vehicle_load(p, m, commands[i], push[i], twist[i])
+    rot = rotation(m.q)
+    force[i] = wp.transpose(rot) * f
+    torque[i] = t
+    on_ball[i] = ball_force(p, ball_v[i], rot, thrust, 1)
+
+
+@wp.kernel(module="unique", enable_backward=False)
+def behind(
+    numbers: wp.array(dtype=Numbers), bodies: wp.array(dtype=Body), middle: wp.array(dtype=Body), before: wp.array(dtype=Body),
+    commands: wp.array(dtype=V4), push: wp.array(dtype=V3), twist: wp.array(dtype=V3), hanging: wp.array(dtype=wp.bool), h: REAL,
+):  # fmt: skip
+    """From the frame's origin to the centre of mass, and the inner states over the whole step by their rates half-way."""
+    i = wp.tid()
+    p, was = numbers[i], before[i]
+    b, m = inner(bodies[i], bodies[i]), inner(bodies[i], middle[i])
+    if hanging[i]:
+        rot = rotation(b.q)
+        b.x += rot * p.com
+        b.v += rot * wp.cross(b.w, p.com)
+    m.x = REAL(0.5) * (was.x + b.x)
+    m.v = REAL(0.5) * (was.v + b.v)
+    m.w = REAL(0.5) * (was.w + b.w)
+    m.q = REAL(0.5) * (was.q + b.q)
+    middle[i] = m
+    _f, _t, _thrust, rates = vehicle_load(p, m, commands[i], push[i], twist[i])
+    bodies[i] = inner(b, along(b, rates, h))
 
 
 def model_of(w) -> mujoco.MjModel:
@@ -98,23 +124,26 @@ class Chain:
         cache, count = {}, len(worlds)
         self.models = [cache.setdefault(repr(vars(w)), model_of(w)) for w in worlds]
         self.data = [mujoco.MjData(m) for m in self.models]
-        self.worlds, self._com = worlds, np.array([w.com for w in worlds])
+        self.worlds = worlds
         self.site = [m.site("ball").id for m in self.models]
         self.rod = [m.body(f"rod{SEGMENTS - 1}").id for m in self.models]
         self._drag = np.array([w.rope_drag for w in worlds])
-        # Arrays of the kernel, and views of them: on the CPU both are the same memory.
-        shared = {"bodies": Body, "middle": Body, "commands": V4, "push": V3, "twist": V3, "ball_v": V3}
-        arrays = {k: wp.zeros(count, dtype=d) for k, d in (shared | {"force": V3, "torque": V3, "on_ball": V3}).items()}
-        self._in = [numbers] + [arrays[k] for k in shared]
-        self._out = [arrays[k] for k in ("force", "torque", "on_ball")]
+        # Arrays of the kernels, and views of them: on the CPU both are the same memory.
+        kinds = {"bodies": Body, "middle": Body, "before": Body, "commands": V4} | dict.fromkeys(
+            ("push", "twist", "ball_v", "force", "torque", "on_ball"), V3
+        )
+        arrays = {k: wp.zeros(count, dtype=d) for k, d in kinds.items()} | {"hanging": wp.full(count, True, dtype=wp.bool)}
+        state = [numbers, *(arrays[k] for k in ("bodies", "middle", "before", "commands", "push", "twist"))]
+        loads = [arrays[k] for k in ("force", "torque", "on_ball")]
+        self._ahead = wp.launch(ahead, count, [*state, arrays["ball_v"], 0.0, *loads], record_cmd=True)
+        self._behind = wp.launch(behind, count, [*state, arrays["hanging"], 0.0], record_cmd=True)
         self._view = {k: v.numpy() for k, v in arrays.items()}
-        self.bodies, self.ball_v = self._view["bodies"], self._view["ball_v"]
+        self.bodies, self.ball_v, self.hanging = self._view["bodies"], self._view["ball_v"], self._view["hanging"]
         self.bodies[:] = bodies
         self._view["middle"][:] = bodies
-        for d, b, com in zip(self.data, self.bodies, self._com):
-            d.qpos[:3], d.qpos[3:7] = b["x"] - com, b["q"]
-        self._before = self.bodies.copy()
-        self.hanging = np.ones(count, dtype=bool)
+        for d, b, w in zip(self.data, self.bodies, worlds):
+            d.qpos[:3], d.qpos[3:7] = b["x"] - w.com, b["q"]
+        self._view["before"][:] = self.bodies
         self.ball_x = np.zeros((count, 3))
         self.tension = np.array([9.81 * (w.ball_mass + w.rope_mass) for w in worlds])
         self._seen = 0.0
@@ -148,7 +177,7 @@ class Chain:
             return
         count = max(1, int(np.ceil((stop - start) / self._step(lanes) - 1e-9)))
         h = (stop - start) / count
-        v, b, m = self._view, self.bodies, self._view["middle"]
+        v, b = self._view, self.bodies
         v["commands"][:], v["push"][:], v["twist"][:] = commands, push, twist
         loads = ball.copy()
         for e in lanes:
@@ -157,35 +186,20 @@ class Chain:
                 n = self.ball_x[e] - self.data[e].xpos[self.rod[e]]
                 n /= np.linalg.norm(n)
                 loads[e] -= self._drag[e] * (self.ball_v[e] - n * (n @ self.ball_v[e]))
+        self._ahead.set_param_by_name("h", h)
+        self._behind.set_param_by_name("h", h)
+        x, q, speed, rate = b["x"], b["q"], b["v"], b["w"]
         for _ in range(count):
-            # Half a step ahead: turning and moving as over the last step, actuators by their own rates.
-            m["v"] = b["v"] + 0.5 * (b["v"] - self._before["v"])
-            m["w"] = b["w"] + 0.5 * (b["w"] - self._before["w"])
-            m["x"] = b["x"] + 0.5 * h * b["v"]
-            q, r = b["q"], 0.25 * h * m["w"]
-            m["q"][:, 0] = q[:, 0] - (q[:, 1:] * r).sum(1)
-            m["q"][:, 1:] = q[:, 1:] + q[:, :1] * r + np.cross(q[:, 1:], r)
-            m["q"] /= np.linalg.norm(m["q"], axis=1, keepdims=True)
-            self._before = b.copy()
-            wp.launch(midpoint, len(b), [*self._in, h, 0, *self._out])
+            self._ahead.launch()
             on_ball = v["on_ball"] + loads
             for e in lanes:
-                d = self.data[e]
+                d, rod = self.data[e], self.rod[e]
                 d.ctrl[:3], d.ctrl[3:] = v["force"][e], v["torque"][e]
-                d.xfrc_applied[self.rod[e], :3] = on_ball[e]
                 # MuJoCo applies it at the rod's centre of mass; the couple moves it to the ball's centre.
-                d.xfrc_applied[self.rod[e], 3:] = np.cross(self.ball_x[e] - d.xipos[self.rod[e]], on_ball[e])
+                (a0, a1, a2), (f0, f1, f2) = (self.ball_x[e] - d.xipos[rod]).tolist(), on_ball[e].tolist()
+                d.xfrc_applied[rod] = f0, f1, f2, a1 * f2 - a2 * f1, a2 * f0 - a0 * f2, a0 * f1 - a1 * f0
                 mujoco.mj_step(self.models[e], d)
-                b["x"][e], b["q"][e], b["v"][e], b["w"][e] = d.qpos[:3], d.qpos[3:7], d.qvel[:3], d.qvel[3:6]
-            if self._com.any():
-                q, c = b["q"], self._com
-                side = 2 * np.cross(q[:, 1:], c)
-                b["x"][lanes] += (c + q[:, :1] * side + np.cross(q[:, 1:], side))[lanes]
-                c = np.cross(b["w"], c)
-                side = 2 * np.cross(q[:, 1:], c)
-                b["v"][lanes] += (c + q[:, :1] * side + np.cross(q[:, 1:], side))[lanes]
-            for name in ("x", "v", "w", "q"):
-                m[name] = 0.5 * (self._before[name] + b[name])
-            wp.launch(midpoint, len(b), [*self._in, h, 1, *self._out])
+                x[e], q[e], speed[e], rate[e] = d.qpos[:3], d.qpos[3:7], d.qvel[:3], d.qvel[3:6]
+            self._behind.launch()
         if any(self.data[e].warning.number.any() for e in lanes):
             raise RuntimeError(f"MuJoCo's chain became unstable at {stop:.4f} s with a pull of {self.tension[lanes].max():.1f} N")
