@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
-from visthrow.diagnose import blind, forms, gain, manoeuvres, measures, plan, point, report, result, search
+from visthrow.diagnose import blackbox, blind, forms, gain, manoeuvres, measures, plan, point, report, result, search
 from visthrow.diagnose.landing import Landings
 from visthrow.errors import DiagnoseError
 from visthrow.storage import write_json
@@ -126,6 +126,57 @@ def test_prediction_does_not_look_at_what_it_predicts(found):
                      for column in (window.residual, window.residual + late))  # fmt: skip
     np.testing.assert_allclose(spoilt[~late], plain[~late])
     np.testing.assert_allclose((spoilt - plain)[late, 0], 1.0 / window.sigma[late])
+
+
+class Means(SyntheticModel):
+    """Windows of one instant and without an initial state, as means of slow flight are."""
+
+    def __post_init__(self):
+        super().__post_init__()
+        self._windows = [self._mean(w) for w in self._windows]
+
+    def _mean(self, window):
+        at = np.flatnonzero(window.time == window.time[20])
+        cut = {name: getattr(window, name)[at] for name in ("time", "channel", "sigma", "effects", "latent")}
+        seen = self._answer(cut["effects"], self.truth) + cut["sigma"] * self._draw.normal(size=len(at))
+        return replace(window, **cut, residual=seen, nuisance=np.zeros((len(at), 0)), nuisance_sd=np.zeros(0))
+
+
+def test_windows_without_states_are_predicted_whole(found):
+    """Nothing is fitted in their head, so nothing of them is left out of the prediction."""
+    point = found[1].work.after
+    window = point.windows[0]
+    bare = replace(window, nuisance=np.zeros((len(window.time), 0)), nuisance_sd=np.zeros(0))
+    left, expected, horizon = forms._predicted(bare, point.noise, window.residual[:, None])
+    np.testing.assert_allclose(left[:, 0], window.residual / window.sigma)
+    np.testing.assert_allclose(expected, point.noise.scale[window.channel] ** 2)
+    assert horizon.min() == 0
+    assert (horizon >= 0).all()
+
+
+def test_means_of_windows_have_a_gain_too(tmp_path):
+    model = Means(effects=EFFECTS, truth={"effect_05": 40.0}, throws=8, free=4, seed=2)
+    diagnosis = search.explain(model, laws=False)
+    assert diagnosis.named == ("effect_05",)
+    measured = gain.measure(diagnosis, draws=500)
+    assert measured.whole
+    assert measured["pos_w"].gain > 0.5
+    assert [row[0] for row in measured["pos_w"].horizons] == [forms.HORIZONS[0]]
+    section = next(s for s in report.sections(diagnosis, measured) if s.name == "gain")
+    assert len(section.parts) == 1  # no curve over a horizon that is none
+    assert "whole windows" in section.parts[0].note
+
+
+def test_no_black_box_where_no_latent_force_acts(found):
+    point = found[1].work.before
+    assert blackbox.table_of(point, np.random.default_rng(0)) is not None
+    still = replace(point, noise=replace(point.noise, latent_sd={}))
+    assert blackbox.table_of(still, np.random.default_rng(0)) is None
+
+
+@pytest.mark.parametrize(("share", "text"), [(-1e-6, "0"), (0.0, "0"), (-0.0, "0"), (0.496, "50"), (-0.02, "-2")])
+def test_nothing_has_no_sign(share, text):
+    assert report.percent(share) == text
 
 
 @pytest.mark.slow

@@ -67,7 +67,7 @@ class Table:
 
 
 def table_of(point: Point, rng: np.random.Generator) -> Table | None:
-    """Choose the basis from the states that were flown; None where the windows carry no knots or no latent forces."""
+    """Choose the basis from the states that were flown; None where windows carry no knots, or no latent force acts."""
     if not all("time" in w.knots and w.latent.size for w in point.windows):
         return None
     inputs = np.vstack([_inputs(w) for w in point.windows])
@@ -76,6 +76,8 @@ def table_of(point: Point, rng: np.random.Generator) -> Table | None:
     mean, deviation = inputs.mean(0), np.maximum(inputs.std(0), 1e-9)
     chosen = rng.choice(len(inputs), size=min(CENTRES, len(inputs)), replace=False)
     blocks = tuple(LATENT_BLOCKS[b] for b in sorted({b for b, _ in point.noise.latent_sd}))
+    if not blocks:
+        return None
     return Table(mean, deviation, ((inputs - mean) / deviation)[chosen], blocks)
 
 

@@ -1,6 +1,7 @@
 """Prediction errors as quadratic forms of the effects' sizes, so that any sizes are scored without simulating again.
 
 Within a window the initial state is fitted to the first HEAD seconds; what follows is predicted and compared at rising horizons.
+A window without an initial state (means, a motor's stand, a camera's view) has nothing to fit, and is predicted whole.
 Both steps are linear in the residuals, hence the squared error of any linear combination of residual columns is a quadratic form.
 """
 
@@ -76,8 +77,9 @@ def _predicted(window: Window, noise: Noise, column: np.ndarray) -> tuple[np.nda
     states = window.nuisance * window.nuisance_sd / sigma[:, None]
     column = column / sigma[:, None]
     begin, length = window.time.min(), np.ptp(window.time)
-    ahead = window.time - begin - min(HEAD * length, HEAD_SECONDS)
-    head = ahead <= 0.0
+    fits = states.shape[1] > 0
+    ahead = window.time - begin - (min(HEAD * length, HEAD_SECONDS) if fits else 0.0)
+    head = (ahead <= 0.0) & fits
     normal = (states[head] / scale[head, None] ** 2).T @ states[head] + np.eye(states.shape[1])
     spread = np.linalg.inv(normal)
     fitted = spread @ ((states[head] / scale[head, None] ** 2).T @ column[head])

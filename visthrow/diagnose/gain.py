@@ -61,6 +61,7 @@ class Gain:
     folds: int = 0
     left_out: str = "flights"  # or "parts of flights"
     landing: LandingGain | None = None  # where the model has throws whose landing was seen
+    whole: bool = False  # windows have no initial state that would have to be fitted first, and are predicted from end to end
 
     def __getitem__(self, channel: str) -> ChannelGain:
         return next(c for c in self.channels if c.channel == channel)
@@ -113,7 +114,8 @@ def measure(diagnosis: Diagnosis, *, seed: int = 0, draws: int = DRAWS) -> Gain:
     sizes = (after.theta - combination[:, 1:]) if left_out == "flights" and diagnosis.theta else ()
     trained = {int(f): work.problem.sizes(size) for f, size in zip(own.groups, sizes)}
     landing = landing_gain(work, diagnosis.theta, trained, seed)
-    return Gain(gains, nats, shares, len(folds), left_out, landing)
+    whole = all(w.nuisance.shape[1] == 0 for w in after.windows)
+    return Gain(gains, nats, shares, len(folds), left_out, landing, whole)
 
 
 def shortfalls(model: Model, sizes: Sequence[Mapping[str, float]]) -> tuple[list[float], int]:

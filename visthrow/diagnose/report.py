@@ -46,8 +46,15 @@ def summary(diagnosis: Diagnosis, gain: Gain | None = None) -> str:
 
 
 def _gain_line(c) -> str:
-    return (f"held-out error of {c.channel}: {c.before:.3g} -> {c.after:.3g} {c.unit}, {100 * c.gain:.0f} % less "
-            f"[{100 * c.low:.0f}, {100 * c.high:.0f}]; noise alone {c.floor:.3g}, black box {c.blackbox:.3g}")  # fmt: skip
+    box = "" if np.isnan(c.blackbox) else f", black box {c.blackbox:.3g}"
+    errors = f"{c.before:.3g} -> {c.after:.3g} {c.unit}".rstrip()
+    return (f"held-out error of {c.channel}: {errors}, {percent(c.gain)} % less "
+            f"[{percent(c.low)}, {percent(c.high)}]; noise alone {c.floor:.3g}{box}")  # fmt: skip
+
+
+def percent(share: float, digits: int = 0) -> str:
+    """A share in per cent, without sign where it is nothing."""
+    return f"{round(100 * share, digits) + 0.0:.{digits}f}"
 
 
 def landing_sentence(landing: LandingGain) -> str:
@@ -165,19 +172,23 @@ def _next(finding: Finding) -> str:
 
 
 def _gain(gain: Gain, diagnosis: Diagnosis) -> Section:
+    title = "Gain on flights that were not used"
     rows = tuple(
-        (c.channel, c.unit, f"{c.before:.3g}", f"{c.after:.3g}", f"{100 * c.gain:.1f} % [{100 * c.low:.0f}, {100 * c.high:.0f}]",
+        (c.channel, c.unit, f"{c.before:.3g}", f"{c.after:.3g}", f"{percent(c.gain, 1)} % [{percent(c.low)}, {percent(c.high)}]",
          f"{c.floor:.3g}", "-" if np.isnan(c.blackbox) else f"{c.blackbox:.3g}", "worse" if c.harmed else "")
         for c in gain.channels
     )  # fmt: skip
     named = ", ".join(f"{name} in {100 * share:.0f} %" for name, share in gain.named_in.items()) or "nothing in any"
-    note = (f"Root mean square errors of predictions from the first {HEAD_SECONDS:g} s of each window, {gain.left_out} "
-            f"left out in {gain.folds} folds, the selection repeated in each ({named}). Interval: 95 %, bootstrap over flights. "
+    of = "whole windows" if gain.whole else f"predictions from the first {HEAD_SECONDS:g} s of each window"
+    note = (f"Root mean square errors of {of}, {gain.left_out} left out in {gain.folds} folds, the selection repeated in each "
+            f"({named}). Interval: 95 %, bootstrap over flights. "
             f"Log-likelihood: {gain.nats_per_sample:+.3f} nats a sample.")  # fmt: skip
     header = ("channel", "unit", "as it stands", "with what was named", "less", "noise alone", "black box", "")
-    parts = (Grid("Held-out prediction error", header, rows, note),
-             Picture("horizons", pictures.horizons(gain), "Error over the horizon of the prediction."))  # fmt: skip
-    return Section("gain", "Gain on flights that were not used", parts)
+    grid = Grid("Held-out prediction error", header, rows, note)
+    if all(len(c.horizons) < 2 for c in gain.channels):
+        return Section("gain", title, (grid,))
+    caption = "Error over the time in the window." if gain.whole else "Error over the horizon of the prediction."
+    return Section("gain", title, (grid, Picture("horizons", pictures.horizons(gain), caption)))
 
 
 def _alternatives(diagnosis: Diagnosis) -> tuple[Grid, ...]:
