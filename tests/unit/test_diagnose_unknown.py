@@ -1,5 +1,7 @@
 """Laws outside the catalogue: terms with units, found and told from names; tables where no formula is asked for."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -109,6 +111,29 @@ def test_a_law_beside_a_known_cause_leaves_the_cause_its_name():
     assert first.interval[0] < 0.01 < first.interval[1]
     formulas = [law.formula for law in diagnosis.laws]
     assert len(set(formulas)) == len(formulas)
+
+
+def with_a_name_for_the_law(most: float) -> SyntheticModel:
+    """A hidden drag of 0.02, and an effect of the very same form that is unusual beyond 0.005 and cannot exceed ``most``."""
+    model = SyntheticModel(effects=EFFECTS, law="speed", law_size=0.02, seed=3)
+    model.effects = (EFFECTS[0], replace(EFFECTS[1], floor=1e-3, prior_sd=3e-3, bounds=(-0.1, most)), *EFFECTS[2:])
+    for w in model._windows:
+        w.effects[:, 1] = w.latent @ model._law(w.knots) / model.law_size
+    return model
+
+
+def test_a_law_takes_no_name_away_that_says_the_same():
+    """The name is far larger than usual and close to its bound, which costs it nats that the nameless term does not pay."""
+    diagnosis = search.explain(with_a_name_for_the_law(0.0198))
+    assert diagnosis.overall == result.KNOWN
+    assert diagnosis.named == ("effect_01",)
+    assert diagnosis["effect_01"].estimate == pytest.approx(0.02, abs=1e-3)
+
+
+def test_a_name_that_would_have_to_exceed_its_bound_stays_none():
+    diagnosis = search.explain(with_a_name_for_the_law(0.01))
+    assert diagnosis.overall == result.UNKNOWN
+    assert not diagnosis.named
 
 
 def test_known_causes_and_gusts_are_no_laws():

@@ -45,6 +45,9 @@ ROUGHER = 2.0
 FORM = 1.0
 """Share of a term by which flights may differ: at knots a tenth of a second apart a law of the thrust's slope is a rough one."""
 
+ANY_SIZE = 1e3
+"""Prior deviation of a name of any size, in its usual one."""
+
 REMAINDER = 0.05
 """Share of a term's evidence below which a name beside it is what the term's form, weighed without a simulation, leaves over."""
 
@@ -349,6 +352,8 @@ def beats_the_catalogue(search: "Search", answer: Answer) -> tuple[Hypothesis | 
     """
     for best in answer.strongest:
         withdrawn = set(search.active) - set(best.names)
+        if len(withdrawn) == 1 and beyond(best, *withdrawn) < MARGIN:
+            continue
         if withdrawn:
             ahead = best.net(search.least) - _catalogue(search, best)
             if ahead > MARGIN:
@@ -367,6 +372,21 @@ def _catalogue(search: "Search", hypothesis: Hypothesis) -> float:
     own = search.point.evidence(search.priors, search.active)
     there = hypothesis.point.evidence(hypothesis.priors, search.active)
     return max(own, there) - search.least * len(search.active)
+
+
+def beyond(hypothesis: Hypothesis, j: int) -> float:
+    """Nats that the last term explains and a name, whatever its size, does not; none where both are the same form.
+
+    A term has neither bounds nor a usual size. It must not take the place of a name that says the same only because the name lies
+    at its bound, or is larger than was expected.
+    """
+    last = len(hypothesis.priors.floor) - 1
+    deviation = hypothesis.priors.deviation([k for k in hypothesis.active if k != last])
+    deviation[[j, last]] = ANY_SIZE * hypothesis.priors.slab[j], 0.0
+    information, score = hypothesis.point.information, hypothesis.point.score
+    known = covariance(information, deviation) @ np.column_stack((information[:, last], score))
+    own, left = information[last, last] - information[last] @ known[:, 0], score[last] - information[last] @ known[:, 1]
+    return float(0.5 * left**2 / max(own, 1e-300))
 
 
 def _names(search: "Search") -> str:
