@@ -2,14 +2,29 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
-from visthrow.diagnose import blackbox, blind, forms, gain, manoeuvres, measures, plan, point, report, result, search
+from visthrow.diagnose import (
+    blackbox,
+    blind,
+    fly_manoeuvres,
+    forms,
+    gain,
+    manoeuvres,
+    measures,
+    plan,
+    point,
+    report,
+    result,
+    search,
+)
 from visthrow.diagnose.landing import Landings
 from visthrow.errors import DiagnoseError
+from visthrow.flightlog import Channel, FlightLog
 from visthrow.storage import write_json
 
 EFFECTS = catalogue(12)
@@ -306,6 +321,54 @@ def test_manoeuvres_are_smooth_bounded_and_begin_at_rest(manoeuvre):
     assert np.abs(r.pos_w[:, :2]).max() < 2.6
     assert np.linalg.norm(r.vel_w, axis=1).max() < 5.5
     assert len(r.csv().splitlines()) == 1 + len(r.time)
+
+
+def swung(reference: manoeuvres.Reference, rope: float) -> tuple[float, float]:
+    """Largest angle [deg] of a point pendulum from the axis of a vehicle that follows exactly, and the least tension in weights.
+
+    In the vehicle's frame gravity is g - a, along which the rotors' axis lies: n' = w x n, w' = n x (g - a) / rope.
+    """
+    gravity, parts = np.array([0.0, 0.0, -9.81]), 6
+    rows = int(np.argmax(reference.release)) if reference.release.any() else len(reference.time)
+    felt = gravity - reference.acc_w[:rows]
+    n, w, angle, tension = np.array([0.0, 0.0, -1.0]), np.zeros(3), 0.0, np.inf
+    for a in felt:
+        for _ in range(parts):
+            w = w + manoeuvres.PERIOD / parts * np.cross(n, a) / rope
+            n = n + manoeuvres.PERIOD / parts * np.cross(w, n)
+            n /= np.linalg.norm(n)
+        angle = max(angle, np.degrees(np.arccos(np.clip(n @ a / np.linalg.norm(a), -1.0, 1.0))))
+        tension = min(tension, (rope * w @ w + n @ a) / 9.81)
+    return angle, tension
+
+
+@pytest.mark.parametrize("manoeuvre", [m for m in manoeuvres.catalogue() if m.payload], ids=lambda m: m.name)
+def test_no_manoeuvre_swings_the_payload_near_the_rotors_or_slackens_its_rope(manoeuvre):
+    angle, tension = swung(manoeuvre.reference(), rope=0.38)  # the paper's, with the payload's radius
+    assert angle < 60.0  # a controller that lags adds some
+    assert tension > 0.2
+
+
+def test_a_manoeuvre_in_which_the_payload_swings_too_far_is_not_proposed(monkeypatch):
+    """With the rope level, and the vehicle tilted by a tenth of a turn towards it, the swing is 54 degrees; upright it is 90."""
+
+    def level(turn: float) -> FlightLog:
+        time = np.arange(3) * 0.1
+        there = {"pos_w": np.zeros((3, 3)), "payload_pos_w": np.tile([-0.38, 0.0, 0.0], (3, 1)),
+                 "quat_wb": np.tile([0.0, np.sin(0.5 * turn), 0.0, np.cos(0.5 * turn)], (3, 1))}  # fmt: skip
+        there["payload_pos_w"][2] = [0.0, 0.0, 5.0]  # let go
+        channels = {name: Channel(time, values, "1" if name == "quat_wb" else "m", "world") for name, values in there.items()}
+        return FlightLog(channels | {"release_command": Channel(time, np.array([0.0, 0.0, 1.0]), "1")}, {})
+
+    chosen = [m for m in manoeuvres.catalogue() if m.name in ("circle", "thrust steps")]
+    logs = [level(0.0), level(0.2 * np.pi)]
+    assert [fly_manoeuvres.swing(log) for log in logs] == pytest.approx([90.0, 54.0])
+    monkeypatch.setattr(fly_manoeuvres, "_sensor_noise", lambda _: {})
+    monkeypatch.setattr(fly_manoeuvres, "fly", lambda *_: logs)
+    monkeypatch.setattr(fly_manoeuvres, "entries_for", lambda *_: {})
+    monkeypatch.setattr(fly_manoeuvres, "ThrowModel", lambda *_, **__: "a model")
+    anything = SimpleNamespace(effects=(), setting=SimpleNamespace(plant=None, sensing=None), device="cpu", substep=1.0, theta={})
+    assert fly_manoeuvres.simulator_of(anything, anything)(chosen) == [None, "a model"]
 
 
 def test_the_report_holds_sentences_pictures_and_numbers(tmp_path, found, measured, hidden, degenerate):

@@ -24,12 +24,17 @@ COARSE = 2.0
 AWAY = 1.5
 """Time given to a dropped payload and to the vehicle before a manoeuvre without payload begins [s]."""
 
+HIGHEST = 75.0
+"""Swing of the payload from the rotors' axis [deg] beyond which it nears the rotors, or a string hangs slack."""
+
 TRACKING = HoverParams(max_speed=8.0, max_tilt=0.9, integral_limit=2.0)
 """A controller that follows a moving reference: the hover controller with room for it."""
 
 
 def simulator_of(model: ThrowModel, diagnosis: Diagnosis, *, seed: int = 0) -> Callable[[Sequence[Manoeuvre]], list[Model | None]]:
     """Make the function that :func:`visthrow.diagnose.plan.propose` simulates with.
+
+    A manoeuvre in which this vehicle's payload swings beyond ``HIGHEST`` has no model: it is not to be flown.
 
     Args:
         model: of the flights at hand.
@@ -42,6 +47,9 @@ def simulator_of(model: ThrowModel, diagnosis: Diagnosis, *, seed: int = 0) -> C
     def simulate(manoeuvres: Sequence[Manoeuvre]) -> list[Model | None]:
         models: list[Model | None] = []
         for log, manoeuvre in zip(fly(model, diagnosis.theta, manoeuvres, noise, seed), manoeuvres):
+            if manoeuvre.payload and not swing(log) < HIGHEST:
+                models.append(None)
+                continue
             there = entries_for(model.setting, set(log.channels), manoeuvre.payload, np.isfinite(manoeuvre.release))
             try:
                 models.append(ThrowModel([log], model.setting.plant, sensing=model.setting.sensing, device=model.device,
@@ -52,6 +60,18 @@ def simulator_of(model: ThrowModel, diagnosis: Diagnosis, *, seed: int = 0) -> C
         return models
 
     return simulate
+
+
+def swing(log: FlightLog) -> float:
+    """Largest angle between the rope and the rotors' axis while the payload hangs [deg]; nan where it was not followed."""
+    from scipy.spatial.transform import Rotation
+
+    asked = log["release_command"]
+    held = log["pos_w"].time < np.min(asked.time[asked.values > 0.5], initial=np.inf)
+    hangs = log["payload_pos_w"].values[held] - log["pos_w"].values[held]
+    axis = Rotation.from_quat(log["quat_wb"].values[held]).apply([0.0, 0.0, -1.0])
+    cosine = np.einsum("ni,ni->n", hangs, axis) / np.linalg.norm(hangs, axis=1)
+    return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))).max())
 
 
 def _sensor_noise(diagnosis: Diagnosis) -> dict[str, float]:

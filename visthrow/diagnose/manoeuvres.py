@@ -1,7 +1,7 @@
 """Safe flights that separate causes: references of position, heading and what is added to the commands, 50 times a second.
 
 A pilot or controller follows the position; doublets and thrust steps are added to its commands. Each stays within a box of a few
-metres; :meth:`Reference.limits` says when to abort.
+metres and leaves the payload well below the rotors; :meth:`Reference.limits` says when to abort.
 """
 
 from collections.abc import Callable
@@ -17,6 +17,9 @@ SETTLE = 1.0
 
 HEIGHT = 1.5
 """Of most manoeuvres above the floor [m]: out of ground effect, the payload 1.2 m up."""
+
+RUN = 3.6
+"""Way of a throw from rest to rest [m], released half way: over a shorter one the payload would trail as high as the rotors."""
 
 
 @dataclass(frozen=True)
@@ -127,17 +130,24 @@ def _steps(t: np.ndarray) -> np.ndarray:
 
 
 def _sideways_step(t: np.ndarray) -> np.ndarray:
-    return 0.8 * _rise(t, 0.0, 0.7)
+    return 0.35 * _rise(t, 0.0, 0.8)
+
+
+def _risen(t: np.ndarray, begin: float, length: float) -> np.ndarray:
+    """Integral of :func:`_rise` over time."""
+    s = np.clip((t - begin) / length, 0.0, 1.0)
+    return length * s**4 * (2.5 + s * (-3.0 + s)) + np.maximum(t - begin - length, 0.0)
 
 
 def _stop(t: np.ndarray) -> np.ndarray:
-    """Gather speed over a second, stop within a quarter, come back slowly."""
-    out = 2.0 * _rise(t, 0.0, 1.1) - 2.0 * _rise(t, 3.0, 2.5)
-    return out - 1.0
+    """Gather 1.5 m/s over 1.6 s, stop within 0.3 s, come back slowly: from this speed the rope stays taut."""
+    far = 1.5 * 0.5 * (1.6 + 0.3)
+    there = 1.5 * (_risen(t, 0.0, 1.6) - _risen(t, 1.6, 0.3))
+    return there - far * _rise(t, 3.9, 2.5) - 0.5 * far
 
 
 def _run(speed: float) -> Callable[[np.ndarray], np.ndarray]:
-    return lambda t: 2.4 * _rise(t, 0.0, 2.4 * 1.875 / speed) - 1.2
+    return lambda t: RUN * _rise(t, 0.0, RUN * 1.875 / speed) - 0.5 * RUN
 
 
 def _round(t: np.ndarray) -> np.ndarray:
@@ -151,11 +161,11 @@ def _turns(t: np.ndarray) -> np.ndarray:
 
 def catalogue() -> tuple[Manoeuvre, ...]:
     """All manoeuvres, in the order in which they would be flown on a day."""
-    slow, slow_time = _passes(3.0, (1.0, 1.0, 1.8, 1.8))
-    fast, fast_time = _passes(4.0, (2.2, 2.2, 2.6, 2.6))
+    slow, slow_time = _passes(3.0, (0.8, 0.8, 1.2, 1.2))
+    fast, fast_time = _passes(4.8, (1.6, 1.6, 1.9, 1.9))
     runs = tuple(
         Manoeuvre(f"throw at {speed:.0f} m/s", "when the payload leaves, at several speeds and pulls",
-                  2.8 + 2.4 * 1.875 / speed, _at(x=_run(speed), z=1.7), release=0.5 * 2.4 * 1.875 / speed)
+                  2.8 + RUN * 1.875 / speed, _at(x=_run(speed), z=1.7), release=0.5 * RUN * 1.875 / speed)
         for speed in (2.0, 3.0, 4.0)
     )  # fmt: skip
     return (
@@ -176,6 +186,6 @@ def catalogue() -> tuple[Manoeuvre, ...]:
         Manoeuvre("circle", "drag in all directions, lever arms", 10.0,
                   _at(x=lambda t: np.cos(_round(t)), y=lambda t: np.sin(_round(t)))),
         Manoeuvre("swing and decay", "rope length by period, damping by decay, payload drag", 9.0, _at(x=_sideways_step)),
-        Manoeuvre("stop after speed", "rope mass and bending, payload's second mode, mount", 8.0, _at(x=_stop)),
+        Manoeuvre("stop after speed", "rope mass and bending, payload's second mode, mount", 9.0, _at(x=_stop)),
         *runs,
     )  # fmt: skip
