@@ -4,6 +4,7 @@ import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import warp as wp
@@ -144,9 +145,8 @@ class Replay:
         def launch(first: int, last: int) -> None:
             wp.launch(self.kernel.replay, last - first, [*before, int(first), *after], device="cpu")
 
-        with ThreadPoolExecutor(cores) as pool:
-            for done in [pool.submit(launch, a, b) for a, b in zip(pieces[:-1], pieces[1:])]:
-                done.result()
+        for done in [_pool(cores).submit(launch, a, b) for a, b in zip(pieces[:-1], pieces[1:])]:
+            done.result()
 
     def _struct(self, struct: type, fields: Mapping, values: Mapping[str, np.ndarray]):
         t = self.types
@@ -166,6 +166,16 @@ class Replay:
             name: np.swapaxes(getattr(struct, name).numpy(), 0, 1) if by_row else getattr(struct, name).numpy()
             for name, (_, by_row) in fields.items()
         }
+
+
+@cache
+def _pool(cores: int) -> ThreadPoolExecutor:
+    """Threads that launch pieces; kept, since a fit of initial states flies some hundred times."""
+    return ThreadPoolExecutor(cores, "replay")
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_pool.cache_clear)  # a child process has none of these threads
 
 
 def _in_order(rides: np.ndarray, resumed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -16,6 +16,7 @@ from visthrow.diagnose import (
     gain,
     manoeuvres,
     measures,
+    pictures,
     plan,
     point,
     report,
@@ -389,6 +390,28 @@ def test_the_report_holds_sentences_pictures_and_numbers(tmp_path, found, measur
     text = report.summary(degenerate)
     assert "CLASS" in text
     assert "cannot tell it from" in text
+
+
+def test_errors_are_told_in_millimetres(found, measured):
+    """On the page as on the command line; a unit that has no smaller one stays."""
+    channel = measured["pos_w"]
+    line = f"held-out error of pos_w: {1e3 * channel.before:.3g} -> {1e3 * channel.after:.3g} mm,"
+    assert line in report.summary(found[1], measured)
+    (grid, _) = next(s for s in report.sections(found[1], measured) if s.name == "gain").parts
+    assert grid.rows[0][1:3] == ("mm", f"{1e3 * channel.before:.3g}")
+    odd = replace(measured, channels=(replace(channel, channel="current", unit="A", blackbox=float("nan")),))
+    text = report.summary(found[1], odd)
+    assert f"held-out error of current: {channel.before:.3g} -> {channel.after:.3g} A," in text
+    assert "nan" not in text
+
+
+@pytest.mark.parametrize(("low", "high", "most", "ticks"), [
+    (0.9, 60.0, 9, [1, 2, 5, 10, 20, 50]), (0.9, 6e3, 9, [1, 3, 10, 30, 100, 300, 1000, 3000]), (0.0, 140.0, 9, None),
+    (-11.0, 12.0, 18, [-10, -5, -2, -1, 0, 1, 2, 5, 10]), (2.1, 4.9, 9, []),
+])  # fmt: skip
+def test_ticks_are_plain_numbers_that_fit(low, high, most, ticks):
+    found = pictures.plain_ticks(low, high, most)
+    assert found == ([0, 1, 2, 5, 10, 20, 50, 100] if ticks is None else ticks)
 
 
 def test_the_report_of_nothing_is_whole_too(tmp_path):

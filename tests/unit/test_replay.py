@@ -1,6 +1,7 @@
 """The replay: the simulator's own flights come back, events fall where they should, lanes do not see each other."""
 
 import dataclasses
+import os
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from sim.hybrid import HybridSim
 from sim.params import SensingParams
 from sim.replay import kernel as rk
-from sim.replay.lanes import Replay
+from sim.replay.lanes import Replay, _pool
 from sim.structs import EXTENSIONS
 from tests.plants import paper_plant
 
@@ -198,6 +199,17 @@ def test_rope_that_leaves_falls_with_the_payload(flight):
     fallen = 0.22 * np.array([0.0, 0.0, -9.81])
     np.testing.assert_allclose(com_velocity(late) - com_velocity(early), fallen, atol=1e-9)
     assert np.linalg.norm(late["payload_vel_w"][0] - early["payload_vel_w"][0] - fallen) > 1e-4
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system starts processes anew")
+def test_a_child_process_has_threads_of_its_own():
+    """Those of its parent do not run in it: a replay would wait for them for ever."""
+    assert _pool(2) is _pool(2)
+    child = os.fork()
+    if not child:
+        os._exit(_pool.cache_info().currsize)
+    _, status = os.waitpid(child, 0)
+    assert os.waitstatus_to_exitcode(status) == 0
 
 
 def test_mixed_segments_are_refused():

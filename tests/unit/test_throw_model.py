@@ -15,6 +15,7 @@ from tests.plants import paper_plant
 from visthrow import config
 from visthrow.diagnose.catalogue import ALL
 from visthrow.diagnose.opened import opened
+from visthrow.diagnose.settling import Settling
 from visthrow.diagnose.throw_model import ThrowModel
 from visthrow.errors import DiagnoseError
 from visthrow.flightlog import Channel, FlightLog
@@ -96,6 +97,21 @@ def test_landings_are_predicted_from_before_the_throw(planted):
     assert wrong.released_errors[0] > 0.02
     np.testing.assert_array_equal(model.landing_errors(PLANTED), right.errors)
     assert len(model.landings({}, [0]).flights) == 0  # a free flight has none
+
+
+def test_one_throw_s_landing_rests_on_what_was_fitted_to_all(monkeypatch):
+    """The same to the bit as by itself, without its states at theta = 0 fitted a second time."""
+    logs = fly(setting_with(PLANTED), noise=0.2, free=0, throws=2, seconds=2.0)
+    wrong, fits, fit = {"release_lag": 0.01}, [], Settling.fit
+    alone = ThrowModel(logs, paper_plant(), only=list(PLANTED)).landings(wrong, [1])
+    model = ThrowModel(logs, paper_plant(), only=list(PLANTED))
+    model.landings({})
+    monkeypatch.setattr(Settling, "fit", lambda self, *a: fits.append(self.setting) or fit(self, *a))
+    among = model.landings(wrong, [1])
+    assert model.setting not in fits
+    assert len(fits) == 2  # before the throw, and up to the separation
+    np.testing.assert_array_equal(among.predicted, alone.predicted)
+    np.testing.assert_array_equal(among.released, alone.released)
 
 
 def test_windows_are_whole(planted):

@@ -197,7 +197,8 @@ def landing_gain(
         return None
     moved = {}
     for name in theta:
-        without = model.landings({other: size for other, size in theta.items() if other != name}, flown)
+        others = {other: size for other, size in theta.items() if other != name}
+        without = model.landings(others, flown) if others else plain
         moved[name] = float(np.nanmean(np.linalg.norm((named.predicted - without.predicted)[good, :2], axis=1)))
     after = mean(held.errors[good], seed=seed)
     released = [float(np.nanmean(found.released_errors[good])) for found in (plain, held)]

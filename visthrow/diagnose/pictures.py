@@ -27,8 +27,11 @@ MOST_CURVES = 24
 """Of the completeness picture; of more effects it shows where their curves rise."""
 SHOWN_HORIZONS = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
 """Ticks [s]."""
+MOST_TICKS = 18  # over the whole width
+STEPS_OF_TICKS = ((1, 2, 5), (1, 3), (1,))
+"""Within a decade of a logarithmic axis; the finest that leaves room is taken."""
 READABLE = {"m": (1e3, "mm"), "rad": (180.0 / np.pi, "deg"), "m/s": (1e3, "mm/s")}
-"""Unit -> factor and unit in pictures, where residuals are small."""
+"""Unit -> factor and unit in pictures and tables, where residuals are small."""
 
 
 def _figure(rows: int, columns: int, height: float, **more):
@@ -36,6 +39,27 @@ def _figure(rows: int, columns: int, height: float, **more):
 
     style.use()
     return plt.subplots(rows, columns, figsize=(WIDTH, height), constrained_layout=True, squeeze=False, **more)
+
+
+def plain_ticks(low: float, high: float, most: int) -> list[float]:
+    """Ticks of a logarithmic axis, or one that is linear about 0, within its limits; none where no choice of them fits."""
+    far = max(abs(low), abs(high))
+    for digits in STEPS_OF_TICKS:
+        sizes = [digit * 10.0**power for power in range(-4, 7) for digit in digits if digit * 10.0**power <= far]
+        if low <= 0.0 <= high:
+            sizes = [size for size in sizes if size >= 1.0]
+            sizes = [*(-size for size in sizes[::-1]), 0.0, *sizes]
+        inside = [tick for tick in sizes if low <= tick <= high]
+        if 2 <= len(inside) <= most:
+            return inside
+    return []
+
+
+def _plain(axis, most: int) -> None:
+    """Ticks of one axis of a picture as plain numbers instead of powers of ten."""
+    if ticks := plain_ticks(*axis.get_view_interval(), most):
+        axis.set_ticks(ticks, [f"{tick:g}" for tick in ticks])
+        axis.set_ticks([], minor=True)
 
 
 def left_over(window: Window, noise: Noise) -> np.ndarray:
@@ -87,6 +111,7 @@ def ladder(diagnosis: Diagnosis) -> bytes:
         axis.axvline(diagnosis.threshold, color=BEFORE, lw=1)
         axis.set(xscale="symlog", xlabel="nats", title=f"step {number}: {step.named}")
         axis.set_xlim(0.0, 1.4 * max([diagnosis.threshold, *screened, *step.refitted.values()]))
+        _plain(axis.xaxis, MOST_TICKS // len(steps))
         axis.tick_params(axis="y", labelsize=8)
     return png_of(figure)
 
@@ -106,8 +131,11 @@ def verdicts(diagnosis: Diagnosis) -> bytes:
         axis.plot(np.array([f.low, f.high]) / f.floor, [y, y], color=colours[f.verdict], lw=2.4, solid_capstyle="butt")
         axis.plot(middle / f.floor, y, "o" if f.estimate else "|", color=colours[f.verdict], ms=6, label=label)
     axis.axvline(0.0, color=style.QUIET, lw=0.8)
-    axis.set(xscale="symlog", xlabel="size in floors (grey: within the floor)", yticks=range(len(shown)), ylim=(-1, len(shown)))
+    axis.set(xlabel="size in floors (grey: within the floor)", yticks=range(len(shown)), ylim=(-1, len(shown)))
     axis.set_yticklabels([f.name for f in shown], fontsize=8)
+    axis.set_xscale("symlog", linthresh=1.0, linscale=0.5)
+    _plain(axis.xaxis, MOST_TICKS)
+    axis.tick_params(axis="x", top=True, labeltop=True)
     figure.legend(loc="outside upper center", ncol=4)
     return png_of(figure)
 
@@ -123,6 +151,7 @@ def horizons(gain: Gain) -> bytes:
         axis.set(title=channel.channel, xlabel="horizon [s]", xscale="log", yscale="log")
         axis.set_xticks(SHOWN_HORIZONS, [f"{x:g}" for x in SHOWN_HORIZONS])
         axis.minorticks_off()
+        _plain(axis.yaxis, MOST_TICKS // 2)
     axes[0, 0].set_ylabel("error [sigma of the sensor]")
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncol=3)
     return png_of(figure)

@@ -10,7 +10,7 @@ import numpy as np
 from visthrow.diagnose import pictures, result
 from visthrow.diagnose.blind import Blind
 from visthrow.diagnose.forms import HEAD_SECONDS
-from visthrow.diagnose.gain import Gain
+from visthrow.diagnose.gain import ChannelGain, Gain
 from visthrow.diagnose.landing import LandingGain
 from visthrow.diagnose.result import Diagnosis, Finding
 from visthrow.report.parts import Grid, Picture, Section, Text
@@ -45,11 +45,19 @@ def summary(diagnosis: Diagnosis, gain: Gain | None = None) -> str:
     return "\n".join(lines)
 
 
-def _gain_line(c) -> str:
-    box = "" if np.isnan(c.blackbox) else f", black box {c.blackbox:.3g}"
-    errors = f"{c.before:.3g} -> {c.after:.3g} {c.unit}".rstrip()
-    return (f"held-out error of {c.channel}: {errors}, {percent(c.gain)} % less "
-            f"[{percent(c.low)}, {percent(c.high)}]; noise alone {c.floor:.3g}{box}")  # fmt: skip
+def _gain_line(c: ChannelGain) -> str:
+    unit, before, after, floor, box = _errors(c)
+    errors = f"{before} -> {after} {unit}".rstrip()
+    beside = f"noise alone {floor}" + (f", black box {box}" if box else "")
+    return (f"held-out error of {c.channel}: {errors}, {percent(c.gain)} % less [{percent(c.low)}, {percent(c.high)}]; "
+            f"{beside}")  # fmt: skip
+
+
+def _errors(c: ChannelGain) -> tuple[str, str, str, str, str]:
+    """Unit and errors of a channel as text: as it stands, with what was named, of noise alone, of the black box if there is one."""
+    factor, unit = pictures.READABLE.get(c.unit, (1.0, c.unit))
+    values = (c.before, c.after, c.floor, c.blackbox)
+    return (unit, *("" if np.isnan(value) else f"{factor * value:.3g}" for value in values))
 
 
 def percent(share: float, digits: int = 0) -> str:
@@ -173,18 +181,18 @@ def _next(finding: Finding) -> str:
 
 def _gain(gain: Gain, diagnosis: Diagnosis) -> Section:
     title = "Gain on flights that were not used"
-    rows = tuple(
-        (c.channel, c.unit, f"{c.before:.3g}", f"{c.after:.3g}", f"{percent(c.gain, 1)} % [{percent(c.low)}, {percent(c.high)}]",
-         f"{c.floor:.3g}", "-" if np.isnan(c.blackbox) else f"{c.blackbox:.3g}", "worse" if c.harmed else "")
-        for c in gain.channels
-    )  # fmt: skip
+    rows = []
+    for c in gain.channels:
+        unit, before, after, floor, box = _errors(c)
+        less = f"{percent(c.gain, 1)} % [{percent(c.low)}, {percent(c.high)}]"
+        rows.append((c.channel, unit, before, after, less, floor, box or "-", "worse" if c.harmed else ""))
     named = ", ".join(f"{name} in {100 * share:.0f} %" for name, share in gain.named_in.items()) or "nothing in any"
     of = "whole windows" if gain.whole else f"predictions from the first {HEAD_SECONDS:g} s of each window"
     note = (f"Root mean square errors of {of}, {gain.left_out} left out in {gain.folds} folds, the selection repeated in each "
             f"({named}). Interval: 95 %, bootstrap over flights. "
             f"Log-likelihood: {gain.nats_per_sample:+.3f} nats a sample.")  # fmt: skip
     header = ("channel", "unit", "as it stands", "with what was named", "less", "noise alone", "black box", "")
-    grid = Grid("Held-out prediction error", header, rows, note)
+    grid = Grid("Held-out prediction error", header, tuple(rows), note)
     if all(len(c.horizons) < 2 for c in gain.channels):
         return Section("gain", title, (grid,))
     caption = "Error over the time in the window." if gain.whole else "Error over the horizon of the prediction."
@@ -204,7 +212,7 @@ def _levels(diagnosis: Diagnosis) -> Section:
          "more than gusts" if level.excessive else "")
         for level in diagnosis.levels
     )  # fmt: skip
-    header = ("what", "phase", "as it stands", "with what was named", "in the quietest phase's", "")
+    header = ("what", "phase", "as it stands", "with what was named", "times the quietest phase", "")
     note = "Deviation of what moves the vehicle besides the model [N; N m]. Gusts do not know the phase of the flight."
     return Section("levels", "Forces that nothing explains", (Grid("Latent forces", header, rows, note, heads=2),))
 

@@ -26,6 +26,7 @@ from visthrow.diagnose.states import (
     hover_state,
     measured_state,
     resampled,
+    rows_of,
 )
 from visthrow.diagnose.threads import each
 from visthrow.errors import DiagnoseError
@@ -249,10 +250,21 @@ class ThrowModel:
         """States fitted at theta = 0, to begin with ``states``, and the samples' derivatives by them; of the same windows, once."""
         cuts = tuple(self.flights.cuts)
         if cuts not in self._fits:
+            if states is None and (among := self._among_more(cuts)) is not None:
+                return among
             settling = self._settling(self.setting)
             fitted = settling.fit(self._begin(self.setting) if states is None else states)
             self._fits[cuts] = fitted, settling.slopes
         return self._fits[cuts]
+
+    def _among_more(self, cuts: tuple[Cut, ...]) -> tuple[States, dict[int, np.ndarray]] | None:
+        """What was fitted to all windows of some flights among those of others, as each flight is fitted by itself."""
+        flights = {c.flight for c in cuts}
+        for more, (states, slopes) in self._fits.items():
+            rows = [row for row, c in enumerate(more) if c.flight in flights]
+            if cuts == tuple(more[row] for row in rows):
+                return rows_of(states, np.array(rows)), {w: slopes[row] for w, row in enumerate(rows) if row in slopes}
+        return None
 
     def _settled(self, setting: Setting) -> States:
         """States fitted in a setting, from the better of those fitted at theta = 0 and those that the setting begins with."""
