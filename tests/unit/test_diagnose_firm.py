@@ -1,8 +1,8 @@
-"""Causes that only some of the flights ask for are marked on the printed page."""
+"""Causes that only some of the flights ask for are marked."""
 
 from types import SimpleNamespace
 
-from visthrow.diagnose.explain_cli import not_firm
+from visthrow.diagnose.report import not_firm
 
 
 def diagnosis(**partners):
@@ -14,8 +14,8 @@ def diagnosis(**partners):
 def test_a_cause_named_in_few_folds_is_marked():
     gain = SimpleNamespace(folds=4, left_out="flights", named_in={"lag": 0.25, "drag": 1.0, "mass": 0.5, "thrust": 0.5})
     said = not_firm(diagnosis(lag=(), drag=(), mass=("thrust",)), gain)
-    assert said == ["not firm: lag is named in 25 % of the 4 searches that leave flights out"]
-    assert not_firm(diagnosis(curve=()), gain) == ["not firm: curve is named in 0 % of the 4 searches that leave flights out"]
+    assert said == ["lag is named in 25 % of the 4 searches that leave flights out"]
+    assert not_firm(diagnosis(curve=()), gain) == ["curve is named in 0 % of the 4 searches that leave flights out"]
 
 
 def test_nothing_is_said_without_folds():

@@ -392,6 +392,16 @@ def test_the_report_holds_sentences_pictures_and_numbers(tmp_path, found, measur
     assert "cannot tell it from" in text
 
 
+def test_what_few_searches_name_is_marked_on_the_page_too(found, measured):
+    _, diagnosis = found
+    shaky = replace(measured, named_in={"effect_03": 0.25, "effect_04": 1.0})
+    line = f"effect_03 is named in 25 % of the {measured.folds} searches that leave flights out"
+    verdict = report.sections(diagnosis, shaky)[0]
+    assert f"**Not firm.** {line}." in [part.text for part in verdict.parts if hasattr(part, "text")]
+    assert f"not firm: {line}" in report.summary(diagnosis, shaky)
+    assert "not firm" not in report.summary(diagnosis, measured)
+
+
 def test_errors_are_told_in_millimetres(found, measured):
     """On the page as on the command line; a unit that has no smaller one stays."""
     channel = measured["pos_w"]

@@ -8,8 +8,6 @@ from visthrow.diagnose.result import INCONSISTENT, OVERALL
 
 DEFAULT_OUT = "out/explain"
 
-FIRM = 2.0 / 3.0
-"""Share of the folds that must name a cause, or one of its class, from the flights that were not left out."""
 MOST_SPOILED = 0.25
 """Share of the logs that may contradict themselves and be left out; where more do, nothing is to be learnt from any."""
 
@@ -57,30 +55,11 @@ def run(args: argparse.Namespace) -> int:
     if not args.no_report and diagnosis.work is not None:
         gain = write_report(Path(args.out), diagnosis, model, logs, args.seed, not args.no_blind)
     print("\n" + report.summary(diagnosis, gain))
-    for line in not_firm(diagnosis, gain):
-        print(line)
     if not args.no_report and diagnosis.work is not None:
         print(f"page, JSON, pictures and recording: {args.out}")
     if args.json:
         write_json(args.json, report.to_json(diagnosis, gain))
     return 0
-
-
-def not_firm(diagnosis, gain) -> list[str]:
-    """A line for each named cause that the search over parts of the flights does not name again."""
-    if gain is None or not gain.folds:
-        return []
-    lines = []
-    for finding in diagnosis.findings:
-        if finding.name not in diagnosis.theta:
-            continue
-        share = min(sum(gain.named_in.get(name, 0.0) for name in (finding.name, *finding.partners)), 1.0)
-        if share < FIRM:
-            lines.append(
-                f"not firm: {finding.name} is named in {100 * share:.0f} % of the {gain.folds} searches "
-                f"that leave {gain.left_out} out"
-            )
-    return lines
 
 
 def write_report(folder: Path, diagnosis, model, logs, seed: int, limits: bool = True):

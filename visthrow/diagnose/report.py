@@ -18,6 +18,9 @@ from visthrow.report.parts import Grid, Picture, Section, Text
 if TYPE_CHECKING:
     from visthrow.diagnose.plan import Proposal
 
+FIRM = 2.0 / 3.0
+"""Share of the folds that must name a cause, or one of its class, from the flights that were not left out."""
+
 
 def sentence_of(diagnosis: Diagnosis) -> str:
     """The overall verdict in a sentence."""
@@ -41,6 +44,7 @@ def summary(diagnosis: Diagnosis, gain: Gain | None = None) -> str:
         lines += [_gain_line(c) for c in gain.channels]
     if gain is not None and gain.landing is not None:
         lines.append(landing_sentence(gain.landing))
+    lines += [f"not firm: {line}" for line in not_firm(diagnosis, gain)]
     lines.append(f"{diagnosis.windows} windows of {diagnosis.flights} flights, {diagnosis.seconds:.1f} s")
     return "\n".join(lines)
 
@@ -75,6 +79,21 @@ def landing_sentence(landing: LandingGain) -> str:
     whose = "held-out throws" if landing.held_out else "the same throws"
     return (f"With what was named the landing error of {landing.throws} {whose} falls from {mm[0]:.0f} to {mm[1]:.0f} mm "
             f"[{mm[2]:.0f}, {mm[3]:.0f}], open loop from before the throw; from the separation on {released}.")  # fmt: skip
+
+
+def not_firm(diagnosis: Diagnosis, gain: Gain | None) -> list[str]:
+    """A line for each named cause that the search over parts of the flights does not name again."""
+    if gain is None or not gain.folds:
+        return []
+    lines = []
+    for finding in diagnosis.findings:
+        if finding.name not in diagnosis.theta:
+            continue
+        share = min(sum(gain.named_in.get(name, 0.0) for name in (finding.name, *finding.partners)), 1.0)
+        if share < FIRM:
+            lines.append(f"{finding.name} is named in {100 * share:.0f} % of the {gain.folds} searches that leave "
+                         f"{gain.left_out} out")  # fmt: skip
+    return lines
 
 
 def _moves(finding: Finding, gain: Gain | None) -> str:
@@ -159,6 +178,7 @@ def _verdict(diagnosis: Diagnosis, gain: Gain | None) -> Section:
     parts: list[Text | Picture] = [Text(reason, "finding") for reason in diagnosis.reasons]
     parts += [Text(f"**{f.verdict}.** {f.sentence}{_moves(f, gain)}{_next(f)}", "finding")
               for f in diagnosis.findings if f.verdict in (result.FOUND, result.CLASS)]  # fmt: skip
+    parts += [Text(f"**Not firm.** {line}.", "finding") for line in not_firm(diagnosis, gain)]
     if diagnosis.overall == result.UNKNOWN and diagnosis.laws:
         law = diagnosis.laws[0]
         parts.append(Text(f"**Law.** {law.formula} with c = {law.coefficient:.3g} ± {law.sd:.2g} {law.unit}.", "finding"))
