@@ -417,11 +417,28 @@ def test_errors_are_told_in_millimetres(found, measured):
 
 @pytest.mark.parametrize(("low", "high", "most", "ticks"), [
     (0.9, 60.0, 9, [1, 2, 5, 10, 20, 50]), (0.9, 6e3, 9, [1, 3, 10, 30, 100, 300, 1000, 3000]), (0.0, 140.0, 9, None),
-    (-11.0, 12.0, 18, [-10, -5, -2, -1, 0, 1, 2, 5, 10]), (2.1, 4.9, 9, []),
+    (-11.0, 12.0, 16, [-10, -5, -2, -1, 0, 1, 2, 5, 10]), (2.1, 4.9, 9, []),
 ])  # fmt: skip
 def test_ticks_are_plain_numbers_that_fit(low, high, most, ticks):
     found = pictures.plain_ticks(low, high, most)
     assert found == ([0, 1, 2, 5, 10, 20, 50, 100] if ticks is None else ticks)
+
+
+def test_many_steps_stand_in_rows_that_can_be_read(found):
+    def size(count: int) -> tuple[int, int]:
+        picture = pictures.ladder(replace(found[1], steps=found[1].steps[:1] * count))
+        return int.from_bytes(picture[16:20], "big"), int.from_bytes(picture[20:24], "big")  # of a PNG's head
+
+    assert size(6)[0] == size(1)[0]
+    assert size(3)[1] == size(1)[1]
+    assert size(6)[1] > 1.9 * size(3)[1]
+
+
+@pytest.mark.parametrize(("channel", "unit"), [
+    ("pos_w", "m"), ("quat_wb", "rad"), ("marker_pos_c", "m"), ("current", "A"), ("motor_wanted", ""),
+])  # fmt: skip
+def test_residuals_have_units(channel, unit):
+    assert forms.unit_of(channel) == unit
 
 
 def test_the_report_of_nothing_is_whole_too(tmp_path):

@@ -21,11 +21,14 @@ HORIZONS = (0.02, 0.05, 0.1, 0.2, 0.3, 0.45, 0.6, 1.0)
 """Upper ends of the horizons [s]; what lies beyond the last belongs to it."""
 
 
+UNITS = {"quat_wb": "rad", "angle": "rad", "thrust": "N", "current": "A", "marker_pos_c": "m"}
+"""Of residuals: an attitude's are rotation vectors, and the small models have channels of their own."""
+
+
 def unit_of(channel: str) -> str:
-    """Unit of a channel's residuals; that of an attitude is a rotation vector."""
-    if channel == "quat_wb":
-        return "rad"
-    return STANDARD_CHANNELS[channel].unit if channel in STANDARD_CHANNELS else ""
+    """Unit of a channel's residuals; empty where it has none, or none that is known."""
+    standard = STANDARD_CHANNELS.get(channel)
+    return UNITS.get(channel, standard.unit if standard else "")
 
 
 @dataclass(frozen=True)

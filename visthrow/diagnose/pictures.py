@@ -27,7 +27,8 @@ MOST_CURVES = 24
 """Of the completeness picture; of more effects it shows where their curves rise."""
 SHOWN_HORIZONS = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
 """Ticks [s]."""
-MOST_TICKS = 18  # over the whole width
+STEPS_ACROSS = 3
+MOST_TICKS = 16  # over the whole width
 STEPS_OF_TICKS = ((1, 2, 5), (1, 3), (1,))
 """Within a decade of a logarithmic axis; the finest that leaves room is taken."""
 READABLE = {"m": (1e3, "mm"), "rad": (180.0 / np.pi, "deg"), "m/s": (1e3, "mm/s")}
@@ -90,17 +91,20 @@ def residuals(work: Work, channel: int) -> bytes:
         axis.plot(time, factor * old, ".", ms=2.2, color=BEFORE, label="model as it stands")
         axis.plot(time, factor * new, ".", ms=2.2, color=AFTER, label="with what was named")
         axis.set(title=f"flight {before.flight}, {before.phase}", xlabel="time [s]")
-    axes[0, 0].set_ylabel(f"measured - simulated [{unit}]")
+    axes[0, 0].set_ylabel(f"measured - simulated [{unit}]" if unit else "measured - simulated")
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncol=3, markerscale=4)
     return png_of(figure)
 
 
 def ladder(diagnosis: Diagnosis) -> bytes:
-    """Nats of each step's candidates, screened and with the simulation run again, and the threshold."""
+    """Nats of each step's candidates, screened and with the simulation run again, and the threshold; steps in rows of three."""
     steps = diagnosis.steps
-    rows = max(len(step.screened) for step in steps)
-    figure, axes = _figure(1, len(steps), 0.55 + 0.27 * rows)
-    for axis, (number, step) in zip(axes[0], enumerate(steps, start=1)):
+    across = min(len(steps), STEPS_ACROSS)
+    down, most = -(-len(steps) // across), max(len(step.screened) for step in steps)
+    figure, axes = _figure(down, across, down * (0.55 + 0.27 * most))
+    for axis in axes.flat[len(steps) :]:
+        axis.set_visible(False)
+    for number, (axis, step) in enumerate(zip(axes.flat, steps), start=1):
         names = list(step.screened)[::-1]
         screened = [max(step.screened[n], 0.0) for n in names]
         axis.barh(names, screened, height=0.62, color=style.FAINT)
@@ -111,7 +115,7 @@ def ladder(diagnosis: Diagnosis) -> bytes:
         axis.axvline(diagnosis.threshold, color=BEFORE, lw=1)
         axis.set(xscale="symlog", xlabel="nats", title=f"step {number}: {step.named}")
         axis.set_xlim(0.0, 1.4 * max([diagnosis.threshold, *screened, *step.refitted.values()]))
-        _plain(axis.xaxis, MOST_TICKS // len(steps))
+        _plain(axis.xaxis, MOST_TICKS // across)
         axis.tick_params(axis="y", labelsize=8)
     return png_of(figure)
 
