@@ -402,6 +402,20 @@ def test_what_few_searches_name_is_marked_on_the_page_too(found, measured):
     assert "not firm" not in report.summary(diagnosis, measured)
 
 
+def test_an_event_is_left_out_or_weighs_little(found):
+    """A flight that was left out has no windows any more; one whose window is far rougher than others has."""
+    _, diagnosis = found
+    flights = {w.flight for w in diagnosis.work.after.windows}
+    told = replace(diagnosis, events=(min(flights), max(flights) + 1))
+    little, out = (line for line in report.summary(told).splitlines() if line.startswith("EVENT"))
+    assert f"flight {min(flights)} " in little
+    assert little.endswith("weighs little")
+    assert f"flight {max(flights) + 1} " in out
+    assert out.endswith("left out")
+    page = [part.text for part in report.sections(told)[0].parts if hasattr(part, "text")]
+    assert sum(text.startswith("**Event.**") for text in page) == 2
+
+
 def test_errors_are_told_in_millimetres(found, measured):
     """On the page as on the command line; a unit that has no smaller one stays."""
     channel = measured["pos_w"]

@@ -36,7 +36,7 @@ def summary(diagnosis: Diagnosis, gain: Gain | None = None) -> str:
             lines.append(f"{f.verdict:6} {f.sentence}{_moves(f, gain)}")
     lines += [f"FOUND  {m.sentence}" for m in diagnosis.mistakes]
     lines += [f"VARIES {s.sentence}" for s in diagnosis.scatter if s.found]
-    lines += [f"EVENT  something happened in flight {flight} that the others do not show" for flight in diagnosis.events]
+    lines += [f"EVENT  {_event(diagnosis, flight)}" for flight in diagnosis.events]
     lines += [f"COPY   flight {flight} repeats flight {of} and was left out" for flight, of in diagnosis.duplicates.items()]
     counted = {v: sum(f.verdict == v for f in diagnosis.findings) for v in result.VERDICTS}
     lines.append(", ".join(f"{count} {verdict.lower()}" for verdict, count in counted.items() if count))
@@ -79,6 +79,13 @@ def landing_sentence(landing: LandingGain) -> str:
     whose = "held-out throws" if landing.held_out else "the same throws"
     return (f"With what was named the landing error of {landing.throws} {whose} falls from {mm[0]:.0f} to {mm[1]:.0f} mm "
             f"[{mm[2]:.0f}, {mm[3]:.0f}], open loop from before the throw; from the separation on {released}.")  # fmt: skip
+
+
+def _event(diagnosis: Diagnosis, flight: int) -> str:
+    """What happened in a flight: of one that was left out, or of one with a window far rougher than its phase."""
+    if diagnosis.work is not None and flight in {w.flight for w in diagnosis.work.after.windows}:
+        return f"something happened in flight {flight} that the rest of its phase does not show; there the flight weighs little"
+    return f"something happened in flight {flight} that the others do not show; it was left out"
 
 
 def not_firm(diagnosis: Diagnosis, gain: Gain | None) -> list[str]:
@@ -184,8 +191,7 @@ def _verdict(diagnosis: Diagnosis, gain: Gain | None) -> Section:
         parts.append(Text(f"**Law.** {law.formula} with c = {law.coefficient:.3g} ± {law.sd:.2g} {law.unit}.", "finding"))
     parts += [Text(f"**FOUND.** {m.sentence}", "finding") for m in diagnosis.mistakes]
     parts += [Text(f"**VARIES.** {s.sentence}", "finding") for s in diagnosis.scatter if s.found]
-    parts += [Text(f"**Event in flight {flight}.** Something happened there that the others do not show; it was left out.",
-                   "finding") for flight in diagnosis.events]  # fmt: skip
+    parts += [Text(f"**Event.** {_event(diagnosis, flight)}.", "finding") for flight in diagnosis.events]
     parts += [Text(f"Flight {flight} repeats flight {of} and counts once.", "finding")
               for flight, of in diagnosis.duplicates.items()]  # fmt: skip
     if gain is not None and gain.landing is not None:
