@@ -317,3 +317,16 @@ def test_a_candidate_that_cannot_stand_does_not_end_the_search(monkeypatch):
     monkeypatch.setattr(search.Search, "_sure", lambda self, point, j: self.name(j) != "effect_03" and sure(self, point, j))
     diagnosis = search.explain(world(truth={"effect_03": 12.0, "effect_07": 8.0}, seed=4), laws=False)
     assert [step.named for step in diagnosis.steps][:1] == ["effect_07"]
+
+
+def test_what_gusts_held_goes_over_to_the_sizes():
+    """A drag in one throw alone, five times its usual size: sizes fitted once, under gusts that hold it, stay a fifth too small."""
+    model = SyntheticModel(effects=EFFECTS, throws=1, free=2, law="speed", law_size=0.0, seed=4)
+    model.effects = (EFFECTS[0], replace(EFFECTS[1], floor=1e-3, prior_sd=4e-3), *EFFECTS[2:])
+    model.law_size = 1.0
+    for w in model._windows:
+        w.effects[:, 1] = w.latent @ model._law(w.knots) if w.phase == "throw" else 0.0
+        w.residual[:] += 0.02 * w.effects[:, 1]
+    diagnosis = search.explain(model, laws=False)
+    assert diagnosis.named == ("effect_01",)
+    assert diagnosis["effect_01"].estimate == pytest.approx(0.02, abs=1e-3)

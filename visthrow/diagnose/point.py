@@ -213,11 +213,16 @@ def fitted(problem: Problem, point: Point, active: Sequence[int]) -> Point:
         if trial is None:
             break
         best = trial
-        left = estimate(best.information, best.score, problem.priors, active) - best.theta
-        left[problem.switches] = 0.0
-        if left @ best.information @ left < 0.1:  # nats still to be gained by a step without noise
+        if to_gain(problem, best, active) < 0.05:
             break
     return best
+
+
+def to_gain(problem: Problem, point: Point, active: Sequence[int]) -> float:
+    """Nats that another step of these effects' sizes would bring by the derivatives, no block turned into another."""
+    left = estimate(point.information, point.score, problem.priors, active) - point.theta
+    left[problem.switches] = 0.0
+    return float(0.5 * left @ point.information @ left)
 
 
 def _step(problem: Problem, point: Point, goal: np.ndarray) -> Point | None:

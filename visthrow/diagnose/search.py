@@ -31,6 +31,7 @@ from visthrow.diagnose.point import (
     fitted,
     linearise,
     lost,
+    to_gain,
     with_all_effects_noise,
     with_fitted_noise,
 )
@@ -45,6 +46,9 @@ CHAIN = 3
 
 SHORTLIST = 3
 """Candidates whose simulation is run again in each step."""
+
+TURNS, TURNED = 8, 0.5
+"""Times that sizes and noise levels are estimated in turn, while the levels leave a step of the sizes worth so many nats."""
 
 CLOSE = 3.0
 """Sets of causes within this many nats of the best are reported as equally possible."""
@@ -175,7 +179,13 @@ class Search:
         return float(estimate(point.information, point.score, self.priors, [*self.active, j])[j] * self.priors.floor[j])
 
     def _candidate(self, point: Point, active: Sequence[int]) -> Point:
-        return with_fitted_noise(fitted(self.problem, self._switched(point, active), active))
+        """Sizes of a set and the noise levels that belong to them, in turn: what gusts held at first goes over to the sizes."""
+        point = with_fitted_noise(fitted(self.problem, self._switched(point, active), active))
+        for _ in range(TURNS):
+            if to_gain(self.problem, point, active) < TURNED:
+                break
+            point = with_fitted_noise(fitted(self.problem, point, active))
+        return point
 
     def _switched(self, point: Point, active: Sequence[int]) -> Point:
         """The point, linearised with another kind of block on where a set asks for one that is off."""
