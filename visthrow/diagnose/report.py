@@ -139,9 +139,10 @@ def sections(
     made = [_verdict(diagnosis, gain)]
     work = diagnosis.work
     if work is not None and diagnosis.theta:
+        fitted = ", with each window's initial state fitted" if any(w.nuisance.size for w in work.after.windows) else ""
         drawn = tuple(
             Picture(f"residual_{name}", pictures.residuals(work, c),
-                    f"{name}: residuals before and after, with each window's initial state fitted.")
+                    f"{name}: residuals before and after{fitted}.")
             for c, name in enumerate(work.problem.model.channels)
             if any(np.any(w.channel == c) for w in work.after.windows)
         )  # fmt: skip
