@@ -21,3 +21,15 @@ def test_a_cause_named_in_few_folds_is_marked():
 def test_nothing_is_said_without_folds():
     assert not_firm(diagnosis(lag=()), None) == []
     assert not_firm(diagnosis(lag=()), SimpleNamespace(folds=0, left_out="flights", named_in={})) == []
+
+
+def test_two_of_three_are_not_firm_and_three_of_four_are():
+    """In recorded flights what two of three parts named was told otherwise by the next flight."""
+    named = {"lag": 2 / 3, "sag": 1 / 3, "curve": 1 / 3, "drag": 1.0}
+    three = SimpleNamespace(folds=3, left_out="parts of flights", named_in=named)
+    assert not_firm(diagnosis(lag=(), drag=()), three) == [
+        "lag is named in 67 % of the 3 searches that leave parts of flights out"
+    ]
+    assert len(not_firm(diagnosis(sag=("curve",)), three)) == 1
+    four = SimpleNamespace(folds=4, left_out="flights", named_in={"lag": 0.75})
+    assert not_firm(diagnosis(lag=()), four) == []

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from visthrow.diagnose.plan import Proposal
 
 FIRM = 2.0 / 3.0
-"""Share of the folds that must name a cause, or one of its class, from the flights that were not left out."""
+"""More of the folds than this share must name a cause, or one of its class: of three folds that leave a flight out, all."""
 
 
 def sentence_of(diagnosis: Diagnosis) -> str:
@@ -97,7 +97,7 @@ def not_firm(diagnosis: Diagnosis, gain: Gain | None) -> list[str]:
         if finding.name not in diagnosis.theta:
             continue
         share = min(sum(gain.named_in.get(name, 0.0) for name in (finding.name, *finding.partners)), 1.0)
-        if share < FIRM:
+        if share < FIRM + 1e-9:
             lines.append(f"{finding.name} is named in {100 * share:.0f} % of the {gain.folds} searches that leave "
                          f"{gain.left_out} out")  # fmt: skip
     return lines
