@@ -24,7 +24,7 @@ MEASUREMENTS = (
     Measurement("weigh the vehicle", "mass_quad", 3e-4, 60.0),  # kitchen scale of 0.1 g, read thrice
     Measurement("weigh the payload", "mass_payload", 2e-4, 60.0),  # the same
     Measurement("weigh the rope", "rope_mass", 1e-4, 120.0),  # the same, taken off its mount
-    Measurement("tape the rope", "rope_length", 1e-3, 60.0),  # steel tape, to the payload's knot
+    Measurement("tape the rope", "rope_length", 1e-3, 60.0),  # steel tape, to the payload's centre
     Measurement("gauge the payload", "payload_offset", 5e-4, 60.0),  # caliper
     Measurement("read a barometer", "air_density", 3e-3, 60.0),  # 1 hPa and 0.5 K
     Measurement("tape between two markers", "frame_scale", 3e-4, 120.0),  # 1 mm in 3 m

@@ -127,7 +127,7 @@ ENTRIES: tuple[Entry, ...] = (
         "battery",
         (-0.5, 0.5),
         0.1,
-        1e-2,
+        3e-3,  # 0.2 % of thrust at 0.7 V from the reference: the floor of thrust_gain
         POSE,
         "Bauersfeld and Scaramuzza 2022",
         [Key("plant.vehicle.thrust.voltage_coefficient")],
