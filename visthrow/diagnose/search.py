@@ -47,6 +47,9 @@ CHAIN = 3
 SHORTLIST = 3
 """Candidates whose simulation is run again in each step."""
 
+HOPE = 0.5
+"""Of the threshold: linear statistics from which a candidate's simulation is run again, where derivatives may fall short of it."""
+
 TURNS, TURNED = 8, 0.5
 """Times that sizes and noise levels are estimated in turn, while the levels leave a step of the sizes worth so many nats."""
 
@@ -123,18 +126,23 @@ class Search:
         """Add the best candidate; False where none is good enough."""
         free = with_all_effects_noise(self.problem, self.point)
         screened, under_free = self._screen(self.point), self._screen(free)
-        short = [j for j in np.argsort(-under_free)[:SHORTLIST] if under_free[j] > max(self.least, 0.3 * under_free.max())]
-        short += [j for j in np.argsort(-screened)[:2] if screened[j] > self.least and j not in short]
+        worth = HOPE * self.least
+        short = [j for j in np.argsort(-under_free)[:SHORTLIST] if under_free[j] > max(worth, 0.3 * under_free.max())]
+        short += [j for j in np.argsort(-screened)[:2] if screened[j] > worth and j not in short]
         if not short:
             return False
         base = self.point, self.active
         tried = {int(j): self._candidate(free, [*self.active, int(j)]) for j in short}
         nats = {j: advantage(self.priors, (point, [*self.active, j]), base) for j, point in tried.items()}
         enough = max([self.least, *(CONTRADICTED * n for n in self.refused.values())])
-        usable = [j for j in sorted(nats, key=nats.get, reverse=True) if nats[j] > enough and self._stands(tried[j], j)]
-        if not usable:
-            return False
-        best = usable[0]
+        ranked = [j for j in sorted(nats, key=nats.get, reverse=True) if nats[j] > enough]
+        best = next((j for j in ranked if self._stands(tried[j], [*self.active, j], j)), None)
+        if best is None:
+            best = max(nats, key=nats.get)
+            tried[best] = self._closer(tried[best], [*self.active, best])
+            nats[best] = advantage(self.priors, (tried[best], [*self.active, best]), base)
+            if nats[best] <= enough or not self._stands(tried[best], [*self.active, best], best):
+                return False
         verdict, found = self._agreed(tried[best], best)
         if verdict is not None:
             return self._set_aside(best, nats[best], verdict)
@@ -159,24 +167,35 @@ class Search:
             self.origin = origin
         return verdict, near
 
-    def _stands(self, point: Point, j: int) -> bool:
-        """Whether a candidate could be named at all, however many nats it brings."""
-        if self.problem.switches[j] and self._share_of(point, j) < WHOLE:
+    def _closer(self, point: Point, active: Sequence[int]) -> Point:
+        """A candidate with derivatives and initial states of its own, where it leads: those of the model as it is may fall short.
+
+        A rope that whips forgets its initial state within a window; what was fitted for another rope explains nothing.
+        """
+        if abs(point.theta[active[-1]]) < 1.0:
+            goal = estimate(point.information, point.score, self.priors, active)
+            goal[self.problem.switches] = point.theta[self.problem.switches]
+            point = fitted(self.problem, linearise(self.problem, goal, point.noise), active)
+        return self._settle(point, active)
+
+    def _stands(self, point: Point, active: Sequence[int], j: int) -> bool:
+        """Whether a candidate of a set could be named at all, however many nats it brings."""
+        if self.problem.switches[j] and self._share_of(point, active, j) < WHOLE:
             self.progress(f"{self.name(j)} is there or not, and these flights ask for a part of it; it is not named")
             return False
-        if not self._sure(point, j):
+        if not self._sure(point, active, j):
             self.progress(f"{self.name(j)} would be no larger than what it cannot be told from; it is not named")
             return False
         return True
 
-    def _sure(self, point: Point, j: int) -> bool:
-        """Whether the interval that an effect would be reported with leaves out 0."""
-        spread = covariance(point.information, self.priors.deviation([*self.active, j]))[j, j]
+    def _sure(self, point: Point, active: Sequence[int], j: int) -> bool:
+        """Whether the interval that an effect of a set would be reported with leaves out 0."""
+        spread = covariance(point.information, self.priors.deviation(list(active)))[j, j]
         return bool(abs(point.theta[j]) > NORMAL_95 * np.hypot(np.sqrt(spread), OWN_FLOOR))
 
-    def _share_of(self, point: Point, j: int) -> float:
+    def _share_of(self, point: Point, active: Sequence[int], j: int) -> float:
         """How much of another kind of block is asked for by a point that has it: about 1 if it is there."""
-        return float(estimate(point.information, point.score, self.priors, [*self.active, j])[j] * self.priors.floor[j])
+        return float(estimate(point.information, point.score, self.priors, list(active))[j] * self.priors.floor[j])
 
     def _candidate(self, point: Point, active: Sequence[int]) -> Point:
         """Sizes of a set and the noise levels that belong to them, in turn: what gusts held at first goes over to the sizes."""
@@ -252,6 +271,8 @@ class Search:
                 point = self._candidate(self.point, rival)
                 ahead = advantage(self.priors, (point, rival), (self.point, self.active))
                 ahead += self._toll(self.active) - self._toll(rival)
+                if ahead > 1.0 and not all(self._stands(point, rival, j) for j in rival if j not in self.active):
+                    continue
                 if ahead > -CLOSE:
                     self.sets.append((tuple(rival), float(-ahead)))
                 if ahead > 1.0 and (winner is None or ahead > winner[0]):
