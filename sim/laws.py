@@ -3,6 +3,9 @@
 A law is plain data (:class:`sim.params.LawParams`). :func:`build_laws` composes the functions of its factors into the kernel that
 is built for it; its coefficient is a number of the run, so that one kernel serves every size of a law. The names are those of
 ``visthrow.diagnose.grammar``. A law's force is taken at the start of an integration step and held over it.
+
+A torque M in the rope's joint acts on the vehicle, and -M on the rope: by the pair of forces that does the same to a straight rope
+of the length l in direction n, (-M x n) / l on the payload and its opposite at the mount. Momentum is conserved.
 """
 
 from types import SimpleNamespace
@@ -15,7 +18,8 @@ from sim.structs import Types, make_struct
 
 LOWEST = 0.05  # height below which 1/z is held [m]
 MOST_LAWS = 4
-BLOCKS = ("vehicle force", "vehicle torque", "payload force")
+SLOWEST = 0.1  # rate of the rope against the vehicle below which dry friction falls to 0 [1/s]
+BLOCKS = ("vehicle force", "vehicle torque", "payload force", "rope joint")
 
 
 def _factors(t: Types, Around: type) -> tuple[dict, dict]:
@@ -153,11 +157,26 @@ def _factors(t: Types, Around: type) -> tuple[dict, dict]:
     def rate_world(a: Around):
         return wp.quat_rotate(a.quat_wb, a.rate_b)
 
+    @wp.func
+    def joint_rate(a: Around):
+        reach = a.payload_pos_w - a.pos_w - wp.quat_rotate(a.quat_wb, a.mount_b)
+        mount_vel = a.vel_w + wp.quat_rotate(a.quat_wb, wp.cross(a.rate_b, a.mount_b))
+        rope_rate = wp.cross(reach, a.payload_vel_w - mount_vel) / wp.dot(reach, reach)
+        return wp.quat_rotate_inv(a.quat_wb, rope_rate) - a.rate_b
+
+    @wp.func
+    def joint_speed(a: Around):
+        return wp.length(joint_rate(a))
+
+    @wp.func
+    def friction(a: Around):
+        return joint_rate(a) / wp.sqrt(wp.dot(joint_rate(a), joint_rate(a)) + real(SLOWEST * SLOWEST))
+
     scalars = {
         "thrust": thrust, "thrust_rate": thrust_rate, "abs_thrust_rate": abs_thrust_rate, "speed": speed,
         "speed_across": speed_across, "speed_across_squared": speed_across_squared, "speed_along": along, "rate": rate_size,
         "rate_yaw": rate_yaw, "inverse_height": inverse_height, "tension": tension, "payload_speed": payload_speed,
-        "swing_speed": swing_speed, "cable_under_rotors": under,
+        "swing_speed": swing_speed, "cable_under_rotors": under, "joint_rate": joint_speed,
     }  # fmt: skip
     vectors = {
         "vehicle force": {
@@ -172,6 +191,9 @@ def _factors(t: Types, Around: type) -> tuple[dict, dict]:
         "payload force": {
             "payload_vel": payload_vel, "vertical_cross_vel": crossed(vertical, payload_vel), "world_z": vertical, "body_z": up,
             "cable": cable, "swing_vel": swing, "cable_cross_swing": crossed(cable, swing), "vel": vel, "sideways": aside,
+        },
+        "rope joint": {
+            "joint_rate": joint_rate, "friction": friction, "axis_cross_cable": crossed(vertical, turned_back(cable)),
         },
     }  # fmt: skip
     return scalars, vectors
@@ -188,8 +210,8 @@ def names() -> tuple[tuple[str, ...], dict[str, tuple[str, ...]]]:
 
 def _around(t: Types) -> dict[str, type]:
     return {
-        "pos_w": t.vec3, "vel_w": t.vec3, "rate_b": t.vec3, "quat_wb": t.quat, "payload_vel_w": t.vec3, "cable_dir_w": t.vec3,
-        "thrust": t.real, "thrust_rate": t.real, "tension": t.real,
+        "pos_w": t.vec3, "vel_w": t.vec3, "rate_b": t.vec3, "quat_wb": t.quat, "payload_pos_w": t.vec3, "payload_vel_w": t.vec3,
+        "cable_dir_w": t.vec3, "mount_b": t.vec3, "thrust": t.real, "thrust_rate": t.real, "tension": t.real,
     }  # fmt: skip
 
 
@@ -210,6 +232,41 @@ def check_laws(laws: tuple[LawParams, ...]) -> None:
                 f"law {law}: expected a block of {BLOCKS}, up to two factors of {scalars}, and a vector of "
                 f"{vectors.get(law.block, BLOCKS)}"
             )
+
+
+def build_joint(t: Types, Around: type, torque) -> object:
+    """Return ``act(around, air)`` -> air whose pushes hold a torque in the rope's joint and its reactions.
+
+    Args:
+        t: types of the wanted precision.
+        Around: struct of what the factors read.
+        torque: function ``(around, coefficients)`` -> torque on the vehicle [N m, body].
+    """
+    Air = t.Air
+
+    @wp.func
+    def act(a: Around, air: Air):
+        out = air
+        on_vehicle = torque(a, air.laws)
+        reach = a.payload_pos_w - a.pos_w - wp.quat_rotate(a.quat_wb, a.mount_b)
+        pair = -wp.cross(wp.quat_rotate(a.quat_wb, on_vehicle), reach) / wp.dot(reach, reach)
+        out.payload_push_w = air.payload_push_w + pair
+        out.push_w = air.push_w - pair
+        out.twist_b = air.twist_b + on_vehicle - wp.cross(a.mount_b, wp.quat_rotate_inv(a.quat_wb, pair))
+        return out
+
+    return act
+
+
+def build_no_joint(t: Types, Around: type) -> object:
+    """The same without any."""
+    Air = t.Air
+
+    @wp.func
+    def act(a: Around, air: Air):
+        return air
+
+    return act
 
 
 def build_laws(t: Types, laws: tuple[LawParams, ...], flow, chain, mount_velocity) -> SimpleNamespace:
@@ -259,7 +316,8 @@ def build_laws(t: Types, laws: tuple[LawParams, ...], flow, chain, mount_velocit
     total = dict.fromkeys(BLOCKS, zero)
     for i, law in enumerate(laws):
         total[law.block] = plus(total[law.block], law, i)
-    force, torque, payload_force = (total[block] for block in BLOCKS)
+    force, torque, payload_force, joint = (total[block] for block in BLOCKS)
+    act_in_joint = build_joint(t, Around, joint) if any(law.block == "rope joint" for law in laws) else build_no_joint(t, Around)
 
     @wp.func
     def on(
@@ -279,14 +337,17 @@ def build_laws(t: Types, laws: tuple[LawParams, ...], flow, chain, mount_velocit
             a.thrust_rate = a.thrust_rate + real(1.0e3) * (f1[i] - f0[i])
         if attached != 0:
             pos, vel = chain.payload(rope, vec3(), mount_velocity(rope, s), n, u)
+            a.payload_pos_w = s.pos_w + wp.quat_rotate(s.quat_wb, rope.mount) + pos
             a.payload_vel_w = vel
             a.cable_dir_w = wp.normalize(pos)
+            a.mount_b = rope.mount
             a.tension = chain.pull(rope, stiffness)
         out = air
         out.push_w = air.push_w + force(a, air.laws)
         out.twist_b = air.twist_b + torque(a, air.laws)
         if attached != 0:
             out.payload_push_w = air.payload_push_w + payload_force(a, air.laws)
+            out = act_in_joint(a, out)
         return out
 
     @wp.func

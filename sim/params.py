@@ -274,10 +274,11 @@ class SimParams:
 class LawParams:
     """A force or torque besides the blocks' own: coefficient times scalars times a vector, by the names of :mod:`sim.laws`.
 
-    It acts on the vehicle (force in the world frame, torque in the body's) or, while it hangs and after, on the payload.
+    It acts on the vehicle (force in the world frame, torque in the body's), on the payload, while it hangs and after, or in the
+    rope's joint at the mount: a torque on the vehicle in the body frame, and the opposite one on the rope.
     """
 
-    block: Literal["vehicle force", "vehicle torque", "payload force"]
+    block: Literal["vehicle force", "vehicle torque", "payload force", "rope joint"]
     factors: tuple[str, ...]  # up to two scalars
     vector: str
     coefficient: float  # in the unit that makes the product N or N m

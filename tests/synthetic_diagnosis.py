@@ -1,7 +1,8 @@
 """Flights of two point masses with effects whose truth is known: a model to be diagnosed without any simulator.
 
 Vehicle and payload are moved by smooth random forces; positions of both are measured. Effects are force shapes on either mass or
-shifts of a measured position, so the linearisation is exact unless ``curvature`` says otherwise.
+shifts of a measured position, so the linearisation is exact unless ``curvature`` says otherwise. A hidden law acts at all times,
+not at the knots alone.
 """
 
 from dataclasses import dataclass, field, replace
@@ -13,19 +14,27 @@ from visthrow.diagnose.model import Effect, Window
 MASS = (0.21, 0.058)  # [kg]
 SIGMA = (5e-4, 8e-4)  # [m]
 LENGTH, KNOTS = 1.0, 11
+FINE = 50  # steps between two knots
 CHANNELS = ("pos_w", "payload_pos_w")
 GUST = (0.015, 6e-4)  # deviation of the gusts on either mass [N]
 GUST_TIME = 0.6  # [s]
 
 
+def _fine() -> np.ndarray:
+    return np.linspace(0.0, LENGTH, FINE * (KNOTS - 1) + 1)
+
+
+def _placed(time: np.ndarray, forces: np.ndarray) -> np.ndarray:
+    """Positions of a unit mass under forces at fine times, shape (T, n) from (F, n)."""
+    fine = _fine()
+    speed = np.cumsum(forces, axis=0) * fine[1]
+    place = np.cumsum(speed, axis=0) * fine[1]
+    return np.array([np.interp(time, fine, column) for column in place.T]).T
+
+
 def _response(time: np.ndarray, knots: np.ndarray) -> np.ndarray:
     """Position after a unit force on a unit mass at each knot (triangles), shape (T, knots)."""
-    fine = np.linspace(0.0, LENGTH, 501)
-    step = fine[1]
-    shapes = np.array([np.interp(fine, knots, row) for row in np.eye(len(knots))]).T
-    speed = np.cumsum(shapes, axis=0) * step
-    place = np.cumsum(speed, axis=0) * step
-    return np.array([np.interp(time, fine, column) for column in place.T]).T
+    return _placed(time, np.array([np.interp(_fine(), knots, row) for row in np.eye(len(knots))]).T)
 
 
 def catalogue(count: int = 20) -> tuple[Effect, ...]:
@@ -70,6 +79,7 @@ class SyntheticModel:
         self._time = np.arange(0.0, LENGTH, 1.0 / self.rate)
         self._knots = np.linspace(0.0, LENGTH, KNOTS)
         self._placed = _response(self._time, self._knots)
+        self.by_law: list[np.ndarray] = []  # of each window, what the law adds to the measured positions
         self._windows = [w for flight in range(self.free + self.throws) for w in self._flight(flight)]
 
     def _flight(self, flight: int) -> list[Window]:
@@ -77,24 +87,28 @@ class SyntheticModel:
             return [self._window(flight, "flight", k * LENGTH, 1.0) for k in range(4)]
         return [self._window(flight, "hover", 0.0, 0.3), self._window(flight, "throw", LENGTH, 2.0)]
 
-    def _smooth(self, size: int, scale: float) -> np.ndarray:
+    def _smooth(self, size: int, scale: float, at: np.ndarray | None = None) -> np.ndarray:
+        at = self._knots if at is None else at
         phase, speed = self._rng.uniform(0, 2 * np.pi, (3, size)), self._rng.uniform(2.0, 9.0, (3, size))
-        waves = np.sin(speed[..., None] * self._knots + phase[..., None]) * self._rng.normal(size=(3, size))[..., None]
-        return scale * waves.sum(0).T / 1.7  # (knots, size)
+        waves = np.sin(speed[..., None] * at + phase[..., None]) * self._rng.normal(size=(3, size))[..., None]
+        return scale * waves.sum(0).T / 1.7  # (times, size)
 
     def _motion(self, vigour: float) -> dict[str, np.ndarray]:
-        velocity = self._smooth(3, 1.5 * vigour)
+        """At fine times; every ``FINE``-th is a knot."""
+        at = _fine()
+        velocity = self._smooth(3, 1.5 * vigour, at)
         return {
-            "time": self._knots, "pos_w": self._smooth(3, 0.5) + [0, 0, 1.5], "vel_w": velocity,
-            "quat_wb": np.tile([0.0, 0.0, 0.0, 1.0], (KNOTS, 1)), "rate_b": self._smooth(3, vigour),
-            "thrust": 2.63 + self._smooth(1, 0.8 * vigour)[:, 0], "payload_pos_w": self._smooth(3, 0.5) + [0, 0, 1.2],
-            "payload_vel_w": velocity + self._smooth(3, 0.7 * vigour),
-            "cable_dir_w": np.tile([0.0, 0.0, -1.0], (KNOTS, 1)), "tension": 0.57 + self._smooth(1, 0.1)[:, 0],
+            "time": at, "pos_w": self._smooth(3, 0.5, at) + [0, 0, 1.5], "vel_w": velocity,
+            "quat_wb": np.tile([0.0, 0.0, 0.0, 1.0], (len(at), 1)), "rate_b": self._smooth(3, vigour, at),
+            "thrust": 2.63 + self._smooth(1, 0.8 * vigour, at)[:, 0], "payload_pos_w": self._smooth(3, 0.5, at) + [0, 0, 1.2],
+            "payload_vel_w": velocity + self._smooth(3, 0.7 * vigour, at),
+            "cable_dir_w": np.tile([0.0, 0.0, -1.0], (len(at), 1)), "tension": 0.57 + self._smooth(1, 0.1, at)[:, 0],
         }  # fmt: skip
 
     def _window(self, flight: int, phase: str, start: float, vigour: float) -> Window:
         n = len(self._time)
-        motion = self._motion(vigour)
+        moves = self._motion(vigour)
+        motion = {name: value[::FINE] for name, value in moves.items()}
         effects = np.zeros((6 * n, len(self.effects)))
         for j, e in enumerate(self.effects):
             on_payload = e.channels == ("payload_pos_w",)
@@ -113,11 +127,10 @@ class SyntheticModel:
                 nuisance[rows, m * 6 + axis], nuisance[rows, m * 6 + 3 + axis] = 1.0, self._time
                 at = (m * 3 + axis) * KNOTS
                 latent[rows, at : at + KNOTS] = self._placed / MASS[m]
-        forces = self._gusts()
-        if self.law:
-            forces = forces + self._law(motion)
         sigma = np.repeat(SIGMA, 3 * n)
-        measured = latent @ forces + self._answer(effects, self.truth) + sigma * self.noise * self._draw.normal(size=6 * n)
+        self.by_law.append(self._moved(moves) if self.law else np.zeros(6 * n))
+        measured = latent @ self._gusts() + self.by_law[-1] + self._answer(effects, self.truth)
+        measured += sigma * self.noise * self._draw.normal(size=6 * n)
         measured += nuisance @ self._draw.normal(0.0, 0.02, 12)
         return Window(
             flight, phase, start + np.tile(np.repeat(self._time, 3), 2), np.repeat([0, 1], 3 * n), measured, sigma, effects,
@@ -130,8 +143,13 @@ class SyntheticModel:
         white = self._draw.normal(size=(2, 3, KNOTS)) * self.gust * np.array(GUST)[:, None, None]
         return (white @ root.T).ravel()
 
+    def _moved(self, moves: dict[str, np.ndarray]) -> np.ndarray:
+        """What the law adds to the measured positions, shape (6 n,)."""
+        forces = self._law(moves).reshape(2, 3, -1)
+        return np.concatenate([(_placed(self._time, forces[m].T) / MASS[m]).ravel() for m in range(2)])
+
     def _law(self, motion: dict[str, np.ndarray]) -> np.ndarray:
-        force = np.zeros((2, 3, KNOTS))
+        force = np.zeros((2, 3, len(motion["time"])))
         if self.law == "speed":  # drag of the vehicle that grows with the square of its speed
             force[0] = -self.law_size * (np.linalg.norm(motion["vel_w"], axis=1)[:, None] * motion["vel_w"]).T
         elif self.law == "swirl":  # a force across the payload's velocity

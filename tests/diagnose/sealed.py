@@ -57,7 +57,7 @@ NOT_WAITED = "timeout"
 
 TERMS = {
     "law_ball_swirl": "F_p = c (z x v_p)", "law_vehicle_swirl": "F = c (e_z x v)", "law_speed_thrust": "F = c T v_xy e_z",
-    "law_slew_thrust": "F = c dT/dt e_z", "law_joint_square": "F_p = c |v_s| v_s",
+    "law_slew_thrust": "F = c dT/dt e_z", "law_joint_square": "M_j = c |Ω| Ω",
 }  # fmt: skip
 """The same as the tool writes them."""
 

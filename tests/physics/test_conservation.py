@@ -5,10 +5,11 @@ import dataclasses
 import numpy as np
 import pytest
 
-from sim.params import GRAVITY
+from sim.hybrid import HybridSim
+from sim.params import GRAVITY, LawParams
 from sim.reference.scene import Wrench, load_scene
 from tests.plants import SCENES
-from tests.simulators import energy, momentum, rotate, scene_sim
+from tests.simulators import energy, momentum, rotate, scene_plant, scene_sim
 
 DRIFT = 5e-3
 """Of the energy in 1.2 s at 2 ms."""
@@ -22,6 +23,12 @@ DISSIPATION = 0.01
 """Of the dissipated energy; the integrator's own loss at 0.25 ms is a few millionths of the whole energy."""
 STEPS = 60
 """Of 20 ms."""
+FRICTION = 5e-4
+"""Of a rope's mount [N m s]."""
+MOVED = 0.02
+"""Rate [rad/s] and speeds [m/s] that this friction changes at least."""
+HELD = 2e-3
+"""Share of the change by which a law differs, that is held over a step of 0.25 ms."""
 
 
 def free(**changes):
@@ -86,6 +93,27 @@ def test_joint_damping_takes_what_its_law_says():
         powers.append(damping * np.square(relative_rates(sim)).sum())
     expected = period * (np.sum(powers) - 0.5 * (powers[0] + powers[-1]))
     assert energies[0] - energies[-1] == pytest.approx(expected, rel=DISSIPATION)
+
+
+def test_a_linear_torque_in_the_ropes_joint_is_the_mounts_friction():
+    """A law's pair of forces and torque do to vehicle, rod and ball what the couple in the chain's own equations does."""
+    scene = free(segments=1, segment_length=0.5, rate_b=(1.0, -4.0, 3.0), cable_rate_w=(2.0, 6.0, 1.0))
+    plant = scene_plant(scene, 2.5e-4, "float64", 0.01)
+    rubbing = dataclasses.replace(plant.rope, mount_damping=FRICTION)
+    law = LawParams("rope joint", (), "joint_rate", FRICTION)
+    ends = []
+    for same in (plant, dataclasses.replace(plant, rope=rubbing), dataclasses.replace(plant, laws=(law,))):
+        sim = HybridSim(same, 1, gravity=0.0)
+        place = ([scene.pos_w], [scene.quat_wb], [scene.vel_w], [scene.rate_b], [scene.cable_dir_w()], [scene.cable_vel_w()])
+        sim.place(*map(np.array, place))
+        sim.set_command(np.array([[2.0, 0.0, 0.0, 0.0]]))
+        for _ in range(20):
+            sim.step()
+        ends.append(np.concatenate([np.ravel(sim.get(name)) for name in ("rate_b", "vel_w", "payload_vel_w")]))
+    without, rubbed, lawful = ends
+    moved = np.abs(rubbed - without)
+    assert np.all(moved.reshape(3, 3).max(axis=1) > MOVED)
+    assert np.abs(lawful - rubbed).max() < HELD * moved.max()
 
 
 @pytest.mark.parametrize("precision", ["float32", "float64"])

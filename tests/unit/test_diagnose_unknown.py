@@ -1,19 +1,24 @@
 """Laws outside the catalogue: terms with units, found and told from names; tables where no formula is asked for."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
-from visthrow.diagnose import grammar, result, search
+from visthrow.diagnose import grammar, result, search, unknown
 from visthrow.diagnose.blackbox import Table, table_of, train, unexplained
+from visthrow.diagnose.evidence import Priors
+from visthrow.diagnose.excess import acts_on
 from visthrow.diagnose.model import LATENT_BLOCKS
+from visthrow.diagnose.point import Problem, linearise
 
 EFFECTS = catalogue(12)
+IN_THE_BODY = ("vehicle torque", grammar.JOINT)
 LEFT = 0.7  # of a hidden force after a table learnt from a dozen throws, in a throw that it has not seen: a table is no formula
 KNOTS = (
-    "time", "pos_w", "vel_w", "quat_wb", "rate_b", "thrust", "payload_pos_w", "payload_vel_w", "cable_dir_w", "tension",
+    "time", "pos_w", "vel_w", "quat_wb", "rate_b", "thrust", "payload_pos_w", "payload_vel_w", "cable_dir_w", "tension", "mount_b",
 )  # fmt: skip
 
 
@@ -40,15 +45,16 @@ def random_knots(seed: int = 0) -> dict:
         "quat_wb": unit(rng.normal(size=(k, 4))), "rate_b": rng.normal(size=(k, 3)), "thrust": rng.uniform(1, 4, k),
         "payload_pos_w": rng.normal(size=(k, 3)), "payload_vel_w": rng.normal(size=(k, 3)),
         "cable_dir_w": unit(rng.normal(size=(k, 3))), "tension": rng.uniform(0, 1, k),
+        "mount_b": np.tile([0.01, 0.0, -0.02], (k, 1)),
     }  # fmt: skip
 
 
-@pytest.mark.parametrize("block", LATENT_BLOCKS)
+@pytest.mark.parametrize("block", grammar.BLOCKS)
 def test_terms_turn_with_the_world(block):
     """Frame-covariant: forces turn with the world about the vertical, torques in the body do not notice."""
     knots, angle = random_knots(), 0.7
     c, s = np.cos(angle), np.sin(angle)
-    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) if block != "vehicle torque" else np.eye(3)
+    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) if block not in IN_THE_BODY else np.eye(3)
     terms = grammar.terms(block, KNOTS)
     assert len(terms) > 300
     values = grammar.table_of(terms, knots)
@@ -56,12 +62,69 @@ def test_terms_turn_with_the_world(block):
     np.testing.assert_allclose(again, np.einsum("ij,kjt->kit", turn, values), atol=1e-9 * np.abs(values).max())
 
 
-def test_the_table_of_terms_holds_each_term():
+@pytest.mark.parametrize("block", grammar.BLOCKS)
+def test_the_table_of_terms_holds_each_term(block):
+    """All at once, in their order, to the last bit what one product after the other gives."""
     knots = random_knots()
-    terms = grammar.terms("payload force", KNOTS)
+    terms = grammar.terms(block, KNOTS)
     values = grammar.table_of(terms, knots)
-    for i in (0, 17, len(terms) - 1):
-        np.testing.assert_allclose(values[:, :, i], terms[i].values(knots))
+    assert values.shape == (len(knots["time"]), 3, len(terms))
+    for i, term in enumerate(terms):
+        own = grammar.VECTORS[block][term.vector].values(knots)
+        for factor in term.factors:
+            own = own * grammar.SCALARS[factor].values(knots)[:, None]
+        np.testing.assert_array_equal(values[:, :, i], own)
+        assert values[:, :, i].tobytes() == term.values(knots).tobytes()
+
+
+def test_what_follows_from_knots_is_computed_once(monkeypatch):
+    calls = []
+    swing = grammar.DERIVED["swing"]
+    monkeypatch.setitem(grammar.DERIVED, "swing", lambda k: calls.append(1) or swing(k))
+    known = grammar.Known(random_knots())
+    for block in grammar.BLOCKS:
+        grammar.table_of(grammar.terms(block, KNOTS), known)
+    assert len(calls) == 1
+
+
+def test_a_torque_in_the_joint_acts_on_both_sides():
+    """No force is left over, and no moment but the one about the rope, which a rope without stiffness does not take."""
+    knots = random_knots()
+    terms = grammar.terms(grammar.JOINT, KNOTS)[:5]
+    torque_b = grammar.table_of(terms, knots)
+    found = grammar.loads(grammar.JOINT, knots, torque_b)
+    assert tuple(sorted(found)) == tuple(sorted(LATENT_BLOCKS))
+    np.testing.assert_allclose(found["vehicle force"], -found["payload force"])
+    away = knots["payload_pos_w"] - knots["pos_w"]
+    along = away - grammar.rotate(knots, knots["mount_b"])
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    for i in range(len(terms)):
+        on_vehicle = grammar.rotate(knots, found["vehicle torque"][:, :, i])
+        about_it = on_vehicle + np.cross(away, found["payload force"][:, :, i])
+        twist = np.einsum("ki,ki->k", grammar.rotate(knots, torque_b[:, :, i]), along)[:, None] * along
+        np.testing.assert_allclose(about_it, twist, atol=1e-12 * np.abs(away).max() ** 3)
+
+
+def test_no_torque_acts_in_a_joint_on_which_nothing_hangs():
+    knots = random_knots() | {"tension": np.array([1.0, 0.5, 0.1, 0.0, 0.0, 0.0])}
+    values = grammar.table_of(grammar.terms(grammar.JOINT, KNOTS), knots)
+    assert not values[3:].any()
+    assert values[:3].any()
+
+
+def test_hats_at_the_knots_follow_the_curve_between_them():
+    """Of a swing of 2 Hz, the values at knots a tenth of a second apart would cut an eighth off."""
+    fine, knots = np.linspace(0.0, 10.0, 801), np.arange(11)
+    curve = lambda t: np.sin(2.0 * np.pi * 0.2 * t + 0.3)  # noqa: E731  in knots
+    hats = np.maximum(1.0 - np.abs(fine[:, None] - knots), 0.0)
+    inside = slice(80, -80)
+    told = [(hats @ c)[inside] for c in (curve(knots), grammar.between(11) @ curve(knots))]
+    truth = curve(fine)[inside]
+    share = [float(t @ truth / (truth @ truth)) for t in told]
+    assert share[0] < 0.9
+    assert share[1] == pytest.approx(1.0, abs=0.02)
+    for count in (1, 2):
+        np.testing.assert_array_equal(grammar.between(count), np.eye(count))
 
 
 @pytest.mark.parametrize(("term", "unit", "formula"), [
@@ -70,6 +133,8 @@ def test_the_table_of_terms_holds_each_term():
     (grammar.Term("payload force", (), "vertical_cross_vel"), "kg s^-1", "F_p = c (z x v_p)"),
     (grammar.Term("vehicle torque", ("thrust",), "axis_cross_vel"), "s", "M = c T (e_z x v)"),
     (grammar.Term("vehicle force", ("thrust",), "body_z"), "1", "F = c T e_z"),
+    (grammar.Term(grammar.JOINT, ("joint_rate",), "joint_rate"), "kg m^2", "M_j = c |Ω| Ω"),
+    (grammar.Term(grammar.JOINT, ("tension",), "friction"), "m", "M_j = c S Ω/|Ω|"),
 ])  # fmt: skip
 def test_units_and_formulas(term, unit, formula):
     assert term.unit == unit
@@ -117,8 +182,8 @@ def with_a_name_for_the_law(most: float) -> SyntheticModel:
     """A hidden drag of 0.02, and an effect of the very same form that is unusual beyond 0.005 and cannot exceed ``most``."""
     model = SyntheticModel(effects=EFFECTS, law="speed", law_size=0.02, seed=3)
     model.effects = (EFFECTS[0], replace(EFFECTS[1], floor=1e-3, prior_sd=3e-3, bounds=(-0.1, most)), *EFFECTS[2:])
-    for w in model._windows:
-        w.effects[:, 1] = w.latent @ model._law(w.knots) / model.law_size
+    for w, moved in zip(model._windows, model.by_law):
+        w.effects[:, 1] = moved / model.law_size
     return model
 
 
@@ -134,6 +199,71 @@ def test_a_name_that_would_have_to_exceed_its_bound_stays_none():
     diagnosis = search.explain(with_a_name_for_the_law(0.01))
     assert diagnosis.overall == result.UNKNOWN
     assert not diagnosis.named
+
+
+def beside_a_law(model: SyntheticModel, active: list[int]) -> tuple[search.Search, unknown.Hypothesis]:
+    """A search that has come to some names, and the hypothesis of the model's drag beside them."""
+    priors = Priors.of(model.effects, model.channels)
+    problem = Problem(model, priors, tuple(range(len(model._windows))))
+    nominal = linearise(problem, np.zeros(len(model.effects)))
+    at = search.Search(problem, nominal, 4.0, lambda _: None, active=active)
+    at.point = at._candidate(nominal, active)
+    term = grammar.Term("vehicle force", ("speed",), "vel")
+    return at, unknown._weigh(at.point, priors, active, term, 0.1, 7.0, unknown._known(at.point))
+
+
+def test_names_in_the_block_of_a_law_are_withdrawn_and_others_stay():
+    """What acts where the law acts may be a part of its form; a force on the payload is none."""
+    truth = {"effect_03": 15.0, "effect_06": 15.0}
+    at, law = beside_a_law(SyntheticModel(effects=EFFECTS, law="speed", law_size=0.02, truth=truth, seed=3), [3, 6])
+    assert [acts_on(at.point, j) for j in at.active] == ["vehicle force", "payload force"]
+    assert unknown.withdrawn_for(at, law) == {3}
+
+
+def test_names_that_differ_by_a_force_in_the_block_of_a_law_are_withdrawn():
+    """A force on the payload and its twin that pushes the vehicle as well: what tells them apart is a force on the vehicle."""
+    model = SyntheticModel(effects=EFFECTS, law="speed", law_size=0.02, seed=3)
+    for w in model._windows:
+        w.effects[:, 8] = w.effects[:, 6] + 0.2 * w.effects[:, 3]
+    at, law = beside_a_law(model, [6, 8])
+    assert [acts_on(at.point, j) for j in at.active] == ["payload force"] * 2
+    assert [acts_on(at.point, j, beside=[14 - j]) for j in at.active] == ["vehicle force"] * 2
+    assert unknown.withdrawn_for(at, law) == {6, 8}
+
+
+def test_what_was_named_for_a_withdrawn_name_alone_goes_with_it():
+    model = SyntheticModel(effects=EFFECTS, law="speed", law_size=0.02, truth={"effect_03": 15.0}, seed=3)
+    at, law = beside_a_law(model, [3, 6])
+    assert unknown.withdrawn_for(at, law) == {3, 6}
+
+
+def test_laws_are_weighed_as_they_are_told():
+    """Beside a name for a part of the drag a wrong form explains about as much; the right one needs no name."""
+    model = with_a_name_for_the_law(0.1)
+    for w in model._windows:
+        drag = np.zeros((6, 11))
+        drag[:3] = -w.knots["vel_w"].T
+        w.effects[:, 1] = w.latent @ (drag @ grammar.between(11).T).ravel()
+    at, right = beside_a_law(model, [1])
+    cubic = grammar.Term("vehicle force", ("speed", "speed"), "vel")
+    wrong = unknown._weigh(at.point, at.priors, at.active, cubic, 0.1, 7.0, unknown._known(at.point))
+    told = unknown._as_told(at, [wrong, right])
+    assert [h.names for h in told] == [(), ()]
+    apart = right.net(4.0) - wrong.net(4.0)
+    assert told[1].net(4.0) - told[0].net(4.0) > apart + 50.0
+    assert told[1].laws()[0].coefficient == pytest.approx(-0.02, rel=0.05)
+    real, beside = beside_a_law(SyntheticModel(effects=EFFECTS, law="speed", law_size=0.01, truth={"effect_03": 60.0}, seed=3), [3])
+    assert [h.names for h in unknown._as_told(real, [beside])] == [(3,)]  # no drag explains that
+
+
+def test_names_that_a_law_hardly_needs_come_after_a_law_without():
+    def hypothesis(nats: float, *names: int) -> tuple[SimpleNamespace, None]:
+        return SimpleNamespace(net=lambda least: nats, names=names), None
+
+    found = [hypothesis(100.0, 1, 2), hypothesis(97.0), hypothesis(98.0, 1), hypothesis(80.0)]
+    assert [h.net(4.0) for h, _ in unknown._ordered(found, 4.0)] == [97.0, 98.0, 100.0, 80.0]
+    assert unknown._ordered([*found, hypothesis(120.0, 1)], 4.0)[0][0].net(4.0) == 120.0
+    assert unknown._ordered([], 4.0) == []
 
 
 def test_known_causes_and_gusts_are_no_laws():

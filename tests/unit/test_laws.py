@@ -23,7 +23,7 @@ def knots(seed: int = 0) -> dict[str, np.ndarray]:
     value = {
         "time": np.array([0.0, 0.1]), "pos_w": rng.normal(size=3), "vel_w": rng.normal(size=3), "rate_b": rng.normal(size=3),
         "quat_wb": quat / np.linalg.norm(quat), "payload_vel_w": rng.normal(size=3), "payload_pos_w": rng.normal(size=3),
-        "cable_dir_w": cable / np.linalg.norm(cable), "tension": 0.7,
+        "cable_dir_w": cable / np.linalg.norm(cable), "tension": 0.7, "mount_b": rng.normal(size=3),
     }  # fmt: skip
     out = {name: v if name == "time" else np.stack([v, v]) for name, v in value.items()}
     return out | {"thrust": np.array([2.5, 2.9])}

@@ -9,8 +9,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from visthrow.diagnose.marginal import posterior
-from visthrow.diagnose.model import LATENT_BLOCKS
+from visthrow.diagnose.grammar import JOINT, JOINT_NEEDS, Known, coefficients, loads
+from visthrow.diagnose.marginal import Gram, posterior
+from visthrow.diagnose.model import LATENT_BLOCKS, Window
 from visthrow.diagnose.point import Point
 from visthrow.diagnose.result import Level
 
@@ -67,29 +68,54 @@ def _upper_limit(point: Point, block: int, phase: str) -> float:
     return float(best * STEP**step)
 
 
-def acts_on(point: Point, j: int) -> str:
-    """Latent block through which an effect moves things, or "" where it moves measurements alone.
+def acts_on(point: Point, j: int, *, joint: bool = False, beside: Sequence[int] = ()) -> str:
+    """Block through which an effect moves things, or "" where it moves measurements alone.
 
     Its column is laid over the columns of each block's latent forces; the block that explains most of it, and at least half, is it.
+
+    Args:
+        point: with the latent forces' derivatives.
+        j: the effect.
+        joint: consider the torque between vehicle and rope as well.
+        beside: effects that may take any size: what they can stand in for is left out.
     """
     weight = point.noise.scale**-2.0
-    total, by_block = 0.0, np.zeros(len(LATENT_BLOCKS))
-    for gram in point.grams:
+    total, by_block = 0.0, dict.fromkeys((*LATENT_BLOCKS, JOINT), 0.0)
+    for gram, window in zip(point.grams, point.windows):
         inner, size = np.tensordot(weight, gram.inner, 1), gram.nuisances + gram.latents
-        column = size + j
-        free = np.arange(gram.nuisances)
+        free, column = [*range(gram.nuisances), *(size + k for k in beside)], size + j
         own = _explained(inner, free, column)
         total += inner[column, column] - own
         for block in np.unique(gram.latent_block):
             with_block = np.concatenate((free, gram.nuisances + np.flatnonzero(gram.latent_block == block)))
-            by_block[block] += _explained(inner, with_block, column) - own
-    best = int(np.argmax(by_block))
-    return LATENT_BLOCKS[best] if total > 0.0 and by_block[best] > 0.5 * total else ""
+            by_block[LATENT_BLOCKS[block]] += _explained(inner, with_block.astype(int), column) - own
+        if joint and (torques := joint_torques(gram, window)) is not None:
+            move = np.zeros((len(inner), len(free) + torques.shape[1]))
+            move[free, np.arange(len(free))] = 1.0
+            move[gram.nuisances : size, len(free) :] = torques
+            by_block[JOINT] += _explained_by(move.T @ inner @ move, move.T @ inner[column]) - own
+    best = max(by_block, key=by_block.get)
+    return best if total > 0.0 and by_block[best] > 0.5 * total else ""
+
+
+def joint_torques(gram: Gram, window: Window) -> np.ndarray | None:
+    """Latents of a gram that torques in the rope's joint about each axis at each knot stand for, shape (L, 3k); None without."""
+    known = Known(window.knots)
+    if not set(JOINT_NEEDS) <= set(known) or len(np.unique(gram.latent_block)) < len(LATENT_BLOCKS):
+        return None
+    count = len(known["time"])
+    units = np.eye(3 * count).reshape(count, 3, 3 * count)
+    at = window.latent_block, window.latent_axis, window.latent_time, known["time"]
+    whole = sum(coefficients(*at, block, values) for block, values in loads(JOINT, known, units).items())
+    return np.linalg.solve(gram.factor, whole)
 
 
 def _explained(inner: np.ndarray, columns: Sequence[int], target: int) -> float:
     """Part of a column's square that other columns explain."""
-    normal, right = inner[np.ix_(columns, columns)], inner[columns, target]
+    return _explained_by(inner[np.ix_(columns, columns)], inner[columns, target])
+
+
+def _explained_by(normal: np.ndarray, right: np.ndarray) -> float:
     normal = normal + np.diag(1e-9 * np.diag(normal) + 1e-12)
     return float(right @ np.linalg.solve(normal, right))
 

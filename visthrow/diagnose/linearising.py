@@ -124,6 +124,7 @@ def at_knots(flights: Flights, setting: Setting, w: int, knots: Mapping[str, np.
     arm = np.array(setting.plant.rope.mount) - np.array(setting.plant.vehicle.body.com)
     reach = told["payload_pos_w"] - told["pos_w"] - Rotation.from_quat(told["quat_wb"]).apply(arm)
     told["cable_dir_w"] = reach / np.linalg.norm(reach, axis=1, keepdims=True)
+    told["mount_b"] = np.tile(arm, (len(time), 1))
     f = flights.flights[c.flight]
     if f.latch != NEVER:
         told["tension"][told["time"] > f.latch + setting.plant.release.lag] = 0.0

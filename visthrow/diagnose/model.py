@@ -62,7 +62,7 @@ class Window:
     knots: Mapping[str, np.ndarray] = field(default_factory=dict)
     """Simulated quantities at the knots of the latent forces, shape (knots, ...), for laws outside the catalogue: ``time``,
     ``pos_w``, ``vel_w``, ``quat_wb``, ``rate_b``, ``thrust`` [N], ``payload_pos_w``, ``payload_vel_w``, ``cable_dir_w``,
-    ``tension`` [N]."""
+    ``tension`` [N], ``mount_b`` (of the rope, from the centre of mass) [m, body frame]."""
 
 
 LATENT_BLOCKS = ("vehicle force", "vehicle torque", "payload force")

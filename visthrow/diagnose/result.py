@@ -80,7 +80,7 @@ class Law:
     """A term outside the catalogue: coefficient times scalar factors times a vector."""
 
     formula: str
-    block: str  # latent block, of visthrow.diagnose.model.LATENT_BLOCKS
+    block: str  # of visthrow.diagnose.grammar.BLOCKS
     factors: tuple[str, ...]  # keys of visthrow.diagnose.grammar.SCALARS
     vector: str  # key of visthrow.diagnose.grammar.VECTORS
     coefficient: float

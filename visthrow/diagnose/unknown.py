@@ -10,15 +10,18 @@ from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.linalg import lapack
 
 from visthrow.diagnose import grammar
 from visthrow.diagnose import noise as noise_levels
 from visthrow.diagnose.consistency import LEAST_FLIGHTS, differ
 from visthrow.diagnose.evidence import Priors, covariance, estimate
-from visthrow.diagnose.marginal import Gram, WindowStatistics, gather, window_statistics
-from visthrow.diagnose.model import LATENT_BLOCKS
-from visthrow.diagnose.point import Point, advantage, shifted
+from visthrow.diagnose.excess import acts_on
+from visthrow.diagnose.marginal import Gram, Integral, Noise, WindowStatistics, gather, window_statistics
+from visthrow.diagnose.model import LATENT_BLOCKS, Window
+from visthrow.diagnose.point import Point, advantage, integrals_of, shifted
 from visthrow.diagnose.result import Law
+from visthrow.diagnose.threads import each
 
 if TYPE_CHECKING:
     from visthrow.diagnose.search import Search
@@ -107,6 +110,12 @@ def _terms(block: str, known: tuple[str, ...]) -> tuple[grammar.Term, ...]:
     return tuple(grammar.terms(block, known))
 
 
+@lru_cache(maxsize=32)
+def _layout(block: str, known: tuple[str, ...]) -> grammar.Layout | None:
+    terms_ = _terms(block, known)
+    return grammar.Layout.of(terms_) if terms_ else None
+
+
 @dataclass
 class _Screen:
     """Information of all terms about one point, summed over windows."""
@@ -118,12 +127,23 @@ class _Screen:
     cross: np.ndarray  # with the effects, shape (T, K)
 
 
-def _columns(point: Point, window: int, block: str, terms_: Sequence[grammar.Term]) -> np.ndarray:
-    w = point.windows[window]
-    if not np.any(w.latent_block == LATENT_BLOCKS.index(block)):
-        return np.zeros((len(w.latent_block), len(terms_)))
-    values = grammar.table_of(terms_, w.knots)
-    return grammar.coefficients(w.latent_block, w.latent_axis, w.latent_time, w.knots["time"], block, values)
+def _columns(window: Window, known: grammar.Known, layout: grammar.Layout) -> np.ndarray:
+    """Latent-force coefficients of terms, shape (L, T)."""
+    shares = grammar.loads(layout.block, known, layout.table(known))
+    at = window.latent_block, window.latent_axis, window.latent_time, known["time"]
+    smooth = grammar.between(len(known["time"]))
+    return sum(grammar.coefficients(*at, block, np.tensordot(smooth, values, 1)) for block, values in shares.items())
+
+
+def _carries(latent_block: np.ndarray, block: str) -> np.ndarray | None:
+    """Which latents of a window terms of a block act through, as a mask; None where the window lacks some."""
+    needed = [LATENT_BLOCKS.index(name) for name in grammar.acting(block)]
+    return np.isin(latent_block, needed) if np.all(np.isin(needed, latent_block)) else None
+
+
+def _felt(block: str) -> str:
+    """Latent block whose levels a term's size is measured in."""
+    return "vehicle torque" if block == grammar.JOINT else block
 
 
 def _calm(point: Point) -> tuple[Point, list[WindowStatistics]]:
@@ -136,7 +156,7 @@ def _calm(point: Point) -> tuple[Point, list[WindowStatistics]]:
     for block in {block for block, _ in levels}:
         limits[block] = ROUGHER * _usual(levels, block)
     noise = replace(point.noise, latent_sd={key: min(level, limits[key[0]]) for key, level in levels.items()})
-    parts = [window_statistics(gram, noise, w) for w, gram in enumerate(point.grams)]
+    parts = each(lambda w: window_statistics(point.grams[w], noise, w), range(len(point.grams)))
     return replace(point, noise=noise, statistics=gather(point.grams, parts, point.theta)), parts
 
 
@@ -146,27 +166,26 @@ def _usual(levels: Mapping[tuple[int, str], float], block: int) -> float:
     return own[(len(own) - 1) // 2]
 
 
-def _screen(point: Point, parts: Sequence[WindowStatistics], block: str) -> _Screen | None:
+def _screen(point: Point, parts: Sequence[WindowStatistics], block: str, known: Sequence[grammar.Known]) -> _Screen | None:
     """Gather what each term of a block says; None where the windows carry no knots for any."""
-    index = LATENT_BLOCKS.index(block)
-    knots = [set(w.knots) for w in point.windows if np.any(w.latent_block == index)]
-    known = set.intersection(*knots) if knots else set()
-    terms_ = _terms(block, tuple(sorted(known))) if "time" in known else ()
-    if not terms_:
+    through = {w: mask for w, gram in enumerate(point.grams) if (mask := _carries(gram.latent_block, block)) is not None}
+    names = [set(point.windows[w].knots) for w in through]
+    shared = set.intersection(*names) if names else set()
+    layout = _layout(block, tuple(sorted(shared))) if "time" in shared else None
+    if layout is None:
         return None
-    count, effects = len(terms_), len(point.theta)
+    felt, count, effects = LATENT_BLOCKS.index(_felt(block)), len(layout.vector), len(point.theta)
     own, score, cross, square = np.zeros(count), np.zeros(count), np.zeros((count, effects)), np.zeros(count)
     rows = 0
-    for w, (gram, part) in enumerate(zip(point.grams, parts)):
-        if not np.any(gram.latent_block == index):
-            continue
-        columns = _columns(point, w, block, terms_)
-        own += np.einsum("lt,lm,mt->t", columns, part.latent_information, columns, optimize=True)
-        score += columns.T @ (part.latent_score + part.latent_effects @ point.theta)
-        cross += columns.T @ part.latent_effects
-        square += (columns**2).sum(0)
-        rows += int((gram.latent_block == index).sum()) // 3
-    return _Screen(list(terms_), np.sqrt(square / max(rows, 1)), own, score, cross)
+    for w, mask in through.items():
+        part, columns = parts[w], _columns(point.windows[w], known[w], layout)
+        square += (columns[point.grams[w].latent_block == felt] ** 2).sum(0)
+        rows += int((point.grams[w].latent_block == felt).sum()) // 3
+        columns = columns[mask]
+        own += ((part.latent_information[np.ix_(mask, mask)] @ columns) * columns).sum(0)
+        score += columns.T @ (part.latent_score + part.latent_effects @ point.theta)[mask]
+        cross += columns.T @ part.latent_effects[mask]
+    return _Screen(list(_terms(block, tuple(sorted(shared)))), np.sqrt(square / max(rows, 1)), own, score, cross)
 
 
 def _gains(point: Point, priors: Priors, active: Sequence[int], screen: _Screen, reach: float) -> tuple[np.ndarray, np.ndarray]:
@@ -180,19 +199,26 @@ def _gains(point: Point, priors: Priors, active: Sequence[int], screen: _Screen,
     return gain, prior
 
 
-def _extended(point: Point, priors: Priors, term: grammar.Term, prior: float) -> tuple[Point, Priors]:
+def _extended(
+    point: Point, priors: Priors, term: grammar.Term, prior: float, known: Sequence[grammar.Known]
+) -> tuple[Point, Priors]:
     """The same point with the term as its last effect, measured in NARROW of its prior deviation."""
-    scale = NARROW * prior
-    raw = [_with_column(g, scale * _columns(point, w, term.block, [term])[:, 0]) for w, g in enumerate(point.raw)]
+    scale, layout = NARROW * prior, grammar.Layout.of([term])
+    grams, integrals = [], []
+    for gram, window, own, integral in zip(point.grams, point.windows, known, point.integrals):
+        acts = _carries(gram.latent_block, term.block) is not None
+        column = scale * _columns(window, own, layout)[:, 0] if acts else np.zeros(gram.latents)
+        grams.append(_with_column(gram, np.linalg.solve(gram.factor, column) if acts else column))
+        integrals.append(_with_last(integral, grams[-1], point.noise))
     wide = Priors(
         np.append(priors.floor, scale), np.append(priors.slab, 1.0 / NARROW), np.append(priors.low, -np.inf),
         np.append(priors.high, np.inf), np.append(priors.visible, True),
     )  # fmt: skip
-    return _rebuilt(replace(point, raw=raw, theta=np.append(point.theta, 0.0)), point.noise), wide
+    return _gathered(replace(point, raw=(), theta=np.append(point.theta, 0.0)), grams, integrals, point.noise), wide
 
 
 def _with_column(gram: Gram, column: np.ndarray) -> Gram:
-    """Append G column as an effect; only for a gram whose latents are still at the knots."""
+    """Append G column as an effect; ``column`` is in the gram's own latents."""
     part = slice(gram.nuisances, gram.nuisances + gram.latents)
     along = gram.inner[:, :, part] @ column
     own = along[:, part] @ column
@@ -202,26 +228,39 @@ def _with_column(gram: Gram, column: np.ndarray) -> Gram:
     return replace(gram, inner=np.concatenate((inner, last[:, None, :]), axis=1), cross=cross)
 
 
-def _rebuilt(point: Point, noise) -> Point:
-    from visthrow.diagnose.marginal import correlated
+def _with_last(known: Integral, gram: Gram, noise: Noise) -> Integral:
+    """The integral of a gram to which one effect was appended."""
+    size, count = len(known.level), len(known.information)
+    last = noise.scale**-2.0 @ gram.inner[:, :, -1]
+    half = lapack.dtrtrs(known.factor, (known.level * last[:size])[:, None], lower=1)[0]
+    own = last[size:] - np.append(known.half, half, axis=1).T @ half[:, 0]
+    information = np.zeros((count + 1, count + 1))
+    information[:count, :count], information[count], information[:, count] = known.information, own, own
+    return replace(known, information=information, half=np.append(known.half, half, axis=1))
 
-    grams = [correlated(g, w, noise.correlation_time) for g, w in zip(point.raw, point.windows)]
-    parts = [window_statistics(gram, noise, w) for w, gram in enumerate(grams)]
-    return replace(point, grams=grams, noise=noise, statistics=gather(grams, parts, point.theta))
+
+def _gathered(point: Point, grams: Sequence[Gram], integrals: Sequence[Integral], noise: Noise) -> Point:
+    parts = [integral.share(gram, noise) for integral, gram in zip(integrals, grams)]
+    return replace(point, grams=grams, noise=noise, integrals=integrals, statistics=gather(grams, parts, point.theta))
 
 
 def _weigh(point: Point, priors: Priors, active: Sequence[int], term: grammar.Term, prior: float, price: float,
-           beside: Hypothesis | None = None) -> Hypothesis:  # fmt: skip
+           known: Sequence[grammar.Known], beside: Hypothesis | None = None) -> Hypothesis:  # fmt: skip
     """Give a term noise levels of its own and compare with the set without it."""
-    base, wide = _extended(point, priors, term, prior)
+    base, wide = _extended(point, priors, term, prior, known)
     named = [*active, len(point.theta)]
     catalogue = beside.catalogue if beside else priors
     change = estimate(base.information, base.score, wide, named) - base.theta
-    noise, _ = noise_levels.fit(base.windows, [shifted(g, change) for g in base.raw], base.noise)
-    own = _rebuilt(base, noise)
+    noise = noise_levels.refit([shifted(g, change) for g in base.grams], base.noise)
+    own = _gathered(base, base.grams, integrals_of(base.grams, noise), noise)
     nats = advantage(wide, (own, named), (base, list(active))) - price
     terms_, scales, paid = (beside.terms, beside.scale, beside.price) if beside else ((), (), 0.0)
     return Hypothesis((*terms_, term), (*scales, NARROW * prior), own, wide, tuple(named), float(nats), catalogue, paid + price)
+
+
+def _known(point: Point) -> list[grammar.Known]:
+    """Quantities at the knots of each window."""
+    return [grammar.Known(window.knots) for window in point.windows]
 
 
 def hypotheses(point: Point, priors: Priors, active: Sequence[int], strongest: dict[str, float], least: float,
@@ -237,7 +276,8 @@ def hypotheses(point: Point, priors: Priors, active: Sequence[int], strongest: d
         beside: a first term that ``point`` already holds.
     """
     calm, parts = _calm(point)
-    screens = {block: screen for block in strongest if (screen := _screen(calm, parts, block)) is not None}
+    known = _known(point)
+    screens = {block: screen for block in strongest if (screen := _screen(calm, parts, block, known)) is not None}
     depths = [term.depth for screen in screens.values() for term in screen.terms]
     price = {depth: float(np.log(sum(d <= depth for d in depths))) for depth in set(depths)}
     found: list[tuple[float, grammar.Term, float]] = []
@@ -246,8 +286,8 @@ def hypotheses(point: Point, priors: Priors, active: Sequence[int], strongest: d
         gain -= [price[term.depth] for term in screen.terms]
         found += [(float(gain[i]), screen.terms[i], float(prior[i])) for i in _distinct(gain, screen)]
     found = sorted((f for f in found if f[0] > least), key=lambda f: -f[0])[:WEIGHED]
-    weighed = [_weigh(point, priors, active, term, prior, price[term.depth], beside) for _, term, prior in found]
-    return sorted((h for h in weighed if h.nats > least and _matters(h) and not _differs(h)), key=lambda h: -h.nats)
+    weighed = [_weigh(point, priors, active, term, prior, price[term.depth], known, beside) for _, term, prior in found]
+    return sorted((h for h in weighed if h.nats > least and _matters(h, known) and not _differs(h)), key=lambda h: -h.nats)
 
 
 def _differs(hypothesis: Hypothesis) -> bool:
@@ -257,16 +297,17 @@ def _differs(hypothesis: Hypothesis) -> bool:
     return len(own) >= LEAST_FLIGHTS and differ(own, statistics.score[:, -1] + own * statistics.theta[-1], FORM)
 
 
-def _matters(hypothesis: Hypothesis) -> bool:
-    """Whether the last term's force, in the phase where it is strongest, exceeds what does not matter."""
+def _matters(hypothesis: Hypothesis, known: Sequence[grammar.Known]) -> bool:
+    """Whether the last term's force, in the phase where it is strongest, exceeds what does not matter in a block it acts in."""
     term, law, point = hypothesis.terms[-1], hypothesis.laws()[-1], hypothesis.point
-    index = LATENT_BLOCKS.index(term.block)
-    square: dict[str, list[float]] = {}
-    for w in point.windows:
-        if np.any(w.latent_block == index):
-            square.setdefault(w.phase, []).append(float((term.values(w.knots) ** 2).sum(1).mean()))
-    force = abs(law.coefficient) * np.sqrt(max(float(np.mean(values)) for values in square.values()))
-    return force > MATERIAL * _usual(point.noise.latent_sd, index)
+    layout = grammar.Layout.of([term])
+    square: dict[tuple[int, str], list[float]] = {}
+    for window, gram, own in zip(point.windows, point.grams, known):
+        if _carries(gram.latent_block, term.block) is not None:
+            for block, values in grammar.loads(term.block, own, layout.table(own)).items():
+                square.setdefault((LATENT_BLOCKS.index(block), window.phase), []).append(float((values**2).sum((1, 2)).mean()))
+    usual = {block: _usual(point.noise.latent_sd, block) for block, _ in square}
+    return any(abs(law.coefficient) * np.sqrt(np.mean(values)) > MATERIAL * usual[block] for (block, _), values in square.items())
 
 
 def _distinct(gain: np.ndarray, screen: _Screen) -> list[int]:
@@ -302,18 +343,32 @@ def find_laws(search: "Search") -> Answer:
     for (block, _), level in search.nominal.noise.latent_sd.items():
         name = LATENT_BLOCKS[block]
         strongest[name] = max(strongest.get(name, 0.0), level)
+    if set(strongest) == set(LATENT_BLOCKS):
+        strongest[grammar.JOINT] = strongest[_felt(grammar.JOINT)]
     if not all(w.knots for w in search.nominal.windows) or not strongest:
         return Answer()
     priors, least = search.priors, search.least
     found = [(h, search.nominal) for h in hypotheses(search.nominal, priors, (), strongest, least)]
     if search.active:
         beside = hypotheses(search.point, priors, search.active, strongest, least)
-        found += [(_pruned(h, least), search.point) for h in beside]
-    found.sort(key=lambda h: -h[0].net(least))
+        found += [(h, search.point) for h in _as_told(search, [_pruned(h, least) for h in beside])]
+    found = _ordered(found, least)
     best = [h for h, _ in found]
     if best and best[0].nats > least + MARGIN:
         best[:1] = _paired(search, *found[0], strongest)
     return Answer(tuple(best))
+
+
+def _ordered(found: Sequence[tuple[Hypothesis, Point]], least: float) -> list[tuple[Hypothesis, Point]]:
+    """Best first; of those within ``MARGIN`` of the best the one with the fewest names: others are not needed beside a law."""
+    top = max((h.net(least) for h, _ in found), default=0.0)
+
+    def rank(item: tuple[Hypothesis, Point]) -> tuple[bool, int, float]:
+        net = item[0].net(least)
+        close = net > top - MARGIN
+        return not close, len(item[0].names) if close else 0, -net
+
+    return sorted(found, key=rank)
 
 
 def _paired(search: "Search", first: Hypothesis, origin: Point, strongest: dict[str, float]) -> list[Hypothesis]:
@@ -326,22 +381,54 @@ def _paired(search: "Search", first: Hypothesis, origin: Point, strongest: dict[
     second = [j for j in pair.active if j != len(pair.priors.floor) - 2]
     if pair.point.evidence(pair.priors, pair.active) - pair.point.evidence(pair.priors, second) > least:
         return [pair, first]
-    own = _weigh(origin, search.priors, first.names, pair.terms[-1], pair.scale[-1] / NARROW, pair.price - first.price)
+    own = _weigh(origin, search.priors, first.names, pair.terms[-1], pair.scale[-1] / NARROW, pair.price - first.price,
+                 _known(origin))  # fmt: skip
     return sorted((own, first), key=lambda h: -h.net(least))
 
 
-def _pruned(hypothesis: Hypothesis, least: float) -> Hypothesis:
-    """Without the names that are not worth their threshold beside the term, the weakest first."""
+def _pruned(hypothesis: Hypothesis, least: float, remainder: float = REMAINDER) -> Hypothesis:
+    """Without the names that are not worth their threshold beside the term, or a share of its evidence, the weakest first."""
     point, priors, active = hypothesis.point, hypothesis.priors, list(hypothesis.active)
     count = len(hypothesis.terms)
     while names := active[:-count]:
         whole = point.evidence(priors, active)
         worth = {j: whole - point.evidence(priors, [k for k in active if k != j]) for j in names}
         weakest = min(worth, key=worth.get)
-        if worth[weakest] > max(least, REMAINDER * (whole - hypothesis.price - point.evidence(priors, names))):
+        if worth[weakest] > max(least, remainder * (whole - hypothesis.price - point.evidence(priors, names))):
             break
         active.remove(weakest)
     return replace(hypothesis, active=tuple(active))
+
+
+def _as_told(search: "Search", beside: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """Hypotheses without the names that will be withdrawn for them, if a law is ahead of the catalogue without these.
+
+    Beside a name in its block a wrong form explains as much as the right one: the name takes up what the form lacks.
+    """
+    told = [_without(h, withdrawn_for(search, h)) for h in beside]
+    ahead = max((h.net(search.least) - _catalogue(search, h) for h in told), default=-np.inf)
+    return told if ahead > MARGIN else list(beside)
+
+
+def _without(hypothesis: Hypothesis, names: set[int]) -> Hypothesis:
+    return replace(hypothesis, active=tuple(j for j in hypothesis.active if j not in names))
+
+
+def withdrawn_for(search: "Search", hypothesis: Hypothesis) -> set[int]:
+    """Names that are not told beside a law: those that act in its block may be a part of its form.
+
+    A name acts there by its column or by what the other names cannot stand in for, as two delays that differ by a force. What is
+    worth nothing without those that act there is not told either.
+    """
+    blocks, names = {term.block for term in hypothesis.terms}, search.active
+    joint = grammar.JOINT in blocks
+    near = {j for j in names if acts_on(search.point, j, joint=joint) in blocks}
+    for j in set(names) - near:
+        others = [k for k in names if k != j]
+        if others and acts_on(search.point, j, joint=joint, beside=others) in blocks:
+            near.add(j)
+    left = _without(hypothesis, near)
+    return set(names) - set((_pruned(left, search.least, 0.0) if near else left).names)
 
 
 def beats_the_catalogue(search: "Search", answer: Answer) -> tuple[Hypothesis | None, set[int], str]:

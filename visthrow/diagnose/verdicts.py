@@ -119,6 +119,8 @@ def _overall(
     search: "Search", found: Sequence[Level], law: "Hypothesis | None", idle: set[int], said: str
 ) -> tuple[str, str, list[str], set[int]]:
     """Overall verdict, block of an unknown effect, reasons, and the names that are withdrawn for it."""
+    from visthrow.diagnose.unknown import withdrawn_for
+
     point, every = search.point, set(search.active)
     strong = too_strong(point, IMPLAUSIBLE_FORCE)
     if strong:
@@ -132,9 +134,7 @@ def _overall(
     reasons = [_excess(level) for level in excessive]
     if law is not None:
         reasons.insert(0, said)
-        blocks = {term.block for term in law.terms}
-        near = {j for j in search.active if acts_on(point, j) in blocks}  # what is named in its block may be a part of its form
-        return result.UNKNOWN, law.terms[0].block, reasons, idle | near
+        return result.UNKNOWN, law.terms[0].block, reasons, idle | withdrawn_for(search, law)
     stuck = [j for j in search.active if _on_bound(search, j)]
     if stuck:
         names = ", ".join(map(search.name, stuck))
