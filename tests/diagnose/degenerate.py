@@ -91,9 +91,6 @@ DEGREE = 0.0175
 Two short hovers in gusts tell a tilt to 2 mrad. Of 8 mrad they hold 4 nats at the best size of any one cause, and 3 for wind,
 frame, markers and drag together, where a cause needs 7: then "no effect; if there at all, between 2 and 10 mrad" is the right
 answer, and there is no class to be reported."""
-LOAD = 0.008
-"""A mass that is 3 % of what the rotors carry, as much as the gain that is hidden beside it [kg]. Of 6 g of payload two hovers hold
-5 nats for the best cause and 7 for all its partners together, where a cause needs 10: again there is no class to be reported."""
 LATE = (1.0,)
 """The only sign in which a delay of commands and one of stamps are a pair: nothing is measured before it happens, so that commands
 that act sooner have no partner."""
@@ -102,8 +99,8 @@ TILTED = frozenset({"wind_x", "frame_tilt_y", "marker_rot_y", "com_x"})
 LONGER = frozenset({"payload_marker_z", "payload_offset", "marker_off_z", "mount_z", "frame_scale"})
 PAIRS = {
     "gain_over_mass": Pair("thrust_gain", 0.03, frozenset({"mass_quad", "air_density"}), BARE, False),
-    "mass_over_gain": Pair("mass_quad", LOAD, frozenset({"thrust_gain", "air_density"}), BARE, False),
-    "payload_or_rope": Pair("mass_payload", LOAD, frozenset({"rope_mass", "downwash", "mass_quad", "thrust_gain"}), HOVER, True),
+    "mass_over_gain": Pair("mass_quad", 0.008, frozenset({"thrust_gain", "air_density"}), BARE, False),
+    "payload_or_rope": Pair("mass_payload", 0.006, frozenset({"rope_mass", "downwash", "mass_quad", "thrust_gain"}), HOVER, True),
     "wind_or_tilt": Pair("wind_x", 0.5, TILTED, BARE, False),
     "tilt_or_wind": Pair("frame_tilt_y", DEGREE, TILTED, BARE, False),
     "markers_or_wind": Pair("marker_rot_y", DEGREE, TILTED, BARE, False),
