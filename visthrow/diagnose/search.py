@@ -47,7 +47,7 @@ CHAIN = 3
 SHORTLIST = 3
 """Candidates whose simulation is run again in each step."""
 
-HOPE = 0.5
+HOPE = 0.6
 """Of the threshold: linear statistics from which a candidate's simulation is run again, where derivatives may fall short of it."""
 
 TURNS, TURNED = 8, 0.5
