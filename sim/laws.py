@@ -341,7 +341,7 @@ def build_laws(t: Types, laws: tuple[LawParams, ...], flow, chain, mount_velocit
             a.payload_vel_w = vel
             a.cable_dir_w = wp.normalize(pos)
             a.mount_b = rope.mount
-            a.tension = chain.pull(rope, stiffness)
+            a.tension = chain.pull(rope, stiffness, u)
         out = air
         out.push_w = air.push_w + force(a, air.laws)
         out.twist_b = air.twist_b + torque(a, air.laws)

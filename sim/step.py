@@ -150,7 +150,7 @@ def build_step(
             n[i] = state.cable_dir_w[i, env]
             u[i] = state.cable_vel_w[i, env]
             stiffness[i] = state.stiffness[i, env]
-        rope = chain.stretched(natural, natural, stiffness, real(0.0))
+        rope = chain.stretched(natural, natural, stiffness, u, real(0.0))
         s = load(state, env)
 
         taken = push(state.queue, env, command[env])
@@ -159,7 +159,7 @@ def build_step(
         timer = state.release_timer[env]
         attached = state.attached[env]
         if release[env] != 0 and timer < real(0.0) and attached != 0:
-            timer = leaving.lag(r, rope, chain.pull(rope, stiffness), gravity)
+            timer = leaving.lag(r, rope, chain.pull(rope, stiffness, u), gravity)
         tiny = real(1.0e-6)
         status = int(0)
         if not taken:
@@ -184,7 +184,7 @@ def build_step(
             active = state.queue[wp.min(slot, depth - 1), env]
             for k in range(count):
                 if attached != 0:
-                    rope = chain.stretched(natural, rope, stiffness, h)
+                    rope = chain.stretched(natural, rope, stiffness, u, h)
                 now = laws.on(p, rope, air, s, n, u, stiffness, active, attached)
                 if attached != 0:
                     s, total, fell_back = coupled.step(
@@ -245,7 +245,7 @@ def build_step(
             n[i] = state.cable_dir_w[i, env]
             u[i] = state.cable_vel_w[i, env]
             stiffness[i] = state.stiffness[i, env]
-        rope = chain.stretched(natural, natural, stiffness, real(0.0))
+        rope = chain.stretched(natural, natural, stiffness, u, real(0.0))
         if state.attached[env] != 0:
             mount = s.pos_w + wp.quat_rotate(s.quat_wb, rope.mount)
             pos, vel = chain.payload(rope, mount, coupled.mount_velocity(rope, s), n, u)

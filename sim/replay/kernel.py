@@ -255,7 +255,7 @@ def build_replay(t: Types, vehicle: VehicleParams, segments: int, laws: tuple[La
             n[i] = starts.cable_dir_w[i, start]
             u[i] = starts.cable_vel_w[i, start]
             stiffness[i] = starts.stiffness[i, start]
-        rope = chain.stretched(natural, natural, stiffness, real(0.0))
+        rope = chain.stretched(natural, natural, stiffness, u, real(0.0))
         mode = windows.payload[w]
         ball = Ball()
         if mode != attached_code:
@@ -327,7 +327,7 @@ def build_replay(t: Types, vehicle: VehicleParams, segments: int, laws: tuple[La
             if mode == attached_code and latch > time + tiny:
                 until = wp.min(until, latch)
             if mode == attached_code and latch <= time + tiny and not latched:
-                separation = latch + leaving.lag(r, rope, chain.pull(rope, stiffness), gravity)
+                separation = latch + leaving.lag(r, rope, chain.pull(rope, stiffness, u), gravity)
                 latched = True
             if mode == attached_code and separation <= time + tiny:
                 ball = let_go(r, rope, s, n, u)
@@ -342,7 +342,7 @@ def build_replay(t: Types, vehicle: VehicleParams, segments: int, laws: tuple[La
                 if knot_time <= time + tiny:
                     if lanes.keep[lane] >= 0:
                         kept = lanes.keep[lane] + knot
-                        knot_of(knots, kept, p, rope, s, pay, pay_vel, chain.pull(rope, stiffness))
+                        knot_of(knots, kept, p, rope, s, pay, pay_vel, chain.pull(rope, stiffness, u))
                         if kept < moments.shape[0]:
                             now = Moment()
                             now.time = time
@@ -377,7 +377,7 @@ def build_replay(t: Types, vehicle: VehicleParams, segments: int, laws: tuple[La
                 hanging = int(0)
                 if mode == attached_code:
                     hanging = 1
-                    rope = chain.stretched(natural, rope, stiffness, h)
+                    rope = chain.stretched(natural, rope, stiffness, u, h)
                 pushed = push_at(air, lanes.axis[lane], lanes.size[lane], real(1.0) - away)
                 pushed = extra.on(p, rope, pushed, s, n, u, stiffness, active, hanging)
                 old = s
@@ -392,7 +392,7 @@ def build_replay(t: Types, vehicle: VehicleParams, segments: int, laws: tuple[La
                     )
                     pay = pos1
                     pay_vel = vel1
-                    if chain.pull(rope, stiffness) < real(SLACK) * rope.payload_mass * gravity:
+                    if chain.pull(rope, stiffness, u) < real(SLACK) * rope.payload_mass * gravity:
                         slack = True
                         if slack_first < windows.start[w]:
                             slack_first = t0
@@ -433,7 +433,7 @@ def build_replay(t: Types, vehicle: VehicleParams, segments: int, laws: tuple[La
 
         if lanes.keep[lane] >= 0:
             if knot < windows.knots[w]:
-                knot_of(knots, lanes.keep[lane] + knot, p, rope, s, pay, pay_vel, chain.pull(rope, stiffness))
+                knot_of(knots, lanes.keep[lane] + knot, p, rope, s, pay, pay_vel, chain.pull(rope, stiffness, u))
             store_quad(ends, lane, s)
             ends.payload_pos_w[lane] = pay
             ends.payload_vel_w[lane] = pay_vel

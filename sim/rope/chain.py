@@ -347,24 +347,22 @@ def build_chain(t: Types, segments: int, extensions: frozenset[str] = frozenset(
         return total
 
     @wp.func
-    def lower_joint(rope: Rope):
-        return rope.segment_length
-
-    @wp.func
-    def payload_center(rope: Rope):
-        return rope.last_center
-
-    first_arm = payload_center if L == 1 else lower_joint
-
-    @wp.func
     def com_velocity(rope: Rope, mount_vel_w: vec3, u: wp.array(dtype=vec3)):
         """Velocity [m/s] of the centre of mass of rope and payload, world frame."""
         return mount_vel_w + momentum(rope, u) * (real(1.0) / rope.total_mass)
 
     @wp.func
-    def pull(rope: Rope, stiffness: wp.array(dtype=real)):
-        """Force [N] along the rope at the mount, from the geometric stiffness of the first rod (tension times arm)."""
-        return stiffness[0] / first_arm(rope)
+    def pull_of_many(rope: Rope, stiffness: wp.array(dtype=real), u: wp.array(dtype=vec3)):
+        """Force [N] along the rope at the mount, from the geometric stiffness of the first rod (tension times length).
+
+        Half of what the first rod itself weighs and swings by is left out.
+        """
+        return stiffness[0] / rope.segment_length
+
+    @wp.func
+    def pull_of_one(rope: Rope, stiffness: wp.array(dtype=real), u: wp.array(dtype=vec3)):
+        """The same of a single rod: what it and the payload weigh, and what keeps them on their circle."""
+        return stiffness[0] / rope.last_center + rope.last_mass * rope.last_center * wp.dot(u[0], u[0])
 
     @wp.func
     def speed_first(rope: Rope, mount_vel_w: vec3, u: wp.array(dtype=vec3), k1: wp.array(dtype=vec3), h: real):
@@ -394,7 +392,7 @@ def build_chain(t: Types, segments: int, extensions: frozenset[str] = frozenset(
         momentum=momentum,
         upper_damping=upper_damping,
         com_velocity=com_velocity,
-        pull=pull,
+        pull=pull_of_one if L == 1 else pull_of_many,
         segments=L,
         vec2=vec2,
     )

@@ -98,23 +98,23 @@ def of(extensions: frozenset[str]) -> SimpleNamespace:
 
 
 def build_stretch(t: Types, chain: SimpleNamespace, extensions: frozenset[str]):
-    """Warp function ``stretched(natural, now, stiffness, h)`` -> the rope under its pull, ``now`` what it was h seconds before.
+    """Warp function ``stretched(natural, now, stiffness, u, h)`` -> the rope under its pull, ``now`` what it was h seconds before.
 
     With h 0 it is at rest. A rope that keeps its length is returned as it is.
     """
-    real, Rope, L = t.real, t.Rope, chain.segments
+    real, vec3, Rope, L = t.real, t.vec3, t.Rope, chain.segments
 
     @wp.func
-    def keeping(natural: Rope, now: Rope, stiffness: wp.array(dtype=real), h: real):
+    def keeping(natural: Rope, now: Rope, stiffness: wp.array(dtype=real), u: wp.array(dtype=vec3), h: real):
         return now
 
     @wp.func
-    def stretched(natural: Rope, now: Rope, stiffness: wp.array(dtype=real), h: real):
+    def stretched(natural: Rope, now: Rope, stiffness: wp.array(dtype=real), u: wp.array(dtype=vec3), h: real):
         if natural.compliance == real(0.0):
             return now
         out = natural
         one = real(1.0)
-        pull = wp.max(chain.pull(now, stiffness), real(0.0))
+        pull = wp.max(chain.pull(now, stiffness, u), real(0.0))
         out.strain = natural.compliance * pull / (natural.segment_length * real(float(L)))
         if h > real(0.0):
             out.strain_rate = (out.strain - now.strain) / (h * (one + out.strain))
