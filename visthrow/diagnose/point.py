@@ -1,6 +1,6 @@
 """The state of a search: the model linearised at some sizes of its effects, with the noise levels that belong there."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,6 +19,7 @@ from visthrow.diagnose.marginal import (
     with_residual,
 )
 from visthrow.diagnose.model import Model, Window
+from visthrow.diagnose.scatter import freed, own_shares
 from visthrow.diagnose.threads import each
 
 STEPS = 3
@@ -172,17 +173,29 @@ def with_all_effects_noise(problem: Problem, point: Point) -> Point:
     return _with_noise_at(point, estimate(point.information, point.score, problem.priors, visible))
 
 
-def with_floors_noise(problem: Problem, point: Point, active: Sequence[int]) -> Point:
+def with_floors_noise(problem: Problem, point: Point, active: Sequence[int], varies: Mapping[int, float] | None = None) -> Point:
     """The same with the noise levels that remain when every effect has its most probable size, those not named below their floors.
 
-    What a dozen effects below their floors leave is no gust, but it is nothing that is missing either.
+    What a dozen effects below their floors leave is no gust, but it is nothing that is missing either; nor is what an effect
+    that varies has of its own in each flight.
+
+    Args:
+        problem: of the search.
+        point: whose derivatives and residuals are taken.
+        active: effects named.
+        varies: deviation in floors of effects that differ from flight to flight.
     """
-    return _with_noise_at(point, covariance(point.information, problem.priors.deviation(list(active))) @ point.score)
+    mean = freed(point.statistics, varies or {})
+    theta = covariance(mean.information.sum(0), problem.priors.deviation(list(active))) @ mean.absolute.sum(0)
+    return _with_noise_at(point, theta, own_shares(point.statistics, theta, varies or {}))
 
 
-def _with_noise_at(point: Point, theta: np.ndarray) -> Point:
-    """The same with noise levels estimated from the residuals that it would have at ``theta``."""
-    noise = levels.refit([shifted(gram, theta - point.theta) for gram in point.grams], point.noise)
+def _with_noise_at(point: Point, theta: np.ndarray, own: np.ndarray | None = None) -> Point:
+    """The same with noise levels estimated from the residuals at ``theta``, and each flight's ``own`` beside it, shape (F, K)."""
+    at = np.tile(theta - point.theta, (len(point.statistics.flights), 1)) + (0.0 if own is None else own)
+    row = {flight: f for f, flight in enumerate(point.statistics.flights.tolist())}
+    moves = [at[row[window.flight]] for window in point.windows]
+    noise = levels.refit([shifted(gram, move) for gram, move in zip(point.grams, moves)], point.noise)
     return _point(point.theta, point.windows, point.raw, point.grams, noise)
 
 

@@ -1,7 +1,8 @@
 """What varies from flight to flight: the deviation of an effect among flights, from the scatter of the flights' own scores.
 
 About the sizes that were found, the score u of an effect in flight f is normal with variance i + i^2 theta^2: i is the flight's
-information, theta the deviation that is looked for. Effects that are not named stay below their floors and add what they could.
+information, theta the deviation that is looked for. What all flights share of the effect is no scatter: it may have any size that
+its prior allows. Effects that are not named stay below their floors and add what they could.
 A flight far from the others is simulated again at other sizes: a release 40 ms early tells twice of it by its derivative.
 """
 
@@ -121,7 +122,9 @@ def straightened(
         information[f] = np.clip(0.5 * curve(size, 2)[f], own[f] / STEEPEST, own[f] * STEEPEST)
         fit[f] = information[f] * size
     whole, scores = statistics.information.copy(), statistics.score.copy()
-    whole[:, j, j] = information
+    steeper = np.sqrt(np.divide(information, own, out=np.ones_like(own), where=own > 0.0))[:, None]
+    whole[:, j, :] *= steeper
+    whole[:, :, j] *= steeper
     scores[:, j] = fit + (whole @ (theta - statistics.theta))[:, j]
     return replace(statistics, information=whole, score=scores)
 
@@ -143,7 +146,7 @@ def _verdict(
         shared = np.where(np.arange(len(theta)) == j, 0.0, SPIKE**2 + drawn)
         plain = i + statistics.information[seen][:, j] ** 2 @ shared
         spread = plain[:, None] + (i[:, None] * size / priors.floor[j]) ** 2
-        value += (-0.5 * np.log(spread) - 0.5 * u[:, None] ** 2 / spread).sum(axis=0)
+        value += _about_a_mean(i, u, spread, priors.slab[j])
     weight = np.gradient(size) * np.sqrt(2.0 / np.pi) / v.prior_sd * np.exp(-0.5 * (size / v.prior_sd) ** 2)
     best = value.max()
     density = np.exp(value - best) * weight
@@ -153,6 +156,67 @@ def _verdict(
     most = float(size[np.argmax(density / np.gradient(size))])
     return Scatter(v.name, v.cause, v.equation, v.block, v.unit, tuple(v.of), nats > least and most > v.floor, most, low, high,
                    v.floor, nats, int(np.count_nonzero(seen)), v.manoeuvres)  # fmt: skip
+
+
+def _about_a_mean(information: np.ndarray, score: np.ndarray, spread: np.ndarray, slab: float) -> np.ndarray:
+    """Log-likelihood of flights' scores that share a size of their own, which is integrated out.
+
+    Args:
+        information: of each flight, shape (F,).
+        score: of each flight, shape (F,).
+        spread: variances of the scores, shape (F, S).
+        slab: deviation of the size that they share, in floors.
+
+    Returns:
+        Shape (S,).
+    """
+    i, u = information[:, None], score[:, None]
+    alone = (-0.5 * np.log(spread) - 0.5 * u**2 / spread).sum(axis=0)
+    known, towards = (i**2 / spread).sum(axis=0), (i * u / spread).sum(axis=0)
+    return alone + 0.5 * towards**2 / (known + slab**-2.0) - 0.5 * np.log1p(slab**2 * known)
+
+
+def freed(statistics: Statistics, deviation: Mapping[int, float]) -> Statistics:
+    """Statistics of flights each of which has its own share of some effects, integrated out: what is left tells of the mean.
+
+    Args:
+        statistics: of the flights.
+        deviation: of such an effect among flights, in floors.
+    """
+    for j, size in deviation.items():
+        column, score = statistics.information[:, :, j], statistics.score
+        own = column[:, j]
+        part = size**2 / (1.0 + size**2 * own)
+        statistics = replace(
+            statistics,
+            information=statistics.information - part[:, None, None] * column[:, :, None] * column[:, None, :],
+            score=score - (part * score[:, j])[:, None] * column,
+            square=statistics.square - part * score[:, j] ** 2 + np.log1p(size**2 * own),
+        )
+    return statistics
+
+
+def own_shares(statistics: Statistics, theta: np.ndarray, deviation: Mapping[int, float]) -> np.ndarray:
+    """Most probable share of each flight of the effects that vary, beside the sizes of all, in floors, shape (F, K).
+
+    Args:
+        statistics: of the flights.
+        theta: sizes that all flights share, in floors.
+        deviation: of an effect among flights, in floors.
+    """
+    own = np.zeros(statistics.score.shape)
+    at = list(deviation)
+    if at:
+        left = (statistics.score - statistics.information @ (theta - statistics.theta))[:, at]
+        inside = statistics.information[:, at][:, :, at] + np.diag([size**-2.0 for size in deviation.values()])
+        own[:, at] = np.linalg.solve(inside, left[..., None])[..., 0]
+    return own
+
+
+def deviations(scatter: Sequence[Scatter], priors: Priors, names: Sequence[str]) -> dict[int, float]:
+    """Deviation in floors of each effect that was found to vary, by its number."""
+    known = list(names)
+    return {j: s.size / float(priors.floor[j]) for s in scatter if s.found for j in map(known.index, set(s.of) & set(known))}
 
 
 def variances(scatter: Sequence[Mapping]) -> dict[str, float]:

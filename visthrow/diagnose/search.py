@@ -5,12 +5,13 @@ that a cause is not excused as noise. The threshold comes from null worlds of th
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 
 import numpy as np
 
+from visthrow.diagnose.catalogue.scatter import VARYING
 from visthrow.diagnose.consistency import Consistency, across_flights, repeated_flights
 from visthrow.diagnose.evidence import (
     NORMAL_95,
@@ -22,6 +23,7 @@ from visthrow.diagnose.evidence import (
     log_evidence,
     threshold,
 )
+from visthrow.diagnose.marginal import Statistics
 from visthrow.diagnose.model import Model
 from visthrow.diagnose.point import (
     Point,
@@ -31,11 +33,13 @@ from visthrow.diagnose.point import (
     fitted,
     linearise,
     lost,
+    moved,
     to_gain,
     with_all_effects_noise,
     with_fitted_noise,
 )
 from visthrow.diagnose.result import Diagnosis, Step
+from visthrow.diagnose.scatter import Scatter, deviations, freed, straightened, varying
 from visthrow.errors import DiagnoseError
 
 MOST_NAMES = 6
@@ -110,7 +114,7 @@ class Search:
         from visthrow.diagnose.unknown import outside
 
         self.point = self.origin = self.nominal
-        while len(self.active) < MOST_NAMES and self._forward():
+        while len(self.active) < MOST_NAMES and (self._forward() or self._mean()):
             self._backward()
             if self.laws and len(self.active) == CHAIN and outside(self):
                 self.progress("a law that the catalogue does not hold explains this better than one name after the other")
@@ -154,6 +158,54 @@ class Search:
         self.point = self._settle(found, self.active)
         self.refused.clear()  # what differed from flight to flight may have been this one's share
         return True
+
+    def scatter(self, active: Sequence[int]) -> tuple[Scatter, ...]:
+        """What varies from flight to flight about the sizes of these effects."""
+        names = [e.name for e in self.problem.model.effects]
+        return varying(self.point.statistics, self._sizes(active), self.priors, names, self.least, self._again)
+
+    def _sizes(self, active: Sequence[int]) -> np.ndarray:
+        """Of these effects, in floors."""
+        return estimate(self.point.information, self.point.score, self.priors, list(active))
+
+    def _again(self, theta: np.ndarray) -> Statistics | None:
+        """The flights simulated at other sizes."""
+        there = moved(self.problem, self.point, theta)
+        return None if there is None else there.statistics
+
+    def about_means(self, active: Sequence[int], varies: Mapping[int, float]) -> Statistics:
+        """What the flights say of the means of effects that vary; of those named, flights far off are told by simulations there.
+
+        Args:
+            active: effects named.
+            varies: deviation in floors of an effect among flights.
+        """
+        statistics, theta = self.point.statistics, self._sizes(active)
+        for j in sorted(set(varies) & set(active)):
+            statistics = straightened(statistics, theta, self.priors, j, self._again)
+        return freed(statistics, varies)
+
+    def _mean(self) -> bool:
+        """Name an effect that was refused because it varies, if the flights agree on its mean; False where there is none."""
+        names, may_vary = [e.name for e in self.problem.model.effects], {name for v in VARYING for name in v.of}
+        for j in sorted((j for j in self.refused if self.name(j) in may_vary), key=self.refused.get, reverse=True):
+            active = [*self.active, j]
+            drawn = deviations(self.scatter(active), self.priors, names)
+            if j not in drawn:
+                continue
+            found = self.about_means(active, {j: drawn[j]})
+            information, score = found.information.sum(0), found.absolute.sum(0)
+            nats = float(additions(information, score, self.priors, self.active)[j])
+            there = replace(self.point, statistics=found, theta=estimate(information, score, self.priors, active))
+            if nats > self.least and self._sure(there, active, j):
+                self.progress(f"{self.name(j)} named, which varies: {nats:.1f} nats that its mean is not 0")
+                ladder = {self.name(j): nats}
+                self.steps.append(Step(self.name(j), nats, ladder, ladder))
+                self.active = active
+                self.point = self._settle(self._candidate(self.point, active), active)
+                self.refused.clear()
+                return True
+        return False
 
     def _agreed(self, point: Point, j: int) -> tuple[Consistency | None, Point]:
         """Why a candidate is no cause or None, and the candidate, linearised where it lies if the flights differ at first."""

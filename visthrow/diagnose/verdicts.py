@@ -9,11 +9,10 @@ import numpy as np
 from visthrow.diagnose import result
 from visthrow.diagnose.evidence import NORMAL_95, OWN_FLOOR, Priors, covariance, estimate
 from visthrow.diagnose.excess import acts_on, levels, too_strong
-from visthrow.diagnose.marginal import Statistics
 from visthrow.diagnose.model import Model, Window
-from visthrow.diagnose.point import Point, moved, with_floors_noise
+from visthrow.diagnose.point import Point, with_floors_noise
 from visthrow.diagnose.result import Diagnosis, Finding, Law, Level
-from visthrow.diagnose.scatter import varying
+from visthrow.diagnose.scatter import deviations, freed
 from visthrow.diagnose.work import Work
 
 if TYPE_CHECKING:
@@ -47,14 +46,9 @@ def conclude(search: "Search", *, laws: bool) -> Diagnosis:
     from visthrow.diagnose.unknown import Answer, beats_the_catalogue, find_laws
 
     point, model = search.point, search.problem.model
-    found = levels(search.nominal, with_floors_noise(search.problem, point, search.active), search.least)
-    sizes = estimate(point.information, point.score, search.priors, search.active)
-
-    def again(theta: np.ndarray) -> Statistics | None:
-        there = moved(search.problem, point, theta)
-        return None if there is None else there.statistics
-
-    scatter = varying(point.statistics, sizes, search.priors, [e.name for e in model.effects], search.least, again)
+    scatter = search.scatter(search.active)
+    varies = deviations(scatter, search.priors, [e.name for e in model.effects])
+    found = levels(search.nominal, with_floors_noise(search.problem, point, search.active, varies), search.least)
     drawn = {name for s in scatter if s.found for name in s.of}
     search.refused = {j: nats for j, nats in search.refused.items() if search.name(j) not in drawn}
     answer = find_laws(search) if laws else Answer()
@@ -71,6 +65,8 @@ def conclude(search: "Search", *, laws: bool) -> Diagnosis:
         point = search.nominal
     elif law[0] is not None and active:
         point = law[0].without_terms()
+    here = point is search.point
+    point = replace(point, statistics=search.about_means(active, varies) if here else freed(point.statistics, varies))
     point = replace(point, theta=estimate(point.information, point.score, search.priors, active))
     spread = covariance(point.information, search.priors.deviation(active))
     findings = tuple(_finding(search, point, j, active, spread, withdrawn) for j in range(len(model.effects)))

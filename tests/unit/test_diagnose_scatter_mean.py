@@ -1,0 +1,100 @@
+"""What all flights share of an effect is no scatter: it is named, with its size, whether the effect varies beside it or not."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.synthetic_diagnosis import SyntheticModel, catalogue
+from tests.unit.test_diagnose_scatter import LEAST, NAMES, PRIORS, flights
+from visthrow.diagnose import result, search
+from visthrow.diagnose.scatter import freed, varying
+
+EFFECTS = tuple(replace(e, name="cmd_delay") if i == 4 else e for i, e in enumerate(catalogue(12)))
+FLOOR = EFFECTS[4].floor
+
+
+class Drawn(SyntheticModel):
+    """Flights each of which has its own size of one effect, in floors."""
+
+    sizes = ()
+
+    def __post_init__(self):
+        super().__post_init__()
+        self._windows = [replace(w, residual=w.residual + self._answer(w.effects, {"cmd_delay": self.sizes[w.flight]}))
+                         for w in self._windows]  # fmt: skip
+
+
+def drawn(sizes, **options) -> SyntheticModel:
+    return type("Own", (Drawn,), {"sizes": tuple(sizes)})(effects=EFFECTS, throws=len(sizes) - 1, free=1, **options)
+
+
+def told(mean: float, deviation: float, seed: int):
+    """Verdict on a release that is late by so much in all flights and by so much more or less in each [s]."""
+    found = flights(np.random.default_rng(seed), release_lag=deviation)
+    common = np.zeros(len(NAMES))
+    common[0] = mean / PRIORS.floor[0]
+    found = replace(found, score=found.score + found.information @ common)
+    return next(s for s in varying(found, np.zeros(len(NAMES)), PRIORS, NAMES, LEAST) if s.name == "lag_jitter")
+
+
+def jitter(diagnosis):
+    return next(s for s in diagnosis.scatter if s.name == "cmd_jitter")
+
+
+def test_a_size_that_all_flights_share_is_no_scatter():
+    assert not any(told(0.010, 0.0, seed).found for seed in range(40))
+
+
+def test_a_deviation_is_about_the_mean():
+    verdicts = [told(0.010, 0.012, seed) for seed in range(40)]
+    assert np.mean([v.found for v in verdicts]) > 0.9
+    inside = np.mean([v.low <= 0.012 <= v.high for v in verdicts])
+    assert inside > 0.84, inside  # 95 %, less three deviations of 40 draws
+    assert abs(np.median([v.size for v in verdicts]) / 0.012 - 1.0) < 0.2
+
+
+def test_what_flights_have_of_their_own_is_integrated_out():
+    found, K, j, size = flights(np.random.default_rng(3), count=1), len(NAMES), 2, 1.7
+    left, own, score = freed(found, {j: size}), found.information[0], found.score[0]
+    theta = np.random.default_rng(4).normal(size=K)
+
+    def misfit(x):
+        there = theta + np.eye(K)[j] * x[:, None]
+        return -2.0 * there @ score + np.einsum("xi,ij,xj->x", there, own, there)
+
+    x = np.linspace(-12.0 * size, 12.0 * size, 20001)
+    density = np.exp(-0.5 * (misfit(x) - misfit(np.zeros(1))) - 0.5 * (x / size) ** 2) / np.sqrt(2.0 * np.pi) / size
+    whole = found.square[0] + misfit(np.zeros(1))[0] - 2.0 * np.log(density.sum() * (x[1] - x[0]))
+    told = left.square[0] - 2.0 * theta @ left.score[0] + theta @ left.information[0] @ theta
+    np.testing.assert_allclose(told, whole, rtol=1e-9)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_an_effect_that_is_there_in_all_flights_is_named_and_does_not_vary(seed):
+    diagnosis = search.explain(drawn(np.full(12, 8.0), seed=seed), laws=False)
+    assert diagnosis.named == ("cmd_delay",)
+    assert not jitter(diagnosis).found
+
+
+@pytest.mark.parametrize("deviation", [4.0, 9.0])  # less than what flights may differ by, and more
+@pytest.mark.parametrize("seed", [1, 2])
+def test_an_effect_that_varies_about_a_mean_is_named_and_varies(seed, deviation):
+    sizes = 14.0 + deviation * np.random.default_rng(seed).permutation(np.linspace(-1.7, 1.7, 12))
+    said = []
+    diagnosis = search.explain(drawn(sizes, seed=seed), laws=False, progress=said.append)
+    assert any("named, which varies" in line for line in said) == (deviation > 5.0)
+    assert diagnosis.overall == result.KNOWN
+    assert diagnosis.named == ("cmd_delay",)
+    found, varies = diagnosis["cmd_delay"], jitter(diagnosis)
+    assert found.low < 14.0 * FLOOR < found.high
+    assert found.sd > deviation * FLOOR / np.sqrt(12) * 0.8  # no mean is known better than its flights scatter
+    assert varies.found
+    assert varies.low < deviation * FLOOR < varies.high
+
+
+def test_an_effect_that_varies_about_nothing_is_not_named():
+    sizes = 6.0 * np.random.default_rng(5).permutation(np.linspace(-1.7, 1.7, 12))
+    diagnosis = search.explain(drawn(sizes, seed=5), laws=False)
+    assert not diagnosis.theta
+    assert jitter(diagnosis).found
