@@ -20,6 +20,7 @@ from itertools import combinations_with_replacement
 import numpy as np
 from scipy.interpolate import CubicSpline
 
+from sim.laws import LOWEST, SLOWEST
 from visthrow.diagnose.model import LATENT_BLOCKS
 
 Unit = tuple[int, int, int]
@@ -33,14 +34,8 @@ JOINT = "rope joint"
 BLOCKS = (*LATENT_BLOCKS, JOINT)
 """What a term can act on."""
 
-LOWEST = 0.05
-"""Height [m] below which 1/z is held, so that a pose at the ground stays finite."""
-
 FINE = 8
 """Points between two knots at which a curve is looked at."""
-
-SLOWEST = 0.1
-"""Rate of the rope against the vehicle [1/s] below which dry friction falls to 0."""
 
 
 class Known(dict):

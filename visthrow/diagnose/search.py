@@ -142,10 +142,11 @@ class Search:
         ranked = [j for j in sorted(nats, key=nats.get, reverse=True) if nats[j] > enough]
         best = next((j for j in ranked if self._stands(tried[j], [*self.active, j], j)), None)
         if best is None:
-            best = max(nats, key=nats.get)
+            best, origin = max(nats, key=nats.get), self.origin
             tried[best] = self._closer(tried[best], [*self.active, best])
             nats[best] = advantage(self.priors, (tried[best], [*self.active, best]), base)
             if nats[best] <= enough or not self._stands(tried[best], [*self.active, best], best):
+                self.origin = origin
                 return False
         verdict, found = self._agreed(tried[best], best)
         if verdict is not None:

@@ -149,6 +149,7 @@ ENTRIES: tuple[Entry, ...] = (
         [Key(f"{R}payload_offset"), Key(f"{R}length", factor=-1.0)],
         confused=("payload_inertia", "rope_mass"),
         manoeuvres=("snap stop",),
+        applies=lambda s: s.plant.rope.length > 0.12,  # of which the upper bound leaves something
         most=lambda s: s.plant.rope.payload_offset,
     ),
     entry(
