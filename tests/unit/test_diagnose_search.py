@@ -244,7 +244,7 @@ def test_gusts_are_no_causes():
 
 def test_threshold_rises_with_the_number_of_candidates_and_holds_in_null_worlds():
     rng = np.random.default_rng(0)
-    few, many = (_threshold(count) for count in (4, 40))
+    few, many = (_threshold(count) for count in (4, 400))
     assert few < many
     information, priors, least = _information(40), _priors(40), _threshold(40)
     best = evidence.additions(information, evidence.null_draws(information, 2000, rng), priors, ()).max(axis=1)

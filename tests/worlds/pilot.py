@@ -12,6 +12,8 @@ SHAKE = np.array([0.8, 0.8, 0.0])
 """Deviation of rates that are added to free flights, to excite the vehicle [rad/s]."""
 TONES = 5
 """Sines that this sums, of 0.8 to 4 Hz."""
+MOST_OFF = 1.0
+"""Limit of the integral of the position's error [m s]."""
 RATE_LIMIT = np.array([10.0, 10.0, 4.0])
 
 
@@ -97,11 +99,13 @@ class Tracker:
     """Flies lanes along their references from position, velocity, attitude with the noise of a tracking system."""
 
     gains = POSITION, VELOCITY, ATTITUDE
+    patience = 0.0  # gain of the integral of what is left of the position [1/s^3]
     lead = LEAD
 
     def __init__(self, references: list, mass: float, ball_mass: float, rng: np.random.Generator):
         self.references, self.rng = references, rng
         self.with_ball, self.alone = mass + ball_mass, mass
+        self.off = np.zeros((len(references), 3))  # integral of the position's error [m s]
 
     def command(self, t: float, x, v, q, hanging) -> np.ndarray:
         """Thrust [N] and body rates [rad/s], shape (E, 4), from position, velocity (world), attitude (wxyz)."""
@@ -111,7 +115,8 @@ class Tracker:
         x = x + self.rng.normal(0, 1e-3, x.shape)
         v = v + self.rng.normal(0, 2e-2, v.shape)
         position, velocity, attitude = self.gains
-        a = a_r + position * (p_r - x) + velocity * (v_r - v)
+        self.off = np.clip(self.off + PERIOD * (p_r - x), -MOST_OFF, MOST_OFF)
+        a = a_r + position * (p_r - x) + velocity * (v_r - v) + self.patience * self.off
         a[:, 2] += GRAVITY
         a[:, 2] = np.maximum(a[:, 2], 2.0)
         mass = np.where(hanging, self.with_ball, self.alone)

@@ -26,6 +26,9 @@ OWN_FLOOR = 0.5
 
 NORMAL_95 = 1.96
 
+VERY_STRONG = 5.0
+"""Nats that any cause needs, however few are in question: Bayes factors above 150 are very strong (Kass and Raftery 1995)."""
+
 CALIBRATION_DRAWS = 4000
 CALIBRATION_QUANTILE = 0.995
 
@@ -145,21 +148,21 @@ def estimate(information: np.ndarray, score: np.ndarray, priors: Priors, active:
 
 
 def null_draws(information: np.ndarray, draws: int, rng: np.random.Generator) -> np.ndarray:
-    """Scores of worlds in which every effect is at plus or minus its floor and nothing else is wrong, shape (draws, K)."""
+    """Scores of worlds in which nothing is wrong but what may go unnamed, every effect drawn from its spike, shape (draws, K)."""
     values, vectors = np.linalg.eigh(information)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
-    floors = rng.choice((-1.0, 1.0), size=(draws, len(information)))
-    return rng.standard_normal((draws, len(information))) @ root.T + floors @ information
+    unnamed = SPIKE * rng.standard_normal((draws, len(information)))
+    return rng.standard_normal((draws, len(information))) @ root.T + unnamed @ information
 
 
 def threshold(statistics: Statistics, priors: Priors, rng: np.random.Generator, draws: int = CALIBRATION_DRAWS) -> float:
-    """Nats that the best of all effects exceeds in half a per cent of null worlds, and at least the log of their number.
+    """Nats that the best of all effects exceeds in half a per cent of null worlds, at least the log of their number, or 5.
 
-    The null worlds have these flights' information, noise as fitted, and every effect at its floor.
+    The null worlds have these flights' information, noise as fitted, and of every effect what may go unnamed.
     """
     information = statistics.information.sum(0)
     candidates = int(priors.visible.sum())
     if not candidates:
         raise DiagnoseError("none of the effects can be seen in the channels of these logs")
     best = additions(information, null_draws(information, draws, rng), priors, ()).max(axis=1)
-    return float(max(np.quantile(best, CALIBRATION_QUANTILE), np.log(candidates)))
+    return float(max(np.quantile(best, CALIBRATION_QUANTILE), np.log(candidates), VERY_STRONG))

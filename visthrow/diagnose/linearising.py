@@ -68,7 +68,7 @@ class Plan:
         own = {name: value[self.kept : self.kept + f.knots[w]] for name, value in knots.items()}
         return Window(
             c.flight, c.phase, f.time(w), channel, f.residual(seen, w, self.first), f.sigma(w), slopes[:, :K], slopes[:, K : K + D],
-            np.array([directions[d].sd for d in self.nuisances]), slopes[:, K + D :],
+            np.array([directions[d].spread(c) for d in self.nuisances]), slopes[:, K + D :],
             np.array([axis // 3 for axis, _ in self.latents]), np.array([axis % 3 for axis, _ in self.latents]),
             np.array([c.start + KNOT_SPACING * knot for _, knot in self.latents]), at_knots(f, setting, w, own),
         )  # fmt: skip

@@ -27,7 +27,7 @@ MAD_TO_SIGMA = 1.4826
 THIRD_DIFFERENCE = np.sqrt(20.0)
 """Deviation of a third difference of white noise, in sigmas: the root of 1 + 9 + 9 + 1."""
 
-CORRELATION_TIMES = (0.15, 0.6, 2.4)
+CORRELATION_TIMES = (0.15, 0.3, 0.6, 1.2, 2.4)
 """Of latent forces [s]: from one knot to longer than a window, the candidates of :func:`fit`."""
 
 SCALE_BOUNDS = (0.3, 10.0)

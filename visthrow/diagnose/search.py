@@ -63,6 +63,9 @@ CLOSE = 3.0
 DOUBT = 15.0
 """Linear statistics this close [nats] are settled by running the simulation."""
 
+RIVALS = 6, 16
+"""Sets that are settled so, and how many where they are ``CLOSE``: of what hover shows, a dozen causes may be the reason."""
+
 CONTRADICTED = 0.5
 """Share of the evidence of an effect that the flights contradict which any other effect must then exceed."""
 
@@ -121,6 +124,10 @@ class Search:
                 return
         self._joint()
 
+    def _ahead(self, first: tuple[Point, Sequence[int]], second: tuple[Point, Sequence[int]]) -> float:
+        """Nats by which a set of effects at its point is ahead of another at its own."""
+        return advantage(self.priors, first, second, self.problem.switches)
+
     def _screen(self, point: Point) -> np.ndarray:
         gain = additions(point.information, point.score, self.priors, self.active)
         gain[[*self.refused, *self.dropped]] = -np.inf
@@ -137,14 +144,14 @@ class Search:
             return False
         base = self.point, self.active
         tried = {int(j): self._candidate(free, [*self.active, int(j)]) for j in short}
-        nats = {j: advantage(self.priors, (point, [*self.active, j]), base) for j, point in tried.items()}
+        nats = {j: self._ahead((point, [*self.active, j]), base) for j, point in tried.items()}
         enough = max([self.least, *(CONTRADICTED * n for n in self.refused.values())])
         ranked = [j for j in sorted(nats, key=nats.get, reverse=True) if nats[j] > enough]
         best = next((j for j in ranked if self._stands(tried[j], [*self.active, j], j)), None)
         if best is None:
             best, origin = max(nats, key=nats.get), self.origin
             tried[best] = self._closer(tried[best], [*self.active, best])
-            nats[best] = advantage(self.priors, (tried[best], [*self.active, best]), base)
+            nats[best] = self._ahead((tried[best], [*self.active, best]), base)
             if nats[best] <= enough or not self._stands(tried[best], [*self.active, best], best):
                 self.origin = origin
                 return False
@@ -307,7 +314,7 @@ class Search:
                 return
             rest = [k for k in self.active if k != weakest]
             without = self._candidate(self.point, rest)
-            if advantage(self.priors, (self.point, self.active), (without, rest)) > self.least:
+            if self._ahead((self.point, self.active), (without, rest)) > self.least:
                 return
             self.progress(f"{self.name(weakest)} dropped again")
             self.active = rest
@@ -322,9 +329,9 @@ class Search:
             winner: tuple[float, list[int], Point] | None = None
             for rival, _ in ranked:
                 point = self._candidate(self.point, rival)
-                ahead = advantage(self.priors, (point, rival), (self.point, self.active))
+                ahead = self._ahead((point, rival), (self.point, self.active))
                 ahead += self._toll(self.active) - self._toll(rival)
-                if ahead > 1.0 and not all(self._stands(point, rival, j) for j in rival if j not in self.active):
+                if ahead > 1.0 and not all(self._fits_in(point, rival, j) for j in rival if j not in self.active):
                     continue
                 if ahead > -CLOSE:
                     self.sets.append((tuple(rival), float(-ahead)))
@@ -338,12 +345,18 @@ class Search:
             distances = ((members, n + winner[0]) for members, n in self.sets if set(members) != set(self.active))
             self.sets = [(tuple(self.active), 0.0), *((members, n) for members, n in distances if n < CLOSE)]
 
+    def _fits_in(self, point: Point, rival: Sequence[int], j: int) -> bool:
+        """Whether an effect of a rival set could be named, and is the same in all flights."""
+        others = [k for k in rival if k != j]
+        same = across_flights(self.point, point, self.priors, others, j, self.least) is None
+        return same and self._stands(point, rival, j)
+
     def _toll(self, active: Sequence[int]) -> float:
         """Every name costs the threshold."""
         return self.least * len(active)
 
     def _rivals(self) -> list[tuple[list[int], float]]:
-        """Sets within ``DOUBT`` nats of the present one by the linear statistics, best first, six at most."""
+        """Sets within ``DOUBT`` nats of the present one by the linear statistics, best first; :data:`RIVALS` at most."""
         if not self.active:
             return []
         information, score = self.point.information, self.point.score
@@ -357,7 +370,8 @@ class Search:
         sets -= {tuple(sorted(self.active))}
         sets = {s for s in sets if not set(s) > set(self.active)}  # additions were tried already
         values = [(list(s), log_evidence(information, score, self.priors, s) - self._toll(s) - own) for s in sets]
-        return sorted((v for v in values if v[1] > -DOUBT), key=lambda v: -v[1])[:6]
+        ranked = sorted((v for v in values if v[1] > -DOUBT), key=lambda v: -v[1])
+        return [v for i, v in enumerate(ranked) if i < RIVALS[0] or i < RIVALS[1] and v[1] > -CLOSE]
 
 
 def explain(

@@ -197,7 +197,7 @@ class Settling:
     def _increment(self, w: int, residual: np.ndarray, done: np.ndarray, damping: float) -> tuple[np.ndarray, float]:
         """Levenberg-Marquardt step of a window's state with its vague prior, shape (directions,), and the fall that it promises."""
         ds, spread = self._fitted(w), self._spread(w)
-        sd = np.array([self.directions[d].sd for d in ds])
+        sd = np.array([self.directions[d].spread(self.flights.cuts[w]) for d in ds])
         off = residual / spread
         weight = np.minimum(1.0, HUBER / np.maximum(np.abs(off), 1e-12))
         scaled = self.slopes[w] * sd / spread[:, None]

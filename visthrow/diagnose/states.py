@@ -18,6 +18,12 @@ INTEGRAL = 1.0
 """Deviation of the rate error's integral [rad]: with a third of it the integrators of 80 windows pull a centre of mass that lies
 1.4 mm off by a quarter towards the frame's origin."""
 
+BENT, SHAKEN = (0.03, 0.5), (0.1, 1.5)
+"""Deviation of a bend of the rope [rad] and of its rate [rad/s]: where the rope stayed taut, and where it has just come taut.
+
+Ropes that fly through the windows before a window arrive there with bends of some 0.005 rad, of 0.03 rad at most. A wider prior
+lets a rope that is too long for what was measured bend until it is short enough; what it does then is whip."""
+
 States = dict[str, np.ndarray]
 """Fields of ``STATE_FIELDS``, shape (S, ...)."""
 
@@ -31,6 +37,11 @@ class Direction:
     sd: float  # vague prior, in the field's unit (attitude: angle [rad])
     step: float  # for the derivative
     part: str | int = ""  # of the rope: "all" segments, the "last", or the half waves of a bend
+    calm: float | None = None  # the prior in windows whose rope was taut all the time, where it is another
+
+    def spread(self, c: Cut) -> float:
+        """The prior's deviation in a window."""
+        return self.sd if self.calm is None or c.shaken else self.calm
 
 
 def directions(plant: PlantParams) -> tuple[Direction, ...]:
@@ -48,8 +59,8 @@ def directions(plant: PlantParams) -> tuple[Direction, ...]:
     found += [Direction("cable_dir_w", i, 0.1, 1e-4, "all") for i in range(2)]
     found += [Direction("cable_vel_w", i, 1.5, 1e-3, "all") for i in range(2)]
     for part in ("last", *range(1, MODES + 1))[: plant.rope.segments - 1]:
-        found += [Direction("cable_dir_w", i, 0.1, 1e-4, part) for i in range(2)]
-        found += [Direction("cable_vel_w", i, 1.5, 1e-3, part) for i in range(2)]
+        found += [Direction("cable_dir_w", i, SHAKEN[0], 1e-4, part, BENT[0]) for i in range(2)]
+        found += [Direction("cable_vel_w", i, SHAKEN[1], 1e-3, part, BENT[1]) for i in range(2)]
     found += [Direction("payload_pos_w", i, 0.1, 1e-4) for i in range(3)]
     return (*found, *[Direction("payload_vel_w", i, 1.0, 1e-3) for i in range(3)])
 
