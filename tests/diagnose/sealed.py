@@ -52,6 +52,9 @@ LAWS = {
 }  # fmt: skip
 """Terms that no entry of the catalogue has, with sizes that show: see :class:`tests.worlds.vehicle.Numbers`."""
 
+MEASURED = ("--measured", "air_density=0.003")
+"""What whoever asks has measured: barometer and thermometer of the hall. In all these worlds the air is as dense as the model's."""
+
 NOT_WAITED = "timeout"
 """Error of a world whose verdict was not waited for."""
 
@@ -86,6 +89,7 @@ def flight_log(record: dict) -> FlightLog:
         "quat_wb": Channel(t, np.nan_to_num(record["quat"][:, [1, 2, 3, 0]]), "1", "world", seen),
         "payload_pos_w": Channel(t, np.nan_to_num(record["ball"]), "m", "world", ball_seen),
         "command": Channel(record["sent_time"], record["sent"], "N, rad/s", "body"),
+        "battery_voltage": Channel(record["sent_time"], record["volt"], "V"),
     }
     asked = np.zeros(len(record["sent_time"]))
     if record["release"] is not None:
@@ -124,7 +128,7 @@ def ask(logs: list[Path], model: list[str], folder: Path, device: str = "cpu", t
     """Verdict of ``visthrow diagnose explain`` on logs, run apart; with ``error`` where it failed or took longer [s]."""
     answer = folder / "verdict.json"
     command = [sys.executable, "-c", WITHOUT_TESTS, "diagnose", "explain", *(p.name for p in logs)]
-    command += ["--device", device, "--json", answer.name, "--out", "report", "--no-report"]
+    command += ["--device", device, "--json", answer.name, "--out", "report", "--no-report", *MEASURED]
     for item in model:
         command += ["--set", item]
     root = Path(__file__).resolve().parents[2]

@@ -108,5 +108,5 @@ def _trimmed(record: dict, table: Table) -> dict:
     seen = (record["time"] >= table.begin) & (record["time"] < table.seconds)
     sent = (record["sent_time"] >= table.begin - 1e-9) & (record["sent_time"] < table.seconds - 1e-9)
     record = record | {name: record[name][seen] for name in ("time", "pos", "quat", "ball")}
-    record |= {name: record[name][sent] for name in ("sent_time", "sent")}
+    record |= {name: record[name][sent] for name in ("sent_time", "sent", "volt")}
     return record if table.payload else record | {"ball": np.full_like(record["ball"], np.nan), "release": None}

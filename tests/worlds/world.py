@@ -37,7 +37,7 @@ ONE_SIDED = ("mocap_delay_quad", "mocap_delay_payload", "payload_drag", "rope_ma
 """Nothing is measured before it happens, the model's payload has no drag that reality could lack, and its rope hardly any mass."""
 PLANTS = ("chain", "string", "rod")
 GUSTS = (0.015, 1.5e-4, 6e-4)
-NOISE = {"pos": 5e-4, "att": np.radians(0.2), "ball": 8e-4}
+NOISE = {"pos": 5e-4, "att": np.radians(0.2), "ball": 8e-4, "volt": 2e-2}
 RATE = 200.0
 
 
@@ -109,10 +109,10 @@ def fly_recipe(recipe: Recipe) -> list[Flights]:
 def recorded(recipe: Recipe, flights: list[Flights]) -> list[dict]:
     """What was recorded of each flight: plain arrays, SI units, quaternions wxyz; NaN where a frame was lost.
 
-    Keys: ``time``, ``pos``, ``quat``, ``ball`` (200 Hz); ``sent_time``, ``sent`` (N, rad/s), ``release`` (its time or None);
+    Keys: ``time``, ``pos``, ``quat``, ``ball`` (200 Hz); ``sent_time``, ``sent`` (N, rad/s), ``volt`` [V], ``release`` (its time or None);
     ``truth_landing`` is what the world knows and no log tells. With a camera, also what :func:`tests.worlds.camera.looked` tells.
     """
-    rng, eye = np.random.default_rng(recipe.seed + 3), np.random.default_rng([recipe.seed, 4])
+    rng, eye, meter = (np.random.default_rng(seed) for seed in (recipe.seed + 3, [recipe.seed, 4], [recipe.seed, 5]))
     w = world_of(recipe)
     tilt, turn = small_turn(w.frame_tilt), small_turn(w.marker_turn)
     out = []
@@ -135,7 +135,7 @@ def recorded(recipe: Recipe, flights: list[Flights]) -> list[dict]:
             release = f.release_at[e] if np.isfinite(f.release_at[e]) else None
             out.append(
                 {"time": t, "pos": pos, "quat": quat, "ball": ball, "sent_time": np.arange(f.commands.shape[1]) * PERIOD,
-                 "sent": f.commands[e], "release": release, "volt": f.volt[e],
+                 "sent": f.commands[e], "release": release, "volt": f.volt[e] + NOISE["volt"] * meter.normal(size=f.volt[e].shape),
                  "truth_landing": f.ball[e][down[0]] if len(down) else None}
             )  # fmt: skip
             if recipe.camera:

@@ -13,6 +13,8 @@ NEVER = 1e9  # a time after every flight [s]
 LEAST_SIGMA = {"pos_w": 2e-5, "quat_wb": 1e-4, "payload_pos_w": 2e-5, "rate_b": 1e-3}
 """Noise below which no channel is believed: what numerics and rounding leave [m], [rad], [m], [rad/s]."""
 
+AT_START = 0.25  # of a log, whose voltages tell how much charge was used before [s]
+
 
 @dataclass(frozen=True)
 class Samples:
@@ -39,7 +41,7 @@ class Recorded:
     attitude: Samples  # quaternions xyzw
     payload: Samples | None
     gyro: Samples | None
-    voltage: float | None  # first measured [V]
+    voltage: float | None  # at the start [V]
     hung: bool | None = None  # whether the log says that a payload hung below at its start; None where it does not
     landing_point: np.ndarray | None = None  # where the log says that the payload came down [m], shape (3,)
 
@@ -103,11 +105,10 @@ def record_of(log: FlightLog, number: int = 0) -> Recorded:
         raise DiagnoseError(f"flight {number}: positions and attitudes of the vehicle have no stamps in common")
     pos = Samples(pos.time[at_pos], pos.values[at_pos], pos.sigma)
     quat = Samples(pos.time, quat.values[at_quat], quat.sigma)
-    voltage = measured(log, "battery_voltage")
     return Recorded(
         command.time[command.valid], np.asarray(command.values, dtype=float)[command.valid], _latch(log), _landing(log),
         pos, quat, _payload(log), _samples(log, "rate_b"),
-        None if voltage is None else float(voltage.values[voltage.valid][0]), _hung(log), _landing_point(log),
+        _voltage(log), _hung(log), _landing_point(log),
     )  # fmt: skip
 
 
@@ -141,6 +142,15 @@ def _landing(log: FlightLog) -> float:
     if "landing" in log and np.any(log["landing"].valid):
         return float(log["landing"].time[log["landing"].valid][0])
     return NEVER
+
+
+def _voltage(log: FlightLog) -> float | None:
+    """Terminal voltage at the start of a log: the median of the samples of its first moment, as single ones are noisy."""
+    channel = measured(log, "battery_voltage")
+    if channel is None:
+        return None
+    time = channel.time[channel.valid]
+    return float(np.median(channel.values[channel.valid][time < time[0] + AT_START]))
 
 
 def _landing_point(log: FlightLog) -> np.ndarray | None:
