@@ -109,7 +109,8 @@ def fly_recipe(recipe: Recipe) -> list[Flights]:
 def recorded(recipe: Recipe, flights: list[Flights]) -> list[dict]:
     """What was recorded of each flight: plain arrays, SI units, quaternions wxyz; NaN where a frame was lost.
 
-    Keys: ``time``, ``pos``, ``quat``, ``ball`` (200 Hz); ``sent_time``, ``sent`` (N, rad/s), ``volt`` [V], ``release`` (its time or None);
+    Keys: ``time``, ``pos``, ``quat``, ``ball`` (200 Hz); ``sent_time``, ``sent`` (N, rad/s), ``volt`` [V]; ``release`` (its time or
+    None);
     ``truth_landing`` is what the world knows and no log tells. With a camera, also what :func:`tests.worlds.camera.looked` tells.
     """
     rng, eye, meter = (np.random.default_rng(seed) for seed in (recipe.seed + 3, [recipe.seed, 4], [recipe.seed, 5]))

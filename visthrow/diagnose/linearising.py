@@ -5,7 +5,7 @@ of them as well; residuals always come from the nominal steps.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -24,10 +24,34 @@ EXACT = ("plant.vehicle.controller.gyro_time_constant", "plant.rope.payload_iner
 """Numbers by which derivatives take the nominal steps: with twice as long ones they differ by more than a fifth. In throws, where
 a rope whips, those by all effects and states do; latent forces there differ by 2 %."""
 
+STILL = 0.1
+"""Root mean square speed of a window [m/s] up to which the vehicle's motion against the air is the air's own doing: rooms have
+draughts of that speed, and a gust brings a hovering vehicle a velocity that goes with it, as if drag were negative."""
+AERODYNAMIC = ("aerodynamics",)
+"""Blocks whose effects go with that velocity."""
+
 
 def exact(e: Entry) -> bool:
     """Whether an effect's derivative needs the nominal steps in every window."""
     return any(key.path in EXACT for key in e.keys)
+
+
+def still(window: Window, blocks: Sequence[str], wind_w: Sequence[float]) -> Window:
+    """A window in which vehicle and air hardly move against each other, without what speeds would tell there; others as they are.
+
+    Args:
+        window: with all columns.
+        blocks: of its effects.
+        wind_w: of the setting [m/s].
+    """
+    knots = window.knots
+    if "vel_w" not in knots or np.sqrt(np.mean(np.sum((knots["vel_w"] - wind_w) ** 2, axis=1))) > STILL:
+        return window
+    calm = {"vel_w": np.zeros_like(knots["vel_w"])}
+    if "payload_vel_w" in knots and np.sqrt(np.mean(np.sum(knots["payload_vel_w"] ** 2, axis=1))) < STILL:
+        calm["payload_vel_w"] = np.zeros_like(knots["payload_vel_w"])
+    told = np.array([block not in AERODYNAMIC for block in blocks])
+    return replace(window, effects=window.effects * told, knots={**knots, **calm})
 
 
 @dataclass(frozen=True)

@@ -371,7 +371,7 @@ class Search:
         sets = {s for s in sets if not set(s) > set(self.active)}  # additions were tried already
         values = [(list(s), log_evidence(information, score, self.priors, s) - self._toll(s) - own) for s in sets]
         ranked = sorted((v for v in values if v[1] > -DOUBT), key=lambda v: -v[1])
-        return [v for i, v in enumerate(ranked) if i < RIVALS[0] or i < RIVALS[1] and v[1] > -CLOSE]
+        return [v for i, v in enumerate(ranked) if i < RIVALS[0] or (i < RIVALS[1] and v[1] > -CLOSE)]
 
 
 def explain(

@@ -13,7 +13,7 @@ from visthrow.diagnose.catalogue import Entry, Setting, apply, entries_for
 from visthrow.diagnose.cutting import Cut, around_slack, cut, thinned
 from visthrow.diagnose.interface import Mistake
 from visthrow.diagnose.landing import Landings, landings
-from visthrow.diagnose.linearising import Plan, exact, lanes_of
+from visthrow.diagnose.linearising import Plan, exact, lanes_of, still
 from visthrow.diagnose.model import Window
 from visthrow.diagnose.opened import opened
 from visthrow.diagnose.recorded import NEVER, carriers, record_of
@@ -309,9 +309,11 @@ class ThrowModel:
             kept += 2 * int(f.knots[w])
         flown = f.fly(replay, settings, perturbed(states, self._directions), lanes, self.substep)
 
+        blocks = [e.effect.block for e in self._graded]
+
         def window(plan: Plan) -> Window:
             given = f, settings[0], steps, self._directions, self._channel(plan.window), flown.seen, flown.knots
-            return plan.window_of(*given)
+            return still(plan.window_of(*given), blocks, settings[0].plant.air.wind_w)
 
         return each(window, plans)
 
