@@ -115,6 +115,14 @@ def test_effects_that_do_the_same_are_a_class_with_their_known_combination():
     assert diagnosis["effect_03"].manoeuvres
 
 
+def test_a_class_may_have_a_dozen_members():
+    """What a hover shows of a weight, eight causes explain alike."""
+    same = {f"effect_{j:02d}": ("effect_03", 1.0) for j in (0, 1, 4, 6, 7, 9, 10)}
+    model = world(truth={"effect_03": 12.0}, same=same, seed=2)
+    diagnosis = search.explain(model, laws=False)
+    assert {f.name for f in diagnosis.findings if f.verdict == result.CLASS} == {"effect_03", *same}
+
+
 def test_a_missing_channel_makes_effects_unobservable_and_names_it():
     model = world(truth={"effect_03": 12.0}, seed=2)
     model.effects = tuple(replace(e, channels=("battery_voltage",)) if e.name == "effect_05" else e for e in EFFECTS)

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
+from visthrow.diagnose import search
 from visthrow.diagnose.catalogue import ALL
 from visthrow.diagnose.evidence import Priors
 from visthrow.diagnose.point import Problem, fitted, linearise
@@ -25,3 +26,27 @@ def test_a_fit_leaves_switches_where_they_are_and_moves_the_others():
 def test_the_catalogue_says_which_effects_are_switches():
     assert {name for name, e in ALL.items() if e.effect.switch} == {name for name, e in ALL.items() if e.switch is not None}
     assert ALL["controller_kind"].effect.switch
+
+
+class Promising(SyntheticModel):
+    """Another kind of block that explains the flights by its derivative, and not once it is simulated."""
+
+    def _there(self, theta, residuals):
+        off = np.random.default_rng(5)
+        on = theta.get("effect_03", 0.0) != 0.0
+        return [r + on * 2.0 * w.sigma * off.normal(size=len(r)) for r, w in zip(residuals, self._windows)]
+
+    def residuals(self, theta):
+        return self._there(theta, super().residuals(theta))
+
+    def windows(self, theta):
+        found = super().windows(theta)
+        return [replace(w, residual=r) for w, r in zip(found, self._there(theta, [w.residual for w in found]))]
+
+
+def test_another_kind_of_block_must_explain_the_flights_itself():
+    """Its derivative where it is off promises some hundred nats; with it on, the flights are explained worse than without."""
+    floor = EFFECTS[3].floor
+    truth = {"effect_03": 1.0 / floor}
+    assert search.explain(SyntheticModel(effects=EFFECTS, truth=truth, seed=4), laws=False).named == ("effect_03",)
+    assert not search.explain(Promising(effects=EFFECTS, truth=truth, seed=4), laws=False).named
