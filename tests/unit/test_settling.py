@@ -36,7 +36,7 @@ def swayed(log: FlightLog) -> FlightLog:
 
 
 BENDING = 0.1
-"""Of a rope in the model that is 6 mm too long, where it was taut all the time [rad]: 0.05 found, 0.34 with the prior of one that
+"""Of a rope in the model that is 6 mm too long, where it was taut all the time [rad]: 0.07 found, 0.34 with the prior of one that
 has just come taut."""
 
 
