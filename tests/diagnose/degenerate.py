@@ -18,7 +18,7 @@ from visthrow.diagnose.measures import MEASUREMENTS
 from visthrow.flightlog import FlightLog
 
 ROUNDS = 3
-"""Proposals that are followed, one after the other."""
+"""Sessions that are followed, one after the other."""
 MOST_FLIGHTS = 4
 """Of one proposal."""
 CLEAR = 3.0
@@ -47,17 +47,19 @@ class Pair:
         for number in range(1, ROUNDS + 1):
             if number > 1:
                 said = explained(folder, logs, recipe, action="plan", more=(*about, *measured))
-            if not (proposal := next((p for p in said["proposals"] if p["separates"]), None)):
+            if not said["session"]:
                 break
-            done.append((proposal["name"], proposal["repeats"]))
-            effect = next((m for m in MEASUREMENTS if m.name == proposal["name"]), None)
-            if effect is not None:
-                value = recipe.effects.get(effect.effect, 0.0) + effect.sd * np.random.default_rng([recipe.seed, number]).normal()
+            for proposal in (p for p in said["proposals"] if p["name"] in said["session"]):
+                done.append((proposal["name"], proposal["repeats"]))
+                effect = next((m for m in MEASUREMENTS if m.name == proposal["name"]), None)
+                if effect is None:
+                    logs += self.flown(recipe, said, proposal, known[proposal["name"]].payload, len(done))
+                    continue
+                error = effect.sd * np.random.default_rng([recipe.seed, len(done)]).normal()
+                value = recipe.effects.get(effect.effect, 0.0) + error
                 if abs(value) > CLEAR * effect.sd:
                     return self.line(first, said, done, effect.effect == self.effect)
                 measured += ["--measured", f"{effect.effect}={effect.sd}"]
-            else:
-                logs += self.flown(recipe, said, proposal, known[proposal["name"]].payload, number)
             said = explained(folder, logs, recipe, more=measured)
             if self.named(said):
                 break

@@ -17,6 +17,7 @@ from visthrow.diagnose.marginal import Noise, correlated, gram_of, window_statis
 from visthrow.diagnose.measures import MEASUREMENTS, Measurement, narrowed
 from visthrow.diagnose.model import LATENT_BLOCKS, Model
 from visthrow.diagnose.result import Diagnosis
+from visthrow.diagnose.search import CLOSE
 from visthrow.errors import DiagnoseError, suggest
 from visthrow.flightlog import Channel, FlightLog
 
@@ -96,6 +97,16 @@ def propose(
     return sorted([*proposals, *_measured(diagnosis, names, pairs)], key=_worth, reverse=True)
 
 
+def session(proposals: Sequence[Proposal]) -> tuple[Proposal, ...]:
+    """What to do in one session: of ranked proposals, each that separates what none before it does."""
+    chosen, apart = [], set()
+    for p in proposals:
+        if new := set(p.separates) - apart:
+            chosen.append(p)
+            apart |= new
+    return tuple(chosen)
+
+
 def _worth(p: Proposal) -> tuple[float, float]:
     """What settles the most comes first, soonest; what settles nothing by its nats a second."""
     return len(p.separates) / np.sqrt(p.seconds * max(p.repeats, 1)), p.nats / np.sqrt(p.seconds)
@@ -159,12 +170,18 @@ def _ratio(model: Model, names: Sequence[str], priors: Priors) -> np.ndarray:
 
 def _gap(diagnosis: Diagnosis, information: np.ndarray, score: np.ndarray, new: np.ndarray, priors: Priors,
          pair: tuple[int, int]) -> float:  # fmt: skip
-    """Expected nats between two members after the new flight, with either as the truth; the smaller one."""
+    """Expected nats between two members after the new flight, with either as the truth; the smaller one.
+
+    A member that is already behind by more than a class allows is no truth to plan for.
+    """
     findings = {f.name: f for f in diagnosis.findings}
     names = [f.name for f in diagnosis.findings]
     rest = [j for j in diagnosis.work.active if j not in pair]
     gaps = []
+    now = {j: log_evidence(information, score, priors, [*rest, j]) for j in pair}
     for truth, other in (pair, pair[::-1]):
+        if now[truth] < now[other] - CLOSE:
+            continue
         theta = np.zeros(len(priors.floor))
         for j in [*rest, truth]:
             theta[j] = findings[names[j]].estimate / priors.floor[j]

@@ -55,7 +55,12 @@ def run(args: argparse.Namespace) -> int:
     for p in ranked:
         told = "; ".join(" from ".join(group) for group in p.separates) or "-"
         print(f"{p.name:28} {p.seconds:7.1f} {p.nats:8.1f} {p.repeats or '-':>7}  {told}")
-    value = report.to_json(diagnosis, extra={"proposals": [dataclasses.asdict(p) for p in ranked]})
+    session = plan.session(ranked)
+    if session:
+        print(f"together they settle the most: {', '.join(p.name + f' x{p.repeats}' * (p.repeats > 1) for p in session)}")
+    value = report.to_json(
+        diagnosis, extra={"proposals": [dataclasses.asdict(p) for p in ranked], "session": [p.name for p in session]}
+    )
     write_json(Path(args.out) / "plan.json", value)
     print(f"references as CSV: {args.out}")
     if args.json:
