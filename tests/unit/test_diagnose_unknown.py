@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
-from visthrow.diagnose import grammar, result, search, unknown
+from visthrow.diagnose import grammar, result, search, unknown, verdicts
 from visthrow.diagnose.blackbox import Table, table_of, train, unexplained
 from visthrow.diagnose.evidence import Priors
 from visthrow.diagnose.excess import acts_on
@@ -291,3 +291,12 @@ def test_the_table_takes_up_what_no_name_explains():
     speeds = np.column_stack((velocity, window.knots["rate_b"], window.knots["thrust"]))
     drag = again.radial(speeds) @ np.array(data["weights"]["vehicle force"]).T
     assert np.linalg.norm(drag - truth) < LEFT * np.linalg.norm(truth)
+
+
+def test_beside_a_law_a_name_must_be_sure_of_its_sign():
+    """The least certain goes first: what it shared with another may make that one sure."""
+    priors = Priors(np.ones(3), np.full(3, 20.0), np.full(3, -np.inf), np.full(3, np.inf), np.ones(3, bool))
+    information = np.diag([4.0, 0.5, 4.0])
+    point = SimpleNamespace(information=information, score=information @ [8.0, 1.0, 0.3])
+    assert verdicts._sure(point, priors, [0, 1, 2]) == [0]
+    assert verdicts._sure(point, priors, []) == []

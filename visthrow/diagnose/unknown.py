@@ -29,6 +29,9 @@ if TYPE_CHECKING:
 MARGIN = 6.0
 """Nats by which a term must be ahead of the catalogue's best."""
 
+JOINS = 16.0
+"""Nats from which a term joins names that all keep their places: what names leave over that are not quite right looks like one."""
+
 WEIGHED = 5
 """Terms that are weighed with noise levels of their own."""
 
@@ -446,7 +449,7 @@ def beats_the_catalogue(search: "Search", answer: Answer) -> tuple[Hypothesis | 
             if ahead > MARGIN:
                 said = f"{_text(best)} explains the flights better than {_names(search)}, by {ahead:.0f} nats"
                 return best, withdrawn, said
-        elif best.nats > search.least + MARGIN:
+        elif best.nats > max(search.least + MARGIN, JOINS):
             return best, set(), f"{_text(best)} is missing besides what the catalogue holds ({best.nats:.0f} nats)"
     return None, set(), ""
 

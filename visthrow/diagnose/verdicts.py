@@ -61,6 +61,9 @@ def conclude(search: "Search", *, laws: bool) -> Diagnosis:
     known = overall != result.UNKNOWN  # a term that is weaker than the names says nothing
     terms = [] if known else _different(answer.strongest)
     active = [j for j in search.active if j not in withdrawn]
+    if law[0] is not None:
+        active = _sure(law[0].without_terms(), search.priors, active)
+        withdrawn = set(search.active) - set(active)
     if not active and search.active:
         point = search.nominal
     elif law[0] is not None and active:
@@ -82,6 +85,19 @@ def conclude(search: "Search", *, laws: bool) -> Diagnosis:
         flights=len(point.statistics.flights), windows=len(point.windows), samples=int(point.statistics.samples.sum()),
         work=Work(search.problem, search.nominal, search.point if active else search.nominal, tuple(active)),
     )  # fmt: skip
+
+
+def _sure(point: Point, priors: Priors, active: Sequence[int]) -> list[int]:
+    """Names whose intervals leave out 0 at a point, the least certain gone first."""
+    left = list(active)
+    while left:
+        theta = estimate(point.information, point.score, priors, left)
+        spread = np.diag(covariance(point.information, priors.deviation(left)))[left]
+        sure = np.abs(theta[left]) / np.hypot(np.sqrt(spread), OWN_FLOOR)
+        if sure.min() > NORMAL_95:
+            break
+        left.pop(int(np.argmin(sure)))
+    return left
 
 
 def _different(hypotheses: Sequence["Hypothesis"]) -> tuple[Law, ...]:
