@@ -15,6 +15,7 @@ from tests.plants import paper_plant
 from visthrow import config
 from visthrow.diagnose.catalogue import ALL
 from visthrow.diagnose.opened import opened
+from visthrow.diagnose.recorded import record_of
 from visthrow.diagnose.settling import Settling
 from visthrow.diagnose.throw_model import ThrowModel
 from visthrow.errors import DiagnoseError
@@ -251,3 +252,12 @@ def test_what_a_simplified_simulator_lacks_stands_out(part, kind, name):
     assert right < 0.7 * wrong, (wrong, right)
     states = {"aerodynamics": 0, "controller_kind": 3, "motor_lag": 4, "rope_flexible": 8}  # integrals, rotors, bends of the rope
     assert whole[0].nuisance.shape[1] - plain[0].nuisance.shape[1] == states[name]
+
+
+def test_the_charge_is_told_by_more_than_one_voltage(planted):
+    """Single samples are noisy, and some autopilots log a first one of nothing."""
+    log = planted[0][0]
+    time = np.arange(0.0, 2.0, 0.02)
+    volts = np.where(time == 0.0, 3.0, 15.2 - 0.1 * time)
+    seen = record_of(FlightLog({**log.channels, "battery_voltage": Channel(time, volts, "V")}, {}))
+    assert seen.voltage == pytest.approx(15.2, abs=0.03)
