@@ -29,7 +29,7 @@ def test_logs_hold_what_was_measured_and_nothing_of_the_truth(logs):
     """A seed, a size or an unmeasured quantity in the logs would give the answer away."""
     for log in logs:
         assert not log.meta
-        assert set(log.channels) == {"pos_w", "quat_wb", "payload_pos_w", "command", "release_command"}
+        assert set(log.channels) == {"pos_w", "quat_wb", "payload_pos_w", "command", "release_command", "battery_voltage"}
     again = cases.logs_of(Recipe(12, "rod", {"com_y": 1e-3}, **SMALL))
     assert np.abs(logs[0]["pos_w"].values - again[0]["pos_w"].values).max() > 1e-3  # another seed is another flight
 
