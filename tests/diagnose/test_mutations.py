@@ -39,13 +39,7 @@ def no_latent_forces(monkeypatch) -> None:
 def no_floors(monkeypatch) -> None:
     """What is not named is not there at all: neither in the evidence, nor in the null worlds, nor in what a name must exceed."""
     monkeypatch.setattr(evidence, "SPIKE", 1e-3)
-    monkeypatch.setattr(search, "OWN_FLOOR", 1e-3)
-
-    def without(information, count, rng):
-        values, vectors = np.linalg.eigh(information)
-        return rng.standard_normal((count, len(information))) @ (vectors * np.sqrt(np.maximum(values, 0.0))).T
-
-    monkeypatch.setattr(evidence, "null_draws", without)
+    monkeypatch.setattr(evidence, "OWN_FLOOR", 1e-3)
 
 
 def no_bounds(monkeypatch) -> None:

@@ -147,6 +147,16 @@ def estimate(information: np.ndarray, score: np.ndarray, priors: Priors, active:
     return theta
 
 
+def certainty(information: np.ndarray, theta: np.ndarray, priors: Priors, active: list[int] | tuple[int, ...]) -> np.ndarray:
+    """Sizes of named effects in the half widths of the 95 % intervals that they are reported with, in the order of ``active``.
+
+    Above 1 an interval leaves out 0.
+    """
+    at = list(active)
+    spread = np.diag(covariance(information, priors.deviation(at)))[at]
+    return np.abs(theta[at]) / (NORMAL_95 * np.hypot(np.sqrt(spread), OWN_FLOOR))
+
+
 def null_draws(information: np.ndarray, draws: int, rng: np.random.Generator) -> np.ndarray:
     """Scores of worlds in which nothing is wrong but what may go unnamed, every effect drawn from its spike, shape (draws, K)."""
     values, vectors = np.linalg.eigh(information)

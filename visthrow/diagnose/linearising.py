@@ -27,8 +27,8 @@ a rope whips, those by all effects and states do; latent forces there differ by 
 STILL = 0.1
 """Root mean square speed of a window [m/s] up to which the vehicle's motion against the air is the air's own doing: rooms have
 draughts of that speed, and a gust brings a hovering vehicle a velocity that goes with it, as if drag were negative."""
-AERODYNAMIC = ("aerodynamics",)
-"""Blocks whose effects go with that velocity."""
+AERODYNAMIC = "aerodynamics"
+"""Block whose effects go with that velocity."""
 
 
 def exact(e: Entry) -> bool:
@@ -50,7 +50,7 @@ def still(window: Window, blocks: Sequence[str], wind_w: Sequence[float]) -> Win
     calm = {"vel_w": np.zeros_like(knots["vel_w"])}
     if "payload_vel_w" in knots and np.sqrt(np.mean(np.sum(knots["payload_vel_w"] ** 2, axis=1))) < STILL:
         calm["payload_vel_w"] = np.zeros_like(knots["payload_vel_w"])
-    told = np.array([block not in AERODYNAMIC for block in blocks])
+    told = np.array([block != AERODYNAMIC for block in blocks])
     return replace(window, effects=window.effects * told, knots={**knots, **calm})
 
 

@@ -147,7 +147,7 @@ def advantage(
         switches: which effects are another kind of block, shape (K,), bool; default: none.
     """
     points = first[0], second[0]
-    kinds = [np.zeros(0) if switches is None else point.theta[: len(switches)][switches] != 0.0 for point in points]
+    kinds = [np.zeros(0) if switches is None else point.theta[switches] != 0.0 for point in points]
     if not np.array_equal(*kinds):
         return first[0].evidence(priors, first[1]) - second[0].evidence(priors, second[1])
     ahead, behind = (max(point.evidence(priors, active) for point in points) for active in (first[1], second[1]))

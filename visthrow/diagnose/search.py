@@ -14,11 +14,9 @@ import numpy as np
 from visthrow.diagnose.catalogue.scatter import VARYING
 from visthrow.diagnose.consistency import Consistency, across_flights, repeated_flights
 from visthrow.diagnose.evidence import (
-    NORMAL_95,
-    OWN_FLOOR,
     Priors,
     additions,
-    covariance,
+    certainty,
     estimate,
     log_evidence,
     threshold,
@@ -250,8 +248,7 @@ class Search:
 
     def _sure(self, point: Point, active: Sequence[int], j: int) -> bool:
         """Whether the interval that an effect of a set would be reported with leaves out 0."""
-        spread = covariance(point.information, self.priors.deviation(list(active)))[j, j]
-        return bool(abs(point.theta[j]) > NORMAL_95 * np.hypot(np.sqrt(spread), OWN_FLOOR))
+        return bool(certainty(point.information, point.theta, self.priors, active)[list(active).index(j)] > 1.0)
 
     def _share_of(self, point: Point, active: Sequence[int], j: int) -> float:
         """How much of another kind of block is asked for by a point that has it: about 1 if it is there."""

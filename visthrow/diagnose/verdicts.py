@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from visthrow.diagnose import result
-from visthrow.diagnose.evidence import NORMAL_95, OWN_FLOOR, Priors, covariance, estimate
+from visthrow.diagnose.evidence import NORMAL_95, OWN_FLOOR, Priors, certainty, covariance, estimate
 from visthrow.diagnose.excess import acts_on, levels, too_strong
 from visthrow.diagnose.model import Model, Window
 from visthrow.diagnose.point import Point, with_floors_noise
@@ -92,9 +92,8 @@ def _sure(point: Point, priors: Priors, active: Sequence[int]) -> list[int]:
     left = list(active)
     while left:
         theta = estimate(point.information, point.score, priors, left)
-        spread = np.diag(covariance(point.information, priors.deviation(left)))[left]
-        sure = np.abs(theta[left]) / np.hypot(np.sqrt(spread), OWN_FLOOR)
-        if sure.min() > NORMAL_95:
+        sure = certainty(point.information, theta, priors, left)
+        if sure.min() > 1.0:
             break
         left.pop(int(np.argmin(sure)))
     return left
