@@ -65,6 +65,18 @@ class Window:
     ``tension`` [N], ``mount_b`` (of the rope, from the centre of mass) [m, body frame]."""
 
 
+@dataclass(frozen=True)
+class Start:
+    """Initial states that follow the effects: those settled where derivatives were taken, moved as these foresee.
+
+    A window whose state stays behind begins with a transient that no derivative tells of: rotors out of balance, a rope that whips.
+    """
+
+    theta: Mapping[str, float]  # where :meth:`Model.windows` took the derivatives
+    moves: Mapping[int, np.ndarray]  # number of a window -> change of its b, shape (D,)
+    slopes: Mapping[int, np.ndarray]  # number of a window -> its X, shape (N, D)
+
+
 LATENT_BLOCKS = ("vehicle force", "vehicle torque", "payload force")
 """Latent forces [N, world frame], torques [N m, body frame] and forces on the payload [N, world frame]."""
 
@@ -79,6 +91,10 @@ class Model(Protocol):
         """Simulate all windows with the effects at ``theta`` (those not named at 0) and linearise there."""
         ...
 
-    def residuals(self, theta: Mapping[str, float]) -> list[np.ndarray]:
-        """Only the residuals of :meth:`windows`, one array of shape (N,) a window; cheaper."""
+    def residuals(self, theta: Mapping[str, float], start: Start | None = None) -> list[np.ndarray]:
+        """Only the residuals of :meth:`windows`, one array of shape (N,) a window; cheaper.
+
+        With a start its moves are flown, and their share by the derivatives is added to the residuals, which so remain those of
+        b = 0. A model that fits initial states in every simulation has no need of it.
+        """
         ...

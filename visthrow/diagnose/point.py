@@ -18,7 +18,7 @@ from visthrow.diagnose.marginal import (
     recorrelated,
     with_residual,
 )
-from visthrow.diagnose.model import Model, Window
+from visthrow.diagnose.model import Model, Start, Window
 from visthrow.diagnose.scatter import freed, own_shares
 from visthrow.diagnose.threads import each
 
@@ -61,6 +61,7 @@ class Point:
     noise: Noise
     statistics: Statistics
     integrals: Sequence[Integral]  # of the grams under these noise levels
+    start: Start | None  # initial states that were flown; None: those of another kind of block than the derivatives'
 
     @property
     def information(self) -> np.ndarray:
@@ -79,11 +80,11 @@ class Point:
 
 
 def _point(theta: np.ndarray, windows: Sequence[Window], raw: Sequence[Gram], grams: Sequence[Gram], noise: Noise,
-           integrals: Sequence[Integral] | None = None) -> Point:  # fmt: skip
+           start: Start | None, integrals: Sequence[Integral] | None = None) -> Point:  # fmt: skip
     """Gather; ``integrals`` are those of another point with the same derivatives and noise."""
     integrals = integrals_of(grams, noise) if integrals is None else integrals
     parts = [known.share(gram, noise) for known, gram in zip(integrals, grams)]
-    return Point(np.array(theta, dtype=float), windows, raw, grams, noise, gather(grams, parts, theta), integrals)
+    return Point(np.array(theta, dtype=float), windows, raw, grams, noise, gather(grams, parts, theta), integrals, start)
 
 
 def integrals_of(grams: Sequence[Gram], noise: Noise) -> list[Integral]:
@@ -105,7 +106,9 @@ def linearise(problem: Problem, theta: np.ndarray, start: Noise | None = None, w
     kept = levels.without_outliers([windows[i] for i in problem.kept], channels)
     raw = each(lambda w: gram_of(w, problem.priors.floor, channels), kept)
     noise, grams = levels.fit(kept, raw, start)
-    return _point(theta, kept, raw, grams, noise)
+    slopes = {i: w.nuisance for i, w in zip(problem.kept, kept)}
+    settled = Start(problem.sizes(theta), {i: np.zeros(slope.shape[1]) for i, slope in slopes.items()}, slopes)
+    return _point(theta, kept, raw, grams, noise, settled)
 
 
 def lost(point: Point) -> list[int]:
@@ -121,7 +124,8 @@ def lost(point: Point) -> list[int]:
 
 def moved(problem: Problem, point: Point, theta: np.ndarray) -> Point | None:
     """Simulate at ``theta`` but keep the derivatives and noise levels of ``point``; None where the simulation fails there."""
-    residuals = problem.model.residuals(problem.sizes(theta))
+    start = _following(problem, point, theta)
+    residuals = problem.model.residuals(problem.sizes(theta), start)
     residuals = [residuals[i] for i in problem.kept]
     if not all(np.all(np.isfinite(r)) for r in residuals):
         return None
@@ -129,7 +133,18 @@ def moved(problem: Problem, point: Point, theta: np.ndarray) -> Point | None:
     floor = problem.priors.floor
     raw = each(lambda w: with_residual(point.raw[w], windows[w], floor, residuals[w]), range(len(windows)))
     grams = [recorrelated(g, r) for g, r in zip(point.grams, raw)]
-    return _point(theta, windows, raw, grams, point.noise, point.integrals)
+    return _point(theta, windows, raw, grams, point.noise, start, point.integrals)
+
+
+def _following(problem: Problem, point: Point, theta: np.ndarray) -> Start | None:
+    """Initial states that belong to ``theta`` by the derivatives; None where another kind of block has states of its own."""
+    kinds = problem.switches
+    if point.start is None or not np.array_equal(theta[kinds], point.theta[kinds]):
+        return None
+    moves = dict(point.start.moves)
+    for i, w, known in zip(problem.kept, point.windows, point.integrals):
+        moves[i] = moves[i] - known.hidden_by(theta - point.theta)[: len(w.nuisance_sd)] * w.nuisance_sd
+    return replace(point.start, moves=moves)
 
 
 def advantage(
@@ -173,7 +188,7 @@ def curvature(problem: Problem, origin: Point, there: Point) -> float:
 
 def with_fitted_noise(point: Point) -> Point:
     """The same with noise levels estimated from its residuals."""
-    return _point(point.theta, point.windows, point.raw, point.grams, levels.refit(point.grams, point.noise))
+    return _point(point.theta, point.windows, point.raw, point.grams, levels.refit(point.grams, point.noise), point.start)
 
 
 def with_all_effects_noise(problem: Problem, point: Point) -> Point:
@@ -208,7 +223,7 @@ def _with_noise_at(point: Point, theta: np.ndarray, own: np.ndarray | None = Non
     row = {flight: f for f, flight in enumerate(point.statistics.flights.tolist())}
     moves = [at[row[window.flight]] for window in point.windows]
     noise = levels.refit([shifted(gram, move) for gram, move in zip(point.grams, moves)], point.noise)
-    return _point(point.theta, point.windows, point.raw, point.grams, noise)
+    return _point(point.theta, point.windows, point.raw, point.grams, noise, point.start)
 
 
 def shifted(gram: Gram, change: np.ndarray) -> Gram:

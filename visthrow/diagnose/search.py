@@ -260,7 +260,10 @@ class Search:
         for _ in range(TURNS):
             if to_gain(self.problem, point, active) < TURNED:
                 break
-            point = with_fitted_noise(fitted(self.problem, point, active))
+            before, point = point, fitted(self.problem, point, active)
+            if np.array_equal(point.theta, before.theta):
+                break
+            point = with_fitted_noise(point)
         return point
 
     def _switched(self, point: Point, active: Sequence[int]) -> Point:

@@ -12,7 +12,7 @@ from sim.replay.kernel import ATTACHED
 from sim.replay.lanes import Replay
 from visthrow.diagnose.catalogue import Setting
 from visthrow.diagnose.replay import Flights, Lane
-from visthrow.diagnose.states import Direction, States, concerns, moved, stacked
+from visthrow.diagnose.states import Direction, States, concerns, moved, moved_along, stacked
 
 DAMPING, DAMPING_MOST = 1e-3, 1e5
 """Of the Levenberg-Marquardt steps: at first, and where a window counts as settled."""
@@ -96,7 +96,7 @@ class Settling:
             trial, hoped = np.zeros_like(moves), np.zeros(count)
             for w in left:
                 trial[w], hoped[w] = self._increment(w, residuals[w], moves[w], damping[w])
-            there = self._moved(states, trial)
+            there = moved_along(states, self.directions, trial)
             seen = dict(zip(left, self._residuals(there, left)))
             tried = self._costs(seen)
             better = tried < cost
@@ -119,12 +119,6 @@ class Settling:
             left = left[~settled[left] & (damping[left] < DAMPING_MOST)]
             if not len(left):
                 break
-        return states
-
-    def _moved(self, states: States, sizes: np.ndarray) -> States:
-        """States moved along all directions by ``sizes``, shape (windows, directions)."""
-        for d, direction in enumerate(self.directions):
-            states = moved(states, direction, sizes[:, d])
         return states
 
     def _residuals(self, states: States, which: np.ndarray) -> list[np.ndarray]:

@@ -105,6 +105,13 @@ def moved(states: States, direction: Direction, size: np.ndarray | float) -> Sta
     return out
 
 
+def moved_along(states: States, directions: tuple[Direction, ...], sizes: np.ndarray) -> States:
+    """States moved along all directions by ``sizes``, shape (S, directions)."""
+    for d, direction in enumerate(directions):
+        states = moved(states, direction, sizes[:, d])
+    return states
+
+
 def _shape(part: str | int, segments: int) -> np.ndarray:
     """How far each segment turns, shape (L,)."""
     if isinstance(part, int):

@@ -14,7 +14,7 @@ from visthrow.diagnose.cutting import Cut, around_slack, cut, thinned
 from visthrow.diagnose.interface import Mistake
 from visthrow.diagnose.landing import Landings, landings
 from visthrow.diagnose.linearising import Plan, exact, lanes_of, still
-from visthrow.diagnose.model import Window
+from visthrow.diagnose.model import Start, Window
 from visthrow.diagnose.opened import opened
 from visthrow.diagnose.recorded import NEVER, carriers, record_of
 from visthrow.diagnose.replay import BATCH, CUDA_BATCH, Flights, Lane, carried
@@ -22,9 +22,11 @@ from visthrow.diagnose.settling import Settling, perturbed
 from visthrow.diagnose.sightings import channels_of, needs_no_flight, sightings, with_sightings
 from visthrow.diagnose.states import (
     States,
+    concerns,
     directions,
     hover_state,
     measured_state,
+    moved_along,
     resampled,
     rows_of,
 )
@@ -114,13 +116,14 @@ class ThrowModel:
         self._told = np.array([w for w, c in enumerate(self.flights.cuts) if c.told])
         self._fits: dict[tuple[Cut, ...], tuple[States, dict[int, np.ndarray]]] = {}
         self._latest: dict[frozenset[str], States] = {frozenset(): self._fitted(states)[0]}
+        self._settled_at: dict[frozenset[tuple[str, float]], States] = {}
         self._sightings = sightings(logs, flights, self.flights.cuts, self.setting)
 
     def windows(self, theta: Mapping[str, float]) -> list[Window]:
         """See :class:`visthrow.diagnose.model.Model`."""
         setting = apply(self.entries, self.setting, theta)
         self._directions = directions(setting.plant)  # another kind of block has other states
-        states = self._latest[self._switches(theta)] = self._settled(setting)
+        states = self._latest[self._switches(theta)] = self._settled_at[_key(theta)] = self._settled(setting)
         steps = [self._step(e, theta.get(e.effect.name, 0.0)) for e in self._graded]
         settings = [setting, *[e.apply(setting, step) for e, step in zip(self._graded, steps)]]
         replay = self._replay(settings)
@@ -162,15 +165,28 @@ class ThrowModel:
         sign = -1.0 if on else 1.0
         return [sign * (x.residual - self.flights.residual(seen, w, lane)) for lane, (w, x) in enumerate(zip(self._told, windows))]
 
-    def residuals(self, theta: Mapping[str, float]) -> list[np.ndarray]:
-        """See :class:`visthrow.diagnose.model.Model`; from the initial states settled last with the same kinds of blocks."""
+    def residuals(self, theta: Mapping[str, float], start: Start | None = None) -> list[np.ndarray]:
+        """See :class:`visthrow.diagnose.model.Model`; without a start from the states settled last with the same kinds of blocks."""
         setting = apply(self.entries, self.setting, theta)
         lanes = [Lane(w, 0, w) for w in self._told]
         states = self._latest.get(self._switches(theta), self._fitted()[0])
+        if start is not None:
+            states = self._following(self._settled_at[_key(start.theta)], setting, start)
         states = resampled(states, setting.plant.rope.segments)
         seen = self.flights.fly(self._replay([setting]), [setting], states, lanes, self.substep).seen
         flown = [self.flights.residual(seen, w, lane) for lane, w in enumerate(self._told)]
-        return [np.concatenate((r, *self._sighting_residuals(w, setting))) for r, w in zip(flown, self._told)]
+        told = [np.concatenate((r, *self._sighting_residuals(w, setting))) for r, w in zip(flown, self._told)]
+        moves = {} if start is None else start.moves
+        return [r + start.slopes[i] @ moves[i] if i in moves else r for i, r in enumerate(told)]
+
+    def _following(self, states: States, setting: Setting, start: Start) -> States:
+        """States moved as a start says."""
+        found, cuts = directions(setting.plant), self.flights.cuts
+        sizes = np.zeros((len(cuts), len(found)))
+        for i, move in start.moves.items():
+            w = self._told[i]
+            sizes[w, [d for d, x in enumerate(found) if concerns(x, cuts[w])]] = move
+        return moved_along(states, found, sizes)
 
     def _switches(self, theta: Mapping[str, float]) -> frozenset[str]:
         """Which other kinds of blocks are on."""
@@ -329,3 +345,8 @@ class ThrowModel:
             separation = self.flights.flights[c.flight].latch + self.setting.plant.release.lag
             cuts += [c] if last < c.start else around_slack(c, first, last + AFTER_SLACK, separation)
         return cuts
+
+
+def _key(theta: Mapping[str, float]) -> frozenset[tuple[str, float]]:
+    """The sizes that are not 0."""
+    return frozenset((name, float(value)) for name, value in theta.items() if value)
