@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from visthrow.diagnose.model import Effect, Start, Window
+from visthrow.diagnose.model import Effect, Linearised, Window
 
 MASS = (0.21, 0.058)  # [kg]
 SIGMA = (5e-4, 8e-4)  # [m]
@@ -178,6 +178,6 @@ class SyntheticModel:
         left = self.residuals(theta)
         return [replace(w, residual=r, effects=w.effects * slope) for w, r in zip(self._windows, left)]
 
-    def residuals(self, theta: dict[str, float], start: Start | None = None) -> list[np.ndarray]:
+    def residuals(self, theta: dict[str, float], about: Linearised | None = None) -> list[np.ndarray]:
         sizes = self._sizes(theta)
         return [w.residual - self._answer(w.effects, sizes) for w in self._windows]

@@ -1,13 +1,7 @@
 """Choice of the compute device."""
 
-import os
-
+from sim.cores import cores as cores
 from visthrow.errors import DeviceError
-
-
-def cores() -> int:
-    """CPU cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def resolve(name: str = "auto") -> str:

@@ -12,6 +12,7 @@ import warp as wp
 from sim import runtime  # noqa: F401  starts Warp
 from sim import state as st
 from sim.checks import check_air, check_numerics, check_release
+from sim.cores import cores
 from sim.laws import check_laws, structure
 from sim.params import GRAVITY, PlantParams, SensingParams
 from sim.replay import kernel as rk
@@ -34,6 +35,9 @@ class Replayed:
 
 _BUILDS: dict = {}
 
+FEW = 32
+"""Lanes a core up to which a CPU has flown them all before a GPU has flown one: there each takes some 50 times as long."""
+
 
 class Replay:
     """Replays windows of recorded flights with perturbed parameters, initial states and forces.
@@ -41,7 +45,7 @@ class Replay:
     Args:
         plants: parameters of the rows that lanes choose from; one choice of blocks and one number of segments.
         sensings: of the same rows.
-        device: Warp device, "cpu" or "cuda:0".
+        device: Warp device, "cpu" or "cuda:0"; with a GPU, runs of few lanes go to the CPU all the same.
         precision: "float64", in which differences of lanes do not drown in rounding, or "float32".
         gravity: [m/s^2].
 
@@ -76,14 +80,14 @@ class Replay:
             _BUILDS[key] = rk.build_replay(t, first.vehicle, self.segments, first.laws)
         self.kernel = _BUILDS[key]
         vehicles = [p.vehicle for p in plants]
-        rows = {
+        self._rows = {
             t.Vehicle: pack_vehicle(t, vehicles, kinds),
             t.Rope: pack_rope(t, ropes_on(vehicles, [p.rope for p in plants])),
             t.Release: pack(t.Release, *[p.release for p in plants]),
             t.Air: pack_air(t, [p.air for p in plants], [p.laws for p in plants]),
             self.kernel.Sensing: pack(self.kernel.Sensing, *sensings),
         }
-        self._plants = [wp.array(value, dtype=struct, device=device) for struct, value in rows.items()]
+        self._plants: dict[str, list[wp.array]] = {}
 
     def run(
         self,
@@ -106,49 +110,53 @@ class Replay:
         """
         k = self.kernel
         count = len(lanes["window"])
+        device = self.device if count > FEW * cores() else "cpu"
+        if device not in self._plants:
+            self._plants[device] = [wp.array(value, dtype=struct, device=device) for struct, value in self._rows.items()]
         w = np.asarray(lanes["window"])
         rows = 2 * windows["vehicle_count"] + windows["payload_count"] + windows["gyro_count"]
         height = max(int(np.max(rows[w])), 1)
         segments = {"cable_dir_w": self.segments, "cable_vel_w": self.segments, "stiffness": self.segments}
         keeping = count if np.any(np.asarray(lanes["keep"]) >= 0) else 1
-        ends = st.allocate(self.types, k.State, rk.STATE_FIELDS, keeping, segments, self.device)
-        held = st.allocate(self.types, k.Knots, rk.KNOT_FIELDS, knots, {}, self.device)
-        out = wp.empty((height, count), dtype=self.types.vec3, device=self.device)
+        ends = st.allocate(self.types, k.State, rk.STATE_FIELDS, keeping, segments, device)
+        held = st.allocate(self.types, k.Knots, rk.KNOT_FIELDS, knots, {}, device)
+        out = wp.empty((height, count), dtype=self.types.vec3, device=device)
         resumed = np.asarray(lanes["resume"]) >= 0
         moments, vec3 = knots if np.any(resumed) else 0, self.types.vec3
-        ropes = [wp.empty((moments, self.segments), dtype=kind, device=self.device) for kind in (vec3, vec3, self.types.real)]
-        left_at = [wp.empty(moments, dtype=k.Moment, device=self.device), *ropes]
-        marks = wp.zeros(count, dtype=k.Pointers, device=self.device)
+        ropes = [wp.empty((moments, self.segments), dtype=kind, device=device) for kind in (vec3, vec3, self.types.real)]
+        left_at = [wp.empty(moments, dtype=k.Moment, device=device), *ropes]
+        marks = wp.zeros(count, dtype=k.Pointers, device=device)
         flown, resumed = _in_order(np.asarray(lanes["rides"]), resumed)
-        order = wp.array(np.concatenate((flown, resumed)), dtype=wp.int32, device=self.device)
+        order = wp.array(np.concatenate((flown, resumed)), dtype=wp.int32, device=device)
         numerics = [knot_spacing, self._sim.gamma, self._sim.max_turn, self.gravity]
         given = [
-            self._struct(k.State, rk.STATE_FIELDS, starts), self._struct(k.Windows, rk.WINDOW_FIELDS, windows),
-            self._struct(k.Lanes, rk.LANE_FIELDS, lanes), self._struct(k.Data, rk.DATA_FIELDS, data),
+            self._struct(struct, fields, values, device) for struct, fields, values in (
+                (k.State, rk.STATE_FIELDS, starts), (k.Windows, rk.WINDOW_FIELDS, windows),
+                (k.Lanes, rk.LANE_FIELDS, lanes), (k.Data, rk.DATA_FIELDS, data),
+            )
         ]  # fmt: skip
         for first, last in ((0, len(flown)), (len(flown), len(flown) + len(resumed))):
-            self._launch(first, last, [*self._plants, *numerics, *given, order], [ends, held, marks, *left_at, out])
+            self._launch(device, first, last, [*self._plants[device], *numerics, *given, order], [ends, held, marks, *left_at, out])
         return Replayed(out.numpy(), self._read(ends, rk.STATE_FIELDS), self._read(held, rk.KNOT_FIELDS))
 
-    def _launch(self, begin: int, end: int, before: list, after: list) -> None:
+    def _launch(self, device: str, begin: int, end: int, before: list, after: list) -> None:
         """Some of the lanes, in one launch or one for each core: on the CPU it runs on one thread and leaves the others free."""
         if end <= begin:
             return
-        if self.device != "cpu":
-            wp.launch(self.kernel.replay, end - begin, [*before, begin, *after], device=self.device, block_dim=64)
-            wp.synchronize_device(self.device)
+        if device != "cpu":
+            wp.launch(self.kernel.replay, end - begin, [*before, begin, *after], device=device, block_dim=64)
+            wp.synchronize_device(device)
             return
         self.kernel.replay.module.load("cpu")
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        pieces = np.linspace(begin, end, min(4 * cores, end - begin) + 1).astype(int)
+        pieces = np.linspace(begin, end, min(4 * cores(), end - begin) + 1).astype(int)
 
         def launch(first: int, last: int) -> None:
             wp.launch(self.kernel.replay, last - first, [*before, int(first), *after], device="cpu")
 
-        for done in [_pool(cores).submit(launch, a, b) for a, b in zip(pieces[:-1], pieces[1:])]:
+        for done in [_pool(cores()).submit(launch, a, b) for a, b in zip(pieces[:-1], pieces[1:])]:
             done.result()
 
-    def _struct(self, struct: type, fields: Mapping, values: Mapping[str, np.ndarray]):
+    def _struct(self, struct: type, fields: Mapping, values: Mapping[str, np.ndarray], device: str):
         t = self.types
         scalar = {"real": t.real, "int": wp.int32, "vec3": t.vec3, "vec4": t.vec4, "quat": t.quat}
         numpy = {"int": np.int32}
@@ -157,7 +165,7 @@ class Replay:
         for name, (kind, by_row) in fields.items():
             value = np.asarray(values[name], dtype=numpy.get(kind, real))
             value = np.ascontiguousarray(np.swapaxes(value, 0, 1) if by_row else value)
-            setattr(out, name, wp.array(value, dtype=scalar[kind], device=self.device))
+            setattr(out, name, wp.array(value, dtype=scalar[kind], device=device))
         return out
 
     @staticmethod
@@ -169,9 +177,9 @@ class Replay:
 
 
 @cache
-def _pool(cores: int) -> ThreadPoolExecutor:
+def _pool(threads: int) -> ThreadPoolExecutor:
     """Threads that launch pieces; kept, since a fit of initial states flies some hundred times."""
-    return ThreadPoolExecutor(cores, "replay")
+    return ThreadPoolExecutor(threads, "replay")
 
 
 if hasattr(os, "register_at_fork"):

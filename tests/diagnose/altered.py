@@ -90,6 +90,6 @@ class Flipped:
         self._last = self.model.windows(theta)
         return [replace(w, residual=w.residual + self._shift(w, b)) for w, b in zip(self._last, self._base)]
 
-    def residuals(self, theta, start=None):
+    def residuals(self, theta, about=None):
         """See :class:`visthrow.diagnose.model.Model`."""
-        return [r + self._shift(w, b) for w, r, b in zip(self._last, self.model.residuals(theta, start), self._base)]
+        return [r + self._shift(w, b) for w, r, b in zip(self._last, self.model.residuals(theta, about), self._base)]

@@ -23,7 +23,7 @@ class Whipping(SyntheticModel):
         self.at = theta.get(NAME, 0.0)
         return super().windows(theta)
 
-    def residuals(self, theta, start=None):
+    def residuals(self, theta, about=None):
         floor = EFFECTS[3].floor
         far = BUMP * (theta.get(NAME, 0.0) - self.at) / floor
         rough = np.random.default_rng(3)

@@ -9,6 +9,7 @@ from tests.synthetic_diagnosis import GUST, SyntheticModel, catalogue
 from visthrow.diagnose import marginal, noise
 from visthrow.diagnose.evidence import Priors
 from visthrow.diagnose.model import Window
+from visthrow.diagnose.stack import BATCH, Stack
 from visthrow.errors import DiagnoseError
 
 EFFECTS = catalogue(6)
@@ -60,6 +61,27 @@ def test_likelihood_is_that_of_the_dense_covariance(fitted):
         assert marginal.posterior(of, choice, 0).log_likelihood == pytest.approx(dense_value, abs=1e-3)
 
 
+def test_windows_side_by_side_are_what_they_are_alone(fitted):
+    """Of different sizes, in more batches than one, in their order."""
+    _, windows, floors, levels, grams = fitted
+    lean = [replace(w, latent=w.latent[:, :-4], latent_block=w.latent_block[:-4], latent_axis=w.latent_axis[:-4],
+                    latent_time=w.latent_time[:-4]) for w in windows[::3]]  # fmt: skip
+    shorter = [marginal.correlated(marginal.gram_of(w, floors, 2), w, levels.correlation_time) for w in lean]
+    mixed = [*grams, *shorter]
+    rows = [*range(len(grams)), *range(0, len(grams), 3)]
+    alone = [marginal.posterior(gram, levels, w).log_likelihood for gram, w in zip(mixed, rows)]
+    assert len(mixed) > BATCH
+    stack = Stack(mixed, windows=rows)
+    np.testing.assert_allclose(stack.values(levels), alone, rtol=1e-8)
+    np.testing.assert_allclose(stack.look(levels)[0], alone, rtol=1e-8)
+
+
+def test_broken_derivatives_are_told_with_their_window(fitted):
+    gram = fitted[4][3]
+    with pytest.raises(DiagnoseError, match=f"flight {gram.flight}, phase {gram.phase}: the normal equations are singular"):
+        Stack([fitted[4][0], replace(gram, inner=-1e6 * gram.inner)]).values(fitted[3])
+
+
 def test_a_single_huge_state_does_not_leak_into_the_effects(fitted):
     """Initial states are vague: a shift of 0.1 m changes the score by rounding alone."""
     _, windows, floors, levels, grams = fitted
@@ -75,13 +97,14 @@ def test_gradients_of_the_likelihood_are_its_differences(fitted):
     levels = replace(levels, share=levels.share * np.random.default_rng(0).uniform(0.7, 1.4, levels.share.shape))
     layout = noise._Layout.of(grams, levels)
     x = layout.pack(levels)
-    _, slope, _ = noise._likelihood(grams, levels, layout)
+    stack = Stack(grams)
+    _, slope, _ = noise._likelihood(stack, levels, layout)
     step, first = 1e-3, len(layout.keys)
 
     def value(i: int, h: float) -> float:
         moved = x.copy()
         moved[i] += h
-        return noise._likelihood(grams, layout.unpack(moved, levels), layout)[0]
+        return noise._likelihood(stack, layout.unpack(moved, levels), layout)[0]
 
     for i in [*range(first), first, first + 7, len(x) - 2, len(x) - 1]:
         assert (value(i, step) - value(i, -step)) / (2 * step) == pytest.approx(slope[i], rel=1e-3, abs=0.1)
@@ -153,7 +176,7 @@ def test_rounding_of_huge_derivatives_does_not_spoil_the_curvature(fitted):
     square = 0.1 * gram.inner[0] / largest
     weight = levels.scale**-2.0
     spoilt = replace(gram, inner=np.stack((square / weight[0], -2.0 * square / weight[1])))
-    _, _, curvature = noise._window_likelihood(spoilt, levels, 0)
+    _, _, curvature = Stack([spoilt]).look(levels)
     assert np.abs(curvature).max() <= 2.0 * max(gram.count.max(), gram.latents)
 
 

@@ -93,7 +93,7 @@ def test_idempotence_what_was_found_is_not_found_again():
         def windows(self, theta):
             return model.windows(self._sum(theta))
 
-        def residuals(self, theta, start=None):
+        def residuals(self, theta, about=None):
             return model.residuals(self._sum(theta))
 
         def _sum(self, theta):

@@ -36,7 +36,7 @@ class Promising(SyntheticModel):
         on = theta.get("effect_03", 0.0) != 0.0
         return [r + on * 2.0 * w.sigma * off.normal(size=len(r)) for r, w in zip(residuals, self._windows)]
 
-    def residuals(self, theta, start=None):
+    def residuals(self, theta, about=None):
         return self._there(theta, super().residuals(theta))
 
     def windows(self, theta):

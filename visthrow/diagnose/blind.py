@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from visthrow.diagnose.evidence import additions
-from visthrow.diagnose.model import Model, Start, Window
+from visthrow.diagnose.model import Linearised, Model, Window
 from visthrow.diagnose.result import Diagnosis
 from visthrow.diagnose.search import CLOSE
 
@@ -129,9 +129,9 @@ class Hidden:
         """See :class:`visthrow.diagnose.model.Model`."""
         return [replace(w, residual=w.residual + s) for w, s in zip(self.model.windows(theta), self._shift)]
 
-    def residuals(self, theta: Mapping[str, float], start: Start | None = None) -> list[np.ndarray]:
+    def residuals(self, theta: Mapping[str, float], about: Linearised | None = None) -> list[np.ndarray]:
         """See :class:`visthrow.diagnose.model.Model`."""
-        return [r + s for r, s in zip(self.model.residuals(theta, start), self._shift)]
+        return [r + s for r, s in zip(self.model.residuals(theta, about), self._shift)]
 
 
 @dataclass(frozen=True)

@@ -10,10 +10,11 @@ from dataclasses import replace
 import numpy as np
 
 from visthrow.diagnose.grammar import JOINT, JOINT_NEEDS, Known, coefficients, loads
-from visthrow.diagnose.marginal import Gram, posterior
+from visthrow.diagnose.marginal import Gram
 from visthrow.diagnose.model import LATENT_BLOCKS, Window
 from visthrow.diagnose.point import Point
 from visthrow.diagnose.result import Level
+from visthrow.diagnose.stack import Stack
 
 UNKNOWN_RATIO = 3.0
 """Latent forces above this many times the quietest phase's are no gusts."""
@@ -35,37 +36,43 @@ def levels(before: Point, after: Point, least: float) -> tuple[Level, ...]:
     """
     found = []
     blocks = sorted({block for block, _ in after.noise.latent_sd})
+    of = {phase: _Phase(after, phase) for _, phase in after.noise.latent_sd}
     for block in blocks:
         phases = [phase for b, phase in after.noise.latent_sd if b == block]
-        limits = {phase: _upper_limit(after, block, phase) for phase in phases}
+        limits = {phase: of[phase].upper_limit(block) for phase in phases}
         quiet_phase = min(limits, key=limits.get)
         quiet = limits[quiet_phase]
         for phase in phases:
             level = after.noise.latent_sd[block, phase]
             nats = 0.0
             if level > UNKNOWN_RATIO * quiet:
-                nats = _likelihood(after, block, phase, level) - _likelihood(after, block, phase, UNKNOWN_RATIO * quiet)
+                nats = of[phase].likelihood(block, level) - of[phase].likelihood(block, UNKNOWN_RATIO * quiet)
             earlier = before.noise.latent_sd.get((block, phase), float("nan"))
             found.append(Level(LATENT_BLOCKS[block], phase, earlier, level, quiet, float(nats), bool(nats > least)))
     return tuple(found)
 
 
-def _windows(point: Point, block: int, phase: str) -> list[int]:
-    return [w for w, g in enumerate(point.grams) if g.phase == phase and np.any(g.latent_block == block)]
+class _Phase:
+    """The windows of a phase under any level of a block's latent forces there."""
 
+    def __init__(self, point: Point, phase: str):
+        """Put them side by side."""
+        windows = [w for w, gram in enumerate(point.grams) if gram.phase == phase]
+        self.noise, self.phase, self.stack = point.noise, phase, Stack([point.grams[w] for w in windows], point.device, windows)
 
-def _likelihood(point: Point, block: int, phase: str, level: float) -> float:
-    noise = replace(point.noise, latent_sd={**point.noise.latent_sd, (block, phase): level})
-    return sum(posterior(point.grams[w], noise, w).log_likelihood for w in _windows(point, block, phase))
+    def likelihood(self, block: int, level: float) -> float:
+        """Of the phase's residuals."""
+        noise = replace(self.noise, latent_sd={**self.noise.latent_sd, (block, self.phase): level})
+        return float(self.stack.values(noise).sum())
 
-
-def _upper_limit(point: Point, block: int, phase: str) -> float:
-    best = point.noise.latent_sd[block, phase]
-    top = _likelihood(point, block, phase, best)
-    for step in range(1, MOST_STEPS):
-        if _likelihood(point, block, phase, best * STEP**step) < top - LIMIT_NATS:
-            break
-    return float(best * STEP**step)
+    def upper_limit(self, block: int) -> float:
+        """Largest level of a block that the residuals allow."""
+        best = self.noise.latent_sd[block, self.phase]
+        top = self.likelihood(block, best)
+        for step in range(1, MOST_STEPS):
+            if self.likelihood(block, best * STEP**step) < top - LIMIT_NATS:
+                break
+        return float(best * STEP**step)
 
 
 def acts_on(point: Point, j: int, *, joint: bool = False, beside: Sequence[int] = ()) -> str:

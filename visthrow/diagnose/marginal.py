@@ -298,10 +298,6 @@ class Integral:
     level: np.ndarray  # prior deviation of [X, G], shape (D + L,)
     log_det: float  # of V
 
-    def hidden_by(self, change: np.ndarray) -> np.ndarray:
-        """What initial state and latent forces would be taken for if the columns' sizes changed so, shape (D + L,), in prior units."""
-        return self.level * np.ravel(lapack.dtrtrs(self.factor, self.half @ change, lower=1, trans=1)[0])
-
     def share(self, gram: Gram, noise: Noise) -> Share:
         """With the residuals of a gram of the same derivatives."""
         weight = noise.scale**-2.0

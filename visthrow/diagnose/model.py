@@ -66,15 +66,14 @@ class Window:
 
 
 @dataclass(frozen=True)
-class Start:
-    """Initial states that follow the effects: those settled where derivatives were taken, moved as these foresee.
+class Linearised:
+    """Where derivatives were taken, and what they are, so that initial states can follow the effects from there.
 
-    A window whose state stays behind begins with a transient that no derivative tells of: rotors out of balance, a rope that whips.
+    A window whose state stays behind begins with a transient that no derivative tells of, such as rotors out of balance.
     """
 
-    theta: Mapping[str, float]  # where :meth:`Model.windows` took the derivatives
-    moves: Mapping[int, np.ndarray]  # number of a window -> change of its b, shape (D,)
-    slopes: Mapping[int, np.ndarray]  # number of a window -> its X, shape (N, D)
+    theta: Mapping[str, float]  # given to :meth:`Model.windows`
+    windows: Mapping[int, Window]  # what came, by number
 
 
 LATENT_BLOCKS = ("vehicle force", "vehicle torque", "payload force")
@@ -91,10 +90,13 @@ class Model(Protocol):
         """Simulate all windows with the effects at ``theta`` (those not named at 0) and linearise there."""
         ...
 
-    def residuals(self, theta: Mapping[str, float], start: Start | None = None) -> list[np.ndarray]:
+    def residuals(self, theta: Mapping[str, float], about: Linearised | None = None) -> list[np.ndarray]:
         """Only the residuals of :meth:`windows`, one array of shape (N,) a window; cheaper.
 
-        With a start its moves are flown, and their share by the derivatives is added to the residuals, which so remain those of
-        b = 0. A model that fits initial states in every simulation has no need of it.
+        Args:
+            theta: sizes of the effects.
+            about: where the caller's derivatives were taken. Initial states begin with those of that place and follow the effects;
+                what that does by the derivatives is added to the residuals again, which so are those of b = 0. A model that fits
+                initial states in every simulation has no need of it.
         """
         ...

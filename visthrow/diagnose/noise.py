@@ -21,6 +21,7 @@ from visthrow.diagnose.marginal import (
     without_effects,
 )
 from visthrow.diagnose.model import LATENT_BLOCKS, Window
+from visthrow.diagnose.stack import Stack
 from visthrow.diagnose.threads import each
 
 MAD_TO_SIGMA = 1.4826
@@ -85,13 +86,16 @@ def highpass_sigma(values: np.ndarray) -> np.ndarray:
     return MAD_TO_SIGMA * np.median(np.abs(third - np.median(third, axis=0)), axis=0) / THIRD_DIFFERENCE
 
 
-def fit(windows: Sequence[Window], grams: Sequence[Gram], start: Noise | None = None) -> tuple[Noise, list[Gram]]:
+def fit(
+    windows: Sequence[Window], grams: Sequence[Gram], start: Noise | None = None, device: str = "cpu"
+) -> tuple[Noise, list[Gram]]:
     """Estimate sensor scales, latent deviations by block and phase, and their correlation time.
 
     Args:
         windows: for the knots of the latent forces.
         grams: of the windows, with ``factor`` the identity.
         start: an earlier estimate: its correlation time is kept, its levels are where the search starts.
+        device: where to calculate.
 
     Returns:
         The levels, and the grams with correlated latent forces that belong to them.
@@ -100,25 +104,27 @@ def fit(windows: Sequence[Window], grams: Sequence[Gram], start: Noise | None = 
     if not any(gram.latents for gram in grams):
         times = times[:1]
     bare = [without_effects(gram) for gram in grams]
-    best: tuple[float, Noise, list[Gram]] | None = None
+    best: tuple[float, Noise, list[Gram], Stack] | None = None
     for time in times:
         shaped = each(lambda w: correlated(bare[w], windows[w], time), range(len(bare)))  # noqa: B023  waits for the result
         noise = start or (best[1] if best else _first_guess(shaped))
-        noise, value = _maximise(shaped, replace(noise, correlation_time=time), ROUGHLY_NATS if len(times) > 1 else ENOUGH_NATS)
+        stack, enough = Stack(shaped, device), ROUGHLY_NATS if len(times) > 1 else ENOUGH_NATS
+        noise, value = _maximise(shaped, stack, replace(noise, correlation_time=time), enough)
         if best is None or value > best[0]:
-            best = value, noise, shaped
-    noise = best[1] if len(times) == 1 else _maximise(best[2], best[1])[0]
+            best = value, noise, shaped, stack
+    noise = best[1] if len(times) == 1 else _maximise(best[2], best[3], best[1])[0]
     return noise, each(lambda w: correlated(grams[w], windows[w], noise.correlation_time), range(len(grams)))
 
 
-def refit(grams: Sequence[Gram], start: Noise) -> Noise:
+def refit(grams: Sequence[Gram], start: Noise, device: str = "cpu") -> Noise:
     """Estimate the levels anew, with the correlation time that the grams have been given.
 
     Args:
         grams: of the windows, with correlated latent forces.
         start: where the search starts.
+        device: where to calculate.
     """
-    return _maximise([without_effects(gram) for gram in grams], start)[0]
+    return _maximise(grams, Stack(grams, device), start)[0]
 
 
 def _first_guess(grams: Sequence[Gram]) -> Noise:
@@ -186,17 +192,23 @@ class _Layout:
         return low, high
 
 
-def _maximise(grams: Sequence[Gram], noise: Noise, enough: float = ENOUGH_NATS) -> tuple[Noise, float]:
+def _maximise(grams: Sequence[Gram], stack: Stack, noise: Noise, enough: float = ENOUGH_NATS) -> tuple[Noise, float]:
     """Most probable logarithms of all levels, with exact gradients and explicit limits.
 
     By Fisher scoring: the expected curvature costs nothing beside the gradient, and a few looks at all windows suffice.
+
+    Args:
+        grams: of the windows.
+        stack: of the same grams.
+        noise: where the search starts.
+        enough: nats below which a step ends it.
     """
     layout = _Layout.of(grams, noise)
     low, high = layout.limits(grams)
     x = np.clip(layout.pack(noise), low, high)
 
     def look(x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-        return _likelihood(grams, layout.unpack(x, noise), layout)
+        return _likelihood(stack, layout.unpack(x, noise), layout)
 
     value, slope, curvature = look(x)
     last = np.zeros_like(x)
@@ -249,51 +261,19 @@ def _scoring_step(
     return np.clip(x + step, low, high) - x, promised
 
 
-def _likelihood(grams: Sequence[Gram], noise: Noise, layout: _Layout) -> tuple[float, np.ndarray, np.ndarray]:
-    """Log-likelihood with the prior of the windows' shares, its gradient by the parameters, and its expected curvature.
-
-    The curvature (Fisher's) is exact among the levels; what the scales share with the fitted columns is given to the channels by
-    their part in them.
-    """
+def _likelihood(stack: Stack, noise: Noise, layout: _Layout) -> tuple[float, np.ndarray, np.ndarray]:
+    """Log-likelihood with the prior of the windows' shares, its gradient by the parameters, and its expected curvature."""
     size = len(layout.keys) + len(layout.pairs) + len(layout.seen)
     value, slope, curvature = noise.log_prior, np.zeros(size), np.zeros((size, size))
     own = np.arange(len(layout.keys), len(layout.keys) + len(layout.pairs))
     inverse = noise.share[tuple(layout.pairs.T)] ** -2.0
     slope[own] = TAIL * (inverse - 1.0)
     curvature[own, own] = 2.0 * TAIL * np.clip(inverse, *PRIOR_CURVATURE)
-    for w, found in enumerate(each(lambda w: _window_likelihood(grams[w], noise, w), range(len(grams)))):
-        rows, parts = layout.rows[w], layout.parts[w]
-        value += found[0]
-        slope[rows] += found[1][parts]
-        curvature[np.ix_(rows, rows)] += found[2][np.ix_(parts, parts)]
-    return value, slope, curvature
-
-
-def _window_likelihood(gram: Gram, noise: Noise, window: int) -> tuple[float, np.ndarray, np.ndarray]:
-    """One window's share of :func:`_likelihood`: value, gradient and curvature by [blocks, scales]."""
-    state = posterior(gram, noise, window)
-    level, n, blocks = noise.deviation(gram, window), gram.nuisances, len(LATENT_BLOCKS)
-    second = np.outer(state.mean, state.mean)
-    second += state.covariance
-    by_block = np.bincount(gram.latent_block, np.diagonal(second)[n:] - 1.0, blocks)
-    scaled = state.covariance * level
-    scaled *= level[:, None]
-    second *= level
-    second *= level[:, None]
-    weight, size = noise.scale**-2.0, len(level)
-    left = gram.square - 2.0 * gram.cross[:, :size] @ (level * state.mean) + gram.hidden @ second.ravel()
-    # Degrees of freedom that the columns take from each channel; rounding of huge derivatives is kept from taking others.
-    taken = np.clip(weight * (gram.hidden @ scaled.ravel()), 0.0, gram.count)
-    member = gram.latent_block[:, None] == np.arange(blocks)
-    squared = state.covariance[n:] ** 2
-    known = np.eye(size)[n:, n:] - state.covariance[n:, n:]
-    curvature = np.zeros((blocks + len(weight),) * 2)
-    curvature[:blocks, :blocks] = 2.0 * member.T @ known**2 @ member
-    shared = member.T @ (np.diagonal(state.covariance)[n:] - squared.sum(1))
-    curvature[:blocks, blocks:] = 2.0 * np.outer(shared, taken / max(taken.sum(), 1e-300))
-    curvature[blocks:, :blocks] = curvature[:blocks, blocks:].T
-    curvature[blocks:, blocks:] = np.diag(2.0 * np.maximum(gram.count - taken, 0.0))
-    return state.log_likelihood, np.concatenate((by_block, left * weight - gram.count)), curvature
+    values, slopes, curvatures = stack.look(noise)
+    for rows, parts, by_level, bend in zip(layout.rows, layout.parts, slopes, curvatures):
+        slope[rows] += by_level[parts]
+        curvature[np.ix_(rows, rows)] += bend[np.ix_(parts, parts)]
+    return value + float(values.sum()), slope, curvature
 
 
 def without_outliers(windows: Sequence[Window], channels: int) -> list[Window]:

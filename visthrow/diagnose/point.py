@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from visthrow.diagnose.marginal import (
     recorrelated,
     with_residual,
 )
-from visthrow.diagnose.model import Model, Start, Window
+from visthrow.diagnose.model import Linearised, Model, Window
 from visthrow.diagnose.scatter import freed, own_shares
 from visthrow.diagnose.threads import each
 
@@ -61,7 +62,8 @@ class Point:
     noise: Noise
     statistics: Statistics
     integrals: Sequence[Integral]  # of the grams under these noise levels
-    start: Start | None  # initial states that were flown; None: those of another kind of block than the derivatives'
+    about: Linearised | None  # where the derivatives were taken; None: with another kind of block than the residuals
+    device: str  # where the model simulates, and the algebra of all windows with it
 
     @property
     def information(self) -> np.ndarray:
@@ -79,12 +81,21 @@ class Point:
         return own - 0.5 * float(self.statistics.absolute_square.sum()) + self.noise.log_prior
 
 
-def _point(theta: np.ndarray, windows: Sequence[Window], raw: Sequence[Gram], grams: Sequence[Gram], noise: Noise,
-           start: Start | None, integrals: Sequence[Integral] | None = None) -> Point:  # fmt: skip
-    """Gather; ``integrals`` are those of another point with the same derivatives and noise."""
-    integrals = integrals_of(grams, noise) if integrals is None else integrals
-    parts = [known.share(gram, noise) for known, gram in zip(integrals, grams)]
-    return Point(np.array(theta, dtype=float), windows, raw, grams, noise, gather(grams, parts, theta), integrals, start)
+def regathered(point: Point, integrals: Sequence[Integral] | None = None, **changes: Any) -> Point:
+    """The point with changes, and what its windows then say.
+
+    Args:
+        point: to change.
+        integrals: of the grams under the noise levels, where they are known.
+        changes: fields of the point.
+    """
+    changed = replace(point, **changes)
+    integrals = integrals_of(changed.grams, changed.noise) if integrals is None else integrals
+    return replace(changed, integrals=integrals, statistics=_statistics(changed.grams, integrals, changed.noise, changed.theta))
+
+
+def _statistics(grams: Sequence[Gram], integrals: Sequence[Integral], noise: Noise, theta: np.ndarray) -> Statistics:
+    return gather(grams, [known.share(gram, noise) for known, gram in zip(integrals, grams)], theta)
 
 
 def integrals_of(grams: Sequence[Gram], noise: Noise) -> list[Integral]:
@@ -105,10 +116,11 @@ def linearise(problem: Problem, theta: np.ndarray, start: Noise | None = None, w
     channels = len(problem.model.channels)
     kept = levels.without_outliers([windows[i] for i in problem.kept], channels)
     raw = each(lambda w: gram_of(w, problem.priors.floor, channels), kept)
-    noise, grams = levels.fit(kept, raw, start)
-    slopes = {i: w.nuisance for i, w in zip(problem.kept, kept)}
-    settled = Start(problem.sizes(theta), {i: np.zeros(slope.shape[1]) for i, slope in slopes.items()}, slopes)
-    return _point(theta, kept, raw, grams, noise, settled)
+    device = getattr(problem.model, "device", "cpu")
+    noise, grams = levels.fit(kept, raw, start, device)
+    integrals, at = integrals_of(grams, noise), np.array(theta, dtype=float)
+    about = Linearised(problem.sizes(theta), dict(zip(problem.kept, kept)))
+    return Point(at, kept, raw, grams, noise, _statistics(grams, integrals, noise, at), integrals, about, device)
 
 
 def lost(point: Point) -> list[int]:
@@ -124,8 +136,9 @@ def lost(point: Point) -> list[int]:
 
 def moved(problem: Problem, point: Point, theta: np.ndarray) -> Point | None:
     """Simulate at ``theta`` but keep the derivatives and noise levels of ``point``; None where the simulation fails there."""
-    start = _following(problem, point, theta)
-    residuals = problem.model.residuals(problem.sizes(theta), start)
+    kinds = problem.switches
+    about = point.about if np.array_equal(theta[kinds], point.theta[kinds]) else None
+    residuals = problem.model.residuals(problem.sizes(theta), about)
     residuals = [residuals[i] for i in problem.kept]
     if not all(np.all(np.isfinite(r)) for r in residuals):
         return None
@@ -133,18 +146,8 @@ def moved(problem: Problem, point: Point, theta: np.ndarray) -> Point | None:
     floor = problem.priors.floor
     raw = each(lambda w: with_residual(point.raw[w], windows[w], floor, residuals[w]), range(len(windows)))
     grams = [recorrelated(g, r) for g, r in zip(point.grams, raw)]
-    return _point(theta, windows, raw, grams, point.noise, start, point.integrals)
-
-
-def _following(problem: Problem, point: Point, theta: np.ndarray) -> Start | None:
-    """Initial states that belong to ``theta`` by the derivatives; None where another kind of block has states of its own."""
-    kinds = problem.switches
-    if point.start is None or not np.array_equal(theta[kinds], point.theta[kinds]):
-        return None
-    moves = dict(point.start.moves)
-    for i, w, known in zip(problem.kept, point.windows, point.integrals):
-        moves[i] = moves[i] - known.hidden_by(theta - point.theta)[: len(w.nuisance_sd)] * w.nuisance_sd
-    return replace(point.start, moves=moves)
+    at = np.array(theta, dtype=float)
+    return regathered(point, point.integrals, theta=at, windows=windows, raw=raw, grams=grams, about=about)
 
 
 def advantage(
@@ -188,7 +191,7 @@ def curvature(problem: Problem, origin: Point, there: Point) -> float:
 
 def with_fitted_noise(point: Point) -> Point:
     """The same with noise levels estimated from its residuals."""
-    return _point(point.theta, point.windows, point.raw, point.grams, levels.refit(point.grams, point.noise), point.start)
+    return regathered(point, noise=levels.refit(point.grams, point.noise, point.device))
 
 
 def with_all_effects_noise(problem: Problem, point: Point) -> Point:
@@ -222,8 +225,8 @@ def _with_noise_at(point: Point, theta: np.ndarray, own: np.ndarray | None = Non
     at = np.tile(theta - point.theta, (len(point.statistics.flights), 1)) + (0.0 if own is None else own)
     row = {flight: f for f, flight in enumerate(point.statistics.flights.tolist())}
     moves = [at[row[window.flight]] for window in point.windows]
-    noise = levels.refit([shifted(gram, move) for gram, move in zip(point.grams, moves)], point.noise)
-    return _point(point.theta, point.windows, point.raw, point.grams, noise, point.start)
+    grams = [shifted(gram, move) for gram, move in zip(point.grams, moves)]
+    return regathered(point, noise=levels.refit(grams, point.noise, point.device))
 
 
 def shifted(gram: Gram, change: np.ndarray) -> Gram:

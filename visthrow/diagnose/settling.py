@@ -11,6 +11,7 @@ import numpy as np
 from sim.replay.kernel import ATTACHED
 from sim.replay.lanes import Replay
 from visthrow.diagnose.catalogue import Setting
+from visthrow.diagnose.model import Window
 from visthrow.diagnose.replay import Flights, Lane
 from visthrow.diagnose.states import Direction, States, concerns, moved, moved_along, stacked
 
@@ -64,10 +65,9 @@ class Settling:
         self.substep = substep
         self.slopes: dict[int, np.ndarray] = {}  # of windows' samples by their states, where they were taken last
         self.replay = Replay([setting.plant], [setting.sensing], device)
-        since = [np.maximum(flights.time(w) - c.start, 0.0) for w, c in enumerate(flights.cuts)]
-        self._drift = [flights.spread(w, *DRIFT) * t ** flights.spread(w, *GROWTH) for w, t in enumerate(since)]
+        self._drift = [drift(flights, w) for w in range(len(flights.cuts))]
         self._gusts = np.ones(len(flights.cuts))  # of each window, against the drift that is thought possible
-        self._tells, self._ends = zip(*[self._told_of_start(w, lag) for w in range(len(flights.cuts))])
+        self._tells, self._ends = zip(*[told_of_start(flights, w, lag) for w in range(len(flights.cuts))])
 
     def better(self, settled: States, fresh: States) -> States:
         """For each window, the better of two initial states."""
@@ -154,17 +154,6 @@ class Settling:
         self._gusts[w] = min(calmer)
         return True
 
-    def _told_of_start(self, w: int, lag: float) -> tuple[np.ndarray, float]:
-        """Which samples tell of a window's start, and how long it is flown for their sake [s].
-
-        They are 1 before the payload may have left, 0 later, for these tell of the release; all 1 where few are left.
-        """
-        c, time = self.flights.cuts[w], self.flights.time(w)
-        left = self.flights.flights[c.flight].latch + lag - EARLIER
-        if c.payload != ATTACHED or not c.start + SEEN < left < c.end:
-            return np.ones(len(time)), c.end
-        return (time < left).astype(float), min(left + ONWARD, c.end)
-
     def _fitted(self, w: int) -> list[int]:
         """Directions in which a window's initial state is fitted."""
         cut = self.flights.cuts[w]
@@ -203,6 +192,48 @@ class Settling:
         out = np.zeros(len(done))
         out[ds] = step * sd
         return out, float(slope @ step - 0.5 * step @ bend @ step)
+
+
+def drift(flights: Flights, w: int) -> np.ndarray:
+    """How far gusts may have led a window's samples by their time, as a deviation, shape (N,)."""
+    since = np.maximum(flights.time(w) - flights.cuts[w].start, 0.0)
+    return flights.spread(w, *DRIFT) * since ** flights.spread(w, *GROWTH)
+
+
+def told_of_start(flights: Flights, w: int, lag: float) -> tuple[np.ndarray, float]:
+    """Which samples tell of a window's start, and how long it is flown for their sake [s].
+
+    They are 1 before the payload may have left, 0 later, for these tell of the release; all 1 where few are left.
+    """
+    c, time = flights.cuts[w], flights.time(w)
+    left = flights.flights[c.flight].latch + lag - EARLIER
+    if c.payload != ATTACHED or not c.start + SEEN < left < c.end:
+        return np.ones(len(time)), c.end
+    return (time < left).astype(float), min(left + ONWARD, c.end)
+
+
+def following(flights: Flights, w: int, window: Window, change: np.ndarray, free: np.ndarray, lag: float) -> np.ndarray:
+    """How a window's initial state follows its effects: so that the flight stays as near to where it was as it can.
+
+    Args:
+        flights: cut into windows.
+        w: number of the window there.
+        window: its derivatives.
+        change: of the effects' sizes, shape (K,).
+        free: which parts of the state follow, shape (D,), bool.
+        lag: of the release, as far as known [s].
+
+    Returns:
+        Changes in the state's units, shape (D,).
+    """
+    samples = len(flights.time(w))  # and those of a camera, which tell nothing of states
+    weight = told_of_start(flights, w, lag)[0] / np.hypot(flights.sigma(w), drift(flights, w))
+    sd = window.nuisance_sd[free]
+    by_state = window.nuisance[:samples, free] * sd * weight[:, None]
+    by_effect = window.effects[:samples] @ change * weight
+    move = np.zeros(len(free))
+    move[free] = -sd * np.linalg.solve(by_state.T @ by_state + np.eye(len(sd)), by_state.T @ by_effect)
+    return move
 
 
 def perturbed(states: States, directions: tuple[Direction, ...]) -> States:

@@ -39,6 +39,11 @@ class Direction:
     part: str | int = ""  # of the rope: "all" segments, the "last", or the half waves of a bend
     calm: float | None = None  # the prior in windows whose rope was taut all the time, where it is another
 
+    @property
+    def follows(self) -> bool:
+        """Whether it goes with the effects: a bend of the rope does not, which would take the place of a wrong length."""
+        return not self.field.startswith("cable") or self.part == "all"
+
     def spread(self, c: Cut) -> float:
         """The prior's deviation in a window."""
         return self.sd if self.calm is None or c.shaken else self.calm

@@ -9,6 +9,8 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from typing import TypeVar
 
+from sim.cores import cores as cores
+
 T = TypeVar("T")
 R = TypeVar("R")
 
@@ -20,11 +22,6 @@ def single() -> None:
     """Ask for one thread a product unless the user said otherwise; works before numpy is imported."""
     for name in VARIABLES:
         os.environ.setdefault(name, "1")
-
-
-def cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @cache

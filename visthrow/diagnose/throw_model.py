@@ -14,11 +14,11 @@ from visthrow.diagnose.cutting import Cut, around_slack, cut, thinned
 from visthrow.diagnose.interface import Mistake
 from visthrow.diagnose.landing import Landings, landings
 from visthrow.diagnose.linearising import Plan, exact, lanes_of, still
-from visthrow.diagnose.model import Start, Window
+from visthrow.diagnose.model import Linearised, Window
 from visthrow.diagnose.opened import opened
 from visthrow.diagnose.recorded import NEVER, carriers, record_of
 from visthrow.diagnose.replay import BATCH, CUDA_BATCH, Flights, Lane, carried
-from visthrow.diagnose.settling import Settling, perturbed
+from visthrow.diagnose.settling import Settling, following, perturbed
 from visthrow.diagnose.sightings import channels_of, needs_no_flight, sightings, with_sightings
 from visthrow.diagnose.states import (
     States,
@@ -165,28 +165,34 @@ class ThrowModel:
         sign = -1.0 if on else 1.0
         return [sign * (x.residual - self.flights.residual(seen, w, lane)) for lane, (w, x) in enumerate(zip(self._told, windows))]
 
-    def residuals(self, theta: Mapping[str, float], start: Start | None = None) -> list[np.ndarray]:
-        """See :class:`visthrow.diagnose.model.Model`; without a start from the states settled last with the same kinds of blocks."""
+    def residuals(self, theta: Mapping[str, float], about: Linearised | None = None) -> list[np.ndarray]:
+        """See :class:`visthrow.diagnose.model.Model`; by default from the states settled last with the same kinds of blocks."""
         setting = apply(self.entries, self.setting, theta)
         lanes = [Lane(w, 0, w) for w in self._told]
-        states = self._latest.get(self._switches(theta), self._fitted()[0])
-        if start is not None:
-            states = self._following(self._settled_at[_key(start.theta)], setting, start)
+        states, moves = self._latest.get(self._switches(theta), self._fitted()[0]), {}
+        if about is not None:
+            states, moves = self._following(setting, theta, about)
         states = resampled(states, setting.plant.rope.segments)
         seen = self.flights.fly(self._replay([setting]), [setting], states, lanes, self.substep).seen
         flown = [self.flights.residual(seen, w, lane) for lane, w in enumerate(self._told)]
         told = [np.concatenate((r, *self._sighting_residuals(w, setting))) for r, w in zip(flown, self._told)]
-        moves = {} if start is None else start.moves
-        return [r + start.slopes[i] @ moves[i] if i in moves else r for i, r in enumerate(told)]
+        return [r + about.windows[i].nuisance @ moves[i] if i in moves else r for i, r in enumerate(told)]
 
-    def _following(self, states: States, setting: Setting, start: Start) -> States:
-        """States moved as a start says."""
-        found, cuts = directions(setting.plant), self.flights.cuts
+    def _following(
+        self, setting: Setting, theta: Mapping[str, float], about: Linearised
+    ) -> tuple[States, dict[int, np.ndarray]]:
+        """States that belong to other sizes of the effects by the derivatives, and how each window's were moved."""
+        names = [e.effect.name for e in self.entries.values()]
+        change = np.array([theta.get(name, 0.0) - about.theta.get(name, 0.0) for name in names])
+        found, cuts, moves = directions(setting.plant), self.flights.cuts, {}
         sizes = np.zeros((len(cuts), len(found)))
-        for i, move in start.moves.items():
+        for i, window in about.windows.items():
             w = self._told[i]
-            sizes[w, [d for d, x in enumerate(found) if concerns(x, cuts[w])]] = move
-        return moved_along(states, found, sizes)
+            own = [d for d, x in enumerate(found) if concerns(x, cuts[w])]
+            free = np.array([found[d].follows for d in own], dtype=bool)
+            moves[i] = following(self.flights, w, window, change, free, self.setting.plant.release.lag)
+            sizes[w, own] = moves[i]
+        return moved_along(self._settled_at[_key(about.theta)], found, sizes), moves
 
     def _switches(self, theta: Mapping[str, float]) -> frozenset[str]:
         """Which other kinds of blocks are on."""

@@ -19,7 +19,7 @@ from visthrow.diagnose.evidence import Priors, covariance, estimate
 from visthrow.diagnose.excess import acts_on
 from visthrow.diagnose.marginal import Gram, Integral, Noise, WindowStatistics, gather, window_statistics
 from visthrow.diagnose.model import LATENT_BLOCKS, Window
-from visthrow.diagnose.point import Point, advantage, integrals_of, shifted
+from visthrow.diagnose.point import Point, advantage, regathered, shifted
 from visthrow.diagnose.result import Law
 from visthrow.diagnose.threads import each
 
@@ -217,7 +217,7 @@ def _extended(
         np.append(priors.floor, scale), np.append(priors.slab, 1.0 / NARROW), np.append(priors.low, -np.inf),
         np.append(priors.high, np.inf), np.append(priors.visible, True),
     )  # fmt: skip
-    return _gathered(replace(point, raw=(), theta=np.append(point.theta, 0.0)), grams, integrals, point.noise), wide
+    return regathered(point, integrals, raw=(), theta=np.append(point.theta, 0.0), grams=grams), wide
 
 
 def _with_column(gram: Gram, column: np.ndarray) -> Gram:
@@ -242,11 +242,6 @@ def _with_last(known: Integral, gram: Gram, noise: Noise) -> Integral:
     return replace(known, information=information, half=np.append(known.half, half, axis=1))
 
 
-def _gathered(point: Point, grams: Sequence[Gram], integrals: Sequence[Integral], noise: Noise) -> Point:
-    parts = [integral.share(gram, noise) for integral, gram in zip(integrals, grams)]
-    return replace(point, grams=grams, noise=noise, integrals=integrals, statistics=gather(grams, parts, point.theta))
-
-
 def _weigh(point: Point, priors: Priors, active: Sequence[int], term: grammar.Term, prior: float, price: float,
            known: Sequence[grammar.Known], beside: Hypothesis | None = None) -> Hypothesis:  # fmt: skip
     """Give a term noise levels of its own and compare with the set without it."""
@@ -254,8 +249,7 @@ def _weigh(point: Point, priors: Priors, active: Sequence[int], term: grammar.Te
     named = [*active, len(point.theta)]
     catalogue = beside.catalogue if beside else priors
     change = estimate(base.information, base.score, wide, named) - base.theta
-    noise = noise_levels.refit([shifted(g, change) for g in base.grams], base.noise)
-    own = _gathered(base, base.grams, integrals_of(base.grams, noise), noise)
+    own = regathered(base, noise=noise_levels.refit([shifted(g, change) for g in base.grams], base.noise, base.device))
     nats = advantage(wide, (own, named), (base, list(active))) - price
     terms_, scales, paid = (beside.terms, beside.scale, beside.price) if beside else ((), (), 0.0)
     return Hypothesis((*terms_, term), (*scales, NARROW * prior), own, wide, tuple(named), float(nats), catalogue, paid + price)

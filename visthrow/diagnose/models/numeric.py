@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from visthrow.diagnose.check.signals import noise
-from visthrow.diagnose.model import Effect, Start, Window
+from visthrow.diagnose.model import Effect, Linearised, Window
 from visthrow.errors import LogError, suggest
 from visthrow.flightlog import Channel
 
@@ -124,7 +124,7 @@ class NumericModel:
             for i, s in enumerate(self.stretches)
         ]  # fmt: skip
 
-    def residuals(self, theta: Mapping[str, float], start: Start | None = None) -> list[np.ndarray]:
+    def residuals(self, theta: Mapping[str, float], about: Linearised | None = None) -> list[np.ndarray]:
         """See :class:`visthrow.diagnose.model.Model`; initial states are fitted anew."""
         return self._settle(self.size(theta))
 

@@ -1,0 +1,164 @@
+"""Windows side by side: what noise levels are worth in all of them at once, on the CPU's cores or where the simulation runs.
+
+The same algebra as :mod:`visthrow.diagnose.marginal`, for grams that are padded to one size: on a GPU in one batch, on a CPU in
+batches that fit its cache.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from visthrow.diagnose.marginal import ROUNDING, Gram, Noise
+from visthrow.diagnose.model import LATENT_BLOCKS
+from visthrow.diagnose.threads import each
+from visthrow.errors import DiagnoseError
+
+BATCH = 8  # windows of a batch on the CPU
+BLOCKS = len(LATENT_BLOCKS)
+
+
+@dataclass(frozen=True)
+class _Batch:
+    """W windows, of n columns [X, G] at most; padded columns are 0."""
+
+    windows: np.ndarray  # rows of the noise's shares, shape (W,)
+    phases: list[str]
+    flights: list[int]
+    hidden: torch.Tensor  # shape (W, C, n, n)
+    cross: torch.Tensor  # shape (W, C, n)
+    square: torch.Tensor  # shape (W, C)
+    count: torch.Tensor  # shape (W, C)
+    log_sigma: torch.Tensor  # shape (W,)
+    member: torch.Tensor  # 1 where a column is of a block, shape (W, n, B)
+    known: torch.Tensor  # 1 where it is one of the initial state, shape (W, n)
+
+
+@dataclass(frozen=True)
+class _Solved:
+    """A batch at some noise levels."""
+
+    weight: torch.Tensor  # of the channels, shape (C,)
+    level: torch.Tensor  # prior deviation of the columns, shape (W, n)
+    factor: torch.Tensor  # lower Cholesky factor of 1 + P^1/2 U' W U P^1/2, shape (W, n, n)
+    right: torch.Tensor  # P^1/2 U' W r, shape (W, n)
+    mean: torch.Tensor  # of [b, a] in prior deviations, shape (W, n)
+    value: torch.Tensor  # log-likelihood of the residuals, but for the powers of 2 pi, shape (W,)
+
+
+class Stack:
+    """Some windows' inner products of initial states and latent forces."""
+
+    def __init__(self, grams: Sequence[Gram], device: str = "cpu", windows: Sequence[int] | None = None):
+        """Pad and move.
+
+        Args:
+            grams: of the windows, with or without effects.
+            device: where to calculate.
+            windows: of each gram, the row of the noise's shares; default: their order.
+        """
+        rows = np.arange(len(grams)) if windows is None else np.asarray(windows, dtype=int)
+        self.device, size = device, BATCH if device == "cpu" else max(len(grams), 1)
+        order = sorted(range(len(grams)), key=lambda w: grams[w].nuisances + grams[w].latents)
+        self._order = [order[first : first + size] for first in range(0, len(order), size)]
+        self._batches = each(lambda own: self._padded([grams[w] for w in own], rows[own]), self._order)
+        self._count = len(grams)
+
+    def _padded(self, grams: Sequence[Gram], windows: np.ndarray) -> _Batch:
+        sizes = [gram.nuisances + gram.latents for gram in grams]
+        count, channels, n = len(grams), len(grams[0].count), max(sizes)
+        hidden, cross = np.zeros((count, channels, n, n)), np.zeros((count, channels, n))
+        member, known = np.zeros((count, n, BLOCKS)), np.zeros((count, n))
+        for w, (gram, size) in enumerate(zip(grams, sizes)):
+            hidden[w, :, :size, :size] = gram.inner[:, :size, :size]
+            cross[w, :, :size] = gram.cross[:, :size]
+            member[w, np.arange(gram.nuisances, size), gram.latent_block] = 1.0
+            known[w, : gram.nuisances] = 1.0
+        square, counts = (np.stack([getattr(gram, name) for gram in grams]) for name in ("square", "count"))
+        log_sigma = np.array([gram.log_sigma for gram in grams])
+        arrays = [torch.from_numpy(a).to(self.device) for a in (hidden, cross, square, counts, log_sigma, member, known)]
+        return _Batch(windows, [gram.phase for gram in grams], [gram.flight for gram in grams], *arrays)
+
+    def values(self, noise: Noise) -> np.ndarray:
+        """Log-likelihood of each window's residuals, but for the powers of 2 pi, shape (W,).
+
+        Raises:
+            DiagnoseError: The normal equations are not positive definite, which only broken derivatives can cause.
+        """
+        return self._in_order([each_[0] for each_ in self._each(lambda batch: (_solved(batch, noise).value,))])
+
+    def look(self, noise: Noise) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Log-likelihood, its gradient and expected curvature by the logarithms of the windows' own levels.
+
+        Args:
+            noise: levels.
+
+        Returns:
+            Values (W,); gradients (W, B + C) by the B blocks' deviations and the C channels' scales; curvatures (W, B + C, B + C).
+            What the scales share with the fitted columns is given to the channels by their part in them.
+
+        Raises:
+            DiagnoseError: As :meth:`values`.
+        """
+        found = self._each(lambda batch: _curved(batch, _solved(batch, noise)))
+        return tuple(self._in_order([part[i] for part in found]) for i in range(3))
+
+    def _each(self, function) -> list[tuple[np.ndarray, ...]]:
+        return each(lambda batch: tuple(value.cpu().numpy() for value in function(batch)), self._batches)
+
+    def _in_order(self, parts: Sequence[np.ndarray]) -> np.ndarray:
+        out = np.empty((self._count, *parts[0].shape[1:])) if parts else np.empty(0)
+        for own, part in zip(self._order, parts):
+            out[own] = part
+        return out
+
+
+def _solved(batch: _Batch, noise: Noise) -> _Solved:
+    shared = [[noise.latent_sd.get((b, phase), 0.0) for b in range(BLOCKS)] for phase in batch.phases]
+    by_block = batch.square.new_tensor(np.array(shared) * noise.share[batch.windows])
+    level = batch.known + (batch.member @ by_block[:, :, None])[..., 0]
+    scale = batch.square.new_tensor(noise.scale)
+    weight, (count, n) = scale**-2.0, level.shape
+    normal = (weight @ batch.hidden.reshape(count, len(scale), n * n)).reshape(count, n, n)
+    normal *= level[:, :, None]
+    normal *= level[:, None]
+    normal.diagonal(dim1=1, dim2=2).add_(1.0)
+    factor, failed = torch.linalg.cholesky_ex(normal)
+    if torch.any(failed):
+        # Levels of many orders of magnitude, as a search for them may try, leave the identity below rounding.
+        normal.diagonal(dim1=1, dim2=2).mul_(1.0 + ROUNDING * (failed[:, None] > 0))
+        factor, failed = torch.linalg.cholesky_ex(normal)
+        if torch.any(failed):
+            w = int(torch.nonzero(failed)[0, 0])
+            raise DiagnoseError(f"window of flight {batch.flights[w]}, phase {batch.phases[w]}: the normal equations are singular")
+    right = level * (weight @ batch.cross)
+    mean = torch.cholesky_solve(right[:, :, None], factor)[..., 0]
+    log_det = 2.0 * (factor.diagonal(dim1=1, dim2=2).log().sum(-1) + batch.log_sigma + batch.count @ scale.log())
+    value = -0.5 * (batch.square @ weight - (right * mean).sum(-1) + log_det)
+    return _Solved(weight, level, factor, right, mean, value)
+
+
+def _curved(batch: _Batch, at: _Solved) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Value, gradient and curvature by [blocks, scales]."""
+    covariance = torch.cholesky_inverse(at.factor)
+    variance, (count, n), channels = covariance.diagonal(dim1=1, dim2=2), at.level.shape, batch.count.shape[1]
+    in_blocks = batch.member.transpose(1, 2)
+    by_block = (in_blocks @ (variance + at.mean**2 - 1.0)[:, :, None])[..., 0]
+    moved = at.level * at.mean
+    scaled = covariance * at.level[:, :, None] * at.level[:, None]
+    both = torch.stack((scaled, moved[:, :, None] * moved[:, None]), -1).reshape(count, n * n, 2)
+    spread, bent = (batch.hidden.reshape(count, channels, n * n) @ both).unbind(-1)
+    left = batch.square - 2.0 * (batch.cross @ moved[:, :, None])[..., 0] + bent + spread
+    # Degrees of freedom that the columns take from each channel; rounding of huge derivatives is kept from taking others.
+    taken = torch.minimum(torch.clamp(at.weight * spread, min=0.0), batch.count)
+    squared = covariance**2
+    shared = (in_blocks @ (variance - squared.sum(-1))[:, :, None])[..., 0]
+    squared.diagonal(dim1=1, dim2=2).copy_((1.0 - variance) ** 2)
+    curvature = at.level.new_zeros(count, BLOCKS + channels, BLOCKS + channels)
+    curvature[:, :BLOCKS, :BLOCKS] = 2.0 * in_blocks @ squared @ batch.member
+    mixed = 2.0 * shared[:, :, None] * (taken / torch.clamp(taken.sum(-1, keepdim=True), min=1e-300))[:, None]
+    curvature[:, :BLOCKS, BLOCKS:] = mixed
+    curvature[:, BLOCKS:, :BLOCKS] = mixed.transpose(1, 2)
+    curvature[:, BLOCKS:, BLOCKS:].diagonal(dim1=1, dim2=2).copy_(2.0 * torch.clamp(batch.count - taken, min=0.0))
+    return at.value, torch.cat((by_block, left * at.weight - batch.count), -1), curvature
