@@ -184,23 +184,27 @@ def correlated(gram: Gram, window: Window, time: float) -> Gram:
     """
     if not gram.latents:
         return gram
-    factor = np.zeros((gram.latents, gram.latents))
+    group = window.latent_block.astype(int) * 3 + window.latent_axis.astype(int)
+    lag = np.abs(window.latent_time[:, None] - window.latent_time)
+    alike = np.where(group[:, None] == group, np.exp(-lag / time), 0.0)
+    factor = np.linalg.cholesky(alike + 1e-9 * np.eye(gram.latents))
+    knots = _knots(group, window.latent_time)
+    own, groups = factor[:knots, :knots], gram.latents // knots
+    part, (channels, size) = slice(gram.nuisances, gram.nuisances + gram.latents), gram.cross.shape
     inner, cross = gram.inner.copy(), gram.cross.copy()
-    key = window.latent_block.astype(int) * 3 + window.latent_axis.astype(int)
-    for group in np.unique(key):
-        at = np.flatnonzero(key == group)
-        lag = np.abs(window.latent_time[at, None] - window.latent_time[at])
-        own = np.linalg.cholesky(np.exp(-lag / time) + 1e-9 * np.eye(len(at)))
-        factor[np.ix_(at, at)] = own
-        at += gram.nuisances
-        inner[:, at] = own.T @ inner[:, at]
-        cross[:, at] = cross[:, at] @ own
-    for group in np.unique(key):
-        at = np.flatnonzero(key == group)
-        own = factor[np.ix_(at, at)]
-        at += gram.nuisances
-        inner[:, :, at] = inner[:, :, at] @ own
+    inner[:, part] = (own.T @ inner[:, part].reshape(channels, groups, knots, size)).reshape(channels, -1, size)
+    inner[:, :, part] = (inner[:, :, part].reshape(channels, size, groups, knots) @ own).reshape(channels, size, -1)
+    cross[:, part] = (cross[:, part].reshape(channels, groups, knots) @ own).reshape(channels, -1)
     return replace(gram, inner=inner, cross=cross, factor=factor)
+
+
+def _knots(group: np.ndarray, time: np.ndarray) -> int:
+    """Knots of groups that follow one another with the same ones each; where they do not, all latents are one."""
+    count = int(np.count_nonzero(group == group[0]))
+    if len(group) % count:
+        return len(group)
+    groups, times = group.reshape(-1, count), time.reshape(-1, count)
+    return count if np.all(groups == groups[:, :1]) and np.all(times == times[0]) else len(group)
 
 
 def with_residual(gram: Gram, window: Window, floors: np.ndarray, residual: np.ndarray) -> Gram:
