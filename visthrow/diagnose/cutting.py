@@ -15,6 +15,7 @@ QUIET_SPEED = 0.35  # of hover [m/s]
 GROUND_MARGIN = 0.05  # above the landing height, below which a payload is left alone [m]
 LATE = 0.1  # by which the release may lag more than expected, before a payload counts as free where the rope was slack [s]
 LEAST_TAUT = 0.05  # before the separation, without which the release cannot be judged [s]
+RINGING = 1.5  # that a rope may whip after it came taut [s]: it bends more than what fitted states of calm windows may
 MOST = 400  # windows; of longer flights these are spread evenly over all
 POSES_LEAST = 8  # measured poses without which a window says nothing
 
@@ -28,7 +29,7 @@ class Cut:
     start: float  # [s]
     end: float  # [s]
     payload: int  # ATTACHED, LOOSE or NO_PAYLOAD, at its start
-    shaken: bool = False  # whether the rope has just come taut
+    shaken: bool = False  # whether the rope came taut not long before
     told: bool = True  # whether its residuals count; otherwise it is only flown through
 
 

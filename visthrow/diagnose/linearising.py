@@ -94,7 +94,7 @@ class Plan:
             c.flight, c.phase, f.time(w), channel, f.residual(seen, w, self.first), f.sigma(w), slopes[:, :K], slopes[:, K : K + D],
             np.array([directions[d].spread(c) for d in self.nuisances]), slopes[:, K + D :],
             np.array([axis // 3 for axis, _ in self.latents]), np.array([axis % 3 for axis, _ in self.latents]),
-            np.array([c.start + KNOT_SPACING * knot for _, knot in self.latents]), at_knots(f, setting, w, own),
+            np.array([c.start + KNOT_SPACING * knot for _, knot in self.latents]), at_knots(f, setting, w, own), c.shaken,
         )  # fmt: skip
 
 

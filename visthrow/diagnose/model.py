@@ -63,6 +63,7 @@ class Window:
     """Simulated quantities at the knots of the latent forces, shape (knots, ...), for laws outside the catalogue: ``time``,
     ``pos_w``, ``vel_w``, ``quat_wb``, ``rate_b``, ``thrust`` [N], ``payload_pos_w``, ``payload_vel_w``, ``cable_dir_w``,
     ``tension`` [N], ``mount_b`` (of the rope, from the centre of mass) [m, body frame]."""
+    shaken: bool = False  # whether it begins in a motion that nobody can know, such as a rope's that has just come taut
 
 
 @dataclass(frozen=True)

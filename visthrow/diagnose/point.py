@@ -29,6 +29,9 @@ STEPS = 3
 LOST, LOST_SHARE = 3.0, 0.15
 """Squared residual a sample, in noise and latent forces, from which a window is lost; share of windows beyond which none is."""
 
+SHAKEN_LOST = 1.3
+"""Of the median window's, from which a shaken one is lost: what its unknown motion does is no effect's doing."""
+
 SMALL_STEP = 0.05
 """In floors: a step that is not worth a simulation."""
 
@@ -130,7 +133,8 @@ def lost(point: Point) -> list[int]:
     """
     misfit = [(known.share(gram, point.noise).square - known.log_det) / max(gram.count.sum(), 1.0)
               for known, gram in zip(point.integrals, point.grams)]  # fmt: skip
-    far = np.flatnonzero(np.array(misfit) > LOST)
+    shaken = np.array([window.shaken for window in point.windows], dtype=bool)
+    far = np.flatnonzero(np.array(misfit) > np.where(shaken, min(SHAKEN_LOST * np.median(misfit), LOST), LOST))
     return far.tolist() if len(far) <= LOST_SHARE * len(misfit) else []
 
 

@@ -22,7 +22,7 @@ from visthrow.diagnose.evidence import (
     threshold,
 )
 from visthrow.diagnose.marginal import Statistics
-from visthrow.diagnose.model import Model
+from visthrow.diagnose.model import Model, Window
 from visthrow.diagnose.point import (
     Point,
     Problem,
@@ -408,15 +408,26 @@ def explain(
     problem = Problem(model, priors, kept)
     nominal = linearise(problem, np.zeros(len(model.effects)), windows=windows)
     for _ in range(LOSSES):
-        gone = set(lost(nominal))
-        if not gone:
+        if not (gone := lost(nominal)):
             break
-        say(f"{len(gone)} windows are left out, which the simulation does not follow")
-        problem = replace(problem, kept=tuple(w for i, w in enumerate(problem.kept) if i not in gone))
-        nominal = linearise(problem, np.zeros(len(model.effects)), windows=windows)
-    least = threshold(nominal.statistics, priors, np.random.default_rng(seed))
-    say(f"{len(problem.kept)} windows of {len(nominal.statistics.flights)} flights; a cause needs {least:.1f} nats")
-    search = Search(problem, nominal, least, say, laws)
-    search.run()
+        problem, nominal = _left_out(problem, gone, windows, say)
+    for again in range(LOSSES):
+        least = threshold(nominal.statistics, priors, np.random.default_rng(seed))
+        say(f"{len(problem.kept)} windows of {len(nominal.statistics.flights)} flights; a cause needs {least:.1f} nats")
+        search = Search(problem, nominal, least, say, laws)
+        search.run()
+        gone = lost(search.point)  # where the causes are in the simulation, it may lose windows that it followed without
+        if not gone or search.events or again == LOSSES - 1:
+            break
+        problem, nominal = _left_out(problem, gone, windows, say)
     diagnosis = conclude(search, laws=laws)
     return replace(diagnosis, duplicates=duplicates, seconds=time.monotonic() - begun, seed=seed)
+
+
+def _left_out(
+    problem: Problem, gone: Sequence[int], windows: Sequence[Window], say: Callable[[str], None]
+) -> tuple[Problem, Point]:
+    """The problem without some of its windows, and the model as it stands."""
+    say(f"{len(gone)} windows are left out, which the simulation does not follow")
+    problem = replace(problem, kept=tuple(w for i, w in enumerate(problem.kept) if i not in set(gone)))
+    return problem, linearise(problem, np.zeros(len(problem.model.effects)), windows=windows)

@@ -8,9 +8,10 @@ import numpy as np
 
 from camera.params import CameraParams
 from sim.params import PlantParams, SensingParams
+from sim.replay.kernel import ATTACHED
 from sim.replay.lanes import Replay
 from visthrow.diagnose.catalogue import Entry, Setting, apply, entries_for
-from visthrow.diagnose.cutting import Cut, around_slack, cut, thinned
+from visthrow.diagnose.cutting import RINGING, Cut, around_slack, cut, thinned
 from visthrow.diagnose.interface import Mistake
 from visthrow.diagnose.landing import Landings, landings
 from visthrow.diagnose.linearising import Plan, exact, lanes_of, still
@@ -344,11 +345,16 @@ class ThrowModel:
         return self.flights.spread(w, 0, 1, at.get("payload_pos_w", -1), at.get("rate_b", -1)).astype(int)
 
     def _without_slack(self, ends: States) -> list[Cut]:
-        """The windows, with the time in which the rope was slack until their ends cut out."""
+        """The windows, with the time in which the rope was slack until their ends cut out; those soon after it are shaken."""
         cuts: list[Cut] = []
+        rings: dict[int, float] = {}  # flight -> until when
         for w, c in enumerate(self.flights.cuts):
             first, last = float(ends["slack_first"][w]), float(ends["slack_last"][w])
             separation = self.flights.flights[c.flight].latch + self.setting.plant.release.lag
+            if c.payload == ATTACHED and c.start < rings.get(c.flight, -np.inf):
+                c = dataclasses.replace(c, shaken=True)
+            if last >= c.start:
+                rings[c.flight] = last + RINGING
             cuts += [c] if last < c.start else around_slack(c, first, last + AFTER_SLACK, separation)
         return cuts
 

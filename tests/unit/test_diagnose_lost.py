@@ -1,0 +1,82 @@
+"""Windows that the simulation does not follow: which are left out, when, and what they would have been taken for."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.flown import fly, setting_with
+from tests.plants import paper_plant
+from tests.synthetic_diagnosis import SyntheticModel, catalogue
+from visthrow.diagnose import result, search
+from visthrow.diagnose.cutting import RINGING
+from visthrow.diagnose.evidence import Priors
+from visthrow.diagnose.point import Problem, linearise, lost
+from visthrow.diagnose.throw_model import ThrowModel
+
+EFFECTS = catalogue(12)
+BAD = 10
+"""Number of the window that is spoiled."""
+ROUGH = 1.0
+"""Noise that is added there, in its own."""
+
+
+class Spoiled(SyntheticModel):
+    """One window moves as nobody can know; with ``beyond`` only where the first effect is larger than that [floors]."""
+
+    shaken, rough, beyond = True, ROUGH, -1.0
+
+    def _spoilt(self, theta, residuals):
+        if abs(theta.get("effect_00", 0.0)) / EFFECTS[0].floor <= self.beyond:
+            return residuals
+        noise = np.random.default_rng(1).standard_normal(len(residuals[BAD])) * self.rough * self._windows[BAD].sigma
+        return [r + noise if i == BAD else r for i, r in enumerate(residuals)]
+
+    def windows(self, theta):
+        found = super().windows(theta)
+        return [replace(w, shaken=self.shaken and i == BAD) for i, w in enumerate(found)]
+
+    def residuals(self, theta, about=None):
+        return self._spoilt(theta, super().residuals(theta, about))
+
+
+def lost_of(model) -> list[int]:
+    windows = model.windows({})
+    problem = Problem(model, Priors.of(tuple(model.effects), tuple(model.channels)), tuple(range(len(windows))))
+    return lost(linearise(problem, np.zeros(len(model.effects)), windows=windows))
+
+
+@pytest.mark.parametrize(
+    ("shaken", "rough", "expected"), [(True, 0.0, []), (True, ROUGH, [BAD]), (False, ROUGH, []), (False, 3.0, [BAD])]
+)
+def test_less_misfit_is_taken_from_a_window_after_slack(shaken, rough, expected):
+    model = Spoiled(effects=EFFECTS, throws=8, seed=4)
+    model.shaken, model.rough = shaken, rough
+    assert lost_of(model) == expected
+
+
+def test_a_window_that_is_lost_where_the_cause_is_leads_to_another_search():
+    said = []
+    model = Spoiled(effects=EFFECTS, truth={"effect_00": 15.0}, throws=8, seed=4)
+    model.rough, model.beyond = 4.0, 5.0
+    diagnosis = search.explain(model, laws=False, progress=said.append)
+    assert sum("are left out, which the simulation does not follow" in line for line in said) == 1
+    assert diagnosis.overall == result.KNOWN
+    assert diagnosis.named == ("effect_00",)
+    assert diagnosis.windows == len(model.windows({})) - 1
+
+
+def test_windows_soon_after_slack_are_shaken(monkeypatch):
+    """The rope whips for some time: what begins calmly is left with less freedom than it has."""
+    logs = fly(setting_with({}), noise=0.2, free=1, throws=0, seconds=5.0)
+    model = ThrowModel(logs, paper_plant(), only=["rope_length"])
+    cuts = model.flights.cuts
+    never = np.array([c.start - 1.0 for c in cuts])
+    assert not any(c.shaken for c in model._without_slack({"slack_first": never, "slack_last": never}))
+    last = never.copy()
+    last[1] = cuts[1].start + 0.1
+    first = np.where(np.arange(len(cuts)) == 1, cuts[1].start + 0.05, never)
+    after = model._without_slack({"slack_first": first, "slack_last": last})
+    for c in after:
+        assert c.shaken == (c.told and last[1] < c.start < last[1] + RINGING), c
+    assert sum(c.shaken for c in after) == 2
