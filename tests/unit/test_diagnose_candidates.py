@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
-from visthrow.diagnose import result, search
+from visthrow.diagnose import result, search, unknown
 
 EFFECTS = catalogue(12)
 NAME, SIZE = "effect_03", 10.0  # in floors
@@ -57,3 +57,19 @@ def test_a_candidate_that_is_refused_leaves_no_derivatives_behind(monkeypatch):
     monkeypatch.setattr(search.Search, "_joint", lambda self: origins.append(self.origin is self.nominal))
     explained(SIZE)
     assert origins == [True]
+
+
+def test_a_law_is_believed_only_where_derivatives_were_taken_at_the_causes(monkeypatch):
+    """Here one that explains what the bend of an effect leaves: it is gone where the effect is linearised."""
+    asked = []
+
+    def law(hunt, answer):
+        asked.append(hunt.origin.theta[3])
+        return None if abs(asked[-1]) > 1.0 else "a law", set(), "a law explains this"
+
+    monkeypatch.setattr(unknown, "find_laws", lambda hunt: unknown.Answer())
+    monkeypatch.setattr(unknown, "beats_the_catalogue", law)
+    monkeypatch.setattr(search, "curvature", lambda *_: 0.0)  # the search stays with its first derivatives
+    diagnosis = search.explain(SyntheticModel(effects=EFFECTS, truth={NAME: SIZE}, seed=5))
+    assert diagnosis.overall == result.KNOWN
+    assert asked == [0.0, pytest.approx(SIZE, rel=0.1)]

@@ -70,6 +70,9 @@ CONTRADICTED = 0.5
 STRAIGHT = 0.5
 """Size in floors that the simulation's distance from its linearisation may fake before the derivatives are taken anew."""
 
+NEAR = 0.1
+"""Distance from where derivatives were taken, in floors, within which they hold for a law as well."""
+
 WHOLE = 0.7
 """Of another kind of block that flights must ask for: of one that is not there, whose state has more freedom, a part is taken."""
 
@@ -117,7 +120,7 @@ class Search:
         self.point = self.origin = self.nominal
         while len(self.active) < MOST_NAMES and (self._forward() or self._mean()):
             self._backward()
-            if self.laws and len(self.active) == CHAIN and outside(self):
+            if self.laws and len(self.active) == CHAIN and outside(self) and not (self.nearer() and not outside(self)):
                 self.progress("a law that the catalogue does not hold explains this better than one name after the other")
                 return
         self._joint()
@@ -287,6 +290,15 @@ class Search:
             if np.abs(point.theta - before.theta).max() <= 0.5 or curvature(self.problem, self.origin, point) <= STRAIGHT:
                 break
         return point
+
+    def nearer(self) -> bool:
+        """Linearise where the search stands; False where that was done. Before a law is believed: it may explain what bends do."""
+        if np.abs(self.origin.theta - self.point.theta).max() <= NEAR:
+            return False
+        self.progress("derivatives are taken where the causes are, for a law may explain what they lack")
+        self.origin = linearise(self.problem, self.point.theta, self.point.noise)
+        self.point = fitted(self.problem, self.origin, self.active)
+        return True
 
     def _set_aside(self, best: int, nats: float, verdict: Consistency) -> bool:
         """An effect of one flight alone: that flight is left out; one that differs from flight to flight is refused."""

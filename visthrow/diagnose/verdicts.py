@@ -45,14 +45,17 @@ def conclude(search: "Search", *, laws: bool) -> Diagnosis:
     """
     from visthrow.diagnose.unknown import Answer, beats_the_catalogue, find_laws
 
+    answer = find_laws(search) if laws else Answer()
+    law = beats_the_catalogue(search, answer)
+    if law[0] is not None and search.nearer():
+        answer = find_laws(search)
+        law = beats_the_catalogue(search, answer)
     point, model = search.point, search.problem.model
     scatter = search.scatter(search.active)
     varies = deviations(scatter, search.priors, [e.name for e in model.effects])
     found = levels(search.nominal, with_floors_noise(search.problem, point, search.active, varies), search.least)
     drawn = {name for s in scatter if s.found for name in s.of}
     search.refused = {j: nats for j, nats in search.refused.items() if search.name(j) not in drawn}
-    answer = find_laws(search) if laws else Answer()
-    law = beats_the_catalogue(search, answer)
     overall, block, reasons, withdrawn = _overall(search, found, *law)
     mistakes = tuple(getattr(model, "mistakes", ()))
     if overall == result.NO_EFFECT and (drawn or mistakes):
