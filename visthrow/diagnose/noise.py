@@ -104,15 +104,15 @@ def fit(
     if not any(gram.latents for gram in grams):
         times = times[:1]
     bare = [without_effects(gram) for gram in grams]
-    best: tuple[float, Noise, list[Gram], Stack] | None = None
+    best: tuple[float, Noise, list[Gram]] | None = None
     for time in times:
         shaped = each(lambda w: correlated(bare[w], windows[w], time), range(len(bare)))  # noqa: B023  waits for the result
         noise = start or (best[1] if best else _first_guess(shaped))
-        stack, enough = Stack(shaped, device), ROUGHLY_NATS if len(times) > 1 else ENOUGH_NATS
-        noise, value = _maximise(shaped, stack, replace(noise, correlation_time=time), enough)
+        enough = ROUGHLY_NATS if len(times) > 1 else ENOUGH_NATS
+        noise, value = _maximise(shaped, replace(noise, correlation_time=time), device, enough)
         if best is None or value > best[0]:
-            best = value, noise, shaped, stack
-    noise = best[1] if len(times) == 1 else _maximise(best[2], best[3], best[1])[0]
+            best = value, noise, shaped
+    noise = best[1] if len(times) == 1 else _maximise(best[2], best[1], device)[0]
     return noise, each(lambda w: correlated(grams[w], windows[w], noise.correlation_time), range(len(grams)))
 
 
@@ -124,7 +124,7 @@ def refit(grams: Sequence[Gram], start: Noise, device: str = "cpu") -> Noise:
         start: where the search starts.
         device: where to calculate.
     """
-    return _maximise(grams, Stack(grams, device), start)[0]
+    return _maximise(grams, start, device)[0]
 
 
 def _first_guess(grams: Sequence[Gram]) -> Noise:
@@ -192,18 +192,18 @@ class _Layout:
         return low, high
 
 
-def _maximise(grams: Sequence[Gram], stack: Stack, noise: Noise, enough: float = ENOUGH_NATS) -> tuple[Noise, float]:
+def _maximise(grams: Sequence[Gram], noise: Noise, device: str, enough: float = ENOUGH_NATS) -> tuple[Noise, float]:
     """Most probable logarithms of all levels, with exact gradients and explicit limits.
 
     By Fisher scoring: the expected curvature costs nothing beside the gradient, and a few looks at all windows suffice.
 
     Args:
         grams: of the windows.
-        stack: of the same grams.
         noise: where the search starts.
+        device: where to calculate.
         enough: nats below which a step ends it.
     """
-    layout = _Layout.of(grams, noise)
+    layout, stack = _Layout.of(grams, noise), Stack(grams, device)
     low, high = layout.limits(grams)
     x = np.clip(layout.pack(noise), low, high)
 

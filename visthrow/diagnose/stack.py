@@ -42,7 +42,6 @@ class _Solved:
     weight: torch.Tensor  # of the channels, shape (C,)
     level: torch.Tensor  # prior deviation of the columns, shape (W, n)
     factor: torch.Tensor  # lower Cholesky factor of 1 + P^1/2 U' W U P^1/2, shape (W, n, n)
-    right: torch.Tensor  # P^1/2 U' W r, shape (W, n)
     mean: torch.Tensor  # of [b, a] in prior deviations, shape (W, n)
     value: torch.Tensor  # log-likelihood of the residuals, but for the powers of 2 pi, shape (W,)
 
@@ -86,7 +85,7 @@ class Stack:
         Raises:
             DiagnoseError: The normal equations are not positive definite, which only broken derivatives can cause.
         """
-        return self._in_order([each_[0] for each_ in self._each(lambda batch: (_solved(batch, noise).value,))])
+        return self._in_order([part for (part,) in self._each(lambda batch: (_solved(batch, noise).value,))])
 
     def look(self, noise: Noise) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Log-likelihood, its gradient and expected curvature by the logarithms of the windows' own levels.
@@ -136,7 +135,7 @@ def _solved(batch: _Batch, noise: Noise) -> _Solved:
     mean = torch.cholesky_solve(right[:, :, None], factor)[..., 0]
     log_det = 2.0 * (factor.diagonal(dim1=1, dim2=2).log().sum(-1) + batch.log_sigma + batch.count @ scale.log())
     value = -0.5 * (batch.square @ weight - (right * mean).sum(-1) + log_det)
-    return _Solved(weight, level, factor, right, mean, value)
+    return _Solved(weight, level, factor, mean, value)
 
 
 def _curved(batch: _Batch, at: _Solved) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:

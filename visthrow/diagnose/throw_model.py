@@ -229,6 +229,7 @@ class ThrowModel:
     def beside(self, cuts: Sequence[Cut]) -> "ThrowModel":
         """The same model of other windows of its flights."""
         other, x = copy.copy(self), self.setting.sensing
+        other._settled_at = {}  # states of other windows
         delays = (x.vehicle_delay, x.payload_delay, x.gyro_delay)
         other.flights = Flights(self.flights.flights, cuts, delays, self.flights.stride)
         other._told = np.array([w for w, c in enumerate(cuts) if c.told])
