@@ -1,4 +1,4 @@
-"""One thread a product for all tests, before any of them imports numpy: see :mod:`visthrow.diagnose.threads`."""
+"""One thread a product for all tests: see :mod:`visthrow.diagnose.threads`."""
 
 from visthrow.diagnose.threads import single
 

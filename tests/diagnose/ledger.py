@@ -156,6 +156,11 @@ def accuracy(worlds: Sequence[dict]) -> list[str]:
     return lines
 
 
+def dusty(world: dict) -> bool:
+    """Whether a world has some of every effect."""
+    return bool(world["recipe"].get("dust"))
+
+
 def answered(worlds: Sequence[dict]) -> list[dict]:
     """Worlds whose verdict was waited for."""
     return [w for w in worlds if w.get("error") != NOT_WAITED]
@@ -177,7 +182,7 @@ def singles(worlds: Sequence[dict]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     out: dict[str, list] = defaultdict(list)
     for w in worlds:
         effects = w["recipe"]["effects"]
-        if len(effects) == 1 and truth_of(w):
+        if len(effects) == 1 and truth_of(w) and not dusty(w):
             (name, theta), = effects.items()
             seen = w["recipe"].get("camera", False) and name not in CAMERA_FLOORS
             out[name + SEEN * seen].append((abs(theta) / ALL_FLOORS[name], names(w)[3] == 1))
@@ -212,6 +217,11 @@ def completeness(worlds: Sequence[dict]) -> list[str]:
 
 def intervals(worlds: Sequence[dict]) -> list[str]:
     """Coverage of the intervals and error of the estimates of the effects that were named by their own names."""
+    groups = {"nothing else": [w for w in worlds if not dusty(w)], "some of every other effect": [w for w in worlds if dusty(w)]}
+    return [line for besides, group in groups.items() if group for line in [f"Besides, {besides}:", "", *_held(group), ""]]
+
+
+def _held(worlds: Sequence[dict]) -> list[str]:
     rows = [e for w in worlds for e in w.get("errors", ()) if e.get("named", True) and e["name"] in ALL_FLOORS]
     rows = [e for e in rows if e.get("sd") or "sd" not in e]
     lines = []
@@ -338,8 +348,8 @@ def plants(worlds: Sequence[dict]) -> list[str]:
     """Nulls with a name and singles found, by plant."""
     lines = ["| plant | nulls with a name | one effect: found | names wrong |", "|---|---|---|---|"]
     for plant, group in grouped(worlds, lambda w: w["recipe"]["plant"]).items():
-        nulls = [w for w in group if not w["recipe"]["effects"]]
-        one = [w for w in group if len(truth_of(w)) == 1]
+        nulls = [w for w in group if not w["recipe"]["effects"] and not dusty(w)]
+        one = [w for w in group if len(truth_of(w)) == 1 and not dusty(w)]
         given, right = np.array([names(w)[:2] for w in group]).sum(0)
         row = [plant, share(sum(bool(w.get("named")) for w in nulls), len(nulls)), share(sum(names(w)[3] for w in one), len(one))]
         lines.append("| " + " | ".join([*row, share(int(given - right), int(given))]) + " |")

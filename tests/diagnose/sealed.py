@@ -24,7 +24,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.worlds.world import CAMERA_FLOORS, PLANTS, Recipe, draw, fly_recipe, recorded
+from tests.worlds.world import CAMERA_FLOORS, PLANTS, Recipe, draw, dust_of, fly_recipe, recorded
 from visthrow.diagnose.threads import single
 from visthrow.errors import VisthrowError
 from visthrow.flightlog import Channel, FlightLog
@@ -73,6 +73,8 @@ SIGHT = ("camera_tilt_x", "camera_latency", "marker_rot_x", "mocap_delay_quad")
 """Likewise with a camera, and what they may be taken for."""
 HELD = 3
 """Throws held back."""
+DUSTY, DUST = "+dust", 0.5
+"""End of the kinds whose worlds have some of every other effect, and its deviation in floors."""
 SMALLEST, LARGEST = 3.0, 30.0
 """Sizes of the completeness curves [floors]."""
 FAINTEST, PLAINEST = 1.0, 15.0
@@ -155,7 +157,7 @@ def on_held_back(recipe: Recipe, theta: dict[str, float], held: Path) -> dict[st
 
     sizes = {"after": theta, "before": {}}
     if not any(name.startswith("law_") for name in recipe.effects):
-        sizes["oracle"] = dict(recipe.effects)
+        sizes["oracle"] = recipe.effects | dust_of(recipe)
     experiment = config.load(Experiment, config.find("train", "state"), model_of(recipe))
     logs = [FlightLog.load(path) for path in sorted(held.glob("*.npz"))]
     names = sorted(set().union(*sizes.values()))
@@ -257,8 +259,10 @@ def drawn(kind: str, number: int) -> Recipe:
     """A world of a kind: ``null``, ``law``, ``curve``, ``flights`` or ``EFFECTSxFLOORS``; ``sight``, ``camera``, ``clear``.
 
     The last three have a camera. ``curve`` and ``sight`` hide one of the effects whose limits are asked for, ``camera`` any of a
-    camera's, ``clear`` none.
+    camera's, ``clear`` none. ``KIND+dust`` is the same with some of every other effect.
     """
+    if kind.endswith(DUSTY):
+        return replace(drawn(kind.removesuffix(DUSTY), number), dust=DUST)
     rng = np.random.default_rng(number + 7)
     if kind == "clear":
         return draw(number, 0, 0.0, camera=True, noise=float(rng.choice([0.5, 1.0, 2.0])), dropouts=float(rng.choice([0.0, 0.1])))
@@ -320,7 +324,7 @@ def warm(plant: str) -> None:
 def main() -> None:
     """Run a bank of sealed worlds and add it to a ledger; worlds that are there are not run again."""
     parser = argparse.ArgumentParser(description=main.__doc__)
-    kinds = "null, law, curve, flights, EFFECTSxFLOORS; with a camera sight, camera, clear: null=20 1x15=30"
+    kinds = "null, law, curve, flights, EFFECTSxFLOORS, any of these +dust; with a camera sight, camera, clear: null=20 1x15=30"
     parser.add_argument("worlds", nargs="*", metavar="KIND=COUNT", help=kinds)
     parser.add_argument("--seed", type=int, help="of the first world; drawn by the system where not given")
     parser.add_argument("--ledger", type=Path, default=Path("ledger.jsonl"))

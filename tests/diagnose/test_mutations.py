@@ -39,7 +39,6 @@ def no_latent_forces(monkeypatch) -> None:
 def no_floors(monkeypatch) -> None:
     """What is not named is not there at all: neither in the evidence, nor in the null worlds, nor in what a name must exceed."""
     monkeypatch.setattr(evidence, "SPIKE", 1e-3)
-    monkeypatch.setattr(evidence, "OWN_FLOOR", 1e-3)
 
 
 def no_bounds(monkeypatch) -> None:

@@ -7,8 +7,10 @@ import pytest
 
 from tests.synthetic_diagnosis import GUST, SyntheticModel, catalogue
 from visthrow.diagnose import marginal, noise
+from visthrow.diagnose import stack as stacks
 from visthrow.diagnose.evidence import Priors
 from visthrow.diagnose.model import Window
+from visthrow.diagnose.point import Problem, linearise, only
 from visthrow.diagnose.stack import BATCH, Stack
 from visthrow.errors import DiagnoseError
 
@@ -74,7 +76,34 @@ def test_windows_side_by_side_are_what_they_are_alone(fitted):
     stack = Stack(mixed, windows=rows)
     np.testing.assert_allclose(stack.values(levels), alone, rtol=1e-8)
     np.testing.assert_allclose(stack.look(levels)[0], alone, rtol=1e-8)
+    for latents in (False, True):
+        for found, gram, w in zip(stack.integrals(levels, latents=latents), mixed, rows, strict=True):
+            single = marginal.integral(gram, levels, w, gram.nuisances if latents else None)
+            size = np.abs(single.information).max()
+            np.testing.assert_allclose(found.information, single.information, atol=1e-9 * size)
+            share, other = found.share(gram, levels), single.share(gram, levels)
+            np.testing.assert_allclose(share.score, other.score, atol=1e-9 * size)
+            assert share.square == pytest.approx(other.square, rel=1e-9)
 
+
+def test_derivatives_are_moved_to_a_gpu_once(fitted):
+    """With other residuals and noise levels they are the same; with other ones they are not."""
+    inner = [gram.inner for gram in fitted[4]]
+    kept = stacks._kept(stacks._Same(inner), tuple([1] * len(inner)), "cpu")
+    assert stacks._kept(stacks._Same(list(inner)), tuple([1] * len(inner)), "cpu") is kept
+    assert stacks._kept(stacks._Same([inner[0].copy(), *inner[1:]]), tuple([1] * len(inner)), "cpu") is not kept
+
+
+def test_a_point_of_some_windows_is_the_point_that_they_give(fitted):
+    """As linearised without the others, but for the correlation time, which all windows told."""
+    model, windows = fitted[:2]
+    problem = Problem(model, Priors.of(model.effects, model.channels), tuple(range(len(windows))))
+    left = [w for w in range(len(windows)) if windows[w].phase != windows[0].phase]
+    whole = linearise(problem, np.zeros(len(EFFECTS)), windows=windows)
+    part, begin = only(whole, left), noise.only(whole.noise, [whole.grams[w] for w in left], left)
+    again = linearise(problem.only(left), np.zeros(len(EFFECTS)), begin, windows)
+    assert {phase for _, phase in part.noise.latent_sd} == {w.phase for w in part.windows} < {w.phase for w in windows}
+    np.testing.assert_allclose(part.information, again.information, rtol=1e-3)
 
 def test_broken_derivatives_are_told_with_their_window(fitted):
     gram = fitted[4][3]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
-from visthrow.diagnose import grammar, result, search, unknown, verdicts
+from visthrow.diagnose import grammar, result, screening, search, unknown, verdicts
 from visthrow.diagnose.blackbox import Table, table_of, train, unexplained
 from visthrow.diagnose.evidence import Priors
 from visthrow.diagnose.excess import acts_on
@@ -210,6 +210,21 @@ def beside_a_law(model: SyntheticModel, active: list[int]) -> tuple[search.Searc
     at.point = at._candidate(nominal, active)
     term = grammar.Term("vehicle force", ("speed",), "vel")
     return at, unknown._weigh(at.point, priors, active, term, 0.1, 7.0, unknown._known(at.point))
+
+
+@pytest.mark.parametrize("block", ["vehicle force", "payload force"])
+def test_all_terms_at_once_say_what_each_says_as_an_effect(block):
+    """Information and score of a column that the windows' inner products were given, and of no further simulation."""
+    at, _ = beside_a_law(SyntheticModel(effects=catalogue(4), law="speed", law_size=0.2, throws=4), [1])
+    known = unknown._known(at.point)
+    of = screening.screen(at.point, screening.statistics(at.point.grams, at.point.noise, "cpu"), block, known)
+    for i in (0, 7, len(of.terms) // 2, len(of.terms) - 1):
+        point, wide = unknown._extended(at.point, at.priors, of.terms[i], 1.0, known)
+        scale = wide.floor[-1]
+        assert point.information[-1, -1] == pytest.approx(scale**2 * of.own[i], rel=1e-6)
+        assert point.score[-1] == pytest.approx(scale * of.score[i], rel=1e-5, abs=1e-9 * scale * np.sqrt(of.own[i]))
+        cross, most = scale * of.cross, scale * np.abs(of.cross).max()
+        np.testing.assert_allclose(point.information[-1, :-1], cross[i], rtol=1e-5, atol=1e-9 * most)
 
 
 def test_names_in_the_block_of_a_law_are_withdrawn_and_others_stay():

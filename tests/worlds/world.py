@@ -58,6 +58,7 @@ class Recipe:
     held: int = 0  # throws besides, which nobody is shown
     low: bool = False  # free flights near the ground
     camera: bool = False  # a camera looks down and a detector marks the goal and the ball
+    dust: float = 0.0  # deviation of every other effect, in its floor: what matters to nobody, and is there in every hall
 
     def digest(self) -> str:
         """SHA-256 of the truth, to be published before a verdict is read."""
@@ -76,9 +77,21 @@ def draw(seed: int, count: int, floors: float, names=tuple(FLOORS), plants=PLANT
     )
 
 
+def dust_of(recipe: Recipe) -> dict[str, float]:
+    """Sizes of what is there besides the hidden effects and is not to be named."""
+    if not recipe.dust:
+        return {}
+    sizes = recipe.dust * np.random.default_rng([recipe.seed, 6]).standard_normal(len(FLOORS))
+    return {
+        name: float(FLOORS[name] * (abs(size) if name in ONE_SIDED else size))
+        for name, size in zip(FLOORS, sizes)
+        if name not in recipe.effects
+    }
+
+
 def world_of(recipe: Recipe):
     """Numbers of the recipe's world. The string's ball is a point."""
-    world = hide(recipe.effects)
+    world = hide(recipe.effects | dust_of(recipe))
     if recipe.plant == "string":
         world.ball_inertia = 0.0
     return world

@@ -35,9 +35,7 @@ def measure(args: argparse.Namespace) -> dict[str, float]:
 
 def run(args: argparse.Namespace) -> int:
     """Measure, print, keep."""
-    from visthrow.diagnose.threads import cores, single
-
-    single()
+    from sim.cores import cores
     from visthrow.device import resolve
 
     runs = [measure(args) for _ in range(args.repeats)]

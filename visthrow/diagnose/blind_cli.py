@@ -23,9 +23,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Search once, hide, print, write."""
-    from visthrow.diagnose.threads import single
-
-    single()
     import dataclasses
 
     from visthrow.diagnose import blind, opening, pictures, search

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from visthrow.diagnose.grammar import JOINT, JOINT_NEEDS, Known, coefficients, loads
+from visthrow.diagnose.grammar import JOINT, JOINT_NEEDS, Known, through_latents
 from visthrow.diagnose.marginal import Gram
 from visthrow.diagnose.model import LATENT_BLOCKS, Window
 from visthrow.diagnose.point import Point
@@ -110,11 +110,7 @@ def joint_torques(gram: Gram, window: Window) -> np.ndarray | None:
     known = Known(window.knots)
     if not set(JOINT_NEEDS) <= set(known) or len(np.unique(gram.latent_block)) < len(LATENT_BLOCKS):
         return None
-    count = len(known["time"])
-    units = np.eye(3 * count).reshape(count, 3, 3 * count)
-    at = window.latent_block, window.latent_axis, window.latent_time, known["time"]
-    whole = sum(coefficients(*at, block, values) for block, values in loads(JOINT, known, units).items())
-    return np.linalg.solve(gram.factor, whole)
+    return np.linalg.solve(gram.factor, through_latents(window, known, JOINT))
 
 
 def _explained(inner: np.ndarray, columns: Sequence[int], target: int) -> float:

@@ -30,9 +30,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Read, search, print, write."""
-    from visthrow.diagnose.threads import single
-
-    single()
     from visthrow.diagnose import opening, report, search
     from visthrow.diagnose.check.run import check, contradictions
     from visthrow.storage import write_json

@@ -21,7 +21,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from sim.laws import LOWEST, SLOWEST
-from visthrow.diagnose.model import LATENT_BLOCKS
+from visthrow.diagnose.model import LATENT_BLOCKS, Window
 
 Unit = tuple[int, int, int]
 """Exponents of kg, m and s."""
@@ -287,11 +287,15 @@ class Layout:
         rows = [([at[f] for f in t.factors] + [0] * MOST_SCALARS)[:MOST_SCALARS] for t in terms_]
         return Layout(terms_[0].block, scalars, vectors, np.array(rows).T, np.array([place[t.vector] for t in terms_]))
 
-    def table(self, knots: Knots) -> np.ndarray:
-        """Values of the terms, shape (k, 3, T); each factor is computed once."""
-        known = knots if isinstance(knots, Known) else Known(knots)
+    def factors(self, known: Known) -> tuple[np.ndarray, np.ndarray]:
+        """Values of the scalars, shape (k, 1 + scalars), and of the vectors, shape (k, 3, vectors); each is computed once."""
         scalars = np.stack((np.ones(len(known["time"])), *(SCALARS[f].read(known) for f in self.scalars)), axis=-1)
-        values = np.stack([VECTORS[self.block][v].read(known) for v in self.vectors], axis=-1)[:, :, self.vector]
+        return scalars, np.stack([VECTORS[self.block][v].read(known) for v in self.vectors], axis=-1)
+
+    def table(self, knots: Knots) -> np.ndarray:
+        """Values of the terms, shape (k, 3, T)."""
+        scalars, vectors = self.factors(knots if isinstance(knots, Known) else Known(knots))
+        values = vectors[:, :, self.vector]
         for which in self.scalar:
             values *= scalars[:, None, which]
         return values
@@ -364,3 +368,15 @@ def coefficients(latent_block: np.ndarray, latent_axis: np.ndarray, latent_time:
     at = np.abs(latent_time[of_block, None] - time).argmin(axis=1)
     out[of_block] = values[at, np.asarray(latent_axis, dtype=int)[of_block]]
     return out
+
+
+def through_latents(window: Window, known: Known, block: str) -> np.ndarray:
+    """Latent-force coefficients that what a block exerts at the knots stands for.
+
+    Returns:
+        Shape (L, 3 k): by component i at knot j in column 3 j + i; of other latent blocks 0.
+    """
+    time, count = known["time"], len(known["time"])
+    units, smooth = np.eye(3 * count).reshape(count, 3, 3 * count), between(count)
+    at = window.latent_block, window.latent_axis, window.latent_time, time
+    return sum(coefficients(*at, name, np.tensordot(smooth, values, 1)) for name, values in loads(block, known, units).items())

@@ -325,7 +325,11 @@ def integral(gram: Gram, noise: Noise, window: int, first: int | None = None) ->
 
 def window_statistics(gram: Gram, noise: Noise, window: int) -> WindowStatistics:
     """Integrate initial state and latent forces out of one window."""
-    whole = integral(gram, noise, window, gram.nuisances)
+    return statistics_of(integral(gram, noise, window, gram.nuisances), gram, noise)
+
+
+def statistics_of(whole: Integral, gram: Gram, noise: Noise) -> WindowStatistics:
+    """What the integral of a gram's latents and effects says with the gram's residuals."""
     share, latents = whole.share(gram, noise), gram.latents
     back = np.linalg.inv(gram.factor) if latents else gram.factor  # from unit latents to knots
     return WindowStatistics(

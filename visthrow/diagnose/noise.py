@@ -127,13 +127,19 @@ def refit(grams: Sequence[Gram], start: Noise, device: str = "cpu") -> Noise:
     return _maximise(grams, start, device)[0]
 
 
+def only(noise: Noise, grams: Sequence[Gram], windows: Sequence[int]) -> Noise:
+    """The levels as they concern some of the windows, whose ``grams`` these are."""
+    levels = {key: noise.latent_sd[key] for key in _first_guess(grams).latent_sd}
+    return replace(noise, share=noise.share[list(windows)], latent_sd=levels)
+
+
 def _first_guess(grams: Sequence[Gram]) -> Noise:
     """Sensor noise as stated, latent forces where they just become visible."""
     scale = np.ones(len(grams[0].count))
     visible: dict[tuple[int, str], list[float]] = {}
     for gram in grams:
         part = slice(gram.nuisances, gram.nuisances + gram.latents)
-        curvature = np.diagonal(gram.inner.sum(0))[part]
+        curvature = np.diagonal(gram.inner, axis1=1, axis2=2).sum(0)[part]
         for block in np.unique(gram.latent_block):
             seen = float(np.median(curvature[gram.latent_block == block]))
             if seen > 0.0:  # else these forces show nowhere in the window

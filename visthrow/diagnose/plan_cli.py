@@ -24,9 +24,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Search, simulate the manoeuvres, rank, write."""
-    from visthrow.diagnose.threads import single
-
-    single()
     import dataclasses
 
     from visthrow.diagnose import manoeuvres, opening, plan, report, search

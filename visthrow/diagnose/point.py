@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from visthrow.diagnose import noise as levels
+from visthrow.diagnose import stack
 from visthrow.diagnose.evidence import Priors, covariance, estimate, log_evidence
 from visthrow.diagnose.marginal import (
     Gram,
@@ -15,7 +16,6 @@ from visthrow.diagnose.marginal import (
     Statistics,
     gather,
     gram_of,
-    integral,
     recorrelated,
     with_residual,
 )
@@ -48,6 +48,10 @@ class Problem:
     def switches(self) -> np.ndarray:
         """Which effects are another kind of block, shape (K,), bool."""
         return np.array([e.switch for e in self.model.effects], dtype=bool)
+
+    def only(self, windows: Sequence[int]) -> "Problem":
+        """The same of some of the windows that are looked at."""
+        return replace(self, kept=tuple(self.kept[w] for w in windows))
 
     def sizes(self, theta: np.ndarray) -> dict[str, float]:
         """Sizes in the effects' units, of those that are not 0; ``theta`` is in floors."""
@@ -93,17 +97,12 @@ def regathered(point: Point, integrals: Sequence[Integral] | None = None, **chan
         changes: fields of the point.
     """
     changed = replace(point, **changes)
-    integrals = integrals_of(changed.grams, changed.noise) if integrals is None else integrals
+    integrals = stack.integrals(changed.grams, changed.noise, changed.device) if integrals is None else integrals
     return replace(changed, integrals=integrals, statistics=_statistics(changed.grams, integrals, changed.noise, changed.theta))
 
 
 def _statistics(grams: Sequence[Gram], integrals: Sequence[Integral], noise: Noise, theta: np.ndarray) -> Statistics:
     return gather(grams, [known.share(gram, noise) for known, gram in zip(integrals, grams)], theta)
-
-
-def integrals_of(grams: Sequence[Gram], noise: Noise) -> list[Integral]:
-    """Integrate initial states and latent forces out of all windows."""
-    return each(lambda w: integral(grams[w], noise, w), range(len(grams)))
 
 
 def linearise(problem: Problem, theta: np.ndarray, start: Noise | None = None, windows: Sequence[Window] | None = None) -> Point:
@@ -121,9 +120,16 @@ def linearise(problem: Problem, theta: np.ndarray, start: Noise | None = None, w
     raw = each(lambda w: gram_of(w, problem.priors.floor, channels), kept)
     device = getattr(problem.model, "device", "cpu")
     noise, grams = levels.fit(kept, raw, start, device)
-    integrals, at = integrals_of(grams, noise), np.array(theta, dtype=float)
+    integrals, at = stack.integrals(grams, noise, device), np.array(theta, dtype=float)
     about = Linearised(problem.sizes(theta), dict(zip(problem.kept, kept)))
     return Point(at, kept, raw, grams, noise, _statistics(grams, integrals, noise, at), integrals, about, device)
+
+
+def only(point: Point, windows: Sequence[int]) -> Point:
+    """The same of some of its windows, with noise levels estimated from these."""
+    own = {name: [getattr(point, name)[w] for w in windows] for name in ("windows", "raw", "grams")}
+    noise = levels.refit(own["grams"], levels.only(point.noise, own["grams"], windows), point.device)
+    return regathered(point, noise=noise, **own)
 
 
 def lost(point: Point) -> list[int]:

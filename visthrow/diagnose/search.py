@@ -22,7 +22,7 @@ from visthrow.diagnose.evidence import (
     threshold,
 )
 from visthrow.diagnose.marginal import Statistics
-from visthrow.diagnose.model import Model, Window
+from visthrow.diagnose.model import Model
 from visthrow.diagnose.point import (
     Point,
     Problem,
@@ -32,6 +32,7 @@ from visthrow.diagnose.point import (
     linearise,
     lost,
     moved,
+    only,
     to_gain,
     with_all_effects_noise,
     with_fitted_noise,
@@ -250,7 +251,7 @@ class Search:
         return True
 
     def _sure(self, point: Point, active: Sequence[int], j: int) -> bool:
-        """Whether the interval that an effect of a set would be reported with leaves out 0."""
+        """Whether an effect of a set is surely not 0, whatever half a floor of it is."""
         return bool(certainty(point.information, point.theta, self.priors, active)[list(active).index(j)] > 1.0)
 
     def _share_of(self, point: Point, active: Sequence[int], j: int) -> float:
@@ -308,12 +309,9 @@ class Search:
             return True
         self.progress(f"event in flight {verdict.flight}: something happened there that the other flights deny")
         self.events.append(verdict.flight)
-        flights = np.array([w.flight for w in self.point.windows])
-        kept = tuple(i for i, flight in zip(self.problem.kept, flights) if flight != verdict.flight)
-        self.problem = replace(self.problem, kept=kept)
-        self.nominal = linearise(self.problem, np.zeros_like(self.point.theta))
-        self.point = self.nominal if not self.active else linearise(self.problem, self.point.theta)
-        self.origin = self.point
+        left = [i for i, window in enumerate(self.point.windows) if window.flight != verdict.flight]
+        self.problem = self.problem.only(left)
+        self.nominal, self.origin, self.point = (only(p, left) for p in (self.nominal, self.origin, self.point))
         return True
 
     def _backward(self) -> None:
@@ -422,7 +420,7 @@ def explain(
     for _ in range(LOSSES):
         if not (gone := lost(nominal)):
             break
-        problem, nominal = _left_out(problem, gone, windows, say)
+        problem, nominal = _left_out(problem, nominal, gone, say)
     for again in range(LOSSES):
         least = threshold(nominal.statistics, priors, np.random.default_rng(seed))
         say(f"{len(problem.kept)} windows of {len(nominal.statistics.flights)} flights; a cause needs {least:.1f} nats")
@@ -431,15 +429,15 @@ def explain(
         gone = lost(search.point)  # where the causes are in the simulation, it may lose windows that it followed without
         if not gone or search.events or again == LOSSES - 1:
             break
-        problem, nominal = _left_out(problem, gone, windows, say)
+        problem, nominal = _left_out(problem, nominal, gone, say)
     diagnosis = conclude(search, laws=laws)
     return replace(diagnosis, duplicates=duplicates, seconds=time.monotonic() - begun, seed=seed)
 
 
 def _left_out(
-    problem: Problem, gone: Sequence[int], windows: Sequence[Window], say: Callable[[str], None]
+    problem: Problem, nominal: Point, gone: Sequence[int], say: Callable[[str], None]
 ) -> tuple[Problem, Point]:
     """The problem without some of its windows, and the model as it stands."""
     say(f"{len(gone)} windows are left out, which the simulation does not follow")
-    problem = replace(problem, kept=tuple(w for i, w in enumerate(problem.kept) if i not in set(gone)))
-    return problem, linearise(problem, np.zeros(len(problem.model.effects)), windows=windows)
+    left = [i for i in range(len(problem.kept)) if i not in set(gone)]
+    return problem.only(left), only(nominal, left)

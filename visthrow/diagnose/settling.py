@@ -13,7 +13,7 @@ from sim.replay.lanes import Replay
 from visthrow.diagnose.catalogue import Setting
 from visthrow.diagnose.model import Window
 from visthrow.diagnose.replay import Flights, Lane
-from visthrow.diagnose.states import Direction, States, concerns, moved, moved_along, stacked
+from visthrow.diagnose.states import Direction, States, concerns, moved, moved_along, rows_of, stacked
 
 DAMPING, DAMPING_MOST = 1e-3, 1e5
 """Of the Levenberg-Marquardt steps: at first, and where a window counts as settled."""
@@ -163,11 +163,11 @@ class Settling:
         """Derivatives of windows' samples by their initial states."""
         if not len(which):
             return {}
-        count, lanes, first = len(self.flights.cuts), [], []
-        for w in which:
+        count, lanes, first = len(which), [], []
+        for row, w in enumerate(which):
             first.append(len(lanes))
-            lanes += [Lane(w, 0, w, rough=True), *[Lane(w, 0, (1 + d) * count + w, rough=True) for d in self._fitted(w)]]
-        there = perturbed(states, self.directions)
+            lanes += [Lane(w, 0, row, rough=True), *[Lane(w, 0, (1 + d) * count + row, rough=True) for d in self._fitted(w)]]
+        there = perturbed(rows_of(states, which), self.directions)
         seen = self.flights.fly(self.replay, [self.setting], there, lanes, self.substep, self._ends).seen
         slopes = {}
         for at, w in zip(first, which):

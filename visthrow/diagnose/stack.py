@@ -4,13 +4,23 @@ The same algebra as :mod:`visthrow.diagnose.marginal`, for grams that are padded
 batches that fit its cache.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property, lru_cache
 
 import numpy as np
 import torch
 
-from visthrow.diagnose.marginal import ROUNDING, Gram, Noise
+from visthrow.diagnose.marginal import (
+    ROUNDING,
+    Gram,
+    Integral,
+    Noise,
+    WindowStatistics,
+    integral,
+    statistics_of,
+    window_statistics,
+)
 from visthrow.diagnose.model import LATENT_BLOCKS
 from visthrow.diagnose.threads import each
 from visthrow.errors import DiagnoseError
@@ -19,14 +29,70 @@ BATCH = 8  # windows of a batch on the CPU
 BLOCKS = len(LATENT_BLOCKS)
 
 
+class _Same(tuple):
+    """Arrays that are the same only if they are the very ones."""
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Same) and len(self) == len(other) and all(a is b for a, b in zip(self, other))
+
+    def __hash__(self) -> int:
+        return hash(tuple(map(id, self)))
+
+
+class _Columns:
+    """Inner products of the columns of W windows, n hidden ones [X, G] at most, K effects; padded columns are 0."""
+
+    def __init__(self, inner: Sequence[np.ndarray], sizes: Sequence[int], device: str):
+        """Keep them.
+
+        Args:
+            inner: of each window, shape (C, P, P).
+            sizes: of each window, its hidden columns.
+            device: where to calculate.
+        """
+        self._inner, self._sizes, self._device = inner, sizes, device
+
+    @cached_property
+    def hidden(self) -> torch.Tensor:
+        """Shape (W, C, n, n)."""
+        n = max(self._sizes)
+        return self._moved(n, n, lambda inner, size: inner[:, :size, :size])
+
+    @cached_property
+    def beside(self) -> torch.Tensor:
+        """Hidden columns with effects, shape (W, C, n, K)."""
+        return self._moved(max(self._sizes), self._effects, lambda inner, size: inner[:, :size, size:])
+
+    @cached_property
+    def own(self) -> torch.Tensor:
+        """Shape (W, C, K, K)."""
+        return self._moved(self._effects, self._effects, lambda inner, size: inner[:, size:, size:])
+
+    @property
+    def _effects(self) -> int:
+        return len(self._inner[0][0]) - self._sizes[0]
+
+    def _moved(self, height: int, width: int, part: Callable[[np.ndarray, int], np.ndarray]) -> torch.Tensor:
+        out = np.zeros((len(self._inner), len(self._inner[0]), height, width))
+        for row, inner, size in zip(out, self._inner, self._sizes):
+            values = part(inner, size)
+            row[:, : values.shape[1], : values.shape[2]] = values
+        return torch.from_numpy(out).to(self._device)
+
+
+@lru_cache(maxsize=2)
+def _kept(inner: _Same, sizes: tuple[int, ...], device: str) -> _Columns:
+    """Those that a GPU has already: residuals and noise levels change far more often than derivatives do."""
+    return _Columns(inner, sizes, device)
+
+
 @dataclass(frozen=True)
 class _Batch:
     """W windows, of n columns [X, G] at most; padded columns are 0."""
 
     windows: np.ndarray  # rows of the noise's shares, shape (W,)
-    phases: list[str]
-    flights: list[int]
-    hidden: torch.Tensor  # shape (W, C, n, n)
+    grams: list[Gram]
+    columns: _Columns
     cross: torch.Tensor  # shape (W, C, n)
     square: torch.Tensor  # shape (W, C)
     count: torch.Tensor  # shape (W, C)
@@ -43,7 +109,22 @@ class _Solved:
     level: torch.Tensor  # prior deviation of the columns, shape (W, n)
     factor: torch.Tensor  # lower Cholesky factor of 1 + P^1/2 U' W U P^1/2, shape (W, n, n)
     mean: torch.Tensor  # of [b, a] in prior deviations, shape (W, n)
+    log_det: torch.Tensor  # of V, shape (W,)
     value: torch.Tensor  # log-likelihood of the residuals, but for the powers of 2 pi, shape (W,)
+
+
+def integrals(grams: Sequence[Gram], noise: Noise, device: str) -> list[Integral]:
+    """Integrate initial states and latent forces out of windows: side by side on a GPU; on a CPU copies would cost more."""
+    if device == "cpu":
+        return each(lambda w: integral(grams[w], noise, w), range(len(grams)))
+    return Stack(grams, device).integrals(noise)
+
+
+def statistics(grams: Sequence[Gram], noise: Noise, device: str) -> list[WindowStatistics]:
+    """The same, and what the windows say of their latent forces as if they were effects."""
+    if device == "cpu":
+        return each(lambda w: window_statistics(grams[w], noise, w), range(len(grams)))
+    return [statistics_of(*pair, noise) for pair in zip(Stack(grams, device).integrals(noise, latents=True), grams)]
 
 
 class Stack:
@@ -67,17 +148,18 @@ class Stack:
     def _padded(self, grams: Sequence[Gram], windows: np.ndarray) -> _Batch:
         sizes = [gram.nuisances + gram.latents for gram in grams]
         count, channels, n = len(grams), len(grams[0].count), max(sizes)
-        hidden, cross = np.zeros((count, channels, n, n)), np.zeros((count, channels, n))
+        cross = np.zeros((count, channels, n))
         member, known = np.zeros((count, n, BLOCKS)), np.zeros((count, n))
         for w, (gram, size) in enumerate(zip(grams, sizes)):
-            hidden[w, :, :size, :size] = gram.inner[:, :size, :size]
             cross[w, :, :size] = gram.cross[:, :size]
             member[w, np.arange(gram.nuisances, size), gram.latent_block] = 1.0
             known[w, : gram.nuisances] = 1.0
         square, counts = (np.stack([getattr(gram, name) for gram in grams]) for name in ("square", "count"))
         log_sigma = np.array([gram.log_sigma for gram in grams])
-        arrays = [torch.from_numpy(a).to(self.device) for a in (hidden, cross, square, counts, log_sigma, member, known)]
-        return _Batch(windows, [gram.phase for gram in grams], [gram.flight for gram in grams], *arrays)
+        arrays = [torch.from_numpy(a).to(self.device) for a in (cross, square, counts, log_sigma, member, known)]
+        inner = [gram.inner for gram in grams]
+        columns = _Columns(inner, sizes, self.device) if self.device == "cpu" else _kept(_Same(inner), tuple(sizes), self.device)
+        return _Batch(windows, list(grams), columns, *arrays)
 
     def values(self, noise: Noise) -> np.ndarray:
         """Log-likelihood of each window's residuals, but for the powers of 2 pi, shape (W,).
@@ -103,6 +185,20 @@ class Stack:
         found = self._each(lambda batch: _curved(batch, _solved(batch, noise)))
         return tuple(self._in_order([part[i] for part in found]) for i in range(3))
 
+    def integrals(self, noise: Noise, *, latents: bool = False) -> list[Integral]:
+        """What is left of the effects' columns of each window, or of those of latent forces and effects.
+
+        See :func:`visthrow.diagnose.marginal.integral`.
+
+        Raises:
+            DiagnoseError: As :meth:`values`.
+        """
+        out: list[Integral | None] = [None] * self._count
+        for own, found in zip(self._order, each(lambda batch: _integrals(batch, noise, latents), self._batches)):
+            for w, of_window in zip(own, found):
+                out[w] = of_window
+        return out
+
     def _each(self, function) -> list[tuple[np.ndarray, ...]]:
         return each(lambda batch: tuple(value.cpu().numpy() for value in function(batch)), self._batches)
 
@@ -114,12 +210,12 @@ class Stack:
 
 
 def _solved(batch: _Batch, noise: Noise) -> _Solved:
-    shared = [[noise.latent_sd.get((b, phase), 0.0) for b in range(BLOCKS)] for phase in batch.phases]
+    shared = [[noise.latent_sd.get((b, gram.phase), 0.0) for b in range(BLOCKS)] for gram in batch.grams]
     by_block = batch.square.new_tensor(np.array(shared) * noise.share[batch.windows])
     level = batch.known + (batch.member @ by_block[:, :, None])[..., 0]
     scale = batch.square.new_tensor(noise.scale)
-    weight, (count, n) = scale**-2.0, level.shape
-    normal = (weight @ batch.hidden.reshape(count, len(scale), n * n)).reshape(count, n, n)
+    weight = scale**-2.0
+    normal = _weighed(weight, batch.columns.hidden)
     normal *= level[:, :, None]
     normal *= level[:, None]
     normal.diagonal(dim1=1, dim2=2).add_(1.0)
@@ -130,12 +226,19 @@ def _solved(batch: _Batch, noise: Noise) -> _Solved:
         factor, failed = torch.linalg.cholesky_ex(normal)
         if torch.any(failed):
             w = int(torch.nonzero(failed)[0, 0])
-            raise DiagnoseError(f"window of flight {batch.flights[w]}, phase {batch.phases[w]}: the normal equations are singular")
+            where = f"window of flight {batch.grams[w].flight}, phase {batch.grams[w].phase}"
+            raise DiagnoseError(f"{where}: the normal equations are singular")
     right = level * (weight @ batch.cross)
     mean = torch.cholesky_solve(right[:, :, None], factor)[..., 0]
     log_det = 2.0 * (factor.diagonal(dim1=1, dim2=2).log().sum(-1) + batch.log_sigma + batch.count @ scale.log())
     value = -0.5 * (batch.square @ weight - (right * mean).sum(-1) + log_det)
-    return _Solved(weight, level, factor, mean, value)
+    return _Solved(weight, level, factor, mean, log_det, value)
+
+
+def _weighed(weight: torch.Tensor, inner: torch.Tensor) -> torch.Tensor:
+    """Sum over the channels, shape (W, i, j)."""
+    count, channels, *shape = inner.shape
+    return (weight @ inner.reshape(count, channels, -1)).reshape(count, *shape)
 
 
 def _curved(batch: _Batch, at: _Solved) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -147,7 +250,7 @@ def _curved(batch: _Batch, at: _Solved) -> tuple[torch.Tensor, torch.Tensor, tor
     moved = at.level * at.mean
     scaled = covariance * at.level[:, :, None] * at.level[:, None]
     both = torch.stack((scaled, moved[:, :, None] * moved[:, None]), -1).reshape(count, n * n, 2)
-    spread, bent = (batch.hidden.reshape(count, channels, n * n) @ both).unbind(-1)
+    spread, bent = (batch.columns.hidden.reshape(count, channels, n * n) @ both).unbind(-1)
     left = batch.square - 2.0 * (batch.cross @ moved[:, :, None])[..., 0] + bent + spread
     # Degrees of freedom that the columns take from each channel; rounding of huge derivatives is kept from taking others.
     taken = torch.minimum(torch.clamp(at.weight * spread, min=0.0), batch.count)
@@ -161,3 +264,23 @@ def _curved(batch: _Batch, at: _Solved) -> tuple[torch.Tensor, torch.Tensor, tor
     curvature[:, BLOCKS:, :BLOCKS] = mixed.transpose(1, 2)
     curvature[:, BLOCKS:, BLOCKS:].diagonal(dim1=1, dim2=2).copy_(2.0 * torch.clamp(batch.count - taken, min=0.0))
     return at.value, torch.cat((by_block, left * at.weight - batch.count), -1), curvature
+
+
+def _integrals(batch: _Batch, noise: Noise, latents: bool) -> list[Integral]:
+    at, columns = _solved(batch, noise), batch.columns
+    right, own = _weighed(at.weight, columns.beside), _weighed(at.weight, columns.own)
+    n = right.shape[1]
+    if latents:
+        hidden = _weighed(at.weight, columns.hidden)
+        own = torch.cat((torch.cat((hidden, right), 2), torch.cat((right.transpose(1, 2), own), 2)), 1)
+        right = own[:, :n]
+    half = torch.linalg.solve_triangular(at.factor, at.level[:, :, None] * right, upper=False)
+    reduced = own - half.transpose(1, 2) @ half
+    arrays = (0.5 * (reduced + reduced.transpose(1, 2)), half, at.factor, at.level, at.log_det)
+    found = []
+    for gram, information, half, factor, level, log_det in zip(batch.grams, *(array.cpu().numpy() for array in arrays)):
+        size = gram.nuisances + gram.latents
+        left = np.r_[gram.nuisances : size, n : len(information)] if latents else slice(None)
+        information = information[left][:, left]
+        found.append(Integral(information, half[:size, left], factor[:size, :size], level[:size], float(log_det)))
+    return found

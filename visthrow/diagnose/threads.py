@@ -3,30 +3,31 @@
 So each product has one thread, and windows are spread over the cores.
 """
 
-import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from typing import TypeVar
+
+from threadpoolctl import threadpool_limits
 
 from sim.cores import cores as cores
 
 T = TypeVar("T")
 R = TypeVar("R")
 
-VARIABLES = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 MOST = 8  # threads, beyond which Python's own share of the work is all that is left
 
 
 def single() -> None:
-    """Ask for one thread a product unless the user said otherwise; works before numpy is imported."""
-    for name in VARIABLES:
-        os.environ.setdefault(name, "1")
+    """Give a product one thread from now on, in numpy, scipy and whatever else of the kind this process has loaded."""
+    import scipy.linalg  # noqa: F401
+
+    threadpool_limits(1)
 
 
 @cache
 def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(min(cores(), MOST), "algebra")
+    return ThreadPoolExecutor(min(cores(), MOST), "algebra", single)
 
 
 def each(function: Callable[[T], R], items: Iterable[T]) -> list[R]:

@@ -185,14 +185,17 @@ class ThrowModel:
         """States that belong to other sizes of the effects by the derivatives, and how each window's were moved."""
         names = [e.effect.name for e in self.entries.values()]
         change = np.array([theta.get(name, 0.0) - about.theta.get(name, 0.0) for name in names])
-        found, cuts, moves = directions(setting.plant), self.flights.cuts, {}
+        found, cuts = directions(setting.plant), self.flights.cuts
         sizes = np.zeros((len(cuts), len(found)))
-        for i, window in about.windows.items():
+
+        def move(i: int) -> np.ndarray:
             w = self._told[i]
             own = [d for d, x in enumerate(found) if concerns(x, cuts[w])]
             free = np.array([found[d].follows for d in own], dtype=bool)
-            moves[i] = following(self.flights, w, window, change, free, self.setting.plant.release.lag)
-            sizes[w, own] = moves[i]
+            sizes[w, own] = by = following(self.flights, w, about.windows[i], change, free, self.setting.plant.release.lag)
+            return by
+
+        moves = dict(zip(about.windows, each(move, about.windows)))
         return moved_along(self._settled_at[_key(about.theta)], found, sizes), moves
 
     def _switches(self, theta: Mapping[str, float]) -> frozenset[str]:

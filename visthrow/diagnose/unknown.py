@@ -4,9 +4,8 @@ A term needs no simulation: its column is G phi, with G the derivatives by the l
 thousands of terms are screened with the statistics at hand; the best are then weighed with noise levels of their own.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,10 +16,11 @@ from visthrow.diagnose import noise as noise_levels
 from visthrow.diagnose.consistency import LEAST_FLIGHTS, differ
 from visthrow.diagnose.evidence import Priors, covariance, estimate
 from visthrow.diagnose.excess import acts_on
-from visthrow.diagnose.marginal import Gram, Integral, Noise, WindowStatistics, gather, window_statistics
-from visthrow.diagnose.model import LATENT_BLOCKS, Window
+from visthrow.diagnose.marginal import Gram, Integral, Noise
+from visthrow.diagnose.model import LATENT_BLOCKS
 from visthrow.diagnose.point import Point, advantage, regathered, shifted
 from visthrow.diagnose.result import Law
+from visthrow.diagnose.screening import calmed, carries, distinct, felt, gains, screen, usual
 from visthrow.diagnose.threads import each
 
 if TYPE_CHECKING:
@@ -44,9 +44,6 @@ NARROW = 1e-3
 MATERIAL = 0.5
 """Root mean square force of a term, in the block's usual latent force, below which it does not matter: that of a gust moves a
 landing by 5 mm within half a second."""
-
-ROUGHER = 2.0
-"""While terms are screened, no phase is rougher than so many times the usual."""
 
 FORM = 1.0
 """Share of a term by which flights may differ: at knots a tenth of a second apart a law of the thrust's slope is a rough one."""
@@ -108,111 +105,21 @@ class Hypothesis:
         return replace(self.point, theta=theta, statistics=inner)
 
 
-@lru_cache(maxsize=32)
-def _terms(block: str, known: tuple[str, ...]) -> tuple[grammar.Term, ...]:
-    return tuple(grammar.terms(block, known))
-
-
-@lru_cache(maxsize=32)
-def _layout(block: str, known: tuple[str, ...]) -> grammar.Layout | None:
-    terms_ = _terms(block, known)
-    return grammar.Layout.of(terms_) if terms_ else None
-
-
-@dataclass
-class _Screen:
-    """Information of all terms about one point, summed over windows."""
-
-    terms: list[grammar.Term]
-    size: np.ndarray  # root mean square over the knots, shape (T,)
-    own: np.ndarray  # shape (T,)
-    score: np.ndarray
-    cross: np.ndarray  # with the effects, shape (T, K)
-
-
-def _columns(window: Window, known: grammar.Known, layout: grammar.Layout) -> np.ndarray:
-    """Latent-force coefficients of terms, shape (L, T)."""
-    shares = grammar.loads(layout.block, known, layout.table(known))
-    at = window.latent_block, window.latent_axis, window.latent_time, known["time"]
-    smooth = grammar.between(len(known["time"]))
-    return sum(grammar.coefficients(*at, block, np.tensordot(smooth, values, 1)) for block, values in shares.items())
-
-
-def _carries(latent_block: np.ndarray, block: str) -> np.ndarray | None:
-    """Which latents of a window terms of a block act through, as a mask; None where the window lacks some."""
-    needed = [LATENT_BLOCKS.index(name) for name in grammar.acting(block)]
-    return np.isin(latent_block, needed) if np.all(np.isin(needed, latent_block)) else None
-
-
-def _felt(block: str) -> str:
-    """Latent block whose levels a term's size is measured in."""
-    return "vehicle torque" if block == grammar.JOINT else block
-
-
-def _calm(point: Point) -> tuple[Point, list[WindowStatistics]]:
-    """The point as if no phase were much rougher than is usual in its block, and the statistics of its windows.
-
-    A force that the model lacks is taken for gusts in the phases in which it acts; there no term of it would stand out.
-    """
-    levels = point.noise.latent_sd
-    limits = {}
-    for block in {block for block, _ in levels}:
-        limits[block] = ROUGHER * _usual(levels, block)
-    noise = replace(point.noise, latent_sd={key: min(level, limits[key[0]]) for key, level in levels.items()})
-    parts = each(lambda w: window_statistics(point.grams[w], noise, w), range(len(point.grams)))
-    return replace(point, noise=noise, statistics=gather(point.grams, parts, point.theta)), parts
-
-
-def _usual(levels: Mapping[tuple[int, str], float], block: int) -> float:
-    """The lower median of a block's levels; the least of a phase with few windows may be anything."""
-    own = sorted(level for (b, _), level in levels.items() if b == block)
-    return own[(len(own) - 1) // 2]
-
-
-def _screen(point: Point, parts: Sequence[WindowStatistics], block: str, known: Sequence[grammar.Known]) -> _Screen | None:
-    """Gather what each term of a block says; None where the windows carry no knots for any."""
-    through = {w: mask for w, gram in enumerate(point.grams) if (mask := _carries(gram.latent_block, block)) is not None}
-    names = [set(point.windows[w].knots) for w in through]
-    shared = set.intersection(*names) if names else set()
-    layout = _layout(block, tuple(sorted(shared))) if "time" in shared else None
-    if layout is None:
-        return None
-    felt, count, effects = LATENT_BLOCKS.index(_felt(block)), len(layout.vector), len(point.theta)
-    own, score, cross, square = np.zeros(count), np.zeros(count), np.zeros((count, effects)), np.zeros(count)
-    rows = 0
-    for w, mask in through.items():
-        part, columns = parts[w], _columns(point.windows[w], known[w], layout)
-        square += (columns[point.grams[w].latent_block == felt] ** 2).sum(0)
-        rows += int((point.grams[w].latent_block == felt).sum()) // 3
-        columns = columns[mask]
-        own += ((part.latent_information[np.ix_(mask, mask)] @ columns) * columns).sum(0)
-        score += columns.T @ (part.latent_score + part.latent_effects @ point.theta)[mask]
-        cross += columns.T @ part.latent_effects[mask]
-    return _Screen(list(_terms(block, tuple(sorted(shared)))), np.sqrt(square / max(rows, 1)), own, score, cross)
-
-
-def _gains(point: Point, priors: Priors, active: Sequence[int], screen: _Screen, reach: float) -> tuple[np.ndarray, np.ndarray]:
-    """Nats of each term, and its prior deviation."""
-    sigma = covariance(point.information, priors.deviation(list(active)))
-    own = np.maximum(screen.own - np.einsum("tk,kl,tl->t", screen.cross, sigma, screen.cross, optimize=True), 0.0)
-    score = screen.score - screen.cross @ (sigma @ point.score)
-    prior = reach / np.maximum(screen.size, 1e-12 * screen.size.max() + 1e-300)
-    gain = -0.5 * np.log1p(prior**2 * own) + 0.5 * score**2 / (own + prior**-2.0)
-    gain[screen.size <= 1e-9 * screen.size.max()] = -np.inf
-    return gain, prior
-
-
 def _extended(
     point: Point, priors: Priors, term: grammar.Term, prior: float, known: Sequence[grammar.Known]
 ) -> tuple[Point, Priors]:
     """The same point with the term as its last effect, measured in NARROW of its prior deviation."""
     scale, layout = NARROW * prior, grammar.Layout.of([term])
-    grams, integrals = [], []
-    for gram, window, own, integral in zip(point.grams, point.windows, known, point.integrals):
-        acts = _carries(gram.latent_block, term.block) is not None
-        column = scale * _columns(window, own, layout)[:, 0] if acts else np.zeros(gram.latents)
-        grams.append(_with_column(gram, np.linalg.solve(gram.factor, column) if acts else column))
-        integrals.append(_with_last(integral, grams[-1], point.noise))
+
+    def longer(w: int) -> tuple[Gram, Integral]:
+        gram, column = point.grams[w], np.zeros(point.grams[w].latents)
+        if carries(gram.latent_block, term.block):
+            values = scale * layout.table(known[w]).ravel()
+            column = np.linalg.solve(gram.factor, grammar.through_latents(point.windows[w], known[w], term.block) @ values)
+        gram = _with_column(gram, column)
+        return gram, _with_last(point.integrals[w], gram, point.noise)
+
+    grams, integrals = zip(*each(longer, range(len(point.grams))))
     wide = Priors(
         np.append(priors.floor, scale), np.append(priors.slab, 1.0 / NARROW), np.append(priors.low, -np.inf),
         np.append(priors.high, np.inf), np.append(priors.visible, True),
@@ -272,16 +179,16 @@ def hypotheses(point: Point, priors: Priors, active: Sequence[int], strongest: d
         least: nats below which no term is weighed.
         beside: a first term that ``point`` already holds.
     """
-    calm, parts = _calm(point)
+    calm, parts = calmed(point)
     known = _known(point)
-    screens = {block: screen for block in strongest if (screen := _screen(calm, parts, block, known)) is not None}
-    depths = [term.depth for screen in screens.values() for term in screen.terms]
+    screens = {block: of for block in strongest if (of := screen(calm, parts, block, known)) is not None}
+    depths = [term.depth for of in screens.values() for term in of.terms]
     price = {depth: float(np.log(sum(d <= depth for d in depths))) for depth in set(depths)}
     found: list[tuple[float, grammar.Term, float]] = []
-    for block, screen in screens.items():
-        gain, prior = _gains(calm, priors, active, screen, REACH * strongest[block])
-        gain -= [price[term.depth] for term in screen.terms]
-        found += [(float(gain[i]), screen.terms[i], float(prior[i])) for i in _distinct(gain, screen)]
+    for block, of in screens.items():
+        gain, prior = gains(calm, priors, active, of, REACH * strongest[block])
+        gain -= [price[term.depth] for term in of.terms]
+        found += [(float(gain[i]), of.terms[i], float(prior[i])) for i in distinct(gain, of, WEIGHED)]
     found = sorted((f for f in found if f[0] > least), key=lambda f: -f[0])[:WEIGHED]
     weighed = [_weigh(point, priors, active, term, prior, price[term.depth], known, beside) for _, term, prior in found]
     return sorted((h for h in weighed if h.nats > least and _matters(h, known) and not _differs(h)), key=lambda h: -h.nats)
@@ -300,23 +207,11 @@ def _matters(hypothesis: Hypothesis, known: Sequence[grammar.Known]) -> bool:
     layout = grammar.Layout.of([term])
     square: dict[tuple[int, str], list[float]] = {}
     for window, gram, own in zip(point.windows, point.grams, known):
-        if _carries(gram.latent_block, term.block) is not None:
+        if carries(gram.latent_block, term.block):
             for block, values in grammar.loads(term.block, own, layout.table(own)).items():
                 square.setdefault((LATENT_BLOCKS.index(block), window.phase), []).append(float((values**2).sum((1, 2)).mean()))
-    usual = {block: _usual(point.noise.latent_sd, block) for block, _ in square}
-    return any(abs(law.coefficient) * np.sqrt(np.mean(values)) > MATERIAL * usual[block] for (block, _), values in square.items())
-
-
-def _distinct(gain: np.ndarray, screen: _Screen) -> list[int]:
-    """The best terms, without those that are a simpler one in other words in these flights."""
-    kept: list[int] = []
-    unit = screen.score / np.maximum(screen.size, 1e-300)
-    for i in np.argsort(-gain, kind="stable")[: 8 * WEIGHED]:
-        if len(kept) == WEIGHED or not np.isfinite(gain[i]):
-            break
-        if not any(np.isclose(abs(unit[i]), abs(unit[k]), rtol=1e-3) for k in kept):
-            kept.append(int(i))
-    return kept
+    common = {block: usual(point.noise.latent_sd, block) for block, _ in square}
+    return any(abs(law.coefficient) * np.sqrt(np.mean(values)) > MATERIAL * common[block] for (block, _), values in square.items())
 
 
 @dataclass(frozen=True)
@@ -341,7 +236,7 @@ def find_laws(search: "Search") -> Answer:
         name = LATENT_BLOCKS[block]
         strongest[name] = max(strongest.get(name, 0.0), level)
     if set(strongest) == set(LATENT_BLOCKS):
-        strongest[grammar.JOINT] = strongest[_felt(grammar.JOINT)]
+        strongest[grammar.JOINT] = strongest[felt(grammar.JOINT)]
     if not all(w.knots for w in search.nominal.windows) or not strongest:
         return Answer()
     priors, least = search.priors, search.least

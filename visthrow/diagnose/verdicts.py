@@ -91,7 +91,7 @@ def conclude(search: "Search", *, laws: bool) -> Diagnosis:
 
 
 def _sure(point: Point, priors: Priors, active: Sequence[int]) -> list[int]:
-    """Names whose intervals leave out 0 at a point, the least certain gone first."""
+    """Names that are surely not 0 at a point, the least certain gone first."""
     left = list(active)
     while left:
         theta = estimate(point.information, point.score, priors, left)

@@ -1,0 +1,160 @@
+"""What flights say of thousands of terms of the grammar at once, without a simulation.
+
+The column of a term is G A v: G are the derivatives by the latent forces, A the latent forces that anything exerted at the knots
+stands for, v the term's values there. So a window needs A' G' V^-1 G A alone, with V as in :mod:`visthrow.diagnose.marginal`, and
+all terms are a product of tables.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+import torch
+
+from visthrow.diagnose import grammar
+from visthrow.diagnose.evidence import Priors, covariance
+from visthrow.diagnose.marginal import WindowStatistics, gather
+from visthrow.diagnose.model import LATENT_BLOCKS
+from visthrow.diagnose.point import Point
+from visthrow.diagnose.stack import BATCH, statistics
+from visthrow.diagnose.threads import each
+
+ROUGHER = 2.0
+"""While terms are screened, no phase is rougher than so many times the usual."""
+
+
+@lru_cache(maxsize=32)
+def _terms(block: str, known: tuple[str, ...]) -> tuple[grammar.Term, ...]:
+    return tuple(grammar.terms(block, known))
+
+
+@lru_cache(maxsize=32)
+def _layout(block: str, known: tuple[str, ...]) -> grammar.Layout | None:
+    terms = _terms(block, known)
+    return grammar.Layout.of(terms) if terms else None
+
+
+@dataclass
+class Screen:
+    """Information of all terms about one point, summed over windows."""
+
+    terms: tuple[grammar.Term, ...]
+    size: np.ndarray  # root mean square over the knots, shape (T,)
+    own: np.ndarray  # shape (T,)
+    score: np.ndarray
+    cross: np.ndarray  # with the effects, shape (T, K)
+
+
+def felt(block: str) -> str:
+    """Latent block whose levels a term's size is measured in."""
+    return "vehicle torque" if block == grammar.JOINT else block
+
+
+def carries(latent_block: np.ndarray, block: str) -> bool:
+    """Whether a window has all latents that terms of a block act through."""
+    return set(map(LATENT_BLOCKS.index, grammar.acting(block))) <= set(np.unique(latent_block).tolist())
+
+
+def usual(levels: Mapping[tuple[int, str], float], block: int) -> float:
+    """The lower median of a block's levels; the least of a phase with few windows may be anything."""
+    own = sorted(level for (b, _), level in levels.items() if b == block)
+    return own[(len(own) - 1) // 2]
+
+
+def calmed(point: Point) -> tuple[Point, list[WindowStatistics]]:
+    """The point as if no phase were much rougher than is usual in its block, and the statistics of its windows.
+
+    A force that the model lacks is taken for gusts in the phases in which it acts; there no term of it would stand out.
+    """
+    levels = point.noise.latent_sd
+    limits = {block: ROUGHER * usual(levels, block) for block in {block for block, _ in levels}}
+    noise = replace(point.noise, latent_sd={key: min(level, limits[key[0]]) for key, level in levels.items()})
+    parts = statistics(point.grams, noise, point.device)
+    return replace(point, noise=noise, statistics=gather(point.grams, parts, point.theta)), parts
+
+
+def screen(point: Point, parts: Sequence[WindowStatistics], block: str, known: Sequence[grammar.Known]) -> Screen | None:
+    """Gather what each term of a block says; None where the windows carry no knots for any.
+
+    Args:
+        point: that the terms are about.
+        parts: statistics of its windows.
+        block: of the terms.
+        known: quantities at the knots of its windows.
+    """
+    through = [w for w, gram in enumerate(point.grams) if carries(gram.latent_block, block)]
+    names = [set(point.windows[w].knots) for w in through]
+    shared = tuple(sorted(set.intersection(*names))) if names else ()
+    layout = _layout(block, shared) if "time" in shared else None
+    if layout is None:
+        return None
+    own, size = LATENT_BLOCKS.index(felt(block)), BATCH if point.device == "cpu" else len(through)
+
+    def told(windows: Sequence[int]) -> tuple[np.ndarray, ...]:
+        return _products([_at_knots(point, parts[w], w, block, known[w], layout, own) for w in windows], layout, point.device)
+
+    batches = [through[first : first + size] for first in range(0, len(through), size)]
+    square, information, score, cross = (sum(shares) for shares in zip(*each(told, batches)))
+    rows = sum(int((point.grams[w].latent_block == own).sum()) // 3 for w in through)
+    return Screen(_terms(block, shared), np.sqrt(square / max(rows, 1)), information, score, cross)
+
+
+def _at_knots(
+    point: Point, part: WindowStatistics, w: int, block: str, known: grammar.Known, layout: grammar.Layout, own: int
+) -> tuple[np.ndarray, ...]:
+    """Of a window: square and information of what is exerted at its knots, its score and cross information; scalars, vectors."""
+    through = grammar.through_latents(point.windows[w], known, block)
+    here = through[point.grams[w].latent_block == own]
+    score = part.latent_score + part.latent_effects @ point.theta
+    told = here.T @ here, through.T @ part.latent_information @ through, through.T @ score, through.T @ part.latent_effects
+    return *told, *layout.factors(known)
+
+
+def _products(windows: Sequence[tuple[np.ndarray, ...]], layout: grammar.Layout, device: str) -> tuple[np.ndarray, ...]:
+    """Square, information, score and cross information of all terms, of these windows together."""
+    longest = max((len(scalars) for *_, scalars, _ in windows), default=0)
+    square, information, score, cross, scalars, vectors = (
+        torch.from_numpy(_padded(arrays, axes, longest)).to(device)
+        for arrays, axes in zip(zip(*windows), ((3, 3), (3, 3), (3,), (3, None), (1, None), (1, None, None)))
+    )
+    values = vectors[..., torch.from_numpy(layout.vector).to(device)]
+    for which in layout.scalar:
+        values *= scalars[:, :, None, torch.from_numpy(which).to(device)]
+    values = values.reshape(len(windows), 3 * longest, -1)
+    flat = values.reshape(-1, values.shape[-1])
+    found = ((square @ values) * values).sum((0, 1)), ((information @ values) * values).sum((0, 1)), \
+        score.reshape(-1) @ flat, flat.T @ cross.reshape(len(flat), -1)
+    return tuple(value.cpu().numpy() for value in found)
+
+
+def _padded(arrays: Sequence[np.ndarray], axes: Sequence[int | None], longest: int) -> np.ndarray:
+    """Arrays side by side, with zeros up to so many knots along each axis that has some entries a knot."""
+    shape = [size if per is None else per * longest for size, per in zip(arrays[0].shape, axes)]
+    out = np.zeros((len(arrays), *shape))
+    for row, array in zip(out, arrays):
+        row[tuple(slice(size) for size in array.shape)] = array
+    return out
+
+
+def gains(point: Point, priors: Priors, active: Sequence[int], of: Screen, reach: float) -> tuple[np.ndarray, np.ndarray]:
+    """Nats of each term beside a set of names, and its prior deviation, which makes it ``reach`` strong at the knots."""
+    sigma = covariance(point.information, priors.deviation(list(active)))
+    own = np.maximum(of.own - np.einsum("tk,kl,tl->t", of.cross, sigma, of.cross, optimize=True), 0.0)
+    score = of.score - of.cross @ (sigma @ point.score)
+    prior = reach / np.maximum(of.size, 1e-12 * of.size.max() + 1e-300)
+    gain = -0.5 * np.log1p(prior**2 * own) + 0.5 * score**2 / (own + prior**-2.0)
+    gain[of.size <= 1e-9 * of.size.max()] = -np.inf
+    return gain, prior
+
+
+def distinct(gain: np.ndarray, of: Screen, most: int) -> list[int]:
+    """The best terms, without those that are a simpler one in other words in these flights."""
+    kept: list[int] = []
+    unit = of.score / np.maximum(of.size, 1e-300)
+    for i in np.argsort(-gain, kind="stable")[: 8 * most]:
+        if len(kept) == most or not np.isfinite(gain[i]):
+            break
+        if not any(np.isclose(abs(unit[i]), abs(unit[k]), rtol=1e-3) for k in kept):
+            kept.append(int(i))
+    return kept
