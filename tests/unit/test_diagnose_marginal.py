@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests import synthetic_diagnosis
 from tests.synthetic_diagnosis import GUST, SyntheticModel, catalogue
 from visthrow.diagnose import marginal, noise
 from visthrow.diagnose import stack as stacks
@@ -84,6 +85,22 @@ def test_windows_side_by_side_are_what_they_are_alone(fitted):
             share, other = found.share(gram, levels), single.share(gram, levels)
             np.testing.assert_allclose(share.score, other.score, atol=1e-9 * size)
             assert share.square == pytest.approx(other.square, rel=1e-9)
+
+
+@pytest.mark.parametrize("gust_time", [0.15, 0.6, 2.4])
+def test_the_correlation_time_is_the_likeliest_of_all(gust_time, monkeypatch):
+    """It is looked for from the middle, uphill."""
+    monkeypatch.setattr(synthetic_diagnosis, "GUST_TIME", gust_time)
+    model = SyntheticModel(effects=EFFECTS, throws=4)
+    windows, floors = model.windows({}), Priors.of(model.effects, model.channels).floor
+    grams = [marginal.without_effects(marginal.gram_of(w, floors, 2)) for w in windows]
+
+    def value(time: float) -> float:
+        shaped = [marginal.correlated(g, w, time) for g, w in zip(grams, windows)]
+        return noise._maximise(shaped, replace(noise._first_guess(shaped), correlation_time=time), "cpu")[1]
+
+    found = noise.fit(windows, [marginal.gram_of(w, floors, 2) for w in windows])[0].correlation_time
+    assert found == max(noise.CORRELATION_TIMES, key=value)
 
 
 def test_derivatives_are_moved_to_a_gpu_once(fitted):

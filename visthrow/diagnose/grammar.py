@@ -376,7 +376,18 @@ def through_latents(window: Window, known: Known, block: str) -> np.ndarray:
     Returns:
         Shape (L, 3 k): by component i at knot j in column 3 j + i; of other latent blocks 0.
     """
-    time, count = known["time"], len(known["time"])
-    units, smooth = np.eye(3 * count).reshape(count, 3, 3 * count), between(count)
-    at = window.latent_block, window.latent_axis, window.latent_time, time
-    return sum(coefficients(*at, name, np.tensordot(smooth, values, 1)) for name, values in loads(block, known, units).items())
+    size = 3 * len(known["time"])
+    if block != JOINT:
+        return _hats(window, known["time"], block)
+    units = np.eye(size).reshape(-1, 3, size)
+    shares = loads(block, known, units)
+    return sum(_hats(window, known["time"], name) @ values.reshape(size, size) for name, values in shares.items())
+
+
+def _hats(window: Window, time: np.ndarray, block: str) -> np.ndarray:
+    """The same of one latent block."""
+    out = np.zeros((len(window.latent_block), len(time), 3))
+    rows = np.flatnonzero(window.latent_block == LATENT_BLOCKS.index(block))
+    at = np.abs(window.latent_time[rows, None] - time).argmin(axis=1)
+    out[rows, :, window.latent_axis[rows].astype(int)] = between(len(time))[at]
+    return out.reshape(len(out), -1)

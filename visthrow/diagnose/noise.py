@@ -104,15 +104,23 @@ def fit(
     if not any(gram.latents for gram in grams):
         times = times[:1]
     bare = [without_effects(gram) for gram in grams]
-    best: tuple[float, Noise, list[Gram]] | None = None
-    for time in times:
-        shaped = each(lambda w: correlated(bare[w], windows[w], time), range(len(bare)))  # noqa: B023  waits for the result
-        noise = start or (best[1] if best else _first_guess(shaped))
-        enough = ROUGHLY_NATS if len(times) > 1 else ENOUGH_NATS
-        noise, value = _maximise(shaped, replace(noise, correlation_time=time), device, enough)
-        if best is None or value > best[0]:
-            best = value, noise, shaped
-    noise = best[1] if len(times) == 1 else _maximise(best[2], best[1], device)[0]
+    found: dict[int, tuple[float, Noise, list[Gram]]] = {}
+
+    def likely(i: int, noise: Noise | None) -> float:
+        if i not in found:
+            shaped = each(lambda w: correlated(bare[w], windows[w], times[i]), range(len(bare)))
+            begin = replace(noise or _first_guess(shaped), correlation_time=times[i])
+            noise, value = _maximise(shaped, begin, device, ROUGHLY_NATS if len(times) > 1 else ENOUGH_NATS)
+            found[i] = value, noise, shaped
+        return found[i][0]
+
+    best = len(times) // 2
+    likely(best, start)
+    for way in (-1, 1):  # the likelihood has one maximum over the time
+        while 0 <= best + way < len(times) and likely(best + way, found[best][1]) > found[best][0]:
+            best += way
+    _, noise, shaped = found[best]
+    noise = noise if len(times) == 1 else _maximise(shaped, noise, device)[0]
     return noise, each(lambda w: correlated(grams[w], windows[w], noise.correlation_time), range(len(grams)))
 
 
@@ -155,8 +163,8 @@ class _Layout:
     keys: list[tuple[int, str]]  # (block, phase)
     pairs: np.ndarray  # (window, block) of each share, shape (S, 2)
     seen: np.ndarray  # channels with samples
-    rows: list[np.ndarray]  # of each window: its parameters
-    parts: list[np.ndarray]  # and what they are in a window's own gradient: blocks, blocks again, scales
+    slopes: np.ndarray  # of each entry of the windows' own gradients that counts: its place there, and its parameter, shape (2, E)
+    curvatures: np.ndarray  # the same of their own curvatures, and pairs of parameters
 
     @staticmethod
     def of(grams: Sequence[Gram], noise: Noise) -> "_Layout":
@@ -167,13 +175,16 @@ class _Layout:
         pairs = np.array([(w, b) for w, own in enumerate(present) for b in own], dtype=int).reshape(-1, 2)
         seen = np.flatnonzero(sum(gram.count for gram in grams) > 0)
         first = len(keys) + len(pairs)
-        rows, parts, at = [], [], len(keys)
-        for gram, own in zip(grams, present):
+        size, width, at = first + len(seen), blocks + len(grams[0].count), len(keys)
+        slopes, curvatures = [], []
+        for w, (gram, own) in enumerate(zip(grams, present)):
             shared = [index[b, gram.phase] for b in own]
-            rows.append(np.array([*shared, *range(at, at + len(own)), *range(first, first + len(seen))], dtype=int))
-            parts.append(np.array([*own, *own, *(blocks + seen)], dtype=int))
+            to = np.array([*shared, *range(at, at + len(own)), *range(first, size)], dtype=int)
+            part = np.array([*own, *own, *(blocks + seen)], dtype=int)  # levels and shares of the blocks, scales
+            slopes.append((w * width + part, to))
+            curvatures.append([(w * width * width + np.add.outer(width * part, part)).ravel(), np.add.outer(size * to, to).ravel()])
             at += len(own)
-        return _Layout(keys, pairs, seen, rows, parts)
+        return _Layout(keys, pairs, seen, np.hstack(slopes), np.hstack(curvatures))
 
     def pack(self, noise: Noise) -> np.ndarray:
         """Logarithms of all levels, shape (P,)."""
@@ -276,9 +287,9 @@ def _likelihood(stack: Stack, noise: Noise, layout: _Layout) -> tuple[float, np.
     slope[own] = TAIL * (inverse - 1.0)
     curvature[own, own] = 2.0 * TAIL * np.clip(inverse, *PRIOR_CURVATURE)
     values, slopes, curvatures = stack.look(noise)
-    for rows, parts, by_level, bend in zip(layout.rows, layout.parts, slopes, curvatures):
-        slope[rows] += by_level[parts]
-        curvature[np.ix_(rows, rows)] += bend[np.ix_(parts, parts)]
+    (own, to), (both, pair) = layout.slopes, layout.curvatures
+    slope += np.bincount(to, slopes.ravel()[own], size)
+    curvature += np.bincount(pair, curvatures.ravel()[both], size * size).reshape(size, size)
     return value + float(values.sum()), slope, curvature
 
 

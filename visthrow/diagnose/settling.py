@@ -14,6 +14,7 @@ from visthrow.diagnose.catalogue import Setting
 from visthrow.diagnose.model import Window
 from visthrow.diagnose.replay import Flights, Lane
 from visthrow.diagnose.states import Direction, States, concerns, moved, moved_along, rows_of, stacked
+from visthrow.diagnose.threads import each
 
 DAMPING, DAMPING_MOST = 1e-3, 1e5
 """Of the Levenberg-Marquardt steps: at first, and where a window counts as settled."""
@@ -94,8 +95,8 @@ class Settling:
             self.slopes |= self._slopes(states, left[stale[left]])
             aged &= ~stale
             trial, hoped = np.zeros_like(moves), np.zeros(count)
-            for w in left:
-                trial[w], hoped[w] = self._increment(w, residuals[w], moves[w], damping[w])
+            for w, told in zip(left, each(lambda w: self._increment(w, residuals[w], moves[w], damping[w]), left)):  # noqa: B023
+                trial[w], hoped[w] = told
             there = moved_along(states, self.directions, trial)
             seen = dict(zip(left, self._residuals(there, left)))
             tried = self._costs(seen)
