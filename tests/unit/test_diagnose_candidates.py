@@ -1,5 +1,7 @@
 """Candidates whose derivatives at the model's own values fall short of what they explain: they are looked at where they lead."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -57,6 +59,22 @@ def test_a_candidate_that_is_refused_leaves_no_derivatives_behind(monkeypatch):
     monkeypatch.setattr(search.Search, "_joint", lambda self: origins.append(self.origin is self.nominal))
     explained(SIZE)
     assert origins == [True]
+
+
+@pytest.mark.parametrize("alike", [(), ("effect_05", "effect_07")])
+def test_what_looks_like_the_best_candidate_is_simulated_as_well(alike, monkeypatch):
+    """Whatever derivatives promise: where a rope whips in two throws, they may say nothing of its mass in all others."""
+    plain, tried = search.Search._candidate, []
+
+    def candidate(self, point, active):
+        tried.append(tuple(active))
+        return plain(self, point, active)
+
+    monkeypatch.setattr(search.Search, "_candidate", candidate)
+    effects = [replace(e, confused_with=alike) if e.name == NAME else e for e in EFFECTS]
+    diagnosis = search.explain(SyntheticModel(effects=tuple(effects), truth={NAME: SIZE}, seed=5), laws=False)
+    assert diagnosis.named == (NAME,)
+    assert {(5,), (7,)} <= set(tried) if alike else not {(5,), (7,)} & set(tried)
 
 
 def test_a_law_is_believed_only_where_derivatives_were_taken_at_the_causes(monkeypatch):

@@ -12,6 +12,7 @@ from visthrow.diagnose import result, search
 from visthrow.diagnose.cutting import RINGING
 from visthrow.diagnose.evidence import Priors
 from visthrow.diagnose.point import Problem, linearise, lost
+from visthrow.diagnose.states import HUNG
 from visthrow.diagnose.throw_model import ThrowModel
 
 EFFECTS = catalogue(12)
@@ -80,3 +81,18 @@ def test_windows_soon_after_slack_are_shaken(monkeypatch):
     for c in after:
         assert c.shaken == (c.told and last[1] < c.start < last[1] + RINGING), c
     assert sum(c.shaken for c in after) == 2
+
+
+def test_a_rope_that_hung_still_begins_straighter():
+    """In windows after hover, and in a flight's first one if it is hover itself; not where it flew, swung or came taut before."""
+    model = ThrowModel(fly(setting_with({}), noise=0.2, free=1, throws=1, seconds=5.0), paper_plant(), only=["rope_length"])
+    bend = next(d for d in model._directions if d.calm is not None)
+    before, spreads = None, set()
+    for c in model.flights.cuts:
+        phase = c.phase if before is None or before.flight != c.flight else before.phase
+        assert c.hung == (phase == "hover"), c
+        assert bend.spread(c) == pytest.approx((HUNG if c.hung else 1.0) * bend.calm)
+        assert bend.spread(replace(c, shaken=True)) == bend.sd > bend.calm
+        before = c
+        spreads.add(c.hung)
+    assert spreads == {True, False}

@@ -30,6 +30,7 @@ class Cut:
     end: float  # [s]
     payload: int  # ATTACHED, LOOSE or NO_PAYLOAD, at its start
     shaken: bool = False  # whether the rope came taut not long before
+    hung: bool = False  # whether the rope hung still until its start
     told: bool = True  # whether its residuals count; otherwise it is only flown through
 
 
@@ -82,7 +83,8 @@ def cut(flight: Recorded, number: int, lag: float, landing_height: float, carrie
         spans += [(a, b, "ballistic", LOOSE) for a, b in _split(after, end)]
         spans += [(a, b, "", NO_PAYLOAD) for a, b in _split(max(end, after), last)]
     cuts = [Cut(number, phase or _phase(flight, a, b), a, b, mode) for a, b, phase, mode in spans]
-    return [c for c in cuts if _seen(flight, c)]
+    until = [cuts[max(i - 1, 0)].phase for i in range(len(cuts))]  # the first window's own: nothing is known of before
+    return [replace(c, hung=phase == "hover") for c, phase in zip(cuts, until) if _seen(flight, c)]
 
 
 def thinned(cuts: list[Cut], most: int = MOST) -> list[Cut]:

@@ -135,6 +135,11 @@ class Search:
         gain[[*self.refused, *self.dropped]] = -np.inf
         return gain
 
+    def _alike(self, j: int) -> list[int]:
+        """What the catalogue says looks like an effect: where a rope whips, derivatives may promise far too little."""
+        names = self.problem.model.effects[j].confused_with
+        return [k for k in np.flatnonzero(~self.problem.switches).tolist() if self.name(k) in names]
+
     def _forward(self) -> bool:
         """Add the best candidate; False where none is good enough."""
         free = with_all_effects_noise(self.problem, self.point)
@@ -144,6 +149,8 @@ class Search:
         short += [j for j in np.argsort(-screened)[:2] if screened[j] > worth and j not in short]
         if not short:
             return False
+        alike = self._alike(max(short, key=lambda j: under_free[j]))
+        short += [j for j in alike if np.isfinite(screened[j]) and j not in short]
         base = self.point, self.active
         tried = {int(j): self._candidate(free, [*self.active, int(j)]) for j in short}
         nats = {j: self._ahead((point, [*self.active, j]), base) for j, point in tried.items()}

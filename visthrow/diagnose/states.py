@@ -23,6 +23,9 @@ BENT, SHAKEN = (0.03, 0.5), (0.1, 1.5)
 
 Ropes that fly through the windows before a window arrive there with bends of some 0.005 rad, of 0.03 rad at most. A wider prior
 lets a rope that is too long for what was measured bend until it is short enough; what it does then is whip."""
+HUNG = 0.1
+"""Of that, where the rope hung still before: there ropes arrive with bends of 0.0005 rad. A wider prior invents bends of
+0.02 rad out of noise; they whip, and tell of the rope's and the payload's mass what is not so."""
 
 States = dict[str, np.ndarray]
 """Fields of ``STATE_FIELDS``, shape (S, ...)."""
@@ -46,7 +49,9 @@ class Direction:
 
     def spread(self, c: Cut) -> float:
         """The prior's deviation in a window."""
-        return self.sd if self.calm is None or c.shaken else self.calm
+        if self.calm is None or c.shaken:
+            return self.sd
+        return HUNG * self.calm if c.hung else self.calm
 
 
 def directions(plant: PlantParams) -> tuple[Direction, ...]:
