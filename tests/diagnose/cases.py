@@ -280,7 +280,7 @@ def run_kind(kind: str) -> Callable[[Recipe, Path], dict]:
 
 
 def main() -> None:
-    """Run cases and add them to a ledger."""
+    """Run cases and add them to a ledger; cases that are there are not run again."""
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("cases", nargs="+", metavar="KIND=COUNT", help=f"of {', '.join(KINDS)}")
     parser.add_argument("--seed", type=int, help="of the first; drawn by the system where not given")
@@ -295,7 +295,11 @@ def main() -> None:
     tasks = []
     for k, (kind, count) in enumerate(item.split("=") for item in args.cases):
         tasks += [(i, Task(kind, draw(kind, first + 10_000 * k + 10 * i), until)) for i in range(int(count))]
+    done = set()
+    if args.ledger.exists():
+        done = {(line["kind"], line["truth_sha256"]) for line in map(json.loads, args.ledger.read_text().splitlines())}
     tasks = [task for _, task in sorted(tasks, key=lambda item: item[0])]  # one of each kind before the second of any
+    tasks = [task for task in tasks if (task.kind, task.recipe.digest()) not in done]
     tally: dict[str, Counter] = {}
     context = mp.get_context("spawn")
     with context.Pool(args.jobs, _alone, (context.Value("i", args.slot),)) as pool:
