@@ -216,12 +216,13 @@ def completeness(worlds: Sequence[dict]) -> list[str]:
 
 
 def intervals(worlds: Sequence[dict]) -> list[str]:
-    """Coverage of the intervals and error of the estimates of the effects that were named by their own names."""
+    """Coverage of the intervals of the effects that were named by their own names, by what there is besides them."""
     groups = {"nothing else": [w for w in worlds if not dusty(w)], "some of every other effect": [w for w in worlds if dusty(w)]}
-    return [line for besides, group in groups.items() if group for line in [f"Besides, {besides}:", "", *_held(group), ""]]
+    return [line for besides, group in groups.items() if group for line in [f"Besides, {besides}:", "", *coverage(group), ""]]
 
 
-def _held(worlds: Sequence[dict]) -> list[str]:
+def coverage(worlds: Sequence[dict]) -> list[str]:
+    """Shares of the intervals that hold the truth, and the error of the estimates."""
     rows = [e for w in worlds for e in w.get("errors", ()) if e.get("named", True) and e["name"] in ALL_FLOORS]
     rows = [e for e in rows if e.get("sd") or "sd" not in e]
     lines = []

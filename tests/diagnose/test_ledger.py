@@ -112,9 +112,20 @@ def test_coverage_counts_what_the_intervals_hold():
         e = {"name": "wind_x", "truth": 0.3, "estimate": 0.3 + z * floor, "sd": floor, "named": True}
         rows.append(world({"wind_x": 0.3}, [["wind_x"]], errors=[e | {"low": e["estimate"] - 1.96 * floor,
                                                                      "high": e["estimate"] + 1.96 * floor}]))  # fmt: skip
-    shares = [float(line.split("= ")[1].split(" %")[0]) for line in ledger.intervals(rows)[:3]]
+    shares = [float(line.split("= ")[1].split(" %")[0]) for line in ledger.coverage(rows)[:3]]
     assert shares == pytest.approx([50, 80, 95], abs=3)
-    assert "median 0.6" in ledger.intervals(rows)[3]  # 0.674 deviations
+    assert "median 0.6" in ledger.coverage(rows)[3]  # 0.674 deviations
+
+
+def test_worlds_with_some_of_every_effect_are_counted_apart():
+    error = {"name": "wind_x", "truth": 0.3, "named": True, "sd": 0.1}
+    held = world({"wind_x": 0.3}, [["wind_x"]], errors=[error | {"estimate": 0.3, "low": 0.2, "high": 0.4}])
+    missed = world({"wind_x": 0.3}, [["wind_x"]], errors=[error | {"estimate": 0.9, "low": 0.8, "high": 1.0}])
+    missed["recipe"] |= {"dust": 0.5}
+    lines = "\n".join(ledger.intervals([held, missed]))
+    assert lines.index("nothing else") < lines.index("95 % intervals hold the truth: 1/1") < lines.index("some of every other")
+    assert "95 % intervals hold the truth: 0/1" in lines
+    assert sum(map(len, (size for size, _ in ledger.singles([held, missed]).values()))) == 1
 
 
 def test_gain_is_a_share_of_the_oracles_and_harm_is_told():
