@@ -91,3 +91,50 @@ def test_a_law_is_believed_only_where_derivatives_were_taken_at_the_causes(monke
     diagnosis = search.explain(SyntheticModel(effects=EFFECTS, truth={NAME: SIZE}, seed=5))
     assert diagnosis.overall == result.KNOWN
     assert asked == [0.0, pytest.approx(SIZE, rel=0.1)]
+
+
+def test_a_name_that_a_later_one_left_with_hardly_any_size_is_dropped(monkeypatch):
+    """However many nats it brings: they are those of what the derivatives lack."""
+    plain, other = search.Search._sure, 6
+
+    def sure(self, point, active, j):
+        return plain(self, point, active, j) and not (j == other and len(active) > 1 and active[-1] != other)
+
+    monkeypatch.setattr(search.Search, "_sure", sure)
+    hidden = {NAME: SIZE, EFFECTS[other].name: 3.0 * SIZE}
+    said = []
+    diagnosis = search.explain(SyntheticModel(effects=EFFECTS, truth=hidden, seed=5), laws=False, progress=said.append)
+    assert said.index(next(s for s in said if "effect_06 named" in s)) < said.index("effect_06 dropped again")
+    assert diagnosis.named == (NAME,)
+
+
+class Levered(SyntheticModel):
+    """A floor of one effect does what three floors of another do, and something of its own besides."""
+
+    by, lever = 1, 3.0
+
+    def _share(self, w):
+        return self.lever * w.effects[:, 3] * EFFECTS[3].floor / EFFECTS[self.by].floor
+
+    def windows(self, theta):
+        own = np.arange(len(EFFECTS)) == self.by
+        found = zip(super().windows(theta), self.residuals(theta))
+        return [replace(w, residual=r, effects=w.effects + self._share(w)[:, None] * own) for w, r in found]
+
+    def residuals(self, theta, about=None):
+        e = EFFECTS[self.by]
+        left = self.truth.get(e.name, 0.0) * e.floor - theta.get(e.name, 0.0)
+        return [r + left * self._share(w) for r, w in zip(super().residuals(theta), self._windows)]
+
+
+def test_sizes_and_intervals_hold_whatever_else_is_below_its_floor():
+    """The configuration gets the sizes with which the named effects alone explain the flights; a finding tells the cause's own."""
+    off, off_alone = [], []
+    for seed in range(5):
+        truth = {NAME: 2.0 * SIZE, EFFECTS[Levered.by].name: 0.9}
+        diagnosis = search.explain(Levered(effects=EFFECTS, truth=truth, seed=seed, throws=8), laws=False)
+        assert diagnosis.named == (NAME,)
+        size, own = 2.0 * SIZE * EFFECTS[3].floor, diagnosis[NAME]
+        off.append((own.estimate - size) / own.sd)
+        off_alone.append((diagnosis.theta[NAME] - size) / own.sd)
+    assert abs(np.mean(off)) < 1.0 < 1.5 < np.mean(off_alone), (off, off_alone)

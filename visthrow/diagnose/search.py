@@ -322,16 +322,17 @@ class Search:
         return True
 
     def _backward(self) -> None:
-        """Drop what a later addition made superfluous."""
+        """Drop what a later addition made superfluous, or left with hardly any size."""
         while len(self.active) > 1:
             whole = self.point.evidence(self.priors, self.active)
             worth = {j: whole - self.point.evidence(self.priors, [k for k in self.active if k != j]) for j in self.active}
-            weakest = min(worth, key=worth.get)
-            if worth[weakest] > self.least:
+            unsure = [j for j in self.active if not self._sure(self.point, self.active, j)]
+            weakest = min(unsure or worth, key=worth.get)
+            if worth[weakest] > self.least and not unsure:
                 return
             rest = [k for k in self.active if k != weakest]
             without = self._candidate(self.point, rest)
-            if self._ahead((self.point, self.active), (without, rest)) > self.least:
+            if self._ahead((self.point, self.active), (without, rest)) > self.least and not unsure:
                 return
             self.progress(f"{self.name(weakest)} dropped again")
             self.active = rest

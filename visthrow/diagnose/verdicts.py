@@ -243,7 +243,7 @@ def _named(search: "Search", point: Point, blank: Finding, j: int, home: int, pa
            spread: np.ndarray) -> Finding:  # fmt: skip
     priors, floor = search.priors, blank.floor
     if j in active:
-        size, variance = point.theta[j], spread[j, j]
+        size, variance = spread[j] @ point.score, spread[j, j]
     else:
         stead = [j if k == home else k for k in active]
         size, sd = _wide(point, priors, j, stead[:-1] if stead[-1] == j else [k for k in stead if k != j])
