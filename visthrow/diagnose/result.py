@@ -39,8 +39,8 @@ class Finding:
     cause: str
     equation: str
     unit: str
-    estimate: float  # most probable size, for a member of a class if it is the cause alone; 0 where not named [unit]
-    sd: float  # with all other effects free below their floors, and the own floor added [unit]
+    estimate: float  # size with all other effects free below their floors; of a class's member if it is the cause; else 0 [unit]
+    sd: float  # likewise, and what numerics add [unit]
     low: float  # 95 % interval [unit]
     high: float
     floor: float  # [unit]
@@ -102,7 +102,7 @@ class Diagnosis:
     block: str  # of an unknown effect, else empty
     reasons: tuple[str, ...]  # for the overall verdict
     findings: tuple[Finding, ...]  # one an effect, in the model's order
-    theta: Mapping[str, float]  # what to set in the model: named effects, of each class its most probable member
+    theta: Mapping[str, float]  # what to set in the model: sizes with which named effects alone, one of each class, explain most
     covariance: tuple[tuple[float, ...], ...]  # of theta's entries, in their units
     threshold: float  # [nats]
     steps: tuple[Step, ...] = ()
