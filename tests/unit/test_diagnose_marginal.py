@@ -122,6 +122,7 @@ def test_a_point_of_some_windows_is_the_point_that_they_give(fitted):
     assert {phase for _, phase in part.noise.latent_sd} == {w.phase for w in part.windows} < {w.phase for w in windows}
     np.testing.assert_allclose(part.information, again.information, rtol=1e-3)
 
+
 def test_broken_derivatives_are_told_with_their_window(fitted):
     gram = fitted[4][3]
     with pytest.raises(DiagnoseError, match=f"flight {gram.flight}, phase {gram.phase}: the normal equations are singular"):

@@ -22,8 +22,8 @@ SPIKE = 0.5
 """Deviation of an effect that is not named, in its floor: the floor is the limit of what may go unnamed, not its usual size."""
 
 OWN_FLOOR = 0.1
-"""Deviation that numerics and what an effect's form leaves out add to its estimate, in its floor. In plants of other code than the
-simulator's, 98 % of 95 % intervals held the size with it."""
+"""Deviation that numerics and what an effect's form leaves out add to its estimate, in its floor. With it 95 % intervals held 94 %
+of 85 sizes that were hidden in plants of other code than the simulator's."""
 
 NORMAL_95 = 1.96
 

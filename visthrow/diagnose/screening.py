@@ -122,10 +122,9 @@ def _products(windows: Sequence[tuple[np.ndarray, ...]], layout: grammar.Layout,
     for which in layout.scalar:
         values *= scalars[:, :, None, torch.from_numpy(which).to(device)]
     values = values.reshape(len(windows), 3 * longest, -1)
-    flat = values.reshape(-1, values.shape[-1])
-    found = ((square @ values) * values).sum((0, 1)), ((information @ values) * values).sum((0, 1)), \
-        score.reshape(-1) @ flat, flat.T @ cross.reshape(len(flat), -1)
-    return tuple(value.cpu().numpy() for value in found)
+    flat, cross = values.reshape(-1, values.shape[-1]), cross.reshape(-1, cross.shape[-1])
+    squares = [((inner @ values) * values).sum((0, 1)) for inner in (square, information)]
+    return tuple(value.cpu().numpy() for value in (*squares, score.reshape(-1) @ flat, flat.T @ cross))
 
 
 def _padded(arrays: Sequence[np.ndarray], axes: Sequence[int | None], longest: int) -> np.ndarray:
