@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from tests.diagnose import ledger
+from tests.diagnose import ledger, sealed
 from tests.diagnose.sealed import NOT_WAITED
-from tests.worlds.world import ALL_FLOORS
+from tests.worlds.world import ALL_FLOORS, FLOORS, ONE_SIDED, dust_of, world_of
 
 TRUTH = math.exp((math.log(9.0) + 6.0) / 3.5)
 """Size of the made-up curve at 90 %."""
@@ -115,6 +115,16 @@ def test_coverage_counts_what_the_intervals_hold():
     shares = [float(line.split("= ")[1].split(" %")[0]) for line in ledger.coverage(rows)[:3]]
     assert shares == pytest.approx([50, 80, 95], abs=3)
     assert "median 0.6" in ledger.coverage(rows)[3]  # 0.674 deviations
+
+
+def test_worlds_with_some_of_every_effect_hide_what_was_drawn_besides():
+    plain, dusty = sealed.drawn("1x10", 3), sealed.drawn("1x10+dust", 3)
+    assert dusty.effects == plain.effects and dust_of(plain) == {}
+    sizes = {name: size / ALL_FLOORS[name] for name, size in dust_of(dusty).items()}
+    assert not set(sizes) & set(dusty.effects) and len(sizes) == len(FLOORS) - 1
+    assert all(sizes[name] >= 0.0 for name in ONE_SIDED if name in sizes)
+    assert np.std(list(sizes.values())) == pytest.approx(sealed.DUST, rel=0.4)
+    assert world_of(dusty).mass != world_of(plain).mass and dusty.digest() != plain.digest()
 
 
 def test_worlds_with_some_of_every_effect_are_counted_apart():
