@@ -119,12 +119,15 @@ def test_coverage_counts_what_the_intervals_hold():
 
 def test_worlds_with_some_of_every_effect_hide_what_was_drawn_besides():
     plain, dusty = sealed.drawn("1x10", 3), sealed.drawn("1x10+dust", 3)
-    assert dusty.effects == plain.effects and dust_of(plain) == {}
+    assert dusty.effects == plain.effects
+    assert dust_of(plain) == {}
     sizes = {name: size / ALL_FLOORS[name] for name, size in dust_of(dusty).items()}
-    assert not set(sizes) & set(dusty.effects) and len(sizes) == len(FLOORS) - 1
+    assert not set(sizes) & set(dusty.effects)
+    assert len(sizes) == len(FLOORS) - 1
     assert all(sizes[name] >= 0.0 for name in ONE_SIDED if name in sizes)
     assert np.std(list(sizes.values())) == pytest.approx(sealed.DUST, rel=0.4)
-    assert world_of(dusty).mass != world_of(plain).mass and dusty.digest() != plain.digest()
+    assert world_of(dusty).mass != world_of(plain).mass
+    assert dusty.digest() != plain.digest()
 
 
 def test_worlds_with_some_of_every_effect_are_counted_apart():
