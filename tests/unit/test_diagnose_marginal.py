@@ -87,6 +87,22 @@ def test_windows_side_by_side_are_what_they_are_alone(fitted):
             assert share.square == pytest.approx(other.square, rel=1e-9)
 
 
+def test_other_residuals_are_the_same_side_by_side(fitted):
+    """Of windows of different lengths and numbers of columns, as a GPU has them padded."""
+    _, windows, floors, _, _ = fitted
+    mixed = [*windows[:4], replace(windows[4], latent=np.zeros((0, 0)), latent_block=np.zeros(0, dtype=int))]
+    cut = ("time", "channel", "residual", "sigma", "effects", "nuisance", "latent")
+    mixed.append(replace(windows[5], **{name: getattr(windows[5], name)[:-7] for name in cut}))
+    grams = [marginal.gram_of(w, floors, 2) for w in mixed]
+    drawn = np.random.default_rng(5)
+    for _ in range(2):  # what stays on the device is not what the residuals were
+        residuals = [drawn.normal(size=len(w.residual)) for w in mixed]
+        alone = [marginal.with_residual(gram, *given) for gram, *given in zip(grams, mixed, [floors] * len(mixed), residuals)]
+        for found, single in zip(stacks.with_residuals(grams, mixed, floors, residuals, "cpu:0"), alone, strict=True):
+            np.testing.assert_allclose(found.cross, single.cross, rtol=1e-9, atol=1e-9 * np.abs(single.cross).max())
+            np.testing.assert_allclose(found.square, single.square, rtol=1e-9)
+
+
 @pytest.mark.parametrize("gust_time", [0.15, 0.6, 2.4])
 def test_the_correlation_time_is_the_likeliest_of_all(gust_time, monkeypatch):
     """It is looked for from the middle, uphill."""
@@ -176,10 +192,11 @@ def test_highpass_sigma_sees_noise_and_neither_motion_nor_outliers():
 
 
 def test_outliers_lose_their_weight_and_good_windows_are_left_alone(fitted):
-    windows = fitted[1]
+    _, windows, floors, _, _ = fitted
     spoilt = windows[0].residual.copy()
     spoilt[[40, 201]] += 0.2
-    first, second = noise.without_outliers([replace(windows[0], residual=spoilt), windows[1]], 2)
+    given = [replace(windows[0], residual=spoilt), windows[1]]
+    first, second = noise.without_outliers(given, [marginal.gram_of(w, floors, 2) for w in given])
     assert set(np.flatnonzero(first.sigma > windows[0].sigma)) == {40, 201}
     assert second is windows[1]
 

@@ -47,6 +47,15 @@ class Known(dict):
         return value
 
 
+def joined(knots: Sequence[Known], names: Sequence[str]) -> Known:
+    """The knots of several windows after one another, of quantities that all of them have.
+
+    What follows from them follows at each knot by itself, but for the thrust's slope, which is taken within windows.
+    """
+    taken = [*names, "slope"] if {"thrust", "time"} <= set(names) else names
+    return Known({name: np.concatenate([known[name] for known in knots]) for name in taken})
+
+
 @dataclass(frozen=True)
 class Factor:
     """A scalar or a vector of the state."""

@@ -331,7 +331,7 @@ def window_statistics(gram: Gram, noise: Noise, window: int) -> WindowStatistics
 def statistics_of(whole: Integral, gram: Gram, noise: Noise) -> WindowStatistics:
     """What the integral of a gram's latents and effects says with the gram's residuals."""
     share, latents = whole.share(gram, noise), gram.latents
-    back = np.linalg.inv(gram.factor) if latents else gram.factor  # from unit latents to knots
+    back = lapack.dtrtri(gram.factor, lower=1)[0] if latents else gram.factor  # from unit latents to knots
     return WindowStatistics(
         whole.information[latents:, latents:], share.score[latents:], share.square,
         back.T @ whole.information[:latents, :latents] @ back, back.T @ share.score[:latents],

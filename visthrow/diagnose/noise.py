@@ -293,25 +293,23 @@ def _likelihood(stack: Stack, noise: Noise, layout: _Layout) -> tuple[float, np.
     return value + float(values.sum()), slope, curvature
 
 
-def without_outliers(windows: Sequence[Window], channels: int) -> list[Window]:
+def without_outliers(windows: Sequence[Window], grams: Sequence[Gram]) -> list[Window]:
     """Give single samples far outside a sigma that puts them at HUBER; windows with none are returned as they are.
 
     Latent forces have a wide prior here, so that a missing effect is followed and only what no force can do stands out.
 
     Args:
         windows: of the flights.
-        channels: number of the model's channels.
-
-    Raises:
-        DiagnoseError: As :func:`visthrow.diagnose.marginal.gram_of`.
+        grams: of the windows, with ``factor`` the identity.
     """
-    return each(lambda window: _mended(window, channels), windows)
+    return each(lambda pair: _mended(*pair), zip(windows, grams))
 
 
-def _mended(window: Window, channels: int) -> Window:
-    sigma, bare = window.sigma, replace(window, effects=window.effects[:, :0])
-    for _ in range(CLEANINGS):
-        gram = hidden_gram(replace(window, sigma=sigma), channels)
+def _mended(window: Window, whole: Gram) -> Window:
+    sigma, bare, gram = window.sigma, replace(window, effects=window.effects[:, :0]), without_effects(whole)
+    for again in range(CLEANINGS):
+        if again:
+            gram = hidden_gram(replace(window, sigma=sigma), len(gram.count))
         guess = _first_guess([gram])
         wide = replace(guess, latent_sd={key: WIDE * level for key, level in guess.latent_sd.items()})
         shaped = correlated(gram, window, wide.correlation_time)

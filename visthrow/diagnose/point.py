@@ -17,7 +17,6 @@ from visthrow.diagnose.marginal import (
     gather,
     gram_of,
     recorrelated,
-    with_residual,
 )
 from visthrow.diagnose.model import Linearised, Model, Window
 from visthrow.diagnose.scatter import freed, own_shares
@@ -116,8 +115,12 @@ def linearise(problem: Problem, theta: np.ndarray, start: Noise | None = None, w
     """
     windows = problem.model.windows(problem.sizes(theta)) if windows is None else windows
     channels = len(problem.model.channels)
-    kept = levels.without_outliers([windows[i] for i in problem.kept], channels)
-    raw = each(lambda w: gram_of(w, problem.priors.floor, channels), kept)
+    found = [windows[i] for i in problem.kept]
+    first = each(lambda w: gram_of(w, problem.priors.floor, channels), found)
+    kept = levels.without_outliers(found, first)
+    mended = [w for w in range(len(kept)) if kept[w] is not found[w]]
+    again = dict(zip(mended, each(lambda w: gram_of(kept[w], problem.priors.floor, channels), mended)))
+    raw = [again.get(w, gram) for w, gram in enumerate(first)]
     device = getattr(problem.model, "device", "cpu")
     noise, grams = levels.fit(kept, raw, start, device)
     integrals, at = stack.integrals(grams, noise, device), np.array(theta, dtype=float)
@@ -153,11 +156,15 @@ def moved(problem: Problem, point: Point, theta: np.ndarray) -> Point | None:
     if not all(np.all(np.isfinite(r)) for r in residuals):
         return None
     windows = [replace(w, residual=r) for w, r in zip(point.windows, residuals)]
-    floor = problem.priors.floor
-    raw = each(lambda w: with_residual(point.raw[w], windows[w], floor, residuals[w]), range(len(windows)))
-    grams = [recorrelated(g, r) for g, r in zip(point.grams, raw)]
+    raw, grams = _with_residuals(problem, point, residuals)
     at = np.array(theta, dtype=float)
     return regathered(point, point.integrals, theta=at, windows=windows, raw=raw, grams=grams, about=about)
+
+
+def _with_residuals(problem: Problem, point: Point, residuals: Sequence[np.ndarray]) -> tuple[list[Gram], list[Gram]]:
+    """The point's grams with other residuals, with latents at the knots and correlated."""
+    raw = stack.with_residuals(point.raw, point.windows, problem.priors.floor, residuals, point.device)
+    return raw, [recorrelated(gram, own) for gram, own in zip(point.grams, raw)]
 
 
 def advantage(
@@ -190,12 +197,10 @@ def curvature(problem: Problem, origin: Point, there: Point) -> float:
         origin: where the derivatives were taken.
         there: a point moved from it, with the same derivatives.
     """
-    floor = problem.priors.floor
-    change = floor * (there.theta - origin.theta)
-    total = np.zeros(len(floor))
-    for old, new, gram, known in zip(origin.windows, there.windows, there.grams, there.integrals):
-        bent = new.residual - (old.residual - old.effects @ change)
-        total += known.share(with_residual(gram, new, floor, bent), there.noise).score
+    change = problem.priors.floor * (there.theta - origin.theta)
+    bent = [new.residual - (old.residual - old.effects @ change) for old, new in zip(origin.windows, there.windows)]
+    _, grams = _with_residuals(problem, there, bent)
+    total = sum(known.share(gram, there.noise).score for known, gram in zip(there.integrals, grams))
     return float(np.abs(covariance(there.information, problem.priors.deviation(())) @ total).max(initial=0.0))
 
 

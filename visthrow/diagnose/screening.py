@@ -91,8 +91,13 @@ def screen(point: Point, parts: Sequence[WindowStatistics], block: str, known: S
         return None
     own, size = LATENT_BLOCKS.index(felt(block)), BATCH if point.device == "cpu" else len(through)
 
+    ends = np.cumsum([len(known[w]["time"]) for w in through])[:-1]
+    factors = zip(*(np.split(values, ends) for values in layout.factors(grammar.joined([known[w] for w in through], shared))))
+    at_knots = dict(zip(through, factors))
+
     def told(windows: Sequence[int]) -> tuple[np.ndarray, ...]:
-        return _products([_at_knots(point, parts[w], w, block, known[w], layout, own) for w in windows], layout, point.device)
+        exerted = [(*_exerted(point, parts[w], w, block, known[w], own), *at_knots[w]) for w in windows]
+        return _products(exerted, layout, point.device)
 
     batches = [through[first : first + size] for first in range(0, len(through), size)]
     square, information, score, cross = (sum(shares) for shares in zip(*each(told, batches)))
@@ -100,19 +105,22 @@ def screen(point: Point, parts: Sequence[WindowStatistics], block: str, known: S
     return Screen(_terms(block, shared), np.sqrt(square / max(rows, 1)), information, score, cross)
 
 
-def _at_knots(
-    point: Point, part: WindowStatistics, w: int, block: str, known: grammar.Known, layout: grammar.Layout, own: int
-) -> tuple[np.ndarray, ...]:
-    """Of a window: square and information of what is exerted at its knots, its score and cross information; scalars, vectors."""
+def _exerted(point: Point, part: WindowStatistics, w: int, block: str, known: grammar.Known, own: int) -> tuple[np.ndarray, ...]:
+    """Of what is exerted at a window's knots: square and information, score and cross information."""
     through = grammar.through_latents(point.windows[w], known, block)
     here = through[point.grams[w].latent_block == own]
     score = part.latent_score + part.latent_effects @ point.theta
-    told = here.T @ here, through.T @ part.latent_information @ through, through.T @ score, through.T @ part.latent_effects
-    return *told, *layout.factors(known)
+    return here.T @ here, through.T @ part.latent_information @ through, through.T @ score, through.T @ part.latent_effects
 
 
 def _products(windows: Sequence[tuple[np.ndarray, ...]], layout: grammar.Layout, device: str) -> tuple[np.ndarray, ...]:
-    """Square, information, score and cross information of all terms, of these windows together."""
+    """Square, information, score and cross information of all terms, of these windows together.
+
+    Args:
+        windows: of each, what is exerted at its knots, and the scalars and vectors there.
+        layout: of the terms.
+        device: where to calculate.
+    """
     longest = max((len(scalars) for *_, scalars, _ in windows), default=0)
     square, information, score, cross, scalars, vectors = (
         torch.from_numpy(_padded(arrays, axes, longest)).to(device)

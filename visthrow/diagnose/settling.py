@@ -5,6 +5,7 @@ long as each brings what it promised, and may come from another setting whose st
 """
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -19,6 +20,8 @@ from visthrow.diagnose.threads import each
 DAMPING, DAMPING_MOST = 1e-3, 1e5
 """Of the Levenberg-Marquardt steps: at first, and where a window counts as settled."""
 ROUNDS = 25
+LADDER = np.array([1.0, 10.0, 100.0, 1000.0])
+"""Dampings that are tried at once, in the one at hand, for windows whose last step did not bring what it promised."""
 DRIFT = 0.02, 0.02, 0.02, 0.04
 """Deviation that gusts bring a flight to in a second: position [m], attitude [rad], payload [m], rate [rad/s]. Fitted as though
 there were none, states took their place: bends of the rope of ten times their prior, after twenty steps."""
@@ -28,13 +31,27 @@ HUBER = 30.0  # deviations, beyond which a sample counts less
 SETTLED = 1.0, 0.003  # fall of the cost, and relative one, below which an initial state is settled
 SHRINKING = 0.1
 """Of what the next step promises against what the last one did, below which derivatives from elsewhere lead to the goal."""
-TRUE = 0.5  # of what a step promised, that it must bring, for derivatives to be used further
+TRUE, WHOLE = 0.5, 0.8
+"""Of what a step promised, that it must bring, and of what the least damped one promised, for derivatives to be used further."""
 ONWARD = 0.1  # flown after the last sample that tells of the start: sensors may be early [s]
 EARLIER = 0.05  # by which a payload may leave before it is expected to [s]
 SEEN = 0.25  # before that, without which an initial state is fitted to the whole window [s]
 TRUSTED = ("motor_speed",)
 """Fields that are linearised about where the commands left them. Fitted without gusts they would take the gusts' place: rotors
 far from their commands at the start of a window, and with them a law of the thrust's slope that is none."""
+
+
+@dataclass(frozen=True)
+class _Trial:
+    """A step of each of L windows."""
+
+    states: States  # where it leads
+    steps: np.ndarray  # shape (L, directions)
+    damping: np.ndarray  # shape (L,)
+    hoped: np.ndarray  # fall of the cost that it promises, shape (L,)
+    whole: np.ndarray  # that of the least damped one that was tried, shape (L,)
+    cost: np.ndarray  # there, shape (L,)
+    residuals: list[np.ndarray]
 
 
 class Settling:
@@ -66,6 +83,9 @@ class Settling:
         self.substep = substep
         self.slopes: dict[int, np.ndarray] = {}  # of windows' samples by their states, where they were taken last
         self.replay = Replay([setting.plant], [setting.sensing], device)
+        self._free = [
+            [d for d, x in enumerate(directions) if concerns(x, cut) and x.field not in TRUSTED] for cut in flights.cuts
+        ]  # directions in which windows' initial states are fitted
         self._drift = [drift(flights, w) for w in range(len(flights.cuts))]
         self._gusts = np.ones(len(flights.cuts))  # of each window, against the drift that is thought possible
         self._tells, self._ends = zip(*[told_of_start(flights, w, lag) for w in range(len(flights.cuts))])
@@ -88,29 +108,31 @@ class Settling:
         left, promised = self.told, np.full(count, np.inf)
         self.slopes |= slopes or {}
         aged = np.isin(np.arange(count), list(self.slopes))  # derivatives come from elsewhere
-        residuals = dict(zip(left, self._residuals(states, left)))
+        residuals = dict(zip(left, self._residuals(rows_of(states, left), left)))
         cost = self._costs(residuals)
-        stale = ~aged
+        stale, doubtful = ~aged, np.zeros(count, dtype=bool)
         for _ in range(ROUNDS):
             self.slopes |= self._slopes(states, left[stale[left]])
             aged &= ~stale
-            trial, hoped = np.zeros_like(moves), np.zeros(count)
-            for w, told in zip(left, each(lambda w: self._increment(w, residuals[w], moves[w], damping[w]), left)):  # noqa: B023
-                trial[w], hoped[w] = told
-            there = moved_along(states, self.directions, trial)
-            seen = dict(zip(left, self._residuals(there, left)))
-            tried = self._costs(seen)
+            trial = self._tried(states, left, residuals, moves, damping, doubtful)
+            tried, hoped, whole = (np.full(count, value) for value in (np.inf, 0.0, 0.0))
+            tried[left], hoped[left], whole[left], damping[left] = trial.cost, trial.hoped, trial.whole, trial.damping
             better = tried < cost
-            residuals |= {w: seen[w] for w in left if better[w]}
-            states = {name: np.where(_like(better, v), there[name], v) for name, v in states.items()}
-            moves[better] += trial[better]
+            rows = np.flatnonzero(better[left])
+            residuals |= {left[row]: trial.residuals[row] for row in rows}
+            states = {name: value.copy() for name, value in states.items()}
+            for name, value in states.items():
+                value[left[rows]] = trial.states[name][rows]
+            moves[left[rows]] += trial.steps[rows]
             fall = np.subtract(cost, tried, out=np.zeros(count), where=better)
             enough = np.maximum(SETTLED[0], SETTLED[1] * np.where(better, tried, cost))
             little = better & (fall < enough)
             settled = little & (~aged | (hoped < SHRINKING * promised)) | (hoped < enough) & (damping <= DAMPING)
-            true = fall > TRUE * hoped
+            true = (fall > TRUE * hoped) & (hoped > WHOLE * whole)
             stale = np.where(better, ~settled & (little | ~true), aged & ~settled)
-            damping = np.where(better, damping / 10.0, np.where(aged, damping, damping * 10.0))
+            raised = damping * np.where(doubtful, 10.0 * LADDER[-1], 10.0)
+            damping = np.where(better, damping / 10.0, np.where(aged, damping, raised))
+            doubtful = ~(better & true)
             promised = np.where(better, hoped, promised)
             aged, cost = aged | better, np.where(better, tried, cost)
             for w in left[settled[left]]:
@@ -122,10 +144,28 @@ class Settling:
                 break
         return states
 
+    def _tried(
+        self, states: States, left: np.ndarray, residuals: Mapping[int, np.ndarray], moves: np.ndarray, damping: np.ndarray,
+        doubtful: np.ndarray,
+    ) -> _Trial:  # fmt: skip
+        """The next step of each window that is left, or the best of several; the least damped one where none helps."""
+        rungs = np.where(doubtful[left], len(LADDER), 1)
+        which, first = np.repeat(left, rungs), np.cumsum(rungs) - rungs
+        tries = np.concatenate([damping[w] * LADDER[:n] for w, n in zip(left, rungs)])
+        told = each(lambda lane: self._increment(lane[0], residuals[lane[0]], moves[lane[0]], lane[1]), zip(which, tries))
+        steps, hoped = (np.array(values) for values in zip(*told))
+        there = moved_along(rows_of(states, which), self.directions, steps)
+        seen = self._residuals(there, which)
+        cost = np.array([self._cost(w, residual) for w, residual in zip(which, seen)])
+        best = np.array([at + cost[at : at + n].argmin() for at, n in zip(first, rungs)])
+        taken = np.where([cost[lane] < self._cost(w, residuals[w]) for w, lane in zip(left, best)], best, first)
+        left_over = [seen[lane] for lane in taken]
+        return _Trial(rows_of(there, taken), steps[taken], tries[taken], hoped[taken], hoped[first], cost[taken], left_over)
+
     def _residuals(self, states: States, which: np.ndarray) -> list[np.ndarray]:
-        """Residuals of windows, of what tells of their initial states."""
-        f = self.flights
-        seen = f.fly(self.replay, [self.setting], states, [Lane(w, 0, w) for w in which], self.substep, self._ends).seen
+        """Residuals of windows, of what tells of their initial states; a row of the states for each."""
+        f, lanes = self.flights, [Lane(w, 0, row) for row, w in enumerate(which)]
+        seen = f.fly(self.replay, [self.setting], states, lanes, self.substep, self._ends).seen
         return [self._tells[w] * f.residual(seen, w, lane) for lane, w in enumerate(which)]
 
     def _costs(self, residuals: Mapping[int, np.ndarray]) -> np.ndarray:
@@ -155,11 +195,6 @@ class Settling:
         self._gusts[w] = min(calmer)
         return True
 
-    def _fitted(self, w: int) -> list[int]:
-        """Directions in which a window's initial state is fitted."""
-        cut = self.flights.cuts[w]
-        return [d for d, x in enumerate(self.directions) if concerns(x, cut) and x.field not in TRUSTED]
-
     def _slopes(self, states: States, which: np.ndarray) -> dict[int, np.ndarray]:
         """Derivatives of windows' samples by their initial states."""
         if not len(which):
@@ -167,12 +202,12 @@ class Settling:
         count, lanes, first = len(which), [], []
         for row, w in enumerate(which):
             first.append(len(lanes))
-            lanes += [Lane(w, 0, row, rough=True), *[Lane(w, 0, (1 + d) * count + row, rough=True) for d in self._fitted(w)]]
+            lanes += [Lane(w, 0, row, rough=True), *[Lane(w, 0, (1 + d) * count + row, rough=True) for d in self._free[w]]]
         there = perturbed(rows_of(states, which), self.directions)
         seen = self.flights.fly(self.replay, [self.setting], there, lanes, self.substep, self._ends).seen
         slopes = {}
         for at, w in zip(first, which):
-            ds, rows = self._fitted(w), int(self.flights.rows[w])
+            ds, rows = self._free[w], int(self.flights.rows[w])
             flat = np.swapaxes(seen[:rows, at : at + 1 + len(ds)], 1, 2).reshape(3 * rows, -1)
             steps = np.array([self.directions[d].step for d in ds])
             slopes[w] = (flat[:, 1:] - flat[:, :1]) / steps * self._tells[w][:, None]
@@ -180,7 +215,7 @@ class Settling:
 
     def _increment(self, w: int, residual: np.ndarray, done: np.ndarray, damping: float) -> tuple[np.ndarray, float]:
         """Levenberg-Marquardt step of a window's state with its vague prior, shape (directions,), and the fall that it promises."""
-        ds, spread = self._fitted(w), self._spread(w)
+        ds, spread = self._free[w], self._spread(w)
         sd = np.array([self.directions[d].spread(self.flights.cuts[w]) for d in ds])
         off = residual / spread
         weight = np.minimum(1.0, HUBER / np.maximum(np.abs(off), 1e-12))
@@ -213,28 +248,27 @@ def told_of_start(flights: Flights, w: int, lag: float) -> tuple[np.ndarray, flo
     return (time < left).astype(float), min(left + ONWARD, c.end)
 
 
-def following(flights: Flights, w: int, window: Window, change: np.ndarray, free: np.ndarray, lag: float) -> np.ndarray:
+def following(flights: Flights, w: int, window: Window, free: np.ndarray, lag: float) -> np.ndarray:
     """How a window's initial state follows its effects: so that the flight stays as near to where it was as it can.
 
     Args:
         flights: cut into windows.
         w: number of the window there.
         window: its derivatives.
-        change: of the effects' sizes, shape (K,).
         free: which parts of the state follow, shape (D,), bool.
         lag: of the release, as far as known [s].
 
     Returns:
-        Changes in the state's units, shape (D,).
+        Changes in the state's units by the effects' sizes, shape (D, K).
     """
     samples = len(flights.time(w))  # and those of a camera, which tell nothing of states
-    weight = told_of_start(flights, w, lag)[0] / np.hypot(flights.sigma(w), drift(flights, w))
+    weight = (told_of_start(flights, w, lag)[0] / np.hypot(flights.sigma(w), drift(flights, w)))[:, None]
     sd = window.nuisance_sd[free]
-    by_state = window.nuisance[:samples, free] * sd * weight[:, None]
-    by_effect = window.effects[:samples] @ change * weight
-    move = np.zeros(len(free))
-    move[free] = -sd * np.linalg.solve(by_state.T @ by_state + np.eye(len(sd)), by_state.T @ by_effect)
-    return move
+    by_state = window.nuisance[:samples, free] * sd * weight
+    by_effect = (by_state * weight).T @ window.effects[:samples]
+    moves = np.zeros((len(free), by_effect.shape[1]))
+    moves[free] = -sd[:, None] * np.linalg.solve(by_state.T @ by_state + np.eye(len(sd)), by_effect)
+    return moves
 
 
 def perturbed(states: States, directions: tuple[Direction, ...]) -> States:

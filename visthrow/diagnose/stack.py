@@ -4,8 +4,8 @@ The same algebra as :mod:`visthrow.diagnose.marginal`, for grams that are padded
 batches that fit its cache.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -20,8 +20,9 @@ from visthrow.diagnose.marginal import (
     integral,
     statistics_of,
     window_statistics,
+    with_residual,
 )
-from visthrow.diagnose.model import LATENT_BLOCKS
+from visthrow.diagnose.model import LATENT_BLOCKS, Window
 from visthrow.diagnose.threads import each
 from visthrow.errors import DiagnoseError
 
@@ -73,17 +74,81 @@ class _Columns:
         return len(self._inner[0][0]) - self._sizes[0]
 
     def _moved(self, height: int, width: int, part: Callable[[np.ndarray, int], np.ndarray]) -> torch.Tensor:
-        out = np.zeros((len(self._inner), len(self._inner[0]), height, width))
-        for row, inner, size in zip(out, self._inner, self._sizes):
+        shape = len(self._inner), len(self._inner[0]), height, width
+        out = torch.zeros(shape, dtype=torch.float64, pin_memory=self._device.startswith("cuda"))  # on its way there twice as fast
+        for row, inner, size in zip(out.numpy(), self._inner, self._sizes):
             values = part(inner, size)
             row[:, : values.shape[1], : values.shape[2]] = values
-        return torch.from_numpy(out).to(self._device)
+        return out.to(self._device)
 
 
 @lru_cache(maxsize=2)
 def _kept(inner: _Same, sizes: tuple[int, ...], device: str) -> _Columns:
     """Those that a GPU has already: residuals and noise levels change far more often than derivatives do."""
     return _Columns(inner, sizes, device)
+
+
+class _Design:
+    """Columns of W windows over their sigmas, on a device; padded with 0 to N samples and P columns."""
+
+    def __init__(self, windows: Sequence[tuple[np.ndarray, ...]], floors: np.ndarray, channels: int, device: str):
+        """Move them there, where they are also scaled.
+
+        Args:
+            windows: of each, what :class:`_Same` arrays of :func:`with_residuals` hold.
+            floors: of the effects, shape (K,).
+            channels: of the model.
+            device: where to calculate.
+        """
+        self._widths = [sum(parts.shape[1] for parts in own[:3]) for own in windows]
+        shape = len(windows), max(len(sigma) for *_, sigma, _ in windows)
+        sigma, member = np.ones(shape), np.zeros((*shape, channels))
+        columns = torch.zeros((*shape, max(self._widths)), dtype=torch.float64, device=device)
+        for row, (nuisance, latent, effects, sd, own_sigma, channel) in enumerate(windows):
+            at = 0
+            for values, scale in ((nuisance, sd), (latent, np.ones(latent.shape[1])), (effects, floors)):
+                there = torch.from_numpy(values).to(device) * torch.from_numpy(scale).to(device)
+                columns[row, : len(values), at : at + values.shape[1]] = there
+                at += values.shape[1]
+            sigma[row, : len(own_sigma)] = own_sigma
+            member[row, np.arange(len(channel)), channel] = 1.0
+        self._sigma, self._member = (torch.from_numpy(a).to(device) for a in (sigma, member))
+        self._columns = columns.div_(self._sigma[:, :, None])
+
+    def products(self, residuals: Sequence[np.ndarray]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Inner products of each window's residual with its columns (C, P), and with itself (C,)."""
+        padded = np.zeros(self._sigma.shape)
+        for row, residual in zip(padded, residuals):
+            row[: len(residual)] = residual
+        off = torch.from_numpy(padded).to(self._sigma.device) / self._sigma
+        by_channel = (self._member * off[:, :, None]).transpose(1, 2)
+        cross, square = (by_channel @ self._columns).cpu().numpy(), (by_channel @ off[:, :, None])[..., 0].cpu().numpy()
+        return ((own[:, :width], its) for own, width, its in zip(cross, self._widths, square))
+
+
+@lru_cache(maxsize=2)
+def _designed(arrays: _Same, channels: int, device: str) -> _Design:
+    """As :func:`_kept`, of windows' columns."""
+    return _Design([arrays[i : i + 6] for i in range(0, len(arrays) - 1, 6)], arrays[-1], channels, device)
+
+
+def with_residuals(
+    grams: Sequence[Gram], windows: Sequence[Window], floors: np.ndarray, residuals: Sequence[np.ndarray], device: str
+) -> list[Gram]:
+    """Grams with the same derivatives and other residuals: of all windows at once on a GPU, where the derivatives stay.
+
+    Args:
+        grams: of the windows, whose latents are at the knots.
+        windows: of the model.
+        floors: of the effects, shape (K,).
+        residuals: of each window, shape (N,).
+        device: where to calculate.
+    """
+    if device == "cpu":
+        return each(lambda w: with_residual(grams[w], windows[w], floors, residuals[w]), range(len(grams)))
+    arrays = [a for w in windows for a in (w.nuisance, w.latent, w.effects, w.nuisance_sd, w.sigma, w.channel)]
+    design = _designed(_Same([*arrays, floors]), len(grams[0].count), device)
+    return [replace(gram, cross=cross, square=square) for gram, (cross, square) in zip(grams, design.products(residuals))]
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """Initial states of replay windows: from smoothed measurements, and the directions in which they are not known."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -92,34 +93,34 @@ def _tangents(n: np.ndarray) -> np.ndarray:
 
 def moved(states: States, direction: Direction, size: np.ndarray | float) -> States:
     """States moved along one direction by ``size`` (shape (S,) or a number)."""
-    out = dict(states)
     size = np.broadcast_to(np.asarray(size, dtype=float), (len(states["pos_w"]),))
-    value = states[direction.field].copy()
-    if direction.field == "quat_wb":
-        turn = np.zeros((len(value), 3))
-        turn[:, direction.axis] = size
-        value = (Rotation.from_quat(value) * Rotation.from_rotvec(turn)).as_quat()
-    elif direction.field.startswith("cable"):
-        n = states["cable_dir_w"]
-        # one plane for the whole rope: that of its mean direction
-        frame = _tangents(n[:, -1])[:, direction.axis][:, None]
-        across = frame - np.sum(frame * n, axis=-1, keepdims=True) * n
-        value += size[:, None, None] * _shape(direction.part, n.shape[1])[:, None] * across
-        if direction.field == "cable_dir_w":
-            value /= np.linalg.norm(value, axis=-1, keepdims=True)
-            u = states["cable_vel_w"]
-            out["cable_vel_w"] = u - np.sum(u * value, axis=-1, keepdims=True) * value
-    else:
-        value[:, direction.axis] += size
-    out[direction.field] = value
+    return moved_along(states, (direction,), size[:, None])
+
+
+def moved_along(states: States, directions: Sequence[Direction], sizes: np.ndarray) -> States:
+    """States moved along all directions by ``sizes``, shape (S, directions); directions of the rope before its rates."""
+    out = dict(states)
+    for field in dict.fromkeys(direction.field for direction in directions):
+        own = [d for d, direction in enumerate(directions) if direction.field == field]
+        axes, size, value = [directions[d].axis for d in own], sizes[:, own], states[field].copy()
+        if field == "quat_wb":
+            turn = np.zeros((len(value), 3))
+            turn[:, axes] = size
+            value = (Rotation.from_quat(value) * Rotation.from_rotvec(turn)).as_quat()
+        elif field.startswith("cable"):
+            n = out["cable_dir_w"]
+            frame = _tangents(n[:, -1])[:, axes]  # one plane for the whole rope: that of its mean direction
+            shapes = np.array([_shape(directions[d].part, n.shape[1]) for d in own])
+            across = np.einsum("sd,dl,sdx->slx", size, shapes, frame)
+            value = out[field] + across - np.sum(across * n, axis=-1, keepdims=True) * n
+            if field == "cable_dir_w":
+                value /= np.linalg.norm(value, axis=-1, keepdims=True)
+                u = states["cable_vel_w"]
+                out["cable_vel_w"] = u - np.sum(u * value, axis=-1, keepdims=True) * value
+        else:
+            value[:, axes] += size
+        out[field] = value
     return out
-
-
-def moved_along(states: States, directions: tuple[Direction, ...], sizes: np.ndarray) -> States:
-    """States moved along all directions by ``sizes``, shape (S, directions)."""
-    for d, direction in enumerate(directions):
-        states = moved(states, direction, sizes[:, d])
-    return states
 
 
 def _shape(part: str | int, segments: int) -> np.ndarray:

@@ -118,6 +118,7 @@ class ThrowModel:
         self._fits: dict[tuple[Cut, ...], tuple[States, dict[int, np.ndarray]]] = {}
         self._latest: dict[frozenset[str], States] = {frozenset(): self._fitted(states)[0]}
         self._settled_at: dict[frozenset[tuple[str, float]], States] = {}
+        self._follows: tuple[Linearised, dict[int, list[int]], dict[int, np.ndarray]] | None = None  # the last that was asked for
         self._sightings = sightings(logs, flights, self.flights.cuts, self.setting)
 
     def windows(self, theta: Mapping[str, float]) -> list[Window]:
@@ -186,16 +187,19 @@ class ThrowModel:
         names = [e.effect.name for e in self.entries.values()]
         change = np.array([theta.get(name, 0.0) - about.theta.get(name, 0.0) for name in names])
         found, cuts = directions(setting.plant), self.flights.cuts
+        if self._follows is None or self._follows[0] is not about:
+            owns = {i: [d for d, x in enumerate(found) if concerns(x, cuts[self._told[i]])] for i in about.windows}
+
+            def ways(i: int) -> np.ndarray:
+                free = np.array([found[d].follows for d in owns[i]], dtype=bool)
+                return following(self.flights, self._told[i], about.windows[i], free, self.setting.plant.release.lag)
+
+            self._follows = about, owns, dict(zip(owns, each(ways, owns)))
+        _, owns, by_effects = self._follows
+        moves = {i: by_effect @ change for i, by_effect in by_effects.items()}
         sizes = np.zeros((len(cuts), len(found)))
-
-        def move(i: int) -> np.ndarray:
-            w = self._told[i]
-            own = [d for d, x in enumerate(found) if concerns(x, cuts[w])]
-            free = np.array([found[d].follows for d in own], dtype=bool)
-            sizes[w, own] = by = following(self.flights, w, about.windows[i], change, free, self.setting.plant.release.lag)
-            return by
-
-        moves = dict(zip(about.windows, each(move, about.windows)))
+        for i, own in owns.items():
+            sizes[self._told[i], own] = moves[i]
         return moved_along(self._settled_at[_key(about.theta)], found, sizes), moves
 
     def _switches(self, theta: Mapping[str, float]) -> frozenset[str]:
@@ -232,7 +236,7 @@ class ThrowModel:
     def beside(self, cuts: Sequence[Cut]) -> "ThrowModel":
         """The same model of other windows of its flights."""
         other, x = copy.copy(self), self.setting.sensing
-        other._settled_at = {}  # states of other windows
+        other._settled_at, other._follows = {}, None  # states of other windows
         delays = (x.vehicle_delay, x.payload_delay, x.gyro_delay)
         other.flights = Flights(self.flights.flights, cuts, delays, self.flights.stride)
         other._told = np.array([w for w, c in enumerate(cuts) if c.told])

@@ -115,7 +115,8 @@ def _extended(
         gram, column = point.grams[w], np.zeros(point.grams[w].latents)
         if carries(gram.latent_block, term.block):
             values = scale * layout.table(known[w]).ravel()
-            column = np.linalg.solve(gram.factor, grammar.through_latents(point.windows[w], known[w], term.block) @ values)
+            knots = grammar.through_latents(point.windows[w], known[w], term.block) @ values
+            column = np.ravel(lapack.dtrtrs(gram.factor, knots[:, None], lower=1)[0])
         gram = _with_column(gram, column)
         return gram, _with_last(point.integrals[w], gram, point.noise)
 
