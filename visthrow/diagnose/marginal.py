@@ -45,6 +45,7 @@ class Gram:
     nuisances: int
     latent_block: np.ndarray  # shape (L,)
     factor: np.ndarray  # what stands between unit latents and knots: G_used = G @ factor, shape (L, L)
+    shown: Mapping[int, float]  # latent block -> median inner product of its columns with themselves
     log_sigma: float = 0.0  # sum over all samples: grams whose outliers have other weights compare
 
     @property
@@ -156,8 +157,15 @@ def _inner_products(window: Window, z: np.ndarray, channels: int) -> Gram:
         inner[c], cross[c], square[c] = own.T @ own, left @ own, left @ left
         count[c] = len(left)
     blocks = np.asarray(window.latent_block, dtype=int)
-    return Gram(window.flight, window.phase, count, inner, cross, square, window.nuisance.shape[1], blocks, np.eye(len(blocks)),
-                float(np.log(window.sigma).sum()))  # fmt: skip
+    states = window.nuisance.shape[1]
+    return Gram(window.flight, window.phase, count, inner, cross, square, states, blocks, np.eye(len(blocks)),
+                _shown(inner, states, blocks), float(np.log(window.sigma).sum()))  # fmt: skip
+
+
+def _shown(inner: np.ndarray, begin: int, blocks: np.ndarray) -> dict[int, float]:
+    """See :class:`Gram`, with ``begin`` the first latent column."""
+    squares = np.diagonal(inner, axis1=1, axis2=2)[:, begin : begin + len(blocks)].sum(0)
+    return {int(block): float(np.median(squares[blocks == block])) for block in np.unique(blocks)}
 
 
 def _check(window: Window, effects: int, channels: int) -> None:
@@ -195,7 +203,7 @@ def correlated(gram: Gram, window: Window, time: float) -> Gram:
     inner[:, part] = (own.T @ inner[:, part].reshape(channels, groups, knots, size)).reshape(channels, -1, size)
     inner[:, :, part] = (inner[:, :, part].reshape(channels, size, groups, knots) @ own).reshape(channels, size, -1)
     cross[:, part] = (cross[:, part].reshape(channels, groups, knots) @ own).reshape(channels, -1)
-    return replace(gram, inner=inner, cross=cross, factor=factor)
+    return replace(gram, inner=inner, cross=cross, factor=factor, shown=_shown(inner, gram.nuisances, gram.latent_block))
 
 
 def _knots(group: np.ndarray, time: np.ndarray) -> int:

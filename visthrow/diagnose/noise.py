@@ -146,12 +146,9 @@ def _first_guess(grams: Sequence[Gram]) -> Noise:
     scale = np.ones(len(grams[0].count))
     visible: dict[tuple[int, str], list[float]] = {}
     for gram in grams:
-        part = slice(gram.nuisances, gram.nuisances + gram.latents)
-        curvature = np.diagonal(gram.inner, axis1=1, axis2=2).sum(0)[part]
-        for block in np.unique(gram.latent_block):
-            seen = float(np.median(curvature[gram.latent_block == block]))
+        for block, seen in gram.shown.items():
             if seen > 0.0:  # else these forces show nowhere in the window
-                visible.setdefault((int(block), gram.phase), []).append(1.0 / np.sqrt(seen))
+                visible.setdefault((block, gram.phase), []).append(1.0 / np.sqrt(seen))
     return Noise(scale, {key: float(np.median(v)) for key, v in visible.items()}, CORRELATION_TIMES[0],
                  np.ones((len(grams), len(LATENT_BLOCKS))))  # fmt: skip
 

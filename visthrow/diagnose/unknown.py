@@ -132,11 +132,12 @@ def _with_column(gram: Gram, column: np.ndarray) -> Gram:
     """Append G column as an effect; ``column`` is in the gram's own latents."""
     part = slice(gram.nuisances, gram.nuisances + gram.latents)
     along = gram.inner[:, :, part] @ column
-    own = along[:, part] @ column
-    inner = np.concatenate((gram.inner, along[:, :, None]), axis=2)
-    last = np.concatenate((along, own[:, None]), axis=1)
+    size = along.shape[1]
+    inner = np.empty((len(along), size + 1, size + 1))  # at once: two concatenations would take the time of a product of windows
+    inner[:, :size, :size], inner[:, :size, size], inner[:, size, :size] = gram.inner, along, along
+    inner[:, size, size] = along[:, part] @ column
     cross = np.concatenate((gram.cross, (gram.cross[:, part] @ column)[:, None]), axis=1)
-    return replace(gram, inner=np.concatenate((inner, last[:, None, :]), axis=1), cross=cross)
+    return replace(gram, inner=inner, cross=cross)
 
 
 def _with_last(known: Integral, gram: Gram, noise: Noise) -> Integral:
