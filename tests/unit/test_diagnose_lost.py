@@ -11,7 +11,7 @@ from tests.synthetic_diagnosis import SyntheticModel, catalogue
 from visthrow.diagnose import result, search
 from visthrow.diagnose.cutting import RINGING
 from visthrow.diagnose.evidence import Priors
-from visthrow.diagnose.point import Problem, linearise, lost
+from visthrow.diagnose.point import Problem, linearise, lost, only
 from visthrow.diagnose.states import HUNG
 from visthrow.diagnose.throw_model import ThrowModel
 
@@ -56,15 +56,29 @@ def test_less_misfit_is_taken_from_a_window_after_slack(shaken, rough, expected)
     assert lost_of(model) == expected
 
 
-def test_a_window_that_is_lost_where_the_cause_is_leads_to_another_search():
+def test_a_window_that_is_lost_where_the_cause_is_is_left_out_and_the_search_goes_on():
     said = []
     model = Spoiled(effects=EFFECTS, truth={"effect_00": 15.0}, throws=8, seed=4)
     model.rough, model.beyond = 4.0, 5.0
     diagnosis = search.explain(model, laws=False, progress=said.append)
     assert sum("are left out, which the simulation does not follow" in line for line in said) == 1
+    assert sum("named" in line for line in said) == 1
     assert diagnosis.overall == result.KNOWN
     assert diagnosis.named == ("effect_00",)
     assert diagnosis.windows == len(model.windows({})) - 1
+
+
+@pytest.mark.parametrize(("active", "stands"), [([0], True), ([0, 5], False), ([5], False), ([], False)])
+def test_without_lost_windows_the_search_goes_on_from_names_that_stand_alone(active, stands):
+    """Otherwise it begins anew: the window may have brought the name."""
+    model = SyntheticModel(effects=EFFECTS, truth={"effect_00": 15.0}, throws=8, seed=4)
+    problem = Problem(model, Priors.of(tuple(model.effects), tuple(model.channels)), tuple(range(len(model.windows({})))))
+    nominal = linearise(problem, np.zeros(len(EFFECTS)))
+    at = search.Search(problem, nominal, 5.0, lambda _: None, active=active, origin=nominal)
+    at.point = at._candidate(nominal, active)
+    left = [i for i in problem.kept if i != BAD]
+    assert at.stands_without([BAD], problem.only(left), only(nominal, left), 5.0) == stands
+    assert len(at.point.windows) == len(at.origin.windows) == len(left)
 
 
 def test_windows_soon_after_slack_are_shaken(monkeypatch):

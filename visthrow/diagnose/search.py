@@ -115,10 +115,11 @@ class Search:
         return self.problem.model.effects[j].name
 
     def run(self) -> None:
-        """Search until nothing exceeds the threshold, or until names follow one another in place of a law."""
+        """Search, on from what is named, until nothing exceeds the threshold or names follow one another in place of a law."""
         from visthrow.diagnose.unknown import outside
 
-        self.point = self.origin = self.nominal
+        if self.point is None:
+            self.point = self.origin = self.nominal
         while len(self.active) < MOST_NAMES and (self._forward() or self._mean()):
             self._backward()
             if self.laws and len(self.active) == CHAIN and outside(self) and not (self.nearer() and not outside(self)):
@@ -175,6 +176,27 @@ class Search:
         self.point = self._settle(found, self.active)
         self.refused.clear()  # what differed from flight to flight may have been this one's share
         return True
+
+    def stands_without(self, gone: Sequence[int], problem: Problem, nominal: Point, least: float) -> bool:
+        """Leave windows out, and say whether each name is still worth the threshold, so that the search may go on from there.
+
+        Args:
+            gone: numbers of the windows.
+            problem: without them.
+            nominal: point without them.
+            least: threshold without them.
+        """
+        left = [i for i in range(len(self.problem.kept)) if i not in set(gone)]
+        self.problem, self.nominal, self.least = problem, nominal, least
+        self.origin, self.point = only(self.origin, left), self._candidate(only(self.point, left), self.active)
+        self.refused, self.dropped = {}, set()
+        worth = self._worth()
+        return bool(worth) and all(nats > least and self._stands(self.point, self.active, j) for j, nats in worth.items())
+
+    def _worth(self) -> dict[int, float]:
+        """What each name adds to the others, in nats."""
+        whole = self.point.evidence(self.priors, self.active)
+        return {j: whole - self.point.evidence(self.priors, [k for k in self.active if k != j]) for j in self.active}
 
     def scatter(self, active: Sequence[int]) -> tuple[Scatter, ...]:
         """What varies from flight to flight about the sizes of these effects."""
@@ -324,8 +346,7 @@ class Search:
     def _backward(self) -> None:
         """Drop what a later addition made superfluous, or left with hardly any size."""
         while len(self.active) > 1:
-            whole = self.point.evidence(self.priors, self.active)
-            worth = {j: whole - self.point.evidence(self.priors, [k for k in self.active if k != j]) for j in self.active}
+            worth = self._worth()
             unsure = [j for j in self.active if not self._sure(self.point, self.active, j)]
             weakest = min(unsure or worth, key=worth.get)
             if worth[weakest] > self.least and not unsure:
@@ -429,17 +450,27 @@ def explain(
         if not (gone := lost(nominal)):
             break
         problem, nominal = _left_out(problem, nominal, gone, say)
-    for again in range(LOSSES):
-        least = threshold(nominal.statistics, priors, np.random.default_rng(seed))
-        say(f"{len(problem.kept)} windows of {len(nominal.statistics.flights)} flights; a cause needs {least:.1f} nats")
-        search = Search(problem, nominal, least, say, laws)
-        search.run()
+    least = _least(nominal, priors, seed, say)
+    search = Search(problem, nominal, least, say, laws)
+    search.run()
+    for _ in range(LOSSES - 1):
         gone = lost(search.point)  # where the causes are in the simulation, it may lose windows that it followed without
-        if not gone or search.events or again == LOSSES - 1:
+        if not gone or search.events:
             break
         problem, nominal = _left_out(problem, nominal, gone, say)
+        least = _least(nominal, priors, seed, say)
+        if not search.stands_without(gone, problem, nominal, least):
+            search = Search(problem, nominal, least, say, laws)
+        search.run()
     diagnosis = conclude(search, laws=laws)
     return replace(diagnosis, duplicates=duplicates, seconds=time.monotonic() - begun, seed=seed)
+
+
+def _least(nominal: Point, priors: Priors, seed: int, say: Callable[[str], None]) -> float:
+    """The threshold [nats]."""
+    least = threshold(nominal.statistics, priors, np.random.default_rng(seed))
+    say(f"{len(nominal.windows)} windows of {len(nominal.statistics.flights)} flights; a cause needs {least:.1f} nats")
+    return least
 
 
 def _left_out(
