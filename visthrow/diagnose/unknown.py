@@ -14,7 +14,7 @@ from scipy.linalg import lapack
 from visthrow.diagnose import grammar
 from visthrow.diagnose import noise as noise_levels
 from visthrow.diagnose.consistency import LEAST_FLIGHTS, differ
-from visthrow.diagnose.evidence import Priors, covariance, estimate
+from visthrow.diagnose.evidence import Priors, covariance, estimate, log_evidence
 from visthrow.diagnose.excess import acts_on
 from visthrow.diagnose.marginal import Gram, Integral, Noise
 from visthrow.diagnose.model import LATENT_BLOCKS
@@ -34,6 +34,10 @@ JOINS = 16.0
 
 WEIGHED = 5
 """Terms that are weighed with noise levels of their own."""
+
+HOPELESS = 0.5
+"""Of what names bring where the model stands alone, by the linear statistics, that a term instead of them must bring to be weighed.
+Of four laws that the catalogue does not hold the true term brought from 1.9 to 100 times as much as the names that stood for it."""
 
 REACH = 3.0
 """Prior deviation of a term's root mean square force, in the block's strongest latent force."""
@@ -170,7 +174,7 @@ def _known(point: Point) -> list[grammar.Known]:
 
 
 def hypotheses(point: Point, priors: Priors, active: Sequence[int], strongest: dict[str, float], least: float,
-               beside: Hypothesis | None = None) -> list[Hypothesis]:  # fmt: skip
+               beside: Hypothesis | None = None, instead: Sequence[int] = ()) -> list[Hypothesis]:  # fmt: skip
     """The best terms beside a set of names, best first.
 
     Args:
@@ -180,8 +184,11 @@ def hypotheses(point: Point, priors: Priors, active: Sequence[int], strongest: d
         strongest: latent force of each block where the model stood alone [N or N m].
         least: nats below which no term is weighed.
         beside: a first term that ``point`` already holds.
+        instead: names that terms are to take the place of, where these are not hopeless.
     """
     calm, parts = calmed(point)
+    information, score = calm.information, calm.score
+    named, bare = (log_evidence(information, score, priors, names) for names in ([*active, *instead], list(active)))
     known = _known(point)
     screens = {block: of for block in strongest if (of := screen(calm, parts, block, known)) is not None}
     depths = [term.depth for of in screens.values() for term in of.terms]
@@ -191,7 +198,7 @@ def hypotheses(point: Point, priors: Priors, active: Sequence[int], strongest: d
         gain, prior = gains(calm, priors, active, of, REACH * strongest[block])
         gain -= [price[term.depth] for term in of.terms]
         found += [(float(gain[i]), of.terms[i], float(prior[i])) for i in distinct(gain, of, WEIGHED)]
-    found = sorted((f for f in found if f[0] > least), key=lambda f: -f[0])[:WEIGHED]
+    found = sorted((f for f in found if f[0] > max(least, HOPELESS * (named - bare))), key=lambda f: -f[0])[:WEIGHED]
     weighed = [_weigh(point, priors, active, term, prior, price[term.depth], known, beside) for _, term, prior in found]
     return sorted((h for h in weighed if h.nats > least and _matters(h, known) and not _differs(h)), key=lambda h: -h.nats)
 
@@ -242,7 +249,7 @@ def find_laws(search: "Search") -> Answer:
     if not all(w.knots for w in search.nominal.windows) or not strongest:
         return Answer()
     priors, least = search.priors, search.least
-    found = [(h, search.nominal) for h in hypotheses(search.nominal, priors, (), strongest, least)]
+    found = [(h, search.nominal) for h in hypotheses(search.nominal, priors, (), strongest, least, instead=search.active)]
     if search.active:
         beside = hypotheses(search.point, priors, search.active, strongest, least)
         found += [(h, search.point) for h in _as_told(search, [_pruned(h, least) for h in beside])]
