@@ -75,7 +75,7 @@ class _Columns:
 
     def _moved(self, height: int, width: int, part: Callable[[np.ndarray, int], np.ndarray]) -> torch.Tensor:
         shape = len(self._inner), len(self._inner[0]), height, width
-        out = torch.zeros(shape, dtype=torch.float64, pin_memory=self._device.startswith("cuda"))  # on its way there twice as fast
+        out = torch.zeros(shape, dtype=torch.float64, pin_memory=self._device.startswith("cuda"))
         for row, inner, size in zip(out.numpy(), self._inner, self._sizes):
             values = part(inner, size)
             row[:, : values.shape[1], : values.shape[2]] = values
@@ -95,7 +95,7 @@ class _Design:
         """Move them there, where they are also scaled.
 
         Args:
-            windows: of each, what :class:`_Same` arrays of :func:`with_residuals` hold.
+            windows: of each, its nuisances, latents, effects, deviations of nuisances, sigmas and channels.
             floors: of the effects, shape (K,).
             channels: of the model.
             device: where to calculate.

@@ -37,7 +37,7 @@ WEIGHED = 5
 
 HOPELESS = 0.5
 """Of what names bring where the model stands alone, by the linear statistics, that a term instead of them must bring to be weighed.
-Of four laws that the catalogue does not hold the true term brought from 1.9 to 100 times as much as the names that stood for it."""
+Of three laws that the catalogue does not hold the true term brought 1.9, 7 and 107 times as much as the names that stood for it."""
 
 REACH = 3.0
 """Prior deviation of a term's root mean square force, in the block's strongest latent force."""
