@@ -40,7 +40,9 @@ def diagnosis(tmp_path):
 def test_apply_writes_what_training_reads(diagnosis, tmp_path, capsys):
     out = tmp_path / "mine.toml"
     scatter = [{"name": "lag_jitter", "found": True, "size": 0.01, "unit": "s", "of": ["release_lag"]}]
-    assert cli.main(["diagnose", "apply", diagnosis(scatter=scatter), "--out", str(out), "--plants", "8"]) == 0
+    own = {"name": "wind_x", "estimate": 0.21, "low": 0.16, "high": 0.26, "unit": "m/s"}
+    given = diagnosis(scatter=scatter, findings=[own, own | {"name": "wind_y"}])
+    assert cli.main(["diagnose", "apply", given, "--out", str(out), "--plants", "8"]) == 0
     capsys.readouterr()
     after, before = config.load(Experiment, out), shipped()
     np.testing.assert_allclose(after.vehicle.thrust.gain, 1.03)
@@ -59,6 +61,8 @@ def test_apply_writes_what_training_reads(diagnosis, tmp_path, capsys):
     assert 'base = "train/state.toml"' in text
     assert "Landing error of 9 throws: 0.11 m before, 0.02 m after" in text
     assert "lag_jitter 0.01 s" in text
+    assert "wind_x = 0.21 m/s (95 %: 0.16 to 0.26)" in text  # beside what is set
+    assert "wind_y" not in text
     for line in text.splitlines():
         assert " = " not in line or "#" in line or line.startswith("base"), line
 

@@ -90,5 +90,9 @@ def origin(report: dict, path: str) -> list[str]:
     if landing:
         before, after = landing["before"], landing["after"]
         lines.append(f"Landing error of {landing['throws']} throws: {before:.3g} m before, {after:.3g} m after.")
+    own = [f for f in report.get("findings") or [] if f["name"] in report.get("theta", {}) and f.get("low") is not None]
+    if own:
+        lines.append("The sizes are those with which these causes alone explain the flights. With everything else below its floor:")
+        lines += [f"{f['name']} = {f['estimate']:.3g} {f['unit']} (95 %: {f['low']:.3g} to {f['high']:.3g})." for f in own]
     drawn = [s for s in report.get("scatter") or [] if s["found"]]
     return lines + [f"Varies from flight to flight: {s['name']} {s['size']:.3g} {s['unit']}." for s in drawn]
