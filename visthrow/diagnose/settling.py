@@ -115,10 +115,11 @@ class Settling:
             self.slopes |= self._slopes(states, left[stale[left]])
             aged &= ~stale
             trial = self._tried(states, left, residuals, moves, damping, doubtful)
+            helps = trial.cost < cost[left]
             tried, hoped, whole = (np.full(count, value) for value in (np.inf, 0.0, 0.0))
-            tried[left], hoped[left], whole[left], damping[left] = trial.cost, trial.hoped, trial.whole, trial.damping
-            better = tried < cost
-            rows = np.flatnonzero(better[left])
+            tried[left], hoped[left], whole[left] = trial.cost, np.where(helps, trial.hoped, trial.whole), trial.whole
+            damping[left] = np.where(helps, trial.damping, damping[left])
+            better, rows = tried < cost, np.flatnonzero(helps)
             residuals |= {left[row]: trial.residuals[row] for row in rows}
             states = {name: value.copy() for name, value in states.items()}
             for name, value in states.items():
@@ -148,7 +149,7 @@ class Settling:
         self, states: States, left: np.ndarray, residuals: Mapping[int, np.ndarray], moves: np.ndarray, damping: np.ndarray,
         doubtful: np.ndarray,
     ) -> _Trial:  # fmt: skip
-        """The next step of each window that is left, or the best of several; the least damped one where none helps."""
+        """The next step of each window that is left, or the best of several."""
         rungs = np.where(doubtful[left], len(LADDER), 1)
         which, first = np.repeat(left, rungs), np.cumsum(rungs) - rungs
         tries = np.concatenate([damping[w] * LADDER[:n] for w, n in zip(left, rungs)])
@@ -158,9 +159,8 @@ class Settling:
         seen = self._residuals(there, which)
         cost = np.array([self._cost(w, residual) for w, residual in zip(which, seen)])
         best = np.array([at + cost[at : at + n].argmin() for at, n in zip(first, rungs)])
-        taken = np.where([cost[lane] < self._cost(w, residuals[w]) for w, lane in zip(left, best)], best, first)
-        left_over = [seen[lane] for lane in taken]
-        return _Trial(rows_of(there, taken), steps[taken], tries[taken], hoped[taken], hoped[first], cost[taken], left_over)
+        rest = [seen[lane] for lane in best]
+        return _Trial(rows_of(there, best), steps[best], tries[best], hoped[best], hoped[first], cost[best], rest)
 
     def _residuals(self, states: States, which: np.ndarray) -> list[np.ndarray]:
         """Residuals of windows, of what tells of their initial states; a row of the states for each."""
