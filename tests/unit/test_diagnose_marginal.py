@@ -78,13 +78,17 @@ def test_windows_side_by_side_are_what_they_are_alone(fitted):
     np.testing.assert_allclose(stack.values(levels), alone, rtol=1e-8)
     np.testing.assert_allclose(stack.look(levels)[0], alone, rtol=1e-8)
     for latents in (False, True):
-        for found, gram, w in zip(stack.integrals(levels, latents=latents), mixed, rows, strict=True):
+        resident = stack.integrals(levels, latents=latents)
+        told = zip(resident, resident.shares(mixed, levels), resident.log_dets, mixed, rows, strict=True)
+        for found, at_once, log_det, gram, w in told:
             single = marginal.integral(gram, levels, w, gram.nuisances if latents else None)
-            size = np.abs(single.information).max()
+            size, other = np.abs(single.information).max(), single.share(gram, levels)
             np.testing.assert_allclose(found.information, single.information, atol=1e-9 * size)
-            share, other = found.share(gram, levels), single.share(gram, levels)
-            np.testing.assert_allclose(share.score, other.score, atol=1e-9 * size)
-            assert share.square == pytest.approx(other.square, rel=1e-9)
+            assert log_det == pytest.approx(single.log_det, rel=1e-12)
+            for share in (found.share(gram, levels), at_once):
+                np.testing.assert_allclose(share.information, single.information, atol=1e-9 * size)
+                np.testing.assert_allclose(share.score, other.score, atol=1e-9 * size)
+                assert share.square == pytest.approx(other.square, rel=1e-9)
 
 
 def test_other_residuals_are_the_same_side_by_side(fitted):

@@ -11,7 +11,6 @@ from visthrow.diagnose import stack
 from visthrow.diagnose.evidence import Priors, covariance, estimate, log_evidence
 from visthrow.diagnose.marginal import (
     Gram,
-    Integral,
     Noise,
     Statistics,
     gather,
@@ -67,7 +66,7 @@ class Point:
     grams: Sequence[Gram]  # latents correlated
     noise: Noise
     statistics: Statistics
-    integrals: Sequence[Integral]  # of the grams under these noise levels
+    integrals: stack.Integrals  # of the grams under these noise levels
     about: Linearised | None  # where the derivatives were taken; None: with another kind of block than the residuals
     device: str  # where the model simulates, and the algebra of all windows with it
 
@@ -87,7 +86,7 @@ class Point:
         return own - 0.5 * float(self.statistics.absolute_square.sum()) + self.noise.log_prior
 
 
-def regathered(point: Point, integrals: Sequence[Integral] | None = None, **changes: Any) -> Point:
+def regathered(point: Point, integrals: stack.Integrals | None = None, **changes: Any) -> Point:
     """The point with changes, and what its windows then say.
 
     Args:
@@ -100,8 +99,8 @@ def regathered(point: Point, integrals: Sequence[Integral] | None = None, **chan
     return replace(changed, integrals=integrals, statistics=_statistics(changed.grams, integrals, changed.noise, changed.theta))
 
 
-def _statistics(grams: Sequence[Gram], integrals: Sequence[Integral], noise: Noise, theta: np.ndarray) -> Statistics:
-    return gather(grams, [known.share(gram, noise) for known, gram in zip(integrals, grams)], theta)
+def _statistics(grams: Sequence[Gram], integrals: stack.Integrals, noise: Noise, theta: np.ndarray) -> Statistics:
+    return gather(grams, integrals.shares(grams, noise), theta)
 
 
 def linearise(problem: Problem, theta: np.ndarray, start: Noise | None = None, windows: Sequence[Window] | None = None) -> Point:
@@ -140,8 +139,8 @@ def lost(point: Point) -> list[int]:
 
     What they say of an effect is chance: their derivatives hold nowhere. Where many are so, none is lost, but something is missing.
     """
-    misfit = [(known.share(gram, point.noise).square - known.log_det) / max(gram.count.sum(), 1.0)
-              for known, gram in zip(point.integrals, point.grams)]  # fmt: skip
+    shares, log_dets = point.integrals.shares(point.grams, point.noise), point.integrals.log_dets
+    misfit = [(own.square - log_det) / max(gram.count.sum(), 1.0) for own, log_det, gram in zip(shares, log_dets, point.grams)]
     shaken = np.array([window.shaken for window in point.windows], dtype=bool)
     far = np.flatnonzero(np.array(misfit) > np.where(shaken, min(SHAKEN_LOST * np.median(misfit), LOST), LOST))
     return far.tolist() if len(far) <= LOST_SHARE * len(misfit) else []
@@ -200,7 +199,7 @@ def curvature(problem: Problem, origin: Point, there: Point) -> float:
     change = problem.priors.floor * (there.theta - origin.theta)
     bent = [new.residual - (old.residual - old.effects @ change) for old, new in zip(origin.windows, there.windows)]
     _, grams = _with_residuals(problem, there, bent)
-    total = sum(known.share(gram, there.noise).score for known, gram in zip(there.integrals, grams))
+    total = sum(share.score for share in there.integrals.shares(grams, there.noise))
     return float(np.abs(covariance(there.information, problem.priors.deviation(())) @ total).max(initial=0.0))
 
 

@@ -152,9 +152,9 @@ class Settling:
         """The next step of each window that is left, or the best of several."""
         rungs = np.where(doubtful[left], len(LADDER), 1)
         which, first = np.repeat(left, rungs), np.cumsum(rungs) - rungs
-        tries = np.concatenate([damping[w] * LADDER[:n] for w, n in zip(left, rungs)])
-        told = each(lambda lane: self._increment(lane[0], residuals[lane[0]], moves[lane[0]], lane[1]), zip(which, tries))
-        steps, hoped = (np.array(values) for values in zip(*told))
+        dampings = [damping[w] * LADDER[:n] for w, n in zip(left, rungs)]
+        told = each(lambda way: self._increments(way[0], residuals[way[0]], moves[way[0]], way[1]), zip(left, dampings))
+        tries, (steps, hoped) = np.concatenate(dampings), map(np.concatenate, zip(*told))
         there = moved_along(rows_of(states, which), self.directions, steps)
         seen = self._residuals(there, which)
         cost = np.array([self._cost(w, residual) for w, residual in zip(which, seen)])
@@ -213,8 +213,20 @@ class Settling:
             slopes[w] = (flat[:, 1:] - flat[:, :1]) / steps * self._tells[w][:, None]
         return slopes
 
-    def _increment(self, w: int, residual: np.ndarray, done: np.ndarray, damping: float) -> tuple[np.ndarray, float]:
-        """Levenberg-Marquardt step of a window's state with its vague prior, shape (directions,), and the fall that it promises."""
+    def _increments(
+        self, w: int, residual: np.ndarray, done: np.ndarray, dampings: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+        """Levenberg-Marquardt steps of a window's state with its vague prior, and the falls that they promise.
+
+        Args:
+            w: the window.
+            residual: where it stands.
+            done: how far it has been moved, shape (directions,).
+            dampings: of the steps, shape (T,).
+
+        Returns:
+            Steps, shape (T, directions); falls of the cost, shape (T,).
+        """
         ds, spread = self._free[w], self._spread(w)
         sd = np.array([self.directions[d].spread(self.flights.cuts[w]) for d in ds])
         off = residual / spread
@@ -222,12 +234,12 @@ class Settling:
         scaled = self.slopes[w] * sd / spread[:, None]
         bend = scaled.T @ (scaled * weight[:, None])
         normal = bend + np.eye(len(ds))
-        normal += damping * np.diag(np.diag(normal))
+        damped = normal + dampings[:, None, None] * np.diag(np.diag(normal))
         slope = scaled.T @ (off * weight)
-        step = np.linalg.solve(normal, slope - done[ds] / sd)
-        out = np.zeros(len(done))
-        out[ds] = step * sd
-        return out, float(slope @ step - 0.5 * step @ bend @ step)
+        step = np.linalg.solve(damped, (slope - done[ds] / sd)[:, None])[..., 0]
+        out = np.zeros((len(dampings), len(done)))
+        out[:, ds] = step * sd
+        return out, step @ slope - 0.5 * np.sum(step @ bend * step, axis=1)
 
 
 def drift(flights: Flights, w: int) -> np.ndarray:

@@ -7,6 +7,7 @@ batches that fit its cache.
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -16,6 +17,7 @@ from visthrow.diagnose.marginal import (
     Gram,
     Integral,
     Noise,
+    Share,
     WindowStatistics,
     integral,
     statistics_of,
@@ -25,6 +27,8 @@ from visthrow.diagnose.marginal import (
 from visthrow.diagnose.model import LATENT_BLOCKS, Window
 from visthrow.diagnose.threads import each
 from visthrow.errors import DiagnoseError
+
+T = TypeVar("T")
 
 BATCH = 8  # windows of a batch on the CPU
 BLOCKS = len(LATENT_BLOCKS)
@@ -178,10 +182,35 @@ class _Solved:
     value: torch.Tensor  # log-likelihood of the residuals, but for the powers of 2 pi, shape (W,)
 
 
-def integrals(grams: Sequence[Gram], noise: Noise, device: str) -> list[Integral]:
+class Integrals(Sequence[Integral]):
+    """What windows say of their effects, whatever their residuals are."""
+
+    def __init__(self, of_windows: Sequence[Integral]):
+        """Keep those of some windows."""
+        self._of_windows = of_windows
+
+    def __len__(self) -> int:
+        """Number of windows."""
+        return len(self._of_windows)
+
+    def __getitem__(self, window):
+        """That of a window."""
+        return self._of_windows[window]
+
+    @property
+    def log_dets(self) -> list[float]:
+        """Of each window's V."""
+        return [known.log_det for known in self]
+
+    def shares(self, grams: Sequence[Gram], noise: Noise) -> list[Share]:
+        """With the residuals of grams of the same derivatives; ``noise`` is what they were integrated with."""
+        return [known.share(gram, noise) for known, gram in zip(self, grams)]
+
+
+def integrals(grams: Sequence[Gram], noise: Noise, device: str) -> Integrals:
     """Integrate initial states and latent forces out of windows: side by side on a GPU; on a CPU copies would cost more."""
     if device == "cpu":
-        return each(lambda w: integral(grams[w], noise, w), range(len(grams)))
+        return Integrals(each(lambda w: integral(grams[w], noise, w), range(len(grams))))
     return Stack(grams, device).integrals(noise)
 
 
@@ -250,7 +279,7 @@ class Stack:
         found = self._each(lambda batch: _curved(batch, _solved(batch, noise)))
         return tuple(self._in_order([part[i] for part in found]) for i in range(3))
 
-    def integrals(self, noise: Noise, *, latents: bool = False) -> list[Integral]:
+    def integrals(self, noise: Noise, *, latents: bool = False) -> Integrals:
         """What is left of the effects' columns of each window, or of those of latent forces and effects.
 
         See :func:`visthrow.diagnose.marginal.integral`.
@@ -258,11 +287,7 @@ class Stack:
         Raises:
             DiagnoseError: As :meth:`values`.
         """
-        out: list[Integral | None] = [None] * self._count
-        for own, found in zip(self._order, each(lambda batch: _integrals(batch, noise, latents), self._batches)):
-            for w, of_window in zip(own, found):
-                out[w] = of_window
-        return out
+        return _Resident(self._order, each(lambda batch: _integrated(batch, noise, latents), self._batches))
 
     def _each(self, function) -> list[tuple[np.ndarray, ...]]:
         return each(lambda batch: tuple(value.cpu().numpy() for value in function(batch)), self._batches)
@@ -331,7 +356,77 @@ def _curved(batch: _Batch, at: _Solved) -> tuple[torch.Tensor, torch.Tensor, tor
     return at.value, torch.cat((by_block, left * at.weight - batch.count), -1), curvature
 
 
-def _integrals(batch: _Batch, noise: Noise, latents: bool) -> list[Integral]:
+@dataclass(frozen=True)
+class _Integrated:
+    """What is left of the last J columns of a batch."""
+
+    batch: _Batch
+    left: list[np.ndarray]  # which of the J columns are a window's own
+    at: _Solved
+    half: torch.Tensor  # as :class:`Integral` has it, shape (W, n, J)
+    information: list[np.ndarray]  # of each window
+
+    def of_windows(self) -> list[Integral]:
+        """Each window's, without what pads it."""
+        arrays = (array.cpu().numpy() for array in (self.half, self.at.factor, self.at.level, self.at.log_det))
+        found = []
+        for gram, left, information, half, factor, level, log_det in zip(self.batch.grams, self.left, self.information, *arrays):
+            size = gram.nuisances + gram.latents
+            found.append(Integral(information, half[:size, left], factor[:size, :size], level[:size], float(log_det)))
+        return found
+
+    def shares(self, grams: Sequence[Gram], noise: Noise) -> list[Share]:
+        """With the residuals of grams of the same derivatives."""
+        weight, (count, n, columns) = noise.scale**-2.0, self.half.shape
+        hidden, beside = np.zeros((count, n)), np.zeros((count, columns))
+        for w, (gram, left) in enumerate(zip(grams, self.left)):
+            cross, size = weight @ gram.cross, gram.nuisances + gram.latents
+            hidden[w, :size], beside[w, left] = cross[:size], cross[len(cross) - len(left) :]
+        right = self.at.level * torch.from_numpy(hidden).to(self.half.device)
+        along = torch.linalg.solve_triangular(self.at.factor, right[:, :, None], upper=False)
+        scores = beside - (self.half.transpose(1, 2) @ along)[..., 0].cpu().numpy()
+        taken = (self.at.log_det - along.square().sum((1, 2))).cpu().numpy()
+        return [
+            Share(information, score[left], float(weight @ gram.square + own))
+            for gram, left, information, score, own in zip(grams, self.left, self.information, scores, taken)
+        ]
+
+
+class _Resident(Integrals):
+    """Those that stay where they were calculated until a window is asked for."""
+
+    def __init__(self, order: Sequence[Sequence[int]], batches: Sequence[_Integrated]):
+        """Keep them.
+
+        Args:
+            order: numbers of each batch's windows.
+            batches: what is left of them.
+        """
+        self._order, self._parts = order, batches
+
+    def __len__(self) -> int:
+        """Number of windows."""
+        return sum(map(len, self._order))
+
+    @cached_property
+    def _of_windows(self) -> list[Integral]:
+        return self._by_window([part.of_windows() for part in self._parts])
+
+    @property
+    def log_dets(self) -> list[float]:
+        """See :attr:`Integrals.log_dets`."""
+        return self._by_window([part.at.log_det.tolist() for part in self._parts])
+
+    def shares(self, grams: Sequence[Gram], noise: Noise) -> list[Share]:
+        """See :meth:`Integrals.shares`."""
+        return self._by_window([part.shares([grams[w] for w in own], noise) for own, part in zip(self._order, self._parts)])
+
+    def _by_window(self, parts: Sequence[Sequence[T]]) -> list[T]:
+        found = {w: value for own, part in zip(self._order, parts) for w, value in zip(own, part)}
+        return [found[w] for w in range(len(self))]
+
+
+def _integrated(batch: _Batch, noise: Noise, latents: bool) -> _Integrated:
     at, columns = _solved(batch, noise), batch.columns
     right, own = _weighed(at.weight, columns.beside), _weighed(at.weight, columns.own)
     n = right.shape[1]
@@ -341,11 +436,8 @@ def _integrals(batch: _Batch, noise: Noise, latents: bool) -> list[Integral]:
         right = own[:, :n]
     half = torch.linalg.solve_triangular(at.factor, at.level[:, :, None] * right, upper=False)
     reduced = own - half.transpose(1, 2) @ half
-    arrays = (0.5 * (reduced + reduced.transpose(1, 2)), half, at.factor, at.level, at.log_det)
-    found = []
-    for gram, information, half, factor, level, log_det in zip(batch.grams, *(array.cpu().numpy() for array in arrays)):
-        size = gram.nuisances + gram.latents
-        left = np.r_[gram.nuisances : size, n : len(information)] if latents else slice(None)
-        information = information[left][:, left]
-        found.append(Integral(information, half[:size, left], factor[:size, :size], level[:size], float(log_det)))
-    return found
+    whole = (0.5 * (reduced + reduced.transpose(1, 2))).cpu().numpy()
+    sizes, width = [(gram.nuisances, gram.nuisances + gram.latents) for gram in batch.grams], whole.shape[1]
+    left = [np.r_[begin:end, n:width] if latents else np.arange(width) for begin, end in sizes]
+    information = [own[np.ix_(columns, columns)] for own, columns in zip(whole, left)]
+    return _Integrated(batch, left, at, half, information)

@@ -21,6 +21,7 @@ from visthrow.diagnose.model import LATENT_BLOCKS
 from visthrow.diagnose.point import Point, advantage, regathered, shifted
 from visthrow.diagnose.result import Law
 from visthrow.diagnose.screening import calmed, carries, distinct, felt, gains, screen, usual
+from visthrow.diagnose.stack import Integrals
 from visthrow.diagnose.threads import each
 
 if TYPE_CHECKING:
@@ -129,7 +130,7 @@ def _extended(
         np.append(priors.floor, scale), np.append(priors.slab, 1.0 / NARROW), np.append(priors.low, -np.inf),
         np.append(priors.high, np.inf), np.append(priors.visible, True),
     )  # fmt: skip
-    return regathered(point, integrals, raw=(), theta=np.append(point.theta, 0.0), grams=grams), wide
+    return regathered(point, Integrals(integrals), raw=(), theta=np.append(point.theta, 0.0), grams=grams), wide
 
 
 def _with_column(gram: Gram, column: np.ndarray) -> Gram:
