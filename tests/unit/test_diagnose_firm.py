@@ -1,8 +1,8 @@
-"""Causes that only some of the flights ask for are marked."""
+"""Causes that only some of the flights ask for are marked, and what else would explain the flights is told."""
 
 from types import SimpleNamespace
 
-from visthrow.diagnose.report import not_firm
+from visthrow.diagnose.report import instead, not_firm
 
 
 def diagnosis(**partners):
@@ -33,3 +33,9 @@ def test_two_of_three_are_not_firm_and_three_of_four_are():
     assert len(not_firm(diagnosis(sag=("curve",)), three)) == 1
     four = SimpleNamespace(folds=4, left_out="flights", named_in={"lag": 0.75})
     assert not_firm(diagnosis(lag=()), four) == []
+
+
+def test_two_causes_that_may_be_two_others_are_told():
+    sets = [(("lag", "drag"), 0.0), (("lag", "mass"), 0.4), (("mass", "curve"), 1.66), (("sag",), 2.9)]  # the second is a class
+    told = instead(SimpleNamespace(theta={"lag": 1.0, "drag": 2.0}, sets=sets))
+    assert told == ["curve, mass in place of drag, lag, 1.7 nats behind", "sag in place of drag, lag, 2.9 nats behind"]

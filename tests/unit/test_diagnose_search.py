@@ -74,6 +74,28 @@ def test_three_effects_are_named_together():
         assert abs(size - truth[name]) < 1.5
 
 
+def hiding(own: float, **options) -> SyntheticModel:
+    """Flights in which effect 7 undoes effect 3, of the same size, but for its ``own`` share."""
+
+    def change(model, window):
+        columns = window.effects.copy()
+        columns[:, 7] = own * columns[:, 7] - columns[:, 3]
+        window = replace(window, effects=columns)
+        return replace(window, residual=window.residual + model._answer(columns, {"effect_03": 14.0, "effect_07": 14.0}))
+
+    return altered(change, seed=3, **options)
+
+
+@pytest.mark.parametrize("beside", [{}, {"effect_04": 10.0}])
+def test_two_effects_that_hide_each_other_are_named_together(beside):
+    """Neither brings a single nat alone, nor does what looks like both."""
+    diagnosis = search.explain(hiding(0.15, truth=beside), laws=False)
+    assert set(diagnosis.named) == {"effect_03", "effect_07", *beside}
+    for name in ("effect_03", "effect_07"):
+        assert diagnosis[name].low < 14.0 * diagnosis[name].floor < diagnosis[name].high
+    assert not any({"effect_03", "effect_07"} & set(step.named.split()) for step in diagnosis.steps)
+
+
 @pytest.mark.slow
 def test_mirror_config_is_wrong_instead_of_the_world():
     """A model that has what the world lacks gets the opposite correction."""
@@ -288,6 +310,11 @@ def test_additions_are_differences_of_the_evidence():
     base = evidence.log_evidence(information, score, free, [2])
     for j in (0, 5):
         assert gain[j] == pytest.approx(evidence.log_evidence(information, score, free, [2, j]) - base, abs=1e-8)
+    pairs = evidence.pair_additions(information, score, replace(priors, visible=np.arange(8) != 6), [2])
+    np.testing.assert_allclose(pairs, pairs.T)
+    np.testing.assert_array_equal(np.isinf(pairs).sum(1), [3, 3, 8, 3, 3, 3, 8, 3])  # itself, the one named, the one not visible
+    for i, j in ((0, 5), (7, 1)):
+        assert pairs[i, j] == pytest.approx(evidence.log_evidence(information, score, free, [2, i, j]) - base, abs=1e-8)
 
 
 def test_evidence_is_the_integral():

@@ -134,6 +134,37 @@ def additions(information: np.ndarray, score: np.ndarray, priors: Priors, active
     return np.where(out, -np.inf, gain)
 
 
+def pair_additions(information: np.ndarray, score: np.ndarray, priors: Priors, active: list[int] | tuple[int, ...]) -> np.ndarray:
+    """Gain of log Z by naming two more effects at once, for each two: of two that hide each other, neither shows alone.
+
+    Args:
+        information: shape (K, K).
+        score: shape (K,).
+        priors: of the effects.
+        active: named already.
+
+    Returns:
+        Nats, shape (K, K), symmetric; -inf for those named already or not visible, and on the diagonal.
+    """
+    sigma = covariance(information, priors.deviation(active))
+    mean, size = score @ sigma, len(score)
+    first, second = np.divmod(np.arange(size * size), size)
+    both = np.stack((first, second), axis=1)
+    change = (priors.slab**-2.0 - SPIKE**-2.0)[both]
+    own, of_both = sigma[both[:, :, None], both[:, None]], mean[both]
+    taken = np.linalg.inv(own + np.eye(2) / change[:, None])
+    wide_mean = of_both - (own @ taken @ of_both[..., None])[..., 0]
+    wide_sd = np.sqrt(np.maximum((own - own @ taken @ own).diagonal(axis1=1, axis2=2), 1e-300))
+    gain = -np.log(priors.slab / SPIKE)[both].sum(1) - 0.5 * np.linalg.slogdet(np.eye(2) + change[..., None] * own)[1]
+    gain -= 0.5 * np.einsum("pi,pij,pj->p", of_both, taken, of_both)
+    low, high, slab = priors.low[both], priors.high[both], priors.slab[both]
+    gain += (_log_mass(wide_mean, wide_sd, low, high) - _log_mass(np.zeros_like(low), slab, low, high)).sum(1)
+    out = ~priors.visible
+    out[list(active)] = True
+    gain[out[first] | out[second] | (first == second)] = -np.inf
+    return gain.reshape(size, size)
+
+
 def estimate(information: np.ndarray, score: np.ndarray, priors: Priors, active: list[int] | tuple[int, ...]) -> np.ndarray:
     """Most probable sizes of the named effects within their bounds, all others at 0; in floors, shape (K,)."""
     from scipy.optimize import lsq_linear

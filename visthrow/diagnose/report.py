@@ -34,6 +34,7 @@ def summary(diagnosis: Diagnosis, gain: Gain | None = None) -> str:
     for f in diagnosis.findings:
         if f.verdict in (result.FOUND, result.CLASS):
             lines.append(f"{f.verdict:6} {f.sentence}{_moves(f, gain)}")
+    lines += [f"OR     {line}" for line in instead(diagnosis)]
     lines += [f"FOUND  {m.sentence}" for m in diagnosis.mistakes]
     lines += [f"VARIES {s.sentence}" for s in diagnosis.scatter if s.found]
     lines += [f"EVENT  {_event(diagnosis, flight)}" for flight in diagnosis.events]
@@ -86,6 +87,16 @@ def _event(diagnosis: Diagnosis, flight: int) -> str:
     if diagnosis.work is not None and flight in {w.flight for w in diagnosis.work.after.windows}:
         return f"something happened in flight {flight} that the rest of its phase does not show; there the flight weighs little"
     return f"something happened in flight {flight} that the others do not show; it was left out"
+
+
+def instead(diagnosis: Diagnosis) -> list[str]:
+    """A line for each set of causes that says the same with several others; single ones that do are told as a class."""
+    lines, named = [], set(diagnosis.theta)
+    for names, behind in diagnosis.sets:
+        gone, new = sorted(named - set(names)), sorted(set(names) - named)
+        if max(len(gone), len(new)) > 1:
+            lines.append(f"{', '.join(new) or 'nothing'} in place of {', '.join(gone) or 'nothing'}, {behind:.1f} nats behind")
+    return lines
 
 
 def not_firm(diagnosis: Diagnosis, gain: Gain | None) -> list[str]:
@@ -186,6 +197,7 @@ def _verdict(diagnosis: Diagnosis, gain: Gain | None) -> Section:
     parts: list[Text | Picture] = [Text(reason, "finding") for reason in diagnosis.reasons]
     parts += [Text(f"**{f.verdict}.** {f.sentence}{_moves(f, gain)}{_next(f)}", "finding")
               for f in diagnosis.findings if f.verdict in (result.FOUND, result.CLASS)]  # fmt: skip
+    parts += [Text(f"**Or.** {line}.", "finding") for line in instead(diagnosis)]
     parts += [Text(f"**Not firm.** {line}.", "finding") for line in not_firm(diagnosis, gain)]
     if diagnosis.overall == result.UNKNOWN and diagnosis.laws:
         law = diagnosis.laws[0]

@@ -19,6 +19,7 @@ from visthrow.diagnose.evidence import (
     certainty,
     estimate,
     log_evidence,
+    pair_additions,
     threshold,
 )
 from visthrow.diagnose.marginal import Statistics
@@ -86,6 +87,15 @@ LOSSES = 3
 JOINT_BEST, JOINT_SIZE = 8, 3
 """All sets of up to so many of the best effects are compared at the end."""
 
+EXCHANGED, PAIRS = 2, 4
+"""Names that two others are tried in place of, and how many sets with two others are settled by running the simulation."""
+
+FAR = 25.0
+"""The same as :data:`DOUBT` where two others stand in place of two: sizes move far together, and derivatives tell less."""
+
+EXCHANGES = 2
+"""Times that a set is compared with others, where the last comparison exchanged it and the search went on from there."""
+
 
 @dataclass
 class Search:
@@ -120,12 +130,16 @@ class Search:
 
         if self.point is None:
             self.point = self.origin = self.nominal
-        while len(self.active) < MOST_NAMES and (self._forward() or self._mean()):
-            self._backward()
-            if self.laws and len(self.active) == CHAIN and outside(self) and not (self.nearer() and not outside(self)):
-                self.progress("a law that the catalogue does not hold explains this better than one name after the other")
+        for _ in range(EXCHANGES):
+            while len(self.active) < MOST_NAMES and (self._forward() or self._mean()):
+                self._backward()
+                if self.laws and len(self.active) == CHAIN and outside(self) and not (self.nearer() and not outside(self)):
+                    self.progress("a law that the catalogue does not hold explains this better than one name after the other")
+                    return
+            named = set(self.active)
+            self._joint()
+            if set(self.active) == named:
                 return
-        self._joint()
 
     def _ahead(self, first: tuple[Point, Sequence[int]], second: tuple[Point, Sequence[int]]) -> float:
         """Nats by which a set of effects at its point is ahead of another at its own."""
@@ -378,7 +392,8 @@ class Search:
                     winner = ahead, list(rival), point
             if winner is None:
                 return
-            self.progress(f"exchanged for {', '.join(map(self.name, winner[1])) or 'nothing'}")
+            together = ", ".join(map(self.name, winner[1])) or "nothing"
+            self.progress(f"exchanged for {together}" if self.active else f"{together} named together: each hides the other")
             self.active = winner[1]
             self.point = self._settle(winner[2], self.active)
             distances = ((members, n + winner[0]) for members, n in self.sets if set(members) != set(self.active))
@@ -396,21 +411,43 @@ class Search:
 
     def _rivals(self) -> list[tuple[list[int], float]]:
         """Sets within ``DOUBT`` nats of the present one by the linear statistics, best first; :data:`RIVALS` at most."""
-        if not self.active:
-            return []
-        information, score = self.point.information, self.point.score
-        own = log_evidence(information, score, self.priors, self.active) - self._toll(self.active)
+        own = self._linear(self.active)
         gain = additions(self.nominal.information, self.nominal.score, self.priors, ())
         gain[list(self.refused)] = -np.inf
         best = {int(j) for j in np.argsort(-gain)[:JOINT_BEST] if np.isfinite(gain[j])} | set(self.active)
-        sets = {tuple(sorted(c)) for size in range(1, JOINT_SIZE + 1) for c in combinations(sorted(best), size)}
+        sizes = range(1, JOINT_SIZE + 1) if self.active else ()  # where nothing is named, each was tried alone
+        sets = {tuple(sorted(c)) for size in sizes for c in combinations(sorted(best), size)}
         usable = [int(k) for k in np.flatnonzero(np.isfinite(gain)) if k not in self.active]
-        sets |= {tuple(sorted([k if i == j else i for i in self.active])) for j in self.active for k in usable}
-        sets -= {tuple(sorted(self.active))}
-        sets = {s for s in sets if not set(s) > set(self.active)}  # additions were tried already
-        values = [(list(s), log_evidence(information, score, self.priors, s) - self._toll(s) - own) for s in sets]
-        ranked = sorted((v for v in values if v[1] > -DOUBT), key=lambda v: -v[1])
-        return [v for i, v in enumerate(ranked) if i < RIVALS[0] or (i < RIVALS[1] and v[1] > -CLOSE)]
+        exchanges = {tuple(sorted([k if i == j else i for i in self.active])): k for j in self.active for k in usable}
+        sets = (sets | set(exchanges)) - {tuple(sorted(self.active))}
+        values = {s: self._linear(s) - own for s in sets if not set(s) > set(self.active)}  # additions were tried already
+        alike = {k for s, k in exchanges.items() if values[s] > -CLOSE}
+        ranked = sorted(((list(s), v) for s, v in values.items() if v > -DOUBT), key=lambda v: -v[1])
+        ranked = [v for i, v in enumerate(ranked) if i < RIVALS[0] or (i < RIVALS[1] and v[1] > -CLOSE)]
+        pairs = self._pairs([k for k in usable if k not in alike and not self.problem.switches[k]], own)
+        known = {tuple(s) for s, _ in ranked}
+        return ranked + [v for v in sorted(pairs, key=lambda v: -v[1]) if tuple(v[0]) not in known][:PAIRS]
+
+    def _linear(self, active: Sequence[int]) -> float:
+        """Evidence of a set by the linear statistics, less what its names cost."""
+        return log_evidence(self.point.information, self.point.score, self.priors, active) - self._toll(active)
+
+    def _pairs(self, usable: Sequence[int], own: float) -> list[tuple[list[int], float]]:
+        """Sets with two more effects beside all names but up to two, which come close to the present one or go beyond it.
+
+        Of two effects that hide each other neither is worth a name alone, nor is one in place of one where two say the same as two.
+
+        Args:
+            usable: what the two are chosen among.
+            own: evidence of the present set.
+        """
+        found, most = [], len(self.active)
+        for rest in (c for size in range(max(most - EXCHANGED, 0), most + 1) for c in combinations(self.active, size)):
+            gain = pair_additions(self.point.information, self.point.score, self.priors, rest)
+            gain = (gain + self._linear(rest) - 2.0 * self.least - own)[np.ix_(usable, usable)]
+            near = FAR if len(rest) + 2 == most else CLOSE
+            found += [(sorted([*rest, usable[i], usable[j]]), float(gain[i, j])) for i, j in np.argwhere(np.triu(gain > -near))]
+        return found
 
 
 def explain(
