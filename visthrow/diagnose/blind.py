@@ -13,7 +13,7 @@ import numpy as np
 from visthrow.diagnose.evidence import additions
 from visthrow.diagnose.model import Linearised, Model, Window
 from visthrow.diagnose.result import Diagnosis
-from visthrow.diagnose.search import CLOSE
+from visthrow.diagnose.rivals import CLOSE
 
 SIZES = np.geomspace(1.0, 64.0, 13)
 """Hidden sizes [floors]."""

@@ -17,7 +17,7 @@ from visthrow.diagnose.marginal import Noise, correlated, gram_of, window_statis
 from visthrow.diagnose.measures import MEASUREMENTS, Measurement, narrowed
 from visthrow.diagnose.model import LATENT_BLOCKS, Model
 from visthrow.diagnose.result import Diagnosis
-from visthrow.diagnose.search import CLOSE
+from visthrow.diagnose.rivals import CLOSE
 from visthrow.errors import DiagnoseError, suggest
 from visthrow.flightlog import Channel, FlightLog
 

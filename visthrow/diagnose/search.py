@@ -7,7 +7,6 @@ that a cause is not excused as noise. The threshold comes from null worlds of th
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import combinations
 
 import numpy as np
 
@@ -18,8 +17,6 @@ from visthrow.diagnose.evidence import (
     additions,
     certainty,
     estimate,
-    log_evidence,
-    pair_additions,
     threshold,
 )
 from visthrow.diagnose.marginal import Statistics
@@ -39,6 +36,7 @@ from visthrow.diagnose.point import (
     with_fitted_noise,
 )
 from visthrow.diagnose.result import Diagnosis, Step
+from visthrow.diagnose.rivals import CLOSE, rivals
 from visthrow.diagnose.scatter import Scatter, deviations, freed, straightened, varying
 from visthrow.errors import DiagnoseError
 
@@ -57,15 +55,6 @@ HOPE = 0.6
 TURNS, TURNED = 8, 0.5
 """Times that sizes and noise levels are estimated in turn, while the levels leave a step of the sizes worth so many nats."""
 
-CLOSE = 3.0
-"""Sets of causes within this many nats of the best are reported as equally possible."""
-
-DOUBT = 15.0
-"""Linear statistics this close [nats] are settled by running the simulation."""
-
-RIVALS = 6, 16
-"""Sets that are settled so, and how many where they are ``CLOSE``: of what hover shows, a dozen causes may be the reason."""
-
 CONTRADICTED = 0.5
 """Share of the evidence of an effect that the flights contradict which any other effect must then exceed."""
 
@@ -83,15 +72,6 @@ LINEARISATIONS = 3
 
 LOSSES = 3
 """Rounds in which windows are left out that the simulation does not follow: the worst hide others."""
-
-JOINT_BEST, JOINT_SIZE = 8, 3
-"""All sets of up to so many of the best effects are compared at the end."""
-
-EXCHANGED, PAIRS = 2, 4
-"""Names that two others are tried in place of, and how many sets with two others are settled by running the simulation."""
-
-FAR = 25.0
-"""The same as :data:`DOUBT` where two others stand in place of two: sizes move far together, and derivatives tell less."""
 
 EXCHANGES = 2
 """Times that a set is compared with others, where the last comparison exchanged it and the search went on from there."""
@@ -377,13 +357,13 @@ class Search:
     def _joint(self) -> None:
         """Compare the set found with all small sets of the best effects, and with itself with one effect exchanged."""
         for _ in range(2):
-            ranked = self._rivals()
+            ranked = rivals(self)
             self.sets = [(tuple(self.active), 0.0)]
             winner: tuple[float, list[int], Point] | None = None
             for rival, _ in ranked:
                 point = self._candidate(self.point, rival)
                 ahead = self._ahead((point, rival), (self.point, self.active))
-                ahead += self._toll(self.active) - self._toll(rival)
+                ahead += self.least * (len(self.active) - len(rival))  # every name costs the threshold
                 if ahead > 1.0 and not all(self._fits_in(point, rival, j) for j in rival if j not in self.active):
                     continue
                 if ahead > -CLOSE:
@@ -404,50 +384,6 @@ class Search:
         others = [k for k in rival if k != j]
         same = across_flights(self.point, point, self.priors, others, j, self.least) is None
         return same and self._stands(point, rival, j)
-
-    def _toll(self, active: Sequence[int]) -> float:
-        """Every name costs the threshold."""
-        return self.least * len(active)
-
-    def _rivals(self) -> list[tuple[list[int], float]]:
-        """Sets within ``DOUBT`` nats of the present one by the linear statistics, best first; :data:`RIVALS` at most."""
-        own = self._linear(self.active)
-        gain = additions(self.nominal.information, self.nominal.score, self.priors, ())
-        gain[list(self.refused)] = -np.inf
-        best = {int(j) for j in np.argsort(-gain)[:JOINT_BEST] if np.isfinite(gain[j])} | set(self.active)
-        sizes = range(1, JOINT_SIZE + 1) if self.active else ()  # where nothing is named, each was tried alone
-        sets = {tuple(sorted(c)) for size in sizes for c in combinations(sorted(best), size)}
-        usable = [int(k) for k in np.flatnonzero(np.isfinite(gain)) if k not in self.active]
-        exchanges = {tuple(sorted([k if i == j else i for i in self.active])): k for j in self.active for k in usable}
-        sets = (sets | set(exchanges)) - {tuple(sorted(self.active))}
-        values = {s: self._linear(s) - own for s in sets if not set(s) > set(self.active)}  # additions were tried already
-        alike = {k for s, k in exchanges.items() if values[s] > -CLOSE}
-        ranked = sorted(((list(s), v) for s, v in values.items() if v > -DOUBT), key=lambda v: -v[1])
-        ranked = [v for i, v in enumerate(ranked) if i < RIVALS[0] or (i < RIVALS[1] and v[1] > -CLOSE)]
-        pairs = self._pairs([k for k in usable if k not in alike and not self.problem.switches[k]], own)
-        known = {tuple(s) for s, _ in ranked}
-        return ranked + [v for v in sorted(pairs, key=lambda v: -v[1]) if tuple(v[0]) not in known][:PAIRS]
-
-    def _linear(self, active: Sequence[int]) -> float:
-        """Evidence of a set by the linear statistics, less what its names cost."""
-        return log_evidence(self.point.information, self.point.score, self.priors, active) - self._toll(active)
-
-    def _pairs(self, usable: Sequence[int], own: float) -> list[tuple[list[int], float]]:
-        """Sets with two more effects beside all names but up to two, which come close to the present one or go beyond it.
-
-        Of two effects that hide each other neither is worth a name alone, nor is one in place of one where two say the same as two.
-
-        Args:
-            usable: what the two are chosen among.
-            own: evidence of the present set.
-        """
-        found, most = [], len(self.active)
-        for rest in (c for size in range(max(most - EXCHANGED, 0), most + 1) for c in combinations(self.active, size)):
-            gain = pair_additions(self.point.information, self.point.score, self.priors, rest)
-            gain = (gain + self._linear(rest) - 2.0 * self.least - own)[np.ix_(usable, usable)]
-            near = FAR if len(rest) + 2 == most else CLOSE
-            found += [(sorted([*rest, usable[i], usable[j]]), float(gain[i, j])) for i, j in np.argwhere(np.triu(gain > -near))]
-        return found
 
 
 def explain(
