@@ -77,6 +77,10 @@ DUSTY, DUST = "+dust", 0.5
 """End of the kinds whose worlds have some of every other effect, and its deviation in floors."""
 SMALLEST, LARGEST = 3.0, 30.0
 """Sizes of the completeness curves [floors]."""
+NEAREST, NEXT = 3.0, 8.0
+"""Those about the limits themselves, which lie at 4 to 9 floors."""
+LIMIT = "limit:"
+"""Begin of the kinds that hide one effect, by its name, about its limit."""
 FAINTEST, PLAINEST = 1.0, 15.0
 """Those of the curves with a camera, whose limits lie at 5 or 6 floors."""
 
@@ -256,7 +260,7 @@ def run_world(recipe: Recipe, device: str = "cpu", verdicts: Path | None = None,
 
 
 def drawn(kind: str, number: int) -> Recipe:
-    """A world of a kind: ``null``, ``law``, ``curve``, ``flights`` or ``EFFECTSxFLOORS``; ``sight``, ``camera``, ``clear``.
+    """A world of a kind: ``null``, ``law``, ``curve``, ``limit:NAME``, ``flights`` or ``EFFECTSxFLOORS``; ``sight``, ``camera``, ``clear``.
 
     The last three have a camera. ``curve`` and ``sight`` hide one of the effects whose limits are asked for, ``camera`` any of a
     camera's, ``clear`` none. ``KIND+dust`` is the same with some of every other effect.
@@ -270,6 +274,8 @@ def drawn(kind: str, number: int) -> Recipe:
         ends, names = ((FAINTEST, PLAINEST), SIGHT) if kind == "sight" else ((SMALLEST, LARGEST), tuple(CAMERA_FLOORS))
         floors = float(np.exp(rng.uniform(*np.log(ends))))
         return draw(number, 1, floors, names=(str(rng.choice(names)),), camera=True)
+    if kind.startswith(LIMIT):
+        return draw(number, 1, float(np.exp(rng.uniform(*np.log((NEAREST, NEXT))))), names=(kind.removeprefix(LIMIT),))
     if kind == "null":
         rough = {"noise": float(rng.choice([0.5, 1.0, 2.0])), "gusts": float(rng.choice([0.5, 1.0, 2.0]))}
         return draw(number, 0, 0.0, dropouts=float(rng.choice([0.0, 0.1])), **rough)
@@ -324,7 +330,7 @@ def warm(plant: str) -> None:
 def main() -> None:
     """Run a bank of sealed worlds and add it to a ledger; worlds that are there are not run again."""
     parser = argparse.ArgumentParser(description=main.__doc__)
-    kinds = "null, law, curve, flights, EFFECTSxFLOORS, any of these +dust; with a camera sight, camera, clear: null=20 1x15=30"
+    kinds = "null, law, curve, limit:NAME, flights, EFFECTSxFLOORS, any of these +dust; with a camera sight, camera, clear: null=20 1x15=30"
     parser.add_argument("worlds", nargs="*", metavar="KIND=COUNT", help=kinds)
     parser.add_argument("--seed", type=int, help="of the first world; drawn by the system where not given")
     parser.add_argument("--ledger", type=Path, default=Path("ledger.jsonl"))
