@@ -260,9 +260,9 @@ def run_world(recipe: Recipe, device: str = "cpu", verdicts: Path | None = None,
 
 
 def drawn(kind: str, number: int) -> Recipe:
-    """A world of a kind: ``null``, ``law``, ``curve``, ``limit:NAME``, ``flights`` or ``EFFECTSxFLOORS``; ``sight``, ``camera``, ``clear``.
+    """A world of a kind: ``null``, ``law``, ``curve``, ``limit:NAME``, ``flights`` or ``EFFECTSxFLOORS``; those with a camera.
 
-    The last three have a camera. ``curve`` and ``sight`` hide one of the effects whose limits are asked for, ``camera`` any of a
+    These are ``sight``, ``camera`` and ``clear``. ``curve`` and ``sight`` hide one of the effects whose limits are asked for, ``camera`` any of a
     camera's, ``clear`` none. ``KIND+dust`` is the same with some of every other effect.
     """
     if kind.endswith(DUSTY):
@@ -330,7 +330,7 @@ def warm(plant: str) -> None:
 def main() -> None:
     """Run a bank of sealed worlds and add it to a ledger; worlds that are there are not run again."""
     parser = argparse.ArgumentParser(description=main.__doc__)
-    kinds = "null, law, curve, limit:NAME, flights, EFFECTSxFLOORS, any of these +dust; with a camera sight, camera, clear: null=20 1x15=30"
+    kinds = "null, law, curve, limit:NAME, flights, EFFECTSxFLOORS, any of these +dust; with a camera sight, camera, clear"
     parser.add_argument("worlds", nargs="*", metavar="KIND=COUNT", help=kinds)
     parser.add_argument("--seed", type=int, help="of the first world; drawn by the system where not given")
     parser.add_argument("--ledger", type=Path, default=Path("ledger.jsonl"))
