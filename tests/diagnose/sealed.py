@@ -262,8 +262,9 @@ def run_world(recipe: Recipe, device: str = "cpu", verdicts: Path | None = None,
 def drawn(kind: str, number: int) -> Recipe:
     """A world of a kind: ``null``, ``law``, ``curve``, ``limit:NAME``, ``flights`` or ``EFFECTSxFLOORS``; those with a camera.
 
-    These are ``sight``, ``camera`` and ``clear``. ``curve`` and ``sight`` hide one of the effects whose limits are asked for, ``camera`` any of a
-    camera's, ``clear`` none. ``KIND+dust`` is the same with some of every other effect.
+    These are ``sight``, ``camera`` and ``clear``. ``curve`` and ``sight`` hide one of the effects whose limits are asked for,
+    ``limit:NAME`` the one that it names, about its limit, ``camera`` any of a camera's, ``clear`` none. ``KIND+dust`` is the same
+    with some of every other effect.
     """
     if kind.endswith(DUSTY):
         return replace(drawn(kind.removesuffix(DUSTY), number), dust=DUST)
