@@ -96,6 +96,20 @@ def test_two_effects_that_hide_each_other_are_named_together(beside):
     assert not any({"effect_03", "effect_07"} & set(step.named.split()) for step in diagnosis.steps)
 
 
+def test_a_law_is_not_shared_out_among_two_effects_that_hide_each_other():
+    """They would take what it does in one phase, and leave the rest unexplained."""
+
+    def change(model, window):
+        columns, by_law = window.effects.copy(), model.by_law[[w is window for w in model._windows].index(True)]
+        columns[:, 7] = (by_law / (14.0 * EFFECTS[7].floor) if window.phase == "flight" else 0.0) - columns[:, 3]
+        return replace(window, effects=columns)
+
+    model = altered(change, seed=3, law="swirl", law_size=0.1)
+    diagnosis = search.explain(model, laws=False)
+    assert diagnosis.overall == result.UNKNOWN
+    assert not {"effect_03", "effect_07"} & set(diagnosis.named)
+
+
 @pytest.mark.slow
 def test_mirror_config_is_wrong_instead_of_the_world():
     """A model that has what the world lacks gets the opposite correction."""

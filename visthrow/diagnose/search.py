@@ -19,6 +19,7 @@ from visthrow.diagnose.evidence import (
     estimate,
     threshold,
 )
+from visthrow.diagnose.excess import levels
 from visthrow.diagnose.marginal import Statistics
 from visthrow.diagnose.model import Model
 from visthrow.diagnose.point import (
@@ -34,6 +35,7 @@ from visthrow.diagnose.point import (
     to_gain,
     with_all_effects_noise,
     with_fitted_noise,
+    with_floors_noise,
 )
 from visthrow.diagnose.result import Diagnosis, Step
 from visthrow.diagnose.rivals import CLOSE, rivals
@@ -364,7 +366,7 @@ class Search:
                 point = self._candidate(self.point, rival)
                 ahead = self._ahead((point, rival), (self.point, self.active))
                 ahead += self.least * (len(self.active) - len(rival))  # every name costs the threshold
-                if ahead > 1.0 and not all(self._fits_in(point, rival, j) for j in rival if j not in self.active):
+                if ahead > 1.0 and not self._believed(point, rival):
                     continue
                 if ahead > -CLOSE:
                     self.sets.append((tuple(rival), float(-ahead)))
@@ -378,6 +380,17 @@ class Search:
             self.point = self._settle(winner[2], self.active)
             distances = ((members, n + winner[0]) for members, n in self.sets if set(members) != set(self.active))
             self.sets = [(tuple(self.active), 0.0), *((members, n) for members, n in distances if n < CLOSE)]
+
+    def _believed(self, point: Point, rival: Sequence[int]) -> bool:
+        """Whether a set that says more may be named: two new names at once if they leave nothing to explain.
+
+        Where a law is missing that the catalogue lacks, pairs that hide each other take a part of it each.
+        """
+        new = [j for j in rival if j not in self.active]
+        if not all(self._fits_in(point, rival, j) for j in new):
+            return False
+        left = levels(self.nominal, with_floors_noise(self.problem, point, rival), self.least) if len(new) > 1 else ()
+        return not any(level.excessive for level in left)
 
     def _fits_in(self, point: Point, rival: Sequence[int], j: int) -> bool:
         """Whether an effect of a rival set could be named, and is the same in all flights."""

@@ -15,7 +15,7 @@ from sim.cores import cores as cores
 T = TypeVar("T")
 R = TypeVar("R")
 
-MOST = 8  # threads, beyond which Python's own share of the work is all that is left
+MOST = 4  # threads: with 8, a diagnosis on 16 cores waited an eighth longer, for Python itself
 
 
 def single() -> None:
