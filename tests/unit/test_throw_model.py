@@ -13,6 +13,7 @@ from sim.params import SensingParams
 from tests.flown import fly, setting_with
 from tests.plants import paper_plant
 from visthrow import config
+from visthrow.diagnose import settling
 from visthrow.diagnose.catalogue import ALL
 from visthrow.diagnose.evidence import Priors
 from visthrow.diagnose.opened import opened
@@ -100,6 +101,22 @@ def test_landings_are_predicted_from_before_the_throw(planted):
     assert wrong.released_errors[0] > 0.02
     np.testing.assert_array_equal(model.landing_errors(PLANTED), right.errors)
     assert len(model.landings({}, [0]).flights) == 0  # a free flight has none
+
+
+def test_dampings_tried_at_once_settle_states_sooner(planted, monkeypatch):
+    """With the same cost in the end: a window that falls short of its promise looks for its damping in one round."""
+    logs, rounds, costs, seen, tried = planted[0], [], [], [], Settling._tried
+    monkeypatch.setattr(Settling, "_tried", lambda self, *a: seen.append(1) or tried(self, *a))
+    for ladder in (settling.LADDER, settling.LADDER[:1]):
+        seen.clear()
+        monkeypatch.setattr(settling, "LADDER", ladder)
+        model = ThrowModel(logs, paper_plant(), only=list(PLANTED))
+        (states, _), windows = model._fitted(), np.arange(len(model.flights.cuts))
+        fit = model._settling(model.setting)
+        costs.append(sum(fit._cost(w, residual) for w, residual in zip(windows, fit._residuals(states, windows))))
+        rounds.append(len(seen))
+    assert rounds[0] < 0.8 * rounds[1]
+    assert costs[0] < 1.01 * costs[1]
 
 
 def test_one_throw_s_landing_rests_on_what_was_fitted_to_all(monkeypatch):
