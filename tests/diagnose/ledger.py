@@ -18,7 +18,7 @@ from statistics import NormalDist
 
 import numpy as np
 
-from tests.diagnose.sealed import NOT_WAITED, TERMS, near
+from tests.diagnose.sealed import NOT_WAITED, TERMS, matched
 from tests.worlds.world import ALL_FLOORS, CAMERA_FLOORS
 
 DRAG = 0.51 / 1.04e-3
@@ -122,15 +122,10 @@ def truth_of(world: dict) -> set[str]:
 
 def names(world: dict) -> tuple[int, int, int, int]:
     """Names given, right up to class, right and alone, and hidden effects that were found."""
-    truth, hits, exact, right = truth_of(world), set(), 0, 0
-    groups = [set(g) for g in world.get("named", ())]
-    for group in groups:
-        new = near(group, truth) - hits
-        if new:
-            right += 1
-            exact += int(bool(group & truth) and len(group) == 1)
-            hits |= new
-    return len(groups), right, exact, len(hits)
+    truth, groups = truth_of(world), [set(g) for g in world.get("named", ())]
+    stands_for = matched(groups, truth)
+    right = sum(map(bool, stands_for))
+    return len(groups), right, sum(group == {name} for group, name in zip(groups, stands_for)), right
 
 
 def accuracy(worlds: Sequence[dict]) -> list[str]:

@@ -189,6 +189,20 @@ def near(group: set[str], truth: set[str]) -> set[str]:
     return {n for n in truth if group & ({n} | set().union(*(a for a in ALIKE if n in a)))}
 
 
+def matched(groups: list[set[str]], truth: set[str]) -> list[str]:
+    """For each name, or class of names, the hidden effect that it stands for, each once; "" where there is none.
+
+    Those that are hidden stand for themselves before what flights hardly tell from others stands for these.
+    """
+    out, left = [""] * len(groups), set(truth)
+    for meant in (set.intersection, near):
+        for i in sorted(range(len(groups)), key=lambda i: len(groups[i])):
+            if not out[i] and (possible := meant(groups[i], left)):
+                out[i] = min(possible)
+                left.remove(out[i])
+    return out
+
+
 def judge(recipe: Recipe, verdict: dict) -> dict:
     """Compare a verdict with the truth.
 
@@ -199,14 +213,9 @@ def judge(recipe: Recipe, verdict: dict) -> dict:
     truth = {n for n in recipe.effects if not n.startswith("law_")}
     groups = named_by(verdict)
     own = all(any(n in group for group in groups) for n in truth) and len(groups) == len(truth)
-    hits, exact, wrong = set(), 0, 0
-    for group in groups:
-        meant = near(group, truth)
-        if meant - hits:
-            exact += int(bool(group & truth) and len(group) == 1)
-            hits |= meant
-        else:
-            wrong += 1
+    stands_for = matched(groups, truth)
+    exact = sum(group == {name} for group, name in zip(groups, stands_for))
+    hits, wrong = set(stands_for) - {""}, stands_for.count("")
     return {
         "exact": exact == len(truth) == len(groups), "class": hits == truth and not wrong, "wrong": wrong,
         "missed": len(truth - hits), "named": [sorted(g) for g in groups], "overall": verdict["overall"],

@@ -32,6 +32,16 @@ def drawn_curve(rng, count: int) -> tuple[np.ndarray, np.ndarray]:
     return size, rng.random(count) < 1.0 / (1.0 + np.exp(-(-6.0 + 3.5 * np.log(size))))
 
 
+def test_hidden_effects_that_look_alike_count_once_each():
+    """Thrust and mass, hidden together: each name stands for its own, a class for one, and no name for two."""
+    both = {"thrust_gain", "mass_quad"}
+    assert sealed.matched([{"mass_quad"}, {"thrust_gain"}], both) == ["mass_quad", "thrust_gain"]
+    assert sealed.matched([{"thrust_gain", "mass_quad"}, {"mass_quad"}], both) == ["thrust_gain", "mass_quad"]
+    assert sealed.matched([{"air_density"}], both) == ["mass_quad"]
+    assert sealed.matched([{"thrust_gain"}, {"air_density"}, {"wind_x"}], {"thrust_gain"}) == ["thrust_gain", "", ""]
+    assert ledger.names(world(dict.fromkeys(both, 0.01), [["mass_quad"], ["thrust_gain"]])) == (2, 2, 2, 2)
+
+
 def test_a_completeness_curve_is_found_again():
     curve = ledger.curve(*drawn_curve(np.random.default_rng(3), 600))
     value, low, high = curve.size(0.9)
