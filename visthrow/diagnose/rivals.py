@@ -72,8 +72,10 @@ def _with_pairs(search: "Search", usable: Sequence[int], own: float) -> list[tup
     """
     found, most = [], len(search.active)
     for rest in (c for size in range(max(most - EXCHANGED, 0), most + 1) for c in combinations(search.active, size)):
-        gain = pair_additions(search.point.information, search.point.score, search.priors, rest)
-        gain = (gain + _linear(search, rest) - 2.0 * search.least - own)[np.ix_(usable, usable)]
-        near = FAR if len(rest) + 2 == most else CLOSE
-        found += [(sorted([*rest, usable[i], usable[j]]), float(gain[i, j])) for i, j in np.argwhere(np.triu(gain > -near))]
+        given = search.point.information, search.point.score, search.priors, rest
+        gain, alone = pair_additions(*given)[np.ix_(usable, usable)], additions(*given)[usable]
+        each = gain - np.maximum.outer(alone, alone) > search.least - CLOSE  # is worth a name beside the other
+        gain += _linear(search, rest) - 2.0 * search.least - own
+        near = each & (gain > (-FAR if len(rest) + 2 == most else -CLOSE))
+        found += [(sorted([*rest, usable[i], usable[j]]), float(gain[i, j])) for i, j in np.argwhere(np.triu(near))]
     return found
