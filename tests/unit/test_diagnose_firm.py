@@ -39,3 +39,5 @@ def test_two_causes_that_may_be_two_others_are_told():
     sets = [(("lag", "drag"), 0.0), (("lag", "mass"), 0.4), (("mass", "curve"), 1.66), (("sag",), 2.9)]  # the second is a class
     told = instead(SimpleNamespace(theta={"lag": 1.0, "drag": 2.0}, sets=sets))
     assert told == ["curve, mass in place of drag, lag, 1.7 nats behind", "sag in place of drag, lag, 2.9 nats behind"]
+    assert instead(SimpleNamespace(theta={"lag": 1.0}, sets=sets)) == []  # a law took the place of one
+    assert instead(SimpleNamespace(theta={}, sets=())) == []

@@ -92,7 +92,8 @@ def _event(diagnosis: Diagnosis, flight: int) -> str:
 def instead(diagnosis: Diagnosis) -> list[str]:
     """A line for each set of causes that says the same with several others; single ones that do are told as a class."""
     lines, named = [], set(diagnosis.theta)
-    for names, behind in diagnosis.sets:
+    withdrawn = not diagnosis.sets or set(diagnosis.sets[0][0]) != named  # for a law
+    for names, behind in () if withdrawn else diagnosis.sets:
         gone, new = sorted(named - set(names)), sorted(set(names) - named)
         if max(len(gone), len(new)) > 1:
             lines.append(f"{', '.join(new) or 'nothing'} in place of {', '.join(gone) or 'nothing'}, {behind:.1f} nats behind")
