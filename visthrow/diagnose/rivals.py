@@ -49,7 +49,7 @@ def rivals(search: "Search") -> list[tuple[list[int], float]]:
     values = {s: _linear(search, s) - own for s in sets if not set(s) > set(active)}  # additions were tried already
     alike = {k for s, k in exchanges.items() if values[s] > -CLOSE}
     ranked = sorted(((list(s), v) for s, v in values.items() if v > -DOUBT), key=lambda v: -v[1])
-    ranked = [v for i, v in enumerate(ranked) if i < MOST or (i < MOST_CLOSE and v[1] > -CLOSE)]
+    ranked = [v for i, v in enumerate(ranked) if i < MOST or (i < MOST_CLOSE and abs(v[1]) < CLOSE)]
     pairs = _with_pairs(search, [k for k in usable if k not in alike and not search.problem.switches[k]], own)
     known = {tuple(s) for s, _ in ranked}
     return ranked + [v for v in sorted(pairs, key=lambda v: -v[1]) if tuple(v[0]) not in known][:PAIRS]
