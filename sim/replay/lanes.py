@@ -1,7 +1,7 @@
 """Launching the replay: parameters, windows, lanes and recorded data as arrays, split over the cores of a CPU."""
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
@@ -48,6 +48,7 @@ class Replay:
         device: Warp device, "cpu" or "cuda:0"; with a GPU, runs of few lanes go to the CPU all the same.
         precision: "float64", in which differences of lanes do not drown in rounding, or "float32".
         gravity: [m/s^2].
+        download: brings what the lanes saw to the host, hundreds of megabytes after a run of many.
 
     Raises:
         ValueError: plants of different blocks or segments, or an unphysical parameter.
@@ -60,6 +61,7 @@ class Replay:
         device: str = "cpu",
         precision: str = "float64",
         gravity: float = GRAVITY,
+        download: Callable[[wp.array], np.ndarray] = wp.array.numpy,
     ):
         first = plants[0]
         if len(sensings) != len(plants) or {p.rope.segments for p in plants} != {first.rope.segments}:
@@ -72,6 +74,7 @@ class Replay:
             check_release(plant.release)
             check_air(plant.air)
         self.device, self.gravity, self.segments, self._sim = device, gravity, first.rope.segments, first.sim
+        self._download = download
         self.types = t = types(precision)
         kinds = kinds_of(first.vehicle)
         check_laws(first.laws)
@@ -137,7 +140,7 @@ class Replay:
         ]  # fmt: skip
         for first, last in ((0, len(flown)), (len(flown), len(flown) + len(resumed))):
             self._launch(device, first, last, [*self._plants[device], *numerics, *given, order], [ends, held, marks, *left_at, out])
-        return Replayed(_downloaded(out), self._read(ends, rk.STATE_FIELDS), self._read(held, rk.KNOT_FIELDS))
+        return Replayed(self._download(out), self._read(ends, rk.STATE_FIELDS), self._read(held, rk.KNOT_FIELDS))
 
     def _launch(self, device: str, begin: int, end: int, before: list, after: list) -> None:
         """Some of the lanes, in one launch or one for each core: on the CPU it runs on one thread and leaves the others free."""
@@ -174,16 +177,6 @@ class Replay:
             name: np.swapaxes(getattr(struct, name).numpy(), 0, 1) if by_row else getattr(struct, name).numpy()
             for name, (_, by_row) in fields.items()
         }
-
-
-def _downloaded(array: wp.array) -> np.ndarray:
-    """What a GPU has written, by way of locked pages that torch keeps: fresh ones cost as much time as the copy."""
-    if not array.device.is_cuda:
-        return array.numpy()
-    import torch
-
-    there = wp.to_torch(array)
-    return torch.empty(there.shape, dtype=there.dtype, pin_memory=True).copy_(there).numpy()
 
 
 @cache

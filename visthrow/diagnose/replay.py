@@ -4,6 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
+import warp as wp
 
 from sim.replay.kernel import ATTACHED, LOOSE, NO_PAYLOAD, WINDOW_FIELDS
 from sim.replay.lanes import Replay, Replayed
@@ -182,6 +184,14 @@ class Flights:
         knots = max(1, int(np.max((given["keep"] + self.knots[given["window"]])[kept], initial=1)))
         windows = self.windows if ends is None else self.windows | {"end": ends}
         return replay.run(states, windows, given, self.data, KNOT_SPACING, knots)
+
+
+def downloaded(array: wp.array) -> np.ndarray:
+    """What a GPU has written, by way of locked pages that torch keeps: fresh ones cost as much time as the copy."""
+    if not array.device.is_cuda:
+        return array.numpy()
+    there = wp.to_torch(array)
+    return torch.empty(there.shape, dtype=there.dtype, pin_memory=True).copy_(there).numpy()
 
 
 def rough_step(setting: Setting, substep: float) -> float:

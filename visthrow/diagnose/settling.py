@@ -13,7 +13,7 @@ from sim.replay.kernel import ATTACHED
 from sim.replay.lanes import Replay
 from visthrow.diagnose.catalogue import Setting
 from visthrow.diagnose.model import Window
-from visthrow.diagnose.replay import Flights, Lane
+from visthrow.diagnose.replay import Flights, Lane, downloaded
 from visthrow.diagnose.states import Direction, States, concerns, moved, moved_along, rows_of, stacked
 from visthrow.diagnose.threads import each
 
@@ -82,7 +82,7 @@ class Settling:
         self.flights, self.told, self.directions, self.setting = flights, told, directions, setting
         self.substep = substep
         self.slopes: dict[int, np.ndarray] = {}  # of windows' samples by their states, where they were taken last
-        self.replay = Replay([setting.plant], [setting.sensing], device)
+        self.replay = Replay([setting.plant], [setting.sensing], device, download=downloaded)
         self._free = [
             [d for d, x in enumerate(directions) if concerns(x, cut) and x.field not in TRUSTED] for cut in flights.cuts
         ]  # directions in which windows' initial states are fitted

@@ -18,7 +18,7 @@ from visthrow.diagnose.linearising import Plan, exact, lanes_of, still
 from visthrow.diagnose.model import Linearised, Window
 from visthrow.diagnose.opened import opened
 from visthrow.diagnose.recorded import NEVER, carriers, record_of
-from visthrow.diagnose.replay import BATCH, CUDA_BATCH, Flights, Lane, carried
+from visthrow.diagnose.replay import BATCH, CUDA_BATCH, Flights, Lane, carried, downloaded
 from visthrow.diagnose.settling import Settling, following, perturbed
 from visthrow.diagnose.sightings import channels_of, needs_no_flight, sightings, with_sightings
 from visthrow.diagnose.states import (
@@ -248,7 +248,7 @@ class ThrowModel:
         return setting, self._settled(setting)
 
     def _replay(self, settings: Sequence[Setting]) -> Replay:
-        return Replay([s.plant for s in settings], [s.sensing for s in settings], self.device)
+        return Replay([s.plant for s in settings], [s.sensing for s in settings], self.device, download=downloaded)
 
     def _begin(self, setting: Setting) -> States:
         """Initial states to start a fit from."""
