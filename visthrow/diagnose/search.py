@@ -112,6 +112,7 @@ class Search:
 
         if self.point is None:
             self.point = self.origin = self.nominal
+        compared: set[int] | None = None
         for _ in range(EXCHANGES):
             while len(self.active) < MOST_NAMES and (self._forward() or self._mean()):
                 self._backward()
@@ -119,8 +120,11 @@ class Search:
                     self.progress("a law that the catalogue does not hold explains this better than one name after the other")
                     return
             named = set(self.active)
+            if named == compared:
+                return
             self._joint()
-            if set(self.active) == named:
+            compared = set(self.active)
+            if compared == named:
                 return
 
     def _ahead(self, first: tuple[Point, Sequence[int]], second: tuple[Point, Sequence[int]]) -> float:
@@ -357,7 +361,7 @@ class Search:
             self.point = self._settle(without, rest)
 
     def _joint(self) -> None:
-        """Compare the set found with all small sets of the best effects, and with itself with one effect exchanged."""
+        """Compare the set found with its rivals by running the simulation, and go over to the best of them."""
         for _ in range(2):
             ranked = rivals(self)
             self.sets = [(tuple(self.active), 0.0)]
