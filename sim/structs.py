@@ -127,6 +127,12 @@ def types(precision: str) -> Types:
     return Types(wp.float32 if precision == "float32" else wp.float64)
 
 
+@lru_cache
+def _numpy_type(struct: type) -> np.dtype:
+    """Of the rows of a struct; Warp works it out anew each time."""
+    return struct.numpy_dtype()
+
+
 def _fill(row: np.void, value) -> None:
     for f in dataclasses.fields(value):
         if f.name not in row.dtype.names:
@@ -204,7 +210,7 @@ def pack_vehicle(t: Types, vehicles: list[P.VehicleParams], kinds: tuple[str, st
     Raises:
         ValueError: other kinds of blocks, or a vehicle that :func:`sim.checks.check_vehicle` refuses.
     """
-    rows = np.zeros(len(vehicles), dtype=t.Vehicle.numpy_dtype())
+    rows = np.zeros(len(vehicles), dtype=_numpy_type(t.Vehicle))
     for row, vehicle in zip(rows, vehicles, strict=True):
         if kinds_of(vehicle) != kinds:
             raise ValueError(
@@ -230,7 +236,7 @@ def _place_rotors(row: np.void, vehicle: P.VehicleParams) -> None:
 
 def pack(struct: type, *values) -> np.ndarray:
     """Structured array for ``wp.array(dtype=struct)``, a row filled from each of the dataclasses it was derived from."""
-    rows = np.zeros(len(values), dtype=struct.numpy_dtype())
+    rows = np.zeros(len(values), dtype=_numpy_type(struct))
     for row, value in zip(rows, values, strict=True):
         _fill(row, value)
     return rows
@@ -273,7 +279,7 @@ def pack_rope(t: Types, ropes: list[P.RopeParams]) -> np.ndarray:
     Raises:
         ValueError: a rope that :func:`sim.checks.check_rope` refuses.
     """
-    rows = np.zeros(len(ropes), dtype=t.Rope.numpy_dtype())
+    rows = np.zeros(len(ropes), dtype=_numpy_type(t.Rope))
     for row, rope in zip(rows, ropes, strict=True):
         check_rope(rope)
         length, mass = rope.length / rope.segments, rope.rope_mass / rope.segments

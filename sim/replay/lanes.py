@@ -16,7 +16,7 @@ from sim.cores import cores
 from sim.laws import check_laws, structure
 from sim.params import GRAVITY, PlantParams, SensingParams
 from sim.replay import kernel as rk
-from sim.structs import kinds_of, pack, pack_air, pack_rope, pack_vehicle, ropes_on, types
+from sim.structs import Types, kinds_of, pack, pack_air, pack_rope, pack_vehicle, ropes_on, types
 
 
 @dataclass(frozen=True)
@@ -31,9 +31,35 @@ class Replayed:
     seen: np.ndarray  # shape (rows, lanes, 3)
     ends: dict[str, np.ndarray]  # states at the end of the windows of lanes that keep, as ``starts``; others undefined
     knots: dict[str, np.ndarray]  # fields of KNOT_FIELDS at the knots of lanes that keep, by the rows of ``keep``
+    # Both are empty where no lane keeps.
+
+
+class Recording:
+    """Windows and the flights that they are of, brought to a device once for all runs; the arrays must not change."""
+
+    def __init__(self, windows: Mapping[str, np.ndarray], data: Mapping[str, np.ndarray]):
+        """Keep them.
+
+        Args:
+            windows: fields of ``kernel.WINDOW_FIELDS``, shape (W,).
+            data: fields of ``kernel.DATA_FIELDS``, flights one after the other.
+        """
+        self.windows, self.data = windows, data
+        self.rows = 2 * windows["vehicle_count"] + windows["payload_count"] + windows["gyro_count"]
+        self.seconds = windows["end"] - windows["start"]
+        self._there: dict[tuple[rk.ReplayKernel, str], tuple] = {}
+
+    def on(self, kernel: rk.ReplayKernel, t: Types, device: str) -> tuple:
+        """Both as a kernel's structs on a device."""
+        if (kernel, device) not in self._there:
+            structs = (kernel.Windows, rk.WINDOW_FIELDS, self.windows), (kernel.Data, rk.DATA_FIELDS, self.data)
+            self._there[kernel, device] = tuple(_struct(t, *given, device) for given in structs)
+        return self._there[kernel, device]
 
 
 _BUILDS: dict = {}
+
+PIECES = 4  # of the lanes for each core of a CPU
 
 FEW = 32
 """Lanes a core up to which a CPU has flown them all before a GPU has flown one: there each takes some 50 times as long."""
@@ -95,9 +121,8 @@ class Replay:
     def run(
         self,
         starts: Mapping[str, np.ndarray],
-        windows: Mapping[str, np.ndarray],
+        recording: Recording,
         lanes: Mapping[str, np.ndarray],
-        data: Mapping[str, np.ndarray],
         knot_spacing: float,
         knots: int = 1,
     ) -> Replayed:
@@ -105,71 +130,69 @@ class Replay:
 
         Args:
             starts: fields of ``kernel.STATE_FIELDS``, shape (S, ...), rope fields (S, L, ...).
-            windows: fields of ``kernel.WINDOW_FIELDS``, shape (W,).
+            recording: what is flown.
             lanes: fields of ``kernel.LANE_FIELDS``, shape (lanes,).
-            data: fields of ``kernel.DATA_FIELDS``, flights one after the other.
             knot_spacing: between knots of the latent forces [s].
             knots: rows of the knot arrays.
         """
-        k = self.kernel
+        k, t = self.kernel, self.types
         count = len(lanes["window"])
         device = self.device if count > FEW * cores() else "cpu"
         if device not in self._plants:
             self._plants[device] = [wp.array(value, dtype=struct, device=device) for struct, value in self._rows.items()]
         w = np.asarray(lanes["window"])
-        rows = 2 * windows["vehicle_count"] + windows["payload_count"] + windows["gyro_count"]
-        height = max(int(np.max(rows[w])), 1)
+        height = max(int(np.max(recording.rows[w])), 1)
         segments = {"cable_dir_w": self.segments, "cable_vel_w": self.segments, "stiffness": self.segments}
-        keeping = count if np.any(np.asarray(lanes["keep"]) >= 0) else 1
-        ends = st.allocate(self.types, k.State, rk.STATE_FIELDS, keeping, segments, device)
-        held = st.allocate(self.types, k.Knots, rk.KNOT_FIELDS, knots, {}, device)
-        out = wp.empty((height, count), dtype=self.types.vec3, device=device)
+        keeps = bool(np.any(np.asarray(lanes["keep"]) >= 0))
+        if keeps:
+            ends = st.allocate(t, k.State, rk.STATE_FIELDS, count, segments, device)
+            held = st.allocate(t, k.Knots, rk.KNOT_FIELDS, knots, {}, device)
+        else:
+            ends, held = k.State(), k.Knots()
+        out = wp.empty((height, count), dtype=t.vec3, device=device)
         resumed = np.asarray(lanes["resume"]) >= 0
-        moments, vec3 = knots if np.any(resumed) else 0, self.types.vec3
-        ropes = [wp.empty((moments, self.segments), dtype=kind, device=device) for kind in (vec3, vec3, self.types.real)]
+        moments, vec3 = knots if np.any(resumed) else 0, t.vec3
+        ropes = [wp.empty((moments, self.segments), dtype=kind, device=device) for kind in (vec3, vec3, t.real)]
         left_at = [wp.empty(moments, dtype=k.Moment, device=device), *ropes]
         marks = wp.zeros(count, dtype=k.Pointers, device=device)
-        flown, resumed = _in_order(np.asarray(lanes["rides"]), resumed)
-        order = wp.array(np.concatenate((flown, resumed)), dtype=wp.int32, device=device)
+        costs = recording.seconds[w] / np.asarray(lanes["substep"])
+        launches = [rows[np.argsort(-costs[rows], kind="stable")] for rows in _in_order(np.asarray(lanes["rides"]), resumed)]
+        order = wp.array(np.concatenate(launches), dtype=wp.int32, device=device)
         numerics = [knot_spacing, self._sim.gamma, self._sim.max_turn, self.gravity]
-        given = [
-            self._struct(struct, fields, values, device) for struct, fields, values in (
-                (k.State, rk.STATE_FIELDS, starts), (k.Windows, rk.WINDOW_FIELDS, windows),
-                (k.Lanes, rk.LANE_FIELDS, lanes), (k.Data, rk.DATA_FIELDS, data),
-            )
-        ]  # fmt: skip
-        for first, last in ((0, len(flown)), (len(flown), len(flown) + len(resumed))):
-            self._launch(device, first, last, [*self._plants[device], *numerics, *given, order], [ends, held, marks, *left_at, out])
-        return Replayed(self._download(out), self._read(ends, rk.STATE_FIELDS), self._read(held, rk.KNOT_FIELDS))
+        told = (k.State, rk.STATE_FIELDS, starts), (k.Lanes, rk.LANE_FIELDS, lanes)
+        (begin, flown), (windows, data) = (_struct(t, *given, device) for given in told), recording.on(k, t, device)
+        before = [*self._plants[device], *numerics, begin, windows, flown, data, order]
+        after, first = [ends, held, marks, *left_at, out], 0
+        for rows in launches:
+            self._launch(device, first, costs[rows], before, after)
+            first += len(rows)
+        read = (self._read(ends, rk.STATE_FIELDS), self._read(held, rk.KNOT_FIELDS)) if keeps else ({}, {})
+        return Replayed(self._download(out), *read)
 
-    def _launch(self, device: str, begin: int, end: int, before: list, after: list) -> None:
-        """Some of the lanes, in one launch or one for each core: on the CPU it runs on one thread and leaves the others free."""
-        if end <= begin:
+    def _launch(self, device: str, begin: int, costs: np.ndarray, before: list, after: list) -> None:
+        """Some of the lanes, in one launch or a few for each core: on the CPU it runs on one thread and leaves the others free.
+
+        Args:
+            device: to launch on.
+            begin: place of the first in the order.
+            costs: of each, in any unit; the longest come first, so that no core is left with one of them in the end.
+            before: arguments that come before the place of the first.
+            after: those that come after it.
+        """
+        if not len(costs):
             return
         if device != "cpu":
-            wp.launch(self.kernel.replay, end - begin, [*before, begin, *after], device=device, block_dim=64)
+            wp.launch(self.kernel.replay, len(costs), [*before, begin, *after], device=device, block_dim=64)
             wp.synchronize_device(device)
             return
         self.kernel.replay.module.load("cpu")
-        pieces = np.linspace(begin, end, min(4 * cores(), end - begin) + 1).astype(int)
 
         def launch(first: int, last: int) -> None:
-            wp.launch(self.kernel.replay, last - first, [*before, int(first), *after], device="cpu")
+            wp.launch(self.kernel.replay, last - first, [*before, begin + first, *after], device="cpu")
 
-        for done in [_pool(cores()).submit(launch, a, b) for a, b in zip(pieces[:-1], pieces[1:])]:
+        marks = _shared_out(costs, PIECES * cores())
+        for done in [_pool(cores()).submit(launch, a, b) for a, b in zip(marks[:-1], marks[1:])]:
             done.result()
-
-    def _struct(self, struct: type, fields: Mapping, values: Mapping[str, np.ndarray], device: str):
-        t = self.types
-        scalar = {"real": t.real, "int": wp.int32, "vec3": t.vec3, "vec4": t.vec4, "quat": t.quat}
-        numpy = {"int": np.int32}
-        real = np.float32 if t.real is wp.float32 else np.float64
-        out = struct()
-        for name, (kind, by_row) in fields.items():
-            value = np.asarray(values[name], dtype=numpy.get(kind, real))
-            value = np.ascontiguousarray(np.swapaxes(value, 0, 1) if by_row else value)
-            setattr(out, name, wp.array(value, dtype=scalar[kind], device=device))
-        return out
 
     @staticmethod
     def _read(struct, fields: Mapping) -> dict[str, np.ndarray]:
@@ -177,6 +200,25 @@ class Replay:
             name: np.swapaxes(getattr(struct, name).numpy(), 0, 1) if by_row else getattr(struct, name).numpy()
             for name, (_, by_row) in fields.items()
         }
+
+
+def _struct(t: Types, struct: type, fields: Mapping, values: Mapping[str, np.ndarray], device: str):
+    """Arrays of the fields in an instance of a struct."""
+    scalar = {"real": t.real, "int": wp.int32, "vec3": t.vec3, "vec4": t.vec4, "quat": t.quat}
+    real = np.float32 if t.real is wp.float32 else np.float64
+    out = struct()
+    for name, (kind, by_row) in fields.items():
+        value = np.asarray(values[name], dtype=np.int32 if kind == "int" else real)
+        value = np.ascontiguousarray(np.swapaxes(value, 0, 1) if by_row else value)
+        setattr(out, name, wp.array(value, dtype=scalar[kind], device=device))
+    return out
+
+
+def _shared_out(costs: np.ndarray, pieces: int) -> list[int]:
+    """Bounds of at most so many runs of lanes that cost about the same, each of at least one lane."""
+    total = np.cumsum(costs)
+    inside = np.searchsorted(total, total[-1] / pieces * np.arange(1, pieces)) + 1
+    return np.unique([0, *inside.tolist(), len(costs)]).tolist()
 
 
 @cache

@@ -24,7 +24,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.worlds.world import CAMERA_FLOORS, PLANTS, Recipe, draw, dust_of, fly_recipe, recorded
+from tests.worlds.world import CAMERA_FLOORS, FLOORS, PLANTS, Recipe, draw, dust_of, fly_recipe, recorded
 from visthrow.diagnose.threads import single
 from visthrow.errors import VisthrowError
 from visthrow.flightlog import Channel, FlightLog
@@ -285,7 +285,10 @@ def drawn(kind: str, number: int) -> Recipe:
         floors = float(np.exp(rng.uniform(*np.log(ends))))
         return draw(number, 1, floors, names=(str(rng.choice(names)),), camera=True)
     if kind.startswith(LIMIT):
-        return draw(number, 1, float(np.exp(rng.uniform(*np.log((NEAREST, NEXT))))), names=(kind.removeprefix(LIMIT),))
+        name = kind.removeprefix(LIMIT)
+        if name not in FLOORS:
+            raise ValueError(f"kind {kind!r}: there is no effect {name!r}; there are {', '.join(FLOORS)}")
+        return draw(number, 1, float(np.exp(rng.uniform(*np.log((NEAREST, NEXT))))), names=(name,))
     if kind == "null":
         rough = {"noise": float(rng.choice([0.5, 1.0, 2.0])), "gusts": float(rng.choice([0.5, 1.0, 2.0]))}
         return draw(number, 0, 0.0, dropouts=float(rng.choice([0.0, 0.1])), **rough)

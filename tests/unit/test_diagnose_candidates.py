@@ -101,6 +101,7 @@ def test_a_name_that_a_later_one_left_with_hardly_any_size_is_dropped(monkeypatc
         return plain(self, point, active, j) and not (j == other and len(active) > 1 and active[-1] != other)
 
     monkeypatch.setattr(search.Search, "_sure", sure)
+    monkeypatch.setattr(search.Search, "_joint", lambda _: None)  # alone it would be a better answer than the other alone
     hidden = {NAME: SIZE, EFFECTS[other].name: 3.0 * SIZE}
     said = []
     diagnosis = search.explain(SyntheticModel(effects=EFFECTS, truth=hidden, seed=5), laws=False, progress=said.append)

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from sim.hybrid import HybridSim
 from sim.params import SensingParams
 from sim.replay import kernel as rk
-from sim.replay.lanes import Replay, _pool
+from sim.replay.lanes import Recording, Replay, _pool
 from sim.structs import EXTENSIONS
 from tests.plants import paper_plant
 
@@ -66,7 +66,7 @@ def replay(flight, plants, sensings=None, count=1, stamps=None, end=0.02 * PERIO
              "parent": -1, "rides": 0} | lane  # fmt: skip
     lanes = {name: np.broadcast_to(value, count).copy() for name, value in lanes.items()}
     engine = Replay(plants, sensings or [SensingParams()] * len(plants))
-    flown = engine.run(start, {k: one(v) for k, v in windows.items()}, lanes, data, 0.1, 9)
+    flown = engine.run(start, Recording({k: one(v) for k, v in windows.items()}, data), lanes, 0.1, 9)
     out = flown.seen
     return {"pos": out[0 : 2 * n : 2], "turn": out[1 : 2 * n : 2], "payload": out[2 * n : 2 * n + m],
             "rate": out[2 * n + m : 3 * n + m]}, flown  # fmt: skip

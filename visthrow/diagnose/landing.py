@@ -15,7 +15,7 @@ from sim.replay.kernel import ATTACHED
 from sim.replay.lanes import Replay
 from visthrow.diagnose.cutting import BEFORE, GROUND_MARGIN, LEAST, LEAST_TAUT, Cut, payload_down
 from visthrow.diagnose.recorded import NEVER, Recorded, Samples
-from visthrow.diagnose.replay import Flights, Lane
+from visthrow.diagnose.replay import Flights, Lane, downloaded
 from visthrow.statistics import mean
 
 if TYPE_CHECKING:
@@ -137,7 +137,7 @@ def _fly(model: "ThrowModel", theta: Mapping[str, float], spans: Mapping[int, tu
     looked = [_with_path(f, ends.get(n)) for n, f in enumerate(model.flights.flights)]
     onward = Flights(looked, flown, (x.vehicle_delay, x.payload_delay, x.gyro_delay))
     lanes = [Lane(i, 0, w) for i, w in enumerate(told)]
-    replay = Replay([setting.plant], [setting.sensing], model.device)
+    replay = Replay([setting.plant], [setting.sensing], model.device, download=downloaded)
     seen = onward.fly(replay, [setting], states, lanes, model.substep).seen
     out = np.full((len(flown), 3), np.nan)
     for i, c in enumerate(flown):

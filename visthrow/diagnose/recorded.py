@@ -1,7 +1,7 @@
 """What a replay needs of a flight log: commands, release, and what was measured of vehicle, payload and gyro."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -23,6 +23,7 @@ class Samples:
     time: np.ndarray  # [s], shape (T,)
     values: np.ndarray  # shape (T, 3) or (T, 4)
     sigma: float  # of one component; of an attitude the angle's [rad]
+    near: dict = field(default_factory=dict, repr=False, compare=False)  # what they say about times that were asked for before
 
     def between(self, first: float, last: float) -> slice:
         """Samples with first <= time < last."""

@@ -8,7 +8,7 @@ import torch
 import warp as wp
 
 from sim.replay.kernel import ATTACHED, LOOSE, NO_PAYLOAD, WINDOW_FIELDS
-from sim.replay.lanes import Replay, Replayed
+from sim.replay.lanes import Recording, Replay, Replayed
 from visthrow.diagnose.catalogue import Setting
 from visthrow.diagnose.cutting import Cut
 from visthrow.diagnose.recorded import NEVER, Recorded, Samples
@@ -88,12 +88,13 @@ class Flights:
         self.windows = {k: v.astype(int) if WINDOW_FIELDS[k][0] == "int" else v for k, v in self.windows.items()}
         self.samples = parts
         self.rows = 2 * self.windows["vehicle_count"] + self.windows["payload_count"] + self.windows["gyro_count"]
-        self.data = {
+        data = {
             "command_time": np.concatenate([f.command_time for f in self.flights]),
             "command": np.concatenate([f.command for f in self.flights]),
             "vehicle_time": self._joined("vehicle").time, "vehicle_quat": self._joined("attitude").values,
             "payload_time": self._joined("payload").time, "gyro_time": self._joined("gyro").time,
         }  # fmt: skip
+        self.recording = Recording(self.windows, data)
 
     def _rows(self, source: Samples | None, c: Cut, delay: float) -> np.ndarray:
         if source is None:
@@ -163,7 +164,7 @@ class Flights:
         states: States,
         lanes: Sequence[Lane],
         substep: float,
-        ends: np.ndarray | None = None,
+        recording: Recording | None = None,
     ) -> Replayed:
         """Fly lanes; ``settings`` are those of the replay's rows.
 
@@ -173,7 +174,7 @@ class Flights:
             states: initial states that the lanes choose from.
             lanes: at most some thousand, for the memory's sake.
             substep: largest integration step [s].
-            ends: of the windows [s], shape (W,), where they end earlier; what is seen afterwards says nothing.
+            recording: the windows, if not as they are.
         """
         names = "window", "plant", "state", "axis", "knot", "size", "keep", "resume", "parent", "rides"
         given = {name: np.array([getattr(x, name) for x in lanes]) for name in names}
@@ -182,8 +183,11 @@ class Flights:
         given["substep"] = steps[given["plant"], rough] * self._fineness[given["window"]]
         kept = given["keep"] >= 0
         knots = max(1, int(np.max((given["keep"] + self.knots[given["window"]])[kept], initial=1)))
-        windows = self.windows if ends is None else self.windows | {"end": ends}
-        return replay.run(states, windows, given, self.data, KNOT_SPACING, knots)
+        return replay.run(states, recording or self.recording, given, KNOT_SPACING, knots)
+
+    def ended(self, ends: Sequence[float]) -> Recording:
+        """The windows that end earlier [s]; what is seen afterwards says nothing."""
+        return Recording(self.windows | {"end": np.array(ends)}, self.recording.data)
 
 
 def downloaded(array: wp.array) -> np.ndarray:

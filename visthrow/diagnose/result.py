@@ -54,12 +54,12 @@ class Finding:
 
 @dataclass(frozen=True)
 class Step:
-    """One addition of the search."""
+    """One addition of the search, or an exchange of all names for a set that says more."""
 
-    named: str
+    named: str  # names of a set with commas between them
     nats: float
-    screened: Mapping[str, float]  # effect -> nats by the linear statistics, best first
-    refitted: Mapping[str, float]  # effect -> nats with the simulation run again
+    screened: Mapping[str, float]  # effect or set -> nats by the linear statistics, best first
+    refitted: Mapping[str, float]  # effect or set -> nats with the simulation run again
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ import numpy as np
 from visthrow.diagnose.evidence import additions, log_evidence, pair_additions
 
 if TYPE_CHECKING:
+    from visthrow.diagnose.point import Point
     from visthrow.diagnose.search import Search
 
 CLOSE = 3.0
@@ -47,6 +48,9 @@ def rivals(search: "Search") -> list[tuple[list[int], float]]:
     exchanges = {tuple(sorted([k if i == j else i for i in active])): k for j in active for k in usable}
     sets = (sets | set(exchanges)) - {tuple(sorted(active))}
     values = {s: _linear(search, s) - own for s in sets if not set(s) > set(active)}  # additions were tried already
+    if len(active) == 1:  # where it is far from nothing, derivatives there may tell too little of what has no share of it
+        there = _linear(search, active, search.nominal)
+        values = {s: max(v, _linear(search, s, search.nominal) - there) for s, v in values.items()}
     alike = {k for s, k in exchanges.items() if values[s] > -CLOSE}
     ranked = sorted(((list(s), v) for s, v in values.items() if v > -DOUBT), key=lambda v: -v[1])
     ranked = [v for i, v in enumerate(ranked) if i < MOST or (i < MOST_CLOSE and abs(v[1]) < CLOSE)]
@@ -55,9 +59,10 @@ def rivals(search: "Search") -> list[tuple[list[int], float]]:
     return ranked + [v for v in sorted(pairs, key=lambda v: -v[1]) if tuple(v[0]) not in known][:PAIRS]
 
 
-def _linear(search: "Search", active: Sequence[int]) -> float:
-    """Evidence of a set, less what its names cost."""
-    return log_evidence(search.point.information, search.point.score, search.priors, active) - search.least * len(active)
+def _linear(search: "Search", active: Sequence[int], point: "Point | None" = None) -> float:
+    """Evidence of a set, less what its names cost; by the statistics of a point, by default where the search stands."""
+    at = search.point if point is None else point
+    return log_evidence(at.information, at.score, search.priors, active) - search.least * len(active)
 
 
 def _with_pairs(search: "Search", usable: Sequence[int], own: float) -> list[tuple[list[int], float]]:

@@ -366,10 +366,12 @@ class Search:
             ranked = rivals(self)
             self.sets = [(tuple(self.active), 0.0)]
             winner: tuple[float, list[int], Point] | None = None
+            settled: dict[str, float] = {}
             for rival, _ in ranked:
                 point = self._candidate(self.point, rival)
                 ahead = self._ahead((point, rival), (self.point, self.active))
                 ahead += self.least * (len(self.active) - len(rival))  # every name costs the threshold
+                settled[self._together(rival)] = float(ahead)
                 if ahead > 1.0 and not self._believed(point, rival):
                     continue
                 if ahead > -CLOSE:
@@ -378,12 +380,17 @@ class Search:
                     winner = ahead, list(rival), point
             if winner is None:
                 return
-            together = ", ".join(map(self.name, winner[1])) or "nothing"
+            together = self._together(winner[1])
             self.progress(f"exchanged for {together}" if self.active else f"{together} named together: each hides the other")
+            self.steps.append(Step(together, winner[0], {self._together(rival): nats for rival, nats in ranked}, settled))
             self.active = winner[1]
             self.point = self._settle(winner[2], self.active)
             distances = ((members, n + winner[0]) for members, n in self.sets if set(members) != set(self.active))
             self.sets = [(tuple(self.active), 0.0), *((members, n) for members, n in distances if n < CLOSE)]
+
+    def _together(self, active: Sequence[int]) -> str:
+        """Names of a set."""
+        return ", ".join(map(self.name, active)) or "nothing"
 
     def _believed(self, point: Point, rival: Sequence[int]) -> bool:
         """Whether a set that says more may be named: two new names at once if they leave nothing to explain.

@@ -88,7 +88,8 @@ class Settling:
         ]  # directions in which windows' initial states are fitted
         self._drift = [drift(flights, w) for w in range(len(flights.cuts))]
         self._gusts = np.ones(len(flights.cuts))  # of each window, against the drift that is thought possible
-        self._tells, self._ends = zip(*[told_of_start(flights, w, lag) for w in range(len(flights.cuts))])
+        self._tells, ends = zip(*[told_of_start(flights, w, lag) for w in range(len(flights.cuts))])
+        self._shortened = flights.ended(ends)
 
     def better(self, settled: States, fresh: States) -> States:
         """For each window, the better of two initial states."""
@@ -165,7 +166,7 @@ class Settling:
     def _residuals(self, states: States, which: np.ndarray) -> list[np.ndarray]:
         """Residuals of windows, of what tells of their initial states; a row of the states for each."""
         f, lanes = self.flights, [Lane(w, 0, row) for row, w in enumerate(which)]
-        seen = f.fly(self.replay, [self.setting], states, lanes, self.substep, self._ends).seen
+        seen = f.fly(self.replay, [self.setting], states, lanes, self.substep, self._shortened).seen
         return [self._tells[w] * f.residual(seen, w, lane) for lane, w in enumerate(which)]
 
     def _costs(self, residuals: Mapping[int, np.ndarray]) -> np.ndarray:
@@ -204,7 +205,7 @@ class Settling:
             first.append(len(lanes))
             lanes += [Lane(w, 0, row, rough=True), *[Lane(w, 0, (1 + d) * count + row, rough=True) for d in self._free[w]]]
         there = perturbed(rows_of(states, which), self.directions)
-        seen = self.flights.fly(self.replay, [self.setting], there, lanes, self.substep, self._ends).seen
+        seen = self.flights.fly(self.replay, [self.setting], there, lanes, self.substep, self._shortened).seen
         slopes = {}
         for at, w in zip(first, which):
             ds, rows = self._free[w], int(self.flights.rows[w])

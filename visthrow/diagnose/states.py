@@ -160,6 +160,12 @@ def smoothed(
     samples: Samples, at: float, before: float = SMOOTH_BEFORE, after: float = SMOOTH_AFTER
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Value and derivative at a time from a local cubic through the samples about it; None without enough of them."""
+    if (at, before, after) not in samples.near:
+        samples.near[at, before, after] = _smoothed(samples, at, before, after)
+    return samples.near[at, before, after]
+
+
+def _smoothed(samples: Samples, at: float, before: float, after: float) -> tuple[np.ndarray, np.ndarray] | None:
     for reach in (1.0, 2.0, 4.0):
         span = samples.between(at - reach * before, at + reach * after)
         if span.stop - span.start >= LEAST_SAMPLES:

@@ -118,7 +118,7 @@ class ThrowModel:
         self._fits: dict[tuple[Cut, ...], tuple[States, dict[int, np.ndarray]]] = {}
         self._latest: dict[frozenset[str], States] = {frozenset(): self._fitted(states)[0]}
         self._settled_at: dict[frozenset[tuple[str, float]], States] = {}
-        self._follows: tuple[Linearised, dict[int, list[int]], dict[int, np.ndarray]] | None = None  # the last that was asked for
+        self._follows: tuple[Linearised, dict[int, list[int]], np.ndarray] | None = None  # the last that was asked for
         self._sightings = sightings(logs, flights, self.flights.cuts, self.setting)
 
     def windows(self, theta: Mapping[str, float]) -> list[Window]:
@@ -190,17 +190,18 @@ class ThrowModel:
         if self._follows is None or self._follows[0] is not about:
             owns = {i: [d for d, x in enumerate(found) if concerns(x, cuts[self._told[i]])] for i in about.windows}
 
-            def ways(i: int) -> np.ndarray:
+            def way(i: int) -> np.ndarray:
                 free = np.array([found[d].follows for d in owns[i]], dtype=bool)
                 return following(self.flights, self._told[i], about.windows[i], free, self.setting.plant.release.lag)
 
-            self._follows = about, owns, dict(zip(owns, each(ways, owns)))
-        _, owns, by_effects = self._follows
-        moves = {i: by_effect @ change for i, by_effect in by_effects.items()}
-        sizes = np.zeros((len(cuts), len(found)))
-        for i, own in owns.items():
-            sizes[self._told[i], own] = moves[i]
-        return moved_along(self._settled_at[_key(about.theta)], found, sizes), moves
+            by_effect = np.zeros((len(cuts), len(found), len(names)))
+            for i, moves in zip(owns, each(way, owns)):
+                by_effect[self._told[i], owns[i]] = moves
+            self._follows = about, owns, by_effect
+        _, owns, by_effect = self._follows
+        sizes = by_effect @ change
+        states = moved_along(self._settled_at[_key(about.theta)], found, sizes)
+        return states, {i: sizes[self._told[i], own] for i, own in owns.items()}
 
     def _switches(self, theta: Mapping[str, float]) -> frozenset[str]:
         """Which other kinds of blocks are on."""
