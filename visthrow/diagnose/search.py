@@ -160,6 +160,8 @@ class Search:
         best = next((j for j in ranked if self._stands(tried[j], [*self.active, j], j)), None)
         if best is None:
             best, origin = max(nats, key=nats.get), self.origin
+            if self.problem.switches[best]:
+                return False  # it was linearised where it leads already
             tried[best] = self._closer(tried[best], [*self.active, best])
             nats[best] = self._ahead((tried[best], [*self.active, best]), base)
             if nats[best] <= enough or not self._stands(tried[best], [*self.active, best], best):
