@@ -95,6 +95,9 @@ def test_two_effects_that_hide_each_other_are_named_together(beside):
         assert diagnosis[name].low < 14.0 * diagnosis[name].floor < diagnosis[name].high
     named = [{"effect_03", "effect_07"} & set(step.named.split(", ")) for step in diagnosis.steps]
     assert sorted(map(len, named)) == [*[0] * len(beside), 2]
+    last = diagnosis.steps[-1]
+    assert last.nats == last.refitted[last.named] > last.least == search.AHEAD
+    assert last.named in list(last.screened)[:3]
 
 
 def test_a_law_is_not_shared_out_among_two_effects_that_hide_each_other():

@@ -97,24 +97,25 @@ def residuals(work: Work, channel: int) -> bytes:
 
 
 def ladder(diagnosis: Diagnosis) -> bytes:
-    """Nats of each step's candidates, screened and with the simulation run again, and the threshold; steps in rows of three."""
+    """Nats of each step's candidates, screened and with the simulation run again, and what they must exceed; rows of three."""
     steps = diagnosis.steps
     across = min(len(steps), STEPS_ACROSS)
-    down, most = -(-len(steps) // across), max(len(step.screened) for step in steps)
+    down, most = -(-len(steps) // across), max(sum(1.0 + 0.6 * name.count(", ") for name in step.screened) for step in steps)
     figure, axes = _figure(down, across, down * (0.55 + 0.27 * most))
     for axis in axes.flat[len(steps) :]:
         axis.set_visible(False)
     for number, (axis, step) in enumerate(zip(axes.flat, steps), start=1):
         names = list(step.screened)[::-1]
         screened = [max(step.screened[n], 0.0) for n in names]
-        axis.barh(names, screened, height=0.62, color=style.FAINT)
+        labels = [name.replace(", ", ",\n") for name in names]
+        axis.barh(labels, screened, height=0.62, color=style.FAINT)
         for y, name in enumerate(names):
             if name in step.refitted:
                 won = name == step.named
                 axis.plot(max(step.refitted[name], 0.0), y, marker="o" if won else "^", ms=6, color=AFTER if won else style.QUIET)
-        axis.axvline(diagnosis.threshold, color=BEFORE, lw=1)
-        axis.set(xscale="symlog", xlabel="nats", title=f"step {number}: {step.named}")
-        axis.set_xlim(0.0, 1.4 * max([diagnosis.threshold, *screened, *step.refitted.values()]))
+        axis.axvline(step.least, color=BEFORE, lw=1)
+        axis.set(xscale="symlog", xlabel="nats", title=f"step {number}: {'exchanged' if ', ' in step.named else step.named}")
+        axis.set_xlim(0.0, 1.4 * max([step.least, *screened, *step.refitted.values()]))
         _plain(axis.xaxis, MOST_TICKS // across)
         axis.tick_params(axis="y", labelsize=8)
     return png_of(figure)

@@ -162,8 +162,8 @@ def sections(
     if gain is not None:
         made.append(_gain(gain, diagnosis))
     if diagnosis.steps:
-        text = Text("Nats of evidence that each candidate would bring, the threshold as a line; marks: with the simulation run "
-                    "again (circle: taken, triangle: beaten).")  # fmt: skip
+        text = Text("Nats of evidence that each candidate would bring, or a set in place of the names before; as a line what it "
+                    "must exceed; marks: with the simulation run again (circle: taken, triangle: beaten).")  # fmt: skip
         made.append(Section("ladder", "Candidates", (text, Picture("ladder", pictures.ladder(diagnosis), "Ladder of candidates."),
                                                      *_alternatives(diagnosis))))  # fmt: skip
     if diagnosis.levels:

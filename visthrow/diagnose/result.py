@@ -57,7 +57,8 @@ class Step:
     """One addition of the search, or an exchange of all names for a set that says more."""
 
     named: str  # names of a set with commas between them
-    nats: float
+    nats: float  # against what was named before
+    least: float  # what it must exceed
     screened: Mapping[str, float]  # effect or set -> nats by the linear statistics, best first
     refitted: Mapping[str, float]  # effect or set -> nats with the simulation run again
 

@@ -51,6 +51,9 @@ CHAIN = 3
 SHORTLIST = 3
 """Candidates whose simulation is run again in each step."""
 
+SHOWN = 10
+"""Candidates that a step keeps for the report."""
+
 HOPE = 0.6
 """Of the threshold: linear statistics from which a candidate's simulation is run again, where derivatives may fall short of it."""
 
@@ -74,6 +77,9 @@ LINEARISATIONS = 3
 
 LOSSES = 3
 """Rounds in which windows are left out that the simulation does not follow: the worst hide others."""
+
+AHEAD = 1.0
+"""Nats by which a set must be ahead of the names for which it is exchanged, each name at the price of the threshold."""
 
 EXCHANGES = 2
 """Times that a set is compared with others, where the last comparison exchanged it and the search went on from there."""
@@ -170,9 +176,9 @@ class Search:
         verdict, found = self._agreed(tried[best], best)
         if verdict is not None:
             return self._set_aside(best, nats[best], verdict)
-        ladder = {self.name(j): float(max(screened[j], under_free[j])) for j in np.argsort(-under_free)[:10]}
+        ladder = {self.name(j): float(max(screened[j], under_free[j])) for j in np.argsort(-under_free)[:SHOWN]}
         again = {self.name(j): float(n) for j, n in sorted(nats.items(), key=lambda item: -item[1])}
-        self.steps.append(Step(self.name(best), float(nats[best]), ladder, again))
+        self.steps.append(Step(self.name(best), float(nats[best]), self.least, ladder, again))
         self.progress(f"{self.name(best)} named, {nats[best]:.1f} nats above the next simpler model")
         self.active.append(best)
         self.point = self._settle(found, self.active)
@@ -241,7 +247,7 @@ class Search:
             if nats > self.least and self._sure(there, active, j):
                 self.progress(f"{self.name(j)} named, which varies: {nats:.1f} nats that its mean is not 0")
                 ladder = {self.name(j): nats}
-                self.steps.append(Step(self.name(j), nats, ladder, ladder))
+                self.steps.append(Step(self.name(j), nats, self.least, ladder, ladder))
                 self.active = active
                 self.point = self._settle(self._candidate(self.point, active), active)
                 self.refused.clear()
@@ -374,17 +380,19 @@ class Search:
                 ahead = self._ahead((point, rival), (self.point, self.active))
                 ahead += self.least * (len(self.active) - len(rival))  # every name costs the threshold
                 settled[self._together(rival)] = float(ahead)
-                if ahead > 1.0 and not self._believed(point, rival):
+                if ahead > AHEAD and not self._believed(point, rival):
                     continue
                 if ahead > -CLOSE:
                     self.sets.append((tuple(rival), float(-ahead)))
-                if ahead > 1.0 and (winner is None or ahead > winner[0]):
+                if ahead > AHEAD and (winner is None or ahead > winner[0]):
                     winner = ahead, list(rival), point
             if winner is None:
                 return
             together = self._together(winner[1])
             self.progress(f"exchanged for {together}" if self.active else f"{together} named together: each hides the other")
-            self.steps.append(Step(together, winner[0], {self._together(rival): nats for rival, nats in ranked}, settled))
+            screened = {self._together(rival): nats for rival, nats in ranked}
+            screened = {name: screened[name] for name in sorted(screened, key=settled.get, reverse=True)[:SHOWN]}
+            self.steps.append(Step(together, winner[0], AHEAD, screened, settled))
             self.active = winner[1]
             self.point = self._settle(winner[2], self.active)
             distances = ((members, n + winner[0]) for members, n in self.sets if set(members) != set(self.active))
