@@ -25,13 +25,12 @@ class Replayed:
 
     With Nv, Np and Ng measured stamps of the vehicle, the payload and the gyro in a lane's window, its first
     ``2 Nv + Np + Ng`` rows hold: position [m] and attitude against the measured one (rotation vector [rad]) in turns,
-    payload [m], rate [rad/s]. The rest is undefined.
+    payload [m], rate [rad/s]. The rest is undefined. ``ends`` and ``knots`` are empty where no lane keeps.
     """
 
     seen: np.ndarray  # shape (rows, lanes, 3)
     ends: dict[str, np.ndarray]  # states at the end of the windows of lanes that keep, as ``starts``; others undefined
     knots: dict[str, np.ndarray]  # fields of KNOT_FIELDS at the knots of lanes that keep, by the rows of ``keep``
-    # Both are empty where no lane keeps.
 
 
 class Recording:

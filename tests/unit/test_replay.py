@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from sim.hybrid import HybridSim
 from sim.params import SensingParams
 from sim.replay import kernel as rk
-from sim.replay.lanes import Recording, Replay, _pool
+from sim.replay.lanes import Recording, Replay, _pool, _shared_out
 from sim.structs import EXTENSIONS
 from tests.plants import paper_plant
 
@@ -216,3 +217,15 @@ def test_mixed_segments_are_refused():
     rigid = dataclasses.replace(plant(), rope=dataclasses.replace(plant().rope, segments=1))
     with pytest.raises(ValueError, match="one number of segments"):
         Replay([plant(), rigid], [SensingParams()] * 2)
+
+
+@pytest.mark.parametrize("costs", [[1.0] * 100, [50.0, *[1.0] * 50], [3.0, 2.0], [7.0]])
+def test_pieces_of_a_run_cost_alike_and_hold_every_lane_once(costs):
+    """No piece takes more than its share and one lane."""
+    bounds = _shared_out(np.array(costs), 8)
+    assert bounds[0] == 0
+    assert bounds[-1] == len(costs)
+    pieces = [costs[a:b] for a, b in pairwise(bounds)]
+    assert all(pieces)
+    assert len(pieces) <= 8
+    assert all(sum(piece[:-1]) <= sum(costs) / 8 for piece in pieces)
