@@ -169,7 +169,8 @@ class Search:
             if self.problem.switches[best]:
                 return False  # it was linearised where it leads already
             tried[best] = self._closer(tried[best], [*self.active, best])
-            nats[best] = self._ahead((tried[best], [*self.active, best]), base)
+            alike = self._candidate(tried[best], self.active), self.active  # begins as it does: new states alone are no gain
+            nats[best] = min(self._ahead((tried[best], [*self.active, best]), other) for other in (base, alike))
             if nats[best] <= enough or not self._stands(tried[best], [*self.active, best], best):
                 self.origin = origin
                 return False
