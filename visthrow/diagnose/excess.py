@@ -32,9 +32,9 @@ def levels(before: Point, after: Point, least: float) -> tuple[Level, ...]:
     Args:
         before: the model as it stands.
         after: with what was named.
-        least: nats from which a level counts as excessive.
+        least: nats from which a level would count as excessive if it were the only one; of many, one is higher by chance.
     """
-    found = []
+    found, least = [], least + np.log(max(len(after.noise.latent_sd), 1))
     blocks = sorted({block for block, _ in after.noise.latent_sd})
     of = {phase: _Phase(after, phase) for _, phase in after.noise.latent_sd}
     for block in blocks:
