@@ -97,10 +97,10 @@ LATE = (1.0,)
 """The only sign in which a delay of commands and one of stamps are a pair: nothing is measured before it happens, so that commands
 that act sooner have no partner."""
 MILLIMETRES, GRAMS = 3e-3, 4e-3
-"""Sizes that two short hovers cannot tell from other causes, 1 to 3 nats apart where the cause itself has 11 to 18.
+"""Sizes that two short hovers hardly tell from other causes, up to 3 nats apart where the cause itself has 10 to 15.
 
-More than that they tell at once, for gusts make the payload swing: 8 mm of rope stand out from 8 mm of a marker by 4 nats on a
-string and by 13 on a rod, 6 g of payload by 2 to 4 nats from what lifts or weighs as much."""
+More than that they tell at once, for gusts make the payload swing: 8 mm of rope stand out from 8 mm of a marker by 2 to 4 nats on
+a string and by 13 on a rod, 6 g of payload by 2 to 4 nats from what lifts or weighs as much."""
 HOVER, BARE, DOUBLETS = ("hover",), ("hover without payload",), ("rate doublets",)
 TILTED = frozenset({"wind_x", "frame_tilt_y", "marker_rot_y", "com_x"})
 LONGER = frozenset({"payload_marker_z", "payload_offset", "marker_off_z", "mount_z", "frame_scale"})

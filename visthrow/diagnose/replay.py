@@ -46,7 +46,7 @@ class Flights:
     """Windows of recorded flights as the replay's arrays.
 
     Attributes:
-        cuts: the windows. knots: of each window, shape (W,). rows: of output of each window, in vectors.
+        cuts: the windows. knots: of each window, shape (W,). rows: of output of each window, in vectors. recording: for a replay.
     """
 
     def __init__(self, flights: Sequence[Recorded], cuts: Sequence[Cut], delays: tuple[float, float, float], stride: int = 1):
@@ -87,7 +87,6 @@ class Flights:
                 self.windows[name][w] = value
         self.windows = {k: v.astype(int) if WINDOW_FIELDS[k][0] == "int" else v for k, v in self.windows.items()}
         self.samples = parts
-        self.rows = 2 * self.windows["vehicle_count"] + self.windows["payload_count"] + self.windows["gyro_count"]
         data = {
             "command_time": np.concatenate([f.command_time for f in self.flights]),
             "command": np.concatenate([f.command for f in self.flights]),
@@ -95,6 +94,7 @@ class Flights:
             "payload_time": self._joined("payload").time, "gyro_time": self._joined("gyro").time,
         }  # fmt: skip
         self.recording = Recording(self.windows, data)
+        self.rows = self.recording.rows
 
     def _rows(self, source: Samples | None, c: Cut, delay: float) -> np.ndarray:
         if source is None:

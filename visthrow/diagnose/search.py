@@ -166,8 +166,8 @@ class Search:
         best = next((j for j in ranked if self._stands(tried[j], [*self.active, j], j)), None)
         if best is None:
             best, origin = max(nats, key=nats.get), self.origin
-            if self.problem.switches[best]:
-                return False  # it was linearised where it leads already
+            if self.problem.switches[best]:  # it was linearised where it leads already
+                return False
             tried[best] = self._closer(tried[best], [*self.active, best])
             alike = self._candidate(tried[best], self.active), self.active  # begins as it does: new states alone are no gain
             nats[best] = min(self._ahead((tried[best], [*self.active, best]), other) for other in (base, alike))
@@ -179,7 +179,7 @@ class Search:
             return self._set_aside(best, nats[best], verdict)
         ladder = {self.name(j): float(max(screened[j], under_free[j])) for j in np.argsort(-under_free)[:SHOWN]}
         again = {self.name(j): float(n) for j, n in sorted(nats.items(), key=lambda item: -item[1])}
-        self.steps.append(Step(self.name(best), float(nats[best]), self.least, ladder, again))
+        self.steps.append(Step(self.name(best), float(nats[best]), float(enough), ladder, again))
         self.progress(f"{self.name(best)} named, {nats[best]:.1f} nats above the next simpler model")
         self.active.append(best)
         self.point = self._settle(found, self.active)
