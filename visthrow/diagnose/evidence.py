@@ -134,31 +134,44 @@ def additions(information: np.ndarray, score: np.ndarray, priors: Priors, active
     return np.where(out, -np.inf, gain)
 
 
-def pair_additions(information: np.ndarray, score: np.ndarray, priors: Priors, active: list[int] | tuple[int, ...]) -> np.ndarray:
-    """Gain of log Z by naming two more effects at once, for each two: of two that hide each other, neither shows alone.
+def set_additions(
+    information: np.ndarray, score: np.ndarray, priors: Priors, active: list[int] | tuple[int, ...], sets: np.ndarray
+) -> np.ndarray:
+    """Gain of log Z by naming several more effects at once, for each of some sets of m: a change of m priors has rank m.
 
     Args:
         information: shape (K, K).
         score: shape (K,).
         priors: of the effects.
         active: named already.
+        sets: effects that are not, shape (n, m).
+
+    Returns:
+        Nats, shape (n,).
+    """
+    sets = np.asarray(sets, dtype=int)
+    sigma = covariance(information, priors.deviation(active))
+    mean, diagonal = (score @ sigma)[sets], np.eye(sets.shape[1])
+    change = (priors.slab**-2.0 - SPIKE**-2.0)[sets]
+    own = sigma[sets[:, :, None], sets[:, None]]
+    taken = np.linalg.inv(own + diagonal / change[:, None])
+    wide_mean = mean - (own @ taken @ mean[..., None])[..., 0]
+    wide_sd = np.sqrt(np.maximum((own - own @ taken @ own).diagonal(axis1=1, axis2=2), 1e-300))
+    gain = -np.log(priors.slab / SPIKE)[sets].sum(1) - 0.5 * np.linalg.slogdet(diagonal + change[..., None] * own)[1]
+    gain -= 0.5 * np.einsum("pi,pij,pj->p", mean, taken, mean)
+    low, high, slab = priors.low[sets], priors.high[sets], priors.slab[sets]
+    return gain + (_log_mass(wide_mean, wide_sd, low, high) - _log_mass(np.zeros_like(low), slab, low, high)).sum(1)
+
+
+def pair_additions(information: np.ndarray, score: np.ndarray, priors: Priors, active: list[int] | tuple[int, ...]) -> np.ndarray:
+    """The same for each two effects: of two that hide each other, neither shows alone.
 
     Returns:
         Nats, shape (K, K), symmetric; -inf for those named already or not visible, and on the diagonal.
     """
-    sigma = covariance(information, priors.deviation(active))
-    mean, size = score @ sigma, len(score)
+    size = len(score)
     first, second = np.divmod(np.arange(size * size), size)
-    both = np.stack((first, second), axis=1)
-    change = (priors.slab**-2.0 - SPIKE**-2.0)[both]
-    own, of_both = sigma[both[:, :, None], both[:, None]], mean[both]
-    taken = np.linalg.inv(own + np.eye(2) / change[:, None])
-    wide_mean = of_both - (own @ taken @ of_both[..., None])[..., 0]
-    wide_sd = np.sqrt(np.maximum((own - own @ taken @ own).diagonal(axis1=1, axis2=2), 1e-300))
-    gain = -np.log(priors.slab / SPIKE)[both].sum(1) - 0.5 * np.linalg.slogdet(np.eye(2) + change[..., None] * own)[1]
-    gain -= 0.5 * np.einsum("pi,pij,pj->p", of_both, taken, of_both)
-    low, high, slab = priors.low[both], priors.high[both], priors.slab[both]
-    gain += (_log_mass(wide_mean, wide_sd, low, high) - _log_mass(np.zeros_like(low), slab, low, high)).sum(1)
+    gain = set_additions(information, score, priors, active, np.stack((first, second), axis=1))
     out = ~priors.visible
     out[list(active)] = True
     gain[out[first] | out[second] | (first == second)] = -np.inf

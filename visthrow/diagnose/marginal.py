@@ -238,7 +238,6 @@ class Posterior:
     """Initial state and latent forces of one window given its data."""
 
     mean: np.ndarray  # of [b, a] in prior deviations, shape (D + L,)
-    covariance: np.ndarray  # shape (D + L, D + L)
     log_likelihood: float  # of the residuals, but for the powers of 2 pi
 
 
@@ -271,15 +270,11 @@ def posterior(gram: Gram, noise: Noise, window: int) -> Posterior:
         DiagnoseError: As of broken derivatives.
     """
     weight, level = noise.scale**-2.0, noise.deviation(gram, window)
-    size = len(level)
     lower, log_det = _factor(gram, noise, level)
-    right = (weight @ gram.cross[:, :size]) * level
-    inverse, _ = lapack.dpotri(lower, lower=1)
-    covariance = inverse + inverse.T  # its upper half is 0
-    covariance.flat[:: size + 1] *= 0.5
-    mean = covariance @ right
+    right = (weight @ gram.cross[:, : len(level)]) * level
+    mean = np.ravel(lapack.dpotrs(lower, right, lower=1)[0])
     quadratic = weight @ gram.square - right @ mean
-    return Posterior(mean, covariance, -0.5 * float(quadratic + log_det))
+    return Posterior(mean, -0.5 * float(quadratic + log_det))
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import lapack
 
 from visthrow.diagnose.marginal import (
     TAIL,
@@ -268,8 +269,12 @@ def _scoring_step(
     if not np.any(free):
         return step, 0.0
     size = np.sqrt(known[free])
-    part = curvature[np.ix_(free, free)] / np.outer(size, size)
-    step[free] = np.linalg.solve(part + 1e-6 * np.eye(len(part)), slope[free] / size) / size
+    part = curvature[np.ix_(free, free)]
+    part /= size[:, None]
+    part /= size
+    part.flat[:: len(part) + 1] += 1e-6
+    _, found, indefinite = lapack.dposv(part, slope[free] / size, lower=1)
+    step[free] = (np.linalg.solve(part, slope[free] / size) if indefinite else found) / size
     promised = float(slope @ step)
     step = np.where(step > 0.0, 0.5 * np.log1p(2.0 * np.maximum(step, 0.0)), np.maximum(step, -LONGEST_FALL))
     return np.clip(x + step, low, high) - x, promised

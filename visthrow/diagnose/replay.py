@@ -1,7 +1,8 @@
 """Recorded flights cut into windows, ready to be replayed in any setting: the arrays that all lanes of a batch share."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -25,9 +26,8 @@ STABLE = 1.75  # shortest lags of the vehicle's filters and rotors, above which 
 BATCH, CUDA_BATCH = 4096, 32768  # lanes of one run, which bounds its memory; on a GPU more lanes cost hardly more time
 
 
-@dataclass(frozen=True)
-class Lane:
-    """What one lane of a batch flies."""
+class Lane(NamedTuple):
+    """What one lane of a batch flies; there are some ten thousand in a run."""
 
     window: int
     plant: int  # row of the settings
@@ -176,11 +176,9 @@ class Flights:
             substep: largest integration step [s].
             recording: the windows, if not as they are.
         """
-        names = "window", "plant", "state", "axis", "knot", "size", "keep", "resume", "parent", "rides"
-        given = {name: np.array([getattr(x, name) for x in lanes]) for name in names}
+        given = {name: np.array(values) for name, values in zip(Lane._fields, zip(*lanes))}
         steps = np.array([(substep * np.sqrt(max(s.step_square, FINEST)), rough_step(s, substep)) for s in settings])
-        rough = np.array([x.rough for x in lanes], dtype=int)
-        given["substep"] = steps[given["plant"], rough] * self._fineness[given["window"]]
+        given["substep"] = steps[given["plant"], given.pop("rough").astype(int)] * self._fineness[given["window"]]
         kept = given["keep"] >= 0
         knots = max(1, int(np.max((given["keep"] + self.knots[given["window"]])[kept], initial=1)))
         return replay.run(states, recording or self.recording, given, KNOT_SPACING, knots)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from visthrow.diagnose.evidence import additions, log_evidence, pair_additions
+from visthrow.diagnose.evidence import additions, log_evidence, pair_additions, set_additions
 
 if TYPE_CHECKING:
     from visthrow.diagnose.point import Point
@@ -47,10 +47,11 @@ def rivals(search: "Search") -> list[tuple[list[int], float]]:
     usable = [int(k) for k in np.flatnonzero(np.isfinite(gain)) if k not in active]
     exchanges = {tuple(sorted([k if i == j else i for i in active])): k for j in active for k in usable}
     sets = (sets | set(exchanges)) - {tuple(sorted(active))}
-    values = {s: _linear(search, s) - own for s in sets if not set(s) > set(active)}  # additions were tried already
+    sets = [s for s in sets if not set(s) > set(active)]  # additions were tried already
+    values = {s: v - own for s, v in _all_linear(search, sets, search.point).items()}
     if len(active) == 1:  # where it is far from nothing, derivatives there may tell too little of what has no share of it
         there = _linear(search, active, search.nominal)
-        values = {s: max(v, _linear(search, s, search.nominal) - there) for s, v in values.items()}
+        values = {s: max(values[s], v - there) for s, v in _all_linear(search, sets, search.nominal).items()}
     alike = {k for s, k in exchanges.items() if values[s] > -CLOSE}
     ranked = sorted(((list(s), v) for s, v in values.items() if v > -DOUBT), key=lambda v: -v[1])
     ranked = [v for i, v in enumerate(ranked) if i < MOST or (i < MOST_CLOSE and abs(v[1]) < CLOSE)]
@@ -63,6 +64,16 @@ def _linear(search: "Search", active: Sequence[int], point: "Point | None" = Non
     """Evidence of a set, less what its names cost; by the statistics of a point, by default where the search stands."""
     at = search.point if point is None else point
     return log_evidence(at.information, at.score, search.priors, active) - search.least * len(active)
+
+
+def _all_linear(search: "Search", sets: Sequence[tuple[int, ...]], point: "Point") -> dict[tuple[int, ...], float]:
+    """The same of many sets at once."""
+    given, found = (point.information, point.score, search.priors, ()), {}
+    nothing = log_evidence(*given)
+    for size in sorted({len(s) for s in sets}):
+        own = [s for s in sets if len(s) == size]
+        found |= zip(own, (nothing + set_additions(*given, own) - search.least * size).tolist())
+    return found
 
 
 def _with_pairs(search: "Search", usable: Sequence[int], own: float) -> list[tuple[list[int], float]]:
