@@ -9,7 +9,7 @@ from tests.diagnose import sealed, test_cases
 from tests.unit import test_diagnose_report as reports
 from tests.unit import test_diagnose_search as searches
 from tests.worlds.world import Recipe
-from visthrow.diagnose import evidence, gain, marginal, noise, point, search
+from visthrow.diagnose import designs, evidence, gain, marginal, noise, search
 from visthrow.diagnose.evidence import Priors
 from visthrow.flightlog import FlightLog
 
@@ -33,8 +33,8 @@ def no_latent_forces(monkeypatch) -> None:
                        latent_axis=none.astype(int), latent_time=none)  # fmt: skip
         return whole(bare, floors, channels)
 
-    monkeypatch.setattr(point, "gram_of", gram)
-    monkeypatch.setattr(noise, "without_outliers", lambda windows, grams: list(windows))  # gusts would be told by their columns
+    monkeypatch.setattr(designs, "gram_of", gram)
+    monkeypatch.setattr(noise, "without_outliers", lambda windows, *_: list(windows))  # gusts would be told by their columns
 
 
 def no_floors(monkeypatch) -> None:

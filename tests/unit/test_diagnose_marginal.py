@@ -7,7 +7,7 @@ import pytest
 
 from tests import synthetic_diagnosis
 from tests.synthetic_diagnosis import GUST, SyntheticModel, catalogue
-from visthrow.diagnose import marginal, noise
+from visthrow.diagnose import designs, marginal, noise
 from visthrow.diagnose import stack as stacks
 from visthrow.diagnose.evidence import Priors
 from visthrow.diagnose.model import Window
@@ -16,6 +16,11 @@ from visthrow.diagnose.stack import BATCH, Stack
 from visthrow.errors import DiagnoseError
 
 EFFECTS = catalogue(6)
+
+
+def likelihood(gram, levels, window):
+    """Logarithm of it, of one window by itself, but for the powers of 2 pi."""
+    return -0.5 * marginal.integral(gram, levels, window).share(gram, levels).square
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +66,7 @@ def test_likelihood_is_that_of_the_dense_covariance(fitted):
         sign, log_det = np.linalg.slogdet(v)
         assert sign > 0
         dense_value = -0.5 * (log_det + window.residual @ np.linalg.solve(v, window.residual))
-        assert marginal.posterior(of, choice, 0).log_likelihood == pytest.approx(dense_value, abs=1e-3)
+        assert likelihood(of, choice, 0) == pytest.approx(dense_value, abs=1e-3)
 
 
 def test_windows_side_by_side_are_what_they_are_alone(fitted):
@@ -72,7 +77,7 @@ def test_windows_side_by_side_are_what_they_are_alone(fitted):
     shorter = [marginal.correlated(marginal.gram_of(w, floors, 2), w, levels.correlation_time) for w in lean]
     mixed = [*grams, *shorter]
     rows = [*range(len(grams)), *range(0, len(grams), 3)]
-    alone = [marginal.posterior(gram, levels, w).log_likelihood for gram, w in zip(mixed, rows)]
+    alone = [likelihood(gram, levels, w) for gram, w in zip(mixed, rows)]
     assert len(mixed) > BATCH
     stack = Stack(mixed, windows=rows)
     np.testing.assert_allclose(stack.values(levels), alone, rtol=1e-8)
@@ -91,7 +96,7 @@ def test_windows_side_by_side_are_what_they_are_alone(fitted):
                 assert share.square == pytest.approx(other.square, rel=1e-9)
 
 
-def test_other_residuals_are_the_same_side_by_side(fitted):
+def test_grams_and_other_residuals_are_the_same_side_by_side(fitted):
     """Of windows of different lengths and numbers of columns, as a GPU has them padded."""
     _, windows, floors, _, _ = fitted
     mixed = [*windows[:4], replace(windows[4], latent=np.zeros((0, 0)), latent_block=np.zeros(0, dtype=int))]
@@ -99,10 +104,15 @@ def test_other_residuals_are_the_same_side_by_side(fitted):
     mixed.append(replace(windows[5], **{name: getattr(windows[5], name)[:-7] for name in cut}))
     grams = [marginal.gram_of(w, floors, 2) for w in mixed]
     drawn = np.random.default_rng(5)
+    for found, single in zip(designs.grams_of(mixed, floors, 2, "cpu:0"), grams, strict=True):
+        for name in ("inner", "cross", "square", "count", "log_sigma"):
+            value = getattr(single, name)
+            np.testing.assert_allclose(getattr(found, name), value, rtol=1e-9, atol=1e-9 * np.abs(value).max())
+        assert found.shown == pytest.approx(single.shown)
     for _ in range(2):  # what stays on the device is not what the residuals were
         residuals = [drawn.normal(size=len(w.residual)) for w in mixed]
         alone = [marginal.with_residual(gram, *given) for gram, *given in zip(grams, mixed, [floors] * len(mixed), residuals)]
-        for found, single in zip(stacks.with_residuals(grams, mixed, floors, residuals, "cpu:0"), alone, strict=True):
+        for found, single in zip(designs.with_residuals(grams, mixed, floors, residuals, "cpu:0"), alone, strict=True):
             np.testing.assert_allclose(found.cross, single.cross, rtol=1e-9, atol=1e-9 * np.abs(single.cross).max())
             np.testing.assert_allclose(found.square, single.square, rtol=1e-9)
 
@@ -126,9 +136,9 @@ def test_the_correlation_time_is_the_likeliest_of_all(gust_time, monkeypatch):
 def test_derivatives_are_moved_to_a_gpu_once(fitted):
     """With other residuals and noise levels they are the same; with other ones they are not."""
     inner = [gram.inner for gram in fitted[4]]
-    kept = stacks._kept(stacks._Same(inner), tuple([1] * len(inner)), "cpu")
-    assert stacks._kept(stacks._Same(list(inner)), tuple([1] * len(inner)), "cpu") is kept
-    assert stacks._kept(stacks._Same([inner[0].copy(), *inner[1:]]), tuple([1] * len(inner)), "cpu") is not kept
+    kept = stacks._kept(designs.Same(inner), tuple([1] * len(inner)), "cpu")
+    assert stacks._kept(designs.Same(list(inner)), tuple([1] * len(inner)), "cpu") is kept
+    assert stacks._kept(designs.Same([inner[0].copy(), *inner[1:]]), tuple([1] * len(inner)), "cpu") is not kept
 
 
 def test_a_point_of_some_windows_is_the_point_that_they_give(fitted):
@@ -195,12 +205,14 @@ def test_highpass_sigma_sees_noise_and_neither_motion_nor_outliers():
     np.testing.assert_allclose(noise.highpass_sigma(signal), 5e-4, rtol=0.1)
 
 
-def test_outliers_lose_their_weight_and_good_windows_are_left_alone(fitted):
+@pytest.mark.parametrize("device", ["cpu", "cpu:0"])
+def test_outliers_lose_their_weight_and_good_windows_are_left_alone(fitted, device):
+    """Whether each window is looked at by itself or all at once, as on a GPU."""
     _, windows, floors, _, _ = fitted
     spoilt = windows[0].residual.copy()
     spoilt[[40, 201]] += 0.2
     given = [replace(windows[0], residual=spoilt), windows[1]]
-    first, second = noise.without_outliers(given, [marginal.gram_of(w, floors, 2) for w in given])
+    first, second = noise.without_outliers(given, [marginal.gram_of(w, floors, 2) for w in given], floors, device)
     assert set(np.flatnonzero(first.sigma > windows[0].sigma)) == {40, 201}
     assert second is windows[1]
 
@@ -227,7 +239,7 @@ def test_levels_do_not_depend_on_where_their_search_starts(bad_window):
     _, found, grams = bad_window
 
     def value(levels) -> float:
-        return levels.log_prior + sum(marginal.posterior(gram, levels, w).log_likelihood for w, gram in enumerate(grams))
+        return levels.log_prior + sum(likelihood(gram, levels, w) for w, gram in enumerate(grams))
 
     less = np.where(found.share == 1.0, 1.0, 0.7 * found.share)
     starts = [replace(found, share=share) for share in (less, np.ones_like(found.share))]

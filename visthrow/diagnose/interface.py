@@ -46,9 +46,8 @@ class Mistake:
 def put_right(logs: Sequence[FlightLog], plant: PlantParams) -> tuple[list[FlightLog], tuple[Mistake, ...]]:
     """Logs with their commands as the simulation takes them, and what was wrong with them."""
     found: list[Mistake] = []
-    mended = list(logs)
+    mended, relation = list(logs), [_followed(log) for log in logs]
     for look in (_axes, _rate_unit):
-        relation = [_followed(log) for log in mended]
         told = [r for r in relation if r is not None]
         mistake = look(told) if told else None
         if mistake is None:
@@ -57,7 +56,7 @@ def put_right(logs: Sequence[FlightLog], plant: PlantParams) -> tuple[list[Fligh
         again = [_followed(log) for log in trial]
         if all(r is None or (s is not None and s.correlation > r.correlation - WORSE) for r, s in zip(relation, again)):
             found.append(mistake[0])
-            mended = trial
+            mended, relation = trial, again
     weight = GRAVITY * (plant.vehicle.body.mass + plant.rope.payload_mass + plant.rope.rope_mass)
     mistake = _thrust_unit(mended, weight, THRUST | {"shares of the full thrust": 4.0 * plant.vehicle.controller.max_thrust})
     if mistake is not None:

@@ -126,7 +126,7 @@ def gram_of(window: Window, floors: np.ndarray, channels: int) -> Gram:
     Raises:
         DiagnoseError: The window's arrays do not fit together, or hold NaN or infinity.
     """
-    _check(window, len(floors), channels)
+    check(window, len(floors), channels)
     return _inner_products(window, columns(window, floors), channels)
 
 
@@ -136,7 +136,7 @@ def hidden_gram(window: Window, channels: int) -> Gram:
     Raises:
         DiagnoseError: As :func:`gram_of`.
     """
-    _check(window, window.effects.shape[1], channels)
+    check(window, window.effects.shape[1], channels)
     return _inner_products(window, columns(replace(window, effects=window.effects[:, :0]), np.zeros(0)), channels)
 
 
@@ -150,14 +150,18 @@ def _inner_products(window: Window, z: np.ndarray, channels: int) -> Gram:
     z /= window.sigma[:, None]
     r = window.residual / window.sigma
     inner = np.zeros((channels, z.shape[1], z.shape[1]))
-    cross, square, count = np.zeros((channels, z.shape[1])), np.zeros(channels), np.zeros(channels)
+    cross, square = np.zeros((channels, z.shape[1])), np.zeros(channels)
     for c in np.unique(window.channel):
         rows = window.channel == c
         own, left = z[rows], r[rows]
         inner[c], cross[c], square[c] = own.T @ own, left @ own, left @ left
-        count[c] = len(left)
-    blocks = np.asarray(window.latent_block, dtype=int)
-    states = window.nuisance.shape[1]
+    return gram_with(window, inner, cross, square)
+
+
+def gram_with(window: Window, inner: np.ndarray, cross: np.ndarray, square: np.ndarray) -> Gram:
+    """The gram of a window whose inner products are known, see :class:`Gram`; its latents are at the knots."""
+    count = np.bincount(window.channel, minlength=len(square)).astype(float)
+    blocks, states = np.asarray(window.latent_block, dtype=int), window.nuisance.shape[1]
     return Gram(window.flight, window.phase, count, inner, cross, square, states, blocks, np.eye(len(blocks)),
                 _shown(inner, states, blocks), float(np.log(window.sigma).sum()))  # fmt: skip
 
@@ -168,7 +172,12 @@ def _shown(inner: np.ndarray, begin: int, blocks: np.ndarray) -> dict[int, float
     return {int(block): float(np.median(squares[blocks == block])) for block in np.unique(blocks)}
 
 
-def _check(window: Window, effects: int, channels: int) -> None:
+def check(window: Window, effects: int, channels: int) -> None:
+    """Refuse a window whose arrays do not fit together.
+
+    Raises:
+        DiagnoseError: They do not, or hold NaN or infinity.
+    """
     n = len(window.residual)
     where = f"window of flight {window.flight}, phase {window.phase}"
     shapes = {"time": window.time.shape[:1], "channel": window.channel.shape, "sigma": window.sigma.shape,
@@ -226,19 +235,18 @@ def with_residual(gram: Gram, window: Window, floors: np.ndarray, residual: np.n
     return replace(gram, cross=np.hstack((by_state, by_latent, by_effect)), square=square)
 
 
+def left_of(window: Window, fit: np.ndarray) -> np.ndarray:
+    """What an initial state in prior deviations and latents at the knots, shape (D + L,), leave of the residual, shape (N,)."""
+    states = window.nuisance.shape[1]
+    left = window.residual - window.nuisance @ (window.nuisance_sd * fit[:states])
+    return left - window.latent @ fit[states:] if len(fit) > states else left
+
+
 def recorrelated(gram: Gram, raw: Gram) -> Gram:
     """The residuals of a gram whose latents are at the knots, in one with the same derivatives whose latents are correlated."""
     part, cross = slice(gram.nuisances, gram.nuisances + gram.latents), raw.cross.copy()
     cross[:, part] = cross[:, part] @ gram.factor
     return replace(gram, cross=cross, square=raw.square)
-
-
-@dataclass(frozen=True)
-class Posterior:
-    """Initial state and latent forces of one window given its data."""
-
-    mean: np.ndarray  # of [b, a] in prior deviations, shape (D + L,)
-    log_likelihood: float  # of the residuals, but for the powers of 2 pi
 
 
 def _factor(gram: Gram, noise: Noise, level: np.ndarray) -> tuple[np.ndarray, float]:
@@ -261,20 +269,6 @@ def _factor(gram: Gram, noise: Noise, level: np.ndarray) -> tuple[np.ndarray, fl
         raise DiagnoseError(f"window of flight {gram.flight}, phase {gram.phase}: the normal equations are singular")
     sensor = gram.log_sigma + gram.count @ np.log(noise.scale)
     return lower, 2.0 * float(np.log(np.diag(lower)).sum() + sensor)
-
-
-def posterior(gram: Gram, noise: Noise, window: int) -> Posterior:
-    """Condition initial state and latent forces on the window's residuals.
-
-    Raises:
-        DiagnoseError: As of broken derivatives.
-    """
-    weight, level = noise.scale**-2.0, noise.deviation(gram, window)
-    lower, log_det = _factor(gram, noise, level)
-    right = (weight @ gram.cross[:, : len(level)]) * level
-    mean = np.ravel(lapack.dpotrs(lower, right, lower=1)[0])
-    quadratic = weight @ gram.square - right @ mean
-    return Posterior(mean, -0.5 * float(quadratic + log_det))
 
 
 @dataclass(frozen=True)

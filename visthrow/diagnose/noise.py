@@ -11,14 +11,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import lapack
 
+from visthrow.diagnose import designs
 from visthrow.diagnose.marginal import (
     TAIL,
     Gram,
     Noise,
-    columns,
     correlated,
     hidden_gram,
-    posterior,
     without_effects,
 )
 from visthrow.diagnose.model import LATENT_BLOCKS, Window
@@ -295,7 +294,7 @@ def _likelihood(stack: Stack, noise: Noise, layout: _Layout) -> tuple[float, np.
     return value + float(values.sum()), slope, curvature
 
 
-def without_outliers(windows: Sequence[Window], grams: Sequence[Gram]) -> list[Window]:
+def without_outliers(windows: Sequence[Window], grams: Sequence[Gram], floors: np.ndarray, device: str = "cpu") -> list[Window]:
     """Give single samples far outside a sigma that puts them at HUBER; windows with none are returned as they are.
 
     Latent forces have a wide prior here, so that a missing effect is followed and only what no force can do stands out.
@@ -303,25 +302,46 @@ def without_outliers(windows: Sequence[Window], grams: Sequence[Gram]) -> list[W
     Args:
         windows: of the flights.
         grams: of the windows, with ``factor`` the identity.
+        floors: of the effects, shape (K,).
+        device: where to calculate.
     """
-    return each(lambda pair: _mended(*pair), zip(windows, grams))
-
-
-def _mended(window: Window, whole: Gram) -> Window:
-    sigma, bare, gram = window.sigma, replace(window, effects=window.effects[:, :0]), without_effects(whole)
+    sigmas = [window.sigma for window in windows]
+    left, given, bare = list(range(len(windows))), list(windows), [without_effects(gram) for gram in grams]
     for again in range(CLEANINGS):
-        if again:
-            gram = hidden_gram(replace(window, sigma=sigma), len(gram.count))
-        guess = _first_guess([gram])
-        wide = replace(guess, latent_sd={key: WIDE * level for key, level in guess.latent_sd.items()})
-        shaped = correlated(gram, window, wide.correlation_time)
-        fitted = wide.deviation(shaped, 0) * posterior(shaped, wide, 0).mean
-        fitted[gram.nuisances :] = shaped.factor @ fitted[gram.nuisances :]
-        left = window.residual - columns(bare, np.zeros(0)) @ fitted
-        normal = np.abs(left) / window.sigma
-        far = normal / (HUBER * np.maximum(1.0, MAD_TO_SIGMA * np.median(normal)))
-        if not np.any(far > 1.0):
+        where = "cpu" if again else device  # few are looked at once more
+        residuals = designs.left_by(given, floors, len(grams[0].count), _widely_fitted(given, bare, where), where)
+        far = {w: _far(windows[w], residual) for w, residual in zip(left, residuals)}
+        left = [w for w in left if np.any(far[w] > 1.0)]
+        if not left:
             break
-        sigma = window.sigma * np.maximum(far, 1.0)
-    outliers = sigma > window.sigma
-    return replace(window, sigma=sigma) if 0.0 < outliers.mean() <= HUBER_SHARE else window
+        for w in left:
+            sigmas[w] = windows[w].sigma * np.maximum(far[w], 1.0)
+        given = [replace(windows[w], sigma=sigmas[w]) for w in left]
+        bare = each(lambda window: hidden_gram(window, len(grams[0].count)), given)
+    return [_mended(window, sigma) for window, sigma in zip(windows, sigmas)]
+
+
+def _widely_fitted(windows: Sequence[Window], bare: Sequence[Gram], device: str) -> list[np.ndarray]:
+    """Initial states in prior deviations and latents at the knots that explain most, with wide priors of the latents."""
+    time = CORRELATION_TIMES[0]
+    shaped = each(lambda w: correlated(bare[w], windows[w], time), range(len(bare)))
+    share = np.zeros((len(bare), len(LATENT_BLOCKS)))
+    for row, gram in zip(share, bare):
+        for (block, _), level in _first_guess([gram]).latent_sd.items():
+            row[block] = WIDE * level
+    levels = {(block, gram.phase): 1.0 for gram in bare for block in gram.shown}
+    fits = Stack(shaped, device).fitted(Noise(np.ones(len(bare[0].count)), levels, time, share))
+    for fit, gram in zip(fits, shaped):
+        fit[gram.nuisances :] = gram.factor @ fit[gram.nuisances :]
+    return fits
+
+
+def _far(window: Window, left: np.ndarray) -> np.ndarray:
+    """How far samples are outside, in that which is far, shape (N,)."""
+    normal = np.abs(left) / window.sigma
+    return normal / (HUBER * np.maximum(1.0, MAD_TO_SIGMA * np.median(normal)))
+
+
+def _mended(window: Window, sigma: np.ndarray) -> Window:
+    """The window with other sigmas, where these differ in a few samples."""
+    return replace(window, sigma=sigma) if 0.0 < (sigma > window.sigma).mean() <= HUBER_SHARE else window

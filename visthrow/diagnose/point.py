@@ -8,18 +8,17 @@ import numpy as np
 
 from visthrow.diagnose import noise as levels
 from visthrow.diagnose import stack
+from visthrow.diagnose.designs import grams_of, with_residuals
 from visthrow.diagnose.evidence import Priors, covariance, estimate, log_evidence
 from visthrow.diagnose.marginal import (
     Gram,
     Noise,
     Statistics,
     gather,
-    gram_of,
     recorrelated,
 )
 from visthrow.diagnose.model import Linearised, Model, Window
 from visthrow.diagnose.scatter import freed, own_shares
-from visthrow.diagnose.threads import each
 
 STEPS = 3
 """Gauss-Newton steps between two linearisations."""
@@ -115,12 +114,12 @@ def linearise(problem: Problem, theta: np.ndarray, start: Noise | None = None, w
     windows = problem.model.windows(problem.sizes(theta)) if windows is None else windows
     channels = len(problem.model.channels)
     found = [windows[i] for i in problem.kept]
-    first = each(lambda w: gram_of(w, problem.priors.floor, channels), found)
-    kept = levels.without_outliers(found, first)
+    device, floors = getattr(problem.model, "device", "cpu"), problem.priors.floor
+    first = grams_of(found, floors, channels, device)
+    kept = levels.without_outliers(found, first, floors, device)
     mended = [w for w in range(len(kept)) if kept[w] is not found[w]]
-    again = dict(zip(mended, each(lambda w: gram_of(kept[w], problem.priors.floor, channels), mended)))
+    again = dict(zip(mended, grams_of([kept[w] for w in mended], floors, channels, "cpu")))
     raw = [again.get(w, gram) for w, gram in enumerate(first)]
-    device = getattr(problem.model, "device", "cpu")
     noise, grams = levels.fit(kept, raw, start, device)
     integrals, at = stack.integrals(grams, noise, device), np.array(theta, dtype=float)
     about = Linearised(problem.sizes(theta), dict(zip(problem.kept, kept)))
@@ -162,7 +161,7 @@ def moved(problem: Problem, point: Point, theta: np.ndarray) -> Point | None:
 
 def _with_residuals(problem: Problem, point: Point, residuals: Sequence[np.ndarray]) -> tuple[list[Gram], list[Gram]]:
     """The point's grams with other residuals, with latents at the knots and correlated."""
-    raw = stack.with_residuals(point.raw, point.windows, problem.priors.floor, residuals, point.device)
+    raw = with_residuals(point.raw, point.windows, problem.priors.floor, residuals, point.device)
     return raw, [recorrelated(gram, own) for gram, own in zip(point.grams, raw)]
 
 

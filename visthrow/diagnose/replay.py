@@ -5,7 +5,6 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-import torch
 import warp as wp
 
 from sim.replay.kernel import ATTACHED, LOOSE, NO_PAYLOAD, WINDOW_FIELDS
@@ -14,6 +13,7 @@ from visthrow.diagnose.catalogue import Setting
 from visthrow.diagnose.cutting import Cut
 from visthrow.diagnose.recorded import NEVER, Recorded, Samples
 from visthrow.diagnose.states import States, rows_of, stacked
+from visthrow.diagnose.transfer import to_host
 
 KNOT_SPACING = 0.1  # of the latent forces [s]
 EARLY = 0.004  # after a window's start, before which no stamp is used: delays may move there [s]
@@ -189,11 +189,8 @@ class Flights:
 
 
 def downloaded(array: wp.array) -> np.ndarray:
-    """What a GPU has written, by way of locked pages that torch keeps: fresh ones cost as much time as the copy."""
-    if not array.device.is_cuda:
-        return array.numpy()
-    there = wp.to_torch(array)
-    return torch.empty(there.shape, dtype=there.dtype, pin_memory=True).copy_(there).numpy()
+    """What a replay has written, on the host."""
+    return to_host(wp.to_torch(array)) if array.device.is_cuda else array.numpy()
 
 
 def rough_step(setting: Setting, substep: float) -> float:

@@ -93,14 +93,11 @@ def screen(point: Point, parts: Sequence[WindowStatistics], block: str, known: S
 
     ends = np.cumsum([len(known[w]["time"]) for w in through])[:-1]
     factors = zip(*(np.split(values, ends) for values in layout.factors(grammar.joined([known[w] for w in through], shared))))
-    at_knots = dict(zip(through, factors))
-
-    def told(windows: Sequence[int]) -> tuple[np.ndarray, ...]:
-        exerted = [(*_exerted(point, parts[w], w, block, known[w], own), *at_knots[w]) for w in windows]
-        return _products(exerted, layout, point.device)
-
-    batches = [through[first : first + size] for first in range(0, len(through), size)]
-    square, information, score, cross = (sum(shares) for shares in zip(*each(told, batches)))
+    exerted = each(lambda w: _exerted(point, parts[w], w, block, known[w], own), through)
+    told = [(*one, *at_knots) for one, at_knots in zip(exerted, factors)]
+    batches = [told[first : first + size] for first in range(0, len(told), size)]
+    shares = each(lambda batch: _products(batch, layout, point.device), batches)
+    square, information, score, cross = map(sum, zip(*shares))
     rows = sum(int((point.grams[w].latent_block == own).sum()) // 3 for w in through)
     return Screen(_terms(block, shared), np.sqrt(square / max(rows, 1)), information, score, cross)
 

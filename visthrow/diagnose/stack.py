@@ -4,14 +4,15 @@ The same algebra as :mod:`visthrow.diagnose.marginal`, for grams that are padded
 batches that fit its cache.
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import TypeVar
 
 import numpy as np
 import torch
 
+from visthrow.diagnose.designs import Same
 from visthrow.diagnose.marginal import (
     ROUNDING,
     Gram,
@@ -22,9 +23,8 @@ from visthrow.diagnose.marginal import (
     integral,
     statistics_of,
     window_statistics,
-    with_residual,
 )
-from visthrow.diagnose.model import LATENT_BLOCKS, Window
+from visthrow.diagnose.model import LATENT_BLOCKS
 from visthrow.diagnose.threads import each
 from visthrow.errors import DiagnoseError
 
@@ -32,16 +32,6 @@ T = TypeVar("T")
 
 BATCH = 8  # windows of a batch on the CPU
 BLOCKS = len(LATENT_BLOCKS)
-
-
-class _Same(tuple):
-    """Arrays that are the same only if they are the very ones."""
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Same) and len(self) == len(other) and all(a is b for a, b in zip(self, other))
-
-    def __hash__(self) -> int:
-        return hash(tuple(map(id, self)))
 
 
 class _Columns:
@@ -87,72 +77,9 @@ class _Columns:
 
 
 @lru_cache(maxsize=2)
-def _kept(inner: _Same, sizes: tuple[int, ...], device: str) -> _Columns:
+def _kept(inner: Same, sizes: tuple[int, ...], device: str) -> _Columns:
     """Those that a GPU has already: residuals and noise levels change far more often than derivatives do."""
     return _Columns(inner, sizes, device)
-
-
-class _Design:
-    """Columns of W windows over their sigmas, on a device; padded with 0 to N samples and P columns."""
-
-    def __init__(self, windows: Sequence[tuple[np.ndarray, ...]], floors: np.ndarray, channels: int, device: str):
-        """Move them there, where they are also scaled.
-
-        Args:
-            windows: of each, its nuisances, latents, effects, deviations of nuisances, sigmas and channels.
-            floors: of the effects, shape (K,).
-            channels: of the model.
-            device: where to calculate.
-        """
-        self._widths = [sum(parts.shape[1] for parts in own[:3]) for own in windows]
-        shape = len(windows), max(len(sigma) for *_, sigma, _ in windows)
-        sigma, member = np.ones(shape), np.zeros((*shape, channels))
-        columns = torch.zeros((*shape, max(self._widths)), dtype=torch.float64, device=device)
-        for row, (nuisance, latent, effects, sd, own_sigma, channel) in enumerate(windows):
-            at = 0
-            for values, scale in ((nuisance, sd), (latent, np.ones(latent.shape[1])), (effects, floors)):
-                there = torch.from_numpy(values).to(device) * torch.from_numpy(scale).to(device)
-                columns[row, : len(values), at : at + values.shape[1]] = there
-                at += values.shape[1]
-            sigma[row, : len(own_sigma)] = own_sigma
-            member[row, np.arange(len(channel)), channel] = 1.0
-        self._sigma, self._member = (torch.from_numpy(a).to(device) for a in (sigma, member))
-        self._columns = columns.div_(self._sigma[:, :, None])
-
-    def products(self, residuals: Sequence[np.ndarray]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Inner products of each window's residual with its columns (C, P), and with itself (C,)."""
-        padded = np.zeros(self._sigma.shape)
-        for row, residual in zip(padded, residuals):
-            row[: len(residual)] = residual
-        off = torch.from_numpy(padded).to(self._sigma.device) / self._sigma
-        by_channel = (self._member * off[:, :, None]).transpose(1, 2)
-        cross, square = (by_channel @ self._columns).cpu().numpy(), (by_channel @ off[:, :, None])[..., 0].cpu().numpy()
-        return ((own[:, :width], its) for own, width, its in zip(cross, self._widths, square))
-
-
-@lru_cache(maxsize=2)
-def _designed(arrays: _Same, channels: int, device: str) -> _Design:
-    """As :func:`_kept`, of windows' columns."""
-    return _Design([arrays[i : i + 6] for i in range(0, len(arrays) - 1, 6)], arrays[-1], channels, device)
-
-
-def with_residuals(
-    grams: Sequence[Gram], windows: Sequence[Window], floors: np.ndarray, residuals: Sequence[np.ndarray], device: str
-) -> list[Gram]:
-    """Grams with the same derivatives and other residuals: of all windows at once on a GPU, where the derivatives stay.
-
-    Args:
-        grams: of the windows, whose latents are at the knots.
-        windows: of the model.
-        floors: of the effects, shape (K,).
-        residuals: of each window, shape (N,).
-        device: where to calculate.
-    """
-    if device == "cpu":
-        return each(lambda w: with_residual(grams[w], windows[w], floors, residuals[w]), range(len(grams)))
-    arrays = [a for w in windows for a in (w.nuisance, w.latent, w.effects, w.nuisance_sd, w.sigma, w.channel)]
-    design = _designed(_Same([*arrays, floors]), len(grams[0].count), device)
-    return [replace(gram, cross=cross, square=square) for gram, (cross, square) in zip(grams, design.products(residuals))]
 
 
 @dataclass(frozen=True)
@@ -234,7 +161,8 @@ class Stack:
         """
         rows = np.arange(len(grams)) if windows is None else np.asarray(windows, dtype=int)
         self.device, size = device, BATCH if device == "cpu" else max(len(grams), 1)
-        order = sorted(range(len(grams)), key=lambda w: grams[w].nuisances + grams[w].latents)
+        self._sizes = [gram.nuisances + gram.latents for gram in grams]
+        order = sorted(range(len(grams)), key=self._sizes.__getitem__)
         self._order = [order[first : first + size] for first in range(0, len(order), size)]
         self._batches = each(lambda own: self._padded([grams[w] for w in own], rows[own]), self._order)
         self._count = len(grams)
@@ -252,7 +180,7 @@ class Stack:
         log_sigma = np.array([gram.log_sigma for gram in grams])
         arrays = [torch.from_numpy(a).to(self.device) for a in (cross, square, counts, log_sigma, member, known)]
         inner = [gram.inner for gram in grams]
-        columns = _Columns(inner, sizes, self.device) if self.device == "cpu" else _kept(_Same(inner), tuple(sizes), self.device)
+        columns = _Columns(inner, sizes, self.device) if self.device == "cpu" else _kept(Same(inner), tuple(sizes), self.device)
         return _Batch(windows, list(grams), columns, *arrays)
 
     def values(self, noise: Noise) -> np.ndarray:
@@ -262,6 +190,20 @@ class Stack:
             DiagnoseError: The normal equations are not positive definite, which only broken derivatives can cause.
         """
         return self._in_order([part for (part,) in self._each(lambda batch: (_solved(batch, noise).value,))])
+
+    def fitted(self, noise: Noise) -> list[np.ndarray]:
+        """Most probable initial state and unit latent forces of each window, shape (D + L,).
+
+        Raises:
+            DiagnoseError: As :meth:`values`.
+        """
+
+        def found(batch: _Batch) -> tuple[torch.Tensor]:
+            at = _solved(batch, noise)
+            return (at.level * at.mean,)
+
+        by_window = {w: row for own, (rows,) in zip(self._order, self._each(found)) for w, row in zip(own, rows)}
+        return [by_window[w][:size] for w, size in enumerate(self._sizes)]
 
     def look(self, noise: Noise) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Log-likelihood, its gradient and expected curvature by the logarithms of the windows' own levels.
