@@ -100,28 +100,32 @@ def fit(
     Returns:
         The levels, and the grams with correlated latent forces that belong to them.
     """
-    times = CORRELATION_TIMES if start is None else (start.correlation_time,)
-    if not any(gram.latents for gram in grams):
-        times = times[:1]
-    bare = [without_effects(gram) for gram in grams]
-    found: dict[int, tuple[float, Noise, list[Gram]]] = {}
+    noise, time = start, CORRELATION_TIMES[0] if start is None else start.correlation_time
+    if start is None and any(gram.latents for gram in grams):
+        noise = _likeliest(windows, grams, device)
+        time = noise.correlation_time
+    shaped = each(lambda w: correlated(grams[w], windows[w], time), range(len(grams)))
+    begin = replace(noise or _first_guess(shaped), correlation_time=time)
+    return _maximise(shaped, begin, device)[0], shaped
+
+
+def _likeliest(windows: Sequence[Window], grams: Sequence[Gram], device: str) -> Noise:
+    """Rough levels with the likeliest correlation time: from the middle uphill, for the likelihood has one maximum over it."""
+    bare, found = [without_effects(gram) for gram in grams], {}
 
     def likely(i: int, noise: Noise | None) -> float:
         if i not in found:
-            shaped = each(lambda w: correlated(bare[w], windows[w], times[i]), range(len(bare)))
-            begin = replace(noise or _first_guess(shaped), correlation_time=times[i])
-            noise, value = _maximise(shaped, begin, device, ROUGHLY_NATS if len(times) > 1 else ENOUGH_NATS)
-            found[i] = value, noise, shaped
-        return found[i][0]
+            shaped = each(lambda w: correlated(bare[w], windows[w], CORRELATION_TIMES[i]), range(len(bare)))
+            begin = replace(noise or _first_guess(shaped), correlation_time=CORRELATION_TIMES[i])
+            found[i] = _maximise(shaped, begin, device, ROUGHLY_NATS)
+        return found[i][1]
 
-    best = len(times) // 2
-    likely(best, start)
-    for way in (-1, 1):  # the likelihood has one maximum over the time
-        while 0 <= best + way < len(times) and likely(best + way, found[best][1]) > found[best][0]:
+    best = len(CORRELATION_TIMES) // 2
+    likely(best, None)
+    for way in (-1, 1):
+        while 0 <= best + way < len(CORRELATION_TIMES) and likely(best + way, found[best][0]) > found[best][1]:
             best += way
-    _, noise, shaped = found[best]
-    noise = noise if len(times) == 1 else _maximise(shaped, noise, device)[0]
-    return noise, each(lambda w: correlated(grams[w], windows[w], noise.correlation_time), range(len(grams)))
+    return found[best][0]
 
 
 def refit(grams: Sequence[Gram], start: Noise, device: str = "cpu") -> Noise:

@@ -40,6 +40,7 @@ from visthrow.diagnose.point import (
 from visthrow.diagnose.result import Diagnosis, Step
 from visthrow.diagnose.rivals import CLOSE, rivals
 from visthrow.diagnose.scatter import Scatter, deviations, freed, straightened, varying
+from visthrow.diagnose.threads import beside
 from visthrow.errors import DiagnoseError
 
 MOST_NAMES = 6
@@ -159,7 +160,8 @@ class Search:
         alike = self._alike(max(short, key=lambda j: under_free[j]))
         short += [j for j in alike if np.isfinite(screened[j]) and j not in short]
         base = self.point, self.active
-        tried = {int(j): self._candidate(free, [*self.active, int(j)]) for j in short}
+        short = [int(j) for j in short]
+        tried = dict(zip(short, self._candidates(free, [[*self.active, j] for j in short])))
         nats = {j: self._ahead((point, [*self.active, j]), base) for j, point in tried.items()}
         enough = max([self.least, *(CONTRADICTED * n for n in self.refused.values())])
         ranked = [j for j in sorted(nats, key=nats.get, reverse=True) if nats[j] > enough]
@@ -308,9 +310,23 @@ class Search:
             point = with_fitted_noise(point)
         return point
 
+    def _candidates(self, point: Point, sets: Sequence[Sequence[int]]) -> list[Point]:
+        """The same of several sets: side by side where they wait for a GPU, but for those that turn on another kind of block."""
+        if point.device == "cpu":
+            return [self._candidate(point, active) for active in sets]
+        turned = [i for i, active in enumerate(sets) if self._off(point, active)]
+        plain = [i for i in range(len(sets)) if i not in turned]
+        found = {i: self._candidate(point, sets[i]) for i in turned}
+        found |= zip(plain, beside(lambda i: self._candidate(point, sets[i]), plain))
+        return [found[i] for i in range(len(sets))]
+
+    def _off(self, point: Point, active: Sequence[int]) -> list[int]:
+        """Other kinds of blocks in a set that a point does not fly."""
+        return [j for j in active if self.problem.switches[j] and point.theta[j] == 0.0]
+
     def _switched(self, point: Point, active: Sequence[int]) -> Point:
         """The point, linearised with another kind of block on where a set asks for one that is off."""
-        off = [j for j in active if self.problem.switches[j] and point.theta[j] == 0.0]
+        off = self._off(point, active)
         if not off:
             return point
         theta = np.where(np.isin(np.arange(len(point.theta)), list(active)), point.theta, 0.0)
@@ -376,8 +392,8 @@ class Search:
             self.sets = [(tuple(self.active), 0.0)]
             winner: tuple[float, list[int], Point] | None = None
             settled: dict[str, float] = {}
-            for rival, _ in ranked:
-                point = self._candidate(self.point, rival)
+            points = self._candidates(self.point, [rival for rival, _ in ranked])
+            for (rival, _), point in zip(ranked, points):
                 ahead = self._ahead((point, rival), (self.point, self.active))
                 ahead += self.least * (len(self.active) - len(rival))  # every name costs the threshold
                 settled[self._together(rival)] = float(ahead)

@@ -25,9 +25,12 @@ def single() -> None:
     threadpool_limits(1)
 
 
+BESIDE = 3  # tasks side by side that mostly wait for a GPU
+
+
 @cache
-def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(min(cores(), MOST), "algebra", single)
+def _pool(name: str, threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads, name, single)
 
 
 def each(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
@@ -35,4 +38,9 @@ def each(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
     items = list(items)
     if min(cores(), len(items)) < 2:
         return [function(item) for item in items]
-    return list(_pool().map(function, items))
+    return list(_pool("algebra", min(cores(), MOST)).map(function, items))
+
+
+def beside(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
+    """The function of every item, in order, a few at once, each of which may call :func:`each`."""
+    return list(_pool("tasks", BESIDE).map(function, items))

@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import threading
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -22,6 +23,7 @@ from visthrow.diagnose.replay import BATCH, CUDA_BATCH, Flights, Lane, carried, 
 from visthrow.diagnose.settling import Settling, following, perturbed
 from visthrow.diagnose.sightings import channels_of, needs_no_flight, sightings, with_sightings
 from visthrow.diagnose.states import (
+    Direction,
     States,
     concerns,
     directions,
@@ -118,6 +120,7 @@ class ThrowModel:
         self._fits: dict[tuple[Cut, ...], tuple[States, dict[int, np.ndarray]]] = {}
         self._latest: dict[frozenset[str], States] = {frozenset(): self._fitted(states)[0]}
         self._settled_at: dict[frozenset[tuple[str, float]], States] = {}
+        self._lock = threading.Lock()  # residuals may be asked for side by side
         self._follows: tuple[Linearised, dict[int, list[int]], np.ndarray] | None = None  # the last that was asked for
         self._sightings = sightings(logs, flights, self.flights.cuts, self.setting)
 
@@ -186,22 +189,28 @@ class ThrowModel:
         """States that belong to other sizes of the effects by the derivatives, and how each window's were moved."""
         names = [e.effect.name for e in self.entries.values()]
         change = np.array([theta.get(name, 0.0) - about.theta.get(name, 0.0) for name in names])
-        found, cuts = directions(setting.plant), self.flights.cuts
-        if self._follows is None or self._follows[0] is not about:
-            owns = {i: [d for d, x in enumerate(found) if concerns(x, cuts[self._told[i]])] for i in about.windows}
-
-            def way(i: int) -> np.ndarray:
-                free = np.array([found[d].follows for d in owns[i]], dtype=bool)
-                return following(self.flights, self._told[i], about.windows[i], free, self.setting.plant.release.lag)
-
-            by_effect = np.zeros((len(cuts), len(found), len(names)))
-            for i, moves in zip(owns, each(way, owns)):
-                by_effect[self._told[i], owns[i]] = moves
-            self._follows = about, owns, by_effect
-        _, owns, by_effect = self._follows
+        found = directions(setting.plant)
+        with self._lock:
+            if self._follows is None or self._follows[0] is not about:
+                self._follows = about, *self._ways(found, about, len(names))
+            _, owns, by_effect = self._follows
         sizes = by_effect @ change
         states = moved_along(self._settled_at[_key(about.theta)], found, sizes)
         return states, {i: sizes[self._told[i], own] for i, own in owns.items()}
+
+    def _ways(self, found: Sequence[Direction], about: Linearised, effects: int) -> tuple[dict[int, list[int]], np.ndarray]:
+        """Which directions each window's state has, and how it follows the effects in them, shape (W, directions, K)."""
+        cuts = self.flights.cuts
+        owns = {i: [d for d, x in enumerate(found) if concerns(x, cuts[self._told[i]])] for i in about.windows}
+
+        def way(i: int) -> np.ndarray:
+            free = np.array([found[d].follows for d in owns[i]], dtype=bool)
+            return following(self.flights, self._told[i], about.windows[i], free, self.setting.plant.release.lag)
+
+        by_effect = np.zeros((len(cuts), len(found), effects))
+        for i, moves in zip(owns, each(way, owns)):
+            by_effect[self._told[i], owns[i]] = moves
+        return owns, by_effect
 
     def _switches(self, theta: Mapping[str, float]) -> frozenset[str]:
         """Which other kinds of blocks are on."""
