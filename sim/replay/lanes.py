@@ -137,6 +137,8 @@ class Replay:
         k, t = self.kernel, self.types
         count = len(lanes["window"])
         device = self.device if count > FEW * cores() else "cpu"
+        if device != "cpu":  # lanes that wait for others would double the time, which is that of the slowest
+            lanes = {**lanes, "resume": np.full(count, -1)}
         if device not in self._plants:
             self._plants[device] = [wp.array(value, dtype=struct, device=device) for struct, value in self._rows.items()]
         w = np.asarray(lanes["window"])

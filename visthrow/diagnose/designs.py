@@ -13,7 +13,7 @@ import torch
 from visthrow.diagnose.marginal import Gram, check, gram_of, gram_with, left_of, with_residual
 from visthrow.diagnose.model import Window
 from visthrow.diagnose.threads import each
-from visthrow.diagnose.transfer import to_host
+from visthrow.diagnose.transfer import side_by_side, to_host
 
 
 class Same(tuple):
@@ -39,19 +39,15 @@ class _Design:
             device: where to calculate.
         """
         self._widths = [sum(parts.shape[1] for parts in own[:3]) for own in windows]
-        shape = len(windows), max(len(sigma) for *_, sigma, _ in windows)
-        sigma, member = np.ones(shape), np.zeros((*shape, channels))
-        columns = torch.zeros((*shape, max(self._widths)), dtype=torch.float64, device=device)
-        for row, (nuisance, latent, effects, sd, own_sigma, channel) in enumerate(windows):
-            at = 0
-            for values, scale in ((nuisance, sd), (latent, np.ones(latent.shape[1])), (effects, floors)):
-                there = torch.from_numpy(values).to(device) * torch.from_numpy(scale).to(device)
-                columns[row, : len(values), at : at + values.shape[1]] = there
-                at += values.shape[1]
-            sigma[row, : len(own_sigma)] = own_sigma
-            member[row, np.arange(len(channel)), channel] = 1.0
-        self._sigma, self._member = (torch.from_numpy(a).to(device) for a in (sigma, member))
-        self._columns = columns.div_(self._sigma[:, :, None])
+        shape, width = (len(windows), max(len(own[4]) for own in windows)), max(self._widths)
+        sigma, member, scale = np.ones(shape), np.zeros((*shape, channels)), np.zeros((len(windows), width))
+        for w, (*parts, sd, own_sigma, channel) in enumerate(windows):
+            scale[w, : self._widths[w]] = np.concatenate((sd, np.ones(parts[1].shape[1]), floors))
+            sigma[w, : len(own_sigma)] = own_sigma
+            member[w, np.arange(len(channel)), channel] = 1.0
+        self._sigma, self._member, scales = (torch.from_numpy(a).to(device) for a in (sigma, member, scale))
+        columns = side_by_side([own[:3] for own in windows], (shape[1], width), device)
+        self._columns = columns.mul_(scales[:, None]).div_(self._sigma[:, :, None])
 
     def inner(self) -> Iterator[np.ndarray]:
         """Inner products of each window's columns by channel, shape (C, P, P)."""

@@ -19,6 +19,7 @@ from visthrow.diagnose.model import LATENT_BLOCKS
 from visthrow.diagnose.point import Point
 from visthrow.diagnose.stack import BATCH, statistics
 from visthrow.diagnose.threads import each
+from visthrow.diagnose.transfer import side_by_side
 
 ROUGHER = 2.0
 """While terms are screened, no phase is rougher than so many times the usual."""
@@ -120,7 +121,7 @@ def _products(windows: Sequence[tuple[np.ndarray, ...]], layout: grammar.Layout,
     """
     longest = max((len(scalars) for *_, scalars, _ in windows), default=0)
     square, information, score, cross, scalars, vectors = (
-        torch.from_numpy(_padded(arrays, axes, longest)).to(device)
+        _padded(arrays, axes, longest, device)
         for arrays, axes in zip(zip(*windows), ((3, 3), (3, 3), (3,), (3, None), (1, None), (1, None, None)))
     )
     values = vectors[..., torch.from_numpy(layout.vector).to(device)]
@@ -132,13 +133,10 @@ def _products(windows: Sequence[tuple[np.ndarray, ...]], layout: grammar.Layout,
     return tuple(value.cpu().numpy() for value in (*squares, score.reshape(-1) @ flat, flat.T @ cross))
 
 
-def _padded(arrays: Sequence[np.ndarray], axes: Sequence[int | None], longest: int) -> np.ndarray:
+def _padded(arrays: Sequence[np.ndarray], axes: Sequence[int | None], longest: int, device: str) -> torch.Tensor:
     """Arrays side by side, with zeros up to so many knots along each axis that has some entries a knot."""
-    shape = [size if per is None else per * longest for size, per in zip(arrays[0].shape, axes)]
-    out = np.zeros((len(arrays), *shape))
-    for row, array in zip(out, arrays):
-        row[tuple(slice(size) for size in array.shape)] = array
-    return out
+    shape = tuple(size if per is None else per * longest for size, per in zip(arrays[0].shape, axes))
+    return side_by_side([[array] for array in arrays], shape, device)
 
 
 def gains(point: Point, priors: Priors, active: Sequence[int], of: Screen, reach: float) -> tuple[np.ndarray, np.ndarray]:

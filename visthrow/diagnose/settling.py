@@ -88,6 +88,8 @@ class Settling:
         ]  # directions in which windows' initial states are fitted
         self._drift = [drift(flights, w) for w in range(len(flights.cuts))]
         self._gusts = np.ones(len(flights.cuts))  # of each window, against the drift that is thought possible
+        self._spreads: dict[int, tuple[float, np.ndarray]] = {}  # and the samples' deviation with these
+        self._scales: dict[int, tuple] = {}  # the last slopes and deviations of a window, and what comes of them
         self._tells, ends = zip(*[told_of_start(flights, w, lag) for w in range(len(flights.cuts))])
         self._shortened = flights.ended(ends)
 
@@ -184,7 +186,11 @@ class Settling:
 
     def _spread(self, w: int) -> np.ndarray:
         """Deviation of a window's samples from a flight without gusts: noise, and how far gusts may have led by then."""
-        return np.hypot(self.flights.sigma(w), self._gusts[w] * self._drift[w])
+        gusts, spread = self._spreads.get(w, (np.nan, None))
+        if gusts != self._gusts[w]:
+            spread = np.hypot(self.flights.sigma(w), self._gusts[w] * self._drift[w])
+            self._spreads[w] = float(self._gusts[w]), spread
+        return spread
 
     def _calmed(self, w: int, residual: np.ndarray) -> bool:
         """Take a window's gusts for as strong as what is left of it says, if that is much less than was thought."""
@@ -214,6 +220,16 @@ class Settling:
             slopes[w] = (flat[:, 1:] - flat[:, :1]) / steps * self._tells[w][:, None]
         return slopes
 
+    def _scaled(self, w: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Prior deviations of a window's state, its derivatives in these and the samples' deviations, and their inner products."""
+        slopes, spread = self.slopes[w], self._spread(w)
+        known = self._scales.get(w)
+        if known is None or known[0] is not slopes or known[1] is not spread:
+            sd = np.array([self.directions[d].spread(self.flights.cuts[w]) for d in self._free[w]])
+            scaled = slopes * sd / spread[:, None]
+            known = self._scales[w] = slopes, spread, (sd, scaled, scaled.T @ scaled)
+        return known[2]
+
     def _increments(
         self, w: int, residual: np.ndarray, done: np.ndarray, dampings: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
@@ -228,12 +244,11 @@ class Settling:
         Returns:
             Steps, shape (T, directions); falls of the cost, shape (T,).
         """
-        ds, spread = self._free[w], self._spread(w)
-        sd = np.array([self.directions[d].spread(self.flights.cuts[w]) for d in ds])
-        off = residual / spread
+        ds, (sd, scaled, bend) = self._free[w], self._scaled(w)
+        off = residual / self._spread(w)
         weight = np.minimum(1.0, HUBER / np.maximum(np.abs(off), 1e-12))
-        scaled = self.slopes[w] * sd / spread[:, None]
-        bend = scaled.T @ (scaled * weight[:, None])
+        if np.any(weight < 1.0):
+            bend = scaled.T @ (scaled * weight[:, None])
         normal = bend + np.eye(len(ds))
         damped = normal + dampings[:, None, None] * np.diag(np.diag(normal))
         slope = scaled.T @ (off * weight)

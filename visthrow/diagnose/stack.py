@@ -26,6 +26,7 @@ from visthrow.diagnose.marginal import (
 )
 from visthrow.diagnose.model import LATENT_BLOCKS
 from visthrow.diagnose.threads import each
+from visthrow.diagnose.transfer import side_by_side
 from visthrow.errors import DiagnoseError
 
 T = TypeVar("T")
@@ -68,12 +69,8 @@ class _Columns:
         return len(self._inner[0][0]) - self._sizes[0]
 
     def _moved(self, height: int, width: int, part: Callable[[np.ndarray, int], np.ndarray]) -> torch.Tensor:
-        shape = len(self._inner), len(self._inner[0]), height, width
-        out = torch.zeros(shape, dtype=torch.float64, pin_memory=self._device.startswith("cuda"))
-        for row, inner, size in zip(out.numpy(), self._inner, self._sizes):
-            values = part(inner, size)
-            row[:, : values.shape[1], : values.shape[2]] = values
-        return out.to(self._device)
+        parts = [[part(inner, size)] for inner, size in zip(self._inner, self._sizes)]
+        return side_by_side(parts, (len(self._inner[0]), height, width), self._device)
 
 
 @lru_cache(maxsize=2)
@@ -145,7 +142,7 @@ def statistics(grams: Sequence[Gram], noise: Noise, device: str) -> list[WindowS
     """The same, and what the windows say of their latent forces as if they were effects."""
     if device == "cpu":
         return each(lambda w: window_statistics(grams[w], noise, w), range(len(grams)))
-    return [statistics_of(*pair, noise) for pair in zip(Stack(grams, device).integrals(noise, latents=True), grams)]
+    return each(lambda pair: statistics_of(*pair, noise), zip(Stack(grams, device).integrals(noise, latents=True), grams))
 
 
 class Stack:
