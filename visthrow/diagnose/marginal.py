@@ -202,11 +202,11 @@ def correlated(gram: Gram, window: Window, time: float) -> Gram:
     if not gram.latents:
         return gram
     group = window.latent_block.astype(int) * 3 + window.latent_axis.astype(int)
-    lag = np.abs(window.latent_time[:, None] - window.latent_time)
-    alike = np.where(group[:, None] == group, np.exp(-lag / time), 0.0)
-    factor = np.linalg.cholesky(alike + 1e-9 * np.eye(gram.latents))
     knots = _knots(group, window.latent_time)
-    own, groups = factor[:knots, :knots], gram.latents // knots
+    lag = np.abs(window.latent_time[:knots, None] - window.latent_time[:knots])
+    alike = np.where(group[:knots, None] == group[:knots], np.exp(-lag / time), 0.0)
+    own, groups = np.linalg.cholesky(alike + 1e-9 * np.eye(knots)), gram.latents // knots
+    factor = np.kron(np.eye(groups), own)
     part, (channels, size) = slice(gram.nuisances, gram.nuisances + gram.latents), gram.cross.shape
     inner, cross = gram.inner.copy(), gram.cross.copy()
     inner[:, part] = (own.T @ inner[:, part].reshape(channels, groups, knots, size)).reshape(channels, -1, size)

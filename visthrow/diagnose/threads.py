@@ -25,6 +25,7 @@ def single() -> None:
     threadpool_limits(1)
 
 
+PIECES = 4  # of what is to be done, for each thread
 BESIDE = 3  # tasks side by side that mostly wait for a GPU
 
 
@@ -35,10 +36,15 @@ def _pool(name: str, threads: int) -> ThreadPoolExecutor:
 
 def each(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
     """The function of every item, in order, on all cores; no call may wait for another of these."""
-    items = list(items)
-    if min(cores(), len(items)) < 2:
+    items, threads = list(items), min(cores(), MOST)
+    if min(threads, len(items)) < 2:
         return [function(item) for item in items]
-    return list(_pool("algebra", min(cores(), MOST)).map(function, items))
+    pieces = min(PIECES * threads, len(items))  # each item by itself would cost as much as the small ones take
+    parts = _pool("algebra", threads).map(lambda first: [function(item) for item in items[first::pieces]], range(pieces))
+    found: list[R] = [None] * len(items)
+    for first, part in enumerate(parts):
+        found[first::pieces] = part
+    return found
 
 
 def beside(function: Callable[[T], R], items: Iterable[T]) -> list[R]:

@@ -7,6 +7,9 @@ import torch
 
 from visthrow.diagnose.threads import each
 
+FEW = 1_000_000
+"""Numbers up to which one thread lays them."""
+
 
 def to_host(tensor: torch.Tensor) -> np.ndarray:
     """A tensor's values."""
@@ -19,7 +22,7 @@ def side_by_side(parts: Sequence[Sequence[np.ndarray]], shape: tuple[int, ...], 
     """Arrays one beside the other on a device, each padded with zeros to one shape.
 
     Args:
-        parts: of each array, what stands side by side along its last axis.
+        parts: of each array, what stands side by side along its last axis, of one height unless it is empty.
         shape: to pad to.
         device: where to.
 
@@ -30,14 +33,17 @@ def side_by_side(parts: Sequence[Sequence[np.ndarray]], shape: tuple[int, ...], 
     rows = out.numpy()
 
     def lay(i: int) -> None:
-        rows[i] = 0.0
-        at = 0
+        row, at, heights = rows[i], 0, (0,) * (len(shape) - 1)
         for values in parts[i]:
-            *heights, width = values.shape
-            rows[i][(*map(slice, heights), slice(at, at + width))] = values
-            at += width
+            if values.size:
+                *heights, width = values.shape
+                row[(*map(slice, heights), slice(at, at + width))] = values
+                at += width
+        row[..., at:] = 0.0
+        for axis, height in enumerate(heights):
+            row[(slice(None),) * axis + (slice(height, None),)] = 0.0
 
-    if device == "cpu":  # on whose cores batches are laid side by side already
+    if device == "cpu" or out.numel() < FEW:  # batches are laid on all cores already, or it is not worth while
         for i in range(len(parts)):
             lay(i)
     else:
