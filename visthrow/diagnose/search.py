@@ -278,7 +278,9 @@ class Search:
             goal = estimate(point.information, point.score, self.priors, active)
             goal[self.problem.switches] = point.theta[self.problem.switches]
             point = fitted(self.problem, linearise(self.problem, goal, point.noise), active)
-        return self._settle(point, active)
+            if not self._sure(point, active, active[-1]):
+                return point
+        return self._settle(point, active, active[-1])
 
     def _stands(self, point: Point, active: Sequence[int], j: int) -> bool:
         """Whether a candidate of a set could be named at all, however many nats it brings."""
@@ -333,8 +335,14 @@ class Search:
         theta[off] = 1.0 / self.priors.floor[off]
         return linearise(self.problem, theta, point.noise)
 
-    def _settle(self, point: Point, active: Sequence[int]) -> Point:
-        """Linearise where the search stands, unless the last derivatives still hold, and step on where that moved the optimum."""
+    def _settle(self, point: Point, active: Sequence[int], doubted: int | None = None) -> Point:
+        """Linearise where the search stands, unless the last derivatives still hold, and step on where that moved the optimum.
+
+        Args:
+            point: where it stands.
+            active: the set.
+            doubted: an effect of it without which the point is of no use, so that it ends where this one is not sure.
+        """
         kinds = self.problem.switches
         same = np.array_equal(self.origin.theta[kinds] != 0.0, point.theta[kinds] != 0.0)
         if same and curvature(self.problem, self.origin, point) < STRAIGHT:
@@ -342,6 +350,8 @@ class Search:
         for _ in range(LINEARISATIONS):
             self.origin = linearise(self.problem, point.theta, point.noise)
             before, point = point, fitted(self.problem, self.origin, active)
+            if doubted is not None and not self._sure(point, active, doubted):
+                break
             if np.abs(point.theta - before.theta).max() <= 0.5 or curvature(self.problem, self.origin, point) <= STRAIGHT:
                 break
         return point
