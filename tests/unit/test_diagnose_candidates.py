@@ -81,6 +81,22 @@ def test_what_whips_where_nothing_is_hidden_is_not_named():
     assert explained(0.0).overall == result.NO_EFFECT
 
 
+@pytest.mark.parametrize(("sure", "times"), [(False, 1), (True, search.LINEARISATIONS)])
+def test_a_candidate_that_is_not_sure_where_it_leads_is_not_followed_further(sure, times, monkeypatch):
+    """Derivatives of a rope of 24 segments are a fifth of a minute."""
+    model = SyntheticModel(effects=EFFECTS, truth={NAME: SIZE}, seed=5)
+    plain, taken = search.linearise, []
+    monkeypatch.setattr(search, "linearise", lambda *given: (taken.append(given), plain(*given))[1])
+    monkeypatch.setattr(search, "curvature", lambda *_: np.inf)
+    monkeypatch.setattr(search, "fitted", lambda problem, point, active: replace(point, theta=point.theta + 2.0))
+    monkeypatch.setattr(search.Search, "_sure", lambda *_: sure)
+    problem = search.Problem(model, search.Priors.of(EFFECTS, model.channels), tuple(range(len(model.windows({})))))
+    nominal = plain(problem, np.zeros(len(EFFECTS)))
+    looked_at = search.Search(problem, nominal, 5.0, lambda _: None, origin=nominal)
+    looked_at._closer(replace(nominal, theta=nominal.theta + 2.0), [3])
+    assert len(taken) == times
+
+
 def test_a_candidate_that_is_refused_leaves_no_derivatives_behind(monkeypatch):
     origins = []
 

@@ -389,3 +389,15 @@ def test_what_gusts_held_goes_over_to_the_sizes():
     diagnosis = search.explain(model, laws=False)
     assert diagnosis.named == ("effect_01",)
     assert diagnosis["effect_01"].estimate == pytest.approx(0.02, abs=1e-3)
+
+
+def test_windows_side_by_side_give_the_same_diagnosis():
+    """As a GPU has them, candidates side by side too: names to the last, sizes but for rounding."""
+    truth = {"effect_03": 12.0, "effect_07": -9.0}
+    alone, together = SyntheticModel(truth=truth, seed=4), SyntheticModel(truth=truth, seed=4)
+    together.device = "cpu:0"
+    first, second = search.explain(alone), search.explain(together)
+    assert set(first.named) == set(truth)
+    assert [s.named for s in second.steps] == [s.named for s in first.steps]
+    assert second.theta == pytest.approx(first.theta, rel=1e-6)
+    assert [f.nats for f in second.findings] == pytest.approx([f.nats for f in first.findings], rel=1e-6, abs=1e-6)
