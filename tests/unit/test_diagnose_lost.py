@@ -9,6 +9,7 @@ from tests.flown import fly, setting_with
 from tests.plants import paper_plant
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
 from visthrow.diagnose import result, search
+from visthrow.diagnose.candidates import candidate
 from visthrow.diagnose.cutting import RINGING
 from visthrow.diagnose.evidence import Priors
 from visthrow.diagnose.point import Problem, linearise, lost, only
@@ -75,7 +76,7 @@ def test_without_lost_windows_the_search_goes_on_from_names_that_stand_alone(act
     problem = Problem(model, Priors.of(tuple(model.effects), tuple(model.channels)), tuple(range(len(model.windows({})))))
     nominal = linearise(problem, np.zeros(len(EFFECTS)))
     at = search.Search(problem, nominal, 5.0, lambda _: None, active=active, origin=nominal)
-    at.point = at._candidate(nominal, active)
+    at.point = candidate(at.problem, nominal, active)
     left = [i for i in problem.kept if i != BAD]
     assert at.stands_without([BAD], problem.only(left), only(nominal, left), 5.0) == stands
     assert len(at.point.windows) == len(at.origin.windows) == len(left)

@@ -9,6 +9,7 @@ import pytest
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
 from visthrow.diagnose import grammar, result, screening, search, unknown, verdicts
 from visthrow.diagnose.blackbox import Table, table_of, train, unexplained
+from visthrow.diagnose.candidates import candidate
 from visthrow.diagnose.evidence import Priors
 from visthrow.diagnose.excess import acts_on
 from visthrow.diagnose.model import LATENT_BLOCKS
@@ -207,7 +208,7 @@ def beside_a_law(model: SyntheticModel, active: list[int]) -> tuple[search.Searc
     problem = Problem(model, priors, tuple(range(len(model._windows))))
     nominal = linearise(problem, np.zeros(len(model.effects)))
     at = search.Search(problem, nominal, 4.0, lambda _: None, active=active)
-    at.point = at._candidate(nominal, active)
+    at.point = candidate(at.problem, nominal, active)
     term = grammar.Term("vehicle force", ("speed",), "vel")
     return at, unknown._weigh(at.point, priors, active, term, 0.1, 7.0, unknown._known(at.point))
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from visthrow.diagnose.candidates import candidate, candidates
 from visthrow.diagnose.catalogue.scatter import VARYING
 from visthrow.diagnose.consistency import Consistency, across_flights, repeated_flights
 from visthrow.diagnose.evidence import (
@@ -32,15 +33,12 @@ from visthrow.diagnose.point import (
     lost,
     moved,
     only,
-    to_gain,
     with_all_effects_noise,
-    with_fitted_noise,
     with_floors_noise,
 )
 from visthrow.diagnose.result import Diagnosis, Step
 from visthrow.diagnose.rivals import CLOSE, rivals
 from visthrow.diagnose.scatter import Scatter, deviations, freed, straightened, varying
-from visthrow.diagnose.threads import beside
 from visthrow.errors import DiagnoseError
 
 MOST_NAMES = 6
@@ -57,9 +55,6 @@ SHOWN = 10
 
 HOPE = 0.6
 """Of the threshold: linear statistics from which a candidate's simulation is run again, where derivatives may fall short of it."""
-
-TURNS, TURNED = 8, 0.5
-"""Times that sizes and noise levels are estimated in turn, while the levels leave a step of the sizes worth so many nats."""
 
 CONTRADICTED = 0.5
 """Share of the evidence of an effect that the flights contradict which any other effect must then exceed."""
@@ -161,7 +156,7 @@ class Search:
         short += [j for j in alike if np.isfinite(screened[j]) and j not in short]
         base = self.point, self.active
         short = [int(j) for j in short]
-        tried = dict(zip(short, self._candidates(free, [[*self.active, j] for j in short])))
+        tried = dict(zip(short, candidates(self.problem, free, [[*self.active, j] for j in short])))
         nats = {j: self._ahead((point, [*self.active, j]), base) for j, point in tried.items()}
         enough = max([self.least, *(CONTRADICTED * n for n in self.refused.values())])
         ranked = [j for j in sorted(nats, key=nats.get, reverse=True) if nats[j] > enough]
@@ -171,8 +166,9 @@ class Search:
             if self.problem.switches[best]:  # it was linearised where it leads already
                 return False
             tried[best] = self._closer(tried[best], [*self.active, best])
-            alike = self._candidate(tried[best], self.active), self.active  # begins as it does: new states alone are no gain
-            nats[best] = min(self._ahead((tried[best], [*self.active, best]), other) for other in (base, alike))
+            alike = candidate(self.problem, tried[best], self.active)  # begins as it does: new states alone are no gain
+            others = base, (alike, self.active)
+            nats[best] = min(self._ahead((tried[best], [*self.active, best]), other) for other in others)
             if nats[best] <= enough or not self._stands(tried[best], [*self.active, best], best):
                 self.origin = origin
                 return False
@@ -199,7 +195,7 @@ class Search:
         """
         left = [i for i in range(len(self.problem.kept)) if i not in set(gone)]
         self.problem, self.nominal, self.least = problem, nominal, least
-        self.origin, self.point = only(self.origin, left), self._candidate(only(self.point, left), self.active)
+        self.origin, self.point = only(self.origin, left), candidate(self.problem, only(self.point, left), self.active)
         self.refused, self.dropped = {}, set()
         worth = self._worth()
         return bool(worth) and all(nats > least and self._stands(self.point, self.active, j) for j, nats in worth.items())
@@ -252,7 +248,7 @@ class Search:
                 ladder = {self.name(j): nats}
                 self.steps.append(Step(self.name(j), nats, self.least, ladder, ladder))
                 self.active = active
-                self.point = self._settle(self._candidate(self.point, active), active)
+                self.point = self._settle(candidate(self.problem, self.point, active), active)
                 self.refused.clear()
                 return True
         return False
@@ -299,41 +295,6 @@ class Search:
     def _share_of(self, point: Point, active: Sequence[int], j: int) -> float:
         """How much of another kind of block is asked for by a point that has it: about 1 if it is there."""
         return float(estimate(point.information, point.score, self.priors, list(active))[j] * self.priors.floor[j])
-
-    def _candidate(self, point: Point, active: Sequence[int]) -> Point:
-        """Sizes of a set and the noise levels that belong to them, in turn: what gusts held at first goes over to the sizes."""
-        point = with_fitted_noise(fitted(self.problem, self._switched(point, active), active))
-        for _ in range(TURNS):
-            if to_gain(self.problem, point, active) < TURNED:
-                break
-            before, point = point, fitted(self.problem, point, active)
-            if np.array_equal(point.theta, before.theta):
-                break
-            point = with_fitted_noise(point)
-        return point
-
-    def _candidates(self, point: Point, sets: Sequence[Sequence[int]]) -> list[Point]:
-        """The same of several sets: side by side where they wait for a GPU, but for those that turn on another kind of block."""
-        if point.device == "cpu":
-            return [self._candidate(point, active) for active in sets]
-        turned = [i for i, active in enumerate(sets) if self._off(point, active)]
-        plain = [i for i in range(len(sets)) if i not in turned]
-        found = {i: self._candidate(point, sets[i]) for i in turned}
-        found |= zip(plain, beside(lambda i: self._candidate(point, sets[i]), plain))
-        return [found[i] for i in range(len(sets))]
-
-    def _off(self, point: Point, active: Sequence[int]) -> list[int]:
-        """Other kinds of blocks in a set that a point does not fly."""
-        return [j for j in active if self.problem.switches[j] and point.theta[j] == 0.0]
-
-    def _switched(self, point: Point, active: Sequence[int]) -> Point:
-        """The point, linearised with another kind of block on where a set asks for one that is off."""
-        off = self._off(point, active)
-        if not off:
-            return point
-        theta = np.where(np.isin(np.arange(len(point.theta)), list(active)), point.theta, 0.0)
-        theta[off] = 1.0 / self.priors.floor[off]
-        return linearise(self.problem, theta, point.noise)
 
     def _settle(self, point: Point, active: Sequence[int], doubted: int | None = None) -> Point:
         """Linearise where the search stands, unless the last derivatives still hold, and step on where that moved the optimum.
@@ -387,7 +348,7 @@ class Search:
             if worth[weakest] > self.least and not unsure:
                 return
             rest = [k for k in self.active if k != weakest]
-            without = self._candidate(self.point, rest)
+            without = candidate(self.problem, self.point, rest)
             if self._ahead((self.point, self.active), (without, rest)) > self.least and not unsure:
                 return
             self.progress(f"{self.name(weakest)} dropped again")
@@ -402,7 +363,7 @@ class Search:
             self.sets = [(tuple(self.active), 0.0)]
             winner: tuple[float, list[int], Point] | None = None
             settled: dict[str, float] = {}
-            points = self._candidates(self.point, [rival for rival, _ in ranked])
+            points = candidates(self.problem, self.point, [rival for rival, _ in ranked])
             for (rival, _), point in zip(ranked, points):
                 ahead = self._ahead((point, rival), (self.point, self.active))
                 ahead += self.least * (len(self.active) - len(rival))  # every name costs the threshold
