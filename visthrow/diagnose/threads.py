@@ -16,6 +16,8 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 MOST = 4  # threads: with 8, a diagnosis on 16 cores waited an eighth longer, for Python itself
+PIECES = 4  # of what is to be done, for each thread
+BESIDE = 3  # tasks side by side that mostly wait for a GPU: 2 are as good, with 4 a diagnosis took an eighth longer
 
 
 def single() -> None:
@@ -23,10 +25,6 @@ def single() -> None:
     import scipy.linalg  # noqa: F401
 
     threadpool_limits(1)
-
-
-PIECES = 4  # of what is to be done, for each thread
-BESIDE = 3  # tasks side by side that mostly wait for a GPU
 
 
 @cache
