@@ -81,9 +81,10 @@ def test_what_whips_where_nothing_is_hidden_is_not_named():
     assert explained(0.0).overall == result.NO_EFFECT
 
 
-@pytest.mark.parametrize(("sure", "times"), [(False, 1), (True, search.LINEARISATIONS)])
-def test_a_candidate_that_is_not_sure_where_it_leads_is_not_followed_further(sure, times, monkeypatch):
-    """Derivatives of a rope of 24 segments are a fifth of a minute."""
+@pytest.mark.parametrize("begin", [0.0, 2.0])
+@pytest.mark.parametrize("sure", [False, True])
+def test_a_candidate_that_is_not_sure_where_it_leads_is_not_followed_further(begin, sure, monkeypatch):
+    """Derivatives of a rope of 24 segments are a fifth of a minute; those of one without a size yet are taken where they point."""
     model = SyntheticModel(effects=EFFECTS, truth={NAME: SIZE}, seed=5)
     plain, taken = search.linearise, []
     monkeypatch.setattr(search, "linearise", lambda *given: (taken.append(given), plain(*given))[1])
@@ -93,8 +94,8 @@ def test_a_candidate_that_is_not_sure_where_it_leads_is_not_followed_further(sur
     problem = search.Problem(model, search.Priors.of(EFFECTS, model.channels), tuple(range(len(model.windows({})))))
     nominal = plain(problem, np.zeros(len(EFFECTS)))
     looked_at = search.Search(problem, nominal, 5.0, lambda _: None, origin=nominal)
-    looked_at._closer(replace(nominal, theta=nominal.theta + 2.0), [3])
-    assert len(taken) == times
+    looked_at._closer(replace(nominal, theta=nominal.theta + begin), [3])
+    assert len(taken) == (search.LINEARISATIONS + (begin == 0.0) if sure else 1)
 
 
 def test_a_candidate_that_is_refused_leaves_no_derivatives_behind(monkeypatch):

@@ -108,6 +108,7 @@ def build(nodes: int = 24):
                 rest = bit + p.ball_reach
             right = wp.dot(n, free_here - free_there) + (wp.dot(d_v, d_v) - along * along) / size
             right += REAL(2.0) * w0 * along + w0 * w0 * (size - rest)
+            # The rope gives, not the ball at its end.
             diagonal = REAL(1.0) / node_mass(p, i) + weight_there - coupling_there * below + w0 * w0 * bit * p.stretch
             known = right + REAL(0.0)
             if i > 0:
