@@ -136,7 +136,7 @@ def test_a_law_is_believed_only_where_derivatives_were_taken_at_the_causes(monke
         asked.append(hunt.origin.theta[3])
         return None if abs(asked[-1]) > 1.0 else "a law", set(), "a law explains this"
 
-    monkeypatch.setattr(unknown, "find_laws", lambda hunt: unknown.Answer())
+    monkeypatch.setattr(unknown, "find_laws", lambda *_: unknown.Answer())
     monkeypatch.setattr(unknown, "beats_the_catalogue", law)
     monkeypatch.setattr(search, "curvature", lambda *_: 0.0)  # the search stays with its first derivatives
     diagnosis = search.explain(SyntheticModel(effects=EFFECTS, truth={NAME: SIZE}, seed=5))

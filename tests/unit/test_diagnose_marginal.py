@@ -117,6 +117,44 @@ def test_grams_and_other_residuals_are_the_same_side_by_side(fitted):
             np.testing.assert_allclose(found.square, single.square, rtol=1e-9)
 
 
+def test_latents_are_correlated_the_same_side_by_side(fitted):
+    """Where the inner products stay for what comes next, unless they were replaced since."""
+    _, windows, floors, levels, _ = fitted
+    cut = ("time", "channel", "residual", "sigma", "effects", "nuisance", "latent")
+    mixed = [*windows[:4], replace(windows[5], **{name: getattr(windows[5], name)[:-7] for name in cut})]
+    few = mixed[1].latent_time < mixed[1].latent_time.max()
+    knots = {name: getattr(mixed[1], name)[few] for name in ("latent_block", "latent_axis", "latent_time")}
+    mixed[1] = replace(mixed[1], latent=mixed[1].latent[:, few], **knots)
+    raw = designs.grams_of(mixed, floors, 2, "cpu:0")
+    raw[2] = marginal.gram_of(mixed[2], floors, 2)  # as one of few whose outliers were mended
+    there, alone = (designs.correlated_of(raw, mixed, 0.3, device) for device in ("cpu:0", "cpu"))
+    for found, single in zip(there, alone, strict=True):
+        assert isinstance(found.placed, marginal.There)
+        assert not isinstance(single.placed, marginal.There)
+        for name in ("inner", "cross", "factor"):
+            value = getattr(single, name)
+            np.testing.assert_allclose(getattr(found, name), value, rtol=1e-9, atol=1e-9 * np.abs(value).max())
+        assert found.shown == pytest.approx(single.shown)
+    np.testing.assert_allclose(Stack(there, "cpu:0").values(levels), Stack(alone).values(levels), rtol=1e-9)
+    bare = [Stack([marginal.without_effects(g) for g in own], device) for own, device in ((there, "cpu:0"), (alone, "cpu"))]
+    np.testing.assert_allclose(bare[0].look(levels)[1], bare[1].look(levels)[1], rtol=1e-6, atol=1e-6)
+    changed = replace(there[0], inner=2.0 * there[0].inner)
+    assert changed.placed is changed.inner
+
+
+def test_other_residuals_leave_the_information(fitted):
+    _, _, floors, levels, grams = fitted
+    theta = np.linspace(-1.0, 1.0, len(floors))
+    shares = [marginal.integral(g, levels, w).share(g, levels) for w, g in enumerate(grams)]
+    known = marginal.gather(grams, shares, np.zeros(len(floors)))
+    other = [replace(g, cross=0.5 * g.cross, square=0.25 * g.square) for g in grams]
+    shares = [marginal.integral(g, levels, w).share(g, levels) for w, g in enumerate(other)]
+    plain, again = marginal.gather(other, shares, theta), marginal.rescored(known, other, shares, theta)
+    for name in ("flights", "information", "score", "square", "samples", "theta", "absolute", "absolute_square"):
+        np.testing.assert_allclose(getattr(again, name), getattr(plain, name), rtol=1e-12)
+    assert not np.allclose(again.score, known.score)
+
+
 @pytest.mark.parametrize("gust_time", [0.15, 0.6, 2.4])
 def test_the_correlation_time_is_the_likeliest_of_all(gust_time, monkeypatch):
     """It is looked for from the middle, uphill."""

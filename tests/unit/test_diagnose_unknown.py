@@ -179,6 +179,23 @@ def test_a_law_beside_a_known_cause_leaves_the_cause_its_name():
     assert len(set(formulas)) == len(formulas)
 
 
+def test_one_term_is_enough_where_derivatives_are_taken_anew(monkeypatch):
+    """And a search that stands where it was asked about is not asked again."""
+    weighed, before, hunts, weigh, nearer = [], [], [], unknown._weigh, search.Search.nearer
+    monkeypatch.setattr(unknown, "_weigh", lambda *given: weighed.append(1) or weigh(*given))
+    monkeypatch.setattr(search.Search, "nearer", lambda hunt: before.append(len(weighed)) or hunts.append(hunt) or nearer(hunt))
+    diagnosis = search.explain(SyntheticModel(effects=EFFECTS, law="swirl", law_size=0.01, truth={"effect_03": 12.0}, seed=3))
+    assert diagnosis.overall == result.UNKNOWN
+    assert before == [1]
+    assert len(weighed) > 5
+    whole = len(weighed)
+    answer = unknown.find_laws(hunts[0])
+    assert len(weighed) == whole
+    hunts[0].active = []
+    assert unknown.find_laws(hunts[0]) is not answer
+    assert len(weighed) > whole
+
+
 def with_a_name_for_the_law(most: float) -> SyntheticModel:
     """A hidden drag of 0.02, and an effect of the very same form that is unusual beyond 0.005 and cannot exceed ``most``."""
     model = SyntheticModel(effects=EFFECTS, law="speed", law_size=0.02, seed=3)

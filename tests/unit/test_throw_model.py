@@ -19,6 +19,7 @@ from visthrow.diagnose.evidence import Priors
 from visthrow.diagnose.opened import opened
 from visthrow.diagnose.point import Problem, curvature, linearise, moved
 from visthrow.diagnose.recorded import record_of
+from visthrow.diagnose.replay import Flights
 from visthrow.diagnose.settling import Settling
 from visthrow.diagnose.throw_model import ThrowModel
 from visthrow.errors import DiagnoseError
@@ -166,8 +167,36 @@ def test_rotors_begin_a_window_where_the_commands_left_them(planted):
     """Fitted without gusts they would take the gusts' place; they stay free to be told by the data."""
     _, model = planted
     model.windows({})
-    assert np.array_equal(model._latest[frozenset()]["motor_speed"], model._begin(model.setting)["motor_speed"])
+    assert np.array_equal(model._latest[frozenset()]["motor_speed"], model._through(model.setting)[0]["motor_speed"])
     assert "motor_speed" in {d.field for d in model._directions}
+
+
+def test_windows_begin_alike_from_states_that_are_known(planted, monkeypatch):
+    """Inner states at the start of a window are those at the end of the one before, wherever its start came from."""
+    _, model = planted
+    launches, fly = [], Flights.fly
+    monkeypatch.setattr(Flights, "fly", lambda *given: launches.append(1) or fly(*given))
+    one_by_one, _ = model._through(model.setting)
+    assert len(launches) > 1
+    launches.clear()
+    at_once, _ = model._through(model.setting, model._fitted()[0])
+    assert len(launches) == 1
+    assert np.array_equal(at_once["pos_w"], one_by_one["pos_w"])
+    np.testing.assert_allclose(at_once["motor_speed"], one_by_one["motor_speed"], rtol=0.02)
+    assert not np.array_equal(at_once["motor_speed"], one_by_one["motor_speed"])
+
+
+def test_each_window_begins_with_the_best_of_its_states(planted, monkeypatch):
+    _, model = planted
+    monkeypatch.setattr(settling, "ROUNDS", 0)
+    good = model._fitted()[0]
+    even = np.arange(len(good["pos_w"])) % 2 == 0
+    mixed = [{**good, "pos_w": good["pos_w"] + 0.05 * np.where(rows, 1.0, 0.0)[:, None]} for rows in (even, ~even)]
+    found = model._settling(model.setting).fit(mixed)
+    told = model._told
+    assert {0, 1} == set((told % 2).tolist())
+    for name, value in good.items():
+        assert np.array_equal(found[name][told], value[told])
 
 
 def test_what_is_known_of_the_sensors_is_taken_off():

@@ -3,17 +3,31 @@
 On a CPU each window is reduced by itself, on all cores, as :mod:`visthrow.diagnose.marginal` has it.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache
+from typing import TypeVar
 
 import numpy as np
 import torch
 
-from visthrow.diagnose.marginal import Gram, check, gram_of, gram_with, left_of, with_residual
+from visthrow.diagnose.marginal import (
+    Gram,
+    There,
+    check,
+    correlated,
+    correlated_with,
+    gram_of,
+    gram_with,
+    knot_factor,
+    left_of,
+    with_residual,
+)
 from visthrow.diagnose.model import Window
 from visthrow.diagnose.threads import each
 from visthrow.diagnose.transfer import side_by_side, to_host
+
+T = TypeVar("T", np.ndarray, torch.Tensor)
 
 
 class Same(tuple):
@@ -49,13 +63,13 @@ class _Design:
         columns = side_by_side([own[:3] for own in windows], (shape[1], width), device)
         self._columns = columns.mul_(scales[:, None]).div_(self._sigma[:, :, None])
 
-    def inner(self) -> Iterator[np.ndarray]:
+    def inner(self) -> list[There]:
         """Inner products of each window's columns by channel, shape (C, P, P)."""
         count, _, channels = self._member.shape
         found = self._columns.new_empty((count, channels, self._columns.shape[2], self._columns.shape[2]))
         for c in range(channels):
             torch.matmul((self._columns * self._member[:, :, c, None]).transpose(1, 2), self._columns, out=found[:, c])
-        return (own[:, :width, :width] for own, width in zip(to_host(found), self._widths))
+        return _on_both(found, self._widths)
 
     def left(self, residuals: Sequence[np.ndarray], fits: Sequence[np.ndarray]) -> list[np.ndarray]:
         """What fits of the first columns leave of each window's residual, shape (N,)."""
@@ -109,7 +123,55 @@ def grams_of(windows: Sequence[Window], floors: np.ndarray, channels: int, devic
     each(lambda w: check(w, len(floors), channels), windows)
     design = _designed(windows, floors, channels, device)
     products = zip(windows, design.inner(), design.products([w.residual for w in windows]))
-    return [gram_with(w, inner, cross, square) for w, inner, (cross, square) in products]
+    return [replace(gram_with(w, inner.of, cross, square), there=inner) for w, inner, (cross, square) in products]
+
+
+def _on_both(values: torch.Tensor, widths: Sequence[int]) -> list[There]:
+    """Square matrices of some channels, shape (W, C, P, P), as far as they are not padded."""
+    return [There(own[:, :n, :n], host[:, :n, :n]) for own, host, n in zip(values, to_host(values), widths)]
+
+
+def padded(
+    inner: Sequence[There | np.ndarray], part: Callable[[T, int], T], shape: tuple[int, ...], device: str
+) -> torch.Tensor:
+    """Parts of grams' inner products one beside the other, each padded with zeros, shape (grams, *shape).
+
+    Args:
+        inner: of the grams, see :attr:`Gram.placed`.
+        part: of one gram's, given its number.
+        shape: to pad to.
+        device: where to.
+    """
+    if not any(isinstance(own, There) for own in inner):
+        return side_by_side([[part(own, i)] for i, own in enumerate(inner)], shape, device)
+    out = torch.zeros((len(inner), *shape), dtype=torch.float64, device=device)
+    for i, own in enumerate(inner):
+        values = part(own.values, i) if isinstance(own, There) else torch.tensor(part(own, i), device=device)
+        out[(i, *map(slice, values.shape))] = values
+    return out
+
+
+def correlated_of(grams: Sequence[Gram], windows: Sequence[Window], time: float, device: str) -> list[Gram]:
+    """Correlate the latent forces of all windows, see :func:`visthrow.diagnose.marginal.correlated`.
+
+    Args:
+        grams: of the windows, with ``factor`` the identity.
+        windows: for the knots.
+        time: correlation time [s].
+        device: where to calculate.
+    """
+    if device == "cpu" or not all(gram.latents for gram in grams):
+        return each(lambda w: correlated(grams[w], windows[w], time), range(len(grams)))
+    factors, widths = [knot_factor(window, time) for window in windows], [gram.cross.shape[1] for gram in grams]
+    channels, size = len(grams[0].count), max(widths)
+    turn = np.tile(np.eye(size), (len(grams), 1, 1))
+    for whole, gram, own in zip(turn, grams, factors):
+        for begin in range(gram.nuisances, gram.nuisances + gram.latents, len(own)):
+            whole[begin : begin + len(own), begin : begin + len(own)] = own
+    right = torch.from_numpy(turn).to(device)[:, None]
+    inner = padded([gram.placed for gram in grams], lambda own, _: own, (channels, size, size), device)
+    there = _on_both(right.mT @ inner @ right, widths)
+    return [correlated_with(gram, both.of, own, both) for gram, both, own in zip(grams, there, factors)]
 
 
 def left_by(

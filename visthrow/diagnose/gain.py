@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.special import stdtrit
 
+from visthrow.diagnose import designs
 from visthrow.diagnose import noise as levels
 from visthrow.diagnose.blackbox import table_of, train
 from visthrow.diagnose.evidence import Priors, additions, estimate, log_evidence
@@ -133,7 +134,7 @@ def shortfalls(model: Model, sizes: Sequence[Mapping[str, float]]) -> tuple[list
     noise, _ = levels.fit(told[-1], raw[-1])
     squares = []
     for windows, grams in zip(told, raw):
-        shaped = [levels.correlated(gram, w, noise.correlation_time) for gram, w in zip(grams, windows)]
+        shaped = designs.correlated_of(grams, windows, noise.correlation_time, "cpu")
         squares.append(sum(window_statistics(gram, noise, i).square for i, gram in enumerate(shaped)))
     return [float(0.5 * (square - squares[-1])) for square in squares], sum(len(w.residual) for w in told[-1])
 

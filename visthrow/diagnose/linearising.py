@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 from scipy.spatial.transform import Rotation
 
 from sim.replay.kernel import NO_PAYLOAD
@@ -66,33 +67,44 @@ class Plan:
     nuisances: tuple[int, ...]  # directions of the initial state
     latents: tuple[tuple[int, int], ...]  # axis and knot
 
+    def slopes(self, rows: int, steps: np.ndarray, directions: Sequence[Direction], seen: torch.Tensor) -> list[torch.Tensor]:
+        """Derivatives of the window's samples by effects, states and latent forces, shape (3 rows, columns) each.
+
+        Args:
+            rows: of its samples.
+            steps: of the effects' derivatives.
+            directions: of initial states.
+            seen: what all lanes of the run saw, shape (rows or more, lanes, 3).
+        """
+        sizes = [*steps, *[directions[d].step for d in self.nuisances], *[LATENT_SIZES[axis] for axis, _ in self.latents]]
+        own = seen[:rows, self.first : self.first + len(self.order) + 2].transpose(1, 2).reshape(3 * rows, -1)
+        for part in (own[:, : self.fine], own[:, self.fine :]):
+            part -= part[:, :1].clone()
+        K, D = len(steps), len(self.nuisances)
+        order, sizes = torch.from_numpy(self.order).to(own.device), own.new_tensor(sizes)
+        return [own[:, order[part]].div_(sizes[part]) for part in (slice(K), slice(K, K + D), slice(K + D, None))]
+
     def window_of(
-        self, flights: Flights, setting: Setting, steps: np.ndarray, directions: Sequence[Direction], channel: np.ndarray,
-        seen: np.ndarray, knots: Mapping[str, np.ndarray],
+        self, flights: Flights, setting: Setting, directions: Sequence[Direction], channel: np.ndarray, residual: np.ndarray,
+        slopes: Sequence[np.ndarray], knots: Mapping[str, np.ndarray],
     ) -> Window:  # fmt: skip
         """What comes of the lanes.
 
         Args:
             flights: all windows.
             setting: of the nominal lane.
-            steps: of the effects' derivatives.
             directions: of initial states.
             channel: of the window's samples.
-            seen: what all lanes of the run saw, shape (rows, lanes, 3).
+            residual: of the nominal lane.
+            slopes: see :meth:`slopes`.
             knots: simulated quantities at all its knots.
         """
         w, f = self.window, flights
-        rows, c, count = int(f.rows[w]), f.cuts[w], len(self.order) + 2
-        flat = np.ascontiguousarray(np.swapaxes(seen[:rows, self.first : self.first + count], 1, 2)).reshape(3 * rows, count)
-        for part in (flat[:, : self.fine], flat[:, self.fine :]):
-            part -= part[:, :1].copy()
-        K, D = len(steps), len(self.nuisances)
-        sizes = [*steps, *[directions[d].step for d in self.nuisances], *[LATENT_SIZES[axis] for axis, _ in self.latents]]
-        slopes = flat[:, self.order] / np.array(sizes)
+        c, (effects, states, latents) = f.cuts[w], slopes
         own = {name: value[self.kept : self.kept + f.knots[w]] for name, value in knots.items()}
         return Window(
-            c.flight, c.phase, f.time(w), channel, f.residual(seen, w, self.first), f.sigma(w), slopes[:, :K], slopes[:, K : K + D],
-            np.array([directions[d].spread(c) for d in self.nuisances]), slopes[:, K + D :],
+            c.flight, c.phase, f.time(w), channel, residual, f.sigma(w), effects, states,
+            np.array([directions[d].spread(c) for d in self.nuisances]), latents,
             np.array([axis // 3 for axis, _ in self.latents]), np.array([axis % 3 for axis, _ in self.latents]),
             np.array([c.start + KNOT_SPACING * knot for _, knot in self.latents]), at_knots(f, setting, w, own), c.shaken,
         )  # fmt: skip

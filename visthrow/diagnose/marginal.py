@@ -14,6 +14,7 @@ Effects are measured in floors throughout: theta = 1 is the size below which an 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg import lapack
@@ -27,6 +28,13 @@ in which something happened may have ten times as much at the price of 11 nats."
 
 ROUNDING = 1e-10
 """Relative growth of the normal equations' diagonal where they are positive definite but for rounding."""
+
+
+class There(NamedTuple):
+    """An array on a GPU, where it was calculated."""
+
+    values: Any  # torch.Tensor
+    of: np.ndarray  # the same on the host
 
 
 @dataclass(frozen=True)
@@ -47,6 +55,12 @@ class Gram:
     factor: np.ndarray  # what stands between unit latents and knots: G_used = G @ factor, shape (L, L)
     shown: Mapping[int, float]  # latent block -> median inner product of its columns with themselves
     log_sigma: float = 0.0  # sum over all samples: grams whose outliers have other weights compare
+    there: There | None = None  # of an ``inner``, which may have been replaced since
+
+    @property
+    def placed(self) -> "There | np.ndarray":
+        """``inner``, with the same on a GPU where it was calculated there."""
+        return self.there if self.there is not None and self.there.of is self.inner else self.inner
 
     @property
     def latents(self) -> int:
@@ -93,12 +107,12 @@ class Statistics:
     samples: np.ndarray  # shape (F,)
     theta: np.ndarray  # shape (K,)
 
-    @property
+    @cached_property
     def absolute(self) -> np.ndarray:
         """Scores about theta = 0, shape (F, K)."""
         return self.score + self.information @ self.theta
 
-    @property
+    @cached_property
     def absolute_square(self) -> np.ndarray:
         """``square`` of the residuals extrapolated to theta = 0, shape (F,)."""
         return self.square + 2.0 * self.score @ self.theta + (self.information @ self.theta) @ self.theta
@@ -143,7 +157,10 @@ def hidden_gram(window: Window, channels: int) -> Gram:
 def without_effects(gram: Gram) -> Gram:
     """The same of nuisances and latents alone."""
     size = gram.nuisances + gram.latents
-    return replace(gram, inner=gram.hidden.reshape(-1, size, size), cross=gram.cross[:, :size])
+    if not isinstance(gram.placed, There):
+        return replace(gram, inner=gram.hidden.reshape(-1, size, size), cross=gram.cross[:, :size])
+    there = There(gram.placed.values[:, :size, :size], gram.inner[:, :size, :size])
+    return replace(gram, inner=there.of, cross=gram.cross[:, :size], there=there)
 
 
 def _inner_products(window: Window, z: np.ndarray, channels: int) -> Gram:
@@ -201,18 +218,30 @@ def correlated(gram: Gram, window: Window, time: float) -> Gram:
     """
     if not gram.latents:
         return gram
+    own = knot_factor(window, time)
+    knots, groups = len(own), gram.latents // len(own)
+    part, (channels, size) = slice(gram.nuisances, gram.nuisances + gram.latents), gram.cross.shape
+    inner = gram.inner.copy()
+    inner[:, part] = (own.T @ inner[:, part].reshape(channels, groups, knots, size)).reshape(channels, -1, size)
+    inner[:, :, part] = (inner[:, :, part].reshape(-1, knots) @ own).reshape(channels, size, -1)
+    return correlated_with(gram, inner, own)
+
+
+def knot_factor(window: Window, time: float) -> np.ndarray:
+    """Cholesky factor of the latents of one group of a window, which is that of all others; see :func:`correlated`."""
     group = window.latent_block.astype(int) * 3 + window.latent_axis.astype(int)
     knots = _knots(group, window.latent_time)
     lag = np.abs(window.latent_time[:knots, None] - window.latent_time[:knots])
     alike = np.where(group[:knots, None] == group[:knots], np.exp(-lag / time), 0.0)
-    own, groups = np.linalg.cholesky(alike + 1e-9 * np.eye(knots)), gram.latents // knots
-    factor = np.kron(np.eye(groups), own)
-    part, (channels, size) = slice(gram.nuisances, gram.nuisances + gram.latents), gram.cross.shape
-    inner, cross = gram.inner.copy(), gram.cross.copy()
-    inner[:, part] = (own.T @ inner[:, part].reshape(channels, groups, knots, size)).reshape(channels, -1, size)
-    inner[:, :, part] = (inner[:, :, part].reshape(channels, size, groups, knots) @ own).reshape(channels, size, -1)
-    cross[:, part] = (cross[:, part].reshape(channels, groups, knots) @ own).reshape(channels, -1)
-    return replace(gram, inner=inner, cross=cross, factor=factor, shown=_shown(inner, gram.nuisances, gram.latent_block))
+    return np.linalg.cholesky(alike + 1e-9 * np.eye(knots))
+
+
+def correlated_with(gram: Gram, inner: np.ndarray, own: np.ndarray, there: There | None = None) -> Gram:
+    """The gram into which a factor of each group's knots was multiplied, with the inner products that came of it."""
+    part, cross = slice(gram.nuisances, gram.nuisances + gram.latents), gram.cross.copy()
+    cross[:, part] = (cross[:, part].reshape(-1, len(own)) @ own).reshape(len(cross), -1)
+    factor, shown = np.kron(np.eye(gram.latents // len(own)), own), _shown(inner, gram.nuisances, gram.latent_block)
+    return replace(gram, inner=inner, cross=cross, factor=factor, shown=shown, there=there)
 
 
 def _knots(group: np.ndarray, time: np.ndarray) -> int:
@@ -372,3 +401,20 @@ def gather(
     if lowest < 0.0:  # rounding, which wide priors of several named effects would turn into evidence
         information += (-2.0 * lowest / len(flights)) * np.diag(scale**-2.0)
     return Statistics(np.array(flights), information, score, square, samples, np.array(theta, dtype=float))
+
+
+def rescored(known: Statistics, grams: Sequence[Gram], parts: Sequence[Share], theta: np.ndarray) -> Statistics:
+    """What windows say with other residuals: their information stays.
+
+    Args:
+        known: of the same windows.
+        grams: of the windows.
+        parts: of the windows.
+        theta: linearisation point in floors, shape (K,).
+    """
+    row = {flight: i for i, flight in enumerate(known.flights.tolist())}
+    which = [row[gram.flight] for gram in grams]
+    score, square = np.zeros_like(known.score), np.zeros_like(known.square)
+    np.add.at(score, which, [part.score for part in parts])
+    np.add.at(square, which, [part.square for part in parts])
+    return replace(known, score=score, square=square, theta=np.array(theta, dtype=float))

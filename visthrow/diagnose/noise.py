@@ -16,7 +16,6 @@ from visthrow.diagnose.marginal import (
     TAIL,
     Gram,
     Noise,
-    correlated,
     hidden_gram,
     without_effects,
 )
@@ -104,7 +103,7 @@ def fit(
     if start is None and any(gram.latents for gram in grams):
         noise = _likeliest(windows, grams, device)
         time = noise.correlation_time
-    shaped = each(lambda w: correlated(grams[w], windows[w], time), range(len(grams)))
+    shaped = designs.correlated_of(grams, windows, time, device)
     begin = replace(noise or _first_guess(shaped), correlation_time=time)
     return _maximise(shaped, begin, device)[0], shaped
 
@@ -115,7 +114,7 @@ def _likeliest(windows: Sequence[Window], grams: Sequence[Gram], device: str) ->
 
     def likely(i: int, noise: Noise | None) -> float:
         if i not in found:
-            shaped = each(lambda w: correlated(bare[w], windows[w], CORRELATION_TIMES[i]), range(len(bare)))
+            shaped = designs.correlated_of(bare, windows, CORRELATION_TIMES[i], device)
             begin = replace(noise or _first_guess(shaped), correlation_time=CORRELATION_TIMES[i])
             found[i] = _maximise(shaped, begin, device, ROUGHLY_NATS)
         return found[i][1]
@@ -328,7 +327,7 @@ def without_outliers(windows: Sequence[Window], grams: Sequence[Gram], floors: n
 def _widely_fitted(windows: Sequence[Window], bare: Sequence[Gram], device: str) -> list[np.ndarray]:
     """Initial states in prior deviations and latents at the knots that explain most, with wide priors of the latents."""
     time = CORRELATION_TIMES[0]
-    shaped = each(lambda w: correlated(bare[w], windows[w], time), range(len(bare)))
+    shaped = designs.correlated_of(bare, windows, time, device)
     share = np.zeros((len(bare), len(LATENT_BLOCKS)))
     for row, gram in zip(share, bare):
         for (block, _), level in _first_guess([gram]).latent_sd.items():

@@ -61,10 +61,12 @@ def throw_model(args: argparse.Namespace, logs: Sequence[FlightLog]) -> tuple[Mo
     """The whole throw, with the plant of an experiment, and its logs with their commands put right."""
     from visthrow import config
     from visthrow.device import resolve
+    from visthrow.diagnose import memory
     from visthrow.diagnose.interface import put_right
     from visthrow.diagnose.throw_model import ThrowModel
     from visthrow.task import Experiment, plant_of
 
+    memory.keep()
     experiment = config.load(Experiment, config.find("train", args.plant), args.overrides)
     only = args.only.split(",") if args.only else None
     known = {"sensing": experiment.sensing, "camera": experiment.camera}

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from visthrow.diagnose.marginal import (
     Statistics,
     gather,
     recorrelated,
+    rescored,
 )
 from visthrow.diagnose.model import Linearised, Model, Window
 from visthrow.diagnose.scatter import freed, own_shares
@@ -69,12 +71,12 @@ class Point:
     about: Linearised | None  # where the derivatives were taken; None: with another kind of block than the residuals
     device: str  # where the model simulates, and the algebra of all windows with it
 
-    @property
+    @cached_property
     def information(self) -> np.ndarray:
         """Of all flights, shape (K, K)."""
         return self.statistics.information.sum(0)
 
-    @property
+    @cached_property
     def score(self) -> np.ndarray:
         """Of all flights, about theta = 0, shape (K,)."""
         return self.statistics.absolute.sum(0)
@@ -99,7 +101,11 @@ def regathered(point: Point, integrals: stack.Integrals | None = None, **changes
 
 
 def _statistics(grams: Sequence[Gram], integrals: stack.Integrals, noise: Noise, theta: np.ndarray) -> Statistics:
-    return gather(grams, integrals.shares(grams, noise), theta)
+    shares = integrals.shares(grams, noise)
+    if integrals.gathered is not None:
+        return rescored(integrals.gathered, grams, shares, theta)
+    integrals.gathered = gather(grams, shares, theta)
+    return integrals.gathered
 
 
 def linearise(problem: Problem, theta: np.ndarray, start: Noise | None = None, windows: Sequence[Window] | None = None) -> Point:

@@ -7,9 +7,11 @@ that a cause is not excused as noise. The threshold comes from null worlds of th
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from visthrow.diagnose import memory
 from visthrow.diagnose.candidates import candidate, candidates
 from visthrow.diagnose.catalogue.scatter import VARYING
 from visthrow.diagnose.consistency import Consistency, across_flights, repeated_flights
@@ -39,7 +41,12 @@ from visthrow.diagnose.point import (
 from visthrow.diagnose.result import Diagnosis, Step
 from visthrow.diagnose.rivals import CLOSE, rivals
 from visthrow.diagnose.scatter import Scatter, deviations, freed, straightened, varying
+from visthrow.diagnose.threads import each
 from visthrow.errors import DiagnoseError
+
+if TYPE_CHECKING:
+    from visthrow.diagnose.designs import Same
+    from visthrow.diagnose.unknown import Answer
 
 MOST_NAMES = 6
 """A longer list of causes is a wrong form, not a finding."""
@@ -98,6 +105,7 @@ class Search:
     dropped: set[int] = field(default_factory=set)  # effects that a later one made superfluous; they are not tried again
     events: list[int] = field(default_factory=list)
     sets: list[tuple[tuple[int, ...], float]] = field(default_factory=list)
+    answer: "tuple[tuple[Same, tuple[int, ...]], Answer] | None" = None  # of the grammar, and the state that was asked about
 
     @property
     def priors(self) -> Priors:
@@ -317,9 +325,14 @@ class Search:
                 break
         return point
 
+    @property
+    def away(self) -> bool:
+        """Whether the derivatives were taken elsewhere than where the search stands."""
+        return bool(np.abs(self.origin.theta - self.point.theta).max() > NEAR)
+
     def nearer(self) -> bool:
         """Linearise where the search stands; False where that was done. Before a law is believed: it may explain what bends do."""
-        if np.abs(self.origin.theta - self.point.theta).max() <= NEAR:
+        if not self.away:
             return False
         self.progress("derivatives are taken where the causes are, for a law may explain what they lack")
         self.origin = linearise(self.problem, self.point.theta, self.point.noise)
@@ -429,11 +442,12 @@ def explain(
     from visthrow.diagnose.verdicts import conclude, out_of_domain
 
     begun, say = time.monotonic(), progress or (lambda _: None)
+    memory.keep()
     priors = Priors.of(tuple(model.effects), tuple(model.channels))
     windows = model.windows({})
     if not windows:
         raise DiagnoseError("the model found no stretch of flight to look at in these logs")
-    finite = [all(np.all(np.isfinite(a)) for a in (w.residual, w.effects, w.nuisance, w.latent)) for w in windows]
+    finite = each(lambda w: all(np.all(np.isfinite(a)) for a in (w.residual, w.effects, w.nuisance, w.latent)), windows)
     duplicates = repeated_flights(windows)
     left_out = {*without, *duplicates}
     kept = tuple(i for i, w in enumerate(windows) if finite[i] and w.flight not in left_out)

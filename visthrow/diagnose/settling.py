@@ -4,7 +4,7 @@ A simulation of every direction costs some thirty times one of the state itself.
 long as each brings what it promised, and may come from another setting whose states were fitted before.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -93,17 +93,11 @@ class Settling:
         self._tells, ends = zip(*[told_of_start(flights, w, lag) for w in range(len(flights.cuts))])
         self._shortened = flights.ended(ends)
 
-    def better(self, settled: States, fresh: States) -> States:
-        """For each window, the better of two initial states."""
-        which = np.arange(len(self.flights.cuts))
-        costs = [self._costs(dict(zip(which, self._residuals(states, which)))) for states in (settled, fresh)]
-        return {name: np.where(_like(costs[1] < costs[0], value), fresh[name], value) for name, value in settled.items()}
-
-    def fit(self, states: States, slopes: Mapping[int, np.ndarray] | None = None) -> States:
+    def fit(self, starts: Sequence[States], slopes: Mapping[int, np.ndarray] | None = None) -> States:
         """Fit each window's initial state to its samples; no step that does not help is taken.
 
         Args:
-            states: to begin with.
+            starts: states to begin with, each window with the best of its own; those that do not count keep the last.
             slopes: of windows' samples by their states, as :attr:`slopes` of another fit has them.
         """
         count = len(self.flights.cuts)
@@ -111,7 +105,7 @@ class Settling:
         left, promised = self.told, np.full(count, np.inf)
         self.slopes |= slopes or {}
         aged = np.isin(np.arange(count), list(self.slopes))  # derivatives come from elsewhere
-        residuals = dict(zip(left, self._residuals(rows_of(states, left), left)))
+        states, residuals = self._best(starts)
         cost = self._costs(residuals)
         stale, doubtful = ~aged, np.zeros(count, dtype=bool)
         for _ in range(ROUNDS):
@@ -148,6 +142,17 @@ class Settling:
                 break
         return states
 
+    def _best(self, starts: Sequence[States]) -> tuple[States, dict[int, np.ndarray]]:
+        """The best of each window's states, and what they leave; all are flown at once."""
+        told, count = self.told, len(self.told)
+        seen = self._residuals(stacked([rows_of(states, told) for states in starts]), np.tile(told, len(starts)))
+        cost = np.array([self._cost(w, residual) for w, residual in zip(np.tile(told, len(starts)), seen)])
+        which = cost.reshape(len(starts), count).argmin(axis=0)
+        best = {name: value.copy() for name, value in starts[-1].items()}
+        for name, value in best.items():
+            value[told] = np.stack([states[name][told] for states in starts])[which, np.arange(count)]
+        return best, {w: seen[start * count + row] for row, (w, start) in enumerate(zip(told, which))}
+
     def _tried(
         self, states: States, left: np.ndarray, residuals: Mapping[int, np.ndarray], moves: np.ndarray, damping: np.ndarray,
         doubtful: np.ndarray,
@@ -156,7 +161,8 @@ class Settling:
         rungs = np.where(doubtful[left], len(LADDER), 1)
         which, first = np.repeat(left, rungs), np.cumsum(rungs) - rungs
         dampings = [damping[w] * LADDER[:n] for w, n in zip(left, rungs)]
-        told = each(lambda way: self._increments(way[0], residuals[way[0]], moves[way[0]], way[1]), zip(left, dampings))
+        each(self._scaled, left)
+        told = [self._increments(w, residuals[w], moves[w], its) for w, its in zip(left, dampings)]
         tries, (steps, hoped) = np.concatenate(dampings), map(np.concatenate, zip(*told))
         there = moved_along(rows_of(states, which), self.directions, steps)
         seen = self._residuals(there, which)
@@ -207,10 +213,11 @@ class Settling:
         if not len(which):
             return {}
         count, lanes, first = len(which), [], []
+        ways = {d: 1 + at for at, d in enumerate(sorted({d for w in which for d in self._free[w]}))}
         for row, w in enumerate(which):
             first.append(len(lanes))
-            lanes += [Lane(w, 0, row, rough=True), *[Lane(w, 0, (1 + d) * count + row, rough=True) for d in self._free[w]]]
-        there = perturbed(rows_of(states, which), self.directions)
+            lanes += [Lane(w, 0, row, rough=True), *[Lane(w, 0, ways[d] * count + row, rough=True) for d in self._free[w]]]
+        there = perturbed(rows_of(states, which), [self.directions[d] for d in ways])
         seen = self.flights.fly(self.replay, [self.setting], there, lanes, self.substep, self._shortened).seen
         slopes = {}
         for at, w in zip(first, which):
@@ -299,11 +306,6 @@ def following(flights: Flights, w: int, window: Window, free: np.ndarray, lag: f
     return moves
 
 
-def perturbed(states: States, directions: tuple[Direction, ...]) -> States:
+def perturbed(states: States, directions: Sequence[Direction]) -> States:
     """The states, and after them each direction's perturbed ones: row ``(1 + d) W + w``."""
     return stacked([states, *[moved(states, d, d.step) for d in directions]])
-
-
-def _like(mask: np.ndarray, value: np.ndarray) -> np.ndarray:
-    """The mask with as many axes as a value."""
-    return mask.reshape(-1, *[1] * (value.ndim - 1))

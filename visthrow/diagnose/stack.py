@@ -12,13 +12,15 @@ from typing import TypeVar
 import numpy as np
 import torch
 
-from visthrow.diagnose.designs import Same
+from visthrow.diagnose.designs import Same, padded
 from visthrow.diagnose.marginal import (
     ROUNDING,
     Gram,
     Integral,
     Noise,
     Share,
+    Statistics,
+    There,
     WindowStatistics,
     integral,
     statistics_of,
@@ -26,7 +28,6 @@ from visthrow.diagnose.marginal import (
 )
 from visthrow.diagnose.model import LATENT_BLOCKS
 from visthrow.diagnose.threads import each
-from visthrow.diagnose.transfer import side_by_side
 from visthrow.errors import DiagnoseError
 
 T = TypeVar("T")
@@ -38,7 +39,7 @@ BLOCKS = len(LATENT_BLOCKS)
 class _Columns:
     """Inner products of the columns of W windows, n hidden ones [X, G] at most, K effects; padded columns are 0."""
 
-    def __init__(self, inner: Sequence[np.ndarray], sizes: Sequence[int], device: str):
+    def __init__(self, inner: Sequence[There | np.ndarray], sizes: Sequence[int], device: str):
         """Keep them.
 
         Args:
@@ -47,30 +48,27 @@ class _Columns:
             device: where to calculate.
         """
         self._inner, self._sizes, self._device = inner, sizes, device
+        whole = inner[0].of if isinstance(inner[0], There) else inner[0]
+        self._channels, self._effects = len(whole), whole.shape[1] - sizes[0]
 
     @cached_property
     def hidden(self) -> torch.Tensor:
         """Shape (W, C, n, n)."""
         n = max(self._sizes)
-        return self._moved(n, n, lambda inner, size: inner[:, :size, :size])
+        return self._moved(n, n, lambda inner, w: inner[:, : self._sizes[w], : self._sizes[w]])
 
     @cached_property
     def beside(self) -> torch.Tensor:
         """Hidden columns with effects, shape (W, C, n, K)."""
-        return self._moved(max(self._sizes), self._effects, lambda inner, size: inner[:, :size, size:])
+        return self._moved(max(self._sizes), self._effects, lambda inner, w: inner[:, : self._sizes[w], self._sizes[w] :])
 
     @cached_property
     def own(self) -> torch.Tensor:
         """Shape (W, C, K, K)."""
-        return self._moved(self._effects, self._effects, lambda inner, size: inner[:, size:, size:])
+        return self._moved(self._effects, self._effects, lambda inner, w: inner[:, self._sizes[w] :, self._sizes[w] :])
 
-    @property
-    def _effects(self) -> int:
-        return len(self._inner[0][0]) - self._sizes[0]
-
-    def _moved(self, height: int, width: int, part: Callable[[np.ndarray, int], np.ndarray]) -> torch.Tensor:
-        parts = [[part(inner, size)] for inner, size in zip(self._inner, self._sizes)]
-        return side_by_side(parts, (len(self._inner[0]), height, width), self._device)
+    def _moved(self, height: int, width: int, part: Callable[[T, int], T]) -> torch.Tensor:
+        return padded(self._inner, part, (self._channels, height, width), self._device)
 
 
 @lru_cache(maxsize=2)
@@ -84,6 +82,7 @@ class _Batch:
     """W windows, of n columns [X, G] at most; padded columns are 0."""
 
     windows: np.ndarray  # rows of the noise's shares, shape (W,)
+    phases: tuple[list[str], np.ndarray]  # that occur, and each window's among them
     grams: list[Gram]
     columns: _Columns
     cross: torch.Tensor  # shape (W, C, n)
@@ -107,7 +106,13 @@ class _Solved:
 
 
 class Integrals(Sequence[Integral]):
-    """What windows say of their effects, whatever their residuals are."""
+    """What windows say of their effects, whatever their residuals are.
+
+    Attributes:
+        gathered: by flights with some residuals, once it was asked for.
+    """
+
+    gathered: Statistics | None = None
 
     def __init__(self, of_windows: Sequence[Integral]):
         """Keep those of some windows."""
@@ -176,9 +181,10 @@ class Stack:
         square, counts = (np.stack([getattr(gram, name) for gram in grams]) for name in ("square", "count"))
         log_sigma = np.array([gram.log_sigma for gram in grams])
         arrays = [torch.from_numpy(a).to(self.device) for a in (cross, square, counts, log_sigma, member, known)]
-        inner = [gram.inner for gram in grams]
+        inner = [gram.placed for gram in grams]
         columns = _Columns(inner, sizes, self.device) if self.device == "cpu" else _kept(Same(inner), tuple(sizes), self.device)
-        return _Batch(windows, list(grams), columns, *arrays)
+        phases, phase = np.unique([gram.phase for gram in grams], return_inverse=True)
+        return _Batch(windows, (phases.tolist(), phase), list(grams), columns, *arrays)
 
     def values(self, noise: Noise) -> np.ndarray:
         """Log-likelihood of each window's residuals, but for the powers of 2 pi, shape (W,).
@@ -239,8 +245,9 @@ class Stack:
 
 
 def _solved(batch: _Batch, noise: Noise) -> _Solved:
-    shared = [[noise.latent_sd.get((b, gram.phase), 0.0) for b in range(BLOCKS)] for gram in batch.grams]
-    by_block = batch.square.new_tensor(np.array(shared) * noise.share[batch.windows])
+    phases, phase = batch.phases
+    shared = np.array([[noise.latent_sd.get((b, name), 0.0) for b in range(BLOCKS)] for name in phases])
+    by_block = batch.square.new_tensor(shared[phase] * noise.share[batch.windows])
     level = batch.known + (batch.member @ by_block[:, :, None])[..., 0]
     scale = batch.square.new_tensor(noise.scale)
     weight = scale**-2.0

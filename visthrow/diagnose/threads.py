@@ -6,6 +6,7 @@ So each product has one thread, and windows are spread over the cores.
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
+from threading import Event
 from typing import TypeVar
 
 from threadpoolctl import threadpool_limits
@@ -16,8 +17,18 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 MOST = 4  # threads: with 8, a diagnosis on 16 cores waited an eighth longer, for Python itself
+MOST_ASIDE = 2
+"""The same where a GPU does all that is large: with 4 a diagnosis took a tenth longer, with 1 a fifth."""
 PIECES = 4  # of what is to be done, for each thread
 BESIDE = 3  # tasks side by side that mostly wait for a GPU: 2 are as good, with 4 a diagnosis took an eighth longer
+
+
+_aside = Event()
+
+
+def aside() -> None:
+    """From now on, give this process's small work the threads that it needs beside a GPU."""
+    _aside.set()
 
 
 def single() -> None:
@@ -34,7 +45,7 @@ def _pool(name: str, threads: int) -> ThreadPoolExecutor:
 
 def each(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
     """The function of every item, in order, on all cores; no call may wait for another of these."""
-    items, threads = list(items), min(cores(), MOST)
+    items, threads = list(items), min(cores(), MOST_ASIDE if _aside.is_set() else MOST)
     if min(threads, len(items)) < 2:
         return [function(item) for item in items]
     pieces = min(PIECES * threads, len(items))  # each item by itself would cost as much as the small ones take

@@ -3,9 +3,12 @@
 import copy
 import dataclasses
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
+import torch
+import warp as wp
 
 from camera.params import CameraParams
 from sim.params import PlantParams, SensingParams
@@ -33,7 +36,8 @@ from visthrow.diagnose.states import (
     resampled,
     rows_of,
 )
-from visthrow.diagnose.threads import each
+from visthrow.diagnose.threads import aside, each
+from visthrow.diagnose.transfer import all_to_host, to_host
 from visthrow.errors import DiagnoseError
 from visthrow.flightlog import FlightLog
 
@@ -85,6 +89,8 @@ class ThrowModel:
         """
         self.setting = opened(Setting(plant, sensing or SensingParams(), camera=camera))
         self.device, self.substep, self.mistakes = device, substep, mistakes
+        if device != "cpu":
+            aside()
         flights = [record_of(log, i) for i, log in enumerate(logs)]
         hangs = carriers(flights) if carries is None else [carries] * len(flights)
         carries = any(hangs)
@@ -115,7 +121,7 @@ class ThrowModel:
         states, ends = self._through(self.setting)
         if (without_slack := self._without_slack(ends)) != cuts:
             self.flights = Flights(flights, without_slack, delays, stride)
-            states = self._begin(self.setting)
+            states, _ = self._through(self.setting)
         self._told = np.array([w for w, c in enumerate(self.flights.cuts) if c.told])
         self._fits: dict[tuple[Cut, ...], tuple[States, dict[int, np.ndarray]]] = {}
         self._latest: dict[frozenset[str], States] = {frozenset(): self._fitted(states)[0]}
@@ -131,7 +137,7 @@ class ThrowModel:
         states = self._latest[self._switches(theta)] = self._settled_at[_key(theta)] = self._settled(setting)
         steps = [self._step(e, theta.get(e.effect.name, 0.0)) for e in self._graded]
         settings = [setting, *[e.apply(setting, step) for e, step in zip(self._graded, steps)]]
-        replay = self._replay(settings)
+        replay = self._replay(settings, download=wp.to_torch)
         found: list[Window] = []
         for batch in self._batches():
             found += self._linearised(replay, settings, np.array(steps), states, batch)
@@ -145,8 +151,10 @@ class ThrowModel:
 
     def _with_sightings(self, setting: Setting, theta: Mapping[str, float], windows: list[Window]) -> list[Window]:
         """Windows with what was seen besides poses, and columns of the effects that this alone shows."""
-        blank = [np.zeros((len(w.residual), len(self._sighted))) for w in windows]
-        whole = [dataclasses.replace(w, effects=np.hstack((w.effects, b))) for w, b in zip(windows, blank)]
+        whole = windows
+        if self._sighted:
+            blank = [np.zeros((len(w.residual), len(self._sighted))) for w in windows]
+            whole = [dataclasses.replace(w, effects=np.hstack((w.effects, b))) for w, b in zip(windows, blank)]
         if not self._sightings:
             return whole
         entries = list(self.entries.values())
@@ -257,15 +265,15 @@ class ThrowModel:
         setting = apply(self.entries, self.setting, theta)
         return setting, self._settled(setting)
 
-    def _replay(self, settings: Sequence[Setting]) -> Replay:
-        return Replay([s.plant for s in settings], [s.sensing for s in settings], self.device, download=downloaded)
+    def _replay(self, settings: Sequence[Setting], download: Callable[[wp.array], Any] = downloaded) -> Replay:
+        return Replay([s.plant for s in settings], [s.sensing for s in settings], self.device, download=download)
 
-    def _begin(self, setting: Setting) -> States:
-        """Initial states to start a fit from."""
-        return self._through(setting)[0]
-
-    def _through(self, setting: Setting) -> tuple[States, States]:
+    def _through(self, setting: Setting, known: States | None = None) -> tuple[States, States]:
         """Initial states from smoothed measurements and, for what nobody measures, from flying through the windows before.
+
+        Args:
+            setting: that is flown.
+            known: states that the windows before begin with, fitted in a setting whose blocks are the same.
 
         Returns:
             The states, and those at the windows' ends.
@@ -278,7 +286,7 @@ class ThrowModel:
                 state["gyro"] = state["rate_b"].copy()
             return state
 
-        return carried(self.flights, self._replay([setting]), setting, begin, self.substep)
+        return carried(self.flights, self._replay([setting]), setting, begin, self.substep, known)
 
     def _settling(self, setting: Setting) -> Settling:
         """What fits initial states in a setting."""
@@ -294,7 +302,7 @@ class ThrowModel:
             if states is None and (among := self._among_more(cuts)) is not None:
                 return among
             settling = self._settling(self.setting)
-            fitted = settling.fit(self._begin(self.setting) if states is None else states)
+            fitted = settling.fit([self._through(self.setting)[0] if states is None else states])
             self._fits[cuts] = fitted, settling.slopes
         return self._fits[cuts]
 
@@ -313,9 +321,11 @@ class ThrowModel:
         if setting == self.setting:
             return states
         settling = self._settling(setting)
-        start = settling.better(resampled(states, setting.plant.rope.segments), self._begin(setting))
+        states = resampled(states, setting.plant.rope.segments)
         ways = [[(x.field, x.axis, x.part) for x in found] for found in (settling.directions, directions(self.setting.plant))]
-        return settling.fit(start, slopes if ways[0] == ways[1] else None)
+        if ways[0] != ways[1]:
+            return settling.fit([states, self._through(setting)[0]])
+        return settling.fit([states, self._through(setting, states)[0]], slopes)
 
     @staticmethod
     def _step(e: Entry, theta: float) -> float:
@@ -350,13 +360,21 @@ class ThrowModel:
             kept += 2 * int(f.knots[w])
         flown = f.fly(replay, settings, perturbed(states, self._directions), lanes, self.substep)
 
+        def slopes(plan: Plan) -> list[torch.Tensor]:
+            return plan.slopes(int(f.rows[plan.window]), steps, self._directions, flown.seen)
+
+        found = [slopes(plan) for plan in plans] if flown.seen.is_cuda else each(slopes, plans)
+        nominal = to_host(flown.seen[:, [plan.first for plan in plans]])
         blocks = [e.effect.block for e in self._graded]
 
-        def window(plan: Plan) -> Window:
-            given = f, settings[0], steps, self._directions, self._channel(plan.window), flown.seen, flown.knots
-            return still(plan.window_of(*given), blocks, settings[0].plant.air.wind_w)
+        parts = all_to_host([part for own in found for part in own])
 
-        return each(window, plans)
+        def window(i: int) -> Window:
+            w, own = plans[i].window, parts[3 * i : 3 * i + 3]
+            given = self._channel(w), f.residual(nominal, w, i), own, flown.knots
+            return still(plans[i].window_of(f, settings[0], self._directions, *given), blocks, settings[0].plant.air.wind_w)
+
+        return each(window, range(len(plans)))
 
     def _channel(self, w: int) -> np.ndarray:
         at = {name: i for i, name in enumerate(self.channels)}

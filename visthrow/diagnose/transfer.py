@@ -18,6 +18,14 @@ def to_host(tensor: torch.Tensor) -> np.ndarray:
     return torch.empty(tensor.shape, dtype=tensor.dtype, pin_memory=True).copy_(tensor).numpy()
 
 
+def all_to_host(tensors: Sequence[torch.Tensor]) -> list[np.ndarray]:
+    """Values of several tensors of one kind, from a GPU in one piece."""
+    if not tensors or not tensors[0].is_cuda:
+        return [tensor.numpy() for tensor in tensors]
+    parts = np.split(to_host(torch.cat([tensor.flatten() for tensor in tensors])), np.cumsum([t.numel() for t in tensors])[:-1])
+    return [part.reshape(tensor.shape) for part, tensor in zip(parts, tensors)]
+
+
 def side_by_side(parts: Sequence[Sequence[np.ndarray]], shape: tuple[int, ...], device: str) -> torch.Tensor:
     """Arrays one beside the other on a device, each padded with zeros to one shape.
 

@@ -4,7 +4,7 @@ A term needs no simulation: its column is G phi, with G the derivatives by the l
 thousands of terms are screened with the statistics at hand; the best are then weighed with noise levels of their own.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -14,6 +14,7 @@ from scipy.linalg import lapack
 from visthrow.diagnose import grammar
 from visthrow.diagnose import noise as noise_levels
 from visthrow.diagnose.consistency import LEAST_FLIGHTS, differ
+from visthrow.diagnose.designs import Same
 from visthrow.diagnose.evidence import Priors, covariance, estimate, log_evidence
 from visthrow.diagnose.excess import acts_on
 from visthrow.diagnose.marginal import Gram, Integral, Noise
@@ -175,7 +176,8 @@ def _known(point: Point) -> list[grammar.Known]:
 
 
 def hypotheses(point: Point, priors: Priors, active: Sequence[int], strongest: dict[str, float], least: float,
-               beside: Hypothesis | None = None, instead: Sequence[int] = ()) -> list[Hypothesis]:  # fmt: skip
+               beside: Hypothesis | None = None, instead: Sequence[int] = (),
+               enough: Callable[[Hypothesis], bool] | None = None) -> list[Hypothesis]:  # fmt: skip
     """The best terms beside a set of names, best first.
 
     Args:
@@ -186,6 +188,7 @@ def hypotheses(point: Point, priors: Priors, active: Sequence[int], strongest: d
         least: nats below which no term is weighed.
         beside: a first term that ``point`` already holds.
         instead: names that terms are to take the place of, where these are not hopeless.
+        enough: whether no other need be weighed after one.
     """
     calm, parts = calmed(point)
     information, score = calm.information, calm.score
@@ -200,8 +203,14 @@ def hypotheses(point: Point, priors: Priors, active: Sequence[int], strongest: d
         gain -= [price[term.depth] for term in of.terms]
         found += [(float(gain[i]), of.terms[i], float(prior[i])) for i in distinct(gain, of, WEIGHED)]
     found = sorted((f for f in found if f[0] > max(least, HOPELESS * (named - bare))), key=lambda f: -f[0])[:WEIGHED]
-    weighed = [_weigh(point, priors, active, term, prior, price[term.depth], known, beside) for _, term, prior in found]
-    return sorted((h for h in weighed if h.nats > least and _matters(h, known) and not _differs(h)), key=lambda h: -h.nats)
+    stand: list[Hypothesis] = []
+    for _, term, prior in found:
+        h = _weigh(point, priors, active, term, prior, price[term.depth], known, beside)
+        if h.nats > least and _matters(h, known) and not _differs(h):
+            stand.append(h)
+            if enough is not None and enough(h):
+                break
+    return sorted(stand, key=lambda h: -h.nats)
 
 
 def _differs(hypothesis: Hypothesis) -> bool:
@@ -229,6 +238,7 @@ class Answer:
     """What the grammar has to say: sets of names and terms, the best first, each net of its prices."""
 
     strongest: tuple[Hypothesis, ...] = ()  # the first possibly of two terms
+    hasty: bool = False  # whether the look ended with one that was enough
 
 
 def outside(search: "Search") -> bool:
@@ -236,11 +246,27 @@ def outside(search: "Search") -> bool:
 
     It does where a term makes at least two names superfluous.
     """
-    return len(beats_the_catalogue(search, find_laws(search))[1]) > 1
+    answer = find_laws(search, lambda h: len(beats_the_catalogue(search, Answer((h,)))[1]) > 1)
+    return len(beats_the_catalogue(search, answer)[1]) > 1
 
 
-def find_laws(search: "Search") -> Answer:
-    """Look for terms that explain the flights instead of the names found, instead of some of them, and beside them."""
+def find_laws(search: "Search", enough: Callable[[Hypothesis], bool] | None = None) -> Answer:
+    """Look for terms that explain the flights instead of the names found, instead of some of them, and beside them.
+
+    Args:
+        search: that has named what it could; where nothing has changed, it is not asked again.
+        enough: which one is all that is asked for where derivatives are from elsewhere: they will be taken anew before it is told.
+    """
+    state = Same((search.nominal, search.point)), tuple(search.active)
+    if search.answer is None or search.answer[0] != state:
+        answer = _look(search, enough if search.away else None)
+        if answer.hasty:
+            return answer
+        search.answer = state, answer
+    return search.answer[1]
+
+
+def _look(search: "Search", enough: Callable[[Hypothesis], bool] | None) -> Answer:
     strongest: dict[str, float] = {}
     for (block, _), level in search.nominal.noise.latent_sd.items():
         name = LATENT_BLOCKS[block]
@@ -250,7 +276,10 @@ def find_laws(search: "Search") -> Answer:
     if not all(w.knots for w in search.nominal.windows) or not strongest:
         return Answer()
     priors, least = search.priors, search.least
-    found = [(h, search.nominal) for h in hypotheses(search.nominal, priors, (), strongest, least, instead=search.active)]
+    alone = hypotheses(search.nominal, priors, (), strongest, least, instead=search.active, enough=enough)
+    if enough is not None and any(map(enough, alone)):
+        return Answer(tuple(alone), hasty=True)
+    found = [(h, search.nominal) for h in alone]
     if search.active:
         beside = hypotheses(search.point, priors, search.active, strongest, least)
         found += [(h, search.point) for h in _as_told(search, [_pruned(h, least) for h in beside])]

@@ -45,7 +45,7 @@ def conclude(search: "Search", *, laws: bool) -> Diagnosis:
     """
     from visthrow.diagnose.unknown import Answer, beats_the_catalogue, find_laws
 
-    answer = find_laws(search) if laws else Answer()
+    answer = find_laws(search, lambda h: beats_the_catalogue(search, Answer((h,)))[0] is not None) if laws else Answer()
     law = beats_the_catalogue(search, answer)
     if law[0] is not None and search.nearer():
         answer = find_laws(search)
