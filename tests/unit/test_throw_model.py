@@ -19,7 +19,6 @@ from visthrow.diagnose.evidence import Priors
 from visthrow.diagnose.opened import opened
 from visthrow.diagnose.point import Problem, curvature, linearise, moved
 from visthrow.diagnose.recorded import record_of
-from visthrow.diagnose.replay import Flights
 from visthrow.diagnose.settling import Settling
 from visthrow.diagnose.throw_model import ThrowModel
 from visthrow.errors import DiagnoseError
@@ -169,21 +168,6 @@ def test_rotors_begin_a_window_where_the_commands_left_them(planted):
     model.windows({})
     assert np.array_equal(model._latest[frozenset()]["motor_speed"], model._through(model.setting)[0]["motor_speed"])
     assert "motor_speed" in {d.field for d in model._directions}
-
-
-def test_windows_begin_alike_from_states_that_are_known(planted, monkeypatch):
-    """Inner states at the start of a window are those at the end of the one before, wherever its start came from."""
-    _, model = planted
-    launches, fly = [], Flights.fly
-    monkeypatch.setattr(Flights, "fly", lambda *given: launches.append(1) or fly(*given))
-    one_by_one, _ = model._through(model.setting)
-    assert len(launches) > 1
-    launches.clear()
-    at_once, _ = model._through(model.setting, model._fitted()[0])
-    assert len(launches) == 1
-    assert np.array_equal(at_once["pos_w"], one_by_one["pos_w"])
-    np.testing.assert_allclose(at_once["motor_speed"], one_by_one["motor_speed"], rtol=0.02)
-    assert not np.array_equal(at_once["motor_speed"], one_by_one["motor_speed"])
 
 
 def test_each_window_begins_with_the_best_of_its_states(planted, monkeypatch):

@@ -25,7 +25,7 @@ from visthrow.diagnose.marginal import (
 )
 from visthrow.diagnose.model import Window
 from visthrow.diagnose.threads import each
-from visthrow.diagnose.transfer import side_by_side, to_host
+from visthrow.diagnose.transfer import all_to_host, side_by_side, to_host
 
 T = TypeVar("T", np.ndarray, torch.Tensor)
 
@@ -91,7 +91,7 @@ class _Design:
         """Inner products of each window's residual with its columns (C, P), and with itself (C,)."""
         off = self._off(residuals)
         by_channel = (self._member * off[:, :, None]).transpose(1, 2)
-        cross, square = (by_channel @ self._columns).cpu().numpy(), (by_channel @ off[:, :, None])[..., 0].cpu().numpy()
+        cross, square = all_to_host((by_channel @ self._columns, (by_channel @ off[:, :, None])[..., 0]))
         return ((own[:, :width], its) for own, width, its in zip(cross, self._widths, square))
 
 

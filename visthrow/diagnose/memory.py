@@ -14,8 +14,8 @@ MAPPED = 2**30  # bytes from which an array has a mapping of its own, which goes
 def keep() -> None:
     """Let this process keep what it frees for what it takes next, and look for garbage among new objects alone.
 
-    By default glibc gives large arrays' pages back to the system and faults them in anew: half the time of a look at noise levels
-    was the kernel's. A third of a million objects of the modules are never garbage.
+    By default glibc gives large arrays' pages back to the system and faults them in anew: of looks at noise levels, one after the
+    other, half the time was the kernel's. A third of a million objects of the modules are never garbage.
     """
     gc.freeze()
     try:

@@ -12,7 +12,7 @@ from sim.replay.lanes import Recording, Replay, Replayed
 from visthrow.diagnose.catalogue import Setting
 from visthrow.diagnose.cutting import Cut
 from visthrow.diagnose.recorded import NEVER, Recorded, Samples
-from visthrow.diagnose.states import States, stacked
+from visthrow.diagnose.states import States, rows_of, stacked
 from visthrow.diagnose.transfer import to_host
 
 KNOT_SPACING = 0.1  # of the latent forces [s]
@@ -204,9 +204,7 @@ def rough_step(setting: Setting, substep: float) -> float:
     return max(nominal, min([longer, *[STABLE * lag for lag in lags]]))
 
 
-def carried(
-    flights: Flights, replay: Replay, setting: Setting, begin, substep: float, known: States | None = None
-) -> tuple[States, States]:
+def carried(flights: Flights, replay: Replay, setting: Setting, begin, substep: float) -> tuple[States, States]:
     """Initial states of all windows: measured poses, and inner states carried through the windows before.
 
     Args:
@@ -215,24 +213,15 @@ def carried(
         setting: what is simulated.
         begin: function ``(flight, cut, inner or None)`` -> one state, with ``inner`` the end of the window before.
         substep: largest integration step [s].
-        known: states that windows are flown from, all at once; default: those found, a window after the other.
 
     Returns:
-        The states, and those at the windows' ends that they, or those known, lead to.
+        The states, and those at the windows' ends that they lead to.
     """
     by_flight: dict[int, list[int]] = {}
     for w, c in enumerate(flights.cuts):
         by_flight.setdefault(c.flight, []).append(w)
     states: list[States | None] = [None] * len(flights.cuts)
     ends: list[States | None] = [None] * len(flights.cuts)
-
-    def fly(now: Sequence[int], begun: States) -> None:
-        flown = flights.fly(replay, [setting], begun, [Lane(w, 0, row, keep=0) for row, w in enumerate(now)], substep)
-        for row, w in enumerate(now):
-            ends[w] = {name: value[row : row + 1].copy() for name, value in flown.ends.items()}
-
-    if known is not None:
-        fly(range(len(flights.cuts)), known)
     for k in range(max(map(len, by_flight.values()))):
         now = [ws[k] for ws in by_flight.values() if k < len(ws)]
         for w in now:
@@ -240,6 +229,8 @@ def carried(
             before = by_flight[c.flight][k - 1] if k else None
             gap = before is None or c.start > flights.cuts[before].end + 1e-6  # in which the inner states have gone
             states[w] = begin(flights.flights[c.flight], c, None if gap else ends[before])
-        if known is None:
-            fly(now, stacked([states[w] for w in now]))
+        lanes = [Lane(w, 0, row, keep=0) for row, w in enumerate(now)]
+        flown = flights.fly(replay, [setting], stacked([states[w] for w in now]), lanes, substep)
+        for row, w in enumerate(now):
+            ends[w] = {name: value.copy() for name, value in rows_of(flown.ends, np.array([row])).items()}
     return stacked(states), stacked(ends)

@@ -19,7 +19,7 @@ from visthrow.diagnose.model import LATENT_BLOCKS
 from visthrow.diagnose.point import Point
 from visthrow.diagnose.stack import BATCH, statistics
 from visthrow.diagnose.threads import each
-from visthrow.diagnose.transfer import side_by_side
+from visthrow.diagnose.transfer import all_to_host, side_by_side
 
 ROUGHER = 2.0
 """While terms are screened, no phase is rougher than so many times the usual."""
@@ -130,7 +130,7 @@ def _products(windows: Sequence[tuple[np.ndarray, ...]], layout: grammar.Layout,
     values = values.reshape(len(windows), 3 * longest, -1)
     flat, cross = values.reshape(-1, values.shape[-1]), cross.reshape(-1, cross.shape[-1])
     squares = [((inner @ values) * values).sum((0, 1)) for inner in (square, information)]
-    return tuple(value.cpu().numpy() for value in (*squares, score.reshape(-1) @ flat, flat.T @ cross))
+    return tuple(all_to_host((*squares, score.reshape(-1) @ flat, flat.T @ cross)))
 
 
 def _padded(arrays: Sequence[np.ndarray], axes: Sequence[int | None], longest: int, device: str) -> torch.Tensor:

@@ -28,6 +28,7 @@ from visthrow.diagnose.marginal import (
 )
 from visthrow.diagnose.model import LATENT_BLOCKS
 from visthrow.diagnose.threads import each
+from visthrow.diagnose.transfer import all_to_host
 from visthrow.errors import DiagnoseError
 
 T = TypeVar("T")
@@ -235,7 +236,7 @@ class Stack:
         return _Resident(self._order, each(lambda batch: _integrated(batch, noise, latents), self._batches))
 
     def _each(self, function) -> list[tuple[np.ndarray, ...]]:
-        return each(lambda batch: tuple(value.cpu().numpy() for value in function(batch)), self._batches)
+        return each(lambda batch: tuple(all_to_host(function(batch))), self._batches)
 
     def _in_order(self, parts: Sequence[np.ndarray]) -> np.ndarray:
         out = np.empty((self._count, *parts[0].shape[1:])) if parts else np.empty(0)
@@ -314,7 +315,7 @@ class _Integrated:
 
     def of_windows(self) -> list[Integral]:
         """Each window's, without what pads it."""
-        arrays = (array.cpu().numpy() for array in (self.half, self.at.factor, self.at.level, self.at.log_det))
+        arrays = all_to_host((self.half, self.at.factor, self.at.level, self.at.log_det))
         found = []
         for gram, left, information, half, factor, level, log_det in zip(self.batch.grams, self.left, self.information, *arrays):
             size = gram.nuisances + gram.latents
@@ -330,11 +331,11 @@ class _Integrated:
             hidden[w, :size], beside[w, left] = cross[:size], cross[len(cross) - len(left) :]
         right = self.at.level * torch.from_numpy(hidden).to(self.half.device)
         along = torch.linalg.solve_triangular(self.at.factor, right[:, :, None], upper=False)
-        scores = beside - (self.half.transpose(1, 2) @ along)[..., 0].cpu().numpy()
-        taken = (self.at.log_det - along.square().sum((1, 2))).cpu().numpy()
+        told = (self.half.transpose(1, 2) @ along)[..., 0], self.at.log_det - along.square().sum((1, 2))
+        explained, taken = all_to_host(told)
         return [
             Share(information, score[left], float(weight @ gram.square + own))
-            for gram, left, information, score, own in zip(grams, self.left, self.information, scores, taken)
+            for gram, left, information, score, own in zip(grams, self.left, self.information, beside - explained, taken)
         ]
 
 

@@ -268,12 +268,8 @@ class ThrowModel:
     def _replay(self, settings: Sequence[Setting], download: Callable[[wp.array], Any] = downloaded) -> Replay:
         return Replay([s.plant for s in settings], [s.sensing for s in settings], self.device, download=download)
 
-    def _through(self, setting: Setting, known: States | None = None) -> tuple[States, States]:
+    def _through(self, setting: Setting) -> tuple[States, States]:
         """Initial states from smoothed measurements and, for what nobody measures, from flying through the windows before.
-
-        Args:
-            setting: that is flown.
-            known: states that the windows before begin with, fitted in a setting whose blocks are the same.
 
         Returns:
             The states, and those at the windows' ends.
@@ -286,7 +282,7 @@ class ThrowModel:
                 state["gyro"] = state["rate_b"].copy()
             return state
 
-        return carried(self.flights, self._replay([setting]), setting, begin, self.substep, known)
+        return carried(self.flights, self._replay([setting]), setting, begin, self.substep)
 
     def _settling(self, setting: Setting) -> Settling:
         """What fits initial states in a setting."""
@@ -321,11 +317,9 @@ class ThrowModel:
         if setting == self.setting:
             return states
         settling = self._settling(setting)
-        states = resampled(states, setting.plant.rope.segments)
+        starts = [resampled(states, setting.plant.rope.segments), self._through(setting)[0]]
         ways = [[(x.field, x.axis, x.part) for x in found] for found in (settling.directions, directions(self.setting.plant))]
-        if ways[0] != ways[1]:
-            return settling.fit([states, self._through(setting)[0]])
-        return settling.fit([states, self._through(setting, states)[0]], slopes)
+        return settling.fit(starts, slopes if ways[0] == ways[1] else None)
 
     @staticmethod
     def _step(e: Entry, theta: float) -> float:

@@ -19,7 +19,7 @@ def to_host(tensor: torch.Tensor) -> np.ndarray:
 
 
 def all_to_host(tensors: Sequence[torch.Tensor]) -> list[np.ndarray]:
-    """Values of several tensors of one kind, from a GPU in one piece."""
+    """Values of several tensors of one kind, from a GPU in one piece: each wait for one gives Python away to other threads."""
     if not tensors or not tensors[0].is_cuda:
         return [tensor.numpy() for tensor in tensors]
     parts = np.split(to_host(torch.cat([tensor.flatten() for tensor in tensors])), np.cumsum([t.numel() for t in tensors])[:-1])
