@@ -3,8 +3,8 @@ kornia).
 
 Frames: ``_w`` world (z up), ``_b`` body (x forward, y left, z up), ``_c`` camera (x image right, y image down, z along
 the optical axis).
-What the policy needs is exported here; files and pictures live in `camera.calibration`, `camera.boards`,
-`camera.foreign`, `camera.render`, `camera.nuisance`, `camera.images`, `camera.overlay`, the detector in `camera.detect`.
+What the policy needs is exported here. Calibration files and boards live in `camera.calibrate`, pictures in `camera.imaging`, the
+detector of ball and goal square in `camera.detectors`.
 Knows neither the simulator nor the rest of the project; cv2, kornia, scipy and yaml are imported by the functions that use them.
 """
 

@@ -98,7 +98,7 @@ def _add_simulated(fake: argparse.ArgumentParser, direct: argparse.ArgumentParse
     fake.add_argument("--rate", type=float, default=100.0, metavar="HZ", help="poses a second of each body")
     for parser in (fake, direct):
         parser.add_argument(
-            "--plant", default="visthrow.wire_plant:make", metavar="MODULE:FUNCTION", help="that makes the vehicle"
+            "--plant", default="visthrow.throws.wire_plant:make", metavar="MODULE:FUNCTION", help="that makes the vehicle"
         )
     fake.add_argument("--device", default="udpout:127.0.0.1:14560", help="the runner's port")
     fake.add_argument("--policy", default="vision", metavar="POLICY", help="whose plant is flown")
@@ -148,8 +148,8 @@ class Keyboard:
         self._stop = True
 
     def words(self, state: str) -> Any:
-        """See `hil.flight.Operator`."""
-        from hil.decision import Words
+        """See `hil.control.loop.Operator`."""
+        from hil.control.decision import Words
 
         said = set()
         while self._open and select.select([sys.stdin], [], [], 0)[0]:
@@ -168,20 +168,20 @@ def _params(args: argparse.Namespace) -> Any:
 
 def _run(args: argparse.Namespace) -> int:
     started = time.monotonic()
-    from hil.autopilot_check import told
     from hil.backends import make_backend, mechanism_lag, require_reach
-    from hil.clock import ManualClock, MonotonicClock
-    from hil.flight import fly
-    from hil.images import open_images
-    from hil.latency import Stages
-    from hil.realtime import keep, prepare
-    from hil.record import Recorder
-    from hil.rehearsal import Rehearsal
-    from hil.report import finish, story
-    from hil.runner import Runner
+    from hil.backends.check import told
+    from hil.control.loop import fly
+    from hil.control.realtime import keep, prepare
+    from hil.control.rehearsal import Rehearsal
+    from hil.control.runner import Runner
+    from hil.links.clock import ManualClock, MonotonicClock
+    from hil.recording.latency import Stages
+    from hil.recording.record import Recorder
+    from hil.recording.report import finish, story
+    from hil.recording.view import beside
+    from hil.sources.images import open_images
     from hil.sources.opening import open_source
-    from hil.view import beside
-    from visthrow.policy import Policy, find_policy
+    from visthrow.onboard.policy import Policy, find_policy
 
     params = _params(args)
     if args.action == "record":
@@ -242,7 +242,7 @@ def _tell(decision: Any) -> None:
 
 
 def _replay(args: argparse.Namespace) -> int:
-    from hil.playback import replay
+    from hil.recording.playback import replay
 
     found = replay(args.folder)
     for n, name, was, now in found["differences"][:10]:
@@ -253,14 +253,14 @@ def _replay(args: argparse.Namespace) -> int:
 
 
 def _view(args: argparse.Namespace) -> int:
-    from hil import view
+    from hil.recording import view
 
     return view.run(Path(args.folder), args.live, args.out, args.web_port, args.data_port)
 
 
 def _check(args: argparse.Namespace) -> int:
     if args.against_camera:
-        from hil import camera_report
+        from hil.recording import camera_report
 
         figures = camera_report.against_camera(_params(args), args.against_camera, args.out)
         print(camera_report.story(figures, args.out))
@@ -268,19 +268,19 @@ def _check(args: argparse.Namespace) -> int:
     if args.hand_carry:
         return _hand_carry(args)
     if args.hover_of is not None:
-        from hil.autopilot_check import hover_of_run
+        from hil.backends.check import hover_of_run
 
         good, text = hover_of_run(args.hover_of)
         print(f"{'PASS' if good else 'FAIL'}  {text}")
         return 0 if good else 1
-    from hil.autopilot_check import AutopilotCheck
     from hil.backends import DryRun, make_backend
-    from hil.clock import ManualClock, MonotonicClock
-    from hil.decision import Words
-    from hil.plausible import unit_problems
-    from hil.runner import Runner
+    from hil.backends.check import AutopilotCheck
+    from hil.control.decision import Words
+    from hil.control.runner import Runner
+    from hil.links.clock import ManualClock, MonotonicClock
+    from hil.poses.plausible import unit_problems
     from hil.sources.opening import open_source
-    from visthrow.policy import Policy, find_policy
+    from visthrow.onboard.policy import Policy, find_policy
 
     params = _params(args)
     import tempfile
@@ -322,9 +322,9 @@ def _check(args: argparse.Namespace) -> int:
 def _hand_carry(args: argparse.Namespace) -> int:
     import tempfile
 
-    from hil import handcarry
-    from hil.clock import ManualClock, MonotonicClock
-    from hil.pose import VEHICLE
+    from hil.links.clock import ManualClock, MonotonicClock
+    from hil.poses import handcarry
+    from hil.poses.pose import VEHICLE
     from hil.sources.opening import open_source
 
     params = _params(args)
@@ -340,10 +340,10 @@ def _hand_carry(args: argparse.Namespace) -> int:
 
 
 def _direct(args: argparse.Namespace) -> int:
-    from hil.direct import Direct, scored
-    from hil.fake import load_plant
-    from hil.mocap import MocapParams
-    from visthrow.policy import Policy, find_policy
+    from hil.fakes.direct import Direct, scored
+    from hil.fakes.mocap import MocapParams
+    from hil.fakes.process import load_plant
+    from visthrow.onboard.policy import Policy, find_policy
 
     params = _params(args)
     policy, mocap = Policy.load(find_policy(params.policy)), MocapParams()
@@ -354,10 +354,10 @@ def _direct(args: argparse.Namespace) -> int:
 
 
 def _fake(args: argparse.Namespace) -> int:
-    from hil.clock import MonotonicClock
-    from hil.device import check_device, open_port
-    from hil.fake import VEHICLE_ID, ListeningPort, MocapParams, load_plant, make_fake, read_options, serve
-    from hil.link import Link
+    from hil.fakes.process import VEHICLE_ID, ListeningPort, MocapParams, load_plant, make_fake, read_options, serve
+    from hil.links.clock import MonotonicClock
+    from hil.links.device import check_device, open_port
+    from hil.links.mavlink_link import Link
 
     options = read_options([*args.overrides, f"answer={args.answer}"])
     plant = load_plant(args.plant, args.policy, args.seed)

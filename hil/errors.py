@@ -1,6 +1,6 @@
 """Errors of the onboard side that a user can cause and mend."""
 
-from visthrow.errors import ConfigError, VisthrowError
+from visthrow.common.errors import ConfigError, VisthrowError
 
 
 class FrameError(ConfigError):

@@ -4,22 +4,22 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from camera.params import CameraParams
-from hil.aim import AimParams
 from hil.backends.ardupilot import ArduPilotParams
 from hil.backends.betaflight import BetaflightParams
 from hil.backends.px4 import Px4Params
-from hil.camera_log import CameraLogParams
-from hil.estimate import EstimateParams
-from hil.frames import FrameParams
-from hil.gate import GateParams
-from hil.images import ImageParams
-from hil.pose import BODIES, PAYLOAD, VEHICLE
-from hil.realtime import RealtimeParams
-from hil.safety import CheckParams, FenceParams, GuardParams
+from hil.control.aim import AimParams
+from hil.control.realtime import RealtimeParams
+from hil.control.safety import CheckParams, FenceParams, GuardParams
+from hil.control.states import StateParams
+from hil.poses.estimate import EstimateParams
+from hil.poses.frames import FrameParams
+from hil.poses.gate import GateParams
+from hil.poses.pose import BODIES, PAYLOAD, VEHICLE
+from hil.poses.track import MOST_PREDICTION
+from hil.recording.camera_log import CameraLogParams
 from hil.sources import BodyIds, CsvParams, LogBody, MocapParams, RigidBody
-from hil.states import StateParams
-from hil.track import MOST_PREDICTION
-from visthrow.errors import ConfigError
+from hil.sources.images import ImageParams
+from visthrow.common.errors import ConfigError
 
 LIVE = ("mavlink", "mocap")
 """Kinds of source that are no recording."""
@@ -36,7 +36,7 @@ class LinkParams:
         ConfigError: an id that MAVLink does not have.
     """
 
-    device: str  # see hil.device
+    device: str  # see hil.links.device
     remote: bool  # whether the device may leave this machine
     system: int  # our own id, 1 to 255
     component: int  # likewise

@@ -5,15 +5,15 @@ import dataclasses
 import numpy as np
 import warp as wp
 
-from sim import runtime  # noqa: F401  starts Warp
-from sim import state as st
-from sim.checks import check_air, check_numerics, check_release
-from sim.laws import check_laws, structure
+from sim.arrays import runtime  # noqa: F401  starts Warp
+from sim.arrays import state as st
+from sim.arrays.checks import check_air, check_numerics, check_release
+from sim.arrays.structs import extensions_of, kinds_of, pack, pack_air, pack_rope, pack_vehicle, ropes_on, types
+from sim.effects.laws import check_laws, structure
 from sim.params import GRAVITY, AirParams, PlantParams, RandomizationParams, ReleaseParams, RopeParams, VehicleParams
 from sim.quadrotor.queue import queue_depth
 from sim.randomize import build_reset
 from sim.step import build_step
-from sim.structs import extensions_of, kinds_of, pack, pack_air, pack_rope, pack_vehicle, ropes_on, types
 
 _BUILDS: dict = {}
 
@@ -77,8 +77,8 @@ class HybridSim:
     Attributes:
         command: [N, rad/s], shape (E,) of vec4: collective thrust and body rates of the next step.
         release: shape (E,), int: non-zero asks for the release; the latch keeps it.
-        state: arrays of :data:`sim.state.STATE_FIELDS`.
-        out: arrays of :data:`sim.state.OUTPUT_FIELDS`.
+        state: arrays of :data:`sim.arrays.state.STATE_FIELDS`.
+        out: arrays of :data:`sim.arrays.state.OUTPUT_FIELDS`.
         goal_w: [m], shape (E,) of vec3: goals that :meth:`randomize` draws.
     """
 
@@ -109,7 +109,7 @@ class HybridSim:
             airs: likewise; default ``[params.air]``.
             releases: likewise; default ``[params.release]``.
             direct: by-pass the blocks: commands are thrust [N] and torque [N m].
-            extensions: of :data:`sim.structs.EXTENSIONS`, to build in besides those that the parameters need.
+            extensions: of :data:`sim.arrays.structs.EXTENSIONS`, to build in besides those that the parameters need.
             gravity: acceleration of free fall, along -z [m/s^2].
 
         Raises:

@@ -272,7 +272,7 @@ class SimParams:
 
 @dataclass(frozen=True)
 class LawParams:
-    """A force or torque besides the blocks' own: coefficient times scalars times a vector, by the names of :mod:`sim.laws`.
+    """A force or torque besides the blocks' own: coefficient times scalars times a vector, by the names of :mod:`sim.effects.laws`.
 
     It acts on the vehicle (force in the world frame, torque in the body's), on the payload, while it hangs and after, or in the
     rope's joint at the mount: a torque on the vehicle in the body frame, and the opposite one on the rope.

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import warp as wp
 
+from sim.arrays.structs import Types
 from sim.params import PlantParams
 from sim.quadrotor.start import build_start
-from sim.structs import Types
 
 
 @dataclass(frozen=True)

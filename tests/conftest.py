@@ -1,5 +1,5 @@
-"""One thread a product for all tests: see :mod:`visthrow.diagnose.threads`."""
+"""One thread a product for all tests: see :mod:`visthrow.diagnose.likelihood.threads`."""
 
-from visthrow.diagnose.threads import single
+from visthrow.diagnose.likelihood.threads import single
 
 single()

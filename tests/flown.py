@@ -4,14 +4,14 @@ import dataclasses
 
 import numpy as np
 
+from sim.arrays.structs import EXTENSIONS
 from sim.hybrid import HybridSim
 from sim.params import PlantParams
-from sim.structs import EXTENSIONS
 from tests.plants import paper_plant
 from tests.worlds.pilot import FreeFlight, Throw, Tracker
-from visthrow.ballistics import flown
 from visthrow.diagnose.catalogue import ALL, Setting, apply
-from visthrow.flightlog import Channel, FlightLog
+from visthrow.logs.flightlog import Channel, FlightLog
+from visthrow.throws.ballistics import flown
 
 FINE = 5e-4  # integration step of the flights [s]
 TICK = 0.005  # between samples [s]

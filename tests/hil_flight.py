@@ -7,12 +7,12 @@ import numpy as np
 import torch
 
 from hil.backends import DryRun, Status
-from hil.frames import multiply, rotate
+from hil.control.runner import Decision, Runner, Words
 from hil.params import HilParams
-from hil.pose import Pose
-from hil.runner import Decision, Runner, Words
+from hil.poses.frames import multiply, rotate
+from hil.poses.pose import Pose
 from visthrow import config
-from visthrow.policy import Policy, find_policy
+from visthrow.onboard.policy import Policy, find_policy
 
 TICK, SUBSTEPS = 0.02, 2  # poses at 100 Hz
 OURS = tuple(

@@ -2,11 +2,11 @@
 
 from pathlib import Path
 
-from hil.record import Recorder
-from hil.runner import Decision, Runner
+from hil.control.runner import Decision, Runner
+from hil.recording.record import Recorder
 from tests.hil_flight import Spy, fly, params, simple_policy
-from visthrow.actions import hover_action
-from visthrow.policy import Policy, find_policy
+from visthrow.onboard.actions import hover_action
+from visthrow.onboard.policy import Policy, find_policy
 
 HOVER = hover_action(9.81 * 0.272, 14.0)[0]
 AT_ONCE = (HOVER, 0.0, 0.0, 0.0, 1.0)

@@ -2,13 +2,13 @@
 
 import numpy as np
 
-from visthrow import results
 from visthrow.baseline import front, thrower
-from visthrow.report import wanted
-from visthrow.report.ablations import FURTHER, PAPER_FOUR
-from visthrow.report.book import HARDENED, SHIPPED, Book
-from visthrow.report.gap import SWEEPS, TRAINED
-from visthrow.results import Result
+from visthrow.evidence.report import wanted
+from visthrow.evidence.report.ablations import FURTHER, PAPER_FOUR
+from visthrow.evidence.report.book import HARDENED, SHIPPED, Book
+from visthrow.evidence.report.gap import SWEEPS, TRAINED
+from visthrow.throws import results
+from visthrow.throws.results import Result
 
 MADE = {"commit": "0" * 40, "command": "made up", "time": "2020-01-01T00:00:00+00:00", "seconds": 1.0}
 PLANTS = ("hybrid", "reference", "reference-realistic")

@@ -8,26 +8,25 @@ from collections.abc import Sequence
 from typing import NoReturn
 
 from visthrow import __version__
-from visthrow.errors import VisthrowError
+from visthrow.common.arguments import EXIT_BAD_INPUT, EXIT_INTERRUPTED
+from visthrow.common.errors import VisthrowError
 
 COMMANDS = {
-    "demo": ("throw once with the shipped vision policy and compare it with the state policy", "visthrow.demo"),
-    "train": ("train a throwing policy from scratch", "visthrow.train_cli"),
-    "fly": ("fly one throw and write a 3D recording and a picture of it", "visthrow.fly"),
-    "compare": ("throw many times with each policy and print landing errors and durations", "visthrow.compare"),
+    "demo": ("throw once with the shipped vision policy and compare it with the state policy", "visthrow.evidence.demo"),
+    "train": ("train a throwing policy from scratch", "visthrow.training.command"),
+    "fly": ("fly one throw and write a 3D recording and a picture of it", "visthrow.throws.fly"),
+    "compare": ("throw many times with each policy and print landing errors and durations", "visthrow.throws.compare"),
     "hil": ("fly a policy on motion-capture poses, live or recorded", "hil.cli"),
     "baseline": ("throw with trajectory optimisation and MPC; its front against the policies", "visthrow.baseline.command"),
     "diagnose": ("say what the simulation gets wrong, from measured flights", "visthrow.diagnose.cli"),
-    "sweep": ("work a list of training runs and throws, on several GPUs or a cluster", "visthrow.sweep.cli"),
-    "report": ("write one page with the paper's tables and figures beside ours", "visthrow.report.command"),
-    "bench": ("measure the speed of the simulator and of the camera", "visthrow.bench"),
-    "config": ("print a configuration with all its values filled in", "visthrow.config_cli"),
+    "sweep": ("work a list of training runs and throws, on several GPUs or a cluster", "visthrow.evidence.sweep.cli"),
+    "report": ("write one page with the paper's tables and figures beside ours", "visthrow.evidence.report.command"),
+    "bench": ("measure the speed of the simulator and of the camera", "visthrow.evidence.bench"),
+    "config": ("print a configuration with all its values filled in", "visthrow.config.command"),
 }
 """Name -> (help, module). The module has ``add_arguments(parser)`` and ``run(args) -> int``."""
 
 TRACEBACK_VARIABLE = "VISTHROW_TRACEBACK"
-EXIT_BAD_INPUT = 2
-EXIT_INTERRUPTED = 130
 
 _EXTRAS = {"submitit": "slurm", "mujoco": "reference", "piqp": "baseline"}
 """Optional packages by import name, and the extra of visthrow that installs them."""
@@ -46,29 +45,6 @@ examples:
 
 'visthrow COMMAND --help' tells more about a command. Set VISTHROW_TRACEBACK=1 to see where an error came from.
 """
-
-
-def add_common(parser: argparse.ArgumentParser, *, device: bool = True, json: bool = True) -> None:
-    """Add the options that commands share: ``--device``, ``--set``, ``--json``.
-
-    Args:
-        parser: Of the command.
-        device: Whether the command computes on a device; read ``args.device`` through ``visthrow.device.resolve``.
-        json: Whether the command prints a table; write it to ``args.json`` as well where that is not None.
-    """
-    parser.add_argument(
-        "--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE",
-        help="change one value of the configuration, for instance --set vehicle.body.mass=0.25; may be repeated",
-    )  # fmt: skip
-    if device:
-        parser.add_argument(
-            "--device",
-            default="auto",
-            metavar="NAME",
-            help="auto, cpu, cuda or cuda:1 (default: a GPU if there is one)",
-        )
-    if json:
-        parser.add_argument("--json", metavar="FILE", help="write the printed figures to this file as well")
 
 
 def build_parser(chosen: str | None = None) -> argparse.ArgumentParser:

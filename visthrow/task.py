@@ -19,12 +19,12 @@ from sim.params import (
     SimParams,
     VehicleParams,
 )
-from visthrow.errors import ConfigError
+from visthrow.common.errors import ConfigError
 
 
 @dataclass(frozen=True)
 class ActionParams:
-    """Limits of the command; see :mod:`visthrow.actions`."""
+    """Limits of the command; see :mod:`visthrow.onboard.actions`."""
 
     max_thrust: float  # collective thrust at +1 [N]
     max_rate: tuple[float, float, float]  # body rates at +-1 [rad/s]
@@ -32,13 +32,13 @@ class ActionParams:
 
 @dataclass(frozen=True)
 class ObservationParams:
-    """What the actor sees; see :mod:`visthrow.observations`."""
+    """What the actor sees; see :mod:`visthrow.onboard.observations`."""
 
     layout: Literal["state", "vision"]
     history: int  # earlier payload measurements beside the current one
     validity: bool  # vision: whether the actor is told which keypoints are valid
     latency: tuple[float, float]  # age of all that is measured, drawn per episode from this range [s]
-    goal_velocity: bool = False  # whether the actor is given a fit of the goal's velocity; see visthrow.goal_motion
+    goal_velocity: bool = False  # whether the actor is given a fit of the goal's velocity; see visthrow.onboard.goal_motion
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class BoundsParams:
 
 @dataclass(frozen=True)
 class RewardParams:
-    """Coefficients of Table II, by the names of its meanings; see :mod:`visthrow.rewards`."""
+    """Coefficients of Table II, by the names of its meanings; see :mod:`visthrow.training.rewards`."""
 
     scale: float  # of the whole reward; the learner's only, the paper's is 1
     velocity: float  # alpha_v
@@ -199,14 +199,14 @@ def plant_of(experiment: Experiment) -> PlantParams:
 
 
 def contract_of(experiment: Experiment) -> dict:
-    """What whoever flies a policy must share with its training; see :mod:`visthrow.policy`.
+    """What whoever flies a policy must share with its training; see :mod:`visthrow.onboard.policy`.
 
     The camera enters for vision policies only. Noise and randomisation are training matters and stay out. An entry whose
     field has a default enters where it differs from that: a policy from before the field was there fits what it is off in.
     """
     from visthrow import config
-    from visthrow.observations import layout_of
-    from visthrow.pilot import camera_conditions
+    from visthrow.onboard.observations import layout_of
+    from visthrow.onboard.pilot import camera_conditions
 
     layout = layout_of(experiment.task.observation)
     contract = {

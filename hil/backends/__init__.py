@@ -9,9 +9,9 @@ from hil.backends.ardupilot import ArduPilot, ArduPilotParams
 from hil.backends.base import Backend, DryRun, Status
 from hil.backends.betaflight import Betaflight, BetaflightParams
 from hil.backends.px4 import Px4, Px4Params
-from hil.device import check_device, open_port
 from hil.errors import RunError
-from hil.msp_log import LoggedPort
+from hil.links.device import check_device, open_port
+from hil.links.msp_log import LoggedPort
 
 MSP_LOG = "link.msp"
 """In a run's folder."""

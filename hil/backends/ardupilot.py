@@ -13,7 +13,7 @@ from typing import Any, Literal
 from hil.backends.audit import Rule, bits, equal, within
 from hil.backends.autopilot import AutopilotParams, MavlinkAutopilot
 from hil.backends.base import FOLLOW, HOLD, LAND
-from hil.mavlink import mav
+from hil.links.pymav import mav
 
 GUIDED, LOITER, LAND_MODE, BRAKE, GUIDED_NOGPS = 4, 5, 9, 17, 20
 """Mode numbers of ArduCopter."""

@@ -12,8 +12,8 @@ from typing import Any
 from hil.backends.audit import Audit, Rule
 from hil.backends.base import FOLLOW, HOLD, LAND, WAIT, Release, Status
 from hil.backends.thrust import ThrustParams
-from hil.link import Link, attitude_target
-from hil.mavlink import mav
+from hil.links.mavlink_link import Link, attitude_target
+from hil.links.pymav import mav
 
 ASK_AGAIN = 0.1
 """Between two requests for a mode or for arming [s]."""

@@ -14,12 +14,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from hil import msp
 from hil.backends.audit import Audit, Rule, equal
 from hil.backends.base import ACCEPTED, FOLLOW, PENDING, WAIT, Release, Status
 from hil.backends.rates import MIDDLE, RATES_TYPES, RatesParams, Sticks
 from hil.backends.thrust import ThrustParams
-from hil.device import MOST_CHUNKS, MutePort, Port
+from hil.links import msp
+from hil.links.device import MOST_CHUNKS, MutePort, Port
 
 BOX_ARM, BOX_OVERRIDE = 0, 50
 """Permanent ids of flight modes."""
@@ -53,7 +53,7 @@ class BetaflightParams:
         ValueError: a number out of its range.
     """
 
-    device: str  # of MSP, see hil.device
+    device: str  # of MSP, see hil.links.device
     remote: bool  # whether the device may leave this machine
     thrust: ThrustParams
     rates: RatesParams

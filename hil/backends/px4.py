@@ -13,7 +13,7 @@ from typing import Any, Literal
 from hil.backends.audit import Rule, bits, equal, within
 from hil.backends.autopilot import AutopilotParams, MavlinkAutopilot, bytes_to_integer, integer_to_bytes
 from hil.backends.base import FOLLOW, HOLD, LAND
-from hil.mavlink import mav
+from hil.links.pymav import mav
 
 MAIN_POSCTL, MAIN_AUTO, MAIN_OFFBOARD = 3, 4, 6
 """Main modes, bits 16 to 23 of a heartbeat's custom mode."""

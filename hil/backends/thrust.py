@@ -8,7 +8,7 @@ import math
 from collections import deque
 from dataclasses import dataclass
 
-from visthrow.hover import GRAVITY
+from visthrow.onboard.hover import GRAVITY
 
 LEAST_SHARES = 50
 """Values that a mean share of hover is taken over: 5 s at 10 Hz."""

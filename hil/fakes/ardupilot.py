@@ -21,8 +21,8 @@ from hil.backends.ardupilot import (
 )
 from hil.backends.thrust import ThrustParams
 from hil.fakes.mavlink import SERVO, FakeMavlink
-from hil.mavlink import mav
-from visthrow.hover import rot_from_quat
+from hil.links.pymav import mav
+from visthrow.onboard.hover import rot_from_quat
 
 FULL_CLIMB = 2.5
 """Climb rate at full thrust where thrust is read as one: PILOT_SPEED_UP's default [m/s]."""

@@ -8,15 +8,15 @@ from typing import Any, Literal, Protocol
 import numpy as np
 
 from hil.backends.thrust import ThrustParams
+from hil.fakes.mocap import SLACK, Mocap, MocapParams
+from hil.fakes.mocap_faults import MocapFault
 from hil.fakes.set_points import SetPoints
 from hil.fakes.witness import Witness
-from hil.frames import FrameParams, Frames
-from hil.link import Link
-from hil.mavlink import mav
-from hil.mocap import SLACK, Mocap, MocapParams
-from hil.mocap_faults import MocapFault
-from hil.pose import PAYLOAD, Pose
-from visthrow.hover import GRAVITY, HoverController, HoverParams
+from hil.links.mavlink_link import Link
+from hil.links.pymav import mav
+from hil.poses.frames import FrameParams, Frames
+from hil.poses.pose import PAYLOAD, Pose
+from visthrow.onboard.hover import GRAVITY, HoverController, HoverParams
 
 VEHICLE_ID, PAYLOAD_ID = (1, 1), (1, 25)
 """MAVLink system and component that poses of vehicle and payload come from."""
@@ -76,7 +76,7 @@ class Options:
     silent_after: float = float("inf")  # it says nothing any more from this time on [s]
     taken_after: float = float("inf")  # when the pilot takes the vehicle over [s]
     pose_message: Literal["ATT_POS_MOCAP", "ODOMETRY"] = "ATT_POS_MOCAP"  # ODOMETRY carries a reset counter
-    mocap_fault: str = "none"  # of hil.mocap_faults
+    mocap_fault: str = "none"  # of hil.fakes.mocap_faults
     fault_time: float = float("inf")  # from which it happens [s]
     prompt: bool = True  # a heartbeat follows a change of mode at once; else up to a second later
     all_channels: bool = False  # Betaflight: all channels come by MSP, the arming one as well

@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from hil import msp
 from hil.backends.betaflight import BOX_ARM, BOX_OVERRIDE, HIGH, LOW, STICKS, TUNING
 from hil.backends.rates import RATES_TYPES, RatesParams, Sticks
 from hil.backends.thrust import ThrustParams
-from hil.device import MOST_CHUNKS, Port
 from hil.fakes.base import Fake, Options, WirePlant
-from hil.link import Link
-from hil.mocap import MocapParams
+from hil.fakes.mocap import MocapParams
+from hil.links import msp
+from hil.links.device import MOST_CHUNKS, Port
+from hil.links.mavlink_link import Link
 
 IDLE_AFTER, DISARM_AFTER = 0.36, 1.6
 """Silence after which the motors idle, and after which it disarms [s]."""

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from visthrow.hover import GRAVITY
+from visthrow.onboard.hover import GRAVITY
 
 MOST_KEPT = 10_000
 """Commands that are remembered."""
@@ -60,5 +60,5 @@ class LevelPlant:
 
 
 def make(policy: str, seed: int) -> LevelPlant:
-    """The plant, for any policy and seed; see `hil.fake.load_plant`."""
+    """The plant, for any policy and seed; see `hil.fakes.process.load_plant`."""
     return LevelPlant()

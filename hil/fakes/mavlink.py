@@ -6,9 +6,9 @@ import numpy as np
 
 from hil.backends.autopilot import ARMED, CUSTOM
 from hil.fakes.base import VEHICLE_ID, Fake, Options, WirePlant
-from hil.link import IGNORE_ATTITUDE, Link
-from hil.mavlink import mav
-from hil.mocap import MocapParams
+from hil.fakes.mocap import MocapParams
+from hil.links.mavlink_link import IGNORE_ATTITUDE, Link
+from hil.links.pymav import mav
 
 FORCE = 21196
 """Second parameter of COMPONENT_ARM_DISARM that disarms in flight."""

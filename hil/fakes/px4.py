@@ -13,7 +13,7 @@ from hil.backends.autopilot import bytes_to_integer, integer_to_bytes
 from hil.backends.px4 import AUTO_LAND, AUTO_LOITER, LAND_OR_HOLD, MAIN_AUTO, MAIN_OFFBOARD, MAIN_POSCTL
 from hil.backends.thrust import ThrustParams
 from hil.fakes.mavlink import FakeMavlink
-from hil.mavlink import mav
+from hil.links.pymav import mav
 
 STREAM_FIRST, STREAM_GAP = 1.0, 0.5
 """Set-points before OFFBOARD, and the longest gap in them: 2 Hz [s]."""

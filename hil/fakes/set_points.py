@@ -4,7 +4,7 @@ from collections import deque
 
 import numpy as np
 
-from hil.mocap import SLACK
+from hil.fakes.mocap import SLACK
 
 
 class SetPoints:

@@ -3,9 +3,9 @@
 from collections.abc import Iterable
 from typing import Protocol
 
-from hil.clock import Clock
 from hil.errors import SourceError
-from hil.pose import Pose
+from hil.links.clock import Clock
+from hil.poses.pose import Pose
 
 
 class Source(Protocol):

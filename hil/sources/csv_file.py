@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from hil.errors import SourceError
-from hil.pose import BODIES, Pose
-from visthrow.errors import ConfigError, suggest
+from hil.poses.pose import BODIES, Pose
+from visthrow.common.errors import ConfigError, suggest
 
 UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "m": 1.0, "cm": 1e-2, "mm": 1e-3, "m/s": 1.0, "mm/s": 1e-3,
          "rad": 1.0, "deg": math.pi / 180, "rad/s": 1.0, "deg/s": math.pi / 180, "1": 1.0}  # fmt: skip

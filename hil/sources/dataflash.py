@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import Any
 
 from hil.errors import SourceError
-from hil.link import quaternion_from_euler
-from hil.pose import Pose, Quaternion
+from hil.links.mavlink_link import quaternion_from_euler
+from hil.poses.pose import Pose, Quaternion
 from hil.sources.logs import LogBody, parsing, read_logs
 from hil.sources.mavlink import PAIR_AGE
 

@@ -10,8 +10,8 @@ from pathlib import Path
 from types import ModuleType
 
 from hil.errors import SourceError
-from hil.pose import BODIES, Pose
-from visthrow.errors import ConfigError, suggest
+from hil.poses.pose import BODIES, Pose
+from visthrow.common.errors import ConfigError, suggest
 
 
 @dataclass(frozen=True)

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hil.clock import Clock
 from hil.errors import SourceError
-from hil.link import Link, pose_from_message
-from hil.mavlink import Parser
-from hil.pose import BODIES, Pose
-from visthrow.errors import ConfigError
+from hil.links.clock import Clock
+from hil.links.mavlink_link import Link, pose_from_message
+from hil.links.pymav import Parser
+from hil.poses.pose import BODIES, Pose
+from visthrow.common.errors import ConfigError
 
 POSE_MESSAGES = ("ATT_POS_MOCAP", "VISION_POSITION_ESTIMATE", "ODOMETRY", "LOCAL_POSITION_NED")
 PAIR_AGE = 0.05

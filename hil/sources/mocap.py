@@ -13,13 +13,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from hil.clock import Clock
-from hil.device import check_device
 from hil.errors import SourceError
-from hil.link import Link
-from hil.pose import BODIES, Pose
+from hil.links.clock import Clock
+from hil.links.device import check_device
+from hil.links.mavlink_link import Link
+from hil.poses.pose import BODIES, Pose
 from hil.sources.logs import load_extra
-from visthrow.errors import ConfigError, suggest
+from visthrow.common.errors import ConfigError, suggest
 
 MOST_WAITING = 2000
 """Poses that are kept between two polls; older ones are dropped."""

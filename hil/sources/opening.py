@@ -3,21 +3,21 @@
 from pathlib import Path
 from typing import Any
 
-from hil.clock import MonotonicClock
-from hil.device import check_device, open_port
 from hil.errors import LinkError, SourceError
-from hil.link import Link, TlogWriter
+from hil.links.clock import MonotonicClock
+from hil.links.device import check_device, open_port
+from hil.links.mavlink_link import Link, TlogWriter
+from hil.links.sync import LinkSync
 from hil.params import LIVE, HilParams
-from hil.plausible import unit_problems
-from hil.pose import VEHICLE, Pose
-from hil.record import TLOG
+from hil.poses.plausible import unit_problems
+from hil.poses.pose import VEHICLE, Pose
+from hil.recording.record import TLOG
 from hil.sources.base import Recorded
 from hil.sources.csv_file import read_csv
 from hil.sources.dataflash import read_bin
 from hil.sources.mavlink import MavlinkSource, read_tlog
 from hil.sources.mocap import open_mocap
 from hil.sources.ulog import read_ulg
-from hil.sync import LinkSync
 
 
 def read_poses(params: HilParams) -> list[Pose]:

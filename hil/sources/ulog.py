@@ -20,11 +20,11 @@ from typing import Any
 import numpy as np
 
 from hil.errors import SourceError
-from hil.frames import rotate
-from hil.pose import Pose, Vector
+from hil.poses.frames import rotate
+from hil.poses.pose import Pose, Vector
 from hil.sources.logs import LogBody, load_extra, parsing, read_logs
 from hil.sources.mavlink import PAIR_AGE
-from visthrow.damaged import Forward
+from visthrow.logs.damaged import Forward
 
 LOCAL, ATTITUDE, RATE = "vehicle_local_position", "vehicle_attitude", "vehicle_angular_velocity"
 TOPICS = (LOCAL, "vehicle_odometry", "vehicle_visual_odometry", "vehicle_mocap_odometry")

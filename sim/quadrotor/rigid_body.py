@@ -8,9 +8,9 @@ from typing import Any
 
 import warp as wp
 
+from sim.arrays.structs import Types
 from sim.params import VehicleParams
 from sim.quadrotor import aero, battery, composer, controller, motor, thrust
-from sim.structs import Types
 
 CONTROLLERS = {"betaflight": controller.rate_controller_betaflight, "geometric": controller.rate_controller_geometric}
 MOTORS = {
@@ -88,7 +88,7 @@ def build_flow(t: Types, vehicle: VehicleParams, extensions: frozenset[str] = fr
     Args:
         t: types of the wanted precision.
         vehicle: its kinds are read here.
-        extensions: names of :data:`sim.structs.EXTENSIONS` to build in.
+        extensions: names of :data:`sim.arrays.structs.EXTENSIONS` to build in.
 
     Returns:
         ``flow(p, air, state, command) -> t.Flow`` (body wrench and the derivatives of all internal states),

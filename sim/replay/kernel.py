@@ -8,18 +8,18 @@ from dataclasses import dataclass
 
 import warp as wp
 
-from sim import state as st
-from sim.coupling import build_coupled_step
-from sim.laws import build_laws
+from sim.arrays import state as st
+from sim.arrays.structs import EXTENSIONS, Types, make_struct
+from sim.effects.laws import build_laws
 from sim.params import LawParams, SensingParams, VehicleParams
 from sim.quadrotor.rigid_body import build_flow
 from sim.quadrotor.thrust import rotor_thrust
-from sim.release import build_letting_go
 from sim.replay.telling import build_telling
 from sim.rope.chain import build_chain
+from sim.rope.coupling import build_coupled_step
 from sim.rope.loose import build_loose_step
 from sim.rope.payload import build_flight, build_payload
-from sim.structs import EXTENSIONS, Types, make_struct
+from sim.rope.release import build_letting_go
 
 EVERYTHING = frozenset(EXTENSIONS)
 """The replay has every extension built in, so that lanes may differ in all of them."""

@@ -9,14 +9,14 @@ from functools import cache
 import numpy as np
 import warp as wp
 
-from sim import runtime  # noqa: F401  starts Warp
-from sim import state as st
-from sim.checks import check_air, check_numerics, check_release
-from sim.cores import cores
-from sim.laws import check_laws, structure
+from sim.arrays import runtime  # noqa: F401  starts Warp
+from sim.arrays import state as st
+from sim.arrays.checks import check_air, check_numerics, check_release
+from sim.arrays.cores import cores
+from sim.arrays.structs import Types, kinds_of, pack, pack_air, pack_rope, pack_vehicle, ropes_on, types
+from sim.effects.laws import check_laws, structure
 from sim.params import GRAVITY, PlantParams, SensingParams
 from sim.replay import kernel as rk
-from sim.structs import Types, kinds_of, pack, pack_air, pack_rope, pack_vehicle, ropes_on, types
 
 
 @dataclass(frozen=True)

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import warp as wp
 
+from sim.arrays.structs import Types, make_struct
 from sim.quadrotor.rigid_body import quat_rate
-from sim.sensing import build_sensing
-from sim.structs import Types, make_struct
+from sim.replay.sensing import build_sensing
 
 
 @dataclass(frozen=True)

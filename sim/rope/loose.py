@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from sim.structs import Types
+from sim.arrays.structs import Types
 
 
 def build_loose_step(t: Types, chain, payload):

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from visthrow import config, kinds
+from visthrow import config
+from visthrow.config import kinds
 
 FILES = sorted(config.configs_root().rglob("*.toml"))
 COMMENTED = ("vehicle", "rope", "camera", "release", "sim", "start", "task")

@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 import torch
 
-from visthrow import actions, config, observations, rewards, terminations
-from visthrow.env import ThrowEnv
+from visthrow import config
+from visthrow.onboard import actions, observations
 from visthrow.task import Experiment
+from visthrow.training import rewards, terminations
+from visthrow.training.env import ThrowEnv
 
 PERIOD = 0.02
 

@@ -8,15 +8,15 @@ import pytest
 import torch
 
 from hil.backends import Status
-from hil.playback import replay
-from hil.pose import PAYLOAD, VEHICLE, Pose
-from hil.record import Recorder, lines, read_poses
-from hil.runner import Runner, Words
+from hil.control.runner import Runner, Words
+from hil.poses.pose import PAYLOAD, VEHICLE, Pose
+from hil.recording.playback import replay
+from hil.recording.record import Recorder, lines, read_poses
 from tests.contract.test_pilot import quiet
 from tests.hil_flight import TICK, Spy, params
 from tests.hil_runs import record_run, saved_policy
-from visthrow.env import ThrowEnv
-from visthrow.policy import Policy, find_policy
+from visthrow.onboard.policy import Policy, find_policy
+from visthrow.training.env import ThrowEnv
 
 CUDA = 1e-5
 """Of an observation on the GPU: another order of additions, other functions of the standard library."""

@@ -10,18 +10,14 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("camera", "sim", "visthrow", "hil")
 
-ONBOARD = ("config", "errors", "observations", "actions", "policy", "pilot", "flightlog", "hover")
-"""Modules of visthrow that fly on board, and those that these are allowed to rest on."""
-ONBOARD_SUPPORT = (
-    "schema", "toml_text", "storage", "logexport", "provenance", "traced", "style",
-    "strip", "rerun_view", "goal_motion", "damaged",
-)  # fmt: skip
+ONBOARD = ("visthrow.config", "visthrow.common", "visthrow.onboard", "visthrow.logs", "visthrow.view")
+"""Rooms of visthrow that fly on board; they rest on each other and on camera alone."""
 
 MAY_USE = {
     "camera": {"camera"},
     "sim": {"sim"},
     "visthrow": {"visthrow", "sim", "camera"},
-    "hil": {"hil", "camera", *(f"visthrow.{name}" for name in ONBOARD + ONBOARD_SUPPORT)},
+    "hil": {"hil", "camera", *ONBOARD},
 }
 NUMPY_WARP_ONLY = {"torch", "cv2", "kornia", "rerun", "rsl_rl", "tensordict", "matplotlib"}
 BLOCKED_ON_BOARD = ("sim", "warp", "rsl_rl", "tensordict", "mujoco")
@@ -60,13 +56,18 @@ def test_packages_import_one_way(package):
     assert not wrong
 
 
+def modules(*rooms: str) -> list[str]:
+    """Return the modules in rooms given by their dotted names."""
+    paths = [path for room in rooms for path in sources(room.replace(".", "/"))]
+    return [".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__") for path in paths]
+
+
 def test_onboard_modules_import_only_onboard_modules():
-    known = {"camera", *(f"visthrow.{name}" for name in ONBOARD + ONBOARD_SUPPORT), "visthrow.__version__"}
+    known = {"camera", *ONBOARD, "visthrow.__version__"}
     wrong = [
-        f"visthrow/{name}.py imports {target}"
-        for name in ONBOARD + ONBOARD_SUPPORT
-        for path in [ROOT / "visthrow" / f"{name}.py"]
-        if path.exists()
+        f"{path.relative_to(ROOT)} imports {target}"
+        for room in ONBOARD
+        for path in sources(room.replace(".", "/"))
         for target in imported(path)
         if target.split(".")[0] in PACKAGES and not allowed(target, known)
     ]
@@ -101,10 +102,7 @@ def test_the_reference_plant_shares_only_the_parameters():
 
 def test_onboard_modules_run_without_simulator_and_trainer():
     """Each onboard module and all of hil import in an interpreter where the heavy packages cannot be imported."""
-    modules = [f"visthrow.{name}" for name in ONBOARD + ONBOARD_SUPPORT if (ROOT / "visthrow" / f"{name}.py").exists()]
-    modules += [
-        ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__") for path in sources("hil")
-    ]
+    names = modules("hil", *ONBOARD)
     code = f"""
 import importlib, sys
 class Blocker:
@@ -112,7 +110,7 @@ class Blocker:
         if name.split(".")[0] in {BLOCKED_ON_BOARD!r}:
             raise ImportError("blocked on board: " + name)
 sys.meta_path.insert(0, Blocker())
-for name in {modules!r}:
+for name in {names!r}:
     importlib.import_module(name)
 try:
     import sim
@@ -122,7 +120,7 @@ except ImportError:
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
     assert result.returncode == 0, result.stderr
     assert result.stdout.split() == ["done"], "the blocker itself must work"
-    assert len(modules) > len(ONBOARD)
+    assert len(names) > len(ONBOARD)
 
 
 def test_importing_visthrow_and_the_command_line_is_cheap():

@@ -9,11 +9,11 @@ import torch
 
 from camera.keypoints import KeypointCamera
 from visthrow import config
-from visthrow.env import ThrowEnv
-from visthrow.errors import MismatchError, PolicyError
-from visthrow.pilot import Pilot, camera_conditions
-from visthrow.policy import Policy
+from visthrow.common.errors import MismatchError, PolicyError
+from visthrow.onboard.pilot import Pilot, camera_conditions
+from visthrow.onboard.policy import Policy
 from visthrow.task import Experiment, contract_of
+from visthrow.training.env import ThrowEnv
 
 STEPS = 200
 SLOWEST_CALL = 4e-3

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import warp as wp
 
+from sim.arrays.state import NONFINITE, OUTPUT_FIELDS, STATE_FIELDS
 from sim.hybrid import HybridSim
 from sim.params import BodyParams
 from sim.standalone import QuadSim
-from sim.state import NONFINITE, OUTPUT_FIELDS, STATE_FIELDS
 from tests.plants import paper_plant
 from tests.simulators import random_commands
 from visthrow import config

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import warp as wp
 
+from sim.arrays.state import OUTPUT_FIELDS, STATE_FIELDS
 from sim.hybrid import HybridSim
 from sim.standalone import QuadSim
-from sim.state import OUTPUT_FIELDS, STATE_FIELDS
 from tests.plants import paper_plant
 from tests.simulators import numerics, random_commands
 from visthrow import config

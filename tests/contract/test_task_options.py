@@ -7,13 +7,14 @@ import pytest
 import torch
 
 from sim.hybrid import rope_variants, tether_lengths
-from visthrow import cli, config, protocol
-from visthrow.env import ThrowEnv
-from visthrow.errors import MismatchError
-from visthrow.loading import load_policy
-from visthrow.plants import ReferenceAdapter
-from visthrow.reference_protocol import Job, fly_batch
+from visthrow import cli, config
+from visthrow.common.errors import MismatchError
 from visthrow.task import Experiment, TargetParams, contract_of
+from visthrow.throws.loading import load_policy
+from visthrow.throws.plants import ReferenceAdapter
+from visthrow.throws.reference_protocol import Job, fly_batch
+from visthrow.training import protocol
+from visthrow.training.env import ThrowEnv
 
 PERIOD = 0.02
 
@@ -140,7 +141,7 @@ def test_the_table_of_a_departing_policy_says_so(tmp_path, capsys):
 
 
 def test_releases_are_those_of_the_throws_and_a_rod_does_not_bow():
-    from visthrow.sweep.release import releases, row
+    from visthrow.evidence.sweep.release import releases, row
 
     loaded = load_policy("state")
     found = releases(loaded, 2.0, 6, "cpu", 0)

@@ -1,4 +1,4 @@
-"""What is tracked holds no path or host of the machine that it was written on, and no file outgrows its room."""
+"""What is tracked holds no path or host of the machine that it was written on."""
 
 import re
 import subprocess
@@ -8,8 +8,6 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 BINARY = {".bbl", ".gz", ".png", ".jpg", ".gif", ".npz", ".rrd", ".parquet", ".onnx", ".ulg", ".pdf"}
-LONGEST = 500
-"""Lines of a Python file."""
 
 MACHINE_PATHS = re.compile(
     r"(?<![\w.:/-])/(?:home|root|Users|workspace|work|opt|mnt|scratch)/\w+"  # absolute folders
@@ -64,15 +62,6 @@ def test_no_machine_paths():
 )  # fmt: skip
 def test_the_pattern_itself(line, caught):
     assert bool(MACHINE_PATHS.search(line)) == caught
-
-
-def test_no_python_file_is_too_long():
-    wrong = {
-        path.relative_to(ROOT).as_posix(): lines
-        for path in FILES
-        if path.suffix == ".py" and (lines := len(path.read_text(encoding="utf-8").splitlines())) > LONGEST
-    }
-    assert not wrong
 
 
 def test_no_test_folder_shadows_a_package():

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from visthrow.flightlog import FlightLog
+from visthrow.logs.flightlog import FlightLog
 
 MIRRORED = {"motor_1": "motor_2", "motor_2": "motor_1", "motor_3": "motor_4", "motor_4": "motor_3"}
 """Effects that a left-right mirror exchanges."""
@@ -86,10 +86,10 @@ class Flipped:
         return (self._sign[window.flight] - 1.0) * base
 
     def windows(self, theta):
-        """See :class:`visthrow.diagnose.model.Model`."""
+        """See :class:`visthrow.diagnose.models.interface.Model`."""
         self._last = self.model.windows(theta)
         return [replace(w, residual=w.residual + self._shift(w, b)) for w, b in zip(self._last, self._base)]
 
     def residuals(self, theta, about=None):
-        """See :class:`visthrow.diagnose.model.Model`."""
+        """See :class:`visthrow.diagnose.models.interface.Model`."""
         return [r + self._shift(w, b) for w, r, b in zip(self._last, self.model.residuals(theta, about), self._base)]

@@ -14,7 +14,7 @@ from tests.diagnose.altered import later, scrambled, with_values
 from tests.diagnose.cases import command_for, environment, logs_of
 from tests.diagnose.sealed import WITHOUT_TESTS
 from tests.worlds.world import Recipe
-from visthrow.flightlog import Channel, FlightLog
+from visthrow.logs.flightlog import Channel, FlightLog
 
 Logs = list[FlightLog]
 HOURS = 2.0

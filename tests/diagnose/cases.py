@@ -25,7 +25,7 @@ import numpy as np
 from tests.diagnose import altered
 from tests.diagnose.sealed import ALIKE, WITHOUT_TESTS, _alone, flight_log, model_of, named_by
 from tests.worlds.world import FLOORS, ONE_SIDED, PLANTS, Recipe, fly_recipe, recorded
-from visthrow.flightlog import FlightLog
+from visthrow.logs.flightlog import FlightLog
 
 SIZE = dict(free=4, free_seconds=6.0, throws=6)
 """Flights of a case: fewer than those of the bank, since each is explained twice."""
@@ -112,7 +112,7 @@ def same(one: dict, other: dict, sizes: Callable[[dict], dict] = lambda theta: t
 def configured(theta: dict[str, float], path: Path) -> str:
     """Write the configuration in which the model has these effects; the path as text."""
     from visthrow import config
-    from visthrow.diagnose import patch
+    from visthrow.diagnose.extend import patch
     from visthrow.task import Experiment
 
     experiment = config.load(Experiment, config.find("train", "state"))
@@ -167,8 +167,9 @@ def scramble(recipe: Recipe, folder: Path) -> dict:
 def flip(recipe: Recipe, _: Path) -> dict:
     """Residuals of every other flight turned around: what is common to all flights is gone."""
     from visthrow import config
-    from visthrow.diagnose import report, search
-    from visthrow.diagnose.throw_model import ThrowModel
+    from visthrow.diagnose.reporting import report
+    from visthrow.diagnose.select import search
+    from visthrow.diagnose.throw.throw_model import ThrowModel
     from visthrow.task import Experiment, plant_of
 
     experiment = config.load(Experiment, config.find("train", "state"), model_of(recipe))

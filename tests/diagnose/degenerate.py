@@ -13,9 +13,9 @@ from tests.diagnose.cases import explained
 from tests.diagnose.sealed import flight_log, named_by
 from tests.worlds.follow import follow, table_of
 from tests.worlds.world import Recipe
-from visthrow.diagnose.manoeuvres import catalogue
-from visthrow.diagnose.measures import MEASUREMENTS
-from visthrow.flightlog import FlightLog
+from visthrow.diagnose.inputs.measures import MEASUREMENTS
+from visthrow.diagnose.planning.manoeuvres import catalogue
+from visthrow.logs.flightlog import FlightLog
 
 ROUNDS = 3
 """Sessions that are followed, one after the other."""

@@ -25,9 +25,9 @@ from pathlib import Path
 import numpy as np
 
 from tests.worlds.world import CAMERA_FLOORS, FLOORS, PLANTS, Recipe, draw, dust_of, fly_recipe, recorded
-from visthrow.diagnose.threads import single
-from visthrow.errors import VisthrowError
-from visthrow.flightlog import Channel, FlightLog
+from visthrow.common.errors import VisthrowError
+from visthrow.diagnose.likelihood.threads import single
+from visthrow.logs.flightlog import Channel, FlightLog
 
 WITHOUT_TESTS = """
 import sys
@@ -151,12 +151,12 @@ def ask(logs: list[Path], model: list[str], folder: Path, device: str = "cpu", t
 def on_held_back(recipe: Recipe, theta: dict[str, float], held: Path) -> dict[str, float]:
     """Nats by which the throws held back are explained worse by the model as it was, and by the verdict's sizes, than by the truth.
 
-    See :func:`visthrow.diagnose.gain.shortfalls`; the truth is the ``oracle``, with 0, and ``samples`` their number. A law outside
-    the catalogue has no size: it is the model as it was then that has 0.
+    See :func:`~visthrow.diagnose.reporting.gain.shortfalls`; the truth is the ``oracle``, with 0, and ``samples`` their number. A law
+    outside the catalogue has no size: it is the model as it was then that has 0.
     """
     from visthrow import config
-    from visthrow.diagnose.gain import shortfalls
-    from visthrow.diagnose.throw_model import ThrowModel
+    from visthrow.diagnose.reporting.gain import shortfalls
+    from visthrow.diagnose.throw.throw_model import ThrowModel
     from visthrow.task import Experiment, plant_of
 
     sizes = {"after": theta, "before": {}}

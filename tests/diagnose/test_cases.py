@@ -12,10 +12,10 @@ from tests.diagnose.bad import BAD
 from tests.diagnose.degenerate import PAIRS
 from tests.worlds.follow import ALONE, follow, table_of
 from tests.worlds.world import Recipe
-from visthrow.diagnose.cutting import ATTACHED, Cut, thinned
-from visthrow.diagnose.manoeuvres import catalogue
-from visthrow.diagnose.recorded import carriers, record_of
-from visthrow.flightlog import FlightLog
+from visthrow.diagnose.planning.manoeuvres import catalogue
+from visthrow.diagnose.throw.cutting import ATTACHED, Cut, thinned
+from visthrow.diagnose.throw.recorded import carriers, record_of
+from visthrow.logs.flightlog import FlightLog
 
 SMALL = dict(free=1, free_seconds=1.0, throws=2)
 
@@ -91,7 +91,8 @@ def test_added_rates_and_thrust_reach_the_commands():
 
 def test_what_the_configuration_knows_of_the_sensors_is_read(monkeypatch):
     """A frame's tilt that was found and applied must not be found again."""
-    from visthrow.diagnose import opening, throw_model
+    from visthrow.diagnose.inputs import opening
+    from visthrow.diagnose.throw import throw_model
 
     monkeypatch.setattr(throw_model, "ThrowModel", lambda logs, plant, **options: options)
     args = argparse.Namespace(plant="state", overrides=["sensing.frame_tilt=[0.01, 0.0, 0.0]"], only=None, device="cpu")

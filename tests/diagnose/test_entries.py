@@ -8,8 +8,9 @@ import pytest
 from tests.diagnose.sealed import flight_log, model_of
 from tests.worlds.world import Recipe, fly_recipe, recorded
 from visthrow import config
-from visthrow.diagnose import gain, search
-from visthrow.diagnose.throw_model import ThrowModel
+from visthrow.diagnose.reporting import gain
+from visthrow.diagnose.select import search
+from visthrow.diagnose.throw.throw_model import ThrowModel
 from visthrow.task import Experiment, plant_of
 
 NEAR = ["rope_length", "payload_drag", "payload_offset", "release_lag", "wind_x", "wind_y", "kick_z"]

@@ -9,9 +9,11 @@ from tests.diagnose import sealed, test_cases
 from tests.unit import test_diagnose_report as reports
 from tests.unit import test_diagnose_search as searches
 from tests.worlds.world import Recipe
-from visthrow.diagnose import designs, evidence, gain, marginal, noise, search
-from visthrow.diagnose.evidence import Priors
-from visthrow.flightlog import FlightLog
+from visthrow.diagnose.likelihood import designs, evidence, marginal, noise
+from visthrow.diagnose.likelihood.evidence import Priors
+from visthrow.diagnose.reporting import gain
+from visthrow.diagnose.select import search
+from visthrow.logs.flightlog import FlightLog
 
 pytestmark = pytest.mark.slow
 

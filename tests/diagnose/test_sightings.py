@@ -15,9 +15,9 @@ from tests.worlds.turns import matrix
 from tests.worlds.world import CAMERA_FLOORS, Recipe, fly_recipe, recorded
 from visthrow import config
 from visthrow.diagnose.catalogue import ALL, Setting
-from visthrow.diagnose.cutting import cut
-from visthrow.diagnose.recorded import record_of
-from visthrow.diagnose.sightings import MEASURED, CameraView, _noise
+from visthrow.diagnose.throw.cutting import cut
+from visthrow.diagnose.throw.recorded import record_of
+from visthrow.diagnose.throw.sightings import MEASURED, CameraView, _noise
 from visthrow.task import Experiment, plant_of
 
 BOX = 0.5

@@ -15,8 +15,9 @@ from tests.diagnose.cases import logs_of
 from tests.diagnose.sealed import LAWS, judge, model_of
 from tests.worlds.world import Recipe, draw
 from visthrow import config
-from visthrow.diagnose import report, search
-from visthrow.diagnose.throw_model import ThrowModel
+from visthrow.diagnose.reporting import report
+from visthrow.diagnose.select import search
+from visthrow.diagnose.throw.throw_model import ThrowModel
 from visthrow.task import Experiment, plant_of
 
 SMALL = dict(free=2, free_seconds=2.0, throws=4)

@@ -6,7 +6,7 @@ import pytest
 from tests.diagnose.sealed import flight_log, model_of
 from tests.worlds.world import Recipe, fly_recipe, recorded
 from visthrow import config
-from visthrow.diagnose.throw_model import ThrowModel
+from visthrow.diagnose.throw.throw_model import ThrowModel
 from visthrow.task import Experiment, plant_of
 
 LEFT = 0.1

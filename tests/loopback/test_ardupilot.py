@@ -8,9 +8,9 @@ import pytest
 from hil.backends import ArduPilot
 from hil.backends.ardupilot import GUIDED, LAND_MODE
 from hil.errors import RunError
-from hil.fake import VEHICLE_ID, FakeAutopilot, MocapParams, Options, load_plant
 from hil.fakes.level import LevelPlant
-from hil.link import Link, attitude_target
+from hil.fakes.process import VEHICLE_ID, FakeAutopilot, MocapParams, Options, load_plant
+from hil.links.mavlink_link import Link, attitude_target
 from hil.params import HilParams
 from tests.hil_flight import simple_policy
 from tests.loopback.wire import pipe, throw
@@ -142,6 +142,6 @@ def test_a_throw_with_a_plain_plant_releases_in_time():
 
 
 def test_plants_that_are_none():
-    for target in ("nowhere:make", "visthrow.wire_plant:none", "visthrow.wire_plant", "", "os:system", "math:pi"):
+    for target in ("nowhere:make", "visthrow.throws.wire_plant:none", "visthrow.throws.wire_plant", "", "os:system", "math:pi"):
         with pytest.raises(RunError, match="expected module:function"):
             load_plant(target, "state", 0)

@@ -12,13 +12,13 @@ import time
 import numpy as np
 import pytest
 
-from hil.decision import Words
+from hil.control.decision import Words
+from hil.control.loop import fly
 from hil.fakes.level import LevelPlant
-from hil.flight import fly
-from hil.record import Recorder
+from hil.recording.record import Recorder
 from tests.hil_flight import simple_policy
 from tests.loopback.wire import peers
-from visthrow.actions import hover_action
+from visthrow.onboard.actions import hover_action
 
 KINDS = ("ardupilot", "px4", "betaflight")
 QUICK = ("states.check_hold=0.2", "states.armed_least=0.1", "states.quiet=0.1", "states.abort=0.5", "states.land=0.5")
@@ -198,7 +198,7 @@ def test_a_policy_at_its_limits_stays_within_them(kind):
 
 @pytest.mark.slow
 def test_the_fence_ends_a_policy_at_its_limits():
-    from visthrow.wire_plant import make
+    from visthrow.throws.wire_plant import make
 
     fake, _, told = run("ardupilot", 4.0, loaded=simple_policy((1.0, 1.0, -1.0, 1.0, -1.0)), plant=make("state", 0),
                         overrides=("states.quiet=0.02",))  # fmt: skip

@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from hil import msp
-from hil.autopilot_check import AutopilotCheck
 from hil.backends.base import FOLLOW, HOLD, LAND, WAIT
-from hil.decision import Words
+from hil.backends.check import AutopilotCheck
+from hil.control.decision import Words
+from hil.control.loop import AutoOperator, fly
 from hil.fakes.level import LevelPlant
 from hil.fakes.px4 import LAND as PX4_LAND
 from hil.fakes.px4 import OFFBOARD, POSCTL, custom
-from hil.flight import AutoOperator, fly
+from hil.links import msp
 from tests.hil_flight import simple_policy
 from tests.loopback.wire import peers, throw
 
@@ -363,7 +363,7 @@ def test_the_hover_share_is_measured_before_a_flight(kind, factor, good):
 @pytest.mark.slow
 def test_a_hover_that_does_not_take_the_weight_arms_no_throw():
     """The vehicle needs a tenth more than its weight by the config: the hover controller finds out, and no throw begins."""
-    from visthrow.wire_plant import make
+    from visthrow.throws.wire_plant import make
 
     summary, fake, told = throw(make("state", 0), loaded=AT_ONCE, seconds=6.0,
                                 overrides=("ardupilot.thrust.hover=0.169", *QUICK[:1], "states.armed=2.5"))  # fmt: skip

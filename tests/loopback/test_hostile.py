@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from hil.backends.base import FAILED
+from hil.control.loop import AutoOperator
 from hil.fakes.level import LevelPlant
-from hil.flight import AutoOperator
-from hil.mavlink import mav
+from hil.links.pymav import mav
 from tests.fuzz import EACH, SEEDS, any_message, mutated, noise
 from tests.hil_flight import simple_policy
 from tests.loopback.wire import peers, throw
-from visthrow.bench.hil_processes import free_port
+from visthrow.evidence.bench.hil_processes import free_port
 
 READY = 8.0
 """Processor time of a run that waits for poses, from its call to its end [s]; its start takes 1.5 s on a free core, 3 s are
@@ -117,7 +117,7 @@ def test_what_the_runner_imports_is_enough_on_board():
         "import sys\n"
         "class Blocker:\n"
         "    def find_spec(self, name, path=None, target=None):\n"
-        "        if name.split('.')[0] in ('sim', 'warp', 'rsl_rl', 'tensordict', 'mujoco', 'visthrow.env'):\n"
+        "        if name.split('.')[0] in ('sim', 'warp', 'rsl_rl', 'tensordict', 'mujoco', 'visthrow.training.env'):\n"
         "            raise ImportError('blocked: ' + name)\n"
         "sys.meta_path.insert(0, Blocker())\n"
         "from visthrow.cli import main\n"

@@ -7,15 +7,15 @@ import math
 
 import pytest
 
-from hil.decision import Words
+from hil.control.decision import Words
+from hil.control.loop import fly
 from hil.errors import RunError
 from hil.fakes.level import LevelPlant
-from hil.flight import fly
-from hil.mocap_faults import FAULTS, MocapFault
-from hil.pose import VEHICLE, Pose
+from hil.fakes.mocap_faults import FAULTS, MocapFault
+from hil.poses.pose import VEHICLE, Pose
 from tests.hil_flight import simple_policy
 from tests.loopback.wire import peers
-from visthrow.actions import hover_action
+from visthrow.onboard.actions import hover_action
 
 HOVER = hover_action(9.81 * 0.272, 14.0)[0]
 NEVER = simple_policy((HOVER, 0.0, 0.0, 0.0, -1.0))

@@ -13,10 +13,10 @@ import time
 import numpy as np
 import pytest
 
-from hil.playback import replay
+from hil.recording.playback import replay
 from tests.hil_flight import simple_policy
 from tests.loopback.wire import CONFIGS
-from visthrow.actions import hover_action
+from visthrow.onboard.actions import hover_action
 
 HOVER = hover_action(9.81 * 0.272, 14.0)[0]
 QUICK = ("states.check_hold=0.2", "states.armed_least=0.1", "states.quiet=0.1", "states.throw=30.0")

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 import torch
 
-from hil.clock import ManualClock
-from hil.device import MutePort
+from hil.control.loop import AutoOperator, fly
+from hil.control.rehearsal import BEGIN, SPARE, Rehearsal
 from hil.fakes.level import LevelPlant
-from hil.flight import AutoOperator, fly
-from hil.link import Link
-from hil.rehearsal import BEGIN, SPARE, Rehearsal
+from hil.links.clock import ManualClock
+from hil.links.device import MutePort
+from hil.links.mavlink_link import Link
 from tests.hil_flight import simple_policy
 from tests.loopback.wire import MemoryPort, peers
-from visthrow.actions import hover_action
-from visthrow.traced import Traced
+from visthrow.onboard.actions import hover_action
+from visthrow.onboard.traced import Traced
 
 QUICK = ("states.check_hold=0.2", "states.armed_least=0.1", "states.quiet=0.1", "states.land=1.0", "goal_w=[0.0, 0.0, 0.0]")
 ACTION = (hover_action(9.81 * 0.272, 14.0)[0], 0.0, 0.0, 0.0, 1.0)
@@ -90,7 +90,7 @@ def flown(kind: str, rehearsed: type[Rehearsal]):
 
 @pytest.mark.parametrize("kind", ["ardupilot", "px4", "betaflight"])
 def test_what_is_sent_is_the_same_to_the_bit_and_the_runner_notices_nothing(kind, monkeypatch):
-    monkeypatch.setattr("hil.rehearsal.MOST", 1)
+    monkeypatch.setattr("hil.control.rehearsal.MOST", 1)
     rehearsal, sent, fake, summary = flown(kind, Watched)
     assert rehearsal.failed is None
     assert rehearsal.count > 60

@@ -12,20 +12,20 @@ import torch
 
 from hil.backends import make_backend, mechanism_lag
 from hil.cli import warm_up
-from hil.clock import MonotonicClock
-from hil.device import check_device, open_port
-from hil.flight import AutoOperator, fly
-from hil.link import Link, TlogWriter
+from hil.control.loop import AutoOperator, fly
+from hil.control.runner import Runner
+from hil.links.clock import MonotonicClock
+from hil.links.device import check_device, open_port
+from hil.links.mavlink_link import Link, TlogWriter
 from hil.params import HilParams
-from hil.playback import replay
-from hil.record import Recorder
-from hil.runner import Runner
+from hil.recording.playback import replay
+from hil.recording.record import Recorder
 from hil.sources import MavlinkSource, read_tlog
 from tests.loopback.wire import throw
 from visthrow import config
-from visthrow.pilot import Pilot
-from visthrow.policy import Policy, find_policy
-from visthrow.wire_plant import make
+from visthrow.onboard.pilot import Pilot
+from visthrow.onboard.policy import Policy, find_policy
+from visthrow.throws.wire_plant import make
 
 LANDING = 0.05
 """Mean landing error over the wire of three throws at 2 m [m], with 1 mm, 0.2 deg, 10 ms and 2 % of loss; 0.10 m is asked for."""

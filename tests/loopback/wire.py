@@ -3,15 +3,15 @@
 from collections import deque
 
 from hil.backends import Betaflight, make_backend, mechanism_lag
-from hil.fake import VEHICLE_ID, MocapParams, Options, make_fake
+from hil.control.loop import AutoOperator, fly
+from hil.control.runner import Runner
 from hil.fakes import Fake
-from hil.flight import AutoOperator, fly
-from hil.link import Link
-from hil.runner import Runner
+from hil.fakes.process import VEHICLE_ID, MocapParams, Options, make_fake
+from hil.links.mavlink_link import Link
+from hil.links.sync import LinkSync
 from hil.sources import MavlinkSource
-from hil.sync import LinkSync
 from visthrow import config
-from visthrow.policy import Policy, find_policy
+from visthrow.onboard.policy import Policy, find_policy
 
 
 class MemoryPort:

@@ -10,9 +10,9 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
+from sim.arrays.state import NONFINITE
 from sim.reference.oracle import OracleRun, converged
 from sim.reference.scene import Scene, load_scene
-from sim.state import NONFINITE
 from tests.plants import SCENES
 from tests.simulators import Flight, fly
 

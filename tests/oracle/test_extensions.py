@@ -7,15 +7,15 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
+from sim.arrays.structs import EXTENSIONS, extensions_of
 from sim.hybrid import HybridSim
 from sim.params import GRAVITY, AirParams
 from sim.reference.extras import ReferenceExtras
 from sim.reference.plant import ReferencePlant
 from sim.standalone import QuadSim
-from sim.structs import EXTENSIONS, extensions_of
 from tests.plants import paper_plant, plain_vehicle
-from visthrow.ballistics import flown
-from visthrow.bench.flops import env_step
+from visthrow.evidence.bench.flops import env_step
+from visthrow.throws.ballistics import flown
 
 EVERYTHING = frozenset(EXTENSIONS)
 """One build for all: what is built in and stands at zero changes nothing."""

@@ -5,10 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from sim.reference.bare import BareScene
 from sim.reference.bench_scenes import implicitfast_scene, rk4_scene
 from sim.reference.oracle import converged, hinges_from_directions, matrix_from_quat
 from sim.reference.scene import load_scene
+from tests.oracle.bare_rope import BareScene
 from tests.plants import SCENES
 
 CONVERGED = 1e-6

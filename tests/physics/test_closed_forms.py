@@ -7,10 +7,10 @@ import pytest
 from scipy.optimize import root
 from scipy.special import ellipk
 
+from sim.arrays.state import NONFINITE
 from sim.hybrid import HybridSim
 from sim.params import GRAVITY, BodyParams, PlantParams, QueueParams
 from sim.standalone import QuadSim
-from sim.state import NONFINITE
 from tests.plants import paper_plant, plain_vehicle
 from tests.simulators import numerics, rods
 

@@ -7,7 +7,7 @@ import pytest
 
 from sim.hybrid import HybridSim
 from visthrow import config
-from visthrow.hover import HoverController, HoverParams
+from visthrow.onboard.hover import HoverController, HoverParams
 from visthrow.task import Experiment, plant_of
 
 GOAL = np.array([0.0, 0.0, 2.0])

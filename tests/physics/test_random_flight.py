@@ -10,14 +10,15 @@ import pytest
 import torch
 import warp as wp
 
+from sim.arrays.state import FALLBACK, NONFINITE
+from sim.arrays.torch_bridge import TorchViews
 from sim.hybrid import HybridSim, tether_lengths
 from sim.params import PlantParams
-from sim.state import FALLBACK, NONFINITE
-from sim.torch_bridge import TorchViews
 from tests.simulators import numerics, random_commands
-from visthrow import config, terminations
-from visthrow import observations as ob
+from visthrow import config
+from visthrow.onboard import observations as ob
 from visthrow.task import Experiment, plant_of
+from visthrow.training import terminations
 
 PERIOD = 0.02
 FAILED = 1e-3

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from sim.params import GRAVITY
-from sim.reference.bare import BareScene
 from sim.reference.oracle import converged
 from sim.reference.plant import ReferencePlant
 from sim.reference.quadrotor import ReferenceQuadrotor
 from sim.reference.scene import Wrench, load_scene
+from tests.oracle.bare_rope import BareScene
 from tests.plants import SCENES, paper_plant, plain_plant
 
 ROUND_OFF = 1e-9

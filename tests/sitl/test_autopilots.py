@@ -17,12 +17,12 @@ import pytest
 from hil.backends import Betaflight, make_backend
 from hil.backends.autopilot import ARMED
 from hil.backends.base import FOLLOW, HOLD
-from hil.device import check_device, open_port
 from hil.errors import LinkError
-from hil.link import Link
-from hil.mavlink import mav
+from hil.links.device import check_device, open_port
+from hil.links.mavlink_link import Link
+from hil.links.pymav import mav
+from hil.links.sync import LinkSync
 from hil.params import HilParams
-from hil.sync import LinkSync
 from visthrow import config
 
 pytestmark = pytest.mark.sitl

@@ -8,10 +8,10 @@ import pytest
 from sim.params import LawParams
 from tests.flown import fly, setting_with
 from visthrow import config
-from visthrow.diagnose.patch import extended
-from visthrow.diagnose.throw_model import ThrowModel
+from visthrow.diagnose.extend.patch import extended
+from visthrow.diagnose.throw.throw_model import ThrowModel
 from visthrow.task import DiagnosedParams, Experiment
-from visthrow.train import Trainer
+from visthrow.training.trainer import Trainer
 
 LAW = LawParams("payload force", (), "vertical_cross_vel", 0.03)
 SMALL = ["ppo.environments=12", "ppo.steps=4", "ppo.hidden=[8]", "ppo.minibatches=2"]

@@ -9,10 +9,10 @@ import time
 import numpy as np
 import pytest
 
-from visthrow import results
-from visthrow.policy import Policy
-from visthrow.sweep.cli import load_list
-from visthrow.sweep.record import collect, status
+from visthrow.evidence.sweep.cli import load_list
+from visthrow.evidence.sweep.record import collect, status
+from visthrow.onboard.policy import Policy
+from visthrow.throws import results
 
 LIST = """
 changes = [
@@ -121,8 +121,8 @@ def test_killed_at_any_moment_it_loses_nothing_and_repeats_nothing(path, tmp_pat
 def test_jobs_through_submitit_in_pieces(path, tmp_path, monkeypatch):
     """The same tasks as jobs of submitit's local executor, in pieces so short that each holds one iteration."""
     pytest.importorskip("submitit")
-    from visthrow.sweep import pool
-    from visthrow.sweep.cluster import Cluster
+    from visthrow.evidence.sweep import pool
+    from visthrow.evidence.sweep.cluster import Cluster
 
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     monkeypatch.setattr(pool, "BUSY_PAUSE", 0.1)

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from visthrow import cli, config, storage
-from visthrow.policy import Policy
+from visthrow import cli, config
+from visthrow.common import storage
+from visthrow.onboard.policy import Policy
 from visthrow.task import Experiment, contract_of
-from visthrow.train import CHECKPOINT, Trainer
+from visthrow.training.trainer import CHECKPOINT, Trainer
 
 SMALL = ["ppo.environments=32", "ppo.steps=8", "ppo.hidden=[16,16]", "ppo.iterations=4", "task.bounds.time_limit=0.4"]
 

@@ -7,11 +7,11 @@ import pytest
 
 from sim.params import LawParams
 from visthrow import cli, config
-from visthrow.diagnose import patch
+from visthrow.common.errors import ConfigError
 from visthrow.diagnose.catalogue import ALL
-from visthrow.errors import ConfigError
-from visthrow.posterior import drawn_plants
+from visthrow.diagnose.extend import patch
 from visthrow.task import DiagnosedParams, Experiment, contract_of, plant_of
+from visthrow.training.posterior import drawn_plants
 
 THETA = {"thrust_gain": 0.03, "mass_quad": 0.006, "rope_length": -0.004, "wind_x": 0.2, "frame_tilt_x": 0.01}
 COVARIANCE = np.diag([0.01, 0.002, 0.0005, 0.02, 0.001]) ** 2

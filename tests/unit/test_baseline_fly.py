@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from visthrow import cli, config, protocol
+from visthrow import cli, config
 from visthrow.baseline import front, report, spline
 from visthrow.baseline import pendulum as pm
 from visthrow.baseline.fly import (
@@ -21,11 +21,12 @@ from visthrow.baseline.fly import (
 from visthrow.baseline.mpc import MPC, MPCParams
 from visthrow.baseline.plan import plan_throw
 from visthrow.baseline.spline import PlanParams
-from visthrow.env import ThrowEnv
-from visthrow.errors import ConfigError
-from visthrow.plants import HybridPlant
-from visthrow.reference_protocol import batch_plant, place_in_hover
+from visthrow.common.errors import ConfigError
 from visthrow.task import Experiment, plant_of
+from visthrow.throws.plants import HybridPlant
+from visthrow.throws.reference_protocol import batch_plant, place_in_hover
+from visthrow.training import protocol
+from visthrow.training.env import ThrowEnv
 
 pytest.importorskip("piqp")
 

@@ -9,8 +9,8 @@ from visthrow.baseline.pendulum import Pendulum
 from visthrow.baseline.plan import plan_throw
 from visthrow.baseline.release import default_release, landing_point, read_release, release_for
 from visthrow.baseline.spline import PlanError, PlanParams
-from visthrow.errors import ConfigError
-from visthrow.flightlog import FlightRecorder
+from visthrow.common.errors import ConfigError
+from visthrow.logs.flightlog import FlightRecorder
 
 MODEL = Pendulum(0.212, 0.060, 0.363)
 

@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 
 from camera import CameraParams
-from sim import state as st
+from sim.arrays import state as st
 from sim.reference.scene import load_scene
-from visthrow import bench, cli, config
-from visthrow.bench import commands, detector, flops, records, sim_cpu, sim_gpu
-from visthrow.bench import mujoco_warp as bench_mujoco_warp
-from visthrow.bench.scenes import HARD_THROW
-from visthrow.errors import StorageError, VisthrowError
+from visthrow import cli, config
+from visthrow.common.errors import StorageError, VisthrowError
+from visthrow.evidence import bench
+from visthrow.evidence.bench import commands, detector, flops, records, sim_cpu, sim_gpu
+from visthrow.evidence.bench import mujoco_warp as bench_mujoco_warp
+from visthrow.evidence.bench.scenes import HARD_THROW
 from visthrow.task import Experiment, plant_of
 
 SCENES = Path(__file__).resolve().parents[1] / "data" / "scenes"
@@ -246,7 +247,7 @@ def test_the_detector_counts_the_same_in_one_process_and_in_two():
 def test_mpc_steps_are_timed_and_recorded(tmp_path, monkeypatch, capsys):
     pytest.importorskip("piqp")
     from visthrow.baseline import spline
-    from visthrow.bench import mpc
+    from visthrow.evidence.bench import mpc
 
     monkeypatch.setattr(spline, "LONGEST", (1.4,))  # one start of the optimisation instead of five
     monkeypatch.setattr(mpc, "TARGETS", (1.5,))

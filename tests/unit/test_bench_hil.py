@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from visthrow.bench import hil, hil_faults, hil_processes, hil_soak, hil_throws
-from visthrow.bench.hil_processes import Pair
 from visthrow.cli import main
-from visthrow.errors import VisthrowError
-from visthrow.policy import Policy, find_policy
+from visthrow.common.errors import VisthrowError
+from visthrow.evidence.bench import hil, hil_faults, hil_processes, hil_soak, hil_throws
+from visthrow.evidence.bench.hil_processes import Pair
+from visthrow.onboard.policy import Policy, find_policy
 
 SOAK_MINUTES = 1.0
 MOST_GROWTH = 100e3

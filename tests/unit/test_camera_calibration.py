@@ -9,11 +9,11 @@ import pytest
 import torch
 
 from camera import Fisheye, FisheyeParams
-from camera import calibration as files
-from camera.boards import BoardParams, calibrate_from_boards
-from camera.foreign import fit_fisheye
+from camera.calibrate import files as files
+from camera.calibrate.boards import BoardParams, calibrate_from_boards
+from camera.calibrate.foreign import fit_fisheye
+from camera.imaging.render import render_board
 from camera.mount import rotation_from_vector
-from camera.render import render_board
 
 DATA = Path(__file__).parents[1] / "data" / "basalt_calib"
 LENS = FisheyeParams(640, 480, 160.1, 150.2, 310.3, 245.4, 0.02, -0.01, 0.002, -0.0002, 200.0)

@@ -8,12 +8,12 @@ import pytest
 import torch
 
 from camera import CameraParams, FisheyeParams, KeypointCamera, KeypointNoiseParams, MountParams, keypoints
-from camera.detect import BallSeen, Detector, GoalSeen, Known, Seen, detected_keypoints, ordered_corners
-from camera.detect_edges import cone_fit
+from camera.detectors.contours import BallSeen, Detector, GoalSeen, Known, Seen, detected_keypoints, ordered_corners
+from camera.detectors.edges import cone_fit
+from camera.imaging.nuisance import NuisanceParams, degrade
+from camera.imaging.render import Clutter, render_scene
 from camera.keypoints import goal_square
 from camera.mount import rotation_from_vector
-from camera.nuisance import NuisanceParams, degrade
-from camera.render import Clutter, render_scene
 
 LENS = FisheyeParams(400, 400, 104.2, 104.2, 199.5, 199.5)
 CAMERA = KeypointCamera(

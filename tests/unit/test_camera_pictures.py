@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from camera import CameraParams, FisheyeParams, KeypointCamera, KeypointNoiseParams, MountParams, keypoints
-from camera.images import AugmentParams, ViewParams, augment, rectify, rotate_frames, view_map
+from camera.imaging.overlay import draw_overlay
+from camera.imaging.rectify import AugmentParams, ViewParams, augment, rectify, rotate_frames, view_map
+from camera.imaging.render import pixel_rays, render_scene
 from camera.mount import rotation_from_vector
-from camera.overlay import draw_overlay
-from camera.render import pixel_rays, render_scene
 
 LENS = FisheyeParams(320, 320, 83.3, 83.3, 159.5, 159.5)
 CAMERA = KeypointCamera(

@@ -7,8 +7,10 @@ import types
 
 import pytest
 
-from visthrow import cli, device, kinds
-from visthrow.errors import ConfigError, DeviceError, VisthrowError, suggest
+from visthrow import cli
+from visthrow.common.errors import ConfigError, DeviceError, VisthrowError, suggest
+from visthrow.config import kinds
+from visthrow.training import device
 
 HELP_BUDGET = 0.5
 """[s], bar of the project for ``visthrow --help``, interpreter start included; the best of a few runs counts."""

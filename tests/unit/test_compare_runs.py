@@ -5,13 +5,13 @@ import json
 import numpy as np
 import pytest
 
-from hil.report import finish
+from hil.recording.report import finish
 from tests.hil_runs import record_run, saved_policy
-from visthrow import from_runs
 from visthrow.cli import main
-from visthrow.errors import LogError
-from visthrow.flightlog import FlightLog, FlightRecorder
-from visthrow.protocol import Throws
+from visthrow.common.errors import LogError
+from visthrow.logs.flightlog import FlightLog, FlightRecorder
+from visthrow.throws import from_runs
+from visthrow.training.protocol import Throws
 
 
 def log(policy="vision", goal=(2.0, 0.0, 0.0), landed=(2.1, 0.05, 0.04), sha="a", home=(0.0, 0.0, 1.333)) -> FlightLog:

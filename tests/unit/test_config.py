@@ -6,8 +6,9 @@ from typing import Literal
 
 import pytest
 
-from visthrow import config, toml_text
-from visthrow.errors import ConfigError
+from visthrow import config
+from visthrow.common import toml_text
+from visthrow.common.errors import ConfigError
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import binom
 
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
-from visthrow.diagnose import result, search
+from visthrow.diagnose.select import result, search
 
 pytestmark = pytest.mark.slow
 

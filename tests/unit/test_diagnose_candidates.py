@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
-from visthrow.diagnose import candidates, result, search, unknown
-from visthrow.diagnose.point import fitted, linearise
+from visthrow.diagnose.select import candidates, result, search, unknown
+from visthrow.diagnose.select.point import fitted, linearise
 
 EFFECTS = catalogue(12)
 NAME, SIZE = "effect_03", 10.0  # in floors

@@ -10,7 +10,7 @@ from visthrow import cli
 from visthrow.diagnose.check.relations import relate
 from visthrow.diagnose.check.run import check, table
 from visthrow.diagnose.check.signals import noise
-from visthrow.flightlog import Channel, FlightLog
+from visthrow.logs.flightlog import Channel, FlightLog
 
 G = 9.81
 DELAY = 0.04

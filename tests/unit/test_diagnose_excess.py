@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from visthrow.diagnose import excess
+from visthrow.diagnose.select import excess
 
 
 class Phase:

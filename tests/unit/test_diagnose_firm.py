@@ -2,7 +2,7 @@
 
 from types import SimpleNamespace
 
-from visthrow.diagnose.report import instead, not_firm
+from visthrow.diagnose.reporting.report import instead, not_firm
 
 
 def diagnosis(**partners):

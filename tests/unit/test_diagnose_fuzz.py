@@ -16,12 +16,12 @@ import pytest
 
 from tests import logfiles
 from visthrow import cli
-from visthrow.diagnose import setup as setups
+from visthrow.common.errors import LogError, VisthrowError
 from visthrow.diagnose.check.run import check, table
-from visthrow.diagnose.ingest import read
-from visthrow.errors import LogError, VisthrowError
-from visthrow.flightlog import Channel, FlightLog
-from visthrow.logexport import export
+from visthrow.diagnose.inputs import setup as setups
+from visthrow.logs import read
+from visthrow.logs.export import export
+from visthrow.logs.flightlog import Channel, FlightLog
 
 REAL = Path(__file__).resolve().parents[1] / "data" / "real"
 PATIENCE = 20.0

@@ -13,12 +13,12 @@ from scipy.spatial.transform import Rotation
 
 from tests import logfiles
 from visthrow import config
-from visthrow.diagnose import setup as setups
-from visthrow.diagnose.ingest import blackbox, blackbox_codec, read
-from visthrow.diagnose.ingest.mapping import ChannelMap, Split, TableMap, TimeColumn, signed_axes
-from visthrow.errors import ConfigError, LogError
-from visthrow.flightlog import Channel, FlightLog
-from visthrow.logexport import export
+from visthrow.common.errors import ConfigError, LogError
+from visthrow.diagnose.inputs import setup as setups
+from visthrow.logs import blackbox, blackbox_codec, read
+from visthrow.logs.export import export
+from visthrow.logs.flightlog import Channel, FlightLog
+from visthrow.logs.mapping import ChannelMap, Split, TableMap, TimeColumn, signed_axes
 
 REAL = Path(__file__).resolve().parents[1] / "data" / "real"
 BBL = REAL / "betaflight_bbl" / "btfl_001_start.bbl"

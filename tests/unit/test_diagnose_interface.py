@@ -6,8 +6,8 @@ from scipy.spatial.transform import Rotation
 
 from sim.params import GRAVITY
 from tests.plants import paper_plant
-from visthrow.diagnose.interface import put_right
-from visthrow.flightlog import Channel, FlightLog
+from visthrow.diagnose.throw.interface import put_right
+from visthrow.logs.flightlog import Channel, FlightLog
 
 PLANT = paper_plant()
 WEIGHT = GRAVITY * (PLANT.vehicle.body.mass + PLANT.rope.payload_mass + PLANT.rope.rope_mass)

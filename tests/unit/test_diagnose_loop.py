@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from visthrow import config
-from visthrow.diagnose import ablations, hall, loop, recorded
-from visthrow.errors import DiagnoseError
-from visthrow.flightlog import Channel, FlightLog
-from visthrow.loading import load_policy
+from visthrow.common.errors import DiagnoseError
+from visthrow.diagnose.proof import ablations, hall, loop
+from visthrow.diagnose.throw import recorded
+from visthrow.logs.flightlog import Channel, FlightLog
 from visthrow.task import Experiment
+from visthrow.throws.loading import load_policy
 
 
 def throws(error: float, failed: int = 0) -> dict:
@@ -88,8 +89,8 @@ def test_throws_are_kept_and_not_flown_twice(tmp_path, monkeypatch):
             fields = {"success": np.array([True, False]), "error": error, "duration": error}
             return [[SimpleNamespace(**fields)]]
 
-    monkeypatch.setattr("visthrow.reference_protocol.Throwing", Flown)
-    monkeypatch.setattr("visthrow.loading.load_policy", lambda *_, **__: None)
+    monkeypatch.setattr("visthrow.throws.reference_protocol.Throwing", Flown)
+    monkeypatch.setattr("visthrow.throws.loading.load_policy", lambda *_, **__: None)
     one = loop.Loop({}, tmp_path, throws=2)
     found = [one._throws("before", "state", lambda line: None) for _ in range(2)]
     assert flown == [((2.0,), 2, loop.PLANT, loop.BATCH)]

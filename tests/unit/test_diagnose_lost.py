@@ -8,13 +8,13 @@ import pytest
 from tests.flown import fly, setting_with
 from tests.plants import paper_plant
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
-from visthrow.diagnose import result, search
-from visthrow.diagnose.candidates import candidate
-from visthrow.diagnose.cutting import RINGING
-from visthrow.diagnose.evidence import Priors
-from visthrow.diagnose.point import Problem, linearise, lost, only
-from visthrow.diagnose.states import HUNG
-from visthrow.diagnose.throw_model import ThrowModel
+from visthrow.diagnose.likelihood.evidence import Priors
+from visthrow.diagnose.select import result, search
+from visthrow.diagnose.select.candidates import candidate
+from visthrow.diagnose.select.point import Problem, linearise, lost, only
+from visthrow.diagnose.throw.cutting import RINGING
+from visthrow.diagnose.throw.states import HUNG
+from visthrow.diagnose.throw.throw_model import ThrowModel
 
 EFFECTS = catalogue(12)
 BAD = 10

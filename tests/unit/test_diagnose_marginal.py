@@ -7,13 +7,13 @@ import pytest
 
 from tests import synthetic_diagnosis
 from tests.synthetic_diagnosis import GUST, SyntheticModel, catalogue
-from visthrow.diagnose import designs, marginal, noise
-from visthrow.diagnose import stack as stacks
-from visthrow.diagnose.evidence import Priors
-from visthrow.diagnose.model import Window
-from visthrow.diagnose.point import Problem, linearise, only
-from visthrow.diagnose.stack import BATCH, Stack
-from visthrow.errors import DiagnoseError
+from visthrow.common.errors import DiagnoseError
+from visthrow.diagnose.likelihood import designs, marginal, noise
+from visthrow.diagnose.likelihood import stack as stacks
+from visthrow.diagnose.likelihood.evidence import Priors
+from visthrow.diagnose.likelihood.stack import BATCH, Stack
+from visthrow.diagnose.models.interface import Window
+from visthrow.diagnose.select.point import Problem, linearise, only
 
 EFFECTS = catalogue(6)
 

@@ -8,17 +8,17 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from visthrow import cli, config
-from visthrow.diagnose import fit as fitting
-from visthrow.diagnose import setup as setups
+from visthrow.common.errors import ConfigError, DiagnoseError, LogError
+from visthrow.diagnose.inputs import fit as fitting
+from visthrow.diagnose.inputs import setup as setups
 from visthrow.diagnose.models.ball import BallModel, BallParams
 from visthrow.diagnose.models.flyer import CableParams, FlyerModel, FlyerParams, TorqueParams
 from visthrow.diagnose.models.gimbal import GimbalModel, GimbalParams
 from visthrow.diagnose.models.pendulum import PendulumModel, PendulumParams
 from visthrow.diagnose.models.stand import StandModel, StandParams
 from visthrow.diagnose.models.trim import TrimModel, TrimParams
-from visthrow.errors import ConfigError, DiagnoseError, LogError
-from visthrow.flightlog import Channel, FlightLog
-from visthrow.logexport import export
+from visthrow.logs.export import export
+from visthrow.logs.flightlog import Channel, FlightLog
 
 G = 9.81
 TIGHT = {"rtol": 1e-10, "atol": 1e-12}

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
-from visthrow.diagnose import plan, search
+from visthrow.diagnose.planning import plan
+from visthrow.diagnose.select import search
 
 
 @pytest.fixture(scope="module")

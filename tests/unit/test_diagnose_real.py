@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from visthrow import cli
-from visthrow.diagnose import setup as setups
 from visthrow.diagnose.check.run import check, contradictions
-from visthrow.diagnose.ingest import read_all
-from visthrow.diagnose.result import CLASS, FOUND, KNOWN, NO_EFFECT
-from visthrow.diagnose.search import explain
+from visthrow.diagnose.inputs import setup as setups
+from visthrow.diagnose.select.result import CLASS, FOUND, KNOWN, NO_EFFECT
+from visthrow.diagnose.select.search import explain
+from visthrow.logs import read_all
 
 DATA = Path(__file__).resolve().parents[1] / "data"
 REAL = DATA / "real"

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from visthrow.diagnose import setup as setups
-from visthrow.diagnose.ingest import table
-from visthrow.errors import LogError
+from visthrow.common.errors import LogError
+from visthrow.diagnose.inputs import setup as setups
+from visthrow.logs import table
 
 DATA = Path(__file__).resolve().parents[1] / "data"
 SWING = ("pendulum_encoder", "real/pendulum_single/single_pendulum_id.csv.gz")

@@ -8,25 +8,14 @@ import numpy as np
 import pytest
 
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
-from visthrow.diagnose import (
-    blackbox,
-    blind,
-    fly_manoeuvres,
-    forms,
-    gain,
-    manoeuvres,
-    measures,
-    pictures,
-    plan,
-    point,
-    report,
-    result,
-    search,
-)
-from visthrow.diagnose.landing import Landings
-from visthrow.errors import DiagnoseError
-from visthrow.flightlog import Channel, FlightLog
-from visthrow.storage import write_json
+from visthrow.common.errors import DiagnoseError
+from visthrow.common.storage import write_json
+from visthrow.diagnose.inputs import measures
+from visthrow.diagnose.planning import fly_manoeuvres, manoeuvres, plan
+from visthrow.diagnose.reporting import blackbox, blind, forms, gain, pictures, report
+from visthrow.diagnose.select import point, result, search
+from visthrow.diagnose.throw.landing import Landings
+from visthrow.logs.flightlog import Channel, FlightLog
 
 EFFECTS = catalogue(12)
 TRUTH = {"effect_03": 12.0, "effect_04": -9.0}
@@ -40,7 +29,7 @@ class Throwing(SyntheticModel):
     """Also predicts where throws land: off by what the effects' sizes miss of the truth, and by 2 mm at random."""
 
     def landings(self, theta, flights=None):
-        """See :meth:`visthrow.diagnose.throw_model.ThrowModel.landings`."""
+        """See :meth:`visthrow.diagnose.throw.throw_model.ThrowModel.landings`."""
         numbers = np.array(sorted({w.flight for w in self._windows}) if flights is None else list(flights))
         floors = {e.name: e.floor for e in self.effects}
         missing = np.array([ARMS[n] * (size * floors[n] - theta.get(n, 0.0)) for n, size in self.truth.items()])
@@ -464,7 +453,7 @@ def test_the_report_of_nothing_is_whole_too(tmp_path):
 
 
 def test_the_recording_is_written(tmp_path, found):
-    from visthrow.diagnose import recording
+    from visthrow.diagnose.reporting import recording
 
     recording.write(tmp_path / "d.rrd", found[1], [])
     assert (tmp_path / "d.rrd").stat().st_size > 10_000
@@ -484,8 +473,8 @@ def test_mistakes_on_the_command_line_are_told(capsys, tmp_path, monkeypatch, ar
 
 
 def test_flights_are_numbers():
-    from visthrow.diagnose.opening import numbers
-    from visthrow.errors import DiagnoseError
+    from visthrow.common.errors import DiagnoseError
+    from visthrow.diagnose.inputs.opening import numbers
 
     assert numbers("0, 3") == (0, 3)
     assert numbers("") == ()

@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from visthrow.diagnose.evidence import Priors
-from visthrow.diagnose.rivals import rivals
+from visthrow.diagnose.likelihood.evidence import Priors
+from visthrow.diagnose.select.rivals import rivals
 
 COUNT = 4
 WIDE = Priors(np.ones(COUNT), np.full(COUNT, 20.0), np.full(COUNT, -np.inf), np.full(COUNT, np.inf), np.ones(COUNT, dtype=bool))

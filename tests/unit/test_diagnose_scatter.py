@@ -2,12 +2,12 @@
 
 import numpy as np
 
-from visthrow.diagnose import patch
 from visthrow.diagnose.catalogue import ALL
 from visthrow.diagnose.catalogue.scatter import VARYING
-from visthrow.diagnose.evidence import Priors
-from visthrow.diagnose.marginal import Statistics
-from visthrow.diagnose.scatter import varying
+from visthrow.diagnose.extend import patch
+from visthrow.diagnose.likelihood.evidence import Priors
+from visthrow.diagnose.likelihood.marginal import Statistics
+from visthrow.diagnose.select.scatter import varying
 
 NAMES = ("release_lag", "payload_drag", "wind_x", "wind_y", "wind_z")
 EFFECTS = tuple(ALL[name].effect for name in NAMES)

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 
 from tests.unit.test_diagnose_scatter import LEAST, NAMES, PRIORS
-from visthrow.diagnose.marginal import Statistics
-from visthrow.diagnose.scatter import varying
+from visthrow.diagnose.likelihood.marginal import Statistics
+from visthrow.diagnose.select.scatter import varying
 
 BENT = 0.1
 """A release early by a floor tells so much more of itself than its derivative says, and twice as much by two."""

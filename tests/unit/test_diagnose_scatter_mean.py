@@ -7,8 +7,8 @@ import pytest
 
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
 from tests.unit.test_diagnose_scatter import LEAST, NAMES, PRIORS, flights
-from visthrow.diagnose import result, search
-from visthrow.diagnose.scatter import freed, varying
+from visthrow.diagnose.select import result, search
+from visthrow.diagnose.select.scatter import freed, varying
 
 EFFECTS = tuple(replace(e, name="cmd_delay") if i == 4 else e for i, e in enumerate(catalogue(12)))
 FLOOR = EFFECTS[4].floor

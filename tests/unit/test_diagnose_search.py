@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
-from visthrow.diagnose import evidence, result, search
-from visthrow.diagnose.consistency import differ
-from visthrow.diagnose.evidence import Priors
-from visthrow.errors import DiagnoseError
+from visthrow.common.errors import DiagnoseError
+from visthrow.diagnose.likelihood import evidence
+from visthrow.diagnose.likelihood.evidence import Priors
+from visthrow.diagnose.select import result, search
+from visthrow.diagnose.select.consistency import differ
 
 EFFECTS = catalogue(12)
 
@@ -309,7 +310,7 @@ def _priors(count: int) -> Priors:
 
 
 def _threshold(count: int) -> float:
-    from visthrow.diagnose.marginal import Statistics
+    from visthrow.diagnose.likelihood.marginal import Statistics
 
     information = _information(count)[None]
     one = np.zeros((1, count))

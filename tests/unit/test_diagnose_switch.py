@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
-from visthrow.diagnose import search
 from visthrow.diagnose.catalogue import ALL
-from visthrow.diagnose.evidence import Priors
-from visthrow.diagnose.point import Problem, fitted, linearise
+from visthrow.diagnose.likelihood.evidence import Priors
+from visthrow.diagnose.select import search
+from visthrow.diagnose.select.point import Problem, fitted, linearise
 
 EFFECTS = tuple(replace(e, switch=i == 3) for i, e in enumerate(catalogue(6)))
 

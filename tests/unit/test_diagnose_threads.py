@@ -2,7 +2,7 @@
 
 import threading
 
-from visthrow.diagnose import threads
+from visthrow.diagnose.likelihood import threads
 
 
 def test_fewer_threads_work_beside_a_gpu(monkeypatch):

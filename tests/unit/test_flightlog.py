@@ -6,9 +6,9 @@ import json
 import numpy as np
 import pytest
 
-from visthrow.errors import LogError
-from visthrow.flightlog import STANDARD_CHANNELS, Channel, FlightLog, FlightRecorder
-from visthrow.logexport import columns, export
+from visthrow.common.errors import LogError
+from visthrow.logs.export import columns, export
+from visthrow.logs.flightlog import STANDARD_CHANNELS, Channel, FlightLog, FlightRecorder
 
 
 @pytest.fixture
@@ -144,7 +144,7 @@ def test_csv_and_parquet_hold_the_same_table(log, tmp_path):
 
 
 def test_standard_channels_are_in_known_frames():
-    from visthrow.flightlog import FRAMES
+    from visthrow.logs.flightlog import FRAMES
 
     assert {spec.frame for spec in STANDARD_CHANNELS.values()} <= set(FRAMES)
     for name, spec in STANDARD_CHANNELS.items():

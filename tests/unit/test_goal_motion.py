@@ -8,8 +8,9 @@ import pytest
 import torch
 
 from camera.keypoints import KeypointCamera
-from visthrow import config, goal_motion
-from visthrow import observations as ob
+from visthrow import config
+from visthrow.onboard import goal_motion
+from visthrow.onboard import observations as ob
 from visthrow.task import Experiment
 
 PERIOD = 0.02

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from hil.aim import Aim, AimParams
+from hil.control.aim import Aim, AimParams
+from hil.control.runner import Runner
 from hil.errors import ConfigError
 from hil.params import HilParams
-from hil.runner import Runner
-from hil.track import BodyState
+from hil.poses.track import BodyState
 from tests.hil_flight import Spy, fly, params, simple_policy
 from visthrow import config
-from visthrow.actions import hover_action
+from visthrow.onboard.actions import hover_action
 
 ROPE = {"payload_mass": 0.058}
 AHEAD, HEIGHT = 0.12, 0.04

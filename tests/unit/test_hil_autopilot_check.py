@@ -4,13 +4,13 @@ import json
 
 import pytest
 
-from hil.autopilot_check import hover_of_run, told
 from hil.backends import DryRun
-from hil.decision import Words
+from hil.backends.check import hover_of_run, told
+from hil.control.decision import Words
+from hil.control.loop import fly
 from hil.errors import RunError
 from hil.fakes.level import LevelPlant
-from hil.flight import fly
-from hil.record import CONFIG, TICKS, Recorder
+from hil.recording.record import CONFIG, TICKS, Recorder
 from tests.hil_flight import simple_policy
 from tests.loopback.wire import peers
 

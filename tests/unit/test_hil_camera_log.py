@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hil import camera_log as log
-from hil.camera_log import CameraLog, CameraLogParams, Mounting
+from hil.recording import camera_log as log
+from hil.recording.camera_log import CameraLog, CameraLogParams, Mounting
 from hil.sources import Column
 from visthrow.cli import main
-from visthrow.errors import ConfigError
+from visthrow.common.errors import ConfigError
 
 DATA = Path(__file__).parents[1] / "data" / "slungload_camera"
 PARAMS = CameraLogParams(

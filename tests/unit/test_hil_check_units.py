@@ -1,6 +1,6 @@
 """`hil check` on live poses: a wrong unit shows as a failed check."""
 
-from hil.pose import Pose
+from hil.poses.pose import Pose
 from hil.sources import Recorded, opening
 from tests.hil_flight import OURS
 from visthrow.cli import main

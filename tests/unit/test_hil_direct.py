@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from hil.direct import Direct, scored
+from hil.fakes.direct import Direct, scored
 from hil.fakes.level import LevelPlant
-from hil.mocap import Mocap, MocapParams
+from hil.fakes.mocap import Mocap, MocapParams
 from hil.params import HilParams
 from tests.hil_flight import simple_policy
 from visthrow import config
-from visthrow.actions import hover_action
+from visthrow.onboard.actions import hover_action
 
 HOVER = hover_action(9.81 * 0.272, 14.0)[0]
 

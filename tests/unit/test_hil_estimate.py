@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hil.estimate import EstimateParams, SlopeFilter, slope_weights
-from hil.frames import FrameParams
-from hil.gate import GateParams
-from hil.pose import Pose
-from hil.track import TRUST, Track
+from hil.poses.estimate import EstimateParams, SlopeFilter, slope_weights
+from hil.poses.frames import FrameParams
+from hil.poses.gate import GateParams
+from hil.poses.pose import Pose
+from hil.poses.track import TRUST, Track
 
 PERIOD = 0.01
 ROUNDING = 1e-9

@@ -6,15 +6,15 @@ import socket
 import numpy as np
 import pytest
 
-from hil.device import check_device, open_port
 from hil.errors import LinkError, RunError
-from hil.fake import ListeningPort, make_fake, read_options
 from hil.fakes.level import LevelPlant
+from hil.fakes.process import ListeningPort, make_fake, read_options
 from hil.fakes.witness import Witness
-from hil.link import Link, attitude_target
-from hil.mavlink import mav
+from hil.links.device import check_device, open_port
+from hil.links.mavlink_link import Link, attitude_target
+from hil.links.pymav import mav
 from tests.loopback.wire import pipe
-from visthrow.errors import ConfigError
+from visthrow.common.errors import ConfigError
 
 LIMITS = (14.0, 10.0, 10.0, 4.0)
 INSIDE = np.array([0.0, 0.0, 1.0])

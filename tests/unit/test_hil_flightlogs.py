@@ -10,15 +10,15 @@ import cv2
 import numpy as np
 import pytest
 
-from hil import flightlogs, view
+from hil.control.landing import Flight, separation
 from hil.errors import RunError
-from hil.landing import Flight, separation
-from hil.record import load_run
-from hil.report import finish, throw_logs
+from hil.recording import flightlogs, view
+from hil.recording.record import load_run
+from hil.recording.report import finish, throw_logs
 from tests.hil_flight import TICK
 from tests.hil_runs import record_run, saved_policy
-from visthrow.flightlog import FlightLog
-from visthrow.logexport import columns
+from visthrow.logs.export import columns
+from visthrow.logs.flightlog import FlightLog
 
 LAG = 0.11
 CLOCK = 3e-3

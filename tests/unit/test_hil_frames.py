@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hil.errors import FrameError
-from hil.frames import FrameParams, Frames, proper_axes, rotation_of
-from hil.pose import Pose
+from hil.poses.frames import FrameParams, Frames, proper_axes, rotation_of
+from hil.poses.pose import Pose
 
 AXES = proper_axes()
 EXACT = 1e-14

@@ -5,12 +5,12 @@ import math
 import numpy as np
 import pytest
 
-from hil.clock import ManualClock, MonotonicClock, Ticker
-from hil.estimate import EstimateParams
-from hil.frames import FrameParams
-from hil.gate import ABORT, HOLD, OK, WARN, Gate, GateParams, Tether
-from hil.pose import Pose
-from hil.track import Track
+from hil.links.clock import ManualClock, MonotonicClock, Ticker
+from hil.poses.estimate import EstimateParams
+from hil.poses.frames import FrameParams
+from hil.poses.gate import ABORT, HOLD, OK, WARN, Gate, GateParams, Tether
+from hil.poses.pose import Pose
+from hil.poses.track import Track
 
 PARAMS = GateParams(0.02, 0.12, 8.0, 0.3, 15.0, 0.5, 0.04, 0.1, 0.25)
 LEVEL = (0.0, 0.0, 0.0, 1.0)

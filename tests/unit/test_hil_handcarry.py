@@ -5,11 +5,11 @@ import math
 import numpy as np
 import pytest
 
-from hil.clock import ManualClock
 from hil.errors import RunError
-from hil.frames import FrameParams, Frames, multiply, proper_axes
-from hil.handcarry import MOVES, Step, collect, find_steps, judge, story
-from hil.pose import Pose
+from hil.links.clock import ManualClock
+from hil.poses.frames import FrameParams, Frames, multiply, proper_axes
+from hil.poses.handcarry import MOVES, Step, collect, find_steps, judge, story
+from hil.poses.pose import Pose
 from hil.sources import Recorded
 from visthrow.cli import main
 

@@ -11,16 +11,16 @@ import pytest
 import torch
 
 from camera import Fisheye, FisheyeParams, KeypointCamera, keypoints
+from camera.imaging.render import render_scene
 from camera.mount import rotation_from_vector
-from camera.render import render_scene
 from hil.errors import SourceError
-from hil.images import STAMPS, Hint, ImageParams, LiveImages, Looker, RecordedImages
 from hil.params import HilParams
-from hil.record import lines
-from hil.sight import Sight, Sights
+from hil.poses.sight import Sight, Sights
+from hil.recording.record import lines
+from hil.sources.images import STAMPS, Hint, ImageParams, LiveImages, Looker, RecordedImages
 from visthrow import config
 from visthrow.cli import main
-from visthrow.errors import ConfigError
+from visthrow.common.errors import ConfigError
 
 SMALL = FisheyeParams(280, 280, 72.9, 72.9, 139.5, 139.5)
 """The lens of the pictures: the field of view of training's, a fifth of its pixels."""

@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from hil.latency import STAGES, Stage, Stages, draw, table
-from hil.pose import PAYLOAD, VEHICLE, Pose
+from hil.poses.pose import PAYLOAD, VEHICLE, Pose
+from hil.recording.latency import STAGES, Stage, Stages, draw, table
 
 BIN = 0.011
 """Relative width of a bin and a little: what a percentile may be off."""

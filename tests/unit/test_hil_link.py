@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hil.device import check_device, open_port
 from hil.errors import LinkError
-from hil.link import Link, TlogWriter, attitude_target, pose_from_message, quaternion_from_euler
-from hil.mavlink import Parser, mav
+from hil.links.device import check_device, open_port
+from hil.links.mavlink_link import Link, TlogWriter, attitude_target, pose_from_message, quaternion_from_euler
+from hil.links.pymav import Parser, mav
 from tests.fuzz import EACH, SEEDS, any_message, mutated, noise
-from visthrow.bench.hil_processes import free_port
+from visthrow.evidence.bench.hil_processes import free_port
 
 FLOAT32 = 2e-7
 """What a quantity near 1 loses on the wire."""

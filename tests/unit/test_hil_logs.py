@@ -9,13 +9,13 @@ import pytest
 
 from hil.errors import SourceError
 from hil.params import HilParams
-from hil.record import lines
+from hil.recording.record import lines
 from hil.sources import LogBody, read_bin, read_ulg
 from tests import logfiles as files
 from tests.unit.test_diagnose_fuzz import damaged, dataflash, patience, ulog
 from visthrow import config
 from visthrow.cli import main
-from visthrow.errors import ConfigError
+from visthrow.common.errors import ConfigError
 
 VEHICLE = (LogBody("vehicle", "VISP"),)
 QUARTER = math.sqrt(0.5)

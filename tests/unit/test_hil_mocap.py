@@ -13,7 +13,7 @@ from hil.params import HilParams
 from hil.sources import MocapParams, RigidBody, open_mocap
 from hil.sources.mocap import MotionCaptureSource, NatNetSource
 from visthrow import config
-from visthrow.errors import ConfigError
+from visthrow.common.errors import ConfigError
 
 BODIES = (RigidBody("vehicle", "quad"), RigidBody("payload", "ball"))
 PARAMS = MocapParams("vicon", "127.0.0.1", timeout=1.0)

@@ -8,13 +8,13 @@ import pytest
 
 from hil.errors import SourceError
 from hil.params import HilParams
-from hil.plausible import unit_problems
-from hil.pose import Pose
+from hil.poses.plausible import unit_problems
+from hil.poses.pose import Pose
 from hil.sources import Column
 from hil.sources.opening import open_source, read_poses
 from visthrow import config
 from visthrow.cli import main
-from visthrow.errors import ConfigError
+from visthrow.common.errors import ConfigError
 
 DATA = Path(__file__).parents[1] / "data"
 FLIGHTS = {

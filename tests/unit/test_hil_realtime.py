@@ -7,8 +7,8 @@ import sys
 
 import pytest
 
-from hil.realtime import RealtimeParams, keep, prepare
-from visthrow.errors import ConfigError
+from hil.control.realtime import RealtimeParams, keep, prepare
+from visthrow.common.errors import ConfigError
 
 
 def test_nothing_is_asked_for_by_default(monkeypatch):
@@ -38,7 +38,7 @@ def test_a_refusal_is_said_with_its_reason(monkeypatch):
 
 GRANTED = """
 import os, threading
-from hil.realtime import RealtimeParams, keep, prepare
+from hil.control.realtime import RealtimeParams, keep, prepare
 params, seen = RealtimeParams(priority=7), {}
 look = lambda name: seen.setdefault(name, os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK)
 def thread(name):

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from hil.backends import Status
+from hil.control.runner import Runner, Words
 from hil.errors import RunError
-from hil.record import Recorder, lines, load_run
-from hil.runner import Runner, Words
+from hil.recording.record import Recorder, lines, load_run
 from tests.hil_flight import Spy, fly, params
-from visthrow.bench.hil_processes import free_port
 from visthrow.cli import main
-from visthrow.errors import StorageError
-from visthrow.policy import Policy, find_policy
+from visthrow.common.errors import StorageError
+from visthrow.evidence.bench.hil_processes import free_port
+from visthrow.onboard.policy import Policy, find_policy
 
 
 def recorded(folder, policy="state", seconds=8.0, spoil=lambda time, poses: poses):

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from hil.backends import Status
+from hil.control.runner import Runner, Words
 from hil.errors import RunError
 from hil.params import HilParams
-from hil.runner import Runner, Words
 from tests.hil_flight import TICK, Spy, changes, fly, params, simple_policy
 from visthrow import config
-from visthrow.actions import hover_action
-from visthrow.errors import ConfigError, MismatchError
+from visthrow.common.errors import ConfigError, MismatchError
+from visthrow.onboard.actions import hover_action
 
 HOVER = hover_action(9.81 * 0.272, 14.0)[0]
 NEVER = (HOVER, 0.0, 0.0, 0.0, -1.0)

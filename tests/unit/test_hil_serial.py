@@ -7,11 +7,11 @@ import tty
 
 import pytest
 
-from hil import msp
 from hil.backends import Betaflight
-from hil.device import Device, SerialPort
 from hil.errors import LinkError, RunError
-from hil.msp_log import LoggedPort, read_log
+from hil.links import msp
+from hil.links.device import Device, SerialPort
+from hil.links.msp_log import LoggedPort, read_log
 from hil.params import HilParams
 from visthrow import config
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from hil.errors import SourceError
-from hil.link import TlogWriter
-from hil.mavlink import Parser, mav
-from hil.pose import Pose
+from hil.links.mavlink_link import TlogWriter
+from hil.links.pymav import Parser, mav
+from hil.poses.pose import Pose
 from hil.sources import BodyIds, Column, CsvParams, MavlinkDecoder, Recorded, read_csv, read_tlog
-from visthrow.errors import ConfigError
+from visthrow.common.errors import ConfigError
 
 BODIES = (BodyIds("vehicle", "ATT_POS_MOCAP", 1, 0), BodyIds("payload", "ODOMETRY", 2, 1))
 
@@ -68,7 +68,7 @@ def test_senders_that_clash_are_refused():
 
 
 def test_a_slow_disk_holds_up_no_message(tmp_path, monkeypatch):
-    monkeypatch.setattr("hil.link.MOST_WAITING", 30)
+    monkeypatch.setattr("hil.links.mavlink_link.MOST_WAITING", 30)
     path, turning, message = tmp_path / "a.tlog", threading.Event(), wired(mocap(0, 0.0))
     writer = TlogWriter(path)
     file = writer._file

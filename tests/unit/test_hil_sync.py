@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from hil.clock import TimeSync
-from hil.fake import VEHICLE_ID, FakeAutopilot, MocapParams, Options
 from hil.fakes.level import LevelPlant
-from hil.link import Link
-from hil.mavlink import mav
+from hil.fakes.process import VEHICLE_ID, FakeAutopilot, MocapParams, Options
+from hil.links.clock import TimeSync
+from hil.links.mavlink_link import Link
+from hil.links.pymav import mav
+from hil.links.sync import LATE, LinkSync
 from hil.sources import BodyIds, MavlinkSource
-from hil.sync import LATE, LinkSync
 from tests.loopback.wire import pipe
 
 RATE = 10.0

@@ -10,8 +10,8 @@ from hil.errors import RunError
 from hil.params import HilParams
 from tests.hil_flight import simple_policy
 from visthrow import config
-from visthrow.errors import ConfigError
-from visthrow.hover import GRAVITY
+from visthrow.common.errors import ConfigError
+from visthrow.onboard.hover import GRAVITY
 
 BENT = ThrustParams(2.668, 0.37, 0.8, 0.08, 0.0)
 

@@ -6,7 +6,7 @@ from hil.backends import Betaflight, DryRun, make_backend, mechanism_lag
 from hil.errors import LinkError, RunError
 from hil.params import HilParams
 from visthrow import config
-from visthrow.errors import ConfigError
+from visthrow.common.errors import ConfigError
 
 
 def load(*overrides, name="dry_run"):

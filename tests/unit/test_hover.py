@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from visthrow.hover import GRAVITY, HoverController, HoverParams, rot_from_quat
+from visthrow.onboard.hover import GRAVITY, HoverController, HoverParams, rot_from_quat
 
 VEHICLE, PAYLOAD, LENGTH = 0.214, 0.058, 0.38
 """Vehicle with the rope [kg], ball [kg], mount to the ball's centre [m]: the paper's."""

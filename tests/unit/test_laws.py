@@ -5,12 +5,12 @@ import dataclasses
 import numpy as np
 import pytest
 
-from sim.laws import BLOCKS, check_laws, names, structure
+from sim.effects.laws import BLOCKS, check_laws, names, structure
 from sim.params import LawParams
 from tests.plants import paper_plant
 from visthrow import config
-from visthrow.bench.flops import _filled, _Source, env_step
-from visthrow.diagnose import grammar
+from visthrow.diagnose.select import grammar
+from visthrow.evidence.bench.flops import _filled, _Source, env_step
 from visthrow.task import Experiment
 
 SWIRL = LawParams("payload force", (), "vertical_cross_vel", 0.02)
@@ -32,9 +32,9 @@ def knots(seed: int = 0) -> dict[str, np.ndarray]:
 def counted_factors():
     """The kernel's own factors, run as plain Python, and the moment that they see."""
     source = _Source()
-    t = source.load("sim.structs").types("float64")
-    laws = source.load("sim.laws")
-    Around = source.load("sim.structs").make_struct("Around", laws._around(t))
+    t = source.load("sim.arrays.structs").types("float64")
+    laws = source.load("sim.effects.laws")
+    Around = source.load("sim.arrays.structs").make_struct("Around", laws._around(t))
     k = knots()
     row = {name: k[name][0] for name in laws._around(t) if name in k} | {"thrust_rate": 4.0}
     return laws._factors(t, Around), _filled(Around, row), k

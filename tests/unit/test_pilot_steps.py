@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from tests.hil_flight import simple_policy
-from visthrow.observations import resampled
-from visthrow.pilot import Pilot
+from visthrow.onboard.observations import resampled
+from visthrow.onboard.pilot import Pilot
 
 PERIOD = 0.02
 LEVEL = np.array([[0.0, 0.0, 0.0, 1.0]])

@@ -9,9 +9,9 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from visthrow.errors import MismatchError, PolicyError, VisthrowError
-from visthrow.policy import FORMAT_VERSION, Policy, find_policy
-from visthrow.storage import from_json_array, json_array
+from visthrow.common.errors import MismatchError, PolicyError, VisthrowError
+from visthrow.common.storage import from_json_array, json_array
+from visthrow.onboard.policy import FORMAT_VERSION, Policy, find_policy
 
 OBS, ACTIONS = 35, 5
 EQUAL = 1e-6
@@ -170,7 +170,7 @@ def test_other_files_and_missing_files_are_refused(policy, tmp_path):
 
 
 def test_policies_are_found_by_shipped_name_or_path(policy, tmp_path, monkeypatch):
-    monkeypatch.setattr("visthrow.policy.SHIPPED", tmp_path / "shipped")
+    monkeypatch.setattr("visthrow.onboard.policy.SHIPPED", tmp_path / "shipped")
     policy.save(tmp_path / "shipped" / "vision.npz")
     policy.save(tmp_path / "mine.npz")
     assert find_policy("vision") == tmp_path / "shipped" / "vision.npz"
@@ -197,7 +197,7 @@ def test_a_full_disk_leaves_the_old_file(policy, tmp_path, monkeypatch):
     def full(fd: int) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("visthrow.storage.os.fsync", full)
+    monkeypatch.setattr("visthrow.common.storage.os.fsync", full)
     with pytest.raises(VisthrowError, match="No space left on device"):
         policy.save(path)
     assert path.read_bytes() == before

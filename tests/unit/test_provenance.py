@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 import pytest
 
-from visthrow import provenance
-from visthrow.errors import StorageError
-from visthrow.storage import atomic_write, write_json
+from visthrow.common import provenance
+from visthrow.common.errors import StorageError
+from visthrow.common.storage import atomic_write, write_json
 
 
 @dataclass(frozen=True)

@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 
 from tests import made_up_results as made_up
-from visthrow import cli, results
+from visthrow import cli
 from visthrow.baseline import spline, thrower
-from visthrow.report import ablations, beyond, book, command, gap, page, throws, trade, wanted
-from visthrow.report.parts import Grid, Picture, Text
-from visthrow.results import Result
-from visthrow.sweep.cli import load_list
+from visthrow.evidence.report import ablations, beyond, book, command, gap, throws, trade, wanted
+from visthrow.evidence.sweep.cli import load_list
+from visthrow.throws import results
+from visthrow.throws.results import Result
+from visthrow.view import page
+from visthrow.view.parts import Grid, Picture, Text
 
 
 @pytest.fixture(scope="module")
@@ -243,7 +245,7 @@ DRIVER = """
 import sys
 from visthrow import cli
 from visthrow.baseline import spline, thrower
-from visthrow.report import wanted
+from visthrow.evidence.report import wanted
 spline.LONGEST = (1.4,)
 wanted.QUICK_LIST = sys.argv[1]
 wanted.quick = lambda: [thrower.unit("pendulum", "none", target, 1) for target in wanted.TARGETS]

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from visthrow import results
-from visthrow.errors import StorageError
+from visthrow.common.errors import StorageError
+from visthrow.throws import results
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -7,11 +7,11 @@ import pytest
 
 from tests.flown import fly, setting_with
 from tests.plants import paper_plant
-from visthrow.diagnose import linearising, throw_model
-from visthrow.diagnose.linearising import exact
-from visthrow.diagnose.replay import rough_step
-from visthrow.diagnose.throw_model import ThrowModel
-from visthrow.flightlog import FlightLog
+from visthrow.diagnose.throw import linearising, throw_model
+from visthrow.diagnose.throw.linearising import exact
+from visthrow.diagnose.throw.replay import rough_step
+from visthrow.diagnose.throw.throw_model import ThrowModel
+from visthrow.logs.flightlog import FlightLog
 
 SWAY = 0.02 * np.array([1.0, 1.0, 1.0]), np.array([0.7, 0.9, 0.5]), np.array([0.0, 1.0, 2.0])
 """Of vehicle and payload alike, as slow gusts bring it: amplitude [m], frequency [Hz], phase [rad]."""

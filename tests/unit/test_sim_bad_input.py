@@ -5,10 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
+from sim.arrays.structs import types
 from sim.hybrid import HybridSim, tether_lengths
 from sim.params import PlantParams
 from sim.standalone import QuadSim
-from sim.structs import types
 from tests.plants import paper_plant
 from visthrow import config
 from visthrow.task import TaskParams

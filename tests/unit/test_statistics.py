@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from visthrow import statistics as st
+from visthrow.common import statistics as st
 
 TRIALS = 300
 COVERAGE = 0.045

@@ -9,13 +9,14 @@ import time
 import numpy as np
 import pytest
 
-from visthrow import cli, config, results
-from visthrow.errors import BusyError, ConfigError
-from visthrow.storage import write_json
-from visthrow.sweep import pool, units
-from visthrow.sweep.cli import load_list
-from visthrow.sweep.lock import Lock, held
-from visthrow.sweep.record import collect, status
+from visthrow import cli, config
+from visthrow.common.errors import BusyError, ConfigError
+from visthrow.common.storage import write_json
+from visthrow.evidence.sweep import pool, units
+from visthrow.evidence.sweep.cli import load_list
+from visthrow.evidence.sweep.lock import Lock, held
+from visthrow.evidence.sweep.record import collect, status
+from visthrow.throws import results
 
 LIST = """
 changes = ["ppo.iterations=2", "ppo.environments=8", "ppo.hidden=[8]"]
@@ -230,7 +231,7 @@ def test_the_time_limit_stops_what_runs(path, tmp_path, monkeypatch):
 
 def test_a_lock_excludes_and_a_killed_process_does_not_hold_it(tmp_path):
     path = tmp_path / "locks" / "a.lock"
-    code = "import time; from pathlib import Path; from visthrow.sweep.lock import Lock\n"
+    code = "import time; from pathlib import Path; from visthrow.evidence.sweep.lock import Lock\n"
     code += f"with Lock(Path({str(path)!r})): print(1, flush=True); time.sleep(60)"
     other = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE)
     try:
@@ -323,7 +324,7 @@ def test_a_job_that_vanishes_is_submitted_again_but_not_for_ever():
     utils = pytest.importorskip("submitit.core.utils")
     from collections import Counter
 
-    from visthrow.sweep import cluster
+    from visthrow.evidence.sweep import cluster
 
     class Ended:
         def __init__(self, outcome):
@@ -348,7 +349,7 @@ def test_a_job_that_vanishes_is_submitted_again_but_not_for_ever():
 def test_a_slurm_job_asks_for_what_it_needs(path, tmp_path, monkeypatch, capsys):
     """A stand-in for sbatch keeps the script that it is given; where there is no Slurm, that is said."""
     pytest.importorskip("submitit")
-    from visthrow.sweep.cluster import Cluster
+    from visthrow.evidence.sweep.cluster import Cluster
 
     words = ["sweep", "run", path, "--out", str(tmp_path / "out"), "--slurm", "partition=gpu", "--devices", "2", "--minutes", "9"]
     monkeypatch.setenv("PATH", str(tmp_path))

@@ -13,16 +13,16 @@ from sim.params import SensingParams
 from tests.flown import fly, setting_with
 from tests.plants import paper_plant
 from visthrow import config
-from visthrow.diagnose import settling
+from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.catalogue import ALL
-from visthrow.diagnose.evidence import Priors
-from visthrow.diagnose.opened import opened
-from visthrow.diagnose.point import Problem, curvature, linearise, moved
-from visthrow.diagnose.recorded import record_of
-from visthrow.diagnose.settling import Settling
-from visthrow.diagnose.throw_model import ThrowModel
-from visthrow.errors import DiagnoseError
-from visthrow.flightlog import Channel, FlightLog
+from visthrow.diagnose.likelihood.evidence import Priors
+from visthrow.diagnose.select.point import Problem, curvature, linearise, moved
+from visthrow.diagnose.throw import settling
+from visthrow.diagnose.throw.opened import opened
+from visthrow.diagnose.throw.recorded import record_of
+from visthrow.diagnose.throw.settling import Settling
+from visthrow.diagnose.throw.throw_model import ThrowModel
+from visthrow.logs.flightlog import Channel, FlightLog
 
 LATENT = np.array([5e-4, 5e-6, 5e-5])  # deviations of the latent forces of each block, which absorb what the step leaves
 PLANTED = {"rope_length": 0.006, "cmd_delay": 0.006, "mass_payload": 0.002, "wind_x": 0.25, "com_y": 8e-4, "release_lag": 0.015}

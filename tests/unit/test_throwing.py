@@ -10,18 +10,20 @@ import numpy as np
 import pytest
 import torch
 
-from visthrow import compare, config, demo, reference_protocol
+from visthrow import config
 from visthrow.cli import main
-from visthrow.errors import ConfigError, MismatchError, PolicyError
-from visthrow.flight import fly
-from visthrow.flightlog import STANDARD_CHANNELS, FlightLog
-from visthrow.loading import load_policy, unique_names
-from visthrow.loose_rope import LooseRope
-from visthrow.plants import HybridPlant, make_plant
-from visthrow.policy import Policy
-from visthrow.protocol import Throws
-from visthrow.tables import csv_text, markdown
+from visthrow.common.errors import ConfigError, MismatchError, PolicyError
+from visthrow.evidence import demo
+from visthrow.logs.flightlog import STANDARD_CHANNELS, FlightLog
+from visthrow.onboard.policy import Policy
 from visthrow.task import Experiment, contract_of
+from visthrow.throws import compare, reference_protocol
+from visthrow.throws.flight import fly
+from visthrow.throws.loading import load_policy, unique_names
+from visthrow.throws.loose_rope import LooseRope
+from visthrow.throws.plants import HybridPlant, make_plant
+from visthrow.training.protocol import Throws
+from visthrow.view.tables import csv_text, markdown
 
 LINK_ERROR = 1e-5  # of a link's length [m]: Newton's last step
 ENERGY_DRIFT = 0.02  # of a swinging rope in half a second: first-order velocity of Verlet steps of 1 ms
@@ -249,7 +251,7 @@ def test_processes_throw_what_one_process_throws(dropper, tmp_path):
 
 
 def test_demo_without_mujoco(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("visthrow.policy.SHIPPED", tmp_path)
+    monkeypatch.setattr("visthrow.onboard.policy.SHIPPED", tmp_path)
     for name in demo.POLICIES:
         dropping_policy(name).save(tmp_path / f"{name}.npz")
     monkeypatch.setattr(demo, "THROWS", 3)

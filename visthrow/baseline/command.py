@@ -4,8 +4,8 @@ import argparse
 import sys
 from pathlib import Path
 
-from visthrow.cli import add_common
-from visthrow.errors import ConfigError
+from visthrow.common.arguments import add_common
+from visthrow.common.errors import ConfigError
 
 TARGETS = (1.5, 2.0, 2.5)
 POLICY_THROWS = 100
@@ -54,12 +54,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Plan, throw, print, write."""
-    from visthrow import compare, config
+    from visthrow import config
     from visthrow.baseline import front
     from visthrow.baseline.spline import PlanParams, payload_bounds_only
-    from visthrow.errors import suggest
-    from visthrow.plants import PLANTS
+    from visthrow.common.errors import suggest
     from visthrow.task import Experiment
+    from visthrow.throws import compare
+    from visthrow.throws.plants import PLANTS
 
     compare.check(args.targets, args.throws)
     for plant in args.plants:
@@ -84,7 +85,7 @@ def _releases(args: argparse.Namespace) -> dict[float, tuple[float, float]]:
     if not args.release_from:
         return {}
     from visthrow.baseline.release import measure
-    from visthrow.loading import load_policy
+    from visthrow.throws.loading import load_policy
 
     loaded = load_policy(args.release_from)
     _say(f"measuring the releases of {loaded.name}")
@@ -93,8 +94,8 @@ def _releases(args: argparse.Namespace) -> dict[float, tuple[float, float]]:
 
 def _policies(names: list[str], seed: int, throws: int) -> list[dict]:
     """Learnt policies at 2.0 m in the training simulator, as ``visthrow compare`` throws them."""
-    from visthrow.loading import load_policy
-    from visthrow.protocol import throw
+    from visthrow.throws.loading import load_policy
+    from visthrow.training.protocol import throw
 
     rows = []
     for name in names:
@@ -107,9 +108,9 @@ def _policies(names: list[str], seed: int, throws: int) -> list[dict]:
 
 
 def _write(args: argparse.Namespace, throws: int, targets: list[dict], swept: list[dict], policies: list[dict]) -> int:
-    from visthrow import provenance
     from visthrow.baseline import front, report
-    from visthrow.storage import atomic_write, write_json
+    from visthrow.common import provenance
+    from visthrow.common.storage import atomic_write, write_json
 
     sums = front.summary(swept, policies) if swept else {}
     bounds = "payload" if args.payload_bounds else "payload and thrust"

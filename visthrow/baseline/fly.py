@@ -1,4 +1,4 @@
-"""Flies planned throws: in the controller's own pendulum (idealised), and on the plants behind :mod:`visthrow.plants`.
+"""Flies planned throws: in the controller's own pendulum (idealised), and on the plants behind :mod:`visthrow.throws.plants`.
 
 The own model knows no delay, no noise, no lag of the release and no aerodynamics: what is flown there is an upper bound.
 On the plants the pendulum's state is put together from what the plant measures, payload velocity included, and smoothed
@@ -20,14 +20,14 @@ from visthrow.baseline.mpc import MPC, MPCParams, SolverError
 from visthrow.baseline.pendulum import Pendulum
 from visthrow.baseline.plan import Plan
 from visthrow.baseline.release import landing_point
-from visthrow.errors import ConfigError, suggest
-from visthrow.hover import HoverController, HoverParams, rot_from_quat
-from visthrow.plants import HybridPlant, Plant, Snapshot
-from visthrow.reference_protocol import FALL_TIME, FIELDS, HOVER_TIME, batch_plant, failures, place_in_hover
+from visthrow.common.errors import ConfigError, suggest
+from visthrow.onboard.hover import HoverController, HoverParams, rot_from_quat
 from visthrow.task import Experiment, plant_of
+from visthrow.throws.plants import HybridPlant, Plant, Snapshot
+from visthrow.throws.reference_protocol import FALL_TIME, FIELDS, HOVER_TIME, batch_plant, failures, place_in_hover
 
 if TYPE_CHECKING:
-    from visthrow.protocol import Throws
+    from visthrow.training.protocol import Throws
 
 FINE = 4
 """Runge-Kutta steps of the flown pendulum in one control period; the controller predicts with one."""
@@ -65,7 +65,7 @@ class Flown:
 
     def throws(self, target: float) -> "Throws":
         """The same as learnt policies are scored."""
-        from visthrow.protocol import Throws
+        from visthrow.training.protocol import Throws
 
         return Throws(target, **{name: getattr(self, name) for name in FIELDS})
 
@@ -95,7 +95,7 @@ def _flown(
 
 
 class _Smoothness:
-    """Root mean square change of normalised commands, as :mod:`visthrow.protocol` measures it."""
+    """Root mean square change of normalised commands, as :mod:`visthrow.training.protocol` measures it."""
 
     def __init__(self, params: MPCParams, first: np.ndarray) -> None:
         self._most, self._rate = params.max_thrust, np.array(params.max_rate)
@@ -369,11 +369,11 @@ def fly_plant(
     plan: Plan, plant_name: str, experiment: Experiment, delays: Delays, count: int = 10, seed: int = 0, batch: int = 0,
     device: str = "cpu",
 ) -> Flown:  # fmt: skip
-    """Fly a plan on a plant of :data:`visthrow.plants.PLANTS`.
+    """Fly a plan on a plant of :data:`visthrow.throws.plants.PLANTS`.
 
     The throws are those that learnt policies meet with the same count and seed: in the training simulator the same vehicles,
-    ropes and starts as :func:`visthrow.protocol.throw`, on a reference plant the same vehicles, winds and starts as
-    :mod:`visthrow.reference_protocol`, from hover under the hover controller.
+    ropes and starts as :func:`visthrow.training.protocol.throw`, on a reference plant the same vehicles, winds and starts as
+    :mod:`visthrow.throws.reference_protocol`, from hover under the hover controller.
 
     Args:
         plan: of the throw.
@@ -382,7 +382,7 @@ def fly_plant(
         delays: that the controller makes up for; ``Delays()`` for none.
         count: throws, flown as one batch.
         seed: of everything random.
-        batch: number of the batch on a reference plant, as :mod:`visthrow.reference_protocol` counts them.
+        batch: number of the batch on a reference plant, as :mod:`visthrow.throws.reference_protocol` counts them.
         device: of the training simulator.
     """
     flight = _PlantFlight(plan, plant_name, experiment, delays, count, seed, batch, device)

@@ -1,6 +1,6 @@
 """Tables by target and by plant, the sweep that trades agility for accuracy, and the figures that sum it up.
 
-Every row is a dictionary: ``plant`` ("pendulum" for the controller's own model, or a plant of :mod:`visthrow.plants`),
+Every row is a dictionary: ``plant`` ("pendulum" for the controller's own model, or a plant of :mod:`visthrow.throws.plants`),
 ``compensation``, ``target``, ``speed``, ``height``, ``w_t``, ``rho``, ``planned`` (duration) and
 :meth:`visthrow.baseline.fly.Flown.summary`.
 """
@@ -16,8 +16,8 @@ from visthrow.baseline.pendulum import Pendulum, pendulum_of
 from visthrow.baseline.plan import Plan, plan_throw
 from visthrow.baseline.release import default_release
 from visthrow.baseline.spline import PlanParams
-from visthrow.tables import PAPER
 from visthrow.task import Experiment, plant_of
+from visthrow.view.tables import PAPER
 
 SPEEDS = (1.7, 2.2, 2.5, 2.9)
 """Release speeds of the sweep [m/s]; the paper's are 1.7 and 2.2."""

@@ -17,7 +17,7 @@ from scipy import sparse
 
 from visthrow.baseline import pendulum as pm
 from visthrow.baseline.pendulum import DIR, INPUTS, QUAT, STATES, Pendulum
-from visthrow.errors import VisthrowError
+from visthrow.common.errors import VisthrowError
 
 WIDTH = STATES + INPUTS
 

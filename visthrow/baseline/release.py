@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from sim.params import GRAVITY
-from visthrow.errors import ConfigError
-from visthrow.flightlog import FlightLog
+from visthrow.common.errors import ConfigError
+from visthrow.logs.flightlog import FlightLog
 
 POLICY_RELEASES = {1.5: (1.107, 2.270), 2.0: (1.127, 2.935), 2.5: (1.146, 3.602)}
 """Target [m] -> height [m] and speed [m/s] at separation of the shipped state policy in the training simulator; mean of
@@ -83,12 +83,12 @@ def measure(loaded, target: float, throws: int = 5, seed: int = 0) -> tuple[floa
     """Mean height [m] and speed [m/s] of a policy's releases in the training simulator.
 
     Args:
-        loaded: policy and experiment, :class:`visthrow.loading.Loaded`.
+        loaded: policy and experiment, :class:`visthrow.throws.loading.Loaded`.
         target: [m] along x.
         throws: flown one by one.
         seed: of the first; the others follow.
     """
-    from visthrow.flight import fly
+    from visthrow.throws.flight import fly
 
     goal = np.array([target, 0.0, 0.0])
     seen = [read_release(fly(loaded, goal, "hybrid", seed + i)) for i in range(throws)]

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from visthrow import style
 from visthrow.baseline.front import PAPER_FRONT, PAPER_TABLE, pareto, points_of
-from visthrow.storage import atomic_write
+from visthrow.common import style
+from visthrow.common.storage import atomic_write
 
 PAPER_VEHICLE = {"state": (1.154, 0.105), "vision": (1.125, 0.101)}
 """The paper's policies on its vehicle at 2.0 m: duration [s] and landing error [m]. Nothing of ours was flown."""

@@ -19,7 +19,7 @@ from scipy.optimize import least_squares
 
 from sim.params import GRAVITY
 from visthrow.baseline.pendulum import Pendulum
-from visthrow.errors import VisthrowError
+from visthrow.common.errors import VisthrowError
 
 SEGMENTS, ORDER = 4, 8
 SMOOTH = 6

@@ -13,16 +13,16 @@ from visthrow.baseline.pendulum import pendulum_of
 from visthrow.baseline.plan import Plan, plan_throw
 from visthrow.baseline.release import default_release
 from visthrow.baseline.spline import PlanParams, payload_bounds_only
-from visthrow.device import resolve
-from visthrow.reference_protocol import BATCH
-from visthrow.results import PROTOCOL, Result, columns_of, join, key_of, work
 from visthrow.task import Experiment, contract_of, plant_of
+from visthrow.throws.reference_protocol import BATCH
+from visthrow.throws.results import PROTOCOL, Result, columns_of, join, key_of, work
+from visthrow.training.device import resolve
 
 NAME = "baseline"
 """What compare calls it beside the policies."""
 
 OWN = "pendulum"
-"""The controller's own model, beside the plants of :data:`visthrow.plants.PLANTS`."""
+"""The controller's own model, beside the plants of :data:`visthrow.throws.plants.PLANTS`."""
 
 MADE_UP = {
     "none": "nothing made up for",
@@ -45,7 +45,7 @@ def unit(
     """Unit of throws with the baseline.
 
     Args:
-        plant: :data:`OWN`, or of :data:`visthrow.plants.PLANTS`.
+        plant: :data:`OWN`, or of :data:`visthrow.throws.plants.PLANTS`.
         compensation: of :data:`visthrow.baseline.fly.COMPENSATIONS`; "none" in the own model.
         target: [m] along x.
         throws: how many.
@@ -121,7 +121,7 @@ def compared(
     """Throws in the own model and on a plant under each compensation.
 
     Args:
-        plant: of :data:`visthrow.plants.PLANTS`.
+        plant: of :data:`visthrow.throws.plants.PLANTS`.
         targets: [m] along x.
         throws: a row.
         seed: of starts and noise.

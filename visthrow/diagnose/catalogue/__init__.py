@@ -1,6 +1,6 @@
 """The catalogue: what reality may have and the simulator lacks. One table file a group of blocks.
 
-The equation of an effect stands in the block of :mod:`sim` that it extends (or in :mod:`sim.sensing`); an entry names the
+The equation of an effect stands in the block of :mod:`sim` that it extends (or in :mod:`sim.replay.sensing`); an entry names the
 numbers of the configuration that it changes, nothing more.
 """
 

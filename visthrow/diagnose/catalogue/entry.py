@@ -7,8 +7,8 @@ from typing import Any
 
 from camera.params import CameraParams
 from sim.params import PlantParams, SensingParams
-from visthrow.diagnose.model import Effect
-from visthrow.errors import DiagnoseError, suggest
+from visthrow.common.errors import DiagnoseError, suggest
+from visthrow.diagnose.models.interface import Effect
 
 POSE = ("pos_w", "quat_wb")
 PAYLOAD = ("payload_pos_w",)

@@ -25,10 +25,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Read, look, print."""
+    from visthrow.common.storage import write_json
     from visthrow.diagnose.check.picture import draw
     from visthrow.diagnose.check.run import check, table
-    from visthrow.diagnose.setup import read_logs
-    from visthrow.storage import write_json
+    from visthrow.diagnose.inputs.setup import read_logs
 
     logs = read_logs(args.logs, args.config)
     results = check(logs)

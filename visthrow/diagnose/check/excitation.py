@@ -6,7 +6,7 @@ import numpy as np
 
 from visthrow.diagnose.check import relations
 from visthrow.diagnose.check.rows import Row
-from visthrow.flightlog import FlightLog
+from visthrow.logs.flightlog import FlightLog
 
 POSITIONS = ("pos_w", "est_pos_w", "mocap_pos_w")
 ATTITUDES = ("quat_wb", "est_quat_wb", "mocap_quat_wb")

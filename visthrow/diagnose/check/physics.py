@@ -7,7 +7,7 @@ import numpy as np
 from sim.reference.rotations import rotation_from_quat, turned
 from visthrow.diagnose.check import relations
 from visthrow.diagnose.check.rows import Row
-from visthrow.flightlog import Channel, FlightLog
+from visthrow.logs.flightlog import Channel, FlightLog
 
 GRAVITY = 9.81
 MOVES = 0.05

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import numpy as np
 
-from visthrow import style
+from visthrow.common import style
 from visthrow.diagnose.check.rows import worst
 from visthrow.diagnose.check.run import Checked
-from visthrow.flightlog import FlightLog
+from visthrow.logs.flightlog import FlightLog
 
 MOST = 10
 """Channels in a picture."""

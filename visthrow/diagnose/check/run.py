@@ -10,7 +10,7 @@ import numpy as np
 
 from visthrow.diagnose.check import excitation, physics, relations, signals
 from visthrow.diagnose.check.rows import Row, Verdict, worst
-from visthrow.flightlog import Channel, FlightLog
+from visthrow.logs.flightlog import Channel, FlightLog
 
 _ALIKE = 0.2
 """Logs that share a larger part of their samples are copies of one another."""

@@ -3,7 +3,7 @@
 import numpy as np
 
 from visthrow.diagnose.check.rows import Row
-from visthrow.flightlog import Channel, FlightLog
+from visthrow.logs.flightlog import Channel, FlightLog
 
 FEW_SAMPLES = 20
 FEW_STEPS, SLOW_PERIOD = 5, 0.5
@@ -60,7 +60,7 @@ def look(name: str, channel: Channel, notes: dict) -> list[Row]:
     Args:
         name: Of the channel.
         channel: Its samples.
-        notes: What the reader left out; see :func:`visthrow.diagnose.ingest.table.make_channel`.
+        notes: What the reader left out; see :func:`visthrow.logs.table.make_channel`.
     """
     count = len(channel.time)
     span = float(np.ptp(channel.time)) if count else 0.0

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from visthrow.diagnose.check.relations import derivative
-from visthrow.diagnose.model import Effect
+from visthrow.diagnose.models.interface import Effect
 from visthrow.diagnose.models.numeric import (
     Lanes,
     NumericModel,
@@ -21,7 +21,7 @@ from visthrow.diagnose.models.numeric import (
     latent_layout,
     sigma_of,
 )
-from visthrow.flightlog import FlightLog
+from visthrow.logs.flightlog import FlightLog
 
 CHANNEL = "payload_pos_w"
 STEPS = 80

@@ -10,11 +10,11 @@ from typing import Literal
 
 import numpy as np
 
+from visthrow.common.errors import ConfigError
 from visthrow.diagnose.models.flyer_effects import effects_of
 from visthrow.diagnose.models.flyer_windows import FINE, stretches_of
 from visthrow.diagnose.models.numeric import Lanes, NumericModel, Stretch, cross, hermite, integrate, latent_force
-from visthrow.errors import ConfigError
-from visthrow.flightlog import FlightLog
+from visthrow.logs.flightlog import FlightLog
 
 
 @dataclass(frozen=True)

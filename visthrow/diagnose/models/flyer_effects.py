@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from visthrow.diagnose.model import Effect
+from visthrow.diagnose.models.interface import Effect
 
 if TYPE_CHECKING:
     from visthrow.diagnose.models.flyer import FlyerParams

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sim.reference.rotations import rotation_from_quat
+from visthrow.common.errors import LogError
 from visthrow.diagnose.models.numeric import Stretch, latent_layout, sigma_of
-from visthrow.errors import LogError
-from visthrow.flightlog import Channel, FlightLog
+from visthrow.logs.flightlog import Channel, FlightLog
 
 if TYPE_CHECKING:
     from visthrow.diagnose.models.flyer import FlyerParams

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from sim.reference.rotations import rotation_from_quat
-from visthrow.diagnose.model import Effect
+from visthrow.common.errors import LogError
+from visthrow.diagnose.models.interface import Effect
 from visthrow.diagnose.models.numeric import Lanes, NumericModel, Stretch, cross, latent_layout, triangles
-from visthrow.errors import LogError
-from visthrow.flightlog import FlightLog
+from visthrow.logs.flightlog import FlightLog
 
 CHANNEL = "marker_pos_c"
 NEEDED = (CHANNEL, "pos_w", "quat_wb", "payload_pos_w")

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from visthrow.common.errors import LogError, suggest
 from visthrow.diagnose.check.signals import noise
-from visthrow.diagnose.model import Effect, Linearised, Window
-from visthrow.errors import LogError, suggest
-from visthrow.flightlog import Channel
+from visthrow.diagnose.models.interface import Effect, Linearised, Window
+from visthrow.logs.flightlog import Channel
 
 EFFECT_STEP = 0.05
 """Step of the differences by effects, in their prior deviations: errors of curvature cancel, those of rounding do not matter."""
@@ -59,7 +59,7 @@ class Lanes:
 
 
 class NumericModel:
-    """Implements :class:`visthrow.diagnose.model.Model` on :meth:`simulate` and :meth:`measure`."""
+    """Implements :class:`visthrow.diagnose.models.interface.Model` on :meth:`simulate` and :meth:`measure`."""
 
     latent_step = 1.0  # of the differences by latent forces [N or N m]
 
@@ -110,7 +110,7 @@ class NumericModel:
         return np.array([float(theta.get(name, 0.0)) for name in names])
 
     def windows(self, theta: Mapping[str, float]) -> list[Window]:
-        """See :class:`visthrow.diagnose.model.Model`."""
+        """See :class:`visthrow.diagnose.models.interface.Model`."""
         size = self.size(theta)
         residuals = self._settle(size, fresh=True)
         slopes, effects, latent = self._by_nuisance(size), self._by_effect(size), self._by_latent(size)
@@ -125,7 +125,7 @@ class NumericModel:
         ]  # fmt: skip
 
     def residuals(self, theta: Mapping[str, float], about: Linearised | None = None) -> list[np.ndarray]:
-        """See :class:`visthrow.diagnose.model.Model`; initial states are fitted anew."""
+        """See :class:`visthrow.diagnose.models.interface.Model`; initial states are fitted anew."""
         return self._settle(self.size(theta))
 
     def _lanes(self, size: np.ndarray, start: np.ndarray | None = None) -> Lanes:
@@ -320,7 +320,7 @@ def latent_layout(
         start: [s].
         end: [s].
         count: Of the knots, the same in all stretches.
-        blocks: Indices into :data:`visthrow.diagnose.model.LATENT_BLOCKS`.
+        blocks: Indices into :data:`visthrow.diagnose.models.interface.LATENT_BLOCKS`.
         axes: Of each block.
     """
     times = np.linspace(start, end, count)

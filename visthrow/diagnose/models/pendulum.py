@@ -5,7 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visthrow.diagnose.model import Effect
+from visthrow.common.errors import LogError
+from visthrow.diagnose.models.interface import Effect
 from visthrow.diagnose.models.numeric import (
     Lanes,
     NumericModel,
@@ -16,8 +17,7 @@ from visthrow.diagnose.models.numeric import (
     latent_layout,
     sigma_of,
 )
-from visthrow.errors import LogError
-from visthrow.flightlog import FlightLog
+from visthrow.logs.flightlog import FlightLog
 
 CHANNEL = "angle"
 KNOTS = 11

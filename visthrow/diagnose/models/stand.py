@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visthrow.diagnose.model import Effect
+from visthrow.diagnose.models.interface import Effect
 from visthrow.diagnose.models.numeric import Lanes, NumericModel, Stretch, latent_layout, triangles
-from visthrow.flightlog import FlightLog
+from visthrow.logs.flightlog import FlightLog
 
 CHANNELS = ("thrust", "current")
 NEEDED = ("thrust", "rotor_speed", "supply_voltage", "current")

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from visthrow.diagnose.check.relations import derivative
-from visthrow.diagnose.model import Effect
+from visthrow.diagnose.models.interface import Effect
 from visthrow.diagnose.models.numeric import Lanes, NumericModel, Stretch, latent_layout
-from visthrow.flightlog import FlightLog
+from visthrow.logs.flightlog import FlightLog
 
 MOTORS = ("fl", "fr", "rl", "rr")
 WORDS = {"fl": "front left", "fr": "front right", "rl": "rear left", "rr": "rear right"}

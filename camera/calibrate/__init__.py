@@ -1,0 +1,1 @@
+"""Calibration of a camera: files of other tools, other lens models, and pictures of a board."""

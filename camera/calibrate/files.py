@@ -1,0 +1,314 @@
+"""Calibration files of the field: OpenCV YAML, Kalibr camchain, ROS camera_info and basalt JSON, in and out.
+
+Convention: all four count pixels from the centre of the top left one and x right, y down, z forward, as `FisheyeParams`
+does. None of them holds a field of view; ours is written as an extra key ``fov_deg`` that their own readers ignore. A
+file without it gets the ``fov_deg`` of the call or, that left out, the angle that the farthest corner of the image
+sees.
+"""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from camera.calibrate.foreign import FOREIGN_MODELS, FitReport, fit_fisheye
+from camera.fisheye import Fisheye, FisheyeParams, check_fisheye, monotonic_limit
+
+EXACT = FitReport("kb4", 0.0, 0.0, 0)
+"""Report of a file that holds our own model: nothing was fitted."""
+
+_KB4 = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4")
+
+
+def read_opencv(path: str | Path, fov_deg: float | None = None) -> FisheyeParams:
+    """Read an OpenCV YAML (or XML, JSON) file of a fisheye calibration.
+
+    Args:
+        path: File with ``fisheye_model: 1``, ``image_width``, ``image_height``, ``camera_matrix`` and four
+            ``distortion_coefficients``, as OpenCV's calibration sample writes them.
+        fov_deg: Full field of view where the file has none [deg].
+
+    Raises:
+        ValueError: The file is missing, cut short, lacks a key, or holds another model.
+    """
+    import cv2
+
+    _text(path)
+    numbers = ("fisheye_model", "image_width", "image_height", "fov_deg")
+    tree: dict[str, Any] = {}
+    try:
+        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+        exists = sorted(storage.root().keys())
+        for key in exists:
+            node = storage.getNode(key)
+            if key in numbers and (node.isInt() or node.isReal()):
+                tree[key] = node.real()
+            elif key in ("camera_matrix", "distortion_coefficients") and node.isMap():
+                tree[key] = node.mat().ravel().tolist()
+    except (cv2.error, SystemError, AttributeError) as error:
+        raise ValueError(f"{path} cannot be read as an OpenCV file (cut short?): {str(error).strip()}") from error
+    if _get(path, tree, "fisheye_model", exists) != 1:
+        raise ValueError(f"{path}: fisheye_model is {tree['fisheye_model']}; expected 1, the Kannala-Brandt model")
+    fx, cx, fy, cy = _from_matrix(path, _get(path, tree, "camera_matrix", exists))
+    k = _floats(path, "distortion_coefficients", _get(path, tree, "distortion_coefficients", exists), 4)
+    size = [_get(path, tree, key, exists) for key in ("image_width", "image_height")]
+    return _params(path, size, (fx, fy, cx, cy, *k), tree.get("fov_deg"), fov_deg)
+
+
+def write_opencv(path: str | Path, fisheye: FisheyeParams) -> None:
+    """Write an OpenCV YAML file.
+
+    Raises:
+        ValueError: The file cannot be opened.
+    """
+    import cv2
+    import numpy as np
+
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_FORMAT_YAML)
+    if not storage.isOpened():
+        raise ValueError(f"{path} cannot be written; expected a folder that exists and can be written to")
+    storage.write("fisheye_model", 1)
+    storage.write("fov_deg", float(fisheye.fov_deg))
+    storage.write("image_width", fisheye.width)
+    storage.write("image_height", fisheye.height)
+    storage.write("camera_matrix", np.array(_matrix(fisheye)).reshape(3, 3))
+    storage.write("distortion_coefficients", np.array(fisheye.coefficients).reshape(4, 1))
+    storage.release()
+
+
+def read_kalibr(path: str | Path, camera: int = 0, fov_deg: float | None = None) -> FisheyeParams:
+    """Read one camera of a Kalibr camchain (``pinhole`` + ``equidistant``, which is Kannala-Brandt).
+
+    Args:
+        path: The camchain YAML.
+        camera: Number of the camera in it.
+        fov_deg: Full field of view where the file has none [deg].
+
+    Raises:
+        ValueError: The file is missing, cut short, lacks a key, or holds another model.
+    """
+    chain = _yaml(path)
+    tree = _mapping(path, f"cam{camera}", _get(path, chain, f"cam{camera}"))
+    _expect(path, tree, "camera_model", ("pinhole",))
+    _expect(path, tree, "distortion_model", ("equidistant",))
+    fx, fy, cx, cy = _floats(path, "intrinsics", _get(path, tree, "intrinsics"), 4)
+    k = _floats(path, "distortion_coeffs", _get(path, tree, "distortion_coeffs"), 4)
+    size = _floats(path, "resolution", _get(path, tree, "resolution"), 2)
+    return _params(path, size, (fx, fy, cx, cy, *k), tree.get("fov_deg"), fov_deg)
+
+
+def write_kalibr(path: str | Path, fisheye: FisheyeParams, topic: str = "/cam0/image_raw") -> None:
+    """Write a Kalibr camchain of one camera."""
+    tree = {
+        "cam0": {
+            "fov_deg": fisheye.fov_deg,
+            "camera_model": "pinhole",
+            "intrinsics": [fisheye.fx, fisheye.fy, fisheye.cx, fisheye.cy],
+            "distortion_model": "equidistant",
+            "distortion_coeffs": list(fisheye.coefficients),
+            "resolution": [fisheye.width, fisheye.height],
+            "rostopic": topic,
+        }
+    }
+    _dump_yaml(path, tree)
+
+
+def read_ros(path: str | Path, fov_deg: float | None = None) -> FisheyeParams:
+    """Read a ROS camera_info YAML with the ``equidistant`` (ROS 2, REP 118) or ``fisheye`` distortion model.
+
+    Args:
+        path: The file.
+        fov_deg: Full field of view where the file has none [deg].
+
+    Raises:
+        ValueError: The file is missing, cut short, lacks a key, or holds another model.
+    """
+    tree = _yaml(path)
+    _expect(path, tree, "distortion_model", ("equidistant", "fisheye"))
+    matrix = _mapping(path, "camera_matrix", _get(path, tree, "camera_matrix"))
+    fx, cx, fy, cy = _from_matrix(path, _get(path, matrix, "data"))
+    node = _mapping(path, "distortion_coefficients", _get(path, tree, "distortion_coefficients"))
+    k = _floats(path, "distortion_coefficients.data", _get(path, node, "data"), 4)
+    for key, count in (
+        ("rectification_matrix", 9),
+        ("projection_matrix", 12),
+    ):  # unused, but a file cut short lacks them
+        _floats(path, f"{key}.data", _get(path, _mapping(path, key, _get(path, tree, key)), "data"), count)
+    size = [_get(path, tree, key) for key in ("image_width", "image_height")]
+    return _params(path, size, (fx, fy, cx, cy, *k), tree.get("fov_deg"), fov_deg)
+
+
+def write_ros(path: str | Path, fisheye: FisheyeParams, name: str = "camera") -> None:
+    """Write a ROS camera_info YAML."""
+    fx, _, cx, _, fy, cy, *_ = _matrix(fisheye)
+    tree = {
+        "fov_deg": fisheye.fov_deg,
+        "image_width": fisheye.width,
+        "image_height": fisheye.height,
+        "camera_name": name,
+        "camera_matrix": {"rows": 3, "cols": 3, "data": _matrix(fisheye)},
+        "distortion_model": "equidistant",
+        "distortion_coefficients": {"rows": 1, "cols": 4, "data": list(fisheye.coefficients)},
+        "rectification_matrix": {"rows": 3, "cols": 3, "data": [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]},
+        "projection_matrix": {"rows": 3, "cols": 4, "data": [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0]},
+    }
+    _dump_yaml(path, tree)
+
+
+def read_basalt(path: str | Path, camera: int = 0, fov_deg: float | None = None) -> tuple[FisheyeParams, FitReport]:
+    """Read one camera of a basalt calibration: ``kb4`` as it is, ``ds`` and ``eucm`` through a fit.
+
+    Args:
+        path: The JSON file.
+        camera: Number of the camera in it.
+        fov_deg: Full field of view where the file has none [deg]; fitted models are fitted inside it.
+
+    Returns:
+        The fisheye and what the fit left over (all zero for ``kb4``).
+
+    Raises:
+        ValueError: The file is missing, cut short, lacks a key, or holds another model.
+    """
+    try:
+        tree = json.loads(_text(path, whole_lines=False))
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path} is no complete JSON (cut short?): {error}") from error
+    tree = _mapping(path, "value0", _get(path, _mapping(path, "the file", tree), "value0"))
+    node = _mapping(path, "intrinsics", _item(path, "intrinsics", _get(path, tree, "intrinsics"), camera))
+    size = _floats(path, "resolution", _item(path, "resolution", _get(path, tree, "resolution"), camera), 2)
+    model = _get(path, node, "camera_type")
+    if model != "kb4" and model not in FOREIGN_MODELS:
+        raise ValueError(f"{path}: camera_type is {model!r}; expected one of {['kb4', *sorted(FOREIGN_MODELS)]}")
+    given = _mapping(path, "intrinsics", _get(path, node, "intrinsics"))
+    names = _KB4 if model == "kb4" else FOREIGN_MODELS[model][0]
+    numbers = _floats(path, "intrinsics", [_get(path, given, name) for name in names], len(names))
+    values = dict(zip(names, numbers, strict=True))
+    if model == "kb4":
+        return _params(path, size, tuple(values[n] for n in _KB4), node.get("fov_deg"), fov_deg), EXACT
+    try:
+        return fit_fisheye(model, values, int(size[0]), int(size[1]), fov_deg)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def write_basalt(path: str | Path, fisheye: FisheyeParams) -> None:
+    """Write a basalt JSON of one ``kb4`` camera at the IMU; sensor noise is left zero for its owner to fill in."""
+    pose = {"px": 0.0, "py": 0.0, "pz": 0.0, "qx": 0.0, "qy": 0.0, "qz": 0.0, "qw": 1.0}
+    values = dict(zip(_KB4, (fisheye.fx, fisheye.fy, fisheye.cx, fisheye.cy, *fisheye.coefficients), strict=True))
+    tree = {
+        "T_imu_cam": [pose],
+        "intrinsics": [{"camera_type": "kb4", "intrinsics": values, "fov_deg": fisheye.fov_deg}],
+        "resolution": [[fisheye.width, fisheye.height]],
+        "calib_accel_bias": [0.0] * 9,
+        "calib_gyro_bias": [0.0] * 12,
+        "imu_update_rate": 200.0,
+        **{f"{sensor}_{kind}_std": [0.0] * 3 for sensor in ("accel", "gyro") for kind in ("noise", "bias")},
+        "cam_time_offset_ns": 0,
+        "vignette": [],
+    }
+    Path(path).write_text(json.dumps({"value0": tree}, indent=4) + "\n")
+
+
+def image_fov_deg(fisheye: FisheyeParams) -> float:
+    """Full field of view that the farthest corner of the image sees [deg], cut to where theta_d stops growing and to
+    360."""
+    limit = min(2.0 * math.degrees(monotonic_limit(fisheye.coefficients)), 360.0)
+    widest = Fisheye(FisheyeParams(**{**vars(fisheye), "fov_deg": limit * (1.0 - 1e-9)}))
+    right, low = fisheye.width - 0.5, fisheye.height - 0.5
+    corners = torch.tensor([[-0.5, -0.5], [right, -0.5], [right, low], [-0.5, low]], dtype=torch.float64)
+    rays, _ = widest.unproject(corners)
+    return 2.0 * math.degrees(float(widest.angle(rays)[0].max()))
+
+
+def _params(path, size, values, own_fov, asked_fov) -> FisheyeParams:
+    """Assemble and check intrinsics; the message of a refusal names the file."""
+    width, height = (int(s) for s in _floats(path, "image size", size, 2))
+    try:
+        fov = own_fov if own_fov is not None else asked_fov
+        if fov is None:
+            fov = image_fov_deg(FisheyeParams(width, height, *values, fov_deg=1.0))
+        params = FisheyeParams(width, height, *values, fov_deg=_floats(path, "fov_deg", [fov], 1)[0])
+        check_fisheye(params)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+    return params
+
+
+def _matrix(fisheye: FisheyeParams) -> list[float]:
+    """Camera matrix, row by row."""
+    return [fisheye.fx, 0.0, fisheye.cx, 0.0, fisheye.fy, fisheye.cy, 0.0, 0.0, 1.0]
+
+
+def _from_matrix(path, values) -> tuple[float, float, float, float]:
+    """fx, cx, fy, cy of a camera matrix without skew."""
+    fx, skew, cx, _, fy, cy, *_ = _floats(path, "camera_matrix", values, 9)
+    if abs(skew) > 1e-9 * abs(fx):
+        raise ValueError(f"{path}: camera_matrix has a skew of {skew}; expected 0, which our model has")
+    return fx, cx, fy, cy
+
+
+def _text(path, whole_lines: bool = True) -> str:
+    """Text of a file that exists and, where the format has no closing bracket, does not end within a line."""
+    if not Path(path).is_file():
+        raise ValueError(f"{path} is not a file; expected a calibration file")
+    text = Path(path).read_text()
+    if whole_lines and not text.endswith("\n"):
+        # "resolution: [640, 48" and "- 48" of 480 read as numbers too: only the missing line end tells.
+        raise ValueError(f"{path} ends within a line (cut short?); expected a line end, which a complete file needs")
+    return text
+
+
+def _yaml(path) -> dict:
+    import yaml
+
+    try:
+        tree = yaml.safe_load(_text(path))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path} is no complete YAML (cut short?): {error}") from error
+    return _mapping(path, "the file", tree)
+
+
+def _dump_yaml(path, tree: dict) -> None:
+    import yaml
+
+    Path(path).write_text(yaml.safe_dump(tree, sort_keys=False))
+
+
+def _mapping(path, name: str, value) -> dict:
+    if not isinstance(value, dict):
+        raise ValueError(f"{path}: {name} is {_short(value)}; expected a mapping of keys to values")
+    return value
+
+
+def _get(path, tree: dict, key: str, exists: list[str] | None = None):
+    if key not in tree:
+        exists = sorted(map(str, tree)) if exists is None else exists
+        raise ValueError(f"{path} lacks the key {key!r} (cut short?); it has {exists}")
+    return tree[key]
+
+
+def _item(path, name: str, values, index: int):
+    if not isinstance(values, list) or not 0 <= index < len(values):
+        count = len(values) if isinstance(values, list) else 0
+        raise ValueError(f"{path}: camera {index} asked for; expected below {count}, the number of {name} in the file")
+    return values[index]
+
+
+def _floats(path, name: str, values, count: int) -> list[float]:
+    listed = isinstance(values, list | tuple) and len(values) == count
+    if not listed or not all(isinstance(v, int | float) and not isinstance(v, bool) for v in values):
+        raise ValueError(f"{path}: {name} is {_short(values)}; expected {count} numbers")
+    return [float(v) for v in values]
+
+
+def _expect(path, tree: dict, key: str, choices: tuple[str, ...]) -> None:
+    value = _get(path, tree, key)
+    if value not in choices:
+        raise ValueError(f"{path}: {key} is {_short(value)}; expected one of {list(choices)}")
+
+
+def _short(value) -> str:
+    text = repr(value)
+    return text if len(text) <= 80 else text[:77] + "..."

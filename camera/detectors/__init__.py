@@ -1,0 +1,1 @@
+"""Detection of ball and goal square on fisheye images."""

@@ -1,0 +1,240 @@
+"""Ball and goal square on fisheye frames, by colour and shape, with OpenCV.
+
+Colour proposes, geometry decides. A blob of the ball's hue is a ball if the edge around it lies on a circular cone of rays, as
+the outline of a ball does in every direction and under every lens; a blob of the goal's hue is the goal if its edges are four
+straight lines in the tangent plane of the rays, with a bright rim around. Edges are found to a fraction of a pixel where the colour
+has fallen to half its level just inside, so that blur moves them little.
+
+The result is rays, not pixels: `detected_keypoints` makes of them what the training lens would have shown, by the functions that
+training calls.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from camera.detectors.edges import (
+    circles_of,
+    colour_maps,
+    colours_of,
+    cone_fit,
+    fit_goal,
+    outlines_of,
+    polar_edge,
+    rays_of,
+)
+from camera.fisheye import Fisheye
+from camera.keypoints import GOAL_KEYPOINTS, PAYLOAD_KEYPOINTS, KeypointCamera, payload_keypoints
+
+DISTANCE_ERROR = 0.15
+"""Of a ball's distance by the size of its cone, a far and blurred one [-]."""
+
+
+@dataclass(frozen=True)
+class DetectorParams:
+    """What ball and goal look like."""
+
+    ball_hue_deg: tuple[float, float] = (46.0, 88.0)  # tennis ball: 62 to 68, and what a wrong white balance makes of it
+    goal_hue_deg: tuple[float, float] = (105.0, 165.0)  # the green field of the square; as above
+    saturation: float = 0.3  # least share of colour in a pixel [-]
+    brightness: float = 0.06  # least value of a pixel [-]
+    ball_distance: tuple[float, float] = (0.15, 4.0)  # of the ball from the lens [m]
+    field_share: float = 0.84  # side of the goal's coloured field over that of the square with its rim [-]
+    coverage: float = 0.35  # share of the ball's outline that must be seen
+    misfit: float = 0.1  # largest RMS of the outline from its cone, in half-angles
+    side_tolerance: float = 0.3  # of the goal's sides from what they must be where height and attitude are known [-]
+
+
+@dataclass(frozen=True)
+class BallSeen:
+    """The ball as a cone of rays."""
+
+    ray_c: np.ndarray  # unit, to the centre, shape (3,), camera frame
+    half_angle: float  # [rad]
+    score: float  # share of the outline seen, less the misfit, less the way from where it was
+
+
+@dataclass(frozen=True)
+class GoalSeen:
+    """The goal square by its corners."""
+
+    rays_c: np.ndarray  # unit, to the outer corners, clockwise in the image, shape (4, 3), camera frame
+    score: float
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What one frame shows; None where nothing was found."""
+
+    ball: BallSeen | None
+    goal: GoalSeen | None
+
+
+@dataclass(frozen=True)
+class Known:
+    """What is known before looking; each part may be left out."""
+
+    up_c: np.ndarray | None = None  # the world's up in the camera frame, unit, shape (3,)
+    height: float | None = None  # of the lens above the ground [m]; with up_c the goal's size is checked
+    ball_distance: tuple[float, float] | None = None  # of the ball from the lens [m], narrower than the parameters'
+    ball_ray_c: np.ndarray | None = None  # to the ball a frame ago, unit, shape (3,)
+    within: float = math.radians(12.0)  # of ball_ray_c [rad]
+
+
+class Detector:
+    """Finds ball and goal in frames of one lens."""
+
+    def __init__(self, lens: Fisheye, payload_radius: float, goal_side: float, params: DetectorParams | None = None) -> None:
+        """Take the lens and the true sizes.
+
+        Args:
+            lens: that took the frames.
+            payload_radius: [m]. goal_side: with the rim [m].
+            params: colours and limits.
+        """
+        self.lens, self.params = lens, params or DetectorParams()
+        self.radius, self.side = payload_radius, goal_side
+        shape = (lens.params.height, lens.params.width)
+        v, u = np.mgrid[: shape[0], : shape[1]]
+        edge = self.lens.edge_radius
+        plane = np.hypot((u - lens.params.cx) / lens.params.fx, (v - lens.params.cy) / lens.params.fy)
+        self._in_view = (plane < edge).astype(np.uint8)
+
+    def detect(self, image: np.ndarray, known: Known | None = None) -> Seen:
+        """Find ball and goal.
+
+        Args:
+            image: BGR, uint8, shape (H, W, 3) of the lens.
+            known: narrows what is looked for.
+
+        Raises:
+            ValueError: an image of another size or type.
+        """
+        shape = (*self._in_view.shape, 3)
+        if image.shape != shape or image.dtype != np.uint8:
+            raise ValueError(f"image of shape {image.shape} and type {image.dtype} came; expected {shape} and uint8")
+        p, known = self.params, known or Known()
+        colours = colours_of(image)
+        ball = colour_maps(colours, p.ball_hue_deg, p.saturation, p.brightness, self._in_view, "yellow")
+        goal = colour_maps(colours, p.goal_hue_deg, p.saturation, p.brightness, self._in_view, "green")
+        return Seen(self._ball(*ball, known), self._goal(*goal, colours.bright, known))
+
+    def _ball(self, mask: np.ndarray, level: np.ndarray, known: Known) -> BallSeen | None:
+        """The blob whose edge is the best cone."""
+        best: BallSeen | None = None
+        for centre, radius in circles_of(mask):
+            found = self._cone(level, centre, radius)
+            if found is None or not self._in_place(found.ray_c, found.half_angle, known):
+                continue
+            score = found.score
+            if known.ball_ray_c is not None:
+                score -= 0.5 * math.acos(min(1.0, float(found.ray_c @ known.ball_ray_c))) / known.within
+            if best is None or score > best.score:
+                best = BallSeen(found.ray_c, found.half_angle, score)
+        return best
+
+    def _cone(self, level: np.ndarray, centre: np.ndarray, radius: float) -> BallSeen | None:
+        """The cone about a circle [px]; looked for again from where it was found, as part of a ball may hide."""
+        found = None
+        for _ in range(2):
+            edge = polar_edge(level, centre, radius)
+            if len(edge.points) < 8:
+                return None
+            ray, half_angle, misfit, share = cone_fit(rays_of(self.lens, edge.points))
+            seen = edge.share * share
+            if seen < 0.5 * self.params.coverage or not half_angle > 0.0:
+                return None
+            found = BallSeen(ray, half_angle, seen - misfit) if seen >= self.params.coverage else None
+            middle, inside = self.lens.project(torch.from_numpy(ray[None]))
+            if misfit > self.params.misfit or not bool(inside):
+                return None
+            centre = middle[0].numpy()
+            radius = float(np.median(np.linalg.norm(edge.points - centre, axis=1)))
+        return found
+
+    def _in_place(self, ray: np.ndarray, half_angle: float, known: Known) -> bool:
+        """Whether a ball can be where a cone puts it: its true radius says how far off it is."""
+        distance = self.radius / max(math.sin(half_angle), 1e-9)
+        low, high = known.ball_distance or self.params.ball_distance
+        if not low <= distance <= high:
+            return False
+        if known.ball_ray_c is not None and float(ray @ known.ball_ray_c) < math.cos(known.within):
+            return False
+        if known.up_c is None or known.height is None:
+            return True
+        # A smaller thing on the ground would, were it the ball, lie below the ground.
+        return known.height + distance * float(ray @ known.up_c) > -DISTANCE_ERROR * distance
+
+    def _goal(self, mask: np.ndarray, level: np.ndarray, bright: np.ndarray, known: Known) -> GoalSeen | None:
+        """The blob that is the best square with a rim."""
+        best: GoalSeen | None = None
+        for contour in outlines_of(mask):
+            found = fit_goal(self.lens, self.params.field_share, contour, level, bright)
+            if found is not None and self._right_size(found[0], known) and (best is None or found[1] > best.score):
+                best = GoalSeen(*found)
+        return best
+
+    def _right_size(self, rays_c: np.ndarray, known: Known) -> bool:
+        """Whether the corners lie on the ground, a goal's side from one another; true where that cannot be told."""
+        if known.up_c is None or known.height is None:
+            return True
+        down = -rays_c @ known.up_c
+        if down.min() < 0.02:
+            return False
+        corners = rays_c * (known.height / down)[:, None]
+        sides = np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1)
+        return bool(np.all(np.abs(sides / self.side - 1.0) < self.params.side_tolerance))
+
+
+def ordered_corners(rays_c: np.ndarray, rot_wc: np.ndarray) -> np.ndarray:
+    """Corners in the order of `camera.keypoints.goal_square`, by where they lie on the ground.
+
+    Args:
+        rays_c: to the corners, in turn about the square, shape (4, 3), camera frame; all below the horizon.
+        rot_wc: camera to world, shape (3, 3).
+
+    Returns:
+        The same rays, shape (4, 3).
+    """
+    rays_w = rays_c @ rot_wc.T
+    ground = rays_w[:, :2] / np.maximum(-rays_w[:, 2:], 1e-3)
+    off = ground - ground.mean(axis=0)
+    wanted = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0]])
+    orders = [np.roll(base, shift) for base in (np.arange(4), np.arange(4)[::-1]) for shift in range(4)]
+    best = max(orders, key=lambda order: float(np.sum(off[order] * wanted)))
+    return rays_c[best]
+
+
+def detected_keypoints(
+    camera: KeypointCamera, seen: Seen, rot_wb: np.ndarray, rot_source: np.ndarray | None = None
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Keypoints of the training camera from what was seen, by the functions that training calls.
+
+    The ball's cone gives its distance, its true radius being known, and from there on the box is training's own, with the
+    bias that training's has: extremes are exact to second order in the half-angle, 2.2e-4 of normalised coordinates at a rope's
+    length. An outline that looks too large by a share s thus moves each side of the box by s half-angles.
+
+    Args:
+        camera: of training.
+        seen: in the camera that took the frame.
+        rot_wb: attitude of the vehicle, body to world, shape (3, 3): says which corner is which.
+        rot_source: rotation from the camera that took the frame to that of training, shape (3, 3); left out, the same.
+
+    Returns:
+        Normalised keypoints [-], shape (8, 2), and validity, shape (8,); zero and invalid where nothing was seen.
+    """
+    turn = np.eye(3) if rot_source is None else rot_source
+    points = torch.zeros(GOAL_KEYPOINTS + PAYLOAD_KEYPOINTS, 2)
+    valid = torch.zeros(GOAL_KEYPOINTS + PAYLOAD_KEYPOINTS, dtype=torch.bool)
+    if seen.goal is not None:
+        rot_wc = rot_wb @ camera.rot_cb.double().numpy().T
+        rays = ordered_corners(seen.goal.rays_c @ turn.T, rot_wc)
+        corners, ok = camera.fisheye.project_normalized(torch.from_numpy(rays).float(), clip=True)
+        points[:GOAL_KEYPOINTS], valid[:GOAL_KEYPOINTS] = corners, ok
+    if seen.ball is not None:
+        ball_c = turn @ seen.ball.ray_c * (camera.params.payload_radius / math.sin(seen.ball.half_angle))
+        box, ok = payload_keypoints(camera, torch.from_numpy(ball_c[None]).float())
+        points[GOAL_KEYPOINTS:], valid[GOAL_KEYPOINTS:] = box[0], ok[0]
+    return points, valid

@@ -1,0 +1,29 @@
+"""What goes into a tick besides poses, and what comes out of it."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Words:
+    """What the operator said since the last tick."""
+
+    arm: bool = False
+    land: bool = False
+    abort: bool = False
+
+
+@dataclass
+class Decision:
+    """All that one tick saw and decided; plain values, as they are recorded."""
+
+    time: float
+    state: str
+    reason: str
+    command: tuple[float, ...] | None = None  # as sent [N, rad/s]
+    action: list[float] | None = None  # of the policy, normalised
+    observation: list[float] | None = None
+    keypoints: list | None = None
+    valid: list | None = None
+    release: bool = False  # the policy asked for it and it was done
+    note: str = ""
+    seen: list | None = None  # of a camera's newest frame since the last tick; see `hil.poses.sight.Sight`

@@ -1,0 +1,423 @@
+"""The runner: each tick from poses to a command. Nothing raises past it; what goes wrong ends in the abort state.
+
+A tick depends on its time, the poses that came, the back-end's status and the operator's words, and on nothing else;
+these are recorded, so that a replay decides alike to the last bit.
+"""
+
+import math
+import traceback
+from collections.abc import Callable
+from dataclasses import asdict
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from hil.backends.base import FAILED, FOLLOW, LAND, PENDING, Backend, Status
+from hil.backends.base import HOLD as HELD
+from hil.control.aim import Aim
+from hil.control.decision import Decision, Words
+from hil.control.hovering import Hovering
+from hil.control.latch import Latch
+from hil.control.safety import Guard, failed_checks, fence_broken, outside
+from hil.control.states import FLYING, Inputs, Machine, State
+from hil.params import HilParams
+from hil.poses.gate import HOLD, Tether
+from hil.poses.pose import GOAL, PAYLOAD, VEHICLE, Pose, Vector
+from hil.poses.sight import Sight, Sights
+from hil.poses.track import BodyState, Track
+from hil.sources.images import Hint
+from visthrow.onboard.hover import GRAVITY
+from visthrow.onboard.pilot import Pilot, PilotOutput
+from visthrow.onboard.policy import Policy
+
+STILL_OFFSET, STILL_SPEED = 0.05, 0.25
+"""Vehicle off its hover point [m], vehicle and payload speed over 0.2 s [m/s] that count as quiet: half of what the
+policies were trained to start from."""
+
+REACQUIRE = 1.0
+"""Before the vehicle is ours, a body that was refused or gone for this long is taken wherever it is [s]."""
+
+HAND_OVER_SPEED, HAND_OVER_TILT = 1.0, math.radians(20.0)
+"""Below these the autopilot's own hold takes over after a throw: braking out of 60 deg is done on poses [m/s, rad]."""
+
+GROUND = 0.12
+"""Height of the vehicle that counts as landed [m]."""
+
+LEVEL_TIME = 0.5
+"""An aborted run without poses levels the vehicle for this long and then falls silent: the autopilot's failsafes act [s]."""
+
+
+def calm(vehicle: BodyState) -> bool:
+    """Whether a vehicle is slow and level enough to be handed over."""
+    x, y, _, _ = vehicle.quat or (0.0, 0.0, 0.0, 1.0)
+    return math.hypot(*vehicle.vel) < HAND_OVER_SPEED and 1.0 - 2.0 * (x * x + y * y) > math.cos(HAND_OVER_TILT)
+
+
+class Runner:
+    """Flies one vehicle.
+
+    Attributes:
+        machine: the state. pilot: the policy. guard: with its counts.
+        tracks: by body. latch: of the release, with the landings so far.
+        hovering: on poses, where no policy flies. errors: tracebacks of what was caught.
+        mass: of vehicle, rope and payload [kg]. alone: of the vehicle [kg].
+        mount_b: where the rope hangs on the vehicle [m]. seen_goal_w: target as of the last tick [m].
+        spent: time that parts of the last tick took [s]; those that it did not do are missing.
+        watcher: called with each pose's body and track once it was taken; None for nobody.
+    """
+
+    def __init__(self, params: HilParams, policy: Policy, backend: Backend, mechanism_lag: float = 0.0) -> None:
+        """Build all parts.
+
+        Args:
+            params: the run.
+            policy: on the CPU.
+            backend: where commands go.
+            mechanism_lag: of the release mechanism, from its command to separation [s].
+
+        Raises:
+            MismatchError: the camera is not the one that the policy was trained with.
+            PolicyError: the policy is incomplete.
+            RunError: the mechanism is slower than the policy was trained for.
+        """
+        self.params, self.backend = params, backend
+        self.pilot = Pilot(policy, params.camera)
+        contract = policy.contract
+        rope, body, action = contract["rope"], contract["vehicle"]["body"], contract["action"]
+        self.alone, self.mass = body["mass"], body["mass"] + rope["rope_mass"] + rope["payload_mass"]
+        self.hang = -rope["mount"][2] + rope["length"] + rope["payload_offset"]
+        height, later = params.landing_height, params.delay.command if params.delay.compensate else 0.0
+        self.latch = Latch(self.pilot.lag, mechanism_lag, self.hang, params.check.rope_tolerance, height, later)
+        self._reach = math.hypot(*rope["mount"]) + rope["length"] + rope["payload_offset"] + params.check.rope_tolerance
+        self.guard = Guard(params.guard, float(action["max_thrust"]), tuple(map(float, action["max_rate"])))
+        self.tracks = {name: Track(frames, params.gate, params.estimate, name == VEHICLE) for name, frames in params.frames.items()}
+        self.machine = Machine(params.states, params.throws, params.observe)
+        heading = math.radians(params.check.heading_deg)
+        self.hovering = Hovering(params.home_w, heading, float(action["max_thrust"]), self.pilot.period)
+        self._aged = 0.5 * sum(contract["observation"]["latency"])
+        self.aim = Aim(params.aim, self._aged + self.latch.lag, height, rope)
+        self._acted = State.IDLE
+        self.errors: list[str] = []
+        self.mount_b: Vector = tuple(map(float, rope["mount"]))
+        self.seen_goal_w: Vector | None = None
+        self.spent: dict[str, float] = {}
+        self._untaken: Exception | None = None
+        self.watcher: Callable[[str, Track], None] | None = None
+        self.sights = Sights(self.pilot.camera, params.images.hold) if params.keypoints == "detector" else None
+        self._sight: Sight | None = None
+
+    def tick(self, now: float, poses: list[Pose], status: Status, words: Words, recording: bool = True) -> Decision:
+        """Decide one tick and send its command.
+
+        Args:
+            now: on the runner's clock [s].
+            poses: raw, that have come since the last tick.
+            status: of the back-end, at this tick.
+            words: of the operator.
+            recording: whether all was recorded so far.
+        """
+        self.spent = {}
+        try:
+            return self._tick(now, poses, status, words, recording)
+        except Exception as error:  # in flight nothing raises past the runner
+            if len(self.errors) < 100:
+                self.errors.append(traceback.format_exc())
+            self.machine.step(now, Inputs(3, 3, failure=f"{type(error).__name__}: {error}"))
+            self.backend.stop_release()
+            if self.machine.flown:
+                self.backend.abort(now)
+            return Decision(now, self.machine.state.value, self.machine.reason, note="exception")
+
+    def rehearse(self, now: float, status: Status, words: Words) -> None:
+        """Tick on what has come so far, and look through the policy's eyes even where it is not flying. For copies alone.
+
+        Args:
+            now, status, words: see :meth:`tick`.
+        """
+        decision = self.tick(now, [], status, words)
+        bodies = {name: self._state(track, now) for name, track in self.tracks.items()}
+        vehicle, payload, goal_w = bodies[VEHICLE], bodies[PAYLOAD], self._goal(bodies)
+        if decision.action is None and None not in (vehicle, payload, goal_w) and vehicle.quat:
+            self._show(vehicle, payload, goal_w, decision)
+
+    def look(self, sights: list[Sight]) -> None:
+        """Take in what a camera saw since the last tick; of several frames the newest counts."""
+        if sights:
+            self._sight = sights[-1]
+
+    def hint(self, now: float) -> Hint | None:
+        """What a detector is told before it looks: vehicle and, while the payload hangs, how far off it can be."""
+        vehicle = self.tracks[VEHICLE].state(now)
+        if vehicle is None or vehicle.quat is None or self.tracks[VEHICLE].gate.level(now) >= HOLD:
+            return None
+        hangs = self.latch.at is None
+        return Hint(vehicle.pos, vehicle.quat, (0.5 * self.hang, 1.4 * self.hang) if hangs else None)
+
+    def take(self, poses: list[Pose]) -> None:
+        """Take in poses that have come before the tick that they belong to, so that the tick has less to do.
+
+        A tick of the rest decides as one of all of them would: what goes wrong here comes up there.
+        """
+        try:
+            if self._untaken is None:
+                self._take(poses)
+                for track in self.tracks.values():
+                    track.settle()
+        except Exception as error:  # as in tick
+            self._untaken = error
+
+    def _take(self, poses: list[Pose]) -> None:
+        for pose in poses:
+            track = self.tracks.get(pose.body)
+            took = track is not None and track.update(pose, self._tether(pose)) is None
+            if took and self.watcher is not None:
+                self.watcher(pose.body, track)
+            if took and pose.body == PAYLOAD:
+                self.latch.follow(pose.arrival - pose.transit(self.params.delay.source), track.gate.last.pos)
+
+    def _tick(self, now: float, poses: list[Pose], status: Status, words: Words, recording: bool) -> Decision:
+        begin = perf_counter()
+        if self._untaken is not None:
+            error, self._untaken = self._untaken, None
+            raise error
+        self._take(poses)
+        self.latch.overdue(now)
+        if self.machine.state in (State.IDLE, State.CHECK):
+            for track in self.tracks.values():
+                # On the ground a body may be carried about out of sight; in flight what has jumped stays refused.
+                if REACQUIRE < track.gate.age(now) < math.inf:
+                    track.restart()
+        bodies = {name: self._state(track, now) for name, track in self.tracks.items()}
+        vehicle, payload = bodies[VEHICLE], bodies[PAYLOAD]
+        goal_w = self.seen_goal_w = self._goal(bodies)
+        state = self.machine.step(now, self._inputs(now, vehicle, payload, goal_w, status, words, recording))
+        # The last tick may itself have ended in another state than it acted in: a command refused, an exception.
+        before, self._acted = self._acted, state
+        if state is not before:
+            self._entered(now, before, state, vehicle)
+        decision = Decision(now, state.value, self.machine.reason)
+        if self._sight is not None and self.sights is not None:
+            decision.seen = self._sight.values()
+            if vehicle is not None and vehicle.quat is not None:
+                self.sights.take(self._sight, vehicle.quat)
+            self._sight = None
+        self.spent["estimate"] = perf_counter() - begin
+        wanted = self._command(now, state, vehicle, payload, goal_w, decision)
+        self._ask(now, state, vehicle, status)
+        if status.mode in (HELD, LAND) and state not in (State.READY, State.ARMED):
+            wanted = None  # handed over
+        if state is State.ABORT and not (status.connected and self.machine.flown):
+            wanted = None  # it has taken over, or hears nothing, or was never ours
+        if self.params.observe and decision.action is None and None not in (vehicle, payload, goal_w) and vehicle.quat:
+            self._show(vehicle, payload, goal_w, decision)
+        if wanted is None:
+            self.guard.reset()
+        else:
+            decision.command = self.guard.check(wanted)
+            if decision.command is None:
+                self.machine.step(now, Inputs(3, 3, failure=f"command {wanted} is not finite"))
+                decision.state, decision.reason = self.machine.state.value, self.machine.reason
+                decision.release = False
+                self.backend.stop_release()
+            else:
+                ready = perf_counter()
+                self.backend.send(decision.command, now)
+                self.spent["send"] = perf_counter() - ready
+                self.spent["total"] = perf_counter() - begin
+        hovers = state in (State.READY, State.ARMED) and status.mode == FOLLOW and decision.command is not None
+        self.hovering.note(decision.command[0] / (self.mass * GRAVITY) if hovers else None)
+        if decision.release:
+            self.backend.release(self.latch.trip(now, goal_w))
+        if state is State.ABORT and self.machine.flown:
+            self.backend.abort(now)
+        return decision
+
+    def _tether(self, pose: Pose) -> Tether | None:
+        """The cable's other end for a pose of vehicle or payload while the payload hangs; None on the ground and after."""
+        other = {VEHICLE: PAYLOAD, PAYLOAD: VEHICLE}.get(pose.body)
+        if other is None or self.latch.at is not None or self.machine.state not in FLYING:
+            return None
+        pos = self.tracks[other].expected(pose.arrival)
+        fresh = self.tracks[other].gate.level(pose.arrival) < HOLD
+        return None if pos is None else Tether(pos, self._reach if fresh else math.inf)
+
+    def _ask(self, now: float, state: State, vehicle: BodyState | None, status: Status) -> None:
+        """Tell the autopilot what it is to do: follow, or hold and land by itself where it can."""
+        if state in (State.READY, State.ARMED, State.THROW):
+            self.backend.ask(FOLLOW, now)
+            if status.mode != FOLLOW:
+                self.hovering.reset()
+        elif state is State.RECOVER and self.backend.holds:
+            stale = vehicle is None or self.tracks[VEHICLE].gate.level(now) >= HOLD
+            if stale or calm(vehicle) or status.mode == HELD:
+                self.backend.ask(HELD, now)
+        elif state is State.LAND and self.backend.holds:
+            self.backend.ask(LAND, now)
+
+    def _state(self, track: Track, now: float) -> BodyState | None:
+        """State of a body, carried forward to the age that the policy was trained with where the config says so."""
+        delay = self.params.delay
+        last = track.gate.last
+        age = track.gate.age(now) + (delay.source if last is None else last.transit(delay.source))
+        ahead = age - self._aged + delay.command if delay.compensate and math.isfinite(age) else 0.0
+        return track.state(now, ahead)
+
+    def _goal(self, bodies: dict[str, BodyState | None]) -> Vector | None:
+        if GOAL not in self.tracks:
+            return self.params.goal_w
+        goal = bodies[GOAL]
+        return None if goal is None else goal.pos
+
+    def _inputs(
+        self, now: float, vehicle: BodyState | None, payload: BodyState | None, goal_w: Vector | None, status: Status,
+        words: Words, recording: bool,
+    ) -> Inputs:  # fmt: skip
+        p, state = self.params, self.machine.state
+        known = vehicle is not None and payload is not None and goal_w is not None
+        hanging = payload if self.latch.at is None else None
+        failure = status.fault
+        if status.release == FAILED and state in (State.THROW, State.RECOVER):
+            failure = "the release was refused or not answered"
+        checks = ["a body has no pose yet"]
+        # After a throw the payload may have been hung on again; only the operator's next word makes the latch new.
+        if known and state is not State.THROW and (self.latch.at is None or state is State.READY):
+            checks = failed_checks(p.check, p.fence, vehicle, payload, goal_w, p.home_w, self.hang)
+            if GOAL in self.tracks and self.tracks[GOAL].gate.level(now) >= HOLD:
+                checks.append("the goal's pose is stale")
+            checks += self._thrust_off()
+        return Inputs(
+            self.tracks[VEHICLE].gate.level(now),
+            self.tracks[PAYLOAD].gate.level(now),
+            status.connected,
+            tuple(checks),
+            # While landing the fence's floor is left on purpose.
+            fence_broken(p.fence, vehicle, hanging) if vehicle is not None and state is not State.LAND else None,
+            # What has not been answered is not over: the payload may yet come off.
+            vehicle is not None and state in (State.ARMED, State.RECOVER) and status.release != PENDING
+            and self._still(vehicle, payload, status.mode == HELD),
+            self.latch.separated(now),
+            self.latch.at is not None,
+            self.aim.given_up(now),
+            vehicle is not None and vehicle.pos[2] < GROUND,
+            failure,
+            words.arm,
+            words.land,
+            words.abort,
+            recording,
+            status.mode == FOLLOW,
+        )
+
+    def _thrust_off(self) -> list[str]:
+        """Whether hovering takes another thrust than the weight: then the calibration is wrong, or the battery low."""
+        p, ratio = self.params, self.hovering.share()
+        if p.backend == "dry-run" or ratio is None:
+            return []
+        allowed = getattr(p, p.backend).thrust.tolerance
+        if abs(ratio - 1.0) <= allowed:
+            return []
+        return [f"hovering takes {ratio:.2f} times the weight, within {allowed:g} of 1 expected: calibrate the thrust"]
+
+    def _still(self, vehicle: BodyState, payload: BodyState | None, held: bool) -> bool:
+        """Whether all is quiet, at the hover point or where the autopilot holds the vehicle."""
+        if not held and math.dist(vehicle.pos, self.params.home_w) > STILL_OFFSET:
+            return False
+        moving = [VEHICLE] + ([PAYLOAD] if self.latch.at is None and payload is not None else [])
+        return all(self.tracks[name].calm_speed() < STILL_SPEED for name in moving)
+
+    def _entered(self, now: float, before: State, state: State, vehicle: BodyState | None) -> None:
+        """What a change of state brings with it."""
+        if before is State.THROW:
+            self.backend.stop_release()
+        if state is State.ARMED:
+            self.latch.rearm()
+            self.backend.rearm()
+        if state is State.THROW:
+            self.pilot.start()
+            self.latch.begin(now)
+            self.aim.begin()
+        if state in (State.READY, State.RECOVER) and before in (State.CHECK, State.THROW):
+            self.hovering.hold(self.params.home_w)
+        if state in (State.LAND, State.ABORT) and vehicle is not None:
+            self.hovering.hold(vehicle.pos)
+
+    def _command(
+        self, now: float, state: State, vehicle: BodyState | None, payload: BodyState | None, goal_w: Vector | None,
+        decision: Decision,
+    ) -> tuple[float, ...] | None:  # fmt: skip
+        """What to send in a state, before the guard; None for nothing."""
+        if state not in FLYING and state is not State.ABORT:
+            return None
+        mass = self.mass if self._carries(now, vehicle, payload) else self.alone
+        if vehicle is None or vehicle.quat is None or self.tracks[VEHICLE].gate.level(now) >= HOLD:
+            if state is State.ABORT and now - self.machine.since > LEVEL_TIME:
+                return None
+            decision.note = "level: no fresh pose"
+            return (mass * GRAVITY, 0.0, 0.0, 0.0)
+        if state is State.THROW:
+            return self._throw(vehicle, payload, goal_w, decision)
+        if state in (State.LAND, State.ABORT):
+            self.hovering.descend()
+        return self.hovering.command(vehicle, mass)
+
+    def _carries(self, now: float, vehicle: BodyState | None, payload: BodyState | None) -> bool:
+        """Whether the payload hangs on the vehicle, by the latch and by its own poses."""
+        fresh = payload is not None and self.tracks[PAYLOAD].gate.level(now) < HOLD
+        if vehicle is None:
+            return self.latch.at is None
+        return self.latch.hangs_still(now, vehicle.pos, payload.pos if fresh else None)
+
+    def _throw(self, vehicle: BodyState, payload: BodyState, goal_w: Vector, decision: Decision) -> tuple[float, ...]:
+        out = self._show(vehicle, payload, goal_w, decision)
+        if out.release[0] and self.latch.at is None:
+            fence = self.params.fence
+            beyond = outside(payload.pos, fence.payload_low, fence.payload_high)
+            wrong = f"payload {beyond}" if beyond else self.aim.astray(decision.time, payload, goal_w)
+            decision.release = wrong is None
+            if wrong is not None:
+                decision.note = f"release refused: {wrong}"
+                self.pilot.not_released()
+        return tuple(map(float, out.command[0]))
+
+    def _show(self, vehicle: BodyState, payload: BodyState, goal_w: Vector, decision: Decision) -> PilotOutput:
+        """Show the policy what there is to see, and note what it makes of it."""
+        attached = not self.latch.separated(decision.time)
+        views = [np.array([v]) for v in (vehicle.pos, vehicle.quat, vehicle.vel, vehicle.rate, payload.pos)]
+        keypoints = None if self.sights is None else self.sights.keypoints(decision.time)
+        out: PilotOutput = self.pilot.act(*views, np.array(goal_w), attached, keypoints, decision.time)
+        self.spent["observation"], self.spent["policy"] = self.pilot.spent
+        decision.action = out.action[0].tolist()
+        decision.observation = out.observation[0].tolist()
+        if out.keypoints is not None:
+            decision.keypoints, decision.valid = out.keypoints[0].tolist(), out.valid[0].tolist()
+        return out
+
+    def problems(self) -> list[str]:
+        """What speaks against a throw as of the last poses."""
+        bodies = {name: track.state(0.0) for name, track in self.tracks.items()}
+        goal_w = self._goal(bodies)
+        missing = [f"no good pose of the {name}" for name, state in bodies.items() if state is None]
+        if missing:
+            return missing
+        p = self.params
+        return failed_checks(p.check, p.fence, bodies[VEHICLE], bodies[PAYLOAD], goal_w, p.home_w, self.hang)
+
+    def summary(self) -> dict[str, Any]:
+        """Counts of the run so far."""
+        return {
+            "state": self.machine.state.value,
+            "reason": self.machine.reason,
+            "aborted": self.machine.aborted,
+            "throws": self.machine.throws,
+            "cancelled": self.machine.cancelled,
+            "latches": self.latch.count,
+            "stuck": self.latch.stuck,
+            "held_back": self.aim.held,
+            "landings": [asdict(landing) for landing in self.latch.landings],
+            "guard": {k: getattr(self.guard, k) for k in ("clipped", "slewed", "refused")},
+            "bodies": {
+                name: {"accepted": track.accepted, "refused": track.gate.refused, "filter_lag": track.filter.lag}
+                for name, track in self.tracks.items()
+            },
+            "errors": self.errors,
+        }

@@ -1,0 +1,218 @@
+"""The state machine of a run: pure logic, a time-out in every state.
+
+    idle -> check -> ready -> armed -> throw -> recover -> ready (more throws) or land -> done
+    any -> abort -> done
+
+``idle`` waits for poses and the autopilot, ``check`` for the checks to hold for a while. From ``ready`` on the runner
+commands: its hover controller holds the vehicle. Each throw needs its own word of the operator.
+"""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+from hil.poses.gate import ABORT, HOLD
+
+
+class State(StrEnum):
+    """Where a run is."""
+
+    IDLE = "idle"
+    CHECK = "check"
+    READY = "ready"
+    ARMED = "armed"
+    THROW = "throw"
+    RECOVER = "recover"
+    LAND = "land"
+    ABORT = "abort"
+    DONE = "done"
+
+
+FLYING = (State.READY, State.ARMED, State.THROW, State.RECOVER, State.LAND)
+"""States in which the runner commands the vehicle."""
+
+
+@dataclass(frozen=True)
+class StateParams:
+    """Time-outs and durations [s].
+
+    Raises:
+        ValueError: one of them is 0 or less.
+    """
+
+    idle: float  # for poses and autopilot to appear; then abort
+    check: float  # for the checks to pass; then abort
+    check_hold: float  # for which all checks must hold
+    ready: float  # for the operator; then land
+    armed: float  # for the swing to become quiet; then back to ready, not armed
+    armed_least: float  # in armed before the throw
+    quiet: float  # for which vehicle and payload must be quiet
+    throw: float  # for the policy to release; then recover with the payload
+    recover: float  # for the hover to become quiet again; then land
+    land: float  # for the descent; then done
+    abort: float  # after which an aborted run ends
+
+    def __post_init__(self) -> None:
+        if min(vars(self).values()) <= 0.0:
+            raise ValueError(f"states {vars(self)}: expected times above 0 s")
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """What one tick knows. Levels are those of `hil.poses.gate`."""
+
+    vehicle: int
+    payload: int
+    connected: bool = True  # the autopilot is there, in the mode and armed as it must be
+    failed_checks: tuple[str, ...] = ()
+    fence: str | None = None  # which fence is broken
+    still: bool = False  # vehicle at home and vehicle and payload slow
+    separated: bool = False  # latch plus trained lag has passed in this throw
+    released: bool = False  # the latch has tripped in this throw
+    astray: bool = False  # releases that were asked for were held back, and nothing better came
+    grounded: bool = False  # the descent has arrived
+    failure: str | None = None  # of policy, guard, release or of the runner itself
+    arm: bool = False  # the operator's words
+    land: bool = False
+    abort: bool = False
+    recording: bool = True  # all could be recorded so far
+    following: bool = True  # the autopilot follows commands
+
+
+class Machine:
+    """The state, since when, and why.
+
+    Attributes:
+        state: now. reason: of the last change. since: time of it [s].
+        throws: throws begun. cancelled: throws that ended without a release.
+        flown: whether this run has ever commanded the vehicle. aborted: whether it was ended by an abort.
+    """
+
+    def __init__(self, params: StateParams, throws: int, patient: bool = False) -> None:
+        """Begin in idle.
+
+        Args:
+            params: time-outs.
+            throws: number after which the run lands.
+            patient: whether idle and check may last for ever, as where poses are only looked at.
+        """
+        self.params, self.most, self.patient = params, throws, patient
+        self.state, self.reason = State.IDLE, "start"
+        self.since: float | None = None
+        self.throws = self.cancelled = 0
+        self.flown = self.aborted = False
+        self._held: float | None = None  # since when what must last has lasted
+
+    def step(self, now: float, seen: Inputs) -> State:
+        """Move on by one tick; returns the state to act in."""
+        if self.since is None:
+            self.since = now
+        urgent = self._urgent(seen)
+        if self.state is State.ABORT:
+            # What was never ours needs no descent.
+            if not self.flown or now - self.since > self.params.abort:
+                self._go(now, State.DONE, self.reason)
+        elif self.state is not State.DONE:
+            if urgent is not None:
+                self._go(now, State.ABORT, urgent)
+            else:
+                _STEPS[self.state](self, now, seen)
+        return self.state
+
+    def _urgent(self, seen: Inputs) -> str | None:
+        if seen.abort:
+            return "the operator said abort"
+        if seen.failure is not None:
+            return seen.failure
+        if self.state not in FLYING:
+            return None
+        if seen.vehicle >= ABORT:
+            return "no new pose of the vehicle"
+        if seen.fence is not None:
+            return f"fence: {seen.fence}"
+        if not seen.connected:
+            return "the autopilot is silent, disarmed or in another mode"
+        return None
+
+    def _go(self, now: float, state: State, reason: str) -> None:
+        if self.state is State.THROW and state is not State.THROW and reason != "separated":
+            self.cancelled += 1
+        self.state, self.reason, self.since, self._held = state, reason, now, None
+        self.throws += state is State.THROW
+        self.flown |= state in FLYING
+        self.aborted |= state is State.ABORT
+
+    def _lasted(self, now: float, holds: bool, time: float) -> bool:
+        """Whether a condition has now held for a time."""
+        if not holds:
+            self._held = None
+            return False
+        if self._held is None:
+            self._held = now
+        return now - self._held >= time - 1e-9
+
+    def _late(self, now: float) -> bool:
+        return now - self.since > getattr(self.params, self.state.value)
+
+    def _idle(self, now: float, seen: Inputs) -> None:
+        if max(seen.vehicle, seen.payload) < HOLD and seen.connected:
+            self._go(now, State.CHECK, "poses and autopilot are there")
+        elif self._late(now) and not self.patient:
+            missing = [n for n, bad in (("vehicle", seen.vehicle >= HOLD), ("payload", seen.payload >= HOLD)) if bad]
+            missing += [] if seen.connected else ["autopilot ready"]
+            self._go(now, State.ABORT, f"no {', no '.join(missing)} within {self.params.idle:g} s")
+
+    def _check(self, now: float, seen: Inputs) -> None:
+        good = not seen.failed_checks and max(seen.vehicle, seen.payload) < HOLD and seen.connected
+        if self._lasted(now, good, self.params.check_hold):
+            self._go(now, State.READY, "checks passed")
+        elif self._late(now) and not self.patient:
+            failed = "; ".join(seen.failed_checks) or "poses or autopilot come and go"
+            self._go(now, State.ABORT, f"checks: {failed}")
+
+    def _ready(self, now: float, seen: Inputs) -> None:
+        if seen.land or self._late(now):
+            self._go(now, State.LAND, "the operator said land" if seen.land else "nobody armed a throw")
+        elif seen.arm and seen.following and seen.recording and not seen.failed_checks and seen.payload < HOLD:
+            self._go(now, State.ARMED, "the operator armed this throw")
+
+    def _armed(self, now: float, seen: Inputs) -> None:
+        long = now - self.since >= self.params.armed_least
+        if seen.land:
+            self._go(now, State.LAND, "the operator said land")
+        elif max(seen.vehicle, seen.payload) >= HOLD or not (seen.recording and seen.following):
+            self._go(now, State.READY, "disarmed: stale poses, not followed, or the recording failed")
+        elif self._lasted(now, seen.still and not seen.failed_checks, self.params.quiet) and long:
+            self._go(now, State.THROW, "quiet")
+        elif self._late(now):
+            self._go(now, State.READY, "disarmed: the swing did not become quiet")
+
+    def _throw(self, now: float, seen: Inputs) -> None:
+        if seen.separated:
+            self._go(now, State.RECOVER, "separated")
+        elif seen.released:
+            return  # what is latched cannot be taken back: fly on until it is off
+        elif max(seen.vehicle, seen.payload) >= HOLD:
+            self._go(now, State.RECOVER, "stale poses")
+        elif seen.astray:
+            self._go(now, State.RECOVER, "the policy released where it would miss")
+        elif self._late(now):
+            self._go(now, State.RECOVER, "the policy did not release in time")
+
+    def _recover(self, now: float, seen: Inputs) -> None:
+        # An old pose is always quiet: what stands still there is the motion capture.
+        if self._lasted(now, seen.still and seen.vehicle < HOLD, self.params.quiet):
+            more = self.throws < self.most
+            self._go(now, State.READY if more else State.LAND, "hovering again")
+        elif seen.land or self._late(now):
+            self._go(now, State.LAND, "the operator said land" if seen.land else "not quiet again in time")
+
+    def _land(self, now: float, seen: Inputs) -> None:
+        if seen.grounded or self._late(now):
+            self._go(now, State.DONE, "landed" if seen.grounded else "landing took too long")
+
+
+_STEPS = {
+    State.IDLE: Machine._idle, State.CHECK: Machine._check, State.READY: Machine._ready, State.ARMED: Machine._armed,
+    State.THROW: Machine._throw, State.RECOVER: Machine._recover, State.LAND: Machine._land,
+}  # fmt: skip
+"""By state. A name put together at each tick would stay in Python's cache of attributes, a new one for each."""

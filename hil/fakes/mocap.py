@@ -1,0 +1,78 @@
+"""What a motion-capture system makes of the truth: rate, noise, latency and loss, from a seed.
+
+The fake autopilot sends these poses over the wire; the same seed gives a throw flown in the simulator directly the same ones.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from hil.poses.frames import multiply
+from hil.poses.pose import PAYLOAD, VEHICLE, Pose
+
+SLACK = 1e-9
+"""Of times that are sums of periods [s]."""
+
+
+@dataclass(frozen=True)
+class MocapParams:
+    """What the motion capture makes of the truth.
+
+    Raises:
+        ValueError: a negative number, no rate, or a loss of 1 or more.
+    """
+
+    rate: float = 100.0  # poses a second of each body [Hz]
+    position_noise: float = 1e-3  # standard deviation [m]
+    angle_noise_deg: float = 0.2  # standard deviation about each axis
+    latency: float = 0.01  # from the instant of a pose to its sending [s]
+    loss: float = 0.02  # share of poses that never come
+
+    def __post_init__(self) -> None:
+        if min(vars(self).values()) < 0.0 or not self.rate > 0.0 or not self.loss < 1.0:
+            raise ValueError(f"mocap {vars(self)}: expected numbers of 0 or more, a rate above 0, a loss below 1")
+
+
+class Mocap:
+    """Measures vehicle and payload."""
+
+    def __init__(self, params: MocapParams, seed: int = 0) -> None:
+        """Begin with a measurement at time 0.
+
+        Args:
+            params: its faults.
+            seed: of noise and loss.
+        """
+        self.params = params
+        self._rng = np.random.default_rng(seed)
+        self._next = 0.0
+
+    def due(self, time: float) -> bool:
+        """Whether a measurement is due at a time [s]."""
+        return time >= self._next - SLACK
+
+    def measure(self, time: float, truth: dict[str, Any]) -> list[Pose]:
+        """Measure both bodies at this instant, which is the due one.
+
+        Args:
+            time: [s].
+            truth: ``pos_w`` [m], ``quat_wb`` (xyzw) and ``payload_pos_w`` [m].
+
+        Returns:
+            Those that are not lost, vehicle first, in our frames; their arrival is the latency after the instant.
+        """
+        self._next += 1.0 / self.params.rate
+        p, rng = self.params, self._rng
+        noise = p.position_noise * rng.standard_normal((2, 3))
+        turn = 0.5 * math.radians(p.angle_noise_deg) * rng.standard_normal(3)
+        lost = rng.random(2) < p.loss
+        quat = multiply(tuple(truth["quat_wb"].astype(float)), (*turn.tolist(), 1.0))
+        norm = math.hypot(*quat)
+        seen = (
+            (VEHICLE, truth["pos_w"] + noise[0], tuple(q / norm for q in quat)),
+            (PAYLOAD, truth["payload_pos_w"] + noise[1], (0.0, 0.0, 0.0, 1.0)),
+        )
+        poses = [Pose(time, time + p.latency, body, tuple(map(float, pos)), attitude) for body, pos, attitude in seen]
+        return [pose for pose, gone in zip(poses, lost) if not gone]

@@ -1,0 +1,172 @@
+"""The fake autopilot's process: builds one of `hil.fakes` around an injected plant and flies it in real time."""
+
+import contextlib
+import importlib
+import inspect
+import json
+import socket
+from pathlib import Path
+from typing import Any
+
+from hil.control.realtime import collected
+from hil.errors import LinkError, RunError
+from hil.fakes import KINDS, VEHICLE_ID, Fake, Options, WirePlant
+from hil.fakes import FakeArduPilot as FakeAutopilot
+from hil.fakes.mocap import MocapParams
+from hil.links.clock import Clock
+from hil.links.device import LARGEST_DATAGRAM
+from hil.links.mavlink_link import Link
+from visthrow import config
+from visthrow.common.errors import suggest
+
+AFTER_LANDING = 10.0
+"""The process ends this long after the payload has landed [s]: the vehicle has landed by then."""
+
+
+def load_plant(target: str, policy: str, seed: int) -> WirePlant:
+    """Call ``module:function`` with policy and seed.
+
+    Raises:
+        RunError: no such module or function, or one that makes no plant of these two.
+    """
+    module, _, name = target.partition(":")
+    try:
+        make = getattr(importlib.import_module(module), name)
+        inspect.signature(make).bind(policy, seed)
+    except (ImportError, AttributeError, ValueError, TypeError) as error:
+        raise RunError(
+            f"plant '{target}': {error}; expected module:function, as visthrow.throws.wire_plant:make, called with policy and seed"
+        ) from error
+    return make(policy, seed)
+
+
+class ListeningPort:
+    """A TCP port of this machine that serves one peer at a time: what a flight controller in software offers."""
+
+    whole = False
+
+    def __init__(self, number: int) -> None:
+        """Listen on a port of the loopback address.
+
+        Raises:
+            LinkError: it is taken, or there is none of that number.
+        """
+        if not 1 <= number <= 65535:
+            raise LinkError(f"tcp port {number}; expected 1 to 65535")
+        self._server = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+        self._server.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            self._server.bind(("127.0.0.1", number))
+        except OSError as error:
+            self._server.close()
+            raise LinkError(f"cannot listen on tcp port {number}: {error.strerror}") from error
+        self._server.listen(1)
+        self._server.setblocking(False)
+        self._peer: socket.socket | None = None
+
+    def read(self) -> bytes | None:
+        """See `hil.links.device.Port`."""
+        if self._peer is None:
+            try:
+                self._peer, _ = self._server.accept()
+            except OSError:
+                return None
+            self._peer.setblocking(False)
+            self._peer.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        try:
+            data = self._peer.recv(LARGEST_DATAGRAM)
+        except BlockingIOError:
+            return None
+        except OSError:
+            data = b""
+        if not data:  # the peer has gone: the next one may come
+            self._peer.close()
+            self._peer = None
+        return data or None
+
+    def write(self, data: bytes) -> bool:
+        """See `hil.links.device.Port`."""
+        try:
+            return self._peer is not None and self._peer.send(data) == len(data)
+        except OSError:
+            return False
+
+    def fileno(self) -> int:
+        """See `hil.links.device.Port`."""
+        return (self._peer or self._server).fileno()
+
+    def close(self) -> None:
+        """See `hil.links.device.Port`."""
+        self._server.close()
+        if self._peer is not None:
+            self._peer.close()
+
+
+def make_fake(
+    kind: str, plant: WirePlant, link: Link, mocap: MocapParams | None = None, seed: int = 0,
+    options: Options | None = None, port: Any = None,
+) -> Fake:  # fmt: skip
+    """A fake of a kind.
+
+    Args:
+        kind: of `hil.fakes.KINDS`.
+        plant, link, mocap, seed, options: see `hil.fakes.Fake`.
+        port: of MSP, for Betaflight.
+
+    Raises:
+        RunError: an unknown kind.
+    """
+    if kind not in KINDS:
+        raise RunError(f"fake of kind '{kind}'; {suggest(kind, KINDS)}")
+    more = {"port": port} if kind == "betaflight" else {}
+    return KINDS[kind](plant, link, mocap, seed, options, **more)
+
+
+def read_options(overrides: list[str]) -> Options:
+    """Options of a fake from ``key=value`` texts.
+
+    Raises:
+        ConfigError: an unknown key or a wrong value; the message says what exists.
+    """
+    return config.loads(Options, "", overrides, "options of the fake")
+
+
+def serve(
+    fake: Fake, clock: Clock, most: float, out: Path | None = None, after: float = AFTER_LANDING
+) -> dict[str, Any]:  # fmt: skip
+    """Fly in real time until ``after`` seconds after the payload's landing, for ``most`` seconds, or until Ctrl-C.
+
+    Returns:
+        The report, with the number of periods that took longer than real time has.
+    """
+    start, begun, late = clock.now() - fake.plant.time, fake.plant.time, 0
+
+    def wall() -> float:
+        # Where the machine is late the vehicle's clock is as late as the vehicle.
+        return fake.plant.time + min(max(clock.now() - start - fake.plant.time, 0.0), fake.plant.period)
+
+    fake.wall, fake.question_lag = wall, 0.0
+    with contextlib.suppress(KeyboardInterrupt), collected():  # a collection of all takes a tenth of a second
+        while fake.plant.time - begun < most:
+            time = fake.plant.time + fake.plant.period
+            due = start + time
+            late += clock.now() > due
+            while clock.now() < due:  # what comes meanwhile acts from when it comes
+                clock.wait_for(fake.port, due)
+                fake.hear()
+            fake.deliver(time)  # poses leave before a period is worked out
+            fake.fly()
+            fake.emit()
+            landed = fake.plant.landing["landing_time"]
+            if landed is not None and fake.plant.time > landed + after:
+                break
+    report = {**fake.report(), "late_periods": late}
+    if out is not None:
+        out.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+    return report
+
+
+__all__ = [
+    "KINDS", "VEHICLE_ID", "FakeAutopilot", "ListeningPort", "MocapParams", "Options", "WirePlant", "load_plant",
+    "make_fake", "read_options", "serve",
+]  # fmt: skip

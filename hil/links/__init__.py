@@ -1,0 +1,1 @@
+"""Links: ports, MAVLink and MSP messages, and the clocks at both ends."""

@@ -1,0 +1,235 @@
+"""The MAVLink link: datagrams in, messages to whoever listens, messages out, both ways into a .tlog.
+
+Nothing here waits, and no bytes that arrive make it raise. :func:`poses_from_message` and :func:`attitude_target` are
+the boundary between MAVLink's units and orders and ours.
+"""
+
+import math
+import struct
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from hil.errors import LinkError
+from hil.links.device import MOST_CHUNKS, MutePort, Port
+from hil.links.pymav import Parser, mav
+from hil.poses.frames import rotate
+from hil.poses.pose import Pose, Quaternion, Vector
+
+LOCAL_FRAMES = (mav.MAV_FRAME_LOCAL_NED, mav.MAV_FRAME_LOCAL_FRD)
+BODY_FRAMES = (mav.MAV_FRAME_BODY_FRD, mav.MAV_FRAME_BODY_NED)
+NAN_QUATERNION = (math.nan,) * 4
+
+IGNORE_ATTITUDE = 128
+"""type_mask of SET_ATTITUDE_TARGET: rates and thrust, no attitude. Other bits beside it are silently not followed."""
+
+
+MOST_WAITING = 100_000
+"""Messages that may wait for a slow disk, some minutes' worth; those beyond are lost, and counted."""
+
+
+WRITE_EVERY = 0.1
+"""Between two looks for messages to write [s]: woken by each one, the thread would take the core from the flying one."""
+
+
+class TlogWriter:
+    """Writes a .tlog: for each message the time [us, big-endian] and its bytes; by a thread of its own, so that a slow disk delays
+    no tick. A write that fails is counted.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        """Open the file.
+
+        Raises:
+            LinkError: it cannot be written.
+        """
+        try:
+            self._file = open(path, "wb", buffering=1 << 16)  # noqa: SIM115 - closed in close()
+        except OSError as error:
+            raise LinkError(f"cannot write {path}: {error.strerror}") from error
+        self.failed = 0
+        self._waiting: deque[bytes] = deque()
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._write, name="tlog", daemon=True)
+        self._thread.start()
+
+    def write(self, message: Any, unix_time: float | None = None) -> None:
+        """Append one message; never raises and never waits.
+
+        Args:
+            message: as parsed or packed.
+            unix_time: [s]; now where it is left out.
+        """
+        stamp = int((time.time() if unix_time is None else unix_time) * 1e6)
+        if len(self._waiting) >= MOST_WAITING:
+            self.failed += 1
+            return
+        self._waiting.append(struct.pack(">Q", stamp) + bytes(message.get_msgbuf()))
+
+    def _write(self) -> None:
+        over = False
+        while not over:
+            over = self._over.wait(WRITE_EVERY)
+            while self._waiting:
+                try:
+                    self._file.write(self._waiting.popleft())
+                except (OSError, ValueError):
+                    self.failed += 1
+
+    def close(self) -> None:
+        """Write what is left and close."""
+        self._over.set()
+        self._thread.join()
+        try:
+            self._file.close()
+        except OSError:
+            self.failed += 1
+
+
+class Link:
+    """A MAVLink peer on a port.
+
+    Attributes:
+        received, sent, dropped: messages that came, went, and could not be sent.
+        parser: counts what was no message.
+        on_pump: called with the time [s] whenever arrivals were taken in. sync: `hil.links.sync.LinkSync`, where there is one.
+    """
+
+    def __init__(self, port: Port, system: int = 245, component: int = 191, tlog: TlogWriter | None = None) -> None:
+        """Wrap an open port.
+
+        Args:
+            port: from :func:`hil.links.device.open_port`.
+            system: our own id. component: likewise; 191 is an onboard computer.
+            tlog: written both ways; closed with the link.
+        """
+        self.port, self.parser, self._tlog = port, Parser(), tlog
+        self._mav = mav.MAVLink(None, system, component)
+        self._listeners: list[Callable[[Any, float], None]] = []
+        self.on_pump: list[Callable[[float], None]] = []
+        self.sync: Any = None
+        self.received = self.sent = self.dropped = 0
+
+    @property
+    def recorded(self) -> bool:
+        """Whether all was recorded so far."""
+        return self._tlog is None or not self._tlog.failed
+
+    def listen(self, listener: Callable[[Any, float], None]) -> None:
+        """Call ``listener(message, arrival)`` for every message from now on."""
+        self._listeners.append(listener)
+
+    def pump(self, clock: Callable[[], float]) -> int:
+        """Hand all that has arrived to the listeners; returns the number of messages."""
+        count = 0
+        for _ in range(MOST_CHUNKS):
+            data = self.port.read()
+            if data is None:
+                break
+            arrival = clock()
+            for message in self.parser.parse(data, self.port.whole):
+                if self._tlog is not None:
+                    self._tlog.write(message)
+                for listener in self._listeners:
+                    listener(message, arrival)
+                count += 1
+        self.received += count
+        for call in self.on_pump:
+            call(clock())
+        return count
+
+    def send(self, message: Any) -> bool:
+        """Send a message; whether the port took it."""
+        try:
+            data = message.pack(self._mav)
+        except (struct.error, TypeError, ValueError, OverflowError):
+            self.dropped += 1
+            return False
+        self._mav.seq = (self._mav.seq + 1) % 256
+        taken = self.port.write(data)
+        if taken and self._tlog is not None:
+            self._tlog.write(message)
+        self.sent += taken
+        self.dropped += not taken
+        return taken
+
+    def muted(self) -> "Link":
+        """A link of the same ids that packs messages and sends them nowhere."""
+        return Link(MutePort(), self._mav.srcSystem, self._mav.srcComponent)
+
+    def close(self) -> None:
+        """Close port and .tlog."""
+        self.port.close()
+        if self._tlog is not None:
+            self._tlog.close()
+
+
+def quaternion_from_euler(roll: float, pitch: float, yaw: float) -> Quaternion:
+    """Attitude wxyz of MAVLink's angles (yaw, then pitch, then roll) [rad]; NaN where one is not finite."""
+    if not (math.isfinite(roll) and math.isfinite(pitch) and math.isfinite(yaw)):
+        return NAN_QUATERNION
+    cr, sr = math.cos(roll / 2), math.sin(roll / 2)
+    cp, sp = math.cos(pitch / 2), math.sin(pitch / 2)
+    cy, sy = math.cos(yaw / 2), math.sin(yaw / 2)
+    return (
+        cr * cp * cy + sr * sp * sy,
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+    )
+
+
+def pose_from_message(message: Any, body: str, arrival: float) -> Pose | None:
+    """A pose message in SI units, still in MAVLink's frames (world north east down or the like, quaternion wxyz).
+
+    Args:
+        message: ATT_POS_MOCAP, VISION_POSITION_ESTIMATE or ODOMETRY.
+        body: whose it is.
+        arrival: on the runner's clock [s].
+
+    Returns:
+        None for another message, and for an ODOMETRY in another frame than LOCAL_NED or LOCAL_FRD.
+    """
+    kind = message.get_type()
+    if kind == "ATT_POS_MOCAP":
+        return Pose(message.time_usec / 1e6, arrival, body, _position(message), tuple(message.q))
+    if kind == "VISION_POSITION_ESTIMATE":
+        quat = quaternion_from_euler(message.roll, message.pitch, message.yaw)
+        return Pose(message.usec / 1e6, arrival, body, _position(message), quat, reset=message.reset_counter)
+    if kind != "ODOMETRY" or message.frame_id not in LOCAL_FRAMES:
+        return None
+    quat = tuple(message.q)
+    vel = _known((message.vx, message.vy, message.vz))
+    if vel is not None and message.child_frame_id in BODY_FRAMES:
+        vel = rotate((*quat[1:], quat[0]), vel)
+    elif message.child_frame_id not in LOCAL_FRAMES:
+        vel = None
+    rate = _known((message.rollspeed, message.pitchspeed, message.yawspeed))
+    return Pose(message.time_usec / 1e6, arrival, body, _position(message), quat, vel, rate, message.reset_counter)
+
+
+def _position(message: Any) -> Vector:
+    return (message.x, message.y, message.z)
+
+
+def _known(vector: Vector) -> Vector | None:
+    """MAVLink writes NaN for a quantity that is not known."""
+    return None if any(math.isnan(x) for x in vector) else vector
+
+
+def attitude_target(time_s: float, target: tuple[int, int], thrust: float, rate_frd: Vector) -> Any:
+    """SET_ATTITUDE_TARGET of a thrust and body rates.
+
+    Args:
+        time_s: on our clock [s].
+        target: system and component of the autopilot.
+        thrust: collective, 0 to 1.
+        rate_frd: [rad/s], body frame forward, right, down.
+    """
+    stamp = int(time_s * 1e3) & 0xFFFFFFFF
+    return mav.MAVLink_set_attitude_target_message(
+        stamp, *target, IGNORE_ATTITUDE, [1.0, 0.0, 0.0, 0.0], *rate_frd, thrust
+    )

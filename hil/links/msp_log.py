@@ -1,0 +1,90 @@
+"""What goes over an MSP port, both ways, in a file: for each chunk the time [us], the direction, its length, its bytes."""
+
+import struct
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from hil.errors import LinkError, RunError
+from hil.links.device import Port
+
+HEAD = struct.Struct(">QcH")
+"""Time since 1970 [us], b"<" to the flight controller or b">" from it, number of bytes."""
+
+MOST_BYTES = 65535
+"""Of a chunk in the file; a longer one is cut."""
+
+
+class LoggedPort:
+    """A port whose traffic is written down; a write to the file that fails is counted and troubles nobody.
+
+    Attributes:
+        failed: number of chunks that could not be written.
+    """
+
+    def __init__(self, port: Port, path: str | Path) -> None:
+        """Open the file.
+
+        Raises:
+            LinkError: it cannot be written.
+        """
+        self._port, self.whole, self.failed = port, port.whole, 0
+        try:
+            Path(path).parent.mkdir(parents=True, exist_ok=True)
+            self._file = open(path, "wb", buffering=1 << 16)  # noqa: SIM115 - closed in close()
+        except OSError as error:
+            port.close()
+            raise LinkError(f"cannot write {path}: {error.strerror}") from error
+
+    def _note(self, direction: bytes, data: bytes) -> None:
+        data = data[:MOST_BYTES]
+        try:
+            self._file.write(HEAD.pack(int(time.time() * 1e6), direction, len(data)) + data)
+        except (OSError, ValueError):
+            self.failed += 1
+
+    def read(self) -> bytes | None:
+        """See `hil.links.device.Port`."""
+        data = self._port.read()
+        if data:
+            self._note(b">", data)
+        return data
+
+    def write(self, data: bytes) -> bool:
+        """See `hil.links.device.Port`."""
+        taken = self._port.write(data)
+        if taken:
+            self._note(b"<", data)
+        return taken
+
+    def fileno(self) -> int:
+        """See `hil.links.device.Port`."""
+        return self._port.fileno()
+
+    def close(self) -> None:
+        """See `hil.links.device.Port`."""
+        self._port.close()
+        try:
+            self._file.close()
+        except OSError:
+            self.failed += 1
+
+
+def read_log(path: str | Path) -> Iterator[tuple[float, bytes, bytes]]:
+    """Time since 1970 [s], direction and bytes of each chunk; one that was cut short at the end is left out.
+
+    Raises:
+        RunError: no such file, or not of this kind.
+    """
+    try:
+        data = Path(path).read_bytes()
+    except OSError as error:
+        raise RunError(f"{path}: cannot be read: {error.strerror}; expected the MSP log of a run") from error
+    at = 0
+    while at + HEAD.size <= len(data):
+        stamp, direction, count = HEAD.unpack_from(data, at)
+        if direction not in (b"<", b">"):
+            raise RunError(f"{path}: damaged at byte {at}; expected the MSP log of a run")
+        at += HEAD.size + count
+        if at <= len(data):
+            yield stamp / 1e6, direction, data[at - count : at]

@@ -1,0 +1,165 @@
+"""Velocity and body rate where the source gives none: a causal polynomial fit over the last poses.
+
+Over the N samples of a window of time, whatever the source's rate, a line (order 1) or a parabola (order 2) is fitted by
+least squares, with the samples' own time stamps, and its slope is taken at the newest one. Under constant acceleration a
+line's slope is late by half the window, ``(N - 1) T / 2`` at an even spacing T; a parabola's is not late at all, but noisier.
+For slopes ``v = sum c_i p(t - a_i)`` of samples of age a_i the lag is ``-sum c_i a_i^2 / 2`` [s] (the response to
+``p = t^2 / 2`` is ``t`` less the lag), which is what :attr:`SlopeFilter.lag` reports. The slope's noise is ``sqrt(sum c_i^2)``
+times that of a sample.
+"""
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+from hil.poses.frames import conjugate, multiply
+from hil.poses.pose import Pose, Quaternion, Vector
+
+MOST_GAP = 0.1
+"""A gap longer than this empties the window: what lies before it says nothing of now [s]."""
+
+MOST_SAMPLES = 32
+"""In a window, whatever the source's rate: the fit's cost stays bounded."""
+
+
+@dataclass(frozen=True)
+class EstimateParams:
+    """The filter.
+
+    Raises:
+        ValueError: an order other than 1 or 2, or a window that is empty or longer than :data:`MOST_GAP`.
+    """
+
+    window: float  # age of the oldest sample, where there are enough younger ones [s]
+    order: int  # 1: line, 2: parabola
+
+    def __post_init__(self) -> None:
+        if self.order not in (1, 2) or not 0.0 < self.window <= MOST_GAP:
+            raise ValueError(
+                f"order {self.order} over a window of {self.window} s; expected 1 or 2, and above 0 to {MOST_GAP} s"
+            )
+
+
+def slope_weights(ages: list[float], order: int) -> list[float]:
+    """Weights c_i of samples of given ages [s] (newest first, 0 first) in the slope at age 0 [1/s].
+
+    With too few samples for the order the order is lowered; with one sample the slope is 0.
+    """
+    return fit_weights(ages, order)[0]
+
+
+def fit_weights(ages: list[float], order: int) -> tuple[list[float], list[float]]:
+    """Weights of the samples in the slope at age 0 [1/s], and in the second derivative [1/s^2] (0 for a line)."""
+    order, none = min(order, len(ages) - 1), [0.0] * len(ages)
+    if order < 1:
+        return none, none
+    n, s1, s2, s3, s4 = float(len(ages)), 0.0, 0.0, 0.0, 0.0
+    for age in ages:
+        square = age * age
+        s1 -= age
+        s2 += square
+        s3 -= age * square
+        s4 += square * square
+    if order == 1:
+        det = n * s2 - s1 * s1
+        return ([(-n * age - s1) / det for age in ages] if det > 0.0 else none), none
+    # The middle and the last row of the inverse of the normal matrix [[n, s1, s2], [s1, s2, s3], [s2, s3, s4]].
+    r0, r1, r2 = s2 * s3 - s1 * s4, n * s4 - s2 * s2, s1 * s2 - n * s3
+    det = r0 * s1 + r1 * s2 + r2 * s3
+    if not det > 0.0:
+        return none, none
+    l0, l2, scale, double = s1 * s3 - s2 * s2, n * s2 - s1 * s1, 1.0 / det, 2.0 / det
+    slope = [(r0 - r1 * age + r2 * age * age) * scale for age in ages]
+    return slope, [(l0 - r2 * age + l2 * age * age) * double for age in ages]
+
+
+class SlopeFilter:
+    """Velocity and body rate of one body.
+
+    The rate is worked out when it is asked for: many poses may come between two ticks, and a bare ball's is never asked for.
+
+    Attributes:
+        acceleration: of the last estimate [m/s^2], world frame; 0 for a line.
+    """
+
+    def __init__(self, params: EstimateParams) -> None:
+        """Start empty."""
+        self.params = params
+        self.acceleration: Vector = (0.0, 0.0, 0.0)
+        self._window: deque[Pose] = deque(maxlen=MOST_SAMPLES)
+        self._ages: list[float] = []
+        self._weights: list[float] = []
+        self._bends: list[float] = []
+        self._rate: Vector | None = None  # until it is asked for
+        self._spin: Vector = (0.0, 0.0, 0.0)
+
+    def reset(self) -> None:
+        """Forget all samples."""
+        self._window.clear()
+
+    def update(self, pose: Pose) -> Vector:
+        """Velocity, world frame [m/s], at a new pose; the source's own where it gives one.
+
+        Args:
+            pose: in our frames, its stamp above the last one's.
+        """
+        window, params, stamp = self._window, self.params, pose.stamp
+        if window and not 0.0 < stamp - window[0].stamp <= MOST_GAP:
+            window.clear()
+        window.appendleft(pose)
+        while len(window) > params.order + 1 and stamp - window[-1].stamp > params.window:
+            window.pop()
+        self._ages = [stamp - sample.stamp for sample in window]
+        self._weights, self._bends = fit_weights(self._ages, params.order)
+        places = [sample.pos for sample in window]
+        self.acceleration, self._rate, self._spin = _sum(self._bends, places), None, (0.0, 0.0, 0.0)
+        return _sum(self._weights, places) if pose.vel is None else pose.vel
+
+    @property
+    def rate(self) -> Vector:
+        """Body rate at the last pose, body frame [rad/s]; the source's own where it gives one, 0 without an attitude."""
+        if self._rate is None:
+            pose = self._window[0] if self._window else None
+            if pose is None or pose.rate is not None or pose.quat is None:
+                self._rate = pose.rate if pose is not None and pose.rate is not None else (0.0, 0.0, 0.0)
+            else:
+                turns = [_turn(pose.quat, sample.quat) for sample in self._window]
+                self._rate, self._spin = _sum(self._weights, turns), _sum(self._bends, turns)
+        return self._rate
+
+    @property
+    def spin(self) -> Vector:
+        """Change of the body rate at the last pose, body frame [rad/s^2]; 0 for a line, and where the source gives rates."""
+        _ = self.rate  # works it out along with itself
+        return self._spin
+
+    @property
+    def lag(self) -> float:
+        """Of the last estimates under constant acceleration [s]; 0 where the source gave both itself."""
+        if not self._window:
+            return 0.0
+        pose = self._window[0]
+        if pose.vel is not None and (pose.rate is not None or pose.quat is None):
+            return 0.0
+        return -0.5 * sum(c * a * a for c, a in zip(self._weights, self._ages))
+
+
+def _sum(weights: list[float], vectors: list[Vector]) -> Vector:
+    x = y = z = 0.0
+    for c, (a, b, d) in zip(weights, vectors):
+        x += c * a
+        y += c * b
+        z += c * d
+    return (x, y, z)
+
+
+def _turn(now: Quaternion, then: Quaternion | None) -> Vector:
+    """Rotation vector from the attitude now to an earlier one, in the body frame of now [rad]."""
+    if then is None:
+        return (0.0, 0.0, 0.0)
+    x, y, z, w = multiply(conjugate(now), then)
+    if w < 0.0:
+        x, y, z, w = -x, -y, -z, -w
+    sine = math.sqrt(x * x + y * y + z * z)
+    scale = 2.0 * math.atan2(sine, w) / sine if sine > 1e-12 else 2.0
+    return (scale * x, scale * y, scale * z)

@@ -1,0 +1,184 @@
+"""The gate that every pose passes, one for each body with its own timer.
+
+A motion-capture system that has lost a body goes on sending its *last* pose, so staleness is judged on content: the
+time since a pose last *differed* from the one before. A body that jumps is refused and stays refused: a pose must lie
+where the last accepted one and its velocity put the body, within a room that grows with the time in which *nothing* came,
+not with the time in which wrong poses came. So two bodies that the system has swapped never become right again by waiting;
+their timers run out and the runner ends the throw. Swapped after a gap, which leaves room for both, they are known by the
+cable: a pose that fits the body at its other end better than its own is not taken, nor one farther off than the cable is long.
+Poses that keep coming, but more rarely than ``hold``, are as good as none.
+"""
+
+import math
+from dataclasses import dataclass
+
+from hil.poses.pose import Pose, Vector
+
+OK, WARN, HOLD, ABORT = range(4)
+"""Levels of staleness."""
+
+MOST_ACCELERATION = 40.0
+"""By which a body may have changed its velocity while nothing came [m/s^2]."""
+
+
+RARE = 3
+"""Gaps longer than ``hold`` in a row that count as no poses at all."""
+
+
+@dataclass(frozen=True)
+class Tether:
+    """Where the cable ends, while the payload hangs on it."""
+
+    pos: Vector  # of the other body, expected at the pose's arrival [m]
+    length: float  # that the two can be apart [m]; infinite where the other body is not known well
+
+
+@dataclass(frozen=True)
+class GateParams:
+    """Limits of one body.
+
+    Raises:
+        ValueError: limits that are not above 0 or not ascending.
+    """
+
+    quat_tolerance: float  # of a quaternion's norm from 1 [-]
+    max_jump: float  # from where the last pose and velocity put the body [m]
+    max_speed: float  # [m/s]
+    max_turn: float  # between two poses, beyond max_turn_rate times the time in which nothing came [rad]
+    max_turn_rate: float  # [rad/s]
+    clock_step: float  # stamps that leave the arrivals by more than this are a step of the source's clock [s]
+    warn: float  # content age [s]
+    hold: float  # content age [s]
+    abort: float  # content age [s]
+
+    def __post_init__(self) -> None:
+        if min(vars(self).values()) <= 0.0:
+            raise ValueError(f"gate {vars(self)}: expected every limit above 0")
+        if not self.warn < self.hold < self.abort:
+            raise ValueError(f"gate: warn {self.warn}, hold {self.hold}, abort {self.abort} s; expected them ascending")
+
+
+class Gate:
+    """Decides about the poses of one body.
+
+    Attributes:
+        refused: number of refused poses by reason.
+        jumped: the source's reset counter has changed since the last :meth:`restart`.
+    """
+
+    def __init__(self, params: GateParams) -> None:
+        """Start without a pose."""
+        self.params = params
+        self.refused: dict[str, int] = {}
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget all: the next good pose is taken wherever it is. On the ground only, at the operator's word."""
+        self.last: Pose | None = None
+        self.jumped = False
+        self._came: Pose | None = None  # last pose in order, accepted or not
+        self._changed = -math.inf  # arrival of the last new content [s]
+        self._gaps = 0  # longer than hold, in a row
+
+    def check(self, pose: Pose, velocity: Vector | None = None, tether: Tether | None = None) -> str | None:
+        """Judge a pose, in our frames.
+
+        Args:
+            pose: with a stamp of the source's clock.
+            velocity: of the body at its last accepted pose [m/s].
+            tether: the cable's other end, where one hangs.
+
+        Returns:
+            Why it is refused, or None where it is accepted: "finite", "quaternion", "old" (reordered or doubled),
+            "repeated" (the content of the last one), "swapped", "cable", "jump", "speed", "turn", "reset".
+        """
+        reason = self._reason(pose, velocity, tether)
+        if reason is not None:
+            self.refused[reason] = self.refused.get(reason, 0) + 1
+            return reason
+        first, self.last = self.last is None, pose
+        self._came = pose
+        rare = not first and pose.arrival - self._changed > self.params.hold
+        self._gaps = self._gaps + 1 if rare else 0
+        self._changed = pose.arrival
+        return None
+
+    def stepped(self, pose: Pose) -> bool:
+        """Whether the source's clock was set between the last accepted pose and this one."""
+        last = self.last
+        return last is not None and (
+            abs((pose.stamp - last.stamp) - (pose.arrival - last.arrival)) > self.params.clock_step
+        )
+
+    def _reason(self, pose: Pose, velocity: Vector | None, tether: Tether | None) -> str | None:
+        last = self.last
+        reason = self._itself(pose)
+        if reason is not None or last is None:
+            return reason
+        if self.jumped or pose.reset != last.reset:
+            self.jumped = True
+            return "reset"
+        stepped = self.stepped(pose)
+        if pose.stamp <= last.stamp and not stepped:
+            return "old"
+        came, self._came = self._came or last, pose
+        if pose.pos == last.pos and pose.quat == last.quat:
+            return "repeated"
+        # A clock that was set says nothing of how long ago the last pose was; the arrivals do.
+        age, gap = (
+            max(pose.arrival - then.arrival if stepped else pose.stamp - then.stamp, 0.0) for then in (last, came)
+        )
+        return self._motion(pose, last, velocity, tether, age, gap)
+
+    def _itself(self, pose: Pose) -> str | None:
+        """What is wrong with a pose, whatever came before."""
+        p = self.params
+        numbers = (pose.stamp, pose.arrival, *pose.pos, *(pose.quat or ()), *(pose.vel or ()), *(pose.rate or ()))
+        if not all(map(math.isfinite, numbers)):
+            return "finite"
+        if pose.quat is not None and abs(math.hypot(*pose.quat) - 1.0) > p.quat_tolerance:
+            return "quaternion"
+        if pose.vel is not None and math.hypot(*pose.vel) > p.max_speed:
+            return "speed"
+        return None
+
+    def _motion(
+        self, pose: Pose, last: Pose, velocity: Vector | None, tether: Tether | None, age: float, gap: float
+    ) -> str | None:
+        """What is wrong with the way from the last accepted pose.
+
+        Args:
+            pose, last: in our frames.
+            velocity, tether: see :meth:`check`.
+            age: of the last accepted pose [s].
+            gap: in which nothing came at all [s].
+        """
+        p = self.params
+        expected = tuple(x + age * v for x, v in zip(last.pos, velocity or (0.0, 0.0, 0.0)))
+        off = math.dist(pose.pos, expected)
+        if tether is not None:
+            apart = math.dist(pose.pos, tether.pos)
+            if apart < off and off > p.max_jump:
+                return "swapped"
+            if apart > tether.length:
+                return "cable"
+        if math.dist(pose.pos, last.pos) > p.max_jump + p.max_speed * age:
+            return "speed"
+        if velocity is not None and off > p.max_jump + 0.5 * MOST_ACCELERATION * gap * gap:
+            return "jump"
+        if pose.quat is not None and last.quat is not None:
+            cosine = min(1.0, abs(sum(a * b for a, b in zip(pose.quat, last.quat))))
+            if 2.0 * math.acos(cosine) > p.max_turn + p.max_turn_rate * gap:
+                return "turn"
+        return None
+
+    def age(self, now: float) -> float:
+        """Time since the content last changed [s]; infinite before the first pose."""
+        return now - self._changed
+
+    def level(self, now: float) -> int:
+        """:data:`OK`, :data:`WARN`, :data:`HOLD` or :data:`ABORT` by the content's age; ABORT where content is rare."""
+        if self._gaps >= RARE:
+            return ABORT
+        age = self.age(now)
+        return (age > self.params.warn) + (age > self.params.hold) + (age > self.params.abort)

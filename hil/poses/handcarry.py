@@ -1,0 +1,267 @@
+"""The hand-carry check: the vehicle is carried about in a stated order, and its poses tell which axes the source really has.
+
+Nose along our x and level at first, a second of rest before and after each move. Three moves of the place tell the world's axes,
+three turns those of the body and the quaternion's order: of the 24 axis cases each (and the two orders) the one under which every
+move went where it was meant to is named.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from hil.errors import RunError
+from hil.links.clock import Clock
+from hil.poses.frames import FrameParams, Frames, conjugate, multiply, proper_axes, rotation_of
+from hil.poses.pose import VEHICLE, Pose
+from hil.sources.base import Source
+
+SPEED, RATE = 0.06, 0.25
+"""Below both the vehicle rests [m/s], [rad/s]: noise of a millimetre and of 0.3 deg stays below."""
+SPAN = 0.2
+"""Over which speed and rate are taken [s]."""
+REST = 0.5
+"""The vehicle rests only after it has for this long [s]."""
+LEAST_WAY, LEAST_TURN = 0.2, math.radians(15.0)
+"""Smaller moves than these are no moves [m], [rad]."""
+LOOK = 0.25
+"""Between two looks at what came [s]."""
+TOLERANCE = math.radians(30.0)
+"""Between a move and its axis: people do not walk straight [rad]."""
+
+
+@dataclass(frozen=True)
+class Move:
+    """One step of the check."""
+
+    text: str  # for the operator
+    turn: bool  # of the attitude, else of the place
+    axis: int | None  # of our axes along or about which it goes; None for the way back, which is not judged
+
+
+MOVES = (
+    Move("carry it forward, along our x, by half a metre", False, 0),
+    Move("carry it to its left, along our y, by half a metre", False, 1),
+    Move("lift it by half a metre", False, 2),
+    Move("tip its nose down by 45 deg, and hold it", True, 1),
+    Move("bring it level again", True, None),
+    Move("tip its right side down by 45 deg, and hold it", True, 0),
+    Move("bring it level again", True, None),
+    Move("turn it to the left by 90 deg, as seen from above", True, 2),
+)
+
+
+@dataclass(frozen=True)
+class Step:
+    """A move as the source tells it, in its own frames."""
+
+    before: Pose  # mean of the rest before
+    after: Pose  # mean of the rest after
+
+    @property
+    def way(self) -> np.ndarray:
+        """Change of place [m], shape (3,), source's world."""
+        return np.subtract(self.after.pos, self.before.pos)
+
+    def turn(self, order: str) -> tuple[np.ndarray, np.ndarray]:
+        """Rotation vectors [rad] of the change of attitude in the source's world and body, quaternions in a given order."""
+        first, second = (_xyzw(pose.quat, order) for pose in (self.before, self.after))
+        return _vector(multiply(second, conjugate(first))), _vector(multiply(conjugate(first), second))
+
+
+@dataclass(frozen=True)
+class Line:
+    """Judgement of one move."""
+
+    text: str
+    passed: bool
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Outcome of the check."""
+
+    lines: tuple[Line, ...]
+    fitting: FrameParams  # under which the moves fit best
+    mirrored: bool  # a left-handed source would fit better: left and right exchanged, or the axes are
+    passed: bool
+
+
+def find_steps(poses: Sequence[Pose]) -> list[Step]:
+    """Moves between rests.
+
+    Args:
+        poses: raw, of the vehicle, in order.
+
+    Raises:
+        RunError: a pose without attitude.
+    """
+    if any(pose.quat is None for pose in poses):
+        raise RunError("hand-carry: the vehicle's source gives no attitude; expected a rigid body, not a marker")
+    good = [p for p in poses if np.isfinite([*p.pos, *p.quat]).all() and math.hypot(*p.quat) > 0.5]
+    rests = _rests(good)
+    steps = [Step(_mean(good[a.stop - 1 :: -1], a), _mean(good[b.start :], b)) for a, b in pairwise(rests)]
+    return [s for s in steps if np.linalg.norm(s.way) > LEAST_WAY or np.linalg.norm(s.turn("xyzw")[0]) > LEAST_TURN]
+
+
+def _rests(poses: Sequence[Pose]) -> list[slice]:
+    """Stretches in which the vehicle rests."""
+    if len(poses) < 3:
+        return []
+    times = np.array([p.arrival for p in poses])
+    pos, quat = np.array([p.pos for p in poses]), np.array([p.quat for p in poses])
+    late = np.minimum(np.searchsorted(times, times + SPAN), len(times) - 1)
+    early = np.maximum(np.searchsorted(times, times - SPAN, side="right") - 1, 0)
+    span = np.maximum(times[late] - times[early], 1e-9)
+    cosine = np.abs(np.sum(quat[late] * quat[early], axis=1)) / np.linalg.norm(quat[late], axis=1)
+    rate = 2 * np.arccos(np.clip(cosine / np.linalg.norm(quat[early], axis=1), 0.0, 1.0)) / span
+    still = (np.linalg.norm(pos[late] - pos[early], axis=1) / span < SPEED) & (rate < RATE)
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], still, [False])).astype(int)))
+    stretches = [slice(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2])]
+    return [s for s in stretches if times[s.stop - 1] - times[s.start] >= REST]
+
+
+def _mean(poses: Sequence[Pose], rest: slice) -> Pose:
+    """Mean of the poses of a rest next to a move."""
+    near = [p for p in poses[: rest.stop - rest.start] if abs(p.arrival - poses[0].arrival) <= REST]
+    quats = np.array([p.quat for p in near])
+    quats[np.sum(quats * quats[0], axis=1) < 0.0] *= -1.0
+    quat = quats.mean(axis=0)
+    place = tuple(np.mean([p.pos for p in near], axis=0).tolist())
+    return replace(near[0], pos=place, quat=tuple((quat / np.linalg.norm(quat)).tolist()))
+
+
+def judge(steps: Sequence[Step], frames: FrameParams) -> Finding:
+    """Say of each move whether it went where it was meant to, and which frames would fit.
+
+    Args:
+        steps: one for each of `MOVES`.
+        frames: of the config.
+
+    Raises:
+        RunError: another number of moves.
+    """
+    if len(steps) != len(MOVES):
+        seen = "; ".join(f"{i}. {move.text}" for i, move in enumerate(MOVES, start=1))
+        raise RunError(f"hand-carry: {len(steps)} moves between rests; expected {len(MOVES)}, a second of rest around each: {seen}")
+    pairs = list(zip(MOVES, steps))
+    ways = [(move.axis, step.way) for move, step in pairs if not move.turn]
+    turns = [(move.axis, step) for move, step in pairs if move.turn and move.axis is not None]
+    world, mirrored = _world_axes(ways)
+    order, body = _body_axes(turns, rotation_of(world))
+    fitting = replace(frames, axes=world, body_axes=body, quaternion=order, yaw_offset_deg=_yaw(ways, rotation_of(world)))
+    lines = [_line(move, step, frames) for move, step in pairs if move.axis is not None]
+    lines.append(_start(steps[0].before, frames))
+    return Finding(tuple(lines), fitting, mirrored, all(line.passed for line in lines))
+
+
+def _world_axes(ways: list[tuple[int, np.ndarray]]) -> tuple[str, bool]:
+    """The axis case under which the places went along their axes, and whether a mirrored one would fit better."""
+    scores = {axes: _agreement([(i, rotation_of(axes) @ way) for i, way in ways]) for axes in proper_axes()}
+    best = max(scores, key=scores.get)
+    matrix = np.column_stack([way / np.linalg.norm(way) for _, way in ways])
+    return best, bool(np.linalg.det(matrix) < -0.5)
+
+
+def _body_axes(turns: list[tuple[int, Step]], world: np.ndarray) -> tuple[str, str]:
+    """Quaternion order and axis case of the body under which the turns went about their axes, in the world and on the body."""
+    best = (-math.inf, "xyzw", "x,y,z")
+    for order in ("xyzw", "wxyz"):
+        vectors = [(axis, *step.turn(order)) for axis, step in turns]
+        in_world = _agreement([(axis, world @ w) for axis, w, _ in vectors])
+        for axes in proper_axes():
+            score = in_world + _agreement([(axis, rotation_of(axes) @ b) for axis, _, b in vectors])
+            if score > best[0] + 1e-9:
+                best = (score, order, axes)
+    return best[1], best[2]
+
+
+def _agreement(vectors: list[tuple[int, np.ndarray]]) -> float:
+    """Sum of the cosines between vectors and the axes that they belong to."""
+    return sum(float(v[axis] / max(np.linalg.norm(v), 1e-12)) for axis, v in vectors)
+
+
+def _yaw(ways: list[tuple[int, np.ndarray]], world: np.ndarray) -> float:
+    """Turn about our z that is left after the exchange of axes [deg]; 0 where it may be the walker's."""
+    forward, left = (world @ ways[i][1] for i in (0, 1))
+    off = math.degrees(math.atan2(-forward[1] + left[0], forward[0] + left[1]))
+    return round(off, 0) if abs(off) > 10.0 else 0.0
+
+
+def _line(move: Move, step: Step, frames: FrameParams) -> Line:
+    ours = Frames(frames)
+    if move.turn:
+        quats = (ours.quat_from_source(pose.quat) for pose in (step.before, step.after))
+        first, second = quats
+        went, size = _vector(multiply(conjugate(first), second)), "rad about"
+    else:
+        went, size = np.array(ours.world_from_source(tuple(step.way))), "m along"
+    length = float(np.linalg.norm(went))
+    off = math.acos(max(-1.0, min(1.0, went[move.axis] / max(length, 1e-12))))
+    passed = off <= TOLERANCE and length >= (LEAST_TURN if move.turn else LEAST_WAY)
+    told = ", ".join(f"{axis} {value:+.2f}" for axis, value in zip("xyz", went))
+    return Line(f"{move.text.split(',')[0]}: {told} ({size} our axes), {math.degrees(off):.0f} deg off", passed)
+
+
+def _start(pose: Pose, frames: FrameParams) -> Line:
+    """The attitude at first, which is to be level with the nose along our x."""
+    x, y, z, w = Frames(frames).quat_from_source(pose.quat)
+    tilt = math.acos(max(-1.0, min(1.0, 1.0 - 2.0 * (x * x + y * y))))
+    heading = math.atan2(2.0 * (x * y + w * z), 1.0 - 2.0 * (y * y + z * z))
+    return Line(
+        f"at first: tilted by {math.degrees(tilt):.0f} deg, nose {math.degrees(heading):+.0f} deg from our x (if the moves pass "
+        "and this does not, define the rigid body anew, level and with its nose along x)",
+        max(tilt, abs(heading)) <= TOLERANCE,
+    )
+
+
+def collect(
+    source: Source, clock: Clock, seconds: float, tell: Callable[[str], None] = lambda text: None, recorded: bool = False
+) -> list[Step]:
+    """Take in the vehicle's poses until all moves were made, or for a time.
+
+    Args:
+        source: of raw poses. clock: to wait by.
+        seconds: after which a live source is given up [s].
+        tell: called with the next move to make.
+        recorded: a recording is taken to its end, whatever the time.
+    """
+    poses: list[Pose] = []
+    steps: list[Step] = []
+    begin, told = clock.now(), -1
+    while not source.ended and len(steps) < len(MOVES) and (recorded or clock.now() - begin < seconds):
+        source.wait(clock, clock.now() + LOOK)
+        poses += [pose for pose in source.poll(clock.now()) if pose.body == VEHICLE]
+        if not recorded:
+            steps = find_steps(poses)
+            if len(steps) != told and len(steps) < len(MOVES):
+                told = len(steps)
+                tell(f"{told + 1} of {len(MOVES)}: {MOVES[told].text}; then hold it still for a second")
+    return find_steps(poses)
+
+
+def story(finding: Finding, frames: FrameParams) -> str:
+    """The outcome in words."""
+    lines = [f"{'PASS' if line.passed else 'FAIL'}  {line.text}" for line in finding.lines]
+    if finding.mirrored:
+        lines.append(
+            "the moves fit a mirrored world: it was not carried forward, left and up in this order, or the source is left-handed"
+        )
+    for name in ("axes", "body_axes", "quaternion", "yaw_offset_deg"):
+        was, fits = getattr(frames, name), getattr(finding.fitting, name)
+        if was != fits and not finding.passed:
+            lines.append(f"would fit: {name} = {fits!r}".replace("'", '"') + f"  (config: {was!r})".replace("'", '"'))
+    return "\n".join(lines)
+
+
+def _xyzw(quat: tuple[float, ...], order: str) -> tuple[float, ...]:
+    return quat if order == "xyzw" else (*quat[1:], quat[0])
+
+
+def _vector(quat: tuple[float, ...]) -> np.ndarray:
+    """Rotation vector of a unit quaternion xyzw, below half a turn [rad]."""
+    *axis, w = quat if quat[3] >= 0.0 else tuple(-x for x in quat)
+    sine = math.hypot(*axis)
+    return np.array(axis) * (2.0 * math.atan2(sine, w) / sine if sine > 1e-12 else 2.0)

@@ -1,0 +1,269 @@
+"""Flight logs of a run, made of its folder: what later tools read of a flight on poses as they read a simulated one.
+
+Times are those of the measurements, on the runner's clock: a source's stamps, moved by what lies between them and the arrivals
+less the transit (known by TIMESYNC, or the delay that the config states), as the median over some poses about each.
+Where the payload let go and came down is found in its own poses.
+"""
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hil.control.decision import Decision
+from hil.control.landing import Landing
+from hil.control.states import State
+from hil.errors import RunError
+from hil.params import HilParams
+from hil.poses.pose import GOAL, PAYLOAD, VEHICLE, Pose
+from hil.recording.playback import Playback, Sample
+from hil.recording.record import PROVENANCE, load_run
+from visthrow import config
+from visthrow.logs.flightlog import FlightLog, FlightRecorder
+from visthrow.onboard.hover import rot_from_quat
+
+LEAD, AFTER = 2.0, 0.5
+"""A throw's log begins this long before it and ends this long after its recovery [s]."""
+
+LEAST_STEP = 1e-6
+"""Between two samples of a channel [s]: poses that were taken in together keep their order."""
+
+STATES = tuple(state.value for state in State)
+
+
+@dataclass
+class Tick:
+    """One tick of a run: as recorded, as decided, and the poses that were taken in it."""
+
+    line: dict[str, Any]
+    decision: Decision
+    samples: list[Sample]
+    ages: dict[str, float]  # of the poses' content by body [s]
+    goal_w: tuple[float, float, float] | None
+
+
+@dataclass
+class Course:
+    """A whole run, played back."""
+
+    folder: Path
+    params: HilParams
+    playback: Playback
+    ticks: list[Tick]
+    provenance: dict[str, Any]
+    throws: list[tuple[int, int]] = field(default_factory=list)  # first tick in throw, last tick of its recovery
+
+    def __post_init__(self) -> None:
+        states = [tick.decision.state for tick in self.ticks]
+        for n, state in enumerate(states):
+            if state == State.THROW and (n == 0 or states[n - 1] != State.THROW):
+                end = next((k for k in range(n, len(states)) if states[k] not in AFTERWARDS), len(states) - 1)
+                self.throws.append((n, end))
+        by_body: dict[str, list[Sample]] = {}
+        for tick in self.ticks:
+            for sample in tick.samples:
+                by_body.setdefault(sample.body, []).append(sample)
+        for samples in by_body.values():
+            stamps = np.array([sample.pose.stamp for sample in samples])
+            apart = np.array([measured(sample, self.params) for sample in samples]) - stamps
+            around = np.pad(apart, ABOUT, mode="edge")
+            offset = np.median(np.lib.stride_tricks.sliding_window_view(around, 2 * ABOUT + 1), axis=1)
+            for sample, time in zip(samples, stamps + offset):
+                sample.time = float(time)
+
+
+ABOUT = 25
+"""Poses on either side that a clock's offset is the median of: jitter of the transport goes, drift stays."""
+
+
+def measured(sample: Sample, params: HilParams) -> float:
+    """When a pose was measured by its arrival alone [s]."""
+    return sample.pose.arrival - sample.pose.transit(params.delay.source)
+
+
+AFTERWARDS = (State.THROW, State.RECOVER, State.ABORT)
+"""States that belong to a throw."""
+
+
+def tick_of(playback: Playback, line: dict[str, Any], poses: list) -> Tick:
+    """Play one tick back."""
+    decision, samples = playback.feed(line, poses)
+    runner = playback.runner
+    ages = {name: track.gate.age(line["time"]) for name, track in runner.tracks.items()}
+    return Tick(line, decision, samples, ages, runner.seen_goal_w)
+
+
+def read(folder: str | Path) -> Course:
+    """Play a run back.
+
+    Raises:
+        RunError: no folder of a run, or a damaged one.
+    """
+    folder = Path(folder)
+    params, policy, lines, poses = load_run(folder)
+    if not lines:
+        raise RunError(f"{folder}: the run ended before its first tick; there is nothing to show")
+    playback = Playback(params, policy)
+    try:
+        provenance = json.loads((folder / PROVENANCE).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        provenance = {}
+    ticks = [tick_of(playback, line, poses.get(line["n"], [])) for line in lines]
+    return Course(folder, params, playback, ticks, provenance)
+
+
+class Samples:
+    """Fills a recorder with ticks."""
+
+    def __init__(self, params: HilParams, playback: Playback, meta: dict) -> None:
+        """Begin.
+
+        Args:
+            params: of the run. playback: whose ticks come. meta: of the log.
+        """
+        self.params, self.runner = params, playback.runner
+        self.recorder = FlightRecorder(meta)
+        self._declare()
+        self._last: dict[str, float] = {}
+        self._vehicle: Pose | None = None  # the last one: where the rope hangs
+
+    def flush(self) -> FlightLog:
+        """The log of what was added since the last call."""
+        log, self.recorder = self.recorder.log(), FlightRecorder(self.recorder.meta)
+        self._declare()
+        return log
+
+    def _declare(self) -> None:
+        for name in (VEHICLE, PAYLOAD, GOAL):
+            self.recorder.declare(f"age_{name}", "s")
+        self.recorder.declare("state", "1")
+
+    def _later(self, name: str, time: float) -> float:
+        """The time, or a moment after the channel's last sample."""
+        time = max(time, self._last.get(name, -np.inf) + LEAST_STEP)
+        self._last[name] = time
+        return time
+
+    def add(self, tick: Tick, attached: bool) -> None:
+        """Add all that one tick holds."""
+        for sample in tick.samples:
+            self._pose(sample, attached)
+        d, now = tick.decision, tick.line["time"]
+        values: dict[str, Any] = {
+            "mode": int(d.state == State.THROW), "state": STATES.index(d.state), "attached": attached,
+            "release_command": float(d.release),
+        }  # fmt: skip
+        values |= {f"age_{name}": age for name, age in tick.ages.items() if np.isfinite(age)}
+        if tick.goal_w is not None:
+            values["goal_w"] = tick.goal_w
+        for name in ("command", "action", "observation", "keypoints"):
+            if getattr(d, name) is not None:
+                values[name] = np.array(getattr(d, name), dtype=float)
+        if d.valid is not None:
+            values["keypoints_valid"] = np.array(d.valid, dtype=bool)
+        for name, seconds in tick.line["times"].items():
+            self.recorder.declare(f"tick_{name}", "s")
+            values[f"tick_{name}"] = seconds
+        self.recorder.add(now, **values)
+
+    def _pose(self, sample: Sample, attached: bool) -> None:
+        pose = sample.pose
+        time = self._later(sample.body, measured(sample, self.params) if sample.time is None else sample.time)
+        if sample.body == PAYLOAD:
+            self.recorder.add(time, payload_pos_w=pose.pos, payload_vel_w=sample.vel_w)
+            vehicle = self._vehicle
+            if attached and vehicle is not None and vehicle.quat is not None:
+                mount = rot_from_quat(np.array([vehicle.quat]))[0] @ np.array(self.runner.mount_b)
+                self.recorder.add(time, cable_points_w=np.stack([vehicle.pos + mount, pose.pos]))
+        elif sample.body == VEHICLE:
+            self._vehicle = pose
+            self.recorder.add(time, pos_w=pose.pos, vel_w=sample.vel_w)
+            if pose.quat is not None:
+                self.recorder.add(time, quat_wb=pose.quat, rate_b=sample.rate_b)
+
+
+def meta_of(params: HilParams, playback: Playback, provenance: dict[str, Any], start: float) -> dict[str, Any]:
+    """What is known of a run from its beginning on; ``start`` [s] is the zero of its pictures."""
+    policy = playback.runner.pilot.policy
+    goal_w = playback.runner.seen_goal_w or params.goal_w
+    return {
+        "policy": provenance.get("policy", Path(params.policy).stem), "policy_sha256": provenance.get("policy_sha256"),
+        "layout": policy.contract["observation"]["layout"], "plant": "poses", "seed": None,
+        "plant_meaning": f"poses of {params.source.kind}, back-end {params.backend}", "goal_w": list(goal_w),
+        "home_w": list(params.home_w), "states": list(STATES), "config": config.to_dict(params), "provenance": provenance,
+        "times": {"policy_start": start}, "result": {"success": False, "failure": None}, "events": [],
+    }  # fmt: skip
+
+
+def events(ticks: list[Tick]) -> list[list]:
+    """Time, state and reason of each change."""
+    found: list[list] = []
+    for tick in ticks:
+        now = [tick.line["time"], tick.decision.state, tick.decision.reason]
+        if not found or found[-1][1:] != now[1:]:
+            found.append(now)
+    return found
+
+
+def log_of(course: Course, first: int, last: int, throw: int | None = None) -> FlightLog:
+    """Log of the ticks from ``first`` to ``last``, both included; of one throw where its number is given."""
+    ticks, runner = course.ticks[first : last + 1], course.playback.runner
+    start = course.ticks[course.throws[throw][0]].line["time"] if throw is not None else ticks[0].line["time"]
+    samples = Samples(course.params, course.playback, meta_of(course.params, course.playback, course.provenance, start))
+    landing = None if throw is None else _landing(runner.latch.landings, start)
+    latch = next((t.line["time"] for t in ticks if t.decision.release and t.line["time"] >= start), None)
+    apart = np.inf if latch is None else (landing.separation if landing and landing.separation else latch + runner.latch.lag)
+    for tick in ticks:
+        samples.add(tick, tick.line["time"] < apart)
+    meta = samples.recorder.meta
+    meta["events"] = events(ticks)
+    meta["goal_w"] = list(next((t.goal_w for t in ticks if t.line["time"] >= start and t.goal_w), course.params.goal_w))
+    if throw is not None:
+        _judge(samples.recorder, landing, latch, ticks, start)
+    return samples.recorder.log()
+
+
+def _landing(landings: list[Landing], start: float) -> Landing | None:
+    return next((landing for landing in landings if abs(landing.start - start) < 1e-9), None)
+
+
+def _judge(recorder: FlightRecorder, landing: Landing | None, latch: float | None, ticks: list[Tick], start: float) -> None:
+    """How a throw ended."""
+    after = [tick for tick in ticks if tick.line["time"] >= start]
+    ended = next((tick for tick in after if tick.decision.state != State.THROW), after[-1])
+    times: dict[str, Any] = {"policy_start": start, "latch": latch, "recovery": ended.line["time"]}
+    times["end"] = ticks[-1].line["time"]
+    over = np.inf if landing is None else landing.time  # what happens once it is down takes nothing from the throw
+    stopped = next((t.decision.reason for t in after if t.decision.state == State.ABORT and t.line["time"] < over), None)
+    failure = stopped or (None if latch is not None else ended.decision.reason)
+    result: dict[str, Any] = {"success": landing is not None and stopped is None, "failure": failure}
+    if landing is not None:
+        times |= {"landing": landing.time, "separation": landing.separation or latch + landing.lag}
+        result |= {"landing_w": list(landing.landing_w), "error": landing.error, "duration": landing.duration,
+                   "separation_found": landing.separation is not None}  # fmt: skip
+        recorder.add(landing.time, landing=landing.landing_w)
+        recorder.add(times["separation"], separation=landing.separation_w or landing.landing_w)
+    elif failure is None:
+        result["failure"] = "no landing was seen in the payload's poses"
+    result["hovering_again"] = any(t.decision.reason == "hovering again" for t in after)
+    recorder.meta |= {"times": times, "result": result}
+
+
+def throws(course: Course) -> list[FlightLog]:
+    """A log a throw."""
+    logs, before = [], 0
+    for number, (first, last) in enumerate(course.throws):
+        period = course.playback.runner.pilot.period
+        begin = max(before, first - round(LEAD / period))
+        until = course.throws[number + 1][0] - 1 if number + 1 < len(course.throws) else len(course.ticks) - 1
+        until = min(until, last + round(AFTER / period))
+        logs.append(log_of(course, begin, until, number))
+        before = until + 1
+    return logs
+
+
+def whole(course: Course) -> FlightLog:
+    """One log of the whole run."""
+    return log_of(course, 0, len(course.ticks) - 1)

@@ -1,0 +1,87 @@
+"""A recorded run, run again tick by tick: what the runner decided and what it took for true.
+
+The replay, the flight logs and the viewer are all made of this, so that they show what was flown and nothing else.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from hil.backends.base import DryRun, Status
+from hil.control.decision import Decision, Words
+from hil.control.runner import Runner
+from hil.params import HilParams
+from hil.poses.pose import Pose, Vector
+from hil.poses.sight import Sight
+from hil.poses.track import Track
+from hil.recording.record import load_run
+from visthrow.onboard.policy import Policy
+
+
+@dataclass
+class Sample:
+    """A pose that the gate let through, in our frames, with what was estimated from it."""
+
+    body: str
+    pose: Pose  # stamp on the source's clock, freed of its steps
+    vel_w: Vector  # [m/s]
+    rate_b: Vector  # [rad/s]
+    time: float | None = None  # of the measurement on the runner's clock [s], once it was worked out from the whole run
+
+
+class Playback:
+    """Feeds recorded ticks to a runner of their config and policy.
+
+    Attributes:
+        runner: after the last tick fed.
+    """
+
+    def __init__(self, params: HilParams, policy: Policy) -> None:
+        """Start before the first tick; see `hil.recording.record.load_run` for both."""
+        self.runner = Runner(params, policy, DryRun())
+        self.runner.watcher = self._take
+        self._samples: list[Sample] = []
+
+    def _take(self, body: str, track: Track) -> None:
+        self._samples.append(Sample(body, *track.sample()))
+
+    def feed(self, line: dict[str, Any], poses: list[Pose]) -> tuple[Decision, list[Sample]]:
+        """Run one recorded tick; returns what was decided, and the poses that were taken in it."""
+        self._samples = []
+        if line.get("seen") is not None:
+            self.runner.look([Sight.of(line["seen"])])
+        decision = self.runner.tick(line["time"], poses, Status(*line["status"]), Words(*line["words"]), line["recording"])
+        return decision, self._samples
+
+
+COMPARED = ("state", "command", "action", "observation", "keypoints", "valid", "release")
+"""What a replay must give again, bit for bit."""
+
+
+def replay(folder: str | Path) -> dict[str, Any]:
+    """Run the recorded poses, statuses and words of a run through the runner again.
+
+    Returns:
+        Number of ticks and actions compared, the bodies, and the differences: tick, name, recorded value, value now.
+
+    Raises:
+        RunError: no folder of a run, or a damaged one.
+    """
+    params, policy, ticks, poses = load_run(folder)
+    playback = Playback(params, policy)
+    differences: list[tuple[int, str, Any, Any]] = []
+    actions = 0
+    for line in ticks:
+        decision, _ = playback.feed(line, poses.get(line["n"], []))
+        actions += decision.action is not None
+        for name in COMPARED:
+            was, now = line[name], getattr(decision, name)
+            now = list(now) if isinstance(now, tuple) else now
+            if was != now:
+                differences.append((line["n"], name, was, now))
+    return {
+        "ticks": len(ticks),
+        "actions": actions,
+        "bodies": sorted({pose.body for group in poses.values() for pose in group} & set(playback.runner.tracks)),
+        "differences": differences,
+    }

@@ -1,0 +1,113 @@
+"""What is made of a run's folder when the run is over: flight logs, pictures, the report of its times."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from hil.errors import RunError
+from hil.recording.flightlogs import read, throws, whole
+from hil.recording.latency import Stages, draw, table
+from hil.recording.record import SUMMARY
+from visthrow.common.errors import VisthrowError
+from visthrow.logs.flightlog import FlightLog
+
+LATENCY_PICTURE, WHOLE = "latency.png", "flight.npz"
+
+
+def story(summary: dict[str, Any], folder: Path) -> str:
+    """A run in a few lines."""
+    lines = [f"{'ABORTED' if summary['aborted'] else 'ended in ' + summary['state']}: {summary['reason']}"]
+    lines.append(f"throws {summary['throws']}, released {summary['latches']}, cancelled {summary['cancelled']}")
+    if summary["stuck"]:
+        lines.append(f"{summary['stuck']} released payload still hung on the vehicle: look at the mechanism")
+    for landing in summary["landings"]:
+        lines.append(
+            f"landing at x {landing['landing_w'][0]:.3f} m, y {landing['landing_w'][1]:+.3f} m by the payload's own poses: "
+            f"{landing['error']:.3f} m from the goal, {landing['duration']:.2f} s after the throw began"
+        )
+        if landing["separation"] is not None:
+            took = landing["separation"] - landing["latch"]
+            lines.append(f"it let go {1e3 * took:.0f} ms after the latch; trained with {1e3 * landing['lag']:.0f} ms")
+    for name, body in summary["bodies"].items():
+        refused = ", ".join(f"{n} {why}" for why, n in body["refused"].items()) or "none"
+        lines.append(f"{name}: {body['accepted']} poses taken; refused: {refused}")
+    ours = summary["missed_ours"]
+    lines.append(f"ticks {summary['ticks']}, missed {summary['missed']}, {ours} of them by taking too long ourselves")
+    lines += table(summary["latency"])
+    lines += [f"error: {text.strip().splitlines()[-1]}" for text in summary["errors"]]
+    return "\n".join([*lines, f"{folder}  the run; `visthrow hil replay {folder}` runs it again"])
+
+
+def throw_path(folder: Path, number: int, ending: str) -> Path:
+    """File of a throw, counted from 1."""
+    return folder / f"throw-{number:02d}{ending}"
+
+
+def finish(folder: str | Path, stages: Stages | None = None) -> list[str]:
+    """Write latency picture, and a flight log and picture a throw; of a run without throws one log of all of it.
+
+    Args:
+        folder: of a run that is over.
+        stages: its times; None where they are not at hand.
+
+    Returns:
+        Lines that say what was written, and what could not be.
+    """
+    folder, said = Path(folder), []
+    try:
+        if stages is not None:
+            draw(folder / LATENCY_PICTURE, stages, f"Times of each stage, run {folder.name}")
+            said.append(f"{folder / LATENCY_PICTURE}  times of each stage")
+        course = read(folder)
+        if not course.throws:
+            whole(course).save(folder / WHOLE)
+            said.append(f"{folder / WHOLE}  flight log of the whole run")
+        for number, log in enumerate(throws(course), start=1):
+            path = throw_path(folder, number, ".npz")
+            log.save(path)
+            said.append(f"{path}  throw {number}: {outcome(log)}")
+            if "landing" in log:
+                picture(folder, number, log, course.params.camera)
+    except VisthrowError as error:
+        said.append(f"not all could be written: {error}")
+    return said
+
+
+def outcome(log: FlightLog) -> str:
+    """How a throw ended, in words."""
+    result = log.meta["result"]
+    if not result["success"]:
+        return f"no landing counted: {result['failure']}"
+    return f"{result['error']:.3f} m from the goal after {result['duration']:.2f} s"
+
+
+def picture(folder: Path, number: int, log: FlightLog, camera: Any) -> Path:
+    """Draw a throw's strip; returns its path."""
+    from visthrow.view import strip
+
+    path = throw_path(folder, number, ".png")
+    strip.draw(path, log, camera)
+    return path
+
+
+def throw_logs(folder: str | Path) -> list[FlightLog]:
+    """Logs of a run's throws: as they were written, else made now.
+
+    Raises:
+        RunError: no folder of a run, or a damaged one.
+        LogError: a log that was written is damaged.
+    """
+    folder = Path(folder)
+    kept = sorted(folder.glob("throw-*.npz"))
+    if kept and len(kept) == _throws_flown(folder):
+        return [FlightLog.load(path) for path in kept]
+    return throws(read(folder))
+
+
+def _throws_flown(folder: Path) -> int | None:
+    try:
+        return json.loads((folder / SUMMARY).read_text(encoding="utf-8"))["throws"]
+    except OSError:
+        return None  # killed: there is no summary
+    except (ValueError, KeyError, TypeError) as error:
+        raise RunError(f"{folder / SUMMARY}: not the summary of a run: {error!r}") from error

@@ -1,0 +1,278 @@
+"""A run in the rerun viewer: live, or from its folder.
+
+The live view reads the folder that the run writes, in a process of its own: the flying process does nothing for it that it
+would not do without it. Where the viewer falls behind, ticks are left out.
+"""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+from urllib.parse import quote
+
+import numpy as np
+
+from hil.errors import RunError
+from hil.params import HilParams
+from hil.poses.pose import PAYLOAD, VEHICLE, Pose
+from hil.recording.flightlogs import Samples, Tick, events, meta_of, read, tick_of
+from hil.recording.playback import Playback
+from hil.recording.record import CONFIG, POLICY, POSES, PROVENANCE, SUMMARY, TICKS, pose_of
+from visthrow import config
+from visthrow.onboard.policy import Policy
+
+EVERY = 0.1
+"""Between two looks at the folder [s]."""
+
+MOST_SHOWN = 100
+"""Ticks sent at a time; of more, where the viewer fell behind, the last ones."""
+
+TRAIL = 300
+"""Poses whose places stay drawn: three seconds at 100 Hz."""
+
+HOST = "127.0.0.1"
+WEB_PORT, DATA_PORT = 9090, 9876
+"""Of rerun's web viewer and of its data; only this machine is listened to."""
+
+BODY_CHANNELS = {VEHICLE: "pos_w", PAYLOAD: "payload_pos_w"}
+
+
+class Show:
+    """Sends ticks to a stream of rerun."""
+
+    def __init__(self, stream: Any, params: HilParams, playback: Playback, provenance: dict[str, Any], start: float) -> None:
+        """Send what does not move.
+
+        Args:
+            stream: a recording stream.
+            params: of the run. playback: whose ticks come. provenance: of the run.
+            start: zero of the viewer's time [s].
+        """
+        from visthrow.view import rerun_view
+
+        self._stream, self._view, self._playback = stream, rerun_view, playback
+        self._meta = meta_of(params, playback, provenance, start)
+        self._samples = Samples(params, playback, self._meta)
+        self._trails: dict[str, deque] = {name: deque(maxlen=TRAIL) for name in BODY_CHANNELS}
+        self._latch: float | None = None
+        self._said: list | None = None
+        rerun_view.still(stream, self._meta["goal_w"], sizes(playback.runner.pilot))
+
+    def take(self, ticks: list[Tick]) -> None:
+        """Send some ticks, in order."""
+        lag = self._playback.runner.latch.lag
+        for tick in ticks:
+            if tick.decision.release:
+                self._latch = tick.line["time"]
+            elif tick.decision.state == "armed":
+                self._latch = None
+            self._samples.add(tick, self._latch is None or tick.line["time"] < self._latch + lag)
+            for sample in tick.samples:
+                if sample.body in self._trails:
+                    self._trails[sample.body].append(sample.pose.pos)
+        log = self._samples.flush()
+        told = events(ticks)
+        if told and self._said is not None and told[0][1:] == self._said[1:]:
+            told = told[1:]
+        self._said = told[-1] if told else self._said
+        log.meta["events"] = told
+        self._view.send(self._stream, log)
+        now = ticks[-1].line["time"] - self._meta["times"]["policy_start"]
+        for body, points in self._trails.items():
+            if len(points) > 1:
+                self._view.trail(self._stream, BODY_CHANNELS[body], now, np.array(points))
+
+
+def sizes(pilot: Any) -> SimpleNamespace:
+    """What `visthrow.view.rerun_view` draws by, from the policy's contract."""
+    contract = pilot.policy.contract
+    rotors = SimpleNamespace(**contract["vehicle"]["rotors"])
+    rope = SimpleNamespace(payload_radius=contract["rope"]["payload_radius"])
+    return SimpleNamespace(camera=pilot.camera.params, vehicle=SimpleNamespace(rotors=rotors), rope=rope)
+
+
+class Tail:
+    """Whole lines that are added to a file."""
+
+    def __init__(self, path: Path) -> None:
+        """Begin at its start; it may not be there yet."""
+        self._path, self._file, self._rest = path, None, ""
+
+    def lines(self) -> Iterator[Any]:
+        """Values of the lines that were completed since the last call."""
+        if self._file is None:
+            if not self._path.is_file():
+                return
+            self._file = self._path.open(encoding="utf-8")
+        self._rest += self._file.read()
+        *whole, self._rest = self._rest.split("\n")
+        for row in whole:
+            yield json.loads(row)
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._file is not None:
+            self._file.close()
+
+
+class Follower:
+    """Plays back a run while it is written."""
+
+    def __init__(self, folder: Path) -> None:
+        """Read config, policy and provenance, which a run writes before it waits for poses.
+
+        Raises:
+            RunError: no folder of a run.
+        """
+        if not all((folder / name).is_file() for name in (CONFIG, POLICY, PROVENANCE)):
+            raise RunError(f"{folder}: no folder of a run; expected {CONFIG}, {POLICY} and {PROVENANCE} in it")
+        self.folder, self.params = folder, config.load(HilParams, folder / CONFIG)
+        self.playback = Playback(self.params, Policy.load(folder / POLICY))
+        self.provenance = json.loads((folder / PROVENANCE).read_text(encoding="utf-8"))
+        self._tails = {name: Tail(folder / name) for name in (TICKS, POSES)}
+        self._lines: deque[dict[str, Any]] = deque()
+        self._poses: dict[int, list[Pose]] = {}
+
+    def ticks(self) -> list[Tick]:
+        """Ticks that were written since the last call, with all their poses."""
+        for row in self._tails[POSES].lines():
+            index, pose = pose_of(row)
+            self._poses.setdefault(index, []).append(pose)
+        self._lines.extend(self._tails[TICKS].lines())
+        found = []
+        while self._lines and len(self._poses.get(self._lines[0]["n"], ())) >= self._lines[0]["poses"]:
+            line = self._lines.popleft()
+            found.append(tick_of(self.playback, line, self._poses.pop(line["n"], [])))
+        return found
+
+    @property
+    def over(self) -> bool:
+        """Whether the run has ended."""
+        return (self.folder / SUMMARY).is_file()
+
+    def close(self) -> None:
+        """Close the files."""
+        for tail in self._tails.values():
+            tail.close()
+
+
+def follow(folder: str | Path, stream: Any, going: Callable[[], bool] = lambda: True) -> int:
+    """Send a run to a stream while it is written, until it is over.
+
+    Args:
+        folder: of the run.
+        stream: of rerun.
+        going: whether to go on.
+
+    Returns:
+        Number of ticks that were left out.
+    """
+    follower, show, dropped = Follower(Path(folder)), None, 0
+    try:
+        while going():
+            over = follower.over
+            ticks = follower.ticks()
+            dropped += max(0, len(ticks) - MOST_SHOWN)
+            if ticks:
+                if show is None:
+                    start = ticks[0].line["time"]
+                    show = Show(stream, follower.params, follower.playback, follower.provenance, start)
+                show.take(ticks[-MOST_SHOWN:])
+            elif over:
+                break
+            time.sleep(EVERY)
+    finally:
+        follower.close()
+    return dropped
+
+
+def write(folder: str | Path, path: str | Path) -> None:
+    """Write a whole run as a ``.rrd`` file.
+
+    Raises:
+        RunError: no folder of a run, or a damaged one.
+        StorageError: the place cannot be written.
+    """
+    from visthrow.view import rerun_view
+
+    course = read(folder)
+    layout = rerun_view.blueprint(np.array(course.params.goal_w), {"state"})
+    with rerun_view.recording(path, layout) as stream:
+        show = Show(stream, course.params, course.playback, course.provenance, course.ticks[0].line["time"])
+        for first in range(0, len(course.ticks), MOST_SHOWN // 10):
+            show.take(course.ticks[first : first + MOST_SHOWN // 10])
+
+
+@contextmanager
+def web_viewer(goal_w: tuple[float, float, float], web_port: int = WEB_PORT, data_port: int = DATA_PORT) -> Iterator[Any]:
+    """Serve rerun's web viewer to this machine alone; gives the stream that it shows.
+
+    Raises:
+        RunError: a port is taken.
+    """
+    import rerun as rr
+
+    from visthrow.view import rerun_view
+
+    command = [sys.executable, "-m", "rerun", "--serve-web", "--bind", HOST, "--port", str(data_port)]
+    command += ["--web-viewer-port", str(web_port), "--server-memory-limit", "500MB"]
+    server = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, stdin=subprocess.DEVNULL)
+    data = f"rerun+http://{HOST}:{data_port}/proxy"
+    try:
+        if not _answers(server, web_port):
+            raise RunError(f"the viewer did not start; are ports {web_port} and {data_port} free? name others")
+        stream = rr.RecordingStream("visthrow", recording_id=None)
+        layout = rerun_view.blueprint(np.array(goal_w), {"state"})
+        stream.connect_grpc(data, default_blueprint=layout)
+        print(f"look at http://{HOST}:{web_port}?url={quote(data, safe='')}", file=sys.stderr, flush=True)
+        yield stream
+        stream.flush()
+    finally:
+        server.terminate()
+        server.wait(5)
+
+
+def _answers(server: subprocess.Popen, port: int) -> bool:
+    """Whether a server of ours listens on a port within half a minute."""
+    import socket
+
+    for _ in range(300):
+        time.sleep(0.1)
+        if server.poll() is not None:
+            return False
+        with socket.socket() as probe:
+            if probe.connect_ex((HOST, port)) == 0:
+                return True
+    return False
+
+
+def beside(folder: Path) -> subprocess.Popen:
+    """Start the live view of a run in a process of its own, at the lowest priority."""
+    command = [sys.executable, "-m", "visthrow.cli", "hil", "view", str(folder), "--live"]
+    lowest = (lambda: os.nice(19)) if hasattr(os, "nice") else None
+    return subprocess.Popen(command, stdin=subprocess.DEVNULL, preexec_fn=lowest)
+
+
+def run(folder: Path, live: bool, out: str | None, web_port: int, data_port: int) -> int:
+    """What ``visthrow hil view`` does: serve the live view, or write files."""
+    from hil.recording.report import finish
+
+    if live:
+        params = Follower(folder).params
+        with web_viewer(params.goal_w, web_port, data_port) as stream:
+            dropped = follow(folder, stream)
+            print(f"the run is over; {dropped} ticks were left out of the view. Ctrl-C closes the viewer", file=sys.stderr)
+            while True:
+                time.sleep(1.0)
+    path = Path(out) if out is not None else folder / "run.rrd"
+    write(folder, path)
+    print(f"{path}  the run in 3D, image plane and signals; open it with: rerun {path}")
+    print("\n".join(finish(folder)))
+    return 0

@@ -1,0 +1,109 @@
+"""State of a batch of plants as Warp arrays, and what one control step puts out.
+
+Shapes use E environments and L rope segments. Rope arrays stand segment first, (L, E), so that neighbouring threads
+read neighbouring memory.
+"""
+
+import warp as wp
+
+from sim.arrays.structs import Types, make_struct
+
+NONFINITE = 1
+"""Status bit: a state became non-finite or faster than any physical one; the environment was put back to its last good state.
+Or the command was not finite, and the last one was held."""
+FALLBACK = 2
+"""Status bit: a rod turned faster than a substep resolves; the first-order stage was kept there."""
+COLLISION = 4
+"""Status bit: the payload came closer to the vehicle than both radii."""
+ROPE_IN_ROTOR = 8
+"""Status bit: a joint of the rope passed through a propeller disc."""
+
+QUAD_FIELDS = {  # name: (type, also by row); the fields of t.QuadState in its order
+    "pos_w": ("vec3", False),
+    "quat_wb": ("quat", False),
+    "vel_w": ("vec3", False),
+    "rate_b": ("vec3", False),
+    "motor_speed": ("vec4", False),
+    "integral": ("vec3", False),
+    "setpoint": ("vec3", False),
+    "gyro": ("vec3", False),
+    "charge_used": ("real", False),
+    "voltage": ("real", False),
+}
+
+STATE_FIELDS = QUAD_FIELDS | {  # those by row have a row a segment, the queue a row a slot
+    "mass_scale": ("real", False),
+    "cable_dir_w": ("vec3", True),
+    "cable_vel_w": ("vec3", True),
+    "stiffness": ("real", True),
+    "queue": ("vec4", True),  # (D, E) commands, newest first
+    "release_timer": ("real", False),  # time to separation [s]; negative: not latched
+    "attached": ("int", False),
+    "status": ("int", False),
+}
+
+OUTPUT_FIELDS = {
+    "payload_pos_w": "vec3",
+    "payload_vel_w": "vec3",  # at the end of the step, or at separation once released
+    "separated": "int",  # separation happened within this step
+    "landing_w": "vec3",
+    "time_to_impact": "real",
+    "clearance": "real",
+    "separation_time": "real",  # valid once released
+    "release_pos_w": "vec3",  # vehicle at separation
+}
+
+
+def array_struct(t: Types, name: str, fields: dict[str, tuple[str, bool]]) -> type:
+    """Warp struct that holds one array per field."""
+    scalar = {"real": t.real, "int": wp.int32, "vec3": t.vec3, "vec4": t.vec4, "quat": t.quat}
+    return make_struct(
+        name, {k: wp.array(dtype=scalar[kind], ndim=2 if rows else 1) for k, (kind, rows) in fields.items()}
+    )
+
+
+def allocate(
+    t: Types, struct: type, fields: dict[str, tuple[str, bool]], count: int, rows: dict[str, int], device: str
+):
+    """Zeroed arrays of shape (E,), or (rows[name], E), in an instance of ``struct``."""
+    scalar = {"real": t.real, "int": wp.int32, "vec3": t.vec3, "vec4": t.vec4, "quat": t.quat}
+    out = struct()
+    for name, (kind, by_row) in fields.items():
+        shape = (rows[name], count) if by_row else count
+        setattr(out, name, wp.zeros(shape, dtype=scalar[kind], device=device))
+    return out
+
+
+def build_access(t: Types, State: type):
+    """Return Warp functions ``load(state, env) -> t.QuadState`` and ``store(state, env, s)`` for a struct of arrays."""
+    QuadState = t.QuadState
+
+    @wp.func
+    def load(state: State, env: int):
+        s = QuadState()
+        s.pos_w = state.pos_w[env]
+        s.quat_wb = state.quat_wb[env]
+        s.vel_w = state.vel_w[env]
+        s.rate_b = state.rate_b[env]
+        s.motor_speed = state.motor_speed[env]
+        s.integral = state.integral[env]
+        s.setpoint = state.setpoint[env]
+        s.gyro = state.gyro[env]
+        s.charge_used = state.charge_used[env]
+        s.voltage = state.voltage[env]
+        return s
+
+    @wp.func
+    def store(state: State, env: int, s: QuadState):
+        state.pos_w[env] = s.pos_w
+        state.quat_wb[env] = s.quat_wb
+        state.vel_w[env] = s.vel_w
+        state.rate_b[env] = s.rate_b
+        state.motor_speed[env] = s.motor_speed
+        state.integral[env] = s.integral
+        state.setpoint[env] = s.setpoint
+        state.gyro[env] = s.gyro
+        state.charge_used[env] = s.charge_used
+        state.voltage[env] = s.voltage
+
+    return load, store

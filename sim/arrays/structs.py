@@ -1,0 +1,299 @@
+"""Warp structs of the parameters and of the vehicle's state, made for one floating-point precision.
+
+The dataclasses of :mod:`sim.params` are the only place where a parameter is declared: :class:`Types` derives the Warp
+struct of each from its annotations, so a field added there reaches the kernels under the same name.
+"""
+
+import dataclasses
+import typing
+from collections.abc import Iterable
+from functools import lru_cache
+from types import SimpleNamespace
+
+import numpy as np
+import warp as wp
+
+from sim import params as P
+from sim.arrays.checks import check_rope, check_vehicle
+
+
+def make_struct(name: str, fields: dict[str, type]) -> type:
+    return wp.struct(type(name, (), {"__annotations__": fields, "__module__": __name__}))
+
+
+class Types:
+    """Scalar, vector and struct types of one precision.
+
+    Attributes:
+        real, vec3, vec4, mat33, quat: Warp types.
+        Vehicle: struct of :class:`sim.params.VehicleParams`, with the mixer's columns added under ``mixer``.
+        Rope: struct of :class:`sim.params.RopeParams` per segment (``segment_length``, ``segment_mass``, ...).
+        Air: struct of :class:`sim.params.AirParams`, the coefficients of the plant's ``laws``, and what pushes from outside
+            during a step: ``push_w`` [N] on the vehicle, ``twist_b`` [N m] about its centre of mass, ``payload_push_w`` [N].
+        QuadState, QuadRate: state of the quadrotor alone and its time derivative.
+    """
+
+    def __init__(self, real: type):
+        self.real = real
+        self.vec3 = wp.types.vector(3, real)
+        self.vec4 = wp.types.vector(4, real)
+        self.mat33 = wp.types.matrix((3, 3), real)
+        self.quat = wp.types.quaternion(real)
+        self.Mixer = make_struct("Mixer", {"roll": self.vec4, "pitch": self.vec4, "yaw": self.vec4})
+        self.Vehicle = self.from_dataclass(P.VehicleParams, {"mixer": self.Mixer})
+        self.Release = self.from_dataclass(P.ReleaseParams, {})
+        self.Randomization = self.from_dataclass(P.RandomizationParams, {})
+        pushes = {"laws": self.vec4, "push_w": self.vec3, "twist_b": self.vec3, "payload_push_w": self.vec3}
+        self.Air = self.from_dataclass(P.AirParams, pushes)
+        self.Rope = make_struct(
+            "Rope",
+            {
+                "mount": self.vec3,
+                "segment_length": real,
+                "segment_mass": real,
+                "segment_inertia": real,
+                "last_mass": real,
+                "last_center": real,
+                "last_inertia": real,
+                "payload_offset": real,
+                "payload_radius": real,
+                "payload_arm": real,
+                "payload_mass": real,
+                "payload_drag": real,
+                "joint_damping": real,
+                "mount_damping": real,
+                "swing_damping": real,
+                "downwash": real,
+                "payload_side": real,
+                "payload_lift": real,
+                "compliance": real,
+                "strain": real,  # of a rope that gives, as it stands
+                "strain_rate": real,  # [1/s]
+                "stretched_share": real,  # of the last rod: how much of its lengthening its centre follows
+                "total_mass": real,
+            },
+        )
+        fields = {
+            "pos_w": self.vec3,
+            "quat_wb": self.quat,
+            "vel_w": self.vec3,
+            "rate_b": self.vec3,
+            "motor_speed": self.vec4,
+            "integral": self.vec3,
+            "setpoint": self.vec3,
+            "gyro": self.vec3,
+            "charge_used": real,
+            "voltage": real,
+        }
+        self.QuadState = make_struct("QuadState", fields)
+        self.QuadRate = make_struct("QuadRate", dict(fields))
+        self.Flow = make_struct(
+            "Flow",
+            {
+                "force_b": self.vec3,
+                "torque_b": self.vec3,
+                "motor_speed": self.vec4,
+                "motor_rate": self.vec4,
+                "integral_rate": self.vec3,
+                "setpoint_rate": self.vec3,
+                "gyro_rate": self.vec3,
+                "charge_rate": real,
+                "voltage_rate": real,
+            },
+        )
+
+    def _field_type(self, annotation) -> type | None:
+        if annotation is float:
+            return self.real
+        if annotation is int:
+            return wp.int32
+        if typing.get_origin(annotation) is tuple:
+            return {3: self.vec3, 4: self.vec4}[len(typing.get_args(annotation))]
+        if dataclasses.is_dataclass(annotation):
+            return self.from_dataclass(annotation, {})
+        return None  # kinds are chosen when the kernel is built; they are no run-time parameters
+
+    def from_dataclass(self, schema: type, extra: dict[str, type]) -> type:
+        hints = typing.get_type_hints(schema)
+        fields = {f.name: self._field_type(hints[f.name]) for f in dataclasses.fields(schema)}
+        return make_struct(schema.__name__, {k: v for k, v in fields.items() if v is not None} | extra)
+
+
+@lru_cache
+def types(precision: str) -> Types:
+    """Types of ``"float32"`` or ``"float64"``; made once, so that kernels of one precision share their structs."""
+    if precision not in ("float32", "float64"):
+        raise ValueError(f"precision {precision!r}: expected 'float32' or 'float64'")
+    return Types(wp.float32 if precision == "float32" else wp.float64)
+
+
+@lru_cache
+def _numpy_type(struct: type) -> np.dtype:
+    """Of the rows of a struct; Warp works it out anew each time."""
+    return struct.numpy_dtype()
+
+
+def _fill(row: np.void, value) -> None:
+    for f in dataclasses.fields(value):
+        if f.name not in row.dtype.names:
+            continue
+        item = getattr(value, f.name)
+        if dataclasses.is_dataclass(item):
+            _fill(row[f.name], item)
+        else:
+            row[f.name] = item
+
+
+def mixer_columns(rotors: P.RotorParams, torque_ratio: float) -> SimpleNamespace:
+    """Thrust of each rotor [N] that makes 1 N m about x, y and z without changing the sum; each of shape (4,)."""
+    x, y, s = np.asarray(rotors.x), np.asarray(rotors.y), np.asarray(rotors.spin)
+    return SimpleNamespace(roll=y / (4 * np.mean(y**2)), pitch=-x / (4 * np.mean(x**2)), yaw=s / (4 * torque_ratio))
+
+
+def kinds_of(vehicle: P.VehicleParams) -> tuple[str, str, str, str]:
+    """Kinds of controller, motor, battery and aerodynamics: what a kernel is built for."""
+    return vehicle.controller.kind, vehicle.motor.kind, vehicle.battery.kind, vehicle.aero.kind
+
+
+EXTENSIONS = {
+    "gain": "thrust gains of single rotors",
+    "wind": "wind",
+    "ground_effect": "thrust near the ground",
+    "payload_drag": "air drag of the payload",
+    "mount_damping": "friction of the rope's mount",
+    "swing_damping": "friction across the rope",
+    "downwash": "the rotors' jet on the payload",
+    "payload_spin": "side force and lift of a payload in flight",
+    "compliance": "rope that gives",
+    "lag_tension": "release lag that depends on the rope's pull",
+    "kick": "speed given to the payload at the release",
+    "rope_tail": "rope that leaves with the payload",
+    "push": "forces from outside",
+}
+"""Parts of the blocks that a kernel holds only if it was built for them, and what they are."""
+
+
+ROPE_EXTENSIONS = ("payload_drag", "mount_damping", "swing_damping", "downwash", "compliance")
+"""Those that are fields of :class:`sim.params.RopeParams` of the same name."""
+
+
+def extensions_of(
+    vehicles: Iterable[P.VehicleParams],
+    ropes: Iterable[P.RopeParams] = (),
+    airs: Iterable[P.AirParams] = (),
+    releases: Iterable[P.ReleaseParams] = (),
+    laws: Iterable[P.LawParams] = (),
+) -> frozenset[str]:
+    """Names of :data:`EXTENSIONS` without which one of these plants would not be simulated in full."""
+    needed = {"push"} if any(True for _ in laws) else set()
+    for v in vehicles:
+        needed |= {"gain"} if any(g != 1.0 for g in v.thrust.gain) else set()
+    for r in ropes:
+        needed |= {name for name in ROPE_EXTENSIONS if getattr(r, name) != 0.0}
+        needed |= {"payload_spin"} if r.payload_side or r.payload_lift else set()
+    for a in airs:
+        needed |= ({"wind"} if any(a.wind_w) else set()) | ({"ground_effect"} if a.ground_effect else set())
+    for x in releases:
+        needed |= {name for name in ("lag_tension", "rope_tail") if getattr(x, name) != 0.0}
+        needed |= {"kick"} if any(x.kick_w) or x.kick_along else set()
+    return frozenset(needed)
+
+
+def pack_vehicle(t: Types, vehicles: list[P.VehicleParams], kinds: tuple[str, str, str, str]) -> np.ndarray:
+    """Structured array of shape (1,) or (E,) for ``wp.array(dtype=t.Vehicle)``.
+
+    Args:
+        t: types of the wanted precision.
+        vehicles: one for all environments, or one each.
+        kinds: of the blocks that the kernel was built for.
+
+    Raises:
+        ValueError: other kinds of blocks, or a vehicle that :func:`sim.arrays.checks.check_vehicle` refuses.
+    """
+    rows = np.zeros(len(vehicles), dtype=_numpy_type(t.Vehicle))
+    for row, vehicle in zip(rows, vehicles, strict=True):
+        if kinds_of(vehicle) != kinds:
+            raise ValueError(
+                f"vehicle of the kinds {kinds_of(vehicle)} in a batch of {kinds}: expected the same blocks"
+            )
+        check_vehicle(vehicle)
+        _fill(row, vehicle)
+        _place_rotors(row, vehicle)
+        columns = mixer_columns(vehicle.rotors, vehicle.thrust.torque_ratio)
+        for name in ("roll", "pitch", "yaw"):
+            row["mixer"][name] = getattr(columns, name)
+    return rows
+
+
+def _place_rotors(row: np.void, vehicle: P.VehicleParams) -> None:
+    """Arms about the centre of mass, and the drag torque as the rotors have it, not as the controller knows it."""
+    com = np.asarray(vehicle.body.com)
+    row["rotors"]["x"] = np.asarray(vehicle.rotors.x) - com[0]
+    row["rotors"]["y"] = np.asarray(vehicle.rotors.y) - com[1]
+    row["rotors"]["z"] = vehicle.rotors.z - com[2]
+    row["thrust"]["torque_ratio"] = vehicle.thrust.torque_ratio * vehicle.thrust.torque_gain
+
+
+def pack(struct: type, *values) -> np.ndarray:
+    """Structured array for ``wp.array(dtype=struct)``, a row filled from each of the dataclasses it was derived from."""
+    rows = np.zeros(len(values), dtype=_numpy_type(struct))
+    for row, value in zip(rows, values, strict=True):
+        _fill(row, value)
+    return rows
+
+
+def pack_air(t: Types, airs: list[P.AirParams], laws: list[tuple[P.LawParams, ...]]) -> np.ndarray:
+    """Structured array for ``wp.array(dtype=t.Air)``: a row for each air, with the coefficients of its plant's laws."""
+    rows = pack(t.Air, *airs)
+    for row, own in zip(rows, laws, strict=True):
+        row["laws"][: len(own)] = [law.coefficient for law in own]
+    return rows
+
+
+def ropes_on(vehicles: list[P.VehicleParams], ropes: list[P.RopeParams]) -> list[P.RopeParams]:
+    """The ropes with their mounts stated from the centre of mass of the vehicle that each hangs on.
+
+    Raises:
+        ValueError: vehicles whose centres of mass differ, and ropes that cannot be paired with them.
+    """
+    coms = [v.body.com for v in vehicles]
+    if len(set(coms)) > 1:
+        if len(ropes) not in (1, len(vehicles)):
+            raise ValueError(
+                f"{len(ropes)} ropes on {len(vehicles)} vehicles of different centres of mass: expected one rope, or one each"
+            )
+        ropes = ropes * len(vehicles) if len(ropes) == 1 else ropes
+    else:
+        coms = coms[:1] * len(ropes)
+    return [
+        dataclasses.replace(rope, mount=tuple(m - c for m, c in zip(rope.mount, com)))
+        for rope, com in zip(ropes, coms, strict=True)
+    ]
+
+
+def pack_rope(t: Types, ropes: list[P.RopeParams]) -> np.ndarray:
+    """Structured array of shape (1,) or (E,) for ``wp.array(dtype=t.Rope)``.
+
+    The last rod carries the payload: its mass, centre and transverse inertia about its upper joint are combined here.
+
+    Raises:
+        ValueError: a rope that :func:`sim.arrays.checks.check_rope` refuses.
+    """
+    rows = np.zeros(len(ropes), dtype=_numpy_type(t.Rope))
+    for row, rope in zip(rows, ropes, strict=True):
+        check_rope(rope)
+        length, mass = rope.length / rope.segments, rope.rope_mass / rope.segments
+        ball = length + rope.payload_offset
+        last_mass = mass + rope.payload_mass
+        row["segment_length"], row["segment_mass"], row["segment_inertia"] = length, mass, mass * length**2 / 3
+        row["last_mass"], row["last_center"] = last_mass, (mass * length / 2 + rope.payload_mass * ball) / last_mass
+        row["last_inertia"] = mass * length**2 / 3 + rope.payload_inertia + rope.payload_mass * ball**2
+        row["payload_offset"], row["payload_radius"] = rope.payload_offset, rope.payload_radius
+        row["payload_arm"], row["payload_mass"], row["payload_drag"] = ball, rope.payload_mass, rope.payload_drag
+        row["joint_damping"], row["mount"] = rope.joint_damping, rope.mount
+        row["mount_damping"], row["swing_damping"] = rope.mount_damping, rope.swing_damping
+        row["downwash"], row["compliance"] = rope.downwash, rope.compliance
+        row["payload_side"], row["payload_lift"] = rope.payload_side, rope.payload_lift
+        row["stretched_share"] = (mass / 2 + rope.payload_mass) / last_mass
+        row["total_mass"] = rope.rope_mass + rope.payload_mass
+    return rows

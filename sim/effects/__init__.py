@@ -1,0 +1,1 @@
+"""Effects that extend the simulator beyond the paper's blocks."""

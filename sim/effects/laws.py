@@ -1,0 +1,359 @@
+"""Laws that a diagnosis found, as blocks of the fused kernel: coefficient times up to two scalars times one vector.
+
+A law is plain data (:class:`sim.params.LawParams`). :func:`build_laws` composes the functions of its factors into the kernel that
+is built for it; its coefficient is a number of the run, so that one kernel serves every size of a law. The names are those of
+``visthrow.diagnose.select.grammar``. A law's force is taken at the start of an integration step and held over it.
+
+A torque M in the rope's joint acts on the vehicle, and -M on the rope: by the pair of forces that does the same to a straight rope
+of the length l in direction n, (-M x n) / l on the payload and its opposite at the mount. Momentum is conserved.
+"""
+
+from types import SimpleNamespace
+
+import warp as wp
+
+from sim.arrays.structs import Types, make_struct
+from sim.params import LawParams
+from sim.quadrotor.thrust import rotor_thrust_scaled
+
+LOWEST = 0.05  # height below which 1/z is held [m]
+MOST_LAWS = 4
+SLOWEST = 0.1  # rate of the rope against the vehicle below which dry friction falls to 0 [1/s]
+BLOCKS = ("vehicle force", "vehicle torque", "payload force", "rope joint")
+
+
+def _factors(t: Types, Around: type) -> tuple[dict, dict]:
+    """Warp functions of the scalars, and of the vectors by block; forces in the world frame, torques in the body's."""
+    vec3, real = t.vec3, t.real
+
+    @wp.func
+    def up(a: Around):
+        return wp.quat_rotate(a.quat_wb, vec3(real(0.0), real(0.0), real(1.0)))
+
+    @wp.func
+    def ahead(a: Around):
+        return wp.quat_rotate(a.quat_wb, vec3(real(1.0), real(0.0), real(0.0)))
+
+    @wp.func
+    def left(a: Around):
+        return wp.quat_rotate(a.quat_wb, vec3(real(0.0), real(1.0), real(0.0)))
+
+    @wp.func
+    def vertical(a: Around):
+        return vec3(real(0.0), real(0.0), real(1.0))
+
+    @wp.func
+    def body_x(a: Around):
+        return vec3(real(1.0), real(0.0), real(0.0))
+
+    @wp.func
+    def body_y(a: Around):
+        return vec3(real(0.0), real(1.0), real(0.0))
+
+    @wp.func
+    def vel(a: Around):
+        return a.vel_w
+
+    @wp.func
+    def vel_body(a: Around):
+        return wp.quat_rotate_inv(a.quat_wb, a.vel_w)
+
+    @wp.func
+    def along(a: Around):
+        return wp.dot(a.vel_w, up(a))
+
+    @wp.func
+    def across(a: Around):
+        return a.vel_w - along(a) * up(a)
+
+    @wp.func
+    def rate(a: Around):
+        return a.rate_b
+
+    @wp.func
+    def cable(a: Around):
+        return a.cable_dir_w
+
+    @wp.func
+    def swing(a: Around):
+        relative = a.payload_vel_w - a.vel_w
+        return relative - wp.dot(relative, a.cable_dir_w) * a.cable_dir_w
+
+    @wp.func
+    def under(a: Around):
+        return -wp.dot(a.cable_dir_w, up(a))
+
+    @wp.func
+    def aside(a: Around):
+        return a.cable_dir_w + under(a) * up(a)
+
+    @wp.func
+    def payload_vel(a: Around):
+        return a.payload_vel_w
+
+    @wp.func
+    def thrust(a: Around):
+        return a.thrust
+
+    @wp.func
+    def thrust_rate(a: Around):
+        return a.thrust_rate
+
+    @wp.func
+    def abs_thrust_rate(a: Around):
+        return wp.abs(a.thrust_rate)
+
+    @wp.func
+    def speed(a: Around):
+        return wp.length(a.vel_w)
+
+    @wp.func
+    def speed_across(a: Around):
+        return wp.length(across(a))
+
+    @wp.func
+    def speed_across_squared(a: Around):
+        return wp.dot(across(a), across(a))
+
+    @wp.func
+    def rate_size(a: Around):
+        return wp.length(a.rate_b)
+
+    @wp.func
+    def rate_yaw(a: Around):
+        return a.rate_b[2]
+
+    @wp.func
+    def inverse_height(a: Around):
+        return real(1.0) / wp.max(a.pos_w[2], real(LOWEST))
+
+    @wp.func
+    def tension(a: Around):
+        return a.tension
+
+    @wp.func
+    def payload_speed(a: Around):
+        return wp.length(a.payload_vel_w)
+
+    @wp.func
+    def swing_speed(a: Around):
+        return wp.length(swing(a))
+
+    def crossed(first, second):
+        @wp.func
+        def cross(a: Around):
+            return wp.cross(first(a), second(a))
+
+        return cross
+
+    def turned_back(vector):
+        @wp.func
+        def back(a: Around):
+            return wp.quat_rotate_inv(a.quat_wb, vector(a))
+
+        return back
+
+    @wp.func
+    def rate_world(a: Around):
+        return wp.quat_rotate(a.quat_wb, a.rate_b)
+
+    @wp.func
+    def joint_rate(a: Around):
+        reach = a.payload_pos_w - a.pos_w - wp.quat_rotate(a.quat_wb, a.mount_b)
+        mount_vel = a.vel_w + wp.quat_rotate(a.quat_wb, wp.cross(a.rate_b, a.mount_b))
+        rope_rate = wp.cross(reach, a.payload_vel_w - mount_vel) / wp.dot(reach, reach)
+        return wp.quat_rotate_inv(a.quat_wb, rope_rate) - a.rate_b
+
+    @wp.func
+    def joint_speed(a: Around):
+        return wp.length(joint_rate(a))
+
+    @wp.func
+    def friction(a: Around):
+        return joint_rate(a) / wp.sqrt(wp.dot(joint_rate(a), joint_rate(a)) + real(SLOWEST * SLOWEST))
+
+    scalars = {
+        "thrust": thrust, "thrust_rate": thrust_rate, "abs_thrust_rate": abs_thrust_rate, "speed": speed,
+        "speed_across": speed_across, "speed_across_squared": speed_across_squared, "speed_along": along, "rate": rate_size,
+        "rate_yaw": rate_yaw, "inverse_height": inverse_height, "tension": tension, "payload_speed": payload_speed,
+        "swing_speed": swing_speed, "cable_under_rotors": under, "joint_rate": joint_speed,
+    }  # fmt: skip
+    vectors = {
+        "vehicle force": {
+            "body_z": up, "body_x": ahead, "body_y": left, "world_z": vertical, "vel": vel, "vel_across": across,
+            "axis_cross_vel": crossed(up, vel), "rate_cross_vel": crossed(rate_world, vel), "cable": cable, "swing_vel": swing,
+        },
+        "vehicle torque": {
+            "body_x": body_x, "body_y": body_y, "body_z": vertical, "rate": rate, "axis_cross_rate": crossed(vertical, rate),
+            "vel": vel_body, "axis_cross_vel": crossed(vertical, vel_body),
+            "axis_cross_cable": crossed(vertical, turned_back(cable)), "axis_cross_swing": crossed(vertical, turned_back(swing)),
+        },
+        "payload force": {
+            "payload_vel": payload_vel, "vertical_cross_vel": crossed(vertical, payload_vel), "world_z": vertical, "body_z": up,
+            "cable": cable, "swing_vel": swing, "cable_cross_swing": crossed(cable, swing), "vel": vel, "sideways": aside,
+        },
+        "rope joint": {
+            "joint_rate": joint_rate, "friction": friction, "axis_cross_cable": crossed(vertical, turned_back(cable)),
+        },
+    }  # fmt: skip
+    return scalars, vectors
+
+
+def names() -> tuple[tuple[str, ...], dict[str, tuple[str, ...]]]:
+    """Scalars, and vectors by block, that a law may name."""
+    from sim.arrays.structs import types
+
+    t = types("float64")
+    scalars, vectors = _factors(t, make_struct("Around", _around(t)))
+    return tuple(scalars), {block: tuple(of) for block, of in vectors.items()}
+
+
+def _around(t: Types) -> dict[str, type]:
+    return {
+        "pos_w": t.vec3, "vel_w": t.vec3, "rate_b": t.vec3, "quat_wb": t.quat, "payload_pos_w": t.vec3, "payload_vel_w": t.vec3,
+        "cable_dir_w": t.vec3, "mount_b": t.vec3, "thrust": t.real, "thrust_rate": t.real, "tension": t.real,
+    }  # fmt: skip
+
+
+def structure(laws: tuple[LawParams, ...]) -> tuple:
+    """What a kernel is built for: everything of the laws but their coefficients."""
+    return tuple((law.block, law.factors, law.vector) for law in laws)
+
+
+def check_laws(laws: tuple[LawParams, ...]) -> None:
+    """Raise ValueError for a law that no block can be made of."""
+    scalars, vectors = names() if laws else ((), {})
+    if len(laws) > MOST_LAWS:
+        raise ValueError(f"{len(laws)} laws: expected at most {MOST_LAWS}")
+    for law in laws:
+        unknown = [name for name in law.factors if name not in scalars]
+        if law.block not in BLOCKS or unknown or law.vector not in vectors[law.block] or len(law.factors) > 2:
+            raise ValueError(
+                f"law {law}: expected a block of {BLOCKS}, up to two factors of {scalars}, and a vector of "
+                f"{vectors.get(law.block, BLOCKS)}"
+            )
+
+
+def build_joint(t: Types, Around: type, torque) -> object:
+    """Return ``act(around, air)`` -> air whose pushes hold a torque in the rope's joint and its reactions.
+
+    Args:
+        t: types of the wanted precision.
+        Around: struct of what the factors read.
+        torque: function ``(around, coefficients)`` -> torque on the vehicle [N m, body].
+    """
+    Air = t.Air
+
+    @wp.func
+    def act(a: Around, air: Air):
+        out = air
+        on_vehicle = torque(a, air.laws)
+        reach = a.payload_pos_w - a.pos_w - wp.quat_rotate(a.quat_wb, a.mount_b)
+        pair = -wp.cross(wp.quat_rotate(a.quat_wb, on_vehicle), reach) / wp.dot(reach, reach)
+        out.payload_push_w = air.payload_push_w + pair
+        out.push_w = air.push_w - pair
+        out.twist_b = air.twist_b + on_vehicle - wp.cross(a.mount_b, wp.quat_rotate_inv(a.quat_wb, pair))
+        return out
+
+    return act
+
+
+def build_no_joint(t: Types, Around: type) -> object:
+    """The same without any."""
+    Air = t.Air
+
+    @wp.func
+    def act(a: Around, air: Air):
+        return air
+
+    return act
+
+
+def build_laws(t: Types, laws: tuple[LawParams, ...], flow, chain, mount_velocity) -> SimpleNamespace:
+    """Compose the laws of a plant.
+
+    Returns:
+        Namespace of Warp functions ``on(p, rope, air, state, n, u, stiffness, command, attached)`` -> air whose pushes hold the
+        laws' forces besides its own, and ``in_flight(air, vel_w)`` [N] on a payload that has left. Without laws both do nothing.
+    """
+    vec3, vec4, real, Vehicle, Rope, Air, QuadState = t.vec3, t.vec4, t.real, t.Vehicle, t.Rope, t.Air, t.QuadState
+    if not laws:
+
+        @wp.func
+        def nothing(
+            p: Vehicle, rope: Rope, air: Air, s: QuadState, n: wp.array(dtype=vec3), u: wp.array(dtype=vec3),
+            stiffness: wp.array(dtype=real), command: vec4, attached: int,
+        ):  # fmt: skip
+            return air
+
+        @wp.func
+        def no_force(air: Air, vel_w: vec3):
+            return vec3()
+
+        return SimpleNamespace(on=nothing, in_flight=no_force)
+
+    Around = make_struct("Around", _around(t))
+    scalars, vectors = _factors(t, Around)
+
+    @wp.func
+    def one(a: Around):
+        return real(1.0)
+
+    @wp.func
+    def zero(a: Around, c: vec4):
+        return vec3()
+
+    def plus(before, law: LawParams, i: int):
+        first, second = (*[scalars[name] for name in law.factors], one, one)[:2]
+        vector = vectors[law.block][law.vector]
+
+        @wp.func
+        def term(a: Around, c: vec4):
+            return before(a, c) + (c[i] * first(a) * second(a)) * vector(a)
+
+        return term
+
+    total = dict.fromkeys(BLOCKS, zero)
+    for i, law in enumerate(laws):
+        total[law.block] = plus(total[law.block], law, i)
+    force, torque, payload_force, joint = (total[block] for block in BLOCKS)
+    act_in_joint = build_joint(t, Around, joint) if any(law.block == "rope joint" for law in laws) else build_no_joint(t, Around)
+
+    @wp.func
+    def on(
+        p: Vehicle, rope: Rope, air: Air, s: QuadState, n: wp.array(dtype=vec3), u: wp.array(dtype=vec3),
+        stiffness: wp.array(dtype=real), command: vec4, attached: int,
+    ):  # fmt: skip
+        a = Around()
+        a.pos_w = s.pos_w
+        a.vel_w = s.vel_w
+        a.rate_b = s.rate_b
+        a.quat_wb = s.quat_wb
+        f = flow(p, air, s, command)
+        f0 = rotor_thrust_scaled(p, f.motor_speed, s.voltage)
+        f1 = rotor_thrust_scaled(p, f.motor_speed + real(1.0e-3) * f.motor_rate, s.voltage)
+        for i in range(4):
+            a.thrust = a.thrust + f0[i]
+            a.thrust_rate = a.thrust_rate + real(1.0e3) * (f1[i] - f0[i])
+        if attached != 0:
+            pos, vel = chain.payload(rope, vec3(), mount_velocity(rope, s), n, u)
+            a.payload_pos_w = s.pos_w + wp.quat_rotate(s.quat_wb, rope.mount) + pos
+            a.payload_vel_w = vel
+            a.cable_dir_w = wp.normalize(pos)
+            a.mount_b = rope.mount
+            a.tension = chain.pull(rope, stiffness, u)
+        out = air
+        out.push_w = air.push_w + force(a, air.laws)
+        out.twist_b = air.twist_b + torque(a, air.laws)
+        if attached != 0:
+            out.payload_push_w = air.payload_push_w + payload_force(a, air.laws)
+            out = act_in_joint(a, out)
+        return out
+
+    @wp.func
+    def in_flight(air: Air, vel_w: vec3):
+        a = Around()
+        a.payload_vel_w = vel_w
+        return payload_force(a, air.laws)
+
+    return SimpleNamespace(on=on, in_flight=in_flight)

@@ -1,0 +1,205 @@
+"""One integration step of the vehicle with the chain as one body: root solve, ROS2 stages, momentum, fall-back."""
+
+from types import SimpleNamespace
+
+import warp as wp
+
+from sim.arrays.structs import Types
+from sim.quadrotor.rigid_body import advance, angular_acceleration, blend
+from sim.rope.payload import LOADS
+
+
+def build_root(t: Types):
+    """Solve for the root's acceleration, given what the chain asks for (``sim.rope.chain``).
+
+    Returns:
+        Warp function ``root(p, rope, state, force_b, torque_b, d, o, b, gravity)`` -> acceleration of the centre of mass
+        [m/s^2, world], angular acceleration [rad/s^2, body], acceleration of the mount [world], force on the chain [N, world].
+    """
+    vec3, mat33, Vehicle, Rope, QuadState = t.vec3, t.mat33, t.Vehicle, t.Rope, t.QuadState
+    real = t.real
+
+    @wp.func
+    def root(
+        p: Vehicle, rope: Rope, s: QuadState, force_b: vec3, torque_b: vec3, d: vec3, o: vec3, b: vec3, gravity: vec3
+    ):
+        r = rope.mount
+        rot = wp.quat_to_matrix(s.quat_wb)
+        inv_mass = real(1.0) / p.body.mass
+        alpha = angular_acceleration(p, s.rate_b, torque_b)
+        acc = inv_mass * (rot * force_b) + gravity
+        free = acc + rot * (wp.cross(alpha, r) + wp.cross(s.rate_b, wp.cross(s.rate_b, r)))
+        arm = rot * wp.skew(r)
+        inv_inertia = vec3(real(1.0) / p.body.inertia[0], real(1.0) / p.body.inertia[1], real(1.0) / p.body.inertia[2])
+        mobility = wp.diag(vec3(inv_mass, inv_mass, inv_mass)) + arm * wp.diag(inv_inertia) * wp.transpose(arm)
+        mass = mat33(d[0], o[0], o[1], o[0], d[1], o[2], o[1], o[2], d[2])
+        eye = wp.diag(vec3(real(1.0), real(1.0), real(1.0)))
+        mount_acc = wp.inverse(eye + mobility * mass) * (free - mobility * b)
+        pull = mass * mount_acc + b
+        reaction_b = -(wp.transpose(rot) * pull)
+        alpha = alpha + wp.cw_mul(inv_inertia, wp.cross(r, reaction_b))
+        return acc - inv_mass * pull, alpha, mount_acc, pull
+
+    return root
+
+
+def build_load(t: Types, chain: SimpleNamespace, payload: SimpleNamespace, mount_velocity, extensions: frozenset[str]):
+    """Force on the payload in both stages of a step, and the momentum that it brings.
+
+    Returns:
+        Warp functions ``first``, ``second`` (``(rope, air, state, flow, n, u, k1, h)`` -> force [N, world]) and
+        ``impulse(momentum, h, force, force)`` -> momentum [N s] after h of the forces' mean. Without any they do nothing.
+    """
+    vec3, real, Rope, Air, QuadState, Flow = t.vec3, t.real, t.Rope, t.Air, t.QuadState, t.Flow
+    last = chain.segments - 1
+
+    @wp.func
+    def none(
+        rope: Rope, air: Air, s: QuadState, f: Flow, n: wp.array(dtype=vec3), u: wp.array(dtype=vec3),
+        k1: wp.array(dtype=vec3), h: real,
+    ):  # fmt: skip
+        return vec3()
+
+    @wp.func
+    def no_impulse(momentum: vec3, h: real, force1: vec3, force2: vec3):
+        return momentum
+
+    @wp.func
+    def impulse(momentum: vec3, h: real, force1: vec3, force2: vec3):
+        return momentum + (real(0.5) * h) * (force1 + force2)
+
+    if not extensions & LOADS:
+        return none, none, no_impulse
+
+    def build(speed):
+        @wp.func
+        def load(
+            rope: Rope, air: Air, s: QuadState, f: Flow, n: wp.array(dtype=vec3), u: wp.array(dtype=vec3),
+            k1: wp.array(dtype=vec3), h: real,
+        ):  # fmt: skip
+            jet = wp.quat_rotate(s.quat_wb, vec3(real(0.0), real(0.0), -f.force_b[2]))
+            return payload.hanging(rope, air, speed(rope, mount_velocity(rope, s), u, k1, h), n[last], jet)
+
+        return load
+
+    return build(chain.speed_first), build(chain.speed_second), impulse
+
+
+def build_coupled_step(
+    t: Types, flow, rate, motor_advance, chain: SimpleNamespace, payload: SimpleNamespace, extensions: frozenset[str]
+):
+    """One step of h seconds of vehicle and chain.
+
+    The vehicle advances by Heun's method, the chain by ROS2, both from the same two solves. The velocity of the root
+    follows from the total linear momentum, which external forces alone change; so it is conserved to round-off.
+    Where a rod turns more than ``max_turn`` in the step, the first stage alone (linearly implicit Euler) is kept.
+
+    Returns:
+        Namespace of Warp functions ``step`` (new state, new total momentum, whether it fell back; the arrays n, u and
+        stiffness change in place), ``step_alone`` (the vehicle after the payload has left), ``momentum`` (total linear
+        momentum [N s]) and ``mount_velocity`` [m/s].
+    """
+    vec3, vec4, real = t.vec3, t.vec4, t.real
+    Vehicle, Rope, Air, QuadState = t.Vehicle, t.Rope, t.Air, t.QuadState
+    vec2 = chain.vec2
+    upper_damping = chain.upper_damping
+    L = chain.segments
+    root = build_root(t)
+
+    @wp.func
+    def mount_velocity(rope: Rope, s: QuadState):
+        return s.vel_w + wp.quat_rotate(s.quat_wb, wp.cross(s.rate_b, rope.mount))
+
+    load_first, load_second, add_impulse = build_load(t, chain, payload, mount_velocity, extensions)
+
+    @wp.func
+    def momentum(p: Vehicle, rope: Rope, s: QuadState, u: wp.array(dtype=vec3)):
+        return p.body.mass * s.vel_w + rope.total_mass * mount_velocity(rope, s) + chain.momentum(rope, u)
+
+    @wp.func
+    def root_velocity(p: Vehicle, rope: Rope, s: QuadState, total: vec3, relative: vec3):
+        """Velocity of the vehicle from the total momentum and the chain's own relative to the mount."""
+        turn = wp.quat_rotate(s.quat_wb, wp.cross(s.rate_b, rope.mount))
+        return (total - rope.total_mass * turn - relative) / (p.body.mass + rope.total_mass)
+
+    @wp.func
+    def damping_torque(rope: Rope, s: QuadState, rate_w: vec3, n: vec3, u: vec3):
+        """Couple of the uppermost joint on the vehicle [N m], body frame."""
+        return upper_damping(rope, 0) * wp.quat_rotate_inv(s.quat_wb, wp.cross(n, u) - rate_w)
+
+    @wp.func
+    def step(
+        p: Vehicle,
+        rope: Rope,
+        air: Air,
+        s: QuadState,
+        total: vec3,
+        command: vec4,
+        n: wp.array(dtype=vec3),
+        u: wp.array(dtype=vec3),
+        stiffness: wp.array(dtype=real),
+        gravity: vec3,
+        gamma: real,
+        max_turn: real,
+        h: real,
+    ):
+        k1 = wp.zeros(shape=(L,), dtype=vec3)
+        n2 = wp.zeros(shape=(L,), dtype=vec3)
+        c1 = wp.zeros(shape=(L,), dtype=vec3)
+        c2 = wp.zeros(shape=(L,), dtype=vec3)
+        hs = wp.zeros(shape=(L,), dtype=vec2)
+        half = real(0.5)
+        weight = (p.body.mass + rope.total_mass) * gravity
+
+        f1 = flow(p, air, s, command)
+        rate_w = wp.quat_rotate(s.quat_wb, s.rate_b)
+        load1 = load_first(rope, air, s, f1, n, u, k1, h)
+        d, o, b = chain.up_first(rope, n, u, n2, k1, stiffness, rate_w, gravity, load1, gamma, h, c1, c2, hs)
+        torque = f1.torque_b + damping_torque(rope, s, rate_w, n[0], u[0])
+        acc_w, alpha_b, mount_acc, pull = root(p, rope, s, f1.force_b, torque, d, o, b, gravity)
+        fastest = chain.down_first(rope, n, u, mount_acc, gamma, h, c1, c2, hs, n2, k1)
+        r1 = rate(p, s, f1, acc_w, alpha_b)
+        push1 = wp.quat_rotate(s.quat_wb, f1.force_b)
+        s2 = advance(s, r1, h)
+        s2.motor_speed = motor_advance(s2.motor_speed, f1.motor_speed)
+        fell_back = fastest * h * h > max_turn * max_turn
+        if fell_back:
+            chain.fall_back(n, u, h, n2, k1)
+            new_total = add_impulse(total + h * (push1 + weight), h, load1, load1)
+            s2.vel_w = root_velocity(p, rope, s2, new_total, chain.momentum(rope, u))
+            return s2, new_total, fell_back
+
+        f2 = flow(p, air, s2, command)
+        rate_w = wp.quat_rotate(s2.quat_wb, s2.rate_b)
+        load2 = load_second(rope, air, s2, f2, n2, u, k1, h)
+        d, o, b = chain.up_second(rope, n, u, n2, k1, stiffness, rate_w, gravity, load2, gamma, h, c1, c2, hs)
+        torque = f2.torque_b + damping_torque(rope, s2, rate_w, n2[0], u[0] + h * k1[0])
+        acc_w, alpha_b, mount_acc, pull = root(p, rope, s2, f2.force_b, torque, d, o, b, gravity)
+        relative = chain.down_second(
+            rope, n, u, stiffness, mount_acc, pull, gravity, load2, gamma, h, c1, c2, hs, n2, k1
+        )
+        r2 = rate(p, s2, f2, acc_w, alpha_b)
+        out = advance(s, blend(r1, half, r2, half), h)
+        out.motor_speed = motor_advance(out.motor_speed, f2.motor_speed)
+        new_total = total + (half * h) * (push1 + wp.quat_rotate(s2.quat_wb, f2.force_b)) + h * weight
+        new_total = add_impulse(new_total, h, load1, load2)
+        out.vel_w = root_velocity(p, rope, out, new_total, relative)
+        return out, new_total, fell_back
+
+    @wp.func
+    def step_alone(p: Vehicle, air: Air, s: QuadState, command: vec4, gravity: vec3, h: real):
+        """Heun step of the vehicle after the payload has left."""
+        f1 = flow(p, air, s, command)
+        inv_mass = real(1.0) / p.body.mass
+        acc1 = inv_mass * wp.quat_rotate(s.quat_wb, f1.force_b) + gravity
+        r1 = rate(p, s, f1, acc1, angular_acceleration(p, s.rate_b, f1.torque_b))
+        s2 = advance(s, r1, h)
+        s2.motor_speed = motor_advance(s2.motor_speed, f1.motor_speed)
+        f2 = flow(p, air, s2, command)
+        acc2 = inv_mass * wp.quat_rotate(s2.quat_wb, f2.force_b) + gravity
+        r2 = rate(p, s2, f2, acc2, angular_acceleration(p, s2.rate_b, f2.torque_b))
+        out = advance(s, blend(r1, real(0.5), r2, real(0.5)), h)
+        out.motor_speed = motor_advance(out.motor_speed, f2.motor_speed)
+        return out
+
+    return SimpleNamespace(step=step, step_alone=step_alone, mount_velocity=mount_velocity, momentum=momentum)

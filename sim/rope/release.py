@@ -1,0 +1,184 @@
+"""Release and ballistic flight: closed-form landing, time to impact, clearance to the vehicle.
+
+Source: the paper, Sec. III-B (projectile without drag) and Eq. 5 (clearance at K fractions of the flight).
+"""
+
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+from sim.arrays.structs import Types
+
+FLIGHT_STEP = 0.02
+"""Largest step of a flight under drag [s]: RK4 is 1e-8 m off a tennis ball's path after a second of them (a test shows it)."""
+FLIGHT_STEPS = 500
+"""Steps after which a payload that has not come down counts as one that never will."""
+
+
+@wp.func
+def time_to_height(pos_w: Any, vel_w: Any, height: Any, gravity: Any):
+    """Time [s] at which a projectile comes down to ``height`` [m]; 0 where it never reaches it.
+
+    Args:
+        gravity: magnitude [m/s^2].
+    """
+    zero = height - height
+    two = type(height)(2.0)
+    root = wp.max(vel_w[2] * vel_w[2] + two * gravity * (pos_w[2] - height), zero)
+    return wp.max((vel_w[2] + wp.sqrt(root)) / gravity, zero)
+
+
+@wp.func
+def projectile(pos_w: Any, vel_w: Any, gravity: Any, time: Any):
+    """Position [m] after ``time`` of free flight, world frame, z up."""
+    fall = type(time)(0.5) * gravity * time * time
+    return pos_w + time * vel_w - type(pos_w)(time - time, time - time, fall)
+
+
+@wp.func
+def clearance(pos_w: Any, vel_w: Any, gravity: Any, time: Any, vehicle_w: Any, samples: int):
+    """Least distance [m] of the flight to a point, at ``samples`` equal fractions of ``time`` from 0 to 1."""
+    least = wp.length(pos_w - vehicle_w)
+    for k in range(1, samples):
+        s = time * type(time)(float(k)) / type(time)(float(samples - 1))
+        least = wp.min(least, wp.length(projectile(pos_w, vel_w, gravity, s) - vehicle_w))
+    return least
+
+
+def build_letting_go(t: Types, extensions: frozenset[str]) -> SimpleNamespace:
+    """How the payload leaves. Equations: :class:`sim.params.ReleaseParams`.
+
+    Returns:
+        Namespace of Warp functions ``lag(r, rope, pull, gravity)`` [s] from the rope's pull at the latch [N], and
+        the payload's velocity [m/s] after ``kick(r, vel_w, along_w)`` with the last segment's direction and after
+        ``tail(r, vel_w, com_vel_w)`` with the velocity of the common centre of mass of payload and rope.
+        Each does only what ``extensions`` name.
+    """
+    real, vec3, Rope, Release = t.real, t.vec3, t.Rope, t.Release
+
+    @wp.func
+    def fixed_lag(r: Release, rope: Rope, pull: real, gravity: real):
+        return r.lag
+
+    @wp.func
+    def lag_by_pull(r: Release, rope: Rope, pull: real, gravity: real):
+        return wp.max(r.lag + r.lag_tension * (pull - rope.payload_mass * gravity), real(0.0))
+
+    @wp.func
+    def no_kick(r: Release, vel_w: vec3, along_w: vec3):
+        return vel_w
+
+    @wp.func
+    def kick(r: Release, vel_w: vec3, along_w: vec3):
+        return vel_w + r.kick_w + r.kick_along * along_w
+
+    @wp.func
+    def no_tail(r: Release, vel_w: vec3, com_vel_w: vec3):
+        return vel_w
+
+    @wp.func
+    def tail(r: Release, vel_w: vec3, com_vel_w: vec3):
+        return vel_w + r.rope_tail * (com_vel_w - vel_w)
+
+    return SimpleNamespace(
+        lag=lag_by_pull if "lag_tension" in extensions else fixed_lag,
+        kick=kick if "kick" in extensions else no_kick,
+        tail=tail if "rope_tail" in extensions else no_tail,
+    )
+
+
+def build_ballistic(t: Types, acceleration, dragging: bool) -> SimpleNamespace:
+    """Flight of the payload alone: in closed form in still, thin air, by RK4 under drag.
+
+    Args:
+        t: types of the wanted precision.
+        acceleration: ``(rope, air, vel_w, gravity)`` -> [m/s^2], world frame.
+        dragging: whether the air counts.
+
+    Returns:
+        Namespace of Warp functions ``time_to_height(rope, air, pos, vel, height, gravity)`` [s],
+        ``after(rope, air, pos, vel, gravity, time)`` [m], ``clearance(rope, air, pos, vel, gravity, time, vehicle_w,
+        samples)`` [m], each with the arguments of the functions of the same names in this module.
+    """
+    real, vec3, Rope, Air = t.real, t.vec3, t.Rope, t.Air
+
+    @wp.func
+    def closed_time(rope: Rope, air: Air, pos_w: vec3, vel_w: vec3, height: real, gravity: real):
+        return time_to_height(pos_w, vel_w, height, gravity)
+
+    @wp.func
+    def closed_after(rope: Rope, air: Air, pos_w: vec3, vel_w: vec3, gravity: real, time: real):
+        return projectile(pos_w, vel_w, gravity, time)
+
+    @wp.func
+    def closed_clearance(
+        rope: Rope, air: Air, pos_w: vec3, vel_w: vec3, gravity: real, time: real, vehicle_w: vec3, samples: int
+    ):
+        return clearance(pos_w, vel_w, gravity, time, vehicle_w, samples)
+
+    if not dragging:
+        return SimpleNamespace(time_to_height=closed_time, after=closed_after, clearance=closed_clearance)
+
+    @wp.func
+    def fly(rope: Rope, air: Air, pos_w: vec3, vel_w: vec3, gravity: real, h: real):
+        """One RK4 step of h seconds."""
+        half = real(0.5) * h
+        g = vec3(real(0.0), real(0.0), -gravity)
+        a1 = acceleration(rope, air, vel_w, g)
+        v2 = vel_w + half * a1
+        a2 = acceleration(rope, air, v2, g)
+        v3 = vel_w + half * a2
+        a3 = acceleration(rope, air, v3, g)
+        v4 = vel_w + h * a3
+        a4 = acceleration(rope, air, v4, g)
+        sixth = h / real(6.0)
+        two = real(2.0)
+        pos = pos_w + sixth * (vel_w + two * v2 + two * v3 + v4)
+        return pos, vel_w + sixth * (a1 + two * a2 + two * a3 + a4)
+
+    @wp.func
+    def after(rope: Rope, air: Air, pos_w: vec3, vel_w: vec3, gravity: real, time: real):
+        count = int(wp.ceil(wp.max(time, real(0.0)) / real(FLIGHT_STEP)))
+        pos = pos_w
+        vel = vel_w
+        for _ in range(count):
+            pos, vel = fly(rope, air, pos, vel, gravity, time / real(float(count)))
+        return pos
+
+    @wp.func
+    def drag_time(rope: Rope, air: Air, pos_w: vec3, vel_w: vec3, height: real, gravity: real):
+        """Steps until the height is passed, then Newton's method from the last step's start."""
+        pos = pos_w
+        vel = vel_w
+        h = real(FLIGHT_STEP)
+        time = real(0.0)
+        next_pos, next_vel = fly(rope, air, pos, vel, gravity, h)
+        count = int(0)
+        while (next_pos[2] > height or next_vel[2] > real(0.0)) and count < FLIGHT_STEPS:
+            pos = next_pos
+            vel = next_vel
+            time = time + h
+            count = count + 1
+            next_pos, next_vel = fly(rope, air, pos, vel, gravity, h)
+        share = time_to_height(pos, vel, height, gravity)
+        for _ in range(3):
+            next_pos, next_vel = fly(rope, air, pos, vel, gravity, share)
+            if next_vel[2] < real(0.0):
+                share = wp.max(share - (next_pos[2] - height) / next_vel[2], real(0.0))
+        return time + share
+
+    @wp.func
+    def drag_clearance(
+        rope: Rope, air: Air, pos_w: vec3, vel_w: vec3, gravity: real, time: real, vehicle_w: vec3, samples: int
+    ):
+        least = wp.length(pos_w - vehicle_w)
+        pos = pos_w
+        vel = vel_w
+        h = time / real(float(samples - 1))
+        for _ in range(samples - 1):
+            pos, vel = fly(rope, air, pos, vel, gravity, h)
+            least = wp.min(least, wp.length(pos - vehicle_w))
+        return least
+
+    return SimpleNamespace(time_to_height=drag_time, after=after, clearance=drag_clearance)

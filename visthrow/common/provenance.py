@@ -1,0 +1,114 @@
+"""Where a result comes from: commit, package versions, command line, processor. Never host names, users or paths."""
+
+import os
+import platform
+import re
+import subprocess
+import sys
+from datetime import UTC, datetime
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from visthrow import __version__, config
+from visthrow.common.errors import StorageError
+from visthrow.common.storage import atomic_write, write_json
+
+PACKAGES = ("numpy", "torch", "warp-lang", "rsl-rl-lib", "tensordict", "kornia", "opencv-python-headless", "rerun-sdk",
+            "scipy", "mujoco-core")  # fmt: skip
+"""Distributions whose version can change a figure."""
+
+COMMIT_VARIABLE = "VISTHROW_COMMIT"
+"""Names the commit where a copy of the tree runs without its history (a cluster node, a container)."""
+
+_FOLDERS = re.compile(r"(?<![\w.~-])(?:~|[A-Za-z]:)?[/\\](?:[^\s/\\=,;:]+[/\\])*")
+
+
+def commit() -> str:
+    """Return the commit of the checkout that runs, with ``-dirty`` where tracked files were changed, else "unknown"."""
+    root = Path(__file__).resolve().parents[2]
+    told = os.environ.get(COMMIT_VARIABLE, "unknown")
+    if not (root / ".git").exists():  # installed, or inside somebody else's repository
+        return told
+    try:
+        head = _git(root, "rev-parse", "HEAD")
+        return f"{head}-dirty" if _git(root, "status", "--porcelain", "--untracked-files=no") else head
+    except (OSError, subprocess.SubprocessError):
+        return told
+
+
+def command() -> str:
+    """Return the command line with absolute folders left out."""
+    return " ".join(_FOLDERS.sub("", argument) for argument in sys.argv)
+
+
+def versions() -> dict[str, str]:
+    """Return the installed version of each package that can change a figure."""
+    found = {"visthrow": __version__, "python": platform.python_version()}
+    for name in PACKAGES:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    return found
+
+
+def processors() -> dict[str, Any]:
+    """Return the CPU's model and core count, and the GPUs' models if torch was imported already."""
+    try:
+        text = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        text = ""
+    model = re.search(r"^model name\s*:\s*(.+)$", text, re.MULTILINE)
+    found = {"cpu": model[1].strip() if model else platform.machine(), "cores": os.cpu_count()}
+    torch = sys.modules.get("torch")
+    if torch is not None and torch.cuda.is_available():
+        found["gpu"] = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]
+    return found
+
+
+def collect() -> dict[str, Any]:
+    """Return all of it, with the time [UTC]."""
+    return {
+        "commit": commit(),
+        "command": command(),
+        "time": datetime.now(UTC).isoformat(timespec="seconds"),
+        "versions": versions(),
+        "processors": processors(),
+    }
+
+
+def write_run_folder(folder: str | Path, run_config: Any, *, resume: bool = False, **extra: Any) -> dict[str, Any]:
+    """Write the resolved config and the provenance beside the results of a run.
+
+    Args:
+        folder: Folder of the run; made if it is not there.
+        run_config: The dataclass that the run uses, written to ``config.toml``.
+        resume: Whether the folder may hold a run already; its config is left, the provenance goes to the next free
+            ``provenance_<n>.json``.
+        **extra: JSON-able values that join the provenance, for instance ``seed=3``.
+
+    Returns:
+        What was written as provenance.
+
+    Raises:
+        StorageError: If the folder holds a run already and ``resume`` is not set, or cannot be written.
+    """
+    folder = Path(folder)
+    record = {**collect(), **extra}
+    if (folder / "config.toml").exists():
+        if not resume:
+            raise StorageError(f"{folder} holds a run already; name another folder, or resume it")
+        count = len(list(folder.glob("provenance*.json")))
+        write_json(folder / f"provenance_{count}.json", record)
+        return record
+    atomic_write(folder / "config.toml", config.dumps(run_config))
+    write_json(folder / "provenance.json", record)
+    return record
+
+
+def _git(root: Path, *arguments: str) -> str:
+    result = subprocess.run(
+        ["git", "-C", str(root), *arguments], capture_output=True, text=True, check=True, timeout=10
+    )
+    return result.stdout.strip()

@@ -1,0 +1,127 @@
+"""Writing of results: whole files or none. Onboard-safe: standard library and numpy only."""
+
+import io
+import json
+import os
+import tempfile
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from visthrow.common.errors import StorageError
+
+
+def atomic_write(path: str | Path, content: bytes | str) -> None:
+    """Write a file so that, whatever happens, the path holds the old content or the whole new one.
+
+    The content goes to a temporary file beside it, is flushed to the disk, and takes the name in one step.
+
+    Args:
+        path: The file; its folder is made if it is not there.
+        content: Bytes, or text written as UTF-8.
+
+    Raises:
+        StorageError: If the disk is full or the place cannot be written; nothing half-written is left.
+    """
+    path = Path(path)
+    data = content.encode("utf-8") if isinstance(content, str) else content
+    temporary = None
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".tmp")
+        with os.fdopen(handle, "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        os.chmod(temporary, 0o644 & ~_umask())  # mkstemp makes it readable for its owner alone
+        os.replace(temporary, path)
+        temporary = None
+    except OSError as error:
+        raise StorageError(f"cannot write {path} ({len(data)} bytes): {error.strerror or error}") from error
+    finally:
+        if temporary is not None:
+            with suppress(OSError):
+                os.unlink(temporary)
+
+
+def write_json(path: str | Path, value: Any) -> None:
+    """Write a value as indented JSON, atomically; NaN and infinity become null, as JSON has neither.
+
+    Raises:
+        StorageError: As ``atomic_write``.
+    """
+    atomic_write(path, json.dumps(_without_nan(value), indent=2, allow_nan=False) + "\n")
+
+
+def savez(path: str | Path, arrays: dict[str, np.ndarray]) -> None:
+    """Write named arrays as a compressed ``.npz``, atomically and without pickle.
+
+    Raises:
+        ValueError: If an array holds Python objects.
+        StorageError: As ``atomic_write``.
+    """
+    for name, array in arrays.items():
+        if np.asarray(array).dtype.hasobject:
+            raise ValueError(f"array '{name}' holds Python objects; expected numbers, bools or text")
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **arrays)
+    atomic_write(path, buffer.getvalue())
+
+
+def loadz(path: str | Path, error: type[Exception], what: str) -> dict[str, np.ndarray]:
+    """Read all arrays of an ``.npz`` without pickle.
+
+    Args:
+        path: The file.
+        error: Exception class for whatever is wrong with the file.
+        what: What the file should be, for messages.
+
+    Raises:
+        Exception: Of class ``error``: no such file, cut short, damaged, or not such a file at all.
+    """
+    path = Path(path)
+    if not path.is_file():
+        near = sorted(p.name for p in path.parent.glob(f"*{path.suffix or '.npz'}")) if path.parent.is_dir() else []
+        raise error(
+            f"{path}: no such file; expected {what}. In that folder: {', '.join(near) or 'nothing of the kind'}"
+        )
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            return {name: archive[name] for name in archive.files}
+    except Exception as cause:  # zipfile, zlib, numpy and the OS each have their own way to say it
+        size = path.stat().st_size
+        # For what is no archive at all numpy recommends to unpickle it.
+        why = "no .npz archive" if "pickle" in str(cause) else cause
+        raise error(f"{path}: cut short or damaged ({size} bytes: {why}); expected {what}") from cause
+
+
+def json_array(value: Any) -> np.ndarray:
+    """Pack a JSON-able value into an array of bytes, for storage in an ``.npz``."""
+    return np.frombuffer(json.dumps(value, sort_keys=True, allow_nan=False).encode("utf-8"), dtype=np.uint8)
+
+
+def from_json_array(array: np.ndarray) -> Any:
+    """Undo ``json_array``.
+
+    Raises:
+        ValueError: If the array holds no JSON.
+    """
+    return json.loads(np.asarray(array, dtype=np.uint8).tobytes().decode("utf-8"))
+
+
+def _without_nan(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(key): _without_nan(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_without_nan(item) for item in value]
+    if isinstance(value, np.generic | np.ndarray):
+        return _without_nan(value.tolist())
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask

@@ -1,0 +1,272 @@
+"""Strict configuration: TOML files in, frozen dataclasses out.
+
+A file holds exactly the keys of its schema. Two things reach beyond the file:
+
+- ``base = "other.toml"`` at its top: the other file's values lie under this file's, table by table.
+- A *string* where the schema wants a table is the path of a file that holds that table.
+
+Both paths are looked up beside the file first, then under the configs folder. Overrides (``"vehicle.body.mass=0.25"``)
+come last. ``"none"`` stands for None where a field is optional; ints pass for floats, bools never for numbers; NaN and
+infinity are refused.
+"""
+
+import copy
+import dataclasses
+import tomllib
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, TypeVar
+
+from visthrow.common import toml_text
+from visthrow.common.errors import ConfigError, suggest
+from visthrow.config import schema as _schema
+from visthrow.config.schema import NONE_WORD, Leaf, Table, dataclass_of
+
+T = TypeVar("T")
+_BASE_KEY = "base"
+
+
+def load(schema: type[T], path: str | Path, overrides: Iterable[str] = ()) -> T:
+    """Load a TOML file into a frozen dataclass.
+
+    Args:
+        schema: Dataclass that the file must fill.
+        path: The file.
+        overrides: ``"a.b=3"``: key path and TOML value (a bare word is a string), applied in order after includes.
+
+    Returns:
+        The filled dataclass.
+
+    Raises:
+        ConfigError: If a file is missing or no TOML, a key is unknown or missing, or a value has the wrong type; the
+            message names file, key path, what came, what was expected and what exists.
+    """
+    tree = _read(schema, Path(path), ())
+    for override in overrides:
+        _override(schema, tree, override)
+    return _schema.build(schema, tree)
+
+
+def loads(schema: type[T], text: str, overrides: Iterable[str] = (), name: str = "(text)") -> T:
+    """Load TOML text, for instance a resolved config stored in a checkpoint; includes are looked up under the root.
+
+    Args:
+        schema: Dataclass that the text must fill.
+        text: TOML.
+        overrides: As for ``load``.
+        name: What messages call the text.
+
+    Raises:
+        ConfigError: As for ``load``.
+    """
+    tree = _parse(schema, text, name, configs_root(), ())
+    for override in overrides:
+        _override(schema, tree, override)
+    return _schema.build(schema, tree)
+
+
+def configs_root() -> Path:
+    """Return the folder of shipped configs: inside the installed package, else beside it in a checkout.
+
+    Raises:
+        ConfigError: If neither is there.
+    """
+    here = Path(__file__).resolve().parents[1]
+    for root in (here / "configs", here.parent / "configs"):
+        if root.is_dir():
+            return root
+    raise ConfigError(
+        f"no configs folder; expected {here / 'configs'} (installed) or {here.parent / 'configs'} (in a checkout)"
+    )
+
+
+def find(kind: str, name: str | Path) -> Path:
+    """Find a config by name (``find("vehicle", "paper")``) or by an explicit path.
+
+    Args:
+        kind: Folder of ``configs``: vehicle, rope, camera, task, train, ...
+        name: Name without ``.toml``, or the path of a file.
+
+    Returns:
+        The path of an existing file.
+
+    Raises:
+        ConfigError: If there is none; the message lists what exists.
+    """
+    root = configs_root()
+    text = str(name)
+    if text.endswith(".toml") or "/" in text or "\\" in text:
+        for candidate in (Path(text), root / kind / text, root / text):
+            if candidate.is_file():
+                return candidate
+    elif (root / kind / f"{text}.toml").is_file():
+        return root / kind / f"{text}.toml"
+    if not (root / kind).is_dir():
+        kinds = (folder.name for folder in root.iterdir() if folder.is_dir())
+        raise ConfigError(f"no kind of config '{kind}'; {suggest(kind, kinds)}")
+    raise ConfigError(
+        f"no {kind} config '{text}' (neither a shipped name nor a file); {suggest(text, available(kind))}"
+    )
+
+
+def available(kind: str) -> list[str]:
+    """Return the names of the shipped configs of one kind, sorted."""
+    return sorted(path.stem for path in (configs_root() / kind).glob("*.toml"))
+
+
+def to_dict(config: Any, *, defaults: bool = True) -> dict[str, Any]:
+    """Turn a config into nested dictionaries of plain values (tuples become lists), for JSON, TOML or a comparison.
+
+    Args:
+        config: Instance of a dataclass.
+        defaults: Whether fields that hold their default are written too.
+
+    Raises:
+        TypeError: If ``config`` is no dataclass instance.
+    """
+    if not dataclasses.is_dataclass(config) or isinstance(config, type):
+        raise TypeError(f"got {config!r}; expected an instance of a dataclass")
+    values = {f: getattr(config, f.name) for f in dataclasses.fields(config) if f.init}
+    return {f.name: _plain(value, defaults) for f, value in values.items() if defaults or not _is_default(f, value)}
+
+
+def dumps(config: Any) -> str:
+    """Write a config as TOML that loads back to an equal config."""
+    return toml_text.dumps(_without_none(to_dict(config)))
+
+
+def _is_default(field: dataclasses.Field, value: Any) -> bool:
+    if field.default_factory is not dataclasses.MISSING:
+        return value == field.default_factory()
+    return field.default is not dataclasses.MISSING and value == field.default
+
+
+def _plain(value: Any, defaults: bool) -> Any:
+    if dataclasses.is_dataclass(value):
+        return to_dict(value, defaults=defaults)
+    if isinstance(value, dict):
+        return {key: _plain(item, defaults) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item, defaults) for item in value]
+    return value
+
+
+def _without_none(value: Any) -> Any:
+    if value is None:
+        return NONE_WORD
+    if isinstance(value, dict):
+        return {key: _without_none(item) for key, item in value.items()}
+    return [_without_none(item) for item in value] if isinstance(value, list) else value
+
+
+def _shown(path: Path) -> str:
+    """Name a file as the user would: relative to where the command runs, if below it."""
+    resolved = path.resolve()
+    cwd = Path.cwd()
+    return str(resolved.relative_to(cwd)) if resolved.is_relative_to(cwd) else str(path)
+
+
+def _read(schema: type, path: Path, stack: tuple[Path, ...]) -> Table:
+    name = _shown(path)
+    resolved = path.resolve()
+    if resolved in stack:
+        chain = " -> ".join(_shown(step) for step in (*stack, resolved))
+        raise ConfigError(f"{name}: files that include or build on each other in a circle: {chain}")
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        near = sorted(p.name for p in path.parent.glob("*.toml")) if path.parent.is_dir() else []
+        raise ConfigError(f"{name}: no such file; {suggest(path.name, near)}") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{name}: cannot be read as UTF-8 text: {error}") from None
+    return _parse(schema, text, name, path.parent, (*stack, resolved))
+
+
+def _parse(schema: type, text: str, name: str, folder: Path, stack: tuple[Path, ...]) -> Table:
+    try:
+        raw = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{name}: no valid TOML: {error}") from None
+    # A schema may itself have a field called "base"; then the word is an ordinary key.
+    base = raw.pop(_BASE_KEY, None) if _BASE_KEY not in _schema.hints(schema) else None
+    tree = _schema.as_node(raw, name)
+    _include(schema, tree, folder, stack, "")
+    if base is None:
+        return tree
+    if not isinstance(base, str):
+        _schema.fail(name, _BASE_KEY, f"got {base!r}; expected the path of one other file")
+    return _merged(_read(schema, _lookup(base, folder, name, _BASE_KEY), stack), tree)
+
+
+def _include(schema: type, tree: Table, folder: Path, stack: tuple[Path, ...], path: str) -> None:
+    """Replace each string that stands where the schema wants a table by the file that it names."""
+    for key, annotation in _schema.hints(schema).items():
+        wanted, node = dataclass_of(annotation), tree.items.get(key)
+        if wanted is None or node is None:
+            continue
+        here = f"{path}.{key}" if path else key
+        if isinstance(node, Table):
+            _include(wanted, node, folder, stack, here)
+        elif isinstance(node.value, str) and not (node.value == NONE_WORD and _schema.is_union(annotation)):
+            tree.items[key] = _read(wanted, _lookup(node.value, folder, node.source, here), stack)
+
+
+def _lookup(name: str, folder: Path, source: str, key: str) -> Path:
+    candidates = list(dict.fromkeys((folder / name, configs_root() / name)))
+    for candidate in candidates:
+        if candidate.is_file():
+            return candidate
+    shipped = {path.relative_to(configs_root()).as_posix() for path in configs_root().rglob("*.toml")}
+    _schema.fail(
+        source, key, f"no file '{name}', neither in {_shown(folder)} nor under configs; {suggest(name, shipped)}"
+    )
+
+
+def _merged(under: Table, over: Table) -> Table:
+    merged = Table(over.source, copy.copy(under.items))
+    for key, item in over.items.items():
+        below = merged.items.get(key)
+        both = isinstance(item, Table) and isinstance(below, Table)
+        merged.items[key] = _merged(below, item) if both else item
+    return merged
+
+
+def _override(schema: type, tree: Table, override: str) -> None:
+    source = f"override '{override}'"
+    path, equals, text = override.partition("=")
+    keys = [key.strip() for key in path.split(".")]
+    if not equals or not all(keys):
+        raise ConfigError(f"{source}: expected key.path=value, for instance vehicle.body.mass=0.25")
+    current: Any = schema
+    for depth, key in enumerate(keys):
+        here = ".".join(keys[:depth])
+        wanted = dataclass_of(current)
+        if wanted is not None:
+            known = _schema.hints(wanted)
+            if key not in known:
+                _schema.fail(source, here, f"unknown key '{key}'; {suggest(key, known)}")
+            current = known[key]
+        elif (values := _schema.dict_values(current)) is not None:
+            current = values
+        else:
+            _schema.fail(source, here, f"has no keys, so '{key}' cannot be set; expected {_schema.describe(current)}")
+        if depth < len(keys) - 1:
+            child = tree.items.get(key)
+            if not isinstance(child, Table):
+                child = tree.items[key] = Table(source)
+            tree = child
+    node = _schema.as_node(_toml_value(text.strip()), source)
+    tree.items[keys[-1]] = node
+    wanted = dataclass_of(current)
+    if wanted is None:
+        return
+    optional_none = isinstance(node, Leaf) and node.value == NONE_WORD and _schema.is_union(current)
+    if isinstance(node, Leaf) and isinstance(node.value, str) and not optional_none:
+        tree.items[keys[-1]] = _read(wanted, _lookup(node.value, Path.cwd(), source, ".".join(keys)), ())
+
+
+def _toml_value(text: str) -> Any:
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text

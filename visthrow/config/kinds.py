@@ -1,0 +1,41 @@
+"""Which schema each folder of configs, and each file that differs from its folder, is read with."""
+
+import importlib
+from pathlib import Path
+
+from visthrow.common.errors import ConfigError, suggest
+
+SCHEMAS = {
+    "vehicle": "sim.params:VehicleParams",
+    "rope": "sim.params:RopeParams",
+    "camera": "camera.params:CameraParams",
+    "release": "sim.params:ReleaseParams",
+    "sim": "sim.params:SimParams",
+    "task": "visthrow.task:TaskParams",
+    "start": "sim.params:RandomizationParams",
+    "train": "visthrow.task:Experiment",
+    "sweep": "visthrow.evidence.sweep.lists:SweepList",
+    "hil": "hil.params:HilParams",
+    "diagnose": "visthrow.diagnose.inputs.setup:Setup",
+    "vehicle/reference_realistic": "sim.reference.extras:ReferenceExtras",
+}
+"""``kind`` or ``kind/name`` -> ``module:class``; the longer key wins."""
+
+
+def schema_of(kind: str, name: str = "") -> type:
+    """Return the schema of a config; its module is imported only now.
+
+    Raises:
+        ConfigError: If no schema is known for the kind.
+    """
+    target = SCHEMAS.get(f"{kind}/{name}") or SCHEMAS.get(kind)
+    if target is None:
+        raise ConfigError(f"no kind of config '{kind}'; {suggest(kind, (key for key in SCHEMAS if '/' not in key))}")
+    module, attribute = target.split(":")
+    return getattr(importlib.import_module(module), attribute)
+
+
+def schema_of_file(path: str | Path) -> type:
+    """Return the schema of a config file from its folder's and its own name."""
+    path = Path(path)
+    return schema_of(path.resolve().parent.name, path.stem)

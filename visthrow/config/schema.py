@@ -1,0 +1,209 @@
+"""Strict conversion of parsed TOML into frozen dataclasses, with the source of every value at hand for messages."""
+
+import dataclasses
+import math
+import types
+import typing
+from dataclasses import dataclass, field
+from functools import cache
+from typing import Any, Literal, Union
+
+from visthrow.common.errors import ConfigError, suggest
+
+NONE_WORD = "none"
+"""TOML has no null: this string stands for None wherever a field is optional."""
+
+
+@dataclass
+class Leaf:
+    """A TOML value that is not a table, with the file or override that set it."""
+
+    value: Any
+    source: str
+
+
+@dataclass
+class Table:
+    """A TOML table, with the file that opened it last."""
+
+    source: str
+    items: dict[str, "Leaf | Table"] = field(default_factory=dict)
+
+
+@cache
+def hints(schema: type) -> dict[str, Any]:
+    """Return the resolved annotation of each field of a dataclass that its constructor takes."""
+    resolved = typing.get_type_hints(schema)
+    return {f.name: resolved[f.name] for f in dataclasses.fields(schema) if f.init}
+
+
+def dataclass_of(annotation: Any) -> type | None:
+    """Return the dataclass that an annotation asks for (``X`` or ``X | None``), or None."""
+    if dataclasses.is_dataclass(annotation) and isinstance(annotation, type):
+        return annotation
+    if is_union(annotation):
+        found = [dataclass_of(option) for option in typing.get_args(annotation)]
+        found = [option for option in found if option is not None]
+        return found[0] if len(found) == 1 else None
+    return None
+
+
+def dict_values(annotation: Any) -> Any:
+    """Return what the values of ``dict[str, X]`` or ``dict[str, X] | None`` are, else None."""
+    options = typing.get_args(annotation) if is_union(annotation) else (annotation,)
+    found = [typing.get_args(option)[1] for option in options if typing.get_origin(option) is dict]
+    return found[0] if len(found) == 1 else None
+
+
+def is_union(annotation: Any) -> bool:
+    """Tell whether an annotation is a union, in either spelling."""
+    return typing.get_origin(annotation) in (Union, types.UnionType)
+
+
+def describe(annotation: Any) -> str:
+    """Name an annotation in words that a user of TOML understands."""
+    if annotation is type(None):
+        return f'"{NONE_WORD}"'
+    if is_union(annotation):
+        return " or ".join(describe(option) for option in typing.get_args(annotation))
+    origin, args = typing.get_origin(annotation), typing.get_args(annotation)
+    if origin is Literal:
+        return "one of " + ", ".join(repr(arg) for arg in args)
+    if origin is tuple:
+        if len(args) == 2 and args[1] is Ellipsis:
+            return f"a list of {describe(args[0])}"
+        if len(set(args)) == 1:
+            return f"a list of {len(args)}, each {describe(args[0])}"
+        return f"a list of {len(args)} ({', '.join(describe(arg) for arg in args)})"
+    if origin is dict:
+        return f"a table of {describe(args[1])}"
+    if dataclass_of(annotation) is not None:
+        return f"a table with the keys {', '.join(hints(annotation))}, or the path of a file that holds them"
+    names = {float: "a number", int: "a whole number", bool: "true or false", str: "a string"}
+    return names.get(annotation, str(annotation))
+
+
+def fail(source: str, path: str, problem: str) -> typing.NoReturn:
+    """Raise a ConfigError that names the file (or override) and the key path."""
+    raise ConfigError(f"{source}: {path or 'top level'}: {problem}")
+
+
+def build(annotation: Any, node: Leaf | Table, path: str = "") -> Any:
+    """Convert one node of the parsed tree into the type that the schema asks for.
+
+    Args:
+        annotation: Type of the field.
+        node: What the files and overrides say.
+        path: Dotted key path, for messages.
+
+    Returns:
+        A value of that type: dataclass, tuple, dict, number, bool, string or None.
+
+    Raises:
+        ConfigError: If anything is unknown, missing or of another type.
+    """
+    if is_union(annotation):
+        return _build_union(annotation, node, path)
+    schema = dataclass_of(annotation)
+    if schema is not None:
+        return _build_dataclass(schema, node, path)
+    origin, args = typing.get_origin(annotation), typing.get_args(annotation)
+    if origin is dict:
+        if not isinstance(node, Table):
+            _wrong_type(annotation, node, path)
+        return {key: build(args[1], item, _join(path, key)) for key, item in node.items.items()}
+    if isinstance(node, Table):
+        fail(node.source, path, f"got a table with the keys {', '.join(node.items)}; expected {describe(annotation)}")
+    if origin is tuple:
+        return _build_tuple(annotation, node, path)
+    if origin is Literal:
+        # True == 1: compare the type too, so that a bool never passes for a number.
+        if not any(type(node.value) is type(arg) and node.value == arg for arg in args):
+            _wrong_type(annotation, node, path)
+        return node.value
+    return _build_scalar(annotation, node, path)
+
+
+def _build_union(annotation: Any, node: Leaf | Table, path: str) -> Any:
+    options = typing.get_args(annotation)
+    if type(None) in options and isinstance(node, Leaf) and node.value == NONE_WORD:
+        return None
+    options = [option for option in options if option is not type(None)]
+    if len(options) == 1:
+        return build(options[0], node, path)
+    for option in options:
+        try:
+            return build(option, node, path)
+        except ConfigError:
+            continue
+    _wrong_type(annotation, node, path)
+
+
+def _build_dataclass(schema: type, node: Leaf | Table, path: str) -> Any:
+    if not isinstance(node, Table):
+        _wrong_type(schema, node, path)
+    types_of = hints(schema)
+    for key, item in node.items.items():
+        if key not in types_of:
+            fail(item.source, _join(path, key), f"unknown key; {suggest(key, types_of)}")
+    required = [
+        f.name
+        for f in dataclasses.fields(schema)
+        if f.init and f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING
+    ]
+    missing = [name for name in required if name not in node.items]
+    if missing:
+        given = ", ".join(node.items) or "nothing"
+        wanted = ", ".join(f"{name} ({describe(types_of[name])})" for name in missing)
+        fail(node.source, path, f"missing {wanted}; given: {given}")
+    values = {key: build(types_of[key], item, _join(path, key)) for key, item in node.items.items()}
+    try:
+        return schema(**values)
+    except (ValueError, ConfigError) as error:
+        fail(node.source, path, str(error))
+
+
+def _build_tuple(annotation: Any, node: Leaf, path: str) -> tuple:
+    args = typing.get_args(annotation)
+    if not isinstance(node.value, list):
+        _wrong_type(annotation, node, path)
+    if len(args) == 2 and args[1] is Ellipsis:
+        args = (args[0],) * len(node.value)
+    if len(args) != len(node.value):
+        fail(node.source, path, f"got a list of {len(node.value)}: {node.value!r}; expected {describe(annotation)}")
+    items = (as_node(value, node.source) for value in node.value)
+    return tuple(build(arg, item, f"{path}[{i}]") for i, (arg, item) in enumerate(zip(args, items)))
+
+
+def _build_scalar(annotation: Any, node: Leaf, path: str) -> Any:
+    value = node.value
+    if annotation is float and type(value) in (int, float):
+        try:
+            number = float(value)
+        except OverflowError:
+            number = math.inf
+        if not math.isfinite(number):
+            fail(node.source, path, f"got {value}; expected a finite number")
+        return number
+    if annotation in (int, bool, str) and type(value) is annotation:
+        return value
+    _wrong_type(annotation, node, path)
+
+
+def as_node(value: Any, source: str) -> Leaf | Table:
+    """Wrap a parsed TOML value, tables recursively."""
+    if isinstance(value, dict):
+        return Table(source, {key: as_node(item, source) for key, item in value.items()})
+    return Leaf(value, source)
+
+
+def _wrong_type(annotation: Any, node: Leaf | Table, path: str) -> typing.NoReturn:
+    if isinstance(node, Table):
+        came = f"a table with the keys {', '.join(node.items) or '(none)'}"
+    else:
+        came = f"{node.value!r} ({type(node.value).__name__})"
+    fail(node.source, path, f"got {came}; expected {describe(annotation)}")
+
+
+def _join(path: str, key: str) -> str:
+    return f"{path}.{key}" if path else key

@@ -1,0 +1,1 @@
+"""Extension of a configuration by a diagnosis."""

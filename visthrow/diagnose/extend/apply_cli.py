@@ -1,0 +1,98 @@
+"""``visthrow diagnose apply``: write the extended configuration that a diagnosis asks for."""
+
+import argparse
+from pathlib import Path
+
+DEFAULT_PLANTS = 64
+HARM = 0.02  # share by which a channel may get worse on held-out flights
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the action."""
+    from visthrow.diagnose.inputs.opening import DEFAULT_PLANT
+
+    parser.epilog = (
+        "examples:\n"
+        "  visthrow diagnose apply out/explain/diagnosis.json --out mine.toml   a configuration on top of the diagnosed one\n"
+        "  visthrow train mine.toml                                             train in it\n"
+        "  visthrow diagnose explain flights --plant mine.toml                  and diagnose it again: nothing should be left\n"
+    )
+    parser.add_argument("diagnosis", metavar="FILE", help="diagnosis.json of an explain")
+    parser.add_argument(
+        "--plant", metavar="NAME", default=DEFAULT_PLANT, help=f"the configuration that was diagnosed (default: {DEFAULT_PLANT})"
+    )
+    parser.add_argument("--out", metavar="FILE", default="extended.toml", help="to write (default: extended.toml)")
+    parser.add_argument(
+        "--plants", type=int, default=DEFAULT_PLANTS, metavar="N",
+        help=f"plants that training draws from the joint posterior; 1: the estimate alone (default: {DEFAULT_PLANTS})",
+    )  # fmt: skip
+    parser.add_argument(
+        "--laws", type=int, default=0, metavar="N", help="write the best N laws outside the catalogue as well (default: 0)"
+    )
+    parser.add_argument("--anyway", action="store_true", help="write it even if held-out flights saw no gain")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Write the file."""
+    import json
+
+    from visthrow import config
+    from visthrow.common.errors import DiagnoseError
+    from visthrow.common.storage import atomic_write
+    from visthrow.diagnose.extend import patch
+    from visthrow.task import Experiment
+
+    try:
+        report = json.loads(Path(args.diagnosis).read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise DiagnoseError(f"{args.diagnosis}: not readable as a diagnosis: {error}") from error
+    theta, covariance = patch.with_scatter(*patch.read(report, args.diagnosis), report)
+    laws = patch.laws_of(report, args.diagnosis, args.laws)
+    if not theta and not laws:
+        print("nothing was named; the configuration stands as it is")
+        return 0
+    doubts = harm(report)
+    if doubts and not args.anyway:
+        raise DiagnoseError(f"held-out flights do not bear this out: {'; '.join(doubts)}; --anyway writes it all the same")
+    path = config.find("train", args.plant)
+    experiment = config.load(Experiment, path)
+    shipped = path.is_relative_to(config.configs_root())
+    base = path.relative_to(config.configs_root()).as_posix() if shipped else str(path.resolve())
+    content = patch.text(base, experiment, theta, covariance, args.plants, origin(report, args.diagnosis), laws)
+    atomic_write(args.out, content)
+    config.load(Experiment, Path(args.out))  # what was written is what training will read
+    named = [*theta, *(f"{law.coefficient:.4g} {' '.join((*law.factors, law.vector))} ({law.block})" for law in laws)]
+    print(f"{args.out}: {', '.join(named)} on top of {base}")
+    return 0
+
+
+def harm(report: dict) -> list[str]:
+    """Reasons against a diagnosis: channels that held-out flights show worse with it, or no better."""
+    channels = (report.get("gain") or {}).get("channels", [])
+    worse = [
+        f"{c['channel']} {100 * (c['after'] / c['before'] - 1):+.1f} %"
+        for c in channels
+        if c.get("before") and c["after"] > (1.0 + HARM) * c["before"]
+    ]
+    nats = (report.get("gain") or {}).get("nats_per_sample")
+    return worse + ([f"log-likelihood {nats:+.3g} nats a sample"] if nats is not None and nats <= 0.0 else [])
+
+
+def origin(report: dict, path: str) -> list[str]:
+    """Lines on where a diagnosis comes from."""
+    made = report.get("provenance") or {}
+    lines = [f"Extended by `visthrow diagnose apply` from {path}: {report.get('overall', 'a diagnosis')}."]
+    lines += [f"{report.get('flights', 0)} flights, {report.get('windows', 0)} windows, {report.get('samples', 0)} samples."]
+    lines += [f"{name}: {made[name]}" for name in ("commit", "time", "command") if made.get(name)]
+    for c in (report.get("gain") or {}).get("channels", []):
+        lines.append(f"Held-out error of {c['channel']}: {c.get('before', 0.0):.3g} before, {c.get('after', 0.0):.3g} after.")
+    landing = (report.get("gain") or {}).get("landing")
+    if landing:
+        before, after = landing["before"], landing["after"]
+        lines.append(f"Landing error of {landing['throws']} throws: {before:.3g} m before, {after:.3g} m after.")
+    own = [f for f in report.get("findings") or [] if f["name"] in report.get("theta", {}) and f.get("low") is not None]
+    if own:
+        lines.append("The sizes are those with which these causes alone explain the flights. With everything else below its floor:")
+        lines += [f"{f['name']} = {f['estimate']:.3g} {f['unit']} (95 %: {f['low']:.3g} to {f['high']:.3g})." for f in own]
+    drawn = [s for s in report.get("scatter") or [] if s["found"]]
+    return lines + [f"Varies from flight to flight: {s['name']} {s['size']:.3g} {s['unit']}." for s in drawn]

@@ -1,0 +1,146 @@
+"""A diagnosis put into the configuration: a TOML on top of the diagnosed one, that training and the next diagnosis read."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from sim.effects.laws import check_laws
+from sim.params import LawParams
+from visthrow import config
+from visthrow.common.errors import DiagnoseError
+from visthrow.common.toml_text import dumps
+from visthrow.diagnose.catalogue import ALL, Setting, apply
+from visthrow.diagnose.select.scatter import variances
+from visthrow.diagnose.throw.opened import closed, opened
+from visthrow.task import Experiment, plant_of
+
+
+def extended(experiment: Experiment, theta: Mapping[str, float]) -> Experiment:
+    """The experiment whose plant and sensors have these effects.
+
+    Raises:
+        DiagnoseError: An effect that the catalogue does not hold.
+    """
+    base = opened(Setting(plant_of(experiment), experiment.sensing, camera=experiment.camera))
+    found = apply(ALL, base, theta)
+    plant = closed(found.plant, plant_of(experiment))
+    return dataclasses.replace(
+        experiment, vehicle=plant.vehicle, rope=plant.rope, release=plant.release, air=plant.air, sensing=found.sensing,
+        camera=found.camera,
+    )  # fmt: skip
+
+
+def differences(before: Any, after: Any) -> dict[str, Any]:
+    """Nested entries of ``after`` that differ from ``before``."""
+    out = {}
+    for key, value in after.items():
+        old = before.get(key)
+        if isinstance(value, dict):
+            inner = differences(old or {}, value)
+            out |= {key: inner} if inner else {}
+        elif value != old:
+            out[key] = value
+    return out
+
+
+def touched(theta: Mapping[str, float]) -> dict[str, list[str]]:
+    """Dotted key of an experiment -> effects that change it."""
+    keys: dict[str, list[str]] = {}
+    for name in theta:
+        for key in ALL[name].keys:
+            path = key.path.removeprefix("plant.")
+            keys.setdefault(path, []).append(name)
+    return keys
+
+
+def text(
+    base: str, experiment: Experiment, theta: Mapping[str, float], covariance: Sequence[Sequence[float]], plants: int,
+    provenance: Sequence[str], laws: Sequence[LawParams] = (),
+) -> str:  # fmt: skip
+    """The TOML file.
+
+    Args:
+        base: path of the diagnosed configuration, as ``base =`` is to name it.
+        experiment: that configuration.
+        theta: sizes of the named effects.
+        covariance: of theta, in its order.
+        plants: to draw in training from the joint posterior.
+        provenance: lines that say where it comes from.
+        laws: terms outside the catalogue, to stand beside those that the configuration has.
+    """
+    after = dataclasses.replace(
+        extended(experiment, theta),
+        diagnosed=_diagnosed(experiment, theta, covariance, plants),
+        laws=(*experiment.laws, *laws),
+    )
+    check_laws(after.laws)
+    changed = differences(config.to_dict(experiment), config.to_dict(after))
+    lines = [f"# {line}" for line in provenance] + [dumps({"base": base}).strip(), ""]
+    about = touched(theta)
+    sd = {name: covariance[i][i] ** 0.5 for i, name in enumerate(theta)}
+    section = ""
+    for line in dumps(changed).splitlines():
+        section = line.strip("[]") if line.startswith("[") else section
+        path = f"{section}.{line.split(' = ')[0]}" if " = " in line else ""
+        switched = [n for n in theta if ALL[n].switch is not None]
+        words = [f"{n} {theta[n]:+.4g} +- {sd[n]:.2g} {ALL[n].effect.unit}" for n in about.get(path, [])]
+        if " = " in line and not words:
+            words = ["of the diagnosis above"] if section == "diagnosed" or line.startswith("laws") else switched
+        lines.append(f"{line}  # {'; '.join(words)}" if words else line)
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def _diagnosed(experiment: Experiment, theta: Mapping[str, float], covariance: Sequence[Sequence[float]], plants: int):
+    """The joint posterior of the plant's own numbers: not of the sensors, the replay's step or which blocks there are."""
+    own = [i for i, name in enumerate(theta) if ALL[name].keys and all(k.path.startswith("plant.") for k in ALL[name].keys)]
+    names = list(theta)
+    rows = tuple(tuple(float(covariance[i][j]) for j in own) for i in own)
+    return dataclasses.replace(experiment.diagnosed, effects=tuple(names[i] for i in own), covariance=rows, plants=plants)
+
+
+def with_scatter(
+    theta: Mapping[str, float], covariance: Sequence[Sequence[float]], report: Mapping[str, Any]
+) -> tuple[dict[str, float], list[list[float]]]:
+    """Sizes and covariance with what varies from flight to flight: training draws it with the rest of the posterior."""
+    drawn = variances(report.get("scatter") or [])
+    names = [*theta, *[name for name in drawn if name not in theta]]
+    whole = np.zeros((len(names), len(names)))
+    whole[: len(theta), : len(theta)] = np.reshape(covariance, (len(theta), len(theta)))
+    for name, variance in drawn.items():
+        whole[names.index(name), names.index(name)] += variance
+    return {name: theta.get(name, 0.0) for name in names}, whole.tolist()
+
+
+def laws_of(report: Mapping[str, Any], path: str, count: int) -> list[LawParams]:
+    """The best ``count`` laws of the JSON that ``explain`` wrote.
+
+    Raises:
+        DiagnoseError: It holds fewer.
+    """
+    told = report.get("laws") or []
+    if count > len(told):
+        raise DiagnoseError(f"{path}: {len(told)} laws outside the catalogue; --laws asks for {count}")
+    return [LawParams(x["block"], tuple(x["factors"]), x["vector"], float(x["coefficient"])) for x in told[:count]]
+
+
+def read(report: Mapping[str, Any], path: str) -> tuple[dict[str, float], list[list[float]]]:
+    """Sizes and covariance from the JSON that ``explain`` wrote.
+
+    Raises:
+        DiagnoseError: Something is missing, or effects of another model than the throw.
+    """
+    try:
+        theta = {str(name): float(size) for name, size in report["theta"].items()}
+        covariance = [[float(x) for x in row] for row in report["covariance"]]
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise DiagnoseError(f"{path}: no diagnosis that `visthrow diagnose explain` wrote: {error!r}") from error
+    if len(covariance) != len(theta) or any(len(row) != len(theta) for row in covariance):
+        raise DiagnoseError(f"{path}: {len(theta)} effects and a covariance of {len(covariance)} rows; expected one each")
+    strange = [name for name in theta if name not in ALL]
+    if strange:
+        raise DiagnoseError(
+            f"{path}: {', '.join(strange)} are no effects of the throw's simulator; apply writes configurations of that alone"
+        )
+    return theta, covariance

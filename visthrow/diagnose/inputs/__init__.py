@@ -1,0 +1,1 @@
+"""Inputs of a diagnosis: its setup, the logs, what was measured besides."""

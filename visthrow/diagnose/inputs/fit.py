@@ -1,0 +1,203 @@
+"""First values of one's own vehicle or motor from standalone flights or tests: all chosen effects at once, with covariance.
+
+Where a diagnosis asks which cause is there, a fit takes for granted that all chosen ones are: their slabs are the only prior.
+"""
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sim.params import VehicleParams
+from visthrow import config
+from visthrow.common.errors import DiagnoseError, suggest
+from visthrow.diagnose.inputs.setup import Setup
+from visthrow.diagnose.models.interface import Model
+from visthrow.logs.flightlog import FlightLog
+
+DEFAULT_FREE = {
+    "flyer": ("thrust_gain", "thrust_curve", "rotor_drag_xy", "rotor_drag_z", "cmd_delay", "frame_tilt_x", "frame_tilt_y"),
+    "stand": ("thrust_gain", "thrust_linear", "load_cell_zero", "power_gain", "idle_power"),
+    "trim": ("motor_fl", "motor_fr", "motor_rl", "motor_rr"),
+}
+"""Model -> effects that are fitted where none are named; what cannot be told from the logs keeps its prior."""
+ROUNDS = 4
+UNKNOWN_SHARE = 0.5
+"""An effect whose deviation is still this share of its prior was not told by the logs."""
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """Sizes of effects, with what is known of them."""
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    theta: np.ndarray  # in the effects' units, shape (K,)
+    covariance: np.ndarray  # shape (K, K)
+    told: tuple[bool, ...]  # by the logs, not the prior
+    rms_before: Mapping[str, float]  # residual by channel, in its unit
+    rms_after: Mapping[str, float]
+    middle_speed: float = 0.0  # of a stand's steps, to which its linear part refers [rad/s]
+
+    def interval(self, i: int) -> tuple[float, float]:
+        """95 % interval of one of them."""
+        half = 1.96 * float(np.sqrt(self.covariance[i, i]))
+        return float(self.theta[i]) - half, float(self.theta[i]) + half
+
+
+def fit(model: Model, free: Sequence[str]) -> Fitted:
+    """Fit effects of a model jointly.
+
+    Args:
+        model: Linearisable; its windows' latent forces and noise levels are estimated on the way.
+        free: Names of effects.
+
+    Raises:
+        DiagnoseError: A name that the model does not have, or none.
+    """
+    from visthrow.diagnose.likelihood.evidence import Priors
+    from visthrow.diagnose.select.point import Problem, fitted, linearise
+
+    known = [effect.name for effect in model.effects]
+    for name in free:
+        if name not in known:
+            raise DiagnoseError(f"no effect '{name}' to fit; {suggest(name, known)}")
+    if not free:
+        raise DiagnoseError(f"nothing to fit; name effects with --free: {', '.join(known)}")
+    at = [known.index(name) for name in free]
+    before = model.windows({})
+    problem = Problem(model, Priors.of(tuple(model.effects), tuple(model.channels)), tuple(range(len(before))))
+    point = linearise(problem, np.zeros(len(known)), windows=before)
+    for _ in range(ROUNDS):
+        start = point.theta
+        point = fitted(problem, point, at)
+        point = linearise(problem, point.theta, point.noise)
+        if np.max(np.abs(point.theta - start)) < 0.5:  # floors
+            break
+    slab = problem.priors.slab[at]
+    posterior = np.linalg.inv(point.information[np.ix_(at, at)] + np.diag(slab**-2.0))
+    floors = problem.priors.floor[at]
+    sizes = point.theta[at] * floors
+    told = tuple(bool(s < UNKNOWN_SHARE * prior) for s, prior in zip(np.sqrt(np.diag(posterior)), slab))
+    after = model.residuals(problem.sizes(point.theta))
+    units = tuple(model.effects[i].unit for i in at)
+    covariance = posterior * np.outer(floors, floors) + np.diag(floors**2)
+    rms = [_rms(model, before, residuals) for residuals in ([w.residual for w in before], after)]
+    return Fitted(tuple(free), units, sizes, covariance, told, *rms, middle_speed=getattr(model, "middle", 0.0))
+
+
+def _rms(model: Model, windows: Sequence[Any], residuals: Sequence[np.ndarray]) -> dict[str, float]:
+    channel, value = np.concatenate([w.channel for w in windows]), np.concatenate(residuals)
+    return {
+        name: float(np.sqrt(np.mean(value[channel == i] ** 2))) for i, name in enumerate(model.channels) if np.any(channel == i)
+    }
+
+
+def vehicle_of(setup: Setup, found: Fitted, base: VehicleParams) -> VehicleParams:
+    """A simulated vehicle with what was found; everything else as in ``base``.
+
+    A map from commands to thrust tells no speed: the thrust coefficient then stays, and the largest thrust follows the map.
+
+    Args:
+        setup: What was assumed before.
+        found: What was fitted.
+        base: Vehicle that lends all other numbers.
+
+    Raises:
+        DiagnoseError: The setup's model is of no vehicle.
+    """
+    size = dict(zip(found.names, map(float, found.theta)))
+    if setup.flyer is not None:
+        return _of_flyer(setup.flyer, size, base)
+    if setup.stand is not None:
+        return _of_stand(setup.stand, size, found.middle_speed, base)
+    raise DiagnoseError(f"'{setup.about}' is no vehicle and no motor; a vehicle is fitted by a setup with [flyer] or [stand]")
+
+
+def _of_flyer(p: Any, size: Mapping[str, float], base: VehicleParams) -> VehicleParams:
+    def get(name: str) -> float:
+        return size.get(name, 0.0)
+
+    gain, curve = 1.0 + get("thrust_gain"), get("thrust_curve")
+    mass = p.mass + get("mass_quad")
+    motor = dataclasses.replace(base.motor, kind="first_order", time_constant=max(p.motor_time_constant + get("motor_tau"), 1e-3))
+    aero = dataclasses.replace(
+        base.aero, kind="rotor_drag", drag_x=p.drag_xy + get("rotor_drag_xy"), drag_y=p.drag_xy + get("rotor_drag_xy"),
+        drag_z=p.drag_z + get("rotor_drag_z"), parasitic=max(get("parasitic"), 0.0), translational_lift=get("translational_lift"),
+    )  # fmt: skip
+    battery = dataclasses.replace(base.battery, reference_voltage=p.reference_voltage)
+    thrust = dataclasses.replace(base.thrust, voltage_coefficient=p.voltage_coefficient + get("battery_sag"))
+    controller = base.controller
+    hover = mass * p.gravity / 4.0
+    if p.input == "motor_speed":
+        # the curve's departure in thrust is taken at hover, where it is measured
+        thrust = dataclasses.replace(thrust, k_f=p.thrust_map[2] * gain, k_1=p.thrust_map[1] * gain)
+    elif p.input == "motor_command":
+        full = sum(p.thrust_map) * gain
+        full *= 1.0 + curve * (full / hover - 1.0)
+        controller = dataclasses.replace(controller, max_thrust=full)
+    else:
+        thrust = dataclasses.replace(thrust, gain=tuple(gain * own for own in thrust.gain))
+    return dataclasses.replace(
+        base, body=dataclasses.replace(base.body, mass=mass), motor=motor, aero=aero, battery=battery, thrust=thrust,
+        controller=controller, queue=dataclasses.replace(base.queue, delay=max(p.command_delay + get("cmd_delay"), 0.0)),
+    )  # fmt: skip
+
+
+def _of_stand(p: Any, size: Mapping[str, float], middle: float, base: VehicleParams) -> VehicleParams:
+    k_f = p.k_f * (1.0 + size.get("thrust_gain", 0.0))
+    k_1 = p.k_f * size.get("thrust_linear", 0.0) * middle
+    thrust = dataclasses.replace(base.thrust, k_f=k_f, k_1=k_1, voltage_coefficient=size.get("thrust_voltage", 0.0))
+    battery = dataclasses.replace(base.battery, reference_voltage=p.reference_voltage)
+    return dataclasses.replace(base, thrust=thrust, battery=battery)
+
+
+def write(folder: str | Path, name: str, setup: Setup, found: Fitted, logs: Sequence[FlightLog], base: VehicleParams) -> list[Path]:
+    """Write ``vehicle.toml`` (where the model is one of a vehicle) and ``fit.json`` with covariance and provenance.
+
+    Returns:
+        Their paths.
+
+    Raises:
+        StorageError: The folder cannot be written.
+    """
+    from visthrow.common.storage import atomic_write, write_json
+
+    folder = Path(folder)
+    sources = {str(log.meta.get("source", "")): _digest(log) for log in logs}
+    record = {
+        "setup": name, "effects": list(found.names), "units": list(found.units), "theta": found.theta.tolist(),
+        "covariance": found.covariance.tolist(), "told_by_logs": list(found.told), "rms_before": dict(found.rms_before),
+        "rms_after": dict(found.rms_after), "logs": sources,
+    }  # fmt: skip
+    write_json(folder / "fit.json", record)
+    if setup.flyer is None and setup.stand is None:
+        return [folder / "fit.json"]
+    vehicle = vehicle_of(setup, found, base)
+    atomic_write(folder / "vehicle.toml", _head(name, found, sources) + config.dumps(vehicle))
+    return [folder / "vehicle.toml", folder / "fit.json"]
+
+
+def _head(name: str, found: Fitted, sources: Mapping[str, str]) -> str:
+    lines = [f"# Fitted by `visthrow diagnose fit` with the setup '{name}'; covariance and provenance also in fit.json."]
+    for i, (effect, unit) in enumerate(zip(found.names, found.units)):
+        low, high = found.interval(i)
+        note = "" if found.told[i] else " (the prior: these logs do not tell)"
+        lines.append(f"# {effect} = {found.theta[i]:.6g} {unit}, 95 % [{low:.6g}, {high:.6g}]{note}")
+    lines.append(f"# covariance, row by row: {json.dumps([[float(f'{x:.4g}') for x in row] for row in found.covariance])}")
+    lines += [f"# log {Path(source).name}: {digest}" for source, digest in sources.items()]
+    return "\n".join(lines) + "\n\n"
+
+
+def _digest(log: FlightLog) -> str:
+    """Fingerprint of a log's samples."""
+    digest = hashlib.sha256()
+    for name in sorted(log.channels):
+        channel = log[name]
+        digest.update(name.encode() + channel.time.tobytes() + np.ascontiguousarray(channel.values).tobytes())
+    return digest.hexdigest()[:16]

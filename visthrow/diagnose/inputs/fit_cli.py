@@ -1,0 +1,51 @@
+"""``visthrow diagnose fit``: the first configuration of one's own vehicle or motor, from standalone flights or tests."""
+
+import argparse
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the action."""
+    parser.epilog = (
+        "examples:\n"
+        "  visthrow diagnose fit hover.csv circle.csv --config mine.toml --out runs/fit     a vehicle without payload\n"
+        "  visthrow diagnose fit stand.csv:a1_* --config motor_stand                          a motor with one propeller\n"
+        "  visthrow config vehicle runs/fit/vehicle.toml                                    what came of it\n"
+    )
+    parser.add_argument("logs", metavar="LOG", nargs="+", help="files, or folders of runs")
+    parser.add_argument("--config", required=True, metavar="NAME", help="of configs/diagnose, or a file; with a model in it")
+    parser.add_argument("--free", nargs="+", default=[], metavar="EFFECT", help="what is fitted (default: by the model)")
+    parser.add_argument("--vehicle", default="paper", metavar="NAME", help="lends all that is not fitted (default: paper)")
+    parser.add_argument("--out", default="out/fit", metavar="FOLDER", help="for vehicle.toml and fit.json (default: out/fit)")
+    parser.add_argument("--json", metavar="FILE", help="write the printed figures to this file as well")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Read, check, fit, write."""
+    from sim.params import VehicleParams
+    from visthrow import config
+    from visthrow.common.storage import write_json
+    from visthrow.diagnose.check.run import check
+    from visthrow.diagnose.inputs import fit as fitting
+    from visthrow.diagnose.inputs import setup as setups
+
+    setup = setups.load(args.config)
+    logs = setups.read_logs(args.logs, args.config)
+    for checked in check(logs):
+        for row in checked.rows:
+            if row.verdict == "bad":
+                print(f"{checked.name}: {row.topic} {row.channel}: {row.text}")
+    model = setups.model_of(setup, logs)
+    free = args.free or [n for n in fitting.DEFAULT_FREE.get(setup.named()[0], ()) if n in {e.name for e in model.effects}]
+    found = fitting.fit(model, free)
+    for i, name in enumerate(found.names):
+        low, high = found.interval(i)
+        note = "" if found.told[i] else "   not told by these logs"
+        print(f"{name:<20} {found.theta[i]:+.5g}  [{low:+.5g}, {high:+.5g}] {found.units[i]}{note}")
+    for channel, before in found.rms_before.items():
+        print(f"residual of {channel}: {before:.4g} before, {found.rms_after[channel]:.4g} after")
+    base = config.load(VehicleParams, config.find("vehicle", args.vehicle))
+    for path in fitting.write(args.out, args.config, setup, found, logs, base):
+        print(path)
+    if args.json:
+        write_json(args.json, {"effects": list(found.names), "theta": found.theta, "covariance": found.covariance})
+    return 0

@@ -1,0 +1,72 @@
+"""What a scale, a tape or a barometer settles that no flight does: measured values narrow the catalogue."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from visthrow.common.errors import DiagnoseError, suggest
+from visthrow.diagnose.models.interface import Effect
+
+WITHIN = 3.0
+"""Deviations of a measurement beyond which the configured value cannot be off."""
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """One measurement on the ground."""
+
+    name: str  # what to do
+    effect: str  # that it settles
+    sd: float  # of the measured value, in the effect's unit
+    seconds: float
+
+
+MEASUREMENTS = (
+    Measurement("weigh the vehicle", "mass_quad", 3e-4, 60.0),  # kitchen scale of 0.1 g, read thrice
+    Measurement("weigh the payload", "mass_payload", 2e-4, 60.0),  # the same
+    Measurement("weigh the rope", "rope_mass", 1e-4, 120.0),  # the same, taken off its mount
+    Measurement("tape the rope", "rope_length", 1e-3, 60.0),  # steel tape, to the payload's centre
+    Measurement("gauge the payload", "payload_offset", 5e-4, 60.0),  # caliper
+    Measurement("read a barometer", "air_density", 3e-3, 60.0),  # 1 hPa and 0.5 K
+    Measurement("tape between two markers", "frame_scale", 3e-4, 120.0),  # 1 mm in 3 m
+)
+
+
+def narrowed(effects: Sequence[Effect], measured: Mapping[str, float]) -> tuple[Effect, ...]:
+    """The catalogue where some configured values were measured.
+
+    Args:
+        effects: of the model.
+        measured: effect -> deviation of the measurement that the configuration's value comes from, in its unit.
+
+    Raises:
+        DiagnoseError: No effect of that name, or a deviation that is not above 0.
+    """
+    known = [e.name for e in effects]
+    for name, sd in measured.items():
+        if name not in known:
+            raise DiagnoseError(f"no effect '{name}' that could have been measured; {suggest(name, known)}")
+        if not sd > 0.0:
+            raise DiagnoseError(f"{name} measured with a deviation of {sd}; expected one above 0")
+    return tuple(_narrow(e, measured[e.name]) if e.name in measured else e for e in effects)
+
+
+def _narrow(effect: Effect, sd: float) -> Effect:
+    low, high = effect.bounds
+    bounds = (max(low, -WITHIN * sd), min(high, WITHIN * sd))
+    return replace(effect, bounds=bounds, prior_sd=min(effect.prior_sd, sd))
+
+
+def parsed(items: Sequence[str]) -> dict[str, float]:
+    """Read ``NAME=DEVIATION`` of the command line.
+
+    Raises:
+        DiagnoseError: Something else.
+    """
+    out = {}
+    for item in items:
+        name, _, sd = item.partition("=")
+        try:
+            out[name.strip()] = float(sd)
+        except ValueError as error:
+            raise DiagnoseError(f"--measured {item}: expected NAME=DEVIATION, such as mass_quad=0.0003") from error
+    return out

@@ -1,0 +1,112 @@
+"""From command line arguments to a model: which logs, read how, held against which simulation."""
+
+import argparse
+from collections.abc import Sequence
+
+from visthrow.common.errors import ConfigError, DiagnoseError, suggest
+from visthrow.diagnose.models.interface import Model
+from visthrow.logs.flightlog import FlightLog
+
+DEFAULT_PLANT = "state"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments that explain, plan and blind share."""
+    from visthrow.common.arguments import add_common
+
+    parser.add_argument("logs", metavar="LOG", nargs="+", help="files, or folders of runs")
+    parser.add_argument("--config", metavar="NAME", help="of configs/diagnose, or a file: how tables are read, and which model")
+    parser.add_argument(
+        "--plant", metavar="NAME", default=DEFAULT_PLANT,
+        help=f"of configs/train, or a file: vehicle, rope and release of the model that is diagnosed (default: {DEFAULT_PLANT})",
+    )  # fmt: skip
+    parser.add_argument("--only", metavar="NAMES", help="consider these effects alone, separated by commas")
+    parser.add_argument(
+        "--measured", metavar="NAME=SD", action="append", default=[],
+        help="the configured value behind this effect was measured with this deviation, such as mass_quad=0.0003 from a scale",
+    )  # fmt: skip
+    parser.add_argument("--without", metavar="FLIGHTS", default="", help="numbers of flights to leave out, from 0, by commas")
+    parser.add_argument("--seed", type=int, default=0, help="of the null worlds and bootstraps (default: 0)")
+    add_common(parser)
+
+
+def open_model(args: argparse.Namespace) -> tuple[Model, list[FlightLog]]:
+    """Read the logs and build the model.
+
+    Raises:
+        ConfigError, LogError, DiagnoseError: As what is read and built; ``--set`` with a setup's own model.
+    """
+    from visthrow.diagnose.inputs import measures
+
+    model, logs = _opened(args)
+    if args.measured:
+        model.effects = measures.narrowed(model.effects, measures.parsed(args.measured))
+    return model, logs
+
+
+def _opened(args: argparse.Namespace) -> tuple[Model, list[FlightLog]]:
+    from visthrow.diagnose.inputs import setup
+
+    logs = setup.read_logs(args.logs, args.config)
+    chosen = setup.load(args.config) if args.config else None
+    if chosen is not None and chosen.named():
+        if args.overrides:
+            raise ConfigError(f"--set changes the throw's plant; the setup '{args.config}' has the model {chosen.named()[0]}")
+        model = setup.model_of(chosen, logs)
+        return (_only(model, args.only.split(",")) if args.only else model), logs
+    return throw_model(args, logs)
+
+
+def throw_model(args: argparse.Namespace, logs: Sequence[FlightLog]) -> tuple[Model, list[FlightLog]]:
+    """The whole throw, with the plant of an experiment, and its logs with their commands put right."""
+    from visthrow import config
+    from visthrow.diagnose.likelihood import memory
+    from visthrow.diagnose.throw.interface import put_right
+    from visthrow.diagnose.throw.throw_model import ThrowModel
+    from visthrow.task import Experiment, plant_of
+    from visthrow.training.device import resolve
+
+    memory.keep()
+    experiment = config.load(Experiment, config.find("train", args.plant), args.overrides)
+    only = args.only.split(",") if args.only else None
+    known = {"sensing": experiment.sensing, "camera": experiment.camera}
+    right, mistakes = put_right(logs, plant_of(experiment))
+    known["mistakes"] = mistakes
+    return ThrowModel(right, plant_of(experiment), device=resolve(args.device), only=only, **known), right
+
+
+class _Part:
+    """A model with some of its effects."""
+
+    def __init__(self, model: Model, keep: Sequence[int]) -> None:
+        self._model, self._keep = model, list(keep)
+        self.effects, self.channels = [model.effects[j] for j in keep], model.channels
+
+    def __getattr__(self, name: str):
+        return getattr(self._model, name)
+
+    def windows(self, theta):
+        """See :class:`visthrow.diagnose.models.interface.Model`."""
+        from dataclasses import replace
+
+        return [replace(w, effects=w.effects[:, self._keep]) for w in self._model.windows(theta)]
+
+
+def _only(model: Model, names: Sequence[str]) -> Model:
+    known = [e.name for e in model.effects]
+    for name in names:
+        if name not in known:
+            raise DiagnoseError(f"no effect '{name}' for these logs; {suggest(name, known)}")
+    return _Part(model, [known.index(name) for name in names])
+
+
+def numbers(text: str) -> tuple[int, ...]:
+    """Flights named on the command line.
+
+    Raises:
+        DiagnoseError: Something else than numbers between commas.
+    """
+    try:
+        return tuple(int(part) for part in text.split(",") if part.strip())
+    except ValueError as error:
+        raise DiagnoseError(f"--without {text}: expected numbers of flights between commas, such as 0,3") from error

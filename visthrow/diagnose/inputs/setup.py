@@ -1,0 +1,93 @@
+"""A diagnosis setup: how logs are read, which simulation they are held against, and its parameters."""
+
+import importlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from visthrow.common.errors import ConfigError
+from visthrow.diagnose.models.ball import BallParams
+from visthrow.diagnose.models.flyer import FlyerParams
+from visthrow.diagnose.models.gimbal import GimbalParams
+from visthrow.diagnose.models.interface import Model
+from visthrow.diagnose.models.pendulum import PendulumParams
+from visthrow.diagnose.models.stand import StandParams
+from visthrow.diagnose.models.trim import TrimParams
+from visthrow.logs.flightlog import FlightLog
+from visthrow.logs.mapping import TableMap
+
+MODELS = {
+    "ball": "visthrow.diagnose.models.ball:BallModel",
+    "pendulum": "visthrow.diagnose.models.pendulum:PendulumModel",
+    "stand": "visthrow.diagnose.models.stand:StandModel",
+    "gimbal": "visthrow.diagnose.models.gimbal:GimbalModel",
+    "flyer": "visthrow.diagnose.models.flyer:FlyerModel",
+    "trim": "visthrow.diagnose.models.trim:TrimModel",
+}
+"""Table of a setup -> ``module:class`` of the model that it parametrises."""
+
+
+@dataclass(frozen=True)
+class Setup:
+    """File of ``configs/diagnose``; at most one of the models.
+
+    Raises:
+        ConfigError: More than one model.
+    """
+
+    about: str  # whose logs these are
+    table: TableMap | None = None  # of tables' columns; None: the logs say themselves what they hold
+    ball: BallParams | None = None
+    pendulum: PendulumParams | None = None
+    stand: StandParams | None = None
+    gimbal: GimbalParams | None = None
+    flyer: FlyerParams | None = None
+    trim: TrimParams | None = None
+
+    def __post_init__(self) -> None:
+        if len(self.named()) > 1:
+            raise ConfigError(f"{' and '.join(self.named())}: a setup has one model")
+
+    def named(self) -> list[str]:
+        """Names of the models that have a table."""
+        return [name for name in MODELS if getattr(self, name) is not None]
+
+
+def model_of(setup: Setup, logs: Sequence[FlightLog]) -> Model:
+    """Make the model that a setup holds logs against.
+
+    Raises:
+        ConfigError: The setup has none.
+        LogError: The logs hold nothing that the model could be held against.
+    """
+    if not setup.named():
+        raise ConfigError(f"the setup '{setup.about}' has no model; expected a table of one of: {', '.join(MODELS)}")
+    name = setup.named()[0]
+    module, attribute = MODELS[name].split(":")
+    return getattr(importlib.import_module(module), attribute)(logs, getattr(setup, name))
+
+
+def load(name: str | Path) -> Setup:
+    """Load a setup by its name in ``configs/diagnose``, or a file.
+
+    Raises:
+        ConfigError: There is none, or it does not fill the schema.
+    """
+    from visthrow import config
+
+    return config.load(Setup, config.find("diagnose", str(name)))
+
+
+def read_logs(paths: Sequence[str | Path], name: str | Path | None = None) -> list[FlightLog]:
+    """Read logs, tables by the setup's mapping.
+
+    Args:
+        paths: Files or folders.
+        name: Of a setup, or None.
+
+    Raises:
+        LogError, ConfigError: As the readers and :func:`load`.
+    """
+    from visthrow.logs import read_all
+
+    return read_all(paths, load(name).table if name is not None else None)

@@ -1,0 +1,212 @@
+"""Windows' columns on a GPU: inner products of all windows at once, again and again while only their residuals change.
+
+On a CPU each window is reduced by itself, on all cores, as :mod:`visthrow.diagnose.likelihood.marginal` has it.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from functools import lru_cache
+from typing import TypeVar
+
+import numpy as np
+import torch
+
+from visthrow.diagnose.likelihood.marginal import (
+    Gram,
+    There,
+    check,
+    correlated,
+    correlated_with,
+    gram_of,
+    gram_with,
+    knot_factor,
+    left_of,
+    with_residual,
+)
+from visthrow.diagnose.likelihood.threads import each
+from visthrow.diagnose.likelihood.transfer import all_to_host, side_by_side, to_host
+from visthrow.diagnose.models.interface import Window
+
+T = TypeVar("T", np.ndarray, torch.Tensor)
+
+
+class Same(tuple):
+    """Arrays that are the same only if they are the very ones."""
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Same) and len(self) == len(other) and all(a is b for a, b in zip(self, other))
+
+    def __hash__(self) -> int:
+        return hash(tuple(map(id, self)))
+
+
+class _Design:
+    """Columns of W windows over their sigmas, on a device; padded with 0 to N samples and P columns."""
+
+    def __init__(self, windows: Sequence[tuple[np.ndarray, ...]], floors: np.ndarray, channels: int, device: str):
+        """Move them there, where they are also scaled.
+
+        Args:
+            windows: of each, its nuisances, latents, effects, deviations of nuisances, sigmas and channels.
+            floors: of the effects, shape (K,).
+            channels: of the model.
+            device: where to calculate.
+        """
+        self._widths = [sum(parts.shape[1] for parts in own[:3]) for own in windows]
+        shape, width = (len(windows), max(len(own[4]) for own in windows)), max(self._widths)
+        sigma, member, scale = np.ones(shape), np.zeros((*shape, channels)), np.zeros((len(windows), width))
+        for w, (*parts, sd, own_sigma, channel) in enumerate(windows):
+            scale[w, : self._widths[w]] = np.concatenate((sd, np.ones(parts[1].shape[1]), floors))
+            sigma[w, : len(own_sigma)] = own_sigma
+            member[w, np.arange(len(channel)), channel] = 1.0
+        self._sigma, self._member, scales = (torch.from_numpy(a).to(device) for a in (sigma, member, scale))
+        columns = side_by_side([own[:3] for own in windows], (shape[1], width), device)
+        self._columns = columns.mul_(scales[:, None]).div_(self._sigma[:, :, None])
+
+    def inner(self) -> list[There]:
+        """Inner products of each window's columns by channel, shape (C, P, P)."""
+        count, _, channels = self._member.shape
+        found = self._columns.new_empty((count, channels, self._columns.shape[2], self._columns.shape[2]))
+        for c in range(channels):
+            torch.matmul((self._columns * self._member[:, :, c, None]).transpose(1, 2), self._columns, out=found[:, c])
+        return _on_both(found, self._widths)
+
+    def left(self, residuals: Sequence[np.ndarray], fits: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """What fits of the first columns leave of each window's residual, shape (N,)."""
+        fit = np.zeros((len(fits), self._columns.shape[2]))
+        for row, own in zip(fit, fits):
+            row[: len(own)] = own
+        explained = self._columns @ torch.from_numpy(fit).to(self._sigma.device)[:, :, None]
+        left = ((self._off(residuals) - explained[:, :, 0]) * self._sigma).cpu().numpy()
+        return [own[: len(residual)] for own, residual in zip(left, residuals)]
+
+    def _off(self, residuals: Sequence[np.ndarray]) -> torch.Tensor:
+        """Residuals over sigmas, shape (W, N)."""
+        padded = np.zeros(self._sigma.shape)
+        for row, residual in zip(padded, residuals):
+            row[: len(residual)] = residual
+        return torch.from_numpy(padded).to(self._sigma.device) / self._sigma
+
+    def products(self, residuals: Sequence[np.ndarray]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Inner products of each window's residual with its columns (C, P), and with itself (C,)."""
+        off = self._off(residuals)
+        by_channel = (self._member * off[:, :, None]).transpose(1, 2)
+        cross, square = all_to_host((by_channel @ self._columns, (by_channel @ off[:, :, None])[..., 0]))
+        return ((own[:, :width], its) for own, width, its in zip(cross, self._widths, square))
+
+
+def _designed(windows: Sequence[Window], floors: np.ndarray, channels: int, device: str) -> _Design:
+    """The windows' columns there: of the very same arrays, once."""
+    arrays = [a for w in windows for a in (w.nuisance, w.latent, w.effects, w.nuisance_sd, w.sigma, w.channel)]
+    return _kept(Same([*arrays, floors]), channels, device)
+
+
+@lru_cache(maxsize=2)
+def _kept(arrays: Same, channels: int, device: str) -> _Design:
+    return _Design([arrays[i : i + 6] for i in range(0, len(arrays) - 1, 6)], arrays[-1], channels, device)
+
+
+def grams_of(windows: Sequence[Window], floors: np.ndarray, channels: int, device: str) -> list[Gram]:
+    """Reduce windows to their inner products, see :func:`visthrow.diagnose.likelihood.marginal.gram_of`.
+
+    Args:
+        windows: with finite residuals and derivatives.
+        floors: of the effects, shape (K,).
+        channels: of the model.
+        device: where to calculate.
+
+    Raises:
+        DiagnoseError: A window's arrays do not fit together, or hold NaN or infinity.
+    """
+    if device == "cpu" or not windows:
+        return each(lambda w: gram_of(w, floors, channels), windows)
+    each(lambda w: check(w, len(floors), channels), windows)
+    design = _designed(windows, floors, channels, device)
+    products = zip(windows, design.inner(), design.products([w.residual for w in windows]))
+    return [replace(gram_with(w, inner.of, cross, square), there=inner) for w, inner, (cross, square) in products]
+
+
+def _on_both(values: torch.Tensor, widths: Sequence[int]) -> list[There]:
+    """Square matrices of some channels, shape (W, C, P, P), as far as they are not padded."""
+    return [There(own[:, :n, :n], host[:, :n, :n]) for own, host, n in zip(values, to_host(values), widths)]
+
+
+def padded(
+    inner: Sequence[There | np.ndarray], part: Callable[[T, int], T], shape: tuple[int, ...], device: str
+) -> torch.Tensor:
+    """Parts of grams' inner products one beside the other, each padded with zeros, shape (grams, *shape).
+
+    Args:
+        inner: of the grams, see :attr:`Gram.placed`.
+        part: of one gram's, given its number.
+        shape: to pad to.
+        device: where to.
+    """
+    if not any(isinstance(own, There) for own in inner):
+        return side_by_side([[part(own, i)] for i, own in enumerate(inner)], shape, device)
+    out = torch.zeros((len(inner), *shape), dtype=torch.float64, device=device)
+    for i, own in enumerate(inner):
+        values = part(own.values, i) if isinstance(own, There) else torch.tensor(part(own, i), device=device)
+        out[(i, *map(slice, values.shape))] = values
+    return out
+
+
+def correlated_of(grams: Sequence[Gram], windows: Sequence[Window], time: float, device: str) -> list[Gram]:
+    """Correlate the latent forces of all windows, see :func:`visthrow.diagnose.likelihood.marginal.correlated`.
+
+    Args:
+        grams: of the windows, with ``factor`` the identity.
+        windows: for the knots.
+        time: correlation time [s].
+        device: where to calculate.
+    """
+    if device == "cpu" or not all(gram.latents for gram in grams):
+        return each(lambda w: correlated(grams[w], windows[w], time), range(len(grams)))
+    factors, widths = [knot_factor(window, time) for window in windows], [gram.cross.shape[1] for gram in grams]
+    channels, size = len(grams[0].count), max(widths)
+    turn = np.tile(np.eye(size), (len(grams), 1, 1))
+    for whole, gram, own in zip(turn, grams, factors):
+        for begin in range(gram.nuisances, gram.nuisances + gram.latents, len(own)):
+            whole[begin : begin + len(own), begin : begin + len(own)] = own
+    right = torch.from_numpy(turn).to(device)[:, None]
+    inner = padded([gram.placed for gram in grams], lambda own, _: own, (channels, size, size), device)
+    there = _on_both(right.mT @ inner @ right, widths)
+    return [correlated_with(gram, both.of, own, both) for gram, both, own in zip(grams, there, factors)]
+
+
+def left_by(
+    windows: Sequence[Window], floors: np.ndarray, channels: int, fits: Sequence[np.ndarray], device: str
+) -> list[np.ndarray]:
+    """What initial states and latent forces leave of windows' residuals.
+
+    Args:
+        windows: of the model.
+        floors: of the effects, shape (K,).
+        channels: of the model.
+        fits: of each window, its initial state in prior deviations and its latents at the knots, shape (D + L,).
+        device: where to calculate.
+
+    Returns:
+        Of each window, shape (N,).
+    """
+    if device == "cpu":
+        return each(lambda pair: left_of(*pair), zip(windows, fits))
+    return _designed(windows, floors, channels, device).left([w.residual for w in windows], fits)
+
+
+def with_residuals(
+    grams: Sequence[Gram], windows: Sequence[Window], floors: np.ndarray, residuals: Sequence[np.ndarray], device: str
+) -> list[Gram]:
+    """Grams with the same derivatives and other residuals: of all windows at once on a GPU, where the derivatives stay.
+
+    Args:
+        grams: of the windows, whose latents are at the knots.
+        windows: of the model.
+        floors: of the effects, shape (K,).
+        residuals: of each window, shape (N,).
+        device: where to calculate.
+    """
+    if device == "cpu":
+        return each(lambda w: with_residual(grams[w], windows[w], floors, residuals[w]), range(len(grams)))
+    design = _designed(windows, floors, len(grams[0].count), device)
+    return [replace(gram, cross=cross, square=square) for gram, (cross, square) in zip(grams, design.products(residuals))]

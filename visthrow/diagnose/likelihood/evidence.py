@@ -1,0 +1,223 @@
+"""Evidence for sets of effects, with floors: whatever is not named may still be there below its floor.
+
+In floors, an effect that is not named has the prior N(0, SPIKE^2), so that a floor is two deviations; a named one has N(0, prior^2)
+within its bounds (the slab):
+
+    log Z = -1/2 log |1 + D^1/2 I D^1/2| + 1/2 s' (I + D^-1)^-1 s + log of the prior's and posterior's mass within the bounds
+
+All functions take information I, shape (K, K), and scores s about theta = 0, shape (K,), or (n, K) for n draws at once.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+from scipy.special import log_ndtr
+
+from visthrow.common.errors import DiagnoseError
+from visthrow.diagnose.likelihood.marginal import Statistics
+from visthrow.diagnose.models.interface import Effect
+
+SPIKE = 0.5
+"""Deviation of an effect that is not named, in its floor: the floor is the limit of what may go unnamed, not its usual size."""
+
+OWN_FLOOR = 0.1
+"""Deviation that numerics and what an effect's form leaves out add to its estimate, in its floor. With it 95 % intervals held 94 %
+of 85 sizes that were hidden in plants of other code than the simulator's."""
+
+NORMAL_95 = 1.96
+
+VERY_STRONG = 5.0
+"""Nats that any cause needs, however few are in question: Bayes factors above 150 are very strong (Kass and Raftery 1995)."""
+
+CALIBRATION_DRAWS = 4000
+CALIBRATION_QUANTILE = 0.995
+
+
+@dataclass(frozen=True)
+class Priors:
+    """What is believed of each effect before the flights, in floors; arrays of shape (K,)."""
+
+    floor: np.ndarray  # in the effects' units
+    slab: np.ndarray  # deviation of a named effect
+    low: np.ndarray
+    high: np.ndarray
+    visible: np.ndarray  # bool: all its channels are there
+
+    @staticmethod
+    def of(effects: list[Effect] | tuple[Effect, ...], channels: list[str] | tuple[str, ...]) -> "Priors":
+        """Read them off the catalogue.
+
+        Raises:
+            DiagnoseError: A floor or prior is not above 0, or bounds do not hold 0.
+        """
+        for e in effects:
+            if not (e.floor > 0.0 and e.prior_sd > 0.0 and e.bounds[0] <= 0.0 <= e.bounds[1]):
+                raise DiagnoseError(
+                    f"effect '{e.name}' has floor {e.floor}, prior_sd {e.prior_sd}, bounds {e.bounds}; expected both above 0, "
+                    "and bounds about 0"
+                )
+        names = [e.name for e in effects]
+        if len(set(names)) < len(names):
+            raise DiagnoseError(f"two effects share a name: {', '.join(sorted({n for n in names if names.count(n) > 1}))}")
+        floor = np.array([e.floor for e in effects], dtype=float)
+        bounds = np.array([e.bounds for e in effects], dtype=float).reshape(-1, 2) / floor[:, None]
+        slab = np.array([e.prior_sd for e in effects], dtype=float) / floor
+        visible = np.array([set(e.channels) <= set(channels) for e in effects], dtype=bool)
+        return Priors(floor, np.maximum(slab, 1.5), bounds[:, 0], bounds[:, 1], visible)
+
+    def deviation(self, active: list[int] | tuple[int, ...]) -> np.ndarray:
+        """Prior deviations with these effects named, shape (K,)."""
+        spread = np.full(len(self.floor), SPIKE)
+        spread[list(active)] = self.slab[list(active)]
+        return spread
+
+
+def _log_mass(mean: np.ndarray, sd: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Logarithm of a normal distribution's mass within bounds, accurate far in the tails."""
+    a, b = (low - mean) / sd, (high - mean) / sd
+    flip = a > 0.0  # use the tail that does not round to 1
+    a, b = np.where(flip, -b, a), np.where(flip, -a, b)
+    upper, lower = log_ndtr(b), log_ndtr(a)
+    return upper + np.log1p(-np.exp(np.minimum(lower - upper, -1e-12)))
+
+
+def covariance(information: np.ndarray, deviation: np.ndarray) -> np.ndarray:
+    """Posterior covariance (I + D^-1)^-1, shape (K, K)."""
+    scaled = information * np.outer(deviation, deviation)
+    scaled.flat[:: len(scaled) + 1] += 1.0
+    return cho_solve(cho_factor(scaled, lower=True), np.eye(len(scaled))) * np.outer(deviation, deviation)
+
+
+def log_evidence(information: np.ndarray, score: np.ndarray, priors: Priors, active: list[int] | tuple[int, ...]) -> float:
+    """log Z of one set of named effects."""
+    deviation = priors.deviation(active)
+    scaled = information * np.outer(deviation, deviation)
+    scaled.flat[:: len(scaled) + 1] += 1.0
+    factor = cho_factor(scaled, lower=True)
+    half = score * deviation
+    mean = cho_solve(factor, half)
+    value = 0.5 * half @ mean - np.log(np.diag(factor[0])).sum()
+    if len(active):
+        at = list(active)
+        spread = cho_solve(factor, np.eye(len(scaled))[:, at])[at].diagonal()
+        mean, spread = mean[at] * deviation[at], np.sqrt(spread) * deviation[at]
+        low, high = priors.low[at], priors.high[at]
+        value += (_log_mass(mean, spread, low, high) - _log_mass(np.zeros(len(at)), deviation[at], low, high)).sum()
+    return float(value)
+
+
+def additions(information: np.ndarray, score: np.ndarray, priors: Priors, active: list[int] | tuple[int, ...]) -> np.ndarray:
+    """Gain of log Z by naming one more effect, for each effect; -inf for those named already or not visible.
+
+    A change of one prior is a rank-one update, so all candidates and all draws cost one factorisation.
+
+    Args:
+        information: shape (K, K).
+        score: shape (K,) or (n, K).
+        priors: of the effects.
+        active: named already.
+
+    Returns:
+        Nats, of the score's shape.
+    """
+    sigma = covariance(information, priors.deviation(active))
+    mean, variance = score @ sigma, np.diag(sigma)
+    out = ~priors.visible
+    out[list(active)] = True
+    change = priors.slab**-2.0 - SPIKE**-2.0
+    left = np.where(out, 1.0, 1.0 + change * variance)
+    gain = -np.log(priors.slab / SPIKE) - 0.5 * np.log(left) - 0.5 * change * mean**2 / left
+    wide_mean, wide_sd = mean / left, np.sqrt(variance / left)
+    inside = _log_mass(wide_mean, wide_sd, priors.low, priors.high)
+    gain = gain + inside - _log_mass(np.zeros_like(priors.low), priors.slab, priors.low, priors.high)
+    return np.where(out, -np.inf, gain)
+
+
+def set_additions(
+    information: np.ndarray, score: np.ndarray, priors: Priors, active: list[int] | tuple[int, ...], sets: np.ndarray
+) -> np.ndarray:
+    """Gain of log Z by naming several more effects at once, for each of some sets of m: a change of m priors has rank m.
+
+    Args:
+        information: shape (K, K).
+        score: shape (K,).
+        priors: of the effects.
+        active: named already.
+        sets: effects that are not, shape (n, m).
+
+    Returns:
+        Nats, shape (n,).
+    """
+    sets = np.asarray(sets, dtype=int)
+    sigma = covariance(information, priors.deviation(active))
+    mean, diagonal = (score @ sigma)[sets], np.eye(sets.shape[1])
+    change = (priors.slab**-2.0 - SPIKE**-2.0)[sets]
+    own = sigma[sets[:, :, None], sets[:, None]]
+    taken = np.linalg.inv(own + diagonal / change[:, None])
+    wide_mean = mean - (own @ taken @ mean[..., None])[..., 0]
+    wide_sd = np.sqrt(np.maximum((own - own @ taken @ own).diagonal(axis1=1, axis2=2), 1e-300))
+    gain = -np.log(priors.slab / SPIKE)[sets].sum(1) - 0.5 * np.linalg.slogdet(diagonal + change[..., None] * own)[1]
+    gain -= 0.5 * np.einsum("pi,pij,pj->p", mean, taken, mean)
+    low, high, slab = priors.low[sets], priors.high[sets], priors.slab[sets]
+    return gain + (_log_mass(wide_mean, wide_sd, low, high) - _log_mass(np.zeros_like(low), slab, low, high)).sum(1)
+
+
+def pair_additions(information: np.ndarray, score: np.ndarray, priors: Priors, active: list[int] | tuple[int, ...]) -> np.ndarray:
+    """The same for each two effects: of two that hide each other, neither shows alone.
+
+    Returns:
+        Nats, shape (K, K), symmetric; -inf for those named already or not visible, and on the diagonal.
+    """
+    size = len(score)
+    first, second = np.divmod(np.arange(size * size), size)
+    gain = set_additions(information, score, priors, active, np.stack((first, second), axis=1))
+    out = ~priors.visible
+    out[list(active)] = True
+    gain[out[first] | out[second] | (first == second)] = -np.inf
+    return gain.reshape(size, size)
+
+
+def estimate(information: np.ndarray, score: np.ndarray, priors: Priors, active: list[int] | tuple[int, ...]) -> np.ndarray:
+    """Most probable sizes of the named effects within their bounds, all others at 0; in floors, shape (K,)."""
+    from scipy.optimize import lsq_linear
+
+    theta = np.zeros(len(score))
+    if len(active):
+        at = list(active)
+        normal = information[np.ix_(at, at)] + np.diag(priors.slab[at] ** -2.0)
+        factor = np.linalg.cholesky(normal)
+        right = np.linalg.solve(factor, score[at])
+        theta[at] = lsq_linear(factor.T, right, (priors.low[at], priors.high[at]), method="bvls").x
+    return theta
+
+
+def certainty(information: np.ndarray, theta: np.ndarray, priors: Priors, active: list[int] | tuple[int, ...]) -> np.ndarray:
+    """Sizes of named effects in the half widths of 95 % intervals to which half a floor is added, in the order of ``active``.
+
+    Above 1 it is more than what may go unnamed.
+    """
+    at = list(active)
+    spread = np.diag(covariance(information, priors.deviation(at)))[at]
+    return np.abs(theta[at]) / (NORMAL_95 * np.hypot(np.sqrt(spread), SPIKE))
+
+
+def null_draws(information: np.ndarray, draws: int, rng: np.random.Generator) -> np.ndarray:
+    """Scores of worlds in which nothing is wrong but what may go unnamed, every effect drawn from its spike, shape (draws, K)."""
+    values, vectors = np.linalg.eigh(information)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    unnamed = SPIKE * rng.standard_normal((draws, len(information)))
+    return rng.standard_normal((draws, len(information))) @ root.T + unnamed @ information
+
+
+def threshold(statistics: Statistics, priors: Priors, rng: np.random.Generator, draws: int = CALIBRATION_DRAWS) -> float:
+    """Nats that the best of all effects exceeds in half a per cent of null worlds, at least the log of their number, or 5.
+
+    The null worlds have these flights' information, noise as fitted, and of every effect what may go unnamed.
+    """
+    information = statistics.information.sum(0)
+    candidates = int(priors.visible.sum())
+    if not candidates:
+        raise DiagnoseError("none of the effects can be seen in the channels of these logs")
+    best = additions(information, null_draws(information, draws, rng), priors, ()).max(axis=1)
+    return float(max(np.quantile(best, CALIBRATION_QUANTILE), np.log(candidates), VERY_STRONG))

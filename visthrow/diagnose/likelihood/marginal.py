@@ -1,0 +1,420 @@
+"""From windows of residuals to what they say about the effects: information and score of every flight.
+
+Initial states b and latent forces a are integrated out. With U = [X, G], prior covariance P of (b, a) and sensor noise W^-1,
+
+    V = W^-1 + U P U',   V^-1 = W - W U (P^-1 + U'W U)^-1 U'W   (Woodbury)
+
+so a window of thousands of samples becomes a few inner products (:class:`Gram`), and a change of noise levels costs one small
+factorisation. The latent forces of one block and axis are an Ornstein-Uhlenbeck process at the knots; its Cholesky factor is
+multiplied into G once, after which P is diagonal.
+
+Effects are measured in floors throughout: theta = 1 is the size below which an effect does not matter.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.linalg import lapack
+
+from visthrow.common.errors import DiagnoseError
+from visthrow.diagnose.models.interface import LATENT_BLOCKS, Window
+
+TAIL = 6.0
+"""Degrees of freedom of the latent forces' scale mixture: from window to window their deviation varies by some 30 %, and a window
+in which something happened may have ten times as much at the price of 11 nats."""
+
+ROUNDING = 1e-10
+"""Relative growth of the normal equations' diagonal where they are positive definite but for rounding."""
+
+
+class There(NamedTuple):
+    """An array on a GPU, where it was calculated."""
+
+    values: Any  # torch.Tensor
+    of: np.ndarray  # the same on the host
+
+
+@dataclass(frozen=True)
+class Gram:
+    """Weighted inner products of one window's columns, by channel; D nuisances, L latents, K effects, P = D + L + K.
+
+    The columns stand in the order nuisances (times their prior deviation), latents, effects (times their floors).
+    """
+
+    flight: int
+    phase: str
+    count: np.ndarray  # samples of each of the model's C channels, shape (C,)
+    inner: np.ndarray  # Z' Z / sigma^2, shape (C, P, P)
+    cross: np.ndarray  # Z' r / sigma^2, shape (C, P)
+    square: np.ndarray  # r' r / sigma^2, shape (C,)
+    nuisances: int
+    latent_block: np.ndarray  # shape (L,)
+    factor: np.ndarray  # what stands between unit latents and knots: G_used = G @ factor, shape (L, L)
+    shown: Mapping[int, float]  # latent block -> median inner product of its columns with themselves
+    log_sigma: float = 0.0  # sum over all samples: grams whose outliers have other weights compare
+    there: There | None = None  # of an ``inner``, which may have been replaced since
+
+    @property
+    def placed(self) -> "There | np.ndarray":
+        """``inner``, with the same on a GPU where it was calculated there."""
+        return self.there if self.there is not None and self.there.of is self.inner else self.inner
+
+    @property
+    def latents(self) -> int:
+        """Number of latent-force coefficients."""
+        return len(self.latent_block)
+
+    @cached_property
+    def hidden(self) -> np.ndarray:
+        """``inner`` of nuisances and latents alone, a row a channel, shape (C, (D + L)^2)."""
+        size = self.nuisances + self.latents
+        return np.ascontiguousarray(self.inner[:, :size, :size]).reshape(len(self.inner), -1)
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Levels of sensor noise and latent forces."""
+
+    scale: np.ndarray  # of each channel's sigma, shape (C,)
+    latent_sd: Mapping[tuple[int, str], float]  # (block, phase) -> deviation [N, N m, N]
+    correlation_time: float  # of the latent forces [s]
+    share: np.ndarray  # latent deviation of each window and block in its phase's, shape (windows, 3)
+
+    def deviation(self, gram: Gram, window: int) -> np.ndarray:
+        """Prior deviation of the columns [X, G] of a window, shape (D + L,)."""
+        shared = np.array([self.latent_sd.get((b, gram.phase), 0.0) for b in range(len(LATENT_BLOCKS))])
+        by_block = shared * self.share[window]
+        return np.concatenate((np.ones(gram.nuisances), by_block[gram.latent_block]))
+
+    @property
+    def log_prior(self) -> float:
+        """Of the windows' shares: their squares follow an inverse gamma distribution; 0 where all are 1."""
+        square = self.share**2
+        return float(-0.5 * TAIL * (np.log(square) + 1.0 / square - 1.0).sum())
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """Everything that F flights say about K effects, in floors, about the linearisation point ``theta``."""
+
+    flights: np.ndarray  # their numbers, shape (F,)
+    information: np.ndarray  # S' V^-1 S, shape (F, K, K)
+    score: np.ndarray  # S' V^-1 r, shape (F, K)
+    square: np.ndarray  # r' V^-1 r + log det V, shape (F,)
+    samples: np.ndarray  # shape (F,)
+    theta: np.ndarray  # shape (K,)
+
+    @cached_property
+    def absolute(self) -> np.ndarray:
+        """Scores about theta = 0, shape (F, K)."""
+        return self.score + self.information @ self.theta
+
+    @cached_property
+    def absolute_square(self) -> np.ndarray:
+        """``square`` of the residuals extrapolated to theta = 0, shape (F,)."""
+        return self.square + 2.0 * self.score @ self.theta + (self.information @ self.theta) @ self.theta
+
+    def only(self, keep: np.ndarray) -> "Statistics":
+        """The same of some flights; ``keep`` is a mask or indices into ``flights``."""
+        return replace(self, flights=self.flights[keep], information=self.information[keep], score=self.score[keep],
+                       square=self.square[keep], samples=self.samples[keep])  # fmt: skip
+
+
+def columns(window: Window, floors: np.ndarray) -> np.ndarray:
+    """The columns [X, G, S] of a window as :class:`Gram` scales them, shape (N, P)."""
+    latent = window.latent if window.latent.size else np.zeros((len(window.residual), 0))
+    return np.hstack((window.nuisance * window.nuisance_sd, latent, window.effects * floors))
+
+
+def gram_of(window: Window, floors: np.ndarray, channels: int) -> Gram:
+    """Reduce a window to its inner products.
+
+    Args:
+        window: with finite residuals and derivatives.
+        floors: of the effects, shape (K,).
+        channels: number C of the model's channels.
+
+    Raises:
+        DiagnoseError: The window's arrays do not fit together, or hold NaN or infinity.
+    """
+    check(window, len(floors), channels)
+    return _inner_products(window, columns(window, floors), channels)
+
+
+def hidden_gram(window: Window, channels: int) -> Gram:
+    """The same of a window whose effects are not asked for.
+
+    Raises:
+        DiagnoseError: As :func:`gram_of`.
+    """
+    check(window, window.effects.shape[1], channels)
+    return _inner_products(window, columns(replace(window, effects=window.effects[:, :0]), np.zeros(0)), channels)
+
+
+def without_effects(gram: Gram) -> Gram:
+    """The same of nuisances and latents alone."""
+    size = gram.nuisances + gram.latents
+    if not isinstance(gram.placed, There):
+        return replace(gram, inner=gram.hidden.reshape(-1, size, size), cross=gram.cross[:, :size])
+    there = There(gram.placed.values[:, :size, :size], gram.inner[:, :size, :size])
+    return replace(gram, inner=there.of, cross=gram.cross[:, :size], there=there)
+
+
+def _inner_products(window: Window, z: np.ndarray, channels: int) -> Gram:
+    z /= window.sigma[:, None]
+    r = window.residual / window.sigma
+    inner = np.zeros((channels, z.shape[1], z.shape[1]))
+    cross, square = np.zeros((channels, z.shape[1])), np.zeros(channels)
+    for c in np.unique(window.channel):
+        rows = window.channel == c
+        own, left = z[rows], r[rows]
+        inner[c], cross[c], square[c] = own.T @ own, left @ own, left @ left
+    return gram_with(window, inner, cross, square)
+
+
+def gram_with(window: Window, inner: np.ndarray, cross: np.ndarray, square: np.ndarray) -> Gram:
+    """The gram of a window whose inner products are known, see :class:`Gram`; its latents are at the knots."""
+    count = np.bincount(window.channel, minlength=len(square)).astype(float)
+    blocks, states = np.asarray(window.latent_block, dtype=int), window.nuisance.shape[1]
+    return Gram(window.flight, window.phase, count, inner, cross, square, states, blocks, np.eye(len(blocks)),
+                _shown(inner, states, blocks), float(np.log(window.sigma).sum()))  # fmt: skip
+
+
+def _shown(inner: np.ndarray, begin: int, blocks: np.ndarray) -> dict[int, float]:
+    """See :class:`Gram`, with ``begin`` the first latent column."""
+    squares = np.diagonal(inner, axis1=1, axis2=2)[:, begin : begin + len(blocks)].sum(0)
+    return {int(block): float(np.median(squares[blocks == block])) for block in np.unique(blocks)}
+
+
+def check(window: Window, effects: int, channels: int) -> None:
+    """Refuse a window whose arrays do not fit together.
+
+    Raises:
+        DiagnoseError: They do not, or hold NaN or infinity.
+    """
+    n = len(window.residual)
+    where = f"window of flight {window.flight}, phase {window.phase}"
+    shapes = {"time": window.time.shape[:1], "channel": window.channel.shape, "sigma": window.sigma.shape,
+              "effects": window.effects.shape[:1], "nuisance": window.nuisance.shape[:1]}  # fmt: skip
+    wrong = {name: shape for name, shape in shapes.items() if shape != (n,)}
+    if wrong or window.effects.shape[1] != effects:
+        raise DiagnoseError(f"{where}: {n} residuals and {effects} effects, but {wrong or window.effects.shape}")
+    if n and (window.channel.max() >= channels or not np.all(window.sigma > 0.0)):
+        raise DiagnoseError(f"{where}: a channel index above {channels - 1}, or a sigma that is not above 0")
+    if not all(np.all(np.isfinite(a)) for a in (window.residual, window.effects, window.nuisance, window.latent)):
+        raise DiagnoseError(f"{where}: a residual or a derivative is not finite")
+
+
+def correlated(gram: Gram, window: Window, time: float) -> Gram:
+    """Multiply the Cholesky factor of Ornstein-Uhlenbeck latents into a Gram whose factor is still the identity.
+
+    Args:
+        gram: of the window.
+        window: for the knots.
+        time: correlation time [s]; latent forces at knots dt apart correlate by exp(-dt/time).
+    """
+    if not gram.latents:
+        return gram
+    own = knot_factor(window, time)
+    knots, groups = len(own), gram.latents // len(own)
+    part, (channels, size) = slice(gram.nuisances, gram.nuisances + gram.latents), gram.cross.shape
+    inner = gram.inner.copy()
+    inner[:, part] = (own.T @ inner[:, part].reshape(channels, groups, knots, size)).reshape(channels, -1, size)
+    inner[:, :, part] = (inner[:, :, part].reshape(-1, knots) @ own).reshape(channels, size, -1)
+    return correlated_with(gram, inner, own)
+
+
+def knot_factor(window: Window, time: float) -> np.ndarray:
+    """Cholesky factor of the latents of one group of a window, which is that of all others; see :func:`correlated`."""
+    group = window.latent_block.astype(int) * 3 + window.latent_axis.astype(int)
+    knots = _knots(group, window.latent_time)
+    lag = np.abs(window.latent_time[:knots, None] - window.latent_time[:knots])
+    alike = np.where(group[:knots, None] == group[:knots], np.exp(-lag / time), 0.0)
+    return np.linalg.cholesky(alike + 1e-9 * np.eye(knots))
+
+
+def correlated_with(gram: Gram, inner: np.ndarray, own: np.ndarray, there: There | None = None) -> Gram:
+    """The gram into which a factor of each group's knots was multiplied, with the inner products that came of it."""
+    part, cross = slice(gram.nuisances, gram.nuisances + gram.latents), gram.cross.copy()
+    cross[:, part] = (cross[:, part].reshape(-1, len(own)) @ own).reshape(len(cross), -1)
+    factor, shown = np.kron(np.eye(gram.latents // len(own)), own), _shown(inner, gram.nuisances, gram.latent_block)
+    return replace(gram, inner=inner, cross=cross, factor=factor, shown=shown, there=there)
+
+
+def _knots(group: np.ndarray, time: np.ndarray) -> int:
+    """Knots of groups that follow one another with the same ones each; where they do not, all latents are one."""
+    count = int(np.count_nonzero(group == group[0]))
+    if len(group) % count:
+        return len(group)
+    groups, times = group.reshape(-1, count), time.reshape(-1, count)
+    return count if np.all(groups == groups[:, :1]) and np.all(times == times[0]) else len(group)
+
+
+def with_residual(gram: Gram, window: Window, floors: np.ndarray, residual: np.ndarray) -> Gram:
+    """The same derivatives with the residuals of another size of the effects."""
+    weighted = np.zeros((len(residual), len(gram.count)))
+    weighted[np.arange(len(residual)), window.channel] = residual / window.sigma**2
+    by_state = (window.nuisance.T @ weighted).T * window.nuisance_sd
+    by_latent = (window.latent.T @ weighted).T @ gram.factor if gram.latents else np.zeros((len(gram.count), 0))
+    by_effect = (window.effects.T @ weighted).T * floors
+    square = np.bincount(window.channel, (residual / window.sigma) ** 2, len(gram.count))
+    return replace(gram, cross=np.hstack((by_state, by_latent, by_effect)), square=square)
+
+
+def left_of(window: Window, fit: np.ndarray) -> np.ndarray:
+    """What an initial state in prior deviations and latents at the knots, shape (D + L,), leave of the residual, shape (N,)."""
+    states = window.nuisance.shape[1]
+    left = window.residual - window.nuisance @ (window.nuisance_sd * fit[:states])
+    return left - window.latent @ fit[states:] if len(fit) > states else left
+
+
+def recorrelated(gram: Gram, raw: Gram) -> Gram:
+    """The residuals of a gram whose latents are at the knots, in one with the same derivatives whose latents are correlated."""
+    part, cross = slice(gram.nuisances, gram.nuisances + gram.latents), raw.cross.copy()
+    cross[:, part] = cross[:, part] @ gram.factor
+    return replace(gram, cross=cross, square=raw.square)
+
+
+def _factor(gram: Gram, noise: Noise, level: np.ndarray) -> tuple[np.ndarray, float]:
+    """Lower Cholesky factor of 1 + P^1/2 U' W U P^1/2, and log det V.
+
+    Raises:
+        DiagnoseError: The normal equations are not positive definite, which only broken derivatives can cause.
+    """
+    size = len(level)
+    normal = (noise.scale**-2.0 @ gram.hidden).reshape(size, size)
+    normal *= level[:, None]
+    normal *= level
+    normal.flat[:: size + 1] += 1.0
+    lower, failed = lapack.dpotrf(normal, lower=1, clean=1)
+    if failed and np.all(np.isfinite(normal)):
+        # Levels of many orders of magnitude, as a search for them may try, leave the identity below rounding.
+        normal.flat[:: size + 1] *= 1.0 + ROUNDING
+        lower, failed = lapack.dpotrf(normal, lower=1, clean=1)
+    if failed:
+        raise DiagnoseError(f"window of flight {gram.flight}, phase {gram.phase}: the normal equations are singular")
+    sensor = gram.log_sigma + gram.count @ np.log(noise.scale)
+    return lower, 2.0 * float(np.log(np.diag(lower)).sum() + sensor)
+
+
+@dataclass(frozen=True)
+class Share:
+    """One window's share of :class:`Statistics`."""
+
+    information: np.ndarray  # shape (K, K)
+    score: np.ndarray  # shape (K,)
+    square: float
+
+
+@dataclass(frozen=True)
+class WindowStatistics(Share):
+    """The same, and what the window says of its latent forces as if they were effects."""
+
+    latent_information: np.ndarray  # G' V^-1 G, shape (L, L)
+    latent_score: np.ndarray  # G' V^-1 r, shape (L,)
+    latent_effects: np.ndarray  # G' V^-1 S, shape (L, K)
+
+
+@dataclass(frozen=True)
+class Integral:
+    """What is left of the last J columns of a window when initial state and latent forces are integrated out; of no residual."""
+
+    information: np.ndarray  # shape (J, J)
+    half: np.ndarray  # L^-1 P^1/2 U' W times the columns, with L of the posterior's precision, shape (D + L, J)
+    factor: np.ndarray  # L
+    level: np.ndarray  # prior deviation of [X, G], shape (D + L,)
+    log_det: float  # of V
+
+    def share(self, gram: Gram, noise: Noise) -> Share:
+        """With the residuals of a gram of the same derivatives."""
+        weight = noise.scale**-2.0
+        cross, size = weight @ gram.cross, len(self.level)
+        along = np.ravel(lapack.dtrtrs(self.factor, self.level * cross[:size], lower=1)[0])
+        score = cross[len(cross) - len(self.information) :] - self.half.T @ along
+        return Share(self.information, score, float(weight @ gram.square - along @ along + self.log_det))
+
+
+def integral(gram: Gram, noise: Noise, window: int, first: int | None = None) -> Integral:
+    """Integrate initial state and latent forces out of one window's columns from ``first`` on; default: of its effects."""
+    level = noise.deviation(gram, window)
+    size = len(level)
+    begin = size if first is None else first
+    factor, log_det = _factor(gram, noise, level)
+    inner = np.tensordot(noise.scale**-2.0, gram.inner[:, :, begin:], 1)
+    half, _ = lapack.dtrtrs(factor, level[:, None] * inner[:size], lower=1)
+    reduced = inner[begin:] - half.T @ half
+    return Integral(0.5 * (reduced + reduced.T), half, factor, level, log_det)
+
+
+def window_statistics(gram: Gram, noise: Noise, window: int) -> WindowStatistics:
+    """Integrate initial state and latent forces out of one window."""
+    return statistics_of(integral(gram, noise, window, gram.nuisances), gram, noise)
+
+
+def statistics_of(whole: Integral, gram: Gram, noise: Noise) -> WindowStatistics:
+    """What the integral of a gram's latents and effects says with the gram's residuals."""
+    share, latents = whole.share(gram, noise), gram.latents
+    back = lapack.dtrtri(gram.factor, lower=1)[0] if latents else gram.factor  # from unit latents to knots
+    return WindowStatistics(
+        whole.information[latents:, latents:], share.score[latents:], share.square,
+        back.T @ whole.information[:latents, :latents] @ back, back.T @ share.score[:latents],
+        back.T @ whole.information[:latents, latents:],
+    )  # fmt: skip
+
+
+def gather(
+    grams: Sequence[Gram], parts: Sequence[Share], theta: np.ndarray, weights: Mapping[int, float] | None = None
+) -> Statistics:
+    """Add up windows by flight.
+
+    Args:
+        grams: of the windows.
+        parts: of the windows.
+        theta: linearisation point in floors, shape (K,).
+        weights: flight -> weight; flights not named count 1, flights of weight 0 are left out.
+
+    Raises:
+        DiagnoseError: No flight is left, or information came out negative beyond rounding.
+    """
+    weights = weights or {}
+    flights = [f for f in sorted({gram.flight for gram in grams}) if weights.get(f, 1.0) > 0.0]
+    if not flights:
+        raise DiagnoseError("no flight is left to look at")
+    size = len(theta)
+    information, score = np.zeros((len(flights), size, size)), np.zeros((len(flights), size))
+    square, samples = np.zeros(len(flights)), np.zeros(len(flights))
+    at = {flight: i for i, flight in enumerate(flights)}
+    for gram, part in zip(grams, parts):
+        if gram.flight in at:
+            i, w = at[gram.flight], weights.get(gram.flight, 1.0)
+            information[i] += w * part.information
+            score[i] += w * part.score
+            square[i] += w * part.square
+            samples[i] += w * gram.count.sum()
+    scale = 1.0 / np.sqrt(np.maximum(np.diagonal(information.sum(0)), 1e-300))
+    lowest = np.linalg.eigvalsh(information.sum(0) * np.outer(scale, scale)).min() if size else 0.0
+    if lowest < -1e-5:
+        raise DiagnoseError(f"information has the eigenvalue {lowest:.1e} relative to its diagonal; the derivatives are broken")
+    if lowest < 0.0:  # rounding, which wide priors of several named effects would turn into evidence
+        information += (-2.0 * lowest / len(flights)) * np.diag(scale**-2.0)
+    return Statistics(np.array(flights), information, score, square, samples, np.array(theta, dtype=float))
+
+
+def rescored(known: Statistics, grams: Sequence[Gram], parts: Sequence[Share], theta: np.ndarray) -> Statistics:
+    """What windows say with other residuals: their information stays.
+
+    Args:
+        known: of the same windows.
+        grams: of the windows.
+        parts: of the windows.
+        theta: linearisation point in floors, shape (K,).
+    """
+    row = {flight: i for i, flight in enumerate(known.flights.tolist())}
+    which = [row[gram.flight] for gram in grams]
+    score, square = np.zeros_like(known.score), np.zeros_like(known.square)
+    np.add.at(score, which, [part.score for part in parts])
+    np.add.at(square, which, [part.square for part in parts])
+    return replace(known, score=score, square=square, theta=np.array(theta, dtype=float))

@@ -1,0 +1,350 @@
+"""Noise levels: sensor noise from differences of neighbours, latent forces from the likelihood of all windows.
+
+A pure fit of everything by maximum likelihood is pulled away by one bad window; hence three guards, each tested by a planted
+fault: single samples far outside lose weight (Huber), a window's latent forces may be stronger or weaker than its phase's (their
+variance has an inverse gamma prior about it, so that the forces have Student's heavy tails), and every level is bounded.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import lapack
+
+from visthrow.diagnose.likelihood import designs
+from visthrow.diagnose.likelihood.marginal import (
+    TAIL,
+    Gram,
+    Noise,
+    hidden_gram,
+    without_effects,
+)
+from visthrow.diagnose.likelihood.stack import Stack
+from visthrow.diagnose.likelihood.threads import each
+from visthrow.diagnose.models.interface import LATENT_BLOCKS, Window
+
+MAD_TO_SIGMA = 1.4826
+THIRD_DIFFERENCE = np.sqrt(20.0)
+"""Deviation of a third difference of white noise, in sigmas: the root of 1 + 9 + 9 + 1."""
+
+CORRELATION_TIMES = (0.15, 0.3, 0.6, 1.2, 2.4)
+"""Of latent forces [s]: from one knot to longer than a window, the candidates of :func:`fit`."""
+
+SCALE_BOUNDS = (0.3, 10.0)
+"""Of a channel's sigma against what the model said."""
+
+LEVEL_LOW, LEVEL_HIGH = 1e-2, 1e4
+"""Latent deviations, in the level at which they become visible. A hundredth of it is as good as none: thousands of knots
+together do not show it, and far below it slopes are lost in rounding."""
+
+HUBER = 6.0
+"""Sigmas from which a sample loses weight."""
+
+HUBER_SHARE = 0.02
+"""More samples than this beyond ``HUBER`` are no outliers but a misfit, which must stay visible."""
+
+SHARE_BOUNDS = (0.1, 1e3)
+"""Latent deviation of a window, in its phase's."""
+
+PRIOR_CURVATURE = (0.05, 2.0)
+"""Limits of the prior's curvature by the logarithm of a window's share, in that at 1: it falls where windows stand far out."""
+
+CLEANINGS = 4
+"""Rounds in which outliers lose weight."""
+
+WIDE = 30.0
+"""Latent forces while outliers are looked for, in the level at which they become visible."""
+
+ITERATIONS = 40
+ENOUGH_NATS, ROUGHLY_NATS = 0.02, 1.0
+"""A step that promises or brings less ends the search for the levels; while correlation times are compared."""
+LONGEST_FALL = 1.0
+"""Of the logarithm of a level in one step: its variance may be predicted to fall below 0."""
+HALVINGS = 8
+ALIGNED, LONGEST_SERIES = 0.9, 0.9
+"""Cosine of two steps that follow one line, and the most by which the second may be as long as the first."""
+STALLED = 1e-9
+"""Of the step: limits and levels count as met within this."""
+
+
+def highpass_sigma(values: np.ndarray) -> np.ndarray:
+    """Standard deviation of white sensor noise on a smooth signal, unmoved by outliers.
+
+    Third differences remove motion up to second order within four samples; their median absolute deviation is scaled to a
+    normal distribution's sigma.
+
+    Args:
+        values: evenly sampled, shape (T,) or (T, D), T >= 4.
+
+    Returns:
+        Sigma in the values' unit, shape () or (D,).
+
+    Source: diagnosis by high-pass differences; Rousseeuw and Croux 1993 for the median absolute deviation.
+    """
+    third = np.diff(np.asarray(values, dtype=float), n=3, axis=0)
+    return MAD_TO_SIGMA * np.median(np.abs(third - np.median(third, axis=0)), axis=0) / THIRD_DIFFERENCE
+
+
+def fit(
+    windows: Sequence[Window], grams: Sequence[Gram], start: Noise | None = None, device: str = "cpu"
+) -> tuple[Noise, list[Gram]]:
+    """Estimate sensor scales, latent deviations by block and phase, and their correlation time.
+
+    Args:
+        windows: for the knots of the latent forces.
+        grams: of the windows, with ``factor`` the identity.
+        start: an earlier estimate: its correlation time is kept, its levels are where the search starts.
+        device: where to calculate.
+
+    Returns:
+        The levels, and the grams with correlated latent forces that belong to them.
+    """
+    noise, time = start, CORRELATION_TIMES[0] if start is None else start.correlation_time
+    if start is None and any(gram.latents for gram in grams):
+        noise = _likeliest(windows, grams, device)
+        time = noise.correlation_time
+    shaped = designs.correlated_of(grams, windows, time, device)
+    begin = replace(noise or _first_guess(shaped), correlation_time=time)
+    return _maximise(shaped, begin, device)[0], shaped
+
+
+def _likeliest(windows: Sequence[Window], grams: Sequence[Gram], device: str) -> Noise:
+    """Rough levels with the likeliest correlation time: from the middle uphill, for the likelihood has one maximum over it."""
+    bare, found = [without_effects(gram) for gram in grams], {}
+
+    def likely(i: int, noise: Noise | None) -> float:
+        if i not in found:
+            shaped = designs.correlated_of(bare, windows, CORRELATION_TIMES[i], device)
+            begin = replace(noise or _first_guess(shaped), correlation_time=CORRELATION_TIMES[i])
+            found[i] = _maximise(shaped, begin, device, ROUGHLY_NATS)
+        return found[i][1]
+
+    best = len(CORRELATION_TIMES) // 2
+    likely(best, None)
+    for way in (-1, 1):
+        while 0 <= best + way < len(CORRELATION_TIMES) and likely(best + way, found[best][0]) > found[best][1]:
+            best += way
+    return found[best][0]
+
+
+def refit(grams: Sequence[Gram], start: Noise, device: str = "cpu") -> Noise:
+    """Estimate the levels anew, with the correlation time that the grams have been given.
+
+    Args:
+        grams: of the windows, with correlated latent forces.
+        start: where the search starts.
+        device: where to calculate.
+    """
+    return _maximise(grams, start, device)[0]
+
+
+def only(noise: Noise, grams: Sequence[Gram], windows: Sequence[int]) -> Noise:
+    """The levels as they concern some of the windows, whose ``grams`` these are."""
+    levels = {key: noise.latent_sd[key] for key in _first_guess(grams).latent_sd}
+    return replace(noise, share=noise.share[list(windows)], latent_sd=levels)
+
+
+def _first_guess(grams: Sequence[Gram]) -> Noise:
+    """Sensor noise as stated, latent forces where they just become visible."""
+    scale = np.ones(len(grams[0].count))
+    visible: dict[tuple[int, str], list[float]] = {}
+    for gram in grams:
+        for block, seen in gram.shown.items():
+            if seen > 0.0:  # else these forces show nowhere in the window
+                visible.setdefault((block, gram.phase), []).append(1.0 / np.sqrt(seen))
+    return Noise(scale, {key: float(np.median(v)) for key, v in visible.items()}, CORRELATION_TIMES[0],
+                 np.ones((len(grams), len(LATENT_BLOCKS))))  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """Where each level stands among the parameters of the search: phases' levels, windows' shares of them, sensor scales."""
+
+    keys: list[tuple[int, str]]  # (block, phase)
+    pairs: np.ndarray  # (window, block) of each share, shape (S, 2)
+    seen: np.ndarray  # channels with samples
+    slopes: np.ndarray  # of each entry of the windows' own gradients that counts: its place there, and its parameter, shape (2, E)
+    curvatures: np.ndarray  # the same of their own curvatures, and pairs of parameters
+
+    @staticmethod
+    def of(grams: Sequence[Gram], noise: Noise) -> "_Layout":
+        """Number the parameters."""
+        keys, blocks = sorted(noise.latent_sd), len(LATENT_BLOCKS)
+        index = {key: i for i, key in enumerate(keys)}
+        present = [[b for b in range(blocks) if (b, gram.phase) in index and np.any(gram.latent_block == b)] for gram in grams]
+        pairs = np.array([(w, b) for w, own in enumerate(present) for b in own], dtype=int).reshape(-1, 2)
+        seen = np.flatnonzero(sum(gram.count for gram in grams) > 0)
+        first = len(keys) + len(pairs)
+        size, width, at = first + len(seen), blocks + len(grams[0].count), len(keys)
+        slopes, curvatures = [], []
+        for w, (gram, own) in enumerate(zip(grams, present)):
+            shared = [index[b, gram.phase] for b in own]
+            to = np.array([*shared, *range(at, at + len(own)), *range(first, size)], dtype=int)
+            part = np.array([*own, *own, *(blocks + seen)], dtype=int)  # levels and shares of the blocks, scales
+            slopes.append((w * width + part, to))
+            curvatures.append([(w * width * width + np.add.outer(width * part, part)).ravel(), np.add.outer(size * to, to).ravel()])
+            at += len(own)
+        return _Layout(keys, pairs, seen, np.hstack(slopes), np.hstack(curvatures))
+
+    def pack(self, noise: Noise) -> np.ndarray:
+        """Logarithms of all levels, shape (P,)."""
+        shared = [noise.latent_sd[key] for key in self.keys]
+        return np.log(np.concatenate((shared, noise.share[tuple(self.pairs.T)], noise.scale[self.seen])))
+
+    def unpack(self, x: np.ndarray, noise: Noise) -> Noise:
+        """The levels; ``noise`` tells all others."""
+        first, last = len(self.keys), len(self.keys) + len(self.pairs)
+        share, scale = noise.share.copy(), noise.scale.copy()
+        share[tuple(self.pairs.T)], scale[self.seen] = np.exp(x[first:last]), np.exp(x[last:])
+        return replace(noise, scale=scale, share=share, latent_sd=dict(zip(self.keys, np.exp(x[:first]).tolist())))
+
+    def limits(self, grams: Sequence[Gram]) -> tuple[np.ndarray, np.ndarray]:
+        """Lowest and highest values of the parameters."""
+        guess = _first_guess(grams).latent_sd
+        visible = np.log([guess[key] for key in self.keys])
+        sizes = len(self.pairs), len(self.seen)
+        bounds = ((np.log(low) + visible, np.full(sizes[0], np.log(share)), np.full(sizes[1], np.log(scale)))
+                  for low, share, scale in zip((LEVEL_LOW, LEVEL_HIGH), SHARE_BOUNDS, SCALE_BOUNDS))  # fmt: skip
+        low, high = map(np.concatenate, bounds)
+        return low, high
+
+
+def _maximise(grams: Sequence[Gram], noise: Noise, device: str, enough: float = ENOUGH_NATS) -> tuple[Noise, float]:
+    """Most probable logarithms of all levels, with exact gradients and explicit limits.
+
+    By Fisher scoring: the expected curvature costs nothing beside the gradient, and a few looks at all windows suffice.
+
+    Args:
+        grams: of the windows.
+        noise: where the search starts.
+        device: where to calculate.
+        enough: nats below which a step ends it.
+    """
+    layout, stack = _Layout.of(grams, noise), Stack(grams, device)
+    low, high = layout.limits(grams)
+    x = np.clip(layout.pack(noise), low, high)
+
+    def look(x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+        return _likelihood(stack, layout.unpack(x, noise), layout)
+
+    value, slope, curvature = look(x)
+    last = np.zeros_like(x)
+    for _ in range(ITERATIONS):
+        plain, promised = _scoring_step(x, slope, curvature, low, high)
+        if promised < enough:
+            break
+        step, last = np.clip(x + _stride(plain, last) * plain, low, high) - x, plain
+        for _ in range(HALVINGS):
+            tried, its_slope, expected = look(x + step)
+            if tried > value:
+                break
+            step = step / 3.0
+        else:
+            break
+        gained, x, value, slope, curvature = tried - value, x + step, tried, its_slope, expected
+        if gained < enough:
+            break
+    return layout.unpack(x, noise), value
+
+
+def _stride(step: np.ndarray, last: np.ndarray) -> float:
+    """By how much to lengthen a step that repeats the last one, shortened: such steps shrink like a geometric series (Aitken)."""
+    square = last @ last
+    if square == 0.0:
+        return 1.0
+    ratio = float(step @ last / square)
+    alike = ratio * np.sqrt(square) > ALIGNED * np.linalg.norm(step)
+    return 1.0 / (1.0 - min(ratio, LONGEST_SERIES)) if alike and ratio > 0.0 else 1.0
+
+
+def _scoring_step(
+    x: np.ndarray, slope: np.ndarray, curvature: np.ndarray, low: np.ndarray, high: np.ndarray
+) -> tuple[np.ndarray, float]:
+    """Fisher's step of the variances within the limits, as logarithms of levels, and the nats that it promises.
+
+    What a limit holds back stays there, and the others move without it. A variance far too small shows in no likelihood's
+    logarithm, but its own step is finite.
+    """
+    known = np.diag(curvature)
+    free = (known > 0.0) & ~((x <= low + STALLED) & (slope < 0.0)) & ~((x >= high - STALLED) & (slope > 0.0))
+    step = np.zeros_like(x)
+    if not np.any(free):
+        return step, 0.0
+    size = np.sqrt(known[free])
+    part = curvature[np.ix_(free, free)]
+    part /= size[:, None]
+    part /= size
+    part.flat[:: len(part) + 1] += 1e-6
+    _, found, indefinite = lapack.dposv(part, slope[free] / size, lower=1)
+    step[free] = (np.linalg.solve(part, slope[free] / size) if indefinite else found) / size
+    promised = float(slope @ step)
+    step = np.where(step > 0.0, 0.5 * np.log1p(2.0 * np.maximum(step, 0.0)), np.maximum(step, -LONGEST_FALL))
+    return np.clip(x + step, low, high) - x, promised
+
+
+def _likelihood(stack: Stack, noise: Noise, layout: _Layout) -> tuple[float, np.ndarray, np.ndarray]:
+    """Log-likelihood with the prior of the windows' shares, its gradient by the parameters, and its expected curvature."""
+    size = len(layout.keys) + len(layout.pairs) + len(layout.seen)
+    value, slope, curvature = noise.log_prior, np.zeros(size), np.zeros((size, size))
+    own = np.arange(len(layout.keys), len(layout.keys) + len(layout.pairs))
+    inverse = noise.share[tuple(layout.pairs.T)] ** -2.0
+    slope[own] = TAIL * (inverse - 1.0)
+    curvature[own, own] = 2.0 * TAIL * np.clip(inverse, *PRIOR_CURVATURE)
+    values, slopes, curvatures = stack.look(noise)
+    (own, to), (both, pair) = layout.slopes, layout.curvatures
+    slope += np.bincount(to, slopes.ravel()[own], size)
+    curvature += np.bincount(pair, curvatures.ravel()[both], size * size).reshape(size, size)
+    return value + float(values.sum()), slope, curvature
+
+
+def without_outliers(windows: Sequence[Window], grams: Sequence[Gram], floors: np.ndarray, device: str = "cpu") -> list[Window]:
+    """Give single samples far outside a sigma that puts them at HUBER; windows with none are returned as they are.
+
+    Latent forces have a wide prior here, so that a missing effect is followed and only what no force can do stands out.
+
+    Args:
+        windows: of the flights.
+        grams: of the windows, with ``factor`` the identity.
+        floors: of the effects, shape (K,).
+        device: where to calculate.
+    """
+    sigmas = [window.sigma for window in windows]
+    left, given, bare = list(range(len(windows))), list(windows), [without_effects(gram) for gram in grams]
+    for again in range(CLEANINGS):
+        where = "cpu" if again else device  # few are looked at once more
+        residuals = designs.left_by(given, floors, len(grams[0].count), _widely_fitted(given, bare, where), where)
+        far = {w: _far(windows[w], residual) for w, residual in zip(left, residuals)}
+        left = [w for w in left if np.any(far[w] > 1.0)]
+        if not left:
+            break
+        for w in left:
+            sigmas[w] = windows[w].sigma * np.maximum(far[w], 1.0)
+        given = [replace(windows[w], sigma=sigmas[w]) for w in left]
+        bare = each(lambda window: hidden_gram(window, len(grams[0].count)), given)
+    return [_mended(window, sigma) for window, sigma in zip(windows, sigmas)]
+
+
+def _widely_fitted(windows: Sequence[Window], bare: Sequence[Gram], device: str) -> list[np.ndarray]:
+    """Initial states in prior deviations and latents at the knots that explain most, with wide priors of the latents."""
+    time = CORRELATION_TIMES[0]
+    shaped = designs.correlated_of(bare, windows, time, device)
+    share = np.zeros((len(bare), len(LATENT_BLOCKS)))
+    for row, gram in zip(share, bare):
+        for (block, _), level in _first_guess([gram]).latent_sd.items():
+            row[block] = WIDE * level
+    levels = {(block, gram.phase): 1.0 for gram in bare for block in gram.shown}
+    fits = Stack(shaped, device).fitted(Noise(np.ones(len(bare[0].count)), levels, time, share))
+    for fit, gram in zip(fits, shaped):
+        fit[gram.nuisances :] = gram.factor @ fit[gram.nuisances :]
+    return fits
+
+
+def _far(window: Window, left: np.ndarray) -> np.ndarray:
+    """How far samples are outside, in that which is far, shape (N,)."""
+    normal = np.abs(left) / window.sigma
+    return normal / (HUBER * np.maximum(1.0, MAD_TO_SIGMA * np.median(normal)))
+
+
+def _mended(window: Window, sigma: np.ndarray) -> Window:
+    """The window with other sigmas, where these differ in a few samples."""
+    return replace(window, sigma=sigma) if 0.0 < (sigma > window.sigma).mean() <= HUBER_SHARE else window

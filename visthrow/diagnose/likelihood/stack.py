@@ -1,0 +1,391 @@
+"""Windows side by side: what noise levels are worth in all of them at once, on the CPU's cores or where the simulation runs.
+
+The same algebra as :mod:`visthrow.diagnose.likelihood.marginal`, for grams that are padded to one size: on a GPU in one batch, on a CPU in
+batches that fit its cache.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import TypeVar
+
+import numpy as np
+import torch
+
+from visthrow.common.errors import DiagnoseError
+from visthrow.diagnose.likelihood.designs import Same, padded
+from visthrow.diagnose.likelihood.marginal import (
+    ROUNDING,
+    Gram,
+    Integral,
+    Noise,
+    Share,
+    Statistics,
+    There,
+    WindowStatistics,
+    integral,
+    statistics_of,
+    window_statistics,
+)
+from visthrow.diagnose.likelihood.threads import each
+from visthrow.diagnose.likelihood.transfer import all_to_host
+from visthrow.diagnose.models.interface import LATENT_BLOCKS
+
+T = TypeVar("T")
+
+BATCH = 8  # windows of a batch on the CPU
+BLOCKS = len(LATENT_BLOCKS)
+
+
+class _Columns:
+    """Inner products of the columns of W windows, n hidden ones [X, G] at most, K effects; padded columns are 0."""
+
+    def __init__(self, inner: Sequence[There | np.ndarray], sizes: Sequence[int], device: str):
+        """Keep them.
+
+        Args:
+            inner: of each window, shape (C, P, P).
+            sizes: of each window, its hidden columns.
+            device: where to calculate.
+        """
+        self._inner, self._sizes, self._device = inner, sizes, device
+        whole = inner[0].of if isinstance(inner[0], There) else inner[0]
+        self._channels, self._effects = len(whole), whole.shape[1] - sizes[0]
+
+    @cached_property
+    def hidden(self) -> torch.Tensor:
+        """Shape (W, C, n, n)."""
+        n = max(self._sizes)
+        return self._moved(n, n, lambda inner, w: inner[:, : self._sizes[w], : self._sizes[w]])
+
+    @cached_property
+    def beside(self) -> torch.Tensor:
+        """Hidden columns with effects, shape (W, C, n, K)."""
+        return self._moved(max(self._sizes), self._effects, lambda inner, w: inner[:, : self._sizes[w], self._sizes[w] :])
+
+    @cached_property
+    def own(self) -> torch.Tensor:
+        """Shape (W, C, K, K)."""
+        return self._moved(self._effects, self._effects, lambda inner, w: inner[:, self._sizes[w] :, self._sizes[w] :])
+
+    def _moved(self, height: int, width: int, part: Callable[[T, int], T]) -> torch.Tensor:
+        return padded(self._inner, part, (self._channels, height, width), self._device)
+
+
+@lru_cache(maxsize=2)
+def _kept(inner: Same, sizes: tuple[int, ...], device: str) -> _Columns:
+    """Those that a GPU has already: residuals and noise levels change far more often than derivatives do."""
+    return _Columns(inner, sizes, device)
+
+
+@dataclass(frozen=True)
+class _Batch:
+    """W windows, of n columns [X, G] at most; padded columns are 0."""
+
+    windows: np.ndarray  # rows of the noise's shares, shape (W,)
+    phases: tuple[list[str], np.ndarray]  # that occur, and each window's among them
+    grams: list[Gram]
+    columns: _Columns
+    cross: torch.Tensor  # shape (W, C, n)
+    square: torch.Tensor  # shape (W, C)
+    count: torch.Tensor  # shape (W, C)
+    log_sigma: torch.Tensor  # shape (W,)
+    member: torch.Tensor  # 1 where a column is of a block, shape (W, n, B)
+    known: torch.Tensor  # 1 where it is one of the initial state, shape (W, n)
+
+
+@dataclass(frozen=True)
+class _Solved:
+    """A batch at some noise levels."""
+
+    weight: torch.Tensor  # of the channels, shape (C,)
+    level: torch.Tensor  # prior deviation of the columns, shape (W, n)
+    factor: torch.Tensor  # lower Cholesky factor of 1 + P^1/2 U' W U P^1/2, shape (W, n, n)
+    mean: torch.Tensor  # of [b, a] in prior deviations, shape (W, n)
+    log_det: torch.Tensor  # of V, shape (W,)
+    value: torch.Tensor  # log-likelihood of the residuals, but for the powers of 2 pi, shape (W,)
+
+
+class Integrals(Sequence[Integral]):
+    """What windows say of their effects, whatever their residuals are.
+
+    Attributes:
+        gathered: by flights with some residuals, once it was asked for.
+    """
+
+    gathered: Statistics | None = None
+
+    def __init__(self, of_windows: Sequence[Integral]):
+        """Keep those of some windows."""
+        self._of_windows = of_windows
+
+    def __len__(self) -> int:
+        """Number of windows."""
+        return len(self._of_windows)
+
+    def __getitem__(self, window):
+        """That of a window."""
+        return self._of_windows[window]
+
+    @property
+    def log_dets(self) -> list[float]:
+        """Of each window's V."""
+        return [known.log_det for known in self]
+
+    def shares(self, grams: Sequence[Gram], noise: Noise) -> list[Share]:
+        """With the residuals of grams of the same derivatives; ``noise`` is what they were integrated with."""
+        return [known.share(gram, noise) for known, gram in zip(self, grams)]
+
+
+def integrals(grams: Sequence[Gram], noise: Noise, device: str) -> Integrals:
+    """Integrate initial states and latent forces out of windows: side by side on a GPU; on a CPU copies would cost more."""
+    if device == "cpu":
+        return Integrals(each(lambda w: integral(grams[w], noise, w), range(len(grams))))
+    return Stack(grams, device).integrals(noise)
+
+
+def statistics(grams: Sequence[Gram], noise: Noise, device: str) -> list[WindowStatistics]:
+    """The same, and what the windows say of their latent forces as if they were effects."""
+    if device == "cpu":
+        return each(lambda w: window_statistics(grams[w], noise, w), range(len(grams)))
+    return each(lambda pair: statistics_of(*pair, noise), zip(Stack(grams, device).integrals(noise, latents=True), grams))
+
+
+class Stack:
+    """Some windows' inner products of initial states and latent forces."""
+
+    def __init__(self, grams: Sequence[Gram], device: str = "cpu", windows: Sequence[int] | None = None):
+        """Pad and move.
+
+        Args:
+            grams: of the windows, with or without effects.
+            device: where to calculate.
+            windows: of each gram, the row of the noise's shares; default: their order.
+        """
+        rows = np.arange(len(grams)) if windows is None else np.asarray(windows, dtype=int)
+        self.device, size = device, BATCH if device == "cpu" else max(len(grams), 1)
+        self._sizes = [gram.nuisances + gram.latents for gram in grams]
+        order = sorted(range(len(grams)), key=self._sizes.__getitem__)
+        self._order = [order[first : first + size] for first in range(0, len(order), size)]
+        self._batches = each(lambda own: self._padded([grams[w] for w in own], rows[own]), self._order)
+        self._count = len(grams)
+
+    def _padded(self, grams: Sequence[Gram], windows: np.ndarray) -> _Batch:
+        sizes = [gram.nuisances + gram.latents for gram in grams]
+        count, channels, n = len(grams), len(grams[0].count), max(sizes)
+        cross = np.zeros((count, channels, n))
+        member, known = np.zeros((count, n, BLOCKS)), np.zeros((count, n))
+        for w, (gram, size) in enumerate(zip(grams, sizes)):
+            cross[w, :, :size] = gram.cross[:, :size]
+            member[w, np.arange(gram.nuisances, size), gram.latent_block] = 1.0
+            known[w, : gram.nuisances] = 1.0
+        square, counts = (np.stack([getattr(gram, name) for gram in grams]) for name in ("square", "count"))
+        log_sigma = np.array([gram.log_sigma for gram in grams])
+        arrays = [torch.from_numpy(a).to(self.device) for a in (cross, square, counts, log_sigma, member, known)]
+        inner = [gram.placed for gram in grams]
+        columns = _Columns(inner, sizes, self.device) if self.device == "cpu" else _kept(Same(inner), tuple(sizes), self.device)
+        phases, phase = np.unique([gram.phase for gram in grams], return_inverse=True)
+        return _Batch(windows, (phases.tolist(), phase), list(grams), columns, *arrays)
+
+    def values(self, noise: Noise) -> np.ndarray:
+        """Log-likelihood of each window's residuals, but for the powers of 2 pi, shape (W,).
+
+        Raises:
+            DiagnoseError: The normal equations are not positive definite, which only broken derivatives can cause.
+        """
+        return self._in_order([part for (part,) in self._each(lambda batch: (_solved(batch, noise).value,))])
+
+    def fitted(self, noise: Noise) -> list[np.ndarray]:
+        """Most probable initial state and unit latent forces of each window, shape (D + L,).
+
+        Raises:
+            DiagnoseError: As :meth:`values`.
+        """
+
+        def found(batch: _Batch) -> tuple[torch.Tensor]:
+            at = _solved(batch, noise)
+            return (at.level * at.mean,)
+
+        by_window = {w: row for own, (rows,) in zip(self._order, self._each(found)) for w, row in zip(own, rows)}
+        return [by_window[w][:size] for w, size in enumerate(self._sizes)]
+
+    def look(self, noise: Noise) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Log-likelihood, its gradient and expected curvature by the logarithms of the windows' own levels.
+
+        Args:
+            noise: levels.
+
+        Returns:
+            Values (W,); gradients (W, B + C) by the B blocks' deviations and the C channels' scales; curvatures (W, B + C, B + C).
+            What the scales share with the fitted columns is given to the channels by their part in them.
+
+        Raises:
+            DiagnoseError: As :meth:`values`.
+        """
+        found = self._each(lambda batch: _curved(batch, _solved(batch, noise)))
+        return tuple(self._in_order([part[i] for part in found]) for i in range(3))
+
+    def integrals(self, noise: Noise, *, latents: bool = False) -> Integrals:
+        """What is left of the effects' columns of each window, or of those of latent forces and effects.
+
+        See :func:`visthrow.diagnose.likelihood.marginal.integral`.
+
+        Raises:
+            DiagnoseError: As :meth:`values`.
+        """
+        return _Resident(self._order, each(lambda batch: _integrated(batch, noise, latents), self._batches))
+
+    def _each(self, function) -> list[tuple[np.ndarray, ...]]:
+        return each(lambda batch: tuple(all_to_host(function(batch))), self._batches)
+
+    def _in_order(self, parts: Sequence[np.ndarray]) -> np.ndarray:
+        out = np.empty((self._count, *parts[0].shape[1:])) if parts else np.empty(0)
+        for own, part in zip(self._order, parts):
+            out[own] = part
+        return out
+
+
+def _solved(batch: _Batch, noise: Noise) -> _Solved:
+    phases, phase = batch.phases
+    shared = np.array([[noise.latent_sd.get((b, name), 0.0) for b in range(BLOCKS)] for name in phases])
+    by_block = batch.square.new_tensor(shared[phase] * noise.share[batch.windows])
+    level = batch.known + (batch.member @ by_block[:, :, None])[..., 0]
+    scale = batch.square.new_tensor(noise.scale)
+    weight = scale**-2.0
+    normal = _weighed(weight, batch.columns.hidden)
+    normal *= level[:, :, None]
+    normal *= level[:, None]
+    normal.diagonal(dim1=1, dim2=2).add_(1.0)
+    factor, failed = torch.linalg.cholesky_ex(normal)
+    if torch.any(failed):
+        # Levels of many orders of magnitude, as a search for them may try, leave the identity below rounding.
+        normal.diagonal(dim1=1, dim2=2).mul_(1.0 + ROUNDING * (failed[:, None] > 0))
+        factor, failed = torch.linalg.cholesky_ex(normal)
+        if torch.any(failed):
+            w = int(torch.nonzero(failed)[0, 0])
+            where = f"window of flight {batch.grams[w].flight}, phase {batch.grams[w].phase}"
+            raise DiagnoseError(f"{where}: the normal equations are singular")
+    right = level * (weight @ batch.cross)
+    mean = torch.cholesky_solve(right[:, :, None], factor)[..., 0]
+    log_det = 2.0 * (factor.diagonal(dim1=1, dim2=2).log().sum(-1) + batch.log_sigma + batch.count @ scale.log())
+    value = -0.5 * (batch.square @ weight - (right * mean).sum(-1) + log_det)
+    return _Solved(weight, level, factor, mean, log_det, value)
+
+
+def _weighed(weight: torch.Tensor, inner: torch.Tensor) -> torch.Tensor:
+    """Sum over the channels, shape (W, i, j)."""
+    count, channels, *shape = inner.shape
+    return (weight @ inner.reshape(count, channels, -1)).reshape(count, *shape)
+
+
+def _curved(batch: _Batch, at: _Solved) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Value, gradient and curvature by [blocks, scales]."""
+    covariance = torch.cholesky_inverse(at.factor)
+    variance, (count, channels) = covariance.diagonal(dim1=1, dim2=2), batch.count.shape
+    in_blocks = batch.member.transpose(1, 2)
+    by_block = (in_blocks @ (variance + at.mean**2 - 1.0)[:, :, None])[..., 0]
+    moved = at.level * at.mean
+    scaled = covariance * at.level[:, :, None] * at.level[:, None]
+    hidden = batch.columns.hidden
+    spread = (hidden * scaled[:, None]).sum((2, 3))  # as products of matrices they take ten times as long on a GPU
+    bent = ((hidden @ moved[:, None, :, None])[..., 0] * moved[:, None]).sum(-1)
+    left = batch.square - 2.0 * (batch.cross @ moved[:, :, None])[..., 0] + bent + spread
+    # Degrees of freedom that the columns take from each channel; rounding of huge derivatives is kept from taking others.
+    taken = torch.minimum(torch.clamp(at.weight * spread, min=0.0), batch.count)
+    squared = covariance**2
+    shared = (in_blocks @ (variance - squared.sum(-1))[:, :, None])[..., 0]
+    squared.diagonal(dim1=1, dim2=2).copy_((1.0 - variance) ** 2)
+    curvature = at.level.new_zeros(count, BLOCKS + channels, BLOCKS + channels)
+    curvature[:, :BLOCKS, :BLOCKS] = 2.0 * in_blocks @ squared @ batch.member
+    mixed = 2.0 * shared[:, :, None] * (taken / torch.clamp(taken.sum(-1, keepdim=True), min=1e-300))[:, None]
+    curvature[:, :BLOCKS, BLOCKS:] = mixed
+    curvature[:, BLOCKS:, :BLOCKS] = mixed.transpose(1, 2)
+    curvature[:, BLOCKS:, BLOCKS:].diagonal(dim1=1, dim2=2).copy_(2.0 * torch.clamp(batch.count - taken, min=0.0))
+    return at.value, torch.cat((by_block, left * at.weight - batch.count), -1), curvature
+
+
+@dataclass(frozen=True)
+class _Integrated:
+    """What is left of the last J columns of a batch."""
+
+    batch: _Batch
+    left: list[np.ndarray]  # which of the J columns are a window's own
+    at: _Solved
+    half: torch.Tensor  # as :class:`Integral` has it, shape (W, n, J)
+    information: list[np.ndarray]  # of each window
+
+    def of_windows(self) -> list[Integral]:
+        """Each window's, without what pads it."""
+        arrays = all_to_host((self.half, self.at.factor, self.at.level, self.at.log_det))
+        found = []
+        for gram, left, information, half, factor, level, log_det in zip(self.batch.grams, self.left, self.information, *arrays):
+            size = gram.nuisances + gram.latents
+            found.append(Integral(information, half[:size, left], factor[:size, :size], level[:size], float(log_det)))
+        return found
+
+    def shares(self, grams: Sequence[Gram], noise: Noise) -> list[Share]:
+        """With the residuals of grams of the same derivatives."""
+        weight, (count, n, columns) = noise.scale**-2.0, self.half.shape
+        hidden, beside = np.zeros((count, n)), np.zeros((count, columns))
+        for w, (gram, left) in enumerate(zip(grams, self.left)):
+            cross, size = weight @ gram.cross, gram.nuisances + gram.latents
+            hidden[w, :size], beside[w, left] = cross[:size], cross[len(cross) - len(left) :]
+        right = self.at.level * torch.from_numpy(hidden).to(self.half.device)
+        along = torch.linalg.solve_triangular(self.at.factor, right[:, :, None], upper=False)
+        told = (self.half.transpose(1, 2) @ along)[..., 0], self.at.log_det - along.square().sum((1, 2))
+        explained, taken = all_to_host(told)
+        return [
+            Share(information, score[left], float(weight @ gram.square + own))
+            for gram, left, information, score, own in zip(grams, self.left, self.information, beside - explained, taken)
+        ]
+
+
+class _Resident(Integrals):
+    """Those that stay where they were calculated until a window is asked for."""
+
+    def __init__(self, order: Sequence[Sequence[int]], batches: Sequence[_Integrated]):
+        """Keep them.
+
+        Args:
+            order: numbers of each batch's windows.
+            batches: what is left of them.
+        """
+        self._order, self._parts = order, batches
+
+    def __len__(self) -> int:
+        """Number of windows."""
+        return sum(map(len, self._order))
+
+    @cached_property
+    def _of_windows(self) -> list[Integral]:
+        return self._by_window([part.of_windows() for part in self._parts])
+
+    @property
+    def log_dets(self) -> list[float]:
+        """See :attr:`Integrals.log_dets`."""
+        return self._by_window([part.at.log_det.tolist() for part in self._parts])
+
+    def shares(self, grams: Sequence[Gram], noise: Noise) -> list[Share]:
+        """See :meth:`Integrals.shares`."""
+        return self._by_window([part.shares([grams[w] for w in own], noise) for own, part in zip(self._order, self._parts)])
+
+    def _by_window(self, parts: Sequence[Sequence[T]]) -> list[T]:
+        found = {w: value for own, part in zip(self._order, parts) for w, value in zip(own, part)}
+        return [found[w] for w in range(len(self))]
+
+
+def _integrated(batch: _Batch, noise: Noise, latents: bool) -> _Integrated:
+    at, columns = _solved(batch, noise), batch.columns
+    right, own = _weighed(at.weight, columns.beside), _weighed(at.weight, columns.own)
+    n = right.shape[1]
+    if latents:
+        hidden = _weighed(at.weight, columns.hidden)
+        own = torch.cat((torch.cat((hidden, right), 2), torch.cat((right.transpose(1, 2), own), 2)), 1)
+        right = own[:, :n]
+    half = torch.linalg.solve_triangular(at.factor, at.level[:, :, None] * right, upper=False)
+    reduced = own - half.transpose(1, 2) @ half
+    whole = (0.5 * (reduced + reduced.transpose(1, 2))).cpu().numpy()
+    sizes, width = [(gram.nuisances, gram.nuisances + gram.latents) for gram in batch.grams], whole.shape[1]
+    left = [np.r_[begin:end, n:width] if latents else np.arange(width) for begin, end in sizes]
+    information = [own[np.ix_(columns, columns)] for own, columns in zip(whole, left)]
+    return _Integrated(batch, left, at, half, information)

@@ -1,0 +1,61 @@
+"""Threads of the linear algebra: its matrices are of some hundred rows, on which several threads a product wait for each other.
+
+So each product has one thread, and windows are spread over the cores.
+"""
+
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from threading import Event
+from typing import TypeVar
+
+from threadpoolctl import threadpool_limits
+
+from sim.arrays.cores import cores as cores
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+MOST = 4  # threads: with 8, a diagnosis on 16 cores waited an eighth longer, for Python itself
+MOST_ASIDE = 2
+"""The same where a GPU does all that is large: with 4 a diagnosis took a tenth longer, with 1 a fifth."""
+PIECES = 4  # of what is to be done, for each thread
+BESIDE = 3  # tasks side by side that mostly wait for a GPU: 2 are as good, with 4 a diagnosis took an eighth longer
+
+
+_aside = Event()
+
+
+def aside() -> None:
+    """From now on, give this process's small work the threads that it needs beside a GPU."""
+    _aside.set()
+
+
+def single() -> None:
+    """Give a product one thread from now on, in numpy, scipy and whatever else of the kind this process has loaded."""
+    import scipy.linalg  # noqa: F401
+
+    threadpool_limits(1)
+
+
+@cache
+def _pool(name: str, threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads, name, single)
+
+
+def each(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
+    """The function of every item, in order, on all cores; no call may wait for another of these."""
+    items, threads = list(items), min(cores(), MOST_ASIDE if _aside.is_set() else MOST)
+    if min(threads, len(items)) < 2:
+        return [function(item) for item in items]
+    pieces = min(PIECES * threads, len(items))  # each item by itself would cost as much as the small ones take
+    parts = _pool("algebra", threads).map(lambda first: [function(item) for item in items[first::pieces]], range(pieces))
+    found: list[R] = [None] * len(items)
+    for first, part in enumerate(parts):
+        found[first::pieces] = part
+    return found
+
+
+def beside(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
+    """The function of every item, in order, a few at once, each of which may call :func:`each`."""
+    return list(_pool("tasks", BESIDE).map(function, items))

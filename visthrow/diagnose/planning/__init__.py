@@ -1,0 +1,1 @@
+"""Planning of flights: which manoeuvre separates what could not be separated."""

@@ -1,0 +1,265 @@
+"""Which flight to fly next: the manoeuvre that separates what these flights could not, with the evidence it promises.
+
+Each manoeuvre is simulated with the model as found; its expected information is added to that at hand. For two members of a class
+the promise is the expected gap of their evidence with either as the truth, the smaller of both.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from visthrow.common.errors import DiagnoseError, suggest
+from visthrow.diagnose.inputs.measures import MEASUREMENTS, Measurement, narrowed
+from visthrow.diagnose.likelihood.evidence import Priors, covariance, log_evidence
+from visthrow.diagnose.likelihood.marginal import Noise, correlated, gram_of, window_statistics
+from visthrow.diagnose.models.interface import LATENT_BLOCKS, Model
+from visthrow.diagnose.planning.manoeuvres import PERIOD, Manoeuvre, Reference
+from visthrow.diagnose.select import result
+from visthrow.diagnose.select.result import Diagnosis
+from visthrow.diagnose.select.rivals import CLOSE
+from visthrow.logs.flightlog import Channel, FlightLog
+
+DECISIVE = 11.0
+"""Expected nats that tell two members of a class apart: those that come scatter with twice their mean as variance, and exceed
+the 3 nats of a class in 95 % of flights."""
+
+NAMEABLE = 0.2
+"""Deviation of an effect, in that of its prior, from which on its usual size is named."""
+
+MOST_REPEATS = 10
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """One manoeuvre, or one measurement on the ground, and what it promises."""
+
+    name: str
+    purpose: str
+    seconds: float
+    nats: float  # of the pair that is hardest to separate, or the logarithm by which a deviation shrinks
+    separates: tuple[tuple[str, ...], ...]  # pairs beyond DECISIVE after ``repeats`` flights
+    repeats: int  # flights until the hardest pair is beyond DECISIVE; 0 where MOST_REPEATS do not suffice
+    limits: str
+    reference: str = ""  # file of its reference
+
+
+def pairs_of(diagnosis: Diagnosis) -> list[tuple[str, str]]:
+    """Members of classes, two by two: the named one against each partner."""
+    found = []
+    for f in diagnosis.findings:
+        if f.verdict == result.CLASS and f.name in diagnosis.theta:
+            found += [(f.name, partner) for partner in f.partners]
+    return found
+
+
+def unclear(diagnosis: Diagnosis) -> list[str]:
+    """Effects that the flights could not show."""
+    return [f.name for f in diagnosis.findings if f.verdict == result.NOT_IDENTIFIABLE]
+
+
+def propose(
+    diagnosis: Diagnosis, manoeuvres: Sequence[Manoeuvre], simulate: Callable[[Sequence[Manoeuvre]], Sequence[Model | None]],
+    about: Sequence[str] = (),
+) -> list[Proposal]:  # fmt: skip
+    """Rank manoeuvres and measurements, best first.
+
+    Args:
+        diagnosis: whose classes, or else whose effects that could not be identified, are to be separated.
+        manoeuvres: to choose among.
+        simulate: gives for each manoeuvre a model of its simulated flight with the same catalogue; None where it cannot be flown.
+        about: names of the effects to plan for; empty for all classes, or else all effects that the flights could not show.
+
+    Raises:
+        DiagnoseError: An effect that the diagnosis does not know.
+    """
+    work = diagnosis.work
+    names = [e.name for e in work.problem.model.effects]
+    for name in about:
+        if name not in names:
+            raise DiagnoseError(f"no effect '{name}' in this diagnosis; {suggest(name, names)}")
+    base, priors = work.after, work.problem.priors
+    pairs = [(names.index(a), names.index(b)) for a, b in pairs_of(diagnosis) if not about or {a, b} & set(about)]
+    vague = [names.index(name) for name in about or unclear(diagnosis)]
+    proposals = []
+    for manoeuvre, model in zip(manoeuvres, simulate(manoeuvres)):
+        if model is None:
+            continue
+        new = expected_information(model, diagnosis.theta, base.noise, names, priors)
+        if pairs:
+            nats, separated, repeats = _classes(diagnosis, new, pairs)
+        else:
+            nats, separated, repeats = _shrinking(base.information, new, priors, vague, work.active)
+        told = tuple(tuple(names[j] for j in group) for group in separated)
+        proposals.append(Proposal(manoeuvre.name, manoeuvre.purpose, manoeuvre.seconds, nats, told, repeats,
+                                  manoeuvre.reference().limits()))  # fmt: skip
+    return sorted([*proposals, *_measured(diagnosis, names, pairs)], key=_worth, reverse=True)
+
+
+def session(proposals: Sequence[Proposal]) -> tuple[Proposal, ...]:
+    """What to do in one session: of ranked proposals, each that separates what none before it does."""
+    chosen, apart = [], set()
+    for p in proposals:
+        if new := set(p.separates) - apart:
+            chosen.append(p)
+            apart |= new
+    return tuple(chosen)
+
+
+def _worth(p: Proposal) -> tuple[float, float]:
+    """What settles the most comes first, soonest; what settles nothing by its nats a second."""
+    return len(p.separates) / np.sqrt(p.seconds * max(p.repeats, 1)), p.nats / np.sqrt(p.seconds)
+
+
+def _measured(diagnosis: Diagnosis, names: Sequence[str], pairs: Sequence[tuple[int, int]]) -> list[Proposal]:
+    """Measurements on the ground that settle members of classes."""
+    findings = {f.name: f for f in diagnosis.findings}
+    out = []
+    for m in MEASUREMENTS:
+        own = [(a, b) for a, b in pairs if m.effect in (names[a], names[b])]
+        if not own:
+            continue
+        j = names.index(m.effect)
+        seen = 0.5 * (findings[m.effect].estimate / m.sd) ** 2  # if it is the cause, the measurement shows it
+        gaps = [min(seen, _denied(diagnosis, j, a + b - j, m)) for a, b in own]
+        apart = tuple((names[a], names[b]) for (a, b), gap in zip(own, gaps) if gap > DECISIVE)
+        out.append(Proposal(m.name, f"settles {m.effect}", m.seconds, min(gaps), apart, int(bool(apart)), ""))
+    return out
+
+
+def _denied(diagnosis: Diagnosis, j: int, truth: int, m: Measurement) -> float:
+    """Nats by which the other member is ahead once the measurement has found the configured value right."""
+    work = diagnosis.work
+    problem = work.problem
+    known = Priors.of(narrowed(problem.model.effects, {m.effect: m.sd}), tuple(problem.model.channels))
+    rest = [k for k in work.active if k not in (j, truth)]
+    sets = ([*rest, truth], [*rest, j])
+    ahead, behind = (log_evidence(work.after.information, work.after.score, known, s) for s in sets)
+    return ahead - behind
+
+
+def expected_information(
+    model: Model, theta: Mapping[str, float], noise: Noise, names: Sequence[str], priors: Priors
+) -> np.ndarray:
+    """Information of simulated flights about the diagnosis' effects, in its floors, shape (K, K); 0 for what they hide."""
+    known = {e.name for e in model.effects}
+    windows = model.windows({name: value for name, value in theta.items() if name in known})
+    floors = np.array([e.floor for e in model.effects])
+    at = np.array([names.index(e.name) for e in model.effects if e.name in names])
+    own = np.array([i for i, e in enumerate(model.effects) if e.name in names])
+    total = np.zeros((len(names), len(names)))
+    loudest = {block: max(v for (b, _), v in noise.latent_sd.items() if b == block) for block, _ in noise.latent_sd}
+    pushed = loudest.get(0, 1.0)  # of a payload that has not been flown: as strongly as the vehicle [N]
+    for window in windows:
+        gram = correlated(gram_of(window, floors, len(model.channels)), window, noise.correlation_time)
+        levels = {(int(b), window.phase): noise.latent_sd.get((int(b), window.phase), loudest.get(int(b), pushed))
+                  for b in np.unique(gram.latent_block)}  # fmt: skip
+        alike = np.ones((1, len(LATENT_BLOCKS)))
+        expected = replace(noise, scale=np.ones(len(model.channels)), latent_sd=levels, share=alike)
+        part = window_statistics(gram, expected, 0).information
+        total[np.ix_(at, at)] += part[np.ix_(own, own)]
+    return total * np.outer(*[_ratio(model, names, priors)] * 2)
+
+
+def _ratio(model: Model, names: Sequence[str], priors: Priors) -> np.ndarray:
+    """The diagnosis' floors in the model's: both catalogues name the same effect, the floors may differ."""
+    floor = {e.name: e.floor for e in model.effects}
+    return np.array([priors.floor[i] / floor[name] if name in floor else 1.0 for i, name in enumerate(names)])
+
+
+def _gap(diagnosis: Diagnosis, information: np.ndarray, score: np.ndarray, new: np.ndarray, priors: Priors,
+         pair: tuple[int, int]) -> float:  # fmt: skip
+    """Expected nats between two members after the new flight, with either as the truth; the smaller one.
+
+    A member that is already behind by more than a class allows is no truth to plan for.
+    """
+    findings = {f.name: f for f in diagnosis.findings}
+    names = [f.name for f in diagnosis.findings]
+    rest = [j for j in diagnosis.work.active if j not in pair]
+    gaps = []
+    now = {j: log_evidence(information, score, priors, [*rest, j]) for j in pair}
+    for truth, other in (pair, pair[::-1]):
+        if now[truth] < now[other] - CLOSE:
+            continue
+        theta = np.zeros(len(priors.floor))
+        for j in [*rest, truth]:
+            theta[j] = findings[names[j]].estimate / priors.floor[j]
+        after = score + new @ theta
+        total = information + new
+        gaps.append(log_evidence(total, after, priors, [*rest, truth]) - log_evidence(total, after, priors, [*rest, other]))
+    return float(min(gaps))
+
+
+def _classes(diagnosis: Diagnosis, new: np.ndarray, pairs: Sequence[tuple[int, int]]):
+    """Nats of the pair that is hardest, pairs apart after ``repeats`` flights, and that number."""
+    base, priors = diagnosis.work.after, diagnosis.work.problem.priors
+
+    def gaps(count: int) -> list[float]:
+        return [_gap(diagnosis, base.information, base.score, count * new, priors, pair) for pair in pairs]
+
+    once = gaps(1)
+    best, apart, repeats = 0, [], 0
+    for count in range(1, MOST_REPEATS + 1):
+        now = [pair for pair, gap in zip(pairs, gaps(count)) if gap > DECISIVE]
+        if len(now) > best:
+            best, apart, repeats = len(now), now, count
+        if best == len(pairs):
+            break
+    return float(min(once)), apart, repeats
+
+
+def _shrinking(information: np.ndarray, new: np.ndarray, priors: Priors, vague: Sequence[int], active: Sequence[int]):
+    """Mean logarithm by which the deviations of effects shrink, those that can then be named, and the number of flights."""
+
+    def deviations(total: np.ndarray) -> np.ndarray:
+        return np.array([np.sqrt(covariance(total, priors.deviation([*active, j]))[j, j]) for j in vague])
+
+    if not vague:
+        return 0.0, [], 0
+    before, once = deviations(information), deviations(information + new)
+    able = np.array([priors.slab[j] for j in vague]) * NAMEABLE
+    best, shown, repeats = 0, [], 0
+    for count in range(1, MOST_REPEATS + 1):
+        after = deviations(information + count * new)
+        now = [(j,) for j, shows in zip(vague, (after < able) & (able < before)) if shows]
+        if len(now) > best:
+            best, shown, repeats = len(now), now, count
+        if best == len(vague):
+            break
+    return float(np.mean(np.log(before / once))), shown, repeats
+
+
+def write_references(folder: str | Path, manoeuvres: Sequence[Manoeuvre], proposals: Sequence[Proposal]) -> list[Proposal]:
+    """Write each proposal's reference as CSV; returns the proposals with their files' names."""
+    from visthrow.common.storage import atomic_write
+
+    by_name, told = {m.name: m for m in manoeuvres}, []
+    for p in proposals:
+        if p.name not in by_name:  # measured on the ground
+            told.append(p)
+            continue
+        name = "".join(c if c.isalnum() else "_" for c in p.name) + ".csv"
+        atomic_write(Path(folder) / name, by_name[p.name].reference().csv())
+        told.append(replace(p, reference=name))
+    return told
+
+
+def log_of(reference: Reference, sampled: Mapping[str, np.ndarray], commands: np.ndarray, *, payload: bool) -> FlightLog:
+    """A simulated flight as a log: poses as sampled, commands as sent.
+
+    Args:
+        reference: whose stamps the commands have.
+        sampled: ``time``, ``pos_w``, ``quat_wb`` and, with a payload, ``payload_pos_w``.
+        commands: [N, rad/s], shape (N, 4).
+        payload: whether it is carried.
+    """
+    time = sampled["time"]
+    channels = {
+        "pos_w": Channel(time, sampled["pos_w"], "m", "world"), "quat_wb": Channel(time, sampled["quat_wb"], "1", "world"),
+        "command": Channel(reference.time, commands, "N, rad/s", "body"),
+    }  # fmt: skip
+    if payload:
+        channels["payload_pos_w"] = Channel(time, sampled["payload_pos_w"], "m", "world")
+        channels["release_command"] = Channel(reference.time, reference.release.astype(float), "1")
+    return FlightLog(channels, {"period": PERIOD})

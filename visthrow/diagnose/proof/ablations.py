@@ -1,0 +1,159 @@
+"""The paper's ablations as hidden defects: a model that lacks a block is held against flights of a plant that has it.
+
+The shipped policy throws on the reference plant, which has everything; the same flights are diagnosed with four models, each
+without one block. What must be named is the block. Nothing is trained. Throws that no diagnosis saw say what the name is worth.
+"""
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from visthrow import config
+from visthrow.common.errors import DiagnoseError
+from visthrow.common.storage import write_json
+from visthrow.diagnose.proof.loop import PLANT, explained, named, recorded_in_a_hall
+from visthrow.logs.flightlog import FlightLog
+from visthrow.task import Experiment, plant_of
+from visthrow.throws.results import RECORDS
+
+LACKS = {
+    "no_aerodynamics": "aerodynamics", "no_motor_lag": "motor_lag", "simple_controller": "controller_kind",
+    "rigid_cable": "rope_flexible",
+}  # fmt: skip
+"""Ablation, as in ``configs/train/state_NAME.toml`` -> the entry of the catalogue that gives the block back."""
+
+COMMITTED = RECORDS / "loops" / "ablations" / "record.json"
+"""Record of the last round that is told of."""
+
+NEAR, FAR = 1.0, 1.9
+"""Distances of the targets, which lie all around [m]."""
+
+
+@dataclass(frozen=True)
+class Ablations:
+    """One round over models that lack a block.
+
+    Attributes:
+        folder: of flights, verdicts and the record; what is there is not done again.
+        names: of :data:`LACKS`.
+        policy: shipped name or file.
+        flights: to be diagnosed.
+        held: further throws, which no diagnosis sees.
+        device: of the diagnosis.
+    """
+
+    folder: Path
+    names: Sequence[str] = tuple(LACKS)
+    policy: str = "state"
+    flights: int = 12
+    held: int = 3
+    device: str = "cpu"
+
+    def run(self, say: Callable[[str], None]) -> dict[str, Any]:
+        """Fly, diagnose with each model, weigh on what was held back; returns the record.
+
+        Raises:
+            DiagnoseError: An ablation that does not exist.
+        """
+        strange = [name for name in self.names if name not in LACKS]
+        if strange:
+            raise DiagnoseError(f"no ablation {', '.join(strange)}; there are {', '.join(LACKS)}")
+        logs = self._flown(say)
+        told = [self._one(name, logs, lambda line, name=name: say(f"{name}: {line}")) for name in self.names]
+        record = {"policy": self.policy, "flights": self.flights, "held": self.held, "ablations": told}
+        write_json(self.folder / "record.json", record)
+        return record
+
+    def _flown(self, say: Callable[[str], None]) -> list[Path]:
+        """Logs of throws at targets all around, by the policy as it was trained, on the plant that has everything.
+
+        Of those held back somebody noted where they came down.
+        """
+        from visthrow.diagnose.proof.hall import throws
+        from visthrow.throws.loading import load_policy
+
+        count = self.flights + self.held
+        paths = [self.folder / "flights" / f"flight_{i:02d}.npz" for i in range(count)]
+        if all(path.exists() for path in paths):
+            return paths
+        rng = np.random.default_rng(0)
+        angle, distance = rng.uniform(-np.pi, np.pi, count), rng.uniform(NEAR, FAR, count)
+        goals = np.column_stack((distance * np.cos(angle), distance * np.sin(angle), np.zeros(count)))
+        for i, (path, log) in enumerate(zip(paths, throws(load_policy(self.policy), PLANT, goals, 0))):
+            seen = recorded_in_a_hall(log, np.random.default_rng(i))
+            landing = {"landing": log["landing"]} if i >= self.flights else {}
+            FlightLog({**seen.channels, **landing}, seen.meta).save(path)
+        say(f"flown: {count}")
+        return paths
+
+    def _one(self, name: str, logs: Sequence[Path], say: Callable[[str], None]) -> dict[str, Any]:
+        base, own = f"state_{name}", self.folder / name
+        own.mkdir(parents=True, exist_ok=True)
+        verdict = explained(logs[: self.flights], base, own / "verdict.json", self.device, say)
+        theta, findings = named(verdict), verdict.get("findings", ())
+        record = {"model": base, "lacks": LACKS[name], "overall": verdict["overall"], "named": theta}
+        record |= {"seconds": verdict.get("seconds"), "reasons": verdict.get("reasons", []), "threshold": verdict.get("threshold")}
+        record["nats"] = {f["name"]: f["nats"] for f in findings if f["name"] in theta}
+        kept = own / "held.json"
+        if not kept.exists():
+            write_json(kept, on_held_back(base, theta, LACKS[name], logs[self.flights :], self.device))
+            say("weighed on the throws that were held back")
+        return record | {"held": json.loads(kept.read_text())}
+
+
+def on_held_back(base: str, theta: Mapping[str, float], lacks: str, logs: Sequence[Path], device: str) -> dict[str, Any]:
+    """What a verdict is worth on throws that it was not found in.
+
+    Returns:
+        ``before``, ``after``: nats by which the throws are explained worse by the model as it was, and with what was named,
+        than by the model with the block that it lacks; see :func:`visthrow.diagnose.reporting.gain.shortfalls`. ``landing_before``,
+        ``landing_after``, ``landing_whole``: mean distance of predicted and seen landings [m], open loop from a second before
+        the separation; None where one never comes down.
+    """
+    from visthrow.diagnose.reporting.gain import shortfalls
+    from visthrow.diagnose.throw.throw_model import ThrowModel
+
+    sizes: list[Mapping[str, float]] = [{}, theta, {lacks: 1.0}]
+    plant = plant_of(config.load(Experiment, config.find("train", base)))
+    only = sorted({lacks, *theta})
+    model = ThrowModel([FlightLog.load(path) for path in logs], plant, device=device, only=only)
+    (before, after, _), samples = shortfalls(model, sizes)
+    found = {"before": before, "after": after, "samples": samples}
+    for who, theta_ in zip(("before", "after", "whole"), sizes):
+        off = model.landing_errors(theta_)
+        found[f"landing_{who}"] = float(np.mean(off)) if len(off) and np.isfinite(off).all() else None
+    return found
+
+
+def read(path: Path | None = None) -> dict[str, Any]:
+    """Record of a round: a file, the folder of one, or without any the committed one.
+
+    Raises:
+        DiagnoseError: There is none.
+    """
+    file = COMMITTED if path is None else path / "record.json" if path.is_dir() else path
+    if not file.exists():
+        raise DiagnoseError(f"{file}: no such record; expected what `visthrow diagnose loop --ablations` left")
+    return json.loads(file.read_text())
+
+
+def table(record: Mapping[str, Any]) -> str:
+    """Markdown table of a round."""
+    lines = [
+        f"{record['flights']} throws of '{record['policy']}' diagnosed, {record['held']} held back", "",
+        "| the model lacks | named | verdict | held back: nats short of the whole model | predicted landing off by [mm] | [s] |",
+        "|---|---|---|---|---|---|",
+    ]  # fmt: skip
+    for r in record["ablations"]:
+        found = ", ".join(f"{n} {size:+.3g} ({r['nats'][n]:.0f} nats)" for n, size in r["named"].items()) or "nothing"
+        held = r["held"]
+        off = " -> ".join("-" if (x := held[f"landing_{who}"]) is None else f"{1e3 * x:.0f}" for who in ("before", "after"))
+        worth = f"{held['before']:.0f} -> {held['after']:.0f}"
+        right = "named" if set(r["named"]) == {r["lacks"]} else "named, with others" if r["lacks"] in r["named"] else "not named"
+        took = f"{r['seconds']:.0f}" if r["seconds"] else "-"
+        lines.append(f"| {r['lacks']} ({r['model']}) | {found} | {r['overall']}, {right} | {worth} | {off} | {took} |")
+    return "\n".join(lines)

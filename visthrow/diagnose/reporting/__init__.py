@@ -1,0 +1,1 @@
+"""Reporting of a diagnosis: gain on held-out flights, page, pictures, recording."""

@@ -1,0 +1,147 @@
+"""What is left as a smooth table over the state, unexplained: the yardstick for named causes, and the last resort without one.
+
+Forces in the body frame are a Gaussian process over body velocity, body rates and thrust, in its sparse form: linear in a few
+radial functions whose weights have a normal prior. It is trained on the same statistics as the search.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from visthrow.diagnose.likelihood.marginal import window_statistics
+from visthrow.diagnose.models.interface import LATENT_BLOCKS, Window
+from visthrow.diagnose.select import grammar
+from visthrow.diagnose.select.point import Point
+
+CENTRES = 20
+WIDTH = 1.5
+"""Of a radial function, in deviations of the inputs."""
+REACHES = (0.03, 0.1, 0.3, 1.0, 3.0)
+"""Prior deviations of the weights, in the block's strongest latent force; the likeliest is taken."""
+
+
+def _inputs(window: Window) -> np.ndarray:
+    """Body velocity, body rates and thrust at the knots, as far as they are known, shape (k, I)."""
+    knots, parts = window.knots, []
+    if {"vel_w", "quat_wb"} <= set(knots):
+        parts.append(grammar.rotate_back(knots, knots["vel_w"]))
+    elif "vel_w" in knots:
+        parts.append(knots["vel_w"])
+    if "rate_b" in knots:
+        parts.append(knots["rate_b"])
+    if "thrust" in knots:
+        parts.append(np.asarray(knots["thrust"])[:, None])
+    return np.hstack(parts) if parts else np.zeros((len(knots.get("time", ())), 0))
+
+
+@dataclass(frozen=True)
+class Table:
+    """A force table: ``force_b = weights' radial(inputs)``; torques likewise."""
+
+    mean: np.ndarray  # of the inputs, shape (I,)
+    deviation: np.ndarray
+    centres: np.ndarray  # in deviations, shape (M, I)
+    blocks: tuple[str, ...]
+
+    def radial(self, inputs: np.ndarray) -> np.ndarray:
+        """Basis functions: constant, linear, radial; shape (k, 1 + I + M)."""
+        z = (inputs - self.mean) / self.deviation
+        distance = ((z[:, None, :] - self.centres) ** 2).sum(-1)
+        return np.hstack((np.ones((len(z), 1)), z, np.exp(-0.5 * distance / WIDTH**2)))
+
+    def columns(self, window: Window) -> np.ndarray:
+        """Latent-force coefficients of every weight, shape (L, weights)."""
+        basis, parts = self.radial(_inputs(window)), []
+        count = basis.shape[1]
+        for block in self.blocks:
+            values = np.zeros((len(basis), 3, 3 * count))
+            for axis in range(3):
+                direction = np.tile(np.eye(3)[axis], (len(basis), 1))
+                if block != "vehicle torque" and "quat_wb" in window.knots:
+                    direction = grammar.rotate(window.knots, direction)
+                values[:, :, axis * count : (axis + 1) * count] = direction[:, :, None] * basis[:, None, :]
+            parts.append(grammar.coefficients(window.latent_block, window.latent_axis, window.latent_time,
+                                              window.knots["time"], block, values))  # fmt: skip
+        return np.hstack(parts)
+
+
+def table_of(point: Point, rng: np.random.Generator) -> Table | None:
+    """Choose the basis from the states that were flown; None where windows carry no knots, or no latent force acts."""
+    if not all("time" in w.knots and w.latent.size for w in point.windows):
+        return None
+    inputs = np.vstack([_inputs(w) for w in point.windows])
+    if not inputs.shape[1]:
+        return None
+    mean, deviation = inputs.mean(0), np.maximum(inputs.std(0), 1e-9)
+    chosen = rng.choice(len(inputs), size=min(CENTRES, len(inputs)), replace=False)
+    blocks = tuple(LATENT_BLOCKS[b] for b in sorted({b for b, _ in point.noise.latent_sd}))
+    if not blocks:
+        return None
+    return Table(mean, deviation, ((inputs - mean) / deviation)[chosen], blocks)
+
+
+@dataclass(frozen=True)
+class Trained:
+    """Information of the table's weights by group of windows."""
+
+    groups: np.ndarray
+    information: np.ndarray  # shape (F, W, W)
+    score: np.ndarray  # shape (F, W)
+    reach: np.ndarray  # prior deviation of each weight at reach 1, shape (W,)
+
+    def weights(self, keep: np.ndarray) -> np.ndarray:
+        """Posterior mean of the weights from some groups, at the likeliest reach, shape (W,)."""
+        information, score = self.information[keep].sum(0), self.score[keep].sum(0)
+        best, mean = -np.inf, np.zeros(len(score))
+        for reach in REACHES:
+            prior = reach * self.reach
+            normal = information * np.outer(prior, prior) + np.eye(len(prior))
+            lower = np.linalg.cholesky(normal)
+            half = np.linalg.solve(lower, score * prior)
+            value = 0.5 * half @ half - np.log(np.diag(lower)).sum()
+            if value > best:
+                best, mean = value, prior * np.linalg.solve(lower.T, half)
+        return mean
+
+
+def train(point: Point, table: Table, groups: Sequence[int], theta: np.ndarray | None = None) -> Trained:
+    """Gather what the windows say about the table's weights.
+
+    Args:
+        point: linearised anywhere.
+        table: whose weights are asked for.
+        groups: of the windows.
+        theta: sizes of the effects beside the table, in floors, shape (K,); default 0.
+    """
+    back = point.statistics.theta - (0.0 if theta is None else theta)
+    names = np.array(sorted(set(groups)))
+    size = table.columns(point.windows[0]).shape[1]
+    information, score = np.zeros((len(names), size, size)), np.zeros((len(names), size))
+    for w, (window, group) in enumerate(zip(point.windows, groups)):
+        columns, part = table.columns(window), window_statistics(point.grams[w], point.noise, w)
+        f = int(np.searchsorted(names, group))
+        information[f] += columns.T @ part.latent_information @ columns
+        score[f] += columns.T @ (part.latent_score + part.latent_effects @ back)
+    reach = np.concatenate([
+        np.full(size // len(table.blocks), max(v for (b, _), v in point.noise.latent_sd.items() if LATENT_BLOCKS[b] == name))
+        for name in table.blocks
+    ])  # fmt: skip
+    return Trained(names, information, score, reach)
+
+
+def unexplained(point: Point, seed: int) -> dict | None:
+    """A table of what is left at a point, as plain data; None where none can be made.
+
+    Force in body axes = sum over functions of weights times (1, inputs, radial functions of the inputs), inputs in deviations.
+    """
+    table = table_of(point, np.random.default_rng(seed))
+    if table is None:
+        return None
+    weights = train(point, table, [0] * len(point.windows), point.statistics.theta).weights(np.ones(1, dtype=bool))
+    by_block = weights.reshape(len(table.blocks), 3, -1)
+    return {
+        "label": "unexplained", "inputs": "body velocity [m/s], body rates [rad/s], thrust [N], as far as known",
+        "mean": table.mean.tolist(), "deviation": table.deviation.tolist(), "centres": table.centres.tolist(), "width": WIDTH,
+        "weights": dict(zip(table.blocks, by_block.tolist())),
+    }  # fmt: skip

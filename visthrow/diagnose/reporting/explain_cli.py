@@ -1,0 +1,84 @@
+"""``visthrow diagnose explain``: what the model gets wrong about measured flights."""
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+from visthrow.diagnose.select.result import INCONSISTENT, OVERALL
+
+DEFAULT_OUT = "out/explain"
+
+MOST_SPOILED = 0.25
+"""Share of the logs that may contradict themselves and be left out; where more do, nothing is to be learnt from any."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the action."""
+    from visthrow.diagnose.inputs.opening import add_arguments as shared
+
+    parser.epilog = (
+        "examples:\n"
+        "  visthrow diagnose explain monday/*.npz                      throws of ours, against the training simulator\n"
+        "  visthrow diagnose explain flights --plant mine.toml         against a vehicle and rope of your own\n"
+        "  visthrow diagnose explain swing.csv --config pendulum       another model, tables read by its mapping\n"
+    )
+    shared(parser)
+    parser.add_argument("--out", default=DEFAULT_OUT, metavar="FOLDER", help=f"of the report (default: {DEFAULT_OUT})")
+    parser.add_argument("--no-report", action="store_true", help="print the verdicts only; no gain, no page, no recording")
+    parser.add_argument("--no-blind", action="store_true", help="leave the detection limits out of the report")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Read, search, print, write."""
+    from visthrow.common.storage import write_json
+    from visthrow.diagnose.check.run import check, contradictions
+    from visthrow.diagnose.inputs import opening
+    from visthrow.diagnose.reporting import report
+    from visthrow.diagnose.select import search
+
+    model, logs = opening.open_model(args)
+    checked = check(logs)
+    reasons, spoiled = contradictions(checked), tuple(i for i, log in enumerate(checked) if contradictions([log]))
+    if len(spoiled) > MOST_SPOILED * len(logs):
+        print(f"{INCONSISTENT}: {OVERALL[INCONSISTENT]}\n" + "\n".join(f"  {reason}" for reason in reasons))
+        if args.json:
+            write_json(args.json, {"overall": INCONSISTENT, "reasons": reasons, "findings": []})
+        return 0
+    print(f"{len(logs)} log(s), {len(model.effects)} effects on {', '.join(model.channels)}", flush=True)
+    for reason in reasons:
+        print(f"  left out: {reason}", flush=True)
+    without = (*opening.numbers(args.without), *spoiled)
+    diagnosis = search.explain(model, seed=args.seed, without=without, progress=lambda line: print(f"  {line}", flush=True))
+    diagnosis = replace(diagnosis, reasons=(*diagnosis.reasons, *(f"left out: {reason}" for reason in reasons)))
+    gain = None
+    if not args.no_report and diagnosis.work is not None:
+        gain = write_report(Path(args.out), diagnosis, model, logs, args.seed, not args.no_blind)
+    print("\n" + report.summary(diagnosis, gain))
+    if not args.no_report and diagnosis.work is not None:
+        print(f"page, JSON, pictures and recording: {args.out}")
+    if args.json:
+        write_json(args.json, report.to_json(diagnosis, gain))
+    return 0
+
+
+def write_report(folder: Path, diagnosis, model, logs, seed: int, limits: bool = True):
+    """Write page, JSON, pictures and recording; returns the gain on held-out flights."""
+    from visthrow.common import provenance
+    from visthrow.common.storage import write_json
+    from visthrow.diagnose.reporting import blackbox, blind, gain, recording, report
+    from visthrow.diagnose.select import result
+
+    measured = gain.measure(diagnosis, seed=seed)
+    measured = measured if measured.channels else None  # windows of one sample have nothing ahead that could be predicted
+    hidden = blind.hide(diagnosis, seed=seed) if limits else None
+    steps = model.step_error() if hasattr(model, "step_error") else None
+    origin = provenance.collect()
+    about = {"logs": len(logs), "command": origin["command"], "commit": origin["commit"], "time": origin["time"]}
+    made = report.sections(diagnosis, measured, hidden, step_check=steps, about=about)
+    report.write(folder, made, diagnosis, "What the simulation gets wrong about these flights")
+    table = blackbox.unexplained(diagnosis.work.after, seed) if diagnosis.overall == result.UNKNOWN else None
+    extra = {"step_error_sigma": steps, "provenance": origin, "table": table}
+    whole = report.to_json(diagnosis, measured, hidden, extra=extra)
+    write_json(folder / "diagnosis.json", whole)
+    recording.write(folder / "diagnosis.rrd", diagnosis, logs)
+    return measured

@@ -1,0 +1,241 @@
+"""Pictures of a diagnosis, in the style of :mod:`visthrow.common.style`; each function returns a PNG."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from visthrow.common import style
+from visthrow.diagnose.likelihood.evidence import covariance
+from visthrow.diagnose.likelihood.marginal import Noise
+from visthrow.diagnose.models.interface import Window
+from visthrow.diagnose.reporting.blind import Blind
+from visthrow.diagnose.reporting.forms import unit_of
+from visthrow.diagnose.reporting.gain import Gain
+from visthrow.diagnose.select import result
+from visthrow.diagnose.select.result import Diagnosis
+from visthrow.diagnose.select.work import Work
+from visthrow.diagnose.throw.landing import LandingGain
+from visthrow.view.parts import png_of
+
+WIDTH = 9.2
+"""[inch]"""
+BEFORE, AFTER = style.COLOURS[1], style.COLOURS[0]
+SHOWN_WINDOWS = 3
+SHOWN_EFFECTS = 14
+"""Rows and columns of the confusion picture."""
+MOST_CURVES = 24
+"""Of the completeness picture; of more effects it shows where their curves rise."""
+SHOWN_HORIZONS = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
+"""Ticks [s]."""
+STEPS_ACROSS = 3
+MOST_TICKS = 16  # over the whole width
+STEPS_OF_TICKS = ((1, 2, 5), (1, 3), (1,))
+"""Within a decade of a logarithmic axis; the finest that leaves room is taken."""
+READABLE = {"m": (1e3, "mm"), "rad": (180.0 / np.pi, "deg"), "m/s": (1e3, "mm/s")}
+"""Unit -> factor and unit in pictures and tables, where residuals are small."""
+
+
+def _figure(rows: int, columns: int, height: float, **more):
+    import matplotlib.pyplot as plt
+
+    style.use()
+    return plt.subplots(rows, columns, figsize=(WIDTH, height), constrained_layout=True, squeeze=False, **more)
+
+
+def plain_ticks(low: float, high: float, most: int) -> list[float]:
+    """Ticks of a logarithmic axis, or one that is linear about 0, within its limits; none where no choice of them fits."""
+    far = max(abs(low), abs(high))
+    for digits in STEPS_OF_TICKS:
+        sizes = [digit * 10.0**power for power in range(-4, 7) for digit in digits if digit * 10.0**power <= far]
+        if low <= 0.0 <= high:
+            sizes = [size for size in sizes if size >= 1.0]
+            sizes = [*(-size for size in sizes[::-1]), 0.0, *sizes]
+        inside = [tick for tick in sizes if low <= tick <= high]
+        if 2 <= len(inside) <= most:
+            return inside
+    return []
+
+
+def _plain(axis, most: int) -> None:
+    """Ticks of one axis of a picture as plain numbers instead of powers of ten."""
+    if ticks := plain_ticks(*axis.get_view_interval(), most):
+        axis.set_ticks(ticks, [f"{tick:g}" for tick in ticks])
+        axis.set_ticks([], minor=True)
+
+
+def left_over(window: Window, noise: Noise) -> np.ndarray:
+    """Residuals with the initial state fitted to the whole window, in the channels' units, shape (N,)."""
+    weight = 1.0 / (window.sigma * noise.scale[window.channel])
+    states = window.nuisance * window.nuisance_sd * weight[:, None]
+    normal = states.T @ states + np.eye(states.shape[1])
+    fitted = np.linalg.solve(normal, states.T @ (window.residual * weight))
+    return window.residual - window.nuisance * window.nuisance_sd @ fitted
+
+
+def residuals(work: Work, channel: int) -> bytes:
+    """Residuals of one channel before and after, laid over each other, in the windows where most was gained, and in a usual one."""
+    name = work.problem.model.channels[channel]
+    factor, unit = READABLE.get(unit_of(name), (1.0, unit_of(name)))
+    pairs = []
+    for before, after in zip(work.before.windows, work.after.windows):
+        rows = before.channel == channel
+        if rows.any():
+            pairs.append((before, after, rows, left_over(before, work.after.noise)[rows], left_over(after, work.after.noise)[rows]))
+    gained = np.argsort([np.mean(b**2) - np.mean(a**2) for *_, b, a in pairs])[::-1]
+    chosen = [*gained[: SHOWN_WINDOWS - 1], gained[len(gained) // 2]] if len(gained) >= SHOWN_WINDOWS else list(gained)
+    figure, axes = _figure(1, len(chosen), 2.9, sharey=True)
+    for axis, i in zip(axes[0], chosen):
+        before, _, rows, old, new = pairs[i]
+        time, noise = before.time[rows], factor * 2.0 * np.median(before.sigma[rows] * work.after.noise.scale[channel])
+        axis.axhspan(-noise, noise, color=style.FAINT, lw=0, label="noise, 2 sigma")
+        axis.plot(time, factor * old, ".", ms=2.2, color=BEFORE, label="model as it stands")
+        axis.plot(time, factor * new, ".", ms=2.2, color=AFTER, label="with what was named")
+        axis.set(title=f"flight {before.flight}, {before.phase}", xlabel="time [s]")
+    axes[0, 0].set_ylabel(f"measured - simulated [{unit}]" if unit else "measured - simulated")
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncol=3, markerscale=4)
+    return png_of(figure)
+
+
+def ladder(diagnosis: Diagnosis) -> bytes:
+    """Nats of each step's candidates, screened and with the simulation run again, and what they must exceed; rows of three."""
+    steps = diagnosis.steps
+    across = min(len(steps), STEPS_ACROSS)
+    down, most = -(-len(steps) // across), max(sum(1.0 + 0.6 * name.count(", ") for name in step.screened) for step in steps)
+    figure, axes = _figure(down, across, down * (0.55 + 0.27 * most))
+    for axis in axes.flat[len(steps) :]:
+        axis.set_visible(False)
+    for number, (axis, step) in enumerate(zip(axes.flat, steps), start=1):
+        names = list(step.screened)[::-1]
+        screened = [max(step.screened[n], 0.0) for n in names]
+        labels = [name.replace(", ", ",\n") for name in names]
+        axis.barh(labels, screened, height=0.62, color=style.FAINT)
+        for y, name in enumerate(names):
+            if name in step.refitted:
+                won = name == step.named
+                axis.plot(max(step.refitted[name], 0.0), y, marker="o" if won else "^", ms=6, color=AFTER if won else style.QUIET)
+        axis.axvline(step.least, color=BEFORE, lw=1)
+        axis.set(xscale="symlog", xlabel="nats", title=f"step {number}: {'exchanged' if ', ' in step.named else step.named}")
+        axis.set_xlim(0.0, 1.4 * max([step.least, *screened, *step.refitted.values()]))
+        _plain(axis.xaxis, MOST_TICKS // across)
+        axis.tick_params(axis="y", labelsize=8)
+    return png_of(figure)
+
+
+def verdicts(diagnosis: Diagnosis) -> bytes:
+    """Every effect's interval in its floors, by verdict."""
+    colours = {result.FOUND: AFTER, result.CLASS: style.COLOURS[3], result.BOUNDED: style.QUIET,
+               result.NOT_IDENTIFIABLE: style.COLOURS[4]}  # fmt: skip
+    shown = [f for f in diagnosis.findings if f.verdict in colours][::-1]
+    figure, axes = _figure(1, 1, 0.8 + 0.19 * len(shown))
+    axis, seen = axes[0, 0], set()
+    axis.axvspan(-1.0, 1.0, color=style.FAINT, lw=0)
+    for y, f in enumerate(shown):
+        label = None if f.verdict in seen else f.verdict
+        seen.add(f.verdict)
+        middle = f.estimate if f.verdict in (result.FOUND, result.CLASS) else 0.5 * (f.low + f.high)
+        axis.plot(np.array([f.low, f.high]) / f.floor, [y, y], color=colours[f.verdict], lw=2.4, solid_capstyle="butt")
+        axis.plot(middle / f.floor, y, "o" if f.estimate else "|", color=colours[f.verdict], ms=6, label=label)
+    axis.axvline(0.0, color=style.QUIET, lw=0.8)
+    axis.set(xlabel="size in floors (grey: within the floor)", yticks=range(len(shown)), ylim=(-1, len(shown)))
+    axis.set_yticklabels([f.name for f in shown], fontsize=8)
+    axis.set_xscale("symlog", linthresh=1.0, linscale=0.5)
+    _plain(axis.xaxis, MOST_TICKS)
+    axis.tick_params(axis="x", top=True, labeltop=True)
+    figure.legend(loc="outside upper center", ncol=4)
+    return png_of(figure)
+
+
+def horizons(gain: Gain) -> bytes:
+    """Prediction error over the horizon on held-out flights."""
+    figure, axes = _figure(1, len(gain.channels), 2.9)
+    for axis, channel in zip(axes[0], gain.channels):
+        h, before, after, floor = np.array(channel.horizons).T
+        axis.plot(h, before, marker="^", color=BEFORE, label="model as it stands")
+        axis.plot(h, after, marker="o", color=AFTER, label="with what was named")
+        axis.plot(h, floor, ":", color=style.INK, label="noise alone")
+        axis.set(title=channel.channel, xlabel="horizon [s]", xscale="log", yscale="log")
+        axis.set_xticks(SHOWN_HORIZONS, [f"{x:g}" for x in SHOWN_HORIZONS])
+        axis.minorticks_off()
+        _plain(axis.yaxis, MOST_TICKS // 2)
+    axes[0, 0].set_ylabel("error [sigma of the sensor]")
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncol=3)
+    return png_of(figure)
+
+
+def landings(landing: LandingGain) -> bytes:
+    """Where each throw was predicted to land, seen from where it landed."""
+    figure, axes = _figure(1, 1, 3.6)
+    axis = axes[0, 0]
+    for off, colour, marker, label in ((landing.off_before, BEFORE, "^", "model as it stands"),
+                                       (landing.off_after, AFTER, "o", "with what was named")):  # fmt: skip
+        axis.plot(*(1e3 * np.array(off).T), marker, color=colour, label=label)
+    for before, after in zip(landing.off_before, landing.off_after):
+        axis.plot(*(1e3 * np.array((before, after)).T), color=style.FAINT, lw=1, zorder=0)
+    axis.plot(0.0, 0.0, "+", color=style.INK, ms=12, label="measured")
+    axis.set(xlabel="x [mm]", ylabel="y [mm]", aspect="equal")
+    figure.legend(loc="outside upper center", ncol=3)
+    return png_of(figure)
+
+
+def confusion(diagnosis: Diagnosis) -> bytes:
+    """Correlations of the effects' estimates with all of them free: what these flights cannot tell apart."""
+    work = diagnosis.work
+    visible = np.flatnonzero(work.problem.priors.visible)
+    sigma = covariance(work.after.information, work.problem.priors.deviation(visible))
+    deviation = np.sqrt(np.diag(sigma))
+    correlation = sigma / np.outer(deviation, deviation)
+    off = np.abs(correlation - np.eye(len(correlation)))
+    off[~work.problem.priors.visible] = 0.0
+    strongest = np.argsort(-np.where(np.isin(np.arange(len(off)), work.active), 2.0, off.max(axis=1)))
+    at = np.sort([j for j in strongest if work.problem.priors.visible[j]][:SHOWN_EFFECTS])
+    names = [work.problem.model.effects[j].name for j in at]
+    figure, axes = _figure(1, 1, 1.6 + 0.3 * len(at))
+    axis = axes[0, 0]
+    image = axis.imshow(correlation[np.ix_(at, at)], vmin=-1.0, vmax=1.0, cmap="RdBu_r")
+    for i in range(len(at)):
+        for j in range(len(at)):
+            value = correlation[at[i], at[j]]
+            if i != j and abs(value) > 0.3:
+                colour = "white" if abs(value) > 0.7 else style.INK
+                axis.text(j, i, f"{value:.2f}", ha="center", va="center", fontsize=7, color=colour)
+    axis.set_xticks(range(len(at)), names, rotation=60, ha="right", fontsize=8)
+    axis.set_yticks(range(len(at)), names, fontsize=8)
+    figure.colorbar(image, ax=axis, shrink=0.7, label="correlation")
+    return png_of(figure)
+
+
+def completeness(blind: Blind, floors: Sequence[float]) -> bytes:
+    """Share of worlds in which a hidden effect is named, over its size in floors; of many effects where it rises."""
+    pairs = [(c, f) for c, f in zip(blind.curves, floors) if c.sizes]
+    last = {c.name: c.limit / f if np.isfinite(c.limit) else np.inf for c, f in pairs}
+    pairs = sorted(pairs, key=lambda p: last[p[0].name])
+    if len(pairs) > MOST_CURVES:
+        return _rises(pairs)
+    half = (len(pairs) + 1) // 2
+    figure, axes = _figure(1, 2, 4.4, sharey=True)
+    for axis, group in zip(axes[0], (pairs[:half], pairs[half:])):
+        for i, (curve, floor) in enumerate(group):
+            look = {"color": style.COLOURS[i % 6], "marker": style.MARKERS[i % 6], "ls": ("-", "--", ":", "-.")[i // 6 % 4]}
+            axis.plot(np.array(curve.sizes) / floor, curve.up_to_class, ms=3.5, lw=1.1, label=curve.name, **look)
+        axis.axhline(0.9, color=style.FAINT)
+        axis.set(xscale="log", xlabel="hidden size [floors]", ylim=(-0.02, 1.02))
+        axis.legend(fontsize=6.5, ncol=2)
+    axes[0, 0].set_ylabel("named, up to its class")
+    return png_of(figure)
+
+
+def _rises(pairs: Sequence[tuple]) -> bytes:
+    """Sizes from which each effect is named in half and in nine tenths of worlds, in floors; open to the right if never."""
+    figure, axes = _figure(1, 1, 0.8 + 0.17 * len(pairs))
+    axis = axes[0, 0]
+    for y, (curve, floor) in enumerate(pairs[::-1]):
+        sizes, share = np.array(curve.sizes) / floor, np.maximum.accumulate(curve.up_to_class)
+        half, most = (float(np.interp(q, share, sizes)) if share[-1] >= q else sizes[-1] for q in (0.5, 0.9))
+        axis.plot((half, most), (y, y), color=style.QUIET, lw=2.4, solid_capstyle="butt")
+        axis.plot(most, y, "o" if share[-1] >= 0.9 else ">", color=AFTER if share[-1] >= 0.9 else BEFORE, ms=5)
+    axis.set(xscale="log", xlabel="hidden size [floors] named in 50 % and (mark) 90 % of worlds; >: never within what was tried",
+             yticks=range(len(pairs)), ylim=(-1, len(pairs)))  # fmt: skip
+    axis.set_yticklabels([curve.name for curve, _ in pairs[::-1]], fontsize=7)
+    axis.set_xticks((1, 2, 5, 10, 20, 50), ("1", "2", "5", "10", "20", "50"))
+    axis.minorticks_off()
+    return png_of(figure)

@@ -1,0 +1,1 @@
+"""Selection of causes: the search, its candidates, and the verdicts that come of it."""

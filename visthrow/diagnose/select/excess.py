@@ -1,0 +1,134 @@
+"""Latent forces by block and phase: what still moves the vehicle after the causes were named, and whether that is too much.
+
+Gusts and draught do not know what the vehicle is doing. A latent force that is several times stronger in throws than in the
+quietest phase is no gust but something that the model lacks.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from visthrow.diagnose.likelihood.marginal import Gram
+from visthrow.diagnose.likelihood.stack import Stack
+from visthrow.diagnose.models.interface import LATENT_BLOCKS, Window
+from visthrow.diagnose.select.grammar import JOINT, JOINT_NEEDS, Known, through_latents
+from visthrow.diagnose.select.point import Point
+from visthrow.diagnose.select.result import Level
+
+UNKNOWN_RATIO = 3.0
+"""Latent forces above this many times the quietest phase's are no gusts."""
+
+LIMIT_NATS = 2.0
+"""Loss of log-likelihood that marks the upper limit of a level (one-sided 97.5 %)."""
+
+STEP, MOST_STEPS = 1.4, 60
+"""Factor from one level to the next above the best, until one is too high. A level that nothing holds up lies anywhere below."""
+
+
+def levels(before: Point, after: Point, least: float) -> tuple[Level, ...]:
+    """Compare the latent forces of each block and phase with the block's quietest phase.
+
+    Args:
+        before: the model as it stands.
+        after: with what was named.
+        least: nats from which a level would count as excessive if it were the only one; of many, one is higher by chance.
+    """
+    found, least = [], least + np.log(max(len(after.noise.latent_sd), 1))
+    blocks = sorted({block for block, _ in after.noise.latent_sd})
+    of = {phase: _Phase(after, phase) for _, phase in after.noise.latent_sd}
+    for block in blocks:
+        phases = [phase for b, phase in after.noise.latent_sd if b == block]
+        limits = {phase: of[phase].upper_limit(block) for phase in phases}
+        quiet_phase = min(limits, key=limits.get)
+        quiet = limits[quiet_phase]
+        for phase in phases:
+            level = after.noise.latent_sd[block, phase]
+            nats = 0.0
+            if level > UNKNOWN_RATIO * quiet:
+                nats = of[phase].likelihood(block, level) - of[phase].likelihood(block, UNKNOWN_RATIO * quiet)
+            earlier = before.noise.latent_sd.get((block, phase), float("nan"))
+            found.append(Level(LATENT_BLOCKS[block], phase, earlier, level, quiet, float(nats), bool(nats > least)))
+    return tuple(found)
+
+
+class _Phase:
+    """The windows of a phase under any level of a block's latent forces there."""
+
+    def __init__(self, point: Point, phase: str):
+        """Put them side by side."""
+        windows = [w for w, gram in enumerate(point.grams) if gram.phase == phase]
+        self.noise, self.phase, self.stack = point.noise, phase, Stack([point.grams[w] for w in windows], point.device, windows)
+
+    def likelihood(self, block: int, level: float) -> float:
+        """Of the phase's residuals."""
+        noise = replace(self.noise, latent_sd={**self.noise.latent_sd, (block, self.phase): level})
+        return float(self.stack.values(noise).sum())
+
+    def upper_limit(self, block: int) -> float:
+        """Largest level of a block that the residuals allow."""
+        best = self.noise.latent_sd[block, self.phase]
+        top = self.likelihood(block, best)
+        for step in range(1, MOST_STEPS):
+            if self.likelihood(block, best * STEP**step) < top - LIMIT_NATS:
+                break
+        return float(best * STEP**step)
+
+
+def acts_on(point: Point, j: int, *, joint: bool = False, beside: Sequence[int] = ()) -> str:
+    """Block through which an effect moves things, or "" where it moves measurements alone.
+
+    Its column is laid over the columns of each block's latent forces; the block that explains most of it, and at least half, is it.
+
+    Args:
+        point: with the latent forces' derivatives.
+        j: the effect.
+        joint: consider the torque between vehicle and rope as well.
+        beside: effects that may take any size: what they can stand in for is left out.
+    """
+    weight = point.noise.scale**-2.0
+    total, by_block = 0.0, dict.fromkeys((*LATENT_BLOCKS, JOINT), 0.0)
+    for gram, window in zip(point.grams, point.windows):
+        inner, size = np.tensordot(weight, gram.inner, 1), gram.nuisances + gram.latents
+        free, column = [*range(gram.nuisances), *(size + k for k in beside)], size + j
+        own = _explained(inner, free, column)
+        total += inner[column, column] - own
+        for block in np.unique(gram.latent_block):
+            with_block = np.concatenate((free, gram.nuisances + np.flatnonzero(gram.latent_block == block)))
+            by_block[LATENT_BLOCKS[block]] += _explained(inner, with_block.astype(int), column) - own
+        if joint and (torques := joint_torques(gram, window)) is not None:
+            move = np.zeros((len(inner), len(free) + torques.shape[1]))
+            move[free, np.arange(len(free))] = 1.0
+            move[gram.nuisances : size, len(free) :] = torques
+            by_block[JOINT] += _explained_by(move.T @ inner @ move, move.T @ inner[column]) - own
+    best = max(by_block, key=by_block.get)
+    return best if total > 0.0 and by_block[best] > 0.5 * total else ""
+
+
+def joint_torques(gram: Gram, window: Window) -> np.ndarray | None:
+    """Latents of a gram that torques in the rope's joint about each axis at each knot stand for, shape (L, 3k); None without."""
+    known = Known(window.knots)
+    if not set(JOINT_NEEDS) <= set(known) or len(np.unique(gram.latent_block)) < len(LATENT_BLOCKS):
+        return None
+    return np.linalg.solve(gram.factor, through_latents(window, known, JOINT))
+
+
+def _explained(inner: np.ndarray, columns: Sequence[int], target: int) -> float:
+    """Part of a column's square that other columns explain."""
+    return _explained_by(inner[np.ix_(columns, columns)], inner[columns, target])
+
+
+def _explained_by(normal: np.ndarray, right: np.ndarray) -> float:
+    normal = normal + np.diag(1e-9 * np.diag(normal) + 1e-12)
+    return float(right @ np.linalg.solve(normal, right))
+
+
+def too_strong(point: Point, share: float) -> tuple[str, ...]:
+    """Phases in which the latent force on the vehicle exceeds a share of the thrust that carries it."""
+    thrusts: dict[str, list[float]] = {}
+    for window in point.windows:
+        if "thrust" in window.knots and len(window.knots["thrust"]):
+            thrusts.setdefault(window.phase, []).append(float(np.median(np.abs(window.knots["thrust"]))))
+    block = LATENT_BLOCKS.index("vehicle force")
+    weight = max((float(np.median(v)) for v in thrusts.values()), default=np.inf)
+    return tuple(p for (b, p), level in point.noise.latent_sd.items() if b == block and level > share * weight)

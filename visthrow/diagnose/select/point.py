@@ -1,0 +1,303 @@
+"""The state of a search: the model linearised at some sizes of its effects, with the noise levels that belong there."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from visthrow.diagnose.likelihood import noise as levels
+from visthrow.diagnose.likelihood import stack
+from visthrow.diagnose.likelihood.designs import grams_of, with_residuals
+from visthrow.diagnose.likelihood.evidence import Priors, covariance, estimate, log_evidence
+from visthrow.diagnose.likelihood.marginal import (
+    Gram,
+    Noise,
+    Statistics,
+    gather,
+    recorrelated,
+    rescored,
+)
+from visthrow.diagnose.models.interface import Linearised, Model, Window
+from visthrow.diagnose.select.scatter import freed, own_shares
+
+STEPS = 3
+"""Gauss-Newton steps between two linearisations."""
+
+LOST, LOST_SHARE = 3.0, 0.15
+"""Squared residual a sample, in noise and latent forces, from which a window is lost; share of windows beyond which none is."""
+
+SHAKEN_LOST = 1.3
+"""Of the median window's, from which a shaken one is lost: what its unknown motion does is no effect's doing."""
+
+SMALL_STEP = 0.05
+"""In floors: a step that is not worth a simulation."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What stays the same during a search."""
+
+    model: Model
+    priors: Priors
+    kept: tuple[int, ...]  # windows that are looked at
+
+    @property
+    def switches(self) -> np.ndarray:
+        """Which effects are another kind of block, shape (K,), bool."""
+        return np.array([e.switch for e in self.model.effects], dtype=bool)
+
+    def only(self, windows: Sequence[int]) -> "Problem":
+        """The same of some of the windows that are looked at."""
+        return replace(self, kept=tuple(self.kept[w] for w in windows))
+
+    def sizes(self, theta: np.ndarray) -> dict[str, float]:
+        """Sizes in the effects' units, of those that are not 0; ``theta`` is in floors."""
+        return {e.name: float(t * e.floor) for e, t in zip(self.model.effects, theta) if t != 0.0}
+
+
+@dataclass(frozen=True)
+class Point:
+    """Windows and statistics at one theta (in floors, shape (K,))."""
+
+    theta: np.ndarray
+    windows: Sequence[Window]
+    raw: Sequence[Gram]  # latents at the knots
+    grams: Sequence[Gram]  # latents correlated
+    noise: Noise
+    statistics: Statistics
+    integrals: stack.Integrals  # of the grams under these noise levels
+    about: Linearised | None  # where the derivatives were taken; None: with another kind of block than the residuals
+    device: str  # where the model simulates, and the algebra of all windows with it
+
+    @cached_property
+    def information(self) -> np.ndarray:
+        """Of all flights, shape (K, K)."""
+        return self.statistics.information.sum(0)
+
+    @cached_property
+    def score(self) -> np.ndarray:
+        """Of all flights, about theta = 0, shape (K,)."""
+        return self.statistics.absolute.sum(0)
+
+    def evidence(self, priors: Priors, active: Sequence[int]) -> float:
+        """log Z of a set of effects, comparable between points with other noise levels."""
+        own = log_evidence(self.information, self.score, priors, list(active))
+        return own - 0.5 * float(self.statistics.absolute_square.sum()) + self.noise.log_prior
+
+
+def regathered(point: Point, integrals: stack.Integrals | None = None, **changes: Any) -> Point:
+    """The point with changes, and what its windows then say.
+
+    Args:
+        point: to change.
+        integrals: of the grams under the noise levels, where they are known.
+        changes: fields of the point.
+    """
+    changed = replace(point, **changes)
+    integrals = stack.integrals(changed.grams, changed.noise, changed.device) if integrals is None else integrals
+    return replace(changed, integrals=integrals, statistics=_statistics(changed.grams, integrals, changed.noise, changed.theta))
+
+
+def _statistics(grams: Sequence[Gram], integrals: stack.Integrals, noise: Noise, theta: np.ndarray) -> Statistics:
+    shares = integrals.shares(grams, noise)
+    if integrals.gathered is not None:
+        return rescored(integrals.gathered, grams, shares, theta)
+    integrals.gathered = gather(grams, shares, theta)
+    return integrals.gathered
+
+
+def linearise(problem: Problem, theta: np.ndarray, start: Noise | None = None, windows: Sequence[Window] | None = None) -> Point:
+    """Simulate and linearise at ``theta``, estimate the noise levels, gather.
+
+    Args:
+        problem: of the search.
+        theta: in floors, shape (K,).
+        start: noise levels to start from.
+        windows: what the model gave there, if it was asked already.
+    """
+    windows = problem.model.windows(problem.sizes(theta)) if windows is None else windows
+    channels = len(problem.model.channels)
+    found = [windows[i] for i in problem.kept]
+    device, floors = getattr(problem.model, "device", "cpu"), problem.priors.floor
+    first = grams_of(found, floors, channels, device)
+    kept = levels.without_outliers(found, first, floors, device)
+    mended = [w for w in range(len(kept)) if kept[w] is not found[w]]
+    again = dict(zip(mended, grams_of([kept[w] for w in mended], floors, channels, "cpu")))
+    raw = [again.get(w, gram) for w, gram in enumerate(first)]
+    noise, grams = levels.fit(kept, raw, start, device)
+    integrals, at = stack.integrals(grams, noise, device), np.array(theta, dtype=float)
+    about = Linearised(problem.sizes(theta), dict(zip(problem.kept, kept)))
+    return Point(at, kept, raw, grams, noise, _statistics(grams, integrals, noise, at), integrals, about, device)
+
+
+def only(point: Point, windows: Sequence[int]) -> Point:
+    """The same of some of its windows, with noise levels estimated from these."""
+    own = {name: [getattr(point, name)[w] for w in windows] for name in ("windows", "raw", "grams")}
+    noise = levels.refit(own["grams"], levels.only(point.noise, own["grams"], windows), point.device)
+    return regathered(point, noise=noise, **own)
+
+
+def lost(point: Point) -> list[int]:
+    """Numbers of windows that the simulation does not follow, whatever forces act: a crash, a rope that whips beyond prediction.
+
+    What they say of an effect is chance: their derivatives hold nowhere. Where many are so, none is lost, but something is missing.
+    """
+    shares, log_dets = point.integrals.shares(point.grams, point.noise), point.integrals.log_dets
+    misfit = [(own.square - log_det) / max(gram.count.sum(), 1.0) for own, log_det, gram in zip(shares, log_dets, point.grams)]
+    shaken = np.array([window.shaken for window in point.windows], dtype=bool)
+    far = np.flatnonzero(np.array(misfit) > np.where(shaken, min(SHAKEN_LOST * np.median(misfit), LOST), LOST))
+    return far.tolist() if len(far) <= LOST_SHARE * len(misfit) else []
+
+
+def moved(problem: Problem, point: Point, theta: np.ndarray) -> Point | None:
+    """Simulate at ``theta`` but keep the derivatives and noise levels of ``point``; None where the simulation fails there."""
+    kinds = problem.switches
+    about = point.about if np.array_equal(theta[kinds], point.theta[kinds]) else None
+    residuals = problem.model.residuals(problem.sizes(theta), about)
+    residuals = [residuals[i] for i in problem.kept]
+    if not all(np.all(np.isfinite(r)) for r in residuals):
+        return None
+    windows = [replace(w, residual=r) for w, r in zip(point.windows, residuals)]
+    raw, grams = _with_residuals(problem, point, residuals)
+    at = np.array(theta, dtype=float)
+    return regathered(point, point.integrals, theta=at, windows=windows, raw=raw, grams=grams, about=about)
+
+
+def _with_residuals(problem: Problem, point: Point, residuals: Sequence[np.ndarray]) -> tuple[list[Gram], list[Gram]]:
+    """The point's grams with other residuals, with latents at the knots and correlated."""
+    raw = with_residuals(point.raw, point.windows, problem.priors.floor, residuals, point.device)
+    return raw, [recorrelated(gram, own) for gram, own in zip(point.grams, raw)]
+
+
+def advantage(
+    priors: Priors, first: tuple[Point, Sequence[int]], second: tuple[Point, Sequence[int]], switches: np.ndarray | None = None
+) -> float:
+    """Nats by which the first set of effects is ahead, each set at whichever of both points suits it better.
+
+    The noise levels of a point were estimated without the floors; a set may do better with the levels of another set. Between
+    points that fly different kinds of blocks there is no such choice: neither's derivatives hold for the other.
+
+    Args:
+        priors: of the effects.
+        first: a set at its own point.
+        second: another.
+        switches: which effects are another kind of block, shape (K,), bool; default: none.
+    """
+    points = first[0], second[0]
+    kinds = [np.zeros(0) if switches is None else point.theta[switches] != 0.0 for point in points]
+    if not np.array_equal(*kinds):
+        return first[0].evidence(priors, first[1]) - second[0].evidence(priors, second[1])
+    ahead, behind = (max(point.evidence(priors, active) for point in points) for active in (first[1], second[1]))
+    return ahead - behind
+
+
+def curvature(problem: Problem, origin: Point, there: Point) -> float:
+    """What the simulation's distance from its linearisation would be taken for: the largest size of any effect, in floors.
+
+    Args:
+        problem: of the search.
+        origin: where the derivatives were taken.
+        there: a point moved from it, with the same derivatives.
+    """
+    change = problem.priors.floor * (there.theta - origin.theta)
+    bent = [new.residual - (old.residual - old.effects @ change) for old, new in zip(origin.windows, there.windows)]
+    _, grams = _with_residuals(problem, there, bent)
+    total = sum(share.score for share in there.integrals.shares(grams, there.noise))
+    return float(np.abs(covariance(there.information, problem.priors.deviation(())) @ total).max(initial=0.0))
+
+
+def with_fitted_noise(point: Point) -> Point:
+    """The same with noise levels estimated from its residuals."""
+    return regathered(point, noise=levels.refit(point.grams, point.noise, point.device))
+
+
+def with_all_effects_noise(problem: Problem, point: Point) -> Point:
+    """The same with the noise levels that remain when every effect may have its linear estimate.
+
+    A large missing effect is taken for noise as long as it is not named; these levels show what may be hidden under it.
+    """
+    visible = np.flatnonzero(problem.priors.visible)
+    return _with_noise_at(point, estimate(point.information, point.score, problem.priors, visible))
+
+
+def with_floors_noise(problem: Problem, point: Point, active: Sequence[int], varies: Mapping[int, float] | None = None) -> Point:
+    """The same with the noise levels that remain when every effect has its most probable size, those not named below their floors.
+
+    What a dozen effects below their floors leave is no gust, but it is nothing that is missing either; nor is what an effect
+    that varies has of its own in each flight.
+
+    Args:
+        problem: of the search.
+        point: whose derivatives and residuals are taken.
+        active: effects named.
+        varies: deviation in floors of effects that differ from flight to flight.
+    """
+    mean = freed(point.statistics, varies or {})
+    theta = covariance(mean.information.sum(0), problem.priors.deviation(list(active))) @ mean.absolute.sum(0)
+    return _with_noise_at(point, theta, own_shares(point.statistics, theta, varies or {}))
+
+
+def _with_noise_at(point: Point, theta: np.ndarray, own: np.ndarray | None = None) -> Point:
+    """The same with noise levels estimated from the residuals at ``theta``, and each flight's ``own`` beside it, shape (F, K)."""
+    at = np.tile(theta - point.theta, (len(point.statistics.flights), 1)) + (0.0 if own is None else own)
+    row = {flight: f for f, flight in enumerate(point.statistics.flights.tolist())}
+    moves = [at[row[window.flight]] for window in point.windows]
+    grams = [shifted(gram, move) for gram, move in zip(point.grams, moves)]
+    return regathered(point, noise=levels.refit(grams, point.noise, point.device))
+
+
+def shifted(gram: Gram, change: np.ndarray) -> Gram:
+    """Inner products of r - S change."""
+    begin = gram.nuisances + gram.latents
+    part = gram.inner[:, :, begin:] @ change
+    square = gram.square - 2.0 * gram.cross[:, begin:] @ change + part[:, begin:] @ change
+    return replace(gram, cross=gram.cross - part, square=np.maximum(square, 0.0))
+
+
+def fitted(problem: Problem, point: Point, active: Sequence[int]) -> Point:
+    """Gauss-Newton with the derivatives of ``point`` and the simulation's own residuals; a step that does not help is halved.
+
+    Args:
+        problem: of the search.
+        point: where the derivatives were taken.
+        active: effects that may move; all others go to 0.
+    """
+    inside = np.isin(np.arange(len(point.theta)), list(active))
+    best = point if np.all(point.theta[~inside] == 0.0) else moved(problem, point, np.where(inside, point.theta, 0.0))
+    if best is None:
+        return point
+    for _ in range(STEPS):
+        goal = estimate(best.information, best.score, problem.priors, active)
+        goal[problem.switches] = best.theta[problem.switches]  # no step turns a block into another
+        trial = _step(problem, best, goal)
+        if trial is None:
+            break
+        best = trial
+        if to_gain(problem, best, active) < 0.05:
+            break
+    return best
+
+
+def to_gain(problem: Problem, point: Point, active: Sequence[int]) -> float:
+    """Nats that another step of these effects' sizes would bring by the derivatives, no block turned into another."""
+    left = estimate(point.information, point.score, problem.priors, active) - point.theta
+    left[problem.switches] = 0.0
+    return float(0.5 * left @ point.information @ left)
+
+
+def _step(problem: Problem, point: Point, goal: np.ndarray) -> Point | None:
+    """The largest part of a step that fits better; None where there is none."""
+    share = 1.0
+    while share > 0.1 and np.abs(share * (goal - point.theta)).max() > SMALL_STEP:
+        trial = moved(problem, point, point.theta + share * (goal - point.theta))
+        if trial is not None and _misfit(problem, trial) < _misfit(problem, point):
+            return trial
+        share /= 2.0
+    return None
+
+
+def _misfit(problem: Problem, point: Point) -> float:
+    prior = (point.theta / problem.priors.slab)[point.theta != 0.0]
+    return float(point.statistics.square.sum() + prior @ prior)

@@ -1,0 +1,138 @@
+"""What a diagnosis says: one verdict for every effect, one overall, and the way that led there. Plain data, ready for JSON."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from visthrow.diagnose.select.scatter import Scatter
+from visthrow.diagnose.throw.interface import Mistake
+
+FOUND, CLASS, BOUNDED = "FOUND", "CLASS", "BOUNDED"
+NOT_IDENTIFIABLE, UNOBSERVABLE = "NOT IDENTIFIABLE", "UNOBSERVABLE"
+VERDICTS = {
+    FOUND: "the model lacks it, and nothing else in the catalogue says the same",
+    CLASS: "this or one of its partners; these flights cannot tell which",
+    BOUNDED: "if it is there, then within these limits",
+    NOT_IDENTIFIABLE: "these flights say hardly more than was known before",
+    UNOBSERVABLE: "a channel is missing that would show it",
+}
+"""Verdicts on one effect; each effect has exactly one."""
+
+NO_EFFECT, KNOWN, UNKNOWN = "NO EFFECT", "KNOWN", "UNKNOWN"
+INCONSISTENT, OUT_OF_DOMAIN = "DATA INCONSISTENT", "OUT OF DOMAIN"
+OVERALL = {
+    NO_EFFECT: "the model explains the flights",
+    KNOWN: "the causes named explain the flights",
+    UNKNOWN: "something is missing that the catalogue does not hold",
+    INCONSISTENT: "the channels do not belong together; no cause can be named",
+    OUT_OF_DOMAIN: "the simulation cannot follow these flights; no cause can be named",
+}
+
+
+@dataclass(frozen=True)
+class Finding:
+    """The verdict on one effect."""
+
+    name: str
+    verdict: str
+    block: str
+    cause: str
+    equation: str
+    unit: str
+    estimate: float  # size with all other effects free below their floors; of a class's member if it is the cause; else 0 [unit]
+    sd: float  # likewise, and what numerics add [unit]
+    low: float  # 95 % interval [unit]
+    high: float
+    floor: float  # [unit]
+    nats: float  # by which naming it raises the evidence
+    partners: tuple[str, ...] = ()  # other members of its class
+    joint: str = ""  # the combination of a class that is known
+    missing: tuple[str, ...] = ()  # channels that would show it
+    manoeuvres: tuple[str, ...] = ()  # that would separate or show it
+    sentence: str = ""
+
+
+@dataclass(frozen=True)
+class Step:
+    """One addition of the search, or an exchange of all names for a set that says more."""
+
+    named: str  # names of a set with commas between them
+    nats: float  # against what was named before
+    least: float  # what it must exceed
+    screened: Mapping[str, float]  # effect or set -> nats by the linear statistics, best first
+    refitted: Mapping[str, float]  # effect or set -> nats with the simulation run again
+
+
+@dataclass(frozen=True)
+class Level:
+    """Latent force of one block in one phase: what moved the vehicle besides the model."""
+
+    block: str
+    phase: str
+    before: float  # with the model as it stands [N or N m]
+    after: float  # with what was named
+    quiet: float  # of the quietest phase, afterwards
+    nats: float  # against its being as low as that times UNKNOWN_RATIO
+    excessive: bool
+
+
+@dataclass(frozen=True)
+class Law:
+    """A term outside the catalogue: coefficient times scalar factors times a vector."""
+
+    formula: str
+    block: str  # of visthrow.diagnose.select.grammar.BLOCKS
+    factors: tuple[str, ...]  # keys of visthrow.diagnose.select.grammar.SCALARS
+    vector: str  # key of visthrow.diagnose.select.grammar.VECTORS
+    coefficient: float
+    sd: float
+    unit: str
+    nats: float  # of evidence, less the log of the number of terms tried
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """95 % interval of the coefficient."""
+        return self.coefficient - 1.96 * self.sd, self.coefficient + 1.96 * self.sd
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """The whole answer. ``work`` holds what report, gain, plan and blind calculate with, and is not written to JSON."""
+
+    overall: str
+    block: str  # of an unknown effect, else empty
+    reasons: tuple[str, ...]  # for the overall verdict
+    findings: tuple[Finding, ...]  # one an effect, in the model's order
+    theta: Mapping[str, float]  # what to set in the model: sizes with which named effects alone, one of each class, explain most
+    covariance: tuple[tuple[float, ...], ...]  # of theta's entries, in their units
+    threshold: float  # [nats]
+    steps: tuple[Step, ...] = ()
+    sets: tuple[tuple[tuple[str, ...], float], ...] = ()  # sets of causes within 3 nats of the best, with their distance
+    levels: tuple[Level, ...] = ()
+    laws: tuple[Law, ...] = ()  # terms outside the catalogue, best first
+    events: tuple[int, ...] = ()  # flights in which something happened once
+    duplicates: Mapping[int, int] = field(default_factory=dict)  # flight -> the earlier flight that it repeats
+    sensor_scale: Mapping[str, float] = field(default_factory=dict)  # channel -> noise found, in that stated
+    flights: int = 0
+    windows: int = 0
+    samples: int = 0
+    seconds: float = 0.0
+    seed: int = 0
+    scatter: tuple[Scatter, ...] = ()  # what may vary from flight to flight
+    mistakes: tuple[Mistake, ...] = ()  # of the logs' interface, put right before anything was estimated
+    work: Any = field(default=None, repr=False, compare=False)
+
+    def __getitem__(self, name: str) -> Finding:
+        """Return the verdict on an effect."""
+        return next(f for f in self.findings if f.name == name)
+
+    @property
+    def named(self) -> tuple[str, ...]:
+        """Effects of ``theta``."""
+        return tuple(self.theta)
+
+    def to_dict(self) -> dict[str, Any]:
+        """All but ``work``, for JSON."""
+        fields = {name: value for name, value in vars(self).items() if name != "work"}
+        plain = {name: [asdict(v) for v in fields[name]] for name in ("findings", "steps", "levels", "laws", "scatter", "mistakes")}
+        return {**fields, **plain}

@@ -1,0 +1,287 @@
+"""From the end of a search to verdicts: exactly one for every effect, one overall, each with its reason in words."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from visthrow.diagnose.likelihood.evidence import NORMAL_95, OWN_FLOOR, Priors, certainty, covariance, estimate
+from visthrow.diagnose.models.interface import Model, Window
+from visthrow.diagnose.select import result
+from visthrow.diagnose.select.excess import acts_on, levels, too_strong
+from visthrow.diagnose.select.point import Point, with_floors_noise
+from visthrow.diagnose.select.result import Diagnosis, Finding, Law, Level
+from visthrow.diagnose.select.scatter import deviations, freed
+from visthrow.diagnose.select.work import Work
+
+if TYPE_CHECKING:
+    from visthrow.diagnose.select.search import Search
+    from visthrow.diagnose.select.unknown import Hypothesis
+
+HALF_PRIOR = 0.5
+"""An effect whose posterior deviation exceeds this share of its prior's was not seen."""
+
+CHAIN = 2
+"""More names than this in one block, with its latent forces still excessive, are one wrong form and no causes."""
+
+IMPLAUSIBLE_FORCE = 0.3
+"""Latent force, in the thrust that carries the vehicle, that no missing cause explains: the channels do not belong together."""
+
+ROUGH = 4.0
+"""Latent force of a window, in its phase's, from which something happened there."""
+
+AT_BOUND = 1e-3
+"""Distance from a physical bound, in floors, at which an estimate lies on it."""
+
+
+
+def conclude(search: "Search", *, laws: bool) -> Diagnosis:
+    """Turn a finished search into verdicts.
+
+    Args:
+        search: that has run.
+        laws: whether to look for laws outside the catalogue.
+    """
+    from visthrow.diagnose.select.unknown import Answer, beats_the_catalogue, find_laws
+
+    answer = find_laws(search, lambda h: beats_the_catalogue(search, Answer((h,)))[0] is not None) if laws else Answer()
+    law = beats_the_catalogue(search, answer)
+    if law[0] is not None and search.nearer():
+        answer = find_laws(search)
+        law = beats_the_catalogue(search, answer)
+    point, model = search.point, search.problem.model
+    scatter = search.scatter(search.active)
+    varies = deviations(scatter, search.priors, [e.name for e in model.effects])
+    found = levels(search.nominal, with_floors_noise(search.problem, point, search.active, varies), search.least)
+    drawn = {name for s in scatter if s.found for name in s.of}
+    search.refused = {j: nats for j, nats in search.refused.items() if search.name(j) not in drawn}
+    overall, block, reasons, withdrawn = _overall(search, found, *law)
+    mistakes = tuple(getattr(model, "mistakes", ()))
+    if overall == result.NO_EFFECT and (drawn or mistakes):
+        besides = [m.name for m in mistakes] + [s.name for s in scatter if s.found]
+        overall, reasons = result.KNOWN, [f"besides {' and '.join(besides)}, {reasons[0]}"]
+    known = overall != result.UNKNOWN  # a term that is weaker than the names says nothing
+    terms = [] if known else _different(answer.strongest)
+    active = [j for j in search.active if j not in withdrawn]
+    if law[0] is not None:
+        active = _sure(law[0].without_terms(), search.priors, active)
+        withdrawn = set(search.active) - set(active)
+    if not active and search.active:
+        point = search.nominal
+    elif law[0] is not None and active:
+        point = law[0].without_terms()
+    here = point is search.point
+    point = replace(point, statistics=search.about_means(active, varies) if here else freed(point.statistics, varies))
+    point = replace(point, theta=estimate(point.information, point.score, search.priors, active))
+    spread = covariance(point.information, search.priors.deviation(active))
+    findings = tuple(_finding(search, point, j, active, spread, withdrawn) for j in range(len(model.effects)))
+    floor = search.priors.floor
+    own = spread[np.ix_(active, active)] + OWN_FLOOR**2 * np.eye(len(active))
+    scaled = own * np.outer(floor[active], floor[active])
+    return Diagnosis(
+        overall, block, tuple(reasons), findings, {search.name(j): float(point.theta[j] * floor[j]) for j in active},
+        tuple(tuple(map(float, row)) for row in scaled), search.least, tuple(search.steps),
+        tuple((tuple(map(search.name, s)), n) for s, n in search.sets), found, tuple(terms), _events(search, point),
+        sensor_scale={name: float(point.noise.scale[c]) for c, name in enumerate(model.channels)},
+        scatter=scatter, mistakes=mistakes,
+        flights=len(point.statistics.flights), windows=len(point.windows), samples=int(point.statistics.samples.sum()),
+        work=Work(search.problem, search.nominal, search.point if active else search.nominal, tuple(active)),
+    )  # fmt: skip
+
+
+def _sure(point: Point, priors: Priors, active: Sequence[int]) -> list[int]:
+    """Names that are surely not 0 at a point, the least certain gone first."""
+    left = list(active)
+    while left:
+        theta = estimate(point.information, point.score, priors, left)
+        sure = certainty(point.information, theta, priors, left)
+        if sure.min() > 1.0:
+            break
+        left.pop(int(np.argmin(sure)))
+    return left
+
+
+def _different(hypotheses: Sequence["Hypothesis"]) -> tuple[Law, ...]:
+    """Laws of hypotheses, each formula once, with the coefficient of the best."""
+    laws: dict[str, Law] = {}
+    for law in (law for hypothesis in hypotheses for law in hypothesis.laws()):
+        laws.setdefault(law.formula, law)
+    return tuple(laws.values())
+
+
+def _events(search: "Search", point: Point) -> tuple[int, ...]:
+    """Flights that were left out for what happened there, and flights with a window far rougher than its phase."""
+    rough = {window.flight for window, share in zip(point.windows, point.noise.share) if share.max() > ROUGH}
+    return tuple(sorted({*search.events, *rough}))
+
+
+def out_of_domain(model: Model, windows: Sequence[Window], usable: int, seed: int) -> Diagnosis:
+    """The verdict where the simulation fails in most windows."""
+    reason = f"the simulation stays finite in {usable} of {len(windows)} windows; check units, axes and the vehicle's configuration"
+    findings = tuple(
+        Finding(e.name, result.NOT_IDENTIFIABLE, e.block, e.cause, e.equation, e.unit, 0.0, e.prior_sd, *e.bounds, e.floor, 0.0,
+                sentence=f"{e.name}: nothing can be said, the simulation does not follow these flights.")
+        for e in model.effects
+    )  # fmt: skip
+    flights = len({w.flight for w in windows})
+    return Diagnosis(result.OUT_OF_DOMAIN, "", (reason,), findings, {}, (), float("nan"), flights=flights, windows=len(windows),
+                     seed=seed)  # fmt: skip
+
+
+def _overall(
+    search: "Search", found: Sequence[Level], law: "Hypothesis | None", idle: set[int], said: str
+) -> tuple[str, str, list[str], set[int]]:
+    """Overall verdict, block of an unknown effect, reasons, and the names that are withdrawn for it."""
+    from visthrow.diagnose.select.unknown import withdrawn_for
+
+    point, every = search.point, set(search.active)
+    strong = too_strong(point, IMPLAUSIBLE_FORCE)
+    if strong:
+        reason = (f"after everything the catalogue can do, forces above {IMPLAUSIBLE_FORCE:.0%} of the thrust are missing in the "
+                  f"phases {', '.join(strong)}: commands and poses, units or axes do not belong together")  # fmt: skip
+        return result.INCONSISTENT, "", [reason], every
+    if search.refused and not search.active and (law is None or law.nats < max(search.refused.values())):
+        names = ", ".join(search.name(j) for j in sorted(search.refused))
+        return result.INCONSISTENT, "", [f"what looks like {names} changes its sign from flight to flight"], every
+    excessive = [level for level in found if level.excessive]
+    reasons = [_excess(level) for level in excessive]
+    if law is not None:
+        reasons.insert(0, said)
+        return result.UNKNOWN, law.terms[0].block, reasons, idle | withdrawn_for(search, law)
+    stuck = [j for j in search.active if _on_bound(search, j)]
+    if stuck:
+        names = ", ".join(map(search.name, stuck))
+        reasons.append(f"{names} would have to lie outside what is physically possible; the form is another")
+        return result.UNKNOWN, acts_on(point, stuck[0]) or search.problem.model.effects[stuck[0]].block, reasons, every
+    if excessive:
+        worst = max(excessive, key=lambda level: level.nats)
+        return result.UNKNOWN, worst.block, reasons, _withdrawn(search, excessive)
+    if search.active:
+        return result.KNOWN, "", [f"{len(search.active)} named, nothing excessive is left"], set()
+    return result.NO_EFFECT, "", [f"no effect exceeds {search.least:.1f} nats, and nothing excessive is left"], set()
+
+
+def _excess(level: Level) -> str:
+    unit = "N m" if "torque" in level.block else "N"
+    return (f"{level.block} in phase {level.phase}: {level.after:.2g} {unit} remain, {level.after / level.quiet:.1f} times the "
+            f"quietest phase ({level.nats:.0f} nats)")  # fmt: skip
+
+
+def _withdrawn(search: "Search", excessive: Sequence[Level]) -> set[int]:
+    """Names that stand for the unknown effect's wrong form: a chain of them in its block, or one that left it as it was."""
+    through = {j: acts_on(search.point, j) for j in search.active}
+    inside = {j for j, block in through.items() if block in {level.block for level in excessive}}
+    if len(inside) > CHAIN:
+        return inside
+    eased = {level.block: level.after < 0.5 * level.before for level in excessive}
+    return {j for j in inside if not eased.get(through[j], True)}
+
+
+def _on_bound(search: "Search", j: int) -> bool:
+    """Whether an estimate lies on its bound and the flights push it on by more than the threshold."""
+    point, priors = search.point, search.priors
+    at = min(abs(point.theta[j] - priors.low[j]), abs(point.theta[j] - priors.high[j])) < AT_BOUND
+    push = point.statistics.score[:, j].sum()
+    return bool(at and push * point.theta[j] > 0.0 and 0.5 * push**2 / point.information[j, j] > search.least)
+
+
+def _finding(search: "Search", point: Point, j: int, active: list[int], spread: np.ndarray, withdrawn: set[int]) -> Finding:
+    effect, priors = search.problem.model.effects[j], search.priors
+    blank = Finding(effect.name, result.UNOBSERVABLE, effect.block, effect.cause, effect.equation, effect.unit, 0.0,
+                    effect.prior_sd, *effect.bounds, effect.floor, 0.0, manoeuvres=tuple(effect.manoeuvres))  # fmt: skip
+    if not priors.visible[j]:
+        missing = tuple(c for c in effect.channels if c not in search.problem.model.channels)
+        return replace(blank, missing=missing, sentence=f"{effect.name}: not to be seen without {', '.join(missing)}.")
+    partners, home = _class_of(search, j, active)
+    if j in active or partners:
+        return _named(search, point, blank, j, home, partners, active, spread)
+    wide = _wide(point, priors, j, active)
+    mean, sd = (value * effect.floor for value in wide)
+    own = float(np.hypot(sd, OWN_FLOOR * effect.floor))
+    low, high = (float(np.clip(mean + side * NORMAL_95 * own, *effect.bounds)) + 0.0 for side in (-1.0, 1.0))  # no -0
+    gain = _worth(point, priors, j, active)
+    blank = replace(blank, sd=own, low=low, high=high, nats=gain)
+    if j in withdrawn:
+        text = f"{effect.name}: explains a part of what is missing, but not its form; the name is withdrawn."
+        return replace(blank, verdict=result.NOT_IDENTIFIABLE, sentence=text)
+    if wide[1] > HALF_PRIOR * priors.slab[j]:
+        text = f"{effect.name}: these flights say hardly more than was known ({own:.2g} of {effect.prior_sd:.2g} {effect.unit})."
+        return replace(blank, verdict=result.NOT_IDENTIFIABLE, sentence=text)
+    text = f"{effect.name}: between {low:.3g} and {high:.3g} {effect.unit}, if there at all."
+    if low == high:
+        beyond = "less" if mean < low else "more"
+        text = f"{effect.name}: on its bound of {low:.3g} {effect.unit}; these flights ask for {beyond} than is possible."
+    return replace(blank, verdict=result.BOUNDED, sentence=text)
+
+
+def _wide(point: Point, priors: Priors, j: int, active: Sequence[int]) -> tuple[float, float]:
+    """Posterior mean and deviation of one effect as if it were named beside the others, in floors."""
+    sigma = covariance(point.information, priors.deviation([*active, j]))
+    return float(sigma[j] @ point.score), float(np.sqrt(sigma[j, j]))
+
+
+def _worth(point: Point, priors: Priors, j: int, active: Sequence[int]) -> float:
+    rest = [k for k in active if k != j]
+    return point.evidence(priors, [*rest, j]) - point.evidence(priors, rest)
+
+
+def _class_of(search: "Search", j: int, active: Sequence[int]) -> tuple[tuple[int, ...], int]:
+    """Partners of an effect, and the named member in whose place it may stand."""
+    for home in active:
+        exchanged = {home}
+        for members, _ in search.sets:
+            new = set(members) - set(active)
+            if len(members) == len(active) and len(new) == 1 and set(active) - set(members) == {home}:
+                exchanged |= new
+        if j in exchanged and len(exchanged) > 1:
+            return tuple(sorted(exchanged - {j})), home
+    return (), j
+
+
+def _named(search: "Search", point: Point, blank: Finding, j: int, home: int, partners: tuple[int, ...], active: list[int],
+           spread: np.ndarray) -> Finding:  # fmt: skip
+    priors, floor = search.priors, blank.floor
+    if j in active:
+        size, variance = spread[j] @ point.score, spread[j, j]
+    else:
+        stead = [j if k == home else k for k in active]
+        size, sd = _wide(point, priors, j, stead[:-1] if stead[-1] == j else [k for k in stead if k != j])
+        variance = sd**2
+    sd = float(np.hypot(np.sqrt(variance), OWN_FLOOR)) * floor
+    size = float(np.clip(size, priors.low[j], priors.high[j]) * floor) + 0.0  # no -0
+    low = max(priors.low[j] * floor, size - NORMAL_95 * sd) + 0.0
+    high = min(priors.high[j] * floor, size + NORMAL_95 * sd) + 0.0
+    rest = [k for k in active if k != home]
+    nats = _worth(point, priors, j, rest)
+    text = f"{size:.3g} ± {sd:.2g} {blank.unit}"
+    blank = replace(blank, estimate=size, sd=sd, low=low, high=high, nats=nats)
+    if not partners:
+        sentence = f"{blank.cause}: {blank.name} = {text} (95 %: {low:.3g} to {high:.3g}), {nats:.0f} nats."
+        return replace(blank, verdict=result.FOUND, sentence=sentence)
+    names, joint = tuple(map(search.name, partners)), _joint(search, point, sorted({j, *partners}), rest)
+    sentence = (f"{blank.cause}: {blank.name} = {text} if it is the cause; these flights cannot tell it from {', '.join(names)}. "
+                f"Known is {joint}.")  # fmt: skip
+    return replace(blank, verdict=result.CLASS, partners=names, joint=joint, sentence=sentence)
+
+
+def _joint(search: "Search", point: Point, members: list[int], rest: list[int]) -> str:
+    """The best known combination of a class: first eigenvector of its members' information in prior deviations."""
+    priors, effects = search.priors, search.problem.model.effects
+    others = np.setdiff1d(np.arange(len(effects)), members)
+    information, slab = point.information, priors.slab[members]
+    nuisance = information[np.ix_(others, others)] + np.diag(priors.deviation(rest)[others] ** -2.0)
+    cross = information[np.ix_(members, others)]
+    schur = information[np.ix_(members, members)] - cross @ np.linalg.solve(nuisance, cross.T)
+    score = point.score[members] - cross @ np.linalg.solve(nuisance, point.score[others])
+    values, vectors = np.linalg.eigh(schur * np.outer(slab, slab))
+    vector, value = vectors[:, -1] / slab, values[-1]  # per floor
+    first = int(np.argmax(np.abs(vectors[:, -1])))
+    scale = vector[first] / priors.floor[members[first]]
+    mean = float(np.linalg.lstsq(schur * np.outer(slab, slab), score * slab, rcond=1e-8)[0] @ vectors[:, -1])
+    unit, parts = effects[members[first]].unit, [effects[members[first]].name]
+    for i in (i for i in range(len(members)) if i != first):
+        other, coefficient = effects[members[i]], vector[i] / priors.floor[members[i]] / scale
+        parts.append(f"{'+' if coefficient > 0 else '-'} {abs(coefficient):.3g} {unit}/({other.unit}) {other.name}")
+    sd = 1.0 / np.sqrt(max(value, 1e-300)) / abs(scale)
+    return f"{' '.join(parts)} = {mean / scale:.4g} ± {sd:.2g} {unit}"

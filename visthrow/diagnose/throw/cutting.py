@@ -1,0 +1,118 @@
+"""Flights cut into windows of about a second at changes of phase."""
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from sim.replay.kernel import ATTACHED, LOOSE, NO_PAYLOAD
+from visthrow.diagnose.throw.recorded import NEVER, Recorded
+
+LENGTH = 1.0  # of a window, about [s]
+LEAST = 0.25  # of a window [s]
+BEFORE, AFTER = 0.55, 0.45  # of the separation, that the window of the throw reaches [s]
+QUIET_SPEED = 0.35  # of hover [m/s]
+GROUND_MARGIN = 0.05  # above the landing height, below which a payload is left alone [m]
+LATE = 0.1  # by which the release may lag more than expected, before a payload counts as free where the rope was slack [s]
+LEAST_TAUT = 0.05  # before the separation, without which the release cannot be judged [s]
+RINGING = 1.5  # that a rope may whip after it came taut [s]: it bends more than what fitted states of calm windows may
+MOST = 400  # windows; of longer flights these are spread evenly over all
+POSES_LEAST = 8  # measured poses without which a window says nothing
+
+
+@dataclass(frozen=True)
+class Cut:
+    """One window of one flight."""
+
+    flight: int
+    phase: str  # hover, flight, throw or ballistic
+    start: float  # [s]
+    end: float  # [s]
+    payload: int  # ATTACHED, LOOSE or NO_PAYLOAD, at its start
+    shaken: bool = False  # whether the rope came taut not long before
+    hung: bool = False  # whether the rope hung still until its start
+    told: bool = True  # whether its residuals count; otherwise it is only flown through
+
+
+def _split(first: float, last: float) -> list[tuple[float, float]]:
+    """Equal pieces of about :data:`LENGTH`."""
+    if last - first < LEAST:
+        return []
+    edges = np.linspace(first, last, max(round((last - first) / LENGTH), 1) + 1)
+    return list(pairwise(edges))
+
+
+def _phase(flight: Recorded, first: float, last: float) -> str:
+    pos = flight.vehicle.values[flight.vehicle.between(first, last)]
+    if len(pos) < 2:
+        return "flight"
+    reach = np.ptp(pos, axis=0) / (last - first)
+    return "hover" if np.linalg.norm(reach) < QUIET_SPEED else "flight"
+
+
+def payload_down(flight: Recorded, landing_height: float) -> float:
+    """When the payload is about to come down, or NEVER [s]."""
+    if flight.payload is None or flight.latch == NEVER:
+        return flight.landing
+    after = flight.payload.time > flight.latch
+    low = after & (flight.payload.values[:, 2] < landing_height + GROUND_MARGIN)
+    return min(flight.landing, float(flight.payload.time[low][0])) if np.any(low) else flight.landing
+
+
+def cut(flight: Recorded, number: int, lag: float, landing_height: float, carries: bool) -> list[Cut]:
+    """Cut one flight.
+
+    Args:
+        flight: what was recorded.
+        number: of the flight.
+        lag: of the release, as far as known [s].
+        landing_height: of the payload's centre [m].
+        carries: whether the flight carries a payload.
+    """
+    first, last = flight.start, flight.end
+    separation = flight.latch + lag
+    hanging = ATTACHED if carries else NO_PAYLOAD
+    down = payload_down(flight, landing_height)
+    if not carries or separation > last:
+        spans = [(a, b, "", hanging) for a, b in _split(first, last)]
+    else:
+        before, after = max(first, separation - BEFORE), min(last, separation + AFTER, down)
+        spans = [(a, b, "", hanging) for a, b in _split(first, before)]
+        spans.append((before, after, "throw", ATTACHED))
+        end = min(down, last)
+        spans += [(a, b, "ballistic", LOOSE) for a, b in _split(after, end)]
+        spans += [(a, b, "", NO_PAYLOAD) for a, b in _split(max(end, after), last)]
+    cuts = [Cut(number, phase or _phase(flight, a, b), a, b, mode) for a, b, phase, mode in spans]
+    until = [cuts[max(i - 1, 0)].phase for i in range(len(cuts))]  # the first window's own: nothing is known of before
+    return [replace(c, hung=phase == "hover") for c, phase in zip(cuts, until) if _seen(flight, c)]
+
+
+def thinned(cuts: list[Cut], most: int = MOST) -> list[Cut]:
+    """Of hours of flight, all throws and what follows them, and so many of the other windows that ``most`` are left."""
+    plain = [i for i, c in enumerate(cuts) if c.phase not in ("throw", "ballistic")]
+    room = max(most - len(cuts) + len(plain), most // 4)
+    if len(plain) <= room:
+        return cuts
+    dropped = set(plain) - {plain[i] for i in np.linspace(0, len(plain) - 1, room).astype(int)}
+    return [c for i, c in enumerate(cuts) if i not in dropped]
+
+
+def around_slack(c: Cut, first: float, last: float, separation: float) -> list[Cut]:
+    """A window cut about the time in which the rope was slack: that is only flown through.
+
+    Args:
+        c: the window.
+        first, last: of that time [s].
+        separation: of the payload [s]; a rope that comes taut no sooner leaves a window of the flight after it.
+    """
+    free = c.start < separation < min(last + LEAST_TAUT, c.end)
+    last = min(max(last, separation + LATE), c.end) if free else min(last, c.end)
+    rest = replace(c, start=last, payload=LOOSE, phase="ballistic") if free else replace(c, start=last, shaken=True)
+    before = replace(c, end=first, phase="flight" if c.phase == "throw" else c.phase)
+    pieces = [before, replace(c, start=first, end=last, told=False), rest]
+    return [replace(p, told=p.told and p.end - p.start > LEAST) for p in pieces if p.end - p.start > 1e-6]
+
+
+def _seen(flight: Recorded, c: Cut) -> bool:
+    span = flight.vehicle.between(c.start, c.end)
+    return span.stop - span.start >= POSES_LEAST

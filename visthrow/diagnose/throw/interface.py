@@ -1,0 +1,142 @@
+"""Mistakes between a log and the simulation that are either there or not: axes, signs and units of the commands.
+
+They are looked for before any effect is estimated: such a mistake is gross, and no small deviation stands for it. Each hypothesis
+must hold in all logs that can tell; the commands are then put right and the diagnosis goes on. (Commands that bear the time of
+their arrival are no gross mistake: they show as the effect ``cmd_delay`` on its bound, the link's delay less.)
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sim.params import GRAVITY, PlantParams
+from visthrow.diagnose.check import relations
+from visthrow.diagnose.throw.recorded import measured
+from visthrow.logs.flightlog import Channel, FlightLog
+
+FIRMLY, CLEARLY = 0.8, 0.15
+"""Correlation of commanded and measured rates that a hypothesis needs, and by how much it must beat the log as it stands."""
+WORSE = 0.05
+"""What a log whose own axes tell little may lose by the hypothesis."""
+MOVES = 0.3  # rates that say something about their axes [rad/s]
+AXES_NATS = float(np.log(48.0))  # so many ways to exchange and turn around three axes
+THRUST = {"N": 1.0, "g of thrust": 9.80665e-3, "mN": 1e-3, "kg of thrust": 9.80665}
+"""Units of a thrust, in newtons."""
+NEAR = 0.25  # of the logarithm of a ratio: hover thrust against weight, gain of the rates
+FAR = 0.8  # the same from which another unit is considered at all
+
+
+@dataclass(frozen=True)
+class Mistake:
+    """One hypothesis that the logs bear out."""
+
+    name: str
+    cause: str  # in words
+    equation: str  # what puts it right
+    nats: float  # by which it beats the log as it stands
+    logs: int  # that can tell
+
+    @property
+    def sentence(self) -> str:
+        """For people."""
+        return f"{self.cause}: {self.name}, {self.equation}; {self.nats:.0f} nats from {self.logs} logs. It was put right."
+
+
+def put_right(logs: Sequence[FlightLog], plant: PlantParams) -> tuple[list[FlightLog], tuple[Mistake, ...]]:
+    """Logs with their commands as the simulation takes them, and what was wrong with them."""
+    found: list[Mistake] = []
+    mended, relation = list(logs), [_followed(log) for log in logs]
+    for look in (_axes, _rate_unit):
+        told = [r for r in relation if r is not None]
+        mistake = look(told) if told else None
+        if mistake is None:
+            continue
+        trial = [_commanded(log, matrix=mistake[1]) for log in mended]
+        again = [_followed(log) for log in trial]
+        if all(r is None or (s is not None and s.correlation > r.correlation - WORSE) for r, s in zip(relation, again)):
+            found.append(mistake[0])
+            mended, relation = trial, again
+    weight = GRAVITY * (plant.vehicle.body.mass + plant.rope.payload_mass + plant.rope.rope_mass)
+    mistake = _thrust_unit(mended, weight, THRUST | {"shares of the full thrust": 4.0 * plant.vehicle.controller.max_thrust})
+    if mistake is not None:
+        found.append(mistake[0])
+        mended = [_commanded(log, scale=mistake[1]) for log in mended]
+    return mended, tuple(found)
+
+
+def _followed(log: FlightLog) -> relations.Relation | None:
+    """How the measured attitude's rates follow the commanded ones; None where nothing turns."""
+    attitude = measured(log, "quat_wb")
+    if attitude is None or "command" not in log or np.count_nonzero(attitude.valid) < 50:
+        return None
+    command = log["command"]
+    time, rate = relations.rates_of(attitude.time[attitude.valid], np.asarray(attitude.values, dtype=float)[attitude.valid])
+    wanted = np.asarray(command.values, dtype=float)[command.valid, 1:]
+    if len(time) < 50 or len(wanted) < 20 or np.max(np.std(rate, axis=0)) < MOVES:
+        return None
+    found = relations.relate(command.time[command.valid], wanted, time, rate)
+    return found if found is not None and found.axes_correlation > FIRMLY else None
+
+
+def _nats(better: np.ndarray, plain: np.ndarray) -> float:
+    """Evidence of correlations against others [nats], counting ten independent samples a log."""
+    return float(5.0 * np.sum(np.log((1.0 - np.minimum(plain, 0.999) ** 2) / (1.0 - np.minimum(better, 0.999) ** 2))))
+
+
+def _axes(relation: Sequence[relations.Relation]) -> tuple[Mistake, np.ndarray] | None:
+    """Exchanged or turned axes of the commanded rates, where all logs that can tell say the same, and they are most."""
+    clear = [r for r in relation if r.axes_correlation > r.correlation + CLEARLY]
+    names = {r.axes for r in clear}
+    own, best = (np.array([getattr(r, n) for r in clear]) for n in ("correlation", "axes_correlation"))
+    nats = _nats(best, np.maximum(own, 0.0)) - AXES_NATS
+    if len(names) != 1 or 2 * len(clear) < len(relation) or nats < AXES_NATS:
+        return None
+    axes = names.pop().split(",")
+    matrix = np.zeros((3, 3))
+    for row, axis in enumerate(axes):
+        matrix[row, "xyz".index(axis[-1])] = -1.0 if axis.startswith("-") else 1.0
+    turned = sorted(axis[-1] for axis in axes) == [axis[-1] for axis in axes]
+    name, cause = ("rate_sign", "A commanded rate has the other sign") if turned else ("rate_axes", "Commanded rates are exchanged")
+    return Mistake(name, cause, f"x, y, z of the vehicle are ({','.join(axes)}) of the command", nats, len(clear)), matrix
+
+
+def _rate_unit(relation: Sequence[relations.Relation]) -> tuple[Mistake, np.ndarray] | None:
+    """Degrees for radians, or radians for degrees, in the commanded rates."""
+    gain = float(np.median([r.scale for r in relation if r.correlation > FIRMLY] or [1.0]))
+    for factor, words in ((np.pi / 180.0, "degrees a second"), (180.0 / np.pi, "radians that were converted twice")):
+        if gain > 0.0 and abs(np.log(gain / factor)) < NEAR:
+            nats = float(len(relation) * 0.5 * (np.log(gain) / NEAR) ** 2)
+            mistake = Mistake("rate_unit", f"Commanded rates are in {words}", f"rates times {factor:.5g}", nats, len(relation))
+            return mistake, factor * np.eye(3)
+    return None
+
+
+def _thrust_unit(logs: Sequence[FlightLog], weight: float, units: Mapping[str, float]) -> tuple[Mistake, float] | None:
+    """Another unit of the commanded thrust, from its median against the weight that it carries [N]."""
+    medians = [float(np.median(c.values[c.valid, 0])) for log in logs if "command" in log and np.any((c := log["command"]).valid)]
+    if not medians:
+        return None
+    ratio = float(np.median(medians)) / weight
+    if not 0.0 < ratio < np.inf or abs(np.log(ratio)) < FAR:
+        return None
+    fits = {unit: abs(np.log(ratio * newtons)) for unit, newtons in units.items()}
+    unit = min(fits, key=fits.get)
+    if fits[unit] > NEAR or unit == "N":
+        return None
+    nats = float(len(medians) * 0.5 * (np.log(ratio) / NEAR) ** 2)
+    mistake = Mistake("thrust_unit", f"Commanded thrust is in {unit}", f"thrust times {units[unit]:.5g}", nats, len(medians))
+    return mistake, units[unit]
+
+
+def _commanded(log: FlightLog, matrix: np.ndarray | None = None, scale: float = 1.0) -> FlightLog:
+    """The log with other commands."""
+    if "command" not in log:
+        return log
+    c = log["command"]
+    values = np.array(c.values, dtype=float)
+    values[:, 0] *= scale
+    if matrix is not None:
+        values[:, 1:] = values[:, 1:] @ matrix.T
+    return FlightLog({**log.channels, "command": Channel(c.time, values, c.unit, c.frame, c.valid)}, log.meta)
+

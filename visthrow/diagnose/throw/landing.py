@@ -1,0 +1,214 @@
+"""Where throws come down: simulated open loop from before the throw, against where the payload was seen to land.
+
+A second before the separation the initial state is fitted to 0.4 s of measurements; from there on nothing but the recorded
+commands is used, so that the landing is predicted through the throw, the release and the ballistic flight. Beside it stands the
+prediction from a state that is fitted up to the separation: what is then left comes from release and flight alone.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sim.replay.kernel import ATTACHED
+from sim.replay.lanes import Replay
+from visthrow.common.statistics import mean
+from visthrow.diagnose.throw.cutting import BEFORE, GROUND_MARGIN, LEAST, LEAST_TAUT, Cut, payload_down
+from visthrow.diagnose.throw.recorded import NEVER, Recorded, Samples
+from visthrow.diagnose.throw.replay import Flights, Lane, downloaded
+
+if TYPE_CHECKING:
+    from visthrow.diagnose.select.work import Work
+    from visthrow.diagnose.throw.throw_model import ThrowModel
+
+LEAD = 1.0  # before the separation, at which the open loop begins [s]
+HEAD = 0.4  # of it, over which the initial state is fitted [s]
+TRACK = 0.1  # of the payload's track just above the ground, from which a landing is taken [s]
+LEAST_TRACK = 6  # samples of it
+AFTERWARDS = 0.4  # simulated beyond the measured landing [s]
+TICK = 5e-3  # between the points of a simulated path [s]; a chord is 0.03 mm off the parabola
+
+
+@dataclass(frozen=True)
+class Landings:
+    """Throws of which the landing was seen; points [m] on the plane of the landing, in the measured frame."""
+
+    flights: np.ndarray  # their numbers, shape (F,)
+    measured: np.ndarray  # shape (F, 3)
+    predicted: np.ndarray  # open loop from before the throw, shape (F, 3); NaN where it never comes down
+    released: np.ndarray  # from a state fitted up to the separation, shape (F, 3)
+
+    @property
+    def errors(self) -> np.ndarray:
+        """Horizontal distance of the open-loop prediction from the measured landing [m], shape (F,)."""
+        return np.linalg.norm((self.predicted - self.measured)[:, :2], axis=1)
+
+    @property
+    def released_errors(self) -> np.ndarray:
+        """The same of the prediction from the separation [m], shape (F,)."""
+        return np.linalg.norm((self.released - self.measured)[:, :2], axis=1)
+
+
+@dataclass(frozen=True)
+class LandingGain:
+    """What the named causes do to predicted landings; lengths in metres, intervals of 95 % by bootstrap over throws."""
+
+    throws: int
+    held_out: bool  # whether each throw was predicted with causes sized by the other flights
+    before: float  # mean distance of prediction and measurement, open loop from before the throw, the model as it stands
+    after: float  # with what was named
+    low: float  # of ``after``
+    high: float
+    released_before: float  # the same from a state fitted up to the separation
+    released_after: float
+    moved: dict[str, float]  # named effect -> mean distance by which it moves the predicted landings
+    off_before: tuple[tuple[float, float], ...] = ()  # of each throw, prediction less measurement along world x and y
+    off_after: tuple[tuple[float, float], ...] = ()
+
+
+def seen_landing(flight: Recorded, height: float) -> tuple[float, np.ndarray] | None:
+    """Time [s] and point [m] at which a payload came down; None where nobody saw it.
+
+    Without a logged landing the track just above the ground is carried on to ``height`` by a parabola.
+    """
+    if flight.latch == NEVER:
+        return None
+    if flight.landing_point is not None:
+        return flight.landing, flight.landing_point
+    if flight.payload is None:
+        return None
+    track = flight.payload
+    down = payload_down(flight, height)
+    above = (track.time > max(down - TRACK, flight.latch)) & (track.time < down + TICK) & (track.values[:, 2] > height)
+    if down == NEVER or np.count_nonzero(above) < LEAST_TRACK or track.values[above][-1, 2] > height + 2.0 * GROUND_MARGIN:
+        return None
+    time = track.time[above] - down
+    fit = np.polynomial.polynomial.polyfit(time, track.values[above], 2)
+    falls = np.roots((fit[::-1, 2]) - [0.0, 0.0, height])
+    falls = falls[np.isreal(falls)].real
+    late = falls[(falls > time[0]) & (falls < TRACK)]
+    if not len(late):
+        return None
+    return down + float(late.min()), np.polynomial.polynomial.polyval(float(late.min()), fit)
+
+
+def landings(model: "ThrowModel", theta: Mapping[str, float], flights: Iterable[int] | None = None) -> Landings:
+    """Predict the landings of throws with effects at ``theta``.
+
+    Args:
+        model: of the flights.
+        theta: sizes of effects in their units; those not named at 0.
+        flights: numbers of flights to look at; default all.
+    """
+    plane = model.setting.plant.release.landing_height
+    numbers = range(len(model.flights.flights)) if flights is None else flights
+    known = {n: seen for n in numbers if (seen := seen_landing(model.flights.flights[n], plane)) is not None}
+    spans = {n: found for n in known if (found := _spans(model, n)) is not None}
+    if not spans:
+        return Landings(np.zeros(0, dtype=int), *np.zeros((3, 0, 3)))
+    ends = {n: known[n][0] + AFTERWARDS for n in spans}
+    paths = [_fly(model, theta, {n: both[k] for n, both in spans.items()}, ends) for k in range(2)]
+    return Landings(np.array(list(spans)), np.array([known[n][1] for n in spans]), *paths)
+
+
+def _spans(model: "ThrowModel", number: int) -> tuple[tuple[float, float], tuple[float, float]] | None:
+    """Where a throw's state is fitted [s]: before the open loop, and up to the separation; both outside of a slack rope."""
+    flight = model.flights.flights[number]
+    separation = flight.latch + model.setting.plant.release.lag
+    own = [c for c in model.flights.cuts if c.flight == number and c.start < separation]
+    if not own:
+        return None
+    slack = [(c.start, c.end) for c in own if not c.told]
+    end = min([separation - LEAD + HEAD, *[first for first, last in slack if last > separation - LEAD]])
+    last = max([separation - BEFORE, own[0].start, *[last for _, last in slack]])
+    head = max(end - HEAD, own[0].start), end
+    return (head, (last, separation)) if head[1] - head[0] > LEAST and separation - last > LEAST_TAUT else None
+
+
+def _fly(model: "ThrowModel", theta: Mapping[str, float], spans: Mapping[int, tuple[float, float]],
+         ends: Mapping[int, float]) -> np.ndarray:  # fmt: skip
+    """Landing points of throws whose states are fitted over ``spans`` and flown on to ``ends``, shape (F, 3)."""
+    cuts = [c for n, (begin, end) in spans.items() for c in _approach(model, n, begin, end)]
+    setting, states = model.beside(cuts).begun(theta)
+    release, x = setting.plant.release, model.setting.sensing
+    told = [w for w, c in enumerate(cuts) if c.told]
+    flown = [replace(cuts[w], end=ends[cuts[w].flight]) for w in told]
+    looked = [_with_path(f, ends.get(n)) for n, f in enumerate(model.flights.flights)]
+    onward = Flights(looked, flown, (x.vehicle_delay, x.payload_delay, x.gyro_delay))
+    lanes = [Lane(i, 0, w) for i, w in enumerate(told)]
+    replay = Replay([setting.plant], [setting.sensing], model.device, download=downloaded)
+    seen = onward.fly(replay, [setting], states, lanes, model.substep).seen
+    out = np.full((len(flown), 3), np.nan)
+    for i, c in enumerate(flown):
+        first, count = 2 * int(onward.windows["vehicle_count"][i]), int(onward.windows["payload_count"][i])
+        time, path = onward.samples["payload"][i].time, seen[first : first + count, i]
+        out[i] = _crossing(path[time > looked[c.flight].latch + release.lag], release.landing_height)
+    return out
+
+
+def _approach(model: "ThrowModel", number: int, begin: float, end: float) -> list[Cut]:
+    """A flight's windows before ``begin``, only flown through, and the one that its state is fitted over."""
+    before = [c for c in model.flights.cuts if c.flight == number and c.start < begin - 1e-3]
+    through = [replace(c, end=min(c.end, begin), told=False) for c in before]
+    return [*through, Cut(number, "throw", begin, end, ATTACHED)]
+
+
+def _with_path(flight: Recorded, end: float | None) -> Recorded:
+    """The flight with stamps of a payload all the way down in place of the measured ones."""
+    if end is None:
+        return flight
+    time = np.arange(flight.latch, end + 1.0, TICK)
+    return replace(flight, payload=Samples(time, np.zeros((len(time), 3)), 1.0), gyro=None)
+
+
+def _crossing(path: np.ndarray, height: float) -> np.ndarray:
+    """Where a path, shape (T, 3), comes down through a height; NaN where it does not."""
+    down = np.flatnonzero((path[:-1, 2] > height) & (path[1:, 2] <= height))
+    if not len(down):
+        return np.full(3, np.nan)
+    a, b = path[down[0]], path[down[0] + 1]
+    return a + (a[2] - height) / (a[2] - b[2]) * (b - a)
+
+
+def landing_gain(
+    work: "Work", theta: Mapping[str, float], trained: Mapping[int, Mapping[str, float]], seed: int
+) -> LandingGain | None:
+    """What the named causes do to predicted landings.
+
+    Args:
+        work: of the diagnosis.
+        theta: sizes of the named effects.
+        trained: flight -> their sizes by the other flights; empty where none were held out.
+        seed: of the bootstrap.
+
+    Returns:
+        None where the model has no throws whose landing was seen.
+    """
+    model = work.problem.model
+    if not hasattr(model, "landings"):
+        return None
+    flown = sorted({w.flight for w in work.after.windows})
+    plain = model.landings({}, flown)
+    named = model.landings(theta, flown) if theta else plain
+    held = joined([model.landings(trained[int(f)], [int(f)]) for f in plain.flights]) if trained else named
+    good = np.isfinite(plain.errors) & np.isfinite(held.errors)
+    if not good.any():
+        return None
+    moved = {}
+    for name in theta:
+        others = {other: size for other, size in theta.items() if other != name}
+        without = model.landings(others, flown) if others else plain
+        moved[name] = float(np.nanmean(np.linalg.norm((named.predicted - without.predicted)[good, :2], axis=1)))
+    after = mean(held.errors[good], seed=seed)
+    released = [float(np.nanmean(found.released_errors[good])) for found in (plain, held)]
+    off = [tuple(map(tuple, (x.predicted - x.measured)[good, :2].tolist())) for x in (plain, held)]
+    return LandingGain(
+        int(good.sum()), bool(trained), float(plain.errors[good].mean()), after.value, after.low, after.high, *released, moved, *off
+    )
+
+
+def joined(parts: Sequence[Landings]) -> Landings:
+    """Landings of several sets of throws in one."""
+    names = ("flights", "measured", "predicted", "released")
+    return Landings(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))

@@ -1,0 +1,168 @@
+"""What a replay needs of a flight log: commands, release, and what was measured of vehicle, payload and gyro."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from visthrow.common.errors import DiagnoseError
+from visthrow.diagnose.likelihood.noise import highpass_sigma
+from visthrow.logs.flightlog import Channel, FlightLog
+
+NEVER = 1e9  # a time after every flight [s]
+LEAST_SIGMA = {"pos_w": 2e-5, "quat_wb": 1e-4, "payload_pos_w": 2e-5, "rate_b": 1e-3}
+"""Noise below which no channel is believed: what numerics and rounding leave [m], [rad], [m], [rad/s]."""
+
+AT_START = 0.25  # of a log, whose voltages tell how much charge was used before [s]
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Valid samples of one measured channel."""
+
+    time: np.ndarray  # [s], shape (T,)
+    values: np.ndarray  # shape (T, 3) or (T, 4)
+    sigma: float  # of one component; of an attitude the angle's [rad]
+    near: dict = field(default_factory=dict, repr=False, compare=False)  # what they say about times that were asked for before
+
+    def between(self, first: float, last: float) -> slice:
+        """Samples with first <= time < last."""
+        return slice(*np.searchsorted(self.time, (first, last)))
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """One flight."""
+
+    command_time: np.ndarray  # [s], shape (C,)
+    command: np.ndarray  # [N, rad/s], shape (C, 4)
+    latch: float  # of the release, or NEVER [s]
+    landing: float  # of the payload, or NEVER [s]
+    vehicle: Samples  # positions [m]; attitudes at the same stamps in ``attitude``
+    attitude: Samples  # quaternions xyzw
+    payload: Samples | None
+    gyro: Samples | None
+    voltage: float | None  # at the start [V]
+    hung: bool | None = None  # whether the log says that a payload hung below at its start; None where it does not
+    landing_point: np.ndarray | None = None  # where the log says that the payload came down [m], shape (3,)
+
+    @property
+    def start(self) -> float:
+        """First time from which both commands and poses are known [s]."""
+        return max(self.command_time[0], self.vehicle.time[0])
+
+    @property
+    def end(self) -> float:
+        """Last time that both reach [s]."""
+        period = np.median(np.diff(self.command_time)) if len(self.command_time) > 1 else 0.02
+        return min(self.command_time[-1] + period, self.vehicle.time[-1] + 1e-6)
+
+
+def measured(log: FlightLog, name: str) -> Channel | None:
+    """A channel as it was measured, where a log holds the truth beside it; None without any valid sample."""
+    for candidate in (f"measured_{name}", name):
+        if candidate in log and np.any(log[candidate].valid):
+            return log[candidate]
+    return None
+
+
+def _samples(log: FlightLog, name: str) -> Samples | None:
+    channel = measured(log, name)
+    if channel is None:
+        return None
+    time, values = channel.time[channel.valid], np.asarray(channel.values, dtype=float)[channel.valid]
+    fresh = np.ones(len(time), dtype=bool)
+    fresh[1:] = np.any(values[1:] != values[:-1], axis=1)  # a repeated sample is a stale one
+    if np.count_nonzero(fresh) < 5:
+        return None
+    time, values = time[fresh], values[fresh]
+    if name == "quat_wb":
+        values = values / np.linalg.norm(values, axis=1, keepdims=True)
+        flips = np.cumprod(np.sign(np.append(1.0, np.sum(values[1:] * values[:-1], axis=1)) + 1e-12))
+        values = values * np.sign(flips)[:, None]
+        sigma = 2.0 * float(np.sqrt(np.sum(highpass_sigma(values) ** 2) / 3.0))  # an angle moves three of four by its half
+    else:
+        sigma = float(np.median(highpass_sigma(values)))
+    return Samples(time, values, max(sigma, LEAST_SIGMA[name]))
+
+
+def record_of(log: FlightLog, number: int = 0) -> Recorded:
+    """Take from a log what a replay needs.
+
+    Raises:
+        DiagnoseError: No commands, or no poses of the vehicle.
+    """
+    missing = [name for name in ("command", "pos_w", "quat_wb") if measured(log, name) is None]
+    if missing:
+        raise DiagnoseError(
+            f"flight {number} holds no {' and no '.join(missing)}; a replay needs command, pos_w and quat_wb; "
+            f"it has {', '.join(sorted(log.channels))}"
+        )
+    command, pos, quat = log["command"], _samples(log, "pos_w"), _samples(log, "quat_wb")
+    if pos is None or quat is None:
+        raise DiagnoseError(f"flight {number} holds fewer than five poses of the vehicle")
+    common, at_pos, at_quat = np.intersect1d(np.round(pos.time, 7), np.round(quat.time, 7), return_indices=True)
+    if len(common) < 5:
+        raise DiagnoseError(f"flight {number}: positions and attitudes of the vehicle have no stamps in common")
+    pos = Samples(pos.time[at_pos], pos.values[at_pos], pos.sigma)
+    quat = Samples(pos.time, quat.values[at_quat], quat.sigma)
+    return Recorded(
+        command.time[command.valid], np.asarray(command.values, dtype=float)[command.valid], _latch(log), _landing(log),
+        pos, quat, _payload(log), _samples(log, "rate_b"),
+        _voltage(log), _hung(log), _landing_point(log),
+    )  # fmt: skip
+
+
+def carriers(flights: Sequence[Recorded]) -> list[bool]:
+    """Whether each flight carries a payload: as its log says, else if it was measured or released there.
+
+    Where no flight measured the payload, one release tells that it hung below in all.
+    """
+    measured_somewhere = any(f.payload is not None for f in flights)
+    released_somewhere = any(f.latch != NEVER for f in flights)
+    seen = [f.payload is not None or f.latch != NEVER if measured_somewhere else released_somewhere for f in flights]
+    return [own if f.hung is None else f.hung for f, own in zip(flights, seen)]
+
+
+def _hung(log: FlightLog) -> bool | None:
+    if "attached" not in log or not np.any(log["attached"].valid):
+        return None
+    return bool(log["attached"].values[log["attached"].valid][0])
+
+
+def _latch(log: FlightLog) -> float:
+    """When the release was commanded."""
+    if "release_command" not in log:
+        return NEVER
+    channel = log["release_command"]
+    asked = np.flatnonzero(channel.valid & (np.asarray(channel.values, dtype=float) > 0.5))
+    return float(channel.time[asked[0]]) if len(asked) else NEVER
+
+
+def _landing(log: FlightLog) -> float:
+    if "landing" in log and np.any(log["landing"].valid):
+        return float(log["landing"].time[log["landing"].valid][0])
+    return NEVER
+
+
+def _voltage(log: FlightLog) -> float | None:
+    """Terminal voltage at the start of a log: the median of the samples of its first moment, as single ones are noisy."""
+    channel = measured(log, "battery_voltage")
+    if channel is None:
+        return None
+    time = channel.time[channel.valid]
+    return float(np.median(channel.values[channel.valid][time < time[0] + AT_START]))
+
+
+def _landing_point(log: FlightLog) -> np.ndarray | None:
+    if "landing" in log and np.any(log["landing"].valid):
+        return np.asarray(log["landing"].values[log["landing"].valid][0], dtype=float)
+    return None
+
+
+def _payload(log: FlightLog) -> Samples | None:
+    samples = _samples(log, "payload_pos_w")
+    if samples is None:
+        return None
+    keep = samples.time < _landing(log) - 1e-3
+    return Samples(samples.time[keep], samples.values[keep], samples.sigma) if np.count_nonzero(keep) >= 5 else None

@@ -1,0 +1,236 @@
+"""Recorded flights cut into windows, ready to be replayed in any setting: the arrays that all lanes of a batch share."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import warp as wp
+
+from sim.replay.kernel import ATTACHED, LOOSE, NO_PAYLOAD, WINDOW_FIELDS
+from sim.replay.lanes import Recording, Replay, Replayed
+from visthrow.diagnose.catalogue import Setting
+from visthrow.diagnose.likelihood.transfer import to_host
+from visthrow.diagnose.throw.cutting import Cut
+from visthrow.diagnose.throw.recorded import NEVER, Recorded, Samples
+from visthrow.diagnose.throw.states import States, rows_of, stacked
+
+KNOT_SPACING = 0.1  # of the latent forces [s]
+EARLY = 0.004  # after a window's start, before which no stamp is used: delays may move there [s]
+FINENESS = {"throw": 0.25}
+"""Step in a phase against the one asked for: the rope whips in throws."""
+FINEST = 0.01  # of the square of the step: a tenth of the step asked for
+ROUGHER = 3.0
+"""Added to the square of the step, in the nominal one, of rough lanes: twice as long steps."""
+STABLE = 1.75  # shortest lags of the vehicle's filters and rotors, above which a rough step may not go
+BATCH, CUDA_BATCH = 4096, 32768  # lanes of one run, which bounds its memory; on a GPU more lanes cost hardly more time
+
+
+class Lane(NamedTuple):
+    """What one lane of a batch flies; there are some ten thousand in a run."""
+
+    window: int
+    plant: int  # row of the settings
+    state: int  # row of the states
+    axis: int = -1  # of its latent force
+    knot: int = 0
+    size: float = 0.0
+    keep: int = -1
+    resume: int = -1  # row of what another lane keeps, at which this one leaves it
+    parent: int = -1  # that lane
+    rides: int = 0  # lanes after it that fly alike and see it otherwise
+    rough: bool = False  # whether it flies with longer steps
+
+
+class Flights:
+    """Windows of recorded flights as the replay's arrays.
+
+    Attributes:
+        cuts: the windows. knots: of each window, shape (W,). rows: of output of each window, in vectors. recording: for a replay.
+    """
+
+    def __init__(self, flights: Sequence[Recorded], cuts: Sequence[Cut], delays: tuple[float, float, float], stride: int = 1):
+        """Lay out flights and windows.
+
+        Args:
+            flights: all of them.
+            cuts: windows, by number of the flight.
+            delays: of vehicle, payload and gyro that the setting knows of [s].
+            stride: use every so many samples.
+        """
+        self.flights, self.cuts, self.stride = list(flights), list(cuts), stride
+        self._known: dict[tuple[str, int], np.ndarray] = {}
+        self.knots = np.array([int(np.ceil((c.end - c.start) / KNOT_SPACING - 1e-6)) + 1 for c in cuts])
+        self._fineness = np.array([FINENESS.get(c.phase, 1.0) for c in cuts])
+        lengths = np.cumsum([0] + [len(f.command_time) for f in self.flights])
+        self.windows = {name: np.zeros(len(self.cuts)) for name in WINDOW_FIELDS}
+        empty = np.zeros((0, 3))
+        parts: dict[str, list[Samples]] = {"vehicle": [], "attitude": [], "payload": [], "gyro": []}
+        counts = {"vehicle": 0, "payload": 0, "gyro": 0}
+        for w, c in enumerate(self.cuts):
+            f = self.flights[c.flight]
+            given = {
+                "start": c.start, "end": c.end, "first_knot": c.start, "knots": self.knots[w], "payload": c.payload,
+                "latch": f.latch if c.payload == ATTACHED else NEVER, "clock_zero": f.start,
+                "command_first": lengths[c.flight], "command_last": lengths[c.flight + 1],
+            }  # fmt: skip
+            sources = {"vehicle": f.vehicle, "payload": f.payload if c.payload in (ATTACHED, LOOSE) else None, "gyro": f.gyro}
+            for (name, source), delay in zip(sources.items(), delays):
+                rows = self._rows(source, c, delay)
+                given |= {f"{name}_first": counts[name], f"{name}_count": len(rows)}
+                counts[name] += len(rows)
+                chosen = source or Samples(np.zeros(0), empty, 1.0)
+                parts[name].append(Samples(chosen.time[rows], chosen.values[rows], chosen.sigma))
+                if name == "vehicle":
+                    parts["attitude"].append(Samples(f.attitude.time[rows], f.attitude.values[rows], f.attitude.sigma))
+            for name, value in given.items():
+                self.windows[name][w] = value
+        self.windows = {k: v.astype(int) if WINDOW_FIELDS[k][0] == "int" else v for k, v in self.windows.items()}
+        self.samples = parts
+        data = {
+            "command_time": np.concatenate([f.command_time for f in self.flights]),
+            "command": np.concatenate([f.command for f in self.flights]),
+            "vehicle_time": self._joined("vehicle").time, "vehicle_quat": self._joined("attitude").values,
+            "payload_time": self._joined("payload").time, "gyro_time": self._joined("gyro").time,
+        }  # fmt: skip
+        self.recording = Recording(self.windows, data)
+        self.rows = self.recording.rows
+
+    def _rows(self, source: Samples | None, c: Cut, delay: float) -> np.ndarray:
+        if source is None:
+            return np.zeros(0, dtype=int)
+        span = source.between(c.start + delay + EARLY, c.end + delay)
+        return np.arange(span.start, span.stop, self.stride)
+
+    def like(self, w: int) -> tuple[int, bool]:
+        """What :meth:`alike` depends on: the same of two windows, the same answer."""
+        c = self.cuts[w]
+        return c.payload, self.flights[c.flight].latch >= c.end
+
+    def alike(self, w: int, setting: Setting, other: Setting) -> bool:
+        """Whether a window is flown alike in two settings, which may be seen otherwise: what differs does nothing in it."""
+        c, plant = self.cuts[w], other.plant
+        if setting.step_square != other.step_square:
+            return False
+        if c.payload == NO_PAYLOAD and not plant.laws:
+            plant = replace(plant, rope=setting.plant.rope, release=setting.plant.release)
+        elif c.payload == ATTACHED and self.flights[c.flight].latch >= c.end:
+            plant = replace(plant, release=setting.plant.release)
+        return plant == setting.plant
+
+    def _joined(self, name: str) -> Samples:
+        parts = self.samples[name]
+        return Samples(np.concatenate([p.time for p in parts]), np.concatenate([p.values for p in parts]), 1.0)
+
+    def time(self, w: int) -> np.ndarray:
+        """Stamps of a window's samples [s], shape (N,)."""
+        return self._told("time", w)
+
+    def sigma(self, w: int) -> np.ndarray:
+        """Noise of a window's samples, shape (N,)."""
+        return self._told("sigma", w)
+
+    def _told(self, what: str, w: int) -> np.ndarray:
+        if (what, w) not in self._known:
+            names = ("vehicle", "vehicle" if what == "time" else "attitude", "payload", "gyro")
+            groups = [getattr(self.samples[name][w], what) for name in names]
+            self._known[what, w] = self.spread(w, *groups)
+        return self._known[what, w]
+
+    def spread(self, w: int, vehicle, attitude, payload, gyro) -> np.ndarray:
+        """A number for every sample of a window, from one for each row of its groups."""
+        s = self.samples
+        pairs = np.stack(np.broadcast_arrays(vehicle, attitude), axis=-1).ravel()
+        counts = len(s["vehicle"][w].time), len(s["payload"][w].time), len(s["gyro"][w].time)
+        if pairs.size == 2:
+            pairs = np.tile(pairs, counts[0])
+        rest = [np.broadcast_to(value, count) for value, count in zip((payload, gyro), counts[1:])]
+        return np.repeat(np.concatenate((pairs, *rest)), 3)
+
+    def residual(self, seen: np.ndarray, w: int, lane: int) -> np.ndarray:
+        """Measured minus simulated, shape (N,); of an attitude the rotation vector from the simulated to the measured."""
+        if ("measured", w) not in self._known:
+            nv = int(self.windows["vehicle_count"][w])
+            measured = np.zeros((int(self.rows[w]), 3))
+            measured[0 : 2 * nv : 2] = self.samples["vehicle"][w].values
+            measured[2 * nv :] = np.concatenate((self.samples["payload"][w].values, self.samples["gyro"][w].values))
+            self._known["measured", w] = measured
+        return (self._known["measured", w] - seen[: int(self.rows[w]), lane]).ravel()
+
+    def fly(
+        self,
+        replay: Replay,
+        settings: Sequence[Setting],
+        states: States,
+        lanes: Sequence[Lane],
+        substep: float,
+        recording: Recording | None = None,
+    ) -> Replayed:
+        """Fly lanes; ``settings`` are those of the replay's rows.
+
+        Args:
+            replay: built of the settings' plants and sensings.
+            settings: whose step sizes count.
+            states: initial states that the lanes choose from.
+            lanes: at most some thousand, for the memory's sake.
+            substep: largest integration step [s].
+            recording: the windows, if not as they are.
+        """
+        given = {name: np.array(values) for name, values in zip(Lane._fields, zip(*lanes))}
+        steps = np.array([(substep * np.sqrt(max(s.step_square, FINEST)), rough_step(s, substep)) for s in settings])
+        given["substep"] = steps[given["plant"], given.pop("rough").astype(int)] * self._fineness[given["window"]]
+        kept = given["keep"] >= 0
+        knots = max(1, int(np.max((given["keep"] + self.knots[given["window"]])[kept], initial=1)))
+        return replay.run(states, recording or self.recording, given, KNOT_SPACING, knots)
+
+    def ended(self, ends: Sequence[float]) -> Recording:
+        """The windows that end earlier [s]; what is seen afterwards says nothing."""
+        return Recording(self.windows | {"end": np.array(ends)}, self.recording.data)
+
+
+def downloaded(array: wp.array) -> np.ndarray:
+    """What a replay has written, on the host."""
+    return to_host(wp.to_torch(array)) if array.device.is_cuda else array.numpy()
+
+
+def rough_step(setting: Setting, substep: float) -> float:
+    """Length of a rough lane's steps [s]: twice the nominal one, as far as the vehicle's shortest lag allows."""
+    controller, motor = setting.plant.vehicle.controller, setting.plant.vehicle.motor
+    lags = [controller.gyro_time_constant, controller.setpoint_time_constant] if controller.kind == "betaflight" else []
+    lags += [motor.time_constant] if motor.kind != "instant" else []
+    lags += [motor.time_constant_down] if motor.kind == "asymmetric" else []
+    nominal = substep * np.sqrt(max(setting.step_square, FINEST))
+    longer = substep * np.sqrt(max(setting.step_square, FINEST) + ROUGHER)
+    return max(nominal, min([longer, *[STABLE * lag for lag in lags]]))
+
+
+def carried(flights: Flights, replay: Replay, setting: Setting, begin, substep: float) -> tuple[States, States]:
+    """Initial states of all windows: measured poses, and inner states carried through the windows before.
+
+    Args:
+        flights: the windows, those of one flight in order of time.
+        replay: whose row 0 is the setting.
+        setting: what is simulated.
+        begin: function ``(flight, cut, inner or None)`` -> one state, with ``inner`` the end of the window before.
+        substep: largest integration step [s].
+
+    Returns:
+        The states, and those at the windows' ends that they lead to.
+    """
+    by_flight: dict[int, list[int]] = {}
+    for w, c in enumerate(flights.cuts):
+        by_flight.setdefault(c.flight, []).append(w)
+    states: list[States | None] = [None] * len(flights.cuts)
+    ends: list[States | None] = [None] * len(flights.cuts)
+    for k in range(max(map(len, by_flight.values()))):
+        now = [ws[k] for ws in by_flight.values() if k < len(ws)]
+        for w in now:
+            c = flights.cuts[w]
+            before = by_flight[c.flight][k - 1] if k else None
+            gap = before is None or c.start > flights.cuts[before].end + 1e-6  # in which the inner states have gone
+            states[w] = begin(flights.flights[c.flight], c, None if gap else ends[before])
+        lanes = [Lane(w, 0, row, keep=0) for row, w in enumerate(now)]
+        flown = flights.fly(replay, [setting], stacked([states[w] for w in now]), lanes, substep)
+        for row, w in enumerate(now):
+            ends[w] = {name: value.copy() for name, value in rows_of(flown.ends, np.array([row])).items()}
+    return stacked(states), stacked(ends)

@@ -1,0 +1,311 @@
+"""Initial states of replay windows fitted to their samples by Levenberg and Marquardt, all windows at once.
+
+A simulation of every direction costs some thirty times one of the state itself. So derivatives are used for several steps, as
+long as each brings what it promised, and may come from another setting whose states were fitted before.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sim.replay.kernel import ATTACHED
+from sim.replay.lanes import Replay
+from visthrow.diagnose.catalogue import Setting
+from visthrow.diagnose.likelihood.threads import each
+from visthrow.diagnose.models.interface import Window
+from visthrow.diagnose.throw.replay import Flights, Lane, downloaded
+from visthrow.diagnose.throw.states import Direction, States, concerns, moved, moved_along, rows_of, stacked
+
+DAMPING, DAMPING_MOST = 1e-3, 1e5
+"""Of the Levenberg-Marquardt steps: at first, and where a window counts as settled."""
+ROUNDS = 25
+LADDER = np.array([1.0, 10.0, 100.0, 1000.0])
+"""Dampings that are tried at once, in the one at hand, for windows whose last step did not bring what it promised."""
+DRIFT = 0.02, 0.02, 0.02, 0.04
+"""Deviation that gusts bring a flight to in a second: position [m], attitude [rad], payload [m], rate [rad/s]. Fitted as though
+there were none, states took their place: bends of the rope of ten times their prior, after twenty steps."""
+CALMER = tuple(0.5**k for k in range(1, 11))  # of that, which windows may turn out to have had
+GROWTH = 1.5, 1.0, 1.5, 0.5  # powers of the time that they have had: forces act as noise, attitude and rate are controlled
+HUBER = 30.0  # deviations, beyond which a sample counts less
+SETTLED = 1.0, 0.003  # fall of the cost, and relative one, below which an initial state is settled
+SHRINKING = 0.1
+"""Of what the next step promises against what the last one did, below which derivatives from elsewhere lead to the goal."""
+TRUE, WHOLE = 0.5, 0.8
+"""Of what a step promised, that it must bring, and of what the least damped one promised, for derivatives to be used further."""
+ONWARD = 0.1  # flown after the last sample that tells of the start: sensors may be early [s]
+EARLIER = 0.05  # by which a payload may leave before it is expected to [s]
+SEEN = 0.25  # before that, without which an initial state is fitted to the whole window [s]
+TRUSTED = ("motor_speed",)
+"""Fields that are linearised about where the commands left them. Fitted without gusts they would take the gusts' place: rotors
+far from their commands at the start of a window, and with them a law of the thrust's slope that is none."""
+
+
+@dataclass(frozen=True)
+class _Trial:
+    """A step of each of L windows."""
+
+    states: States  # where it leads
+    steps: np.ndarray  # shape (L, directions)
+    damping: np.ndarray  # shape (L,)
+    hoped: np.ndarray  # fall of the cost that it promises, shape (L,)
+    whole: np.ndarray  # that of the least damped one that was tried, shape (L,)
+    cost: np.ndarray  # there, shape (L,)
+    residuals: list[np.ndarray]
+
+
+class Settling:
+    """Fits the states of the windows that count in one setting."""
+
+    def __init__(
+        self,
+        flights: Flights,
+        told: np.ndarray,
+        directions: tuple[Direction, ...],
+        setting: Setting,
+        *,
+        lag: float,
+        substep: float,
+        device: str,
+    ):
+        """Make ready.
+
+        Args:
+            flights: cut into windows.
+            told: windows that count.
+            directions: in which states may be wrong.
+            setting: what is simulated.
+            lag: of the release, as far as known [s].
+            substep: largest integration step [s].
+            device: of the replay.
+        """
+        self.flights, self.told, self.directions, self.setting = flights, told, directions, setting
+        self.substep = substep
+        self.slopes: dict[int, np.ndarray] = {}  # of windows' samples by their states, where they were taken last
+        self.replay = Replay([setting.plant], [setting.sensing], device, download=downloaded)
+        self._free = [
+            [d for d, x in enumerate(directions) if concerns(x, cut) and x.field not in TRUSTED] for cut in flights.cuts
+        ]  # directions in which windows' initial states are fitted
+        self._drift = [drift(flights, w) for w in range(len(flights.cuts))]
+        self._gusts = np.ones(len(flights.cuts))  # of each window, against the drift that is thought possible
+        self._spreads: dict[int, tuple[float, np.ndarray]] = {}  # and the samples' deviation with these
+        self._scales: dict[int, tuple] = {}  # the last slopes and deviations of a window, and what comes of them
+        self._tells, ends = zip(*[told_of_start(flights, w, lag) for w in range(len(flights.cuts))])
+        self._shortened = flights.ended(ends)
+
+    def fit(self, starts: Sequence[States], slopes: Mapping[int, np.ndarray] | None = None) -> States:
+        """Fit each window's initial state to its samples; no step that does not help is taken.
+
+        Args:
+            starts: states to begin with, each window with the best of its own; those that do not count keep the last.
+            slopes: of windows' samples by their states, as :attr:`slopes` of another fit has them.
+        """
+        count = len(self.flights.cuts)
+        moves, damping = np.zeros((count, len(self.directions))), np.full(count, DAMPING)
+        left, promised = self.told, np.full(count, np.inf)
+        self.slopes |= slopes or {}
+        aged = np.isin(np.arange(count), list(self.slopes))  # derivatives come from elsewhere
+        states, residuals = self._best(starts)
+        cost = self._costs(residuals)
+        stale, doubtful = ~aged, np.zeros(count, dtype=bool)
+        for _ in range(ROUNDS):
+            self.slopes |= self._slopes(states, left[stale[left]])
+            aged &= ~stale
+            trial = self._tried(states, left, residuals, moves, damping, doubtful)
+            helps = trial.cost < cost[left]
+            tried, hoped, whole = (np.full(count, value) for value in (np.inf, 0.0, 0.0))
+            tried[left], hoped[left], whole[left] = trial.cost, np.where(helps, trial.hoped, trial.whole), trial.whole
+            damping[left] = np.where(helps, trial.damping, damping[left])
+            better, rows = tried < cost, np.flatnonzero(helps)
+            residuals |= {left[row]: trial.residuals[row] for row in rows}
+            states = {name: value.copy() for name, value in states.items()}
+            for name, value in states.items():
+                value[left[rows]] = trial.states[name][rows]
+            moves[left[rows]] += trial.steps[rows]
+            fall = np.subtract(cost, tried, out=np.zeros(count), where=better)
+            enough = np.maximum(SETTLED[0], SETTLED[1] * np.where(better, tried, cost))
+            little = better & (fall < enough)
+            settled = little & (~aged | (hoped < SHRINKING * promised)) | (hoped < enough) & (damping <= DAMPING)
+            true = (fall > TRUE * hoped) & (hoped > WHOLE * whole)
+            stale = np.where(better, ~settled & (little | ~true), aged & ~settled)
+            raised = damping * np.where(doubtful, 10.0 * LADDER[-1], 10.0)
+            damping = np.where(better, damping / 10.0, np.where(aged, damping, raised))
+            doubtful = ~(better & true)
+            promised = np.where(better, hoped, promised)
+            aged, cost = aged | better, np.where(better, tried, cost)
+            for w in left[settled[left]]:
+                if self._calmed(w, residuals[w]):
+                    settled[w], promised[w] = False, np.inf
+                    cost[w] = self._cost(w, residuals[w])
+            left = left[~settled[left] & (damping[left] < DAMPING_MOST)]
+            if not len(left):
+                break
+        return states
+
+    def _best(self, starts: Sequence[States]) -> tuple[States, dict[int, np.ndarray]]:
+        """The best of each window's states, and what they leave; all are flown at once."""
+        told, count = self.told, len(self.told)
+        seen = self._residuals(stacked([rows_of(states, told) for states in starts]), np.tile(told, len(starts)))
+        cost = np.array([self._cost(w, residual) for w, residual in zip(np.tile(told, len(starts)), seen)])
+        which = cost.reshape(len(starts), count).argmin(axis=0)
+        best = {name: value.copy() for name, value in starts[-1].items()}
+        for name, value in best.items():
+            value[told] = np.stack([states[name][told] for states in starts])[which, np.arange(count)]
+        return best, {w: seen[start * count + row] for row, (w, start) in enumerate(zip(told, which))}
+
+    def _tried(
+        self, states: States, left: np.ndarray, residuals: Mapping[int, np.ndarray], moves: np.ndarray, damping: np.ndarray,
+        doubtful: np.ndarray,
+    ) -> _Trial:  # fmt: skip
+        """The next step of each window that is left, or the best of several."""
+        rungs = np.where(doubtful[left], len(LADDER), 1)
+        which, first = np.repeat(left, rungs), np.cumsum(rungs) - rungs
+        dampings = [damping[w] * LADDER[:n] for w, n in zip(left, rungs)]
+        each(self._scaled, left)
+        told = [self._increments(w, residuals[w], moves[w], its) for w, its in zip(left, dampings)]
+        tries, (steps, hoped) = np.concatenate(dampings), map(np.concatenate, zip(*told))
+        there = moved_along(rows_of(states, which), self.directions, steps)
+        seen = self._residuals(there, which)
+        cost = np.array([self._cost(w, residual) for w, residual in zip(which, seen)])
+        best = np.array([at + cost[at : at + n].argmin() for at, n in zip(first, rungs)])
+        rest = [seen[lane] for lane in best]
+        return _Trial(rows_of(there, best), steps[best], tries[best], hoped[best], hoped[first], cost[best], rest)
+
+    def _residuals(self, states: States, which: np.ndarray) -> list[np.ndarray]:
+        """Residuals of windows, of what tells of their initial states; a row of the states for each."""
+        f, lanes = self.flights, [Lane(w, 0, row) for row, w in enumerate(which)]
+        seen = f.fly(self.replay, [self.setting], states, lanes, self.substep, self._shortened).seen
+        return [self._tells[w] * f.residual(seen, w, lane) for lane, w in enumerate(which)]
+
+    def _costs(self, residuals: Mapping[int, np.ndarray]) -> np.ndarray:
+        """Costs of windows, infinite where there is no residual, shape (W,)."""
+        costs = np.full(len(self.flights.cuts), np.inf)
+        for w, residual in residuals.items():
+            costs[w] = self._cost(w, residual)
+        return costs
+
+    def _cost(self, w: int, residual: np.ndarray) -> float:
+        """Huber's cost of a window's residual; infinite where one is not finite."""
+        off = np.abs(residual) / self._spread(w)
+        cost = float(np.sum(np.where(off < HUBER, 0.5 * off**2, HUBER * (off - 0.5 * HUBER))))
+        return cost if np.isfinite(cost) else np.inf
+
+    def _spread(self, w: int) -> np.ndarray:
+        """Deviation of a window's samples from a flight without gusts: noise, and how far gusts may have led by then."""
+        gusts, spread = self._spreads.get(w, (np.nan, None))
+        if gusts != self._gusts[w]:
+            spread = np.hypot(self.flights.sigma(w), self._gusts[w] * self._drift[w])
+            self._spreads[w] = float(self._gusts[w]), spread
+        return spread
+
+    def _calmed(self, w: int, residual: np.ndarray) -> bool:
+        """Take a window's gusts for as strong as what is left of it says, if that is much less than was thought."""
+        square, noise, drift = residual**2, self.flights.sigma(w) ** 2, self._drift[w] ** 2
+        told = np.count_nonzero(self._tells[w])
+        calmer = [g for g in CALMER if g < self._gusts[w] and np.sum(square / (noise + g * g * drift)) < told]
+        if not calmer:
+            return False
+        self._gusts[w] = min(calmer)
+        return True
+
+    def _slopes(self, states: States, which: np.ndarray) -> dict[int, np.ndarray]:
+        """Derivatives of windows' samples by their initial states."""
+        if not len(which):
+            return {}
+        count, lanes, first = len(which), [], []
+        ways = {d: 1 + at for at, d in enumerate(sorted({d for w in which for d in self._free[w]}))}
+        for row, w in enumerate(which):
+            first.append(len(lanes))
+            lanes += [Lane(w, 0, row, rough=True), *[Lane(w, 0, ways[d] * count + row, rough=True) for d in self._free[w]]]
+        there = perturbed(rows_of(states, which), [self.directions[d] for d in ways])
+        seen = self.flights.fly(self.replay, [self.setting], there, lanes, self.substep, self._shortened).seen
+        slopes = {}
+        for at, w in zip(first, which):
+            ds, rows = self._free[w], int(self.flights.rows[w])
+            flat = np.swapaxes(seen[:rows, at : at + 1 + len(ds)], 1, 2).reshape(3 * rows, -1)
+            steps = np.array([self.directions[d].step for d in ds])
+            slopes[w] = (flat[:, 1:] - flat[:, :1]) / steps * self._tells[w][:, None]
+        return slopes
+
+    def _scaled(self, w: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Prior deviations of a window's state, its derivatives in these and the samples' deviations, and their inner products."""
+        slopes, spread = self.slopes[w], self._spread(w)
+        known = self._scales.get(w)
+        if known is None or known[0] is not slopes or known[1] is not spread:
+            sd = np.array([self.directions[d].spread(self.flights.cuts[w]) for d in self._free[w]])
+            scaled = slopes * sd / spread[:, None]
+            known = self._scales[w] = slopes, spread, (sd, scaled, scaled.T @ scaled)
+        return known[2]
+
+    def _increments(
+        self, w: int, residual: np.ndarray, done: np.ndarray, dampings: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+        """Levenberg-Marquardt steps of a window's state with its vague prior, and the falls that they promise.
+
+        Args:
+            w: the window.
+            residual: where it stands.
+            done: how far it has been moved, shape (directions,).
+            dampings: of the steps, shape (T,).
+
+        Returns:
+            Steps, shape (T, directions); falls of the cost, shape (T,).
+        """
+        ds, (sd, scaled, bend) = self._free[w], self._scaled(w)
+        off = residual / self._spread(w)
+        weight = np.minimum(1.0, HUBER / np.maximum(np.abs(off), 1e-12))
+        if np.any(weight < 1.0):
+            bend = scaled.T @ (scaled * weight[:, None])
+        normal = bend + np.eye(len(ds))
+        damped = normal + dampings[:, None, None] * np.diag(np.diag(normal))
+        slope = scaled.T @ (off * weight)
+        step = np.linalg.solve(damped, (slope - done[ds] / sd)[:, None])[..., 0]
+        out = np.zeros((len(dampings), len(done)))
+        out[:, ds] = step * sd
+        return out, step @ slope - 0.5 * np.sum(step @ bend * step, axis=1)
+
+
+def drift(flights: Flights, w: int) -> np.ndarray:
+    """How far gusts may have led a window's samples by their time, as a deviation, shape (N,)."""
+    since = np.maximum(flights.time(w) - flights.cuts[w].start, 0.0)
+    return flights.spread(w, *DRIFT) * since ** flights.spread(w, *GROWTH)
+
+
+def told_of_start(flights: Flights, w: int, lag: float) -> tuple[np.ndarray, float]:
+    """Which samples tell of a window's start, and how long it is flown for their sake [s].
+
+    They are 1 before the payload may have left, 0 later, for these tell of the release; all 1 where few are left.
+    """
+    c, time = flights.cuts[w], flights.time(w)
+    left = flights.flights[c.flight].latch + lag - EARLIER
+    if c.payload != ATTACHED or not c.start + SEEN < left < c.end:
+        return np.ones(len(time)), c.end
+    return (time < left).astype(float), min(left + ONWARD, c.end)
+
+
+def following(flights: Flights, w: int, window: Window, free: np.ndarray, lag: float) -> np.ndarray:
+    """How a window's initial state follows its effects: so that the flight stays as near to where it was as it can.
+
+    Args:
+        flights: cut into windows.
+        w: number of the window there.
+        window: its derivatives.
+        free: which parts of the state follow, shape (D,), bool.
+        lag: of the release, as far as known [s].
+
+    Returns:
+        Changes in the state's units by the effects' sizes, shape (D, K).
+    """
+    samples = len(flights.time(w))  # and those of a camera, which tell nothing of states
+    weight = (told_of_start(flights, w, lag)[0] / np.hypot(flights.sigma(w), drift(flights, w)))[:, None]
+    sd = window.nuisance_sd[free]
+    by_state = window.nuisance[:samples, free] * sd * weight
+    by_effect = (by_state * weight).T @ window.effects[:samples]
+    moves = np.zeros((len(free), by_effect.shape[1]))
+    moves[free] = -sd[:, None] * np.linalg.solve(by_state.T @ by_state + np.eye(len(sd)), by_effect)
+    return moves
+
+
+def perturbed(states: States, directions: Sequence[Direction]) -> States:
+    """The states, and after them each direction's perturbed ones: row ``(1 + d) W + w``."""
+    return stacked([states, *[moved(states, d, d.step) for d in directions]])

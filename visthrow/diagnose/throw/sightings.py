@@ -1,0 +1,277 @@
+"""What is measured besides poses and told without a simulation: where payloads landed, and what a camera saw.
+
+Each kind predicts its samples from what motion capture saw, taken back through the setting's delays, frame and markers, so that
+it depends on sensors, camera and landing plane alone. Its samples stand behind the simulated ones of their window.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Protocol
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from camera.params import CameraParams
+from sim.params import SensingParams
+from visthrow.diagnose.catalogue import Entry, Setting
+from visthrow.diagnose.likelihood.noise import highpass_sigma
+from visthrow.diagnose.models.interface import Window
+from visthrow.diagnose.throw.cutting import Cut
+from visthrow.diagnose.throw.recorded import NEVER, Recorded, Samples, measured
+from visthrow.diagnose.throw.states import smoothed
+from visthrow.logs.flightlog import FlightLog
+
+LANDING, KEYPOINTS = "landing", "keypoints"
+LANDING_SIGMA = 2e-3
+"""Of a logged landing's height [m]: a ball is pressed in, and samples lie milliseconds apart."""
+GRID = 0.02
+"""Between the smoothed poses that a camera's views are predicted from [s]."""
+NEAR = 0.025
+"""Reach of that smoothing [s]: attitudes change within 50 ms, which a wider one would show late."""
+SHORT = 1e-3
+"""Over which the speed of a keypoint is taken [s]: its row differs from the others' by a few milliseconds at most."""
+LEAST_KEYPOINT_SIGMA = 2e-4  # normalised
+MEASURED = np.array([(1, 1)] * 4 + [(1, 0), (0, 1), (1, 0), (0, 1)], dtype=bool)
+"""Coordinates (8, 2) that a detector measures: corners, and where each side of a box is; the rest are middles of sides."""
+ACTS_ON = ("camera.", "plant.release.landing_height", "plant.rope.payload_radius", "sensing.camera_")
+"""Numbers that nothing but these samples depends on: their effects need no simulation."""
+
+
+class Sighting(Protocol):
+    """Samples of one channel in each window."""
+
+    channel: str
+
+    def samples(self, window: int) -> tuple[np.ndarray, np.ndarray, float]:
+        """Stamps [s], values and sigma of a window, shape (N,), (N,), ()."""
+        ...
+
+    def predicted(self, window: int, setting: Setting) -> np.ndarray:
+        """The same in a setting, shape (N,)."""
+        ...
+
+
+def channels_of(logs: Sequence[FlightLog], flights: Sequence[Recorded], camera: CameraParams | None) -> list[str]:
+    """Channels of the sightings that the logs hold."""
+    landed = any(f.landing_point is not None and f.latch != NEVER for f in flights)
+    looked = camera is not None and any(seen_by_camera(log) and f.payload is not None for log, f in zip(logs, flights))
+    return [LANDING] * landed + [KEYPOINTS] * looked
+
+
+def sightings(logs: Sequence[FlightLog], flights: Sequence[Recorded], cuts: Sequence[Cut], setting: Setting) -> list[Sighting]:
+    """All that the logs hold of windows that count."""
+    held = channels_of(logs, flights, setting.camera)
+    heights: list[Sighting] = [LandingHeight(flights, cuts)] if LANDING in held else []
+    return heights + ([CameraView(logs, flights, cuts, setting)] if KEYPOINTS in held else [])
+
+
+def needs_no_flight(e: Entry) -> bool:
+    """Whether nothing but sightings shows an effect."""
+    return bool(e.keys) and all(key.path.startswith(ACTS_ON) for key in e.keys)
+
+
+def seen_by_camera(log: FlightLog) -> bool:
+    """Whether a log holds keypoints that a camera saw: those that a policy's pilot projected from poses say nothing about it."""
+    config = log.meta.get("config")
+    made = config.get("keypoints", "") if isinstance(config, dict) else ""
+    seen = made == "detector" or (made == "" and "policy" not in log.meta)
+    return seen and measured(log, KEYPOINTS) is not None and "keypoints_valid" in log
+
+
+def with_sightings(
+    window: Window, number: int, kinds: Sequence[Sighting], channels: Sequence[str], settings: Sequence[Setting], steps: np.ndarray
+) -> Window:
+    """A window with its sightings behind the simulated samples.
+
+    Args:
+        window: with a column for every effect.
+        number: of the window.
+        kinds: of sightings.
+        channels: of the model.
+        settings: the one that is linearised about, then one for each effect, a step away.
+        steps: of the effects, 0 for those without a derivative here, shape (K,).
+    """
+    for kind in kinds:
+        time, values, sigma = kind.samples(number)
+        if not len(time):
+            continue
+        plain = kind.predicted(number, settings[0])
+        columns = np.zeros((len(time), len(steps)))
+        for k in np.flatnonzero(steps):
+            other = settings[1 + k]
+            if other.sensing != settings[0].sensing or other.camera != settings[0].camera or kind.channel == LANDING:
+                columns[:, k] = (kind.predicted(number, other) - plain) / steps[k]
+        window = replace(
+            window, time=np.append(window.time, time), residual=np.append(window.residual, values - plain),
+            channel=np.append(window.channel, np.full(len(time), channels.index(kind.channel))),
+            sigma=np.append(window.sigma, np.full(len(time), sigma)), effects=np.vstack((window.effects, columns)),
+            nuisance=_longer(window.nuisance, len(time)), latent=_longer(window.latent, len(time)),
+        )  # fmt: skip
+    return window
+
+
+def _longer(columns: np.ndarray, rows: int) -> np.ndarray:
+    return np.vstack((columns, np.zeros((rows, columns.shape[1]))))
+
+
+def _origin(x: SensingParams, points: np.ndarray) -> np.ndarray:
+    """Measured points in the world's frame [m], shape (N, 3)."""
+    return Rotation.from_rotvec(x.frame_tilt).inv().apply(points) / (1.0 + x.scale)
+
+
+class LandingHeight:
+    """Height at which the payload's centre was when it came down [m]: one sample of a throw."""
+
+    channel = LANDING
+
+    def __init__(self, flights: Sequence[Recorded], cuts: Sequence[Cut]):
+        """Give each landing to the last window of its flight that counts."""
+        self._points: dict[int, tuple[float, np.ndarray]] = {}
+        for n, flight in enumerate(flights):
+            own = [w for w, c in enumerate(cuts) if c.flight == n and c.told]
+            if flight.landing_point is not None and flight.latch != NEVER and own:
+                self._points[own[-1]] = flight.landing, flight.landing_point
+
+    def samples(self, window: int) -> tuple[np.ndarray, np.ndarray, float]:
+        """See :class:`Sighting`."""
+        if window not in self._points:
+            return np.zeros(0), np.zeros(0), LANDING_SIGMA
+        time, point = self._points[window]
+        return np.array([time]), point[2:], LANDING_SIGMA
+
+    def predicted(self, window: int, setting: Setting) -> np.ndarray:
+        """See :class:`Sighting`."""
+        x, point = setting.sensing, self._points[window][1]
+        there = _origin(x, point[None])[0] - np.array(x.payload_offset)
+        there[2] = setting.plant.release.landing_height
+        seen = Rotation.from_rotvec(x.frame_tilt).apply(there + np.array(x.payload_offset)) * (1.0 + x.scale)
+        return seen[2:]
+
+
+class CameraView:
+    """Keypoints that a camera saw, normalised: payload's box, and the goal's corners where the log knows the goal."""
+
+    channel = KEYPOINTS
+
+    def __init__(self, logs: Sequence[FlightLog], flights: Sequence[Recorded], cuts: Sequence[Cut], setting: Setting):
+        """Smooth the poses about each view.
+
+        Args:
+            logs: flights. flights: the same as the replay takes them. cuts: windows. setting: the diagnosed one.
+        """
+        self._nominal, self._windows = setting, {}
+        for w, c in enumerate(cuts):
+            if c.told and seen_by_camera(logs[c.flight]) and flights[c.flight].payload is not None:
+                view = _view(logs[c.flight], flights[c.flight], c, setting.sensing)
+                if view is not None:
+                    self._windows[w] = view
+
+    def samples(self, window: int) -> tuple[np.ndarray, np.ndarray, float]:
+        """See :class:`Sighting`."""
+        if window not in self._windows:
+            return np.zeros(0), np.zeros(0), LEAST_KEYPOINT_SIGMA
+        view = self._windows[window]
+        time = np.broadcast_to(view["time"][:, None, None], view["points"].shape)
+        return time[view["valid"]].ravel(), view["points"][view["valid"]].ravel(), view["sigma"]
+
+    def predicted(self, window: int, setting: Setting) -> np.ndarray:
+        """See :class:`Sighting`; NaN where the lens is none."""
+        view, x = self._windows[window], setting.sensing
+        try:
+            lens = self._nominal.camera
+            row = lens.fisheye.cy + view["points"][..., 1] * _reach(lens)[1]
+            middle = row.mean(axis=1)
+            time = view["time"] - x.camera_delay + x.camera_line_time * middle
+            points = _seen(view, setting, self._nominal, time)
+            if x.camera_line_time != 0.0:
+                slope = (_seen(view, setting, self._nominal, time + SHORT) - points) / SHORT
+                points = points + slope * (x.camera_line_time * (row - middle[:, None]))[..., None]
+        except ValueError:
+            return np.full(np.count_nonzero(view["valid"]), np.nan)
+        return points[view["valid"]].ravel()
+
+
+def _reach(camera) -> np.ndarray:
+    """Pixels of 1 in normalised coordinates along x and y."""
+    from camera.fisheye import Fisheye
+
+    return np.array([camera.fisheye.fx, camera.fisheye.fy]) * float(Fisheye(camera.fisheye).edge_radius)
+
+
+def _view(log: FlightLog, flight: Recorded, c: Cut, x: SensingParams) -> dict | None:
+    """Views of one window: stamps, points, what is valid of them, goal, and smoothed poses on a grid about them."""
+    channel = measured(log, KEYPOINTS)
+    inside = channel.valid & (channel.time >= c.start) & (channel.time < c.end)
+    inside &= (channel.time > flight.payload.time[0]) & (channel.time < flight.payload.time[-1])
+    if np.count_nonzero(inside) < 5:
+        return None
+    valid = np.asarray(log["keypoints_valid"].values, dtype=bool)
+    stamps, kept = channel.time[inside], np.flatnonzero(inside)
+    at = np.searchsorted(log["keypoints_valid"].time, stamps - 1e-9)
+    points = np.asarray(channel.values, dtype=float)
+    goal = np.asarray(log["goal_w"].values, dtype=float)[0] if "goal_w" in log else log.meta.get("goal_w")
+    seen = valid[np.minimum(at, len(valid) - 1)]
+    if goal is None:
+        seen[:, :4] = False
+    grid = np.arange(stamps[0] - 3 * GRID, stamps[-1] + 4 * GRID, GRID)
+    table = {name: [smoothed(s, t, NEAR, NEAR) for t in grid] for name, s in _sources(flight, x).items()}
+    if any(row is None for rows in table.values() for row in rows):
+        return None
+    seen = seen[..., None] & MEASURED
+    if not np.any(seen):
+        return None
+    view = {"time": stamps, "points": points[kept], "valid": seen, "grid": grid,
+            "goal": np.zeros(3) if goal is None else np.asarray(goal, dtype=float)[:3],
+            "sigma": max(_noise(points[kept], seen), LEAST_KEYPOINT_SIGMA)}  # fmt: skip
+    return view | {name: (np.array([r[0] for r in rows]), np.array([r[1] for r in rows])) for name, rows in table.items()}
+
+
+def _noise(points: np.ndarray, seen: np.ndarray) -> float:
+    """Of coordinates while they are seen: what stands in the log where they are not is none."""
+    tracks = [points[seen[:, k, i], k, i] for k, i in zip(*np.nonzero(MEASURED))]
+    sigmas = [highpass_sigma(track) for track in tracks if len(track) > 3]
+    return float(np.median(sigmas)) if sigmas else 0.0
+
+
+def _sources(flight: Recorded, x: SensingParams) -> dict[str, Samples]:
+    """Tracks at the times that they show."""
+    tracks = {"vehicle": (flight.vehicle, x.vehicle_delay), "attitude": (flight.attitude, x.vehicle_delay),
+              "payload": (flight.payload, x.payload_delay)}  # fmt: skip
+    return {name: replace(track, time=track.time - delay) for name, (track, delay) in tracks.items()}
+
+
+def _at(view: dict, name: str, time: np.ndarray) -> np.ndarray:
+    """A smoothed track at times: points [m], or rotations from xyzw."""
+    grid, (values, slopes) = view["grid"], view[name]
+    k = np.clip(np.searchsorted(grid, time) - 1, 0, len(grid) - 2)
+    h = time - grid[k]
+    s = (h / GRID)[:, None]
+    turns = name == "attitude"
+    here = Rotation.from_quat(values[k]) if turns else None
+    chord = (here.inv() * Rotation.from_quat(values[k + 1])).as_rotvec() if turns else values[k + 1] - values[k]
+    # A cubic that meets both ends: a jump there, divided by a small delay, would pass for an effect of that delay.
+    bend = s * (1.0 - s) * ((1.0 - s) * (GRID * slopes[k] - chord) - s * (GRID * slopes[k + 1] - chord))
+    way = s * chord + bend
+    return (here * Rotation.from_rotvec(way)).as_quat() if turns else values[k] + way
+
+
+def _seen(view: dict, setting: Setting, nominal: Setting, time: np.ndarray) -> np.ndarray:
+    """Keypoints that the setting's camera sees at times, in the nominal lens's normalised coordinates, shape (T, 8, 2)."""
+    import torch
+
+    from camera.keypoints import KeypointCamera, keypoints
+
+    x, camera = setting.sensing, setting.camera
+    vehicle = time + (x.vehicle_delay - nominal.sensing.vehicle_delay)
+    frame, marker = Rotation.from_rotvec(x.frame_tilt), Rotation.from_rotvec(x.marker_rotation)
+    turned = frame.inv() * Rotation.from_quat(_at(view, "attitude", vehicle)) * marker.inv()
+    # The mount is stated from the centre of mass as it was believed: where the weight really lies moves no lens.
+    off = np.array(x.marker_offset) - np.array(nominal.plant.vehicle.body.com)
+    pos = _origin(x, _at(view, "vehicle", vehicle)) - turned.apply(off)
+    ball = _origin(x, _at(view, "payload", time + (x.payload_delay - nominal.sensing.payload_delay))) - np.array(x.payload_offset)
+    lens = KeypointCamera(camera, dtype=torch.float64)
+    arrays = pos, turned.as_matrix(), np.tile(view["goal"], (len(time), 1)), ball
+    points = keypoints(lens, *[torch.from_numpy(np.ascontiguousarray(v)) for v in arrays])[0].numpy()
+    own, other = camera.fisheye, nominal.camera.fisheye
+    pixel = points * _reach(camera) + np.array([own.cx, own.cy])
+    return (pixel - np.array([other.cx, other.cy])) / _reach(nominal.camera)

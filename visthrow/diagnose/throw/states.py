@@ -1,0 +1,272 @@
+"""Initial states of replay windows: from smoothed measurements, and the directions in which they are not known."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from sim.params import GRAVITY, PlantParams
+from sim.replay.kernel import ATTACHED, LOOSE, STATE_FIELDS
+from visthrow.diagnose.catalogue import Setting
+from visthrow.diagnose.throw.cutting import Cut
+from visthrow.diagnose.throw.recorded import Recorded, Samples
+
+SMOOTH_BEFORE, SMOOTH_AFTER = 0.06, 0.08  # of a window's start, over which measurements are smoothed [s]
+LEAST_SAMPLES = 6
+MODES = 4  # half waves of a bent rope
+INTEGRAL = 1.0
+"""Deviation of the rate error's integral [rad]: with a third of it the integrators of 80 windows pull a centre of mass that lies
+1.4 mm off by a quarter towards the frame's origin."""
+
+BENT, SHAKEN = (0.03, 0.5), (0.1, 1.5)
+"""Deviation of a bend of the rope [rad] and of its rate [rad/s]: where the rope stayed taut, and where it has just come taut.
+
+Ropes that fly through the windows before a window arrive there with bends of some 0.005 rad, of 0.03 rad at most. A wider prior
+lets a rope that is too long for what was measured bend until it is short enough; what it does then is whip."""
+HUNG = 0.1
+"""Of that, where the rope hung still before: there ropes arrive with bends of 0.0005 rad. A wider prior invents bends of
+0.02 rad out of noise; they whip, and tell of the rope's and the payload's mass what is not so."""
+
+States = dict[str, np.ndarray]
+"""Fields of ``STATE_FIELDS``, shape (S, ...)."""
+
+
+@dataclass(frozen=True)
+class Direction:
+    """A way in which an initial state may be wrong."""
+
+    field: str
+    axis: int
+    sd: float  # vague prior, in the field's unit (attitude: angle [rad])
+    step: float  # for the derivative
+    part: str | int = ""  # of the rope: "all" segments, the "last", or the half waves of a bend
+    calm: float | None = None  # the prior in windows whose rope was taut all the time, where it is another
+
+    @property
+    def follows(self) -> bool:
+        """Whether it goes with the effects: a bend of the rope does not, which would take the place of a wrong length."""
+        return not self.field.startswith("cable") or self.part == "all"
+
+    def spread(self, c: Cut) -> float:
+        """The prior's deviation in a window."""
+        if self.calm is None or c.shaken:
+            return self.sd
+        return HUNG * self.calm if c.hung else self.calm
+
+
+def directions(plant: PlantParams) -> tuple[Direction, ...]:
+    """Directions, vague in whatever a sensing effect can move."""
+    hover = np.sqrt(plant.vehicle.body.mass * GRAVITY / 4.0 / plant.vehicle.thrust.k_f)
+    gain = plant.vehicle.controller.i_gain
+    found = [Direction("pos_w", i, 0.1, 1e-4) for i in range(3)]
+    found += [Direction("quat_wb", i, 0.1, 1e-4) for i in range(3)]
+    found += [Direction("vel_w", i, 1.0, 1e-3) for i in range(3)]
+    found += [Direction("rate_b", i, 3.0, 1e-3) for i in range(3)]
+    if plant.vehicle.controller.kind == "betaflight":
+        found += [Direction("integral", i, INTEGRAL * gain[i], 1e-3 * gain[i]) for i in range(3) if gain[i] > 0.0]
+    if plant.vehicle.motor.kind != "instant":
+        found += [Direction("motor_speed", i, 0.15 * hover, 1e-4 * hover) for i in range(4)]
+    found += [Direction("cable_dir_w", i, 0.1, 1e-4, "all") for i in range(2)]
+    found += [Direction("cable_vel_w", i, 1.5, 1e-3, "all") for i in range(2)]
+    for part in ("last", *range(1, MODES + 1))[: plant.rope.segments - 1]:
+        found += [Direction("cable_dir_w", i, SHAKEN[0], 1e-4, part, BENT[0]) for i in range(2)]
+        found += [Direction("cable_vel_w", i, SHAKEN[1], 1e-3, part, BENT[1]) for i in range(2)]
+    found += [Direction("payload_pos_w", i, 0.1, 1e-4) for i in range(3)]
+    return (*found, *[Direction("payload_vel_w", i, 1.0, 1e-3) for i in range(3)])
+
+
+def concerns(direction: Direction, c: Cut) -> bool:
+    """Whether the state at the start of a window has the direction: higher bends only a rope that has just come taut."""
+    if direction.field.startswith("cable"):
+        return c.payload == ATTACHED and (c.shaken or direction.part in ("all", "last", 1))
+    return c.payload == LOOSE if direction.field.startswith("payload") else True
+
+
+def _tangents(n: np.ndarray) -> np.ndarray:
+    """Two unit vectors normal to each direction, shape (..., 2, 3)."""
+    away = np.where(np.abs(n[..., :1]) < 0.7, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
+    first = np.cross(n, away)
+    first /= np.linalg.norm(first, axis=-1, keepdims=True)
+    return np.stack((first, np.cross(n, first)), axis=-2)
+
+
+def moved(states: States, direction: Direction, size: np.ndarray | float) -> States:
+    """States moved along one direction by ``size`` (shape (S,) or a number)."""
+    size = np.broadcast_to(np.asarray(size, dtype=float), (len(states["pos_w"]),))
+    return moved_along(states, (direction,), size[:, None])
+
+
+def moved_along(states: States, directions: Sequence[Direction], sizes: np.ndarray) -> States:
+    """States moved along all directions by ``sizes``, shape (S, directions); directions of the rope before its rates."""
+    out = dict(states)
+    for field in dict.fromkeys(direction.field for direction in directions):
+        own = [d for d, direction in enumerate(directions) if direction.field == field]
+        axes, size, value = [directions[d].axis for d in own], sizes[:, own], states[field].copy()
+        if field == "quat_wb":
+            turn = np.zeros((len(value), 3))
+            turn[:, axes] = size
+            value = (Rotation.from_quat(value) * Rotation.from_rotvec(turn)).as_quat()
+        elif field.startswith("cable"):
+            n = out["cable_dir_w"]
+            frame = _tangents(n[:, -1])[:, axes]  # one plane for the whole rope: that of its mean direction
+            shapes = np.array([_shape(directions[d].part, n.shape[1]) for d in own])
+            across = np.einsum("sd,dl,sdx->slx", size, shapes, frame)
+            value = out[field] + across - np.sum(across * n, axis=-1, keepdims=True) * n
+            if field == "cable_dir_w":
+                value /= np.linalg.norm(value, axis=-1, keepdims=True)
+                u = states["cable_vel_w"]
+                out["cable_vel_w"] = u - np.sum(u * value, axis=-1, keepdims=True) * value
+        else:
+            value[:, axes] += size
+        out[field] = value
+    return out
+
+
+def _shape(part: str | int, segments: int) -> np.ndarray:
+    """How far each segment turns, shape (L,)."""
+    if isinstance(part, int):
+        return np.cos(part * np.pi * (np.arange(segments) + 0.5) / segments)
+    return np.ones(segments) if part == "all" else (np.arange(segments) == segments - 1).astype(float)
+
+
+def rows_of(states: States, rows: np.ndarray) -> States:
+    """Some of the states."""
+    return {name: value[rows] for name, value in states.items()}
+
+
+def stacked(parts: list[States]) -> States:
+    """States one after the other."""
+    return {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}
+
+
+def resampled(states: States, segments: int) -> States:
+    """The states with ropes of another number of segments, of the same shape."""
+    n = states["cable_dir_w"]
+    if n.shape[1] == segments:
+        return states
+    at = (np.arange(segments) + 0.5) / segments * n.shape[1]
+    rows = np.minimum(at.astype(int), n.shape[1] - 1)
+    if segments == 1:
+        chord = np.mean(n, axis=1, keepdims=True)
+        out = {"cable_dir_w": chord / np.linalg.norm(chord, axis=-1, keepdims=True)}
+        out["cable_vel_w"] = np.mean(states["cable_vel_w"], axis=1, keepdims=True)
+    else:
+        out = {name: states[name][:, rows] for name in ("cable_dir_w", "cable_vel_w")}
+    return states | out | {"stiffness": states["stiffness"][:, rows]}
+
+
+def smoothed(
+    samples: Samples, at: float, before: float = SMOOTH_BEFORE, after: float = SMOOTH_AFTER
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Value and derivative at a time from a local cubic through the samples about it; None without enough of them."""
+    if (at, before, after) not in samples.near:
+        samples.near[at, before, after] = _smoothed(samples, at, before, after)
+    return samples.near[at, before, after]
+
+
+def _smoothed(samples: Samples, at: float, before: float, after: float) -> tuple[np.ndarray, np.ndarray] | None:
+    for reach in (1.0, 2.0, 4.0):
+        span = samples.between(at - reach * before, at + reach * after)
+        if span.stop - span.start >= LEAST_SAMPLES:
+            time, values = samples.time[span] - at, samples.values[span]
+            if values.shape[1] == 4:
+                return _smoothed_turn(time, values)
+            fit = np.polynomial.polynomial.polyfit(time, values, 2 if len(time) < 12 else 3)
+            return fit[0], fit[1]
+    return None
+
+
+def _smoothed_turn(time: np.ndarray, quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Attitude at time 0 (xyzw) and the body rate there [rad/s]."""
+    middle = Rotation.from_quat(quats[np.argmin(np.abs(time))])
+    turn = (middle.inv() * Rotation.from_quat(quats)).as_rotvec()
+    fit = np.polynomial.polynomial.polyfit(time, turn, 2 if len(time) < 12 else 3)
+    return (middle * Rotation.from_rotvec(fit[0])).as_quat(), fit[1]
+
+
+def measured_state(flight: Recorded, at: float, setting: Setting, payload: int, inner: States) -> States:
+    """One state at a time of a flight: measured where it is measured, the rest from ``inner`` (one state).
+
+    The measurements are taken back through the setting's delays, frame and markers.
+    """
+    out = {name: value.copy() for name, value in inner.items()}
+    x, plant = setting.sensing, setting.plant
+    level, marker = Rotation.from_rotvec(x.frame_tilt).inv(), Rotation.from_rotvec(x.marker_rotation)
+    pos, vel = smoothed(flight.vehicle, at + x.vehicle_delay) or (flight.vehicle.values[0], np.zeros(3))
+    quat, rate = smoothed(flight.attitude, at + x.vehicle_delay) or (flight.attitude.values[0], np.zeros(3))
+    attitude = level * Rotation.from_quat(quat) * marker.inv()
+    rate = marker.apply(rate)
+    if flight.gyro is not None and (seen := smoothed(flight.gyro, at + x.gyro_delay)) is not None:
+        rate = seen[0] - np.array(x.gyro_bias)
+    off = np.array(x.marker_offset) - np.array(plant.vehicle.body.com)
+    pos, vel = level.apply([pos, vel]) / (1.0 + x.scale)
+    out["pos_w"][0], out["quat_wb"][0] = pos - attitude.apply(off), attitude.as_quat()
+    out["vel_w"][0], out["rate_b"][0] = vel - attitude.apply(_cross(rate, off)), rate
+    if payload in (ATTACHED, LOOSE) and flight.payload is not None:
+        seen = smoothed(flight.payload, at + x.payload_delay)
+        if seen is not None:
+            point, speed = level.apply(seen) / (1.0 + x.scale)
+            point = point - np.array(x.payload_offset)
+            out["payload_pos_w"][0], out["payload_vel_w"][0] = point, speed
+            if payload == ATTACHED:
+                _hang(out, plant, attitude, point, speed)
+    return out
+
+
+def _hang(state: States, plant: PlantParams, attitude: Rotation, point: np.ndarray, speed: np.ndarray) -> None:
+    """Turn the rope, in the shape that it has, so that it reaches from the mount to the payload and follows both."""
+    arm = np.array(plant.rope.mount) - np.array(plant.vehicle.body.com)
+    mount = state["pos_w"][0] + attitude.apply(arm)
+    mount_vel = state["vel_w"][0] + attitude.apply(_cross(state["rate_b"][0], arm))
+    reach = point - mount
+    distance = max(float(np.linalg.norm(reach)), 1e-3)
+    n, u = state["cable_dir_w"][0], state["cable_vel_w"][0]
+    link = np.full((len(n), 1), plant.rope.length / len(n))
+    link[-1] += plant.rope.payload_offset
+    chord = np.sum(link * n, axis=0)
+    chord /= np.linalg.norm(chord)
+    axis = _cross(chord, reach / distance)
+    sine, cosine = float(np.linalg.norm(axis)), float(chord @ reach / distance)
+    turn = Rotation.from_rotvec(axis * (np.arctan2(sine, cosine) / sine if sine > 1e-12 else 0.0))
+    n, u = turn.apply(n), turn.apply(u)
+    lacking = speed - mount_vel - np.sum(link * u, axis=0)
+    spin = _cross(reach, lacking) / distance**2
+    state["cable_dir_w"][0], state["cable_vel_w"][0] = n, u + np.cross(spin, n)
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Of two vectors; numpy's, which is for many, takes twenty times as long."""
+    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+
+
+def hover_state(flight: Recorded, plant: PlantParams, payload: int) -> States:
+    """A state in hover at the flight's start: what the first window's measurements do not tell."""
+    v, rope, L = plant.vehicle, plant.rope, plant.rope.segments
+    thrust = max(float(flight.command[0, 0]), 0.05)
+    speed = np.sqrt(thrust / 4.0 / v.thrust.k_f)
+    power = v.battery.idle_power + thrust * speed * v.thrust.torque_ratio / v.battery.efficiency
+    used = _charge(flight, plant, power)
+    open_volts = float(np.polynomial.polynomial.polyval(used, v.battery.ocv))
+    sagged = 0.5 * (open_volts + np.sqrt(max(open_volts**2 - 4.0 * v.battery.resistance * power, 0.0)))
+    down = np.array([0.0, 0.0, -1.0])
+    state = {name: np.zeros((1, L, 3) if rows else (1, 3)) for name, (_, rows) in STATE_FIELDS.items()}
+    state |= {"slack_first": np.zeros(1), "slack_last": np.zeros(1)}
+    below = rope.payload_mass + rope.rope_mass * (np.arange(L, 0, -1) - 0.5) / L
+    state |= {
+        "quat_wb": np.array([[0.0, 0.0, 0.0, 1.0]]), "motor_speed": np.full((1, 4), speed),
+        "setpoint": flight.command[:1, 1:].copy(), "gyro": np.zeros((1, 3)), "charge_used": np.array([used]),
+        "voltage": np.array([sagged if v.battery.kind == "sag" else v.battery.reference_voltage]),
+        "cable_dir_w": np.tile(down, (1, L, 1)), "stiffness": below[None] * GRAVITY * rope.length / L,
+    }  # fmt: skip
+    return state
+
+
+def _charge(flight: Recorded, plant: PlantParams, power: float) -> float:
+    """Fraction of the charge used at the start, from the first voltage under load; a fifth where none was logged."""
+    cell = plant.vehicle.battery
+    if flight.voltage is None or cell.kind != "sag":
+        return 0.2 if cell.kind == "sag" else 0.0
+    grid = np.linspace(0.0, 1.0, 201)
+    open_volts = flight.voltage + cell.resistance * power / flight.voltage
+    return float(np.interp(-open_volts, -np.polynomial.polynomial.polyval(grid, cell.ocv), grid))

@@ -1,0 +1,394 @@
+"""The whole throw as a model to diagnose: vehicle, rope, payload and release replayed from recorded commands."""
+
+import copy
+import dataclasses
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+import warp as wp
+
+from camera.params import CameraParams
+from sim.params import PlantParams, SensingParams
+from sim.replay.kernel import ATTACHED
+from sim.replay.lanes import Replay
+from visthrow.common.errors import DiagnoseError
+from visthrow.diagnose.catalogue import Entry, Setting, apply, entries_for
+from visthrow.diagnose.likelihood.threads import aside, each
+from visthrow.diagnose.likelihood.transfer import all_to_host, to_host
+from visthrow.diagnose.models.interface import Linearised, Window
+from visthrow.diagnose.throw.cutting import RINGING, Cut, around_slack, cut, thinned
+from visthrow.diagnose.throw.interface import Mistake
+from visthrow.diagnose.throw.landing import Landings, landings
+from visthrow.diagnose.throw.linearising import Plan, exact, lanes_of, still
+from visthrow.diagnose.throw.opened import opened
+from visthrow.diagnose.throw.recorded import NEVER, carriers, record_of
+from visthrow.diagnose.throw.replay import BATCH, CUDA_BATCH, Flights, Lane, carried, downloaded
+from visthrow.diagnose.throw.settling import Settling, following, perturbed
+from visthrow.diagnose.throw.sightings import channels_of, needs_no_flight, sightings, with_sightings
+from visthrow.diagnose.throw.states import (
+    Direction,
+    States,
+    concerns,
+    directions,
+    hover_state,
+    measured_state,
+    moved_along,
+    resampled,
+    rows_of,
+)
+from visthrow.logs.flightlog import FlightLog
+
+AFTER_SLACK = 0.05  # that a rope is given to come taut [s]
+
+
+class ThrowModel:
+    """Flights of a vehicle, with or without a payload, against the simulator that training uses.
+
+    Attributes:
+        effects: of the catalogue that concern this plant and these logs.
+        channels: measured ones.
+        entries: name -> entry of the catalogue.
+        setting: what the residuals at theta = 0 are simulated with.
+    """
+
+    def __init__(
+        self,
+        logs: Sequence[FlightLog],
+        plant: PlantParams,
+        *,
+        sensing: SensingParams | None = None,
+        device: str = "cpu",
+        substep: float = 0.002,
+        stride: int = 1,
+        only: Sequence[str] | None = None,
+        carries: bool | None = None,
+        simpler: bool = False,
+        camera: CameraParams | None = None,
+        mistakes: tuple[Mistake, ...] = (),
+    ):
+        """Cut the flights and find the windows' initial states.
+
+        Args:
+            logs: flights.
+            plant: the diagnosed one.
+            sensing: what is known of the sensors.
+            device: "cpu" or "cuda:0".
+            substep: largest integration step [s].
+            stride: use every so many measured samples.
+            only: names of the effects to consider; default all that apply.
+            carries: whether a payload hangs below in all flights; default: in those in which one was measured or released.
+            simpler: consider also blocks simpler than the plant's, such as a rigid rope; each compiles a kernel.
+            camera: whose keypoints the logs hold.
+            mistakes: of the logs' interface that were put right before.
+
+        Raises:
+            DiagnoseError: no flight can be replayed, or ``only`` names what does not exist.
+        """
+        self.setting = opened(Setting(plant, sensing or SensingParams(), camera=camera))
+        self.device, self.substep, self.mistakes = device, substep, mistakes
+        if device != "cpu":
+            aside()
+        flights = [record_of(log, i) for i, log in enumerate(logs)]
+        hangs = carriers(flights) if carries is None else [carries] * len(flights)
+        carries = any(hangs)
+        release = plant.release
+        cuts = thinned([c for i, f in enumerate(flights) for c in cut(f, i, release.lag, release.landing_height, hangs[i])])
+        if not cuts:
+            raise DiagnoseError(f"{len(flights)} flights hold no stretch of poses and commands long enough to replay")
+        self.channels = ["pos_w", "quat_wb"]
+        self.channels += ["payload_pos_w"] if carries and any(f.payload for f in flights) else []
+        self.channels += ["rate_b"] if any(f.gyro for f in flights) else []
+        self.channels += channels_of(logs, flights, camera)
+        thrown = any(f.latch != NEVER for f in flights)
+        self.entries: dict[str, Entry] = entries_for(self.setting, set(self.channels), carries, thrown, simpler)
+        if only is not None:
+            unknown = [name for name in only if name not in self.entries]
+            if unknown:
+                raise DiagnoseError(f"no effects {unknown} for these flights; there are {', '.join(self.entries)}")
+            self.entries = {name: self.entries[name] for name in only}
+        self._sighted = [e for e in self.entries.values() if needs_no_flight(e)]
+        self._graded = [e for e in self.entries.values() if e.switch is None and e not in self._sighted]
+        self._switched = [e for e in self.entries.values() if e.switch is not None]
+        self.entries = {e.effect.name: e for e in (*self._graded, *self._switched, *self._sighted)}
+        self.effects = tuple(e.effect for e in self.entries.values())
+        self._directions = directions(self.setting.plant)
+        x = self.setting.sensing
+        delays = (x.vehicle_delay, x.payload_delay, x.gyro_delay)
+        self.flights = Flights(flights, cuts, delays, stride)
+        states, ends = self._through(self.setting)
+        if (without_slack := self._without_slack(ends)) != cuts:
+            self.flights = Flights(flights, without_slack, delays, stride)
+            states, _ = self._through(self.setting)
+        self._told = np.array([w for w, c in enumerate(self.flights.cuts) if c.told])
+        self._fits: dict[tuple[Cut, ...], tuple[States, dict[int, np.ndarray]]] = {}
+        self._latest: dict[frozenset[str], States] = {frozenset(): self._fitted(states)[0]}
+        self._settled_at: dict[frozenset[tuple[str, float]], States] = {}
+        self._lock = threading.Lock()  # residuals may be asked for side by side
+        self._follows: tuple[Linearised, dict[int, list[int]], np.ndarray] | None = None  # the last that was asked for
+        self._sightings = sightings(logs, flights, self.flights.cuts, self.setting)
+
+    def windows(self, theta: Mapping[str, float]) -> list[Window]:
+        """See :class:`visthrow.diagnose.models.interface.Model`."""
+        setting = apply(self.entries, self.setting, theta)
+        self._directions = directions(setting.plant)  # another kind of block has other states
+        states = self._latest[self._switches(theta)] = self._settled_at[_key(theta)] = self._settled(setting)
+        steps = [self._step(e, theta.get(e.effect.name, 0.0)) for e in self._graded]
+        settings = [setting, *[e.apply(setting, step) for e, step in zip(self._graded, steps)]]
+        replay = self._replay(settings, download=wp.to_torch)
+        found: list[Window] = []
+        for batch in self._batches():
+            found += self._linearised(replay, settings, np.array(steps), states, batch)
+        columns = [self._secant(e, theta, found) for e in self._switched]
+        if columns:
+            found = [
+                dataclasses.replace(w, effects=np.hstack((w.effects, np.stack([c[i] for c in columns], axis=1))))
+                for i, w in enumerate(found)
+            ]
+        return self._with_sightings(setting, theta, found)
+
+    def _with_sightings(self, setting: Setting, theta: Mapping[str, float], windows: list[Window]) -> list[Window]:
+        """Windows with what was seen besides poses, and columns of the effects that this alone shows."""
+        whole = windows
+        if self._sighted:
+            blank = [np.zeros((len(w.residual), len(self._sighted))) for w in windows]
+            whole = [dataclasses.replace(w, effects=np.hstack((w.effects, b))) for w, b in zip(windows, blank)]
+        if not self._sightings:
+            return whole
+        entries = list(self.entries.values())
+        steps = np.array([0.0 if e.switch else self._step(e, theta.get(e.effect.name, 0.0)) for e in entries])
+        settings = [setting, *[setting if e.switch else e.apply(setting, step) for e, step in zip(entries, steps)]]
+        return [
+            with_sightings(w, number, self._sightings, self.channels, settings, steps) for number, w in zip(self._told, whole)
+        ]
+
+    def _secant(self, e: Entry, theta: Mapping[str, float], windows: list[Window]) -> list[np.ndarray]:
+        """Samples with the other kind of block less those with this one, per theta; a column for each window.
+
+        Each kind begins in initial states settled for it: a transient that the other's state brings would be taken for its effect.
+        """
+        on = theta.get(e.effect.name, 0.0) > 0.5
+        elsewhere = {**theta, e.effect.name: 0.0 if on else 1.0}
+        other = apply(self.entries, self.setting, elsewhere)
+        lanes = [Lane(w, 0, w) for w in self._told]
+        start = self._latest[self._switches(elsewhere)] = self._settled(other)
+        seen = self.flights.fly(self._replay([other]), [other], start, lanes, self.substep).seen
+        sign = -1.0 if on else 1.0
+        return [sign * (x.residual - self.flights.residual(seen, w, lane)) for lane, (w, x) in enumerate(zip(self._told, windows))]
+
+    def residuals(self, theta: Mapping[str, float], about: Linearised | None = None) -> list[np.ndarray]:
+        """See :class:`visthrow.diagnose.models.interface.Model`; by default from the states settled last with the same kinds of blocks."""
+        setting = apply(self.entries, self.setting, theta)
+        lanes = [Lane(w, 0, w) for w in self._told]
+        states, moves = self._latest.get(self._switches(theta), self._fitted()[0]), {}
+        if about is not None:
+            states, moves = self._following(setting, theta, about)
+        states = resampled(states, setting.plant.rope.segments)
+        seen = self.flights.fly(self._replay([setting]), [setting], states, lanes, self.substep).seen
+        flown = [self.flights.residual(seen, w, lane) for lane, w in enumerate(self._told)]
+        told = [np.concatenate((r, *self._sighting_residuals(w, setting))) for r, w in zip(flown, self._told)]
+        return [r + about.windows[i].nuisance @ moves[i] if i in moves else r for i, r in enumerate(told)]
+
+    def _following(
+        self, setting: Setting, theta: Mapping[str, float], about: Linearised
+    ) -> tuple[States, dict[int, np.ndarray]]:
+        """States that belong to other sizes of the effects by the derivatives, and how each window's were moved."""
+        names = [e.effect.name for e in self.entries.values()]
+        change = np.array([theta.get(name, 0.0) - about.theta.get(name, 0.0) for name in names])
+        found = directions(setting.plant)
+        with self._lock:
+            if self._follows is None or self._follows[0] is not about:
+                self._follows = about, *self._ways(found, about, len(names))
+            _, owns, by_effect = self._follows
+        sizes = by_effect @ change
+        states = moved_along(self._settled_at[_key(about.theta)], found, sizes)
+        return states, {i: sizes[self._told[i], own] for i, own in owns.items()}
+
+    def _ways(self, found: Sequence[Direction], about: Linearised, effects: int) -> tuple[dict[int, list[int]], np.ndarray]:
+        """Which directions each window's state has, and how it follows the effects in them, shape (W, directions, K)."""
+        cuts = self.flights.cuts
+        owns = {i: [d for d, x in enumerate(found) if concerns(x, cuts[self._told[i]])] for i in about.windows}
+
+        def way(i: int) -> np.ndarray:
+            free = np.array([found[d].follows for d in owns[i]], dtype=bool)
+            return following(self.flights, self._told[i], about.windows[i], free, self.setting.plant.release.lag)
+
+        by_effect = np.zeros((len(cuts), len(found), effects))
+        for i, moves in zip(owns, each(way, owns)):
+            by_effect[self._told[i], owns[i]] = moves
+        return owns, by_effect
+
+    def _switches(self, theta: Mapping[str, float]) -> frozenset[str]:
+        """Which other kinds of blocks are on."""
+        return frozenset(e.effect.name for e in self._switched if theta.get(e.effect.name, 0.0) > 0.5)
+
+    def _sighting_residuals(self, w: int, setting: Setting) -> list[np.ndarray]:
+        held = [(kind, kind.samples(w)[1]) for kind in self._sightings]
+        return [values - kind.predicted(w, setting) for kind, values in held if len(values)]
+
+    def step_error(self, finer: int = 4) -> dict[str, float]:
+        """Largest change of any sample of each channel when the step is so many times finer, in its noise."""
+        fine = dataclasses.replace(self.setting, step_square=1.0 / finer**2)
+        settings = [self.setting, fine]
+        count, f = len(self._told), self.flights
+        lanes = [Lane(w, s, w) for s in range(2) for w in self._told]
+        seen = f.fly(self._replay(settings), settings, self._fitted()[0], lanes, self.substep).seen
+        worst = dict.fromkeys(self.channels, 0.0)
+        for lane, w in enumerate(self._told):
+            off = np.abs(f.residual(seen, w, lane) - f.residual(seen, w, count + lane)) / f.sigma(w)
+            for i, name in enumerate(self.channels):
+                here = off[self._channel(w) == i]
+                worst[name] = max(worst[name], float(here.max())) if len(here) else worst[name]
+        return worst
+
+    def landings(self, theta: Mapping[str, float], flights: Sequence[int] | None = None) -> Landings:
+        """See :func:`visthrow.diagnose.throw.landing.landings`."""
+        return landings(self, theta, flights)
+
+    def landing_errors(self, theta: Mapping[str, float]) -> np.ndarray:
+        """Distance of each throw's predicted landing from the measured one [m], shape (throws,)."""
+        return self.landings(theta).errors
+
+    def beside(self, cuts: Sequence[Cut]) -> "ThrowModel":
+        """The same model of other windows of its flights."""
+        other, x = copy.copy(self), self.setting.sensing
+        other._settled_at, other._follows = {}, None  # states of other windows
+        delays = (x.vehicle_delay, x.payload_delay, x.gyro_delay)
+        other.flights = Flights(self.flights.flights, cuts, delays, self.flights.stride)
+        other._told = np.array([w for w, c in enumerate(cuts) if c.told])
+        return other
+
+    def begun(self, theta: Mapping[str, float]) -> tuple[Setting, States]:
+        """The setting with effects at ``theta``, and initial states fitted in it."""
+        setting = apply(self.entries, self.setting, theta)
+        return setting, self._settled(setting)
+
+    def _replay(self, settings: Sequence[Setting], download: Callable[[wp.array], Any] = downloaded) -> Replay:
+        return Replay([s.plant for s in settings], [s.sensing for s in settings], self.device, download=download)
+
+    def _through(self, setting: Setting) -> tuple[States, States]:
+        """Initial states from smoothed measurements and, for what nobody measures, from flying through the windows before.
+
+        Returns:
+            The states, and those at the windows' ends.
+        """
+
+        def begin(flight, c, inner):
+            start = hover_state(flight, setting.plant, c.payload) if inner is None else inner
+            state = measured_state(flight, c.start, setting, c.payload, start)
+            if inner is None:
+                state["gyro"] = state["rate_b"].copy()
+            return state
+
+        return carried(self.flights, self._replay([setting]), setting, begin, self.substep)
+
+    def _settling(self, setting: Setting) -> Settling:
+        """What fits initial states in a setting."""
+        return Settling(
+            self.flights, self._told, directions(setting.plant), setting, lag=self.setting.plant.release.lag, substep=self.substep,
+            device=self.device,
+        )  # fmt: skip
+
+    def _fitted(self, states: States | None = None) -> tuple[States, dict[int, np.ndarray]]:
+        """States fitted at theta = 0, to begin with ``states``, and the samples' derivatives by them; of the same windows, once."""
+        cuts = tuple(self.flights.cuts)
+        if cuts not in self._fits:
+            if states is None and (among := self._among_more(cuts)) is not None:
+                return among
+            settling = self._settling(self.setting)
+            fitted = settling.fit([self._through(self.setting)[0] if states is None else states])
+            self._fits[cuts] = fitted, settling.slopes
+        return self._fits[cuts]
+
+    def _among_more(self, cuts: tuple[Cut, ...]) -> tuple[States, dict[int, np.ndarray]] | None:
+        """What was fitted to all windows of some flights among those of others, as each flight is fitted by itself."""
+        flights = {c.flight for c in cuts}
+        for more, (states, slopes) in self._fits.items():
+            rows = [row for row, c in enumerate(more) if c.flight in flights]
+            if cuts == tuple(more[row] for row in rows):
+                return rows_of(states, np.array(rows)), {w: slopes[row] for w, row in enumerate(rows) if row in slopes}
+        return None
+
+    def _settled(self, setting: Setting) -> States:
+        """States fitted in a setting, from the better of those fitted at theta = 0 and those that the setting begins with."""
+        states, slopes = self._fitted()
+        if setting == self.setting:
+            return states
+        settling = self._settling(setting)
+        starts = [resampled(states, setting.plant.rope.segments), self._through(setting)[0]]
+        ways = [[(x.field, x.axis, x.part) for x in found] for found in (settling.directions, directions(self.setting.plant))]
+        return settling.fit(starts, slopes if ways[0] == ways[1] else None)
+
+    @staticmethod
+    def _step(e: Entry, theta: float) -> float:
+        """Step of theta for the derivative: upwards, unless that leaves the bounds."""
+        step = e.step * e.effect.floor
+        return -step if theta + step > e.effect.bounds[1] else step
+
+    def _batches(self) -> list[list[int]]:
+        """Windows in groups whose lanes fit a run."""
+        batches, room = [], 0
+        for w in self._told:
+            lanes = 2 + len(self._graded) + len(self._directions) + 9 * int(self.flights.knots[w])
+            if not batches or room < lanes:
+                batches.append([])
+                room = BATCH if self.device == "cpu" else CUDA_BATCH
+            batches[-1].append(w)
+            room -= lanes
+        return batches
+
+    def _linearised(
+        self, replay: Replay, settings: list[Setting], steps: np.ndarray, states: States, batch: list[int]
+    ) -> list[Window]:
+        f, needs = self.flights, np.array([exact(e) for e in self._graded], dtype=bool)
+        plans, lanes, kept = [], [], 0
+        known: dict[tuple, np.ndarray] = {}
+        for w in batch:
+            if f.like(w) not in known:
+                known[f.like(w)] = np.array([f.alike(w, settings[0], other) for other in settings[1:]], dtype=bool)
+            plan, own = lanes_of(f, w, known[f.like(w)], needs, self._directions, len(lanes), kept)
+            plans.append(plan)
+            lanes += own
+            kept += 2 * int(f.knots[w])
+        flown = f.fly(replay, settings, perturbed(states, self._directions), lanes, self.substep)
+
+        def slopes(plan: Plan) -> list[torch.Tensor]:
+            return plan.slopes(int(f.rows[plan.window]), steps, self._directions, flown.seen)
+
+        found = [slopes(plan) for plan in plans] if flown.seen.is_cuda else each(slopes, plans)
+        nominal = to_host(flown.seen[:, [plan.first for plan in plans]])
+        blocks = [e.effect.block for e in self._graded]
+
+        parts = all_to_host([part for own in found for part in own])
+
+        def window(i: int) -> Window:
+            w, own = plans[i].window, parts[3 * i : 3 * i + 3]
+            given = self._channel(w), f.residual(nominal, w, i), own, flown.knots
+            return still(plans[i].window_of(f, settings[0], self._directions, *given), blocks, settings[0].plant.air.wind_w)
+
+        return each(window, range(len(plans)))
+
+    def _channel(self, w: int) -> np.ndarray:
+        at = {name: i for i, name in enumerate(self.channels)}
+        return self.flights.spread(w, 0, 1, at.get("payload_pos_w", -1), at.get("rate_b", -1)).astype(int)
+
+    def _without_slack(self, ends: States) -> list[Cut]:
+        """The windows, with the time in which the rope was slack until their ends cut out; those soon after it are shaken."""
+        cuts: list[Cut] = []
+        rings: dict[int, float] = {}  # flight -> until when
+        for w, c in enumerate(self.flights.cuts):
+            first, last = float(ends["slack_first"][w]), float(ends["slack_last"][w])
+            separation = self.flights.flights[c.flight].latch + self.setting.plant.release.lag
+            if c.payload == ATTACHED and c.start < rings.get(c.flight, -np.inf):
+                c = dataclasses.replace(c, shaken=True)
+            if last >= c.start:
+                rings[c.flight] = last + RINGING
+            cuts += [c] if last < c.start else around_slack(c, first, last + AFTER_SLACK, separation)
+        return cuts
+
+
+def _key(theta: Mapping[str, float]) -> frozenset[tuple[str, float]]:
+    """The sizes that are not 0."""
+    return frozenset((name, float(value)) for name, value in theta.items() if value)

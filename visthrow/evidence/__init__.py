@@ -1,0 +1,1 @@
+"""Evidence: reports, sweeps, benchmarks and the committed records they stand on."""

@@ -1,0 +1,60 @@
+"""``visthrow bench hil``: the runner against the fake autopilot, each in its own process, over loopback in real time.
+
+Latency and soak by default: times of each stage, ticks missed, memory. With ``--throws`` a series of throws, each paired with
+the same one flown without a wire. With ``--faults`` what the runner does when something fails, and after how long.
+"""
+
+import argparse
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from visthrow.evidence.bench.records import finish
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure what was asked for."""
+    if args.throws:
+        from visthrow.evidence.bench.hil_throws import series
+
+        return finish(series(args), args)
+    if args.faults is not None:
+        from visthrow.evidence.bench.hil_faults import faults
+
+        return finish(faults(args), args)
+    from visthrow.evidence.bench.hil_soak import soak
+
+    return finish(soak(args), args)
+
+
+def bootstrap_upper(ratio_of: np.ndarray, level: float = 0.9, draws: int = 20_000, seed: int = 0) -> tuple[float, float]:
+    """Ratio of the means of two columns of pairs, and the one-sided upper bound of it by drawing pairs anew.
+
+    Args:
+        ratio_of: shape (N, 2).
+        level: of the bound.
+        draws: bootstrap samples. seed: of them.
+    """
+    rng = np.random.default_rng(seed)
+    means = ratio_of[rng.integers(len(ratio_of), size=(draws, len(ratio_of)))].mean(axis=1)
+    value = float(ratio_of[:, 0].mean() / ratio_of[:, 1].mean())
+    return value, float(np.quantile(means[:, 0] / means[:, 1], level))
+
+
+def json_lines(path: Path) -> list[dict[str, Any]]:
+    """Values of a file of lines; a last one that was cut short is left out, and so is a file that is not there."""
+    found = []
+    for row in path.read_text(encoding="utf-8").splitlines() if path.is_file() else ():
+        try:
+            found.append(json.loads(row))
+        except ValueError:
+            break
+    return found
+
+
+def finite(value: float | None) -> bool:
+    """Whether a figure is there and a number."""
+    return value is not None and math.isfinite(value)

@@ -1,0 +1,181 @@
+"""Runs and fakes as processes of their own: what is measured is what is flown, the command itself."""
+
+import contextlib
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from visthrow.common.arguments import EXIT_INTERRUPTED
+from visthrow.common.errors import VisthrowError
+
+ENDED = 120.0
+"""Most that the end of a run may take once it was told to [s]."""
+
+COMMAND = (sys.executable, "-m", "visthrow.cli", "hil")
+
+
+_given: set[int] = set()
+_giving = threading.Lock()
+
+
+def free_port() -> int:
+    """A UDP port of this machine that nobody listens on, and that this process was not given before."""
+    with _giving:
+        while True:
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+                probe.bind(("127.0.0.1", 0))
+                port = probe.getsockname()[1]
+            if port not in _given:
+                _given.add(port)
+                return port
+
+
+def own_cores(jobs: int) -> list[tuple[int | None, int | None]]:
+    """Cores of run and fake for each of so many pairs at once; None where there are too few for two each and one to spare."""
+    usable = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+    if len(usable) <= 2 * jobs:
+        return [(None, None)] * jobs
+    return [(usable[2 * job], usable[2 * job + 1]) for job in range(jobs)]
+
+
+@dataclass(frozen=True)
+class Pair:
+    """A run against a fake.
+
+    Attributes:
+        run: further arguments of ``visthrow hil run``. fake: of ``visthrow hil fake``.
+        core, fake_core: that each is kept on; None leaves it to the system.
+        orderly: Ctrl-C ends both in order, and what there is by then is returned.
+    """
+
+    run: tuple[str, ...]
+    fake: tuple[str, ...]
+    core: int | None = None
+    fake_core: int | None = None
+    orderly: bool = False
+
+    def fly(
+        self, folder: Path, watch: Callable[[int], None] | None = None, alone: bool = False
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Start both, wait until the fake is done, end the run.
+
+        Args:
+            folder: of the run; not there yet.
+            watch: called twice a second with the run's process id.
+            alone: the fake flies on to its end where the run has ended, or was killed, before.
+
+        Returns:
+            The run's summary, with whether it was ``interrupted``, empty where it was killed, and the fake's report.
+
+        Raises:
+            VisthrowError: one of them did not start, or did not end; the message holds what it said.
+        """
+        port, report = free_port(), folder.with_suffix(".fake.json")
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        run = [*COMMAND, "run", "--set", f'link.device="udp:127.0.0.1:{port}"', "--out", str(folder), "--auto-arm", "--bare"]
+        run += self.run
+        fake = [*COMMAND, "fake", "--device", f"udpout:127.0.0.1:{port}", "--out", str(report), *self.fake]
+        with self._started(run, self.core) as runner:
+            said = _first_line(runner)
+            with self._started(fake, self.fake_core) as other:
+                interrupted = self._until(other, watch, runner, alone)
+            killed = _end(runner, said, alone)
+        try:
+            summary = {} if killed else json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+            summary |= {} if killed else {"interrupted": interrupted}
+            return summary, json.loads(report.read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            raise VisthrowError(f"a process of the pair ended without its report: {error}") from error
+        finally:
+            report.unlink(missing_ok=True)
+
+    def _until(self, fake: subprocess.Popen, watch: Callable[[int], None] | None, runner: subprocess.Popen, alone: bool) -> bool:
+        """Wait for the fake's end; whether Ctrl-C brought it about."""
+        try:
+            _until(fake, watch, runner, alone)
+        except KeyboardInterrupt:
+            if not self.orderly:
+                raise
+            fake.send_signal(signal.SIGINT)
+            fake.wait(ENDED)
+            return True
+        return False
+
+    @contextlib.contextmanager
+    def _started(self, command: list[str], core: int | None) -> Iterator[subprocess.Popen]:
+        quiet = subprocess.DEVNULL
+        process = subprocess.Popen(
+            command, stdin=quiet, stdout=quiet, stderr=subprocess.PIPE, text=True,
+            start_new_session=self.orderly,  # the terminal's Ctrl-C is for us alone
+        )  # fmt: skip
+        try:
+            if core is not None:  # long before it has threads
+                os.sched_setaffinity(process.pid, {core})
+            yield process
+        finally:
+            if process.poll() is None:
+                process.kill()
+            process.wait()
+
+
+def _first_line(process: subprocess.Popen) -> str:
+    """What a run says when it is ready."""
+    line = process.stderr.readline()
+    if not line.startswith("ready after"):
+        raise VisthrowError(f"the run did not start: {line}{process.stderr.read()}")
+    return line
+
+
+def _until(fake: subprocess.Popen, watch: Callable[[int], None] | None, runner: subprocess.Popen, alone: bool) -> None:
+    while fake.poll() is None:
+        gone = runner.poll() is not None
+        if gone and not alone:  # aborted, say: the fake tells what it has seen
+            fake.send_signal(signal.SIGINT)
+            fake.wait(ENDED)
+            return
+        if watch is not None and not gone:
+            watch(runner.pid)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            fake.wait(0.5)
+    if fake.returncode:
+        raise VisthrowError(f"the fake failed: {fake.stderr.read()}")
+
+
+def _end(runner: subprocess.Popen, said: str, alone: bool) -> bool:
+    """The fake is gone; what is still flying is told to stop. Whether the run had been killed, which it may where it was left
+    alone."""
+    if runner.poll() is None:
+        runner.send_signal(signal.SIGINT)
+    try:
+        _, text = runner.communicate(timeout=ENDED)
+    except subprocess.TimeoutExpired as error:
+        raise VisthrowError(f"the run did not end within {ENDED:g} s after it was told to: {said}") from error
+    if alone and runner.returncode == -signal.SIGKILL:
+        return True
+    # 1: aborted, as it was told; interrupted: it had just ended by itself as the signal came. Its summary tells the rest.
+    if runner.returncode not in (0, 1, EXIT_INTERRUPTED, -signal.SIGINT):
+        raise VisthrowError(f"the run failed with status {runner.returncode}: {text}")
+    return False
+
+
+class Memory:
+    """Resident memory of a process over time."""
+
+    def __init__(self) -> None:
+        """Start without a sample."""
+        self.samples: list[tuple[float, float]] = []  # [s], [bytes]
+
+    def __call__(self, pid: int) -> None:
+        """Take a sample; nothing where the system does not tell."""
+        with contextlib.suppress(OSError, ValueError, IndexError):
+            pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
+            self.samples.append((time.monotonic(), float(pages * os.sysconf("SC_PAGE_SIZE"))))

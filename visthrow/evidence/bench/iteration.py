@@ -1,0 +1,171 @@
+"""``visthrow bench train``: where the wall time of a training iteration goes."""
+
+import argparse
+import statistics
+import time
+from collections.abc import Callable
+from typing import Any
+
+from visthrow import config
+from visthrow.common.errors import VisthrowError
+from visthrow.evidence.bench import card, records
+from visthrow.evidence.bench.records import Report, Table, rate
+
+WARM_UP = 3
+"""Iterations before measuring: the first runs eagerly, the second captures the CUDA graph."""
+
+PARTS = {
+    "simulation": "the fused kernel",
+    "environment": "noise, rewards, ends, resets, observations, camera",
+    "inference": "actor and critic, sampling",
+    "storage": "rollout buffer, normalisation, returns",
+    "learning": "PPO's update",
+}
+
+
+class Stretch:
+    """Device operations to be timed: replayed from a CUDA graph, as training does, or on the CPU run as they are."""
+
+    def __init__(self, function: Callable[[], Any], device: str):
+        import torch
+
+        self._run = function
+        self._settle = torch.cuda.synchronize if device.startswith("cuda") else (lambda: None)
+        function()
+        if device.startswith("cuda"):
+            self._settle()
+            graph = torch.cuda.CUDAGraph()
+            with torch.cuda.graph(graph):
+                function()
+            self._run = graph.replay
+
+    def seconds(self, before: Callable[[], Any] = lambda: None) -> float:
+        """Wall time of one run [s]; ``before`` is not timed."""
+        before()
+        self._settle()
+        start = time.perf_counter()
+        self._run()
+        self._settle()
+        return time.perf_counter() - start
+
+
+def whole(trainer: Any, iterations: int) -> dict[str, list[float]]:
+    """Wall time [s] of rollouts and updates as training makes them."""
+    for _ in range(WARM_UP):
+        trainer.step()
+    rows = [trainer.step() for _ in range(iterations)]
+    return {"rollout": [r["rollout_s"] for r in rows], "learning": [r["learning_s"] for r in rows]}
+
+
+def alone(trainer: Any, repeats: int) -> dict[str, float]:
+    """Median wall time [s] of an iteration's simulator steps, environment steps and policy calls, each alone.
+
+    The trainer's environment is spent afterwards: its steps do not belong to an iteration.
+    """
+    import torch
+
+    from sim.arrays.torch_bridge import on_torch_stream
+
+    env, alg, steps, device = trainer.env, trainer.alg, trainer.experiment.ppo.steps, trainer.device
+    observations = env.get_observations()
+    with torch.inference_mode():
+        actions = alg.act(observations).clone()
+        actions[:, -1] = -1.0  # nothing is released: the rope is simulated throughout
+
+    def simulate() -> None:
+        with on_torch_stream(device):
+            for _ in range(steps):
+                env.sim.step()
+
+    def steps_of_env() -> None:
+        with torch.inference_mode():
+            for _ in range(steps):
+                env.step(actions)
+
+    def infer() -> None:
+        with torch.inference_mode():
+            for _ in range(steps):
+                alg.act(observations)
+
+    found = {}
+    for name, function in (("simulation", simulate), ("step", steps_of_env), ("inference", infer)):
+        with torch.inference_mode():
+            env.reset()
+        stretch = Stretch(function, device)
+        found[name] = statistics.median(
+            stretch.seconds(_fresh(env) if name == "simulation" else lambda: None) for _ in range(repeats)
+        )
+    return found
+
+
+def _fresh(env: Any) -> Callable[[], None]:
+    def start() -> None:
+        import torch
+
+        with torch.inference_mode():
+            env.reset()
+
+    return start
+
+
+def split(total: dict[str, float], parts: dict[str, float]) -> dict[str, float]:
+    """Seconds of each of :data:`PARTS` from the whole iteration and the parts measured alone; none below zero."""
+    environment = max(parts["step"] - parts["simulation"], 0.0)
+    storage = max(total["rollout"] - parts["step"] - parts["inference"], 0.0)
+    return {
+        "simulation": parts["simulation"],
+        "environment": environment,
+        "inference": parts["inference"],
+        "storage": storage,
+        "learning": total["learning"],
+    }
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure a training iteration."""
+    if args.iterations < 1 or args.repeats < 1:
+        raise VisthrowError(f"--iterations {args.iterations}, --repeats {args.repeats}: expected positive numbers")
+    from visthrow.task import Experiment
+    from visthrow.training import device
+
+    path = config.find("train", args.config)
+    experiment = config.load(Experiment, path, args.overrides)
+    return records.finish(
+        measure(experiment, path.stem, device.resolve(args.device), args.iterations, args.repeats), args
+    )
+
+
+def measure(experiment: Any, name: str, device: str, iterations: int, repeats: int) -> Report:
+    """Measure and report."""
+    from visthrow.training.trainer import Trainer
+
+    trainer = Trainer(experiment, device, seed=1)
+    runs = whole(trainer, iterations)
+    total = {key: statistics.median(values) for key, values in runs.items()}
+    parts = split(total, alone(trainer, repeats))
+    samples, wall = trainer.samples_per_iteration, sum(total.values())
+    rows = [
+        (f"{part}: {PARTS[part]}", f"{t * 1e3:.2f} ms", f"{100 * t / wall:.0f} %", rate(samples / t) if t else "")
+        for part, t in parts.items()
+    ]
+    rows.append(("iteration", f"{wall * 1e3:.2f} ms", "100 %", rate(samples / wall)))
+    p = experiment.ppo
+    title = f"{name}: {p.environments:,} environments x {p.steps} steps on {card.name(device)}"
+    notes = (
+        f"Rollout and learning are medians of {iterations} iterations of training itself, after {WARM_UP} that warm "
+        "up. Simulation, environment step and policy were then run alone, from CUDA graphs on a GPU; environment is "
+        "the step less the simulation, storage what is left of the rollout.",
+        f"The paper's 2e8 environment steps at this speed: {2e8 / samples * wall:.0f} s.",
+    )
+    figures = {
+        "config": name,
+        "device": device,
+        "samples": samples,
+        "seconds": parts,
+        "iteration_s": wall,
+        "rollout_s": total["rollout"],
+        "steps_per_s": samples / wall,
+        "runs": runs,
+    }
+    table = Table(title, ("part", "time", "share", "env-steps/s"), tuple(rows))
+    return Report("train", f"A training iteration on {card.name(device)}", (table,), notes, figures)

@@ -1,0 +1,138 @@
+"""Reports of measurements: printed as Markdown, written as JSON with their provenance, kept in the package."""
+
+import argparse
+import json
+import re
+from dataclasses import asdict, dataclass, field
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from visthrow.common import provenance
+from visthrow.common.errors import StorageError, VisthrowError, suggest
+from visthrow.common.storage import write_json
+
+FOLDER = Path(__file__).resolve().parent / "records"
+FURTHER_PACKAGES = ("mujoco-warp",)
+KEYS = {"bench", "title", "provenance", "tables", "notes", "figures"}
+_NAME = re.compile(r"[a-z0-9][a-z0-9_-]*")
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table as it is printed: every cell is text."""
+
+    title: str
+    header: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+
+    def markdown(self) -> str:
+        """Text of the table, columns aligned."""
+        lines = [self.header, *self.rows]
+        width = [max(len(line[i]) for line in lines) for i in range(len(self.header))]
+        text = ["| " + " | ".join(cell.ljust(w) for cell, w in zip(line, width)) + " |" for line in lines]
+        text.insert(1, "|" + "|".join("-" * (w + 2) for w in width) + "|")
+        return "\n".join([f"**{self.title}**", "", *text])
+
+
+@dataclass(frozen=True)
+class Report:
+    """One measurement.
+
+    Attributes:
+        bench: which of ``visthrow bench`` made it.
+        title: one line.
+        tables: what is printed.
+        notes: sentences below the tables: how it was measured, what a number does not say.
+        figures: the numbers behind the tables, SI units, for programs.
+    """
+
+    bench: str
+    title: str
+    tables: tuple[Table, ...]
+    notes: tuple[str, ...]
+    figures: dict[str, Any] = field(default_factory=dict)
+
+    def record(self) -> dict[str, Any]:
+        """The report with its provenance, as JSON holds it."""
+        origin = provenance.collect()
+        for name in FURTHER_PACKAGES:
+            try:
+                origin["versions"][name] = metadata.version(name)
+            except metadata.PackageNotFoundError:
+                continue
+        return {**asdict(self), "provenance": origin}
+
+
+def rate(per_second: float) -> str:
+    """A rate as text: in millions from 100,000 on."""
+    return f"{per_second / 1e6:,.2f} M" if per_second >= 1e5 else f"{per_second:,.0f}"
+
+
+def finish(report: Report, args: argparse.Namespace) -> int:
+    """Print a report and write it where ``--json`` and ``--record`` say."""
+    path = record_path(args.record) if args.record else None
+    print(body(asdict(report)))
+    for target in (args.json, path):
+        if target is not None:
+            write_json(target, report.record())
+            print(f"\nwritten: {target}")
+    return 0
+
+
+def record_path(name: str) -> Path:
+    """File of a record.
+
+    Raises:
+        StorageError: a name that is no plain word.
+    """
+    if not _NAME.fullmatch(name):
+        raise StorageError(f"record name '{name}': expected lower-case letters, digits, '-' and '_'")
+    return FOLDER / f"{name}.json"
+
+
+def body(record: dict[str, Any]) -> str:
+    """Title, tables and notes of a record as Markdown."""
+    tables = [Table(t["title"], tuple(t["header"]), tuple(map(tuple, t["rows"]))).markdown() for t in record["tables"]]
+    return "\n\n".join([f"### {record['title']}", *tables, "\n".join(f"- {note}" for note in record["notes"])]).rstrip()
+
+
+def origin(record: dict[str, Any]) -> str:
+    """Provenance of a record in a few lines of Markdown."""
+    came = record["provenance"]
+    processors = came["processors"]
+    machine = f"{processors['cpu']}, {processors['cores']} cores"
+    if processors.get("gpu"):
+        machine += f"; {', '.join(processors['gpu'])}"
+    versions = ", ".join(f"{name} {version}" for name, version in came["versions"].items())
+    return f"`{came['command']}`, {came['time']}, commit {came['commit'][:12]}\n\n{machine}\n\n{versions}"
+
+
+def load(path: Path) -> dict[str, Any]:
+    """Read a record.
+
+    Raises:
+        StorageError: no JSON, or keys missing.
+    """
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise StorageError(f"{path.name}: not a readable record ({error})") from error
+    missing = KEYS - (record.keys() if isinstance(record, dict) else set())
+    if missing:
+        raise StorageError(f"{path.name}: not a record; missing {sorted(missing)}")
+    return record
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print records."""
+    kept = {path.stem: path for path in sorted(FOLDER.glob("*.json"))}
+    unknown = [name for name in args.names if name not in kept]
+    if unknown:
+        raise VisthrowError(f"no record '{unknown[0]}'; {suggest(unknown[0], kept)}")
+    for name in args.names or kept:
+        record = load(kept[name])
+        print(f"## {name}\n\n{origin(record)}\n\n{body(record)}\n")
+    if not kept:
+        print("nothing is recorded yet; measure with: visthrow bench sim --record NAME")
+    return 0

@@ -1,0 +1,210 @@
+"""One CPU core: wall time a simulated second of one environment, against MuJoCo C on the same rope."""
+
+import contextlib
+import os
+import statistics
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from sim.hybrid import HybridSim, tether_lengths
+from visthrow.common.errors import VisthrowError
+from visthrow.evidence.bench import commands
+from visthrow.evidence.bench.records import Report, Table
+from visthrow.task import Experiment, plant_of
+
+BATCH = 1024
+"""Environments of the batch: what they share, the launch and the fetching of code, is spread over enough of them, and
+their state (1 kB each) stays in the core's second-level cache."""
+
+EPISODE = 50
+"""Control steps from one start to the next: one simulated second, about a throw."""
+
+TOLERANCE = 1e-3  # [m], of ball and vehicle at the end of the hard throw
+BARS = {"RK4": 20.0, "implicitfast": 4.0}
+
+
+@contextlib.contextmanager
+def on_one_core(core: int | None = None) -> Iterator[int | None]:
+    """Keep the process on one core; yields its number, None where the system cannot do it.
+
+    Raises:
+        VisthrowError: a core that this process may not use.
+    """
+    if not hasattr(os, "sched_setaffinity"):
+        yield None
+        return
+    before = os.sched_getaffinity(0)
+    chosen = max(before) if core is None else core
+    if chosen not in before:
+        raise VisthrowError(f"--core {chosen}: expected one of {sorted(before)}")
+    os.sched_setaffinity(0, {chosen})
+    try:
+        yield chosen
+    finally:
+        os.sched_setaffinity(0, before)
+
+
+class Batch:
+    """The full model: a batch of plants with all blocks under drawn commands."""
+
+    def __init__(self, experiment: Experiment, count: int, kind: str):
+        self.plant, self.spreads = plant_of(experiment), experiment.task.start
+        self.sim = HybridSim(self.plant, count, ropes=tether_lengths(experiment.rope, self.spreads))
+        self.commands = commands.draw(kind, self.plant, experiment.task.action, EPISODE, count)
+
+    def cost(self, seconds: float) -> float:
+        """Wall time [s] a simulated second and environment, measured for about ``seconds``, starts left out."""
+        spent, steps = 0.0, 0
+        while spent < seconds:
+            self.sim.randomize(self.spreads)
+            for command in self.commands:
+                self.sim.set_command(command)
+                start = time.perf_counter()
+                self.sim.step()
+                spent += time.perf_counter() - start
+            steps += EPISODE
+        return spent / (steps * self.sim.count * self.plant.sim.control_period)
+
+
+def cost_in_c(scene: Any, seconds: float) -> float:
+    """Wall time [s] a simulated second of a scene of ``sim.reference.bench_scenes``, measured for about ``seconds``."""
+    chunk = round(0.5 / scene.step)
+    spent, steps = 0.0, 0
+    while spent < seconds:
+        start = time.perf_counter()
+        scene.advance(chunk)
+        spent += time.perf_counter() - start
+        steps += chunk
+    return spent / (steps * scene.step)
+
+
+def interleaved(a: Callable[[], float], b: Callable[[], float], repeats: int) -> list[tuple[float, float]]:
+    """Measure A B A B ...; each pair sees about the same machine."""
+    return [(a(), b()) for _ in range(repeats)]
+
+
+def longest_accurate_step(error: Callable[[float], float], duration: float, tolerance: float) -> float:
+    """Longest step [s] that divides ``duration`` and whose error, and that of shorter ones, stays within ``tolerance``.
+
+    Args:
+        error: of a step [m]; NaN counts as too much.
+        duration: [s].
+        tolerance: [m].
+
+    Raises:
+        VisthrowError: even 0.1 ms is too long.
+    """
+    wrong, right = round(duration / 2.0e-3), round(duration / 1.0e-4)
+    if not error(duration / right) <= tolerance:
+        raise VisthrowError("the step search starts from 0.1 ms, which is too long already")
+    while right - wrong > 1:
+        middle = (wrong + right) // 2
+        if error(duration / middle) <= tolerance:
+            right = middle
+        else:
+            wrong = middle
+    return duration / right
+
+
+def contenders(plant: Any) -> tuple[dict[str, Any], dict[str, tuple[float, float]]]:
+    """MuJoCo's two scenes, and how far (ball, vehicle) [m] each contender ends from the converged hard throw."""
+    from sim.reference import bench_scenes
+    from sim.reference.oracle import converged
+    from visthrow.evidence.bench import scenes
+
+    hard = scenes.HARD_THROW
+
+    def ends(**how: Any) -> tuple:
+        run = converged(hard, **how)
+        return run.ball_pos_w[-1], run.pos_w[-1]
+
+    truth = ends()
+    step = longest_accurate_step(lambda h: max(scenes.distance(ends(step=h), truth)), hard.duration, TOLERANCE)
+    implicit = {"step": bench_scenes.IMPLICIT_STEP, "armature": bench_scenes.ARMATURE}
+    errors = {
+        "ours": scenes.distance(scenes.end_of_scene(hard, plant), truth),
+        "RK4": scenes.distance(ends(step=step), truth),
+        "implicitfast": scenes.distance(ends(integrator="implicitfast", **implicit), truth),
+    }
+    return {
+        "RK4": bench_scenes.rk4_scene(hard, step),
+        "implicitfast": bench_scenes.implicitfast_scene(hard, **implicit),
+    }, errors
+
+
+def measure(
+    experiment: Experiment, batch: int, repeats: int, seconds: float, core: int | None, with_mujoco: bool = True
+) -> Report:
+    """Measure on one core and report."""
+    plant = plant_of(experiment)
+    rivals, errors = contenders(plant) if with_mujoco else ({}, {})
+    ours = {kind: Batch(experiment, batch, kind) for kind in commands.KINDS}
+    pairs: dict[str, list[tuple[float, float]]] = {}
+    with on_one_core(core) as used:
+        for warm in ours.values():
+            warm.cost(0.1 * seconds)
+        for name, scene in rivals.items():
+            cost_in_c(scene, 0.1 * seconds)
+            pairs[name] = interleaved(
+                lambda: ours["hover"].cost(seconds), lambda s=scene: cost_in_c(s, seconds), repeats
+            )
+        full = [ours["full"].cost(seconds) for _ in range(repeats)]
+        alone = [a for rows in pairs.values() for a, _ in rows] or [ours["hover"].cost(seconds) for _ in range(repeats)]
+    hover = statistics.median(alone)
+    period, segments = plant.sim.control_period, plant.rope.segments
+    rows = [
+        _row(f"visthrow, all blocks, {plant.sim.substep * 1e3:g} ms, hover", hover, None, errors.get("ours"), period)
+    ]
+    rows.append(_row("the same, full-range commands", statistics.median(full), None, None, period))
+    figures: dict[str, Any] = {
+        "batch": batch,
+        "core": used,
+        "repeats": repeats,
+        "seconds": seconds,
+        "errors_m": errors,
+        "ours_s_per_s": {"hover": hover, "full": statistics.median(full)},
+        "hover_runs": alone,
+        "full_runs": full,
+        "env_steps_per_s": 1.0 / (hover * period),
+        "full_range": commands.shares(ours["full"].sim),
+        "rivals": {},
+    }
+    for name, scene in rivals.items():
+        found = {"scene": scene.name, "step_s": scene.step, "pairs": pairs[name], "bar": BARS[name]}
+        found["s_per_s"] = statistics.median(b for _, b in pairs[name])
+        found["ratio"] = statistics.median(b / a for a, b in pairs[name])
+        rows.append(_row(scene.name, found["s_per_s"], found["ratio"], errors[name], period))
+        figures["rivals"][name] = found
+    header = ("plant", "wall time a simulated second", "env-steps/s", "ratio", "hard throw: ball, vehicle off by")
+    table = Table(f"One core, rope of {segments} segments; ours in a batch of {batch}", header, tuple(rows))
+    return Report(
+        "sim", f"Simulator on one CPU core against MuJoCo C ({segments} segments)", (table,), _notes(figures), figures
+    )
+
+
+def _row(
+    name: str, cost: float, ratio: float | None, error: tuple[float, float] | None, period: float
+) -> tuple[str, ...]:
+    off = "" if error is None else f"{error[0] * 1e3:.3g} mm, {error[1] * 1e3:.3g} mm"
+    return name, f"{cost * 1e3:.3f} ms", f"{1.0 / (cost * period):,.0f}", "" if ratio is None else f"{ratio:.1f}", off
+
+
+def _notes(figures: dict[str, Any]) -> tuple[str, ...]:
+    full = figures["full_range"]
+    notes = [
+        f"Measured on core {figures['core']} in stretches of {figures['seconds']:g} s, median of {figures['repeats']}.",
+        f"Under full-range commands {100 * full['fallback']:.0f} % of the last control steps kept a first stage "
+        f"somewhere and {100 * full['failed']:.2f} % failed.",
+    ]
+    if figures["rivals"]:
+        step = figures["rivals"]["RK4"]["step_s"]
+        notes += [
+            "Ours and MuJoCo take turns; the ratio is the median over the pairs. Ours flies queue, controller, motors, "
+            "battery and aerodynamics, MuJoCo the bare rope and a constant wrench, in one call of mj_step a throw.",
+            f"RK4 at {step * 1e3:.4g} ms is the longest step that ends the hard throw within {TOLERANCE * 1e3:g} mm of "
+            "a converged run (bisection over the steps that divide it).",
+        ]
+        bars = ", ".join(f"{n} {r['ratio']:.1f} (at least {r['bar']:g})" for n, r in figures["rivals"].items())
+        notes.append(f"Bars: {bars}.")
+    return tuple(notes)

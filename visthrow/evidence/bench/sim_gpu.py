@@ -1,0 +1,186 @@
+"""A GPU: environment steps a second over batch sizes from a CUDA graph, against MuJoCo Warp and the card's limits."""
+
+import statistics
+import time
+from typing import Any
+
+import warp as wp
+
+from sim.hybrid import HybridSim, tether_lengths
+from visthrow.evidence.bench import card, commands, compile_time, flops
+from visthrow.evidence.bench.records import Report, Table, rate
+from visthrow.task import Experiment, plant_of
+
+BATCHES = tuple(2**k for k in range(12, 20))  # 4,096 to 524,288
+GRAPH_STEPS = 20  # control steps in the graph
+REPLAYS = 3  # of the graph between two starts: 1.2 simulated seconds
+BARS = {"env_steps_per_s": 30e6, "over_mujoco_warp": 30.0}
+
+
+class Graph:
+    """Control steps of a batch under drawn commands, captured once and replayed."""
+
+    def __init__(self, experiment: Experiment, count: int, kind: str, device: str, steps: int = GRAPH_STEPS):
+        plant = plant_of(experiment)
+        self.spreads, self.steps, self.device = experiment.task.start, steps, device
+        self.sim = HybridSim(plant, count, device, ropes=tether_lengths(experiment.rope, self.spreads))
+        drawn = commands.draw(kind, plant, experiment.task.action, steps, count)
+        self._commands = [wp.array(c, dtype=self.sim.types.vec4, device=device) for c in drawn]
+        self.sim.randomize(self.spreads)
+        self._advance()  # loads the module: a capture cannot
+        with wp.ScopedCapture(device=device, force_module_load=False) as capture:
+            self._advance()
+        self.graph = capture.graph
+
+    def _advance(self) -> None:
+        for command in self._commands:
+            wp.copy(self.sim.command, command)
+            self.sim.step()
+
+    def rate(self, replays: int = REPLAYS) -> float:
+        """Environment steps a second of one stretch from a new start, the start left out."""
+        self.sim.randomize(self.spreads)
+        wp.synchronize_device(self.device)
+        start = time.perf_counter()
+        for _ in range(replays):
+            wp.capture_launch(self.graph)
+        wp.synchronize_device(self.device)
+        return self.sim.count * self.steps * replays / (time.perf_counter() - start)
+
+
+def sweep(experiment: Experiment, device: str, batches: tuple[int, ...], repeats: int) -> list[dict[str, Any]]:
+    """Median rates over batch sizes and command kinds, with the shares of fallen-back and failed environments."""
+    rows = []
+    for count in batches:
+        row: dict[str, Any] = {"batch": count}
+        for kind in commands.KINDS:
+            graph = Graph(experiment, count, kind, device)
+            graph.rate()
+            rates = [graph.rate() for _ in range(repeats)]
+            row[kind] = {"env_steps_per_s": statistics.median(rates), "runs": rates, **commands.shares(graph.sim)}
+            del graph
+        rows.append(row)
+    return rows
+
+
+def floor(experiment: Experiment, device: str, best: float) -> dict[str, Any]:
+    """Operations and bytes that a step cannot do without, and how near the measured rate comes to the card's peaks."""
+    plant = plant_of(experiment)
+    count, size = flops.env_step(plant, device), flops.traffic(plant, device)
+    found: dict[str, Any] = {"operations": count, "bytes": size, "card": None}
+    peaks = card.peaks(device)
+    if peaks is not None:
+        by_flops, by_bytes = peaks.flops / count["total"], peaks.bandwidth / size["traffic"]
+        found |= {
+            "card": {"name": peaks.name, "flops": peaks.flops, "bandwidth": peaks.bandwidth, "source": peaks.source},
+            "limit_by_flops": by_flops,
+            "limit_by_bytes": by_bytes,
+            "share_of_flops": best / by_flops,
+            "share_of_bandwidth": best / by_bytes,
+        }
+    return found
+
+
+def measure(
+    experiment: Experiment, device: str, batches: tuple[int, ...] | list[int], repeats: int, with_mujoco: bool = True
+) -> Report:
+    """Measure and report."""
+    plant = plant_of(experiment)
+    with compile_time.fresh_cache(device) as compiling:
+        rows = sweep(experiment, device, tuple(batches), repeats)
+    best = {kind: max(rows, key=lambda r: r[kind]["env_steps_per_s"]) for kind in commands.KINDS}
+    top = {kind: best[kind][kind]["env_steps_per_s"] for kind in commands.KINDS}
+    lowest = min(top.values())
+    figures: dict[str, Any] = {
+        "device": device,
+        "batches": rows,
+        "best": {k: {"batch": best[k]["batch"], "env_steps_per_s": top[k]} for k in top},
+        "graph_steps": GRAPH_STEPS,
+        "replays": REPLAYS,
+        "repeats": repeats,
+        "bars": BARS,
+        "floor": floor(experiment, device, lowest),
+        "compile": compiling,
+        "mujoco_warp": None,
+    }
+    tables = [_sweep_table(rows, plant.rope.segments)]
+    if with_mujoco:
+        from visthrow.evidence.bench import mujoco_warp
+
+        found = mujoco_warp.measure(device, min(repeats, 3), plant.sim.control_period)
+        figures["mujoco_warp"] = found
+        if "rows" in found:
+            found["ratio"] = {k: top[k] / found["best"]["env_steps_per_s"] for k in top}
+            tables.append(mujoco_warp.table(found))
+    tables.append(_floor_table(figures))
+    return Report("sim", f"Simulator on {card.name(device)}", tuple(tables), _notes(figures), figures)
+
+
+def _sweep_table(rows: list[dict[str, Any]], segments: int) -> Table:
+    header = ("environments", "hover, env-steps/s", "full range, env-steps/s", "full range: fell back", "failed")
+    cells = [
+        (
+            f"{row['batch']:,}",
+            rate(row["hover"]["env_steps_per_s"]),
+            rate(row["full"]["env_steps_per_s"]),
+            f"{100 * row['full']['fallback']:.1f} %",
+            f"{100 * row['full']['failed']:.3f} %",
+        )
+        for row in rows
+    ]
+    return Table(f"visthrow, all blocks, rope of {segments} segments", header, tuple(cells))
+
+
+def _floor_table(figures: dict[str, Any]) -> Table:
+    limits, comp = figures["floor"], figures["compile"]
+    size, count = limits["bytes"], limits["operations"]
+    rows = [
+        ("operations an env-step", f"{count['total']:,}"),
+        ("bytes moved an env-step, at least", f"{size['traffic']:,}"),
+        ("bytes an environment", f"{size['environment']:,}"),
+        ("compile time, empty cache", f"{comp['cold_s']:.1f} s"),
+        ("load time, warm cache", f"{comp['warm_s']:.1f} s"),
+    ]
+    if limits["card"]:
+        c = limits["card"]
+        rows[2:2] = [
+            (
+                f"limit by operations ({c['flops'] / 1e12:.0f} TFLOP/s)",
+                f"{limits['limit_by_flops'] / 1e6:,.0f} M env-steps/s",
+            ),
+            (
+                f"limit by bytes ({c['bandwidth'] / 1e12:.1f} TB/s)",
+                f"{limits['limit_by_bytes'] / 1e6:,.0f} M env-steps/s",
+            ),
+            (
+                "reached of the two",
+                f"{100 * limits['share_of_flops']:.0f} %, {100 * limits['share_of_bandwidth']:.1f} %",
+            ),
+        ]
+    return Table("Floor and size", ("what", "value"), tuple(rows))
+
+
+def _notes(figures: dict[str, Any]) -> tuple[str, ...]:
+    best = figures["best"]
+    notes = [
+        f"One graph holds {GRAPH_STEPS} control steps with a new command each; {REPLAYS} replays from a new random "
+        f"start a measurement, median of {figures['repeats']}. One env-step is one control step.",
+        "Best: "
+        + "; ".join(f"{k} {rate(b['env_steps_per_s'])} env-steps/s at {b['batch']:,}" for k, b in best.items())
+        + f" (bar {BARS['env_steps_per_s'] / 1e6:.0f} M).",
+        "Operations: additions, multiplications, divisions, roots, minima and maxima of one env-step at hover, counted "
+        "by running the kernel's own source; none for loads, comparisons, indices. Bytes: state read and written once, "
+        "command in, payload out; the rope's scratch arrays live in the card's caches and are not counted.",
+    ]
+    limits, found = figures["floor"], figures["mujoco_warp"]
+    if limits["card"]:
+        notes.append(f"Peaks: {limits['card']['source']}.")
+    if found is not None:
+        ratios = found.get("ratio")
+        notes.append(
+            found["why_not"]
+            if ratios is None
+            else f"Over MuJoCo Warp's best: hover {ratios['hover']:.0f}, full range {ratios['full']:.0f} times "
+            f"(bar {BARS['over_mujoco_warp']:.0f})."
+        )
+    return tuple(notes)

@@ -1,0 +1,80 @@
+"""``visthrow demo``: throw once with the shipped vision policy and compare it with the state policy."""
+
+import argparse
+import time
+from pathlib import Path
+
+from visthrow.throws import compare, fly
+
+THROWS, TARGETS = 100, (1.5, 2.0, 2.5)
+"""In the training simulator, for each policy."""
+
+REFERENCE_THROWS, REFERENCE_TARGETS = 6, (2.0,)
+"""On the reference plant, for each policy; one such throw costs seconds."""
+
+POLICIES = ("state", "vision")
+SEED = 0
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.epilog = "Takes less than a minute on two CPU cores. No GPU is needed and none is used.\n"
+    parser.add_argument(
+        "--out", default="out/demo", metavar="FOLDER", help="for pictures, tables and recording (default: out/demo)"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Fly, compare, list the files."""
+    import importlib.util
+
+    from visthrow.throws.loading import load_policy
+    from visthrow.view.tables import PAPER_NOTE
+
+    begin = time.perf_counter()
+    loaded = [load_policy(name) for name in POLICIES]
+    folder = Path(args.out)
+    compare.writable(folder)
+    if importlib.util.find_spec("mujoco") is None:
+        paths = _here(loaded, folder)
+        print("The reference plant is left out: it needs MuJoCo, pip install 'visthrow[reference]'\n")
+    else:
+        from visthrow.throws.reference_protocol import Throwing
+
+        # The reference plant flies in a process of its own meanwhile.
+        with Throwing(
+            loaded, REFERENCE_TARGETS, REFERENCE_THROWS, "reference-realistic", SEED, 1, together=True
+        ) as throwing:
+            paths = _here(loaded, folder)
+            print(
+                f"{REFERENCE_THROWS} throws a policy on the reference plant, which stands in for a real vehicle ...",
+                flush=True,
+            )
+            paths += _told(loaded, throwing.results(), "reference-realistic", folder)
+    print(PAPER_NOTE + "\n\nFiles:")
+    for path in paths:
+        print(f"  {path}")
+    print(f"\nAll of it took {time.perf_counter() - begin:.0f} s.")
+    return 0
+
+
+def _here(loaded: list, folder: Path) -> list[Path]:
+    """One recorded throw, and many in the training simulator."""
+    from visthrow.throws.flight import fly as throw_once
+
+    print("One throw at a target 2 m ahead with the vision policy ...", flush=True)
+    log = throw_once(loaded[1], [2.0, 0.0, 0.0], "hybrid", SEED)
+    paths = fly.write(folder, log, loaded[1].experiment)
+    print(fly.story(log) + "\n")
+    print(f"{THROWS} throws a policy and target in the training simulator ...", flush=True)
+    return paths + _told(loaded, compare.throw_hybrid(loaded, TARGETS, THROWS, "cpu", SEED), "hybrid", folder)
+
+
+def _told(loaded: list, throws: list, plant: str, folder: Path) -> list[Path]:
+    """Print the table and write it with its plot."""
+    from visthrow.view.tables import markdown
+
+    entries = compare.entries_of(loaded, POLICIES, throws)
+    title, rows = compare.title_of(plant, SEED), compare.rows_of(entries)
+    print(markdown(rows, title), flush=True)
+    return compare.write(folder, entries, rows, plant, title)

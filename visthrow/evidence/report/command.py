@@ -1,0 +1,165 @@
+"""``visthrow report``: one page with the paper's evidence and ours, from records or from throws made now."""
+
+import argparse
+import sys
+import time
+from pathlib import Path
+
+from visthrow.common.errors import StorageError, VisthrowError
+
+TITLE = "Throwing with a quadrotor: the paper's evidence and ours"
+UNITS = "throws"
+"""Folder of single results, in the output folder."""
+
+NO_REFERENCE = ('runs.shipped.throws=["own"]',)
+"""Changes of the quick list where MuJoCo is not installed."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.epilog = (
+        "examples:\n"
+        "  visthrow report                                the page, from the committed records\n"
+        "  visthrow report --quick                        few throws of the shipped policies and the baseline, made now\n"
+        "  visthrow report --results runs/sweep/throws    with throws of your own sweep on top\n"
+        "  visthrow report --measure --jobs 30            fly what no record holds of the baseline's throws; needs piqp\n"
+        "\nEverything is a unit of work that is kept when it is done: killed at any moment and started again, the command goes\n"
+        "on where it was. Trainings and throws of policies are the matter of 'visthrow sweep run paper' and 'gap'.\n"
+    )
+    parser.add_argument("--quick", action="store_true", help="throw now, few throws, instead of reading records")
+    parser.add_argument("--measure", action="store_true", help="fly the baseline's throws that no record holds, then report")
+    parser.add_argument(
+        "--results", nargs="+", action="extend", default=[], metavar="FOLDER", help="folders with further results of throws"
+    )
+    parser.add_argument(
+        "--records", metavar="FOLDER",
+        help="folder of records (default: those of the package); --measure writes baseline.json there",
+    )
+    parser.add_argument("--jobs", type=int, metavar="N", help="processes at once (default: one a core)")
+    parser.add_argument("--out", default="out/report", metavar="FOLDER", help="for page, tables and pictures (default: out/report)")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Throw if asked to, read, write."""
+    from visthrow.evidence.report import book
+    from visthrow.throws.compare import writable
+    from visthrow.throws.results import RECORDS
+    from visthrow.training import device
+    from visthrow.view import page
+
+    begin = time.perf_counter()
+    if args.quick and args.measure:
+        raise VisthrowError("--quick and --measure: expected one of them; --quick throws few, --measure what the records lack")
+    if args.jobs is not None and args.jobs < 1:
+        raise VisthrowError(f"--jobs {args.jobs}; expected 1 or more")
+    out, jobs = Path(args.out), args.jobs or device.cores()
+    records = Path(args.records) if args.records else RECORDS
+    folders = [_folder(name) for name in args.results]
+    writable(out)
+    if args.quick:
+        quick(out, jobs)
+        found = book.read((), [out / "quick" / UNITS, *folders], "quick: few throws, wide intervals")
+    else:
+        if args.measure:
+            measure(out, records, jobs)
+        found = book.read([records], folders)
+    paths = page.write(out, TITLE, lead(found), sections(found))
+    print(summary(found))
+    for path in paths[:2]:
+        print(path)
+    print(f"{len(found.results)} sets of throws, {len(found.runs)} trainings, {time.perf_counter() - begin:.0f} s")
+    return 0
+
+
+def _folder(name: str) -> Path:
+    path = Path(name)
+    if not path.exists():
+        raise StorageError(f"--results {name}: no such folder; expected one with results of throws, as runs/sweep/throws")
+    return path
+
+
+def quick(out: Path, jobs: int) -> None:
+    """Make the few throws of ``configs/sweep/quick.toml`` and of the baseline, as far as they are not there.
+
+    Raises:
+        VisthrowError: throws that failed; the message names them.
+    """
+    from importlib.util import find_spec
+
+    from visthrow.evidence.report import wanted
+    from visthrow.evidence.sweep.cli import load_list
+    from visthrow.evidence.sweep.pool import Local, Pool
+    from visthrow.throws import results
+
+    folder, changes = out / "quick", ()
+    if find_spec("mujoco") is None:
+        changes = NO_REFERENCE
+        _say("the reference plant is left out: it needs MuJoCo, pip install 'visthrow[reference]'")
+    local = Local(wanted.QUICK_LIST, folder, ["cpu"], jobs, changes)
+    outcome = Pool(load_list(wanted.QUICK_LIST, changes), folder, local, _say).run(None)
+    if outcome.failed:
+        told = "; ".join(f"{name}: {reason}" for name, reason in outcome.failed.items())
+        raise VisthrowError(f"throws failed: {told}; all that was printed is in {folder / 'logs'}")
+    if outcome.stopped:
+        raise KeyboardInterrupt
+    if find_spec("piqp") is None:
+        _say("the baseline is left out: it needs piqp, pip install 'visthrow[baseline]'")
+        return
+    from visthrow.baseline.thrower import fly_unit
+
+    results.work(wanted.quick(), folder / UNITS, fly_unit, None, jobs, lambda text: _say(f"TO+MPC: {text}"))
+
+
+def measure(out: Path, records: Path, jobs: int) -> None:
+    """Fly the baseline's throws that ``records`` lacks, and write the record anew."""
+    import importlib
+
+    from visthrow.baseline.thrower import fly_unit
+    from visthrow.evidence.report import wanted
+    from visthrow.throws import results
+
+    importlib.import_module("piqp")  # said here rather than by every worker
+    path = records / "throws" / "baseline.json"
+    known = results.load_all([path])
+    found = results.work(wanted.full(), out / UNITS, fly_unit, known, jobs, lambda text: _say(f"TO+MPC: {text}"))
+    results.pack(found.values(), path)
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
+
+
+def lead(found) -> str:
+    """What this page is, and what it is not."""
+    note = f" **{found.note[0].upper() + found.note[1:]}.**" if found.note else ""
+    return (
+        "Zhai et al., Learning to Throw, table by table. Ours is simulated throughout: **no vehicle was flown for this "
+        "project**, and the reference plants (MuJoCo, own code of every block, effects that the training lacks) stand in for "
+        f"one. Every row says on which plant it was measured. Brackets are 95 % bootstrap intervals.{note}"
+    )
+
+
+def sections(found) -> list:
+    """All sections, each followed by what somebody wrote beside its data."""
+    from dataclasses import replace
+
+    from visthrow.evidence.report import ablations, beyond, gap, origin, throws, trade
+    from visthrow.view.parts import Text
+
+    made = [
+        throws.throws_section(found), throws.vision_section(found), ablations.section(found), trade.baseline_section(found),
+        trade.front_section(found), gap.section(found), beyond.section(found), beyond.training_section(found),
+        origin.section(found),
+    ]  # fmt: skip
+    return [
+        replace(s, parts=(*s.parts, *(Text(p, "why") for p in found.findings.get(s.name, "").split("\n\n") if p))) for s in made
+    ]
+
+
+def summary(found) -> str:
+    """The table that is printed."""
+    from visthrow.evidence.report.throws import throws_section
+    from visthrow.view.parts import Grid
+
+    grids = [part for part in throws_section(found).parts if isinstance(part, Grid)]
+    return grids[0].markdown() + "\n" if grids else "no throws of the shipped policies are recorded; see --quick\n"

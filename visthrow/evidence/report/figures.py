@@ -1,0 +1,291 @@
+"""Pictures of the report: intervals, scatter, fronts, curves. All in the style of :mod:`visthrow.common.style`."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from visthrow.common import style
+from visthrow.common.statistics import Interval
+from visthrow.view.parts import png_of
+
+WIDTH = 9.2
+"""Of a picture over the page's whole width [inch]."""
+
+CIRCLES = (0.1, 0.2, 0.4)
+"""About the target, in scatter panels [m]."""
+
+
+@dataclass(frozen=True)
+class Mark:
+    """A value with its interval, and the paper's beside it."""
+
+    label: str
+    interval: Interval
+    series: int = 0  # which colour and marker
+    paper: Interval | None = None
+
+
+@dataclass(frozen=True)
+class Line:
+    """A curve with a band."""
+
+    label: str
+    x: Sequence[float]
+    intervals: Sequence[Interval]
+    series: int = 0
+    own: int | None = None  # index of the point at the policy's own value
+
+
+@dataclass(frozen=True)
+class Panel:
+    """Axes of one picture."""
+
+    title: str
+    xlabel: str
+    lines: tuple[Line, ...]
+    missing: str = ""  # said where there are no lines
+
+
+@dataclass(frozen=True)
+class Trade:
+    """Durations and errors on one plant."""
+
+    title: str
+    fronts: tuple[tuple[int, str, np.ndarray], ...]  # series, label, points (N, 2): duration [s], error [m]
+    stars: tuple[tuple[str, Interval, Interval], ...]  # label, duration [s], error [m]
+    crosses: tuple[tuple[str, np.ndarray], ...] = ()  # the paper's
+
+
+def _look(series: int) -> tuple[str, str]:
+    return style.COLOURS[series % len(style.COLOURS)], style.MARKERS[series % len(style.MARKERS)]
+
+
+def marks(rows: Sequence[Mark], xlabel: str, series: Sequence[str], zero: float | None = None, log: bool = False) -> bytes:
+    """Values with intervals, one below the other; crosses stand for the paper's.
+
+    Args:
+        rows: from the top.
+        xlabel: with unit.
+        series: names of the colours.
+        zero: where a line stands that an interval is to be compared with.
+        log: a logarithmic axis.
+    """
+    style.use()
+    import matplotlib.pyplot as plt
+
+    names = list(dict.fromkeys(row.label for row in rows))
+    count = len({row.series for row in rows})
+    figure, axis = plt.subplots(figsize=(WIDTH, 1.2 + 0.26 * len(names) * max(1.0, 0.55 * count)), layout="constrained")
+    shown = {}
+    for row in rows:
+        colour, marker = _look(row.series)
+        y = -names.index(row.label) - 0.2 * (row.series - 0.5 * (count - 1))
+        value = row.interval
+        axis.plot([value.low, value.high], [y, y], "-", color=colour, lw=2.2, solid_capstyle="butt", alpha=0.55)
+        shown[row.series] = axis.plot(value.value, y, marker, color=colour, ms=6.5, mec="white", mew=0.6, zorder=3)[0]
+        if row.paper is not None:
+            above = y + 0.14
+            ends = [max(row.paper.low, 0.1 * row.paper.value) if log else row.paper.low, row.paper.high]
+            axis.plot(ends, [above, above], "-", color=style.QUIET, lw=1.0)
+            shown[len(series)] = axis.plot(row.paper.value, above, "x", color=style.INK, ms=7, mew=1.5, zorder=4)[0]
+    if zero is not None:
+        axis.axvline(zero, color=style.QUIET, lw=1.0, ls=(0, (4, 3)), zorder=1)
+    if log:
+        _log_axis(axis.xaxis, "x", axis)
+    axis.set_yticks([-i for i in range(len(names))], names)
+    axis.set_ylim(-len(names) + 0.45, 0.55)
+    axis.tick_params(axis="y", length=0)
+    axis.grid(True, axis="x")
+    axis.set_axisbelow(True)
+    axis.set_xlabel(xlabel)
+    if len(shown) > 1:
+        names = [*series, "the paper's vehicle"]
+        keys = sorted(shown)
+        figure.legend([shown[key] for key in keys], [names[key] for key in keys], loc="outside right upper")
+    return png_of(figure)
+
+
+def _log_axis(which, name: str, axis) -> None:
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    getattr(axis, f"set_{name}scale")("log")
+    which.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    which.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    which.set_minor_formatter(NullFormatter())
+
+
+def scatter(panels: Sequence[tuple[str, Sequence[tuple[str, np.ndarray]]]], columns: int = 3) -> bytes:
+    """Landing points from above, the throw upwards.
+
+    Args:
+        panels: title and, for each colour, its label and misses (N, 2) [m]: along the throw, to the left.
+        columns: panels side by side.
+    """
+    style.use()
+    import matplotlib.pyplot as plt
+
+    columns = min(columns, len(panels))
+    rows = -(-len(panels) // columns)
+    far = max((np.abs(points).max() for _, series in panels for _, points in series if len(points)), default=0.2)
+    half = float(np.clip(1.06 * far, 0.12, 0.7))
+    size = WIDTH / max(columns, 3)
+    figure, axes = plt.subplots(
+        rows, columns, figsize=(size * columns, size * rows + 0.5), layout="constrained", squeeze=False, sharex=True, sharey=True
+    )
+    for axis in axes.flat[len(panels) :]:
+        axis.set_visible(False)
+    for axis, (title, series) in zip(axes.flat, panels):
+        _target(axis, half)
+        for i, (label, points) in enumerate(series):
+            _landings(axis, points, half, i, label)
+        axis.set(xlim=(-half, half), ylim=(-half, half), aspect="equal")
+        axis.set_title(title, fontsize=10.5 if columns <= 3 else 8.5)
+    for axis in axes[-1]:
+        axis.set_xlabel("lateral, to the right [m]")
+    for axis in axes[:, 0]:
+        axis.set_ylabel("along the throw [m]")
+    handles, labels = axes.flat[0].get_legend_handles_labels()
+    if len(labels) > 1:
+        figure.legend(handles, labels, loc="outside upper center", ncols=len(labels))
+    return png_of(figure)
+
+
+def _target(axis, half: float) -> None:
+    from matplotlib.patches import Circle
+
+    for radius in CIRCLES:
+        if radius < half:
+            axis.add_patch(Circle((0, 0), radius, fill=False, color=style.QUIET, lw=0.8, ls=(0, (4, 3)), zorder=1))
+        if 0.3 * half < radius < half:
+            axis.annotate(
+                f"{radius:g} m", (0.7071 * radius, -0.7071 * radius), fontsize=7.5, color=style.QUIET, xytext=(2, -2),
+                textcoords="offset points", ha="left", va="top", zorder=2,
+            )  # fmt: skip
+    axis.plot(0, 0, "+", color=style.INK, ms=12, mew=1.4, zorder=5)
+    axis.grid(True)
+    axis.set_axisbelow(True)
+
+
+def _landings(axis, points: np.ndarray, half: float, series: int, label: str) -> None:
+    """Points outside the panel stand at its edge, hollow; a thick cross marks their mean."""
+    colour, marker = _look(series)
+    shown = np.clip(points, -half, half)
+    inside = np.all(shown == points, axis=1)
+    alpha = 0.8 if len(points) <= 40 else 0.35
+    axis.scatter(-points[inside, 1], points[inside, 0], s=11, color=colour, marker=marker, alpha=alpha, lw=0, label=label, zorder=3)
+    out = shown[~inside]
+    axis.scatter(-out[:, 1], out[:, 0], s=18, facecolor="none", edgecolor=colour, marker=marker, clip_on=False, zorder=3)
+    if len(points):
+        center = points.mean(0)
+        axis.plot(-center[1], center[0], marker, color=colour, ms=7, mec="white", mew=1.2, zorder=6)
+
+
+def trades(panels: Sequence[Trade]) -> bytes:
+    """Agility against accuracy, a panel a plant; lines join the settings that no other one beats."""
+    style.use()
+    import matplotlib.pyplot as plt
+
+    from visthrow.baseline.front import pareto
+
+    figure, axes = plt.subplots(
+        1, len(panels), figsize=(WIDTH, 5.2), layout="constrained", sharex=True, sharey=True, squeeze=False
+    )
+    labels: dict[str, object] = {}
+    for axis, panel in zip(axes[0], panels):
+        for series, label, points in panel.fronts:
+            colour, marker = _look(series)
+            best = points[pareto(points)] if len(points) else points
+            axis.plot(*points.T, marker, color=colour, ms=4.5, alpha=0.35, mew=0)
+            labels[label] = axis.plot(*best.T, marker + "-", color=colour, ms=5.5, lw=1.4)[0]
+        for label, points in panel.crosses:
+            starred = len(points) <= 2
+            look = {"marker": "*", "ms": 11, "ls": "none", "mec": "white"} if starred else {"marker": "x", "ms": 6, "ls": "--"}
+            labels[label] = axis.plot(*points.T, color=style.QUIET, lw=1.1, **look)[0]
+        for i, (label, duration, error) in enumerate(panel.stars):
+            colour = style.COLOURS[3 + i]
+            axis.plot([duration.value] * 2, [error.low, error.high], "-", color=colour, lw=2.0, alpha=0.6)
+            axis.plot([duration.low, duration.high], [error.value] * 2, "-", color=colour, lw=2.0, alpha=0.6)
+            star = {"color": colour, "ms": 14, "mec": "white", "mew": 0.7, "ls": "none", "zorder": 5}
+            labels[label] = axis.plot(duration.value, error.value, "*", **star)[0]
+        empty = [label for _, label, points in panel.fronts if not len(points)]
+        if empty or not panel.fronts:
+            said = "no setting landed all its throws:\n" + "\n".join(empty) if empty else "not swept yet"
+            axis.text(0.03, 0.02, said, transform=axis.transAxes, fontsize=7.5, color=style.QUIET, va="bottom")
+        axis.set_title(panel.title, fontsize=10.5)
+        axis.set_xlabel("from start to landing [s]")
+        _log_axis(axis.yaxis, "y", axis)
+        axis.grid(True, which="major")
+    axes[0, 0].set_ylabel("mean landing error [m]")
+    figure.legend(labels.values(), labels.keys(), loc="outside lower center", ncols=2, fontsize=9)
+    return png_of(figure)
+
+
+def curves(panels: Sequence[Panel], ylabel: str, columns: int = 3, log: bool = False) -> bytes:
+    """Curves with bands of their intervals, one scale for all panels; a ring marks the policy's own value."""
+    style.use()
+    import matplotlib.pyplot as plt
+
+    columns = min(columns, len(panels))
+    rows = -(-len(panels) // columns)
+    figure, axes = plt.subplots(
+        rows, columns, figsize=(WIDTH if columns > 1 else 0.62 * WIDTH, 2.75 * rows + 0.4), layout="constrained", squeeze=False,
+        sharey=True,
+    )  # fmt: skip
+    for axis in axes.flat[len(panels) :]:
+        axis.set_visible(False)
+    labels: dict[str, object] = {}
+    for axis, panel in zip(axes.flat, panels):
+        for line in panel.lines:
+            labels.setdefault(line.label, _curve(axis, line))
+        if not panel.lines:
+            axis.text(0.5, 0.5, panel.missing or "no results", transform=axis.transAxes, ha="center", color=style.QUIET, fontsize=9)
+        axis.set_title(panel.title, fontsize=10.5)
+        axis.set_xlabel(panel.xlabel)
+        axis.grid(True)
+        axis.set_axisbelow(True)
+        if log:
+            _log_axis(axis.yaxis, "y", axis)
+        else:
+            axis.set_ylim(bottom=0.0)
+    for axis in axes[:, 0]:
+        axis.set_ylabel(ylabel)
+    if len(labels) > 1:
+        figure.legend(labels.values(), labels.keys(), loc="outside upper center", ncols=min(len(labels), 4 if columns > 1 else 2))
+    return png_of(figure)
+
+
+def _curve(axis, line: Line):
+    colour, marker = _look(line.series)
+    x = np.asarray(line.x, dtype=float)
+    axis.fill_between(x, [i.low for i in line.intervals], [i.high for i in line.intervals], color=colour, alpha=0.18, lw=0)
+    (drawn,) = axis.plot(x, [i.value for i in line.intervals], marker + "-", color=colour, ms=4.5, lw=1.5)
+    if line.own is not None:
+        axis.plot(x[line.own], line.intervals[line.own].value, "o", ms=11, mfc="none", mec=style.INK, mew=1.1)
+    return drawn
+
+
+def learning(groups: Sequence[tuple[str, Sequence[np.ndarray]]]) -> bytes:
+    """Landing error over training: a panel a group, each run its environment steps (N,) and errors (N,) as rows."""
+    style.use()
+    import matplotlib.pyplot as plt
+
+    columns = min(6, len(groups))
+    rows = -(-len(groups) // columns)
+    figure, axes = plt.subplots(
+        rows, columns, figsize=(WIDTH, 1.5 * rows + 0.3), layout="constrained", squeeze=False, sharex=True, sharey=True
+    )
+    for axis in axes.flat[len(groups) :]:
+        axis.set_visible(False)
+    for axis, (title, runs) in zip(axes.flat, groups):
+        for i, run in enumerate(runs):
+            axis.plot(run[0] / 1e6, run[1], color=style.COLOURS[i % len(style.COLOURS)], lw=1.2)
+        _log_axis(axis.yaxis, "y", axis)
+        axis.set_title(title, fontsize=7.5)
+        axis.tick_params(labelsize=7.5)
+        axis.grid(True, which="major")
+    for axis in axes[-1]:
+        axis.set_xlabel("million steps", fontsize=8)
+    for axis in axes[:, 0]:
+        axis.set_ylabel("error [m]", fontsize=8)
+    return png_of(figure)

@@ -1,0 +1,152 @@
+"""Sections on the learnt policies: their throws on each plant, and vision against state."""
+
+import math
+
+from visthrow.common import statistics as st
+from visthrow.evidence.report import figures
+from visthrow.evidence.report.book import HARDENED, SHIPPED, Book, errors, landed, misses
+from visthrow.evidence.report.wanted import FRONT_TARGET, TARGETS
+from visthrow.throws.plants import PLANTS
+from visthrow.throws.results import Result
+from visthrow.view.parts import Grid, Picture, Section, Text
+from visthrow.view.tables import PAPER, PAPER_NOTE
+
+SHORT = {
+    "pendulum": "own model", "hybrid": "training simulator", "reference": "reference plant",
+    "reference-realistic": "realistic reference plant",
+}  # fmt: skip
+"""Plant -> its name in tables."""
+
+
+def throws_section(book: Book) -> Section:
+    """Landing error and duration of the shipped policies on every plant, the paper's beside them."""
+    rows, missing = [], []
+    for name in (*SHIPPED, HARDENED):
+        for target in TARGETS:
+            for plant in PLANTS:
+                found = book.shipped(name, plant, target)
+                if found is None:
+                    if wanted_there(plant, target):
+                        missing.append(f"{name} at {target:g} m on the {SHORT[plant]}")
+                    continue
+                rows.append(_row(name, target, plant, found))
+    parts: list = [
+        Text(
+            "Throws of the shipped policies from hover. In training goals lie within 2 m, so 2.5 m is out of distribution. The "
+            "training simulator has all noise of the training; the reference plants were never seen in it. vision_dropout was "
+            "trained with a tenth of all keypoints lost, and is thrown so in the training simulator."
+        )
+    ]
+    if rows:
+        head = ("policy", "target [m]", "plant", "throws", "landed", "landing error [m], mean and 95 % interval", "deviation [m]",
+                "duration [s]", "bias along / left [m]", "the paper's vehicle: error [m], duration [s]")  # fmt: skip
+        parts.append(Grid("Landing error and duration", head, tuple(rows), PAPER_NOTE, heads=3))
+    picture = _scatter(book)
+    if picture:
+        parts.append(picture)
+    if missing:
+        parts.append(Text("Not thrown: " + "; ".join(missing) + ".", "missing"))
+    return Section("throws", "What the policies do", tuple(parts))
+
+
+def wanted_there(plant: str, target: float) -> bool:
+    """Whether the report wants policies thrown there: on the plain reference plant at one target alone."""
+    return plant != "reference" or target == FRONT_TARGET
+
+
+def _row(name: str, target: float, plant: str, found: Result) -> tuple[str, ...]:
+    head = (name, f"{target:.1f}", SHORT[plant], str(len(found.good)), f"{100 * landed([found]):.1f} %")
+    paper = PAPER.get((name, target))
+    beside = "-" if paper is None else "{:.3f} ± {:.3f}, {:.3f} ± {:.3f}".format(*paper)
+    if not found.good.any():
+        return (*head, "-", "-", "-", "-", beside)
+    bias = st.bias(misses([found]))
+    return (
+        *head, st.mean(errors([found])).text(), f"{found.of('error').std():.3f}", f"{found.of('duration').mean():.3f}",
+        f"{bias.along.value:+.3f} / {bias.aside.value:+.3f}", beside,
+    )  # fmt: skip
+
+
+def _scatter(book: Book) -> Picture | None:
+    for plant in ("reference-realistic", "hybrid"):
+        panels = []
+        for target in TARGETS:
+            found = [(name, book.shipped(name, plant, target)) for name in SHIPPED]
+            series = [(f"{name} policy", result.miss) for name, result in found if result is not None and result.good.any()]
+            if series:
+                panels.append((f"target {target:.1f} m", series))
+        if panels:
+            text = f"Landing points from above on the {SHORT[plant]}; large marks: means. The paper's figure shows 1.5 m and 2.0 m."
+            return Picture("landings", figures.scatter(panels), text)
+    return None
+
+
+def vision_section(book: Book) -> Section:
+    """What vision costs: difference of mean landing errors at each target, on each plant."""
+    rows, marks, missing = [], [], []
+    for i, plant in enumerate(PLANTS):
+        for target in TARGETS:
+            pair = _groups(book, plant, target)
+            if pair is None:
+                if wanted_there(plant, target):
+                    missing.append(f"{target:g} m on the {SHORT[plant]}")
+                continue
+            (vision, state), runs = pair
+            gap, faster = (_minus(vision, state, name) for name in ("error", "duration"))
+            paper = _paper(target)
+            beside = "-" if paper is None else f"{paper[0]:+.3f}, {paper[1]:+.3f}"
+            rows.append((SHORT[plant], f"{target:.1f}", runs, gap.text(sign=True), _said(gap), faster.text(sign=True), beside))
+            marks.append(figures.Mark(f"{target:.1f} m", gap, i, None if paper is None or i else _paper_gap(target)))
+    parts: list = [
+        Text("Vision minus state: positive means that vision lands further off. Where several trainings of both are recorded, "
+             "the interval covers trainings and throws; else it speaks of the two shipped policies alone, throw by throw: both "
+             "met the same vehicles, starts and winds.")
+    ]  # fmt: skip
+    if rows:
+        head = ("plant", "target [m]", "policies", "error: vision - state [m]", "in words", "duration: vision - state [s]",
+                "the paper's: error [m], duration [s]")  # fmt: skip
+        parts.append(Grid("Vision against state", head, tuple(rows), heads=1))
+        names = [SHORT[plant] for plant in PLANTS]
+        picture = figures.marks(marks, "landing error, vision minus state [m]", names, zero=0.0)
+        text = "Difference of mean landing errors with 95 % intervals; left of the line vision lands nearer."
+        parts.append(Picture("vision", picture, text))
+    if missing:
+        parts.append(Text("Not thrown by both: " + "; ".join(missing) + ".", "missing"))
+    return Section("vision", "Vision against state", tuple(parts))
+
+
+def _minus(vision: list[Result], state: list[Result], name: str) -> st.Interval:
+    """Difference of means: throw by throw where one policy of each met the same vehicles and starts."""
+    alike = all(vision[0].unit[key] == state[0].unit[key] for key in ("throws", "seed", "plant", "target"))
+    if len(vision) == len(state) == 1 and alike:
+        return st.paired(vision[0].columns[name], state[0].columns[name])
+    return st.difference([r.of(name) for r in vision], [r.of(name) for r in state])
+
+
+def _groups(book: Book, plant: str, target: float) -> tuple[tuple[list[Result], list[Result]], str] | None:
+    """Runs of both layouts: those trained for the comparison where two or more of each are there, else the shipped ones."""
+    trained = [book.seeds(layout, "full", plant, target, {}) for layout in ("vision", "state")]
+    if min(map(len, trained)) >= 2:
+        return (trained[0], trained[1]), f"{len(trained[0])} and {len(trained[1])} trainings"
+    shipped = [book.shipped(layout, plant, target) for layout in ("vision", "state")]
+    if any(result is None or not result.good.any() for result in shipped):
+        return None
+    return ([shipped[0]], [shipped[1]]), "shipped"
+
+
+def _paper(target: float) -> tuple[float, float] | None:
+    vision, state = PAPER.get(("vision", target)), PAPER.get(("state", target))
+    return None if vision is None or state is None else (vision[0] - state[0], vision[2] - state[2])
+
+
+def _paper_gap(target: float) -> st.Interval:
+    """The paper's difference of errors [m] with a normal interval from its deviations, ten throws each."""
+    (vision, vision_std), (state, state_std) = (PAPER[(name, target)][:2] for name in ("vision", "state"))
+    half = 1.96 * math.hypot(vision_std, state_std) / math.sqrt(10.0)
+    return st.Interval(vision - state, vision - state - half, vision - state + half, "throws")
+
+
+def _said(gap: st.Interval) -> str:
+    if 0.0 in gap:
+        return "no difference shows"
+    return "vision further off" if gap.value > 0.0 else "vision nearer"

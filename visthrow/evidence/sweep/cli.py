@@ -1,0 +1,177 @@
+"""``visthrow sweep``: work lists of training runs and throws in resumable pieces, on several GPUs or a cluster."""
+
+import argparse
+import os
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+
+DEFAULT_OUT = "runs/sweep"
+RELEASE_TARGET, RELEASE_COUNT = 2.0, 200  # as the throws of the ablations [m], and how many
+ACTIONS = ("run", "status", "collect", "releases", "work")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.epilog = (
+        "examples:\n"
+        "  visthrow sweep run paper --devices cuda:0,cuda:1 --jobs 30    all runs of configs/sweep/paper.toml\n"
+        "  visthrow sweep run paper --minutes 9                          stop after 9 minutes; the same command goes on\n"
+        "  visthrow sweep run paper --slurm partition=gpu --devices 8 --minutes 60    as jobs of a cluster\n"
+        "  visthrow sweep status paper                                   a line a run\n"
+        "  visthrow sweep collect paper --records out/records            what is committed of it\n"
+        "  visthrow sweep releases paper --units state-1,state_rigid_cable-1    how these policies let go, at 2 m\n"
+        "\nWhat is done is not done again: a training run is known by its resolved config and seed, throws by the policy's\n"
+        "content and everything else they depend on. Ctrl-C, a kill or a power cut lose what was not yet in a checkpoint.\n"
+    )
+    add = parser.add_argument
+    add("action", choices=ACTIONS, help="work is what run starts processes with")
+    add("list", metavar="LIST", help="name of configs/sweep, or a TOML file of your own")
+    add("--out", metavar="FOLDER", default=DEFAULT_OUT, help=f"of all results (default: {DEFAULT_OUT})")
+    devices = "one training at once on each: cuda:0,cuda:1; with a cluster how many (default: auto)"
+    add("--devices", metavar="NAMES", default="auto", help=devices)
+    add("--jobs", type=int, metavar="N", help="throws on the reference plant at once (default: one a core)")
+    add("--minutes", type=float, help="end after so long with checkpoints; on a cluster the length of a job")
+    add("--slurm", metavar="KEY=VALUE", action="append", help="submit jobs, with this option of sbatch; may be repeated")
+    add("--records", metavar="FOLDER", help="collect: where to (default: records beside the results)")
+    add("--units", metavar="NAMES", help="work and releases: which, with commas between")
+    add("--device", default="auto", help="work and releases: where")
+    add("--parent", type=int, metavar="ID", help="work: process with which this one is to end")
+    add(
+        "--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE",
+        help="change one value of the list, for instance --set runs.full.seeds=[1]; may be repeated",
+    )  # fmt: skip
+
+
+def load_list(name: str, overrides: tuple[str, ...] = ()):
+    """Units of a list, by a name of ``configs/sweep`` or a file.
+
+    Raises:
+        ConfigError: no such list, or something wrong in it.
+    """
+    from visthrow import config
+    from visthrow.evidence.sweep.lists import SweepList
+    from visthrow.evidence.sweep.units import expand
+
+    path = config.find("sweep", name)
+    return expand(path.stem, config.load(SweepList, path, overrides))
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run, tell, collect."""
+    actions = {"run": _run, "status": _status, "collect": _collect, "releases": _releases, "work": _work}
+    return actions[args.action](args)
+
+
+def _run(args: argparse.Namespace) -> int:
+    from visthrow.common.errors import ConfigError
+    from visthrow.evidence.sweep.pool import Local, Pool
+    from visthrow.training import device
+
+    if args.minutes is not None and args.minutes <= 0:
+        raise ConfigError(f"--minutes {args.minutes:g}; expected more than 0")
+    changes = tuple(args.overrides)
+    work, out = load_list(args.list, changes), Path(args.out)
+    jobs = args.jobs or device.cores()
+    begin = time.monotonic()
+
+    def say(text: str) -> None:
+        print(f"{time.monotonic() - begin:6.0f} s  {text}", flush=True)
+
+    with _Terminated():
+        if args.slurm is not None:
+            starter = _cluster(args, out, jobs, changes)
+            outcome = Pool(work, out, starter, say).run()
+        else:
+            names = args.devices.split(",")
+            starter = Local(args.list, out, [device.resolve(name) for name in names], jobs, changes)
+            outcome = Pool(work, out, starter, say).run(args.minutes)
+    for name, reason in outcome.failed.items():
+        print(f"{name} failed: {reason}; all it printed is in {out / 'logs'}", file=sys.stderr)
+    if outcome.stopped:
+        print("stopped before the end; the same command goes on", file=sys.stderr)
+        return 130
+    return 1 if outcome.failed else 0
+
+
+def _cluster(args: argparse.Namespace, out: Path, jobs: int, changes: tuple[str, ...]):
+    from visthrow.common.errors import ConfigError
+    from visthrow.evidence.sweep.cluster import Cluster
+
+    wrong = [item for item in args.slurm if "=" not in item]
+    if wrong or not args.devices.isdigit() or args.minutes is None:
+        raise ConfigError(
+            f"--slurm {' '.join(args.slurm)} --devices {args.devices} --minutes {args.minutes}; expected KEY=VALUE, the number "
+            "of GPUs to use at once, and the length of a job"
+        )
+    options = {f"slurm_{key}": value for key, value in (item.split("=", 1) for item in args.slurm)}
+    return Cluster(args.list, out, "slurm", int(args.devices), jobs, args.minutes, changes, options)
+
+
+class _Terminated:
+    """SIGTERM read as Ctrl-C while it is entered, so that a batch system's signal also ends in checkpoints."""
+
+    def __enter__(self) -> None:
+        self._before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+
+    def __exit__(self, *_: object) -> None:
+        signal.signal(signal.SIGTERM, self._before)
+
+
+def _work(args: argparse.Namespace) -> int:
+    from visthrow.common.errors import ConfigError
+    from visthrow.evidence.sweep.work import work
+
+    if not args.units:
+        raise ConfigError("sweep work: no --units; expected ids as `visthrow sweep run` gives them")
+    if args.parent:
+        threading.Thread(target=_follow, args=(args.parent,), daemon=True).start()
+    return work(load_list(args.list, tuple(args.overrides)), Path(args.out), args.units.split(","), args.device, args.minutes)
+
+
+def _follow(parent: int) -> None:
+    """Stop this process as Ctrl-C does once its parent is gone."""
+    while os.getppid() == parent:
+        time.sleep(0.5)
+    os.kill(os.getpid(), signal.SIGINT)
+
+
+def _status(args: argparse.Namespace) -> int:
+    from visthrow.evidence.sweep.record import status
+
+    lines, done = status(load_list(args.list, tuple(args.overrides)), Path(args.out))
+    print("\n".join(lines))
+    return 0 if done else 1
+
+
+def _collect(args: argparse.Namespace) -> int:
+    from visthrow.evidence.sweep.record import collect
+
+    out = Path(args.out)
+    for path in collect(load_list(args.list, tuple(args.overrides)), out, Path(args.records or out / "records")):
+        print(path)
+    return 0
+
+
+def _releases(args: argparse.Namespace) -> int:
+    from visthrow.common.errors import ConfigError, suggest
+    from visthrow.evidence.sweep.release import HEAD, releases, row
+    from visthrow.throws.loading import load_policy
+    from visthrow.training.device import resolve
+
+    work, out, device = load_list(args.list, tuple(args.overrides)), Path(args.out), resolve(args.device)
+    known = {source.name: source for source in work.sources if source.config and source.done(out)}
+    print(HEAD)
+    for name in (args.units or ",".join(known)).split(","):
+        if name not in known:
+            raise ConfigError(f"no trained policy '{name}' in {out}; {suggest(name, known)}")
+        source = known[name]
+        layout = source.experiment().task.observation.layout
+        vehicle = ("vehicle", "rope", "release", "observation.latency")
+        for where, config_name, changes in (("its own", source.config, source.changes), ("the full", layout, ())):
+            if where == "its own" or source.config != layout:
+                loaded = load_policy(source.policy(out), config_name, changes, vehicle)
+                print(row(name, where, releases(loaded, RELEASE_TARGET, RELEASE_COUNT, device)), flush=True)
+    return 0

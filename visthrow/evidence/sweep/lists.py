@@ -1,0 +1,55 @@
+"""Schema of a list of training runs and throws: one file of ``configs/sweep``."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from visthrow.common.errors import ConfigError, suggest
+from visthrow.throws.plants import PLANTS
+
+
+@dataclass(frozen=True)
+class ThrowParams:
+    """Throws of every policy that names them."""
+
+    plant: str  # of visthrow.throws.plants.PLANTS
+    targets: tuple[float, ...]  # along x [m]
+    count: int  # of each policy at each target
+    seed: int = 0  # of starts and noise
+    fly_in: Literal["own", "full"] = "own"  # the policy's training config, or its layout's full one (state, vision)
+    changes: tuple[str, ...] = ()  # key=value of that config
+    allow: tuple[str, ...] = ()  # parts of the policy's contract that may be broken so; recorded as departures
+
+    def __post_init__(self) -> None:
+        if self.plant not in PLANTS:
+            raise ConfigError(f"no plant '{self.plant}'; {suggest(self.plant, PLANTS)}")
+        if self.count < 1 or not self.targets:
+            raise ConfigError(f"{self.count} throws at the targets {self.targets}; expected 1 or more of each")
+
+
+@dataclass(frozen=True)
+class RunGroup:
+    """Training runs, or policies that are there already, with the throws that each is to fly."""
+
+    throws: tuple[str, ...]  # names of tables of throws
+    configs: tuple[str, ...] = ()  # of configs/train, or TOML files
+    seeds: tuple[int, ...] = (1,)  # every config with every one of them, seed after seed
+    changes: tuple[str, ...] = ()  # key=value of the configs
+    policies: tuple[str, ...] = ()  # shipped names, or files, that need no training
+
+
+@dataclass(frozen=True)
+class SweepList:
+    """What is to be done, the most important first."""
+
+    runs: dict[str, RunGroup]
+    throws: dict[str, ThrowParams]
+    commit: Literal["any", "same"] = "any"  # whether a run by another commit counts as done
+    changes: tuple[str, ...] = ()  # key=value of every training config
+    most_throws: int | None = None  # in any set; for a trial of the list
+    checkpoint_every: int = 100  # iterations: what a killed training loses at most, about 14 s of one H200
+
+    def __post_init__(self) -> None:
+        for name, group in self.runs.items():
+            for wanted in group.throws:
+                if wanted not in self.throws:
+                    raise ConfigError(f"runs.{name}: no throws '{wanted}'; {suggest(wanted, self.throws)}")

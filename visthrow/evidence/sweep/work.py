@@ -1,0 +1,124 @@
+"""Doing of units in this process: a piece of a training run, throws. What is done, or is being done elsewhere, is left alone."""
+
+import argparse
+import shutil
+import sys
+import time
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+
+from visthrow.common import provenance
+from visthrow.common.errors import BusyError
+from visthrow.common.storage import write_json
+from visthrow.evidence.sweep.lock import Lock
+from visthrow.evidence.sweep.units import Source, ThrowUnit, Work, throws_folder
+from visthrow.throws import results
+from visthrow.throws.loading import Loaded, load_policy
+
+PIECES = "pieces"
+"""Folder of a run with one file a piece."""
+
+EXIT_STOPPED, EXIT_BUSY = 130, 75
+
+
+def lock_of(out: Path, name: str) -> Path:
+    """Lock file of a unit."""
+    return out / "locks" / f"{name.replace('/', '_')}.lock"
+
+
+def work(work: Work, out: Path, ids: Sequence[str], device: str, minutes: float | None) -> int:
+    """Do units one after the other.
+
+    Args:
+        work: the list.
+        out: folder of all results.
+        ids: of trainings and throws.
+        device: as :func:`visthrow.training.device.resolve` takes it.
+        minutes: after which a training stops with a checkpoint.
+
+    Returns:
+        0; 130 where a training was stopped before its end; 75 where another process had the unit.
+    """
+    begin, status = time.monotonic(), 0
+    throws = {unit.id: unit for units in work.throws.values() for unit in units}
+    for name in ids:
+        left = None if minutes is None else max(minutes - (time.monotonic() - begin) / 60, 0.01)
+        unit = throws.get(name) or work.source(name)
+        try:
+            with Lock(lock_of(out, name)):
+                if unit.done(out):
+                    continue
+                if isinstance(unit, Source):
+                    status = train(unit, out, device, left, work.checkpoint_every)
+                elif unit.source.done(out):
+                    fly(unit, out, device)
+        except BusyError as error:
+            print(error, file=sys.stderr)
+            status = EXIT_BUSY
+        if status:
+            break
+    return status
+
+
+def train(source: Source, out: Path, device: str, minutes: float | None, checkpoint_every: int) -> int:
+    """Train, or go on, to the end or for some minutes; returns the exit status of ``visthrow train``."""
+    from visthrow.training import command as train_cli
+    from visthrow.training.trainer import CHECKPOINT
+
+    folder = source.folder(out)
+    resume = (folder / CHECKPOINT).is_file()
+    if folder.exists() and not resume:  # killed before its first checkpoint
+        shutil.rmtree(folder)
+    parser = argparse.ArgumentParser()
+    train_cli.add_arguments(parser)
+    words = [source.config, "--seed", str(source.seed), "--out", str(folder), "--device", device]
+    words += ["--checkpoint-every", str(checkpoint_every), *(["--resume"] if resume else [])]
+    words += ["--minutes", f"{minutes:.3f}"] if minutes is not None else []
+    for change in source.changes:
+        words += ["--set", change]
+    start, began = time.perf_counter(), datetime.now(UTC).isoformat(timespec="seconds")
+    status = 1
+    try:
+        status = train_cli.run(parser.parse_args(words))
+    finally:
+        piece = {"start": began, "seconds": round(time.perf_counter() - start, 2), "status": status, "commit": provenance.commit()}
+        write_json(folder / PIECES / f"{time.time_ns()}.json", {**piece, "processors": provenance.processors()})
+    return status
+
+
+def fly(unit: ThrowUnit, out: Path, device: str) -> None:
+    """Throw and write the result."""
+    from visthrow.training.device import resolve
+
+    start = time.perf_counter()
+    loaded = load(unit, out)
+    if unit.params.plant == "hybrid":
+        from visthrow.training.protocol import throw
+
+        device = resolve(device)
+        policy = loaded.policy.to(device)
+        columns = results.columns_of(throw(loaded.experiment, policy.act, unit.target, unit.count, device, unit.params.seed))
+    else:
+        import torch
+
+        from visthrow.throws.reference_protocol import Job, fly_batch
+
+        torch.set_num_threads(1)
+        columns = fly_batch([loaded], unit.params.plant, Job((0,), unit.target, unit.batch, unit.count, unit.params.seed))
+    made = {"commit": provenance.commit(), "command": f"visthrow sweep run (throws {unit.set} of {unit.source.name})",
+            "time": datetime.now(UTC).isoformat(timespec="seconds"), "seconds": round(time.perf_counter() - start, 2)}  # fmt: skip
+    results.save(throws_folder(out), results.Result(unit.unit(out), columns, made))
+
+
+def load(unit: ThrowUnit, out: Path) -> Loaded:
+    """The policy with the experiment that it is to fly in, departing from its contract as far as the list allows.
+
+    Raises:
+        MismatchError: the list does not allow what differs.
+    """
+    source, changes = unit.source, unit.params.changes
+    flown_in = unit.flown_in(unit.experiments(out)[0]["task"]["observation"]["layout"])
+    if flown_in is None and source.config:  # the list's config: that of the file may have fields of another version
+        flown_in, changes = source.config, source.changes + changes
+    return load_policy(source.policy(out), flown_in, changes, unit.params.allow)

@@ -1,0 +1,93 @@
+"""Logs of any kind into :class:`visthrow.logs.flightlog.FlightLog`."""
+
+from collections.abc import Sequence
+from fnmatch import fnmatchcase
+from pathlib import Path
+
+from visthrow.common.errors import LogError, suggest
+from visthrow.logs.flightlog import FlightLog
+from visthrow.logs.mapping import TableMap
+
+ENDINGS = (".npz", ".csv", ".csv.gz", ".csv.xz", ".parquet", ".bbl", ".bfl", ".ulg", ".bin", ".tlog")
+RUN_LOG = "flight.npz"
+"""In the folder of a run of ``visthrow hil``: its flight log."""
+
+
+def read(path: str | Path, mapping: TableMap | None = None) -> list[FlightLog]:
+    """Read a file, or the folder of a run, into flight logs; a file may hold several.
+
+    Args:
+        path: Of one of :data:`ENDINGS`, or a folder that holds a ``flight.npz``. ``stand.csv:a1_*`` takes of the logs in a
+            file those whose part fits the pattern.
+        mapping: Of a table's columns; not needed for our own exports and decoded blackbox logs.
+
+    Raises:
+        LogError: It cannot be read, or a table needs a mapping.
+    """
+    path = Path(path)
+    file, colon, pattern = str(path).rpartition(":")
+    if colon and not path.exists() and Path(file).is_file():
+        return _parts(read(file, mapping), file, pattern)
+    if path.is_dir():
+        return _of_folder(path)
+    name = path.name.lower()
+    if not path.exists():
+        near = sorted(p.name for p in path.parent.iterdir()) if path.parent.is_dir() else []
+        raise LogError(f"{path}: no such file; in that folder: {', '.join(near[:20]) or 'nothing'}")
+    if name.endswith((".csv", ".csv.gz", ".csv.xz", ".parquet")):
+        logs = _of_table(path, mapping)
+    elif name.endswith((".bbl", ".bfl")):
+        from visthrow.logs.blackbox_log import logs_of_blackbox
+
+        logs = logs_of_blackbox(path)
+    elif name.endswith((".ulg", ".bin", ".tlog")):
+        from visthrow.logs import autopilot
+
+        readers = {".ulg": autopilot.log_of_ulog, ".bin": autopilot.log_of_dataflash, ".tlog": autopilot.log_of_telemetry}
+        logs = [readers[path.suffix.lower()](path)]
+    elif name.endswith(".npz"):
+        log = FlightLog.load(path)
+        log.meta.setdefault("source", str(path))
+        logs = [log]
+    else:
+        raise LogError(f"{path}: ending '{path.suffix}'; expected one of {', '.join(ENDINGS)}")
+    return logs
+
+
+def read_all(paths: Sequence[str | Path], mapping: TableMap | None = None) -> list[FlightLog]:
+    """Read several files; see :func:`read`."""
+    return [log for path in paths for log in read(path, mapping)]
+
+
+def _parts(logs: list[FlightLog], file: str, pattern: str) -> list[FlightLog]:
+    names = [str(log.meta.get("part", "")) for log in logs]
+    chosen = [log for log, name in zip(logs, names) if fnmatchcase(name, pattern)]
+    if not chosen:
+        raise LogError(f"{file}: no part '{pattern}' among {len(names)}; {suggest(pattern, names)}")
+    return chosen
+
+
+def _of_folder(path: Path) -> list[FlightLog]:
+    if (path / RUN_LOG).is_file():
+        return read(path / RUN_LOG)
+    logs = sorted(p for p in path.glob("*.npz") if p.name != "policy.npz")
+    if not logs:
+        raise LogError(f"{path}: a folder without {RUN_LOG} or other .npz logs; name the files themselves")
+    return read_all(logs)
+
+
+def _of_table(path: Path, mapping: TableMap | None) -> list[FlightLog]:
+    from visthrow.logs import blackbox_log, table
+
+    columns = table.read_table(path)
+    if mapping is not None:
+        return table.logs_of(columns, mapping, str(path))
+    if blackbox_log.is_decoded(columns):
+        return [blackbox_log.log_of_decoded(columns, path)]
+    if table.is_export(columns):
+        log = table.log_of_export(columns, str(path))
+        if path.suffix == ".parquet":
+            log.meta.update(table.metadata_of(path))
+        return [log]
+    names = ", ".join(list(columns)[:12])
+    raise LogError(f"{path}: a table with the columns {names}, ...: it needs a mapping; give --config NAME (configs/diagnose)")

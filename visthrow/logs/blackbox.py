@@ -1,0 +1,321 @@
+"""Raw Betaflight blackbox files (.bbl, .bfl): headers and frames of every log in the file.
+
+A frame that does not decode is dropped, and nothing is believed until the next frame that stands on its own (I). A file
+may end within a frame.
+
+Source: Betaflight, "Blackbox logging internals"; frame checks as in Betaflight's blackbox-log-viewer.
+"""
+
+import contextlib
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from visthrow.common.errors import LogError
+from visthrow.logs.blackbox_codec import ENCODINGS, Corrupt, EndOfLog, Reader, extend, plan
+
+MARKER = b"H Product:Blackbox flight data recorder by Nicholas Sherlock"
+MAIN, FRAMES, EVENT = b"IP", b"IPSGHE", ord("E")
+(
+    ZERO, PREVIOUS, STRAIGHT_LINE, AVERAGE_2, MINTHROTTLE, MOTOR_0, INC, HOME_COORD, P1500, VBATREF, LAST_MAIN_TIME, MINMOTOR,
+) = range(12)  # fmt: skip
+HOME_COORD_1 = 256
+_LONGEST_FRAME = 256  # bytes
+_LONGEST_GAP_US = 10_000_000
+_MOST_ITERATIONS = 5000 * 10
+_EVENTS = {
+    0: "sync beep", 13: "adjustment", 14: "logging resumes", 15: "disarm", 30: "flight mode", 255: "end of log",
+}  # fmt: skip
+
+
+@dataclass
+class Fields:
+    """Definition of one kind of frame."""
+
+    names: list[str] = field(default_factory=list)
+    signed: list[int] = field(default_factory=list)
+    predictor: list[int] = field(default_factory=list)
+    encoding: list[int] = field(default_factory=list)
+
+
+@dataclass
+class BlackboxLog:
+    """One log of a file, in the units of the file."""
+
+    header: dict[str, str]
+    names: list[str]  # of the columns of ``main``
+    main: np.ndarray  # shape (T, fields), int64
+    slow_names: list[str] = field(default_factory=list)
+    slow: list[list[int]] = field(default_factory=list)
+    gps_names: list[str] = field(default_factory=list)
+    gps: list[list[int]] = field(default_factory=list)
+    events: list[tuple[str, tuple[float, ...]]] = field(default_factory=list)
+    frames: dict[str, int] = field(default_factory=dict)  # kind -> number decoded
+    corrupt: int = 0  # stretches of bytes that could not be decoded
+    dropped: int = 0  # frames decoded but resting on a damaged one
+    complete: bool = False  # whether the log ends with its end marker
+
+    def column(self, name: str) -> np.ndarray:
+        """One field of all main frames, shape (T,)."""
+        return self.main[:, self.names.index(name)]
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.names
+
+
+def read_blackbox(path: str | Path) -> list[BlackboxLog]:
+    """Read every log of a raw file.
+
+    Raises:
+        LogError: No such file, no blackbox file, or none of its logs holds a frame.
+    """
+    try:
+        data = Path(path).read_bytes()
+    except OSError as error:
+        raise LogError(f"{path}: cannot be read: {error.strerror or error}; expected a blackbox file") from error
+    starts = []
+    at = data.find(MARKER)
+    while at >= 0:
+        starts.append(at)
+        at = data.find(MARKER, at + 1)
+    if not starts:
+        raise LogError(f"{path}: no blackbox log in its {len(data)} bytes; expected '{MARKER.decode()}'")
+    logs, problems = [], []
+    for number, (start, end) in enumerate(zip(starts, [*starts[1:], len(data)]), start=1):
+        try:
+            logs.append(_Decoder(data[start:end]).decode())
+        except LogError as error:
+            problems.append(f"log {number}: {error}")
+    logs = [log for log in logs if len(log.main)]
+    if not logs:
+        raise LogError(f"{path}: {len(starts)} log(s), none with a frame in it {'; '.join(problems)}".rstrip())
+    return logs
+
+
+class _Decoder:
+    """Decodes one log: header lines, then frames until the end."""
+
+    def __init__(self, data: bytes) -> None:
+        self.header: dict[str, str] = {}
+        self.fields: dict[str, Fields] = {}
+        self.reader = Reader(data, self._read_header(data))
+        self.motor0 = None
+        self._prepare()
+        self.history: list[list[int]] = []  # last frames, newest first; empty: not valid
+        self.home: list[int] | None = None
+        self.last_time = self.last_iteration = None
+
+    def _read_header(self, data: bytes) -> int:
+        pos = 0
+        while data[pos : pos + 2] == b"H ":
+            end = data.find(b"\n", pos)
+            if end < 0:
+                raise LogError("cut short within its header")
+            key, colon, value = data[pos + 2 : end].decode("latin-1").partition(":")
+            if colon:
+                words = key.split()
+                if len(words) == 3 and words[0] == "Field":
+                    entry = self.fields.setdefault(words[1], Fields())
+                    if words[2] == "name":
+                        entry.names = value.split(",")
+                    elif words[2] in ("signed", "predictor", "encoding"):
+                        setattr(entry, words[2], _numbers(value, key))
+                else:
+                    self.header[key] = value.strip()
+            pos = end + 1
+        return pos
+
+    def _prepare(self) -> None:
+        if "I" not in self.fields or "P" not in self.fields:
+            raise LogError("no definition of I and P frames in its header")
+        self.fields["P"].names, self.fields["P"].signed = self.fields["I"].names, self.fields["I"].signed
+        if self.header.get("Data version", "2") != "2":
+            raise LogError(f"data version {self.header['Data version']}; version 2 is read")
+        for kind, of in self.fields.items():
+            sizes = {len(of.names), len(of.predictor), len(of.encoding)}
+            if len(sizes) > 1:
+                raise LogError(f"definition of {kind} frames contradicts itself: {sorted(sizes)} fields")
+            unknown = [code for code in of.encoding if code not in ENCODINGS]
+            if unknown:
+                raise LogError(f"{kind} frames use encoding {unknown[0]}; known: {ENCODINGS}")
+        self.plans = {kind: plan(of.encoding, [p == INC for p in of.predictor]) for kind, of in self.fields.items()}
+        names = self.fields["I"].names
+        self.at_time = names.index("time") if "time" in names else None
+        self.at_iteration = names.index("loopIteration") if "loopIteration" in names else None
+        self.at_motor0 = names.index("motor[0]") if "motor[0]" in names else None
+        output = _numbers(self.header.get("motorOutput", "0"), "motorOutput")
+        self.constant = {
+            MINTHROTTLE: _int(self.header, "minthrottle"), P1500: 1500, VBATREF: _int(self.header, "vbatref"),
+            MINMOTOR: output[0],
+        }  # fmt: skip
+        self.interval = max(1, _int(self.header, "I interval", 32))
+        num, _, denom = self.header.get("P interval", "1/1").partition("/")
+        self.p_num, self.p_denom = (int(num), int(denom)) if denom else (1, max(1, int(num)))
+
+    def decode(self) -> BlackboxLog:
+        rows: list[list[int]] = []
+        log = BlackboxLog(self.header, self.fields["I"].names, np.empty((0, 0)))
+        log.slow_names = self.fields.get("S", Fields()).names
+        log.gps_names = self.fields.get("G", Fields()).names
+        good = {"I": rows.append, "P": rows.append, "S": log.slow.append, "G": log.gps.append, "H": self._set_home}
+        reader, lost = self.reader, False
+        while reader.pos < reader.end and not log.complete:
+            start, kind = reader.pos, chr(reader.data[reader.pos])
+            try:
+                frame = self._frame(kind, log)
+            except EndOfLog:
+                break
+            except Corrupt:
+                frame = None
+            if frame is None:  # look for the next frame byte by byte
+                log.corrupt += not lost
+                lost, self.history, reader.pos = True, [], start + 1
+                continue
+            lost = False
+            if kind != "E" and not frame:  # decoded, but rests on what was lost
+                log.dropped += 1
+                continue
+            log.frames[kind] = log.frames.get(kind, 0) + 1
+            if kind != "E":
+                good[kind](frame)
+        log.main = np.array(rows, dtype=np.int64).reshape(len(rows), len(log.names))
+        return log
+
+    def _set_home(self, frame: list[int]) -> None:
+        self.home = frame
+
+    def _frame(self, kind: str, log: BlackboxLog) -> list[int] | None:
+        """Values of the next frame; empty: not to be used; None: no frame."""
+        reader = self.reader
+        start = reader.pos
+        reader.pos += 1
+        if kind == "E":
+            event = _event(reader)
+            if event is None:
+                return None
+            log.events.append(event)
+            log.complete = event[0] == "end of log"
+            if event[0] == "logging resumes":
+                self.last_iteration, self.last_time = int(event[1][0]), int(event[1][1])
+            return [1]
+        if kind not in self.plans:
+            return None
+        base = self.history if kind == "P" else []
+        usable = kind != "P" or bool(base)
+        values = self._values(kind, base)
+        ended = reader.pos >= reader.end or reader.data[reader.pos] in FRAMES
+        if not ended or reader.pos - start > _LONGEST_FRAME:
+            return None
+        if kind in "IP":
+            if not usable:
+                return []
+            if not self._continuous(values, kind):
+                self.history = []
+                return []
+            self.history = [values, values] if kind == "I" else [values, self.history[0]]
+            self._remember(values)
+        return values
+
+    def _values(self, kind: str, base: list[list[int]]) -> list[int]:
+        of, reader = self.fields[kind], self.reader
+        values = [0] * len(of.names)
+        for decoder, first, count in self.plans[kind]:
+            values[first : first + count] = decoder(reader, count)[:count]
+        homes = 0
+        for i, predictor in enumerate(of.predictor):
+            if predictor == ZERO:
+                continue
+            if predictor in (HOME_COORD, HOME_COORD_1):
+                values[i] += self.home[min(homes, len(self.home) - 1)] if self.home else 0
+                homes += 1
+            else:
+                values[i] = self._predicted(predictor, i, values, base)
+            unsigned = of.signed and i < len(of.signed) and not of.signed[i]
+            values[i] = values[i] & 0xFFFFFFFF if unsigned else extend(values[i], 32)
+        return values
+
+    def _predicted(self, predictor: int, i: int, values: list[int], base: list[list[int]]) -> int:
+        value = values[i]
+        if predictor in self.constant:
+            return value + self.constant[predictor]
+        if predictor == MOTOR_0:
+            return value + (values[self.at_motor0] if self.at_motor0 is not None else 0)
+        if predictor == LAST_MAIN_TIME:
+            return value + (self.last_time or 0)
+        if not base:
+            return value
+        if predictor == INC:
+            return base[0][i] + 1 + self._skipped()
+        if predictor == PREVIOUS:
+            return value + base[0][i]
+        if predictor == STRAIGHT_LINE:
+            return value + 2 * base[0][i] - base[1][i]
+        if predictor == AVERAGE_2:
+            return value + int((base[0][i] + base[1][i]) / 2)  # C rounds towards zero
+        raise Corrupt
+
+    def _skipped(self) -> int:
+        """Iterations since the last main frame that are left out on purpose."""
+        if self.last_iteration is None:
+            return 0
+        count = 0
+        while count < self.interval and not self._kept(self.last_iteration + 1 + count):
+            count += 1
+        return count
+
+    def _kept(self, iteration: int) -> bool:
+        return (iteration % self.interval + self.p_num - 1) % self.p_denom < self.p_num
+
+    def _continuous(self, values: list[int], kind: str) -> bool:
+        if self.at_time is not None and self.last_time is not None:
+            passed = values[self.at_time] - self.last_time
+            if passed < -(1 << 31):  # the 32-bit clock turned over
+                passed += 1 << 32
+            if not 0 <= passed <= _LONGEST_GAP_US:
+                return kind == "I" and self._jump()
+        if self.at_iteration is not None and self.last_iteration is not None:
+            passed = values[self.at_iteration] - self.last_iteration
+            if not 0 <= passed <= _MOST_ITERATIONS:
+                return kind == "I" and self._jump()
+        return True
+
+    def _jump(self) -> bool:
+        """Refuse one I frame that jumps; believe the next one, wherever it stands."""
+        self.last_time = self.last_iteration = None
+        return False
+
+    def _remember(self, values: list[int]) -> None:
+        if self.at_time is not None:
+            self.last_time = values[self.at_time]
+        if self.at_iteration is not None:
+            self.last_iteration = values[self.at_iteration]
+
+
+def _event(reader: Reader) -> tuple[str, tuple[float, ...]] | None:
+    kind = reader.byte()
+    if kind not in _EVENTS:
+        return None
+    if kind == 255:
+        text = b"End of log"
+        found = reader.data[reader.pos : reader.pos + len(text)] == text
+        return (_EVENTS[kind], ()) if found else None
+    if kind == 13:
+        function = reader.byte()
+        return _EVENTS[kind], (function & 127, reader.float32() if function & 128 else reader.signed())
+    read: Callable[[], int] = reader.unsigned
+    return _EVENTS[kind], tuple(read() for _ in range(2 if kind in (14, 30) else 1))
+
+
+def _numbers(text: str, key: str) -> list[int]:
+    try:
+        return [int(word) for word in text.split(",")]
+    except ValueError:
+        raise LogError(f"header '{key}' is '{text}'; expected whole numbers with commas between") from None
+
+
+def _int(header: dict[str, str], key: str, default: int = 0) -> int:
+    with contextlib.suppress(ValueError):
+        return int(header.get(key, default))
+    return default

@@ -1,0 +1,128 @@
+"""The mapping file: which columns of a table become which channels, in which unit, about which axes, on which clock."""
+
+import re
+from dataclasses import dataclass
+from typing import Literal
+
+from visthrow.common.errors import ConfigError, suggest
+from visthrow.logs.flightlog import FRAMES, STANDARD_CHANNELS
+from visthrow.logs.units import to_si
+
+_AXES = re.compile(r"[+-]?[xyz]")
+_ORDERS = ("xyzw", "wxyz")
+_WIDTH = {"quaternion": (4,), "euler": (3,), "vector": None}
+
+
+@dataclass(frozen=True)
+class TimeColumn:
+    """A clock: a column of stamps, or rows that are evenly spaced.
+
+    Raises:
+        ConfigError: Neither or both of them, or no unit of time.
+    """
+
+    column: str = ""  # of the stamps; "": rows are evenly spaced
+    unit: str = "s"  # of the stamps
+    row_period: float = 0.0  # between two rows [s], where there is no column
+
+    def __post_init__(self) -> None:
+        if bool(self.column) == (self.row_period > 0.0):
+            raise ConfigError("time: give either a column or a row_period above 0 s")
+        if to_si(self.unit, "time")[0] != "s":
+            raise ConfigError(f"time: unit '{self.unit}'; expected a unit of time")
+
+
+@dataclass(frozen=True)
+class ChannelMap:
+    """Columns of one channel.
+
+    Raises:
+        ConfigError: A unit, frame, number of columns or order of axes that the channel cannot have.
+    """
+
+    name: str  # of the channel; those of visthrow.logs.flightlog.STANDARD_CHANNELS have a meaning, others are free
+    columns: tuple[str, ...]
+    unit: str  # of the columns
+    kind: Literal["vector", "quaternion", "euler"] = "vector"  # euler: roll, pitch, yaw; yaw is turned first
+    order: str = "xyzw"  # of a quaternion's columns
+    axes: str = ""  # our x, y, z in the source's axes, such as "x,-y,-z" for north-east-down; "": as they come
+    body_axes: str = ""  # of an attitude: our body's x, y, z in the source's body axes
+    frame: str = ""  # of a free channel; "": none
+    scale: float = 1.0  # the column is multiplied by it, before its unit
+    offset: float = 0.0  # and this is added then, in the column's unit
+    held: bool = False  # between measurements the table repeats the last one; repetitions are left out
+    clock: str = ""  # of the setup's further clocks; "": the main one
+
+    def __post_init__(self) -> None:
+        where = f"channel '{self.name}'"
+        to_si(self.unit, where)
+        if not self.columns:
+            raise ConfigError(f"{where}: no columns")
+        wanted = _WIDTH[self.kind]
+        if wanted and len(self.columns) not in wanted:
+            raise ConfigError(f"{where}: {self.kind} of {len(self.columns)} columns; expected {wanted[0]}")
+        if self.order not in _ORDERS:
+            raise ConfigError(f"{where}: order '{self.order}'; {suggest(self.order, _ORDERS)}")
+        if self.frame and self.frame not in FRAMES:
+            raise ConfigError(f"{where}: frame '{self.frame}'; {suggest(self.frame, FRAMES)}")
+        for axes in (self.axes, self.body_axes):
+            if axes:
+                signed_axes(axes, where)
+        spec = STANDARD_CHANNELS.get(self.name)
+        if spec is None:
+            return
+        ours = "1" if self.kind != "vector" else to_si(self.unit, where)[0]
+        if ours not in spec.unit.split(", "):
+            raise ConfigError(f"{where}: unit '{self.unit}' is of the kind '{ours}'; the channel is in '{spec.unit}'")
+
+
+def signed_axes(text: str, where: str) -> list[tuple[int, float]]:
+    """Read ``"x,-y,-z"`` as the source's index and sign of each of our axes.
+
+    Raises:
+        ConfigError: Not three different axes, or a mirror image: axes that no rotation turns into ours.
+    """
+    parts = [part.strip() for part in text.split(",")]
+    if len(parts) != 3 or not all(_AXES.fullmatch(part) for part in parts):
+        raise ConfigError(f"{where}: axes '{text}'; expected three such as 'x,-y,-z'")
+    found = [("xyz".index(part[-1]), -1.0 if part[0] == "-" else 1.0) for part in parts]
+    order = [index for index, _ in found]
+    if sorted(order) != [0, 1, 2]:
+        raise ConfigError(f"{where}: axes '{text}' name one axis twice")
+    even = order in ([0, 1, 2], [1, 2, 0], [2, 0, 1])
+    if (1.0 if even else -1.0) * found[0][1] * found[1][1] * found[2][1] < 0.0:
+        raise ConfigError(f"{where}: axes '{text}' are a mirror image; no rotation turns them into ours")
+    return found
+
+
+@dataclass(frozen=True)
+class Split:
+    """How one table becomes several logs."""
+
+    column: str = ""  # a log for each of its values; "": one
+    gap: float = 0.0  # a new log begins where no row comes for so long [s]; 0: never
+    shortest: float = 0.0  # shorter ones are left out [s]
+
+
+@dataclass(frozen=True)
+class TableMap:
+    """Mapping of a table's columns.
+
+    Raises:
+        ConfigError: Two channels of one name, or a clock that is not defined.
+    """
+
+    time: TimeColumn
+    channels: tuple[ChannelMap, ...]
+    clocks: dict[str, TimeColumn] | None = None  # further ones, by name
+    split: Split | None = None
+
+    def __post_init__(self) -> None:
+        seen: set[str] = set()
+        for channel in self.channels:
+            if channel.name in seen:
+                raise ConfigError(f"channel '{channel.name}' is mapped twice")
+            seen.add(channel.name)
+            if channel.clock and channel.clock not in (self.clocks or {}):
+                known = suggest(channel.clock, self.clocks or {})
+                raise ConfigError(f"channel '{channel.name}': no clock '{channel.clock}'; {known}")

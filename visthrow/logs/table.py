@@ -1,0 +1,310 @@
+"""CSV (plain, gzip, xz) and parquet tables into flight logs, by a mapping; our own exports without one."""
+
+import csv
+import gzip
+import io
+import json
+import lzma
+import math
+import re
+import zlib
+from pathlib import Path
+
+import numpy as np
+
+from visthrow.common.errors import LogError, suggest
+from visthrow.logs.flightlog import STANDARD_CHANNELS, Channel, FlightLog
+from visthrow.logs.mapping import ChannelMap, Split, TableMap, TimeColumn, signed_axes
+from visthrow.logs.units import to_si
+
+Table = dict[str, np.ndarray]
+"""Column -> values; numbers as float64 (NaN where the cell is empty), anything else as text."""
+
+_EXPORTED = re.compile(r"(?P<name>\w+?)(?:\[(?P<index>[\d,]+)\])? \[(?P<unit>.+?)(?:, (?P<frame>world|body|camera|image|mocap))?\]")
+_LARGEST = 1e100
+"""No number of a flight is as large, in whatever unit; its square is still a number."""
+_OPENERS = {".gz": gzip.decompress, ".xz": lzma.decompress}
+
+
+def read_table(path: str | Path) -> Table:
+    """Read a table.
+
+    Args:
+        path: ``.csv``, ``.csv.gz``, ``.csv.xz`` or ``.parquet``.
+
+    Raises:
+        LogError: It cannot be read, has no rows, or a row has another number of cells than the header.
+    """
+    path = Path(path)
+    try:
+        data = path.read_bytes()
+        if path.suffix == ".parquet":
+            return _parquet(data, path)
+        text = _OPENERS.get(path.suffix, bytes)(data).decode("utf-8-sig")
+        rows = list(csv.reader(io.StringIO(text, newline="")))
+    except (OSError, EOFError, UnicodeDecodeError, lzma.LZMAError, zlib.error, csv.Error) as error:
+        raise LogError(f"{path}: cannot be read: {error}; expected a CSV table, plain, .gz or .xz") from error
+    header = [name.strip() for name in rows[0]] if rows else []
+    body = [row for row in rows[1:] if row]
+    if len(header) < 2:
+        raise LogError(f"{path}: no header line with columns; expected a CSV table")
+    if body and len(body[-1]) < len(header):  # cut short while it was written
+        body.pop()
+    if not body:
+        raise LogError(f"{path}: a header of {len(header)} columns and no rows below it")
+    wrong = next((i for i, row in enumerate(body) if len(row) != len(header)), None)
+    if wrong is not None:
+        raise LogError(f"{path}: row {wrong + 1} has {len(body[wrong])} cells; the header has {len(header)}")
+    twice = {name for name in header if header.count(name) > 1}
+    if twice:
+        raise LogError(f"{path}: column '{min(twice)}' stands twice in the header")
+    return {name: _column(cells) for name, cells in zip(header, zip(*body))}
+
+
+def _column(cells: tuple[str, ...]) -> np.ndarray:
+    try:
+        return np.array(cells, dtype=np.float64)
+    except ValueError:
+        pass
+    try:
+        return np.array([float(cell) if cell.strip() else math.nan for cell in cells])
+    except ValueError:
+        return np.array(cells)
+
+
+def _parquet(data: bytes, path: Path) -> Table:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        table = pq.read_table(io.BytesIO(data))
+    except (pa.ArrowException, OSError) as error:
+        raise LogError(f"{path}: cannot be read: {error}; expected a parquet table") from error
+    columns = {}
+    for name in table.column_names:
+        values = table[name].to_numpy(zero_copy_only=False)
+        columns[name] = values.astype(np.float64) if values.dtype.kind in "bifu" else _column(tuple(map(_text, values)))
+    if not columns or not table.num_rows:
+        raise LogError(f"{path}: a parquet table without rows")
+    return columns
+
+
+def _text(value: object) -> str:
+    return "" if value is None or value != value else str(value)
+
+
+def logs_of(table: Table, mapping: TableMap, source: str) -> list[FlightLog]:
+    """Make flight logs of a table.
+
+    Args:
+        table: From :func:`read_table`.
+        mapping: Of its columns.
+        source: What messages call the table.
+
+    Raises:
+        LogError: A column is missing or holds no numbers, or nothing is left after splitting.
+    """
+    count = len(next(iter(table.values())))
+    parts = _parts(table, mapping, count, source)
+    logs = [_log(table, mapping, rows, label, source) for rows, label in parts]
+    if not logs:
+        shortest = mapping.split.shortest if mapping.split else 0.0
+        raise LogError(f"{source}: {count} rows, but no stretch without a gap that lasts {shortest:g} s")
+    return logs
+
+
+def _numbers(table: Table, name: str, source: str) -> np.ndarray:
+    if name not in table:
+        raise LogError(f"{source}: no column '{name}'; {suggest(name, table)}")
+    if table[name].dtype.kind not in "fiub":
+        raise LogError(f"{source}: column '{name}' holds text such as '{table[name][0]}'; expected numbers")
+    return table[name]
+
+
+def _stamps(table: Table, clock: TimeColumn, source: str) -> np.ndarray:
+    if not clock.column:
+        return clock.row_period * np.arange(len(next(iter(table.values()))))
+    factor = to_si(clock.unit, "time")[1]
+    return _numbers(table, clock.column, source) * factor
+
+
+def _parts(table: Table, mapping: TableMap, count: int, source: str) -> list[tuple[np.ndarray, str]]:
+    split = mapping.split or Split()
+    everything = np.arange(count)
+    if split.column:
+        if split.column not in table:
+            raise LogError(f"{source}: no column '{split.column}'; {suggest(split.column, table)}")
+        values = table[split.column]
+        order = list(dict.fromkeys(values.tolist()))
+        parts = [(everything[values == value], f"{value:g}" if isinstance(value, float) else value) for value in order]
+    else:
+        parts = [(everything, "")]
+    if split.gap > 0.0:
+        time = _stamps(table, mapping.time, source)
+        parts = [
+            (piece, f"{label}#{i}" if label else f"#{i}")
+            for rows, label in parts
+            for i, piece in enumerate(np.split(rows, np.flatnonzero(np.diff(time[rows]) > split.gap) + 1))
+        ]
+    if split.shortest > 0.0:
+        time = _stamps(table, mapping.time, source)
+        parts = [(rows, label) for rows, label in parts if len(rows) and np.ptp(time[rows]) >= split.shortest]
+    return parts
+
+
+def _log(table: Table, mapping: TableMap, rows: np.ndarray, label: str, source: str) -> FlightLog:
+    meta = {"source": source, "part": label, "rows": len(rows), "ingest": {}}
+    channels = {}
+    for entry in mapping.channels:
+        clock = mapping.clocks[entry.clock] if entry.clock and mapping.clocks else mapping.time
+        time = _stamps(table, clock, source)[rows]
+        values = np.column_stack([_numbers(table, name, source)[rows] for name in entry.columns])
+        channel, notes = make_channel(time, values, entry, source)
+        channels[entry.name] = channel
+        meta["ingest"][entry.name] = notes | {"clock": entry.clock or "main"}
+    return FlightLog(channels, meta)
+
+
+def make_channel(time: np.ndarray, values: np.ndarray, entry: ChannelMap, source: str) -> tuple[Channel, dict]:
+    """Turn columns into a channel of ours.
+
+    Rows without a stamp, of a stamp that was there before, or of an earlier one are left out and counted: a clock must go on.
+
+    Args:
+        time: Stamps [s], shape (T,); NaN where there is none.
+        values: The columns, shape (T, C).
+        entry: Their mapping.
+        source: What messages call the table.
+
+    Returns:
+        The channel, and how many rows were left out for which reason.
+    """
+    spec = STANDARD_CHANNELS.get(entry.name)
+    unit, factor = to_si(entry.unit, f"channel '{entry.name}'")
+    notes = {"rows": len(time)}
+    stamped = np.isfinite(time)
+    notes["unstamped"] = int(np.sum(~stamped))
+    time, values = time[stamped], values[stamped]
+    ahead = np.ones(len(time), dtype=bool)
+    if len(time):
+        highest = np.maximum.accumulate(time)
+        ahead[1:] = time[1:] > highest[:-1]
+        notes["repeated"] = int(np.sum(np.diff(time) == 0.0))
+        notes["backwards"] = int(np.sum(np.diff(time) < 0.0))
+    time, values = time[ahead], values[ahead]
+    valid = np.all(np.abs(values) < _LARGEST, axis=1)  # not where it is NaN
+    if entry.held and len(values):
+        fresh = np.ones(len(values), dtype=bool)
+        fresh[1:] = np.any(values[1:] != values[:-1], axis=1)
+        notes["held"] = int(np.sum(~fresh))
+        time, values, valid = time[fresh], values[fresh], valid[fresh]
+    values = _converted(np.where(valid[:, None], values, 0.0), entry, factor)
+    if entry.kind != "vector":
+        unit = "1"
+        norm = np.linalg.norm(values, axis=1)
+        valid &= np.abs(norm - 1.0) < 0.1
+        values = values / np.where(norm > 0.0, norm, 1.0)[:, None]
+    notes["invalid"] = int(np.sum(~valid))
+    if (spec is not None and spec.shape == ()) or (spec is None and len(entry.columns) == 1):
+        values = values[:, 0]
+    if spec is not None and unit in spec.unit.split(", "):
+        unit = spec.unit
+    frame = spec.frame if spec is not None else (entry.frame or "none")
+    try:
+        return Channel(time, values, unit, frame, valid), notes
+    except LogError as error:
+        raise LogError(f"{source}: channel '{entry.name}': {error}") from error
+
+
+def _converted(values: np.ndarray, entry: ChannelMap, factor: float) -> np.ndarray:
+    values = (values * entry.scale + entry.offset) * factor
+    if entry.kind == "vector":
+        if entry.axes and values.shape[1] == 3:
+            index, sign = zip(*signed_axes(entry.axes, entry.name))
+            return values[:, list(index)] * np.array(sign)
+        return values
+    from scipy.spatial.transform import Rotation
+
+    if entry.kind == "euler":
+        quat = Rotation.from_euler("ZYX", values[:, ::-1]).as_quat()
+    else:
+        quat = values[:, [1, 2, 3, 0]] if entry.order == "wxyz" else values
+    if not entry.axes and not entry.body_axes:
+        return quat
+    length = np.linalg.norm(quat, axis=1)
+    turned = Rotation.from_matrix(_matrix(entry.axes)) * Rotation.from_quat(np.where(length[:, None] > 0, quat, [0, 0, 0, 1]))
+    return (turned * Rotation.from_matrix(_matrix(entry.body_axes)).inv()).as_quat() * length[:, None]
+
+
+def _matrix(axes: str) -> np.ndarray:
+    """Rotation from the source's axes to ours, shape (3, 3)."""
+    matrix = np.zeros((3, 3))
+    for row, (index, sign) in enumerate(signed_axes(axes or "x,y,z", "axes")):
+        matrix[row, index] = sign
+    return matrix
+
+
+def is_export(table: Table) -> bool:
+    """Tell whether a table is one of :func:`visthrow.logs.export.export`."""
+    return "time [s]" in table and all(_EXPORTED.fullmatch(name) for name in table if name != "time [s]")
+
+
+def log_of_export(table: Table, source: str) -> FlightLog:
+    """Read back a table that :func:`visthrow.logs.export.export` wrote.
+
+    Raises:
+        LogError: Columns of one channel do not fit together.
+    """
+    found: dict[str, dict] = {}
+    for column in table:
+        match = _EXPORTED.fullmatch(column)
+        if match and column != "time [s]":
+            index = tuple(int(part) for part in match["index"].split(",")) if match["index"] else ()
+            entry = found.setdefault(match["name"], {"unit": match["unit"], "frame": match["frame"] or "none", "at": {}})
+            entry["at"][index] = _as_numbers(table, column, source)
+    channels, time = {}, _numbers(table, "time [s]", source)
+    for name, entry in found.items():
+        if name in STANDARD_CHANNELS:  # its unit may hold a comma
+            entry["unit"], entry["frame"] = STANDARD_CHANNELS[name].unit, STANDARD_CHANNELS[name].frame
+        shape = tuple(np.max(list(entry["at"]), axis=0) + 1) if () not in entry["at"] else ()
+        if len(entry["at"]) != math.prod(shape):
+            raise LogError(f"{source}: channel '{name}' has {len(entry['at'])} columns; expected {math.prod(shape)}")
+        values = np.full((len(time), *shape), np.nan)
+        for index, cells in entry["at"].items():
+            values[(slice(None), *index)] = cells
+        there = np.all(np.abs(values.reshape(len(time), -1)) < _LARGEST, axis=1)  # not where it is NaN
+        try:
+            channels[name] = Channel(time[there], values[there], entry["unit"], entry["frame"])
+        except LogError as error:
+            raise LogError(f"{source}: channel '{name}': {error}") from error
+    try:
+        return FlightLog(channels, {"source": source})
+    except LogError as error:
+        raise LogError(f"{source}: {error}") from error
+
+
+def _as_numbers(table: Table, column: str, source: str) -> np.ndarray:
+    cells = table[column]
+    if cells.dtype.kind in "fiub":
+        return cells.astype(float)
+    words = {"True": 1.0, "False": 0.0, "": math.nan}
+    wrong = [cell for cell in cells.tolist() if cell not in words and not _is_number(cell)]
+    if wrong:
+        raise LogError(f"{source}: column '{column}' holds text such as '{wrong[0]}'; expected numbers, True or False")
+    return np.array([words[cell] if cell in words else float(cell) for cell in cells.tolist()])
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
+
+
+def metadata_of(path: str | Path) -> dict:
+    """Return the metadata that our own parquet export carries, or nothing."""
+    import pyarrow.parquet as pq
+
+    stored = (pq.read_schema(path).metadata or {}).get(b"visthrow")
+    return json.loads(stored) if stored else {}

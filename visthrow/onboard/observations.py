@@ -1,0 +1,159 @@
+"""The one observation: what the training environment and the HIL runner both show the actor. Onboard-safe.
+
+``frame`` puts one control step's measurement into a row; noise, where there is any, is added to that row; ``observe``
+pushes the payload's part into the history and assembles the actor's input. With E the batch (1 on board), the layouts are
+
+``state`` (35 with a history of 3; the paper, Sec. III-C), world frame, SI units::
+
+    position 3 | velocity 3 | body rates 3 | rotation 6 | previous action 5 | goal - payload, horizontal 2
+    | payload - vehicle, now and H steps back 3 (1 + H) | attached 1
+
+``vision`` (61, or 69 with validity bits; Sec. IV-C)::
+
+    position 3 | velocity 3 | body rates 3 | rotation 6 | previous action 5 | goal corners 8
+    | payload keypoints, now and H steps back 8 (1 + H) | attached 1 | validity of goal and payload keypoints 8
+
+and either one, where goals move, has the fit of the goal's velocity 2 (:mod:`visthrow.onboard.goal_motion`) at its end.
+
+The rotation is the first two columns of rot_wb (Zhou et al., CVPR 2019), column after column.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from camera.history import push
+from camera.keypoints import KEYPOINTS, KeypointCamera, keypoints
+
+VEHICLE = 15
+"""Width of the vehicle's own part."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Widths of one observation layout."""
+
+    name: str
+    goal: int  # width of the goal's part
+    payload: int  # width of the payload's part, once
+    history: int  # H
+    validity: int  # width of the validity bits
+    motion: int = 0  # width of the goal's velocity
+
+    @property
+    def frame(self) -> int:
+        """Width of a frame without the validity bits: what noise is added to."""
+        return VEHICLE + self.goal + self.payload
+
+    @property
+    def dimension(self) -> int:
+        """Width of the actor's input."""
+        return VEHICLE + 5 + self.goal + self.payload * (1 + self.history) + 1 + self.validity + self.motion
+
+
+def layout_of(params) -> Layout:
+    """Layout of :class:`visthrow.task.ObservationParams` (or anything with its fields).
+
+    Raises:
+        ValueError: an unknown layout or a negative history.
+    """
+    if params.history < 0:
+        raise ValueError(f"observation history {params.history}: expected 0 or more")
+    motion = 2 if getattr(params, "goal_velocity", False) else 0  # contracts from before lack it
+    if params.layout == "state":
+        return Layout("state", 2, 3, params.history, 0, motion)
+    if params.layout == "vision":
+        return Layout("vision", 8, 8, params.history, KEYPOINTS if params.validity else 0, motion)
+    raise ValueError(f"observation layout {params.layout!r}: expected 'state' or 'vision'")
+
+
+def resampled(history: Tensor, newest: Tensor, ages: list[float], period: float) -> Tensor:
+    """Histories as they would be if a step had come each period before now, by straight lines between those that came.
+
+    Args:
+        history: payload parts of earlier steps, newest first, shape (E, 1 + H, payload).
+        newest: of this step, shape (E, payload).
+        ages: of the steps in the history, newest first, ascending [s]; rows beyond them are copies of the oldest.
+        period: [s].
+
+    Returns:
+        Rows that are 1, 2, ... periods old, shape (E, 1 + H, payload); what is older than all that came is the oldest.
+    """
+    knots, rows, out = [0.0, *ages], torch.cat([newest[:, None], history], dim=1), []
+    for k in range(1, 1 + history.shape[1]):
+        after = next((i for i, age in enumerate(knots) if age >= k * period), len(knots) - 1)
+        gap = knots[after] - knots[after - 1]
+        share = min((k * period - knots[after - 1]) / gap, 1.0)
+        out.append(torch.lerp(rows[:, after - 1], rows[:, after], share))
+    return torch.stack(out, dim=1)
+
+
+def rotation_from_quat(quat: Tensor) -> Tensor:
+    """Rotation matrix, shape (E, 3, 3), of unit quaternions xyzw, shape (E, 4)."""
+    products = quat.unsqueeze(-1) * (quat + quat).unsqueeze(-2)  # of all pairs at once
+    xx, xy, xz, _, _, yy, yz, _, _, _, zz, _, wx, wy, wz, _ = products.flatten(-2).unbind(-1)
+    rows = [1 - (yy + zz), xy - wz, xz + wy, xy + wz, 1 - (xx + zz), yz - wx, xz - wy, yz + wx, 1 - (xx + yy)]
+    return torch.stack(rows, -1).unflatten(-1, (3, 3))
+
+
+def vehicle_part(pos_w: Tensor, vel_w: Tensor, rate_b: Tensor, rot_wb: Tensor) -> Tensor:
+    """Vehicle's part of a frame, shape (E, 15)."""
+    return torch.cat([pos_w, vel_w, rate_b, rot_wb[..., 0], rot_wb[..., 1]], dim=-1)
+
+
+def state_part(pos_w: Tensor, goal_w: Tensor, payload_w: Tensor) -> Tensor:
+    """Goal and payload of a state frame: horizontal offset goal - payload, payload - vehicle; shape (E, 5)."""
+    return torch.cat([goal_w[:, :2] - payload_w[:, :2], payload_w - pos_w], dim=-1)
+
+
+def vision_part(
+    camera: KeypointCamera, pos_w: Tensor, rot_wb: Tensor, goal_w: Tensor, payload_w: Tensor, extrinsics=None
+) -> tuple[Tensor, Tensor]:
+    """Goal and payload of a vision frame.
+
+    Returns:
+        Keypoints, shape (E, 8, 2), normalised image coordinates, goal corners first; validity, shape (E, 8).
+    """
+    return keypoints(camera, pos_w, rot_wb, goal_w, payload_w, extrinsics)
+
+
+def observe(
+    layout: Layout,
+    frame: Tensor,
+    valid: Tensor | None,
+    previous_action: Tensor,
+    attached: Tensor,
+    history: Tensor,
+    fresh: Tensor,
+    goal_vel_w: Tensor | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Assemble the actor's input and move the payload's history on.
+
+    Args:
+        layout: of the policy.
+        frame: shape (E, layout.frame): vehicle, goal, payload.
+        valid: validity of the keypoints, shape (E, 8); None where the layout has none.
+        previous_action: clipped, shape (E, 5).
+        attached: 1 while the payload hangs on the vehicle, shape (E,), float.
+        history: payload parts now and earlier, newest first, shape (E, 1 + H, payload).
+        fresh: episodes that begin here, bool, shape (E,): their history is filled with the current value.
+        goal_vel_w: fit of the goal's horizontal velocity [m/s], shape (E, 2); None where the layout has none.
+
+    Returns:
+        Observation, shape (E, layout.dimension), and the new history.
+    """
+    goal_end = VEHICLE + layout.goal
+    history = push(history, frame[:, goal_end:], fresh)
+    parts = [
+        frame[:, :VEHICLE],
+        previous_action,
+        frame[:, VEHICLE:goal_end],
+        history.flatten(1),
+        attached.unsqueeze(-1),
+    ]
+    if layout.validity:
+        parts.append(valid.to(frame.dtype))
+    if layout.motion:
+        parts.append(goal_vel_w)
+    return torch.cat(parts, dim=-1), history

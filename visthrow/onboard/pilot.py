@@ -1,0 +1,282 @@
+"""The policy in flight: from poses of vehicle, payload and goal to a command. Onboard-safe.
+
+The same functions of :mod:`visthrow.onboard.observations` and :mod:`visthrow.onboard.actions` that the training environment calls, with
+a batch of one on board; only the noise is missing.
+"""
+
+import copy
+import time
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from camera.keypoints import KeypointCamera
+from camera.params import CameraParams
+from visthrow import config
+from visthrow.common.errors import PolicyError
+from visthrow.onboard import actions as act
+from visthrow.onboard import goal_motion
+from visthrow.onboard import observations as ob
+from visthrow.onboard.hover import GRAVITY
+from visthrow.onboard.policy import Policy
+from visthrow.onboard.traced import Traced
+
+VIEWS = {"pos_w": 3, "quat_wb": 4, "vel_w": 3, "rate_b": 3, "payload_w": 3, "goal_w": 3, "attached": 1}
+"""What one step is shown, and the width of each: the columns of one array."""
+
+
+JITTER = 2e-3
+"""By which steps may be off their times without being counted as late [s]: the payload moves some millimetres in it."""
+
+
+@dataclass(frozen=True)
+class PilotOutput:
+    """What one control step decided, and what it saw. NumPy, shape (E, ...)."""
+
+    action: np.ndarray  # normalised, clipped, shape (E, 5)
+    command: np.ndarray  # collective thrust [N] and body rates [rad/s], shape (E, 4)
+    release: np.ndarray  # whether the latch is to trip, shape (E,), bool
+    observation: np.ndarray  # shape (E, D)
+    keypoints: np.ndarray | None  # normalised image coordinates, shape (E, 8, 2); None without a camera
+    valid: np.ndarray | None  # which of them are seen, shape (E, 8), bool
+
+
+def camera_conditions(params: CameraParams) -> dict[str, Any]:
+    """Return what a vision policy's contract says of the camera: lens, mount and sizes, without noise."""
+    camera = config.to_dict(params)
+    return {
+        "fisheye": camera["fisheye"],
+        "mount": {key: camera["mount"][key] for key in ("position_b", "rpy_deg")},
+        "goal_side": camera["goal_side"],
+        "payload_radius": camera["payload_radius"],
+        "invalid_reads": camera["noise"]["invalid_reads"],
+    }
+
+
+class Pilot:
+    """Flies E vehicles with one policy; remembers the previous action and the payload's history.
+
+    Attributes:
+        policy: the policy. layout: of its observation. period: between two calls [s].
+        lag: from latch to separation [s].
+        camera: None where the policy looks at none and no camera was given.
+        spent: time that the last call took for the observation and for the policy [s].
+    """
+
+    def __init__(self, policy: Policy, camera_params: CameraParams | None = None, count: int = 1) -> None:
+        """Read the conditions of the policy's contract.
+
+        Args:
+            policy: on the CPU.
+            camera_params: a vision policy's camera; with a state policy keypoints are computed for whoever draws them.
+            count: E.
+
+        Raises:
+            PolicyError: The contract lacks an entry, or a vision policy is given no camera.
+            MismatchError: The camera is not the one that the policy was trained with.
+            ValueError: count below 1.
+        """
+        if count < 1:
+            raise ValueError(f"pilot of {count} vehicles; expected 1 or more")
+        contract = policy.contract
+        try:
+            self.layout = ob.layout_of(SimpleNamespace(**contract["observation"]))
+            self._max_thrust = float(contract["action"]["max_thrust"])
+            self._max_rate = torch.tensor(contract["action"]["max_rate"], dtype=torch.float32)
+            self._threshold = float(contract["release"]["threshold"])
+            self.lag = float(contract["release"]["lag"])
+            self.period = float(contract["control_period"])
+            rope = contract["rope"]
+            mass = contract["vehicle"]["body"]["mass"] + rope["rope_mass"] + rope["payload_mass"]
+        except (KeyError, AttributeError, TypeError) as error:
+            raise PolicyError(
+                f"the policy's contract is incomplete: {error!r}; it was not written by visthrow train"
+            ) from error
+        if self.layout.dimension != policy.obs_dim:
+            raise PolicyError(
+                f"layout '{self.layout.name}' has {self.layout.dimension} numbers, the network {policy.obs_dim}"
+            )
+        if self.layout.name == "vision":
+            if camera_params is None:
+                raise PolicyError("a vision policy needs a camera; got none")
+            policy.require({"camera": camera_conditions(camera_params)}, sections={"camera"})
+        self.policy, self.count = policy, count
+        self.camera = None if camera_params is None else KeypointCamera(camera_params)
+        self._views = np.zeros((count, sum(VIEWS.values())), dtype=np.float32)
+        self._observe, self._observe_given = Traced(self._observed), Traced(self._observed)
+        self._decide, self._later = Traced(self._decision), torch.zeros(count, dtype=torch.bool)
+        self.spent = (0.0, 0.0)
+        self._first = torch.tensor([act.hover_action(GRAVITY * mass, self._max_thrust)], dtype=torch.float32)
+        self.start()
+
+    def __deepcopy__(self, memo: dict) -> "Pilot":
+        """What a step changes it puts in another's place, so that the rest can be shared."""
+        return copy.copy(self)
+
+    def start(self) -> None:
+        """Begin a throw from hover: the next call fills the history."""
+        self._previous = self._first.repeat(self.count, 1)
+        self._history = torch.zeros(self.count, 1 + self.layout.history, self.layout.payload)
+        self._fresh = torch.ones(self.count, dtype=torch.bool)
+        self._goal_fit, self._steps = goal_motion.empty_sums(self.count), 0
+        self._times: tuple[float, ...] = ()  # of the history's rows, newest first; those beyond are copies of the oldest [s]
+        self._unasked = self._previous[:, 4]  # what the action before the last one said of the release
+
+    @property
+    def previous_action(self) -> np.ndarray:
+        """Clipped action of the last call, hover before the first one, shape (E, 5)."""
+        return self._previous.numpy()
+
+    @torch.inference_mode()
+    def act(
+        self,
+        pos_w: np.ndarray,
+        quat_wb: np.ndarray,
+        vel_w: np.ndarray,
+        rate_b: np.ndarray,
+        payload_w: np.ndarray,
+        goal_w: np.ndarray,
+        attached: np.ndarray | bool = True,
+        keypoints: tuple[np.ndarray, np.ndarray] | None = None,
+        now: float | None = None,
+    ) -> PilotOutput:
+        """Decide one control step.
+
+        Args:
+            pos_w: of the vehicle's centre of mass [m], shape (E, 3), world frame.
+            quat_wb: attitude, xyzw, shape (E, 4).
+            vel_w: [m/s], shape (E, 3). rate_b: [rad/s], shape (E, 3).
+            payload_w: of the payload's centre [m], shape (E, 3).
+            goal_w: [m], shape (E, 3) or (3,).
+            attached: whether the payload hangs on the vehicle, shape (E,) or one for all.
+            keypoints: what a detector saw, normalised, shape (E, 8, 2), and validity, shape (E, 8), in place of what payload
+                and goal project to; only with a camera.
+            now: time of this step on any clock [s], where steps may be late or missing; None: they come a period apart.
+
+        Raises:
+            ValueError: An array of another shape.
+        """
+        begin = time.perf_counter()
+        goal_w, attached = np.asarray(goal_w).reshape(-1, 3), np.asarray(attached).reshape(-1, 1)
+        views = self._measured(pos_w, quat_wb, vel_w, rate_b, payload_w, goal_w, attached)
+        given = () if keypoints is None else tuple(torch.from_numpy(np.array(part)) for part in keypoints)
+        observation, *rest = self._seen(views, given)
+        if now is not None and self._bridged(now, rest[0][:, 0]):
+            observation, *rest = self._seen(views, given)
+        self._history, self._goal_fit, *seen = rest if self.layout.motion else (rest[0], self._goal_fit, *rest[1:])
+        decided = time.perf_counter()
+        action, command, release = self._decide(observation)
+        self._unasked = self._previous[:, 4]
+        self._previous, self._fresh, self._steps = action, self._later, self._steps + 1
+        points, valid = (part.numpy() for part in seen) if seen else (None, None)
+        out = PilotOutput(action.numpy(), command.numpy(), release.numpy(), observation.numpy(), points, valid)
+        self.spent = (decided - begin, time.perf_counter() - decided)
+        return out
+
+    def not_released(self) -> None:
+        """Say that the release which the last call asked for was not done: the next call is told of none, as in training."""
+        self._previous = torch.cat([self._previous[:, :4], self._unasked[:, None]], dim=-1)
+
+    def _seen(self, views: Tensor, given: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+        """What `_observed` makes of a step's measurements and all that was before; ``given``: keypoints of a detector."""
+        carried = (self._previous, self._history, self._fresh)
+        if self.layout.motion:
+            carried += (self._goal_fit, torch.full((self.count,), self._steps * self.period))
+        return (self._observe_given if given else self._observe)(views, *carried, *given)
+
+    def _bridged(self, now: float, newest: Tensor) -> bool:
+        """Make the history one of steps a period apart, as in training; whether steps before this one were late or missing.
+
+        Args:
+            now: of this step [s]. newest: its payload part, shape (E, layout.payload).
+        """
+        times, period, rows = self._times, self.period, 1 + self.layout.history
+        ages = [now - time for time in times]
+        due = [now - k * period for k in range(1, 1 + rows) if ages and k * period < ages[-1] + JITTER]
+        late = len(due) != len(times) or any(abs(time - when) > JITTER for time, when in zip(times, due))
+        if late:
+            self._history = ob.resampled(self._history, newest, ages, period)
+            self._steps += max(round(ages[0] / period) - 1, 0)
+            times = tuple(due)
+        self._times = (now, *times[: rows - 1])
+        return late
+
+    def _measured(self, *views: np.ndarray | bool) -> Tensor:
+        """The measurements of one step side by side, shape (E, 20): the columns of :data:`VIEWS`.
+
+        Raises:
+            ValueError: one of another shape.
+        """
+        at = 0
+        for (name, width), value in zip(VIEWS.items(), views):
+            array = np.asarray(value)
+            shared = array.shape == (1, width) and name in ("goal_w", "attached")
+            if array.shape != (self.count, width) and not shared:
+                raise ValueError(f"{name} has shape {array.shape}; expected ({self.count}, {width})")
+            self._views[:, at : at + width] = array
+            at += width
+        return torch.from_numpy(self._views)
+
+    def _observed(
+        self, views: Tensor, previous: Tensor, history: Tensor, fresh: Tensor, *further: Tensor
+    ) -> tuple[Tensor, ...]:
+        """Assemble the observation, shape (E, D).
+
+        Args:
+            views: shape (E, 20). previous, history, fresh: see `visthrow.onboard.observations.observe`.
+            further: sums of the goal's fit and time [s], where the layout has its velocity; then keypoints and validity that
+                a detector saw, else what the camera sees of goal and payload is computed, where there is one.
+
+        Returns:
+            Observation, new history, new sums of the goal's fit, keypoints and validity; the latter where there are any.
+        """
+        pos, quat, vel, rate, payload, goal, attached = views.split(list(VIEWS.values()), -1)
+        rot, moving = ob.rotation_from_quat(quat), 2 if self.layout.motion else 0
+        seen = further[moving:]
+        if not seen and self.camera is not None:
+            seen = ob.vision_part(self.camera, pos, rot, goal, payload)
+        points, valid = seen or (None, None)
+        part = points.flatten(1) if self.layout.name == "vision" else ob.state_part(pos, goal, payload)
+        frame = torch.cat([ob.vehicle_part(pos, vel, rate, rot), part], dim=-1)
+        sums, velocity = (), None
+        if moving:
+            place, weight = goal_motion.measured_goal(self.layout, frame, valid, self.camera)
+            fitted, velocity = goal_motion.fit(*further[:2], place, weight, fresh)
+            sums = (fitted,)
+        observation, history = ob.observe(self.layout, frame, valid, previous, attached[:, 0], history, fresh, velocity)
+        return observation, history, *sums, *seen
+
+    def _decision(self, observation: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Clipped action, command and whether a release is asked for."""
+        raw = self.policy.act(observation)
+        action = act.clip_action(raw)
+        command = act.command_from_action(action, self._max_thrust, self._max_rate)
+        return action, command, act.release_asked(raw, self._threshold)
+
+    @torch.inference_mode()
+    def see(
+        self, pos_w: np.ndarray, quat_wb: np.ndarray, payload_w: np.ndarray, goal_w: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Keypoints alone, as in :meth:`act`, without a decision: shape (E, 8, 2) and validity, shape (E, 8).
+
+        Raises:
+            PolicyError: There is no camera.
+            ValueError: An array of another shape.
+        """
+        if self.camera is None:
+            raise PolicyError("this pilot has no camera")
+        rot = ob.rotation_from_quat(self._tensor("quat_wb", quat_wb, 4))
+        goal = self._tensor("goal_w", np.broadcast_to(np.asarray(goal_w), (self.count, 3)), 3)
+        payload = self._tensor("payload_w", payload_w, 3)
+        points, valid = ob.vision_part(self.camera, self._tensor("pos_w", pos_w, 3), rot, goal, payload)
+        return points.numpy(), valid.numpy()
+
+    def _tensor(self, name: str, value: np.ndarray, width: int) -> Tensor:
+        array = np.array(value, dtype=np.float32)  # a copy: torch warns of read-only memory
+        if array.shape != (self.count, width):
+            raise ValueError(f"{name} has shape {array.shape}; expected ({self.count}, {width})")
+        return torch.from_numpy(array)

@@ -1,0 +1,349 @@
+"""The exported policy: a small network, the conditions that it was trained under, and how it was made.
+
+Onboard-safe: torch, numpy and json only. The file is an ``.npz`` without pickle: ``layer<i>_weight`` and
+``layer<i>_bias`` (float32), optionally ``normalizer_mean``, ``normalizer_std``, ``normalizer_eps``, and ``header``,
+JSON text with ``format_version``, ``activation``, ``contract`` and ``made_by``.
+
+``contract`` is a nested dictionary of everything that whoever flies the policy must share with its training: camera,
+mount, action limits, release lag, vehicle, observation layout. ``contract["observation"]["dimension"]`` and
+``contract["action"]["dimension"]``, where given, must fit the network. ``made_by`` tells config, commit, command, seed
+and figures; nothing depends on it.
+"""
+
+import json
+import math
+import re
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from visthrow.common.errors import MismatchError, PolicyError, suggest
+from visthrow.common.storage import from_json_array, json_array, loadz, savez
+
+FORMAT_VERSION = 1
+
+RELATIVE_TOLERANCE = 1e-9
+"""Two numbers of a contract are the same up to this: what a round trip through text or a unit conversion may cost."""
+
+RSL_RL_EPS = 1e-2
+"""What rsl_rl 5.5's EmpiricalNormalization adds to the standard deviation; it is not part of its state."""
+
+_ACTIVATIONS = {
+    "elu": F.elu,
+    "selu": F.selu,
+    "relu": F.relu,
+    "lrelu": F.leaky_relu,
+    "tanh": torch.tanh,
+    "sigmoid": torch.sigmoid,
+    "softplus": F.softplus,
+    "gelu": F.gelu,
+    "swish": F.silu,
+    "mish": F.mish,
+}
+"""By rsl_rl's names; its "crelu" is missing, as it stands for another function than the name says."""
+
+
+@dataclass(frozen=True)
+class Policy:
+    """A multi-layer perceptron ``obs (E, D) -> action (E, A)`` with an optional fixed normaliser before it.
+
+    Raises:
+        PolicyError: If shapes do not fit each other or the contract, a number is not finite, or the activation is
+            unknown.
+    """
+
+    weights: tuple[Tensor, ...]  # (out, in) each
+    biases: tuple[Tensor, ...]  # (out,) each
+    activation: str  # between the layers; the last one is linear
+    contract: dict[str, Any]
+    made_by: dict[str, Any] = field(default_factory=dict)
+    mean: Tensor | None = None  # (D,), of the observation
+    std: Tensor | None = None  # (D,)
+    eps: float = 0.0  # added to std
+
+    def __post_init__(self) -> None:
+        if self.activation not in _ACTIVATIONS:
+            raise PolicyError(f"activation '{self.activation}'; {suggest(self.activation, _ACTIVATIONS)}")
+        _check_shapes(self)
+        for part, declared in (("observation", self.obs_dim), ("action", self.action_dim)):
+            section = self.contract.get(part)
+            told = section.get("dimension", declared) if isinstance(section, Mapping) else declared
+            if told != declared:
+                raise PolicyError(f"the contract says {part} dimension {told}, the network has {declared}")
+
+    @property
+    def obs_dim(self) -> int:
+        """Number of observations D."""
+        return self.weights[0].shape[1]
+
+    @property
+    def action_dim(self) -> int:
+        """Number of actions A."""
+        return self.weights[-1].shape[0]
+
+    @torch.no_grad()
+    def act(self, obs: Tensor) -> Tensor:
+        """Return the deterministic action.
+
+        Args:
+            obs: Observations as in training, shape (E, D); taken to the policy's dtype.
+
+        Returns:
+            Normalised actions, unclipped, shape (E, A).
+
+        Raises:
+            PolicyError: If the last axis is not D long.
+        """
+        if obs.shape[-1] != self.obs_dim:
+            raise PolicyError(f"got observations of shape {tuple(obs.shape)}; this policy expects (E, {self.obs_dim})")
+        x = obs.to(self.weights[0].dtype)
+        if self.mean is not None:
+            x = (x - self.mean) / (self.std + self.eps)
+        activation = _ACTIVATIONS[self.activation]
+        for weight, bias in zip(self.weights[:-1], self.biases[:-1]):
+            x = activation(F.linear(x, weight, bias))
+        return F.linear(x, self.weights[-1], self.biases[-1])
+
+    def to(self, device: str | torch.device) -> "Policy":
+        """Return the policy with its tensors on another device."""
+
+        def move(tensor: Tensor | None) -> Tensor | None:
+            return None if tensor is None else tensor.to(device)
+
+        return Policy(
+            tuple(map(move, self.weights)),
+            tuple(map(move, self.biases)),
+            self.activation,
+            self.contract,
+            self.made_by,
+            move(self.mean),
+            move(self.std),
+            self.eps,
+        )
+
+    def require(
+        self, contract_now: Mapping[str, Any], sections: Collection[str] | None = None, allow: Collection[str] = ()
+    ) -> dict[str, Any]:
+        """Refuse to serve under other conditions than those of the training.
+
+        Args:
+            contract_now: The conditions here, as the training wrote them.
+            sections: Top-level keys to compare; all if None.
+            allow: Keys of tables or values that may differ, ``("vehicle", "observation.latency")``: an experiment's
+                stated departures from the training.
+
+        Returns:
+            What differs by allowance: dotted key -> the value here, None where there is nothing.
+
+        Raises:
+            MismatchError: Naming every key that differs without allowance, with both values.
+        """
+        trained, now = _flat(self.contract, sections), _flat(contract_now, sections)
+        differing = [
+            key
+            for key in sorted(trained.keys() | now.keys())
+            if not _same(trained.get(key, _ABSENT), now.get(key, _ABSENT))
+        ]
+        allowed = [key for key in differing if any(re.match(rf"{re.escape(name)}(?![^.\[])", key) for name in allow)]
+        refused = [
+            f"  {key}: trained with {_show(trained, key)}, here {_show(now, key)}" for key in differing if key not in allowed
+        ]
+        if refused:
+            raise MismatchError("the policy was trained under other conditions:\n" + "\n".join(refused))
+        return {key: now.get(key) for key in allowed}
+
+    def save(self, path: str | Path) -> None:
+        """Write the policy file, whole or not at all.
+
+        Raises:
+            PolicyError: If contract or made_by cannot be written as JSON.
+            StorageError: If the place cannot be written.
+        """
+        header = {
+            "format_version": FORMAT_VERSION,
+            "activation": self.activation,
+            "contract": self.contract,
+            "made_by": self.made_by,
+        }
+        try:
+            arrays = {"header": json_array(header)}
+        except (TypeError, ValueError) as error:
+            raise PolicyError(f"contract or made_by holds what JSON cannot: {error}") from error
+        for i, (weight, bias) in enumerate(zip(self.weights, self.biases)):
+            arrays[f"layer{i}_weight"], arrays[f"layer{i}_bias"] = weight.cpu().numpy(), bias.cpu().numpy()
+        if self.mean is not None:
+            arrays["normalizer_mean"], arrays["normalizer_std"] = self.mean.cpu().numpy(), self.std.cpu().numpy()
+            arrays["normalizer_eps"] = np.float64(self.eps)
+        savez(path, arrays)
+
+    @staticmethod
+    def load(path: str | Path, device: str | torch.device = "cpu") -> "Policy":
+        """Read a policy file.
+
+        Raises:
+            PolicyError: If the file is missing, cut short, of another version or incomplete, or contradicts itself.
+        """
+        arrays = loadz(path, PolicyError, "a policy file written by `visthrow train`")
+
+        def take(name: str) -> Tensor:
+            if name not in arrays:
+                raise PolicyError(f"{path}: no entry '{name}'; {suggest(name, arrays)}")
+            return torch.from_numpy(arrays[name]).to(device)
+
+        header = _header(take("header").cpu().numpy(), path)
+        count = sum(name.endswith("_weight") for name in arrays)
+        normalized = "normalizer_mean" in arrays
+        try:
+            return Policy(
+                tuple(take(f"layer{i}_weight") for i in range(count)),
+                tuple(take(f"layer{i}_bias") for i in range(count)),
+                header["activation"],
+                header["contract"],
+                header["made_by"],
+                take("normalizer_mean") if normalized else None,
+                take("normalizer_std") if normalized else None,
+                float(take("normalizer_eps")) if normalized else 0.0,
+            )
+        except PolicyError as error:
+            raise PolicyError(f"{path}: {error}") if str(path) not in str(error) else error from None
+
+    @staticmethod
+    def from_actor_state(
+        state: Mapping[str, Tensor],
+        activation: str,
+        contract: dict[str, Any],
+        made_by: dict[str, Any] | None = None,
+        eps: float = RSL_RL_EPS,
+    ) -> "Policy":
+        """Build the policy from the state of an rsl_rl 5.5 ``MLPModel`` actor with a Gaussian of its own spread.
+
+        Args:
+            state: ``actor.state_dict()``: ``mlp.<i>.weight``, ``mlp.<i>.bias``, ``obs_normalizer._mean`` and ``._std``;
+                the spread under ``distribution.`` plays no part in the deterministic action.
+            activation: The actor's hidden activation by rsl_rl's name.
+            contract: Conditions of the training.
+            made_by: Where it comes from.
+            eps: Of the normaliser.
+
+        Raises:
+            PolicyError: If the state holds anything else (another model class), or does not fit the contract.
+        """
+        known = ("mlp.", "obs_normalizer.", "distribution.")
+        foreign = sorted(key for key in state if not key.startswith(known))
+        index = sorted(int(key.split(".")[1]) for key in state if key.startswith("mlp.") and key.endswith(".weight"))
+        if foreign or not index:
+            came = ", ".join(foreign) or "no mlp.<i>.weight"
+            wanted = "mlp.<i>.weight, mlp.<i>.bias, obs_normalizer._mean, obs_normalizer._std"
+            raise PolicyError(f"got {came}; expected the state of an rsl_rl MLPModel: {wanted}")
+
+        def take(key: str) -> Tensor:
+            return state[key].detach().to("cpu", torch.float32).clone()
+
+        normalized = "obs_normalizer._mean" in state
+        return Policy(
+            tuple(take(f"mlp.{i}.weight") for i in index),
+            tuple(take(f"mlp.{i}.bias") for i in index),
+            activation.lower(),
+            json.loads(json.dumps(contract)),
+            json.loads(json.dumps(made_by or {})),
+            take("obs_normalizer._mean").reshape(-1) if normalized else None,
+            take("obs_normalizer._std").reshape(-1) if normalized else None,
+            eps if normalized else 0.0,
+        )
+
+
+SHIPPED = Path(__file__).resolve().parent / "policies"
+"""Folder of the policies that come with the package."""
+
+
+def find_policy(name: str | Path) -> Path:
+    """Find a policy by the name of a shipped one (``vision``) or by the path of a file.
+
+    Raises:
+        PolicyError: If there is neither; the message lists what exists.
+    """
+    for candidate in (Path(name), SHIPPED / f"{name}.npz"):
+        if candidate.is_file():
+            return candidate
+    shipped = suggest(str(name), (path.stem for path in SHIPPED.glob("*.npz")))
+    raise PolicyError(f"no policy '{name}': neither a file nor one that comes with visthrow; {shipped}")
+
+
+_ABSENT = object()
+
+
+def _check_shapes(policy: Policy) -> None:
+    if not policy.weights or len(policy.weights) != len(policy.biases):
+        raise PolicyError(f"got {len(policy.weights)} weights and {len(policy.biases)} biases; expected a pair a layer")
+    width = policy.weights[0].shape[-1]
+    named = [("normalizer mean", policy.mean), ("normalizer std", policy.std)]
+    if (policy.mean is None) != (policy.std is None):
+        raise PolicyError("a normaliser needs both mean and std; one is missing")
+    for name, tensor in named:
+        if tensor is not None and tensor.shape != (width,):
+            raise PolicyError(f"{name} has shape {tuple(tensor.shape)}; the first layer takes ({width},)")
+    for i, (weight, bias) in enumerate(zip(policy.weights, policy.biases)):
+        if weight.ndim != 2 or weight.shape[1] != width or bias.shape != weight.shape[:1]:
+            came = f"weight {tuple(weight.shape)} and bias {tuple(bias.shape)}"
+            raise PolicyError(f"layer {i} has {came}; expected (n, {width}) and (n,)")
+        width = weight.shape[0]
+        named += [(f"layer {i} weight", weight), (f"layer {i} bias", bias)]
+    for name, tensor in named:
+        if tensor is not None and not bool(torch.isfinite(tensor).all()):
+            raise PolicyError(f"{name} holds numbers that are not finite")
+    if policy.std is not None and not bool((policy.std + policy.eps > 0.0).all()):
+        raise PolicyError(
+            f"normalizer std + eps must be above 0; the smallest is {float((policy.std + policy.eps).min())}"
+        )
+
+
+def _header(array: np.ndarray, path: str | Path) -> dict[str, Any]:
+    try:
+        header = from_json_array(array)
+        version = header["format_version"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise PolicyError(f"{path}: its header is not readable: {error!r}") from error
+    if version != FORMAT_VERSION:
+        raise PolicyError(f"{path}: format version {version}; this program reads version {FORMAT_VERSION}")
+    wanted = {"activation": str, "contract": dict, "made_by": dict}
+    for key, kind in wanted.items():
+        if not isinstance(header.get(key), kind):
+            raise PolicyError(f"{path}: header entry '{key}' is {header.get(key)!r}; expected a {kind.__name__}")
+    return header
+
+
+def _flat(tree: Mapping[str, Any], sections: Collection[str] | None) -> dict[str, Any]:
+    """Flatten nested dictionaries and lists to dotted keys; an empty one stays as a value."""
+    flat: dict[str, Any] = {}
+
+    def walk(value: Any, path: str) -> None:
+        if isinstance(value, Mapping) and value:
+            for key, item in value.items():
+                walk(item, f"{path}.{key}" if path else str(key))
+        elif isinstance(value, list | tuple) and value:
+            for i, item in enumerate(value):
+                walk(item, f"{path}[{i}]")
+        else:
+            flat[path] = list(value) if isinstance(value, tuple) else value
+
+    walk({key: item for key, item in tree.items() if sections is None or key in sections}, "")
+    flat.pop("", None)
+    return flat
+
+
+def _same(a: Any, b: Any) -> bool:
+    if isinstance(a, bool) or isinstance(b, bool):
+        return a is b
+    if isinstance(a, int | float) and isinstance(b, int | float):
+        return math.isclose(a, b, rel_tol=RELATIVE_TOLERANCE)
+    return type(a) is type(b) and a == b
+
+
+def _show(flat: dict[str, Any], key: str) -> str:
+    return repr(flat[key]) if key in flat else "nothing"

@@ -1,0 +1,1 @@
+"""Throws on either plant: one throw, many throws, and what is made of their results."""

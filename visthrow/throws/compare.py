@@ -1,0 +1,278 @@
+"""``visthrow compare``: throw many times with each policy and print landing errors and durations."""
+
+import argparse
+import importlib
+import math
+import os
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from visthrow.common.arguments import add_common
+from visthrow.common.errors import ConfigError, StorageError
+
+DEFAULT_POLICIES = ("state", "vision")
+DEFAULT_TARGETS = (1.5, 2.0, 2.5)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.epilog = (
+        "examples:\n"
+        "  visthrow compare                               state against vision, 200 throws at each of three targets\n"
+        "  visthrow compare vision runs/v2/policy.npz     a shipped policy against one of your own\n"
+        "  visthrow compare state baseline --throws 50    against trajectory optimisation and MPC on the same throws\n"
+        "  visthrow compare --plant reference-realistic --throws 50   on the stand-in for a real vehicle (minutes)\n"
+        "  visthrow compare --from runs/hil/*              throws of HIL runs, from their folders\n"
+        "\nA throw starts in hover with the payload near z = 0.95 m. The landing error is the horizontal distance\n"
+        "from the target, the duration counts from the policy's start to the landing, smoothness is the root mean\n"
+        "square change of the normalised commands from step to step. The policy 'baseline' stands for four rows: in the\n"
+        "controller's own model, an idealised bound, and on the plant with no, most or all of the known delays\n"
+        "made up for.\n"
+    )
+    kinds = "shipped names, policy files, or baseline (default: state vision)"
+    parser.add_argument("policies", metavar="POLICY", nargs="*", help=kinds)
+    parser.add_argument(
+        "--from", dest="runs", nargs="+", metavar="RUN", help="throw nothing: take the throws of HIL runs from their folders"
+    )
+    parser.add_argument(
+        "--targets", type=float, nargs="+", default=list(DEFAULT_TARGETS), metavar="M", help="distances along x [m]"
+    )
+    parser.add_argument(
+        "--throws", type=int, default=200, metavar="N", help="for each policy and target (default: 200)"
+    )
+    plants = "hybrid (the training simulator, with all its noise), reference, or reference-realistic"
+    parser.add_argument("--plant", default="hybrid", metavar="NAME", help=plants)
+    parser.add_argument("--seed", type=int, default=0, help="of starts and noise (default: 0)")
+    parser.add_argument("--config", metavar="NAME", help="fly in this train config instead of each policy's own")
+    allow = "part of a policy's contract that --config and --set may break (vehicle, rope.length); told above the table"
+    parser.add_argument("--allow", action="append", default=[], metavar="KEY", help=f"{allow}; may be repeated")
+    parser.add_argument(
+        "--out", default="out/compare", metavar="FOLDER", help="for table, CSV and plot (default: out/compare)"
+    )
+    add_common(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Throw, print, write."""
+    if args.runs:
+        return _from_runs(args)
+    check(args.targets, args.throws)
+    from visthrow.baseline.thrower import NAME
+    from visthrow.common.errors import suggest
+    from visthrow.throws.loading import load_policy, unique_names
+    from visthrow.throws.plants import PLANTS
+    from visthrow.training.device import resolve
+
+    if args.plant not in PLANTS:
+        raise ConfigError(f"no plant '{args.plant}'; {suggest(args.plant, PLANTS)}")
+    wanted = args.policies or DEFAULT_POLICIES
+    loaded = [load_policy(name, args.config, args.overrides, args.allow) for name in wanted if name != NAME]
+    writable(Path(args.out))
+    if NAME in wanted:
+        importlib.import_module("piqp")  # said here rather than after all policies have thrown
+    if not loaded:
+        throws = []
+    elif args.plant == "hybrid":
+        throws = throw_hybrid(loaded, args.targets, args.throws, resolve(args.device), args.seed)
+    else:
+        from visthrow.throws.reference_protocol import Throwing
+
+        with Throwing(loaded, args.targets, args.throws, args.plant, args.seed) as throwing:
+            throws = throwing.results()
+    entries = entries_of(loaded, unique_names(loaded), throws)
+    if NAME in wanted:
+        entries += throw_baseline(args)
+    title, rows = title_of(args.plant, args.seed) + departures_note(loaded), rows_of(entries)
+    print(report(title, rows))
+    for path in write(Path(args.out), entries, rows, args.plant, title):
+        print(path)
+    if args.json:
+        from visthrow.common.storage import write_json
+
+        departures = {item.name: item.departures for item in loaded if item.departures}
+        write_json(args.json, {"plant": args.plant, "seed": args.seed, "rows": rows, "departures": departures})
+    return 0
+
+
+def _from_runs(args: argparse.Namespace) -> int:
+    """The same table and files from the folders of HIL runs.
+
+    Raises:
+        ConfigError: policies were named as well.
+    """
+    from visthrow.common.storage import write_json
+    from visthrow.throws import from_runs
+
+    if args.policies:
+        raise ConfigError(f"--from with policies {' '.join(args.policies)}; the runs say which policies were flown")
+    writable(Path(args.out))
+    logs = from_runs.logs_of(args.runs)
+    entries = from_runs.entries(logs)
+    rows = [row for row in rows_of(entries) if row["throws"]]
+    how = ", ".join(sorted({log.meta["plant_meaning"] for log in logs}))
+    title = f"Throws from hover on {how}: {len(logs)} throws of {len(args.runs)} runs"
+    print(report(title, rows, from_runs.NOTE))
+    for path in write(Path(args.out), entries, rows, "runs", title, f"{len(logs)} throws of HIL runs", from_runs.NOTE):
+        print(path)
+    if args.json:
+        write_json(args.json, {"plant": "runs", "runs": args.runs, "rows": rows})
+    return 0
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One row's thrower: what it is called, what it sees ("state", "vision") or is, and its throws a target."""
+
+    name: str
+    layout: str
+    throws: Sequence
+
+
+def entries_of(loaded: Sequence, names: Sequence[str], throws: Sequence[Sequence]) -> list[Entry]:
+    """Entries of learnt policies."""
+    layouts = (item.policy.contract["observation"]["layout"] for item in loaded)
+    return [Entry(*parts) for parts in zip(names, layouts, throws)]
+
+
+def throw_baseline(args: argparse.Namespace) -> list[Entry]:
+    """Throw with trajectory optimisation and MPC: in its own model, and on the plant under each compensation."""
+    import tempfile
+
+    from visthrow.baseline import thrower
+    from visthrow.throws.reference_protocol import FIELDS
+    from visthrow.training.device import cores
+    from visthrow.training.protocol import Throws
+
+    def say(text: str) -> None:
+        if sys.stderr.isatty():
+            print(f"\rTO+MPC: {text:<60}", end="", file=sys.stderr, flush=True)
+
+    with tempfile.TemporaryDirectory() as folder:
+        found = thrower.compared(
+            args.plant, args.targets, args.throws, args.seed, folder, cores(), args.config or "state", args.overrides, say
+        )
+    say("")
+    own = thrower.title_of(thrower.OWN, "none")
+    return [
+        Entry(
+            name, "TO+MPC" if name == own else "",
+            [Throws(of.unit["target"], **{field: of.columns[field] for field in FIELDS}) for of in row],
+        )
+        for name, row in found.items()
+    ]  # fmt: skip
+
+
+def check(targets: Sequence[float], throws: int) -> None:
+    """Refuse what cannot be thrown.
+
+    Raises:
+        ConfigError: no throws, or a target that is no distance or further than a vehicle may fly.
+    """
+    if throws < 1:
+        raise ConfigError(f"--throws {throws}; expected 1 or more")
+    for target in targets:
+        if not (math.isfinite(target) and 0.0 <= target <= 3.0):
+            raise ConfigError(
+                f"--targets {target:g}; expected distances from 0 to 3 m, policies are trained on goals within 2 m"
+            )
+    if len(set(targets)) < len(targets):
+        raise ConfigError(f"--targets {' '.join(f'{x:g}' for x in targets)}: the same one twice")
+
+
+def writable(folder: Path) -> None:
+    """Make the folder of the results now, so that no work is done for results that could not be written.
+
+    Raises:
+        StorageError: it cannot be made or written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StorageError(f"cannot make the folder {folder}: {error.strerror or error}") from error
+    if not os.access(folder, os.W_OK):
+        raise StorageError(f"the folder {folder} cannot be written")
+
+
+def throw_hybrid(
+    loaded: Sequence, targets: Sequence[float], count: int, device: str, seed: int, show: bool = True
+) -> list[list]:
+    """Throw in the training simulator; for each policy a `Throws` a target."""
+    from visthrow.training.protocol import throw
+
+    rows, total = [], len(loaded) * len(targets)
+    for item in loaded:
+        policy = item.policy.to(device)
+        row = []
+        for target in targets:
+            if show and sys.stderr.isatty():
+                done = len(rows) * len(targets) + len(row)
+                print(
+                    f"\rthrows in the training simulator: {done} of {total} sets   ",
+                    end="",
+                    file=sys.stderr,
+                    flush=True,
+                )
+            row.append(throw(item.experiment, policy.act, target, count, device, seed))
+        rows.append(row)
+    if show and sys.stderr.isatty():
+        print(f"\r{' ' * 60}\r", end="", file=sys.stderr, flush=True)
+    return rows
+
+
+def title_of(plant: str, seed: int) -> str:
+    """Heading of a table: which plant, which noise, which seed."""
+    meaning = {
+        "hybrid": "the training simulator with all its noise and randomisation",
+        "reference": "the reference plant (MuJoCo) without extras: measurements late but exact, still air",
+        "reference-realistic": "the reference plant (MuJoCo) with pinned wind, drag, build errors and mocap noise",
+    }[plant]
+    return f"Throws from hover on {meaning} (`{plant}`, seed {seed})"
+
+
+def departures_note(loaded: Sequence) -> str:
+    """End of a heading that says under which other conditions than its training's each policy was flown."""
+    notes = [
+        f"{item.name} flown with {', '.join(f'{key} = {value!r}' for key, value in item.departures.items())}, trained otherwise"
+        for item in loaded
+        if item.departures
+    ]
+    return "".join(f"; {note}" for note in notes)
+
+
+def rows_of(entries: Sequence[Entry]) -> list[dict]:
+    """Summaries, target after target, throwers side by side."""
+    count = len(entries[0].throws)
+    return [
+        {"policy": entry.name, "layout": entry.layout, **entry.throws[column].summary()}
+        for column in range(count)
+        for entry in entries
+    ]
+
+
+def report(title: str, rows: Sequence[dict], note: str | None = None) -> str:
+    """Table with its note on the paper's figures."""
+    from visthrow.view.tables import PAPER_NOTE, markdown
+
+    return f"{markdown(rows, title)}\n{note or PAPER_NOTE}\n"
+
+
+def write(
+    folder: Path, entries: Sequence[Entry], rows: Sequence[dict], plant: str, title: str, subtitle: str | None = None,
+    note: str | None = None,
+) -> list[Path]:  # fmt: skip
+    """Write Markdown, CSV and scatter plot; returns their paths."""
+    from visthrow.common.storage import atomic_write
+    from visthrow.view import scatter, tables
+
+    stem = f"compare-{plant}"
+    paths = [folder / f"{stem}.md", folder / f"{stem}.csv", folder / f"{stem}.png"]
+    atomic_write(paths[0], report(title, rows, note))
+    atomic_write(paths[1], tables.csv_text([(entry.name, plant, of) for entry in entries for of in entry.throws]))
+    from visthrow.throws.plants import PLANTS
+
+    if subtitle is None:
+        subtitle = f"{len(entries[0].throws[0].success)} throws each, {PLANTS[plant]}"
+    scatter.draw(paths[2], [(e.name, e.throws) for e in entries], subtitle)
+    return paths

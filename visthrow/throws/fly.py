@@ -1,0 +1,113 @@
+"""``visthrow fly``: fly one throw and write a 3D recording and a picture of it."""
+
+import argparse
+import sys
+from pathlib import Path
+
+from visthrow.common.arguments import add_common
+
+FILES = {
+    "flight.npz": "every signal of the flight; read it with visthrow.logs.flightlog.FlightLog.load",
+    "throw.rrd": "the scene in 3D, the image plane and all signals; open it with: rerun",
+    "throw.png": "the throw in four pictures",
+}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.epilog = (
+        "examples:\n"
+        "  visthrow fly                                   the shipped vision policy throws at a target 2 m ahead\n"
+        "  visthrow fly --policy state --target 1.5\n"
+        "  visthrow fly --target 1.2 0.8                  a target 1.2 m ahead and 0.8 m to the left\n"
+        "  visthrow fly --plant reference-realistic       on the stand-in for a real vehicle (about a minute)\n"
+        "\nThe vehicle hovers until the swing is quiet, the policy throws, the hover controller brings it back.\n"
+    )
+    parser.add_argument(
+        "--policy", default="vision", metavar="POLICY", help="a shipped name or a policy file (default: vision)"
+    )
+    parser.add_argument(
+        "--target",
+        type=float,
+        nargs="+",
+        default=[2.0],
+        metavar="M",
+        help="distance ahead, or x and y [m] (default: 2.0)",
+    )
+    plants = "hybrid (the training simulator, the default), reference, or reference-realistic"
+    parser.add_argument("--plant", default="hybrid", metavar="NAME", help=plants)
+    parser.add_argument("--seed", type=int, default=0, help="of start, measurements and plant (default: 0)")
+    parser.add_argument("--config", metavar="NAME", help="fly in this train config instead of the policy's own")
+    parser.add_argument("--out", default="out/fly", metavar="FOLDER", help="for the files (default: out/fly)")
+    add_common(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Fly, write, tell."""
+    from visthrow.common.errors import ConfigError, suggest
+    from visthrow.common.storage import write_json
+    from visthrow.throws.compare import writable
+    from visthrow.throws.flight import check_goal, fly
+    from visthrow.throws.loading import load_policy
+    from visthrow.throws.plants import PLANTS
+    from visthrow.training.device import resolve
+
+    if args.plant not in PLANTS:
+        raise ConfigError(f"no plant '{args.plant}'; {suggest(args.plant, PLANTS)}")
+    if len(args.target) > 2:
+        raise ConfigError(f"--target {' '.join(f'{x:g}' for x in args.target)}; expected a distance, or x and y")
+    loaded = load_policy(args.policy, args.config, args.overrides)
+    goal = [args.target[0], args.target[1] if len(args.target) == 2 else 0.0, 0.0]
+    check_goal(loaded, goal)
+    writable(Path(args.out))
+    if args.plant != "hybrid":
+        print("flying on the reference plant; this takes about a minute", file=sys.stderr)
+    log = fly(loaded, goal, args.plant, args.seed, resolve(args.device))
+    paths = write(Path(args.out), log, loaded.experiment)
+    print(story(log))
+    for path in paths:
+        print(f"{path}  {FILES[path.name]}")
+    if args.json:
+        write_json(args.json, {key: log.meta[key] for key in ("policy", "plant", "goal_w", "seed", "times", "result")})
+    return 0 if log.meta["result"]["success"] else 1
+
+
+def write(folder: Path, log, experiment) -> list[Path]:
+    """Write log, recording and, for a throw that landed, the picture; returns their paths."""
+    from visthrow.view import rerun_view, strip
+
+    paths = [folder / name for name in FILES]
+    log.save(paths[0])
+    rerun_view.write(paths[1], log, experiment)
+    if "landing" not in log:
+        return paths[:2]
+    strip.draw(paths[2], log, experiment.camera)
+    return paths
+
+
+def story(log) -> str:
+    """What happened, in a few lines."""
+    times, result, goal = log.meta["times"], log.meta["result"], log.meta["goal_w"]
+    start = times["policy_start"]
+    plant = f"{log.meta['plant_meaning']} (plant {log.meta['plant']}, seed {log.meta['seed']})"
+    lines = [
+        f"policy '{log.meta['policy']}' on {plant}",
+        f"hover   {start:.2f} s until the swing was quiet",
+    ]
+    if "separation" in times:
+        at = log["separation"].values[0]
+        lines.append(
+            f"throw   release asked for {times['latch'] - start:.2f} s and done {times['separation'] - start:.2f} s "
+            f"after the start, payload at x {at[0]:.2f} m, z {at[2]:.2f} m"
+        )
+    if "landing" in log:
+        x, y, _ = log["landing"].values[0]
+        lines.append(
+            f"landing at x {x:.3f} m, y {y:+.3f} m: {result['error']:.3f} m from the target "
+            f"({goal[0]:g}, {goal[1]:g}), {result['duration']:.2f} s after the start"
+        )
+    if result["failure"]:
+        lines.append(f"failed: {result['failure']}")
+    end = "hovering again" if result["hovering_again"] else "not hovering again"
+    lines.append(f"after   {times['end'] - times['recovery']:.1f} s of recovery the vehicle was {end}")
+    return "\n".join(lines)

@@ -1,0 +1,100 @@
+"""Throws of HIL runs, from the flight logs in their folders, as the tables of simulated throws want them."""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from visthrow.common.errors import LogError
+from visthrow.logs.flightlog import FlightLog
+from visthrow.onboard.observations import VEHICLE
+from visthrow.throws.compare import Entry
+from visthrow.training.protocol import Throws
+
+PATTERN = "throw-*.npz"
+
+NOTE = (
+    "The paper's figures are ten throws a target of its vehicle. Whether a vehicle or a fake autopilot was at the other end of "
+    "these runs their folders do not say."
+)
+
+
+def logs_of(folders: Iterable[str | Path]) -> list[FlightLog]:
+    """Logs of all throws of some runs.
+
+    Raises:
+        LogError: a folder without throws, or a damaged log.
+    """
+    logs: list[FlightLog] = []
+    for folder in map(Path, folders):
+        found = sorted(folder.glob(PATTERN))
+        if not found:
+            here = ", ".join(sorted(path.name for path in folder.iterdir())) if folder.is_dir() else "no such folder"
+            raise LogError(
+                f"{folder}: no {PATTERN} in it ({here or 'empty'}); expected the folder of a run with throws. Of a run that was "
+                f"killed they are made by: visthrow hil view {folder}"
+            )
+        logs += map(FlightLog.load, found)
+    return logs
+
+
+def entries(logs: list[FlightLog]) -> list[Entry]:
+    """An entry a policy, its throws by the distance of their goals; policies of one name and other content are told apart.
+
+    Raises:
+        LogError: a log that holds no throw.
+    """
+    groups: dict[tuple[str, str, str], dict[float, list[FlightLog]]] = {}
+    for log in logs:
+        try:
+            key = (log.meta["policy"], log.meta["policy_sha256"] or "", log.meta["layout"])
+            distance = round(float(np.linalg.norm(_offset(log))), 2)
+        except (KeyError, TypeError) as error:
+            raise LogError(f"a log holds no throw of a run: {error!r}; it knows {', '.join(log.meta)}") from error
+        groups.setdefault(key, {}).setdefault(distance, []).append(log)
+    targets = sorted({distance for by_distance in groups.values() for distance in by_distance})
+    names = [name for name, _, _ in groups]
+    return [
+        Entry(
+            name if names.count(name) == 1 else f"{name} {sha[:8]}", layout,
+            [_throws(target, by_distance.get(target, [])) for target in targets],
+        )
+        for (name, sha, layout), by_distance in sorted(groups.items())
+    ]  # fmt: skip
+
+
+def _offset(log: FlightLog) -> np.ndarray:
+    """From where the vehicle hovers to the goal [m], shape (2,)."""
+    return np.array(log.meta["goal_w"][:2]) - np.array(log.meta["home_w"][:2])
+
+
+def _throws(target: float, logs: list[FlightLog]) -> Throws:
+    """Throws at one distance; landing points along the throw and across it, from where the vehicle hovered."""
+    rows = [_row(log) for log in logs]
+    columns = np.array(rows, dtype=float).reshape(-1, 5)
+    success = np.isfinite(columns[:, 2])
+    return Throws(
+        target, success, columns[:, :2], columns[:, 2], columns[:, 3], np.full(len(rows), np.nan), columns[:, 4]
+    )
+
+
+def _row(log: FlightLog) -> tuple[float, ...]:
+    """Landing along and across, error, duration, smoothness; NaN for a throw that counts as failed."""
+    result = log.meta["result"]
+    if not result["success"]:
+        return (np.nan,) * 5
+    offset = _offset(log)
+    distance = np.linalg.norm(offset)
+    ahead = offset / distance if distance > 0.0 else np.array([1.0, 0.0])
+    landed = np.array(result["landing_w"][:2]) - np.array(log.meta["home_w"][:2])
+    across = ahead[0] * landed[1] - ahead[1] * landed[0]
+    return float(landed @ ahead), float(across), result["error"], result["duration"], smoothness(log)
+
+
+def smoothness(log: FlightLog) -> float:
+    """Root mean square change of the normalised commands from step to step of a throw, as `visthrow.training.protocol` has it."""
+    times = log.meta["times"]
+    of, seen = log["action"], log["observation"]
+    during = (of.time >= times["policy_start"] - 1e-9) & (of.time < times["recovery"] - 1e-9)
+    action, before = of.values[during, :4], seen.values[during, VEHICLE : VEHICLE + 4]
+    return float(np.sqrt(np.mean(np.square(action - before))))

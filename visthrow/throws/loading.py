@@ -1,0 +1,67 @@
+"""A policy together with the experiment that it is flown in."""
+
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from visthrow import config
+from visthrow.common import toml_text
+from visthrow.common.errors import PolicyError
+from visthrow.onboard.policy import Policy, find_policy
+from visthrow.task import Experiment, contract_of
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """A policy, what to call it, and the experiment (plant, camera, task) that it is flown in.
+
+    Attributes:
+        departures: where that experiment breaks the policy's contract by allowance: dotted key -> the value flown with.
+    """
+
+    name: str
+    policy: Policy
+    experiment: Experiment
+    departures: dict[str, Any] = field(default_factory=dict)
+
+
+def load_policy(
+    name: str | Path, config_name: str | None = None, overrides: Iterable[str] = (), allow: Collection[str] = ()
+) -> Loaded:
+    """Load a policy and the experiment that it was trained in, or another one that fits its contract.
+
+    Args:
+        name: of a shipped policy, or a file.
+        config_name: a config of ``configs/train`` to fly in instead of the policy's own.
+        overrides: ``key=value`` changes of that config.
+        allow: parts of the contract that may be broken, as of :meth:`visthrow.onboard.policy.Policy.require`.
+
+    Raises:
+        PolicyError: no such policy, or it does not carry its config and none was named.
+        MismatchError: the config breaks the policy's contract; the message names every difference.
+        ConfigError: a wrong config or override.
+    """
+    path = find_policy(name)
+    policy = Policy.load(path)
+    if config_name is not None:
+        experiment = config.load(Experiment, config.find("train", config_name), overrides)
+    elif isinstance(policy.made_by.get("config"), dict):
+        text = toml_text.dumps({**policy.made_by["config"], "ppo": _learning(policy)})
+        experiment = config.loads(Experiment, text, overrides, name=f"{path} (the config it was trained with)")
+    else:
+        raise PolicyError(f"{path} does not carry the config it was trained with; name one with --config")
+    departures = policy.require(contract_of(experiment), allow=allow)
+    return Loaded(path.stem if path.stem != "policy" else path.resolve().parent.name, policy, experiment, departures)
+
+
+def _learning(policy: Policy) -> dict:
+    """Learning parameters of today's config: they play no part in flight, and an older policy may lack a newer one."""
+    layout = policy.contract.get("observation", {}).get("layout", "state")
+    return config.to_dict(config.load(Experiment, config.find("train", layout)).ppo)
+
+
+def unique_names(loaded: list[Loaded]) -> list[str]:
+    """Return a name for each; where two are alike, numbered."""
+    names = [item.name for item in loaded]
+    return [name if names.count(name) == 1 else f"{name} {i + 1}" for i, name in enumerate(names)]

@@ -1,0 +1,321 @@
+"""The two plants behind one face: the training simulator and the reference plant, NumPy in and out."""
+
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+
+from sim.params import RandomizationParams
+from visthrow import config
+from visthrow.common.errors import ConfigError, suggest
+from visthrow.task import Experiment, NoiseParams, plant_of
+from visthrow.throws.ballistics import flown
+from visthrow.throws.loose_rope import LooseRope
+
+PLANTS = {
+    "hybrid": "the training simulator",
+    "reference": "the reference plant without extras",
+    "reference-realistic": "the realistic reference plant",
+}
+"""Name -> what pictures call it."""
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """State of E plants at one time; world frame, quaternions xyzw."""
+
+    time: float  # [s]
+    pos_w: np.ndarray  # [m], shape (E, 3)
+    quat_wb: np.ndarray  # shape (E, 4)
+    vel_w: np.ndarray  # [m/s], shape (E, 3)
+    rate_b: np.ndarray  # [rad/s], shape (E, 3)
+    payload_pos_w: np.ndarray  # its centre [m], shape (E, 3)
+    payload_vel_w: np.ndarray  # [m/s], shape (E, 3)
+    cable_points_w: np.ndarray  # joints of the rope, mount end first [m], shape (E, L + 1, 3)
+    motor_speed: np.ndarray  # [rad/s], shape (E, 4)
+    battery_voltage: np.ndarray  # [V], shape (E,)
+    attached: np.ndarray  # shape (E,), bool
+    latched: np.ndarray  # shape (E,), bool
+
+
+@dataclass(frozen=True)
+class Landings:
+    """Where and when the payloads came down, on the plant's clock; NaN where they did not yet."""
+
+    landed: np.ndarray  # shape (E,), bool
+    point_w: np.ndarray  # of the payload's centre [m], shape (E, 3)
+    time: np.ndarray  # [s], shape (E,)
+    separation_time: np.ndarray  # [s], shape (E,)
+
+
+class Plant(Protocol):
+    """What a flight needs of a plant."""
+
+    name: str
+    count: int
+    period: float
+    time: float
+
+    def reset(self, pos_w: np.ndarray, cable_dir_w: np.ndarray | None = None) -> None:
+        """Put the vehicles level and at rest to positions [m], shape (E, 3), with stated rope directions (E, L, 3)."""
+
+    def step(self, command: np.ndarray, release: np.ndarray | bool = False) -> None:
+        """Advance one control period under commands [N, rad/s], shape (E, 4)."""
+
+    @property
+    def state(self) -> Snapshot:
+        """The truth."""
+
+    def measured(self) -> Snapshot:
+        """What the pilot is told: with noise and latency where the plant has them."""
+
+    @property
+    def landing(self) -> Landings:
+        """Landings so far."""
+
+
+class HybridPlant:
+    """The training simulator. After the release the ball flies in closed form and the rope with it (`LooseRope`)."""
+
+    name = "hybrid"
+
+    def __init__(
+        self,
+        experiment: Experiment,
+        count: int = 1,
+        seed: int = 0,
+        device: str = "cpu",
+        noise: NoiseParams | None = None,
+        latency: tuple[float, float] = (0.0, 0.0),
+        start: RandomizationParams | None = None,
+    ) -> None:
+        """Build the simulator.
+
+        Args:
+            experiment: whose plant it is.
+            count: E.
+            seed: of the measurements' noise.
+            device: "cpu" or "cuda:0".
+            noise: of the measurements, in each quantity's SI unit as in training; None for none.
+            latency: range that each vehicle's age of measurements is drawn from at a reset [s].
+            start: with it, vehicles, ropes and starts are those of :func:`visthrow.training.protocol.throw` with the same seed and
+                start, and commands are disturbed as in training.
+        """
+        from sim.hybrid import HybridSim, rope_variants
+
+        self.params, self.count, self.noise, self.latency = plant_of(experiment), count, noise, latency
+        self.period = self.params.sim.control_period
+        self._start, self._action = start, experiment.task.action
+        ropes = None if start is None else rope_variants(self.params.rope, start)
+        self._sim = HybridSim(self.params, count, device, seed, ropes=ropes)
+        self._rng = np.random.default_rng(seed)
+        self._command_bias = np.zeros((count, 4))
+        if start is None:
+            self.reset(np.tile([0.0, 0.0, experiment.task.start.spawn_height], (count, 1)))
+        else:
+            self._sim.randomize(start)
+            self._sim.randomize(start)  # as ThrowEnv, which draws once when it is built and once when it is reset
+            self._command_bias = noise.command_bias * self._rng.standard_normal((count, 4))
+            self._begin()
+
+    def reset(self, pos_w: np.ndarray, cable_dir_w: np.ndarray | None = None) -> None:
+        """See `Plant`."""
+        self._sim.place(pos_w=pos_w, cable_dir_w=cable_dir_w)
+        self._begin()
+
+    def _begin(self) -> None:
+        self.time = 0.0
+        count = self.count
+        self._latched, self._separation = np.zeros(count, bool), np.full(count, np.nan)
+        self._ropes: list[LooseRope | None] = [None] * count
+        bias = 0.0 if self.noise is None else self.noise.observation_bias
+        self._bias = bias * self._rng.standard_normal((5, count, 3))
+        self._age = self._rng.uniform(*self.latency, count)
+        self._before = self.state
+
+    def step(self, command: np.ndarray, release: np.ndarray | bool = False) -> None:
+        """See `Plant`."""
+        release = np.broadcast_to(np.asarray(release, dtype=bool), (self.count,))
+        self._before = self.state
+        self._sim.set_command(command if self._start is None else self._disturbed(command), release)
+        self._sim.step()
+        self._latched = self._latched | release
+        separated = self._sim.get("separated") != 0
+        landed = self.landing.landed
+        for e, rope in enumerate(self._ropes):
+            if rope is not None and not landed[e]:
+                rope.fly(self.period)
+            elif rope is None and separated[e]:
+                inside = float(self._sim.get("separation_time")[e])
+                self._separation[e] = self.time + inside
+                self._ropes[e] = self._let_go(e)
+                if self.period - inside > 1e-6:
+                    self._ropes[e].fly(self.period - inside)
+        self.time += self.period
+
+    def postpone(self, time: float) -> None:
+        """Let payloads that are latched and still hang separate so much later [s]: the latch tripped within the last period."""
+        timer = self._sim.get("release_timer")
+        waits = self._latched & (self._sim.get("attached") != 0) & (timer >= 0.0)
+        self._sim.state.release_timer.assign(np.where(waits, timer + time, timer).astype(timer.dtype))
+
+    def _disturbed(self, command: np.ndarray) -> np.ndarray:
+        """Commands with the training's noise, which is on their normalised form."""
+        import torch
+
+        from visthrow.onboard import actions as act
+
+        most, rates = self._action.max_thrust, torch.tensor(self._action.max_rate, dtype=torch.float64)
+        action = act.action_from_command(torch.from_numpy(np.asarray(command, dtype=float)), most, rates)
+        error = self._command_bias + self.noise.command_step * self._rng.standard_normal((self.count, 4))
+        return act.command_from_action(action + torch.from_numpy(error), most, rates).numpy()
+
+    def _let_go(self, e: int) -> LooseRope:
+        """Rope of one plant at separation: the simulator keeps its directions and rates of that instant."""
+        rope = self.params.rope
+        ball, ball_vel = (self._sim.get(name)[e].astype(float) for name in ("payload_pos_w", "payload_vel_w"))
+        link = rope.length / rope.segments
+        direction, turn = (self._sim.get(name)[e].astype(float) for name in ("cable_dir_w", "cable_vel_w"))
+
+        def upwards(end: np.ndarray, step: np.ndarray) -> np.ndarray:
+            knot = end - rope.payload_offset * step[-1]
+            above = knot - link * np.cumsum(step[::-1], axis=0)[::-1]
+            return np.vstack((above, knot))
+
+        return LooseRope(upwards(ball, direction), upwards(ball_vel, turn), ball, ball_vel)
+
+    def _ball(self) -> tuple[np.ndarray, np.ndarray]:
+        """Ball in flight: position and velocity; at rest after landing."""
+        pos, vel = self._sim.get("payload_pos_w").astype(float), self._sim.get("payload_vel_w").astype(float)
+        landing = self.landing
+        pos, vel = flown(self.params.rope, self.params.air, pos, vel, np.nan_to_num(self.time - self._separation))
+        down = landing.landed[:, None]
+        return np.where(down, landing.point_w, pos), np.where(down, 0.0, vel)
+
+    @property
+    def state(self) -> Snapshot:
+        """See `Plant`."""
+        sim = self._sim
+        ball, ball_vel = self._ball()
+        points = sim.cable_points_w()
+        for e, rope in enumerate(self._ropes):
+            if rope is not None:
+                points[e] = rope.points_w(ball[e])
+        body = {name: sim.get(name).astype(float) for name in ("pos_w", "quat_wb", "vel_w", "rate_b", "motor_speed")}
+        return Snapshot(
+            self.time, payload_pos_w=ball, payload_vel_w=ball_vel, cable_points_w=points,
+            battery_voltage=sim.get("voltage").astype(float), attached=sim.get("attached") != 0,
+            latched=self._latched.copy(), **body,
+        )  # fmt: skip
+
+    def measured(self) -> Snapshot:
+        """The truth, late and with the training's observation noise, which on the attitude is an angle [rad]."""
+        now = _late(self._before, self.state, self._age / self.period)
+        if self.noise is None:
+            return now
+        error = self._bias + self.noise.observation_step * self._rng.standard_normal((5, self.count, 3))
+        quat = now.quat_wb + 0.5 * _quat_times_vector(now.quat_wb, error[4])
+        return replace(
+            now, pos_w=now.pos_w + error[0], vel_w=now.vel_w + error[1], rate_b=now.rate_b + error[2],
+            payload_pos_w=now.payload_pos_w + error[3], quat_wb=quat / np.linalg.norm(quat, axis=1, keepdims=True),
+        )  # fmt: skip
+
+    @property
+    def landing(self) -> Landings:
+        """See `Plant`."""
+        impact = self._separation + self._sim.get("time_to_impact")
+        landed = ~np.isnan(self._separation) & (impact <= self.time + 1e-9)
+        point = np.where(landed[:, None], self._sim.get("landing_w").astype(float), np.nan)
+        return Landings(landed, point, np.where(landed, impact, np.nan), self._separation.copy())
+
+
+class ReferenceAdapter:
+    """The reference plant, with the pinned extras or with none but the latency and drag that the policy was trained for."""
+
+    def __init__(self, experiment: Experiment, count: int = 1, seed: int = 0, realistic: bool = True) -> None:
+        """Build the plant.
+
+        Args:
+            experiment: whose plant it is.
+            count: E.
+            seed: of everything random.
+            realistic: with the extras of ``configs/vehicle/reference_realistic.toml``.
+        """
+        from sim.reference.extras import ReferenceExtras, load_extras
+        from sim.reference.plant import ReferencePlant
+
+        known = {"payload_drag": experiment.rope.payload_drag}
+        trained = ReferenceExtras(mocap_latency=float(np.mean(experiment.task.observation.latency)), **known)
+        extras = load_extras(config.find("vehicle", "reference_realistic")) if realistic else trained
+        self.name = "reference-realistic" if realistic else "reference"
+        self.params, self.count = plant_of(experiment), count
+        self.period = self.params.sim.control_period
+        self._plant = ReferencePlant(self.params, extras, seed, count)
+        self.reset(np.tile([0.0, 0.0, experiment.task.start.spawn_height], (count, 1)))
+
+    def reset(self, pos_w: np.ndarray, cable_dir_w: np.ndarray | None = None) -> None:
+        """See `Plant`."""
+        level, still = np.tile([0.0, 0.0, 0.0, 1.0], (self.count, 1)), np.zeros((self.count, 3))
+        self._plant.reset(pos_w, level, still, still, cable_dir_w)
+
+    @property
+    def time(self) -> float:
+        """Since the reset [s]."""
+        return self._plant.time
+
+    def step(self, command: np.ndarray, release: np.ndarray | bool = False) -> None:
+        """See `Plant`."""
+        self._plant.step(command, release)
+
+    @property
+    def state(self) -> Snapshot:
+        """See `Plant`."""
+        return Snapshot(**vars(self._plant.state))
+
+    def measured(self) -> Snapshot:
+        """See `Plant`."""
+        return Snapshot(**vars(self._plant.measured()))
+
+    @property
+    def landing(self) -> Landings:
+        """See `Plant`."""
+        now = self._plant.landing
+        return Landings(now.landed, now.point_w, now.time, now.separation_time)
+
+
+def make_plant(name: str, experiment: Experiment, count: int = 1, seed: int = 0, device: str = "cpu") -> Plant:
+    """Build a plant by its name in :data:`PLANTS`; the training simulator with the task's noise and latency.
+
+    Raises:
+        ConfigError: no plant of that name.
+    """
+    if name == "hybrid":
+        return HybridPlant(experiment, count, seed, device, experiment.task.noise, experiment.task.observation.latency)
+    if name in PLANTS:
+        return ReferenceAdapter(experiment, count, seed, realistic=name == "reference-realistic")
+    raise ConfigError(f"no plant '{name}'; {suggest(name, PLANTS)}")
+
+
+def _late(before: Snapshot, now: Snapshot, share: np.ndarray) -> Snapshot:
+    """What is measured, linear from now (0) to one control period ago (1); share: shape (E,)."""
+    if not np.any(share):
+        return now
+    names = ("pos_w", "quat_wb", "vel_w", "rate_b", "payload_pos_w", "payload_vel_w")
+    late = {name: getattr(now, name) for name in names}
+    late = {name: value + share[:, None] * (getattr(before, name) - value) for name, value in late.items()}
+    late["quat_wb"] /= np.linalg.norm(late["quat_wb"], axis=1, keepdims=True)
+    return replace(now, **late)
+
+
+def _quat_times_vector(quat: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    """Product of quaternions xyzw, shape (E, 4), and pure quaternions of vectors, shape (E, 3)."""
+    imaginary = quat[:, 3:] * vector + np.cross(quat[:, :3], vector)
+    return np.column_stack((imaginary, -np.sum(quat[:, :3] * vector, axis=1)))
+
+
+def random_ropes(rng: np.random.Generator, count: int, segments: int, angle: float) -> np.ndarray:
+    """Straight ropes off the vertical by a normal angle of deviation ``angle`` [rad], shape (E, L, 3)."""
+    tilt = angle * rng.standard_normal((count, 2))
+    down = np.column_stack((tilt, -np.ones(count)))
+    down /= np.linalg.norm(down, axis=1, keepdims=True)
+    return np.repeat(down[:, None], segments, axis=1)

@@ -1,0 +1,276 @@
+"""Results of throws as units of work: what goes in is named and hashed, what comes out is one small file, or a packed record.
+
+A unit is a flat description of everything that its throws depend on (:func:`policy_unit` and the like). Its key is a hash of
+that, so that a changed input is another unit and an unchanged one is never worked twice. Each unit is written whole
+when it is done: a process killed at any moment loses no more than the units that it was working on.
+"""
+
+import hashlib
+import json
+import multiprocessing as mp
+import signal
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from visthrow.common import provenance
+from visthrow.common.errors import StorageError
+from visthrow.common.storage import atomic_write
+
+PROTOCOL = 1
+"""Goes up when the same unit would come out otherwise: an older result is then no longer used."""
+
+RECORDS = Path(__file__).resolve().parents[1] / "evidence" / "records"
+"""Committed records: ``throws`` (packed results), ``training`` (runs), ``findings`` (text)."""
+
+DIGITS = 4
+"""After the decimal point, in SI units: 0.1 mm, a hundredth of what throws scatter by."""
+
+
+@dataclass(frozen=True)
+class Result:
+    """Throws of one unit.
+
+    Attributes:
+        unit: what they depend on.
+        columns: one row a throw: ``success`` (bool), ``landing_w`` [m] (N, 2), ``error`` [m], ``duration`` [s] and whatever
+            else was measured; NaN where a throw failed.
+        provenance: commit, command, time [UTC], seconds of work.
+        extra: further figures of the whole unit.
+    """
+
+    unit: dict[str, Any]
+    columns: dict[str, np.ndarray]
+    provenance: dict[str, Any] = field(default_factory=dict)
+    extra: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def key(self) -> str:
+        """Of the unit."""
+        return key_of(self.unit)
+
+    @property
+    def good(self) -> np.ndarray:
+        """Throws that landed, shape (N,), bool."""
+        return self.columns["success"].astype(bool)
+
+    def of(self, name: str) -> np.ndarray:
+        """A column without the failed throws."""
+        return self.columns[name][self.good]
+
+    @property
+    def miss(self) -> np.ndarray:
+        """Landing points of the successful throws relative to the target [m], shape (N, 2): along x, to the left.
+
+        Where the target moves it is meant where it was at impact (column ``goal_w``).
+        """
+        goal = self.of("goal_w") if "goal_w" in self.columns else np.array([self.unit["target"], 0.0])
+        return self.of("landing_w") - goal
+
+
+def key_of(unit: dict[str, Any]) -> str:
+    """Hash of a unit: 16 hexadecimal digits, independent of the order of its entries."""
+    return hashlib.sha256(json.dumps(unit, sort_keys=True, allow_nan=False).encode()).hexdigest()[:16]
+
+
+def hash_of(path: str | Path) -> str:
+    """Hash of a file's content: 16 hexadecimal digits."""
+    return hashlib.sha256(Path(path).read_bytes()).hexdigest()[:16]
+
+
+def policy_unit(
+    policy: str, weights: str, layout: str, plant: str, target: float, throws: int, seed: int = 0, *,
+    run: str = "", variant: str = "full", train_seed: int | None = None, departures: dict[str, Any] | None = None,
+) -> dict[str, Any]:  # fmt: skip
+    """Unit of throws with a learnt policy.
+
+    Args:
+        policy: what it is called.
+        weights: :func:`hash_of` its file.
+        layout: "state" or "vision".
+        plant: of :data:`visthrow.throws.plants.PLANTS`.
+        target: [m] along x.
+        throws: how many.
+        seed: of starts and noise.
+        run: training config.
+        variant: "full", or the name of what the training lacked or had more of.
+        train_seed: of the training.
+        departures: config key -> value, where the throws are flown under other conditions than the policy's own.
+    """
+    return {
+        "kind": "policy", "protocol": PROTOCOL, "policy": policy, "weights": weights, "layout": layout, "run": run or layout,
+        "variant": variant, "train_seed": train_seed, "plant": plant, "target": float(target), "throws": int(throws),
+        "seed": int(seed), "departures": dict(departures or {}),
+    }  # fmt: skip
+
+
+def columns_of(throws: Any) -> dict[str, np.ndarray]:
+    """Per-throw arrays of a dataclass of throws (:class:`visthrow.training.protocol.Throws`, :class:`visthrow.baseline.fly.Flown`)."""
+    count = len(throws.success)
+    found = {name: np.asarray(value) for name, value in vars(throws).items() if isinstance(value, np.ndarray)}
+    return {name: value for name, value in found.items() if value.ndim and len(value) == count}
+
+
+def save(folder: str | Path, result: Result) -> Path:
+    """Write one result as ``<key>.json``.
+
+    Raises:
+        StorageError: the place cannot be written.
+    """
+    path = Path(folder) / f"{result.key}.json"
+    write_compact(path, _to_json(result))
+    return path
+
+
+def write_compact(path: str | Path, value: Any) -> None:
+    """Write JSON with one line a result, atomically."""
+    if isinstance(value, dict) and "results" in value:
+        lines = ",\n".join(json.dumps(item, allow_nan=False, separators=(",", ":")) for item in value["results"])
+        atomic_write(path, f'{{"results": [\n{lines}\n]}}\n')
+    else:
+        atomic_write(path, json.dumps(value, allow_nan=False) + "\n")
+
+
+def load(path: str | Path) -> list[Result]:
+    """Read the results of one file, a single one or a packed record.
+
+    Raises:
+        StorageError: not such a file.
+    """
+    try:
+        value = json.loads(Path(path).read_text(encoding="utf-8"))
+        return [_from_json(item) for item in value.get("results", [value])]
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise StorageError(f"{path}: expected throws as visthrow writes them; got {type(error).__name__}: {error}") from error
+
+
+def load_all(places: Iterable[str | Path]) -> dict[str, Result]:
+    """Read all results in folders and files, by key; of two with one key the later place counts."""
+    found: dict[str, Result] = {}
+    for place in map(Path, places):
+        files = sorted(place.glob("*.json")) if place.is_dir() else [place] if place.exists() else []
+        for path in files:
+            found.update({result.key: result for result in load(path)})
+    return found
+
+
+def join(found: Iterable[Result]) -> list[Result]:
+    """Put the batches of one set of throws together: units that differ in nothing but ``batch`` and its size, in order.
+
+    Of two results for one batch the larger counts. Units without a batch stay as they are.
+    """
+    whole: list[Result] = []
+    groups: dict[str, dict[int, Result]] = {}
+    for result in found:
+        if "batch" not in result.unit:
+            whole.append(result)
+            continue
+        rest = {name: value for name, value in result.unit.items() if name not in ("batch", "throws")}
+        group, batch = groups.setdefault(key_of(rest), {}), result.unit["batch"]
+        if batch not in group or result.unit["throws"] > group[batch].unit["throws"]:
+            group[batch] = result
+    return whole + [_joined([group[batch] for batch in sorted(group)]) for group in groups.values()]
+
+
+def _joined(group: list[Result]) -> Result:
+    if len(group) == 1:
+        return group[0]
+    unit = {name: value for name, value in group[0].unit.items() if name != "batch"}
+    unit["throws"] = sum(result.unit["throws"] for result in group)
+    columns = {name: np.concatenate([result.columns[name] for result in group]) for name in group[0].columns}
+    seconds = sum(result.provenance.get("seconds", 0.0) for result in group)
+    return Result(unit, columns, {**group[0].provenance, "seconds": seconds}, group[0].extra)
+
+
+def pack(results: Iterable[Result], path: str | Path) -> None:
+    """Write results into one file, sorted by what they are, so that the same results give the same file."""
+    ordered = sorted(results, key=lambda result: json.dumps(result.unit, sort_keys=True))
+    write_compact(path, {"results": [_to_json(result) for result in ordered]})
+
+
+def work(
+    units: Sequence[dict[str, Any]],
+    folder: str | Path,
+    function: Callable[[dict[str, Any]], tuple[dict[str, np.ndarray], dict[str, Any]]],
+    known: dict[str, Result] | None = None,
+    processes: int = 1,
+    say: Callable[[str], None] = lambda text: None,
+) -> dict[str, Result]:
+    """Do what is not done yet.
+
+    Args:
+        units: in the order in which they are wanted.
+        folder: of the finished ones.
+        function: of a unit, importable by its name; returns columns and extra figures.
+        known: results from elsewhere, by key; they count as done.
+        processes: that work at once; 1 works in this one.
+        say: told of the progress.
+
+    Returns:
+        Results of all units by key.
+    """
+    results = {**load_all([folder]), **(known or {})}
+    todo = list({key_of(unit): unit for unit in units if key_of(unit) not in results}.values())
+    begin = time.monotonic()
+    for done, result in enumerate(_done(todo, str(folder), function, processes), 1):
+        results[result.key] = result
+        left = (time.monotonic() - begin) / done * (len(todo) - done)
+        say(f"{done} of {len(todo)} sets of throws, about {left:.0f} s left")
+    return {key_of(unit): results[key_of(unit)] for unit in units}
+
+
+def _done(todo: list[dict], folder: str, function: Callable, processes: int) -> Iterable[Result]:
+    tasks = [(unit, folder, function, provenance.commit(), provenance.command()) for unit in todo]
+    if processes <= 1 or len(tasks) <= 1:
+        yield from map(_one, tasks)
+        return
+    with mp.get_context("spawn").Pool(min(processes, len(tasks)), _quiet) as pool:
+        yield from pool.imap_unordered(_one, tasks, chunksize=1)
+
+
+def _quiet() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends its workers
+    import torch
+
+    torch.set_num_threads(1)
+
+
+def _one(task: tuple) -> Result:
+    from datetime import UTC, datetime
+
+    unit, folder, function, commit, command = task
+    begin = time.perf_counter()
+    columns, extra = function(unit)
+    origin = {
+        "commit": commit, "command": command, "time": datetime.now(UTC).isoformat(timespec="seconds"),
+        "seconds": round(time.perf_counter() - begin, 2),
+    }  # fmt: skip
+    result = Result(unit, columns, origin, extra)
+    save(folder, result)
+    return load(Path(folder) / f"{result.key}.json")[0]
+
+
+def _to_json(result: Result) -> dict[str, Any]:
+    return {
+        "unit": result.unit,
+        "throws": {name: _plain(value) for name, value in result.columns.items()},
+        "provenance": result.provenance,
+        "extra": result.extra,
+    }
+
+
+def _plain(value: np.ndarray) -> list:
+    if value.dtype == bool:
+        return value.astype(int).tolist()
+    rounded = np.round(value.astype(float), DIGITS)
+    return np.where(np.isfinite(rounded), rounded, None).tolist()
+
+
+def _from_json(item: dict[str, Any]) -> Result:
+    columns = {name: np.array(value, dtype=float) for name, value in item["throws"].items()}
+    columns["success"] = columns["success"] > 0.5
+    return Result(item["unit"], columns, item.get("provenance", {}), item.get("extra", {}))

@@ -1,0 +1,368 @@
+"""ThrowEnv: the throwing task as rsl_rl's vectorised environment.
+
+A step is a chain of device operations without branches on data, allocations on the simulator's side or copies to the
+host, so a whole rollout can be captured in one CUDA graph (:mod:`visthrow.training.trainer`). Every observation is a fresh tensor.
+"""
+
+import math
+
+import torch
+import warp as wp
+from rsl_rl.env import VecEnv
+from tensordict import TensorDict
+from torch import Tensor
+
+from camera import history as hist
+from camera.keypoints import KEYPOINTS, KeypointCamera
+from camera.noise import StepDraw, apply_latency, apply_noise
+from sim.arrays.torch_bridge import TorchViews, on_torch_stream
+from sim.hybrid import HybridSim, rope_variants
+from sim.params import GRAVITY
+from visthrow.onboard import actions as act
+from visthrow.onboard import goal_motion
+from visthrow.onboard import observations as ob
+from visthrow.task import Experiment, plant_of
+from visthrow.training import rewards, terminations
+from visthrow.training.posterior import drawn_plants
+
+RESULTS = ("episodes", "released", "landing_error", "duration")
+"""Sums over finished episodes; landing error [m] and duration [s] over the released ones."""
+
+POSE = ob.VEHICLE + 3
+"""Width of a pose sample: vehicle's part of a frame and the payload's position."""
+
+
+class ThrowEnv(VecEnv):
+    """Batch of throws. Observation groups: ``actor`` and ``critic``.
+
+    The critic sees the vehicle, goal offset, payload history and payload velocity without noise, and further the time to
+    separation, the time since start, the vehicle's mass and the battery's voltage; where the task has them, the goal's
+    velocity and the scales of payload mass and cable length too.
+
+    Attributes:
+        last: what the last step ended: ``released``, ``negative`` (bool), ``landing_error`` [m], ``duration`` [s] from the
+            policy's start to the payload's landing, ``landing_w`` [m], ``clearance`` [m]; each over (E,). Where goals move,
+            ``goal_w`` [m] too, where the goal is at impact.
+        totals: running sums of :data:`RESULTS`.
+    """
+
+    def __init__(self, experiment: Experiment, device: str = "cpu", seed: int = 0, count: int | None = None):
+        """Build simulator and buffers and start all episodes.
+
+        Args:
+            experiment: plant, camera, task.
+            device: "cpu" or "cuda:0".
+            seed: of the simulator's resets; torch's own generator draws the noise and is the caller's to seed.
+            count: number of environments; default the experiment's.
+        """
+        self.cfg = experiment
+        task = experiment.task
+        self.num_envs = count or experiment.ppo.environments
+        self.num_actions = act.ACTIONS
+        self.device = device
+        self.max_episode_length = round(task.bounds.time_limit / experiment.sim.control_period)
+        plants = drawn_plants(experiment, seed)
+        ropes = [rope for plant in plants for rope in rope_variants(plant.rope, task.start)]
+        share = len(ropes) // len(plants)
+        each = {name: [getattr(plant, name) for plant in plants for _ in range(share)] for name in ("vehicle", "air", "release")}
+        many = {f"{name}s": parts for name, parts in each.items()} if len(plants) > 1 else {}
+        self.sim = HybridSim(plant_of(experiment), self.num_envs, device, seed, ropes=ropes, **many)
+        self.views = TorchViews(self.sim)
+        self.layout = ob.layout_of(task.observation)
+        self.camera = KeypointCamera(experiment.camera, device)
+        E, make = self.num_envs, {"device": device, "dtype": torch.float32}
+        weight = GRAVITY * (experiment.vehicle.body.mass + experiment.rope.rope_mass + experiment.rope.payload_mass)
+        self._start_action = torch.tensor(act.hover_action(weight, task.action.max_thrust), **make)
+        self._max_rate = torch.tensor(task.action.max_rate, **make)
+        self._rate_weights = torch.tensor(task.reward.rate_command, **make)
+        self._change_weights = torch.tensor(task.reward.command_change, **make)
+        self.episode_length_buf = torch.zeros(E, device=device, dtype=torch.long)
+        latency = experiment.camera.noise.history_length
+        self._memory = {
+            "previous": torch.zeros(E, act.ACTIONS, **make),
+            "history": torch.zeros(E, 1 + self.layout.history, self.layout.payload, **make),
+            "true_history": torch.zeros(E, 1 + self.layout.history, 3, **make),
+            "frame_bias": torch.zeros(E, ob.VEHICLE + 5, **make),
+            "command_bias": torch.zeros(E, act.COMMANDS, **make),
+            "keypoint_bias": torch.zeros(E, KEYPOINTS, 2, **make),
+            "extrinsic_rotation": torch.zeros(E, 3, **make),
+            "extrinsic_offset": torch.zeros(E, 3, **make),
+            "pose_age": torch.zeros(E, **make),
+            "last_pose": torch.zeros(E, POSE, **make),
+            "late_points": torch.zeros(E, latency, KEYPOINTS, 2, **make),
+            "late_valid": torch.zeros(E, latency, KEYPOINTS, device=device, dtype=torch.bool),
+            "totals": torch.zeros(len(RESULTS), device=device, dtype=torch.float64),
+        }
+        self._latency = torch.tensor(experiment.camera.noise.latency, **make)
+        if task.target.moves:
+            self._memory["goal_vel"] = torch.zeros(E, 3, **make)
+        if self.layout.motion:
+            self._memory["goal_fit"] = goal_motion.empty_sums(E, device)
+        self._cargo: Tensor | None = None
+        if task.start.payload_variants > 1:
+            scales = [[r.payload_mass / experiment.rope.payload_mass, r.length / experiment.rope.length] for r in ropes]
+            self._cargo = torch.tensor([scales[e % len(ropes)] for e in range(E)], **make)
+        self.last: dict[str, Tensor] = {}
+        self._goal: Tensor | None = None
+        self.reset()
+
+    @property
+    def previous_action(self) -> Tensor:
+        """Clipped action of the last step, shape (E, 5)."""
+        return self._memory["previous"]
+
+    def fix_goal(self, goal_w: Tensor | None) -> None:
+        """Use one goal [m], shape (3,), for all episodes from the next reset on, or drawn ones again (None)."""
+        self._goal = goal_w
+
+    def _start(self, fresh: Tensor) -> None:
+        """Start episodes where ``fresh``, bool, shape (E,)."""
+        mask = self._mask(fresh)
+        with on_torch_stream(self.device):
+            self.sim.randomize(self.cfg.task.start, mask)
+        if self._goal is not None:
+            self.views.goal_w.copy_(torch.where(fresh[:, None], self._goal, self.views.goal_w))
+
+    @property
+    def totals(self) -> dict[str, float]:
+        """Sums over finished episodes since :meth:`clear_totals`."""
+        return dict(zip(RESULTS, self._memory["totals"].tolist(), strict=True))
+
+    def clear_totals(self) -> None:
+        """Start the sums again."""
+        self._memory["totals"].zero_()
+
+    def reset(self) -> TensorDict:
+        """Start a new episode everywhere."""
+        fresh = torch.ones(self.num_envs, device=self.device, dtype=torch.bool)
+        self._start(fresh)
+        self._begin(fresh)
+        self._observations = self._observe(fresh)
+        return self._observations
+
+    def get_observations(self) -> TensorDict:
+        """Observations of the current step."""
+        return self._observations.clone()
+
+    def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict]:
+        """Apply actions, shape (E, 5), for one control period; finished episodes start anew.
+
+        Returns:
+            Observations, rewards (E,), dones (E,), and an empty dictionary: the time limit is a negative end and must not
+            be bootstrapped, so there are no ``time_outs``.
+        """
+        task, memory = self.cfg.task, self._memory
+        action = act.clip_action(actions)
+        noisy = action[:, : act.COMMANDS] + torch.randn_like(memory["command_bias"]) * task.noise.command_step
+        noisy = noisy + memory["command_bias"]
+        self.views.command.copy_(act.command_from_action(noisy, task.action.max_thrust, self._max_rate))
+        self.views.release.copy_(act.release_asked(actions, self.cfg.release.threshold))
+        with on_torch_stream(self.device):
+            self.sim.step()
+        if task.target.moves:
+            self.views.goal_w.add_(memory["goal_vel"] * self.cfg.sim.control_period)
+        self.episode_length_buf += 1
+        reward, done = self._judge(action)
+        self._tally(done)
+        self._start(done)
+        memory["previous"].copy_(action)
+        self._begin(done)
+        self._observations = self._observe(done)
+        return self._observations, reward, done.to(torch.float32), {}
+
+    def _mask(self, done: Tensor):
+        """Warp view of a boolean mask."""
+        self._done = done.to(torch.int32)
+        return wp.from_torch(self._done)
+
+    def _judge(self, action: Tensor) -> tuple[Tensor, Tensor]:
+        """Reward and end of the step just made."""
+        task, state, out = self.cfg.task, self.views.state, self.views.out
+        period = self.cfg.sim.control_period
+        p = task.reward
+        rot_wb = ob.rotation_from_quat(state["quat_wb"])
+        released = out["separated"] != 0
+        latched = state["release_timer"] >= 0.0
+        time = self.episode_length_buf * period
+        payload = out["payload_pos_w"]
+        negative = ~released & terminations.negative(
+            task.bounds,
+            state["pos_w"],
+            rot_wb,
+            payload,
+            state["status"],
+            latched,
+            time,
+            self.cfg.release.landing_height,
+        )
+        goal = self._goal_at_impact()
+        error = (out["landing_w"] - goal)[:, :2].square().sum(-1).sqrt()
+        carry = (
+            rewards.kinetic(p, state["vel_w"], state["rate_b"], out["payload_vel_w"])
+            + rewards.command(p, action, self._rate_weights)
+            + rewards.change(p, action, self._memory["previous"], self._change_weights)
+            + rewards.carry_time(p, period)
+        )
+        at_release = (
+            rewards.landing(p, error)
+            + rewards.time_of_flight(p, out["time_to_impact"])
+            + rewards.proximity(p, out["clearance"], self.cfg.release.clearance_margin)
+        )
+        reward = carry + torch.where(released, at_release, 0.0) - p.termination * negative
+        self.last = {
+            "released": released,
+            "negative": negative,
+            "landing_error": error,
+            "duration": time - period + out["separation_time"] + out["time_to_impact"],
+            "landing_w": out["landing_w"].clone(),
+            "clearance": out["clearance"].clone(),
+            "action": action,
+        }
+        if task.target.moves:
+            self.last["goal_w"] = goal
+        return p.scale * reward, released | negative
+
+    def _goal_at_impact(self) -> Tensor:
+        """Goal [m], shape (E, 3), where it is when a payload released in the last step lands."""
+        if not self.cfg.task.target.moves:
+            return self.views.goal_w
+        out = self.views.out
+        left = out["separation_time"] + out["time_to_impact"] - self.cfg.sim.control_period
+        return self.views.goal_w + self._memory["goal_vel"] * left[:, None]
+
+    def _tally(self, done: Tensor) -> None:
+        hit = self.last["released"].to(torch.float64)
+        sums = [done.to(torch.float64), hit, self.last["landing_error"] * hit, self.last["duration"] * hit]
+        self._memory["totals"] += torch.stack([s.sum() for s in sums])
+
+    def _begin(self, fresh: Tensor) -> None:
+        """Draw what holds for an episode where one begins."""
+        memory, noise, camera = self._memory, self.cfg.task.noise, self.cfg.camera
+        self.episode_length_buf.masked_fill_(fresh, 0)
+        memory["previous"].copy_(torch.where(fresh[:, None], self._start_action, memory["previous"]))
+        spreads = {
+            "frame_bias": noise.observation_bias,
+            "command_bias": noise.command_bias,
+            "keypoint_bias": camera.noise.bias_std,
+            "extrinsic_rotation": camera.mount.rotation_error_std,
+            "extrinsic_offset": camera.mount.position_error_std,
+        }
+        for name, std in spreads.items():
+            if std > 0.0:
+                old = memory[name]
+                mask = fresh.view(-1, *(1,) * (old.dim() - 1))
+                old.copy_(torch.where(mask, torch.randn_like(old) * std, old))
+        low, high = self.cfg.task.observation.latency
+        if high > 0.0:
+            age = memory["pose_age"]
+            age.copy_(torch.where(fresh, low + (high - low) * torch.rand_like(age), age))
+        slow, fast = self.cfg.task.target.speed
+        if fast > 0.0:
+            velocity = memory["goal_vel"]
+            drawn = torch.rand_like(velocity[:, :2])
+            speed, heading = slow + (fast - slow) * drawn[:, 0], 2.0 * math.pi * drawn[:, 1]
+            new = torch.stack([speed * heading.cos(), speed * heading.sin(), torch.zeros_like(speed)], dim=-1)
+            velocity.copy_(torch.where(fresh[:, None], new, velocity))
+
+    def _late(self, pose: Tensor, fresh: Tensor) -> Tensor:
+        """Pose sample as old as the episode's latency, linear between the last two control steps."""
+        memory = self._memory
+        if self.cfg.task.observation.latency[1] == 0.0:
+            return pose
+        last = torch.where(fresh[:, None], pose, memory["last_pose"])
+        late = pose + (last - pose) * (memory["pose_age"] / self.cfg.sim.control_period)[:, None]
+        memory["last_pose"].copy_(pose)
+        return late
+
+    def _observe(self, fresh: Tensor) -> TensorDict:
+        """Actor's and critic's view of the current state."""
+        state, memory, noise = self.views.state, self._memory, self.cfg.task.noise
+        payload, goal = self.views.out["payload_pos_w"], self.views.goal_w
+        rot_wb = ob.rotation_from_quat(state["quat_wb"])
+        vehicle = ob.vehicle_part(state["pos_w"], state["vel_w"], state["rate_b"], rot_wb)
+        exact = torch.cat([vehicle, ob.state_part(state["pos_w"], goal, payload)], dim=-1)
+        attached = state["attached"].to(torch.float32)
+        pose = self._late(torch.cat([vehicle, payload], dim=-1), fresh)
+        late_goal = self._late_goal()
+        seen = torch.cat([pose[:, : ob.VEHICLE], ob.state_part(pose[:, :3], late_goal, pose[:, ob.VEHICLE :])], dim=-1)
+        measured = seen + torch.randn_like(seen) * noise.observation_step + memory["frame_bias"]
+        valid = None
+        if self.layout.name == "vision":
+            if self.cfg.task.observation.latency[1] > 0.0:
+                x_axis, y_axis = pose[:, 9:12], pose[:, 12:15]
+                rot_wb = torch.stack([x_axis, y_axis, torch.linalg.cross(x_axis, y_axis)], dim=-1)
+            points, valid = self._see(pose[:, :3], rot_wb, late_goal, pose[:, ob.VEHICLE :], fresh)
+            measured = torch.cat([measured[:, : ob.VEHICLE], points.flatten(1)], dim=-1)
+        time = self.episode_length_buf.to(torch.float32) * self.cfg.sim.control_period
+        goal_vel = None
+        if self.layout.motion:
+            place, weight = goal_motion.measured_goal(self.layout, measured, valid, self.camera)
+            sums, goal_vel = goal_motion.fit(memory["goal_fit"], time, place, weight, fresh)
+            memory["goal_fit"].copy_(sums)
+        actor, history = ob.observe(
+            self.layout, measured, valid, memory["previous"], attached, memory["history"], fresh, goal_vel
+        )
+        memory["history"].copy_(history)
+        goal_offset, relative = exact[:, ob.VEHICLE : ob.VEHICLE + 2], exact[:, ob.VEHICLE + 2 :]
+        true_history = hist.push(memory["true_history"], relative, fresh)
+        memory["true_history"].copy_(true_history)
+        inner = torch.stack([state["release_timer"], time, state["mass_scale"], state["voltage"], attached], dim=-1)
+        parts = [vehicle, memory["previous"], goal_offset, true_history.flatten(1), self.views.out["payload_vel_w"], inner]
+        if self.cfg.task.target.moves:
+            parts.append(memory["goal_vel"][:, :2])
+        if self._cargo is not None:
+            parts.append(self._cargo)
+        observed = {"actor": actor, "critic": torch.cat(parts, dim=-1)}
+        return TensorDict(observed, batch_size=[self.num_envs], device=self.device)
+
+    def _late_goal(self) -> Tensor:
+        """Goal [m], shape (E, 3), where it was when what is measured now was measured."""
+        if not self.cfg.task.target.moves:
+            return self.views.goal_w
+        return self.views.goal_w - self._memory["goal_vel"] * self._memory["pose_age"][:, None]
+
+    def _see(
+        self, pos_w: Tensor, rot_wb: Tensor, goal_w: Tensor, payload_w: Tensor, fresh: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Keypoints as the detector reports them: extrinsic error, latency, noise, drop-out."""
+        memory, camera = self._memory, self.cfg.camera
+        extrinsics = None
+        if camera.mount.rotation_error_std > 0.0 or camera.mount.position_error_std > 0.0:
+            extrinsics = self.camera.extrinsics(memory["extrinsic_rotation"], memory["extrinsic_offset"])
+        points, valid = ob.vision_part(self.camera, pos_w, rot_wb, goal_w, payload_w, extrinsics)
+        if camera.noise.latency > 0.0:
+            memory["late_points"].copy_(hist.push(memory["late_points"], points, fresh))
+            memory["late_valid"].copy_(hist.push(memory["late_valid"], valid, fresh))
+            points, valid = apply_latency(memory["late_points"], memory["late_valid"], self._latency)
+        draw = StepDraw(torch.randn_like(points), torch.rand_like(points[..., 0]))
+        return apply_noise(camera.noise, points, valid, memory["keypoint_bias"], draw)
+
+    def _tensors(self) -> dict[str, Tensor]:
+        """All that the next step depends on, besides torch's generators."""
+        found = {f"sim.{k}": v for k, v in self.views.state.items()} | {
+            f"out.{k}": v for k, v in self.views.out.items()
+        }
+        found |= {f"memory.{k}": v for k, v in self._memory.items()} | {
+            f"obs.{k}": v for k, v in self._observations.items()
+        }
+        return found | {
+            "episode": wp.to_torch(self.sim.episode),
+            "goal_w": self.views.goal_w,
+            "length": self.episode_length_buf,
+        }
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Copy of all that the next step depends on, besides torch's generators."""
+        return {k: v.clone() for k, v in self._tensors().items()}
+
+    def load_state_dict(self, saved: dict[str, Tensor]) -> None:
+        """Take up a state of :meth:`state_dict` of an environment of the same experiment and size.
+
+        Raises:
+            ValueError: a missing entry or another shape.
+        """
+        for name, target in self._tensors().items():
+            if name not in saved or saved[name].shape != target.shape:
+                have = tuple(saved[name].shape) if name in saved else "nothing"
+                raise ValueError(f"environment state {name!r}: expected shape {tuple(target.shape)}, got {have}")
+            target.copy_(saved[name])

@@ -1,0 +1,1 @@
+"""What people look at: recordings for rerun, strips, scatter plots, tables, pages."""

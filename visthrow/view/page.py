@@ -1,0 +1,72 @@
+"""Puts sections into one self-contained page, and into Markdown with its pictures beside it."""
+
+import base64
+import html
+import re
+from collections.abc import Sequence
+from importlib import resources
+from pathlib import Path
+
+from visthrow import __version__
+from visthrow.common.storage import atomic_write
+from visthrow.view.parts import Grid, Picture, Section, Text
+
+_BOLD, _CODE = re.compile(r"\*\*(.+?)\*\*"), re.compile(r"`(.+?)`")
+
+
+def _marked(text: str) -> str:
+    """HTML of a paragraph with its bold words and code."""
+    return _CODE.sub(r"<code>\1</code>", _BOLD.sub(r"<b>\1</b>", html.escape(text, quote=False)))
+
+
+def _inline(png: bytes) -> str:
+    return "data:image/png;base64," + base64.b64encode(png).decode("ascii")
+
+
+def html_of(title: str, lead: str, sections: Sequence[Section]) -> str:
+    """The whole page; it loads nothing from elsewhere.
+
+    Raises:
+        ModuleNotFoundError: jinja2 is not installed.
+    """
+    import jinja2
+    import markupsafe
+
+    template = resources.files("visthrow.view").joinpath("page.html.j2").read_text(encoding="utf-8")
+    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment.filters["marked"] = lambda text: markupsafe.Markup(_marked(text))
+    environment.filters["inline"] = _inline
+    environment.tests |= {
+        "text": lambda part: isinstance(part, Text),
+        "grid": lambda part: isinstance(part, Grid),
+        "picture": lambda part: isinstance(part, Picture),
+    }
+    return environment.from_string(template).render(title=title, lead=lead, sections=sections, version=__version__)
+
+
+def markdown_of(title: str, lead: str, sections: Sequence[Section]) -> str:
+    """The same as Markdown; pictures are named as :func:`write` writes them."""
+    lines = [f"# {title}", lead]
+    for section in sections:
+        lines.append(f"## {section.title}")
+        for part in section.parts:
+            if isinstance(part, Text):
+                lines.append({"missing": "*Missing.* ", "finding": "- ", "why": ""}.get(part.kind, "") + part.text)
+            elif isinstance(part, Grid):
+                lines.append(part.markdown())
+            else:
+                lines.append(f"![{part.caption}]({part.name}.png)\n\n*{part.caption}*")
+    return "\n\n".join(lines) + "\n"
+
+
+def write(folder: Path, title: str, lead: str, sections: Sequence[Section]) -> list[Path]:
+    """Write ``report.html``, ``report.md`` and the pictures; returns the paths, the page first."""
+    paths = [folder / "report.html", folder / "report.md"]
+    for section in sections:
+        for part in section.parts:
+            if isinstance(part, Picture):
+                paths.append(folder / f"{part.name}.png")
+                atomic_write(paths[-1], part.png)
+    atomic_write(paths[1], markdown_of(title, lead, sections))
+    atomic_write(paths[0], html_of(title, lead, sections))
+    return paths

@@ -1,0 +1,339 @@
+"""A flight for the rerun viewer: the scene in 3D, the image plane, and all signals on one time line. Onboard-safe.
+
+The only module that imports rerun. Time zero is the policy's start. What a log does not hold is not shown: a flight on
+motion capture knows no motor speeds, a simulated one no age of its poses. Sizes come from an experiment, or from anything
+with ``camera``, ``vehicle.rotors`` and ``rope.payload_radius``.
+"""
+
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from camera.fisheye import Fisheye
+from camera.keypoints import GOAL_KEYPOINTS, KeypointCamera
+from camera.params import CameraParams
+from visthrow.common import style
+from visthrow.common.errors import StorageError
+from visthrow.common.storage import atomic_write
+from visthrow.logs.flightlog import FlightLog
+
+TIMELINE = "throw_time"
+ROTOR_NAMES = ("front left", "front right", "rear left", "rear right")
+AXES = ("x", "y", "z")
+BODIES = ("vehicle", "payload", "goal")
+FIELD = 2.0  # half-width of the drawn floor about the throw [m]
+
+
+def write(path: str | Path, log: FlightLog, experiment: Any) -> None:
+    """Write a flight as a ``.rrd`` file with a blueprint that lays out the viewer.
+
+    Args:
+        path: The file.
+        log: a flight of :func:`visthrow.throws.flight.fly`.
+        experiment: for the sizes of vehicle, ball and camera.
+
+    Raises:
+        StorageError: the place cannot be written.
+    """
+    with recording(path, blueprint(np.array(log.meta["goal_w"]), set(log.channels))) as stream:
+        still(stream, log.meta["goal_w"], experiment)
+        send(stream, log)
+        if "landing" in log:
+            _landing(stream, log)
+        for name, entity, _ in TRAILS:
+            _trail(stream, log, name, entity)
+
+
+@contextmanager
+def recording(path: str | Path, layout: rrb.Blueprint) -> Iterator[rr.RecordingStream]:
+    """Give a stream whose content becomes a ``.rrd`` file, whole or not at all.
+
+    Args:
+        path: The file.
+        layout: of the viewer that opens it.
+
+    Raises:
+        StorageError: the place cannot be written.
+    """
+    stream = rr.RecordingStream("visthrow", recording_id=None)
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "flight.rrd"
+        try:
+            stream.save(file, default_blueprint=layout)
+            yield stream
+            stream.flush()
+            stream.disconnect()
+            content = file.read_bytes()
+        except OSError as error:
+            raise StorageError(f"cannot write the recording: {error}") from error
+    atomic_write(path, content)
+
+
+def _times(log: FlightLog, name: str) -> rr.TimeColumn:
+    return rr.TimeColumn(TIMELINE, duration=log[name].time - log.meta["times"]["policy_start"])
+
+
+def _colour(hexadecimal: str, alpha: int = 255) -> list[int]:
+    return [*(int(hexadecimal[i : i + 2], 16) for i in (1, 3, 5)), alpha]
+
+
+TRAILS = (
+    ("payload_pos_w", "world/trail/ball", style.PAYLOAD),
+    ("pos_w", "world/trail/vehicle", style.QUIET),
+)
+"""Channel, entity and colour of the lines that grow during a throw."""
+
+
+def still(stream: rr.RecordingStream, goal_w: Any, experiment: Any) -> None:
+    """Send what does not move: ground, shapes, strokes, the camera's field of view.
+
+    Args:
+        stream: where to.
+        goal_w: target [m], shape (3,).
+        experiment: for the sizes of vehicle, ball and camera.
+    """
+    goal = np.asarray(goal_w, dtype=float)
+    stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    middle, reach = 0.5 * goal[:2], 0.5 * np.abs(goal[:2]) + FIELD
+    floor = rr.Boxes3D(
+        centers=[[*middle, -0.011]], half_sizes=[[*reach, 0.01]], colors=[[232, 230, 224]], fill_mode="solid"
+    )
+    stream.log("world/ground", floor, static=True)
+    half = experiment.camera.goal_side / 2.0
+    corners = half * np.array([[1, 1, 0], [1, -1, 0], [-1, -1, 0], [-1, 1, 0], [1, 1, 0]])
+    square = rr.LineStrips3D([corners + [0, 0, 0.003]], radii=0.006, colors=[_colour(style.GOAL)])
+    stream.log("world/goal", square, rr.Transform3D(translation=goal), static=True)
+    centre = rr.Points3D([[0.0, 0.0, 0.0]], radii=0.012, colors=[_colour(style.GOAL)])
+    stream.log("world/goal/centre", centre, static=True)
+    _vehicle(stream, experiment)
+    radius = experiment.rope.payload_radius
+    ball = rr.Ellipsoids3D(half_sizes=[[radius] * 3], colors=[_colour(style.PAYLOAD)], fill_mode="solid")
+    stream.log("world/ball", ball, static=True)
+    stream.log("world/rope", rr.LineStrips3D.from_fields(radii=0.003, colors=[_colour(style.ROPE)]), static=True)
+    for _, entity, colour in TRAILS:
+        stream.log(entity, rr.LineStrips3D.from_fields(radii=0.004, colors=[_colour(colour, 170)]), static=True)
+    _plane(stream, experiment.camera)
+
+
+def send(stream: rr.RecordingStream, log: FlightLog) -> None:
+    """Send all that moves, from a whole flight or from a piece of one; see :func:`still` for the rest."""
+    if "pos_w" in log and "quat_wb" in log:
+        pose = rr.Transform3D.columns(translation=log["pos_w"].values, quaternion=_at_times(log, "quat_wb", "pos_w"))
+        stream.send_columns("world/vehicle", [_times(log, "pos_w")], pose)
+    if "payload_pos_w" in log:
+        moved = rr.Transform3D.columns(translation=log["payload_pos_w"].values)
+        stream.send_columns("world/ball", [_times(log, "payload_pos_w")], moved)
+    if "cable_points_w" in log:
+        rope = log["cable_points_w"].values.astype(np.float32)
+        columns = rr.LineStrips3D.columns(strips=list(rope))
+        stream.send_columns("world/rope", [_times(log, "cable_points_w")], columns)
+    if "goal_w" in log:
+        there = rr.Transform3D.columns(translation=log["goal_w"].values)
+        stream.send_columns("world/goal", [_times(log, "goal_w")], there)
+    if "keypoints" in log:
+        _image(stream, log)
+    _signals(stream, log)
+    for time, state, reason in log.meta.get("events", ()):
+        stream.set_time(TIMELINE, duration=time - log.meta["times"]["policy_start"])
+        stream.log("events", rr.TextLog(f"{state}: {reason}", level="WARN" if state == "abort" else "INFO"))
+
+
+def _at_times(log: FlightLog, name: str, of: str) -> np.ndarray:
+    """Samples of one channel at the times of another."""
+    return log[name].hold(log[of].time)
+
+
+def _landing(stream: rr.RecordingStream, log: FlightLog) -> None:
+    label = f"{100 * log.meta['result']['error']:.1f} cm off"
+    mark = rr.Points3D.from_fields(radii=0.015, colors=[_colour(style.INK)], labels=[label])
+    stream.log("world/landing", mark, static=True)
+    where = rr.Points3D.columns(positions=log["landing"].values.astype(np.float32))
+    stream.send_columns("world/landing", [_times(log, "landing")], where)
+
+
+def _vehicle(stream: rr.RecordingStream, experiment: Any) -> None:
+    rotors = experiment.vehicle.rotors
+    hubs = np.column_stack((rotors.x, rotors.y, np.full(4, rotors.z)))
+    arms = [np.vstack(([0.0, 0.0, rotors.z], hub)) for hub in hubs]
+    dark = _colour(style.VEHICLE)
+    stream.log("world/vehicle/arms", rr.LineStrips3D(arms, radii=0.005, colors=[dark]), static=True)
+    hub_size = [[0.028, 0.018, 0.014]]
+    stream.log("world/vehicle/body", rr.Boxes3D(half_sizes=hub_size, colors=[dark], fill_mode="solid"), static=True)
+    discs = rr.Ellipsoids3D(
+        centers=hubs + [0, 0, 0.008], half_sizes=[[rotors.radius, rotors.radius, 0.002]] * 4, fill_mode="solid",
+        colors=[_colour(style.COLOURS[0] if hub[0] > 0 else "#9AA5B1") for hub in hubs],  # the front ones stand out
+    )  # fmt: skip
+    stream.log("world/vehicle/rotors", discs, static=True)
+
+
+def _trail(stream: rr.RecordingStream, log: FlightLog, name: str, entity: str) -> None:
+    """A line that grows from the policy's start to the landing."""
+    times, channel = log.meta["times"], log[name]
+    rows = np.flatnonzero(
+        (channel.time >= times["policy_start"] - 1e-9) & (channel.time <= times.get("landing", np.inf) + 0.02)
+    )
+    rows = rows[1:]
+    if not len(rows):
+        return
+    first = rows[0] - 1
+    strips = [channel.values[first : row + 1].astype(np.float32) for row in rows]
+    column = rr.TimeColumn(TIMELINE, duration=channel.time[rows] - times["policy_start"])
+    stream.send_columns(entity, [column], rr.LineStrips3D.columns(strips=strips))
+
+
+def trail(stream: rr.RecordingStream, name: str, time: float, points: np.ndarray) -> None:
+    """Send the line that a body has left so far, for flights that are still going on.
+
+    Args:
+        stream: where to.
+        name: channel of :data:`TRAILS`.
+        time: of its end [s], zero as in the logs sent.
+        points: [m], shape (N, 3).
+    """
+    stream.set_time(TIMELINE, duration=time)
+    entity = next(entity for channel, entity, _ in TRAILS if channel == name)
+    stream.log(entity, rr.LineStrips3D.from_fields(strips=[points.astype(np.float32)]))
+
+
+def _plane(stream: rr.RecordingStream, camera: CameraParams) -> None:
+    """Field of view and body axes, in normalised image coordinates times 100, so that the viewer's strokes fit."""
+    lens = Fisheye(camera.fisheye)
+    angle = np.linspace(0.0, 2.0 * np.pi, 121)
+    circle = np.column_stack((np.cos(angle), np.sin(angle)))
+    import torch
+
+    right = float(lens.radius_from_angle(torch.tensor(np.pi / 2)) / lens.edge_radius)
+    rings = rr.LineStrips2D(
+        [100 * circle, 100 * right * circle], colors=[[150, 150, 150], [80, 80, 80]], radii=[0.7, 0.4],
+        show_labels=False,
+    )  # fmt: skip
+    stream.log("camera/field_of_view", rings, static=True)
+    places = [[0.0, 95.0], [0.0, 100.0 * right - 4.0]]  # a strip's own label would stand in the middle, on the ball
+    names = [f"{camera.fisheye.fov_deg / 2:g}° off the axis", "90°"]
+    stream.log("camera/angles", rr.Points2D(places, labels=names, radii=0.1, colors=[150, 150, 150]), static=True)
+    axes = 22.0 * KeypointCamera(camera).rot_cb.numpy().T[:2, :2]  # rows: the body's x and y as directions in the image
+    arrows = rr.Arrows2D(vectors=axes, radii=0.5, colors=[200, 200, 200], show_labels=False)
+    stream.log("camera/body_axes", arrows, static=True)
+    labels = rr.Points2D(1.2 * axes, labels=["x", "y"], radii=0.1, colors=[200, 200, 200])
+    stream.log("camera/body_axes/names", labels, static=True)
+    for name, colour in GROUPS.items():
+        stream.log(f"camera/{name}", rr.Points2D.from_fields(radii=1.8, colors=[colour]), static=True)
+        stream.log(f"camera/{name}/outline", rr.LineStrips2D.from_fields(radii=0.5, colors=[colour]), static=True)
+    stream.log("camera/invalid", rr.Points2D.from_fields(radii=1.2, colors=[[170, 170, 170]]), static=True)
+
+
+GROUPS = {"goal": [60, 200, 80], "payload": [230, 60, 60]}
+"""Keypoints and their colours."""
+
+
+def _image(stream: rr.RecordingStream, log: FlightLog) -> None:
+    """Keypoints in the plane of :func:`_plane`; those that are not valid stand grey where they read."""
+    points, valid = 100.0 * log["keypoints"].values, log["keypoints_valid"].values.astype(bool)
+    for name, part in (("goal", slice(0, GOAL_KEYPOINTS)), ("payload", slice(GOAL_KEYPOINTS, None))):
+        _points(stream, log, f"camera/{name}", points[:, part], valid[:, part])
+        _outline(stream, log, f"camera/{name}/outline", points[:, part], valid[:, part], box=name == "payload")
+    _points(stream, log, "camera/invalid", points, ~valid)
+
+
+def _points(stream, log: FlightLog, entity: str, points: np.ndarray, shown: np.ndarray) -> None:
+    columns = rr.Points2D.columns(positions=points[shown].astype(np.float32)).partition(shown.sum(axis=1))
+    stream.send_columns(entity, [_times(log, "keypoints")], columns)
+
+
+def _outline(stream, log: FlightLog, entity: str, points: np.ndarray, valid: np.ndarray, box: bool) -> None:
+    """Closed outline of a group while all of it is seen; the payload's four are the midpoints of a box's edges."""
+    whole = valid.all(axis=1)
+    strips = []
+    for p in points[whole]:
+        if box:
+            left, top, right, bottom = p[0, 0], p[1, 1], p[2, 0], p[3, 1]
+            p = np.array([[left, top], [right, top], [right, bottom], [left, bottom]])
+        strips.append(np.vstack((p, p[:1])).astype(np.float32))
+    if strips:
+        columns = rr.LineStrips2D.columns(strips=strips).partition(whole.astype(int))
+        stream.send_columns(entity, [_times(log, "keypoints")], columns)
+
+
+def _curves(log: FlightLog) -> list[tuple[str, str, int | None, str, str]]:
+    """Entity, channel, component, label and colour of each curve that the log has samples for."""
+    c = style.COLOURS
+    curves: list[tuple[str, str, int | None, str, str]] = [("thrust", "command", 0, "collective thrust [N]", c[0])]
+    for i, axis in enumerate(AXES):
+        curves.append((f"rate_command/{axis}", "command", 1 + i, f"{axis} commanded [rad/s]", c[i]))
+        curves.append((f"rate/{axis}", "rate_b", i, f"{axis} flown [rad/s]", _paler(c[i])))
+    curves += [(f"motors/{i}", "motor_speed", i, f"{name} [rad/s]", c[i]) for i, name in enumerate(ROTOR_NAMES)]
+    curves += [
+        ("battery", "battery_voltage", None, "battery [V]", c[2]),
+        ("phase/mode", "mode", None, "0 hover controller, 1 policy", c[0]),
+        ("phase/attached", "attached", None, "payload attached", c[1]),
+        ("phase/release", "release_command", None, "release command", c[3]),
+        ("phase/state", "state", None, "state: " + ", ".join(log.meta.get("states", ())), c[2]),
+    ]
+    curves += [(f"age/{body}", f"age_{body}", None, f"{body}'s pose [ms]", c[i]) for i, body in enumerate(BODIES)]
+    names = [name for name in log.channels if name.startswith("tick_")]
+    curves += [(f"tick/{n[5:]}", n, None, f"{n[5:]} [ms]", c[i % len(c)]) for i, n in enumerate(names)]
+    return [curve for curve in curves if curve[1] in log]
+
+
+MILLISECONDS = ("age", "tick")
+"""Groups whose channels, in seconds, are drawn in milliseconds."""
+
+
+def _signals(stream: rr.RecordingStream, log: FlightLog) -> None:
+    for entity, name, component, label, colour in _curves(log):
+        values = log[name].values if component is None else log[name].values[:, component]
+        scale = 1e3 if entity.split("/")[0] in MILLISECONDS else 1.0
+        stream.log(f"signals/{entity}", rr.SeriesLines(names=[label], colors=[_colour(colour)]), static=True)
+        column = rr.Scalars.columns(scalars=scale * values.astype(float))
+        stream.send_columns(f"signals/{entity}", [_times(log, name)], column)
+
+
+def _paler(colour: str) -> str:
+    return "#" + "".join(f"{(int(colour[i : i + 2], 16) + 255) // 2:02x}" for i in (1, 3, 5))
+
+
+def blueprint(goal: np.ndarray, channels: set[str]) -> rrb.Blueprint:
+    """Layout of the viewer.
+
+    Args:
+        goal: target [m], shape (3,).
+        channels: names of those that there are.
+    """
+    middle = np.array([0.5 * goal[0], 0.5 * goal[1], 0.9])
+    eye = rrb.EyeControls3D(position=middle + [0.3, -3.4, 0.9], look_target=middle, eye_up=[0.0, 0.0, 1.0])
+    scene = rrb.Spatial3DView(
+        origin="world",
+        name="Throw",
+        background=[245, 246, 248],
+        eye_controls=eye,
+        line_grid=rrb.LineGrid3D(visible=False),
+    )
+    bounds = rrb.VisualBounds2D(x_range=[-106, 106], y_range=[-106, 106])
+    image = rrb.Spatial2DView(origin="camera", name="Fisheye keypoints", background=[12, 12, 14], visual_bounds=bounds)
+    live = "state" in channels
+    plots = [_plot("Phase", -0.1, 8.1 if live else 1.1, "phase"), _plot("Collective thrust [N]", 0.0, 14.0, "thrust"),
+             _plot("Body rates [rad/s]", -11.0, 11.0, "rate_command", "rate")]  # fmt: skip
+    if "motor_speed" in channels:
+        plots.append(_plot("Motor speeds [rad/s]", 0.0, 4000.0, "motors"))
+    if "battery_voltage" in channels:
+        plots.append(_plot("Battery [V]", 13.0, 17.0, "battery"))
+    if live:
+        plots += [_plot("Age of poses [ms]", 0.0, 120.0, "age"), _plot("Tick [ms]", 0.0, 5.0, "tick"),
+                  rrb.TextLogView(origin="events", name="States")]  # fmt: skip
+    top = rrb.Horizontal(scene, image, column_shares=[2.2, 1.0])
+    below = rrb.Grid(*plots, grid_columns=3)
+    return rrb.Blueprint(rrb.Vertical(top, below, row_shares=[1.7, 1.0]), collapse_panels=True)
+
+
+def _plot(name: str, low: float, high: float, *entities: str) -> rrb.TimeSeriesView:
+    return rrb.TimeSeriesView(
+        name=name, origin="signals", contents=[f"/signals/{e}/**" for e in entities],
+        axis_x=rrb.TimeAxis(link=rrb.components.LinkAxis.LinkToGlobal),
+        axis_y=rrb.ScalarAxis(range=(low, high), zoom_lock=False), plot_legend=rrb.PlotLegend(visible=True),
+    )  # fmt: skip

@@ -1,0 +1,236 @@
+"""The picture of one throw: the paper's strip of side views, and what the camera saw at the same instants."""
+
+import dataclasses
+import io
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from camera.imaging.overlay import draw_overlay
+from camera.keypoints import GOAL_KEYPOINTS, KeypointCamera, keypoints
+from camera.params import CameraParams
+from visthrow.common import style
+from visthrow.common.errors import LogError
+from visthrow.common.storage import atomic_write
+from visthrow.logs.flightlog import FlightLog
+from visthrow.onboard.hover import rot_from_quat
+
+MARGIN = 0.35  # about what is seen [m]
+GROUND = 0.13  # of it seen below z = 0 [m]
+WIDTH, LEFT, PANEL, GAP = 13.6, 0.62, 3.06, 0.22
+"""Of the picture, its left margin, a panel, and the gap between two [inch]."""
+
+ARM = 0.097  # half the motor-to-motor diagonal, for drawing only [m]
+ROTOR = 0.0381  # propeller radius, for drawing only [m]
+BLADE_HEIGHT = 0.018  # of the rotor plane, for drawing only [m]
+PIXELS = 480  # of the camera's picture as drawn
+GHOST_EVERY = 0.06  # between the faint earlier poses [s]
+
+
+def instants(log: FlightLog) -> list[tuple[str, float]]:
+    """Captions and times [s] of the four views.
+
+    Raises:
+        LogError: the flight has no release or landing.
+    """
+    times = log.meta["times"]
+    if "separation" not in times or "landing" not in times:
+        raise LogError(
+            f"the flight has no release and landing to draw: {log.meta['result'].get('failure') or 'it was cut short'}"
+        )
+    start, separation = times["policy_start"], times["separation"]
+    return [
+        ("Hover", start),
+        ("Accelerate", start + 0.55 * (separation - start)),
+        ("Release", separation),
+        ("Landing", times["landing"]),
+    ]
+
+
+def draw(path: str | Path, log: FlightLog, camera: CameraParams) -> None:
+    """Draw the strip.
+
+    Args:
+        path: PNG file.
+        log: a flight with release and landing.
+        camera: whose keypoints the log holds.
+
+    Raises:
+        LogError: the flight has no release or landing.
+        StorageError: the place cannot be written.
+    """
+    views = instants(log)
+    style.use()
+    import matplotlib.pyplot as plt
+
+    side = _bounds(log)
+    upper = PANEL * (side[2] + GROUND) / (side[1] - side[0])  # heights from here on in inches
+    height = 1.18 + upper + 0.98 + PANEL + 0.08
+    figure = plt.figure(figsize=(WIDTH, height))
+    lens = KeypointCamera(drawn_larger(camera))
+    all_seen = True
+    for column, (caption, time) in enumerate(views):
+        left = LEFT + column * (PANEL + GAP)
+        axis = figure.add_axes((left / WIDTH, (PANEL + 1.06) / height, PANEL / WIDTH, upper / height))
+        _side_view(axis, log, time, side, column)
+        axis.set_title(f"({'abcd'[column]})  {caption},  t = {time - views[0][1]:.2f} s", loc="left")
+        axis = figure.add_axes((left / WIDTH, 0.08 / height, PANEL / WIDTH, PANEL / height))
+        all_seen &= _camera_view(axis, log, lens, time, first=column == 0)
+    texts = {"x": LEFT / WIDTH, "ha": "left", "va": "top"}
+    figure.suptitle(_headline(log), y=1.0 - 0.2 / height, fontsize=13.5, fontweight="bold", **texts)
+    quiet = {"fontsize": 10.5, "color": style.QUIET, **texts}
+    figure.text(y=1.0 - 0.54 / height, s=_subline(log), **quiet)
+    unseen = "" if all_seen else "; a cross: outside the field of view"
+    field = f"{camera.fisheye.fov_deg:g}°"
+    note = f"The same instants on the fisheye image ({field}): corners of the target square, box of the ball{unseen}"
+    figure.text(y=(PANEL + 0.42) / height, s=note, **quiet)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png")
+    plt.close(figure)
+    atomic_write(path, buffer.getvalue())
+
+
+def _headline(log: FlightLog) -> str:
+    result, goal = log.meta["result"], log.meta["goal_w"]
+    return (
+        f"{log.meta['policy'].capitalize()} policy, target {np.hypot(goal[0], goal[1]):.1f} m: the ball lands "
+        f"{100 * result['error']:.1f} cm from it, {result['duration']:.2f} s after the start"
+    )
+
+
+def _subline(log: FlightLog) -> str:
+    where = f"Flown on {log.meta['plant_meaning']}" if log.meta["plant"] == "poses" else f"Simulated on {log.meta['plant_meaning']}"
+    drawn = f"Faint: the vehicle every {GHOST_EVERY:g} s. Dashed: the ball in free flight."
+    return f"{where}, seen from the side. {drawn}"
+
+
+def drawn_larger(camera: CameraParams) -> CameraParams:
+    """The same lens on fewer pixels, on which the overlay's strokes are thicker."""
+    lens = camera.fisheye
+    scale = PIXELS / max(lens.width, lens.height)
+    fewer = dataclasses.replace(
+        lens,
+        width=round(scale * lens.width),
+        height=round(scale * lens.height),
+        fx=scale * lens.fx,
+        fy=scale * lens.fy,
+        cx=scale * (lens.cx + 0.5) - 0.5,
+        cy=scale * (lens.cy + 0.5) - 0.5,
+    )
+    return dataclasses.replace(camera, fisheye=fewer)
+
+
+def _bounds(log: FlightLog) -> tuple[float, float, float]:
+    """Left, right and top of the side views [m]."""
+    times = log.meta["times"]
+    paths = []
+    for name in ("pos_w", "payload_pos_w"):
+        time = log[name].time
+        paths.append(log[name].values[(time >= times["policy_start"]) & (time <= times["landing"] + 0.02)])
+    x = np.concatenate([*(path[:, 0] for path in paths), [log.meta["goal_w"][0]]])
+    top = max(path[:, 2].max() for path in paths)
+    return float(x.min() - MARGIN), float(x.max() + MARGIN), float(top + 0.6 * MARGIN)
+
+
+def _at(log: FlightLog, name: str, time: float) -> np.ndarray:
+    """Value at a time, linear between samples."""
+    channel = log[name]
+    flat = channel.values.reshape(len(channel.time), -1)
+    at = [np.interp(time, channel.time, flat[:, i]) for i in range(flat.shape[1])]
+    return np.array(at).reshape(channel.values.shape[1:])
+
+
+def _side_view(axis, log: FlightLog, time: float, side: tuple[float, float, float], column: int) -> None:
+    from matplotlib.patches import Rectangle
+
+    left, right, top = side
+    times, goal = log.meta["times"], log.meta["goal_w"]
+    axis.set(xlim=(left, right), ylim=(-GROUND, top), aspect="equal", yticks=np.arange(0.0, top, 0.5))
+    axis.add_patch(Rectangle((left, -GROUND), right - left, GROUND, color="#EFEDE8", lw=0, zorder=0))
+    axis.axhline(0.0, color=style.QUIET, lw=1.0, zorder=1)
+    axis.plot([goal[0] - 0.125, goal[0] + 0.125], [0, 0], color=style.GOAL, lw=5, solid_capstyle="butt", zorder=2)
+    if column:
+        axis.tick_params(labelleft=False)
+    else:
+        axis.set_ylabel("height [m]")
+        axis.set_xlabel("distance ahead [m]")
+        axis.annotate(
+            "target",
+            (goal[0], 0.0),
+            xytext=(0, 6),
+            textcoords="offset points",
+            ha="center",
+            va="bottom",
+            color=style.GOAL,
+            fontsize=9,
+        )
+    axis.tick_params(length=2.5)
+    for past in np.arange(times["policy_start"], time - 0.03, GHOST_EVERY):
+        _vehicle(axis, log, past, 0.16)
+    payload = log["payload_pos_w"]
+    seen = (payload.time >= times["policy_start"]) & (payload.time < time)
+    path = np.vstack([payload.values[seen], _at(log, "payload_pos_w", time)])
+    when = np.append(payload.time[seen], time)
+    carried, flown = when <= times["separation"] + 1e-6, when >= times["separation"] - 0.02
+    axis.plot(path[carried, 0], path[carried, 2], color=style.PAYLOAD, lw=1.3, alpha=0.45, zorder=3)
+    if np.count_nonzero(flown) > 1:
+        axis.plot(path[flown, 0], path[flown, 2], color=style.PAYLOAD, lw=1.8, ls=(0, (4, 1.6)), zorder=3)
+    if log["cable_points_w"].time[-1] > time - 0.05:  # poses tell nothing of a rope that has let go
+        rope = _at(log, "cable_points_w", time)
+        axis.plot(rope[:, 0], rope[:, 2], color=style.ROPE, lw=1.3, zorder=4)
+    _vehicle(axis, log, time, 1.0)
+    ball = _at(log, "payload_pos_w", time)
+    from matplotlib.patches import Circle
+
+    axis.add_patch(Circle((ball[0], ball[2]), 0.033, color=style.PAYLOAD, lw=0, zorder=6))
+
+
+def _vehicle(axis, log: FlightLog, time: float, alpha: float) -> None:
+    """Arms and rotor discs as seen along y."""
+    pos = _at(log, "pos_w", time)
+    rot = rot_from_quat(_at(log, "quat_wb", time)[None])[0]
+    reach = ARM / np.sqrt(2.0)
+    for sx in (1.0, -1.0):
+        hub = pos + rot @ np.array([sx * reach, 0.0, BLADE_HEIGHT])
+        foot = pos + rot @ np.array([sx * reach, 0.0, 0.0])
+        ends = [hub + rot @ np.array([s * ROTOR, 0.0, 0.0]) for s in (-1.0, 1.0)]
+        line = {"color": style.VEHICLE, "alpha": alpha, "zorder": 5, "solid_capstyle": "round"}
+        axis.plot([pos[0], foot[0]], [pos[2], foot[2]], lw=2.4, **line)
+        if alpha == 1.0:
+            axis.plot([foot[0], hub[0]], [foot[2], hub[2]], lw=1.2, **line)
+            axis.plot([ends[0][0], ends[1][0]], [ends[0][2], ends[1][2]], lw=1.8, **line)
+
+
+def _camera_view(axis, log: FlightLog, camera: KeypointCamera, time: float, first: bool) -> bool:
+    """Keypoints of the true poses at a time, named in the first view; returns whether all are seen."""
+
+    def one(name: str) -> torch.Tensor:
+        return torch.tensor(_at(log, name, time)[None], dtype=torch.float32)
+
+    rot = torch.tensor(rot_from_quat(one("quat_wb").numpy().astype(float)), dtype=torch.float32)
+    goal = torch.tensor([log.meta["goal_w"]], dtype=torch.float32)
+    points, valid = keypoints(camera, one("pos_w"), rot, goal, one("payload_pos_w"))
+    picture = draw_overlay(camera, points[0], valid[0])[:, :, ::-1]
+    lens = camera.fisheye
+    from matplotlib.patches import Ellipse
+
+    size = (2.0 * lens.params.fx * lens.edge_radius, 2.0 * lens.params.fy * lens.edge_radius)
+    circle = Ellipse((lens.params.cx, lens.params.cy), *size, transform=axis.transData)
+    axis.imshow(picture, interpolation="antialiased").set_clip_path(circle)
+    axis.set_axis_off()
+    seen = bool(valid.all())
+    if not first:
+        return seen
+    pixels = lens.denormalize(points[0].double()).numpy()
+    for name, part in (("target", slice(0, GOAL_KEYPOINTS)), ("ball", slice(GOAL_KEYPOINTS, None))):
+        right, middle = pixels[part, 0].max(), pixels[part, 1].mean()
+        axis.annotate(
+            name, (right, middle), xytext=(7, 0), textcoords="offset points", color="white", va="center", fontsize=9
+        )  # fmt: skip
+    quarter = float(lens.radius_from_angle(torch.tensor(np.pi / 2))) * lens.params.fy
+    axis.annotate(
+        "90° off the axis", (lens.params.cx, lens.params.cy + quarter), xytext=(0, 4), textcoords="offset points",
+        color="#B5B5B5", ha="center", va="bottom", fontsize=8,
+    )  # fmt: skip
+    return seen
