@@ -8,6 +8,7 @@ import types
 import pytest
 
 from visthrow import cli
+from visthrow.common import arguments
 from visthrow.common.errors import ConfigError, DeviceError, VisthrowError, suggest
 from visthrow.config import kinds
 from visthrow.training import device
@@ -33,7 +34,7 @@ def command(monkeypatch):
             return outcome
 
         module = types.ModuleType("fake_command")
-        module.add_arguments = lambda parser: cli.add_common(parser)
+        module.add_arguments = lambda parser: arguments.add_common(parser)
         module.run = run
         monkeypatch.setitem(sys.modules, "fake_command", module)
         monkeypatch.setitem(cli.COMMANDS, "try", ("try it", "fake_command"))
