@@ -61,8 +61,8 @@ def test_help_imports_nothing_heavy():
 
 
 def test_no_command_and_unknown_command_list_the_commands():
-    for arguments in ((), ("thrwo",)):
-        result = run(*arguments)
+    for words in ((), ("thrwo",)):
+        result = run(*words)
         assert result.returncode == 2
         assert "Traceback" not in result.stderr
     assert "compare" in result.stderr
