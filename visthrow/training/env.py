@@ -1,7 +1,7 @@
 """ThrowEnv: the throwing task as rsl_rl's vectorised environment.
 
 A step is a chain of device operations without branches on data, allocations on the simulator's side or copies to the
-host, so a whole rollout can be captured in one CUDA graph (:mod:`visthrow.training.ppo`). Every observation is a fresh tensor.
+host, so a whole rollout can be captured in one CUDA graph (:mod:`visthrow.training.ppo.algorithm`). Every observation is a fresh tensor.
 """
 
 import math

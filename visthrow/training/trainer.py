@@ -59,7 +59,7 @@ class Algorithm(Protocol):
 
 def build(experiment: Experiment, device: str, seed: int, ranks: dict | None) -> Algorithm:
     """Algorithm that the experiment names; imported only when chosen."""
-    from visthrow.training.ppo import PPOTraining
+    from visthrow.training.ppo.algorithm import PPOTraining
 
     return PPOTraining(experiment, device, seed, ranks)
 
