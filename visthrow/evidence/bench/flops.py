@@ -85,7 +85,9 @@ class _Translation:
         """One argument of the step kernel: a number, an array, or the struct of state or output arrays."""
         if isinstance(given, wp.array):
             return self.array(given)
-        if isinstance(given, int | float):
+        if isinstance(given, int):  # an index
+            return given
+        if isinstance(given, float):
             return counting.Real(given)
         names = st.STATE_FIELDS if given is self._sim.state else st.OUTPUT_FIELDS
         return SimpleNamespace(**{name: self.array(getattr(given, name)) for name in names})
