@@ -33,12 +33,12 @@ def params(**changes) -> PPOParams:
     return config.loads(PPOParams, text, (), name="test")
 
 
-def observations() -> TensorDict:
+def observations(device: str = "cpu") -> TensorDict:
     drawn = {"actor": 2.0 * torch.randn(ENVIRONMENTS, SEEN) + 1.0, "critic": torch.randn(ENVIRONMENTS, KNOWN)}
-    return TensorDict(drawn, batch_size=[ENVIRONMENTS])
+    return TensorDict(drawn, batch_size=[ENVIRONMENTS]).to(device)
 
 
-def build(p: PPOParams, own: bool) -> PPO:
+def build(p: PPOParams, own: bool, device: str = "cpu") -> PPO:
     """Our algorithm or rsl_rl's with rsl_rl's networks, from the same weights."""
     cfg = rsl_rl_config(p, None)
     if not own:
@@ -48,7 +48,7 @@ def build(p: PPOParams, own: bool) -> PPO:
     torch.manual_seed(0)
     env = SimpleNamespace(num_envs=ENVIRONMENTS, num_actions=ACTIONS)
     with contextlib.redirect_stdout(io.StringIO()):
-        alg = PPO.construct_algorithm(observations(), env, cfg, "cpu")
+        alg = PPO.construct_algorithm(observations(device), env, cfg, device)
     alg.train_mode()
     return alg
 
@@ -56,8 +56,9 @@ def build(p: PPOParams, own: bool) -> PPO:
 def iterate(alg: PPO, seed: int) -> dict[str, float]:
     """A rollout of drawn observations and rewards, and the update."""
     torch.manual_seed(seed)
-    obs = [observations() for _ in range(STEPS + 1)]
-    rewards, dones = torch.randn(STEPS, ENVIRONMENTS), (torch.rand(STEPS, ENVIRONMENTS) < 0.1).float()
+    obs = [observations(alg.device) for _ in range(STEPS + 1)]
+    rewards = torch.randn(STEPS, ENVIRONMENTS).to(alg.device)
+    dones = (torch.rand(STEPS, ENVIRONMENTS) < 0.1).float().to(alg.device)
     with torch.inference_mode():
         for i in range(STEPS):
             alg.act(obs[i])
@@ -164,3 +165,34 @@ def test_the_sample_is_the_gaussians():
     drawn = gaussian.sample()
     assert abs(float(drawn.mean()) - 1.0) < 0.02
     assert abs(float(drawn.std()) - 0.5) < 0.02
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@pytest.mark.parametrize("products", ["float32", "bfloat16"])
+def test_the_captured_update_is_the_launched_one_and_rsl_rls(products):
+    """Five iterations: the first launches, the second captures, three replay."""
+    p = params(products=products, schedule="fixed")
+    captured, launched, theirs = (build(p, own, "cuda:0") for own in (True, True, False))
+    for seed in range(5):
+        launched._updates = 0
+        figures = [iterate(alg, seed) for alg in (captured, launched, theirs)]
+        assert figures[0] == pytest.approx(figures[1], rel=1e-3, abs=1e-5)
+    assert captured._graph is not None
+    assert launched._graph is None
+    for a, b, c in zip(captured._layers, launched._layers, [*theirs.actor.mlp.parameters(), *theirs.critic.parameters()]):
+        torch.testing.assert_close(a, b, **SAME)
+        if products == "float32":
+            torch.testing.assert_close(a, c, **SAME)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_the_rate_of_a_captured_update_is_rsl_rls():
+    for kl in (1e-5, 1.0):
+        ours, theirs = (build(params(desired_kl=kl), own, "cuda:0") for own in (True, False))
+        for seed in range(4):
+            iterate(ours, seed)
+            iterate(theirs, seed)
+        assert ours.learning_rate == pytest.approx(theirs.learning_rate, rel=1e-5)
+        assert abs(ours.learning_rate / 1e-3 - 1.0) > 0.1
