@@ -149,6 +149,7 @@ class PPOParams:
     entropy: float
     value_coefficient: float
     max_grad_norm: float
+    products: Literal["float32", "bfloat16"] = "float32"  # of the hidden layers; weights are float32 either way
 
     def __post_init__(self) -> None:
         counts = {name: getattr(self, name) for name in ("environments", "steps", "iterations", "epochs", "minibatches")}
