@@ -150,6 +150,22 @@ class PPOParams:
     value_coefficient: float
     max_grad_norm: float
     products: Literal["float32", "bfloat16"] = "float32"  # of the hidden layers; weights are float32 either way
+    critic: tuple[int, ...] = ()  # hidden layers of the critic; empty for the actor's
+    critic_first: int = 0  # iterations at the beginning in which the critic alone learns
+
+    def __post_init__(self) -> None:
+        whole = ("environments", "steps", "iterations", "epochs", "minibatches")
+        above = ("initial_std", "learning_rate", "desired_kl", "final_kl", "clip", "max_grad_norm")
+        wrong = [name for name in whole if getattr(self, name) < 1] + [name for name in above if getattr(self, name) <= 0.0]
+        wrong += [name for name in ("discount", "gae_lambda") if not 0.0 < getattr(self, name) <= 1.0]
+        wrong += [name for name in ("entropy", "value_coefficient", "critic_first") if getattr(self, name) < 0.0]
+        wrong += [name for name in ("hidden", "critic") if any(width < 1 for width in getattr(self, name))]
+        wrong += [] if self.hidden else ["hidden"]
+        if wrong:
+            given = ", ".join(f"{name} {getattr(self, name)}" for name in wrong)
+            raise ConfigError(
+                f"ppo: {given}; expected whole numbers of 1 or more, shares of 0 to 1, positive rates and at least one layer"
+            )
 
     def __post_init__(self) -> None:
         counts = {name: getattr(self, name) for name in ("environments", "steps", "iterations", "epochs", "minibatches")}

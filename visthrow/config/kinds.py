@@ -14,6 +14,7 @@ SCHEMAS = {
     "task": "visthrow.task:TaskParams",
     "start": "sim.params:RandomizationParams",
     "train": "visthrow.task:Experiment",
+    "ppo": "visthrow.task:PPOParams",
     "sweep": "visthrow.evidence.sweep.lists:SweepList",
     "hil": "hil.params:HilParams",
     "diagnose": "visthrow.diagnose.inputs.setup:Setup",
