@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from visthrow.common.errors import DiagnoseError
-from visthrow.diagnose.catalogue.scatter import VARYING
+from visthrow.config.effects import random_effects
 from visthrow.diagnose.likelihood import memory
 from visthrow.diagnose.likelihood.evidence import (
     Priors,
@@ -241,7 +241,7 @@ class Search:
 
     def _mean(self) -> bool:
         """Name an effect that was refused because it varies, if the flights agree on its mean; False where there is none."""
-        names, may_vary = [e.name for e in self.problem.model.effects], {name for v in VARYING for name in v.of}
+        names, may_vary = [e.name for e in self.problem.model.effects], {name for v in random_effects() for name in v.of}
         for j in sorted((j for j in self.refused if self.name(j) in may_vary), key=self.refused.get, reverse=True):
             active = [*self.active, j]
             drawn = deviations(self.scatter(active), self.priors, names)

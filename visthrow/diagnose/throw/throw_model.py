@@ -11,19 +11,20 @@ import torch
 import warp as wp
 
 from camera.params import CameraParams
+from sim.effects.effect import SettingEffect, apply
+from sim.effects.setting import Setting, generalised
 from sim.params import PlantParams, SensingParams
 from sim.replay.kernel import ATTACHED
 from sim.replay.lanes import Replay
 from visthrow.common.errors import DiagnoseError
-from visthrow.diagnose.catalogue import Entry, Setting, apply, entries_for
 from visthrow.diagnose.likelihood.threads import aside, each
 from visthrow.diagnose.likelihood.transfer import all_to_host, to_host
 from visthrow.diagnose.models.interface import Linearised, Window
 from visthrow.diagnose.throw.cutting import RINGING, Cut, around_slack, cut, thinned
+from visthrow.diagnose.throw.effects import effects_for
 from visthrow.diagnose.throw.interface import Mistake
 from visthrow.diagnose.throw.landing import Landings, landings
 from visthrow.diagnose.throw.linearising import Plan, exact, lanes_of, still
-from visthrow.diagnose.throw.opened import opened
 from visthrow.diagnose.throw.recorded import NEVER, carriers, record_of
 from visthrow.diagnose.throw.replay import BATCH, CUDA_BATCH, Flights, Lane, carried, downloaded
 from visthrow.diagnose.throw.settling import Settling, following, perturbed
@@ -87,7 +88,7 @@ class ThrowModel:
         Raises:
             DiagnoseError: no flight can be replayed, or ``only`` names what does not exist.
         """
-        self.setting = opened(Setting(plant, sensing or SensingParams(), camera=camera))
+        self.setting = generalised(Setting(plant, sensing or SensingParams(), camera=camera))
         self.device, self.substep, self.mistakes = device, substep, mistakes
         if device != "cpu":
             aside()
@@ -103,17 +104,17 @@ class ThrowModel:
         self.channels += ["rate_b"] if any(f.gyro for f in flights) else []
         self.channels += channels_of(logs, flights, camera)
         thrown = any(f.latch != NEVER for f in flights)
-        self.entries: dict[str, Entry] = entries_for(self.setting, set(self.channels), carries, thrown, simpler)
+        self.entries: dict[str, SettingEffect] = effects_for(self.setting, set(self.channels), carries, thrown, simpler)
         if only is not None:
             unknown = [name for name in only if name not in self.entries]
             if unknown:
                 raise DiagnoseError(f"no effects {unknown} for these flights; there are {', '.join(self.entries)}")
             self.entries = {name: self.entries[name] for name in only}
         self._sighted = [e for e in self.entries.values() if needs_no_flight(e)]
-        self._graded = [e for e in self.entries.values() if e.switch is None and e not in self._sighted]
-        self._switched = [e for e in self.entries.values() if e.switch is not None]
-        self.entries = {e.effect.name: e for e in (*self._graded, *self._switched, *self._sighted)}
-        self.effects = tuple(e.effect for e in self.entries.values())
+        self._graded = [e for e in self.entries.values() if not e.switch and e not in self._sighted]
+        self._switched = [e for e in self.entries.values() if e.switch]
+        self.entries = {e.name: e for e in (*self._graded, *self._switched, *self._sighted)}
+        self.effects = tuple(self.entries.values())
         self._directions = directions(self.setting.plant)
         x = self.setting.sensing
         delays = (x.vehicle_delay, x.payload_delay, x.gyro_delay)
@@ -135,7 +136,7 @@ class ThrowModel:
         setting = apply(self.entries, self.setting, theta)
         self._directions = directions(setting.plant)  # another kind of block has other states
         states = self._latest[self._switches(theta)] = self._settled_at[_key(theta)] = self._settled(setting)
-        steps = [self._step(e, theta.get(e.effect.name, 0.0)) for e in self._graded]
+        steps = [self._step(e, theta.get(e.name, 0.0)) for e in self._graded]
         settings = [setting, *[e.apply(setting, step) for e, step in zip(self._graded, steps)]]
         replay = self._replay(settings, download=wp.to_torch)
         found: list[Window] = []
@@ -158,19 +159,19 @@ class ThrowModel:
         if not self._sightings:
             return whole
         entries = list(self.entries.values())
-        steps = np.array([0.0 if e.switch else self._step(e, theta.get(e.effect.name, 0.0)) for e in entries])
+        steps = np.array([0.0 if e.switch else self._step(e, theta.get(e.name, 0.0)) for e in entries])
         settings = [setting, *[setting if e.switch else e.apply(setting, step) for e, step in zip(entries, steps)]]
         return [
             with_sightings(w, number, self._sightings, self.channels, settings, steps) for number, w in zip(self._told, whole)
         ]
 
-    def _secant(self, e: Entry, theta: Mapping[str, float], windows: list[Window]) -> list[np.ndarray]:
+    def _secant(self, e: SettingEffect, theta: Mapping[str, float], windows: list[Window]) -> list[np.ndarray]:
         """Samples with the other kind of block less those with this one, per theta; a column for each window.
 
         Each kind begins in initial states settled for it: a transient that the other's state brings would be taken for its effect.
         """
-        on = theta.get(e.effect.name, 0.0) > 0.5
-        elsewhere = {**theta, e.effect.name: 0.0 if on else 1.0}
+        on = theta.get(e.name, 0.0) > 0.5
+        elsewhere = {**theta, e.name: 0.0 if on else 1.0}
         other = apply(self.entries, self.setting, elsewhere)
         lanes = [Lane(w, 0, w) for w in self._told]
         start = self._latest[self._switches(elsewhere)] = self._settled(other)
@@ -195,7 +196,7 @@ class ThrowModel:
         self, setting: Setting, theta: Mapping[str, float], about: Linearised
     ) -> tuple[States, dict[int, np.ndarray]]:
         """States that belong to other sizes of the effects by the derivatives, and how each window's were moved."""
-        names = [e.effect.name for e in self.entries.values()]
+        names = list(self.entries)
         change = np.array([theta.get(name, 0.0) - about.theta.get(name, 0.0) for name in names])
         found = directions(setting.plant)
         with self._lock:
@@ -222,7 +223,7 @@ class ThrowModel:
 
     def _switches(self, theta: Mapping[str, float]) -> frozenset[str]:
         """Which other kinds of blocks are on."""
-        return frozenset(e.effect.name for e in self._switched if theta.get(e.effect.name, 0.0) > 0.5)
+        return frozenset(e.name for e in self._switched if theta.get(e.name, 0.0) > 0.5)
 
     def _sighting_residuals(self, w: int, setting: Setting) -> list[np.ndarray]:
         held = [(kind, kind.samples(w)[1]) for kind in self._sightings]
@@ -322,10 +323,10 @@ class ThrowModel:
         return settling.fit(starts, slopes if ways[0] == ways[1] else None)
 
     @staticmethod
-    def _step(e: Entry, theta: float) -> float:
+    def _step(e: SettingEffect, theta: float) -> float:
         """Step of theta for the derivative: upwards, unless that leaves the bounds."""
-        step = e.step * e.effect.floor
-        return -step if theta + step > e.effect.bounds[1] else step
+        step = e.step * e.floor
+        return -step if theta + step > e.bounds[1] else step
 
     def _batches(self) -> list[list[int]]:
         """Windows in groups whose lanes fit a run."""
@@ -359,7 +360,7 @@ class ThrowModel:
 
         found = [slopes(plan) for plan in plans] if flown.seen.is_cuda else each(slopes, plans)
         nominal = to_host(flown.seen[:, [plan.first for plan in plans]])
-        blocks = [e.effect.block for e in self._graded]
+        blocks = [e.block for e in self._graded]
 
         parts = all_to_host([part for own in found for part in own])
 
