@@ -74,7 +74,7 @@ def run(args: argparse.Namespace) -> int:
     if args.resume and not (folder / CHECKPOINT).exists():
         raise CheckpointError(f"{folder}: no {CHECKPOINT} to resume from")
     if lead:
-        provenance.write_run_folder(folder, experiment, resume=args.resume, seed=args.seed)
+        provenance.write_run_folder(folder, config.dumps(experiment), resume=args.resume, seed=args.seed)
     trainer = Trainer(experiment, name, args.seed, ranks)
     if args.resume:
         trainer.load(folder / CHECKPOINT)
