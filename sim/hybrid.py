@@ -69,6 +69,22 @@ def rope_variants(rope: RopeParams, z: RandomizationParams) -> list[RopeParams]:
     ]
 
 
+def _check(
+    params: PlantParams, count: int, ropes: list[RopeParams], airs: list[AirParams], releases: list[ReleaseParams]
+) -> None:
+    """Refuse a batch that cannot be simulated; vehicles are checked where they are packed."""
+    if count < 1:
+        raise ValueError(f"HybridSim of {count} environments: expected 1 or more")
+    check_numerics(params.sim)
+    for release in releases:
+        check_release(release)
+    for air in airs:
+        check_air(air)
+    check_laws(params.laws)
+    if {r.segments for r in ropes} != {params.rope.segments}:
+        raise ValueError(f"ropes of {sorted({r.segments for r in ropes})} segments in one batch of {params.rope.segments}")
+
+
 class HybridSim:
     """Batched plant: command queue, rate controller, motors, battery, aerodynamics, rope, payload, release.
 
@@ -115,22 +131,9 @@ class HybridSim:
         Raises:
             ValueError: no environment, ropes of different segment counts, or an unphysical parameter.
         """
-        if count < 1:
-            raise ValueError(f"HybridSim of {count} environments: expected 1 or more")
-        check_numerics(params.sim)
-        releases = releases or [params.release]
-        for release in releases:
-            check_release(release)
-        ropes = ropes or [params.rope]
-        vehicles = vehicles or [params.vehicle]
-        airs = airs or [params.air]
-        for air in airs:
-            check_air(air)
-        check_laws(params.laws)
-        if {r.segments for r in ropes} != {params.rope.segments}:
-            raise ValueError(
-                f"ropes of {sorted({r.segments for r in ropes})} segments in one batch of {params.rope.segments}"
-            )
+        vehicles, ropes = vehicles or [params.vehicle], ropes or [params.rope]
+        airs, releases = airs or [params.air], releases or [params.release]
+        _check(params, count, ropes, airs, releases)
         self.params, self.count, self.device, self.seed = params, count, device, seed
         self.gravity = gravity
         self.extensions = extensions_of(vehicles, ropes, airs, releases, params.laws) | extensions

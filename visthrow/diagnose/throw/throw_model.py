@@ -25,7 +25,7 @@ from visthrow.diagnose.throw.effects import effects_for
 from visthrow.diagnose.throw.interface import Mistake
 from visthrow.diagnose.throw.landing import Landings, landings
 from visthrow.diagnose.throw.linearising import Plan, exact, lanes_of, still
-from visthrow.diagnose.throw.recorded import NEVER, carriers, record_of
+from visthrow.diagnose.throw.recorded import NEVER, Recorded, carriers, record_of
 from visthrow.diagnose.throw.replay import BATCH, CUDA_BATCH, Flights, Lane, carried, downloaded
 from visthrow.diagnose.throw.settling import Settling, following, perturbed
 from visthrow.diagnose.throw.sightings import channels_of, needs_no_flight, sightings, with_sightings
@@ -94,34 +94,19 @@ class ThrowModel:
             aside()
         flights = [record_of(log, i) for i, log in enumerate(logs)]
         hangs = carriers(flights) if carries is None else [carries] * len(flights)
-        carries = any(hangs)
-        release = plant.release
-        cuts = thinned([c for i, f in enumerate(flights) for c in cut(f, i, release.lag, release.landing_height, hangs[i])])
+        carries, release = any(hangs), (plant.release.lag, plant.release.landing_height)
+        cuts = thinned([c for i, f in enumerate(flights) for c in cut(f, i, *release, hangs[i])])
         if not cuts:
             raise DiagnoseError(f"{len(flights)} flights hold no stretch of poses and commands long enough to replay")
-        self.channels = ["pos_w", "quat_wb"]
-        self.channels += ["payload_pos_w"] if carries and any(f.payload for f in flights) else []
-        self.channels += ["rate_b"] if any(f.gyro for f in flights) else []
-        self.channels += channels_of(logs, flights, camera)
+        self.channels = [*_measured(flights, carries), *channels_of(logs, flights, camera)]
         thrown = any(f.latch != NEVER for f in flights)
-        self.entries: dict[str, SettingEffect] = effects_for(self.setting, set(self.channels), carries, thrown, simpler)
-        if only is not None:
-            unknown = [name for name in only if name not in self.entries]
-            if unknown:
-                raise DiagnoseError(f"no effects {unknown} for these flights; there are {', '.join(self.entries)}")
-            self.entries = {name: self.entries[name] for name in only}
-        self._sighted = [e for e in self.entries.values() if needs_no_flight(e)]
-        self._graded = [e for e in self.entries.values() if not e.switch and e not in self._sighted]
-        self._switched = [e for e in self.entries.values() if e.switch]
-        self.entries = {e.name: e for e in (*self._graded, *self._switched, *self._sighted)}
-        self.effects = tuple(self.entries.values())
+        concerned = effects_for(self.setting, set(self.channels), carries, thrown, simpler)
+        self._choose(concerned if only is None else _only(concerned, only))
         self._directions = directions(self.setting.plant)
-        x = self.setting.sensing
-        delays = (x.vehicle_delay, x.payload_delay, x.gyro_delay)
-        self.flights = Flights(flights, cuts, delays, stride)
+        self.flights = self._cut(flights, cuts, stride)
         states, ends = self._through(self.setting)
         if (without_slack := self._without_slack(ends)) != cuts:
-            self.flights = Flights(flights, without_slack, delays, stride)
+            self.flights = self._cut(flights, without_slack, stride)
             states, _ = self._through(self.setting)
         self._told = np.array([w for w, c in enumerate(self.flights.cuts) if c.told])
         self._fits: dict[tuple[Cut, ...], tuple[States, dict[int, np.ndarray]]] = {}
@@ -130,6 +115,19 @@ class ThrowModel:
         self._lock = threading.Lock()  # residuals may be asked for side by side
         self._follows: tuple[Linearised, dict[int, list[int]], np.ndarray] | None = None  # the last that was asked for
         self._sightings = sightings(logs, flights, self.flights.cuts, self.setting)
+
+    def _cut(self, flights: Sequence[Recorded], cuts: Sequence[Cut], stride: int) -> Flights:
+        """Return these windows of flights, in the time of their sensors."""
+        x = self.setting.sensing
+        return Flights(flights, cuts, (x.vehicle_delay, x.payload_delay, x.gyro_delay), stride)
+
+    def _choose(self, effects: Mapping[str, SettingEffect]) -> None:
+        """Take these effects: first those that are simulated by degrees, then switches, then what only cameras see."""
+        self._sighted = [e for e in effects.values() if needs_no_flight(e)]
+        self._graded = [e for e in effects.values() if not e.switch and e not in self._sighted]
+        self._switched = [e for e in effects.values() if e.switch]
+        self.effects = (*self._graded, *self._switched, *self._sighted)
+        self.entries = {e.name: e for e in self.effects}
 
     def windows(self, theta: Mapping[str, float]) -> list[Window]:
         """See :class:`visthrow.diagnose.models.interface.Model`."""
@@ -254,10 +252,9 @@ class ThrowModel:
 
     def beside(self, cuts: Sequence[Cut]) -> "ThrowModel":
         """The same model of other windows of its flights."""
-        other, x = copy.copy(self), self.setting.sensing
+        other = copy.copy(self)
         other._settled_at, other._follows = {}, None  # states of other windows
-        delays = (x.vehicle_delay, x.payload_delay, x.gyro_delay)
-        other.flights = Flights(self.flights.flights, cuts, delays, self.flights.stride)
+        other.flights = self._cut(self.flights.flights, cuts, self.flights.stride)
         other._told = np.array([w for w, c in enumerate(cuts) if c.told])
         return other
 
@@ -393,3 +390,17 @@ class ThrowModel:
 def _key(theta: Mapping[str, float]) -> frozenset[tuple[str, float]]:
     """The sizes that are not 0."""
     return frozenset((name, float(value)) for name, value in theta.items() if value)
+
+
+def _only(effects: Mapping[str, SettingEffect], names: Sequence[str]) -> dict[str, SettingEffect]:
+    """Return the effects of these names, in their order."""
+    unknown = [name for name in names if name not in effects]
+    if unknown:
+        raise DiagnoseError(f"no effects {unknown} for these flights; there are {', '.join(effects)}")
+    return {name: effects[name] for name in names}
+
+
+def _measured(flights: Sequence[Recorded], carries: bool) -> list[str]:
+    """Return the channels of poses and rates that these flights have."""
+    payload = ["payload_pos_w"] if carries and any(f.payload for f in flights) else []
+    return ["pos_w", "quat_wb", *payload, *(["rate_b"] if any(f.gyro for f in flights) else [])]
