@@ -75,6 +75,15 @@ def rope_variants(rope: RopeParams, z: RandomizationParams) -> list[RopeParams]:
     ]
 
 
+def _check(params: PlantParams, count: int, ropes: list[RopeParams]) -> None:
+    """Refuse a batch that cannot be simulated."""
+    if count < 1:
+        raise ValueError(f"HybridSim of {count} environments: expected 1 or more")
+    check_laws(params.laws)
+    if {r.segments for r in ropes} != {params.rope.segments}:
+        raise ValueError(f"ropes of {sorted({r.segments for r in ropes})} segments in one batch of {params.rope.segments}")
+
+
 class HybridSim:
     """Batched plant: command queue, rate controller, motors, battery, aerodynamics, rope, payload, release.
 
@@ -123,17 +132,9 @@ class HybridSim:
         Raises:
             ValueError: no environment, ropes of different segment counts, or a law that no block can be made of.
         """
-        if count < 1:
-            raise ValueError(f"HybridSim of {count} environments: expected 1 or more")
-        releases = releases or [params.release]
-        ropes = ropes or [params.rope]
-        vehicles = vehicles or [params.vehicle]
-        airs = airs or [params.air]
-        check_laws(params.laws)
-        if {r.segments for r in ropes} != {params.rope.segments}:
-            raise ValueError(
-                f"ropes of {sorted({r.segments for r in ropes})} segments in one batch of {params.rope.segments}"
-            )
+        vehicles, ropes = vehicles or [params.vehicle], ropes or [params.rope]
+        airs, releases = airs or [params.air], releases or [params.release]
+        _check(params, count, ropes)
         self.params, self.count, self.device, self.seed = params, count, device, seed
         self.gravity, self.threads = gravity, threads or cores()
         self.extensions = extensions_of(vehicles, ropes, airs, releases, params.laws) | extensions
@@ -150,9 +151,8 @@ class HybridSim:
         outputs = {k: (v, False) for k, v in st.OUTPUT_FIELDS.items()}
         self.out = st.allocate(t, self._step.Output, outputs, count, {}, device)
         self.command = wp.zeros(count, dtype=t.vec4, device=device)
-        self.release = wp.zeros(count, dtype=wp.int32, device=device)
+        self.release, self.episode = (wp.zeros(count, dtype=wp.int32, device=device) for _ in range(2))
         self.goal_w = wp.zeros(count, dtype=t.vec3, device=device)
-        self.episode = wp.zeros(count, dtype=wp.int32, device=device)
         self._all = wp.full(count, 1, dtype=wp.int32, device=device)
         self._used = wp.zeros(count, dtype=t.real, device=device)
         self._spreads: tuple[RandomizationParams, wp.array] | None = None

@@ -147,6 +147,14 @@ def build_kernels(t: Types, vehicle: VehicleParams, integrator: str, extensions:
     return quad_step_kernel, quad_reset_kernel, State, Start
 
 
+def _built(precision: str, vehicle: VehicleParams, integrator: str, extensions: frozenset[str]) -> tuple:
+    """Return kernels and structs of a choice of blocks, built once."""
+    key = (precision, integrator, kinds_of(vehicle), extensions)
+    if key not in _BUILDS:
+        _BUILDS[key] = build_kernels(types(precision), vehicle, integrator, extensions)
+    return _BUILDS[key]
+
+
 class QuadSim:
     """Batched quadrotor: command queue, rate controller, motors, battery, aerodynamics, external wrench.
 
@@ -208,10 +216,7 @@ class QuadSim:
         self.vehicle, self.count, self.device, self.types = vehicle, count, device, t
         self.integration_step, self.control_period, self.gravity = step, control_period, gravity
         extensions = extensions_of(vehicles, airs=[air])
-        key = (precision, integrator, kinds_of(vehicle), extensions)
-        if key not in _BUILDS:
-            _BUILDS[key] = build_kernels(t, vehicle, integrator, extensions)
-        self._step, self._reset, State, Start = _BUILDS[key]
+        self._step, self._reset, State, Start = _built(precision, vehicle, integrator, extensions)
         self._vehicles = wp.array(rows, dtype=t.Vehicle, device=device)
         self._airs = wp.array(pack(t.Air, air), dtype=t.Air, device=device)
         depth = max(queue_depth(v.queue.delay, control_period) for v in vehicles)

@@ -5,11 +5,13 @@ import dataclasses
 import numpy as np
 
 from sim.arrays.structs import EXTENSIONS
+from sim.effects.effect import apply
+from sim.effects.setting import Setting
 from sim.hybrid import HybridSim
 from sim.params import PlantParams
 from tests.plants import paper_plant
 from tests.worlds.pilot import FreeFlight, Throw, Tracker
-from visthrow.diagnose.catalogue import ALL, Setting, apply
+from visthrow.config.effects import chosen
 from visthrow.logs.flightlog import Channel, FlightLog
 from visthrow.throws.ballistics import flown
 
@@ -21,7 +23,7 @@ NOISE = {"pos_w": 5e-4, "quat_wb": np.radians(0.2), "payload_pos_w": 8e-4}
 
 def setting_with(theta: dict[str, float], plant: PlantParams | None = None) -> Setting:
     """The paper's plant with effects of the catalogue."""
-    return apply(ALL, Setting(plant or paper_plant()), theta)
+    return apply(chosen(theta), Setting(plant or paper_plant()), theta)
 
 
 def fly(

@@ -167,17 +167,6 @@ class PPOParams:
                 f"ppo: {given}; expected whole numbers of 1 or more, shares of 0 to 1, positive rates and at least one layer"
             )
 
-    def __post_init__(self) -> None:
-        counts = {name: getattr(self, name) for name in ("environments", "steps", "iterations", "epochs", "minibatches")}
-        if min(counts.values()) < 1 or not self.hidden or min(self.hidden) < 1:
-            raise ConfigError(f"ppo: {counts} and hidden layers of {self.hidden}; expected 1 or more of each")
-        require_positive(
-            "ppo", initial_std=self.initial_std, learning_rate=self.learning_rate, clip=self.clip, max_grad_norm=self.max_grad_norm
-        )
-        for name in ("discount", "gae_lambda"):
-            if not 0.0 < getattr(self, name) <= 1.0:
-                raise ConfigError(f"ppo.{name} is {getattr(self, name)}; expected a number above 0 and up to 1")
-
 
 @dataclass(frozen=True)
 class DiagnosedParams:

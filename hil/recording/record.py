@@ -17,6 +17,7 @@ from hil.control.decision import Decision, Words
 from hil.errors import RunError
 from hil.params import HilParams
 from hil.poses.pose import Pose
+from visthrow import config
 from visthrow.common import provenance
 from visthrow.common.errors import StorageError
 from visthrow.common.storage import atomic_write, write_json
@@ -48,7 +49,7 @@ class Recorder:
         source = find_policy(params.policy)
         data = source.read_bytes()
         provenance.write_run_folder(
-            self.folder, params, policy=source.stem, policy_sha256=hashlib.sha256(data).hexdigest()
+            self.folder, config.dumps(params), policy=source.stem, policy_sha256=hashlib.sha256(data).hexdigest()
         )
         atomic_write(self.folder / POLICY, data)
         self.failed: str | None = None
@@ -166,8 +167,6 @@ def load_run(folder: str | Path) -> tuple[HilParams, Policy, list[dict[str, Any]
         RunError: no folder of a run, or a damaged one.
         ConfigError, PolicyError: its config or policy cannot be read.
     """
-    from visthrow import config
-
     folder = Path(folder)
     require_run(folder)
     params, policy = config.load(HilParams, folder / CONFIG), Policy.load(folder / POLICY)

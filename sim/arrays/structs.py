@@ -20,6 +20,18 @@ def make_struct(name: str, fields: dict[str, type]) -> type:
     return wp.struct(type(name, (), {"__annotations__": fields, "__module__": __name__}))
 
 
+ROPE_NUMBERS = (
+    "segment_length", "segment_mass", "segment_inertia", "last_mass", "last_center", "last_inertia",
+    "payload_offset", "payload_radius", "payload_arm", "payload_mass", "payload_drag",
+    "joint_damping", "mount_damping", "swing_damping", "downwash", "payload_side", "payload_lift", "compliance",
+    "strain",  # of a rope that gives, as it stands
+    "strain_rate",  # [1/s]
+    "stretched_share",  # of the last rod: how much of its lengthening its centre follows
+    "total_mass",
+)  # fmt: skip
+"""Scalars of the device's rope, beside its mount."""
+
+
 class Types:
     """Scalar, vector and struct types of one precision.
 
@@ -44,34 +56,7 @@ class Types:
         self.Randomization = self.from_dataclass(P.RandomizationParams, {})
         pushes = {"laws": self.vec4, "push_w": self.vec3, "twist_b": self.vec3, "payload_push_w": self.vec3}
         self.Air = self.from_dataclass(P.AirParams, pushes)
-        self.Rope = make_struct(
-            "Rope",
-            {
-                "mount": self.vec3,
-                "segment_length": real,
-                "segment_mass": real,
-                "segment_inertia": real,
-                "last_mass": real,
-                "last_center": real,
-                "last_inertia": real,
-                "payload_offset": real,
-                "payload_radius": real,
-                "payload_arm": real,
-                "payload_mass": real,
-                "payload_drag": real,
-                "joint_damping": real,
-                "mount_damping": real,
-                "swing_damping": real,
-                "downwash": real,
-                "payload_side": real,
-                "payload_lift": real,
-                "compliance": real,
-                "strain": real,  # of a rope that gives, as it stands
-                "strain_rate": real,  # [1/s]
-                "stretched_share": real,  # of the last rod: how much of its lengthening its centre follows
-                "total_mass": real,
-            },
-        )
+        self.Rope = make_struct("Rope", {"mount": self.vec3, **dict.fromkeys(ROPE_NUMBERS, real)})
         fields = {
             "pos_w": self.vec3,
             "quat_wb": self.quat,

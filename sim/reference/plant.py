@@ -139,11 +139,7 @@ class ReferencePlant:
             "cable_dir_w": (hanging if cable_dir_w is None else cable_dir_w, (count, segments, 3)),
             "cable_vel_w": (np.zeros_like(hanging) if cable_vel_w is None else cable_vel_w, (count, segments, 3)),
         }
-        values = {}
-        for name, (value, shape) in given.items():
-            values[name] = np.array(value, dtype=np.float64)
-            if values[name].shape != shape:
-                raise ValueError(f"plant: {name} has shape {values[name].shape}, expected {shape}")
+        values = {name: _array(name, value, shape) for name, (value, shape) in given.items()}
         self._draw()
         rotation = rotation_from_quat(values["quat_wb"])
         offset_w = turned(rotation, self._errors.com_offset)
@@ -451,3 +447,10 @@ class ReferencePlant:
             latched=self._latched.copy(),
             **noisy,
         )
+
+
+def _array(name: str, value: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    array = np.array(value, dtype=np.float64)
+    if array.shape != shape:
+        raise ValueError(f"plant: {name} has shape {array.shape}, expected {shape}")
+    return array

@@ -2,16 +2,22 @@
 
 import re
 import tomllib
+import types
+import typing
 from pathlib import Path
 
 import pytest
 
+from camera.params import CameraParams
+from sim.params import PlantParams, SensingParams
 from visthrow import config
-from visthrow.config import kinds
+from visthrow.config import effects, kinds, schema
 
 FILES = sorted(config.configs_root().rglob("*.toml"))
-COMMENTED = ("vehicle", "rope", "camera", "release", "sim", "start", "task")
+COMMENTED = ("vehicle", "rope", "camera", "release", "sim", "start", "task", "effects")
 """Kinds whose every number carries a comment: its table or equation of the paper, or why it was chosen."""
+TEXT = re.compile(r'^\w+ = (?:".*"|\[(?:"[^"]*"(?:, )?)*\])$|^prior_sd = [-\d.e]+$', re.MULTILINE)
+"""Lines of words in a table of effects, and its prior, which its ``source`` explains."""
 
 HAS_NUMBER = re.compile(r"(?<![\w.])[-+]?\d")
 
@@ -45,14 +51,37 @@ def uncommented(text: str) -> list[str]:
 
 @pytest.mark.parametrize("path", [path for path in FILES if path.parent.name in COMMENTED], ids=named)
 def test_every_number_says_where_it_comes_from(path):
-    assert not uncommented(path.read_text(encoding="utf-8"))
+    text = path.read_text(encoding="utf-8")
+    assert not uncommented(TEXT.sub("", text) if path.parent.name == "effects" else text)
 
 
 def test_the_check_itself():
+    assert uncommented(TEXT.sub("", 'source = "of 2012"\nprior_sd = 1e-3\nof = ["x_1", "y"]\nfloor = 2.0')) == ["floor = 2.0"]
     assert uncommented("a = 1\nb = 2  # because\n") == ["a = 1"]
     assert uncommented("# because\na = 1\nb = [2, 3]\n") == []
     assert uncommented("# because\na = 1\n\nb = 2\n[t]\nc = 3") == ["b = 2", "c = 3"]
     assert uncommented('a = "x1"\nb = true') == []
+
+
+def test_the_catalogue_reads_every_file_of_effects_and_every_number_of_a_change_exists():
+    assert set(effects.FILES) == set(config.available("effects"))
+    kinds_of = {"plant": PlantParams, "sensing": SensingParams, "camera": CameraParams, "step_square": float}
+    for name, effect in effects.catalogue().items():
+        for path in [*(c.path for c in effect.changes), *(x.path for x in effect.lowest)]:
+            kind = types.SimpleNamespace(**kinds_of)
+            for part in path.split("."):
+                kind = getattr(kind, part) if isinstance(kind, types.SimpleNamespace) else schema.hints(kind)[part]
+            index = max((c.index or 0 for c in effect.changes if c.path == path), default=0)
+            numbers = typing.get_args(kind) or (kind,)
+            assert numbers[index] is float, f"{name}: {path}[{index}] is {kind}"
+
+
+def test_an_effect_that_changes_nothing_or_names_no_condition_is_refused():
+    text = config.find("effects", "numerics").read_text(encoding="utf-8")
+    with pytest.raises(config.ConfigError, match="neither; expected one"):
+        config.loads(kinds.schema_of("effects"), re.sub(r"(?m)^changes = .*$", "", text))
+    with pytest.raises(config.ConfigError, match="got 'never'; expected one of: always, aerodynamics"):
+        config.loads(kinds.schema_of("effects"), text + 'needs = "never"\n')
 
 
 def test_every_schema_has_a_config_and_every_folder_a_schema():

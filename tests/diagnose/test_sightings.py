@@ -8,13 +8,14 @@ import pytest
 import torch
 
 from camera.keypoints import KeypointCamera, keypoints
+from sim.effects.setting import Setting
 from tests.diagnose.sealed import flight_log
 from tests.worlds.camera import CENTRE, FOCAL, HALF_VIEW, marks
 from tests.worlds.numbers import hide
 from tests.worlds.turns import matrix
 from tests.worlds.world import CAMERA_FLOORS, Recipe, fly_recipe, recorded
 from visthrow import config
-from visthrow.diagnose.catalogue import ALL, Setting
+from visthrow.config.effects import catalogue
 from visthrow.diagnose.throw.cutting import cut
 from visthrow.diagnose.throw.recorded import record_of
 from visthrow.diagnose.throw.sightings import MEASURED, CameraView, _noise
@@ -48,8 +49,8 @@ class Eyes:
 
     def column(self, name: str) -> np.ndarray:
         """The same of an effect, a unit of it, by the step that the model takes."""
-        step = ALL[name].step * ALL[name].effect.floor
-        other = ALL[name].apply(self.setting, step)
+        step = catalogue()[name].step * catalogue()[name].floor
+        other = catalogue()[name].apply(self.setting, step)
         pairs = [(self.view.predicted(w, other) - self.view.predicted(w, self.setting), self.view.samples(w)[2])
                  for w in self.windows]  # fmt: skip
         return np.concatenate([change / sigma for change, sigma in pairs]) / step
@@ -85,7 +86,7 @@ def test_the_worlds_camera_sees_what_the_packages_sees():
 def test_every_effect_of_the_camera_is_measured_by_keypoints_alone(flown, name):
     """With a track that jumps at the ends of its pieces the latency was a tenth of what was hidden."""
     truth = SIZE * CAMERA_FLOORS[name]
-    assert CAMERA_FLOORS[name] == ALL[name].effect.floor
+    assert CAMERA_FLOORS[name] == catalogue()[name].floor
     eyes = Eyes(flown, {name: truth})
     column, off = eyes.column(name), eyes.off()
     assert column @ off / (column @ column) == pytest.approx(truth, rel=0.15)

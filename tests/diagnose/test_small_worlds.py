@@ -83,11 +83,11 @@ def test_a_dozen_small_worlds():
 @pytest.mark.slow
 def test_exchanged_names_would_be_noticed(monkeypatch):
     """Mutation: names of two effects are exchanged in the catalogue; worlds of another hand notice, the simulator's would not."""
-    from visthrow.diagnose import catalogue
+    from visthrow.config.effects import catalogue
 
-    one, other = catalogue.ALL["com_x"], catalogue.ALL["com_y"]
-    monkeypatch.setitem(catalogue.ALL, "com_x", replace(one, keys=other.keys))
-    monkeypatch.setitem(catalogue.ALL, "com_y", replace(other, keys=one.keys))
+    one, other = catalogue()["com_x"], catalogue()["com_y"]
+    monkeypatch.setitem(catalogue(), "com_x", replace(one, changes=other.changes))
+    monkeypatch.setitem(catalogue(), "com_y", replace(other, changes=one.changes))
     assert not right(Recipe(4, "rod", {"com_x": 3e-3}, FLOORS, **SMALL))
 
 

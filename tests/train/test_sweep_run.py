@@ -9,8 +9,8 @@ import time
 import numpy as np
 import pytest
 
-from visthrow.evidence.sweep.cli import load_list
 from visthrow.evidence.sweep.record import collect, status
+from visthrow.evidence.sweep.units import load_list
 from visthrow.onboard.policy import Policy
 from visthrow.throws import results
 

@@ -8,7 +8,7 @@ import pytest
 from sim.params import LawParams
 from visthrow import cli, config
 from visthrow.common.errors import ConfigError
-from visthrow.diagnose.catalogue import ALL
+from visthrow.config.effects import catalogue
 from visthrow.diagnose.extend import patch
 from visthrow.task import DiagnosedParams, Experiment, contract_of, plant_of
 from visthrow.training.posterior import drawn_plants
@@ -93,10 +93,10 @@ def test_a_law_is_written_as_a_block(diagnosis, tmp_path, capsys):
 
 def test_every_effect_can_be_written():
     before = shipped()
-    setting = patch.opened(patch.Setting(plant_of(before), camera=before.camera))
-    for name, e in ALL.items():
+    setting = patch.generalised(patch.Setting(plant_of(before), camera=before.camera))
+    for name, e in catalogue().items():
         if name != "step_error" and e.applies(setting):  # whose step is the replay's
-            theta = {name: 1.0 if e.switch else e.effect.floor}
+            theta = {name: 1.0 if e.switch else e.floor}
             content = patch.text("train/state.toml", before, theta, [[1e-12]], 1, ["test"])
             after = config.loads(Experiment, content)
             assert after != before, name

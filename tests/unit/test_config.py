@@ -135,6 +135,46 @@ def test_a_base_s_include_is_resolved_beside_the_base_before_merging(write):
     assert config.load(Outer, path).inner == Inner("b", (5.0, 6.0))
 
 
+@dataclass(frozen=True)
+class Row:
+    name: str
+    a: int
+    b: tuple[int, int]
+    c: int = 0
+
+
+@dataclass(frozen=True)
+class Rows:
+    rows: dict[str, Row]
+
+
+def test_a_table_among_like_ones_lies_on_top_of_its_base():
+    text = "[rows.z]\nbase = 'y'\nc = 5\n[rows.x]\na = 1\nb = [2, 3]\n[rows.y]\nbase = 'x'\na = 4\n"
+    loaded = config.loads(Rows, text)
+    assert loaded.rows == {"z": Row("z", 4, (2, 3), 5), "x": Row("x", 1, (2, 3)), "y": Row("y", 4, (2, 3))}
+    assert list(loaded.rows) == ["z", "x", "y"], "in the order of the file"
+    assert config.loads(Rows, config.dumps(loaded)) == loaded
+    assert config.loads(Rows, text, ["rows.x.a=7"]).rows["x"].a == 7
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[rows.x]\na = 1\nb = [1, 2]\n[rows.y]\nbase = 'z'", "rows.y.base: got 'z'; expected another table; known: x"),
+        ("[rows.x]\nbase = 'y'\n[rows.y]\nbase = 'x'", "rows.y.base: got 'x'"),
+        ("[rows.x]\nbase = 'x'", "rows.x.base: got 'x'"),
+        ("[rows.x]\nbase = { a = 1 }", "rows.x.base: got a table"),
+        ("[rows.x]\na = 1\nb = [1, 2]\n[rows.y]\nbase = 'x'\nd = 1", "rows.y.d: unknown key"),
+        ("[rows.x]\na = 1\n[rows.y]\nbase = 'x'", "missing b"),
+        ("[rows.x]\nname = 'y'\na = 1\nb = [1, 2]", "rows.x.name: got 'y'; expected the heading, 'x'"),
+    ],
+)
+def test_a_wrong_base_of_a_table_is_refused(text, said):
+    with pytest.raises(ConfigError) as caught:
+        config.loads(Rows, text)
+    assert said in str(caught.value)
+
+
 def test_circles_are_refused(write):
     write("a.toml", 'base = "b.toml"')
     path = write("b.toml", 'base = "a.toml"')

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
-from visthrow.diagnose.select import candidates, result, search, unknown
+from visthrow.diagnose.select import point as points
+from visthrow.diagnose.select import result, search, unknown
 from visthrow.diagnose.select.point import fitted, linearise
 
 EFFECTS = catalogue(12)
@@ -115,13 +116,13 @@ def test_a_candidate_that_is_refused_leaves_no_derivatives_behind(monkeypatch):
 @pytest.mark.parametrize("alike", [(), ("effect_05", "effect_07")])
 def test_what_looks_like_the_best_candidate_is_simulated_as_well(alike, monkeypatch):
     """Whatever derivatives promise: where a rope whips in two throws, they may say nothing of its mass in all others."""
-    plain, tried = candidates.candidate, []
+    plain, tried = points.candidate, []
 
     def candidate(problem, point, active):
         tried.append(tuple(active))
         return plain(problem, point, active)
 
-    monkeypatch.setattr(candidates, "candidate", candidate)
+    monkeypatch.setattr(points, "candidate", candidate)
     effects = [replace(e, confused_with=alike) if e.name == NAME else e for e in EFFECTS]
     diagnosis = search.explain(SyntheticModel(effects=tuple(effects), truth={NAME: SIZE}, seed=5), laws=False)
     assert diagnosis.named == (NAME,)

@@ -10,8 +10,7 @@ from tests.plants import paper_plant
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
 from visthrow.diagnose.likelihood.evidence import Priors
 from visthrow.diagnose.select import result, search
-from visthrow.diagnose.select.candidates import candidate
-from visthrow.diagnose.select.point import Problem, linearise, lost, only
+from visthrow.diagnose.select.point import Problem, candidate, linearise, lost, only
 from visthrow.diagnose.throw.cutting import RINGING
 from visthrow.diagnose.throw.states import HUNG
 from visthrow.diagnose.throw.throw_model import ThrowModel

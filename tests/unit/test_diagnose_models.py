@@ -12,7 +12,8 @@ from visthrow.common.errors import ConfigError, DiagnoseError, LogError
 from visthrow.diagnose.inputs import fit as fitting
 from visthrow.diagnose.inputs import setup as setups
 from visthrow.diagnose.models.ball import BallModel, BallParams
-from visthrow.diagnose.models.flyer import CableParams, FlyerModel, FlyerParams, TorqueParams
+from visthrow.diagnose.models.flyer import FlyerModel
+from visthrow.diagnose.models.flyer_params import CableParams, FlyerParams, TorqueParams
 from visthrow.diagnose.models.gimbal import GimbalModel, GimbalParams
 from visthrow.diagnose.models.pendulum import PendulumModel, PendulumParams
 from visthrow.diagnose.models.stand import StandModel, StandParams

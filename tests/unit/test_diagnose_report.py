@@ -357,7 +357,7 @@ def test_a_manoeuvre_in_which_the_payload_swings_too_far_is_not_proposed(monkeyp
     assert [fly_manoeuvres.swing(log) for log in logs] == pytest.approx([90.0, 54.0])
     monkeypatch.setattr(fly_manoeuvres, "_sensor_noise", lambda _: {})
     monkeypatch.setattr(fly_manoeuvres, "fly", lambda *_: logs)
-    monkeypatch.setattr(fly_manoeuvres, "entries_for", lambda *_: {})
+    monkeypatch.setattr(fly_manoeuvres, "effects_for", lambda *_: {})
     monkeypatch.setattr(fly_manoeuvres, "ThrowModel", lambda *_, **__: "a model")
     anything = SimpleNamespace(effects=(), setting=SimpleNamespace(plant=None, sensing=None), device="cpu", substep=1.0, theta={})
     assert fly_manoeuvres.simulator_of(anything, anything)(chosen) == [None, "a model"]

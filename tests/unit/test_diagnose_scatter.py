@@ -2,15 +2,14 @@
 
 import numpy as np
 
-from visthrow.diagnose.catalogue import ALL
-from visthrow.diagnose.catalogue.scatter import VARYING
+from visthrow.config.effects import catalogue, random_effects
 from visthrow.diagnose.extend import patch
 from visthrow.diagnose.likelihood.evidence import Priors
 from visthrow.diagnose.likelihood.marginal import Statistics
 from visthrow.diagnose.select.scatter import varying
 
 NAMES = ("release_lag", "payload_drag", "wind_x", "wind_y", "wind_z")
-EFFECTS = tuple(ALL[name].effect for name in NAMES)
+EFFECTS = tuple(catalogue()[name] for name in NAMES)
 PRIORS = Priors.of(EFFECTS, ("pos_w", "quat_wb", "payload_pos_w"))
 LEAST = 4.0
 
@@ -55,8 +54,8 @@ def test_three_flights_say_nothing():
 
 
 def test_training_draws_what_varies():
-    for v in VARYING:
-        assert all(ALL[name].effect.unit == v.unit and ALL[name].effect.block == v.block for name in v.of)
+    for v in random_effects():
+        assert all(catalogue()[name].unit == v.unit and catalogue()[name].block == v.block for name in v.of)
     report = {"scatter": [{"name": "lag_jitter", "found": True, "size": 0.01, "of": ["release_lag"]},
                           {"name": "gust", "found": False, "size": 0.2, "of": ["wind_x"]}]}  # fmt: skip
     theta, covariance = patch.with_scatter({"rope_length": 0.01}, [[1e-8]], report)

@@ -11,9 +11,8 @@ from visthrow.diagnose.likelihood.evidence import Priors
 from visthrow.diagnose.models.interface import LATENT_BLOCKS
 from visthrow.diagnose.reporting.blackbox import Table, table_of, train, unexplained
 from visthrow.diagnose.select import grammar, result, screening, search, unknown, verdicts
-from visthrow.diagnose.select.candidates import candidate
 from visthrow.diagnose.select.excess import acts_on
-from visthrow.diagnose.select.point import Problem, linearise
+from visthrow.diagnose.select.point import Problem, candidate, linearise
 
 EFFECTS = catalogue(12)
 IN_THE_BODY = ("vehicle torque", grammar.JOINT)

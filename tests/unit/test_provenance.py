@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import pytest
 
+from visthrow import config
 from visthrow.common import provenance
 from visthrow.common.errors import StorageError
 from visthrow.common.storage import atomic_write, write_json
@@ -43,13 +44,13 @@ def test_commit_of_a_copy_without_history_is_what_it_was_told(monkeypatch, tmp_p
 
 def test_run_folder_holds_config_and_record_and_is_not_overwritten(tmp_path):
     folder = tmp_path / "deep" / "run"
-    written = provenance.write_run_folder(folder, Settings(3, 1e-3), seed=3)
+    written = provenance.write_run_folder(folder, config.dumps(Settings(3, 1e-3)), seed=3)
     assert tomllib.loads((folder / "config.toml").read_text()) == {"seed": 3, "rate": 1e-3}
     assert json.loads((folder / "provenance.json").read_text()) == written
     assert written["seed"] == 3
     with pytest.raises(StorageError, match="holds a run already"):
-        provenance.write_run_folder(folder, Settings(4, 1.0))
-    provenance.write_run_folder(folder, Settings(4, 1.0), resume=True)
+        provenance.write_run_folder(folder, config.dumps(Settings(4, 1.0)))
+    provenance.write_run_folder(folder, config.dumps(Settings(4, 1.0)), resume=True)
     assert tomllib.loads((folder / "config.toml").read_text())["seed"] == 3
     assert (folder / "provenance_1.json").exists()
 

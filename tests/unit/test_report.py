@@ -12,7 +12,7 @@ from tests import made_up_results as made_up
 from visthrow import cli
 from visthrow.baseline import spline, thrower
 from visthrow.evidence.report import ablations, beyond, book, command, gap, throws, trade, wanted
-from visthrow.evidence.sweep.cli import load_list
+from visthrow.evidence.sweep.units import load_list
 from visthrow.throws import results
 from visthrow.throws.results import Result
 from visthrow.view import page

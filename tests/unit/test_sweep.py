@@ -13,9 +13,9 @@ from visthrow import cli, config
 from visthrow.common.errors import BusyError, ConfigError
 from visthrow.common.storage import write_json
 from visthrow.evidence.sweep import pool, units
-from visthrow.evidence.sweep.cli import load_list
 from visthrow.evidence.sweep.lock import Lock, held
 from visthrow.evidence.sweep.record import collect, status
+from visthrow.evidence.sweep.units import load_list
 from visthrow.throws import results
 
 LIST = """

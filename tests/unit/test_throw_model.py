@@ -9,16 +9,16 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from camera.keypoints import KeypointCamera, keypoints
 from camera.params import CameraParams
+from sim.effects.setting import generalised
 from sim.params import SensingParams
 from tests.flown import fly, setting_with
 from tests.plants import paper_plant
 from visthrow import config
 from visthrow.common.errors import DiagnoseError
-from visthrow.diagnose.catalogue import ALL
+from visthrow.config.effects import catalogue
 from visthrow.diagnose.likelihood.evidence import Priors
 from visthrow.diagnose.select.point import Problem, curvature, linearise, moved
 from visthrow.diagnose.throw import settling
-from visthrow.diagnose.throw.opened import opened
 from visthrow.diagnose.throw.recorded import record_of
 from visthrow.diagnose.throw.settling import Settling
 from visthrow.diagnose.throw.throw_model import ThrowModel
@@ -192,16 +192,16 @@ def test_what_is_known_of_the_sensors_is_taken_off():
 
 
 def test_the_catalogue_is_sound():
-    plant = dataclasses.replace(opened(setting_with({})), camera=config.load(CameraParams, config.find("camera", "fisheye")))
-    for name, e in ALL.items():
-        assert e.effect.bounds[0] <= 0.0 <= e.effect.bounds[1], name
-        assert 0.0 < e.effect.floor < 3.0 * e.effect.prior_sd, name
-        assert e.effect.channels, name
-        assert e.effect.source, name
+    plant = dataclasses.replace(generalised(setting_with({})), camera=config.load(CameraParams, config.find("camera", "fisheye")))
+    for name, e in catalogue().items():
+        assert e.bounds[0] <= 0.0 <= e.bounds[1], name
+        assert 0.0 < e.floor < 3.0 * e.prior_sd, name
+        assert e.channels, name
+        assert e.source, name
         if e.applies(plant):
-            low, high = e.bounded(plant).effect.bounds
+            low, high = e.bounded(plant).bounds
             assert low <= 0.0 < high, name
-            assert e.apply(plant, e.effect.bounds[1] if e.switch else e.step * e.effect.floor) != plant, name
+            assert e.apply(plant, e.bounds[1] if e.switch else e.step * e.floor) != plant, name
             assert e.apply(plant, 0.0) == plant, name
 
 

@@ -16,6 +16,7 @@ from visthrow.baseline.pendulum import Pendulum, pendulum_of
 from visthrow.baseline.plan import Plan, plan_throw
 from visthrow.baseline.release import default_release
 from visthrow.baseline.spline import PlanParams
+from visthrow.common.statistics import pareto
 from visthrow.task import Experiment, plant_of
 from visthrow.view.tables import PAPER
 
@@ -121,16 +122,6 @@ def sweep(
             rows.append(study.fly(plan, "pendulum", "none"))
             rows += [study.fly(plan, plant, "both") for plant in plants]
     return rows
-
-
-def pareto(points: np.ndarray) -> np.ndarray:
-    """Indices of the points (N, 2), smaller is better in both, that no other one beats; by the first coordinate."""
-    front, best = [], np.inf
-    for i in np.lexsort((points[:, 1], points[:, 0])):
-        if points[i, 1] < best:
-            front.append(int(i))
-            best = points[i, 1]
-    return np.array(front, dtype=int)
 
 
 def hypervolume(points: np.ndarray, corner: tuple[float, float] = CORNER) -> float:

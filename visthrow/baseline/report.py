@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from visthrow.baseline.front import PAPER_FRONT, PAPER_TABLE, pareto, points_of
+from visthrow.baseline.front import PAPER_FRONT, PAPER_TABLE, points_of
 from visthrow.common import style
+from visthrow.common.statistics import pareto
 from visthrow.common.storage import atomic_write
 
 PAPER_VEHICLE = {"state": (1.154, 0.105), "vision": (1.125, 0.101)}

@@ -10,7 +10,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from visthrow import __version__, config
+from visthrow import __version__
 from visthrow.common.errors import StorageError
 from visthrow.common.storage import atomic_write, write_json
 
@@ -78,12 +78,12 @@ def collect() -> dict[str, Any]:
     }
 
 
-def write_run_folder(folder: str | Path, run_config: Any, *, resume: bool = False, **extra: Any) -> dict[str, Any]:
+def write_run_folder(folder: str | Path, config_text: str, *, resume: bool = False, **extra: Any) -> dict[str, Any]:
     """Write the resolved config and the provenance beside the results of a run.
 
     Args:
         folder: Folder of the run; made if it is not there.
-        run_config: The dataclass that the run uses, written to ``config.toml``.
+        config_text: The resolved config of the run as TOML, written to ``config.toml``.
         resume: Whether the folder may hold a run already; its config is left, the provenance goes to the next free
             ``provenance_<n>.json``.
         **extra: JSON-able values that join the provenance, for instance ``seed=3``.
@@ -102,7 +102,7 @@ def write_run_folder(folder: str | Path, run_config: Any, *, resume: bool = Fals
         count = len(list(folder.glob("provenance*.json")))
         write_json(folder / f"provenance_{count}.json", record)
         return record
-    atomic_write(folder / "config.toml", config.dumps(run_config))
+    atomic_write(folder / "config.toml", config_text)
     write_json(folder / "provenance.json", record)
     return record
 

@@ -9,9 +9,11 @@ Both paths are looked up beside the file first, then under the configs folder, t
 of ``configs/train/vision.toml`` finds its ``base = "state.toml"`` wherever it lies. Overrides (``"vehicle.body.mass=0.25"``)
 come last. ``"none"`` stands for None where a field is optional; ints pass for floats, bools never for numbers; NaN and
 infinity are refused.
+
+Among like tables (``[effects.wind_x]``, ``[effects.wind_y]``) one may name a sibling: ``base = "wind_x"`` puts the sibling's values
+under the table's own. A field ``name`` of such tables is their heading.
 """
 
-import copy
 import dataclasses
 import tomllib
 from collections.abc import Iterable
@@ -22,10 +24,9 @@ from visthrow.common import toml_text
 from visthrow.common.errors import ConfigError, suggest
 from visthrow.config import schema as _schema
 from visthrow.config.kinds import kinds_of
-from visthrow.config.schema import NONE_WORD, Leaf, Table, dataclass_of
+from visthrow.config.schema import BASE_KEY, NONE_WORD, Leaf, Table, dataclass_of, merged
 
 T = TypeVar("T")
-_BASE_KEY = "base"
 
 
 def load(schema: type[T], path: str | Path, overrides: Iterable[str] = ()) -> T:
@@ -190,14 +191,14 @@ def _parse(schema: type, text: str, name: str, folder: Path, stack: tuple[Path, 
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{name}: no valid TOML: {error}") from None
     # A schema may itself have a field called "base"; then the word is an ordinary key.
-    base = raw.pop(_BASE_KEY, None) if _BASE_KEY not in _schema.hints(schema) else None
+    base = raw.pop(BASE_KEY, None) if BASE_KEY not in _schema.hints(schema) else None
     tree = _schema.as_node(raw, name)
     _include(schema, tree, folder, stack, "")
     if base is None:
         return tree
     if not isinstance(base, str):
-        _schema.fail(name, _BASE_KEY, f"got {base!r}; expected the path of one other file")
-    return _merged(_read(schema, _lookup(schema, base, folder, name, _BASE_KEY), stack), tree)
+        _schema.fail(name, BASE_KEY, f"got {base!r}; expected the path of one other file")
+    return merged(_read(schema, _lookup(schema, base, folder, name, BASE_KEY), stack), tree)
 
 
 def _include(schema: type, tree: Table, folder: Path, stack: tuple[Path, ...], path: str) -> None:
@@ -220,15 +221,6 @@ def _lookup(schema: type, name: str, folder: Path, source: str, key: str) -> Pat
             return candidate
     shipped = {path.relative_to(root).as_posix() for kind in kinds or ("**",) for path in root.glob(f"{kind}/*.toml")}
     _schema.fail(source, key, f"no file '{name}', neither in {_shown(folder)} nor under configs; {suggest(name, shipped)}")
-
-
-def _merged(under: Table, over: Table) -> Table:
-    merged = Table(over.source, copy.copy(under.items))
-    for key, item in over.items.items():
-        below = merged.items.get(key)
-        both = isinstance(item, Table) and isinstance(below, Table)
-        merged.items[key] = _merged(below, item) if both else item
-    return merged
 
 
 def _override(schema: type, tree: Table, override: str) -> None:

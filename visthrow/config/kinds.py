@@ -11,6 +11,7 @@ SCHEMAS = {
     "camera": "camera.params:CameraParams",
     "release": "sim.params:ReleaseParams",
     "sim": "sim.params:SimParams",
+    "effects": "sim.effects.effect:EffectTables",
     "task": "visthrow.task:TaskParams",
     "start": "sim.params:RandomizationParams",
     "train": "visthrow.task:Experiment",

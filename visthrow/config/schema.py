@@ -12,6 +12,8 @@ from visthrow.common.errors import ConfigError, suggest
 
 NONE_WORD = "none"
 """TOML has no null: this string stands for None wherever a field is optional."""
+BASE_KEY = "base"
+"""Names what lies under a file (another file) or under a table among like ones (a sibling)."""
 
 
 @dataclass
@@ -111,7 +113,7 @@ def build(annotation: Any, node: Leaf | Table, path: str = "") -> Any:
     if origin is dict:
         if not isinstance(node, Table):
             _wrong_type(annotation, node, path)
-        return {key: build(args[1], item, _join(path, key)) for key, item in node.items.items()}
+        return {key: build(args[1], item, _join(path, key)) for key, item in _rows(args[1], node, path).items()}
     if isinstance(node, Table):
         fail(node.source, path, f"got a table with the keys {', '.join(node.items)}; expected {describe(annotation)}")
     if origin is tuple:
@@ -161,6 +163,47 @@ def _build_dataclass(schema: type, node: Leaf | Table, path: str) -> Any:
         return schema(**values)
     except (ValueError, ConfigError) as error:
         fail(node.source, path, str(error))
+
+
+def _rows(annotation: Any, node: Table, path: str) -> dict[str, Leaf | Table]:
+    """Return like tables of one table, each on top of the sibling that it names as its base; a field ``name`` is the heading."""
+    schema = dataclass_of(annotation)
+    if schema is None or BASE_KEY in hints(schema):
+        return node.items
+
+    def row(key: str, above: tuple[str, ...]) -> Leaf | Table:
+        item = node.items[key]
+        if not isinstance(item, Table):
+            return item
+        own = Table(item.source, {k: v for k, v in item.items.items() if k != BASE_KEY})
+        if "name" in hints(schema):
+            given = own.items.get("name")
+            if given is not None and not (isinstance(given, Leaf) and given.value == key):
+                fail(item.source, _join(_join(path, key), "name"), f"got {_shown(given)}; expected the heading, {key!r}")
+            own.items["name"] = Leaf(key, item.source)
+        base = item.items.get(BASE_KEY)
+        if base is None:
+            return own
+        others = {k for k, v in node.items.items() if isinstance(v, Table)} - {key, *above}
+        if not isinstance(base, Leaf) or base.value not in others:
+            problem = f"got {_shown(base)}; expected another table; {suggest(_shown(base), others)}"
+            fail(item.source, _join(_join(path, key), BASE_KEY), problem)
+        return merged(row(base.value, (key, *above)), own)
+
+    return {key: row(key, ()) for key in node.items}
+
+
+def _shown(node: Leaf | Table) -> str:
+    return repr(node.value) if isinstance(node, Leaf) else "a table"
+
+
+def merged(under: Table, over: Table) -> Table:
+    """Return one table with another's values on top of its own, table by table."""
+    both = Table(over.source, dict(under.items))
+    for key, item in over.items.items():
+        below = both.items.get(key)
+        both.items[key] = merged(below, item) if isinstance(item, Table) and isinstance(below, Table) else item
+    return both
 
 
 def _build_tuple(annotation: Any, node: Leaf, path: str) -> tuple:

@@ -5,11 +5,11 @@ import importlib
 from typing import Any
 
 ACTIONS = {
-    "check": ("look at logs: clocks, units, frames, gaps, what is excited, what they can answer", "visthrow.diagnose.check.cli"),
+    "check": ("look at logs: clocks, units, frames, gaps, what is excited, what they can answer", "visthrow.diagnose.inputs.check_cli"),
     "explain": ("say what the simulation gets wrong about flights, and what that is worth", "visthrow.diagnose.reporting.explain_cli"),
     "apply": ("write the configuration that a diagnosis asks for, ready to train in", "visthrow.diagnose.extend.apply_cli"),
     "fit": ("make the first configuration of your own vehicle or motor, from flights without payload", "visthrow.diagnose.inputs.fit_cli"),
-    "plan": ("propose the manoeuvre that separates what could not be separated", "visthrow.diagnose.planning.plan_cli"),
+    "plan": ("propose the manoeuvre that separates what could not be separated", "visthrow.diagnose.reporting.plan_cli"),
     "loop": ("hide an effect in the reference plant, find it, train with it, fly again", "visthrow.diagnose.proof.loop_cli"),
     "blind": ("hide effects in your own noise: which sizes would be named", "visthrow.diagnose.reporting.blind_cli"),
 }

@@ -53,6 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Train."""
+    from visthrow import config
     from visthrow.common import provenance
     from visthrow.common.errors import TrainError
     from visthrow.training import device
@@ -77,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
             trainer.step()
         return 0
     told = {"seed": seed} | ({"from": _origin(args.start, policy)} if policy is not None else {})
-    provenance.write_run_folder(folder, experiment, resume=args.resume, **told)
+    provenance.write_run_folder(folder, config.dumps(experiment), resume=args.resume, **told)
     why = _loop(args, trainer, folder, last)
     _report(args, trainer, folder, time.perf_counter() - start, finished=why in (DONE, REACHED))
     if why in (DONE, REACHED):

@@ -6,14 +6,15 @@ from typing import Any
 
 import numpy as np
 
+from sim.effects.effect import apply
 from sim.effects.laws import check_laws
+from sim.effects.setting import Setting, generalised, specialised
 from sim.params import LawParams
 from visthrow import config
 from visthrow.common.errors import DiagnoseError
 from visthrow.common.toml_text import dumps
-from visthrow.diagnose.catalogue import ALL, Setting, apply
+from visthrow.config.effects import catalogue, chosen
 from visthrow.diagnose.select.scatter import variances
-from visthrow.diagnose.throw.opened import closed, opened
 from visthrow.task import Experiment, plant_of
 
 
@@ -21,11 +22,11 @@ def extended(experiment: Experiment, theta: Mapping[str, float]) -> Experiment:
     """The experiment whose plant and sensors have these effects.
 
     Raises:
-        DiagnoseError: An effect that the catalogue does not hold.
+        ConfigError: An effect that the catalogue does not hold.
     """
-    base = opened(Setting(plant_of(experiment), experiment.sensing, camera=experiment.camera))
-    found = apply(ALL, base, theta)
-    plant = closed(found.plant, plant_of(experiment))
+    base = generalised(Setting(plant_of(experiment), experiment.sensing, camera=experiment.camera))
+    found = apply(chosen(theta), base, theta)
+    plant = specialised(found.plant, plant_of(experiment))
     return dataclasses.replace(
         experiment, vehicle=plant.vehicle, rope=plant.rope, release=plant.release, air=plant.air, sensing=found.sensing,
         camera=found.camera,
@@ -49,7 +50,7 @@ def touched(theta: Mapping[str, float]) -> dict[str, list[str]]:
     """Dotted key of an experiment -> effects that change it."""
     keys: dict[str, list[str]] = {}
     for name in theta:
-        for key in ALL[name].keys:
+        for key in catalogue()[name].changes:
             path = key.path.removeprefix("plant.")
             keys.setdefault(path, []).append(name)
     return keys
@@ -84,8 +85,8 @@ def text(
     for line in dumps(changed).splitlines():
         section = line.strip("[]") if line.startswith("[") else section
         path = f"{section}.{line.split(' = ')[0]}" if " = " in line else ""
-        switched = [n for n in theta if ALL[n].switch is not None]
-        words = [f"{n} {theta[n]:+.4g} +- {sd[n]:.2g} {ALL[n].effect.unit}" for n in about.get(path, [])]
+        switched = [n for n in theta if catalogue()[n].switch]
+        words = [f"{n} {theta[n]:+.4g} +- {sd[n]:.2g} {catalogue()[n].unit}" for n in about.get(path, [])]
         if " = " in line and not words:
             words = ["of the diagnosis above"] if section == "diagnosed" or line.startswith("laws") else switched
         lines.append(f"{line}  # {'; '.join(words)}" if words else line)
@@ -94,7 +95,8 @@ def text(
 
 def _diagnosed(experiment: Experiment, theta: Mapping[str, float], covariance: Sequence[Sequence[float]], plants: int):
     """The joint posterior of the plant's own numbers: not of the sensors, the replay's step or which blocks there are."""
-    own = [i for i, name in enumerate(theta) if ALL[name].keys and all(k.path.startswith("plant.") for k in ALL[name].keys)]
+    changes = [catalogue()[name].changes for name in theta]
+    own = [i for i, keys in enumerate(changes) if keys and all(k.path.startswith("plant.") for k in keys)]
     names = list(theta)
     rows = tuple(tuple(float(covariance[i][j]) for j in own) for i in own)
     return dataclasses.replace(experiment.diagnosed, effects=tuple(names[i] for i in own), covariance=rows, plants=plants)
@@ -138,7 +140,7 @@ def read(report: Mapping[str, Any], path: str) -> tuple[dict[str, float], list[l
         raise DiagnoseError(f"{path}: no diagnosis that `visthrow diagnose explain` wrote: {error!r}") from error
     if len(covariance) != len(theta) or any(len(row) != len(theta) for row in covariance):
         raise DiagnoseError(f"{path}: {len(theta)} effects and a covariance of {len(covariance)} rows; expected one each")
-    strange = [name for name in theta if name not in ALL]
+    strange = [name for name in theta if name not in catalogue()]
     if strange:
         raise DiagnoseError(
             f"{path}: {', '.join(strange)} are no effects of the throw's simulator; apply writes configurations of that alone"

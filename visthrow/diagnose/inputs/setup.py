@@ -7,7 +7,7 @@ from pathlib import Path
 
 from visthrow.common.errors import ConfigError
 from visthrow.diagnose.models.ball import BallParams
-from visthrow.diagnose.models.flyer import FlyerParams
+from visthrow.diagnose.models.flyer_params import FlyerParams
 from visthrow.diagnose.models.gimbal import GimbalParams
 from visthrow.diagnose.models.interface import Model
 from visthrow.diagnose.models.pendulum import PendulumParams

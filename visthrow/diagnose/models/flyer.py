@@ -5,70 +5,14 @@ flies; where each motor's command is logged, the rates follow too. No controller
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
-from visthrow.common.errors import ConfigError
 from visthrow.diagnose.models.flyer_effects import effects_of
+from visthrow.diagnose.models.flyer_params import FlyerParams
 from visthrow.diagnose.models.flyer_windows import FINE, stretches_of
 from visthrow.diagnose.models.numeric import Lanes, NumericModel, Stretch, cross, hermite, integrate, latent_force
 from visthrow.logs.flightlog import FlightLog
-
-
-@dataclass(frozen=True)
-class CableParams:
-    """Payload on a massless cable at the vehicle's centre of mass."""
-
-    length: float  # to the payload's centre [m]
-    mass: float  # of the payload [kg]
-
-
-@dataclass(frozen=True)
-class TorqueParams:
-    """What turns commands of single motors into rates."""
-
-    inertia: tuple[float, float, float]  # [kg m^2]
-    arm_x: float  # of each rotor from the centre of mass, along x and along y [m]
-    arm_y: float
-    torque_ratio: float  # drag torque over thrust [m]
-    spin: tuple[float, float, float, float]  # +1 turns clockwise seen from above; order of the rotors as everywhere
-
-
-@dataclass(frozen=True)
-class FlyerParams:
-    """The vehicle that is assumed before anything is found.
-
-    Raises:
-        ConfigError: ``input`` names no channel that commands come from, or the thrust map does not rise.
-    """
-
-    input: Literal["motor_command", "motor_speed", "thrust_command", "command"]  # channel of the commands
-    position: str  # channel of the measured position
-    attitude: str  # channel of the measured attitude
-    mass: float  # of the vehicle alone [kg]
-    gravity: float  # [m/s^2]
-    thrust_map: tuple[float, float, float]  # thrust of a motor (of all, for a thrust command) by powers 0, 1, 2 of its input [N]
-    motor_time_constant: float  # [s]
-    command_delay: float  # [s]
-    reference_voltage: float  # at which the map holds [V]
-    voltage_coefficient: float  # thrust changes by this share a volt [1/V]
-    drag_xy: float  # rotor drag [kg/s]
-    drag_z: float  # [kg/s]
-    lowest: float  # windows keep above this height [m]
-    window: float  # [s]
-    step: float  # of the integration [s]
-    every: int  # the position samples taken: each so-manieth
-    most_windows: int  # spread evenly over all logs
-    torque: TorqueParams | None = None  # None: rates are not simulated
-    cable: CableParams | None = None  # None: no payload
-
-    def __post_init__(self) -> None:
-        if self.torque is not None and self.input not in ("motor_command", "motor_speed"):
-            raise ConfigError(f"torque needs commands of single motors; the input is '{self.input}'")
-        if self.thrust_map[1] <= 0.0 and self.thrust_map[2] <= 0.0:
-            raise ConfigError(f"thrust_map {self.thrust_map} does not rise")
 
 
 class FlyerModel(NumericModel):

@@ -1,17 +1,13 @@
 """Catalogue of a quadrotor that is driven by its logged commands and its measured attitude."""
 
-from typing import TYPE_CHECKING
-
+from visthrow.diagnose.models.flyer_params import FlyerParams
 from visthrow.diagnose.models.interface import Effect
-
-if TYPE_CHECKING:
-    from visthrow.diagnose.models.flyer import FlyerParams
 
 _SCALE = ("hover with and without a weighed load",)
 _YAW = ("hover at two yaw angles half a turn apart",)
 
 
-def effects_of(params: "FlyerParams") -> list[Effect]:
+def effects_of(params: FlyerParams) -> list[Effect]:
     """Entries that apply, with priors in proportion to the vehicle's weight where a force is meant."""
     seen = (params.position, params.attitude, params.input)
     found = [*_thrust(params, seen), *_aero(params, seen), *_sensing(params, seen)]
@@ -22,7 +18,7 @@ def effects_of(params: "FlyerParams") -> list[Effect]:
     return found
 
 
-def _thrust(params: "FlyerParams", seen: tuple[str, ...]) -> list[Effect]:
+def _thrust(params: FlyerParams, seen: tuple[str, ...]) -> list[Effect]:
     return [
         Effect("thrust_gain", "the thrust map's scale", "T (1 + theta)", "1", "thrust map", (-0.6, 0.6), 0.1, 2e-3, seen,
                "Agilicious 2022", ("mass_quad",), _SCALE),
@@ -40,7 +36,7 @@ def _thrust(params: "FlyerParams", seen: tuple[str, ...]) -> list[Effect]:
     ]  # fmt: skip
 
 
-def _aero(params: "FlyerParams", seen: tuple[str, ...]) -> list[Effect]:
+def _aero(params: FlyerParams, seen: tuple[str, ...]) -> list[Effect]:
     weight = params.mass / 0.21  # the table's priors are those of a 0.21 kg vehicle
     return [
         Effect("rotor_drag_xy", "rotor drag across the shafts", "F -= theta (v_x, v_y, 0)", "kg/s", "aero",
@@ -55,7 +51,7 @@ def _aero(params: "FlyerParams", seen: tuple[str, ...]) -> list[Effect]:
     ]  # fmt: skip
 
 
-def _sensing(params: "FlyerParams", seen: tuple[str, ...]) -> list[Effect]:
+def _sensing(params: FlyerParams, seen: tuple[str, ...]) -> list[Effect]:
     found = [
         Effect("pose_delay", "the delay of the measured position", "y(t) = x(t - theta)", "s", "sensing", (-0.1, 0.1), 5e-3, 5e-4,
                seen, "motion capture pipelines", ("cmd_delay",), ()),
@@ -77,7 +73,7 @@ def _sensing(params: "FlyerParams", seen: tuple[str, ...]) -> list[Effect]:
     return found
 
 
-def _torque(params: "FlyerParams", seen: tuple[str, ...]) -> list[Effect]:
+def _torque(params: FlyerParams, seen: tuple[str, ...]) -> list[Effect]:
     motors = {"fl": "front left", "fr": "front right", "rl": "rear left", "rr": "rear right"}
     of = params.torque
     return [
@@ -93,7 +89,7 @@ def _torque(params: "FlyerParams", seen: tuple[str, ...]) -> list[Effect]:
     ]  # fmt: skip
 
 
-def _cable(params: "FlyerParams", seen: tuple[str, ...]) -> list[Effect]:
+def _cable(params: FlyerParams, seen: tuple[str, ...]) -> list[Effect]:
     of = params.cable
     return [
         Effect("rope_length", "the cable's length", "|p_p - p_q| = L + theta", "m", "rope", (-0.5 * of.length, of.length),

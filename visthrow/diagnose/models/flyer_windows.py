@@ -1,17 +1,14 @@
 """Cuts logs of a quadrotor into windows: measurements, inputs on a grid, first guesses of the state."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sim.reference.rotations import rotation_from_quat
 from visthrow.common.errors import LogError
+from visthrow.diagnose.models.flyer_params import FlyerParams
 from visthrow.diagnose.models.numeric import Stretch, latent_layout, sigma_of
 from visthrow.logs.flightlog import Channel, FlightLog
-
-if TYPE_CHECKING:
-    from visthrow.diagnose.models.flyer import FlyerParams
 
 FINE = 16
 """Steps of the commands' table in a step of the integration: commands switch at their own times."""
@@ -27,7 +24,7 @@ _IDLE = 0.3
 """Windows in which the thrust falls below this share of the weight are on the ground."""
 
 
-def stretches_of(logs: Sequence[FlightLog], params: "FlyerParams", channels: Sequence[str]) -> list[Stretch]:
+def stretches_of(logs: Sequence[FlightLog], params: FlyerParams, channels: Sequence[str]) -> list[Stretch]:
     """Windows of all logs, at most ``most_windows``, spread evenly.
 
     Raises:
@@ -50,7 +47,7 @@ def _holds(log: FlightLog, name: str) -> bool:
     return name in log and bool(np.any(log[name].valid))
 
 
-def _expect_thrust(found: Sequence[Stretch], params: "FlyerParams") -> None:
+def _expect_thrust(found: Sequence[Stretch], params: FlyerParams) -> None:
     """Refuse commands of another unit: they carry neither the vehicle nor anything like it."""
     weight = params.gravity * (params.mass + (params.cable.mass if params.cable is not None else 0.0))
     told = np.concatenate([s.data["input"] for s in found])
@@ -62,7 +59,7 @@ def _expect_thrust(found: Sequence[Stretch], params: "FlyerParams") -> None:
         )
 
 
-def _windows(log: FlightLog, number: int, params: "FlyerParams", channels: Sequence[str]) -> list[Stretch]:
+def _windows(log: FlightLog, number: int, params: FlyerParams, channels: Sequence[str]) -> list[Stretch]:
     sigma = {name: sigma_of(log[name], _least(name)) for name in channels}
     position, attitude, told = log[params.position], log[params.attitude], log[params.input]
     first = max(c.time[0] for c in (position, attitude, told))
@@ -88,7 +85,7 @@ def _covered(channel: Channel, start: float, end: float) -> bool:
     return len(inside) > 5 and float(np.max(np.diff(np.concatenate([[start], inside, [end]])))) < _MOST_MISSING
 
 
-def _window(log, number: int, params: "FlyerParams", channels, sigma, start: float) -> Stretch | None:
+def _window(log, number: int, params: FlyerParams, channels, sigma, start: float) -> Stretch | None:
     end = start + params.window
     rows = [_samples(log[name], start, end, params.every) for name in channels]
     if any(len(time) < 5 for time, _ in rows[:1]):
@@ -118,7 +115,7 @@ def _samples(channel: Channel, start: float, end: float, every: int) -> tuple[np
     return channel.time[inside], channel.values[inside].astype(float)
 
 
-def _inputs(channel: Channel, params: "FlyerParams", start: float) -> np.ndarray:
+def _inputs(channel: Channel, params: FlyerParams, start: float) -> np.ndarray:
     """Held commands on fine steps from one window before the start to its end, shape (fine steps, motors)."""
     count = FINE * round(params.window / params.step)
     times = start - params.window + params.step / FINE * np.arange(2 * count + 1)
@@ -142,7 +139,7 @@ def _line(time: np.ndarray, values: np.ndarray, start: float) -> tuple[np.ndarra
     return value, slope
 
 
-def _guess(rows, channels, params: "FlyerParams") -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _guess(rows, channels, params: FlyerParams) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Unknowns at the start, their spread, and the cable's direction there."""
     start = float(rows[0][0][0])
     pos, vel = _line(*rows[0], start)

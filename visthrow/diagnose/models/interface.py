@@ -15,27 +15,7 @@ from typing import Protocol
 
 import numpy as np
 
-
-@dataclass(frozen=True)
-class Effect:
-    """One cause that reality may have and the model lacks, or has with another size.
-
-    The size theta is a *deviation*: 0 means that the model is right as it stands.
-    """
-
-    name: str  # identifier, such as rope_length
-    cause: str  # in words, as the first half of a sentence
-    equation: str  # what it changes, with theta
-    unit: str  # of theta
-    block: str  # block of the simulator that holds the equation, such as rope, motor, sensing
-    bounds: tuple[float, float]  # physically possible values of theta
-    prior_sd: float  # spread of theta where the effect is present
-    floor: float  # size below which it does not matter: numerics, and 5 mm of landing or a tenth of the noise
-    channels: tuple[str, ...]  # channels of the log without which it cannot be seen
-    source: str  # of equation and prior
-    confused_with: tuple[str, ...] = ()  # effects that look alike in ordinary flights
-    manoeuvres: tuple[str, ...] = ()  # manoeuvres that separate it from those
-    switch: bool = False  # theta is 0 or 1: another kind of block, of which a derivative says little
+from sim.effects.effect import Effect
 
 
 @dataclass(frozen=True)

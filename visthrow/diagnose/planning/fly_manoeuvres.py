@@ -5,12 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from sim.effects.effect import apply
 from visthrow.common.errors import DiagnoseError
-from visthrow.diagnose.catalogue import apply, entries_for
 from visthrow.diagnose.models.interface import Model
 from visthrow.diagnose.planning.manoeuvres import PERIOD, Manoeuvre, Reference
 from visthrow.diagnose.planning.plan import log_of
 from visthrow.diagnose.select.result import Diagnosis
+from visthrow.diagnose.throw.effects import effects_for
 from visthrow.diagnose.throw.throw_model import ThrowModel
 from visthrow.logs.flightlog import FlightLog
 from visthrow.onboard.hover import HoverController, HoverParams
@@ -50,7 +51,7 @@ def simulator_of(model: ThrowModel, diagnosis: Diagnosis, *, seed: int = 0) -> C
             if manoeuvre.payload and not swing(log) < HIGHEST:
                 models.append(None)
                 continue
-            there = entries_for(model.setting, set(log.channels), manoeuvre.payload, np.isfinite(manoeuvre.release))
+            there = effects_for(model.setting, set(log.channels), manoeuvre.payload, np.isfinite(manoeuvre.release))
             try:
                 models.append(ThrowModel([log], model.setting.plant, sensing=model.setting.sensing, device=model.device,
                                          substep=COARSE * model.substep, only=[n for n in there if n in asked],

@@ -328,7 +328,7 @@ def table(records: Sequence[Mapping[str, Any]]) -> str:
 
 def picture(records: Sequence[Mapping[str, Any]]) -> bytes:
     """Mean landing errors with intervals, a group a loop, as PNG."""
-    from visthrow.evidence.report.figures import Mark, marks
+    from visthrow.view.figures import Mark, marks
 
     rows = [
         Mark(hidden_text(r), statistics.mean(1e3 * landed(r["throws"][name])), WHO.index(name))

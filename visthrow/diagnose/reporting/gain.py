@@ -17,9 +17,9 @@ from visthrow.diagnose.likelihood.marginal import Statistics, gather, gram_of, w
 from visthrow.diagnose.models.interface import Model
 from visthrow.diagnose.reporting.blackbox import table_of, train
 from visthrow.diagnose.reporting.forms import HORIZONS, Forms, forms, unit_of
+from visthrow.diagnose.reporting.landing_gain import LandingGain, landing_gain
 from visthrow.diagnose.select.point import Point
 from visthrow.diagnose.select.result import Diagnosis
-from visthrow.diagnose.throw.landing import LandingGain, landing_gain
 
 DRAWS = 10_000
 MOST_FOLDS = 12

@@ -11,10 +11,10 @@ from visthrow.diagnose.models.interface import Window
 from visthrow.diagnose.reporting.blind import Blind
 from visthrow.diagnose.reporting.forms import unit_of
 from visthrow.diagnose.reporting.gain import Gain
+from visthrow.diagnose.reporting.landing_gain import LandingGain
 from visthrow.diagnose.select import result
 from visthrow.diagnose.select.result import Diagnosis
-from visthrow.diagnose.select.work import Work
-from visthrow.diagnose.throw.landing import LandingGain
+from visthrow.diagnose.select.state import Work
 from visthrow.view.parts import png_of
 
 WIDTH = 9.2

@@ -11,9 +11,9 @@ from visthrow.diagnose.reporting import pictures
 from visthrow.diagnose.reporting.blind import Blind
 from visthrow.diagnose.reporting.forms import HEAD_SECONDS
 from visthrow.diagnose.reporting.gain import ChannelGain, Gain
+from visthrow.diagnose.reporting.landing_gain import LandingGain
 from visthrow.diagnose.select import result
 from visthrow.diagnose.select.result import Diagnosis, Finding
-from visthrow.diagnose.throw.landing import LandingGain
 from visthrow.view.parts import Grid, Picture, Section, Text
 
 if TYPE_CHECKING:

@@ -2,15 +2,12 @@
 
 from collections.abc import Sequence
 from itertools import combinations
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from visthrow.diagnose.likelihood.evidence import additions, log_evidence, pair_additions, set_additions
-
-if TYPE_CHECKING:
-    from visthrow.diagnose.select.point import Point
-    from visthrow.diagnose.select.search import Search
+from visthrow.diagnose.select.point import Point
+from visthrow.diagnose.select.state import SearchState
 
 CLOSE = 3.0
 """Sets of causes within this many nats of the best are reported as equally possible."""
@@ -31,7 +28,7 @@ FAR = 25.0
 """The same as :data:`DOUBT` where two others stand in place of two: sizes move far together, and derivatives tell less."""
 
 
-def rivals(search: "Search") -> list[tuple[list[int], float]]:
+def rivals(search: SearchState) -> list[tuple[list[int], float]]:
     """Sets to be settled by running the simulation, with their nats against those named; every name costs the threshold.
 
     Args:
@@ -60,13 +57,13 @@ def rivals(search: "Search") -> list[tuple[list[int], float]]:
     return ranked + [v for v in sorted(pairs, key=lambda v: -v[1]) if tuple(v[0]) not in known][:PAIRS]
 
 
-def _linear(search: "Search", active: Sequence[int], point: "Point | None" = None) -> float:
+def _linear(search: SearchState, active: Sequence[int], point: Point | None = None) -> float:
     """Evidence of a set, less what its names cost; by the statistics of a point, by default where the search stands."""
     at = search.point if point is None else point
     return log_evidence(at.information, at.score, search.priors, active) - search.least * len(active)
 
 
-def _all_linear(search: "Search", sets: Sequence[tuple[int, ...]], point: "Point") -> dict[tuple[int, ...], float]:
+def _all_linear(search: SearchState, sets: Sequence[tuple[int, ...]], point: Point) -> dict[tuple[int, ...], float]:
     """The same of many sets at once."""
     given, found = (point.information, point.score, search.priors, ()), {}
     nothing = log_evidence(*given)
@@ -76,7 +73,7 @@ def _all_linear(search: "Search", sets: Sequence[tuple[int, ...]], point: "Point
     return found
 
 
-def _with_pairs(search: "Search", usable: Sequence[int], own: float) -> list[tuple[list[int], float]]:
+def _with_pairs(search: SearchState, usable: Sequence[int], own: float) -> list[tuple[list[int], float]]:
     """Sets with two more effects beside all names but up to two, which come close to those named or go beyond them.
 
     Of two effects that hide each other neither is worth a name alone, nor is one in place of one where two say the same as two.

@@ -12,7 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from visthrow.diagnose.catalogue.scatter import VARYING, Varying
+from sim.effects.effect import RandomEffect
+from visthrow.config.effects import random_effects
 from visthrow.diagnose.likelihood.evidence import SPIKE, Priors
 from visthrow.diagnose.likelihood.marginal import Statistics
 
@@ -72,8 +73,9 @@ def varying(
     """
     known, told = list(names), {}
     drawn = np.zeros(len(theta))  # variances of what is known to vary, in floors
-    for _ in VARYING:
-        free = [v for v in VARYING if not (v.name in told and told[v.name].found)]
+    may_vary = random_effects()
+    for _ in may_vary:
+        free = [v for v in may_vary if not (v.name in told and told[v.name].found)]
         at = {v.name: [known.index(name) for name in v.of if name in known] for v in free}
         new = [s for v in free if (s := _verdict(v, statistics, theta, priors, at[v.name], least, drawn)) is not None]
         best = max((s for s in new if s.found), key=lambda s: s.nats, default=None)
@@ -130,7 +132,7 @@ def straightened(
 
 
 def _verdict(
-    v: Varying, statistics: Statistics, theta: np.ndarray, priors: Priors, at: Sequence[int], least: float,
+    v: RandomEffect, statistics: Statistics, theta: np.ndarray, priors: Priors, at: Sequence[int], least: float,
     drawn: np.ndarray,
 ) -> Scatter | None:
     at = [j for j in at if priors.visible[j]]

@@ -5,14 +5,13 @@ causes, so that a cause is not excused as noise. The threshold comes from null w
 """
 
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from visthrow.common.errors import DiagnoseError
-from visthrow.diagnose.catalogue.scatter import VARYING
+from visthrow.config.effects import random_effects
 from visthrow.diagnose.likelihood import memory
 from visthrow.diagnose.likelihood.evidence import (
     Priors,
@@ -21,32 +20,30 @@ from visthrow.diagnose.likelihood.evidence import (
     estimate,
     threshold,
 )
-from visthrow.diagnose.likelihood.marginal import Statistics
 from visthrow.diagnose.likelihood.threads import each
 from visthrow.diagnose.models.interface import Model
-from visthrow.diagnose.select.candidates import candidate, candidates
 from visthrow.diagnose.select.consistency import Consistency, across_flights, repeated_flights
 from visthrow.diagnose.select.excess import levels
 from visthrow.diagnose.select.point import (
     Point,
     Problem,
     advantage,
+    candidate,
+    candidates,
     curvature,
     fitted,
     linearise,
     lost,
-    moved,
     only,
     with_all_effects_noise,
     with_floors_noise,
 )
 from visthrow.diagnose.select.result import Diagnosis, Step
 from visthrow.diagnose.select.rivals import CLOSE, rivals
-from visthrow.diagnose.select.scatter import Scatter, deviations, freed, straightened, varying
-
-if TYPE_CHECKING:
-    from visthrow.diagnose.likelihood.designs import Same
-    from visthrow.diagnose.select.unknown import Answer
+from visthrow.diagnose.select.scatter import deviations
+from visthrow.diagnose.select.state import SearchState
+from visthrow.diagnose.select.unknown import outside
+from visthrow.diagnose.select.verdicts import conclude, out_of_domain
 
 MOST_NAMES = 6
 """A longer list of causes is a wrong form, not a finding."""
@@ -69,9 +66,6 @@ CONTRADICTED = 0.5
 STRAIGHT = 0.5
 """Size in floors that the simulation's distance from its linearisation may fake before the derivatives are taken anew."""
 
-NEAR = 0.1
-"""Distance from where derivatives were taken, in floors, within which they hold for a law as well."""
-
 WHOLE = 0.7
 """Of another kind of block that flights must ask for: of one that is not there, whose state has more freedom, a part is taken."""
 
@@ -89,37 +83,11 @@ EXCHANGES = 2
 
 
 @dataclass
-class Search:
+class Search(SearchState):
     """One search; :func:`explain` is the door to it."""
-
-    problem: Problem
-    nominal: Point
-    least: float  # threshold [nats]
-    progress: Callable[[str], None]
-    laws: bool = True  # whether to look for laws outside the catalogue
-    active: list[int] = field(default_factory=list)
-    point: Point | None = None
-    origin: Point | None = None  # where the derivatives were taken last
-    steps: list[Step] = field(default_factory=list)
-    refused: dict[int, float] = field(default_factory=dict)  # effects that are not the same in all flights, with their nats
-    dropped: set[int] = field(default_factory=set)  # effects that a later one made superfluous; they are not tried again
-    events: list[int] = field(default_factory=list)
-    sets: list[tuple[tuple[int, ...], float]] = field(default_factory=list)
-    answer: "tuple[tuple[Same, tuple[int, ...]], Answer] | None" = None  # of the grammar, and the state that was asked about
-
-    @property
-    def priors(self) -> Priors:
-        """Of the effects."""
-        return self.problem.priors
-
-    def name(self, j: int) -> str:
-        """Of an effect."""
-        return self.problem.model.effects[j].name
 
     def run(self) -> None:
         """Search, on from what is named, until nothing exceeds the threshold or names follow one another in place of a law."""
-        from visthrow.diagnose.select.unknown import outside
-
         if self.point is None:
             self.point = self.origin = self.nominal
         compared: set[int] | None = None
@@ -213,35 +181,9 @@ class Search:
         whole = self.point.evidence(self.priors, self.active)
         return {j: whole - self.point.evidence(self.priors, [k for k in self.active if k != j]) for j in self.active}
 
-    def scatter(self, active: Sequence[int]) -> tuple[Scatter, ...]:
-        """What varies from flight to flight about the sizes of these effects."""
-        names = [e.name for e in self.problem.model.effects]
-        return varying(self.point.statistics, self._sizes(active), self.priors, names, self.least, self._again)
-
-    def _sizes(self, active: Sequence[int]) -> np.ndarray:
-        """Of these effects, in floors."""
-        return estimate(self.point.information, self.point.score, self.priors, list(active))
-
-    def _again(self, theta: np.ndarray) -> Statistics | None:
-        """The flights simulated at other sizes."""
-        there = moved(self.problem, self.point, theta)
-        return None if there is None else there.statistics
-
-    def about_means(self, active: Sequence[int], varies: Mapping[int, float]) -> Statistics:
-        """What the flights say of the means of effects that vary; of those named, flights far off are told by simulations there.
-
-        Args:
-            active: effects named.
-            varies: deviation in floors of an effect among flights.
-        """
-        statistics, theta = self.point.statistics, self._sizes(active)
-        for j in sorted(set(varies) & set(active)):
-            statistics = straightened(statistics, theta, self.priors, j, self._again)
-        return freed(statistics, varies)
-
     def _mean(self) -> bool:
         """Name an effect that was refused because it varies, if the flights agree on its mean; False where there is none."""
-        names, may_vary = [e.name for e in self.problem.model.effects], {name for v in VARYING for name in v.of}
+        names, may_vary = [e.name for e in self.problem.model.effects], {name for v in random_effects() for name in v.of}
         for j in sorted((j for j in self.refused if self.name(j) in may_vary), key=self.refused.get, reverse=True):
             active = [*self.active, j]
             drawn = deviations(self.scatter(active), self.priors, names)
@@ -324,20 +266,6 @@ class Search:
             if np.abs(point.theta - before.theta).max() <= 0.5 or curvature(self.problem, self.origin, point) <= STRAIGHT:
                 break
         return point
-
-    @property
-    def away(self) -> bool:
-        """Whether the derivatives were taken elsewhere than where the search stands."""
-        return bool(np.abs(self.origin.theta - self.point.theta).max() > NEAR)
-
-    def nearer(self) -> bool:
-        """Linearise where the search stands; False where that was done. Before a law is believed: it may explain what bends do."""
-        if not self.away:
-            return False
-        self.progress("derivatives are taken where the causes are, for a law may explain what they lack")
-        self.origin = linearise(self.problem, self.point.theta, self.point.noise)
-        self.point = fitted(self.problem, self.origin, self.active)
-        return True
 
     def _set_aside(self, best: int, nats: float, verdict: Consistency) -> bool:
         """An effect of one flight alone: that flight is left out; one that differs from flight to flight is refused."""
@@ -439,8 +367,6 @@ def explain(
     Raises:
         DiagnoseError: The model gives no window, or contradicts itself.
     """
-    from visthrow.diagnose.select.verdicts import conclude, out_of_domain
-
     begun, say = time.monotonic(), progress or (lambda _: None)
     memory.keep()
     priors = Priors.of(tuple(model.effects), tuple(model.channels))

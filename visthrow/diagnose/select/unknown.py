@@ -6,7 +6,6 @@ thousands of terms are screened with the statistics at hand; the best are then w
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.linalg import lapack
@@ -24,9 +23,7 @@ from visthrow.diagnose.select.excess import acts_on
 from visthrow.diagnose.select.point import Point, advantage, regathered, shifted
 from visthrow.diagnose.select.result import Law
 from visthrow.diagnose.select.screening import calmed, carries, distinct, felt, gains, screen, usual
-
-if TYPE_CHECKING:
-    from visthrow.diagnose.select.search import Search
+from visthrow.diagnose.select.state import SearchState
 
 MARGIN = 6.0
 """Nats by which a term must be ahead of the catalogue's best."""
@@ -241,7 +238,7 @@ class Answer:
     hasty: bool = False  # whether the look ended with one that was enough
 
 
-def outside(search: "Search") -> bool:
+def outside(search: SearchState) -> bool:
     """Whether a search that has come to several names follows a law that the catalogue does not hold.
 
     It does where a term makes at least two names superfluous.
@@ -250,7 +247,7 @@ def outside(search: "Search") -> bool:
     return len(beats_the_catalogue(search, answer)[1]) > 1
 
 
-def find_laws(search: "Search", enough: Callable[[Hypothesis], bool] | None = None) -> Answer:
+def find_laws(search: SearchState, enough: Callable[[Hypothesis], bool] | None = None) -> Answer:
     """Look for terms that explain the flights instead of the names found, instead of some of them, and beside them.
 
     Args:
@@ -266,7 +263,7 @@ def find_laws(search: "Search", enough: Callable[[Hypothesis], bool] | None = No
     return search.answer[1]
 
 
-def _look(search: "Search", enough: Callable[[Hypothesis], bool] | None) -> Answer:
+def _look(search: SearchState, enough: Callable[[Hypothesis], bool] | None) -> Answer:
     strongest: dict[str, float] = {}
     for (block, _), level in search.nominal.noise.latent_sd.items():
         name = LATENT_BLOCKS[block]
@@ -302,7 +299,7 @@ def _ordered(found: Sequence[tuple[Hypothesis, Point]], least: float) -> list[tu
     return sorted(found, key=rank)
 
 
-def _paired(search: "Search", first: Hypothesis, origin: Point, strongest: dict[str, float]) -> list[Hypothesis]:
+def _paired(search: SearchState, first: Hypothesis, origin: Point, strongest: dict[str, float]) -> list[Hypothesis]:
     """The best hypothesis, after it joined by a second term or replaced by one that makes it superfluous where there is such."""
     least = search.least
     pairs = hypotheses(first.point, first.priors, first.active, strongest, least + MARGIN, first)
@@ -331,7 +328,7 @@ def _pruned(hypothesis: Hypothesis, least: float, remainder: float = REMAINDER) 
     return replace(hypothesis, active=tuple(active))
 
 
-def _as_told(search: "Search", beside: Sequence[Hypothesis]) -> list[Hypothesis]:
+def _as_told(search: SearchState, beside: Sequence[Hypothesis]) -> list[Hypothesis]:
     """Hypotheses without the names that will be withdrawn for them, if a law is ahead of the catalogue without these.
 
     Beside a name in its block a wrong form explains as much as the right one: the name takes up what the form lacks.
@@ -345,7 +342,7 @@ def _without(hypothesis: Hypothesis, names: set[int]) -> Hypothesis:
     return replace(hypothesis, active=tuple(j for j in hypothesis.active if j not in names))
 
 
-def withdrawn_for(search: "Search", hypothesis: Hypothesis) -> set[int]:
+def withdrawn_for(search: SearchState, hypothesis: Hypothesis) -> set[int]:
     """Names that are not told beside a law: those that act in its block may be a part of its form.
 
     A name acts there by its column or by what the other names cannot stand in for, as two delays that differ by a force. What is
@@ -362,7 +359,7 @@ def withdrawn_for(search: "Search", hypothesis: Hypothesis) -> set[int]:
     return set(names) - set((_pruned(left, search.least, 0.0) if near else left).names)
 
 
-def beats_the_catalogue(search: "Search", answer: Answer) -> tuple[Hypothesis | None, set[int], str]:
+def beats_the_catalogue(search: SearchState, answer: Answer) -> tuple[Hypothesis | None, set[int], str]:
     """Whether a term must replace or join the catalogue's names.
 
     Returns:
@@ -382,7 +379,7 @@ def beats_the_catalogue(search: "Search", answer: Answer) -> tuple[Hypothesis | 
     return None, set(), ""
 
 
-def _catalogue(search: "Search", hypothesis: Hypothesis) -> float:
+def _catalogue(search: SearchState, hypothesis: Hypothesis) -> float:
     """Value of the names alone, where the search stands or with the residuals and noise levels of the hypothesis.
 
     Outliers lose weight anew at each linearisation, so that the evidence at two of them is not quite of the same data.
@@ -407,7 +404,7 @@ def beyond(hypothesis: Hypothesis, j: int) -> float:
     return float(0.5 * left**2 / max(own, 1e-300))
 
 
-def _names(search: "Search") -> str:
+def _names(search: SearchState) -> str:
     return ", ".join(search.name(j) for j in search.active)
 
 

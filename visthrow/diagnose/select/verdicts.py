@@ -2,22 +2,18 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from visthrow.diagnose.likelihood.evidence import NORMAL_95, OWN_FLOOR, Priors, certainty, covariance, estimate
 from visthrow.diagnose.models.interface import Model, Window
-from visthrow.diagnose.select import result
+from visthrow.diagnose.select import result, unknown
 from visthrow.diagnose.select.excess import acts_on, levels, too_strong
 from visthrow.diagnose.select.point import Point, with_floors_noise
 from visthrow.diagnose.select.result import Diagnosis, Finding, Law, Level
 from visthrow.diagnose.select.scatter import deviations, freed
-from visthrow.diagnose.select.work import Work
-
-if TYPE_CHECKING:
-    from visthrow.diagnose.select.search import Search
-    from visthrow.diagnose.select.unknown import Hypothesis
+from visthrow.diagnose.select.state import SearchState, Work
+from visthrow.diagnose.select.unknown import Answer, Hypothesis
 
 HALF_PRIOR = 0.5
 """An effect whose posterior deviation exceeds this share of its prior's was not seen."""
@@ -36,20 +32,18 @@ AT_BOUND = 1e-3
 
 
 
-def conclude(search: "Search", *, laws: bool) -> Diagnosis:
+def conclude(search: SearchState, *, laws: bool) -> Diagnosis:
     """Turn a finished search into verdicts.
 
     Args:
         search: that has run.
         laws: whether to look for laws outside the catalogue.
     """
-    from visthrow.diagnose.select.unknown import Answer, beats_the_catalogue, find_laws
-
-    answer = find_laws(search, lambda h: beats_the_catalogue(search, Answer((h,)))[0] is not None) if laws else Answer()
-    law = beats_the_catalogue(search, answer)
+    answer = unknown.find_laws(search, lambda h: unknown.beats_the_catalogue(search, Answer((h,)))[0] is not None) if laws else Answer()
+    law = unknown.beats_the_catalogue(search, answer)
     if law[0] is not None and search.nearer():
-        answer = find_laws(search)
-        law = beats_the_catalogue(search, answer)
+        answer = unknown.find_laws(search)
+        law = unknown.beats_the_catalogue(search, answer)
     point, model = search.point, search.problem.model
     scatter = search.scatter(search.active)
     varies = deviations(scatter, search.priors, [e.name for e in model.effects])
@@ -102,7 +96,7 @@ def _sure(point: Point, priors: Priors, active: Sequence[int]) -> list[int]:
     return left
 
 
-def _different(hypotheses: Sequence["Hypothesis"]) -> tuple[Law, ...]:
+def _different(hypotheses: Sequence[Hypothesis]) -> tuple[Law, ...]:
     """Laws of hypotheses, each formula once, with the coefficient of the best."""
     laws: dict[str, Law] = {}
     for law in (law for hypothesis in hypotheses for law in hypothesis.laws()):
@@ -110,7 +104,7 @@ def _different(hypotheses: Sequence["Hypothesis"]) -> tuple[Law, ...]:
     return tuple(laws.values())
 
 
-def _events(search: "Search", point: Point) -> tuple[int, ...]:
+def _events(search: SearchState, point: Point) -> tuple[int, ...]:
     """Flights that were left out for what happened there, and flights with a window far rougher than its phase."""
     rough = {window.flight for window, share in zip(point.windows, point.noise.share) if share.max() > ROUGH}
     return tuple(sorted({*search.events, *rough}))
@@ -130,11 +124,9 @@ def out_of_domain(model: Model, windows: Sequence[Window], usable: int, seed: in
 
 
 def _overall(
-    search: "Search", found: Sequence[Level], law: "Hypothesis | None", idle: set[int], said: str
+    search: SearchState, found: Sequence[Level], law: Hypothesis | None, idle: set[int], said: str
 ) -> tuple[str, str, list[str], set[int]]:
     """Overall verdict, block of an unknown effect, reasons, and the names that are withdrawn for it."""
-    from visthrow.diagnose.select.unknown import withdrawn_for
-
     point, every = search.point, set(search.active)
     strong = too_strong(point, IMPLAUSIBLE_FORCE)
     if strong:
@@ -148,7 +140,7 @@ def _overall(
     reasons = [_excess(level) for level in excessive]
     if law is not None:
         reasons.insert(0, said)
-        return result.UNKNOWN, law.terms[0].block, reasons, idle | withdrawn_for(search, law)
+        return result.UNKNOWN, law.terms[0].block, reasons, idle | unknown.withdrawn_for(search, law)
     stuck = [j for j in search.active if _on_bound(search, j)]
     if stuck:
         names = ", ".join(map(search.name, stuck))
@@ -168,7 +160,7 @@ def _excess(level: Level) -> str:
             f"quietest phase ({level.nats:.0f} nats)")  # fmt: skip
 
 
-def _withdrawn(search: "Search", excessive: Sequence[Level]) -> set[int]:
+def _withdrawn(search: SearchState, excessive: Sequence[Level]) -> set[int]:
     """Names that stand for the unknown effect's wrong form: a chain of them in its block, or one that left it as it was."""
     through = {j: acts_on(search.point, j) for j in search.active}
     inside = {j for j, block in through.items() if block in {level.block for level in excessive}}
@@ -178,7 +170,7 @@ def _withdrawn(search: "Search", excessive: Sequence[Level]) -> set[int]:
     return {j for j in inside if not eased.get(through[j], True)}
 
 
-def _on_bound(search: "Search", j: int) -> bool:
+def _on_bound(search: SearchState, j: int) -> bool:
     """Whether an estimate lies on its bound and the flights push it on by more than the threshold."""
     point, priors = search.point, search.priors
     at = min(abs(point.theta[j] - priors.low[j]), abs(point.theta[j] - priors.high[j])) < AT_BOUND
@@ -186,7 +178,7 @@ def _on_bound(search: "Search", j: int) -> bool:
     return bool(at and push * point.theta[j] > 0.0 and 0.5 * push**2 / point.information[j, j] > search.least)
 
 
-def _finding(search: "Search", point: Point, j: int, active: list[int], spread: np.ndarray, withdrawn: set[int]) -> Finding:
+def _finding(search: SearchState, point: Point, j: int, active: list[int], spread: np.ndarray, withdrawn: set[int]) -> Finding:
     effect, priors = search.problem.model.effects[j], search.priors
     blank = Finding(effect.name, result.UNOBSERVABLE, effect.block, effect.cause, effect.equation, effect.unit, 0.0,
                     effect.prior_sd, *effect.bounds, effect.floor, 0.0, manoeuvres=tuple(effect.manoeuvres))  # fmt: skip
@@ -226,7 +218,7 @@ def _worth(point: Point, priors: Priors, j: int, active: Sequence[int]) -> float
     return point.evidence(priors, [*rest, j]) - point.evidence(priors, rest)
 
 
-def _class_of(search: "Search", j: int, active: Sequence[int]) -> tuple[tuple[int, ...], int]:
+def _class_of(search: SearchState, j: int, active: Sequence[int]) -> tuple[tuple[int, ...], int]:
     """Partners of an effect, and the named member in whose place it may stand."""
     for home in active:
         exchanged = {home}
@@ -239,7 +231,7 @@ def _class_of(search: "Search", j: int, active: Sequence[int]) -> tuple[tuple[in
     return (), j
 
 
-def _named(search: "Search", point: Point, blank: Finding, j: int, home: int, partners: tuple[int, ...], active: list[int],
+def _named(search: SearchState, point: Point, blank: Finding, j: int, home: int, partners: tuple[int, ...], active: list[int],
            spread: np.ndarray) -> Finding:  # fmt: skip
     priors, floor = search.priors, blank.floor
     if j in active:
@@ -265,7 +257,7 @@ def _named(search: "Search", point: Point, blank: Finding, j: int, home: int, pa
     return replace(blank, verdict=result.CLASS, partners=names, joint=joint, sentence=sentence)
 
 
-def _joint(search: "Search", point: Point, members: list[int], rest: list[int]) -> str:
+def _joint(search: SearchState, point: Point, members: list[int], rest: list[int]) -> str:
     """The best known combination of a class: first eigenvector of its members' information in prior deviations."""
     priors, effects = search.priors, search.problem.model.effects
     others = np.setdiff1d(np.arange(len(effects)), members)

@@ -7,20 +7,17 @@ prediction from a state that is fitted up to the separation: what is then left c
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 
+from sim.effects.setting import Setting
 from sim.replay.kernel import ATTACHED
 from sim.replay.lanes import Replay
-from visthrow.common.statistics import mean
 from visthrow.diagnose.throw.cutting import BEFORE, GROUND_MARGIN, LEAST, LEAST_TAUT, Cut, payload_down
 from visthrow.diagnose.throw.recorded import NEVER, Recorded, Samples
 from visthrow.diagnose.throw.replay import Flights, Lane, downloaded
-
-if TYPE_CHECKING:
-    from visthrow.diagnose.select.work import Work
-    from visthrow.diagnose.throw.throw_model import ThrowModel
+from visthrow.diagnose.throw.states import States
 
 LEAD = 1.0  # before the separation, at which the open loop begins [s]
 HEAD = 0.4  # of it, over which the initial state is fitted [s]
@@ -50,23 +47,6 @@ class Landings:
         return np.linalg.norm((self.released - self.measured)[:, :2], axis=1)
 
 
-@dataclass(frozen=True)
-class LandingGain:
-    """What the named causes do to predicted landings; lengths in metres, intervals of 95 % by bootstrap over throws."""
-
-    throws: int
-    held_out: bool  # whether each throw was predicted with causes sized by the other flights
-    before: float  # mean distance of prediction and measurement, open loop from before the throw, the model as it stands
-    after: float  # with what was named
-    low: float  # of ``after``
-    high: float
-    released_before: float  # the same from a state fitted up to the separation
-    released_after: float
-    moved: dict[str, float]  # named effect -> mean distance by which it moves the predicted landings
-    off_before: tuple[tuple[float, float], ...] = ()  # of each throw, prediction less measurement along world x and y
-    off_after: tuple[tuple[float, float], ...] = ()
-
-
 def seen_landing(flight: Recorded, height: float) -> tuple[float, np.ndarray] | None:
     """Time [s] and point [m] at which a payload came down; None where nobody saw it.
 
@@ -93,7 +73,24 @@ def seen_landing(flight: Recorded, height: float) -> tuple[float, np.ndarray] | 
     return down + float(late.min()), np.polynomial.polynomial.polyval(float(late.min()), fit)
 
 
-def landings(model: "ThrowModel", theta: Mapping[str, float], flights: Iterable[int] | None = None) -> Landings:
+class FlownModel(Protocol):
+    """What of a :class:`visthrow.diagnose.throw.throw_model.ThrowModel` landings are predicted with."""
+
+    setting: Setting
+    flights: Flights
+    device: str
+    substep: float
+
+    def beside(self, cuts: Sequence[Cut]) -> "FlownModel":
+        """Return the same model of other windows of its flights."""
+        ...
+
+    def begun(self, theta: Mapping[str, float]) -> tuple[Setting, States]:
+        """Return the setting with effects at ``theta``, and initial states fitted in it."""
+        ...
+
+
+def landings(model: FlownModel, theta: Mapping[str, float], flights: Iterable[int] | None = None) -> Landings:
     """Predict the landings of throws with effects at ``theta``.
 
     Args:
@@ -112,7 +109,7 @@ def landings(model: "ThrowModel", theta: Mapping[str, float], flights: Iterable[
     return Landings(np.array(list(spans)), np.array([known[n][1] for n in spans]), *paths)
 
 
-def _spans(model: "ThrowModel", number: int) -> tuple[tuple[float, float], tuple[float, float]] | None:
+def _spans(model: FlownModel, number: int) -> tuple[tuple[float, float], tuple[float, float]] | None:
     """Where a throw's state is fitted [s]: before the open loop, and up to the separation; both outside of a slack rope."""
     flight = model.flights.flights[number]
     separation = flight.latch + model.setting.plant.release.lag
@@ -126,7 +123,7 @@ def _spans(model: "ThrowModel", number: int) -> tuple[tuple[float, float], tuple
     return (head, (last, separation)) if head[1] - head[0] > LEAST and separation - last > LEAST_TAUT else None
 
 
-def _fly(model: "ThrowModel", theta: Mapping[str, float], spans: Mapping[int, tuple[float, float]],
+def _fly(model: FlownModel, theta: Mapping[str, float], spans: Mapping[int, tuple[float, float]],
          ends: Mapping[int, float]) -> np.ndarray:  # fmt: skip
     """Landing points of throws whose states are fitted over ``spans`` and flown on to ``ends``, shape (F, 3)."""
     cuts = [c for n, (begin, end) in spans.items() for c in _approach(model, n, begin, end)]
@@ -147,7 +144,7 @@ def _fly(model: "ThrowModel", theta: Mapping[str, float], spans: Mapping[int, tu
     return out
 
 
-def _approach(model: "ThrowModel", number: int, begin: float, end: float) -> list[Cut]:
+def _approach(model: FlownModel, number: int, begin: float, end: float) -> list[Cut]:
     """A flight's windows before ``begin``, only flown through, and the one that its state is fitted over."""
     before = [c for c in model.flights.cuts if c.flight == number and c.start < begin - 1e-3]
     through = [replace(c, end=min(c.end, begin), told=False) for c in before]
@@ -169,46 +166,3 @@ def _crossing(path: np.ndarray, height: float) -> np.ndarray:
         return np.full(3, np.nan)
     a, b = path[down[0]], path[down[0] + 1]
     return a + (a[2] - height) / (a[2] - b[2]) * (b - a)
-
-
-def landing_gain(
-    work: "Work", theta: Mapping[str, float], trained: Mapping[int, Mapping[str, float]], seed: int
-) -> LandingGain | None:
-    """What the named causes do to predicted landings.
-
-    Args:
-        work: of the diagnosis.
-        theta: sizes of the named effects.
-        trained: flight -> their sizes by the other flights; empty where none were held out.
-        seed: of the bootstrap.
-
-    Returns:
-        None where the model has no throws whose landing was seen.
-    """
-    model = work.problem.model
-    if not hasattr(model, "landings"):
-        return None
-    flown = sorted({w.flight for w in work.after.windows})
-    plain = model.landings({}, flown)
-    named = model.landings(theta, flown) if theta else plain
-    held = joined([model.landings(trained[int(f)], [int(f)]) for f in plain.flights]) if trained else named
-    good = np.isfinite(plain.errors) & np.isfinite(held.errors)
-    if not good.any():
-        return None
-    moved = {}
-    for name in theta:
-        others = {other: size for other, size in theta.items() if other != name}
-        without = model.landings(others, flown) if others else plain
-        moved[name] = float(np.nanmean(np.linalg.norm((named.predicted - without.predicted)[good, :2], axis=1)))
-    after = mean(held.errors[good], seed=seed)
-    released = [float(np.nanmean(found.released_errors[good])) for found in (plain, held)]
-    off = [tuple(map(tuple, (x.predicted - x.measured)[good, :2].tolist())) for x in (plain, held)]
-    return LandingGain(
-        int(good.sum()), bool(trained), float(plain.errors[good].mean()), after.value, after.low, after.high, *released, moved, *off
-    )
-
-
-def joined(parts: Sequence[Landings]) -> Landings:
-    """Landings of several sets of throws in one."""
-    names = ("flights", "measured", "predicted", "released")
-    return Landings(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))

@@ -11,8 +11,9 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
+from sim.effects.effect import SettingEffect
+from sim.effects.setting import Setting
 from sim.replay.kernel import NO_PAYLOAD
-from visthrow.diagnose.catalogue import Entry, Setting
 from visthrow.diagnose.models.interface import Window
 from visthrow.diagnose.throw.recorded import NEVER
 from visthrow.diagnose.throw.replay import FINENESS, KNOT_SPACING, Flights, Lane
@@ -32,9 +33,9 @@ AERODYNAMIC = "aerodynamics"
 """Block whose effects go with that velocity."""
 
 
-def exact(e: Entry) -> bool:
+def exact(e: SettingEffect) -> bool:
     """Whether an effect's derivative needs the nominal steps in every window."""
-    return any(key.path in EXACT for key in e.keys)
+    return any(key.path in EXACT for key in e.changes)
 
 
 def still(window: Window, blocks: Sequence[str], wind_w: Sequence[float]) -> Window:

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sim.effects.setting import Setting
 from sim.replay.kernel import ATTACHED
 from sim.replay.lanes import Replay
-from visthrow.diagnose.catalogue import Setting
 from visthrow.diagnose.likelihood.threads import each
 from visthrow.diagnose.models.interface import Window
 from visthrow.diagnose.throw.replay import Flights, Lane, downloaded

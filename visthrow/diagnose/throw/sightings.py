@@ -12,8 +12,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from camera.params import CameraParams
+from sim.effects.effect import SettingEffect
+from sim.effects.setting import Setting
 from sim.params import SensingParams
-from visthrow.diagnose.catalogue import Entry, Setting
 from visthrow.diagnose.likelihood.noise import highpass_sigma
 from visthrow.diagnose.models.interface import Window
 from visthrow.diagnose.throw.cutting import Cut
@@ -65,9 +66,9 @@ def sightings(logs: Sequence[FlightLog], flights: Sequence[Recorded], cuts: Sequ
     return heights + ([CameraView(logs, flights, cuts, setting)] if KEYPOINTS in held else [])
 
 
-def needs_no_flight(e: Entry) -> bool:
+def needs_no_flight(e: SettingEffect) -> bool:
     """Whether nothing but sightings shows an effect."""
-    return bool(e.keys) and all(key.path.startswith(ACTS_ON) for key in e.keys)
+    return bool(e.changes) and all(key.path.startswith(ACTS_ON) for key in e.changes)
 
 
 def seen_by_camera(log: FlightLog) -> bool:

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from sim.effects.setting import Setting
 from sim.params import GRAVITY, PlantParams
 from sim.replay.kernel import ATTACHED, LOOSE, STATE_FIELDS
-from visthrow.diagnose.catalogue import Setting
 from visthrow.diagnose.throw.cutting import Cut
 from visthrow.diagnose.throw.recorded import Recorded, Samples
 

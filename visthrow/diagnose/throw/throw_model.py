@@ -11,20 +11,21 @@ import torch
 import warp as wp
 
 from camera.params import CameraParams
+from sim.effects.effect import SettingEffect, apply
+from sim.effects.setting import Setting, generalised
 from sim.params import PlantParams, SensingParams
 from sim.replay.kernel import ATTACHED
 from sim.replay.lanes import Replay
 from visthrow.common.errors import DiagnoseError
-from visthrow.diagnose.catalogue import Entry, Setting, apply, entries_for
 from visthrow.diagnose.likelihood.threads import aside, each
 from visthrow.diagnose.likelihood.transfer import all_to_host, to_host
 from visthrow.diagnose.models.interface import Linearised, Window
 from visthrow.diagnose.throw.cutting import RINGING, Cut, around_slack, cut, thinned
+from visthrow.diagnose.throw.effects import effects_for
 from visthrow.diagnose.throw.interface import Mistake
 from visthrow.diagnose.throw.landing import Landings, landings
 from visthrow.diagnose.throw.linearising import Plan, exact, lanes_of, still
-from visthrow.diagnose.throw.opened import opened
-from visthrow.diagnose.throw.recorded import NEVER, carriers, record_of
+from visthrow.diagnose.throw.recorded import NEVER, Recorded, carriers, record_of
 from visthrow.diagnose.throw.replay import BATCH, CUDA_BATCH, Flights, Lane, carried, downloaded
 from visthrow.diagnose.throw.settling import Settling, following, perturbed
 from visthrow.diagnose.throw.sightings import channels_of, needs_no_flight, sightings, with_sightings
@@ -87,40 +88,25 @@ class ThrowModel:
         Raises:
             DiagnoseError: no flight can be replayed, or ``only`` names what does not exist.
         """
-        self.setting = opened(Setting(plant, sensing or SensingParams(), camera=camera))
+        self.setting = generalised(Setting(plant, sensing or SensingParams(), camera=camera))
         self.device, self.substep, self.mistakes = device, substep, mistakes
         if device != "cpu":
             aside()
         flights = [record_of(log, i) for i, log in enumerate(logs)]
         hangs = carriers(flights) if carries is None else [carries] * len(flights)
-        carries = any(hangs)
-        release = plant.release
-        cuts = thinned([c for i, f in enumerate(flights) for c in cut(f, i, release.lag, release.landing_height, hangs[i])])
+        carries, release = any(hangs), (plant.release.lag, plant.release.landing_height)
+        cuts = thinned([c for i, f in enumerate(flights) for c in cut(f, i, *release, hangs[i])])
         if not cuts:
             raise DiagnoseError(f"{len(flights)} flights hold no stretch of poses and commands long enough to replay")
-        self.channels = ["pos_w", "quat_wb"]
-        self.channels += ["payload_pos_w"] if carries and any(f.payload for f in flights) else []
-        self.channels += ["rate_b"] if any(f.gyro for f in flights) else []
-        self.channels += channels_of(logs, flights, camera)
+        self.channels = [*_measured(flights, carries), *channels_of(logs, flights, camera)]
         thrown = any(f.latch != NEVER for f in flights)
-        self.entries: dict[str, Entry] = entries_for(self.setting, set(self.channels), carries, thrown, simpler)
-        if only is not None:
-            unknown = [name for name in only if name not in self.entries]
-            if unknown:
-                raise DiagnoseError(f"no effects {unknown} for these flights; there are {', '.join(self.entries)}")
-            self.entries = {name: self.entries[name] for name in only}
-        self._sighted = [e for e in self.entries.values() if needs_no_flight(e)]
-        self._graded = [e for e in self.entries.values() if e.switch is None and e not in self._sighted]
-        self._switched = [e for e in self.entries.values() if e.switch is not None]
-        self.entries = {e.effect.name: e for e in (*self._graded, *self._switched, *self._sighted)}
-        self.effects = tuple(e.effect for e in self.entries.values())
+        concerned = effects_for(self.setting, set(self.channels), carries, thrown, simpler)
+        self._choose(concerned if only is None else _only(concerned, only))
         self._directions = directions(self.setting.plant)
-        x = self.setting.sensing
-        delays = (x.vehicle_delay, x.payload_delay, x.gyro_delay)
-        self.flights = Flights(flights, cuts, delays, stride)
+        self.flights = self._cut(flights, cuts, stride)
         states, ends = self._through(self.setting)
         if (without_slack := self._without_slack(ends)) != cuts:
-            self.flights = Flights(flights, without_slack, delays, stride)
+            self.flights = self._cut(flights, without_slack, stride)
             states, _ = self._through(self.setting)
         self._told = np.array([w for w, c in enumerate(self.flights.cuts) if c.told])
         self._fits: dict[tuple[Cut, ...], tuple[States, dict[int, np.ndarray]]] = {}
@@ -130,12 +116,25 @@ class ThrowModel:
         self._follows: tuple[Linearised, dict[int, list[int]], np.ndarray] | None = None  # the last that was asked for
         self._sightings = sightings(logs, flights, self.flights.cuts, self.setting)
 
+    def _cut(self, flights: Sequence[Recorded], cuts: Sequence[Cut], stride: int) -> Flights:
+        """Return these windows of flights, in the time of their sensors."""
+        x = self.setting.sensing
+        return Flights(flights, cuts, (x.vehicle_delay, x.payload_delay, x.gyro_delay), stride)
+
+    def _choose(self, effects: Mapping[str, SettingEffect]) -> None:
+        """Take these effects: first those that are simulated by degrees, then switches, then what only cameras see."""
+        self._sighted = [e for e in effects.values() if needs_no_flight(e)]
+        self._graded = [e for e in effects.values() if not e.switch and e not in self._sighted]
+        self._switched = [e for e in effects.values() if e.switch]
+        self.effects = (*self._graded, *self._switched, *self._sighted)
+        self.entries = {e.name: e for e in self.effects}
+
     def windows(self, theta: Mapping[str, float]) -> list[Window]:
         """See :class:`visthrow.diagnose.models.interface.Model`."""
         setting = apply(self.entries, self.setting, theta)
         self._directions = directions(setting.plant)  # another kind of block has other states
         states = self._latest[self._switches(theta)] = self._settled_at[_key(theta)] = self._settled(setting)
-        steps = [self._step(e, theta.get(e.effect.name, 0.0)) for e in self._graded]
+        steps = [self._step(e, theta.get(e.name, 0.0)) for e in self._graded]
         settings = [setting, *[e.apply(setting, step) for e, step in zip(self._graded, steps)]]
         replay = self._replay(settings, download=wp.to_torch)
         found: list[Window] = []
@@ -158,19 +157,19 @@ class ThrowModel:
         if not self._sightings:
             return whole
         entries = list(self.entries.values())
-        steps = np.array([0.0 if e.switch else self._step(e, theta.get(e.effect.name, 0.0)) for e in entries])
+        steps = np.array([0.0 if e.switch else self._step(e, theta.get(e.name, 0.0)) for e in entries])
         settings = [setting, *[setting if e.switch else e.apply(setting, step) for e, step in zip(entries, steps)]]
         return [
             with_sightings(w, number, self._sightings, self.channels, settings, steps) for number, w in zip(self._told, whole)
         ]
 
-    def _secant(self, e: Entry, theta: Mapping[str, float], windows: list[Window]) -> list[np.ndarray]:
+    def _secant(self, e: SettingEffect, theta: Mapping[str, float], windows: list[Window]) -> list[np.ndarray]:
         """Samples with the other kind of block less those with this one, per theta; a column for each window.
 
         Each kind begins in initial states settled for it: a transient that the other's state brings would be taken for its effect.
         """
-        on = theta.get(e.effect.name, 0.0) > 0.5
-        elsewhere = {**theta, e.effect.name: 0.0 if on else 1.0}
+        on = theta.get(e.name, 0.0) > 0.5
+        elsewhere = {**theta, e.name: 0.0 if on else 1.0}
         other = apply(self.entries, self.setting, elsewhere)
         lanes = [Lane(w, 0, w) for w in self._told]
         start = self._latest[self._switches(elsewhere)] = self._settled(other)
@@ -195,7 +194,7 @@ class ThrowModel:
         self, setting: Setting, theta: Mapping[str, float], about: Linearised
     ) -> tuple[States, dict[int, np.ndarray]]:
         """States that belong to other sizes of the effects by the derivatives, and how each window's were moved."""
-        names = [e.effect.name for e in self.entries.values()]
+        names = list(self.entries)
         change = np.array([theta.get(name, 0.0) - about.theta.get(name, 0.0) for name in names])
         found = directions(setting.plant)
         with self._lock:
@@ -222,7 +221,7 @@ class ThrowModel:
 
     def _switches(self, theta: Mapping[str, float]) -> frozenset[str]:
         """Which other kinds of blocks are on."""
-        return frozenset(e.effect.name for e in self._switched if theta.get(e.effect.name, 0.0) > 0.5)
+        return frozenset(e.name for e in self._switched if theta.get(e.name, 0.0) > 0.5)
 
     def _sighting_residuals(self, w: int, setting: Setting) -> list[np.ndarray]:
         held = [(kind, kind.samples(w)[1]) for kind in self._sightings]
@@ -253,10 +252,9 @@ class ThrowModel:
 
     def beside(self, cuts: Sequence[Cut]) -> "ThrowModel":
         """The same model of other windows of its flights."""
-        other, x = copy.copy(self), self.setting.sensing
+        other = copy.copy(self)
         other._settled_at, other._follows = {}, None  # states of other windows
-        delays = (x.vehicle_delay, x.payload_delay, x.gyro_delay)
-        other.flights = Flights(self.flights.flights, cuts, delays, self.flights.stride)
+        other.flights = self._cut(self.flights.flights, cuts, self.flights.stride)
         other._told = np.array([w for w, c in enumerate(cuts) if c.told])
         return other
 
@@ -322,10 +320,10 @@ class ThrowModel:
         return settling.fit(starts, slopes if ways[0] == ways[1] else None)
 
     @staticmethod
-    def _step(e: Entry, theta: float) -> float:
+    def _step(e: SettingEffect, theta: float) -> float:
         """Step of theta for the derivative: upwards, unless that leaves the bounds."""
-        step = e.step * e.effect.floor
-        return -step if theta + step > e.effect.bounds[1] else step
+        step = e.step * e.floor
+        return -step if theta + step > e.bounds[1] else step
 
     def _batches(self) -> list[list[int]]:
         """Windows in groups whose lanes fit a run."""
@@ -359,7 +357,7 @@ class ThrowModel:
 
         found = [slopes(plan) for plan in plans] if flown.seen.is_cuda else each(slopes, plans)
         nominal = to_host(flown.seen[:, [plan.first for plan in plans]])
-        blocks = [e.effect.block for e in self._graded]
+        blocks = [e.block for e in self._graded]
 
         parts = all_to_host([part for own in found for part in own])
 
@@ -392,3 +390,17 @@ class ThrowModel:
 def _key(theta: Mapping[str, float]) -> frozenset[tuple[str, float]]:
     """The sizes that are not 0."""
     return frozenset((name, float(value)) for name, value in theta.items() if value)
+
+
+def _only(effects: Mapping[str, SettingEffect], names: Sequence[str]) -> dict[str, SettingEffect]:
+    """Return the effects of these names, in their order."""
+    unknown = [name for name in names if name not in effects]
+    if unknown:
+        raise DiagnoseError(f"no effects {unknown} for these flights; there are {', '.join(effects)}")
+    return {name: effects[name] for name in names}
+
+
+def _measured(flights: Sequence[Recorded], carries: bool) -> list[str]:
+    """Return the channels of poses and rates that these flights have."""
+    payload = ["payload_pos_w"] if carries and any(f.payload for f in flights) else []
+    return ["pos_w", "quat_wb", *payload, *(["rate_b"] if any(f.gyro for f in flights) else [])]

@@ -3,10 +3,10 @@
 import math
 
 from visthrow.common import statistics as st
-from visthrow.evidence.report import figures
 from visthrow.evidence.report.book import ANY, Book, durations, errors, landed, misses
 from visthrow.evidence.report.throws import SHORT
 from visthrow.throws.results import Result
+from visthrow.view import figures
 from visthrow.view.parts import Grid, Picture, Section, Text
 from visthrow.view.tables import PAPER_ABLATIONS
 

@@ -5,10 +5,10 @@ import json
 import numpy as np
 
 from visthrow.common import statistics as st
-from visthrow.evidence.report import figures
 from visthrow.evidence.report.book import SHIPPED, Book, landed
 from visthrow.evidence.report.throws import SHORT
 from visthrow.throws.results import Result
+from visthrow.view import figures
 from visthrow.view.parts import Grid, Picture, Section, Text
 
 TARGET = 2.0

@@ -87,8 +87,8 @@ def quick(out: Path, jobs: int) -> None:
     from importlib.util import find_spec
 
     from visthrow.evidence.report import wanted
-    from visthrow.evidence.sweep.cli import load_list
     from visthrow.evidence.sweep.pool import Local, Pool
+    from visthrow.evidence.sweep.units import load_list
     from visthrow.throws import results
 
     folder, changes = out / "quick", ()

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from visthrow.common import statistics as st
-from visthrow.evidence.report import figures
 from visthrow.evidence.report.book import ANY, HARDENED, SHIPPED, Book, errors, landed
 from visthrow.evidence.report.throws import SHORT
 from visthrow.throws.results import Result
+from visthrow.view import figures
 from visthrow.view.parts import Grid, Picture, Section, Text
 
 PLANT, TARGET = "hybrid", 2.0

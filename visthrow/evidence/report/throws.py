@@ -3,11 +3,11 @@
 import math
 
 from visthrow.common import statistics as st
-from visthrow.evidence.report import figures
 from visthrow.evidence.report.book import HARDENED, SHIPPED, Book, errors, landed, misses
 from visthrow.evidence.report.wanted import FRONT_TARGET, TARGETS
 from visthrow.throws.plants import PLANTS
 from visthrow.throws.results import Result
+from visthrow.view import figures
 from visthrow.view.parts import Grid, Picture, Section, Text
 from visthrow.view.tables import PAPER, PAPER_NOTE
 

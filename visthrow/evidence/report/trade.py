@@ -6,11 +6,11 @@ import numpy as np
 
 from visthrow.baseline import front, thrower
 from visthrow.common import statistics as st
-from visthrow.evidence.report import figures
 from visthrow.evidence.report.book import SHIPPED, Book, landed
 from visthrow.evidence.report.throws import SHORT
 from visthrow.evidence.report.wanted import BOUNDS, FRONT_TARGET, FRONT_THROWS, TARGETS
 from visthrow.throws.results import Result
+from visthrow.view import figures
 from visthrow.view.parts import Grid, Picture, Section, Text
 from visthrow.view.tables import PAPER
 

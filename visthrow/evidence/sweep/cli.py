@@ -45,20 +45,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
-def load_list(name: str, overrides: tuple[str, ...] = ()):
-    """Units of a list, by a name of ``configs/sweep`` or a file.
-
-    Raises:
-        ConfigError: no such list, or something wrong in it.
-    """
-    from visthrow import config
-    from visthrow.evidence.sweep.lists import SweepList
-    from visthrow.evidence.sweep.units import expand
-
-    path = config.find("sweep", name)
-    return expand(path.stem, config.load(SweepList, path, overrides))
-
-
 def run(args: argparse.Namespace) -> int:
     """Run, tell, collect."""
     actions = {"run": _run, "status": _status, "collect": _collect, "releases": _releases, "work": _work}
@@ -68,6 +54,7 @@ def run(args: argparse.Namespace) -> int:
 def _run(args: argparse.Namespace) -> int:
     from visthrow.common.errors import ConfigError
     from visthrow.evidence.sweep.pool import Local, Pool
+    from visthrow.evidence.sweep.units import load_list
     from visthrow.training import device
 
     if args.minutes is not None and args.minutes <= 0:
@@ -122,6 +109,7 @@ class _Terminated:
 
 def _work(args: argparse.Namespace) -> int:
     from visthrow.common.errors import ConfigError
+    from visthrow.evidence.sweep.units import load_list
     from visthrow.evidence.sweep.work import work
 
     if not args.units:
@@ -140,6 +128,7 @@ def _follow(parent: int) -> None:
 
 def _status(args: argparse.Namespace) -> int:
     from visthrow.evidence.sweep.record import status
+    from visthrow.evidence.sweep.units import load_list
 
     lines, done = status(load_list(args.list, tuple(args.overrides)), Path(args.out))
     print("\n".join(lines))
@@ -148,6 +137,7 @@ def _status(args: argparse.Namespace) -> int:
 
 def _collect(args: argparse.Namespace) -> int:
     from visthrow.evidence.sweep.record import collect
+    from visthrow.evidence.sweep.units import load_list
 
     out = Path(args.out)
     for path in collect(load_list(args.list, tuple(args.overrides)), out, Path(args.records or out / "records")):
@@ -158,6 +148,7 @@ def _collect(args: argparse.Namespace) -> int:
 def _releases(args: argparse.Namespace) -> int:
     from visthrow.common.errors import ConfigError, suggest
     from visthrow.evidence.sweep.release import HEAD, releases, row
+    from visthrow.evidence.sweep.units import load_list
     from visthrow.throws.loading import load_policy
     from visthrow.training.device import resolve
 

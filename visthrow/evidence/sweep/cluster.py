@@ -92,7 +92,7 @@ def do(
     list_name: str, out: str, changes: tuple[str, ...], folder: str, ids: tuple[str, ...], device: str, minutes: float
 ) -> int:
     """Do a task's units in a job; returns the exit status of ``visthrow sweep work``."""
-    from visthrow.evidence.sweep.cli import load_list
+    from visthrow.evidence.sweep.units import load_list
     from visthrow.evidence.sweep.work import work
 
     os.chdir(folder)

@@ -153,6 +153,16 @@ def variant_of(run: str) -> str:
     return (rest or "full") if layout in ("state", "vision") else stem
 
 
+def load_list(name: str, overrides: tuple[str, ...] = ()) -> Work:
+    """Load a list by a name of ``configs/sweep`` or a file, and expand it to units.
+
+    Raises:
+        ConfigError: no such list, or something wrong in it.
+    """
+    path = config.find("sweep", name)
+    return expand(path.stem, config.load(SweepList, path, overrides))
+
+
 def expand(name: str, params: SweepList) -> Work:
     """Cut a list into units.
 

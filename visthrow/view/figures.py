@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from visthrow.common import style
-from visthrow.common.statistics import Interval
+from visthrow.common.statistics import Interval, pareto
 from visthrow.view.parts import png_of
 
 WIDTH = 9.2
@@ -185,8 +185,6 @@ def trades(panels: Sequence[Trade]) -> bytes:
     """Agility against accuracy, a panel a plant; lines join the settings that no other one beats."""
     style.use()
     import matplotlib.pyplot as plt
-
-    from visthrow.baseline.front import pareto
 
     figure, axes = plt.subplots(
         1, len(panels), figsize=(WIDTH, 5.2), layout="constrained", sharex=True, sharey=True, squeeze=False

@@ -1,0 +1,65 @@
+"""Named functions of a setting that the tables of ``configs/effects`` refer to: which blocks it has, and it with another block."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+from sim.effects.setting import AERODYNAMICS, Setting
+
+SEGMENTS = 15
+"""Of a rope that turns out to be flexible (the paper, Sec. III-B)."""
+LONGEST_OFFSET = 0.12
+"""Length of a rope from which a payload's offset can be taken [m]: its upper bound, 0.1 m, leaves something."""
+
+
+def _vehicle(setting: Setting, **parts: dict[str, Any]) -> Setting:
+    vehicle = setting.plant.vehicle
+    changed = {name: dataclasses.replace(getattr(vehicle, name), **values) for name, values in parts.items()}
+    plant = dataclasses.replace(setting.plant, vehicle=dataclasses.replace(vehicle, **changed))
+    return dataclasses.replace(setting, plant=plant)
+
+
+def _segments(setting: Setting, count: int) -> Setting:
+    rope = dataclasses.replace(setting.plant.rope, segments=count)
+    return dataclasses.replace(setting, plant=dataclasses.replace(setting.plant, rope=rope))
+
+
+def _lagging(setting: Setting) -> Setting:
+    tau = setting.plant.vehicle.motor.time_constant
+    return _vehicle(setting, motor={"kind": "asymmetric", "time_constant_down": tau})
+
+
+def _pid(setting: Setting) -> bool:
+    return setting.plant.vehicle.controller.kind == "betaflight"
+
+
+CONDITIONS: dict[str, Callable[[Setting], bool]] = {
+    "always": lambda s: True,
+    "aerodynamics": lambda s: s.plant.vehicle.aero.kind != "none",
+    "no aerodynamics": lambda s: not any(getattr(s.plant.vehicle.aero, name) for name in AERODYNAMICS),
+    "PID controller": _pid,
+    "proportional controller": lambda s: not _pid(s),
+    "feed-forward": lambda s: _pid(s) and any(s.plant.vehicle.controller.feedforward_gain),
+    "integral limit": lambda s: _pid(s) and all(s.plant.vehicle.controller.integral_limit),
+    "motor lag": lambda s: s.plant.vehicle.motor.kind != "instant",
+    "motor lag of two": lambda s: s.plant.vehicle.motor.kind == "asymmetric",
+    "no motor lag": lambda s: s.plant.vehicle.motor.kind == "instant",
+    "rotor inertia": lambda s: s.plant.vehicle.rotors.inertia > 0.0,
+    "battery": lambda s: s.plant.vehicle.battery.kind == "sag",
+    "payload inertia": lambda s: s.plant.rope.payload_inertia > 0.0,
+    "long rope": lambda s: s.plant.rope.length > LONGEST_OFFSET,
+    "flexible rope": lambda s: s.plant.rope.segments > 1,
+    "rigid rope": lambda s: s.plant.rope.segments == 1,
+    "camera": lambda s: s.camera is not None,
+}
+"""Name -> whether a setting has what an effect changes."""
+
+SWITCHES: dict[str, Callable[[Setting], Setting]] = {
+    "PID controller": lambda s: _vehicle(s, controller={"kind": "betaflight"}),
+    "proportional controller": lambda s: _vehicle(s, controller={"kind": "geometric"}),
+    "motor lag": _lagging,
+    "no motor lag": lambda s: _vehicle(s, motor={"kind": "instant"}),
+    "flexible rope": lambda s: _segments(s, SEGMENTS),
+    "rigid rope": lambda s: _segments(s, 1),
+}
+"""Name -> the setting with another kind of block."""

@@ -1,0 +1,159 @@
+"""Effects: what reality may have and the simulator lacks, and what each changes in the description of a simulated flight.
+
+The equation of an effect stands in the block of :mod:`sim` that it extends (or in :mod:`sim.replay.sensing`); its table in
+``configs/effects`` names the numbers of a :class:`sim.effects.setting.Setting` that it changes, nothing more.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from sim.effects.blocks import CONDITIONS, SWITCHES
+from sim.effects.setting import Setting
+
+
+@dataclass(frozen=True)
+class Effect:
+    """One cause that reality may have and the model lacks, or has with another size.
+
+    The size theta is a *deviation*: 0 means that the model is right as it stands.
+    """
+
+    name: str  # identifier, such as rope_length
+    cause: str  # in words, as the first half of a sentence
+    equation: str  # what it changes, with theta
+    unit: str  # of theta
+    block: str  # block of the simulator that holds the equation, such as rope, motor, sensing
+    bounds: tuple[float, float]  # physically possible values of theta
+    prior_sd: float  # spread of theta where the effect is present
+    floor: float  # size below which it does not matter: numerics, and 5 mm of landing or a tenth of the noise
+    channels: tuple[str, ...]  # channels of the log without which it cannot be seen
+    source: str  # of equation and prior
+    confused_with: tuple[str, ...] = ()  # effects that look alike in ordinary flights
+    manoeuvres: tuple[str, ...] = ()  # manoeuvres that separate it from those
+    switch: str = ""  # where theta is 0 or 1: the other kind of block that 1 puts in, of which a derivative says little
+
+
+@dataclass(frozen=True)
+class Change:
+    """A number of a setting that an effect changes."""
+
+    path: str  # such as plant.vehicle.thrust.gain
+    index: int | None = None  # of a tuple; None: all of it
+    scale: bool = False  # times (1 + factor theta) instead of plus factor theta
+    factor: float = 1.0  # of theta
+
+    def apply(self, setting: Setting, theta: float) -> Setting:
+        """Return the setting with this number changed."""
+        value = _read(setting, self.path)
+        if isinstance(value, tuple):
+            picked = range(len(value)) if self.index is None else (self.index,)
+            new: Any = tuple(self._new(v, theta) if i in picked else v for i, v in enumerate(value))
+        else:
+            new = self._new(value, theta)
+        return _replaced(setting, self.path.split("."), new)
+
+    def _new(self, value: float, theta: float) -> float:
+        return value * (1.0 + self.factor * theta) if self.scale else value + self.factor * theta
+
+
+def _read(setting: Any, path: str) -> Any:
+    for name in path.split("."):
+        setting = getattr(setting, name)
+    return setting
+
+
+def _replaced(owner: Any, names: list[str], new: Any) -> Any:
+    if len(names) == 1:
+        return dataclasses.replace(owner, **{names[0]: new})
+    return dataclasses.replace(owner, **{names[0]: _replaced(getattr(owner, names[0]), names[1:], new)})
+
+
+@dataclass(frozen=True)
+class Lowest:
+    """How low a number of the setting may come: theta is at least ``least - share * number / factor``."""
+
+    path: str
+    share: float = 1.0  # of the number that may go
+    factor: float = 1.0  # of theta in the number's change
+    least: float = 0.0  # that stays [unit of theta]
+
+
+@dataclass(frozen=True)
+class SettingEffect(Effect):
+    """An effect as a change of a setting; a table of ``configs/effects``.
+
+    Raises:
+        ValueError: A condition or a kind of block that does not exist, or neither or both of changes and switch.
+    """
+
+    changes: tuple[Change, ...] = ()
+    step: float = 0.25  # of theta for derivatives, in floors
+    needs: str = "always"  # what the setting must have: a name of sim.effects.blocks.CONDITIONS
+    simpler: bool = False  # a switch to a simpler block: left out unless asked for, as each compiles a kernel
+    lowest: tuple[Lowest, ...] = ()  # beside the bounds: no negative mass, delay or drag
+
+    def __post_init__(self) -> None:
+        for name, known in ((self.needs, CONDITIONS), (self.switch, {"": None, **SWITCHES})):
+            if name not in known:
+                raise ValueError(f"got '{name}'; expected one of: {', '.join(filter(None, known))}")
+        if bool(self.changes) == bool(self.switch):
+            raise ValueError("got both changes and a switch, or neither; expected one of them")
+
+    def applies(self, setting: Setting) -> bool:
+        """Tell whether a setting has what the effect changes."""
+        return CONDITIONS[self.needs](setting)
+
+    def apply(self, setting: Setting, theta: float) -> Setting:
+        """Return the setting in which the effect has the size ``theta``."""
+        if self.switch:
+            return SWITCHES[self.switch](setting) if theta > 0.5 else setting
+        for change in self.changes:
+            setting = change.apply(setting, theta)
+        return setting
+
+    def bounded(self, setting: Setting) -> "SettingEffect":
+        """Return the effect with the lower bound that this setting's own numbers set."""
+        if not self.lowest:
+            return self
+        most = min(x.share * _read(setting, x.path) / x.factor - x.least for x in self.lowest)
+        return dataclasses.replace(self, bounds=(max(self.bounds[0], -most), self.bounds[1]))
+
+
+@dataclass(frozen=True)
+class RandomEffect:
+    """A quantity that is drawn anew in every flight, from a normal distribution about its mean."""
+
+    name: str
+    cause: str  # in words, as the first half of a sentence
+    equation: str  # theta: the standard deviation
+    of: tuple[str, ...]  # effects, in whose unit it is; of several one deviation for all
+    unit: str
+    block: str
+    prior_sd: float  # of the half-normal deviation, where the quantity varies
+    floor: float
+    source: str
+    confused_with: tuple[str, ...] = ()
+    manoeuvres: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class EffectTables:
+    """A file of ``configs/effects``: name -> what bears it."""
+
+    effects: dict[str, SettingEffect] = field(default_factory=dict)
+    random_effects: dict[str, RandomEffect] = field(default_factory=dict)
+
+
+def apply(effects: Mapping[str, SettingEffect], setting: Setting, theta: Mapping[str, float]) -> Setting:
+    """Return the setting with effects of these sizes.
+
+    Raises:
+        KeyError: No effect of that name.
+    """
+    for name, size in theta.items():
+        effect = effects[name]
+        if size != 0.0:
+            setting = effect.apply(setting, size)
+    return setting

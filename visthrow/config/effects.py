@@ -1,0 +1,51 @@
+"""The catalogue of effects: the files of ``configs/effects``, read once. Training and diagnosis both apply it.
+
+Its classes are those of :mod:`sim.effects.effect`, which is imported when the catalogue is asked for: configurations are read on
+board too, where no simulator is installed.
+"""
+
+from collections.abc import Iterable
+from functools import cache
+from typing import Any
+
+from visthrow import config
+from visthrow.common.errors import ConfigError, suggest
+from visthrow.config import kinds
+
+FILES = ("thrust", "body", "air", "rope", "sensing", "camera", "numerics", "structure", "random")
+"""Files of ``configs/effects`` in the order of the catalogue, which is that of a diagnosis' columns."""
+
+
+@cache
+def _tables() -> tuple[Any, ...]:
+    schema = kinds.schema_of("effects")
+    return tuple(config.load(schema, config.find("effects", name)) for name in FILES)
+
+
+@cache
+def catalogue() -> dict[str, Any]:
+    """Return every effect, a ``SettingEffect``, by its name.
+
+    Raises:
+        ConfigError: A file does not fill its schema.
+    """
+    return {name: effect for table in _tables() for name, effect in table.effects.items()}
+
+
+@cache
+def random_effects() -> tuple[Any, ...]:
+    """Return what may differ from flight to flight, each a ``RandomEffect``."""
+    return tuple(effect for table in _tables() for effect in table.random_effects.values())
+
+
+def chosen(names: Iterable[str]) -> dict[str, Any]:
+    """Return the effects of these names.
+
+    Raises:
+        ConfigError: The catalogue does not hold one of them.
+    """
+    known = catalogue()
+    for name in names:
+        if name not in known:
+            raise ConfigError(f"no effect '{name}'; {suggest(name, known)}")
+    return {name: known[name] for name in names}
