@@ -20,7 +20,7 @@ from visthrow.task import Experiment
         ("camera", "fisheye", "fisheye.k1=1e9", "1 deg off the axis"),
         ("task", "state", "bounds.altitude=[3,0.5]", "lower limit before the upper"),
         ("task", "state", "noise.command_step=-1", "command_step"),
-        ("train", "state", "ppo.iterations=-3", "iterations -3"),
+        ("train", "state", "ppo.iterations=-3", "1 or more"),
         ("train", "state", "ppo.discount=1.5", "discount"),
     ],
 )
