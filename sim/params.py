@@ -221,6 +221,11 @@ class RopeParams:
     payload_lift: float = 0.0  # the same upwards in the path's vertical plane [kg/m]
     compliance: float = 0.0  # lengthening for every newton of pull [m/N]
 
+    @property
+    def hanging_mass(self) -> float:
+        """Mass of rope and payload [kg]."""
+        return self.rope_mass + self.payload_mass
+
 
 @dataclass(frozen=True)
 class AirParams:
@@ -294,6 +299,11 @@ class PlantParams:
     sim: SimParams
     air: AirParams = AirParams()
     laws: tuple[LawParams, ...] = ()
+
+    @property
+    def total_mass(self) -> float:
+        """Mass of the vehicle with all that hangs on it [kg]."""
+        return self.vehicle.body.mass + self.rope.hanging_mass
 
 
 @dataclass(frozen=True)

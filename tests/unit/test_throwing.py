@@ -18,7 +18,7 @@ from visthrow.logs.flightlog import STANDARD_CHANNELS, FlightLog
 from visthrow.onboard.policy import Policy
 from visthrow.task import Experiment, contract_of
 from visthrow.throws import compare, reference_protocol
-from visthrow.throws.flight import fly
+from visthrow.throws.recorded import fly
 from visthrow.throws.loading import load_policy, unique_names
 from visthrow.throws.loose_rope import LooseRope
 from visthrow.throws.plants import HybridPlant, make_plant

@@ -60,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _here(loaded: list, folder: Path) -> list[Path]:
     """One recorded throw, and many in the training simulator."""
-    from visthrow.throws.flight import fly as throw_once
+    from visthrow.throws.recorded import fly as throw_once
 
     print("One throw at a target 2 m ahead with the vision policy ...", flush=True)
     log = throw_once(loaded[1], [2.0, 0.0, 0.0], "hybrid", SEED)

@@ -1,0 +1,156 @@
+"""Work done side by side: computations in processes of their own, and what waits for other processes in threads.
+
+Results come as they are done. An error, Ctrl-C or leaving early ends the processes. To go on with what was interrupted, a caller
+keeps each result as it comes and leaves out what is there.
+"""
+
+import math
+import multiprocessing as mp
+import pickle
+import signal
+import sys
+import time
+import traceback
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor
+from concurrent.futures import wait as wait_for
+from multiprocessing.connection import wait
+from typing import Any
+
+from visthrow.common.errors import VisthrowError
+
+LOOK = 0.5
+"""Between two looks at the progress [s]."""
+
+
+class Workers:
+    """Processes that begin their tasks at once; a context manager that ends them when left.
+
+    >>> with Workers(math.sqrt, [1.0, 4.0], 2) as workers:  # doctest: +SKIP
+    ...     roots = workers.results("roots")
+    """
+
+    def __init__(self, function: Callable[[Any], Any], tasks: Iterable[Any], processes: int) -> None:
+        """Start.
+
+        Args:
+            function: of a task, importable by its name; it may call :func:`progress`.
+            tasks: taken one by one in this order.
+            processes: at most; there are no more than tasks.
+        """
+        self._tasks = list(tasks)
+        context = mp.get_context("spawn")
+        self._shares = context.Array("d", len(self._tasks), lock=False)
+        # Pickled here: multiprocessing's own pickler would send tensors as shared memory.
+        work, taken = pickle.dumps((function, self._tasks)), context.Value("i", 0)
+        self._running: dict[Any, mp.Process] = {}
+        for _ in range(min(processes, len(self._tasks))):
+            ours, theirs = context.Pipe(duplex=False)
+            process = context.Process(target=_serve, args=(theirs, work, taken, self._shares), daemon=True)
+            process.start()
+            theirs.close()
+            self._running[ours] = process
+
+    def __enter__(self) -> "Workers":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for process in self._running.values():
+            process.terminate()
+        for process in self._running.values():
+            process.join()
+
+    def __iter__(self) -> Iterator[tuple[int, Any]]:
+        """Yield a task's place in the order and its result, as they are done."""
+        return self._done(lambda: None)
+
+    def results(self, label: str = "") -> list[Any]:
+        """Wait for all results, in the order of the tasks; with a label and on a terminal, with a line of progress."""
+        begin, shown = time.monotonic(), bool(label) and sys.stderr.isatty()
+
+        def show() -> None:
+            share = sum(self._shares) / len(self._tasks)
+            left = (time.monotonic() - begin) * (1 / share - 1) if share > 0.02 else math.nan
+            note = f", about {left:.0f} s left" if math.isfinite(left) else ""
+            print(f"\r{label}: {100 * share:3.0f} %{note}   ", end="", file=sys.stderr, flush=True)
+
+        found = dict(self._done(show if shown else lambda: None))
+        if shown:
+            print(f"\r{' ' * (len(label) + 30)}\r", end="", file=sys.stderr, flush=True)
+        return [found[index] for index in range(len(self._tasks))]
+
+    def _done(self, look: Callable[[], None]) -> Iterator[tuple[int, Any]]:
+        open_ = list(self._running)
+        while open_:
+            look()
+            for end in wait(open_, LOOK):
+                try:
+                    message = end.recv()
+                except EOFError:
+                    self._running[end].join()
+                    raise VisthrowError(f"a worker process ended with status {self._running[end].exitcode}") from None
+                if message is None:
+                    open_.remove(end)
+                elif message[0] is None:
+                    raise message[1]
+                else:
+                    yield message
+
+
+def done(function: Callable[[Any], Any], tasks: Iterable[Any], processes: int = 1) -> Iterator[tuple[int, Any]]:
+    """Yield each task's place in the order and its result as they are done; in this process where one will do."""
+    tasks = list(tasks)
+    if processes <= 1 or len(tasks) <= 1:
+        yield from ((index, function(task)) for index, task in enumerate(tasks))
+        return
+    with Workers(function, tasks, processes) as workers:
+        yield from workers
+
+
+_note: Callable[[float], None] = lambda share: None  # noqa: E731
+
+
+def progress(share: float) -> None:
+    """Say in a task which share of it is done; nothing outside of a worker."""
+    _note(share)
+
+
+def _serve(end: Any, work: bytes, taken: Any, shares: Any) -> None:
+    """Take tasks until none is left."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends its workers
+    import torch
+
+    global _note
+    torch.set_num_threads(1)
+    try:
+        function, tasks = pickle.loads(work)
+        while True:
+            with taken.get_lock():
+                index, taken.value = taken.value, taken.value + 1
+            if index >= len(tasks):
+                end.send(None)
+                return
+            _note = lambda share, index=index: shares.__setitem__(index, share)
+            end.send((index, function(tasks[index])))
+            shares[index] = 1.0
+    except Exception as error:
+        error.add_note(f"in a worker process:\n{traceback.format_exc()}")
+        end.send((None, error))
+
+
+def side_by_side(what: Callable[[Any, Any], Any], items: Iterable[Any], places: Sequence[Any]) -> Iterator[Any]:
+    """Yield what is made of each item in a thread, as they are done; as many at once as there are places, one a place.
+
+    After an error nothing more is begun.
+    """
+    free, todo, running = list(reversed(places)), iter(items), {}
+    with ThreadPoolExecutor(len(places)) as pool:
+        while True:
+            while free and (item := next(todo, None)) is not None:
+                place = free.pop()
+                running[pool.submit(what, item, place)] = place
+            if not running:
+                return
+            for future in wait_for(running, return_when=FIRST_COMPLETED).done:
+                free.append(running.pop(future))
+                yield future.result()
