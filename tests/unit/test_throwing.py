@@ -18,10 +18,10 @@ from visthrow.logs.flightlog import STANDARD_CHANNELS, FlightLog
 from visthrow.onboard.policy import Policy
 from visthrow.task import Experiment, contract_of
 from visthrow.throws import compare, reference_protocol
-from visthrow.throws.recorded import fly
 from visthrow.throws.loading import load_policy, unique_names
 from visthrow.throws.loose_rope import LooseRope
 from visthrow.throws.plants import HybridPlant, make_plant
+from visthrow.throws.recorded import fly
 from visthrow.training.protocol import Throws
 from visthrow.view.tables import csv_text, markdown
 

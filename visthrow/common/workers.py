@@ -42,11 +42,11 @@ class Workers:
         context = mp.get_context("spawn")
         self._shares = context.Array("d", len(self._tasks), lock=False)
         # Pickled here: multiprocessing's own pickler would send tensors as shared memory.
-        work, taken = pickle.dumps((function, self._tasks)), context.Value("i", 0)
+        work, self._taken = pickle.dumps((function, self._tasks)), context.Value("i", 0)
         self._running: dict[Any, mp.Process] = {}
         for _ in range(min(processes, len(self._tasks))):
             ours, theirs = context.Pipe(duplex=False)
-            process = context.Process(target=_serve, args=(theirs, work, taken, self._shares), daemon=True)
+            process = context.Process(target=_serve, args=(theirs, work, self._taken, self._shares), daemon=True)
             process.start()
             theirs.close()
             self._running[ours] = process
@@ -107,12 +107,14 @@ def done(function: Callable[[Any], Any], tasks: Iterable[Any], processes: int = 
         yield from workers
 
 
-_note: Callable[[float], None] = lambda share: None  # noqa: E731
+_shares: Any = None
+_index = 0
 
 
 def progress(share: float) -> None:
     """Say in a task which share of it is done; nothing outside of a worker."""
-    _note(share)
+    if _shares is not None:
+        _shares[_index] = share
 
 
 def _serve(end: Any, work: bytes, taken: Any, shares: Any) -> None:
@@ -120,19 +122,19 @@ def _serve(end: Any, work: bytes, taken: Any, shares: Any) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends its workers
     import torch
 
-    global _note
+    global _shares, _index
     torch.set_num_threads(1)
+    _shares = shares
     try:
         function, tasks = pickle.loads(work)
         while True:
             with taken.get_lock():
-                index, taken.value = taken.value, taken.value + 1
-            if index >= len(tasks):
+                _index, taken.value = taken.value, taken.value + 1
+            if _index >= len(tasks):
                 end.send(None)
                 return
-            _note = lambda share, index=index: shares.__setitem__(index, share)
-            end.send((index, function(tasks[index])))
-            shares[index] = 1.0
+            end.send((_index, function(tasks[_index])))
+            progress(1.0)
     except Exception as error:
         error.add_note(f"in a worker process:\n{traceback.format_exc()}")
         end.send((None, error))

@@ -6,11 +6,11 @@ import math
 import os
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 from visthrow.common.arguments import add_common
 from visthrow.common.errors import ConfigError, StorageError
+from visthrow.throws.results import Entry
 
 DEFAULT_POLICIES = ("state", "vision")
 DEFAULT_TARGETS = (1.5, 2.0, 2.5)
@@ -119,15 +119,6 @@ def _from_runs(args: argparse.Namespace) -> int:
     if args.json:
         write_json(args.json, {"plant": "runs", "runs": args.runs, "rows": rows})
     return 0
-
-
-@dataclass(frozen=True)
-class Entry:
-    """One row's thrower: what it is called, what it sees ("state", "vision") or is, and its throws a target."""
-
-    name: str
-    layout: str
-    throws: Sequence
 
 
 def entries_of(loaded: Sequence, names: Sequence[str], throws: Sequence[Sequence]) -> list[Entry]:

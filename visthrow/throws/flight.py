@@ -131,7 +131,8 @@ class Flight:
     """E vehicles of a plant in flight.
 
     Attributes:
-        now: the plant's state. elapsed: since the phase began [s]. begin: when the first throw began, on the plant's clock [s]; NaN before it.
+        now: the plant's state. elapsed: since the phase began [s].
+        begin: when the first throw began, on the plant's clock [s]; NaN before it.
         open: whose throw is neither over nor failed, shape (E,). flown: whom the pilots fly in this period, shape (E,).
         failed: shape (E,), bool. failures: why, a message or None for each.
         commands: that were sent, each of shape (E, 4).

@@ -8,8 +8,8 @@ from sim.reference.rotations import rotation_from_quat, turned
 from visthrow.diagnose.check import relations
 from visthrow.diagnose.check.rows import Row
 from visthrow.logs.flightlog import Channel, FlightLog
+from visthrow.onboard.hover import GRAVITY
 
-GRAVITY = 9.81
 MOVES = 0.05
 """Below this speed [m/s], rate [rad/s] or acceleration / 10 [m/s^2] a channel does not move enough to be compared."""
 

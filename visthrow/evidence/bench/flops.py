@@ -118,7 +118,7 @@ def hovering(plant: PlantParams, device: str = "cpu") -> HybridSim:
     sim = HybridSim(plant, 1, device)
     tilt = np.array([np.sin(0.2), 0.0, -np.cos(0.2)])
     sim.place(pos_w=np.array([[0.0, 0.0, 1.3]]), cable_dir_w=np.tile(tilt, (1, plant.rope.segments, 1)))
-    weight = GRAVITY * (plant.vehicle.body.mass + plant.rope.rope_mass + plant.rope.payload_mass)
+    weight = GRAVITY * plant.total_mass
     sim.set_command(np.array([[weight, 0.1, -0.1, 0.05]]))
     return sim
 
