@@ -4,7 +4,6 @@ Results come as they are done. An error, Ctrl-C or leaving early ends the proces
 keeps each result as it comes and leaves out what is there.
 """
 
-import math
 import multiprocessing as mp
 import pickle
 import signal
@@ -23,28 +22,31 @@ LOOK = 0.5
 """Between two looks at the progress [s]."""
 
 
-class Workers:
-    """Processes that begin their tasks at once; a context manager that ends them when left.
+def status(text: str) -> None:
+    """Show a text on the terminal's last line in place of the one before; nothing clears it, or where there is no terminal."""
+    if sys.stderr.isatty():
+        print(f"\r{text:<78}", end="" if text else "\r", file=sys.stderr, flush=True)
 
-    >>> with Workers(math.sqrt, [1.0, 4.0], 2) as workers:  # doctest: +SKIP
-    ...     roots = workers.results("roots")
+
+class Workers:
+    """Processes that begin their tasks at once, in order; a context manager that ends them when left.
+
+    Iterating yields each task's place in the order and its result, as they are done.
     """
 
-    def __init__(self, function: Callable[[Any], Any], tasks: Iterable[Any], processes: int) -> None:
+    def __init__(self, function: Callable[[Any], Any], tasks: Iterable[Any], processes: int, label: str = "") -> None:
         """Start.
 
         Args:
             function: of a task, importable by its name; it may call :func:`progress`.
-            tasks: taken one by one in this order.
-            processes: at most; there are no more than tasks.
+            tasks: what it is called with. processes: at most; there are no more than tasks.
+            label: of a line of progress on the terminal; empty for none.
         """
-        self._tasks = list(tasks)
-        context = mp.get_context("spawn")
-        self._shares = context.Array("d", len(self._tasks), lock=False)
-        # Pickled here: multiprocessing's own pickler would send tensors as shared memory.
-        work, self._taken = pickle.dumps((function, self._tasks)), context.Value("i", 0)
-        self._running: dict[Any, mp.Process] = {}
-        for _ in range(min(processes, len(self._tasks))):
+        tasks, context = list(tasks), mp.get_context("spawn")
+        self.label, self._running, self._taken = label, {}, context.Value("i", 0)
+        self._shares = context.Array("d", len(tasks), lock=False)
+        work = pickle.dumps((function, tasks))  # here: multiprocessing's own pickler would send tensors as shared memory
+        for _ in range(min(processes, len(tasks))):
             ours, theirs = context.Pipe(duplex=False)
             process = context.Process(target=_serve, args=(theirs, work, self._taken, self._shares), daemon=True)
             process.start()
@@ -61,40 +63,26 @@ class Workers:
             process.join()
 
     def __iter__(self) -> Iterator[tuple[int, Any]]:
-        """Yield a task's place in the order and its result, as they are done."""
-        return self._done(lambda: None)
-
-    def results(self, label: str = "") -> list[Any]:
-        """Wait for all results, in the order of the tasks; with a label and on a terminal, with a line of progress."""
-        begin, shown = time.monotonic(), bool(label) and sys.stderr.isatty()
-
-        def show() -> None:
-            share = sum(self._shares) / len(self._tasks)
-            left = (time.monotonic() - begin) * (1 / share - 1) if share > 0.02 else math.nan
-            note = f", about {left:.0f} s left" if math.isfinite(left) else ""
-            print(f"\r{label}: {100 * share:3.0f} %{note}   ", end="", file=sys.stderr, flush=True)
-
-        found = dict(self._done(show if shown else lambda: None))
-        if shown:
-            print(f"\r{' ' * (len(label) + 30)}\r", end="", file=sys.stderr, flush=True)
-        return [found[index] for index in range(len(self._tasks))]
-
-    def _done(self, look: Callable[[], None]) -> Iterator[tuple[int, Any]]:
-        open_ = list(self._running)
-        while open_:
-            look()
-            for end in wait(open_, LOOK):
+        busy, begin = list(self._running), time.monotonic()
+        while busy:
+            share = sum(self._shares) / len(self._shares)
+            left = f", about {(time.monotonic() - begin) * (1 / share - 1):.0f} s left" if share > 0.02 else ""
+            if self.label:
+                status(f"{self.label}: {100 * share:3.0f} %{left}")
+            for end in wait(busy, LOOK):
                 try:
-                    message = end.recv()
+                    index, result = end.recv()
                 except EOFError:
                     self._running[end].join()
                     raise VisthrowError(f"a worker process ended with status {self._running[end].exitcode}") from None
-                if message is None:
-                    open_.remove(end)
-                elif message[0] is None:
-                    raise message[1]
+                if isinstance(index, int):
+                    yield index, result
+                elif result is None:
+                    busy.remove(end)
                 else:
-                    yield message
+                    raise result
+        if self.label:
+            status("")
 
 
 def done(function: Callable[[Any], Any], tasks: Iterable[Any], processes: int = 1) -> Iterator[tuple[int, Any]]:
@@ -102,9 +90,9 @@ def done(function: Callable[[Any], Any], tasks: Iterable[Any], processes: int = 
     tasks = list(tasks)
     if processes <= 1 or len(tasks) <= 1:
         yield from ((index, function(task)) for index, task in enumerate(tasks))
-        return
-    with Workers(function, tasks, processes) as workers:
-        yield from workers
+    else:
+        with Workers(function, tasks, processes) as workers:
+            yield from workers
 
 
 _shares: Any = None
@@ -118,7 +106,7 @@ def progress(share: float) -> None:
 
 
 def _serve(end: Any, work: bytes, taken: Any, shares: Any) -> None:
-    """Take tasks until none is left."""
+    """Take tasks until none is left, then say so: (None, None); (None, error) after an error."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends its workers
     import torch
 
@@ -131,7 +119,7 @@ def _serve(end: Any, work: bytes, taken: Any, shares: Any) -> None:
             with taken.get_lock():
                 _index, taken.value = taken.value, taken.value + 1
             if _index >= len(tasks):
-                end.send(None)
+                end.send((None, None))
                 return
             end.send((_index, function(tasks[_index])))
             progress(1.0)

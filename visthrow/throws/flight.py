@@ -200,7 +200,7 @@ class Flight:
         plant.step(sent.command, sent.release)
         self.now = plant.state
         if throws:
-            self._judge(self.now)
+            self.judge(self.now)
         self.recorder.after(self, seen, sent)
 
     def _held(self, seen: Snapshot) -> np.ndarray:
@@ -209,8 +209,8 @@ class Flight:
         mass = plant.vehicle.body.mass + np.where(seen.attached, plant.rope.hanging_mass, 0.0)
         return self._hover.step(seen.pos_w, seen.quat_wb, seen.vel_w, self.home_w, mass)
 
-    def _judge(self, now: Snapshot) -> None:
-        """Note whose throw has failed or is over."""
+    def judge(self, now: Snapshot) -> None:
+        """Note whose throw has failed or is over, by the state after a period."""
         plant, landing = self.plant, self.plant.landing
         carrying = self.flown & now.attached
         for cause, mask in self._causes(now).items():

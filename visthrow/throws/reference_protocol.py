@@ -125,16 +125,9 @@ class Throwing:
     """
 
     def __init__(
-        self,
-        loaded: Sequence[Loaded],
-        targets: Sequence[float],
-        throws: int,
-        plant_name: str,
-        seed: int,
-        processes: int | None = None,
-        together: bool = False,
-        size: int = BATCH,
-    ) -> None:
+        self, loaded: Sequence[Loaded], targets: Sequence[float], throws: int, plant_name: str, seed: int,
+        processes: int | None = None, together: bool = False, size: int = BATCH,
+    ) -> None:  # fmt: skip
         """Start.
 
         Args:
@@ -170,7 +163,9 @@ class Throwing:
         Returns:
             For each policy, a :class:`visthrow.training.protocol.Throws` a target.
         """
-        parts = self._workers.results("throws on the reference plant" if show else "")
+        self._workers.label = "throws on the reference plant" if show else ""
+        found = dict(self._workers)
+        parts = [found[index] for index in range(len(self.jobs))]
         return [[self._throws(parts, policy, target) for target in self._targets] for policy in range(self._count)]
 
     def _throws(self, parts: Sequence[dict[str, np.ndarray]], policy: int, target: float) -> Throws:
