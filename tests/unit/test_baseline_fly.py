@@ -183,11 +183,10 @@ def test_a_batch_on_a_reference_plant_starts_as_the_policies_do(plan, experiment
 
 def test_flown_throws_are_scored_as_policies_are(plan, experiment):
     flown = fly_plant(plan, "hybrid", experiment, delays_of(experiment), 2)
-    throws = flown.throws(2.0)
-    assert throws.summary()["error_mean"] == pytest.approx(flown.error.mean())
-    assert throws.error == pytest.approx(np.linalg.norm(throws.landing_w - [2.0, 0.0], axis=1))
-    assert np.all((throws.clearance > 0.2) & (throws.clearance < 2.0))
-    assert np.all((throws.smoothness > 0.0) & (throws.smoothness < 1.0))
+    assert flown.summary()["error_mean"] == pytest.approx(flown.error.mean())
+    assert flown.error == pytest.approx(np.linalg.norm(flown.landing_w - [2.0, 0.0], axis=1))
+    assert np.all((flown.clearance > 0.2) & (flown.clearance < 2.0))
+    assert np.all((flown.smoothness > 0.0) & (flown.smoothness < 1.0))
 
 
 def test_delays_by_name(experiment):

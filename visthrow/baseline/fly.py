@@ -24,7 +24,7 @@ from visthrow.onboard.hover import rot_from_quat
 from visthrow.task import Experiment
 from visthrow.throws.flight import FALL_TIME, Decision, Flight, Scores, Smoothness, hover, throw
 from visthrow.throws.plants import HybridPlant, Plant, Snapshot
-from visthrow.throws.reference_protocol import FIELDS, HOVER_TIME, batch_plant, place_in_hover
+from visthrow.throws.reference_protocol import HOVER_TIME, batch_plant, place_in_hover
 from visthrow.training.protocol import Throws
 
 FINE = 4
@@ -38,35 +38,21 @@ TRUST = np.repeat([0.2, 0.3, 0.15, 0.3, 0.5], [3, 3, 3, 3, 4])
 """Share of a measurement in the estimate of payload position and velocity, cable direction and rate, and attitude."""
 
 
-@dataclass(frozen=True)
-class Flown:
-    """Results of N throws of one plan; NaN where a throw failed.
+@dataclass(frozen=True, kw_only=True)
+class Flown(Throws):
+    """Throws of one plan, scored as learnt policies are; the clearance is NaN in the own model.
 
     Attributes:
-        success: shape (N,), bool.
-        landing_w: [m], shape (N, 2). error: [m], shape (N,). duration: from start to landing [s], shape (N,).
         position_error: of the payload at separation against the planned release [m], shape (N,).
         velocity_error: the same [m/s], shape (N,).
         tracking: root mean square distance of the payload from the path until the release [m], shape (N,).
-        smoothness: root mean square change of the normalised commands from step to step, shape (N,).
-        clearance: least distance of the payload from the vehicle after separation [m], shape (N,); NaN in the own model.
         step_times: of all steps of the controller [s], shape (K,).
     """
 
-    success: np.ndarray
-    landing_w: np.ndarray
-    error: np.ndarray
-    duration: np.ndarray
     position_error: np.ndarray
     velocity_error: np.ndarray
     tracking: np.ndarray
-    smoothness: np.ndarray
-    clearance: np.ndarray
     step_times: np.ndarray
-
-    def throws(self, target: float) -> Throws:
-        """The same as learnt policies are scored."""
-        return Throws(target, **{name: getattr(self, name) for name in FIELDS})
 
     def summary(self) -> dict[str, float]:
         """Mean and deviation of the successful throws; times of a step in ms."""
@@ -159,10 +145,11 @@ def fly_pendulum(
     good &= np.isfinite(fall)
     blank = np.where(good, 1.0, np.nan)
     landing = point * blank[:, None]
+    error = np.linalg.norm(landing - [plan.target, 0.0], axis=1)
     return Flown(
-        good, landing, np.linalg.norm(landing - [plan.target, 0.0], axis=1), (plan.path.duration + fall) * blank,
+        plan.target, good, landing, error, (plan.path.duration + fall) * blank, np.full(count, np.nan), smoothness * blank,
         **_off(plan, state[:, pm.POS], state[:, pm.VEL], good), tracking=np.sqrt(tracking / steps) * blank,
-        smoothness=smoothness * blank, clearance=np.full(count, np.nan), step_times=np.array(times),
+        step_times=np.array(times),
     )  # fmt: skip
 
 
@@ -337,7 +324,7 @@ class _Tracking(Scores):
         columns = self.columns(flight)
         off = _off(self.pilots.plan, *self.separated, columns["success"])
         tracking = np.sqrt(self._sum / np.maximum(self._due, 1)) * np.where(columns["success"], 1.0, np.nan)
-        return Flown(**columns, **off, tracking=tracking, step_times=np.array(self.pilots.times))
+        return Flown(self.pilots.plan.target, **columns, **off, tracking=tracking, step_times=np.array(self.pilots.times))
 
 
 def fly_plant(

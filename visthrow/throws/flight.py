@@ -67,8 +67,8 @@ class Policies:
         self.goal_vel_w = np.zeros_like(goal_w) if goal_vel_w is None else goal_vel_w
         share = len(goal_w) // len(loaded)
         self.slices = [slice(i * share, (i + 1) * share) for i in range(len(loaded))]
-        cameras = [item.experiment.camera if draws or _layout(item) == "vision" else None for item in loaded]
-        self.pilots = [Pilot(item.policy, camera, share) for item, camera in zip(loaded, cameras)]
+        looks = [draws or item.policy.contract["observation"]["layout"] == "vision" for item in loaded]
+        self.pilots = [Pilot(item.policy, item.experiment.camera if look else None, share) for item, look in zip(loaded, looks)]
         self.first_action = np.vstack([pilot.previous_action for pilot in self.pilots])
 
     def decide(self, flight: "Flight", seen: Snapshot, held: np.ndarray) -> Decision:
@@ -78,10 +78,6 @@ class Policies:
             outs.append(pilot.act(*(getattr(seen, name)[part] for name in VIEWS), goal_w[part], seen.attached[part]))
         names = ("command", "release", "action", *(["observation"] if len(outs) == 1 else []))
         return Decision(*(np.concatenate([getattr(out, name) for out in outs]) for name in names))
-
-
-def _layout(item: Loaded) -> str:
-    return item.policy.contract["observation"]["layout"]
 
 
 class Recorder:
@@ -107,24 +103,19 @@ class Phase:
     over: Callable[["Flight"], bool]
 
 
-def lasting(time: float) -> Callable[["Flight"], bool]:
-    """End of a phase of a given time [s], to the nearest period."""
-    return lambda flight: flight.elapsed > time - 0.5 * flight.plant.period
-
-
 def throw(seconds: float | None = None) -> Phase:
     """Throw until every payload has landed or its throw has failed, at most for a time [s]; default what the bounds allow."""
 
     def over(flight: "Flight") -> bool:
         most = flight.pilots.experiment.task.bounds.time_limit + FALL_TIME if seconds is None else seconds
-        return not np.any(flight.open) or lasting(most)(flight)
+        return not np.any(flight.open) or flight.lasted(most)
 
     return Phase(True, over)
 
 
 def hover(seconds: float) -> Phase:
     """Hover for a time [s]."""
-    return Phase(False, lasting(seconds))
+    return Phase(False, lambda flight: flight.lasted(seconds))
 
 
 class Flight:
@@ -138,9 +129,7 @@ class Flight:
         commands: that were sent, each of shape (E, 4).
     """
 
-    def __init__(
-        self, plant: Plant, pilots: Pilots, recorder: Recorder | None = None, home_w: np.ndarray | None = None
-    ) -> None:  # fmt: skip
+    def __init__(self, plant: Plant, pilots: Pilots, recorder: Recorder | None = None, home_w: np.ndarray | None = None) -> None:
         """Take over a plant.
 
         Args:
@@ -163,6 +152,10 @@ class Flight:
     def elapsed(self) -> float:
         """See the class."""
         return self.plant.time - self._phase_begin
+
+    def lasted(self, time: float) -> bool:
+        """Whether the phase has lasted for a time [s], to the nearest period."""
+        return self.elapsed > time - 0.5 * self.plant.period
 
     def goal_at(self, time: float | np.ndarray) -> np.ndarray:
         """Goals [m], shape (E, 3), at a time or a time each on the plant's clock [s]."""
@@ -287,10 +280,7 @@ class Scores(Recorder):
         goal = flight.goal_at(landing.time)[:, :2]
         moving = {"goal_w": goal * blank[:, None]} if np.any(flight.pilots.goal_vel_w) else {}
         return {
-            "success": success,
-            "landing_w": point,
-            "error": np.linalg.norm(point - goal, axis=1),
-            "duration": (landing.time - flight.begin) * blank,
-            "clearance": np.where(success, self.clearance, np.nan),
+            "success": success, "landing_w": point, "error": np.linalg.norm(point - goal, axis=1),
+            "duration": (landing.time - flight.begin) * blank, "clearance": np.where(success, self.clearance, np.nan),
             "smoothness": self.smoothness.value * blank,
-        } | moving
+        } | moving  # fmt: skip
