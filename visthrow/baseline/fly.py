@@ -22,7 +22,7 @@ from visthrow.baseline.release import landing_point
 from visthrow.common.errors import ConfigError, suggest
 from visthrow.onboard.hover import rot_from_quat
 from visthrow.task import Experiment
-from visthrow.throws.flight import FALL_TIME, Decision, Flight, Scores, Smoothness, hover, throw
+from visthrow.throws.flight import FALL_TIME, Decision, Flight, Pilots, Scores, Smoothness, hover, throw
 from visthrow.throws.plants import HybridPlant, Plant, Snapshot
 from visthrow.throws.reference_protocol import HOVER_TIME, batch_plant, place_in_hover
 from visthrow.training.protocol import Throws
@@ -230,12 +230,11 @@ def _started(
     return plant, place_in_hover(plant, experiment, start, rng)
 
 
-class Controllers:
+class Controllers(Pilots):
     """MPC of E vehicles as the pilots of a flight: tracks a plan, and trips the latch at its time.
 
     Attributes:
-        experiment, goal_w, goal_vel_w, first_action: see `visthrow.throws.flight.Pilots`.
-        latch: period of the throw in which the latch trips.
+        latch: period of the throw in which the latch trips. most: periods that a throw may take.
         times: that all steps of the controllers took [s].
     """
 
@@ -246,18 +245,16 @@ class Controllers:
             plan: of the throw. experiment: whose limits, mount and delays they are.
             period: of the commands [s]. delays: to make up for. count: E.
         """
-        self.plan, self.experiment, self.delays, self.period = plan, experiment, delays, period
-        self.goal_w, self.goal_vel_w = np.tile([plan.target, 0.0, 0.0], (count, 1)), np.zeros((count, 3))
-        action = experiment.task.action
+        self.plan, self.delays, self.period, action = plan, delays, period, experiment.task.action
         self.params = MPCParams(period=period, max_thrust=action.max_thrust, max_rate=action.max_rate)
         self.latch = round((plan.path.duration - delays.release) / period)
         self.most = self.latch + round((experiment.release.lag + FALL_TIME) / period) + 2
-        """Periods that a throw may take."""
         self.times: list[float] = []
         self._mpc = [MPC(plan.model, self.params) for _ in range(count)]
         self._reference = plan.reference(delays.command, period, self.most + self.params.stages)
         self._hover = pm.hover(plan.model, np.zeros((count, 3)))[1]
-        self.first_action = _normalised(self.params, self._hover)
+        goal_w = np.tile([plan.target, 0.0, 0.0], (count, 1))
+        super().__init__(experiment, goal_w, _normalised(self.params, self._hover))
         self._estimate: np.ndarray | None = None
         self._period = 0
 

@@ -7,7 +7,6 @@ payload, and the hover controller, which runs along, what has let go or failed. 
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
@@ -35,41 +34,35 @@ class Decision:
     observation: np.ndarray | None = None  # of a policy, shape (E, D)
 
 
-class Pilots(Protocol):
-    """Who throws with E vehicles.
+class Pilots:
+    """Who throws with E vehicles; the children decide."""
 
-    Attributes:
-        experiment: with the bounds of the throw.
-        goal_w: at the start of the throw [m], shape (E, 3). goal_vel_w: [m/s], shape (E, 3).
-        first_action: normalised command of the hover before the throw, shape (E, 4 or 5).
-    """
-
-    experiment: Experiment
-    goal_w: np.ndarray
-    goal_vel_w: np.ndarray
-    first_action: np.ndarray
-
-    def decide(self, flight: "Flight", seen: Snapshot, held: np.ndarray) -> Decision:
-        """Decide for all vehicles, of which those of ``flight.flown`` follow; ``held`` are the hover controller's commands."""
-
-
-class Policies:
-    """Learnt policies that share a batch, each with the same number of vehicles, the first policy's first."""
-
-    def __init__(self, loaded: Sequence[Loaded], goal_w: np.ndarray, goal_vel_w: np.ndarray | None = None, draws: bool = False) -> None:
+    def __init__(self, experiment: Experiment, goal_w: np.ndarray, first_action: np.ndarray, goal_vel_w: np.ndarray | None = None):
         """Begin before the throw.
 
         Args:
-            loaded: policies, trained for one plant. goal_w: [m], shape (E, 3). goal_vel_w: [m/s], shape (E, 3); None: still.
-            draws: with cameras for state policies too, for whoever draws what they would see.
+            experiment: with the bounds of the throw.
+            goal_w: at its start [m], shape (E, 3). goal_vel_w: [m/s], shape (E, 3); None: still.
+            first_action: normalised command of the hover before, shape (E, 4 or 5).
         """
-        self.experiment, self.goal_w = loaded[0].experiment, goal_w
+        self.experiment, self.goal_w, self.first_action = experiment, goal_w, first_action
         self.goal_vel_w = np.zeros_like(goal_w) if goal_vel_w is None else goal_vel_w
+
+    def decide(self, flight: "Flight", seen: Snapshot, held: np.ndarray) -> Decision:
+        """Decide for all vehicles, of which those of ``flight.flown`` follow; ``held`` are the hover controller's commands."""
+        raise NotImplementedError
+
+
+class Policies(Pilots):
+    """Learnt policies that share a batch, each with the same number of vehicles, the first policy's first."""
+
+    def __init__(self, loaded: Sequence[Loaded], goal_w: np.ndarray, goal_vel_w: np.ndarray | None = None, draws: bool = False) -> None:
+        """Begin with policies that were trained for one plant; ``draws``: state policies too have a camera, to be drawn."""
         share = len(goal_w) // len(loaded)
         self.slices = [slice(i * share, (i + 1) * share) for i in range(len(loaded))]
         looks = [draws or item.policy.contract["observation"]["layout"] == "vision" for item in loaded]
         self.pilots = [Pilot(item.policy, item.experiment.camera if look else None, share) for item, look in zip(loaded, looks)]
-        self.first_action = np.vstack([pilot.previous_action for pilot in self.pilots])
+        super().__init__(loaded[0].experiment, goal_w, np.vstack([pilot.previous_action for pilot in self.pilots]), goal_vel_w)
 
     def decide(self, flight: "Flight", seen: Snapshot, held: np.ndarray) -> Decision:
         """See `Pilots`."""

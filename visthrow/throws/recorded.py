@@ -20,9 +20,7 @@ HOVER_LEAST, HOVER_MOST = 1.5, 6.0  # time in hover before the throw [s]
 QUIET_OFFSET, QUIET_SPEED = 0.03, 0.12  # vehicle off its hover point [m]; payload against the world [m/s]
 QUIET_TIME = 0.4  # for which it must last [s]
 RECOVERY_MOST = 8.0  # [s]
-ROPE_ON_GROUND = (
-    0.003  # height at which the rope is drawn where it would pass through the ground; no plant knows it [m]
-)
+ROPE_ON_GROUND = 0.003  # height at which the rope is drawn where it would pass through the ground; no plant knows it [m]
 MEASURED = {"pos_w": "m", "quat_wb": "1", "vel_w": "m/s", "rate_b": "rad/s", "payload_pos_w": "m"}
 """Channels that are recorded a second time as measured, under ``measured_<name>``, with their units."""
 
@@ -129,16 +127,19 @@ def fly(
     plant = make_plant(plant_name, experiment, 1, seed, device)
     home = np.array([0.0, 0.0, experiment.task.start.spawn_height])
     rng = np.random.default_rng(seed)
-    plant.reset(
-        home[None] + START_SPREAD * rng.uniform(-1, 1, (1, 3)),
-        random_ropes(rng, 1, experiment.rope.segments, START_SWING),
-    )
+    place = home[None] + START_SPREAD * rng.uniform(-1, 1, (1, 3))
+    plant.reset(place, random_ropes(rng, 1, experiment.rope.segments, START_SWING))
     pilots = Policies([loaded], np.asarray(goal_w, dtype=float)[None], draws=True)
     recording = _Full(pilots, _meta(loaded, plant_name, goal_w, seed))
     flight = Flight(plant, pilots, recording, home)
-    flight.run([_until_quiet(home), Phase(True, lambda flight: not np.any(flight.open & flight.now.attached))])
+    hangs_still = _hovering(lambda now: np.linalg.norm(now.payload_vel_w[0]) < QUIET_SPEED, home, HOVER_LEAST, HOVER_MOST)
+    flight.run([hangs_still, Phase(True, lambda flight: not np.any(flight.open & flight.now.attached))])
     recovery = plant.time
-    flight.run([_until_recovered(home)])
+
+    def recovered(now: Snapshot) -> bool:  # the payload lies on the ground or hangs still
+        return np.linalg.norm(now.vel_w[0]) < QUIET_SPEED and (plant.landing.landed[0] or now.attached[0])
+
+    flight.run([_hovering(recovered, home, 0.0, RECOVERY_MOST)])
     return _finished(flight, recording, recovery)
 
 
@@ -169,31 +170,17 @@ def _meta(loaded: Loaded, plant_name: str, goal_w: np.ndarray, seed: int) -> dic
     }  # fmt: skip
 
 
-def _hovering(quiet: Callable[[Snapshot, Flight], bool], home: np.ndarray, least: float, most: float) -> Phase:
+def _hovering(quiet: Callable[[Snapshot], bool], home: np.ndarray, least: float, most: float) -> Phase:
     """Hover until the vehicle is at its place and quiet for a while; least and most time [s]."""
     still = 0.0
 
     def over(flight: Flight) -> bool:
         nonlocal still
         near = np.linalg.norm(flight.now.pos_w[0] - home) < QUIET_OFFSET
-        still = still + flight.plant.period if near and quiet(flight.now, flight) else 0.0
+        still = still + flight.plant.period if near and quiet(flight.now) else 0.0
         return flight.elapsed >= least - 1e-9 and (still >= QUIET_TIME or flight.elapsed >= most)
 
     return Phase(False, over)
-
-
-def _until_quiet(home: np.ndarray) -> Phase:
-    """Hover before the throw, until the payload hangs still."""
-    return _hovering(lambda now, _: np.linalg.norm(now.payload_vel_w[0]) < QUIET_SPEED, home, HOVER_LEAST, HOVER_MOST)
-
-
-def _until_recovered(home: np.ndarray) -> Phase:
-    """Hover after the throw, until the vehicle stands still, and the payload lies on the ground or hangs again."""
-
-    def quiet(now: Snapshot, flight: Flight) -> bool:
-        return np.linalg.norm(now.vel_w[0]) < QUIET_SPEED and (flight.plant.landing.landed[0] or now.attached[0])
-
-    return _hovering(quiet, home, 0.0, RECOVERY_MOST)
 
 
 def _finished(flight: Flight, recording: _Full, recovery: float) -> FlightLog:

@@ -48,27 +48,11 @@ def while_carrying(
     }
 
 
-def broken(status: Tensor) -> Tensor:
-    """Simulator put the environment back from a bad state."""
-    return (status & NONFINITE) != 0
-
-
-def collided(status: Tensor) -> Tensor:
-    """Payload touched the vehicle."""
-    return (status & COLLISION) != 0
-
-
 def negative(
-    p: BoundsParams,
-    pos_w: Tensor,
-    rot_wb: Tensor,
-    payload_w: Tensor,
-    status: Tensor,
-    latched: Tensor,
-    time: Tensor,
+    p: BoundsParams, pos_w: Tensor, rot_wb: Tensor, payload_w: Tensor, status: Tensor, latched: Tensor, time: Tensor,
     landing_height: float,
-) -> Tensor:
-    """All negative ends of an episode. Once the latch has tripped only collision and leaving the bounds end one early.
+) -> Tensor:  # fmt: skip
+    """All negative ends of an episode. Once the latch has tripped only collision, a bad state and leaving the bounds end one early.
 
     Args:
         p: bounds.
@@ -77,6 +61,6 @@ def negative(
         latched: shape (E,), bool. time: since the start [s], shape (E,).
         landing_height: [m].
     """
-    always = (*out_of_bounds(p, pos_w).values(), collided(status), broken(status))
+    always = (*out_of_bounds(p, pos_w).values(), (status & (COLLISION | NONFINITE)) != 0)
     carrying = while_carrying(p, pos_w, rot_wb[:, 2, 2], payload_w, time, landing_height)
     return reduce(or_, always) | (reduce(or_, carrying.values()) & ~latched)
