@@ -42,14 +42,10 @@ def run(args: argparse.Namespace) -> int:
         from visthrow.throws.reference_protocol import Throwing
 
         # The reference plant flies in a process of its own meanwhile.
-        with Throwing(
-            loaded, REFERENCE_TARGETS, REFERENCE_THROWS, "reference-realistic", SEED, 1, together=True
-        ) as throwing:
+        throws = (loaded, REFERENCE_TARGETS, REFERENCE_THROWS, "reference-realistic", SEED, 1)
+        with Throwing(*throws, together=True) as throwing:
             paths = _here(loaded, folder)
-            print(
-                f"{REFERENCE_THROWS} throws a policy on the reference plant, which stands in for a real vehicle ...",
-                flush=True,
-            )
+            print(f"{REFERENCE_THROWS} throws a policy on the reference plant, which stands in for a real vehicle ...", flush=True)
             paths += _told(loaded, throwing.results(), "reference-realistic", folder)
     print(PAPER_NOTE + "\n\nFiles:")
     for path in paths:

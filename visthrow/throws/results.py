@@ -226,7 +226,7 @@ def work(
     results = {**load_all([folder]), **(known or {})}
     todo = list({key_of(unit): unit for unit in units if key_of(unit) not in results}.values())
     begin = time.monotonic()
-    one = partial(_one, str(folder), function, provenance.commit(), provenance.command())
+    one = partial(finish, folder, function, provenance.commit(), provenance.command())
     for count, (_, result) in enumerate(done(one, todo, processes), 1):
         results[result.key] = result
         left = (time.monotonic() - begin) / count * (len(todo) - count)
@@ -234,7 +234,8 @@ def work(
     return {key_of(unit): results[key_of(unit)] for unit in units}
 
 
-def _one(folder: str, function: Callable, commit: str, command: str, unit: dict[str, Any]) -> Result:
+def finish(folder: str | Path, function: Callable, commit: str, command: str, unit: dict[str, Any]) -> Result:
+    """Do one unit as :func:`work` does, and write its result with commit, command, time and seconds."""
     begin = time.perf_counter()
     columns, extra = function(unit)
     origin = {
