@@ -67,7 +67,7 @@ def alone(trainer: Any, repeats: int) -> dict[str, float]:
 
     from sim.arrays.torch_bridge import on_torch_stream
 
-    env, alg, steps, device = trainer.env, trainer.alg, trainer.experiment.ppo.steps, trainer.device
+    env, alg, steps, device = trainer.algorithm.env, trainer.algorithm.alg, trainer.experiment.ppo.steps, trainer.device
     observations = env.get_observations()
     with torch.inference_mode():
         actions = alg.act(observations).clone()
@@ -144,7 +144,7 @@ def measure(experiment: Any, name: str, device: str, iterations: int, repeats: i
     runs = whole(trainer, iterations)
     total = {key: statistics.median(values) for key, values in runs.items()}
     parts = split(total, alone(trainer, repeats))
-    samples, wall = trainer.samples_per_iteration, sum(total.values())
+    samples, wall = trainer.algorithm.samples, sum(total.values())
     rows = [
         (f"{part}: {PARTS[part]}", f"{t * 1e3:.2f} ms", f"{100 * t / wall:.0f} %", rate(samples / t) if t else "")
         for part, t in parts.items()
