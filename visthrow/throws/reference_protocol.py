@@ -104,20 +104,21 @@ def _goal_velocities(experiment: Experiment, count: int, rng: np.random.Generato
     return np.column_stack((speed * np.cos(heading), speed * np.sin(heading), np.zeros(count)))
 
 
+def batches(throws: int, size: int = BATCH) -> list[tuple[int, int]]:
+    """Number and size of each batch that throws are cut into."""
+    return [(first // size, min(size, throws - first)) for first in range(0, throws, size)]
+
+
 def plan(
     policies: int, targets: Sequence[float], throws: int, seed: int, together: bool = False, size: int = BATCH
 ) -> list[Job]:
     """Cut throws of each policy at each target into batches, with all policies in one batch or each in its own."""
     groups = [tuple(range(policies))] if together else [(i,) for i in range(policies)]
-    return [
-        Job(group, target, batch, min(size, throws - batch * size), seed)
-        for target in targets
-        for group in groups
-        for batch in range(math.ceil(throws / size))
-    ]
+    cut = batches(throws, size)
+    return [Job(group, target, *part, seed) for target in targets for group in groups for part in cut]
 
 
-class Throwing:
+class Throwing(Workers):
     """Throws on their way in processes of their own; a context manager that stops them when left early.
 
     >>> with Throwing(policies, (1.5, 2.0), 200, "reference-realistic", seed=0) as throwing:  # doctest: +SKIP
@@ -149,13 +150,8 @@ class Throwing:
             raise ConfigError("policies of different plants cannot fly in one batch")
         self.jobs = plan(len(loaded), targets, throws, seed, together, size)
         self._count, self._targets = len(loaded), list(targets)
-        self._workers = Workers(partial(fly_batch, list(loaded), plant_name), self.jobs, processes or cores())
-
-    def __enter__(self) -> "Throwing":
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._workers.__exit__(*error)
+        flown = partial(fly_batch, list(loaded), plant_name)
+        super().__init__(flown, self.jobs, processes or cores(), "throws on the reference plant")
 
     def results(self, show: bool = True) -> list[list[Throws]]:
         """Wait, with a progress line on a terminal.
@@ -163,8 +159,8 @@ class Throwing:
         Returns:
             For each policy, a :class:`visthrow.training.protocol.Throws` a target.
         """
-        self._workers.label = "throws on the reference plant" if show else ""
-        found = dict(self._workers)
+        self.label *= show
+        found = dict(self)
         parts = [found[index] for index in range(len(self.jobs))]
         return [[self._throws(parts, policy, target) for target in self._targets] for policy in range(self._count)]
 
