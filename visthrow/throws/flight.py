@@ -115,7 +115,7 @@ class Flight:
     """E vehicles of a plant in flight.
 
     Attributes:
-        now: the plant's state. elapsed: since the phase began [s].
+        elapsed: since the phase began [s].
         begin: when the first throw began, on the plant's clock [s]; NaN before it.
         open: whose throw is neither over nor failed, shape (E,). flown: whom the pilots fly in this period, shape (E,).
         failed: shape (E,), bool. failures: why, a message or None for each.
@@ -133,13 +133,19 @@ class Flight:
         """
         count = plant.count
         self.plant, self.pilots, self.recorder = plant, pilots, recorder or Recorder()
-        self.now = plant.state
+        self._now: Snapshot | None = None
         self.home_w = self.now.pos_w if home_w is None else home_w
         self.begin = math.nan
         self.open, self.flown, self.failed = np.ones(count, bool), np.zeros(count, bool), np.zeros(count, bool)
         self.failures: list[str | None] = [None] * count
         self.commands: list[np.ndarray] = []
         self._hover = HoverController(HoverParams(), plant.period, count)
+
+    @property
+    def now(self) -> Snapshot:
+        """State of the plant, which is asked for it once a period, and only if somebody wants it."""
+        self._now = self._now or self.plant.state
+        return self._now
 
     @property
     def elapsed(self) -> float:
@@ -184,7 +190,7 @@ class Flight:
         self.recorder.before(self, seen, sent)
         self.commands.append(sent.command)
         plant.step(sent.command, sent.release)
-        self.now = plant.state
+        self._now = None
         if throws:
             self.judge(self.now)
         self.recorder.after(self, seen, sent)
