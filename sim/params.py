@@ -278,6 +278,11 @@ class RopeParams:
             if not math.isfinite(getattr(self, name)):
                 raise ValueError(f"rope.{name} is {getattr(self, name)}: expected a finite value")
 
+    @property
+    def hanging_mass(self) -> float:
+        """Mass of rope and payload [kg]."""
+        return self.rope_mass + self.payload_mass
+
 
 @dataclass(frozen=True)
 class AirParams:
@@ -373,6 +378,11 @@ class PlantParams:
     sim: SimParams
     air: AirParams = AirParams()
     laws: tuple[LawParams, ...] = ()
+
+    @property
+    def total_mass(self) -> float:
+        """Mass of the vehicle with all that hangs on it [kg]."""
+        return self.vehicle.body.mass + self.rope.hanging_mass
 
 
 @dataclass(frozen=True)

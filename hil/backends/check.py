@@ -102,8 +102,7 @@ def hover_of_run(folder: str | Path) -> tuple[bool, str]:
     params = config.load(HilParams, folder / CONFIG)
     if params.backend == "dry-run":
         raise RunError(f"{folder} is a dry run: nothing followed its commands; expected a run with an autopilot")
-    contract = Policy.load(folder / "policy.npz").contract
-    mass = contract["vehicle"]["body"]["mass"] + contract["rope"]["rope_mass"] + contract["rope"]["payload_mass"]
+    mass = Policy.load(folder / "policy.npz").total_mass
     thrusts, hovering = [], 0
     for line in lines(folder / TICKS):
         mode = Status(*line["status"]).mode

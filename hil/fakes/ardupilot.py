@@ -22,7 +22,7 @@ from hil.backends.ardupilot import (
 from hil.backends.thrust import ThrustParams
 from hil.fakes.mavlink import SERVO, FakeMavlink
 from hil.links.pymav import mav
-from visthrow.onboard.hover import rot_from_quat
+from visthrow.onboard.hover import GRAVITY, rot_from_quat
 
 FULL_CLIMB = 2.5
 """Climb rate at full thrust where thrust is read as one: PILOT_SPEED_UP's default [m/s]."""
@@ -99,7 +99,7 @@ class FakeArduPilot(FakeMavlink):
         up = rot_from_quat(now["quat_wb"][None].astype(float))[0, 2, 2]
         if not int(self.parameters["GUID_OPTIONS"]) & THRUST_AS_THRUST:
             climb = FULL_CLIMB * (2.0 * target[0] / self.plant.max_thrust - 1.0)
-            out[0] = self.weight() * (1.0 + CLIMB_GAIN * (climb - now["vel_w"][2]) / 9.81)
+            out[0] = self.weight() * (1.0 + CLIMB_GAIN * (climb - now["vel_w"][2]) / GRAVITY)
         elif self.parameters["ATC_ANGLE_BOOST"]:
             out[0] /= max(up, 0.5)
         out[0] = min(max(out[0], 0.0), self.plant.max_thrust)

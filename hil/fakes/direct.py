@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from hil.control.hovering import Hovering
 from hil.fakes import KINDS, WirePlant
 from hil.fakes.mocap import SLACK, Mocap, MocapParams
 from hil.fakes.set_points import SetPoints
@@ -21,7 +22,7 @@ from hil.params import HilParams
 from hil.poses.frames import FrameParams
 from hil.poses.pose import PAYLOAD, VEHICLE, Pose
 from hil.poses.track import BodyState, Track
-from visthrow.onboard.hover import HoverController, HoverParams
+from visthrow.onboard.hover import GRAVITY
 from visthrow.onboard.pilot import Pilot
 from visthrow.onboard.policy import Policy
 
@@ -49,7 +50,6 @@ class Direct:
         self.pilot = Pilot(policy, params.camera)
         self.mocap = Mocap(mocap, seed)
         self._tracks = {body: Track(OURS, params.gate, params.estimate) for body in (VEHICLE, PAYLOAD)}
-        self._hover = HoverController(HoverParams(max_thrust=plant.max_thrust), self.pilot.period)
         share = round(1.0 / (mocap.rate * plant.period))
         draw = np.random.default_rng([seed, 1])
         self._phase, self._in_time = int(draw.integers(max(share, 1))), bool(draw.integers(2))
@@ -57,7 +57,8 @@ class Direct:
         self._latency = mocap.latency
         states = params.states
         self._taken, self._start = states.check_hold, states.check_hold + states.armed_least + SETTLED
-        self._place = np.array(plant.state["pos_w"], dtype=float)
+        place = tuple(plant.state["pos_w"].astype(float).tolist())
+        self._hover = Hovering(place, 0.0, plant.max_thrust, self.pilot.period)
         self._late = KINDS[params.backend].usual_delay if params.backend in KINDS else 0.0
         self._set_points = SetPoints()
         self._coming: deque[Pose] = deque()
@@ -84,7 +85,7 @@ class Direct:
         """
         latch, start = None, None
         tick = self._phase * self.plant.period
-        level = np.array([self.plant.mass[0] * 9.81, 0.0, 0.0, 0.0])
+        level = np.array([self.plant.mass[0] * GRAVITY, 0.0, 0.0, 0.0])
         while self.plant.time < MOST:
             self._take()
             now = self.plant.time
@@ -115,10 +116,9 @@ class Direct:
             return None, False
         apart = latch is not None and now - latch >= self.pilot.lag - SLACK
         if not throwing or apart:
-            views = [np.array([v]) for v in (vehicle.pos, vehicle.quat, vehicle.vel)]
-            mass = self.plant.mass[1 if apart else 0]
-            place = self._place if now < self._taken else np.array(self.params.home_w)
-            return self._hover.step(*views, place, mass)[0], False
+            if now >= self._taken:
+                self._hover.place_w = self.params.home_w
+            return np.array(self._hover.command(vehicle, self.plant.mass[1 if apart else 0])), False
         views = [np.array([v]) for v in (vehicle.pos, vehicle.quat, vehicle.vel, vehicle.rate, payload.pos)]
         out = self.pilot.act(*views, np.array(self.params.goal_w), True)
         return out.command[0].astype(float), bool(out.release[0])

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from hil.poses.frames import multiply
 from hil.poses.pose import PAYLOAD, VEHICLE, Pose
+from visthrow.common.mocap import measured
 
 SLACK = 1e-9
 """Of times that are sums of periods [s]."""
@@ -65,14 +65,10 @@ class Mocap:
         """
         self._next += 1.0 / self.params.rate
         p, rng = self.params, self._rng
-        noise = p.position_noise * rng.standard_normal((2, 3))
-        turn = 0.5 * math.radians(p.angle_noise_deg) * rng.standard_normal(3)
+        names = ("pos_w", "payload_pos_w", "quat_wb")
+        noise = dict(zip(names, (p.position_noise, p.position_noise, math.radians(p.angle_noise_deg))))
+        vehicle, payload, quat = measured({name: truth[name][None].astype(float) for name in names}, noise, rng).values()
         lost = rng.random(2) < p.loss
-        quat = multiply(tuple(truth["quat_wb"].astype(float)), (*turn.tolist(), 1.0))
-        norm = math.hypot(*quat)
-        seen = (
-            (VEHICLE, truth["pos_w"] + noise[0], tuple(q / norm for q in quat)),
-            (PAYLOAD, truth["payload_pos_w"] + noise[1], (0.0, 0.0, 0.0, 1.0)),
-        )
-        poses = [Pose(time, time + p.latency, body, tuple(map(float, pos)), attitude) for body, pos, attitude in seen]
+        seen = ((VEHICLE, vehicle, quat[0].tolist()), (PAYLOAD, payload, (0.0, 0.0, 0.0, 1.0)))
+        poses = [Pose(time, time + p.latency, body, tuple(pos[0].tolist()), tuple(attitude)) for body, pos, attitude in seen]
         return [pose for pose, gone in zip(poses, lost) if not gone]

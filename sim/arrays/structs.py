@@ -274,5 +274,5 @@ def pack_rope(t: Types, ropes: list[P.RopeParams]) -> np.ndarray:
         row["downwash"], row["compliance"] = rope.downwash, rope.compliance
         row["payload_side"], row["payload_lift"] = rope.payload_side, rope.payload_lift
         row["stretched_share"] = (mass / 2 + rope.payload_mass) / last_mass
-        row["total_mass"] = rope.rope_mass + rope.payload_mass
+        row["total_mass"] = rope.hanging_mass
     return rows

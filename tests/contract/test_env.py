@@ -118,7 +118,9 @@ def test_reward_terms_by_hand():
 def test_ends_of_an_episode():
     bounds = experiment().task.bounds
     pos = torch.tensor([[0, 0, 1.3], [0, 0, 0.4], [0, 0, 3.1], [2.5, 2.5, 1.3], [0, 0, 1.3]])
-    assert terminations.out_of_bounds(bounds, pos).tolist() == [False, True, True, True, False]
+    height, far = (mask.tolist() for mask in terminations.out_of_bounds(bounds, pos).values())
+    assert height == [False, True, True, False, False]
+    assert far == [False, False, False, True, False]
     level = torch.eye(3).expand(5, 3, 3)
     low = pos - torch.tensor([0.0, 0.0, 0.4])
     status = torch.tensor([0, 0, 0, 0, 4], dtype=torch.int32)

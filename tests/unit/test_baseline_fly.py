@@ -11,7 +11,7 @@ from visthrow.baseline import front, report, spline
 from visthrow.baseline import pendulum as pm
 from visthrow.baseline.fly import (
     Delays,
-    _PlantFlight,
+    _started,
     delays_of,
     fly_pendulum,
     fly_plant,
@@ -171,24 +171,23 @@ def test_commands_in_the_training_simulator_are_disturbed(experiment):
 
 def test_a_batch_on_a_reference_plant_starts_as_the_policies_do(plan, experiment):
     pytest.importorskip("mujoco")
-    flight = _PlantFlight(plan, "reference-realistic", experiment, Delays(), 3, 5)
+    flown, _ = _started("reference-realistic", experiment, 2.0, 0, 3, 5, "cpu")
     plant, rng = batch_plant(experiment, "reference-realistic", 2.0, 0, 3, 5)
     place_in_hover(plant, experiment, protocol.hover_start(experiment).task.start, rng)
     command = np.tile([2.67, 0.0, 0.3, 0.0], (3, 1))
     for _ in range(3):  # winds and build errors show once it flies
-        flight.plant.step(command)
+        flown.step(command)
         plant.step(command)
-    assert np.array_equal(flight.plant.state.pos_w, plant.state.pos_w)
-    assert np.array_equal(flight.plant.measured().pos_w, plant.measured().pos_w)
+    assert np.array_equal(flown.state.pos_w, plant.state.pos_w)
+    assert np.array_equal(flown.measured().pos_w, plant.measured().pos_w)
 
 
 def test_flown_throws_are_scored_as_policies_are(plan, experiment):
     flown = fly_plant(plan, "hybrid", experiment, delays_of(experiment), 2)
-    throws = flown.throws(2.0)
-    assert throws.summary()["error_mean"] == pytest.approx(flown.error.mean())
-    assert throws.error == pytest.approx(np.linalg.norm(throws.landing_w - [2.0, 0.0], axis=1))
-    assert np.all((throws.clearance > 0.2) & (throws.clearance < 2.0))
-    assert np.all((throws.smoothness > 0.0) & (throws.smoothness < 1.0))
+    assert flown.summary()["error_mean"] == pytest.approx(flown.error.mean())
+    assert flown.error == pytest.approx(np.linalg.norm(flown.landing_w - [2.0, 0.0], axis=1))
+    assert np.all((flown.clearance > 0.2) & (flown.clearance < 2.0))
+    assert np.all((flown.smoothness > 0.0) & (flown.smoothness < 1.0))
 
 
 def test_delays_by_name(experiment):

@@ -9,7 +9,7 @@ import pytest
 
 from visthrow import config
 from visthrow.common.errors import DiagnoseError
-from visthrow.diagnose.proof import ablations, hall, loop
+from visthrow.diagnose.proof import ablations, loop
 from visthrow.diagnose.throw import recorded
 from visthrow.logs.flightlog import Channel, FlightLog
 from visthrow.task import Experiment
@@ -89,8 +89,8 @@ def test_throws_are_kept_and_not_flown_twice(tmp_path, monkeypatch):
             fields = {"success": np.array([True, False]), "error": error, "duration": error}
             return [[SimpleNamespace(**fields)]]
 
-    monkeypatch.setattr("visthrow.throws.reference_protocol.Throwing", Flown)
-    monkeypatch.setattr("visthrow.throws.loading.load_policy", lambda *_, **__: None)
+    monkeypatch.setattr("visthrow.diagnose.proof.loop.Throwing", Flown)
+    monkeypatch.setattr("visthrow.diagnose.proof.loop.load_policy", lambda *_, **__: None)
     one = loop.Loop({}, tmp_path, throws=2)
     found = [one._throws("before", "state", lambda line: None) for _ in range(2)]
     assert flown == [((2.0,), 2, loop.PLANT, loop.BATCH)]
@@ -98,7 +98,7 @@ def test_throws_are_kept_and_not_flown_twice(tmp_path, monkeypatch):
         np.testing.assert_array_equal(loop.landed(throws_), [0.1235])
 
 
-def test_a_hall_records_poses_with_its_noise_and_nothing_true():
+def test_poses_are_recorded_with_the_noise_of_motion_capture_and_nothing_true():
     time = np.arange(0.0, 40.0, 0.02)
     level = np.tile([0.0, 0.0, 0.0, 1.0], (len(time), 1))
     place = np.zeros((len(time), 3))
@@ -109,7 +109,7 @@ def test_a_hall_records_poses_with_its_noise_and_nothing_true():
         "release_command": Channel(time, np.zeros(len(time)), "1"),
     }  # fmt: skip
     meta = {"times": {"policy_start": 2.0, "landing": 38.0, "end": 40.0}, "policy": "state", "plant": "reference"}
-    seen = loop.recorded_in_a_hall(FlightLog(channels, meta), np.random.default_rng(0))
+    seen = loop.recorded(FlightLog(channels, meta), np.random.default_rng(0))
     assert set(seen.channels) == {"pos_w", "payload_pos_w", "quat_wb", "command", "release_command"}
     assert seen["pos_w"].time[0] >= 2.0 - loop.BEFORE
     assert seen["payload_pos_w"].time[-1] <= 38.0 < seen["pos_w"].time[-1]
@@ -150,7 +150,7 @@ def test_finished_loops_are_shown_and_others_refused(tmp_path, monkeypatch):
 def test_throws_side_by_side_come_down_at_their_goals():
     """Each of a batch flies to its own goal, asks for its own release, and is logged as one flight."""
     goals = np.array([[1.4, 0.0, 0.0], [0.0, -1.2, 0.0]])
-    logs = hall.throws(load_policy("state"), "hybrid", goals, 0)
+    logs = ablations.throws(load_policy("state"), "hybrid", goals, 0)
     for goal, log in zip(goals, logs):
         begin, landing = log.meta["times"]["policy_start"], log["landing"]
         assert np.linalg.norm(landing.values[0, :2] - goal[:2]) < 0.1
@@ -158,16 +158,16 @@ def test_throws_side_by_side_come_down_at_their_goals():
         assert begin < log["release_command"].time[asked][0] < landing.time[0]
         apart = np.linalg.norm(log["pos_w"].values - log["payload_pos_w"].values, axis=1)
         assert np.ptp(apart[log["pos_w"].time < begin]) < 0.01  # hangs still
-        seen = loop.recorded_in_a_hall(log, np.random.default_rng(0))
+        seen = loop.recorded(log, np.random.default_rng(0))
         assert "landing" not in seen
         assert recorded.record_of(seen, 0).latch == pytest.approx(log["release_command"].time[asked][0])
     assert np.linalg.norm(logs[0]["landing"].values - logs[1]["landing"].values) > 1.0
 
 
 def test_a_batch_that_does_not_come_down_is_an_error(monkeypatch):
-    monkeypatch.setattr(hall, "FALL_TIME", -10.0)
+    monkeypatch.setattr("visthrow.throws.flight.FALL_TIME", -10.0)
     with pytest.raises(DiagnoseError, match="did not come down"):
-        hall.throws(load_policy("state"), "hybrid", np.array([[1.4, 0.0, 0.0]]), 0)
+        ablations.throws(load_policy("state"), "hybrid", np.array([[1.4, 0.0, 0.0]]), 0)
 
 
 @pytest.fixture

@@ -5,6 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
+from sim import params
 from visthrow.onboard.hover import GRAVITY, HoverController, HoverParams, rot_from_quat
 
 VEHICLE, PAYLOAD, LENGTH = 0.214, 0.058, 0.38
@@ -254,3 +255,8 @@ def test_nonsense_parameters_are_refused(wrong):
         HoverParams(**wrong)
     with pytest.raises(ValueError, match="period"):
         HoverController(HoverParams(), 0.0)
+
+
+def test_gravity_on_board_is_the_simulators():
+    """It is written twice, because on board there is no simulator to import it from."""
+    assert GRAVITY == params.GRAVITY

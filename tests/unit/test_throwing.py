@@ -5,6 +5,7 @@ import dataclasses
 import json
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,10 +19,11 @@ from visthrow.logs.flightlog import STANDARD_CHANNELS, FlightLog
 from visthrow.onboard.policy import Policy
 from visthrow.task import Experiment, contract_of
 from visthrow.throws import compare, reference_protocol
-from visthrow.throws.flight import fly
+from visthrow.throws.flight import Flight
 from visthrow.throws.loading import load_policy, unique_names
 from visthrow.throws.loose_rope import LooseRope
 from visthrow.throws.plants import HybridPlant, make_plant
+from visthrow.throws.recorded import fly
 from visthrow.training.protocol import Throws
 from visthrow.view.tables import csv_text, markdown
 
@@ -275,7 +277,10 @@ def test_plan_covers_every_throw_once():
 
 def test_failures_name_their_cause():
     experiment = config.load(Experiment, config.find("train", "state"))
-    now = HybridPlant(experiment, 5).state
+    plant = HybridPlant(experiment, 5)
+    flight = Flight(plant, SimpleNamespace(experiment=experiment))
+    flight.begin = plant.time - 0.1
+    now = plant.state
     pos = now.pos_w.copy()
     pos[1, 2], pos[2, 0] = 3.5, 3.5
     payload = now.payload_pos_w.copy()
@@ -283,12 +288,16 @@ def test_failures_name_their_cause():
     quat = now.quat_wb.copy()
     quat[4] = [1.0, 0.0, 0.0, 0.0]
     now = dataclasses.replace(now, pos_w=pos, payload_pos_w=payload, quat_wb=quat)
-    found = reference_protocol.failures(experiment, now, 0.1)
-    assert found[0] is None
-    for message, cause in zip(found[1:], ("altitude", "further than", "hit", "tilted"), strict=True):
-        assert cause in message
+    flight.flown[:] = True
     latched = dataclasses.replace(now, latched=np.ones(5, bool))
-    assert reference_protocol.failures(experiment, latched, 0.1)[4] is None
+    flight.judge(latched)
+    assert flight.failures[4] is None
+    flight.judge(now)
+    assert flight.failures[0] is None
+    for message, cause in zip(flight.failures[1:], ("altitude", "further than", "hit", "tilted"), strict=True):
+        assert cause in message
+    assert flight.open.tolist() == [True, False, False, False, False]
+    assert flight.failed.tolist() == [False, True, True, True, True]
 
 
 def throws(error: float, success: int = 4) -> Throws:

@@ -1,11 +1,11 @@
 """``visthrow baseline``: plan with splines, track with MPC, throw; tables, sweep and picture of the front."""
 
 import argparse
-import sys
 from pathlib import Path
 
 from visthrow.common.arguments import add_common
 from visthrow.common.errors import ConfigError
+from visthrow.common.workers import status
 
 TARGETS = (1.5, 2.0, 2.5)
 POLICY_THROWS = 100
@@ -71,13 +71,13 @@ def run(args: argparse.Namespace) -> int:
     plants = [] if args.quick else args.plants
     params = payload_bounds_only(PlanParams()) if args.payload_bounds else PlanParams()
     study = front.Study(experiment, min(args.throws, 2) if args.quick else args.throws, args.seed, params)
-    targets = front.by_target(study, args.targets, plants, front.COMPENSATIONS, _say, _releases(args))
+    targets = front.by_target(study, args.targets, plants, front.COMPENSATIONS, status, _releases(args))
     swept, policies = [], []
     if not args.no_sweep:
         speeds, weights = ((2.2,), front.WEIGHTS[2::2]) if args.quick else (front.SPEEDS, front.WEIGHTS)
-        swept = front.sweep(study, 2.0, speeds, weights, plants, _say)
+        swept = front.sweep(study, 2.0, speeds, weights, plants, status)
         policies = _policies(args.policies, args.seed, 10 if args.quick else POLICY_THROWS)
-    _say("")
+    status("")
     return _write(args, study.throws, targets, swept, policies)
 
 
@@ -88,7 +88,7 @@ def _releases(args: argparse.Namespace) -> dict[float, tuple[float, float]]:
     from visthrow.throws.loading import load_policy
 
     loaded = load_policy(args.release_from)
-    _say(f"measuring the releases of {loaded.name}")
+    status(f"measuring the releases of {loaded.name}")
     return {target: measure(loaded, target, seed=args.seed) for target in args.targets}
 
 
@@ -100,7 +100,7 @@ def _policies(names: list[str], seed: int, throws: int) -> list[dict]:
     rows = []
     for name in names:
         loaded = load_policy(name)
-        _say(f"throwing with {loaded.name}")
+        status(f"throwing with {loaded.name}")
         result = throw(loaded.experiment, loaded.policy.act, 2.0, throws, "cpu", seed).summary()
         if result["success"]:
             rows.append({"policy": loaded.name, "plant": "hybrid", **result})
@@ -134,9 +134,3 @@ def _write(args: argparse.Namespace, throws: int, targets: list[dict], swept: li
     if args.json:
         write_json(args.json, value)
     return 0
-
-
-def _say(text: str) -> None:
-    """Progress on a terminal, on one line."""
-    if sys.stderr.isatty():
-        print(f"\r{text:<70}", end="" if text else "\r", file=sys.stderr, flush=True)

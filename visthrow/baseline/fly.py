@@ -9,11 +9,10 @@ motors) through its own model under the commands on their way, and trips the lat
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sim.params import RandomizationParams
+from sim.params import GRAVITY, RandomizationParams
 from visthrow import config
 from visthrow.baseline import pendulum as pm
 from visthrow.baseline.mpc import MPC, MPCParams, SolverError
@@ -21,53 +20,39 @@ from visthrow.baseline.pendulum import Pendulum
 from visthrow.baseline.plan import Plan
 from visthrow.baseline.release import landing_point
 from visthrow.common.errors import ConfigError, suggest
-from visthrow.onboard.hover import HoverController, HoverParams, rot_from_quat
-from visthrow.task import Experiment, plant_of
+from visthrow.onboard.hover import rot_from_quat
+from visthrow.task import Experiment
+from visthrow.throws.flight import FALL_TIME, Decision, Flight, Pilots, Scores, Smoothness, hover, throw
 from visthrow.throws.plants import HybridPlant, Plant, Snapshot
-from visthrow.throws.reference_protocol import FALL_TIME, FIELDS, HOVER_TIME, batch_plant, failures, place_in_hover
-
-if TYPE_CHECKING:
-    from visthrow.training.protocol import Throws
+from visthrow.throws.reference_protocol import HOVER_TIME, batch_plant, place_in_hover
+from visthrow.training.protocol import Throws
 
 FINE = 4
 """Runge-Kutta steps of the flown pendulum in one control period; the controller predicts with one."""
 
 
+SENT = 8
+"""Commands on their way that the controller looks back at; more than any delay holds."""
+
 TRUST = np.repeat([0.2, 0.3, 0.15, 0.3, 0.5], [3, 3, 3, 3, 4])
 """Share of a measurement in the estimate of payload position and velocity, cable direction and rate, and attitude."""
 
 
-@dataclass(frozen=True)
-class Flown:
-    """Results of N throws of one plan; NaN where a throw failed.
+@dataclass(frozen=True, kw_only=True)
+class Flown(Throws):
+    """Throws of one plan, scored as learnt policies are; the clearance is NaN in the own model.
 
     Attributes:
-        success: shape (N,), bool.
-        landing_w: [m], shape (N, 2). error: [m], shape (N,). duration: from start to landing [s], shape (N,).
         position_error: of the payload at separation against the planned release [m], shape (N,).
         velocity_error: the same [m/s], shape (N,).
         tracking: root mean square distance of the payload from the path until the release [m], shape (N,).
-        smoothness: root mean square change of the normalised commands from step to step, shape (N,).
-        clearance: least distance of the payload from the vehicle after separation [m], shape (N,); NaN in the own model.
         step_times: of all steps of the controller [s], shape (K,).
     """
 
-    success: np.ndarray
-    landing_w: np.ndarray
-    error: np.ndarray
-    duration: np.ndarray
     position_error: np.ndarray
     velocity_error: np.ndarray
     tracking: np.ndarray
-    smoothness: np.ndarray
-    clearance: np.ndarray
     step_times: np.ndarray
-
-    def throws(self, target: float) -> "Throws":
-        """The same as learnt policies are scored."""
-        from visthrow.training.protocol import Throws
-
-        return Throws(target, **{name: getattr(self, name) for name in FIELDS})
 
     def summary(self) -> dict[str, float]:
         """Mean and deviation of the successful throws; times of a step in ms."""
@@ -81,42 +66,19 @@ class Flown:
         return out
 
 
-def _flown(
-    plan: Plan, good: np.ndarray, pos_w, vel_w, landing_w, duration, tracking, smoothness, clearance, step_times
-) -> Flown:
+def _off(plan: Plan, pos_w: np.ndarray, vel_w: np.ndarray, good: np.ndarray) -> dict[str, np.ndarray]:
+    """How far payloads were from the planned release at separation; NaN where a throw failed."""
     blank = np.where(good, 1.0, np.nan)
-    landing = landing_w * blank[:, None]
-    return Flown(
-        good, landing, np.linalg.norm(landing - [plan.target, 0.0], axis=1), duration * blank,
-        np.linalg.norm(pos_w - plan.release.pos_w, axis=1) * blank,
-        np.linalg.norm(vel_w - plan.release.vel_w, axis=1) * blank, tracking * blank, smoothness * blank,
-        clearance * blank, np.array(step_times),
-    )  # fmt: skip
+    return {
+        "position_error": np.linalg.norm(pos_w - plan.release.pos_w, axis=1) * blank,
+        "velocity_error": np.linalg.norm(vel_w - plan.release.vel_w, axis=1) * blank,
+    }
 
 
-class _Smoothness:
-    """Root mean square change of normalised commands, as :mod:`visthrow.training.protocol` measures it."""
-
-    def __init__(self, params: MPCParams, first: np.ndarray) -> None:
-        self._most, self._rate = params.max_thrust, np.array(params.max_rate)
-        self._last = self._normalised(first)
-        self._sum, self._steps = np.zeros(len(first)), np.zeros(len(first))
-
-    def _normalised(self, command: np.ndarray) -> np.ndarray:
-        throttle = np.sqrt(np.clip(command[:, :1], 0.0, self._most) / self._most)
-        return np.hstack([2.0 * throttle - 1.0, command[:, 1:] / self._rate])
-
-    def add(self, command: np.ndarray, active: np.ndarray | bool = True) -> None:
-        """Count the commands (E, 4) of vehicles that are being flown."""
-        now = self._normalised(command)
-        self._sum += active * ((now - self._last) ** 2).mean(1)
-        self._steps += active
-        self._last = now
-
-    @property
-    def value(self) -> np.ndarray:
-        """Shape (E,)."""
-        return np.sqrt(self._sum / np.maximum(self._steps, 1))
+def _normalised(params: MPCParams, command: np.ndarray) -> np.ndarray:
+    """Commands (E, 4) as a policy puts them out."""
+    throttle = np.sqrt(np.clip(command[:, :1], 0.0, params.max_thrust) / params.max_thrust)
+    return np.hstack([2.0 * throttle - 1.0, command[:, 1:] / np.array(params.max_rate)])
 
 
 def random_starts(plan: Plan, count: int, seed: int) -> np.ndarray:
@@ -166,14 +128,14 @@ def fly_pendulum(
     smoothness = np.full(count, np.nan)
     for e in range(count):
         controller.reset()
-        change = _Smoothness(params, pm.hover(plan.model, state[e : e + 1, pm.POS])[1])
+        change = Smoothness(_normalised(params, pm.hover(plan.model, state[e : e + 1, pm.POS])[1]))
         try:
             for k in range(steps):
                 off = state[e, pm.POS] - reference[0][k, pm.POS]
                 tracking[e] += off @ off
                 command = controller.step(state[e], (reference[0][k : k + horizon + 1], reference[1][k : k + horizon]))
                 times.append(controller.step_time)
-                change.add(command[None])
+                change.add(_normalised(params, command[None]))
                 good[e] &= pm.tension(plan.model, state[e], command) > 0.0
                 state[e] = pm.step(plan.model, state[e], command, params.period if k < steps - 1 else last, FINE)
         except SolverError:
@@ -181,9 +143,13 @@ def fly_pendulum(
         smoothness[e] = change.value[0]
     point, fall = landing_point(state[:, pm.POS], state[:, pm.VEL], landing_height)
     good &= np.isfinite(fall)
-    return _flown(
-        plan, good, state[:, pm.POS], state[:, pm.VEL], point, plan.path.duration + fall, np.sqrt(tracking / steps),
-        smoothness, np.full(count, np.nan), times,
+    blank = np.where(good, 1.0, np.nan)
+    landing = point * blank[:, None]
+    error = np.linalg.norm(landing - [plan.target, 0.0], axis=1)
+    return Flown(
+        plan.target, good, landing, error, (plan.path.duration + fall) * blank, np.full(count, np.nan), smoothness * blank,
+        **_off(plan, state[:, pm.POS], state[:, pm.VEL], good), tracking=np.sqrt(tracking / steps) * blank,
+        step_times=np.array(times),
     )  # fmt: skip
 
 
@@ -253,86 +219,67 @@ def _under(model: Pendulum, state: np.ndarray, sent: np.ndarray, period: float, 
 
 
 def _started(
-    name: str, experiment: Experiment, start: RandomizationParams, target: float, batch: int, count: int, seed: int,
-    device: str,
-) -> Plant:  # fmt: skip
-    """Plant at the start of the throws that learnt policies meet."""
-    task = experiment.task
+    name: str, experiment: Experiment, target: float, batch: int, count: int, seed: int, device: str
+) -> tuple[Plant, np.ndarray]:  # fmt: skip
+    """Plant at the start of the throws that learnt policies meet, and the place it hovers at [m], shape (3,)."""
+    task, start = experiment.task, config.load(RandomizationParams, config.find("start", "hover"))
     if name == "hybrid":
-        return HybridPlant(experiment, count, seed, device, task.noise, task.observation.latency, start)
+        plant = HybridPlant(experiment, count, seed, device, task.noise, task.observation.latency, start)
+        return plant, np.array([0.0, 0.0, start.spawn_height])
     plant, rng = batch_plant(experiment, name, target, batch, count, seed)
-    place_in_hover(plant, experiment, start, rng)
-    return plant
+    return plant, place_in_hover(plant, experiment, start, rng)
 
 
-class _PlantFlight:
-    """State of a batch of throws on a plant."""
+class Controllers(Pilots):
+    """MPC of E vehicles as the pilots of a flight: tracks a plan, and trips the latch at its time.
 
-    def __init__(
-        self,
-        plan: Plan,
-        plant_name: str,
-        experiment: Experiment,
-        delays: Delays,
-        count: int,
-        seed: int,
-        batch: int = 0,
-        device: str = "cpu",
-    ) -> None:
-        start = config.load(RandomizationParams, config.find("start", "hover"))
-        self.plan, self.experiment, self.delays, self.count = plan, experiment, delays, count
-        self.plant = _started(plant_name, experiment, start, plan.target, batch, count, seed, device)
-        self.params = MPCParams(period=self.plant.period, max_thrust=experiment.task.action.max_thrust,
-                                max_rate=experiment.task.action.max_rate)  # fmt: skip
-        self.mount = np.array(plant_of(experiment).rope.mount)
-        self.home = np.array([0.0, 0.0, start.spawn_height])
-        self.controllers = [MPC(plan.model, self.params) for _ in range(count)]
-        self.hovering = HoverController(HoverParams(), self.plant.period, count)
-        hover = pm.hover(plan.model, np.zeros((count, 3)))[1]
-        self.sent = np.tile(hover, (8, 1, 1))
-        self.change = _Smoothness(self.params, hover)
-        self.estimate: np.ndarray | None = None
-        self.failed, self.flying = np.zeros(count, bool), np.ones(count, bool)
-        self.separated = np.full((2, count, 3), np.nan)
-        self.clearance = np.full(count, np.inf)
-        self.tracking, self.tracked, self.times = np.zeros(count), np.zeros(count), []
+    Attributes:
+        latch: period of the throw in which the latch trips. most: periods that a throw may take.
+        times: that all steps of the controllers took [s].
+    """
 
-    def hold(self, seen: Snapshot) -> np.ndarray:
-        """Command that hovers at the start."""
-        rope = self.experiment.rope
-        mass = self.experiment.vehicle.body.mass + np.where(seen.attached, rope.rope_mass + rope.payload_mass, 0.0)
-        return self.hovering.step(seen.pos_w, seen.quat_wb, seen.vel_w, self.home, mass)
+    def __init__(self, plan: Plan, experiment: Experiment, period: float, delays: Delays, count: int) -> None:
+        """Begin in hover.
 
-    def send(self, command: np.ndarray, release: np.ndarray) -> None:
-        """Advance the plant by one period."""
-        self.sent = np.concatenate([command[None], self.sent[:-1]])
-        self.plant.step(command, release)
+        Args:
+            plan: of the throw. experiment: whose limits, mount and delays they are.
+            period: of the commands [s]. delays: to make up for. count: E.
+        """
+        self.plan, self.delays, self.period, action = plan, delays, period, experiment.task.action
+        self.params = MPCParams(period=period, max_thrust=action.max_thrust, max_rate=action.max_rate)
+        self.latch = round((plan.path.duration - delays.release) / period)
+        self.most = self.latch + round((experiment.release.lag + FALL_TIME) / period) + 2
+        self.times: list[float] = []
+        self._mpc = [MPC(plan.model, self.params) for _ in range(count)]
+        self._reference = plan.reference(delays.command, period, self.most + self.params.stages)
+        self._hover = pm.hover(plan.model, np.zeros((count, 3)))[1]
+        goal_w = np.tile([plan.target, 0.0, 0.0], (count, 1))
+        super().__init__(experiment, goal_w, _normalised(self.params, self._hover))
+        self._estimate: np.ndarray | None = None
+        self._period = 0
 
-    def throw(self, k: int, reference: tuple[np.ndarray, np.ndarray], latch: int) -> None:
-        """Period k of the throw: the controller flies what it holds, the hover controller the rest."""
-        seen = self.plant.measured()
-        active = self.flying & seen.attached & ~self.failed
-        command = self.hold(seen)
-        state = look_ahead(self.plan.model, self._estimated(seen), self.sent, self.plant.period, self.delays)
-        n = self.params.stages
-        for e in np.flatnonzero(active):
+    def decide(self, flight: Flight, seen: Snapshot, held: np.ndarray) -> Decision:
+        """See `visthrow.throws.flight.Pilots`; a vehicle whose programme has no solution has failed, and is held."""
+        command, k, n = held.copy(), self._period, self.params.stages
+        sent = np.stack([*flight.commands[: -SENT - 1 : -1], *[self._hover] * (SENT - len(flight.commands))])
+        state = look_ahead(self.plan.model, self._estimated(seen, sent), sent, self.period, self.delays)
+        reference = (self._reference[0][k : k + n + 1], self._reference[1][k : k + n])
+        for e in np.flatnonzero(flight.flown):
             try:
-                command[e] = self.controllers[e].step(state[e], (reference[0][k : k + n + 1], reference[1][k : k + n]))
-                self.times.append(self.controllers[e].step_time)
-            except SolverError:
-                self.failed[e] = True
-        before = self.plant.state.attached
-        self.change.add(command, active)
-        self.send(command, active & (k >= latch))
-        self._watch(k, before)
+                command[e] = self._mpc[e].step(state[e], reference)
+                self.times.append(self._mpc[e].step_time)
+            except SolverError as error:
+                flight.fail(e, str(error))
+        self._period += 1
+        return Decision(command, np.full(len(command), k >= self.latch), _normalised(self.params, command))
 
-    def _estimated(self, seen: Snapshot) -> np.ndarray:
+    def _estimated(self, seen: Snapshot, sent: np.ndarray) -> np.ndarray:
         """State now: the model's prediction from the period before, corrected by what is measured."""
-        measured = pendulum_state(seen, self.mount)
-        if self.estimate is None:
-            self.estimate = measured
+        measured = pendulum_state(seen, np.array(self.experiment.rope.mount))
+        if self._estimate is None:
+            self._estimate = measured
         span = self.delays.measurement + self.delays.command
-        then = _under(self.plan.model, self.estimate, self.sent, self.plant.period, span + self.plant.period, span)
+        then = _under(self.plan.model, self._estimate, sent, self.period, span + self.period, span)
         side = np.sign((then[:, pm.QUAT] * measured[:, pm.QUAT]).sum(1, keepdims=True))
         measured[:, pm.QUAT] *= side
         estimate = then + TRUST * (measured - then)
@@ -340,29 +287,41 @@ class _PlantFlight:
             estimate[:, part] /= np.linalg.norm(estimate[:, part], axis=1, keepdims=True)
         direction = estimate[:, pm.DIR]
         estimate[:, pm.RATE] -= (estimate[:, pm.RATE] * direction).sum(1, keepdims=True) * direction
-        self.estimate = estimate
+        self._estimate = estimate
         return estimate
 
-    def _watch(self, k: int, before: np.ndarray) -> None:
-        """Record separations and failures."""
-        plant, now, landing = self.plant, self.plant.state, self.plant.landing
-        elapsed = (k + 1) * plant.period
-        due = now.attached & (elapsed <= self.plan.path.duration)
-        off = now.payload_pos_w - self.plan.path.sample(np.array([elapsed]))[0, 0]
-        self.tracking += due * (off**2).sum(1)
-        self.tracked += due
-        for e in np.flatnonzero(before & ~now.attached):
-            back = plant.time - landing.separation_time[e]
-            vel = now.payload_vel_w[e] + np.array([0.0, 0.0, 9.81 * back])
+
+class _Tracking(Scores):
+    """Scores, and how well payloads keep to the plan."""
+
+    def __init__(self, pilots: Controllers) -> None:
+        super().__init__(pilots)
+        count = len(pilots.goal_w)
+        self.pilots, self.separated = pilots, np.full((2, count, 3), np.nan)
+        self._sum, self._due, self._period = np.zeros(count), np.zeros(count), 0
+
+    def after(self, flight: Flight, seen: Snapshot, sent: Decision) -> None:
+        """See `Recorder`."""
+        super().after(flight, seen, sent)
+        if sent.action is None:
+            return
+        now, path = flight.now, self.pilots.plan.path
+        self._period += 1
+        elapsed = self._period * flight.plant.period
+        due = now.attached & (elapsed <= path.duration)
+        self._sum += due * ((now.payload_pos_w - path.sample(np.array([elapsed]))[0, 0]) ** 2).sum(1)
+        self._due += due
+        for e in np.flatnonzero(seen.attached & ~now.attached):
+            back = flight.plant.time - flight.plant.landing.separation_time[e]
+            vel = now.payload_vel_w[e] + np.array([0.0, 0.0, GRAVITY * back])
             self.separated[:, e] = now.payload_pos_w[e] - back * 0.5 * (vel + now.payload_vel_w[e]), vel
-        apart = np.linalg.norm(now.payload_pos_w - now.pos_w, axis=1)
-        away = ~now.attached & ~landing.landed
-        self.clearance = np.where(away, np.minimum(self.clearance, apart), self.clearance)
-        messages = failures(self.experiment, now, elapsed)
-        self.failed |= np.array([message is not None for message in messages]) & now.attached & self.flying
-        gone = ~now.attached & ~landing.landed & (plant.time - np.nan_to_num(landing.separation_time) > FALL_TIME)
-        self.failed |= gone
-        self.flying &= ~(self.failed | landing.landed)
+
+    def flown(self, flight: Flight) -> Flown:
+        """Results of all throws."""
+        columns = self.columns(flight)
+        off = _off(self.pilots.plan, *self.separated, columns["success"])
+        tracking = np.sqrt(self._sum / np.maximum(self._due, 1)) * np.where(columns["success"], 1.0, np.nan)
+        return Flown(self.pilots.plan.target, **columns, **off, tracking=tracking, step_times=np.array(self.pilots.times))
 
 
 def fly_plant(
@@ -385,23 +344,9 @@ def fly_plant(
         batch: number of the batch on a reference plant, as :mod:`visthrow.throws.reference_protocol` counts them.
         device: of the training simulator.
     """
-    flight = _PlantFlight(plan, plant_name, experiment, delays, count, seed, batch, device)
-    plant, period = flight.plant, flight.plant.period
-    if plant_name != "hybrid":
-        for _ in range(round(HOVER_TIME / period)):
-            flight.send(flight.hold(plant.measured()), np.zeros(count, bool))
-    began = plant.time
-    latch = round((plan.path.duration - delays.release) / period)
-    limit = latch + round((experiment.release.lag + FALL_TIME) / period) + 2
-    reference = plan.reference(delays.command, period, limit + flight.params.stages)
-    for k in range(limit):
-        if not flight.flying.any():
-            break
-        flight.throw(k, reference, latch)
-    landing = plant.landing
-    good = landing.landed & ~flight.failed
-    tracking = np.sqrt(flight.tracking / np.maximum(flight.tracked, 1))
-    return _flown(
-        plan, good, *flight.separated, landing.point_w[:, :2], landing.time - began, tracking, flight.change.value,
-        flight.clearance, flight.times,
-    )  # fmt: skip
+    plant, home = _started(plant_name, experiment, plan.target, batch, count, seed, device)
+    pilots = Controllers(plan, experiment, plant.period, delays, count)
+    flight = Flight(plant, pilots, tracking := _Tracking(pilots), home)
+    before = [] if plant_name == "hybrid" else [hover(HOVER_TIME)]
+    flight.run([*before, throw(pilots.most * plant.period)])
+    return tracking.flown(flight)

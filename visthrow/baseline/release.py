@@ -88,7 +88,7 @@ def measure(loaded, target: float, throws: int = 5, seed: int = 0) -> tuple[floa
         throws: flown one by one.
         seed: of the first; the others follow.
     """
-    from visthrow.throws.flight import fly
+    from visthrow.throws.recorded import fly
 
     goal = np.array([target, 0.0, 0.0])
     seen = [read_release(fly(loaded, goal, "hybrid", seed + i)) for i in range(throws)]

@@ -14,7 +14,7 @@ from visthrow.baseline.plan import Plan, plan_throw
 from visthrow.baseline.release import default_release
 from visthrow.baseline.spline import PlanParams, payload_bounds_only
 from visthrow.task import Experiment, contract_of, plant_of
-from visthrow.throws.reference_protocol import BATCH
+from visthrow.throws.reference_protocol import batches
 from visthrow.throws.results import PROTOCOL, Result, columns_of, join, key_of, work
 from visthrow.training.device import resolve
 
@@ -71,8 +71,7 @@ def units(plant: str, compensation: str, target: float, throws: int, seed: int =
     """:func:`unit`, cut into the batches in which reference plants are flown."""
     if plant in (OWN, "hybrid"):
         return [unit(plant, compensation, target, throws, seed, **how)]
-    sizes = [min(BATCH, throws - first) for first in range(0, throws, BATCH)]
-    return [unit(plant, compensation, target, size, seed, batch=i, **how) for i, size in enumerate(sizes)]
+    return [unit(plant, compensation, target, size, seed, batch=i, **how) for i, size in batches(throws)]
 
 
 @lru_cache(maxsize=8)

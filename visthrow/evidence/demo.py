@@ -42,14 +42,10 @@ def run(args: argparse.Namespace) -> int:
         from visthrow.throws.reference_protocol import Throwing
 
         # The reference plant flies in a process of its own meanwhile.
-        with Throwing(
-            loaded, REFERENCE_TARGETS, REFERENCE_THROWS, "reference-realistic", SEED, 1, together=True
-        ) as throwing:
+        throws = (loaded, REFERENCE_TARGETS, REFERENCE_THROWS, "reference-realistic", SEED, 1)
+        with Throwing(*throws, together=True) as throwing:
             paths = _here(loaded, folder)
-            print(
-                f"{REFERENCE_THROWS} throws a policy on the reference plant, which stands in for a real vehicle ...",
-                flush=True,
-            )
+            print(f"{REFERENCE_THROWS} throws a policy on the reference plant, which stands in for a real vehicle ...", flush=True)
             paths += _told(loaded, throwing.results(), "reference-realistic", folder)
     print(PAPER_NOTE + "\n\nFiles:")
     for path in paths:
@@ -60,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _here(loaded: list, folder: Path) -> list[Path]:
     """One recorded throw, and many in the training simulator."""
-    from visthrow.throws.flight import fly as throw_once
+    from visthrow.throws.recorded import fly as throw_once
 
     print("One throw at a target 2 m ahead with the vision policy ...", flush=True)
     log = throw_once(loaded[1], [2.0, 0.0, 0.0], "hybrid", SEED)

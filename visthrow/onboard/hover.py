@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 GRAVITY = 9.81
-"""[m/s^2]; written again here because onboard modules do not import ``sim``."""
+"""[m/s^2]; that of :mod:`sim.params`, written again because onboard modules do not import ``sim``."""
 
 
 @dataclass(frozen=True)

@@ -90,8 +90,7 @@ class Pilot:
             self._threshold = float(contract["release"]["threshold"])
             self.lag = float(contract["release"]["lag"])
             self.period = float(contract["control_period"])
-            rope = contract["rope"]
-            mass = contract["vehicle"]["body"]["mass"] + rope["rope_mass"] + rope["payload_mass"]
+            mass = policy.total_mass
         except (KeyError, AttributeError, TypeError) as error:
             raise PolicyError(
                 f"the policy's contract is incomplete: {error!r}; it was not written by visthrow train"

@@ -87,6 +87,12 @@ class Policy:
         """Number of actions A."""
         return self.weights[-1].shape[0]
 
+    @property
+    def total_mass(self) -> float:
+        """Mass of the vehicle with all that hangs on it, by the contract [kg]."""
+        rope = self.contract["rope"]
+        return self.contract["vehicle"]["body"]["mass"] + (rope["rope_mass"] + rope["payload_mass"])
+
     @torch.no_grad()
     def act(self, obs: Tensor) -> Tensor:
         """Return the deterministic action.

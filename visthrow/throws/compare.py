@@ -4,13 +4,13 @@ import argparse
 import importlib
 import math
 import os
-import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 from visthrow.common.arguments import add_common
 from visthrow.common.errors import ConfigError, StorageError
+from visthrow.common.workers import status
+from visthrow.throws.results import Entry
 
 DEFAULT_POLICIES = ("state", "vision")
 DEFAULT_TARGETS = (1.5, 2.0, 2.5)
@@ -121,15 +121,6 @@ def _from_runs(args: argparse.Namespace) -> int:
     return 0
 
 
-@dataclass(frozen=True)
-class Entry:
-    """One row's thrower: what it is called, what it sees ("state", "vision") or is, and its throws a target."""
-
-    name: str
-    layout: str
-    throws: Sequence
-
-
 def entries_of(loaded: Sequence, names: Sequence[str], throws: Sequence[Sequence]) -> list[Entry]:
     """Entries of learnt policies."""
     layouts = (item.policy.contract["observation"]["layout"] for item in loaded)
@@ -145,15 +136,12 @@ def throw_baseline(args: argparse.Namespace) -> list[Entry]:
     from visthrow.training.device import cores
     from visthrow.training.protocol import Throws
 
-    def say(text: str) -> None:
-        if sys.stderr.isatty():
-            print(f"\rTO+MPC: {text:<60}", end="", file=sys.stderr, flush=True)
-
     with tempfile.TemporaryDirectory() as folder:
         found = thrower.compared(
-            args.plant, args.targets, args.throws, args.seed, folder, cores(), args.config or "state", args.overrides, say
+            args.plant, args.targets, args.throws, args.seed, folder, cores(), args.config or "state", args.overrides,
+            lambda text: status(f"TO+MPC: {text}"),
         )
-    say("")
+    status("")
     own = thrower.title_of(thrower.OWN, "none")
     return [
         Entry(
@@ -196,28 +184,19 @@ def writable(folder: Path) -> None:
 
 
 def throw_hybrid(
-    loaded: Sequence, targets: Sequence[float], count: int, device: str, seed: int, show: bool = True
+    loaded: Sequence, targets: Sequence[float], count: int, device: str, seed: int
 ) -> list[list]:
     """Throw in the training simulator; for each policy a `Throws` a target."""
     from visthrow.training.protocol import throw
 
-    rows, total = [], len(loaded) * len(targets)
+    rows: list[list] = []
     for item in loaded:
-        policy = item.policy.to(device)
-        row = []
-        for target in targets:
-            if show and sys.stderr.isatty():
-                done = len(rows) * len(targets) + len(row)
-                print(
-                    f"\rthrows in the training simulator: {done} of {total} sets   ",
-                    end="",
-                    file=sys.stderr,
-                    flush=True,
-                )
-            row.append(throw(item.experiment, policy.act, target, count, device, seed))
+        policy, row = item.policy.to(device), []
         rows.append(row)
-    if show and sys.stderr.isatty():
-        print(f"\r{' ' * 60}\r", end="", file=sys.stderr, flush=True)
+        for target in targets:
+            status(f"throws in the training simulator: {sum(map(len, rows))} of {len(loaded) * len(targets)} sets")
+            row.append(throw(item.experiment, policy.act, target, count, device, seed))
+    status("")
     return rows
 
 

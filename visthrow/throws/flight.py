@@ -1,251 +1,285 @@
-"""One throw from hover to the vehicle hovering again, recorded."""
+"""The flight loop: the vehicles of a plant hover, throw and recover, a batch of them or one.
 
+A flight is a sequence of phases. In a hover the hover controller flies all vehicles. In a throw the pilots fly what carries its
+payload, and the hover controller, which runs along, what has let go or failed. A recorder sees each period, whatever it keeps of it.
+"""
+
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from visthrow.common import provenance
-from visthrow.common.errors import ConfigError
-from visthrow.logs.flightlog import FlightLog, FlightRecorder
 from visthrow.onboard.hover import HoverController, HoverParams
-from visthrow.onboard.pilot import Pilot, PilotOutput
+from visthrow.onboard.pilot import Pilot
+from visthrow.task import Experiment
 from visthrow.throws.loading import Loaded
-from visthrow.throws.loose_rope import LooseRope
-from visthrow.throws.plants import PLANTS, Plant, Snapshot, make_plant, random_ropes
+from visthrow.throws.plants import Plant, Snapshot
+from visthrow.training import terminations
 
-START_SPREAD = 0.10  # of the start about the hover point [m]
-START_SWING = 0.05  # of the rope at the start [rad]
-HOVER_LEAST, HOVER_MOST = 1.5, 6.0  # time in hover before the throw [s]
-QUIET_OFFSET, QUIET_SPEED = 0.03, 0.12  # vehicle off its hover point [m]; payload against the world [m/s]
-QUIET_TIME = 0.4  # for which it must last [s]
-RECOVERY_MOST = 8.0  # [s]
-ROPE_ON_GROUND = (
-    0.003  # height at which the rope is drawn where it would pass through the ground; no plant knows it [m]
-)
-MEASURED = ("pos_w", "quat_wb", "vel_w", "rate_b", "payload_pos_w")
-"""Channels that are recorded a second time as measured, under ``measured_<name>``."""
+FALL_TIME = 1.5
+"""Longest flight after separation that is waited for [s]."""
+
+VIEWS = ("pos_w", "quat_wb", "vel_w", "rate_b", "payload_pos_w")
+"""What a policy is shown of a vehicle."""
 
 
-@dataclass
-class _Ends:
-    """Times of a flight on the plant's clock [s]; None where the event did not happen."""
+@dataclass(frozen=True)
+class Decision:
+    """What E vehicles are to do in one period."""
 
-    policy_start: float | None = None
-    latch: float | None = None
-    recovery: float | None = None
-    failure: str | None = None
-
-
-class _Recording:
-    """Plant, recorder and the rope on the ground of one flight."""
-
-    def __init__(self, plant: Plant, goal_w: np.ndarray, pilot: Pilot, meta: dict[str, Any]) -> None:
-        self.plant, self.goal_w, self.pilot = plant, goal_w, pilot
-        self.recorder = FlightRecorder(meta)
-        units = {"pos_w": "m", "quat_wb": "1", "vel_w": "m/s", "rate_b": "rad/s", "payload_pos_w": "m"}
-        for name in MEASURED:
-            self.recorder.declare(f"measured_{name}", units[name], "body" if name == "rate_b" else "world")
-        self._resting: LooseRope | None = None
-        self._before: Snapshot | None = None
-
-    def step(self, command: np.ndarray, release: bool, mode: int, measured: Snapshot, seen: PilotOutput | None) -> None:
-        """Record the state now and what is sent, then advance the plant."""
-        self.sample(measured)
-        time = self.plant.time
-        extra: dict[str, Any] = {"command": command[0], "release_command": float(release), "mode": mode}
-        if seen is not None:
-            extra |= {"action": seen.action[0], "observation": seen.observation[0]}
-        points, valid = self.pilot.see(measured.pos_w, measured.quat_wb, measured.payload_pos_w, self.goal_w)
-        extra |= {"keypoints": points[0], "keypoints_valid": valid[0]}
-        self.recorder.add(time, goal_w=self.goal_w, **extra)
-        self.plant.step(command, np.array([release]))
-
-    def sample(self, measured: Snapshot) -> None:
-        """Record the true and the measured state now."""
-        now = self.plant.state
-        names = (
-            "pos_w",
-            "quat_wb",
-            "vel_w",
-            "rate_b",
-            "payload_pos_w",
-            "payload_vel_w",
-            "motor_speed",
-            "battery_voltage",
-            "attached",
-        )
-        values = {name: getattr(now, name)[0] for name in names}
-        values["cable_points_w"] = self._rope(now)
-        values["cable_points_w"][:, 2] = np.maximum(values["cable_points_w"][:, 2], ROPE_ON_GROUND)
-        self.recorder.add(now.time, **values, **{f"measured_{name}": getattr(measured, name)[0] for name in MEASURED})
-        self._before = now
-
-    def _rope(self, now: Snapshot) -> np.ndarray:
-        """Rope now; after the landing it sinks to the ground instead of standing still as the plants leave it."""
-        if not self.plant.landing.landed[0]:
-            return now.cable_points_w[0].copy()
-        before, period = self._before, self.plant.period
-        if self._resting is None:
-            age = max(self.plant.landing.time[0] - before.time, 1e-3)
-            points, ball = now.cable_points_w[0], now.payload_pos_w[0]
-            speed = (points - before.cable_points_w[0]) / age
-            self._resting = LooseRope(points, np.clip(speed, -20.0, 20.0), ball, np.zeros(3))
-            period = now.time - self.plant.landing.time[0]
-        if period > 1e-6:
-            self._resting.sink(period, ROPE_ON_GROUND - now.payload_pos_w[0, 2])
-        return self._resting.points_w(now.payload_pos_w[0])
+    command: np.ndarray  # collective thrust [N] and body rates [rad/s], shape (E, 4)
+    release: np.ndarray  # whether the latch is to trip, shape (E,), bool
+    action: np.ndarray | None = None  # the command normalised, and whatever else a policy puts out, shape (E, 4 or 5)
+    observation: np.ndarray | None = None  # of a policy, shape (E, D)
 
 
-def fly(
-    loaded: Loaded, goal_w: np.ndarray, plant_name: str = "hybrid", seed: int = 0, device: str = "cpu"
-) -> FlightLog:
-    """Hover until the swing is quiet, throw, and hover again at the start.
+class Pilots:
+    """Who throws with E vehicles; the children decide."""
 
-    The throw ends at separation; from there the hover controller has the vehicle. Keypoints are those that the pilot
-    computes from measured poses, and are recorded for a state policy too.
+    def __init__(self, experiment: Experiment, goal_w: np.ndarray, first_action: np.ndarray, goal_vel_w: np.ndarray | None = None):
+        """Begin before the throw.
 
-    Args:
-        loaded: policy and experiment.
-        goal_w: on the ground [m], shape (3,).
-        plant_name: of :data:`visthrow.throws.plants.PLANTS`.
-        seed: of start, plant and measurements.
-        device: of the training simulator.
+        Args:
+            experiment: with the bounds of the throw.
+            goal_w: at its start [m], shape (E, 3). goal_vel_w: [m/s], shape (E, 3); None: still.
+            first_action: normalised command of the hover before, shape (E, 4 or 5).
+        """
+        self.experiment, self.goal_w, self.first_action = experiment, goal_w, first_action
+        self.goal_vel_w = np.zeros_like(goal_w) if goal_vel_w is None else goal_vel_w
 
-    Returns:
-        The flight with all standard channels; ``meta["result"]`` says how it ended, ``meta["times"]`` when.
+    def decide(self, flight: "Flight", seen: Snapshot, held: np.ndarray) -> Decision:
+        """Decide for all vehicles, of which those of ``flight.flown`` follow; ``held`` are the hover controller's commands."""
+        raise NotImplementedError
 
-    Raises:
-        ConfigError: the goal is not a point in reach of the vehicle's bounds.
+
+class Policies(Pilots):
+    """Learnt policies that share a batch, each with the same number of vehicles, the first policy's first."""
+
+    def __init__(self, loaded: Sequence[Loaded], goal_w: np.ndarray, goal_vel_w: np.ndarray | None = None, draws: bool = False) -> None:
+        """Begin with policies that were trained for one plant; ``draws``: state policies too have a camera, to be drawn."""
+        share = len(goal_w) // len(loaded)
+        self.slices = [slice(i * share, (i + 1) * share) for i in range(len(loaded))]
+        looks = [draws or item.policy.contract["observation"]["layout"] == "vision" for item in loaded]
+        self.pilots = [Pilot(item.policy, item.experiment.camera if look else None, share) for item, look in zip(loaded, looks)]
+        super().__init__(loaded[0].experiment, goal_w, np.vstack([pilot.previous_action for pilot in self.pilots]), goal_vel_w)
+
+    def decide(self, flight: "Flight", seen: Snapshot, held: np.ndarray) -> Decision:
+        """See `Pilots`."""
+        outs, goal_w = [], flight.goal_at(seen.time)
+        for pilot, part in zip(self.pilots, self.slices):
+            outs.append(pilot.act(*(getattr(seen, name)[part] for name in VIEWS), goal_w[part], seen.attached[part]))
+        names = ("command", "release", "action", *(["observation"] if len(outs) == 1 else []))
+        return Decision(*(np.concatenate([getattr(out, name) for out in outs]) for name in names))
+
+
+class Recorder:
+    """Keeps nothing of a flight; the children do."""
+
+    def before(self, flight: "Flight", seen: Snapshot, sent: Decision) -> None:
+        """Called each period with what was measured and is sent, before the plant moves."""
+
+    def after(self, flight: "Flight", seen: Snapshot, sent: Decision) -> None:
+        """Called after it, with the new state in ``flight.now``."""
+
+
+@dataclass(frozen=True)
+class Phase:
+    """Part of a flight.
+
+    Attributes:
+        throws: whether the pilots fly, or the hover controller, which begins with empty integrals.
+        over: asked after each period.
     """
-    check_goal(loaded, goal_w)
-    experiment = loaded.experiment
-    plant = make_plant(plant_name, experiment, 1, seed, device)
-    pilot = Pilot(loaded.policy, experiment.camera)
-    home = np.array([0.0, 0.0, experiment.task.start.spawn_height])
-    rng = np.random.default_rng(seed)
-    plant.reset(
-        home[None] + START_SPREAD * rng.uniform(-1, 1, (1, 3)),
-        random_ropes(rng, 1, experiment.rope.segments, START_SWING),
-    )
-    recording = _Recording(plant, np.asarray(goal_w, dtype=float), pilot, _meta(loaded, plant_name, goal_w, seed))
-    ends = _Ends()
-    _hover(recording, experiment, home)
-    _throw(recording, experiment, ends)
-    _recover(recording, experiment, home, ends)
-    return _finished(recording, ends)
+
+    throws: bool
+    over: Callable[["Flight"], bool]
 
 
-def check_goal(loaded: Loaded, goal_w: np.ndarray) -> None:
-    """Refuse a goal that no throw reaches.
+def throw(seconds: float | None = None) -> Phase:
+    """Throw until every payload has landed or its throw has failed, at most for a time [s]; default what the bounds allow."""
 
-    Raises:
-        ConfigError: not three finite numbers, or further than the vehicle may fly.
+    def over(flight: "Flight") -> bool:
+        most = flight.pilots.experiment.task.bounds.time_limit + FALL_TIME if seconds is None else seconds
+        return not np.any(flight.open) or flight.lasted(most)
+
+    return Phase(True, over)
+
+
+def hover(seconds: float) -> Phase:
+    """Hover for a time [s]."""
+    return Phase(False, lambda flight: flight.lasted(seconds))
+
+
+class Flight:
+    """E vehicles of a plant in flight.
+
+    Attributes:
+        elapsed: since the phase began [s].
+        begin: when the first throw began, on the plant's clock [s]; NaN before it.
+        open: whose throw is neither over nor failed, shape (E,). flown: whom the pilots fly in this period, shape (E,).
+        failed: shape (E,), bool. failures: why, a message or None for each.
+        commands: that were sent, each of shape (E, 4).
     """
-    goal_w = np.asarray(goal_w, dtype=float)
-    limit = loaded.experiment.task.bounds.horizontal
-    if goal_w.shape != (3,) or not np.all(np.isfinite(goal_w)):
-        raise ConfigError(f"goal {goal_w}; expected three finite numbers [m]")
-    distance = float(np.hypot(*goal_w[:2]))
-    trained = loaded.experiment.task.start.goal_radius
-    if distance > limit:
-        raise ConfigError(
-            f"the goal lies {distance:g} m away; the vehicle may not leave {limit:g} m, and '{loaded.name}' was "
-            f"trained on goals within {trained:g} m"
-        )
 
+    def __init__(self, plant: Plant, pilots: Pilots, recorder: Recorder | None = None, home_w: np.ndarray | None = None) -> None:
+        """Take over a plant.
 
-def _meta(loaded: Loaded, plant_name: str, goal_w: np.ndarray, seed: int) -> dict[str, Any]:
-    experiment = loaded.experiment
-    from visthrow import config
+        Args:
+            plant: at its start.
+            pilots: who throws.
+            recorder: told of each period.
+            home_w: place that the hover controller holds [m], shape (3,) or (E, 3); None: where the vehicles are.
+        """
+        count = plant.count
+        self.plant, self.pilots, self.recorder = plant, pilots, recorder or Recorder()
+        self._now: Snapshot | None = None
+        self.home_w = self.now.pos_w if home_w is None else home_w
+        self.begin = math.nan
+        self.open, self.flown, self.failed = np.ones(count, bool), np.zeros(count, bool), np.zeros(count, bool)
+        self.failures: list[str | None] = [None] * count
+        self.commands: list[np.ndarray] = []
+        self._hover = HoverController(HoverParams(), plant.period, count)
 
-    return {
-        "policy": loaded.name, "layout": loaded.policy.contract["observation"]["layout"], "plant": plant_name,
-        "plant_meaning": PLANTS[plant_name], "goal_w": [float(x) for x in goal_w], "seed": seed,
-        "config": config.to_dict(experiment), "provenance": provenance.collect(),
-    }  # fmt: skip
+    @property
+    def now(self) -> Snapshot:
+        """State of the plant, which is asked for it once a period, and only if somebody wants it."""
+        self._now = self._now or self.plant.state
+        return self._now
 
+    @property
+    def elapsed(self) -> float:
+        """See the class."""
+        return self.plant.time - self._phase_begin
 
-def _hover(recording: _Recording, experiment, home: np.ndarray) -> None:
-    plant = recording.plant
-    rope, body = experiment.rope, experiment.vehicle.body
-    controller = HoverController(HoverParams(), plant.period)
-    quiet = 0.0
-    while plant.time < HOVER_LEAST - 1e-9 or (quiet < QUIET_TIME and plant.time < HOVER_MOST):
+    def lasted(self, time: float) -> bool:
+        """Whether the phase has lasted for a time [s], to the nearest period."""
+        return self.elapsed > time - 0.5 * self.plant.period
+
+    def goal_at(self, time: float | np.ndarray) -> np.ndarray:
+        """Goals [m], shape (E, 3), at a time or a time each on the plant's clock [s]."""
+        return self.pilots.goal_w + np.reshape(time - self.begin, (-1, 1)) * self.pilots.goal_vel_w
+
+    def run(self, phases: Sequence[Phase]) -> None:
+        """Fly one phase after the other, each for a period at least."""
+        for phase in phases:
+            self._phase_begin = self.plant.time
+            if not phase.throws:
+                self._hover.reset()
+            elif math.isnan(self.begin):
+                self.begin = self.plant.time
+            self._period(phase.throws)
+            while not phase.over(self):
+                self._period(phase.throws)
+
+    def fail(self, vehicle: int, cause: str) -> None:
+        """Note that a vehicle's throw has failed, unless it had before."""
+        self.failed[vehicle], self.failures[vehicle] = True, self.failures[vehicle] or cause
+
+    def _period(self, throws: bool) -> None:
+        """Measure, decide, send."""
+        plant = self.plant
         seen = plant.measured()
-        command = controller.step(
-            seen.pos_w, seen.quat_wb, seen.vel_w, home, body.mass + rope.rope_mass + rope.payload_mass
-        )
-        recording.step(command, False, 0, seen, None)
-        now = plant.state
-        off = np.linalg.norm(now.pos_w[0] - home)
-        still = off < QUIET_OFFSET and np.linalg.norm(now.payload_vel_w[0]) < QUIET_SPEED
-        quiet = quiet + plant.period if still else 0.0
+        held = self._held(seen)
+        self.flown = self.open & seen.attached & throws
+        sent = Decision(held, np.zeros(plant.count, bool))
+        if throws:
+            asked = self.pilots.decide(self, seen, held)
+            command = np.where(self.flown[:, None], asked.command, held)
+            sent = Decision(command, asked.release & self.flown, asked.action, asked.observation)
+        self.recorder.before(self, seen, sent)
+        self.commands.append(sent.command)
+        plant.step(sent.command, sent.release)
+        self._now = None
+        if throws:
+            self.judge(self.now)
+        self.recorder.after(self, seen, sent)
+
+    def _held(self, seen: Snapshot) -> np.ndarray:
+        """Commands of the hover controller."""
+        plant = self.plant.params
+        mass = plant.vehicle.body.mass + np.where(seen.attached, plant.rope.hanging_mass, 0.0)
+        return self._hover.step(seen.pos_w, seen.quat_wb, seen.vel_w, self.home_w, mass)
+
+    def judge(self, now: Snapshot) -> None:
+        """Note whose throw has failed or is over, by the state after a period."""
+        plant, landing = self.plant, self.plant.landing
+        carrying = self.flown & now.attached
+        for cause, mask in self._causes(now).items():
+            for e in np.flatnonzero(mask & carrying):
+                self.fail(e, cause)
+        fallen = plant.time - np.nan_to_num(landing.separation_time)
+        for e in np.flatnonzero(~now.attached & ~landing.landed & (fallen > FALL_TIME)):
+            self.fail(e, f"the payload did not land within {FALL_TIME:g} s of its separation")
+        self.open &= ~(self.failed | landing.landed)
+
+    def _causes(self, now: Snapshot) -> dict[str, np.ndarray]:
+        """Which throws have ended early, by cause, the first that holds first: the ends of an episode of training."""
+        experiment, pos_w, payload_w = self.pilots.experiment, now.pos_w, now.payload_pos_w
+        bounds, rope = experiment.task.bounds, experiment.rope
+        touching = rope.payload_radius + experiment.vehicle.collision_radius
+        upright = 1.0 - 2.0 * (now.quat_wb[:, 0] ** 2 + now.quat_wb[:, 1] ** 2)
+        height = experiment.release.landing_height
+        carrying = terminations.while_carrying(bounds, pos_w, upright, payload_w, self.plant.time - self.begin, height)
+        return {
+            "the simulation failed": ~(np.isfinite(pos_w) & np.isfinite(payload_w)).all(1),
+            **terminations.out_of_bounds(bounds, pos_w),
+            "the payload hit the vehicle": np.linalg.norm(payload_w - pos_w, axis=1) < touching,
+            **{cause: mask & ~now.latched for cause, mask in carrying.items()},
+        }
 
 
-def _throw(recording: _Recording, experiment, ends: _Ends) -> None:
-    from visthrow.throws.reference_protocol import failures
+class Smoothness:
+    """Root mean square change of normalised commands from step to step."""
 
-    plant, pilot = recording.plant, recording.pilot
-    ends.policy_start = plant.time
-    pilot.start()
-    while True:
-        seen = plant.measured()
-        out = pilot.act(
-            seen.pos_w, seen.quat_wb, seen.vel_w, seen.rate_b, seen.payload_pos_w, recording.goal_w, seen.attached
-        )
-        if out.release[0] and ends.latch is None:
-            ends.latch = plant.time
-        recording.step(out.command, bool(out.release[0]), 1, seen, out)
-        now = plant.state
-        if not now.attached[0]:
-            break
-        found = failures(experiment, now, plant.time - ends.policy_start)
-        if found is not None and found[0]:
-            ends.failure = found[0]
-            break
-    ends.recovery = plant.time
+    def __init__(self, first: np.ndarray) -> None:
+        """Begin with the command before the first, shape (E, 4 or more)."""
+        self._last, self._sum, self._steps = first, np.zeros(len(first)), np.zeros(len(first))
+
+    def add(self, action: np.ndarray, active: np.ndarray | bool = True) -> None:
+        """Count normalised commands, shape (E, 4 or more), of vehicles that are being flown."""
+        self._sum += active * np.mean((action - self._last)[:, :4] ** 2, axis=1)
+        self._steps += active
+        self._last = action
+
+    @property
+    def value(self) -> np.ndarray:
+        """Shape (E,)."""
+        return np.sqrt(self._sum / np.maximum(self._steps, 1.0))
 
 
-def _recover(recording: _Recording, experiment, home: np.ndarray, ends: _Ends) -> None:
-    plant = recording.plant
-    rope, body = experiment.rope, experiment.vehicle.body
-    controller = HoverController(HoverParams(), plant.period)
-    quiet, start = 0.0, plant.time
-    while plant.time - start < RECOVERY_MOST and quiet < QUIET_TIME:
-        seen = plant.measured()
-        hangs = rope.rope_mass + rope.payload_mass if seen.attached[0] else 0.0
-        command = controller.step(seen.pos_w, seen.quat_wb, seen.vel_w, home, body.mass + hangs)
-        recording.step(command, False, 0, seen, None)
-        now = plant.state
-        calm = np.linalg.norm(now.pos_w[0] - home) < QUIET_OFFSET and np.linalg.norm(now.vel_w[0]) < QUIET_SPEED
-        down = plant.landing.landed[0] or now.attached[0]
-        quiet = quiet + plant.period if calm and down else 0.0
+class Scores(Recorder):
+    """Measures what :class:`visthrow.training.protocol.Throws` holds.
 
+    Attributes:
+        clearance: least distance of the payload from the vehicle in flight [m], shape (E,); infinite before.
+        smoothness: of the pilots' commands.
+    """
 
-def _finished(recording: _Recording, ends: _Ends) -> FlightLog:
-    plant, recorder = recording.plant, recording.recorder
-    recording.sample(plant.measured())
-    landing = plant.landing
-    times = {"policy_start": ends.policy_start, "latch": ends.latch, "recovery": ends.recovery, "end": plant.time}
-    result: dict[str, Any] = {"success": False, "failure": ends.failure}
-    if not np.isnan(landing.separation_time[0]):
-        times["separation"] = float(landing.separation_time[0])
-    if landing.landed[0]:
-        point, when = landing.point_w[0], float(landing.time[0])
-        times["landing"] = when
-        recorder.add(when, landing=point)
-        off = point[:2] - recording.goal_w[:2]
-        result |= {"success": ends.failure is None, "landing_w": point.tolist(), "error": float(np.hypot(*off)),
-                   "duration": when - ends.policy_start}  # fmt: skip
-    now = plant.state
-    result["hovering_again"] = bool(np.linalg.norm(now.vel_w[0]) < 2 * QUIET_SPEED and now.pos_w[0, 2] > 0.5)
-    recorder.meta |= {"times": times, "result": result}
-    log = recorder.log()
-    if "separation" not in times:
-        return log
-    with_separation = FlightRecorder(recorder.meta)
-    payload = log["payload_pos_w"]
-    at = [np.interp(times["separation"], payload.time, payload.values[:, i]) for i in range(3)]
-    with_separation.add(times["separation"], separation=np.array(at))
-    return FlightLog({**log.channels, **with_separation.log().channels}, recorder.meta)
+    def __init__(self, pilots: Pilots) -> None:
+        """Begin before the throw."""
+        self.clearance, self.smoothness = np.full(len(pilots.goal_w), np.inf), Smoothness(pilots.first_action)
+
+    def after(self, flight: Flight, seen: Snapshot, sent: Decision) -> None:
+        """See `Recorder`."""
+        if sent.action is None:
+            return
+        now = flight.now
+        self.smoothness.add(sent.action, flight.flown)
+        apart = np.linalg.norm(now.payload_pos_w - now.pos_w, axis=1)
+        away = ~now.attached & ~flight.plant.landing.landed
+        self.clearance = np.where(away, np.minimum(self.clearance, apart), self.clearance)
+
+    def columns(self, flight: Flight) -> dict[str, np.ndarray]:
+        """A row a throw, NaN where it failed; ``goal_w`` where goals move."""
+        landing = flight.plant.landing
+        success = landing.landed & ~flight.failed
+        blank = np.where(success, 1.0, np.nan)
+        point = landing.point_w[:, :2] * blank[:, None]
+        goal = flight.goal_at(landing.time)[:, :2]
+        moving = {"goal_w": goal * blank[:, None]} if np.any(flight.pilots.goal_vel_w) else {}
+        return {
+            "success": success, "landing_w": point, "error": np.linalg.norm(point - goal, axis=1),
+            "duration": (landing.time - flight.begin) * blank, "clearance": np.where(success, self.clearance, np.nan),
+            "smoothness": self.smoothness.value * blank,
+        } | moving  # fmt: skip

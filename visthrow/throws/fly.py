@@ -47,9 +47,9 @@ def run(args: argparse.Namespace) -> int:
     from visthrow.common.errors import ConfigError, suggest
     from visthrow.common.storage import write_json
     from visthrow.throws.compare import writable
-    from visthrow.throws.flight import check_goal, fly
     from visthrow.throws.loading import load_policy
     from visthrow.throws.plants import PLANTS
+    from visthrow.throws.recorded import check_goal, fly
     from visthrow.training.device import resolve
 
     if args.plant not in PLANTS:

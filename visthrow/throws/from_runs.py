@@ -8,7 +8,7 @@ import numpy as np
 from visthrow.common.errors import LogError
 from visthrow.logs.flightlog import FlightLog
 from visthrow.onboard.observations import VEHICLE
-from visthrow.throws.compare import Entry
+from visthrow.throws.results import Entry
 from visthrow.training.protocol import Throws
 
 PATTERN = "throw-*.npz"

@@ -11,7 +11,8 @@ Source: Verlet steps with all links solved for at once (SHAKE; Ryckaert, Ciccott
 
 import numpy as np
 
-GRAVITY = 9.81  # [m/s^2]
+from sim.params import GRAVITY
+
 STEP = 1e-3  # [s]
 ITERATIONS = 4
 """Newton steps for the links; from one step of 1 ms to the next they are off by less than 1 % and converge at once."""

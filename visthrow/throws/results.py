@@ -7,11 +7,11 @@ when it is done: a process killed at any moment loses no more than the units tha
 
 import hashlib
 import json
-import multiprocessing as mp
-import signal
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ import numpy as np
 from visthrow.common import provenance
 from visthrow.common.errors import StorageError
 from visthrow.common.storage import atomic_write
+from visthrow.common.workers import done
 
 PROTOCOL = 1
 """Goes up when the same unit would come out otherwise: an older result is then no longer used."""
@@ -70,6 +71,15 @@ class Result:
         """
         goal = self.of("goal_w") if "goal_w" in self.columns else np.array([self.unit["target"], 0.0])
         return self.of("landing_w") - goal
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One row's thrower: what it is called, what it sees ("state", "vision") or is, and its throws a target."""
+
+    name: str
+    layout: str
+    throws: Sequence
 
 
 def key_of(unit: dict[str, Any]) -> str:
@@ -216,33 +226,16 @@ def work(
     results = {**load_all([folder]), **(known or {})}
     todo = list({key_of(unit): unit for unit in units if key_of(unit) not in results}.values())
     begin = time.monotonic()
-    for done, result in enumerate(_done(todo, str(folder), function, processes), 1):
+    one = partial(finish, folder, function, provenance.commit(), provenance.command())
+    for count, (_, result) in enumerate(done(one, todo, processes), 1):
         results[result.key] = result
-        left = (time.monotonic() - begin) / done * (len(todo) - done)
-        say(f"{done} of {len(todo)} sets of throws, about {left:.0f} s left")
+        left = (time.monotonic() - begin) / count * (len(todo) - count)
+        say(f"{count} of {len(todo)} sets of throws, about {left:.0f} s left")
     return {key_of(unit): results[key_of(unit)] for unit in units}
 
 
-def _done(todo: list[dict], folder: str, function: Callable, processes: int) -> Iterable[Result]:
-    tasks = [(unit, folder, function, provenance.commit(), provenance.command()) for unit in todo]
-    if processes <= 1 or len(tasks) <= 1:
-        yield from map(_one, tasks)
-        return
-    with mp.get_context("spawn").Pool(min(processes, len(tasks)), _quiet) as pool:
-        yield from pool.imap_unordered(_one, tasks, chunksize=1)
-
-
-def _quiet() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends its workers
-    import torch
-
-    torch.set_num_threads(1)
-
-
-def _one(task: tuple) -> Result:
-    from datetime import UTC, datetime
-
-    unit, folder, function, commit, command = task
+def finish(folder: str | Path, function: Callable, commit: str, command: str, unit: dict[str, Any]) -> Result:
+    """Do one unit as :func:`work` does, and write its result with commit, command, time and seconds."""
     begin = time.perf_counter()
     columns, extra = function(unit)
     origin = {

@@ -7,7 +7,7 @@ import dataclasses
 
 import numpy as np
 
-from visthrow.task import Experiment
+from visthrow.task import Experiment, plant_of
 from visthrow.throws.loading import load_policy
 from visthrow.throws.plants import HybridPlant, random_ropes
 
@@ -39,12 +39,11 @@ class WirePlant:
             task=dataclasses.replace(experiment.task, observation=observation),
         )
         self._plant = HybridPlant(fine)
-        rope, body = experiment.rope, experiment.vehicle.body
         self.home_w = np.array([0.0, 0.0, experiment.task.start.spawn_height])
-        self.mass = (body.mass + rope.rope_mass + rope.payload_mass, body.mass)
+        self.mass = (plant_of(experiment).total_mass, experiment.vehicle.body.mass)
         self.max_thrust = experiment.task.action.max_thrust
         rng = np.random.default_rng(seed)
-        self._plant.reset(self.home_w + 0.1 * rng.uniform(-1, 1, (1, 3)), random_ropes(rng, 1, rope.segments, 0.05))
+        self._plant.reset(self.home_w + 0.1 * rng.uniform(-1, 1, (1, 3)), random_ropes(rng, 1, experiment.rope.segments, 0.05))
 
     def step(self, command: np.ndarray, release: bool, after: float = 0.0) -> None:
         """Advance by one period under collective thrust [N] and body rates [rad/s], shape (4,).

@@ -71,7 +71,7 @@ class ThrowEnv(VecEnv):
         self.layout = ob.layout_of(task.observation)
         self.camera = KeypointCamera(experiment.camera, device)
         E, make = self.num_envs, {"device": device, "dtype": torch.float32}
-        weight = GRAVITY * (experiment.vehicle.body.mass + experiment.rope.rope_mass + experiment.rope.payload_mass)
+        weight = GRAVITY * plant_of(experiment).total_mass
         self._start_action = torch.tensor(act.hover_action(weight, task.action.max_thrust), **make)
         self._max_rate = torch.tensor(task.action.max_rate, **make)
         self._rate_weights = torch.tensor(task.reward.rate_command, **make)

@@ -6,6 +6,7 @@ landing error and counts against the success rate.
 """
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -78,7 +79,10 @@ def hover_start(experiment: Experiment) -> Experiment:
     return dataclasses.replace(experiment, task=dataclasses.replace(experiment.task, start=start))
 
 
-def throw(experiment: Experiment, policy, target: float, count: int, device: str = "cpu", seed: int = 0) -> Throws:
+def throw(
+    experiment: Experiment, policy, target: float, count: int, device: str = "cpu", seed: int = 0,
+    build: Callable[..., ThrowEnv] = ThrowEnv,
+) -> Throws:  # fmt: skip
     """Throw ``count`` times in the training simulator, with all its noise.
 
     Args:
@@ -88,11 +92,12 @@ def throw(experiment: Experiment, policy, target: float, count: int, device: str
         count: throws, flown as one batch.
         device: of the simulator and the policy.
         seed: of starts and noise; torch's generators are put back afterwards.
+        build: makes the environment, as the class does.
     """
     devices = [device] if device.startswith("cuda") else []
     with torch.random.fork_rng(devices=devices), torch.inference_mode():
         torch.manual_seed(seed)
-        env = ThrowEnv(hover_start(experiment), device, seed, count)
+        env = build(hover_start(experiment), device, seed, count)
         env.fix_goal(torch.tensor([target, 0.0, 0.0], device=device))
         return _fly(env, policy, target, count)
 

@@ -1,56 +1,58 @@
-"""Ends of an episode (the paper, Sec. III-C). Every function returns bool tensors over the batch, shape (E,)."""
+"""Ends of a throw (the paper, Sec. III-C), for an episode of training and for a flight on any plant.
+
+The functions take and return tensors or NumPy arrays over the batch, shape (E,) or (E, 3).
+"""
 
 import math
+from functools import reduce
+from operator import or_
+from typing import TypeVar
 
-import torch
+import numpy as np
 from torch import Tensor
 
 from sim.arrays.state import COLLISION, NONFINITE
 from visthrow.task import BoundsParams
 
+Array = TypeVar("Array", Tensor, np.ndarray)
 
-def out_of_bounds(p: BoundsParams, pos_w: Tensor) -> Tensor:
+
+def out_of_bounds(p: BoundsParams, pos_w: Array) -> dict[str, Array]:
     """Vehicle outside the altitude or the horizontal bounds. pos_w: [m], shape (E, 3)."""
     height = pos_w[:, 2]
-    return (height < p.altitude[0]) | (height > p.altitude[1]) | (pos_w[:, :2].square().sum(-1) > p.horizontal**2)
+    low, high = p.altitude
+    return {
+        f"the vehicle left its altitude bounds of {low:g} to {high:g} m": (height < low) | (height > high),
+        f"the vehicle went further than {p.horizontal:g} m": (pos_w[:, :2] ** 2).sum(-1) > p.horizontal**2,
+    }
 
 
-def tilted(p: BoundsParams, rot_wb: Tensor) -> Tensor:
-    """Body z further from the vertical than allowed. rot_wb: shape (E, 3, 3)."""
-    return rot_wb[:, 2, 2] < math.cos(math.radians(p.tilt_deg))
+def while_carrying(
+    p: BoundsParams, pos_w: Array, upright: Array, payload_w: Array, time: Array | float, landing_height: float
+) -> dict[str, Array]:
+    """What ends a throw before the latch has tripped only.
 
+    The payload on the ground is not in the paper, whose bounds leave it open.
 
-def payload_above(pos_w: Tensor, payload_w: Tensor) -> Tensor:
-    """Payload higher than the vehicle."""
-    return payload_w[:, 2] > pos_w[:, 2]
-
-
-def payload_on_ground(payload_w: Tensor, landing_height: float) -> Tensor:
-    """Payload down while still attached; not in the paper, whose bounds leave it open."""
-    return payload_w[:, 2] < landing_height
-
-
-def broken(status: Tensor) -> Tensor:
-    """Simulator put the environment back from a bad state."""
-    return torch.bitwise_and(status, NONFINITE) != 0
-
-
-def collided(status: Tensor) -> Tensor:
-    """Payload touched the vehicle."""
-    return torch.bitwise_and(status, COLLISION) != 0
+    Args:
+        p: bounds.
+        pos_w, payload_w: [m], shape (E, 3). upright: vertical component of the body's z axis, shape (E,).
+        time: since the start [s], shape (E,) or one for all.
+        landing_height: [m].
+    """
+    return {
+        "the vehicle tilted too far": upright < math.cos(math.radians(p.tilt_deg)),
+        "the payload rose above the vehicle": payload_w[:, 2] > pos_w[:, 2],
+        "the payload touched the ground before the release": payload_w[:, 2] < landing_height,
+        f"no release within {p.time_limit:g} s": time > p.time_limit - 1e-6,
+    }
 
 
 def negative(
-    p: BoundsParams,
-    pos_w: Tensor,
-    rot_wb: Tensor,
-    payload_w: Tensor,
-    status: Tensor,
-    latched: Tensor,
-    time: Tensor,
+    p: BoundsParams, pos_w: Tensor, rot_wb: Tensor, payload_w: Tensor, status: Tensor, latched: Tensor, time: Tensor,
     landing_height: float,
-) -> Tensor:
-    """All negative ends. Once the latch has tripped only collision and leaving the bounds end an episode early.
+) -> Tensor:  # fmt: skip
+    """All negative ends of an episode. Once the latch has tripped only collision, a bad state and leaving the bounds end one early.
 
     Args:
         p: bounds.
@@ -59,11 +61,6 @@ def negative(
         latched: shape (E,), bool. time: since the start [s], shape (E,).
         landing_height: [m].
     """
-    always = out_of_bounds(p, pos_w) | collided(status) | broken(status)
-    carrying = (
-        tilted(p, rot_wb)
-        | payload_above(pos_w, payload_w)
-        | payload_on_ground(payload_w, landing_height)
-        | (time > p.time_limit - 1e-6)
-    )
-    return always | (carrying & ~latched)
+    always = (*out_of_bounds(p, pos_w).values(), (status & (COLLISION | NONFINITE)) != 0)
+    carrying = while_carrying(p, pos_w, rot_wb[:, 2, 2], payload_w, time, landing_height)
+    return reduce(or_, always) | (reduce(or_, carrying.values()) & ~latched)

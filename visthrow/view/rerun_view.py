@@ -35,7 +35,7 @@ def write(path: str | Path, log: FlightLog, experiment: Any) -> None:
 
     Args:
         path: The file.
-        log: a flight of :func:`visthrow.throws.flight.fly`.
+        log: a flight of :func:`visthrow.throws.recorded.fly`.
         experiment: for the sizes of vehicle, ball and camera.
 
     Raises:

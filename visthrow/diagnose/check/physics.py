@@ -8,8 +8,8 @@ from sim.reference.rotations import rotation_from_quat, turned
 from visthrow.diagnose.check import relations
 from visthrow.diagnose.check.rows import Row
 from visthrow.logs.flightlog import Channel, FlightLog
+from visthrow.onboard.hover import GRAVITY
 
-GRAVITY = 9.81
 MOVES = 0.05
 """Below this speed [m/s], rate [rad/s] or acceleration / 10 [m/s^2] a channel does not move enough to be compared."""
 
@@ -152,7 +152,7 @@ def _gravity(log: FlightLog, quat: str, pos: str) -> list[Row]:
     both = f"acc_b, {quat}"
     hint = relations.unit_hint(size / GRAVITY)
     if not 0.85 < size / GRAVITY < 1.15:
-        text = f"the mean force is {size:.4g} m/s^2, not 9.81: {hint or 'axes are exchanged, or gravity is missing'}"
+        text = f"the mean force is {size:.4g} m/s^2, not {GRAVITY}: {hint or 'axes are exchanged, or gravity is missing'}"
         return [Row("units" if hint else "frames", both, "bad", text, figures)]
     if tilt > 30.0:
         text = f"the mean force points {tilt:.0f} deg off up: turned or mirrored axes"
@@ -172,7 +172,7 @@ def _still_gravity(log: FlightLog) -> list[Row]:
     figures = {"median_m_s2": size, "mean_b_m_s2": np.mean(acc, axis=0).tolist()}
     if not 0.7 < size / GRAVITY < 1.4:
         hint = relations.unit_hint(size / GRAVITY) or "gravity is missing or the unit is wrong"
-        return [Row("units", "acc_b", "bad", f"median force {size:.4g} m/s^2, not 9.81: {hint}", figures)]
+        return [Row("units", "acc_b", "bad", f"median force {size:.4g} m/s^2, not {GRAVITY}: {hint}", figures)]
     return [Row("units", "acc_b", "ok", f"median force {size:.3f} m/s^2", figures)]
 
 

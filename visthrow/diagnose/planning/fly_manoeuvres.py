@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from sim.effects.effect import apply
+from visthrow.common import mocap
 from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.models.interface import Model
 from visthrow.diagnose.planning.manoeuvres import PERIOD, Manoeuvre, Reference
@@ -107,8 +108,7 @@ def fly(
     start = np.array([r.pos_w[0] for r in references])
     sim.place(start)
     carried = np.array([m.payload for m in manoeuvres])
-    loaded = plant.vehicle.body.mass + plant.rope.payload_mass + plant.rope.rope_mass
-    pilot = _Pilot(sim, references, carried, loaded, plant.vehicle.body.mass)
+    pilot = _Pilot(sim, references, carried, plant.total_mass, plant.vehicle.body.mass)
     for _ in range(round(AWAY / PERIOD)):
         pilot.step(None)
     rows = max(len(r.time) for r in references)
@@ -158,15 +158,9 @@ class _Pilot:
 
 def _recorded(reference: Reference, manoeuvre: Manoeuvre, e: int, pilot: _Pilot, sampled, noise: dict[str, float],
               rng: np.random.Generator) -> FlightLog:  # fmt: skip
-    from scipy.spatial.transform import Rotation
-
     rows = len(reference.time)
-    flown = {name: np.concatenate([s[name][:, e] for s in sampled[:rows]]) for name in sampled[0]}
-    count = len(flown["pos_w"])
-    for name in ("pos_w", "payload_pos_w"):
-        flown[name] = flown[name] + noise.get(name, noise["pos_w"]) * rng.standard_normal((count, 3))
-    turn = Rotation.from_rotvec(noise["quat_wb"] * rng.standard_normal((count, 3)))
-    flown["quat_wb"] = (Rotation.from_quat(flown["quat_wb"]) * turn).as_quat()
-    flown["time"] = SAMPLE_PERIOD * np.arange(count)
+    flown = {name: np.concatenate([s[name][:, e] for s in sampled[:rows]]) for name in ("pos_w", "payload_pos_w", "quat_wb")}
+    flown = mocap.measured(flown, {"payload_pos_w": noise["pos_w"], **noise}, rng)
+    flown["time"] = SAMPLE_PERIOD * np.arange(len(flown["pos_w"]))
     commands = np.array([row[e] for row in pilot.sent[:rows]])
     return log_of(reference, flown, commands, payload=manoeuvre.payload)

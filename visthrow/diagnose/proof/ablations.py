@@ -12,12 +12,18 @@ from typing import Any
 
 import numpy as np
 
+from sim.params import RandomizationParams
 from visthrow import config
 from visthrow.common.errors import DiagnoseError
 from visthrow.common.storage import write_json
-from visthrow.diagnose.proof.loop import PLANT, explained, named, recorded_in_a_hall
+from visthrow.diagnose.proof.loop import PLANT, explained, named, recorded
 from visthrow.logs.flightlog import FlightLog
 from visthrow.task import Experiment, plant_of
+from visthrow.throws.flight import Flight, Phase, Policies, hover
+from visthrow.throws.loading import Loaded, load_policy
+from visthrow.throws.plants import make_plant
+from visthrow.throws.recorded import Recording
+from visthrow.throws.reference_protocol import place_in_hover
 from visthrow.throws.results import RECORDS
 
 LACKS = {
@@ -28,6 +34,9 @@ LACKS = {
 
 COMMITTED = RECORDS / "loops" / "ablations" / "record.json"
 """Record of the last round that is told of."""
+
+SETTLED, AFTERWARDS = 2.4, 0.7
+"""Hover before the policy takes over, of which a log keeps the last part; flown on after the last landing [s]."""
 
 NEAR, FAR = 1.0, 1.9
 """Distances of the targets, which lie all around [m]."""
@@ -73,9 +82,6 @@ class Ablations:
 
         Of those held back somebody noted where they came down.
         """
-        from visthrow.diagnose.proof.hall import throws
-        from visthrow.throws.loading import load_policy
-
         count = self.flights + self.held
         paths = [self.folder / "flights" / f"flight_{i:02d}.npz" for i in range(count)]
         if all(path.exists() for path in paths):
@@ -84,7 +90,7 @@ class Ablations:
         angle, distance = rng.uniform(-np.pi, np.pi, count), rng.uniform(NEAR, FAR, count)
         goals = np.column_stack((distance * np.cos(angle), distance * np.sin(angle), np.zeros(count)))
         for i, (path, log) in enumerate(zip(paths, throws(load_policy(self.policy), PLANT, goals, 0))):
-            seen = recorded_in_a_hall(log, np.random.default_rng(i))
+            seen = recorded(log, np.random.default_rng(i))
             landing = {"landing": log["landing"]} if i >= self.flights else {}
             FlightLog({**seen.channels, **landing}, seen.meta).save(path)
         say(f"flown: {count}")
@@ -103,6 +109,47 @@ class Ablations:
             write_json(kept, on_held_back(base, theta, LACKS[name], logs[self.flights :], self.device))
             say("weighed on the throws that were held back")
         return record | {"held": json.loads(kept.read_text())}
+
+
+def throws(loaded: Loaded, plant_name: str, goals_w: np.ndarray, seed: int) -> list[FlightLog]:
+    """Throw at goals, one vehicle each, side by side: one vehicle costs nearly as much as thirty.
+
+    All hover for the same time first; :func:`visthrow.throws.recorded.fly` waits for the swing to become quiet.
+
+    Args:
+        loaded: policy and experiment, whose plant it is.
+        plant_name: of :data:`visthrow.throws.plants.PLANTS`.
+        goals_w: on the ground [m], shape (E, 3).
+        seed: of plant and starts.
+
+    Returns:
+        A log each with poses, commands, the release's command and the landing; ``meta["times"]`` as of that function.
+
+    Raises:
+        DiagnoseError: A throw failed.
+    """
+    plant, rng = make_plant(plant_name, loaded.experiment, len(goals_w), seed), np.random.default_rng(seed)
+    home = place_in_hover(plant, loaded.experiment, config.load(RandomizationParams, config.find("start", "hover")), rng)
+    meta = {"policy": loaded.name, "plant": plant.name}
+    recording = Recording(("pos_w", "quat_wb", "payload_pos_w"), len(goals_w), meta)
+    flight, landed = Flight(plant, Policies([loaded], goals_w), recording, home), 0
+
+    def over(flight: Flight) -> bool:
+        nonlocal landed
+        landed += not flight.open.any()
+        return landed > round(AFTERWARDS / plant.period) or bool(flight.failed.any())
+
+    flight.run([hover(SETTLED), Phase(True, over)])
+    if flight.failed.any():
+        raise DiagnoseError(
+            f"throws {np.flatnonzero(flight.failed)} did not come down ({', '.join({c for c in flight.failures if c})}); "
+            "can the policy fly this plant?"
+        )
+    landing, end = plant.landing, plant.time - plant.period
+    for recorder, point, when in zip(recording.recorders, landing.point_w, landing.time):
+        recorder.add(float(when), landing=point)
+        recorder.meta["times"] = {"policy_start": flight.begin, "landing": float(when), "end": end}
+    return [recorder.log() for recorder in recording.recorders]
 
 
 def on_held_back(base: str, theta: Mapping[str, float], lacks: str, logs: Sequence[Path], device: str) -> dict[str, Any]:

@@ -9,32 +9,35 @@ that has the hidden effect itself.
 import concurrent.futures
 import dataclasses
 import json
-import multiprocessing as mp
 import shutil
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from visthrow import config
-from visthrow.common import statistics, toml_text
+from visthrow.common import mocap, statistics, toml_text, workers
 from visthrow.common.errors import DiagnoseError
 from visthrow.common.storage import atomic_write, write_json
 from visthrow.diagnose.extend.patch import extended
 from visthrow.logs.flightlog import Channel, FlightLog
 from visthrow.task import Experiment
+from visthrow.throws.loading import Loaded, load_policy
+from visthrow.throws.recorded import fly
+from visthrow.throws.reference_protocol import Throwing
 from visthrow.throws.results import DIGITS, RECORDS
 
 PLANT = "reference"
 """The reference plant without extras: what the diagnosis finds is what was hidden, or a mistake."""
 
 NOISE = {"pos_w": 5e-4, "quat_wb": np.radians(0.2), "payload_pos_w": 8e-4}
-"""Of the recordings: motion capture of a hall [m], [rad], [m]."""
+"""Of the recordings: motion capture [m], [rad], [m]."""
 
 BEFORE, AFTER = 1.5, 0.6
 """What is kept of a flight before the policy starts and after the landing [s]."""
@@ -164,9 +167,6 @@ class Loop:
         return explained(logs, self.base, self.folder / "verdict.json", self.diagnose_on, say)
 
     def _throws(self, name: str, policy: str, say: Callable[[str], None]) -> dict[str, Any]:
-        from visthrow.throws.loading import load_policy
-        from visthrow.throws.reference_protocol import Throwing
-
         path = self.folder / f"throws_{name}.json"
         if not path.exists():
             loaded = [load_policy(policy, str(self.folder / "hidden.toml"), allow=CONTRACT)]
@@ -237,11 +237,8 @@ def fly_all(
     paths = [folder / f"flight_{i:02d}.npz" for i in range(count)]
     todo = [(i, path) for i, path in enumerate(paths) if not path.exists()]
     text = toml_text.dumps(config.to_dict(truth, defaults=False))
-    with concurrent.futures.ProcessPoolExecutor(processes, mp.get_context("spawn")) as pool:
-        done = [pool.submit(_fly_one, policy, base, text, i, path) for i, path in todo]
-        for i, future in enumerate(concurrent.futures.as_completed(done)):
-            future.result()
-            say(f"flown: {i + 1} of {len(todo)}")
+    for k, _ in enumerate(workers.done(partial(_fly_one, policy, base, text), todo, processes), 1):
+        say(f"flown: {k} of {len(todo)}")
     return paths
 
 
@@ -261,35 +258,25 @@ def explained(
     return verdict
 
 
-def _fly_one(policy: str, base: str, text: str, number: int, path: Path) -> None:
-    """Fly one throw of a policy that was trained in ``base`` and keep what was measured of it."""
-    from visthrow.throws.flight import fly
-    from visthrow.throws.loading import Loaded, load_policy
-
+def _fly_one(policy: str, base: str, text: str, flight: tuple[int, Path]) -> None:
+    """Fly one throw of a policy that was trained in ``base``, by its number, and keep what was measured of it."""
+    number, path = flight
     shipped = load_policy(policy, base)
     truth = config.loads(Experiment, text, (), name="the hidden world")
     rng = np.random.default_rng(number)
     angle, distance = rng.uniform(-np.pi, np.pi), rng.uniform(1.0, 1.9)
     goal = np.array([distance * np.cos(angle), distance * np.sin(angle), 0.0])
-    recorded_in_a_hall(fly(Loaded(shipped.name, shipped.policy, truth), goal, PLANT, number), rng).save(path)
+    recorded(fly(Loaded(shipped.name, shipped.policy, truth), goal, PLANT, number), rng).save(path)
 
 
-def recorded_in_a_hall(log: FlightLog, rng: np.random.Generator) -> FlightLog:
+def recorded(log: FlightLog, rng: np.random.Generator) -> FlightLog:
     """What motion capture and the radio's log would hold of a simulated flight: noisy poses, commands, nothing true."""
     start = log.meta["times"]["policy_start"] - BEFORE
     end = log.meta["times"].get("landing", log.meta["times"]["end"])
-    channels = {}
-    for name in ("command", "release_command"):
-        channels[name] = _between(log[name], start, end + AFTER)
-    for name in ("pos_w", "payload_pos_w"):
-        c = _between(log[name], start, end + AFTER if name == "pos_w" else end)
-        channels[name] = dataclasses.replace(c, values=c.values + NOISE[name] * rng.normal(size=c.values.shape))
-    q = _between(log["quat_wb"], start, end + AFTER)
-    turn = 0.5 * NOISE["quat_wb"] * rng.normal(size=(len(q.time), 3))
-    x, w = q.values[:, :3], q.values[:, 3:]
-    noisy = np.hstack((x + w * turn + np.cross(x, turn), w - np.sum(x * turn, axis=1, keepdims=True)))
-    noisy /= np.linalg.norm(noisy, axis=1, keepdims=True)
-    channels["quat_wb"] = dataclasses.replace(q, values=noisy)
+    channels = {name: _between(log[name], start, end + AFTER) for name in ("command", "release_command", "pos_w", "quat_wb")}
+    channels["payload_pos_w"] = _between(log["payload_pos_w"], start, end)
+    seen = mocap.measured({name: channels[name].values for name in ("pos_w", "payload_pos_w", "quat_wb")}, NOISE, rng)
+    channels |= {name: dataclasses.replace(channels[name], values=values) for name, values in seen.items()}
     return FlightLog(channels, {"policy": log.meta["policy"], "plant": log.meta["plant"]})
 
 

@@ -57,7 +57,7 @@ def put_right(logs: Sequence[FlightLog], plant: PlantParams) -> tuple[list[Fligh
         if all(r is None or (s is not None and s.correlation > r.correlation - WORSE) for r, s in zip(relation, again)):
             found.append(mistake[0])
             mended, relation = trial, again
-    weight = GRAVITY * (plant.vehicle.body.mass + plant.rope.payload_mass + plant.rope.rope_mass)
+    weight = GRAVITY * plant.total_mass
     mistake = _thrust_unit(mended, weight, THRUST | {"shares of the full thrust": 4.0 * plant.vehicle.controller.max_thrust})
     if mistake is not None:
         found.append(mistake[0])

@@ -1,10 +1,8 @@
 """``visthrow bench detector``: recall, precision and pixel error of the keypoint detector on rendered frames, by nuisance."""
 
 import argparse
-import concurrent.futures
 import functools
 import math
-import multiprocessing as mp
 import os
 import time
 from collections.abc import Iterator
@@ -22,6 +20,7 @@ from camera.mount import rotation_from_vector
 from camera.params import CameraParams
 from visthrow import config
 from visthrow.common.errors import VisthrowError
+from visthrow.common.workers import done
 from visthrow.evidence.bench.records import Report, Table, finish
 
 LEVELS = {
@@ -247,7 +246,9 @@ def levels(measure: Measure, count: int, jobs: int = 1) -> dict[str, dict[str, d
         count: scenes a level. jobs: processes at once; the figures do not depend on it.
     """
     total: Counts = {}
-    for counts, spent in _all_counted(measure, count, min(jobs, count)):
+    found = dict(done(functools.partial(_counted, measure.camera.params, measure.seed), range(count), jobs))
+    for index in range(count):
+        counts, spent = found[index]
         measure.spent += spent
         for name, pair in counts.items():
             for kind, tally in pair.items():
@@ -255,19 +256,7 @@ def levels(measure: Measure, count: int, jobs: int = 1) -> dict[str, dict[str, d
     return {name: {kind: tally.figures() for kind, tally in pair.items()} for name, pair in total.items()}
 
 
-def _all_counted(measure: Measure, count: int, jobs: int) -> Iterator[tuple[Counts, list[float]]]:
-    """`Measure.counted` of every scene, in order."""
-    if jobs <= 1:
-        for index in range(count):
-            counts, _ = measure.counted(index)
-            yield counts, []
-        return
-    work = functools.partial(_one, measure.camera.params, measure.seed)
-    with concurrent.futures.ProcessPoolExecutor(jobs, mp.get_context("spawn"), torch.set_num_threads, (1,)) as pool:
-        yield from pool.map(work, range(count))
-
-
-def _one(params: CameraParams, seed: int, index: int) -> tuple[Counts, list[float]]:
+def _counted(params: CameraParams, seed: int, index: int) -> tuple[Counts, list[float]]:
     return Measure(params, seed).counted(index)
 
 

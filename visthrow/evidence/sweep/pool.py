@@ -61,28 +61,20 @@ class Starter(Protocol):
         """Start a task."""
 
 
-class Process:
+class Process(subprocess.Popen):
     """A task in a process of this machine; it stops by itself when this one dies (see ``visthrow sweep work``)."""
 
     def __init__(self, words: Sequence[str], log: Path, environment: dict[str, str]) -> None:
         log.parent.mkdir(parents=True, exist_ok=True)
         environment = {**os.environ, "PYTHONUNBUFFERED": "1", **environment}
         with log.open("ab") as file:
-            self._process = subprocess.Popen(
+            super().__init__(
                 words, stdin=subprocess.DEVNULL, stdout=file, stderr=subprocess.STDOUT, env=environment, start_new_session=True
             )
 
-    def poll(self) -> int | None:
-        """See `Running`."""
-        return self._process.poll()
-
     def stop(self) -> None:
         """See `Running`."""
-        self._process.send_signal(signal.SIGINT)
-
-    def kill(self) -> None:
-        """See `Running`."""
-        self._process.kill()
+        self.send_signal(signal.SIGINT)
 
 
 @dataclass

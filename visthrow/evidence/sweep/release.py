@@ -5,13 +5,16 @@ full plant, or the same.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
+from tensordict import TensorDict
 
+from sim.hybrid import rope_variants
 from visthrow.throws.loading import Loaded
 from visthrow.training.env import ThrowEnv
-from visthrow.training.protocol import hover_start
+from visthrow.training.protocol import throw
 
 
 @dataclass(frozen=True)
@@ -40,18 +43,21 @@ class Releases:
 class _Watched(ThrowEnv):
     """Environment that keeps each first episode's release and cable; on the CPU or a device."""
 
-    def watch(self) -> None:
-        """Begin to keep."""
+    def reset(self) -> TensorDict:
+        """See `ThrowEnv`; begins to keep."""
+        ropes = rope_variants(self.cfg.rope, self.cfg.task.start)
+        lengths = torch.tensor([rope.length for rope in ropes], device=self.device)
+        self.lengths = lengths.repeat(-(-self.num_envs // len(ropes)))[: self.num_envs]
         self.open = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
         blank = torch.full((self.num_envs, 3), torch.nan, device=self.device)
         self.kept = dict.fromkeys(("ball", "vel", "vehicle", "landing"), blank)
         self.time = blank[:, 0]
         self.bow, self.slack = (torch.zeros(self.num_envs, device=self.device) for _ in range(2))
+        return super().reset()
 
     def _judge(self, action: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         reward, done = super()._judge(action)
-        if hasattr(self, "open"):
-            self._keep(done)
+        self._keep(done)
         return reward, done
 
     def _keep(self, done: torch.Tensor) -> None:
@@ -83,22 +89,14 @@ def releases(loaded: Loaded, target: float, count: int, device: str, seed: int =
         device: "cpu" or "cuda:0".
         seed: of starts and noise.
     """
-    from sim.hybrid import rope_variants
+    built: list[_Watched] = []
 
-    experiment = hover_start(loaded.experiment)
-    policy = loaded.policy.to(device)
-    with torch.random.fork_rng(devices=[device] if device.startswith("cuda") else []), torch.inference_mode():
-        torch.manual_seed(seed)
-        env = _Watched(experiment, device, seed, count)
-        lengths = [rope.length for rope in rope_variants(experiment.rope, experiment.task.start)]
-        env.lengths = torch.tensor(lengths, device=device).repeat(-(-count // len(lengths)))[:count]
-        env.fix_goal(torch.tensor([target, 0.0, 0.0], device=device))
-        observations = env.reset()
-        env.watch()
-        for _ in range(env.max_episode_length + 1):
-            observations, *_ = env.step(policy.act(observations["actor"]))
-            if not bool(env.open.any()):
-                break
+    def build(*args: Any) -> _Watched:
+        built.append(_Watched(*args))
+        return built[0]
+
+    throw(loaded.experiment, loaded.policy.to(device).act, target, count, device, seed, build)
+    env = built[0]
     parts = (env.time, env.kept["ball"], env.kept["vel"], env.kept["vehicle"], env.kept["landing"], env.bow, env.slack)
     return Releases(*(part.cpu().numpy().astype(float) for part in parts))
 

@@ -18,7 +18,7 @@ from visthrow.evidence.sweep.lists import SweepList, ThrowParams
 from visthrow.onboard.policy import find_policy
 from visthrow.task import Experiment
 from visthrow.throws import results
-from visthrow.throws.reference_protocol import BATCH
+from visthrow.throws.reference_protocol import batches
 
 POLICY, SUMMARY, PROGRESS = "policy.npz", "summary.json", "progress.csv"
 
@@ -207,12 +207,8 @@ def _trained(name: str, changes: tuple[str, ...], seed: int, commit: str) -> Sou
 def _throws(source: Source, name: str, params: ThrowParams) -> list[ThrowUnit]:
     if params.plant == "hybrid":
         return [ThrowUnit(source, name, params, target, params.count) for target in params.targets]
-    starts = range(0, params.count, BATCH)
-    return [
-        ThrowUnit(source, name, params, target, min(BATCH, params.count - start), start // BATCH)
-        for target in params.targets
-        for start in starts
-    ]
+    cut = batches(params.count)
+    return [ThrowUnit(source, name, params, target, size, batch) for target in params.targets for batch, size in cut]
 
 
 @cache

@@ -8,6 +8,9 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
+import numpy as np
+import torch
+
 from visthrow.common import provenance
 from visthrow.common.errors import BusyError
 from visthrow.common.storage import write_json
@@ -89,26 +92,22 @@ def train(source: Source, out: Path, device: str, minutes: float | None, checkpo
 
 def fly(unit: ThrowUnit, out: Path, device: str) -> None:
     """Throw and write the result."""
-    from visthrow.training.device import resolve
+    command = f"visthrow sweep run (throws {unit.set} of {unit.source.name})"
+    results.finish(throws_folder(out), lambda _: (_columns(unit, out, device), {}), provenance.commit(), command, unit.unit(out))
 
-    start = time.perf_counter()
+
+def _columns(unit: ThrowUnit, out: Path, device: str) -> dict[str, np.ndarray]:
+    from visthrow.throws.reference_protocol import Job, fly_batch
+    from visthrow.training.device import resolve
+    from visthrow.training.protocol import throw
+
     loaded = load(unit, out)
     if unit.params.plant == "hybrid":
-        from visthrow.training.protocol import throw
-
         device = resolve(device)
         policy = loaded.policy.to(device)
-        columns = results.columns_of(throw(loaded.experiment, policy.act, unit.target, unit.count, device, unit.params.seed))
-    else:
-        import torch
-
-        from visthrow.throws.reference_protocol import Job, fly_batch
-
-        torch.set_num_threads(1)
-        columns = fly_batch([loaded], unit.params.plant, Job((0,), unit.target, unit.batch, unit.count, unit.params.seed))
-    made = {"commit": provenance.commit(), "command": f"visthrow sweep run (throws {unit.set} of {unit.source.name})",
-            "time": datetime.now(UTC).isoformat(timespec="seconds"), "seconds": round(time.perf_counter() - start, 2)}  # fmt: skip
-    results.save(throws_folder(out), results.Result(unit.unit(out), columns, made))
+        return results.columns_of(throw(loaded.experiment, policy.act, unit.target, unit.count, device, unit.params.seed))
+    torch.set_num_threads(1)
+    return fly_batch([loaded], unit.params.plant, Job((0,), unit.target, unit.batch, unit.count, unit.params.seed))
 
 
 def load(unit: ThrowUnit, out: Path) -> Loaded:

@@ -18,12 +18,13 @@ from typing import Any
 import torch
 
 from visthrow.common.errors import VisthrowError, suggest
+from visthrow.common.workers import side_by_side
 from visthrow.evidence.bench.hil.figures import json_lines
 from visthrow.evidence.bench.hil.processes import ENDED, Pair, own_cores
 from visthrow.evidence.bench.hil.soak import STILL, never_releasing
-from visthrow.evidence.bench.hil.throws import side_by_side
 from visthrow.evidence.bench.records import Report, Table
 from visthrow.onboard.actions import hover_action
+from visthrow.onboard.hover import GRAVITY
 
 MOCAP, AUTOPILOT, OWN = "Motion capture", "The autopilot", "The runner itself"
 
@@ -149,9 +150,9 @@ def policies(folder: Path) -> dict[str, Path]:
     """Write the policies of the cases, of the shipped state policy's contract; files by name."""
     from visthrow.onboard.policy import Policy, find_policy
 
-    contract = Policy.load(find_policy("state")).contract
-    vehicle, hanging = contract["vehicle"]["body"]["mass"], contract["rope"]["payload_mass"] + contract["rope"]["rope_mass"]
-    hover = hover_action(9.81 * (vehicle + hanging), contract["action"]["max_thrust"])[0]
+    shipped = Policy.load(find_policy("state"))
+    contract = shipped.contract
+    hover = hover_action(GRAVITY * shipped.total_mass, contract["action"]["max_thrust"])[0]
     same = {"at once": (hover, 0.0, 0.0, 0.0, 1.0), "limits": (1.0, 1.0, -1.0, 1.0, -1.0)}
     made = {"never": never_releasing("state", folder / "never.npz")}
     wide = contract["observation"]["dimension"]

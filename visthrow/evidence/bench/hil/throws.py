@@ -6,8 +6,6 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
-from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +13,7 @@ import numpy as np
 
 from visthrow.common import statistics
 from visthrow.common.errors import VisthrowError
+from visthrow.common.workers import side_by_side
 from visthrow.evidence.bench.hil.figures import bootstrap_upper, finite, json_lines
 from visthrow.evidence.bench.hil.processes import COMMAND, Pair, own_cores
 from visthrow.evidence.bench.records import Report, Table
@@ -65,25 +64,6 @@ def series(args: argparse.Namespace) -> Report:
             _keep(kept, line, file)
             _progress(count, args.throws, line, kept[("direct", line["seed"])])
     return _report([(kept[("wire", s)], kept[("direct", s)]) for s in seeds], args)
-
-
-def side_by_side(what: Callable[[Any, Any], Any], items: list, places: list) -> Iterator[Any]:
-    """What is made of each item, in the order in which it is done; as many at once as there are places, one a place.
-
-    After an error nothing more is begun.
-    """
-    free, todo, running = list(reversed(places)), iter(items), {}
-    with ThreadPoolExecutor(len(places)) as pool:
-        while True:
-            while free and (item := next(todo, None)) is not None:
-                place = free.pop()
-                running[pool.submit(what, item, place)] = place
-            if not running:
-                return
-            done, _ = wait(running, return_when=FIRST_COMPLETED)
-            for future in done:
-                free.append(running.pop(future))
-                yield future.result()
 
 
 def _keep(kept: dict, line: dict[str, Any], file: Any) -> None:

@@ -19,7 +19,7 @@ def draw(kind: str, plant: PlantParams, limits: ActionParams, steps: int, count:
     a *= 2.0
     a -= 1.0
     if kind == "hover":
-        weight = GRAVITY * (plant.vehicle.body.mass + plant.rope.rope_mass + plant.rope.payload_mass)
+        weight = GRAVITY * plant.total_mass
         a[..., 0] = weight * (1.0 + 0.1 * a[..., 0])
         a[..., 1:] *= 0.5
         return a

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 
 from sim.hybrid import HybridSim
-from sim.params import PlantParams
+from sim.params import GRAVITY, PlantParams
 from sim.reference.scene import Scene, Wrench
 
 TOTAL_MASS = 0.21 + 0.004 + 0.058
@@ -18,7 +18,7 @@ HARD_THROW = Scene(
     segments=15, segment_length=0.022, segment_mass=0.004 / 15,
     ball_mass=0.058, ball_inertia=4.2108e-5, ball_offset=0.033, direction=(1.2, -0.15, -1.0),
     cable_rate_w=(0.0, 0.0, 0.0), joint_damping=1.0e-5, duration=0.5,
-    schedule=(Wrench(0.0, (0.0, 0.0, THRUST_WEIGHTS * TOTAL_MASS * 9.81), (0.0, 0.0, 0.0)),),
+    schedule=(Wrench(0.0, (0.0, 0.0, THRUST_WEIGHTS * TOTAL_MASS * GRAVITY), (0.0, 0.0, 0.0)),),
 )  # fmt: skip
 """2.2 times the total weight along body z, the rope straight but far from hanging. Equal to the tests' scene file."""
 

@@ -1,0 +1,77 @@
+"""Work side by side: results, errors and what ends early."""
+
+import math
+import os
+import time
+
+import pytest
+
+from visthrow.common.errors import VisthrowError
+from visthrow.common.workers import Workers, done, progress, side_by_side
+
+
+def squared(number: float) -> float:
+    """Of slow work that says how far it is."""
+    progress(0.5)
+    time.sleep(0.01 * number)
+    return number * number
+
+
+def refused(number: int) -> int:
+    raise VisthrowError(f"no {number}")
+
+
+def killed(number: int) -> int:
+    os._exit(7)
+
+
+def endless(number: int) -> int:
+    time.sleep(600.0)
+    return number
+
+
+def test_one_process_works_here_and_in_order():
+    seen = []
+    assert list(done(lambda x: seen.append(os.getpid()) or x, [3, 1, 2])) == [(0, 3), (1, 1), (2, 2)]
+    assert set(seen) == {os.getpid()}
+
+
+@pytest.mark.slow
+def test_processes_do_each_task_once():
+    assert sorted(done(squared, [3.0, 1.0, 2.0, 5.0, 4.0], 2)) == [(0, 9.0), (1, 1.0), (2, 4.0), (3, 25.0), (4, 16.0)]
+    assert list(done(math.sqrt, [], 2)) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("function", "message"), [(refused, "^no [12]"), (killed, "ended with status 7")])
+def test_an_error_or_a_dead_process_ends_the_work(function, message):
+    with pytest.raises(VisthrowError, match=message):
+        list(done(function, [1, 2], 2))
+
+
+@pytest.mark.slow
+def test_leaving_early_ends_the_processes():
+    begin = time.monotonic()
+    with Workers(endless, [1, 2], 2) as workers:
+        running = list(workers._running.values())
+    assert time.monotonic() - begin < 60.0
+    assert not any(process.is_alive() for process in running)
+
+
+def test_threads_hold_one_place_each_and_begin_nothing_after_an_error():
+    busy, begun = set(), []
+
+    def work(item, place):
+        assert place not in busy
+        busy.add(place)
+        begun.append(item)
+        time.sleep(0.01)
+        busy.remove(place)
+        if item == 4:
+            raise VisthrowError("no")
+        return 10 * item
+
+    assert sorted(side_by_side(work, range(4), ["a", "b"])) == [0, 10, 20, 30]
+    with pytest.raises(VisthrowError, match="no"):
+        list(side_by_side(work, range(4, 20), ["a", "b"]))
+    assert max(begun) < 8

@@ -1,0 +1,146 @@
+"""Work done side by side: computations in processes of their own, and what waits for other processes in threads.
+
+Results come as they are done. An error, Ctrl-C or leaving early ends the processes. To go on with what was interrupted, a caller
+keeps each result as it comes and leaves out what is there.
+"""
+
+import multiprocessing as mp
+import pickle
+import signal
+import sys
+import time
+import traceback
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor
+from concurrent.futures import wait as wait_for
+from multiprocessing.connection import wait
+from typing import Any
+
+from visthrow.common.errors import VisthrowError
+
+LOOK = 0.5
+"""Between two looks at the progress [s]."""
+
+
+def status(text: str) -> None:
+    """Show a text on the terminal's last line in place of the one before; nothing clears it, or where there is no terminal."""
+    if sys.stderr.isatty():
+        print(f"\r{text:<78}", end="" if text else "\r", file=sys.stderr, flush=True)
+
+
+class Workers:
+    """Processes that begin their tasks at once, in order; a context manager that ends them when left.
+
+    Iterating yields each task's place in the order and its result, as they are done.
+    """
+
+    def __init__(self, function: Callable[[Any], Any], tasks: Iterable[Any], processes: int, label: str = "") -> None:
+        """Start.
+
+        Args:
+            function: of a task, importable by its name; it may call :func:`progress`.
+            tasks: what it is called with. processes: at most; there are no more than tasks.
+            label: of a line of progress on the terminal; empty for none.
+        """
+        tasks, context = list(tasks), mp.get_context("spawn")
+        self.label, self._running, self._taken = label, {}, context.Value("i", 0)
+        self._shares = context.Array("d", len(tasks), lock=False)
+        work = pickle.dumps((function, tasks))  # here: multiprocessing's own pickler would send tensors as shared memory
+        for _ in range(min(processes, len(tasks))):
+            ours, theirs = context.Pipe(duplex=False)
+            process = context.Process(target=_serve, args=(theirs, work, self._taken, self._shares), daemon=True)
+            process.start()
+            theirs.close()
+            self._running[ours] = process
+
+    def __enter__(self) -> "Workers":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for process in self._running.values():
+            process.terminate()
+        for process in self._running.values():
+            process.join()
+
+    def __iter__(self) -> Iterator[tuple[int, Any]]:
+        busy, begin = list(self._running), time.monotonic()
+        while busy:
+            share = sum(self._shares) / len(self._shares)
+            left = f", about {(time.monotonic() - begin) * (1 / share - 1):.0f} s left" if share > 0.02 else ""
+            if self.label:
+                status(f"{self.label}: {100 * share:3.0f} %{left}")
+            for end in wait(busy, LOOK):
+                try:
+                    index, result = end.recv()
+                except EOFError:
+                    self._running[end].join()
+                    raise VisthrowError(f"a worker process ended with status {self._running[end].exitcode}") from None
+                if isinstance(index, int):
+                    yield index, result
+                elif result is None:
+                    busy.remove(end)
+                else:
+                    raise result
+        if self.label:
+            status("")
+
+
+def done(function: Callable[[Any], Any], tasks: Iterable[Any], processes: int = 1) -> Iterator[tuple[int, Any]]:
+    """Yield each task's place in the order and its result as they are done; in this process where one will do."""
+    tasks = list(tasks)
+    if processes <= 1 or len(tasks) <= 1:
+        yield from ((index, function(task)) for index, task in enumerate(tasks))
+    else:
+        with Workers(function, tasks, processes) as workers:
+            yield from workers
+
+
+_shares: Any = None
+_index = 0
+
+
+def progress(share: float) -> None:
+    """Say in a task which share of it is done; nothing outside of a worker."""
+    if _shares is not None:
+        _shares[_index] = share
+
+
+def _serve(end: Any, work: bytes, taken: Any, shares: Any) -> None:
+    """Take tasks until none is left, then say so: (None, None); (None, error) after an error."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends its workers
+    import torch
+
+    global _shares, _index
+    torch.set_num_threads(1)
+    _shares = shares
+    try:
+        function, tasks = pickle.loads(work)
+        while True:
+            with taken.get_lock():
+                _index, taken.value = taken.value, taken.value + 1
+            if _index >= len(tasks):
+                end.send((None, None))
+                return
+            end.send((_index, function(tasks[_index])))
+            progress(1.0)
+    except Exception as error:
+        error.add_note(f"in a worker process:\n{traceback.format_exc()}")
+        end.send((None, error))
+
+
+def side_by_side(what: Callable[[Any, Any], Any], items: Iterable[Any], places: Sequence[Any]) -> Iterator[Any]:
+    """Yield what is made of each item in a thread, as they are done; as many at once as there are places, one a place.
+
+    After an error nothing more is begun.
+    """
+    free, todo, running = list(reversed(places)), iter(items), {}
+    with ThreadPoolExecutor(len(places)) as pool:
+        while True:
+            while free and (item := next(todo, None)) is not None:
+                place = free.pop()
+                running[pool.submit(what, item, place)] = place
+            if not running:
+                return
+            for future in wait_for(running, return_when=FIRST_COMPLETED).done:
+                free.append(running.pop(future))
+                yield future.result()

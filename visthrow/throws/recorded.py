@@ -1,0 +1,210 @@
+"""Recorded throws: one from hover to the vehicle hovering again, and what any flight is recorded by."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from visthrow import config
+from visthrow.common import provenance
+from visthrow.common.errors import ConfigError
+from visthrow.logs.flightlog import Channel, FlightLog, FlightRecorder
+from visthrow.throws.flight import Decision, Flight, Phase, Policies, Recorder
+from visthrow.throws.loading import Loaded
+from visthrow.throws.loose_rope import LooseRope
+from visthrow.throws.plants import PLANTS, Snapshot, make_plant, random_ropes
+
+START_SPREAD = 0.10  # of the start about the hover point [m]
+START_SWING = 0.05  # of the rope at the start [rad]
+HOVER_LEAST, HOVER_MOST = 1.5, 6.0  # time in hover before the throw [s]
+QUIET_OFFSET, QUIET_SPEED = 0.03, 0.12  # vehicle off its hover point [m]; payload against the world [m/s]
+QUIET_TIME = 0.4  # for which it must last [s]
+RECOVERY_MOST = 8.0  # [s]
+ROPE_ON_GROUND = 0.003  # height at which the rope is drawn where it would pass through the ground; no plant knows it [m]
+MEASURED = {"pos_w": "m", "quat_wb": "1", "vel_w": "m/s", "rate_b": "rad/s", "payload_pos_w": "m"}
+"""Channels that are recorded a second time as measured, under ``measured_<name>``, with their units."""
+
+
+class Recording(Recorder):
+    """A flight log of each vehicle: what is true at each period's beginning, and what is sent then.
+
+    Attributes:
+        recorders: one a vehicle.
+    """
+
+    def __init__(self, names: Sequence[str], count: int, meta: dict[str, Any]) -> None:
+        """Start empty.
+
+        Args:
+            names: standard channels that a snapshot has. count: of vehicles. meta: of every log.
+        """
+        self.names, self.recorders = names, [FlightRecorder(meta) for _ in range(count)]
+
+    def before(self, flight: Flight, seen: Snapshot, sent: Decision) -> None:
+        """See `Recorder`."""
+        now = flight.now
+        for e, recorder in enumerate(self.recorders):
+            recorder.add(now.time, **{name: getattr(now, name)[e] for name in self.names})
+            recorder.add(now.time, command=sent.command[e], release_command=float(sent.release[e]))
+
+
+class _Full(Recording):
+    """Everything of one vehicle: the rope down to the ground and what the camera sees too.
+
+    Attributes:
+        latch: when the release was asked for [s]; None before.
+    """
+
+    def __init__(self, pilots: Policies, meta: dict[str, Any]) -> None:
+        truth = ("payload_vel_w", "motor_speed", "battery_voltage", "attached")
+        super().__init__((*MEASURED, *truth), 1, meta)
+        self.pilots = pilots
+        self.latch: float | None = None
+        for name, unit in MEASURED.items():
+            self.recorders[0].declare(f"measured_{name}", unit, "body" if name == "rate_b" else "world")
+        self._resting: LooseRope | None = None
+        self._before: Snapshot | None = None
+
+    def before(self, flight: Flight, seen: Snapshot, sent: Decision) -> None:
+        """See `Recorder`."""
+        super().before(flight, seen, sent)
+        recorder, now, throws = self.recorders[0], flight.now, sent.action is not None
+        if sent.release[0] and self.latch is None:
+            self.latch = now.time
+        points, valid = self.pilots.pilots[0].see(seen.pos_w, seen.quat_wb, seen.payload_pos_w, self.pilots.goal_w)
+        recorder.add(now.time, goal_w=self.pilots.goal_w[0], mode=int(throws), keypoints=points[0], keypoints_valid=valid[0])
+        if throws:
+            recorder.add(now.time, action=sent.action[0], observation=sent.observation[0])
+        self.sample(flight, seen)
+
+    def sample(self, flight: Flight, seen: Snapshot) -> None:
+        """Record rope and measurements now."""
+        points = self._rope(flight)
+        points[:, 2] = np.maximum(points[:, 2], ROPE_ON_GROUND)
+        measured = {f"measured_{name}": getattr(seen, name)[0] for name in MEASURED}
+        self.recorders[0].add(flight.now.time, cable_points_w=points, **measured)
+        self._before = flight.now
+
+    def _rope(self, flight: Flight) -> np.ndarray:
+        """Rope now; after the landing it sinks to the ground instead of standing still as the plants leave it."""
+        now, landing, before, period = flight.now, flight.plant.landing, self._before, flight.plant.period
+        if not landing.landed[0]:
+            return now.cable_points_w[0].copy()
+        if self._resting is None:
+            age = max(landing.time[0] - before.time, 1e-3)
+            points, ball = now.cable_points_w[0], now.payload_pos_w[0]
+            speed = (points - before.cable_points_w[0]) / age
+            self._resting = LooseRope(points, np.clip(speed, -20.0, 20.0), ball, np.zeros(3))
+            period = now.time - landing.time[0]
+        if period > 1e-6:
+            self._resting.sink(period, ROPE_ON_GROUND - now.payload_pos_w[0, 2])
+        return self._resting.points_w(now.payload_pos_w[0])
+
+
+def fly(
+    loaded: Loaded, goal_w: np.ndarray, plant_name: str = "hybrid", seed: int = 0, device: str = "cpu"
+) -> FlightLog:
+    """Hover until the swing is quiet, throw, and hover again at the start.
+
+    The throw ends at separation; from there the hover controller has the vehicle. Keypoints are those that the pilot
+    computes from measured poses, and are recorded for a state policy too.
+
+    Args:
+        loaded: policy and experiment.
+        goal_w: on the ground [m], shape (3,).
+        plant_name: of :data:`visthrow.throws.plants.PLANTS`.
+        seed: of start, plant and measurements.
+        device: of the training simulator.
+
+    Returns:
+        The flight with all standard channels; ``meta["result"]`` says how it ended, ``meta["times"]`` when.
+
+    Raises:
+        ConfigError: the goal is not a point in reach of the vehicle's bounds.
+    """
+    check_goal(loaded, goal_w)
+    experiment = loaded.experiment
+    plant = make_plant(plant_name, experiment, 1, seed, device)
+    home = np.array([0.0, 0.0, experiment.task.start.spawn_height])
+    rng = np.random.default_rng(seed)
+    place = home[None] + START_SPREAD * rng.uniform(-1, 1, (1, 3))
+    plant.reset(place, random_ropes(rng, 1, experiment.rope.segments, START_SWING))
+    pilots = Policies([loaded], np.asarray(goal_w, dtype=float)[None], draws=True)
+    recording = _Full(pilots, _meta(loaded, plant_name, goal_w, seed))
+    flight = Flight(plant, pilots, recording, home)
+    hangs_still = _hovering(lambda now: np.linalg.norm(now.payload_vel_w[0]) < QUIET_SPEED, home, HOVER_LEAST, HOVER_MOST)
+    flight.run([hangs_still, Phase(True, lambda flight: not np.any(flight.open & flight.now.attached))])
+    recovery = plant.time
+
+    def recovered(now: Snapshot) -> bool:  # the payload lies on the ground or hangs still
+        return np.linalg.norm(now.vel_w[0]) < QUIET_SPEED and (plant.landing.landed[0] or now.attached[0])
+
+    flight.run([_hovering(recovered, home, 0.0, RECOVERY_MOST)])
+    return _finished(flight, recording, recovery)
+
+
+def check_goal(loaded: Loaded, goal_w: np.ndarray) -> None:
+    """Refuse a goal that no throw reaches.
+
+    Raises:
+        ConfigError: not three finite numbers, or further than the vehicle may fly.
+    """
+    goal_w = np.asarray(goal_w, dtype=float)
+    limit = loaded.experiment.task.bounds.horizontal
+    if goal_w.shape != (3,) or not np.all(np.isfinite(goal_w)):
+        raise ConfigError(f"goal {goal_w}; expected three finite numbers [m]")
+    distance = float(np.hypot(*goal_w[:2]))
+    trained = loaded.experiment.task.start.goal_radius
+    if distance > limit:
+        raise ConfigError(
+            f"the goal lies {distance:g} m away; the vehicle may not leave {limit:g} m, and '{loaded.name}' was "
+            f"trained on goals within {trained:g} m"
+        )
+
+
+def _meta(loaded: Loaded, plant_name: str, goal_w: np.ndarray, seed: int) -> dict[str, Any]:
+    return {
+        "policy": loaded.name, "layout": loaded.policy.contract["observation"]["layout"], "plant": plant_name,
+        "plant_meaning": PLANTS[plant_name], "goal_w": [float(x) for x in goal_w], "seed": seed,
+        "config": config.to_dict(loaded.experiment), "provenance": provenance.collect(),
+    }  # fmt: skip
+
+
+def _hovering(quiet: Callable[[Snapshot], bool], home: np.ndarray, least: float, most: float) -> Phase:
+    """Hover until the vehicle is at its place and quiet for a while; least and most time [s]."""
+    still = 0.0
+
+    def over(flight: Flight) -> bool:
+        nonlocal still
+        near = np.linalg.norm(flight.now.pos_w[0] - home) < QUIET_OFFSET
+        still = still + flight.plant.period if near and quiet(flight.now) else 0.0
+        return flight.elapsed >= least - 1e-9 and (still >= QUIET_TIME or flight.elapsed >= most)
+
+    return Phase(False, over)
+
+
+def _finished(flight: Flight, recording: _Full, recovery: float) -> FlightLog:
+    """The log with the last state, and how the throw ended."""
+    plant, now, recorder = flight.plant, flight.now, recording.recorders[0]
+    recorder.add(now.time, **{name: getattr(now, name)[0] for name in recording.names})
+    recording.sample(flight, plant.measured())
+    landing, failure = plant.landing, flight.failures[0]
+    times = {"policy_start": flight.begin, "latch": recording.latch, "recovery": recovery, "end": plant.time}
+    result: dict[str, Any] = {"success": False, "failure": failure}
+    if not np.isnan(landing.separation_time[0]):
+        times["separation"] = float(landing.separation_time[0])
+    if landing.landed[0]:
+        point, when = landing.point_w[0], float(landing.time[0])
+        times["landing"] = when
+        recorder.add(when, landing=point)
+        off = point[:2] - flight.pilots.goal_w[0, :2]
+        result |= {"success": failure is None, "landing_w": point.tolist(), "error": float(np.hypot(*off)),
+                   "duration": when - flight.begin}  # fmt: skip
+    result["hovering_again"] = bool(np.linalg.norm(now.vel_w[0]) < 2 * QUIET_SPEED and now.pos_w[0, 2] > 0.5)
+    recorder.meta |= {"times": times, "result": result}
+    log = recorder.log()
+    if "separation" in times:
+        payload, when = log["payload_pos_w"], np.array([times["separation"]])
+        at = np.column_stack([np.interp(when, payload.time, payload.values[:, i]) for i in range(3)])
+        log.channels["separation"] = Channel(when, at, "m", "world")
+    return log
