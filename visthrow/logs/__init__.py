@@ -37,14 +37,13 @@ def read(path: str | Path, mapping: TableMap | None = None) -> list[FlightLog]:
     if name.endswith((".csv", ".csv.gz", ".csv.xz", ".parquet")):
         logs = _of_table(path, mapping)
     elif name.endswith((".bbl", ".bfl")):
-        from visthrow.logs.blackbox_log import logs_of_blackbox
+        from visthrow.logs.blackbox.channels import logs_of_blackbox
 
         logs = logs_of_blackbox(path)
     elif name.endswith((".ulg", ".bin", ".tlog")):
-        from visthrow.logs import autopilot
+        from visthrow.logs.autopilot import log_of_autopilot
 
-        readers = {".ulg": autopilot.log_of_ulog, ".bin": autopilot.log_of_dataflash, ".tlog": autopilot.log_of_telemetry}
-        logs = [readers[path.suffix.lower()](path)]
+        logs = [log_of_autopilot(path)]
     elif name.endswith(".npz"):
         log = FlightLog.load(path)
         log.meta.setdefault("source", str(path))
@@ -77,13 +76,14 @@ def _of_folder(path: Path) -> list[FlightLog]:
 
 
 def _of_table(path: Path, mapping: TableMap | None) -> list[FlightLog]:
-    from visthrow.logs import blackbox_log, table
+    from visthrow.logs import table
+    from visthrow.logs.blackbox import channels
 
     columns = table.read_table(path)
     if mapping is not None:
         return table.logs_of(columns, mapping, str(path))
-    if blackbox_log.is_decoded(columns):
-        return [blackbox_log.log_of_decoded(columns, path)]
+    if channels.is_decoded(columns):
+        return [channels.log_of_decoded(columns, path)]
     if table.is_export(columns):
         log = table.log_of_export(columns, str(path))
         if path.suffix == ".parquet":

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from visthrow.common.errors import LogError
-from visthrow.logs.blackbox import BlackboxLog, read_blackbox
+from visthrow.logs.blackbox.decoder import BlackboxLog, read_blackbox
 from visthrow.logs.flightlog import Channel, FlightLog
 from visthrow.logs.mapping import ChannelMap
 from visthrow.logs.table import Table, make_channel
