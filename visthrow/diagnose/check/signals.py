@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from visthrow.diagnose.check.rows import Row
+from visthrow.logs.check.rows import Row
 from visthrow.logs.flightlog import Channel, FlightLog
 
 FEW_SAMPLES = 20

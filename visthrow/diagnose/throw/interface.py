@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from sim.params import GRAVITY, PlantParams
-from visthrow.diagnose.check import relations
 from visthrow.diagnose.throw.recorded import measured
+from visthrow.logs.check import relations, thrust
 from visthrow.logs.flightlog import Channel, FlightLog
 
 FIRMLY, CLEARLY = 0.8, 0.15
@@ -21,8 +21,6 @@ WORSE = 0.05
 """What a log whose own axes tell little may lose by the hypothesis."""
 MOVES = 0.3  # rates that say something about their axes [rad/s]
 AXES_NATS = float(np.log(48.0))  # so many ways to exchange and turn around three axes
-THRUST = {"N": 1.0, "g of thrust": 9.80665e-3, "mN": 1e-3, "kg of thrust": 9.80665}
-"""Units of a thrust, in newtons."""
 NEAR = 0.25  # of the logarithm of a ratio: hover thrust against weight, gain of the rates
 FAR = 0.8  # the same from which another unit is considered at all
 
@@ -58,7 +56,7 @@ def put_right(logs: Sequence[FlightLog], plant: PlantParams) -> tuple[list[Fligh
             found.append(mistake[0])
             mended, relation = trial, again
     weight = GRAVITY * (plant.vehicle.body.mass + plant.rope.payload_mass + plant.rope.rope_mass)
-    mistake = _thrust_unit(mended, weight, THRUST | {"shares of the full thrust": 4.0 * plant.vehicle.controller.max_thrust})
+    mistake = _thrust_unit(mended, weight, thrust.UNITS | {"shares of the full thrust": 4.0 * plant.vehicle.controller.max_thrust})
     if mistake is not None:
         found.append(mistake[0])
         mended = [_commanded(log, scale=mistake[1]) for log in mended]
