@@ -16,7 +16,7 @@ from hil.poses.frames import FrameParams
 from hil.poses.gate import GateParams
 from hil.poses.pose import BODIES, PAYLOAD, VEHICLE
 from hil.poses.track import MOST_PREDICTION
-from hil.sources import BodyIds, LogBody, MocapParams, RigidBody
+from hil.sources import CHANNELS, BodyIds, LogBody, MocapParams, RigidBody
 from hil.sources.images import ImageParams
 from visthrow.common.errors import ConfigError
 from visthrow.logs.mapping import ChannelMap, TableMap, TimeColumn
@@ -138,10 +138,9 @@ class HilParams:
                 f"landing_height {self.landing_height} m; expected within the payload's fence, {f.payload_low[2]} to "
                 f"{f.payload_high[2]} m of height"
             )
-        written = ORDERS.get(self.source.kind)
-        if any(channel.kind == "euler" for channel in self.source.columns):
-            written = "xyzw"
+        angles = {channel.name for channel in self.source.columns if channel.kind == "euler"}
         for name, frames in self.frames.items():
+            written = "xyzw" if CHANNELS[name][1] in angles else ORDERS.get(self.source.kind)
             if written is not None and frames.quaternion != written:
                 raise ConfigError(
                     f"frames.{name}.quaternion is '{frames.quaternion}'; a source of kind {self.source.kind} writes '{written}'"

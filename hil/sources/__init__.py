@@ -6,9 +6,10 @@ A source hands on raw poses, in its own frames; `hil.poses.frames` converts them
 from hil.sources.base import Recorded, Source
 from hil.sources.mavlink import BodyIds, MavlinkDecoder, MavlinkSource
 from hil.sources.mocap import MocapParams, RigidBody, open_mocap
-from hil.sources.player import LogBody, read_autopilot, read_table, read_tlog
+from hil.sources.player import CHANNELS, LogBody, read_autopilot, read_table, read_tlog
 
 __all__ = [
+    "CHANNELS",
     "BodyIds",
     "LogBody",
     "MavlinkDecoder",

@@ -23,6 +23,7 @@ class TimeColumn:
     column: str = ""  # of the stamps; "": rows are evenly spaced
     unit: str = "s"  # of the stamps
     row_period: float = 0.0  # between two rows [s], where there is no column
+    offset: float = 0.0  # added to its times [s]: streams on clocks apart, as `diagnose check` says by how much
 
     def __post_init__(self) -> None:
         if bool(self.column) == (self.row_period > 0.0):

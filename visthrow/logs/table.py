@@ -167,9 +167,8 @@ def _numbers(table: Table, name: str, source: str) -> np.ndarray:
 
 def _stamps(table: Table, clock: TimeColumn, source: str) -> np.ndarray:
     if not clock.column:
-        return clock.row_period * np.arange(len(next(iter(table.values()))))
-    factor = to_si(clock.unit, "time")[1]
-    return _numbers(table, clock.column, source) * factor
+        return clock.row_period * np.arange(len(next(iter(table.values())))) + clock.offset
+    return _numbers(table, clock.column, source) * to_si(clock.unit, "time")[1] + clock.offset
 
 
 def _parts(table: Table, mapping: TableMap, count: int, source: str) -> list[tuple[np.ndarray, str]]:

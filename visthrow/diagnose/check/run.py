@@ -66,6 +66,11 @@ def contradictions(results: Sequence[Checked]) -> list[str]:
     ]
 
 
+def copies(results: Sequence[Checked]) -> tuple[int, ...]:
+    """Logs that hold what an earlier one holds, by number: a copy counts once."""
+    return tuple(i for i, checked in enumerate(results) if any(row.topic == "duplicates" for row in checked.rows))
+
+
 def label(log: FlightLog, number: int) -> str:
     """Name of a log for people."""
     source = Path(str(log.meta.get("source", f"log {number + 1}"))).name

@@ -12,6 +12,7 @@ import numpy as np
 
 from sim.params import GRAVITY, PlantParams
 from visthrow.diagnose.throw.recorded import measured
+from visthrow.logs.axes import matrix_of
 from visthrow.logs.check import relations, thrust
 from visthrow.logs.flightlog import Channel, FlightLog
 
@@ -77,26 +78,18 @@ def _followed(log: FlightLog) -> relations.Relation | None:
     return found if found is not None and found.axes_correlation > FIRMLY else None
 
 
-def _nats(better: np.ndarray, plain: np.ndarray) -> float:
-    """Evidence of correlations against others [nats], counting ten independent samples a log."""
-    return float(5.0 * np.sum(np.log((1.0 - np.minimum(plain, 0.999) ** 2) / (1.0 - np.minimum(better, 0.999) ** 2))))
-
-
 def _axes(relation: Sequence[relations.Relation]) -> tuple[Mistake, np.ndarray] | None:
     """Exchanged or turned axes of the commanded rates, where all logs that can tell say the same, and they are most."""
     clear = [r for r in relation if r.axes_correlation > r.correlation + CLEARLY]
     names = {r.axes for r in clear}
-    own, best = (np.array([getattr(r, n) for r in clear]) for n in ("correlation", "axes_correlation"))
-    nats = _nats(best, np.maximum(own, 0.0)) - AXES_NATS
+    nats = sum(r.nats for r in clear)
     if len(names) != 1 or 2 * len(clear) < len(relation) or nats < AXES_NATS:
         return None
-    axes = names.pop().split(",")
-    matrix = np.zeros((3, 3))
-    for row, axis in enumerate(axes):
-        matrix[row, "xyz".index(axis[-1])] = -1.0 if axis.startswith("-") else 1.0
+    text = names.pop()
+    axes = text.split(",")
     turned = sorted(axis[-1] for axis in axes) == [axis[-1] for axis in axes]
     name, cause = ("rate_sign", "A commanded rate has the other sign") if turned else ("rate_axes", "Commanded rates are exchanged")
-    return Mistake(name, cause, f"x, y, z of the vehicle are ({','.join(axes)}) of the command", nats, len(clear)), matrix
+    return Mistake(name, cause, f"x, y, z of the vehicle are ({text}) of the command", nats, len(clear)), matrix_of(text)
 
 
 def _rate_unit(relation: Sequence[relations.Relation]) -> tuple[Mistake, np.ndarray] | None:

@@ -21,7 +21,7 @@ _LARGEST_SHARE = 2.0  # of a command whose full size is 1; what a controller ask
 _VOLTS = (0.5, 100.0)  # of any pack of such a vehicle [V]
 BELONGS, FIRMLY, CLEARLY = 0.35, 0.7, 0.12
 _LIVELY = 0.2  # rates that noise and draught alone do not make [rad/s]
-_DELAY_WARN, _DELAY_BAD, _DELAY_KNOWN = 0.02, 0.05, 0.003  # between measurements of one motion [s]
+_DELAY_WARN, _DELAY_BAD, _DELAY_KNOWN = 0.02, 0.05, 0.012  # between measurements of one motion [s]
 _PERIOD = (2e-4, 2.0)  # between two positions, median [s]
 _STEEPEST = 75.0  # median tilt of a flight [deg]
 _NATS = 10.0  # of evidence, from which other axes count as found: e^-10 of good logs would fail
@@ -122,7 +122,8 @@ def _rates(log: FlightLog, quat: str) -> list[Row]:
     if len(time_q) < 50 or len(time_w) < 50:
         return []
     time_d, derived = relations.rates_of(time_q, q)
-    if not (usable(time_d, derived, MOVES) and usable(time_w, w, 0.0)):
+    moving = usable(time_d, derived, MOVES) or usable(time_w, w, MOVES)
+    if not (moving and usable(time_d, derived, 0.0) and usable(time_w, w, 0.0)):
         return []
     return _compared(relations.relate(time_d, derived, time_w, w), f"rate of {quat}", "rate_b")
 
@@ -156,7 +157,7 @@ def _kind(axes: str) -> str:
 def _late(found: relations.Relation, both: str, figures: dict) -> Row:
     """How late the second measurement of one motion is, and what would put it right."""
     text = f"the second is {1e3 * found.delay:+.1f} ms behind the first (sd {1e3 * found.delay_sd:.1f} ms)"
-    far = abs(found.delay) > _DELAY_BAD and found.delay_sd < 0.2 * abs(found.delay) and found.correlation > FIRMLY
+    far = abs(found.delay) > _DELAY_BAD and found.delay_sd < 0.3 * abs(found.delay) and found.correlation > FIRMLY
     if far:
         text += f": streams on clocks apart; add {-found.delay:+.3f} s to the second's time (offset of its clock in the mapping)"
     verdict = "bad" if far else "warn" if abs(found.delay) > _DELAY_WARN else "ok"
@@ -219,8 +220,9 @@ def _forces(log: FlightLog, quat: str, path: str) -> list[Row]:
         pushed = relations.attitude_at(time_q, q, time_a).apply(force_b) - [0.0, 0.0, GRAVITY]
         pushed, name = relations.mean_over(time_a, pushed, time, _SPAN), "acc_b"
     else:
-        size = np.linalg.norm(acc + [0.0, 0.0, GRAVITY], axis=1, keepdims=True)
-        pushed, name, force_b = turn.apply([0.0, 0.0, 1.0]) * size - [0.0, 0.0, GRAVITY], "thrust along z", None
+        up = turn.apply([0.0, 0.0, 1.0])
+        pushed = up / np.maximum(up[:, 2:], 0.2) * (acc[:, 2:] + GRAVITY) * [1.0, 1.0, 0.0]
+        acc, name, force_b = acc * [1.0, 1.0, 0.0], "thrust along z", None
     found = relations.relate(time, acc, time, pushed)
     if found is None:
         return []
@@ -237,8 +239,8 @@ def _exchanged_body(time: np.ndarray, expected_b: np.ndarray, time_a: np.ndarray
     if len(at) < 50:
         return None
     felt = relations.mean_over(time_a, force_b, at, 2.0 * _SPAN)
-    found = relations.relate(at, relations.on_grid(time, expected_b, at), at, felt)
-    if found is None or found.nats < _NATS or found.axes_correlation < _SEEN or abs(found.axes_delay) > _DELAY_BAD:
+    found = relations.relate(at, relations.on_grid(time, expected_b, at), at, felt, reach=_DELAY_BAD)
+    if found is None or found.nats < _NATS or found.axes_correlation < _SEEN:
         return None
     text = f"acc_b fits as ({found.axes}), {found.nats:.0f} nats better: {_kind(found.axes)} "
     text += f"(correlation {found.axes_correlation:.2f}, not {found.correlation:.2f})"

@@ -80,7 +80,7 @@ def relate(time_a: np.ndarray, a: np.ndarray, time_b: np.ndarray, b: np.ndarray,
     at = int(np.argmax(own))
     offset, curve = _peak(own, at)
     names, best, best_at = _best_axes(cross / scale_of) if a.shape[1] == 3 else _best_sign(own)
-    effective = max(count * min(1.0, INDEPENDENT / max(period, 1e-3)), 10.0)
+    effective = max(count * min(1.0, period / INDEPENDENT), 10.0)
     sd = period * np.sqrt(max(1.0 - own[at] ** 2, 1e-6) / effective / max(curve, 1e-9))
     plain, turned = (min(max(c, 0.0), 0.999) for c in (own[at], best))
     nats = 0.5 * effective * np.log((1.0 - plain**2) / (1.0 - turned**2)) - np.log(len(EVERY))
