@@ -28,10 +28,11 @@ from hil.errors import SourceError
 from hil.poses.pose import BODIES, GOAL, PAYLOAD, VEHICLE, Pose
 from hil.sources.mavlink import PAIR_AGE, BodyIds, MavlinkDecoder
 from visthrow.common.errors import ConfigError, LogError, suggest
-from visthrow.logs import messages, read
+from visthrow.logs import read
 from visthrow.logs.flightlog import Channel, FlightLog
 from visthrow.logs.mapping import TableMap
-from visthrow.logs.messages import Fields, Messages
+from visthrow.logs.readers import messages
+from visthrow.logs.readers.messages import Fields, Messages
 
 CHANNELS = {
     VEHICLE: ("pos_w", "quat_wb", "vel_w", "rate_b"),

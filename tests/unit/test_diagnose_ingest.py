@@ -17,11 +17,11 @@ from visthrow.common.errors import ConfigError, LogError
 from visthrow.diagnose.inputs import setup as setups
 from visthrow.logs import read
 from visthrow.logs.axes import turn_of
-from visthrow.logs.blackbox import codec as blackbox_codec
-from visthrow.logs.blackbox import decoder as blackbox
 from visthrow.logs.export import export
 from visthrow.logs.flightlog import Channel, FlightLog
 from visthrow.logs.mapping import ChannelMap, Split, TableMap, TimeColumn
+from visthrow.logs.readers.blackbox import codec as blackbox_codec
+from visthrow.logs.readers.blackbox import decoder as blackbox
 
 REAL = Path(__file__).resolve().parents[1] / "data" / "real"
 BBL = REAL / "betaflight_bbl" / "btfl_001_start.bbl"

@@ -67,7 +67,7 @@ def look(name: str, channel: Channel, notes: dict) -> list[Row]:
     Args:
         name: Of the channel.
         channel: Its samples.
-        notes: What the reader left out; see :func:`visthrow.logs.table.make_channel`.
+        notes: What the reader left out; see :func:`visthrow.logs.readers.table.make_channel`.
     """
     count = len(channel.time)
     span = float(np.ptp(channel.time)) if count else 0.0

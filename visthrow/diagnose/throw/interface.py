@@ -22,6 +22,8 @@ WORSE = 0.05
 """What a log whose own axes tell little may lose by the hypothesis."""
 MOVES = 0.3  # rates that say something about their axes [rad/s]
 AXES_NATS = float(np.log(48.0))  # so many ways to exchange and turn around three axes
+LIFTED = 0.15  # above where it stood, from which a vehicle flies [m]
+VARIED, LATE, SLOPES = 0.05, 0.05, (0.3, 2.0)  # of the throttle's hover, motors [s], plausible slopes of thrust over throttle
 NEAR = 0.25  # of the logarithm of a ratio: hover thrust against weight, gain of the rates
 FAR = 0.8  # the same from which another unit is considered at all
 
@@ -44,8 +46,9 @@ class Mistake:
 
 def put_right(logs: Sequence[FlightLog], plant: PlantParams) -> tuple[list[FlightLog], tuple[Mistake, ...]]:
     """Logs with their commands as the simulation takes them, and what was wrong with them."""
-    found: list[Mistake] = []
-    mended, relation = list(logs), [_followed(log) for log in logs]
+    weight = GRAVITY * (plant.vehicle.body.mass + plant.rope.payload_mass + plant.rope.rope_mass)
+    mended, found = _from_throttle(logs, weight)
+    relation = [_followed(log) for log in mended]
     for look in (_axes, _rate_unit):
         told = [r for r in relation if r is not None]
         mistake = look(told) if told else None
@@ -56,12 +59,75 @@ def put_right(logs: Sequence[FlightLog], plant: PlantParams) -> tuple[list[Fligh
         if all(r is None or (s is not None and s.correlation > r.correlation - WORSE) for r, s in zip(relation, again)):
             found.append(mistake[0])
             mended, relation = trial, again
-    weight = GRAVITY * (plant.vehicle.body.mass + plant.rope.payload_mass + plant.rope.rope_mass)
     mistake = _thrust_unit(mended, weight, thrust.UNITS | {"shares of the full thrust": 4.0 * plant.vehicle.controller.max_thrust})
     if mistake is not None:
         found.append(mistake[0])
         mended = [_commanded(log, scale=mistake[1]) for log in mended]
     return mended, tuple(found)
+
+
+def _from_throttle(logs: Sequence[FlightLog], weight: float) -> tuple[list[FlightLog], list[Mistake]]:
+    """Logs of autopilots with commands made of throttle and commanded rates, cut to where they fly.
+
+    Around hover the thrust of a vehicle is ``T = W (1 + s (u / h - 1))``: weight W [N] at the share h of full throttle. The slope
+    s is fitted where an accelerometer tells the force and the throttle varies enough, else it is 1.
+    """
+    made, shares = list(logs), []
+    for i, log in enumerate(logs):
+        if "command" in log or "throttle" not in log or "rate_setpoint_b" not in log:
+            continue
+        told = _calibrated(log)
+        if told is None:
+            continue
+        hover, slope, start, end = told
+        rates = log["rate_setpoint_b"]
+        share = log["throttle"].hold(rates.time)
+        thrust_n = np.maximum(weight * (1.0 + slope * (share / hover - 1.0)), 0.0)
+        values = np.column_stack([thrust_n, np.where(rates.valid[:, None], rates.values, 0.0)])
+        command = Channel(rates.time, values, "N, rad/s", "body", rates.valid)
+        made[i] = _between(FlightLog({**log.channels, "command": command}, log.meta), start, end)
+        shares.append((hover, slope))
+    if not shares:
+        return made, []
+    hover, slope = np.median(shares, axis=0)
+    cause = "Commanded thrust is a throttle, calibrated by the weight that it carries in flight"
+    equation = f"thrust = {weight:.3f} N (1 + {slope:.2f} (throttle / {hover:.3f} - 1))"
+    return made, [Mistake("throttle", cause, equation, 0.0, len(shares))]
+
+
+def _calibrated(log: FlightLog) -> tuple[float, float, float, float] | None:
+    """Throttle in hover, slope of the thrust about it, first and last time in flight [s]; None where nothing flies."""
+    channel = log["throttle"]
+    time, share = channel.time[channel.valid], channel.values[channel.valid].astype(float)
+    flies = share > 0.5 * np.percentile(share, 75) if np.any(share > 0.0) else np.zeros(len(share), bool)
+    place = measured(log, "pos_w")
+    if place is not None:
+        height = np.interp(time, place.time[place.valid], place.values[place.valid][:, 2])
+        flies &= height > np.min(height) + min(LIFTED, 0.5 * np.ptp(height))
+    if np.count_nonzero(flies) < 50:
+        return None
+    start, end = float(time[flies][0]), float(time[flies][-1])
+    inside = (time >= start) & (time <= end)
+    hover = float(np.median(share[inside]))
+    if "acc_b" not in log or np.std(share[inside]) < VARIED * hover:
+        return hover, 1.0, start, end
+    acc = log["acc_b"]
+    grid = time[inside][(time[inside] > acc.time[0] + 0.2) & (time[inside] < acc.time[-1] - 0.2)]
+    felt = relations.mean_over(acc.time[acc.valid], acc.values[acc.valid].astype(float)[:, 2:3], grid + LATE, 0.1)[:, 0] / GRAVITY
+    asked = relations.mean_over(time, share[:, None], grid, 0.1)[:, 0] / hover
+    slope, level = np.polyfit(asked, felt, 1)
+    if not (SLOPES[0] < slope < SLOPES[1] and level + slope > 0.5):
+        return hover, 1.0, start, end
+    return hover * float(1.0 + (1.0 - level - slope) / slope), float(slope), start, end
+
+
+def _between(log: FlightLog, start: float, end: float) -> FlightLog:
+    """A stretch of a log."""
+    channels = {}
+    for name, c in log.channels.items():
+        keep = (c.time >= start) & (c.time <= end)
+        channels[name] = Channel(c.time[keep], c.values[keep], c.unit, c.frame, c.valid[keep])
+    return FlightLog(channels, log.meta)
 
 
 def _followed(log: FlightLog) -> relations.Relation | None:

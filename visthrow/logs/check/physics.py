@@ -258,10 +258,12 @@ def _pushed(found: relations.Relation, acc: np.ndarray, pushed: np.ndarray, both
     """Rows about a push that has the axes of the change of velocity."""
     off = np.mean(pushed - acc, axis=0)
     figures = {"correlation": found.correlation, "delay_s": found.delay, "scale": found.scale, "offset_m_s2": off.tolist()}
+    if found.correlation < FIRMLY and not sensed:
+        return []  # a payload or a draught pushes as well
     if found.correlation < FIRMLY:
-        verdict = "bad" if sensed and found.correlation < BELONGS and np.sqrt(np.sum(np.var(acc, axis=0))) > 1.0 else "warn"
+        verdict = "bad" if found.correlation < BELONGS and np.sqrt(np.sum(np.var(acc, axis=0))) > 1.0 else "warn"
         text = f"hardly go together (correlation {found.correlation:.2f}): attitude or accelerometer of another flight, or noise"
-        return [Row("frames", both, verdict if sensed else "ok", text, figures)]
+        return [Row("frames", both, verdict, text, figures)]
     rows = [Row("frames", both, "ok", f"go together as they are, correlation {found.correlation:.2f}", figures)]
     if not 0.5 < found.scale < 2.0:
         hint = relations.unit_hint(found.scale) or "no unit explains it"

@@ -12,8 +12,8 @@ import numpy as np
 from visthrow.common.errors import LogError
 from visthrow.logs.flightlog import FlightLog
 from visthrow.logs.mapping import ChannelMap
-from visthrow.logs.messages import Messages, read_dataflash, read_telemetry, read_ulog
-from visthrow.logs.table import make_channel
+from visthrow.logs.readers.messages import Messages, read_dataflash, read_telemetry, read_ulog
+from visthrow.logs.readers.table import make_channel
 
 NED = "x,-y,-z"
 """Our axes in the autopilot's, world and body alike."""
@@ -47,6 +47,7 @@ ULOG = (
     _t("vehicle_visual_odometry", "position[0] position[1] position[2]", "mocap_pos_w", "m", frame="world"),
     _t("vehicle_visual_odometry", "q[0] q[1] q[2] q[3]", "mocap_quat_wb", "1", kind="quaternion", frame="world"),
     _t("vehicle_rates_setpoint", "roll pitch yaw", "rate_setpoint_b", "rad/s", frame="body"),
+    _t("vehicle_rates_setpoint", "thrust_body[2]", "throttle", "1", flip=False, scale=-1.0),
     _t("battery_status", "voltage_v", "battery_voltage", "V", flip=False),
     _t("battery_status", "current_a", "current", "A", flip=False),
     _t("actuator_motors", "control[2] control[0] control[1] control[3]", "motor_command", "1", flip=False),
@@ -82,6 +83,8 @@ TELEMETRY = (
     _t("RAW_IMU", "xacc yacc zacc", "acc_b", "mg", frame="body"),
     _t("VISION_POSITION_ESTIMATE", "x y z", "mocap_pos_w", "m", frame="world"),
     _t("ATT_POS_MOCAP", "x y z", "mocap_pos_w", "m", frame="world"),
+    _t("ATTITUDE_TARGET", "body_roll_rate body_pitch_rate body_yaw_rate", "rate_setpoint_b", "rad/s", frame="body"),
+    _t("ATTITUDE_TARGET", "thrust", "throttle", "1", flip=False),
     _t("SYS_STATUS", "voltage_battery", "battery_voltage", "mV", flip=False),
     _t("SERVO_OUTPUT_RAW", "servo3_raw servo1_raw servo2_raw servo4_raw", "motor_output", "1", flip=False),
 )
