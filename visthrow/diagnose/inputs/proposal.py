@@ -21,8 +21,10 @@ _SPLIT = re.compile(r"[^A-Za-z0-9]+|(?<=[a-z])(?=[A-Z])|(?<=\D)(?=\d)|(?<=\d)(?=
 _TIME = re.compile(
     r"(^|[._/ ])(t|ts|time|stamp|timestamp|secs?|seconds|millis|micros|frame)([._ \[(\d]|$)", re.IGNORECASE
 )
-_SUFFIX = {"s": "s", "sec": "s", "ms": "ms", "us": "us", "ns": "ns", "mm": "mm", "cm": "cm", "m": "m", "deg": "deg", "rad": "rad", "mv": "mV",
-           "v": "V", "g": "g", "gf": "gf", "n": "N", "rpm": "rpm", "dps": "deg/s", "a": "A", "ma": "mA"}  # fmt: skip
+_SUFFIX = {
+    **{unit: unit for unit in ("s", "ms", "us", "ns", "mm", "cm", "m", "deg", "rad", "g", "gf", "rpm")},
+    "sec": "s", "mv": "mV", "v": "V", "n": "N", "dps": "deg/s", "a": "A", "ma": "mA",
+}  # fmt: skip
 _TARGET = re.compile(r"target|setpoint|(^|[._])sp[._]|desired|des([._]|$)|ref|cmd|rpyd|omegar|goal|^sp_|residual", re.IGNORECASE)
 _NOT_VEHICLE = re.compile(r"payload|load|ball|(^|[._])l_|cam|object|tag|marker", re.IGNORECASE)
 _ESTIMATE = re.compile(r"est|ekf|kalman", re.IGNORECASE)

@@ -21,7 +21,7 @@ _AGAINST = 8.0  # nats by which no thrust at all must explain the force better, 
 _DELAYS = np.arange(-0.2, 0.4001, 0.01)  # that are tried [s]
 _LATEST, _MOTORS = 0.16, 0.07  # motors and their filters take 0 to 0.12 s, usually 0.07 [s]
 _CLEARER = 0.04  # of correlation, by which a delay that no motor has must be better
-_MASS_WARN, _MASS_BAD = 0.15, 0.5  # of the logarithm of thrust over weight: a battery's charge; another unit or map
+_MASS_WARN, _MASS_BAD = 0.15, 1.0  # of the logarithm of thrust over weight: a battery's charge; another unit or map
 _UNEVEN = 0.4  # of the logarithm of a rotor over the others: an arm's weight or a cut blade makes 0.25 of a speed
 
 
@@ -141,11 +141,12 @@ def _weight(mass: float, known: Known, both: str) -> Row:
         return Row("thrust", both, "ok", f"thrust over force {mass:.4g} kg", {"mass_kg": mass})
     off, ratio = float(np.log(mass / known.mass)), mass / known.mass
     text = f"thrust over force {mass:.4g} kg, {ratio:.3g} times the model's {known.mass:.4g} kg"
-    verdict = "bad" if abs(off) > _MASS_BAD else "warn" if abs(off) > _MASS_WARN else "ok"
     unit = min(UNITS, key=lambda unit: abs(np.log(ratio * UNITS[unit])))
-    hint = "" if verdict != "bad" else f"in {unit}" if abs(np.log(ratio * UNITS[unit])) < _UNIT else ""
-    text += f": {hint or 'the thrust map is of another vehicle or channel'}" if verdict == "bad" else ""
-    return Row("units" if hint else "thrust", both, verdict, text, {"mass_kg": mass, "model_kg": known.mass})
+    if abs(off) > _MASS_BAD and abs(np.log(ratio * UNITS[unit])) < _UNIT:
+        return Row("units", both, "bad", f"{text}: in {unit}", {"mass_kg": mass, "model_kg": known.mass})
+    verdict = "warn" if abs(off) > _MASS_WARN else "ok"
+    text += ": the thrust map is of another vehicle, battery or channel" if verdict == "warn" else ""
+    return Row("thrust", both, verdict, text, {"mass_kg": mass, "model_kg": known.mass})
 
 
 def _rotors(log: FlightLog) -> list[Row]:
