@@ -29,7 +29,7 @@ def read(path: str | Path, mapping: TableMap | None = None) -> list[FlightLog]:
     """
     path = Path(path)
     file, colon, pattern = str(path).rpartition(":")
-    if "+" in path.name and not path.exists():
+    if "+" in str(path) and not path.exists() and Path(str(path).split("+")[0]).exists():
         return [_joined(str(path), mapping)]
     if colon and not path.exists() and Path(file).is_file():
         return _parts(read(file, mapping), file, pattern)

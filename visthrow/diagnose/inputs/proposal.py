@@ -32,7 +32,7 @@ _CAPTURE = re.compile(r"loc|mocap|vicon|opti|qualisys", re.IGNORECASE)
 _HINTS = (
     ("acc_b", r"acc|imu.*a[xyz]?$"), ("rate_b", r"gyro|omega|rate|angvel|angular|(^|[._])w$"),
     ("velocity", r"vel|(^|[._])v$|speed"), ("euler", r"rpy|roll|pitch|euler|attitude|orient"),
-    ("position", r"pos|(^|[._])p$|loc|pose|translation|estimate|mocap|vicon|opti|^$"),
+    ("position", r"pos|(^|[._])p$|loc|pose|translation|estimate|mocap|vicon|opti|uav|drone|quad|vehicle|copter|^$"),
 )  # fmt: skip
 _FIRMLY, _BELONGS = 0.8, 0.6  # correlations of what is the derivative of what
 _FASTEST, _WIDEST = 40.0, 60.0  # of vehicles in a hall [m/s], [m]
@@ -109,7 +109,8 @@ def _rises(cells: np.ndarray) -> bool:
 
 
 def _words(name: str) -> list[str]:
-    return [word.lower() for word in _SPLIT.split(name) if word] or [name.lower()]
+    last = re.split(r"[^A-Za-z0-9]+", name.rstrip(")]} "))[-1].lower()
+    return [last] if last in _SUFFIX else [word.lower() for word in _SPLIT.split(name) if word] or [last]
 
 
 _ENDINGS = {**{letter: letter for letter in "xyzw"}, "north": "x", "east": "y", "down": "z", "roll": "x", "pitch": "y", "yaw": "z",
@@ -327,23 +328,24 @@ class _Chooser:
         for group in self._open(3):
             if not self._hinted(group, "rate_b"):
                 continue
-            found = None
+            found, times = None, 1.0
             if attitude is not None and len(attitude.time) > 100:
                 at, derived = relations.rates_of(attitude.time[attitude.valid], attitude.values[attitude.valid])
                 good = np.all(np.isfinite(group.values), axis=1)
                 found = relations.relate(at, derived, self.time[good], group.values[good], reach=0.2)
+                times = float(np.sqrt(np.mean(np.var(group.values[good], axis=0)) / max(np.mean(np.var(derived, axis=0)), 1e-12)))
             score = found.axes_correlation if found is not None else 0.0
             if best is None or score > best[0]:
-                best = (score, group, found)
+                best = (score, group, times)
         if best is None:
             return
-        score, group, found = best
+        score, group, times = best
         largest = float(np.nanpercentile(np.abs(group.values), 99))
         unit = group.unit if group.unit.endswith("/s") else "deg/s" if largest > 30.0 else "rad/s"
         why = f"99 % within {largest:.3g}"
-        if found is not None and score > _BELONGS:
-            unit = "deg/s" if found.scale > 7.0 else "rad/s"
-            why = f"the rates of the attitude, correlation {score:.2f}, {found.scale:.3g} times"
+        if score > _BELONGS:
+            unit = "deg/s" if times > 7.0 else "rad/s"
+            why = f"the rates of the attitude, correlation {score:.2f}, {times:.3g} times"
         self._take("rate_b", group, ChannelMap("rate_b", group.columns, unit), why)
 
     def _forces(self) -> None:
