@@ -8,6 +8,7 @@ import types
 import pytest
 
 from visthrow import cli
+from visthrow.common import arguments
 from visthrow.common.errors import ConfigError, DeviceError, VisthrowError, suggest
 from visthrow.config import kinds
 from visthrow.training import device
@@ -33,7 +34,7 @@ def command(monkeypatch):
             return outcome
 
         module = types.ModuleType("fake_command")
-        module.add_arguments = lambda parser: cli.add_common(parser)
+        module.add_arguments = lambda parser: arguments.add_common(parser)
         module.run = run
         monkeypatch.setitem(sys.modules, "fake_command", module)
         monkeypatch.setitem(cli.COMMANDS, "try", ("try it", "fake_command"))
@@ -60,8 +61,8 @@ def test_help_imports_nothing_heavy():
 
 
 def test_no_command_and_unknown_command_list_the_commands():
-    for arguments in ((), ("thrwo",)):
-        result = run(*arguments)
+    for words in ((), ("thrwo",)):
+        result = run(*words)
         assert result.returncode == 2
         assert "Traceback" not in result.stderr
     assert "compare" in result.stderr

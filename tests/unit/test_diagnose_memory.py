@@ -9,7 +9,7 @@ import pytest
 FREE_AND_TAKE = """
 import resource, sys
 import numpy as np
-from visthrow.diagnose import memory
+from visthrow.diagnose.likelihood import memory
 if sys.argv[1] == "kept":
     memory.keep()
 def faults():

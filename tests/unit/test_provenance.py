@@ -34,7 +34,7 @@ def test_record_is_complete_and_free_of_names(monkeypatch):
 
 
 def test_commit_of_a_copy_without_history_is_what_it_was_told(monkeypatch, tmp_path):
-    monkeypatch.setattr(provenance, "__file__", str(tmp_path / "visthrow" / "provenance.py"))
+    monkeypatch.setattr(provenance, "__file__", str(tmp_path / "visthrow" / "common" / "provenance.py"))
     monkeypatch.delenv(provenance.COMMIT_VARIABLE, raising=False)
     assert provenance.commit() == "unknown"
     monkeypatch.setenv(provenance.COMMIT_VARIABLE, "abc123")

@@ -90,7 +90,7 @@ def test_work_does_only_what_is_missing(tmp_path):
 
 WORKER = """
 import sys, time, numpy as np
-from visthrow import results
+from visthrow.throws import results
 def function(u):
     with open(sys.argv[2], "a") as log:
         log.write(f"{u['seed']}\\n")
