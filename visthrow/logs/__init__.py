@@ -11,6 +11,8 @@ from visthrow.logs.flightlog import FlightLog
 from visthrow.logs.mapping import TableMap
 
 ENDINGS = (".npz", ".csv", ".csv.gz", ".csv.xz", ".txt", ".parquet", ".bbl", ".bfl", ".ulg", ".bin", ".tlog")
+RECORDINGS = (".mat", ".h5", ".hdf5", ".bag", ".db3", ".mcap")
+"""Of other tools; the Crazyflie's card names its files without an ending."""
 TABLES = (".csv", ".csv.gz", ".csv.xz", ".txt", ".parquet")
 RUN_LOG = "flight.npz"
 """In the folder of a run of ``visthrow hil``: its flight log."""
@@ -53,8 +55,10 @@ def read(path: str | Path, mapping: TableMap | None = None) -> list[FlightLog]:
         log = FlightLog.load(path)
         log.meta.setdefault("source", str(path))
         logs = [log]
+    elif _is_recording(path):
+        logs = _of_table(path, mapping)
     else:
-        raise LogError(f"{path}: ending '{path.suffix}'; expected one of {', '.join(ENDINGS)}")
+        raise LogError(f"{path}: ending '{path.suffix}'; expected one of {', '.join((*ENDINGS, *RECORDINGS))}")
     return logs
 
 
@@ -98,19 +102,28 @@ def table_of(path: str | Path) -> dict[str, np.ndarray]:
     Raises:
         LogError: It cannot be read, or its format needs no mapping.
     """
-    from visthrow.logs.readers import table
+    from visthrow.logs.readers import recordings, table
 
-    name = Path(path).name.lower()
-    if not name.endswith(TABLES):
-        raise LogError(f"{path}: ending '{Path(path).suffix}'; a mapping is for {', '.join(TABLES)}; other logs say what they hold")
-    return table.read_table(path)
+    path = Path(path)
+    if path.name.lower().endswith(TABLES) or not path.is_file():
+        return table.read_table(path)
+    if not _is_recording(path):
+        known = ", ".join((*TABLES, *RECORDINGS))
+        raise LogError(f"{path}: ending '{path.suffix}'; a mapping is for {known}; other logs say what they hold")
+    return recordings.read_recording(path)
+
+
+def _is_recording(path: Path) -> bool:
+    from visthrow.logs.readers.recordings import is_card
+
+    return path.suffix.lower() in RECORDINGS or (path.is_file() and path.suffix.lower() not in ENDINGS and is_card(path))
 
 
 def _of_table(path: Path, mapping: TableMap | None) -> list[FlightLog]:
     from visthrow.logs.readers import table
     from visthrow.logs.readers.blackbox import channels
 
-    columns = table.read_table(path)
+    columns = table_of(path)
     if mapping is not None:
         return table.logs_of(columns, mapping, str(path))
     if channels.is_decoded(columns):

@@ -41,16 +41,16 @@ def toml_of(found, name: str) -> str:
     lines += [f'about = "{name}"']
     if found.mapping is None:
         return "\n".join(lines) + "\n"
-    time = found.mapping.time
-    why = f"  # {found.why['time']}" if "time" in found.why else ""
-    lines += ["", "[table.time]", f'column = "{time.column}"{why}' if time.column else f"row_period = {time.row_period}"]
-    lines += [f'unit = "{time.unit}"'] if time.column and time.unit != "s" else []
+    for title, clock in [("time", found.mapping.time), *(found.mapping.clocks or {}).items()]:
+        lines += ["", f"[table.{title}]" if title == "time" else f'[table.clocks."{title}"]']
+        lines += [f'column = "{clock.column}"' if clock.column else f"row_period = {clock.row_period}"]
+        lines += [f'unit = "{clock.unit}"'] if clock.column and clock.unit != "s" else []
     for entry in found.mapping.channels:
         listed = ", ".join(f'"{column}"' for column in entry.columns)
         lines += ["", "[[table.channels]]", f'name = "{entry.name}"  # {found.why[entry.name]}']
         lines += [f"columns = [{listed}]", f'unit = "{entry.unit}"']
         lines += [f'kind = "{entry.kind}"'] if entry.kind != "vector" else []
-        lines += [f'{key} = "{value}"' for key in ("axes", "body_axes", "frame") if (value := getattr(entry, key))]
+        lines += [f'{key} = "{value}"' for key in ("axes", "body_axes", "frame", "clock") if (value := getattr(entry, key))]
         lines += ['order = "wxyz"'] if entry.order != "xyzw" else []
         lines += ["held = true"] if entry.held else []
     for title, table in (("flyer", found.flyer or {}), ("flyer.cable", (found.flyer or {}).get("cable", {}))):

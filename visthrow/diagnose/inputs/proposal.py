@@ -19,7 +19,7 @@ from visthrow.logs.units import UNITS
 
 _SPLIT = re.compile(r"[^A-Za-z0-9]+|(?<=[a-z])(?=[A-Z])|(?<=\D)(?=\d)|(?<=\d)(?=\D)")
 _TIME = re.compile(
-    r"(^|[._/ ])(t|ts|time|stamp|timestamp|secs?|seconds|millis|micros|frame)([._ \[(\d]|$)", re.IGNORECASE
+    r"(^|[._/: ])(t|ts|time|stamp|timestamp|secs?|seconds|millis|micros|frame)([._ \[(\d]|$)", re.IGNORECASE
 )
 _SUFFIX = {
     **{unit: unit for unit in ("s", "ms", "us", "ns", "mm", "cm", "m", "deg", "rad", "g", "gf", "rpm")},
@@ -59,7 +59,7 @@ class Proposal:
 
 
 def propose(table: Table, source: str) -> Proposal:
-    """Propose a mapping of a table's columns.
+    """Propose a mapping of the columns of a table, or of the tables of a recording.
 
     Raises:
         LogError: No column holds numbers that change.
@@ -67,16 +67,36 @@ def propose(table: Table, source: str) -> Proposal:
     numbers = {name: cells.astype(float) for name, cells in table.items() if cells.dtype.kind in "fiub"}
     if not any(np.nanstd(cells) > 0.0 for cells in numbers.values() if np.any(np.isfinite(cells))):
         raise LogError(f"{source}: none of its {len(table)} columns holds numbers that change")
-    found = Proposal(None)
-    clock, time = _clock(numbers, found)
-    groups = _groups({name: cells for name, cells in numbers.items() if name != clock.column and len(cells) == len(time)})
-    channels = _Chooser(time, groups, found).channels()
+    found, channels, clocks = Proposal(None), {}, {}
+    for topic, part in _tables(numbers).items():
+        if len(next(iter(part.values()))) < 50:
+            continue
+        clock, time = _clock(part, found)
+        columns = {name: cells for name, cells in part.items() if name != clock.column and len(cells) == len(time)}
+        mine = _Chooser(time, _groups(columns), found).channels()
+        for entry in mine:
+            if entry.name in channels:
+                found.questions.append(f"'{entry.name}' is also {', '.join(entry.columns)}: which one?")
+            else:
+                channels[entry.name] = replace(entry, clock=topic)
+        if mine:
+            clocks[topic] = clock
     if not channels:
         found.questions.append("no column looks like a position, an attitude, rates, forces or motors: which columns are they?")
         return found
-    found.mapping = TableMap(clock, tuple(channels))
+    first, *others = clocks
+    entries = tuple(replace(c, clock="" if c.clock == first else c.clock) for c in channels.values())
+    found.mapping = TableMap(clocks[first], entries, {name: clocks[name] for name in others} or None)
     _corrected(table, source, found)
     return found
+
+
+def _tables(numbers: Table) -> dict[str, Table]:
+    """Columns by the table that they are of: what stands before a colon."""
+    tables: dict[str, Table] = {}
+    for name, cells in numbers.items():
+        tables.setdefault(name.rpartition(":")[0], {})[name] = cells
+    return tables
 
 
 def _clock(numbers: Table, found: Proposal) -> tuple[TimeColumn, np.ndarray]:

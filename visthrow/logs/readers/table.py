@@ -15,7 +15,7 @@ import numpy as np
 from visthrow.common.errors import LogError, suggest
 from visthrow.logs.axes import OURS, turn_of
 from visthrow.logs.flightlog import STANDARD_CHANNELS, Channel, FlightLog
-from visthrow.logs.mapping import ChannelMap, Split, TableMap, TimeColumn
+from visthrow.logs.mapping import ChannelMap, TableMap, TimeColumn
 from visthrow.logs.units import to_si
 
 Table = dict[str, np.ndarray]
@@ -171,8 +171,10 @@ def _stamps(table: Table, clock: TimeColumn, source: str) -> np.ndarray:
     return _numbers(table, clock.column, source) * to_si(clock.unit, "time")[1] + clock.offset
 
 
-def _parts(table: Table, mapping: TableMap, count: int, source: str) -> list[tuple[np.ndarray, str]]:
-    split = mapping.split or Split()
+def _parts(table: Table, mapping: TableMap, count: int, source: str) -> list[tuple[np.ndarray | slice, str]]:
+    split = mapping.split
+    if split is None:
+        return [(slice(None), "")]
     everything = np.arange(count)
     if split.column:
         if split.column not in table:
@@ -195,13 +197,20 @@ def _parts(table: Table, mapping: TableMap, count: int, source: str) -> list[tup
     return parts
 
 
-def _log(table: Table, mapping: TableMap, rows: np.ndarray, label: str, source: str) -> FlightLog:
-    meta = {"source": source, "part": label, "rows": len(rows), "ingest": {}}
+def _log(table: Table, mapping: TableMap, rows: np.ndarray | slice, label: str, source: str) -> FlightLog:
+    count = len(next(iter(table.values()))[rows])
+    meta = {"source": source, "part": label, "rows": count, "ingest": {}}
     channels = {}
     for entry in mapping.channels:
         clock = mapping.clocks[entry.clock] if entry.clock and mapping.clocks else mapping.time
         time = _stamps(table, clock, source)[rows]
-        values = np.column_stack([_numbers(table, name, source)[rows] for name in entry.columns])
+        columns = [_numbers(table, name, source)[rows] for name in entry.columns]
+        if {len(column) for column in columns} != {len(time)}:
+            raise LogError(
+                f"{source}: channel '{entry.name}': {len(time)} stamps, columns of {', '.join(str(len(c)) for c in columns)}; "
+                "expected one table and its clock"
+            )
+        values = np.column_stack(columns)
         channel, notes = make_channel(time, values, entry, source)
         channels[entry.name] = channel
         meta["ingest"][entry.name] = notes | {"clock": entry.clock or "main"}
