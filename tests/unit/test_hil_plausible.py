@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from hil.poses.pose import Pose
 from hil.sources.opening import open_source, read_poses
 from visthrow import config
 from visthrow.cli import main
+from visthrow.common import toml_text
 
 DATA = Path(__file__).parents[1] / "data"
 FLIGHTS = {
@@ -107,3 +109,18 @@ def test_recorded_flights_replay(name, tmp_path, capsys):
     told = capsys.readouterr().out
     assert "all bit for bit the same" in told
     assert int(told.split(" actions")[0].split()[-1]) > 150, "of 200 ticks"
+
+
+def test_a_run_recorded_with_another_form_of_mapping_replays(tmp_path, capsys):
+    """Runs of earlier versions name a body's columns, and a camera's log; replaying needs neither, the poses are recorded."""
+    file, out = f"source.file={DATA / FLIGHTS['crazyflie_log']}", tmp_path / "run"
+    assert main(["hil", "record", "--config", "crazyflie_log", "--set", file, "--seconds", "1", "--bare", "--out", str(out)]) == 0
+    tree = tomllib.loads((out / "config.toml").read_text())
+    assert "time" in tree["source"]
+    tree["against"] = "none"
+    tree["source"]["columns"] = [{"body": "vehicle", "pos": {"names": ["x", "y", "z"], "unit": "mm"}, "row_period": 0.01}]
+    del tree["source"]["time"]
+    (out / "config.toml").write_text(toml_text.dumps(tree))
+    capsys.readouterr()
+    assert main(["hil", "replay", str(out)]) == 0
+    assert "all bit for bit the same" in capsys.readouterr().out
