@@ -73,10 +73,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     check = subs["check"]
     check.add_argument("--hand-carry", action="store_true", help="carry the vehicle about by hand: are the axes right?")
-    check.add_argument(
-        "--against-camera", nargs="+", metavar="FILE", help="recordings of a camera's detections; the first is fitted"
-    )
-    check.add_argument("--out", default="out/against_camera", metavar="FOLDER", help="of --against-camera")
     subs["check"].add_argument(
         "--hover-of", metavar="FOLDER", default=None, help="of a run: was its hover's thrust the weight by the calibration?"
     )
@@ -259,12 +255,6 @@ def _view(args: argparse.Namespace) -> int:
 
 
 def _check(args: argparse.Namespace) -> int:
-    if args.against_camera:
-        from hil.recording import camera_report
-
-        figures = camera_report.against_camera(_params(args), args.against_camera, args.out)
-        print(camera_report.story(figures, args.out))
-        return 0
     if args.hand_carry:
         return _hand_carry(args)
     if args.hover_of is not None:

@@ -16,10 +16,10 @@ from hil.poses.frames import FrameParams
 from hil.poses.gate import GateParams
 from hil.poses.pose import BODIES, PAYLOAD, VEHICLE
 from hil.poses.track import MOST_PREDICTION
-from hil.recording.camera_log import CameraLogParams
-from hil.sources import BodyIds, CsvParams, LogBody, MocapParams, RigidBody
+from hil.sources import CHANNELS, BodyIds, LogBody, MocapParams, RigidBody
 from hil.sources.images import ImageParams
 from visthrow.common.errors import ConfigError
+from visthrow.logs.mapping import ChannelMap, TableMap, TimeColumn
 
 LIVE = ("mavlink", "mocap")
 """Kinds of source that are no recording."""
@@ -53,11 +53,21 @@ class SourceParams:
     kind: Literal["mavlink", "tlog", "csv", "bin", "ulg", "mocap"]
     file: str | None  # of a recording: tlog, csv, bin or ulg
     senders: tuple[BodyIds, ...]  # of mavlink and tlog
-    columns: tuple[CsvParams, ...]  # of csv
+    columns: tuple[ChannelMap, ...] = ()  # of csv: of hil.sources.player.CHANNELS; none where the file names its channels
+    time: TimeColumn | None = None  # of csv: its clock
     logs: tuple[LogBody, ...] = ()  # of bin and ulg
     bodies: tuple[RigidBody, ...] = ()  # of mocap
     mocap: MocapParams | None = None
     check_units: bool = True  # refuse recordings whose numbers no vehicle makes: a unit of the mapping is wrong
+
+    def __post_init__(self) -> None:
+        if bool(self.columns) != (self.time is not None):
+            raise ConfigError("source: columns of a table need its time, and a time its columns")
+
+    @property
+    def mapping(self) -> TableMap | None:
+        """Mapping of a table; None where it needs none."""
+        return TableMap(self.time, self.columns) if self.time is not None else None
 
 
 @dataclass(frozen=True)
@@ -106,7 +116,6 @@ class HilParams:
     images: ImageParams | None = None  # of the detector
     realtime: RealtimeParams = field(default_factory=RealtimeParams)
     aim: AimParams | None = None  # which releases are held back; None: none
-    against: CameraLogParams | None = None  # a camera's own detections in the source's file
 
     def __post_init__(self) -> None:
         if not {VEHICLE, PAYLOAD} <= set(self.frames) <= set(BODIES):
@@ -129,8 +138,9 @@ class HilParams:
                 f"landing_height {self.landing_height} m; expected within the payload's fence, {f.payload_low[2]} to "
                 f"{f.payload_high[2]} m of height"
             )
-        written = ORDERS.get(self.source.kind)
+        angles = {channel.name for channel in self.source.columns if channel.kind == "euler"}
         for name, frames in self.frames.items():
+            written = "xyzw" if CHANNELS[name][1] in angles else ORDERS.get(self.source.kind)
             if written is not None and frames.quaternion != written:
                 raise ConfigError(
                     f"frames.{name}.quaternion is '{frames.quaternion}'; a source of kind {self.source.kind} writes '{written}'"

@@ -12,15 +12,13 @@ the others mirror the world and are refused. Common sets:
 
 import math
 from dataclasses import dataclass, replace
-from itertools import permutations, product
 from typing import Literal
 
 import numpy as np
 
 from hil.errors import FrameError
 from hil.poses.pose import Pose, Quaternion, Vector
-
-LETTERS = "xyz"
+from visthrow.logs.axes import turn_of
 
 
 @dataclass(frozen=True)
@@ -48,37 +46,16 @@ class FrameParams:
             )
 
 
-def proper_axes() -> list[str]:
-    """Return the 24 sets of axes that are turns."""
-    signs = list(product(("", "-"), repeat=3))
-    every = [",".join(s + a for s, a in zip(sign, order)) for order in permutations(LETTERS) for sign in signs]
-    return [axes for axes in every if np.linalg.det(_matrix(axes)) > 0]
-
-
 def rotation_of(axes: str) -> np.ndarray:
-    """Matrix of a set of axes: ``v_ours = matrix @ v_source``, shape (3, 3).
+    """Return the matrix of a set of axes: ``v_ours = matrix @ v_source``, shape (3, 3).
 
     Raises:
         FrameError: not three signed letters, one of them twice, or a mirrored set.
     """
-    words = [word.strip() for word in axes.split(",")]
-    letters = sorted(word.lstrip("+-") for word in words)
-    if len(words) != 3 or any(len(word) > 2 or not word for word in words) or letters != list(LETTERS):
-        raise FrameError(f"axes '{axes}'; expected x, y and z once each, signed, for instance 'y,x,-z'")
-    matrix = _matrix(",".join(words))
-    if np.linalg.det(matrix) < 0:
-        raise FrameError(
-            f"axes '{axes}' mirror the world (a left-handed set); turn one sign or exchange two letters. "
-            f"The 24 turns: {' '.join(proper_axes())}"
-        )
-    return matrix
-
-
-def _matrix(axes: str) -> np.ndarray:
-    matrix = np.zeros((3, 3))
-    for row, word in enumerate(axes.split(",")):
-        matrix[row, LETTERS.index(word[-1])] = -1.0 if word[0] == "-" else 1.0
-    return matrix
+    try:
+        return turn_of(axes)
+    except ValueError as error:
+        raise FrameError(str(error)) from error
 
 
 class Frames:

@@ -14,9 +14,10 @@ import numpy as np
 
 from hil.errors import RunError
 from hil.links.clock import Clock
-from hil.poses.frames import FrameParams, Frames, conjugate, multiply, proper_axes, rotation_of
+from hil.poses.frames import FrameParams, Frames, conjugate, multiply, rotation_of
 from hil.poses.pose import VEHICLE, Pose
 from hil.sources.base import Source
+from visthrow.logs.axes import TURNS
 
 SPEED, RATE = 0.06, 0.25
 """Below both the vehicle rests [m/s], [rad/s]: noise of a millimetre and of 0.3 deg stays below."""
@@ -159,7 +160,7 @@ def judge(steps: Sequence[Step], frames: FrameParams) -> Finding:
 
 def _world_axes(ways: list[tuple[int, np.ndarray]]) -> tuple[str, bool]:
     """The axis case under which the places went along their axes, and whether a mirrored one would fit better."""
-    scores = {axes: _agreement([(i, rotation_of(axes) @ way) for i, way in ways]) for axes in proper_axes()}
+    scores = {axes: _agreement([(i, rotation_of(axes) @ way) for i, way in ways]) for axes in TURNS}
     best = max(scores, key=scores.get)
     matrix = np.column_stack([way / np.linalg.norm(way) for _, way in ways])
     return best, bool(np.linalg.det(matrix) < -0.5)
@@ -171,7 +172,7 @@ def _body_axes(turns: list[tuple[int, Step]], world: np.ndarray) -> tuple[str, s
     for order in ("xyzw", "wxyz"):
         vectors = [(axis, *step.turn(order)) for axis, step in turns]
         in_world = _agreement([(axis, world @ w) for axis, w, _ in vectors])
-        for axes in proper_axes():
+        for axes in TURNS:
             score = in_world + _agreement([(axis, rotation_of(axes) @ b) for axis, _, b in vectors])
             if score > best[0] + 1e-9:
                 best = (score, order, axes)

@@ -8,6 +8,7 @@ import hashlib
 import json
 import queue
 import threading
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -19,8 +20,9 @@ from hil.params import HilParams
 from hil.poses.pose import Pose
 from visthrow import config
 from visthrow.common import provenance
-from visthrow.common.errors import StorageError
+from visthrow.common.errors import ConfigError, StorageError
 from visthrow.common.storage import atomic_write, write_json
+from visthrow.common.toml_text import dumps
 from visthrow.onboard.policy import Policy, find_policy
 
 POLICY, CONFIG, POSES, TICKS, TLOG, SUMMARY, PROVENANCE = (
@@ -160,6 +162,21 @@ def require_run(folder: Path) -> None:
         raise RunError(f"{folder}: no folder of a run; expected {CONFIG}, {POLICY}, {POSES} and {TICKS} in it")
 
 
+def _replayable(path: Path) -> str:
+    """Config of a run without what only reads the recording's source: its poses are here, and its form has changed before.
+
+    Raises:
+        ConfigError: it cannot be read.
+    """
+    try:
+        tree = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{path}: cannot be read: {error}; expected the config of a run") from error
+    tree.pop("against", None)
+    tree["source"] = {key: value for key, value in tree.get("source", {}).items() if key not in ("columns", "time")}
+    return dumps(tree)
+
+
 def load_run(folder: str | Path) -> tuple[HilParams, Policy, list[dict[str, Any]], dict[int, list[Pose]]]:
     """Config, policy, ticks and raw poses of a run.
 
@@ -169,7 +186,7 @@ def load_run(folder: str | Path) -> tuple[HilParams, Policy, list[dict[str, Any]
     """
     folder = Path(folder)
     require_run(folder)
-    params, policy = config.load(HilParams, folder / CONFIG), Policy.load(folder / POLICY)
+    params, policy = config.loads(HilParams, _replayable(folder / CONFIG), name=str(folder / CONFIG)), Policy.load(folder / POLICY)
     ticks, poses = list(lines(folder / TICKS)), read_poses(folder)
     if not (folder / SUMMARY).is_file():  # killed: the two files may end at different ticks, with half of its poses
         ticks = [line for line in ticks if line["n"] < max(poses, default=0)]

@@ -4,17 +4,13 @@ A source hands on raw poses, in its own frames; `hil.poses.frames` converts them
 """
 
 from hil.sources.base import Recorded, Source
-from hil.sources.csv_file import Column, CsvParams, read_csv
-from hil.sources.dataflash import read_bin
-from hil.sources.logs import LogBody
-from hil.sources.mavlink import BodyIds, MavlinkDecoder, MavlinkSource, read_tlog
+from hil.sources.mavlink import BodyIds, MavlinkDecoder, MavlinkSource
 from hil.sources.mocap import MocapParams, RigidBody, open_mocap
-from hil.sources.ulog import read_ulg
+from hil.sources.player import CHANNELS, LogBody, read_autopilot, read_table, read_tlog
 
 __all__ = [
+    "CHANNELS",
     "BodyIds",
-    "Column",
-    "CsvParams",
     "LogBody",
     "MavlinkDecoder",
     "MavlinkSource",
@@ -23,8 +19,7 @@ __all__ = [
     "RigidBody",
     "Source",
     "open_mocap",
-    "read_bin",
-    "read_csv",
+    "read_autopilot",
+    "read_table",
     "read_tlog",
-    "read_ulg",
 ]

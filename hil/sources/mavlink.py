@@ -1,16 +1,12 @@
-"""Poses from MAVLink messages, over a link or out of a .tlog: one decoder for both."""
+"""Poses from MAVLink messages, over a link or out of a .tlog (see ``hil.sources.player``): one decoder for both."""
 
-import math
-import struct
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from hil.errors import SourceError
 from hil.links.clock import Clock
 from hil.links.mavlink_link import Link, pose_from_message
-from hil.links.pymav import Parser
 from hil.poses.pose import BODIES, Pose
 from visthrow.common.errors import ConfigError
 
@@ -127,44 +123,3 @@ class MavlinkSource:
     def close(self) -> None:
         """See `hil.sources.base.Source`."""
         self._link.close()
-
-
-def read_tlog(path: str | Path, bodies: tuple[BodyIds, ...]) -> list[Pose]:
-    """Poses of a .tlog; arrivals are seconds from its first message.
-
-    Raises:
-        SourceError: no such file, or nothing in it is a message.
-    """
-    path = Path(path)
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise SourceError(f"{path}: cannot be read: {error.strerror}; expected a .tlog") from error
-    decoder, parser, poses = MavlinkDecoder(bodies), Parser(), []
-    at, first, messages = 0, None, 0
-    while at + 8 < len(data):
-        length = _length(data, at + 8)
-        if length is None:
-            at += 1  # damaged here: look for the next message
-            continue
-        stamp = struct.unpack_from(">Q", data, at)[0] / 1e6
-        found = parser.parse(data[at + 8 : at + 8 + length])
-        at += 8 + length if found else 1
-        for message in found:
-            messages += 1
-            first = stamp if first is None else first
-            pose = decoder.feed(message, stamp - first)
-            if pose is not None and math.isfinite(stamp):
-                poses.append(pose)
-    if not messages:
-        raise SourceError(f"{path}: {len(data)} bytes without a single MAVLink message; expected a .tlog")
-    return poses
-
-
-def _length(data: bytes, at: int) -> int | None:
-    """Length of the message that begins at a place, or None where none does or it is cut short."""
-    head = data[at : at + 3]
-    if len(head) < 3 or head[0] not in (0xFE, 0xFD):
-        return None
-    length = head[1] + 8 if head[0] == 0xFE else head[1] + 12 + 13 * (head[2] & 1)
-    return length if at + length <= len(data) else None

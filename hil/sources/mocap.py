@@ -18,8 +18,8 @@ from hil.links.clock import Clock
 from hil.links.device import check_device
 from hil.links.mavlink_link import Link
 from hil.poses.pose import BODIES, Pose
-from hil.sources.logs import load_extra
 from visthrow.common.errors import ConfigError, suggest
+from visthrow.common.extras import load_extra
 
 MOST_WAITING = 2000
 """Poses that are kept between two polls; older ones are dropped."""
@@ -118,7 +118,7 @@ class MotionCaptureSource(MocapSource):
         super().__init__(clock, link)
         self._names = _names(bodies)
         if module is None:
-            module = load_extra("motioncapture", "motioncapture")
+            module = load_extra("motioncapture", "motioncapture", "this source", SourceError)
             _probe(params)
         connect = module.connect
         self._stop, self._ready = threading.Event(), threading.Event()
@@ -172,7 +172,7 @@ class NatNetSource(MocapSource):
             raise SourceError(f"natnet bodies {', '.join(wrong)}; expected streaming ids, which are numbers")
         self._names = {int(name): body for name, body in _names(bodies).items()}
         self.untracked = 0
-        module = module or load_extra("natnet", "natnet")
+        module = module or load_extra("natnet", "natnet", "this source", SourceError)
         self._client = module.NatNetClient(
             server_ip_address=params.host, local_ip_address=params.local, use_multicast=params.multicast
         )

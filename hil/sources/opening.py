@@ -10,14 +10,12 @@ from hil.links.mavlink_link import Link, TlogWriter
 from hil.links.sync import LinkSync
 from hil.params import LIVE, HilParams
 from hil.poses.plausible import unit_problems
-from hil.poses.pose import VEHICLE, Pose
+from hil.poses.pose import Pose
 from hil.recording.record import TLOG
 from hil.sources.base import Recorded
-from hil.sources.csv_file import read_csv
-from hil.sources.dataflash import read_bin
-from hil.sources.mavlink import MavlinkSource, read_tlog
+from hil.sources.mavlink import MavlinkSource
 from hil.sources.mocap import open_mocap
-from hil.sources.ulog import read_ulg
+from hil.sources.player import read_autopilot, read_table, read_tlog
 
 
 def read_poses(params: HilParams) -> list[Pose]:
@@ -29,11 +27,9 @@ def read_poses(params: HilParams) -> list[Pose]:
     source = params.source
     if source.kind == "tlog":
         return read_tlog(source.file, source.senders)
-    if source.kind == "bin":
-        return read_bin(source.file, source.logs)
-    if source.kind == "ulg":
-        return read_ulg(source.file, source.logs)
-    return read_csv(source.file, source.columns, params.frames[VEHICLE].quaternion)
+    if source.kind in ("bin", "ulg"):
+        return read_autopilot(source.file, source.logs, source.kind)
+    return read_table(source.file, source.mapping)
 
 
 def open_source(params: HilParams, folder: Path, speed: float) -> tuple[Any, Link | None, bool]:

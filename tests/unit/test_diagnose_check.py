@@ -7,9 +7,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from visthrow import cli
-from visthrow.diagnose.check.relations import relate
 from visthrow.diagnose.check.run import check, table
 from visthrow.diagnose.check.signals import noise
+from visthrow.logs.check.relations import relate
 from visthrow.logs.flightlog import Channel, FlightLog
 
 G = 9.81

@@ -15,10 +15,13 @@ from tests import logfiles
 from visthrow import config
 from visthrow.common.errors import ConfigError, LogError
 from visthrow.diagnose.inputs import setup as setups
-from visthrow.logs import blackbox, blackbox_codec, read
+from visthrow.logs import read
+from visthrow.logs.axes import turn_of
 from visthrow.logs.export import export
 from visthrow.logs.flightlog import Channel, FlightLog
-from visthrow.logs.mapping import ChannelMap, Split, TableMap, TimeColumn, signed_axes
+from visthrow.logs.mapping import ChannelMap, Split, TableMap, TimeColumn
+from visthrow.logs.readers.blackbox import codec as blackbox_codec
+from visthrow.logs.readers.blackbox import decoder as blackbox
 
 REAL = Path(__file__).resolve().parents[1] / "data" / "real"
 BBL = REAL / "betaflight_bbl" / "btfl_001_start.bbl"
@@ -224,14 +227,48 @@ class TestTables:
         rows = ["t,v", "0,1", "10,2", "10,3", "20,4", "5,5", "30,", ",7", "40,8"]
         (log,) = read(written(tmp_path, rows), mapping(ChannelMap("x", ("v",), "m")))
         notes = log.meta["ingest"]["x"]
-        assert log["x"].time == pytest.approx([0, 0.01, 0.02, 0.03, 0.04])
-        assert log["x"].valid.tolist() == [True, True, True, False, True]
-        assert (notes["repeated"], notes["backwards"], notes["unstamped"], notes["invalid"]) == (1, 1, 1, 1)
+        assert log["x"].time == pytest.approx([0, 0.01, 0.02, 0.04])
+        assert (notes["repeated"], notes["backwards"], notes["unstamped"], notes["blank"]) == (1, 1, 1, 1)
 
     def test_held_values_are_one_measurement(self, tmp_path):
         rows = ["t,v", *(f"{10 * i},{i // 4}" for i in range(12))]
         (log,) = read(written(tmp_path, rows), mapping(ChannelMap("x", ("v",), "m", held=True)))
         assert log["x"].time == pytest.approx([0, 0.04, 0.08])
+
+    def test_blanks_are_no_samples_and_break_no_hold(self, tmp_path):
+        """Two streams in one table: rows of the one are blank in the other; a part of a vector that is blank is a bad sample."""
+        rows = ["t,v,a,b", *(f"{10 * i},{i // 6 if i % 2 else ''},{i if i % 3 else ''},{i}" for i in range(13))]
+        (log,) = read(
+            written(tmp_path, rows), mapping(ChannelMap("x", ("v",), "m", held=True), ChannelMap("y", ("a", "b"), "m"))
+        )
+        assert log["x"].time == pytest.approx([0.01, 0.07])
+        assert np.all(log["x"].valid)
+        assert len(log["y"].time) == 13
+        assert log["y"].valid.tolist() == [i % 3 > 0 for i in range(13)]
+
+    @pytest.mark.parametrize(
+        "text",
+        [
+            "t;v\n0;1,5\n10;2,5\n20;3,5\n", "t\tv\n0\t1.5\n10\t2.5\n20\t3.5\n", "t v\n0 1.5\n10   2.5\n20 3.5\n",
+            "t;v\n0;1.5\n10;2.5\n20;3.5\n",
+        ],
+    )  # fmt: skip
+    def test_separators_and_decimal_commas(self, tmp_path, text):
+        (tmp_path / "a.csv").write_text(text)
+        (log,) = read(tmp_path / "a.csv", mapping(ChannelMap("x", ("v",), "m")))
+        assert log["x"].values == pytest.approx([1.5, 2.5, 3.5])
+
+    def test_no_header_and_lists_in_cells(self, tmp_path):
+        (tmp_path / "a.csv").write_text('0,"[1.0, 2.0, 3.0]"\n10,"[1.5, 2.0, 3.0]"\n20,"[2.0, 2.0]"\n')
+        listed = ChannelMap("pos_w", tuple(f"p[{i}]" for i in range(3)), "m")
+        (tmp_path / "b.csv").write_text("t,p\n" + (tmp_path / "a.csv").read_text())
+        (log,) = read(tmp_path / "b.csv", mapping(listed))
+        assert log["pos_w"].values[1] == pytest.approx([1.5, 2.0, 3.0])
+        assert log["pos_w"].valid.tolist() == [True, True, False]
+        (tmp_path / "c.csv").write_text("0,1,2\n10,3,4\n20,5,6\n")
+        columns = TableMap(TimeColumn("column 1", "ms"), (ChannelMap("x", ("column 3",), "m"),))
+        (log,) = read(tmp_path / "c.csv", columns)
+        assert log["x"].values == pytest.approx([2, 4, 6])
 
     def test_clocks_of_their_own_and_splits(self, tmp_path):
         rows = ["t,u,b,v", *(f"{10 * i},{2 * i},{'ab'[i // 50]},{i}" for i in range(100))]
@@ -272,7 +309,7 @@ class TestTables:
     @pytest.mark.parametrize(
         ("rows", "message"),
         [
-            (["t,v", "0,1", "1,2,3", "2,2"], "row 2 has 3 cells"),
+            (["t,v", "0,1", "1,2,3", "2,2"], "line 3 has 3 cells"),
             (["t,v"], "no rows"),
             ([""], "no header"),
             (["t,w", "0,1"], "no column 'v'"),
@@ -312,9 +349,9 @@ class TestTables:
             ({"unit": "parsec"}, "unit 'parsec'"),
             ({"unit": "deg"}, "is of the kind 'rad'"),
             ({"columns": ()}, "no columns"),
-            ({"axes": "x,y"}, "expected three"),
-            ({"axes": "x,y,-z"}, "mirror image"),
-            ({"axes": "x,x,z"}, "names? one axis twice"),
+            ({"axes": "x,y"}, "expected x, y and z once each"),
+            ({"axes": "x,y,-z"}, "mirror the world"),
+            ({"axes": "x,x,z"}, "expected x, y and z once each"),
             ({"kind": "quaternion"}, "quaternion of 3 columns"),
         ],
     )
@@ -323,7 +360,7 @@ class TestTables:
             ChannelMap(**({"name": "pos_w", "columns": ("x", "y", "z"), "unit": "m"} | change))
 
     def test_axes(self):
-        assert signed_axes("y,-x,z", "") == [(1, 1.0), (0, -1.0), (2, 1.0)]
+        assert turn_of("y,-x,z") @ [1.0, 2.0, 3.0] == pytest.approx([2.0, -1.0, 3.0])
 
 
 class TestAutopilots:

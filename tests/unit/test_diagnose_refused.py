@@ -8,7 +8,7 @@ import pytest
 
 from visthrow.common.errors import LogError
 from visthrow.diagnose.inputs import setup as setups
-from visthrow.logs import table
+from visthrow.logs.readers import table
 
 DATA = Path(__file__).resolve().parents[1] / "data"
 SWING = ("pendulum_encoder", "real/pendulum_single/single_pendulum_id.csv.gz")

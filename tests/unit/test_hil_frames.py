@@ -7,10 +7,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hil.errors import FrameError
-from hil.poses.frames import FrameParams, Frames, proper_axes, rotation_of
+from hil.poses.frames import FrameParams, Frames, rotation_of
 from hil.poses.pose import Pose
+from visthrow.logs.axes import TURNS
 
-AXES = proper_axes()
+AXES = TURNS
 EXACT = 1e-14
 """Rounding of a few float64 products of numbers near 1."""
 

@@ -7,11 +7,12 @@ import pytest
 
 from hil.errors import RunError
 from hil.links.clock import ManualClock
-from hil.poses.frames import FrameParams, Frames, multiply, proper_axes
+from hil.poses.frames import FrameParams, Frames, multiply
 from hil.poses.handcarry import MOVES, Step, collect, find_steps, judge, story
 from hil.poses.pose import Pose
 from hil.sources import Recorded
 from visthrow.cli import main
+from visthrow.logs.axes import TURNS as AXES
 
 OURS = FrameParams("x,y,z", "x,y,z", "xyzw", 0.0, (0.0, 0.0, 0.0))
 RATE = 100.0
@@ -71,7 +72,7 @@ def check(steps, true: FrameParams, config: FrameParams):
     return judge([Step(source(step.before), source(step.after)) for step in steps], config)
 
 
-@pytest.mark.parametrize("axes", proper_axes())
+@pytest.mark.parametrize("axes", AXES)
 def test_every_axis_case_is_named(steps, axes):
     for true in (made(axes=axes), made(body_axes=axes), made(axes=axes, body_axes="x,-y,-z", quaternion="wxyz")):
         right = check(steps, true, true)
@@ -87,7 +88,7 @@ def test_any_mixture_is_named(steps):
     rng = np.random.default_rng(1)
     for _ in range(25):
         true, config = (
-            made(*rng.choice(proper_axes(), 2), rng.choice(["xyzw", "wxyz"]), float(rng.choice([0.0, 30.0, -40.0])))
+            made(*rng.choice(AXES, 2), rng.choice(["xyzw", "wxyz"]), float(rng.choice([0.0, 30.0, -40.0])))
             for _ in range(2)
         )
         found = check(steps, true, config)
@@ -149,10 +150,13 @@ def test_the_command_on_a_recording(tmp_path, capsys, axes, status):
     rows = [(p.stamp, *p.pos, *p.quat) for p in carried(made("y,x,-z", "x,-y,-z", "wxyz"))]
     path.write_text("t,x,y,z,qw,qx,qy,qz\n" + "\n".join(",".join(map(str, row)) for row in rows))
     columns = (
-        '[{body="vehicle", time={names=["t"], unit="s"}, pos={names=["x", "y", "z"], unit="m"}, '
-        'quat={names=["qw", "qx", "qy", "qz"], unit="1"}}]'
+        '[{name="pos_w", columns=["x", "y", "z"], unit="m"}, '
+        '{name="quat_wb", columns=["qw", "qx", "qy", "qz"], unit="1", kind="quaternion"}]'
     )
-    settings = ("source.kind=csv", f"source.file={path}", f"source.columns={columns}", f'frames.vehicle.axes="{axes}"')
+    settings = (
+        "source.kind=csv", f"source.file={path}", 'source.time={column="t"}', f"source.columns={columns}",
+        f'frames.vehicle.axes="{axes}"',
+    )  # fmt: skip
     command = ["hil", "check", "--hand-carry", *(word for setting in settings for word in ("--set", setting))]
     assert main(command) == status
     out = capsys.readouterr().out

@@ -202,13 +202,14 @@ def test_the_runner_flies_on_what_the_detector_saw(folder, tmp_path, capsys):
     """The vision policy's observations hold the detections, and a replay without the pictures gives the same actions."""
     fisheye = ", ".join(f"{key}={value}" for key, value in dataclasses.asdict(SMALL).items())
     columns = (
-        '[{body="vehicle", time={names=["t"], unit="s"}, pos={names=["x","y","z"], unit="m"}, '
-        'quat={names=["qx","qy","qz","qw"], unit="1"}}, '
-        '{body="payload", time={names=["t"], unit="s"}, pos={names=["bx","by","bz"], unit="m"}}]'
+        '[{name="pos_w", columns=["x","y","z"], unit="m"}, '
+        '{name="quat_wb", columns=["qx","qy","qz","qw"], unit="1", kind="quaternion"}, '
+        '{name="payload_pos_w", columns=["bx","by","bz"], unit="m"}]'
     )
     frames = '{axes="x,y,z", body_axes="x,y,z", quaternion="xyzw", yaw_offset_deg=0.0, marker_offset_b=[0.0, 0.0, 0.0]}'
     settings = (
-        "source.kind=csv", f"source.file={folder / 'poses.csv'}", f"source.columns={columns}", "keypoints=detector",
+        "source.kind=csv", f"source.file={folder / 'poses.csv'}", 'source.time={column="t"}',
+        f"source.columns={columns}", "keypoints=detector",
         f'images={{kind="folder", path="{folder}", fisheye={{{fisheye}}}}}', f"frames.vehicle={frames}",
         f"frames.payload={frames}", f"goal_w=[{GOAL[0]}, {GOAL[1]}, 0.0]", "delay.source=0.0",
     )  # fmt: skip

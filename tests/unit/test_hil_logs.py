@@ -10,7 +10,7 @@ import pytest
 from hil.errors import SourceError
 from hil.params import HilParams
 from hil.recording.record import lines
-from hil.sources import LogBody, read_bin, read_ulg
+from hil.sources import LogBody, read_autopilot
 from tests import logfiles as files
 from tests.unit.test_diagnose_fuzz import damaged, dataflash, patience, ulog
 from visthrow import config
@@ -18,6 +18,16 @@ from visthrow.cli import main
 from visthrow.common.errors import ConfigError
 
 VEHICLE = (LogBody("vehicle", "VISP"),)
+
+
+def read_bin(path, bodies):
+    return read_autopilot(path, bodies, "bin")
+
+
+def read_ulg(path, bodies):
+    return read_autopilot(path, bodies, "ulg")
+
+
 QUARTER = math.sqrt(0.5)
 YAWED = (QUARTER, 0.0, 0.0, QUARTER)
 """A quarter turn about down, wxyz."""
@@ -139,7 +149,7 @@ def test_the_estimate_of_a_ulg_takes_the_attitude_before_it(tmp_path):
     assert [pose.quat[0] for pose in poses] == pytest.approx([QUARTER, 1.0, 1.0, 1.0])
     assert [pose.rate is None for pose in poses] == [True, False, False, False]
     assert [pose.reset for pose in poses] == [1, 1, 2, 2]
-    with pytest.raises(SourceError, match=r"no vehicle_odometry 0 in this log.*vehicle_local_position 0"):
+    with pytest.raises(SourceError, match=r"no vehicle_odometry in this log.*vehicle_local_position"):
         read_ulg(path, (LogBody("vehicle", "vehicle_odometry"),))
     del topics["vehicle_attitude", 0]
     files.write_ulg(path, topics)
@@ -237,12 +247,12 @@ def test_a_topic_without_a_field_says_which(tmp_path):
 def test_files_that_are_no_log(tmp_path, content, capfd):
     path = tmp_path / "x"
     path.write_bytes(content)
-    with pytest.raises(SourceError, match=r"expected a dataflash log \(\.BIN\)"):
+    with pytest.raises(SourceError, match=r"expected an ArduPilot dataflash log \(\.BIN\)"):
         read_bin(path, VEHICLE)
     with pytest.raises(SourceError, match="cannot be read"):
         read_bin(tmp_path / "none.BIN", VEHICLE)
     pytest.importorskip("pyulog")
-    with pytest.raises(SourceError, match=r"\.ulg|no vehicle_odometry 0 in this log"):
+    with pytest.raises(SourceError, match=r"\.ulg|no vehicle_odometry in this log"):
         read_ulg(path, (LogBody("vehicle", "vehicle_odometry"),))
     assert capfd.readouterr() == ("", "")
 

@@ -160,15 +160,23 @@ base = "{base}"
 kind = "csv"
 file = "{file}"
 senders = []
+[source.time]
+column = "t"
+
 [[source.columns]]
-body = "vehicle"
-time = {{ names = ["t"], unit = "s" }}
-pos = {{ names = ["x", "y", "z"], unit = "mm" }}
-quat = {{ names = ["qx", "qy", "qz", "qw"], unit = "1" }}
+name = "pos_w"
+columns = ["x", "y", "z"]
+unit = "mm"
+
 [[source.columns]]
-body = "payload"
-time = {{ names = ["t"], unit = "s" }}
-pos = {{ names = ["px", "py", "pz"], unit = "mm" }}
+name = "quat_wb"
+columns = ["qx", "qy", "qz", "qw"]
+unit = "1"
+kind = "quaternion"
+[[source.columns]]
+name = "payload_pos_w"
+columns = ["px", "py", "pz"]
+unit = "mm"
 [frames.vehicle]
 axes = "x,y,z"
 body_axes = "x,y,z"

@@ -10,9 +10,13 @@ import pytest
 from hil.errors import SourceError
 from hil.links.mavlink_link import TlogWriter
 from hil.links.pymav import Parser, mav
+from hil.params import HilParams
 from hil.poses.pose import Pose
-from hil.sources import BodyIds, Column, CsvParams, MavlinkDecoder, Recorded, read_csv, read_tlog
+from hil.sources import BodyIds, MavlinkDecoder, Recorded, read_table, read_tlog
+from visthrow import config
 from visthrow.common.errors import ConfigError
+from visthrow.logs.flightlog import Channel, FlightLog
+from visthrow.logs.mapping import ChannelMap, TableMap, TimeColumn
 
 BODIES = (BodyIds("vehicle", "ATT_POS_MOCAP", 1, 0), BodyIds("payload", "ODOMETRY", 2, 1))
 
@@ -117,61 +121,84 @@ def test_files_that_are_no_tlog(tmp_path):
 
 
 CSV = "t,x,y,z,roll,pitch,yaw\n1000,1,2,3,0,0,90\n1010,1.5,2,3,0,0,90\n\n1020,,2,3,0,0,90\n"
-PARAMS = CsvParams(
-    "vehicle", Column(("x", "y", "z"), "mm"), Column(("t",), "ms"), euler=Column(("roll", "pitch", "yaw"), "deg")
-)
+PLACE = ChannelMap("pos_w", ("x", "y", "z"), "mm")
+MAPPING = TableMap(TimeColumn("t", "ms"), (PLACE, ChannelMap("quat_wb", ("roll", "pitch", "yaw"), "deg", "euler")))
 
 
 @pytest.mark.parametrize("packed", [False, True])
 def test_csv_with_units(tmp_path, packed):
     path = tmp_path / ("a.csv.gz" if packed else "a.csv")
     path.write_bytes(gzip.compress(CSV.encode()) if packed else CSV.encode())
-    poses = read_csv(path, (PARAMS,))
+    poses = read_table(path, MAPPING)
     assert [pose.stamp for pose in poses] == pytest.approx([1.0, 1.01, 1.02])
     assert [pose.arrival for pose in poses] == pytest.approx([0.0, 0.01, 0.02])
     assert poses[1].pos == pytest.approx((1.5e-3, 2e-3, 3e-3))
     half = math.sqrt(0.5)
     assert poses[0].quat == pytest.approx((0.0, 0.0, half, half))
-    assert read_csv(path, (PARAMS,), "wxyz")[0].quat == pytest.approx((half, 0.0, 0.0, half))
     assert math.isnan(poses[2].pos[0]), "an empty cell is for the gate to refuse"
+
+
+def test_a_flight_log_is_a_source_without_a_mapping(tmp_path):
+    """Channels of other clocks are those at or before the position, unless they are old."""
+    time = 0.01 * np.arange(20)
+    place = np.column_stack([time, 0 * time, 1 + 0 * time])
+    turned = np.tile([0.0, 0.0, 0.0, 1.0], (8, 1))
+    turned[3:, 2:] = math.sqrt(0.5)
+    valid = np.arange(20) != 5
+    log = FlightLog({
+        "pos_w": Channel(time, place, "m", "world", valid), "quat_wb": Channel(time[:16:2] + 0.004, turned, "1", "world"),
+        "payload_pos_w": Channel(time + 0.003, place - [0, 0, 0.4], "m", "world"),
+    })  # fmt: skip
+    log.save(tmp_path / "a.npz")
+    poses = read_table(tmp_path / "a.npz", None)
+    vehicle = [pose for pose in poses if pose.body == "vehicle"]
+    assert [math.isnan(pose.pos[0]) for pose in vehicle] == (~valid).tolist()
+    assert vehicle[0].quat is None, "no attitude yet"
+    assert [pose.quat[2] > 0.5 for pose in vehicle[1:]] == [i > 6 for i in range(1, 20)]
+    assert vehicle[19].quat is not None, "46 ms old"
+    assert [pose.arrival for pose in poses if pose.body == "payload"] == pytest.approx(time + 0.003)
+    FlightLog({"rate_b": Channel(time, place, "rad/s", "body")}).save(tmp_path / "b.npz")
+    with pytest.raises(SourceError, match="no position of a body"):
+        read_table(tmp_path / "b.npz", None)
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("t,x,y\n1,2,3\n", "no column 'z'"),
-        (CSV.replace("1.5", "one"), "line 3: could not convert"),
+        ("t,x,y,roll,pitch,yaw\n1,2,3,4,5,6\n", "no column 'z'"),
+        (CSV.replace("1.5", "one"), "column 'x' holds text such as 'one' in row 2"),
         (CSV.replace("1010,1.5", "1010"), "line 3 has 6 cells; the header has 7"),
+        ("", "no header line with the columns' names"),
     ],
 )
 def test_wrong_csv(tmp_path, text, message):
     path = tmp_path / "a.csv"
     path.write_text(text)
     with pytest.raises(SourceError, match=message):
-        read_csv(path, (PARAMS,))
-    with pytest.raises(SourceError, match="cannot be read"):
-        read_csv(tmp_path / "b.csv", (PARAMS,))
+        read_table(path, MAPPING)
+    with pytest.raises(SourceError, match="no such file"):
+        read_table(tmp_path / "b.csv", MAPPING)
 
 
-def test_csv_without_mapping_or_header(tmp_path):
+def test_csv_without_mapping(tmp_path):
     path = tmp_path / "a.csv"
     path.write_text(CSV)
-    with pytest.raises(SourceError, match=r"source.columns is empty.*crazyflie_log.toml. The file has: t, x, y"):
-        read_csv(path, ())
-    path.write_text("")
-    with pytest.raises(SourceError, match="no line with the columns' names"):
-        read_csv(path, (PARAMS,))
+    with pytest.raises(SourceError, match=r"columns t, x, y, z, roll, pitch, yaw, .*it needs a mapping"):
+        read_table(path, None)
 
 
-def test_wrong_mappings():
-    with pytest.raises(ConfigError, match="pos in 'ft'; expected one of: m, cm, mm"):
-        CsvParams("vehicle", Column(("x", "y", "z"), "ft"), row_period=0.01)
-    with pytest.raises(ConfigError, match="expected 3"):
-        CsvParams("vehicle", Column(("x", "y"), "m"), row_period=0.01)
-    with pytest.raises(ConfigError, match="row_period"):
-        CsvParams("vehicle", Column(("x", "y", "z"), "m"))
-    with pytest.raises(ConfigError, match="did you mean 'vehicle'"):
-        CsvParams("vehicel", Column(("x", "y", "z"), "m"), row_period=0.01)
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (('source.columns=[{name="pos_w", columns=["x", "y", "z"], unit="m"}]',), "columns of a table need its time"),
+        (('source.columns=[{name="pos_w", columns=["x", "y", "z"], unit="deg"}]', 'source.time={column="t"}'), "of the kind 'rad'"),
+        (('source.columns=[{name="quat_wb", columns=["r", "p", "y"], unit="deg", kind="euler"}]', 'source.time={column="t"}'),
+         "kind csv writes 'xyzw'"),
+    ],
+)  # fmt: skip
+def test_wrong_mappings(settings, message):
+    with pytest.raises(ConfigError, match=message):
+        config.load(HilParams, config.find("hil", "dry_run"), ("source.kind=csv", "source.file=a.csv", *settings))
 
 
 def test_recorded_poses_come_when_their_time_has_come():

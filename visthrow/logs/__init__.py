@@ -4,11 +4,16 @@ from collections.abc import Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
 
+import numpy as np
+
 from visthrow.common.errors import LogError, suggest
 from visthrow.logs.flightlog import FlightLog
 from visthrow.logs.mapping import TableMap
 
-ENDINGS = (".npz", ".csv", ".csv.gz", ".csv.xz", ".parquet", ".bbl", ".bfl", ".ulg", ".bin", ".tlog")
+ENDINGS = (".npz", ".csv", ".csv.gz", ".csv.xz", ".txt", ".parquet", ".bbl", ".bfl", ".ulg", ".bin", ".tlog")
+RECORDINGS = (".mat", ".h5", ".hdf5", ".bag", ".db3", ".mcap")
+"""Of other tools; the Crazyflie's card names its files without an ending."""
+TABLES = (".csv", ".csv.gz", ".csv.xz", ".txt", ".parquet")
 RUN_LOG = "flight.npz"
 """In the folder of a run of ``visthrow hil``: its flight log."""
 
@@ -18,7 +23,7 @@ def read(path: str | Path, mapping: TableMap | None = None) -> list[FlightLog]:
 
     Args:
         path: Of one of :data:`ENDINGS`, or a folder that holds a ``flight.npz``. ``stand.csv:a1_*`` takes of the logs in a
-            file those whose part fits the pattern.
+            file those whose part fits the pattern; ``LOG00001.BFL+mocap.csv`` joins logs of one flight.
         mapping: Of a table's columns; not needed for our own exports and decoded blackbox logs.
 
     Raises:
@@ -26,6 +31,8 @@ def read(path: str | Path, mapping: TableMap | None = None) -> list[FlightLog]:
     """
     path = Path(path)
     file, colon, pattern = str(path).rpartition(":")
+    if "+" in str(path) and not path.exists() and Path(str(path).split("+")[0]).exists():
+        return [_joined(str(path), mapping)]
     if colon and not path.exists() and Path(file).is_file():
         return _parts(read(file, mapping), file, pattern)
     if path.is_dir():
@@ -34,29 +41,42 @@ def read(path: str | Path, mapping: TableMap | None = None) -> list[FlightLog]:
     if not path.exists():
         near = sorted(p.name for p in path.parent.iterdir()) if path.parent.is_dir() else []
         raise LogError(f"{path}: no such file; in that folder: {', '.join(near[:20]) or 'nothing'}")
-    if name.endswith((".csv", ".csv.gz", ".csv.xz", ".parquet")):
+    if name.endswith(TABLES):
         logs = _of_table(path, mapping)
     elif name.endswith((".bbl", ".bfl")):
-        from visthrow.logs.blackbox_log import logs_of_blackbox
+        from visthrow.logs.readers.blackbox.channels import logs_of_blackbox
 
         logs = logs_of_blackbox(path)
     elif name.endswith((".ulg", ".bin", ".tlog")):
-        from visthrow.logs import autopilot
+        from visthrow.logs.readers.autopilot import log_of_autopilot
 
-        readers = {".ulg": autopilot.log_of_ulog, ".bin": autopilot.log_of_dataflash, ".tlog": autopilot.log_of_telemetry}
-        logs = [readers[path.suffix.lower()](path)]
+        logs = [log_of_autopilot(path)]
     elif name.endswith(".npz"):
         log = FlightLog.load(path)
         log.meta.setdefault("source", str(path))
         logs = [log]
+    elif _is_recording(path):
+        logs = _of_table(path, mapping)
     else:
-        raise LogError(f"{path}: ending '{path.suffix}'; expected one of {', '.join(ENDINGS)}")
+        raise LogError(f"{path}: ending '{path.suffix}'; expected one of {', '.join((*ENDINGS, *RECORDINGS))}")
     return logs
 
 
 def read_all(paths: Sequence[str | Path], mapping: TableMap | None = None) -> list[FlightLog]:
     """Read several files; see :func:`read`."""
     return [log for path in paths for log in read(path, mapping)]
+
+
+def _joined(paths: str, mapping: TableMap | None) -> FlightLog:
+    from visthrow.logs.joining import join
+
+    logs = []
+    for path in paths.split("+"):
+        found = read(path, mapping)
+        if len(found) != 1:
+            raise LogError(f"{path}: {len(found)} logs in it; joining needs one of each, named as FILE:PART")
+        logs += found
+    return join(logs)
 
 
 def _parts(logs: list[FlightLog], file: str, pattern: str) -> list[FlightLog]:
@@ -76,14 +96,38 @@ def _of_folder(path: Path) -> list[FlightLog]:
     return read_all(logs)
 
 
-def _of_table(path: Path, mapping: TableMap | None) -> list[FlightLog]:
-    from visthrow.logs import blackbox_log, table
+def table_of(path: str | Path) -> dict[str, np.ndarray]:
+    """Return the columns of a table, by name.
 
-    columns = table.read_table(path)
+    Raises:
+        LogError: It cannot be read, or its format needs no mapping.
+    """
+    from visthrow.logs.readers import recordings, table
+
+    path = Path(path)
+    if path.name.lower().endswith(TABLES) or not path.is_file():
+        return table.read_table(path)
+    if not _is_recording(path):
+        known = ", ".join((*TABLES, *RECORDINGS))
+        raise LogError(f"{path}: ending '{path.suffix}'; a mapping is for {known}; other logs say what they hold")
+    return recordings.read_recording(path)
+
+
+def _is_recording(path: Path) -> bool:
+    from visthrow.logs.readers.recordings import is_card
+
+    return path.suffix.lower() in RECORDINGS or (path.is_file() and path.suffix.lower() not in ENDINGS and is_card(path))
+
+
+def _of_table(path: Path, mapping: TableMap | None) -> list[FlightLog]:
+    from visthrow.logs.readers import table
+    from visthrow.logs.readers.blackbox import channels
+
+    columns = table_of(path)
     if mapping is not None:
         return table.logs_of(columns, mapping, str(path))
-    if blackbox_log.is_decoded(columns):
-        return [blackbox_log.log_of_decoded(columns, path)]
+    if channels.is_decoded(columns):
+        return [channels.log_of_decoded(columns, path)]
     if table.is_export(columns):
         log = table.log_of_export(columns, str(path))
         if path.suffix == ".parquet":

@@ -1,14 +1,13 @@
 """The mapping file: which columns of a table become which channels, in which unit, about which axes, on which clock."""
 
-import re
 from dataclasses import dataclass
 from typing import Literal
 
 from visthrow.common.errors import ConfigError, suggest
+from visthrow.logs.axes import turn_of
 from visthrow.logs.flightlog import FRAMES, STANDARD_CHANNELS
 from visthrow.logs.units import to_si
 
-_AXES = re.compile(r"[+-]?[xyz]")
 _ORDERS = ("xyzw", "wxyz")
 _WIDTH = {"quaternion": (4,), "euler": (3,), "vector": None}
 
@@ -24,6 +23,7 @@ class TimeColumn:
     column: str = ""  # of the stamps; "": rows are evenly spaced
     unit: str = "s"  # of the stamps
     row_period: float = 0.0  # between two rows [s], where there is no column
+    offset: float = 0.0  # added to its times [s]: streams on clocks apart, as `diagnose check` says by how much
 
     def __post_init__(self) -> None:
         if bool(self.column) == (self.row_period > 0.0):
@@ -67,32 +67,16 @@ class ChannelMap:
             raise ConfigError(f"{where}: frame '{self.frame}'; {suggest(self.frame, FRAMES)}")
         for axes in (self.axes, self.body_axes):
             if axes:
-                signed_axes(axes, where)
+                try:
+                    turn_of(axes)
+                except ValueError as error:
+                    raise ConfigError(f"{where}: {error}") from error
         spec = STANDARD_CHANNELS.get(self.name)
         if spec is None:
             return
         ours = "1" if self.kind != "vector" else to_si(self.unit, where)[0]
         if ours not in spec.unit.split(", "):
             raise ConfigError(f"{where}: unit '{self.unit}' is of the kind '{ours}'; the channel is in '{spec.unit}'")
-
-
-def signed_axes(text: str, where: str) -> list[tuple[int, float]]:
-    """Read ``"x,-y,-z"`` as the source's index and sign of each of our axes.
-
-    Raises:
-        ConfigError: Not three different axes, or a mirror image: axes that no rotation turns into ours.
-    """
-    parts = [part.strip() for part in text.split(",")]
-    if len(parts) != 3 or not all(_AXES.fullmatch(part) for part in parts):
-        raise ConfigError(f"{where}: axes '{text}'; expected three such as 'x,-y,-z'")
-    found = [("xyz".index(part[-1]), -1.0 if part[0] == "-" else 1.0) for part in parts]
-    order = [index for index, _ in found]
-    if sorted(order) != [0, 1, 2]:
-        raise ConfigError(f"{where}: axes '{text}' name one axis twice")
-    even = order in ([0, 1, 2], [1, 2, 0], [2, 0, 1])
-    if (1.0 if even else -1.0) * found[0][1] * found[1][1] * found[2][1] < 0.0:
-        raise ConfigError(f"{where}: axes '{text}' are a mirror image; no rotation turns them into ours")
-    return found
 
 
 @dataclass(frozen=True)

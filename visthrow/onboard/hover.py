@@ -8,8 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-GRAVITY = 9.81
-"""[m/s^2]; that of :mod:`sim.params`, written again because onboard modules do not import ``sim``."""
+from visthrow.common.constants import GRAVITY
 
 
 @dataclass(frozen=True)

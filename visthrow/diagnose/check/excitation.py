@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visthrow.diagnose.check import relations
-from visthrow.diagnose.check.rows import Row
+from visthrow.logs.check import relations
+from visthrow.logs.check.rows import Row
 from visthrow.logs.flightlog import FlightLog
 
 POSITIONS = ("pos_w", "est_pos_w", "mocap_pos_w")

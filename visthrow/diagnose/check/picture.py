@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 
 from visthrow.common import style
-from visthrow.diagnose.check.rows import worst
 from visthrow.diagnose.check.run import Checked
+from visthrow.logs.check.rows import worst
 from visthrow.logs.flightlog import FlightLog
 
 MOST = 10

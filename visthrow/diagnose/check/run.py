@@ -8,8 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from visthrow.diagnose.check import excitation, physics, relations, signals
-from visthrow.diagnose.check.rows import Row, Verdict, worst
+from visthrow.diagnose.check import excitation, signals
+from visthrow.logs.check import physics, relations, thrust
+from visthrow.logs.check.rows import NOTHING, Known, Row, Verdict, worst
 from visthrow.logs.flightlog import Channel, FlightLog
 
 _ALIKE = 0.2
@@ -17,6 +18,8 @@ _ALIKE = 0.2
 _ONE_PAYLOAD = 0.005
 """Two logs whose payloads' paths agree to this [m] hold one payload."""
 _MOST_PAIRED = 12
+_OTHER_SCALE = 0.08
+"""Of the logarithm of thrust over force, that a battery's charge alone does not make."""
 _MOVING = ("pos", "rate", "acc", "quat", "vel", "angle", "thrust", "motor")
 
 
@@ -37,10 +40,20 @@ class Checked:
         return {"log": self.name, "verdict": self.verdict, "rows": [asdict(row) for row in self.rows]}
 
 
-def check(logs: Sequence[FlightLog]) -> list[Checked]:
-    """Look at logs one by one, and at what they have in common."""
-    copies, shared = _copies(logs), _shared_payloads(logs)
-    return [Checked(label(log, i), (*_look(log), *copies.get(i, ()), *shared.get(i, ()))) for i, log in enumerate(logs)]
+def check(logs: Sequence[FlightLog], known: Known = NOTHING) -> list[Checked]:
+    """Look at logs one by one, and at what they have in common.
+
+    Args:
+        logs: Of flights.
+        known: What the model says of the vehicle.
+    """
+    common = [_copies(logs), _shared_payloads(logs), _masses(logs, known)]
+    rows = [(*_look(log, known), *(row for found in common for row in found.get(i, ()))) for i, log in enumerate(logs)]
+    return [Checked(label(log, i), of) for i, (log, of) in enumerate(zip(logs, rows))]
+
+
+CONTRADICT = ("frames", "units", "delay", "thrust", "excited")
+"""Topics in which a bad finding keeps a log from naming causes: the channels are not of one flight and clock."""
 
 
 def contradictions(results: Sequence[Checked]) -> list[str]:
@@ -49,8 +62,13 @@ def contradictions(results: Sequence[Checked]) -> list[str]:
         f"{checked.name}: {row.channel + ': ' if row.channel else ''}{row.text}"
         for checked in results
         for row in checked.rows
-        if row.verdict == "bad" and (row.topic in ("frames", "units", "excited") or "never overlap" in row.text)
+        if row.verdict == "bad" and (row.topic in CONTRADICT or "never overlap" in row.text)
     ]
+
+
+def copies(results: Sequence[Checked]) -> tuple[int, ...]:
+    """Logs that hold what an earlier one holds, by number: a copy counts once."""
+    return tuple(i for i, checked in enumerate(results) if any(row.topic == "duplicates" for row in checked.rows))
 
 
 def label(log: FlightLog, number: int) -> str:
@@ -60,7 +78,7 @@ def label(log: FlightLog, number: int) -> str:
     return f"{source}:{part}" if part else source
 
 
-def _look(log: FlightLog) -> list[Row]:
+def _look(log: FlightLog, known: Known) -> list[Row]:
     if not log.channels:
         return [Row("clock", "", "bad", "no channel at all")]
     log = _until_landing(log)
@@ -68,9 +86,9 @@ def _look(log: FlightLog) -> list[Row]:
     for name, channel in log.channels.items():
         rows += signals.look(name, channel, signals.notes_of(log, name))
     rows += _clocks(log)
-    known = {name: channel for name, channel in log.channels.items() if np.sum(channel.valid) >= signals.FEW_SAMPLES}
-    usable = FlightLog(known, log.meta)
-    return rows + physics.look(usable) + excitation.look(usable)
+    full = {name: channel for name, channel in log.channels.items() if np.sum(channel.valid) >= signals.FEW_SAMPLES}
+    usable = FlightLog(full, log.meta)
+    return rows + physics.look(usable, known) + thrust.look(usable, known) + excitation.look(usable)
 
 
 def _until_landing(log: FlightLog) -> FlightLog:
@@ -124,6 +142,20 @@ def _copies(logs: Sequence[FlightLog]) -> dict[int, list[Row]]:
             if shared > _ALIKE and prints[i]:
                 text = f"shares {100 * shared:.0f} % of its samples with {label(logs[i], i)}: a copy counts once"
                 found.setdefault(j, []).append(Row("duplicates", "", "bad", text, {"copy_of": i, "shared": shared}))
+    return found
+
+
+def _masses(logs: Sequence[FlightLog], known: Known) -> dict[int, list[Row]]:
+    """Logs whose thrust stands to the force otherwise than in the others: another battery, vehicle, payload or map."""
+    masses = {i: mass for i, log in enumerate(logs) if (mass := thrust.mass_of(log, known)) is not None}
+    if len(masses) < 2:
+        return {}
+    middle, found = float(np.median(list(masses.values()))), {}
+    for i, mass in masses.items():
+        if abs(np.log(mass / middle)) > _OTHER_SCALE:
+            text = f"thrust over force {mass:.4g} kg, {mass / middle:.3g} times that of the flights' middle: "
+            text += "the thrust's scale differs from flight to flight"
+            found[i] = [Row("thrust", "", "warn", text, {"mass_kg": mass, "middle_kg": middle})]
     return found
 
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from visthrow.diagnose.check.rows import Row
+from visthrow.logs.check.rows import Row
 from visthrow.logs.flightlog import Channel, FlightLog
 
 FEW_SAMPLES = 20
@@ -18,7 +18,14 @@ _JITTER_WARN = 0.25  # of a period, 95th percentile
 _STUCK_TIME = 0.25  # [s]; a moving vehicle's pose does not stand still to the last digit for so long
 _RAIL_SHARE = 0.01
 _RAILED = ("command", "motor_command", "motor_output", "pwm", "acc_b", "rate_b", "throttle", "motor_speed")
+_SWITCHES = ("release_command", "attached", "mode")
+"""Channels that rest on one of few values by their nature."""
 _NEVER_STUCK = ("pos", "quat", "vel", "rate", "acc", "payload", "angle")
+_FASTEST = {"m": 30.0, "1": 20.0, "m/s": 1e3, "rad/s": 5e3, "m/s^2": 5e4, "rad": 50.0, "V": 500.0}
+"""Unit -> change a second that is a jump and no motion: of vehicles, their rotors and their packs."""
+_HARDEST = 30.0  # acceleration of a vehicle or payload that throws [m/s^2]
+_ASKED = ("setpoint", "command", "action", "observation", "goal", "keypoints", "throttle", "motor", "pwm", "residual")
+"""Channels of which somebody may ask for a step, or that hold no motion."""
 _STOPS_AT_ZERO = ("throttle", "motor_command", "command", "motor_output", "pwm", "motor_speed")
 
 
@@ -60,7 +67,7 @@ def look(name: str, channel: Channel, notes: dict) -> list[Row]:
     Args:
         name: Of the channel.
         channel: Its samples.
-        notes: What the reader left out; see :func:`visthrow.logs.table.make_channel`.
+        notes: What the reader left out; see :func:`visthrow.logs.readers.table.make_channel`.
     """
     count = len(channel.time)
     span = float(np.ptp(channel.time)) if count else 0.0
@@ -118,10 +125,10 @@ def _values(name: str, channel: Channel) -> list[Row]:
     rows = []
     if any(word in name for word in _NEVER_STUCK) and "setpoint" not in name:
         rows += _stuck(name, values, time)
-    if any(word in name for word in _RAILED) and "setpoint" not in name:
+    if any(word in name for word in _RAILED) and "setpoint" not in name and name not in _SWITCHES:
         rows += _railed(name, values)
-    if "pos" in name or "quat" in name:
-        rows += _jumps(name, values, time)
+    if channel.unit in _FASTEST and not any(word in name for word in _ASKED):
+        rows += _jumps(name, values, time, channel.unit)
     return rows
 
 
@@ -163,20 +170,40 @@ def _railed(name: str, values: np.ndarray) -> list[Row]:
     return [Row("values", name, "warn", f"{100 * worst:.1f} % of the samples at {where}: saturated", {"share": worst})]
 
 
-def _jumps(name: str, values: np.ndarray, time: np.ndarray) -> list[Row]:
+def _jumps(name: str, values: np.ndarray, time: np.ndarray, unit: str) -> list[Row]:
+    """Steps that no motion makes, from sample to sample and across gaps."""
     if "quat" in name:
         signs = np.sign(np.sum(values[1:] * values[:-1], axis=1))
         values = values * np.cumprod(np.concatenate([[1.0], np.where(signs == 0.0, 1.0, signs)]))[:, None]
-    size = np.linalg.norm(np.diff(values, axis=0), axis=1)
-    steps = np.diff(time)
+    size, steps = np.linalg.norm(np.diff(values, axis=0), axis=1), np.diff(time)
     usual = np.maximum(np.percentile(size, 99), 1e-9)
-    far = (size > 5.0 * usual) & (size / steps > (20.0 if "quat" in name else 30.0)) & (steps < 5 * np.median(steps))
-    if not np.any(far):
+    near = steps < 5 * np.median(steps)
+    far = (size > 5.0 * usual) & (size / steps > _FASTEST[unit]) & near
+    unit_word, rows = "" if unit == "1" else f" {unit}", []
+    if np.any(far):
+        at = int(np.argmax(np.where(far, size, 0.0)))
+        text = f"{int(np.sum(far))} jumps, the largest {size[at]:.3g}{unit_word} at {time[at]:.2f} s"
+        rows.append(Row("values", name, "warn" if np.mean(far) < 0.02 else "bad", text, {"jumps": int(np.sum(far))}))
+    return rows + _jumps_across(name, values, time, np.flatnonzero(~near)) if unit == "m" else rows
+
+
+def _jumps_across(name: str, values: np.ndarray, time: np.ndarray, gaps: np.ndarray) -> list[Row]:
+    """Positions that do not go on behind a gap where they went before it: another origin, or another body."""
+    off = []
+    for i in gaps:
+        before, after = slice(max(i - 8, 0), i + 1), slice(i + 1, i + 10)
+        if min(len(time[before]), len(time[after])) < 5:
+            continue
+        expected = [np.polyfit(time[part] - middle, values[part], 1)[1] for part, middle in
+                    ((before, 0.5 * (time[i] + time[i + 1])), (after, 0.5 * (time[i] + time[i + 1])))]  # fmt: skip
+        apart, width = float(np.linalg.norm(expected[1] - expected[0])), float(time[i + 1] - time[i])
+        if apart > 0.05 + 0.25 * _HARDEST * width**2:
+            off.append((apart, float(time[i]), width))
+    if not off:
         return []
-    at = int(np.argmax(np.where(far, size, 0.0)))
-    unit = "" if "quat" in name else " m"
-    text = f"{int(np.sum(far))} jumps, the largest {size[at]:.3g}{unit} at {time[at]:.2f} s"
-    return [Row("values", name, "warn" if np.mean(far) < 0.02 else "bad", text, {"jumps": int(np.sum(far))})]
+    apart, at, width = max(off)
+    text = f"{len(off)} jumps across gaps, the largest {apart:.3g} m over the {width:.2f} s from {at:.2f} s: another origin or body?"
+    return [Row("values", name, "warn", text, {"jumps_across_gaps": len(off), "largest_m": apart})]
 
 
 def _noise(name: str, channel: Channel) -> list[Row]:

@@ -17,6 +17,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("logs", metavar="LOG", nargs="+", help="files, or folders of runs")
     parser.add_argument("--config", metavar="NAME", help="of configs/diagnose, or a file: how a table's columns are read")
+    parser.add_argument("--plant", metavar="NAME", help="of configs/train, or a file: cable and mass that the logs must have")
     parser.add_argument("--all", action="store_true", help="print every row, fine ones too")
     parser.add_argument("--out", default=DEFAULT_OUT, metavar="FOLDER", help=f"of the pictures (default: {DEFAULT_OUT})")
     parser.add_argument("--no-pictures", action="store_true", help="draw none")
@@ -28,10 +29,10 @@ def run(args: argparse.Namespace) -> int:
     from visthrow.common.storage import write_json
     from visthrow.diagnose.check.picture import draw
     from visthrow.diagnose.check.run import check, table
-    from visthrow.diagnose.inputs.setup import read_logs
+    from visthrow.diagnose.inputs.setup import known, read_logs
 
     logs = read_logs(args.logs, args.config)
-    results = check(logs)
+    results = check(logs, known(args.config, args.plant))
     for number, (log, checked) in enumerate(zip(logs, results), start=1):
         print(table(checked, args.all) + "\n")
         if not args.no_pictures:

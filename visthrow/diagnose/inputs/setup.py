@@ -13,6 +13,7 @@ from visthrow.diagnose.models.interface import Model
 from visthrow.diagnose.models.pendulum import PendulumParams
 from visthrow.diagnose.models.stand import StandParams
 from visthrow.diagnose.models.trim import TrimParams
+from visthrow.logs.check.rows import Known
 from visthrow.logs.flightlog import FlightLog
 from visthrow.logs.mapping import TableMap
 
@@ -76,6 +77,31 @@ def load(name: str | Path) -> Setup:
     from visthrow import config
 
     return config.load(Setup, config.find("diagnose", str(name)))
+
+
+def known(name: str | Path | None, plant: str | None = None) -> Known:
+    """Return what a setup, or the plant of an experiment, says of the vehicle.
+
+    Args:
+        name: Of a setup, or None.
+        plant: Of configs/train, or a file; asked only where the setup has no flying model.
+
+    Raises:
+        ConfigError: As :func:`load`.
+    """
+    flyer = load(name).flyer if name is not None else None
+    if flyer is not None:
+        cable = flyer.cable
+        mass = flyer.mass + (cable.mass if cable is not None else 0.0)
+        return Known(cable.length if cable is not None else 0.0, mass, flyer.input, flyer.thrust_map)
+    if plant is None:
+        return Known()
+    from visthrow import config
+    from visthrow.task import Experiment, plant_of
+
+    told = plant_of(config.load(Experiment, config.find("train", plant)))
+    rope = told.rope
+    return Known(rope.length + rope.payload_offset, told.vehicle.body.mass + rope.rope_mass + rope.payload_mass)
 
 
 def read_logs(paths: Sequence[str | Path], name: str | Path | None = None) -> list[FlightLog]:

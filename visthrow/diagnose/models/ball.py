@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visthrow.diagnose.check.relations import derivative
 from visthrow.diagnose.models.interface import Effect
 from visthrow.diagnose.models.numeric import (
     Lanes,
@@ -21,6 +20,7 @@ from visthrow.diagnose.models.numeric import (
     latent_layout,
     sigma_of,
 )
+from visthrow.logs.check.relations import derivative
 from visthrow.logs.flightlog import FlightLog
 
 CHANNEL = "payload_pos_w"

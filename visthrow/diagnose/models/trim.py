@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visthrow.diagnose.check.relations import derivative
 from visthrow.diagnose.models.interface import Effect
 from visthrow.diagnose.models.numeric import Lanes, NumericModel, Stretch, latent_layout
+from visthrow.logs.check.relations import derivative
 from visthrow.logs.flightlog import FlightLog
 
 MOTORS = ("fl", "fr", "rl", "rr")

@@ -31,13 +31,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Read, search, print, write."""
     from visthrow.common.storage import write_json
-    from visthrow.diagnose.check.run import check, contradictions
-    from visthrow.diagnose.inputs import opening
+    from visthrow.diagnose.check.run import check, contradictions, copies
+    from visthrow.diagnose.inputs import opening, setup
     from visthrow.diagnose.reporting import report
     from visthrow.diagnose.select import search
 
     model, logs = opening.open_model(args)
-    checked = check(logs)
+    checked = check(logs, setup.known(args.config))
     reasons, spoiled = contradictions(checked), tuple(i for i, log in enumerate(checked) if contradictions([log]))
     if len(spoiled) > MOST_SPOILED * len(logs):
         print(f"{INCONSISTENT}: {OVERALL[INCONSISTENT]}\n" + "\n".join(f"  {reason}" for reason in reasons))
@@ -45,9 +45,11 @@ def run(args: argparse.Namespace) -> int:
             write_json(args.json, {"overall": INCONSISTENT, "reasons": reasons, "findings": []})
         return 0
     print(f"{len(logs)} log(s), {len(model.effects)} effects on {', '.join(model.channels)}", flush=True)
+    doubled = tuple(i for i in copies(checked) if i not in spoiled)
+    reasons += [f"{checked[i].name}: a copy of another log, which counts once" for i in doubled]
     for reason in reasons:
         print(f"  left out: {reason}", flush=True)
-    without = (*opening.numbers(args.without), *spoiled)
+    without = (*opening.numbers(args.without), *spoiled, *doubled)
     diagnosis = search.explain(model, seed=args.seed, without=without, progress=lambda line: print(f"  {line}", flush=True))
     diagnosis = replace(diagnosis, reasons=(*diagnosis.reasons, *(f"left out: {reason}" for reason in reasons)))
     gain = None

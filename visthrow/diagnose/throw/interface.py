@@ -11,8 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from sim.params import GRAVITY, PlantParams
-from visthrow.diagnose.check import relations
 from visthrow.diagnose.throw.recorded import measured
+from visthrow.logs.axes import matrix_of
+from visthrow.logs.check import relations, thrust
 from visthrow.logs.flightlog import Channel, FlightLog
 
 FIRMLY, CLEARLY = 0.8, 0.15
@@ -21,8 +22,8 @@ WORSE = 0.05
 """What a log whose own axes tell little may lose by the hypothesis."""
 MOVES = 0.3  # rates that say something about their axes [rad/s]
 AXES_NATS = float(np.log(48.0))  # so many ways to exchange and turn around three axes
-THRUST = {"N": 1.0, "g of thrust": 9.80665e-3, "mN": 1e-3, "kg of thrust": 9.80665}
-"""Units of a thrust, in newtons."""
+LIFTED = 0.15  # above where it stood, from which a vehicle flies [m]
+VARIED, LATE, SLOPES = 0.05, 0.05, (0.3, 2.0)  # of the throttle's hover, motors [s], plausible slopes of thrust over throttle
 NEAR = 0.25  # of the logarithm of a ratio: hover thrust against weight, gain of the rates
 FAR = 0.8  # the same from which another unit is considered at all
 
@@ -45,8 +46,9 @@ class Mistake:
 
 def put_right(logs: Sequence[FlightLog], plant: PlantParams) -> tuple[list[FlightLog], tuple[Mistake, ...]]:
     """Logs with their commands as the simulation takes them, and what was wrong with them."""
-    found: list[Mistake] = []
-    mended, relation = list(logs), [_followed(log) for log in logs]
+    weight = GRAVITY * (plant.vehicle.body.mass + plant.rope.payload_mass + plant.rope.rope_mass)
+    mended, found = _from_throttle(logs, weight)
+    relation = [_followed(log) for log in mended]
     for look in (_axes, _rate_unit):
         told = [r for r in relation if r is not None]
         mistake = look(told) if told else None
@@ -58,11 +60,75 @@ def put_right(logs: Sequence[FlightLog], plant: PlantParams) -> tuple[list[Fligh
             found.append(mistake[0])
             mended, relation = trial, again
     weight = GRAVITY * plant.total_mass
-    mistake = _thrust_unit(mended, weight, THRUST | {"shares of the full thrust": 4.0 * plant.vehicle.controller.max_thrust})
+    mistake = _thrust_unit(mended, weight, thrust.UNITS | {"shares of the full thrust": 4.0 * plant.vehicle.controller.max_thrust})
     if mistake is not None:
         found.append(mistake[0])
         mended = [_commanded(log, scale=mistake[1]) for log in mended]
     return mended, tuple(found)
+
+
+def _from_throttle(logs: Sequence[FlightLog], weight: float) -> tuple[list[FlightLog], list[Mistake]]:
+    """Logs of autopilots with commands made of throttle and commanded rates, cut to where they fly.
+
+    Around hover the thrust of a vehicle is ``T = W (1 + s (u / h - 1))``: weight W [N] at the share h of full throttle. The slope
+    s is fitted where an accelerometer tells the force and the throttle varies enough, else it is 1.
+    """
+    made, shares = list(logs), []
+    for i, log in enumerate(logs):
+        if "command" in log or "throttle" not in log or "rate_setpoint_b" not in log:
+            continue
+        told = _calibrated(log)
+        if told is None:
+            continue
+        hover, slope, start, end = told
+        rates = log["rate_setpoint_b"]
+        share = log["throttle"].hold(rates.time)
+        thrust_n = np.maximum(weight * (1.0 + slope * (share / hover - 1.0)), 0.0)
+        values = np.column_stack([thrust_n, np.where(rates.valid[:, None], rates.values, 0.0)])
+        command = Channel(rates.time, values, "N, rad/s", "body", rates.valid)
+        made[i] = _between(FlightLog({**log.channels, "command": command}, log.meta), start, end)
+        shares.append((hover, slope))
+    if not shares:
+        return made, []
+    hover, slope = np.median(shares, axis=0)
+    cause = "Commanded thrust is a throttle, calibrated by the weight that it carries in flight"
+    equation = f"thrust = {weight:.3f} N (1 + {slope:.2f} (throttle / {hover:.3f} - 1))"
+    return made, [Mistake("throttle", cause, equation, 0.0, len(shares))]
+
+
+def _calibrated(log: FlightLog) -> tuple[float, float, float, float] | None:
+    """Throttle in hover, slope of the thrust about it, first and last time in flight [s]; None where nothing flies."""
+    channel = log["throttle"]
+    time, share = channel.time[channel.valid], channel.values[channel.valid].astype(float)
+    flies = share > 0.5 * np.percentile(share, 75) if np.any(share > 0.0) else np.zeros(len(share), bool)
+    place = measured(log, "pos_w")
+    if place is not None:
+        height = np.interp(time, place.time[place.valid], place.values[place.valid][:, 2])
+        flies &= height > np.min(height) + min(LIFTED, 0.5 * np.ptp(height))
+    if np.count_nonzero(flies) < 50:
+        return None
+    start, end = float(time[flies][0]), float(time[flies][-1])
+    inside = (time >= start) & (time <= end)
+    hover = float(np.median(share[inside]))
+    if "acc_b" not in log or np.std(share[inside]) < VARIED * hover:
+        return hover, 1.0, start, end
+    acc = log["acc_b"]
+    grid = time[inside][(time[inside] > acc.time[0] + 0.2) & (time[inside] < acc.time[-1] - 0.2)]
+    felt = relations.mean_over(acc.time[acc.valid], acc.values[acc.valid].astype(float)[:, 2:3], grid + LATE, 0.1)[:, 0] / GRAVITY
+    asked = relations.mean_over(time, share[:, None], grid, 0.1)[:, 0] / hover
+    slope, level = np.polyfit(asked, felt, 1)
+    if not (SLOPES[0] < slope < SLOPES[1] and level + slope > 0.5):
+        return hover, 1.0, start, end
+    return hover * float(1.0 + (1.0 - level - slope) / slope), float(slope), start, end
+
+
+def _between(log: FlightLog, start: float, end: float) -> FlightLog:
+    """A stretch of a log."""
+    channels = {}
+    for name, c in log.channels.items():
+        keep = (c.time >= start) & (c.time <= end)
+        channels[name] = Channel(c.time[keep], c.values[keep], c.unit, c.frame, c.valid[keep])
+    return FlightLog(channels, log.meta)
 
 
 def _followed(log: FlightLog) -> relations.Relation | None:
@@ -79,26 +145,18 @@ def _followed(log: FlightLog) -> relations.Relation | None:
     return found if found is not None and found.axes_correlation > FIRMLY else None
 
 
-def _nats(better: np.ndarray, plain: np.ndarray) -> float:
-    """Evidence of correlations against others [nats], counting ten independent samples a log."""
-    return float(5.0 * np.sum(np.log((1.0 - np.minimum(plain, 0.999) ** 2) / (1.0 - np.minimum(better, 0.999) ** 2))))
-
-
 def _axes(relation: Sequence[relations.Relation]) -> tuple[Mistake, np.ndarray] | None:
     """Exchanged or turned axes of the commanded rates, where all logs that can tell say the same, and they are most."""
     clear = [r for r in relation if r.axes_correlation > r.correlation + CLEARLY]
     names = {r.axes for r in clear}
-    own, best = (np.array([getattr(r, n) for r in clear]) for n in ("correlation", "axes_correlation"))
-    nats = _nats(best, np.maximum(own, 0.0)) - AXES_NATS
+    nats = sum(r.nats for r in clear)
     if len(names) != 1 or 2 * len(clear) < len(relation) or nats < AXES_NATS:
         return None
-    axes = names.pop().split(",")
-    matrix = np.zeros((3, 3))
-    for row, axis in enumerate(axes):
-        matrix[row, "xyz".index(axis[-1])] = -1.0 if axis.startswith("-") else 1.0
+    text = names.pop()
+    axes = text.split(",")
     turned = sorted(axis[-1] for axis in axes) == [axis[-1] for axis in axes]
     name, cause = ("rate_sign", "A commanded rate has the other sign") if turned else ("rate_axes", "Commanded rates are exchanged")
-    return Mistake(name, cause, f"x, y, z of the vehicle are ({','.join(axes)}) of the command", nats, len(clear)), matrix
+    return Mistake(name, cause, f"x, y, z of the vehicle are ({text}) of the command", nats, len(clear)), matrix_of(text)
 
 
 def _rate_unit(relation: Sequence[relations.Relation]) -> tuple[Mistake, np.ndarray] | None:

@@ -7,12 +7,15 @@ import numpy as np
 
 from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.likelihood.noise import highpass_sigma
+from visthrow.logs.check.relations import attitude_at
 from visthrow.logs.flightlog import Channel, FlightLog
 
 NEVER = 1e9  # a time after every flight [s]
 LEAST_SIGMA = {"pos_w": 2e-5, "quat_wb": 1e-4, "payload_pos_w": 2e-5, "rate_b": 1e-3}
 """Noise below which no channel is believed: what numerics and rounding leave [m], [rad], [m], [rad/s]."""
 
+BETWEEN = 0.05
+"""Attitudes further apart [s] tell nothing of the times between them."""
 AT_START = 0.25  # of a log, whose voltages tell how much charge was used before [s]
 
 
@@ -101,16 +104,30 @@ def record_of(log: FlightLog, number: int = 0) -> Recorded:
     command, pos, quat = log["command"], _samples(log, "pos_w"), _samples(log, "quat_wb")
     if pos is None or quat is None:
         raise DiagnoseError(f"flight {number} holds fewer than five poses of the vehicle")
-    common, at_pos, at_quat = np.intersect1d(np.round(pos.time, 7), np.round(quat.time, 7), return_indices=True)
-    if len(common) < 5:
-        raise DiagnoseError(f"flight {number}: positions and attitudes of the vehicle have no stamps in common")
-    pos = Samples(pos.time[at_pos], pos.values[at_pos], pos.sigma)
-    quat = Samples(pos.time, quat.values[at_quat], quat.sigma)
+    pos, quat = _paired(pos, quat, number)
     return Recorded(
         command.time[command.valid], np.asarray(command.values, dtype=float)[command.valid], _latch(log), _landing(log),
         pos, quat, _payload(log), _samples(log, "rate_b"),
         _voltage(log), _hung(log), _landing_point(log),
     )  # fmt: skip
+
+
+def _paired(pos: Samples, quat: Samples, number: int) -> tuple[Samples, Samples]:
+    """Positions and attitudes of the same times: of common stamps, else attitudes between their samples.
+
+    Raises:
+        DiagnoseError: Neither has them.
+    """
+    common, at_pos, at_quat = np.intersect1d(np.round(pos.time, 7), np.round(quat.time, 7), return_indices=True)
+    if len(common) >= 0.2 * min(len(pos.time), len(quat.time)) and len(common) >= 5:
+        time = pos.time[at_pos]
+        return Samples(time, pos.values[at_pos], pos.sigma), Samples(time, quat.values[at_quat], quat.sigma)
+    at = np.clip(np.searchsorted(quat.time, pos.time), 1, len(quat.time) - 1)
+    near = (quat.time[at] - quat.time[at - 1] < BETWEEN) & (pos.time >= quat.time[0]) & (pos.time <= quat.time[-1])
+    if np.count_nonzero(near) < 5:
+        raise DiagnoseError(f"flight {number}: positions and attitudes of the vehicle were never measured at one time")
+    time = pos.time[near]
+    return Samples(time, pos.values[near], pos.sigma), Samples(time, attitude_at(quat.time, quat.values, time).as_quat(), quat.sigma)
 
 
 def carriers(flights: Sequence[Recorded]) -> list[bool]:

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from visthrow.common.errors import LogError
-from visthrow.logs.blackbox_codec import ENCODINGS, Corrupt, EndOfLog, Reader, extend, plan
+from visthrow.logs.readers.blackbox.codec import ENCODINGS, Corrupt, EndOfLog, Reader, extend, plan
 
 MARKER = b"H Product:Blackbox flight data recorder by Nicholas Sherlock"
 MAIN, FRAMES, EVENT = b"IP", b"IPSGHE", ord("E")

@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from visthrow.common.errors import LogError
-from visthrow.logs.blackbox import BlackboxLog, read_blackbox
 from visthrow.logs.flightlog import Channel, FlightLog
 from visthrow.logs.mapping import ChannelMap
-from visthrow.logs.table import Table, make_channel
+from visthrow.logs.readers.blackbox.decoder import BlackboxLog, read_blackbox
+from visthrow.logs.readers.table import Table, make_channel
 from visthrow.logs.units import G
 
 MOTOR_ORDER = (3, 1, 2, 0)

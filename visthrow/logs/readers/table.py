@@ -13,8 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from visthrow.common.errors import LogError, suggest
+from visthrow.logs.axes import OURS, turn_of
 from visthrow.logs.flightlog import STANDARD_CHANNELS, Channel, FlightLog
-from visthrow.logs.mapping import ChannelMap, Split, TableMap, TimeColumn, signed_axes
+from visthrow.logs.mapping import ChannelMap, TableMap, TimeColumn
 from visthrow.logs.units import to_si
 
 Table = dict[str, np.ndarray]
@@ -23,14 +24,21 @@ Table = dict[str, np.ndarray]
 _EXPORTED = re.compile(r"(?P<name>\w+?)(?:\[(?P<index>[\d,]+)\])? \[(?P<unit>.+?)(?:, (?P<frame>world|body|camera|image|mocap))?\]")
 _LARGEST = 1e100
 """No number of a flight is as large, in whatever unit; its square is still a number."""
+_SNIFFED = 65536  # characters in which separators are looked for
+_COMMA = re.compile(r"\d,\d")
+_LIST = re.compile(r"[\[(].*[\])]")
+_PARTS = re.compile(r"[,;\s]+")
 _OPENERS = {".gz": gzip.decompress, ".xz": lzma.decompress}
 
 
 def read_table(path: str | Path) -> Table:
     """Read a table.
 
+    Cells may be separated by commas, semicolons, tabs or blanks, decimals written with a comma, lists stand in a cell
+    (``[1.0, 2.0]`` becomes ``name[0]``, ``name[1]``); without a header line columns are called ``column 1`` and so on.
+
     Args:
-        path: ``.csv``, ``.csv.gz``, ``.csv.xz`` or ``.parquet``.
+        path: ``.csv``, ``.csv.gz``, ``.csv.xz``, ``.txt`` or ``.parquet``.
 
     Raises:
         LogError: It cannot be read, has no rows, or a row has another number of cells than the header.
@@ -41,27 +49,62 @@ def read_table(path: str | Path) -> Table:
         if path.suffix == ".parquet":
             return _parquet(data, path)
         text = _OPENERS.get(path.suffix, bytes)(data).decode("utf-8-sig")
-        rows = list(csv.reader(io.StringIO(text, newline="")))
+        comma, rows = _rows(text)
     except (OSError, EOFError, UnicodeDecodeError, lzma.LZMAError, zlib.error, csv.Error) as error:
         raise LogError(f"{path}: cannot be read: {error}; expected a CSV table, plain, .gz or .xz") from error
-    header = [name.strip() for name in rows[0]] if rows else []
-    body = [row for row in rows[1:] if row]
+    header = [name.strip() for name in rows[0][1]] if rows else []
+    body = rows[1:]
+    if header and all(_is_number(cell, comma) for cell in header):
+        header, body = [f"column {i}" for i in range(1, len(header) + 1)], rows
     if len(header) < 2:
-        raise LogError(f"{path}: no header line with columns; expected a CSV table")
-    if body and len(body[-1]) < len(header):  # cut short while it was written
+        raise LogError(f"{path}: no header line with the columns' names; expected a CSV table")
+    if body and len(body[-1][1]) < len(header):  # cut short while it was written
         body.pop()
     if not body:
         raise LogError(f"{path}: a header of {len(header)} columns and no rows below it")
-    wrong = next((i for i, row in enumerate(body) if len(row) != len(header)), None)
+    wrong = next(((line, row) for line, row in body if len(row) != len(header)), None)
     if wrong is not None:
-        raise LogError(f"{path}: row {wrong + 1} has {len(body[wrong])} cells; the header has {len(header)}")
+        raise LogError(f"{path}: line {wrong[0]} has {len(wrong[1])} cells; the header has {len(header)}")
     twice = {name for name in header if header.count(name) > 1}
     if twice:
         raise LogError(f"{path}: column '{min(twice)}' stands twice in the header")
-    return {name: _column(cells) for name, cells in zip(header, zip(*body))}
+    table: Table = {}
+    for name, cells in zip(header, zip(*(row for _, row in body))):
+        table |= _lists(name, cells) or {name: _column(cells, comma)}
+    return table
 
 
-def _column(cells: tuple[str, ...]) -> np.ndarray:
+def _rows(text: str) -> tuple[bool, list[tuple[int, list[str]]]]:
+    """Return whether decimals have a comma, and each line that is not empty with its number."""
+    head = [line for line in text[:_SNIFFED].splitlines()[:20] if line.strip()] or [""]
+    mark = next((m for m in ";\t," if m in head[0]), " ")
+    comma = mark in ";\t" and any(map(_COMMA.search, head[1:])) and not any("." in line for line in head[1:])
+    reader = csv.reader(io.StringIO(text, newline=""), delimiter=mark, skipinitialspace=mark == " ")
+    return comma, [(reader.line_num, row) for row in reader if row]
+
+
+def _is_number(cell: str, comma: bool = False) -> bool:
+    try:
+        float(cell.replace(",", ".") if comma else cell)
+    except ValueError:
+        return False
+    return True
+
+
+def _lists(name: str, cells: tuple[str, ...]) -> Table:
+    """Return a column for each place of a column of lists; nothing where its cells hold none."""
+    first = next((cell.strip() for cell in cells if cell.strip()), "")
+    if not _LIST.fullmatch(first):
+        return {}
+    rows = [[float(part) if _is_number(part) else math.nan for part in _PARTS.split(c.strip("[]() \t"))] for c in cells]
+    width = max(map(len, rows))
+    values = np.array([row + [math.nan] * (width - len(row)) for row in rows])
+    return {f"{name}[{i}]": values[:, i] for i in range(width)}
+
+
+def _column(cells: tuple[str, ...], comma: bool = False) -> np.ndarray:
+    if comma:
+        cells = tuple(cell.replace(",", ".") for cell in cells)
     try:
         return np.array(cells, dtype=np.float64)
     except ValueError:
@@ -117,19 +160,21 @@ def _numbers(table: Table, name: str, source: str) -> np.ndarray:
     if name not in table:
         raise LogError(f"{source}: no column '{name}'; {suggest(name, table)}")
     if table[name].dtype.kind not in "fiub":
-        raise LogError(f"{source}: column '{name}' holds text such as '{table[name][0]}'; expected numbers")
+        row, cell = next((i, c) for i, c in enumerate(table[name].tolist(), start=1) if c.strip() and not _is_number(c))
+        raise LogError(f"{source}: column '{name}' holds text such as '{cell}' in row {row}; expected numbers")
     return table[name]
 
 
 def _stamps(table: Table, clock: TimeColumn, source: str) -> np.ndarray:
     if not clock.column:
-        return clock.row_period * np.arange(len(next(iter(table.values()))))
-    factor = to_si(clock.unit, "time")[1]
-    return _numbers(table, clock.column, source) * factor
+        return clock.row_period * np.arange(len(next(iter(table.values())))) + clock.offset
+    return _numbers(table, clock.column, source) * to_si(clock.unit, "time")[1] + clock.offset
 
 
-def _parts(table: Table, mapping: TableMap, count: int, source: str) -> list[tuple[np.ndarray, str]]:
-    split = mapping.split or Split()
+def _parts(table: Table, mapping: TableMap, count: int, source: str) -> list[tuple[np.ndarray | slice, str]]:
+    split = mapping.split
+    if split is None:
+        return [(slice(None), "")]
     everything = np.arange(count)
     if split.column:
         if split.column not in table:
@@ -152,13 +197,20 @@ def _parts(table: Table, mapping: TableMap, count: int, source: str) -> list[tup
     return parts
 
 
-def _log(table: Table, mapping: TableMap, rows: np.ndarray, label: str, source: str) -> FlightLog:
-    meta = {"source": source, "part": label, "rows": len(rows), "ingest": {}}
+def _log(table: Table, mapping: TableMap, rows: np.ndarray | slice, label: str, source: str) -> FlightLog:
+    count = len(next(iter(table.values()))[rows])
+    meta = {"source": source, "part": label, "rows": count, "ingest": {}}
     channels = {}
     for entry in mapping.channels:
         clock = mapping.clocks[entry.clock] if entry.clock and mapping.clocks else mapping.time
         time = _stamps(table, clock, source)[rows]
-        values = np.column_stack([_numbers(table, name, source)[rows] for name in entry.columns])
+        columns = [_numbers(table, name, source)[rows] for name in entry.columns]
+        if {len(column) for column in columns} != {len(time)}:
+            raise LogError(
+                f"{source}: channel '{entry.name}': {len(time)} stamps, columns of {', '.join(str(len(c)) for c in columns)}; "
+                "expected one table and its clock"
+            )
+        values = np.column_stack(columns)
         channel, notes = make_channel(time, values, entry, source)
         channels[entry.name] = channel
         meta["ingest"][entry.name] = notes | {"clock": entry.clock or "main"}
@@ -192,10 +244,14 @@ def make_channel(time: np.ndarray, values: np.ndarray, entry: ChannelMap, source
         notes["repeated"] = int(np.sum(np.diff(time) == 0.0))
         notes["backwards"] = int(np.sum(np.diff(time) < 0.0))
     time, values = time[ahead], values[ahead]
+    said = ~np.all(np.isnan(values), axis=1)  # a row of blanks is of another channel: no sample
+    notes["blank"] = int(np.sum(~said))
+    time, values = time[said], values[said]
     valid = np.all(np.abs(values) < _LARGEST, axis=1)  # not where it is NaN
     if entry.held and len(values):
         fresh = np.ones(len(values), dtype=bool)
-        fresh[1:] = np.any(values[1:] != values[:-1], axis=1)
+        same = (values[1:] == values[:-1]) | (np.isnan(values[1:]) & np.isnan(values[:-1]))
+        fresh[1:] = ~np.all(same, axis=1)
         notes["held"] = int(np.sum(~fresh))
         time, values, valid = time[fresh], values[fresh], valid[fresh]
     values = _converted(np.where(valid[:, None], values, 0.0), entry, factor)
@@ -220,8 +276,7 @@ def _converted(values: np.ndarray, entry: ChannelMap, factor: float) -> np.ndarr
     values = (values * entry.scale + entry.offset) * factor
     if entry.kind == "vector":
         if entry.axes and values.shape[1] == 3:
-            index, sign = zip(*signed_axes(entry.axes, entry.name))
-            return values[:, list(index)] * np.array(sign)
+            return values @ turn_of(entry.axes).T
         return values
     from scipy.spatial.transform import Rotation
 
@@ -232,16 +287,8 @@ def _converted(values: np.ndarray, entry: ChannelMap, factor: float) -> np.ndarr
     if not entry.axes and not entry.body_axes:
         return quat
     length = np.linalg.norm(quat, axis=1)
-    turned = Rotation.from_matrix(_matrix(entry.axes)) * Rotation.from_quat(np.where(length[:, None] > 0, quat, [0, 0, 0, 1]))
-    return (turned * Rotation.from_matrix(_matrix(entry.body_axes)).inv()).as_quat() * length[:, None]
-
-
-def _matrix(axes: str) -> np.ndarray:
-    """Rotation from the source's axes to ours, shape (3, 3)."""
-    matrix = np.zeros((3, 3))
-    for row, (index, sign) in enumerate(signed_axes(axes or "x,y,z", "axes")):
-        matrix[row, index] = sign
-    return matrix
+    turned = Rotation.from_matrix(turn_of(entry.axes or OURS)) * Rotation.from_quat(np.where(length[:, None] > 0, quat, [0, 0, 0, 1]))
+    return (turned * Rotation.from_matrix(turn_of(entry.body_axes or OURS)).inv()).as_quat() * length[:, None]
 
 
 def is_export(table: Table) -> bool:
@@ -292,14 +339,6 @@ def _as_numbers(table: Table, column: str, source: str) -> np.ndarray:
     if wrong:
         raise LogError(f"{source}: column '{column}' holds text such as '{wrong[0]}'; expected numbers, True or False")
     return np.array([words[cell] if cell in words else float(cell) for cell in cells.tolist()])
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
 
 
 def metadata_of(path: str | Path) -> dict:

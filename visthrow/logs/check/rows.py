@@ -11,7 +11,7 @@ ORDER = ("ok", "warn", "bad")
 class Row:
     """One finding."""
 
-    topic: str  # clock, gaps, values, noise, units, frames, delay, excited, answers, duplicates
+    topic: str  # clock, gaps, values, noise, units, frames, delay, cable, thrust, excited, answers, duplicates
     channel: str  # that it speaks of; or several; or "" for the whole log
     verdict: Verdict
     text: str
@@ -21,3 +21,16 @@ class Row:
 def worst(rows: list[Row]) -> Verdict:
     """Return the worst verdict among rows; ``ok`` where there is none."""
     return ORDER[max((ORDER.index(row.verdict) for row in rows), default=0)]
+
+
+@dataclass(frozen=True)
+class Known:
+    """What a model says of a vehicle, where it says it."""
+
+    cable_length: float = 0.0  # to the payload's centre [m]; 0: none
+    mass: float = 0.0  # of all that flies [kg]; 0: not known
+    thrust_input: str = ""  # channel that the thrust comes from; "": whatever the log holds
+    thrust_map: tuple[float, float, float] | None = None  # thrust of a motor (of all, for a thrust command) by powers 0, 1, 2 [N]
+
+
+NOTHING = Known()

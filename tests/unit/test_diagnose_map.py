@@ -1,0 +1,157 @@
+"""`visthrow diagnose map`: mappings proposed for real tables, tables of odd forms, logs of one flight joined, throttles as commands."""
+
+import gzip
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from tests import logfiles
+from tests.plants import paper_plant
+from tests.unit.test_diagnose_check import flight, log_of
+from visthrow import cli
+from visthrow.common.errors import LogError
+from visthrow.diagnose.check.run import check, contradictions
+from visthrow.diagnose.inputs import setup
+from visthrow.diagnose.inputs.map_cli import toml_of
+from visthrow.diagnose.inputs.proposal import propose
+from visthrow.diagnose.throw.interface import put_right
+from visthrow.diagnose.throw.recorded import record_of
+from visthrow.logs import read, table_of
+from visthrow.logs.flightlog import Channel, FlightLog
+from visthrow.logs.joining import join, offset_of
+
+REAL = Path(__file__).resolve().parents[1] / "data" / "real"
+SETS = {
+    "payload_cf_single/log204": "cf_payload", "payload_cf_two_drones/coltrans_02_cf3": "cf_payload_pair",
+    "nanobench_cf21/B3_figure8_fast_rep1": "nanobench_cf21", "pendulum_single/single_pendulum_id": "pendulum_encoder",
+}  # fmt: skip
+SLOPE = 0.15
+"""Of a slope that 20 s of an accelerometer with 0.1 m/s^2 of noise tell, averaged over 0.1 s."""
+FREE = {"est_vel_w", "motor_command", "current", "angle_rate", "torque_command_b"}
+"""Channels whose order or kind the proposal asks about, or that it leaves out."""
+
+
+@pytest.mark.parametrize("path", SETS)
+def test_a_proposal_names_the_columns_that_the_shipped_mapping_names(path, tmp_path):
+    """Columns and units of every channel that both have are the same, and the file loads."""
+    file = REAL / f"{path}.csv.gz"
+    found = propose(table_of(file), str(file))
+    (tmp_path / "mine.toml").write_text(toml_of(found, file.name))
+    mine, shipped = (setup.load(name).table for name in (tmp_path / "mine.toml", SETS[path]))
+    ours = {c.name: c for c in shipped.channels}
+    common = [c for c in mine.channels if c.name in ours and c.name not in FREE]
+    assert len(common) >= min(len(set(ours) - FREE) - 1, 8)
+    for channel in common:
+        other = ours[channel.name]
+        if channel.name != "rate_b":  # several columns hold rates
+            assert (channel.columns, channel.unit, channel.kind) == (other.columns, other.unit, other.kind)
+    assert (mine.time.column, mine.time.unit) == (shipped.time.column, shipped.time.unit)
+    log = read(file, mine)[0]
+    assert not contradictions(check([log], setup.known(tmp_path / "mine.toml")))
+
+
+def written(path: Path, columns: dict[str, np.ndarray], mark: str = ",", comma: bool = False) -> Path:
+    rows = "\n".join(mark.join(f"{x:.9g}" for x in row) for row in zip(*columns.values()))
+    text = f"{mark.join(columns)}\n{rows.replace('.', ',') if comma else rows}\n"
+    path.write_bytes(gzip.compress(text.encode()) if path.suffix == ".gz" else text.encode())
+    return path
+
+
+def table(**more: np.ndarray) -> dict[str, np.ndarray]:
+    """A flight as another tool might write it: milliseconds, millimetres, degrees, rates in another body frame."""
+    columns = flight(20.0)
+    angles = np.degrees(Rotation.from_quat(columns["quat_wb"]).as_euler("ZYX")[:, ::-1])
+    names = {"millis": 1e3 * columns["time"]}
+    names |= {f"uav{a}": 1e3 * c for a, c in zip("XYZ", columns["pos_w"].T)}
+    names |= dict(zip(("roll", "pitch", "yaw"), angles.T))
+    flipped = np.degrees(columns["rate_b"]) * [1.0, -1.0, -1.0]
+    names |= {f"gyro.{a}": c for a, c in zip("xyz", flipped.T)}
+    return names | {f"acc_{a}": c / 9.80665 for a, c in zip("xyz", columns["acc_b"].T)} | more
+
+
+def test_units_and_axes_are_found_by_physics(tmp_path):
+    path = written(tmp_path / "a.csv", {**table(), "vbat_mV": np.linspace(3900.0, 3700.0, 2000)}, mark=";", comma=True)
+    found = propose(table_of(path), "a.csv")
+    by = {c.name: c for c in found.mapping.channels}
+    assert (found.mapping.time.column, found.mapping.time.unit) == ("millis", "ms")
+    assert {name: c.unit for name, c in by.items()} == {
+        "quat_wb": "deg", "rate_b": "deg/s", "acc_b": "g", "battery_voltage": "mV", "pos_w": "mm",
+    }  # fmt: skip
+    assert by["rate_b"].axes == "x,-y,-z"
+    assert "axes by physics" in found.why["rate_b"]
+
+
+def test_the_command_writes_a_setup_that_check_takes(tmp_path, capsys):
+    path = written(tmp_path / "a.csv.gz", table())
+    assert cli.main(["diagnose", "map", str(path), "--out", str(tmp_path / "mine.toml")]) == 0
+    assert 'name = "rate_b"  # the rates of the attitude' in capsys.readouterr().out
+    assert cli.main(["diagnose", "check", str(path), "--config", str(tmp_path / "mine.toml"), "--no-pictures"]) == 0
+
+
+def test_what_is_not_known_is_asked(tmp_path):
+    columns = {name: values for name, values in table().items() if name != "millis"}
+    found = propose(table_of(written(tmp_path / "a.csv", columns)), "a.csv")
+    assert any("how far are the rows apart" in question for question in found.questions)
+    with pytest.raises(LogError, match="none of its 2 columns holds numbers that change"):
+        propose({"a": np.zeros(9), "b": np.array(["x"] * 9)}, "b.csv")
+    with pytest.raises(LogError, match=r"ending '\.ulg'; a mapping is for"):
+        table_of(tmp_path / "a.ulg")
+
+
+def test_logs_of_one_flight_are_joined_on_one_clock(tmp_path):
+    """Motion capture 37.42 s behind the vehicle's log; rates by gyro and by attitude tell."""
+    columns = flight(20.0)
+    whole = log_of(columns)
+    onboard = FlightLog({name: whole[name] for name in ("rate_b", "acc_b", "command")}, {"source": "a.npz"})
+    late = {n: Channel(whole[n].time[300:] + 37.42, whole[n].values[300:], whole[n].unit, whole[n].frame) for n in ("pos_w", "quat_wb")}
+    seen = FlightLog(late, {"source": "b.npz"})
+    offset, correlation, by = offset_of(onboard, seen)
+    assert offset == pytest.approx(-37.42, abs=0.01)
+    assert correlation > 0.9
+    assert by == "body rates"
+    onboard.save(tmp_path / "a.npz")
+    seen.save(tmp_path / "b.npz")
+    (log,) = read(f"{tmp_path}/a.npz+{tmp_path}/b.npz")
+    assert log["pos_w"].time == pytest.approx(whole["pos_w"].time[300:], abs=0.01)
+    assert set(log.channels) == {"rate_b", "acc_b", "command", "pos_w", "quat_wb"}
+    stranger = log_of(flight(20.0, seed=9))
+    with pytest.raises(LogError, match="not one flight"):
+        join([onboard, FlightLog({"quat_wb": stranger["quat_wb"]}, {"source": "c.npz"})])
+    with pytest.raises(LogError, match="nothing in it that the others measured too"):
+        join([onboard, FlightLog({"battery_voltage": Channel(np.arange(9.0), np.ones(9), "V")}, {"source": "d.npz"})])
+
+
+def test_a_throttle_becomes_a_command_in_newtons(tmp_path):
+    """A ULog holds ``thrust_body`` and rates; hover is at 0.37 of full, with a slope of 0.8 about it."""
+    pytest.importorskip("pyulog")
+    columns, plant = flight(20.0), paper_plant()
+    weight = 9.81 * (plant.vehicle.body.mass + plant.rope.payload_mass + plant.rope.rope_mass)
+    force = np.linalg.norm(columns["acc_b"], axis=1) / 9.81
+    smooth = np.convolve(np.pad(force, 5, mode="edge"), np.ones(11) / 11, "valid")
+    share = 0.37 * (1.0 + (smooth - 1.0) / 0.8)
+    ahead = np.interp(columns["time"] + 0.05, columns["time"], share)
+    stamps = (1_000_000 + np.round(1e6 * columns["time"])).astype(int).tolist()
+    flip = np.array([1.0, -1.0, -1.0])
+    quat = (columns["quat_wb"] * [1, -1, -1, 1])[:, [3, 0, 1, 2]]
+    logfiles.write_ulg(tmp_path / "a.ulg", {
+        ("vehicle_local_position", 0): (["uint64_t timestamp", *(f"float {n}" for n in ("x", "y", "z", "vx", "vy", "vz"))],
+         [(t, *(p * flip), *(v * flip)) for t, p, v in zip(stamps, columns["pos_w"], columns["vel_w"])]),
+        ("vehicle_attitude", 0): (["uint64_t timestamp", "float[4] q"], [(t + 3000, *q) for t, q in zip(stamps, quat)]),
+        ("sensor_combined", 0): (["uint64_t timestamp", "float[3] gyro_rad", "float[3] accelerometer_m_s2"],
+         [(t, *(w * flip), *(a * flip)) for t, w, a in zip(stamps, columns["rate_b"], columns["acc_b"])]),
+        ("vehicle_rates_setpoint", 0): (["uint64_t timestamp", "float roll", "float pitch", "float yaw", "float[3] thrust_body"],
+         [(t, *(c[1:] * flip), 0.0, 0.0, -u) for t, c, u in zip(stamps, columns["command"], ahead)]),
+    })  # fmt: skip
+    (log,) = read(tmp_path / "a.ulg")
+    assert "command" not in log
+    (made,), (mistake,) = put_right([log], plant)
+    assert mistake.name == "throttle"
+    assert "throttle / 0.37" in mistake.equation
+    command = made["command"]
+    true = weight * np.interp(command.time + 0.05, columns["time"], smooth)
+    assert np.mean(command.values[:, 0]) == pytest.approx(np.mean(true), rel=0.02)
+    assert np.polyfit(true, command.values[:, 0], 1)[0] == pytest.approx(1.0, abs=SLOPE)
+    recorded = record_of(made)
+    assert len(recorded.vehicle.time) == len(recorded.attitude.time) > 1000, "attitudes lie between the positions"

@@ -1,0 +1,189 @@
+"""Traps made of real flights: what is wrong is named, with the right reason, and good flights stay free of it."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests import logfiles
+from tests.unit.test_diagnose_check import faults, flight, log_of
+from visthrow.diagnose.check.run import check, contradictions, copies
+from visthrow.diagnose.inputs import setup
+from visthrow.logs import read
+from visthrow.logs.check import relations
+from visthrow.logs.check.rows import Known
+from visthrow.logs.flightlog import Channel, FlightLog
+
+REAL = Path(__file__).resolve().parents[1] / "data" / "real"
+FLIGHTS = {n: setup.read_logs([REAL / "payload_cf_single" / f"log{n}.csv.gz"], "cf_payload")[0] for n in (204, 205, 206)}
+"""Flights along x, along y, and in place."""
+CRAZYFLIE = setup.known("cf_payload")
+PATHS = ("pos_w", "vel_w", "payload_pos_w", "payload_vel_w", "mocap_pos_w")
+LATE = 0.1
+
+
+def changed(log: FlightLog, names, change) -> FlightLog:
+    channels = {n: Channel(c.time, change(c.values.astype(float)), c.unit, c.frame, c.valid) for n in names for c in [log[n]]}
+    return FlightLog({**log.channels, **channels}, log.meta)
+
+
+def shifted(log: FlightLog, *names: str, by: float = LATE) -> FlightLog:
+    channels = {n: Channel(c.time + by, c.values, c.unit, c.frame, c.valid) for n in names for c in [log[n]]}
+    return FlightLog({**log.channels, **channels}, log.meta)
+
+
+def bad(log: FlightLog, known: Known = CRAZYFLIE) -> str:
+    (checked,) = check([log], known)
+    return " | ".join(f"{row.topic} {row.channel}: {row.text}" for row in checked.rows if row.verdict == "bad")
+
+
+@pytest.mark.parametrize("number", FLIGHTS)
+def test_flights_as_they_are(number):
+    assert bad(FLIGHTS[number]) == ""
+
+
+@pytest.mark.parametrize("path", ["nanobench_cf21/B3_figure8_fast_rep1", "payload_cf_two_drones/coltrans_02_cf9"])
+def test_other_flights_as_they_are(path):
+    name = {"nanobench_cf21": "nanobench_cf21", "payload_cf_two_drones": "cf_payload_pair"}[path.split("/")[0]]
+    (log,) = setup.read_logs([REAL / f"{path}.csv.gz"], name)
+    assert bad(log, setup.known(name)) == ""
+
+
+@pytest.mark.parametrize("number", [204, 205])
+def test_exchanged_axes_are_named_with_their_evidence(number):
+    found = bad(changed(FLIGHTS[number], PATHS, lambda v: v[:, [1, 0, 2]]))
+    assert "fit with (y,x,z) of positions and velocities" in found
+    assert float(found.split(" nats better")[0].split()[-1]) > 15.0
+    assert "a mirror image" in found
+
+
+def test_a_mirror_image_is_named():
+    assert "fit with (x,-y,z) of positions and velocities" in bad(changed(FLIGHTS[205], PATHS, lambda v: v * [1, -1, 1]))
+
+
+def test_an_exchanged_accelerometer_is_named():
+    assert "acc_b fits as (y,x,z)" in bad(changed(FLIGHTS[204], ["acc_b"], lambda v: v[:, [1, 0, 2]]))
+
+
+@pytest.mark.parametrize(
+    ("streams", "row"),
+    [
+        (("quat_wb", "rate_b", "acc_b", "thrust_command"), "d(vel_w)/dt, quat_wb acc_b"),
+        (("rate_b", "acc_b"), "rate of quat_wb, rate_b"),
+        (("payload_pos_w",), "pos_w, payload_pos_w"),
+    ],
+)
+def test_late_streams_are_named_with_their_offset(streams, row):
+    (checked,) = check([shifted(FLIGHTS[204], *streams)], CRAZYFLIE)
+    (found,) = [r for r in checked.rows if (r.topic, r.channel, r.verdict) == ("delay", row, "bad")]
+    assert found.figures["delay_s"] == pytest.approx(LATE, abs=0.02)
+    assert contradictions([checked])
+
+
+def test_thrust_of_another_flight_is_refused():
+    found = bad(FlightLog({**FLIGHTS[205].channels, "thrust_command": FLIGHTS[204]["thrust_command"]}))
+    assert "the force does not follow the thrust" in found
+    assert "thrust of another flight" in found
+
+
+def test_early_thrust_is_named():
+    assert "the stream of the thrust is about" in bad(shifted(FLIGHTS[206], "thrust_command", by=-LATE))
+
+
+@pytest.mark.parametrize(
+    ("names", "factor", "words"),
+    [
+        (("thrust_command",), 101.97, "times the model's 0.0419 kg: in g of thrust"),
+        (("rate_b",), 57.3, "rate of quat_wb, rate_b: the second is 57.* times the first: one is in degrees"),
+        (("acc_b",), 1 / 9.80665, "not 9.81: one is in g"),
+        (PATHS, 1000.0, "millimetres taken for metres"),
+    ],
+)
+def test_units_are_named_by_their_ratio(names, factor, words):
+    found = bad(changed(FLIGHTS[204], names, lambda v: v * factor))
+    assert all(part in found for part in words.split(".*")), found
+
+
+def test_the_cable_is_held_against_the_models():
+    assert "apart by +70.3 % of the model's cable of 0.3 m: another cable" in bad(FLIGHTS[204], Known(cable_length=0.3))
+
+
+def test_a_copy_counts_once():
+    results = check([FLIGHTS[204], FLIGHTS[205], FLIGHTS[204]], CRAZYFLIE)
+    assert copies(results) == (2,)
+    assert not contradictions(results)
+
+
+def test_a_scale_of_thrust_that_differs_from_flight_to_flight():
+    logs = [*FLIGHTS.values(), changed(FLIGHTS[205], ["thrust_command"], lambda v: 1.3 * v)]
+    texts = [row.text for row in check(logs, CRAZYFLIE)[3].rows if row.verdict == "warn"]
+    assert any("the thrust's scale differs from flight to flight" in text for text in texts)
+
+
+@pytest.mark.parametrize(
+    ("factor", "words"), [(0.5, "rear left reads 0.50 of the others in flight: half"), (0.0, "sensor is dead"), (2.0, "twice")]
+)
+def test_a_rotor_sensor_that_reads_wrong(factor, words):
+    columns = flight()
+    speed = 1500.0 * np.sqrt(columns["command"][:, :1] / 2.0) * (1.0 + 0.01 * np.random.default_rng(0).normal(size=(1200, 4)))
+    rotors = Channel(columns["time"], speed, "rad/s")
+    assert "reads" not in faults(log_of(columns, motor_speed=rotors))
+    wrong = Channel(columns["time"], speed * [1.0, 1.0, factor, 1.0], "rad/s")
+    assert words in faults(log_of(columns, motor_speed=wrong))
+
+
+def test_jumps_in_every_channel_and_across_gaps():
+    columns = flight()
+    columns["rate_b"][700] += 90.0
+    columns["vel_w"][300] += 25.0
+    found = faults(log_of(columns), "warn")
+    assert "values rate_b: 2 jumps" in found
+    assert "values vel_w: 2 jumps" in found
+    columns = flight()
+    keep = np.ones(len(columns["time"]), bool)
+    keep[400:430] = False
+    whole = {name: values[keep] for name, values in columns.items()}
+    assert "across gaps" not in faults(log_of(whole), "warn")
+    whole["pos_w"] = whole["pos_w"] + np.where(whole["time"] > 4.2, 2.0, 0.0)[:, None] * [1.0, 0.0, 0.0]
+    assert "1 jumps across gaps, the largest 2" in faults(log_of(whole), "warn")
+
+
+def test_a_release_is_not_saturated():
+    columns = flight()
+    released = Channel(columns["time"], (columns["time"] > 5.0).astype(float), "1")
+    assert "saturated" not in faults(log_of(columns, release_command=released), "warn")
+
+
+def test_positions_at_10_hz_are_looked_at(tmp_path):
+    """ArduPilot's own logs hold its estimate at 10 Hz; the difference of two is then 0.2 s wide."""
+    columns, path = flight(), tmp_path / "a.BIN"
+    imu = ("QBffffff", "TimeUS,I,GyrX,GyrY,GyrZ,AccX,AccY,AccZ")
+    flip = np.array([1.0, -1.0, -1.0])
+    rows = [("IMU", (int(1e6 * t), 0, *(w * flip), *(a * flip))) for t, w, a in zip(columns["time"], columns["rate_b"], columns["acc_b"])]
+    rows += [
+        ("XKF1", (int(1e6 * t), 0, 0.0, 0.0, 0.0, *(v * flip), 0.0, *(p * flip), 0.0, 0.0, 0.0, 0.0))
+        for t, p, v in list(zip(columns["time"], columns["pos_w"], columns["vel_w"]))[::10]
+    ]
+    logfiles.write_bin(path, {"IMU": imu, "XKF1": logfiles.XKF1}, rows)
+    (log,) = read(path)
+    (checked,) = check([log])
+    assert checked.verdict != "bad"
+    compared = [row for row in checked.rows if row.channel == "d(pos_w)/dt, vel_w" and row.topic == "frames"]
+    assert compared
+    assert compared[0].figures["correlation"] > 0.95
+    time, rate = relations.derivative(log["pos_w"].time, log["pos_w"].values)
+    assert len(time) > 100
+    assert rate[:, 0] == pytest.approx(np.interp(time, log["vel_w"].time, log["vel_w"].values[:, 0]), abs=0.1)
+
+
+def test_explain_leaves_a_copy_out(tmp_path, capsys):
+    from visthrow import cli
+
+    files = [REAL / "payload_cf_single" / "log204.csv.gz"]
+    copy = tmp_path / "copy.csv.gz"
+    copy.write_bytes(files[0].read_bytes())
+    names = [*map(str, files), str(copy), "--config", "cf_payload", "--only", "rotor_drag_xy", "--no-report"]
+    assert cli.main(["diagnose", "explain", *names]) == 0
+    out = capsys.readouterr().out
+    assert "left out: copy.csv.gz: a copy of another log, which counts once" in out
+    assert "2 log(s)" in out

@@ -1,0 +1,452 @@
+"""Proposal of a mapping: what the columns of a foreign table are, by their names, their values and physics.
+
+Names say which columns belong together and hint at what they are; values say the units (a quaternion has length 1, a resting
+accelerometer 9.81 m/s^2 or 1 g); physics decides: a velocity is the derivative of a position, rates are those of the attitude, a
+payload keeps its distance. What none of them tells becomes a question.
+"""
+
+import re
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from visthrow.common.errors import ConfigError, LogError
+from visthrow.logs.check import physics, relations, thrust
+from visthrow.logs.flightlog import Channel, FlightLog
+from visthrow.logs.mapping import ChannelMap, TableMap, TimeColumn
+from visthrow.logs.readers.table import Table, logs_of, make_channel
+from visthrow.logs.units import UNITS
+
+_SPLIT = re.compile(r"[^A-Za-z0-9]+|(?<=[a-z])(?=[A-Z])|(?<=\D)(?=\d)|(?<=\d)(?=\D)")
+_TIME = re.compile(
+    r"(^|[._/: ])(t|ts|time|stamp|timestamp|secs?|seconds|millis|micros|frame)([._ \[(\d]|$)", re.IGNORECASE
+)
+_SUFFIX = {
+    **{unit: unit for unit in ("s", "ms", "us", "ns", "mm", "cm", "m", "deg", "rad", "g", "gf", "rpm")},
+    "sec": "s", "mv": "mV", "v": "V", "n": "N", "dps": "deg/s", "a": "A", "ma": "mA",
+}  # fmt: skip
+_TARGET = re.compile(r"target|setpoint|(^|[._])sp[._]|desired|des([._]|$)|ref|cmd|rpyd|omegar|goal|^sp_|residual", re.IGNORECASE)
+_NOT_VEHICLE = re.compile(r"payload|load|ball|(^|[._])l_|cam|object|tag|marker", re.IGNORECASE)
+_ESTIMATE = re.compile(r"est|ekf|kalman", re.IGNORECASE)
+_CAPTURE = re.compile(r"loc|mocap|vicon|opti|qualisys", re.IGNORECASE)
+_HINTS = (
+    ("acc_b", r"acc|imu.*a[xyz]?$"), ("rate_b", r"gyro|omega|rate|angvel|angular|(^|[._])w$"),
+    ("velocity", r"vel|(^|[._])v$|speed"), ("euler", r"rpy|roll|pitch|euler|attitude|orient"),
+    ("position", r"pos|(^|[._])p$|loc|pose|translation|estimate|mocap|vicon|opti|uav|drone|quad|vehicle|copter|^$"),
+)  # fmt: skip
+_FIRMLY, _BELONGS = 0.8, 0.6  # correlations of what is the derivative of what
+_FASTEST, _WIDEST = 40.0, 60.0  # of vehicles in a hall [m/s], [m]
+
+
+@dataclass
+class Group:
+    """Columns that belong together."""
+
+    stem: str  # what their names share
+    columns: tuple[str, ...]
+    values: np.ndarray  # shape (T, number of columns)
+    unit: str = ""  # that the names end in, "" where they do not
+
+
+@dataclass
+class Proposal:
+    """A mapping, why, and what is left to ask."""
+
+    mapping: TableMap | None
+    flyer: dict | None = None  # parameters of the flying model as far as the log tells them, None where it cannot fly one
+    why: dict[str, str] = field(default_factory=dict)  # by channel
+    questions: list[str] = field(default_factory=list)
+
+
+def propose(table: Table, source: str) -> Proposal:
+    """Propose a mapping of the columns of a table, or of the tables of a recording.
+
+    Raises:
+        LogError: No column holds numbers that change.
+    """
+    numbers = {name: cells.astype(float) for name, cells in table.items() if cells.dtype.kind in "fiub"}
+    if not any(np.nanstd(cells) > 0.0 for cells in numbers.values() if np.any(np.isfinite(cells))):
+        raise LogError(f"{source}: none of its {len(table)} columns holds numbers that change")
+    found, channels, clocks = Proposal(None), {}, {}
+    for topic, part in _tables(numbers).items():
+        if len(next(iter(part.values()))) < 50:
+            continue
+        clock, time = _clock(part, found)
+        columns = {name: cells for name, cells in part.items() if name != clock.column and len(cells) == len(time)}
+        mine = _Chooser(time, _groups(columns), found).channels()
+        for entry in mine:
+            if entry.name in channels:
+                found.questions.append(f"'{entry.name}' is also {', '.join(entry.columns)}: which one?")
+            else:
+                channels[entry.name] = replace(entry, clock=topic)
+        if mine:
+            clocks[topic] = clock
+    if not channels:
+        found.questions.append("no column looks like a position, an attitude, rates, forces or motors: which columns are they?")
+        return found
+    first, *others = clocks
+    entries = tuple(replace(c, clock="" if c.clock == first else c.clock) for c in channels.values())
+    found.mapping = TableMap(clocks[first], entries, {name: clocks[name] for name in others} or None)
+    _corrected(table, source, found)
+    return found
+
+
+def _tables(numbers: Table) -> dict[str, Table]:
+    """Columns by the table that they are of: what stands before a colon."""
+    tables: dict[str, Table] = {}
+    for name, cells in numbers.items():
+        tables.setdefault(name.rpartition(":")[0], {})[name] = cells
+    return tables
+
+
+def _clock(numbers: Table, found: Proposal) -> tuple[TimeColumn, np.ndarray]:
+    """The column of stamps and its unit, or evenly spaced rows."""
+    rising = [name for name, cells in numbers.items() if _rises(cells)]
+    named = [name for name in rising if _TIME.search(name)]
+    name = next(iter(named or rising), None)
+    if name is None:
+        count = max(map(len, numbers.values()))
+        found.questions.append("no column rises as a clock does: how far are the rows apart? row_period = 0.01 [s] is a guess")
+        return TimeColumn(row_period=0.01), 0.01 * np.arange(count)
+    step = float(np.nanmedian(np.diff(numbers[name])))
+    told = _SUFFIX.get(_words(name)[-1], "")
+    rate = re.search(r"(\d+) ?hz", name, re.IGNORECASE)
+    if rate and f"1/{rate[1]} s" in UNITS:
+        told = f"1/{rate[1]} s"
+    fitting = [unit for unit in ("s", "ms", "us", "ns") if 2e-4 <= step * UNITS[unit][1] <= 0.25]
+    unit = told if told in UNITS and UNITS[told][0] == "s" else fitting[0] if fitting else "s"
+    if not told and len(fitting) != 1:
+        found.questions.append(f"time '{name}': a step of {step:g} fits the units {', '.join(fitting) or 'of none'}; '{unit}' is a guess")
+    if not named:
+        found.questions.append(f"is '{name}', the first column that rises, the time?")
+    found.why["time"] = f"rises by {step:g} a row, {1.0 / (step * UNITS[unit][1]):.4g} Hz"
+    return TimeColumn(name, unit), numbers[name] * UNITS[unit][1]
+
+
+def _rises(cells: np.ndarray) -> bool:
+    steps = np.diff(cells[np.isfinite(cells)])
+    return len(steps) > 10 and bool(np.all(steps >= 0.0)) and float(np.mean(steps > 0.0)) > 0.3
+
+
+def _words(name: str) -> list[str]:
+    last = re.split(r"[^A-Za-z0-9]+", name.rstrip(")]} "))[-1].lower()
+    return [last] if last in _SUFFIX else [word.lower() for word in _SPLIT.split(name) if word] or [last]
+
+
+_ENDINGS = {**{letter: letter for letter in "xyzw"}, "north": "x", "east": "y", "down": "z", "roll": "x", "pitch": "y", "yaw": "z",
+            "0": "x", "1": "y", "2": "z", "3": "w"}  # fmt: skip
+_COMPONENT = re.compile(
+    r"^(.*?)[._\[ (]*(roll|pitch|yaw|north|east|down|[xyzw]|[0-3])[\])]?"
+    r"(?:[._ \[(]+(mm|cm|m|deg|rad|dps|g|mg|mps|body|world|vicon|mocap|si)[\])]?)?$",
+    re.IGNORECASE,
+)
+_MOTOR = re.compile(r"^(.*?)(?:motor|pwm|rotor|rpm|m|esc|erpm|output|servo)[._\[]?(\d)\]?([._][a-z]+)?$", re.IGNORECASE)
+
+
+def _groups(numbers: Table) -> list[Group]:
+    """Columns in threes (x, y, z or roll, pitch, yaw) and fours (a quaternion's, motors'), then single ones."""
+    parts: dict[tuple[str, str], dict[str, str]] = {}
+    motors: dict[str, list[str]] = {}
+    for name in numbers:
+        motor, match = _MOTOR.match(name), _COMPONENT.match(name)
+        if motor:
+            motors.setdefault(motor[1] + (motor[3] or ""), []).append(name)
+        if match:
+            angle = "rpy" if match[2].lower() in ("roll", "pitch", "yaw") else ""
+            parts.setdefault((match[1] + angle, (match[3] or "").lower()), {}).setdefault(_ENDINGS[match[2].lower()], name)
+    groups, used = [], set()
+    for names in motors.values():
+        if len(names) == 4:
+            groups.append(Group("motor", tuple(names), np.column_stack([numbers[n] for n in names])))
+            used |= set(names)
+    for (stem, unit), of in parts.items():
+        for letters in ("xyzw", "xyz"):
+            columns = tuple(of[letter] for letter in letters if letter in of)
+            if len(columns) == len(letters) and not used & set(columns):
+                groups.append(Group(stem, columns, np.column_stack([numbers[n] for n in columns]), _SUFFIX.get(unit, "")))
+                used |= set(columns)
+                break
+    singles = [name for name in numbers if name not in used]
+    return groups + [Group(name, (name,), numbers[name][:, None], _SUFFIX.get(_words(name)[-1], "")) for name in singles]
+
+
+class _Chooser:
+    """Decides which group is which channel."""
+
+    def __init__(self, time: np.ndarray, groups: list[Group], found: Proposal) -> None:
+        self.time, self.found = time, found
+        self.groups = [g for g in groups if np.any(np.nanstd(g.values, axis=0) > 0.0)]
+        self.taken: set[int] = set()
+        self.made: dict[str, tuple[ChannelMap, Channel]] = {}
+
+    def channels(self) -> list[ChannelMap]:
+        """All that are recognised, the vehicle's path first."""
+        self._quaternions()
+        self._positions()
+        self._velocities()
+        self._angles()
+        self._rates()
+        self._forces()
+        self._inputs()
+        if "pos_w" in self.made and not self.made.keys() & {"quat_wb", "rate_b", "acc_b", "motor_command", "vel_w"}:
+            self.found.questions.append("nothing but pos_w moves: if that is a payload or a ball, call it payload_pos_w")
+        for group in self._open(1):
+            values = np.unique(group.values[np.isfinite(group.values)])
+            whole = 1 < len(values) <= 64 and np.all(values == np.round(values))
+            if whole and re.search(r"ball|track|body|id$|test|run|flight", group.stem):
+                ask = f'[table.split] column = "{group.stem}"'
+                self.found.questions.append(f"'{group.stem}' has {len(values)} values: one log for each? {ask}")
+        return [entry for entry, _ in self.made.values()]
+
+    def _open(self, size: int) -> list[Group]:
+        return [g for g in self.groups if id(g) not in self.taken and g.values.shape[1] == size and not _TARGET.search(g.stem)]
+
+    def _take(self, name: str, group: Group, entry: ChannelMap, why: str) -> None:
+        """Make a channel of a group, unless its units contradict what the name stands for."""
+        values = group.values
+        if np.mean(np.all(values[1:] == values[:-1], axis=1)) > 0.5:
+            entry, why = replace(entry, held=True), why + "; its values are held between measurements"
+        try:
+            channel, _ = make_channel(self.time, values, entry, "table")
+        except (ConfigError, LogError):
+            return
+        self.taken.add(id(group))
+        self.made[name], self.found.why[name] = (entry, channel), why
+
+    def _hinted(self, group: Group, kind: str) -> bool:
+        stem = group.stem.lower()
+        return bool(re.search(dict(_HINTS)[kind], stem)) and not any(
+            re.search(of, stem) for name, of in _HINTS if name not in (kind, "position")
+        )
+
+    def _quaternions(self) -> None:
+        for group in self._open(4):
+            if group.stem == "motor" or not 0.95 < np.nanmedian(np.linalg.norm(group.values, axis=1)) < 1.05:
+                continue
+            other = _NOT_VEHICLE.search(group.stem)
+            name = ("payload_quat_wb" if "cam" not in group.stem.lower() else "marker_quat_c") if other else "quat_wb"
+            if name in self.made:
+                name = "est_quat_wb" if name == "quat_wb" and "est" in group.stem.lower() else ""
+            if not name:
+                continue
+            order = "xyzw" if group.columns[0] == sorted(group.columns)[1] or group.columns[-1].lower().find("w") >= 0 else "wxyz"
+            frame = "" if name == "quat_wb" else "camera" if name == "marker_quat_c" else "world"
+            entry = ChannelMap(name, group.columns, "1", "quaternion", order, frame=frame)
+            self._take(name, group, entry, "four columns of length 1")
+
+    def _positions(self) -> None:
+        smooth = [g for g in self._open(3) if self._smooth(g)]
+        groups = [g for g in smooth if self._hinted(g, "position") or g.unit in ("mm", "cm", "m")]
+        moving = [g for g in smooth if self._hinted(g, "velocity")] + groups
+        groups = [g for g in groups if not self._derived(g, moving)]
+        for group in [g for g in groups if "cam" in g.stem.lower()]:
+            unit = self._length_unit(group)
+            if unit and "marker_pos_c" not in self.made:
+                entry = ChannelMap("marker_pos_c", group.columns, unit, frame="camera")
+                self._take("marker_pos_c", group, entry, "three columns that move smoothly; their name speaks of a camera")
+        paths = [(g, unit) for g in groups if "cam" not in g.stem.lower() and (unit := self._length_unit(g))]
+        pay = self._payload(paths)
+        vehicles = [(g, u) for g, u in paths if pay is None or g is not pay[0]]
+        for group, unit in vehicles:
+            told = "est_pos_w" if _ESTIMATE.search(group.stem) else "mocap_pos_w" if _CAPTURE.search(group.stem) else "pos_w"
+            name = next((n for n in (["pos_w", told] if len(vehicles) == 1 or told == "pos_w" or group is vehicles[0][0] else [told])
+                         if n not in self.made), "")  # fmt: skip
+            if name:
+                wide = float(np.nanmax(np.nanstd(group.values, axis=0)))
+                entry = ChannelMap(name, group.columns, unit, frame="" if name == "pos_w" else "world")
+                self._take(name, group, entry, f"three columns that move smoothly, by {wide:.3g} {unit} (sd)")
+        if len(vehicles) > 1:
+            listed = "; ".join(", ".join(g.columns) for g, _ in vehicles)
+            self.found.questions.append(f"several positions ({listed}): which is the vehicle's, and by which sensor? The first is taken")
+        if pay is not None:
+            self._take("payload_pos_w", pay[0], ChannelMap("payload_pos_w", pay[0].columns, pay[1]), pay[2])
+
+    def _length_unit(self, group: Group) -> str:
+        """Unit of a position: as named, else that in which it is no faster and wider than a hall; "" where none fits."""
+        if group.unit in ("mm", "cm", "m"):
+            return group.unit
+        good = np.all(np.isfinite(group.values), axis=1)
+        wide = float(np.max(np.ptp(group.values[good], axis=0))) if np.any(good) else 0.0
+        if wide <= 0.0:
+            return ""
+        unit = "mm" if wide > _WIDEST else "m"
+        if unit == "m" and wide > 0.3 * _WIDEST:
+            self.found.questions.append(f"{', '.join(group.columns)} span {wide:.3g}: metres are a guess")
+        return unit
+
+    def _payload(self, paths: list[tuple[Group, str]]) -> tuple[Group, str, str] | None:
+        """The path below another one that keeps its distance from it."""
+        found = []
+        for upper, a in paths:
+            for lower, b in paths:
+                if upper is lower:
+                    continue
+                gap = lower.values * UNITS[b][1] - upper.values * UNITS[a][1]
+                length = np.linalg.norm(gap, axis=1)
+                middle, spread = np.nanmedian(length), np.nanstd(length)
+                if 0.05 < middle < 20.0 and spread < 0.1 * middle and np.nanmedian(gap[:, 2]) < -0.3 * middle:
+                    found.append((spread / middle, lower, b, middle))
+        best = min(found, key=lambda of: of[0], default=None)
+        if best is None and len(paths) == 1 and _NOT_VEHICLE.search(" ".join(paths[0][0].columns)):
+            return (*paths[0], "the only path, and its name speaks of no vehicle")
+        return best and (best[1], best[2], f"keeps {best[3]:.3f} m from another path, below it")
+
+    def _smooth(self, group: Group) -> bool:
+        values = group.values[np.all(np.isfinite(group.values), axis=1)]
+        if len(values) < 50:
+            return False
+        moves, steps = np.std(values, axis=0), np.std(np.diff(values, axis=0), axis=0)
+        return bool(np.max(moves) > 0.0 and np.max(steps) < 0.3 * np.max(moves))
+
+    def _derived(self, group: Group, groups: list[Group]) -> bool:
+        """Whether a group is the derivative of another one."""
+        return any(other is not group and self._relation(other, group, _FIRMLY) is not None for other in groups)
+
+    def _relation(self, path: Group, rate: Group, least: float) -> relations.Relation | None:
+        time, values = self.time, path.values
+        good = np.isfinite(time) & np.all(np.isfinite(values), axis=1)
+        both = good & np.all(np.isfinite(rate.values), axis=1)
+        both[1:] &= np.diff(np.maximum.accumulate(np.nan_to_num(time))) > 0.0
+        if np.sum(both) < 100:
+            return None
+        at, derived = relations.derivative(time[both], values[both], 0.1)
+        found = relations.relate(at, derived, time[both], rate.values[both], reach=0.2)
+        return found if found is not None and found.correlation > least and abs(found.delay) < 0.15 else None
+
+    def _velocities(self) -> None:
+        for name in ("pos_w", "payload_pos_w", "est_pos_w"):
+            if name not in self.made:
+                continue
+            entry = self.made[name][0]
+            path = next(g for g in self.groups if g.columns == entry.columns)
+            found = [(r.correlation, g, r) for g in self._open(3) if (r := self._relation(path, g, _BELONGS)) is not None]
+            if not found:
+                continue
+            _, group, relation = max(found, key=lambda of: of[0])
+            size = UNITS[entry.unit][1] / relation.scale
+            unit = min(("m/s", "cm/s", "mm/s"), key=lambda u: abs(np.log(size / UNITS[u][1])))
+            own = name.replace("pos", "vel")
+            frame = "world" if own == "est_vel_w" else ""
+            why = f"the derivative of {name}, correlation {relation.correlation:.2f}, {relation.scale:.3g} of its unit a second"
+            self._take(own, group, ChannelMap(own, group.columns, unit, frame=frame), why)
+
+    def _angles(self) -> None:
+        for group in self._open(3):
+            if "quat_wb" in self.made or not self._hinted(group, "euler") or not self._smooth(group):
+                continue
+            largest = float(np.nanpercentile(np.abs(group.values), 99))
+            unit = group.unit if group.unit in ("deg", "rad") else "deg" if largest > 7.0 else "rad"
+            if largest < 7.0 and not group.unit:
+                listed = ", ".join(group.columns)
+                self.found.questions.append(f"angles {listed} reach {largest:.3g}: radians are taken; small ones may be degrees")
+            entry = ChannelMap("quat_wb", group.columns, unit, "euler")
+            self._take("quat_wb", group, entry, f"roll, pitch, yaw up to {largest:.3g} {unit}")
+
+    def _rates(self) -> None:
+        attitude = self.made.get("quat_wb", (None, None))[1]
+        best = None
+        for group in self._open(3):
+            if not self._hinted(group, "rate_b"):
+                continue
+            found, times = None, 1.0
+            if attitude is not None and len(attitude.time) > 100:
+                at, derived = relations.rates_of(attitude.time[attitude.valid], attitude.values[attitude.valid])
+                good = np.all(np.isfinite(group.values), axis=1)
+                found = relations.relate(at, derived, self.time[good], group.values[good], reach=0.2)
+                times = float(np.sqrt(np.mean(np.var(group.values[good], axis=0)) / max(np.mean(np.var(derived, axis=0)), 1e-12)))
+            score = found.axes_correlation if found is not None else 0.0
+            if best is None or score > best[0]:
+                best = (score, group, times)
+        if best is None:
+            return
+        score, group, times = best
+        largest = float(np.nanpercentile(np.abs(group.values), 99))
+        unit = group.unit if group.unit.endswith("/s") else "deg/s" if largest > 30.0 else "rad/s"
+        why = f"99 % within {largest:.3g}"
+        if score > _BELONGS:
+            unit = "deg/s" if times > 7.0 else "rad/s"
+            why = f"the rates of the attitude, correlation {score:.2f}, {times:.3g} times"
+        self._take("rate_b", group, ChannelMap("rate_b", group.columns, unit), why)
+
+    def _forces(self) -> None:
+        for group in self._open(3):
+            size = float(np.nanmedian(np.linalg.norm(group.values, axis=1)))
+            unit = next((u for u in ("m/s^2", "g", "mg") if 0.8 < size * UNITS[u][1] / physics.GRAVITY < 1.25), "")
+            if unit and self._hinted(group, "acc_b") and "acc_b" not in self.made:
+                entry = ChannelMap("acc_b", group.columns, unit, frame="body")
+                self._take("acc_b", group, entry, f"a middle size of {size:.3g}: gravity in {unit}")
+
+    def _inputs(self) -> None:
+        for group in self._open(4):
+            if group.stem == "motor" and "motor_command" not in self.made:
+                high = float(np.nanpercentile(group.values, 99))
+                unit = "1/65535" if high > 5000.0 else "1/1000" if high > 150.0 else "%" if high > 2.0 else "1"
+                self._take("motor_command", group, ChannelMap("motor_command", group.columns, unit), f"four motors up to {high:.5g}")
+                self.found.questions.append(
+                    f"motors {', '.join(group.columns)}: order them front left, front right, rear left, rear right "
+                    "(Crazyflie: 4, 1, 3, 2; Betaflight: 4, 2, 3, 1; PX4: 3, 1, 2, 4). Are they commands, or speeds?"
+                )
+        for group in self._open(1):
+            stem = group.stem.lower()
+            middle = float(np.nanmedian(group.values))
+            if re.search(r"vbat|volt|batt", stem) and "battery_voltage" not in self.made and middle > 0.0:
+                units = (group.unit,) if group.unit in ("V", "mV") else ("V", "cV", "mV")
+                unit = next((u for u in units if 2.5 < middle * UNITS[u][1] < 60.0), "")
+                if unit:
+                    entry = ChannelMap("battery_voltage", group.columns, unit)
+                    self._take("battery_voltage", group, entry, f"a middle of {middle:.4g}: a pack in {unit}")
+            elif re.search(r"theta|angle", stem) and "angle" not in self.made and not self.made.keys() & {"quat_wb"}:
+                unit = group.unit if group.unit in ("deg", "rad") else "rad"
+                self._take("angle", group, ChannelMap("angle", group.columns, unit), f"an angle, by its name; a middle of {middle:.3g}")
+            elif re.search(r"thrust", stem) and "thrust_command" not in self.made:
+                unit = group.unit if group.unit in ("N", "gf") else "N"
+                self._take("thrust_command", group, ChannelMap("thrust_command", group.columns, unit), f"a middle of {middle:.4g}")
+                self.found.questions.append(f"thrust '{group.stem}': newtons of all motors together, as taken?")
+
+
+def _corrected(table: Table, source: str, found: Proposal) -> None:
+    """Read the table by the proposal, hold it against physics, and turn axes that another set explains; mirrors are asked about."""
+    for _ in range(3):
+        log = logs_of(table, found.mapping, source)[0]
+        full = FlightLog({n: c for n, c in log.channels.items() if np.sum(c.valid) >= 50}, log.meta)
+        wrong = [row for row in physics.look(full) if row.verdict == "bad"]
+        turns = [row for row in wrong if row.topic == "frames" and "axes" in row.figures and row.channel.endswith("rate_b")]
+        if not turns or "a mirror image" in turns[0].text:
+            break
+        row = turns[0]
+        entries = [replace(c, axes=row.figures["axes"]) if c.name == "rate_b" else c for c in found.mapping.channels]
+        if entries == list(found.mapping.channels):
+            break
+        found.mapping = replace(found.mapping, channels=tuple(entries))
+        found.why["rate_b"] += f"; axes by physics: {row.text}"
+    found.questions += [f"physics speaks against {row.channel}: {row.text}" for row in wrong]
+    found.flyer = _flyer(full, found)
+
+
+def _flyer(log: FlightLog, found: Proposal) -> dict | None:
+    """A flying model to begin with: thrust scaled so that it carries the vehicle, the rest as of a small quadrotor at rest air."""
+    told = thrust.thrust_of(log)
+    if told is None or "quat_wb" not in log or "pos_w" not in log or np.median(told[2]) <= 0.0:
+        return None
+    mass, gap = thrust.mass_of(log), None
+    if "payload_pos_w" in log:
+        (time, pos), (time_p, pos_p) = physics.valid(log["pos_w"]), physics.valid(log["payload_pos_w"])
+        gap = float(np.median(np.linalg.norm(pos_p - relations.on_grid(time, pos, time_p), axis=1)))
+    name, _, total = told
+    motors = 1 if name in ("thrust_command", "throttle") else 4
+    hover = float(np.median(total[total > 0.5 * np.percentile(total, 90)])) / motors
+    weighed = mass or 1.0
+    first = 1.0 if mass else weighed * physics.GRAVITY / motors / hover
+    why = "is what its thrust carries" if mass else "stands for any: the thrust is scaled to it"
+    ask = ", payload and all; what does the payload weigh?" if gap else ""
+    found.questions.append(f"what does the vehicle weigh? {weighed:.4g} kg {why}{ask}")
+    power = [0.0, 0.0, first / hover] if name == "motor_speed" else [0.0, first, 0.0]
+    period = float(np.median(np.diff(log["pos_w"].time)))
+    table = {
+        "input": name, "position": "pos_w", "attitude": "quat_wb", "mass": round(weighed * (0.85 if gap else 1.0), 5), "gravity": 9.81,
+        "thrust_map": [float(f"{x:.4g}") for x in power], "motor_time_constant": 0.03, "command_delay": 0.0,
+        "reference_voltage": float(np.round(np.median(log["battery_voltage"].values), 2)) if "battery_voltage" in log else 1.0,
+        "voltage_coefficient": 0.0, "drag_xy": 0.0, "drag_z": 0.0, "lowest": 0.3, "window": 1.0, "step": 0.02,
+        "every": max(1, round(0.03 / period)), "most_windows": 24,
+    }  # fmt: skip
+    return table | ({"cable": {"length": round(gap, 4), "mass": round(0.15 * weighed, 5)}} if gap else {})

@@ -1,0 +1,59 @@
+"""Exchanges of axes, written as text: ``"x,-y,-z"`` says that our x, y, z are the source's x, its -y and its -z. Onboard-safe.
+
+Of the 48 such sets 24 are turns; the others are mirror images.
+"""
+
+import re
+from itertools import permutations, product
+
+import numpy as np
+
+OURS = "x,y,z"
+"""Axes that are ours already."""
+_AXIS = re.compile(r"[+-]?[xyz]")
+
+
+def matrix_of(axes: str) -> np.ndarray:
+    """Return the matrix of a set of axes, mirror images too: ``v_ours = matrix @ v_source``, shape (3, 3).
+
+    Raises:
+        ValueError: Not three signed letters, or one of them twice.
+    """
+    words = [word.strip() for word in axes.split(",")]
+    if len(words) != 3 or not all(map(_AXIS.fullmatch, words)) or len({word[-1] for word in words}) != 3:
+        raise ValueError(f"axes '{axes}'; expected x, y and z once each, signed, such as 'x,-y,-z'")
+    matrix = np.zeros((3, 3))
+    for row, word in enumerate(words):
+        matrix[row, "xyz".index(word[-1])] = -1.0 if word[0] == "-" else 1.0
+    return matrix
+
+
+def turn_of(axes: str) -> np.ndarray:
+    """Return the matrix of a set of axes that is a turn, shape (3, 3).
+
+    Raises:
+        ValueError: As :func:`matrix_of`, or a mirror image.
+    """
+    matrix = matrix_of(axes)
+    if is_mirror(axes):
+        raise ValueError(
+            f"axes '{axes}' mirror the world: no rotation turns them into ours; turn one sign or exchange two letters. "
+            f"The 24 turns: {' '.join(TURNS)}"
+        )
+    return matrix
+
+
+def is_mirror(axes: str) -> bool:
+    """Tell whether a set of axes is a mirror image."""
+    return bool(np.linalg.det(matrix_of(axes)) < 0.0)
+
+
+EVERY = tuple(
+    ",".join(sign + letter for sign, letter in zip(signs, order))
+    for order in permutations("xyz") for signs in product(("", "-"), repeat=3)
+)  # fmt: skip
+"""All 48 sets."""
+TURNS = tuple(axes for axes in EVERY if not is_mirror(axes))
+"""The 24 that are turns."""
+MATRICES = np.array([matrix_of(axes) for axes in EVERY])
+"""Matrix of each of :data:`EVERY`, shape (48, 3, 3)."""

@@ -1,0 +1,135 @@
+"""Logs of autopilots as flight logs: PX4's ULog, ArduPilot's DataFlash (.BIN) and MAVLink telemetry (.tlog).
+
+All of them are north-east-down and forward-right-down; ours become x north, y west, z up and forward, left, up.
+"""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from visthrow.common.errors import LogError
+from visthrow.logs.flightlog import FlightLog
+from visthrow.logs.mapping import ChannelMap
+from visthrow.logs.readers.messages import Messages, read_dataflash, read_telemetry, read_ulog
+from visthrow.logs.readers.table import make_channel
+
+NED = "x,-y,-z"
+"""Our axes in the autopilot's, world and body alike."""
+
+
+@dataclass(frozen=True)
+class Tap:
+    """Fields of one kind of message that make a channel; of taps to one channel the first that is there is used."""
+
+    message: str
+    fields: tuple[str, ...]
+    channel: str
+    unit: str
+    kind: str = "vector"
+    flip: bool = True  # from forward-right-down or north-east-down
+    frame: str = ""
+    scale: float = 1.0
+
+
+def _t(message: str, fields: str, channel: str, unit: str, **more) -> Tap:
+    return Tap(message, tuple(fields.split()), channel, unit, **more)
+
+
+ULOG = (
+    _t("vehicle_local_position", "x y z", "pos_w", "m"),
+    _t("vehicle_local_position", "vx vy vz", "vel_w", "m/s"),
+    _t("vehicle_attitude", "q[0] q[1] q[2] q[3]", "quat_wb", "1", kind="quaternion"),
+    _t("vehicle_angular_velocity", "xyz[0] xyz[1] xyz[2]", "rate_b", "rad/s"),
+    _t("sensor_combined", "gyro_rad[0] gyro_rad[1] gyro_rad[2]", "rate_b", "rad/s"),
+    _t("sensor_combined", "accelerometer_m_s2[0] accelerometer_m_s2[1] accelerometer_m_s2[2]", "acc_b", "m/s^2", frame="body"),
+    _t("vehicle_visual_odometry", "position[0] position[1] position[2]", "mocap_pos_w", "m", frame="world"),
+    _t("vehicle_visual_odometry", "q[0] q[1] q[2] q[3]", "mocap_quat_wb", "1", kind="quaternion", frame="world"),
+    _t("vehicle_rates_setpoint", "roll pitch yaw", "rate_setpoint_b", "rad/s", frame="body"),
+    _t("vehicle_rates_setpoint", "thrust_body[2]", "throttle", "1", flip=False, scale=-1.0),
+    _t("battery_status", "voltage_v", "battery_voltage", "V", flip=False),
+    _t("battery_status", "current_a", "current", "A", flip=False),
+    _t("actuator_motors", "control[2] control[0] control[1] control[3]", "motor_command", "1", flip=False),
+    _t("actuator_outputs", "output[2] output[0] output[1] output[3]", "motor_output", "1", flip=False),
+)
+"""PX4's quad X: motors front right, rear left, front left, rear right."""
+
+DATAFLASH = (
+    _t("XKF1", "PN PE PD", "pos_w", "m"),
+    _t("NKF1", "PN PE PD", "pos_w", "m"),
+    _t("XKF1", "VN VE VD", "vel_w", "m/s"),
+    _t("NKF1", "VN VE VD", "vel_w", "m/s"),
+    _t("ATT", "Roll Pitch Yaw", "quat_wb", "deg", kind="euler"),
+    _t("IMU", "GyrX GyrY GyrZ", "rate_b", "rad/s"),
+    _t("IMU", "AccX AccY AccZ", "acc_b", "m/s^2", frame="body"),
+    _t("VISP", "PX PY PZ", "mocap_pos_w", "m", frame="world"),
+    _t("RATE", "RDes PDes YDes", "rate_setpoint_b", "deg/s", frame="body"),
+    _t("BAT", "Volt", "battery_voltage", "V", flip=False),
+    _t("BAT", "Curr", "current", "A", flip=False),
+    _t("RCOU", "C3 C1 C2 C4", "motor_output", "1", flip=False),
+    _t("CTUN", "ThO", "throttle", "1", flip=False),
+)
+"""ArduPilot's quad X: motors front right, rear left, front left, rear right."""
+
+TELEMETRY = (
+    _t("LOCAL_POSITION_NED", "x y z", "pos_w", "m"),
+    _t("LOCAL_POSITION_NED", "vx vy vz", "vel_w", "m/s"),
+    _t("ATTITUDE_QUATERNION", "q1 q2 q3 q4", "quat_wb", "1", kind="quaternion"),
+    _t("ATTITUDE", "roll pitch yaw", "quat_wb", "rad", kind="euler"),
+    _t("ATTITUDE", "rollspeed pitchspeed yawspeed", "rate_b", "rad/s"),
+    _t("HIGHRES_IMU", "xacc yacc zacc", "acc_b", "m/s^2", frame="body"),
+    _t("SCALED_IMU", "xacc yacc zacc", "acc_b", "mg", frame="body"),
+    _t("RAW_IMU", "xacc yacc zacc", "acc_b", "mg", frame="body"),
+    _t("VISION_POSITION_ESTIMATE", "x y z", "mocap_pos_w", "m", frame="world"),
+    _t("ATT_POS_MOCAP", "x y z", "mocap_pos_w", "m", frame="world"),
+    _t("ATTITUDE_TARGET", "body_roll_rate body_pitch_rate body_yaw_rate", "rate_setpoint_b", "rad/s", frame="body"),
+    _t("ATTITUDE_TARGET", "thrust", "throttle", "1", flip=False),
+    _t("SYS_STATUS", "voltage_battery", "battery_voltage", "mV", flip=False),
+    _t("SERVO_OUTPUT_RAW", "servo3_raw servo1_raw servo2_raw servo4_raw", "motor_output", "1", flip=False),
+)
+
+READERS = {
+    ".ulg": (read_ulog, ULOG),
+    ".bin": (read_dataflash, DATAFLASH),
+    ".tlog": (read_telemetry, TELEMETRY),
+}
+"""Ending -> reader of the messages, and what they tell."""
+
+
+def log_of_autopilot(path: str | Path) -> FlightLog:
+    """Read the log of an autopilot, by its ending.
+
+    Raises:
+        LogError: It cannot be read, or holds nothing of a vehicle's motion.
+    """
+    reader, taps = READERS[Path(path).suffix.lower()]
+    found = reader(path, {tap.message for tap in taps})
+    channels, notes = {}, {}
+    for tap in taps:
+        fields = found.first(tap.message)
+        if fields is None or tap.channel in channels or not all(field in fields for field in tap.fields):
+            continue
+        flip = NED if tap.flip and (len(tap.fields) == 3 or tap.kind != "vector") else ""
+        entry = ChannelMap(
+            tap.channel, tap.fields, tap.unit, kind=tap.kind, order="wxyz" if tap.kind == "quaternion" else "xyzw",
+            axes=flip, body_axes=flip if tap.kind != "vector" else "", frame=tap.frame, scale=tap.scale,
+        )  # fmt: skip
+        with np.errstate(invalid="ignore"):  # damaged floats
+            values = np.column_stack([fields[field] for field in tap.fields]).astype(float)
+        channels[tap.channel], noted = make_channel(np.asarray(fields["time"], float), values, entry, str(path))
+        notes[tap.channel] = noted | {"clock": "autopilot", "message": tap.message}
+    return _from_zero(channels, found, {"ingest": notes})
+
+
+def _from_zero(channels: dict, found: Messages, meta: dict) -> FlightLog:
+    """Count time from the first sample."""
+    if not any(len(channel.time) for channel in channels.values()):
+        known = ", ".join(sorted({tap.message for tap in READERS[found.path.suffix.lower()][1]}))
+        raise LogError(f"{found.path}: no message of a vehicle's motion in it; known: {known}")
+    start = min(float(channel.time[0]) for channel in channels.values() if len(channel.time))
+    if not math.isfinite(start):
+        raise LogError(f"{found.path}: stamps are not finite")
+    for name, channel in channels.items():
+        channels[name] = type(channel)(channel.time - start, channel.values, channel.unit, channel.frame, channel.valid)
+    return FlightLog(channels, {"source": str(found.path), "start": start, "kind": found.kind, **meta, **found.meta})

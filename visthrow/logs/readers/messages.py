@@ -1,0 +1,239 @@
+"""Messages of autopilot logs as arrays: PX4's ULog, ArduPilot's DataFlash (.BIN) and MAVLink telemetry (.tlog). Onboard-safe.
+
+The one place that opens these files. Names, units and axes stay those of the autopilot; ``visthrow.logs.readers.autopilot`` makes flight
+logs of them, ``hil.sources`` poses. Files are read as bytes: no device string, no condition, nothing is evaluated.
+
+Source: PX4 ULog file format; ArduPilot, AP_Logger/LogStructure.h; MAVLink's .tlog (big-endian microseconds before each message).
+"""
+
+import io
+import os
+import struct
+import tempfile
+from collections import Counter
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from visthrow.common.errors import LogError
+from visthrow.common.extras import load_extra
+
+Fields = dict[str, np.ndarray]
+"""Field -> values, shape (T,); ``time`` is when it was measured and ``arrival`` when it was written, both [s]."""
+
+MOST_RETURNS = 8
+"""Times that a reader may step back to one and the same byte; one that is led astray by a damaged length does so for ever."""
+
+_HEAD = b"\xa3\x95"  # of every DataFlash message; whatever begins otherwise would be searched byte by byte
+_INSTANCE = ("I", "C")  # fields of DataFlash that number sensors and estimator cores
+_STDERR = 2
+
+
+@dataclass
+class Messages:
+    """What a log holds of the messages that were asked for."""
+
+    path: Path
+    kind: str  # ulog, dataflash, telemetry
+    fields: dict[tuple[str, int], Fields] = field(default_factory=dict)  # by message and instance
+    meta: dict[str, Any] = field(default_factory=dict)
+
+    def first(self, name: str) -> Fields | None:
+        """Return the message of the lowest instance; None where there is none."""
+        numbers = sorted(instance for known, instance in self.fields if known == name)
+        return self.fields[name, numbers[0]] if numbers else None
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the messages."""
+        return sorted({name for name, _ in self.fields})
+
+
+def read_ulog(path: str | Path, wanted: Collection[str]) -> Messages:
+    """Read topics of PX4's ``.ulg``; the time is ``timestamp_sample`` where it is known.
+
+    Raises:
+        LogError: pyulog is not installed, or the file is no ULog.
+    """
+    ulog = load_extra("pyulog", "logs", f"{path}: a PX4 log", LogError)
+    with _parsing(path, "a PX4 log (.ulg)"):
+        log = ulog.ULog(Forward(Path(path).read_bytes()), list(wanted))
+    found = Messages(Path(path), "ulog")
+    for data in log.data_list:
+        if "timestamp" in data.data:
+            arrival = data.data["timestamp"] * 1e-6
+            sample = data.data.get("timestamp_sample")
+            time = arrival if sample is None else np.where(sample > 0, sample * 1e-6, arrival)
+            found.fields[data.name, data.multi_id] = {**data.data, "time": time, "arrival": arrival}
+    drops = [(drop.timestamp * 1e-6, drop.duration * 1e-3) for drop in log.dropouts]
+    found.meta = {"dropouts": drops, "damaged": bool(log.file_corruption)}
+    return found
+
+
+def read_dataflash(path: str | Path, wanted: Collection[str]) -> Messages:
+    """Read messages of ArduPilot's ``.BIN``; the time of VISP is that of its measurement.
+
+    Raises:
+        LogError: The file is no DataFlash log.
+    """
+    from pymavlink.DFReader import DFReader_binary
+
+    columns = _Columns()
+    with _parsing(path, "an ArduPilot dataflash log (.BIN)") as complaints:
+        with Path(path).open("rb") as file:
+            head = file.read(2)
+        if head != _HEAD:
+            raise LogError(f"it begins with {head.hex(' ') or 'nothing'}, not a3 95")
+        log = DFReader_binary(str(path))
+        known = {fmt.name for fmt in log.formats.values()} & set(wanted)
+        while known and (message := _next(log, list(known), columns)) is not None:
+            row = message.to_dict()
+            instance = next((row[name] for name in _INSTANCE if isinstance(row.get(name), int)), 0)
+            if "TimeUS" in row:
+                measured = row["CTimeMS"] * 1e-3 if "CTimeMS" in row else row["TimeUS"] * 1e-6
+                columns.add((message.get_type(), instance), row | {"time": measured, "arrival": row["TimeUS"] * 1e-6})
+        log.close()
+    return Messages(Path(path), "dataflash", columns.arrays(), {"damaged": bool(complaints)})
+
+
+def _next(log: Any, wanted: list[str], columns: "_Columns") -> Any:
+    """Return the next message; None at the end, and where the reader fails after it gave some."""
+    try:
+        return log.recv_match(type=wanted)
+    except Exception:  # pymavlink raises whatever struct, mmap and itself raise
+        if not columns.rows:
+            raise
+        return None
+
+
+def read_telemetry(path: str | Path, wanted: Collection[str]) -> Messages:
+    """Read messages of a ``.tlog``, of the first sender of each; the time is the sender's stamp where there is one.
+
+    Raises:
+        LogError: The file cannot be read, or holds no MAVLink message.
+    """
+    columns, sender, used = _Columns(), {}, 0
+    for arrival, message in telemetry(path):
+        name = message.get_type()
+        used += 8 + len(message.get_msgbuf())
+        whose = (message.get_srcSystem(), message.get_srcComponent())
+        if name in wanted and sender.setdefault(name, whose) == whose:
+            row = message.to_dict()
+            boot, usec = row.get("time_boot_ms"), row.get("time_usec")
+            measured = boot * 1e-3 if boot is not None else usec * 1e-6 if usec is not None else arrival
+            columns.add((name, 0), row | {"time": measured, "arrival": arrival})
+    return Messages(Path(path), "telemetry", columns.arrays(), {"damaged": used < Path(path).stat().st_size})
+
+
+def telemetry(path: str | Path) -> Iterator[tuple[float, Any]]:
+    """Yield arrival [s] and message of a ``.tlog``, past damaged bytes.
+
+    Raises:
+        LogError: The file cannot be read, or holds no MAVLink message.
+    """
+    from pymavlink.dialects.v20 import ardupilotmega as mav
+
+    try:
+        data = Path(path).read_bytes()
+    except OSError as error:
+        raise LogError(f"{path}: cannot be read: {error.strerror}; expected a .tlog") from error
+    decoder, at, count = mav.MAVLink(None), 0, 0
+    while at + 8 < len(data):
+        length = _mavlink_length(data, at + 8)
+        try:
+            message = decoder.decode(bytearray(data[at + 8 : at + 8 + length])) if length else None
+        except Exception:  # of a damaged message, pymavlink raises whatever it stumbles over
+            message = None
+        if message is None or message.get_msgId() < 0:  # an unknown one, whose checksum is not known either
+            at += 1  # look for the next message
+            continue
+        yield struct.unpack_from(">Q", data, at)[0] * 1e-6, message
+        at, count = at + 8 + length, count + 1
+    if not count:
+        raise LogError(f"{path}: {len(data)} bytes without a single MAVLink message; expected a .tlog")
+
+
+def _mavlink_length(data: bytes, at: int) -> int:
+    """Return the length of the message that begins at a place; 0 where none does, or it is cut short."""
+    head = data[at : at + 3]
+    if len(head) < 3 or head[0] not in (0xFE, 0xFD):
+        return 0
+    length = head[1] + 8 if head[0] == 0xFE else head[1] + 12 + 13 * (head[2] & 1)
+    return length if at + length <= len(data) else 0
+
+
+class _Columns:
+    """Rows of messages, gathered by message and instance; a row that lacks a field of the first is left out."""
+
+    def __init__(self) -> None:
+        self.rows: dict[tuple[str, int], dict[str, list[float]]] = {}
+
+    def add(self, key: tuple[str, int], row: dict[str, Any]) -> None:
+        numbers: dict[str, float] = {}
+        for name, value in row.items():
+            if isinstance(value, (int, float)):
+                numbers[name] = float(value)
+            elif isinstance(value, (list, tuple)):
+                numbers |= {f"{name}[{i}]": float(x) for i, x in enumerate(value) if isinstance(x, (int, float))}
+        rows = self.rows.setdefault(key, {name: [] for name in numbers})
+        if rows.keys() <= numbers.keys():
+            for name, values in rows.items():
+                values.append(numbers[name])
+
+    def arrays(self) -> dict[tuple[str, int], Fields]:
+        return {key: {name: np.array(values) for name, values in rows.items()} for key, rows in self.rows.items()}
+
+
+class Forward(io.BytesIO):
+    """Bytes of a file for a reader that looks for the next message of a damaged log by stepping back: never in a circle."""
+
+    def __init__(self, data: bytes) -> None:
+        """Begin at the first byte."""
+        super().__init__(data)
+        self._returns: Counter[int] = Counter()
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        """As of any file.
+
+        Raises:
+            LogError: It leads to a byte that was returned to too often.
+        """
+        before = self.tell()
+        after = super().seek(offset, whence)
+        if after < before:
+            self._returns[after] += 1
+            if self._returns[after] > MOST_RETURNS:
+                raise LogError(f"the length of a message leads nowhere, near byte {after}")
+        return after
+
+
+@contextmanager
+def _parsing(path: str | Path, what: str) -> Iterator[list[str]]:
+    """Turn whatever a parser makes of a file that is none of its own into one error; what it prints becomes a list.
+
+    Some of them print a line a damaged byte, and past Python.
+
+    Raises:
+        LogError: Instead of any other exception.
+    """
+    said: list[str] = []
+    heard = io.StringIO()
+    try:
+        with tempfile.TemporaryFile() as file:
+            kept = os.dup(_STDERR)
+            os.dup2(file.fileno(), _STDERR)
+            try:
+                with redirect_stdout(heard), redirect_stderr(heard):
+                    yield said
+            finally:
+                os.dup2(kept, _STDERR)
+                os.close(kept)
+                file.seek(0)
+                said += [*heard.getvalue().splitlines(), *file.read().decode(errors="replace").splitlines()]
+    except Exception as error:
+        detail = getattr(error, "strerror", None) or str(error) or type(error).__name__
+        raise LogError(f"{path}: cannot be read: {detail}; expected {what}") from error

@@ -1,0 +1,218 @@
+"""Recordings of other tools as columns: ROS 1 and 2 bags, MCAP, MATLAB, HDF5, and the Crazyflie's own log on a card.
+
+A recording holds several tables, each on a clock of its own: column ``drone/pose:position.x`` is of the table ``drone/pose``, whose
+stamps are ``drone/pose:time`` [s]. A mapping reads them as it reads a table's columns, each channel with its clock.
+
+Source: crazyflie-firmware, tools/usdlog/cfusdlog.py (the card's format); rosbags, mcap, scipy.io and h5py read the others.
+"""
+
+import io
+import json
+import struct
+import zlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from visthrow.common.errors import LogError
+from visthrow.common.extras import load_extra
+from visthrow.logs.readers.table import Table
+
+WIDEST = 32
+"""A matrix of more columns than this is a picture, a cloud of points or a covariance, and no signal."""
+_CARD = 0xBC
+_CARD_TYPES = set("BbHhIiQqfdeL?")
+
+
+def read_recording(path: str | Path) -> Table:
+    """Read all columns of numbers.
+
+    Args:
+        path: One of :data:`READERS`, or a file of the Crazyflie's card.
+
+    Raises:
+        LogError: A package is missing, or the file cannot be read or holds no numbers.
+    """
+    path = Path(path)
+    reader = READERS.get(path.suffix.lower(), _card)
+    try:
+        table = reader(path)
+    except LogError:
+        raise
+    except Exception as error:  # readers of others raise what comes
+        raise LogError(f"{path}: cannot be read: {error!r}; expected {_EXPECTED.get(path.suffix.lower(), 'a recording')}") from error
+    if not table:
+        raise LogError(f"{path}: no columns of numbers in it")
+    return table
+
+
+def is_card(path: Path) -> bool:
+    """Tell whether a file without a known ending is of a Crazyflie's card."""
+    with path.open("rb") as file:
+        head = file.read(5)
+    return len(head) == 5 and head[0] == _CARD and struct.unpack("<H", head[1:3])[0] in (1, 2)
+
+
+def _card(path: Path) -> Table:
+    """Events of the card's log: each a table; stamps of version 1 in milliseconds, of version 2 in microseconds."""
+    data = path.read_bytes()
+    if len(data) < 9 or data[0] != _CARD:
+        raise LogError(f"{path}: begins with {data[:1].hex() or 'nothing'}, not bc; expected a log of a Crazyflie's card")
+    if struct.unpack("<I", data[-4:])[0] != zlib.crc32(data[:-4]):
+        raise LogError(f"{path}: its checksum is wrong: cut short or damaged")
+    version, kinds = struct.unpack_from("<HH", data, 1)
+    if version not in (1, 2):
+        raise LogError(f"{path}: version {version} of a Crazyflie's card; versions 1 and 2 are known")
+    stamp, unit = ("<HI", 1e-3) if version == 1 else ("<HQ", 1e-6)
+    at, events = 5, {}
+    for _ in range(kinds):
+        number, at = struct.unpack_from("<H", data, at)[0], at + 2
+        name, at = _word(data, at)
+        count, at = struct.unpack_from("<H", data, at)[0], at + 2
+        fields = []
+        for _ in range(count):
+            field, at = _word(data, at)
+            fields.append((field[:-3], field[-2]))
+        if not all(kind in _CARD_TYPES for _, kind in fields):
+            raise LogError(f"{path}: a variable of {name} has a type that is not known; known: {''.join(sorted(_CARD_TYPES))}")
+        events[number] = (name, [field for field, _ in fields], "<" + "".join(kind for _, kind in fields), [])
+    while at + struct.calcsize(stamp) <= len(data) - 4:
+        number, time = struct.unpack_from(stamp, data, at)
+        if number not in events:
+            raise LogError(f"{path}: event {number} near byte {at} was not announced; damaged")
+        _, _, form, rows = events[number]
+        at += struct.calcsize(stamp)
+        rows.append((time * unit, *struct.unpack_from(form, data, at)))
+        at += struct.calcsize(form)
+    start = min((rows[0][0] for *_, rows in events.values() if rows), default=0.0)
+    table: Table = {}
+    for name, fields, _, rows in events.values():
+        columns = np.array(rows, dtype=float).reshape(-1, 1 + len(fields))
+        if len(columns):
+            table |= {f"{name}:{field}": columns[:, i] for i, field in enumerate(["time", *fields])}
+            table[f"{name}:time"] = columns[:, 0] - start
+    return table
+
+
+def _word(data: bytes, at: int) -> tuple[str, int]:
+    end = data.index(b"\x00", at)
+    return data[at:end].decode(), end + 1
+
+
+def _matlab(path: Path) -> Table:
+    from scipy.io import loadmat
+
+    try:
+        return _flat(loadmat(path, simplify_cells=True))
+    except NotImplementedError:  # version 7.3 is HDF5
+        return _hdf5(path)
+
+
+def _hdf5(path: Path) -> Table:
+    h5py = load_extra("h5py", "recordings", f"{path}: an HDF5 file", LogError)
+    found: dict[str, Any] = {}
+    with h5py.File(path) as file:
+        file.visititems(lambda name, item: found.update({name: item[()]}) if isinstance(item, h5py.Dataset) else None)
+    return _flat(found)
+
+
+def _flat(tree: dict[str, Any], prefix: str = "") -> Table:
+    """Columns of a tree of arrays: vectors as they are, matrices column by column, the longer side being time."""
+    table: Table = {}
+    for name, value in tree.items():
+        if name.startswith("__"):
+            continue
+        if isinstance(value, dict):
+            table |= _flat(value, f"{prefix}{name}.")
+            continue
+        values = np.asarray(value)
+        if values.dtype.names:
+            table |= _flat({field: values[field] for field in values.dtype.names}, f"{prefix}{name}.")
+        elif values.dtype.kind in "bif" or values.dtype.kind == "u":
+            values = values.squeeze()
+            values = values.T if values.ndim == 2 and values.shape[0] < values.shape[1] else values
+            if values.ndim == 1 and len(values) > 1:
+                table[prefix + name] = values.astype(float)
+            elif values.ndim == 2 and values.shape[1] <= WIDEST:
+                table |= {f"{prefix}{name}[{i}]": column.astype(float) for i, column in enumerate(values.T)}
+    return table
+
+
+def _bag(path: Path) -> Table:
+    """Topics of a ROS 1 or ROS 2 bag; the time is the header's stamp where there is one."""
+    load_extra("rosbags.highlevel", "recordings", f"{path}: a ROS bag", LogError)
+    from rosbags.highlevel import AnyReader
+    from rosbags.typesys import Stores, get_typestore
+
+    def messages() -> Iterator[tuple[str, float, Any]]:
+        folder = path if path.suffix == ".bag" or path.is_dir() else path.parent if (path.parent / "metadata.yaml").exists() else path
+        with AnyReader([folder], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+            for connection, stamp, raw in reader.messages():
+                yield connection.topic.strip("/"), stamp * 1e-9, reader.deserialize(raw, connection.msgtype)
+
+    return _topics(messages())
+
+
+def _mcap(path: Path) -> Table:
+    """Channels of an MCAP file: JSON as it is, ROS messages as of a bag."""
+    reading = load_extra("mcap.reader", "recordings", f"{path}: an MCAP file", LogError)
+    data = path.read_bytes()
+
+    def messages() -> Iterator[tuple[str, float, Any]]:
+        for _, channel, message in reading.make_reader(io.BytesIO(data)).iter_messages():
+            if channel.message_encoding == "json":
+                yield channel.topic.strip("/"), message.log_time * 1e-9, json.loads(message.data)
+
+    table = _topics(messages())
+    return table or _bag(path)
+
+
+def _topics(messages: Iterator[tuple[str, float, Any]]) -> Table:
+    """A table a topic; a field that is missing in some messages is blank there."""
+    rows: dict[str, list[dict[str, float]]] = {}
+    for topic, arrival, message in messages:
+        row = dict(_numbers(message, ""))
+        stamp = next((at for head in ("header.stamp", "stamp", "timestamp") if (at := _stamp(row, head))), 0.0)
+        rows.setdefault(topic, []).append({"time": stamp or arrival, "arrival": arrival} | row)
+    start = min((row["time"] for of in rows.values() for row in of), default=0.0)
+    table: Table = {}
+    for topic, of in rows.items():
+        names = list(dict.fromkeys(name for row in of for name in row))
+        for name in names:
+            values = np.array([row.get(name, np.nan) for row in of])
+            table[f"{topic}:{name}"] = values - start if name in ("time", "arrival") else values
+    return table
+
+
+def _stamp(row: dict[str, float], head: str) -> float:
+    """Seconds of a ROS stamp; 0 where the message has none."""
+    whole, part = row.get(f"{head}.sec", row.get(f"{head}.secs", 0.0)), row.get(f"{head}.nanosec", row.get(f"{head}.nsecs", 0.0))
+    return whole + 1e-9 * part
+
+
+def _numbers(value: Any, name: str) -> Iterator[tuple[str, float]]:
+    """Name and value of each number in a message."""
+    if isinstance(value, (bool, int, float, np.integer, np.floating)):
+        yield name, float(value)
+    elif isinstance(value, dict):
+        for key, of in value.items():
+            yield from _numbers(of, f"{name}.{key}" if name else key)
+    elif isinstance(value, (list, tuple, np.ndarray)) and len(value) <= WIDEST:
+        for i, of in enumerate(value):
+            yield from _numbers(of, f"{name}[{i}]")
+    elif hasattr(value, "__dataclass_fields__"):
+        for key in value.__dataclass_fields__:
+            if not key.startswith("__"):
+                yield from _numbers(getattr(value, key), f"{name}.{key}" if name else key)
+
+
+READERS: dict[str, Callable[[Path], Table]] = {
+    ".mat": _matlab, ".h5": _hdf5, ".hdf5": _hdf5, ".bag": _bag, ".db3": _bag, ".mcap": _mcap,
+}  # fmt: skip
+"""Ending -> reader."""
+_EXPECTED = {
+    ".mat": "a MATLAB file", ".h5": "an HDF5 file", ".hdf5": "an HDF5 file", ".bag": "a ROS 1 bag", ".db3": "a ROS 2 bag",
+    ".mcap": "an MCAP file",
+}  # fmt: skip
