@@ -24,7 +24,7 @@ ROPE_ON_GROUND = (
     0.003  # height at which the rope is drawn where it would pass through the ground; no plant knows it [m]
 )
 MEASURED = ("pos_w", "quat_wb", "vel_w", "rate_b", "payload_pos_w")
-"""Channels that are recorded a second time as measured, under ``measured_<name>``."""
+"""Channels that are recorded a second time as measured, under ``measured_<name>``, stamped when the measured state was true."""
 
 
 @dataclass
@@ -48,10 +48,11 @@ class _Recording:
             self.recorder.declare(f"measured_{name}", units[name], "body" if name == "rate_b" else "world")
         self._resting: LooseRope | None = None
         self._before: Snapshot | None = None
+        self._sampled = -np.inf  # stamp of the last measured sample [s]
 
     def step(self, command: np.ndarray, release: bool, mode: int, measured: Snapshot, seen: PilotOutput | None) -> None:
         """Record the state now and what is sent, then advance the plant."""
-        self.sample(measured)
+        self.sample()
         time = self.plant.time
         extra: dict[str, Any] = {"command": command[0], "release_command": float(release), "mode": mode}
         if seen is not None:
@@ -61,8 +62,8 @@ class _Recording:
         self.recorder.add(time, goal_w=self.goal_w, **extra)
         self.plant.step(command, np.array([release]))
 
-    def sample(self, measured: Snapshot) -> None:
-        """Record the true and the measured state now."""
+    def sample(self) -> None:
+        """Record the true state now, and the measured one that the pilot was told of last."""
         now = self.plant.state
         names = (
             "pos_w",
@@ -78,7 +79,11 @@ class _Recording:
         values = {name: getattr(now, name)[0] for name in names}
         values["cable_points_w"] = self._rope(now)
         values["cable_points_w"][:, 2] = np.maximum(values["cable_points_w"][:, 2], ROPE_ON_GROUND)
-        self.recorder.add(now.time, **values, **{f"measured_{name}": getattr(measured, name)[0] for name in MEASURED})
+        self.recorder.add(now.time, **values)
+        sample = self.plant.sample
+        if sample.time > self._sampled:
+            self.recorder.add(sample.time, **{f"measured_{name}": getattr(sample, name)[0] for name in MEASURED})
+            self._sampled = sample.time
         self._before = now
 
     def _rope(self, now: Snapshot) -> np.ndarray:
@@ -225,7 +230,8 @@ def _recover(recording: _Recording, experiment, home: np.ndarray, ends: _Ends) -
 
 def _finished(recording: _Recording, ends: _Ends) -> FlightLog:
     plant, recorder = recording.plant, recording.recorder
-    recording.sample(plant.measured())
+    plant.measured()
+    recording.sample()
     landing = plant.landing
     times = {"policy_start": ends.policy_start, "latch": ends.latch, "recovery": ends.recovery, "end": plant.time}
     result: dict[str, Any] = {"success": False, "failure": ends.failure}
