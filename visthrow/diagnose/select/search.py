@@ -411,7 +411,7 @@ class Search:
         new = [j for j in rival if j not in self.active]
         if not all(self._fits_in(point, rival, j) for j in new):
             return False
-        left = levels(self.nominal, with_floors_noise(self.problem, point, rival), self.least) if len(new) > 1 else ()
+        left = levels(self.problem, self.nominal, with_floors_noise(self.problem, point, rival), self.least) if len(new) > 1 else ()
         return not any(level.excessive for level in left)
 
     def _fits_in(self, point: Point, rival: Sequence[int], j: int) -> bool:

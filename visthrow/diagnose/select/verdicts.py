@@ -53,7 +53,7 @@ def conclude(search: "Search", *, laws: bool) -> Diagnosis:
     point, model = search.point, search.problem.model
     scatter = search.scatter(search.active)
     varies = deviations(scatter, search.priors, [e.name for e in model.effects])
-    found = levels(search.nominal, with_floors_noise(search.problem, point, search.active, varies), search.least)
+    found = levels(search.problem, search.nominal, with_floors_noise(search.problem, point, search.active, varies), search.least)
     drawn = {name for s in scatter if s.found for name in s.of}
     search.refused = {j: nats for j, nats in search.refused.items() if search.name(j) not in drawn}
     overall, block, reasons, withdrawn = _overall(search, found, *law)
