@@ -11,8 +11,9 @@ from tests.synthetic_diagnosis import SyntheticModel, catalogue
 from visthrow.common.errors import DiagnoseError
 from visthrow.common.storage import write_json
 from visthrow.diagnose.inputs import measures
+from visthrow.diagnose.likelihood import forms
 from visthrow.diagnose.planning import fly_manoeuvres, manoeuvres, plan
-from visthrow.diagnose.reporting import blackbox, blind, forms, gain, pictures, report
+from visthrow.diagnose.reporting import blackbox, blind, gain, pictures, report
 from visthrow.diagnose.select import point, result, search
 from visthrow.diagnose.throw.landing import Landings
 from visthrow.logs.flightlog import Channel, FlightLog

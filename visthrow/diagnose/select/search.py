@@ -439,6 +439,7 @@ def explain(
     Raises:
         DiagnoseError: The model gives no window, or contradicts itself.
     """
+    from visthrow.diagnose.select.held_out import judged
     from visthrow.diagnose.select.verdicts import conclude, out_of_domain
 
     begun, say = time.monotonic(), progress or (lambda _: None)
@@ -471,7 +472,7 @@ def explain(
         if not search.stands_without(gone, problem, nominal, least):
             search = Search(problem, nominal, least, say, laws)
         search.run()
-    diagnosis = conclude(search, laws=laws)
+    diagnosis = judged(conclude(search, laws=laws), seed)
     return replace(diagnosis, duplicates=duplicates, seconds=time.monotonic() - begun, seed=seed)
 
 
