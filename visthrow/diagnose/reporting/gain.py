@@ -47,7 +47,7 @@ def measure(diagnosis: Diagnosis, *, seed: int = 0, draws: int = DRAWS) -> Gain:
         draws: of the bootstrap.
     """
     work, rng = diagnosis.work, np.random.default_rng(seed)
-    cross = crossed(work, diagnosis.threshold)
+    cross = crossed(diagnosis)
     box = _blackbox(work.before, cross.groups, cross.folds, work.after, len(work.problem.model.channels), rng)
     gains = channel_gains(work, cross, rng, draws, box)
     shares = {work.problem.model.effects[j].name: n / len(cross.folds) for j, n in cross.named.items()}
@@ -55,7 +55,7 @@ def measure(diagnosis: Diagnosis, *, seed: int = 0, draws: int = DRAWS) -> Gain:
     trained = {int(f): work.problem.sizes(size) for f, size in zip(cross.statistics.flights, sizes)}
     landing = landing_gain(work, diagnosis.theta, trained, seed)
     whole = all(w.nuisance.shape[1] == 0 for w in work.after.windows)
-    nats = _nats(work.before, cross, work.after.theta)
+    nats = _nats(work.before, work.after, cross)
     return Gain(gains, nats, shares, len(cross.folds), cross.left_out, landing, whole)
 
 
@@ -94,12 +94,12 @@ def _blackbox(before: Point, groups: Sequence[int], folds, after: Point, channel
     return own.error(combination)
 
 
-def _nats(before: Point, cross: Crossed, theta: np.ndarray) -> float:
+def _nats(before: Point, after: Point, cross: Crossed) -> float:
     """Held-out log-likelihood per sample, after minus before, each with its own noise levels."""
-    plain, after, change = regrouped(before, cross.groups), cross.statistics, cross.trained - theta
-    quadratic = np.einsum("fi,fij,fj->f", change, after.information, change)
-    square = after.square - 2.0 * np.einsum("fi,fi->f", change, after.score) + quadratic
-    return float(0.5 * (plain.square.sum() - square.sum()) / after.samples.sum())
+    plain, own, change = regrouped(before, cross.groups), regrouped(after, cross.groups), cross.trained - after.theta
+    quadratic = np.einsum("fi,fij,fj->f", change, own.information, change)
+    square = own.square - 2.0 * np.einsum("fi,fi->f", change, own.score) + quadratic
+    return float(0.5 * (plain.square.sum() - square.sum()) / own.samples.sum())
 
 
 def bootstrap_sizes(statistics: Statistics, priors: Priors, active: Sequence[int], rng: np.random.Generator, draws: int = DRAWS):

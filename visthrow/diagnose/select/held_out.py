@@ -27,6 +27,8 @@ from visthrow.diagnose.select import result
 from visthrow.diagnose.select.excess import UNKNOWN_RATIO
 from visthrow.diagnose.select.point import Point
 from visthrow.diagnose.select.result import ChannelGain, Diagnosis, Finding, HeldOut
+from visthrow.diagnose.select.rivals import CLOSE
+from visthrow.diagnose.select.scatter import deviations, freed
 from visthrow.diagnose.select.work import Work
 
 DRAWS = 10_000
@@ -110,16 +112,13 @@ def folds_of(count: int) -> list[np.ndarray]:
     return [np.arange(count)[k::MOST_FOLDS] for k in range(min(count, MOST_FOLDS))]
 
 
-def crossed(work: Work, least: float) -> Crossed:
-    """Repeat the search without each of the flights, by statistics.
-
-    Args:
-        work: of the diagnosis.
-        least: threshold [nats].
-    """
+def crossed(diagnosis: Diagnosis) -> Crossed:
+    """Repeat a search without each of the flights, by statistics; what an effect that varies has of its own there is integrated out."""
+    work, least = diagnosis.work, diagnosis.threshold
     point, priors = work.after, work.problem.priors
     groups, left_out = groups_of(point, work.problem.kept)
-    statistics = regrouped(point, groups)
+    varies = deviations(diagnosis.scatter, priors, [e.name for e in work.problem.model.effects])
+    statistics = freed(regrouped(point, groups), varies)
     count, folds = len(statistics.flights), folds_of(len(statistics.flights))
     trained, named = np.zeros((count, len(priors.floor))), Counter()
     for fold in folds:
@@ -127,8 +126,10 @@ def crossed(work: Work, least: float) -> Crossed:
         if not len(rest):
             continue
         information, score = statistics.information[rest].sum(0), statistics.absolute[rest].sum(0)
-        found = [select(information, score, priors, least, begin=begin) for begin in ((), work.active)]
-        active = max(found, key=lambda s: log_evidence(information, score, priors, s) - least * len(s))
+        anew, active = (select(information, score, priors, least, begin=begin) for begin in ((), work.active))
+        worth = [log_evidence(information, score, priors, s) - least * len(s) for s in (anew, active)]
+        if worth[0] > worth[1] + CLOSE:  # else the rest cannot tell these names from others, and does not deny them
+            active = anew
         trained[fold] = estimate(information, score, priors, active)
         named.update(active)
     return Crossed(groups, left_out, statistics, folds, trained, named)
@@ -238,15 +239,10 @@ def studentised(before: np.ndarray, after: np.ndarray, rng: np.random.Generator,
     return float(1.0 - np.exp(0.5 * value)), float(low), float(high)
 
 
-def measure(work: Work, least: float, seed: int = 0) -> HeldOut:
-    """Ask held-out flights about the names of a search.
-
-    Args:
-        work: of the diagnosis.
-        least: threshold [nats].
-        seed: of the bootstrap.
-    """
-    cross, effects = crossed(work, least), work.problem.model.effects
+def measure(diagnosis: Diagnosis, seed: int = 0) -> HeldOut:
+    """Ask held-out flights about the names of a search; ``seed``: of the bootstrap."""
+    work, cross = diagnosis.work, crossed(diagnosis)
+    effects = work.problem.model.effects
     share = borne_out(cross.statistics, cross.trained, work.after.theta)
     named = {effects[j].name: n / len(cross.folds) for j, n in cross.named.items()}
     channels = channel_gains(work, cross, np.random.default_rng(seed))
@@ -262,9 +258,9 @@ def judged(diagnosis: Diagnosis, seed: int = 0) -> Diagnosis:
     """
     if not diagnosis.theta or diagnosis.overall not in (result.KNOWN, result.UNKNOWN):
         return diagnosis
-    held, alone = measure(diagnosis.work, diagnosis.threshold, seed), not _compares_phases(diagnosis.work.after)
+    held, alone = measure(diagnosis, seed), not _compares_phases(diagnosis.work.after)
     names = list(diagnosis.theta)
-    if held.harmful:
+    if held.share <= 0.0 or (alone and any(c.harmed and c.high < 0.0 for c in held.channels)):
         reason = f"held-out {held.left_out} are explained worse with {', '.join(names)} ({_share(held)}); withdrawn"
         return _unconfirmed(_demoted(diagnosis, names, result.NOT_IDENTIFIABLE, "held-out flights are explained worse with it"),
                             held, names, reason)  # fmt: skip
@@ -288,7 +284,8 @@ def _unconfirmed(diagnosis: Diagnosis, held: HeldOut, names: Sequence[str], reas
     """Something is there that no confirmed name explains: in the block of the name that promised most."""
     most = max((diagnosis[name] for name in names), key=lambda f: f.nats)
     block = diagnosis.block or most.block
-    return replace(diagnosis, overall=result.UNKNOWN, block=block, reasons=(reason, *diagnosis.reasons), held_out=held)
+    earlier = diagnosis.reasons if diagnosis.overall == result.UNKNOWN else ()
+    return replace(diagnosis, overall=result.UNKNOWN, block=block, reasons=(reason, *earlier), held_out=held)
 
 
 def share_of(finding: Finding, held: HeldOut) -> float:

@@ -136,11 +136,6 @@ class HeldOut:
     folds: int = 0
     left_out: str = "flights"  # or "parts of flights"
 
-    @property
-    def harmful(self) -> bool:
-        """Whether held-out flights are explained worse, as a whole or in a channel, by more than chance."""
-        return self.share <= 0.0 or any(c.harmed and c.high < 0.0 for c in self.channels)
-
 
 @dataclass(frozen=True)
 class Diagnosis:
