@@ -130,6 +130,10 @@ def test_a_config_without_diagnosis_keeps_its_contract():
         ({"covariance": [[1.0]]}, "expected one each"),
         ({"theta": None}, "no diagnosis"),
         ({"gain": {"channels": [{"channel": "pos_w", "before": 1.0, "after": 1.5}]}}, "do not bear this out"),
+        ({"model": "flyer"}, "a diagnosis of the model 'flyer'"),
+        ({"theta": {"thrust_curve": -0.481}, "covariance": [[1e-3]]}, "from -0.0004 to 0.0004"),
+        ({"theta": {"thrust_curve": -1e-4}, "covariance": [[1e-9]], "findings": [{"name": "thrust_curve", "unit": "1"}]},
+         "thrust_curve in '1'; the throw's thrust_curve is in 'N s/rad'"),
     ],
 )
 def test_mistakes_are_told(diagnosis, changes, message, tmp_path, capsys):

@@ -12,6 +12,7 @@ from visthrow import config
 from visthrow.common.errors import DiagnoseError
 from visthrow.common.toml_text import dumps
 from visthrow.diagnose.catalogue import ALL, Setting, apply
+from visthrow.diagnose.inputs.opening import THROW
 from visthrow.diagnose.select.scatter import variances
 from visthrow.diagnose.throw.opened import closed, opened
 from visthrow.task import Experiment, plant_of
@@ -138,9 +139,32 @@ def read(report: Mapping[str, Any], path: str) -> tuple[dict[str, float], list[l
         raise DiagnoseError(f"{path}: no diagnosis that `visthrow diagnose explain` wrote: {error!r}") from error
     if len(covariance) != len(theta) or any(len(row) != len(theta) for row in covariance):
         raise DiagnoseError(f"{path}: {len(theta)} effects and a covariance of {len(covariance)} rows; expected one each")
+    _refuse_strange(report, path, theta)
+    return theta, covariance
+
+
+def _refuse_strange(report: Mapping[str, Any], path: str, theta: Mapping[str, float]) -> None:
+    """Refuse effects of another model, though they may bear the same name, and sizes that the throw's simulator cannot have.
+
+    Raises:
+        DiagnoseError: It is of another model; an effect or its unit is none of the catalogue's; a size lies outside its bounds.
+    """
+    model = report.get("model", THROW)
+    if model != THROW:
+        raise DiagnoseError(
+            f"{path}: a diagnosis of the model '{model}'; apply writes configurations of the whole throw alone, and "
+            f"`visthrow diagnose fit` those of a vehicle by itself"
+        )
     strange = [name for name in theta if name not in ALL]
     if strange:
         raise DiagnoseError(
             f"{path}: {', '.join(strange)} are no effects of the throw's simulator; apply writes configurations of that alone"
         )
-    return theta, covariance
+    units = {f["name"]: f["unit"] for f in report.get("findings") or [] if "unit" in f}
+    for name, size in theta.items():
+        effect = ALL[name].effect
+        if units.get(name, effect.unit) != effect.unit:
+            raise DiagnoseError(f"{path}: {name} in '{units[name]}'; the throw's {name} is in '{effect.unit}': of another model")
+        low, high = effect.bounds
+        if not low <= size <= high:
+            raise DiagnoseError(f"{path}: {name} = {size:.4g} {effect.unit}; the throw's simulator has it from {low:g} to {high:g}")

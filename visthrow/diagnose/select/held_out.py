@@ -243,7 +243,8 @@ def measure(diagnosis: Diagnosis, seed: int = 0) -> HeldOut:
     """Ask held-out flights about the names of a search; ``seed``: of the bootstrap."""
     work, cross = diagnosis.work, crossed(diagnosis)
     effects = work.problem.model.effects
-    share = borne_out(cross.statistics, cross.trained, work.after.theta)
+    sizes = np.array([diagnosis.theta.get(e.name, 0.0) for e in effects]) / work.problem.priors.floor
+    share = borne_out(cross.statistics, cross.trained, sizes)
     named = {effects[j].name: n / len(cross.folds) for j, n in cross.named.items()}
     channels = channel_gains(work, cross, np.random.default_rng(seed))
     return HeldOut(*share, channels, named, len(cross.folds), cross.left_out)
