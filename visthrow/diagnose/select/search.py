@@ -24,6 +24,7 @@ from visthrow.diagnose.likelihood.evidence import (
 from visthrow.diagnose.likelihood.marginal import Statistics
 from visthrow.diagnose.likelihood.threads import each
 from visthrow.diagnose.models.interface import Model
+from visthrow.diagnose.select import held_out
 from visthrow.diagnose.select.candidates import candidate, candidates
 from visthrow.diagnose.select.consistency import Consistency, across_flights, repeated_flights
 from visthrow.diagnose.select.excess import levels
@@ -439,7 +440,6 @@ def explain(
     Raises:
         DiagnoseError: The model gives no window, or contradicts itself.
     """
-    from visthrow.diagnose.select.held_out import judged
     from visthrow.diagnose.select.verdicts import conclude, out_of_domain
 
     begun, say = time.monotonic(), progress or (lambda _: None)
@@ -472,7 +472,7 @@ def explain(
         if not search.stands_without(gone, problem, nominal, least):
             search = Search(problem, nominal, least, say, laws)
         search.run()
-    diagnosis = judged(conclude(search, laws=laws), seed)
+    diagnosis = held_out.judged(conclude(search, laws=laws), seed)
     return replace(diagnosis, duplicates=duplicates, seconds=time.monotonic() - begun, seed=seed)
 
 
