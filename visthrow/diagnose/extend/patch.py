@@ -114,16 +114,17 @@ def with_scatter(
     return {name: theta.get(name, 0.0) for name in names}, whole.tolist()
 
 
-def laws_of(report: Mapping[str, Any], path: str, count: int) -> list[LawParams]:
-    """The best ``count`` laws of the JSON that ``explain`` wrote.
+def laws_of(report: Mapping[str, Any], path: str, rank: int) -> list[LawParams]:
+    """All laws of the explanation of this rank, from 1, in the JSON that ``explain`` wrote; none for 0.
 
     Raises:
         DiagnoseError: It holds fewer.
     """
-    told = report.get("laws") or []
-    if count > len(told):
-        raise DiagnoseError(f"{path}: {len(told)} laws outside the catalogue; --laws asks for {count}")
-    return [LawParams(x["block"], tuple(x["factors"]), x["vector"], float(x["coefficient"])) for x in told[:count]]
+    told = report.get("explanations") or [[law] for law in report.get("laws") or []]
+    if rank > len(told):
+        raise DiagnoseError(f"{path}: {len(told)} explanations by laws outside the catalogue; --laws asks for number {rank}")
+    laws = told[rank - 1] if rank else []
+    return [LawParams(x["block"], tuple(x["factors"]), x["vector"], float(x["coefficient"])) for x in laws]
 
 
 def read(report: Mapping[str, Any], path: str) -> tuple[dict[str, float], list[list[float]]]:

@@ -152,6 +152,7 @@ class Diagnosis:
     sets: tuple[tuple[tuple[str, ...], float], ...] = ()  # sets of causes within 3 nats of the best, with their distance
     levels: tuple[Level, ...] = ()
     laws: tuple[Law, ...] = ()  # terms outside the catalogue, best first
+    explanations: tuple[tuple[Law, ...], ...] = ()  # terms that belong together, one such set in place of another, best first
     events: tuple[int, ...] = ()  # flights in which something happened once
     duplicates: Mapping[int, int] = field(default_factory=dict)  # flight -> the earlier flight that it repeats
     sensor_scale: Mapping[str, float] = field(default_factory=dict)  # channel -> noise found, in that stated
@@ -178,5 +179,6 @@ class Diagnosis:
         """All but ``work``, for JSON."""
         fields = {name: value for name, value in vars(self).items() if name != "work"}
         plain = {name: [asdict(v) for v in fields[name]] for name in ("findings", "steps", "levels", "laws", "scatter", "mistakes")}
+        plain["explanations"] = [[asdict(law) for law in laws] for laws in self.explanations]
         held = None if self.held_out is None else asdict(self.held_out)
         return {**fields, **plain, "held_out": held}

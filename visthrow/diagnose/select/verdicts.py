@@ -63,6 +63,7 @@ def conclude(search: "Search", *, laws: bool) -> Diagnosis:
         overall, reasons = result.KNOWN, [f"besides {' and '.join(besides)}, {reasons[0]}"]
     known = overall != result.UNKNOWN  # a term that is weaker than the names says nothing
     terms = [] if known else _different(answer.strongest)
+    explanations = () if known else tuple(tuple(h.laws()) for h in answer.strongest)
     active = [j for j in search.active if j not in withdrawn]
     if law[0] is not None:
         active = _sure(law[0].without_terms(), search.priors, active)
@@ -84,7 +85,7 @@ def conclude(search: "Search", *, laws: bool) -> Diagnosis:
         tuple(tuple(map(float, row)) for row in scaled), search.least, tuple(search.steps),
         tuple((tuple(map(search.name, s)), n) for s, n in search.sets), found, tuple(terms), _events(search, point),
         sensor_scale={name: float(point.noise.scale[c]) for c, name in enumerate(model.channels)},
-        scatter=scatter, mistakes=mistakes,
+        scatter=scatter, mistakes=mistakes, explanations=explanations,
         flights=len(point.statistics.flights), windows=len(point.windows), samples=int(point.statistics.samples.sum()),
         work=Work(search.problem, search.nominal, search.point if active else search.nominal, tuple(active)),
     )  # fmt: skip
