@@ -14,6 +14,7 @@ from tests.diagnose.altered import later, scrambled, with_values
 from tests.diagnose.cases import command_for, environment, logs_of
 from tests.diagnose.sealed import WITHOUT_TESTS
 from tests.worlds.world import Recipe
+from visthrow.diagnose.reporting.explain_cli import REFUSED
 from visthrow.logs.flightlog import Channel, FlightLog
 
 Logs = list[FlightLog]
@@ -136,7 +137,7 @@ def fair(done: subprocess.CompletedProcess, verdict: dict, right: frozenset[str]
     """No traceback, no name that is not right; and either a verdict or an error of one sentence."""
     if "Traceback" in done.stderr or set(verdict.get("theta") or {}) - right:
         return False
-    return done.returncode == 2 and bool(done.stderr.strip()) if verdict["overall"] == "ERROR" else done.returncode == 0
+    return done.returncode == 2 and bool(done.stderr.strip()) if verdict["overall"] == "ERROR" else done.returncode in (0, REFUSED)
 
 
 def doubled(logs: Logs) -> Logs:

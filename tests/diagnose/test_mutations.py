@@ -11,8 +11,7 @@ from tests.unit import test_diagnose_search as searches
 from tests.worlds.world import Recipe
 from visthrow.diagnose.likelihood import designs, evidence, marginal, noise
 from visthrow.diagnose.likelihood.evidence import Priors
-from visthrow.diagnose.reporting import gain
-from visthrow.diagnose.select import search
+from visthrow.diagnose.select import held_out, search
 from visthrow.logs.flightlog import FlightLog
 
 pytestmark = pytest.mark.slow
@@ -57,12 +56,12 @@ def no_bounds(monkeypatch) -> None:
 
 def bootstrap_of_one_flight(monkeypatch) -> None:
     """Every resample holds one flight alone, many times: intervals of the gain are those of the scatter within it."""
-    plain = gain.studentised
+    plain = held_out.studentised
 
     def one(before, after, rng, draws):
         return plain(np.repeat(before[:1], len(before)), np.repeat(after[:1], len(after)), rng, draws)
 
-    monkeypatch.setattr(gain, "studentised", one)
+    monkeypatch.setattr(held_out, "studentised", one)
 
 
 def truth_in_the_log(monkeypatch) -> None:

@@ -88,7 +88,20 @@ def test_a_law_is_written_as_a_block(diagnosis, tmp_path, capsys):
     assert "vertical_cross_vel" in capsys.readouterr().out
     assert config.load(Experiment, out).laws == (LawParams("payload force", ("speed",), "vertical_cross_vel", 0.02),)
     assert cli.main([*arguments, "--laws", "2"]) == 2
-    assert "asks for 2" in capsys.readouterr().err
+    assert "asks for number 2" in capsys.readouterr().err
+    assert cli.main(arguments) == 0
+    assert "--laws 1 writes it" in capsys.readouterr().out
+
+
+def test_laws_that_belong_together_are_written_together(diagnosis, tmp_path):
+    """The first explanation has two terms, the second, which stands in its place, one of them."""
+    swirl = {"block": "payload force", "factors": ["speed"], "vector": "vertical_cross_vel", "coefficient": 0.02}
+    other = swirl | {"factors": [], "coefficient": 0.03}
+    given = diagnosis(theta={}, covariance=[], laws=[swirl, other], explanations=[[swirl, other], [other | {"coefficient": 0.05}]])
+    for rank, coefficients in ((1, [0.02, 0.03]), (2, [0.05])):
+        out = tmp_path / f"{rank}.toml"
+        assert cli.main(["diagnose", "apply", given, "--out", str(out), "--laws", str(rank)]) == 0
+        assert [law.coefficient for law in config.load(Experiment, out).laws] == coefficients
 
 
 def test_every_effect_can_be_written():
@@ -130,6 +143,10 @@ def test_a_config_without_diagnosis_keeps_its_contract():
         ({"covariance": [[1.0]]}, "expected one each"),
         ({"theta": None}, "no diagnosis"),
         ({"gain": {"channels": [{"channel": "pos_w", "before": 1.0, "after": 1.5}]}}, "do not bear this out"),
+        ({"model": "flyer"}, "a diagnosis of the model 'flyer'"),
+        ({"theta": {"thrust_curve": -0.481}, "covariance": [[1e-3]]}, "from -0.0004 to 0.0004"),
+        ({"theta": {"thrust_curve": -1e-4}, "covariance": [[1e-9]], "findings": [{"name": "thrust_curve", "unit": "1"}]},
+         "thrust_curve in '1'; the throw's thrust_curve is in 'N s/rad'"),
     ],
 )
 def test_mistakes_are_told(diagnosis, changes, message, tmp_path, capsys):

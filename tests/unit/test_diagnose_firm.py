@@ -1,38 +1,88 @@
-"""Causes that only some of the flights ask for are marked, and what else would explain the flights is told."""
+"""Which of the names held-out flights confirm, and what else would explain the flights."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
-from visthrow.diagnose.reporting.report import instead, not_firm
+import numpy as np
+import pytest
+
+from tests.synthetic_diagnosis import SyntheticModel, catalogue
+from visthrow.diagnose.likelihood.marginal import Statistics
+from visthrow.diagnose.reporting.report import instead, landing_sentence
+from visthrow.diagnose.select import held_out, result, search
+
+EFFECTS = catalogue(12)
 
 
-def diagnosis(**partners):
-    """Of causes that were named, with the other members of their classes."""
-    findings = [SimpleNamespace(name=name, partners=others) for name, others in partners.items()]
-    return SimpleNamespace(findings=[*findings, SimpleNamespace(name="other", partners=())], theta=dict.fromkeys(partners, 1.0))
+def promised(nats, came):
+    """Share and interval of flights that promise and bring so many nats by one effect of a size of 1."""
+    information = 2.0 * np.array(nats, dtype=float)[:, None, None]
+    score = (np.array(came, dtype=float) + np.array(nats))[:, None]  # came = score - information / 2
+    count = len(nats)
+    statistics = Statistics(np.arange(count), information, score, np.zeros(count), np.ones(count), np.zeros(1))
+    return held_out.borne_out(statistics, np.ones((count, 1)), np.ones(1))
 
 
-def test_a_cause_named_in_few_folds_is_marked():
-    gain = SimpleNamespace(folds=4, left_out="flights", named_in={"lag": 0.25, "drag": 1.0, "mass": 0.5, "thrust": 0.5})
-    said = not_firm(diagnosis(lag=(), drag=(), mass=("thrust",)), gain)
-    assert said == ["lag is named in 25 % of the 4 searches that leave flights out"]
-    assert not_firm(diagnosis(curve=()), gain) == ["curve is named in 0 % of the 4 searches that leave flights out"]
+@pytest.mark.parametrize(("nats", "came", "sure"), [
+    ([30.0, 40.0, 35.0], [29.0, 41.0, 36.0], True),
+    ([0.01, 30.0, 40.0, 35.0], [0.0, 29.0, 41.0, 36.0], True),  # one flight cannot tell: it counts neither way
+    ([30.0, 40.0, 35.0], [90.0, -60.0, 10.0], False),  # what three flights say has nothing in common
+    ([1.0, 1.2, 1.1], [1.0, 1.2, 1.1], False),  # 3 nats agree by chance as well
+    ([200.0, 0.1], [200.0, 0.1], False),  # one flight alone
+])  # fmt: skip
+def test_names_are_confirmed_by_what_flights_agree_on(nats, came, sure):
+    share, low, _ = promised(nats, came)
+    assert share == pytest.approx(sum(came) / sum(nats))
+    assert (low > 0.0) == sure
 
 
-def test_nothing_is_said_without_folds():
-    assert not_firm(diagnosis(lag=()), None) == []
-    assert not_firm(diagnosis(lag=()), SimpleNamespace(folds=0, left_out="flights", named_in={})) == []
+def test_a_cause_that_all_flights_show_is_confirmed():
+    diagnosis = search.explain(SyntheticModel(effects=EFFECTS, truth={"effect_05": 40.0}, throws=8, free=4, seed=2), laws=False)
+    assert diagnosis.overall == result.KNOWN
+    assert diagnosis.held_out.low > 0.5
+    assert diagnosis["effect_05"].verdict == result.FOUND
 
 
-def test_two_of_three_are_not_firm_and_three_of_four_are():
-    """In recorded flights what two of three parts named was told otherwise by the next flight."""
-    named = {"lag": 2 / 3, "sag": 1 / 3, "curve": 1 / 3, "drag": 1.0}
-    three = SimpleNamespace(folds=3, left_out="parts of flights", named_in=named)
-    assert not_firm(diagnosis(lag=(), drag=()), three) == [
-        "lag is named in 67 % of the 3 searches that leave parts of flights out"
-    ]
-    assert len(not_firm(diagnosis(sag=("curve",)), three)) == 1
-    four = SimpleNamespace(folds=4, left_out="flights", named_in={"lag": 0.75})
-    assert not_firm(diagnosis(lag=()), four) == []
+def judged(monkeypatch, truth, **changes):
+    """A diagnosis whose held-out flights say something else."""
+    plain = held_out.measure
+
+    def measure(*args):
+        return replace(plain(*args), **changes)
+
+    monkeypatch.setattr(held_out, "measure", measure)
+    return search.explain(SyntheticModel(effects=EFFECTS, truth=truth, throws=8, free=4, seed=2), laws=False)
+
+
+def test_names_that_held_out_flights_do_not_confirm_are_candidates(monkeypatch):
+    diagnosis = judged(monkeypatch, {"effect_05": 40.0}, share=0.4, low=-0.2, high=1.0)
+    assert (diagnosis.overall, dict(diagnosis.theta)) == (result.UNKNOWN, {})
+    assert diagnosis["effect_05"].verdict == result.CANDIDATE
+    assert "do not confirm effect_05 (they bear out 40 % [-20, 100]" in diagnosis.reasons[0]
+
+
+def test_names_that_do_harm_are_withdrawn(monkeypatch):
+    diagnosis = judged(monkeypatch, {"effect_05": 40.0}, share=-0.1, low=-0.3, high=0.1)
+    assert (diagnosis.overall, dict(diagnosis.theta)) == (result.UNKNOWN, {})
+    assert diagnosis["effect_05"].verdict == result.NOT_IDENTIFIABLE
+    assert "are explained worse with effect_05" in diagnosis.reasons[0]
+
+
+def test_a_name_that_few_searches_find_again_is_a_candidate(monkeypatch):
+    """Of two, the other keeps its name, with the size that it has alone."""
+    diagnosis = judged(monkeypatch, {"effect_05": 40.0, "effect_02": 40.0}, named_in={"effect_05": 1.0, "effect_02": 2 / 3})
+    assert diagnosis["effect_02"].verdict == result.CANDIDATE
+    assert set(diagnosis.theta) == {"effect_05"}
+    assert np.shape(diagnosis.covariance) == (1, 1)
+    assert diagnosis.overall == result.KNOWN
+
+
+@pytest.mark.parametrize(("after", "verb"), [(0.050, "rises from 34 to 50 mm"), (0.012, "falls from 34 to 12 mm"),
+                                             (0.0341, "stays at 34 mm")])  # fmt: skip
+def test_the_landing_error_goes_where_it_goes(after, verb):
+    gain = SimpleNamespace(throws=3, held_out=True, before=0.034, after=after, low=0.9 * after, high=1.1 * after,
+                           released_before=0.01, released_after=0.01, moved={"lag": 0.01})  # fmt: skip
+    assert verb in landing_sentence(gain)
 
 
 def test_two_causes_that_may_be_two_others_are_told():

@@ -11,9 +11,10 @@ from tests.synthetic_diagnosis import SyntheticModel, catalogue
 from visthrow.common.errors import DiagnoseError
 from visthrow.common.storage import write_json
 from visthrow.diagnose.inputs import measures
+from visthrow.diagnose.likelihood import forms
 from visthrow.diagnose.planning import fly_manoeuvres, manoeuvres, plan
-from visthrow.diagnose.reporting import blackbox, blind, forms, gain, pictures, report
-from visthrow.diagnose.select import point, result, search
+from visthrow.diagnose.reporting import blackbox, blind, gain, pictures, report
+from visthrow.diagnose.select import held_out, point, result, search
 from visthrow.diagnose.throw.landing import Landings
 from visthrow.logs.flightlog import Channel, FlightLog
 
@@ -203,7 +204,7 @@ def test_intervals_of_the_gain_hold_what_they_promise_and_stay_finite(flights):
     for _ in range(200):
         before = rng.lognormal(0.0, 0.5, flights)
         after = before * 0.25 * rng.lognormal(-0.5 * 0.4**2, 0.4, flights)
-        _, low, high = gain.studentised(before, after, rng, 400)
+        _, low, high = held_out.studentised(before, after, rng, 400)
         inside += low < 1.0 - np.sqrt(0.25) < high
         widest = max(widest, high - low)
     assert 0.88 < inside / 200 < 0.995
@@ -383,14 +384,15 @@ def test_the_report_holds_sentences_pictures_and_numbers(tmp_path, found, measur
     assert "cannot tell it from" in text
 
 
-def test_what_few_searches_name_is_marked_on_the_page_too(found, measured):
+def test_a_candidate_is_on_the_page_too(found, measured):
     _, diagnosis = found
-    shaky = replace(measured, named_in={"effect_03": 0.25, "effect_04": 1.0})
-    line = f"effect_03 is named in 25 % of the {measured.folds} searches that leave flights out"
-    verdict = report.sections(diagnosis, shaky)[0]
-    assert f"**Not firm.** {line}." in [part.text for part in verdict.parts if hasattr(part, "text")]
-    assert f"not firm: {line}" in report.summary(diagnosis, shaky)
-    assert "not firm" not in report.summary(diagnosis, measured)
+    line = "the flights ask for it"
+    findings = tuple(replace(f, verdict=result.CANDIDATE, sentence=line) if f.name == "effect_03" else f for f in diagnosis.findings)
+    shaky = replace(diagnosis, findings=findings)
+    verdict = report.sections(shaky, measured)[0]
+    assert any(part.text.startswith(f"**CANDIDATE.** {line}") for part in verdict.parts if hasattr(part, "text"))
+    assert f"CANDIDATE {line}" in report.summary(shaky, measured)
+    assert "CANDIDATE" not in report.summary(diagnosis, measured)
 
 
 def test_an_event_is_left_out_or_weighs_little(found):

@@ -80,7 +80,7 @@ def test_an_effect_that_is_there_in_all_flights_is_named_and_does_not_vary(seed)
 @pytest.mark.parametrize("deviation", [4.0, 9.0])  # less than what flights may differ by, and more
 @pytest.mark.parametrize("seed", [1, 2])
 def test_an_effect_that_varies_about_a_mean_is_named_and_varies(seed, deviation):
-    sizes = 14.0 + deviation * np.random.default_rng(seed).permutation(np.linspace(-1.7, 1.7, 12))
+    sizes = 14.0 + deviation * np.random.default_rng(seed).permutation(np.linspace(-1.7, 1.7, 16))
     said = []
     diagnosis = search.explain(drawn(sizes, seed=seed), laws=False, progress=said.append)
     assert any("named, which varies" in line for line in said) == (deviation > 5.0)
@@ -88,7 +88,7 @@ def test_an_effect_that_varies_about_a_mean_is_named_and_varies(seed, deviation)
     assert diagnosis.named == ("cmd_delay",)
     found, varies = diagnosis["cmd_delay"], jitter(diagnosis)
     assert found.low < 14.0 * FLOOR < found.high
-    assert found.sd > deviation * FLOOR / np.sqrt(12) * 0.8  # no mean is known better than its flights scatter
+    assert found.sd > deviation * FLOOR / np.sqrt(16) * 0.8  # no mean is known better than its flights scatter
     assert varies.found
     assert varies.low < deviation * FLOOR < varies.high
 

@@ -70,6 +70,10 @@ class Plant(Protocol):
         """What the pilot is told: with noise and latency where the plant has them."""
 
     @property
+    def sample(self) -> Snapshot:
+        """What motion capture and gyro took down behind the last :meth:`measured`; ``time`` is when it was true."""
+
+    @property
     def landing(self) -> Landings:
         """Landings so far."""
 
@@ -131,6 +135,7 @@ class HybridPlant:
         bias = 0.0 if self.noise is None else self.noise.observation_bias
         self._bias = bias * self._rng.standard_normal((5, count, 3))
         self._age = self._rng.uniform(*self.latency, count)
+        self._error = np.zeros((5, count, 3))
         self._before = self.state
 
     def step(self, command: np.ndarray, release: np.ndarray | bool = False) -> None:
@@ -210,10 +215,24 @@ class HybridPlant:
 
     def measured(self) -> Snapshot:
         """The truth, late and with the training's observation noise, which on the attitude is an angle [rad]."""
-        now = _late(self._before, self.state, self._age / self.period)
+        if self.noise is not None:
+            step = self.noise.observation_step * self._rng.standard_normal((5, self.count, 3))
+            self._error = self._bias + step
+        return self._erring(_late(self._before, self.state, self._age / self.period))
+
+    @property
+    def sample(self) -> Snapshot:
+        """The truth now, with the error of the last :meth:`measured`.
+
+        The pilot hears of it late, by a chord between two control steps as in training; sensors know no chord.
+        """
+        return self._erring(self.state)
+
+    def _erring(self, now: Snapshot) -> Snapshot:
+        """A state with the error of the last measurement."""
         if self.noise is None:
             return now
-        error = self._bias + self.noise.observation_step * self._rng.standard_normal((5, self.count, 3))
+        error = self._error
         quat = now.quat_wb + 0.5 * _quat_times_vector(now.quat_wb, error[4])
         return replace(
             now, pos_w=now.pos_w + error[0], vel_w=now.vel_w + error[1], rate_b=now.rate_b + error[2],
@@ -274,7 +293,13 @@ class ReferenceAdapter:
 
     def measured(self) -> Snapshot:
         """See `Plant`."""
-        return Snapshot(**vars(self._plant.measured()))
+        self._sample = Snapshot(**vars(self._plant.measured()))
+        return self._sample
+
+    @property
+    def sample(self) -> Snapshot:
+        """See `Plant`; the plant's latency is that of whole samples."""
+        return self._sample
 
     @property
     def landing(self) -> Landings:

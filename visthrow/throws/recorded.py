@@ -22,7 +22,7 @@ QUIET_TIME = 0.4  # for which it must last [s]
 RECOVERY_MOST = 8.0  # [s]
 ROPE_ON_GROUND = 0.003  # height at which the rope is drawn where it would pass through the ground; no plant knows it [m]
 MEASURED = {"pos_w": "m", "quat_wb": "1", "vel_w": "m/s", "rate_b": "rad/s", "payload_pos_w": "m"}
-"""Channels that are recorded a second time as measured, under ``measured_<name>``, with their units."""
+"""Channels recorded a second time as measured, under ``measured_<name>``, stamped when they were true, with their units."""
 
 
 class Recording(Recorder):
@@ -64,6 +64,7 @@ class _Full(Recording):
             self.recorders[0].declare(f"measured_{name}", unit, "body" if name == "rate_b" else "world")
         self._resting: LooseRope | None = None
         self._before: Snapshot | None = None
+        self._sampled = -np.inf  # stamp of the last measured sample [s]
 
     def before(self, flight: Flight, seen: Snapshot, sent: Decision) -> None:
         """See `Recorder`."""
@@ -75,14 +76,17 @@ class _Full(Recording):
         recorder.add(now.time, goal_w=self.pilots.goal_w[0], mode=int(throws), keypoints=points[0], keypoints_valid=valid[0])
         if throws:
             recorder.add(now.time, action=sent.action[0], observation=sent.observation[0])
-        self.sample(flight, seen)
+        self.sample(flight)
 
-    def sample(self, flight: Flight, seen: Snapshot) -> None:
-        """Record rope and measurements now."""
+    def sample(self, flight: Flight) -> None:
+        """Record the rope now, and the measured state that the pilot was given last, stamped when it was true."""
         points = self._rope(flight)
         points[:, 2] = np.maximum(points[:, 2], ROPE_ON_GROUND)
-        measured = {f"measured_{name}": getattr(seen, name)[0] for name in MEASURED}
-        self.recorders[0].add(flight.now.time, cable_points_w=points, **measured)
+        self.recorders[0].add(flight.now.time, cable_points_w=points)
+        sample = flight.plant.sample
+        if sample.time > self._sampled:
+            self.recorders[0].add(sample.time, **{f"measured_{name}": getattr(sample, name)[0] for name in MEASURED})
+            self._sampled = sample.time
         self._before = flight.now
 
     def _rope(self, flight: Flight) -> np.ndarray:
@@ -187,7 +191,8 @@ def _finished(flight: Flight, recording: _Full, recovery: float) -> FlightLog:
     """The log with the last state, and how the throw ended."""
     plant, now, recorder = flight.plant, flight.now, recording.recorders[0]
     recorder.add(now.time, **{name: getattr(now, name)[0] for name in recording.names})
-    recording.sample(flight, plant.measured())
+    plant.measured()
+    recording.sample(flight)
     landing, failure = plant.landing, flight.failures[0]
     times = {"policy_start": flight.begin, "latch": recording.latch, "recovery": recovery, "end": plant.time}
     result: dict[str, Any] = {"success": False, "failure": failure}

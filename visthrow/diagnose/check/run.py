@@ -66,9 +66,9 @@ def contradictions(results: Sequence[Checked]) -> list[str]:
     ]
 
 
-def copies(results: Sequence[Checked]) -> tuple[int, ...]:
-    """Logs that hold what an earlier one holds, by number: a copy counts once."""
-    return tuple(i for i, checked in enumerate(results) if any(row.topic == "duplicates" for row in checked.rows))
+def copies(results: Sequence[Checked]) -> dict[int, int]:
+    """Return the logs that hold what an earlier one holds, by number, and which one: a copy counts once."""
+    return {i: row.figures["copy_of"] for i, checked in enumerate(results) for row in checked.rows if row.topic == "duplicates"}
 
 
 def label(log: FlightLog, number: int) -> str:

@@ -27,7 +27,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"plants that training draws from the joint posterior; 1: the estimate alone (default: {DEFAULT_PLANTS})",
     )  # fmt: skip
     parser.add_argument(
-        "--laws", type=int, default=0, metavar="N", help="write the best N laws outside the catalogue as well (default: 0)"
+        "--laws", type=int, default=0, metavar="N",
+        help="write the laws of the N-th best explanation outside the catalogue, which belong together, as well (default: 0, none)",
     )
     parser.add_argument("--anyway", action="store_true", help="write it even if held-out flights saw no gain")
 
@@ -49,7 +50,8 @@ def run(args: argparse.Namespace) -> int:
     theta, covariance = patch.with_scatter(*patch.read(report, args.diagnosis), report)
     laws = patch.laws_of(report, args.diagnosis, args.laws)
     if not theta and not laws:
-        print("nothing was named; the configuration stands as it is")
+        unused = ", but a law outside the catalogue explains the flights: --laws 1 writes it" if report.get("laws") else ""
+        print(f"nothing was named{unused}; the configuration stands as it is")
         return 0
     doubts = harm(report)
     if doubts and not args.anyway:

@@ -14,6 +14,7 @@ from visthrow import config
 from visthrow.common.errors import DiagnoseError
 from visthrow.common.toml_text import dumps
 from visthrow.config.effects import catalogue, chosen
+from visthrow.diagnose.inputs.opening import THROW
 from visthrow.diagnose.select.scatter import variances
 from visthrow.task import Experiment, plant_of
 
@@ -115,16 +116,17 @@ def with_scatter(
     return {name: theta.get(name, 0.0) for name in names}, whole.tolist()
 
 
-def laws_of(report: Mapping[str, Any], path: str, count: int) -> list[LawParams]:
-    """The best ``count`` laws of the JSON that ``explain`` wrote.
+def laws_of(report: Mapping[str, Any], path: str, rank: int) -> list[LawParams]:
+    """All laws of the explanation of this rank, from 1, in the JSON that ``explain`` wrote; none for 0.
 
     Raises:
         DiagnoseError: It holds fewer.
     """
-    told = report.get("laws") or []
-    if count > len(told):
-        raise DiagnoseError(f"{path}: {len(told)} laws outside the catalogue; --laws asks for {count}")
-    return [LawParams(x["block"], tuple(x["factors"]), x["vector"], float(x["coefficient"])) for x in told[:count]]
+    told = report.get("explanations") or [[law] for law in report.get("laws") or []]
+    if rank > len(told):
+        raise DiagnoseError(f"{path}: {len(told)} explanations by laws outside the catalogue; --laws asks for number {rank}")
+    laws = told[rank - 1] if rank else []
+    return [LawParams(x["block"], tuple(x["factors"]), x["vector"], float(x["coefficient"])) for x in laws]
 
 
 def read(report: Mapping[str, Any], path: str) -> tuple[dict[str, float], list[list[float]]]:
@@ -140,9 +142,33 @@ def read(report: Mapping[str, Any], path: str) -> tuple[dict[str, float], list[l
         raise DiagnoseError(f"{path}: no diagnosis that `visthrow diagnose explain` wrote: {error!r}") from error
     if len(covariance) != len(theta) or any(len(row) != len(theta) for row in covariance):
         raise DiagnoseError(f"{path}: {len(theta)} effects and a covariance of {len(covariance)} rows; expected one each")
-    strange = [name for name in theta if name not in catalogue()]
+    _refuse_strange(report, path, theta)
+    return theta, covariance
+
+
+def _refuse_strange(report: Mapping[str, Any], path: str, theta: Mapping[str, float]) -> None:
+    """Refuse effects of another model, though they may bear the same name, and sizes that the throw's simulator cannot have.
+
+    Raises:
+        DiagnoseError: It is of another model; an effect or its unit is none of the catalogue's; a size lies outside its bounds.
+    """
+    model = report.get("model", THROW)
+    if model != THROW:
+        raise DiagnoseError(
+            f"{path}: a diagnosis of the model '{model}'; apply writes configurations of the whole throw alone, and "
+            f"`visthrow diagnose fit` those of a vehicle by itself"
+        )
+    known = catalogue()
+    strange = [name for name in theta if name not in known]
     if strange:
         raise DiagnoseError(
             f"{path}: {', '.join(strange)} are no effects of the throw's simulator; apply writes configurations of that alone"
         )
-    return theta, covariance
+    units = {f["name"]: f["unit"] for f in report.get("findings") or [] if "unit" in f}
+    for name, size in theta.items():
+        effect = known[name]
+        if units.get(name, effect.unit) != effect.unit:
+            raise DiagnoseError(f"{path}: {name} in '{units[name]}'; the throw's {name} is in '{effect.unit}': of another model")
+        low, high = effect.bounds
+        if not low <= size <= high:
+            raise DiagnoseError(f"{path}: {name} = {size:.4g} {effect.unit}; the throw's simulator has it from {low:g} to {high:g}")

@@ -8,6 +8,8 @@ from visthrow.diagnose.models.interface import Model
 from visthrow.logs.flightlog import FlightLog
 
 DEFAULT_PLANT = "state"
+THROW = "throw"
+"""Name of the model that is no setup's own: the whole throw."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -42,6 +44,14 @@ def open_model(args: argparse.Namespace) -> tuple[Model, list[FlightLog]]:
     if args.measured:
         model.effects = measures.narrowed(model.effects, measures.parsed(args.measured))
     return model, logs
+
+
+def model_name(args: argparse.Namespace) -> str:
+    """Name of the model that the arguments ask for."""
+    from visthrow.diagnose.inputs import setup
+
+    own = setup.load(args.config).named() if args.config else []
+    return own[0] if own else THROW
 
 
 def _opened(args: argparse.Namespace) -> tuple[Model, list[FlightLog]]:

@@ -4,12 +4,16 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from visthrow.diagnose.select.result import INCONSISTENT, OVERALL
+from visthrow.diagnose.inputs.opening import THROW
+from visthrow.diagnose.select.result import INCONSISTENT, OUT_OF_DOMAIN, OVERALL
 
 DEFAULT_OUT = "out/explain"
 
-MOST_SPOILED = 0.25
+MOST_SPOILED = 0.5
 """Share of the logs that may contradict themselves and be left out; where more do, nothing is to be learnt from any."""
+
+REFUSED = 1
+"""Exit status where no cause can be named: the data contradict themselves, or the simulation does not follow them."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -43,28 +47,29 @@ def run(args: argparse.Namespace) -> int:
         print(f"{INCONSISTENT}: {OVERALL[INCONSISTENT]}\n" + "\n".join(f"  {reason}" for reason in reasons))
         if args.json:
             write_json(args.json, {"overall": INCONSISTENT, "reasons": reasons, "findings": []})
-        return 0
+        return REFUSED
     print(f"{len(logs)} log(s), {len(model.effects)} effects on {', '.join(model.channels)}", flush=True)
-    doubled = tuple(i for i in copies(checked) if i not in spoiled)
+    doubled = {i: other for i, other in copies(checked).items() if i not in spoiled}
     reasons += [f"{checked[i].name}: a copy of another log, which counts once" for i in doubled]
     for reason in reasons:
         print(f"  left out: {reason}", flush=True)
     without = (*opening.numbers(args.without), *spoiled, *doubled)
     diagnosis = search.explain(model, seed=args.seed, without=without, progress=lambda line: print(f"  {line}", flush=True))
-    diagnosis = replace(diagnosis, reasons=(*diagnosis.reasons, *(f"left out: {reason}" for reason in reasons)))
+    left_out = (f"left out: {reason}" for reason in reasons)
+    diagnosis = replace(diagnosis, reasons=(*diagnosis.reasons, *left_out), duplicates={**doubled, **diagnosis.duplicates})
     gain = None
     if not args.no_report and diagnosis.work is not None:
-        gain = write_report(Path(args.out), diagnosis, model, logs, args.seed, not args.no_blind)
+        gain = write_report(Path(args.out), diagnosis, model, logs, args.seed, not args.no_blind, opening.model_name(args))
     print("\n" + report.summary(diagnosis, gain))
     if not args.no_report and diagnosis.work is not None:
         print(f"page, JSON, pictures and recording: {args.out}")
     if args.json:
-        write_json(args.json, report.to_json(diagnosis, gain))
-    return 0
+        write_json(args.json, report.to_json(diagnosis, gain, extra={"model": opening.model_name(args)}))
+    return REFUSED if diagnosis.overall in (INCONSISTENT, OUT_OF_DOMAIN) else 0
 
 
-def write_report(folder: Path, diagnosis, model, logs, seed: int, limits: bool = True):
-    """Write page, JSON, pictures and recording; returns the gain on held-out flights."""
+def write_report(folder: Path, diagnosis, model, logs, seed: int, limits: bool = True, name: str = THROW):
+    """Write page, JSON, pictures and recording; returns the gain on held-out flights. ``name``: of the model."""
     from visthrow.common import provenance
     from visthrow.common.storage import write_json
     from visthrow.diagnose.reporting import blackbox, blind, gain, recording, report
@@ -79,7 +84,7 @@ def write_report(folder: Path, diagnosis, model, logs, seed: int, limits: bool =
     made = report.sections(diagnosis, measured, hidden, step_check=steps, about=about)
     report.write(folder, made, diagnosis, "What the simulation gets wrong about these flights")
     table = blackbox.unexplained(diagnosis.work.after, seed) if diagnosis.overall == result.UNKNOWN else None
-    extra = {"step_error_sigma": steps, "provenance": origin, "table": table}
+    extra = {"model": name, "step_error_sigma": steps, "provenance": origin, "table": table}
     whole = report.to_json(diagnosis, measured, hidden, extra=extra)
     write_json(folder / "diagnosis.json", whole)
     recording.write(folder / "diagnosis.rrd", diagnosis, logs)

@@ -5,51 +5,21 @@ Beside it stand the noise floor, which cannot be beaten, and a black box trained
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.special import stdtrit
 
 from visthrow.diagnose.likelihood import designs
 from visthrow.diagnose.likelihood import noise as levels
-from visthrow.diagnose.likelihood.evidence import Priors, additions, estimate, log_evidence
-from visthrow.diagnose.likelihood.marginal import Statistics, gather, gram_of, window_statistics
+from visthrow.diagnose.likelihood.evidence import Priors
+from visthrow.diagnose.likelihood.forms import forms
+from visthrow.diagnose.likelihood.marginal import Statistics, gram_of, window_statistics
 from visthrow.diagnose.models.interface import Model
 from visthrow.diagnose.reporting.blackbox import table_of, train
-from visthrow.diagnose.reporting.forms import HORIZONS, Forms, forms, unit_of
 from visthrow.diagnose.reporting.landing_gain import LandingGain, landing_gain
+from visthrow.diagnose.select.held_out import DRAWS, Crossed, channel_gains, crossed, regrouped
 from visthrow.diagnose.select.point import Point
-from visthrow.diagnose.select.result import Diagnosis
-
-DRAWS = 10_000
-MOST_FOLDS = 12
-FEWEST_FLIGHTS = 3
-"""With fewer, parts of flights are left out instead, and the report says so."""
-PARTS = 3
-FEW_GROUPS = 8
-MOST_NAMES = 6
-HARM = 0.01
-
-
-@dataclass(frozen=True)
-class ChannelGain:
-    """Prediction error on held-out flights of one channel; root mean squares in ``unit``."""
-
-    channel: str
-    unit: str
-    before: float
-    after: float
-    floor: float  # of sensor noise and of the initial state's uncertainty
-    blackbox: float  # NaN where none can be trained
-    gain: float  # 1 - after / before
-    low: float  # 95 % interval of the gain, by bootstrap over flights
-    high: float
-    horizons: tuple[tuple[float, float, float, float], ...]  # horizon [s], before, after, floor, in sigmas
-
-    @property
-    def harmed(self) -> bool:
-        """Whether the prediction got worse by more than a per cent."""
-        return self.after > (1.0 + HARM) * self.before
+from visthrow.diagnose.select.result import ChannelGain, Diagnosis
 
 
 @dataclass(frozen=True)
@@ -68,23 +38,6 @@ class Gain:
         return next(c for c in self.channels if c.channel == channel)
 
 
-def select(information: np.ndarray, score: np.ndarray, priors: Priors, least: float, most: int = MOST_NAMES) -> list[int]:
-    """Forward search with backward elimination by the statistics alone."""
-    active: list[int] = []
-    while len(active) < most:
-        gain = additions(information, score, priors, active)
-        best = int(np.argmax(gain))
-        if gain[best] <= least:
-            break
-        active.append(best)
-        whole = log_evidence(information, score, priors, active)
-        for j in list(active[:-1]):
-            rest = [k for k in active if k != j]
-            if whole - log_evidence(information, score, priors, rest) < least:
-                active, whole = rest, log_evidence(information, score, priors, rest)
-    return active
-
-
 def measure(diagnosis: Diagnosis, *, seed: int = 0, draws: int = DRAWS) -> Gain:
     """Measure the gain of a diagnosis on held-out flights.
 
@@ -94,29 +47,16 @@ def measure(diagnosis: Diagnosis, *, seed: int = 0, draws: int = DRAWS) -> Gain:
         draws: of the bootstrap.
     """
     work, rng = diagnosis.work, np.random.default_rng(seed)
-    before, after, priors = work.before, work.after, work.problem.priors
-    groups, left_out = _groups(after, work.problem.kept)
-    statistics = _regrouped(after, groups)
-    folds = _folds(len(statistics.flights))
-    channels = len(work.problem.model.channels)
-    by_effect = [np.hstack((w.residual[:, None], w.effects * priors.floor)) for w in after.windows]
-    own = forms(after.windows, groups, after.noise, by_effect, channels)
-    plain = forms(before.windows, groups, after.noise, [w.residual[:, None] for w in before.windows], channels)
-    combination, named = _cross_validated(statistics, folds, priors, diagnosis.threshold, after.theta)
-    error_before, error_after = plain.error(np.ones(1)), own.error(combination)
-    box = _blackbox(before, groups, folds, after, channels, rng)
-    nats = _nats(before, statistics, groups, combination)
-    shares = {work.problem.model.effects[j].name: n / len(folds) for j, n in named.items()}
-    gains = tuple(
-        _channel(name, c, after, own, error_before[:, c], error_after[:, c], None if box is None else box[:, c], rng, draws)
-        for c, name in enumerate(work.problem.model.channels)
-        if own.count[:, c].sum() > 0
-    )
-    sizes = (after.theta - combination[:, 1:]) if left_out == "flights" and diagnosis.theta else ()
-    trained = {int(f): work.problem.sizes(size) for f, size in zip(own.groups, sizes)}
+    cross = crossed(diagnosis)
+    box = _blackbox(work.before, cross.groups, cross.folds, work.after, len(work.problem.model.channels), rng)
+    gains = channel_gains(work, cross, rng, draws, box)
+    shares = {work.problem.model.effects[j].name: n / len(cross.folds) for j, n in cross.named.items()}
+    sizes = cross.trained if cross.left_out == "flights" and diagnosis.theta else ()
+    trained = {int(f): work.problem.sizes(size) for f, size in zip(cross.statistics.flights, sizes)}
     landing = landing_gain(work, diagnosis.theta, trained, seed)
-    whole = all(w.nuisance.shape[1] == 0 for w in after.windows)
-    return Gain(gains, nats, shares, len(folds), left_out, landing, whole)
+    whole = all(w.nuisance.shape[1] == 0 for w in work.after.windows)
+    nats = _nats(work.before, work.after, cross)
+    return Gain(gains, nats, shares, len(cross.folds), cross.left_out, landing, whole)
 
 
 def shortfalls(model: Model, sizes: Sequence[Mapping[str, float]]) -> tuple[list[float], int]:
@@ -139,43 +79,6 @@ def shortfalls(model: Model, sizes: Sequence[Mapping[str, float]]) -> tuple[list
     return [float(0.5 * (square - squares[-1])) for square in squares], sum(len(w.residual) for w in told[-1])
 
 
-def _groups(point: Point, kept: Sequence[int]) -> tuple[list[int], str]:
-    flights = [w.flight for w in point.windows]
-    if len(set(flights)) >= FEWEST_FLIGHTS or len(flights) < PARTS:
-        return flights, "flights"
-    order = {f: [i for i, g in enumerate(flights) if g == f] for f in set(flights)}
-    return [f * PARTS + PARTS * order[f].index(i) // len(order[f]) for i, f in enumerate(flights)], "parts of flights"
-
-
-def _regrouped(point: Point, groups: Sequence[int]) -> Statistics:
-    parts = [window_statistics(gram, point.noise, w) for w, gram in enumerate(point.grams)]
-    return gather([replace(gram, flight=g) for gram, g in zip(point.grams, groups)], parts, point.theta)
-
-
-def _folds(count: int) -> list[np.ndarray]:
-    return [np.arange(count)[k::MOST_FOLDS] for k in range(min(count, MOST_FOLDS))]
-
-
-def _cross_validated(
-    statistics: Statistics, folds: Sequence[np.ndarray], priors: Priors, least: float, theta: np.ndarray
-) -> tuple[np.ndarray, dict[int, int]]:
-    """For each group the column combination [1, -(theta_train - theta)] of its fold, and how often each effect was named."""
-    combination = np.ones((len(statistics.flights), 1 + len(theta)))
-    named: dict[int, int] = {}
-    for fold in folds:
-        rest = np.setdiff1d(np.arange(len(statistics.flights)), fold)
-        active: list[int] = []
-        trained = np.zeros(len(theta))
-        if len(rest):
-            information, score = statistics.information[rest].sum(0), statistics.absolute[rest].sum(0)
-            active = select(information, score, priors, least)
-            trained = estimate(information, score, priors, active)
-        combination[fold, 1:] = theta - trained
-        for j in active:
-            named[j] = named.get(j, 0) + 1
-    return combination, named
-
-
 def _blackbox(before: Point, groups: Sequence[int], folds, after: Point, channels: int, rng: np.random.Generator):
     """Squared errors of the black box on held-out groups, shape (F, C, H); None where it cannot be trained."""
     table = table_of(before, rng)
@@ -191,68 +94,12 @@ def _blackbox(before: Point, groups: Sequence[int], folds, after: Point, channel
     return own.error(combination)
 
 
-def _nats(before: Point, after: Statistics, groups: Sequence[int], combination: np.ndarray) -> float:
+def _nats(before: Point, after: Point, cross: Crossed) -> float:
     """Held-out log-likelihood per sample, after minus before, each with its own noise levels."""
-    plain = _regrouped(before, groups)
-    change = -combination[:, 1:]
-    quadratic = np.einsum("fi,fij,fj->f", change, after.information, change)
-    square = after.square - 2.0 * np.einsum("fi,fi->f", change, after.score) + quadratic
-    return float(0.5 * (plain.square.sum() - square.sum()) / after.samples.sum())
-
-
-def _channel(name, c, after: Point, own: Forms, before, error, box, rng, draws: int) -> ChannelGain:
-    count = own.count[:, c].sum()
-    rows = [w.sigma[w.channel == c] for w in after.windows if np.any(w.channel == c)]
-    sigma = float(np.median(np.concatenate(rows)))
-
-    def rms(square: np.ndarray) -> float:
-        return float(np.sqrt(np.maximum(square.sum(), 0.0) / max(count, 1.0)) * sigma)
-
-    value, low, high = studentised(before.sum(1), error.sum(1), rng, draws)
-    by_horizon = own.count[:, c].sum(0)
-    seen = by_horizon > 0
-    curves = [np.sqrt(np.maximum(x.sum(0)[seen], 0.0) / by_horizon[seen]) for x in (before, error, own.floor[:, c])]
-    horizons = tuple((h, *map(float, row)) for h, *row in zip(np.array(HORIZONS)[seen].tolist(), *curves))
-    return ChannelGain(name, unit_of(name), rms(before), rms(error), rms(own.floor[:, c]),
-                       float("nan") if box is None else rms(box), value, low, high, horizons)  # fmt: skip
-
-
-def studentised(before: np.ndarray, after: np.ndarray, rng: np.random.Generator, draws: int) -> tuple[float, float, float]:
-    """Gain 1 - sqrt(sum after / sum before) with a 95 % interval by the studentised bootstrap over groups.
-
-    Of few groups many resamples hold little else than one of them, and say nothing of the spread: there it is Student's interval.
-
-    Args:
-        before: sums of squares by group, shape (F,).
-        after: the same afterwards.
-        rng: for the draws.
-        draws: number of bootstrap samples.
-
-    Source: Efron and Tibshirani 1993, ch. 12, on the logarithm of the ratio.
-    """
-    n = len(before)
-    if before.sum() <= 0.0 or after.sum() <= 0.0:
-        return 0.0, float("nan"), float("nan")
-    value = np.log(after.sum() / before.sum())
-    if n < 2:
-        return float(1.0 - np.exp(0.5 * value)), float("nan"), float("nan")
-
-    def spread(w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        a, b = w @ after, w @ before
-        influence = after / a[:, None] - before / b[:, None]
-        return np.log(a / b), np.sqrt(n / (n - 1.0) * (w * influence**2).sum(1))
-
-    _, own = spread(np.ones((1, n)))
-    if n < FEW_GROUPS:
-        reach = 0.5 * stdtrit(n - 1, 0.975) * own[0]
-        return tuple(float(1.0 - np.exp(0.5 * value + side)) for side in (0.0, reach, -reach))
-    weights = rng.multinomial(n, np.full(n, 1.0 / n), size=draws)
-    usable = weights @ before > 0.0
-    ratio, error = spread(weights[usable])
-    t = (ratio - value) / np.maximum(error, 1e-3 * own[0] + 1e-300)
-    upper, lower = np.quantile(t, (0.025, 0.975))
-    low, high = 1.0 - np.exp(0.5 * (value - upper * own[0])), 1.0 - np.exp(0.5 * (value - lower * own[0]))
-    return float(1.0 - np.exp(0.5 * value)), float(low), float(high)
+    plain, own, change = regrouped(before, cross.groups), regrouped(after, cross.groups), cross.trained - after.theta
+    quadratic = np.einsum("fi,fij,fj->f", change, own.information, change)
+    square = own.square - 2.0 * np.einsum("fi,fi->f", change, own.score) + quadratic
+    return float(0.5 * (plain.square.sum() - square.sum()) / own.samples.sum())
 
 
 def bootstrap_sizes(statistics: Statistics, priors: Priors, active: Sequence[int], rng: np.random.Generator, draws: int = DRAWS):

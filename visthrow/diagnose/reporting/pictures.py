@@ -6,10 +6,10 @@ import numpy as np
 
 from visthrow.common import style
 from visthrow.diagnose.likelihood.evidence import covariance
+from visthrow.diagnose.likelihood.forms import READABLE, unit_of
 from visthrow.diagnose.likelihood.marginal import Noise
 from visthrow.diagnose.models.interface import Window
 from visthrow.diagnose.reporting.blind import Blind
-from visthrow.diagnose.reporting.forms import unit_of
 from visthrow.diagnose.reporting.gain import Gain
 from visthrow.diagnose.reporting.landing_gain import LandingGain
 from visthrow.diagnose.select import result
@@ -31,9 +31,6 @@ STEPS_ACROSS = 3
 MOST_TICKS = 16  # over the whole width
 STEPS_OF_TICKS = ((1, 2, 5), (1, 3), (1,))
 """Within a decade of a logarithmic axis; the finest that leaves room is taken."""
-READABLE = {"m": (1e3, "mm"), "rad": (180.0 / np.pi, "deg"), "m/s": (1e3, "mm/s")}
-"""Unit -> factor and unit in pictures and tables, where residuals are small."""
-
 
 def _figure(rows: int, columns: int, height: float, **more):
     import matplotlib.pyplot as plt
@@ -123,7 +120,7 @@ def ladder(diagnosis: Diagnosis) -> bytes:
 
 def verdicts(diagnosis: Diagnosis) -> bytes:
     """Every effect's interval in its floors, by verdict."""
-    colours = {result.FOUND: AFTER, result.CLASS: style.COLOURS[3], result.BOUNDED: style.QUIET,
+    colours = {result.FOUND: AFTER, result.CLASS: style.COLOURS[3], result.CANDIDATE: style.COLOURS[3], result.BOUNDED: style.QUIET,
                result.NOT_IDENTIFIABLE: style.COLOURS[4]}  # fmt: skip
     shown = [f for f in diagnosis.findings if f.verdict in colours][::-1]
     figure, axes = _figure(1, 1, 0.8 + 0.19 * len(shown))
@@ -132,7 +129,7 @@ def verdicts(diagnosis: Diagnosis) -> bytes:
     for y, f in enumerate(shown):
         label = None if f.verdict in seen else f.verdict
         seen.add(f.verdict)
-        middle = f.estimate if f.verdict in (result.FOUND, result.CLASS) else 0.5 * (f.low + f.high)
+        middle = f.estimate if f.verdict in result.NAMED else 0.5 * (f.low + f.high)
         axis.plot(np.array([f.low, f.high]) / f.floor, [y, y], color=colours[f.verdict], lw=2.4, solid_capstyle="butt")
         axis.plot(middle / f.floor, y, "o" if f.estimate else "|", color=colours[f.verdict], ms=6, label=label)
     axis.axvline(0.0, color=style.QUIET, lw=0.8)

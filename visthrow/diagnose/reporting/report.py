@@ -7,21 +7,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from visthrow.diagnose.likelihood.forms import HEAD_SECONDS
 from visthrow.diagnose.reporting import pictures
 from visthrow.diagnose.reporting.blind import Blind
-from visthrow.diagnose.reporting.forms import HEAD_SECONDS
-from visthrow.diagnose.reporting.gain import ChannelGain, Gain
+from visthrow.diagnose.reporting.gain import Gain
 from visthrow.diagnose.reporting.landing_gain import LandingGain
 from visthrow.diagnose.select import result
-from visthrow.diagnose.select.result import Diagnosis, Finding
+from visthrow.diagnose.select.result import ChannelGain, Diagnosis, Finding
 from visthrow.view.parts import Grid, Picture, Section, Text
 
 if TYPE_CHECKING:
     from visthrow.diagnose.planning.plan import Proposal
-
-FIRM = 2.0 / 3.0
-"""More of the folds than this share must name a cause, or one of its class: of three folds that leave a flight out, all."""
-
 
 def sentence_of(diagnosis: Diagnosis) -> str:
     """The overall verdict in a sentence."""
@@ -33,7 +29,7 @@ def summary(diagnosis: Diagnosis, gain: Gain | None = None) -> str:
     """What the command line prints."""
     lines = [sentence_of(diagnosis), *(f"  {reason}" for reason in diagnosis.reasons), ""]
     for f in diagnosis.findings:
-        if f.verdict in (result.FOUND, result.CLASS):
+        if f.verdict in result.NAMED:
             lines.append(f"{f.verdict:6} {f.sentence}{_moves(f, gain)}")
     lines += [f"OR     {line}" for line in instead(diagnosis)]
     lines += [f"FOUND  {m.sentence}" for m in diagnosis.mistakes]
@@ -42,11 +38,11 @@ def summary(diagnosis: Diagnosis, gain: Gain | None = None) -> str:
     lines += [f"COPY   flight {flight} repeats flight {of} and was left out" for flight, of in diagnosis.duplicates.items()]
     counted = {v: sum(f.verdict == v for f in diagnosis.findings) for v in result.VERDICTS}
     lines.append(", ".join(f"{count} {verdict.lower()}" for verdict, count in counted.items() if count))
-    if gain is not None and diagnosis.theta:
-        lines += [_gain_line(c) for c in gain.channels]
+    told = gain or diagnosis.held_out
+    if told is not None and (diagnosis.theta or gain is None):
+        lines += [_gain_line(c) for c in told.channels]
     if gain is not None and gain.landing is not None:
         lines.append(landing_sentence(gain.landing))
-    lines += [f"not firm: {line}" for line in not_firm(diagnosis, gain)]
     lines.append(f"{diagnosis.windows} windows of {diagnosis.flights} flights, {diagnosis.seconds:.1f} s")
     return "\n".join(lines)
 
@@ -79,7 +75,10 @@ def landing_sentence(landing: LandingGain) -> str:
         return (f"{landing.throws} throws, predicted open loop from before the throw, land {mm[0]:.0f} mm off where they were seen "
                 f"to; from the separation on {1e3 * landing.released_before:.0f} mm.")  # fmt: skip
     whose = "held-out throws" if landing.held_out else "the same throws"
-    return (f"With what was named the landing error of {landing.throws} {whose} falls from {mm[0]:.0f} to {mm[1]:.0f} mm "
+    goes = f"{'falls' if mm[1] < mm[0] else 'rises'} from {mm[0]:.0f} to {mm[1]:.0f} mm"
+    if round(mm[0]) == round(mm[1]):
+        goes = f"stays at {mm[1]:.0f} mm"
+    return (f"With what was named the landing error of {landing.throws} {whose} {goes} "
             f"[{mm[2]:.0f}, {mm[3]:.0f}], open loop from before the throw; from the separation on {released}.")  # fmt: skip
 
 
@@ -98,21 +97,6 @@ def instead(diagnosis: Diagnosis) -> list[str]:
         gone, new = sorted(named - set(names)), sorted(set(names) - named)
         if max(len(gone), len(new)) > 1:
             lines.append(f"{', '.join(new) or 'nothing'} in place of {', '.join(gone) or 'nothing'}, {behind:.1f} nats behind")
-    return lines
-
-
-def not_firm(diagnosis: Diagnosis, gain: Gain | None) -> list[str]:
-    """A line for each named cause that the search over parts of the flights does not name again."""
-    if gain is None or not gain.folds:
-        return []
-    lines = []
-    for finding in diagnosis.findings:
-        if finding.name not in diagnosis.theta:
-            continue
-        share = min(sum(gain.named_in.get(name, 0.0) for name in (finding.name, *finding.partners)), 1.0)
-        if share < FIRM + 1e-9:
-            lines.append(f"{finding.name} is named in {100 * share:.0f} % of the {gain.folds} searches that leave "
-                         f"{gain.left_out} out")  # fmt: skip
     return lines
 
 
@@ -198,9 +182,8 @@ def write(folder: str | Path, made: Sequence[Section], diagnosis: Diagnosis, tit
 def _verdict(diagnosis: Diagnosis, gain: Gain | None) -> Section:
     parts: list[Text | Picture] = [Text(reason, "finding") for reason in diagnosis.reasons]
     parts += [Text(f"**{f.verdict}.** {f.sentence}{_moves(f, gain)}{_next(f)}", "finding")
-              for f in diagnosis.findings if f.verdict in (result.FOUND, result.CLASS)]  # fmt: skip
+              for f in diagnosis.findings if f.verdict in result.NAMED]  # fmt: skip
     parts += [Text(f"**Or.** {line}.", "finding") for line in instead(diagnosis)]
-    parts += [Text(f"**Not firm.** {line}.", "finding") for line in not_firm(diagnosis, gain)]
     if diagnosis.overall == result.UNKNOWN and diagnosis.laws:
         law = diagnosis.laws[0]
         parts.append(Text(f"**Law.** {law.formula} with c = {law.coefficient:.3g} ± {law.sd:.2g} {law.unit}.", "finding"))

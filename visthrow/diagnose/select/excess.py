@@ -13,11 +13,16 @@ from visthrow.diagnose.likelihood.marginal import Gram
 from visthrow.diagnose.likelihood.stack import Stack
 from visthrow.diagnose.models.interface import LATENT_BLOCKS, Window
 from visthrow.diagnose.select.grammar import JOINT, JOINT_NEEDS, Known, through_latents
-from visthrow.diagnose.select.point import Point
+from visthrow.diagnose.select.point import Point, Problem
 from visthrow.diagnose.select.result import Level
+from visthrow.logs.flightlog import STANDARD_CHANNELS
 
 UNKNOWN_RATIO = 3.0
 """Latent forces above this many times the quietest phase's are no gusts."""
+
+LANDING = 5e-3
+"""Distance [m] that a latent force must move a body along an axis within a window, else it does not matter: a cause that moves a
+landing by less is below its floor as well."""
 
 LIMIT_NATS = 2.0
 """Loss of log-likelihood that marks the upper limit of a level (one-sided 97.5 %)."""
@@ -26,10 +31,11 @@ STEP, MOST_STEPS = 1.4, 60
 """Factor from one level to the next above the best, until one is too high. A level that nothing holds up lies anywhere below."""
 
 
-def levels(before: Point, after: Point, least: float) -> tuple[Level, ...]:
-    """Compare the latent forces of each block and phase with the block's quietest phase.
+def levels(problem: Problem, before: Point, after: Point, least: float) -> tuple[Level, ...]:
+    """Compare the latent forces of each block and phase with the block's quietest phase, and with what would move a landing.
 
     Args:
+        problem: of the search.
         before: the model as it stands.
         after: with what was named.
         least: nats from which a level would count as excessive if it were the only one; of many, one is higher by chance.
@@ -37,6 +43,7 @@ def levels(before: Point, after: Point, least: float) -> tuple[Level, ...]:
     found, least = [], least + np.log(max(len(after.noise.latent_sd), 1))
     blocks = sorted({block for block, _ in after.noise.latent_sd})
     of = {phase: _Phase(after, phase) for _, phase in after.noise.latent_sd}
+    floors = _floors(after, _positions(problem.model.channels))
     for block in blocks:
         phases = [phase for b, phase in after.noise.latent_sd if b == block]
         limits = {phase: of[phase].upper_limit(block) for phase in phases}
@@ -44,12 +51,28 @@ def levels(before: Point, after: Point, least: float) -> tuple[Level, ...]:
         quiet = limits[quiet_phase]
         for phase in phases:
             level = after.noise.latent_sd[block, phase]
-            nats = 0.0
-            if level > UNKNOWN_RATIO * quiet:
-                nats = of[phase].likelihood(block, level) - of[phase].likelihood(block, UNKNOWN_RATIO * quiet)
+            nats, most = 0.0, max(UNKNOWN_RATIO * quiet, floors.get((block, phase), 0.0))
+            if level > most:
+                nats = of[phase].likelihood(block, level) - of[phase].likelihood(block, most)
             earlier = before.noise.latent_sd.get((block, phase), float("nan"))
             found.append(Level(LATENT_BLOCKS[block], phase, earlier, level, quiet, float(nats), bool(nats > least)))
     return tuple(found)
+
+
+def _positions(channels: Sequence[str]) -> list[int]:
+    """Numbers of the channels that hold positions [m]."""
+    return [c for c, name in enumerate(channels) if name in STANDARD_CHANNELS and STANDARD_CHANNELS[name].unit == "m"]
+
+
+def _floors(point: Point, positions: Sequence[int]) -> dict[tuple[int, str], float]:
+    """Latent deviation [N or N m] of each block and phase that moves a position by ``LANDING`` within the median window."""
+    moves: dict[tuple[int, str], list[float]] = {}
+    for gram, window in zip(point.grams, point.windows):
+        seen = np.isin(window.channel, positions)
+        for block in np.unique(gram.latent_block) if seen.any() else ():
+            reach = window.latent[seen] @ gram.factor[:, gram.latent_block == block]
+            moves.setdefault((int(block), gram.phase), []).append(float(np.sqrt((reach**2).sum(1).max())))
+    return {key: LANDING / median for key, found in moves.items() if (median := float(np.median(found))) > 0.0}
 
 
 class _Phase:

@@ -8,22 +8,30 @@ from visthrow.diagnose.select.scatter import Scatter
 from visthrow.diagnose.throw.interface import Mistake
 
 FOUND, CLASS, BOUNDED = "FOUND", "CLASS", "BOUNDED"
+CANDIDATE = "CANDIDATE"
+NAMED = (FOUND, CLASS, CANDIDATE)
+"""Verdicts on effects that the flights ask for."""
 NOT_IDENTIFIABLE, UNOBSERVABLE = "NOT IDENTIFIABLE", "UNOBSERVABLE"
 VERDICTS = {
     FOUND: "the model lacks it, and nothing else in the catalogue says the same",
     CLASS: "this or one of its partners; these flights cannot tell which",
+    CANDIDATE: "the flights ask for it, but held-out flights do not confirm it, or not all searches name it",
     BOUNDED: "if it is there, then within these limits",
     NOT_IDENTIFIABLE: "these flights say hardly more than was known before",
     UNOBSERVABLE: "a channel is missing that would show it",
 }
 """Verdicts on one effect; each effect has exactly one."""
 
-NO_EFFECT, KNOWN, UNKNOWN = "NO EFFECT", "KNOWN", "UNKNOWN"
+NO_EFFECT, KNOWN, IN_PART, UNKNOWN = "NO EFFECT", "KNOWN", "EXPLAINED IN PART", "UNKNOWN"
 INCONSISTENT, OUT_OF_DOMAIN = "DATA INCONSISTENT", "OUT OF DOMAIN"
+HARM = 0.01
+"""Share by which a prediction may get worse before it counts as harmed."""
+
 OVERALL = {
     NO_EFFECT: "the model explains the flights",
     KNOWN: "the causes named explain the flights",
-    UNKNOWN: "something is missing that the catalogue does not hold",
+    IN_PART: "the causes named explain a part of the flights, as held-out ones confirm; more is left than noise",
+    UNKNOWN: "something is missing that no cause of the catalogue is shown to explain",
     INCONSISTENT: "the channels do not belong together; no cause can be named",
     OUT_OF_DOMAIN: "the simulation cannot follow these flights; no cause can be named",
 }
@@ -96,6 +104,40 @@ class Law:
 
 
 @dataclass(frozen=True)
+class ChannelGain:
+    """Prediction error on held-out flights of one channel; root mean squares in ``unit``."""
+
+    channel: str
+    unit: str
+    before: float
+    after: float
+    floor: float  # of sensor noise and of the initial state's uncertainty
+    blackbox: float  # NaN where none can be, or was, trained
+    gain: float  # 1 - after / before
+    low: float  # 95 % interval of the gain, by bootstrap over flights
+    high: float
+    horizons: tuple[tuple[float, float, float, float], ...]  # horizon [s], before, after, floor, in sigmas
+
+    @property
+    def harmed(self) -> bool:
+        """Whether the prediction got worse by more than a per cent."""
+        return self.after > (1.0 + HARM) * self.before
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """What held-out flights say of a set of names."""
+
+    share: float  # what the names brought there, of the nats that they promise: 1 as promised, 0 nothing
+    low: float  # 95 % interval of the share
+    high: float
+    channels: tuple[ChannelGain, ...]
+    named_in: Mapping[str, float] = field(default_factory=dict)  # effect -> share of folds that named it
+    folds: int = 0
+    left_out: str = "flights"  # or "parts of flights"
+
+
+@dataclass(frozen=True)
 class Diagnosis:
     """The whole answer. ``work`` holds what report, gain, plan and blind calculate with, and is not written to JSON."""
 
@@ -110,6 +152,7 @@ class Diagnosis:
     sets: tuple[tuple[tuple[str, ...], float], ...] = ()  # sets of causes within 3 nats of the best, with their distance
     levels: tuple[Level, ...] = ()
     laws: tuple[Law, ...] = ()  # terms outside the catalogue, best first
+    explanations: tuple[tuple[Law, ...], ...] = ()  # terms that belong together, one such set in place of another, best first
     events: tuple[int, ...] = ()  # flights in which something happened once
     duplicates: Mapping[int, int] = field(default_factory=dict)  # flight -> the earlier flight that it repeats
     sensor_scale: Mapping[str, float] = field(default_factory=dict)  # channel -> noise found, in that stated
@@ -120,6 +163,7 @@ class Diagnosis:
     seed: int = 0
     scatter: tuple[Scatter, ...] = ()  # what may vary from flight to flight
     mistakes: tuple[Mistake, ...] = ()  # of the logs' interface, put right before anything was estimated
+    held_out: HeldOut | None = None  # where something was named
     work: Any = field(default=None, repr=False, compare=False)
 
     def __getitem__(self, name: str) -> Finding:
@@ -135,4 +179,6 @@ class Diagnosis:
         """All but ``work``, for JSON."""
         fields = {name: value for name, value in vars(self).items() if name != "work"}
         plain = {name: [asdict(v) for v in fields[name]] for name in ("findings", "steps", "levels", "laws", "scatter", "mistakes")}
-        return {**fields, **plain}
+        plain["explanations"] = [[asdict(law) for law in laws] for laws in self.explanations]
+        held = None if self.held_out is None else asdict(self.held_out)
+        return {**fields, **plain, "held_out": held}

@@ -22,6 +22,7 @@ from visthrow.diagnose.likelihood.evidence import (
 )
 from visthrow.diagnose.likelihood.threads import each
 from visthrow.diagnose.models.interface import Model
+from visthrow.diagnose.select import held_out
 from visthrow.diagnose.select.consistency import Consistency, across_flights, repeated_flights
 from visthrow.diagnose.select.excess import levels
 from visthrow.diagnose.select.point import (
@@ -339,7 +340,7 @@ class Search(SearchState):
         new = [j for j in rival if j not in self.active]
         if not all(self._fits_in(point, rival, j) for j in new):
             return False
-        left = levels(self.nominal, with_floors_noise(self.problem, point, rival), self.least) if len(new) > 1 else ()
+        left = levels(self.problem, self.nominal, with_floors_noise(self.problem, point, rival), self.least) if len(new) > 1 else ()
         return not any(level.excessive for level in left)
 
     def _fits_in(self, point: Point, rival: Sequence[int], j: int) -> bool:
@@ -397,7 +398,7 @@ def explain(
         if not search.stands_without(gone, problem, nominal, least):
             search = Search(problem, nominal, least, say, laws)
         search.run()
-    diagnosis = conclude(search, laws=laws)
+    diagnosis = held_out.judged(conclude(search, laws=laws), seed)
     return replace(diagnosis, duplicates=duplicates, seconds=time.monotonic() - begun, seed=seed)
 
 

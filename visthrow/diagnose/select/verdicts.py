@@ -47,7 +47,7 @@ def conclude(search: SearchState, *, laws: bool) -> Diagnosis:
     point, model = search.point, search.problem.model
     scatter = search.scatter(search.active)
     varies = deviations(scatter, search.priors, [e.name for e in model.effects])
-    found = levels(search.nominal, with_floors_noise(search.problem, point, search.active, varies), search.least)
+    found = levels(search.problem, search.nominal, with_floors_noise(search.problem, point, search.active, varies), search.least)
     drawn = {name for s in scatter if s.found for name in s.of}
     search.refused = {j: nats for j, nats in search.refused.items() if search.name(j) not in drawn}
     overall, block, reasons, withdrawn = _overall(search, found, *law)
@@ -57,6 +57,7 @@ def conclude(search: SearchState, *, laws: bool) -> Diagnosis:
         overall, reasons = result.KNOWN, [f"besides {' and '.join(besides)}, {reasons[0]}"]
     known = overall != result.UNKNOWN  # a term that is weaker than the names says nothing
     terms = [] if known else _different(answer.strongest)
+    explanations = () if known else tuple(tuple(h.laws()) for h in answer.strongest)
     active = [j for j in search.active if j not in withdrawn]
     if law[0] is not None:
         active = _sure(law[0].without_terms(), search.priors, active)
@@ -78,7 +79,7 @@ def conclude(search: SearchState, *, laws: bool) -> Diagnosis:
         tuple(tuple(map(float, row)) for row in scaled), search.least, tuple(search.steps),
         tuple((tuple(map(search.name, s)), n) for s, n in search.sets), found, tuple(terms), _events(search, point),
         sensor_scale={name: float(point.noise.scale[c]) for c, name in enumerate(model.channels)},
-        scatter=scatter, mistakes=mistakes,
+        scatter=scatter, mistakes=mistakes, explanations=explanations,
         flights=len(point.statistics.flights), windows=len(point.windows), samples=int(point.statistics.samples.sum()),
         work=Work(search.problem, search.nominal, search.point if active else search.nominal, tuple(active)),
     )  # fmt: skip

@@ -25,6 +25,10 @@ UNITS = {"quat_wb": "rad", "angle": "rad", "thrust": "N", "current": "A", "marke
 """Of residuals: an attitude's are rotation vectors, and the small models have channels of their own."""
 
 
+READABLE = {"m": (1e3, "mm"), "rad": (180.0 / np.pi, "deg"), "m/s": (1e3, "mm/s")}
+"""Unit -> factor and unit in pictures and tables, where residuals are small."""
+
+
 def unit_of(channel: str) -> str:
     """Unit of a channel's residuals; empty where it has none, or none that is known."""
     standard = STANDARD_CHANNELS.get(channel)
@@ -71,6 +75,12 @@ def forms(windows: Sequence[Window], groups: Sequence[int], noise: Noise, column
                     count[f, c, h] += rows.sum()
                     floor[f, c, h] += expected[rows].sum()
     return Forms(names, square, count, floor)
+
+
+def left_ahead(window: Window, noise: Noise) -> np.ndarray:
+    """Residuals of a window in sigmas once its initial state is fitted to its head, shape (N,); 0 in the head."""
+    left, _, horizon = _predicted(window, noise, window.residual[:, None])
+    return np.where(horizon < 0, 0.0, left[:, 0])
 
 
 def _predicted(window: Window, noise: Noise, column: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

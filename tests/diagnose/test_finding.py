@@ -1,0 +1,61 @@
+"""What is hidden must be found: the tool passes the suite of :mod:`tests.diagnose.finding`, and four spoilt tools do not."""
+
+import os
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.diagnose import finding
+from visthrow.diagnose import catalogue
+
+SPOILT = {
+    "always NO EFFECT": lambda kinds: finding.blind,
+    "always the most common name": lambda kinds: finding.always(most_common(kinds)),
+    "reads file names": lambda kinds: finding.reader_of_file_names,
+    "takes two effects for each other": lambda kinds: finding.exchanged(kinds[0].hidden[0], kinds[1].hidden[0]),
+}
+"""What is wrong with a tool -> it, made for these kinds of worlds."""
+
+
+def most_common(kinds) -> str:
+    """The effect that most of these worlds hide."""
+    return Counter(name for kind in kinds for name in kind.hidden).most_common(1)[0][0]
+
+
+@pytest.fixture(scope="module")
+def suite():
+    """Kinds of worlds and the first seed, drawn by the system and printed."""
+    seed = int.from_bytes(os.urandom(4), "little")
+    print(f"seed {seed}")
+    return finding.kinds(np.random.default_rng(seed)), seed
+
+
+def test_what_is_hidden_is_found(suite):
+    finding.require(finding.explain, *suite)
+
+
+@pytest.mark.parametrize("name", list(SPOILT))
+def test_a_spoilt_tool_is_caught(name, suite):
+    kinds, seed = suite
+    with pytest.raises(AssertionError, match="seed"):
+        finding.require(SPOILT[name](kinds), kinds, seed)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_what_is_hidden_is_found_in_more_worlds(seed):
+    """Further suites, and a plant of MuJoCo, whose flights take longer."""
+    chain = [finding.Kind((), "chain"), finding.Kind(("com_x",), "chain"), finding.Kind(("cmd_delay",), "chain")]
+    finding.require(finding.explain, [*finding.kinds(np.random.default_rng(seed)), *chain], 1_000_000 * seed)
+
+
+@pytest.mark.slow
+def test_effects_exchanged_in_the_catalogue_are_noticed(monkeypatch):
+    """Worlds of another hand notice; worlds of the simulator's own equations would not."""
+    one, other = catalogue.ALL["com_x"], catalogue.ALL["com_y"]
+    monkeypatch.setitem(catalogue.ALL, "com_x", replace(one, keys=other.keys))
+    monkeypatch.setitem(catalogue.ALL, "com_y", replace(other, keys=one.keys))
+    with pytest.raises(AssertionError, match="seed"):
+        finding.require(finding.explain, [finding.Kind(("com_x",), "rod")], 4)

@@ -1,0 +1,55 @@
+"""What ``visthrow diagnose explain`` does with logs that are copies, or wrong, among others."""
+
+import json
+
+import numpy as np
+import pytest
+
+from tests.diagnose.altered import with_values
+from tests.diagnose.cases import logs_of
+from tests.worlds.world import Recipe
+from visthrow import cli
+from visthrow.diagnose.reporting.explain_cli import REFUSED
+from visthrow.logs.flightlog import FlightLog
+
+MODEL = ("--only", "com_x", "--set", "rope.segments=1", "--device", "cpu", "--no-report")
+
+
+@pytest.fixture(scope="module")
+def flights():
+    """Three throws of a vehicle whose centre of mass lies 3 mm forward."""
+    return logs_of(Recipe(4, "rod", {"com_x": 3e-3}, 30.0, free=0, throws=3))
+
+
+def explained(logs, folder, *arguments):
+    """Exit status, and the JSON of an explanation."""
+    for i, log in enumerate(logs):
+        log.save(folder / f"{i}.npz")
+    names = [str(folder / f"{i}.npz") for i in range(len(logs))]
+    status = cli.main(["diagnose", "explain", *names, *MODEL, "--json", str(folder / "said.json"), *arguments])
+    return status, json.loads((folder / "said.json").read_text())
+
+
+def in_millimetres(log: FlightLog) -> FlightLog:
+    return with_values(log, {"pos_w": lambda x: 1e3 * x, "payload_pos_w": lambda x: 1e3 * x})
+
+
+def test_a_copied_log_counts_once(flights, tmp_path):
+    status, once = explained(flights, tmp_path)
+    again, twice = explained([*flights, flights[0]], tmp_path)
+    assert status == again == 0
+    assert twice["duplicates"] == {"3": 0}
+    assert (twice["flights"], once["model"]) == (3, "throw")
+    assert twice["theta"] == pytest.approx(once["theta"])
+
+
+def test_one_bad_log_of_three_does_not_refuse_the_others(flights, tmp_path):
+    status, said = explained([in_millimetres(flights[0]), *flights[1:]], tmp_path)
+    assert (status, said["flights"]) == (0, 2)
+    assert any(reason.startswith("left out: 0.npz") for reason in said["reasons"])
+
+
+def test_where_most_logs_are_bad_the_status_says_so(flights, tmp_path):
+    status, said = explained([*map(in_millimetres, flights[:2]), flights[2]], tmp_path)
+    assert (status, said["overall"]) == (REFUSED, "DATA INCONSISTENT")
+    assert np.size(said["findings"]) == 0

@@ -1,0 +1,368 @@
+"""What held-out flights say of the names: they decide.
+
+Each flight is left out in turn, the search repeated on the others by their statistics, and its answer predicts the one left out, with
+gusts integrated out. A set of names is confirmed where the interval of what it brings there excludes nothing; names that the
+searches do not find again are candidates, and all are where that interval holds nothing; names that do harm there are withdrawn.
+"""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import stdtrit
+
+from visthrow.diagnose.likelihood.evidence import (
+    NORMAL_95,
+    OWN_FLOOR,
+    Priors,
+    additions,
+    covariance,
+    estimate,
+    log_evidence,
+)
+from visthrow.diagnose.likelihood.forms import HORIZONS, READABLE, Forms, forms, left_ahead, unit_of
+from visthrow.diagnose.likelihood.marginal import Statistics, gather, window_statistics
+from visthrow.diagnose.select import result
+from visthrow.diagnose.select.excess import UNKNOWN_RATIO
+from visthrow.diagnose.select.point import Point
+from visthrow.diagnose.select.result import ChannelGain, Diagnosis, Finding, HeldOut
+from visthrow.diagnose.select.rivals import CLOSE
+from visthrow.diagnose.select.scatter import deviations, freed
+from visthrow.diagnose.select.state import Work
+
+DRAWS = 10_000
+MOST_FOLDS = 12
+FEWEST_FLIGHTS = 3
+"""With fewer, parts of flights are left out instead, and the report says so."""
+PARTS = 3
+FEW_GROUPS = 8
+MOST_NAMES = 6
+FIRM = 2.0 / 3.0
+"""More of the folds than this share must name a cause, or one of its class: of three folds that leave a flight out, all."""
+TELLING = 0.1
+"""Of what flights promise in the mean, from which one counts among those that can tell."""
+MOSTLY = 0.6
+"""Share of what is left from which it is said to lie in one axis or one flight."""
+
+
+@dataclass(frozen=True)
+class Crossed:
+    """Searches that leave groups of windows (flights) out."""
+
+    groups: list[int]  # of each window
+    left_out: str  # what the groups are
+    statistics: Statistics  # by group
+    folds: list[np.ndarray]  # rows of the statistics that are left out together
+    trained: np.ndarray  # sizes in floors that the others gave, shape (F, K)
+    named: Mapping[int, int]  # effect -> number of folds that named it
+
+
+def select(
+    information: np.ndarray, score: np.ndarray, priors: Priors, least: float, most: int = MOST_NAMES, begin: Sequence[int] = ()
+) -> list[int]:
+    """Forward search with backward elimination by the statistics alone.
+
+    Args:
+        information: of the flights, shape (K, K).
+        score: about 0, shape (K,).
+        priors: of the effects.
+        least: threshold [nats].
+        most: names.
+        begin: a set to begin from; causes that hide each other are not found one by one.
+    """
+    active = _without_idle(information, score, priors, least, list(begin))
+    while len(active) < most:
+        gain = additions(information, score, priors, active)
+        best = int(np.argmax(gain))
+        if gain[best] <= least:
+            break
+        active = [*_without_idle(information, score, priors, least, [*active, best], active), best]
+    return active
+
+
+def _without_idle(
+    information: np.ndarray, score: np.ndarray, priors: Priors, least: float, active: list[int], asked: Sequence[int] | None = None
+) -> list[int]:
+    """A set without those that the others make superfluous; ``asked``: which may go, and which alone are returned."""
+    asked = list(active if asked is None else asked)
+    whole = log_evidence(information, score, priors, active)
+    for j in list(asked):
+        rest = [k for k in active if k != j]
+        if whole - log_evidence(information, score, priors, rest) < least:
+            active, whole = rest, log_evidence(information, score, priors, rest)
+            asked.remove(j)
+    return asked
+
+
+def groups_of(point: Point, kept: Sequence[int]) -> tuple[list[int], str]:
+    flights = [w.flight for w in point.windows]
+    if len(set(flights)) >= FEWEST_FLIGHTS or len(flights) < PARTS:
+        return flights, "flights"
+    order = {f: [i for i, g in enumerate(flights) if g == f] for f in set(flights)}
+    return [f * PARTS + PARTS * order[f].index(i) // len(order[f]) for i, f in enumerate(flights)], "parts of flights"
+
+
+def regrouped(point: Point, groups: Sequence[int]) -> Statistics:
+    parts = [window_statistics(gram, point.noise, w) for w, gram in enumerate(point.grams)]
+    return gather([replace(gram, flight=g) for gram, g in zip(point.grams, groups)], parts, point.theta)
+
+
+def folds_of(count: int) -> list[np.ndarray]:
+    return [np.arange(count)[k::MOST_FOLDS] for k in range(min(count, MOST_FOLDS))]
+
+
+def crossed(diagnosis: Diagnosis) -> Crossed:
+    """Repeat a search without each of the flights, by statistics; what an effect that varies has of its own there is integrated out."""
+    work, least = diagnosis.work, diagnosis.threshold
+    point, priors = work.after, work.problem.priors
+    groups, left_out = groups_of(point, work.problem.kept)
+    varies = deviations(diagnosis.scatter, priors, [e.name for e in work.problem.model.effects])
+    statistics = freed(regrouped(point, groups), varies)
+    count, folds = len(statistics.flights), folds_of(len(statistics.flights))
+    trained, named = np.zeros((count, len(priors.floor))), Counter()
+    for fold in folds:
+        rest = np.setdiff1d(np.arange(count), fold)
+        if not len(rest):
+            continue
+        information, score = statistics.information[rest].sum(0), statistics.absolute[rest].sum(0)
+        anew, active = (select(information, score, priors, least, begin=begin) for begin in ((), work.active))
+        worth = [log_evidence(information, score, priors, s) - least * len(s) for s in (anew, active)]
+        if worth[0] > worth[1] + CLOSE:  # else the rest cannot tell these names from others, and does not deny them
+            active = anew
+        trained[fold] = estimate(information, score, priors, active)
+        named.update(active)
+    return Crossed(groups, left_out, statistics, folds, trained, named)
+
+
+def borne_out(statistics: Statistics, trained: np.ndarray, theta: np.ndarray) -> tuple[float, float, float]:
+    """What names bring to held-out flights, of what they promise there, with a 95 % interval.
+
+    A right size promises theta' I theta / 2 nats with a variance of twice that. The interval is that of the flights' scatter (Student,
+    over flights that can tell), or of this chance where it is wider.
+
+    Args:
+        statistics: of the flights.
+        trained: sizes that the other flights gave, in floors, shape (F, K).
+        theta: sizes that all flights gave, shape (K,).
+    """
+    promised = 0.5 * np.einsum("i,fij,j->f", theta, statistics.information, theta)
+    quadratic = np.einsum("fi,fij,fj->f", trained, statistics.information, trained)
+    came, total = np.einsum("fi,fi->f", trained, statistics.absolute) - 0.5 * quadratic, promised.sum()
+    if total <= 0.0:
+        return 0.0, float("nan"), float("nan")
+    value, n = came.sum() / total, int((promised > TELLING * promised.mean()).sum())
+    if n < 2:
+        return float(value), float("nan"), float("nan")
+    scatter = np.sqrt(n / (n - 1.0) * ((came - value * promised) ** 2).sum()) / total
+    reach = max(stdtrit(n - 1, 0.975) * scatter, NORMAL_95 * np.sqrt(2.0 / total))
+    return float(value), float(value - reach), float(value + reach)
+
+
+def channel_gains(
+    work: Work, cross: Crossed, rng: np.random.Generator, draws: int = DRAWS, box: np.ndarray | None = None
+) -> tuple[ChannelGain, ...]:
+    """Prediction errors on held-out flights of every measured channel.
+
+    Args:
+        work: of the diagnosis.
+        cross: searches that leave flights out.
+        rng: of the bootstrap.
+        draws: of the bootstrap.
+        box: squared errors of a black box, shape (F, C, H).
+    """
+    before, after, names = work.before, work.after, work.problem.model.channels
+    by_effect = [np.hstack((w.residual[:, None], w.effects * work.problem.priors.floor)) for w in after.windows]
+    own = forms(after.windows, cross.groups, after.noise, by_effect, len(names))
+    plain = forms(before.windows, cross.groups, after.noise, [w.residual[:, None] for w in before.windows], len(names))
+    combination = np.hstack((np.ones((len(cross.trained), 1)), after.theta - cross.trained))
+    errors = plain.error(np.ones(1)), own.error(combination)
+    return tuple(
+        _channel(name, c, after, own, errors[0][:, c], errors[1][:, c], None if box is None else box[:, c], rng, draws)
+        for c, name in enumerate(names)
+        if own.count[:, c].sum() > 0
+    )
+
+
+def _channel(name, c, after: Point, own: Forms, before, error, box, rng, draws: int) -> ChannelGain:
+    count = own.count[:, c].sum()
+    rows = [w.sigma[w.channel == c] for w in after.windows if np.any(w.channel == c)]
+    sigma = float(np.median(np.concatenate(rows)))
+
+    def rms(square: np.ndarray) -> float:
+        return float(np.sqrt(np.maximum(square.sum(), 0.0) / max(count, 1.0)) * sigma)
+
+    value, low, high = studentised(before.sum(1), error.sum(1), rng, draws)
+    by_horizon = own.count[:, c].sum(0)
+    seen = by_horizon > 0
+    curves = [np.sqrt(np.maximum(x.sum(0)[seen], 0.0) / by_horizon[seen]) for x in (before, error, own.floor[:, c])]
+    horizons = tuple((h, *map(float, row)) for h, *row in zip(np.array(HORIZONS)[seen].tolist(), *curves))
+    return ChannelGain(name, unit_of(name), rms(before), rms(error), rms(own.floor[:, c]),
+                       float("nan") if box is None else rms(box), value, low, high, horizons)  # fmt: skip
+
+
+def studentised(before: np.ndarray, after: np.ndarray, rng: np.random.Generator, draws: int) -> tuple[float, float, float]:
+    """Gain 1 - sqrt(sum after / sum before) with a 95 % interval by the studentised bootstrap over groups.
+
+    Of few groups many resamples hold little else than one of them, and say nothing of the spread: there it is Student's interval.
+
+    Args:
+        before: sums of squares by group, shape (F,).
+        after: the same afterwards.
+        rng: for the draws.
+        draws: number of bootstrap samples.
+
+    Source: Efron and Tibshirani 1993, ch. 12, on the logarithm of the ratio.
+    """
+    n = len(before)
+    if before.sum() <= 0.0 or after.sum() <= 0.0:
+        return 0.0, float("nan"), float("nan")
+    value = np.log(after.sum() / before.sum())
+    if n < 2:
+        return float(1.0 - np.exp(0.5 * value)), float("nan"), float("nan")
+
+    def spread(w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        a, b = w @ after, w @ before
+        influence = after / a[:, None] - before / b[:, None]
+        return np.log(a / b), np.sqrt(n / (n - 1.0) * (w * influence**2).sum(1))
+
+    _, own = spread(np.ones((1, n)))
+    if n < FEW_GROUPS:
+        reach = 0.5 * stdtrit(n - 1, 0.975) * own[0]
+        return tuple(float(1.0 - np.exp(0.5 * value + side)) for side in (0.0, reach, -reach))
+    weights = rng.multinomial(n, np.full(n, 1.0 / n), size=draws)
+    usable = weights @ before > 0.0
+    ratio, error = spread(weights[usable])
+    t = (ratio - value) / np.maximum(error, 1e-3 * own[0] + 1e-300)
+    upper, lower = np.quantile(t, (0.025, 0.975))
+    low, high = 1.0 - np.exp(0.5 * (value - upper * own[0])), 1.0 - np.exp(0.5 * (value - lower * own[0]))
+    return float(1.0 - np.exp(0.5 * value)), float(low), float(high)
+
+
+def measure(diagnosis: Diagnosis, seed: int = 0) -> HeldOut:
+    """Ask held-out flights about the names of a search; ``seed``: of the bootstrap."""
+    work, cross = diagnosis.work, crossed(diagnosis)
+    effects = work.problem.model.effects
+    sizes = np.array([diagnosis.theta.get(e.name, 0.0) for e in effects]) / work.problem.priors.floor
+    share = borne_out(cross.statistics, cross.trained, sizes)
+    named = {effects[j].name: n / len(cross.folds) for j, n in cross.named.items()}
+    channels = channel_gains(work, cross, np.random.default_rng(seed))
+    return HeldOut(*share, channels, named, len(cross.folds), cross.left_out)
+
+
+def judged(diagnosis: Diagnosis, seed: int = 0) -> Diagnosis:
+    """A diagnosis as held-out flights leave it.
+
+    Args:
+        diagnosis: of a search.
+        seed: of the bootstrap.
+    """
+    if not diagnosis.theta or diagnosis.overall not in (result.KNOWN, result.UNKNOWN):
+        return diagnosis
+    held, alone = measure(diagnosis, seed), not _compares_phases(diagnosis.work.after)
+    names = list(diagnosis.theta)
+    if held.share <= 0.0 or (alone and any(c.harmed and c.high < 0.0 for c in held.channels)):
+        reason = f"held-out {held.left_out} are explained worse with {', '.join(names)} ({_share(held)}); withdrawn"
+        return _unconfirmed(_demoted(diagnosis, names, result.NOT_IDENTIFIABLE, "held-out flights are explained worse with it"),
+                            held, names, reason)  # fmt: skip
+    shown = not alone or not held.channels or any(c.low > 0.0 for c in held.channels)
+    if not (held.low > 0.0 and shown):
+        reason = f"held-out {held.left_out} do not confirm {', '.join(names)} ({_share(held)})"
+        return _unconfirmed(_demoted(diagnosis, names, result.CANDIDATE, "held-out flights do not confirm it"), held, names, reason)
+    unsure = [name for name in names if share_of(diagnosis[name], held) < FIRM + 1e-9]
+    after = _demoted(diagnosis, unsure, result.CANDIDATE, "not all searches that leave flights out name it")
+    if not after.theta:
+        reason = f"searches that leave {held.left_out} out do not agree on a name"
+        return _unconfirmed(after, held, names, reason)
+    left = [c for c in held.channels if alone and c.after > UNKNOWN_RATIO * c.floor]
+    after = replace(after, held_out=held)
+    if diagnosis.overall == result.UNKNOWN or not left:
+        return after
+    return replace(after, overall=result.IN_PART, reasons=tuple(_left(c, diagnosis.work) for c in left))
+
+
+def _unconfirmed(diagnosis: Diagnosis, held: HeldOut, names: Sequence[str], reason: str) -> Diagnosis:
+    """Something is there that no confirmed name explains: in the block of the name that promised most."""
+    most = max((diagnosis[name] for name in names), key=lambda f: f.nats)
+    block = diagnosis.block or most.block
+    earlier = diagnosis.reasons if diagnosis.overall == result.UNKNOWN else ()
+    return replace(diagnosis, overall=result.UNKNOWN, block=block, reasons=(reason, *earlier), held_out=held)
+
+
+def share_of(finding: Finding, held: HeldOut) -> float:
+    """Share of the folds that name a cause or one of its class."""
+    return min(sum(held.named_in.get(name, 0.0) for name in (finding.name, *finding.partners)), 1.0)
+
+
+def _compares_phases(point: Point) -> bool:
+    """Whether latent forces of a calm phase tell what gusts are: else what is left is held to the sensors' noise."""
+    return max(Counter(block for block, _ in point.noise.latent_sd).values(), default=0) > 1
+
+
+def _demoted(diagnosis: Diagnosis, names: Sequence[str], verdict: str, why: str) -> Diagnosis:
+    """Names and the members of their classes with another verdict; what stays named is sized without them."""
+    if not names:
+        return diagnosis
+    gone = {*names, *(partner for name in names for partner in diagnosis[name].partners)}
+    kept = {name: size for name, size in diagnosis.theta.items() if name not in names}
+    findings = tuple(
+        replace(f, verdict=verdict, sentence=f"{f.sentence} But {why}.")
+        if f.name in gone and f.name not in kept and f.verdict in (result.FOUND, result.CLASS) else f
+        for f in diagnosis.findings
+    )  # fmt: skip
+    theta, spread, work = _sized(diagnosis.work, list(kept))
+    return replace(diagnosis, findings=findings, theta=theta, covariance=spread, work=work)
+
+
+def _sized(work: Work, names: Sequence[str]) -> tuple[dict[str, float], tuple[tuple[float, ...], ...], Work]:
+    """Sizes with which some of the names alone explain the flights, their covariance, and the work of these."""
+    known, priors, point = [e.name for e in work.problem.model.effects], work.problem.priors, work.after
+    active = [known.index(name) for name in names]
+    if not active:
+        return {}, (), replace(work, after=work.before, active=())
+    theta = estimate(point.information, point.score, priors, active)
+    spread = covariance(point.information, priors.deviation(active))[np.ix_(active, active)]
+    scaled = (spread + OWN_FLOOR**2 * np.eye(len(active))) * np.outer(priors.floor[active], priors.floor[active])
+    sizes = {name: float(theta[j] * priors.floor[j]) for name, j in zip(names, active)}
+    return sizes, tuple(tuple(map(float, row)) for row in scaled), replace(work, active=tuple(active))
+
+
+def _share(held: HeldOut) -> str:
+    if np.isnan(held.low):
+        return "too few of them can tell"
+    return f"they bear out {100 * held.share:.0f} % [{100 * held.low:.0f}, {100 * held.high:.0f}] of what it promises"
+
+
+def _left(c: ChannelGain, work: Work) -> str:
+    """What is left of a channel's error, and of which kind."""
+    factor, unit = READABLE.get(c.unit, (1.0, c.unit))
+    said = f"{factor * c.after:.3g} of {factor * c.before:.3g} {unit}".rstrip()
+    kind = _kind(work, work.problem.model.channels.index(c.channel))
+    return f"{c.channel}: {said} left on held-out flights, noise alone {factor * c.floor:.3g}{f'; {kind}' if kind else ''}"
+
+
+def _kind(work: Work, channel: int) -> str:
+    """Where the error of a channel that is left lies: an axis, a flight, or growing with the time in the flight."""
+    point = work.after
+    by_axis, by_flight, late, spans = np.zeros(3), Counter(), [], {}
+    for window in point.windows:
+        spans.setdefault(window.flight, []).append(window.time.mean())
+    for window in point.windows:
+        rows, left = window.channel == channel, left_ahead(window, point.noise)
+        if not rows.any():
+            continue
+        square, times = left[rows] ** 2, window.time[rows]
+        if len(square) % 3 == 0 and np.all(np.diff(times.reshape(-1, 3), axis=1) == 0.0):
+            by_axis += square.reshape(-1, 3).sum(0)
+        by_flight[window.flight] += float(square.sum())
+        first, last = min(spans[window.flight]), max(spans[window.flight])
+        late.append((window.time.mean() - first > 0.5 * (last - first), square.sum(), len(square)))
+    total, parts = sum(by_flight.values()), []
+    if by_axis.max(initial=0.0) > MOSTLY * by_axis.sum() > 0.0:
+        parts.append(f"mostly along {'xyz'[int(by_axis.argmax())]}")
+    if len(by_flight) > 2 and max(by_flight.values()) > MOSTLY * total:
+        parts.append(f"mostly in flight {max(by_flight, key=by_flight.get)}")
+    halves = [np.sqrt(sum(s for h, s, _ in late if h == half) / max(sum(n for h, _, n in late if h == half), 1)) for half in (0, 1)]
+    if min(halves) > 0.0 and halves[1] > 1.5 * halves[0]:
+        parts.append("growing within the flight")
+    return ", ".join(parts)
