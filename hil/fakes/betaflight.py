@@ -72,7 +72,7 @@ class FakeBetaflight(Fake):
         self.override = False
         self._first: float | None = None
         self._heard = -np.inf
-        self._asked_open = self._low_first = False
+        self._asked_open = self._low_first = self._disarmed = False
 
     def _set_rates(self) -> None:
         p, axes = self.parameters, ("roll", "pitch", "yaw")
@@ -217,7 +217,7 @@ class FakeBetaflight(Fake):
         if not (self.options.all_channels or self.taken) and self._first is not None and self.plant.time - self._first >= REACTION:
             self.override = self.armed
         if not self.override or self._target is None:
-            gone = self._first is not None and not self.armed and not self.options.all_channels
+            gone = self._first is not None and not self.armed and (self._disarmed or not self.options.all_channels)
             return np.zeros(4) if gone else self.hold(self._place)
         if not self.options.all_channels:
             if quiet <= OVERRIDE_GONE:
@@ -228,7 +228,7 @@ class FakeBetaflight(Fake):
         if quiet > IDLE_AFTER:
             self.happened("failsafe: motors idle")
         if quiet > DISARM_AFTER:
-            self.armed = self.override = False
+            self.armed, self.override, self._disarmed = False, False, True
             self.happened("failsafe: disarmed")
         return np.zeros(4) if quiet > IDLE_AFTER else self._target
 

@@ -139,7 +139,7 @@ class Link:
         self._listeners.append(listener)
 
     def pump(self, clock: Callable[[], float]) -> int:
-        """Hand all that has arrived to the listeners; returns the number of messages."""
+        """Hand all that has arrived to the listeners; returns the number of chunks that were read, refused ones as well."""
         count, looked, shut = 0, 0, 0
         while looked < MOST_CHUNKS and shut < MOST_SHUT_OUT and (data := self.port.read()) is not None:
             self.sender = self.port.sender
@@ -151,7 +151,7 @@ class Link:
         self.received += count
         for call in self.on_pump:
             call(clock())
-        return count
+        return looked + shut
 
     def _take(self, data: bytes, arrival: float) -> int:
         """Hand on the messages in a chunk that are of our parties; returns their number."""
@@ -200,7 +200,7 @@ class Link:
 
 
 def pump(links: Sequence[Link], clock: Callable[[], float]) -> int:
-    """Hand on all that has arrived on some links; returns the number of messages."""
+    """Hand on all that has arrived on some links; returns the number of chunks that were read."""
     return sum([link.pump(clock) for link in links])
 
 

@@ -25,6 +25,9 @@ MOST_KEPT = 256
 MOST_SAID = 20
 """Senders that are said while a run goes on; the summary has the others."""
 
+NOT_YET = "before its first"
+"""Why a message of a party is not taken that has not been heard as the one that it is to be."""
+
 SHARED = frozenset({"TIMESYNC", "NAMED_VALUE_INT"})
 """Messages that a party may send beside its own: its clock, and whether it is simulated."""
 
@@ -164,6 +167,9 @@ class Roster:
             why = self._objection(party, message, kind, address, now)
         else:
             why = None if self.at.setdefault("peer", address) == address else "a second sender"
+        if why is not None and why.startswith(NOT_YET):
+            self._count(Seen(address, system, component, kind, why))  # of no stranger: its first one is on its way
+            return False
         if why is not None:
             self.refuse(Seen(address, system, component, kind, why))
             return False
@@ -205,7 +211,7 @@ class Roster:
             if now - self.heard[party.name] < SILENT:
                 return f"a second sender; the {party.name} speaks from {shown(self.at[party.name])}"
         first = "HEARTBEAT" if party.autopilot is not None else ", ".join(sorted(party.kinds))
-        return None if not first or kind in first.split(", ") else f"before its first {first}"
+        return None if not first or kind in first.split(", ") else f"{NOT_YET} {first}"
 
     def expected(self) -> str:
         """The parties in words."""

@@ -380,3 +380,76 @@ def test_an_answer_that_nobody_asked_for_changes_nothing():
         desk.fake.port.write(msp.pack(frame))
     desk.turn(0.1, HOVER)
     assert desk.status.release == "idle"
+
+
+def test_betaflight_is_read_back_from_its_channel_where_outputs_are_forwarded():
+    """MSP_SERVO does not show them; a good release is none that moved nothing."""
+    desk = Desk("betaflight", parameters={"channel_forwarding": 1}).follow()
+    desk.backend.release(desk.now)
+    desk.turn(1.0, HOVER)
+    assert (desk.status.release, desk.fake.witness.releases) == ("accepted", 1)
+    desk = Desk("betaflight", parameters={"channel_forwarding": 1}, answer="silent").follow()
+    desk.backend.release(desk.now)
+    desk.turn(1.0, HOVER)
+    assert desk.status.release == "failed", "a channel that does not arrive is none"
+
+
+def test_betaflight_arms_though_the_receiver_was_lost_as_arm_went_up():
+    """ARM that is high when the receiver comes back has to go low first."""
+    desk = Desk("betaflight", "betaflight.arm_channel=1", all_channels=True)
+    came, lost = desk.fake._sticks_came, []
+
+    def deaf(channels):
+        if channels[4] > 1700 and not lost:
+            lost.append(desk.now)
+        if not (lost and desk.now < lost[0] + 0.5):
+            came(channels)
+
+    desk.fake._sticks_came = deaf
+    desk.turn(1.0)
+    desk.turn(3.0, HOVER, FOLLOW)
+    assert lost
+    assert (desk.fake.armed, desk.status.mode) == (True, FOLLOW)
+
+
+def test_what_speaks_against_arming_is_said_in_words():
+    desk = Desk("betaflight", "betaflight.arm_channel=1", all_channels=True, arming=False)
+    desk.turn(1.0)
+    assert desk.status.note == "arming disabled: tilted more than small_angle (flags 0x100)"
+
+
+def test_px4_without_the_gripper_switch_flies_and_with_it_off_does_not():
+    """PD_GRIPPER_EN is gone since 1.17; older firmware has it, and answers no DO_GRIPPER without it."""
+    desk = Desk("px4")
+    desk.turn(1.5)
+    assert (desk.backend.audit.done, desk.status.fault) == (True, None)
+    assert desk.backend.audit.refused == {"PD_GRIPPER_EN": "no such parameter"}
+    old = Desk("px4", parameters={"PD_GRIPPER_EN": 0.0})
+    old.turn(1.5)
+    assert old.backend.audit.problems == ["PD_GRIPPER_EN is 0; expected 1, or none since 1.17"]
+
+
+def test_px4s_gripper_opens_at_the_minimum_of_its_output():
+    """A config that takes the closed end for the open one is found at connect; without the audit a jam does not pass as a release."""
+    wrong = Desk("px4", "px4.servo_open_us=2000")
+    wrong.turn(1.5)
+    assert wrong.backend.audit.problems == ["PWM_AUX_MIN1 is 1000; expected 2000 (servo_open_us)"]
+    jammed = Desk("px4", "px4.servo_open_us=2000", "px4.audit=false", "px4.release_timeout=1.5", answer="stuck").follow()
+    jammed.backend.release(jammed.now)
+    jammed.turn(2.0, HOVER)
+    assert jammed.status.release == "failed"
+
+
+@pytest.mark.parametrize("kind", ["ardupilot", "px4"])
+def test_a_mode_is_seen_soon_though_the_heartbeat_is_slow(kind):
+    """PX4's comes once a second and says nothing of a change; it is asked for more often."""
+    desk = Desk(kind, prompt=False).follow()
+    begin = desk.now
+    while desk.status.mode != HOLD:
+        desk.turn(0.02, HOVER, HOLD)
+        assert desk.now - begin < 0.2
+
+
+def test_idle_says_at_once_why_it_waits():
+    _, _, told = throw(LevelPlant(), loaded=AT_ONCE, seconds=1.0, armed=False)
+    assert any(d.state == "idle" and d.waits == "autopilot not ready (disarmed)" for d in told)

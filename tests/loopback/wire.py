@@ -87,7 +87,7 @@ CONFIGS = {"ardupilot": "fake", "px4": "fake_px4", "betaflight": "fake_betafligh
 
 def peers(
     plant, seed=0, answer="accepted", overrides=(), mocap=None, policy="state", loaded=None, kind="ardupilot", tell=None,
-    write=False, **options,
+    write=False, key=None, **options,
 ):
     """Runner and fake at the ends of a pipe: runner, source, clock, fake."""
     from hil.params import HilParams
@@ -98,9 +98,9 @@ def peers(
     mine, its = pipe()
     mine.whole = its.whole = False
     more = Options(answer=answer, **options)
-    fake = make_fake(kind, plant, Link(there, *VEHICLE_ID), mocap or MocapParams(), seed, more, its)
+    fake = make_fake(kind, plant, Link(there, *VEHICLE_ID, key=key), mocap or MocapParams(), seed, more, its)
     roster = Roster(parties(params, True, True))
-    clock, link = PlantClock(fake), Link(here, params.link.system, params.link.component, roster=roster)
+    clock, link = PlantClock(fake), Link(here, params.link.system, params.link.component, roster=roster, key=key)
     if params.delay.synchronise:
         LinkSync(link)
     source = MavlinkSource(link, params.source.senders, clock.now)
