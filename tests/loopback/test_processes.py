@@ -114,7 +114,8 @@ def never(tmp_path):
     return path
 
 
-OWN = {"ardupilot": "levelled: no set-points", "px4": "left OFFBOARD: no set-points", "betaflight": "override: the pilot's sticks count again"}
+OWN = {"ardupilot": "levelled: no set-points", "px4": "left OFFBOARD: no set-points",
+       "betaflight": "override: the pilot's sticks count again"}  # fmt: skip
 """What the vehicle does by itself when nobody speaks any more."""
 
 
@@ -140,7 +141,7 @@ def test_the_runner_is_killed_in_mid_throw(tmp_path, kind, never):
 
 
 def test_sigterm_in_mid_throw(tmp_path, never):
-    """What systemd, `timeout` and a shutdown send; the others, in hover and with each kind, are flown by `bench hil --faults`."""
+    """What systemd, `timeout` and a shutdown send; `bench hil --faults` flies the others, in hover and with each kind."""
     with Pair(tmp_path, "ardupilot", never, overrides=(*QUICK, "states.abort=1.0")) as pair:
         pair.wait_for("throw")
         pair.wait_for_actions(10)
