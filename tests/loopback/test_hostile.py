@@ -18,7 +18,7 @@ from hil.links.signing import Signed
 from tests.fuzz import EACH, SEEDS, any_message, mutated, noise
 from tests.hil_flight import simple_policy
 from tests.loopback.wire import HERE, cut, peers, throw
-from visthrow.evidence.bench.hil_processes import free_port
+from visthrow.evidence.bench.hil.processes import free_port
 from visthrow.onboard.actions import hover_action
 
 READY = 8.0
