@@ -155,13 +155,13 @@ def unmoved(seed: int, count: int) -> None:
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2, 3])
-def test_spoofed_stray_and_unsigned_packets_change_no_bit_of_a_throw(seed):
+def test_forged_packets_change_no_bit_of_a_throw(seed):
     unmoved(seed, 10_000)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", SEEDS)
-def test_a_million_spoofed_stray_and_unsigned_packets_change_no_bit_of_a_throw(seed):
+def test_a_million_forged_packets_change_no_bit_of_a_throw(seed):
     unmoved(seed, EACH)
 
 
