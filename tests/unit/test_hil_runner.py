@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 
 from hil.backends import Status
-from hil.control.runner import Runner, Words
+from hil.control.runner import WARM_CALLS, Runner, Words
 from hil.errors import RunError
 from hil.params import HilParams
 from tests.hil_flight import TICK, Spy, changes, fly, params, simple_policy
 from visthrow import config
 from visthrow.common.errors import ConfigError, MismatchError
 from visthrow.onboard.actions import hover_action
+from visthrow.onboard.pilot import Pilot
 
 HOVER = hover_action(9.81 * 0.272, 14.0)[0]
 NEVER = (HOVER, 0.0, 0.0, 0.0, -1.0)
@@ -70,6 +71,25 @@ def test_the_mechanisms_own_time_is_taken_off_and_a_slow_one_is_refused():
     assert runner(mechanism=0.114).latch.trip(1.0, (0.0, 0.0, 0.0)) == 1.0
     with pytest.raises(RunError, match=r"takes 0\.12 s .* trained with 0\.11 s"):
         runner(mechanism=0.12)
+
+
+def test_a_warm_up_changes_no_bit(monkeypatch):
+    """It calls the policy on a copy, before the run and as a throw is armed."""
+    called = []
+    warm, act = Runner.warm_up, Pilot.act
+
+    def counted(pilot, *args):
+        called.append(pilot)
+        return act(pilot, *args)
+
+    monkeypatch.setattr(Pilot, "act", counted)
+    pilot = runner()
+    pilot.warm_up()
+    decisions = fly(pilot, 4.0)
+    assert sum(each is not pilot.pilot for each in called) == 2 * WARM_CALLS
+    monkeypatch.setattr(Runner, "warm_up", lambda self, vehicle=None: None)
+    assert fly(runner(), 4.0) == decisions
+    monkeypatch.setattr(Runner, "warm_up", warm)
 
 
 def test_nothing_is_released_without_the_operators_word():
@@ -245,7 +265,7 @@ def test_bodies_exchanged_from_the_start_are_noticed():
 @pytest.mark.parametrize(
     ("status", "reason"),
     [
-        (lambda t: Status(t < START, "silent"), "the autopilot is silent, disarmed or in another mode"),
+        (lambda t: Status(t < START, "silent"), "the autopilot is silent, disarmed or in another mode: silent"),
         (lambda t: Status(True, "", "failed" if t > START else "idle"), "the release was refused or not answered"),
     ],
 )
@@ -257,7 +277,7 @@ def test_an_autopilot_that_goes(status, reason):
 
 def test_an_autopilot_in_another_mode_never_leads_to_a_throw():
     pilot, decisions = thrown(status=lambda t: Status(False, "mode"), overrides=("states.idle=2.0",), seconds=5.0)
-    assert ("abort", "no autopilot ready within 2 s") in changes(decisions)
+    assert ("abort", "autopilot not ready (mode), for 2 s") in changes(decisions)
     assert decisions[-1].state == "done", "what was never ours needs no descent"
     assert not pilot.backend.sent
 
@@ -304,6 +324,47 @@ def test_a_policy_that_saturates_stays_within_its_limits_and_the_fence_ends_it()
     _, decisions = thrown(action=(1.0, 1.0, -1.0, 1.0, -1.0), seconds=6.0)
     assert changes(decisions)[-1][0] == "abort"
     assert changes(decisions)[-1][1].startswith("fence: ")
+
+
+def narrowed(pilot, high):
+    """From the recovery on the vehicle's fence ends so far ahead [m]: it is outside of it."""
+    tight = dataclasses.replace(pilot.params.fence, vehicle_high=(high, 2.5, 2.8))
+
+    def watch(time, decision):
+        if decision.state == "recover":
+            object.__setattr__(pilot.params, "fence", tight)
+
+    return watch
+
+
+def test_a_fence_that_is_left_after_the_throw_lands_and_is_no_abort():
+    """The payload is off, the vehicle brakes: what was to be done is done. It comes down at once, and says why."""
+    pilot = runner(AT_ONCE, "throws=2")
+    decisions = fly(pilot, 20.0, watch=narrowed(pilot, -0.5))
+    safe(pilot, decisions)
+    assert [state for state, _ in changes(decisions)][-4:] == ["throw", "recover", "land", "done"]
+    assert when(decisions, "land") - when(decisions, "recover") <= 2 * TICK
+    assert dict(changes(decisions))["land"].startswith("after the throw, fence: vehicle x")
+    assert (pilot.summary()["aborted"], len(pilot.latch.landings)) == (False, 1)
+    assert pilot.summary()["left_fence"].startswith("vehicle x")
+
+
+def test_a_fence_that_is_left_with_the_payload_on_still_aborts():
+    pilot = runner(NEVER, "states.throw=1.0")
+    decisions = fly(pilot, 20.0, watch=narrowed(pilot, -0.5))
+    safe(pilot, decisions)
+    assert dict(changes(decisions))["abort"].startswith("fence: vehicle x")
+
+
+def test_a_throw_that_does_not_begin_says_what_is_in_the_way():
+    """The vehicle drifts while it is armed, beyond where a throw may begin; then the thrust is wrong. Neither is called a swing."""
+    pilot = runner(AT_ONCE, "states.armed=1.5", "states.armed_least=1.0")
+    pilot._thrust_off = lambda: ["hovering takes 1.10 times the weight"] if pilot.machine.state == "armed" else []
+    decisions = fly(pilot, 5.0)
+    assert ("ready", "disarmed: hovering takes 1.10 times the weight") in changes(decisions)
+    waits = [d.waits for d in decisions if d.state == "armed"]
+    assert "hovering takes 1.10 times the weight" in waits[1]
+    assert all(d.waits == "" for d in decisions if d.state == "throw")
 
 
 def test_no_exception_leaves_the_runner():
