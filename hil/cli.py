@@ -96,10 +96,12 @@ def _add_simulated(fake: argparse.ArgumentParser, direct: argparse.ArgumentParse
     direct.add_argument("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE")
     direct.add_argument("--seeds", type=seed, nargs="+", default=[0], metavar="N", help="of starts, noise and loss; a throw each")
     fake.add_argument("--rate", type=float, default=100.0, metavar="HZ", help="poses a second of each body")
-    for parser in (fake, direct):
+    plants = {direct: "make", fake: "make; of a firmware make_motors"}
+    for parser, name in plants.items():
         parser.add_argument(
-            "--plant", default="visthrow.throws.wire_plant:make", metavar="MODULE:FUNCTION", help="that makes the vehicle"
-        )
+            "--plant", default=None, metavar="MODULE:FUNCTION",
+            help=f"that makes the vehicle (default: visthrow.throws.wire_plant:{name})",
+        )  # fmt: skip
     fake.add_argument("--device", default="udpout:127.0.0.1:14560", help="the runner's port")
     fake.add_argument("--policy", default="vision", metavar="POLICY", help="whose plant is flown")
     fake.add_argument("--seed", type=seed, default=0, help="of start, noise and loss")
@@ -109,7 +111,12 @@ def _add_simulated(fake: argparse.ArgumentParser, direct: argparse.ArgumentParse
     fake.add_argument(
         "--answer", default="accepted", help="to the release: accepted, in-progress, denied, silent, stuck"
     )
-    fake.add_argument("--kind", default="ardupilot", help="of autopilot: ardupilot, px4, betaflight")
+    fake.add_argument(
+        "--kind", default="ardupilot", help="of autopilot: ardupilot, px4, betaflight; betaflight-sitl is a bridge to its firmware"
+    )
+    fake.add_argument("--firmware", default=None, metavar="PROGRAM", help="that betaflight-sitl starts")
+    fake.add_argument("--folder", default="out/firmware", metavar="FOLDER", help="of the firmware's settings and blackbox")
+    fake.add_argument("--config", default="betaflight_sitl", metavar="NAME", help="of the run that the firmware is set up for")
     fake.add_argument("--msp-port", type=int, default=14561, help="where the fake Betaflight listens")
     fake.add_argument(
         "--option", dest="overrides", action="append", default=[], metavar="KEY=VALUE",
@@ -348,7 +355,7 @@ def _direct(args: argparse.Namespace) -> int:
     params = _params(args)
     policy, mocap = Policy.load(find_policy(params.policy)), MocapParams()
     for seed in args.seeds:
-        report = Direct(load_plant(args.plant, params.policy, seed), policy, params, mocap, seed).throw()
+        report = Direct(load_plant(args.plant or "visthrow.throws.wire_plant:make", params.policy, seed), policy, params, mocap, seed).throw()
         print(json.dumps({"seed": seed, **scored(report, params, report["start"]), **report}), flush=True)
     return 0
 
@@ -359,14 +366,50 @@ def _fake(args: argparse.Namespace) -> int:
     from hil.links.device import check_device, open_port
     from hil.links.mavlink_link import Link
 
-    options = read_options([*args.overrides, f"answer={args.answer}"])
-    plant = load_plant(args.plant, args.policy, args.seed)
+    options, mocap = read_options([*args.overrides, f"answer={args.answer}"]), MocapParams(rate=args.rate)
+    firmware = args.kind == "betaflight-sitl"
+    plant = load_plant(args.plant or f"visthrow.throws.wire_plant:{'make_motors' if firmware else 'make'}", args.policy, args.seed)
     link = Link(open_port(check_device(args.device)), *VEHICLE_ID)
-    port = ListeningPort(args.msp_port) if args.kind == "betaflight" else None
-    fake = make_fake(args.kind, plant, link, MocapParams(rate=args.rate), args.seed, options, port)
-    print(f"the fake {args.kind} flies", file=sys.stderr, flush=True)
-    report = serve(
-        fake, MonotonicClock(args.speed), args.seconds, None if args.out is None else Path(args.out), args.after
-    )
+    clock, out = MonotonicClock(args.speed), None if args.out is None else Path(args.out)
+    if firmware:
+        report = _fly_firmware(args, plant, link, mocap, options, clock, out)
+    else:
+        port = ListeningPort(args.msp_port) if args.kind == "betaflight" else None
+        fake = make_fake(args.kind, plant, link, mocap, args.seed, options, port)
+        print(f"the fake {args.kind} flies", file=sys.stderr, flush=True)
+        report = serve(fake, clock, args.seconds, out, args.after)
     print(json.dumps(report, indent=2))
     return 0
+
+
+def _fly_firmware(
+    args: argparse.Namespace, plant: Any, link: Any, mocap: Any, options: Any, clock: Any, out: Path | None
+) -> dict[str, Any]:  # fmt: skip
+    """Set a firmware up, fly the plant by its motor outputs, end it."""
+    from hil.errors import RunError
+    from hil.fakes.process import serve
+    from hil.fakes.sitl import SLOW, BetaflightSitl, Firmware, favour, needed
+    from hil.params import HilParams
+    from visthrow import config
+
+    if args.firmware is None:
+        raise RunError("--kind betaflight-sitl without --firmware; expected Betaflight's program for a PC")
+    params = config.load(HilParams, config.find("hil", args.config), [])
+    firmware = Firmware(args.firmware, args.folder)
+    try:
+        kept = firmware.set_up(needed(params.betaflight))
+        print("".join(f"{name:28} {value}\n" for name, value in kept.items()), end="", file=sys.stderr)
+        fake = BetaflightSitl(plant, link, mocap, args.seed, options, params.betaflight)
+        favour()
+        fake.sensors.start(args.speed)
+        print("the firmware has its settings; it flies", file=sys.stderr, flush=True)
+        report = serve(fake, clock, args.seconds, out, args.after)
+        fake.close()
+    finally:
+        firmware.stop()
+    if report["late_periods"] > SLOW * report["time"] / plant.period:
+        print(
+            f"this machine is too slow: {report['late_periods']} of {report['time'] / plant.period:.0f} periods were late; "
+            f"slow both clocks, --speed {args.speed / 2:g} here and of the run", file=sys.stderr,
+        )  # fmt: skip
+    return report
