@@ -355,7 +355,8 @@ def _direct(args: argparse.Namespace) -> int:
     params = _params(args)
     policy, mocap = Policy.load(find_policy(params.policy)), MocapParams()
     for seed in args.seeds:
-        report = Direct(load_plant(args.plant or "visthrow.throws.wire_plant:make", params.policy, seed), policy, params, mocap, seed).throw()
+        plant = load_plant(args.plant or "visthrow.throws.wire_plant:make", params.policy, seed)
+        report = Direct(plant, policy, params, mocap, seed).throw()
         print(json.dumps({"seed": seed, **scored(report, params, report["start"]), **report}), flush=True)
     return 0
 

@@ -1,9 +1,13 @@
 """Thrust calibration: from newtons to the share of full thrust that an autopilot takes, and its measurement in hover.
 
 Around hover the thrust of a vehicle is ``T = W (1 + s (u / h - 1))``: weight W [N] at the share h, with a slope s relative
-to a straight line through the origin. An autopilot that does not straighten the rotors' curve (Betaflight: its
-``thrust_linear`` acts on the controller's output, not on the pilot's throttle) has ``T = W (1 + s ((z / z_h)^n - 1))`` with the
-motors' command z = idle + (1 - idle) u and an exponent n, 2 where thrust goes with the square of it. Vehicles in software hovered at shares of 0.37 and 0.49, with slopes of 0.70 to 0.92.
+to a straight line through the origin. Vehicles in software hovered at shares of 0.37 and 0.49, with slopes of 0.70 to 0.92.
+
+Where the autopilot does not straighten the rotors' curve (Betaflight: its ``thrust_linear`` acts on what the controller puts
+out, and takes it off the pilot's throttle again) it is ``T = W (1 + s ((z / z_h)^n - 1))`` with the motors' command
+``z = idle + (1 - idle) u``; n is 2 where thrust goes with the square of that command.
+
+Source: betaflight 4.6, src/main/flight/pid.c, pidApplyThrustLinearization and pidCompensateThrustLinearization.
 """
 
 import math

@@ -250,8 +250,9 @@ def _listens(port: int) -> bool:
 
 
 def favour(process: int = 0) -> None:
-    """Put a process, this one by default, before others, as far as the system grants it."""
+    """Put a process, this one by default, before others, as far as the system grants it; this one's children stay as they are."""
     with contextlib.suppress(OSError):
         os.setpriority(os.PRIO_PROCESS, process, FAVOUR)
     with contextlib.suppress(OSError, AttributeError):
-        os.sched_setscheduler(process, os.SCHED_FIFO, os.sched_param(PRIORITY))
+        policy = os.SCHED_FIFO | (0 if process else os.SCHED_RESET_ON_FORK)
+        os.sched_setscheduler(process, policy, os.sched_param(PRIORITY))
