@@ -49,6 +49,7 @@ def needed(params: BetaflightParams) -> dict[str, str]:
     rates = params.rates
     out = {
         "serial UART2": "1 115200 57600 0 115200",  # MSP for the bridge, beside the runner's
+        "serial_update_rate_hz": "1000",  # one MSP command a turn: 100 of them cannot take commands and questions at 50 Hz each
         "small_angle": "180",  # it hangs in a stand: any attitude may arm
         "rates_type": rates.type.upper(),
         "min_check": str(params.minimum_us),
