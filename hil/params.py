@@ -11,6 +11,7 @@ from hil.control.aim import AimParams
 from hil.control.realtime import RealtimeParams
 from hil.control.safety import CheckParams, FenceParams, GuardParams
 from hil.control.states import StateParams
+from hil.links.roster import check_allowed
 from hil.poses.estimate import EstimateParams
 from hil.poses.frames import FrameParams
 from hil.poses.gate import GateParams
@@ -34,16 +35,19 @@ class LinkParams:
 
     Raises:
         ConfigError: an id that MAVLink does not have.
+        LinkError: an allowed sender that is no address.
     """
 
     device: str  # see hil.links.device
     remote: bool  # whether the device may leave this machine
     system: int  # our own id, 1 to 255
     component: int  # likewise
+    allow: tuple[str, ...] = ()  # senders of datagrams that are heard, ADDRESS or ADDRESS:PORT; none: any
 
     def __post_init__(self) -> None:
         if not (1 <= self.system <= 255 and 1 <= self.component <= 255):
             raise ConfigError(f"link.system {self.system}, component {self.component}; expected 1 to 255 each")
+        check_allowed(self.allow)
 
 
 @dataclass(frozen=True)
@@ -57,6 +61,7 @@ class SourceParams:
     logs: tuple[LogBody, ...] = ()  # of bin and ulg
     bodies: tuple[RigidBody, ...] = ()  # of mocap
     mocap: MocapParams | None = None
+    device: str | None = None  # of mavlink poses that come on a port of their own, see hil.links.device; none: link.device
     check_units: bool = True  # refuse recordings whose numbers no vehicle makes: a unit of the mapping is wrong
 
 

@@ -13,19 +13,19 @@ KINDS = tuple(sorted(mav.mavlink_map))
 """Numbers of all messages of the dialect."""
 
 
-def framed(kind, body: bytes) -> bytes:
-    """A message of the vehicle with a right checksum over any content, so that its fields reach whoever listens."""
+def framed(kind, body: bytes, ids: tuple[int, int] = (1, 1)) -> bytes:
+    """A message, of the vehicle by its ids, with a right checksum over any content, so that its fields reach whoever listens."""
     number = kind.id
-    head = bytes([len(body), 0, 0, 0, 1, 1])
+    head = bytes([len(body), 0, 0, 0, *ids])
     head += bytes([number & 255, number >> 8 & 255, number >> 16 & 255])
     crc = x25crc(head + body + bytes([kind.crc_extra]))
     return bytes([mav.PROTOCOL_MARKER_V2]) + head + body + crc.crc.to_bytes(2, "little")
 
 
-def any_message(rng: np.random.Generator, kinds: tuple[int, ...] = KINDS) -> bytes:
+def any_message(rng: np.random.Generator, kinds: tuple[int, ...] = KINDS, ids: tuple[int, int] = (1, 1)) -> bytes:
     """A message of one of the kinds with any bits in its fields."""
     kind = mav.mavlink_map[kinds[rng.integers(len(kinds))]]
-    return framed(kind, rng.bytes(kind.unpacker.size))
+    return framed(kind, rng.bytes(kind.unpacker.size), ids)
 
 
 def noise(rng: np.random.Generator) -> bytes:

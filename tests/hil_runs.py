@@ -37,7 +37,7 @@ def record_run(folder: Path, *overrides: str, seconds: float = 8.0, close: bool 
     runner.tick = keep
     fly(runner, seconds, **spoiled)
     if close:
-        recorder.close(runner.summary())
+        recorder.close({**runner.summary(), "ticks": len(decisions)})
     else:
         recorder.close({})
         (folder / "summary.json").unlink()

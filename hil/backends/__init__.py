@@ -6,12 +6,16 @@ from pathlib import Path
 from typing import Any
 
 from hil.backends.ardupilot import ArduPilot, ArduPilotParams
+from hil.backends.autopilot import MavlinkAutopilot
 from hil.backends.base import Backend, DryRun, Status
 from hil.backends.betaflight import Betaflight, BetaflightParams
 from hil.backends.px4 import Px4, Px4Params
 from hil.errors import RunError
 from hil.links.device import check_device, open_port
 from hil.links.msp_log import LoggedPort
+
+AUTOPILOTS: dict[str, type[MavlinkAutopilot]] = {"ardupilot": ArduPilot, "px4": Px4}
+"""Back-ends that speak MAVLink."""
 
 MSP_LOG = "link.msp"
 """In a run's folder."""
@@ -53,8 +57,7 @@ def make_backend(
         return Betaflight(port, params.betaflight, write, tell)
     if link is None:
         raise RunError(f"backend {params.backend} without a MAVLink link; expected source.kind mavlink")
-    kind = {"ardupilot": ArduPilot, "px4": Px4}[params.backend]
-    return kind(link, getattr(params, params.backend), write, tell)
+    return AUTOPILOTS[params.backend](link, getattr(params, params.backend), write, tell)
 
 
 def require_reach(params: Any, contract: dict[str, Any]) -> None:
@@ -89,6 +92,6 @@ def require_reach(params: Any, contract: dict[str, Any]) -> None:
 
 
 __all__ = [
-    "ArduPilot", "ArduPilotParams", "Backend", "Betaflight", "BetaflightParams", "DryRun", "Px4", "Px4Params", "Status",
+    "AUTOPILOTS", "ArduPilot", "ArduPilotParams", "Backend", "Betaflight", "BetaflightParams", "DryRun", "Px4", "Px4Params", "Status",
     "make_backend", "mechanism_lag", "require_reach",
 ]  # fmt: skip

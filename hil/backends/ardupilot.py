@@ -8,7 +8,7 @@ SRV_Channel (SERVOn_FUNCTION 28 is Gripper), AP_NavEKF_Source.cpp (EK3_SRC1_POSX
 """
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 from hil.backends.audit import Rule, bits, equal, within
 from hil.backends.autopilot import AutopilotParams, MavlinkAutopilot
@@ -52,13 +52,13 @@ class ArduPilotParams(AutopilotParams):
 class ArduPilot(MavlinkAutopilot):
     """See `hil.backends.base.Backend`."""
 
-    name = "ardupilot"
+    name, autopilot = "ardupilot", mav.MAV_AUTOPILOT_ARDUPILOTMEGA
     params: ArduPilotParams
 
-    def _role(self, beat: Any) -> str | None:
-        if beat.custom_mode in (GUIDED, GUIDED_NOGPS):
+    def _role(self, mode: int) -> str | None:
+        if mode in (GUIDED, GUIDED_NOGPS):
             return FOLLOW
-        return {self.params.hold_mode: HOLD, LAND_MODE: LAND}.get(beat.custom_mode)
+        return {self.params.hold_mode: HOLD, LAND_MODE: LAND}.get(mode)
 
     def _mode_numbers(self, mode: str) -> tuple[float, float]:
         p = self.params

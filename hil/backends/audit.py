@@ -10,8 +10,14 @@ ASK_AGAIN = 0.2
 SETTLE = 0.5
 """After a value was written, answers may still be on their way that were given before; then it is read back [s]."""
 
-GIVE_UP = 5.0
+GIVE_UP, GIVE_UP_OPTIONAL = 5.0, 1.0
 """A value that has not come within this time is missing [s]."""
+
+NO_SUCH_PARAMETER = 1
+"""MAV_PARAM_ERROR_DOES_NOT_EXIST."""
+
+MOST_NAMED = 4
+"""Parameters that a fault names; the table has all."""
 
 
 @dataclass(frozen=True)
@@ -23,6 +29,7 @@ class Rule:
     why: str
     good: Callable[[float], bool]
     value: Callable[[float], float] | None = None  # what is written where the operator asked for it; None: nothing can be
+    optional: bool = False  # firmware without it is right as well
 
 
 def equal(name: str, value: float, why: str, writable: bool = True) -> Rule:
@@ -44,7 +51,8 @@ class Audit:
     """Asks for parameters one by one and judges them.
 
     Attributes:
-        found: values by name. written: names that were changed. problems: mismatches in words, once the audit is done.
+        found: values by name. refused: why a value is not told, by name. written: names that were changed.
+        problems: mismatches in words, once the audit is done.
     """
 
     def __init__(
@@ -61,6 +69,7 @@ class Audit:
         """
         self.rules, self._ask, self._write, self._tell = tuple(rules), ask, write, tell
         self.found: dict[str, float] = {}
+        self.refused: dict[str, str] = {}
         self.written: list[str] = []
         self._asked: dict[str, float] = {}
         self._written_at: dict[str, float] = {}
@@ -68,6 +77,16 @@ class Audit:
         self._begun: float | None = None
         self.done = not self.rules
         self.problems: list[str] = []
+
+    def refuse(self, name: str, error: int) -> None:
+        """Take an answer that there is no value.
+
+        Args:
+            name: of the parameter.
+            error: MAV_PARAM_ERROR.
+        """
+        if not self.done and any(rule.name == name for rule in self.rules):
+            self.refused[name] = "no such parameter" if error == NO_SUCH_PARAMETER else f"refused with error {error}"
 
     def feed(self, name: str, value: float) -> None:
         """Take an answer."""
@@ -92,8 +111,12 @@ class Audit:
             return
         if self._begun is None:
             self._begun = now
-        missing = [rule.name for rule in self.rules if rule.name not in self.found]
-        if not missing or now - self._begun > GIVE_UP:
+        waited = now - self._begun
+        missing = [
+            rule.name for rule in self.rules
+            if rule.name not in self.found and rule.name not in self.refused and not (rule.optional and waited > GIVE_UP_OPTIONAL)
+        ]  # fmt: skip
+        if not missing or waited > GIVE_UP:
             self.done, self.problems = True, self._mismatches()
             if self._tell is not None:
                 self._tell(self.table())
@@ -103,24 +126,35 @@ class Audit:
                 self._asked[name] = now
                 self._ask(name)
 
+    def _judged(self, rule: Rule) -> bool:
+        value = self.found.get(rule.name)
+        return rule.optional if value is None else rule.good(value)
+
     def _mismatches(self) -> list[str]:
         out = []
         for rule in self.rules:
             value = self.found.get(rule.name)
-            if value is None:
-                out.append(f"{rule.name} was not told; expected {rule.expected}")
-            elif not rule.good(value):
-                out.append(f"{rule.name} is {value:g}; expected {rule.expected}")
+            what = f": {self.refused[rule.name]}" if rule.name in self.refused else " was not told"
+            if not self._judged(rule):
+                out.append(f"{rule.name}{what if value is None else f' is {value:g}'}; expected {rule.expected}")
         return out
+
+    def fault(self) -> str | None:
+        """What ends the run, in short; the table has it in full."""
+        if not self.problems:
+            return None
+        names = [rule.name for rule in self.rules if not self._judged(rule)]
+        more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
+        return f"parameter audit: {', '.join(names[:MOST_NAMED])}{more} wrong, see the table"
 
     def table(self) -> str:
         """Parameter, found, expected, why, a line each."""
         rows = [("", "parameter", "found", "expected", "why")]
         for rule in self.rules:
             value = self.found.get(rule.name)
-            good = value is not None and rule.good(value)
-            mark = "ok" if good else "WRONG"
-            shown = "no answer" if value is None else f"{value:g}" + (" (written)" if rule.name in self.written else "")
+            mark = "ok" if self._judged(rule) else "WRONG"
+            shown = self.refused.get(rule.name, "no answer") if value is None else f"{value:g}"
+            shown += " (written)" if rule.name in self.written else ""
             rows.append((mark, rule.name, shown, rule.expected, rule.why))
         widths = [max(len(row[i]) for row in rows) for i in range(4)]
         lines = ["  ".join([*(cell.ljust(w) for cell, w in zip(row, widths)), row[4]]).rstrip() for row in rows]

@@ -14,12 +14,17 @@ from hil.backends.base import FOLLOW, HOLD, LAND, WAIT, Release, Status
 from hil.backends.thrust import ThrustParams
 from hil.links.mavlink_link import Link, attitude_target
 from hil.links.pymav import mav
+from hil.links.roster import Party
 
 ASK_AGAIN = 0.1
 """Between two requests for a mode or for arming [s]."""
 
-STREAM = ((mav.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW, 5_000), (mav.MAVLINK_MSG_ID_ATTITUDE_TARGET, 50_000))
-"""Messages asked for at connect and their periods [us]: read-back of the mechanism, share of thrust in hover."""
+STREAM = (
+    (mav.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW, 5_000), (mav.MAVLINK_MSG_ID_ATTITUDE_TARGET, 50_000),
+    (mav.MAVLINK_MSG_ID_HEARTBEAT, 100_000),
+)  # fmt: skip
+"""Messages asked for at connect and their periods [us]: read-back of the mechanism, share of thrust in hover, and the mode, which a
+heartbeat of 1 Hz tells up to a second late."""
 
 SERVO_NEAR = 50
 """An output this near to where the mechanism is open counts as open [us]."""
@@ -71,6 +76,7 @@ class MavlinkAutopilot:
     """
 
     name = "autopilot"
+    autopilot = mav.MAV_AUTOPILOT_GENERIC
     holds = True
 
     def __init__(
@@ -84,7 +90,7 @@ class MavlinkAutopilot:
             write: whether wrong parameters are written.
             tell: is handed the table of parameters.
         """
-        self.params, self._link = params, link
+        self.params, self._link, self._write, self._tell = params, link, write, tell
         self._heartbeat: Any = None
         self._heard = self._told = self._asked_at = self._streamed = -1e9
         self._wanted: str | None = None
@@ -97,19 +103,30 @@ class MavlinkAutopilot:
         self._kinds: dict[str, int] = {}  # of parameters, as MAV_PARAM_TYPE
         self.release_record = Release(params.release_timeout, params.servo_output > 0)
         self._servo = f"servo{params.servo_output}_raw"  # one string for good: Python's cache of attributes keeps each new one
-        rules = self._rules() if params.audit else ()
-        self.audit = Audit(rules, self._ask_parameter, self._write_parameter if write else None, tell)
+        self._begin_audit()
         self.texts: list[str] = []
         self.share: float | None = None
         self._exact = False
         self.voltage: float | None = None
         link.listen(self._hear)
+        link.roster.moved.append(self._came_back)
+
+    def _begin_audit(self) -> None:
+        rules = self._rules() if self.params.audit else ()
+        self.audit = Audit(rules, self._ask_parameter, self._write_parameter if self._write else None, self._tell)
+
+    def _came_back(self, party: Party) -> None:
+        """From another address it may be another vehicle of the same ids."""
+        if party.name == "autopilot":
+            self._heartbeat = None
+            self._streamed = -1e9
+            self._begin_audit()
 
     def _rules(self) -> list[Rule]:
         raise NotImplementedError
 
-    def _role(self, beat: Any) -> str | None:
-        """FOLLOW, HOLD or LAND by a heartbeat's mode; None for another one."""
+    def _role(self, mode: int) -> str | None:
+        """FOLLOW, HOLD or LAND by a heartbeat's custom mode; None for another one."""
         raise NotImplementedError
 
     def _mode_numbers(self, mode: str) -> tuple[float, float]:
@@ -141,11 +158,13 @@ class MavlinkAutopilot:
             self.texts.append(str(message.text))
         elif kind == "SERVO_OUTPUT_RAW" and 1 <= p.servo_output <= 16:
             value = getattr(message, self._servo, 0)
-            if value and abs(value - p.servo_open_us) <= SERVO_NEAR:
-                self.release_record.moved()
+            if value:
+                self.release_record.output(abs(value - p.servo_open_us) <= SERVO_NEAR)
         elif kind == "PARAM_VALUE":
             self._kinds[message.param_id] = message.param_type
             self.audit.feed(message.param_id, self._stored(message.param_value, message.param_type))
+        elif kind == "PARAM_ERROR":
+            self.audit.refuse(message.param_id, message.error)
         elif kind == "ATTITUDE_TARGET":
             self.share, self._exact = message.thrust, True
         elif kind == "VFR_HUD" and not self._exact:  # in whole percent
@@ -155,7 +174,7 @@ class MavlinkAutopilot:
 
     def _judge_mode(self) -> None:
         """Whether the mode is still one of ours."""
-        role = self._role(self._heartbeat)
+        role = self._role(self._heartbeat.custom_mode)
         if self._wanted is None:
             return
         self._was_armed |= bool(self._heartbeat.base_mode & ARMED)
@@ -184,22 +203,22 @@ class MavlinkAutopilot:
             return "no heartbeat" if beat is None else f"no heartbeat for {now - self._heard:.1f} s", WAIT
         if not self.audit.done:
             return "parameters are being read", WAIT
-        role, armed = self._role(beat), bool(beat.base_mode & ARMED)
+        role, armed = self._role(beat.custom_mode), bool(beat.base_mode & ARMED)
         if self._wanted is None:
             if not armed and not p.arm:
                 return "disarmed", WAIT
             ready = role == FOLLOW or (p.take and role == HOLD)
-            return ("", role) if ready else (f"in mode {self._mode_text(beat)}; expected {self._expected_modes()}", WAIT)
+            return ("", role) if ready else (f"in mode {self._mode_text(beat.custom_mode)}; expected {self._expected_modes()}", WAIT)
         if self._taken_over:
-            return f"in mode {self._mode_text(beat)}, which the runner did not ask for: pilot or failsafe has it", WAIT
+            return f"in mode {self._mode_text(beat.custom_mode)}, which the runner did not ask for: pilot or failsafe has it", WAIT
         if armed or self._wanted == LAND:  # on the ground it disarms itself
             return "", role or WAIT
         if self._was_armed or self._arm_refused or not p.arm:
             return self._arm_refused or "disarmed", WAIT
         return "", WAIT
 
-    def _mode_text(self, beat: Any) -> str:
-        return str(beat.custom_mode)
+    def _mode_text(self, mode: int) -> str:
+        return str(mode)
 
     def _expected_modes(self) -> str:
         raise NotImplementedError
@@ -207,9 +226,8 @@ class MavlinkAutopilot:
     def status(self, now: float) -> Status:
         """See `Backend`."""
         note, mode = self._note(now)
-        problems = self.audit.problems
-        fault = f"parameter audit: {'; '.join(problems)}" if problems else None
-        return Status(not note and not problems, note or self.release_record.note, self.release_record.state, mode, fault)
+        fault = self.audit.fault()
+        return Status(not note and fault is None, note or self.release_record.note, self.release_record.state, mode, fault)
 
     def send(self, command: tuple[float, ...], now: float) -> bool:
         """See `Backend`."""
@@ -222,7 +240,7 @@ class MavlinkAutopilot:
         """See `Backend`: asks until the heartbeat shows the mode."""
         if mode != self._wanted:
             if self._wanted is None and self._heartbeat is not None:  # the first one that is ours was the pilot's
-                self._may.add(self._role(self._heartbeat))
+                self._may.add(self._role(self._heartbeat.custom_mode))
             self._may.add(mode)
             self._wanted, self._reached, self._asked_at = mode, False, -1e9
             if self._heartbeat is not None:
@@ -230,9 +248,10 @@ class MavlinkAutopilot:
         if self._taken_over or now - self._asked_at < ASK_AGAIN:
             return
         beat = self._heartbeat
-        if beat is None or self._role(beat) != mode:
+        if beat is None or self._role(beat.custom_mode) != mode:
             self._asked_at = now
             self._command(mav.MAV_CMD_DO_SET_MODE, 0, CUSTOM, *self._mode_numbers(mode))
+            self._command(mav.MAV_CMD_REQUEST_MESSAGE, 0, mav.MAVLINK_MSG_ID_HEARTBEAT)
         elif mode == FOLLOW and self.params.arm and not beat.base_mode & ARMED:
             self._asked_at = now
             self._command(mav.MAV_CMD_COMPONENT_ARM_DISARM, 0, 1.0)
@@ -263,10 +282,6 @@ class MavlinkAutopilot:
         if self.release_record.due(now):
             number, values = self._release_command()
             self._command(number, self.release_record.sends - 1, *values)
-
-    def stand_ins(self) -> dict[int, Any]:
-        """See `Backend`."""
-        return {id(self._link): self._link.muted(), id(self.params): self.params, id(self.audit): self.audit}
 
     def due(self) -> float | None:
         """See `Backend`."""

@@ -53,9 +53,6 @@ class Backend(Protocol):
     def service(self, now: float) -> None:
         """Do what is due: heartbeats, the release, its repetition."""
 
-    def stand_ins(self) -> dict[int, Any]:
-        """What a deep copy is to have in the place of parts of this one, by their ``id``, so that it sends nothing."""
-
     def due(self) -> float | None:
         """When :meth:`service` is to be called at the latest [s]; None for the next tick."""
 
@@ -97,7 +94,7 @@ class Release:
         self.at: float | None = None  # of the next send [s]
         self._first = 0.0
         self._sent: float | None = None  # until the first answer
-        self._answered = self._moved = False
+        self._answered = self._moved = self._closed = False
 
     def start(self, when: float) -> None:
         """Open at a time [s]."""
@@ -124,9 +121,10 @@ class Release:
             self._answered = True
             self._judge()
 
-    def moved(self) -> None:
-        """The mechanism was seen to have moved."""
-        if self.state == PENDING and self.sends:
+    def output(self, is_open: bool) -> None:
+        """The mechanism's output was seen; it has moved when it is open, and was seen closed in this throw before."""
+        self._closed |= not is_open
+        if is_open and self._closed and self.state == PENDING and self.sends:
             self._moved = True
             self._judge()
 
@@ -135,7 +133,8 @@ class Release:
         if self.state != PENDING:
             return False
         if now - self._first > self.timeout:
-            why = "accepted, but nothing moved" if self._answered else "no final answer"
+            stood = "the output was not seen closed before" if self.read_back and not self._closed else "nothing moved"
+            why = f"accepted, but {stood}" if self._answered else "no final answer"
             self._end(FAILED, f"{why} within {self.timeout:g} s")
         elif self.at is not None and now >= self.at - ROUNDING:
             if not self.sends:
@@ -184,10 +183,6 @@ class DryRun:
     def due(self) -> float | None:
         """See `Backend`."""
         return None
-
-    def stand_ins(self) -> dict[int, Any]:
-        """See `Backend`."""
-        return {}
 
     def _nothing(self, *_: Any) -> None:
         """See `Backend`."""

@@ -2,11 +2,15 @@
 
 The flight controller has no hold of its own and hears no poses; the runner's hover controller flies before and after the
 throw. Two ways to be heard: MSP OVERRIDE (``arm_channel = 0``): a real receiver supplies all channels, and while the pilot
-holds a switch the four sticks and the release channel are ours; and RX_MSP (``arm_channel`` an AUX): all channels are ours, for
-benches and software only. Silence: the motors idle after 0.36 s, disarming follows at 1.6 s.
+holds a switch the four sticks and the release channel are ours; after 0.3 s of silence the pilot's own sticks count again. And RX_MSP
+(``arm_channel`` an AUX): all channels are ours, for benches and software only; after 0.36 s of silence the motors idle, disarming
+follows at 1.6 s.
+
+MSP_SERVO does not show what CHANNEL_FORWARDING puts out: then the release is read back from its channel alone. ARM that is raised
+while the receiver is in failsafe has to go low again before the firmware arms.
 
 Source: betaflight.com, Controlling Betaflight From a Companion Computer Over MSP; src/main/msp/msp.c (payloads), rx.c, rc.c,
-msp_box.c (permanent ids).
+msp_box.c (permanent ids); src/main/fc/runtime_config.c (armingDisableFlagNames).
 """
 
 import struct
@@ -19,7 +23,7 @@ from hil.backends.base import ACCEPTED, FOLLOW, PENDING, WAIT, Release, Status
 from hil.backends.rates import MIDDLE, RATES_TYPES, RatesParams, Sticks
 from hil.backends.thrust import ThrustParams
 from hil.links import msp
-from hil.links.device import MOST_CHUNKS, MutePort, Port
+from hil.links.device import MOST_CHUNKS, Port
 
 BOX_ARM, BOX_OVERRIDE = 0, 50
 """Permanent ids of flight modes."""
@@ -39,8 +43,27 @@ KEEP_ALIVE = 0.02
 OPEN_TIME = 2.0
 """After which the mechanism closes again, so that the next payload can be hung on [s]."""
 
-POLLS = {msp.STATUS: 0.1, msp.RC: 0.1, msp.ANALOG: 1.0}
+ARM_LOW = 0.5
+"""For which nothing may speak against arming before ARM is raised, or raised again [s]."""
+
+FORWARDING = 1 << 20
+"""Bit of CHANNEL_FORWARDING in MSP_FEATURE_CONFIG."""
+
+BLOCKS = (
+    "no gyro", "failsafe", "receiver lost", "the receiver is back: ARM must go low first", "failsafe switch", "runaway take-off",
+    "crash", "throttle not low", "tilted more than small_angle", "just booted", "prearm", "processor load", "calibrating",
+    "CLI is open", "CMS menu", "BST", "MSP asked", "paralyze", "GPS rescue", "rescue switch", "RPM filter", "reboot required",
+    "DSHOT bitbang", "accelerometer not calibrated", "motor protocol", "crash flip",
+)  # fmt: skip
+"""Bits of the arming-disabled flags of MSP_STATUS in words; the highest of a version is the ARM switch itself, which is raised while
+another one is set."""
+
+POLLS = {msp.STATUS: 0.1, msp.RC: 0.1, msp.SERVO: 0.1, msp.ANALOG: 1.0}
 """What is asked for all the time, and how often [s]."""
+
+READ_BACK = 0.04
+"""Between two questions for the release [s]. The firmware takes one command in a turn of its serial ports, 100 turns a second by its
+default: with a question or two beside every frame the frames queued up, and came 0.1 to 0.3 s late just after a release."""
 
 AXES = ("roll", "pitch", "yaw")
 
@@ -111,8 +134,9 @@ class Betaflight:
         self._boxes: tuple[int, ...] = ()
         self._tuning = b""
         self._polled = dict.fromkeys(POLLS, -1e9)
-        self._heard = self._framed = self._boxed = -1e9
+        self._heard = self._framed = self._boxed = self._read_back = -1e9
         self._flags = self._blocks = 0
+        self._free_since: float | None = None  # since when nothing speaks against arming, with ARM low
         self._taken = self._over = self._raised = False  # asked for; over; has followed
         self._sticks_us = (MIDDLE, MIDDLE, MIDDLE, LOW)  # roll, pitch, yaw, throttle
         self._opened: float | None = None
@@ -140,6 +164,9 @@ class Betaflight:
             Rule("failsafe_delay", "above 0, at most 1.5 s", "motors stop so late when the runner is gone",
                  lambda v: 0.0 < v <= 1.5),
         ]  # fmt: skip
+        if p.servo_output:
+            rules.append(Rule("channel_forwarding", "0, or 1", "1: MSP_SERVO does not show the output, its channel is read back",
+                              lambda v: v in (0.0, 1.0)))  # fmt: skip
         if p.arm_channel:
             rules.append(equal("arm_aux", p.arm_channel, "AUX of the ARM mode", False))
         else:
@@ -148,10 +175,18 @@ class Betaflight:
 
     def status(self, now: float) -> Status:
         """See `Backend`."""
-        problems = self.audit.problems
-        fault = f"parameter audit: {'; '.join(problems)}" if problems else None
+        fault = self.audit.fault()
         note, mode = self._note(now)
-        return Status(not note and not problems, note or self.release_record.note, self.release_record.state, mode, fault)
+        said = note or self._hint() or self.release_record.note
+        return Status(not note and fault is None, said, self.release_record.state, mode, fault)
+
+    def _hint(self) -> str:
+        """What it waits for, though nothing is wrong."""
+        if not self._taken or self._raised:
+            return ""
+        if self.params.arm_channel:
+            return f"arming disabled: {blocked(self._blocks)}" if self._blocks else "it is being armed"
+        return "" if self._box(BOX_OVERRIDE) else "MSP OVERRIDE is off: switch it on to hand over"
 
     def _note(self, now: float) -> tuple[str, str]:
         p = self.params
@@ -166,7 +201,7 @@ class Betaflight:
         if self._taken and self._raised:
             return ("disarmed" if not armed else "MSP OVERRIDE is off: the pilot has it"), WAIT
         if p.arm_channel:
-            return (f"arming disabled, flags {self._blocks:#x}" if self._blocks else ""), WAIT
+            return (f"arming disabled: {blocked(self._blocks)}" if self._blocks and not self._taken else ""), WAIT
         if not armed:
             return "disarmed", WAIT
         return ("MSP OVERRIDE is on before the runner is ready: switch it off" if ours and not self._taken else ""), WAIT
@@ -192,14 +227,20 @@ class Betaflight:
         for i, value in enumerate(self._sticks_us):
             channels[self._order[i]] = value
         if p.arm_channel:
-            channels[STICKS + p.arm_channel - 1] = HIGH if self._taken and not self._over else LOW
+            channels[STICKS + p.arm_channel - 1] = HIGH if self._arms(now) else LOW
         channels[STICKS + p.release_channel - 1] = LOW if self._opened is None else HIGH
         self._framed = now
         return self._write(msp.SET_RAW_RC, struct.pack(f"<{len(channels)}H", *channels))
 
+    def _arms(self, now: float) -> bool:
+        """Whether ARM is to be high: not before nothing has spoken against it for a while, and low again where something does."""
+        if not self._taken or self._over:
+            return False
+        return self._box(BOX_ARM) or (self._free_since is not None and now - self._free_since >= ARM_LOW)
+
     def ask(self, mode: str, now: float) -> None:
         """See `Backend`: takes the vehicle; it neither holds nor lands by itself."""
-        if mode == FOLLOW and not self._blocks:
+        if mode == FOLLOW:
             self._taken = True
 
     def release(self, when: float) -> None:
@@ -221,7 +262,7 @@ class Betaflight:
         """See `Backend`."""
         self._pump(now)
         for command, period in POLLS.items():
-            if now - self._polled[command] >= period:
+            if now - self._polled[command] >= period and (command != msp.SERVO or self.release_record.read_back):
                 self._polled[command] = now
                 self._write(command)
         if not (self._boxes and self._order) and now - self._boxed >= 0.5:
@@ -233,17 +274,16 @@ class Betaflight:
         if self.release_record.due(now) and self._opened is None:
             self._opened = now
             self._frame(now)
-        if self.release_record.state == PENDING and self._opened is not None:
-            self._write(msp.SERVO if self.params.servo_output else msp.RC)
+        waits = self.release_record.state == PENDING and self._opened is not None
+        if waits and now - self._read_back >= READ_BACK:
+            self._read_back = now
+            if self.release_record.read_back:
+                self._write(msp.SERVO)
             self._write(msp.RC)
         if self._opened is not None and now - self._opened > OPEN_TIME:
             self._opened = None
         if self.params.arm_channel and not self._taken and not self._over and now - self._framed >= KEEP_ALIVE:
             self._frame(now)
-
-    def stand_ins(self) -> dict[int, Any]:
-        """See `Backend`."""
-        return {id(self._port): MutePort(), id(self.params): self.params, id(self.sticks): self.sticks, id(self.audit): self.audit}
 
     def due(self) -> float | None:
         """See `Backend`."""
@@ -288,10 +328,14 @@ class Betaflight:
             self._heard = now
         if frame.command in readers:
             readers[frame.command](frame)
+        if frame.command == msp.STATUS:
+            self._free_since = None if self._blocks else now if self._free_since is None else self._free_since
         if frame.command == msp.RC_TUNING and not self.audit.written:
             self._tuning = frame.payload
         for name, value in settings(frame, self.params).items():
             self.audit.feed(name, value)
+            if name == "channel_forwarding" and value:
+                self.release_record.read_back = False
 
     def _hear_status(self, frame: msp.Frame) -> None:
         flags = frame.u32(6)
@@ -319,8 +363,8 @@ class Betaflight:
 
     def _hear_servo(self, frame: msp.Frame) -> None:
         outputs, at = frame.words(), self.params.servo_output - 1
-        if 0 <= at < len(outputs) and abs(outputs[at] - self.params.servo_open_us) <= NEAR:
-            self.release_record.moved()
+        if 0 <= at < len(outputs):
+            self.release_record.output(abs(outputs[at] - self.params.servo_open_us) <= NEAR)
 
     def _hear_boxes(self, frame: msp.Frame) -> None:
         self._boxes = tuple(frame.payload)
@@ -353,9 +397,15 @@ TUNING = {
 TOLD = {
     msp.API_VERSION: ("api_version",), msp.RC_TUNING: tuple(TUNING), msp.RC_DEADBAND: ("deadband", "yaw_deadband"),
     msp.RX_CONFIG: ("mid_rc", "min_check"), msp.FAILSAFE_CONFIG: ("failsafe_delay",),
-    msp.MODE_RANGES: ("arm_aux", "override_aux"),
+    msp.MODE_RANGES: ("arm_aux", "override_aux"), msp.FEATURE_CONFIG: ("channel_forwarding",),
 }  # fmt: skip
 """Which answer tells which setting."""
+
+
+def blocked(flags: int) -> str:
+    """What speaks against arming, in words."""
+    named = [text for bit, text in enumerate(BLOCKS) if flags >> bit & 1]
+    return f"{', '.join(named) or 'ARM switch'} (flags {flags:#x})"
 
 
 def settings(frame: msp.Frame, params: BetaflightParams) -> dict[str, float]:
@@ -373,6 +423,9 @@ def settings(frame: msp.Frame, params: BetaflightParams) -> dict[str, float]:
     elif frame.command == msp.FAILSAFE_CONFIG:
         tenths = frame.u8(0)
         raw["failsafe_delay"] = None if tenths is None else 0.1 * tenths
+    elif frame.command == msp.FEATURE_CONFIG:
+        bits = frame.u32(0)
+        raw["channel_forwarding"] = None if bits is None else float(bool(bits & FORWARDING))
     elif frame.command == msp.MODE_RANGES:
         raw = {"arm_aux": _aux(frame, BOX_ARM, params.arm_channel), "override_aux": _aux(frame, BOX_OVERRIDE, 0)}
     return {name: float(value) for name, value in raw.items() if value is not None}

@@ -1,17 +1,18 @@
 """PX4: SET_ATTITUDE_TARGET in OFFBOARD, DO_GRIPPER or DO_SET_ACTUATOR, Hold (AUTO.LOITER), Land (AUTO.LAND).
 
 OFFBOARD is refused until set-points have come for a second, and left when they cease for COM_OF_LOSS_T; so the runner streams
-first and asks then. DO_GRIPPER is answered IN_PROGRESS first. Integer parameters travel as bytes in a float field.
+first and asks then. DO_GRIPPER is answered IN_PROGRESS first, and ACCEPTED after PD_GRIPPER_TO whatever moves: the read-back of the
+output is what says that it did. A gripper opens at the minimum of its output. Integer parameters travel as bytes in a float field.
 
-Source: docs.px4.io, Offboard Mode and Parameter Reference (COM_OF_LOSS_T, COM_OBL_RC_ACT, EKF2_EV_CTRL, PD_GRIPPER_EN); the
-output functions (Peripheral via Actuator Set 1 is 301, Gripper 430) are those of Actuator Configuration.
+Source: docs.px4.io, Offboard Mode and Parameter Reference (COM_OF_LOSS_T, COM_OBL_RC_ACT, EKF2_EV_CTRL, PD_GRIPPER_TO, PWM_AUX_MIN1;
+PD_GRIPPER_EN up to 1.16); the output functions (Peripheral via Actuator Set 1 is 301, Gripper 430) are those of Actuator Configuration.
 """
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 from hil.backends.audit import Rule, bits, equal, within
-from hil.backends.autopilot import AutopilotParams, MavlinkAutopilot, bytes_to_integer, integer_to_bytes
+from hil.backends.autopilot import SERVO_NEAR, AutopilotParams, MavlinkAutopilot, bytes_to_integer, integer_to_bytes
 from hil.backends.base import FOLLOW, HOLD, LAND
 from hil.links.pymav import mav
 
@@ -57,20 +58,20 @@ class Px4Params(AutopilotParams):
 class Px4(MavlinkAutopilot):
     """See `hil.backends.base.Backend`."""
 
-    name = "px4"
+    name, autopilot = "px4", mav.MAV_AUTOPILOT_PX4
     params: Px4Params
     _stream_since = _sent_at = -1e9
 
-    def _role(self, beat: Any) -> str | None:
-        main, sub = beat.custom_mode >> 16 & 255, beat.custom_mode >> 24 & 255
+    def _role(self, mode: int) -> str | None:
+        main, sub = mode >> 16 & 255, mode >> 24 & 255
         if main == MAIN_OFFBOARD:
             return FOLLOW
         if main == MAIN_POSCTL and (self.params.hold == "position" or not self._ours):
             return HOLD  # the pilot holds it by hand: until it is taken, or when it is given back
         return {AUTO_LOITER: HOLD, AUTO_LAND: LAND}.get(sub) if main == MAIN_AUTO else None
 
-    def _mode_text(self, beat: Any) -> str:
-        return f"{beat.custom_mode >> 16 & 255}.{beat.custom_mode >> 24 & 255}"
+    def _mode_text(self, mode: int) -> str:
+        return f"{mode >> 16 & 255}.{mode >> 24 & 255}"
 
     def _mode_numbers(self, mode: str) -> tuple[float, float]:
         hold = (MAIN_AUTO, AUTO_LOITER) if self.params.hold == "hold" else (MAIN_POSCTL, 0)
@@ -116,8 +117,23 @@ class Px4(MavlinkAutopilot):
             bits("EKF2_EV_CTRL", POSITION_BITS, "holding after the throw needs the hall's position"),
         ]  # fmt: skip
         if p.release == "gripper":
-            rules.append(equal("PD_GRIPPER_EN", 1.0, "DO_GRIPPER is not answered without it"))
+            rules += [
+                Rule("PD_GRIPPER_EN", "1, or none since 1.17", "DO_GRIPPER is not answered without it", lambda v: v == 1.0,
+                     lambda _: 1.0, optional=True),
+                Rule("PD_GRIPPER_TO", f"below {p.release_timeout:g}", "ACCEPTED comes so late [s]", lambda v: v < p.release_timeout,
+                     optional=True),
+            ]  # fmt: skip
         if p.output_parameter:
             function = 430.0 if p.release == "gripper" else 300.0 + p.gripper
             rules.append(equal(p.output_parameter, function, "what drives the output that the mechanism hangs on"))
+            rules += self._ends()
         return rules
+
+    def _ends(self) -> list[Rule]:
+        """The end of the output at which the mechanism is open is the one that is read back."""
+        p = self.params
+        open_end = {-1.0: "MIN", 1.0: "MAX"}.get(-1.0 if p.release == "gripper" else p.actuator_open)
+        if not p.servo_output or open_end is None or "FUNC" not in p.output_parameter:
+            return []
+        name, why = p.output_parameter.replace("FUNC", open_end), "the output with the mechanism open, which is read back [us]"
+        return [Rule(name, f"{p.servo_open_us} (servo_open_us)", why, lambda v: abs(v - p.servo_open_us) <= SERVO_NEAR)]

@@ -10,6 +10,7 @@ class Words:
     arm: bool = False
     land: bool = False
     abort: bool = False
+    why: str = ""  # of the abort, where it was no word: a signal, the end of the run's time
 
 
 @dataclass
@@ -26,4 +27,5 @@ class Decision:
     valid: list | None = None
     release: bool = False  # the policy asked for it and it was done
     note: str = ""
+    waits: str = ""  # why it does not go on
     seen: list | None = None  # of a camera's newest frame since the last tick; see `hil.poses.sight.Sight`

@@ -4,16 +4,15 @@ import gc
 import math
 import time
 from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
-from hil.backends.base import Backend
+from hil.backends.base import Backend, DryRun
 from hil.control.decision import Decision, Words
 from hil.control.realtime import collected
-from hil.control.rehearsal import BEGIN, Rehearsal
 from hil.control.runner import Runner
 from hil.control.states import State
 from hil.links.clock import Clock, Ticker
-from hil.poses.pose import Pose
 from hil.recording.latency import Stages
 from hil.recording.record import Recorder
 from hil.sources import Source
@@ -25,6 +24,9 @@ the second number that goes round from tick to tick, so that the link is looked 
 point of their periods."""
 
 GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
+
+SAY_AGAIN = 3.0
+"""Between two words on why it does not go on [s]."""
 
 COLLECT_ALL = 50
 """Ticks between two looks of the garbage collector at all that was made since the start; the others see the last tick's."""
@@ -48,82 +50,121 @@ class AutoOperator:
 def fly(
     runner: Runner, source: Source, clock: Clock, operator: Operator, recorder: Recorder | None = None,
     most: float = float("inf"), tell: Callable[[Decision], None] | None = None, stages: Stages | None = None,
-    eyes: Eyes | None = None, rehearsal: Rehearsal | None = None,
+    eyes: Eyes | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """Run until the state machine is done, the recorded poses have ended, or for ``most`` seconds.
+
+    A vehicle that is ours is never left without a word: where the time is over in flight, or something raises, the run is aborted and
+    goes on until it has ended. A second Ctrl-C ends it at once, after one more request to land.
 
     Args:
         runner: with its back-end. source: of poses. clock: of the ticks. operator: who arms.
         recorder: of the run's folder; None records nothing.
         most: [s].
-        tell: called with the first decision of each state.
+        tell: called with the first decision of each state, and of each reason why it does not go on.
         stages: filled with the times of each stage.
         eyes: a camera, where keypoints are a detector's.
-        rehearsal: of this runner's ticks; None for none.
 
     Returns:
         The runner's summary with ticks, misses (those that a tick of ours caused by taking too long, and all), and the
         times of each stage.
     """
-    ticker, backend, stages = Ticker(clock, runner.pilot.period), runner.backend, stages or Stages()
-    ahead = AHEAD if rehearsal is None else BEGIN
-    begin, throws, told, ended, ours, ticks = clock.now(), [], None, -math.inf, 0, 0
+    loop = Loop(runner, source, clock, operator, recorder, tell, stages or Stages(), eyes)
+    begin, backend = clock.now(), runner.backend
     with collected():
-        while runner.machine.state is not State.DONE and clock.now() - begin < most and not source.ended:
-            _wait(clock, ticker.due() - ahead - AHEAD_SPREAD * (ticks * GOLDEN % 1.0), backend, source)
-            early = _approach(runner, source, clock, ticker.due(), rehearsal)
-            due, missed = ticker.due(), ticker.missed
-            now, start = ticker.take(), time.perf_counter()
-            ours += (ticker.missed - missed) * (ended > due)
-            late = source.poll(now)
-            polled = time.perf_counter()
-            status, words = backend.status(now), operator.words(runner.machine.state.value)
-            recording = recorder is None or recorder.failed is None
-            asked = time.perf_counter()
-            if eyes is not None:
-                eyes.tell(runner.hint(now))
-                runner.look(eyes.poll(now))
-            decision = runner.tick(now, late, status, words, recording)
-            poses = early + late
-            times = {"late": ticker.late, "poll": polled - start, **stages.poses(poses, now), **runner.spent}
-            if "total" in times:
-                times["total"] += asked - start
-            backend.service(now)
-            stages.add(times)
-            if decision.release:
-                throws.append(now)
-            if tell is not None and decision.state != told:
-                told = decision.state
-                tell(decision)
-            if recorder is not None:
-                recorder.tick(ticker.index, poses, status, words, recording, decision, times)
-            ticks += 1
-            gc.collect(1 if ticks % COLLECT_ALL == 0 else 0)
-            ended = clock.now()
-    record = getattr(backend, "release_record", None)  # a dry run has none
-    for delay in record.answers if record is not None else ():
-        stages.add({"ack": delay})
-    if runner.machine.state is State.DONE and not runner.machine.aborted:
-        backend.finish(clock.now())
-    return {
-        **runner.summary(), "ticks": ticks, "missed": ticker.missed, "missed_ours": ours,
-        "worst_late_s": ticker.worst, "latency": stages.summary(), "latch_times": throws,
-        **({} if rehearsal is None else {"rehearsals": rehearsal.count, "rehearsal_failed": rehearsal.failed}),
-    }  # fmt: skip
+        while runner.machine.state is not State.DONE and not source.ended:
+            over = clock.now() - begin >= most
+            if over and (backend.name == DryRun.name or not runner.in_flight):
+                break
+            try:
+                loop.turn(over)
+            except KeyboardInterrupt as error:
+                runner.fail(clock.now(), error)
+                break
+            except Exception as error:  # of what stands around the runner: it ends in abort all the same
+                runner.fail(clock.now(), error)
+                clock.sleep_until(clock.now() + runner.pilot.period)
+    return loop.summary()
 
 
-def _approach(runner: Runner, source: Source, clock: Clock, due: float, rehearsal: Rehearsal | None) -> list[Pose]:
-    """Wait until a tick is due [s], and rehearse it; returns the poses that were taken in before it."""
-    poses = source.poll(clock.now())
-    runner.take(poses)
-    own = runner.backend.due()
-    if rehearsal is not None and (own is None or own >= due):  # what the back-end has to do to the millisecond goes first
-        for now in rehearsal.steps(clock, due):
-            came = source.poll(now)
-            runner.take(came)
-            poses += came
-    _wait(clock, due, runner.backend, source)
-    return poses
+@dataclass
+class Loop:
+    """The turns of a run: wait for the tick, take poses in, tick, record; see :func:`fly` for its parts."""
+
+    runner: Runner
+    source: Source
+    clock: Clock
+    operator: Operator
+    recorder: Recorder | None = None
+    tell: Callable[[Decision], None] | None = None
+    stages: Stages = field(default_factory=Stages)
+    eyes: Eyes | None = None
+    ours: int = 0  # ticks that were missed because one of ours took too long
+    count: int = 0
+    throws: list[float] = field(default_factory=list)  # times of the latches [s]
+    _ended: float = -math.inf
+    _said: tuple[str, str] = ("", "")
+    _said_at: float = -math.inf
+
+    def __post_init__(self) -> None:
+        self.ticker = Ticker(self.clock, self.runner.pilot.period)
+
+    def turn(self, over: bool) -> None:
+        """One tick; ``over``: the run's time is, and what flies is to come down."""
+        runner, source, clock, ticker, backend = self.runner, self.source, self.clock, self.ticker, self.runner.backend
+        source.hold(runner.in_flight)
+        _wait(clock, ticker.due() - AHEAD - AHEAD_SPREAD * (self.count * GOLDEN % 1.0), backend, source)
+        early = source.poll(clock.now())
+        runner.take(early)
+        _wait(clock, ticker.due(), backend, source)
+        due, missed = ticker.due(), ticker.missed
+        now, start = ticker.take(), time.perf_counter()
+        self.ours += (ticker.missed - missed) * (self._ended > due)
+        late = source.poll(now)
+        polled = time.perf_counter()
+        status, words = backend.status(now), self.operator.words(runner.machine.state.value)
+        if over:
+            words = replace(words, abort=True, why=words.why or "the time of the run is over")
+        recording = self.recorder is None or self.recorder.failed is None
+        asked = time.perf_counter()
+        if self.eyes is not None:
+            self.eyes.tell(runner.hint(now))
+            runner.look(self.eyes.poll(now))
+        decision = runner.tick(now, late, status, words, recording)
+        times = {"late": ticker.late, "poll": polled - start, **self.stages.poses(early + late, now), **runner.spent}
+        if "total" in times:
+            times["total"] += asked - start
+        backend.service(now)
+        self.stages.add(times)
+        if decision.release:
+            self.throws.append(now)
+        self._tell(decision)
+        if self.recorder is not None:
+            self.recorder.tick(ticker.index, early + late, status, words, recording, decision, times)
+        self.count += 1
+        gc.collect(1 if self.count % COLLECT_ALL == 0 else 0)
+        self._ended = clock.now()
+
+    def _tell(self, decision: Decision) -> None:
+        """Say a change of state at once, a change of what it waits for every few seconds: numbers in it change with each tick."""
+        said = decision.state, decision.waits
+        fresh = said[0] != self._said[0] or (said != self._said and decision.time - self._said_at >= SAY_AGAIN)
+        if self.tell is not None and fresh:
+            self._said, self._said_at = said, decision.time
+            self.tell(decision)
+
+    def summary(self) -> dict[str, Any]:
+        """See :func:`fly`."""
+        runner, backend, ticker = self.runner, self.runner.backend, self.ticker
+        record = getattr(backend, "release_record", None)  # a dry run has none
+        for delay in record.answers if record is not None else ():
+            self.stages.add({"ack": delay})
+        if runner.machine.state is State.DONE and not runner.machine.aborted:
+            backend.finish(self.clock.now())
+        return {
+            **runner.summary(), "ticks": self.count, "missed": ticker.missed, "missed_ours": self.ours,
+            "worst_late_s": ticker.worst, "latency": self.stages.summary(), "latch_times": self.throws,
+        }  # fmt: skip
 
 
 def _wait(clock: Clock, until: float, backend: Backend, source: Source) -> None:

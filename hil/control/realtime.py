@@ -7,11 +7,15 @@ Both need rights: ``setcap cap_sys_nice,cap_ipc_lock+ep`` on the interpreter, or
 import ctypes
 import gc
 import os
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
 from visthrow.common.errors import ConfigError
+
+SWITCH = 5e-4
+"""After which one thread gives way to another [s]; Python's 5 ms are a quarter of a tick."""
 
 LOCK_CURRENT, LOCK_FUTURE = 1, 2
 """Flags of mlockall(2)."""
@@ -25,7 +29,6 @@ class RealtimeParams:
         ConfigError: a priority out of range.
     """
 
-    rehearse: bool = True  # run through each tick until it is due, so that it finds its code and data in the caches
     priority: int = 0  # of SCHED_FIFO, 1 to 99; 0: as any process
     lock_memory: bool = False  # no page of the process leaves the memory
 
@@ -49,7 +52,14 @@ def collected() -> Iterator[None]:
 
 
 def prepare(params: RealtimeParams) -> list[str]:
-    """Ask for what is wanted, for this thread and those that it starts from now on; returns what was refused, and why."""
+    """Ask for what is wanted, for this thread and those that it starts from now on; returns what was refused, and why.
+
+    The network runs on one thread, more only wait for each other; the recorder's gives way to the flying one soon.
+    """
+    import torch
+
+    torch.set_num_threads(1)
+    sys.setswitchinterval(SWITCH)
     refused = []
     if params.lock_memory:
         try:

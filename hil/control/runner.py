@@ -4,10 +4,11 @@ A tick depends on its time, the poses that came, the back-end's status and the o
 these are recorded, so that a replay decides alike to the last bit.
 """
 
+import copy
 import math
 import traceback
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from time import perf_counter
 from typing import Any
 
@@ -46,6 +47,27 @@ GROUND = 0.12
 
 LEVEL_TIME = 0.5
 """An aborted run without poses levels the vehicle for this long and then falls silent: the autopilot's failsafes act [s]."""
+
+
+WARM_CALLS = 3
+"""Of the policy before it is to fly: code, data and the traced operations are at hand after two."""
+
+MOST_ERRORS = 100
+"""Tracebacks that are kept."""
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Where things are as of a tick, in our world; None for what has no good pose yet."""
+
+    vehicle: BodyState | None
+    payload: BodyState | None
+    goal_w: Vector | None  # [m]
+
+    @property
+    def known(self) -> bool:
+        """Whether all are there."""
+        return self.vehicle is not None and self.payload is not None and self.goal_w is not None
 
 
 def calm(vehicle: BodyState) -> bool:
@@ -121,25 +143,38 @@ class Runner:
         try:
             return self._tick(now, poses, status, words, recording)
         except Exception as error:  # in flight nothing raises past the runner
-            if len(self.errors) < 100:
-                self.errors.append(traceback.format_exc())
-            self.machine.step(now, Inputs(3, 3, failure=f"{type(error).__name__}: {error}"))
-            self.backend.stop_release()
-            if self.machine.flown:
-                self.backend.abort(now)
-            return Decision(now, self.machine.state.value, self.machine.reason, note="exception")
+            return self.fail(now, error)
 
-    def rehearse(self, now: float, status: Status, words: Words) -> None:
-        """Tick on what has come so far, and look through the policy's eyes even where it is not flying. For copies alone.
+    def fail(self, now: float, error: BaseException) -> Decision:
+        """End the run because of an exception: abort, and no further release. The autopilot is asked to land, tick by tick.
 
         Args:
-            now, status, words: see :meth:`tick`.
+            now: [s]. error: as it was caught.
         """
-        decision = self.tick(now, [], status, words)
-        bodies = {name: self._state(track, now) for name, track in self.tracks.items()}
-        vehicle, payload, goal_w = bodies[VEHICLE], bodies[PAYLOAD], self._goal(bodies)
-        if decision.action is None and None not in (vehicle, payload, goal_w) and vehicle.quat:
-            self._show(vehicle, payload, goal_w, decision)
+        if len(self.errors) < MOST_ERRORS and isinstance(error, Exception):
+            self.errors.append("".join(traceback.format_exception(error)))
+        what = "Ctrl-C twice" if isinstance(error, KeyboardInterrupt) else f"{type(error).__name__}: {error}"
+        self.machine.step(now, Inputs(3, 3, failure=what))
+        self.backend.stop_release()
+        if self.machine.flown:
+            self.backend.abort(now)
+        return Decision(now, self.machine.state.value, self.machine.reason, note="exception")
+
+    @property
+    def in_flight(self) -> bool:
+        """Whether the vehicle is ours and the run is not over."""
+        return self.machine.flown and self.machine.state is not State.DONE
+
+    def warm_up(self, vehicle: BodyState | None = None) -> None:
+        """Call the policy a few times on a copy, so that the first calls of a throw find code and data at hand.
+
+        Args:
+            vehicle: as it hovers; any place will do.
+        """
+        pilot, pos = copy.copy(self.pilot), np.array([self.params.home_w if vehicle is None else vehicle.pos])
+        still, goal_w = np.zeros((1, 3)), np.array(self.params.goal_w)
+        for _ in range(WARM_CALLS):
+            pilot.act(pos, np.array([[0.0, 0.0, 0.0, 1.0]]), still, still, pos - [0.0, 0.0, self.hang], goal_w)
 
     def look(self, sights: list[Sight]) -> None:
         """Take in what a camera saw since the last tick; of several frames the newest counts."""
@@ -178,6 +213,19 @@ class Runner:
 
     def _tick(self, now: float, poses: list[Pose], status: Status, words: Words, recording: bool) -> Decision:
         begin = perf_counter()
+        seen = self._estimate(now, poses)
+        decision, state = self._decide(now, seen, status, words, recording)
+        self.spent["estimate"] = perf_counter() - begin
+        wanted = self._command(now, state, seen, decision)
+        self._ask(now, state, seen.vehicle, status)
+        if self.params.observe and decision.action is None and seen.known and seen.vehicle.quat:
+            self._show(seen, decision)
+        decision.command = self._guarded(now, wanted if self._ours(state, status) else None, decision)
+        self._send(now, state, decision, status, seen, begin)
+        return decision
+
+    def _estimate(self, now: float, poses: list[Pose]) -> Seen:
+        """Take poses in; where the bodies are now."""
         if self._untaken is not None:
             error, self._untaken = self._untaken, None
             raise error
@@ -189,49 +237,57 @@ class Runner:
                 if REACQUIRE < track.gate.age(now) < math.inf:
                     track.restart()
         bodies = {name: self._state(track, now) for name, track in self.tracks.items()}
-        vehicle, payload = bodies[VEHICLE], bodies[PAYLOAD]
-        goal_w = self.seen_goal_w = self._goal(bodies)
-        state = self.machine.step(now, self._inputs(now, vehicle, payload, goal_w, status, words, recording))
+        self.seen_goal_w = self._goal(bodies)
+        return Seen(bodies[VEHICLE], bodies[PAYLOAD], self.seen_goal_w)
+
+    def _decide(self, now: float, seen: Seen, status: Status, words: Words, recording: bool) -> tuple[Decision, State]:
+        """Move the state machine on, and do what a change of state brings with it."""
+        inputs = self._inputs(now, seen, status, words, recording)
+        state = self.machine.step(now, inputs)
         # The last tick may itself have ended in another state than it acted in: a command refused, an exception.
         before, self._acted = self._acted, state
         if state is not before:
-            self._entered(now, before, state, vehicle)
-        decision = Decision(now, state.value, self.machine.reason)
+            self._entered(now, before, state, seen.vehicle)
+        decision = Decision(now, state.value, self.machine.reason, waits=self.machine.waits(inputs))
         if self._sight is not None and self.sights is not None:
             decision.seen = self._sight.values()
-            if vehicle is not None and vehicle.quat is not None:
-                self.sights.take(self._sight, vehicle.quat)
+            if seen.vehicle is not None and seen.vehicle.quat is not None:
+                self.sights.take(self._sight, seen.vehicle.quat)
             self._sight = None
-        self.spent["estimate"] = perf_counter() - begin
-        wanted = self._command(now, state, vehicle, payload, goal_w, decision)
-        self._ask(now, state, vehicle, status)
+        return decision, state
+
+    def _ours(self, state: State, status: Status) -> bool:
+        """Whether commands are sent: not where it was handed over, nor to what has been taken over, hears nothing or was never ours."""
         if status.mode in (HELD, LAND) and state not in (State.READY, State.ARMED):
-            wanted = None  # handed over
-        if state is State.ABORT and not (status.connected and self.machine.flown):
-            wanted = None  # it has taken over, or hears nothing, or was never ours
-        if self.params.observe and decision.action is None and None not in (vehicle, payload, goal_w) and vehicle.quat:
-            self._show(vehicle, payload, goal_w, decision)
+            return False
+        return state is not State.ABORT or (status.connected and self.machine.flown)
+
+    def _guarded(self, now: float, wanted: tuple[float, ...] | None, decision: Decision) -> tuple[float, ...] | None:
+        """A command within its limits; one that is not finite ends the run."""
         if wanted is None:
             self.guard.reset()
-        else:
-            decision.command = self.guard.check(wanted)
-            if decision.command is None:
-                self.machine.step(now, Inputs(3, 3, failure=f"command {wanted} is not finite"))
-                decision.state, decision.reason = self.machine.state.value, self.machine.reason
-                decision.release = False
-                self.backend.stop_release()
-            else:
-                ready = perf_counter()
-                self.backend.send(decision.command, now)
-                self.spent["send"] = perf_counter() - ready
-                self.spent["total"] = perf_counter() - begin
+            return None
+        command = self.guard.check(wanted)
+        if command is None:
+            self.machine.step(now, Inputs(3, 3, failure=f"command {wanted} is not finite"))
+            decision.state, decision.reason = self.machine.state.value, self.machine.reason
+            decision.release = False
+            self.backend.stop_release()
+        return command
+
+    def _send(self, now: float, state: State, decision: Decision, status: Status, seen: Seen, begin: float) -> None:
+        """Send the command, then the release, then the request to land."""
+        if decision.command is not None:
+            ready = perf_counter()
+            self.backend.send(decision.command, now)
+            self.spent["send"] = perf_counter() - ready
+            self.spent["total"] = perf_counter() - begin
         hovers = state in (State.READY, State.ARMED) and status.mode == FOLLOW and decision.command is not None
         self.hovering.note(decision.command[0] / (self.mass * GRAVITY) if hovers else None)
         if decision.release:
-            self.backend.release(self.latch.trip(now, goal_w))
+            self.backend.release(self.latch.trip(now, seen.goal_w))
         if state is State.ABORT and self.machine.flown:
             self.backend.abort(now)
-        return decision
 
     def _tether(self, pose: Pose) -> Tether | None:
         """The cable's other end for a pose of vehicle or payload while the payload hangs; None on the ground and after."""
@@ -269,19 +325,16 @@ class Runner:
         goal = bodies[GOAL]
         return None if goal is None else goal.pos
 
-    def _inputs(
-        self, now: float, vehicle: BodyState | None, payload: BodyState | None, goal_w: Vector | None, status: Status,
-        words: Words, recording: bool,
-    ) -> Inputs:  # fmt: skip
+    def _inputs(self, now: float, seen: Seen, status: Status, words: Words, recording: bool) -> Inputs:
         p, state = self.params, self.machine.state
-        known = vehicle is not None and payload is not None and goal_w is not None
+        vehicle, payload, goal_w = seen.vehicle, seen.payload, seen.goal_w
         hanging = payload if self.latch.at is None else None
         failure = status.fault
         if status.release == FAILED and state in (State.THROW, State.RECOVER):
             failure = "the release was refused or not answered"
         checks = ["a body has no pose yet"]
         # After a throw the payload may have been hung on again; only the operator's next word makes the latch new.
-        if known and state is not State.THROW and (self.latch.at is None or state is State.READY):
+        if seen.known and state is not State.THROW and (self.latch.at is None or state is State.READY):
             checks = failed_checks(p.check, p.fence, vehicle, payload, goal_w, p.home_w, self.hang)
             if GOAL in self.tracks and self.tracks[GOAL].gate.level(now) >= HOLD:
                 checks.append("the goal's pose is stale")
@@ -306,6 +359,8 @@ class Runner:
             words.abort,
             recording,
             status.mode == FOLLOW,
+            status.note,
+            words.why,
         )
 
     def _thrust_off(self) -> list[str]:
@@ -332,6 +387,7 @@ class Runner:
         if state is State.ARMED:
             self.latch.rearm()
             self.backend.rearm()
+            self.warm_up(vehicle)
         if state is State.THROW:
             self.pilot.start()
             self.latch.begin(now)
@@ -341,21 +397,19 @@ class Runner:
         if state in (State.LAND, State.ABORT) and vehicle is not None:
             self.hovering.hold(vehicle.pos)
 
-    def _command(
-        self, now: float, state: State, vehicle: BodyState | None, payload: BodyState | None, goal_w: Vector | None,
-        decision: Decision,
-    ) -> tuple[float, ...] | None:  # fmt: skip
+    def _command(self, now: float, state: State, seen: Seen, decision: Decision) -> tuple[float, ...] | None:
         """What to send in a state, before the guard; None for nothing."""
         if state not in FLYING and state is not State.ABORT:
             return None
-        mass = self.mass if self._carries(now, vehicle, payload) else self.alone
+        vehicle = seen.vehicle
+        mass = self.mass if self._carries(now, vehicle, seen.payload) else self.alone
         if vehicle is None or vehicle.quat is None or self.tracks[VEHICLE].gate.level(now) >= HOLD:
             if state is State.ABORT and now - self.machine.since > LEVEL_TIME:
                 return None
             decision.note = "level: no fresh pose"
             return (mass * GRAVITY, 0.0, 0.0, 0.0)
         if state is State.THROW:
-            return self._throw(vehicle, payload, goal_w, decision)
+            return self._throw(seen, decision)
         if state in (State.LAND, State.ABORT):
             self.hovering.descend()
         return self.hovering.command(vehicle, mass)
@@ -367,8 +421,8 @@ class Runner:
             return self.latch.at is None
         return self.latch.hangs_still(now, vehicle.pos, payload.pos if fresh else None)
 
-    def _throw(self, vehicle: BodyState, payload: BodyState, goal_w: Vector, decision: Decision) -> tuple[float, ...]:
-        out = self._show(vehicle, payload, goal_w, decision)
+    def _throw(self, seen: Seen, decision: Decision) -> tuple[float, ...]:
+        out, payload, goal_w = self._show(seen, decision), seen.payload, seen.goal_w
         if out.release[0] and self.latch.at is None:
             fence = self.params.fence
             beyond = outside(payload.pos, fence.payload_low, fence.payload_high)
@@ -379,12 +433,13 @@ class Runner:
                 self.pilot.not_released()
         return tuple(map(float, out.command[0]))
 
-    def _show(self, vehicle: BodyState, payload: BodyState, goal_w: Vector, decision: Decision) -> PilotOutput:
+    def _show(self, seen: Seen, decision: Decision) -> PilotOutput:
         """Show the policy what there is to see, and note what it makes of it."""
+        vehicle, payload = seen.vehicle, seen.payload
         attached = not self.latch.separated(decision.time)
         views = [np.array([v]) for v in (vehicle.pos, vehicle.quat, vehicle.vel, vehicle.rate, payload.pos)]
         keypoints = None if self.sights is None else self.sights.keypoints(decision.time)
-        out: PilotOutput = self.pilot.act(*views, np.array(goal_w), attached, keypoints, decision.time)
+        out: PilotOutput = self.pilot.act(*views, np.array(seen.goal_w), attached, keypoints, decision.time)
         self.spent["observation"], self.spent["policy"] = self.pilot.spent
         decision.action = out.action[0].tolist()
         decision.observation = out.observation[0].tolist()
@@ -419,5 +474,6 @@ class Runner:
                 name: {"accepted": track.accepted, "refused": track.gate.refused, "filter_lag": track.filter.lag}
                 for name, track in self.tracks.items()
             },
+            "left_fence": self.machine.left_fence,
             "errors": self.errors,
         }

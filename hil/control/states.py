@@ -76,6 +76,13 @@ class Inputs:
     abort: bool = False
     recording: bool = True  # all could be recorded so far
     following: bool = True  # the autopilot follows commands
+    note: str = ""  # of the autopilot: what is wrong, or what it waits for
+    why: str = ""  # of the abort, where it was no word
+
+    def missing(self) -> list[str]:
+        """What has to be there before anything is checked, and is not."""
+        found = [f"no fresh pose of the {n}" for n, level in (("vehicle", self.vehicle), ("payload", self.payload)) if level >= HOLD]
+        return found if self.connected else [*found, "autopilot not ready" + (f" ({self.note})" if self.note else "")]
 
 
 class Machine:
@@ -85,6 +92,7 @@ class Machine:
         state: now. reason: of the last change. since: time of it [s].
         throws: throws begun. cancelled: throws that ended without a release.
         flown: whether this run has ever commanded the vehicle. aborted: whether it was ended by an abort.
+        left_fence: how the vehicle left its fence after a throw; that ends the run by a landing, and is no abort.
     """
 
     def __init__(self, params: StateParams, throws: int, patient: bool = False) -> None:
@@ -100,6 +108,7 @@ class Machine:
         self.since: float | None = None
         self.throws = self.cancelled = 0
         self.flown = self.aborted = False
+        self.left_fence: str | None = None
         self._held: float | None = None  # since when what must last has lasted
 
     def step(self, now: float, seen: Inputs) -> State:
@@ -120,17 +129,17 @@ class Machine:
 
     def _urgent(self, seen: Inputs) -> str | None:
         if seen.abort:
-            return "the operator said abort"
+            return seen.why or "the operator said abort"
         if seen.failure is not None:
             return seen.failure
         if self.state not in FLYING:
             return None
         if seen.vehicle >= ABORT:
             return "no new pose of the vehicle"
-        if seen.fence is not None:
+        if seen.fence is not None and not (self.state is State.RECOVER and seen.released):
             return f"fence: {seen.fence}"
         if not seen.connected:
-            return "the autopilot is silent, disarmed or in another mode"
+            return "the autopilot is silent, disarmed or in another mode" + (f": {seen.note}" if seen.note else "")
         return None
 
     def _go(self, now: float, state: State, reason: str) -> None:
@@ -140,6 +149,22 @@ class Machine:
         self.throws += state is State.THROW
         self.flown |= state in FLYING
         self.aborted |= state is State.ABORT
+
+    def waits(self, seen: Inputs) -> str:
+        """Why it does not go on, in words; empty where nothing is in the way but time."""
+        texts: list[str] = []
+        if self.state in (State.IDLE, State.CHECK, State.READY, State.ARMED):
+            texts = seen.missing() if self.state in (State.IDLE, State.CHECK) else []
+            texts += seen.failed_checks if self.state is not State.IDLE else ()
+        if self.state in (State.READY, State.ARMED):
+            texts += [] if seen.payload < HOLD else ["no fresh pose of the payload"]
+            texts += [] if seen.recording else ["the recording failed"]
+            texts += [] if seen.following else ["it does not follow yet" + (f" ({seen.note})" if seen.note else "")]
+        if self.state in (State.ARMED, State.RECOVER) and not seen.still:
+            texts.append("not quiet yet")
+        if self.state is State.READY and not texts and not seen.arm:
+            texts.append("the operator's word: arm")
+        return "; ".join(texts)
 
     def _lasted(self, now: float, holds: bool, time: float) -> bool:
         """Whether a condition has now held for a time."""
@@ -157,17 +182,14 @@ class Machine:
         if max(seen.vehicle, seen.payload) < HOLD and seen.connected:
             self._go(now, State.CHECK, "poses and autopilot are there")
         elif self._late(now) and not self.patient:
-            missing = [n for n, bad in (("vehicle", seen.vehicle >= HOLD), ("payload", seen.payload >= HOLD)) if bad]
-            missing += [] if seen.connected else ["autopilot ready"]
-            self._go(now, State.ABORT, f"no {', no '.join(missing)} within {self.params.idle:g} s")
+            self._go(now, State.ABORT, f"{', '.join(seen.missing())}, for {self.params.idle:g} s")
 
     def _check(self, now: float, seen: Inputs) -> None:
         good = not seen.failed_checks and max(seen.vehicle, seen.payload) < HOLD and seen.connected
         if self._lasted(now, good, self.params.check_hold):
             self._go(now, State.READY, "checks passed")
         elif self._late(now) and not self.patient:
-            failed = "; ".join(seen.failed_checks) or "poses or autopilot come and go"
-            self._go(now, State.ABORT, f"checks: {failed}")
+            self._go(now, State.ABORT, f"checks: {self.waits(seen) or 'poses or autopilot come and go'}")
 
     def _ready(self, now: float, seen: Inputs) -> None:
         if seen.land or self._late(now):
@@ -184,7 +206,7 @@ class Machine:
         elif self._lasted(now, seen.still and not seen.failed_checks, self.params.quiet) and long:
             self._go(now, State.THROW, "quiet")
         elif self._late(now):
-            self._go(now, State.READY, "disarmed: the swing did not become quiet")
+            self._go(now, State.READY, f"disarmed: {self.waits(seen) or 'the swing did not become quiet'}")
 
     def _throw(self, now: float, seen: Inputs) -> None:
         if seen.separated:
@@ -200,7 +222,10 @@ class Machine:
 
     def _recover(self, now: float, seen: Inputs) -> None:
         # An old pose is always quiet: what stands still there is the motion capture.
-        if self._lasted(now, seen.still and seen.vehicle < HOLD, self.params.quiet):
+        if seen.fence is not None:  # it brakes as hard as it can, and what was to be done is done: no more throws
+            self.left_fence = seen.fence
+            self._go(now, State.LAND, f"after the throw, fence: {seen.fence}")
+        elif self._lasted(now, seen.still and seen.vehicle < HOLD, self.params.quiet):
             more = self.throws < self.most
             self._go(now, State.READY if more else State.LAND, "hovering again")
         elif seen.land or self._late(now):

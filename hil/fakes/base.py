@@ -1,6 +1,7 @@
 """What all fakes share: plant, motion capture on the wire, a queue of things that take their time, a hold of their own."""
 
 import heapq
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
@@ -8,12 +9,11 @@ from typing import Any, Literal, Protocol
 import numpy as np
 
 from hil.backends.thrust import ThrustParams
-from hil.fakes.mocap import SLACK, Mocap, MocapParams
-from hil.fakes.mocap_faults import MocapFault
-from hil.fakes.set_points import SetPoints
+from hil.fakes.mocap import SLACK, Mocap, MocapFault, MocapParams
 from hil.fakes.witness import Witness
 from hil.links.mavlink_link import Link
 from hil.links.pymav import mav
+from hil.links.roster import SIMULATED
 from hil.poses.frames import FrameParams, Frames
 from hil.poses.pose import PAYLOAD, Pose
 from visthrow.onboard.hover import GRAVITY, HoverController, HoverParams
@@ -28,6 +28,9 @@ MAX_RATES = (10.0, 10.0, 4.0)
 """Largest body rates that the policies were trained with [rad/s]."""
 
 MOST_EVENTS = 200
+
+ANNOUNCED = 1.0
+"""Between two words that nothing real flies, which `--auto-arm` asks for [s]."""
 
 DESCENT, TOUCH = 0.4, 0.12
 """Of a landing below the vehicle [m]; height that counts as down [m]."""
@@ -76,15 +79,44 @@ class Options:
     silent_after: float = float("inf")  # it says nothing any more from this time on [s]
     taken_after: float = float("inf")  # when the pilot takes the vehicle over [s]
     pose_message: Literal["ATT_POS_MOCAP", "ODOMETRY"] = "ATT_POS_MOCAP"  # ODOMETRY carries a reset counter
-    mocap_fault: str = "none"  # of hil.fakes.mocap_faults
+    mocap_fault: str = "none"  # of hil.fakes.mocap
     fault_time: float = float("inf")  # from which it happens [s]
-    prompt: bool = True  # a heartbeat follows a change of mode at once; else up to a second later
+    prompt: bool | None = None  # a heartbeat follows a change of mode at once, or only when it is due; None: as of the kind
     all_channels: bool = False  # Betaflight: all channels come by MSP, the arming one as well
 
     def __post_init__(self) -> None:
         times = (self.command_delay or 0.0, self.answer_delay, self.servo_delay, self.mechanism)
         if self.answer not in ANSWERS or min(times) < 0.0:
             raise ValueError(f"fake {vars(self)}: expected an answer of {', '.join(ANSWERS)}, times of 0 s or more")
+
+
+class SetPoints:
+    """Set-points that begin to act at any time, flown by a plant in periods of its own: those that came, and from when on they act."""
+
+    def __init__(self) -> None:
+        """Start with none."""
+        self._acting: np.ndarray | None = None
+        self._coming: deque[tuple[float, np.ndarray]] = deque()
+
+    def add(self, when: float, target: np.ndarray) -> None:
+        """Take a set-point, thrust [N] and body rates [rad/s], that acts from a time on [s], later than those before."""
+        self._coming.append((when, target))
+
+    def forget(self) -> None:
+        """Nothing that came so far counts any more."""
+        self._acting = None
+        self._coming.clear()
+
+    def flown(self, begin: float, period: float) -> np.ndarray | None:
+        """What acts in the period from a time on [s]: the mean, where it changes within it; None before the first one."""
+        mean, since = np.zeros(4), begin
+        while self._coming and self._coming[0][0] < begin + period - SLACK:
+            when, target = self._coming.popleft()
+            if self._acting is not None:
+                mean += (max(when, begin) - since) / period * self._acting
+                since = max(when, begin)
+            self._acting = target
+        return None if self._acting is None else mean + (begin + period - since) / period * self._acting
 
 
 class Fake:
@@ -100,6 +132,7 @@ class Fake:
     # The real autopilots took 70 to 79 ms (ArduPilot), 86 to 98 ms (PX4) and 55 to 90 ms (Betaflight) from a set-point to
     # half of a step of 1.5 rad/s; the training simulator's own vehicle takes 75 ms. What is missing is this delay [s].
     usual_delay = 0.0
+    usually_prompt = True  # with its heartbeat after a change of mode
 
     def __init__(
         self, plant: WirePlant, link: Link, mocap: MocapParams | None = None, seed: int = 0, options: Options | None = None
@@ -122,7 +155,8 @@ class Fake:
         ned = Frames(FrameParams("x,-y,-z", "x,-y,-z", "wxyz", 0.0, (0.0, 0.0, 0.0)))
         self._to_source: Callable[[Pose], Pose] = ned.source_from_pose
         self._hover = HoverController(HoverParams(max_thrust=plant.max_thrust), plant.period)
-        self._payload_sender = mav.MAVLink(None, *PAYLOAD_ID)
+        self._payload_sender = link.packer(*PAYLOAD_ID)
+        self._announced = -np.inf
         self._later: list[tuple[float, int, Callable[[], None]]] = []
         self._set_points = SetPoints()
         self._count = 0
@@ -254,6 +288,9 @@ class Fake:
             written = [self._to_source(pose) for pose in self.mocap.measure(self.plant.time, self.plant.state)]
             for pose in self.mocap_fault.spoil(written, self.plant.time):
                 self._post(pose)
+        if self.plant.time - self._announced >= ANNOUNCED:
+            self._announced = self.plant.time
+            self.link.send(mav.MAVLink_named_value_int_message(int(1e3 * self.plant.time), SIMULATED.encode(), 1))
         self.deliver(self.plant.time)
         if not self.silent:
             self.speak()

@@ -1,7 +1,9 @@
 """A fake Betaflight on an MSP port; the poses come from the motion capture's bridge, a MAVLink peer beside it.
 
 A pilot holds it until stick frames come; then the override switch goes on (or, with all channels by MSP, the arming channel
-takes it). Silence of 0.36 s idles the motors, of 1.6 s disarms. Pitch stick forward is nose down. It hears no poses.
+takes it). With the override the pilot's own sticks count again after 0.3 s of silence; with all channels by MSP 0.36 s idle the
+motors, 1.6 s disarm, and an arming channel that is high when the receiver comes back arms nothing before it was low. Pitch stick
+forward is nose down. Outputs of CHANNEL_FORWARDING are not in MSP_SERVO. It hears no poses.
 """
 
 import struct
@@ -10,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from hil.backends.betaflight import BOX_ARM, BOX_OVERRIDE, HIGH, LOW, STICKS, TUNING
+from hil.backends.betaflight import BOX_ARM, BOX_OVERRIDE, FORWARDING, HIGH, LOW, STICKS, TUNING
 from hil.backends.rates import RATES_TYPES, RatesParams, Sticks
 from hil.backends.thrust import ThrustParams
 from hil.fakes.base import Fake, Options, WirePlant
@@ -20,7 +22,13 @@ from hil.links.device import MOST_CHUNKS, Port
 from hil.links.mavlink_link import Link
 
 IDLE_AFTER, DISARM_AFTER = 0.36, 1.6
-"""Silence after which the motors idle, and after which it disarms [s]."""
+"""Silence after which the motors idle, and after which it disarms, with all channels by MSP [s]."""
+
+OVERRIDE_GONE = 0.3
+"""Silence after which the receiver's channels count again, under MSP OVERRIDE [s]."""
+
+RECEIVER_LOST, LOW_FIRST, ARM_SWITCH = 1 << 2, 1 << 3, 1 << 29
+"""Bits of the arming-disabled flags."""
 
 REACTION = 0.5
 """Of the pilot, from the first stick frame to the override switch [s]."""
@@ -55,14 +63,16 @@ class FakeBetaflight(Fake):
             self.armed = False
         tuning = {"rates_type": RATES_TYPES["actual"], "roll_rc_rate": 60, "pitch_rc_rate": 60, "yaw_rc_rate": 30,
                   "roll_rate": 60, "pitch_rate": 60, "yaw_rate": 30, "roll_expo": 0, "pitch_expo": 0, "yaw_expo": 0}  # fmt: skip
-        self.parameters: dict[str, float] = {"deadband": 0, "yaw_deadband": 0, "min_check": MINIMUM, "mid_rc": 1500,
-                                             "failsafe_delay": 0.4, **tuning, **self.options.parameters}  # fmt: skip
+        self.parameters: dict[str, float] = {
+            "deadband": 0, "yaw_deadband": 0, "min_check": MINIMUM, "mid_rc": 1500, "failsafe_delay": 0.4, "channel_forwarding": 0,
+            **tuning, **self.options.parameters,
+        }  # fmt: skip
         self._set_rates()
         self.channels: list[int] = []
         self.override = False
         self._first: float | None = None
         self._heard = -np.inf
-        self._asked_open = False
+        self._asked_open = self._low_first = self._disarmed = False
 
     def _set_rates(self) -> None:
         p, axes = self.parameters, ("roll", "pitch", "yaw")
@@ -89,6 +99,7 @@ class FakeBetaflight(Fake):
             msp.SERVO: self._servo, msp.ANALOG: lambda: struct.pack("<BHHhH", 111, 0, 0, 0, 1110),
             msp.RC_TUNING: self._tuning, msp.RC_DEADBAND: self._deadband, msp.RX_CONFIG: self._rx_config,
             msp.FAILSAFE_CONFIG: self._failsafe, msp.MODE_RANGES: self._ranges, msp.EEPROM_WRITE: lambda: b"",
+            msp.FEATURE_CONFIG: lambda: struct.pack("<I", FORWARDING if self.parameters["channel_forwarding"] else 0),
         }  # fmt: skip
         if frame.command == msp.SET_RAW_RC:
             self._sticks_came(list(frame.words()))
@@ -119,7 +130,9 @@ class FakeBetaflight(Fake):
         idle = throttle <= MINIMUM
         command = (0.0 if idle else self.thrust_map.thrust(share), *rates)
         self.witness.command(self.plant.time, command)
+        back = self.plant.time - self._heard > IDLE_AFTER
         self.channels, self._heard = channels, self.plant.time
+        self._low_first |= back and not self.armed and channels[STICKS + ARM_AUX - 1] > 1700
         self._first = self.plant.time if self._first is None else self._first
         self._arm_channel(throttle)
         if self.override:
@@ -132,7 +145,8 @@ class FakeBetaflight(Fake):
         if not self.options.all_channels:
             return
         high = self.channels[STICKS + ARM_AUX - 1] > 1700
-        if high and not self.armed and throttle <= MINIMUM and self.options.arming:
+        self._low_first &= high
+        if high and not (self.armed or self._low_first) and throttle <= MINIMUM and self.options.arming:
             self.armed = self.override = True
         elif not high:
             self.armed = self.override = False
@@ -153,6 +167,8 @@ class FakeBetaflight(Fake):
         on = {BOX_ARM: self.armed, BOX_OVERRIDE: self.override, 27: failsafe and self.armed}
         flags = sum(1 << i for i, box in enumerate(BOXES) if on.get(box, False))
         blocks = 0 if self.armed or self.options.arming else 1 << 8
+        if self.options.all_channels and not self.armed:
+            blocks |= RECEIVER_LOST * (self.plant.time - self._heard > IDLE_AFTER) | (LOW_FIRST | ARM_SWITCH) * self._low_first
         return struct.pack("<HHHIBHHBBI", 125, 0, 33, flags, 0, 10, 0, 0, 29, blocks)
 
     def _rc(self) -> bytes:
@@ -165,7 +181,8 @@ class FakeBetaflight(Fake):
         return struct.pack(f"<{len(channels)}H", *channels)
 
     def _servo(self) -> bytes:
-        return struct.pack("<8H", HIGH if self.moved else LOW, *([1500] * 7))
+        shown = 1500 if self.parameters["channel_forwarding"] else HIGH if self.moved else LOW
+        return struct.pack("<8H", shown, *([1500] * 7))
 
     def _tuning(self) -> bytes:
         out = bytearray(24)
@@ -200,12 +217,18 @@ class FakeBetaflight(Fake):
         if not (self.options.all_channels or self.taken) and self._first is not None and self.plant.time - self._first >= REACTION:
             self.override = self.armed
         if not self.override or self._target is None:
-            gone = self._first is not None and not self.armed and not self.options.all_channels
+            gone = self._first is not None and not self.armed and (self._disarmed or not self.options.all_channels)
             return np.zeros(4) if gone else self.hold(self._place)
+        if not self.options.all_channels:
+            if quiet <= OVERRIDE_GONE:
+                self._place = self.plant.state["pos_w"].astype(float)
+                return self._target
+            self.happened("override: the pilot's sticks count again")
+            return self.hold(self._place)
         if quiet > IDLE_AFTER:
             self.happened("failsafe: motors idle")
         if quiet > DISARM_AFTER:
-            self.armed = self.override = False
+            self.armed, self.override, self._disarmed = False, False, True
             self.happened("failsafe: disarmed")
         return np.zeros(4) if quiet > IDLE_AFTER else self._target
 

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from hil.fakes import KINDS, WirePlant
+from hil.fakes.base import SetPoints
 from hil.fakes.mocap import SLACK, Mocap, MocapParams
-from hil.fakes.set_points import SetPoints
 from hil.params import HilParams
 from hil.poses.frames import FrameParams
 from hil.poses.pose import PAYLOAD, VEHICLE, Pose

@@ -13,8 +13,8 @@ from hil.links.pymav import mav
 FORCE = 21196
 """Second parameter of COMPONENT_ARM_DISARM that disarms in flight."""
 
-SERVO, CLOSED_US, OPEN_US = 9, 1100, 1900
-"""Output of the mechanism, from 1, and its ends [us]."""
+SERVO = 9
+"""Output of the mechanism, from 1."""
 
 
 class FakeMavlink(Fake):
@@ -23,6 +23,8 @@ class FakeMavlink(Fake):
     autopilot = mav.MAV_AUTOPILOT_GENERIC
     usual_mode = pilots_mode = 0
     defaults: dict[str, float]  # parameters of a vehicle that is set up well
+    tells_unknown = False  # by PARAM_ERROR, of a parameter that it does not have; else it is silent
+    ends = (1100, 1900)  # of the mechanism's output, closed and open [us]
 
     def __init__(
         self, plant: WirePlant, link: Link, mocap: MocapParams | None = None, seed: int = 0, options: Options | None = None
@@ -56,7 +58,7 @@ class FakeMavlink(Fake):
 
     def beat_soon(self) -> None:
         """Mode or arming have changed."""
-        if self.options.prompt:
+        if self.usually_prompt if self.options.prompt is None else self.options.prompt:
             self._next_beat = 0.0
 
     def say(self, message: Any, delay: float = 0.0) -> None:
@@ -98,6 +100,9 @@ class FakeMavlink(Fake):
             self.beat_soon()
         elif number == mav.MAV_CMD_COMPONENT_ARM_DISARM:
             self._arm(message)
+        elif number == mav.MAV_CMD_REQUEST_MESSAGE:
+            self._next_beat = 0.0 if int(message.param1) == mav.MAVLINK_MSG_ID_HEARTBEAT else self._next_beat
+            self.acknowledge(number, mav.MAV_RESULT_ACCEPTED)
         elif number == mav.MAV_CMD_SET_MESSAGE_INTERVAL:
             self._streams[int(message.param1)] = (self.plant.time, 1e-6 * message.param2)
             self.acknowledge(number, mav.MAV_RESULT_ACCEPTED)
@@ -142,7 +147,12 @@ class FakeMavlink(Fake):
         return field
 
     def _tell_parameter(self, name: str) -> None:
-        if name in self.parameters:  # an unknown one is answered with silence, as by ArduPilot
+        if name not in self.parameters:
+            if not self.tells_unknown:
+                return
+            error = mav.MAVLink_param_error_message(245, 191, name.encode(), -1, mav.MAV_PARAM_ERROR_DOES_NOT_EXIST)
+            self.say(error, self.options.answer_delay)
+        else:
             field, kind = self.field(name)
             self.say(mav.MAVLink_param_value_message(name.encode(), field, kind, 1, 0), self.options.answer_delay)
 
@@ -151,18 +161,23 @@ class FakeMavlink(Fake):
         time = self.plant.time
         if time >= self._next_beat:
             self._next_beat = time + 1.0
-            flags = CUSTOM | (ARMED if self.armed else 0)
-            self.link.send(mav.MAVLink_heartbeat_message(mav.MAV_TYPE_QUADROTOR, self.autopilot, flags, self.mode, 4, 3))
+            self._beat()
         for number, (due, period) in self._streams.items():
             if time >= due - 1e-9:
                 self._streams[number] = (due + period, period)
                 self._stream(number)
 
+    def _beat(self) -> None:
+        flags = CUSTOM | (ARMED if self.armed else 0)
+        self.link.send(mav.MAVLink_heartbeat_message(mav.MAV_TYPE_QUADROTOR, self.autopilot, flags, self.mode, 4, 3))
+
     def _stream(self, number: int) -> None:
         """Send one of the messages that were asked for."""
-        if number == mav.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW:
+        if number == mav.MAVLINK_MSG_ID_HEARTBEAT:
+            self._beat()
+        elif number == mav.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW:
             outputs = [0] * 16
-            outputs[SERVO - 1] = OPEN_US if self.moved else CLOSED_US
+            outputs[SERVO - 1] = self.ends[self.moved]
             self.link.send(mav.MAVLink_servo_output_raw_message(int(self.clock() * 1e6) & 0xFFFFFFFF, 0, *outputs))
         elif number == mav.MAVLINK_MSG_ID_ATTITUDE:
             x, y, z = map(float, self.plant.state["rate_b"])

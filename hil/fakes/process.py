@@ -43,7 +43,7 @@ def load_plant(target: str, policy: str, seed: int) -> WirePlant:
 class ListeningPort:
     """A TCP port of this machine that serves one peer at a time: what a flight controller in software offers."""
 
-    whole = False
+    whole, sender = False, None
 
     def __init__(self, number: int) -> None:
         """Listen on a port of the loopback address.
@@ -84,7 +84,7 @@ class ListeningPort:
             self._peer = None
         return data or None
 
-    def write(self, data: bytes) -> bool:
+    def write(self, data: bytes, to: tuple[str, int] | None = None) -> bool:
         """See `hil.links.device.Port`."""
         try:
             return self._peer is not None and self._peer.send(data) == len(data)
@@ -155,7 +155,7 @@ class Paced:
         due = self._start + time
         self.late += clock.now() > due
         while clock.now() < due:  # what comes meanwhile acts from when it comes
-            clock.wait_for(fake.port, due)
+            clock.wait_for([fake.port], due)
             fake.hear()
         fake.deliver(time)  # poses leave before a period is worked out
         fake.fly()

@@ -1,8 +1,9 @@
 """A fake PX4.
 
 OFFBOARD is refused until set-points have come for a second without a gap, and left for what COM_OBL_RC_ACT says when they cease
-for COM_OF_LOSS_T; DO_GRIPPER is answered IN_PROGRESS, and ACCEPTED when the gripper's time is over; integer parameters travel
-as bytes. Out of OFFBOARD set-points vanish without a word. Until it is taken the pilot holds it in Position mode.
+for COM_OF_LOSS_T; DO_GRIPPER is answered IN_PROGRESS, and ACCEPTED when PD_GRIPPER_TO is over, whatever moves; the gripper opens to its
+output's minimum; there is no PD_GRIPPER_EN since 1.17; integer parameters travel as bytes. Out of OFFBOARD set-points vanish without
+a word. Its heartbeat comes once a second and with no change of mode. Until it is taken the pilot holds it in Position mode.
 """
 
 from typing import Any
@@ -18,10 +19,7 @@ from hil.links.pymav import mav
 STREAM_FIRST, STREAM_GAP = 1.0, 0.5
 """Set-points before OFFBOARD, and the longest gap in them: 2 Hz [s]."""
 
-GRIPPER_TIME = 1.0
-"""From IN_PROGRESS to ACCEPTED [s]."""
-
-INTEGERS = ("COM_OBL_RC_ACT", "EKF2_EV_CTRL", "PD_GRIPPER_EN", "PWM_AUX_FUNC1")
+INTEGERS = ("COM_OBL_RC_ACT", "EKF2_EV_CTRL", "PWM_AUX_FUNC1", "PWM_AUX_MIN1", "PWM_AUX_MAX1")
 
 
 def custom(main: int, sub: int = 0) -> int:
@@ -39,9 +37,11 @@ class FakePx4(FakeMavlink):
     autopilot = mav.MAV_AUTOPILOT_PX4
     usual_mode = pilots_mode = POSCTL
     usual_delay = 0.017
+    usually_prompt, tells_unknown = False, True
     thrust_map = ThrustParams(2.668, 0.1585, 0.8, 0.1, 0.0)
     defaults = {  # noqa: RUF012 - copied by each instance
-        "COM_OF_LOSS_T": 0.5, "COM_OBL_RC_ACT": 5.0, "EKF2_EV_CTRL": 11.0, "PD_GRIPPER_EN": 1.0, "PWM_AUX_FUNC1": 430.0,
+        "COM_OF_LOSS_T": 0.5, "COM_OBL_RC_ACT": 5.0, "EKF2_EV_CTRL": 11.0, "PD_GRIPPER_TO": 1.0, "PWM_AUX_FUNC1": 430.0,
+        "PWM_AUX_MIN1": 1000.0, "PWM_AUX_MAX1": 2000.0,
     }  # fmt: skip
     _stream_since = _last = -np.inf
 
@@ -85,7 +85,7 @@ class FakePx4(FakeMavlink):
         """See `FakeMavlink`."""
         answer, number = self.options.answer, message.command
         gripper = number == mav.MAV_CMD_DO_GRIPPER
-        if answer == "denied" or (gripper and not self.parameters["PD_GRIPPER_EN"]):
+        if answer == "denied":
             self.acknowledge(number, mav.MAV_RESULT_DENIED)
             return
         if self.parameters["PWM_AUX_FUNC1"] == (430.0 if gripper else 301.0):
@@ -93,7 +93,7 @@ class FakePx4(FakeMavlink):
         if gripper:
             self.acknowledge(number, mav.MAV_RESULT_IN_PROGRESS)
             if answer != "in-progress":
-                self.acknowledge(number, mav.MAV_RESULT_ACCEPTED, GRIPPER_TIME)
+                self.acknowledge(number, mav.MAV_RESULT_ACCEPTED, self.parameters["PD_GRIPPER_TO"])
         elif answer != "in-progress":
             self.acknowledge(number, mav.MAV_RESULT_ACCEPTED)
 
@@ -106,6 +106,12 @@ class FakePx4(FakeMavlink):
     def value(self, field: float, kind: int) -> float:
         """See `FakeMavlink`."""
         return bytes_to_integer(field) if kind == mav.MAV_PARAM_TYPE_INT32 else field
+
+    @property
+    def ends(self) -> tuple[int, int]:
+        """Of the mechanism's output, closed and open [us]: a gripper opens at the minimum, an actuator set's 1 is the maximum."""
+        ends = int(self.parameters["PWM_AUX_MAX1"]), int(self.parameters["PWM_AUX_MIN1"])
+        return ends if self.parameters["PWM_AUX_FUNC1"] == 430.0 else ends[::-1]
 
     def flown(self) -> np.ndarray:
         """See `Fake`."""

@@ -3,6 +3,7 @@
 import select
 import time
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -16,7 +17,7 @@ class Clock(Protocol):
     def sleep_until(self, when: float) -> None:
         """Wait until a time [s]; at once where it has passed."""
 
-    def wait_for(self, file: Any, when: float) -> None:
+    def wait_for(self, files: Sequence[Any], when: float) -> None:
         """Wait until there is something to read from a file (anything with ``fileno``), or until a time [s]."""
 
 
@@ -43,11 +44,11 @@ class MonotonicClock:
         if left > 0.0:
             time.sleep(left)
 
-    def wait_for(self, file: Any, when: float) -> None:
+    def wait_for(self, files: Sequence[Any], when: float) -> None:
         """See `Clock`."""
         left = (when - self.now()) / self._speed
         if left > 0.0:
-            select.select([file], [], [], left)
+            select.select(files, [], [], left)
 
 
 class ManualClock:
@@ -65,7 +66,7 @@ class ManualClock:
         """See `Clock`."""
         self.time = max(self.time, when)
 
-    def wait_for(self, file: Any, when: float) -> None:
+    def wait_for(self, files: Sequence[Any], when: float) -> None:
         """See `Clock`."""
         self.sleep_until(when)
 

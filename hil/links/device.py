@@ -18,6 +18,9 @@ LARGEST_DATAGRAM = 65536
 MOST_CHUNKS = 256
 """Datagrams, or pieces of a stream, read in one go: a flood must not hold up the tick."""
 
+MOST_SHUT_OUT = 4096
+"""Datagrams of strangers thrown away in one go, unread: 5 ms; they must not stand in the way of those that are ours."""
+
 
 @dataclass(frozen=True)
 class Device:
@@ -65,12 +68,13 @@ class Port(Protocol):
     """Where bytes come from and go to; neither call ever waits."""
 
     whole: bool  # whether each chunk is a whole datagram
+    sender: tuple[str, int] | None  # of the last chunk; None on a stream, which has one peer
 
     def read(self) -> bytes | None:
         """The next chunk; None where there is none."""
 
-    def write(self, data: bytes) -> bool:
-        """Whether the bytes were taken."""
+    def write(self, data: bytes, to: tuple[str, int] | None = None) -> bool:
+        """Whether the bytes were taken; on UDP for an address, where the device does not name it."""
 
     def fileno(self) -> int:
         """For waiting until there is something to read."""
@@ -94,7 +98,7 @@ class _SocketPort:
 
 
 class UdpPort(_SocketPort):
-    """A UDP socket; one that listens answers whoever spoke to it first, and hears nobody else from then on."""
+    """A UDP socket; one that listens hears everybody, and says who sent what."""
 
     whole = True
 
@@ -107,12 +111,11 @@ class UdpPort(_SocketPort):
         family = socket.AF_INET6 if ":" in device.host else socket.AF_INET
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
-        self._peer = None
+        self._peer = (device.host, device.port) if device.kind == "udpout" else None
+        self.sender: tuple[str, int] | None = None
         try:
             if device.kind == "udp":
                 self._socket.bind((device.host, device.port))
-            else:
-                self._peer = (device.host, device.port)
         except OSError as error:
             self._socket.close()
             raise LinkError(f"cannot open {device.kind}:{device.host}:{device.port}: {error.strerror}") from error
@@ -126,51 +129,23 @@ class UdpPort(_SocketPort):
                 return None
             except OSError:  # the peer's port is closed: ICMP, reported here
                 return None
-            if self._peer is None:
-                self._peer = sender[:2]
-            if sender[:2] == self._peer:
+            if self._peer in (None, sender[:2]):
+                self.sender = sender[:2]
                 return data
 
-    def write(self, data: bytes) -> bool:
+    def write(self, data: bytes, to: tuple[str, int] | None = None) -> bool:
         """See `Port`."""
-        if self._peer is None:
-            return False
+        to = self._peer or to
         try:
-            return self._socket.sendto(data, self._peer) == len(data)
+            return to is not None and self._socket.sendto(data, to) == len(data)
         except OSError:
             return False
-
-
-class MutePort(_SocketPort):
-    """Takes all and lets nothing out: what is written goes through the system to this port itself, and is thrown away there."""
-
-    whole = True
-
-    def __init__(self) -> None:
-        """Open a socket that nobody else knows."""
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.setblocking(False)
-        self._socket.bind(("127.0.0.1", 0))
-        self._self = self._socket.getsockname()
-
-    def read(self) -> bytes | None:
-        """See `Port`: nothing."""
-        return None
-
-    def write(self, data: bytes) -> bool:
-        """See `Port`."""
-        try:
-            self._socket.sendto(data, self._self)
-            self._socket.recv(LARGEST_DATAGRAM)
-        except OSError:
-            return False
-        return True
 
 
 class TcpPort(_SocketPort):
     """A TCP connection, opened within two seconds or not at all."""
 
-    whole = False
+    whole, sender = False, None
 
     def __init__(self, device: Device) -> None:
         """Connect.
@@ -192,7 +167,7 @@ class TcpPort(_SocketPort):
         except OSError:
             return None
 
-    def write(self, data: bytes) -> bool:
+    def write(self, data: bytes, to: tuple[str, int] | None = None) -> bool:
         """See `Port`."""
         try:
             return self._socket.send(data) == len(data)
@@ -203,7 +178,7 @@ class TcpPort(_SocketPort):
 class SerialPort:
     """A serial port."""
 
-    whole = False
+    whole, sender = False, None
 
     def __init__(self, device: Device) -> None:
         """Open it.
@@ -227,7 +202,7 @@ class SerialPort:
         except OSError:
             return None
 
-    def write(self, data: bytes) -> bool:
+    def write(self, data: bytes, to: tuple[str, int] | None = None) -> bool:
         """See `Port`."""
         try:
             return self._port.write(data) == len(data)

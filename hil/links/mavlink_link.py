@@ -9,13 +9,16 @@ import struct
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from hil.errors import LinkError
-from hil.links.device import MOST_CHUNKS, MutePort, Port
+from hil.links.clock import Clock
+from hil.links.device import MOST_CHUNKS, MOST_SHUT_OUT, Port
 from hil.links.pymav import Parser, mav
+from hil.links.roster import Address, Roster, Seen
+from hil.links.signing import Signed
 from hil.poses.frames import rotate
 from hil.poses.pose import Pose, Quaternion, Vector
 
@@ -90,28 +93,41 @@ class TlogWriter:
 
 
 class Link:
-    """A MAVLink peer on a port.
+    """The MAVLink peers of a port.
 
     Attributes:
-        received, sent, dropped: messages that came, went, and could not be sent.
-        parser: counts what was no message.
+        received, sent, dropped: messages that were taken in, went, and could not be sent.
+        parser: counts what was no message. roster: who may speak.
+        sender: address of the message that listeners are called with.
         on_pump: called with the time [s] whenever arrivals were taken in. sync: `hil.links.sync.LinkSync`, where there is one.
     """
 
-    def __init__(self, port: Port, system: int = 245, component: int = 191, tlog: TlogWriter | None = None) -> None:
+    def __init__(
+        self, port: Port, system: int = 245, component: int = 191, tlog: TlogWriter | None = None, roster: Roster | None = None,
+        key: bytes | None = None,
+    ) -> None:  # fmt: skip
         """Wrap an open port.
 
         Args:
             port: from :func:`hil.links.device.open_port`.
             system: our own id. component: likewise; 191 is an onboard computer.
             tlog: written both ways; closed with the link.
+            roster: who may speak; None takes anybody.
+            key: that messages are signed with, and have to be; None: neither.
         """
-        self.port, self.parser, self._tlog = port, Parser(), tlog
-        self._mav = mav.MAVLink(None, system, component)
+        self.port, self.roster, self._tlog = port, roster or Roster(), tlog
+        self._key, streams = key, {}
+        self.parser = Parser() if key is None else Parser(lambda: Signed(key, streams=streams))
+        self._mav = self.packer(system, component)
         self._listeners: list[Callable[[Any, float], None]] = []
         self.on_pump: list[Callable[[float], None]] = []
         self.sync: Any = None
+        self.sender: Address = None
         self.received = self.sent = self.dropped = 0
+
+    def packer(self, system: int, component: int) -> mav.MAVLink:
+        """What packs messages of ids of their own for this link, signed where it is."""
+        return mav.MAVLink(None, system, component) if self._key is None else Signed(self._key, system, component)
 
     @property
     def recorded(self) -> bool:
@@ -123,48 +139,83 @@ class Link:
         self._listeners.append(listener)
 
     def pump(self, clock: Callable[[], float]) -> int:
-        """Hand all that has arrived to the listeners; returns the number of messages."""
-        count = 0
-        for _ in range(MOST_CHUNKS):
-            data = self.port.read()
-            if data is None:
-                break
-            arrival = clock()
-            for message in self.parser.parse(data, self.port.whole):
-                if self._tlog is not None:
-                    self._tlog.write(message)
-                for listener in self._listeners:
-                    listener(message, arrival)
-                count += 1
+        """Hand all that has arrived to the listeners; returns the number of chunks that were read, refused ones as well."""
+        count, looked, shut = 0, 0, 0
+        while looked < MOST_CHUNKS and shut < MOST_SHUT_OUT and (data := self.port.read()) is not None:
+            self.sender = self.port.sender
+            if self.roster.shuts_out(self.sender):
+                shut += 1
+                continue
+            looked += 1
+            count += self._take(data, clock())
         self.received += count
         for call in self.on_pump:
             call(clock())
+        return looked + shut
+
+    def _take(self, data: bytes, arrival: float) -> int:
+        """Hand on the messages in a chunk that are of our parties; returns their number."""
+        count = 0
+        for message in self.parser.parse(data, self.port.whole):
+            if not self.roster.admit(message, self.sender, arrival):
+                continue
+            if self._tlog is not None:
+                self._tlog.write(message)
+            for listener in self._listeners:
+                listener(message, arrival)
+            count += 1
+        for forged in self.parser.forged:
+            ids = forged[5:7] if forged[0] == mav.PROTOCOL_MARKER_V2 else forged[3:5]
+            self.roster.refuse(Seen(self.sender, *ids, "message", "no valid signature"))
         return count
 
-    def send(self, message: Any) -> bool:
-        """Send a message; whether the port took it."""
+    def send(self, message: Any, to: Address = None) -> bool:
+        """Send a message; whether the port took it.
+
+        Args:
+            message: not packed yet.
+            to: one address; left out, the autopilot's where the message names a target, else those of all parties.
+        """
         try:
+            if isinstance(self._mav, Signed):
+                self._mav.touch()
             data = message.pack(self._mav)
         except (struct.error, TypeError, ValueError, OverflowError):
             self.dropped += 1
             return False
         self._mav.seq = (self._mav.seq + 1) % 256
-        taken = self.port.write(data)
+        addresses = (to,) if to is not None else self.roster.addresses(message) or (None,)
+        taken = all([self.port.write(data, address) for address in addresses])
         if taken and self._tlog is not None:
             self._tlog.write(message)
         self.sent += taken
         self.dropped += not taken
         return taken
 
-    def muted(self) -> "Link":
-        """A link of the same ids that packs messages and sends them nowhere."""
-        return Link(MutePort(), self._mav.srcSystem, self._mav.srcComponent)
-
     def close(self) -> None:
         """Close port and .tlog."""
         self.port.close()
         if self._tlog is not None:
             self._tlog.close()
+
+
+def pump(links: Sequence[Link], clock: Callable[[], float]) -> int:
+    """Hand on all that has arrived on some links; returns the number of chunks that were read."""
+    return sum([link.pump(clock) for link in links])
+
+
+def wait(links: Sequence[Link], clock: Clock, arrivals: Callable[[], float], until: float) -> None:
+    """Wait until a time [s], handing on what comes in the meantime.
+
+    Args:
+        links: to look at. clock: to wait by. arrivals: clock of what arrives.
+        until: [s].
+    """
+    while links and clock.now() < until:
+        clock.wait_for([link.port for link in links], until)
+        if not pump(links, arrivals):
+            break
+    clock.sleep_until(until)
 
 
 def quaternion_from_euler(roll: float, pitch: float, yaw: float) -> Quaternion:

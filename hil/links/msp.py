@@ -10,7 +10,7 @@ Source: betaflight, src/main/msp/msp_serial.c and msp_protocol.h.
 import struct
 from dataclasses import dataclass
 
-API_VERSION, FC_VARIANT, MODE_RANGES, RX_CONFIG, RX_MAP, FAILSAFE_CONFIG = 1, 2, 34, 44, 64, 75
+API_VERSION, FC_VARIANT, MODE_RANGES, FEATURE_CONFIG, RX_CONFIG, RX_MAP, FAILSAFE_CONFIG = 1, 2, 34, 36, 44, 64, 75
 STATUS, SERVO, RC, ANALOG, RC_TUNING, BOXIDS, RC_DEADBAND = 101, 103, 105, 110, 111, 119, 125
 SET_RAW_RC, SET_RC_TUNING, EEPROM_WRITE = 200, 204, 250
 """Command numbers."""

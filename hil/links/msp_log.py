@@ -28,7 +28,7 @@ class LoggedPort:
         Raises:
             LinkError: it cannot be written.
         """
-        self._port, self.whole, self.failed = port, port.whole, 0
+        self._port, self.whole, self.sender, self.failed = port, port.whole, None, 0
         try:
             Path(path).parent.mkdir(parents=True, exist_ok=True)
             self._file = open(path, "wb", buffering=1 << 16)  # noqa: SIM115 - closed in close()
@@ -50,7 +50,7 @@ class LoggedPort:
             self._note(b">", data)
         return data
 
-    def write(self, data: bytes) -> bool:
+    def write(self, data: bytes, to: tuple[str, int] | None = None) -> bool:
         """See `hil.links.device.Port`."""
         taken = self._port.write(data)
         if taken:

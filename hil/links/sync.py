@@ -7,6 +7,7 @@ from typing import Any
 from hil.links.clock import TimeSync
 from hil.links.mavlink_link import Link
 from hil.links.pymav import mav
+from hil.links.roster import Address, shown
 from hil.poses.pose import Pose
 
 ASK_EVERY = (0.05, 0.15)
@@ -21,14 +22,15 @@ class LinkSync:
     """Keeps the clocks of all peers of a link.
 
     Attributes:
-        peers: by MAVLink system. foreign: poses whose stamps are not of their sender's TIMESYNC clock.
+        peers: by MAVLink system and address: two senders of one system may have two clocks.
+        foreign: poses whose stamps are not of their sender's TIMESYNC clock.
     """
 
     def __init__(self, link: Link) -> None:
         """Listen to a link, and ask from its pump."""
         self._link = link
         self._asked, self._pause, self._random = -1e9, 0.0, random.Random(0)
-        self.peers: dict[int, TimeSync] = {}
+        self.peers: dict[tuple[int, Address], TimeSync] = {}
         self._pending: list[int] = []
         self.foreign = 0
         link.listen(self._hear)
@@ -47,9 +49,9 @@ class LinkSync:
         if message.get_type() != "TIMESYNC":
             return
         if message.tc1 == 0:
-            self._link.send(mav.MAVLink_timesync_message(TimeSync.stamp(arrival), message.ts1))
+            self._link.send(mav.MAVLink_timesync_message(TimeSync.stamp(arrival), message.ts1), self._link.sender)
         elif message.ts1 in self._pending:
-            peer = self.peers.setdefault(message.get_srcSystem(), TimeSync())
+            peer = self.peers.setdefault((message.get_srcSystem(), self._link.sender), TimeSync())
             peer.take(message.tc1, message.ts1, arrival)
 
     def dated(self, pose: Pose, system: int) -> Pose:
@@ -57,9 +59,9 @@ class LinkSync:
 
         Args:
             pose: with its sender's stamp.
-            system: MAVLink id of the sender.
+            system: MAVLink id of the sender, whose message the link has just handed on.
         """
-        peer = self.peers.get(system)
+        peer = self.peers.get((system, self._link.sender))
         if peer is None or peer.offset is None:
             return pose
         measured = pose.stamp - peer.offset
@@ -69,11 +71,11 @@ class LinkSync:
         return replace(pose, measured=min(measured, pose.arrival))
 
     def summary(self) -> dict[str, Any]:
-        """Offsets and round trips [s] by system."""
+        """Offsets and round trips [s] by system and address."""
         return {
             "peers": {
-                system: {"offset": peer.offset, "round_trip": peer.round_trip, "steps": peer.steps}
-                for system, peer in self.peers.items()
+                f"{system} at {shown(address)}": {"offset": peer.offset, "round_trip": peer.round_trip, "steps": peer.steps}
+                for (system, address), peer in self.peers.items()
             },
             "foreign_stamps": self.foreign,
         }

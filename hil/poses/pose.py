@@ -35,10 +35,6 @@ class Pose:
     reset: int = 0
     measured: float | None = None
 
-    def __deepcopy__(self, memo: dict) -> "Pose":
-        """Nothing in it can change."""
-        return self
-
     def transit(self, usual: float) -> float:
         """Time from measurement to arrival [s]: known, or what is usual."""
         return usual if self.measured is None else self.arrival - self.measured

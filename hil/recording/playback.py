@@ -3,6 +3,7 @@
 The replay, the flight logs and the viewer are all made of this, so that they show what was flown and nothing else.
 """
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from hil.params import HilParams
 from hil.poses.pose import Pose, Vector
 from hil.poses.sight import Sight
 from hil.poses.track import Track
-from hil.recording.record import load_run
+from hil.recording.record import SUMMARY, load_run
 from visthrow.onboard.policy import Policy
 
 
@@ -62,7 +63,8 @@ def replay(folder: str | Path) -> dict[str, Any]:
     """Run the recorded poses, statuses and words of a run through the runner again.
 
     Returns:
-        Number of ticks and actions compared, the bodies, and the differences: tick, name, recorded value, value now.
+        Number of ticks and actions compared, the bodies, the differences (tick, name, recorded value, value now), and what is
+        missing of the recording, or None.
 
     Raises:
         RunError: no folder of a run, or a damaged one.
@@ -84,4 +86,16 @@ def replay(folder: str | Path) -> dict[str, Any]:
         "actions": actions,
         "bodies": sorted({pose.body for group in poses.values() for pose in group} & set(playback.runner.tracks)),
         "differences": differences,
+        "cut": _cut(folder, len(ticks)),
     }
+
+
+def _cut(folder: str | Path, ticks: int) -> str | None:
+    """What is missing of a recording, in words."""
+    try:
+        flown = json.loads((Path(folder) / SUMMARY).read_text(encoding="utf-8"))["ticks"]
+    except OSError:
+        return "no summary: the run was killed, or its disk was full; how many ticks it flew on is not known"
+    except (ValueError, KeyError, TypeError) as error:
+        return f"{SUMMARY} does not say how many ticks there were: {error!r}"
+    return None if ticks == flown else f"{flown - ticks} of {flown} ticks are missing"

@@ -27,6 +27,9 @@ POLICY, CONFIG, POSES, TICKS, TLOG, SUMMARY, PROVENANCE = (
 )  # fmt: skip
 
 
+POSES_TLOG = "poses.tlog"
+"""Of poses that come on a port of their own."""
+
 MOST_WAITING = 50_000
 """Lines that may wait for a slow disk, some minutes' worth; beyond them the recording has failed."""
 
@@ -45,6 +48,8 @@ class Recorder:
             StorageError: the folder holds a run already, or cannot be written.
         """
         self.folder = Path(folder)
+        if (self.folder / CONFIG).exists():
+            raise StorageError(f"{self.folder} holds a run already; name another folder with --out")
         source = find_policy(params.policy)
         data = source.read_bytes()
         provenance.write_run_folder(
@@ -73,7 +78,7 @@ class Recorder:
             self._queue.put((POSES, json.dumps(values)))
         line = {
             "n": index, "status": list(vars(status).values()),
-            "words": [words.arm, words.land, words.abort], "recording": recording, **vars(decision), "times": times,
+            "words": list(vars(words).values()), "recording": recording, **vars(decision), "times": times,
             "poses": len(poses),
         }  # fmt: skip
         self._queue.put((TICKS, json.dumps(line)))

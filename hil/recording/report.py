@@ -20,6 +20,8 @@ def story(summary: dict[str, Any], folder: Path) -> str:
     lines.append(f"throws {summary['throws']}, released {summary['latches']}, cancelled {summary['cancelled']}")
     if summary["stuck"]:
         lines.append(f"{summary['stuck']} released payload still hung on the vehicle: look at the mechanism")
+    if summary["left_fence"]:
+        lines.append(f"after the throw the vehicle left its fence: {summary['left_fence']}")
     for landing in summary["landings"]:
         lines.append(
             f"landing at x {landing['landing_w'][0]:.3f} m, y {landing['landing_w'][1]:+.3f} m by the payload's own poses: "
@@ -31,6 +33,9 @@ def story(summary: dict[str, Any], folder: Path) -> str:
     for name, body in summary["bodies"].items():
         refused = ", ".join(f"{n} {why}" for why, n in body["refused"].items()) or "none"
         lines.append(f"{name}: {body['accepted']} poses taken; refused: {refused}")
+    for link in summary["links"]:
+        if link["refused"]:
+            lines.append(f"refused on the link: {link['refused']} messages, most often {link['refused_most'][0]['what']}")
     ours = summary["missed_ours"]
     lines.append(f"ticks {summary['ticks']}, missed {summary['missed']}, {ours} of them by taking too long ourselves")
     lines += table(summary["latency"])

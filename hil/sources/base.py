@@ -5,6 +5,7 @@ from typing import Protocol
 
 from hil.errors import SourceError
 from hil.links.clock import Clock
+from hil.links.mavlink_link import Link
 from hil.poses.pose import Pose
 
 
@@ -12,6 +13,7 @@ class Source(Protocol):
     """Where poses come from; polling never waits and never raises."""
 
     ended: bool  # nothing will come any more
+    links: tuple[Link, ...]  # that are served by polling
 
     def poll(self, now: float) -> list[Pose]:
         """Raw poses that have arrived by ``now`` [s] on the runner's clock, in order of arrival."""
@@ -19,12 +21,17 @@ class Source(Protocol):
     def wait(self, clock: Clock, until: float) -> None:
         """Wait until a time [s], taking in what comes in the meantime, so that its arrival is known."""
 
+    def hold(self, flying: bool) -> None:
+        """Say whether the vehicle is ours in flight: then nobody's address on the links may change."""
+
     def close(self) -> None:
         """Give the port or file back."""
 
 
 class Recorded:
     """Recorded poses, each handed on when the runner's clock has reached its arrival."""
+
+    links = ()
 
     def __init__(self, poses: Iterable[Pose]) -> None:
         """Sort by arrival; poses that arrived together keep their order.
@@ -57,6 +64,9 @@ class Recorded:
     def wait(self, clock: Clock, until: float) -> None:
         """See `Source`."""
         clock.sleep_until(until)
+
+    def hold(self, flying: bool) -> None:
+        """See `Source`."""
 
     def close(self) -> None:
         """See `Source`."""

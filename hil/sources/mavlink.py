@@ -9,12 +9,15 @@ from typing import Any
 
 from hil.errors import SourceError
 from hil.links.clock import Clock
-from hil.links.mavlink_link import Link, pose_from_message
+from hil.links.mavlink_link import Link, pose_from_message, pump, wait
 from hil.links.pymav import Parser
 from hil.poses.pose import BODIES, Pose
 from visthrow.common.errors import ConfigError
 
 POSE_MESSAGES = ("ATT_POS_MOCAP", "VISION_POSITION_ESTIMATE", "ODOMETRY", "LOCAL_POSITION_NED")
+BESIDE = {"LOCAL_POSITION_NED": ("LOCAL_POSITION_NED", "ATTITUDE_QUATERNION")}
+"""Messages that make up a pose, where it is more than one."""
+
 PAIR_AGE = 0.05
 """An attitude older than this against the position that it is to be paired with is none [s]."""
 
@@ -94,13 +97,14 @@ class MavlinkDecoder:
 
 
 class MavlinkSource:
-    """Poses of a link. Polling it also serves the link's other listeners."""
+    """Poses of a link. Polling it also serves the link's other listeners, and the autopilot's link where that is another one."""
 
     ended = False
 
-    def __init__(self, link: Link, bodies: tuple[BodyIds, ...], clock: Callable[[], float]) -> None:
-        """Listen to a link; ``clock`` gives the arrivals."""
+    def __init__(self, link: Link, bodies: tuple[BodyIds, ...], clock: Callable[[], float], beside: Link | None = None) -> None:
+        """Listen to a link; ``clock`` gives the arrivals. ``beside`` is another link to serve."""
         self._link, self._clock, self._decoder = link, clock, MavlinkDecoder(bodies)
+        self.links = (link,) if beside is None else (link, beside)
         self._waiting: list[Pose] = []
         link.listen(self._hear)
 
@@ -112,21 +116,23 @@ class MavlinkSource:
 
     def poll(self, now: float) -> list[Pose]:
         """See `hil.sources.base.Source`."""
-        self._link.pump(self._clock)
+        pump(self.links, self._clock)
         poses, self._waiting = self._waiting, []
         return poses
 
     def wait(self, clock: Clock, until: float) -> None:
         """See `hil.sources.base.Source`."""
-        while clock.now() < until:
-            clock.wait_for(self._link.port, until)
-            if not self._link.pump(self._clock):
-                break
-        clock.sleep_until(until)
+        wait(self.links, clock, self._clock, until)
+
+    def hold(self, flying: bool) -> None:
+        """See `hil.sources.base.Source`."""
+        for link in self.links:
+            link.roster.flying = flying
 
     def close(self) -> None:
         """See `hil.sources.base.Source`."""
-        self._link.close()
+        for link in self.links:
+            link.close()
 
 
 def read_tlog(path: str | Path, bodies: tuple[BodyIds, ...]) -> list[Pose]:

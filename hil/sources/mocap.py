@@ -16,7 +16,7 @@ from typing import Any, Literal
 from hil.errors import SourceError
 from hil.links.clock import Clock
 from hil.links.device import check_device
-from hil.links.mavlink_link import Link
+from hil.links.mavlink_link import Link, pump, wait
 from hil.poses.pose import BODIES, Pose
 from hil.sources.logs import load_extra
 from visthrow.common.errors import ConfigError, suggest
@@ -71,7 +71,7 @@ class MocapSource:
 
     def __init__(self, clock: Callable[[], float], link: Link | None = None) -> None:
         """Take the clock that arrivals are told by, and the link to serve."""
-        self._clock, self._link = clock, link
+        self._clock, self.links = clock, () if link is None else (link,)
         self._waiting: deque[Pose] = deque(maxlen=MOST_WAITING)
         self.failure: str | None = None
 
@@ -81,22 +81,22 @@ class MocapSource:
 
     def poll(self, now: float) -> list[Pose]:
         """See `hil.sources.base.Source`."""
-        if self._link is not None:
-            self._link.pump(self._clock)
+        pump(self.links, self._clock)
         return [self._waiting.popleft() for _ in range(len(self._waiting))]
 
     def wait(self, clock: Clock, until: float) -> None:
         """See `hil.sources.base.Source`."""
-        while self._link is not None and clock.now() < until:
-            clock.wait_for(self._link.port, until)
-            if not self._link.pump(self._clock):
-                break
-        clock.sleep_until(until)
+        wait(self.links, clock, self._clock, until)
+
+    def hold(self, flying: bool) -> None:
+        """See `hil.sources.base.Source`."""
+        for link in self.links:
+            link.roster.flying = flying
 
     def close(self) -> None:
         """See `hil.sources.base.Source`."""
-        if self._link is not None:
-            self._link.close()
+        for link in self.links:
+            link.close()
 
 
 class MotionCaptureSource(MocapSource):

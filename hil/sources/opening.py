@@ -1,21 +1,24 @@
 """Opens the source that a config names."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from hil.backends import AUTOPILOTS
 from hil.errors import LinkError, SourceError
 from hil.links.clock import MonotonicClock
 from hil.links.device import check_device, open_port
 from hil.links.mavlink_link import Link, TlogWriter
+from hil.links.roster import Party, Roster
 from hil.links.sync import LinkSync
 from hil.params import LIVE, HilParams
 from hil.poses.plausible import unit_problems
 from hil.poses.pose import VEHICLE, Pose
-from hil.recording.record import TLOG
+from hil.recording.record import POSES_TLOG, TLOG
 from hil.sources.base import Recorded
 from hil.sources.csv_file import read_csv
 from hil.sources.dataflash import read_bin
-from hil.sources.mavlink import MavlinkSource, read_tlog
+from hil.sources.mavlink import BESIDE, MavlinkSource, read_tlog
 from hil.sources.mocap import open_mocap
 from hil.sources.ulog import read_ulg
 
@@ -36,13 +39,35 @@ def read_poses(params: HilParams) -> list[Pose]:
     return read_csv(source.file, source.columns, params.frames[VEHICLE].quaternion)
 
 
-def open_source(params: HilParams, folder: Path, speed: float) -> tuple[Any, Link | None, bool]:
+def parties(params: HilParams, poses: bool, autopilot: bool) -> list[Party]:
+    """Who may speak on a link.
+
+    Args:
+        params: the run.
+        poses: whether the link carries MAVLink poses. autopilot: whether it carries the autopilot, where that speaks MAVLink.
+    """
+    found = []
+    if poses:
+        for ids in params.source.senders:
+            kinds = frozenset(BESIDE.get(ids.message, (ids.message,)))
+            found.append(Party(ids.body, ids.system, ids.component, kinds))
+    if autopilot and params.backend in AUTOPILOTS:
+        vehicle = getattr(params, params.backend)
+        found.append(Party("autopilot", vehicle.system, vehicle.component, autopilot=AUTOPILOTS[params.backend].autopilot))
+    return found
+
+
+def open_source(
+    params: HilParams, folder: Path, speed: float, key: bytes | None = None, tell: Callable[[str], None] | None = None
+) -> tuple[Any, Link | None, bool]:  # fmt: skip
     """Open a source.
 
     Args:
         params: the run.
         folder: of the run, where a link's .tlog goes.
         speed: of the clock.
+        key: that the links' messages are signed with; None: they are not.
+        tell: is handed who is refused; never waits.
 
     Returns:
         Source of poses, the autopilot's link where there is one, and whether the poses are recorded ones.
@@ -57,16 +82,26 @@ def open_source(params: HilParams, folder: Path, speed: float) -> tuple[Any, Lin
         if problems:
             raise SourceError(f"{source.file}: {'; '.join(problems)} (source.check_units=false lets it pass)")
         return Recorded(poses), None, True
-    clock, link = MonotonicClock(speed).now, None
-    if source.kind == "mavlink" or params.backend in ("ardupilot", "px4"):
-        port = open_port(check_device(params.link.device, remote=params.link.remote))
+    clock, own = MonotonicClock(speed).now, source.kind == "mavlink" and source.device is not None
+
+    def opened(device: str, tlog: str, who: list[Party]) -> Link:
+        port = open_port(check_device(device, remote=params.link.remote))
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise LinkError(f"cannot make {folder}: {error.strerror}; expected a folder that can be written (--out)") from error
-        link = Link(port, params.link.system, params.link.component, TlogWriter(folder / TLOG))
+        roster = Roster(who, params.link.allow, tell)
+        link = Link(port, params.link.system, params.link.component, TlogWriter(folder / tlog), roster, key)
         if params.delay.synchronise:
             LinkSync(link)
-    if source.kind == "mavlink":
+        return link
+
+    link = None
+    if (source.kind == "mavlink" and not own) or params.backend in AUTOPILOTS:
+        link = opened(params.link.device, TLOG, parties(params, source.kind == "mavlink" and not own, True))
+    if source.kind != "mavlink":
+        return open_mocap(source.mocap, source.bodies, clock, params.link.remote, link), link, False
+    if not own:
         return MavlinkSource(link, source.senders, clock), link, False
-    return open_mocap(source.mocap, source.bodies, clock, params.link.remote, link), link, False
+    poses = opened(source.device, POSES_TLOG, parties(params, True, False))
+    return MavlinkSource(poses, source.senders, clock, link), link, False

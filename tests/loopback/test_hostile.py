@@ -14,10 +14,12 @@ from hil.backends.base import FAILED
 from hil.control.loop import AutoOperator
 from hil.fakes.level import LevelPlant
 from hil.links.pymav import mav
+from hil.links.signing import Signed
 from tests.fuzz import EACH, SEEDS, any_message, mutated, noise
 from tests.hil_flight import simple_policy
-from tests.loopback.wire import peers, throw
+from tests.loopback.wire import HERE, cut, peers, throw
 from visthrow.evidence.bench.hil_processes import free_port
+from visthrow.onboard.actions import hover_action
 
 READY = 8.0
 """Processor time of a run that waits for poses, from its call to its end [s]; its start takes 1.5 s on a free core, 3 s are
@@ -57,6 +59,103 @@ def test_messages_of_every_kind_command_nothing(kind):
 @pytest.mark.parametrize("seed", SEEDS)
 def test_a_million_messages_command_nothing(seed):
     flood(EACH, ("ardupilot", "px4")[seed % 2], seed)
+
+
+STRANGERS = tuple(("127.0.0.1", 2 + i) for i in range(5)) + (("10.0.0.9", 14550),)
+KEY, OTHER_KEY = bytes(range(32)), bytes(32)
+AT_ONCE = 200
+"""Packets beside each look at the link: together with the true ones less than are read in one go."""
+
+
+def lies() -> list:
+    """What an attacker would say with the vehicle's ids: it is elsewhere, disarmed, in another mode, has released, is well set up."""
+    quat = [1.0, 0.0, 0.0, 0.0]
+    return [
+        mav.MAVLink_att_pos_mocap_message(5_000_000, quat, 0.4, 0.2, -1.2), mav.MAVLink_heartbeat_message(2, 3, 0, 5, 4, 3),
+        mav.MAVLink_heartbeat_message(2, 12, 128, 4, 4, 3), mav.MAVLink_heartbeat_message(2, 3, 128, 9, 4, 3),
+        mav.MAVLink_command_ack_message(mav.MAV_CMD_DO_GRIPPER, 0), mav.MAVLink_command_ack_message(mav.MAV_CMD_DO_GRIPPER, 4),
+        mav.MAVLink_param_value_message(b"GUID_OPTIONS", 0.0, 9, 1, 0), mav.MAVLink_timesync_message(77, 78),
+        mav.MAVLink_timesync_message(0, 79), mav.MAVLink_servo_output_raw_message(5, 0, *([1900] * 16)),
+        mav.MAVLink_param_error_message(245, 191, b"GUID_OPTIONS", -1, 1), mav.MAVLink_named_value_int_message(0, b"SIMULATED", 0),
+        mav.MAVLink_attitude_target_message(0, 0, quat, 0.0, 0.0, 0.0, 0.9),
+    ]  # fmt: skip
+
+
+def forger(rng, signed: bool, captured: list[bytes]):
+    """Makes one packet and its sender: spoofed, stray, noise; with signing also from the vehicle's own address, unsigned, signed
+    with another key, or sent once more."""
+    said, packers = lies(), {ids: mav.MAVLink(None, *ids) for ids in ((1, 1), (1, 25))}
+    forged = {ids: Signed(OTHER_KEY, *ids) for ids in packers}
+
+    def make():
+        ids = ((1, 1), (1, 25))[rng.integers(2)]
+        who, kind = STRANGERS[rng.integers(len(STRANGERS))], rng.integers(5)
+        if signed and rng.random() < 0.5:
+            who = HERE
+        if kind == 0:
+            return noise(rng), who
+        if kind == 1:
+            return any_message(rng, ids=(int(rng.integers(1, 256)), int(rng.integers(256)))), who
+        if kind == 2 and captured:
+            return captured[rng.integers(len(captured))], who
+        if kind == 3 and signed:
+            return said[rng.integers(len(said))].pack(forged[ids]), who
+        return said[rng.integers(len(said))].pack(packers[ids]), who
+
+    return make
+
+
+def flown(seed: int, count: int, kind: str, signed: bool):
+    """A throw in lock step beside so many forged packets: what was decided, what the vehicle took, what was refused."""
+    kwargs = {"key": KEY} if signed else {}
+    hover = hover_action(9.81 * 0.272, 14.0)[0]
+    quick = ("states.check_hold=0.2", "states.armed_least=0.1", "states.quiet=0.1", "states.land=0.5")
+    runner, source, clock, fake = peers(LevelPlant(), kind=kind, loaded=simple_policy((hover, 0, 0, 0, 1.0)), overrides=quick, **kwargs)
+    rng, port, captured = np.random.default_rng(seed), source.links[0].port, []
+    make, left, decisions, poll, tick = forger(rng, signed, captured), [count], [], source.poll, runner.tick
+
+    def polled(now):
+        # Whoever speaks first with the right ids is the vehicle, where nothing is signed: so strangers come when it is known.
+        known = signed or len(source.links[0].roster.at) == len(source.links[0].roster.parties)
+        captured.extend(data for data in list(port.inbox)[:2] if len(captured) < 100 and isinstance(data, bytes))
+        if known and left[0] > 0:
+            left[0] -= AT_ONCE
+            true, forged = list(port.inbox), [make() for _ in range(AT_ONCE)]
+            port.inbox.clear()
+            port.inbox.extend(forged[: AT_ONCE // 2] + true + forged[AT_ONCE // 2 :])
+        return poll(now)
+
+    def ticked(now, *args):
+        decisions.append(tick(now, *args))
+        return decisions[-1]
+
+    source.poll, runner.tick = polled, ticked
+    summary = cut(runner, source, clock, AutoOperator(), None, 12.0, lambda decision: None)
+    return decisions, summary, fake, source.links[0].roster, left[0], runner
+
+
+def unmoved(seed: int, count: int) -> None:
+    """Forged packets change no bit of what is decided, and none of what the vehicle takes."""
+    kind, signed = ("ardupilot", "px4")[seed % 2], seed % 4 >= 2
+    decisions, summary, fake, roster, left, runner = flown(seed, count, kind, signed)
+    alone, _, plain, _, _, _ = flown(seed, 0, kind, signed)
+    assert decisions == alone
+    assert (fake.witness.commands, fake.witness.releases, fake.witness.breaches) == (plain.witness.commands, 1, [])
+    assert fake.events == plain.events
+    assert (summary["latches"], summary["errors"], runner.errors) == (1, [], [])
+    assert left <= 0, "all were sent while it flew"
+    assert roster.refused > 0.5 * count, "the rest is noise"
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2, 3])
+def test_spoofed_stray_and_unsigned_packets_change_no_bit_of_a_throw(seed):
+    unmoved(seed, 10_000)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_million_spoofed_stray_and_unsigned_packets_change_no_bit_of_a_throw(seed):
+    unmoved(seed, EACH)
 
 
 def test_a_flood_in_mid_throw_neither_commands_nor_releases():

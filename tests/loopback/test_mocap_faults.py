@@ -11,7 +11,7 @@ from hil.control.decision import Words
 from hil.control.loop import fly
 from hil.errors import RunError
 from hil.fakes.level import LevelPlant
-from hil.fakes.mocap_faults import FAULTS, MocapFault
+from hil.fakes.mocap import FAULTS, MocapFault
 from hil.poses.pose import VEHICLE, Pose
 from tests.hil_flight import simple_policy
 from tests.loopback.wire import peers

@@ -3,15 +3,20 @@
 from collections import deque
 
 from hil.backends import Betaflight, make_backend, mechanism_lag
-from hil.control.loop import AutoOperator, fly
+from hil.control.loop import AutoOperator, Loop
 from hil.control.runner import Runner
 from hil.fakes import Fake
 from hil.fakes.process import VEHICLE_ID, MocapParams, Options, make_fake
 from hil.links.mavlink_link import Link
+from hil.links.roster import Roster
 from hil.links.sync import LinkSync
 from hil.sources import MavlinkSource
+from hil.sources.opening import parties
 from visthrow import config
 from visthrow.onboard.policy import Policy, find_policy
+
+HERE = ("127.0.0.1", 1)
+"""Address of the other end."""
 
 
 class MemoryPort:
@@ -20,13 +25,19 @@ class MemoryPort:
     whole = True
 
     def __init__(self) -> None:
-        self.inbox: deque[bytes] = deque()
+        self.inbox: deque[bytes | tuple[bytes, tuple[str, int]]] = deque()  # with the sender, where it is not the other end
         self.other: MemoryPort | None = None
+        self.sender: tuple[str, int] | None = None
 
     def read(self) -> bytes | None:
-        return self.inbox.popleft() if self.inbox else None
+        if not self.inbox:
+            return None
+        data = self.inbox.popleft()
+        data, self.sender = data if isinstance(data, tuple) else (data, HERE)
+        return data
 
-    def write(self, data: bytes) -> bool:
+    def write(self, data: bytes, to: tuple[str, int] | None = None) -> bool:
+        assert to in (None, HERE), "what is sent goes to the other end"
         self.other.inbox.append(bytes(data))
         return True
 
@@ -67,8 +78,8 @@ class PlantClock:
     def sleep_until(self, when: float) -> None:
         self._until(when, None)
 
-    def wait_for(self, port: MemoryPort, when: float) -> None:
-        self._until(when, port)
+    def wait_for(self, ports: list[MemoryPort], when: float) -> None:
+        self._until(when, ports[0])
 
 
 CONFIGS = {"ardupilot": "fake", "px4": "fake_px4", "betaflight": "fake_betaflight"}
@@ -76,7 +87,7 @@ CONFIGS = {"ardupilot": "fake", "px4": "fake_px4", "betaflight": "fake_betafligh
 
 def peers(
     plant, seed=0, answer="accepted", overrides=(), mocap=None, policy="state", loaded=None, kind="ardupilot", tell=None,
-    write=False, **options,
+    write=False, key=None, **options,
 ):
     """Runner and fake at the ends of a pipe: runner, source, clock, fake."""
     from hil.params import HilParams
@@ -87,8 +98,9 @@ def peers(
     mine, its = pipe()
     mine.whole = its.whole = False
     more = Options(answer=answer, **options)
-    fake = make_fake(kind, plant, Link(there, *VEHICLE_ID), mocap or MocapParams(), seed, more, its)
-    clock, link = PlantClock(fake), Link(here, params.link.system, params.link.component)
+    fake = make_fake(kind, plant, Link(there, *VEHICLE_ID, key=key), mocap or MocapParams(), seed, more, its)
+    roster = Roster(parties(params, True, True))
+    clock, link = PlantClock(fake), Link(here, params.link.system, params.link.component, roster=roster, key=key)
     if params.delay.synchronise:
         LinkSync(link)
     source = MavlinkSource(link, params.source.senders, clock.now)
@@ -100,11 +112,19 @@ def peers(
     return Runner(params, loaded, backend, mechanism_lag(params)), source, clock, fake
 
 
+def cut(runner, source, clock, operator, recorder, seconds, tell):
+    """The turns of a run for a time [s], and no more: it is neither aborted nor landed then. Its summary."""
+    loop, begin = Loop(runner, source, clock, operator, recorder, tell), clock.now()
+    while runner.machine.state != "done" and clock.now() - begin < seconds:
+        loop.turn(False)
+    return loop.summary()
+
+
 def throw(plant, seconds=20.0, recorder=None, phase=0, operator=None, **kwargs):
     """A run in lock step, its ticks ``phase`` of the plant's periods after the poses: summary, fake, decisions."""
     runner, source, clock, fake = peers(plant, **kwargs)
     for _ in range(phase):
         fake.step()
     told = []
-    summary = fly(runner, source, clock, operator or AutoOperator(), recorder, seconds, told.append)
+    summary = cut(runner, source, clock, operator or AutoOperator(), recorder, seconds, told.append)
     return summary, fake, told

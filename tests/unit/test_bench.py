@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from camera import CameraParams
+from camera.params import CameraParams
 from sim.arrays import state as st
 from sim.reference.scene import load_scene
 from visthrow import cli, config

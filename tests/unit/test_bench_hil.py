@@ -127,16 +127,13 @@ def test_a_run_that_does_not_start_says_why(tmp_path):
 
 
 def test_a_short_soak_over_udp(tmp_path, capsys):
-    """Three seconds each way: all is counted, and the fake saw nothing that it should not. Times are for a quiet machine."""
+    """Three seconds: all is counted, and the fake saw nothing that it should not. Times are for a quiet machine."""
     out, run = tmp_path / "soak.json", tmp_path / "run"
     assert main(["bench", "hil", "--minutes", "0.05", "--json", str(out), "--keep", str(run), "--out", str(tmp_path)]) == 0
     figures = json.loads(out.read_text())["figures"]
     assert figures["ticks"] > 50
     assert figures["breaches"] == []
-    for latency in (figures["latency_ms"], figures["latency_without_rehearsal_ms"]):
-        assert all(latency[name] for name in ("poll", "estimate", "observation", "policy", "send", "total"))
-    assert figures["rehearsal_failed"] is None
-    assert figures["rehearsals"] > 20
+    assert all(figures["latency_ms"][name] for name in ("poll", "estimate", "observation", "policy", "send", "total"))
     assert not figures["interrupted"]
     assert hil.json_lines(tmp_path / "soak.jsonl")[0]["memory_bytes"] > 50e6
     assert "within the bars" in capsys.readouterr().out.replace("NOT ", "")

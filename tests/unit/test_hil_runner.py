@@ -245,7 +245,7 @@ def test_bodies_exchanged_from_the_start_are_noticed():
 @pytest.mark.parametrize(
     ("status", "reason"),
     [
-        (lambda t: Status(t < START, "silent"), "the autopilot is silent, disarmed or in another mode"),
+        (lambda t: Status(t < START, "silent"), "the autopilot is silent, disarmed or in another mode: silent"),
         (lambda t: Status(True, "", "failed" if t > START else "idle"), "the release was refused or not answered"),
     ],
 )
@@ -257,7 +257,7 @@ def test_an_autopilot_that_goes(status, reason):
 
 def test_an_autopilot_in_another_mode_never_leads_to_a_throw():
     pilot, decisions = thrown(status=lambda t: Status(False, "mode"), overrides=("states.idle=2.0",), seconds=5.0)
-    assert ("abort", "no autopilot ready within 2 s") in changes(decisions)
+    assert ("abort", "autopilot not ready (mode), for 2 s") in changes(decisions)
     assert decisions[-1].state == "done", "what was never ours needs no descent"
     assert not pilot.backend.sent
 

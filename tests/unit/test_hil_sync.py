@@ -10,7 +10,7 @@ from hil.links.mavlink_link import Link
 from hil.links.pymav import mav
 from hil.links.sync import LATE, LinkSync
 from hil.sources import BodyIds, MavlinkSource
-from tests.loopback.wire import pipe
+from tests.loopback.wire import HERE, pipe
 
 RATE = 10.0
 """Exchanges a second."""
@@ -86,7 +86,7 @@ def test_poses_are_dated_by_their_senders_clock(offset):
     known = [pose for pose in poses if pose.measured is not None]
     assert len(known) > 150
     assert all(abs(pose.transit(9.9) - 0.01) <= 1e-5 for pose in known[20:])
-    assert sync.peers[1].steps == 0
+    assert sync.peers[1, HERE].steps == 0
 
 
 def test_stamps_of_another_clock_are_not_believed():

@@ -4,7 +4,6 @@ The same functions of :mod:`visthrow.onboard.observations` and :mod:`visthrow.on
 a batch of one on board; only the noise is missing.
 """
 
-import copy
 import time
 from dataclasses import dataclass
 from types import SimpleNamespace
@@ -112,10 +111,6 @@ class Pilot:
         self.spent = (0.0, 0.0)
         self._first = torch.tensor([act.hover_action(GRAVITY * mass, self._max_thrust)], dtype=torch.float32)
         self.start()
-
-    def __deepcopy__(self, memo: dict) -> "Pilot":
-        """What a step changes it puts in another's place, so that the rest can be shared."""
-        return copy.copy(self)
 
     def start(self) -> None:
         """Begin a throw from hover: the next call fills the history."""

@@ -141,7 +141,7 @@ CASES = {
 
 def known_cases() -> dict[str, Case]:
     """All faults by name."""
-    mocap = import_module("hil.fakes.mocap_faults").FAULTS  # the onboard side is not imported by name: it must not need this one
+    mocap = import_module("hil.fakes.mocap").FAULTS  # the onboard side is not imported by name: it must not need this one
     return {**{name: _mocap(name, text) for name, (text, _) in mocap.items()}, **CASES}
 
 

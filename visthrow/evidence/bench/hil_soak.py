@@ -1,4 +1,4 @@
-"""The soak of ``visthrow bench hil``: a throw that lasts, as a run flies it, with rehearsed ticks and without."""
+"""The soak of ``visthrow bench hil``: a throw that lasts, as a run flies it."""
 
 import argparse
 import dataclasses
@@ -19,14 +19,11 @@ from visthrow.evidence.bench.records import Report, Table
 STILL = ("--plant", "hil.fakes.level:make")
 """A vehicle without a simulator: it takes no time from the runner."""
 
-P50, P99 = 0.5, 1.5
+P50, P99 = 1.0, 3.0
 """Bars of the whole way from the look for messages to the command's bytes [ms]."""
 
 WARM = 0.2
 """Share of a soak before memory is looked at: buffers fill, pages are touched."""
-
-COMPARED = 1.0
-"""Most that the same is flown without rehearsals [min]."""
 
 TELL = 30.0
 """Between two words on how far a soak has come [s]."""
@@ -73,19 +70,14 @@ def soak(args: argparse.Namespace) -> Report:
         policy = never_releasing(args.policy, place / "policy.npz")
         run = ("--config", "fake", "--set", f'policy="{policy}"', "--set", "states.throw=1e6", "--set", "states.abort=0.5")
 
-        def fly(minutes: float, name: str, *more: str, watch: Memory | None = None) -> tuple[dict[str, Any], dict[str, Any]]:
-            fake = (*STILL, "--rate", str(args.rate), "--seconds", str(60.0 * minutes))
-            return Pair((*run, *more), fake, args.core, _another(args.core), orderly=True).fly(place / name, watch)
-
-        without, _ = fly(min(args.minutes, COMPARED), "without", "--set", "realtime.rehearse=false")
-        summary, report = fly(args.minutes, "run", watch=progress)
+        fake = (*STILL, "--rate", str(args.rate), "--seconds", str(60.0 * args.minutes))
+        summary, report = Pair(run, fake, args.core, _another(args.core), orderly=True).fly(place / "run", progress)
         size = sum(path.stat().st_size for path in (place / "run").iterdir())
         if args.keep is not None:
             shutil.copytree(place / "run", args.keep)
-    for found in (without, summary):
-        if not found["latency"].get("total"):
-            raise VisthrowError(f"no command was ever sent: {found['reason']}")
-    return _report(summary, without, report, progress, size, args)
+    if not summary["latency"].get("total"):
+        raise VisthrowError(f"no command was ever sent: {summary['reason']}")
+    return _report(summary, report, progress, size, args)
 
 
 def _another(core: int | None) -> int | None:
@@ -126,7 +118,7 @@ def _stages(latency: dict[str, dict[str, float]], title: str) -> Table:
 
 
 def _report(
-    summary: dict, without: dict, report: dict, progress: Progress, size: int, args: argparse.Namespace
+    summary: dict, report: dict, progress: Progress, size: int, args: argparse.Namespace
 ) -> Report:  # fmt: skip
     grown, samples, early = slope(progress.samples), progress.samples, summary["interrupted"]
     seconds = progress.seconds if early else 60.0 * args.minutes
@@ -135,7 +127,6 @@ def _report(
         ("ticks", f"{summary['ticks']:,}"),
         ("missed", str(summary["missed"])),
         ("missed because a tick of ours took too long", str(summary["missed_ours"])),
-        ("rehearsals", f"{summary['rehearsals']:,}"),
         ("commands that the fake took", f"{report['commands']:,}"),
         ("breaches it noted", str(len(report["breaches"]))),
         ("memory at the start and at the end", " and ".join(ends)),
@@ -143,16 +134,13 @@ def _report(
         ("recorded", f"{size / 1e6:.1f} MB"),
     )
     figures = {
-        "latency_ms": summary["latency"], "latency_without_rehearsal_ms": without["latency"], "ticks": summary["ticks"],
-        "missed": summary["missed"], "missed_ours": summary["missed_ours"], "missed_ours_without_rehearsal": without["missed_ours"],
-        "rehearsals": summary["rehearsals"], "rehearsal_failed": summary["rehearsal_failed"],
+        "latency_ms": summary["latency"], "ticks": summary["ticks"], "missed": summary["missed"], "missed_ours": summary["missed_ours"],
         "worst_late_s": summary["worst_late_s"], "seconds": seconds, "interrupted": early, "rate_hz": args.rate,
         "memory_bytes_per_s": grown, "memory_bytes": [s for _, s in samples[:: max(1, len(samples) // 200)]],
         "breaches": report["breaches"], "recorded_bytes": size,
     }  # fmt: skip
     tables = (
         _stages(summary["latency"], "Times of each stage [ms]"),
-        _stages(without["latency"], "The same without rehearsed ticks [ms]"),
         Table("The run", ("what", "measured"), counts),
     )
     title = f"HIL runner over loopback: {seconds:.0f} s in real time, poses at {args.rate:g} Hz"

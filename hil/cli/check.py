@@ -1,0 +1,123 @@
+"""``visthrow hil check``: the poses that come and the autopilot, a hand-carry, the hover of a run, a camera's recording."""
+
+import argparse
+import dataclasses
+import json
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from hil.backends import DryRun, make_backend
+from hil.backends.check import AutopilotCheck, hover_of_run
+from hil.cli.flight import key_of, params_of
+from hil.control.decision import Words
+from hil.control.runner import Runner
+from hil.links.clock import Clock, ManualClock, MonotonicClock
+from hil.links.roster import Roster
+from hil.params import HilParams
+from hil.poses import handcarry
+from hil.poses.plausible import unit_problems
+from hil.poses.pose import VEHICLE
+from hil.poses.track import Track
+from hil.sources.opening import open_source
+from visthrow.onboard.policy import Policy, find_policy
+
+LISTEN, CARRY = 5.0, 180.0
+"""How long poses are looked at, and a vehicle is carried about, where nothing else is said [s]."""
+
+
+def check(args: argparse.Namespace) -> int:
+    """Do the check that was asked for."""
+    if args.against_camera:
+        return _camera(args)
+    if args.hand_carry:
+        return _hand_carry(args)
+    return _listen(args) if args.hover_of is None else _hover(args)
+
+
+def _camera(args: argparse.Namespace) -> int:
+    from hil.recording import camera_report
+
+    figures = camera_report.against_camera(params_of(args), args.against_camera, args.out)
+    print(camera_report.story(figures, args.out))
+    return 0
+
+
+def _hover(args: argparse.Namespace) -> int:
+    good, text = hover_of_run(args.hover_of)
+    print(f"{'PASS' if good else 'FAIL'}  {text}")
+    return 0 if good else 1
+
+
+@contextmanager
+def _opened(params: HilParams, args: argparse.Namespace) -> Iterator[tuple[Any, Any, Clock, bool]]:
+    """Source, the autopilot's link, clock, and whether the poses are recorded ones."""
+    with tempfile.TemporaryDirectory() as folder:
+        source, link, recorded = open_source(params, Path(folder), args.speed, key_of(args))
+        try:
+            yield source, link, ManualClock(source.start) if recorded else MonotonicClock(args.speed), recorded
+        finally:
+            source.close()
+
+
+def _hand_carry(args: argparse.Namespace) -> int:
+    params = params_of(args)
+    params = dataclasses.replace(params, source=dataclasses.replace(params.source, check_units=False))
+    with _opened(params, args) as (source, _, clock, recorded):
+        steps = handcarry.collect(source, clock, args.seconds or CARRY, lambda text: print(text, flush=True), recorded)
+    finding = handcarry.judge(steps, params.frames[VEHICLE])
+    print(handcarry.story(finding, params.frames[VEHICLE]))
+    return 0 if finding.passed else 1
+
+
+def _listen(args: argparse.Namespace) -> int:
+    """Look at poses and autopilot for a while, and command nothing."""
+    params = params_of(args)
+    with _opened(params, args) as (source, link, clock, _):
+        runner = Runner(params, Policy.load(find_policy(params.policy)), DryRun())
+        autopilot = AutopilotCheck(params, make_backend(params, link))
+        begin, seconds, poses = clock.now(), args.seconds or LISTEN, []
+        while clock.now() - begin < seconds and not source.ended:
+            now = clock.now()
+            came = source.poll(now)
+            poses += came
+            runner.tick(now, came, runner.backend.status(now), Words())
+            autopilot.tick(now, runner)
+            clock.sleep_until(now + runner.pilot.period)
+        now = clock.now()
+        found = autopilot.results(now, runner.mass)
+        autopilot.backend.close()
+    for name, track in runner.tracks.items():
+        print(_told(name, track, now, now - begin))
+    for one in source.links:
+        print("\n".join(_heard(one.roster, params, now - begin)))
+    problems = runner.problems() + unit_problems(poses, params.frames) + [text for good, text in found if not good]
+    print("".join(f"{text}\n" for good, text in found if good), end="")
+    print("\n".join(f"FAIL  {text}" for text in problems) or "PASS  all checks")
+    return 1 if problems else 0
+
+
+def _told(name: str, track: Track, now: float, seconds: float) -> str:
+    """A body in a line."""
+    state, refused = track.state(now), json.dumps(track.gate.refused) if track.gate.refused else "none"
+    if state is None:
+        return f"{name}: no pose; refused by the gate: {refused}"
+    x, y, z = state.pos
+    return (
+        f"{name}: {track.accepted / seconds:.0f} poses/s, age {1e3 * state.age:.0f} ms, at ({x:+.3f}, {y:+.3f}, {z:+.3f}) m, "
+        f"refused: {refused}, velocity late by {max(0.0, 1e3 * track.filter.lag):.0f} ms"
+    )
+
+
+def _heard(roster: Roster, params: HilParams, seconds: float) -> list[str]:
+    """Who was heard on a link with which ids; all of it where somebody expected was not, else what was refused."""
+    silent = [party.name for party in roster.parties if party.name not in roster.at]
+    lines = [f"{' and '.join(silent)} not heard; expected: {roster.expected()}"] if silent else []
+    for seen, count in sorted(roster.seen.items(), key=lambda row: -row[1]):
+        if silent or seen.why:
+            lines.append(f"  {count / seconds:.1f} a second: {seen.text()}")
+    if silent and not roster.seen:
+        lines.append(f"  nobody speaks on {params.source.device or params.link.device}")
+    return lines

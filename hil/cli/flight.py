@@ -1,0 +1,108 @@
+"""``visthrow hil run`` and ``record``: from a configuration to a flown run with its folder."""
+
+import argparse
+import dataclasses
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from hil.backends import make_backend, mechanism_lag, require_reach
+from hil.backends.check import told
+from hil.cli.terminal import Terminal, Voice
+from hil.control.loop import fly as fly_loop
+from hil.control.realtime import keep, prepare
+from hil.control.runner import Runner
+from hil.errors import RunError
+from hil.links.clock import ManualClock, MonotonicClock
+from hil.links.device import check_device
+from hil.links.signing import read_key
+from hil.params import HilParams
+from hil.recording.latency import Stages
+from hil.recording.record import Recorder
+from hil.recording.report import finish, story
+from hil.recording.view import beside
+from hil.sources.images import open_images
+from hil.sources.opening import open_source
+from visthrow import config
+from visthrow.onboard.policy import Policy, find_policy
+
+
+def params_of(args: argparse.Namespace) -> HilParams:
+    """The configuration that a command names."""
+    return config.load(HilParams, config.find("hil", args.config), args.overrides)
+
+
+def key_of(args: argparse.Namespace) -> bytes | None:
+    """The key that ``--sign`` names, or None."""
+    return None if args.sign is None else read_key(args.sign)
+
+
+def require_fake(params: HilParams) -> None:
+    """Refuse ``--auto-arm`` where a real vehicle could be at the other end.
+
+    Raises:
+        RunError: a device that is no loopback address, or poses that do not come by MAVLink.
+    """
+    devices = [params.link.device, params.source.device or params.link.device]
+    devices += [params.betaflight.device] if params.backend == "betaflight" else []
+    far = [text for text in devices if text.startswith("serial:") or not _loopback(text)]
+    if params.source.kind == "mocap":
+        far.append(f"source.kind {params.source.kind}")
+    if far:
+        raise RunError(f"--auto-arm with {', '.join(far)}; it is for `visthrow hil fake` on this machine alone: type 'arm' instead")
+
+
+def _loopback(text: str) -> bool:
+    return check_device(text, remote=True).host.startswith(("127.", "::1"))
+
+
+def fly(args: argparse.Namespace) -> int:
+    """Fly, or run dry, and write the run's folder.
+
+    Returns:
+        1 for a run that was aborted or in which something raised, else 0.
+    """
+    started, recording = time.monotonic(), args.action == "record"
+    params = params_of(args)
+    if recording:
+        params = dataclasses.replace(params, backend="dry-run", observe=True)
+    auto_arm = not recording and args.auto_arm
+    if auto_arm:
+        require_fake(params)
+    folder = Path(args.out or f"runs/hil/{time.strftime('%Y%m%d-%H%M%S')}")
+    policy, voice = Policy.load(find_policy(params.policy)), Voice()
+    source, link, recorded = open_source(params, folder, args.speed, key_of(args), voice.say)
+    clock = ManualClock(source.start) if recorded else MonotonicClock(args.speed)
+    require_reach(params, policy.contract)
+    backend = make_backend(params, link, not recording and args.write_parameters, voice.say, folder)
+    runner = Runner(params, policy, backend, mechanism_lag(params))
+    refused = prepare(params.realtime)
+    runner.warm_up()
+    recorder = Recorder(folder, params)
+    for text in refused or keep(params.realtime):  # the recorder's thread holds what the flying one waits for; others do not
+        voice.say(f"note: {text}")
+    operator = Terminal(auto_arm, lambda: any(one.roster.simulated for one in source.links), voice.say)
+    print(f"ready after {time.monotonic() - started:.2f} s; waiting for poses", file=sys.stderr, flush=True)
+    viewer, stages = beside(folder) if args.view else None, Stages()
+    eyes = open_images(params.images, params.camera, clock.now) if params.keypoints == "detector" else None
+    summary = fly_loop(
+        runner, source, clock, operator, recorder, args.seconds or float("inf"), voice.decision, stages, eyes
+    )  # fmt: skip
+    summary["autopilot"] = told(backend, link)
+    summary["links"] = [one.roster.summary() for one in source.links]
+    _close(eyes, backend, source)
+    recorder.close(summary)
+    if viewer is not None:
+        viewer.terminate()
+    voice.close()
+    print(story(summary, folder))
+    if not args.bare:
+        print("\n".join(finish(folder, stages)))
+    return 1 if summary["aborted"] or summary["errors"] else 0
+
+
+def _close(*parts: Any) -> None:
+    for part in parts:
+        if part is not None:
+            part.close()

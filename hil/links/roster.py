@@ -1,0 +1,238 @@
+"""Who may speak on a link: each party belongs to the ids that the config names, and to the address of its first valid message.
+
+A party is a body's poses or the autopilot. What comes from nobody's ids, from another address than its party's, or from an autopilot
+of another type is refused, counted, and said once a sender. On the ground a party that has fallen silent may come back from another
+address (a bridge that was started again); in flight none may.
+"""
+
+import ipaddress
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+from hil.errors import LinkError
+from hil.links.pymav import mav
+
+Address = tuple[str, int] | None
+"""Of a datagram's sender; None on a stream, which has one peer."""
+
+SILENT = 1.5
+"""After which another address may take a party's place on the ground: longer than a heartbeat's second [s]."""
+
+MOST_KEPT = 256
+"""Kinds of messages of all senders that are told apart; the rest is counted together."""
+
+MOST_SAID = 20
+"""Senders that are said while a run goes on; the summary has the others."""
+
+NOT_YET = "before its first"
+"""Why a message of a party is not taken that has not been heard as the one that it is to be."""
+
+SHARED = frozenset({"TIMESYNC", "NAMED_VALUE_INT"})
+"""Messages that a party may send beside its own: its clock, and whether it is simulated."""
+
+SIMULATED = "SIMULATED"
+"""Name of the NAMED_VALUE_INT by which a fake says that nothing real flies."""
+
+
+@dataclass(frozen=True)
+class Party:
+    """One that the config names."""
+
+    name: str  # of a body, or "autopilot"
+    system: int  # MAVLink id
+    component: int  # MAVLink id; 0 for any
+    kinds: frozenset[str] = frozenset()  # messages that are its; empty: all that are no other party's
+    autopilot: int | None = None  # MAV_AUTOPILOT that its HEARTBEAT must name
+
+    def has(self, system: int, component: int) -> bool:
+        """Whether ids are those of the party."""
+        return self.system == system and self.component in (0, component)
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What came from one sender, as it is counted."""
+
+    address: Address
+    system: int | None
+    component: int | None
+    kind: str
+    why: str = ""  # it was refused; empty where it was taken
+
+    def text(self) -> str:
+        """In words."""
+        ids = "" if self.system is None else f" of system {self.system}, component {self.component}"
+        return f"{self.kind}{ids} from {shown(self.address)}" + (f": {self.why}" if self.why else "")
+
+
+OTHERS = Seen(None, None, None, "others")
+
+
+def shown(address: Address) -> str:
+    """An address in words."""
+    if address is None:
+        return "the link's peer"
+    return f"[{address[0]}]:{address[1]}" if ":" in address[0] else f"{address[0]}:{address[1]}"
+
+
+def autopilot_name(number: int) -> str:
+    """Name of a MAV_AUTOPILOT."""
+    entry = mav.enums["MAV_AUTOPILOT"].get(number)
+    return str(number) if entry is None else entry.name.removeprefix("MAV_AUTOPILOT_")
+
+
+def check_allowed(senders: Iterable[str]) -> tuple[tuple[str, int | None], ...]:
+    """Read a list of allowed senders, ``ADDRESS`` or ``ADDRESS:PORT`` each.
+
+    Raises:
+        LinkError: what is neither.
+    """
+    out = []
+    for text in senders:
+        host, _, port = text.rpartition(":") if text.count(":") == 1 or (text.startswith("[") and "]:" in text) else (text, "", "")
+        try:
+            address = str(ipaddress.ip_address(host.strip("[]")))
+            number = int(port) if port else None
+        except ValueError:
+            raise LinkError(f"link.allow '{text}'; expected a numeric address such as 192.168.1.10, or 192.168.1.10:14550") from None
+        out.append((address, number))
+    return tuple(out)
+
+
+class Roster:
+    """The parties of a link and where they are.
+
+    Attributes:
+        at: address by party. heard: when it last spoke [s]. flying: whether parties are held to their addresses.
+        seen: counts of what came. refused: messages and datagrams that were not taken.
+        moved: called with a party that came back from another address. tell: is handed each sender that is refused, once.
+        simulated: whether a party has said that nothing real flies.
+    """
+
+    def __init__(self, parties: Iterable[Party] = (), allow: Iterable[str] = (), tell: Callable[[str], None] | None = None) -> None:
+        """Wait for them all.
+
+        Args:
+            parties: without one, the first valid message of anybody says who is heard and answered.
+            allow: addresses that may send at all; none: any.
+            tell: see above; never waits.
+        """
+        self.parties, self._allow, self.tell = tuple(parties), check_allowed(allow), tell
+        self.at: dict[str, Address] = {}
+        self.heard: dict[str, float] = {}
+        self.flying = self.simulated = False
+        self.seen: dict[Seen, int] = {}
+        self.refused = 0
+        self.moved: list[Callable[[Party], None]] = []
+        self._said: set[tuple] = set()
+
+    def shuts_out(self, address: Address) -> bool:
+        """Whether a datagram is not even looked into: not on the list, or from nobody's address in flight."""
+        if address is None:
+            return False
+        if self._allow and not any(host == address[0] and port in (None, address[1]) for host, port in self._allow):
+            self.refuse(Seen(address, None, None, "datagram", "not on link.allow"))
+            return True
+        if self.flying and self.parties and address not in self.at.values():
+            self.refuse(Seen(address, None, None, "datagram", "another sender while it flies"))
+            return True
+        return False
+
+    def refuse(self, seen: Seen) -> None:
+        """Count what is not taken, and say who sent it."""
+        self.refused += 1
+        self._count(seen)
+        who = (seen.address, seen.system, seen.component, seen.why)
+        if self.tell is not None and who not in self._said and len(self._said) < MOST_SAID:
+            self._said.add(who)
+            self.tell(f"refused: {seen.text()}")
+
+    def _count(self, seen: Seen) -> None:
+        seen = seen if seen in self.seen or len(self.seen) < MOST_KEPT else OTHERS
+        self.seen[seen] = self.seen.get(seen, 0) + 1
+
+    def admit(self, message: Any, address: Address, now: float) -> bool:
+        """Whether a message is one of a party's; binds the party to its address.
+
+        Args:
+            message: as parsed. address: of its sender. now: [s].
+        """
+        kind, system, component = message.get_type(), message.get_srcSystem(), message.get_srcComponent()
+        party = self._party(kind, system, component, address)
+        if party is None and any(p.has(system, component) and self.at.get(p.name, ...) == address for p in self.parties):
+            self._count(Seen(address, system, component, kind))  # a party's, that nobody asked for
+            return False
+        if self.parties:
+            why = self._objection(party, message, kind, address, now)
+        else:
+            why = None if self.at.setdefault("peer", address) == address else "a second sender"
+        if why is not None and why.startswith(NOT_YET):
+            self._count(Seen(address, system, component, kind, why))  # of no stranger: its first one is on its way
+            return False
+        if why is not None:
+            self.refuse(Seen(address, system, component, kind, why))
+            return False
+        self._count(Seen(address, system, component, kind))
+        if party is None:
+            return True
+        self.heard[party.name] = now
+        if kind == "NAMED_VALUE_INT" and message.name == SIMULATED:
+            self.simulated = bool(message.value)
+        if party.name not in self.at:
+            self.at[party.name] = address
+        elif self.at[party.name] != address:
+            self.at[party.name] = address
+            if self.tell is not None:
+                self.tell(f"the {party.name} speaks from {shown(address)} now")
+            for call in self.moved:
+                call(party)
+        return True
+
+    def _party(self, kind: str, system: int, component: int, address: Address) -> Party | None:
+        """Whose message it is by kind and ids; of a shared kind, one of theirs at this address first."""
+        ours = [party for party in self.parties if party.has(system, component)]
+        if kind in SHARED:
+            here = [party for party in ours if party.name in self.at and self.at[party.name] == address]
+            return next(iter([*here, *ours]), None)
+        return next((p for p in ours if kind in p.kinds), next((p for p in ours if not p.kinds), None))
+
+    def _objection(self, party: Party | None, message: Any, kind: str, address: Address, now: float) -> str | None:
+        """Why a message is not taken, or None."""
+        if party is None:
+            return f"nobody of this run, which expects {self.expected()}"
+        if party.autopilot is not None and kind == "HEARTBEAT" and message.autopilot != party.autopilot:
+            return f"it is a {autopilot_name(message.autopilot)}, expected is a {autopilot_name(party.autopilot)}"
+        if self.at.get(party.name, ...) == address:
+            return None
+        if party.name in self.at:
+            if self.flying:
+                return f"another sender while it flies; the {party.name} speaks from {shown(self.at[party.name])}"
+            if now - self.heard[party.name] < SILENT:
+                return f"a second sender; the {party.name} speaks from {shown(self.at[party.name])}"
+        first = "HEARTBEAT" if party.autopilot is not None else ", ".join(sorted(party.kinds))
+        return None if not first or kind in first.split(", ") else f"{NOT_YET} {first}"
+
+    def expected(self) -> str:
+        """The parties in words."""
+        texts = []
+        for p in self.parties:
+            what = "/".join(sorted(p.kinds)) if p.kinds else "all"
+            kind = "" if p.autopilot is None else f" {autopilot_name(p.autopilot)}"
+            texts.append(f"{p.name}{kind} as {p.system}/{p.component or 'any'} ({what})")
+        return ", ".join(texts) or "anybody"
+
+    def addresses(self, message: Any) -> tuple[Address, ...]:
+        """Where a message of ours goes: what names a target to the autopilot, the rest to all."""
+        if hasattr(message, "target_system") and "autopilot" in self.at:
+            return (self.at["autopilot"],)
+        return tuple(dict.fromkeys(self.at.values()))
+
+    def summary(self) -> dict[str, Any]:
+        """Who was heard from where, and what was refused, most first."""
+        refused = sorted(((n, seen) for seen, n in self.seen.items() if seen.why or seen is OTHERS), key=lambda row: -row[0])
+        return {
+            "at": {name: shown(address) for name, address in self.at.items()},
+            "refused": self.refused,
+            "refused_most": [{"count": n, "what": seen.text()} for n, seen in refused[:MOST_SAID]],
+        }

@@ -1,0 +1,127 @@
+"""Every way for a run to end, in hover and in throw, with each autopilot's fake: it lands or does what its table says, nothing
+is released, and the summary is there. Lock step; `test_processes` does the same with processes."""
+
+import os
+import signal
+
+import pytest
+
+from hil.cli.terminal import ENDING, Terminal
+from hil.control.loop import fly
+from hil.fakes.level import LevelPlant
+from tests.hil_flight import simple_policy
+from tests.loopback.wire import peers
+from visthrow.onboard.actions import hover_action
+
+KINDS = ("ardupilot", "px4", "betaflight")
+QUICK = ("states.check_hold=0.2", "states.armed_least=0.1", "states.quiet=0.1", "states.abort=0.6")
+NEVER = simple_policy((hover_action(9.81 * 0.272, 14.0)[0], 0.0, 0.0, 0.0, -1.0))
+STATES = {"armed": ("states.armed_least=9.0",), "throw": ()}
+"""In hover, and in a throw that the policy never ends."""
+
+LANDS = {"ardupilot": "mode 9", "px4": "mode 4.6"}
+"""What is asked for; Betaflight has no landing of its own: the runner flies a descent."""
+
+
+class Told:
+    """The terminal's signals, the loop's parts that raise, the end of the time: done a few ticks into a state."""
+
+    def __init__(self, way: str, state: str, kind: str, monkeypatch):
+        overrides = (*QUICK, *STATES[state], *(() if kind == "betaflight" else (f"{kind}.take=true",)))
+        self.runner, source, self.clock, self.fake = peers(LevelPlant(), kind=kind, loaded=NEVER, overrides=overrides)
+        self.way, self.state, self.done_at, self.ticks = way, state, None, 0
+        monkeypatch.setattr("sys.stdin", open(os.devnull))
+        self.saved = {number: signal.getsignal(number) for number in ENDING}
+        operator = Terminal(True, lambda: True, lambda text: None)
+        tick, poll = self.runner.tick, source.poll
+
+        def ticked(now, *args):
+            decision = tick(now, *args)
+            self.ticks += decision.state == state
+            if self.ticks == 5 and self.done_at is None:
+                self.done_at = now
+                self.act()
+            return decision
+
+        def polled(now):
+            if self.way == "source raises" and self.done_at is not None:
+                raise OSError("the network card has gone")
+            return poll(now)
+
+        self.runner.tick, source.poll = ticked, polled
+        try:
+            most = 2.4 if way == "time over" else float("inf")
+            self.summary = fly(self.runner, source, self.clock, operator, None, most, self.tell)
+        finally:
+            for number, handler in self.saved.items():
+                signal.signal(number, handler)
+
+    def tell(self, decision):
+        if self.way == "output raises" and self.done_at is not None and decision.state == self.state:
+            raise BrokenPipeError("nobody reads")
+
+    def act(self):
+        if self.way.startswith("SIG"):
+            os.kill(os.getpid(), getattr(signal, self.way))
+        if self.way == "Ctrl-C twice":
+            os.kill(os.getpid(), signal.SIGINT)
+            self.way = "SIGINT again"
+
+    @property
+    def after(self):
+        """What the vehicle did from then on, with the time since."""
+        return [(round(at - self.done_at, 2), text) for at, text in self.fake.events if at >= self.done_at - 1e-6]
+
+
+REASONS = {
+    "SIGINT": "the operator said abort (Ctrl-C)", "SIGTERM": "the process was told to end (SIGTERM)",
+    "SIGHUP": "the process was told to end (SIGHUP)", "SIGQUIT": "the process was told to end (SIGQUIT)",
+    "time over": "the time of the run is over", "source raises": "OSError: the network card has gone",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("state", STATES)
+@pytest.mark.parametrize("way", REASONS)
+def test_it_ends_by_landing(way, state, kind, monkeypatch):
+    run = Told(way, state, kind, monkeypatch)
+    assert (run.summary["aborted"], run.summary["reason"], run.summary["state"]) == (True, REASONS[way], "done")
+    assert (run.fake.witness.breaches, run.fake.witness.releases) == ([], 0)
+    if kind == "betaflight":
+        assert run.fake.override, "it is the runner that brings it down"
+        if way != "source raises":
+            asked = run.runner.hovering.place_w[2]
+            assert asked < 1.333 - 0.3 * 0.4, "a descent of 0.4 m/s, for 0.6 s"
+    else:
+        assert LANDS[kind] in [text for _, text in run.after]
+        if way != "time over":
+            assert next(at for at, text in run.after if text == LANDS[kind]) <= 0.06
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_second_ctrl_c_ends_it_at_once_and_it_lands_all_the_same(kind, monkeypatch):
+    """The landing was asked for by the first one; the summary is there."""
+    run = None
+    original = Terminal.words
+
+    def words(terminal, state):
+        found = original(terminal, state)
+        if found.abort and state == "abort":
+            os.kill(os.getpid(), signal.SIGINT)
+        return found
+
+    monkeypatch.setattr(Terminal, "words", words)
+    run = Told("SIGINT", "throw", kind, monkeypatch)
+    assert run.summary["aborted"]
+    assert run.summary["ticks"] > 5
+    assert run.runner.errors == []
+    for _ in range(20):
+        run.fake.step()
+    if kind != "betaflight":
+        assert LANDS[kind] in [text for _, text in run.after]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_terminal_that_raises_does_not_end_a_throw_without_landing(kind, monkeypatch):
+    run = Told("output raises", "armed", kind, monkeypatch)
+    assert run.summary["state"] == "throw" or run.summary["aborted"]

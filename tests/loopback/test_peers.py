@@ -1,0 +1,200 @@
+"""Who is on the wire, over UDP between sockets: strays, two senders, a bridge that restarts, another autopilot, cut recordings."""
+
+import contextlib
+import shutil
+import socket
+
+import pytest
+
+from hil.backends import make_backend
+from hil.links.device import check_device, open_port
+from hil.links.mavlink_link import Link
+from hil.links.pymav import mav
+from hil.links.roster import SILENT
+from hil.params import HilParams
+from hil.sources.mavlink import MavlinkSource
+from hil.sources.opening import open_source
+from tests.hil_runs import record_run, saved_policy
+from visthrow import config
+from visthrow.cli import main
+from visthrow.evidence.bench.hil_processes import free_port
+
+ATTITUDE = "SET_ATTITUDE_TARGET"
+
+
+class Wire:
+    """The runner's end of a link on a UDP port, and senders of any ids at others."""
+
+    def __init__(self, folder, base="fake", *overrides):
+        self.now, self.said = 0.0, []
+        self.number, self.other = free_port(), free_port()
+        given = (f'link.device="udp:127.0.0.1:{self.number}"', *(o.format(other=self.other) for o in overrides))
+        self.params = config.load(HilParams, config.find("hil", base), given)
+        self.source, self.link, _ = open_source(self.params, folder, 1.0, None, self.said.append)
+        self.backend = make_backend(self.params, self.link)
+
+    def peer(self, system=1, component=1, number=None):
+        """Somebody with a socket of its own, and what it hears."""
+        link, heard = Link(open_port(check_device(f"udpout:127.0.0.1:{number or self.number}")), system, component), []
+        link.listen(lambda message, arrival: heard.append(message.get_type()))
+        return link, heard
+
+    def poll(self, seconds=0.0):
+        self.now += seconds
+        self.source._clock = lambda: self.now
+        poses = self.source.poll(self.now)
+        self.backend.service(self.now)
+        return poses
+
+
+@pytest.fixture
+def wire(tmp_path):
+    with contextlib.ExitStack() as stack:
+        def make(*args):
+            made = Wire(tmp_path / "run", *args)
+            stack.callback(made.source.close)
+            return made
+
+        yield make
+
+
+def beat(autopilot=mav.MAV_AUTOPILOT_ARDUPILOTMEGA):
+    return mav.MAVLink_heartbeat_message(2, autopilot, 128, 4, 4, 3)
+
+
+def pose(x=1.0):
+    return mav.MAVLink_att_pos_mocap_message(5, [1.0, 0.0, 0.0, 0.0], x, 2.0, 3.0)
+
+
+def test_a_stray_byte_does_not_make_its_sender_the_vehicle(wire):
+    """It came first; the vehicle is heard all the same, and the stranger gets no command."""
+    run = wire()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+        stranger.sendto(b"\0", ("127.0.0.1", run.number))
+        run.poll()
+        vehicle, heard = run.peer()
+        vehicle.send(beat())
+        run.poll()
+        assert run.backend._heartbeat is not None
+        assert run.backend.send((2.7, 0.0, 0.0, 0.0), run.now)
+        vehicle.pump(lambda: 0.0)
+        assert ATTITUDE in heard
+        stranger.setblocking(False)
+        with pytest.raises(BlockingIOError):
+            stranger.recv(1000)
+
+
+def test_another_kind_of_autopilot_is_not_taken_for_the_vehicle(wire):
+    """A PX4 that happens to send to the port of a run that expects an ArduPilot: it is asked for nothing."""
+    run = wire()
+    other, heard = run.peer()
+    for _ in range(3):
+        other.send(beat(mav.MAV_AUTOPILOT_PX4))
+        run.poll(1.0)
+    other.pump(lambda: 0.0)
+    assert heard == []
+    assert run.backend.status(run.now).note == "no heartbeat"
+    (line,) = run.said
+    assert "it is a PX4, expected is a ARDUPILOTMEGA" in line
+
+
+def test_a_bridge_of_the_motion_capture_and_the_autopilot_share_a_port(wire):
+    """D3: poses of one sender, the vehicle of another, with the same ids."""
+    run = wire()
+    vehicle, bridge = run.peer()[0], run.peer()[0]
+    vehicle.send(beat())
+    run.poll()
+    bridge.send(pose())
+    assert [p.body for p in run.poll()] == ["vehicle"]
+    assert run.backend._heartbeat is not None
+    assert run.said == []
+
+
+def test_poses_come_on_a_port_of_their_own(wire):
+    """As `ardupilot.toml` has it: the autopilot on its own device, the poses by UDP."""
+    run = wire("fake", 'source.device="udp:127.0.0.1:{other}"')
+    vehicle, heard = run.peer()
+    bridge, asked = run.peer(number=run.other)
+    stray = run.peer(number=run.other)[0]
+    vehicle.send(beat())
+    bridge.send(pose())
+    run.poll()
+    vehicle.send(pose(9.0))  # on the autopilot's port nobody's poses are expected
+    stray.send(beat())
+    bridge.send(pose(2.0))
+    assert [p.pos[0] for p in run.poll(0.2)] == [2.0]
+    run.backend.send((2.7, 0.0, 0.0, 0.0), run.now)
+    vehicle.pump(lambda: 0.0)
+    bridge.pump(lambda: 0.0)
+    assert ATTITUDE in heard
+    assert set(asked) <= {"TIMESYNC", "HEARTBEAT"}
+    assert len(run.source.links) == 2
+
+
+def test_a_bridge_that_restarts_is_heard_again_on_the_ground_and_audited_anew(wire):
+    run = wire()
+    first = run.peer()[0]
+    first.send(beat())
+    run.poll()
+    audit = run.backend.audit
+    second, heard = run.peer()
+    run.source.hold(True)
+    run.now += 10.0
+    second.send(beat())
+    run.poll()
+    assert run.backend.audit is audit, "not in flight"
+    run.source.hold(False)
+    run.now += SILENT
+    second.send(beat())
+    run.poll(0.1)
+    assert run.backend.audit is not audit
+    second.pump(lambda: 0.0)
+    assert "PARAM_REQUEST_READ" in heard
+    assert any("the autopilot speaks from" in text for text in run.said)
+
+
+def test_check_says_who_is_heard_with_which_ids(tmp_path, capsys, monkeypatch):
+    number = free_port()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        poll, packer = MavlinkSource.poll, mav.MAVLink(None, 42, 7)
+        message = mav.MAVLink_vision_position_estimate_message(5, 1.0, 2.0, 3.0, 0.1, 0.2, 0.3)
+
+        def sending(source, now):
+            sender.sendto(message.pack(packer), ("127.0.0.1", number))
+            return poll(source, now)
+
+        monkeypatch.setattr(MavlinkSource, "poll", sending)
+        assert main(["hil", "check", "--seconds", "0.5", "--set", f'link.device="udp:127.0.0.1:{number}"']) == 1
+        port = sender.getsockname()[1]
+    out = capsys.readouterr().out
+    assert "vehicle: no pose" in out
+    assert "vehicle and payload not heard; expected: vehicle as 1/1 (ATT_POS_MOCAP), payload as 1/25 (ATT_POS_MOCAP)" in out
+    assert f"VISION_POSITION_ESTIMATE of system 42, component 7 from 127.0.0.1:{port}: nobody of this run" in out
+    monkeypatch.setattr(MavlinkSource, "poll", poll)
+    assert main(["hil", "check", "--seconds", "0.1", "--set", f'link.device="udp:127.0.0.1:{number}"']) == 1
+    assert f"nobody speaks on udp:127.0.0.1:{number}" in capsys.readouterr().out
+
+
+def test_a_replay_of_a_cut_recording_is_no_success(tmp_path, capsys):
+    record_run(tmp_path / "run", saved_policy(tmp_path), seconds=3.0)
+    assert main(["hil", "replay", str(tmp_path / "run")]) == 0
+    ticks = tmp_path / "run" / "ticks.jsonl"
+    rows = ticks.read_text().splitlines()
+    for kept, gone in ((rows[:6], len(rows) - 6), (rows[:50] + rows[53:], 3)):
+        shutil.copytree(tmp_path / "run", tmp_path / "cut", dirs_exist_ok=True)
+        (tmp_path / "cut" / "ticks.jsonl").write_text("\n".join(kept) + "\n")
+        capsys.readouterr()
+        assert main(["hil", "replay", str(tmp_path / "cut")]) == 1
+        assert f"CUT: {gone} of {len(rows)} ticks are missing" in capsys.readouterr().out
+    (tmp_path / "run" / "summary.json").unlink()
+    assert main(["hil", "replay", str(tmp_path / "run")]) == 1
+    assert "CUT: no summary" in capsys.readouterr().out
+
+
+def test_a_folder_that_holds_a_run_is_not_resumed(tmp_path, capsys):
+    record_run(tmp_path / "run", saved_policy(tmp_path), seconds=0.5)
+    number = free_port()
+    assert main(["hil", "run", "--seconds", "0.1", "--out", str(tmp_path / "run"), "--set", f'link.device="udp:127.0.0.1:{number}"']) == 2
+    said = capsys.readouterr().err
+    assert "holds a run already; name another folder with --out" in said
+    assert "resume" not in said

@@ -1,0 +1,154 @@
+"""Who may speak on a link: ids, type of autopilot, addresses that are held in flight; what is refused is counted and said."""
+
+import pytest
+
+from hil.errors import LinkError
+from hil.links.pymav import Parser, mav
+from hil.links.roster import MOST_KEPT, SILENT, SIMULATED, Party, Roster, check_allowed
+
+AUTOPILOT = Party("autopilot", 1, 1, autopilot=mav.MAV_AUTOPILOT_PX4)
+VEHICLE = Party("vehicle", 1, 1, frozenset({"ATT_POS_MOCAP"}))
+BALL = Party("payload", 42, 0, frozenset({"ODOMETRY"}))
+A, B, C = ("127.0.0.1", 1001), ("127.0.0.1", 1002), ("10.0.0.9", 14550)
+
+
+def wired(message, system=1, component=1):
+    (got,) = Parser().parse(message.pack(mav.MAVLink(None, system, component)))
+    return got
+
+
+def beat(autopilot=mav.MAV_AUTOPILOT_PX4, **ids):
+    return wired(mav.MAVLink_heartbeat_message(2, autopilot, 0, 0, 0, 3), **ids)
+
+
+def pose(**ids):
+    return wired(mav.MAVLink_att_pos_mocap_message(5, [1.0, 0.0, 0.0, 0.0], 1.0, 2.0, 3.0), **ids)
+
+
+def odometry(**ids):
+    return wired(
+        mav.MAVLink_odometry_message(7, 20, 12, 1.0, 2.0, 3.0, [1.0, 0, 0, 0], 0, 0, 0, 0, 0, 0, [0.0] * 21, [0.0] * 21), **ids
+    )
+
+
+def roster(*parties, **more):
+    said = []
+    return Roster(parties or (AUTOPILOT, VEHICLE, BALL), tell=said.append, **more), said
+
+
+def test_poses_and_autopilot_of_the_same_ids_come_from_two_senders():
+    """A bridge of the motion capture that uses the vehicle's own ids, beside the vehicle."""
+    who, said = roster()
+    assert who.admit(pose(), A, 0.0)
+    assert who.admit(beat(), B, 0.1)
+    assert who.admit(odometry(system=42, component=7), A, 0.2)
+    assert who.at == {"vehicle": A, "autopilot": B, "payload": A}
+    assert (who.refused, said) == (0, [])
+    assert who.addresses(mav.MAVLink_command_long_message(1, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0)) == (B,)
+    assert set(who.addresses(mav.MAVLink_timesync_message(0, 1))) == {A, B}
+    sync = wired(mav.MAVLink_timesync_message(5, 6))
+    assert who.admit(sync, A, 0.3), "either clock of system 1"
+    assert who.admit(sync, B, 0.3)
+    assert not who.admit(sync, C, 0.3)
+
+
+def test_an_autopilot_is_heard_from_its_first_right_heartbeat_on():
+    who, said = roster(AUTOPILOT)
+    other = wired(mav.MAVLink_sys_status_message(0, 0, 0, 0, 12000, 0, 0, 0, 0, 0, 0, 0, 0))
+    assert not who.admit(other, A, 0.0)
+    assert not who.admit(beat(mav.MAV_AUTOPILOT_ARDUPILOTMEGA), A, 0.1)
+    assert not who.at
+    assert who.admit(beat(), A, 0.2)
+    assert who.admit(other, A, 0.3)
+    assert not who.admit(beat(mav.MAV_AUTOPILOT_ARDUPILOTMEGA), A, 0.4), "at its own address as well"
+    assert who.refused == 2, "what came too early is of no stranger"
+    assert said == [
+        "refused: HEARTBEAT of system 1, component 1 from 127.0.0.1:1001: it is a ARDUPILOTMEGA, expected is a PX4",
+    ]
+
+
+def test_a_stranger_is_refused_counted_and_said_once():
+    who, said = roster()
+    for i in range(50):
+        assert not who.admit(pose(system=9, component=9), C, 0.01 * i)
+    (line,) = said
+    assert line.startswith("refused: ATT_POS_MOCAP of system 9, component 9 from 10.0.0.9:14550: nobody of this run, which expects")
+    assert "vehicle as 1/1 (ATT_POS_MOCAP)" in line
+    assert who.summary()["refused_most"][0]["count"] == who.refused == 50
+
+
+def test_what_a_party_sends_beside_its_own_is_neither_taken_nor_said():
+    who, said = roster(VEHICLE)
+    assert who.admit(pose(), A, 0.0)
+    assert not who.admit(beat(), A, 0.1)
+    assert (who.refused, said) == (0, [])
+    assert not who.admit(beat(), B, 0.1)
+    assert who.refused == 1
+
+
+def test_on_the_ground_a_party_that_fell_silent_comes_back_from_another_address():
+    who, said = roster()
+    back = []
+    who.moved.append(back.append)
+    assert who.admit(beat(), A, 0.0)
+    assert not who.admit(beat(), B, SILENT - 0.1), "two at once: the first one stays"
+    assert who.admit(beat(), A, SILENT)
+    assert not who.admit(beat(), B, 2.0 * SILENT - 0.1)
+    assert who.admit(beat(), B, 2.0 * SILENT + 0.1)
+    assert (who.at["autopilot"], back, said[-1]) == (B, [AUTOPILOT], "the autopilot speaks from 127.0.0.1:1002 now")
+    assert not who.admit(beat(), A, 2.0 * SILENT + 0.2)
+
+
+def test_in_flight_no_address_changes():
+    who, _ = roster()
+    assert who.admit(beat(), A, 0.0)
+    assert who.admit(pose(), A, 0.0)
+    who.flying = True
+    assert not who.admit(beat(), B, 100.0)
+    assert not who.admit(pose(), B, 100.0)
+    assert who.shuts_out(B), "unread"
+    assert not who.shuts_out(A)
+    assert not who.shuts_out(None), "a stream has one peer"
+    who.flying = False
+    assert not who.shuts_out(B)
+    assert who.admit(beat(), B, 101.0)
+
+
+def test_only_those_on_the_list_are_looked_at():
+    who, said = roster(allow=("10.0.0.9", "127.0.0.1:1002"))
+    assert [who.shuts_out(address) for address in (A, B, C, ("10.0.0.9", 5))] == [True, False, False, False]
+    assert said == ["refused: datagram from 127.0.0.1:1001: not on link.allow"]
+
+
+@pytest.mark.parametrize("text", ["example.org", "10.0.0.300", "10.0.0.9:x", "", "10.0.0.9:14550:1"])
+def test_a_list_of_allowed_senders_holds_addresses(text):
+    with pytest.raises(LinkError, match=r"link\.allow .*; expected a numeric address"):
+        check_allowed((text,))
+
+
+def test_an_open_link_answers_whoever_sent_the_first_valid_message():
+    who = Roster()
+    assert who.admit(pose(), A, 0.0)
+    assert not who.admit(pose(), B, 0.0)
+    assert who.addresses(beat()) == (A,)
+
+
+def test_no_flood_fills_the_memory():
+    who, said = roster()
+    for i in range(20_000):
+        who.admit(pose(system=9, component=i % 256), ("10.0.0.9", 1 + i), 0.0)
+    assert len(who.seen) <= MOST_KEPT + 1
+    assert who.refused == 20_000
+    assert len(said) <= 20
+
+
+def test_a_fake_says_that_it_is_one():
+    who, _ = roster()
+    word = wired(mav.MAVLink_named_value_int_message(0, SIMULATED.encode(), 1))
+    assert not who.admit(word, A, 0.0)
+    assert not who.simulated
+    who.admit(pose(), A, 0.0)
+    assert not who.admit(word, B, 0.0), "nobody says it for another one"
+    assert not who.simulated
+    who.admit(word, A, 0.1)
+    assert who.simulated

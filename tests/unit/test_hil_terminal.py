@@ -1,0 +1,126 @@
+"""The operator's terminal: lines, half lines, what is no text, signals; and a voice that holds nobody up."""
+
+import os
+import signal
+import threading
+import time
+
+import pytest
+
+from hil.cli.flight import require_fake
+from hil.cli.terminal import ENDING, PAUSING, Terminal, Voice
+from hil.control.decision import Decision, Words
+from hil.errors import RunError
+from hil.params import HilParams
+from visthrow import config
+
+
+@pytest.fixture
+def typed(monkeypatch):
+    """The writing end of standard input, and a way to make a terminal."""
+    read, write = os.pipe()
+    stdin = os.fdopen(read, "rb", buffering=0)
+    monkeypatch.setattr("sys.stdin", stdin)
+    saved = {number: signal.getsignal(number) for number in (*ENDING, *PAUSING)}
+    yield write
+    for number, handler in saved.items():
+        signal.signal(number, handler)
+    stdin.close()
+
+
+def test_lines_are_words_and_half_a_line_holds_nobody_up(typed):
+    terminal = Terminal()
+    os.write(typed, b"ar")
+    assert terminal.words("ready") == Words()
+    os.write(typed, b"m\nLAND \nnonsense\n")
+    assert terminal.words("ready") == Words(arm=True, land=True)
+    assert terminal.words("ready") == Words()
+    os.write(typed, b"\xff\xfe\xe9\nabort\n")
+    assert terminal.words("ready") == Words(abort=True), "bytes that are no text raise nothing"
+    os.write(typed, b"arm")
+    os.close(typed)
+    assert terminal.words("ready") == Words(arm=True), "the last line needs no end"
+    assert terminal.words("ready") == Words()
+
+
+@pytest.mark.parametrize("number", ENDING)
+def test_signals_that_would_end_the_process_say_abort(typed, number):
+    terminal = Terminal()
+    os.kill(os.getpid(), number)
+    words = terminal.words("throw")
+    assert words.abort
+    assert signal.Signals(number).name in words.why or "Ctrl-C" in words.why
+    assert terminal.words("abort") == words, "it stays said"
+    if number != signal.SIGINT:
+        os.kill(os.getpid(), number)  # systemd says it again; nothing raises
+        assert terminal.words("abort") == words
+
+
+def test_only_a_second_ctrl_c_raises(typed):
+    terminal = Terminal()
+    os.kill(os.getpid(), signal.SIGTERM)
+    os.kill(os.getpid(), signal.SIGINT)
+    assert terminal.words("throw").abort
+    with pytest.raises(KeyboardInterrupt):
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(0.1)
+
+
+@pytest.mark.parametrize("number", PAUSING)
+def test_ctrl_z_does_not_stop_it_in_mid_flight(typed, number):
+    Terminal()
+    assert signal.getsignal(number) is signal.SIG_IGN
+
+
+def test_auto_arm_is_for_what_says_that_it_is_simulated(typed):
+    said, simulated = [], []
+    terminal = Terminal(True, lambda: bool(simulated), said.append)
+    assert not terminal.words("ready").arm
+    assert not terminal.words("ready").arm
+    assert len(said) == 1
+    assert "does not say that it is simulated" in said[0]
+    simulated.append(1)
+    assert not terminal.words("check").arm
+    assert terminal.words("ready").arm
+    assert not Terminal(False, lambda: True).words("ready").arm
+
+
+@pytest.mark.parametrize(
+    ("base", "override"),
+    [("ardupilot", "throws=1"), ("fake", 'link.device="udp:192.168.1.2:14560"'), ("vicon", "throws=1"),
+     ("fake_betaflight", 'betaflight.device="serial:/dev/ttyACM0:115200"'), ("fake", 'source.device="udp:10.0.0.1:14561"')],
+)  # fmt: skip
+def test_auto_arm_is_refused_for_what_is_not_on_this_machine(base, override):
+    params = config.load(HilParams, config.find("hil", base), (override, "link.remote=true"))
+    with pytest.raises(RunError, match="--auto-arm with .*; it is for `visthrow hil fake` on this machine alone"):
+        require_fake(params)
+    require_fake(config.load(HilParams, config.find("hil", "fake_betaflight")))
+
+
+def test_a_terminal_that_takes_nothing_holds_nobody_up(monkeypatch):
+    gate = threading.Event()
+
+    class Stuck:
+        def write(self, text):
+            gate.wait(10.0)
+            raise BrokenPipeError
+
+        def flush(self):
+            pass
+
+    monkeypatch.setattr("sys.stderr", Stuck())
+    voice, start = Voice(), time.monotonic()
+    for _ in range(5000):
+        voice.say("x")
+    assert time.monotonic() - start < 1.0
+    gate.set()
+    voice.close()
+
+
+def test_a_reason_is_not_said_twice(capsys):
+    voice = Voice()
+    for state, reason, waits in (("abort", "no", ""), ("done", "no", ""), ("idle", "start", "no pose"), ("idle", "start", "disarmed")):
+        voice.decision(Decision(1.0, state, reason, waits=waits))
+    voice.close()
+    said = [line.split(maxsplit=2)[2] for line in capsys.readouterr().err.splitlines()]
+    assert [" ".join(line.split()) for line in said] == ["abort no", "done", "idle start", "idle waits: no pose", "idle waits: disarmed"]
