@@ -35,11 +35,12 @@ def throw(folder: Path, settings: Path, distance: float, seed: int, args: argpar
     shutil.copy(settings / "eeprom.bin", folder)
     firmware = Firmware(program(), folder)
     firmware.start()
+    told = open(folder / "run.txt", "w")  # noqa: SIM115 - the runner's; it ends with it
     runner = subprocess.Popen(
         [sys.executable, "-m", "visthrow.cli", "hil", "run", "--config", args.config, "--auto-arm", "--speed", str(args.speed),
          "--out", str(folder / "run"), "--set", f"goal_w=[{distance},0.0,0.0]", "--set", "realtime.priority=10", "--set",
          "states.abort=0.5", "--set", f'policy="{args.policy}"'],
-        stdout=open(folder / "run.txt", "w"), stderr=subprocess.STDOUT,
+        stdout=told, stderr=subprocess.STDOUT,
     )  # fmt: skip
     fake = None
     try:

@@ -130,9 +130,14 @@ class MotorPlant(WirePlant):
         self._look()
         self.force_b = np.array([0.0, 0.0, GRAVITY])
 
+    def look(self) -> dict[str, np.ndarray]:
+        """Attitude, velocity, rates, motor_speed [rad/s] and voltage [V] now: what a period needs."""
+        names = ("quat_wb", "vel_w", "rate_b", "motor_speed", "voltage")
+        return {name: value[0] for name, value in zip(names, self._plant.look(*names))}
+
     def _look(self) -> None:
-        now = self._plant.look("quat_wb", "vel_w", "rate_b", "motor_speed", "voltage")
-        self.quat_wb, self._vel_w, self.rate_b, self._speed, self._voltage = (each[0] for each in now)
+        self._now = self.look()
+        self.quat_wb, self.rate_b = self._now["quat_wb"], self._now["rate_b"]
 
     def _built(self, experiment: Experiment) -> HybridPlant:
         queue = dataclasses.replace(experiment.vehicle.queue, delay=0.0)  # the firmware's own path comes in its place
@@ -147,14 +152,14 @@ class MotorPlant(WirePlant):
 
     def step(self, command: np.ndarray, release: bool, after: float = 0.0) -> None:
         """Advance by one period under motor commands, 0 to 1, shape (4,); release: see `WirePlant`."""
-        vel_w = self._vel_w
-        speed = self._full_speed * np.clip(command, 0.0, 1.0) * self._voltage / self._reference
+        vel_w = self._now["vel_w"]
+        speed = self._full_speed * np.clip(command, 0.0, 1.0) * self._now["voltage"] / self._reference
         super().step(speed, release and not self.held, after)
         self._look()
         if self._stand is None:
-            push_w = (self._vel_w - vel_w) / self.period + np.array([0.0, 0.0, GRAVITY])
+            push_w = (self._now["vel_w"] - vel_w) / self.period + np.array([0.0, 0.0, GRAVITY])
             self.force_b = turned_back(self.quat_wb, push_w)
-        elif self._k_f * np.sum(self._speed**2) < self.mass[0] * GRAVITY:
+        elif self._k_f * np.sum(self._now["motor_speed"] ** 2) < self.mass[0] * GRAVITY:
             self._plant.hold(self._stand)
             self._look()
         else:
