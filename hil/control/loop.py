@@ -2,6 +2,7 @@
 
 import gc
 import math
+import re
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -26,7 +27,9 @@ point of their periods."""
 GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
 
 SAY_AGAIN = 3.0
-"""Between two words on why it does not go on [s]."""
+"""Between two words on why it does not go on that differ in their numbers alone [s]."""
+
+NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?")
 
 COLLECT_ALL = 50
 """Ticks between two looks of the garbage collector at all that was made since the start; the others see the last tick's."""
@@ -103,8 +106,9 @@ class Loop:
     count: int = 0
     throws: list[float] = field(default_factory=list)  # times of the latches [s]
     _ended: float = -math.inf
-    _said: tuple[str, str] = ("", "")
-    _said_at: float = -math.inf
+    _state: str = ""
+    _waits: str = ""
+    _said: dict[str, float] = field(default_factory=dict)  # reasons to wait, without their numbers, and when they were said [s]
 
     def __post_init__(self) -> None:
         self.ticker = Ticker(self.clock, self.runner.pilot.period)
@@ -146,11 +150,15 @@ class Loop:
         self._ended = clock.now()
 
     def _tell(self, decision: Decision) -> None:
-        """Say a change of state at once, a change of what it waits for every few seconds: numbers in it change with each tick."""
-        said = decision.state, decision.waits
-        fresh = said[0] != self._said[0] or (said != self._said and decision.time - self._said_at >= SAY_AGAIN)
-        if self.tell is not None and fresh:
-            self._said, self._said_at = said, decision.time
+        """Say a change of state and a new reason to wait at once, and one that differs in its numbers alone every few seconds."""
+        waits, now = decision.waits, decision.time
+        kind = NUMBER.sub("", waits)
+        if decision.state != self._state:
+            self._state, self._said = decision.state, {}
+        elif not waits or waits == self._waits or now - self._said.get(kind, -math.inf) < SAY_AGAIN:
+            return
+        self._said[kind], self._waits = now, waits
+        if self.tell is not None:
             self.tell(decision)
 
     def summary(self) -> dict[str, Any]:

@@ -188,8 +188,8 @@ def test_betaflight_with_all_channels_arms_with_the_throttle_low_and_disarms_in_
 TRAPS = {
     "ardupilot": {"GUID_OPTIONS": 0.0, "ATC_ANGLE_BOOST": 1.0, "GUID_TIMEOUT": 3.0, "EK3_SRC1_POSXY": 3.0,
                   "GRIP_ENABLE": 0.0, "SERVO9_FUNCTION": 33.0},
-    "px4": {"COM_OF_LOSS_T": 5.0, "COM_OBL_RC_ACT": 0.0, "EKF2_EV_CTRL": 0.0, "PD_GRIPPER_EN": 0.0, "PD_GRIPPER_TO": 6.0, "PWM_AUX_FUNC1": 301.0,
-            "PWM_AUX_MIN1": 900.0},
+    "px4": {"COM_OF_LOSS_T": 5.0, "COM_OBL_RC_ACT": 0.0, "EKF2_EV_CTRL": 0.0, "PD_GRIPPER_EN": 0.0, "PD_GRIPPER_TO": 6.0,
+            "PWM_AUX_FUNC1": 301.0, "PWM_AUX_MIN1": 900.0},
     "betaflight": {"rates_type": 0, "roll_rc_rate": 7, "pitch_rate": 67, "yaw_expo": 50, "deadband": 5, "min_check": 1000,
                    "mid_rc": 1510, "failsafe_delay": 2.0},
 }  # fmt: skip

@@ -30,7 +30,7 @@ class Told:
         overrides = (*QUICK, *STATES[state], *(() if kind == "betaflight" else (f"{kind}.take=true",)))
         self.runner, source, self.clock, self.fake = peers(LevelPlant(), kind=kind, loaded=NEVER, overrides=overrides)
         self.way, self.state, self.done_at, self.ticks = way, state, None, 0
-        monkeypatch.setattr("sys.stdin", open(os.devnull))
+        monkeypatch.setattr("sys.stdin", None)
         self.saved = {number: signal.getsignal(number) for number in ENDING}
         operator = Terminal(True, lambda: True, lambda text: None)
         tick, poll = self.runner.tick, source.poll

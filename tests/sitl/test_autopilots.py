@@ -4,7 +4,7 @@ Each is run where its address stands in the environment, and skipped where nothi
 
     VISTHROW_SITL_ARDUPILOT=tcp:127.0.0.1:5760     arducopter --model quad, or sim_vehicle.py
     VISTHROW_SITL_PX4=udp:127.0.0.1:14540          PX4's offboard port, make px4_sitl sihsim_quadx
-    VISTHROW_SITL_BETAFLIGHT=tcp:127.0.0.1:5761    betaflight_SITL.elf, first serial port, feature RX_MSP
+    VISTHROW_SITL_BETAFLIGHT=tcp:127.0.0.1:5761    betaflight_SITL.elf, first serial port; set up as hil/README.md says
 
 They prove protocol, order and failsafes; nothing of aerodynamics, cable or policy.
 """
@@ -21,8 +21,10 @@ from hil.errors import LinkError
 from hil.links.device import check_device, open_port
 from hil.links.mavlink_link import Link
 from hil.links.pymav import mav
+from hil.links.roster import Roster
 from hil.links.sync import LinkSync
 from hil.params import HilParams
+from hil.sources.opening import parties
 from visthrow import config
 
 pytestmark = pytest.mark.sitl
@@ -37,6 +39,13 @@ PERIOD = 0.02
 """Between two commands [s]."""
 
 
+POSITION = 60.0
+"""ArduPilot's estimator takes so long at most to know where the vehicle is [s]."""
+
+HOVER_SHARE = {"ardupilot": ("ardupilot.thrust.hover=0.39",), "px4": (), "betaflight": ()}
+"""Of the vehicle in the autopilot's own software: with the fakes' share it does not lift, or shoots away."""
+
+
 class Bench:
     """An autopilot in software, spoken to by hand."""
 
@@ -45,17 +54,18 @@ class Bench:
         if not address:
             pytest.skip(f"VISTHROW_SITL_{kind.upper()} is not set")
         names = {"ardupilot": "fake", "px4": "fake_px4", "betaflight": "fake_betaflight"}
-        self.kind, self.params = kind, config.load(HilParams, config.find("hil", names[kind]), overrides)
+        self.kind = kind
+        self.params = config.load(HilParams, config.find("hil", names[kind]), (*HOVER_SHARE[kind], *overrides))
         try:
             port = open_port(check_device(address))
         except LinkError as error:
             pytest.skip(str(error))
-        self.link, self.rates = None, []
+        self.link, self.rates, self.placed = None, [], False
         self.tables: list[str] = []
         if kind == "betaflight":
             self.backend = Betaflight(port, self.params.betaflight, False, self.tables.append)
         else:
-            self.link = Link(port, 245, 191)
+            self.link = Link(port, 245, 191, roster=Roster(parties(self.params, False, True)))
             LinkSync(self.link)
             self.link.listen(self._hear)
             self.backend = make_backend(self.params, self.link, True, self.tables.append)
@@ -63,6 +73,7 @@ class Bench:
     def _hear(self, message, arrival):
         if message.get_type() == "ATTITUDE":
             self.rates.append((arrival, message.rollspeed))
+        self.placed |= message.get_type() == "LOCAL_POSITION_NED"
 
     @property
     def status(self):
@@ -139,14 +150,18 @@ def test_every_parameter_of_the_audit_exists(bench, kind):
 def test_clocks_are_known(bench, kind):
     desk = bench(kind, *NO_MECHANISM[kind])
     desk.turn(3.0)
-    peer = desk.link.sync.peers[1]
+    (peer,) = (clock for (system, _), clock in desk.link.sync.peers.items() if system == 1)
     assert peer.offset is not None
     assert peer.round_trip < 0.05
 
 
-def flying(desk):
-    """Taken over and armed, commands followed; on the ground, with a thrust that does not lift."""
+def flying(desk, placed=False):
+    """Taken over and armed, commands followed; on the ground, with a thrust that does not lift. ``placed``: its position is known."""
     params = getattr(desk.params, desk.kind)
+    if placed and desk.kind == "ardupilot":
+        values = (mav.MAV_CMD_SET_MESSAGE_INTERVAL, 0, mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED, 100_000.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        desk.link.send(mav.MAVLink_command_long_message(1, 1, *values))
+        assert desk.turn(POSITION, until=lambda: desk.placed), "no position"
     idle = (0.3 * params.thrust.weight, 0.0, 0.0, 0.0)
     desk.turn(30.0, idle, FOLLOW, until=lambda: desk.status.mode == FOLLOW)
     status = desk.status
@@ -155,11 +170,12 @@ def flying(desk):
 
 
 TAKE = {
-    "ardupilot": ("ardupilot.take=true", "ardupilot.arm=true", "ardupilot.follow_mode=20", "ardupilot.audit=false"),
+    "ardupilot": ("ardupilot.take=true", "ardupilot.arm=true", "ardupilot.follow_mode=20"),
     "px4": ("px4.arm=true", "px4.audit=false"),
     "betaflight": ("betaflight.audit=false",),
 }
-"""Bench settings: the runner arms; GUIDED_NOGPS needs no position."""
+"""Bench settings: the runner arms; GUIDED_NOGPS needs no position. ArduPilot's parameters are written: without GUID_OPTIONS a thrust is
+a climb rate."""
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -200,7 +216,7 @@ def test_the_autopilots_own_hold_takes_over(bench, kind):
     """It needs a position: in ArduPilot's software the simulated GPS, in PX4's whatever its estimator is fed with."""
     more = ("ardupilot.hold_mode=5", "ardupilot.follow_mode=4") if kind == "ardupilot" else ()
     desk = bench(kind, *NO_MECHANISM[kind], *TAKE[kind], *more)
-    params = flying(desk)
+    params = flying(desk, placed=True)
     lift = (1.3 * params.thrust.weight, 0.0, 0.0, 0.0)
     desk.turn(2.0, lift)
     desk.turn(5.0, lift, HOLD, until=lambda: desk.status.mode == HOLD)

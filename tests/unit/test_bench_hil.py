@@ -170,13 +170,25 @@ def test_a_minute_at_200_hz(tmp_path):
         assert abs(figures["memory_bytes_per_s"]) < MOST_GROWTH
 
 
+TOLD = (
+    *(f"{name}{where}" for name in ("ctrl-c", "sigterm", "sighup") for where in ("", "-in-hover")), "time-over",
+)  # fmt: skip
+"""Ways for a run to end that it hears of."""
+
+ITSELF = {"ardupilot": "levelled: no set-points", "px4": "left OFFBOARD: no set-points",
+          "betaflight": "override: the pilot's sticks count again"}  # fmt: skip
+"""What each kind does by itself when nobody speaks any more."""
+
+LANDS = {"ardupilot": "mode 9", "px4": "mode 4.6"}
+
 FLOWN_THROUGH = {"none", "clock-forth", "clock-back", "shuffle", "double", "late", "disk-full"}
 ENDS = {
     **dict.fromkeys(("stop", "repeat", "swap", "jump", "order", "zero-quaternion", "nan-quaternion"), ("recover", "abort")),
     **dict.fromkeys(("reset", "stuck", "in-progress", "no-answer"), ("recover", "abort")),
     **dict.fromkeys(("payload-lost", "rare"), ("recover",)),
-    **dict.fromkeys(("silent", "taken", "not-armed", "no-numbers", "ctrl-c", "denied"), ("abort",)), "limits": ("throw",),
-    "no-arming": ("ready", "abort"), "killed": (), "very-late": (), "slow-mechanism": ("refused",),
+    **dict.fromkeys(("silent", "taken", "not-armed", "no-numbers", "denied", *TOLD, "ctrl-c-twice"), ("abort",)), "limits": ("throw",),
+    "killed": (), "killed-in-hover": (),
+    "no-arming": ("ready", "abort"), "very-late": (), "slow-mechanism": ("refused",),
 }  # fmt: skip
 """By fault what the runner does from then on, in this order, maybe with more between and after."""
 
@@ -195,13 +207,33 @@ def test_every_fault_over_udp(tmp_path):
         assert all(wanted in steps for wanted in ENDS.get(name, ())), (name, found["states"])
         case = hil_faults.known_cases()[name]
         if case.since in ("fault", "act"):
-            assert found["began_in"] == "throw", name
+            assert found["began_in"] == ("armed" if name.endswith("-in-hover") else "throw"), name
         if name in FLOWN_THROUGH:
             assert found["states"] == [], name
     assert [event["what"] for event in figures["killed"]["events"]] == ["levelled: no set-points"]
 
 
-@pytest.mark.parametrize("words", [["swop"], ["none", "--jobs", "0"], ["none", "--speed", "2"]])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["ardupilot", "px4", "betaflight"])
+def test_every_way_to_end_a_run_over_udp(kind, tmp_path):
+    """In hover and in throw: it lands, or does by itself what the table says; the summary is there."""
+    out, names = tmp_path / "faults.json", (*TOLD, "ctrl-c-twice", "killed", "killed-in-hover")
+    assert main(["bench", "hil", "--faults", *names, "--kind", kind, "--speed", "0.5", "--json", str(out)]) == 0
+    figures = json.loads(out.read_text())["figures"]
+    assert set(figures) == set(names) == {name for name, case in hil_faults.known_cases().items() if case.ends}
+    for name, found in figures.items():
+        assert (found["breaches"], found["releases"]) == ([], 0), name
+        assert found["summary"] == ("killed" not in name), name
+        events = [event["what"] for event in found["events"]]
+        if "killed" in name:
+            assert ITSELF[kind] in events, name
+        elif kind in LANDS:
+            assert LANDS[kind] in events, name
+        if "killed" not in name:
+            assert found["states"][0]["what"].startswith("abort"), name
+
+
+@pytest.mark.parametrize("words", [["swop"], ["none", "--jobs", "0"], ["none", "--speed", "2"], ["none", "--kind", "px4"]])
 def test_faults_that_cannot_be_injected(words, capsys):
     assert main(["bench", "hil", "--faults", *words]) == 2
-    assert re.search("did you mean 'swap'|expected 1 or more, and", capsys.readouterr().err)
+    assert re.search("did you mean 'swap'|expected 1 or more, and|expected ctrl-c, ", capsys.readouterr().err)

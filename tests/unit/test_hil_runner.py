@@ -306,6 +306,47 @@ def test_a_policy_that_saturates_stays_within_its_limits_and_the_fence_ends_it()
     assert changes(decisions)[-1][1].startswith("fence: ")
 
 
+def narrowed(pilot, high):
+    """From the recovery on the vehicle's fence ends so far ahead [m]: it is outside of it."""
+    tight = dataclasses.replace(pilot.params.fence, vehicle_high=(high, 2.5, 2.8))
+
+    def watch(time, decision):
+        if decision.state == "recover":
+            object.__setattr__(pilot.params, "fence", tight)
+
+    return watch
+
+
+def test_a_fence_that_is_left_after_the_throw_lands_and_is_no_abort():
+    """The payload is off, the vehicle brakes: what was to be done is done. It comes down at once, and says why."""
+    pilot = runner(AT_ONCE, "throws=2")
+    decisions = fly(pilot, 20.0, watch=narrowed(pilot, -0.5))
+    safe(pilot, decisions)
+    assert [state for state, _ in changes(decisions)][-4:] == ["throw", "recover", "land", "done"]
+    assert when(decisions, "land") - when(decisions, "recover") <= 2 * TICK
+    assert dict(changes(decisions))["land"].startswith("after the throw, fence: vehicle x")
+    assert (pilot.summary()["aborted"], len(pilot.latch.landings)) == (False, 1)
+    assert pilot.summary()["left_fence"].startswith("vehicle x")
+
+
+def test_a_fence_that_is_left_with_the_payload_on_still_aborts():
+    pilot = runner(NEVER, "states.throw=1.0")
+    decisions = fly(pilot, 20.0, watch=narrowed(pilot, -0.5))
+    safe(pilot, decisions)
+    assert dict(changes(decisions))["abort"].startswith("fence: vehicle x")
+
+
+def test_a_throw_that_does_not_begin_says_what_is_in_the_way():
+    """The vehicle drifts while it is armed, beyond where a throw may begin; then the thrust is wrong. Neither is called a swing."""
+    pilot = runner(AT_ONCE, "states.armed=1.5", "states.armed_least=1.0")
+    pilot._thrust_off = lambda: ["hovering takes 1.10 times the weight"] if pilot.machine.state == "armed" else []
+    decisions = fly(pilot, 5.0)
+    assert ("ready", "disarmed: hovering takes 1.10 times the weight") in changes(decisions)
+    waits = [d.waits for d in decisions if d.state == "armed"]
+    assert "hovering takes 1.10 times the weight" in waits[1]
+    assert all(d.waits == "" for d in decisions if d.state == "throw")
+
+
 def test_no_exception_leaves_the_runner():
     pilot = runner(NEVER)
 

@@ -62,8 +62,7 @@ def test_only_a_second_ctrl_c_raises(typed):
     os.kill(os.getpid(), signal.SIGINT)
     assert terminal.words("throw").abort
     with pytest.raises(KeyboardInterrupt):
-        os.kill(os.getpid(), signal.SIGINT)
-        time.sleep(0.1)
+        terminal._told_to_end(signal.SIGINT, None)
 
 
 @pytest.mark.parametrize("number", PAUSING)
@@ -92,7 +91,7 @@ def test_auto_arm_is_for_what_says_that_it_is_simulated(typed):
 )  # fmt: skip
 def test_auto_arm_is_refused_for_what_is_not_on_this_machine(base, override):
     params = config.load(HilParams, config.find("hil", base), (override, "link.remote=true"))
-    with pytest.raises(RunError, match="--auto-arm with .*; it is for `visthrow hil fake` on this machine alone"):
+    with pytest.raises(RunError, match=r"--auto-arm with .*; it is for `visthrow hil fake` on this machine alone"):
         require_fake(params)
     require_fake(config.load(HilParams, config.find("hil", "fake_betaflight")))
 

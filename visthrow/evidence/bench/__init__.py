@@ -93,6 +93,7 @@ def _add_hil(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument("--out", default="out/hil", metavar="FOLDER", help="of the series (default: out/hil)")
     parser.add_argument("--keep-runs", action="store_true", help="keep the run folder of each throw, for hil view")
+    parser.add_argument("--kind", default="ardupilot", help="of fake in faults; other kinds fly the ways for a run to end")
     parser.add_argument("--faults", nargs="*", metavar="NAME", help="inject these faults instead (default: each in turn)")
     parser.add_argument("--json", metavar="FILE", help="write the printed figures to this file as well")
 

@@ -19,7 +19,7 @@ import torch
 
 from visthrow.common.errors import VisthrowError, suggest
 from visthrow.evidence.bench.hil import json_lines
-from visthrow.evidence.bench.hil_processes import ENDED, Pair, own_cores
+from visthrow.evidence.bench.hil_processes import CONFIGS, ENDED, Pair, own_cores
 from visthrow.evidence.bench.hil_soak import STILL, never_releasing
 from visthrow.evidence.bench.hil_throws import side_by_side
 from visthrow.evidence.bench.records import Report, Table
@@ -29,6 +29,12 @@ MOCAP, AUTOPILOT, OWN = "Motion capture", "The autopilot", "The runner itself"
 
 START = 2.5
 """When a fault begins [s]."""
+
+STARTS = 6.0
+"""For which a fake that is there first waits for its run [s]."""
+
+ENOUGH = 6.0
+"""Time of a run that ends in its throw [s]: the fake's start, and what there is before a throw."""
 
 LENGTHS = {MOCAP: 1.2, AUTOPILOT: 4.0, OWN: 2.5}
 """How long it is watched [s]: a heartbeat may be missing for three."""
@@ -66,7 +72,7 @@ class Case:
         run: settings of the run. fake: arguments of the fake.
         act: done to the run's process in mid throw. since: what times count from: `START` on the
         vehicle's clock ("fault"), the deed ("act"), or the run's latch or first tick in a state.
-        refused: whether the run does not even start.
+        refused: whether the run does not even start. ends: whether it is a way for the run to end, and so flown with any kind.
     """
 
     text: str
@@ -77,6 +83,7 @@ class Case:
     act: Act | None = None
     since: str = "fault"
     refused: bool = False
+    ends: bool = False
 
 
 def _pause(seconds: float) -> Act:
@@ -116,6 +123,26 @@ def _answer(answer: str, text: str) -> Case:
     return Case(text, AUTOPILOT, "at once", HERE, ("--answer", answer), since="latch")
 
 
+ENDS = {
+    "ctrl-c": ("Ctrl-C", signal.SIGINT), "sigterm": ("SIGTERM (systemd, timeout, shutdown)", signal.SIGTERM),
+    "sighup": ("SIGHUP (ssh is gone, the terminal closed)", signal.SIGHUP), "killed": ("the runner is killed (SIGKILL)", signal.SIGKILL),
+}  # fmt: skip
+"""Ways for a run to be ended from outside, and the signals."""
+
+HOVERS = ("states.armed_least=9.0",)
+"""Armed it hovers, until its time for that is over."""
+
+
+def _ending(text: str, number: int, run: tuple[str, ...] = ()) -> Case:
+    return Case(text, OWN, run=run, act=_signal(number), since="act", ends=True)
+
+
+def _twice(folder: Path, pid: int, speed: float) -> None:
+    os.kill(pid, signal.SIGINT)
+    time.sleep(0.2 / speed)
+    os.kill(pid, signal.SIGINT)
+
+
 CASES = {
     "silent": Case("the autopilot falls silent", AUTOPILOT, fake=_option(f"silent_after={START}")),
     "taken": Case("the pilot takes the vehicle into another mode", AUTOPILOT, fake=_option(f"taken_after={START}")),
@@ -134,8 +161,10 @@ CASES = {
     "late": Case("a tick is 0.15 s late", OWN, act=_pause(0.15), since="act"),
     "very-late": Case("a tick is 0.8 s late", OWN, act=_pause(0.8), since="act"),
     "disk-full": Case("the disk is full", OWN, act=_fill_disk, since="act"),
-    "ctrl-c": Case("Ctrl-C", OWN, act=_signal(signal.SIGINT), since="act"),
-    "killed": Case("the runner is killed (SIGKILL)", OWN, act=_signal(signal.SIGKILL), since="act"),
+    **{name: _ending(text, signal) for name, (text, signal) in ENDS.items()},
+    **{f"{name}-in-hover": _ending(f"{text}, in hover", signal, HOVERS) for name, (text, signal) in ENDS.items()},
+    "ctrl-c-twice": Case("Ctrl-C twice", OWN, act=_twice, since="act", ends=True),
+    "time-over": Case("the time of --seconds is over", OWN, since="time", ends=True),
 }  # fmt: skip
 
 
@@ -195,6 +224,8 @@ def faults(args: argparse.Namespace) -> Report:
     Raises:
         VisthrowError: an unknown name, no process at all, or a speed out of range.
     """
+    if args.kind not in CONFIGS:
+        raise VisthrowError(f"--kind {args.kind}; {suggest(args.kind, CONFIGS)}")
     if not (args.jobs >= 1 and 0.05 <= args.speed <= 1.0):
         raise VisthrowError(f"--jobs {args.jobs}, --speed {args.speed}; expected 1 or more, and 0.05 to 1")
     cases = known_cases()
@@ -207,9 +238,13 @@ def faults(args: argparse.Namespace) -> Report:
         made = policies(Path(folder))
 
         def inject(name: str, cores: tuple[int | None, int | None]) -> tuple[str, dict[str, Any]]:
-            return name, _one(cases[name], made[cases[name].policy], Path(folder) / name, cores, args.speed)
+            return name, _one(cases[name], made[cases[name].policy], Path(folder) / name, cores, args.speed, args.kind)
 
-        names = [name for name in cases if name in (args.faults or cases)]
+        flown = {name for name in cases if args.kind == "ardupilot" or cases[name].ends}
+        odd = [name for name in args.faults if name not in flown]
+        if odd:
+            raise VisthrowError(f"--kind {args.kind} with {', '.join(odd)}; expected {', '.join(sorted(flown))}")
+        names = [name for name in cases if name in (args.faults or flown)]
         done = dict(_announced(side_by_side(inject, names, own_cores(args.jobs))))
         for name in names:
             case, found = cases[name], done[name]
@@ -243,16 +278,19 @@ def _told(steps: list[dict[str, Any]]) -> str:
 
 
 def _one(
-    case: Case, policy: Path, folder: Path, cores: tuple[int | None, int | None], speed: float
+    case: Case, policy: Path, folder: Path, cores: tuple[int | None, int | None], speed: float, kind: str
 ) -> dict[str, Any]:  # fmt: skip
     length, clock = LENGTHS[case.group], ("--speed", str(speed))
-    run = ["--config", "fake", *clock, "--set", f'policy="{policy}"']
+    run = [*clock, "--set", f'policy="{policy}"']
     for setting in (*(f"{key}={value}" for key, value in QUICK.items()), *case.run):
         run += ["--set", setting]
-    fake = (*STILL, *clock, "--seconds", str(START + length), *case.fake)
+    early = STARTS if kind == "betaflight" else 0.0  # its fake is there first
+    fake = (*STILL, *clock, "--seconds", str(early + START + length), *case.fake)
+    if case.since == "time":
+        run += ["--seconds", str(ENOUGH)]
     deed = None if case.act is None else Deed(case.act, folder, speed)
     try:
-        summary, report = Pair(tuple(run), fake, *cores).fly(folder, deed, alone=True)
+        summary, report = Pair(tuple(run), fake, *cores, kind=kind).fly(folder, deed, alone=True)
     except VisthrowError as error:
         if not case.refused:
             raise
@@ -262,7 +300,7 @@ def _one(
     ticks = json_lines(folder / "ticks.jsonl")
     offset = _offset(folder)
     begin = _begin(case, summary, ticks, offset, deed)
-    last = START + length - 0.1 + offset  # then the fake goes, which is none of these
+    last = early + START + length - 0.1 + offset  # then the fake goes, which is none of these
     began_in = before = next((tick["state"] for tick in reversed(ticks) if tick["time"] < begin), None)
     states = []
     for tick in ticks:
@@ -272,7 +310,7 @@ def _one(
     events = [{"what": text, "after": at + offset - LATENCY - begin} for at, text in report["events"]]
     return {
         "began_in": began_in, "states": states, "events": [event for event in events if event["after"] > -0.02],
-        "missed": summary.get("missed", "?"), "commands": report["commands"], "releases": report["releases"],
+        "missed": summary.get("missed", "?"), "summary": bool(summary), "commands": report["commands"], "releases": report["releases"],
         "breaches": report["breaches"],
     }  # fmt: skip
 
@@ -280,13 +318,15 @@ def _one(
 def _offset(folder: Path) -> float:
     """From the vehicle's clock at a measurement to the run's at the arrival of its pose [s]."""
     rows = [row for row in json_lines(folder / "poses.jsonl") if row[3] == "vehicle"]
-    return statistics.median(row[2] - row[1] for row in rows if row[1] < START)
+    return statistics.median(row[2] - row[1] for row in rows if row[1] < rows[0][1] + START)
 
 
 def _begin(case: Case, summary: dict, ticks: list[dict], offset: float, deed: Deed | None) -> float:
     """When the times of a case begin, on the run's clock [s]."""
     if case.since == "act":
         return deed.at
+    if case.since == "time":
+        return next(tick["time"] for tick in ticks if tick["words"][2])
     if case.since == "fault":
         return START + offset - (0.0 if case.group == MOCAP else LATENCY)
     if case.since == "latch":

@@ -20,6 +20,9 @@ from visthrow.common.errors import VisthrowError
 ENDED = 120.0
 """Most that the end of a run may take once it was told to [s]."""
 
+CONFIGS = {"ardupilot": "fake", "px4": "fake_px4", "betaflight": "fake_betaflight"}
+"""Of a run against each kind of fake."""
+
 COMMAND = (sys.executable, "-m", "visthrow.cli", "hil")
 
 
@@ -27,11 +30,11 @@ _given: set[int] = set()
 _giving = threading.Lock()
 
 
-def free_port() -> int:
-    """A UDP port of this machine that nobody listens on, and that this process was not given before."""
+def free_port(kind: int = socket.SOCK_DGRAM) -> int:
+    """A port of this machine, UDP or TCP, that nobody listens on, and that this process was not given before."""
     with _giving:
         while True:
-            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            with socket.socket(socket.AF_INET, kind) as probe:
                 probe.bind(("127.0.0.1", 0))
                 port = probe.getsockname()[1]
             if port not in _given:
@@ -55,6 +58,7 @@ class Pair:
         run: further arguments of ``visthrow hil run``. fake: of ``visthrow hil fake``.
         core, fake_core: that each is kept on; None leaves it to the system.
         orderly: Ctrl-C ends both in order, and what there is by then is returned.
+        kind: of autopilot; Betaflight's fake is there first, since it listens.
     """
 
     run: tuple[str, ...]
@@ -62,6 +66,7 @@ class Pair:
     core: int | None = None
     fake_core: int | None = None
     orderly: bool = False
+    kind: str = "ardupilot"
 
     def fly(
         self, folder: Path, watch: Callable[[int], None] | None = None, alone: bool = False
@@ -79,15 +84,21 @@ class Pair:
         Raises:
             VisthrowError: one of them did not start, or did not end; the message holds what it said.
         """
-        port, report = free_port(), folder.with_suffix(".fake.json")
+        port, msp, report = free_port(), free_port(socket.SOCK_STREAM), folder.with_suffix(".fake.json")
         folder.parent.mkdir(parents=True, exist_ok=True)
-        run = [*COMMAND, "run", "--set", f'link.device="udp:127.0.0.1:{port}"', "--out", str(folder), "--auto-arm", "--bare"]
-        run += self.run
-        fake = [*COMMAND, "fake", "--device", f"udpout:127.0.0.1:{port}", "--out", str(report), *self.fake]
-        with self._started(run, self.core) as runner:
-            said = _first_line(runner)
-            with self._started(fake, self.fake_core) as other:
-                interrupted = self._until(other, watch, runner, alone)
+        run = [*COMMAND, "run", "--config", CONFIGS[self.kind], "--set", f'link.device="udp:127.0.0.1:{port}"', "--auto-arm", "--bare"]
+        run += ["--set", f'betaflight.device="tcp:127.0.0.1:{msp}"', "--out", str(folder), *self.run]
+        fake = [*COMMAND, "fake", "--kind", self.kind, "--device", f"udpout:127.0.0.1:{port}", "--msp-port", str(msp)]
+        fake += ["--out", str(report), *self.fake]
+        with contextlib.ExitStack() as both:
+            if self.kind == "betaflight":
+                other = both.enter_context(self._started(fake, self.fake_core))
+                _first_line(other, "the fake")
+            runner = both.enter_context(self._started(run, self.core))
+            said = _first_line(runner, "ready after")
+            if self.kind != "betaflight":
+                other = both.enter_context(self._started(fake, self.fake_core))
+            interrupted = self._until(other, watch, runner, alone)
             killed = _end(runner, said, alone)
         try:
             summary = {} if killed else json.loads((folder / "summary.json").read_text(encoding="utf-8"))
@@ -127,10 +138,10 @@ class Pair:
             process.wait()
 
 
-def _first_line(process: subprocess.Popen) -> str:
-    """What a run says when it is ready."""
+def _first_line(process: subprocess.Popen, expected: str) -> str:
+    """What a process says when it is ready."""
     line = process.stderr.readline()
-    if not line.startswith("ready after"):
+    if not line.startswith(expected):
         raise VisthrowError(f"the run did not start: {line}{process.stderr.read()}")
     return line
 

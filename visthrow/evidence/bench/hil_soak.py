@@ -8,7 +8,6 @@ import shutil
 import sys
 import tempfile
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -68,7 +67,7 @@ def soak(args: argparse.Namespace) -> Report:
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
         policy = never_releasing(args.policy, place / "policy.npz")
-        run = ("--config", "fake", "--set", f'policy="{policy}"', "--set", "states.throw=1e6", "--set", "states.abort=0.5")
+        run = ("--set", f'policy="{policy}"', "--set", "states.throw=1e6", "--set", "states.abort=0.5")
 
         fake = (*STILL, "--rate", str(args.rate), "--seconds", str(60.0 * args.minutes))
         summary, report = Pair(run, fake, args.core, _another(args.core), orderly=True).fly(place / "run", progress)

@@ -113,7 +113,7 @@ def _over_the_wire(
 ) -> dict[str, Any]:  # fmt: skip
     shutil.rmtree(folder, ignore_errors=True)  # half a run of an interrupted series
     speed = ("--speed", str(args.speed))
-    run = ("--config", "fake", "--set", f"policy={args.policy}", "--set", "states.abort=0.3", *speed)
+    run = ("--set", f"policy={args.policy}", "--set", "states.abort=0.3", *speed)
     fake = ("--policy", args.policy, "--seed", str(seed), "--seconds", str(LONGEST), "--after", str(AFTER), *speed)
     summary, report = Pair(run, fake, *cores).fly(folder)
     landed = report["landing_w"]
