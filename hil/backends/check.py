@@ -60,7 +60,7 @@ class AutopilotCheck:
             return []
         audit, status = self.backend.audit, self.backend.status(now)
         print(audit.table())
-        out = [(False, f"parameter {text}") for text in audit.problems]
+        out = [] if audit.fault() is None else [(False, audit.fault())]
         if not audit.done:
             out.append((False, f"parameters were not read: {status.note or 'the time was too short'}"))
         return [*out, self.meter.story(mass)]

@@ -43,7 +43,7 @@ def load_plant(target: str, policy: str, seed: int) -> WirePlant:
 class ListeningPort:
     """A TCP port of this machine that serves one peer at a time: what a flight controller in software offers."""
 
-    whole, sender = False, None
+    whole, sender, peer = False, None, None
 
     def __init__(self, number: int) -> None:
         """Listen on a port of the loopback address.

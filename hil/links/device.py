@@ -69,6 +69,7 @@ class Port(Protocol):
 
     whole: bool  # whether each chunk is a whole datagram
     sender: tuple[str, int] | None  # of the last chunk; None on a stream, which has one peer
+    peer: tuple[str, int] | None  # that the device names; None where it names none
 
     def read(self) -> bytes | None:
         """The next chunk; None where there is none."""
@@ -111,7 +112,7 @@ class UdpPort(_SocketPort):
         family = socket.AF_INET6 if ":" in device.host else socket.AF_INET
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
-        self._peer = (device.host, device.port) if device.kind == "udpout" else None
+        self.peer = (device.host, device.port) if device.kind == "udpout" else None
         self.sender: tuple[str, int] | None = None
         try:
             if device.kind == "udp":
@@ -122,20 +123,16 @@ class UdpPort(_SocketPort):
 
     def read(self) -> bytes | None:
         """See `Port`."""
-        while True:
-            try:
-                data, sender = self._socket.recvfrom(LARGEST_DATAGRAM)
-            except (BlockingIOError, InterruptedError):
-                return None
-            except OSError:  # the peer's port is closed: ICMP, reported here
-                return None
-            if self._peer in (None, sender[:2]):
-                self.sender = sender[:2]
-                return data
+        try:
+            data, sender = self._socket.recvfrom(LARGEST_DATAGRAM)
+        except OSError:  # there is none, or the peer's port is closed: ICMP, reported here
+            return None
+        self.sender = sender[:2]
+        return data
 
     def write(self, data: bytes, to: tuple[str, int] | None = None) -> bool:
         """See `Port`."""
-        to = self._peer or to
+        to = self.peer or to
         try:
             return to is not None and self._socket.sendto(data, to) == len(data)
         except OSError:
@@ -145,7 +142,7 @@ class UdpPort(_SocketPort):
 class TcpPort(_SocketPort):
     """A TCP connection, opened within two seconds or not at all."""
 
-    whole, sender = False, None
+    whole, sender, peer = False, None, None
 
     def __init__(self, device: Device) -> None:
         """Connect.
@@ -178,7 +175,7 @@ class TcpPort(_SocketPort):
 class SerialPort:
     """A serial port."""
 
-    whole, sender = False, None
+    whole, sender, peer = False, None, None
 
     def __init__(self, device: Device) -> None:
         """Open it.

@@ -116,6 +116,7 @@ class Link:
             key: that messages are signed with, and have to be; None: neither.
         """
         self.port, self.roster, self._tlog = port, roster or Roster(), tlog
+        self.roster.only = port.peer
         self._key, streams = key, {}
         self.parser = Parser() if key is None else Parser(lambda: Signed(key, streams=streams))
         self._mav = self.packer(system, component)

@@ -28,7 +28,7 @@ class LoggedPort:
         Raises:
             LinkError: it cannot be written.
         """
-        self._port, self.whole, self.sender, self.failed = port, port.whole, None, 0
+        self._port, self.whole, self.sender, self.peer, self.failed = port, port.whole, None, None, 0
         try:
             Path(path).parent.mkdir(parents=True, exist_ok=True)
             self._file = open(path, "wb", buffering=1 << 16)  # noqa: SIM115 - closed in close()

@@ -107,7 +107,7 @@ class Roster:
         at: address by party. heard: when it last spoke [s]. flying: whether parties are held to their addresses.
         seen: counts of what came. refused: messages and datagrams that were not taken.
         moved: called with a party that came back from another address. tell: is handed each sender that is refused, once.
-        simulated: whether a party has said that nothing real flies.
+        simulated: whether a party has said that nothing real flies. only: address that the device names, or None.
     """
 
     def __init__(self, parties: Iterable[Party] = (), allow: Iterable[str] = (), tell: Callable[[str], None] | None = None) -> None:
@@ -124,13 +124,17 @@ class Roster:
         self.flying = self.simulated = False
         self.seen: dict[Seen, int] = {}
         self.refused = 0
+        self.only: Address = None
         self.moved: list[Callable[[Party], None]] = []
         self._said: set[tuple] = set()
 
     def shuts_out(self, address: Address) -> bool:
-        """Whether a datagram is not even looked into: not on the list, or from nobody's address in flight."""
+        """Whether a datagram is not even looked into: not from the device's peer, not on the list, or from nobody's address in flight."""
         if address is None:
             return False
+        if self.only not in (None, address):
+            self.refuse(Seen(address, None, None, "datagram", f"the link's device is {shown(self.only)}"))
+            return True
         if self._allow and not any(host == address[0] and port in (None, address[1]) for host, port in self._allow):
             self.refuse(Seen(address, None, None, "datagram", "not on link.allow"))
             return True

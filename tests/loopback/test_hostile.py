@@ -18,7 +18,7 @@ from hil.links.signing import Signed
 from tests.fuzz import EACH, SEEDS, any_message, mutated, noise
 from tests.hil_flight import simple_policy
 from tests.loopback.wire import HERE, cut, peers, throw
-from visthrow.evidence.bench.hil_processes import free_port
+from visthrow.evidence.bench.hil.processes import free_port
 from visthrow.onboard.actions import hover_action
 
 READY = 8.0
@@ -63,6 +63,8 @@ def test_a_million_messages_command_nothing(seed):
 
 STRANGERS = tuple(("127.0.0.1", 2 + i) for i in range(5)) + (("10.0.0.9", 14550),)
 KEY, OTHER_KEY = bytes(range(32)), bytes(32)
+MOST_THROWS = 8
+
 AT_ONCE = 200
 """Packets beside each look at the link: together with the true ones less than are read in one go."""
 
@@ -135,26 +137,31 @@ def flown(seed: int, count: int, kind: str, signed: bool):
 
 
 def unmoved(seed: int, count: int) -> None:
-    """Forged packets change no bit of what is decided, and none of what the vehicle takes."""
+    """Forged packets, over as many throws as it takes, change no bit of what is decided, and none of what the vehicle takes."""
     kind, signed = ("ardupilot", "px4")[seed % 2], seed % 4 >= 2
-    decisions, summary, fake, roster, left, runner = flown(seed, count, kind, signed)
     alone, _, plain, _, _, _ = flown(seed, 0, kind, signed)
-    assert decisions == alone
-    assert (fake.witness.commands, fake.witness.releases, fake.witness.breaches) == (plain.witness.commands, 1, [])
-    assert fake.events == plain.events
-    assert (summary["latches"], summary["errors"], runner.errors) == (1, [], [])
-    assert left <= 0, "all were sent while it flew"
-    assert roster.refused > 0.5 * count, "the rest is noise"
+    left = count
+    for part in range(MOST_THROWS):
+        decisions, summary, fake, roster, rest, runner = flown(1000 * part + seed, left, kind, signed)
+        assert decisions == alone
+        assert (fake.witness.commands, fake.witness.releases, fake.witness.breaches) == (plain.witness.commands, 1, [])
+        assert fake.events == plain.events
+        assert (summary["latches"], summary["errors"], runner.errors) == (1, [], [])
+        assert roster.refused > 0.5 * (left - rest), "the rest is noise"
+        left = rest
+        if left <= 0:
+            return
+    raise AssertionError(f"{left} of {count} packets were not sent")
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2, 3])
-def test_spoofed_stray_and_unsigned_packets_change_no_bit_of_a_throw(seed):
+def test_forged_packets_change_no_bit_of_a_throw(seed):
     unmoved(seed, 10_000)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", SEEDS)
-def test_a_million_spoofed_stray_and_unsigned_packets_change_no_bit_of_a_throw(seed):
+def test_a_million_forged_packets_change_no_bit_of_a_throw(seed):
     unmoved(seed, EACH)
 
 

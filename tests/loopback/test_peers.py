@@ -17,7 +17,7 @@ from hil.sources.opening import open_source
 from tests.hil_runs import record_run, saved_policy
 from visthrow import config
 from visthrow.cli import main
-from visthrow.evidence.bench.hil_processes import free_port
+from visthrow.evidence.bench.hil.processes import free_port
 
 ATTITUDE = "SET_ATTITUDE_TARGET"
 

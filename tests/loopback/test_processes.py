@@ -43,7 +43,8 @@ def free_port(kind=socket.SOCK_DGRAM) -> int:
 class Pair:
     """A fake and a runner, each in a process of its own."""
 
-    def __init__(self, folder, kind, policy, plant=("--plant", "hil.fakes.level:make"), overrides=()):
+    def __init__(self, folder, kind, policy, plant=("--plant", "hil.fakes.level:make"), overrides=(), both=()):
+        self.both = both  # further arguments of runner and fake
         self.folder, poses, msp = folder, free_port(), free_port(socket.SOCK_STREAM)
         self.device, self.msp = f"127.0.0.1:{poses}", msp
         self.fake = self.runner = None
@@ -57,7 +58,7 @@ class Pair:
     def _start_fake(self, kind, plant):
         self.fake = subprocess.Popen(
             [*COMMAND, "fake", "--kind", kind, "--device", f"udpout:{self.device}", "--msp-port", str(self.msp), *plant,
-             "--seconds", "300", "--after", "1.5", "--out", str(self.folder / "fake.json")],
+             "--seconds", "300", "--after", "1.5", "--out", str(self.folder / "fake.json"), *self.both],
             stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
         )  # fmt: skip
         assert "flies" in self.fake.stderr.readline()
@@ -65,7 +66,7 @@ class Pair:
     def _start_runner(self, kind, policy, overrides):
         sets = [f'link.device="udp:{self.device}"', f'betaflight.device="tcp:127.0.0.1:{self.msp}"', f'policy="{policy}"']
         self.runner = subprocess.Popen(
-            [*COMMAND, "run", "--config", CONFIGS[kind], "--auto-arm", "--out", str(self.folder / "run"),
+            [*COMMAND, "run", "--config", CONFIGS[kind], "--auto-arm", "--out", str(self.folder / "run"), *self.both,
              *(part for text in (*sets, *overrides) for part in ("--set", text))],
             stdout=subprocess.PIPE, stderr=subprocess.PIPE, stdin=subprocess.DEVNULL, text=True,
         )  # fmt: skip
@@ -141,8 +142,11 @@ def test_the_runner_is_killed_in_mid_throw(tmp_path, kind, never):
 
 
 def test_sigterm_in_mid_throw(tmp_path, never):
-    """What systemd, `timeout` and a shutdown send; `bench hil --faults` flies the others, in hover and with each kind."""
-    with Pair(tmp_path, "ardupilot", never, overrides=(*QUICK, "states.abort=1.0")) as pair:
+    """What systemd, `timeout` and a shutdown send; `bench hil --faults` flies the others, in hover and with each kind. Signed."""
+    key = tmp_path / "key"
+    key.write_text("a phrase that both know\n")
+    key.chmod(0o600)
+    with Pair(tmp_path, "ardupilot", never, overrides=(*QUICK, "states.abort=1.0"), both=("--sign", str(key))) as pair:
         pair.wait_for("throw")
         pair.wait_for_actions(10)
         os.kill(pair.runner.pid, signal.SIGTERM)

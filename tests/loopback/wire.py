@@ -22,7 +22,7 @@ HERE = ("127.0.0.1", 1)
 class MemoryPort:
     """One end of a pipe of datagrams."""
 
-    whole = True
+    whole, peer = True, None
 
     def __init__(self) -> None:
         self.inbox: deque[bytes | tuple[bytes, tuple[str, int]]] = deque()  # with the sender, where it is not the other end

@@ -100,6 +100,9 @@ class Bench:
             values = (mav.MAV_CMD_SET_MESSAGE_INTERVAL, 0, number, 10_000.0, 0.0, 0.0, 0.0, 0.0, 0.0)
             self.link.send(mav.MAVLink_command_long_message(1, 1, *values))
         self.turn(ANSWER, until=lambda: self.backend.audit.done)
+        if self.kind == "ardupilot":
+            for name, value in WRITTEN.items():
+                self.backend._write_parameter(name, value)
         return self
 
     def close(self):
@@ -160,11 +163,13 @@ def flying(desk, placed=False):
 
 
 TAKE = {
-    "ardupilot": ("ardupilot.take=true", "ardupilot.arm=true", "ardupilot.follow_mode=20"),
+    "ardupilot": ("ardupilot.take=true", "ardupilot.arm=true", "ardupilot.follow_mode=20", "ardupilot.audit=false"),
     "px4": ("px4.arm=true", "px4.audit=false"),
 }
-"""Bench settings: the runner arms; GUIDED_NOGPS needs no position. ArduPilot's parameters are written: without GUID_OPTIONS a thrust is
-a climb rate."""
+"""Bench settings: the runner arms; GUIDED_NOGPS needs no position."""
+
+WRITTEN = {"GUID_OPTIONS": 8.0, "ATC_ANGLE_BOOST": 0.0, "GUID_TIMEOUT": 0.5, "SERVO9_FUNCTION": 0.0}
+"""Of ArduPilot: without the first a thrust is a climb rate. Not what the audit wants of its position: here it comes from a GPS."""
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -12,8 +12,9 @@ from hil.errors import LinkError
 from hil.links.device import check_device, open_port
 from hil.links.mavlink_link import Link, TlogWriter, attitude_target, pose_from_message, quaternion_from_euler
 from hil.links.pymav import Parser, mav
+from hil.links.roster import Roster
 from tests.fuzz import EACH, SEEDS, any_message, mutated, noise
-from visthrow.evidence.bench.hil_processes import free_port
+from visthrow.evidence.bench.hil.processes import free_port
 
 FLOAT32 = 2e-7
 """What a quantity near 1 loses on the wire."""
@@ -163,6 +164,25 @@ def test_both_ways_over_loopback_and_the_tlog_reads_back(tmp_path):
     reader = mavutil.mavlink_connection(str(tmp_path / "link.tlog"), dialect="ardupilotmega")
     assert [reader.recv_msg().get_type() for _ in range(2)] == ["ATT_POS_MOCAP", "SET_ATTITUDE_TARGET"]
     reader.close()
+
+
+def test_a_device_that_names_its_peer_hears_nobody_else():
+    number, said = free_port(), []
+    ours = Link(open_port(check_device(f"udpout:127.0.0.1:{number}")), roster=Roster(tell=said.append))
+    peer = Link(open_port(check_device(f"udp:127.0.0.1:{number}")), 1, 1)
+    heard = []
+    ours.listen(lambda message, arrival: heard.append(message.get_type()))
+    assert ours.send(MESSAGES[3])
+    peer.pump(lambda: 0.0)
+    (address,) = peer.roster.at.values()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+        stranger.sendto(packed(MESSAGES[2]), address)
+        peer.send(MESSAGES[0])
+        ours.pump(lambda: 0.0)
+        assert heard == ["ATT_POS_MOCAP"]
+        assert said == [f"refused: datagram from 127.0.0.1:{stranger.getsockname()[1]}: the link's device is 127.0.0.1:{number}"]
+    ours.close()
+    peer.close()
 
 
 def test_a_message_that_cannot_be_packed_is_not_sent(tmp_path):

@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 
 from hil.backends import Status
-from hil.control.runner import Runner, Words
+from hil.control.runner import WARM_CALLS, Runner, Words
 from hil.errors import RunError
 from hil.params import HilParams
 from tests.hil_flight import TICK, Spy, changes, fly, params, simple_policy
 from visthrow import config
 from visthrow.common.errors import ConfigError, MismatchError
 from visthrow.onboard.actions import hover_action
+from visthrow.onboard.pilot import Pilot
 
 HOVER = hover_action(9.81 * 0.272, 14.0)[0]
 NEVER = (HOVER, 0.0, 0.0, 0.0, -1.0)
@@ -70,6 +71,25 @@ def test_the_mechanisms_own_time_is_taken_off_and_a_slow_one_is_refused():
     assert runner(mechanism=0.114).latch.trip(1.0, (0.0, 0.0, 0.0)) == 1.0
     with pytest.raises(RunError, match=r"takes 0\.12 s .* trained with 0\.11 s"):
         runner(mechanism=0.12)
+
+
+def test_a_warm_up_changes_no_bit(monkeypatch):
+    """It calls the policy on a copy, before the run and as a throw is armed."""
+    called = []
+    warm, act = Runner.warm_up, Pilot.act
+
+    def counted(pilot, *args):
+        called.append(pilot)
+        return act(pilot, *args)
+
+    monkeypatch.setattr(Pilot, "act", counted)
+    pilot = runner()
+    pilot.warm_up()
+    decisions = fly(pilot, 4.0)
+    assert sum(each is not pilot.pilot for each in called) == 2 * WARM_CALLS
+    monkeypatch.setattr(Runner, "warm_up", lambda self, vehicle=None: None)
+    assert fly(runner(), 4.0) == decisions
+    monkeypatch.setattr(Runner, "warm_up", warm)
 
 
 def test_nothing_is_released_without_the_operators_word():

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from visthrow.common.errors import VisthrowError
-from visthrow.evidence.bench.hil_processes import Memory, Pair
+from visthrow.evidence.bench.hil.processes import Memory, Pair
 from visthrow.evidence.bench.records import Report, Table
 
 STILL = ("--plant", "hil.fakes.level:make")

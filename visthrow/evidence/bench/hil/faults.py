@@ -18,10 +18,10 @@ from typing import Any
 import torch
 
 from visthrow.common.errors import VisthrowError, suggest
-from visthrow.evidence.bench.hil import json_lines
-from visthrow.evidence.bench.hil_processes import CONFIGS, ENDED, Pair, own_cores
-from visthrow.evidence.bench.hil_soak import STILL, never_releasing
-from visthrow.evidence.bench.hil_throws import side_by_side
+from visthrow.evidence.bench.hil.figures import json_lines
+from visthrow.evidence.bench.hil.processes import CONFIGS, ENDED, Pair, own_cores
+from visthrow.evidence.bench.hil.soak import STILL, never_releasing
+from visthrow.evidence.bench.hil.throws import side_by_side
 from visthrow.evidence.bench.records import Report, Table
 from visthrow.onboard.actions import hover_action
 
@@ -161,8 +161,8 @@ CASES = {
     "late": Case("a tick is 0.15 s late", OWN, act=_pause(0.15), since="act"),
     "very-late": Case("a tick is 0.8 s late", OWN, act=_pause(0.8), since="act"),
     "disk-full": Case("the disk is full", OWN, act=_fill_disk, since="act"),
-    **{name: _ending(text, signal) for name, (text, signal) in ENDS.items()},
-    **{f"{name}-in-hover": _ending(f"{text}, in hover", signal, HOVERS) for name, (text, signal) in ENDS.items()},
+    **{name: _ending(text, number) for name, (text, number) in ENDS.items()},
+    **{f"{name}-in-hover": _ending(f"{text}, in hover", number, HOVERS) for name, (text, number) in ENDS.items()},
     "ctrl-c-twice": Case("Ctrl-C twice", OWN, act=_twice, since="act", ends=True),
     "time-over": Case("the time of --seconds is over", OWN, since="time", ends=True),
 }  # fmt: skip
