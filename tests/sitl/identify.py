@@ -1,6 +1,6 @@
 """What our controller block gets wrong of Betaflight's: rate doublets through the firmware, the block fitted to them, the rest.
 
-    python tests/sitl/alone.py python tests/sitl/identify.py --out out/identify --speed 0.4
+    python tests/sitl/alone.py python tests/sitl/identify.py --out out/identify --seconds 36
 
 Writes ``flight.npz``, ``vehicle.toml`` and ``fit.json``: relative rms of the rates on doublets that were not fitted, by the shipped block
 and by the fitted one. ``visthrow hil direct --plant tests.sitl.identify:make_fitted`` throws with the fitted vehicle.

@@ -97,6 +97,7 @@ def test_the_configs_of_real_vehicles_can_do_what_the_shipped_policies_ask(name)
     assert (real.backend, getattr(real, name).audit) == (name, True)
     swapped = dataclasses.replace(
         real, link=fake.link, ardupilot=fake.ardupilot, px4=fake.px4, betaflight=fake.betaflight,
+        source=dataclasses.replace(real.source, device=fake.source.device),
         delay=dataclasses.replace(real.delay, command=fake.delay.command),
     )  # fmt: skip
     assert swapped == fake
