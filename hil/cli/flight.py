@@ -1,6 +1,7 @@
 """``visthrow hil run`` and ``record``: from a configuration to a flown run with its folder."""
 
 import argparse
+import contextlib
 import dataclasses
 import sys
 import time
@@ -96,10 +97,16 @@ def fly(args: argparse.Namespace) -> int:
     if viewer is not None:
         viewer.terminate()
     voice.close()
-    print(story(summary, folder))
+    _show(story(summary, folder))
     if not args.bare:
-        print("\n".join(finish(folder, stages)))
+        _show("\n".join(finish(folder, stages)))
     return 1 if summary["aborted"] or summary["errors"] else 0
+
+
+def _show(text: str) -> None:
+    """Print where somebody still reads: the terminal may have gone with the run."""
+    with contextlib.suppress(OSError):
+        print(text, flush=True)
 
 
 def _close(*parts: Any) -> None:

@@ -451,5 +451,9 @@ def test_a_mode_is_seen_soon_though_the_heartbeat_is_slow(kind):
 
 
 def test_idle_says_at_once_why_it_waits():
-    _, _, told = throw(LevelPlant(), loaded=AT_ONCE, seconds=1.0, armed=False)
-    assert any(d.state == "idle" and d.waits == "autopilot not ready (disarmed)" for d in told)
+    runner, source, clock, _ = peers(LevelPlant(), loaded=AT_ONCE, overrides=("states.idle=1.0",), armed=False)
+    told = []
+    fly(runner, source, clock, AutoOperator(), None, 5.0, told.append)
+    waits = {d.waits: d.time for d in told if d.state == "idle"}
+    assert waits["autopilot not ready (disarmed)"] < 0.2
+    assert len(told) <= 8, "and not at every tick"

@@ -31,6 +31,9 @@ def flood(count: int, kind: str, seed: int) -> None:
     runner, source, clock, fake = peers(LevelPlant(), kind=kind, write=True, loaded=simple_policy((-0.1269, 0, 0, 0, 1.0)))
     rng, inbox, commands = np.random.default_rng(seed), source._link.port.inbox, []
     fake.link.listen(lambda message, arrival: commands.append((message.get_type(), getattr(message, "command", None))))
+    for _ in range(20):  # it is the vehicle's own address that all of it comes from
+        fake.step()
+    source.poll(clock.now())
     good = [any_message(rng) for _ in range(200)]
     makers = (any_message, any_message, any_message, lambda rng: mutated(rng, good), noise)
     said = 0

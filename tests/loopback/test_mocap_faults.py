@@ -8,13 +8,12 @@ import math
 import pytest
 
 from hil.control.decision import Words
-from hil.control.loop import fly
 from hil.errors import RunError
 from hil.fakes.level import LevelPlant
 from hil.fakes.mocap import FAULTS, MocapFault
 from hil.poses.pose import VEHICLE, Pose
 from tests.hil_flight import simple_policy
-from tests.loopback.wire import peers
+from tests.loopback.wire import cut, peers
 from visthrow.onboard.actions import hover_action
 
 HOVER = hover_action(9.81 * 0.272, 14.0)[0]
@@ -55,7 +54,7 @@ def spoiled(name: str, seconds: float = 0.7, loaded=NEVER):
         plant, overrides=(*QUICK, *more), loaded=loaded, mocap_fault=name, fault_time=START,
         pose_message="ODOMETRY" if more else "ATT_POS_MOCAP",
     )  # fmt: skip
-    fly(runner, source, clock, OneWord(), None, START + seconds, told.append)
+    cut(runner, source, clock, OneWord(), None, START + seconds, told.append)
     return runner, fake, [(d.state, d.reason, d.time) for d in told]
 
 
@@ -104,7 +103,7 @@ def test_a_fault_as_the_policy_asks_for_the_release(name):
     runner, source, clock, fake = peers(
         plant, overrides=(*QUICK, "states.check=1.0"), loaded=at_once, mocap_fault=name, fault_time=0.0
     )
-    fly(runner, source, clock, OneWord(), None, 3.0)
+    cut(runner, source, clock, OneWord(), None, 3.0, lambda decision: None)
     assert fake.witness.breaches == []
     assert fake.witness.releases == (1 if name in FLOWN_THROUGH else 0), runner.machine.reason
     assert runner.latch.count == fake.witness.releases

@@ -1,13 +1,16 @@
 """Runner and fake as two processes in real time: whole throws with each kind, SIGTERM, SIGKILL, a full disk."""
 
+import fcntl
 import json
 import os
+import pty
 import re
 import resource
 import signal
 import socket
 import subprocess
 import sys
+import termios
 import time
 
 import numpy as np
@@ -30,6 +33,9 @@ ONE_THROW, MOST_LATE = 0.25, 100
 FEW_MISSED = 3
 """Ticks of a run that may be missed where its throw is to land in its place."""
 
+START = 5.0
+"""After which a run whose output is not read has begun to listen [s]."""
+
 FULL_DISK = 20_000
 """Bytes that a file may still grow by: some forty ticks."""
 
@@ -43,8 +49,8 @@ def free_port(kind=socket.SOCK_DGRAM) -> int:
 class Pair:
     """A fake and a runner, each in a process of its own."""
 
-    def __init__(self, folder, kind, policy, plant=("--plant", "hil.fakes.level:make"), overrides=(), both=()):
-        self.both = both  # further arguments of runner and fake
+    def __init__(self, folder, kind, policy, plant=("--plant", "hil.fakes.level:make"), overrides=(), both=(), terminal=None):
+        self.both, self.terminal = both, terminal  # further arguments of runner and fake; what the runner's controls it
         self.folder, poses, msp = folder, free_port(), free_port(socket.SOCK_STREAM)
         self.device, self.msp = f"127.0.0.1:{poses}", msp
         self.fake = self.runner = None
@@ -68,9 +74,23 @@ class Pair:
         self.runner = subprocess.Popen(
             [*COMMAND, "run", "--config", CONFIGS[kind], "--auto-arm", "--out", str(self.folder / "run"), *self.both,
              *(part for text in (*sets, *overrides) for part in ("--set", text))],
-            stdout=subprocess.PIPE, stderr=subprocess.PIPE, stdin=subprocess.DEVNULL, text=True,
+            **self._streams(), text=True,
         )  # fmt: skip
-        assert self.runner.stderr.readline().startswith("ready after")
+        if self.terminal is None:
+            assert self.runner.stderr.readline().startswith("ready after")
+        else:
+            time.sleep(START)
+
+    def _streams(self) -> dict:
+        """A terminal of its own, or pipes."""
+        if self.terminal is None:
+            return {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "stdin": subprocess.DEVNULL}
+
+        def control():
+            os.setsid()
+            fcntl.ioctl(self.terminal, termios.TIOCSCTTY, 0)
+
+        return {"stdout": self.terminal, "stderr": self.terminal, "stdin": self.terminal, "preexec_fn": control}
 
     def wait_for(self, state: str) -> None:
         """Until the runner says that it is in a state."""
@@ -158,6 +178,23 @@ def test_sigterm_in_mid_throw(tmp_path, never):
     assert (report["breaches"], report["releases"]) == ([], 0)
     assert "mode 9" in [text for _, text in report["events"]]
     assert json.loads((tmp_path / "run" / "summary.json").read_text())["aborted"]
+
+
+@pytest.mark.slow
+def test_the_terminal_is_closed_in_mid_throw(tmp_path, never):
+    """As by a dropped ssh: the run's terminal is gone, and says so by SIGHUP; it lands, and its folder is complete."""
+    master, slave = pty.openpty()
+    with Pair(tmp_path, "ardupilot", never, overrides=(*QUICK, "states.abort=1.0"), terminal=slave) as pair:
+        os.close(slave)
+        pair.wait_for_actions(10)
+        os.close(master)
+        assert pair.runner.wait(PATIENCE) == 1
+        time.sleep(1.0)
+        report = pair.report()
+    assert "mode 9" in [text for _, text in report["events"]]
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert summary["reason"] == "the process was told to end (SIGHUP)"
+    assert (tmp_path / "run" / "throw-01.npz").is_file()
 
 
 @pytest.mark.slow

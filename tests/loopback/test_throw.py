@@ -61,7 +61,7 @@ def test_a_policy_that_asks_too_early_is_held_back_and_throws_all_the_same(monke
 
     def hasty(pilot, *args):
         out = act(pilot, *args)
-        if len(asked) < 8:
+        if len(asked) < 8 and len(args) > 6:  # a warm-up knows no time
             asked.append(args[-1])
             pilot._previous = torch.cat([pilot._previous[:, :4], torch.ones(1, 1)], dim=-1)
             out = dataclasses.replace(out, release=np.array([True]))

@@ -113,8 +113,18 @@ def peers(
 
 
 def cut(runner, source, clock, operator, recorder, seconds, tell):
-    """The turns of a run for a time [s], and no more: it is neither aborted nor landed then. Its summary."""
-    loop, begin = Loop(runner, source, clock, operator, recorder, tell), clock.now()
+    """The turns of a run for a time [s], and no more: it is neither aborted nor landed then. Its summary.
+
+    ``tell`` is handed the first decision of each state; what is waited for stands in those of `Loop` itself.
+    """
+    said = []
+
+    def change(decision):
+        if not said or said[-1] != decision.state:
+            said.append(decision.state)
+            tell(decision)
+
+    loop, begin = Loop(runner, source, clock, operator, recorder, change), clock.now()
     while runner.machine.state != "done" and clock.now() - begin < seconds:
         loop.turn(False)
     return loop.summary()

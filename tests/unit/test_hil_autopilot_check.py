@@ -76,5 +76,5 @@ def test_the_summary_keeps_what_the_autopilot_said(run):
     assert kept["parameters"]["found"]["GUID_OPTIONS"] == 8
     assert kept["parameters"]["problems"] == kept["parameters"]["written"] == []
     assert kept["release"] == {"state": "idle", "note": "", "sends": 0}
-    assert kept["clocks"]["peers"]["1"]["steps"] == 0
+    assert kept["clocks"]["peers"]["1 at 127.0.0.1:1"]["steps"] == 0
     assert told(DryRun(), None) == {"backend": "dry-run"}

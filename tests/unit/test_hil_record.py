@@ -32,7 +32,7 @@ def recorded(folder, policy="state", seconds=8.0, spoil=lambda time, poses: pose
 
     runner.tick = keep
     fly(runner, seconds, poses=spoil)
-    recorder.close(runner.summary())
+    recorder.close({**runner.summary(), "ticks": len(inputs)})
     return inputs
 
 
@@ -75,9 +75,11 @@ def test_a_folder_cut_short_by_a_kill_replays(run_folder, tmp_path, capsys):
         data = (tmp_path / name).read_bytes()
         (tmp_path / name).write_bytes(data[: len(data) // 2])
     (tmp_path / "summary.json").unlink()
-    assert main(["hil", "replay", str(tmp_path)]) == 0
-    count = int(capsys.readouterr().out.split()[0])
-    assert 150 < count < 250
+    assert main(["hil", "replay", str(tmp_path)]) == 1, "what there is is the same, and not all is there"
+    out = capsys.readouterr().out
+    assert "all bit for bit the same" in out
+    assert "CUT: no summary" in out
+    assert 150 < int(out.split()[0]) < 250
 
 
 def test_what_is_no_run(run_folder, tmp_path, capsys):

@@ -90,15 +90,19 @@ def test_a_vehicle_that_cannot_do_it_is_refused(name, override, message):
 
 @pytest.mark.parametrize("name", ["ardupilot", "px4", "betaflight"])
 def test_the_configs_of_real_vehicles_can_do_what_the_shipped_policies_ask(name):
-    """They differ from those of the fakes in device, calibration, mechanism and the lateness of commands alone."""
+    """They differ from those of the fakes in devices, calibration, mechanism and the lateness of commands alone."""
     real = config.load(HilParams, config.find("hil", name))
     fake = config.load(HilParams, config.find("hil", "fake" if name == "ardupilot" else f"fake_{name}"))
     require_reach(real, simple_policy().contract)
     assert (real.backend, getattr(real, name).audit) == (name, True)
     swapped = dataclasses.replace(
         real, link=fake.link, ardupilot=fake.ardupilot, px4=fake.px4, betaflight=fake.betaflight,
+<<<<<<< HEAD
         source=dataclasses.replace(real.source, device=fake.source.device),
         delay=dataclasses.replace(real.delay, command=fake.delay.command),
+=======
+        delay=dataclasses.replace(real.delay, command=fake.delay.command), source=dataclasses.replace(real.source, device=None),
+>>>>>>> vehicle
     )  # fmt: skip
     assert swapped == fake
     with pytest.raises(ConfigError, match="a recording flies dry"):
