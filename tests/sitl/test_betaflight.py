@@ -217,6 +217,7 @@ def test_a_whole_throw(tmp_path):
         "vision_dropout", "--speed", str(SPEED), "--after", "9", "--out", str(report), stderr=subprocess.PIPE,
         stdout=subprocess.DEVNULL,
     )  # fmt: skip
+    runner = None
     try:
         wait_for(bridge, "it flies")
         runner = visthrow(
@@ -248,6 +249,7 @@ def test_a_runner_that_is_killed_leaves_the_firmware_to_its_failsafe(tmp_path):
         "hil", "fake", "--kind", "betaflight-sitl", "--firmware", str(program()), "--folder", str(tmp_path / "firmware"),
         "--speed", str(SPEED), "--out", str(report), stderr=subprocess.PIPE, stdout=subprocess.DEVNULL,
     )  # fmt: skip
+    runner = None
     try:
         wait_for(bridge, "it flies")
         runner = visthrow(
@@ -262,7 +264,8 @@ def test_a_runner_that_is_killed_leaves_the_firmware_to_its_failsafe(tmp_path):
         bridge.communicate(timeout=LONG)
     finally:
         bridge.kill()
-        runner.kill()
+        if runner is not None:
+            runner.kill()
     found = json.loads(report.read_text())
     told = [text for _, text in found["events"]]
     assert told == ["armed", "disarmed"], found["events"]

@@ -97,12 +97,7 @@ def test_the_configs_of_real_vehicles_can_do_what_the_shipped_policies_ask(name)
     assert (real.backend, getattr(real, name).audit) == (name, True)
     swapped = dataclasses.replace(
         real, link=fake.link, ardupilot=fake.ardupilot, px4=fake.px4, betaflight=fake.betaflight,
-<<<<<<< HEAD
-        source=dataclasses.replace(real.source, device=fake.source.device),
-        delay=dataclasses.replace(real.delay, command=fake.delay.command),
-=======
         delay=dataclasses.replace(real.delay, command=fake.delay.command), source=dataclasses.replace(real.source, device=None),
->>>>>>> vehicle
     )  # fmt: skip
     assert swapped == fake
     with pytest.raises(ConfigError, match="a recording flies dry"):

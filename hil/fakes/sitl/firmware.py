@@ -9,9 +9,12 @@ Source: betaflight 4.6, src/platform/SIMULATOR/sitl.c, src/main/cli/cli.c, src/m
 """
 
 import contextlib
+import ctypes
 import os
+import signal
 import socket
 import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -22,7 +25,7 @@ from hil.fakes.sitl.packets import StillSensors
 PORTS = (5761, 5762)
 """TCP ports of the first two serial ports: the first is the runner's, the second the bridge's."""
 
-START, ANSWER, REBOOT = 10.0, 5.0, 5.0
+START, ANSWER, REBOOT = 20.0, 20.0, 10.0
 """Time for a start, for an answer of the command line and for the end after ``save`` [s]."""
 
 SETTLED = 0.5
@@ -38,6 +41,11 @@ the 5-inch quadrotors that they are made for. At the full ones it rings, its mot
 
 FAVOUR, PRIORITY = -15, 10
 """Nice value and real-time priority of firmware and bridge where the system grants them: the loop runs 8000 times a second."""
+
+PR_SET_PDEATHSIG = 1
+"""Of prctl."""
+
+_LIBC = ctypes.CDLL(None)
 
 PROMPT = b"\n# "
 
@@ -110,8 +118,9 @@ class Firmware:
         told = self.folder / "firmware.txt"  # its errors; of what it prints, most are the words of its memory
         with open(told, "wb") as errors:
             self._process = subprocess.Popen(
-                [self.program], cwd=self.folder, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=errors
-            )
+                [self.program], cwd=self.folder, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=errors,
+                preexec_fn=_end_with_parent,
+            )  # fmt: skip
         favour(self._process.pid)
         end = time.monotonic() + START
         while f"bind port {PORTS[0]} for UART1" not in (words := told.read_text(errors="replace")):
@@ -150,6 +159,18 @@ class Firmware:
         Raises:
             RunError: a setting that the firmware refuses or does not keep.
         """
+        try:
+            kept = self._written(settings)
+        except BaseException:
+            self.stop()
+            raise
+        wrong = [f"{name} is {kept[name]!r}, expected {value!r}" for name, value in settings.items() if kept[name] != value]
+        if wrong:
+            self.stop()
+            raise RunError(f"the firmware did not keep its settings: {'; '.join(wrong)}")
+        return kept
+
+    def _written(self, settings: dict[str, str]) -> dict[str, str]:
         self.start()
         with StillSensors(), CommandLine() as line:
             for name, value in settings.items():
@@ -161,10 +182,6 @@ class Firmware:
             kept = {name: line.read(name) for name in settings}
         self.stop()  # whoever was on the command line cannot arm
         self.start()
-        wrong = [f"{name} is {kept[name]!r}, expected {value!r}" for name, value in settings.items() if kept[name] != value]
-        if wrong:
-            self.stop()
-            raise RunError(f"the firmware did not keep its settings: {'; '.join(wrong)}")
         return kept
 
 
@@ -249,6 +266,12 @@ def _listens(port: int) -> bool:
         except OSError:
             return True
     return False
+
+
+def _end_with_parent() -> None:
+    """Where the system can (Linux), the firmware ends when the process that started it is gone, however that ended."""
+    if sys.platform == "linux":
+        _LIBC.prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
 def favour(process: int = 0) -> None:
