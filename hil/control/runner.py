@@ -120,6 +120,7 @@ class Runner:
         self._aged = 0.5 * sum(contract["observation"]["latency"])
         self.aim = Aim(params.aim, self._aged + self.latch.lag, height, rope)
         self._acted = State.IDLE
+        self._stop_at = math.inf  # when no release of this throw is sent any more [s]
         self.errors: list[str] = []
         self.mount_b: Vector = tuple(map(float, rope["mount"]))
         self.seen_goal_w: Vector | None = None
@@ -248,6 +249,9 @@ class Runner:
         before, self._acted = self._acted, state
         if state is not before:
             self._entered(now, before, state, seen.vehicle)
+        if now >= self._stop_at or state is State.ABORT:
+            self.backend.stop_release()
+            self._stop_at = math.inf
         decision = Decision(now, state.value, self.machine.reason, waits=self.machine.waits(inputs))
         if self._sight is not None and self.sights is not None:
             decision.seen = self._sight.values()
@@ -383,7 +387,8 @@ class Runner:
     def _entered(self, now: float, before: State, state: State, vehicle: BodyState | None) -> None:
         """What a change of state brings with it."""
         if before is State.THROW:
-            self.backend.stop_release()
+            # A fast mechanism may have to be told only after the policy's own time of separation, where commands act late.
+            self._stop_at = self.latch.told if state is State.RECOVER and self.latch.at is not None else now
         if state is State.ARMED:
             self.latch.rearm()
             self.backend.rearm()

@@ -294,7 +294,7 @@ def test_a_release_before_its_hour_is_not_sent_when_it_was_stopped():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("mechanism", [0.11, 0.06, pytest.param(0.002, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("mechanism", [0.11, 0.06, 0.002])
 def test_latch_to_separation_is_the_trained_lag(kind, mechanism):
     """Measured by the fake, which knows the true separation; a faster mechanism waits for the difference.
 
