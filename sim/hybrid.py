@@ -24,12 +24,13 @@ FEWEST = 64
 _BUILDS: dict = {}
 
 
-def _kernels(params: PlantParams, direct: bool, extensions: frozenset[str]):
+def _kernels(params: PlantParams, direct: bool, motors: bool, extensions: frozenset[str]):
     """Kernels of one choice of blocks; built once a process."""
-    key = (params.sim.precision, params.rope.segments, kinds_of(params.vehicle), direct, extensions, structure(params.laws))
+    blocks = (kinds_of(params.vehicle), direct, motors, extensions)
+    key = (params.sim.precision, params.rope.segments, blocks, structure(params.laws))
     if key not in _BUILDS:
         t = types(params.sim.precision)
-        step = build_step(t, params, direct, extensions)
+        step = build_step(t, params, direct, extensions, motors)
         _BUILDS[key] = (t, step, build_reset(t, params, step.State))
     return _BUILDS[key]
 
@@ -109,6 +110,7 @@ class HybridSim:
         airs: list[AirParams] | None = None,
         releases: list[ReleaseParams] | None = None,
         direct: bool = False,
+        motors: bool = False,
         extensions: frozenset[str] = frozenset(),
         gravity: float = GRAVITY,
         threads: int | None = None,
@@ -125,6 +127,7 @@ class HybridSim:
             airs: likewise; default ``[params.air]``.
             releases: likewise; default ``[params.release]``.
             direct: by-pass the blocks: commands are thrust [N] and torque [N m].
+            motors: by-pass the rate controller: commands are motor-speed set-points [rad/s]; a firmware flies the vehicle.
             extensions: of :data:`sim.arrays.structs.EXTENSIONS`, to build in besides those that the parameters need.
             gravity: acceleration of free fall, along -z [m/s^2].
             threads: at most, of a CPU; default all its cores. The bits do not depend on it.
@@ -138,7 +141,7 @@ class HybridSim:
         self.params, self.count, self.device, self.seed = params, count, device, seed
         self.gravity, self.threads = gravity, threads or cores()
         self.extensions = extensions_of(vehicles, ropes, airs, releases, params.laws) | extensions
-        self.types, self._step, self._reset = _kernels(params, direct, self.extensions)
+        self.types, self._step, self._reset = _kernels(params, direct, motors, self.extensions)
         t = self.types
         self._vehicles = wp.array(pack_vehicle(t, vehicles, kinds_of(params.vehicle)), dtype=t.Vehicle, device=device)
         self._ropes = wp.array(pack_rope(t, ropes_on(vehicles, ropes)), dtype=t.Rope, device=device)

@@ -33,7 +33,7 @@ class StepKernels:
 
 
 def build_step(
-    t: Types, params: PlantParams, direct: bool = False, extensions: frozenset[str] = frozenset()
+    t: Types, params: PlantParams, direct: bool = False, extensions: frozenset[str] = frozenset(), motors: bool = False
 ) -> StepKernels:
     """Compose the kernel for the kinds and the number of segments of ``params``.
 
@@ -42,6 +42,7 @@ def build_step(
         params: kinds and segment count are read here; all numbers are read by the kernel at run time.
         direct: by-pass the blocks; see :func:`sim.quadrotor.rigid_body.build_direct_flow`.
         extensions: names of :data:`sim.arrays.structs.EXTENSIONS` to build in; the others cost nothing.
+        motors: by-pass the rate controller: commands are motor-speed set-points [rad/s].
     """
     real, vec3, vec4 = t.real, t.vec3, t.vec4
     Vehicle, Rope, Release, Air, QuadState = t.Vehicle, t.Rope, t.Release, t.Air, t.QuadState
@@ -49,7 +50,7 @@ def build_step(
     nonfinite, fallback, collision, in_rotor = st.NONFINITE, st.FALLBACK, st.COLLISION, st.ROPE_IN_ROTOR
     State = st.array_struct(t, "State", st.STATE_FIELDS)
     Output = st.array_struct(t, "Output", {k: (v, False) for k, v in st.OUTPUT_FIELDS.items()})
-    flow, rate, motor_advance = build_flow(t, params.vehicle, extensions)
+    flow, rate, motor_advance = build_flow(t, params.vehicle, extensions, motors)
     if direct:
         flow = build_direct_flow(t)
     chain = build_chain(t, L, extensions)

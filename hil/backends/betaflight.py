@@ -61,6 +61,10 @@ another one is set."""
 POLLS = {msp.STATUS: 0.1, msp.RC: 0.1, msp.SERVO: 0.1, msp.ANALOG: 1.0}
 """What is asked for all the time, and how often [s]."""
 
+READ_BACK = 0.04
+"""Between two questions for the release [s]. The firmware takes one command in a turn of its serial ports, 100 turns a second by its
+default: with a question or two beside every frame the frames queued up, and came 0.1 to 0.3 s late just after a release."""
+
 AXES = ("roll", "pitch", "yaw")
 
 
@@ -130,7 +134,7 @@ class Betaflight:
         self._boxes: tuple[int, ...] = ()
         self._tuning = b""
         self._polled = dict.fromkeys(POLLS, -1e9)
-        self._heard = self._framed = self._boxed = -1e9
+        self._heard = self._framed = self._boxed = self._read_back = -1e9
         self._flags = self._blocks = 0
         self._free_since: float | None = None  # since when nothing speaks against arming, with ARM low
         self._taken = self._over = self._raised = False  # asked for; over; has followed
@@ -270,7 +274,9 @@ class Betaflight:
         if self.release_record.due(now) and self._opened is None:
             self._opened = now
             self._frame(now)
-        if self.release_record.state == PENDING and self._opened is not None:
+        waits = self.release_record.state == PENDING and self._opened is not None
+        if waits and now - self._read_back >= READ_BACK:
+            self._read_back = now
             if self.release_record.read_back:
                 self._write(msp.SERVO)
             self._write(msp.RC)

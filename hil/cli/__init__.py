@@ -95,8 +95,9 @@ def _add_simulated(fake: argparse.ArgumentParser, direct: argparse.ArgumentParse
     fake.add_argument("--rate", type=float, default=100.0, metavar="HZ", help="poses a second of each body")
     for parser in (fake, direct):
         parser.add_argument(
-            "--plant", default="visthrow.throws.wire_plant:make", metavar="MODULE:FUNCTION", help="that makes the vehicle"
-        )
+            "--plant", default=None, metavar="MODULE:FUNCTION",
+            help="that makes the vehicle (default: visthrow.throws.wire_plant:make, behind a firmware :make_motors)",
+        )  # fmt: skip
     fake.add_argument("--device", default="udpout:127.0.0.1:14560", help="the runner's port")
     fake.add_argument("--sign", default=None, metavar="KEYFILE", help="as of `hil run`")
     fake.add_argument("--policy", default="vision", metavar="POLICY", help="whose plant is flown")
@@ -107,7 +108,12 @@ def _add_simulated(fake: argparse.ArgumentParser, direct: argparse.ArgumentParse
     fake.add_argument(
         "--answer", default="accepted", help="to the release: accepted, in-progress, denied, silent, stuck"
     )
-    fake.add_argument("--kind", default="ardupilot", help="of autopilot: ardupilot, px4, betaflight")
+    fake.add_argument(
+        "--kind", default="ardupilot", help="of autopilot: ardupilot, px4, betaflight; betaflight-sitl is a bridge to its firmware"
+    )
+    fake.add_argument("--firmware", default=None, metavar="PROGRAM", help="that betaflight-sitl starts")
+    fake.add_argument("--folder", default="out/firmware", metavar="FOLDER", help="of the firmware's settings and blackbox")
+    fake.add_argument("--config", default="betaflight_sitl", metavar="NAME", help="of the run that the firmware is set up for")
     fake.add_argument("--msp-port", type=int, default=14561, help="where the fake Betaflight listens")
     fake.add_argument(
         "--option", dest="overrides", action="append", default=[], metavar="KEY=VALUE",

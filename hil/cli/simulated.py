@@ -4,15 +4,24 @@ import argparse
 import json
 import sys
 from pathlib import Path
+from typing import Any
 
 from hil.cli.flight import key_of, params_of
+from hil.errors import RunError
+from hil.fakes.base import Options
 from hil.fakes.direct import Direct, scored
 from hil.fakes.mocap import MocapParams
 from hil.fakes.process import VEHICLE_ID, ListeningPort, load_plant, make_fake, read_options, serve
-from hil.links.clock import MonotonicClock
+from hil.fakes.sitl import SLOW, BetaflightSitl, Firmware, MotorPlant, favour, needed
+from hil.links.clock import Clock, MonotonicClock
 from hil.links.device import check_device, open_port
 from hil.links.mavlink_link import Link
+from hil.params import HilParams
+from visthrow import config
 from visthrow.onboard.policy import Policy, find_policy
+
+PLANT, MOTORS = "visthrow.throws.wire_plant:make", "visthrow.throws.wire_plant:make_motors"
+"""What makes the vehicle behind a fake, and behind a firmware."""
 
 
 def direct(args: argparse.Namespace) -> int:
@@ -20,19 +29,52 @@ def direct(args: argparse.Namespace) -> int:
     params = params_of(args)
     policy, mocap = Policy.load(find_policy(params.policy)), MocapParams()
     for seed in args.seeds:
-        report = Direct(load_plant(args.plant, params.policy, seed), policy, params, mocap, seed).throw()
+        report = Direct(load_plant(args.plant or PLANT, params.policy, seed), policy, params, mocap, seed).throw()
         print(json.dumps({"seed": seed, **scored(report, params, report["start"]), **report}), flush=True)
     return 0
 
 
 def fake(args: argparse.Namespace) -> int:
     """Fly a fake autopilot, and print its report."""
-    options = read_options([*args.overrides, f"answer={args.answer}"])
-    plant = load_plant(args.plant, args.policy, args.seed)
+    options, mocap = read_options([*args.overrides, f"answer={args.answer}"]), MocapParams(rate=args.rate)
+    sitl = args.kind == "betaflight-sitl"
+    plant = load_plant(args.plant or (MOTORS if sitl else PLANT), args.policy, args.seed)
     link = Link(open_port(check_device(args.device)), *VEHICLE_ID, key=key_of(args))
-    port = ListeningPort(args.msp_port) if args.kind == "betaflight" else None
-    flown = make_fake(args.kind, plant, link, MocapParams(rate=args.rate), args.seed, options, port)
-    print(f"the fake {args.kind} flies", file=sys.stderr, flush=True)
-    out = None if args.out is None else Path(args.out)
-    print(json.dumps(serve(flown, MonotonicClock(args.speed), args.seconds, out, args.after), indent=2))
+    clock, out = MonotonicClock(args.speed), None if args.out is None else Path(args.out)
+    if sitl:
+        report = _fly_firmware(args, plant, link, mocap, options, clock, out)
+    else:
+        port = ListeningPort(args.msp_port) if args.kind == "betaflight" else None
+        flown = make_fake(args.kind, plant, link, mocap, args.seed, options, port)
+        print(f"the fake {args.kind} flies", file=sys.stderr, flush=True)
+        report = serve(flown, clock, args.seconds, out, args.after)
+    print(json.dumps(report, indent=2))
     return 0
+
+
+def _fly_firmware(
+    args: argparse.Namespace, plant: MotorPlant, link: Link, mocap: MocapParams, options: Options, clock: Clock, out: Path | None
+) -> dict[str, Any]:  # fmt: skip
+    """Set a firmware up, fly the plant by its motor outputs, end it; the report."""
+    if args.firmware is None:
+        raise RunError("--kind betaflight-sitl without --firmware; expected Betaflight's program for a PC")
+    params = config.load(HilParams, config.find("hil", args.config)).betaflight
+    firmware = Firmware(args.firmware, args.folder)
+    try:
+        kept = firmware.set_up(needed(params))
+        print("".join(f"{name:28} {value}\n" for name, value in kept.items()), end="", file=sys.stderr)
+        flown = BetaflightSitl(plant, link, mocap, args.seed, options, params)
+        favour()
+        flown.sensors.start(args.speed)
+        print("the firmware has its settings; it flies", file=sys.stderr, flush=True)
+        report = serve(flown, clock, args.seconds, out, args.after)
+        flown.close()
+    finally:
+        firmware.stop()
+    periods = report["time"] / plant.period
+    if report["late_periods"] > SLOW * periods:
+        print(
+            f"this machine is too slow: {report['late_periods']} of {periods:.0f} periods were late; slow both clocks, --speed "
+            f"{args.speed / 2:g} here and of the run", file=sys.stderr,
+        )  # fmt: skip
+    return report

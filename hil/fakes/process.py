@@ -131,6 +131,37 @@ def read_options(overrides: list[str]) -> Options:
     return config.loads(Options, "", overrides, "options of the fake")
 
 
+class Paced:
+    """A fake in real time, a period at a call.
+
+    Attributes:
+        late: periods that took longer than real time has.
+    """
+
+    def __init__(self, fake: Fake, clock: Clock) -> None:
+        """Start now; where the machine is late the vehicle's clock is as late as the vehicle."""
+        self.fake, self.clock, self.late = fake, clock, 0
+        self._start = clock.now() - fake.plant.time
+        fake.wall, fake.question_lag = self._wall, 0.0
+
+    def _wall(self) -> float:
+        plant = self.fake.plant
+        return plant.time + min(max(self.clock.now() - self._start - plant.time, 0.0), plant.period)
+
+    def step(self) -> None:
+        """Wait until the next period is over, hearing what comes, and fly it."""
+        fake, clock = self.fake, self.clock
+        time = fake.plant.time + fake.plant.period
+        due = self._start + time
+        self.late += clock.now() > due
+        while clock.now() < due:  # what comes meanwhile acts from when it comes
+            clock.wait_for([fake.port], due)
+            fake.hear()
+        fake.deliver(time)  # poses leave before a period is worked out
+        fake.fly()
+        fake.emit()
+
+
 def serve(
     fake: Fake, clock: Clock, most: float, out: Path | None = None, after: float = AFTER_LANDING
 ) -> dict[str, Any]:  # fmt: skip
@@ -139,34 +170,20 @@ def serve(
     Returns:
         The report, with the number of periods that took longer than real time has.
     """
-    start, begun, late = clock.now() - fake.plant.time, fake.plant.time, 0
-
-    def wall() -> float:
-        # Where the machine is late the vehicle's clock is as late as the vehicle.
-        return fake.plant.time + min(max(clock.now() - start - fake.plant.time, 0.0), fake.plant.period)
-
-    fake.wall, fake.question_lag = wall, 0.0
+    paced, begun = Paced(fake, clock), fake.plant.time
     with contextlib.suppress(KeyboardInterrupt), collected():  # a collection of all takes a tenth of a second
         while fake.plant.time - begun < most:
-            time = fake.plant.time + fake.plant.period
-            due = start + time
-            late += clock.now() > due
-            while clock.now() < due:  # what comes meanwhile acts from when it comes
-                clock.wait_for([fake.port], due)
-                fake.hear()
-            fake.deliver(time)  # poses leave before a period is worked out
-            fake.fly()
-            fake.emit()
+            paced.step()
             landed = fake.plant.landing["landing_time"]
             if landed is not None and fake.plant.time > landed + after:
                 break
-    report = {**fake.report(), "late_periods": late}
+    report = {**fake.report(), "late_periods": paced.late}
     if out is not None:
         out.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
     return report
 
 
 __all__ = [
-    "KINDS", "VEHICLE_ID", "FakeAutopilot", "ListeningPort", "MocapParams", "Options", "WirePlant", "load_plant",
+    "KINDS", "VEHICLE_ID", "FakeAutopilot", "ListeningPort", "MocapParams", "Options", "Paced", "WirePlant", "load_plant",
     "make_fake", "read_options", "serve",
 ]  # fmt: skip

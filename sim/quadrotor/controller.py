@@ -116,3 +116,10 @@ def rate_controller_geometric(p: Any, command: Any, rate_b: Any, integral: Any, 
         f[i] = wp.clamp(f[i] + quarter, p.controller.min_thrust, p.controller.max_thrust)
     still = rate_b - rate_b
     return speeds_of_thrusts(p, f), still, still, still
+
+
+@wp.func
+def motor_speeds(p: Any, command: Any, rate_b: Any, integral: Any, setpoint: Any, gyro: Any, voltage: Any):
+    """The controller by-passed: commands are motor-speed set-points [rad/s], shape (4,), from outside."""
+    still = rate_b - rate_b
+    return command, still, still, still

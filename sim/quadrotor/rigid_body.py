@@ -82,19 +82,20 @@ def pushed(air: Any, quat_wb: Any, force: Any, torque: Any):
     return force + wp.quat_rotate_inv(quat_wb, air.push_w), torque + air.twist_b
 
 
-def build_flow(t: Types, vehicle: VehicleParams, extensions: frozenset[str] = frozenset()):
+def build_flow(t: Types, vehicle: VehicleParams, extensions: frozenset[str] = frozenset(), motors: bool = False):
     """Compose the blocks of a vehicle's kinds.
 
     Args:
         t: types of the wanted precision.
         vehicle: its kinds are read here.
         extensions: names of :data:`sim.arrays.structs.EXTENSIONS` to build in.
+        motors: in place of the vehicle's controller, commands are motor-speed set-points.
 
     Returns:
         ``flow(p, air, state, command) -> t.Flow`` (body wrench and the derivatives of all internal states),
         ``rate(p, state, flow, acc_w, angular_acc_b) -> t.QuadRate``, and ``motor_advance``.
     """
-    rate_controller = CONTROLLERS[vehicle.controller.kind]
+    rate_controller = controller.motor_speeds if motors else CONTROLLERS[vehicle.controller.kind]
     motor_rate, motor_advance = MOTORS[vehicle.motor.kind]
     battery_rate = BATTERIES[vehicle.battery.kind]
     aerodynamics = AEROS[vehicle.aero.kind]

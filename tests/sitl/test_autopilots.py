@@ -4,9 +4,8 @@ Each is run where its address stands in the environment, and skipped where nothi
 
     VISTHROW_SITL_ARDUPILOT=tcp:127.0.0.1:5760     arducopter --model quad, or sim_vehicle.py
     VISTHROW_SITL_PX4=udp:127.0.0.1:14540          PX4's offboard port, make px4_sitl sihsim_quadx
-    VISTHROW_SITL_BETAFLIGHT=tcp:127.0.0.1:5761    betaflight_SITL.elf, first serial port; set up as hil/README.md says
 
-They prove protocol, order and failsafes; nothing of aerodynamics, cable or policy.
+They prove protocol, order and failsafes; nothing of aerodynamics, cable or policy. Betaflight's firmware has tests of its own beside these.
 """
 
 import os
@@ -14,7 +13,7 @@ import time
 
 import pytest
 
-from hil.backends import Betaflight, make_backend
+from hil.backends import make_backend
 from hil.backends.autopilot import ARMED
 from hil.backends.base import FOLLOW, HOLD
 from hil.errors import LinkError
@@ -42,7 +41,7 @@ PERIOD = 0.02
 POSITION = 60.0
 """ArduPilot's estimator takes so long at most to know where the vehicle is [s]."""
 
-HOVER_SHARE = {"ardupilot": ("ardupilot.thrust.hover=0.39",), "px4": (), "betaflight": ()}
+HOVER_SHARE = {"ardupilot": ("ardupilot.thrust.hover=0.39",), "px4": ()}
 """Of the vehicle in the autopilot's own software: with the fakes' share it does not lift, or shoots away."""
 
 
@@ -53,22 +52,19 @@ class Bench:
         address = os.environ.get(f"VISTHROW_SITL_{kind.upper()}")
         if not address:
             pytest.skip(f"VISTHROW_SITL_{kind.upper()} is not set")
-        names = {"ardupilot": "fake", "px4": "fake_px4", "betaflight": "fake_betaflight"}
+        names = {"ardupilot": "fake", "px4": "fake_px4"}
         self.kind = kind
         self.params = config.load(HilParams, config.find("hil", names[kind]), (*HOVER_SHARE[kind], *overrides))
         try:
             port = open_port(check_device(address))
         except LinkError as error:
             pytest.skip(str(error))
-        self.link, self.rates, self.placed = None, [], False
+        self.rates, self.placed = [], False
         self.tables: list[str] = []
-        if kind == "betaflight":
-            self.backend = Betaflight(port, self.params.betaflight, False, self.tables.append)
-        else:
-            self.link = Link(port, 245, 191, roster=Roster(parties(self.params, False, True)))
-            LinkSync(self.link)
-            self.link.listen(self._hear)
-            self.backend = make_backend(self.params, self.link, True, self.tables.append)
+        self.link = Link(port, 245, 191, roster=Roster(parties(self.params, False, True)))
+        LinkSync(self.link)
+        self.link.listen(self._hear)
+        self.backend = make_backend(self.params, self.link, True, self.tables.append)
 
     def _hear(self, message, arrival):
         if message.get_type() == "ATTITUDE":
@@ -83,8 +79,7 @@ class Bench:
         """Run for a time, or until something holds."""
         end = time.monotonic() + seconds
         while (now := time.monotonic()) < end:
-            if self.link is not None:
-                self.link.pump(time.monotonic)
+            self.link.pump(time.monotonic)
             if command is not None:
                 self.backend.send(command, now)
             if ask is not None:
@@ -96,17 +91,14 @@ class Bench:
         return until is None
 
     def heard(self) -> bool:
-        if self.kind == "betaflight":
-            return self.backend._heard > 0.0
         return self.backend._heartbeat is not None
 
     def connect(self):
         if not self.turn(ANSWER, until=self.heard):
             pytest.skip("nothing answers")
-        if self.link is not None:
-            for number in (mav.MAVLINK_MSG_ID_ATTITUDE, mav.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW):
-                values = (mav.MAV_CMD_SET_MESSAGE_INTERVAL, 0, number, 10_000.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-                self.link.send(mav.MAVLink_command_long_message(1, 1, *values))
+        for number in (mav.MAVLINK_MSG_ID_ATTITUDE, mav.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW):
+            values = (mav.MAV_CMD_SET_MESSAGE_INTERVAL, 0, number, 10_000.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+            self.link.send(mav.MAVLink_command_long_message(1, 1, *values))
         self.turn(ANSWER, until=lambda: self.backend.audit.done)
         if self.kind == "ardupilot":
             for name, value in WRITTEN.items():
@@ -115,8 +107,7 @@ class Bench:
 
     def close(self):
         self.backend.close()
-        if self.link is not None:
-            self.link.close()
+        self.link.close()
 
 
 @pytest.fixture
@@ -132,13 +123,12 @@ def bench():
         each.close()
 
 
-KINDS = ("ardupilot", "px4", "betaflight")
+KINDS = ("ardupilot", "px4")
 NO_MECHANISM = {
     "ardupilot": ("ardupilot.servo_output=9", 'ardupilot.release="servo"'),
     "px4": ("px4.servo_output=0", 'px4.release="actuator"', 'px4.output_parameter=""'),
-    "betaflight": ("betaflight.servo_output=0", "betaflight.arm_channel=1"),
 }
-"""Software has no gripper: a bare servo output, an actuator set, the channel's own read-back."""
+"""Software has no gripper: a bare servo output, an actuator set."""
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -149,7 +139,7 @@ def test_every_parameter_of_the_audit_exists(bench, kind):
     assert "no answer" not in desk.tables[0], desk.tables[0]
 
 
-@pytest.mark.parametrize("kind", ["ardupilot", "px4"])
+@pytest.mark.parametrize("kind", KINDS)
 def test_clocks_are_known(bench, kind):
     desk = bench(kind, *NO_MECHANISM[kind])
     desk.turn(3.0)
@@ -175,7 +165,6 @@ def flying(desk, placed=False):
 TAKE = {
     "ardupilot": ("ardupilot.take=true", "ardupilot.arm=true", "ardupilot.follow_mode=20", "ardupilot.audit=false"),
     "px4": ("px4.arm=true", "px4.audit=false"),
-    "betaflight": ("betaflight.audit=false",),
 }
 """Bench settings: the runner arms; GUIDED_NOGPS needs no position."""
 
@@ -187,11 +176,10 @@ WRITTEN = {"GUID_OPTIONS": 8.0, "ATC_ANGLE_BOOST": 0.0, "GUID_TIMEOUT": 0.5, "SE
 def test_it_is_taken_and_armed(bench, kind):
     desk = bench(kind, *NO_MECHANISM[kind], *TAKE[kind])
     flying(desk)
-    if desk.link is not None:
-        assert desk.backend._heartbeat.base_mode & ARMED
+    assert desk.backend._heartbeat.base_mode & ARMED
 
 
-@pytest.mark.parametrize("kind", ["ardupilot", "px4"])
+@pytest.mark.parametrize("kind", KINDS)
 def test_a_step_of_the_roll_rate(bench, kind):
     desk = bench(kind, *NO_MECHANISM[kind], *TAKE[kind])
     params = flying(desk)
@@ -216,7 +204,7 @@ def test_the_release_is_answered_and_moves(bench, kind):
     assert desk.status.release == "accepted", (record.note, record.sends)
 
 
-@pytest.mark.parametrize("kind", ["ardupilot", "px4"])
+@pytest.mark.parametrize("kind", KINDS)
 def test_the_autopilots_own_hold_takes_over(bench, kind):
     """It needs a position: in ArduPilot's software the simulated GPS, in PX4's whatever its estimator is fed with."""
     more = ("ardupilot.hold_mode=5", "ardupilot.follow_mode=4") if kind == "ardupilot" else ()
@@ -230,7 +218,7 @@ def test_the_autopilots_own_hold_takes_over(bench, kind):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_silence_ends_in_the_autopilots_own_hands(bench, kind):
-    """PX4 leaves OFFBOARD, Betaflight disarms; ArduPilot stays in its mode and levels."""
+    """PX4 leaves OFFBOARD; ArduPilot stays in its mode and levels."""
     desk = bench(kind, *NO_MECHANISM[kind], *TAKE[kind])
     flying(desk)
     desk.turn(4.5)

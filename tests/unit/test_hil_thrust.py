@@ -102,3 +102,22 @@ def test_the_configs_of_real_vehicles_can_do_what_the_shipped_policies_ask(name)
     assert swapped == fake
     with pytest.raises(ConfigError, match="a recording flies dry"):
         config.load(HilParams, config.find("hil", name), ['source.kind="tlog"', 'source.file="a.tlog"'])
+
+
+def test_a_curve_of_the_rotors_is_inverted_exactly():
+    """``T = W (z / z_h)^2`` with ``z = idle + (1 - idle) u``: 4 times the weight at twice the motors' command."""
+    params = ThrustParams(2.668, 0.36, 1.0, 0.08, 0.0, 2.0, 0.055)
+    motors = 0.055 + 0.945 * 0.36
+    double = (2 * motors - 0.055) / 0.945
+    assert params.thrust(double) == pytest.approx(4 * 2.668)
+    assert params.share(4 * 2.668) == pytest.approx(double)
+    assert params.share(2.668) == pytest.approx(0.36)
+    assert params.share(0.0) == 0.0
+    for thrust in (0.5, 2.0, 7.0):
+        assert params.thrust(params.share(thrust)) == pytest.approx(thrust)
+
+
+@pytest.mark.parametrize("wrong", [(0.5, 0.0), (2.0, 0.6), (2.0, -0.1)])
+def test_curves_that_no_rotor_has_are_refused(wrong):
+    with pytest.raises(ValueError, match="exponent"):
+        ThrustParams(2.668, 0.36, 1.0, 0.08, 0.0, *wrong)

@@ -20,6 +20,10 @@ PLANTS = {
 """Name -> what pictures call it."""
 
 
+BODIES = ("pos_w", "quat_wb", "vel_w", "rate_b", "cable_dir_w", "cable_vel_w")
+"""State arrays of bodies and ropes."""
+
+
 @dataclass(frozen=True)
 class Snapshot:
     """State of E plants at one time; world frame, quaternions xyzw."""
@@ -92,6 +96,7 @@ class HybridPlant:
         noise: NoiseParams | None = None,
         latency: tuple[float, float] = (0.0, 0.0),
         start: RandomizationParams | None = None,
+        motors: bool = False,
     ) -> None:
         """Build the simulator.
 
@@ -104,6 +109,7 @@ class HybridPlant:
             latency: range that each vehicle's age of measurements is drawn from at a reset [s].
             start: with it, vehicles, ropes and starts are those of :func:`visthrow.training.protocol.throw` with the same seed and
                 start, and commands are disturbed as in training.
+            motors: commands are motor-speed set-points [rad/s], shape (E, 4); see `sim.hybrid.HybridSim`.
         """
         from sim.hybrid import HybridSim, rope_variants
 
@@ -111,7 +117,7 @@ class HybridPlant:
         self.period = self.params.sim.control_period
         self._start, self._action = start, experiment.task.action
         ropes = None if start is None else rope_variants(self.params.rope, start)
-        self._sim = HybridSim(self.params, count, device, seed, ropes=ropes)
+        self._sim = HybridSim(self.params, count, device, seed, ropes=ropes, motors=motors)
         self._rng = np.random.default_rng(seed)
         self._command_bias = np.zeros((count, 4))
         if start is None:
@@ -141,7 +147,8 @@ class HybridPlant:
     def step(self, command: np.ndarray, release: np.ndarray | bool = False) -> None:
         """See `Plant`."""
         release = np.broadcast_to(np.asarray(release, dtype=bool), (self.count,))
-        self._before = self.state
+        if np.any(self._age):
+            self._before = self.state
         self._sim.set_command(command if self._start is None else self._disturbed(command), release)
         self._sim.step()
         self._latched = self._latched | release
@@ -157,6 +164,27 @@ class HybridPlant:
                 if self.period - inside > 1e-6:
                     self._ropes[e].fly(self.period - inside)
         self.time += self.period
+
+    def hold(self, names: dict[str, np.ndarray] | None = None) -> dict[str, np.ndarray]:
+        """Put bodies and ropes back to where an earlier call found them; motors and battery go on.
+
+        Args:
+            names: what that call returned; None only looks.
+
+        Returns:
+            State arrays of bodies and ropes.
+        """
+        for name, value in (names or {}).items():
+            getattr(self._sim.state, name).assign(value)
+        return names or {name: getattr(self._sim.state, name).numpy().copy() for name in BODIES}
+
+    def look(self, *names: str) -> list[np.ndarray]:
+        """Arrays of the simulator's state, environment first: a snapshot's price is many times that."""
+        return [self._sim.get(name).astype(float) for name in names]
+
+    def stop_motors(self) -> None:
+        """Let the rotors stand still."""
+        self._sim.state.motor_speed.zero_()
 
     def postpone(self, time: float) -> None:
         """Let payloads that are latched and still hang separate so much later [s]: the latch tripped within the last period."""

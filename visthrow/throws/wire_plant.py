@@ -7,12 +7,18 @@ import dataclasses
 
 import numpy as np
 
+from visthrow.common.constants import GRAVITY
 from visthrow.task import Experiment, plant_of
 from visthrow.throws.loading import load_policy
 from visthrow.throws.plants import HybridPlant, random_ropes
 
 PERIOD = 0.005
 """Of the plant behind the wire [s]: commands that come between two control periods wait no longer than this."""
+
+
+MECHANISM = 0.06
+"""From the trip of the latch to separation behind a firmware [s]: a quick servo, so that the firmware's own delay has room
+within the lag that the policies were trained with."""
 
 
 class WirePlant:
@@ -32,18 +38,24 @@ class WirePlant:
             experiment: whose plant it is.
             seed: of the start.
         """
-        observation = dataclasses.replace(experiment.task.observation, latency=(0.0, 0.0))
-        fine = dataclasses.replace(
-            experiment,
-            sim=dataclasses.replace(experiment.sim, control_period=PERIOD),
-            task=dataclasses.replace(experiment.task, observation=observation),
-        )
-        self._plant = HybridPlant(fine)
+        self._plant = self._built(experiment)
         self.home_w = np.array([0.0, 0.0, experiment.task.start.spawn_height])
         self.mass = (plant_of(experiment).total_mass, experiment.vehicle.body.mass)
         self.max_thrust = experiment.task.action.max_thrust
         rng = np.random.default_rng(seed)
         self._plant.reset(self.home_w + 0.1 * rng.uniform(-1, 1, (1, 3)), random_ropes(rng, 1, experiment.rope.segments, 0.05))
+
+    def _built(self, experiment: Experiment) -> HybridPlant:
+        return HybridPlant(self._fine(experiment))
+
+    def _fine(self, experiment: Experiment) -> Experiment:
+        """The experiment with this plant's period, nothing measured late."""
+        observation = dataclasses.replace(experiment.task.observation, latency=(0.0, 0.0))
+        return dataclasses.replace(
+            experiment,
+            sim=dataclasses.replace(experiment.sim, control_period=self.period),
+            task=dataclasses.replace(experiment.task, observation=observation),
+        )
 
     def step(self, command: np.ndarray, release: bool, after: float = 0.0) -> None:
         """Advance by one period under collective thrust [N] and body rates [rad/s], shape (4,).
@@ -90,3 +102,81 @@ def make(policy: str, seed: int) -> WirePlant:
         seed: of the start.
     """
     return WirePlant(load_policy(policy).experiment, seed)
+
+
+class MotorPlant(WirePlant):
+    """The same vehicle without its rate controller, for a firmware that puts out motor commands.
+
+    Electronic speed controllers turn the rotors at ``full_speed * command * voltage / reference_voltage``: thrust goes with
+    the square of the command and of the battery's voltage. The vehicle stands still at its start, the rope hanging, until its
+    rotors carry its weight.
+
+    Attributes:
+        force_b: specific force, what an accelerometer shows [m/s^2], body frame. held: whether it still stands.
+        quat_wb, rate_b: attitude xyzw and body rates [rad/s] now.
+    """
+
+    period = 0.002
+
+    def __init__(self, experiment: Experiment, seed: int) -> None:
+        """See `WirePlant`."""
+        super().__init__(experiment, seed)
+        controller, thrust, battery = experiment.vehicle.controller, experiment.vehicle.thrust, experiment.vehicle.battery
+        self._full_speed = (controller.max_thrust / thrust.k_f) ** 0.5
+        self._k_f, self._reference = thrust.k_f, battery.reference_voltage
+        self._plant.stop_motors()
+        self._stand: dict[str, np.ndarray] | None = self._plant.hold()
+        self._look()
+        self.force_b = np.array([0.0, 0.0, GRAVITY])
+
+    def look(self) -> dict[str, np.ndarray]:
+        """Attitude, velocity, rates, motor_speed [rad/s] and voltage [V] now: what a period needs."""
+        names = ("quat_wb", "vel_w", "rate_b", "motor_speed", "voltage")
+        return {name: value[0] for name, value in zip(names, self._plant.look(*names))}
+
+    def _look(self) -> None:
+        self._now = self.look()
+        self.quat_wb, self.rate_b = self._now["quat_wb"], self._now["rate_b"]
+
+    def _built(self, experiment: Experiment) -> HybridPlant:
+        queue = dataclasses.replace(experiment.vehicle.queue, delay=0.0)  # the firmware's own path comes in its place
+        vehicle = dataclasses.replace(experiment.vehicle, queue=queue)
+        release = dataclasses.replace(experiment.release, lag=MECHANISM)
+        return HybridPlant(self._fine(dataclasses.replace(experiment, vehicle=vehicle, release=release)), motors=True)
+
+    @property
+    def held(self) -> bool:
+        """Whether it still stands."""
+        return self._stand is not None
+
+    def step(self, command: np.ndarray, release: bool, after: float = 0.0) -> None:
+        """Advance by one period under motor commands, 0 to 1, shape (4,); release: see `WirePlant`."""
+        vel_w = self._now["vel_w"]
+        speed = self._full_speed * np.clip(command, 0.0, 1.0) * self._now["voltage"] / self._reference
+        super().step(speed, release and not self.held, after)
+        self._look()
+        if self._stand is None:
+            push_w = (self._now["vel_w"] - vel_w) / self.period + np.array([0.0, 0.0, GRAVITY])
+            self.force_b = turned_back(self.quat_wb, push_w)
+        elif self._k_f * np.sum(self._now["motor_speed"] ** 2) < self.mass[0] * GRAVITY:
+            self._plant.hold(self._stand)
+            self._look()
+        else:
+            self._stand = None
+
+
+def turned_back(quat: np.ndarray, vector_w: np.ndarray) -> np.ndarray:
+    """A vector of the world frame in the frame of an attitude xyzw."""
+    axis, w = quat[:3], quat[3]
+    twice = 2.0 * np.cross(axis, vector_w)
+    return vector_w - w * twice + np.cross(axis, twice)
+
+
+def make_motors(policy: str, seed: int) -> MotorPlant:
+    """The plant that a policy was trained on, flown by motor commands.
+
+    Args:
+        policy: a shipped name or a file.
+        seed: of the start.
+    """
+    return MotorPlant(load_policy(policy).experiment, seed)

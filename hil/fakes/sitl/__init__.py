@@ -1,0 +1,6 @@
+"""Real firmware in software with the simulator's vehicle behind it: its process, its set-up, the bridge between the two."""
+
+from hil.fakes.sitl.betaflight import SLOW, BetaflightSitl, MotorPlant
+from hil.fakes.sitl.firmware import Firmware, favour, needed
+
+__all__ = ["SLOW", "BetaflightSitl", "Firmware", "MotorPlant", "favour", "needed"]

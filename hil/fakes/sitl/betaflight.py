@@ -1,0 +1,169 @@
+"""The bridge: Betaflight's firmware flies the simulator's vehicle, rope and ball by its own motor outputs.
+
+Each period of the vehicle the firmware gets gyro, accelerometer and attitude, and answers with four motor commands. The release
+is read from the firmware's own channels by MSP on its second serial port. The runner speaks to the first one; the bridge sends
+the poses of both bodies beside it. Until the rotors carry it the vehicle hangs in a stand.
+"""
+
+import socket
+from typing import Any
+
+import numpy as np
+
+from hil.backends.betaflight import BOX_ARM, HIGH, NEAR, STICKS, BetaflightParams
+from hil.fakes.base import Fake, Options, WirePlant
+from hil.fakes.mocap import MocapParams
+from hil.fakes.sitl.firmware import PORTS
+from hil.fakes.sitl.packets import MOTORS, Sensors, motors
+from hil.links import msp
+from hil.links.device import LARGEST_DATAGRAM, MOST_CHUNKS, Device, Port, TcpPort
+from hil.links.mavlink_link import Link
+
+ASK = {msp.RC: 0.01, msp.STATUS: 0.1}
+"""What the firmware is asked for, and how often [s]."""
+
+SLOW = 0.01
+"""Share of late periods above which the machine is too slow for real time."""
+
+
+class MotorPlant(WirePlant):
+    """What flies behind the firmware: steps are taken under motor commands."""
+
+    held: bool
+    quat_wb: np.ndarray
+    rate_b: np.ndarray
+    force_b: np.ndarray
+
+
+class MotorPort:
+    """Where the firmware's motor outputs come in; a `hil.links.device.Port` that is only read."""
+
+    whole = True
+
+    def __init__(self) -> None:
+        """Listen on the firmware's port, loopback only."""
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.bind(("127.0.0.1", MOTORS))
+        self._socket.setblocking(False)
+
+    def read(self) -> bytes | None:
+        """See `Port`."""
+        try:
+            return self._socket.recv(LARGEST_DATAGRAM)
+        except OSError:
+            return None
+
+    def write(self, data: bytes) -> bool:
+        """See `Port`: nothing goes out here."""
+        return False
+
+    def fileno(self) -> int:
+        """See `Port`."""
+        return self._socket.fileno()
+
+    def close(self) -> None:
+        """See `Port`."""
+        self._socket.close()
+
+
+class BetaflightSitl(Fake):
+    """See the head of this module.
+
+    Attributes:
+        motors: last outputs, 0 to 1, shape (4,), in our order. answered: periods in which the firmware put out motors.
+    """
+
+    def __init__(
+        self, plant: MotorPlant, link: Link, mocap: MocapParams | None, seed: int, options: Options, params: BetaflightParams
+    ) -> None:  # fmt: skip
+        """Connect to a firmware that runs.
+
+        Args:
+            plant, link, mocap, seed, options: see `Fake`.
+            params: of the runner's back-end: which channel opens the mechanism.
+        """
+        super().__init__(plant, link, mocap, seed, options)
+        self.params, self.armed = params, False
+        self.port, self.sensors = MotorPort(), Sensors()
+        self._msp: Port = TcpPort(Device("tcp", "127.0.0.1", PORTS[1]))
+        self._parser, self._asked = msp.Parser(), dict.fromkeys(ASK, -1e9)
+        self._boxes: tuple[int, ...] = ()
+        self._open = False
+        self._blocks = 0
+        self.motors = np.zeros(4)
+        self.answered = 0
+        self.cycles: list[int] = []
+        self._fresh = False
+
+    def hear(self) -> None:
+        """See `Fake`: motors, and what the firmware says of itself."""
+        super().hear()
+        for _ in range(MOST_CHUNKS):
+            packet = self.port.read()
+            if packet is None:
+                break
+            outputs = motors(packet)
+            if outputs is not None:
+                self.motors, self._fresh = outputs, True
+        for _ in range(MOST_CHUNKS):
+            data = self._msp.read()
+            if data is None:
+                return
+            self.heard = self.wall()
+            for frame in self._parser.parse(data):
+                self._hear(frame)
+
+    def _hear(self, frame: msp.Frame) -> None:
+        if frame.command == msp.BOXIDS:
+            self._boxes = tuple(frame.payload)
+        elif frame.command == msp.STATUS and self._boxes:
+            self._hear_status(frame)
+        elif frame.command == msp.RC:
+            channels, at = frame.words(), STICKS + self.params.release_channel - 1
+            opened = at < len(channels) and abs(channels[at] - HIGH) <= NEAR
+            if opened and not self._open:
+                self.note_release()
+                self.open_mechanism()
+            self._open = opened
+
+    def _hear_status(self, frame: msp.Frame) -> None:
+        flags, cycle = frame.u32(6) or 0, frame.u16(0)
+        armed = BOX_ARM in self._boxes and bool(flags >> self._boxes.index(BOX_ARM) & 1)
+        if armed != self.armed:
+            self.happened("armed" if armed else "disarmed")
+        self.armed = armed
+        if armed and cycle:
+            self.cycles.append(cycle)
+
+    def flown(self) -> np.ndarray:
+        """See `Fake`: the firmware's motor outputs."""
+        self.answered += self._fresh
+        self._fresh = False
+        return self.motors
+
+    def speak(self) -> None:
+        """See `Fake`: samples of this moment, and questions that are due."""
+        plant = self.plant
+        self.sensors.send(plant.rate_b, plant.force_b, plant.quat_wb)
+        for command, period in ASK.items():
+            if plant.time - self._asked[command] >= period:
+                self._asked[command] = plant.time
+                self._msp.write(msp.pack(msp.Frame(command)))
+        if not self._boxes and self._asked[msp.STATUS] == plant.time:
+            self._msp.write(msp.pack(msp.Frame(msp.BOXIDS)))
+
+    def take(self) -> None:
+        """See `Fake`: there is no pilot; all channels are the runner's."""
+
+    def report(self) -> dict[str, Any]:
+        """See `Fake`."""
+        loop = float(np.median(self.cycles)) if self.cycles else None
+        unknown = ("followed", "ignored", "commands", "worst", "breaches", "last_command")  # the runner's link passes us by
+        known = {name: value for name, value in super().report().items() if name not in unknown}
+        return {**known, "held": self.plant.held, "motor_packets": self.answered, "loop_us": loop}
+
+    def close(self) -> None:
+        """See `Fake`."""
+        super().close()
+        for port in (self.port, self.sensors, self._msp):
+            port.close()

@@ -1,0 +1,283 @@
+"""Betaflight in software as a process: start it, write its settings over its command line, read them back, end it.
+
+The firmware keeps its settings (``eeprom.bin``) and its blackbox (``LOG00001.BFL``) in the folder that it runs in. It ends
+itself where a board would restart, so it is started anew after ``save``. It answers on its command line only while it is fed
+with samples of its sensors (`hil.fakes.sitl.packets`), and listens on every address of the machine: keep it in a network
+namespace (``unshare -rn``), or on a machine that nobody else reaches.
+
+Source: betaflight 4.6, src/platform/SIMULATOR/sitl.c, src/main/cli/cli.c, src/main/msp/msp_box.c.
+"""
+
+import contextlib
+import ctypes
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from hil.backends.betaflight import STICKS, BetaflightParams
+from hil.errors import RunError
+from hil.fakes.sitl.packets import StillSensors
+
+PORTS = (5761, 5762)
+"""TCP ports of the first two serial ports: the first is the runner's, the second the bridge's."""
+
+START, ANSWER, REBOOT = 20.0, 20.0, 10.0
+"""Time for a start, for an answer of the command line and for the end after ``save`` [s]."""
+
+SETTLED = 0.5
+"""From listening to ready for samples [s]: one that comes before its sensors are begun stops the firmware for ever."""
+
+GAINS = {
+    "p_roll": 11, "i_roll": 20, "d_roll": 8, "d_max_roll": 10, "f_roll": 30,
+    "p_pitch": 12, "i_pitch": 21, "d_pitch": 9, "d_max_pitch": 12, "f_pitch": 31,
+    "p_yaw": 45, "i_yaw": 80, "f_yaw": 120,
+}  # fmt: skip
+"""Betaflight's own for yaw, a quarter of them for roll and pitch: the paper's vehicle turns four times as fast for the same output as
+the 5-inch quadrotors that they are made for. At the full ones it rings, its motors take 33 ms."""
+
+FAVOUR, PRIORITY = -15, 10
+"""Nice value and real-time priority of firmware and bridge where the system grants them: the loop runs 8000 times a second."""
+
+PR_SET_PDEATHSIG = 1
+"""Of prctl."""
+
+_LIBC = ctypes.CDLL(None)
+
+PROMPT = b"\n# "
+
+
+def needed(params: BetaflightParams) -> dict[str, str]:
+    """Settings that a throw needs, by the name that the command line prints them under.
+
+    ``serial``, ``aux`` and ``feature`` lines stand under their first words; see `lines`.
+    """
+    rates = params.rates
+    out = {
+        "serial UART2": "1 115200 57600 0 115200",  # MSP for the bridge, beside the runner's
+        "serial_update_rate_hz": "1000",  # one MSP command a turn: 100 of them cannot take commands and questions at 50 Hz each
+        "small_angle": "180",  # it hangs in a stand: any attitude may arm
+        "rates_type": rates.type.upper(),
+        "min_check": str(params.minimum_us),
+        "deadband": "0",
+        "yaw_deadband": "0",
+        "thr_expo": "0",
+        "blackbox_device": "VIRTUAL",
+        "blackbox_sample_rate": "1/8",  # 1 kHz of 8
+    }
+    out |= {name: str(value) for name, value in GAINS.items()}
+    for i, axis in enumerate(("roll", "pitch", "yaw")):
+        out |= {
+            f"{axis}_rc_rate": str(rates.rc_rates[i]),
+            f"{axis}_srate": str(rates.rates[i]),
+            f"{axis}_expo": str(rates.expo[i]),
+        }
+    if params.arm_channel:
+        out["aux 0"] = f"0 {params.arm_channel - 1} 1700 2100 0 0"
+    else:  # a receiver has all channels; the switch of MSP OVERRIDE is on AUX 2
+        mask = (1 << STICKS) - 1 | 1 << STICKS + params.release_channel - 1
+        out |= {"aux 0": "0 0 1700 2100 0 0", "aux 1": "50 1 1700 2100 0 0", "msp_override_channels_mask": str(mask)}
+    return out
+
+
+def line_of(name: str, value: str) -> str:
+    """What sets a value: ``serial``, ``aux`` and ``feature`` have their own commands."""
+    return f"{name} {value}" if " " in name else f"set {name} = {value}"
+
+
+class Firmware:
+    """One process of the firmware.
+
+    Attributes:
+        folder: that it runs in: settings, blackbox, what it prints (``firmware.txt``).
+    """
+
+    def __init__(self, program: str | Path, folder: str | Path) -> None:
+        """Name program and folder; nothing runs yet.
+
+        Raises:
+            RunError: there is no such program.
+        """
+        self.program, self.folder = Path(program).resolve(), Path(folder)
+        if not self.program.is_file():
+            raise RunError(f"no firmware at {program}; expected Betaflight's program for a PC, as `make TARGET=SITL` builds it")
+        self.folder.mkdir(parents=True, exist_ok=True)
+        self._process: subprocess.Popen | None = None
+
+    def start(self) -> None:
+        """Start it and wait until it listens.
+
+        Raises:
+            RunError: it ends, does not listen in time, or another one is already there.
+        """
+        if _listens(PORTS[0]):
+            raise RunError(f"something listens on port {PORTS[0]} already; expected no other firmware beside this one")
+        told = self.folder / "firmware.txt"  # its errors; of what it prints, most are the words of its memory
+        with open(told, "wb") as errors:
+            self._process = subprocess.Popen(
+                [self.program], cwd=self.folder, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=errors,
+                preexec_fn=_end_with_parent,
+            )  # fmt: skip
+        favour(self._process.pid)
+        end = time.monotonic() + START
+        while f"bind port {PORTS[0]} for UART1" not in (words := told.read_text(errors="replace")):
+            if not self.runs or time.monotonic() > end:
+                self.stop()
+                raise RunError(f"the firmware does not listen on port {PORTS[0]}; its words: {words[-200:]!r}")
+            time.sleep(0.02)
+        if "failed" in words:
+            self.stop()
+            raise RunError(f"the firmware cannot listen: {words!r}")
+        time.sleep(SETTLED)
+
+    @property
+    def runs(self) -> bool:
+        """Whether the process is there."""
+        return self._process is not None and self._process.poll() is None
+
+    def stop(self) -> None:
+        """End it: politely, then for good."""
+        if self._process is None:
+            return
+        self._process.terminate()
+        try:
+            self._process.wait(REBOOT)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._process = None
+
+    def set_up(self, settings: dict[str, str]) -> dict[str, str]:
+        """Write settings, start anew, and read them back; it runs afterwards.
+
+        Returns:
+            What was read back.
+
+        Raises:
+            RunError: a setting that the firmware refuses or does not keep.
+        """
+        try:
+            kept = self._written(settings)
+        except BaseException:
+            self.stop()
+            raise
+        wrong = [f"{name} is {kept[name]!r}, expected {value!r}" for name, value in settings.items() if kept[name] != value]
+        if wrong:
+            self.stop()
+            raise RunError(f"the firmware did not keep its settings: {'; '.join(wrong)}")
+        return kept
+
+    def _written(self, settings: dict[str, str]) -> dict[str, str]:
+        self.start()
+        with StillSensors(), CommandLine() as line:
+            for name, value in settings.items():
+                line.ask(line_of(name, value))
+            line.save()
+        self._process.wait(REBOOT)
+        self.start()
+        with StillSensors(), CommandLine() as line:
+            kept = {name: line.read(name) for name in settings}
+        self.stop()  # whoever was on the command line cannot arm
+        self.start()
+        return kept
+
+
+class CommandLine:
+    """The firmware's command line on its first serial port."""
+
+    def __init__(self) -> None:
+        """Connect and enter it.
+
+        Raises:
+            RunError: nobody answers.
+        """
+        self._socket = socket.create_connection(("127.0.0.1", PORTS[0]), timeout=ANSWER)
+        self._socket.sendall(b"#")
+        self._heard()
+
+    def __enter__(self) -> "CommandLine":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._socket.close()
+
+    def _heard(self) -> str:
+        """What is said up to the next prompt."""
+        data, end = b"", time.monotonic() + ANSWER
+        while not data.endswith(PROMPT):
+            self._socket.settimeout(max(end - time.monotonic(), 1e-3))
+            try:
+                chunk = self._socket.recv(65536)
+            except TimeoutError:
+                chunk = b""
+            if not chunk:
+                raise RunError(f"the firmware's command line does not answer; last words {data[-80:]!r}")
+            data += chunk
+        return data.decode("ascii", "replace")
+
+    def ask(self, text: str) -> str:
+        """Give a command; what it says.
+
+        Raises:
+            RunError: it is refused.
+        """
+        self._socket.sendall(text.encode() + b"\n")
+        answer = self._heard()
+        if "###ERROR" in answer:
+            raise RunError(f"the firmware refuses {text!r}: {answer[answer.index('###') :].splitlines()[0]}")
+        return answer
+
+    def read(self, name: str) -> str:
+        """Value of a setting as the firmware prints it; empty where it prints none."""
+        command = name.split()[0]
+        answer = self.ask(command if " " in name else f"get {name}")
+        start = f"{name} " if " " in name else f"{name} = "
+        for text in answer.splitlines():
+            if text.startswith(start):
+                return text[len(start) :].strip()
+        return ""
+
+    def save(self) -> None:
+        """Keep the settings; the firmware ends, where a board would restart.
+
+        Raises:
+            RunError: it does not.
+        """
+        self._socket.sendall(b"save\n")
+        self._socket.settimeout(REBOOT)
+        try:
+            while self._socket.recv(65536):
+                pass
+        except ConnectionError:
+            pass
+        except TimeoutError:
+            raise RunError(f"the firmware does not end {REBOOT:g} s after `save`") from None
+
+
+def _listens(port: int) -> bool:
+    """Whether somebody listens; nothing is connected, as the firmware serves one peer."""
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind(("127.0.0.1", port))
+        except OSError:
+            return True
+    return False
+
+
+def _end_with_parent() -> None:
+    """Where the system can (Linux), the firmware ends when the process that started it is gone, however that ended."""
+    if sys.platform == "linux":
+        _LIBC.prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+
+
+def favour(process: int = 0) -> None:
+    """Put a process, this one by default, before others, as far as the system grants it; this one's children stay as they are."""
+    with contextlib.suppress(OSError):
+        os.setpriority(os.PRIO_PROCESS, process, FAVOUR)
+    with contextlib.suppress(OSError, AttributeError):
+        policy = os.SCHED_FIFO | (0 if process else os.SCHED_RESET_ON_FORK)
+        os.sched_setscheduler(process, policy, os.sched_param(PRIORITY))

@@ -1,0 +1,194 @@
+"""What our controller block gets wrong of Betaflight's: rate doublets through the firmware, the block fitted to them, the rest.
+
+    python tests/sitl/alone.py python tests/sitl/identify.py --out out/identify --seconds 36
+
+Writes ``flight.npz``, ``vehicle.toml`` and ``fit.json``: relative rms of the rates on doublets that were not fitted, by the shipped block
+and by the fitted one. ``visthrow hil direct --plant tests.sitl.identify:make_fitted`` throws with the fitted vehicle.
+"""
+
+import argparse
+import dataclasses
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from hil.fakes.sitl import Firmware, needed
+from hil.params import HilParams
+from sim.hybrid import HybridSim
+from sim.params import VehicleParams
+from tests.sitl import test_betaflight as bench
+from visthrow import config
+from visthrow.onboard.hover import HoverController, HoverParams
+from visthrow.task import plant_of
+from visthrow.throws.loading import load_policy
+from visthrow.throws.wire_plant import WirePlant
+
+PERIOD = 0.002
+BEFORE, LENGTH = 0.02, 0.36
+"""A window begins so long before its doublet and lasts so long [s]."""
+
+EVERY = 0.9
+"""Between two doublets [s]: the hover recovers in between."""
+
+SIZES = ((1.0, 2.5, 5.0, 8.0), (1.0, 2.5, 5.0, 8.0), (0.5, 1.0, 2.0, 3.0))
+"""Of doublets about x, y, z [rad/s]."""
+
+LIFTS = (0.6, 1.0, 1.5, 2.2)
+"""Thrust during a doublet, times that of the hover."""
+
+STALL = 3
+"""Periods without a motor output that count as a stall of the firmware."""
+
+NAMES = ("delay", "setpoint", "gyro", "p", "i", "d", "ff", "p_yaw", "i_yaw", "ff_yaw")
+
+
+def fly(folder: Path, seconds: float, seed: int = 0) -> dict[str, np.ndarray]:
+    """Hover through the firmware with a doublet of a rate now and then; states and commands of each period."""
+    settings = folder / "settings"
+    if not (settings / "eeprom.bin").exists():
+        firmware = Firmware(bench.program(), settings)
+        firmware.set_up(needed(config.load(HilParams, config.find("hil", "betaflight_sitl")).betaflight))
+        firmware.stop()
+    run = folder / "run"
+    run.mkdir(parents=True, exist_ok=True)
+    desk = bench.Bench(run, settings)
+    rng, plant = np.random.default_rng(seed), desk.plant
+    hover = HoverController(HoverParams(max_thrust=plant.max_thrust), bench.TICK)
+    rows, starts = [], []
+    try:
+        desk.take()
+        end, due, doublet, lift = plant.time + seconds, plant.time + 2.0, None, 1.0
+        while plant.time < end:
+            state = plant.state
+            views = [state[name].astype(float)[None] for name in ("pos_w", "quat_wb", "vel_w")]
+            command = hover.step(*views, plant.home_w, plant.mass[0])[0]
+            if plant.time >= due:
+                axis = int(rng.integers(3))
+                size = rng.choice(SIZES[axis]) * rng.choice((-1.0, 1.0))
+                doublet, due = (axis, size, plant.time, rng.integers(2, 5) * bench.TICK), due + EVERY
+                lift = rng.choice(LIFTS)
+                starts.append((plant.time, axis, size, lift))
+            command[0] *= lift if doublet is not None and plant.time - doublet[2] < 2 * doublet[3] - 1e-6 else 1.0
+            if doublet is not None and plant.time - doublet[2] < 2 * doublet[3] - 1e-6:
+                command[1:] = 0.0
+                command[1 + doublet[0]] = doublet[1] if plant.time - doublet[2] < doublet[3] - 1e-6 else -doublet[1]
+            for _ in range(round(bench.TICK / PERIOD)):
+                now = plant.look()
+                pos = plant.state["pos_w"]
+                answered = desk.fake.answered
+                rows.append((plant.time, *now["rate_b"], *now["quat_wb"], *now["vel_w"], *pos, *command, answered))
+                desk.paced.step()
+            desk.backend.send(command, desk.clock.now())
+            desk.backend.service(desk.clock.now())
+    finally:
+        desk.close()
+    return {"rows": np.array(rows), "starts": np.array(starts), "late": np.array(desk.paced.late / len(rows))}
+
+
+def changed(vehicle: VehicleParams, theta: np.ndarray) -> VehicleParams:
+    """The vehicle with other numbers in its controller: times [s] as they are, gains by 1 + the logarithm of their factor."""
+    delay, setpoint, gyro = theta[:3]
+    p, i, d, ff, p_yaw, i_yaw, ff_yaw = np.exp(theta[3:] - 1.0).tolist()
+    c = vehicle.controller
+    scale = lambda gain, both, yaw: (gain[0] * both, gain[1] * both, gain[2] * yaw)  # noqa: E731
+    controller = dataclasses.replace(
+        c, setpoint_time_constant=float(setpoint), gyro_time_constant=float(gyro), p_gain=scale(c.p_gain, p, p_yaw),
+        i_gain=scale(c.i_gain, i, i_yaw), d_gain=scale(c.d_gain, d, 1.0), feedforward_gain=scale(c.feedforward_gain, ff, ff_yaw),
+        integral_limit=tuple(10.0 * limit for limit in c.integral_limit),
+    )  # fmt: skip
+    return dataclasses.replace(vehicle, controller=controller, queue=dataclasses.replace(vehicle.queue, delay=float(delay)))
+
+
+class Windows:
+    """Doublets as the firmware flew them, and as the simulator does."""
+
+    def __init__(self, flight: dict[str, np.ndarray], policy: str):
+        rows = flight["rows"]
+        first = np.searchsorted(rows[:, 0], flight["starts"][:, 0] - BEFORE)
+        count = round(LENGTH / PERIOD)
+        first = first[first + count < len(rows)]
+        # Where the firmware was not scheduled for a while its outputs stand still: such a doublet says nothing of its controller.
+        stood = np.array([np.diff(rows[at - round(BEFORE / PERIOD) : at + count, 18][::STALL]).min() == 0 for at in first])
+        self.starts, self.stalled, first = flight["starts"][: len(first)][~stood], int(stood.sum()), first[~stood]
+        self.rows = np.stack([rows[at : at + count] for at in first])  # (E, T, fields)
+        lead = round(0.1 / PERIOD)
+        self.earlier = np.stack([rows[at - lead : at, 14:18] for at in first])  # commands before a window, for the queue
+        plant = plant_of(load_policy(policy).experiment)
+        self.plant = dataclasses.replace(plant, sim=dataclasses.replace(plant.sim, control_period=PERIOD))
+
+    def rates(self, vehicle: VehicleParams, chosen: np.ndarray) -> np.ndarray:
+        """Rates by the simulator under the same commands [rad/s], shape (E, T, 3)."""
+        rows = self.rows[chosen]
+        sim = HybridSim(dataclasses.replace(self.plant, vehicle=vehicle), len(rows))
+        start = rows[:, 0]
+        sim.place(start[:, 11:14], start[:, 4:8], start[:, 8:11], start[:, 1:4])
+        depth = sim.state.queue.shape[0]
+        newest_first = self.earlier[chosen][:, ::-1][:, np.minimum(np.arange(depth), self.earlier.shape[1] - 1)]
+        sim.state.queue.assign(np.swapaxes(newest_first, 0, 1).astype(np.float32))
+        out = np.empty((*rows.shape[:2], 3))
+        for k in range(rows.shape[1]):
+            out[:, k] = sim.get("rate_b")
+            sim.set_command(rows[:, k, 14:18])
+            sim.step()
+        return out
+
+    def miss(self, vehicle: VehicleParams, chosen: np.ndarray) -> float:
+        """Rms of the difference over the rms of the firmware's rates."""
+        flown = self.rows[chosen][:, :, 1:4]
+        return float(np.sqrt(((self.rates(vehicle, chosen) - flown) ** 2).mean() / (flown**2).mean()))
+
+
+def fit(windows: Windows, chosen: np.ndarray) -> np.ndarray:
+    """Numbers of :func:`changed` that fit the chosen windows best."""
+    vehicle = windows.plant.vehicle
+    c = vehicle.controller
+    start = np.array([0.020, c.setpoint_time_constant, c.gyro_time_constant, *np.ones(7)])
+    low = np.array([0.0, 1e-3, 5e-4, *np.full(7, -3.0)])
+    high = np.array([0.06, 0.05, 0.03, *np.full(7, 5.0)])
+
+    def off(theta: np.ndarray) -> np.ndarray:
+        return (windows.rates(changed(vehicle, theta), chosen) - windows.rows[chosen][:, :, 1:4]).ravel()
+
+    found = least_squares(off, start, bounds=(low, high), x_scale=[5e-3, 5e-3, 2e-3, *np.full(7, 0.5)], diff_step=1e-2, max_nfev=25)
+    return found.x
+
+
+def make_fitted(policy: str, seed: int) -> WirePlant:
+    """The training's plant with the fitted vehicle of ``VISTHROW_FITTED``."""
+    experiment = load_policy(policy).experiment
+    vehicle = config.load(VehicleParams, os.environ["VISTHROW_FITTED"])
+    return WirePlant(dataclasses.replace(experiment, vehicle=vehicle), seed)
+
+
+def main() -> None:
+    """Fly, fit, compare, write."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--out", type=Path, default=Path("out/identify"))
+    parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--policy", default="vision_dropout")
+    args = parser.parse_args()
+    file = args.out / "flight.npz"
+    if not file.exists():
+        np.savez(file, **fly(args.out, args.seconds))
+    flight = dict(np.load(file))
+    windows = Windows(flight, args.policy)
+    every = np.arange(len(windows.rows))
+    seen, held_out = every[every % 3 != 2], every[every % 3 == 2]
+    shipped = windows.plant.vehicle
+    theta = fit(windows, seen)
+    fitted = changed(shipped, theta)
+    (args.out / "vehicle.toml").write_text(config.dumps(fitted))
+    figures = {
+        "doublets": len(every), "stalled": windows.stalled, "late": float(flight["late"]), "shipped": windows.miss(shipped, held_out),
+        "fitted": windows.miss(fitted, held_out), "seen": windows.miss(fitted, seen),
+        **{name: float(v if k < 3 else np.exp(v - 1.0)) for k, (name, v) in enumerate(zip(NAMES, theta))},
+    }  # fmt: skip
+    (args.out / "fit.json").write_text(json.dumps(figures, indent=2) + "\n")
+    print(json.dumps(figures, indent=2))
+
+
+if __name__ == "__main__":
+    main()

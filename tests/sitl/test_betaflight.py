@@ -1,0 +1,272 @@
+"""Betaflight's own firmware flies the simulated vehicle: take-over, steps, a whole throw with release and recovery, silence.
+
+``make test-sitl`` builds the firmware (the package `betaflight` holds its sources; GPL-3, a tool of these tests alone) and runs
+this file in a network of its own. The firmware's clock is slowed to ``VISTHROW_SITL_SPEED`` of real time, 0.5 where it is not set.
+"""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import sysconfig
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hil.backends import Betaflight
+from hil.backends.base import FOLLOW
+from hil.fakes.base import Options
+from hil.fakes.mocap import MocapParams
+from hil.fakes.process import VEHICLE_ID, Paced
+from hil.fakes.sitl import BetaflightSitl, Firmware, favour, needed
+from hil.links.clock import MonotonicClock
+from hil.links.device import Device, UdpPort, check_device, open_port
+from hil.links.mavlink_link import Link
+from hil.params import HilParams
+from visthrow import config
+from visthrow.throws.wire_plant import make_motors
+
+pytestmark = pytest.mark.sitl
+
+SPEED = float(os.environ.get("VISTHROW_SITL_SPEED", "0.5"))
+"""Of both clocks."""
+
+TICK = 0.02
+"""Between two commands [s]."""
+
+STEP = np.array([1.5, 1.5, 1.0])
+"""Rates that are asked for about x, y, z [rad/s]."""
+
+HALF_STEP = 0.15
+"""Time to half of a step [s]: 55 to 90 ms were measured; a period of the commands and a late machine besides."""
+
+OTHERS = 0.25
+"""Rate of the other axes beside a step, as a share of it: 0.03 of 1.5 rad/s were measured on a quiet machine."""
+
+LIFT = 0.25
+"""Share by which a step of thrust may differ from what was asked for: the battery's voltage has changed since the calibration."""
+
+IDLE, DISARM = (0.2, 0.6), (1.0, 2.5)
+"""Silence after which the motors idle and after which it disarms [s]: 0.36 and 1.6 s were measured."""
+
+MISS = 0.35
+"""Of a landing [m]; a payload that just hangs is 2 m off. Throws on a quiet machine land 0.02 to 0.15 m off."""
+
+
+LONG = 200.0
+"""A run on a busy machine [s]."""
+
+
+def program() -> Path:
+    """The firmware that the package built, or the one that the environment names."""
+    named = os.environ.get("VISTHROW_FIRMWARE")
+    where = Path(sysconfig.get_paths()["purelib"]) / "betaflight" / "firmware" / "obj"
+    found = [Path(named)] if named else sorted(where.glob("betaflight_*_SITL"))
+    if not found:
+        pytest.fail(f"no firmware in {where}; `make test-sitl` builds it")
+    return found[0]
+
+
+@pytest.fixture(scope="session")
+def settings(tmp_path_factory):
+    """A folder with the firmware's settings, written and read back once, and what was read."""
+    folder = tmp_path_factory.mktemp("firmware")
+    params = config.load(HilParams, config.find("hil", "betaflight_sitl")).betaflight
+    firmware = Firmware(program(), folder)
+    kept = firmware.set_up(needed(params))
+    firmware.stop()
+    return folder, kept
+
+
+class Bench:
+    """Firmware, bridge and the runner's back-end in one process, period by period."""
+
+    def __init__(self, folder: Path, settings: Path):
+        shutil.copy(settings / "eeprom.bin", folder)
+        self.params = config.load(HilParams, config.find("hil", "betaflight_sitl")).betaflight
+        self.firmware = Firmware(program(), folder)
+        self.firmware.start()
+        self.plant = make_motors("vision_dropout", 0)
+        nobody = Link(UdpPort(Device("udpout", "127.0.0.1", 14999)), *VEHICLE_ID)
+        self.fake = BetaflightSitl(self.plant, nobody, MocapParams(), 0, Options(), self.params)
+        self.backend = Betaflight(open_port(check_device(self.params.device)), self.params)
+        self.clock = MonotonicClock(SPEED)
+        favour()
+        self.fake.sensors.start(SPEED)
+        self.paced, self._next = Paced(self.fake, self.clock), 0.0
+        self.rows: list[tuple] = []
+
+    def turn(self, seconds, command=None, ask=None, until=None):
+        """Fly for a time, or until something holds; a command is sent each tick."""
+        end = self.plant.time + seconds
+        while self.plant.time < end:
+            self.paced.step()
+            self.rows.append((self.plant.time, *self.plant.rate_b, self.plant.force_b[2], self.fake.motors.sum()))
+            if self.plant.time >= self._next:
+                self._next = self.plant.time + TICK
+                now = self.clock.now()
+                if command is not None:
+                    self.backend.send(command, now)
+                if ask is not None:
+                    self.backend.ask(ask, now)
+                if command is not None or ask is not None:
+                    self.backend.service(now)
+            if until is not None and until():
+                return True
+        return until is None
+
+    def take(self):
+        """Read the settings, arm, lift out of the stand and hang there for a moment."""
+        idle, hover = (0.0, 0.0, 0.0, 0.0), (self.plant.mass[0] * 9.81 * 1.02, 0.0, 0.0, 0.0)
+        known = lambda: self.backend.audit.done and self.fake._boxes  # noqa: E731
+        assert self.turn(10.0, idle, until=known), "the firmware answers on both ports"
+        following = lambda: self.backend.status(self.clock.now()).mode == FOLLOW  # noqa: E731
+        assert self.turn(10.0, idle, FOLLOW, until=following), self.backend.status(self.clock.now())
+        assert self.turn(3.0, hover, until=lambda: not self.plant.held), f"motors {self.fake.motors}"
+        self.turn(0.4, hover)
+        return hover
+
+    def close(self):
+        self.backend.close()
+        self.fake.close()
+        self.firmware.stop()
+
+
+@pytest.fixture
+def bench(tmp_path, settings):
+    desk = Bench(tmp_path, settings[0])
+    yield desk
+    desk.close()
+
+
+def test_settings_are_written_and_read_back(settings):
+    params = config.load(HilParams, config.find("hil", "betaflight_sitl")).betaflight
+    assert settings[1] == needed(params)
+    assert settings[1]["small_angle"] == "180"
+    assert settings[1]["blackbox_device"] == "VIRTUAL"
+
+
+def test_it_is_taken_armed_and_follows_steps(bench):
+    """Sign, axis, scale and time of each rate and of thrust, by the vehicle's own motion."""
+    hover = bench.take()
+    assert bench.fake.armed
+    assert not bench.backend.audit.problems
+    print()
+    for axis, name in enumerate(("roll", "pitch", "yaw")):
+        for sign in (1.0, -1.0):
+            command = np.zeros(3)
+            command[axis] = sign * STEP[axis]
+            begun, first = bench.plant.time, len(bench.rows)
+            bench.turn(0.3, (hover[0], *command))
+            rows = np.array(bench.rows[first:])
+            rate = sign * rows[:, 1 + axis] / STEP[axis]
+            half = rows[np.argmax(rate > 0.5), 0] - begun
+            reached, others = rate[-25:].mean(), np.delete(rows[-25:, 1:4], axis, 1)
+            print(f"{name} {sign * STEP[axis]:+.1f} rad/s: reached {reached:.2f}, half after {1e3 * half:.0f} ms")
+            assert (rate > 0.5).any()
+            assert half < HALF_STEP
+            assert 0.8 < reached < 1.3
+            assert np.abs(others).mean() < OTHERS * STEP[axis] + 0.05
+        bench.turn(0.2, hover)
+    for share in (1.2, 0.8):
+        first = len(bench.rows)
+        bench.turn(0.3, (share * hover[0], 0.0, 0.0, 0.0))
+        force = np.array(bench.rows[first:])[-25:, 4].mean()
+        asked = share * hover[0] / bench.plant.mass[0]
+        print(f"thrust x {share}: {force:.2f} of {asked:.2f} m/s^2")
+        assert force == pytest.approx(asked, rel=LIFT)
+
+
+def test_silence_idles_the_motors_and_disarms(bench):
+    bench.take()
+    begun, first = bench.plant.time, len(bench.rows)
+    assert bench.turn(6.0, until=lambda: not bench.fake.armed), "it disarms"
+    rows = np.array(bench.rows[first:])
+    least = 4 * 0.06  # of four motors at idle, 5.5 %
+    quiet = rows[:, 5] < least
+    assert quiet.any(), rows[:, 5].min()
+    idle, gone = rows[np.argmax(quiet), 0] - begun, bench.plant.time - begun
+    print(f"\nmotors idle {idle:.2f} s, disarmed {gone:.2f} s after the last frame")
+    assert IDLE[0] < idle < IDLE[1]
+    assert DISARM[0] < gone < DISARM[1]
+
+
+def visthrow(*words, **more):
+    return subprocess.Popen([sys.executable, "-m", "visthrow.cli", *words], text=True, **more)
+
+
+def wait_for(process, words):
+    """Read what a process says up to a line with these words."""
+    said = []
+    for line in process.stderr:
+        said.append(line)
+        if words in line:
+            return
+    pytest.fail("".join(said[-30:]))
+
+
+def test_a_whole_throw(tmp_path):
+    """Take-over, throw, release, recovery and landing with the page's two commands; the error is printed."""
+    report, folder = tmp_path / "report.json", tmp_path / "firmware"
+    bridge = visthrow(
+        "hil", "fake", "--kind", "betaflight-sitl", "--firmware", str(program()), "--folder", str(folder), "--policy",
+        "vision_dropout", "--speed", str(SPEED), "--after", "9", "--out", str(report), stderr=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+    )  # fmt: skip
+    runner = None
+    try:
+        wait_for(bridge, "it flies")
+        runner = visthrow(
+            "hil", "run", "--config", "betaflight_sitl", "--auto-arm", "--bare", "--speed", str(SPEED), "--out",
+            str(tmp_path / "run"), "--set", "realtime.priority=10", stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        )  # fmt: skip
+        told, states = runner.communicate(timeout=LONG)
+        bridge.communicate(timeout=LONG)
+    finally:
+        bridge.kill()
+    found = json.loads(report.read_text())
+    assert found["landing_w"] is not None, states
+    error = float(np.hypot(found["landing_w"][0] - 2.0, found["landing_w"][1]))
+    lag = found["separation_time"] - found["release_time"]
+    late = found["late_periods"] / (found["time"] / 0.002)
+    print(f"\nlanding error {error:.3f} m, {100 * late:.1f} % of the periods late, loop {found['loop_us']:.0f} us, {lag:.3f} s")
+    print(told.splitlines()[0])
+    assert found["releases"] == 1
+    assert error < MISS, states
+    assert "recover" in states
+    assert "hovering again" in states
+    assert list(folder.glob("LOG*")), "the firmware wrote its blackbox"
+
+
+def test_a_runner_that_is_killed_leaves_the_firmware_to_its_failsafe(tmp_path):
+    """SIGKILL in hover: the motors stop and it disarms, with nothing of the runner left."""
+    report, run = tmp_path / "report.json", tmp_path / "run"
+    bridge = visthrow(
+        "hil", "fake", "--kind", "betaflight-sitl", "--firmware", str(program()), "--folder", str(tmp_path / "firmware"),
+        "--speed", str(SPEED), "--out", str(report), stderr=subprocess.PIPE, stdout=subprocess.DEVNULL,
+    )  # fmt: skip
+    runner = None
+    try:
+        wait_for(bridge, "it flies")
+        runner = visthrow(
+            "hil", "run", "--config", "betaflight_sitl", "--bare", "--speed", str(SPEED), "--out", str(run),
+            stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
+        )  # fmt: skip
+        wait_for(runner, "checks passed")
+        time.sleep(1.5 / SPEED)
+        runner.kill()
+        time.sleep(2.0 * DISARM[1] / SPEED)
+        bridge.send_signal(signal.SIGINT)
+        bridge.communicate(timeout=LONG)
+    finally:
+        bridge.kill()
+        if runner is not None:
+            runner.kill()
+    found = json.loads(report.read_text())
+    told = [text for _, text in found["events"]]
+    assert told == ["armed", "disarmed"], found["events"]
+    assert not found["armed"]

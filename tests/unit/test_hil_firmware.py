@@ -1,0 +1,183 @@
+"""The bridge to a firmware, without one: packets, its command line, what is read of its channels."""
+
+import itertools
+import socket
+import threading
+
+import numpy as np
+import pytest
+
+from hil.backends.betaflight import BOX_ARM, HIGH, LOW
+from hil.errors import RunError
+from hil.fakes.base import Options
+from hil.fakes.mocap import MocapParams
+from hil.fakes.process import VEHICLE_ID, ListeningPort
+from hil.fakes.sitl import BetaflightSitl, Firmware, betaflight, firmware, needed, packets
+from hil.links import msp
+from hil.links.device import Device, UdpPort
+from hil.links.mavlink_link import Link
+from hil.params import HilParams
+from visthrow import config
+from visthrow.throws.wire_plant import make_motors
+
+
+@pytest.fixture
+def params():
+    return config.load(HilParams, config.find("hil", "betaflight_sitl")).betaflight
+
+
+def free_port(kind=socket.SOCK_STREAM):
+    with socket.socket(socket.AF_INET, kind) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def test_samples_are_forward_right_down_and_the_force_turned_round():
+    """The firmware's own wrapper: rates FRD, acceleration the negative of FLU, attitude w first."""
+    values = packets.FDM.unpack(packets.samples(1.0, np.array([0.1, 0.2, 0.3]), np.array([1.0, 2.0, 9.8]), np.array([0.0, 0.1, 0.2, 0.9])))
+    assert values[1:4] == (0.1, -0.2, -0.3)
+    assert values[4:7] == (-1.0, -2.0, -9.8)
+    assert values[7:11] == (0.9, 0.0, 0.1, 0.2)
+    assert len(values) == 18
+
+
+def test_motors_come_in_our_order():
+    """Betaflight's motors 1 rear right, 2 front right, 3 rear left, 4 front left go out as 2, 3, 4, 1."""
+    packet = packets.PWM.pack(2.0, 3.0, 4.0, 1.0)
+    assert packets.motors(packet).tolist() == [4.0, 2.0, 3.0, 1.0]
+    assert packets.motors(packet[:-1]) is None
+
+
+def test_stamps_stand_still_after_the_clocks_rate_was_set(monkeypatch):
+    """Two stamps whose difference is the rate's share of the time between them, less than 20 ms; the same one from then on."""
+    monkeypatch.setattr(packets, "CALIBRATION", 0.01)
+    port = free_port(socket.SOCK_DGRAM)
+    monkeypatch.setattr(packets, "SENSORS", port)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as firm:
+        firm.bind(("127.0.0.1", port))
+        firm.settimeout(2.0)
+        sensors = packets.Sensors()
+        sensors.start(0.5)
+        sensors.send(np.zeros(3), np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
+        stamps = [packets.FDM.unpack(firm.recv(200))[0] for _ in range(7)]
+        sensors.close()
+    moved = [b - a for a, b in itertools.pairwise(stamps)]
+    assert stamps[0] == 1.0
+    assert sum(step != 0.0 for step in moved) == 1
+    assert packets.GAP <= sum(moved) < packets.MOST_GAP
+    assert moved[-1] == 0.0
+
+
+class Answers:
+    """A command line that keeps what it is told, but for what it is to forget; one connection."""
+
+    def __init__(self, port, forgets=()):
+        self._server = socket.create_server(("127.0.0.1", port))
+        self.kept, self.forgets = {}, forgets
+        threading.Thread(target=self._serve, daemon=True).start()
+
+    def _serve(self):
+        peer, _ = self._server.accept()
+        peer.recv(1)
+        peer.sendall(b"\r\nEntering CLI Mode, type 'exit' to reboot, or 'help'\r\n\r\n# ")
+        for line in peer.makefile("r"):
+            peer.sendall(self._said(line.strip()).encode() + b"\r\n# ")
+
+    def _said(self, line):
+        words = line.split()
+        if words[0] == "set":
+            self.kept |= {} if words[1] in self.forgets else {words[1]: words[3]}
+            return f"{words[1]} set to {words[3]}"
+        if words[0] == "get":
+            return f"{words[1]} = {self.kept.get(words[1], '25')}\r\nAllowed range: 0 - 180"
+        return "###ERROR IN input: UNKNOWN COMMAND, TRY 'HELP'###"
+
+    def close(self):
+        self._server.close()
+
+
+@pytest.fixture
+def answers(monkeypatch):
+    port = free_port()
+    monkeypatch.setattr(firmware, "PORTS", (port, port + 1))
+    server = Answers(port, forgets=("min_check",))
+    yield server
+    server.close()
+
+
+def test_command_line_writes_reads_back_and_says_what_is_refused(answers):
+    with firmware.CommandLine() as line:
+        line.ask(firmware.line_of("small_angle", "180"))
+        line.ask(firmware.line_of("min_check", "1050"))
+        assert line.read("small_angle") == "180"
+        assert line.read("min_check") == "25"
+        with pytest.raises(RunError, match=r"refuses 'serial UART2 1'.*UNKNOWN COMMAND"):
+            line.ask(firmware.line_of("serial UART2", "1"))
+
+
+def test_a_program_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(RunError, match=r"no firmware at .*nothing"):
+        Firmware(tmp_path / "nothing", tmp_path)
+
+
+def test_a_program_that_ends_at_once_is_told(tmp_path, monkeypatch):
+    monkeypatch.setattr(firmware, "PORTS", (free_port(), free_port()))
+    with pytest.raises(RunError, match="does not listen"):
+        Firmware("/bin/false", tmp_path).start()
+
+
+def test_settings_follow_the_runs_configuration(params):
+    found = needed(params)
+    assert found["roll_srate"] == "60"
+    assert found["yaw_srate"] == "30"
+    assert found["aux 0"] == "0 0 1700 2100 0 0"
+    assert "aux 1" not in found
+    override = config.load(HilParams, config.find("hil", "betaflight_sitl"), ["betaflight.arm_channel=0"]).betaflight
+    assert needed(override)["msp_override_channels_mask"] == "143"  # sticks and AUX 4
+    assert needed(override)["aux 1"].startswith("50 ")
+
+
+def test_the_bridge_sees_arming_and_the_release_channel(params, monkeypatch):
+    """What the firmware says by MSP becomes events, and the release's channel opens the mechanism once."""
+    mine, motor = free_port(), free_port(socket.SOCK_DGRAM)
+    monkeypatch.setattr(betaflight, "PORTS", (0, mine))
+    monkeypatch.setattr(betaflight, "MOTORS", motor)
+    serial = ListeningPort(mine)
+    fake = BetaflightSitl(
+        make_motors("vision_dropout", 0), Link(UdpPort(Device("udpout", "127.0.0.1", 14999)), *VEHICLE_ID), MocapParams(), 0,
+        Options(), params,
+    )  # fmt: skip
+    parser, channels = msp.Parser(), [1500, 1500, 1500, 1000, LOW, LOW, LOW, LOW]
+    flags = [0]
+
+    def answer(frame):
+        payloads = {
+            msp.BOXIDS: bytes([1, BOX_ARM]), msp.RC: np.array(channels, dtype="<u2").tobytes(),
+            msp.STATUS: bytes([125, 0, 0, 0, 0, 0]) + flags[0].to_bytes(4, "little") + bytes(12),
+        }  # fmt: skip
+        serial.write(msp.pack(msp.Frame(frame.command, payloads[frame.command], msp.ANSWER)))
+
+    def turn(count):
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as firm:
+            for _ in range(count):
+                firm.sendto(packets.PWM.pack(0.2, 0.3, 0.4, 0.1), ("127.0.0.1", motor))
+                fake.step()
+                data = serial.read()
+                for frame in parser.parse(data or b""):
+                    answer(frame)
+
+    turn(120)
+    assert fake.motors == pytest.approx([0.4, 0.2, 0.3, 0.1])
+    assert not fake.armed
+    flags[0] = 0b10
+    turn(120)
+    assert fake.armed
+    channels[7] = HIGH
+    turn(40)
+    report = fake.report()
+    assert report["releases"] == 1
+    assert report["loop_us"] == 125
+    assert report["motor_packets"] > 200
+    assert [text for _, text in report["events"]] == ["armed"]
+    serial.close()
+    fake.close()
