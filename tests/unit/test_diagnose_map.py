@@ -90,6 +90,16 @@ def test_the_command_writes_a_setup_that_check_takes(tmp_path, capsys):
     assert cli.main(["diagnose", "check", str(path), "--config", str(tmp_path / "mine.toml"), "--no-pictures"]) == 0
 
 
+def test_a_flying_model_carries_the_weight_that_was_weighed():
+    file = REAL / "nanobench_cf21" / "B3_figure8_fast_rep1.csv.gz"
+    found = propose(table_of(file), file.name, mass=0.027)
+    assert found.flyer["mass"] == 0.027
+    hover = 4.0 * found.flyer["thrust_map"][1] * 0.68  # of full throttle, by eye
+    assert hover == pytest.approx(0.027 * 9.81, rel=0.2)
+    assert not any("weigh" in question for question in found.questions)
+    assert any("what does the vehicle weigh? 1 kg" in question for question in propose(table_of(file), file.name).questions)
+
+
 def test_what_is_not_known_is_asked(tmp_path):
     columns = {name: values for name, values in table().items() if name != "millis"}
     found = propose(table_of(written(tmp_path / "a.csv", columns)), "a.csv")

@@ -105,8 +105,10 @@ def table_of(path: str | Path) -> dict[str, np.ndarray]:
     from visthrow.logs.readers import recordings, table
 
     path = Path(path)
-    if path.name.lower().endswith(TABLES) or not path.is_file():
+    if path.name.lower().endswith(TABLES):
         return table.read_table(path)
+    if path.suffix.lower() not in ENDINGS and not path.is_file():
+        raise LogError(f"{path}: no such file")
     if not _is_recording(path):
         known = ", ".join((*TABLES, *RECORDINGS))
         raise LogError(f"{path}: ending '{path.suffix}'; a mapping is for {known}; other logs say what they hold")

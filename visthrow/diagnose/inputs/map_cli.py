@@ -14,6 +14,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "  visthrow diagnose check flight.csv --config mine.toml\n"
     )
     parser.add_argument("file", metavar="FILE", help="a table, or a recording of another tool")
+    parser.add_argument("--mass", metavar="KG", type=float, help="of the vehicle alone, from a scale")
     parser.add_argument("--out", metavar="FILE", help="write the mapping to this file")
 
 
@@ -24,7 +25,7 @@ def run(args: argparse.Namespace) -> int:
     from visthrow.diagnose.inputs.proposal import propose
     from visthrow.logs import table_of
 
-    found = propose(table_of(args.file), args.file)
+    found = propose(table_of(args.file), args.file, args.mass)
     text = toml_of(found, Path(args.file).name)
     if args.out:
         atomic_write(args.out, text)

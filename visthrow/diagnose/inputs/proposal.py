@@ -58,8 +58,13 @@ class Proposal:
     questions: list[str] = field(default_factory=list)
 
 
-def propose(table: Table, source: str) -> Proposal:
+def propose(table: Table, source: str, mass: float | None = None) -> Proposal:
     """Propose a mapping of the columns of a table, or of the tables of a recording.
+
+    Args:
+        table: Its columns.
+        source: What messages call it.
+        mass: Of the vehicle alone [kg], where it was weighed.
 
     Raises:
         LogError: No column holds numbers that change.
@@ -87,7 +92,7 @@ def propose(table: Table, source: str) -> Proposal:
     first, *others = clocks
     entries = tuple(replace(c, clock="" if c.clock == first else c.clock) for c in channels.values())
     found.mapping = TableMap(clocks[first], entries, {name: clocks[name] for name in others} or None)
-    _corrected(table, source, found)
+    _corrected(table, source, found, mass)
     return found
 
 
@@ -404,7 +409,7 @@ class _Chooser:
                 self.found.questions.append(f"thrust '{group.stem}': newtons of all motors together, as taken?")
 
 
-def _corrected(table: Table, source: str, found: Proposal) -> None:
+def _corrected(table: Table, source: str, found: Proposal, weighed: float | None) -> None:
     """Read the table by the proposal, hold it against physics, and turn axes that another set explains; mirrors are asked about."""
     for _ in range(3):
         log = logs_of(table, found.mapping, source)[0]
@@ -420,10 +425,10 @@ def _corrected(table: Table, source: str, found: Proposal) -> None:
         found.mapping = replace(found.mapping, channels=tuple(entries))
         found.why["rate_b"] += f"; axes by physics: {row.text}"
     found.questions += [f"physics speaks against {row.channel}: {row.text}" for row in wrong]
-    found.flyer = _flyer(full, found)
+    found.flyer = _flyer(full, found, weighed)
 
 
-def _flyer(log: FlightLog, found: Proposal) -> dict | None:
+def _flyer(log: FlightLog, found: Proposal, weighed: float | None) -> dict | None:
     """A flying model to begin with: thrust scaled so that it carries the vehicle, the rest as of a small quadrotor at rest air."""
     told = thrust.thrust_of(log)
     if told is None or "quat_wb" not in log or "pos_w" not in log or np.median(told[2]) <= 0.0:
@@ -435,18 +440,21 @@ def _flyer(log: FlightLog, found: Proposal) -> dict | None:
     name, _, total = told
     motors = 1 if name in ("thrust_command", "throttle") else 4
     hover = float(np.median(total[total > 0.5 * np.percentile(total, 90)])) / motors
-    weighed = mass or 1.0
-    first = 1.0 if mass else weighed * physics.GRAVITY / motors / hover
-    why = "is what its thrust carries" if mass else "stands for any: the thrust is scaled to it"
-    ask = ", payload and all; what does the payload weigh?" if gap else ""
-    found.questions.append(f"what does the vehicle weigh? {weighed:.4g} kg {why}{ask}")
+    share = 0.85 if gap else 1.0  # of the vehicle in what flies, until both are weighed
+    whole = weighed / share if weighed else mass or 1.0
+    first = 1.0 if mass else whole * physics.GRAVITY / motors / hover
+    if weighed is None:
+        why = "is what its thrust carries" if mass else "stands for any, and the thrust is scaled to it"
+        found.questions.append(f"what does the vehicle weigh? {whole:.4g} kg {why}; call map again with --mass KG")
+    if gap:
+        found.questions.append(f"what does the payload weigh? {(1.0 - share) * whole:.3g} kg is a guess")
     power = [0.0, 0.0, first / hover] if name == "motor_speed" else [0.0, first, 0.0]
     period = float(np.median(np.diff(log["pos_w"].time)))
     table = {
-        "input": name, "position": "pos_w", "attitude": "quat_wb", "mass": round(weighed * (0.85 if gap else 1.0), 5), "gravity": 9.81,
+        "input": name, "position": "pos_w", "attitude": "quat_wb", "mass": round(whole * share, 5), "gravity": 9.81,
         "thrust_map": [float(f"{x:.4g}") for x in power], "motor_time_constant": 0.03, "command_delay": 0.0,
         "reference_voltage": float(np.round(np.median(log["battery_voltage"].values), 2)) if "battery_voltage" in log else 1.0,
         "voltage_coefficient": 0.0, "drag_xy": 0.0, "drag_z": 0.0, "lowest": 0.3, "window": 1.0, "step": 0.02,
         "every": max(1, round(0.03 / period)), "most_windows": 24,
     }  # fmt: skip
-    return table | ({"cable": {"length": round(gap, 4), "mass": round(0.15 * weighed, 5)}} if gap else {})
+    return table | ({"cable": {"length": round(gap, 4), "mass": round((1.0 - share) * whole, 5)}} if gap else {})
