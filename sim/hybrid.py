@@ -145,7 +145,7 @@ class HybridSim:
         rows = {"cable_dir_w": segments, "cable_vel_w": segments, "stiffness": segments, "queue": depth}
         self.state = st.allocate(t, self._step.State, st.STATE_FIELDS, count, rows, device)
         outputs = {k: (v, False) for k, v in st.OUTPUT_FIELDS.items()}
-        self.out = st.allocate(t, self._step.Output, outputs, count, {}, device)
+        self.out, self.foreseen = (st.allocate(t, self._step.Output, outputs, count, {}, device) for _ in range(2))
         self.command = wp.zeros(count, dtype=t.vec4, device=device)
         self.release = wp.zeros(count, dtype=wp.int32, device=device)
         self.goal_w = wp.zeros(count, dtype=t.vec3, device=device)
@@ -179,6 +179,11 @@ class HybridSim:
             device=self.device,
             block_dim=64,
         )
+
+    def foresee(self) -> None:
+        """Write into ``foreseen`` what follows if every payload separates now; the plants stay as they are."""
+        inputs = [self._vehicles, self._ropes, self._release, self._airs, self.gravity, self.state, self.foreseen]
+        wp.launch(self._step.foresee, self.count, inputs, device=self.device, block_dim=64)
 
     def randomize(self, spreads: RandomizationParams, mask: wp.array | None = None) -> None:
         """Start new episodes where ``mask`` (shape (E,), int) is non-zero; everywhere without one."""
@@ -261,6 +266,12 @@ class HybridSim:
 
     def _update_payload(self) -> None:
         wp.launch(self._step.payload, self.count, [self._ropes, self.state, self.out], device=self.device)
+
+    def plants(self) -> tuple[np.ndarray, np.ndarray]:
+        """Parameters of vehicle and rope of every environment as the kernels read them: structured arrays, shape (E,)."""
+        vehicles, ropes = self._vehicles.numpy(), self._ropes.numpy()
+        rows = np.arange(self.count)
+        return vehicles[rows % len(vehicles)], ropes[rows % len(ropes)]
 
     def set_command(self, command: np.ndarray, release: np.ndarray | None = None) -> None:
         """Copy commands [N, rad/s], shape (E, 4), and release requests, shape (E,), to the device.

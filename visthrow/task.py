@@ -136,6 +136,24 @@ class PPOParams:
 
 
 @dataclass(frozen=True)
+class FirstOrderParams:
+    """First-order training; see :mod:`visthrow.training.first_order`. Throws a gradient: ``ppo.environments``."""
+
+    horizon: int = 52
+    decay: float = 0.97
+    learning_rate: float = 2e-3
+    final_rate: float = 1e-4
+    max_grad_norm: float = 1.0
+    width: float = 0.5
+    final_width: float = 0.05
+    sharp: float = 0.7
+    first_release: int = 24
+    free: float = 0.15
+    initial_release: float = -2.0
+    saturation: float = 1.0
+
+
+@dataclass(frozen=True)
 class DiagnosedParams:
     """What a diagnosis leaves uncertain about the plant (``visthrow diagnose apply`` writes it).
 
@@ -173,6 +191,8 @@ class Experiment:
     laws: tuple[LawParams, ...] = ()  # found by a diagnosis, besides the blocks' own
     sensing: SensingParams = field(default_factory=SensingParams)  # of the hall; the diagnosis alone reads it
     diagnosed: DiagnosedParams = field(default_factory=DiagnosedParams)
+    algorithm: Literal["ppo", "first_order"] = "ppo"
+    first_order: FirstOrderParams = field(default_factory=FirstOrderParams)
 
     def __post_init__(self) -> None:
         if self.ppo.environments < 1 or self.ppo.steps < 1 or self.ppo.iterations < 1:

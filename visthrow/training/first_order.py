@@ -1,0 +1,297 @@
+"""First-order training: flights of the simulator, gradients through a surrogate of it (:mod:`visthrow.training.surrogate`).
+
+A gradient takes one batch of flights in which nothing is released. Where the payload would land is foreseen at every
+step, so a flight knows the outcome of each release that it could have made. The release becomes smooth by a hazard,
+the probability ``h = sigmoid((a - threshold) / width)`` that the latch trips in a step, and the cost of a flight is the
+mean over the step of release: with the survival S[k] = prod_(j < k) (1 - h[j]),
+
+    - sum_k S[k] h[k] (reward at release k) - sum_k S[k - lag] (rewards while carrying) + S[end] (penalty of an end)
+
+The width falls on a schedule until the hazard is the latch. Soft barriers stand before the bounds, where rewards have no
+slope. The derivatives by states and actions run backward through the surrogate and the network's Jacobian in one
+kernel; decaying by a factor each step, they stay bounded.
+"""
+
+import math
+from types import SimpleNamespace
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from sim.params import GRAVITY
+from sim.arrays.torch_bridge import on_torch_stream
+from visthrow.onboard import actions as act
+from visthrow.onboard import observations as ob
+from visthrow.training import rewards
+from visthrow.common.errors import ConfigError
+from visthrow.task import Experiment
+from visthrow.training.env import ThrowEnv
+from visthrow.training.surrogate import Flights, Plants, Surrogate, build_backward, fit
+
+BARRIER = 600.0
+"""Barriers cost this times the square of how far a state is within their margins."""
+MARGINS = {"altitude": 0.15, "ground": 0.1, "above": 0.08, "upright": 0.15}
+"""Reach of the barriers: of altitude, payload over ground, payload below vehicle [m], cosine of the tilt."""
+
+
+class FirstOrder:
+    """First-order training of an actor.
+
+    Attributes:
+        surrogate: fitted to the environment's plants at the start.
+        optimizer: Adam on the actor's network.
+    """
+
+    def __init__(self, experiment: Experiment, env: ThrowEnv, actor: torch.nn.Module):
+        """Fit the surrogate and start the network near hover.
+
+        Args:
+            experiment: the run's configuration.
+            env: whose flights are used; its number of environments is that of throws a gradient.
+            actor: rsl_rl's ``MLPModel``; its normaliser is set here, its network trained.
+
+        Raises:
+            ConfigError: Goals that move, or a horizon too short for a release.
+        """
+        self.cfg, self.p, self.env, self.actor = experiment, experiment.first_order, env, actor
+        if experiment.task.target.moves:
+            raise ConfigError('algorithm = "first_order" throws at goals that stand still; train moving ones by "ppo"')
+        E, T, device = env.num_envs, self.p.horizon, env.device
+        lag = experiment.release.lag / experiment.sim.control_period
+        self.lag, rest = int(lag + 1e-6), max(lag - int(lag + 1e-6), 0.0)
+        self.releases = T - self.lag - 1
+        if self.releases < 1:
+            raise ConfigError(f"first_order.horizon is {T} steps; expected at least {self.lag + 2} for a release to end in")
+        self.plants = Plants(env)
+        with torch.no_grad():
+            self.surrogate = fit(env, self.plants)
+        self.flights, self.adjoint = Flights(T, E, device), Flights(T, E, device)
+        make = {"device": device, "dtype": torch.float32}
+        self.buffers = SimpleNamespace(
+            obs=torch.zeros(T, E, env.layout.dimension, **make),
+            action=torch.zeros(T, E, act.ACTIONS, **make),
+            landing=torch.zeros(T + 1, E, 2, **make),
+            time=torch.zeros(T + 1, E, **make),
+            age=torch.zeros(E, **make),
+            goal=torch.zeros(E, 3, **make),
+            mass=torch.zeros(E, **make),
+            previous=torch.zeros(E, act.ACTIONS, **make),
+        )
+        nodes = (-1.0, 0.0, 1.0, 2.0)  # of the cubic through the steps about the separation
+        shares = [math.prod((rest - b) / (a - b) for b in nodes if b != a) for a in nodes]
+        k = torch.arange(self.releases, device=device)
+        self._separation = [(w, (k + self.lag + int(a)).clamp(0, T)) for a, w in zip(nodes, shares)]
+        self._begin()
+        self.optimizer = torch.optim.Adam(actor.mlp.parameters(), lr=self.p.learning_rate, betas=(0.9, 0.95))
+
+    def _begin(self) -> None:
+        """Hover with the latch at rest, whatever is seen."""
+        last = self.actor.mlp[-1]
+        with torch.no_grad():
+            last.weight.mul_(0.1)
+            last.bias.copy_(self.env._start_action)
+            last.bias[act.COMMANDS] = self.p.initial_release
+
+    def policy(self, obs: Tensor) -> Tensor:
+        """Actions of observations, shape (E, 5)."""
+        return self.actor.mlp(self.actor.obs_normalizer(obs))
+
+    @torch.no_grad()
+    def rollout(self) -> None:
+        """Fly one batch without release."""
+        env, f, b = self.env, self.flights, self.buffers
+        env.reset()
+        b.goal.copy_(env.views.goal_w)
+        b.mass.copy_(self.plants.mass(env))
+        b.age.copy_(env.pose_age)
+        b.previous.copy_(env.previous_action)
+        f.steps.zero_()
+        alive = torch.ones_like(f.steps)
+        self._record(0)
+        for k in range(self.p.horizon):
+            b.obs[k].copy_(env._observations["actor"])
+            b.action[k].copy_(self.policy(b.obs[k]))
+            _, _, done, _ = env.step(b.action[k], hold=True)
+            alive = alive * (done == 0)
+            f.steps += alive
+            self._record(k + 1)
+
+    def _record(self, k: int) -> None:
+        env, b = self.env, self.buffers
+        self.flights.record(k, env, self.plants.thrust_factor)
+        with on_torch_stream(env.device):
+            env.sim.foresee()
+        b.landing[k].copy_(env.views.foreseen["landing_w"][:, :2])
+        b.time[k].copy_(env.views.foreseen["time_to_impact"])
+
+    def _rewards_at_release(self, x: SimpleNamespace) -> tuple[Tensor, Tensor, Tensor]:
+        """Reward, landing error [m] and time to impact [s] of a release at each step, shape (releases, E)."""
+        p, release, b = self.cfg.task.reward, self.cfg.release, self.buffers
+        up = x.load_vel[..., 2]
+        time = (up + (up.square() + 2.0 * GRAVITY * (x.load_pos[..., 2] - release.landing_height)).clamp(min=1e-6).sqrt()) / GRAVITY
+        landing = x.load_pos[..., :2] + x.load_vel[..., :2] * time[..., None]
+        landing = landing + (b.landing - landing).detach()  # the simulator's own value, the slope of flight without drag
+        time = time + (b.time - time).detach()
+        share = torch.linspace(0.0, 1.0, release.clearance_samples, device=time.device) * time[..., None]
+        fall = torch.tensor([0.0, 0.0, 0.5 * GRAVITY], device=time.device)
+        path = (x.load_pos - x.pos)[:, :, None] + share[..., None] * x.load_vel[:, :, None] - share[..., None] ** 2 * fall
+        clearance = (path.square().sum(-1) + 1e-12).sqrt().amin(-1)
+        landing, time, clearance = (sum(w * value[i] for w, i in self._separation) for value in (landing, time, clearance))
+        error = ((landing - b.goal[:, :2]).square().sum(-1) + 1e-8).sqrt()
+        reward = rewards.landing(p, error) + rewards.time_of_flight(p, time)
+        return reward + rewards.proximity(p, clearance, release.clearance_margin), error, time
+
+    def _carrying(self, x: SimpleNamespace) -> Tensor:
+        """Rewards of each step while carrying, barriers included, shape (T, E)."""
+        task, env = self.cfg.task, self.env
+        p, bounds = task.reward, task.bounds
+        rate, height, load = x.response[1:, :, 1:], x.pos[1:, :, 2], x.load_pos[1:, :, 2]
+        before = torch.cat([self.buffers.previous[None], x.clipped[:-1]])
+        now, before = x.clipped.flatten(0, 1), before.flatten(0, 1)
+        on_action = rewards.command(p, now, env._rate_weights) + rewards.change(p, now, before, env._change_weights)
+        inside = [
+            height - bounds.altitude[0] - MARGINS["altitude"],
+            bounds.altitude[1] - MARGINS["altitude"] - height,
+            load - self.cfg.release.landing_height - MARGINS["ground"],
+            height - load - MARGINS["above"],
+            x.upright[1:] - math.cos(math.radians(bounds.tilt_deg)) - MARGINS["upright"],
+            bounds.horizontal - MARGINS["altitude"] - x.pos[1:, :, :2].norm(dim=-1),
+        ]
+        barrier = BARRIER * sum(gap.clamp(max=0.0).square() for gap in inside)
+        moving = rewards.kinetic(p, x.vel[1:], rate, x.load_vel[1:])
+        return moving + on_action.view_as(moving) + rewards.carry_time(p, self.cfg.sim.control_period) - barrier
+
+    def _cost(self, x: SimpleNamespace, width: Tensor, first: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """Mean cost of the flights and figures of what is released."""
+        p, K, steps = self.cfg.task.reward, self.releases, self.flights.steps
+        k = torch.arange(self.p.horizon, device=steps.device)[:, None]
+        reward, error, time = self._rewards_at_release(x)
+        hazard = torch.sigmoid((x.action[:K, :, act.COMMANDS] - self.cfg.release.threshold) / width) * (k[:K] >= first)
+        ended, cut = k[:K] > steps, k[:K] + self.lag + 1 > steps
+        hazard = torch.where(ended, 1.0, hazard)
+        reward = torch.where(cut, -p.termination, reward)
+        survival = torch.cat([torch.ones_like(hazard[:1]), (1.0 - hazard).cumprod(0)])
+        chance = survival[:-1] * hazard
+        carried = survival[(k[:, 0] - self.lag).clamp(0, K)] * (k < steps)
+        past = (x.action.abs() - 1.0).clamp(min=0.0).square().sum(-1) * (k < steps)
+        gain = (chance * reward).sum(0) + (carried * self._carrying(x)).sum(0) - p.termination * survival[-1]
+        done = (chance * ~cut).detach()
+        total = done.sum().clamp(min=1e-6)
+        duration = (k[:K] + 1) * self.cfg.sim.control_period + self.cfg.release.lag + time
+        figures = {"released": done.sum() / done.shape[1], "landing_error": (done * error).sum() / total,
+                   "duration": (done * duration).sum() / total}  # fmt: skip
+        return (self.p.saturation * past.sum(0) - gain).mean() * p.scale, figures
+
+    def derivatives(self, width: Tensor, first: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """Derivatives of the cost of the last rollout by the actions, shape (T, E, 5), and figures.
+
+        Args:
+            width: of the hazard.
+            first: step before which nothing is released.
+        """
+        f, b, adjoint = self.flights, self.buffers, self.adjoint
+        quat = f.quat
+        tilt = ob.rotation_from_quat(quat)[..., 2, :]  # world z in the body frame
+        x = SimpleNamespace(**{name: getattr(f, name).clone() for name in ("pos", "vel", "load_pos", "load_vel", "response")})
+        x.upright, x.action, x.clipped = tilt[..., 2].clone(), b.action.clone(), act.clip_action(b.action)
+        leaves = vars(x)
+        for leaf in leaves.values():
+            leaf.requires_grad_()
+        with torch.enable_grad():
+            cost, figures = self._cost(x, width, first)
+        by = dict(zip(leaves, torch.autograd.grad(cost, list(leaves.values()), allow_unused=True), strict=True))
+        for name in ("pos", "vel", "load_pos", "load_vel", "response"):
+            getattr(adjoint, name).copy_(by[name])
+        up = torch.zeros_like(tilt)
+        up[..., 2] = 1.0
+        adjoint.turn.copy_(torch.linalg.cross(up, tilt) * by["upright"][..., None])
+        adjoint.command.zero_()
+        by_clipped, by_action = by["clipped"].contiguous(), by["action"].contiguous()
+        self._backward(by_clipped, by_action)
+        return by_action, figures | {"cost": cost.detach()}
+
+    def _backward(self, by_clipped: Tensor, by_action: Tensor) -> None:
+        """Run the backward kernel over the last rollout; ``by_action`` becomes the whole derivative."""
+        env, f, b, s, task = self.env, self.flights, self.buffers, self.surrogate, self.cfg.task
+        lens = self._lens() if env.layout.name == "vision" else torch.zeros(1, 1, 1, 3, device=env.device)
+        vec3 = lambda tensor: wp.from_torch(tensor.contiguous(), dtype=wp.vec3)  # noqa: E731
+        with on_torch_stream(env.device):
+            wp.launch(
+                build_backward(env.layout),
+                env.num_envs,
+                [
+                    wp.from_torch(s.response, dtype=wp.vec4), wp.from_torch(s.force), wp.from_torch(s.tension),
+                    wp.from_torch(b.mass), wp.from_torch(self.plants.load_mass), vec3(self.plants.mount),
+                    vec3(env.camera.square_w), task.action.max_thrust, wp.vec3(*task.action.max_rate),
+                    self.cfg.sim.control_period, self.p.decay, self.adjoint.course, f.course, wp.from_torch(f.steps),
+                    wp.from_torch(b.age), vec3(b.goal), wp.from_torch(b.action), wp.from_torch(self._jacobian()), vec3(lens),
+                    wp.from_torch(by_clipped), wp.from_torch(by_action),
+                ],
+                device=env.device,
+                block_dim=64,
+            )  # fmt: skip
+
+    def _jacobian(self) -> Tensor:
+        """Derivatives of the network's actions by the observations of the last rollout, shape (T, E, 5, D)."""
+        x, slopes, layers = self.actor.obs_normalizer(self.buffers.obs.flatten(0, 1)), [], list(self.actor.mlp)
+        for layer in layers:
+            if isinstance(layer, torch.nn.Linear):
+                x = layer(x).detach().requires_grad_()
+            else:
+                with torch.enable_grad():
+                    y = layer(x)
+                slopes.append(torch.autograd.grad(y.sum(), x)[0])
+                x = y.detach()
+        linear = [layer.weight.detach() for layer in layers if isinstance(layer, torch.nn.Linear)]
+        product = linear[-1].expand(len(x), -1, -1)
+        for weight, slope in zip(reversed(linear[:-1]), reversed(slopes), strict=True):
+            product = (product * slope[:, None]).flatten(0, 1) @ weight
+            product = product.unflatten(0, (len(x), act.ACTIONS))
+        if self.actor.obs_normalization:
+            product = product / (self.actor.obs_normalizer._std + self.actor.obs_normalizer.eps)
+        return product.reshape(self.p.horizon, self.env.num_envs, act.ACTIONS, -1).contiguous()
+
+    def _lens(self) -> Tensor:
+        """Derivatives of each image coordinate by its point's place in the body frame, shape (T, E, 16, 3).
+
+        To move the camera by -e is to move every point by e, so three directions give them all.
+        """
+        env, f, T = self.env, self.flights, self.p.horizon
+        late = (self.buffers.age / self.cfg.sim.control_period)[:, None]
+        rot = ob.rotation_from_quat(f.quat)
+        pose = torch.cat([f.pos, rot[..., 0], rot[..., 1], f.load_pos], -1)[:T]
+        pose = torch.lerp(pose, torch.cat([pose[:1], pose[:-1]]), late).flatten(0, 1)
+        pos, x_axis, y_axis, load = pose.split(3, -1)
+        rot = torch.stack([x_axis, y_axis, torch.linalg.cross(x_axis, y_axis)], -1)
+        goal = self.buffers.goal.repeat(T, 1)
+        extrinsics = env.extrinsics()
+        if extrinsics is not None:
+            extrinsics = tuple(part.repeat(T, *(1,) * (part.dim() - 1)) for part in extrinsics)
+
+        def image(pos: Tensor) -> Tensor:
+            return ob.vision_part(env.camera, pos, rot, goal, load, extrinsics)[0].flatten(1)
+
+        columns = [torch.func.jvp(image, (pos,), (-rot[..., i].contiguous(),))[1] for i in range(3)]
+        kept = 1.0 - self.cfg.camera.noise.drop_probability
+        return kept * torch.stack(columns, -1).unflatten(0, (T, env.num_envs))
+
+    def learn(self, done: float) -> dict[str, Tensor]:
+        """One step of Adam along the gradient of the last rollout. done: share of the training that is over."""
+        p, device = self.p, self.env.device
+        width = p.width * (p.final_width / p.width) ** min(done / p.sharp, 1.0)
+        first = p.first_release * max(1.0 - done / p.free, 0.0)
+        by_action, figures = self.derivatives(torch.tensor(width, device=device), torch.tensor(first, device=device))
+        flown = torch.arange(p.horizon, device=device)[:, None] <= self.flights.steps
+        seen = self.buffers.obs.flatten(0, 1)
+        self.optimizer.zero_grad()
+        with torch.enable_grad():
+            (self.policy(seen) * (by_action * flown[..., None]).flatten(0, 1)).sum().backward()
+        norm = torch.nn.utils.clip_grad_norm_(self.actor.mlp.parameters(), p.max_grad_norm)
+        rate = p.final_rate + 0.5 * (p.learning_rate - p.final_rate) * (1.0 + math.cos(math.pi * min(done, 1.0)))
+        for group in self.optimizer.param_groups:
+            group["lr"] = rate
+        self.optimizer.step()
+        if self.actor.obs_normalization:
+            self.actor.obs_normalizer.update(seen)
+        return figures | {"gradient_norm": norm, "learning_rate": rate, "ended": (self.flights.steps < p.horizon).float().mean()}
