@@ -241,7 +241,7 @@ class FirstOrder:
             else:
                 with torch.enable_grad():
                     y = layer(x)
-                slopes.append(torch.autograd.grad(y.sum(), x)[0])
+                    slopes.append(torch.autograd.grad(y.sum(), x)[0])
                 x = y.detach()
         linear = [layer.weight.detach() for layer in layers if isinstance(layer, torch.nn.Linear)]
         product = linear[-1].expand(len(x), -1, -1)

@@ -25,6 +25,7 @@ from visthrow.onboard.policy import Policy
 from visthrow.task import Experiment, PPOParams, contract_of
 from visthrow.training import protocol
 from visthrow.training.env import ThrowEnv
+from visthrow.training.first_order import FirstOrder
 
 CHECKPOINT = "checkpoint.pt"
 POLICY = "policy.npz"
@@ -106,6 +107,7 @@ class Trainer:
         self.alg.train_mode()
         if ranks:
             self.alg.broadcast_parameters()
+        self.first_order = FirstOrder(experiment, self.env, self.alg.actor) if experiment.algorithm == "first_order" else None
         self._obs = self.env.get_observations()
         self._graph = None
         self.iteration = 0

@@ -1,0 +1,199 @@
+"""First-order training: its backward pass against torch's autograd of the same surrogate and against the simulator itself."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from sim.params import GRAVITY
+from visthrow import config
+from visthrow.onboard import actions as act
+from visthrow.onboard import observations as ob
+from visthrow.task import Experiment
+from visthrow.training.surrogate import TAUT
+from visthrow.training.trainer import Trainer
+
+SMALL = ['algorithm="first_order"', "ppo.environments=24", "ppo.hidden=[16,16]", "ppo.steps=8", "first_order.horizon=14", "first_order.initial_release=-0.3"]
+QUIET = ["task.noise.observation_step=0", "task.noise.observation_bias=0", "task.noise.command_step=0",
+         "task.noise.command_bias=0", "camera.noise.step_std=0", "camera.noise.bias_std=0"]  # fmt: skip
+
+SECOND_ORDER = 0.01
+"""A rotation's derivative is taken to second order in a step's turn, and the turn from the rates at its ends."""
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    """Small work; the same bits need the same number of threads."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def first_order(name="state", *changes):
+    """A first-order training of a small network that has been made to react to what it sees."""
+    found = Trainer(config.load(Experiment, config.find("train", name), [*SMALL, *changes]), "cpu", 3).first_order
+    with torch.no_grad():
+        found.actor.mlp[-1].weight.mul_(5.0)
+    return found
+
+
+def slowed(x, decay):
+    """x whose derivative is scaled."""
+    return decay * x + ((1.0 - decay) * x).detach()
+
+
+def at(value, slope):
+    """The slope of one tensor at the value of another."""
+    return value + slope - slope.detach()
+
+
+def exponential(vector):
+    """Rotation matrices of rotation vectors."""
+    x, y, z = vector.unbind(-1)
+    zero = torch.zeros_like(x)
+    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
+    return torch.linalg.matrix_exp(cross)
+
+
+def advance(fo, true, k, x, response, commands):
+    """The surrogate's step in torch, from state ``x`` to the dictionary of state k + 1, before the decay."""
+    s, dt, pl = fo.surrogate, fo.cfg.sim.control_period, fo.plants
+    M, m = fo.buffers.mass[:, None], pl.load_mass[:, None]
+    y = s.response[0] * response[k] + (s.response[1] * response[k - 1] if k else 0.0)
+    y = y + sum(s.response[2 + j] * commands[k - j] for j in range(len(s.response) - 2) if k >= j)
+    y = at(true.response[k + 1], y)
+    turned = x["rot"] @ exponential(0.5 * dt * (response[k] + y)[:, 1:])
+    rots = ob.rotation_from_quat(true.quat)
+    rot = rots[k + 1] @ turned.detach().mT @ turned
+    z = 0.5 * (x["rot"][..., 2] + rot[..., 2])
+    axes = x["rot"].detach()
+    drag = (axes * s.force[1:]) @ axes.mT @ x["vel"][..., None]
+    f = s.force[0] * 0.5 * (response[k] + y)[:, :1] * z - drag[..., 0]
+    arms = true.load_pos - true.pos - (rots @ pl.mount[..., None])[..., 0]
+    arm = x["load_pos"] - x["pos"] - (x["rot"] @ pl.mount[..., None])[..., 0] + 0.5 * dt * (x["load_vel"] - x["vel"])
+    arm = at(0.5 * (arms[k] + arms[k + 1]), arm)
+    u = at(0.5 * (true.load_vel - true.vel)[k : k + 2].sum(0), x["load_vel"] - x["vel"])
+    length = arm.norm(dim=-1, keepdim=True)
+    n = arm / length
+    dot = lambda a, b: (a * b).sum(-1, keepdim=True)  # noqa: E731
+    a, b, c = s.tension
+    pull = M * m / (M + m) * (-a * dot(n, f) / M + b * (dot(u, u) - dot(n, u) ** 2) / length + c * dot(n, u) / dt)
+    g = torch.tensor([0.0, 0.0, GRAVITY])
+    measured = -dot(n, m * ((true.load_vel[k + 1] - true.load_vel[k]) / dt + g)).detach()
+    pull = torch.where(measured > TAUT * GRAVITY * m, at(measured, pull), 0.0)
+    vel = at(true.vel[k + 1], x["vel"] + dt * (f + pull * n) / M)
+    load_vel = at(true.load_vel[k + 1], x["load_vel"] - dt * pull * n / m)
+    pos = at(true.pos[k + 1], x["pos"] + 0.5 * dt * (x["vel"] + vel))
+    load_pos = at(true.load_pos[k + 1], x["load_pos"] + 0.5 * dt * (x["load_vel"] + load_vel))
+    return {"pos": pos, "vel": vel, "rot": rot, "load_pos": load_pos, "load_vel": load_vel, "response": y}
+
+
+def reference(fo, by):
+    """Derivatives by the actions of ``sum_k <by[k], state k>`` through the closed loop, by torch's autograd."""
+    true, b, layout = fo.flights, fo.buffers, fo.env.layout
+    extra = torch.zeros_like(b.action, requires_grad=True)
+    rots, late = ob.rotation_from_quat(true.quat), (b.age / fo.cfg.sim.control_period)[:, None]
+    x = {name: getattr(true, name)[0].clone() for name in ("pos", "vel", "load_pos", "load_vel", "response")} | {"rot": rots[0]}
+    poses, responses, commands, cost = [], [], [], 0.0
+    previous, history, valid = b.previous, torch.zeros(24, 1 + layout.history, layout.payload), torch.zeros(24, 8)
+    for k in range(fo.p.horizon):
+        responses.append(x["response"])
+        pose = torch.cat([ob.vehicle_part(x["pos"], x["vel"], x["response"][:, 1:], x["rot"]), x["load_pos"]], -1)
+        poses.append(pose)
+        seen = torch.lerp(pose, poses[max(k - 1, 0)], late)
+        if layout.name == "state":
+            frame = torch.cat([seen[:, :15], ob.state_part(seen[:, :3], b.goal, seen[:, 15:])], -1)
+        else:
+            x_axis, y_axis = seen[:, 9:12], seen[:, 12:15]
+            rot = torch.stack([x_axis, y_axis, torch.linalg.cross(x_axis, y_axis)], -1)
+            points = ob.vision_part(fo.env.camera, seen[:, :3], rot, b.goal, seen[:, 15:])[0]
+            frame = torch.cat([seen[:, :15], points.flatten(1)], -1)
+        fresh = torch.full((24,), k == 0)
+        obs, history = ob.observe(layout, frame, valid, previous, torch.ones(24), history, fresh)
+        obs = at(b.obs[k], obs)  # the validity bits are the environment's own
+        action = fo.policy(obs) + extra[k]
+        previous = at(act.clip_action(b.action[k]), action)
+        throttle = (0.5 * (b.action[k, :, :1] + 1.0)).clamp(0.05, 1.0)
+        scale = torch.cat([fo.cfg.task.action.max_thrust * throttle, fo.env._max_rate.expand(24, -1)], -1)
+        commands.append(action[:, :4] * scale)
+        x = advance(fo, true, k, x, responses, commands)
+        x = {name: slowed(value, fo.p.decay) for name, value in x.items()}
+        cost = cost + sum((x[name] * by[name][k + 1] * (k < true.steps)[:, None]).sum() for name in by)
+    return torch.autograd.grad(cost, extra)[0]
+
+
+@pytest.mark.parametrize("name", ["state", "vision"])
+def test_backward_pass_equals_autograd_of_the_same_surrogate(name):
+    """Closed loop: queue, response, rope, latency, histories, lens, network, over a whole flight."""
+    fo = first_order(name)
+    fo.rollout()
+    assert (fo.flights.steps == fo.p.horizon).all()
+    assert fo.buffers.action.abs().max() < 1.0
+    torch.manual_seed(0)
+    by = {n: torch.randn_like(getattr(fo.flights, n)) for n in ("pos", "vel", "load_pos", "load_vel", "response")}
+    for n, value in by.items():
+        getattr(fo.adjoint, n).copy_(value)
+    for n in ("turn", "command"):
+        getattr(fo.adjoint, n).zero_()
+    found, unused = torch.zeros_like(fo.buffers.action), torch.zeros_like(fo.buffers.action)
+    fo._backward(unused, found)
+    with torch.enable_grad():
+        expected = reference(fo, by)
+    size = expected.square().mean(1).sqrt()
+    off = (found - expected).square().mean(1).sqrt()
+    assert (off[size > 0] / size[size > 0]).max() < SECOND_ORDER
+
+
+def test_slopes_are_those_of_the_simulator():
+    """Landing point of a release at the flight's end against commands at each earlier step, by differences of the simulator."""
+    fo = first_order("state", *QUIET, "task.start.tether_variants=1")
+    plan = fo.env._start_action + 0.25 * torch.randn(fo.p.horizon, 24, 5) * torch.tensor([0.4, 1.0, 1.0, 1.0, 0.0])
+    episode = fo.env.state_dict()["episode"].clone()
+
+    def fly(actions):
+        """Landing points of flights under stated actions, from the same starts each time."""
+        fo.env.load_state_dict(fo.env.state_dict() | {"episode": episode})
+        fo.policy = lambda obs: actions[fly.step]
+        fly.step = -1
+        inner = fo.env.step
+        fo.env.step = lambda a, hold: inner(a, hold)
+
+        def policy(obs):
+            fly.step += 1
+            return actions[fly.step]
+
+        fo.policy = policy
+        fo.rollout()
+        fo.env.step = inner
+        return fo.buffers.landing[-1].clone()
+
+    landing = fly(plan)
+    assert (fo.flights.steps == fo.p.horizon).all()
+    last, size = fo.p.horizon, 0.02
+    x = {n: getattr(fo.flights, n).clone().requires_grad_() for n in ("load_pos", "load_vel")}
+    up = x["load_vel"][-1, :, 2]
+    time = (up + (up.square() + 2 * GRAVITY * (x["load_pos"][-1, :, 2] - fo.cfg.release.landing_height)).sqrt()) / GRAVITY
+    point = x["load_pos"][-1, :, :2] + x["load_vel"][-1, :, :2] * time[:, None]
+    assert (point - landing).abs().max() < 1e-4
+    fo._jacobian = lambda: torch.zeros(last, 24, 5, fo.env.layout.dimension)
+    fo.p = dataclasses.replace(fo.p, decay=1.0)
+    for axis in range(2):
+        for n, value in zip(x, torch.autograd.grad(point[:, axis].sum(), list(x.values()), retain_graph=True)):
+            getattr(fo.adjoint, n).copy_(value)
+        for n in ("pos", "vel", "turn", "response", "command"):
+            getattr(fo.adjoint, n).zero_()
+        found, unused = torch.zeros_like(plan), torch.zeros_like(plan)
+        fly(plan)
+        fo._backward(unused, found)
+        for channel in range(4):
+            kept = []
+            for k in range(0, last - 3):
+                step = torch.zeros_like(plan)
+                step[k, :, channel] = size
+                slope = (fly(plan + step) - fly(plan - step))[:, axis] / (2 * size)
+                kept.append(torch.stack([found[k, :, channel], slope]))
+            pair = torch.stack(kept)  # (k, 2, E)
+            a, c = pair[:, 0].flatten(), pair[:, 1].flatten()
+            print(axis, channel, "cos", float((a @ c) / (a.norm() * c.norm())), "ratio", float((a @ c) / (c @ c)), "size", float(c.square().mean().sqrt()))
+            print("  per k", [round(float((p[0] @ p[1]) / (p[0].norm() * p[1].norm() + 1e-9)), 3) for p in pair])
