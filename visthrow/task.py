@@ -139,6 +139,7 @@ class PPOParams:
 class FirstOrderParams:
     """First-order training; see :mod:`visthrow.training.first_order`. Throws a gradient: ``ppo.environments``."""
 
+    iterations: int = 600
     horizon: int = 52
     decay: float = 0.97
     learning_rate: float = 2e-3
@@ -193,6 +194,16 @@ class Experiment:
     diagnosed: DiagnosedParams = field(default_factory=DiagnosedParams)
     algorithm: Literal["ppo", "first_order"] = "ppo"
     first_order: FirstOrderParams = field(default_factory=FirstOrderParams)
+
+    @property
+    def iterations(self) -> int:
+        """Iterations of the training."""
+        return self.first_order.iterations if self.algorithm == "first_order" else self.ppo.iterations
+
+    @property
+    def steps_per_iteration(self) -> int:
+        """Environment steps an iteration."""
+        return self.ppo.environments * (self.first_order.horizon if self.algorithm == "first_order" else self.ppo.steps)
 
     def __post_init__(self) -> None:
         if self.ppo.environments < 1 or self.ppo.steps < 1 or self.ppo.iterations < 1:

@@ -93,7 +93,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _last(args: argparse.Namespace, trainer) -> int:
-    return args.iterations or trainer.experiment.ppo.iterations
+    return args.iterations or trainer.experiment.iterations
 
 
 def _follow(args: argparse.Namespace, trainer) -> bool:

@@ -13,26 +13,51 @@ kernel; decaying by a factor each step, they stay bounded.
 """
 
 import math
+from collections.abc import Callable
 from types import SimpleNamespace
 
 import torch
 import warp as wp
 from torch import Tensor
 
-from sim.params import GRAVITY
 from sim.arrays.torch_bridge import on_torch_stream
+from sim.params import GRAVITY
+from visthrow.common.errors import ConfigError
 from visthrow.onboard import actions as act
 from visthrow.onboard import observations as ob
-from visthrow.training import rewards
-from visthrow.common.errors import ConfigError
 from visthrow.task import Experiment
+from visthrow.training import rewards
 from visthrow.training.env import ThrowEnv
-from visthrow.training.surrogate import Flights, Plants, Surrogate, build_backward, fit
+from visthrow.training.surrogate import Flights, Model, Plants, Seen, Surrogate, build_backward, fit
 
 BARRIER = 600.0
 """Barriers cost this times the square of how far a state is within their margins."""
 MARGINS = {"altitude": 0.15, "ground": 0.1, "above": 0.08, "upright": 0.15}
 """Reach of the barriers: of altitude, payload over ground, payload below vehicle [m], cosine of the tilt."""
+
+OUTLIER = 4.0
+"""A flight's derivatives are shortened to this many times the median flight's."""
+
+
+class Replayed:
+    """Work on fixed tensors of a GPU: done eagerly once, then captured in a CUDA graph and replayed."""
+
+    def __init__(self, work: Callable[[], None]):
+        self._work, self._warm, self._graph = work, False, None
+
+    def __call__(self) -> None:
+        """Do the work."""
+        if not self._warm:
+            self._work()
+            self._warm = True
+            return
+        if self._graph is None:
+            torch.cuda.synchronize()
+            graph = torch.cuda.CUDAGraph()
+            with torch.cuda.graph(graph):
+                self._work()
+            self._graph = graph
+        self._graph.replay()
 
 
 class FirstOrder:
@@ -41,6 +66,7 @@ class FirstOrder:
     Attributes:
         surrogate: fitted to the environment's plants at the start.
         optimizer: Adam on the actor's network.
+        rollout: flies one batch without release.
     """
 
     def __init__(self, experiment: Experiment, env: ThrowEnv, actor: torch.nn.Module):
@@ -65,7 +91,8 @@ class FirstOrder:
             raise ConfigError(f"first_order.horizon is {T} steps; expected at least {self.lag + 2} for a release to end in")
         self.plants = Plants(env)
         with torch.no_grad():
-            self.surrogate = fit(env, self.plants)
+            watch = actor.obs_normalizer.update if actor.obs_normalization else lambda obs: None
+            self.surrogate = fit(env, self.plants, watch)  # random commands give every observation a spread to start from
         self.flights, self.adjoint = Flights(T, E, device), Flights(T, E, device)
         make = {"device": device, "dtype": torch.float32}
         self.buffers = SimpleNamespace(
@@ -82,8 +109,14 @@ class FirstOrder:
         shares = [math.prod((rest - b) / (a - b) for b in nodes if b != a) for a in nodes]
         k = torch.arange(self.releases, device=device)
         self._separation = [(w, (k + self.lag + int(a)).clamp(0, T)) for a, w in zip(nodes, shares)]
+        self._fall = torch.tensor([0.0, 0.0, 0.5 * GRAVITY], **make)
+        self._width, self._first = torch.zeros((), **make), torch.zeros((), **make)
+        self._figures: dict[str, Tensor] = {}
         self._begin()
-        self.optimizer = torch.optim.Adam(actor.mlp.parameters(), lr=self.p.learning_rate, betas=(0.9, 0.95))
+        on_gpu = device.startswith("cuda")
+        rate = torch.tensor(self.p.learning_rate, **make) if on_gpu else self.p.learning_rate
+        self.optimizer = torch.optim.Adam(actor.mlp.parameters(), lr=rate, betas=(0.9, 0.95), capturable=on_gpu)
+        self.rollout, self._update = (Replayed(work) if on_gpu else work for work in (self._fly, self._descend))
 
     def _begin(self) -> None:
         """Hover with the latch at rest, whatever is seen."""
@@ -98,7 +131,7 @@ class FirstOrder:
         return self.actor.mlp(self.actor.obs_normalizer(obs))
 
     @torch.no_grad()
-    def rollout(self) -> None:
+    def _fly(self) -> None:
         """Fly one batch without release."""
         env, f, b = self.env, self.flights, self.buffers
         env.reset()
@@ -134,8 +167,7 @@ class FirstOrder:
         landing = landing + (b.landing - landing).detach()  # the simulator's own value, the slope of flight without drag
         time = time + (b.time - time).detach()
         share = torch.linspace(0.0, 1.0, release.clearance_samples, device=time.device) * time[..., None]
-        fall = torch.tensor([0.0, 0.0, 0.5 * GRAVITY], device=time.device)
-        path = (x.load_pos - x.pos)[:, :, None] + share[..., None] * x.load_vel[:, :, None] - share[..., None] ** 2 * fall
+        path = (x.load_pos - x.pos)[:, :, None] + share[..., None] * x.load_vel[:, :, None] - share[..., None] ** 2 * self._fall
         clearance = (path.square().sum(-1) + 1e-12).sqrt().amin(-1)
         landing, time, clearance = (sum(w * value[i] for w, i in self._separation) for value in (landing, time, clearance))
         error = ((landing - b.goal[:, :2]).square().sum(-1) + 1e-8).sqrt()
@@ -162,12 +194,12 @@ class FirstOrder:
         moving = rewards.kinetic(p, x.vel[1:], rate, x.load_vel[1:])
         return moving + on_action.view_as(moving) + rewards.carry_time(p, self.cfg.sim.control_period) - barrier
 
-    def _cost(self, x: SimpleNamespace, width: Tensor, first: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+    def _cost(self, x: SimpleNamespace) -> tuple[Tensor, dict[str, Tensor]]:
         """Mean cost of the flights and figures of what is released."""
         p, K, steps = self.cfg.task.reward, self.releases, self.flights.steps
         k = torch.arange(self.p.horizon, device=steps.device)[:, None]
         reward, error, time = self._rewards_at_release(x)
-        hazard = torch.sigmoid((x.action[:K, :, act.COMMANDS] - self.cfg.release.threshold) / width) * (k[:K] >= first)
+        hazard = torch.sigmoid((x.action[:K, :, act.COMMANDS] - self.cfg.release.threshold) / self._width) * (k[:K] >= self._first)
         ended, cut = k[:K] > steps, k[:K] + self.lag + 1 > steps
         hazard = torch.where(ended, 1.0, hazard)
         reward = torch.where(cut, -p.termination, reward)
@@ -183,13 +215,8 @@ class FirstOrder:
                    "duration": (done * duration).sum() / total}  # fmt: skip
         return (self.p.saturation * past.sum(0) - gain).mean() * p.scale, figures
 
-    def derivatives(self, width: Tensor, first: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """Derivatives of the cost of the last rollout by the actions, shape (T, E, 5), and figures.
-
-        Args:
-            width: of the hazard.
-            first: step before which nothing is released.
-        """
+    def derivatives(self) -> tuple[Tensor, dict[str, Tensor]]:
+        """Derivatives of the cost of the last rollout by the actions, shape (T, E, 5), and figures."""
         f, b, adjoint = self.flights, self.buffers, self.adjoint
         quat = f.quat
         tilt = ob.rotation_from_quat(quat)[..., 2, :]  # world z in the body frame
@@ -199,7 +226,7 @@ class FirstOrder:
         for leaf in leaves.values():
             leaf.requires_grad_()
         with torch.enable_grad():
-            cost, figures = self._cost(x, width, first)
+            cost, figures = self._cost(x)
         by = dict(zip(leaves, torch.autograd.grad(cost, list(leaves.values()), allow_unused=True), strict=True))
         for name in ("pos", "vel", "load_pos", "load_vel", "response"):
             getattr(adjoint, name).copy_(by[name])
@@ -213,24 +240,26 @@ class FirstOrder:
 
     def _backward(self, by_clipped: Tensor, by_action: Tensor) -> None:
         """Run the backward kernel over the last rollout; ``by_action`` becomes the whole derivative."""
-        env, f, b, s, task = self.env, self.flights, self.buffers, self.surrogate, self.cfg.task
+        env, seen = self.env, Seen()
         lens = self._lens() if env.layout.name == "vision" else torch.zeros(1, 1, 1, 3, device=env.device)
-        vec3 = lambda tensor: wp.from_torch(tensor.contiguous(), dtype=wp.vec3)  # noqa: E731
+        network = self._jacobian()
+        seen.age, seen.network = wp.from_torch(self.buffers.age), wp.from_torch(network)
+        for name, tensor in (("goal", self.buffers.goal), ("corners", env.camera.square_w), ("lens", lens)):
+            setattr(seen, name, wp.from_torch(tensor.contiguous(), dtype=wp.vec3))
+        arrays = [wp.from_torch(tensor) for tensor in (self.flights.steps, self.buffers.action, by_clipped, by_action)]
+        inputs = [self._model(), self.adjoint.course, self.flights.course, seen, *arrays]
         with on_torch_stream(env.device):
-            wp.launch(
-                build_backward(env.layout),
-                env.num_envs,
-                [
-                    wp.from_torch(s.response, dtype=wp.vec4), wp.from_torch(s.force), wp.from_torch(s.tension),
-                    wp.from_torch(b.mass), wp.from_torch(self.plants.load_mass), vec3(self.plants.mount),
-                    vec3(env.camera.square_w), task.action.max_thrust, wp.vec3(*task.action.max_rate),
-                    self.cfg.sim.control_period, self.p.decay, self.adjoint.course, f.course, wp.from_torch(f.steps),
-                    wp.from_torch(b.age), vec3(b.goal), wp.from_torch(b.action), wp.from_torch(self._jacobian()), vec3(lens),
-                    wp.from_torch(by_clipped), wp.from_torch(by_action),
-                ],
-                device=env.device,
-                block_dim=64,
-            )  # fmt: skip
+            wp.launch(build_backward(env.layout), env.num_envs, inputs, device=env.device, block_dim=64)
+
+    def _model(self) -> Model:
+        """What the backward kernel knows of the plants."""
+        model, s, action = Model(), self.surrogate, self.cfg.task.action
+        model.response, model.mount = wp.from_torch(s.response, dtype=wp.vec4), wp.from_torch(self.plants.mount, dtype=wp.vec3)
+        model.force, model.tension = wp.from_torch(s.force), wp.from_torch(s.tension)
+        model.mass, model.load_mass = wp.from_torch(self.buffers.mass), wp.from_torch(self.plants.load_mass)
+        model.max_thrust, model.max_rate = action.max_thrust, wp.vec3(*action.max_rate)
+        model.period, model.decay = self.cfg.sim.control_period, self.p.decay
+        return model
 
     def _jacobian(self) -> Tensor:
         """Derivatives of the network's actions by the observations of the last rollout, shape (T, E, 5, D)."""
@@ -276,22 +305,44 @@ class FirstOrder:
         kept = 1.0 - self.cfg.camera.noise.drop_probability
         return kept * torch.stack(columns, -1).unflatten(0, (T, env.num_envs))
 
-    def learn(self, done: float) -> dict[str, Tensor]:
+    def learn(self, done: float) -> dict[str, float]:
         """One step of Adam along the gradient of the last rollout. done: share of the training that is over."""
-        p, device = self.p, self.env.device
-        width = p.width * (p.final_width / p.width) ** min(done / p.sharp, 1.0)
-        first = p.first_release * max(1.0 - done / p.free, 0.0)
-        by_action, figures = self.derivatives(torch.tensor(width, device=device), torch.tensor(first, device=device))
-        flown = torch.arange(p.horizon, device=device)[:, None] <= self.flights.steps
-        seen = self.buffers.obs.flatten(0, 1)
-        self.optimizer.zero_grad()
-        with torch.enable_grad():
-            (self.policy(seen) * (by_action * flown[..., None]).flatten(0, 1)).sum().backward()
-        norm = torch.nn.utils.clip_grad_norm_(self.actor.mlp.parameters(), p.max_grad_norm)
+        p = self.p
+        self._width.fill_(p.width * (p.final_width / p.width) ** min(done / p.sharp, 1.0))
+        self._first.fill_(p.first_release * max(1.0 - done / p.free, 0.0))
         rate = p.final_rate + 0.5 * (p.learning_rate - p.final_rate) * (1.0 + math.cos(math.pi * min(done, 1.0)))
         for group in self.optimizer.param_groups:
-            group["lr"] = rate
+            group["lr"] = group["lr"].fill_(rate) if isinstance(group["lr"], Tensor) else rate
+        self._update()
+        return {name: float(value) for name, value in self._figures.items()} | {"learning_rate": rate}
+
+    def _descend(self) -> None:
+        """Gradient of the last rollout, Adam, observation statistics."""
+        by_action, self._figures = self.derivatives()
+        flown = torch.arange(self.p.horizon, device=self.env.device)[:, None] <= self.flights.steps
+        by_action = by_action * flown[..., None]
+        size = by_action.square().sum((0, 2)).sqrt()  # a few wild flights must not outweigh the rest
+        by_action = by_action * (OUTLIER * size.median() / size.clamp(min=1e-12)).clamp(max=1.0)[:, None]
+        seen, parameters = self.buffers.obs.flatten(0, 1), list(self.actor.mlp.parameters())
+        with torch.enable_grad():
+            output = self.policy(seen)
+        gradients = torch.autograd.grad(output, parameters, by_action.flatten(0, 1))
+        for parameter, gradient in zip(parameters, gradients, strict=True):
+            parameter.grad = gradient
+        self._figures["gradient_norm"] = torch.nn.utils.clip_grad_norm_(parameters, self.p.max_grad_norm)
+        self._figures["ended"] = (self.flights.steps < self.p.horizon).float().mean()
         self.optimizer.step()
         if self.actor.obs_normalization:
-            self.actor.obs_normalizer.update(seen)
-        return figures | {"gradient_norm": norm, "learning_rate": rate, "ended": (self.flights.steps < p.horizon).float().mean()}
+            normalizer = self.actor.obs_normalizer
+            std = normalizer._std  # the update makes a new tensor; a graph reads this one
+            normalizer.update(seen)
+            normalizer._std = std.copy_(normalizer._std)
+
+    def state_dict(self) -> dict:
+        """All that the next gradient depends on besides network, environment and random generators."""
+        return {"optimizer": self.optimizer.state_dict(), "surrogate": vars(self.surrogate)}
+
+    def load_state_dict(self, saved: dict) -> None:
+        """Take up a state of :meth:`state_dict`."""
+        self.optimizer.load_state_dict(saved["optimizer"])
+        self.surrogate = Surrogate(**saved["surrogate"])

@@ -14,6 +14,7 @@ commands by linear least squares. The backward pass is one kernel, a thread a fl
 a rotation's derivative is that by a turn about the body axes, R exp(turn).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -28,6 +29,9 @@ from visthrow.training.env import ThrowEnv
 
 EXCITED = ((0.35, 0.5, 0.5, 0.5), 0.7)
 """Random commands of the fit: spread of the normalised actions about hover, and how much of one the next step keeps."""
+
+SLACK_THROTTLE = 0.05
+"""Least throttle at which the slope of the thrust is taken: at none it is nought, and nothing would lead away from there."""
 
 TAUT = 0.1
 """Pull on the payload in its weights above which the rope counts as taut."""
@@ -120,8 +124,8 @@ class Surrogate:
     residual: Tensor
 
 
-def random_flights(env: ThrowEnv, plants: Plants, steps: int) -> tuple[Flights, Tensor]:
-    """Flights under random commands from the task's starts, and the vehicles' masses."""
+def random_flights(env: ThrowEnv, plants: Plants, steps: int, watch: Callable[[Tensor], None]) -> tuple[Flights, Tensor]:
+    """Flights under random commands from the task's starts, and the vehicles' masses; ``watch`` is shown what is observed."""
     flights = Flights(steps, env.num_envs, env.device)
     env.reset()
     mass = plants.mass(env).clone()
@@ -132,7 +136,8 @@ def random_flights(env: ThrowEnv, plants: Plants, steps: int) -> tuple[Flights, 
     alive = torch.ones(env.num_envs, device=env.device, dtype=torch.bool)
     flights.record(0, env, plants.thrust_factor)
     for k in range(steps):
-        _, _, done, _ = env.step(hover + swing, hold=True)
+        seen, _, done, _ = env.step(hover + swing, hold=True)
+        watch(seen["actor"])
         flights.command[k].copy_(env.views.command)
         flights.record(k + 1, env, plants.thrust_factor)
         alive = alive & (done == 0)
@@ -152,12 +157,17 @@ def _solve(features: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
     return found, (left.square().mean() / target.square().mean()).sqrt()
 
 
-def fit(env: ThrowEnv, plants: Plants, steps: int = 40, least: int = 8000) -> Surrogate:
-    """Fit the surrogate to random flights of the environment's plants, at least ``least`` steps of them."""
+def fit(
+    env: ThrowEnv, plants: Plants, watch: Callable[[Tensor], None] = lambda obs: None, steps: int = 40, least: int = 8000
+) -> Surrogate:
+    """Fit the surrogate to random flights of the environment's plants, at least ``least`` steps of them.
+
+    ``watch`` is shown the actor's observations, shape (E, D), of each step.
+    """
     period, lags = env.cfg.sim.control_period, max(queue_depth(env.cfg.vehicle.queue.delay, env.cfg.sim.control_period), 2)
     parts: list[dict[str, Tensor]] = []
     for _ in range(-(-least // (env.num_envs * steps)) + 1):
-        flights, mass = random_flights(env, plants, steps)
+        flights, mass = random_flights(env, plants, steps, watch)
         k = torch.arange(lags, steps, device=env.device)
         whole = k[:, None] < flights.steps
         parts.append(_regressors(flights, plants, mass, k, lags, period, whole))
@@ -210,6 +220,33 @@ def _regressors(f: Flights, plants: Plants, mass: Tensor, k: Tensor, lags: int, 
     }
 
 
+@wp.struct
+class Model:
+    """The surrogate and what it is evaluated on."""
+
+    response: wp.array(dtype=wp.vec4)
+    force: wp.array(dtype=float)
+    tension: wp.array(dtype=float)
+    mass: wp.array(dtype=float)
+    load_mass: wp.array(dtype=float)
+    mount: wp.array(dtype=wp.vec3)
+    max_thrust: float
+    max_rate: wp.vec3
+    period: float
+    decay: float  # of derivatives, per step
+
+
+@wp.struct
+class Seen:
+    """What the actor sees, and its derivatives."""
+
+    age: wp.array(dtype=float)  # of poses [s]
+    goal: wp.array(dtype=wp.vec3)
+    corners: wp.array(dtype=wp.vec3)  # of the goal square, from the goal
+    lens: wp.array3d(dtype=wp.vec3)  # (T, E, 16): of image coordinates by points in the body frame
+    network: wp.array4d(dtype=float)  # (T, E, 5, D): of actions by observations
+
+
 @wp.func
 def turned(quat: wp.quat, arm_b: wp.vec3, grad_w: wp.vec3):
     """Derivative by the turn of what has the derivative ``grad_w`` by the world vector ``R arm_b``."""
@@ -217,41 +254,27 @@ def turned(quat: wp.quat, arm_b: wp.vec3, grad_w: wp.vec3):
 
 
 @wp.func
-def step_back(
-    # Params:
-    response: wp.array(dtype=wp.vec4),
-    force: wp.array(dtype=float),
-    tension: wp.array(dtype=float),
-    mass: float,
-    load_mass: float,
-    mount: wp.vec3,
-    period: float,
-    decay: float,
-    # In:
-    x: Course,
-    k: int,
-    e: int,
-    # State in:
-    adj: Course,
-):
+def step_back(p: Model, x: Course, adj: Course, k: int, e: int):
     """Add to the derivatives by state k, k - 1 and by the commands up to k what those by state k + 1 make of them."""
-    half = 0.5 * period
+    dt = p.period
+    half = 0.5 * dt
+    mass = p.mass[e]
+    load_mass = p.load_mass[e]
+    mount = p.mount[e]
     up = wp.vec3(0.0, 0.0, 1.0)
     rot = x.quat[k, e]
     rot_next = x.quat[k + 1, e]
-    g_pos = decay * adj.pos[k + 1, e]
-    g_load = decay * adj.load_pos[k + 1, e]
-    g_vel = decay * adj.vel[k + 1, e] + half * g_pos
-    g_load_vel = decay * adj.load_vel[k + 1, e] + half * g_load
-    g_turn = decay * adj.turn[k + 1, e]
-    g_response = decay * adj.response[k + 1, e]
+    g_pos = p.decay * adj.pos[k + 1, e]
+    g_load = p.decay * adj.load_pos[k + 1, e]
+    g_vel = p.decay * adj.vel[k + 1, e] + half * g_pos
+    g_load_vel = p.decay * adj.load_vel[k + 1, e] + half * g_load
+    g_turn = p.decay * adj.turn[k + 1, e]
+    g_response = p.decay * adj.response[k + 1, e]
 
-    z = wp.quat_rotate(rot, up) + wp.quat_rotate(rot_next, up)
-    z = 0.5 * z
-    thrust = 0.5 * (x.response[k, e][0] + x.response[k + 1, e][0])
-    vel_b = wp.quat_rotate_inv(rot, x.vel[k, e])
-    drag = wp.vec3(force[1], force[2], force[3])
-    f = force[0] * thrust * z - wp.quat_rotate(rot, wp.cw_mul(drag, vel_b))
+    z = 0.5 * (wp.quat_rotate(rot, up) + wp.quat_rotate(rot_next, up))
+    thrust = 0.5 * p.force[0] * (x.response[k, e][0] + x.response[k + 1, e][0])
+    drag = wp.vec3(p.force[1], p.force[2], p.force[3])
+    f = thrust * z - wp.quat_rotate(rot, wp.cw_mul(drag, wp.quat_rotate_inv(rot, x.vel[k, e])))
     arm = 0.5 * (x.load_pos[k, e] - x.pos[k, e] + x.load_pos[k + 1, e] - x.pos[k + 1, e])
     arm = arm - 0.5 * (wp.quat_rotate(rot, mount) + wp.quat_rotate(rot_next, mount))
     length = wp.length(arm)
@@ -259,189 +282,140 @@ def step_back(
     u = 0.5 * (x.load_vel[k, e] - x.vel[k, e] + x.load_vel[k + 1, e] - x.vel[k + 1, e])
     along = wp.dot(n, u)
     across = u - along * n
-    load_force = load_mass * ((x.load_vel[k + 1, e] - x.load_vel[k, e]) / period + GRAVITY * up)
-    pull = -wp.dot(n, load_force)
-    reduced = mass * load_mass / (mass + load_mass)
+    pull = -load_mass * wp.dot(n, (x.load_vel[k + 1, e] - x.load_vel[k, e]) / dt + GRAVITY * up)
 
-    g_f = period / mass * g_vel
+    g_f = dt / mass * g_vel
     g_u = wp.vec3(0.0, 0.0, 0.0)
     g_arm = wp.vec3(0.0, 0.0, 0.0)
     if pull > TAUT * GRAVITY * load_mass:
-        both = g_f - period / load_mass * g_load_vel
-        g_pull = wp.dot(n, both) * reduced
-        centrifugal = g_pull * tension[1] / length
-        g_n = pull * both + g_pull * (tension[2] / period * u - tension[0] / mass * f) - 2.0 * centrifugal * along * u
-        g_u = 2.0 * centrifugal * across + g_pull * tension[2] / period * n
-        g_f = g_f - g_pull * tension[0] / mass * n
-        g_arm = (g_n - wp.dot(n, g_n) * n - centrifugal * wp.dot(across, across) * n) / length
-    g_z = 0.5 * force[0] * thrust * g_f
-    g_thrust = 0.5 * force[0] * wp.dot(z, g_f)
+        both = g_f - dt / load_mass * g_load_vel
+        g_pull = wp.dot(n, both) * mass * load_mass / (mass + load_mass)
+        swing = g_pull * p.tension[1] / length
+        g_n = pull * both + g_pull * (p.tension[2] / dt * u - p.tension[0] / mass * f) - 2.0 * swing * along * u
+        g_u = 2.0 * swing * across + g_pull * p.tension[2] / dt * n
+        g_f = g_f - g_pull * p.tension[0] / mass * n
+        g_arm = (g_n - wp.dot(n, g_n) * n - swing * wp.dot(across, across) * n) / length
 
+    g_z = 0.5 * thrust * g_f
     g_turn = g_turn + turned(rot_next, up, g_z)
     rates = x.response[k, e] + x.response[k + 1, e]
     phi = half * wp.vec3(rates[1], rates[2], rates[3])
-    g_phi = g_turn + 0.5 * wp.cross(phi, g_turn) + wp.cross(phi, wp.cross(phi, g_turn)) / 6.0
-    g_rate = half * g_phi
-    g_same = wp.vec4(g_thrust, g_rate[0], g_rate[1], g_rate[2])
-    g_response = g_response + g_same
-    adj.response[k, e] = adj.response[k, e] + g_same + wp.cw_mul(response[0], g_response)
+    g_rate = half * (g_turn + 0.5 * wp.cross(phi, g_turn) + wp.cross(phi, wp.cross(phi, g_turn)) / 6.0)
+    g_mean = wp.vec4(0.5 * p.force[0] * wp.dot(z, g_f), g_rate[0], g_rate[1], g_rate[2])
+    g_response = g_response + g_mean
+    adj.response[k, e] += g_mean + wp.cw_mul(p.response[0], g_response)
     if k > 0:
-        adj.response[k - 1, e] = adj.response[k - 1, e] + wp.cw_mul(response[1], g_response)
-    for j in range(response.shape[0] - 2):
+        adj.response[k - 1, e] += wp.cw_mul(p.response[1], g_response)
+    for j in range(p.response.shape[0] - 2):
         if k >= j:
-            adj.command[k - j, e] = adj.command[k - j, e] + wp.cw_mul(response[2 + j], g_response)
-
+            adj.command[k - j, e] += wp.cw_mul(p.response[2 + j], g_response)
+    adj.pos[k, e] += g_pos - g_arm
+    adj.load_pos[k, e] += g_load + g_arm
     g_drag = wp.quat_rotate(rot, wp.cw_mul(drag, wp.quat_rotate_inv(rot, g_f)))
-    adj.pos[k, e] = adj.pos[k, e] + g_pos - g_arm
-    adj.load_pos[k, e] = adj.load_pos[k, e] + g_load + g_arm
-    adj.vel[k, e] = adj.vel[k, e] + g_vel + half * g_pos - half * g_arm - g_u - g_drag
-    adj.load_vel[k, e] = adj.load_vel[k, e] + g_load_vel + half * g_load + half * g_arm + g_u
+    adj.vel[k, e] += g_vel + half * (g_pos - g_arm) - g_u - g_drag
+    adj.load_vel[k, e] += g_load_vel + half * (g_load + g_arm) + g_u
     before = wp.quat_rotate_inv(rot, wp.quat_rotate(rot_next, g_turn))
-    adj.turn[k, e] = adj.turn[k, e] + before + turned(rot, up, g_z) - turned(rot, mount, g_arm)
+    adj.turn[k, e] += before + turned(rot, up, g_z) - turned(rot, mount, g_arm)
 
 
 @lru_cache
 def build_backward(layout: ob.Layout) -> wp.Kernel:
-    """Backward pass of whole flights whose actor sees a layout; arguments at :func:`backward`."""
-    vision, history = layout.name == "vision", layout.history
-    goal_at, load_at, width = ob.VEHICLE + 5, ob.VEHICLE + 5 + layout.goal, layout.payload
+    """Backward pass of whole flights whose actor sees a layout, a thread a flight."""
+    vision, history, width = layout.name == "vision", layout.history, layout.payload
+    previous_at, goal_at, load_at = ob.VEHICLE, ob.VEHICLE + 5, ob.VEHICLE + 5 + layout.goal
 
     @wp.func
-    def at(jacobian: wp.array4d(dtype=float), g: VEC5, k: int, e: int, i: int):
+    def by(s: Seen, g: VEC5, k: int, e: int, i: int):
         """Derivative by entry i of observation k."""
-        total = float(0.0)
-        for j in range(5):
-            total += g[j] * jacobian[k, e, j, i]
+        total = g[0] * s.network[k, e, 0, i]
+        for j in range(1, 5):
+            total += g[j] * s.network[k, e, j, i]
         return total
 
     @wp.func
-    def three(jacobian: wp.array4d(dtype=float), g: VEC5, k: int, e: int, i: int):
-        return wp.vec3(at(jacobian, g, k, e, i), at(jacobian, g, k, e, i + 1), at(jacobian, g, k, e, i + 2))
+    def by_three(s: Seen, g: VEC5, k: int, e: int, i: int):
+        return wp.vec3(by(s, g, k, e, i), by(s, g, k, e, i + 1), by(s, g, k, e, i + 2))
 
     @wp.func
-    def point_back(adj: Course, x: Course, i: int, e: int, share: float, point_w: wp.vec3, g_b: wp.vec3):
-        """Derivatives by the pose that a point is seen from, of what has the derivative g_b by the point in the body frame."""
-        quat = x.quat[i, e]
-        adj.pos[i, e] = adj.pos[i, e] - share * wp.quat_rotate(quat, g_b)
-        point_b = wp.quat_rotate_inv(quat, point_w - x.pos[i, e])
-        adj.turn[i, e] = adj.turn[i, e] + share * wp.cross(g_b, point_b)
+    def point_back(x: Course, adj: Course, i: int, e: int, point_w: wp.vec3, g_b: wp.vec3):
+        """From the derivative by a point in the body frame to those by the pose that it is seen from."""
+        adj.pos[i, e] -= wp.quat_rotate(x.quat[i, e], g_b)
+        adj.turn[i, e] += wp.cross(g_b, wp.quat_rotate_inv(x.quat[i, e], point_w - x.pos[i, e]))
 
     @wp.func
-    def seen_back(
-        adj: Course,
-        x: Course,
-        jacobian: wp.array4d(dtype=float),
-        lens: wp.array3d(dtype=wp.vec3),
-        corners: wp.array(dtype=wp.vec3),
-        goal: wp.vec3,
-        g: VEC5,
-        k: int,
-        i: int,
-        e: int,
-        share: float,
-    ):
-        """Add to the derivatives by state i what those by observation k make of them; ``share``: of state i in what is seen."""
-        quat = x.quat[i, e]
-        adj.pos[i, e] = adj.pos[i, e] + share * three(jacobian, g, k, e, 0)
-        adj.vel[i, e] = adj.vel[i, e] + share * three(jacobian, g, k, e, 3)
-        rate = three(jacobian, g, k, e, 6)
-        adj.response[i, e] = adj.response[i, e] + share * wp.vec4(0.0, rate[0], rate[1], rate[2])
-        turn = turned(quat, wp.vec3(1.0, 0.0, 0.0), three(jacobian, g, k, e, 9))
-        turn = turn + turned(quat, wp.vec3(0.0, 1.0, 0.0), three(jacobian, g, k, e, 12))
-        adj.turn[i, e] = adj.turn[i, e] + share * turn
+    def vehicle_back(s: Seen, x: Course, adj: Course, g: VEC5, k: int, i: int, e: int, share: float):
+        """From observation k to state i, of which ``share`` is in it: the vehicle and the goal."""
+        adj.pos[i, e] += share * by_three(s, g, k, e, 0)
+        adj.vel[i, e] += share * by_three(s, g, k, e, 3)
+        rate = share * by_three(s, g, k, e, 6)
+        adj.response[i, e] += wp.vec4(0.0, rate[0], rate[1], rate[2])
+        x_axis = turned(x.quat[i, e], wp.vec3(1.0, 0.0, 0.0), by_three(s, g, k, e, 9))
+        adj.turn[i, e] += share * (x_axis + turned(x.quat[i, e], wp.vec3(0.0, 1.0, 0.0), by_three(s, g, k, e, 12)))
         if wp.static(vision):
             for j in range(4):
-                g_b = at(jacobian, g, k, e, goal_at + 2 * j) * lens[k, e, 2 * j]
-                g_b = g_b + at(jacobian, g, k, e, goal_at + 2 * j + 1) * lens[k, e, 2 * j + 1]
-                point_back(adj, x, i, e, share, goal + corners[j], g_b)
+                at = goal_at + 2 * j
+                g_b = by(s, g, k, e, at) * s.lens[k, e, 2 * j] + by(s, g, k, e, at + 1) * s.lens[k, e, 2 * j + 1]
+                point_back(x, adj, i, e, s.goal[e] + s.corners[j], share * g_b)
         else:
-            offset = wp.vec3(at(jacobian, g, k, e, goal_at), at(jacobian, g, k, e, goal_at + 1), 0.0)
-            adj.load_pos[i, e] = adj.load_pos[i, e] - share * offset
+            adj.load_pos[i, e] -= share * wp.vec3(by(s, g, k, e, goal_at), by(s, g, k, e, goal_at + 1), 0.0)
 
     @wp.func
-    def load_back(
-        adj: Course,
-        x: Course,
-        jacobian: wp.array4d(dtype=float),
-        lens: wp.array3d(dtype=wp.vec3),
-        g: VEC5,
-        k: int,
-        age: int,
-        then: int,
-        i: int,
-        e: int,
-        share: float,
-    ):
-        """The same of the payload as it was seen ``age`` steps before observation k, in observation ``then``."""
+    def load_back(s: Seen, x: Course, adj: Course, g: VEC5, k: int, age: int, i: int, e: int, share: float):
+        """From observation k to state i: the payload as it was ``age`` observations ago."""
+        at = load_at + width * age
         if wp.static(vision):
             g_b = wp.vec3(0.0, 0.0, 0.0)
             for j in range(8):
-                g_b = g_b + at(jacobian, g, k, e, load_at + width * age + j) * lens[then, e, 8 + j]
-            point_back(adj, x, i, e, share, x.load_pos[i, e], g_b)
-            adj.load_pos[i, e] = adj.load_pos[i, e] + share * wp.quat_rotate(x.quat[i, e], g_b)
+                g_b += share * by(s, g, k, e, at + j) * s.lens[wp.max(k - age, 0), e, 8 + j]
+            point_back(x, adj, i, e, x.load_pos[i, e], g_b)
+            adj.load_pos[i, e] += wp.quat_rotate(x.quat[i, e], g_b)
         else:
-            offset = share * three(jacobian, g, k, e, load_at + width * age)
-            adj.load_pos[i, e] = adj.load_pos[i, e] + offset
-            adj.pos[i, e] = adj.pos[i, e] - offset
+            offset = share * by_three(s, g, k, e, at)
+            adj.load_pos[i, e] += offset
+            adj.pos[i, e] -= offset
 
     @wp.kernel(module="unique", enable_backward=False)
     def backward_kernel(
         # Params:
-        response: wp.array(dtype=wp.vec4),
-        force: wp.array(dtype=float),
-        tension: wp.array(dtype=float),
-        mass: wp.array(dtype=float),
-        load_mass: wp.array(dtype=float),
-        mount: wp.array(dtype=wp.vec3),
-        corners: wp.array(dtype=wp.vec3),
-        max_thrust: float,
-        max_rate: wp.vec3,
-        period: float,
-        decay: float,
+        p: Model,
         # State in:
         adj: Course,
         # In:
         x: Course,
+        s: Seen,
         steps: wp.array(dtype=wp.int32),
-        age: wp.array(dtype=float),
-        goal: wp.array(dtype=wp.vec3),
         action: wp.array3d(dtype=float),
-        jacobian: wp.array4d(dtype=float),
-        lens: wp.array3d(dtype=wp.vec3),
         # Out:
         by_clipped: wp.array3d(dtype=float),
         by_action: wp.array3d(dtype=float),
     ):
         e = wp.tid()
-        last = action.shape[0]
-        late = age[e] / period
-        for back in range(last):
-            k = last - 1 - back
+        late = s.age[e] / p.period
+        for back in range(action.shape[0]):
+            k = action.shape[0] - 1 - back
             if k <= steps[e]:
                 if k < steps[e]:
-                    step_back(response, force, tension, mass[e], load_mass[e], mount[e], period, decay, x, k, e, adj)
+                    step_back(p, x, adj, k, e)
+                throttle = wp.clamp(0.5 * (action[k, e, 0] + 1.0), SLACK_THROTTLE, 1.0)
+                scale = wp.vec4(p.max_thrust * throttle, p.max_rate[0], p.max_rate[1], p.max_rate[2])
+                command = wp.cw_mul(scale, adj.command[k, e])
                 g = VEC5()
-                c = adj.command[k, e]
-                throttle = wp.clamp(0.5 * (action[k, e, 0] + 1.0), 0.05, 1.0)
-                scale = wp.vec4(max_thrust * throttle, max_rate[0], max_rate[1], max_rate[2])
                 for j in range(5):
                     clipped = by_clipped[k, e, j]
                     if j < 4:
-                        clipped += c[j] * scale[j]
-                    a = action[k, e, j]
-                    if wp.abs(a) > 1.0 and clipped * a < 0.0:
-                        clipped = 0.0  # it is at its limit and would go further
+                        clipped += command[j]
+                    if wp.abs(action[k, e, j]) > 1.0:
+                        clipped = 0.0
                     g[j] = by_action[k, e, j] + clipped
                     by_action[k, e, j] = g[j]
+                before = wp.max(k - 1, 0)
                 if k > 0:
                     for j in range(5):
-                        by_clipped[k - 1, e, j] = by_clipped[k - 1, e, j] + at(jacobian, g, k, e, wp.static(ob.VEHICLE) + j)
-                before = wp.max(k - 1, 0)
-                seen_back(adj, x, jacobian, lens, corners, goal[e], g, k, k, e, 1.0 - late)
-                seen_back(adj, x, jacobian, lens, corners, goal[e], g, k, before, e, late)
-                for h in range(history + 1):
-                    then = wp.max(k - h, 0)
-                    load_back(adj, x, jacobian, lens, g, k, h, then, then, e, 1.0 - late)
-                    load_back(adj, x, jacobian, lens, g, k, h, then, wp.max(then - 1, 0), e, late)
+                        by_clipped[before, e, j] += by(s, g, k, e, previous_at + j)
+                vehicle_back(s, x, adj, g, k, k, e, 1.0 - late)
+                vehicle_back(s, x, adj, g, k, before, e, late)
+                for age in range(history + 1):
+                    load_back(s, x, adj, g, k, age, wp.max(k - age, 0), e, 1.0 - late)
+                    load_back(s, x, adj, g, k, age, wp.max(k - age - 1, 0), e, late)
 
     return backward_kernel

@@ -77,7 +77,8 @@ class Trainer:
     """One training run.
 
     Attributes:
-        env: the environment. alg: rsl_rl's PPO. iteration: iterations done.
+        env: the environment. alg: rsl_rl's PPO, whose actor first-order training trains too. iteration: iterations done.
+        first_order: where that is the algorithm; else None.
         seconds: wall time spent in rollouts and in learning since the start or the resume.
     """
 
@@ -107,7 +108,11 @@ class Trainer:
         self.alg.train_mode()
         if ranks:
             self.alg.broadcast_parameters()
-        self.first_order = FirstOrder(experiment, self.env, self.alg.actor) if experiment.algorithm == "first_order" else None
+        self.first_order: FirstOrder | None = None
+        if experiment.algorithm == "first_order":
+            if ranks:
+                raise ConfigError('algorithm = "first_order" trains on one device; run one process')
+            self.first_order = FirstOrder(experiment, self.env, self.alg.actor)
         self._obs = self.env.get_observations()
         self._graph = None
         self.iteration = 0
@@ -116,11 +121,7 @@ class Trainer:
     @property
     def samples_per_iteration(self) -> int:
         """Environment steps an iteration, over all ranks."""
-        return (
-            self.experiment.ppo.environments
-            * self.experiment.ppo.steps
-            * (self.ranks["world_size"] if self.ranks else 1)
-        )
+        return self.experiment.steps_per_iteration * (self.ranks["world_size"] if self.ranks else 1)
 
     def _rollout(self) -> None:
         obs = self._obs
@@ -135,7 +136,9 @@ class Trainer:
 
     def rollout(self) -> None:
         """Collect one batch: eagerly the first time (everything is allocated then), from a captured graph afterwards."""
-        if not self.device.startswith("cuda"):
+        if self.first_order:
+            self.first_order.rollout()
+        elif not self.device.startswith("cuda"):
             self._rollout()
         elif self._graph is not None:
             self._graph.replay()
@@ -157,7 +160,9 @@ class Trainer:
 
     def _learn(self) -> dict[str, float]:
         p = self.experiment.ppo
-        done = min(self.iteration / p.iterations, 1.0)
+        done = min(self.iteration / self.experiment.iterations, 1.0)
+        if self.first_order:
+            return self.first_order.learn(done)
         self.alg.desired_kl = (1.0 - done) * p.desired_kl + done * p.final_kl
         figures = self.alg.update()
         if (
@@ -181,19 +186,20 @@ class Trainer:
         self.seconds["rollout"] += middle - start
         self.seconds["learning"] += end - middle
         self.iteration += 1
+        times = {"iteration": self.iteration, "rollout_s": middle - start, "learning_s": end - middle}
+        return (self._thrown() if self.first_order is None else {}) | figures | times
+
+    def _thrown(self) -> dict[str, float]:
+        """Means of the episodes that PPO's rollout finished."""
         totals = self.env.totals
         released, episodes = max(totals["released"], 1.0), max(totals["episodes"], 1.0)
-        figures |= {
-            "iteration": self.iteration,
+        return {
             "released": totals["released"] / episodes,
             "landing_error": totals["landing_error"] / released,
             "duration": totals["duration"] / released,
             "episodes": totals["episodes"],
             "learning_rate": self.alg.learning_rate,
-            "rollout_s": middle - start,
-            "learning_s": end - middle,
         }
-        return figures
 
     def actor(self):
         """The deterministic policy: function of observations (E, D) -> actions (E, 5)."""
@@ -213,6 +219,7 @@ class Trainer:
         """Write a checkpoint that a resumed run goes on from as if it had not stopped; all or nothing."""
         content = {
             "algorithm": self.alg.save(),
+            "first_order": self.first_order.state_dict() if self.first_order else None,
             "iteration": self.iteration,
             "env": self.env.state_dict(),
             "seed": self.seed,
@@ -242,6 +249,8 @@ class Trainer:
                 f"{path}: written by a run of another configuration or seed; resume with the same ones"
             )
         self.alg.load(saved["algorithm"], None, True)
+        if self.first_order:
+            self.first_order.load_state_dict(saved["first_order"])
         self.iteration = saved["iteration"]
         rank = self.ranks["global_rank"] if self.ranks else 0
         if (
