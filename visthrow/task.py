@@ -141,15 +141,15 @@ class FirstOrderParams:
 
     iterations: int = 600
     horizon: int = 52
-    decay: float = 0.97
-    learning_rate: float = 2e-3
+    decay: float = 0.92
+    learning_rate: float = 3e-3
     final_rate: float = 1e-4
     max_grad_norm: float = 1.0
     width: float = 0.5
     final_width: float = 0.05
     sharp: float = 0.7
     first_release: int = 24
-    free: float = 0.15
+    free: tuple[float, float] = (0.2, 0.5)
     initial_release: float = -2.0
     saturation: float = 1.0
 

@@ -1,6 +1,7 @@
 """First-order training: its backward pass against torch's autograd of the same surrogate and against the simulator itself."""
 
 import dataclasses
+import itertools
 
 import pytest
 import torch
@@ -13,12 +14,17 @@ from visthrow.task import Experiment
 from visthrow.training.surrogate import TAUT
 from visthrow.training.trainer import Trainer
 
-SMALL = ['algorithm="first_order"', "ppo.environments=24", "ppo.hidden=[16,16]", "ppo.steps=8", "first_order.horizon=14", "first_order.initial_release=-0.3"]
+SMALL = ['algorithm="first_order"', "ppo.environments=24", "ppo.hidden=[16,16]", "ppo.steps=8", "first_order.horizon=14",
+         "first_order.initial_release=-0.3"]  # fmt: skip
 QUIET = ["task.noise.observation_step=0", "task.noise.observation_bias=0", "task.noise.command_step=0",
          "task.noise.command_bias=0", "camera.noise.step_std=0", "camera.noise.bias_std=0"]  # fmt: skip
 
 SECOND_ORDER = 0.01
 """A rotation's derivative is taken to second order in a step's turn, and the turn from the rates at its ends."""
+LEAST_COSINE, MOST_BIAS = 0.97, 0.15
+"""Between slopes of surrogate and simulator: what the fit leaves (a sixth of a step's change of the rates) lets them differ."""
+LEARNT = 0.5
+"""Landing error that the small task is brought under [m]; goals lie within 1 m, dropped payloads 0.65 m off on average."""
 
 
 @pytest.fixture(autouse=True)
@@ -119,8 +125,17 @@ def reference(fo, by):
         commands.append(action[:, :4] * scale)
         x = advance(fo, true, k, x, responses, commands)
         x = {name: slowed(value, fo.p.decay) for name, value in x.items()}
-        cost = cost + sum((x[name] * by[name][k + 1] * (k < true.steps)[:, None]).sum() for name in by)
+        cost = cost + sum((x[name] * by[name][k + 1]).sum() for name in by)
     return torch.autograd.grad(cost, extra)[0]
+
+
+def backward(fo, by):
+    """The same by the kernel."""
+    for name, tensor in fo.adjoint.tensors.items():
+        tensor.copy_(by[name]) if name in by else tensor.zero_()
+    found = torch.zeros_like(fo.buffers.action)
+    fo._backward(torch.zeros_like(found), found)
+    return found
 
 
 @pytest.mark.parametrize("name", ["state", "vision"])
@@ -132,68 +147,85 @@ def test_backward_pass_equals_autograd_of_the_same_surrogate(name):
     assert fo.buffers.action.abs().max() < 1.0
     torch.manual_seed(0)
     by = {n: torch.randn_like(getattr(fo.flights, n)) for n in ("pos", "vel", "load_pos", "load_vel", "response")}
-    for n, value in by.items():
-        getattr(fo.adjoint, n).copy_(value)
-    for n in ("turn", "command"):
-        getattr(fo.adjoint, n).zero_()
-    found, unused = torch.zeros_like(fo.buffers.action), torch.zeros_like(fo.buffers.action)
-    fo._backward(unused, found)
-    with torch.enable_grad():
-        expected = reference(fo, by)
+    found, expected = backward(fo, by), reference(fo, by)
     size = expected.square().mean(1).sqrt()
     off = (found - expected).square().mean(1).sqrt()
     assert (off[size > 0] / size[size > 0]).max() < SECOND_ORDER
 
 
-def test_slopes_are_those_of_the_simulator():
-    """Landing point of a release at the flight's end against commands at each earlier step, by differences of the simulator."""
-    fo = first_order("state", *QUIET, "task.start.tether_variants=1")
-    plan = fo.env._start_action + 0.25 * torch.randn(fo.p.horizon, 24, 5) * torch.tensor([0.4, 1.0, 1.0, 1.0, 0.0])
-    episode = fo.env.state_dict()["episode"].clone()
+SLOWER = ["vehicle.queue.delay=0.045", "vehicle.motor.time_constant=0.06", "rope.payload_mass=0.08", "rope.length=0.5"]
+
+
+@pytest.mark.parametrize("vehicle", [[], SLOWER], ids=["own", "slower"])
+def test_slopes_are_those_of_the_simulator(vehicle, monkeypatch):
+    """Where the payload lands against thrust, roll and pitch commands at earlier steps, by differences of the simulator.
+
+    Yaw moves the landing by a thirtieth of what the others do, which is less than what a surrogate leaves.
+    """
+    fo = first_order("state", *QUIET, *vehicle, "task.start.tether_variants=1")
+    torch.manual_seed(5)
+    plan = fo.env._start_action + torch.randn(fo.p.horizon, 24, 5) * torch.tensor([0.1, 0.25, 0.25, 0.25, 0.0])
+    start = fo.env.state_dict()
 
     def fly(actions):
-        """Landing points of flights under stated actions, from the same starts each time."""
-        fo.env.load_state_dict(fo.env.state_dict() | {"episode": episode})
-        fo.policy = lambda obs: actions[fly.step]
-        fly.step = -1
-        inner = fo.env.step
-        fo.env.step = lambda a, hold: inner(a, hold)
-
-        def policy(obs):
-            fly.step += 1
-            return actions[fly.step]
-
-        fo.policy = policy
+        fo.env.load_state_dict(start)
+        left = iter(actions)
+        monkeypatch.setattr(fo, "policy", lambda obs: next(left))
         fo.rollout()
-        fo.env.step = inner
         return fo.buffers.landing[-1].clone()
 
-    landing = fly(plan)
+    fly(plan)
     assert (fo.flights.steps == fo.p.horizon).all()
-    last, size = fo.p.horizon, 0.02
-    x = {n: getattr(fo.flights, n).clone().requires_grad_() for n in ("load_pos", "load_vel")}
+    x = {name: getattr(fo.flights, name).clone().requires_grad_() for name in ("load_pos", "load_vel")}
     up = x["load_vel"][-1, :, 2]
     time = (up + (up.square() + 2 * GRAVITY * (x["load_pos"][-1, :, 2] - fo.cfg.release.landing_height)).sqrt()) / GRAVITY
     point = x["load_pos"][-1, :, :2] + x["load_vel"][-1, :, :2] * time[:, None]
-    assert (point - landing).abs().max() < 1e-4
-    fo._jacobian = lambda: torch.zeros(last, 24, 5, fo.env.layout.dimension)
+    torch.testing.assert_close(point.detach(), fo.buffers.landing[-1], atol=1e-4, rtol=0)
+    monkeypatch.setattr(fo, "_jacobian", lambda: torch.zeros(*plan.shape, fo.env.layout.dimension))
     fo.p = dataclasses.replace(fo.p, decay=1.0)
+    found = []
     for axis in range(2):
-        for n, value in zip(x, torch.autograd.grad(point[:, axis].sum(), list(x.values()), retain_graph=True)):
-            getattr(fo.adjoint, n).copy_(value)
-        for n in ("pos", "vel", "turn", "response", "command"):
-            getattr(fo.adjoint, n).zero_()
-        found, unused = torch.zeros_like(plan), torch.zeros_like(plan)
-        fly(plan)
-        fo._backward(unused, found)
-        for channel in range(4):
-            kept = []
-            for k in range(0, last - 3):
-                step = torch.zeros_like(plan)
-                step[k, :, channel] = size
-                slope = (fly(plan + step) - fly(plan - step))[:, axis] / (2 * size)
-                kept.append(torch.stack([found[k, :, channel], slope]))
-            pair = torch.stack(kept)  # (k, 2, E)
-            a, c = pair[:, 0].flatten(), pair[:, 1].flatten()
-            print(axis, channel, "cos", float((a @ c) / (a.norm() * c.norm())), "ratio", float((a @ c) / (c @ c)), "size", float(c.square().mean().sqrt()))
-            print("  per k", [round(float((p[0] @ p[1]) / (p[0].norm() * p[1].norm() + 1e-9)), 3) for p in pair])
+        by = dict(zip(x, torch.autograd.grad(point[:, axis].sum(), list(x.values()), retain_graph=True), strict=True))
+        found.append(backward(fo, by))
+    size = 0.02  # normalised; float32 resolves the landing to 1e-5 of the 2e-3 m that this makes
+    for axis in range(2):
+        pairs = []
+        for k, channel in itertools.product((0, 4, 8), range(3)):
+            step = torch.zeros_like(plan)
+            step[k, :, channel] = size
+            slope = (fly(plan + step) - fly(plan - step))[:, axis] / (2 * size)
+            pairs.append(torch.stack([found[axis][k, :, channel], slope]))
+        surrogate, simulator = torch.cat(pairs, dim=1)
+        assert surrogate @ simulator / (surrogate.norm() * simulator.norm()) > LEAST_COSINE
+        assert surrogate @ simulator / simulator.square().sum() == pytest.approx(1.0, abs=MOST_BIAS)
+
+
+def small_task():
+    """A gentle task that a small network makes headway in within seconds: one start, near goals, no early release."""
+    words = [f"task.start.{name}=[0,0,0]" for name in ("position", "velocity", "attitude_deg", "rate_deg")]
+    words += [f"task.start.{name}=0" for name in ("mass", "cable_angle_deg", "cable_rate_deg")]
+    words += ["task.start.goal_radius=1.0", "ppo.environments=32", "ppo.hidden=[32,32]", "ppo.minibatches=1"]
+    words += [f"first_order.{word}" for word in ("horizon=40", "iterations=60", "learning_rate=4e-3", "initial_release=-0.5",
+                                                 "final_width=0.1", "first_release=20", "free=[2.0,3.0]")]  # fmt: skip
+    return config.load(Experiment, config.find("train", "state"), ['algorithm="first_order"', *words])
+
+
+def thrown(turn):
+    """Share released and mean landing error over the last of 40 iterations; ``turn`` alters the surrogate."""
+    trainer = Trainer(small_task(), "cpu", 1)
+    turn(trainer.first_order.surrogate)
+    figures = [trainer.step() for _ in range(40)][-5:]
+    return tuple(sum(row[name] for row in figures) / len(figures) for name in ("released", "landing_error"))
+
+
+def learnt(released, error):
+    return released > 0.9 and error < LEARNT
+
+
+def test_it_learns():
+    assert learnt(*thrown(lambda surrogate: None))
+
+
+def test_with_a_sign_turned_it_does_not_learn():
+    """What the test above asserts does not hold where the commands' effect has the wrong sign."""
+    assert not learnt(*thrown(lambda surrogate: surrogate.response[2:].neg_()))

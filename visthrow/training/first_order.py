@@ -309,7 +309,8 @@ class FirstOrder:
         """One step of Adam along the gradient of the last rollout. done: share of the training that is over."""
         p = self.p
         self._width.fill_(p.width * (p.final_width / p.width) ** min(done / p.sharp, 1.0))
-        self._first.fill_(p.first_release * max(1.0 - done / p.free, 0.0))
+        start, end = p.free
+        self._first.fill_(p.first_release * min(max((end - done) / (end - start), 0.0), 1.0))
         rate = p.final_rate + 0.5 * (p.learning_rate - p.final_rate) * (1.0 + math.cos(math.pi * min(done, 1.0)))
         for group in self.optimizer.param_groups:
             group["lr"] = group["lr"].fill_(rate) if isinstance(group["lr"], Tensor) else rate
