@@ -79,6 +79,7 @@ class HybridSim:
         release: shape (E,), int: non-zero asks for the release; the latch keeps it.
         state: arrays of :data:`sim.arrays.state.STATE_FIELDS`.
         out: arrays of :data:`sim.arrays.state.OUTPUT_FIELDS`.
+        vehicles: parameters of environment e at ``e % len(vehicles)``.
         goal_w: [m], shape (E,) of vec3: goals that :meth:`randomize` draws.
     """
 
@@ -131,7 +132,7 @@ class HybridSim:
             raise ValueError(
                 f"ropes of {sorted({r.segments for r in ropes})} segments in one batch of {params.rope.segments}"
             )
-        self.params, self.count, self.device, self.seed = params, count, device, seed
+        self.params, self.count, self.device, self.seed, self.vehicles = params, count, device, seed, vehicles
         self.gravity = gravity
         self.extensions = extensions_of(vehicles, ropes, airs, releases, params.laws) | extensions
         self.types, self._step, self._reset = _kernels(params, direct, self.extensions)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -65,7 +66,7 @@ def exponential(vector):
 def advance(fo, true, k, x, response, commands):
     """The surrogate's step in torch, from state ``x`` to the dictionary of state k + 1, before the decay."""
     s, dt, pl = fo.surrogate, fo.cfg.sim.control_period, fo.plants
-    M, m = fo.buffers.mass[:, None], pl.load_mass[:, None]
+    M, m = fo.flights.mass[:, None], pl.load_mass[:, None]
     y = s.response[0] * response[k] + (s.response[1] * response[k - 1] if k else 0.0)
     y = y + sum(s.response[2 + j] * commands[k - j] for j in range(len(s.response) - 2) if k >= j)
     y = at(true.response[k + 1], y)
@@ -83,8 +84,8 @@ def advance(fo, true, k, x, response, commands):
     length = arm.norm(dim=-1, keepdim=True)
     n = arm / length
     dot = lambda a, b: (a * b).sum(-1, keepdim=True)  # noqa: E731
-    a, b, c = s.tension
-    pull = M * m / (M + m) * (-a * dot(n, f) / M + b * (dot(u, u) - dot(n, u) ** 2) / length + c * dot(n, u) / dt)
+    a, b = s.tension
+    pull = M * m / (M + m) * (-a * dot(n, f) / M + b * (dot(u, u) - dot(n, u) ** 2) / length)
     g = torch.tensor([0.0, 0.0, GRAVITY])
     measured = -dot(n, m * ((true.load_vel[k + 1] - true.load_vel[k]) / dt + g)).detach()
     pull = torch.where(measured > TAUT * GRAVITY * m, at(measured, pull), 0.0)
@@ -97,12 +98,12 @@ def advance(fo, true, k, x, response, commands):
 
 def reference(fo, by):
     """Derivatives by the actions of ``sum_k <by[k], state k>`` through the closed loop, by torch's autograd."""
-    true, b, layout = fo.flights, fo.buffers, fo.env.layout
+    true, b, layout = SimpleNamespace(**fo.flights.x), fo, fo.env.layout
     extra = torch.zeros_like(b.action, requires_grad=True)
     rots, late = ob.rotation_from_quat(true.quat), (b.age / fo.cfg.sim.control_period)[:, None]
     x = {name: getattr(true, name)[0].clone() for name in ("pos", "vel", "load_pos", "load_vel", "response")} | {"rot": rots[0]}
     poses, responses, commands, cost = [], [], [], 0.0
-    previous, history, valid = b.previous, torch.zeros(24, 1 + layout.history, layout.payload), torch.zeros(24, 8)
+    previous, history, valid = fo.env._start_action.expand(24, -1), torch.zeros(24, 1 + layout.history, layout.payload), torch.zeros(24, 8)
     for k in range(fo.p.horizon):
         responses.append(x["response"])
         pose = torch.cat([ob.vehicle_part(x["pos"], x["vel"], x["response"][:, 1:], x["rot"]), x["load_pos"]], -1)
@@ -131,9 +132,9 @@ def reference(fo, by):
 
 def backward(fo, by):
     """The same by the kernel."""
-    for name, tensor in fo.adjoint.tensors.items():
+    for name, tensor in fo.adjoint.x.items():
         tensor.copy_(by[name]) if name in by else tensor.zero_()
-    found = torch.zeros_like(fo.buffers.action)
+    found = torch.zeros_like(fo.action)
     fo._backward(torch.zeros_like(found), found)
     return found
 
@@ -144,9 +145,9 @@ def test_backward_pass_equals_autograd_of_the_same_surrogate(name):
     fo = first_order(name)
     fo.rollout()
     assert (fo.flights.steps == fo.p.horizon).all()
-    assert fo.buffers.action.abs().max() < 1.0
+    assert fo.action.abs().max() < 1.0
     torch.manual_seed(0)
-    by = {n: torch.randn_like(getattr(fo.flights, n)) for n in ("pos", "vel", "load_pos", "load_vel", "response")}
+    by = {n: torch.randn_like(fo.flights.x[n]) for n in ("pos", "vel", "load_pos", "load_vel", "response")}
     found, expected = backward(fo, by), reference(fo, by)
     size = expected.square().mean(1).sqrt()
     off = (found - expected).square().mean(1).sqrt()
@@ -172,15 +173,15 @@ def test_slopes_are_those_of_the_simulator(vehicle, monkeypatch):
         left = iter(actions)
         monkeypatch.setattr(fo, "policy", lambda obs: next(left))
         fo.rollout()
-        return fo.buffers.landing[-1].clone()
+        return fo.landing[-1].clone()
 
     fly(plan)
     assert (fo.flights.steps == fo.p.horizon).all()
-    x = {name: getattr(fo.flights, name).clone().requires_grad_() for name in ("load_pos", "load_vel")}
+    x = {name: fo.flights.x[name].clone().requires_grad_() for name in ("load_pos", "load_vel")}
     up = x["load_vel"][-1, :, 2]
     time = (up + (up.square() + 2 * GRAVITY * (x["load_pos"][-1, :, 2] - fo.cfg.release.landing_height)).sqrt()) / GRAVITY
     point = x["load_pos"][-1, :, :2] + x["load_vel"][-1, :, :2] * time[:, None]
-    torch.testing.assert_close(point.detach(), fo.buffers.landing[-1], atol=1e-4, rtol=0)
+    torch.testing.assert_close(point.detach(), fo.landing[-1], atol=1e-4, rtol=0)
     monkeypatch.setattr(fo, "_jacobian", lambda: torch.zeros(*plan.shape, fo.env.layout.dimension))
     fo.p = dataclasses.replace(fo.p, decay=1.0)
     found = []

@@ -89,22 +89,15 @@ class FirstOrder:
         self.releases = T - self.lag - 1
         if self.releases < 1:
             raise ConfigError(f"first_order.horizon is {T} steps; expected at least {self.lag + 2} for a release to end in")
-        self.plants = Plants(env)
-        with torch.no_grad():
-            watch = actor.obs_normalizer.update if actor.obs_normalization else lambda obs: None
-            self.surrogate = fit(env, self.plants, watch)  # random commands give every observation a spread to start from
+        self.plants = Plants.of(env)
+        with torch.no_grad():  # random commands give every observation a spread to start from
+            self.surrogate = fit(env, self.plants, actor.obs_normalizer.update if actor.obs_normalization else lambda obs: None)
         self.flights, self.adjoint = Flights(T, E, device), Flights(T, E, device)
         make = {"device": device, "dtype": torch.float32}
-        self.buffers = SimpleNamespace(
-            obs=torch.zeros(T, E, env.layout.dimension, **make),
-            action=torch.zeros(T, E, act.ACTIONS, **make),
-            landing=torch.zeros(T + 1, E, 2, **make),
-            time=torch.zeros(T + 1, E, **make),
-            age=torch.zeros(E, **make),
-            goal=torch.zeros(E, 3, **make),
-            mass=torch.zeros(E, **make),
-            previous=torch.zeros(E, act.ACTIONS, **make),
-        )
+        self.obs = torch.zeros(T, E, env.layout.dimension, **make)
+        self.action = torch.zeros(T, E, act.ACTIONS, **make)
+        self.landing, self.time = torch.zeros(T + 1, E, 2, **make), torch.zeros(T + 1, E, **make)
+        self.age, self.goal = torch.zeros(E, **make), torch.zeros(E, 3, **make)
         nodes = (-1.0, 0.0, 1.0, 2.0)  # of the cubic through the steps about the separation
         shares = [math.prod((rest - b) / (a - b) for b in nodes if b != a) for a in nodes]
         k = torch.arange(self.releases, device=device)
@@ -133,44 +126,37 @@ class FirstOrder:
     @torch.no_grad()
     def _fly(self) -> None:
         """Fly one batch without release."""
-        env, f, b = self.env, self.flights, self.buffers
-        env.reset()
-        b.goal.copy_(env.views.goal_w)
-        b.mass.copy_(self.plants.mass(env))
-        b.age.copy_(env.pose_age)
-        b.previous.copy_(env.previous_action)
-        f.steps.zero_()
-        alive = torch.ones_like(f.steps)
-        self._record(0)
-        for k in range(self.p.horizon):
-            b.obs[k].copy_(env._observations["actor"])
-            b.action[k].copy_(self.policy(b.obs[k]))
-            _, _, done, _ = env.step(b.action[k], hold=True)
-            alive = alive * (done == 0)
-            f.steps += alive
-            self._record(k + 1)
+        env = self.env
 
-    def _record(self, k: int) -> None:
-        env, b = self.env, self.buffers
-        self.flights.record(k, env, self.plants.thrust_factor)
-        with on_torch_stream(env.device):
-            env.sim.foresee()
-        b.landing[k].copy_(env.views.foreseen["landing_w"][:, :2])
-        b.time[k].copy_(env.views.foreseen["time_to_impact"])
+        def decide(k: int, seen: Tensor) -> Tensor:
+            self.obs[k].copy_(seen)
+            self.action[k].copy_(self.policy(seen))
+            return self.action[k]
+
+        def foresee(k: int) -> None:
+            if k == 0:
+                self.goal.copy_(env.views.goal_w)
+                self.age.copy_(env.pose_age)
+            with on_torch_stream(env.device):
+                env.sim.foresee()
+            self.landing[k].copy_(env.views.foreseen["landing_w"][:, :2])
+            self.time[k].copy_(env.views.foreseen["time_to_impact"])
+
+        self.flights.fly(env, self.plants, decide, foresee)
 
     def _rewards_at_release(self, x: SimpleNamespace) -> tuple[Tensor, Tensor, Tensor]:
         """Reward, landing error [m] and time to impact [s] of a release at each step, shape (releases, E)."""
-        p, release, b = self.cfg.task.reward, self.cfg.release, self.buffers
+        p, release = self.cfg.task.reward, self.cfg.release
         up = x.load_vel[..., 2]
         time = (up + (up.square() + 2.0 * GRAVITY * (x.load_pos[..., 2] - release.landing_height)).clamp(min=1e-6).sqrt()) / GRAVITY
         landing = x.load_pos[..., :2] + x.load_vel[..., :2] * time[..., None]
-        landing = landing + (b.landing - landing).detach()  # the simulator's own value, the slope of flight without drag
-        time = time + (b.time - time).detach()
+        landing = landing + (self.landing - landing).detach()  # the simulator's own value, the slope of flight without drag
+        time = time + (self.time - time).detach()
         share = torch.linspace(0.0, 1.0, release.clearance_samples, device=time.device) * time[..., None]
         path = (x.load_pos - x.pos)[:, :, None] + share[..., None] * x.load_vel[:, :, None] - share[..., None] ** 2 * self._fall
         clearance = (path.square().sum(-1) + 1e-12).sqrt().amin(-1)
         landing, time, clearance = (sum(w * value[i] for w, i in self._separation) for value in (landing, time, clearance))
-        error = ((landing - b.goal[:, :2]).square().sum(-1) + 1e-8).sqrt()
+        error = ((landing - self.goal[:, :2]).square().sum(-1) + 1e-8).sqrt()
         reward = rewards.landing(p, error) + rewards.time_of_flight(p, time)
         return reward + rewards.proximity(p, clearance, release.clearance_margin), error, time
 
@@ -179,7 +165,7 @@ class FirstOrder:
         task, env = self.cfg.task, self.env
         p, bounds = task.reward, task.bounds
         rate, height, load = x.response[1:, :, 1:], x.pos[1:, :, 2], x.load_pos[1:, :, 2]
-        before = torch.cat([self.buffers.previous[None], x.clipped[:-1]])
+        before = torch.cat([env._start_action.expand_as(x.clipped[:1]), x.clipped[:-1]])
         now, before = x.clipped.flatten(0, 1), before.flatten(0, 1)
         on_action = rewards.command(p, now, env._rate_weights) + rewards.change(p, now, before, env._change_weights)
         inside = [
@@ -217,23 +203,20 @@ class FirstOrder:
 
     def derivatives(self) -> tuple[Tensor, dict[str, Tensor]]:
         """Derivatives of the cost of the last rollout by the actions, shape (T, E, 5), and figures."""
-        f, b, adjoint = self.flights, self.buffers, self.adjoint
-        quat = f.quat
-        tilt = ob.rotation_from_quat(quat)[..., 2, :]  # world z in the body frame
-        x = SimpleNamespace(**{name: getattr(f, name).clone() for name in ("pos", "vel", "load_pos", "load_vel", "response")})
-        x.upright, x.action, x.clipped = tilt[..., 2].clone(), b.action.clone(), act.clip_action(b.action)
+        f, adjoint, states = self.flights.x, self.adjoint.x, ("pos", "vel", "load_pos", "load_vel", "response")
+        tilt = ob.rotation_from_quat(f["quat"])[..., 2, :]  # world z in the body frame
+        x = SimpleNamespace(**{name: f[name].clone() for name in states})
+        x.upright, x.action, x.clipped = tilt[..., 2].clone(), self.action.clone(), act.clip_action(self.action)
         leaves = vars(x)
         for leaf in leaves.values():
             leaf.requires_grad_()
         with torch.enable_grad():
             cost, figures = self._cost(x)
-        by = dict(zip(leaves, torch.autograd.grad(cost, list(leaves.values()), allow_unused=True), strict=True))
-        for name in ("pos", "vel", "load_pos", "load_vel", "response"):
-            getattr(adjoint, name).copy_(by[name])
-        up = torch.zeros_like(tilt)
-        up[..., 2] = 1.0
-        adjoint.turn.copy_(torch.linalg.cross(up, tilt) * by["upright"][..., None])
-        adjoint.command.zero_()
+        by = dict(zip(leaves, torch.autograd.grad(cost, list(leaves.values())), strict=True))
+        for name in states:
+            adjoint[name].copy_(by[name])
+        adjoint["turn"].copy_(torch.stack([-tilt[..., 1], tilt[..., 0], torch.zeros_like(tilt[..., 0])], -1) * by["upright"][..., None])
+        adjoint["command"].zero_()
         by_clipped, by_action = by["clipped"].contiguous(), by["action"].contiguous()
         self._backward(by_clipped, by_action)
         return by_action, figures | {"cost": cost.detach()}
@@ -243,10 +226,10 @@ class FirstOrder:
         env, seen = self.env, Seen()
         lens = self._lens() if env.layout.name == "vision" else torch.zeros(1, 1, 1, 3, device=env.device)
         network = self._jacobian()
-        seen.age, seen.network = wp.from_torch(self.buffers.age), wp.from_torch(network)
-        for name, tensor in (("goal", self.buffers.goal), ("corners", env.camera.square_w), ("lens", lens)):
+        seen.age, seen.network = wp.from_torch(self.age), wp.from_torch(network)
+        for name, tensor in (("goal", self.goal), ("corners", env.camera.square_w), ("lens", lens)):
             setattr(seen, name, wp.from_torch(tensor.contiguous(), dtype=wp.vec3))
-        arrays = [wp.from_torch(tensor) for tensor in (self.flights.steps, self.buffers.action, by_clipped, by_action)]
+        arrays = [wp.from_torch(tensor) for tensor in (self.flights.steps, self.action, by_clipped, by_action)]
         inputs = [self._model(), self.adjoint.course, self.flights.course, seen, *arrays]
         with on_torch_stream(env.device):
             wp.launch(build_backward(env.layout), env.num_envs, inputs, device=env.device, block_dim=64)
@@ -256,14 +239,14 @@ class FirstOrder:
         model, s, action = Model(), self.surrogate, self.cfg.task.action
         model.response, model.mount = wp.from_torch(s.response, dtype=wp.vec4), wp.from_torch(self.plants.mount, dtype=wp.vec3)
         model.force, model.tension = wp.from_torch(s.force), wp.from_torch(s.tension)
-        model.mass, model.load_mass = wp.from_torch(self.buffers.mass), wp.from_torch(self.plants.load_mass)
+        model.mass, model.load_mass = wp.from_torch(self.flights.mass), wp.from_torch(self.plants.load_mass)
         model.max_thrust, model.max_rate = action.max_thrust, wp.vec3(*action.max_rate)
         model.period, model.decay = self.cfg.sim.control_period, self.p.decay
         return model
 
     def _jacobian(self) -> Tensor:
         """Derivatives of the network's actions by the observations of the last rollout, shape (T, E, 5, D)."""
-        x, slopes, layers = self.actor.obs_normalizer(self.buffers.obs.flatten(0, 1)), [], list(self.actor.mlp)
+        x, slopes, layers = self.actor.obs_normalizer(self.obs.flatten(0, 1)), [], list(self.actor.mlp)
         for layer in layers:
             if isinstance(layer, torch.nn.Linear):
                 x = layer(x).detach().requires_grad_()
@@ -286,14 +269,14 @@ class FirstOrder:
 
         To move the camera by -e is to move every point by e, so three directions give them all.
         """
-        env, f, T = self.env, self.flights, self.p.horizon
-        late = (self.buffers.age / self.cfg.sim.control_period)[:, None]
-        rot = ob.rotation_from_quat(f.quat)
-        pose = torch.cat([f.pos, rot[..., 0], rot[..., 1], f.load_pos], -1)[:T]
+        env, f, T = self.env, self.flights.x, self.p.horizon
+        late = (self.age / self.cfg.sim.control_period)[:, None]
+        rot = ob.rotation_from_quat(f["quat"])
+        pose = torch.cat([f["pos"], rot[..., 0], rot[..., 1], f["load_pos"]], -1)[:T]
         pose = torch.lerp(pose, torch.cat([pose[:1], pose[:-1]]), late).flatten(0, 1)
         pos, x_axis, y_axis, load = pose.split(3, -1)
         rot = torch.stack([x_axis, y_axis, torch.linalg.cross(x_axis, y_axis)], -1)
-        goal = self.buffers.goal.repeat(T, 1)
+        goal = self.goal.repeat(T, 1)
         extrinsics = env.extrinsics()
         if extrinsics is not None:
             extrinsics = tuple(part.repeat(T, *(1,) * (part.dim() - 1)) for part in extrinsics)
@@ -324,7 +307,7 @@ class FirstOrder:
         by_action = by_action * flown[..., None]
         size = by_action.square().sum((0, 2)).sqrt()  # a few wild flights must not outweigh the rest
         by_action = by_action * (OUTLIER * size.median() / size.clamp(min=1e-12)).clamp(max=1.0)[:, None]
-        seen, parameters = self.buffers.obs.flatten(0, 1), list(self.actor.mlp.parameters())
+        seen, parameters = self.obs.flatten(0, 1), list(self.actor.mlp.parameters())
         with torch.enable_grad():
             output = self.policy(seen)
         gradients = torch.autograd.grad(output, parameters, by_action.flatten(0, 1))

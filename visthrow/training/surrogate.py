@@ -6,10 +6,10 @@ the response ``y = (thrust, body rates)``, commands u, vehicle p, v, R, payload 
     y[k+1] = A0 y[k] + A1 y[k-1] + sum_j B_j u[k-j] + c         per channel: controller, motors and queue
     R[k+1] = R[k] exp(dt (w[k] + w[k+1]) / 2)
     f      = kappa F z - R diag(drag) R^T v                      F, z: mean thrust and mean body z of the step
-    T      = mu (-a n.f / M + b |u_perp|^2 / l + c n.u / dt)     u = s - v; n, l: of the rope as a taut, massless rod
+    T      = mu (-a n.f / M + b |u_perp|^2 / l)                  u = s - v; n, l: of the rope as a taut, massless rod
     v[k+1] = v + dt (f / M + g + T n / M),  s[k+1] = s + dt (g - T n / m),  mu = M m / (M + m)
 
-and positions by the trapezoid. A0, A1, B, c, kappa, drag, a, b, c are fitted to flights of the simulator under random
+and positions by the trapezoid. A0, A1, B, c, kappa, drag, a and b are fitted to flights of the simulator under random
 commands by linear least squares. The backward pass is one kernel, a thread a flight, with derivatives written by hand;
 a rotation's derivative is that by a turn about the body axes, R exp(turn).
 """
@@ -17,6 +17,7 @@ a rotation's derivative is that by a turn about the body axes, R exp(turn).
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import torch
 import warp as wp
@@ -27,22 +28,21 @@ from sim.quadrotor.queue import queue_depth
 from visthrow.onboard import observations as ob
 from visthrow.training.env import ThrowEnv
 
-EXCITED = ((0.35, 0.5, 0.5, 0.5), 0.7)
-"""Random commands of the fit: spread of the normalised actions about hover, and how much of one the next step keeps."""
-
+EXCITED, KEPT = (0.35, 0.5, 0.5, 0.5, 0.0), 0.7
+"""Random actions of the fit: spread about hover, and the share of one that the next keeps."""
+FITTED = 8000
+"""Steps of flight that the fit rests on."""
 SLACK_THROTTLE = 0.05
 """Least throttle at which the slope of the thrust is taken: at none it is nought, and nothing would lead away from there."""
-
 TAUT = 0.1
 """Pull on the payload in its weights above which the rope counts as taut."""
-
 
 VEC5 = wp.types.vector(5, float)
 
 
 @wp.struct
 class Course:
-    """Course of flights or derivatives of a cost by it: steps first, (T + 1, E)."""
+    """Course of flights, or derivatives of a cost by it: (T + 1, E)."""
 
     pos: wp.array2d(dtype=wp.vec3)
     vel: wp.array2d(dtype=wp.vec3)
@@ -54,170 +54,132 @@ class Course:
     quat: wp.array2d(dtype=wp.quat)  # flights alone
 
 
-WIDTHS = {"pos": 3, "vel": 3, "turn": 3, "load_pos": 3, "load_vel": 3, "response": 4, "command": 4, "quat": 4}
+class Plants(NamedTuple):
+    """An environment's plants, each over (E,)."""
+
+    body_mass: Tensor
+    rope_mass: Tensor
+    load_mass: Tensor
+    mount: Tensor
+    thrust_factor: Tensor
+
+    @staticmethod
+    def of(env: ThrowEnv) -> "Plants":
+        """Those of an environment."""
+        vehicle, rope = env.sim.plants()
+        rope_mass = rope["total_mass"] - rope["payload_mass"]
+        rows = (vehicle["body"]["mass"], rope_mass, rope["payload_mass"], rope["mount"], vehicle["thrust"]["k_f"])
+        return Plants(*(torch.tensor(row, device=env.device, dtype=torch.float32) for row in rows))
 
 
 class Flights:
-    """Recorded flights, or derivatives by them: tensors of shape (T + 1, E, width) under the names of :class:`Course`.
+    """Recorded flights, or derivatives by them.
 
     Attributes:
-        steps: steps until the flight ended, shape (E,), int32: states 0 to ``steps`` are of one flight.
-        course: the same memory for kernels.
+        x: tensors of shape (T + 1, E, 3 or 4) under the names of :class:`Course`; the same memory for kernels: ``course``.
+        steps: until the flight ended, shape (E,), int32: states 0 to ``steps`` are of one flight. mass: of the vehicles, the
+            rope included [kg], shape (E,).
     """
 
     def __init__(self, steps: int, count: int, device: str):
-        self.tensors = {name: torch.zeros(steps + 1, count, width, device=device) for name, width in WIDTHS.items()}
-        self.steps = torch.zeros(count, device=device, dtype=torch.int32)
+        kinds = {name: field.type.dtype for name, field in Course.vars.items()}
+        self.x = {name: torch.zeros(steps + 1, count, kind._length_, device=device) for name, kind in kinds.items()}
         self.course = Course()
-        for name, tensor in self.tensors.items():
-            kind = {3: wp.vec3, 4: wp.quat if name == "quat" else wp.vec4}[WIDTHS[name]]
-            setattr(self.course, name, wp.from_torch(tensor, dtype=kind))
+        for name, kind in kinds.items():
+            setattr(self.course, name, wp.from_torch(self.x[name], dtype=kind))
+        self.steps, self.mass = torch.zeros(count, device=device, dtype=torch.int32), torch.zeros(count, device=device)
 
-    def __getattr__(self, name: str) -> Tensor:
-        try:
-            return self.__dict__["tensors"][name]
-        except KeyError:
-            raise AttributeError(name) from None
-
-    def record(self, k: int, env: ThrowEnv, thrust_factor: Tensor) -> None:
-        """Take down the environment's state as state k."""
-        state, out = env.views.state, env.views.out
-        sources = {"pos": state["pos_w"], "vel": state["vel_w"], "quat": state["quat_wb"],
-                   "load_pos": out["payload_pos_w"], "load_vel": out["payload_vel_w"]}  # fmt: skip
-        for name, source in sources.items():
-            self.tensors[name][k].copy_(source)
-        self.response[k, :, 0].copy_(thrust_factor * state["motor_speed"].square().sum(-1))
-        self.response[k, :, 1:].copy_(state["rate_b"])
-
-
-class Plants:
-    """Masses, mounts and thrust factors of an environment's plants, each over (E,)."""
-
-    def __init__(self, env: ThrowEnv):
-        vehicle, rope = env.sim.plants()
-        make = {"device": env.device, "dtype": torch.float32}
-        self.body_mass = torch.tensor(vehicle["body"]["mass"], **make)
-        self.rope_mass = torch.tensor(rope["total_mass"] - rope["payload_mass"], **make)
-        self.load_mass = torch.tensor(rope["payload_mass"], **make)
-        self.mount = torch.tensor(rope["mount"], **make)
-        self.thrust_factor = torch.tensor(vehicle["thrust"]["k_f"], **make)
-
-    def mass(self, env: ThrowEnv) -> Tensor:
-        """Mass of the vehicles with the rope [kg], shape (E,)."""
-        return self.body_mass * env.views.state["mass_scale"] + self.rope_mass
+    def fly(self, env: ThrowEnv, plants: Plants, act: Callable[[int, Tensor], Tensor], passed: Callable[[int], None]) -> None:
+        """Fly from new starts without release; ``act(k, observations)``, then ``passed(k)`` at each state k, the last included."""
+        state, out, x = env.views.state, env.views.out, self.x
+        seen = env.reset()
+        self.mass.copy_(plants.body_mass * state["mass_scale"] + plants.rope_mass)
+        self.steps.zero_()
+        alive = torch.ones_like(self.steps)
+        for k in range(len(x["pos"])):
+            for name, source in (("pos", state["pos_w"]), ("vel", state["vel_w"]), ("quat", state["quat_wb"]),
+                                 ("load_pos", out["payload_pos_w"]), ("load_vel", out["payload_vel_w"])):  # fmt: skip
+                x[name][k].copy_(source)
+            x["response"][k, :, 0].copy_(plants.thrust_factor * state["motor_speed"].square().sum(-1))
+            x["response"][k, :, 1:].copy_(state["rate_b"])
+            passed(k)
+            if k < len(x["pos"]) - 1:
+                seen, _, done, _ = env.step(act(k, seen["actor"]), hold=True)
+                x["command"][k].copy_(env.views.command)
+                alive = alive * (done == 0)
+                self.steps += alive
 
 
 @dataclass
 class Surrogate:
-    """Fitted coefficients.
-
-    Attributes:
-        response: rows A0, A1, B_0, ..., B_(D-1), shape (2 + D, 4).
-        force: kappa and the drag along the body axes [N s/m], shape (4,). tension: a, b, c, shape (3,).
-        residual: root mean square of what the fit leaves of a step's change of response, momentum and tension, as shares
-            of that change's own root mean square, shape (6,).
-    """
+    """Fitted coefficients: rows A0, A1, B_0, ..., shape (2 + D, 4); kappa and drag [N s/m], shape (4,); a, b, shape (2,)."""
 
     response: Tensor
     force: Tensor
     tension: Tensor
-    residual: Tensor
 
 
-def random_flights(env: ThrowEnv, plants: Plants, steps: int, watch: Callable[[Tensor], None]) -> tuple[Flights, Tensor]:
-    """Flights under random commands from the task's starts, and the vehicles' masses; ``watch`` is shown what is observed."""
-    flights = Flights(steps, env.num_envs, env.device)
-    env.reset()
-    mass = plants.mass(env).clone()
-    spread, kept = EXCITED
-    spread = torch.tensor([*spread, 0.0], device=env.device)
-    hover = env.previous_action.clone()
+def fit(env: ThrowEnv, plants: Plants, watch: Callable[[Tensor], None], steps: int = 40) -> Surrogate:
+    """Fit the surrogate to random flights; ``watch`` is shown the actor's observations, shape (E, D), of each step."""
+    period = env.cfg.sim.control_period
+    lags = max(queue_depth(v.queue.delay, period) for v in env.sim.vehicles)
+    flights, parts = Flights(steps, env.num_envs, env.device), []
+    spread, hover = torch.tensor(EXCITED, device=env.device), env.previous_action.clone()
     swing = torch.randn_like(hover) * spread
-    alive = torch.ones(env.num_envs, device=env.device, dtype=torch.bool)
-    flights.record(0, env, plants.thrust_factor)
-    for k in range(steps):
-        seen, _, done, _ = env.step(hover + swing, hold=True)
-        watch(seen["actor"])
-        flights.command[k].copy_(env.views.command)
-        flights.record(k + 1, env, plants.thrust_factor)
-        alive = alive & (done == 0)
-        flights.steps += alive
-        swing = kept * swing + (1.0 - kept**2) ** 0.5 * spread * torch.randn_like(swing)
-    return flights, mass
+
+    def act(k: int, seen: Tensor) -> Tensor:
+        watch(seen)
+        swing.mul_(KEPT).add_((1.0 - KEPT**2) ** 0.5 * spread * torch.randn_like(swing))
+        return hover + swing
+
+    for _ in range(FITTED // (env.num_envs * steps) + 1):
+        flights.fly(env, plants, act, lambda k: None)
+        parts.append(_regressors(flights, plants, lags, period))
+    rows = {name: torch.cat([part[name] for part in parts]).double() for name in parts[0]}
+    response = [_solve(rows["lagged"][..., c], rows["next"][:, c])[:-1] for c in range(4)]
+    force = _solve(rows["push"].flatten(0, 1), rows["momentum"].flatten())
+    pulled = -(rows["along"] * (rows["push"] @ force)).sum(-1) / rows["mass"]
+    tension = _solve(torch.stack([pulled, rows["swing"]], -1) * rows["reduced"][:, None], rows["tension"])
+    return Surrogate(*(x.float().contiguous() for x in (torch.stack(response, -1), force, tension)))
 
 
-def _solve(features: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-    """Least-squares coefficients, and the root mean square left as a share of the target's."""
-    features, target = features.double(), target.double()
+def _solve(features: Tensor, target: Tensor) -> Tensor:
+    """Least-squares coefficients; what nothing excites gets none."""
     scale = features.square().mean(0).sqrt().clamp(min=1e-12)
-    normal = (features / scale).T @ (features / scale)
-    ridge = 1e-9 * len(features) * torch.eye(len(scale), dtype=normal.dtype, device=normal.device)
-    found = torch.linalg.solve(normal + ridge, (features / scale).T @ target) / scale
-    left = target - features @ found
-    return found, (left.square().mean() / target.square().mean()).sqrt()
+    normal = (features / scale).mT @ (features / scale) / len(features)
+    ridge = 1e-9 * torch.eye(len(scale), dtype=normal.dtype, device=normal.device)
+    return torch.linalg.solve(normal + ridge, (features / scale).mT @ target / len(features)) / scale
 
 
-def fit(
-    env: ThrowEnv, plants: Plants, watch: Callable[[Tensor], None] = lambda obs: None, steps: int = 40, least: int = 8000
-) -> Surrogate:
-    """Fit the surrogate to random flights of the environment's plants, at least ``least`` steps of them.
-
-    ``watch`` is shown the actor's observations, shape (E, D), of each step.
-    """
-    period, lags = env.cfg.sim.control_period, max(queue_depth(env.cfg.vehicle.queue.delay, env.cfg.sim.control_period), 2)
-    parts: list[dict[str, Tensor]] = []
-    for _ in range(-(-least // (env.num_envs * steps)) + 1):
-        flights, mass = random_flights(env, plants, steps, watch)
-        k = torch.arange(lags, steps, device=env.device)
-        whole = k[:, None] < flights.steps
-        parts.append(_regressors(flights, plants, mass, k, lags, period, whole))
-    rows = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
-    response, residual = [], []
-    for c in range(4):
-        found, left = _solve(rows["lagged"][..., c], rows["next"][:, c])
-        response.append(found[:-1])
-        change = (rows["next"] - rows["lagged"][:, 0])[:, c].square().mean().sqrt()
-        residual.append(left * rows["next"][:, c].square().mean().sqrt() / change)
-    force, left = _solve(rows["push"].flatten(0, 1), rows["momentum"].flatten())
-    residual.append(left)
-    pulling = -(rows["along"] * (rows["push"] @ force.float())).sum(-1) / rows["mass"]
-    pull = torch.stack([pulling, *rows["swing"].unbind(-1)], -1) * (rows["reduced"] * rows["taut"])[:, None]
-    tension, left = _solve(pull, rows["tension"] * rows["taut"])
-    residual.append(left)
-    return Surrogate(*(x.float() for x in (torch.stack(response, -1), force, tension, torch.stack(residual))))
-
-
-def _regressors(f: Flights, plants: Plants, mass: Tensor, k: Tensor, lags: int, period: float, whole: Tensor) -> dict:
-    """Rows of the three regressions from the steps ``k`` of flights, where ``whole``."""
-    lagged = [f.response[k], f.response[k - 1], *(f.command[k - j] for j in range(lags))]
-    rot = ob.rotation_from_quat(f.quat)
-    thrust_w = (0.5 * (f.response[k, :, :1] + f.response[k + 1, :, :1])) * 0.5 * (rot[k, :, :, 2] + rot[k + 1, :, :, 2])
-    load_mass = plants.load_mass[:, None]
-    drag = [-rot[k, :, :, i] * (rot[k, :, :, i] * f.vel[k]).sum(-1, keepdim=True) for i in range(3)]
-    gravity = torch.tensor([0.0, 0.0, GRAVITY], device=f.vel.device)
-    load_force = load_mass * ((f.load_vel[k + 1] - f.load_vel[k]) / period + gravity)
-    momentum = mass[:, None] * ((f.vel[k + 1] - f.vel[k]) / period + gravity) + load_force
-    arm = f.load_pos - f.pos - (rot @ plants.mount[:, :, None]).squeeze(-1)
-    arm = 0.5 * (arm[k] + arm[k + 1])
+def _regressors(flights: Flights, plants: Plants, lags: int, period: float) -> dict[str, Tensor]:
+    """Rows of the three regressions from the whole steps of flights; those of the tension count where the rope is taut."""
+    f, mass, load_mass = flights.x, flights.mass, plants.load_mass
+    k = torch.arange(max(lags - 1, 1), len(f["pos"]) - 1, device=mass.device)
+    rot, y = ob.rotation_from_quat(f["quat"]), f["response"]
+    lagged = [y[k], y[k - 1], *(f["command"][k - j] for j in range(lags)), torch.ones_like(y[k])]
+    thrust_w = 0.25 * (y[k, :, :1] + y[k + 1, :, :1]) * (rot[k, :, :, 2] + rot[k + 1, :, :, 2])
+    drag = [-rot[k, :, :, i] * (rot[k, :, :, i] * f["vel"][k]).sum(-1, keepdim=True) for i in range(3)]
+    gravity = torch.tensor([0.0, 0.0, GRAVITY], device=mass.device)
+    load_force = load_mass[:, None] * ((f["load_vel"][k + 1] - f["load_vel"][k]) / period + gravity)
+    momentum = mass[:, None] * ((f["vel"][k + 1] - f["vel"][k]) / period + gravity) + load_force
+    arm = f["load_pos"] - f["pos"] - (rot @ plants.mount[:, :, None]).squeeze(-1)
+    arm, u = (0.5 * (path[k] + path[k + 1]) for path in (arm, f["load_vel"] - f["vel"]))
     length = arm.norm(dim=-1)
     n = arm / length[..., None]
-    u = 0.5 * (f.load_vel[k] - f.vel[k] + f.load_vel[k + 1] - f.vel[k + 1])
-    along = (n * u).sum(-1)
-    reduced = mass * plants.load_mass / (mass + plants.load_mass)
-    swing = torch.stack([(u.square().sum(-1) - along.square()) / length, along / period], -1)
     tension = -(n * load_force).sum(-1)
-    return {
-        "next": f.response[k + 1][whole],
-        "lagged": torch.stack([*lagged, torch.ones_like(lagged[0])], -2)[whole],
-        "push": torch.stack([thrust_w, *drag], -1)[whole],
-        "momentum": momentum[whole],
-        "along": n[whole],
-        "swing": swing[whole],
-        "mass": mass.expand(len(k), -1)[whole],
-        "reduced": reduced.expand(len(k), -1)[whole],
-        "tension": tension[whole],
-        "taut": (tension > TAUT * GRAVITY * plants.load_mass)[whole].float(),
+    taut = tension > TAUT * GRAVITY * load_mass
+    rows = {
+        "next": y[k + 1],
+        "lagged": torch.stack(lagged, -2),
+        "push": torch.stack([thrust_w, *drag], -1),
+        "momentum": momentum,
+        "along": n,
+        "mass": mass.expand_as(tension),
+        "reduced": taut * mass * load_mass / (mass + load_mass),
+        "swing": (u - (n * u).sum(-1, keepdim=True) * n).square().sum(-1) / length,
+        "tension": tension * taut,
     }
+    return {name: row[k[:, None] < flights.steps] for name, row in rows.items()}
 
 
 @wp.struct
@@ -291,8 +253,8 @@ def step_back(p: Model, x: Course, adj: Course, k: int, e: int):
         both = g_f - dt / load_mass * g_load_vel
         g_pull = wp.dot(n, both) * mass * load_mass / (mass + load_mass)
         swing = g_pull * p.tension[1] / length
-        g_n = pull * both + g_pull * (p.tension[2] / dt * u - p.tension[0] / mass * f) - 2.0 * swing * along * u
-        g_u = 2.0 * swing * across + g_pull * p.tension[2] / dt * n
+        g_n = pull * both - g_pull * p.tension[0] / mass * f - 2.0 * swing * along * u
+        g_u = 2.0 * swing * across
         g_f = g_f - g_pull * p.tension[0] / mass * n
         g_arm = (g_n - wp.dot(n, g_n) * n - swing * wp.dot(across, across) * n) / length
 
