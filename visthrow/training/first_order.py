@@ -86,7 +86,7 @@ class FirstOrder:
         E, T, device = env.num_envs, self.p.horizon, env.device
         lag = experiment.release.lag / experiment.sim.control_period
         self.lag, rest = int(lag + 1e-6), max(lag - int(lag + 1e-6), 0.0)
-        self.releases = T - self.lag - 1
+        self.releases = T - self.lag - 1  # the cubic looks a step past the separation
         if self.releases < 1:
             raise ConfigError(f"first_order.horizon is {T} steps; expected at least {self.lag + 2} for a release to end in")
         self.plants = Plants.of(env)
@@ -186,7 +186,7 @@ class FirstOrder:
         k = torch.arange(self.p.horizon, device=steps.device)[:, None]
         reward, error, time = self._rewards_at_release(x)
         hazard = torch.sigmoid((x.action[:K, :, act.COMMANDS] - self.cfg.release.threshold) / self._width) * (k[:K] >= self._first)
-        ended, cut = k[:K] > steps, k[:K] + self.lag + 1 > steps
+        ended, cut = k[:K] > steps, k[:K] + self.lag + 2 > steps
         hazard = torch.where(ended, 1.0, hazard)
         reward = torch.where(cut, -p.termination, reward)
         survival = torch.cat([torch.ones_like(hazard[:1]), (1.0 - hazard).cumprod(0)])
