@@ -8,12 +8,19 @@ import warp as wp
 from sim.arrays import runtime  # noqa: F401  starts Warp
 from sim.arrays import state as st
 from sim.arrays.checks import check_air, check_numerics, check_release
+from sim.arrays.cores import cores, in_pieces
 from sim.arrays.structs import extensions_of, kinds_of, pack, pack_air, pack_rope, pack_vehicle, ropes_on, types
 from sim.effects.laws import check_laws, structure
 from sim.params import GRAVITY, AirParams, PlantParams, RandomizationParams, ReleaseParams, RopeParams, VehicleParams
 from sim.quadrotor.queue import queue_depth
 from sim.randomize import build_reset
 from sim.step import build_step
+
+PIECES = 2
+"""Of a batch for each core of a CPU; more than one, since a core may have other work too."""
+
+FEWEST = 64
+"""Environments of a piece: their step takes a millisecond, its launch a tenth."""
 
 _BUILDS: dict = {}
 
@@ -97,6 +104,7 @@ class HybridSim:
         direct: bool = False,
         extensions: frozenset[str] = frozenset(),
         gravity: float = GRAVITY,
+        threads: int | None = None,
     ):
         """Allocate ``count`` plants.
 
@@ -112,6 +120,7 @@ class HybridSim:
             direct: by-pass the blocks: commands are thrust [N] and torque [N m].
             extensions: of :data:`sim.arrays.structs.EXTENSIONS`, to build in besides those that the parameters need.
             gravity: acceleration of free fall, along -z [m/s^2].
+            threads: at most, of a CPU; default all its cores. The bits do not depend on it.
 
         Raises:
             ValueError: no environment, ropes of different segment counts, or an unphysical parameter.
@@ -133,7 +142,7 @@ class HybridSim:
                 f"ropes of {sorted({r.segments for r in ropes})} segments in one batch of {params.rope.segments}"
             )
         self.params, self.count, self.device, self.seed, self.vehicles = params, count, device, seed, vehicles
-        self.gravity = gravity
+        self.gravity, self.threads = gravity, threads or cores()
         self.extensions = extensions_of(vehicles, ropes, airs, releases, params.laws) | extensions
         self.types, self._step, self._reset = _kernels(params, direct, self.extensions)
         t = self.types
@@ -159,9 +168,8 @@ class HybridSim:
     def step(self) -> None:
         """Advance every plant by one control period under ``command`` and ``release``."""
         s = self.params.sim
-        wp.launch(
+        self._launch(
             self._step.step,
-            self.count,
             [
                 self._vehicles,
                 self._ropes,
@@ -177,14 +185,13 @@ class HybridSim:
                 self.release,
                 self.out,
             ],
-            device=self.device,
             block_dim=64,
         )
 
     def foresee(self) -> None:
         """Write into ``foreseen`` what follows if every payload separates now; the plants stay as they are."""
         inputs = [self._vehicles, self._ropes, self._release, self._airs, self.gravity, self.state, self.foreseen]
-        wp.launch(self._step.foresee, self.count, inputs, device=self.device, block_dim=64)
+        self._launch(self._step.foresee, inputs, block_dim=64)
 
     def randomize(self, spreads: RandomizationParams, mask: wp.array | None = None) -> None:
         """Start new episodes where ``mask`` (shape (E,), int) is non-zero; everywhere without one."""
@@ -192,9 +199,8 @@ class HybridSim:
             packed = pack(self.types.Randomization, spreads)
             self._spreads = (spreads, wp.array(packed, dtype=self.types.Randomization, device=self.device))
         mask = self._all if mask is None else mask
-        wp.launch(
+        self._launch(
             self._reset.randomize,
-            self.count,
             [
                 self._vehicles,
                 self._ropes,
@@ -206,7 +212,6 @@ class HybridSim:
                 mask,
                 self.goal_w,
             ],
-            device=self.device,
         )
         self._update_payload()
 
@@ -266,7 +271,21 @@ class HybridSim:
         return np.float32 if self.types.real is wp.float32 else np.float64
 
     def _update_payload(self) -> None:
-        wp.launch(self._step.payload, self.count, [self._ropes, self.state, self.out], device=self.device)
+        self._launch(self._step.payload, [self._ropes, self.state, self.out])
+
+    def _launch(self, kernel: wp.Kernel, arguments: list, block_dim: int = 256) -> None:
+        """Launch a kernel for all plants, on a CPU in pieces that run side by side."""
+        count, device = self.count, self.device
+        pieces = min(PIECES * self.threads, count // FEWEST) if device == "cpu" and self.threads > 1 else 1
+        if pieces <= 1:
+            wp.launch(kernel, count, [0, *arguments], device=device, block_dim=block_dim)
+            return
+        kernel.module.load(device)  # by one thread
+
+        def launch(first: int, last: int) -> None:
+            wp.launch(kernel, last - first, [first, *arguments], device=device)
+
+        in_pieces(launch, [count * i // pieces for i in range(pieces + 1)], self.threads)
 
     def plants(self) -> tuple[np.ndarray, np.ndarray]:
         """Parameters of vehicle and rope of every environment as the kernels read them: structured arrays, shape (E,)."""

@@ -1,7 +1,7 @@
 """The fused control step: command queue, blocks, chain, release and checks of one control period in one kernel.
 
 ``build_step`` composes the functions of one choice of blocks into one kernel. One thread an environment, no atomics,
-nothing else is launched; the same kernel runs on the CPU and on CUDA.
+nothing else is launched; the same kernel runs on the CPU, all at once or some from ``first`` on, and on CUDA.
 """
 
 from dataclasses import dataclass
@@ -120,6 +120,7 @@ def build_step(
     @wp.kernel(module="unique", enable_backward=False)
     def step_kernel(
         # Params:
+        first: int,
         vehicle: wp.array(dtype=Vehicle),
         ropes: wp.array(dtype=Rope),
         releases: wp.array(dtype=Release),
@@ -137,7 +138,7 @@ def build_step(
         # Out:
         out: Output,
     ):
-        env = wp.tid()
+        env = wp.tid() + first
         p = vehicle[env % vehicle.shape[0]]
         natural = ropes[env % ropes.shape[0]]
         r = releases[env % releases.shape[0]]
@@ -230,13 +231,14 @@ def build_step(
     @wp.kernel(module="unique", enable_backward=False)
     def payload_kernel(
         # Params:
+        first: int,
         ropes: wp.array(dtype=Rope),
         # State in:
         state: State,
         # Out:
         out: Output,
     ):
-        env = wp.tid()
+        env = wp.tid() + first
         natural = ropes[env % ropes.shape[0]]
         s = load(state, env)
         n = wp.zeros(shape=(L,), dtype=vec3)
@@ -256,6 +258,7 @@ def build_step(
     @wp.kernel(module="unique", enable_backward=False)
     def foresee_kernel(
         # Params:
+        first: int,
         vehicle: wp.array(dtype=Vehicle),
         ropes: wp.array(dtype=Rope),
         releases: wp.array(dtype=Release),
@@ -266,7 +269,7 @@ def build_step(
         # Out:
         out: Output,
     ):
-        env = wp.tid()
+        env = first + wp.tid()
         p = vehicle[env % vehicle.shape[0]]
         natural = ropes[env % ropes.shape[0]]
         n = wp.zeros(shape=(L,), dtype=vec3)

@@ -133,6 +133,7 @@ class PPOParams:
     entropy: float
     value_coefficient: float
     max_grad_norm: float
+    products: Literal["float32", "bfloat16"] = "float32"  # of the hidden layers; weights are float32 either way
 
 
 @dataclass(frozen=True)
@@ -197,11 +198,11 @@ class Experiment:
 
     @property
     def iterations(self) -> int:
-        """Iterations of the training."""
+        """Iterations of a whole training."""
         return self.first_order.iterations if self.algorithm == "first_order" else self.ppo.iterations
 
     @property
-    def steps_per_iteration(self) -> int:
+    def samples(self) -> int:
         """Environment steps an iteration."""
         return self.ppo.environments * (self.first_order.horizon if self.algorithm == "first_order" else self.ppo.steps)
 

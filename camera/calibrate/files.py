@@ -14,7 +14,8 @@ from typing import Any
 import torch
 
 from camera.calibrate.foreign import FOREIGN_MODELS, FitReport, fit_fisheye
-from camera.fisheye import Fisheye, FisheyeParams, check_fisheye, monotonic_limit
+from camera.fisheye import Fisheye
+from camera.params import FisheyeParams, check_fisheye, monotonic_limit
 
 EXACT = FitReport("kb4", 0.0, 0.0, 0)
 """Report of a file that holds our own model: nothing was fitted."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from camera.fisheye import FisheyeParams, check_fisheye, monotonic_limit
+from camera.params import FisheyeParams, check_fisheye, monotonic_limit
 
 GRID = 64
 """Pixels along each side of the grid on which a foreign model is sampled."""

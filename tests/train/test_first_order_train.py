@@ -13,6 +13,7 @@ import torch
 from visthrow import cli, config
 from visthrow.onboard.policy import Policy
 from visthrow.task import Experiment, contract_of
+from visthrow.training.first_order.algorithm import FirstOrder
 from visthrow.training.trainer import CHECKPOINT, Trainer
 
 SMALL = ['algorithm="first_order"', "ppo.environments=16", "ppo.hidden=[16,16]", "ppo.minibatches=1",
@@ -57,23 +58,24 @@ def test_its_policy_is_one_like_any_other(whole):
     policy.require(contract_of(experiment))
     trainer = Trainer(experiment, "cpu", 1)
     trainer.load(whole / CHECKPOINT)
-    obs = torch.randn(64, trainer.env.layout.dimension)
+    obs = torch.randn(64, trainer.algorithm.env.layout.dimension)
     with torch.inference_mode():
-        assert (trainer.actor()(obs) - policy.act(obs)).abs().max() < 1e-6
+        assert (trainer.algorithm.act(obs) - policy.act(obs)).abs().max() < 1e-6
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_keeps_what_was_done(whole, tmp_path, monkeypatch, number):
-    folder, learn = tmp_path / "run", Trainer._learn
+    folder, step = tmp_path / "run", FirstOrder.step
 
-    def interrupted(self):
-        if self.iteration == 1:
-            os.kill(os.getpid(), number)  # in the middle of the second iteration
-        return learn(self)
+    def interrupted(self, done):
+        figures = step(self, done)
+        if done == 1 / 4:
+            os.kill(os.getpid(), number)  # in the second iteration
+        return figures
 
-    monkeypatch.setattr(Trainer, "_learn", interrupted)
+    monkeypatch.setattr(FirstOrder, "step", interrupted)
     assert cli.main(words(folder)) == 130
-    monkeypatch.setattr(Trainer, "_learn", learn)
+    monkeypatch.setattr(FirstOrder, "step", step)
     assert cli.main(words(folder, "--resume")) == 0
     assert same(whole, folder)
 

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 import torch
 
-from camera import Fisheye, FisheyeParams
 from camera.calibrate import files as files
 from camera.calibrate.boards import BoardParams, calibrate_from_boards
 from camera.calibrate.foreign import fit_fisheye
+from camera.fisheye import Fisheye
 from camera.imaging.render import render_board
 from camera.mount import rotation_from_vector
+from camera.params import FisheyeParams
 
 DATA = Path(__file__).parents[1] / "data" / "basalt_calib"
 LENS = FisheyeParams(640, 480, 160.1, 150.2, 310.3, 245.4, 0.02, -0.01, 0.002, -0.0002, 200.0)

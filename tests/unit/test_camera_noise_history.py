@@ -3,19 +3,9 @@
 import pytest
 import torch
 
-from camera import (
-    KeypointNoiseParams,
-    StepDraw,
-    apply_latency,
-    apply_noise,
-    at_latency,
-    draw_episode,
-    draw_step,
-    filled,
-    push,
-    push_,
-)
-from camera.noise import check_noise
+from camera.history import at_latency, filled, push, push_
+from camera.noise import StepDraw, apply_latency, apply_noise, draw_episode, draw_step
+from camera.params import KeypointNoiseParams, check_noise
 
 SAMPLES = 20_000
 

@@ -12,7 +12,7 @@ from visthrow import config
 from visthrow.onboard import actions as act
 from visthrow.onboard import observations as ob
 from visthrow.task import Experiment
-from visthrow.training.surrogate import TAUT
+from visthrow.training.first_order.surrogate import TAUT
 from visthrow.training.trainer import Trainer
 
 SMALL = ['algorithm="first_order"', "ppo.environments=24", "ppo.hidden=[16,16]", "ppo.steps=8", "first_order.horizon=14",
@@ -39,9 +39,9 @@ def one_thread():
 
 def first_order(name="state", *changes):
     """A first-order training of a small network that has been made to react to what it sees."""
-    found = Trainer(config.load(Experiment, config.find("train", name), [*SMALL, *changes]), "cpu", 3).first_order
+    found = Trainer(config.load(Experiment, config.find("train", name), [*SMALL, *changes]), "cpu", 3).algorithm
     with torch.no_grad():
-        found.actor.mlp[-1].weight.mul_(5.0)
+        found.network.mlp[-1].weight.mul_(5.0)
     return found
 
 
@@ -119,7 +119,7 @@ def reference(fo, by):
         fresh = torch.full((24,), k == 0)
         obs, history = ob.observe(layout, frame, valid, previous, torch.ones(24), history, fresh)
         obs = at(b.obs[k], obs)  # the validity bits are the environment's own
-        action = fo.policy(obs) + extra[k]
+        action = fo.act(obs) + extra[k]
         previous = at(act.clip_action(b.action[k]), action)
         throttle = (0.5 * (b.action[k, :, :1] + 1.0)).clamp(0.05, 1.0)
         scale = torch.cat([fo.cfg.task.action.max_thrust * throttle, fo.env._max_rate.expand(24, -1)], -1)
@@ -171,7 +171,7 @@ def test_slopes_are_those_of_the_simulator(vehicle, monkeypatch):
     def fly(actions):
         fo.env.load_state_dict(start)
         left = iter(actions)
-        monkeypatch.setattr(fo, "policy", lambda obs: next(left))
+        monkeypatch.setattr(fo, "act", lambda obs: next(left))
         fo.rollout()
         return fo.landing[-1].clone()
 
@@ -214,7 +214,7 @@ def small_task():
 def thrown(turn):
     """Share released and mean landing error over the last of 40 iterations; ``turn`` alters the surrogate."""
     trainer = Trainer(small_task(), "cpu", 1)
-    turn(trainer.first_order.surrogate)
+    turn(trainer.algorithm.surrogate)
     figures = [trainer.step() for _ in range(40)][-5:]
     return tuple(sum(row[name] for row in figures) / len(figures) for name in ("released", "landing_error"))
 

@@ -1,18 +1,7 @@
-"""First-order training: flights of the simulator, gradients through a surrogate of it (:mod:`visthrow.training.surrogate`).
-
-A gradient takes one batch of flights in which nothing is released. Where the payload would land is foreseen at every
-step, so a flight knows the outcome of each release that it could have made. The release becomes smooth by a hazard,
-the probability ``h = sigmoid((a - threshold) / width)`` that the latch trips in a step, and the cost of a flight is the
-mean over the step of release: with the survival S[k] = prod_(j < k) (1 - h[j]),
-
-    - sum_k S[k] h[k] (reward at release k) - sum_k S[k - lag] (rewards while carrying) + S[end] (penalty of an end)
-
-The width falls on a schedule until the hazard is the latch. Soft barriers stand before the bounds, where rewards have no
-slope. The derivatives by states and actions run backward through the surrogate and the network's Jacobian in one
-kernel; decaying by a factor each step, they stay bounded.
-"""
+"""First-order training on the throwing task, as a trainer drives it."""
 
 import math
+import time
 from collections.abc import Callable
 from types import SimpleNamespace
 
@@ -25,10 +14,13 @@ from sim.params import GRAVITY
 from visthrow.common.errors import ConfigError
 from visthrow.onboard import actions as act
 from visthrow.onboard import observations as ob
+from visthrow.onboard.policy import Policy
 from visthrow.task import Experiment
 from visthrow.training import rewards
 from visthrow.training.env import ThrowEnv
-from visthrow.training.surrogate import Flights, Model, Plants, Seen, Surrogate, build_backward, fit
+from visthrow.training.first_order.backward import Model, Seen, build_backward
+from visthrow.training.first_order.surrogate import Flights, Plants, Surrogate, fit
+from visthrow.training.ppo.network import Network
 
 BARRIER = 600.0
 """Barriers cost this times the square of how far a state is within their margins."""
@@ -61,29 +53,34 @@ class Replayed:
 
 
 class FirstOrder:
-    """First-order training of an actor.
+    """First-order training; see :class:`visthrow.training.trainer.Algorithm`.
 
     Attributes:
         surrogate: fitted to the environment's plants at the start.
-        optimizer: Adam on the actor's network.
+        network: of the policy, with its normaliser.
         rollout: flies one batch without release.
     """
 
-    def __init__(self, experiment: Experiment, env: ThrowEnv, actor: torch.nn.Module):
+    def __init__(self, experiment: Experiment, device: str, seed: int, ranks: dict | None = None):
         """Fit the surrogate and start the network near hover.
 
         Args:
-            experiment: the run's configuration.
-            env: whose flights are used; its number of environments is that of throws a gradient.
-            actor: rsl_rl's ``MLPModel``; its normaliser is set here, its network trained.
+            experiment: the run's configuration; the environments of ``ppo`` are the throws of a gradient, its network the policy's.
+            device: "cpu" or "cuda:0".
+            seed: of the environment; torch's own generators are the caller's to seed.
+            ranks: of a distributed run.
 
         Raises:
-            ConfigError: Goals that move, or a horizon too short for a release.
+            ConfigError: A distributed run, goals that move, or a horizon too short for a release.
         """
-        self.cfg, self.p, self.env, self.actor = experiment, experiment.first_order, env, actor
-        if experiment.task.target.moves:
-            raise ConfigError('algorithm = "first_order" throws at goals that stand still; train moving ones by "ppo"')
-        E, T, device = env.num_envs, self.p.horizon, env.device
+        self.cfg, self.p, p = experiment, experiment.first_order, experiment.ppo
+        if ranks or experiment.task.target.moves:
+            raise ConfigError('algorithm = "first_order" trains in one process and throws at goals that stand still; "ppo" does both')
+        self.env = env = ThrowEnv(experiment, device, seed)
+        E, T, self.iterations = env.num_envs, self.p.horizon, self.p.iterations
+        self.samples = E * T
+        seen = env.get_observations()
+        self.network = Network(seen, {"actor": ["actor"]}, "actor", act.ACTIONS, p.hidden, p.activation, p.normalize).to(device)
         lag = experiment.release.lag / experiment.sim.control_period
         self.lag, rest = int(lag + 1e-6), max(lag - int(lag + 1e-6), 0.0)
         self.releases = T - self.lag - 1  # the cubic looks a step past the separation
@@ -91,7 +88,7 @@ class FirstOrder:
             raise ConfigError(f"first_order.horizon is {T} steps; expected at least {self.lag + 2} for a release to end in")
         self.plants = Plants.of(env)
         with torch.no_grad():  # random commands give every observation a spread to start from
-            self.surrogate = fit(env, self.plants, actor.obs_normalizer.update if actor.obs_normalization else lambda obs: None)
+            self.surrogate = fit(env, self.plants, self._watch)
         self.flights, self.adjoint = Flights(T, E, device), Flights(T, E, device)
         make = {"device": device, "dtype": torch.float32}
         self.obs = torch.zeros(T, E, env.layout.dimension, **make)
@@ -102,26 +99,26 @@ class FirstOrder:
         shares = [math.prod((rest - b) / (a - b) for b in nodes if b != a) for a in nodes]
         k = torch.arange(self.releases, device=device)
         self._separation = [(w, (k + self.lag + int(a)).clamp(0, T)) for a, w in zip(nodes, shares)]
-        self._fall = torch.tensor([0.0, 0.0, 0.5 * GRAVITY], **make)
+        self._drop = torch.tensor([0.0, 0.0, 0.5 * GRAVITY], **make)
         self._width, self._first = torch.zeros((), **make), torch.zeros((), **make)
         self._figures: dict[str, Tensor] = {}
         self._begin()
         on_gpu = device.startswith("cuda")
         rate = torch.tensor(self.p.learning_rate, **make) if on_gpu else self.p.learning_rate
-        self.optimizer = torch.optim.Adam(actor.mlp.parameters(), lr=rate, betas=(0.9, 0.95), capturable=on_gpu)
+        self.optimizer = torch.optim.Adam(self.network.mlp.parameters(), lr=rate, betas=(0.9, 0.95), capturable=on_gpu)
         self.rollout, self._update = (Replayed(work) if on_gpu else work for work in (self._fly, self._descend))
 
     def _begin(self) -> None:
         """Hover with the latch at rest, whatever is seen."""
-        last = self.actor.mlp[-1]
+        last = self.network.mlp[-1]
         with torch.no_grad():
             last.weight.mul_(0.1)
             last.bias.copy_(self.env._start_action)
             last.bias[act.COMMANDS] = self.p.initial_release
 
-    def policy(self, obs: Tensor) -> Tensor:
-        """Actions of observations, shape (E, 5)."""
-        return self.actor.mlp(self.actor.obs_normalizer(obs))
+    def act(self, obs: Tensor) -> Tensor:
+        """Actions, shape (E, 5), for observations, shape (E, D)."""
+        return self.network.mlp(self.network.obs_normalizer(obs))
 
     @torch.no_grad()
     def _fly(self) -> None:
@@ -130,7 +127,7 @@ class FirstOrder:
 
         def decide(k: int, seen: Tensor) -> Tensor:
             self.obs[k].copy_(seen)
-            self.action[k].copy_(self.policy(seen))
+            self.action[k].copy_(self.act(seen))
             return self.action[k]
 
         def foresee(k: int) -> None:
@@ -148,17 +145,17 @@ class FirstOrder:
         """Reward, landing error [m] and time to impact [s] of a release at each step, shape (releases, E)."""
         p, release = self.cfg.task.reward, self.cfg.release
         up = x.load_vel[..., 2]
-        time = (up + (up.square() + 2.0 * GRAVITY * (x.load_pos[..., 2] - release.landing_height)).clamp(min=1e-6).sqrt()) / GRAVITY
-        landing = x.load_pos[..., :2] + x.load_vel[..., :2] * time[..., None]
+        fall = (up + (up.square() + 2.0 * GRAVITY * (x.load_pos[..., 2] - release.landing_height)).clamp(min=1e-6).sqrt()) / GRAVITY
+        landing = x.load_pos[..., :2] + x.load_vel[..., :2] * fall[..., None]
         landing = landing + (self.landing - landing).detach()  # the simulator's own value, the slope of flight without drag
-        time = time + (self.time - time).detach()
-        share = torch.linspace(0.0, 1.0, release.clearance_samples, device=time.device) * time[..., None]
-        path = (x.load_pos - x.pos)[:, :, None] + share[..., None] * x.load_vel[:, :, None] - share[..., None] ** 2 * self._fall
+        fall = fall + (self.time - fall).detach()
+        share = torch.linspace(0.0, 1.0, release.clearance_samples, device=fall.device) * fall[..., None]
+        path = (x.load_pos - x.pos)[:, :, None] + share[..., None] * x.load_vel[:, :, None] - share[..., None] ** 2 * self._drop
         clearance = (path.square().sum(-1) + 1e-12).sqrt().amin(-1)
-        landing, time, clearance = (sum(w * value[i] for w, i in self._separation) for value in (landing, time, clearance))
+        landing, fall, clearance = (sum(w * value[i] for w, i in self._separation) for value in (landing, fall, clearance))
         error = ((landing - self.goal[:, :2]).square().sum(-1) + 1e-8).sqrt()
-        reward = rewards.landing(p, error) + rewards.time_of_flight(p, time)
-        return reward + rewards.proximity(p, clearance, release.clearance_margin), error, time
+        reward = rewards.landing(p, error) + rewards.time_of_flight(p, fall)
+        return reward + rewards.proximity(p, clearance, release.clearance_margin), error, fall
 
     def _carrying(self, x: SimpleNamespace) -> Tensor:
         """Rewards of each step while carrying, barriers included, shape (T, E)."""
@@ -184,7 +181,7 @@ class FirstOrder:
         """Mean cost of the flights and figures of what is released."""
         p, K, steps = self.cfg.task.reward, self.releases, self.flights.steps
         k = torch.arange(self.p.horizon, device=steps.device)[:, None]
-        reward, error, time = self._rewards_at_release(x)
+        reward, error, fall = self._rewards_at_release(x)
         hazard = torch.sigmoid((x.action[:K, :, act.COMMANDS] - self.cfg.release.threshold) / self._width) * (k[:K] >= self._first)
         ended, cut = k[:K] > steps, k[:K] + self.lag + 2 > steps
         hazard = torch.where(ended, 1.0, hazard)
@@ -196,7 +193,7 @@ class FirstOrder:
         gain = (chance * reward).sum(0) + (carried * self._carrying(x)).sum(0) - p.termination * survival[-1]
         done = (chance * ~cut).detach()
         total = done.sum().clamp(min=1e-6)
-        duration = (k[:K] + 1) * self.cfg.sim.control_period + self.cfg.release.lag + time
+        duration = (k[:K] + 1) * self.cfg.sim.control_period + self.cfg.release.lag + fall
         figures = {"released": done.sum() / done.shape[1], "landing_error": (done * error).sum() / total,
                    "duration": (done * duration).sum() / total}  # fmt: skip
         return (self.p.saturation * past.sum(0) - gain).mean() * p.scale, figures
@@ -246,7 +243,7 @@ class FirstOrder:
 
     def _jacobian(self) -> Tensor:
         """Derivatives of the network's actions by the observations of the last rollout, shape (T, E, 5, D)."""
-        x, slopes, layers = self.actor.obs_normalizer(self.obs.flatten(0, 1)), [], list(self.actor.mlp)
+        x, slopes, layers = self.network.obs_normalizer(self.obs.flatten(0, 1)), [], list(self.network.mlp)
         for layer in layers:
             if isinstance(layer, torch.nn.Linear):
                 x = layer(x).detach().requires_grad_()
@@ -260,8 +257,8 @@ class FirstOrder:
         for weight, slope in zip(reversed(linear[:-1]), reversed(slopes), strict=True):
             product = (product * slope[:, None]).flatten(0, 1) @ weight
             product = product.unflatten(0, (len(x), act.ACTIONS))
-        if self.actor.obs_normalization:
-            product = product / (self.actor.obs_normalizer._std + self.actor.obs_normalizer.eps)
+        if self.network.obs_normalization:
+            product = product / (self.network.obs_normalizer._std + self.network.obs_normalizer.eps)
         return product.reshape(self.p.horizon, self.env.num_envs, act.ACTIONS, -1).contiguous()
 
     def _lens(self) -> Tensor:
@@ -288,17 +285,22 @@ class FirstOrder:
         kept = 1.0 - self.cfg.camera.noise.drop_probability
         return kept * torch.stack(columns, -1).unflatten(0, (T, env.num_envs))
 
-    def learn(self, done: float) -> dict[str, float]:
-        """One step of Adam along the gradient of the last rollout. done: share of the training that is over."""
-        p = self.p
+    def step(self, done: float) -> dict[str, float]:
+        """One rollout and one step of Adam at this share of the training; returns its figures."""
+        p, start = self.p, time.perf_counter()
         self._width.fill_(p.width * (p.final_width / p.width) ** min(done / p.sharp, 1.0))
-        start, end = p.free
-        self._first.fill_(p.first_release * min(max((end - done) / (end - start), 0.0), 1.0))
-        rate = p.final_rate + 0.5 * (p.learning_rate - p.final_rate) * (1.0 + math.cos(math.pi * min(done, 1.0)))
+        self._first.fill_(p.first_release * min(max((p.free[1] - done) / (p.free[1] - p.free[0]), 0.0), 1.0))
+        rate = p.final_rate + 0.5 * (p.learning_rate - p.final_rate) * (1.0 + math.cos(math.pi * done))
         for group in self.optimizer.param_groups:
             group["lr"] = group["lr"].fill_(rate) if isinstance(group["lr"], Tensor) else rate
+        self.rollout()
+        if self.env.device.startswith("cuda"):
+            torch.cuda.synchronize()
+        middle = time.perf_counter()
         self._update()
-        return {name: float(value) for name, value in self._figures.items()} | {"learning_rate": rate}
+        figures = {name: float(value) for name, value in self._figures.items()}
+        times = {"rollout_s": middle - start, "learning_s": time.perf_counter() - middle}
+        return figures | times | {"learning_rate": rate, "episodes": float(self.env.num_envs)}
 
     def _descend(self) -> None:
         """Gradient of the last rollout, Adam, observation statistics."""
@@ -307,26 +309,38 @@ class FirstOrder:
         by_action = by_action * flown[..., None]
         size = by_action.square().sum((0, 2)).sqrt()  # a few wild flights must not outweigh the rest
         by_action = by_action * (OUTLIER * size.median() / size.clamp(min=1e-12)).clamp(max=1.0)[:, None]
-        seen, parameters = self.obs.flatten(0, 1), list(self.actor.mlp.parameters())
+        seen, parameters = self.obs.flatten(0, 1), list(self.network.mlp.parameters())
         with torch.enable_grad():
-            output = self.policy(seen)
+            output = self.act(seen)
         gradients = torch.autograd.grad(output, parameters, by_action.flatten(0, 1))
         for parameter, gradient in zip(parameters, gradients, strict=True):
             parameter.grad = gradient
         self._figures["gradient_norm"] = torch.nn.utils.clip_grad_norm_(parameters, self.p.max_grad_norm)
         self._figures["ended"] = (self.flights.steps < self.p.horizon).float().mean()
         self.optimizer.step()
-        if self.actor.obs_normalization:
-            normalizer = self.actor.obs_normalizer
+        self._watch(seen)
+
+    def _watch(self, seen: Tensor) -> None:
+        """Take observations, shape (N, D), into the normaliser's statistics."""
+        if self.network.obs_normalization:
+            normalizer = self.network.obs_normalizer
             std = normalizer._std  # the update makes a new tensor; a graph reads this one
             normalizer.update(seen)
             normalizer._std = std.copy_(normalizer._std)
 
-    def state_dict(self) -> dict:
-        """All that the next gradient depends on besides network, environment and random generators."""
-        return {"optimizer": self.optimizer.state_dict(), "surrogate": vars(self.surrogate)}
+    def export(self, contract: dict, made_by: dict) -> Policy:
+        """The policy as a file's content."""
+        return Policy.from_actor_state(self.network.state_dict(), self.cfg.ppo.activation, contract, made_by)
 
-    def load_state_dict(self, saved: dict) -> None:
-        """Take up a state of :meth:`state_dict`."""
+    def state_dict(self) -> dict:
+        """All that the next iteration depends on, besides torch's generators."""
+        parts = {"network": self.network.state_dict(), "optimizer": self.optimizer.state_dict()}
+        return {**parts, "surrogate": vars(self.surrogate), "env": self.env.state_dict()}
+
+    def load_state_dict(self, saved: dict, own_throws: bool = True) -> None:
+        """Take up a state of :meth:`state_dict`; its environment too where ``own_throws`` is set."""
+        self.network.load_state_dict(saved["network"])
         self.optimizer.load_state_dict(saved["optimizer"])
         self.surrogate = Surrogate(**saved["surrogate"])
+        if own_throws:
+            self.env.load_state_dict(saved["env"])
