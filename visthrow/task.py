@@ -138,21 +138,28 @@ class PPOParams:
 
 @dataclass(frozen=True)
 class FirstOrderParams:
-    """First-order training; see :mod:`visthrow.training.first_order`. Throws a gradient: ``ppo.environments``."""
+    """Learning parameters of :mod:`visthrow.training.first_order`; ``ppo`` has the throws a gradient and the network."""
 
-    iterations: int = 600
-    horizon: int = 52
-    decay: float = 0.92
-    learning_rate: float = 3e-3
-    final_rate: float = 1e-4
+    iterations: int = 1000  # gradients
+    horizon: int = 48  # of a flight [control steps]; the latch trips near the 35th
+    decay: float = 0.92  # of derivatives, per step backward
+    learning_rate: float = 3e-3  # at the first iteration
+    final_rate: float = 1e-4  # at the last one; half a cosine between
     max_grad_norm: float = 1.0
-    width: float = 0.5
+    width: float = 0.5  # of the hazard at the first iteration, in units of the fifth action
     final_width: float = 0.05
-    sharp: float = 0.7
-    first_release: int = 24
-    free: tuple[float, float] = (0.2, 0.5)
-    initial_release: float = -2.0
-    saturation: float = 1.0
+    sharp: float = 0.7  # share of the training after which the width is the final one; geometric till then
+    first_release: int = 24  # step before which nothing is released at the beginning: else the payload is dropped at once
+    free: tuple[float, float] = (0.2, 0.5)  # shares of the training between which that step comes down to 0
+    initial_release: float = -2.0  # fifth action of the untrained network
+    saturation: float = 1.0  # cost of the square that an action is past its limits by
+
+    def __post_init__(self) -> None:
+        if not (0.0 <= self.free[0] < self.free[1] and self.sharp > 0.0 and 0.0 < self.final_width <= self.width):
+            raise ConfigError(
+                f"first_order: free {self.free}, sharp {self.sharp}, widths {self.width} to {self.final_width}; expected an "
+                "ascending range, a share above 0 and widths above 0 that do not grow"
+            )
 
 
 @dataclass(frozen=True)
@@ -207,6 +214,8 @@ class Experiment:
         return self.ppo.environments * (self.first_order.horizon if self.algorithm == "first_order" else self.ppo.steps)
 
     def __post_init__(self) -> None:
+        if self.first_order.iterations < 1:
+            raise ConfigError(f"first_order.iterations is {self.first_order.iterations}; expected 1 or more")
         if self.ppo.environments < 1 or self.ppo.steps < 1 or self.ppo.iterations < 1:
             raise ConfigError(
                 f"ppo: {self.ppo.environments} environments, {self.ppo.steps} steps, {self.ppo.iterations} iterations; "

@@ -18,7 +18,7 @@ from visthrow.onboard.policy import Policy
 from visthrow.task import Experiment
 from visthrow.training import rewards
 from visthrow.training.env import ThrowEnv
-from visthrow.training.first_order.backward import Model, Seen, build_backward
+from visthrow.training.first_order.backward import Setting, build_backward
 from visthrow.training.first_order.surrogate import Flights, Plants, Surrogate, fit
 from visthrow.training.ppo.network import Network
 
@@ -30,6 +30,9 @@ MARGINS = {"altitude": 0.15, "ground": 0.1, "above": 0.08, "upright": 0.15}
 OUTLIER = 4.0
 """A flight's derivatives are shortened to this many times the median flight's."""
 
+STEPS_AT_ONCE = 4
+"""Of a flight whose Jacobians are taken together on the way: they fit a core's cache."""
+
 
 class Replayed:
     """Work on fixed tensors of a GPU: done eagerly once, then captured in a CUDA graph and replayed."""
@@ -40,15 +43,13 @@ class Replayed:
     def __call__(self) -> None:
         """Do the work."""
         if not self._warm:
-            self._work()
             self._warm = True
-            return
+            return self._work()
         if self._graph is None:
             torch.cuda.synchronize()
-            graph = torch.cuda.CUDAGraph()
-            with torch.cuda.graph(graph):
+            self._graph = torch.cuda.CUDAGraph()
+            with torch.cuda.graph(self._graph):
                 self._work()
-            self._graph = graph
         self._graph.replay()
 
 
@@ -220,46 +221,39 @@ class FirstOrder:
 
     def _backward(self, by_clipped: Tensor, by_action: Tensor) -> None:
         """Run the backward kernel over the last rollout; ``by_action`` becomes the whole derivative."""
-        env, seen = self.env, Seen()
+        env, task, p = self.env, self.cfg.task, Setting()
+        p.max_thrust, p.max_rate = task.action.max_thrust, wp.vec3(*task.action.max_rate)
+        p.period, p.decay = self.cfg.sim.control_period, self.p.decay
         lens = self._lens() if env.layout.name == "vision" else torch.zeros(1, 1, 1, 3, device=env.device)
-        network = self._jacobian()
-        seen.age, seen.network = wp.from_torch(self.age), wp.from_torch(network)
-        for name, tensor in (("goal", self.goal), ("corners", env.camera.square_w), ("lens", lens)):
-            setattr(seen, name, wp.from_torch(tensor.contiguous(), dtype=wp.vec3))
+        vectors = {"mount": self.plants.mount, "goal": self.goal, "corners": env.camera.square_w, "lens": lens}
+        plain = {"mass": self.flights.mass, "load_mass": self.plants.load_mass, "age": self.age, "network": self._jacobian()}
+        for name, tensor in {**vars(self.surrogate), **plain, **vectors}.items():
+            kind = wp.vec3 if name in vectors else wp.vec4 if name == "response" else wp.float32
+            setattr(p, name, wp.from_torch(tensor.contiguous(), dtype=kind))
         arrays = [wp.from_torch(tensor) for tensor in (self.flights.steps, self.action, by_clipped, by_action)]
-        inputs = [self._model(), self.adjoint.course, self.flights.course, seen, *arrays]
         with on_torch_stream(env.device):
+            inputs = [p, self.adjoint.course, self.flights.course, *arrays]
             wp.launch(build_backward(env.layout), env.num_envs, inputs, device=env.device, block_dim=64)
-
-    def _model(self) -> Model:
-        """What the backward kernel knows of the plants."""
-        model, s, action = Model(), self.surrogate, self.cfg.task.action
-        model.response, model.mount = wp.from_torch(s.response, dtype=wp.vec4), wp.from_torch(self.plants.mount, dtype=wp.vec3)
-        model.force, model.tension = wp.from_torch(s.force), wp.from_torch(s.tension)
-        model.mass, model.load_mass = wp.from_torch(self.flights.mass), wp.from_torch(self.plants.load_mass)
-        model.max_thrust, model.max_rate = action.max_thrust, wp.vec3(*action.max_rate)
-        model.period, model.decay = self.cfg.sim.control_period, self.p.decay
-        return model
 
     def _jacobian(self) -> Tensor:
         """Derivatives of the network's actions by the observations of the last rollout, shape (T, E, 5, D)."""
-        x, slopes, layers = self.network.obs_normalizer(self.obs.flatten(0, 1)), [], list(self.network.mlp)
-        for layer in layers:
-            if isinstance(layer, torch.nn.Linear):
-                x = layer(x).detach().requires_grad_()
-            else:
+        *hidden, last = self.network.mlp
+        normalizer = self.network.obs_normalizer
+        scale = normalizer._std + normalizer.eps if self.network.obs_normalization else 1.0
+        jacobian = []
+        for x in self.obs.split(STEPS_AT_ONCE):
+            x, slopes = normalizer(x.flatten(0, 1)), []
+            for linear, activation in zip(hidden[::2], hidden[1::2], strict=True):
                 with torch.enable_grad():
-                    y = layer(x)
+                    x = linear(x).detach().requires_grad_()
+                    y = activation(x)
                     slopes.append(torch.autograd.grad(y.sum(), x)[0])
                 x = y.detach()
-        linear = [layer.weight.detach() for layer in layers if isinstance(layer, torch.nn.Linear)]
-        product = linear[-1].expand(len(x), -1, -1)
-        for weight, slope in zip(reversed(linear[:-1]), reversed(slopes), strict=True):
-            product = (product * slope[:, None]).flatten(0, 1) @ weight
-            product = product.unflatten(0, (len(x), act.ACTIONS))
-        if self.network.obs_normalization:
-            product = product / (self.network.obs_normalizer._std + self.network.obs_normalizer.eps)
-        return product.reshape(self.p.horizon, self.env.num_envs, act.ACTIONS, -1).contiguous()
+            product = last.weight.detach().expand(len(x), -1, -1)
+            for linear, slope in zip(hidden[-2::-2], reversed(slopes), strict=True):
+                product = (product * slope[:, None]) @ linear.weight.detach()
+            jacobian.append((product / scale).view(-1, self.env.num_envs, *product.shape[1:]))
+        return torch.cat(jacobian)
 
     def _lens(self) -> Tensor:
         """Derivatives of each image coordinate by its point's place in the body frame, shape (T, E, 16, 3).

@@ -19,8 +19,8 @@ VEC5 = wp.types.vector(5, float)
 
 
 @wp.struct
-class Model:
-    """The surrogate and what it is evaluated on."""
+class Setting:
+    """What flights and policy are like: the surrogate, the plants, what the actor sees and how it reacts."""
 
     response: wp.array(dtype=wp.vec4)
     force: wp.array(dtype=float)
@@ -32,12 +32,6 @@ class Model:
     max_rate: wp.vec3
     period: float
     decay: float  # of derivatives, per step
-
-
-@wp.struct
-class Seen:
-    """What the actor sees, and its derivatives."""
-
     age: wp.array(dtype=float)  # of poses [s]
     goal: wp.array(dtype=wp.vec3)
     corners: wp.array(dtype=wp.vec3)  # of the goal square, from the goal
@@ -52,16 +46,11 @@ def turned(quat: wp.quat, arm_b: wp.vec3, grad_w: wp.vec3):
 
 
 @wp.func
-def step_back(p: Model, x: Course, adj: Course, k: int, e: int):
+def step_back(p: Setting, x: Course, adj: Course, k: int, e: int):
     """Add to the derivatives by state k, k - 1 and by the commands up to k what those by state k + 1 make of them."""
-    dt = p.period
-    half = 0.5 * dt
-    mass = p.mass[e]
-    load_mass = p.load_mass[e]
-    mount = p.mount[e]
-    up = wp.vec3(0.0, 0.0, 1.0)
-    rot = x.quat[k, e]
-    rot_next = x.quat[k + 1, e]
+    dt, half, up = p.period, 0.5 * p.period, wp.vec3(0.0, 0.0, 1.0)
+    mass, load_mass, mount = p.mass[e], p.load_mass[e], p.mount[e]
+    rot, rot_next = x.quat[k, e], x.quat[k + 1, e]
     g_pos = p.decay * adj.pos[k + 1, e]
     g_load = p.decay * adj.load_pos[k + 1, e]
     g_vel = p.decay * adj.vel[k + 1, e] + half * g_pos
@@ -123,16 +112,16 @@ def build_backward(layout: ob.Layout) -> wp.Kernel:
     previous_at, goal_at, load_at = ob.VEHICLE, ob.VEHICLE + 5, ob.VEHICLE + 5 + layout.goal
 
     @wp.func
-    def by(s: Seen, g: VEC5, k: int, e: int, i: int):
+    def by(p: Setting, g: VEC5, k: int, e: int, i: int):
         """Derivative by entry i of observation k."""
-        total = g[0] * s.network[k, e, 0, i]
+        total = g[0] * p.network[k, e, 0, i]
         for j in range(1, 5):
-            total += g[j] * s.network[k, e, j, i]
+            total += g[j] * p.network[k, e, j, i]
         return total
 
     @wp.func
-    def by_three(s: Seen, g: VEC5, k: int, e: int, i: int):
-        return wp.vec3(by(s, g, k, e, i), by(s, g, k, e, i + 1), by(s, g, k, e, i + 2))
+    def by_three(p: Setting, g: VEC5, k: int, e: int, i: int):
+        return wp.vec3(by(p, g, k, e, i), by(p, g, k, e, i + 1), by(p, g, k, e, i + 2))
 
     @wp.func
     def point_back(x: Course, adj: Course, i: int, e: int, point_w: wp.vec3, g_b: wp.vec3):
@@ -141,46 +130,45 @@ def build_backward(layout: ob.Layout) -> wp.Kernel:
         adj.turn[i, e] += wp.cross(g_b, wp.quat_rotate_inv(x.quat[i, e], point_w - x.pos[i, e]))
 
     @wp.func
-    def vehicle_back(s: Seen, x: Course, adj: Course, g: VEC5, k: int, i: int, e: int, share: float):
+    def vehicle_back(p: Setting, x: Course, adj: Course, g: VEC5, k: int, i: int, e: int, share: float):
         """From observation k to state i, of which ``share`` is in it: the vehicle and the goal."""
-        adj.pos[i, e] += share * by_three(s, g, k, e, 0)
-        adj.vel[i, e] += share * by_three(s, g, k, e, 3)
-        rate = share * by_three(s, g, k, e, 6)
+        adj.pos[i, e] += share * by_three(p, g, k, e, 0)
+        adj.vel[i, e] += share * by_three(p, g, k, e, 3)
+        rate = share * by_three(p, g, k, e, 6)
         adj.response[i, e] += wp.vec4(0.0, rate[0], rate[1], rate[2])
-        x_axis = turned(x.quat[i, e], wp.vec3(1.0, 0.0, 0.0), by_three(s, g, k, e, 9))
-        adj.turn[i, e] += share * (x_axis + turned(x.quat[i, e], wp.vec3(0.0, 1.0, 0.0), by_three(s, g, k, e, 12)))
+        x_axis = turned(x.quat[i, e], wp.vec3(1.0, 0.0, 0.0), by_three(p, g, k, e, 9))
+        adj.turn[i, e] += share * (x_axis + turned(x.quat[i, e], wp.vec3(0.0, 1.0, 0.0), by_three(p, g, k, e, 12)))
         if wp.static(vision):
             for j in range(4):
                 at = goal_at + 2 * j
-                g_b = by(s, g, k, e, at) * s.lens[k, e, 2 * j] + by(s, g, k, e, at + 1) * s.lens[k, e, 2 * j + 1]
-                point_back(x, adj, i, e, s.goal[e] + s.corners[j], share * g_b)
+                g_b = by(p, g, k, e, at) * p.lens[k, e, 2 * j] + by(p, g, k, e, at + 1) * p.lens[k, e, 2 * j + 1]
+                point_back(x, adj, i, e, p.goal[e] + p.corners[j], share * g_b)
         else:
-            adj.load_pos[i, e] -= share * wp.vec3(by(s, g, k, e, goal_at), by(s, g, k, e, goal_at + 1), 0.0)
+            adj.load_pos[i, e] -= share * wp.vec3(by(p, g, k, e, goal_at), by(p, g, k, e, goal_at + 1), 0.0)
 
     @wp.func
-    def load_back(s: Seen, x: Course, adj: Course, g: VEC5, k: int, age: int, i: int, e: int, share: float):
+    def load_back(p: Setting, x: Course, adj: Course, g: VEC5, k: int, age: int, i: int, e: int, share: float):
         """From observation k to state i: the payload as it was ``age`` observations ago."""
         at = load_at + width * age
         if wp.static(vision):
             g_b = wp.vec3(0.0, 0.0, 0.0)
             for j in range(8):
-                g_b += share * by(s, g, k, e, at + j) * s.lens[wp.max(k - age, 0), e, 8 + j]
+                g_b += share * by(p, g, k, e, at + j) * p.lens[wp.max(k - age, 0), e, 8 + j]
             point_back(x, adj, i, e, x.load_pos[i, e], g_b)
             adj.load_pos[i, e] += wp.quat_rotate(x.quat[i, e], g_b)
         else:
-            offset = share * by_three(s, g, k, e, at)
+            offset = share * by_three(p, g, k, e, at)
             adj.load_pos[i, e] += offset
             adj.pos[i, e] -= offset
 
     @wp.kernel(module="unique", enable_backward=False)
     def backward_kernel(
         # Params:
-        p: Model,
+        p: Setting,
         # State in:
         adj: Course,
         # In:
         x: Course,
-        s: Seen,
         steps: wp.array(dtype=wp.int32),
         action: wp.array3d(dtype=float),
         # Out:
@@ -188,7 +176,7 @@ def build_backward(layout: ob.Layout) -> wp.Kernel:
         by_action: wp.array3d(dtype=float),
     ):
         e = wp.tid()
-        late = s.age[e] / p.period
+        late = p.age[e] / p.period
         for back in range(action.shape[0]):
             k = action.shape[0] - 1 - back
             if k <= steps[e]:
@@ -209,11 +197,11 @@ def build_backward(layout: ob.Layout) -> wp.Kernel:
                 before = wp.max(k - 1, 0)
                 if k > 0:
                     for j in range(5):
-                        by_clipped[before, e, j] += by(s, g, k, e, previous_at + j)
-                vehicle_back(s, x, adj, g, k, k, e, 1.0 - late)
-                vehicle_back(s, x, adj, g, k, before, e, late)
+                        by_clipped[before, e, j] += by(p, g, k, e, previous_at + j)
+                vehicle_back(p, x, adj, g, k, k, e, 1.0 - late)
+                vehicle_back(p, x, adj, g, k, before, e, late)
                 for age in range(history + 1):
-                    load_back(s, x, adj, g, k, age, wp.max(k - age, 0), e, 1.0 - late)
-                    load_back(s, x, adj, g, k, age, wp.max(k - age - 1, 0), e, late)
+                    load_back(p, x, adj, g, k, age, wp.max(k - age, 0), e, 1.0 - late)
+                    load_back(p, x, adj, g, k, age, wp.max(k - age - 1, 0), e, late)
 
     return backward_kernel
