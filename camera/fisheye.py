@@ -9,7 +9,7 @@ the CPU.
 
 import torch
 
-from camera.params import FisheyeParams, check_fisheye
+from camera.params import FisheyeParams
 
 AXIS_EPSILON = 1e-20
 """Added to x^2 + y^2 so that value and gradient are finite on the axis: a radius of 1e-10 in the points' unit."""
@@ -54,12 +54,7 @@ class Fisheye:
     """
 
     def __init__(self, params: FisheyeParams):
-        """Check the intrinsics and precompute the edge of the field of view.
-
-        Raises:
-            ValueError: See `check_fisheye`.
-        """
-        check_fisheye(params)
+        """Keep what projection and its inverse need of the intrinsics."""
         self.params = params
         self.half_fov = params.half_fov
         self._equidistant = not any(params.coefficients)

@@ -6,6 +6,18 @@ from typing import Literal
 
 import numpy as np
 
+SEEN_AT_LEAST = math.radians(1.0)
+"""Angle off the axis that any lens must image [rad]."""
+
+
+def monotonic_limit(coefficients: tuple[float, ...]) -> float:
+    """Angle off the axis at which theta_d stops growing, ``inf`` where it never does [rad]."""
+    slope = [(2 * i + 3) * k for i, k in enumerate(coefficients)][::-1] + [1.0]
+    roots = np.roots(np.trim_zeros(slope, "f")) if any(slope[:-1]) else np.zeros(0)
+    real = roots[np.abs(roots.imag) < 1e-12 * np.abs(roots)].real if roots.size else roots
+    positive = real[real > 0.0]
+    return float(np.sqrt(positive.min())) if positive.size else math.inf
+
 
 @dataclass(frozen=True)
 class FisheyeParams:
@@ -40,6 +52,35 @@ class FisheyeParams:
     def half_fov(self) -> float:
         """Largest angle off the optical axis that is inside the field of view [rad]."""
         return math.radians(self.fov_deg) / 2.0
+
+    def __post_init__(self) -> None:
+        """Refuse intrinsics that describe no camera.
+
+        Raises:
+            ValueError: A value is not finite or out of range, or theta_d does not grow all the way to the edge of the field
+            of view.
+        """
+        for name in ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "fov_deg"):
+            if not math.isfinite(getattr(self, name)):
+                raise ValueError(f"fisheye {name} is {getattr(self, name)}; expected a finite number")
+        for name in ("width", "height", "fx", "fy"):
+            if getattr(self, name) <= 0:
+                raise ValueError(f"fisheye {name} is {getattr(self, name)}; expected a number above 0")
+        if not 0.0 < self.fov_deg <= 360.0:
+            raise ValueError(f"fisheye fov_deg is {self.fov_deg}; expected a full angle above 0 and up to 360 deg")
+        t2 = SEEN_AT_LEAST**2
+        near = SEEN_AT_LEAST * (1 + sum(k * t2 ** (n + 1) for n, k in enumerate(self.coefficients)))
+        if near * min(self.fx, self.fy) > math.hypot(self.width, self.height):
+            raise ValueError(
+                f"fisheye k = {self.coefficients} with fx = {self.fx}, fy = {self.fy}: a ray 1 deg off the axis falls outside an image "
+                f"of {self.width} x {self.height} px; expected a lens that sees more than that"
+            )
+        limit = monotonic_limit(self.coefficients)
+        if limit <= self.half_fov:
+            raise ValueError(
+                f"theta_d with k = {self.coefficients} stops growing at {math.degrees(limit):.2f} deg off the axis, "
+                f"inside the field of view; expected fov_deg below {2 * math.degrees(limit):.2f}, got {self.fov_deg}"
+            )
 
 
 @dataclass(frozen=True)
@@ -84,6 +125,20 @@ class KeypointNoiseParams:
         """Entries that a latency buffer must hold."""
         return int(-(-self.latency // 1)) + 1
 
+    def __post_init__(self) -> None:
+        """Refuse noise settings out of range.
+
+        Raises:
+            ValueError: A negative spread or latency, a probability outside [0, 1], or an unknown ``invalid_reads``.
+        """
+        for name in ("step_std", "bias_std", "latency"):
+            if not getattr(self, name) >= 0.0:
+                raise ValueError(f"keypoint noise {name} is {getattr(self, name)}; expected a number of at least 0")
+        if not 0.0 <= self.drop_probability <= 1.0:
+            raise ValueError(f"keypoint noise drop_probability is {self.drop_probability}; expected a number in [0, 1]")
+        if self.invalid_reads not in ("edge", "zero"):
+            raise ValueError(f"keypoint noise invalid_reads is {self.invalid_reads!r}; expected one of 'edge', 'zero'")
+
 
 @dataclass(frozen=True)
 class CameraParams:
@@ -95,62 +150,12 @@ class CameraParams:
     goal_side: float  # side of the ground square around the target whose corners are seen [m]
     payload_radius: float  # radius of the ball whose bounding box is seen [m]
 
+    def __post_init__(self) -> None:
+        """Refuse parameters that describe no camera.
 
-def monotonic_limit(coefficients: tuple[float, ...]) -> float:
-    """Angle off the axis at which theta_d stops growing, ``inf`` where it never does [rad]."""
-    slope = [(2 * i + 3) * k for i, k in enumerate(coefficients)][::-1] + [1.0]
-    roots = np.roots(np.trim_zeros(slope, "f")) if any(slope[:-1]) else np.zeros(0)
-    real = roots[np.abs(roots.imag) < 1e-12 * np.abs(roots)].real if roots.size else roots
-    positive = real[real > 0.0]
-    return float(np.sqrt(positive.min())) if positive.size else math.inf
-
-
-def check_fisheye(params: FisheyeParams) -> None:
-    """Refuse intrinsics that describe no camera.
-
-    Raises:
-        ValueError: A value is not finite or out of range, or theta_d does not grow all the way to the edge of the field
-        of view.
-    """
-    for name in ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "fov_deg"):
-        if not math.isfinite(getattr(params, name)):
-            raise ValueError(f"fisheye {name} is {getattr(params, name)}; expected a finite number")
-    for name in ("width", "height", "fx", "fy"):
-        if getattr(params, name) <= 0:
-            raise ValueError(f"fisheye {name} is {getattr(params, name)}; expected a number above 0")
-    if not 0.0 < params.fov_deg <= 360.0:
-        raise ValueError(f"fisheye fov_deg is {params.fov_deg}; expected a full angle above 0 and up to 360 deg")
-    limit = monotonic_limit(params.coefficients)
-    if limit <= params.half_fov:
-        raise ValueError(
-            f"theta_d with k = {params.coefficients} stops growing at {math.degrees(limit):.2f} deg off the axis, "
-            f"inside the field of view; expected fov_deg below {2 * math.degrees(limit):.2f}, got {params.fov_deg}"
-        )
-
-
-def check_noise(params: KeypointNoiseParams) -> None:
-    """Refuse noise settings out of range.
-
-    Raises:
-        ValueError: A negative spread or latency, a probability outside [0, 1], or an unknown ``invalid_reads``.
-    """
-    for name in ("step_std", "bias_std", "latency"):
-        if not getattr(params, name) >= 0.0:
-            raise ValueError(f"keypoint noise {name} is {getattr(params, name)}; expected a number of at least 0")
-    if not 0.0 <= params.drop_probability <= 1.0:
-        raise ValueError(f"keypoint noise drop_probability is {params.drop_probability}; expected a number in [0, 1]")
-    if params.invalid_reads not in ("edge", "zero"):
-        raise ValueError(f"keypoint noise invalid_reads is {params.invalid_reads!r}; expected one of 'edge', 'zero'")
-
-
-def check_camera(params: CameraParams) -> None:
-    """Refuse parameters that describe no camera.
-
-    Raises:
-        ValueError: See `check_fisheye` and `check_noise`; or a size that is not above 0.
-    """
-    check_fisheye(params.fisheye)
-    check_noise(params.noise)
-    for name in ("goal_side", "payload_radius"):
-        if not getattr(params, name) > 0.0:
-            raise ValueError(f"camera {name} is {getattr(params, name)}; expected a length above 0 m")
+        Raises:
+            ValueError: A size that is not above 0.
+        """
+        for name in ("goal_side", "payload_radius"):
+            if not getattr(self, name) > 0.0:
+                raise ValueError(f"camera {name} is {getattr(self, name)}; expected a length above 0 m")

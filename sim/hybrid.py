@@ -7,7 +7,6 @@ import warp as wp
 
 from sim.arrays import runtime  # noqa: F401  starts Warp
 from sim.arrays import state as st
-from sim.arrays.checks import check_air, check_numerics, check_release
 from sim.arrays.cores import cores, in_pieces
 from sim.arrays.structs import extensions_of, kinds_of, pack, pack_air, pack_rope, pack_vehicle, ropes_on, types
 from sim.effects.laws import check_laws, structure
@@ -123,19 +122,14 @@ class HybridSim:
             threads: at most, of a CPU; default all its cores. The bits do not depend on it.
 
         Raises:
-            ValueError: no environment, ropes of different segment counts, or an unphysical parameter.
+            ValueError: no environment, ropes of different segment counts, or a law that no block can be made of.
         """
         if count < 1:
             raise ValueError(f"HybridSim of {count} environments: expected 1 or more")
-        check_numerics(params.sim)
         releases = releases or [params.release]
-        for release in releases:
-            check_release(release)
         ropes = ropes or [params.rope]
         vehicles = vehicles or [params.vehicle]
         airs = airs or [params.air]
-        for air in airs:
-            check_air(air)
         check_laws(params.laws)
         if {r.segments for r in ropes} != {params.rope.segments}:
             raise ValueError(

@@ -18,6 +18,8 @@ from sim.params import (
     SensingParams,
     SimParams,
     VehicleParams,
+    require_not_negative,
+    require_positive,
 )
 from visthrow.common.errors import ConfigError
 
@@ -28,6 +30,9 @@ class ActionParams:
 
     max_thrust: float  # collective thrust at +1 [N]
     max_rate: tuple[float, float, float]  # body rates at +-1 [rad/s]
+
+    def __post_init__(self) -> None:
+        require_positive("task.action", max_thrust=self.max_thrust, max_rate=min(self.max_rate))
 
 
 @dataclass(frozen=True)
@@ -50,6 +55,12 @@ class NoiseParams:
     command_step: float  # per step, in normalised commands
     command_bias: float  # per episode
 
+    def __post_init__(self) -> None:
+        require_not_negative(
+            "task.noise", observation_step=self.observation_step, observation_bias=self.observation_bias,
+            command_step=self.command_step, command_bias=self.command_bias,
+        )  # fmt: skip
+
 
 @dataclass(frozen=True)
 class BoundsParams:
@@ -59,6 +70,11 @@ class BoundsParams:
     horizontal: float  # distance of the vehicle from the spawn axis [m]
     tilt_deg: float  # between body z and the vertical [deg]
     time_limit: float  # a negative end, never bootstrapped [s]
+
+    def __post_init__(self) -> None:
+        require_positive("task.bounds", horizontal=self.horizontal, tilt_deg=self.tilt_deg, time_limit=self.time_limit)
+        if not self.altitude[0] < self.altitude[1]:
+            raise ValueError(f"task.bounds.altitude is {self.altitude} m; expected the lower limit before the upper one")
 
 
 @dataclass(frozen=True)
@@ -134,6 +150,33 @@ class PPOParams:
     value_coefficient: float
     max_grad_norm: float
     products: Literal["float32", "bfloat16"] = "float32"  # of the hidden layers; weights are float32 either way
+    critic: tuple[int, ...] = ()  # hidden layers of the critic; empty for the actor's
+    critic_first: int = 0  # iterations at the beginning in which the critic alone learns
+
+    def __post_init__(self) -> None:
+        whole = ("environments", "steps", "iterations", "epochs", "minibatches")
+        above = ("initial_std", "learning_rate", "desired_kl", "final_kl", "clip", "max_grad_norm")
+        wrong = [name for name in whole if getattr(self, name) < 1] + [name for name in above if getattr(self, name) <= 0.0]
+        wrong += [name for name in ("discount", "gae_lambda") if not 0.0 < getattr(self, name) <= 1.0]
+        wrong += [name for name in ("entropy", "value_coefficient", "critic_first") if getattr(self, name) < 0.0]
+        wrong += [name for name in ("hidden", "critic") if any(width < 1 for width in getattr(self, name))]
+        wrong += [] if self.hidden else ["hidden"]
+        if wrong:
+            given = ", ".join(f"{name} {getattr(self, name)}" for name in wrong)
+            raise ConfigError(
+                f"ppo: {given}; expected whole numbers of 1 or more, shares of 0 to 1, positive rates and at least one layer"
+            )
+
+    def __post_init__(self) -> None:
+        counts = {name: getattr(self, name) for name in ("environments", "steps", "iterations", "epochs", "minibatches")}
+        if min(counts.values()) < 1 or not self.hidden or min(self.hidden) < 1:
+            raise ConfigError(f"ppo: {counts} and hidden layers of {self.hidden}; expected 1 or more of each")
+        require_positive(
+            "ppo", initial_std=self.initial_std, learning_rate=self.learning_rate, clip=self.clip, max_grad_norm=self.max_grad_norm
+        )
+        for name in ("discount", "gae_lambda"):
+            if not 0.0 < getattr(self, name) <= 1.0:
+                raise ConfigError(f"ppo.{name} is {getattr(self, name)}; expected a number above 0 and up to 1")
 
 
 @dataclass(frozen=True)
@@ -143,8 +186,9 @@ class FirstOrderParams:
     iterations: int = 1000  # gradients
     horizon: int = 48  # of a flight [control steps]; the latch trips near the 35th
     decay: float = 0.92  # of derivatives, per step backward
-    learning_rate: float = 3e-3  # at the first iteration
-    final_rate: float = 1e-4  # at the last one; half a cosine between
+    learning_rate: float = 2e-3  # at the first iteration
+    adapting_rate: float = 3e-4  # in its place where the training starts from a policy
+    final_rate: float = 5e-5  # at the last one; half a cosine between
     max_grad_norm: float = 1.0
     width: float = 0.5  # of the hazard at the first iteration, in units of the fifth action
     final_width: float = 0.05
@@ -155,10 +199,10 @@ class FirstOrderParams:
     saturation: float = 1.0  # cost of the square that an action is past its limits by
 
     def __post_init__(self) -> None:
-        if not (0.0 <= self.free[0] < self.free[1] and self.sharp > 0.0 and 0.0 < self.final_width <= self.width):
+        if not (self.iterations > 0 and 0.0 <= self.free[0] < self.free[1] and self.sharp > 0.0 and 0.0 < self.final_width <= self.width):
             raise ConfigError(
-                f"first_order: free {self.free}, sharp {self.sharp}, widths {self.width} to {self.final_width}; expected an "
-                "ascending range, a share above 0 and widths above 0 that do not grow"
+                f"first_order: iterations {self.iterations}, free {self.free}, sharp {self.sharp}, widths {self.width} to "
+                f"{self.final_width}; expected 1 or more, an ascending range, a share above 0, widths above 0 that do not grow"
             )
 
 
@@ -214,13 +258,6 @@ class Experiment:
         return self.ppo.environments * (self.first_order.horizon if self.algorithm == "first_order" else self.ppo.steps)
 
     def __post_init__(self) -> None:
-        if self.first_order.iterations < 1:
-            raise ConfigError(f"first_order.iterations is {self.first_order.iterations}; expected 1 or more")
-        if self.ppo.environments < 1 or self.ppo.steps < 1 or self.ppo.iterations < 1:
-            raise ConfigError(
-                f"ppo: {self.ppo.environments} environments, {self.ppo.steps} steps, {self.ppo.iterations} iterations; "
-                "expected 1 or more of each"
-            )
         low, high = self.task.observation.latency
         if not 0.0 <= low <= high <= self.sim.control_period:
             raise ConfigError(

@@ -11,11 +11,9 @@ import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
-from urllib.parse import quote
 
 import numpy as np
 
@@ -36,10 +34,6 @@ MOST_SHOWN = 100
 
 TRAIL = 300
 """Poses whose places stay drawn: three seconds at 100 Hz."""
-
-HOST = "127.0.0.1"
-WEB_PORT, DATA_PORT = 9090, 9876
-"""Of rerun's web viewer and of its data; only this machine is listened to."""
 
 BODY_CHANNELS = {VEHICLE: "pos_w", PAYLOAD: "payload_pos_w"}
 
@@ -210,49 +204,6 @@ def write(folder: str | Path, path: str | Path) -> None:
             show.take(course.ticks[first : first + MOST_SHOWN // 10])
 
 
-@contextmanager
-def web_viewer(goal_w: tuple[float, float, float], web_port: int = WEB_PORT, data_port: int = DATA_PORT) -> Iterator[Any]:
-    """Serve rerun's web viewer to this machine alone; gives the stream that it shows.
-
-    Raises:
-        RunError: a port is taken.
-    """
-    import rerun as rr
-
-    from visthrow.view import rerun_view
-
-    command = [sys.executable, "-m", "rerun", "--serve-web", "--bind", HOST, "--port", str(data_port)]
-    command += ["--web-viewer-port", str(web_port), "--server-memory-limit", "500MB"]
-    server = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, stdin=subprocess.DEVNULL)
-    data = f"rerun+http://{HOST}:{data_port}/proxy"
-    try:
-        if not _answers(server, web_port):
-            raise RunError(f"the viewer did not start; are ports {web_port} and {data_port} free? name others")
-        stream = rr.RecordingStream("visthrow", recording_id=None)
-        layout = rerun_view.blueprint(np.array(goal_w), {"state"})
-        stream.connect_grpc(data, default_blueprint=layout)
-        print(f"look at http://{HOST}:{web_port}?url={quote(data, safe='')}", file=sys.stderr, flush=True)
-        yield stream
-        stream.flush()
-    finally:
-        server.terminate()
-        server.wait(5)
-
-
-def _answers(server: subprocess.Popen, port: int) -> bool:
-    """Whether a server of ours listens on a port within half a minute."""
-    import socket
-
-    for _ in range(300):
-        time.sleep(0.1)
-        if server.poll() is not None:
-            return False
-        with socket.socket() as probe:
-            if probe.connect_ex((HOST, port)) == 0:
-                return True
-    return False
-
-
 def beside(folder: Path) -> subprocess.Popen:
     """Start the live view of a run in a process of its own, at the lowest priority."""
     command = [sys.executable, "-m", "visthrow.cli", "hil", "view", str(folder), "--live"]
@@ -265,8 +216,11 @@ def run(folder: Path, live: bool, out: str | None, web_port: int, data_port: int
     from hil.recording.report import finish
 
     if live:
-        params = Follower(folder).params
-        with web_viewer(params.goal_w, web_port, data_port) as stream:
+        from visthrow.view import rerun_view
+        from visthrow.view.live import web_viewer
+
+        layout = rerun_view.blueprint(np.array(Follower(folder).params.goal_w), {"state"})
+        with web_viewer(layout, web_port, data_port) as stream:
             dropped = follow(folder, stream)
             print(f"the run is over; {dropped} ticks were left out of the view. Ctrl-C closes the viewer", file=sys.stderr)
             while True:

@@ -8,7 +8,6 @@ import warp as wp
 
 from sim.arrays import runtime  # noqa: F401  starts Warp
 from sim.arrays import state as st
-from sim.arrays.checks import check_air, check_numerics, check_release
 from sim.arrays.cores import cores, in_pieces
 from sim.arrays.structs import Types, kinds_of, pack, pack_air, pack_rope, pack_vehicle, ropes_on, types
 from sim.effects.laws import check_laws, structure
@@ -91,10 +90,6 @@ class Replay:
                 f"{len(plants)} plants of {sorted({p.rope.segments for p in plants})} segments with {len(sensings)} sensings: "
                 "expected one number of segments and a sensing each"
             )
-        check_numerics(first.sim)
-        for plant in plants:
-            check_release(plant.release)
-            check_air(plant.air)
         self.device, self.gravity, self.segments, self._sim = device, gravity, first.rope.segments, first.sim
         self._download = download
         self.types = t = types(precision)

@@ -1,8 +1,12 @@
 """Training: what a run leaves behind, resuming, interruption, a full disk. Tiny networks and batches."""
 
 import errno
+import json
 import os
 import signal
+import subprocess
+import sys
+import time
 
 import numpy as np
 import pytest
@@ -10,7 +14,7 @@ import torch
 
 from visthrow import cli, config
 from visthrow.common import storage
-from visthrow.onboard.policy import Policy
+from visthrow.onboard.policy import Policy, find_policy
 from visthrow.task import Experiment, contract_of
 from visthrow.training.trainer import CHECKPOINT, Trainer
 
@@ -75,23 +79,110 @@ def test_resume_goes_on_bit_for_bit(whole, tmp_path):
     assert (folder / "progress.csv").read_text().count("\n") == 1 + 4
 
 
-def test_ctrl_c_keeps_what_was_done(whole, tmp_path, monkeypatch, capsys):
+def iterations_of(folder) -> list[int]:
+    """First column of the log, to see that none is missing or made twice."""
+    return [int(row.split(",")[0]) for row in (folder / "progress.csv").read_text().splitlines()[1:]]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=["Ctrl-C", "SIGTERM"])
+def test_a_signal_leaves_checkpoint_and_policy_and_the_printed_command_goes_on(whole, tmp_path, monkeypatch, capsys, number):
     folder = tmp_path / "run"
-    learn = Trainer.step
+    step = Trainer.step
 
     def interrupted(self):
         if self.iteration == 1:
-            os.kill(os.getpid(), signal.SIGINT)  # in the middle of the second iteration
-        return learn(self)
+            os.kill(os.getpid(), number)  # in the middle of the second iteration
+        return step(self)
 
     monkeypatch.setattr(Trainer, "step", interrupted)
     assert train(folder) == 130
-    assert "--resume" in capsys.readouterr().err
-    assert (folder / "progress.csv").read_text().count("\n") == 1 + 2
-    monkeypatch.setattr(Trainer, "step", learn)
-    assert train(folder, "--resume") == 0
+    assert iterations_of(folder) == [1, 2]
+    stopped = Policy.load(folder / "policy.npz")
+    assert stopped.made_by["figures"]["iterations"] == 2
+    assert len(json.loads((folder / "evaluation.json").read_text())["figures"]["throws"]) == 3
+    assert not (folder / "summary.json").exists()
+    command = capsys.readouterr().err.split("go on with: visthrow ")[1].split("\n")[0]
+    monkeypatch.setattr(Trainer, "step", step)
+    assert cli.main([*command.split(), "--device", "cpu"]) == 0  # without --set: the folder has its configuration
+    assert iterations_of(folder) == [1, 2, 3, 4]
+    assert (folder / "summary.json").exists()
+    assert not (folder / "evaluation.json").exists()
     for a, b in zip(weights(whole), weights(folder), strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+def test_a_process_that_is_killed_goes_on_bit_for_bit(whole, tmp_path):
+    folder = tmp_path / "run"
+    words = ["train", "laptop", "--device", "cpu", "--out", str(folder), "--checkpoint-every", "1"]
+    changes = [word for item in [*SMALL[:3], "ppo.iterations=4", SMALL[4]] for word in ("--set", item)]
+    slowed = (
+        "import sys, time; from visthrow import cli; from visthrow.training.trainer import Trainer; step = Trainer.step; "
+        "Trainer.step = lambda self: (time.sleep(1.0 if self.iteration == 2 else 0.0), step(self))[1]; cli.main(sys.argv[1:])"
+    )
+    run = subprocess.Popen(
+        [sys.executable, "-c", slowed, *words, *changes], stdout=subprocess.DEVNULL, env={**os.environ, "OMP_NUM_THREADS": "1"}
+    )
+    while run.poll() is None and not ((folder / "progress.csv").exists() and len(iterations_of(folder)) == 2):
+        time.sleep(0.01)
+    run.kill()
+    assert run.wait() == -signal.SIGKILL
+    assert train(folder, "--resume") == 0
+    assert iterations_of(folder) == [1, 2, 3, 4]
+    for a, b in zip(weights(whole), weights(folder), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_minutes_leave_a_policy(tmp_path, capsys):
+    folder = tmp_path / "run"
+    assert train(folder, "--minutes", "1e-6") == 130
+    assert iterations_of(folder) == [1]
+    assert Policy.load(folder / "policy.npz").made_by["figures"]["iterations"] == 1
+    assert "success" not in capsys.readouterr().out
+
+
+def test_a_policy_is_taken_up_and_an_error_that_it_has_ends_the_run(tmp_path, capsys):
+    """The critic alone learns at first, so the actor is the shipped one to the bit; it lands within a metre at once."""
+    folder = tmp_path / "run"
+    words = ["train", "laptop", "--from", "state", "--until", "1.0", "--evaluate-every", "1", "--out", str(folder)]
+    words += ["--device", "cpu", "--set", "ppo.environments=16", "--set", "ppo.steps=4", "--set", "rope.length=0.5"]
+    assert cli.main(words) == 0
+    assert iterations_of(folder) == [1]
+    shipped, taken = Policy.load(find_policy("state")), Policy.load(folder / "policy.npz")
+    for a, b in zip([*shipped.weights, *shipped.biases], [*taken.weights, *taken.biases], strict=True):
+        torch.testing.assert_close(a, b, rtol=0, atol=0)
+    torch.testing.assert_close(taken.mean, shipped.mean, atol=1e-4, rtol=0)
+    torch.testing.assert_close(taken.std, shipped.std, atol=1e-4, rtol=1e-4)
+    assert taken.contract["rope"]["length"] == 0.5
+    assert json.loads((folder / "provenance.json").read_text())["from"]["policy"] == "state"
+    assert "landed" in capsys.readouterr().out
+
+
+def test_a_policy_of_another_task_is_not_taken_up(tmp_path, capsys):
+    assert train(tmp_path / "a", "--from", "vision") == 2
+    message = capsys.readouterr().err
+    assert "--from" in message
+    assert "observation.layout" in message
+    assert not (tmp_path / "a").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--iterations", "-3"], "--iterations -3"),
+        (["--evaluate-every", "-1"], "--evaluate-every -1"),
+        (["--minutes", "0"], "--minutes 0"),
+        (["--until", "-0.1"], "--until -0.1"),
+        (["--set", "vehicle.body.mass=-1"], "mass"),
+        (["--set", "rope.length=-0.2"], "length"),
+        (["--set", "ppo.epochs=0"], "epochs 0"),
+        (["--set", "ppo.learning_rate=-1e-3"], "learning_rate -0.001"),
+        (["--resume", "--from", "state"], "--from"),
+    ],
+)
+def test_what_cannot_be_trained_is_refused_before_a_folder_is_made(tmp_path, capsys, words, said):
+    assert train(tmp_path / "a", *words) == 2
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "a").exists()
 
 
 def test_full_disk_says_so_and_loses_nothing(whole, tmp_path, monkeypatch, capsys):
@@ -135,7 +226,16 @@ def test_resume_under_another_seed_is_refused(tmp_path, capsys):
     folder = tmp_path / "run"
     assert train(folder, "--iterations", "1") == 0
     assert train(folder, "--resume", "--seed", "2") == 2
-    assert "another configuration or seed" in capsys.readouterr().err
+    assert "another seed, 1" in capsys.readouterr().err
+
+
+def test_resume_under_another_configuration_is_refused(tmp_path, capsys):
+    folder = tmp_path / "run"
+    assert train(folder, "--iterations", "1") == 0
+    assert train(folder, "--resume", "--set", "ppo.clip=0.3") == 2
+    assert "another configuration" in capsys.readouterr().err
+    assert cli.main(["train", "vision", "--resume", "--out", str(folder), "--device", "cpu"]) == 2
+    assert "another configuration than vision" in capsys.readouterr().err
 
 
 def test_unknown_names_and_indivisible_batches_are_refused(tmp_path, capsys):

@@ -87,7 +87,8 @@ def test_wrong_content_is_named(tmp_path, name, old, new, message):
 
 def test_a_lens_that_folds_inside_its_field_of_view_is_refused(tmp_path):
     path = tmp_path / "ros.yaml"
-    files.write_ros(path, FisheyeParams(640, 480, 160.0, 160.0, 320.0, 240.0, k1=-0.3, fov_deg=200.0))
+    files.write_ros(path, FisheyeParams(640, 480, 160.0, 160.0, 320.0, 240.0, k1=-0.3, fov_deg=100.0))
+    path.write_text(path.read_text().replace("100.0", "200.0"))
     with pytest.raises(ValueError, match=r"ros\.yaml: theta_d"):
         files.read_ros(path)
 

@@ -96,15 +96,25 @@ def write_run_folder(folder: str | Path, run_config: Any, *, resume: bool = Fals
     """
     folder = Path(folder)
     record = {**collect(), **extra}
-    if (folder / "config.toml").exists():
-        if not resume:
-            raise StorageError(f"{folder} holds a run already; name another folder, or resume it")
+    if not resume:
+        check_free(folder)
+    elif (folder / "config.toml").exists():
         count = len(list(folder.glob("provenance*.json")))
         write_json(folder / f"provenance_{count}.json", record)
         return record
     atomic_write(folder / "config.toml", config.dumps(run_config))
     write_json(folder / "provenance.json", record)
     return record
+
+
+def check_free(folder: str | Path) -> None:
+    """Refuse a folder that holds a run.
+
+    Raises:
+        StorageError: it does.
+    """
+    if (Path(folder) / "config.toml").exists():
+        raise StorageError(f"{folder} holds a run already; name another folder, or resume it")
 
 
 def _git(root: Path, *arguments: str) -> str:

@@ -14,6 +14,7 @@ SCHEMAS = {
     "task": "visthrow.task:TaskParams",
     "start": "sim.params:RandomizationParams",
     "train": "visthrow.task:Experiment",
+    "ppo": "visthrow.task:PPOParams",
     "sweep": "visthrow.evidence.sweep.lists:SweepList",
     "hil": "hil.params:HilParams",
     "diagnose": "visthrow.diagnose.inputs.setup:Setup",
@@ -33,6 +34,11 @@ def schema_of(kind: str, name: str = "") -> type:
         raise ConfigError(f"no kind of config '{kind}'; {suggest(kind, (key for key in SCHEMAS if '/' not in key))}")
     module, attribute = target.split(":")
     return getattr(importlib.import_module(module), attribute)
+
+
+def kinds_of(schema: type) -> list[str]:
+    """Return the folders of configs whose files fill a schema: none for one that no shipped config has."""
+    return [key for key, target in SCHEMAS.items() if target == f"{schema.__module__}:{schema.__name__}" and "/" not in key]
 
 
 def schema_of_file(path: str | Path) -> type:

@@ -1,18 +1,30 @@
-"""Progress of a training run: a line on the terminal, a CSV row an iteration."""
+"""Progress of a training run: a picture on the terminal, lines where there is none, a CSV row an iteration."""
 
 import csv
 import io
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 
 from visthrow.common.storage import atomic_write
+from visthrow.training.protocol import Throws
+from visthrow.view import terminal
 
 COLUMNS = (
     "iteration", "released", "landing_error", "duration", "episodes", "value", "surrogate", "entropy", "learning_rate",
-    "rollout_s", "learning_s", "wall_s", "error_2m", "duration_2m",
+    "rollout_s", "learning_s", "wall_s", "error_2m", "duration_2m", "landed_2m",
 )  # fmt: skip
+
+REDRAWN = 0.5
+"""Between two pictures [s]."""
+
+CURVE, SCATTER = (56, 10), (22, 10)
+"""Width and height of the two plots, in characters."""
+
+REACH = 0.3
+"""Half of the square about the target that the scatter shows [m]."""
 
 
 class TrainLog:
@@ -21,7 +33,7 @@ class TrainLog:
     A resumed run keeps the rows up to its checkpoint and drops later ones, a torn last row included: they are made again.
     """
 
-    def __init__(self, path: Path, samples: int, last: int, done: int = 0):
+    def __init__(self, path: Path, samples: int, last: int, done: int = 0, minutes: float | None = None):
         """Open the file.
 
         Args:
@@ -29,14 +41,18 @@ class TrainLog:
             samples: environment steps an iteration.
             last: iteration that the run ends at.
             done: iterations that a resumed run has behind it.
+            minutes: that it may take, where they are limited.
         """
-        self.samples, self.last, self.start = samples, last, time.perf_counter()
+        self.samples, self.last, self.done, self.minutes = samples, last, done, minutes
         rows = _rows(path, done) if done and path.exists() else []
         text = io.StringIO()
         writer = csv.DictWriter(text, COLUMNS, extrasaction="ignore", lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
         atomic_write(path, text.getvalue())
+        self._before = float(rows[-1]["wall_s"]) if rows else 0.0
+        self._picture = Picture(rows) if sys.stdout.isatty() else None
+        self._start = time.perf_counter()
         self._file = path.open("a", newline="", encoding="utf-8")
         self._writer = csv.DictWriter(self._file, COLUMNS, extrasaction="ignore", lineterminator="\n")
 
@@ -50,35 +66,88 @@ class TrainLog:
             if error is None:
                 raise
 
-    def row(self, figures: dict) -> None:
-        """Write one iteration's figures.
+    def row(self, figures: dict, throws: Throws | None = None) -> None:
+        """Write one iteration's figures and, where it ended in throws, what came of them.
 
         Raises:
             OSError: the disk is full or gone.
         """
-        wall = time.perf_counter() - self.start
-        self._writer.writerow(figures | {"wall_s": wall})
+        gone = time.perf_counter() - self._start
+        figures = figures | {"wall_s": self._before + gone} | (evaluated(throws) if throws is not None else {})
+        self._writer.writerow(figures)
         self._file.flush()
         speed = self.samples / (figures["rollout_s"] + figures["learning_s"]) / 1e6
         text = (
             f"iteration {figures['iteration']}/{self.last}  {speed:.2f} M steps/s  released {100 * figures['released']:.0f} %  "
-            f"landing error {figures['landing_error']:.3f} m  {wall:.0f} s"
+            f"landing error {figures['landing_error']:.3f} m  {terminal.clock(figures['wall_s'])}, "
+            f"{terminal.clock(self._left(figures['iteration'], gone))} left"
         )
-        lead = "\r" if sys.stdout.isatty() else ""
-        if "error_2m" in figures:
-            print(f"{lead}{text}  at 2.0 m: {figures['error_2m']:.4f} m, {figures['duration_2m']:.3f} s", flush=True)
-        elif lead:
-            print(f"{lead}{text}   ", end="", flush=True)
+        if self._picture is not None:
+            self._picture.draw(text, figures, throws)
+        elif throws is not None:
+            print(f"{text}  at 2.0 m: {told(figures)}", flush=True)
         elif figures["iteration"] % 25 == 0:
             print(text, flush=True)
+
+    def _left(self, iteration: int, gone: float) -> float:
+        """Time to the last iteration or the end of the minutes at the speed so far [s]."""
+        left = (self.last - iteration) * gone / max(iteration - self.done, 1)
+        return left if self.minutes is None else min(left, 60.0 * self.minutes - gone)
+
+
+class Picture:
+    """Landing error against wall time, and where the last evaluation's throws landed, drawn over itself."""
+
+    def __init__(self, rows: Sequence[dict]):
+        """Begin with the rows of a resumed run."""
+        self._training = [(float(row["wall_s"]), float(row["landing_error"])) for row in rows if row["landing_error"]]
+        self._thrown = [(float(row["wall_s"]), float(row["error_2m"])) for row in rows if row["error_2m"]]
+        self._last: Throws | None = None
+        self._said, self._lines, self._drawn = "no evaluation yet", 0, 0.0
+
+    def draw(self, text: str, figures: dict, throws: Throws | None) -> None:
+        """Take an iteration's figures; draw where the last picture is old or there are throws."""
+        self._training.append((figures["wall_s"], figures["landing_error"]))
+        if throws is not None:
+            self._thrown.append((figures["wall_s"], figures["error_2m"]))
+            self._last, self._said = throws, told(figures)
+        now = time.perf_counter()
+        if throws is None and now - self._drawn < REDRAWN:
+            return
+        self._drawn = now
+        lines = [text, *self.lines()]
+        up = f"\x1b[{self._lines}A" if self._lines else ""
+        print(up + "".join(f"\x1b[2K{line}\n" for line in lines), end="", flush=True)
+        self._lines = len(lines)
+
+    def lines(self) -> list[str]:
+        """The picture without its head line."""
+        left = terminal.curve([(".", self._training), ("o", self._thrown)], *CURVE, "[m]")
+        points = []
+        if self._last is not None:
+            good, middle = self._last.success, (self._last.target, 0.0)
+            offsets = (self._last.landing_w if self._last.goal_w is None else self._last.landing_w - self._last.goal_w + middle) - middle
+            points = [(-float(y), float(x)) for x, y in offsets[good]]
+        right = terminal.scatter(points, REACH, *SCATTER)
+        heads = ["landing error: . training, o throws at 2.0 m"], [f"landings within {REACH:g} m: {self._said}"]
+        return terminal.beside([*heads[0], *left], [*heads[1], *right])
+
+
+def evaluated(throws: Throws) -> dict[str, float]:
+    """Columns of an evaluation; no error where none landed."""
+    row, nan = throws.summary(), float("nan")
+    return {"error_2m": row.get("error_mean", nan), "duration_2m": row.get("duration_mean", nan), "landed_2m": row["success"]}
+
+
+def told(figures: dict) -> str:
+    """An evaluation in words."""
+    return f"{figures['error_2m']:.4f} m, {figures['duration_2m']:.3f} s, landed {100 * figures['landed_2m']:.1f} %"
 
 
 def _rows(path: Path, done: int) -> list[dict]:
     """Whole rows of a log up to an iteration."""
     with path.open(newline="", encoding="utf-8") as file:
         rows = [
-            row
-            for row in csv.DictReader(file)
-            if (row.get("iteration") or "").isdigit() and row["duration_2m"] is not None
+            row for row in csv.DictReader(file) if (row.get("iteration") or "").isdigit() and row[COLUMNS[-1]] is not None
         ]
     return [row for row in rows if int(row["iteration"]) <= done]

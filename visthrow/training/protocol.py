@@ -19,6 +19,9 @@ from visthrow.training.env import ThrowEnv
 TARGETS = (1.5, 2.0, 2.5)
 """Targets along x [m]; the last lies outside the training distribution."""
 
+LANDED = 0.95
+"""Share of throws that must land before their mean error says anything of a policy."""
+
 
 @dataclass(frozen=True)
 class Throws:
@@ -40,6 +43,10 @@ class Throws:
     clearance: np.ndarray
     smoothness: np.ndarray
     goal_w: np.ndarray | None = None
+
+    def within(self, error: float) -> bool:
+        """Whether they land so near on average [m], and all but one in twenty land."""
+        return bool(self.success.mean() >= LANDED) and float(self.error[self.success].mean()) <= error
 
     def summary(self) -> dict[str, float]:
         """Mean and deviation of the successful throws, with the success rate."""

@@ -1,5 +1,6 @@
 """A training run: one algorithm, its evaluation, checkpoints that hold all state, and the policy that comes of it."""
 
+import dataclasses
 import io
 from pathlib import Path
 from typing import Protocol
@@ -9,15 +10,21 @@ from torch import Tensor
 
 from visthrow import config
 from visthrow.common import provenance
-from visthrow.common.errors import CheckpointError
+from visthrow.common.errors import CheckpointError, MismatchError
 from visthrow.common.storage import atomic_write, write_json
 from visthrow.onboard.policy import Policy
 from visthrow.task import Experiment, contract_of
 from visthrow.training import protocol
 from visthrow.training.env import ThrowEnv
 
-CHECKPOINT = "checkpoint.pt"
-POLICY = "policy.npz"
+CHECKPOINT, POLICY, SUMMARY, EVALUATION = "checkpoint.pt", "policy.npz", "summary.json", "evaluation.json"
+"""Of a run's folder: the last iteration's state, the policy, the figures of a run that came to its end, and of one that did not."""
+
+ADAPTATION = 'ppo="ppo/adapt.toml"'
+"""Override that puts the schedule of a training from a policy in the place of the configuration's own."""
+
+TASK = ("observation", "action", "control_period")
+"""Parts of a policy's contract that its network cannot do without; plant, camera and release may differ from its training's."""
 
 
 class Algorithm(Protocol):
@@ -50,6 +57,9 @@ class Algorithm(Protocol):
     def export(self, contract: dict, made_by: dict) -> Policy:
         """The policy as a file's content."""
 
+    def take_up(self, policy: Policy) -> None:
+        """Start from a policy of the same layers: its weights, and its normaliser, which hardly moves from there."""
+
     def state_dict(self) -> dict:
         """Tensors and numbers that the next iteration depends on, besides torch's generators."""
 
@@ -66,6 +76,21 @@ def build(experiment: Experiment, device: str, seed: int, ranks: dict | None) ->
     from visthrow.training.ppo.algorithm import PPOTraining
 
     return PPOTraining(experiment, device, seed, ranks)
+
+
+def fitted(experiment: Experiment, policy: Policy) -> Experiment:
+    """The experiment with the policy's layers as its actor's, for a training that starts from the policy.
+
+    Raises:
+        MismatchError: the experiment's task observes or acts otherwise; the message names every difference.
+    """
+    try:
+        policy.require(contract_of(experiment), TASK, allow=("observation.latency",))
+    except MismatchError as error:
+        raise MismatchError(f"--from: the task of this run is not the policy's; {error}") from None
+    p, hidden = experiment.ppo, tuple(len(bias) for bias in policy.biases[:-1])
+    layers = {"hidden": hidden, "critic": p.critic or p.hidden, "activation": policy.activation}
+    return dataclasses.replace(experiment, ppo=dataclasses.replace(p, **layers, normalize=policy.mean is not None))
 
 
 class Trainer:
@@ -103,9 +128,17 @@ class Trainer:
             self.seconds[part] += figures[f"{part}_s"]
         return figures | {"iteration": self.iteration}
 
+    def take_up(self, policy: Policy) -> None:
+        """Start from a policy that :func:`fitted` found to fit."""
+        self.algorithm.take_up(policy)
+
+    def throw(self, target: float, count: int = 200, seed: int = 12345) -> protocol.Throws:
+        """Throws from hover with the current policy; see :mod:`visthrow.training.protocol`."""
+        return protocol.throw(self.experiment, self.algorithm.act, target, count, self.device, seed)
+
     def evaluate(self, target: float, count: int = 200, seed: int = 12345) -> dict[str, float]:
-        """Summary of throws from hover with the current policy; see :mod:`visthrow.training.protocol`."""
-        return protocol.throw(self.experiment, self.algorithm.act, target, count, self.device, seed).summary()
+        """Summary of :meth:`throw`."""
+        return self.throw(target, count, seed).summary()
 
     def save(self, path: Path) -> None:
         """Write a checkpoint that a resumed run goes on from as if it had not stopped; all or nothing."""
@@ -148,8 +181,8 @@ class Trainer:
             torch.cuda.set_rng_state(saved["cuda_rng"].cpu(), self.device)
 
 
-def finish(trainer: Trainer, folder: Path, figures: dict) -> Policy:
-    """Write the policy file and the run's summary into its folder."""
+def finish(trainer: Trainer, folder: Path, figures: dict, finished: bool = True) -> Policy:
+    """Write the policy and its figures into the run's folder; a summary only where the run came to its end."""
     made_by = provenance.collect() | {
         "seed": trainer.seed,
         "config": config.to_dict(trainer.experiment, defaults=False),  # readable when fields come and go
@@ -157,5 +190,7 @@ def finish(trainer: Trainer, folder: Path, figures: dict) -> Policy:
     }
     policy = trainer.algorithm.export(contract_of(trainer.experiment), made_by)
     policy.save(folder / POLICY)
-    write_json(folder / "summary.json", {k: v for k, v in made_by.items() if k != "config"})
+    write_json(folder / (SUMMARY if finished else EVALUATION), {k: v for k, v in made_by.items() if k != "config"})
+    if finished:
+        (folder / EVALUATION).unlink(missing_ok=True)
     return policy

@@ -42,12 +42,36 @@ def write(path: str | Path, log: FlightLog, experiment: Any) -> None:
         StorageError: the place cannot be written.
     """
     with recording(path, blueprint(np.array(log.meta["goal_w"]), set(log.channels))) as stream:
-        still(stream, log.meta["goal_w"], experiment)
-        send(stream, log)
-        if "landing" in log:
-            _landing(stream, log)
-        for name, entity, _ in TRAILS:
-            _trail(stream, log, name, entity)
+        whole(stream, log, experiment)
+
+
+def show(address: str, name: str, log: FlightLog, experiment: Any, landings_w: np.ndarray) -> None:
+    """Send a flight to a viewer as a recording of its own.
+
+    Args:
+        address: of a viewer; see :func:`visthrow.view.live.served`.
+        name: of the recording.
+        log, experiment: as of :func:`write`.
+        landings_w: where other throws came down, to be drawn with it [m], shape (N, 2).
+    """
+    stream = rr.RecordingStream("visthrow", recording_id=name)
+    stream.connect_grpc(address, default_blueprint=blueprint(np.array(log.meta["goal_w"]), set(log.channels)))
+    stream.send_recording_name(name)
+    whole(stream, log, experiment)
+    places = np.column_stack((landings_w, np.full(len(landings_w), 0.004))).astype(np.float32)
+    stream.log("world/landings", rr.Points3D(places, radii=0.008, colors=[_colour(style.PAYLOAD, 150)]), static=True)
+    stream.flush()
+    stream.disconnect()
+
+
+def whole(stream: rr.RecordingStream, log: FlightLog, experiment: Any) -> None:
+    """Send all of a flight; arguments as of :func:`write`."""
+    still(stream, log.meta["goal_w"], experiment)
+    send(stream, log)
+    if "landing" in log:
+        _landing(stream, log)
+    for name, entity, _ in TRAILS:
+        _trail(stream, log, name, entity)
 
 
 @contextmanager

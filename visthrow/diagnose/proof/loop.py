@@ -51,7 +51,7 @@ COMMITTED = RECORDS / "loops"
 WHO = ("before", "after", "oracle")
 """The policies that are compared."""
 
-POLICY, CHECKPOINT = "policy.npz", "checkpoint.pt"
+POLICY, CHECKPOINT, SUMMARY = "policy.npz", "checkpoint.pt", "summary.json"
 """Of a training's folder, as :mod:`visthrow.training.trainer` names them; that one is heavy to import."""
 
 RECORD = "record.json"
@@ -138,7 +138,7 @@ class Loop:
     def _train(self, name: str, say: Callable[[str], None]) -> None:
         """Train a policy in a process of its own; the oracle's model is the hidden one."""
         flown = self.folder / f"throws_{'after' if name == 'extended' else name}.json"
-        if (self.folder / name / POLICY).exists() or flown.exists():
+        if (self.folder / name / SUMMARY).exists() or flown.exists():
             return
         source = self.folder / ("hidden.toml" if name == "oracle" else f"{name}.toml")
         command = [sys.executable, "-m", "visthrow.cli", "train", str(source), "--out", str(self.folder / name)]

@@ -8,7 +8,7 @@ KINDS = {
     "sim": ("the simulator: on a CPU core against MuJoCo C, on a GPU against MuJoCo Warp", "visthrow.evidence.bench.sim.command"),
     "camera": ("keypoints of thousands of environments against kornia and OpenCV", "visthrow.evidence.bench.camera"),
     "detector": ("recall, precision and pixel error of the keypoint detector on rendered frames", "visthrow.evidence.bench.detector"),
-    "train": ("where the wall time of a training iteration goes", "visthrow.evidence.bench.iteration"),
+    "train": ("where the wall time of a training goes: in an iteration, or to an error", "visthrow.evidence.bench.iteration"),
     "hil": ("the HIL runner over loopback: latency and soak, throws over the wire, faults", "visthrow.evidence.bench.hil.command"),
     "mpc": ("a step of the baseline's controller, and its tracking error", "visthrow.evidence.bench.mpc"),
     "explain": ("seconds of a diagnosis and of its report, on logs of one's own", "visthrow.evidence.bench.explain"),
@@ -24,10 +24,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
         "examples:\n"
         "  visthrow bench sim                             one CPU core against MuJoCo C on the same rope\n"
+        "  visthrow bench sim --threads 2                 two threads of a CPU against one\n"
         "  visthrow bench sim --device cuda               steps a second over batch sizes on a GPU\n"
         "  visthrow bench camera                          keypoints on the CPU, and on the GPU if there is one\n"
         "  visthrow bench detector --out out/sheet.png    the ball and goal detector by nuisance, 15 minutes\n"
         "  visthrow bench train state --device cuda       simulation, environment, inference and learning\n"
+        "  visthrow bench train laptop --until 0.06 0.04  seconds of a whole training to these errors, over seeds\n"
         "  visthrow bench hil --minutes 1                 message in to command out, missed ticks, memory\n"
         "  visthrow bench hil --throws 60 --policy state  throws over the wire, and the same without it\n"
         "  visthrow bench mpc                             a step of the baseline's controller; needs piqp\n"
@@ -44,10 +46,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     detector.add_argument("--seed", type=int, default=0, help="of the scenes")
     detector.add_argument("--jobs", type=int, metavar="N", help="processes at once (default: one a core)")
     detector.add_argument("--out", metavar="FILE", help="write a contact sheet of the first scenes there, .png")
-    train.add_argument(
-        "config", metavar="CONFIG", nargs="?", default="state", help="training configuration (default: state)"
-    )
+    train.add_argument("configs", metavar="CONFIG", nargs="*", default=["state"], help="training configurations (default: state)")
     train.add_argument("--iterations", type=int, default=5, metavar="N", help="iterations measured (default: 5)")
+    train.add_argument(
+        "--until", type=float, nargs="+", metavar="ERROR", help="train until throws at 2.0 m land so near on average [m], and time that"
+    )
+    train.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3, 4, 5], metavar="N", help="of the trainings (default: 1 to 5)")
+    train.add_argument("--minutes", type=float, default=30.0, metavar="T", help="that a training may take (default: 30)")
     _add_hil(hil)
     opening.add_arguments(explain)
     explain.add_argument("--no-report", action="store_true", help="measure the verdicts only")
@@ -104,6 +109,9 @@ def _add_sim(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--seconds", type=float, default=1.0, metavar="S", help="wall time of one measurement, about (default: 1)"
+    )
+    parser.add_argument(
+        "--threads", type=int, default=1, metavar="N", help="measure N threads of a CPU against one instead of MuJoCo (default: 1)"
     )
     parser.add_argument("--without-mujoco", action="store_true", help="measure this simulator alone")
 

@@ -124,16 +124,26 @@ def split(total: dict[str, float], parts: dict[str, float]) -> dict[str, float]:
 
 def run(args: argparse.Namespace) -> int:
     """Measure a training iteration."""
-    if args.iterations < 1 or args.repeats < 1:
-        raise VisthrowError(f"--iterations {args.iterations}, --repeats {args.repeats}: expected positive numbers")
+    wrong = args.iterations < 1 or args.repeats < 1 or args.minutes <= 0.0 or any(error <= 0.0 for error in args.until or ())
+    if wrong:
+        raise VisthrowError(
+            f"--iterations {args.iterations}, --repeats {args.repeats}, --minutes {args.minutes}, --until {args.until}: "
+            "expected positive numbers"
+        )
     from visthrow.task import Experiment
     from visthrow.training import device
 
-    path = config.find("train", args.config)
-    experiment = config.load(Experiment, path, args.overrides)
-    return records.finish(
-        measure(experiment, path.stem, device.resolve(args.device), args.iterations, args.repeats), args
-    )
+    paths = [config.find("train", name) for name in args.configs]
+    experiments = {path.stem: config.load(Experiment, path, args.overrides) for path in paths}
+    name = device.resolve(args.device)
+    if args.until:
+        from visthrow.evidence.bench import time_to_error
+
+        return records.finish(time_to_error.measure(experiments, name, args.until, args.seeds, args.minutes), args)
+    if len(experiments) > 1:
+        raise VisthrowError(f"{' '.join(experiments)}: an iteration is measured of one configuration; several with --until")
+    (stem, experiment), *_ = experiments.items()
+    return records.finish(measure(experiment, stem, name, args.iterations, args.repeats), args)
 
 
 def measure(experiment: Any, name: str, device: str, iterations: int, repeats: int) -> Report:

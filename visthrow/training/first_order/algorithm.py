@@ -103,6 +103,7 @@ class FirstOrder:
         self._drop = torch.tensor([0.0, 0.0, 0.5 * GRAVITY], **make)
         self._width, self._first = torch.zeros((), **make), torch.zeros((), **make)
         self._figures: dict[str, Tensor] = {}
+        self._adapting = False
         self._begin()
         on_gpu = device.startswith("cuda")
         rate = torch.tensor(self.p.learning_rate, **make) if on_gpu else self.p.learning_rate
@@ -282,9 +283,11 @@ class FirstOrder:
     def step(self, done: float) -> dict[str, float]:
         """One rollout and one step of Adam at this share of the training; returns its figures."""
         p, start = self.p, time.perf_counter()
-        self._width.fill_(p.width * (p.final_width / p.width) ** min(done / p.sharp, 1.0))
-        self._first.fill_(p.first_release * min(max((p.free[1] - done) / (p.free[1] - p.free[0]), 0.0), 1.0))
-        rate = p.final_rate + 0.5 * (p.learning_rate - p.final_rate) * (1.0 + math.cos(math.pi * done))
+        learnt = 1.0 if self._adapting else done
+        self._width.fill_(p.width * (p.final_width / p.width) ** min(learnt / p.sharp, 1.0))
+        self._first.fill_(p.first_release * min(max((p.free[1] - learnt) / (p.free[1] - p.free[0]), 0.0), 1.0))
+        highest = p.adapting_rate if self._adapting else p.learning_rate
+        rate = p.final_rate + 0.5 * (highest - p.final_rate) * (1.0 + math.cos(math.pi * done))
         for group in self.optimizer.param_groups:
             group["lr"] = group["lr"].fill_(rate) if isinstance(group["lr"], Tensor) else rate
         self.rollout()
@@ -326,15 +329,20 @@ class FirstOrder:
         """The policy as a file's content."""
         return Policy.from_actor_state(self.network.state_dict(), self.cfg.ppo.activation, contract, made_by)
 
+    def take_up(self, policy: Policy) -> None:
+        """Start from a policy of the same layers: it releases as it has learnt to, and the rate starts at that of adaptation."""
+        self.network.take_up(policy)
+        self._adapting = True
+
     def state_dict(self) -> dict:
         """All that the next iteration depends on, besides torch's generators."""
-        parts = {"network": self.network.state_dict(), "optimizer": self.optimizer.state_dict()}
+        parts = {"network": self.network.state_dict(), "optimizer": self.optimizer.state_dict(), "adapting": self._adapting}
         return {**parts, "surrogate": vars(self.surrogate), "env": self.env.state_dict()}
 
     def load_state_dict(self, saved: dict, own_throws: bool = True) -> None:
         """Take up a state of :meth:`state_dict`; its environment too where ``own_throws`` is set."""
         self.network.load_state_dict(saved["network"])
         self.optimizer.load_state_dict(saved["optimizer"])
-        self.surrogate = Surrogate(**saved["surrogate"])
+        self.surrogate, self._adapting = Surrogate(**saved["surrogate"]), saved["adapting"]
         if own_throws:
             self.env.load_state_dict(saved["env"])

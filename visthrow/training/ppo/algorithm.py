@@ -21,7 +21,6 @@ def rsl_rl_config(p: PPOParams, ranks: dict | None) -> dict:
     """Configuration dictionary of rsl_rl 5.5 for our parameters; both observation groups are named."""
     network = {
         "class_name": Network,
-        "hidden_dims": list(p.hidden),
         "activation": p.activation,
         "obs_normalization": p.normalize,
         "bfloat16": p.products == "bfloat16",
@@ -44,8 +43,8 @@ def rsl_rl_config(p: PPOParams, ranks: dict | None) -> dict:
     }
     return {
         "num_steps_per_env": p.steps,
-        "actor": {**network, "distribution_cfg": spread},
-        "critic": network,
+        "actor": {**network, "hidden_dims": list(p.hidden), "distribution_cfg": spread},
+        "critic": {**network, "hidden_dims": list(p.critic or p.hidden)},
         "algorithm": algorithm,
         "obs_groups": {"actor": ["actor"], "critic": ["critic"]},
         "multi_gpu": ranks,
@@ -122,6 +121,7 @@ class PPOTraining:
             torch.cuda.synchronize()
         middle = time.perf_counter()
         self.alg.desired_kl = (1.0 - done) * p.desired_kl + done * p.final_kl
+        self.alg.actor_learns.fill_(float(done * p.iterations >= p.critic_first - 0.5))
         figures = self.alg.update()
         end = time.perf_counter()
         times = {"rollout_s": middle - start, "learning_s": end - middle}
@@ -134,6 +134,11 @@ class PPOTraining:
     def export(self, contract: dict, made_by: dict) -> Policy:
         """The policy as a file's content."""
         return Policy.from_actor_state(self.alg.actor.state_dict(), self.experiment.ppo.activation, contract, made_by)
+
+    @torch.no_grad()
+    def take_up(self, policy: Policy) -> None:
+        """Start from a policy of the same layers: its weights, and its normaliser, which hardly moves from there."""
+        self.alg.actor.take_up(policy)
 
     def state_dict(self) -> dict:
         """All that the next iteration depends on, besides torch's generators."""

@@ -47,6 +47,7 @@ def loss(
     clip: float,
     value_coefficient: float,
     clip_value: int,
+    actor_learns: wp.array(dtype=float),
     # In:
     mean: wp.array2d(dtype=float),
     value: wp.array(dtype=float),
@@ -62,7 +63,10 @@ def loss(
     value_gradient: wp.array(dtype=float),
     parts: wp.array2d(dtype=float),
 ):
-    """Clipped surrogate and value loss of each of N samples; gradients are those of the minibatch's mean."""
+    """Clipped surrogate and value loss of each of N samples; gradients are those of the minibatch's mean.
+
+    ``actor_learns`` is 1, or 0 to leave the actor as it is.
+    """
     i = wp.tid()
     share = 1.0 / float(mean.shape[0])
     actions = mean.shape[1]
@@ -72,7 +76,7 @@ def loss(
     parts[i, SURROGATE] = wp.max(whole, clipped)
     slope = float(0.0)  # of the mean loss by the log-probability; beyond the clip it is level
     if whole >= clipped:
-        slope = whole * share
+        slope = whole * share * actor_learns[0]
     for j in range(actions):
         z = (action[i, j] - mean[i, j]) / std[j]
         moved = (old_mean[i, j] - mean[i, j]) / std[j]
@@ -100,6 +104,7 @@ def spread_and_rate(
     entropy_coefficient: float,
     adaptive: int,
     target_kl: wp.array(dtype=float),
+    actor_learns: wp.array(dtype=float),
     # In:
     sums: wp.array(dtype=float),
     std: wp.array(dtype=float),
@@ -122,7 +127,7 @@ def spread_and_rate(
         square = ratio * ratio
         divergence += 0.5 * (square + sums[MOVED + j] / count - 1.0 - wp.log(square))
         entropy += wp.log(std[j]) + 0.5 + HALF_LOG_TWO_PI
-        spread_gradient[j] = sums[MOVED + actions + j] - entropy_coefficient
+        spread_gradient[j] = sums[MOVED + actions + j] - entropy_coefficient * actor_learns[0]
     totals[0] += sums[VALUE] / count
     totals[1] += sums[SURROGATE] / count
     totals[2] += entropy

@@ -27,6 +27,7 @@ class CapturedPPO(PPO):
         self._spread = actor.distribution.log_std_param
         self._layers = [w for w in chain(actor.parameters(), critic.parameters()) if w is not self._spread]
         self.rate, self.target_kl = torch.tensor([self.learning_rate], **make), torch.tensor([self.desired_kl], **make)
+        self.actor_learns = torch.ones(1, **make)  # 0 holds the actor still, to the bit, while the critic learns
         self.optimizer = torch.optim.Adam([self._spread, *self._layers], lr=self.rate, fused=True, capturable=self._cuda)
         samples, actions = storage.num_envs * storage.num_transitions_per_env, storage.actions.shape[-1]
         self._minibatch = samples // self.num_mini_batches
@@ -135,8 +136,8 @@ class CapturedPPO(PPO):
         mean, value, std = self.actor.output(seen), self.critic.output(known), self._std()
         columns = [t if t.shape[-1] > 1 else t.view(-1) for t in samples]
         self._launch(
-            loss.loss, self._minibatch, self.clip_param, self.value_loss_coef, int(self.use_clipped_value_loss), mean, value.view(-1),
-            std, *columns, self._mean_gradient, self._value_gradient.view(-1), self._parts,
+            loss.loss, self._minibatch, self.clip_param, self.value_loss_coef, int(self.use_clipped_value_loss), self.actor_learns,
+            mean, value.view(-1), std, *columns, self._mean_gradient, self._value_gradient.view(-1), self._parts,
         )  # fmt: skip
         sums = self._parts.sum(0)
         if self.is_multi_gpu:
@@ -145,7 +146,7 @@ class CapturedPPO(PPO):
             moved /= self.gpu_world_size
         self._launch(
             loss.spread_and_rate, 1, float(self._minibatch), self.entropy_coef, int(self.schedule == "adaptive"), self.target_kl,
-            sums, std, self._old_std, self.rate, self._spread.grad, self._totals,
+            self.actor_learns, sums, std, self._old_std, self.rate, self._spread.grad, self._totals,
         )  # fmt: skip
         gradients = torch.autograd.grad([mean, value], self._layers, [self._mean_gradient, self._value_gradient])
         for layer, gradient in zip(self._layers, gradients):

@@ -9,9 +9,10 @@ from visthrow.evidence.bench import records
 
 def run(args: argparse.Namespace) -> int:
     """Measure the simulator."""
-    if args.seconds <= 0 or args.repeats < 1 or any(n < 1 for n in args.batch or ()):
+    if args.seconds <= 0 or args.repeats < 1 or args.threads < 1 or any(n < 1 for n in args.batch or ()):
         raise VisthrowError(
-            f"--seconds {args.seconds}, --repeats {args.repeats}, --batch {args.batch}: expected positive numbers"
+            f"--seconds {args.seconds}, --repeats {args.repeats}, --batch {args.batch}, --threads {args.threads}: "
+            "expected positive numbers"
         )
     from visthrow.task import Experiment
 
@@ -21,14 +22,11 @@ def run(args: argparse.Namespace) -> int:
 
         if args.batch and len(args.batch) > 1:
             raise VisthrowError(f"--batch {args.batch}: one core is measured at one batch size")
-        report = sim_cpu.measure(
-            experiment,
-            args.batch[0] if args.batch else sim_cpu.BATCH,
-            args.repeats,
-            args.seconds,
-            args.core,
-            not args.without_mujoco,
-        )
+        batch = args.batch[0] if args.batch else sim_cpu.BATCH
+        if args.threads > 1:
+            report = sim_cpu.measure_threads(experiment, batch, args.repeats, args.seconds, args.threads)
+        else:
+            report = sim_cpu.measure(experiment, batch, args.repeats, args.seconds, args.core, not args.without_mujoco)
     else:
         from visthrow.evidence.bench.sim import gpu as sim_gpu
         from visthrow.training import device

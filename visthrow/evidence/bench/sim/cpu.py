@@ -7,6 +7,9 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
+import numpy as np
+
+from sim.arrays.state import OUTPUT_FIELDS, STATE_FIELDS
 from sim.hybrid import HybridSim, tether_lengths
 from visthrow.common.errors import VisthrowError
 from visthrow.evidence.bench.records import Report, Table
@@ -22,6 +25,7 @@ EPISODE = 50
 
 TOLERANCE = 1e-3  # [m], of ball and vehicle at the end of the hard throw
 BARS = {"RK4": 20.0, "implicitfast": 4.0}
+THREADS_BAR = 1.8  # two threads on two cores over one
 
 
 @contextlib.contextmanager
@@ -48,9 +52,9 @@ def on_one_core(core: int | None = None) -> Iterator[int | None]:
 class Batch:
     """The full model: a batch of plants with all blocks under drawn commands."""
 
-    def __init__(self, experiment: Experiment, count: int, kind: str):
+    def __init__(self, experiment: Experiment, count: int, kind: str, threads: int = 1):
         self.plant, self.spreads = plant_of(experiment), experiment.task.start
-        self.sim = HybridSim(self.plant, count, ropes=tether_lengths(experiment.rope, self.spreads))
+        self.sim = HybridSim(self.plant, count, ropes=tether_lengths(experiment.rope, self.spreads), threads=threads)
         self.commands = commands.draw(kind, self.plant, experiment.task.action, EPISODE, count)
 
     def cost(self, seconds: float) -> float:
@@ -181,6 +185,34 @@ def measure(
     return Report(
         "sim", f"Simulator on one CPU core against MuJoCo C ({segments} segments)", (table,), _notes(figures), figures
     )
+
+
+def measure_threads(experiment: Experiment, batch: int, repeats: int, seconds: float, threads: int) -> Report:
+    """Measure one thread and several in turns, and compare the bits that they leave."""
+    one, many = (Batch(experiment, batch, "hover", n) for n in (1, threads))
+    for warm in (one, many):
+        warm.cost(0.1 * seconds)
+    pairs = interleaved(lambda: one.cost(seconds), lambda: many.cost(seconds), repeats)
+    ratio = statistics.median(a / b for a, b in pairs)
+    for each in (one, many):
+        each.sim.episode.zero_()
+        each.sim.randomize(each.spreads)
+        for command in each.commands:
+            each.sim.set_command(command)
+            each.sim.step()
+    same = all(np.array_equal(one.sim.get(name), many.sim.get(name)) for name in (*STATE_FIELDS, *OUTPUT_FIELDS))
+    period = one.plant.sim.control_period
+    costs = [statistics.median(column) for column in zip(*pairs)]
+    rows = [_row(f"{n} thread{'s' * (n > 1)}", cost, costs[0] / cost, None, period) for n, cost in zip((1, threads), costs)]
+    header = ("plant", "wall time a simulated second", "env-steps/s", "ratio", "")
+    table = Table(f"All blocks at hover, a batch of {batch}", header, tuple(rows))
+    notes = (
+        f"In turns, stretches of {seconds:g} s, {repeats} of each; median of the pairs' ratios {ratio:.2f} (bar {THREADS_BAR:g} "
+        "with two cores).",
+        f"A second of flight from drawn starts leaves {'the same bits' if same else 'OTHER BITS'}.",
+    )
+    figures = {"batch": batch, "threads": threads, "pairs": pairs, "ratio": ratio, "same_bits": same}
+    return Report("sim", f"Simulator on {threads} CPU threads against one", (table,), notes, figures)
 
 
 def _row(

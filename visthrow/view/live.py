@@ -1,0 +1,65 @@
+"""rerun's web viewer, served to this machine alone. Onboard-safe."""
+
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+from urllib.parse import quote
+
+from visthrow.common.errors import DeviceError
+
+HOST = "127.0.0.1"
+WEB_PORT, DATA_PORT = 9090, 9876
+"""Of the viewer's page and of its data; only this machine is listened to."""
+
+
+@contextmanager
+def served(web_port: int = WEB_PORT, data_port: int = DATA_PORT) -> Iterator[str]:
+    """Serve the viewer and say where; gives the address that streams connect to with ``connect_grpc``.
+
+    Raises:
+        DeviceError: a port is taken.
+    """
+    command = [sys.executable, "-m", "rerun", "--serve-web", "--bind", HOST, "--port", str(data_port)]
+    command += ["--web-viewer-port", str(web_port), "--server-memory-limit", "500MB"]
+    server = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, stdin=subprocess.DEVNULL)
+    data = f"rerun+http://{HOST}:{data_port}/proxy"
+    try:
+        if not _answers(server, web_port):
+            raise DeviceError(f"the viewer did not start; are ports {web_port} and {data_port} free? name others")
+        print(f"look at http://{HOST}:{web_port}?url={quote(data, safe='')}", file=sys.stderr, flush=True)
+        yield data
+    finally:
+        server.terminate()
+        server.wait(5)
+
+
+@contextmanager
+def web_viewer(layout: Any, web_port: int = WEB_PORT, data_port: int = DATA_PORT) -> Iterator[Any]:
+    """Serve the viewer with one recording; gives the stream that it shows.
+
+    Raises:
+        DeviceError: a port is taken.
+    """
+    import rerun as rr
+
+    with served(web_port, data_port) as data:
+        stream = rr.RecordingStream("visthrow", recording_id=None)
+        stream.connect_grpc(data, default_blueprint=layout)
+        yield stream
+        stream.flush()
+
+
+def _answers(server: subprocess.Popen, port: int) -> bool:
+    """Whether a server of ours listens on a port within half a minute."""
+    for _ in range(300):
+        time.sleep(0.1)
+        if server.poll() is not None:
+            return False
+        with socket.socket() as probe:
+            if probe.connect_ex((HOST, port)) == 0:
+                return True
+    return False
