@@ -154,26 +154,14 @@ class PPOParams:
     critic_first: int = 0  # iterations at the beginning in which the critic alone learns
 
     def __post_init__(self) -> None:
-        whole = ("environments", "steps", "iterations", "epochs", "minibatches")
-        above = ("initial_std", "learning_rate", "desired_kl", "final_kl", "clip", "max_grad_norm")
-        wrong = [name for name in whole if getattr(self, name) < 1] + [name for name in above if getattr(self, name) <= 0.0]
-        wrong += [name for name in ("discount", "gae_lambda") if not 0.0 < getattr(self, name) <= 1.0]
-        wrong += [name for name in ("entropy", "value_coefficient", "critic_first") if getattr(self, name) < 0.0]
-        wrong += [name for name in ("hidden", "critic") if any(width < 1 for width in getattr(self, name))]
-        wrong += [] if self.hidden else ["hidden"]
-        if wrong:
-            given = ", ".join(f"{name} {getattr(self, name)}" for name in wrong)
-            raise ConfigError(
-                f"ppo: {given}; expected whole numbers of 1 or more, shares of 0 to 1, positive rates and at least one layer"
-            )
-
-    def __post_init__(self) -> None:
         counts = {name: getattr(self, name) for name in ("environments", "steps", "iterations", "epochs", "minibatches")}
-        if min(counts.values()) < 1 or not self.hidden or min(self.hidden) < 1:
-            raise ConfigError(f"ppo: {counts} and hidden layers of {self.hidden}; expected 1 or more of each")
+        if min(counts.values()) < 1 or not self.hidden or min(self.hidden + self.critic) < 1:
+            layers = f"hidden layers of {self.hidden}, the critic's of {self.critic or self.hidden}"
+            raise ConfigError(f"ppo: {counts} and {layers}; expected 1 or more of each")
         require_positive(
             "ppo", initial_std=self.initial_std, learning_rate=self.learning_rate, clip=self.clip, max_grad_norm=self.max_grad_norm
         )
+        require_not_negative("ppo", critic_first=self.critic_first, entropy=self.entropy, value_coefficient=self.value_coefficient)
         for name in ("discount", "gae_lambda"):
             if not 0.0 < getattr(self, name) <= 1.0:
                 raise ConfigError(f"ppo.{name} is {getattr(self, name)}; expected a number above 0 and up to 1")

@@ -305,7 +305,7 @@ class FirstOrder:
         flown = torch.arange(self.p.horizon, device=self.env.device)[:, None] <= self.flights.steps
         by_action = by_action * flown[..., None]
         size = by_action.square().sum((0, 2)).sqrt()  # a few wild flights must not outweigh the rest
-        by_action = by_action * (OUTLIER * size.median() / size.clamp(min=1e-12)).clamp(max=1.0)[:, None]
+        by_action = by_action * (OUTLIER * size.sort().values[len(size) // 2] / size.clamp(min=1e-12)).clamp(max=1.0)[:, None]
         seen, parameters = self.obs.flatten(0, 1), list(self.network.mlp.parameters())
         with torch.enable_grad():
             output = self.act(seen)

@@ -16,6 +16,9 @@ from visthrow.training.env import ThrowEnv
 from visthrow.training.ppo.network import CapturableGaussian, Network
 from visthrow.training.ppo.update import CapturedPPO
 
+WARM_UP_RATE = 2e-3
+"""Learning rate of a critic that learns alone; nothing that it moves is flown."""
+
 
 def rsl_rl_config(p: PPOParams, ranks: dict | None) -> dict:
     """Configuration dictionary of rsl_rl 5.5 for our parameters; both observation groups are named."""
@@ -121,11 +124,18 @@ class PPOTraining:
             torch.cuda.synchronize()
         middle = time.perf_counter()
         self.alg.desired_kl = (1.0 - done) * p.desired_kl + done * p.final_kl
-        self.alg.actor_learns.fill_(float(done * p.iterations >= p.critic_first - 0.5))
+        self._warm_up(round(done * p.iterations))
         figures = self.alg.update()
         end = time.perf_counter()
         times = {"rollout_s": middle - start, "learning_s": end - middle}
         return {**figures, **self.env.episode_means(), "learning_rate": self.alg.learning_rate, **times}
+
+    def _warm_up(self, iteration: int) -> None:
+        """Let the critic alone learn in the first iterations, faster, and the actor from there at the rate that is set."""
+        first = self.experiment.ppo.critic_first
+        if first and iteration in (0, first):
+            self.alg.set_rate(WARM_UP_RATE if iteration == 0 else self.experiment.ppo.learning_rate)
+        self.alg.actor_learns.fill_(float(iteration >= first))
 
     def act(self, obs: Tensor) -> Tensor:
         """Deterministic actions, shape (E, 5), of the current policy for the actor's observations, shape (E, D)."""

@@ -65,7 +65,8 @@ def loss(
 ):
     """Clipped surrogate and value loss of each of N samples; gradients are those of the minibatch's mean.
 
-    ``actor_learns`` is 1, or 0 to leave the actor as it is.
+    ``actor_learns`` is 1, or 0 to leave the actor as it is; the value's steps are not clipped then, for a critic that is
+    far off to get near.
     """
     i = wp.tid()
     share = 1.0 / float(mean.shape[0])
@@ -87,7 +88,7 @@ def loss(
     off = value[i] - returns[i]
     error = off * off
     slope = off
-    if clip_value != 0:
+    if clip_value != 0 and actor_learns[0] > 0.0:
         step = value[i] - old_value[i]
         near = old_value[i] + wp.clamp(step, -clip, clip) - returns[i]
         if near * near > error:

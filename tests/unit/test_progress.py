@@ -1,0 +1,78 @@
+"""The log of a training: what stands in the file, what is left, the picture on a terminal."""
+
+import csv
+import io
+
+import numpy as np
+import pytest
+
+from visthrow.training import progress
+from visthrow.training.protocol import Throws
+
+FIGURES = {"released": 1.0, "landing_error": 0.5, "rollout_s": 0.1, "learning_s": 0.1}
+
+
+def throws(error: float = 0.05) -> Throws:
+    landing = np.array([[2.0 + error, 0.0], [2.0, error], [np.nan, np.nan]])
+    off = np.array([error, error, np.nan])
+    blank = np.array([1.0, 1.0, np.nan])
+    return Throws(2.0, np.array([True, True, False]), landing, off, blank, blank, blank)
+
+
+class Screen(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """Ten seconds an iteration."""
+    now = [100.0]
+    monkeypatch.setattr(progress.time, "perf_counter", lambda: now[0])
+    return now
+
+
+def rows_of(path):
+    return list(csv.DictReader(path.open()))
+
+
+def test_the_picture_shows_errors_landings_and_the_time_left(tmp_path, monkeypatch, clock):
+    screen = Screen()
+    monkeypatch.setattr(progress.sys, "stdout", screen)
+    with progress.TrainLog(tmp_path / "p.csv", 1000, 10) as log:
+        for i in range(1, 4):
+            clock[0] += 10.0
+            log.row(FIGURES | {"iteration": i}, throws() if i == 3 else None)
+    text = screen.getvalue()
+    last = text.split("\x1b[2K")
+    assert "1:10 left" in text  # seven iterations of ten seconds
+    assert "0.0500 m, 1.000 s, landed 66.7 %" in text
+    assert sum(line.count("o") for line in last[-13:] if "|" in line) == 1
+    assert "1" in "".join(line.split("|")[-2] for line in last if line.count("|") == 3)
+    heights = [int(part.split("A")[0]) for part in text.split("\x1b[")[1:] if part.split("A")[0].isdigit()]
+    assert heights
+    assert set(heights) == {text.split(f"\x1b[{heights[0]}A")[0].count("\n")}  # each picture covers the one before
+    assert float(rows_of(tmp_path / "p.csv")[-1]["error_2m"]) == pytest.approx(0.05)
+    assert float(rows_of(tmp_path / "p.csv")[-1]["landed_2m"]) == pytest.approx(2 / 3)
+
+
+def test_a_resumed_log_goes_on_in_time_and_drops_what_is_made_again(tmp_path, clock, capsys):
+    with progress.TrainLog(tmp_path / "p.csv", 1000, 10) as log:
+        for i in range(1, 4):
+            clock[0] += 10.0
+            log.row(FIGURES | {"iteration": i})
+    with progress.TrainLog(tmp_path / "p.csv", 1000, 10, done=2, minutes=1.0) as log:
+        clock[0] += 10.0
+        log.row(FIGURES | {"iteration": 3}, throws())
+    assert [(int(r["iteration"]), float(r["wall_s"])) for r in rows_of(tmp_path / "p.csv")] == [(1, 10.0), (2, 20.0), (3, 30.0)]
+    assert "0:50 left" in capsys.readouterr().out  # the minute ends before the seven iterations
+
+
+def test_what_no_throw_reaches_is_no_error():
+    nothing = Throws(2.0, np.zeros(3, dtype=bool), *(np.full((3, 2), np.nan), *(np.full(3, np.nan) for _ in range(4))))
+    assert np.isnan(progress.evaluated(nothing)["error_2m"])
+    assert not nothing.within(100.0)
+    assert not throws().within(0.1)  # two of three land
+    good = Throws(2.0, np.ones(3, dtype=bool), np.zeros((3, 2)), *(np.full(3, 0.04) for _ in range(4)))
+    assert good.within(0.05)
+    assert not good.within(0.03)
