@@ -206,16 +206,16 @@ def small_task():
     words = [f"task.start.{name}=[0,0,0]" for name in ("position", "velocity", "attitude_deg", "rate_deg")]
     words += [f"task.start.{name}=0" for name in ("mass", "cable_angle_deg", "cable_rate_deg")]
     words += ["task.start.goal_radius=1.0", "ppo.environments=32", "ppo.hidden=[32,32]", "ppo.minibatches=1"]
-    words += [f"first_order.{word}" for word in ("horizon=40", "iterations=60", "learning_rate=4e-3", "initial_release=-0.5",
+    words += [f"first_order.{word}" for word in ("horizon=40", "iterations=100", "learning_rate=4e-3", "initial_release=-0.5",
                                                  "final_width=0.1", "first_release=20", "free=[2.0,3.0]")]  # fmt: skip
     return config.load(Experiment, config.find("train", "state"), ['algorithm="first_order"', *words])
 
 
 def thrown(turn):
-    """Share released and mean landing error over the last of 40 iterations; ``turn`` alters the surrogate."""
+    """Share released and mean landing error over the last of 60 iterations; ``turn`` alters the surrogate."""
     trainer = Trainer(small_task(), "cpu", 1)
     turn(trainer.algorithm.surrogate)
-    figures = [trainer.step() for _ in range(40)][-5:]
+    figures = [trainer.step() for _ in range(60)][-5:]
     return tuple(sum(row[name] for row in figures) / len(figures) for name in ("released", "landing_error"))
 
 
