@@ -95,6 +95,7 @@ class HybridSim:
         release: shape (E,), int: non-zero asks for the release; the latch keeps it.
         state: arrays of :data:`sim.arrays.state.STATE_FIELDS`.
         out: arrays of :data:`sim.arrays.state.OUTPUT_FIELDS`.
+        vehicles: parameters of environment e at ``e % len(vehicles)``.
         goal_w: [m], shape (E,) of vec3: goals that :meth:`randomize` draws.
     """
 
@@ -138,7 +139,7 @@ class HybridSim:
         vehicles, ropes = vehicles or [params.vehicle], ropes or [params.rope]
         airs, releases = airs or [params.air], releases or [params.release]
         _check(params, count, ropes)
-        self.params, self.count, self.device, self.seed = params, count, device, seed
+        self.params, self.count, self.device, self.seed, self.vehicles = params, count, device, seed, vehicles
         self.gravity, self.threads = gravity, threads or cores()
         self.extensions = extensions_of(vehicles, ropes, airs, releases, params.laws) | extensions
         self.types, self._step, self._reset = _kernels(params, direct, motors, self.extensions)
@@ -152,7 +153,7 @@ class HybridSim:
         rows = {"cable_dir_w": segments, "cable_vel_w": segments, "stiffness": segments, "queue": depth}
         self.state = st.allocate(t, self._step.State, st.STATE_FIELDS, count, rows, device)
         outputs = {k: (v, False) for k, v in st.OUTPUT_FIELDS.items()}
-        self.out = st.allocate(t, self._step.Output, outputs, count, {}, device)
+        self.out, self.foreseen = (st.allocate(t, self._step.Output, outputs, count, {}, device) for _ in range(2))
         self.command = wp.zeros(count, dtype=t.vec4, device=device)
         self.release, self.episode = (wp.zeros(count, dtype=wp.int32, device=device) for _ in range(2))
         self.goal_w = wp.zeros(count, dtype=t.vec3, device=device)
@@ -183,6 +184,11 @@ class HybridSim:
             ],
             block_dim=64,
         )
+
+    def foresee(self) -> None:
+        """Write into ``foreseen`` what follows if every payload separates now; the plants stay as they are."""
+        inputs = [self._vehicles, self._ropes, self._release, self._airs, self.gravity, self.state, self.foreseen]
+        self._launch(self._step.foresee, inputs, block_dim=64)
 
     def randomize(self, spreads: RandomizationParams, mask: wp.array | None = None) -> None:
         """Start new episodes where ``mask`` (shape (E,), int) is non-zero; everywhere without one."""
@@ -277,6 +283,12 @@ class HybridSim:
             wp.launch(kernel, last - first, [first, *arguments], device=device)
 
         in_pieces(launch, [count * i // pieces for i in range(pieces + 1)], self.threads)
+
+    def plants(self) -> tuple[np.ndarray, np.ndarray]:
+        """Parameters of vehicle and rope of every environment as the kernels read them: structured arrays, shape (E,)."""
+        vehicles, ropes = self._vehicles.numpy(), self._ropes.numpy()
+        rows = np.arange(self.count)
+        return vehicles[rows % len(vehicles)], ropes[rows % len(ropes)]
 
     def set_command(self, command: np.ndarray, release: np.ndarray | None = None) -> None:
         """Copy commands [N, rad/s], shape (E, 4), and release requests, shape (E,), to the device.

@@ -28,6 +28,7 @@ class StepKernels:
 
     step: wp.Kernel
     payload: wp.Kernel
+    foresee: wp.Kernel
     State: type
     Output: type
 
@@ -255,4 +256,32 @@ def build_step(
             out.payload_pos_w[env] = pos
             out.payload_vel_w[env] = vel
 
-    return StepKernels(step_kernel, payload_kernel, State, Output)
+    @wp.kernel(module="unique", enable_backward=False)
+    def foresee_kernel(
+        # Params:
+        first: int,
+        vehicle: wp.array(dtype=Vehicle),
+        ropes: wp.array(dtype=Rope),
+        releases: wp.array(dtype=Release),
+        airs: wp.array(dtype=Air),
+        gravity: real,
+        # State in:
+        state: State,
+        # Out:
+        out: Output,
+    ):
+        env = first + wp.tid()
+        p = vehicle[env % vehicle.shape[0]]
+        natural = ropes[env % ropes.shape[0]]
+        n = wp.zeros(shape=(L,), dtype=vec3)
+        u = wp.zeros(shape=(L,), dtype=vec3)
+        stiffness = wp.zeros(shape=(L,), dtype=real)
+        for i in range(L):
+            n[i] = state.cable_dir_w[i, env]
+            u[i] = state.cable_vel_w[i, env]
+            stiffness[i] = state.stiffness[i, env]
+        rope = chain.stretched(natural, natural, stiffness, u, real(0.0))
+        r = releases[env % releases.shape[0]]
+        separate(p, rope, r, airs[env % airs.shape[0]], load(state, env), n, u, gravity, out, env, real(0.0))
+
+    return StepKernels(step_kernel, payload_kernel, foresee_kernel, State, Output)

@@ -168,6 +168,33 @@ class PPOParams:
 
 
 @dataclass(frozen=True)
+class FirstOrderParams:
+    """Learning parameters of :mod:`visthrow.training.first_order`; ``ppo`` has the throws a gradient and the network."""
+
+    iterations: int = 1000  # gradients
+    horizon: int = 48  # of a flight [control steps]; the latch trips near the 35th
+    decay: float = 0.92  # of derivatives, per step backward
+    learning_rate: float = 2e-3  # at the first iteration
+    adapting_rate: float = 3e-4  # in its place where the training starts from a policy
+    final_rate: float = 5e-5  # at the last one; half a cosine between
+    max_grad_norm: float = 1.0
+    width: float = 0.5  # of the hazard at the first iteration, in units of the fifth action
+    final_width: float = 0.05
+    sharp: float = 0.7  # share of the training after which the width is the final one; geometric till then
+    first_release: int = 24  # step before which nothing is released at the beginning: else the payload is dropped at once
+    free: tuple[float, float] = (0.2, 0.5)  # shares of the training between which that step comes down to 0
+    initial_release: float = -2.0  # fifth action of the untrained network
+    saturation: float = 1.0  # cost of the square that an action is past its limits by
+
+    def __post_init__(self) -> None:
+        if not (self.iterations > 0 and 0.0 <= self.free[0] < self.free[1] and self.sharp > 0.0 and 0.0 < self.final_width <= self.width):
+            raise ConfigError(
+                f"first_order: iterations {self.iterations}, free {self.free}, sharp {self.sharp}, widths {self.width} to "
+                f"{self.final_width}; expected 1 or more, an ascending range, a share above 0, widths above 0 that do not grow"
+            )
+
+
+@dataclass(frozen=True)
 class DiagnosedParams:
     """What a diagnosis leaves uncertain about the plant (``visthrow diagnose apply`` writes it).
 
@@ -205,6 +232,18 @@ class Experiment:
     laws: tuple[LawParams, ...] = ()  # found by a diagnosis, besides the blocks' own
     sensing: SensingParams = field(default_factory=SensingParams)  # of the hall; the diagnosis alone reads it
     diagnosed: DiagnosedParams = field(default_factory=DiagnosedParams)
+    algorithm: Literal["ppo", "first_order"] = "ppo"
+    first_order: FirstOrderParams = field(default_factory=FirstOrderParams)
+
+    @property
+    def iterations(self) -> int:
+        """Iterations of a whole training."""
+        return self.first_order.iterations if self.algorithm == "first_order" else self.ppo.iterations
+
+    @property
+    def samples(self) -> int:
+        """Environment steps an iteration."""
+        return self.ppo.environments * (self.first_order.horizon if self.algorithm == "first_order" else self.ppo.steps)
 
     def __post_init__(self) -> None:
         low, high = self.task.observation.latency

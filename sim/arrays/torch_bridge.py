@@ -12,7 +12,7 @@ class TorchViews:
 
     Attributes:
         command: shape (E, 4), writable. release: shape (E,), int32, writable. goal_w: shape (E, 3).
-        state, out: dictionaries of the state and output arrays: (E, 3), (E,), (L, E, 3), ...
+        state, out, foreseen: dictionaries of the state and output arrays: (E, 3), (E,), (L, E, 3), ...
     """
 
     def __init__(self, sim: HybridSim):
@@ -20,7 +20,10 @@ class TorchViews:
         self.release = wp.to_torch(sim.release, requires_grad=False)
         self.goal_w = wp.to_torch(sim.goal_w, requires_grad=False)
         self.state = {name: wp.to_torch(getattr(sim.state, name), requires_grad=False) for name in st.STATE_FIELDS}
-        self.out = {name: wp.to_torch(getattr(sim.out, name), requires_grad=False) for name in st.OUTPUT_FIELDS}
+        self.out, self.foreseen = (
+            {name: wp.to_torch(getattr(out, name), requires_grad=False) for name in st.OUTPUT_FIELDS}
+            for out in (sim.out, sim.foreseen)
+        )
 
 
 def on_torch_stream(device: str):

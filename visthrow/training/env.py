@@ -111,6 +111,18 @@ class ThrowEnv(VecEnv):
         """Clipped action of the last step, shape (E, 5)."""
         return self._memory["previous"]
 
+    @property
+    def pose_age(self) -> Tensor:
+        """Age of what is measured in these episodes [s], shape (E,)."""
+        return self._memory["pose_age"]
+
+    def extrinsics(self) -> tuple[Tensor, Tensor] | None:
+        """Mounts of these episodes' cameras (:meth:`camera.keypoints.KeypointCamera.extrinsics`); None where all are nominal."""
+        mount = self.cfg.camera.mount
+        if mount.rotation_error_std == 0.0 and mount.position_error_std == 0.0:
+            return None
+        return self.camera.extrinsics(self._memory["extrinsic_rotation"], self._memory["extrinsic_offset"])
+
     def fix_goal(self, goal_w: Tensor | None) -> None:
         """Use one goal [m], shape (3,), for all episodes from the next reset on, or drawn ones again (None)."""
         self._goal = goal_w
@@ -154,8 +166,12 @@ class ThrowEnv(VecEnv):
         """Observations of the current step."""
         return self._observations.clone()
 
-    def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict]:
+    def step(self, actions: Tensor, hold: bool = False) -> tuple[TensorDict, Tensor, Tensor, dict]:
         """Apply actions, shape (E, 5), for one control period; finished episodes start anew.
+
+        Args:
+            actions: unclipped.
+            hold: keep the latch shut whatever is asked.
 
         Returns:
             Observations, rewards (E,), dones (E,), and an empty dictionary: the time limit is a negative end and must not
@@ -166,7 +182,7 @@ class ThrowEnv(VecEnv):
         noisy = action[:, : act.COMMANDS] + torch.randn_like(memory["command_bias"]) * task.noise.command_step
         noisy = noisy + memory["command_bias"]
         self.views.command.copy_(act.command_from_action(noisy, task.action.max_thrust, self._max_rate))
-        self.views.release.copy_(act.release_asked(actions, self.cfg.release.threshold))
+        self.views.release.copy_(act.release_asked(actions, self.cfg.release.threshold) & (not hold))
         with on_torch_stream(self.device):
             self.sim.step()
         if task.target.moves:
@@ -336,10 +352,7 @@ class ThrowEnv(VecEnv):
     ) -> tuple[Tensor, Tensor]:
         """Keypoints as the detector reports them: extrinsic error, latency, noise, drop-out."""
         memory, camera = self._memory, self.cfg.camera
-        extrinsics = None
-        if camera.mount.rotation_error_std > 0.0 or camera.mount.position_error_std > 0.0:
-            extrinsics = self.camera.extrinsics(memory["extrinsic_rotation"], memory["extrinsic_offset"])
-        points, valid = ob.vision_part(self.camera, pos_w, rot_wb, goal_w, payload_w, extrinsics)
+        points, valid = ob.vision_part(self.camera, pos_w, rot_wb, goal_w, payload_w, self.extrinsics())
         if camera.noise.latency > 0.0:
             memory["late_points"].copy_(hist.push(memory["late_points"], points, fresh))
             memory["late_valid"].copy_(hist.push(memory["late_valid"], valid, fresh))

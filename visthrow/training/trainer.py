@@ -69,6 +69,10 @@ class Algorithm(Protocol):
 
 def build(experiment: Experiment, device: str, seed: int, ranks: dict | None) -> Algorithm:
     """Algorithm that the experiment names; imported only when chosen."""
+    if experiment.algorithm == "first_order":
+        from visthrow.training.first_order.algorithm import FirstOrder
+
+        return FirstOrder(experiment, device, seed, ranks)
     from visthrow.training.ppo.algorithm import PPOTraining
 
     return PPOTraining(experiment, device, seed, ranks)

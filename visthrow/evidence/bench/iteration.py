@@ -143,6 +143,8 @@ def run(args: argparse.Namespace) -> int:
     if len(experiments) > 1:
         raise VisthrowError(f"{' '.join(experiments)}: an iteration is measured of one configuration; several with --until")
     (stem, experiment), *_ = experiments.items()
+    if experiment.algorithm != "ppo":
+        raise VisthrowError(f'{stem}: algorithm "{experiment.algorithm}"; parts of an iteration are measured of "ppo"; use --until')
     return records.finish(measure(experiment, stem, name, args.iterations, args.repeats), args)
 
 

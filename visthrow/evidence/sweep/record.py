@@ -108,7 +108,7 @@ def _run(source: Source, out: Path) -> dict[str, Any]:
     """A finished training for the record."""
     rows, summary = _progress(source, out), _summary(source, out)
     experiment = source.experiment()
-    per_iteration = experiment.ppo.environments * experiment.ppo.steps
+    per_iteration = experiment.samples
     step = max(len(rows) // CURVE_POINTS, 1)
     curve, seconds = [], 0.0
     for i, row in enumerate(rows, 1):

@@ -47,7 +47,7 @@ class Source:
     @property
     def iterations(self) -> int:
         """That the training is to have."""
-        return self.experiment().ppo.iterations
+        return self.experiment().iterations
 
     def folder(self, out: Path) -> Path:
         """Of the training run."""

@@ -10,7 +10,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from visthrow.common.errors import ConfigError
-from visthrow.onboard.policy import RSL_RL_EPS, Policy
+from visthrow.onboard.policy import Policy
 from visthrow.task import Experiment, PPOParams
 from visthrow.training.env import ThrowEnv
 from visthrow.training.ppo.network import CapturableGaussian, Network
@@ -18,9 +18,6 @@ from visthrow.training.ppo.update import CapturedPPO
 
 WARM_UP_RATE = 2e-3
 """Learning rate of a critic that learns alone; nothing that it moves is flown."""
-
-SEEN = 10**8
-"""Observations that a policy's normaliser counts for when it is taken up: about those of its training, which no file tells."""
 
 
 def rsl_rl_config(p: PPOParams, ranks: dict | None) -> dict:
@@ -151,15 +148,7 @@ class PPOTraining:
     @torch.no_grad()
     def take_up(self, policy: Policy) -> None:
         """Start from a policy of the same layers: its weights, and its normaliser, which hardly moves from there."""
-        actor = self.alg.actor
-        layers = [layer for layer in actor.mlp if isinstance(layer, torch.nn.Linear)]
-        for layer, weight, bias in zip(layers, policy.weights, policy.biases, strict=True):
-            layer.weight.copy_(weight)
-            layer.bias.copy_(bias)
-        if policy.mean is not None:
-            std = policy.std + (policy.eps - RSL_RL_EPS)
-            state = {"_mean": policy.mean, "_std": std, "_var": std.square(), "count": torch.tensor(SEEN)}
-            actor.obs_normalizer.load_state_dict({k: v.view_as(getattr(actor.obs_normalizer, k)) for k, v in state.items()})
+        self.alg.actor.take_up(policy)
 
     def state_dict(self) -> dict:
         """All that the next iteration depends on, besides torch's generators."""

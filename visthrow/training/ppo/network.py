@@ -11,8 +11,13 @@ from rsl_rl.modules.distribution import GaussianDistribution
 from tensordict import TensorDict
 from torch import Tensor
 
+from visthrow.onboard.policy import RSL_RL_EPS, Policy
+
 ALIGNED = 16
 """Columns that an input is filled up to a multiple of on a GPU: tensor cores read rows of 16 bytes or multiples."""
+
+SEEN = 10**8
+"""Observations that a policy's normaliser counts for when it is taken up: about those of its training, which no file tells."""
 
 
 class CapturableGaussian(GaussianDistribution):
@@ -37,6 +42,18 @@ class Network(MLPModel):
             return output
         self.distribution.update(output)
         return self.distribution.sample()
+
+    @torch.no_grad()
+    def take_up(self, policy: Policy) -> None:
+        """Start from a policy of the same layers: its weights, and its normaliser, which hardly moves from there."""
+        layers = [layer for layer in self.mlp if isinstance(layer, torch.nn.Linear)]
+        for layer, weight, bias in zip(layers, policy.weights, policy.biases, strict=True):
+            layer.weight.copy_(weight)
+            layer.bias.copy_(bias)
+        if policy.mean is not None:
+            std = policy.std + (policy.eps - RSL_RL_EPS)
+            state = {"_mean": policy.mean, "_std": std, "_var": std.square(), "count": torch.tensor(SEEN)}
+            self.obs_normalizer.load_state_dict({k: v.view_as(getattr(self.obs_normalizer, k)) for k, v in state.items()})
 
     def prepared(self, obs: TensorDict) -> Tensor:
         """Normalised observations as :meth:`output` takes them at its fastest, on a GPU filled up with columns of zeros."""

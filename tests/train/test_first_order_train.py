@@ -1,0 +1,119 @@
+"""First-order training through the command: what it leaves behind, and that it goes on bit for bit however it was stopped."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+import torch
+
+from visthrow import cli, config
+from visthrow.onboard.policy import Policy
+from visthrow.task import Experiment, contract_of
+from visthrow.training.first_order.algorithm import FirstOrder
+from visthrow.training.trainer import CHECKPOINT, Trainer
+
+SMALL = ['algorithm="first_order"', "ppo.environments=16", "ppo.hidden=[16,16]", "ppo.minibatches=1",
+         "task.bounds.time_limit=0.4", "first_order.horizon=12", "first_order.iterations=4"]  # fmt: skip
+PATIENCE = 300.0
+"""Longest wait for what takes seconds on an idle machine [s]."""
+
+
+def words(folder, *extra):
+    sets = [part for item in SMALL for part in ("--set", item)]
+    return ["train", "state", "--device", "cpu", "--out", str(folder), "--checkpoint-every", "1", *sets, *extra]
+
+
+def same(one, two):
+    weights = [[w.numpy() for w in Policy.load(folder / "policy.npz").weights] for folder in (one, two)]
+    for a, b in zip(*weights, strict=True):
+        np.testing.assert_array_equal(a, b)
+    return (two / "progress.csv").read_text().count("\n") == 1 + 4
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    """The same bits need the same number of threads."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A run of four iterations without interruption."""
+    torch.set_num_threads(1)
+    folder = tmp_path_factory.mktemp("whole") / "run"
+    assert cli.main(words(folder)) == 0
+    return folder
+
+
+def test_its_policy_is_one_like_any_other(whole):
+    experiment = config.load(Experiment, whole / "config.toml")
+    policy = Policy.load(whole / "policy.npz")
+    policy.require(contract_of(experiment))
+    trainer = Trainer(experiment, "cpu", 1)
+    trainer.load(whole / CHECKPOINT)
+    obs = torch.randn(64, trainer.algorithm.env.layout.dimension)
+    with torch.inference_mode():
+        assert (trainer.algorithm.act(obs) - policy.act(obs)).abs().max() < 1e-6
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_keeps_what_was_done(whole, tmp_path, monkeypatch, number):
+    folder, step = tmp_path / "run", FirstOrder.step
+
+    def interrupted(self, done):
+        figures = step(self, done)
+        if done == 1 / 4:
+            os.kill(os.getpid(), number)  # in the second iteration
+        return figures
+
+    monkeypatch.setattr(FirstOrder, "step", interrupted)
+    assert cli.main(words(folder)) == 130
+    monkeypatch.setattr(FirstOrder, "step", step)
+    assert cli.main(words(folder, "--resume")) == 0
+    assert same(whole, folder)
+
+
+def test_killed_it_goes_on(whole, tmp_path):
+    """SIGKILL, as a machine without power would."""
+    folder = tmp_path / "run"
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    running = subprocess.Popen([sys.executable, "-m", "visthrow.cli", *words(folder)], env=environment)
+    end = time.monotonic() + PATIENCE
+    while not (folder / CHECKPOINT).exists():
+        assert time.monotonic() < end, "no checkpoint came"
+        assert running.poll() is None or (folder / CHECKPOINT).exists()
+        time.sleep(0.01)
+    running.kill()
+    running.wait()
+    assert cli.main(words(folder, "--resume")) == 0
+    assert same(whole, folder)
+
+
+def test_what_it_cannot_train_is_refused(tmp_path, capsys):
+    assert cli.main(words(tmp_path / "a", "--set", "first_order.horizon=5")) == 2
+    assert "expected at least 7" in capsys.readouterr().err
+    assert cli.main(words(tmp_path / "b", "--set", "task.target.speed=[0.0,0.5]")) == 2
+    assert "stand still" in capsys.readouterr().err
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("name", ["state", "vision"])
+def test_replayed_from_graphs_it_computes_what_it_computes_eagerly(name):
+    """Four iterations: one that allocates, one that captures, two that replay, with fresh noise each."""
+
+    def errors(eager):
+        trainer = Trainer(config.load(Experiment, config.find("train", name), SMALL), "cuda:0", 1)
+        if eager:
+            trainer.algorithm.rollout, trainer.algorithm._update = trainer.algorithm._fly, trainer.algorithm._descend
+        return [trainer.step()["cost"] for _ in range(4)]
+
+    captured = errors(False)
+    assert len(set(captured)) == 4
+    np.testing.assert_allclose(captured, errors(True), rtol=1e-3)

@@ -1,0 +1,348 @@
+"""First-order training on the throwing task, as a trainer drives it."""
+
+import math
+import time
+from collections.abc import Callable
+from types import SimpleNamespace
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from sim.arrays.torch_bridge import on_torch_stream
+from sim.params import GRAVITY
+from visthrow.common.errors import ConfigError
+from visthrow.onboard import actions as act
+from visthrow.onboard import observations as ob
+from visthrow.onboard.policy import Policy
+from visthrow.task import Experiment
+from visthrow.training import rewards
+from visthrow.training.env import ThrowEnv
+from visthrow.training.first_order.backward import Setting, build_backward
+from visthrow.training.first_order.surrogate import Flights, Plants, Surrogate, fit
+from visthrow.training.ppo.network import Network
+
+BARRIER = 600.0
+"""Barriers cost this times the square of how far a state is within their margins."""
+MARGINS = {"altitude": 0.15, "ground": 0.1, "above": 0.08, "upright": 0.15}
+"""Reach of the barriers: of altitude, payload over ground, payload below vehicle [m], cosine of the tilt."""
+
+OUTLIER = 4.0
+"""A flight's derivatives are shortened to this many times the median flight's."""
+
+STEPS_AT_ONCE = 4
+"""Of a flight whose Jacobians are taken together on the way: they fit a core's cache."""
+
+
+class Replayed:
+    """Work on fixed tensors of a GPU: done eagerly once, then captured in a CUDA graph and replayed."""
+
+    def __init__(self, work: Callable[[], None]):
+        self._work, self._warm, self._graph = work, False, None
+
+    def __call__(self) -> None:
+        """Do the work."""
+        if not self._warm:
+            self._warm = True
+            return self._work()
+        if self._graph is None:
+            torch.cuda.synchronize()
+            self._graph = torch.cuda.CUDAGraph()
+            with torch.cuda.graph(self._graph):
+                self._work()
+        self._graph.replay()
+
+
+class FirstOrder:
+    """First-order training; see :class:`visthrow.training.trainer.Algorithm`.
+
+    Attributes:
+        surrogate: fitted to the environment's plants at the start.
+        network: of the policy, with its normaliser.
+        rollout: flies one batch without release.
+    """
+
+    def __init__(self, experiment: Experiment, device: str, seed: int, ranks: dict | None = None):
+        """Fit the surrogate and start the network near hover.
+
+        Args:
+            experiment: the run's configuration; the environments of ``ppo`` are the throws of a gradient, its network the policy's.
+            device: "cpu" or "cuda:0".
+            seed: of the environment; torch's own generators are the caller's to seed.
+            ranks: of a distributed run.
+
+        Raises:
+            ConfigError: A distributed run, goals that move, or a horizon too short for a release.
+        """
+        self.cfg, self.p, p = experiment, experiment.first_order, experiment.ppo
+        if ranks or experiment.task.target.moves:
+            raise ConfigError('algorithm = "first_order" trains in one process and throws at goals that stand still; "ppo" does both')
+        self.env = env = ThrowEnv(experiment, device, seed)
+        E, T, self.iterations = env.num_envs, self.p.horizon, self.p.iterations
+        self.samples = E * T
+        seen = env.get_observations()
+        self.network = Network(seen, {"actor": ["actor"]}, "actor", act.ACTIONS, p.hidden, p.activation, p.normalize).to(device)
+        lag = experiment.release.lag / experiment.sim.control_period
+        self.lag, rest = int(lag + 1e-6), max(lag - int(lag + 1e-6), 0.0)
+        self.releases = T - self.lag - 1  # the cubic looks a step past the separation
+        if self.releases < 1:
+            raise ConfigError(f"first_order.horizon is {T} steps; expected at least {self.lag + 2} for a release to end in")
+        self.plants = Plants.of(env)
+        with torch.no_grad():  # random commands give every observation a spread to start from
+            self.surrogate = fit(env, self.plants, self._watch)
+        self.flights, self.adjoint = Flights(T, E, device), Flights(T, E, device)
+        make = {"device": device, "dtype": torch.float32}
+        self.obs = torch.zeros(T, E, env.layout.dimension, **make)
+        self.action = torch.zeros(T, E, act.ACTIONS, **make)
+        self.landing, self.time = torch.zeros(T + 1, E, 2, **make), torch.zeros(T + 1, E, **make)
+        self.age, self.goal = torch.zeros(E, **make), torch.zeros(E, 3, **make)
+        nodes = (-1.0, 0.0, 1.0, 2.0)  # of the cubic through the steps about the separation
+        shares = [math.prod((rest - b) / (a - b) for b in nodes if b != a) for a in nodes]
+        k = torch.arange(self.releases, device=device)
+        self._separation = [(w, (k + self.lag + int(a)).clamp(0, T)) for a, w in zip(nodes, shares)]
+        self._drop = torch.tensor([0.0, 0.0, 0.5 * GRAVITY], **make)
+        self._width, self._first = torch.zeros((), **make), torch.zeros((), **make)
+        self._figures: dict[str, Tensor] = {}
+        self._adapting = False
+        self._begin()
+        on_gpu = device.startswith("cuda")
+        rate = torch.tensor(self.p.learning_rate, **make) if on_gpu else self.p.learning_rate
+        self.optimizer = torch.optim.Adam(self.network.mlp.parameters(), lr=rate, betas=(0.9, 0.95), capturable=on_gpu)
+        self.rollout, self._update = (Replayed(work) if on_gpu else work for work in (self._fly, self._descend))
+
+    def _begin(self) -> None:
+        """Hover with the latch at rest, whatever is seen."""
+        last = self.network.mlp[-1]
+        with torch.no_grad():
+            last.weight.mul_(0.1)
+            last.bias.copy_(self.env._start_action)
+            last.bias[act.COMMANDS] = self.p.initial_release
+
+    def act(self, obs: Tensor) -> Tensor:
+        """Actions, shape (E, 5), for observations, shape (E, D)."""
+        return self.network.mlp(self.network.obs_normalizer(obs))
+
+    @torch.no_grad()
+    def _fly(self) -> None:
+        """Fly one batch without release."""
+        env = self.env
+
+        def decide(k: int, seen: Tensor) -> Tensor:
+            self.obs[k].copy_(seen)
+            self.action[k].copy_(self.act(seen))
+            return self.action[k]
+
+        def foresee(k: int) -> None:
+            if k == 0:
+                self.goal.copy_(env.views.goal_w)
+                self.age.copy_(env.pose_age)
+            with on_torch_stream(env.device):
+                env.sim.foresee()
+            self.landing[k].copy_(env.views.foreseen["landing_w"][:, :2])
+            self.time[k].copy_(env.views.foreseen["time_to_impact"])
+
+        self.flights.fly(env, self.plants, decide, foresee)
+
+    def _rewards_at_release(self, x: SimpleNamespace) -> tuple[Tensor, Tensor, Tensor]:
+        """Reward, landing error [m] and time to impact [s] of a release at each step, shape (releases, E)."""
+        p, release = self.cfg.task.reward, self.cfg.release
+        up = x.load_vel[..., 2]
+        fall = (up + (up.square() + 2.0 * GRAVITY * (x.load_pos[..., 2] - release.landing_height)).clamp(min=1e-6).sqrt()) / GRAVITY
+        landing = x.load_pos[..., :2] + x.load_vel[..., :2] * fall[..., None]
+        landing = landing + (self.landing - landing).detach()  # the simulator's own value, the slope of flight without drag
+        fall = fall + (self.time - fall).detach()
+        share = torch.linspace(0.0, 1.0, release.clearance_samples, device=fall.device) * fall[..., None]
+        path = (x.load_pos - x.pos)[:, :, None] + share[..., None] * x.load_vel[:, :, None] - share[..., None] ** 2 * self._drop
+        clearance = (path.square().sum(-1) + 1e-12).sqrt().amin(-1)
+        landing, fall, clearance = (sum(w * value[i] for w, i in self._separation) for value in (landing, fall, clearance))
+        error = ((landing - self.goal[:, :2]).square().sum(-1) + 1e-8).sqrt()
+        reward = rewards.landing(p, error) + rewards.time_of_flight(p, fall)
+        return reward + rewards.proximity(p, clearance, release.clearance_margin), error, fall
+
+    def _carrying(self, x: SimpleNamespace) -> Tensor:
+        """Rewards of each step while carrying, barriers included, shape (T, E)."""
+        task, env = self.cfg.task, self.env
+        p, bounds = task.reward, task.bounds
+        rate, height, load = x.response[1:, :, 1:], x.pos[1:, :, 2], x.load_pos[1:, :, 2]
+        before = torch.cat([env._start_action.expand_as(x.clipped[:1]), x.clipped[:-1]])
+        now, before = x.clipped.flatten(0, 1), before.flatten(0, 1)
+        on_action = rewards.command(p, now, env._rate_weights) + rewards.change(p, now, before, env._change_weights)
+        inside = [
+            height - bounds.altitude[0] - MARGINS["altitude"],
+            bounds.altitude[1] - MARGINS["altitude"] - height,
+            load - self.cfg.release.landing_height - MARGINS["ground"],
+            height - load - MARGINS["above"],
+            x.upright[1:] - math.cos(math.radians(bounds.tilt_deg)) - MARGINS["upright"],
+            bounds.horizontal - MARGINS["altitude"] - x.pos[1:, :, :2].norm(dim=-1),
+        ]
+        barrier = BARRIER * sum(gap.clamp(max=0.0).square() for gap in inside)
+        moving = rewards.kinetic(p, x.vel[1:], rate, x.load_vel[1:])
+        return moving + on_action.view_as(moving) + rewards.carry_time(p, self.cfg.sim.control_period) - barrier
+
+    def _cost(self, x: SimpleNamespace) -> tuple[Tensor, dict[str, Tensor]]:
+        """Mean cost of the flights and figures of what is released."""
+        p, K, steps = self.cfg.task.reward, self.releases, self.flights.steps
+        k = torch.arange(self.p.horizon, device=steps.device)[:, None]
+        reward, error, fall = self._rewards_at_release(x)
+        hazard = torch.sigmoid((x.action[:K, :, act.COMMANDS] - self.cfg.release.threshold) / self._width) * (k[:K] >= self._first)
+        ended, cut = k[:K] > steps, k[:K] + self.lag + 2 > steps
+        hazard = torch.where(ended, 1.0, hazard)
+        reward = torch.where(cut, -p.termination, reward)
+        survival = torch.cat([torch.ones_like(hazard[:1]), (1.0 - hazard).cumprod(0)])
+        chance = survival[:-1] * hazard
+        carried = survival[(k[:, 0] - self.lag).clamp(0, K)] * (k < steps)
+        past = (x.action.abs() - 1.0).clamp(min=0.0).square().sum(-1) * (k < steps)
+        gain = (chance * reward).sum(0) + (carried * self._carrying(x)).sum(0) - p.termination * survival[-1]
+        done = (chance * ~cut).detach()
+        total = done.sum().clamp(min=1e-6)
+        duration = (k[:K] + 1) * self.cfg.sim.control_period + self.cfg.release.lag + fall
+        figures = {"released": done.sum() / done.shape[1], "landing_error": (done * error).sum() / total,
+                   "duration": (done * duration).sum() / total}  # fmt: skip
+        return (self.p.saturation * past.sum(0) - gain).mean() * p.scale, figures
+
+    def derivatives(self) -> tuple[Tensor, dict[str, Tensor]]:
+        """Derivatives of the cost of the last rollout by the actions, shape (T, E, 5), and figures."""
+        f, adjoint, states = self.flights.x, self.adjoint.x, ("pos", "vel", "load_pos", "load_vel", "response")
+        tilt = ob.rotation_from_quat(f["quat"])[..., 2, :]  # world z in the body frame
+        x = SimpleNamespace(**{name: f[name].clone() for name in states})
+        x.upright, x.action, x.clipped = tilt[..., 2].clone(), self.action.clone(), act.clip_action(self.action)
+        leaves = vars(x)
+        for leaf in leaves.values():
+            leaf.requires_grad_()
+        with torch.enable_grad():
+            cost, figures = self._cost(x)
+        by = dict(zip(leaves, torch.autograd.grad(cost, list(leaves.values())), strict=True))
+        for name in states:
+            adjoint[name].copy_(by[name])
+        adjoint["turn"].copy_(torch.stack([-tilt[..., 1], tilt[..., 0], torch.zeros_like(tilt[..., 0])], -1) * by["upright"][..., None])
+        adjoint["command"].zero_()
+        by_clipped, by_action = by["clipped"].contiguous(), by["action"].contiguous()
+        self._backward(by_clipped, by_action)
+        return by_action, figures | {"cost": cost.detach()}
+
+    def _backward(self, by_clipped: Tensor, by_action: Tensor) -> None:
+        """Run the backward kernel over the last rollout; ``by_action`` becomes the whole derivative."""
+        env, task, p = self.env, self.cfg.task, Setting()
+        p.max_thrust, p.max_rate = task.action.max_thrust, wp.vec3(*task.action.max_rate)
+        p.period, p.decay = self.cfg.sim.control_period, self.p.decay
+        lens = self._lens() if env.layout.name == "vision" else torch.zeros(1, 1, 1, 3, device=env.device)
+        vectors = {"mount": self.plants.mount, "goal": self.goal, "corners": env.camera.square_w, "lens": lens}
+        plain = {"mass": self.flights.mass, "load_mass": self.plants.load_mass, "age": self.age, "network": self._jacobian()}
+        for name, tensor in {**vars(self.surrogate), **plain, **vectors}.items():
+            kind = wp.vec3 if name in vectors else wp.vec4 if name == "response" else wp.float32
+            setattr(p, name, wp.from_torch(tensor.contiguous(), dtype=kind))
+        arrays = [wp.from_torch(tensor) for tensor in (self.flights.steps, self.action, by_clipped, by_action)]
+        with on_torch_stream(env.device):
+            inputs = [p, self.adjoint.course, self.flights.course, *arrays]
+            wp.launch(build_backward(env.layout), env.num_envs, inputs, device=env.device, block_dim=64)
+
+    def _jacobian(self) -> Tensor:
+        """Derivatives of the network's actions by the observations of the last rollout, shape (T, E, 5, D)."""
+        *hidden, last = self.network.mlp
+        normalizer = self.network.obs_normalizer
+        scale = normalizer._std + normalizer.eps if self.network.obs_normalization else 1.0
+        jacobian = []
+        for x in self.obs.split(STEPS_AT_ONCE):
+            x, slopes = normalizer(x.flatten(0, 1)), []
+            for linear, activation in zip(hidden[::2], hidden[1::2], strict=True):
+                with torch.enable_grad():
+                    x = linear(x).detach().requires_grad_()
+                    y = activation(x)
+                    slopes.append(torch.autograd.grad(y.sum(), x)[0])
+                x = y.detach()
+            product = last.weight.detach().expand(len(x), -1, -1)
+            for linear, slope in zip(hidden[-2::-2], reversed(slopes), strict=True):
+                product = (product * slope[:, None]) @ linear.weight.detach()
+            jacobian.append((product / scale).view(-1, self.env.num_envs, *product.shape[1:]))
+        return torch.cat(jacobian)
+
+    def _lens(self) -> Tensor:
+        """Derivatives of each image coordinate by its point's place in the body frame, shape (T, E, 16, 3).
+
+        To move the camera by -e is to move every point by e, so three directions give them all.
+        """
+        env, f, T = self.env, self.flights.x, self.p.horizon
+        late = (self.age / self.cfg.sim.control_period)[:, None]
+        rot = ob.rotation_from_quat(f["quat"])
+        pose = torch.cat([f["pos"], rot[..., 0], rot[..., 1], f["load_pos"]], -1)[:T]
+        pose = torch.lerp(pose, torch.cat([pose[:1], pose[:-1]]), late).flatten(0, 1)
+        pos, x_axis, y_axis, load = pose.split(3, -1)
+        rot = torch.stack([x_axis, y_axis, torch.linalg.cross(x_axis, y_axis)], -1)
+        goal = self.goal.repeat(T, 1)
+        extrinsics = env.extrinsics()
+        if extrinsics is not None:
+            extrinsics = tuple(part.repeat(T, *(1,) * (part.dim() - 1)) for part in extrinsics)
+
+        def image(pos: Tensor) -> Tensor:
+            return ob.vision_part(env.camera, pos, rot, goal, load, extrinsics)[0].flatten(1)
+
+        columns = [torch.func.jvp(image, (pos,), (-rot[..., i].contiguous(),))[1] for i in range(3)]
+        kept = 1.0 - self.cfg.camera.noise.drop_probability
+        return kept * torch.stack(columns, -1).unflatten(0, (T, env.num_envs))
+
+    def step(self, done: float) -> dict[str, float]:
+        """One rollout and one step of Adam at this share of the training; returns its figures."""
+        p, start = self.p, time.perf_counter()
+        learnt = 1.0 if self._adapting else done
+        self._width.fill_(p.width * (p.final_width / p.width) ** min(learnt / p.sharp, 1.0))
+        self._first.fill_(p.first_release * min(max((p.free[1] - learnt) / (p.free[1] - p.free[0]), 0.0), 1.0))
+        highest = p.adapting_rate if self._adapting else p.learning_rate
+        rate = p.final_rate + 0.5 * (highest - p.final_rate) * (1.0 + math.cos(math.pi * done))
+        for group in self.optimizer.param_groups:
+            group["lr"] = group["lr"].fill_(rate) if isinstance(group["lr"], Tensor) else rate
+        self.rollout()
+        if self.env.device.startswith("cuda"):
+            torch.cuda.synchronize()
+        middle = time.perf_counter()
+        self._update()
+        figures = {name: float(value) for name, value in self._figures.items()}
+        times = {"rollout_s": middle - start, "learning_s": time.perf_counter() - middle}
+        return figures | times | {"learning_rate": rate, "episodes": float(self.env.num_envs)}
+
+    def _descend(self) -> None:
+        """Gradient of the last rollout, Adam, observation statistics."""
+        by_action, self._figures = self.derivatives()
+        flown = torch.arange(self.p.horizon, device=self.env.device)[:, None] <= self.flights.steps
+        by_action = by_action * flown[..., None]
+        size = by_action.square().sum((0, 2)).sqrt()  # a few wild flights must not outweigh the rest
+        by_action = by_action * (OUTLIER * size.sort().values[len(size) // 2] / size.clamp(min=1e-12)).clamp(max=1.0)[:, None]
+        seen, parameters = self.obs.flatten(0, 1), list(self.network.mlp.parameters())
+        with torch.enable_grad():
+            output = self.act(seen)
+        gradients = torch.autograd.grad(output, parameters, by_action.flatten(0, 1))
+        for parameter, gradient in zip(parameters, gradients, strict=True):
+            parameter.grad = gradient
+        self._figures["gradient_norm"] = torch.nn.utils.clip_grad_norm_(parameters, self.p.max_grad_norm)
+        self._figures["ended"] = (self.flights.steps < self.p.horizon).float().mean()
+        self.optimizer.step()
+        self._watch(seen)
+
+    def _watch(self, seen: Tensor) -> None:
+        """Take observations, shape (N, D), into the normaliser's statistics."""
+        if self.network.obs_normalization:
+            normalizer = self.network.obs_normalizer
+            std = normalizer._std  # the update makes a new tensor; a graph reads this one
+            normalizer.update(seen)
+            normalizer._std = std.copy_(normalizer._std)
+
+    def export(self, contract: dict, made_by: dict) -> Policy:
+        """The policy as a file's content."""
+        return Policy.from_actor_state(self.network.state_dict(), self.cfg.ppo.activation, contract, made_by)
+
+    def take_up(self, policy: Policy) -> None:
+        """Start from a policy of the same layers: it releases as it has learnt to, and the rate starts at that of adaptation."""
+        self.network.take_up(policy)
+        self._adapting = True
+
+    def state_dict(self) -> dict:
+        """All that the next iteration depends on, besides torch's generators."""
+        parts = {"network": self.network.state_dict(), "optimizer": self.optimizer.state_dict(), "adapting": self._adapting}
+        return {**parts, "surrogate": vars(self.surrogate), "env": self.env.state_dict()}
+
+    def load_state_dict(self, saved: dict, own_throws: bool = True) -> None:
+        """Take up a state of :meth:`state_dict`; its environment too where ``own_throws`` is set."""
+        self.network.load_state_dict(saved["network"])
+        self.optimizer.load_state_dict(saved["optimizer"])
+        self.surrogate, self._adapting = Surrogate(**saved["surrogate"]), saved["adapting"]
+        if own_throws:
+            self.env.load_state_dict(saved["env"])
