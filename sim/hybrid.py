@@ -148,8 +148,12 @@ class HybridSim:
         self._ropes = wp.array(pack_rope(t, ropes_on(vehicles, ropes)), dtype=t.Rope, device=device)
         self._airs = wp.array(pack_air(t, airs, [params.laws] * len(airs)), dtype=t.Air, device=device)
         self._release = wp.array(pack(t.Release, *releases), dtype=t.Release, device=device)
-        segments, period = params.rope.segments, params.sim.control_period
-        depth = max(queue_depth(v.queue.delay, period) for v in vehicles)
+        self._allocate(max(queue_depth(v.queue.delay, params.sim.control_period) for v in vehicles))
+        self.place(pos_w=np.zeros((count, 3)))
+
+    def _allocate(self, depth: int) -> None:
+        """Make the arrays of state and output, with a command queue so deep."""
+        t, count, device, segments = self.types, self.count, self.device, self.params.rope.segments
         rows = {"cable_dir_w": segments, "cable_vel_w": segments, "stiffness": segments, "queue": depth}
         self.state = st.allocate(t, self._step.State, st.STATE_FIELDS, count, rows, device)
         outputs = {k: (v, False) for k, v in st.OUTPUT_FIELDS.items()}
@@ -160,7 +164,6 @@ class HybridSim:
         self._all = wp.full(count, 1, dtype=wp.int32, device=device)
         self._used = wp.zeros(count, dtype=t.real, device=device)
         self._spreads: tuple[RandomizationParams, wp.array] | None = None
-        self.place(pos_w=np.zeros((count, 3)))
 
     def step(self) -> None:
         """Advance every plant by one control period under ``command`` and ``release``."""

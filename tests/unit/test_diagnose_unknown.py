@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
+from visthrow.diagnose.likelihood import grammar
 from visthrow.diagnose.likelihood.evidence import Priors
 from visthrow.diagnose.models.interface import LATENT_BLOCKS
 from visthrow.diagnose.reporting.blackbox import Table, table_of, train, unexplained
-from visthrow.diagnose.select import grammar, result, screening, search, unknown, verdicts
+from visthrow.diagnose.select import result, screening, search, unknown, verdicts
 from visthrow.diagnose.select.excess import acts_on
 from visthrow.diagnose.select.point import Problem, candidate, linearise
 

@@ -13,7 +13,7 @@ from sim.hybrid import HybridSim
 from sim.params import LawParams
 from tests.plants import paper_plant
 from visthrow import config
-from visthrow.diagnose.select import grammar
+from visthrow.diagnose.likelihood import grammar
 from visthrow.task import Experiment
 
 SWIRL = LawParams("payload force", (), "vertical_cross_vel", 0.02)

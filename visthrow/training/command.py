@@ -277,8 +277,8 @@ def _viewer(wanted: bool, trainer) -> Iterator:
     import torch
 
     from visthrow.task import contract_of
-    from visthrow.throws.flight import fly
     from visthrow.throws.loading import Loaded
+    from visthrow.throws.recorded import fly
     from visthrow.view import live, rerun_view
 
     with live.served() as address:

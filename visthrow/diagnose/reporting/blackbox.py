@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from visthrow.diagnose.likelihood import grammar
 from visthrow.diagnose.likelihood.marginal import window_statistics
 from visthrow.diagnose.models.interface import LATENT_BLOCKS, Window
-from visthrow.diagnose.select import grammar
 from visthrow.diagnose.select.point import Point
 
 CENTRES = 20

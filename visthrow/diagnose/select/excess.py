@@ -9,10 +9,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from visthrow.diagnose.likelihood.grammar import JOINT, JOINT_NEEDS, Known, through_latents
 from visthrow.diagnose.likelihood.marginal import Gram
 from visthrow.diagnose.likelihood.stack import Stack
 from visthrow.diagnose.models.interface import LATENT_BLOCKS, Window
-from visthrow.diagnose.select.grammar import JOINT, JOINT_NEEDS, Known, through_latents
 from visthrow.diagnose.select.point import Point, Problem
 from visthrow.diagnose.select.result import Level
 from visthrow.logs.flightlog import STANDARD_CHANNELS

@@ -89,9 +89,9 @@ class Law:
     """A term outside the catalogue: coefficient times scalar factors times a vector."""
 
     formula: str
-    block: str  # of visthrow.diagnose.select.grammar.BLOCKS
-    factors: tuple[str, ...]  # keys of visthrow.diagnose.select.grammar.SCALARS
-    vector: str  # key of visthrow.diagnose.select.grammar.VECTORS
+    block: str  # of visthrow.diagnose.likelihood.grammar.BLOCKS
+    factors: tuple[str, ...]  # keys of visthrow.diagnose.likelihood.grammar.SCALARS
+    vector: str  # key of visthrow.diagnose.likelihood.grammar.VECTORS
     coefficient: float
     sd: float
     unit: str

@@ -12,13 +12,13 @@ from functools import lru_cache
 import numpy as np
 import torch
 
+from visthrow.diagnose.likelihood import grammar
 from visthrow.diagnose.likelihood.evidence import Priors, covariance
 from visthrow.diagnose.likelihood.marginal import WindowStatistics, gather
 from visthrow.diagnose.likelihood.stack import BATCH, statistics
 from visthrow.diagnose.likelihood.threads import each
 from visthrow.diagnose.likelihood.transfer import all_to_host, side_by_side
 from visthrow.diagnose.models.interface import LATENT_BLOCKS
-from visthrow.diagnose.select import grammar
 from visthrow.diagnose.select.point import Point
 
 ROUGHER = 2.0

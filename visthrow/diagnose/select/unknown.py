@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import lapack
 
+from visthrow.diagnose.likelihood import grammar
 from visthrow.diagnose.likelihood import noise as noise_levels
 from visthrow.diagnose.likelihood.designs import Same
 from visthrow.diagnose.likelihood.evidence import Priors, covariance, estimate, log_evidence
@@ -17,7 +18,6 @@ from visthrow.diagnose.likelihood.marginal import Gram, Integral, Noise
 from visthrow.diagnose.likelihood.stack import Integrals
 from visthrow.diagnose.likelihood.threads import each
 from visthrow.diagnose.models.interface import LATENT_BLOCKS
-from visthrow.diagnose.select import grammar
 from visthrow.diagnose.select.consistency import LEAST_FLIGHTS, differ
 from visthrow.diagnose.select.excess import acts_on
 from visthrow.diagnose.select.point import Point, advantage, regathered, shifted
