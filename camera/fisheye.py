@@ -6,75 +6,16 @@ no branches on data, no boolean-mask indexing. Only elementwise operations whose
 the CPU.
 """
 
-import math
-from dataclasses import dataclass
 
-import numpy as np
 import torch
+
+from camera.params import FisheyeParams
 
 AXIS_EPSILON = 1e-20
 """Added to x^2 + y^2 so that value and gradient are finite on the axis: a radius of 1e-10 in the points' unit."""
 
 NEWTON_STEPS = 16
 """Safeguarded Newton steps of the inverse: bisection where a Newton step would leave the bracket."""
-
-
-@dataclass(frozen=True)
-class FisheyeParams:
-    """Intrinsics of a Kannala-Brandt fisheye camera.
-
-    ``theta = atan2(sqrt(x^2 + y^2), z)``, ``theta_d = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8)``,
-    ``u = fx theta_d cos(phi) + cx``, ``v = fy theta_d sin(phi) + cy``. All k zero: the equidistant lens.
-
-    Convention: pixel (0, 0) is the *centre* of the top left pixel, u to the right, v down, as in OpenCV, Kalibr, ROS
-    and basalt.
-    Source: Kannala and Brandt, "A generic camera model and calibration method", TPAMI 28(8), 2006, eq. 6.
-    """
-
-    width: int  # [px]
-    height: int  # [px]
-    fx: float  # [px/rad]
-    fy: float  # [px/rad]
-    cx: float  # [px]
-    cy: float  # [px]
-    k1: float = 0.0  # [rad^-2]
-    k2: float = 0.0  # [rad^-4]
-    k3: float = 0.0  # [rad^-6]
-    k4: float = 0.0  # [rad^-8]
-    fov_deg: float = 220.0  # full field of view, twice the largest angle off the axis [deg]
-
-    @property
-    def coefficients(self) -> tuple[float, float, float, float]:
-        """Distortion coefficients (k1, k2, k3, k4)."""
-        return (self.k1, self.k2, self.k3, self.k4)
-
-    @property
-    def half_fov(self) -> float:
-        """Largest angle off the optical axis that is inside the field of view [rad]."""
-        return math.radians(self.fov_deg) / 2.0
-
-
-def check_fisheye(params: FisheyeParams) -> None:
-    """Refuse intrinsics that describe no camera.
-
-    Raises:
-        ValueError: A value is not finite or out of range, or theta_d does not grow all the way to the edge of the field
-        of view.
-    """
-    for name in ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "fov_deg"):
-        if not math.isfinite(getattr(params, name)):
-            raise ValueError(f"fisheye {name} is {getattr(params, name)}; expected a finite number")
-    for name in ("width", "height", "fx", "fy"):
-        if getattr(params, name) <= 0:
-            raise ValueError(f"fisheye {name} is {getattr(params, name)}; expected a number above 0")
-    if not 0.0 < params.fov_deg <= 360.0:
-        raise ValueError(f"fisheye fov_deg is {params.fov_deg}; expected a full angle above 0 and up to 360 deg")
-    limit = monotonic_limit(params.coefficients)
-    if limit <= params.half_fov:
-        raise ValueError(
-            f"theta_d with k = {params.coefficients} stops growing at {math.degrees(limit):.2f} deg off the axis, "
-            f"inside the field of view; expected fov_deg below {2 * math.degrees(limit):.2f}, got {params.fov_deg}"
-        )
 
 
 def transfer_pixels(pixels: torch.Tensor, source: "Fisheye", target: "Fisheye") -> tuple[torch.Tensor, torch.Tensor]:
@@ -91,15 +32,6 @@ def transfer_pixels(pixels: torch.Tensor, source: "Fisheye", target: "Fisheye") 
     rays, seen = source.unproject(pixels)
     normalized, valid = target.project_normalized(rays)
     return normalized, seen & valid
-
-
-def monotonic_limit(coefficients: tuple[float, ...]) -> float:
-    """Angle off the axis at which theta_d stops growing, ``inf`` where it never does [rad]."""
-    slope = [(2 * i + 3) * k for i, k in enumerate(coefficients)][::-1] + [1.0]
-    roots = np.roots(np.trim_zeros(slope, "f")) if any(slope[:-1]) else np.zeros(0)
-    real = roots[np.abs(roots.imag) < 1e-12 * np.abs(roots)].real if roots.size else roots
-    positive = real[real > 0.0]
-    return float(np.sqrt(positive.min())) if positive.size else math.inf
 
 
 class Fisheye:
@@ -122,12 +54,7 @@ class Fisheye:
     """
 
     def __init__(self, params: FisheyeParams):
-        """Check the intrinsics and precompute the edge of the field of view.
-
-        Raises:
-            ValueError: See `check_fisheye`.
-        """
-        check_fisheye(params)
+        """Keep what projection and its inverse need of the intrinsics."""
         self.params = params
         self.half_fov = params.half_fov
         self._equidistant = not any(params.coefficients)

@@ -8,7 +8,7 @@ import torch
 
 from camera.fisheye import AXIS_EPSILON, Fisheye
 from camera.mount import extrinsics_with_error, nominal_rot_cb, points_c_from_w
-from camera.params import CameraParams, check_camera
+from camera.params import CameraParams
 
 GOAL_KEYPOINTS = 4
 PAYLOAD_KEYPOINTS = 4
@@ -36,12 +36,7 @@ class KeypointCamera:
     """
 
     def __init__(self, params: CameraParams, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32):
-        """Check the parameters and put the constants on the device.
-
-        Raises:
-            ValueError: See `check_camera`.
-        """
-        check_camera(params)
+        """Put the constants on the device."""
         self.params = params
         self.fisheye = Fisheye(params.fisheye)
         self.rot_cb = nominal_rot_cb(params.mount).to(device=device, dtype=dtype)

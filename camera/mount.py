@@ -5,32 +5,13 @@ where the trainer turns that on), and the training environment must equal the on
 """
 
 import math
-from dataclasses import dataclass
 
 import torch
 
+from camera.params import MountParams
+
 DOWNWARD_ROT_CB = ((0.0, -1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
 """rot_cb of the downward camera: x_c (image right) = -y_b, y_c (image down) = -x_b, z_c (optical axis) = -z_b."""
-
-
-@dataclass(frozen=True)
-class MountParams:
-    """Where the camera sits on the body and how it is turned.
-
-    Convention: with ``rpy_deg`` zero the camera looks down and the top of the image is the vehicle's front:
-    x_c (image right) = -y_b (the vehicle's right), y_c (image down) = -x_b, z_c (optical axis) = -z_b. ``rpy_deg``
-    turns the camera about the body axes from there, ``rot_bc = Rz(yaw) Ry(pitch) Rx(roll) rot_bc_down``: a negative
-    pitch lets it look forward.
-    """
-
-    position_b: tuple[float, float, float] = (0.0, 0.0, 0.0)  # lens from the centre of mass [m], body frame
-    rpy_deg: tuple[float, float, float] = (
-        0.0,
-        0.0,
-        0.0,
-    )  # roll, pitch, yaw from the downward pose [deg], about body axes
-    rotation_error_std: float = 0.0  # per episode and axis, unknown to the policy [rad]
-    position_error_std: float = 0.0  # per episode and axis, unknown to the policy [m]
 
 
 def rotation_from_vector(vector: torch.Tensor) -> torch.Tensor:

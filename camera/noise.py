@@ -4,35 +4,12 @@ The randomness is an argument (`draw_step`, `draw_episode` make it from a torch.
 are pure, so that a CUDA graph can replay them on refilled buffers and the HIL runner can pass zeros.
 """
 
-from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import torch
 
 from camera.history import at_latency, latency_weights
-
-
-@dataclass(frozen=True)
-class KeypointNoiseParams:
-    """Imperfections of the keypoints, in normalised image coordinates (1 at the edge of the field of view).
-
-    ``invalid_reads``: ``edge``: a point outside the field of view reads as its direction at the edge, radius 1: it
-    moves smoothly there and away again, says on which side to look, and cannot be taken for a point in the middle of
-    the image even by an actor without validity bits. Whoever knows poses (training, HIL) can compute it; behind a
-    detector it takes a tracker. ``zero``: it reads as the principal point. A dropped-out point reads zero in both:
-    nothing was measured.
-    """
-
-    step_std: float = 0.01  # Gaussian per step, keypoint and axis [-]
-    bias_std: float = 0.001  # Gaussian per episode, keypoint and axis [-]
-    drop_probability: float = 0.0  # per step and keypoint that it reads as invalid [-]
-    latency: float = 0.0  # age of the keypoints that the policy sees, fractions interpolated [policy steps]
-    invalid_reads: Literal["edge", "zero"] = "edge"
-
-    @property
-    def history_length(self) -> int:
-        """Entries that a latency buffer must hold."""
-        return int(-(-self.latency // 1)) + 1
+from camera.params import KeypointNoiseParams
 
 
 class StepDraw(NamedTuple):
@@ -40,21 +17,6 @@ class StepDraw(NamedTuple):
 
     normals: torch.Tensor
     uniforms: torch.Tensor
-
-
-def check_noise(params: KeypointNoiseParams) -> None:
-    """Refuse noise settings out of range.
-
-    Raises:
-        ValueError: A negative spread or latency, a probability outside [0, 1], or an unknown ``invalid_reads``.
-    """
-    for name in ("step_std", "bias_std", "latency"):
-        if not getattr(params, name) >= 0.0:
-            raise ValueError(f"keypoint noise {name} is {getattr(params, name)}; expected a number of at least 0")
-    if not 0.0 <= params.drop_probability <= 1.0:
-        raise ValueError(f"keypoint noise drop_probability is {params.drop_probability}; expected a number in [0, 1]")
-    if params.invalid_reads not in ("edge", "zero"):
-        raise ValueError(f"keypoint noise invalid_reads is {params.invalid_reads!r}; expected one of 'edge', 'zero'")
 
 
 def draw_step(

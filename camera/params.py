@@ -1,10 +1,143 @@
-"""Configuration of the camera: one frozen dataclass a file of ``configs/camera``."""
+"""Configuration of the camera: one frozen dataclass a file of ``configs/camera``. Imports neither torch nor cv2."""
 
+import math
 from dataclasses import dataclass
+from typing import Literal
 
-from camera.fisheye import FisheyeParams, check_fisheye
-from camera.mount import MountParams
-from camera.noise import KeypointNoiseParams, check_noise
+import numpy as np
+
+SEEN_AT_LEAST = math.radians(1.0)
+"""Angle off the axis that any lens must image [rad]."""
+
+
+def monotonic_limit(coefficients: tuple[float, ...]) -> float:
+    """Angle off the axis at which theta_d stops growing, ``inf`` where it never does [rad]."""
+    slope = [(2 * i + 3) * k for i, k in enumerate(coefficients)][::-1] + [1.0]
+    roots = np.roots(np.trim_zeros(slope, "f")) if any(slope[:-1]) else np.zeros(0)
+    real = roots[np.abs(roots.imag) < 1e-12 * np.abs(roots)].real if roots.size else roots
+    positive = real[real > 0.0]
+    return float(np.sqrt(positive.min())) if positive.size else math.inf
+
+
+@dataclass(frozen=True)
+class FisheyeParams:
+    """Intrinsics of a Kannala-Brandt fisheye camera.
+
+    ``theta = atan2(sqrt(x^2 + y^2), z)``, ``theta_d = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8)``,
+    ``u = fx theta_d cos(phi) + cx``, ``v = fy theta_d sin(phi) + cy``. All k zero: the equidistant lens.
+
+    Convention: pixel (0, 0) is the *centre* of the top left pixel, u to the right, v down, as in OpenCV, Kalibr, ROS
+    and basalt.
+    Source: Kannala and Brandt, "A generic camera model and calibration method", TPAMI 28(8), 2006, eq. 6.
+    """
+
+    width: int  # [px]
+    height: int  # [px]
+    fx: float  # [px/rad]
+    fy: float  # [px/rad]
+    cx: float  # [px]
+    cy: float  # [px]
+    k1: float = 0.0  # [rad^-2]
+    k2: float = 0.0  # [rad^-4]
+    k3: float = 0.0  # [rad^-6]
+    k4: float = 0.0  # [rad^-8]
+    fov_deg: float = 220.0  # full field of view, twice the largest angle off the axis [deg]
+
+    @property
+    def coefficients(self) -> tuple[float, float, float, float]:
+        """Distortion coefficients (k1, k2, k3, k4)."""
+        return (self.k1, self.k2, self.k3, self.k4)
+
+    @property
+    def half_fov(self) -> float:
+        """Largest angle off the optical axis that is inside the field of view [rad]."""
+        return math.radians(self.fov_deg) / 2.0
+
+    def __post_init__(self) -> None:
+        """Refuse intrinsics that describe no camera.
+
+        Raises:
+            ValueError: A value is not finite or out of range, or theta_d does not grow all the way to the edge of the field
+            of view.
+        """
+        for name in ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "fov_deg"):
+            if not math.isfinite(getattr(self, name)):
+                raise ValueError(f"fisheye {name} is {getattr(self, name)}; expected a finite number")
+        for name in ("width", "height", "fx", "fy"):
+            if getattr(self, name) <= 0:
+                raise ValueError(f"fisheye {name} is {getattr(self, name)}; expected a number above 0")
+        if not 0.0 < self.fov_deg <= 360.0:
+            raise ValueError(f"fisheye fov_deg is {self.fov_deg}; expected a full angle above 0 and up to 360 deg")
+        t2 = SEEN_AT_LEAST**2
+        near = SEEN_AT_LEAST * (1 + sum(k * t2 ** (n + 1) for n, k in enumerate(self.coefficients)))
+        if near * min(self.fx, self.fy) > math.hypot(self.width, self.height):
+            raise ValueError(
+                f"fisheye k = {self.coefficients} with fx = {self.fx}, fy = {self.fy}: a ray 1 deg off the axis falls outside an image "
+                f"of {self.width} x {self.height} px; expected a lens that sees more than that"
+            )
+        limit = monotonic_limit(self.coefficients)
+        if limit <= self.half_fov:
+            raise ValueError(
+                f"theta_d with k = {self.coefficients} stops growing at {math.degrees(limit):.2f} deg off the axis, "
+                f"inside the field of view; expected fov_deg below {2 * math.degrees(limit):.2f}, got {self.fov_deg}"
+            )
+
+
+@dataclass(frozen=True)
+class MountParams:
+    """Where the camera sits on the body and how it is turned.
+
+    Convention: with ``rpy_deg`` zero the camera looks down and the top of the image is the vehicle's front:
+    x_c (image right) = -y_b (the vehicle's right), y_c (image down) = -x_b, z_c (optical axis) = -z_b. ``rpy_deg``
+    turns the camera about the body axes from there, ``rot_bc = Rz(yaw) Ry(pitch) Rx(roll) rot_bc_down``: a negative
+    pitch lets it look forward.
+    """
+
+    position_b: tuple[float, float, float] = (0.0, 0.0, 0.0)  # lens from the centre of mass [m], body frame
+    rpy_deg: tuple[float, float, float] = (
+        0.0,
+        0.0,
+        0.0,
+    )  # roll, pitch, yaw from the downward pose [deg], about body axes
+    rotation_error_std: float = 0.0  # per episode and axis, unknown to the policy [rad]
+    position_error_std: float = 0.0  # per episode and axis, unknown to the policy [m]
+
+
+@dataclass(frozen=True)
+class KeypointNoiseParams:
+    """Imperfections of the keypoints, in normalised image coordinates (1 at the edge of the field of view).
+
+    ``invalid_reads``: ``edge``: a point outside the field of view reads as its direction at the edge, radius 1: it
+    moves smoothly there and away again, says on which side to look, and cannot be taken for a point in the middle of
+    the image even by an actor without validity bits. Whoever knows poses (training, HIL) can compute it; behind a
+    detector it takes a tracker. ``zero``: it reads as the principal point. A dropped-out point reads zero in both:
+    nothing was measured.
+    """
+
+    step_std: float = 0.01  # Gaussian per step, keypoint and axis [-]
+    bias_std: float = 0.001  # Gaussian per episode, keypoint and axis [-]
+    drop_probability: float = 0.0  # per step and keypoint that it reads as invalid [-]
+    latency: float = 0.0  # age of the keypoints that the policy sees, fractions interpolated [policy steps]
+    invalid_reads: Literal["edge", "zero"] = "edge"
+
+    @property
+    def history_length(self) -> int:
+        """Entries that a latency buffer must hold."""
+        return int(-(-self.latency // 1)) + 1
+
+    def __post_init__(self) -> None:
+        """Refuse noise settings out of range.
+
+        Raises:
+            ValueError: A negative spread or latency, a probability outside [0, 1], or an unknown ``invalid_reads``.
+        """
+        for name in ("step_std", "bias_std", "latency"):
+            if not getattr(self, name) >= 0.0:
+                raise ValueError(f"keypoint noise {name} is {getattr(self, name)}; expected a number of at least 0")
+        if not 0.0 <= self.drop_probability <= 1.0:
+            raise ValueError(f"keypoint noise drop_probability is {self.drop_probability}; expected a number in [0, 1]")
+        if self.invalid_reads not in ("edge", "zero"):
+            raise ValueError(f"keypoint noise invalid_reads is {self.invalid_reads!r}; expected one of 'edge', 'zero'")
 
 
 @dataclass(frozen=True)
@@ -17,15 +150,12 @@ class CameraParams:
     goal_side: float  # side of the ground square around the target whose corners are seen [m]
     payload_radius: float  # radius of the ball whose bounding box is seen [m]
 
+    def __post_init__(self) -> None:
+        """Refuse parameters that describe no camera.
 
-def check_camera(params: CameraParams) -> None:
-    """Refuse parameters that describe no camera.
-
-    Raises:
-        ValueError: See `check_fisheye` and `check_noise`; or a size that is not above 0.
-    """
-    check_fisheye(params.fisheye)
-    check_noise(params.noise)
-    for name in ("goal_side", "payload_radius"):
-        if not getattr(params, name) > 0.0:
-            raise ValueError(f"camera {name} is {getattr(params, name)}; expected a length above 0 m")
+        Raises:
+            ValueError: A size that is not above 0.
+        """
+        for name in ("goal_side", "payload_radius"):
+            if not getattr(self, name) > 0.0:
+                raise ValueError(f"camera {name} is {getattr(self, name)}; expected a length above 0 m")

@@ -7,13 +7,19 @@ import warp as wp
 
 from sim.arrays import runtime  # noqa: F401  starts Warp
 from sim.arrays import state as st
-from sim.arrays.checks import check_air, check_numerics, check_release
+from sim.arrays.cores import cores, in_pieces
 from sim.arrays.structs import extensions_of, kinds_of, pack, pack_air, pack_rope, pack_vehicle, ropes_on, types
 from sim.effects.laws import check_laws, structure
 from sim.params import GRAVITY, AirParams, PlantParams, RandomizationParams, ReleaseParams, RopeParams, VehicleParams
 from sim.quadrotor.queue import queue_depth
 from sim.randomize import build_reset
 from sim.step import build_step
+
+PIECES = 2
+"""Of a batch for each core of a CPU; more than one, since a core may have other work too."""
+
+FEWEST = 64
+"""Environments of a piece: their step takes a millisecond, its launch a tenth."""
 
 _BUILDS: dict = {}
 
@@ -96,6 +102,7 @@ class HybridSim:
         direct: bool = False,
         extensions: frozenset[str] = frozenset(),
         gravity: float = GRAVITY,
+        threads: int | None = None,
     ):
         """Allocate ``count`` plants.
 
@@ -111,28 +118,24 @@ class HybridSim:
             direct: by-pass the blocks: commands are thrust [N] and torque [N m].
             extensions: of :data:`sim.arrays.structs.EXTENSIONS`, to build in besides those that the parameters need.
             gravity: acceleration of free fall, along -z [m/s^2].
+            threads: at most, of a CPU; default all its cores. The bits do not depend on it.
 
         Raises:
-            ValueError: no environment, ropes of different segment counts, or an unphysical parameter.
+            ValueError: no environment, ropes of different segment counts, or a law that no block can be made of.
         """
         if count < 1:
             raise ValueError(f"HybridSim of {count} environments: expected 1 or more")
-        check_numerics(params.sim)
         releases = releases or [params.release]
-        for release in releases:
-            check_release(release)
         ropes = ropes or [params.rope]
         vehicles = vehicles or [params.vehicle]
         airs = airs or [params.air]
-        for air in airs:
-            check_air(air)
         check_laws(params.laws)
         if {r.segments for r in ropes} != {params.rope.segments}:
             raise ValueError(
                 f"ropes of {sorted({r.segments for r in ropes})} segments in one batch of {params.rope.segments}"
             )
         self.params, self.count, self.device, self.seed = params, count, device, seed
-        self.gravity = gravity
+        self.gravity, self.threads = gravity, threads or cores()
         self.extensions = extensions_of(vehicles, ropes, airs, releases, params.laws) | extensions
         self.types, self._step, self._reset = _kernels(params, direct, self.extensions)
         t = self.types
@@ -158,9 +161,8 @@ class HybridSim:
     def step(self) -> None:
         """Advance every plant by one control period under ``command`` and ``release``."""
         s = self.params.sim
-        wp.launch(
+        self._launch(
             self._step.step,
-            self.count,
             [
                 self._vehicles,
                 self._ropes,
@@ -176,7 +178,6 @@ class HybridSim:
                 self.release,
                 self.out,
             ],
-            device=self.device,
             block_dim=64,
         )
 
@@ -186,9 +187,8 @@ class HybridSim:
             packed = pack(self.types.Randomization, spreads)
             self._spreads = (spreads, wp.array(packed, dtype=self.types.Randomization, device=self.device))
         mask = self._all if mask is None else mask
-        wp.launch(
+        self._launch(
             self._reset.randomize,
-            self.count,
             [
                 self._vehicles,
                 self._ropes,
@@ -200,7 +200,6 @@ class HybridSim:
                 mask,
                 self.goal_w,
             ],
-            device=self.device,
         )
         self._update_payload()
 
@@ -260,7 +259,21 @@ class HybridSim:
         return np.float32 if self.types.real is wp.float32 else np.float64
 
     def _update_payload(self) -> None:
-        wp.launch(self._step.payload, self.count, [self._ropes, self.state, self.out], device=self.device)
+        self._launch(self._step.payload, [self._ropes, self.state, self.out])
+
+    def _launch(self, kernel: wp.Kernel, arguments: list, block_dim: int = 256) -> None:
+        """Launch a kernel for all plants, on a CPU in pieces that run side by side."""
+        count, device = self.count, self.device
+        pieces = min(PIECES * self.threads, count // FEWEST) if device == "cpu" and self.threads > 1 else 1
+        if pieces <= 1:
+            wp.launch(kernel, count, [0, *arguments], device=device, block_dim=block_dim)
+            return
+        kernel.module.load(device)  # by one thread
+
+        def launch(first: int, last: int) -> None:
+            wp.launch(kernel, last - first, [first, *arguments], device=device)
+
+        in_pieces(launch, [count * i // pieces for i in range(pieces + 1)], self.threads)
 
     def set_command(self, command: np.ndarray, release: np.ndarray | None = None) -> None:
         """Copy commands [N, rad/s], shape (E, 4), and release requests, shape (E,), to the device.

@@ -64,6 +64,7 @@ def build_reset(t: Types, params: PlantParams, State: type) -> ResetKernels:
     @wp.kernel(module="unique", enable_backward=False)
     def randomize_kernel(
         # Params:
+        first: int,
         vehicle: wp.array(dtype=Vehicle),
         ropes: wp.array(dtype=Rope),
         spreads: wp.array(dtype=Randomization),
@@ -77,7 +78,7 @@ def build_reset(t: Types, params: PlantParams, State: type) -> ResetKernels:
         # Out:
         goal_w: wp.array(dtype=vec3),
     ):
-        env = wp.tid()
+        env = wp.tid() + first
         if mask[env] != 0:
             p = vehicle[env % vehicle.shape[0]]
             rope = ropes[env % ropes.shape[0]]

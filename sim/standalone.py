@@ -10,7 +10,6 @@ import warp as wp
 
 from sim.arrays import runtime  # noqa: F401  starts Warp
 from sim.arrays import state as st
-from sim.arrays.checks import check_air
 from sim.arrays.structs import Types, extensions_of, kinds_of, pack, pack_vehicle, types
 from sim.params import GRAVITY, AirParams, VehicleParams
 from sim.quadrotor.queue import push, queue_depth, split_delay
@@ -204,7 +203,6 @@ class QuadSim:
             if not (math.isfinite(value) and value > 0):
                 raise ValueError(f"{name} {value} s: expected a finite, positive time")
         vehicles = vehicles or [vehicle]
-        check_air(air)
         t = types(precision)
         rows = pack_vehicle(t, vehicles, kinds_of(vehicle))
         self.vehicle, self.count, self.device, self.types = vehicle, count, device, t

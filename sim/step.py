@@ -1,7 +1,7 @@
 """The fused control step: command queue, blocks, chain, release and checks of one control period in one kernel.
 
 ``build_step`` composes the functions of one choice of blocks into one kernel. One thread an environment, no atomics,
-nothing else is launched; the same kernel runs on the CPU and on CUDA.
+nothing else is launched; the same kernel runs on the CPU, all at once or some from ``first`` on, and on CUDA.
 """
 
 from dataclasses import dataclass
@@ -119,6 +119,7 @@ def build_step(
     @wp.kernel(module="unique", enable_backward=False)
     def step_kernel(
         # Params:
+        first: int,
         vehicle: wp.array(dtype=Vehicle),
         ropes: wp.array(dtype=Rope),
         releases: wp.array(dtype=Release),
@@ -136,7 +137,7 @@ def build_step(
         # Out:
         out: Output,
     ):
-        env = wp.tid()
+        env = wp.tid() + first
         p = vehicle[env % vehicle.shape[0]]
         natural = ropes[env % ropes.shape[0]]
         r = releases[env % releases.shape[0]]
@@ -229,13 +230,14 @@ def build_step(
     @wp.kernel(module="unique", enable_backward=False)
     def payload_kernel(
         # Params:
+        first: int,
         ropes: wp.array(dtype=Rope),
         # State in:
         state: State,
         # Out:
         out: Output,
     ):
-        env = wp.tid()
+        env = wp.tid() + first
         natural = ropes[env % ropes.shape[0]]
         s = load(state, env)
         n = wp.zeros(shape=(L,), dtype=vec3)

@@ -18,6 +18,8 @@ from sim.params import (
     SensingParams,
     SimParams,
     VehicleParams,
+    require_not_negative,
+    require_positive,
 )
 from visthrow.common.errors import ConfigError
 
@@ -28,6 +30,9 @@ class ActionParams:
 
     max_thrust: float  # collective thrust at +1 [N]
     max_rate: tuple[float, float, float]  # body rates at +-1 [rad/s]
+
+    def __post_init__(self) -> None:
+        require_positive("task.action", max_thrust=self.max_thrust, max_rate=min(self.max_rate))
 
 
 @dataclass(frozen=True)
@@ -50,6 +55,12 @@ class NoiseParams:
     command_step: float  # per step, in normalised commands
     command_bias: float  # per episode
 
+    def __post_init__(self) -> None:
+        require_not_negative(
+            "task.noise", observation_step=self.observation_step, observation_bias=self.observation_bias,
+            command_step=self.command_step, command_bias=self.command_bias,
+        )  # fmt: skip
+
 
 @dataclass(frozen=True)
 class BoundsParams:
@@ -59,6 +70,11 @@ class BoundsParams:
     horizontal: float  # distance of the vehicle from the spawn axis [m]
     tilt_deg: float  # between body z and the vertical [deg]
     time_limit: float  # a negative end, never bootstrapped [s]
+
+    def __post_init__(self) -> None:
+        require_positive("task.bounds", horizontal=self.horizontal, tilt_deg=self.tilt_deg, time_limit=self.time_limit)
+        if not self.altitude[0] < self.altitude[1]:
+            raise ValueError(f"task.bounds.altitude is {self.altitude} m; expected the lower limit before the upper one")
 
 
 @dataclass(frozen=True)
@@ -133,6 +149,18 @@ class PPOParams:
     entropy: float
     value_coefficient: float
     max_grad_norm: float
+    products: Literal["float32", "bfloat16"] = "float32"  # of the hidden layers; weights are float32 either way
+
+    def __post_init__(self) -> None:
+        counts = {name: getattr(self, name) for name in ("environments", "steps", "iterations", "epochs", "minibatches")}
+        if min(counts.values()) < 1 or not self.hidden or min(self.hidden) < 1:
+            raise ConfigError(f"ppo: {counts} and hidden layers of {self.hidden}; expected 1 or more of each")
+        require_positive(
+            "ppo", initial_std=self.initial_std, learning_rate=self.learning_rate, clip=self.clip, max_grad_norm=self.max_grad_norm
+        )
+        for name in ("discount", "gae_lambda"):
+            if not 0.0 < getattr(self, name) <= 1.0:
+                raise ConfigError(f"ppo.{name} is {getattr(self, name)}; expected a number above 0 and up to 1")
 
 
 @dataclass(frozen=True)
@@ -175,11 +203,6 @@ class Experiment:
     diagnosed: DiagnosedParams = field(default_factory=DiagnosedParams)
 
     def __post_init__(self) -> None:
-        if self.ppo.environments < 1 or self.ppo.steps < 1 or self.ppo.iterations < 1:
-            raise ConfigError(
-                f"ppo: {self.ppo.environments} environments, {self.ppo.steps} steps, {self.ppo.iterations} iterations; "
-                "expected 1 or more of each"
-            )
         low, high = self.task.observation.latency
         if not 0.0 <= low <= high <= self.sim.control_period:
             raise ConfigError(

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from camera.fisheye import Fisheye, FisheyeParams
+from camera.fisheye import Fisheye
+from camera.params import FisheyeParams
 
 DETECTED_AT_LEAST = 3
 """Views with a found board below which the intrinsics are not determined."""

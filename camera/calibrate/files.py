@@ -14,7 +14,8 @@ from typing import Any
 import torch
 
 from camera.calibrate.foreign import FOREIGN_MODELS, FitReport, fit_fisheye
-from camera.fisheye import Fisheye, FisheyeParams, check_fisheye, monotonic_limit
+from camera.fisheye import Fisheye
+from camera.params import FisheyeParams, monotonic_limit
 
 EXACT = FitReport("kb4", 0.0, 0.0, 0)
 """Report of a file that holds our own model: nothing was fitted."""
@@ -230,7 +231,6 @@ def _params(path, size, values, own_fov, asked_fov) -> FisheyeParams:
         if fov is None:
             fov = image_fov_deg(FisheyeParams(width, height, *values, fov_deg=1.0))
         params = FisheyeParams(width, height, *values, fov_deg=_floats(path, "fov_deg", [fov], 1)[0])
-        check_fisheye(params)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
     return params

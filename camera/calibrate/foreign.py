@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from camera.fisheye import FisheyeParams, check_fisheye, monotonic_limit
+from camera.params import FisheyeParams, monotonic_limit
 
 GRID = 64
 """Pixels along each side of the grid on which a foreign model is sampled."""
@@ -127,7 +127,6 @@ def fit_fisheye(
     limit = 2.0 * math.degrees(monotonic_limit(coefficients))
     fov = min(seen_deg if fov_deg is None else fov_deg, seen_deg, limit * (1.0 - 1e-9))
     params = FisheyeParams(width, height, float(fit.x[0]), float(fit.x[1]), *map(float, centre), *coefficients, fov)
-    check_fisheye(params)
     return params, FitReport(model, float(np.sqrt(np.mean(error**2))), float(error.max()), len(theta))
 
 

@@ -13,8 +13,9 @@ from typing import Literal
 import torch
 
 from camera.calibrate.boards import BoardParams
-from camera.fisheye import Fisheye, FisheyeParams
+from camera.fisheye import Fisheye
 from camera.mount import rotate
+from camera.params import FisheyeParams
 
 GROUND_LIGHT, GROUND_DARK = 0.62, 0.50
 TILE = 0.5

@@ -17,9 +17,9 @@ import numpy as np
 import torch
 
 from camera.detectors.contours import Detector, DetectorParams, Known
-from camera.fisheye import Fisheye, FisheyeParams
-from camera.mount import MountParams, nominal_rot_cb
-from camera.params import CameraParams
+from camera.fisheye import Fisheye
+from camera.mount import nominal_rot_cb
+from camera.params import CameraParams, FisheyeParams, MountParams
 from hil.errors import SourceError
 from hil.poses.pose import Quaternion, Vector
 from hil.poses.sight import Sight

@@ -14,7 +14,6 @@ import numpy as np
 import warp as wp
 
 from sim import params as P
-from sim.arrays.checks import check_rope, check_vehicle
 
 
 def make_struct(name: str, fields: dict[str, type]) -> type:
@@ -208,7 +207,7 @@ def pack_vehicle(t: Types, vehicles: list[P.VehicleParams], kinds: tuple[str, st
         kinds: of the blocks that the kernel was built for.
 
     Raises:
-        ValueError: other kinds of blocks, or a vehicle that :func:`sim.arrays.checks.check_vehicle` refuses.
+        ValueError: other kinds of blocks.
     """
     rows = np.zeros(len(vehicles), dtype=_numpy_type(t.Vehicle))
     for row, vehicle in zip(rows, vehicles, strict=True):
@@ -216,7 +215,6 @@ def pack_vehicle(t: Types, vehicles: list[P.VehicleParams], kinds: tuple[str, st
             raise ValueError(
                 f"vehicle of the kinds {kinds_of(vehicle)} in a batch of {kinds}: expected the same blocks"
             )
-        check_vehicle(vehicle)
         _fill(row, vehicle)
         _place_rotors(row, vehicle)
         columns = mixer_columns(vehicle.rotors, vehicle.thrust.torque_ratio)
@@ -275,13 +273,9 @@ def pack_rope(t: Types, ropes: list[P.RopeParams]) -> np.ndarray:
     """Structured array of shape (1,) or (E,) for ``wp.array(dtype=t.Rope)``.
 
     The last rod carries the payload: its mass, centre and transverse inertia about its upper joint are combined here.
-
-    Raises:
-        ValueError: a rope that :func:`sim.arrays.checks.check_rope` refuses.
     """
     rows = np.zeros(len(ropes), dtype=_numpy_type(t.Rope))
     for row, rope in zip(rows, ropes, strict=True):
-        check_rope(rope)
         length, mass = rope.length / rope.segments, rope.rope_mass / rope.segments
         ball = length + rope.payload_offset
         last_mass = mass + rope.payload_mass

@@ -1,18 +1,14 @@
 """Launching the replay: parameters, windows, lanes and recorded data as arrays, split over the cores of a CPU."""
 
-import os
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cache
 
 import numpy as np
 import warp as wp
 
 from sim.arrays import runtime  # noqa: F401  starts Warp
 from sim.arrays import state as st
-from sim.arrays.checks import check_air, check_numerics, check_release
-from sim.arrays.cores import cores
+from sim.arrays.cores import cores, in_pieces
 from sim.arrays.structs import Types, kinds_of, pack, pack_air, pack_rope, pack_vehicle, ropes_on, types
 from sim.effects.laws import check_laws, structure
 from sim.params import GRAVITY, PlantParams, SensingParams
@@ -94,10 +90,6 @@ class Replay:
                 f"{len(plants)} plants of {sorted({p.rope.segments for p in plants})} segments with {len(sensings)} sensings: "
                 "expected one number of segments and a sensing each"
             )
-        check_numerics(first.sim)
-        for plant in plants:
-            check_release(plant.release)
-            check_air(plant.air)
         self.device, self.gravity, self.segments, self._sim = device, gravity, first.rope.segments, first.sim
         self._download = download
         self.types = t = types(precision)
@@ -191,9 +183,7 @@ class Replay:
         def launch(first: int, last: int) -> None:
             wp.launch(self.kernel.replay, last - first, [*before, begin + first, *after], device="cpu")
 
-        marks = _shared_out(costs, PIECES * cores())
-        for done in [_pool(cores()).submit(launch, a, b) for a, b in zip(marks[:-1], marks[1:])]:
-            done.result()
+        in_pieces(launch, _shared_out(costs, PIECES * cores()), cores())
 
     @staticmethod
     def _read(struct, fields: Mapping) -> dict[str, np.ndarray]:
@@ -220,16 +210,6 @@ def _shared_out(costs: np.ndarray, pieces: int) -> list[int]:
     total = np.cumsum(costs)
     inside = np.searchsorted(total, total[-1] / pieces * np.arange(1, pieces)) + 1
     return np.unique([0, *inside.tolist(), len(costs)]).tolist()
-
-
-@cache
-def _pool(threads: int) -> ThreadPoolExecutor:
-    """Threads that launch pieces; kept, since a fit of initial states flies some hundred times."""
-    return ThreadPoolExecutor(threads, "replay")
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_pool.cache_clear)  # a child process has none of these threads
 
 
 def _in_order(rides: np.ndarray, resumed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -17,7 +17,7 @@ from hil.links.pymav import mav
 from tests.fuzz import EACH, SEEDS, any_message, mutated, noise
 from tests.hil_flight import simple_policy
 from tests.loopback.wire import peers, throw
-from visthrow.evidence.bench.hil_processes import free_port
+from visthrow.evidence.bench.hil.processes import free_port
 
 READY = 8.0
 """Processor time of a run that waits for poses, from its call to its end [s]; its start takes 1.5 s on a free core, 3 s are

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from camera import Fisheye, FisheyeParams
+from camera.fisheye import Fisheye
+from camera.params import FisheyeParams
 
 PIXEL_TOLERANCE = 1e-9  # px; the bar: 1e4 times the rounding of float64 at 1,000 px
 LENSES = pytest.mark.parametrize(

@@ -5,11 +5,11 @@ import dataclasses
 import numpy as np
 import pytest
 
-from sim.reference.bench_scenes import implicitfast_scene, rk4_scene
 from sim.reference.oracle import converged, hinges_from_directions, matrix_from_quat
 from sim.reference.scene import load_scene
 from tests.oracle.bare_rope import BareScene
 from tests.plants import SCENES
+from visthrow.evidence.bench.sim.mujoco_c import implicitfast_scene, rk4_scene
 
 CONVERGED = 1e-6
 """Doubling the oracle's step moves the whip, the harsher scene, by 1.7e-7 m, halving it by 1.4e-11 m [m]."""

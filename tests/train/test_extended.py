@@ -27,8 +27,8 @@ def test_training_in_an_extended_simulator():
     trainer = Trainer(dataclasses.replace(found, laws=(LAW,), diagnosed=loose), "cpu", 0)
     figures = [trainer.step() for _ in range(2)]
     assert all(np.isfinite(f["value"]) for f in figures)
-    assert trainer.env.sim.extensions >= {"payload_drag", "wind", "kick", "push", "payload_spin", "compliance"}
-    assert len(trainer.env.sim._vehicles.numpy()) == len(trainer.env.sim._ropes.numpy()) > 4
+    assert trainer.algorithm.env.sim.extensions >= {"payload_drag", "wind", "kick", "push", "payload_spin", "compliance"}
+    assert len(trainer.algorithm.env.sim._vehicles.numpy()) == len(trainer.algorithm.env.sim._ropes.numpy()) > 4
 
 
 @pytest.mark.slow

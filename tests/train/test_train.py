@@ -60,9 +60,9 @@ def test_exported_policy_equals_the_network(whole):
     experiment = config.load(Experiment, whole / "config.toml")
     trainer = Trainer(experiment, "cpu", 1)
     trainer.load(whole / CHECKPOINT)
-    obs = torch.randn(64, trainer.env.layout.dimension)
+    obs = torch.randn(64, trainer.algorithm.env.layout.dimension)
     with torch.inference_mode():
-        difference = (trainer.actor()(obs) - Policy.load(whole / "policy.npz").act(obs)).abs().max()
+        difference = (trainer.algorithm.act(obs) - Policy.load(whole / "policy.npz").act(obs)).abs().max()
     assert difference < 1e-6
 
 
@@ -77,18 +77,18 @@ def test_resume_goes_on_bit_for_bit(whole, tmp_path):
 
 def test_ctrl_c_keeps_what_was_done(whole, tmp_path, monkeypatch, capsys):
     folder = tmp_path / "run"
-    learn = Trainer._learn
+    learn = Trainer.step
 
     def interrupted(self):
         if self.iteration == 1:
             os.kill(os.getpid(), signal.SIGINT)  # in the middle of the second iteration
         return learn(self)
 
-    monkeypatch.setattr(Trainer, "_learn", interrupted)
+    monkeypatch.setattr(Trainer, "step", interrupted)
     assert train(folder) == 130
     assert "--resume" in capsys.readouterr().err
     assert (folder / "progress.csv").read_text().count("\n") == 1 + 2
-    monkeypatch.setattr(Trainer, "_learn", learn)
+    monkeypatch.setattr(Trainer, "step", learn)
     assert train(folder, "--resume") == 0
     for a, b in zip(weights(whole), weights(folder), strict=True):
         np.testing.assert_array_equal(a, b)
@@ -153,6 +153,6 @@ def test_further_ranks_resume_with_data_of_their_own(whole):
     first.load(whole / CHECKPOINT)
     second.load(whole / CHECKPOINT)
     assert first.iteration == second.iteration == 4
-    weight = next(first.alg.actor.parameters()), next(second.alg.actor.parameters())
+    weight = next(first.algorithm.alg.actor.parameters()), next(second.algorithm.alg.actor.parameters())
     torch.testing.assert_close(*weight, rtol=0, atol=0)
-    assert not torch.equal(first.env.views.state["pos_w"], second.env.views.state["pos_w"])
+    assert not torch.equal(first.algorithm.env.views.state["pos_w"], second.algorithm.env.views.state["pos_w"])

@@ -9,15 +9,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from camera import CameraParams
-from sim.arrays import state as st
+from camera.params import CameraParams
 from sim.reference.scene import load_scene
 from visthrow import cli, config
 from visthrow.common.errors import StorageError, VisthrowError
 from visthrow.evidence import bench
-from visthrow.evidence.bench import commands, detector, flops, records, sim_cpu, sim_gpu
-from visthrow.evidence.bench import mujoco_warp as bench_mujoco_warp
-from visthrow.evidence.bench.scenes import HARD_THROW
+from visthrow.evidence.bench import detector, records
+from visthrow.evidence.bench.sim import commands
+from visthrow.evidence.bench.sim import cpu as sim_cpu
+from visthrow.evidence.bench.sim import gpu as sim_gpu
+from visthrow.evidence.bench.sim import mujoco_warp as bench_mujoco_warp
+from visthrow.evidence.bench.sim.scenes import HARD_THROW
 from visthrow.task import Experiment, plant_of
 
 SCENES = Path(__file__).resolve().parents[1] / "data" / "scenes"
@@ -45,31 +47,6 @@ def test_hard_throw_is_the_scene_of_the_tests():
             assert np.allclose(value[0]["force_b"], filed[name][0]["force_b"], rtol=1e-9)
         else:
             assert np.allclose(value, filed[name], rtol=1e-9), name
-
-
-def test_counted_step_equals_the_compiled_one(experiment):
-    """The operations are counted on the code that runs: same state after a step at hover, to round-off."""
-    plant = plant_of(experiment)
-    plant = dataclasses.replace(plant, sim=dataclasses.replace(plant.sim, precision="float64"))
-    sim = flops.hovering(plant)
-    before = sim.get("pos_w").copy()
-    state, count = flops.run_counted(sim)
-    assert np.array_equal(sim.get("pos_w"), before), "counting must leave the simulator as it is"
-    sim.step()
-    for name in st.STATE_FIELDS:
-        value = getattr(sim.state, name).numpy()
-        value = value[:, 0] if st.STATE_FIELDS[name][1] else value
-        counted = np.array(
-            [[float(c) for c in x.c] if hasattr(x, "c") else float(x) for x in getattr(state, name)._rows]
-        )
-        assert np.allclose(counted, value, rtol=ROUND_OFF, atol=ROUND_OFF), name
-    stages = 2 * round(plant.sim.control_period / plant.sim.substep)
-    assert count > 100 * plant.rope.segments * stages, "a rod costs hundreds of operations a stage"
-
-
-def test_traffic_counts_state_once_each_way(experiment):
-    size = flops.traffic(plant_of(experiment))
-    assert 2 * size["state"] < size["traffic"] < 2 * size["environment"]
 
 
 def test_longest_accurate_step_finds_the_last_good_one():

@@ -14,8 +14,12 @@ from scipy import stats
 
 from visthrow.cli import main
 from visthrow.common.errors import VisthrowError
-from visthrow.evidence.bench import hil, hil_faults, hil_processes, hil_soak, hil_throws
-from visthrow.evidence.bench.hil_processes import Pair
+from visthrow.evidence.bench.hil import faults as hil_faults
+from visthrow.evidence.bench.hil import figures as hil
+from visthrow.evidence.bench.hil import processes as hil_processes
+from visthrow.evidence.bench.hil import soak as hil_soak
+from visthrow.evidence.bench.hil import throws as hil_throws
+from visthrow.evidence.bench.hil.processes import Pair
 from visthrow.onboard.policy import Policy, find_policy
 
 SOAK_MINUTES = 1.0

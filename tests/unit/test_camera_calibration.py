@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 import torch
 
-from camera import Fisheye, FisheyeParams
 from camera.calibrate import files as files
 from camera.calibrate.boards import BoardParams, calibrate_from_boards
 from camera.calibrate.foreign import fit_fisheye
+from camera.fisheye import Fisheye
 from camera.imaging.render import render_board
 from camera.mount import rotation_from_vector
+from camera.params import FisheyeParams
 
 DATA = Path(__file__).parents[1] / "data" / "basalt_calib"
 LENS = FisheyeParams(640, 480, 160.1, 150.2, 310.3, 245.4, 0.02, -0.01, 0.002, -0.0002, 200.0)
@@ -86,7 +87,8 @@ def test_wrong_content_is_named(tmp_path, name, old, new, message):
 
 def test_a_lens_that_folds_inside_its_field_of_view_is_refused(tmp_path):
     path = tmp_path / "ros.yaml"
-    files.write_ros(path, FisheyeParams(640, 480, 160.0, 160.0, 320.0, 240.0, k1=-0.3, fov_deg=200.0))
+    files.write_ros(path, FisheyeParams(640, 480, 160.0, 160.0, 320.0, 240.0, k1=-0.3, fov_deg=100.0))
+    path.write_text(path.read_text().replace("100.0", "200.0"))
     with pytest.raises(ValueError, match=r"ros\.yaml: theta_d"):
         files.read_ros(path)
 

@@ -3,19 +3,11 @@
 import pytest
 import torch
 
-from camera import (
-    CameraParams,
-    FisheyeParams,
-    KeypointCamera,
-    KeypointNoiseParams,
-    MountParams,
-    StepDraw,
-    apply_noise,
-    filled,
-    keypoints,
-    push_,
-)
+from camera.history import filled, push_
+from camera.keypoints import KeypointCamera, keypoints
 from camera.mount import rotation_from_vector
+from camera.noise import StepDraw, apply_noise
+from camera.params import CameraParams, FisheyeParams, KeypointNoiseParams, MountParams
 
 ENVIRONMENTS = 4096
 BENT = FisheyeParams(640, 480, 160.0, 150.0, 310.0, 245.0, 0.02, -0.01, 0.002, -0.0002, 200.0)

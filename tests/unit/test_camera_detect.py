@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 import torch
 
-from camera import CameraParams, FisheyeParams, KeypointCamera, KeypointNoiseParams, MountParams, keypoints
 from camera.detectors.contours import BallSeen, Detector, GoalSeen, Known, Seen, detected_keypoints, ordered_corners
 from camera.detectors.edges import cone_fit
 from camera.imaging.nuisance import NuisanceParams, degrade
 from camera.imaging.render import Clutter, render_scene
-from camera.keypoints import goal_square
+from camera.keypoints import KeypointCamera, goal_square, keypoints
 from camera.mount import rotation_from_vector
+from camera.params import CameraParams, FisheyeParams, KeypointNoiseParams, MountParams
 
 LENS = FisheyeParams(400, 400, 104.2, 104.2, 199.5, 199.5)
 CAMERA = KeypointCamera(

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from camera import Fisheye, FisheyeParams, transfer_pixels
+from camera.fisheye import Fisheye, transfer_pixels
+from camera.params import FisheyeParams
 
 EQUIDISTANT = FisheyeParams(640, 640, 166.6786, 166.6786, 319.5, 319.5)
 BENT = FisheyeParams(640, 480, 160.0, 150.0, 310.0, 245.0, 0.02, -0.01, 0.002, -0.0002, 200.0)

@@ -6,18 +6,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from camera import (
-    CameraParams,
-    Fisheye,
-    FisheyeParams,
-    KeypointCamera,
-    KeypointNoiseParams,
-    MountParams,
-    keypoints,
-    payload_keypoints,
-)
-from camera.keypoints import ball_extremes_c, goal_corners_w
+from camera.fisheye import Fisheye
+from camera.keypoints import KeypointCamera, ball_extremes_c, goal_corners_w, keypoints, payload_keypoints
 from camera.mount import nominal_rot_cb, points_c_from_w, rotation_from_vector
+from camera.params import CameraParams, FisheyeParams, KeypointNoiseParams, MountParams
 
 LENS = FisheyeParams(640, 640, 166.6786, 166.6786, 319.5, 319.5)
 PARAMS = CameraParams(LENS, MountParams(position_b=(0.03, 0.0, -0.02)), KeypointNoiseParams(), 0.25, 0.033)

@@ -3,19 +3,9 @@
 import pytest
 import torch
 
-from camera import (
-    KeypointNoiseParams,
-    StepDraw,
-    apply_latency,
-    apply_noise,
-    at_latency,
-    draw_episode,
-    draw_step,
-    filled,
-    push,
-    push_,
-)
-from camera.noise import check_noise
+from camera.history import at_latency, filled, push, push_
+from camera.noise import StepDraw, apply_latency, apply_noise, draw_episode, draw_step
+from camera.params import KeypointNoiseParams
 
 SAMPLES = 20_000
 
@@ -98,7 +88,7 @@ def test_same_seed_same_noise():
 )
 def test_bad_noise_is_refused(change):
     with pytest.raises(ValueError, match=next(iter(change))):
-        check_noise(KeypointNoiseParams(**change))
+        KeypointNoiseParams(**change)
 
 
 @pytest.mark.parametrize(("latency", "length"), [(0.0, 1), (0.5, 2), (1.0, 2), (2.2, 4)])

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from camera import CameraParams, FisheyeParams, KeypointCamera, KeypointNoiseParams, MountParams, keypoints
 from camera.imaging.overlay import draw_overlay
 from camera.imaging.rectify import AugmentParams, ViewParams, augment, rectify, rotate_frames, view_map
 from camera.imaging.render import pixel_rays, render_scene
+from camera.keypoints import KeypointCamera, keypoints
 from camera.mount import rotation_from_vector
+from camera.params import CameraParams, FisheyeParams, KeypointNoiseParams, MountParams
 
 LENS = FisheyeParams(320, 320, 83.3, 83.3, 159.5, 159.5)
 CAMERA = KeypointCamera(

@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 import torch
 
-from camera import Fisheye, FisheyeParams, KeypointCamera, keypoints
+from camera.fisheye import Fisheye
 from camera.imaging.render import render_scene
+from camera.keypoints import KeypointCamera, keypoints
 from camera.mount import rotation_from_vector
+from camera.params import FisheyeParams
 from hil.errors import SourceError
 from hil.params import HilParams
 from hil.poses.sight import Sight, Sights

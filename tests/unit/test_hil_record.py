@@ -13,7 +13,7 @@ from hil.recording.record import Recorder, lines, load_run
 from tests.hil_flight import Spy, fly, params
 from visthrow.cli import main
 from visthrow.common.errors import StorageError
-from visthrow.evidence.bench.hil_processes import free_port
+from visthrow.evidence.bench.hil.processes import free_port
 from visthrow.onboard.policy import Policy, find_policy
 
 

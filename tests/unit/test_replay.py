@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from sim.arrays.cores import _pool
 from sim.arrays.structs import EXTENSIONS
 from sim.hybrid import HybridSim
 from sim.params import SensingParams
 from sim.replay import kernel as rk
-from sim.replay.lanes import Recording, Replay, _pool, _shared_out
+from sim.replay.lanes import Recording, Replay, _shared_out
 from tests.plants import paper_plant
 
 PERIODS, RELEASED_AT = 40, 20

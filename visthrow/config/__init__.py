@@ -5,7 +5,8 @@ A file holds exactly the keys of its schema. Two things reach beyond the file:
 - ``base = "other.toml"`` at its top: the other file's values lie under this file's, table by table.
 - A *string* where the schema wants a table is the path of a file that holds that table.
 
-Both paths are looked up beside the file first, then under the configs folder. Overrides (``"vehicle.body.mass=0.25"``)
+Both paths are looked up beside the file first, then under the configs folder, then among the shipped configs of the same kind: a copy
+of ``configs/train/vision.toml`` finds its ``base = "state.toml"`` wherever it lies. Overrides (``"vehicle.body.mass=0.25"``)
 come last. ``"none"`` stands for None where a field is optional; ints pass for floats, bools never for numbers; NaN and
 infinity are refused.
 """
@@ -20,6 +21,7 @@ from typing import Any, TypeVar
 from visthrow.common import toml_text
 from visthrow.common.errors import ConfigError, suggest
 from visthrow.config import schema as _schema
+from visthrow.config.kinds import kinds_of
 from visthrow.config.schema import NONE_WORD, Leaf, Table, dataclass_of
 
 T = TypeVar("T")
@@ -195,7 +197,7 @@ def _parse(schema: type, text: str, name: str, folder: Path, stack: tuple[Path, 
         return tree
     if not isinstance(base, str):
         _schema.fail(name, _BASE_KEY, f"got {base!r}; expected the path of one other file")
-    return _merged(_read(schema, _lookup(base, folder, name, _BASE_KEY), stack), tree)
+    return _merged(_read(schema, _lookup(schema, base, folder, name, _BASE_KEY), stack), tree)
 
 
 def _include(schema: type, tree: Table, folder: Path, stack: tuple[Path, ...], path: str) -> None:
@@ -208,18 +210,16 @@ def _include(schema: type, tree: Table, folder: Path, stack: tuple[Path, ...], p
         if isinstance(node, Table):
             _include(wanted, node, folder, stack, here)
         elif isinstance(node.value, str) and not (node.value == NONE_WORD and _schema.is_union(annotation)):
-            tree.items[key] = _read(wanted, _lookup(node.value, folder, node.source, here), stack)
+            tree.items[key] = _read(wanted, _lookup(wanted, node.value, folder, node.source, here), stack)
 
 
-def _lookup(name: str, folder: Path, source: str, key: str) -> Path:
-    candidates = list(dict.fromkeys((folder / name, configs_root() / name)))
-    for candidate in candidates:
+def _lookup(schema: type, name: str, folder: Path, source: str, key: str) -> Path:
+    root, kinds = configs_root(), kinds_of(schema)
+    for candidate in dict.fromkeys((folder / name, root / name, *(root / kind / name for kind in kinds))):
         if candidate.is_file():
             return candidate
-    shipped = {path.relative_to(configs_root()).as_posix() for path in configs_root().rglob("*.toml")}
-    _schema.fail(
-        source, key, f"no file '{name}', neither in {_shown(folder)} nor under configs; {suggest(name, shipped)}"
-    )
+    shipped = {path.relative_to(root).as_posix() for kind in kinds or ("**",) for path in root.glob(f"{kind}/*.toml")}
+    _schema.fail(source, key, f"no file '{name}', neither in {_shown(folder)} nor under configs; {suggest(name, shipped)}")
 
 
 def _merged(under: Table, over: Table) -> Table:
@@ -262,7 +262,7 @@ def _override(schema: type, tree: Table, override: str) -> None:
         return
     optional_none = isinstance(node, Leaf) and node.value == NONE_WORD and _schema.is_union(current)
     if isinstance(node, Leaf) and isinstance(node.value, str) and not optional_none:
-        tree.items[keys[-1]] = _read(wanted, _lookup(node.value, Path.cwd(), source, ".".join(keys)), ())
+        tree.items[keys[-1]] = _read(wanted, _lookup(wanted, node.value, Path.cwd(), source, ".".join(keys)), ())
 
 
 def _toml_value(text: str) -> Any:

@@ -35,6 +35,11 @@ def schema_of(kind: str, name: str = "") -> type:
     return getattr(importlib.import_module(module), attribute)
 
 
+def kinds_of(schema: type) -> list[str]:
+    """Return the folders of configs whose files fill a schema: none for one that no shipped config has."""
+    return [key for key, target in SCHEMAS.items() if target == f"{schema.__module__}:{schema.__name__}" and "/" not in key]
+
+
 def schema_of_file(path: str | Path) -> type:
     """Return the schema of a config file from its folder's and its own name."""
     path = Path(path)

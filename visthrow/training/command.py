@@ -93,7 +93,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _last(args: argparse.Namespace, trainer) -> int:
-    return args.iterations or trainer.experiment.ppo.iterations
+    return args.iterations or trainer.algorithm.iterations
 
 
 def _follow(args: argparse.Namespace, trainer) -> bool:
@@ -141,7 +141,7 @@ def _loop(args: argparse.Namespace, trainer, folder: Path) -> bool:
     start, kept = time.perf_counter(), trainer.iteration
     try:
         with (
-            TrainLog(folder / "progress.csv", trainer.samples_per_iteration, _last(args, trainer), kept) as log,
+            TrainLog(folder / "progress.csv", trainer.algorithm.samples, _last(args, trainer), kept) as log,
             StopRequest() as stop,
         ):
             while trainer.iteration < _last(args, trainer):
@@ -176,7 +176,7 @@ def _report(args: argparse.Namespace, trainer, folder: Path, wall: float) -> int
         "throws": rows,
         "wall_s": wall,
         "iterations": trainer.iteration,
-        "env_steps": trainer.iteration * trainer.samples_per_iteration,
+        "env_steps": trainer.iteration * trainer.algorithm.samples,
         "seconds": dict(trainer.seconds),
     }
     finish(trainer, folder, figures)

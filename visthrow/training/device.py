@@ -24,3 +24,12 @@ def resolve(name: str = "auto") -> str:
     if wanted not in exists:
         raise DeviceError(f"device '{name}' is not there; expected auto or one of {', '.join(exists)}")
     return wanted
+
+
+def device_name(device: str) -> str:
+    """Return the model of the processor that a device is."""
+    if not device.startswith("cuda"):
+        return "CPU"
+    import torch
+
+    return torch.cuda.get_device_name(device)

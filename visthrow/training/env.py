@@ -1,7 +1,7 @@
 """ThrowEnv: the throwing task as rsl_rl's vectorised environment.
 
 A step is a chain of device operations without branches on data, allocations on the simulator's side or copies to the
-host, so a whole rollout can be captured in one CUDA graph (:mod:`visthrow.training.trainer`). Every observation is a fresh tensor.
+host, so a whole rollout can be captured in one CUDA graph (:mod:`visthrow.training.ppo.algorithm`). Every observation is a fresh tensor.
 """
 
 import math
@@ -131,6 +131,16 @@ class ThrowEnv(VecEnv):
     def clear_totals(self) -> None:
         """Start the sums again."""
         self._memory["totals"].zero_()
+
+    def episode_means(self) -> dict[str, float]:
+        """Means over the episodes that finished since :meth:`clear_totals`, and their number.
+
+        ``released`` is a share of the episodes; ``landing_error`` [m] and ``duration`` [s] are means over the released.
+        """
+        totals = self.totals
+        released, episodes = max(totals["released"], 1.0), max(totals["episodes"], 1.0)
+        means = {name: totals[name] / released for name in ("landing_error", "duration")}
+        return {"released": totals["released"] / episodes, **means, "episodes": totals["episodes"]}
 
     def reset(self) -> TensorDict:
         """Start a new episode everywhere."""

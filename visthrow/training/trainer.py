@@ -1,28 +1,18 @@
-"""Training by rsl_rl's PPO: rollout in one CUDA graph, checkpoints that hold all state, export of the policy.
+"""A training run: one algorithm, its evaluation, checkpoints that hold all state, and the policy that comes of it."""
 
-rsl_rl's own runner copies figures to the host at every step and its checkpoints leave out the environment and the random
-generators; this one drives the same algorithm object without either.
-"""
-
-import contextlib
 import io
-import os
-import time
 from pathlib import Path
-
-os.environ.setdefault("GIT_PYTHON_REFRESH", "quiet")
+from typing import Protocol
 
 import torch
-from rsl_rl.algorithms import PPO
-from rsl_rl.modules.distribution import GaussianDistribution
-from tensordict import TensorDict
+from torch import Tensor
 
 from visthrow import config
 from visthrow.common import provenance
-from visthrow.common.errors import CheckpointError, ConfigError
+from visthrow.common.errors import CheckpointError
 from visthrow.common.storage import atomic_write, write_json
 from visthrow.onboard.policy import Policy
-from visthrow.task import Experiment, PPOParams, contract_of
+from visthrow.task import Experiment, contract_of
 from visthrow.training import protocol
 from visthrow.training.env import ThrowEnv
 
@@ -30,58 +20,60 @@ CHECKPOINT = "checkpoint.pt"
 POLICY = "policy.npz"
 
 
-class CapturableGaussian(GaussianDistribution):
-    """rsl_rl's Gaussian with a sample that a CUDA graph can hold: torch.normal copies its spread's minimum to the host."""
+class Algorithm(Protocol):
+    """What a trainer drives: one way to a better policy, an iteration at a time.
 
-    def sample(self) -> torch.Tensor:
-        """Sample of the current distribution."""
-        return self.mean + self.std * torch.randn_like(self.mean)
+    Attributes:
+        env: environment that it learns in.
+        iterations: of a whole training.
+        samples: environment steps an iteration, over all ranks.
+    """
+
+    env: ThrowEnv
+    iterations: int
+    samples: int
+
+    def step(self, done: float) -> dict[str, float]:
+        """One iteration.
+
+        Args:
+            done: share of the whole training that lies behind, 0 to 1, for schedules.
+
+        Returns:
+            Figures for the log, :data:`visthrow.training.progress.COLUMNS` of those that the algorithm has; always
+            ``rollout_s`` and ``learning_s`` [s] and the finished episodes' :meth:`ThrowEnv.episode_means`.
+        """
+
+    def act(self, obs: Tensor) -> Tensor:
+        """Deterministic actions, shape (E, 5), of the current policy for the actor's observations, shape (E, D)."""
+
+    def export(self, contract: dict, made_by: dict) -> Policy:
+        """The policy as a file's content."""
+
+    def state_dict(self) -> dict:
+        """Tensors and numbers that the next iteration depends on, besides torch's generators."""
+
+    def load_state_dict(self, saved: dict, own_throws: bool = True) -> None:
+        """Take up a state of :meth:`state_dict`, bit for bit; without ``own_throws`` episodes start anew (a further rank)."""
 
 
-def rsl_rl_config(p: PPOParams, ranks: dict | None) -> dict:
-    """Configuration dictionary of rsl_rl 5.5 for our parameters; both observation groups are named."""
-    network = {
-        "class_name": "MLPModel",
-        "hidden_dims": list(p.hidden),
-        "activation": p.activation,
-        "obs_normalization": p.normalize,
-    }
-    spread = {"class_name": CapturableGaussian, "init_std": p.initial_std, "std_type": "log"}
-    algorithm = {
-        "class_name": "PPO",
-        "num_learning_epochs": p.epochs,
-        "num_mini_batches": p.minibatches,
-        "learning_rate": p.learning_rate,
-        "schedule": p.schedule,
-        "desired_kl": p.desired_kl,
-        "gamma": p.discount,
-        "lam": p.gae_lambda,
-        "clip_param": p.clip,
-        "entropy_coef": p.entropy,
-        "value_loss_coef": p.value_coefficient,
-        "max_grad_norm": p.max_grad_norm,
-        "use_clipped_value_loss": True,
-    }
-    return {
-        "num_steps_per_env": p.steps,
-        "actor": {**network, "distribution_cfg": spread},
-        "critic": network,
-        "algorithm": algorithm,
-        "obs_groups": {"actor": ["actor"], "critic": ["critic"]},
-        "multi_gpu": ranks,
-    }
+def build(experiment: Experiment, device: str, seed: int, ranks: dict | None) -> Algorithm:
+    """Algorithm that the experiment names; imported only when chosen."""
+    from visthrow.training.ppo.algorithm import PPOTraining
+
+    return PPOTraining(experiment, device, seed, ranks)
 
 
 class Trainer:
     """One training run.
 
     Attributes:
-        env: the environment. alg: rsl_rl's PPO. iteration: iterations done.
+        algorithm: what learns. iteration: iterations done.
         seconds: wall time spent in rollouts and in learning since the start or the resume.
     """
 
     def __init__(self, experiment: Experiment, device: str, seed: int, ranks: dict | None = None):
-        """Build environment and algorithm.
+        """Build the algorithm.
 
         Args:
             experiment: the run's configuration.
@@ -89,132 +81,34 @@ class Trainer:
             seed: of everything random.
             ranks: rsl_rl's ``multi_gpu`` dictionary in a distributed run.
         """
-        p = experiment.ppo
-        if (p.environments * p.steps) % p.minibatches:
-            raise ConfigError(
-                f"ppo: {p.environments} x {p.steps} samples do not divide into {p.minibatches} minibatches"
-            )
         rank = ranks["global_rank"] if ranks else 0
         torch.manual_seed(seed * 1000 + rank)
         if device.startswith("cuda"):
             torch.cuda.set_device(device)  # captures and synchronisation go to the current device
             torch.backends.cuda.matmul.allow_tf32 = True
         self.experiment, self.device, self.seed, self.ranks = experiment, device, seed, ranks
-        self.env = ThrowEnv(experiment, device, seed * 1000 + rank)
-        with contextlib.redirect_stdout(io.StringIO()):
-            self.alg = PPO.construct_algorithm(self.env.get_observations(), self.env, rsl_rl_config(p, ranks), device)
-        self.alg.train_mode()
-        if ranks:
-            self.alg.broadcast_parameters()
-        self._obs = self.env.get_observations()
-        self._graph = None
+        self.algorithm = build(experiment, device, seed * 1000 + rank, ranks)
         self.iteration = 0
         self.seconds = {"rollout": 0.0, "learning": 0.0}
 
-    @property
-    def samples_per_iteration(self) -> int:
-        """Environment steps an iteration, over all ranks."""
-        return (
-            self.experiment.ppo.environments
-            * self.experiment.ppo.steps
-            * (self.ranks["world_size"] if self.ranks else 1)
-        )
-
-    def _rollout(self) -> None:
-        obs = self._obs
-        with torch.inference_mode():
-            for _ in range(self.experiment.ppo.steps):
-                actions = self.alg.act(obs)
-                obs, reward, done, extras = self.env.step(actions)
-                self.alg.process_env_step(obs, reward, done, extras)
-            self.alg.compute_returns(obs)
-            for key, value in obs.items():
-                self._obs[key].copy_(value)
-
-    def rollout(self) -> None:
-        """Collect one batch: eagerly the first time (everything is allocated then), from a captured graph afterwards."""
-        if not self.device.startswith("cuda"):
-            self._rollout()
-        elif self._graph is not None:
-            self._graph.replay()
-        elif self.seconds["rollout"] == 0.0:
-            self._rollout()
-        else:
-            self.alg.storage.clear()
-            torch.cuda.synchronize()
-            graph = torch.cuda.CUDAGraph()
-            with torch.cuda.graph(graph):
-                self._rollout()
-            self._graph = graph
-            self._captured_std = [(n, n._std) for n in self._normalizers()]
-            graph.replay()
-
-    def _normalizers(self) -> list:
-        models = (self.alg.actor, self.alg.critic)
-        return [m.obs_normalizer for m in models if m.obs_normalization]
-
-    def _learn(self) -> dict[str, float]:
-        p = self.experiment.ppo
-        done = min(self.iteration / p.iterations, 1.0)
-        self.alg.desired_kl = (1.0 - done) * p.desired_kl + done * p.final_kl
-        figures = self.alg.update()
-        if (
-            self._graph is not None
-        ):  # rsl_rl makes a new tensor of the spread; the graph reads the one it was captured with
-            for normalizer, captured in self._captured_std:
-                captured.copy_(normalizer._std)
-                normalizer._std = captured
-        return figures
-
     def step(self) -> dict[str, float]:
-        """One iteration: rollout and update. Returns losses and the finished episodes' means."""
-        self.env.clear_totals()
-        start = time.perf_counter()
-        self.rollout()
-        if self.device.startswith("cuda"):
-            torch.cuda.synchronize()
-        middle = time.perf_counter()
-        figures = self._learn()
-        end = time.perf_counter()
-        self.seconds["rollout"] += middle - start
-        self.seconds["learning"] += end - middle
+        """One iteration; returns losses and the finished episodes' means."""
+        figures = self.algorithm.step(min(self.iteration / self.algorithm.iterations, 1.0))
         self.iteration += 1
-        totals = self.env.totals
-        released, episodes = max(totals["released"], 1.0), max(totals["episodes"], 1.0)
-        figures |= {
-            "iteration": self.iteration,
-            "released": totals["released"] / episodes,
-            "landing_error": totals["landing_error"] / released,
-            "duration": totals["duration"] / released,
-            "episodes": totals["episodes"],
-            "learning_rate": self.alg.learning_rate,
-            "rollout_s": middle - start,
-            "learning_s": end - middle,
-        }
-        return figures
-
-    def actor(self):
-        """The deterministic policy: function of observations (E, D) -> actions (E, 5)."""
-        model = self.alg.get_policy()
-        return lambda obs: model(TensorDict({"actor": obs}, batch_size=[len(obs)], device=obs.device))
+        for part in self.seconds:
+            self.seconds[part] += figures[f"{part}_s"]
+        return figures | {"iteration": self.iteration}
 
     def evaluate(self, target: float, count: int = 200, seed: int = 12345) -> dict[str, float]:
         """Summary of throws from hover with the current policy; see :mod:`visthrow.training.protocol`."""
-        return protocol.throw(self.experiment, self.actor(), target, count, self.device, seed).summary()
-
-    def export(self, made_by: dict) -> Policy:
-        """The policy as a file's content."""
-        state = self.alg.get_policy().state_dict()
-        return Policy.from_actor_state(state, self.experiment.ppo.activation, contract_of(self.experiment), made_by)
+        return protocol.throw(self.experiment, self.algorithm.act, target, count, self.device, seed).summary()
 
     def save(self, path: Path) -> None:
         """Write a checkpoint that a resumed run goes on from as if it had not stopped; all or nothing."""
         content = {
-            "algorithm": self.alg.save(),
+            "algorithm": self.algorithm.state_dict(),
             "iteration": self.iteration,
-            "env": self.env.state_dict(),
             "seed": self.seed,
-            "obs": {k: v.clone() for k, v in self._obs.items()},
             "config": config.dumps(self.experiment),
             "rng": torch.get_rng_state(),
             "cuda_rng": torch.cuda.get_rng_state(self.device) if self.device.startswith("cuda") else None,
@@ -239,17 +133,12 @@ class Trainer:
             raise CheckpointError(
                 f"{path}: written by a run of another configuration or seed; resume with the same ones"
             )
-        self.alg.load(saved["algorithm"], None, True)
         self.iteration = saved["iteration"]
         rank = self.ranks["global_rank"] if self.ranks else 0
-        if (
-            rank > 0
-        ):  # the checkpoint holds the first rank's environments; with them every rank would collect the same data
+        self.algorithm.load_state_dict(saved["algorithm"], own_throws=rank == 0)
+        if rank > 0:  # the checkpoint holds the first rank's episodes; with them every rank would collect the same data
             torch.manual_seed((self.seed * 1000 + rank) * 100_003 + self.iteration)
             return
-        self.env.load_state_dict(saved["env"])
-        for key, value in saved["obs"].items():
-            self._obs[key].copy_(value)
         torch.set_rng_state(saved["rng"].cpu())
         if saved["cuda_rng"] is not None and self.device.startswith("cuda"):
             torch.cuda.set_rng_state(saved["cuda_rng"].cpu(), self.device)
@@ -262,7 +151,7 @@ def finish(trainer: Trainer, folder: Path, figures: dict) -> Policy:
         "config": config.to_dict(trainer.experiment, defaults=False),  # readable when fields come and go
         "figures": figures,
     }
-    policy = trainer.export(made_by)
+    policy = trainer.algorithm.export(contract_of(trainer.experiment), made_by)
     policy.save(folder / POLICY)
     write_json(folder / "summary.json", {k: v for k, v in made_by.items() if k != "config"})
     return policy

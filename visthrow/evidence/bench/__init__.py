@@ -5,13 +5,12 @@ import argparse
 from visthrow.common.arguments import add_common
 
 KINDS = {
-    "sim": ("the simulator: on a CPU core against MuJoCo C, on a GPU against MuJoCo Warp", "visthrow.evidence.bench.sim"),
+    "sim": ("the simulator: on a CPU core against MuJoCo C, on a GPU against MuJoCo Warp", "visthrow.evidence.bench.sim.command"),
     "camera": ("keypoints of thousands of environments against kornia and OpenCV", "visthrow.evidence.bench.camera"),
     "detector": ("recall, precision and pixel error of the keypoint detector on rendered frames", "visthrow.evidence.bench.detector"),
     "train": ("where the wall time of a training iteration goes", "visthrow.evidence.bench.iteration"),
-    "hil": ("the HIL runner over loopback: latency and soak, throws over the wire, faults", "visthrow.evidence.bench.hil"),
+    "hil": ("the HIL runner over loopback: latency and soak, throws over the wire, faults", "visthrow.evidence.bench.hil.command"),
     "mpc": ("a step of the baseline's controller, and its tracking error", "visthrow.evidence.bench.mpc"),
-    "effects": ("operations of a control step that each effect costs: none where it is off", "visthrow.evidence.bench.effects"),
     "explain": ("seconds of a diagnosis and of its report, on logs of one's own", "visthrow.evidence.bench.explain"),
     "records": ("print the recorded measurements as Markdown", "visthrow.evidence.bench.records"),
 }
@@ -32,12 +31,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "  visthrow bench hil --minutes 1                 message in to command out, missed ticks, memory\n"
         "  visthrow bench hil --throws 60 --policy state  throws over the wire, and the same without it\n"
         "  visthrow bench mpc                             a step of the baseline's controller; needs piqp\n"
-        "  visthrow bench effects                         what each effect costs in the fused step, on and off\n"
         "  visthrow bench explain monday/*.npz            seconds of a diagnosis and of its report\n"
         "  visthrow bench records                         what was measured before, on which machine and commit\n"
     )
     kinds = parser.add_subparsers(dest="bench", metavar="WHAT", title="what to measure", required=True)
-    sim, camera, detector, train, hil, mpc, effects, explain, records = (
+    sim, camera, detector, train, hil, mpc, explain, records = (
         kinds.add_parser(name, help=text, description=text) for name, (text, _) in KINDS.items()
     )
     _add_sim(sim)
@@ -60,15 +58,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     mpc.add_argument("--throws", type=int, default=10, metavar="N", help="a target and plant (default: 10)")
     for kind in (sim, mpc):
         kind.add_argument("--core", type=int, metavar="N", help="CPU core to stay on (default: the last one)")
-    for kind in (sim, mpc, effects):
+    for kind in (sim, mpc):
         kind.add_argument(
             "--config", default="state", metavar="NAME", help="training configuration whose plant is measured (default: state)"
         )
     for kind in (sim, camera, detector, train):
         add_common(kind)
-    for kind in (mpc, effects):
-        add_common(kind, device=False)
-    for kind in (sim, camera, detector, train, hil, mpc, effects, explain):
+    add_common(mpc, device=False)
+    for kind in (sim, camera, detector, train, hil, mpc, explain):
         kind.add_argument("--record", metavar="NAME", help="keep the result in the package's records under this name")
     sim.set_defaults(device="cpu")
     explain.set_defaults(device="cpu", repeats=2)

@@ -14,9 +14,10 @@ from camera.keypoints import KEYPOINTS, KeypointCamera, keypoints
 from camera.mount import points_c_from_w
 from visthrow import config
 from visthrow.common.errors import VisthrowError
-from visthrow.evidence.bench import card, records
+from visthrow.evidence.bench import records
 from visthrow.evidence.bench.records import Report, Table, rate
-from visthrow.evidence.bench.sim_cpu import on_one_core
+from visthrow.evidence.bench.sim.cpu import on_one_core
+from visthrow.training.device import device_name
 
 STRETCH = 0.2  # [s], wall time of one measurement, about
 SAFE_ANGLE = math.radians(85.0)
@@ -184,7 +185,7 @@ def measure(params: Any, count: int, device: str, repeats: int, stretch: float =
             (_LABELS[n], f"{t * 1e3:.3f} ms", f"{rate(count * KEYPOINTS / t)}", f"{t / own:.2f}")
             for n, t in row.items()
         )
-        where = "one CPU core" if place == "cpu" else card.name(place)
+        where = "one CPU core" if place == "cpu" else device_name(place)
         tables.append(Table(f"{count:,} environments, {count * KEYPOINTS:,} points, {where}", header, cells))
     notes = (
         "Keypoints are the whole function of the training environment: frames, the ball's outline, projection, its box "

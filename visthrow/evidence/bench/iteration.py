@@ -8,8 +8,9 @@ from typing import Any
 
 from visthrow import config
 from visthrow.common.errors import VisthrowError
-from visthrow.evidence.bench import card, records
+from visthrow.evidence.bench import records
 from visthrow.evidence.bench.records import Report, Table, rate
+from visthrow.training.device import device_name
 
 WARM_UP = 3
 """Iterations before measuring: the first runs eagerly, the second captures the CUDA graph."""
@@ -66,7 +67,7 @@ def alone(trainer: Any, repeats: int) -> dict[str, float]:
 
     from sim.arrays.torch_bridge import on_torch_stream
 
-    env, alg, steps, device = trainer.env, trainer.alg, trainer.experiment.ppo.steps, trainer.device
+    env, alg, steps, device = trainer.algorithm.env, trainer.algorithm.alg, trainer.experiment.ppo.steps, trainer.device
     observations = env.get_observations()
     with torch.inference_mode():
         actions = alg.act(observations).clone()
@@ -143,14 +144,14 @@ def measure(experiment: Any, name: str, device: str, iterations: int, repeats: i
     runs = whole(trainer, iterations)
     total = {key: statistics.median(values) for key, values in runs.items()}
     parts = split(total, alone(trainer, repeats))
-    samples, wall = trainer.samples_per_iteration, sum(total.values())
+    samples, wall = trainer.algorithm.samples, sum(total.values())
     rows = [
         (f"{part}: {PARTS[part]}", f"{t * 1e3:.2f} ms", f"{100 * t / wall:.0f} %", rate(samples / t) if t else "")
         for part, t in parts.items()
     ]
     rows.append(("iteration", f"{wall * 1e3:.2f} ms", "100 %", rate(samples / wall)))
     p = experiment.ppo
-    title = f"{name}: {p.environments:,} environments x {p.steps} steps on {card.name(device)}"
+    title = f"{name}: {p.environments:,} environments x {p.steps} steps on {device_name(device)}"
     notes = (
         f"Rollout and learning are medians of {iterations} iterations of training itself, after {WARM_UP} that warm "
         "up. Simulation, environment step and policy were then run alone, from CUDA graphs on a GPU; environment is "
@@ -168,4 +169,4 @@ def measure(experiment: Any, name: str, device: str, iterations: int, repeats: i
         "runs": runs,
     }
     table = Table(title, ("part", "time", "share", "env-steps/s"), tuple(rows))
-    return Report("train", f"A training iteration on {card.name(device)}", (table,), notes, figures)
+    return Report("train", f"A training iteration on {device_name(device)}", (table,), notes, figures)

@@ -8,7 +8,7 @@ from visthrow import config
 from visthrow.common.errors import VisthrowError
 from visthrow.evidence.bench import records
 from visthrow.evidence.bench.records import Report, Table
-from visthrow.evidence.bench.sim_cpu import on_one_core
+from visthrow.evidence.bench.sim.cpu import on_one_core
 
 TARGETS = (1.5, 2.0, 2.5)
 LIMIT_MS = 10.0

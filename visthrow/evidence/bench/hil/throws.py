@@ -15,8 +15,8 @@ import numpy as np
 
 from visthrow.common import statistics
 from visthrow.common.errors import VisthrowError
-from visthrow.evidence.bench.hil import bootstrap_upper, finite, json_lines
-from visthrow.evidence.bench.hil_processes import COMMAND, Pair, own_cores
+from visthrow.evidence.bench.hil.figures import bootstrap_upper, finite, json_lines
+from visthrow.evidence.bench.hil.processes import COMMAND, Pair, own_cores
 from visthrow.evidence.bench.records import Report, Table
 
 MEAN, RATIO = 0.10, 1.3

@@ -9,8 +9,8 @@ from typing import Any
 
 from sim.hybrid import HybridSim, tether_lengths
 from visthrow.common.errors import VisthrowError
-from visthrow.evidence.bench import commands
 from visthrow.evidence.bench.records import Report, Table
+from visthrow.evidence.bench.sim import commands
 from visthrow.task import Experiment, plant_of
 
 BATCH = 1024
@@ -68,7 +68,7 @@ class Batch:
 
 
 def cost_in_c(scene: Any, seconds: float) -> float:
-    """Wall time [s] a simulated second of a scene of ``sim.reference.bench_scenes``, measured for about ``seconds``."""
+    """Wall time [s] a simulated second of a scene of ``visthrow.evidence.bench.sim.mujoco_c``, measured for about ``seconds``."""
     chunk = round(0.5 / scene.step)
     spent, steps = 0.0, 0
     while spent < seconds:
@@ -109,9 +109,9 @@ def longest_accurate_step(error: Callable[[float], float], duration: float, tole
 
 def contenders(plant: Any) -> tuple[dict[str, Any], dict[str, tuple[float, float]]]:
     """MuJoCo's two scenes, and how far (ball, vehicle) [m] each contender ends from the converged hard throw."""
-    from sim.reference import bench_scenes
     from sim.reference.oracle import converged
-    from visthrow.evidence.bench import scenes
+    from visthrow.evidence.bench.sim import mujoco_c as bench_scenes
+    from visthrow.evidence.bench.sim import scenes
 
     hard = scenes.HARD_THROW
 

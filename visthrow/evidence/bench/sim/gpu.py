@@ -1,4 +1,4 @@
-"""A GPU: environment steps a second over batch sizes from a CUDA graph, against MuJoCo Warp and the card's limits."""
+"""A GPU: environment steps a second over batch sizes from a CUDA graph, against MuJoCo Warp."""
 
 import statistics
 import time
@@ -7,9 +7,10 @@ from typing import Any
 import warp as wp
 
 from sim.hybrid import HybridSim, tether_lengths
-from visthrow.evidence.bench import card, commands, compile_time, flops
 from visthrow.evidence.bench.records import Report, Table, rate
+from visthrow.evidence.bench.sim import commands
 from visthrow.task import Experiment, plant_of
+from visthrow.training.device import device_name
 
 BATCHES = tuple(2**k for k in range(12, 20))  # 4,096 to 524,288
 GRAPH_STEPS = 20  # control steps in the graph
@@ -63,34 +64,14 @@ def sweep(experiment: Experiment, device: str, batches: tuple[int, ...], repeats
     return rows
 
 
-def floor(experiment: Experiment, device: str, best: float) -> dict[str, Any]:
-    """Operations and bytes that a step cannot do without, and how near the measured rate comes to the card's peaks."""
-    plant = plant_of(experiment)
-    count, size = flops.env_step(plant, device), flops.traffic(plant, device)
-    found: dict[str, Any] = {"operations": count, "bytes": size, "card": None}
-    peaks = card.peaks(device)
-    if peaks is not None:
-        by_flops, by_bytes = peaks.flops / count["total"], peaks.bandwidth / size["traffic"]
-        found |= {
-            "card": {"name": peaks.name, "flops": peaks.flops, "bandwidth": peaks.bandwidth, "source": peaks.source},
-            "limit_by_flops": by_flops,
-            "limit_by_bytes": by_bytes,
-            "share_of_flops": best / by_flops,
-            "share_of_bandwidth": best / by_bytes,
-        }
-    return found
-
-
 def measure(
     experiment: Experiment, device: str, batches: tuple[int, ...] | list[int], repeats: int, with_mujoco: bool = True
 ) -> Report:
     """Measure and report."""
     plant = plant_of(experiment)
-    with compile_time.fresh_cache(device) as compiling:
-        rows = sweep(experiment, device, tuple(batches), repeats)
+    rows = sweep(experiment, device, tuple(batches), repeats)
     best = {kind: max(rows, key=lambda r: r[kind]["env_steps_per_s"]) for kind in commands.KINDS}
     top = {kind: best[kind][kind]["env_steps_per_s"] for kind in commands.KINDS}
-    lowest = min(top.values())
     figures: dict[str, Any] = {
         "device": device,
         "batches": rows,
@@ -99,21 +80,18 @@ def measure(
         "replays": REPLAYS,
         "repeats": repeats,
         "bars": BARS,
-        "floor": floor(experiment, device, lowest),
-        "compile": compiling,
         "mujoco_warp": None,
     }
     tables = [_sweep_table(rows, plant.rope.segments)]
     if with_mujoco:
-        from visthrow.evidence.bench import mujoco_warp
+        from visthrow.evidence.bench.sim import mujoco_warp
 
         found = mujoco_warp.measure(device, min(repeats, 3), plant.sim.control_period)
         figures["mujoco_warp"] = found
         if "rows" in found:
             found["ratio"] = {k: top[k] / found["best"]["env_steps_per_s"] for k in top}
             tables.append(mujoco_warp.table(found))
-    tables.append(_floor_table(figures))
-    return Report("sim", f"Simulator on {card.name(device)}", tuple(tables), _notes(figures), figures)
+    return Report("sim", f"Simulator on {device_name(device)}", tuple(tables), _notes(figures), figures)
 
 
 def _sweep_table(rows: list[dict[str, Any]], segments: int) -> Table:
@@ -131,35 +109,6 @@ def _sweep_table(rows: list[dict[str, Any]], segments: int) -> Table:
     return Table(f"visthrow, all blocks, rope of {segments} segments", header, tuple(cells))
 
 
-def _floor_table(figures: dict[str, Any]) -> Table:
-    limits, comp = figures["floor"], figures["compile"]
-    size, count = limits["bytes"], limits["operations"]
-    rows = [
-        ("operations an env-step", f"{count['total']:,}"),
-        ("bytes moved an env-step, at least", f"{size['traffic']:,}"),
-        ("bytes an environment", f"{size['environment']:,}"),
-        ("compile time, empty cache", f"{comp['cold_s']:.1f} s"),
-        ("load time, warm cache", f"{comp['warm_s']:.1f} s"),
-    ]
-    if limits["card"]:
-        c = limits["card"]
-        rows[2:2] = [
-            (
-                f"limit by operations ({c['flops'] / 1e12:.0f} TFLOP/s)",
-                f"{limits['limit_by_flops'] / 1e6:,.0f} M env-steps/s",
-            ),
-            (
-                f"limit by bytes ({c['bandwidth'] / 1e12:.1f} TB/s)",
-                f"{limits['limit_by_bytes'] / 1e6:,.0f} M env-steps/s",
-            ),
-            (
-                "reached of the two",
-                f"{100 * limits['share_of_flops']:.0f} %, {100 * limits['share_of_bandwidth']:.1f} %",
-            ),
-        ]
-    return Table("Floor and size", ("what", "value"), tuple(rows))
-
-
 def _notes(figures: dict[str, Any]) -> tuple[str, ...]:
     best = figures["best"]
     notes = [
@@ -168,13 +117,8 @@ def _notes(figures: dict[str, Any]) -> tuple[str, ...]:
         "Best: "
         + "; ".join(f"{k} {rate(b['env_steps_per_s'])} env-steps/s at {b['batch']:,}" for k, b in best.items())
         + f" (bar {BARS['env_steps_per_s'] / 1e6:.0f} M).",
-        "Operations: additions, multiplications, divisions, roots, minima and maxima of one env-step at hover, counted "
-        "by running the kernel's own source; none for loads, comparisons, indices. Bytes: state read and written once, "
-        "command in, payload out; the rope's scratch arrays live in the card's caches and are not counted.",
     ]
-    limits, found = figures["floor"], figures["mujoco_warp"]
-    if limits["card"]:
-        notes.append(f"Peaks: {limits['card']['source']}.")
+    found = figures["mujoco_warp"]
     if found is not None:
         ratios = found.get("ratio")
         notes.append(

@@ -1,33 +1,11 @@
-"""``visthrow bench hil``: the runner against the fake autopilot, each in its own process, over loopback in real time.
+"""Figures of measurements: bounds of ratios, lines of a file, what is a number."""
 
-Latency and soak by default: times of each stage, ticks missed, memory. With ``--throws`` a series of throws, each paired with
-the same one flown without a wire. With ``--faults`` what the runner does when something fails, and after how long.
-"""
-
-import argparse
 import json
 import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-
-from visthrow.evidence.bench.records import finish
-
-
-def run(args: argparse.Namespace) -> int:
-    """Measure what was asked for."""
-    if args.throws:
-        from visthrow.evidence.bench.hil_throws import series
-
-        return finish(series(args), args)
-    if args.faults is not None:
-        from visthrow.evidence.bench.hil_faults import faults
-
-        return finish(faults(args), args)
-    from visthrow.evidence.bench.hil_soak import soak
-
-    return finish(soak(args), args)
 
 
 def bootstrap_upper(ratio_of: np.ndarray, level: float = 0.9, draws: int = 20_000, seed: int = 0) -> tuple[float, float]:

@@ -18,10 +18,10 @@ from typing import Any
 import torch
 
 from visthrow.common.errors import VisthrowError, suggest
-from visthrow.evidence.bench.hil import json_lines
-from visthrow.evidence.bench.hil_processes import ENDED, Pair, own_cores
-from visthrow.evidence.bench.hil_soak import STILL, never_releasing
-from visthrow.evidence.bench.hil_throws import side_by_side
+from visthrow.evidence.bench.hil.figures import json_lines
+from visthrow.evidence.bench.hil.processes import ENDED, Pair, own_cores
+from visthrow.evidence.bench.hil.soak import STILL, never_releasing
+from visthrow.evidence.bench.hil.throws import side_by_side
 from visthrow.evidence.bench.records import Report, Table
 from visthrow.onboard.actions import hover_action
 

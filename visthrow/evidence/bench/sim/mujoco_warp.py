@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from visthrow.evidence.bench.records import Table, rate
-from visthrow.evidence.bench.scenes import HARD_THROW
+from visthrow.evidence.bench.sim.scenes import HARD_THROW
 
 BATCHES = (8192, 16384, 32768, 65536)
 SUBSTEPS = 10  # in the graph: one control step of ours
@@ -23,9 +23,9 @@ MISSING = (
 def _model() -> tuple[Any, Any]:
     import mujoco
 
-    from sim.reference import bench_scenes
     from sim.reference.model import build_attached
     from sim.reference.oracle import initial_data, rope_from_scene
+    from visthrow.evidence.bench.sim import mujoco_c as bench_scenes
 
     model = build_attached(rope_from_scene(HARD_THROW), "universal", bench_scenes.ARMATURE)
     model.opt.timestep, model.opt.integrator = bench_scenes.IMPLICIT_STEP, mujoco.mjtIntegrator.mjINT_IMPLICITFAST

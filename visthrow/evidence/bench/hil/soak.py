@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from visthrow.common.errors import VisthrowError
-from visthrow.evidence.bench.hil_processes import Memory, Pair
+from visthrow.evidence.bench.hil.processes import Memory, Pair
 from visthrow.evidence.bench.records import Report, Table
 
 STILL = ("--plant", "hil.fakes.level:make")

@@ -17,7 +17,7 @@ def run(args: argparse.Namespace) -> int:
 
     experiment = config.load(Experiment, config.find("train", args.config), args.overrides)
     if args.device == "cpu":
-        from visthrow.evidence.bench import sim_cpu
+        from visthrow.evidence.bench.sim import cpu as sim_cpu
 
         if args.batch and len(args.batch) > 1:
             raise VisthrowError(f"--batch {args.batch}: one core is measured at one batch size")
@@ -30,7 +30,7 @@ def run(args: argparse.Namespace) -> int:
             not args.without_mujoco,
         )
     else:
-        from visthrow.evidence.bench import sim_gpu
+        from visthrow.evidence.bench.sim import gpu as sim_gpu
         from visthrow.training import device
 
         name = device.resolve(args.device)

@@ -1,0 +1,198 @@
+"""The update for a GPU computes what rsl_rl's own computes: the same samples, order, losses, gradients, rates."""
+
+import contextlib
+import copy
+import io
+from types import SimpleNamespace
+
+import pytest
+import torch
+from rsl_rl.algorithms import PPO
+from tensordict import TensorDict
+
+from visthrow import config
+from visthrow.task import PPOParams
+from visthrow.training.ppo.algorithm import rsl_rl_config
+from visthrow.training.ppo.network import CapturableGaussian
+from visthrow.training.ppo.update import CapturedPPO
+
+ENVIRONMENTS, STEPS, SEEN, KNOWN, ACTIONS = 32, 8, 7, 9, 5
+
+SAME = {"rtol": 2e-4, "atol": 2e-6}
+"""Float32 sums in another order, over some twenty steps of Adam, whose first ones divide by a gradient's own size."""
+
+
+def params(**changes) -> PPOParams:
+    table = {
+        "environments": ENVIRONMENTS, "steps": STEPS, "iterations": 10, "hidden": [16, 16], "activation": "elu", "normalize": True,
+        "initial_std": 0.5, "epochs": 3, "minibatches": 4, "learning_rate": 1e-3, "schedule": "adaptive", "desired_kl": 0.01,
+        "final_kl": 0.01, "discount": 0.99, "gae_lambda": 0.95, "clip": 0.2, "entropy": 0.01, "value_coefficient": 1.0,
+        "max_grad_norm": 0.5,
+    }  # fmt: skip
+    text = "\n".join(f"{k} = {str(v).lower() if isinstance(v, bool) else repr(v)}" for k, v in (table | changes).items())
+    return config.loads(PPOParams, text, (), name="test")
+
+
+def observations(device: str = "cpu") -> TensorDict:
+    drawn = {"actor": 2.0 * torch.randn(ENVIRONMENTS, SEEN) + 1.0, "critic": torch.randn(ENVIRONMENTS, KNOWN)}
+    return TensorDict(drawn, batch_size=[ENVIRONMENTS]).to(device)
+
+
+def build(p: PPOParams, own: bool, device: str = "cpu") -> PPO:
+    """Our algorithm or rsl_rl's with rsl_rl's networks, from the same weights."""
+    cfg = rsl_rl_config(p, None)
+    if not own:
+        cfg["algorithm"]["class_name"] = "PPO"
+        for name in ("actor", "critic"):
+            cfg[name] = {k: v for k, v in cfg[name].items() if k != "bfloat16"} | {"class_name": "MLPModel"}
+    torch.manual_seed(0)
+    env = SimpleNamespace(num_envs=ENVIRONMENTS, num_actions=ACTIONS)
+    with contextlib.redirect_stdout(io.StringIO()):
+        alg = PPO.construct_algorithm(observations(device), env, cfg, device)
+    alg.train_mode()
+    return alg
+
+
+def iterate(alg: PPO, seed: int) -> dict[str, float]:
+    """A rollout of drawn observations and rewards, and the update."""
+    torch.manual_seed(seed)
+    obs = [observations(alg.device) for _ in range(STEPS + 1)]
+    rewards = torch.randn(STEPS, ENVIRONMENTS).to(alg.device)
+    dones = (torch.rand(STEPS, ENVIRONMENTS) < 0.1).float().to(alg.device)
+    with torch.inference_mode():
+        for i in range(STEPS):
+            alg.act(obs[i])
+            alg.process_env_step(obs[i + 1], rewards[i], dones[i], {})
+        alg.compute_returns(obs[-1])
+    torch.manual_seed(seed + 100)  # rsl_rl draws samples in its update that it throws away
+    return alg.update()
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{}, {"schedule": "fixed"}, {"desired_kl": 1e-5}, {"desired_kl": 1.0}, {"normalize": False, "epochs": 1, "minibatches": 8}],
+    ids=["adaptive", "fixed", "rate falls", "rate rises", "one pass"],
+)
+def test_the_update_is_rsl_rls(changes):
+    p = params(**changes)
+    ours, theirs = build(p, own=True), build(p, own=False)
+    assert isinstance(ours, CapturedPPO)
+    assert not isinstance(theirs, CapturedPPO)
+    start = [w.detach().clone() for w in ours.actor.parameters()]
+    for seed in range(3):
+        mine, other = iterate(ours, seed), iterate(theirs, seed)
+        assert mine == pytest.approx(other, rel=1e-3, abs=1e-5)
+        assert ours.learning_rate == pytest.approx(theirs.learning_rate, rel=1e-5)
+    for a, b in zip((ours.actor, ours.critic), (theirs.actor, theirs.critic)):
+        for name, value in b.state_dict().items():
+            torch.testing.assert_close(a.state_dict()[name], value, **SAME)
+    moved = max(float((a - b.detach()).abs().max()) for a, b in zip(start, ours.actor.parameters()))
+    assert moved > 100 * SAME["atol"]
+    assert (abs(ours.learning_rate / p.learning_rate - 1.0) > 0.1) == (p.schedule == "adaptive")
+
+
+def test_a_turned_gradient_is_noticed(monkeypatch):
+    """The comparison above would not hold a sign that is wrong."""
+    p = params(schedule="fixed")
+    ours, theirs = build(p, own=True), build(p, own=False)
+    gradients = torch.autograd.grad
+    monkeypatch.setattr(torch.autograd, "grad", lambda *a: [-g for g in gradients(*a)])
+    iterate(ours, 0)
+    iterate(theirs, 0)
+    worst = max(float((a - b).detach().abs().max()) for a, b in zip(ours.actor.parameters(), theirs.actor.parameters()))
+    assert worst > 10 * SAME["atol"]
+
+
+def test_the_host_reads_once_and_buffers_keep_their_places(monkeypatch):
+    """What a CUDA graph needs: no value is looked at inside the epochs, and what they read and write does not move."""
+    alg = build(params(), own=True)
+    iterate(alg, 0)
+    alg.storage.step = 0
+
+    def places():
+        stored = [alg.storage.advantages, alg.storage.returns, alg.storage.values, *alg.storage.distribution_params]
+        kept = [alg.rate, alg.target_kl, alg.actor.obs_normalizer._std, alg._spread, *alg._layers]
+        adam = [t for state in alg.optimizer.state.values() for t in state.values()]
+        return [t.data_ptr() for t in (*stored, *kept, *adam)]
+
+    before = places()
+
+    def refuse(self, *_):
+        raise AssertionError("a tensor was read on the host")
+
+    with monkeypatch.context() as patch:
+        for name in ("item", "tolist", "numpy", "__bool__", "__float__", "__int__"):
+            patch.setattr(torch.Tensor, name, refuse)
+        alg._epochs()
+    iterate(alg, 1)
+    assert places() == before
+    assert alg.optimizer.param_groups[0]["lr"] is alg.rate
+
+
+def test_products_in_bfloat16_follow_those_in_float32():
+    """The same minibatches; weights stay float32 and end within the rounding of the products, moved some ten times as far."""
+    plain, short = (build(params(schedule="fixed", products=kind), own=True) for kind in ("float32", "bfloat16"))
+    start = [w.detach().clone() for w in plain.actor.parameters()]
+    for seed in range(3):
+        iterate(plain, seed)
+        iterate(short, seed)
+    assert {w.dtype for w in [short._spread, *short._layers]} == {torch.float32}
+    off = torch.cat([(a - b).flatten() for a, b in zip(plain.actor.parameters(), short.actor.parameters())]).norm()
+    way = torch.cat([(a - b).flatten() for a, b in zip(plain.actor.parameters(), start)]).norm()
+    assert 0.0 < off < 0.3 * way
+
+
+def test_a_state_that_was_saved_goes_on_the_same():
+    first, second = build(params(), own=True), build(params(), own=True)
+    iterate(first, 0)
+    second.load(copy.deepcopy(first.save()), None, True)
+    assert second.learning_rate == first.learning_rate != params().learning_rate
+    assert iterate(first, 1) == iterate(second, 1)
+    for a, b in zip(first._layers, second._layers):
+        torch.testing.assert_close(a, b, rtol=0, atol=0)
+
+
+def test_time_outs_are_refused():
+    alg = build(params(), own=True)
+    with pytest.raises(ValueError, match="time_outs"):
+        alg.process_env_step(observations(), torch.zeros(ENVIRONMENTS), torch.zeros(ENVIRONMENTS), {"time_outs": 1})
+
+
+def test_the_sample_is_the_gaussians():
+    gaussian = CapturableGaussian(5, init_std=0.5, std_type="log")
+    gaussian.update(torch.ones(4000, 5))
+    torch.manual_seed(1)
+    drawn = gaussian.sample()
+    assert abs(float(drawn.mean()) - 1.0) < 0.02
+    assert abs(float(drawn.std()) - 0.5) < 0.02
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@pytest.mark.parametrize("products", ["float32", "bfloat16"])
+def test_the_captured_update_is_the_launched_one_and_rsl_rls(products):
+    """Five iterations: the first launches, the second captures, three replay."""
+    p = params(products=products, schedule="fixed")
+    captured, launched, theirs = (build(p, own, "cuda:0") for own in (True, True, False))
+    for seed in range(5):
+        launched._updates = 0
+        figures = [iterate(alg, seed) for alg in (captured, launched, theirs)]
+        assert figures[0] == pytest.approx(figures[1], rel=1e-3, abs=1e-5)
+    assert captured._graph is not None
+    assert launched._graph is None
+    for a, b, c in zip(captured._layers, launched._layers, [*theirs.actor.mlp.parameters(), *theirs.critic.parameters()]):
+        torch.testing.assert_close(a, b, **SAME)
+        if products == "float32":
+            torch.testing.assert_close(a, c, **SAME)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_the_rate_of_a_captured_update_is_rsl_rls():
+    for kl in (1e-5, 1.0):
+        ours, theirs = (build(params(desired_kl=kl), own, "cuda:0") for own in (True, False))
+        for seed in range(4):
+            iterate(ours, seed)
+            iterate(theirs, seed)
+        assert ours.learning_rate == pytest.approx(theirs.learning_rate, rel=1e-5)
+        assert abs(ours.learning_rate / 1e-3 - 1.0) > 0.1

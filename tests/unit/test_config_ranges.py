@@ -1,0 +1,44 @@
+"""What no plant, camera or training can be is refused where the configuration is read, and a copied file finds its base."""
+
+import pytest
+
+from visthrow import cli, config
+from visthrow.common.errors import ConfigError
+from visthrow.task import Experiment
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "change", "message"),
+    [
+        ("vehicle", "paper", "body.mass=-1", "vehicle.body.mass is -1"),
+        ("rope", "paper", "length=-0.2", "rope.length is -0.2"),
+        ("rope", "paper", "length=0", "rope.length is 0"),
+        ("rope", "paper", "segments=0", "expected 1 to 64"),
+        ("rope", "paper", "segments=100", "expected 1 to 64"),
+        ("camera", "fisheye", "fisheye.fov_deg=400", "up to 360 deg"),
+        ("camera", "fisheye", "fisheye.fx=0", "fx is 0"),
+        ("camera", "fisheye", "fisheye.k1=1e9", "1 deg off the axis"),
+        ("task", "state", "bounds.altitude=[3,0.5]", "lower limit before the upper"),
+        ("task", "state", "noise.command_step=-1", "command_step"),
+        ("train", "state", "ppo.iterations=-3", "1 or more"),
+        ("train", "state", "ppo.discount=1.5", "discount"),
+    ],
+)
+def test_the_command_refuses(kind, name, change, message, capsys):
+    assert cli.main(["config", kind, name, "--set", change]) == 2
+    assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["vision", "vision_dropout", "state_far"])
+def test_a_copy_elsewhere_finds_its_base(name, tmp_path):
+    shipped = config.find("train", name)
+    copy = tmp_path / "mine.toml"
+    copy.write_text(shipped.read_text(encoding="utf-8"), encoding="utf-8")
+    assert config.load(Experiment, copy) == config.load(Experiment, shipped)
+
+
+def test_a_base_that_is_nowhere_suggests_its_own_kind(tmp_path):
+    (tmp_path / "mine.toml").write_text('base = "visoin.toml"', encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"did you mean 'train/vision\.toml'") as caught:
+        config.load(Experiment, tmp_path / "mine.toml")
+    assert "vehicle/" not in str(caught.value)

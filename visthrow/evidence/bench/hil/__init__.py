@@ -1,0 +1,1 @@
+"""Measurements of the HIL runner against the fakes, over loopback between processes."""

@@ -1,0 +1,148 @@
+"""PPO on the throwing task, as a trainer drives it."""
+
+import contextlib
+import io
+import time
+
+import torch
+from rsl_rl.algorithms import PPO
+from tensordict import TensorDict
+from torch import Tensor
+
+from visthrow.common.errors import ConfigError
+from visthrow.onboard.policy import Policy
+from visthrow.task import Experiment, PPOParams
+from visthrow.training.env import ThrowEnv
+from visthrow.training.ppo.network import CapturableGaussian, Network
+from visthrow.training.ppo.update import CapturedPPO
+
+
+def rsl_rl_config(p: PPOParams, ranks: dict | None) -> dict:
+    """Configuration dictionary of rsl_rl 5.5 for our parameters; both observation groups are named."""
+    network = {
+        "class_name": Network,
+        "hidden_dims": list(p.hidden),
+        "activation": p.activation,
+        "obs_normalization": p.normalize,
+        "bfloat16": p.products == "bfloat16",
+    }
+    spread = {"class_name": CapturableGaussian, "init_std": p.initial_std, "std_type": "log"}
+    algorithm = {
+        "class_name": CapturedPPO,
+        "num_learning_epochs": p.epochs,
+        "num_mini_batches": p.minibatches,
+        "learning_rate": p.learning_rate,
+        "schedule": p.schedule,
+        "desired_kl": p.desired_kl,
+        "gamma": p.discount,
+        "lam": p.gae_lambda,
+        "clip_param": p.clip,
+        "entropy_coef": p.entropy,
+        "value_loss_coef": p.value_coefficient,
+        "max_grad_norm": p.max_grad_norm,
+        "use_clipped_value_loss": True,
+    }
+    return {
+        "num_steps_per_env": p.steps,
+        "actor": {**network, "distribution_cfg": spread},
+        "critic": network,
+        "algorithm": algorithm,
+        "obs_groups": {"actor": ["actor"], "critic": ["critic"]},
+        "multi_gpu": ranks,
+    }
+
+
+class PPOTraining:
+    """PPO on :class:`ThrowEnv`, as the trainer drives it; see :class:`visthrow.training.trainer.Algorithm`.
+
+    Attributes:
+        alg: rsl_rl's algorithm object.
+    """
+
+    def __init__(self, experiment: Experiment, device: str, seed: int, ranks: dict | None = None):
+        """Build environment and networks.
+
+        Args:
+            experiment: the run's configuration.
+            device: "cpu" or "cuda:0".
+            seed: of the environment; torch's own generators are the caller's to seed.
+            ranks: rsl_rl's ``multi_gpu`` dictionary in a distributed run.
+
+        Raises:
+            ConfigError: samples that do not divide into minibatches.
+        """
+        p = experiment.ppo
+        if (p.environments * p.steps) % p.minibatches:
+            raise ConfigError(f"ppo: {p.environments} x {p.steps} samples do not divide into {p.minibatches} minibatches")
+        self.experiment, self.device = experiment, device
+        self.iterations = p.iterations
+        self.samples = p.environments * p.steps * (ranks["world_size"] if ranks else 1)
+        self.env = ThrowEnv(experiment, device, seed)
+        with contextlib.redirect_stdout(io.StringIO()):
+            self.alg: CapturedPPO = PPO.construct_algorithm(self.env.get_observations(), self.env, rsl_rl_config(p, ranks), device)
+        self.alg.train_mode()
+        if ranks:
+            self.alg.broadcast_parameters()
+        self._obs = self.env.get_observations()
+        self._graph: torch.cuda.CUDAGraph | None = None
+        self._rollouts = 0
+
+    def _rollout(self) -> None:
+        obs = self._obs
+        with torch.inference_mode():
+            for _ in range(self.experiment.ppo.steps):
+                actions = self.alg.act(obs)
+                obs, reward, done, extras = self.env.step(actions)
+                self.alg.process_env_step(obs, reward, done, extras)
+            self.alg.compute_returns(obs)
+            for key, value in obs.items():
+                self._obs[key].copy_(value)
+
+    def rollout(self) -> None:
+        """Collect one batch: eagerly the first time (everything is allocated then), from a captured graph afterwards."""
+        if not self.device.startswith("cuda") or self._rollouts == 0:
+            self._rollout()
+        else:
+            if self._graph is None:
+                self.alg.storage.clear()
+                torch.cuda.synchronize()
+                self._graph = torch.cuda.CUDAGraph()
+                with torch.cuda.graph(self._graph):
+                    self._rollout()
+            self._graph.replay()
+        self._rollouts += 1
+
+    def step(self, done: float) -> dict[str, float]:
+        """One iteration, rollout and update, at this share of the training; returns its figures."""
+        p = self.experiment.ppo
+        self.env.clear_totals()
+        start = time.perf_counter()
+        self.rollout()
+        if self.device.startswith("cuda"):
+            torch.cuda.synchronize()
+        middle = time.perf_counter()
+        self.alg.desired_kl = (1.0 - done) * p.desired_kl + done * p.final_kl
+        figures = self.alg.update()
+        end = time.perf_counter()
+        times = {"rollout_s": middle - start, "learning_s": end - middle}
+        return {**figures, **self.env.episode_means(), "learning_rate": self.alg.learning_rate, **times}
+
+    def act(self, obs: Tensor) -> Tensor:
+        """Deterministic actions, shape (E, 5), of the current policy for the actor's observations, shape (E, D)."""
+        return self.alg.actor(TensorDict({"actor": obs}, batch_size=[len(obs)], device=obs.device))
+
+    def export(self, contract: dict, made_by: dict) -> Policy:
+        """The policy as a file's content."""
+        return Policy.from_actor_state(self.alg.actor.state_dict(), self.experiment.ppo.activation, contract, made_by)
+
+    def state_dict(self) -> dict:
+        """All that the next iteration depends on, besides torch's generators."""
+        return {"networks": self.alg.save(), "env": self.env.state_dict(), "obs": {k: v.clone() for k, v in self._obs.items()}}
+
+    def load_state_dict(self, saved: dict, own_throws: bool = True) -> None:
+        """Take up a state of :meth:`state_dict`; its environment too where ``own_throws`` is set."""
+        self.alg.load(saved["networks"], None, True)
+        if own_throws:
+            self.env.load_state_dict(saved["env"])
+            for key, value in saved["obs"].items():
+                self._obs[key].copy_(value)

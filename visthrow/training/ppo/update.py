@@ -1,0 +1,180 @@
+"""rsl_rl's PPO with an update that a CUDA graph can hold."""
+
+from itertools import chain
+
+import torch
+import warp as wp
+from rsl_rl.algorithms import PPO
+from tensordict import TensorDict
+from torch import Tensor
+
+from sim.arrays.torch_bridge import on_torch_stream
+from visthrow.training.ppo import loss
+from visthrow.training.ppo.network import Network
+
+
+class CapturedPPO(PPO):
+    """rsl_rl's PPO of networks without memory and with a Gaussian whose spread is the same for all samples.
+
+    Values and log-probabilities of a rollout are computed in a few large pieces at its end, samples are gathered in the
+    order of the minibatches once for all epochs, and the adaptive learning rate lives on the device.
+    """
+
+    def __init__(self, actor: Network, critic: Network, storage, **settings):
+        super().__init__(actor, critic, storage, **settings)
+        make = {"device": self.device, "dtype": torch.float32}
+        self._cuda = torch.device(self.device).type == "cuda"
+        self._spread = actor.distribution.log_std_param
+        self._layers = [w for w in chain(actor.parameters(), critic.parameters()) if w is not self._spread]
+        self.rate, self.target_kl = torch.tensor([self.learning_rate], **make), torch.tensor([self.desired_kl], **make)
+        self.optimizer = torch.optim.Adam([self._spread, *self._layers], lr=self.rate, fused=True, capturable=self._cuda)
+        samples, actions = storage.num_envs * storage.num_transitions_per_env, storage.actions.shape[-1]
+        self._minibatch = samples // self.num_mini_batches
+        self._order = torch.zeros(samples, device=self.device, dtype=torch.long)
+        storage.distribution_params = tuple(torch.zeros(storage.actions.shape, **make) for _ in range(2))
+        self._old_std, self._last_value = torch.ones(actions, **make), torch.zeros(storage.num_envs, **make)
+        self._totals = torch.zeros(3, **make)
+        self._mean_gradient = torch.zeros(self._minibatch, actions, **make)
+        self._value_gradient = torch.zeros(self._minibatch, 1, **make)
+        self._parts = torch.zeros(self._minibatch, 2 + 2 * actions, **make)
+        self._spread.grad = torch.zeros(actions, **make)
+        self._updates = 0
+        self._graph: torch.cuda.CUDAGraph | None = None
+
+    def act(self, obs: TensorDict) -> Tensor:
+        """Sample actions, shape (E, A), and store what the rollout's end needs of them."""
+        storage = self.storage
+        actions = self.actor(obs, stochastic_output=True).detach()
+        storage.observations[storage.step].copy_(obs)
+        storage.actions[storage.step].copy_(actions)
+        storage.distribution_params[0][storage.step].copy_(self.actor.output_mean)
+        return actions
+
+    def process_env_step(self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: dict) -> None:
+        """Store one step's rewards and ends, shape (E,).
+
+        Raises:
+            ValueError: the environment bootstraps at its time limit, which is not served here.
+        """
+        if "time_outs" in extras:
+            raise ValueError("time_outs of the environment: expected none; its time limit is an end like others")
+        storage = self.storage
+        storage.rewards[storage.step].copy_(rewards[:, None])
+        storage.dones[storage.step].copy_(dones[:, None])
+        storage.step += 1
+
+    @torch.no_grad()
+    def compute_returns(self, obs: TensorDict) -> None:
+        """Values, log-probabilities, returns and advantages of the stored steps, in place."""
+        storage = self.storage
+        for known, values in zip(
+            storage.observations.flatten(0, 1).split(self._minibatch), storage.values.flatten(0, 1).split(self._minibatch)
+        ):
+            values.copy_(self.critic.output(self.critic.prepared(known)))
+        self._last_value.copy_(self.critic(obs)[:, 0])
+        self._old_std.copy_(self._std())
+        storage.distribution_params[1].copy_(self._old_std.expand_as(storage.actions))
+        self._launch(
+            loss.log_probabilities, len(self._order), storage.actions.flatten(0, 1), storage.distribution_params[0].flatten(0, 1),
+            self._old_std, storage.actions_log_prob.view(-1),
+        )  # fmt: skip
+        steps = [t[..., 0] for t in (storage.rewards, storage.dones, storage.values)]
+        self._launch(loss.returns_of, storage.num_envs, self.gamma, self.lam, *steps, self._last_value, storage.returns[..., 0])
+        torch.sub(storage.returns, storage.values, out=storage.advantages)
+        storage.advantages.sub_(storage.advantages.mean()).div_(storage.advantages.std() + 1e-8)
+
+    def _std(self) -> Tensor:
+        """Spread of the actions, shape (A,)."""
+        return self._spread.detach().clamp(*self.actor.distribution.log_std_range).exp()
+
+    def _launch(self, kernel: wp.Kernel, count: int, *arguments: Tensor | float | int) -> None:
+        """Launch a kernel on torch's stream."""
+        given = [wp.from_torch(a.detach(), requires_grad=False) if isinstance(a, Tensor) else a for a in arguments]
+        with on_torch_stream(self.device):
+            wp.launch(kernel, count, given, device=self.device)
+
+    def update(self) -> dict[str, float]:
+        """All epochs over the stored samples; returns mean losses. From the second on a GPU replays a captured graph."""
+        self.target_kl.fill_(self.desired_kl)
+        self._order.copy_(torch.randperm(len(self._order), device=self.device))
+        if not self._cuda or self.is_multi_gpu or self._updates == 0:
+            self._epochs()
+        else:
+            if self._graph is None:
+                torch.cuda.synchronize()
+                self._graph = torch.cuda.CUDAGraph()
+                with torch.cuda.graph(self._graph):
+                    self._epochs()
+            self._graph.replay()
+        self._updates += 1
+        self._update_normalizers()
+        self.storage.clear()
+        *losses, self.learning_rate = torch.cat([self._totals, self.rate]).tolist()
+        count = self.num_learning_epochs * self.num_mini_batches
+        return {name: total / count for name, total in zip(("value", "surrogate", "entropy"), losses)}
+
+    def _epochs(self) -> None:
+        """Gather the samples in the order of the minibatches and descend on each, once an epoch."""
+        storage = self.storage
+        obs = storage.observations.flatten(0, 1)
+        stored = (
+            storage.actions, storage.distribution_params[0], storage.actions_log_prob, storage.advantages, storage.returns,
+            storage.values,
+        )  # fmt: skip
+        with torch.no_grad():
+            gathered = [model.prepared(obs)[self._order] for model in (self.actor, self.critic)]
+            gathered += [t.flatten(0, 1)[self._order] for t in stored]
+        batches = list(zip(*(part.split(self._minibatch) for part in gathered)))
+        self._totals.zero_()
+        for _ in range(self.num_learning_epochs):
+            for seen, known, *samples in batches:
+                self._descend(seen, known, samples)
+
+    def _descend(self, seen: Tensor, known: Tensor, samples: list[Tensor]) -> None:
+        """One gradient step on a minibatch: the networks' inputs, and what :func:`loss.loss` reads of the samples."""
+        mean, value, std = self.actor.output(seen), self.critic.output(known), self._std()
+        columns = [t if t.shape[-1] > 1 else t.view(-1) for t in samples]
+        self._launch(
+            loss.loss, self._minibatch, self.clip_param, self.value_loss_coef, int(self.use_clipped_value_loss), mean, value.view(-1),
+            std, *columns, self._mean_gradient, self._value_gradient.view(-1), self._parts,
+        )  # fmt: skip
+        sums = self._parts.sum(0)
+        if self.is_multi_gpu:
+            moved = sums[2 : 2 + len(std)]
+            torch.distributed.all_reduce(moved)
+            moved /= self.gpu_world_size
+        self._launch(
+            loss.spread_and_rate, 1, float(self._minibatch), self.entropy_coef, int(self.schedule == "adaptive"), self.target_kl,
+            sums, std, self._old_std, self.rate, self._spread.grad, self._totals,
+        )  # fmt: skip
+        gradients = torch.autograd.grad([mean, value], self._layers, [self._mean_gradient, self._value_gradient])
+        for layer, gradient in zip(self._layers, gradients):
+            layer.grad = gradient
+        if self.is_multi_gpu:
+            self.reduce_parameters()
+        for model in (self.actor, self.critic):
+            torch.nn.utils.clip_grad_norm_(model.parameters(), self.max_grad_norm)
+        self.optimizer.step()
+
+    def _update_normalizers(self) -> None:
+        """rsl_rl's update of the observations' statistics; it makes a new tensor of the spread, graphs read the old one."""
+        obs = self.storage.observations.flatten(0, 1)
+        for model in (self.actor, self.critic):
+            if model.obs_normalization:
+                captured = model.obs_normalizer._std
+                model.update_normalization(obs)
+                model.obs_normalizer._std = captured.copy_(model.obs_normalizer._std)
+
+    def load(self, loaded_dict: dict, load_cfg: dict | None, strict: bool) -> bool:
+        """Take up a state of :meth:`save`; the rate keeps its place on the device, graphs are captured anew."""
+        result = super().load(loaded_dict, load_cfg, strict)
+        self.set_rate(float(self.learning_rate))
+        self._graph, self._updates = None, 0
+        return result
+
+    def set_rate(self, rate: float) -> None:
+        """Go on with this learning rate."""
+        self.learning_rate = rate
+        self.rate.fill_(rate)
+        for group in self.optimizer.param_groups:
+            group["lr"] = self.rate
