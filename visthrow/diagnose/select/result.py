@@ -152,7 +152,6 @@ class Diagnosis:
     sets: tuple[tuple[tuple[str, ...], float], ...] = ()  # sets of causes within 3 nats of the best, with their distance
     levels: tuple[Level, ...] = ()
     laws: tuple[Law, ...] = ()  # terms outside the catalogue, best first
-    explanations: tuple[tuple[Law, ...], ...] = ()  # terms that belong together, one such set in place of another, best first
     events: tuple[int, ...] = ()  # flights in which something happened once
     duplicates: Mapping[int, int] = field(default_factory=dict)  # flight -> the earlier flight that it repeats
     sensor_scale: Mapping[str, float] = field(default_factory=dict)  # channel -> noise found, in that stated
@@ -163,6 +162,7 @@ class Diagnosis:
     seed: int = 0
     scatter: tuple[Scatter, ...] = ()  # what may vary from flight to flight
     mistakes: tuple[Mistake, ...] = ()  # of the logs' interface, put right before anything was estimated
+    explanations: tuple[tuple[Law, ...], ...] = ()  # terms that belong together, one such set in place of another, best first
     held_out: HeldOut | None = None  # where something was named
     work: Any = field(default=None, repr=False, compare=False)
 
