@@ -8,8 +8,8 @@ import threading
 import numpy as np
 import pytest
 
-from hil.backends.betaflight import BOX_ARM, HIGH, LOW, Betaflight
 from hil.backends.base import FOLLOW
+from hil.backends.betaflight import BOX_ARM, HIGH, LOW, Betaflight
 from hil.errors import RunError
 from hil.fakes.base import Options
 from hil.fakes.mocap import MocapParams
