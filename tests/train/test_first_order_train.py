@@ -106,14 +106,14 @@ def test_what_it_cannot_train_is_refused(tmp_path, capsys):
 @pytest.mark.gpu
 @pytest.mark.parametrize("name", ["state", "vision"])
 def test_replayed_from_graphs_it_computes_what_it_computes_eagerly(name):
-    """Four iterations: one that allocates, one that captures, two that replay, with fresh noise each."""
+    """Six iterations: three that warm up, one that captures, two that replay, with fresh noise each."""
 
     def errors(eager):
         trainer = Trainer(config.load(Experiment, config.find("train", name), SMALL), "cuda:0", 1)
         if eager:
             trainer.algorithm.rollout, trainer.algorithm._update = trainer.algorithm._fly, trainer.algorithm._descend
-        return [trainer.step()["cost"] for _ in range(4)]
+        return [trainer.step()["cost"] for _ in range(6)]
 
     captured = errors(False)
-    assert len(set(captured)) == 4
+    assert len(set(captured)) == 6
     np.testing.assert_allclose(captured, errors(True), rtol=1e-3)

@@ -35,22 +35,31 @@ STEPS_AT_ONCE = 4
 
 
 class Replayed:
-    """Work on fixed tensors of a GPU: done eagerly once, then captured in a CUDA graph and replayed."""
+    """Work on fixed tensors of a GPU: done eagerly at first, then captured in a CUDA graph and replayed.
+
+    All of it happens on one stream of its own: autograd's thread makes its handles there before a capture forbids that.
+    """
+
+    EAGER = 3
 
     def __init__(self, work: Callable[[], None]):
-        self._work, self._warm, self._graph = work, False, None
+        self._work, self._done, self._graph, self._stream = work, 0, None, torch.cuda.Stream()
 
     def __call__(self) -> None:
         """Do the work."""
-        if not self._warm:
-            self._warm = True
-            return self._work()
-        if self._graph is None:
+        self._stream.wait_stream(torch.cuda.current_stream())
+        if self._graph is None and self._done == self.EAGER:
             torch.cuda.synchronize()
             self._graph = torch.cuda.CUDAGraph()
-            with torch.cuda.graph(self._graph):
+            with torch.cuda.graph(self._graph, stream=self._stream):
                 self._work()
-        self._graph.replay()
+        with torch.cuda.stream(self._stream):
+            if self._graph is None:
+                self._work()
+                self._done += 1
+            else:
+                self._graph.replay()
+        torch.cuda.current_stream().wait_stream(self._stream)
 
 
 class FirstOrder:
