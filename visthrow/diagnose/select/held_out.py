@@ -261,8 +261,10 @@ def judged(diagnosis: Diagnosis, seed: int = 0) -> Diagnosis:
         return diagnosis
     held, alone = measure(diagnosis, seed), not _compares_phases(diagnosis.work.after)
     names = list(diagnosis.theta)
-    if held.share <= 0.0 or (alone and any(c.harmed and c.high < 0.0 for c in held.channels)):
-        reason = f"held-out {held.left_out} are explained worse with {', '.join(names)} ({_share(held)}); withdrawn"
+    harmed = [c for c in held.channels if alone and c.harmed and c.high < 0.0]
+    if held.share <= 0.0 or harmed:
+        how = ", ".join(f"{c.channel} by {-100 * c.gain:.0f} %" for c in harmed) or _share(held)
+        reason = f"held-out {held.left_out} are explained worse with {', '.join(names)} ({how}); withdrawn"
         return _unconfirmed(_demoted(diagnosis, names, result.NOT_IDENTIFIABLE, "held-out flights are explained worse with it"),
                             held, names, reason)  # fmt: skip
     shown = not alone or not held.channels or any(c.low > 0.0 for c in held.channels)
