@@ -117,7 +117,7 @@ class FirstOrder:
         on_gpu = device.startswith("cuda")
         rate = torch.tensor(self.p.learning_rate, **make) if on_gpu else self.p.learning_rate
         self.optimizer = torch.optim.Adam(self.network.mlp.parameters(), lr=rate, betas=(0.9, 0.95), capturable=on_gpu)
-        self.rollout, self._update = (Replayed(work) if on_gpu else work for work in (self._fly, self._descend))
+        self.rollout, self._update = (Replayed(self._fly) if on_gpu else self._fly), self._descend
 
     def _begin(self) -> None:
         """Hover with the latch at rest, whatever is seen."""
