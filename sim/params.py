@@ -202,7 +202,8 @@ class VehicleParams:
         """Raise ValueError for a vehicle that the equations do not describe."""
         body, rotors, c, cell = self.body, self.rotors, self.controller, self.battery
         require_positive("vehicle.body", mass=body.mass, inertia=min(body.inertia))
-        require_positive("vehicle.thrust", k_f=self.thrust.k_f, torque_ratio=self.thrust.torque_ratio)
+        require_positive("vehicle.thrust", k_f=self.thrust.k_f)
+        require_not_negative("vehicle.thrust", torque_ratio=self.thrust.torque_ratio)
         require_positive("vehicle.motor", time_constant=self.motor.time_constant)
         if self.motor.kind == "asymmetric":
             require_positive("vehicle.motor", time_constant_down=self.motor.time_constant_down)

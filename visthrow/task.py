@@ -173,7 +173,7 @@ class FirstOrderParams:
 
     iterations: int = 1000  # gradients
     horizon: int = 48  # of a flight [control steps]; the latch trips near the 35th
-    decay: float = 0.92  # of derivatives, per step backward
+    decay: float = 0.97  # of derivatives, per step backward; with 0.92 500 gradients of 4,096 throws end at 0.059 m, with 0.97 at 0.041 m
     learning_rate: float = 2e-3  # at the first iteration
     adapting_rate: float = 3e-4  # in its place where the training starts from a policy
     final_rate: float = 5e-5  # at the last one; half a cosine between

@@ -192,7 +192,7 @@ def pack_vehicle(t: Types, vehicles: list[P.VehicleParams], kinds: tuple[str, st
         kinds: of the blocks that the kernel was built for.
 
     Raises:
-        ValueError: other kinds of blocks.
+        ValueError: other kinds of blocks, or rotors without torque, which no mixer can command yaw with.
     """
     rows = np.zeros(len(vehicles), dtype=_numpy_type(t.Vehicle))
     for row, vehicle in zip(rows, vehicles, strict=True):
@@ -200,6 +200,7 @@ def pack_vehicle(t: Types, vehicles: list[P.VehicleParams], kinds: tuple[str, st
             raise ValueError(
                 f"vehicle of the kinds {kinds_of(vehicle)} in a batch of {kinds}: expected the same blocks"
             )
+        P.require_positive("vehicle.thrust", torque_ratio=vehicle.thrust.torque_ratio)  # the mixer divides by it
         _fill(row, vehicle)
         _place_rotors(row, vehicle)
         columns = mixer_columns(vehicle.rotors, vehicle.thrust.torque_ratio)

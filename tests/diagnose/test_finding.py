@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.diagnose import finding
-from visthrow.diagnose import catalogue
+from visthrow.config.effects import catalogue
 
 SPOILT = {
     "always NO EFFECT": lambda kinds: finding.blind,
@@ -54,8 +54,9 @@ def test_what_is_hidden_is_found_in_more_worlds(seed):
 @pytest.mark.slow
 def test_effects_exchanged_in_the_catalogue_are_noticed(monkeypatch):
     """Worlds of another hand notice; worlds of the simulator's own equations would not."""
-    one, other = catalogue.ALL["com_x"], catalogue.ALL["com_y"]
-    monkeypatch.setitem(catalogue.ALL, "com_x", replace(one, keys=other.keys))
-    monkeypatch.setitem(catalogue.ALL, "com_y", replace(other, keys=one.keys))
+    known = catalogue()
+    one, other = known["com_x"], known["com_y"]
+    monkeypatch.setitem(known, "com_x", replace(one, changes=other.changes))
+    monkeypatch.setitem(known, "com_y", replace(other, changes=one.changes))
     with pytest.raises(AssertionError, match="seed"):
         finding.require(finding.explain, [finding.Kind(("com_x",), "rod")], 4)

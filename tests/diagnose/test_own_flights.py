@@ -7,8 +7,8 @@ from visthrow.diagnose.select import search
 from visthrow.diagnose.throw.throw_model import ThrowModel
 from visthrow.logs.flightlog import FlightLog
 from visthrow.task import plant_of
-from visthrow.throws.flight import MEASURED, fly
 from visthrow.throws.loading import load_policy
+from visthrow.throws.recorded import MEASURED, fly
 
 SEEDS = (1, 2, 3)
 LATE = (8e-3, 12e-3)

@@ -18,5 +18,6 @@ def test_a_wrong_unit_of_a_live_source_fails_the_check(monkeypatch, capsys):
     command = ["hil", "check", "--seconds", "1.9", *(word for setting in OURS for word in ("--set", setting))]
     assert main(command) == 1
     out = capsys.readouterr().out
-    assert "FAIL  vehicle: its positions span" in out
-    assert "are they millimetres given as 'm'" in out
+    assert "FAIL  pos_w: 300 m/s" in out
+    assert "FAIL  payload_pos_w: 300 m/s" in out
+    assert "millimetres taken for metres?" in out

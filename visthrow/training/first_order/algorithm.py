@@ -304,7 +304,7 @@ class FirstOrder:
             torch.cuda.synchronize()
         middle = time.perf_counter()
         self._update()
-        figures = {name: float(value) for name, value in self._figures.items()}
+        figures = {name: float(value.detach()) for name, value in self._figures.items()}
         times = {"rollout_s": middle - start, "learning_s": time.perf_counter() - middle}
         return figures | times | {"learning_rate": rate, "episodes": float(self.env.num_envs)}
 
