@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from tests.diagnose import sealed, test_cases
-from tests.unit import test_diagnose_report as reports
-from tests.unit import test_diagnose_search as searches
+from tests.unit.on_diagnose import test_report as reports
+from tests.unit.on_diagnose import test_search as searches
 from tests.worlds.world import Recipe
 from visthrow.diagnose.likelihood import designs, evidence, marginal, noise
 from visthrow.diagnose.likelihood.evidence import Priors

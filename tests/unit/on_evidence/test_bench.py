@@ -22,7 +22,7 @@ from visthrow.evidence.bench.sim import mujoco_warp as bench_mujoco_warp
 from visthrow.evidence.bench.sim.scenes import HARD_THROW
 from visthrow.task import Experiment, plant_of
 
-SCENES = Path(__file__).resolve().parents[1] / "data" / "scenes"
+SCENES = Path(__file__).resolve().parents[2] / "data" / "scenes"
 ROUND_OFF = 1e-12
 """Relative; the counted run and the compiled kernel do the same float64 arithmetic, but for contractions."""
 

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from tests.unit.test_diagnose_scatter import LEAST, NAMES, PRIORS
+from tests.unit.on_diagnose.test_scatter import LEAST, NAMES, PRIORS
 from visthrow.diagnose.likelihood.marginal import Statistics
 from visthrow.diagnose.select.scatter import varying
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests import logfiles
-from tests.unit.test_diagnose_check import faults, flight, log_of
+from tests.unit.on_diagnose.test_check import faults, flight, log_of
 from visthrow.diagnose.check.run import check, contradictions, copies
 from visthrow.diagnose.inputs import setup
 from visthrow.logs import read
@@ -14,7 +14,7 @@ from visthrow.logs.check import relations
 from visthrow.logs.check.rows import Known
 from visthrow.logs.flightlog import Channel, FlightLog
 
-REAL = Path(__file__).resolve().parents[1] / "data" / "real"
+REAL = Path(__file__).resolve().parents[2] / "data" / "real"
 FLIGHTS = {n: setup.read_logs([REAL / "payload_cf_single" / f"log{n}.csv.gz"], "cf_payload")[0] for n in (204, 205, 206)}
 """Flights along x, along y, and in place."""
 CRAZYFLIE = setup.known("cf_payload")

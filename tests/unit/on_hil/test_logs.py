@@ -12,7 +12,7 @@ from hil.params import HilParams
 from hil.recording.record import lines
 from hil.sources import LogBody, read_autopilot
 from tests import logfiles as files
-from tests.unit.test_diagnose_fuzz import damaged, dataflash, patience, ulog
+from tests.unit.on_logs.test_fuzz import damaged, dataflash, patience, ulog
 from visthrow import config
 from visthrow.cli import main
 from visthrow.common.errors import ConfigError

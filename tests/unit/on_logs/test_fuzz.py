@@ -23,7 +23,7 @@ from visthrow.logs import read
 from visthrow.logs.export import export
 from visthrow.logs.flightlog import Channel, FlightLog
 
-REAL = Path(__file__).resolve().parents[1] / "data" / "real"
+REAL = Path(__file__).resolve().parents[2] / "data" / "real"
 PATIENCE = 20.0
 """Seconds; the longest of these small files takes one on a busy machine."""
 DAMAGES = 12

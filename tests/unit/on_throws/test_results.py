@@ -14,7 +14,7 @@ import pytest
 from visthrow.common.errors import StorageError
 from visthrow.throws import results
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 
 
 def unit(number: int = 0) -> dict:

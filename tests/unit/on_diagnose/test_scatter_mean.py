@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
-from tests.unit.test_diagnose_scatter import LEAST, NAMES, PRIORS, flights
+from tests.unit.on_diagnose.test_scatter import LEAST, NAMES, PRIORS, flights
 from visthrow.diagnose.select import result, search
 from visthrow.diagnose.select.scatter import freed, varying
 

@@ -17,7 +17,7 @@ from visthrow import config
 from visthrow.cli import main
 from visthrow.common import toml_text
 
-DATA = Path(__file__).parents[1] / "data"
+DATA = Path(__file__).parents[2] / "data"
 FLIGHTS = {
     "crazyflie_log": "payload_cf_single/log201.csv.gz",
     "crazyflie_pair_log": "payload_cf_two_drones/coltrans_02_cf3.csv.gz",

@@ -18,7 +18,7 @@ from visthrow.diagnose.select.result import CANDIDATE, FOUND, IN_PART, KNOWN, NA
 from visthrow.diagnose.select.search import explain
 from visthrow.logs import read_all
 
-DATA = Path(__file__).resolve().parents[1] / "data"
+DATA = Path(__file__).resolve().parents[2] / "data"
 REAL = DATA / "real"
 FULL = Path(os.environ.get("VISTHROW_REAL_DATA", REAL))
 SETUPS = {

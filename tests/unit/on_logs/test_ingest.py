@@ -23,7 +23,7 @@ from visthrow.logs.mapping import ChannelMap, Split, TableMap, TimeColumn
 from visthrow.logs.readers.blackbox import codec as blackbox_codec
 from visthrow.logs.readers.blackbox import decoder as blackbox
 
-REAL = Path(__file__).resolve().parents[1] / "data" / "real"
+REAL = Path(__file__).resolve().parents[2] / "data" / "real"
 BBL = REAL / "betaflight_bbl" / "btfl_001_start.bbl"
 
 

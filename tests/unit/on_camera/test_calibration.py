@@ -16,7 +16,7 @@ from camera.imaging.render import render_board
 from camera.mount import rotation_from_vector
 from camera.params import FisheyeParams
 
-DATA = Path(__file__).parents[1] / "data" / "basalt_calib"
+DATA = Path(__file__).parents[2] / "data" / "basalt_calib"
 LENS = FisheyeParams(640, 480, 160.1, 150.2, 310.3, 245.4, 0.02, -0.01, 0.002, -0.0002, 200.0)
 FORMATS = {
     "opencv.yaml": (files.write_opencv, files.read_opencv),

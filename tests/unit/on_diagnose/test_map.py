@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from tests import logfiles
 from tests.plants import paper_plant
-from tests.unit.test_diagnose_check import flight, log_of
+from tests.unit.on_diagnose.test_check import flight, log_of
 from visthrow import cli
 from visthrow.common.errors import LogError
 from visthrow.diagnose.check.run import check, contradictions
@@ -22,7 +22,7 @@ from visthrow.logs import read, table_of
 from visthrow.logs.flightlog import Channel, FlightLog
 from visthrow.logs.joining import join, offset_of
 
-REAL = Path(__file__).resolve().parents[1] / "data" / "real"
+REAL = Path(__file__).resolve().parents[2] / "data" / "real"
 SETS = {
     "payload_cf_single/log204": "cf_payload", "payload_cf_two_drones/coltrans_02_cf3": "cf_payload_pair",
     "nanobench_cf21/B3_figure8_fast_rep1": "nanobench_cf21", "pendulum_single/single_pendulum_id": "pendulum_encoder",
