@@ -33,15 +33,6 @@ def weights(folder):
     return [w.numpy() for w in Policy.load(folder / "policy.npz").weights]
 
 
-@pytest.fixture(autouse=True)
-def one_thread():
-    """The same bits need the same number of threads."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
-
-
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     """A run of four iterations without interruption."""

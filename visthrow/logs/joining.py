@@ -74,13 +74,18 @@ def _turning(log: FlightLog) -> tuple[np.ndarray, np.ndarray] | None:
     return time, np.linalg.norm(rate, axis=1)
 
 
+def _velocity(log: FlightLog) -> tuple[np.ndarray, np.ndarray]:
+    """Times and velocities from measured positions."""
+    good = log["pos_w"].valid
+    return relations.derivative(log["pos_w"].time[good], log["pos_w"].values[good].astype(float))
+
+
 def _speed(log: FlightLog) -> tuple[np.ndarray, np.ndarray] | None:
     if "vel_w" in log:
         return _size(log["vel_w"])
     if "pos_w" not in log:
         return None
-    good = log["pos_w"].valid
-    time, vel = relations.derivative(log["pos_w"].time[good], log["pos_w"].values[good].astype(float))
+    time, vel = _velocity(log)
     return time, np.linalg.norm(vel, axis=1)
 
 
@@ -89,9 +94,7 @@ def _force(log: FlightLog) -> tuple[np.ndarray, np.ndarray] | None:
         return _size(log["acc_b"])
     if "pos_w" not in log:
         return None
-    good = log["pos_w"].valid
-    time, vel = relations.derivative(log["pos_w"].time[good], log["pos_w"].values[good].astype(float))
-    time, acc = relations.derivative(time, vel)
+    time, acc = relations.derivative(*_velocity(log))
     return time, np.linalg.norm(acc + [0.0, 0.0, GRAVITY], axis=1)
 
 

@@ -211,15 +211,6 @@ def test_intervals_of_the_gain_hold_what_they_promise_and_stay_finite(flights):
     assert widest < 5.0
 
 
-def test_bootstrapped_sizes_agree_with_their_posterior(found):
-    _, diagnosis = found
-    work = diagnosis.work
-    draws = gain.bootstrap_sizes(work.after.statistics, work.problem.priors, work.active, np.random.default_rng(0), 2000)
-    names = [EFFECTS[j].name for j in work.active]
-    for name, column in zip(names, draws.T):
-        assert abs(np.median(column) - TRUTH[name]) < 1.0
-
-
 @pytest.fixture(scope="module")
 def hidden(found):
     return blind.hide(found[1], draws=60)

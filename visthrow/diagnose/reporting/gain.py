@@ -13,7 +13,7 @@ from visthrow.diagnose.likelihood import designs
 from visthrow.diagnose.likelihood import noise as levels
 from visthrow.diagnose.likelihood.evidence import Priors
 from visthrow.diagnose.likelihood.forms import forms
-from visthrow.diagnose.likelihood.marginal import Statistics, gram_of, window_statistics
+from visthrow.diagnose.likelihood.marginal import gram_of, window_statistics
 from visthrow.diagnose.models.interface import Model
 from visthrow.diagnose.reporting.blackbox import table_of, train
 from visthrow.diagnose.reporting.landing_gain import LandingGain, landing_gain
@@ -100,12 +100,3 @@ def _nats(before: Point, after: Point, cross: Crossed) -> float:
     quadratic = np.einsum("fi,fij,fj->f", change, own.information, change)
     square = own.square - 2.0 * np.einsum("fi,fi->f", change, own.score) + quadratic
     return float(0.5 * (plain.square.sum() - square.sum()) / own.samples.sum())
-
-
-def bootstrap_sizes(statistics: Statistics, priors: Priors, active: Sequence[int], rng: np.random.Generator, draws: int = DRAWS):
-    """Sizes of the named effects in resampled flights, in floors, shape (draws, named)."""
-    at, n = list(active), len(statistics.flights)
-    weights = rng.multinomial(n, np.full(n, 1.0 / n), size=draws).astype(float)
-    own = statistics.information[:, at][:, :, at]
-    normal = np.einsum("df,fij->dij", weights, own) + np.diag(priors.slab[at] ** -2.0)
-    return np.linalg.solve(normal, (weights @ statistics.absolute[:, at])[:, :, None])[:, :, 0]

@@ -35,9 +35,9 @@ STEPS_AT_ONCE = 4
 
 
 class Replayed:
-    """Work on fixed tensors of a GPU: done eagerly at first, then captured in a CUDA graph and replayed.
+    """Work on fixed tensors of a GPU: done eagerly at first, then captured in a CUDA graph and replayed, on a stream of its own.
 
-    All of it happens on one stream of its own: autograd's thread makes its handles there before a capture forbids that.
+    For work without autograd: capturing that failed on an H200 (cudaErrorStreamCaptureUnsupported).
     """
 
     EAGER = 3
@@ -117,7 +117,7 @@ class FirstOrder:
         on_gpu = device.startswith("cuda")
         rate = torch.tensor(self.p.learning_rate, **make) if on_gpu else self.p.learning_rate
         self.optimizer = torch.optim.Adam(self.network.mlp.parameters(), lr=rate, betas=(0.9, 0.95), capturable=on_gpu)
-        self.rollout, self._update = (Replayed(self._fly) if on_gpu else self._fly), self._descend
+        self.rollout = Replayed(self._fly) if on_gpu else self._fly
 
     def _begin(self) -> None:
         """Hover with the latch at rest, whatever is seen."""
@@ -303,7 +303,7 @@ class FirstOrder:
         if self.env.device.startswith("cuda"):
             torch.cuda.synchronize()
         middle = time.perf_counter()
-        self._update()
+        self._descend()
         figures = {name: float(value.detach()) for name, value in self._figures.items()}
         times = {"rollout_s": middle - start, "learning_s": time.perf_counter() - middle}
         return figures | times | {"learning_rate": rate, "episodes": float(self.env.num_envs)}

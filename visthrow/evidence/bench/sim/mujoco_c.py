@@ -7,17 +7,14 @@ import dataclasses
 from collections.abc import Callable
 
 import mujoco
-import numpy as np
 
 from sim.reference.model import build_attached
-from sim.reference.oracle import converged, initial_data, rope_from_scene
+from sim.reference.oracle import initial_data, rope_from_scene
 from sim.reference.scene import Scene
 
 ARMATURE = 2e-7
 """Reflected inertia of the hinges that lets implicitfast stand 2 ms [kg m^2]."""
 IMPLICIT_STEP = 2e-3
-CANDIDATES = (1000, 800, 625, 500, 400, 250, 200, 125, 100, 50)
-"""Steps that a search tries, longest first [us]; all divide 0.5 s, and the schedules' switches where it matters."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,30 +48,12 @@ def _build(scene: Scene, name: str, step: float, integrator: int, armature: floa
     return BenchScene(name, step, advance)
 
 
-def largest_accurate_step(scene: Scene, tolerance: float = 1e-3) -> float:
-    """Return the longest RK4 step [s] of ``CANDIDATES`` that ends a scene within ``tolerance`` [m] of a converged run.
-
-    Raises:
-        ValueError: no candidate does.
-    """
-    truth = converged(scene)
-    for microseconds in CANDIDATES:
-        step = microseconds / 1e6
-        if any(abs(t - step * round(t / step)) > 1e-9 for t in (scene.duration, *(w.t_start for w in scene.schedule))):
-            continue
-        run = converged(scene, step)
-        errors = (run.ball_pos_w - truth.ball_pos_w)[-1], (run.pos_w - truth.pos_w)[-1]
-        if all(np.linalg.norm(error) <= tolerance for error in errors):
-            return step
-    raise ValueError(f"bench: no RK4 step of {CANDIDATES} us ends the scene within {tolerance} m")
-
-
 def rk4_scene(scene: Scene, step: float) -> BenchScene:
     """Return the physical rope with MuJoCo's RK4; the schedule's first wrench acts throughout.
 
     Args:
         scene: the rope and its start.
-        step: [s]; for a fair figure ``largest_accurate_step(scene)``.
+        step: [s]; for a fair figure the longest that is accurate, see :mod:`visthrow.evidence.bench.sim.cpu`.
     """
     return _build(scene, f"MuJoCo C, RK4, {step * 1e3:g} ms", step, mujoco.mjtIntegrator.mjINT_RK4, 0.0)
 
