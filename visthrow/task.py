@@ -124,6 +124,7 @@ class TaskParams:
     bounds: BoundsParams
     reward: RewardParams
     target: TargetParams = TargetParams()
+    critic: Literal["full", "paper"] = "full"  # what the critic sees beside the actor's quantities; see visthrow.training.env
 
 
 @dataclass(frozen=True)

@@ -35,9 +35,10 @@ POSE = ob.VEHICLE + 3
 class ThrowEnv(VecEnv):
     """Batch of throws. Observation groups: ``actor`` and ``critic``.
 
-    The critic sees the vehicle, goal offset, payload history and payload velocity without noise, and further the time to
-    separation, the time since start, the vehicle's mass and the battery's voltage; where the task has them, the goal's
-    velocity and the scales of payload mass and cable length too.
+    The critic sees the state layout's quantities (vehicle, previous action, goal offset, payload history, attached) and the
+    payload's velocity, all without noise or latency. That is the paper's critic (Sec. III-C and IV-C; 38 numbers). Unless
+    ``task.critic`` is "paper" it also sees the time to separation, the time since start, the vehicle's mass and the battery's
+    voltage (42 numbers); where the task has them, the goal's velocity and the scales of payload mass and cable length too.
 
     Attributes:
         last: what the last step ended: ``released``, ``negative`` (bool), ``landing_error`` [m], ``duration`` [s] from the
@@ -223,18 +224,17 @@ class ThrowEnv(VecEnv):
         )
         goal = self._goal_at_impact()
         error = (out["landing_w"] - goal)[:, :2].square().sum(-1).sqrt()
-        carry = (
+        attached = (
             rewards.kinetic(p, state["vel_w"], state["rate_b"], out["payload_vel_w"])
             + rewards.command(p, action, self._rate_weights)
             + rewards.change(p, action, self._memory["previous"], self._change_weights)
-            + rewards.carry_time(p, period)
         )
         at_release = (
             rewards.landing(p, error)
             + rewards.time_of_flight(p, out["time_to_impact"])
             + rewards.proximity(p, out["clearance"], self.cfg.release.clearance_margin)
         )
-        reward = carry + torch.where(released, at_release, 0.0) - p.termination * negative
+        reward = torch.where(released, at_release, attached) + rewards.carry_time(p, period) - p.termination * negative
         self.last = {
             "released": released,
             "negative": negative,
@@ -332,8 +332,11 @@ class ThrowEnv(VecEnv):
         goal_offset, relative = exact[:, ob.VEHICLE : ob.VEHICLE + 2], exact[:, ob.VEHICLE + 2 :]
         true_history = hist.push(memory["true_history"], relative, fresh)
         memory["true_history"].copy_(true_history)
-        inner = torch.stack([state["release_timer"], time, state["mass_scale"], state["voltage"], attached], dim=-1)
-        parts = [vehicle, memory["previous"], goal_offset, true_history.flatten(1), self.views.out["payload_vel_w"], inner]
+        inner = [attached]
+        if self.cfg.task.critic == "full":
+            inner = [state["release_timer"], time, state["mass_scale"], state["voltage"], attached]
+        known = torch.stack(inner, dim=-1)
+        parts = [vehicle, memory["previous"], goal_offset, true_history.flatten(1), self.views.out["payload_vel_w"], known]
         if self.cfg.task.target.moves:
             parts.append(memory["goal_vel"][:, :2])
         if self._cargo is not None:
