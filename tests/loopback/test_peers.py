@@ -14,10 +14,10 @@ from hil.links.roster import SILENT
 from hil.params import HilParams
 from hil.sources.mavlink import MavlinkSource
 from hil.sources.opening import open_source
+from tests.bench.processes import free_port
 from tests.hil_runs import record_run, saved_policy
 from visthrow import config
 from visthrow.cli import main
-from visthrow.evidence.bench.hil.processes import free_port
 
 ATTITUDE = "SET_ATTITUDE_TARGET"
 

@@ -11,7 +11,6 @@ ACTIONS = {
     "apply": ("write the configuration that a diagnosis asks for, ready to train in", "visthrow.diagnose.extend.apply_cli"),
     "fit": ("make the first configuration of your own vehicle or motor, from flights without payload", "visthrow.diagnose.inputs.fit_cli"),
     "plan": ("propose the manoeuvre that separates what could not be separated", "visthrow.diagnose.reporting.plan_cli"),
-    "loop": ("hide an effect in the reference plant, find it, train with it, fly again", "visthrow.diagnose.proof.loop_cli"),
     "blind": ("hide effects in your own noise: which sizes would be named", "visthrow.diagnose.reporting.blind_cli"),
 }
 """Name -> (help, module). The module has ``add_arguments(parser)`` and ``run(args) -> int``."""

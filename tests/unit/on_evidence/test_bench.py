@@ -11,10 +11,11 @@ import pytest
 
 from camera.params import CameraParams
 from sim.reference.scene import load_scene
+from tests.bench import detector, mpc
 from visthrow import cli, config
 from visthrow.common.errors import StorageError, VisthrowError
 from visthrow.evidence import bench
-from visthrow.evidence.bench import detector, records
+from visthrow.evidence.bench import records
 from visthrow.evidence.bench.sim import commands
 from visthrow.evidence.bench.sim import cpu as sim_cpu
 from visthrow.evidence.bench.sim import gpu as sim_gpu
@@ -205,7 +206,7 @@ def test_every_measurement_can_be_kept(kind):
 @pytest.mark.parametrize("words", ["--frames 0", "--jobs 0", "--out {}/sheet.jpg", "--out {}/file/sheet.png"])
 def test_a_detector_is_not_measured_for_nothing(words, tmp_path, capsys):
     (tmp_path / "file").touch()
-    assert cli.main(["bench", "detector", *words.format(tmp_path).split()]) == 2
+    assert detector.main(words.format(tmp_path).split()) == 2
     assert "expected" in capsys.readouterr().err
 
 
@@ -224,16 +225,15 @@ def test_the_detector_counts_the_same_in_one_process_and_in_two():
 def test_mpc_steps_are_timed_and_recorded(tmp_path, monkeypatch, capsys):
     pytest.importorskip("piqp")
     from visthrow.baseline import spline
-    from visthrow.evidence.bench import mpc
 
     monkeypatch.setattr(spline, "LONGEST", (1.4,))  # one start of the optimisation instead of five
     monkeypatch.setattr(mpc, "TARGETS", (1.5,))
     monkeypatch.setattr(records, "FOLDER", tmp_path)
-    assert cli.main(["bench", "mpc", "--throws", "1", "--record", "mpc-test"]) == 0
+    assert mpc.main(["--throws", "1", "--record", "mpc-test"]) == 0
     rows = records.load(tmp_path / "mpc-test.json")["figures"]["rows"]
     assert [row["plant"] for row in rows] == ["pendulum", "hybrid"]
     for row in rows:
         assert 0.0 < row["p50_ms"] <= row["p99_ms"] <= row["max_ms"]
         assert row["steps"] > 40
     assert "| 1.5 m" in capsys.readouterr().out
-    assert cli.main(["bench", "mpc", "--throws", "0"]) == 2
+    assert mpc.main(["--throws", "0"]) == 2

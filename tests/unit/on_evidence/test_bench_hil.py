@@ -1,4 +1,4 @@
-"""What ``visthrow bench hil`` makes of its measurements; and, slow, the measurements themselves over UDP."""
+"""What ``tests.bench.runner`` makes of its measurements; and, slow, the measurements themselves over UDP."""
 
 import argparse
 import json
@@ -12,14 +12,15 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from tests.bench import faults as hil_faults
+from tests.bench import figures as hil
+from tests.bench import processes as hil_processes
+from tests.bench import runner
+from tests.bench import soak as hil_soak
+from tests.bench import throws as hil_throws
+from tests.bench.processes import Pair
 from visthrow.cli import main
 from visthrow.common.errors import VisthrowError
-from visthrow.evidence.bench.hil import faults as hil_faults
-from visthrow.evidence.bench.hil import figures as hil
-from visthrow.evidence.bench.hil import processes as hil_processes
-from visthrow.evidence.bench.hil import soak as hil_soak
-from visthrow.evidence.bench.hil import throws as hil_throws
-from visthrow.evidence.bench.hil.processes import Pair
 from visthrow.onboard.policy import Policy, find_policy
 
 SOAK_MINUTES = 1.0
@@ -121,7 +122,7 @@ def test_throws_side_by_side_share_nothing(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("words", ["--throws 1", "--minutes 0", "--rate 0.1", "--throws 5 --speed 3", "--throws 5 --jobs 0"])
 def test_what_cannot_be_measured(words, tmp_path, capsys):
-    assert main(["bench", "hil", *words.split(), "--out", str(tmp_path)]) == 2
+    assert runner.main([*words.split(), "--out", str(tmp_path)]) == 2
     assert "expected" in capsys.readouterr().err
 
 
@@ -133,7 +134,7 @@ def test_a_run_that_does_not_start_says_why(tmp_path):
 def test_a_short_soak_over_udp(tmp_path, capsys):
     """Three seconds: all is counted, and the fake saw nothing that it should not. Times are for a quiet machine."""
     out, run = tmp_path / "soak.json", tmp_path / "run"
-    assert main(["bench", "hil", "--minutes", "0.05", "--json", str(out), "--keep", str(run), "--out", str(tmp_path)]) == 0
+    assert runner.main(["--minutes", "0.05", "--json", str(out), "--keep", str(run), "--out", str(tmp_path)]) == 0
     figures = json.loads(out.read_text())["figures"]
     assert figures["ticks"] > 50
     assert figures["breaches"] == []
@@ -147,8 +148,8 @@ def test_a_short_soak_over_udp(tmp_path, capsys):
 @pytest.mark.slow
 def test_an_interrupted_soak_tells_what_there_is(tmp_path):
     out = tmp_path / "soak.json"
-    words = ["bench", "hil", "--minutes", "0.3", "--json", str(out), "--out", str(tmp_path)]
-    bench = subprocess.Popen([sys.executable, "-m", "visthrow.cli", *words], stdout=subprocess.PIPE, text=True)
+    words = ["--minutes", "0.3", "--json", str(out), "--out", str(tmp_path)]
+    bench = subprocess.Popen([sys.executable, "-m", "tests.bench.runner", *words], stdout=subprocess.PIPE, text=True)
     end = time.monotonic() + 120.0
     while not (tmp_path / "soak.jsonl").is_file() and time.monotonic() < end:
         time.sleep(0.2)
@@ -201,7 +202,7 @@ ENDS = {
 def test_every_fault_over_udp(tmp_path):
     """The same outcomes between two processes as in lock step (tests/loopback); times are the machine's."""
     out = tmp_path / "faults.json"
-    assert main(["bench", "hil", "--faults", "--speed", "0.5", "--json", str(out)]) == 0
+    assert runner.main(["--faults", "--speed", "0.5", "--json", str(out)]) == 0
     figures = json.loads(out.read_text())["figures"]
     assert set(figures) == set(hil_faults.known_cases()) == FLOWN_THROUGH | set(ENDS)
     for name, found in figures.items():
@@ -222,7 +223,7 @@ def test_every_fault_over_udp(tmp_path):
 def test_every_way_to_end_a_run_over_udp(kind, tmp_path):
     """In hover and in throw: it lands, or does by itself what the table says; the summary is there."""
     out, names = tmp_path / "faults.json", (*TOLD, "ctrl-c-twice", "killed", "killed-in-hover")
-    assert main(["bench", "hil", "--faults", *names, "--kind", kind, "--speed", "0.5", "--json", str(out)]) == 0
+    assert runner.main(["--faults", *names, "--kind", kind, "--speed", "0.5", "--json", str(out)]) == 0
     figures = json.loads(out.read_text())["figures"]
     assert set(figures) == set(names) == {name for name, case in hil_faults.known_cases().items() if case.ends}
     for name, found in figures.items():
@@ -239,5 +240,5 @@ def test_every_way_to_end_a_run_over_udp(kind, tmp_path):
 
 @pytest.mark.parametrize("words", [["swop"], ["none", "--jobs", "0"], ["none", "--speed", "2"], ["none", "--kind", "px4"]])
 def test_faults_that_cannot_be_injected(words, capsys):
-    assert main(["bench", "hil", "--faults", *words]) == 2
+    assert runner.main(["--faults", *words]) == 2
     assert re.search("did you mean 'swap'|expected 1 or more, and|expected ctrl-c, ", capsys.readouterr().err)

@@ -13,8 +13,8 @@ from hil.links.device import check_device, open_port
 from hil.links.mavlink_link import Link, TlogWriter, attitude_target, pose_from_message, quaternion_from_euler
 from hil.links.pymav import Parser, mav
 from hil.links.roster import Roster
+from tests.bench.processes import free_port
 from tests.fuzz import EACH, SEEDS, any_message, mutated, noise
-from visthrow.evidence.bench.hil.processes import free_port
 
 FLOAT32 = 2e-7
 """What a quantity near 1 loses on the wire."""

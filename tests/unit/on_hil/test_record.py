@@ -10,10 +10,10 @@ from hil.backends import Status
 from hil.control.runner import Runner, Words
 from hil.errors import RunError
 from hil.recording.record import Recorder, lines, load_run
+from tests.bench.processes import free_port
 from tests.hil_flight import Spy, fly, params
 from visthrow.cli import main
 from visthrow.common.errors import StorageError
-from visthrow.evidence.bench.hil.processes import free_port
 from visthrow.onboard.policy import Policy, find_policy
 
 

@@ -77,12 +77,12 @@ def _row(found: Result) -> tuple[str, ...]:
 
 
 def _steps() -> list[Grid | Text]:
-    """Step times of the controller, from the records of ``visthrow bench mpc``."""
+    """Step times of the controller, from the records of ``python -m tests.bench.mpc``."""
     from visthrow.evidence.bench import records
 
     found = [records.load(path) for path in sorted(records.FOLDER.glob("mpc*.json"))]
     if not found:
-        return [Text("No step times of the controller: `visthrow bench mpc --record mpc-cpu`.", "missing")]
+        return [Text("No step times of the controller: `python -m tests.bench.mpc --record mpc-cpu`.", "missing")]
     grids = []
     for record in found:
         cpu, (table,) = record["provenance"]["processors"]["cpu"], record["tables"]

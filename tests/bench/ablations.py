@@ -2,9 +2,15 @@
 
 The shipped policy throws on the reference plant, which has everything; the same flights are diagnosed with four models, each
 without one block. What must be named is the block. Nothing is trained. Throws that no diagnosis saw say what the name is worth.
+
+    python -m tests.bench.ablations                 all four; minutes on two cores
+    python -m tests.bench.ablations no_motor_lag    one of them
+    python -m tests.bench.ablations --show          the committed record
 """
 
+import argparse
 import json
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,10 +19,11 @@ from typing import Any
 import numpy as np
 
 from sim.params import RandomizationParams
+from tests.bench import start
+from tests.bench.loop import PLANT, add_arguments, explained, named, recorded
 from visthrow import config
 from visthrow.common.errors import DiagnoseError
 from visthrow.common.storage import write_json
-from visthrow.diagnose.proof.loop import PLANT, explained, named, recorded
 from visthrow.logs.flightlog import FlightLog
 from visthrow.task import Experiment, plant_of
 from visthrow.throws.flight import Flight, Phase, Policies, hover
@@ -24,7 +31,7 @@ from visthrow.throws.loading import Loaded, load_policy
 from visthrow.throws.plants import make_plant
 from visthrow.throws.recorded import Recording
 from visthrow.throws.reference_protocol import place_in_hover
-from visthrow.throws.results import RECORDS
+from visthrow.training.device import resolve
 
 LACKS = {
     "no_aerodynamics": "aerodynamics", "no_motor_lag": "motor_lag", "simple_controller": "controller_kind",
@@ -32,7 +39,7 @@ LACKS = {
 }  # fmt: skip
 """Ablation, as in ``configs/train/state_NAME.toml`` -> the entry of the catalogue that gives the block back."""
 
-COMMITTED = RECORDS / "loops" / "ablations" / "record.json"
+COMMITTED = Path(__file__).parent / "loops" / "ablations" / "record.json"
 """Record of the last round that is told of."""
 
 SETTLED, AFTERWARDS = 2.4, 0.7
@@ -184,7 +191,7 @@ def read(path: Path | None = None) -> dict[str, Any]:
     """
     file = COMMITTED if path is None else path / "record.json" if path.is_dir() else path
     if not file.exists():
-        raise DiagnoseError(f"{file}: no such record; expected what `visthrow diagnose loop --ablations` left")
+        raise DiagnoseError(f"{file}: no such record; expected what `python -m tests.bench.ablations` left")
     return json.loads(file.read_text())
 
 
@@ -204,3 +211,27 @@ def table(record: Mapping[str, Any]) -> str:
         took = f"{r['seconds']:.0f}" if r["seconds"] else "-"
         lines.append(f"| {r['lacks']} ({r['model']}) | {found} | {r['overall']}, {right} | {worth} | {off} | {took} |")
     return "\n".join(lines)
+
+
+def run(args: argparse.Namespace) -> None:
+    """Name the blocks that models lack, or show what was named."""
+    if args.show is not None:
+        print("\n\n".join(table(read(place)) for place in args.show or (None,)))
+        return
+    one = Ablations(
+        Path(args.out) / "ablations", args.names or tuple(LACKS), args.policy, args.flights, args.held, resolve(args.diagnose_on)
+    )
+    print("\n" + table(one.run(lambda line: print(f"  {line}", flush=True))))
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command."""
+    parser = start.parser_of(__doc__, record=False)
+    add_arguments(parser)
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(LACKS)} (default: all)")
+    parser.add_argument("--held", type=int, default=Ablations.held, help="throws held back (default: 3)")
+    return start.main(parser, run, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -7,9 +7,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from tests.bench import ablations, loop
 from visthrow import config
 from visthrow.common.errors import DiagnoseError
-from visthrow.diagnose.proof import ablations, loop
 from visthrow.diagnose.throw import recorded
 from visthrow.logs.flightlog import Channel, FlightLog
 from visthrow.task import Experiment
@@ -89,8 +89,8 @@ def test_throws_are_kept_and_not_flown_twice(tmp_path, monkeypatch):
             fields = {"success": np.array([True, False]), "error": error, "duration": error}
             return [[SimpleNamespace(**fields)]]
 
-    monkeypatch.setattr("visthrow.diagnose.proof.loop.Throwing", Flown)
-    monkeypatch.setattr("visthrow.diagnose.proof.loop.load_policy", lambda *_, **__: None)
+    monkeypatch.setattr("tests.bench.loop.Throwing", Flown)
+    monkeypatch.setattr("tests.bench.loop.load_policy", lambda *_, **__: None)
     one = loop.Loop({}, tmp_path, throws=2)
     found = [one._throws("before", "state", lambda line: None) for _ in range(2)]
     assert flown == [((2.0,), 2, loop.PLANT, loop.BATCH)]

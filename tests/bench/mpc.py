@@ -1,10 +1,14 @@
-"""``visthrow bench mpc``: one real-time iteration of the baseline's controller, and how closely it follows its plan."""
+"""One real-time iteration of the baseline's controller, and how closely it follows its plan."""
 
 import argparse
+import sys
+from collections.abc import Sequence
 
 import numpy as np
 
+from tests.bench import start
 from visthrow import config
+from visthrow.common.arguments import add_common
 from visthrow.common.errors import VisthrowError
 from visthrow.evidence.bench import records
 from visthrow.evidence.bench.records import Report, Table
@@ -65,3 +69,17 @@ def measure(experiment, throws: int, core: int | None = None) -> Report:
     )
     table = Table("Step times", head, tuple(rows))
     return Report("mpc", "Step of the model-predictive controller", (table,), notes, {"rows": figures})
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command."""
+    parser = start.parser_of(__doc__)
+    parser.add_argument("--throws", type=int, default=10, metavar="N", help="a target and plant (default: 10)")
+    parser.add_argument("--core", type=int, metavar="N", help="CPU core to stay on (default: the last one)")
+    parser.add_argument("--config", default="state", metavar="NAME", help="of configs/train: whose plant it is (default: state)")
+    add_common(parser, device=False, json=False)
+    return start.main(parser, run, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

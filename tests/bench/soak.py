@@ -1,4 +1,4 @@
-"""The soak of ``visthrow bench hil``: a throw that lasts, as a run flies it."""
+"""The soak of ``tests.bench.runner``: a throw that lasts, as a run flies it."""
 
 import argparse
 import dataclasses
@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
+from tests.bench.processes import Memory, Pair
 from visthrow.common.errors import VisthrowError
-from visthrow.evidence.bench.hil.processes import Memory, Pair
 from visthrow.evidence.bench.records import Report, Table
 
 STILL = ("--plant", "hil.fakes.level:make")

@@ -1,11 +1,12 @@
-"""``visthrow bench detector``: recall, precision and pixel error of the keypoint detector on rendered frames, by nuisance."""
+"""Recall, precision and pixel error of the keypoint detector on rendered frames, by nuisance."""
 
 import argparse
 import functools
 import math
 import os
+import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -18,7 +19,9 @@ from camera.imaging.render import Clutter, render_scene
 from camera.keypoints import GOAL_KEYPOINTS, KeypointCamera, keypoints
 from camera.mount import rotation_from_vector
 from camera.params import CameraParams
+from tests.bench import start
 from visthrow import config
+from visthrow.common.arguments import add_common
 from visthrow.common.errors import VisthrowError
 from visthrow.common.workers import done
 from visthrow.evidence.bench.records import Report, Table, finish
@@ -308,3 +311,18 @@ def _require_place(path: Path) -> None:
 def _row(level: str, kind: str, f: dict[str, float]) -> tuple[str, ...]:
     errors = (f"{f[key]:.2f} px" for key in ("median_px", "rms_px", "p95_px"))
     return (*level.split("; "), kind, f"{f['visible']:.0f}", f"{f['recall']:.3f}", f"{f['precision']:.3f}", *errors)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command."""
+    parser = start.parser_of(__doc__)
+    parser.add_argument("--frames", type=int, default=100, metavar="N", help="scenes a level (default: 100)")
+    parser.add_argument("--seed", type=int, default=0, help="of the scenes")
+    parser.add_argument("--jobs", type=int, metavar="N", help="processes at once (default: one a core)")
+    parser.add_argument("--out", metavar="FILE", help="write a contact sheet of the first scenes there, .png")
+    add_common(parser, device=False, json=False)
+    return start.main(parser, run, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -17,11 +17,11 @@ from typing import Any
 
 import torch
 
+from tests.bench.figures import json_lines
+from tests.bench.processes import CONFIGS, ENDED, Pair, own_cores
+from tests.bench.soak import STILL, never_releasing
 from visthrow.common.errors import VisthrowError, suggest
 from visthrow.common.workers import side_by_side
-from visthrow.evidence.bench.hil.figures import json_lines
-from visthrow.evidence.bench.hil.processes import CONFIGS, ENDED, Pair, own_cores
-from visthrow.evidence.bench.hil.soak import STILL, never_releasing
 from visthrow.evidence.bench.records import Report, Table
 from visthrow.onboard.actions import hover_action
 from visthrow.onboard.hover import GRAVITY

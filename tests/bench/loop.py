@@ -4,8 +4,14 @@ Every stage leaves a file in the folder of its effect and is skipped where the f
 goes on; stages that do not need each other run side by side. Three policies meet on the same throws of the plant: the one
 that knew nothing, the one that was trained anew in the model extended by the diagnosis, and the oracle, trained in a model
 that has the hidden effect itself.
+
+    python -m tests.bench.loop --hide motor_tau=0.02     a slower motor; minutes on a GPU, hours on a CPU
+    python -m tests.bench.loop --base state_no_motor_lag --policy runs/state_no_motor_lag-1/policy.npz --hide motor_lag=1
+    python -m tests.bench.loop --show                    the committed loops
+    python -m tests.bench.loop --show runs/loop/* --picture loops.png
 """
 
+import argparse
 import concurrent.futures
 import dataclasses
 import json
@@ -21,9 +27,10 @@ from typing import Any
 
 import numpy as np
 
+from tests.bench import start
 from visthrow import config
 from visthrow.common import mocap, statistics, toml_text, workers
-from visthrow.common.errors import DiagnoseError
+from visthrow.common.errors import ConfigError, DiagnoseError
 from visthrow.common.storage import atomic_write, write_json
 from visthrow.diagnose.extend.patch import extended
 from visthrow.logs.flightlog import Channel, FlightLog
@@ -31,7 +38,8 @@ from visthrow.task import Experiment
 from visthrow.throws.loading import Loaded, load_policy
 from visthrow.throws.recorded import fly
 from visthrow.throws.reference_protocol import Throwing
-from visthrow.throws.results import DIGITS, RECORDS
+from visthrow.throws.results import DIGITS
+from visthrow.training.device import cores, resolve
 
 PLANT = "reference"
 """The reference plant without extras: what the diagnosis finds is what was hidden, or a mistake."""
@@ -48,7 +56,7 @@ BATCH = 20
 THROW_SEED = 20_000
 """Of the throws that judge; the flights that are diagnosed have the seeds from 0."""
 
-COMMITTED = RECORDS / "loops"
+COMMITTED = Path(__file__).parent / "loops"
 """Records of the loops that are told of."""
 
 WHO = ("before", "after", "oracle")
@@ -324,3 +332,56 @@ def picture(records: Sequence[Mapping[str, Any]]) -> bytes:
         if len(landed(r["throws"][name]))
     ]
     return marks(rows, "landing error on the plant [mm]", WHO, log=True)
+
+
+def run(args: argparse.Namespace) -> None:
+    """Go round for the effects, all hidden at once, or show what was run."""
+    if args.show is not None:
+        records = read(args.show)
+        print(table(records))
+        if args.picture:
+            atomic_write(args.picture, picture(records))
+        return
+    hidden = {}
+    for item in args.hide:
+        name, _, size = item.partition("=")
+        try:
+            hidden[name] = float(size)
+        except ValueError:
+            raise ConfigError(f"--hide {item}; expected EFFECT=SIZE, such as motor_tau=0.02") from None
+    if not hidden:
+        raise ConfigError("nothing to hide; name an effect, such as --hide motor_tau=0.02, or say --show")
+    parts = [f"{n}_{v:g}" for n, v in hidden.items()]
+    folder = Path(args.out) / "-".join(parts if args.base == Loop.base else [args.base, *parts])
+    record = Loop(
+        hidden, folder, args.base, args.policy, flights=args.flights, throws=args.throws, device=resolve(args.device),
+        diagnose_on=resolve(args.diagnose_on), processes=args.processes or cores(), changes=tuple(args.changes),
+    ).run(lambda line: print(f"  {line}", flush=True))  # fmt: skip
+    print("\n" + table([record]))
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add what loops and ablations share."""
+    parser.add_argument("--policy", default=Loop.policy, metavar="NAME", help="shipped, or a file (default: state)")
+    parser.add_argument("--show", type=Path, nargs="*", metavar="FOLDER", help="run nothing, show these (default: those committed)")
+    parser.add_argument("--flights", type=int, default=Loop.flights, help="that are diagnosed (default: 12)")
+    parser.add_argument("--diagnose-on", default="cpu", metavar="NAME", help="device of the diagnosis (default: cpu)")
+    parser.add_argument("--out", default="runs/loop", metavar="FOLDER", help="(default: runs/loop)")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command."""
+    parser = start.parser_of(__doc__, record=False)
+    add_arguments(parser)
+    parser.add_argument("--hide", action="append", default=[], metavar="EFFECT=SIZE", help="of the catalogue; may be repeated")
+    parser.add_argument("--base", default=Loop.base, metavar="NAME", help="of configs/train: what is diagnosed (default: state)")
+    parser.add_argument("--picture", type=Path, metavar="FILE", help="with --show: draw them, a PNG")
+    parser.add_argument("--throws", type=int, default=Loop.throws, help="of each policy in the end (default: 200)")
+    parser.add_argument("--processes", type=int, help="for flights and throws (default: one a core)")
+    parser.add_argument("--device", default="auto", metavar="NAME", help="of the trainings")
+    parser.add_argument("--set", action="append", default=[], dest="changes", metavar="KEY=VALUE", help="in the trainings")
+    return start.main(parser, run, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

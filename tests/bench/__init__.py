@@ -1,0 +1,1 @@
+"""Measurements that stand behind records of this repository: ``python -m tests.bench.NAME --help``."""

@@ -1,1 +1,0 @@
-"""Measurements of the HIL runner against the fakes, over loopback between processes."""
