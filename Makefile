@@ -10,7 +10,7 @@ PYTHON ?= $(firstword $(foreach name,python3 python3.13 python3.12 python3.11,$(
 # Test files at once, each with one thread; a file's tests stay in one process, which shares what it compiled and flew.
 JOBS ?= 2
 
-.PHONY: demo test test-all test-sitl lint format clean install
+.PHONY: demo docs test test-all test-sitl lint format clean install
 .DELETE_ON_ERROR:
 
 demo: $(STAMP)
@@ -27,6 +27,10 @@ test-sitl: $(STAMP)
 	$(BIN)/python -m pip install --quiet "pip>=25.1"
 	$(BIN)/python -m pip install --quiet -c constraints.txt --group sitl
 	OMP_NUM_THREADS=1 $(BIN)/python tests/sitl/alone.py $(BIN)/python -m pytest -m sitl -rA tests/sitl/test_betaflight.py
+
+# The documentation, to be read from its folder, offline: out/site/index.html. A broken link or name fails.
+docs: $(STAMP)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --strict
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

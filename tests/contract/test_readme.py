@@ -9,7 +9,7 @@ import pytest
 from visthrow import cli
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGES = [ROOT / name for name in ("README.md", "hil/README.md", "hil/backends/betaflight.md", "visthrow/diagnose/README.md")]
+PAGES = [ROOT / name for name in ("README.md", "docs/pilots/runner.md", "docs/pilots/betaflight.md", "docs/explanation/diagnosis.md")]
 TEXT = "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
 BLOCKS = re.findall(r"```(\w*)\n(.*?)```", TEXT, re.DOTALL)
 LINES = [line.split("#")[0].strip() for _, block in BLOCKS for line in block.splitlines() if line.startswith("visthrow ")]

@@ -1,4 +1,4 @@
-"""Recorded data of others: what is said of each, and what is not. The reasons stand in visthrow/diagnose/real_data.md.
+"""Recorded data of others: what is said of each, and what is not. The reasons stand in docs/explanation/real_data.md.
 
 With the environment variable VISTHROW_REAL_DATA naming a folder of the full data sets, all of their files are looked at.
 """
