@@ -189,7 +189,8 @@ def keypoints(
         Keypoints [-], shape (E, 8, 2), normalised image coordinates (x right, y down, 1 at the edge of the field of
         view), goal corners first (order of `goal_square`), then the payload's box (left, top, right, bottom); and
         validity (bool), shape (E, 8). With ``invalid_reads = "edge"`` an invalid corner reads its direction at the edge
-        and an invalid side of the box is that of the outline clipped to the edge; with ``"zero"`` both read zero.
+        and an invalid side of the box is that of the outline clipped to the edge. With ``"zero"`` both read zero, and the
+        middle of a side is valid where that side and the two across it, which give its other coordinate, are seen.
     """
     rot_cb, position_b = (camera.rot_cb, camera.position_b) if extrinsics is None else extrinsics
     corners_w = goal_corners_w(goal_w, square_w=camera.square_w)
@@ -197,6 +198,24 @@ def keypoints(
     rays_c = ball_extremes_c(camera.fisheye, points_c[:, 4], camera.params.payload_radius, camera._identity)
     seen, valid = camera.fisheye.project_normalized(torch.cat([points_c[:, :4], rays_c], -2), clip=True)
     points = torch.cat([seen[:, :4], box_midpoints(seen[:, 4:])], -2)
-    if not camera.edge_reads:
-        points = points * valid.unsqueeze(-1)
-    return points, valid
+    return by_rule(camera, points, valid)
+
+
+def by_rule(camera: KeypointCamera, points: torch.Tensor, valid: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Apply ``invalid_reads`` to points that are clipped to the edge.
+
+    Args:
+        camera: The camera.
+        points: Normalised keypoints [-], shape (E, 8, 2): corners, then the box.
+        valid: Whether corner or side is in the field of view, shape (E, 8).
+
+    Returns:
+        Keypoints and validity as `keypoints` gives them.
+    """
+    if camera.edge_reads:
+        return points, valid
+    box = valid[:, GOAL_KEYPOINTS:]
+    flanks, ends = box[:, 0::2].all(1, keepdim=True), box[:, 1::2].all(1, keepdim=True)
+    whole = box & torch.cat([ends, flanks, ends, flanks], 1)
+    valid = torch.cat([valid[:, :GOAL_KEYPOINTS], whole], 1)
+    return torch.where(valid.unsqueeze(-1), points, torch.zeros_like(points)), valid

@@ -107,11 +107,11 @@ class MountParams:
 class KeypointNoiseParams:
     """Imperfections of the keypoints, in normalised image coordinates (1 at the edge of the field of view).
 
-    ``invalid_reads``: ``edge``: a point outside the field of view reads as its direction at the edge, radius 1: it
-    moves smoothly there and away again, says on which side to look, and cannot be taken for a point in the middle of
-    the image even by an actor without validity bits. Whoever knows poses (training, HIL) can compute it; behind a
-    detector it takes a tracker. ``zero``: it reads as the principal point. A dropped-out point reads zero in both:
-    nothing was measured.
+    ``invalid_reads``, the rule for what is out of view: ``zero``: it reads as the principal point with validity 0 and
+    tells nothing but that it is not seen, as behind a camera. A point that is computed from the ball's box counts as
+    seen where all of the box that it is computed from is. ``edge``: it reads as its exact, noise-free direction at the
+    edge, radius 1, which only poses can tell: for ablations, and the default for policies from before the rule was
+    recorded. A dropped-out point reads zero in both: nothing was measured.
     """
 
     step_std: float = 0.01  # Gaussian per step, keypoint and axis [-]

@@ -21,7 +21,7 @@ from sim.params import (
     require_not_negative,
     require_positive,
 )
-from visthrow.common.errors import ConfigError
+from visthrow.common.errors import ConfigError, suggest
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,12 @@ class TaskParams:
     bounds: BoundsParams
     reward: RewardParams
     target: TargetParams = TargetParams()
-    critic: Literal["full", "paper"] = "full"  # what the critic sees beside the actor's quantities; see visthrow.training.env
+
+
+PRIVILEGED = (
+    "exact", "payload_velocity", "release_timer", "time", "mass", "voltage", "goal_velocity", "cargo", "mount", "pose_age",
+)  # fmt: skip
+"""What a critic may be told beyond the actor's observation; see :class:`visthrow.training.env.ThrowEnv`."""
 
 
 @dataclass(frozen=True)
@@ -153,6 +158,7 @@ class PPOParams:
     products: Literal["float32", "bfloat16"] = "float32"  # of the hidden layers; weights are float32 either way
     critic: tuple[int, ...] = ()  # hidden layers of the critic; empty for the actor's
     critic_first: int = 0  # iterations at the beginning in which the critic alone learns
+    privileged: tuple[str, ...] = PRIVILEGED[:8]  # inputs of the critic alone, of PRIVILEGED; what a task lacks is left out
 
     def __post_init__(self) -> None:
         counts = {name: getattr(self, name) for name in ("environments", "steps", "iterations", "epochs", "minibatches")}
@@ -163,6 +169,9 @@ class PPOParams:
             "ppo", initial_std=self.initial_std, learning_rate=self.learning_rate, clip=self.clip, max_grad_norm=self.max_grad_norm
         )
         require_not_negative("ppo", critic_first=self.critic_first, entropy=self.entropy, value_coefficient=self.value_coefficient)
+        for name in self.privileged:
+            if name not in PRIVILEGED or self.privileged.count(name) > 1:
+                raise ConfigError(f"ppo.privileged has {name!r}; {suggest(name, PRIVILEGED)}, each once")
         for name in ("discount", "gae_lambda"):
             if not 0.0 < getattr(self, name) <= 1.0:
                 raise ConfigError(f"ppo.{name} is {getattr(self, name)}; expected a number above 0 and up to 1")

@@ -26,7 +26,7 @@ from camera.detectors.edges import (
     rays_of,
 )
 from camera.fisheye import Fisheye
-from camera.keypoints import GOAL_KEYPOINTS, PAYLOAD_KEYPOINTS, KeypointCamera, payload_keypoints
+from camera.keypoints import GOAL_KEYPOINTS, PAYLOAD_KEYPOINTS, KeypointCamera, by_rule, payload_keypoints
 
 DISTANCE_ERROR = 0.15
 """Of a ball's distance by the size of its cone, a far and blurred one [-]."""
@@ -237,4 +237,5 @@ def detected_keypoints(
         ball_c = turn @ seen.ball.ray_c * (camera.params.payload_radius / math.sin(seen.ball.half_angle))
         box, ok = payload_keypoints(camera, torch.from_numpy(ball_c[None]).float())
         points[GOAL_KEYPOINTS:], valid[GOAL_KEYPOINTS:] = box[0], ok[0]
-    return points, valid
+    points, valid = by_rule(camera, points[None], valid[None])
+    return points[0], valid[0]

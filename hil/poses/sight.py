@@ -1,7 +1,7 @@
 """What a camera saw, as the policy is to be shown it: rays of one frame, and what they read while nothing is seen.
 
-A detector's misses are not training's: there a point outside of the field of view reads its direction at the edge. So what was last
-seen near the edge is taken to have left over it, and anything else to be where it was for a while, then to read as dropped out.
+What is not seen reads where it was for a while, then as dropped out. To a policy that was trained with the exact direction at the edge
+in place of what is out of view, what was last seen near the edge reads as its direction there.
 """
 
 from dataclasses import dataclass
@@ -75,7 +75,7 @@ class Sights:
         for name, part in (("goal", slice(0, GOAL_KEYPOINTS)), ("ball", slice(GOAL_KEYPOINTS, None))):
             if now - self._times[name] > self._hold:
                 radius = points[part].norm(dim=-1, keepdim=True)
-                left = bool((radius > NEAR_EDGE).any())
+                left = self._camera.edge_reads and bool((radius > NEAR_EDGE).any())
                 points[part] = points[part] / radius.clamp(min=1e-6) if left else torch.zeros_like(points[part])
                 valid[part] = False
         return points[None].numpy(), valid[None].numpy()

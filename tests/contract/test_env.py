@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from visthrow import config
+from visthrow.common.errors import ConfigError
 from visthrow.onboard import actions, observations
 from visthrow.task import Experiment
 from visthrow.training import rewards, terminations
@@ -90,6 +91,20 @@ def test_the_papers_recipe_and_nothing_else(name):
     rest = -2.0 * PERIOD - reward
     assert ((rest > 0.0) & (rest < 1.0)).all(), "a second costs 2 as in Table II; what is left are speeds and commands"
     assert paper.ppo.environments * paper.ppo.steps * paper.ppo.iterations == pytest.approx(2e8, rel=1e-3)
+
+
+def test_the_critic_sees_what_is_named():
+    """In the order of the documentation; without ``exact`` it begins with what the actor sees."""
+    e = experiment()
+    named = {"payload_velocity": 3, "release_timer": 1, "time": 1, "mass": 1, "voltage": 1, "mount": 6, "pose_age": 1}
+    for chosen in [(), ("exact",), ("mass",), ("exact", "mount"), tuple(named), ("exact", *named)]:
+        own = dataclasses.replace(e, ppo=dataclasses.replace(e.ppo, privileged=chosen))
+        seen = ThrowEnv(own, count=4).get_observations()
+        known = sum(named.get(name, 0) for name in chosen)
+        assert seen["critic"].shape == (4, 35 + known)  # exact: the same parts without their noise
+        assert torch.equal(seen["critic"][:, :35], seen["actor"]) == ("exact" not in chosen)
+    with pytest.raises(ConfigError, match=r"ppo\.privileged has 'velocity'; .*payload_velocity"):
+        dataclasses.replace(e.ppo, privileged=("velocity",))
 
 
 def test_release_ends_an_episode_after_the_lag_and_is_paid_by_hand():

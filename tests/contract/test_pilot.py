@@ -11,8 +11,9 @@ from camera.keypoints import KeypointCamera
 from visthrow import config
 from visthrow.common.errors import MismatchError, PolicyError
 from visthrow.onboard.pilot import Pilot, camera_conditions
-from visthrow.onboard.policy import Policy
+from visthrow.onboard.policy import Policy, find_policy
 from visthrow.task import Experiment, contract_of
+from visthrow.throws.loading import load_policy
 from visthrow.training.env import ThrowEnv
 
 STEPS = 200
@@ -108,6 +109,15 @@ def test_a_call_fits_many_times_into_a_control_period():
 def test_camera_conditions_are_those_of_the_contract():
     experiment = quiet("vision")
     assert camera_conditions(experiment.camera) == contract_of(experiment)["camera"]
+
+
+def test_a_policy_keeps_its_own_rule_for_what_is_out_of_view():
+    camera = config.load(Experiment, config.find("train", "vision")).camera
+    assert camera.noise.invalid_reads == "zero"
+    assert Pilot(Policy.load(find_policy("vision")), camera).camera.edge_reads
+    assert load_policy("vision", "vision").experiment.camera.noise.invalid_reads == "edge"
+    with pytest.raises(MismatchError, match="invalid_reads: trained with 'edge', here 'zero'"):
+        load_policy("vision", None, ["camera.noise.invalid_reads=zero"])
 
 
 def test_another_camera_is_refused():

@@ -5,7 +5,7 @@ a batch of one on board; only the noise is missing.
 """
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -56,6 +56,12 @@ def camera_conditions(params: CameraParams) -> dict[str, Any]:
     }
 
 
+def by_own_rule(policy: Policy, params: CameraParams) -> CameraParams:
+    """Return a camera with the policy's own rule for what is out of view: it is the program's, not the camera's."""
+    rule = policy.contract.get("camera", {}).get("invalid_reads", params.noise.invalid_reads)
+    return replace(params, noise=replace(params.noise, invalid_reads=rule))
+
+
 class Pilot:
     """Flies E vehicles with one policy; remembers the previous action and the payload's history.
 
@@ -101,6 +107,7 @@ class Pilot:
         if self.layout.name == "vision":
             if camera_params is None:
                 raise PolicyError("a vision policy needs a camera; got none")
+            camera_params = by_own_rule(policy, camera_params)
             policy.require({"camera": camera_conditions(camera_params)}, sections={"camera"})
         self.policy, self.count = policy, count
         self.camera = None if camera_params is None else KeypointCamera(camera_params)

@@ -45,7 +45,9 @@ def load_policy(
     path = find_policy(name)
     policy = Policy.load(path)
     if config_name is not None:
-        experiment = config.load(Experiment, config.find("train", config_name), overrides)
+        rule = policy.contract.get("camera", {}).get("invalid_reads")
+        own = [] if rule is None else [f"camera.noise.invalid_reads={rule}"]  # of the program, not of the camera
+        experiment = config.load(Experiment, config.find("train", config_name), [*own, *overrides])
     elif isinstance(policy.made_by.get("config"), dict):
         text = toml_text.dumps({**policy.made_by["config"], "ppo": _learning(policy)})
         experiment = config.loads(Experiment, text, overrides, name=f"{path} (the config it was trained with)")

@@ -35,10 +35,11 @@ POSE = ob.VEHICLE + 3
 class ThrowEnv(VecEnv):
     """Batch of throws. Observation groups: ``actor`` and ``critic``.
 
-    The critic sees the state layout's quantities (vehicle, previous action, goal offset, payload history, attached) and the
-    payload's velocity, all without noise or latency. That is the paper's critic (Sec. III-C and IV-C; 38 numbers). Unless
-    ``task.critic`` is "paper" it also sees the time to separation, the time since start, the vehicle's mass and the battery's
-    voltage (42 numbers); where the task has them, the goal's velocity and the scales of payload mass and cable length too.
+    The critic sees what ``ppo.privileged`` names. ``exact``: vehicle, goal offset and payload history without noise, else
+    the actor's observation. ``payload_velocity`` [m/s]. ``release_timer``: to separation [s]. ``time``: since the start [s].
+    ``mass``: the vehicle's scale. ``voltage``: of the battery [V]. ``goal_velocity`` [m/s] and ``cargo``, the scales of payload
+    mass and cable length, where the task has them. ``mount``: the camera's rotation [rad] and offset [m] from its nominal
+    pose. ``pose_age``: of what is measured [s]. The paper's critic (Sec. III-C and IV-C; 38 numbers) is told the first two.
 
     Attributes:
         last: what the last step ended: ``released``, ``negative`` (bool), ``landing_error`` [m], ``duration`` [s] from the
@@ -329,20 +330,37 @@ class ThrowEnv(VecEnv):
             self.layout, measured, valid, memory["previous"], attached, memory["history"], fresh, goal_vel
         )
         memory["history"].copy_(history)
-        goal_offset, relative = exact[:, ob.VEHICLE : ob.VEHICLE + 2], exact[:, ob.VEHICLE + 2 :]
-        true_history = hist.push(memory["true_history"], relative, fresh)
-        memory["true_history"].copy_(true_history)
-        inner = [attached]
-        if self.cfg.task.critic == "full":
-            inner = [state["release_timer"], time, state["mass_scale"], state["voltage"], attached]
-        known = torch.stack(inner, dim=-1)
-        parts = [vehicle, memory["previous"], goal_offset, true_history.flatten(1), self.views.out["payload_vel_w"], known]
-        if self.cfg.task.target.moves:
-            parts.append(memory["goal_vel"][:, :2])
-        if self._cargo is not None:
-            parts.append(self._cargo)
-        observed = {"actor": actor, "critic": torch.cat(parts, dim=-1)}
+        observed = {"actor": actor, "critic": self._privileged(actor, exact, time, fresh)}
         return TensorDict(observed, batch_size=[self.num_envs], device=self.device)
+
+    def _privileged(self, actor: Tensor, exact: Tensor, time: Tensor, fresh: Tensor) -> Tensor:
+        """Critic's view: what ``ppo.privileged`` names."""
+        state, memory, named = self.views.state, self._memory, self.cfg.ppo.privileged
+        parts = [actor]
+        if "exact" in named:
+            vehicle, goal_offset, relative = exact.split([ob.VEHICLE, 2, 3], dim=-1)
+            true_history = hist.push(memory["true_history"], relative, fresh)
+            memory["true_history"].copy_(true_history)
+            parts = [vehicle, memory["previous"], goal_offset, true_history.flatten(1)]
+        known = {
+            "payload_velocity": self.views.out["payload_vel_w"],
+            "release_timer": state["release_timer"][:, None],
+            "time": time[:, None],
+            "mass": state["mass_scale"][:, None],
+            "voltage": state["voltage"][:, None],
+        }
+        parts += [value for name, value in known.items() if name in named]
+        if "exact" in named:
+            parts.append(state["attached"].to(torch.float32)[:, None])
+        if self.cfg.task.target.moves and "goal_velocity" in named:
+            parts.append(memory["goal_vel"][:, :2])
+        if self._cargo is not None and "cargo" in named:
+            parts.append(self._cargo)
+        if "mount" in named:
+            parts += [memory["extrinsic_rotation"], memory["extrinsic_offset"]]
+        if "pose_age" in named:
+            parts.append(memory["pose_age"][:, None])
+        return torch.cat(parts, dim=-1)
 
     def _late_goal(self) -> Tensor:
         """Goal [m], shape (E, 3), where it was when what is measured now was measured."""

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from camera.fisheye import Fisheye
-from camera.keypoints import KeypointCamera, ball_extremes_c, goal_corners_w, keypoints, payload_keypoints
+from camera.keypoints import KeypointCamera, ball_extremes_c, by_rule, goal_corners_w, keypoints, payload_keypoints
 from camera.mount import nominal_rot_cb, points_c_from_w, rotation_from_vector
 from camera.params import CameraParams, FisheyeParams, KeypointNoiseParams, MountParams
 
@@ -190,6 +190,30 @@ def test_what_invalid_points_read(reads):
     assert len(corners) > 50
     assert torch.allclose(corners.norm(dim=-1), torch.full((len(corners),), expected, dtype=torch.float64))
     assert points.abs().max() <= 1.0 + 1e-12
+
+
+def test_out_of_view_tells_nothing_but_that():
+    """Wherever a hidden thing is, all that reaches the policy is the same; of a ball cut by the edge no hidden side leaks."""
+    honest = replace(PARAMS, noise=KeypointNoiseParams(invalid_reads="zero"))
+    camera = KeypointCamera(honest, dtype=torch.float64)
+    pos_w, rot_wb = hover(1.0, 3)
+    goal_w = torch.zeros(3, 2, dtype=torch.float64)
+    above_w = torch.tensor([[0.0, 0.0, 2.0], [0.5, 0.3, 2.2], [-0.4, 0.0, 1.8]], dtype=torch.float64)
+    points, valid = keypoints(camera, pos_w, rot_wb, goal_w, above_w)
+    assert not valid[:, 4:].any()
+    assert torch.equal(points[:1], points[1:2])
+    assert torch.equal(points[:1], points[2:])
+    off_axis = torch.deg2rad(torch.linspace(100.0, 120.0, 81, dtype=torch.float64))
+    rays = torch.stack([off_axis.sin(), torch.full_like(off_axis, 0.05), off_axis.cos()], -1)
+    _, sides = payload_keypoints(camera, 0.2 * rays)
+    partly = sides.any(-1) & ~sides.all(-1)
+    assert partly.sum() > 3
+    shown, told = by_rule(camera, torch.ones(81, 8, 2, dtype=torch.float64), torch.cat([sides, sides], -1))
+    cut = told[partly, 4:]
+    assert not cut.all(-1).any()
+    for k, (one, other) in enumerate([(1, 3), (0, 2), (1, 3), (0, 2)]):
+        assert torch.equal(told[:, 4 + k], sides[:, k] & sides[:, one] & sides[:, other])
+    assert (shown[~told] == 0.0).all()
 
 
 def test_batch_of_many_equals_batch_of_one_bit_for_bit():

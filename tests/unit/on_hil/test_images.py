@@ -146,8 +146,10 @@ def test_only_the_newest_of_several_pictures_is_looked_at(folder):
     assert sight.stamp == pytest.approx(PERIOD * 2)
 
 
-def test_what_is_not_seen_any_more():
-    camera = KeypointCamera(training())
+@pytest.mark.parametrize("reads", ["edge", "zero"])
+def test_what_is_not_seen_any_more(reads):
+    lens = training()
+    camera = KeypointCamera(dataclasses.replace(lens, noise=dataclasses.replace(lens.noise, invalid_reads=reads)))
     sights, level = Sights(camera, 0.1), (0.0, 0.0, 0.0, 1.0)
     points, valid = sights.keypoints(0.0)
     assert not valid.any()
@@ -162,8 +164,8 @@ def test_what_is_not_seen_any_more():
     sights.take(ahead, level)
     points, valid = sights.keypoints(2.2)
     assert not valid.any()
-    np.testing.assert_allclose(np.linalg.norm(points[0, 4:], axis=-1), 1.0, atol=1e-6)
-    assert (points[0, 4:, 1] < -0.9).all(), "gone over the upper edge, it reads there"
+    np.testing.assert_allclose(np.linalg.norm(points[0, 4:], axis=-1), 1.0 if reads == "edge" else 0.0, atol=1e-6)
+    assert bool((points[0, 4:, 1] < -0.9).all()) == (reads == "edge"), "gone over the upper edge, it reads there by the rule of edges alone"
     sights.take(Sight(1.5, None, below.ball), level)
     again, _ = sights.keypoints(2.2)
     np.testing.assert_array_equal(again, points, "an older frame changes nothing")

@@ -270,7 +270,9 @@ def _seen(view: dict, setting: Setting, nominal: Setting, time: np.ndarray) -> n
     off = np.array(x.marker_offset) - np.array(nominal.plant.vehicle.body.com)
     pos = _origin(x, _at(view, "vehicle", vehicle)) - turned.apply(off)
     ball = _origin(x, _at(view, "payload", time + (x.payload_delay - nominal.sensing.payload_delay))) - np.array(x.payload_offset)
-    lens = KeypointCamera(camera, dtype=torch.float64)
+    # Smooth past the edge too: what was seen counts also where this predicts it out of view.
+    smooth = replace(camera, noise=replace(camera.noise, invalid_reads="edge"))
+    lens = KeypointCamera(smooth, dtype=torch.float64)
     arrays = pos, turned.as_matrix(), np.tile(view["goal"], (len(time), 1)), ball
     points = keypoints(lens, *[torch.from_numpy(np.ascontiguousarray(v)) for v in arrays])[0].numpy()
     own, other = camera.fisheye, nominal.camera.fisheye
