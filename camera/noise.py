@@ -13,10 +13,14 @@ from camera.params import KeypointNoiseParams
 
 
 class StepDraw(NamedTuple):
-    """Randomness of one step: standard normals, shape (E, K, 2), and uniforms in [0, 1), shape (E, K)."""
+    """Randomness of one step: standard normals, shape (E, K, 2), and uniforms in [0, 1), shape (E, K).
+
+    ``wrong``: uniforms of wrong points, shape (E, K, 3): whether, and where; None where there are none.
+    """
 
     normals: torch.Tensor
     uniforms: torch.Tensor
+    wrong: torch.Tensor | None = None
 
 
 def draw_step(
@@ -60,7 +64,11 @@ def apply_noise(
     seen = valid & kept
     # Clipped points carry no noise: they are a rule, not a measurement.
     unseen = keypoints * kept.unsqueeze(-1) if params.invalid_reads == "edge" else torch.zeros_like(keypoints)
-    return torch.where(seen.unsqueeze(-1), noisy, unseen), seen
+    points = torch.where(seen.unsqueeze(-1), noisy, unseen)
+    if draw.wrong is None:
+        return points, seen
+    mistaken = draw.wrong[..., 0] < params.wrong_probability
+    return torch.where(mistaken.unsqueeze(-1), 2.0 * draw.wrong[..., 1:] - 1.0, points), seen | mistaken
 
 
 def apply_latency(

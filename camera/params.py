@@ -111,13 +111,17 @@ class KeypointNoiseParams:
     tells nothing but that it is not seen, as behind a camera. A point that is computed from the ball's box counts as
     seen where all of the box that it is computed from is. ``edge``: it reads as its exact, noise-free direction at the
     edge, radius 1, which only poses can tell: for ablations, and the default for policies from before the rule was
-    recorded. A dropped-out point reads zero in both: nothing was measured.
+    recorded. A dropped-out point reads zero in both: nothing was measured. A wrong point reads a
+    place anywhere in the image, and as valid.
     """
 
     step_std: float = 0.01  # Gaussian per step, keypoint and axis [-]
     bias_std: float = 0.001  # Gaussian per episode, keypoint and axis [-]
     drop_probability: float = 0.0  # per step and keypoint that it reads as invalid [-]
     latency: float = 0.0  # age of the keypoints that the policy sees, fractions interpolated [policy steps]
+    wrong_probability: float = 0.0  # per step and keypoint that something else is taken for it [-]
+    held_probability: float = 0.0  # per step that the last image's keypoints come again [-]
+    scale_std: float = 0.0  # Gaussian per episode: relative error of the focal length [-]
     invalid_reads: Literal["edge", "zero"] = "edge"
 
     @property
@@ -131,11 +135,12 @@ class KeypointNoiseParams:
         Raises:
             ValueError: A negative spread or latency, a probability outside [0, 1], or an unknown ``invalid_reads``.
         """
-        for name in ("step_std", "bias_std", "latency"):
+        for name in ("step_std", "bias_std", "latency", "scale_std"):
             if not getattr(self, name) >= 0.0:
                 raise ValueError(f"keypoint noise {name} is {getattr(self, name)}; expected a number of at least 0")
-        if not 0.0 <= self.drop_probability <= 1.0:
-            raise ValueError(f"keypoint noise drop_probability is {self.drop_probability}; expected a number in [0, 1]")
+        for name in ("drop_probability", "wrong_probability", "held_probability"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise ValueError(f"keypoint noise {name} is {getattr(self, name)}; expected a number in [0, 1]")
         if self.invalid_reads not in ("edge", "zero"):
             raise ValueError(f"keypoint noise invalid_reads is {self.invalid_reads!r}; expected one of 'edge', 'zero'")
 

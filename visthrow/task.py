@@ -40,10 +40,25 @@ class ObservationParams:
     """What the actor sees; see :mod:`visthrow.onboard.observations`."""
 
     layout: Literal["state", "vision"]
-    history: int  # earlier payload measurements beside the current one
+    history: int  # earlier measurements beside the current one
     validity: bool  # vision: whether the actor is told which keypoints are valid
     latency: tuple[float, float]  # age of all that is measured, drawn per episode from this range [s]
+    latency_jitter: float = 0.0  # of that age, uniform up to this to either side, drawn per step [s]
     goal_velocity: bool = False  # whether the actor is given a fit of the goal's velocity; see visthrow.onboard.goal_motion
+    history_of: Literal["payload", "frame"] = "payload"  # what a measurement of the history holds; frame: all, and the action before
+
+    @property
+    def oldest(self) -> float:
+        """Age of the oldest sample that may be measured [s]."""
+        return self.latency[1] + self.latency_jitter
+
+    def __post_init__(self) -> None:
+        low, high = self.latency
+        if not 0.0 <= low <= high < 1.0:
+            raise ConfigError(f"task.observation.latency is {low} to {high} s; expected an ascending range from 0 up to a second")
+        require_not_negative("task.observation", latency_jitter=self.latency_jitter)
+        if self.latency_jitter > low:
+            raise ConfigError(f"task.observation.latency_jitter is {self.latency_jitter} s; expected at most the shortest latency, {low} s")
 
 
 @dataclass(frozen=True)
@@ -256,12 +271,6 @@ class Experiment:
         return self.ppo.environments * (self.first_order.horizon if self.algorithm == "first_order" else self.ppo.steps)
 
     def __post_init__(self) -> None:
-        low, high = self.task.observation.latency
-        if not 0.0 <= low <= high <= self.sim.control_period:
-            raise ConfigError(
-                f"task.observation.latency is {low} to {high} s; expected an ascending range within one control period "
-                f"of {self.sim.control_period} s"
-            )
         if abs(self.camera.payload_radius - self.rope.payload_radius) > 1e-9:
             raise ConfigError(
                 f"camera.payload_radius is {self.camera.payload_radius} m and rope.payload_radius {self.rope.payload_radius} m; "

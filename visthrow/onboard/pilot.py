@@ -63,7 +63,7 @@ def by_own_rule(policy: Policy, params: CameraParams) -> CameraParams:
 
 
 class Pilot:
-    """Flies E vehicles with one policy; remembers the previous action and the payload's history.
+    """Flies E vehicles with one policy; remembers the previous action and the history.
 
     Attributes:
         policy: the policy. layout: of its observation. period: between two calls [s].
@@ -121,7 +121,7 @@ class Pilot:
     def start(self) -> None:
         """Begin a throw from hover: the next call fills the history."""
         self._previous = self._first.repeat(self.count, 1)
-        self._history = torch.zeros(self.count, 1 + self.layout.history, self.layout.payload)
+        self._history = torch.zeros(self.count, 1 + self.layout.history, self.layout.row)
         self._fresh = torch.ones(self.count, dtype=torch.bool)
         self._goal_fit, self._steps = goal_motion.empty_sums(self.count), 0
         self._times: tuple[float, ...] = ()  # of the history's rows, newest first; those beyond are copies of the oldest [s]
@@ -193,7 +193,7 @@ class Pilot:
         """Make the history one of steps a period apart, as in training; whether steps before this one were late or missing.
 
         Args:
-            now: of this step [s]. newest: its payload part, shape (E, layout.payload).
+            now: of this step [s]. newest: its measurement, shape (E, layout.row).
         """
         times, period, rows = self._times, self.period, 1 + self.layout.history
         ages = [now - time for time in times]

@@ -1,5 +1,7 @@
 """The two plants behind one face: the training simulator and the reference plant, NumPy in and out."""
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -142,13 +144,13 @@ class HybridPlant:
         self._bias = bias * self._rng.standard_normal((5, count, 3))
         self._age = self._rng.uniform(*self.latency, count)
         self._error = np.zeros((5, count, 3))
-        self._before = self.state
+        self._past = [self.state] * max(math.ceil(self.latency[1] / self.period - 1e-9), 1)  # newest first
 
     def step(self, command: np.ndarray, release: np.ndarray | bool = False) -> None:
         """See `Plant`."""
         release = np.broadcast_to(np.asarray(release, dtype=bool), (self.count,))
         if np.any(self._age):
-            self._before = self.state
+            self._past = [self.state, *self._past[:-1]]
         self._sim.set_command(command if self._start is None else self._disturbed(command), release)
         self._sim.step()
         self._latched = self._latched | release
@@ -246,7 +248,7 @@ class HybridPlant:
         if self.noise is not None:
             step = self.noise.observation_step * self._rng.standard_normal((5, self.count, 3))
             self._error = self._bias + step
-        return self._erring(_late(self._before, self.state, self._age / self.period))
+        return self._erring(_late([self.state, *self._past], self._age / self.period))
 
     @property
     def sample(self) -> Snapshot:
@@ -349,13 +351,17 @@ def make_plant(name: str, experiment: Experiment, count: int = 1, seed: int = 0,
     raise ConfigError(f"no plant '{name}'; {suggest(name, PLANTS)}")
 
 
-def _late(before: Snapshot, now: Snapshot, share: np.ndarray) -> Snapshot:
-    """What is measured, linear from now (0) to one control period ago (1); share: shape (E,)."""
-    if not np.any(share):
+def _late(states: Sequence[Snapshot], age: np.ndarray) -> Snapshot:
+    """What is measured, linear between states one control period apart, newest first; age: in periods, shape (E,)."""
+    now = states[0]
+    if not np.any(age):
         return now
-    names = ("pos_w", "quat_wb", "vel_w", "rate_b", "payload_pos_w", "payload_vel_w")
-    late = {name: getattr(now, name) for name in names}
-    late = {name: value + share[:, None] * (getattr(before, name) - value) for name, value in late.items()}
+    row = np.minimum(age.astype(int), len(states) - 2)
+    late, share, each = {}, (age - row)[:, None], np.arange(len(age))
+    for name in ("pos_w", "quat_wb", "vel_w", "rate_b", "payload_pos_w", "payload_vel_w"):
+        values = np.stack([getattr(state, name) for state in states])
+        newer, older = values[row, each], values[row + 1, each]
+        late[name] = newer + share * (older - newer)
     late["quat_wb"] /= np.linalg.norm(late["quat_wb"], axis=1, keepdims=True)
     return replace(now, **late)
 

@@ -79,27 +79,8 @@ class ThrowEnv(VecEnv):
         self._rate_weights = torch.tensor(task.reward.rate_command, **make)
         self._change_weights = torch.tensor(task.reward.command_change, **make)
         self.episode_length_buf = torch.zeros(E, device=device, dtype=torch.long)
-        latency = experiment.camera.noise.history_length
-        self._memory = {
-            "previous": torch.zeros(E, act.ACTIONS, **make),
-            "history": torch.zeros(E, 1 + self.layout.history, self.layout.payload, **make),
-            "true_history": torch.zeros(E, 1 + self.layout.history, 3, **make),
-            "frame_bias": torch.zeros(E, ob.VEHICLE + 5, **make),
-            "command_bias": torch.zeros(E, act.COMMANDS, **make),
-            "keypoint_bias": torch.zeros(E, KEYPOINTS, 2, **make),
-            "extrinsic_rotation": torch.zeros(E, 3, **make),
-            "extrinsic_offset": torch.zeros(E, 3, **make),
-            "pose_age": torch.zeros(E, **make),
-            "last_pose": torch.zeros(E, POSE, **make),
-            "late_points": torch.zeros(E, latency, KEYPOINTS, 2, **make),
-            "late_valid": torch.zeros(E, latency, KEYPOINTS, device=device, dtype=torch.bool),
-            "totals": torch.zeros(len(RESULTS), device=device, dtype=torch.float64),
-        }
+        self._memory = self._remembered()
         self._latency = torch.tensor(experiment.camera.noise.latency, **make)
-        if task.target.moves:
-            self._memory["goal_vel"] = torch.zeros(E, 3, **make)
-        if self.layout.motion:
-            self._memory["goal_fit"] = goal_motion.empty_sums(E, device)
         self._cargo: Tensor | None = None
         if task.start.payload_variants > 1:
             scales = [[r.payload_mass / experiment.rope.payload_mass, r.length / experiment.rope.length] for r in ropes]
@@ -107,6 +88,34 @@ class ThrowEnv(VecEnv):
         self.last: dict[str, Tensor] = {}
         self._goal: Tensor | None = None
         self.reset()
+
+    def _remembered(self) -> dict[str, Tensor]:
+        """What an episode carries from step to step beside the simulator's state."""
+        task, E, make = self.cfg.task, self.num_envs, {"device": self.device, "dtype": torch.float32}
+        seen, latency, device = task.observation, self.cfg.camera.noise.history_length, self.device
+        memory = {
+            "previous": torch.zeros(E, act.ACTIONS, **make),
+            "history": torch.zeros(E, 1 + self.layout.history, self.layout.row, **make),
+            "true_history": torch.zeros(E, 1 + self.layout.history, 3, **make),
+            "frame_bias": torch.zeros(E, ob.VEHICLE + 5, **make),
+            "command_bias": torch.zeros(E, act.COMMANDS, **make),
+            "keypoint_bias": torch.zeros(E, KEYPOINTS, 2, **make),
+            "extrinsic_rotation": torch.zeros(E, 3, **make),
+            "extrinsic_offset": torch.zeros(E, 3, **make),
+            "pose_age": torch.zeros(E, **make),
+            "poses": torch.zeros(E, 1 + max(math.ceil(seen.oldest / self.cfg.sim.control_period - 1e-9), 1), POSE, **make),
+            "scale_error": torch.zeros(E, 1, 1, **make),
+            "held_points": torch.zeros(E, KEYPOINTS, 2, **make),
+            "held_valid": torch.zeros(E, KEYPOINTS, device=device, dtype=torch.bool),
+            "late_points": torch.zeros(E, latency, KEYPOINTS, 2, **make),
+            "late_valid": torch.zeros(E, latency, KEYPOINTS, device=device, dtype=torch.bool),
+            "totals": torch.zeros(len(RESULTS), device=device, dtype=torch.float64),
+        }
+        if task.target.moves:
+            memory["goal_vel"] = torch.zeros(E, 3, **make)
+        if self.layout.motion:
+            memory["goal_fit"] = goal_motion.empty_sums(E, device)
+        return memory
 
     @property
     def previous_action(self) -> Tensor:
@@ -273,6 +282,7 @@ class ThrowEnv(VecEnv):
             "keypoint_bias": camera.noise.bias_std,
             "extrinsic_rotation": camera.mount.rotation_error_std,
             "extrinsic_offset": camera.mount.position_error_std,
+            "scale_error": camera.noise.scale_std,
         }
         for name, std in spreads.items():
             if std > 0.0:
@@ -292,14 +302,19 @@ class ThrowEnv(VecEnv):
             velocity.copy_(torch.where(fresh[:, None], new, velocity))
 
     def _late(self, pose: Tensor, fresh: Tensor) -> Tensor:
-        """Pose sample as old as the episode's latency, linear between the last two control steps."""
-        memory = self._memory
-        if self.cfg.task.observation.latency[1] == 0.0:
+        """Pose sample as old as the episode's latency, linear between two control steps."""
+        memory, seen = self._memory, self.cfg.task.observation
+        if seen.oldest == 0.0:
             return pose
-        last = torch.where(fresh[:, None], pose, memory["last_pose"])
-        late = pose + (last - pose) * (memory["pose_age"] / self.cfg.sim.control_period)[:, None]
-        memory["last_pose"].copy_(pose)
-        return late
+        poses, age = hist.push(memory["poses"], pose, fresh), memory["pose_age"]
+        memory["poses"].copy_(poses)
+        if seen.latency_jitter > 0.0:
+            age = age + seen.latency_jitter * (2.0 * torch.rand_like(age) - 1.0)
+        age = age / self.cfg.sim.control_period
+        before = age.floor().clamp(max=poses.shape[1] - 2.0)
+        row = before.long()[:, None, None].expand(-1, 1, poses.shape[2])
+        newer, older = (poses.gather(1, row + k)[:, 0] for k in (0, 1))
+        return newer + (older - newer) * (age - before)[:, None]
 
     def _observe(self, fresh: Tensor) -> TensorDict:
         """Actor's and critic's view of the current state."""
@@ -315,7 +330,7 @@ class ThrowEnv(VecEnv):
         measured = seen + torch.randn_like(seen) * noise.observation_step + memory["frame_bias"]
         valid = None
         if self.layout.name == "vision":
-            if self.cfg.task.observation.latency[1] > 0.0:
+            if self.cfg.task.observation.oldest > 0.0:
                 x_axis, y_axis = pose[:, 9:12], pose[:, 12:15]
                 rot_wb = torch.stack([x_axis, y_axis, torch.linalg.cross(x_axis, y_axis)], dim=-1)
             points, valid = self._see(pose[:, :3], rot_wb, late_goal, pose[:, ob.VEHICLE :], fresh)
@@ -371,15 +386,26 @@ class ThrowEnv(VecEnv):
     def _see(
         self, pos_w: Tensor, rot_wb: Tensor, goal_w: Tensor, payload_w: Tensor, fresh: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Keypoints as the detector reports them: extrinsic error, latency, noise, drop-out."""
+        """Keypoints as the detector reports them: errors of mount and focal length, latency, noise, drop-out, held images."""
         memory, camera = self._memory, self.cfg.camera
         points, valid = ob.vision_part(self.camera, pos_w, rot_wb, goal_w, payload_w, self.extrinsics())
+        if camera.noise.scale_std > 0.0:
+            points = points * (1.0 + memory["scale_error"])
         if camera.noise.latency > 0.0:
             memory["late_points"].copy_(hist.push(memory["late_points"], points, fresh))
             memory["late_valid"].copy_(hist.push(memory["late_valid"], valid, fresh))
             points, valid = apply_latency(memory["late_points"], memory["late_valid"], self._latency)
         draw = StepDraw(torch.randn_like(points), torch.rand_like(points[..., 0]))
-        return apply_noise(camera.noise, points, valid, memory["keypoint_bias"], draw)
+        if camera.noise.wrong_probability > 0.0:
+            draw = draw._replace(wrong=torch.rand(*points.shape[:2], 3, device=points.device))
+        points, valid = apply_noise(camera.noise, points, valid, memory["keypoint_bias"], draw)
+        if camera.noise.held_probability > 0.0:
+            held = (torch.rand_like(points[:, 0, 0]) < camera.noise.held_probability) & ~fresh
+            points = torch.where(held[:, None, None], memory["held_points"], points)
+            valid = torch.where(held[:, None], memory["held_valid"], valid)
+            memory["held_points"].copy_(points)
+            memory["held_valid"].copy_(valid)
+        return points, valid
 
     def _tensors(self) -> dict[str, Tensor]:
         """All that the next step depends on, besides torch's generators."""

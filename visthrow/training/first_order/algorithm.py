@@ -81,9 +81,13 @@ class FirstOrder:
             ranks: of a distributed run.
 
         Raises:
-            ConfigError: A distributed run, goals that move, or a horizon too short for a release.
+            ConfigError: A distributed run, goals that move, a history of whole frames, or a horizon too short for a release.
         """
         self.cfg, self.p, p = experiment, experiment.first_order, experiment.ppo
+        seen = experiment.task.observation
+        if seen.history_of != "payload" or seen.oldest > experiment.sim.control_period:
+            came = f'history_of = "{seen.history_of}" and measurements up to {seen.oldest} s old'
+            raise ConfigError(f'algorithm = "first_order" takes a history of the payload and a latency of one period at most; got {came}')
         if ranks or experiment.task.target.moves:
             raise ConfigError('algorithm = "first_order" trains in one process and throws at goals that stand still; "ppo" does both')
         self.env = env = ThrowEnv(experiment, device, seed)
