@@ -21,6 +21,7 @@ COMMANDS = {
     "diagnose": ("say what the simulation gets wrong, from measured flights", "visthrow.diagnose.cli"),
     "sweep": ("work a list of training runs and throws, on several GPUs or a cluster", "visthrow.evidence.sweep.cli"),
     "report": ("write one page with the paper's tables and figures beside ours", "visthrow.evidence.report.command"),
+    "camera": ("make a camera configuration from a calibration, check it, look at what it sees", "visthrow.view.camera.command"),
     "bench": ("measure the speed of the simulator and of the camera", "visthrow.evidence.bench"),
     "config": ("print a configuration with all its values filled in", "visthrow.config.command"),
 }

@@ -1,6 +1,8 @@
-"""Calibration from pictures of a chessboard, through OpenCV's fisheye calibration."""
+"""Calibration from pictures of a board, through OpenCV's fisheye calibration, and the check of a lens against such pictures."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import torch
@@ -11,22 +13,60 @@ from camera.params import FisheyeParams
 DETECTED_AT_LEAST = 3
 """Views with a found board below which the intrinsics are not determined."""
 
+BEFORE = 0.17
+"""Cosine of the angle off the axis up to which points start the fit of a pose: 80 deg."""
+
+VIEW_AT_LEAST = 6
+"""Points of a partly seen board below which its pose is not determined well."""
+
 
 @dataclass(frozen=True)
 class BoardParams:
-    """A chessboard: inner corners (where four squares meet) and size of a square.
+    """A board: chessboard (inner corners, where four squares meet), circles (a grid of their centres) or ChArUco.
 
-    Convention: corner (i, j) lies at ``(j, i, 0) square_size`` from the first, x along the columns, y along the rows.
+    Convention: point (i, j) lies at ``(j, i, 0) square_size`` from the first, x along the columns, y along the rows.
+
+    Raises:
+        ValueError: A size that is no board's, or a dictionary that OpenCV does not have.
     """
 
-    columns: int  # inner corners along x
-    rows: int  # inner corners along y
-    square_size: float  # [m]
+    columns: int  # points along x: inner corners, or circles
+    rows: int  # points along y
+    square_size: float  # side of a square, or distance of neighbouring circles [m]
+    pattern: Literal["chessboard", "circles", "charuco"] = "chessboard"
+    marker_size: float = 0.0  # side of a ChArUco marker [m]
+    dictionary: str = "DICT_4X4_50"  # of the ChArUco markers, as OpenCV calls it
+
+    def __post_init__(self) -> None:
+        if min(self.columns, self.rows) < 2 or not self.square_size > 0.0:
+            raise ValueError(
+                f"board of {self.columns} x {self.rows} points, {self.square_size} m apart; expected 2 or more each way, above 0 m apart"
+            )
+        if self.pattern == "charuco" and not 0.0 < self.marker_size < self.square_size:
+            raise ValueError(f"ChArUco marker of {self.marker_size} m; expected a side above 0 and below the square's {self.square_size} m")
 
     def corners_m(self) -> np.ndarray:
-        """Inner corners row by row [m], float64, shape (rows * columns, 3), board frame."""
+        """Points row by row [m], float64, shape (rows * columns, 3), board frame."""
         x, y = np.meshgrid(np.arange(self.columns), np.arange(self.rows))
         return np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)]) * self.square_size
+
+    def charuco(self):
+        """OpenCV's object of a ChArUco board: one square more each way than inner corners."""
+        import cv2
+
+        known = sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_"))
+        if self.dictionary not in known:
+            raise ValueError(f"ChArUco dictionary {self.dictionary!r}; expected one of {', '.join(known)}")
+        markers = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
+        return cv2.aruco.CharucoBoard((self.columns + 1, self.rows + 1), self.square_size, self.marker_size, markers)
+
+
+@dataclass(frozen=True)
+class View:
+    """What of a board one picture shows: points [m], shape (N, 3), board frame, and their pixels [px], shape (N, 2)."""
+
+    points_m: np.ndarray
+    pixels: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -36,35 +76,47 @@ class BoardReport:
     Attributes:
         rms_px: Root mean square distance of corners and their reprojections over all views [px].
         image_rms_px: The same for each picture [px]; NaN where no board was found.
+        points: Points of boards in all pictures.
     """
 
     rms_px: float
     image_rms_px: tuple[float, ...]
+    points: int
 
 
-def find_corners(image: np.ndarray, board: BoardParams) -> np.ndarray | None:
-    """Inner corners of a board in a picture.
+def find_board(image: np.ndarray, board: BoardParams) -> View | None:
+    """Find a board in a picture.
 
     Args:
         image: Grey or colour picture, uint8, shape (H, W) or (H, W, 3).
         board: The board.
 
     Returns:
-        Corners row by row [px], shape (rows * columns, 2), or None where no whole board is found.
+        Its points, row by row; of a ChArUco board those that are seen. None where no whole board (of a ChArUco board: fewer
+        than six points) is found.
     """
     import cv2
 
     grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    if board.pattern == "charuco":
+        corners, ids, _, _ = cv2.aruco.CharucoDetector(board.charuco()).detectBoard(grey)
+        if ids is None or len(ids) < VIEW_AT_LEAST:
+            return None
+        margin = 0.5 * (1.0 - board.marker_size / board.square_size)  # free of the marker about each corner, in squares
+        return View(board.corners_m()[ids.ravel()], _refine(grey, corners.reshape(-1, 2), margin))
+    if board.pattern == "circles":
+        found, centres = cv2.findCirclesGrid(grey, (board.columns, board.rows), flags=cv2.CALIB_CB_SYMMETRIC_GRID)
+        return View(board.corners_m(), centres.reshape(-1, 2).astype(np.float64)) if found else None
     # Equalising the histogram helps in bad light and costs accuracy in good light, so it comes second.
     for flags in (cv2.CALIB_CB_ACCURACY, cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE):
         found, corners = cv2.findChessboardCornersSB(grey, (board.columns, board.rows), flags=flags)
         if found:
-            return _refine(grey, corners.reshape(-1, 2))
+            return View(board.corners_m(), _refine(grey, corners.reshape(-1, 2)))
     return None
 
 
-def _refine(grey: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Corners at sub-pixel accuracy, from windows that reach almost half-way to the nearest other corner.
+def _refine(grey: np.ndarray, corners: np.ndarray, share: float = 0.45) -> np.ndarray:
+    """Corners at sub-pixel accuracy, from windows that reach a share of the way to the nearest other corner.
 
     The detector's own sub-pixel step assumes straight edges over a whole square, which a fisheye bends: on rendered
     boards the lens calibrated from it was 0.76 px off, with this step 0.10 px.
@@ -72,7 +124,7 @@ def _refine(grey: np.ndarray, corners: np.ndarray) -> np.ndarray:
     import cv2
 
     apart = np.linalg.norm(corners[:, None] - corners[None], axis=-1) + np.diag(np.full(len(corners), np.inf))
-    half = int(np.clip(0.45 * apart.min(), 1, 8))
+    half = int(np.clip(share * apart.min(), 1, 8))
     criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-4)
     start = corners.astype(np.float32).reshape(-1, 1, 2).copy()
     return cv2.cornerSubPix(grey, start, (half, half), (-1, -1), criteria).reshape(-1, 2).astype(np.float64)
@@ -81,7 +133,7 @@ def _refine(grey: np.ndarray, corners: np.ndarray) -> np.ndarray:
 def calibrate_from_boards(
     images: list[np.ndarray], board: BoardParams, fov_deg: float = 180.0
 ) -> tuple[FisheyeParams, BoardReport]:
-    """Calibrate a fisheye from pictures of a chessboard.
+    """Calibrate a fisheye from pictures of a board.
 
     OpenCV's model folds past 90 deg off the axis, so every board must lie before the lens; the polynomial found there
     goes on past 90 deg.
@@ -99,43 +151,101 @@ def calibrate_from_boards(
     """
     import cv2
 
-    sizes = sorted({image.shape[:2] for image in images})
-    if len(sizes) != 1:
-        raise ValueError(f"pictures of sizes {sizes} came (height, width); expected one size, that of one camera")
-    corners = [find_corners(image, board) for image in images]
-    views = [c for c in corners if c is not None]
-    if len(views) < DETECTED_AT_LEAST:
-        raise ValueError(
-            f"a board of {board.columns} x {board.rows} inner corners was found in {len(views)} of "
-            f"{len(images)} pictures; expected at least {DETECTED_AT_LEAST}"
-        )
-    height, width = sizes[0]
-    points_m = board.corners_m()
+    size, found = find_boards(images, board)
+    views = [view for view in found if view is not None]
+    height, width = size
     # The focal length that lets 180 deg fill the width: a start that keeps OpenCV's first step inside the model.
     start = np.array([[width / np.pi, 0.0, width / 2 - 0.5], [0.0, width / np.pi, height / 2 - 0.5], [0.0, 0.0, 1.0]])
     flags = cv2.CALIB_RECOMPUTE_EXTRINSIC | cv2.CALIB_FIX_SKEW | cv2.CALIB_USE_INTRINSIC_GUESS
     criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 200, 1e-10)
     try:
         _, matrix, k, rotations, translations = cv2.fisheye.calibrate(
-            [points_m[None]] * len(views), [v[None] for v in views], (width, height), start, np.zeros((4, 1)),
+            [v.points_m[None] for v in views], [v.pixels[None] for v in views], (width, height), start, np.zeros((4, 1)),
             flags=flags, criteria=criteria,
         )  # fmt: skip
     except cv2.error as error:
         raise ValueError(f"OpenCV found no fisheye for {len(views)} boards: {str(error).strip()}") from error
     values = [float(x) for x in (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *k.ravel())]
     params = FisheyeParams(width, height, *values, fov_deg=fov_deg)
-    lens = Fisheye(params)
+    project = _projection(Fisheye(params))
     poses = iter(zip(rotations, translations, strict=True))
-    squares = [np.nan if c is None else _mean_square(lens, points_m, c, *next(poses)) for c in corners]
-    return params, BoardReport(float(np.sqrt(np.nanmean(squares))), tuple(float(s) for s in np.sqrt(squares)))
+    return params, _report([None if v is None else _residual(project, v, np.concatenate(next(poses)).ravel()) for v in found])
 
 
-def _mean_square(
-    lens: Fisheye, points_m: np.ndarray, corners: np.ndarray, rotation: np.ndarray, translation: np.ndarray
-) -> float:
-    """Mean squared distance of corners from their reprojections in one view [px^2]."""
+def check_boards(images: list[np.ndarray], board: BoardParams, fisheye: FisheyeParams) -> BoardReport:
+    """Reprojection error of a given lens on pictures of a board: each board's pose is fitted, the lens is left as it is.
+
+    Args:
+        images: Pictures of one camera, uint8, shape (H, W) or (H, W, 3), of the lens's size.
+        board: The board.
+        fisheye: The lens.
+
+    Raises:
+        ValueError: Pictures are not of the lens's size, or too few show the board.
+    """
+    size, found = find_boards(images, board)
+    if size != (fisheye.height, fisheye.width):
+        raise ValueError(f"pictures of {size[1]} x {size[0]} px came; expected {fisheye.width} x {fisheye.height}, the lens's size")
+    lens = Fisheye(fisheye)
+    project = _projection(lens)
+    return _report([None if v is None else _residual(project, v, board_pose(lens, v)) for v in found])
+
+
+def find_boards(images: list[np.ndarray], board: BoardParams) -> tuple[tuple[int, int], list[View | None]]:
+    """Size (height, width) of all pictures, and what each shows of the board.
+
+    Raises:
+        ValueError: Pictures differ in size, or fewer than three show the board.
+    """
+    sizes = sorted({image.shape[:2] for image in images})
+    if len(sizes) != 1:
+        raise ValueError(f"pictures of sizes {sizes} came (height, width); expected one size, that of one camera")
+    views = [find_board(image, board) for image in images]
+    seen = sum(view is not None for view in views)
+    if seen < DETECTED_AT_LEAST:
+        raise ValueError(
+            f"a {board.pattern} of {board.columns} x {board.rows} points was found in {seen} of "
+            f"{len(images)} pictures; expected at least {DETECTED_AT_LEAST}"
+        )
+    return sizes[0], views
+
+
+def board_pose(lens: Fisheye, view: View) -> np.ndarray:
+    """Pose of a board by least squares of its pixels: rotation vector [rad] and place of its first point [m], shape (6,), camera frame."""
+    import cv2
+    from scipy.optimize import least_squares
+
+    rays = lens.unproject(torch.from_numpy(view.pixels))[0].numpy()
+    before = rays[:, 2] > BEFORE
+    if np.count_nonzero(before) < VIEW_AT_LEAST:
+        raise ValueError(
+            f"{np.count_nonzero(before)} points of a board lie within {np.degrees(np.arccos(BEFORE)):.0f} deg of the axis; "
+            f"expected {VIEW_AT_LEAST}: is this the lens of these pictures?"
+        )
+    plane = rays[before, :2] / rays[before, 2:]
+    _, turn, place = cv2.solvePnP(view.points_m[before], plane, np.eye(3), np.zeros(4), flags=cv2.SOLVEPNP_IPPE)
+    project, start = _projection(lens), np.concatenate([turn, place]).ravel()
+    return least_squares(lambda pose: _residual(project, view, pose), start, x_scale="jac", method="lm").x
+
+
+def reprojected(lens: Fisheye, view: View) -> np.ndarray:
+    """Pixels [px], shape (N, 2), at which a lens expects the points of a board whose pose was fitted."""
+    return view.pixels + _residual(_projection(lens), view, board_pose(lens, view)).reshape(-1, 2)
+
+
+def _projection(lens: Fisheye) -> Callable[[np.ndarray], np.ndarray]:
+    return lambda points_c: lens.project(torch.from_numpy(points_c))[0].numpy()
+
+
+def _residual(project: Callable[[np.ndarray], np.ndarray], view: View, pose: np.ndarray) -> np.ndarray:
+    """Reprojected less seen pixels [px], shape (2 N,), of a board at a pose (rotation vector, place)."""
     import cv2
 
-    points_c = points_m @ cv2.Rodrigues(rotation)[0].T + translation.ravel()
-    pixels = lens.project(torch.from_numpy(points_c))[0].numpy()
-    return float(np.mean(np.sum((pixels - corners) ** 2, axis=1)))
+    return (project(view.points_m @ cv2.Rodrigues(pose[:3])[0].T + pose[3:]) - view.pixels).ravel()
+
+
+def _report(residuals: list[np.ndarray | None]) -> BoardReport:
+    """Errors of pictures from their residuals, shape (2 N,) each."""
+    together = np.concatenate([r for r in residuals if r is not None])
+    each = (np.nan if r is None else float(np.sqrt(2.0 * np.mean(r * r))) for r in residuals)
+    return BoardReport(float(np.sqrt(2.0 * np.mean(together**2))), tuple(each), together.size // 2)

@@ -1,4 +1,4 @@
-"""Other lens models of the field (double sphere, extended unified) and their conversion into ours by a fit.
+"""Other lens models of the field (double sphere, extended unified, ocam) and their conversion into ours by a fit.
 
 NumPy, float64: this runs once, when a calibration file is read.
 """
@@ -96,13 +96,40 @@ def fit_fisheye(
     Raises:
         ValueError: The model is unknown, or no grid point lies in the field of view, or the fit describes no camera.
     """
-    from scipy.optimize import least_squares
-
     if model not in FOREIGN_MODELS:
         raise ValueError(f"camera model {model!r} cannot be fitted; expected one of {sorted(FOREIGN_MODELS)}")
+    centre, focal = (values["cx"], values["cy"]), (values["fx"], values["fy"])
+    return fit_rays(model, lambda pixels: FOREIGN_MODELS[model][1](values, pixels), centre, focal, width, height, fov_deg)
+
+
+def fit_rays(
+    model: str,
+    unproject: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]],
+    centre_px: tuple[float, float],
+    focal_px: tuple[float, float],
+    width: int,
+    height: int,
+    fov_deg: float | None = None,
+) -> tuple[FisheyeParams, FitReport]:
+    """Fit our model to any lens that turns pixels into rays; see :func:`fit_fisheye`.
+
+    Args:
+        model: What the report calls the lens.
+        unproject: Rays, shape (N, 3), camera frame, and validity, shape (N,), of pixels [px], shape (N, 2).
+        centre_px: Principal point, taken over.
+        focal_px: fx and fy to start from.
+        width: Image width [px].
+        height: Image height [px].
+        fov_deg: Full field of view to fit in [deg]; by default all that the image sees.
+
+    Raises:
+        ValueError: No grid point lies in the field of view, or the fit describes no camera.
+    """
+    from scipy.optimize import least_squares
+
     u, v = np.meshgrid(np.linspace(-0.5, width - 0.5, GRID), np.linspace(-0.5, height - 0.5, GRID))
     pixels = np.column_stack([u.ravel(), v.ravel()])
-    rays, valid = FOREIGN_MODELS[model][1](values, pixels)
+    rays, valid = unproject(pixels)
     theta = np.arctan2(np.linalg.norm(rays[:, :2], axis=1), rays[:, 2])
     seen_deg = 2.0 * math.degrees(theta[valid].max(initial=0.0))
     if fov_deg is not None:
@@ -112,7 +139,7 @@ def fit_fisheye(
             f"{model} model sees {np.count_nonzero(valid)} of {len(pixels)} pixels of the grid; expected 50"
         )
     theta, pixels = theta[valid], pixels[valid]
-    centre = np.array([values["cx"], values["cy"]])
+    centre = np.array(centre_px)
     direction = rays[valid, :2] / np.maximum(np.sin(theta), 1e-12)[:, None]
     powers = theta[:, None] ** (2 * np.arange(1, 5) + 1)
 
@@ -120,7 +147,7 @@ def fit_fisheye(
         radius = theta + powers @ unknown[2:]
         return (direction * radius[:, None] * unknown[:2] - (pixels - centre)).ravel()
 
-    start = np.array([values["fx"], values["fy"], 0.0, 0.0, 0.0, 0.0])
+    start = np.array([*focal_px, 0.0, 0.0, 0.0, 0.0])
     fit = least_squares(residual, start, x_scale="jac", method="lm", xtol=1e-14, ftol=1e-14)
     error = np.linalg.norm(fit.fun.reshape(-1, 2), axis=1)
     coefficients = tuple(float(k) for k in fit.x[2:])

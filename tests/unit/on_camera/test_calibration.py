@@ -177,7 +177,7 @@ def test_calibration_from_rendered_boards():
 def test_board_refusals():
     board = BoardParams(8, 6, 0.04)
     grey = np.full((100, 100), 128, np.uint8)
-    with pytest.raises(ValueError, match="found in 0 of 2 pictures"):
+    with pytest.raises(ValueError, match="was found in 0 of 2 pictures"):
         calibrate_from_boards([grey, grey], board)
     with pytest.raises(ValueError, match="expected one size"):
         calibrate_from_boards([grey, grey[:50]], board)
