@@ -220,6 +220,31 @@ class FirstOrderParams:
 
 
 @dataclass(frozen=True)
+class DistillationParams:
+    """Learning parameters of :mod:`visthrow.training.distillation`; ``ppo.environments`` has the throws of an iteration."""
+
+    teacher: str = "state"  # state policy: a shipped name or a file
+    iterations: int = 500
+    horizon: int = 72  # of a throw [control steps]
+    hidden: int = 256  # of the encoder
+    memory: int = 128  # of the recurrent unit
+    epochs: int = 1
+    minibatches: int = 4
+    learning_rate: float = 2e-3  # at the first iteration
+    final_rate: float = 5e-5  # at the last one; half a cosine between
+    action_weight: float = 0.3  # of what an error of the estimate does to the action
+    alone: float = 0.3  # share of the training after which the estimator flies alone
+    led: float = 0.05  # share of the throws that are flown on what there is, then too
+
+    def __post_init__(self) -> None:
+        require_positive(
+            "distillation", iterations=self.iterations, horizon=self.horizon, hidden=self.hidden, memory=self.memory,
+            epochs=self.epochs, minibatches=self.minibatches, learning_rate=self.learning_rate, alone=self.alone,
+        )  # fmt: skip
+        require_not_negative("distillation", final_rate=self.final_rate, action_weight=self.action_weight, led=self.led)
+
+
+@dataclass(frozen=True)
 class DiagnosedParams:
     """What a diagnosis leaves uncertain about the plant (``visthrow diagnose apply`` writes it).
 
@@ -257,18 +282,23 @@ class Experiment:
     laws: tuple[LawParams, ...] = ()  # found by a diagnosis, besides the blocks' own
     sensing: SensingParams = field(default_factory=SensingParams)  # of the hall; the diagnosis alone reads it
     diagnosed: DiagnosedParams = field(default_factory=DiagnosedParams)
-    algorithm: Literal["ppo", "first_order"] = "ppo"
+    algorithm: Literal["ppo", "first_order", "distillation"] = "ppo"
     first_order: FirstOrderParams = field(default_factory=FirstOrderParams)
+    distillation: DistillationParams = field(default_factory=DistillationParams)
 
     @property
     def iterations(self) -> int:
         """Iterations of a whole training."""
-        return self.first_order.iterations if self.algorithm == "first_order" else self.ppo.iterations
+        return self._chosen.iterations
 
     @property
     def samples(self) -> int:
         """Environment steps an iteration."""
-        return self.ppo.environments * (self.first_order.horizon if self.algorithm == "first_order" else self.ppo.steps)
+        return self.ppo.environments * (self.ppo.steps if self.algorithm == "ppo" else self._chosen.horizon)
+
+    @property
+    def _chosen(self) -> PPOParams | FirstOrderParams | DistillationParams:
+        return getattr(self, self.algorithm)
 
     def __post_init__(self) -> None:
         if abs(self.camera.payload_radius - self.rope.payload_radius) > 1e-9:

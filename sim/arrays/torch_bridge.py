@@ -1,5 +1,7 @@
 """The one bridge between the simulator's Warp arrays and torch tensors: views of the same memory, no copies."""
 
+from collections.abc import Callable
+
 import torch
 import warp as wp
 
@@ -32,3 +34,31 @@ def on_torch_stream(device: str):
         return wp.ScopedDevice(device)
     capturing = torch.cuda.is_current_stream_capturing()  # a capture may not wait for another stream
     return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream()), sync_enter=not capturing)
+
+
+class Replayed:
+    """Work on fixed tensors of a GPU: done eagerly at first, then captured in a CUDA graph and replayed, on a stream of its own.
+
+    For work without autograd: capturing that failed on an H200 (cudaErrorStreamCaptureUnsupported).
+    """
+
+    EAGER = 3
+
+    def __init__(self, work: Callable[[], None]):
+        self._work, self._done, self._graph, self._stream = work, 0, None, torch.cuda.Stream()
+
+    def __call__(self) -> None:
+        """Do the work."""
+        self._stream.wait_stream(torch.cuda.current_stream())
+        if self._graph is None and self._done == self.EAGER:
+            torch.cuda.synchronize()
+            self._graph = torch.cuda.CUDAGraph()
+            with torch.cuda.graph(self._graph, stream=self._stream):
+                self._work()
+        with torch.cuda.stream(self._stream):
+            if self._graph is None:
+                self._work()
+                self._done += 1
+            else:
+                self._graph.replay()
+        torch.cuda.current_stream().wait_stream(self._stream)

@@ -101,7 +101,7 @@ def _policies(names: list[str], seed: int, throws: int) -> list[dict]:
     for name in names:
         loaded = load_policy(name)
         status(f"throwing with {loaded.name}")
-        result = throw(loaded.experiment, loaded.policy.act, 2.0, throws, "cpu", seed).summary()
+        result = throw(loaded.experiment, loaded.policy.actor(throws), 2.0, throws, "cpu", seed).summary()
         if result["success"]:
             rows.append({"policy": loaded.name, "plant": "hybrid", **result})
     return rows

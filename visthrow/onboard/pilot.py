@@ -63,7 +63,7 @@ def by_own_rule(policy: Policy, params: CameraParams) -> CameraParams:
 
 
 class Pilot:
-    """Flies E vehicles with one policy; remembers the previous action and the history.
+    """Flies E vehicles with one policy; remembers the previous action, the history and the policy's memory.
 
     Attributes:
         policy: the policy. layout: of its observation. period: between two calls [s].
@@ -122,6 +122,7 @@ class Pilot:
         """Begin a throw from hover: the next call fills the history."""
         self._previous = self._first.repeat(self.count, 1)
         self._history = torch.zeros(self.count, 1 + self.layout.history, self.layout.row)
+        self._memory = self.policy.begin(self.count)
         self._fresh = torch.ones(self.count, dtype=torch.bool)
         self._goal_fit, self._steps = goal_motion.empty_sums(self.count), 0
         self._times: tuple[float, ...] = ()  # of the history's rows, newest first; those beyond are copies of the oldest [s]
@@ -170,7 +171,7 @@ class Pilot:
             observation, *rest = self._seen(views, given)
         self._history, self._goal_fit, *seen = rest if self.layout.motion else (rest[0], self._goal_fit, *rest[1:])
         decided = time.perf_counter()
-        action, command, release = self._decide(observation)
+        action, command, release, self._memory = self._decide(observation, self._memory)
         self._unasked = self._previous[:, 4]
         self._previous, self._fresh, self._steps = action, self._later, self._steps + 1
         points, valid = (part.numpy() for part in seen) if seen else (None, None)
@@ -251,12 +252,12 @@ class Pilot:
         observation, history = ob.observe(self.layout, frame, valid, previous, attached[:, 0], history, fresh, velocity)
         return observation, history, *sums, *seen
 
-    def _decision(self, observation: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Clipped action, command and whether a release is asked for."""
-        raw = self.policy.act(observation)
+    def _decision(self, observation: Tensor, memory: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Clipped action, command, whether a release is asked for, and the policy's memory."""
+        raw, memory = self.policy.step(observation, memory)
         action = act.clip_action(raw)
         command = act.command_from_action(action, self._max_thrust, self._max_rate)
-        return action, command, act.release_asked(raw, self._threshold)
+        return action, command, act.release_asked(raw, self._threshold), memory
 
     @torch.inference_mode()
     def see(

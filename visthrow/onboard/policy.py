@@ -2,7 +2,8 @@
 
 Onboard-safe: torch, numpy and json only. The file is an ``.npz`` without pickle: ``layer<i>_weight`` and
 ``layer<i>_bias`` (float32), optionally ``normalizer_mean``, ``normalizer_std``, ``normalizer_eps``, and ``header``,
-JSON text with ``format_version``, ``activation``, ``contract`` and ``made_by``.
+JSON text with ``format_version``, ``activation``, ``contract`` and ``made_by``. A policy with a memory has its estimator
+too, ``estimator_<field>``, and format version 2.
 
 ``contract`` is a nested dictionary of everything that whoever flies the policy must share with its training: camera,
 mount, action limits, release lag, vehicle, observation layout. ``contract["observation"]["dimension"]`` and
@@ -13,8 +14,8 @@ and figures; nothing depends on it.
 import json
 import math
 import re
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +26,10 @@ from torch import Tensor
 
 from visthrow.common.errors import MismatchError, PolicyError, suggest
 from visthrow.common.storage import from_json_array, json_array, loadz, savez
+from visthrow.onboard.estimator import Estimator
 
-FORMAT_VERSION = 1
+FORMAT_VERSIONS = (1, 2)
+"""Without and with an estimator."""
 
 RELATIVE_TOLERANCE = 1e-9
 """Two numbers of a contract are the same up to this: what a round trip through text or a unit conversion may cost."""
@@ -53,6 +56,8 @@ _ACTIVATIONS = {
 class Policy:
     """A multi-layer perceptron ``obs (E, D) -> action (E, A)`` with an optional fixed normaliser before it.
 
+    With an estimator the perceptron looks at the estimate (E, S) in place of the observation, and the policy has a memory.
+
     Raises:
         PolicyError: If shapes do not fit each other or the contract, a number is not finite, or the activation is
             unknown.
@@ -66,6 +71,7 @@ class Policy:
     mean: Tensor | None = None  # (D,), of the observation
     std: Tensor | None = None  # (D,)
     eps: float = 0.0  # added to std
+    estimator: Estimator | None = None
 
     def __post_init__(self) -> None:
         if self.activation not in _ACTIVATIONS:
@@ -80,7 +86,7 @@ class Policy:
     @property
     def obs_dim(self) -> int:
         """Number of observations D."""
-        return self.weights[0].shape[1]
+        return self.weights[0].shape[1] if self.estimator is None else self.estimator.obs_dim
 
     @property
     def action_dim(self) -> int:
@@ -106,9 +112,47 @@ class Policy:
         Raises:
             PolicyError: If the last axis is not D long.
         """
+        if self.estimator is not None:
+            raise PolicyError("this policy has a memory; expected a call of step or actor rather than act")
+        return self.decide(self._fitting(obs))
+
+    def begin(self, count: int) -> Tensor:
+        """Memory at the beginning of a throw, shape (E, H); H is 0 for a policy without one."""
+        width = 0 if self.estimator is None else self.estimator.memory
+        return torch.zeros(count, width, device=self.weights[0].device, dtype=self.weights[0].dtype)
+
+    @torch.no_grad()
+    def step(self, obs: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
+        """Action as :meth:`act`, shape (E, A), and the memory for the next step, shape (E, H).
+
+        Raises:
+            PolicyError: If the last axis of the observations is not D long.
+        """
+        seen = self._fitting(obs)
+        if self.estimator is not None:
+            seen, memory = self.estimator.step(seen, memory)
+        return self.decide(seen), memory
+
+    def actor(self, count: int) -> Callable[[Tensor], Tensor]:
+        """Function of the observations of one throw after the other step, shape (E, D); it carries the memory, where there is one."""
+        if self.estimator is None:
+            return self.act
+        memory = self.begin(count)
+
+        def act(obs: Tensor) -> Tensor:
+            nonlocal memory
+            action, memory = self.step(obs, memory)
+            return action
+
+        return act
+
+    def _fitting(self, obs: Tensor) -> Tensor:
         if obs.shape[-1] != self.obs_dim:
             raise PolicyError(f"got observations of shape {tuple(obs.shape)}; this policy expects (E, {self.obs_dim})")
-        x = obs.to(self.weights[0].dtype)
+        return obs.to(self.weights[0].dtype)
+
+    def decide(self, x: Tensor) -> Tensor:
+        """Action of the perceptron alone, shape (E, A), for what it looks at, shape (E, S); differentiable."""
         if self.mean is not None:
             x = (x - self.mean) / (self.std + self.eps)
         activation = _ACTIVATIONS[self.activation]
@@ -131,6 +175,7 @@ class Policy:
             move(self.mean),
             move(self.std),
             self.eps,
+            None if self.estimator is None else self.estimator.to(device),
         )
 
     def require(
@@ -172,7 +217,7 @@ class Policy:
             StorageError: If the place cannot be written.
         """
         header = {
-            "format_version": FORMAT_VERSION,
+            "format_version": FORMAT_VERSIONS[self.estimator is not None],
             "activation": self.activation,
             "contract": self.contract,
             "made_by": self.made_by,
@@ -186,6 +231,8 @@ class Policy:
         if self.mean is not None:
             arrays["normalizer_mean"], arrays["normalizer_std"] = self.mean.cpu().numpy(), self.std.cpu().numpy()
             arrays["normalizer_eps"] = np.float64(self.eps)
+        if self.estimator is not None:
+            arrays |= {f"estimator_{field.name}": getattr(self.estimator, field.name).cpu().numpy() for field in fields(Estimator)}
         savez(path, arrays)
 
     @staticmethod
@@ -206,6 +253,9 @@ class Policy:
         count = sum(name.endswith("_weight") for name in arrays)
         normalized = "normalizer_mean" in arrays
         try:
+            estimator = None
+            if header["format_version"] == FORMAT_VERSIONS[1]:
+                estimator = Estimator(**{field.name: take(f"estimator_{field.name}") for field in fields(Estimator)})
             return Policy(
                 tuple(take(f"layer{i}_weight") for i in range(count)),
                 tuple(take(f"layer{i}_bias") for i in range(count)),
@@ -215,6 +265,7 @@ class Policy:
                 take("normalizer_mean") if normalized else None,
                 take("normalizer_std") if normalized else None,
                 float(take("normalizer_eps")) if normalized else 0.0,
+                estimator,
             )
         except PolicyError as error:
             raise PolicyError(f"{path}: {error}") if str(path) not in str(error) else error from None
@@ -288,6 +339,8 @@ def _check_shapes(policy: Policy) -> None:
     if not policy.weights or len(policy.weights) != len(policy.biases):
         raise PolicyError(f"got {len(policy.weights)} weights and {len(policy.biases)} biases; expected a pair a layer")
     width = policy.weights[0].shape[-1]
+    if policy.estimator is not None and len(policy.estimator.output_bias) != width:
+        raise PolicyError(f"the estimator gives {len(policy.estimator.output_bias)} numbers; the first layer takes {width}")
     named = [("normalizer mean", policy.mean), ("normalizer std", policy.std)]
     if (policy.mean is None) != (policy.std is None):
         raise PolicyError("a normaliser needs both mean and std; one is missing")
@@ -315,8 +368,9 @@ def _header(array: np.ndarray, path: str | Path) -> dict[str, Any]:
         version = header["format_version"]
     except (ValueError, KeyError, TypeError) as error:
         raise PolicyError(f"{path}: its header is not readable: {error!r}") from error
-    if version != FORMAT_VERSION:
-        raise PolicyError(f"{path}: format version {version}; this program reads version {FORMAT_VERSION}")
+    if version not in FORMAT_VERSIONS:
+        readable = " and ".join(map(str, FORMAT_VERSIONS))
+        raise PolicyError(f"{path}: format version {version}; this program reads versions {readable}")
     wanted = {"activation": str, "contract": dict, "made_by": dict}
     for key, kind in wanted.items():
         if not isinstance(header.get(key), kind):

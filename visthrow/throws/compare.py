@@ -195,7 +195,7 @@ def throw_hybrid(
         rows.append(row)
         for target in targets:
             status(f"throws in the training simulator: {sum(map(len, rows))} of {len(loaded) * len(targets)} sets")
-            row.append(throw(item.experiment, policy.act, target, count, device, seed))
+            row.append(throw(item.experiment, policy.actor(count), target, count, device, seed))
     status("")
     return rows
 

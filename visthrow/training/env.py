@@ -134,6 +134,13 @@ class ThrowEnv(VecEnv):
             return None
         return self.camera.extrinsics(self._memory["extrinsic_rotation"], self._memory["extrinsic_offset"])
 
+    def exact_frame(self, age: float) -> Tensor:
+        """State frame without noise, shape (E, 20), as it was so long ago [s], at most a control period."""
+        newer, older = self._memory["poses"][:, :2].unbind(1)
+        pose = torch.lerp(newer, older, age / self.cfg.sim.control_period)
+        offset = ob.state_part(pose[:, :3], self.views.goal_w, pose[:, ob.VEHICLE :])
+        return torch.cat([pose[:, : ob.VEHICLE], offset], dim=-1)
+
     def fix_goal(self, goal_w: Tensor | None) -> None:
         """Use one goal [m], shape (3,), for all episodes from the next reset on, or drawn ones again (None)."""
         self._goal = goal_w
@@ -304,10 +311,10 @@ class ThrowEnv(VecEnv):
     def _late(self, pose: Tensor, fresh: Tensor) -> Tensor:
         """Pose sample as old as the episode's latency, linear between two control steps."""
         memory, seen = self._memory, self.cfg.task.observation
-        if seen.oldest == 0.0:
-            return pose
         poses, age = hist.push(memory["poses"], pose, fresh), memory["pose_age"]
         memory["poses"].copy_(poses)
+        if seen.oldest == 0.0:
+            return pose
         if seen.latency_jitter > 0.0:
             age = age + seen.latency_jitter * (2.0 * torch.rand_like(age) - 1.0)
         age = age / self.cfg.sim.control_period

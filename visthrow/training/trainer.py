@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Protocol
 
 import torch
-from torch import Tensor
 
 from visthrow import config
 from visthrow.common import provenance
@@ -51,9 +50,6 @@ class Algorithm(Protocol):
             ``rollout_s`` and ``learning_s`` [s] and the finished episodes' :meth:`ThrowEnv.episode_means`.
         """
 
-    def act(self, obs: Tensor) -> Tensor:
-        """Deterministic actions, shape (E, 5), of the current policy for the actor's observations, shape (E, D)."""
-
     def export(self, contract: dict, made_by: dict) -> Policy:
         """The policy as a file's content."""
 
@@ -73,6 +69,10 @@ def build(experiment: Experiment, device: str, seed: int, ranks: dict | None) ->
         from visthrow.training.first_order.algorithm import FirstOrder
 
         return FirstOrder(experiment, device, seed, ranks)
+    if experiment.algorithm == "distillation":
+        from visthrow.training.distillation import Distillation
+
+        return Distillation(experiment, device, seed, ranks)
     from visthrow.training.ppo.algorithm import PPOTraining
 
     return PPOTraining(experiment, device, seed, ranks)
@@ -134,7 +134,8 @@ class Trainer:
 
     def throw(self, target: float, count: int = 200, seed: int = 12345) -> protocol.Throws:
         """Throws from hover with the current policy; see :mod:`visthrow.training.protocol`."""
-        return protocol.throw(self.experiment, self.algorithm.act, target, count, self.device, seed)
+        policy = self.algorithm.export(contract_of(self.experiment), {}).to(self.device)
+        return protocol.throw(self.experiment, policy.actor(count), target, count, self.device, seed)
 
     def evaluate(self, target: float, count: int = 200, seed: int = 12345) -> dict[str, float]:
         """Summary of :meth:`throw`."""

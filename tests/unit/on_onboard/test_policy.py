@@ -11,7 +11,7 @@ from tensordict import TensorDict
 
 from visthrow.common.errors import MismatchError, PolicyError, VisthrowError
 from visthrow.common.storage import from_json_array, json_array
-from visthrow.onboard.policy import FORMAT_VERSION, Policy, find_policy
+from visthrow.onboard.policy import FORMAT_VERSIONS, Policy, find_policy
 
 OBS, ACTIONS = 35, 5
 EQUAL = 1e-6
@@ -126,7 +126,7 @@ def rewritten(path, change):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (lambda a, h: h.update(format_version=FORMAT_VERSION + 1), "this program reads version 1"),
+        (lambda a, h: h.update(format_version=FORMAT_VERSIONS[-1] + 1), "this program reads versions 1 and 2"),
         (lambda a, h: h.pop("contract"), "'contract' is None; expected a dict"),
         (lambda a, h: h.update(activation="relux"), "did you mean 'relu'"),
         (lambda a, h: a.pop("layer1_bias"), "no entry 'layer1_bias'"),

@@ -95,7 +95,7 @@ def releases(loaded: Loaded, target: float, count: int, device: str, seed: int =
         built.append(_Watched(*args))
         return built[0]
 
-    throw(loaded.experiment, loaded.policy.to(device).act, target, count, device, seed, build)
+    throw(loaded.experiment, loaded.policy.to(device).actor(count), target, count, device, seed, build)
     env = built[0]
     parts = (env.time, env.kept["ball"], env.kept["vel"], env.kept["vehicle"], env.kept["landing"], env.bow, env.slack)
     return Releases(*(part.cpu().numpy().astype(float) for part in parts))

@@ -105,7 +105,7 @@ def _columns(unit: ThrowUnit, out: Path, device: str) -> dict[str, np.ndarray]:
     if unit.params.plant == "hybrid":
         device = resolve(device)
         policy = loaded.policy.to(device)
-        return results.columns_of(throw(loaded.experiment, policy.act, unit.target, unit.count, device, unit.params.seed))
+        return results.columns_of(throw(loaded.experiment, policy.actor(unit.count), unit.target, unit.count, device, unit.params.seed))
     torch.set_num_threads(1)
     return fly_batch([loaded], unit.params.plant, Job((0,), unit.target, unit.batch, unit.count, unit.params.seed))
 

@@ -2,14 +2,13 @@
 
 import math
 import time
-from collections.abc import Callable
 from types import SimpleNamespace
 
 import torch
 import warp as wp
 from torch import Tensor
 
-from sim.arrays.torch_bridge import on_torch_stream
+from sim.arrays.torch_bridge import Replayed, on_torch_stream
 from sim.params import GRAVITY
 from visthrow.common.errors import ConfigError
 from visthrow.onboard import actions as act
@@ -32,34 +31,6 @@ OUTLIER = 4.0
 
 STEPS_AT_ONCE = 4
 """Of a flight whose Jacobians are taken together on the way: they fit a core's cache."""
-
-
-class Replayed:
-    """Work on fixed tensors of a GPU: done eagerly at first, then captured in a CUDA graph and replayed, on a stream of its own.
-
-    For work without autograd: capturing that failed on an H200 (cudaErrorStreamCaptureUnsupported).
-    """
-
-    EAGER = 3
-
-    def __init__(self, work: Callable[[], None]):
-        self._work, self._done, self._graph, self._stream = work, 0, None, torch.cuda.Stream()
-
-    def __call__(self) -> None:
-        """Do the work."""
-        self._stream.wait_stream(torch.cuda.current_stream())
-        if self._graph is None and self._done == self.EAGER:
-            torch.cuda.synchronize()
-            self._graph = torch.cuda.CUDAGraph()
-            with torch.cuda.graph(self._graph, stream=self._stream):
-                self._work()
-        with torch.cuda.stream(self._stream):
-            if self._graph is None:
-                self._work()
-                self._done += 1
-            else:
-                self._graph.replay()
-        torch.cuda.current_stream().wait_stream(self._stream)
 
 
 class FirstOrder:

@@ -1,0 +1,228 @@
+"""A vision policy with a memory, distilled from a state policy: an estimator learns what the state policy looks at.
+
+The state policy decides; in place of its observation it is given the estimate that a recurrent network makes of all that a
+vision policy has seen (:mod:`visthrow.onboard.estimator`). The network flies, first with the state policy's exact observation
+in some throws and then alone, and is fitted by regression to that exact observation on the states that it meets (DAgger: Ross
+et al., AISTATS 2011), with backpropagation through the whole throw.
+"""
+
+import math
+import time
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from sim.arrays.torch_bridge import Replayed
+from visthrow.common.errors import ConfigError
+from visthrow.onboard import actions as act
+from visthrow.onboard import observations as ob
+from visthrow.onboard.estimator import Estimator
+from visthrow.onboard.policy import Policy, find_policy
+from visthrow.task import Experiment, contract_of
+from visthrow.training.env import ThrowEnv
+
+SCALES = (0.02, 0.05, 0.2, 0.02, 0.02, 0.01)
+"""Errors that count alike: of position [m], velocity [m/s], body rates [rad/s], rotation [-], goal and payload offsets [m]."""
+
+WATCHED = 50
+"""Iterations in which the observations' mean and spread are taken; from there they stand still."""
+
+
+class Network(nn.Module):
+    """The estimator as it is trained; see :class:`visthrow.onboard.estimator.Estimator` for its parts and shapes."""
+
+    def __init__(self, kept: Tensor, learnt: Tensor, width: int, hidden: int, memory: int):
+        """Begin with an estimate of what is kept.
+
+        Args:
+            kept: entry of the observation that each estimate corrects, ``width`` for none, shape (S,).
+            learnt: which estimates are learnt, bool, shape (S,); the others are what is kept.
+            width: D. hidden: N. memory: H.
+        """
+        super().__init__()
+        self.encoder, self.gru, self.output = nn.Linear(width, hidden), nn.GRU(hidden, memory), nn.Linear(memory, len(kept))
+        with torch.no_grad():
+            self.output.weight.mul_(0.1)
+            self.output.bias.zero_()
+        for name, value in (("kept", kept), ("learnt", learnt.float()), ("sums", torch.zeros(3, width, dtype=torch.float64))):
+            self.register_buffer(name, value)
+
+    def watch(self, obs: Tensor) -> None:
+        """Take observations, shape (N, D), into their mean and spread."""
+        x = obs.double()
+        self.sums.add_(torch.stack([torch.full_like(x[0], len(x)), x.sum(0), x.square().sum(0)]))
+
+    def frozen(self) -> Estimator:
+        """The estimator that flies; it shares the parameters."""
+        count, total, squares = self.sums
+        mean = total / count.clamp(min=1.0)
+        std = (squares / count.clamp(min=1.0) - mean.square()).clamp(min=0.0).sqrt()
+        mask, gru = self.learnt, self.gru
+        parts = [mean.float(), torch.where(count > 0, std, torch.ones_like(std)).float() + 0.01, self.encoder.weight, self.encoder.bias]
+        parts += [gru.weight_ih_l0, gru.bias_ih_l0, gru.weight_hh_l0, gru.bias_hh_l0]
+        parts += [self.output.weight * mask[:, None], self.output.bias * mask, self.kept]
+        return Estimator(*(part.detach() for part in parts))
+
+    def forward(self, obs: Tensor, mean: Tensor, std: Tensor) -> Tensor:
+        """Estimates, shape (T, E, S), along throws, shape (T, E, D), under the estimator's normaliser."""
+        x, _ = self.gru(F.elu(self.encoder((obs - mean) / std)))
+        return F.pad(obs, (0, 1))[..., self.kept] + self.output(x) * self.learnt
+
+
+class Distillation:
+    """Distillation of a state policy; see :class:`visthrow.training.trainer.Algorithm`.
+
+    Attributes:
+        teacher: the state policy. network: what is fitted.
+    """
+
+    def __init__(self, experiment: Experiment, device: str, seed: int, ranks: dict | None = None):
+        """Load the state policy and start the network.
+
+        Args:
+            experiment: the run's configuration; the environments of ``ppo`` are the throws of an iteration.
+            device: "cpu" or "cuda:0".
+            seed: of the environment; torch's own generators are the caller's to seed.
+            ranks: of a distributed run.
+
+        Raises:
+            ConfigError: A distributed run, moving goals, or no vision layout with a history of the payload.
+            MismatchError: The state policy acts otherwise than this task.
+        """
+        self.cfg, self.p = experiment, experiment.distillation
+        seen = experiment.task.observation
+        if ranks or experiment.task.target.moves or seen.layout != "vision" or seen.history_of != "payload":
+            expected = 'one process, goals that stand still, observation.layout = "vision" and observation.history_of = "payload"'
+            raise ConfigError(f'algorithm = "distillation" takes {expected}')
+        self.teacher = Policy.load(find_policy(self.p.teacher), device)
+        self.teacher.require(contract_of(experiment), ("action", "control_period", "release"))
+        contract = self.teacher.contract["observation"]
+        if contract["layout"] != "state" or self.teacher.estimator is not None:
+            raise ConfigError(f"distillation.teacher {self.p.teacher!r} has the layout {contract['layout']!r}; expected 'state'")
+        self.env = env = ThrowEnv(experiment, device, seed)
+        self.iterations, E, T = self.p.iterations, env.num_envs, self.p.horizon
+        self.samples = E * T
+        self._layout = ob.Layout("state", 2, 3, contract["history"], 0)
+        self._age = sum(contract["latency"]) / 2.0
+        kept, learnt = _passed(env.layout, self._layout)
+        self.network = Network(kept, learnt, env.layout.dimension, self.p.hidden, self.p.memory).to(device)
+        widths = (3, 3, 3, 6, ob.VEHICLE - 15 + 5, 2, 3 * (1 + self._layout.history), 1)
+        scales = [SCALES[0], SCALES[1], SCALES[2], SCALES[3], 1.0, SCALES[4], SCALES[5], 1.0]
+        make = {"device": device, "dtype": torch.float32}
+        self._scales = torch.cat([torch.full((width,), scale, **make) for width, scale in zip(widths, scales)])
+        self._obs, self._truth = torch.zeros(T, E, env.layout.dimension, **make), torch.zeros(T, E, self._layout.dimension, **make)
+        self._alive, self._led = torch.zeros(T, E, **make), torch.zeros(E, 1, device=device, dtype=torch.bool)
+        self._history = torch.zeros(E, 1 + self._layout.history, self._layout.row, **make)
+        self._flying = self.network.frozen()
+        on_gpu = device.startswith("cuda")
+        self.optimizer = torch.optim.Adam(self.network.parameters(), lr=self.p.learning_rate, fused=on_gpu)
+        self.rollout = Replayed(self._fly) if on_gpu else self._fly
+
+    @torch.no_grad()
+    def _fly(self) -> None:
+        """Fly one batch from new starts and record what was seen, what there was, and until when each throw lasted."""
+        env, policy = self.env, self.teacher
+        seen, memory = env.reset()["actor"], torch.zeros(env.num_envs, self.p.memory, device=env.device)
+        fresh, alive = torch.ones_like(self._led[:, 0]), torch.ones_like(self._alive[0])
+        for k in range(self.p.horizon):
+            self._obs[k].copy_(seen)
+            truth, history = ob.observe(
+                self._layout, env.exact_frame(self._age), None, env.previous_action, env.views.state["attached"].float(), self._history,
+                fresh if k == 0 else ~fresh,
+            )  # fmt: skip
+            self._history.copy_(history)
+            self._truth[k].copy_(truth)
+            self._alive[k].copy_(alive)
+            estimate, memory = self._flying.step(seen, memory)
+            action = policy.decide(torch.where(self._led, truth, estimate))
+            observations, _, done, _ = env.step(action)
+            seen, alive = observations["actor"], alive * (done == 0)
+
+    def step(self, done: float) -> dict[str, float]:
+        """One rollout and the gradient steps on it at this share of the training; returns its figures."""
+        p, start = self.p, time.perf_counter()
+        led = self.env.num_envs * max(1.0 - done / p.alone, p.led)
+        self._led.copy_((torch.arange(self.env.num_envs, device=self.env.device) < led)[:, None])
+        self.env.clear_totals()
+        self.rollout()
+        if self.env.device.startswith("cuda"):
+            torch.cuda.synchronize()
+        middle = time.perf_counter()
+        rate = p.final_rate + 0.5 * (p.learning_rate - p.final_rate) * (1.0 + math.cos(math.pi * done))
+        for group in self.optimizer.param_groups:
+            group["lr"] = rate
+        if done * self.iterations < WATCHED:
+            self.network.watch(self._obs.flatten(0, 1))
+        figures = self._descend()
+        times = {"rollout_s": middle - start, "learning_s": time.perf_counter() - middle}
+        return figures | self.env.episode_means() | times | {"learning_rate": rate}
+
+    def _descend(self) -> dict[str, float]:
+        """Fit the last rollout, each throw once an epoch."""
+        self._refresh()
+        mean, std = self._flying.mean, self._flying.std
+        total = torch.zeros((), device=self.env.device)
+        for _ in range(self.p.epochs):
+            for rows in torch.randperm(self.env.num_envs, device=self.env.device).chunk(self.p.minibatches):
+                obs, truth, alive = self._obs[:, rows], self._truth[:, rows], self._alive[:, rows]
+                estimate = self.network(obs, mean, std)
+                off = F.smooth_l1_loss(estimate / self._scales, truth / self._scales, reduction="none").mean(-1)
+                wanted, action = act.clip_action(self.teacher.decide(truth)), self.teacher.decide(estimate)
+                wrong = (act.clip_action(action) - wanted).detach()  # beyond the limits only the way back counts
+                acted = (wrong * action).sum(-1) if self.p.action_weight else 0.0
+                loss = (alive * (off + self.p.action_weight * acted)).sum() / alive.sum()
+                self.optimizer.zero_grad(set_to_none=True)
+                loss.backward()
+                nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
+                self.optimizer.step()
+                total += (alive * off).sum().detach() / alive.sum()
+        self._refresh()
+        return {"value": float(total) / (self.p.epochs * self.p.minibatches)}
+
+    def _refresh(self) -> None:
+        """Take the network's state into what flies, in place: a captured rollout reads these tensors."""
+        for name, value in vars(self.network.frozen()).items():
+            getattr(self._flying, name).copy_(value)
+
+    def export(self, contract: dict, made_by: dict) -> Policy:
+        """The policy as a file's content."""
+        t = self.teacher.to("cpu")
+        estimator = Estimator(**{name: value.detach().cpu().clone() for name, value in vars(self.network.frozen()).items()})
+        return Policy(t.weights, t.biases, t.activation, contract, made_by, t.mean, t.std, t.eps, estimator)
+
+    def take_up(self, policy: Policy) -> None:
+        """Start from a policy with an estimator of the same shape."""
+        e, n = policy.estimator, self.network
+        if e is None or e.input_weight.shape != n.gru.weight_ih_l0.shape:
+            raise ConfigError("--from: the policy has no estimator of this configuration's shape to start from")
+        parts = {"encoder.weight": e.encoder_weight, "encoder.bias": e.encoder_bias, "gru.weight_ih_l0": e.input_weight,
+                 "gru.bias_ih_l0": e.input_bias, "gru.weight_hh_l0": e.memory_weight, "gru.bias_hh_l0": e.memory_bias,
+                 "output.weight": e.output_weight, "output.bias": e.output_bias}  # fmt: skip
+        n.load_state_dict(n.state_dict() | parts)
+        count, std = 1e8, (e.std - 0.01).double()
+        n.sums.copy_(torch.stack([torch.full_like(std, count), count * e.mean, count * (std.square() + e.mean.double().square())]))
+        self._refresh()
+
+    def state_dict(self) -> dict:
+        """All that the next iteration depends on, besides torch's generators."""
+        return {"network": self.network.state_dict(), "optimizer": self.optimizer.state_dict(), "env": self.env.state_dict()}
+
+    def load_state_dict(self, saved: dict, own_throws: bool = True) -> None:
+        """Take up a state of :meth:`state_dict`; its environment too where ``own_throws`` is set."""
+        self.network.load_state_dict(saved["network"])
+        self.optimizer.load_state_dict(saved["optimizer"])
+        self._refresh()
+        if own_throws:
+            self.env.load_state_dict(saved["env"])
+
+
+def _passed(seen: ob.Layout, wanted: ob.Layout) -> tuple[Tensor, Tensor]:
+    """Which entry of a vision observation each entry of a state observation corrects, and which of these are learnt."""
+    none, vehicle = seen.dimension, list(range(ob.VEHICLE + 5))
+    attached = seen.dimension - seen.validity - seen.motion - 1
+    between = wanted.dimension - len(vehicle) - 1
+    kept = torch.tensor([*vehicle, *[none] * between, attached])
+    learnt = torch.ones(wanted.dimension, dtype=torch.bool)
+    learnt[ob.VEHICLE : ob.VEHICLE + 5] = learnt[-1] = False  # the action before and the latch are known
+    return kept, learnt
