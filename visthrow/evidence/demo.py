@@ -4,10 +4,11 @@ import argparse
 import time
 from pathlib import Path
 
+from visthrow.common.errors import ConfigError
 from visthrow.throws import compare, fly
 
 THROWS, TARGETS = 100, (1.5, 2.0, 2.5)
-"""In the training simulator, for each policy."""
+"""In the training simulator, for each policy; ``--throws`` asks for another number."""
 
 REFERENCE_THROWS, REFERENCE_TARGETS = 6, (2.0,)
 """On the reference plant, for each policy; one such throw costs seconds."""
@@ -22,6 +23,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", default="out/demo", metavar="FOLDER", help="for pictures, tables and recording (default: out/demo)"
     )
+    parser.add_argument(
+        "--throws", type=int, default=THROWS, metavar="N",
+        help=f"for each policy and target in the training simulator (default: {THROWS}); on the reference plant {REFERENCE_THROWS} at most",
+    )  # fmt: skip
 
 
 def run(args: argparse.Namespace) -> int:
@@ -31,21 +36,23 @@ def run(args: argparse.Namespace) -> int:
     from visthrow.throws.loading import load_policy
     from visthrow.view.tables import PAPER_NOTE
 
-    begin = time.perf_counter()
+    if args.throws < 1:
+        raise ConfigError(f"--throws {args.throws}; expected 1 or more")
+    begin, few = time.perf_counter(), min(args.throws, REFERENCE_THROWS)
     loaded = [load_policy(name) for name in POLICIES]
     folder = Path(args.out)
     compare.writable(folder)
     if importlib.util.find_spec("mujoco") is None:
-        paths = _here(loaded, folder)
+        paths = _here(loaded, folder, args.throws)
         print("The reference plant is left out: it needs MuJoCo, pip install 'visthrow[reference]'\n")
     else:
         from visthrow.throws.reference_protocol import Throwing
 
         # The reference plant flies in a process of its own meanwhile.
-        throws = (loaded, REFERENCE_TARGETS, REFERENCE_THROWS, "reference-realistic", SEED, 1)
+        throws = (loaded, REFERENCE_TARGETS, few, "reference-realistic", SEED, 1)
         with Throwing(*throws, together=True) as throwing:
-            paths = _here(loaded, folder)
-            print(f"{REFERENCE_THROWS} throws a policy on the reference plant, which stands in for a real vehicle ...", flush=True)
+            paths = _here(loaded, folder, args.throws)
+            print(f"{few} throws a policy on the reference plant, which stands in for a real vehicle ...", flush=True)
             paths += _told(loaded, throwing.results(), "reference-realistic", folder)
     print(PAPER_NOTE + "\n\nFiles:")
     for path in paths:
@@ -54,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _here(loaded: list, folder: Path) -> list[Path]:
+def _here(loaded: list, folder: Path, throws: int) -> list[Path]:
     """One recorded throw, and many in the training simulator."""
     from visthrow.throws.recorded import fly as throw_once
 
@@ -62,8 +69,8 @@ def _here(loaded: list, folder: Path) -> list[Path]:
     log = throw_once(loaded[1], [2.0, 0.0, 0.0], "hybrid", SEED)
     paths = fly.write(folder, log, loaded[1].experiment)
     print(fly.story(log) + "\n")
-    print(f"{THROWS} throws a policy and target in the training simulator ...", flush=True)
-    return paths + _told(loaded, compare.throw_hybrid(loaded, TARGETS, THROWS, "cpu", SEED), "hybrid", folder)
+    print(f"{throws} throws a policy and target in the training simulator ...", flush=True)
+    return paths + _told(loaded, compare.throw_hybrid(loaded, TARGETS, throws, "cpu", SEED), "hybrid", folder)
 
 
 def _told(loaded: list, throws: list, plant: str, folder: Path) -> list[Path]:
