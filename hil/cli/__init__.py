@@ -93,7 +93,10 @@ def _add_simulated(fake: argparse.ArgumentParser, direct: argparse.ArgumentParse
     direct.add_argument("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE")
     direct.add_argument("--seeds", type=seed, nargs="+", default=[0], metavar="N", help="of starts, noise and loss; a throw each")
     fake.add_argument("--rate", type=float, default=100.0, metavar="HZ", help="poses a second of each body")
+    direct.add_argument("--policy", default=None, metavar="POLICY", help="whose plant is flown (default: the one that throws)")
     for parser in (fake, direct):
+        parser.add_argument("--firmware", default=None, metavar="PROGRAM", help="Betaflight's for a PC, to fly the plant's motors")
+        parser.add_argument("--folder", default="out/firmware", metavar="FOLDER", help="of the firmware's settings and blackbox")
         parser.add_argument(
             "--plant", default=None, metavar="MODULE:FUNCTION",
             help="that makes the vehicle (default: visthrow.throws.wire_plant:make, behind a firmware :make_motors)",
@@ -111,8 +114,6 @@ def _add_simulated(fake: argparse.ArgumentParser, direct: argparse.ArgumentParse
     fake.add_argument(
         "--kind", default="ardupilot", help="of autopilot: ardupilot, px4, betaflight; betaflight-sitl is a bridge to its firmware"
     )
-    fake.add_argument("--firmware", default=None, metavar="PROGRAM", help="that betaflight-sitl starts")
-    fake.add_argument("--folder", default="out/firmware", metavar="FOLDER", help="of the firmware's settings and blackbox")
     fake.add_argument("--config", default="betaflight_sitl", metavar="NAME", help="of the run that the firmware is set up for")
     fake.add_argument("--msp-port", type=int, default=14561, help="where the fake Betaflight listens")
     fake.add_argument(

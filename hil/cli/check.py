@@ -45,7 +45,7 @@ def _hover(args: argparse.Namespace) -> int:
 def _opened(params: HilParams, args: argparse.Namespace) -> Iterator[tuple[Any, Any, Clock, bool]]:
     """Source, the autopilot's link, clock, and whether the poses are recorded ones."""
     with tempfile.TemporaryDirectory() as folder:
-        source, link, recorded = open_source(params, Path(folder), args.speed, key_of(args))
+        source, link, recorded = open_source(params, Path(folder), MonotonicClock(args.speed), key_of(args))
         try:
             yield source, link, ManualClock(source.start) if recorded else MonotonicClock(args.speed), recorded
         finally:

@@ -73,7 +73,7 @@ def fly(args: argparse.Namespace) -> int:
         require_fake(params)
     folder = Path(args.out or f"runs/hil/{time.strftime('%Y%m%d-%H%M%S')}")
     policy, voice = Policy.load(find_policy(params.policy)), Voice()
-    source, link, recorded = open_source(params, folder, args.speed, key_of(args), voice.say)
+    source, link, recorded = open_source(params, folder, MonotonicClock(args.speed), key_of(args), voice.say)
     clock = ManualClock(source.start) if recorded else MonotonicClock(args.speed)
     require_reach(params, policy.contract)
     backend = make_backend(params, link, not recording and args.write_parameters, voice.say, folder)

@@ -12,7 +12,7 @@ from hil.fakes.base import Options
 from hil.fakes.direct import Direct, scored
 from hil.fakes.mocap import MocapParams
 from hil.fakes.process import VEHICLE_ID, ListeningPort, load_plant, make_fake, read_options, serve
-from hil.fakes.sitl import SLOW, BetaflightSitl, Firmware, MotorPlant, favour, needed
+from hil.fakes.sitl import SLOW, BetaflightSitl, Firmware, MotorPlant, needed, throw
 from hil.links.clock import Clock, MonotonicClock
 from hil.links.device import check_device, open_port
 from hil.links.mavlink_link import Link
@@ -25,11 +25,18 @@ PLANT, MOTORS = "visthrow.throws.wire_plant:make", "visthrow.throws.wire_plant:m
 
 
 def direct(args: argparse.Namespace) -> int:
-    """Throw without a wire; a line of JSON a seed."""
+    """Throw without a wire, or through a firmware in lock step; a line of JSON a seed."""
     params = params_of(args)
     policy, mocap = Policy.load(find_policy(params.policy)), MocapParams()
+    plant = args.plant or (PLANT if args.firmware is None else MOTORS)
     for seed in args.seeds:
-        report = Direct(load_plant(args.plant or PLANT, params.policy, seed), policy, params, mocap, seed).throw()
+        flown = load_plant(plant, args.policy or params.policy, seed)
+        if args.firmware is None:
+            report = Direct(flown, policy, params, mocap, seed).throw()
+        else:
+            report = throw(args.firmware, Path(args.folder) / f"{seed:03d}", params, policy, flown, mocap, seed)
+            summary = report.pop("run")
+            report |= {"start": None, "state": summary["state"], "reason": summary["reason"]}
         print(json.dumps({"seed": seed, **scored(report, params, report["start"]), **report}), flush=True)
     return 0
 
@@ -62,10 +69,10 @@ def _fly_firmware(
     firmware = Firmware(args.firmware, args.folder)
     try:
         kept = firmware.set_up(needed(params))
+        firmware.start()
         print("".join(f"{name:28} {value}\n" for name, value in kept.items()), end="", file=sys.stderr)
-        flown = BetaflightSitl(plant, link, mocap, args.seed, options, params)
-        favour()
-        flown.sensors.start(args.speed)
+        flown = BetaflightSitl(plant, link, mocap, args.seed, options, params, firmware.stands)
+        flown.sensors.start()
         print("the firmware has its settings; it flies", file=sys.stderr, flush=True)
         report = serve(flown, clock, args.seconds, out, args.after)
         flown.close()

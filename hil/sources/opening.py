@@ -6,7 +6,7 @@ from typing import Any
 
 from hil.backends import AUTOPILOTS
 from hil.errors import LinkError, SourceError
-from hil.links.clock import MonotonicClock
+from hil.links.clock import Clock
 from hil.links.device import check_device, open_port
 from hil.links.mavlink_link import Link, TlogWriter
 from hil.links.roster import Party, Roster
@@ -54,14 +54,14 @@ def parties(params: HilParams, poses: bool, autopilot: bool) -> list[Party]:
 
 
 def open_source(
-    params: HilParams, folder: Path, speed: float, key: bytes | None = None, tell: Callable[[str], None] | None = None
+    params: HilParams, folder: Path, clock: Clock, key: bytes | None = None, tell: Callable[[str], None] | None = None
 ) -> tuple[Any, Link | None, bool]:  # fmt: skip
     """Open a source.
 
     Args:
         params: the run.
         folder: of the run, where a link's .tlog goes.
-        speed: of the clock.
+        clock: of what arrives.
         key: that the links' messages are signed with; None: they are not.
         tell: is handed who is refused; never waits.
 
@@ -78,7 +78,7 @@ def open_source(
         if problems:
             raise SourceError(f"{source.file}: {'; '.join(problems)} (source.check_units=false lets it pass)")
         return Recorded(poses), None, True
-    clock, own = MonotonicClock(speed).now, source.kind == "mavlink" and source.device is not None
+    own = source.kind == "mavlink" and source.device is not None
 
     def opened(device: str, tlog: str, who: list[Party]) -> Link:
         port = open_port(check_device(device, remote=params.link.remote))
@@ -96,8 +96,8 @@ def open_source(
     if (source.kind == "mavlink" and not own) or params.backend in AUTOPILOTS:
         link = opened(params.link.device, TLOG, parties(params, source.kind == "mavlink" and not own, True))
     if source.kind != "mavlink":
-        return open_mocap(source.mocap, source.bodies, clock, params.link.remote, link), link, False
+        return open_mocap(source.mocap, source.bodies, clock.now, params.link.remote, link), link, False
     if not own:
-        return MavlinkSource(link, source.senders, clock), link, False
+        return MavlinkSource(link, source.senders, clock.now), link, False
     poses = opened(source.device, POSES_TLOG, parties(params, True, False))
-    return MavlinkSource(poses, source.senders, clock, link), link, False
+    return MavlinkSource(poses, source.senders, clock.now, link), link, False

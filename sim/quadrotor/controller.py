@@ -105,6 +105,50 @@ def rate_controller_betaflight(
 
 
 @wp.func
+def rate_controller_motor_mixing(
+    p: Any, command: Any, rate_b: Any, integral: Any, setpoint: Any, gyro: Any, voltage: Any
+):
+    """PID whose output is added to motor commands, with iterm_relax, as Betaflight's firmware has them.
+
+    Returns:
+        As of `rate_controller_betaflight`; the set-point filter is that of iterm_relax.
+    """
+    c = p.controller
+    zero, one = voltage - voltage, type(voltage)(1.0)
+    asked = type(rate_b)(command[1], command[2], command[3])
+    setpoint_rate = (asked - setpoint) / c.setpoint_time_constant
+    gyro_rate = (rate_b - gyro) / c.gyro_time_constant
+    error = asked - gyro
+    integral_rate = wp.cw_mul(c.i_gain, error)
+    for i in range(3):
+        if i < 2:
+            integral_rate[i] = integral_rate[i] * wp.max(one - wp.abs(asked[i] - setpoint[i]) / c.relax_threshold, zero)
+        if integral_rate[i] * integral[i] > zero and wp.abs(integral[i]) >= c.integral_limit[i]:
+            integral_rate[i] = zero
+    torque = (
+        wp.cw_mul(c.p_gain, error)
+        + integral
+        - wp.cw_mul(c.d_gain, gyro_rate)
+        + wp.cw_mul(c.feedforward_gain, setpoint_rate)
+    )
+    two, quarter = type(voltage)(2.0), type(voltage)(0.25)
+    idle = wp.sqrt(c.min_thrust / c.max_thrust)
+    share = p.mixer.roll * torque[0] + p.mixer.pitch * torque[1] + p.mixer.yaw * torque[2]
+    share = share / (two * wp.sqrt(c.mix_thrust * c.max_thrust))
+    spread = wp.max(share) - wp.min(share)
+    if spread > one - idle:
+        share = share * ((one - idle) / spread)
+    base = wp.sqrt(wp.max(command[0], zero) * quarter / c.max_thrust)
+    base = wp.clamp(base, idle - wp.min(share), one - wp.max(share))
+    full = wp.sqrt(c.max_thrust / p.thrust.k_f)
+    full = full * (one + (one - c.voltage_compensation) * (voltage / c.calibration_voltage - one))
+    speed = share
+    for i in range(4):
+        speed[i] = wp.max(share[i] + base, zero) * full
+    return speed, integral_rate, setpoint_rate, gyro_rate
+
+
+@wp.func
 def rate_controller_geometric(p: Any, command: Any, rate_b: Any, integral: Any, setpoint: Any, gyro: Any, voltage: Any):
     """Proportional rate controller with the gyroscopic term, each rotor clipped by itself (the paper's ablation)."""
     rate_command = type(rate_b)(command[1], command[2], command[3])

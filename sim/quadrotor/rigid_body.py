@@ -12,7 +12,11 @@ from sim.arrays.structs import Types
 from sim.params import VehicleParams
 from sim.quadrotor import aero, battery, composer, controller, motor, thrust
 
-CONTROLLERS = {"betaflight": controller.rate_controller_betaflight, "geometric": controller.rate_controller_geometric}
+CONTROLLERS = {
+    "betaflight": controller.rate_controller_betaflight,
+    "motor_mixing": controller.rate_controller_motor_mixing,
+    "geometric": controller.rate_controller_geometric,
+}
 MOTORS = {
     "first_order": (motor.motor_rate_first_order, motor.motor_advance_first_order),
     "instant": (motor.motor_rate_instant, motor.motor_advance_instant),

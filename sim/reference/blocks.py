@@ -122,6 +122,35 @@ def betaflight(
     return np.sqrt(thrusts / vehicle.thrust.k_f) * correction[:, None], setpoint_dot, gyro_dot, integral_dot
 
 
+def motor_mixing(
+    vehicle: VehicleParams, filters: np.ndarray, command: np.ndarray, rate: np.ndarray, voltage: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Rate controller that mixes motor commands and relaxes its integral; arguments and result as of :func:`betaflight`.
+
+    ``filters`` are low-pass of the command, of the gyro, and integral, shape (E, 9).
+    """
+    gains: ControllerParams = vehicle.controller
+    low, gyro, integral = np.split(filters, 3, axis=1)
+    asked = command[:, 1:]
+    low_dot = (asked - low) / gains.setpoint_time_constant
+    gyro_dot = (rate - gyro) / gains.gyro_time_constant
+    torque = np.array(gains.p_gain) * (asked - gyro) + integral
+    torque = torque - np.array(gains.d_gain) * gyro_dot + np.array(gains.feedforward_gain) * low_dot
+    relaxed = np.clip(1.0 - np.abs(asked - low) / gains.relax_threshold, 0.0, None)
+    relaxed[:, 2] = 1.0
+    integral_dot = np.array(gains.i_gain) * (asked - gyro) * relaxed
+    windup = (np.abs(integral) >= np.array(gains.integral_limit)) & (integral_dot * integral > 0.0)
+    tilt, yaw = _motor_shares(torque, vehicle.rotors, vehicle.thrust.torque_ratio)
+    added = (tilt + yaw) * 0.5 / np.sqrt(gains.mix_thrust * gains.max_thrust)
+    idle = np.sqrt(gains.min_thrust / gains.max_thrust)
+    added = added / np.maximum(np.ptp(added, axis=1) / (1.0 - idle), 1.0)[:, None]
+    throttle = np.sqrt(np.maximum(command[:, :1], 0.0) / 4.0 / gains.max_thrust)
+    throttle = np.maximum(np.minimum(throttle, 1.0 - added.max(axis=1, keepdims=True)), idle - added.min(axis=1, keepdims=True))
+    relative = voltage / gains.calibration_voltage
+    factor = np.sqrt(gains.max_thrust / vehicle.thrust.k_f) * (1.0 + (1.0 - gains.voltage_compensation) * (relative - 1.0))
+    return factor[:, None] * np.maximum(throttle + added, 0.0), low_dot, gyro_dot, np.where(windup, 0.0, integral_dot)
+
+
 def geometric(vehicle: VehicleParams, command: np.ndarray, rate: np.ndarray) -> np.ndarray:
     """Return the motor-speed set-points of the simple rate controller [rad/s], shape (E, 4)."""
     gains = vehicle.controller

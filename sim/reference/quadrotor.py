@@ -99,6 +99,10 @@ def vehicle_rates(
     rates = np.zeros_like(state)
     if vehicle.controller.kind == "geometric":
         setpoint = blocks.geometric(vehicle, command, rate_b)
+    elif vehicle.controller.kind == "motor_mixing":
+        setpoint, rates[:, 0:3], rates[:, 3:6], rates[:, 6:9] = blocks.motor_mixing(
+            vehicle, state[:, 0:9], command, rate_b, voltage
+        )
     else:
         setpoint, rates[:, 0:3], rates[:, 3:6], rates[:, 6:9] = blocks.betaflight(
             vehicle, state[:, 0:3], state[:, 3:6], state[:, 6:9], command, rate_b, voltage

@@ -7,6 +7,7 @@ import socket
 import pytest
 
 from hil.backends import make_backend
+from hil.links.clock import MonotonicClock
 from hil.links.device import check_device, open_port
 from hil.links.mavlink_link import Link
 from hil.links.pymav import mav
@@ -30,7 +31,7 @@ class Wire:
         self.number, self.other = free_port(), free_port()
         given = (f'link.device="udp:127.0.0.1:{self.number}"', *(o.format(other=self.other) for o in overrides))
         self.params = config.load(HilParams, config.find("hil", base), given)
-        self.source, self.link, _ = open_source(self.params, folder, 1.0, None, self.said.append)
+        self.source, self.link, _ = open_source(self.params, folder, MonotonicClock(), None, self.said.append)
         self.backend = make_backend(self.params, self.link)
 
     def peer(self, system=1, component=1, number=None):

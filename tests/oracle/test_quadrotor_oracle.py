@@ -68,8 +68,8 @@ def test_a_second_of_full_range_commands(precision):
 @pytest.mark.parametrize(
     "changes",
     [
-        {}, {"delay": 0.0}, {"delay": 0.0467}, {"delay": 0.04}, {"controller": "geometric"}, {"motor": "instant"},
-        {"battery": "ideal"}, {"aero": "none"},
+        {}, {"delay": 0.0}, {"delay": 0.0467}, {"delay": 0.04}, {"controller": "geometric"}, {"controller": "motor_mixing"},
+        {"motor": "instant"}, {"battery": "ideal"}, {"aero": "none"},
     ],
     ids=str,
 )

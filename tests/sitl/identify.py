@@ -16,6 +16,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from hil.fakes.sitl import Firmware, needed
+from hil.fakes.sitl.firmware import GAINS
 from hil.params import HilParams
 from sim.hybrid import HybridSim
 from sim.params import VehicleParams
@@ -39,19 +40,20 @@ SIZES = ((1.0, 2.5, 5.0, 8.0), (1.0, 2.5, 5.0, 8.0), (0.5, 1.0, 2.0, 3.0))
 LIFTS = (0.6, 1.0, 1.5, 2.2)
 """Thrust during a doublet, times that of the hover."""
 
+RELAX, IDLE = 1.0 / (2.0 * np.pi * 15.0), 0.055
+"""Of iterm_relax_cutoff, 15 Hz [s]; motor_idle, 5.5 %."""
+
 STALL = 3
 """Periods without a motor output that count as a stall of the firmware."""
 
-NAMES = ("delay", "setpoint", "gyro", "p", "i", "d", "ff", "p_yaw", "i_yaw", "ff_yaw")
+NAMES = ("delay", "gyro", "voltage", "p", "i", "d", "p_yaw", "i_yaw")
 
 
 def fly(folder: Path, seconds: float, seed: int = 0) -> dict[str, np.ndarray]:
     """Hover through the firmware with a doublet of a rate now and then; states and commands of each period."""
     settings = folder / "settings"
     if not (settings / "eeprom.bin").exists():
-        firmware = Firmware(bench.program(), settings)
-        firmware.set_up(needed(config.load(HilParams, config.find("hil", "betaflight_sitl")).betaflight))
-        firmware.stop()
+        Firmware(bench.program(), settings).set_up(needed(config.load(HilParams, config.find("hil", "betaflight_sitl")).betaflight))
     run = folder / "run"
     run.mkdir(parents=True, exist_ok=True)
     desk = bench.Bench(run, settings)
@@ -75,31 +77,35 @@ def fly(folder: Path, seconds: float, seed: int = 0) -> dict[str, np.ndarray]:
             if doublet is not None and plant.time - doublet[2] < 2 * doublet[3] - 1e-6:
                 command[1:] = 0.0
                 command[1 + doublet[0]] = doublet[1] if plant.time - doublet[2] < doublet[3] - 1e-6 else -doublet[1]
+            desk.backend.send(command, plant.time)
+            desk.backend.service(plant.time)
             for _ in range(round(bench.TICK / PERIOD)):
                 now = plant.look()
                 pos = plant.state["pos_w"]
                 answered = desk.fake.answered
                 rows.append((plant.time, *now["rate_b"], *now["quat_wb"], *now["vel_w"], *pos, *command, answered))
-                desk.paced.step()
-            desk.backend.send(command, desk.clock.now())
-            desk.backend.service(desk.clock.now())
+                desk.fake.step()
     finally:
         desk.close()
-    return {"rows": np.array(rows), "starts": np.array(starts), "late": np.array(desk.paced.late / len(rows))}
+    return {"rows": np.array(rows), "starts": np.array(starts)}
 
 
 def changed(vehicle: VehicleParams, theta: np.ndarray) -> VehicleParams:
-    """The vehicle with other numbers in its controller: times [s] as they are, gains by 1 + the logarithm of their factor."""
-    delay, setpoint, gyro = theta[:3]
-    p, i, d, ff, p_yaw, i_yaw, ff_yaw = np.exp(theta[3:] - 1.0).tolist()
+    """The vehicle with the firmware's controller; numbers of it by `NAMES`: times [s], voltage [V], 1 + logarithms of factors of gains."""
+    delay, gyro, voltage = theta[:3].tolist()
+    p, i, d, p_yaw, i_yaw = np.exp(theta[3:] - 1.0).tolist()
     c = vehicle.controller
-    scale = lambda gain, both, yaw: (gain[0] * both, gain[1] * both, gain[2] * yaw)  # noqa: E731
-    controller = dataclasses.replace(
-        c, setpoint_time_constant=float(setpoint), gyro_time_constant=float(gyro), p_gain=scale(c.p_gain, p, p_yaw),
-        i_gain=scale(c.i_gain, i, i_yaw), d_gain=scale(c.d_gain, d, 1.0), feedforward_gain=scale(c.feedforward_gain, ff, ff_yaw),
-        integral_limit=tuple(10.0 * limit for limit in c.integral_limit),
+    scale = lambda gain, both, yaw, of: (  # noqa: E731
+        gain[0] * both, gain[1] * both * GAINS[f"{of}_pitch"] / GAINS[f"{of}_roll"], gain[2] * yaw,
     )  # fmt: skip
-    return dataclasses.replace(vehicle, controller=controller, queue=dataclasses.replace(vehicle.queue, delay=float(delay)))
+    full = c.max_thrust * (voltage / vehicle.battery.reference_voltage) ** 2
+    controller = dataclasses.replace(
+        c, kind="motor_mixing", setpoint_time_constant=RELAX, gyro_time_constant=gyro, p_gain=scale(c.p_gain, p, p_yaw, "p"),
+        i_gain=scale(c.i_gain, i, i_yaw, "i"), d_gain=scale(c.d_gain, d, 1.0, "d"), feedforward_gain=(0.0, 0.0, 0.0),
+        integral_limit=tuple(10.0 * limit for limit in c.integral_limit), max_thrust=full, min_thrust=full * IDLE**2,
+        calibration_voltage=voltage, voltage_compensation=0.0,
+    )  # fmt: skip
+    return dataclasses.replace(vehicle, controller=controller, queue=dataclasses.replace(vehicle.queue, delay=delay))
 
 
 class Windows:
@@ -144,15 +150,14 @@ class Windows:
 def fit(windows: Windows, chosen: np.ndarray) -> np.ndarray:
     """Numbers of :func:`changed` that fit the chosen windows best."""
     vehicle = windows.plant.vehicle
-    c = vehicle.controller
-    start = np.array([0.020, c.setpoint_time_constant, c.gyro_time_constant, *np.ones(7)])
-    low = np.array([0.0, 1e-3, 5e-4, *np.full(7, -3.0)])
-    high = np.array([0.06, 0.05, 0.03, *np.full(7, 5.0)])
+    start = np.array([0.004, 0.002, 16.5, *np.ones(5)])
+    low = np.array([0.0, 5e-4, 14.0, *np.full(5, -3.0)])
+    high = np.array([0.06, 0.03, 18.0, *np.full(5, 5.0)])
 
     def off(theta: np.ndarray) -> np.ndarray:
         return (windows.rates(changed(vehicle, theta), chosen) - windows.rows[chosen][:, :, 1:4]).ravel()
 
-    found = least_squares(off, start, bounds=(low, high), x_scale=[5e-3, 5e-3, 2e-3, *np.full(7, 0.5)], diff_step=1e-2, max_nfev=25)
+    found = least_squares(off, start, bounds=(low, high), x_scale=[5e-3, 2e-3, 0.3, *np.full(5, 0.5)], diff_step=1e-2, max_nfev=25)
     return found.x
 
 
@@ -182,7 +187,7 @@ def main() -> None:
     fitted = changed(shipped, theta)
     (args.out / "vehicle.toml").write_text(config.dumps(fitted))
     figures = {
-        "doublets": len(every), "stalled": windows.stalled, "late": float(flight["late"]), "shipped": windows.miss(shipped, held_out),
+        "doublets": len(every), "stalled": windows.stalled, "shipped": windows.miss(shipped, held_out),
         "fitted": windows.miss(fitted, held_out), "seen": windows.miss(fitted, seen),
         **{name: float(v if k < 3 else np.exp(v - 1.0)) for k, (name, v) in enumerate(zip(NAMES, theta))},
     }  # fmt: skip

@@ -21,9 +21,8 @@ from hil.backends import Betaflight
 from hil.backends.base import FOLLOW
 from hil.fakes.base import Options
 from hil.fakes.mocap import MocapParams
-from hil.fakes.process import VEHICLE_ID, Paced
-from hil.fakes.sitl import BetaflightSitl, Firmware, favour, needed
-from hil.links.clock import MonotonicClock
+from hil.fakes.process import VEHICLE_ID
+from hil.fakes.sitl import BetaflightSitl, Firmware, needed
 from hil.links.device import Device, UdpPort, check_device, open_port
 from hil.links.mavlink_link import Link
 from hil.params import HilParams
@@ -76,14 +75,11 @@ def settings(tmp_path_factory):
     """A folder with the firmware's settings, written and read back once, and what was read."""
     folder = tmp_path_factory.mktemp("firmware")
     params = config.load(HilParams, config.find("hil", "betaflight_sitl")).betaflight
-    firmware = Firmware(program(), folder)
-    kept = firmware.set_up(needed(params))
-    firmware.stop()
-    return folder, kept
+    return folder, Firmware(program(), folder).set_up(needed(params))
 
 
 class Bench:
-    """Firmware, bridge and the runner's back-end in one process, period by period."""
+    """Firmware, bridge and the runner's back-end in one process, in lock step."""
 
     def __init__(self, folder: Path, settings: Path):
         shutil.copy(settings / "eeprom.bin", folder)
@@ -92,23 +88,21 @@ class Bench:
         self.firmware.start()
         self.plant = make_motors("vision_dropout", 0)
         nobody = Link(UdpPort(Device("udpout", "127.0.0.1", 14999)), *VEHICLE_ID)
-        self.fake = BetaflightSitl(self.plant, nobody, MocapParams(), 0, Options(), self.params)
+        self.fake = BetaflightSitl(self.plant, nobody, MocapParams(), 0, Options(), self.params, self.firmware.stands)
         self.backend = Betaflight(open_port(check_device(self.params.device)), self.params)
-        self.clock = MonotonicClock(SPEED)
-        favour()
-        self.fake.sensors.start(SPEED)
-        self.paced, self._next = Paced(self.fake, self.clock), 0.0
+        self.fake.sensors.start()
+        self._next = 0.0
         self.rows: list[tuple] = []
 
     def turn(self, seconds, command=None, ask=None, until=None):
         """Fly for a time, or until something holds; a command is sent each tick."""
         end = self.plant.time + seconds
         while self.plant.time < end:
-            self.paced.step()
-            self.rows.append((self.plant.time, *self.plant.rate_b, self.plant.force_b[2], self.fake.motors.sum()))
-            if self.plant.time >= self._next:
-                self._next = self.plant.time + TICK
-                now = self.clock.now()
+            self.fake.step()
+            now = self.plant.time
+            self.rows.append((now, *self.plant.rate_b, self.plant.force_b[2], self.fake.motors.sum()))
+            if now >= self._next:
+                self._next = now + TICK
                 if command is not None:
                     self.backend.send(command, now)
                 if ask is not None:
@@ -124,8 +118,8 @@ class Bench:
         idle, hover = (0.0, 0.0, 0.0, 0.0), (self.plant.mass[0] * 9.81 * 1.02, 0.0, 0.0, 0.0)
         known = lambda: self.backend.audit.done and self.fake._boxes  # noqa: E731
         assert self.turn(10.0, idle, until=known), "the firmware answers on both ports"
-        following = lambda: self.backend.status(self.clock.now()).mode == FOLLOW  # noqa: E731
-        assert self.turn(10.0, idle, FOLLOW, until=following), self.backend.status(self.clock.now())
+        following = lambda: self.backend.status(self.plant.time).mode == FOLLOW  # noqa: E731
+        assert self.turn(10.0, idle, FOLLOW, until=following), self.backend.status(self.plant.time)
         assert self.turn(3.0, hover, until=lambda: not self.plant.held), f"motors {self.fake.motors}"
         self.turn(0.4, hover)
         return hover

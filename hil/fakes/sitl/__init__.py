@@ -1,6 +1,7 @@
 """Real firmware in software with the simulator's vehicle behind it: its process, its set-up, the bridge between the two."""
 
 from hil.fakes.sitl.betaflight import SLOW, BetaflightSitl, MotorPlant
-from hil.fakes.sitl.firmware import Firmware, favour, needed
+from hil.fakes.sitl.firmware import Firmware, needed
+from hil.fakes.sitl.throw import throw
 
-__all__ = ["SLOW", "BetaflightSitl", "Firmware", "MotorPlant", "favour", "needed"]
+__all__ = ["SLOW", "BetaflightSitl", "Firmware", "MotorPlant", "needed", "throw"]

@@ -74,17 +74,19 @@ class BetaflightSitl(Fake):
     """
 
     def __init__(
-        self, plant: MotorPlant, link: Link, mocap: MocapParams | None, seed: int, options: Options, params: BetaflightParams
+        self, plant: MotorPlant, link: Link, mocap: MocapParams | None, seed: int, options: Options, params: BetaflightParams,
+        stands: int | None,
     ) -> None:  # fmt: skip
         """Connect to a firmware that runs.
 
         Args:
             plant, link, mocap, seed, options: see `Fake`.
             params: of the runner's back-end: which channel opens the mechanism.
+            stands: see `Sensors`.
         """
         super().__init__(plant, link, mocap, seed, options)
         self.params, self.armed = params, False
-        self.port, self.sensors = MotorPort(), Sensors()
+        self.port, self.sensors = MotorPort(), Sensors(stands)
         self._msp: Port = TcpPort(Device("tcp", "127.0.0.1", PORTS[1]))
         self._parser, self._asked = msp.Parser(), dict.fromkeys(ASK, -1e9)
         self._boxes: tuple[int, ...] = ()
@@ -94,6 +96,11 @@ class BetaflightSitl(Fake):
         self.answered = 0
         self.cycles: list[int] = []
         self._fresh = False
+
+    def fly(self) -> None:
+        """See `Fake`: a period by what the firmware made of the samples at its beginning."""
+        self.sensors.send(self.plant.rate_b, self.plant.force_b, self.plant.quat_wb, self.plant.period)
+        super().fly()
 
     def hear(self) -> None:
         """See `Fake`: motors, and what the firmware says of itself."""
@@ -142,9 +149,8 @@ class BetaflightSitl(Fake):
         return self.motors
 
     def speak(self) -> None:
-        """See `Fake`: samples of this moment, and questions that are due."""
+        """See `Fake`: questions that are due."""
         plant = self.plant
-        self.sensors.send(plant.rate_b, plant.force_b, plant.quat_wb)
         for command, period in ASK.items():
             if plant.time - self._asked[command] >= period:
                 self._asked[command] = plant.time

@@ -32,15 +32,26 @@ SETTLED = 0.5
 """From listening to ready for samples [s]: one that comes before its sensors are begun stops the firmware for ever."""
 
 GAINS = {
-    "p_roll": 11, "i_roll": 20, "d_roll": 8, "d_max_roll": 10, "f_roll": 30,
-    "p_pitch": 12, "i_pitch": 21, "d_pitch": 9, "d_max_pitch": 12, "f_pitch": 31,
-    "p_yaw": 45, "i_yaw": 80, "f_yaw": 120,
+    "p_roll": 11, "i_roll": 20, "d_roll": 8, "d_max_roll": 8,
+    "p_pitch": 12, "i_pitch": 21, "d_pitch": 9, "d_max_pitch": 9,
+    "p_yaw": 45, "i_yaw": 80,
 }  # fmt: skip
 """Betaflight's own for yaw, a quarter of them for roll and pitch: the paper's vehicle turns four times as fast for the same output as
 the 5-inch quadrotors that they are made for. At the full ones it rings, its motors take 33 ms."""
 
-FAVOUR, PRIORITY = -15, 10
-"""Nice value and real-time priority of firmware and bridge where the system grants them: the loop runs 8000 times a second."""
+FOR_THUMBS = {
+    "rc_smoothing": "OFF",  # three filters of 18 Hz at 50 commands a second: 13 ms later
+    "f_roll": "0", "f_pitch": "0", "f_yaw": "0",  # feedforward takes the steps of 50 commands a second for flicks of a stick
+    "anti_gravity_gain": "0", "throttle_boost": "0",  # they add to P, I and throttle where the throttle moves, as it does in a throw
+    "tpa_rate": "0", "tpa_low_rate": "0",  # D goes with the throttle
+    "gyro_lpf1_dyn_min_hz": "0", "dterm_lpf1_dyn_min_hz": "0",  # filters that go with the throttle: static ones in their place
+    "dterm_lpf1_static_hz": "0",  # of two filters of D the second is left, 150 Hz
+    "pidsum_limit": "1000", "pidsum_limit_yaw": "1000",  # the mixer knows how much the motors can
+}  # fmt: skip
+"""What the firmware does for a pilot's thumbs or with the throttle, and is better off where a computer commands: the vehicle then is
+the same at any command, and a policy can be trained in it."""
+
+LOCKSTEP = Path(__file__).with_name("lockstep.c")
 
 PR_SET_PDEATHSIG = 1
 """Of prctl."""
@@ -68,7 +79,7 @@ def needed(params: BetaflightParams) -> dict[str, str]:
         "blackbox_device": "VIRTUAL",
         "blackbox_sample_rate": "1/8",  # 1 kHz of 8
     }
-    out |= {name: str(value) for name, value in GAINS.items()}
+    out |= {name: str(value) for name, value in GAINS.items()} | FOR_THUMBS
     for i, axis in enumerate(("roll", "pitch", "yaw")):
         out |= {
             f"{axis}_rc_rate": str(rates.rc_rates[i]),
@@ -106,22 +117,31 @@ class Firmware:
             raise RunError(f"no firmware at {program}; expected Betaflight's program for a PC, as `make TARGET=SITL` builds it")
         self.folder.mkdir(parents=True, exist_ok=True)
         self._process: subprocess.Popen | None = None
+        self.stands: int | None = None
 
-    def start(self) -> None:
+    def start(self, lockstep: bool = True) -> None:
         """Start it and wait until it listens.
 
+        Args:
+            lockstep: whether its clock goes by the stamps of its samples; else by the wall's.
+
         Raises:
-            RunError: it ends, does not listen in time, or another one is already there.
+            RunError: it ends, does not listen in time, or another one is already there; no compiler for ``lockstep.c``.
         """
         if _listens(PORTS[0]):
             raise RunError(f"something listens on port {PORTS[0]} already; expected no other firmware beside this one")
+        said, environment = -1, dict(os.environ)
+        if lockstep:
+            self.stands, said = os.pipe()
+            environment |= {"LD_PRELOAD": str(compiled(self.folder)), "VISTHROW_STANDS": str(said)}
         told = self.folder / "firmware.txt"  # its errors; of what it prints, most are the words of its memory
         with open(told, "wb") as errors:
             self._process = subprocess.Popen(
                 [self.program], cwd=self.folder, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=errors,
-                preexec_fn=_end_with_parent,
+                preexec_fn=_end_with_parent, env=environment, pass_fds=[said] if lockstep else [],
             )  # fmt: skip
-        favour(self._process.pid)
+        if lockstep:
+            os.close(said)
         end = time.monotonic() + START
         while f"bind port {PORTS[0]} for UART1" not in (words := told.read_text(errors="replace")):
             if not self.runs or time.monotonic() > end:
@@ -149,9 +169,12 @@ class Firmware:
             self._process.kill()
             self._process.wait()
         self._process = None
+        if self.stands is not None:
+            os.close(self.stands)
+            self.stands = None
 
     def set_up(self, settings: dict[str, str]) -> dict[str, str]:
-        """Write settings, start anew, and read them back; it runs afterwards.
+        """Write settings, start anew, and read them back; it is not running afterwards.
 
         Returns:
             What was read back.
@@ -161,28 +184,40 @@ class Firmware:
         """
         try:
             kept = self._written(settings)
-        except BaseException:
+        finally:
             self.stop()
-            raise
         wrong = [f"{name} is {kept[name]!r}, expected {value!r}" for name, value in settings.items() if kept[name] != value]
         if wrong:
-            self.stop()
             raise RunError(f"the firmware did not keep its settings: {'; '.join(wrong)}")
         return kept
 
     def _written(self, settings: dict[str, str]) -> dict[str, str]:
-        self.start()
+        self.start(lockstep=False)
         with StillSensors(), CommandLine() as line:
             for name, value in settings.items():
                 line.ask(line_of(name, value))
             line.save()
         self._process.wait(REBOOT)
-        self.start()
+        self.start(lockstep=False)
         with StillSensors(), CommandLine() as line:
-            kept = {name: line.read(name) for name in settings}
-        self.stop()  # whoever was on the command line cannot arm
-        self.start()
-        return kept
+            return {name: line.read(name) for name in settings}
+
+
+def compiled(folder: Path) -> Path:
+    """The library of ``lockstep.c``, compiled into a folder where it is not there yet.
+
+    Raises:
+        RunError: no compiler, or one that refuses it.
+    """
+    library = folder.resolve() / "lockstep.so"
+    if not library.exists():
+        command = [os.environ.get("CC", "gcc"), "-O2", "-shared", "-fPIC", "-o", library, LOCKSTEP, "-lpthread"]
+        try:
+            subprocess.run(command, check=True, capture_output=True, text=True)
+        except (OSError, subprocess.CalledProcessError) as error:
+            told = getattr(error, "stderr", "") or error
+            raise RunError(f"cannot compile {LOCKSTEP.name}: {told}; expected a C compiler, as the firmware's own build has one") from error
+    return library
 
 
 class CommandLine:
@@ -272,12 +307,3 @@ def _end_with_parent() -> None:
     """Where the system can (Linux), the firmware ends when the process that started it is gone, however that ended."""
     if sys.platform == "linux":
         _LIBC.prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-
-
-def favour(process: int = 0) -> None:
-    """Put a process, this one by default, before others, as far as the system grants it; this one's children stay as they are."""
-    with contextlib.suppress(OSError):
-        os.setpriority(os.PRIO_PROCESS, process, FAVOUR)
-    with contextlib.suppress(OSError, AttributeError):
-        policy = os.SCHED_FIFO | (0 if process else os.SCHED_RESET_ON_FORK)
-        os.sched_setscheduler(process, policy, os.sched_param(PRIORITY))

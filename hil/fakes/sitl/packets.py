@@ -4,18 +4,16 @@ Convention: the firmware wants rates forward, right, down; the negative of the s
 w, x, y, z of forward, left, up in north, west, up. It answers every packet of samples with one of motors, in the order front
 right, rear left, front left, rear right.
 
-The firmware's clock goes at wall time times a rate, the ratio of the last two stamps' difference to that of their arrivals where
-the former lies between 0 and 20 ms. So stamps that stand still leave the rate as it is, and no jitter of the machine reaches the
-firmware's clock; two stamps set it (`Sensors.start`). Stamps that go with the simulation would make its clock leap whenever
-two packets come close to each other.
+A stamp says up to when the firmware may run (``lockstep.c``).
 
 Source: betaflight 4.6, src/platform/SIMULATOR/sitl.c (updateState, micros64, pwmCompleteMotorUpdate) and target/SITL/target.h.
 """
 
+import os
+import select
 import socket
 import struct
 import threading
-import time
 
 import numpy as np
 
@@ -41,11 +39,8 @@ SEA_LEVEL = 101325.0
 STILL, CALIBRATION = 0.002, 3.0
 """Between two packets at rest, and the time that the firmware's gyro takes to be calibrated and its receiver to begin [s]."""
 
-GAP, MOST_GAP = 0.018, 0.0199
-"""Firmware time between the two stamps that set its clock's rate, and the most that counts [s]."""
-
-TRIES = 20
-"""Of two stamps less than that apart."""
+PATIENCE = 10.0
+"""For the firmware to come to a stamp [s], on the wall's clock: a tenth of a millisecond is usual."""
 
 
 def samples(stamp: float, rate_b: np.ndarray, force_b: np.ndarray, quat_wb: np.ndarray) -> bytes:
@@ -65,39 +60,45 @@ def motors(packet: bytes) -> np.ndarray | None:
 
 
 class Sensors:
-    """Where samples are sent to."""
+    """Where samples are sent to, and the firmware's clock."""
 
-    def __init__(self) -> None:
-        """Open a socket."""
+    def __init__(self, stands: int | None = None) -> None:
+        """Open a socket.
+
+        Args:
+            stands: pipe on which the firmware says that it has come to a stamp; None for one that runs by itself.
+        """
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._stamp = 1.0
+        self._stands, self._stamp = stands, 0.0
         self._last: tuple[np.ndarray, ...] = (np.zeros(3), np.array([0.0, 0.0, GRAVITY]), np.array([0.0, 0.0, 0.0, 1.0]))
 
-    def send(self, rate_b: np.ndarray, force_b: np.ndarray, quat_wb: np.ndarray) -> None:
-        """Send samples; see `samples`."""
-        self._last = (rate_b, force_b, quat_wb)
-        self._socket.sendto(samples(self._stamp, *self._last), ("127.0.0.1", SENSORS))
-
-    def start(self, rate: float) -> None:
-        """Let the firmware calibrate its sensors, and its clock go at a rate of wall time; the vehicle stands still meanwhile.
+    def send(self, rate_b: np.ndarray, force_b: np.ndarray, quat_wb: np.ndarray, period: float) -> None:
+        """Send samples, see `samples`, let the firmware run for a period [s], and wait until it has.
 
         Raises:
-            RunError: the machine is too busy for the clock to be set.
+            RunError: it does not.
         """
+        self._last = (rate_b, force_b, quat_wb)
+        self._stamp += period
+        self._socket.sendto(samples(self._stamp, *self._last), ("127.0.0.1", SENSORS))
+        if self._stands is not None:
+            there = select.select([self._stands], [], [], PATIENCE)[0]
+            if not there or not os.read(self._stands, 8):
+                raise RunError(f"the firmware has not come to the time {self._stamp:.3f} s of its samples after {PATIENCE:g} s")
+
+    def rest(self, period: float) -> None:
+        """The same with a vehicle that stands still, as at the last time."""
+        self.send(*self._last, period)
+
+    def start(self) -> None:
+        """Let the firmware calibrate its sensors, the vehicle standing still.
+
+        Raises:
+            RunError: see `send`.
+        """
+        self.rest(0.0)  # from here on its clock is ours
         for _ in range(round(CALIBRATION / STILL)):
-            self.send(*self._last)
-            time.sleep(STILL)
-        for _ in range(TRIES if rate != 1.0 else 0):
-            began = time.monotonic()
-            time.sleep(GAP / rate)
-            passed = rate * (time.monotonic() - began)
-            if passed < MOST_GAP:
-                self._stamp += passed
-                self.send(*self._last)
-                return
-            self.send(*self._last)  # slept too long: the same stamp again, from which the next try begins
-        if rate != 1.0:
-            raise RunError(f"the machine sleeps longer than it is told to, {TRIES} times in a row; expected a quieter one")
+            self.rest(STILL)
 
     def close(self) -> None:
         """Give the socket back."""
@@ -115,7 +116,7 @@ class StillSensors:
 
     def _feed(self) -> None:
         while not self._done.wait(STILL):
-            self._sensors.send(*self._sensors._last)
+            self._sensors.rest(0.0)
 
     def __exit__(self, *_: object) -> None:
         self._done.set()

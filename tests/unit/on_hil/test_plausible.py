@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from hil.errors import SourceError
+from hil.links.clock import MonotonicClock
 from hil.params import HilParams
 from hil.poses.plausible import unit_problems
 from hil.poses.pose import Pose
@@ -89,9 +90,9 @@ def test_little_data_and_a_still_vehicle_say_nothing():
 def test_a_recording_in_wrong_units_is_refused_unless_told(tmp_path, capsys):
     params = flight("crazyflie_log", vel_w="m/s")
     with pytest.raises(SourceError, match=r"vel_w: the second is 1\d\d\d times .* \(source\.check_units=false lets it pass\)"):
-        open_source(params, tmp_path, 1.0)
+        open_source(params, tmp_path, MonotonicClock())
     lax = dataclasses.replace(params, source=dataclasses.replace(params.source, check_units=False))
-    assert open_source(lax, tmp_path, 1.0)[2]
+    assert open_source(lax, tmp_path, MonotonicClock())[2]
     wrong = 'source.columns=[{name="pos_w", columns=["t_s", "t_s", "acc"], unit="mm"}]'
     file = f"source.file={DATA / FLIGHTS['crazyflie_log']}"
     assert main(["hil", "check", "--config", "crazyflie_log", "--set", file, "--set", wrong]) == 2

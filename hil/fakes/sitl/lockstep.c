@@ -1,0 +1,117 @@
+/* Loaded into Betaflight's process (LD_PRELOAD): its clock goes by what the bridge sends, not by the wall's.
+
+From the first packet of samples on, time stands in the packets: a stamp says up to when the firmware may run. Its main thread's
+clock advances by the times it sleeps and a little for each look at it; at the stamp it stands still, after its serial ports have
+sent what they have, and says so on a pipe (VISTHROW_STANDS). What comes on the ports meanwhile is taken in before it goes on. So a
+flight is the same on any machine, as slow or as fast as it is.
+
+Source: betaflight 4.6, src/platform/SIMULATOR/sitl.c (micros64, updateState, udpThread, tcpThread), lib/main/dyad. */
+
+#define _GNU_SOURCE
+#include <pthread.h>
+#include <stdint.h>
+#include <stdlib.h>
+#include <sys/select.h>
+#include <sys/socket.h>
+#include <sys/syscall.h>
+#include <time.h>
+#include <unistd.h>
+
+enum { LOOK_NS = 100, SAMPLES = 144, TURNS = 4 };
+
+static pthread_mutex_t lock = PTHREAD_MUTEX_INITIALIZER;
+static pthread_cond_t moved = PTHREAD_COND_INITIALIZER;
+static int begun, turns, waits;         /* in lock step; turns that the ports may take; whether they wait for some */
+static int64_t now_ns, limit_ns, origin_ns;
+static __thread int sampled;            /* samples were received, and are dealt with when this thread waits for the next */
+static __thread double stamp;
+
+static int64_t wall(void) {
+    struct timespec t;
+    syscall(SYS_clock_gettime, CLOCK_MONOTONIC, &t);
+    return t.tv_sec * 1000000000LL + t.tv_nsec;
+}
+
+static int is_main(void) {
+    static __thread int known;
+    if (!known) known = 1 + (syscall(SYS_gettid) == getpid());
+    return known == 2;
+}
+
+static void serve_ports(void) {         /* bytes that have come go in, answers go out; called with the lock held */
+    turns = TURNS;
+    pthread_cond_broadcast(&moved);
+    while (turns > 0 || !waits) pthread_cond_wait(&moved, &lock);
+}
+
+static void stand(void) {
+    const char *name = getenv("VISTHROW_STANDS");
+    pthread_mutex_lock(&lock);
+    serve_ports();
+    if (name && write(atoi(name), &now_ns, sizeof now_ns) != sizeof now_ns) _exit(1);
+    while (now_ns >= limit_ns) pthread_cond_wait(&moved, &lock);
+    pthread_mutex_unlock(&lock);
+}
+
+static void grant(void) {
+    sampled = 0;
+    pthread_mutex_lock(&lock);
+    if (!begun) {
+        now_ns = wall();
+        origin_ns = now_ns - (int64_t)(1e9 * stamp);
+        limit_ns = now_ns;
+        __atomic_store_n(&begun, 1, __ATOMIC_SEQ_CST);
+    } else {
+        serve_ports();
+        limit_ns = origin_ns + (int64_t)(1e9 * stamp + 0.5);
+    }
+    pthread_cond_broadcast(&moved);
+    pthread_mutex_unlock(&lock);
+}
+
+int clock_gettime(clockid_t id, struct timespec *t) {
+    if (id != CLOCK_MONOTONIC || !__atomic_load_n(&begun, __ATOMIC_SEQ_CST)) return syscall(SYS_clock_gettime, id, t);
+    int64_t ns = __atomic_add_fetch(&now_ns, is_main() ? LOOK_NS : 0, __ATOMIC_SEQ_CST);
+    t->tv_sec = ns / 1000000000LL;
+    t->tv_nsec = ns % 1000000000LL;
+    return 0;
+}
+
+int nanosleep(const struct timespec *want, struct timespec *left) {
+    if (!is_main() || !__atomic_load_n(&begun, __ATOMIC_SEQ_CST)) return syscall(SYS_nanosleep, want, left);
+    int64_t ns = __atomic_add_fetch(&now_ns, want->tv_sec * 1000000000LL + want->tv_nsec, __ATOMIC_SEQ_CST);
+    if (ns >= __atomic_load_n(&limit_ns, __ATOMIC_SEQ_CST)) stand();
+    return 0;
+}
+
+ssize_t recvfrom(int fd, void *data, size_t size, int flags, struct sockaddr *from, socklen_t *length) {
+    ssize_t got = syscall(SYS_recvfrom, fd, data, size, flags, from, length);
+    if (got == SAMPLES && size == SAMPLES) {
+        stamp = *(double *)data;
+        *(double *)data = 1.0;          /* stamps that stand still leave the rate of the firmware's clock at 1 */
+        sampled = 1;
+    }
+    return got;
+}
+
+int select(int count, fd_set *reads, fd_set *writes, fd_set *faults, struct timeval *most) {
+    if (sampled) grant();
+    int ports = most && most->tv_sec == 0 && most->tv_usec < 20000;  /* their thread waits for 10 ms, the others for 100 */
+    if (ports && __atomic_load_n(&begun, __ATOMIC_SEQ_CST)) {
+        pthread_mutex_lock(&lock);
+        waits = 1;
+        pthread_cond_broadcast(&moved);
+        while (turns == 0) pthread_cond_wait(&moved, &lock);
+        waits = 0;
+        turns--;
+        pthread_mutex_unlock(&lock);
+        most->tv_usec = 0;
+    }
+    struct timespec time, *limit = NULL;
+    if (most) {
+        time.tv_sec = most->tv_sec;
+        time.tv_nsec = 1000L * most->tv_usec;
+        limit = &time;
+    }
+    return syscall(SYS_pselect6, count, reads, writes, faults, limit, NULL);
+}

@@ -1,0 +1,125 @@
+"""A throw through the firmware in lock step: runner, link, firmware and vehicle take turns in one process, on no clock but theirs.
+
+The runner is the one that flies, with its state machine, guard, back-end and recorder; poses come by MAVLink, commands go by MSP.
+The same seed gives the same throw on any machine that is not out of memory, as fast as it can.
+"""
+
+import select
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from hil.backends import make_backend, mechanism_lag
+from hil.control.loop import AutoOperator, Loop
+from hil.control.runner import Runner
+from hil.control.states import State
+from hil.fakes.base import VEHICLE_ID, Fake, Options
+from hil.fakes.mocap import SLACK, MocapParams
+from hil.fakes.sitl.betaflight import BetaflightSitl, MotorPlant
+from hil.fakes.sitl.firmware import Firmware, needed
+from hil.links.device import Device, check_device, open_port
+from hil.links.mavlink_link import Link
+from hil.params import HilParams
+from hil.recording.record import Recorder
+from hil.sources.opening import open_source
+from visthrow.onboard.policy import Policy
+
+SETTINGS = "settings"
+"""Folder of the firmware's settings beside those of the throws."""
+
+AFTER, MOST = 1.2, 25.0
+"""Flown on after a landing; flown at most [s]."""
+
+
+class FlightClock:
+    """A clock that goes as far as the vehicle behind the firmware has flown; see `hil.links.clock.Clock`."""
+
+    def __init__(self, fake: Fake) -> None:
+        """Begin at the vehicle's time."""
+        self._fake, self._now = fake, fake.plant.time
+
+    def now(self) -> float:
+        """See `Clock`."""
+        return self._now
+
+    def sleep_until(self, when: float) -> None:
+        """See `Clock`: fly until then."""
+        self.wait_for((), when)
+
+    def wait_for(self, files: Sequence[Any], when: float) -> None:
+        """See `Clock`: fly until there is something to read, or until then."""
+        plant = self._fake.plant
+        while self._now < when - SLACK:
+            if when < plant.time + plant.period - SLACK:  # within a period nothing comes
+                self._now = when
+                return
+            self._fake.step()
+            self._now = plant.time
+            if files and select.select(files, [], [], 0.0)[0]:
+                return
+
+
+def set_up(program: str | Path, folder: Path, params: HilParams) -> Path:
+    """The firmware's settings for a run, written and read back where the folder has none yet.
+
+    Raises:
+        RunError: see `Firmware`.
+    """
+    settings = folder / SETTINGS
+    if not (settings / "eeprom.bin").exists():
+        Firmware(program, settings).set_up(needed(params.betaflight))
+    return settings / "eeprom.bin"
+
+
+def throw(
+    program: str | Path, folder: Path, params: HilParams, policy: Policy, plant: MotorPlant, mocap: MocapParams, seed: int
+) -> dict[str, Any]:  # fmt: skip
+    """Fly one throw.
+
+    Args:
+        program: of the firmware. folder: of the throw, made anew: the run's record (``run``) and the firmware's blackbox; its
+            settings lie beside it.
+        params: of the run. policy: on the CPU. plant: what flies behind the firmware.
+        mocap: its faults. seed: of noise and loss.
+
+    Returns:
+        The bridge's report, with the runner's summary under ``run``.
+
+    Raises:
+        RunError: the firmware does not run.
+    """
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    shutil.copy(set_up(program, folder.parent, params), folder)
+    firmware, fake, parts = Firmware(program, folder), None, []
+    try:
+        firmware.start()
+        port = check_device(params.source.device or params.link.device).port
+        link = Link(open_port(Device("udpout", "127.0.0.1", port)), *VEHICLE_ID)
+        fake = BetaflightSitl(plant, link, mocap, seed, Options(), params.betaflight, firmware.stands)
+        clock = FlightClock(fake)
+        source, link, _ = open_source(params, folder / "run", clock)
+        backend = make_backend(params, link, folder=folder / "run")
+        parts = [source, backend]
+        fake.sensors.start()
+        runner = Runner(params, policy, backend, mechanism_lag(params))
+        recorder = Recorder(folder / "run", params)
+        summary = _flown(Loop(runner, source, clock, AutoOperator(), recorder), fake)
+        recorder.close(summary)
+        return {**fake.report(), "run": summary}
+    finally:
+        for part in [*parts, fake]:
+            if part is not None:
+                part.close()
+        firmware.stop()
+
+
+def _flown(loop: Loop, fake: BetaflightSitl) -> dict[str, Any]:
+    """Take turns until the runner is done and the payload has lain for a while."""
+    plant, done = fake.plant, False
+    while plant.time < MOST and not done:
+        loop.turn(False)
+        landed = plant.landing["landing_time"]
+        done = loop.runner.machine.state is State.DONE or (landed is not None and plant.time > landed + AFTER)
+    return {**loop.summary(), "links": [one.roster.summary() for one in loop.source.links], "autopilot": {}}
