@@ -91,7 +91,8 @@ class ControllerParams:
     tau, ``u_i = u_c + m_i / (2 sqrt(mix_thrust max_thrust))``; all m_i are scaled where their range exceeds that from idle
     ``sqrt(min_thrust / max_thrust)`` to 1, then u_c is shifted so that every u_i lies in it. The gains hold at ``mix_thrust`` a
     motor; elsewhere the loop's gain goes with the square root of thrust. ``Omega* = u_i sqrt(max_thrust / k_f)``, times the
-    voltage's factor above with ``calibration_voltage`` for u_ref. Source: betaflight 4.6, src/main/flight/pid.c (applyItermRelax), mixer.c (applyMixerAdjustment).
+    voltage's factor above with ``calibration_voltage`` for u_ref. Source: betaflight 4.6, src/main/flight/pid.c
+    (applyItermRelax), mixer.c (applyMixerAdjustment).
 
     ``geometric`` (the ablation): ``tau = geometric_gain J (w_cmd - w) + w x J w`` without filters, integral or
     voltage; f_i clipped one by one to [f_min, max_thrust]; ``Omega* = sqrt(f_i / k_f)``.

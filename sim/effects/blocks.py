@@ -1,13 +1,17 @@
 """Named functions of a setting that the tables of ``configs/effects`` refer to: which blocks it has, and it with another block."""
 
 import dataclasses
+import math
 from collections.abc import Callable
 from typing import Any
 
 from sim.effects.setting import AERODYNAMICS, Setting
+from sim.params import GRAVITY
 
 SEGMENTS = 15
 """Of a rope that turns out to be flexible (the paper, Sec. III-B)."""
+RELAX = 1.0 / (2.0 * math.pi * 15.0)
+"""Time constant of Betaflight's default iterm_relax_cutoff, 15 Hz [s]."""
 LONGEST_OFFSET = 0.12
 """Length of a rope from which a payload's offset can be taken [m]: its upper bound, 0.1 m, leaves something."""
 
@@ -30,7 +34,20 @@ def _lagging(setting: Setting) -> Setting:
 
 
 def _pid(setting: Setting) -> bool:
-    return setting.plant.vehicle.controller.kind == "betaflight"
+    return setting.plant.vehicle.controller.kind in ("betaflight", "motor_mixing")
+
+
+def _mixes_motors(setting: Setting) -> bool:
+    return setting.plant.vehicle.controller.kind == "motor_mixing"
+
+
+def _motor_mixing(setting: Setting) -> Setting:
+    """With the same gains in hover, iterm_relax of 15 Hz in place of the set-point's filter, the feed-forward off."""
+    plant = setting.plant
+    return _vehicle(setting, controller={
+        "kind": "motor_mixing", "mix_thrust": 0.25 * plant.total_mass * GRAVITY, "setpoint_time_constant": RELAX,
+        "feedforward_gain": (0.0, 0.0, 0.0), "calibration_voltage": plant.vehicle.battery.reference_voltage,
+    })  # fmt: skip
 
 
 CONDITIONS: dict[str, Callable[[Setting], bool]] = {
@@ -39,6 +56,8 @@ CONDITIONS: dict[str, Callable[[Setting], bool]] = {
     "no aerodynamics": lambda s: not any(getattr(s.plant.vehicle.aero, name) for name in AERODYNAMICS),
     "PID controller": _pid,
     "proportional controller": lambda s: not _pid(s),
+    "thrust mixing": lambda s: _pid(s) and not _mixes_motors(s),
+    "motor mixing": _mixes_motors,
     "feed-forward": lambda s: _pid(s) and any(s.plant.vehicle.controller.feedforward_gain),
     "integral limit": lambda s: _pid(s) and all(s.plant.vehicle.controller.integral_limit),
     "motor lag": lambda s: s.plant.vehicle.motor.kind != "instant",
@@ -56,6 +75,7 @@ CONDITIONS: dict[str, Callable[[Setting], bool]] = {
 
 SWITCHES: dict[str, Callable[[Setting], Setting]] = {
     "PID controller": lambda s: _vehicle(s, controller={"kind": "betaflight"}),
+    "motor mixing": _motor_mixing,
     "proportional controller": lambda s: _vehicle(s, controller={"kind": "geometric"}),
     "motor lag": _lagging,
     "no motor lag": lambda s: _vehicle(s, motor={"kind": "instant"}),

@@ -1,7 +1,8 @@
 """Betaflight's own firmware flies the simulated vehicle: take-over, steps, a whole throw with release and recovery, silence.
 
 ``make test-sitl`` builds the firmware (the package `betaflight` holds its sources; GPL-3, a tool of these tests alone) and runs
-this file in a network of its own. The firmware's clock is slowed to ``VISTHROW_SITL_SPEED`` of real time, 0.5 where it is not set.
+this file in a network of its own. Its clock goes in lock step with the vehicle; where two processes fly, both are paced to
+``VISTHROW_SITL_SPEED`` of real time, 0.5 where it is not set.
 """
 
 import json
@@ -22,11 +23,12 @@ from hil.backends.base import FOLLOW
 from hil.fakes.base import Options
 from hil.fakes.mocap import MocapParams
 from hil.fakes.process import VEHICLE_ID
-from hil.fakes.sitl import BetaflightSitl, Firmware, needed
+from hil.fakes.sitl import BetaflightSitl, Firmware, needed, throw
 from hil.links.device import Device, UdpPort, check_device, open_port
 from hil.links.mavlink_link import Link
 from hil.params import HilParams
 from visthrow import config
+from visthrow.onboard.policy import Policy, find_policy
 from visthrow.throws.wire_plant import make_motors
 
 pytestmark = pytest.mark.sitl
@@ -187,6 +189,25 @@ def test_silence_idles_the_motors_and_disarms(bench):
     print(f"\nmotors idle {idle:.2f} s, disarmed {gone:.2f} s after the last frame")
     assert IDLE[0] < idle < IDLE[1]
     assert DISARM[0] < gone < DISARM[1]
+
+
+def test_throws_in_lock_step_are_the_same_to_the_bit(tmp_path, settings):
+    """The runner with its link, the firmware and the vehicle on one clock: what a busy machine cannot change."""
+    shutil.copytree(settings[0], tmp_path / "settings")
+    params = config.load(HilParams, config.find("hil", "betaflight_sitl"))
+    policy, reports = Policy.load(find_policy(params.policy)), []
+    for name in ("first", "again"):
+        plant = make_motors(params.policy, 1)
+        reports.append(throw(program(), tmp_path / name, params, policy, plant, MocapParams(), 1))
+    one, again = reports
+    error = float(np.hypot(one["landing_w"][0] - 2.0, one["landing_w"][1]))
+    print(f"\nlanding error {error:.3f} m, loop {one['loop_us']:.0f} us")
+    assert one["landing_w"] == again["landing_w"]
+    assert one["separation_time"] == again["separation_time"]
+    assert one["releases"] == 1
+    assert error < MISS
+    assert (tmp_path / "first" / "run" / "throw-01.npz").exists()
+    assert list((tmp_path / "first").glob("LOG*")), "the firmware wrote its blackbox"
 
 
 def visthrow(*words, **more):

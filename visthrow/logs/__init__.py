@@ -10,7 +10,9 @@ from visthrow.common.errors import LogError, suggest
 from visthrow.logs.flightlog import FlightLog
 from visthrow.logs.mapping import TableMap
 
-ENDINGS = (".npz", ".csv", ".csv.gz", ".csv.xz", ".txt", ".parquet", ".bbl", ".bfl", ".ulg", ".bin", ".tlog")
+BLACKBOX = (".bbl", ".bfl", ".bf")
+"""Of Betaflight; the last is that of its software in the loop."""
+ENDINGS = (".npz", ".csv", ".csv.gz", ".csv.xz", ".txt", ".parquet", *BLACKBOX, ".ulg", ".bin", ".tlog")
 RECORDINGS = (".mat", ".h5", ".hdf5", ".bag", ".db3", ".mcap")
 """Of other tools; the Crazyflie's card names its files without an ending."""
 TABLES = (".csv", ".csv.gz", ".csv.xz", ".txt", ".parquet")
@@ -43,7 +45,7 @@ def read(path: str | Path, mapping: TableMap | None = None) -> list[FlightLog]:
         raise LogError(f"{path}: no such file; in that folder: {', '.join(near[:20]) or 'nothing'}")
     if name.endswith(TABLES):
         logs = _of_table(path, mapping)
-    elif name.endswith((".bbl", ".bfl")):
+    elif name.endswith(BLACKBOX):
         from visthrow.logs.readers.blackbox.channels import logs_of_blackbox
 
         logs = logs_of_blackbox(path)

@@ -8,7 +8,6 @@ namespace (``unshare -rn``), or on a machine that nobody else reaches.
 Source: betaflight 4.6, src/platform/SIMULATOR/sitl.c, src/main/cli/cli.c, src/main/msp/msp_box.c.
 """
 
-import contextlib
 import ctypes
 import os
 import signal

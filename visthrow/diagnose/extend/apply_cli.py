@@ -17,7 +17,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "  visthrow train mine.toml                                             train in it\n"
         "  visthrow diagnose explain flights --plant mine.toml                  and diagnose it again: nothing should be left\n"
     )
-    parser.add_argument("diagnosis", metavar="FILE", help="diagnosis.json of an explain")
+    parser.add_argument("diagnosis", metavar="FILE", help="diagnosis.json of an explain, or a blackbox: its firmware's rate controller")
     parser.add_argument(
         "--plant", metavar="NAME", default=DEFAULT_PLANT, help=f"the configuration that was diagnosed (default: {DEFAULT_PLANT})"
     )
@@ -30,6 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--laws", type=int, default=0, metavar="N",
         help="write the laws of the N-th best explanation outside the catalogue, which belong together, as well (default: 0, none)",
     )
+    parser.add_argument("--hover", type=float, metavar="SHARE", help="with a blackbox: throttle in hover, 0 to 1")
     parser.add_argument("--anyway", action="store_true", help="write it even if held-out flights saw no gain")
 
 
@@ -40,9 +41,18 @@ def run(args: argparse.Namespace) -> int:
     from visthrow import config
     from visthrow.common.errors import DiagnoseError
     from visthrow.common.storage import atomic_write
-    from visthrow.diagnose.extend import patch
+    from visthrow.diagnose.extend import firmware, patch
+    from visthrow.logs import BLACKBOX
     from visthrow.task import Experiment
 
+    if Path(args.diagnosis).suffix.lower() in BLACKBOX:
+        if args.hover is None:
+            raise DiagnoseError("a blackbox without --hover; expected the share of throttle in hover, such as --hover 0.36")
+        base, experiment = _diagnosed(args.plant)
+        atomic_write(args.out, firmware.text(args.diagnosis, base, experiment, args.hover))
+        config.load(Experiment, Path(args.out))
+        print(f"{args.out}: the rate controller of {args.diagnosis} on top of {base}")
+        return 0
     try:
         report = json.loads(Path(args.diagnosis).read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
@@ -56,16 +66,23 @@ def run(args: argparse.Namespace) -> int:
     doubts = harm(report)
     if doubts and not args.anyway:
         raise DiagnoseError(f"held-out flights do not bear this out: {'; '.join(doubts)}; --anyway writes it all the same")
-    path = config.find("train", args.plant)
-    experiment = config.load(Experiment, path)
-    shipped = path.is_relative_to(config.configs_root())
-    base = path.relative_to(config.configs_root()).as_posix() if shipped else str(path.resolve())
+    base, experiment = _diagnosed(args.plant)
     content = patch.text(base, experiment, theta, covariance, args.plants, origin(report, args.diagnosis), laws)
     atomic_write(args.out, content)
     config.load(Experiment, Path(args.out))  # what was written is what training will read
     named = [*theta, *(f"{law.coefficient:.4g} {' '.join((*law.factors, law.vector))} ({law.block})" for law in laws)]
     print(f"{args.out}: {', '.join(named)} on top of {base}")
     return 0
+
+
+def _diagnosed(plant: str):
+    """Name that another configuration finds the diagnosed one under, and what it says."""
+    from visthrow import config
+    from visthrow.task import Experiment
+
+    path = config.find("train", plant)
+    shipped = path.is_relative_to(config.configs_root())
+    return path.relative_to(config.configs_root()).as_posix() if shipped else str(path.resolve()), config.load(Experiment, path)
 
 
 def harm(report: dict) -> list[str]:

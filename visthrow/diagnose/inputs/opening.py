@@ -82,7 +82,7 @@ def throw_model(args: argparse.Namespace, logs: Sequence[FlightLog]) -> tuple[Mo
     known = {"sensing": experiment.sensing, "camera": experiment.camera}
     right, mistakes = put_right(logs, plant_of(experiment))
     known["mistakes"] = mistakes
-    return ThrowModel(right, plant_of(experiment), device=resolve(args.device), only=only, **known), right
+    return ThrowModel(right, plant_of(experiment), device=resolve(args.device), only=only, simpler=only is not None, **known), right
 
 
 class _Part:

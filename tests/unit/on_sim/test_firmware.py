@@ -1,0 +1,60 @@
+"""Betaflight's settings as numbers of the rate controller's block."""
+
+import dataclasses
+import math
+
+import pytest
+
+from sim.effects.firmware import calibrated_voltage, controller_of, left_out
+from tests.plants import paper_plant
+
+SETTINGS = {
+    "rollPID": "11,20,8", "pitchPID": "22,20,8", "yawPID": "45,80,0", "ff_weight": "0,0,0", "iterm_relax_cutoff": "15",
+    "motor_idle": "550", "pidsum_limit": "500", "iterm_windup": "80", "gyro_lpf1_static_hz": "250", "gyro_lpf2_static_hz": "500",
+    "dterm_lpf2_static_hz": "150", "d_max": "8,8,0",
+}  # fmt: skip
+
+
+def test_a_gain_is_the_torque_that_the_motors_make_of_it():
+    """1 deg/s of error, by hand: P 11 puts 0.352319 of 1000 on each motor, beyond idle; two rise and two fall."""
+    vehicle = paper_plant().vehicle
+    c = controller_of(vehicle, SETTINGS, 0.66, vehicle.battery.reference_voltage)
+    hover, step = math.sqrt(0.66 / 3.5), 0.352319e-3 * 0.945
+    rise = 3.5 * ((hover + step) ** 2 - (hover - step) ** 2)
+    assert c.p_gain[0] * math.radians(1.0) == pytest.approx(2.0 * rise * vehicle.rotors.y[0], rel=1e-6)
+    assert c.p_gain[1] == pytest.approx(2.0 * c.p_gain[0], rel=1e-12)
+    assert c.p_gain[2] * math.radians(1.0) == pytest.approx(
+        2.0 * 45.0 / 11.0 * rise * vehicle.thrust.torque_ratio, rel=1e-6
+    )
+    assert c.gyro_time_constant == pytest.approx((1 / 250 + 1 / 500 + 1 / 150) / (2 * math.pi))
+    assert c.min_thrust == pytest.approx(3.5 * 0.055**2)
+
+
+def test_the_voltage_of_a_hover():
+    vehicle = paper_plant().vehicle
+    voltage = calibrated_voltage(vehicle, SETTINGS, 0.66, 0.36)
+    thrust = 3.5 * ((0.055 + 0.945 * 0.36) * voltage / vehicle.battery.reference_voltage) ** 2
+    assert thrust == pytest.approx(0.66)
+
+
+def test_what_the_block_has_no_number_for_is_told():
+    told = left_out(SETTINGS | {"tpa_rate": "65", "d_max": "10,12,0"})
+    assert [text.split()[0] for text in told] == ["tpa_rate", "d_max"]
+    assert left_out(SETTINGS | {"d_max": "0,0,0"}) == []
+
+
+def test_settings_that_are_missing_are_named():
+    with pytest.raises(ValueError, match="iterm_relax_cutoff"):
+        controller_of(paper_plant().vehicle, {"rollPID": "1,2,3"}, 0.66, 15.0)
+
+
+def test_the_switch_keeps_the_hover():
+    """The block that mixes motor commands has the gains of the one that mixes thrusts, at the thrust of the hover."""
+    from sim.effects.blocks import SWITCHES
+    from sim.effects.setting import Setting
+
+    plant = paper_plant()
+    switched = SWITCHES["motor mixing"](Setting(plant)).plant.vehicle.controller
+    assert switched.p_gain == plant.vehicle.controller.p_gain
+    assert switched.mix_thrust == pytest.approx(plant.total_mass * 9.81 / 4)
+    assert dataclasses.replace(switched, kind="betaflight").max_thrust == plant.vehicle.controller.max_thrust
