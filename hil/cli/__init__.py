@@ -112,7 +112,7 @@ def _add_simulated(fake: argparse.ArgumentParser, direct: argparse.ArgumentParse
         "--answer", default="accepted", help="to the release: accepted, in-progress, denied, silent, stuck"
     )
     fake.add_argument(
-        "--kind", default="ardupilot", help="of autopilot: ardupilot, px4, betaflight; betaflight-sitl is a bridge to its firmware"
+        "--kind", default="ardupilot", help="of autopilot: ardupilot, px4, betaflight; or a bridge to one in software: betaflight-sitl, ardupilot-sitl, px4-sih"
     )
     fake.add_argument("--config", default="betaflight_sitl", metavar="NAME", help="of the run that the firmware is set up for")
     fake.add_argument("--msp-port", type=int, default=14561, help="where the fake Betaflight listens")

@@ -12,7 +12,7 @@ from hil.fakes.base import Options
 from hil.fakes.direct import Direct, scored
 from hil.fakes.mocap import MocapParams
 from hil.fakes.process import VEHICLE_ID, ListeningPort, load_plant, make_fake, read_options, serve
-from hil.fakes.sitl import SLOW, BetaflightSitl, Firmware, MotorPlant, needed, throw
+from hil.fakes.sitl import SLOW, ArduPilotSitl, BetaflightSitl, Firmware, MotorPlant, needed, throw
 from hil.links.clock import Clock, MonotonicClock
 from hil.links.device import check_device, open_port
 from hil.links.mavlink_link import Link
@@ -44,12 +44,13 @@ def direct(args: argparse.Namespace) -> int:
 def fake(args: argparse.Namespace) -> int:
     """Fly a fake autopilot, and print its report."""
     options, mocap = read_options([*args.overrides, f"answer={args.answer}"]), MocapParams(rate=args.rate)
-    sitl = args.kind == "betaflight-sitl"
-    plant = load_plant(args.plant or (MOTORS if sitl else PLANT), args.policy, args.seed)
+    sitl = SITL.get(args.kind)
+    plant = load_plant(args.plant or (PLANT if sitl is None else MOTORS), args.policy, args.seed)
     link = Link(open_port(check_device(args.device)), *VEHICLE_ID, key=key_of(args))
     clock, out = MonotonicClock(args.speed), None if args.out is None else Path(args.out)
-    if sitl:
-        report = _fly_firmware(args, plant, link, mocap, options, clock, out)
+    if sitl is not None:
+        report = sitl(args, plant, link, mocap, options, clock, out)
+        _tell_late(report, plant.period, args.speed)
     else:
         port = ListeningPort(args.msp_port) if args.kind == "betaflight" else None
         flown = make_fake(args.kind, plant, link, mocap, args.seed, options, port)
@@ -59,7 +60,7 @@ def fake(args: argparse.Namespace) -> int:
     return 0
 
 
-def _fly_firmware(
+def _fly_betaflight(
     args: argparse.Namespace, plant: MotorPlant, link: Link, mocap: MocapParams, options: Options, clock: Clock, out: Path | None
 ) -> dict[str, Any]:  # fmt: skip
     """Set a firmware up, fly the plant by its motor outputs, end it; the report."""
@@ -78,10 +79,31 @@ def _fly_firmware(
         flown.close()
     finally:
         firmware.stop()
-    periods = report["time"] / plant.period
+    return report
+
+
+def _fly_ardupilot(
+    args: argparse.Namespace, plant: MotorPlant, link: Link, mocap: MocapParams, options: Options, clock: Clock, out: Path | None
+) -> dict[str, Any]:  # fmt: skip
+    """Fly the plant by ArduPilot's outputs; the report."""
+    params = config.load(HilParams, config.find("hil", args.config)).ardupilot
+    flown = ArduPilotSitl(plant, link, mocap, args.seed, options, params)
+    print("waiting for ArduPilot: --model json:127.0.0.1", file=sys.stderr, flush=True)
+    try:
+        return serve(flown, clock, args.seconds, out, args.after)
+    finally:
+        flown.close()
+
+
+def _tell_late(report: dict[str, Any], period: float, speed: float) -> None:
+    """Say where the machine was too slow for its clock."""
+    periods = report["time"] / period
     if report["late_periods"] > SLOW * periods:
         print(
             f"this machine is too slow: {report['late_periods']} of {periods:.0f} periods were late; slow both clocks, --speed "
-            f"{args.speed / 2:g} here and of the run", file=sys.stderr,
+            f"{speed / 2:g} here and of the run", file=sys.stderr,
         )  # fmt: skip
-    return report
+
+
+SITL = {"betaflight-sitl": _fly_betaflight, "ardupilot-sitl": _fly_ardupilot}
+"""Kinds of fake that are a bridge to a firmware in software."""

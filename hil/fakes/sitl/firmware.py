@@ -19,7 +19,7 @@ from pathlib import Path
 
 from hil.backends.betaflight import STICKS, BetaflightParams
 from hil.errors import RunError
-from hil.fakes.sitl.packets import StillSensors
+from hil.fakes.sitl.packets import StillSensors, stood
 
 PORTS = (5761, 5762)
 """TCP ports of the first two serial ports: the first is the runner's, the second the bridge's."""
@@ -150,7 +150,11 @@ class Firmware:
         if "failed" in words:
             self.stop()
             raise RunError(f"the firmware cannot listen: {words!r}")
-        time.sleep(SETTLED)
+        if self.stands is None:
+            time.sleep(SETTLED)
+        elif not stood(self.stands, START):
+            self.stop()
+            raise RunError(f"the firmware does not come to stand {START:g} s after its start; its words: {words!r}")
 
     @property
     def runs(self) -> bool:

@@ -1,9 +1,9 @@
 /* Loaded into Betaflight's process (LD_PRELOAD): its clock goes by what the bridge sends, not by the wall's.
 
-From the first packet of samples on, time stands in the packets: a stamp says up to when the firmware may run. Its main thread's
-clock advances by the times it sleeps and a little for each look at it; at the stamp it stands still, after its serial ports have
-sent what they have, and says so on a pipe (VISTHROW_STANDS). What comes on the ports meanwhile is taken in before it goes on. So a
-flight is the same on any machine, as slow or as fast as it is.
+The clock begins at a fixed time and advances by the times that the main thread sleeps and a little for each look at it. After
+START_NS, and from then on at the stamp of each packet of samples, the main thread stands still: its serial ports send what they have,
+it says so on a pipe (VISTHROW_STANDS), and waits for the next packet. What has come on the ports meanwhile is taken in before it goes
+on. So a flight is the same on any machine, as slow or as fast as it is.
 
 Source: betaflight 4.6, src/platform/SIMULATOR/sitl.c (micros64, updateState, udpThread, tcpThread), lib/main/dyad. */
 
@@ -17,20 +17,15 @@ Source: betaflight 4.6, src/platform/SIMULATOR/sitl.c (micros64, updateState, ud
 #include <time.h>
 #include <unistd.h>
 
+#define START_NS 2000000000LL           /* for sensors and ports to be begun */
 enum { LOOK_NS = 100, SAMPLES = 144, TURNS = 4 };
 
 static pthread_mutex_t lock = PTHREAD_MUTEX_INITIALIZER;
 static pthread_cond_t moved = PTHREAD_COND_INITIALIZER;
-static int begun, turns, waits;         /* in lock step; turns that the ports may take; whether they wait for some */
-static int64_t now_ns, limit_ns, origin_ns;
+static int turns, waits;                /* turns that the ports may take; whether they wait for some */
+static int64_t now_ns = 1000000000LL, limit_ns = 1000000000LL + START_NS;
 static __thread int sampled;            /* samples were received, and are dealt with when this thread waits for the next */
 static __thread double stamp;
-
-static int64_t wall(void) {
-    struct timespec t;
-    syscall(SYS_clock_gettime, CLOCK_MONOTONIC, &t);
-    return t.tv_sec * 1000000000LL + t.tv_nsec;
-}
 
 static int is_main(void) {
     static __thread int known;
@@ -56,21 +51,14 @@ static void stand(void) {
 static void grant(void) {
     sampled = 0;
     pthread_mutex_lock(&lock);
-    if (!begun) {
-        now_ns = wall();
-        origin_ns = now_ns - (int64_t)(1e9 * stamp);
-        limit_ns = now_ns;
-        __atomic_store_n(&begun, 1, __ATOMIC_SEQ_CST);
-    } else {
-        serve_ports();
-        limit_ns = origin_ns + (int64_t)(1e9 * stamp + 0.5);
-    }
+    serve_ports();
+    limit_ns = 1000000000LL + START_NS + (int64_t)(1e9 * stamp + 0.5);
     pthread_cond_broadcast(&moved);
     pthread_mutex_unlock(&lock);
 }
 
 int clock_gettime(clockid_t id, struct timespec *t) {
-    if (id != CLOCK_MONOTONIC || !__atomic_load_n(&begun, __ATOMIC_SEQ_CST)) return syscall(SYS_clock_gettime, id, t);
+    if (id != CLOCK_MONOTONIC) return syscall(SYS_clock_gettime, id, t);
     int64_t ns = __atomic_add_fetch(&now_ns, is_main() ? LOOK_NS : 0, __ATOMIC_SEQ_CST);
     t->tv_sec = ns / 1000000000LL;
     t->tv_nsec = ns % 1000000000LL;
@@ -78,7 +66,7 @@ int clock_gettime(clockid_t id, struct timespec *t) {
 }
 
 int nanosleep(const struct timespec *want, struct timespec *left) {
-    if (!is_main() || !__atomic_load_n(&begun, __ATOMIC_SEQ_CST)) return syscall(SYS_nanosleep, want, left);
+    if (!is_main()) return syscall(SYS_nanosleep, want, left);
     int64_t ns = __atomic_add_fetch(&now_ns, want->tv_sec * 1000000000LL + want->tv_nsec, __ATOMIC_SEQ_CST);
     if (ns >= __atomic_load_n(&limit_ns, __ATOMIC_SEQ_CST)) stand();
     return 0;
@@ -96,8 +84,7 @@ ssize_t recvfrom(int fd, void *data, size_t size, int flags, struct sockaddr *fr
 
 int select(int count, fd_set *reads, fd_set *writes, fd_set *faults, struct timeval *most) {
     if (sampled) grant();
-    int ports = most && most->tv_sec == 0 && most->tv_usec < 20000;  /* their thread waits for 10 ms, the others for 100 */
-    if (ports && __atomic_load_n(&begun, __ATOMIC_SEQ_CST)) {
+    if (most && most->tv_sec == 0 && most->tv_usec < 20000) {  /* the ports' thread waits for 10 ms, the others for 100 */
         pthread_mutex_lock(&lock);
         waits = 1;
         pthread_cond_broadcast(&moved);

@@ -59,6 +59,11 @@ def motors(packet: bytes) -> np.ndarray | None:
     return np.array([values[at] for at in OURS])
 
 
+def stood(stands: int, most: float) -> bool:
+    """Whether a firmware in lock step says on its pipe, within a time [s], that it stands still."""
+    return bool(select.select([stands], [], [], most)[0]) and bool(os.read(stands, 8))
+
+
 class Sensors:
     """Where samples are sent to, and the firmware's clock."""
 
@@ -81,10 +86,8 @@ class Sensors:
         self._last = (rate_b, force_b, quat_wb)
         self._stamp += period
         self._socket.sendto(samples(self._stamp, *self._last), ("127.0.0.1", SENSORS))
-        if self._stands is not None:
-            there = select.select([self._stands], [], [], PATIENCE)[0]
-            if not there or not os.read(self._stands, 8):
-                raise RunError(f"the firmware has not come to the time {self._stamp:.3f} s of its samples after {PATIENCE:g} s")
+        if self._stands is not None and not stood(self._stands, PATIENCE):
+            raise RunError(f"the firmware has not come to the time {self._stamp:.3f} s of its samples after {PATIENCE:g} s")
 
     def rest(self, period: float) -> None:
         """The same with a vehicle that stands still, as at the last time."""
@@ -96,7 +99,6 @@ class Sensors:
         Raises:
             RunError: see `send`.
         """
-        self.rest(0.0)  # from here on its clock is ours
         for _ in range(round(CALIBRATION / STILL)):
             self.rest(STILL)
 

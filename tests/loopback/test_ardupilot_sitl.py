@@ -1,0 +1,112 @@
+"""The bridge to ArduPilot's JSON interface against a fake of the other side, which sends servo outputs and waits for the state."""
+
+import json
+import socket
+import struct
+import threading
+
+import numpy as np
+import pytest
+
+from hil.fakes.base import VEHICLE_ID, Options
+from hil.fakes.mocap import MocapParams
+from hil.fakes.sitl.ardupilot import SERVOS, ArduPilotSitl, outputs
+from hil.links.device import Device, UdpPort
+from hil.links.mavlink_link import Link
+from hil.params import HilParams
+from visthrow import config
+from visthrow.throws.wire_plant import make_motors
+
+HOVER = 1437
+"""Output at which the rotors carry the vehicle [us]: the square root of its weight over four motors of 3.5 N, a little more."""
+
+
+class OtherSide(threading.Thread):
+    """Sends frames one after another and keeps the states that come back."""
+
+    def __init__(self, frames):
+        super().__init__(daemon=True)
+        self.frames, self.states = frames, []
+
+    def run(self):
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
+            link.settimeout(2.0)
+            for number, servos in self.frames:
+                link.sendto(struct.pack("<HHI16H", 18458, 1000, number, *servos), ("127.0.0.1", SERVOS))
+                try:
+                    self.states.append(json.loads(link.recv(4096)))
+                except TimeoutError:
+                    return
+
+
+def servos(*motors, hook=1100):
+    return (*motors, 1000, 1000, 1000, 1000, hook, *[1000] * 7)
+
+
+@pytest.fixture
+def bridge():
+    params = config.load(HilParams, config.find("hil", "ardupilot_sitl")).ardupilot
+    link = Link(UdpPort(Device("udpout", "127.0.0.1", 14998)), *VEHICLE_ID)
+    made = ArduPilotSitl(make_motors("vision_dropout", 0), link, MocapParams(), 0, Options(), params)
+    yield made
+    made.close()
+
+
+def fly(bridge, frames):
+    other = OtherSide(frames)
+    other.start()
+    for _ in frames:
+        bridge.step()
+    other.join(5.0)
+    return other.states
+
+
+def test_each_frame_is_flown_once_and_answered_with_the_state_after_it(bridge):
+    """A frame that comes again moves nothing; time goes by the period; the vehicle stands until its rotors carry it."""
+    frames = [(n, servos(1000, 1000, 1000, 1000)) for n in (1, 2, 2, 3)]
+    states = fly(bridge, frames)
+    assert [round(state["timestamp"], 6) for state in states] == [0.002, 0.004, 0.004, 0.006]
+    assert (bridge.frames, bridge.repeated, bridge.restarts) == (3, 1, 0)
+    assert bridge.plant.held
+    np.testing.assert_allclose(states[-1]["position"], [1.0, -1.0, -1.0] * bridge.plant.state["pos_w"], atol=1e-6)
+    np.testing.assert_allclose(states[-1]["imu"]["accel_body"], [0.0, 0.0, -9.81], atol=0.1)
+
+
+def test_motors_turn_the_vehicle_as_ardupilot_means_them(bridge):
+    """Outputs 1 and 4 are front and rear right, 1 and 3 the front, 1 and 2 turn counter-clockwise: signs of roll, pitch and yaw."""
+    lift = [(n, servos(*[HOVER + 20] * 4)) for n in range(1, 101)]
+    fly(bridge, lift)
+    assert not bridge.plant.held
+    for weaker, axis in (((0, 3), 0), ((1, 3), 1)):  # right side lower: rolls right; rear lower: pitches up
+        outs = [HOVER + 20 - 30 * (i in weaker) for i in range(4)]
+        before = bridge.plant.rate_b.copy()
+        states = fly(bridge, [(1000 * (axis + 1) + n, servos(*outs)) for n in range(25)])
+        told = np.array(states[-1]["imu"]["gyro"]) - np.array([1.0, -1.0, -1.0]) * before
+        assert told[axis] > 0.2
+        assert abs(told[axis]) > 3.0 * abs(np.delete(told, axis)).max()
+    before = bridge.plant.rate_b.copy()
+    states = fly(bridge, [(5000 + n, servos(HOVER + 60, HOVER + 60, HOVER - 30, HOVER - 30)) for n in range(25)])
+    told = np.array(states[-1]["imu"]["gyro"]) - np.array([1.0, -1.0, -1.0]) * before
+    assert told[2] > 0.02, "motors 1 and 2 turn counter-clockwise, the vehicle clockwise: yaw right"
+
+
+def test_the_mechanisms_output_lets_the_ball_go(bridge):
+    fly(bridge, [(n, servos(*[HOVER + 20] * 4)) for n in range(1, 101)])
+    fly(bridge, [(101 + n, servos(*[HOVER + 20] * 4, hook=1900)) for n in range(60)])
+    report = bridge.report()
+    assert report["releases"] == 1
+    assert report["separation_time"] == pytest.approx(report["release_time"] + 0.06, abs=0.005)
+
+
+def test_strange_packets_are_none():
+    assert outputs(b"") is None
+    assert outputs(struct.pack("<HHI16H", 18459, 1000, 1, *[1500] * 16)) is None
+    assert outputs(struct.pack("<HHI15H", 18458, 1000, 1, *[1500] * 15)) is None
+    number, values = outputs(struct.pack("<HHI32H", 29569, 1000, 7, *range(1000, 1032)))
+    assert number == 7
+    assert values[31] == 1031.0
+
+
+def test_ardupilot_that_starts_again_is_counted(bridge):
+    fly(bridge, [(50, servos(1000, 1000, 1000, 1000)), (1, servos(1000, 1000, 1000, 1000))])
+    assert bridge.restarts == 1
