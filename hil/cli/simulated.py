@@ -6,13 +6,15 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from hil.cli.flight import key_of, params_of
 from hil.errors import RunError
 from hil.fakes.base import Options
 from hil.fakes.direct import Direct, scored
 from hil.fakes.mocap import MocapParams
 from hil.fakes.process import VEHICLE_ID, ListeningPort, load_plant, make_fake, read_options, serve
-from hil.fakes.sitl import SLOW, ArduPilotSitl, BetaflightSitl, Firmware, MotorPlant, needed, throw
+from hil.fakes.sitl import SLOW, ArduPilotSitl, BetaflightSitl, Firmware, HangingBall, MotorPlant, Px4Sih, needed, throw
 from hil.links.clock import Clock, MonotonicClock
 from hil.links.device import check_device, open_port
 from hil.links.mavlink_link import Link
@@ -20,8 +22,14 @@ from hil.params import HilParams
 from visthrow import config
 from visthrow.onboard.policy import Policy, find_policy
 
-PLANT, MOTORS = "visthrow.throws.wire_plant:make", "visthrow.throws.wire_plant:make_motors"
-"""What makes the vehicle behind a fake, and behind a firmware."""
+PLANT, MOTORS, BALL = "visthrow.throws.wire_plant:make", "visthrow.throws.wire_plant:make_motors", "hil.cli.simulated:make_ball"
+"""What makes the vehicle behind a fake, and behind a firmware; the ball below a firmware's own vehicle."""
+
+BRIDGE_ID = (254, 190)
+"""MAVLink ids of the bridge where it listens to an autopilot itself."""
+
+BALL_LAG = 0.06
+"""From the mechanism's output to separation below PX4's vehicle [s], as `visthrow.throws.wire_plant.MECHANISM`."""
 
 
 def direct(args: argparse.Namespace) -> int:
@@ -44,8 +52,8 @@ def direct(args: argparse.Namespace) -> int:
 def fake(args: argparse.Namespace) -> int:
     """Fly a fake autopilot, and print its report."""
     options, mocap = read_options([*args.overrides, f"answer={args.answer}"]), MocapParams(rate=args.rate)
-    sitl = SITL.get(args.kind)
-    plant = load_plant(args.plant or (PLANT if sitl is None else MOTORS), args.policy, args.seed)
+    sitl, usual = SITL.get(args.kind, (None, PLANT))
+    plant = load_plant(args.plant or usual, args.policy, args.seed)
     link = Link(open_port(check_device(args.device)), *VEHICLE_ID, key=key_of(args))
     clock, out = MonotonicClock(args.speed), None if args.out is None else Path(args.out)
     if sitl is not None:
@@ -95,6 +103,29 @@ def _fly_ardupilot(
         flown.close()
 
 
+def _fly_px4(
+    args: argparse.Namespace, plant: HangingBall, link: Link, mocap: MocapParams, options: Options, clock: Clock, out: Path | None
+) -> dict[str, Any]:  # fmt: skip
+    """Hang the ball below PX4's own vehicle; the report."""
+    params = config.load(HilParams, config.find("hil", args.config)).px4
+    flown = Px4Sih(plant, link, mocap, args.seed, options, params, Link(open_port(check_device(args.autopilot)), *BRIDGE_ID))
+    print(f"waiting for PX4 on {args.autopilot}", file=sys.stderr, flush=True)
+    try:
+        return serve(flown, clock, args.seconds, out, args.after)
+    finally:
+        flown.close()
+
+
+def make_ball(policy: str, seed: int) -> HangingBall:
+    """Rope and ball that a policy was trained with, below a vehicle that is told where it is."""
+    contract = Policy.load(find_policy(policy)).contract
+    rope, alone = contract["rope"], contract["vehicle"]["body"]["mass"]
+    return HangingBall(
+        np.array(rope["mount"]), rope["length"] + rope["payload_offset"], BALL_LAG,
+        (alone + rope["rope_mass"] + rope["payload_mass"], alone), contract["action"]["max_thrust"],
+    )  # fmt: skip
+
+
 def _tell_late(report: dict[str, Any], period: float, speed: float) -> None:
     """Say where the machine was too slow for its clock."""
     periods = report["time"] / period
@@ -105,5 +136,7 @@ def _tell_late(report: dict[str, Any], period: float, speed: float) -> None:
         )  # fmt: skip
 
 
-SITL = {"betaflight-sitl": _fly_betaflight, "ardupilot-sitl": _fly_ardupilot}
-"""Kinds of fake that are a bridge to a firmware in software."""
+SITL: dict[str, tuple[Any, str]] = {
+    "betaflight-sitl": (_fly_betaflight, MOTORS), "ardupilot-sitl": (_fly_ardupilot, MOTORS), "px4-sih": (_fly_px4, BALL),
+}
+"""Kinds of fake that are a bridge to a firmware in software: what flies them, and what makes the vehicle behind it."""

@@ -3,6 +3,7 @@
 from hil.fakes.sitl.ardupilot import ArduPilotSitl
 from hil.fakes.sitl.betaflight import SLOW, BetaflightSitl, MotorPlant
 from hil.fakes.sitl.firmware import Firmware, needed
+from hil.fakes.sitl.sih import HangingBall, Px4Sih
 from hil.fakes.sitl.throw import throw
 
-__all__ = ["SLOW", "ArduPilotSitl", "BetaflightSitl", "Firmware", "MotorPlant", "needed", "throw"]
+__all__ = ["SLOW", "ArduPilotSitl", "BetaflightSitl", "Firmware", "HangingBall", "MotorPlant", "Px4Sih", "needed", "throw"]
