@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from visthrow.evidence.bench.hil.processes import free_port
 
 from hil.cli.simulated import make_ball
 from hil.fakes.base import VEHICLE_ID, Options
@@ -14,7 +15,6 @@ from hil.links.mavlink_link import Link
 from hil.links.pymav import mav
 from hil.params import HilParams
 from visthrow import config
-from visthrow.evidence.bench.hil.processes import free_port
 
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
 STILL = np.zeros(3)
