@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 import pytest
-from visthrow.evidence.bench.hil.processes import free_port
 
 from hil.cli.simulated import make_ball
 from hil.fakes.base import VEHICLE_ID, Options
@@ -14,6 +13,7 @@ from hil.links.device import Device, UdpPort
 from hil.links.mavlink_link import Link
 from hil.links.pymav import mav
 from hil.params import HilParams
+from tests.bench.processes import free_port
 from visthrow import config
 
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])

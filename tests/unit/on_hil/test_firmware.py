@@ -1,8 +1,10 @@
 """The bridge to a firmware, without one: packets, its command line, what is read of its channels."""
 
 import dataclasses
-import itertools
+import os
+import shutil
 import socket
+import subprocess
 import threading
 
 import numpy as np
@@ -50,24 +52,65 @@ def test_motors_come_in_our_order():
     assert packets.motors(packet[:-1]) is None
 
 
-def test_stamps_stand_still_after_the_clocks_rate_was_set(monkeypatch):
-    """Two stamps whose difference is the rate's share of the time between them, less than 20 ms; the same one from then on."""
-    monkeypatch.setattr(packets, "CALIBRATION", 0.01)
-    port = free_port(socket.SOCK_DGRAM)
+STUB = r"""
+#include <arpa/inet.h>
+#include <pthread.h>
+#include <stdio.h>
+#include <string.h>
+#include <sys/select.h>
+#include <time.h>
+static int state;
+static void *samples(void *unused) {
+    for (;;) {
+        double data[18]; fd_set set; struct timeval most = {0, 100000};
+        FD_ZERO(&set); FD_SET(state, &set);
+        if (select(state + 1, &set, NULL, NULL, &most) == 1) recvfrom(state, data, sizeof data, 0, NULL, NULL);
+    }
+}
+static void *ports(void *unused) {
+    for (;;) { struct timeval most = {0, 9999}; select(0, NULL, NULL, NULL, &most); }
+}
+int main(int argc, char **argv) {
+    struct sockaddr_in at = {.sin_family = AF_INET}; pthread_t a, b; long turns = 0;
+    int port; sscanf(argv[1], "%d", &port); at.sin_port = htons(port); at.sin_addr.s_addr = htonl(INADDR_LOOPBACK);
+    state = socket(AF_INET, SOCK_DGRAM, 0); bind(state, (struct sockaddr *)&at, sizeof at);
+    pthread_create(&a, NULL, samples, NULL); pthread_create(&b, NULL, ports, NULL);
+    for (;;) {
+        struct timespec now, nap = {0, 50000}; clock_gettime(CLOCK_MONOTONIC, &now); nanosleep(&nap, NULL);
+        printf("%ld %ld.%09ld\n", ++turns, now.tv_sec, now.tv_nsec); fflush(stdout);
+    }
+}
+"""
+"""A program with the firmware's threads: one for samples, one for ports, and a loop that sleeps for 50 us and tells its clock."""
+
+
+@pytest.mark.skipif(shutil.which("gcc") is None, reason="no C compiler")
+def test_a_clock_in_lock_step_goes_as_far_as_the_samples_let_it(tmp_path, monkeypatch):
+    """Loops of 50.1 us: 2 s after the start it stands still; each packet lets it go on by its period, twice the same in two runs."""
+    source, program, port = tmp_path / "stub.c", tmp_path / "stub", free_port(socket.SOCK_DGRAM)
+    source.write_text(STUB)
+    subprocess.run(["gcc", "-o", program, source, "-lpthread"], check=True)
     monkeypatch.setattr(packets, "SENSORS", port)
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as firm:
-        firm.bind(("127.0.0.1", port))
-        firm.settimeout(2.0)
-        sensors = packets.Sensors()
-        sensors.start(0.5)
-        sensors.send(np.zeros(3), np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
-        stamps = [packets.FDM.unpack(firm.recv(200))[0] for _ in range(7)]
-        sensors.close()
-    moved = [b - a for a, b in itertools.pairwise(stamps)]
-    assert stamps[0] == 1.0
-    assert sum(step != 0.0 for step in moved) == 1
-    assert packets.GAP <= sum(moved) < packets.MOST_GAP
-    assert moved[-1] == 0.0
+    told = []
+    for _ in range(2):
+        stands, said = os.pipe()
+        environment = os.environ | {"LD_PRELOAD": str(firmware.compiled(tmp_path)), "VISTHROW_STANDS": str(said)}
+        command = [program, str(port)]
+        with open(tmp_path / "told.txt", "w") as out, subprocess.Popen(command, env=environment, pass_fds=[said], stdout=out) as stub:
+            assert packets.stood(stands, 10.0)
+            sensors = packets.Sensors(stands)
+            for period in (0.002, 0.002, 0.010):
+                sensors.rest(period)
+            assert not packets.stood(stands, 0.05), "it stands until the next packet"
+            stub.kill()
+            sensors.close()
+        os.close(stands)
+        os.close(said)
+        told.append((tmp_path / "told.txt").read_text().splitlines()[-1])
+    turns, now = told[0].split()
+    assert float(now) == pytest.approx(1.0 + 2.0 + 0.014, abs=1e-4)
+    assert int(turns) == pytest.approx(2.014 / 50.1e-6, rel=1e-3)
+    assert told[0] == told[1]
 
 
 class Answers:
@@ -147,7 +190,7 @@ def test_the_bridge_sees_arming_and_the_release_channel(params, monkeypatch):
     serial = ListeningPort(mine)
     fake = BetaflightSitl(
         make_motors("vision_dropout", 0), Link(UdpPort(Device("udpout", "127.0.0.1", 14999)), *VEHICLE_ID), MocapParams(), 0,
-        Options(), params,
+        Options(), params, None,
     )  # fmt: skip
     parser, channels = msp.Parser(), [1500, 1500, 1500, 1000, LOW, LOW, LOW, LOW]
     flags = [0]
