@@ -1,0 +1,98 @@
+"""The loop closed on Betaflight's firmware: throws before, what the diagnosis found, throws after.
+
+    python -m tests.sitl.loop                                       # the committed record
+    python tests/sitl/alone.py python -m tests.sitl.loop --name before --policy vision_dropout --out out/loop     # and again
+    python tests/sitl/alone.py python -m tests.sitl.loop --name after --policy POLICY --out out/loop
+
+Each series is twenty throws at 1.5, 2.0 and 2.5 m through the firmware, in lock step, poses with 1 mm and 0.2 deg of noise at 100 Hz, and
+the same throws on our own block with the policy's own vehicle (``own``). A series that was cut goes on where it was. The record
+keeps error and separation of each throw; the runs and the firmware's blackboxes are left in the folder.
+"""
+
+import argparse
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+
+from hil.fakes.direct import Direct
+from hil.fakes.mocap import MocapParams
+from hil.fakes.sitl import throw
+from hil.params import HilParams
+from tests.sitl.test_betaflight import program
+from visthrow import config
+from visthrow.common import provenance
+from visthrow.onboard.policy import Policy, find_policy
+from visthrow.throws.wire_plant import make, make_motors
+
+RECORD = Path(__file__).with_name("betaflight-4.6.0.json")
+DISTANCES, SEEDS = (2.0, 1.5, 2.5), range(20)
+
+
+def flown(where: str, distance: float, seed: int, policy: str, plant: str, folder: Path) -> dict:
+    """One throw, through the firmware or on our own block; what became of it."""
+    params = config.load(HilParams, config.find("hil", "betaflight_sitl"), [f"goal_w=[{distance},0.0,0.0]", f'policy="{policy}"'])
+    loaded = Policy.load(find_policy(policy))
+    if where == "own":
+        report = Direct(make(policy, seed), loaded, params, MocapParams(), seed).throw()
+    else:
+        report = throw(program(), folder / f"{distance:g}-{seed:02d}", params, loaded, make_motors(plant, seed), MocapParams(), seed)
+    landing = report["landing_w"]
+    error = None if landing is None else round(math.hypot(landing[0] - distance, landing[1]), 5)
+    why = report.get("run", {}).get("reason", "")
+    return {"where": where, "distance": distance, "seed": seed, "error": error, "landing_w": landing, "ended": why}
+
+
+def series(args: argparse.Namespace) -> list[dict]:
+    """All throws of a series that are not there yet."""
+    args.out.mkdir(parents=True, exist_ok=True)
+    lines = args.out / f"{args.name}.jsonl"
+    found = [json.loads(text) for text in lines.read_text().splitlines()] if lines.exists() else []
+    done = {(line["where"], line["distance"], line["seed"]) for line in found}
+    for where in ("own", "firmware"):
+        for distance in DISTANCES:
+            for seed in SEEDS:
+                if (where, distance, seed) not in done:
+                    found.append(flown(where, distance, seed, args.policy, args.plant, args.out / args.name))
+                    with open(lines, "a") as out:
+                        out.write(json.dumps(found[-1]) + "\n")
+                    print(json.dumps(found[-1]), flush=True)
+    return found
+
+
+def table(record: dict) -> str:
+    """A record as a table of Markdown: mean, greatest error [m], and how many landed."""
+    out = ["| | " + " | ".join(f"{d:g} m" for d in sorted(DISTANCES)) + " |", "|---|" + "---|" * len(DISTANCES)]
+    for name, one in record.items():
+        for where, words in (("firmware", "through the firmware"), ("own", "on our own block")):
+            cells = []
+            for distance in sorted(DISTANCES):
+                throws = [t for t in one["throws"] if t["where"] == where and t["distance"] == distance]
+                errors = [t["error"] for t in throws if t["error"] is not None]
+                told = f"{np.mean(errors):.3f} m (to {max(errors):.3f})" if errors else "none landed"
+                cells.append(f"{told}, {len(errors)} of {len(throws)}")
+            out.append(f"| {name}, {one['policy']}, {words} | " + " | ".join(cells) + " |")
+    return "\n".join(out)
+
+
+def main() -> None:
+    """Show the record, or make a series of it anew."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--name", choices=("before", "after"), help="of the series to fly; left out: show the record")
+    parser.add_argument("--policy", help="that throws: a shipped name or a file")
+    parser.add_argument("--plant", default="vision_dropout", help="policy whose vehicle is behind the firmware")
+    parser.add_argument("--out", type=Path, default=Path("out/loop"))
+    parser.add_argument("--record", action="store_true", help="keep the series in the committed record")
+    args = parser.parse_args()
+    record = json.loads(RECORD.read_text())
+    if args.name:
+        made = {"policy": Path(args.policy).stem, "commit": provenance.commit(), "throws": series(args)}
+        record["loop"] = {**record.get("loop", {}), args.name: made}
+        if args.record:
+            RECORD.write_text(json.dumps(record, indent=1) + "\n")
+    print(table(record["loop"]))
+
+
+if __name__ == "__main__":
+    main()
