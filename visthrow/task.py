@@ -285,6 +285,7 @@ class Experiment:
     algorithm: Literal["ppo", "first_order", "distillation"] = "ppo"
     first_order: FirstOrderParams = field(default_factory=FirstOrderParams)
     distillation: DistillationParams = field(default_factory=DistillationParams)
+    flown_as: str = ""  # train config whose conditions a policy of this training is flown in; empty: its own
 
     @property
     def iterations(self) -> int:

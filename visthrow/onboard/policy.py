@@ -250,7 +250,7 @@ class Policy:
             return torch.from_numpy(arrays[name]).to(device)
 
         header = _header(take("header").cpu().numpy(), path)
-        count = sum(name.endswith("_weight") for name in arrays)
+        count = sum(name.startswith("layer") and name.endswith("_weight") for name in arrays)
         normalized = "normalizer_mean" in arrays
         try:
             estimator = None

@@ -1,0 +1,129 @@
+"""Distillation: it learns, its policy remembers on board as in training, and it goes on bit for bit after a stop."""
+
+import os
+import signal
+
+import numpy as np
+import pytest
+import torch
+
+from visthrow import cli, config
+from visthrow.onboard.pilot import Pilot
+from visthrow.onboard.policy import Policy
+from visthrow.task import Experiment
+from visthrow.training.distillation import Distillation
+from visthrow.training.env import ThrowEnv
+from visthrow.training.trainer import CHECKPOINT, Trainer
+
+SMALL = ['algorithm="distillation"', "ppo.environments=48", "distillation.hidden=64", "distillation.memory=32"]
+FLOWN = 25
+"""Control steps that the memory is compared over."""
+AGREES = 2e-5
+"""Of float32 between torch's recurrent layer and the exported step, and between a batch and single throws."""
+
+
+def overrides(*extra):
+    return [part for item in (*SMALL, *extra) for part in ("--set", item)]
+
+
+def words(folder, *extra):
+    sets = overrides("distillation.iterations=4", "distillation.horizon=12", "task.bounds.time_limit=0.4")
+    return ["train", "vision", "--device", "cpu", "--out", str(folder), "--checkpoint-every", "1", *sets, *extra]
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A run of four iterations without interruption."""
+    torch.set_num_threads(1)
+    folder = tmp_path_factory.mktemp("whole") / "run"
+    assert cli.main(words(folder)) == 0
+    return folder
+
+
+def trained(iterations, sign=1.0):
+    """Trainer after so many iterations of a short schedule; ``sign`` turns every gradient."""
+    sets = (*SMALL[:2], "distillation.iterations=14", "distillation.horizon=60", "distillation.hidden=128", "distillation.memory=64",
+            "distillation.epochs=2", "distillation.learning_rate=0.005")  # fmt: skip
+    trainer = Trainer(config.load(Experiment, config.find("train", "vision"), sets), "cpu", 1)
+    for parameter in trainer.algorithm.network.parameters():
+        parameter.register_hook(lambda gradient: sign * gradient)
+    losses = [trainer.step()["value"] for _ in range(iterations)]
+    return trainer, losses
+
+
+def test_it_learns():
+    """A dozen rollouts of 48 throws teach it to throw; with the gradient's sign turned they do not."""
+    trainer, losses = trained(14)
+    assert losses[-1] < 0.5 * losses[0]
+    summary = trainer.throw(2.0, 64).summary()
+    assert summary["success"] > 0.9
+    assert summary["error_mean"] < 0.5  # untrained it drops the payload at once, 2.0 m off
+    _, wrong = trained(4, sign=-1.0)
+    assert wrong[-1] > losses[0]
+
+
+def test_the_exported_policy_remembers_as_the_network_does(whole):
+    trainer = Trainer(config.load(Experiment, whole / "config.toml"), "cpu", 1)
+    trainer.load(whole / CHECKPOINT)
+    policy, network = Policy.load(whole / "policy.npz"), trainer.algorithm.network
+    obs = torch.randn(FLOWN, 5, policy.obs_dim)
+    with torch.no_grad():
+        estimates = network(obs, policy.estimator.mean, policy.estimator.std)
+    memory = policy.begin(5)
+    for seen, wanted in zip(obs, estimates):
+        estimate, memory = policy.estimator.step(seen, memory)
+        torch.testing.assert_close(estimate, wanted, rtol=0, atol=AGREES)
+
+
+def test_the_pilot_remembers_as_training_does(whole):
+    """The same commands from poses on board as from the environment's observations, with a memory that starts anew."""
+    noise = ("observation_step", "observation_bias", "command_step", "command_bias")
+    quiet = [*(f"task.noise.{name}=0.0" for name in noise), "camera.noise.step_std=0.0", "camera.noise.bias_std=0.0",
+             "task.observation.latency=[0.0,0.0]"]  # fmt: skip
+    experiment = config.load(Experiment, whole / "config.toml", quiet)
+    policy = Policy.load(whole / "policy.npz")
+    env, pilot = ThrowEnv(experiment, "cpu", 3, 3), Pilot(policy, experiment.camera, 3)
+    for _ in range(2):
+        seen, act = env.reset()["actor"], policy.actor(3)
+        pilot.start()
+        for _ in range(8):
+            state = {key: value.numpy().copy() for key, value in env.views.state.items()}
+            views = [state[key] for key in ("pos_w", "quat_wb", "vel_w", "rate_b")]
+            out = pilot.act(*views, env.views.out["payload_pos_w"].numpy().copy(), env.views.goal_w.numpy().copy(), state["attached"])
+            action = act(seen)
+            np.testing.assert_allclose(out.action, action.clamp(-1.0, 1.0).numpy(), atol=AGREES)
+            seen = env.step(action, hold=True)[0]["actor"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_stop_keeps_what_was_done(whole, tmp_path, monkeypatch, number):
+    folder, step = tmp_path / "run", Distillation.step
+
+    def interrupted(self, done):
+        figures = step(self, done)
+        if done == 1 / 4:
+            os.kill(os.getpid(), number)  # in the second iteration
+        return figures
+
+    monkeypatch.setattr(Distillation, "step", interrupted)
+    assert cli.main(words(folder)) == 130
+    monkeypatch.setattr(Distillation, "step", step)
+    assert cli.main(words(folder, "--resume")) == 0
+    one, two = (Policy.load(run / "policy.npz").estimator for run in (whole, folder))
+    for name, value in vars(one).items():
+        np.testing.assert_array_equal(value.numpy(), getattr(two, name).numpy(), err_msg=name)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ('distillation.teacher="vision"', "has the layout 'vision'; expected 'state'"),
+        ('task.observation.layout="state"', 'observation.layout = "vision"'),
+        ('task.observation.history_of="frame"', 'observation.history_of = "payload"'),
+        ("distillation.memory=0", "memory"),
+    ],
+)
+def test_what_cannot_be_distilled_is_refused(tmp_path, capsys, change, said):
+    assert cli.main(["train", "vision", "--device", "cpu", "--out", str(tmp_path / "run"), *overrides(change)]) == 2
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
