@@ -79,7 +79,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     subs["run"].add_argument("--auto-arm", action="store_true", help="arm whenever ready; for `visthrow hil fake` alone")
     for name in ("replay", "view"):
-        subs[name].add_argument("folder", metavar="FOLDER", help="of a run")
+        more = ", or its bundle" if name == "replay" else ""
+        subs[name].add_argument("folder", metavar="FOLDER", help=f"of a run{more}")
     subs["view"].add_argument("--live", action="store_true", help="serve the run while it goes on, on 127.0.0.1 alone")
     subs["view"].add_argument("--out", default=None, metavar="FILE", help="of the recording (default: run.rrd in the folder)")
     subs["view"].add_argument("--web-port", type=int, default=9090, metavar="N", help="of the live view (default: 9090)")

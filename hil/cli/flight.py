@@ -19,6 +19,7 @@ from hil.links.clock import ManualClock, MonotonicClock
 from hil.links.device import check_device
 from hil.links.signing import read_key
 from hil.params import HilParams
+from hil.recording.bundle import pack
 from hil.recording.latency import Stages
 from hil.recording.record import Recorder
 from hil.recording.report import finish, story
@@ -100,7 +101,11 @@ def fly(args: argparse.Namespace) -> int:
     _show(story(summary, folder))
     if not args.bare:
         _show("\n".join(finish(folder, stages)))
-    return 1 if summary["aborted"] or summary["errors"] else 0
+    if summary["aborted"] or summary["errors"]:
+        with contextlib.suppress(RunError):
+            _show(f"{pack(folder)}  the run in one file: `visthrow hil replay` says where it went wrong")
+        return 1
+    return 0
 
 
 def _show(text: str) -> None:

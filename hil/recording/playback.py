@@ -11,10 +11,12 @@ from typing import Any
 from hil.backends.base import DryRun, Status
 from hil.control.decision import Decision, Words
 from hil.control.runner import Runner
+from hil.control.states import State
 from hil.params import HilParams
-from hil.poses.pose import Pose, Vector
+from hil.poses.pose import VEHICLE, Pose, Vector
 from hil.poses.sight import Sight
 from hil.poses.track import Track
+from hil.recording.bundle import sentence
 from hil.recording.record import SUMMARY, load_run
 from visthrow.onboard.policy import Policy
 
@@ -64,29 +66,38 @@ def replay(folder: str | Path) -> dict[str, Any]:
 
     Returns:
         Number of ticks and actions compared, the bodies, the differences (tick, name, recorded value, value now), and what is
-        missing of the recording, or None.
+        missing of the recording, or None; ``story``: where it went wrong, in a sentence.
 
     Raises:
         RunError: no folder of a run, or a damaged one.
     """
     params, policy, ticks, poses = load_run(folder)
-    playback = Playback(params, policy)
+    playback, turn, last = Playback(params, policy), None, None
     differences: list[tuple[int, str, Any, Any]] = []
     actions = 0
     for line in ticks:
         decision, _ = playback.feed(line, poses.get(line["n"], []))
         actions += decision.action is not None
+        seen = {"time": decision.time, "state": decision.state, "reason": decision.reason, "since": decision.time}
+        if last is not None and decision.state == last["state"]:
+            seen["since"] = last["since"]
+        seen["vehicle"] = playback.runner.tracks[VEHICLE].state(decision.time)
+        if turn is None and decision.state == State.ABORT.value:
+            turn = {**seen, **({} if last is None else {"state": last["state"], "since": last["since"]})}
+        last = seen
         for name in COMPARED:
             was, now = line[name], getattr(decision, name)
             now = list(now) if isinstance(now, tuple) else now
             if was != now:
                 differences.append((line["n"], name, was, now))
+    cut = _cut(folder, len(ticks))
     return {
         "ticks": len(ticks),
         "actions": actions,
         "bodies": sorted({pose.body for group in poses.values() for pose in group} & set(playback.runner.tracks)),
         "differences": differences,
-        "cut": _cut(folder, len(ticks)),
+        "cut": cut,
+        "story": sentence(turn, last, cut),
     }
 
 

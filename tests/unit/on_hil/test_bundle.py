@@ -1,0 +1,64 @@
+"""A run that ended other than well: one file that replays it, and where it went wrong in a sentence."""
+
+import zipfile
+
+import pytest
+
+from hil.recording.bundle import pack
+from tests.hil_runs import record_run, saved_policy
+from visthrow.cli import main
+
+LOST = 2.5
+"""From which on no pose comes [s]: some ticks later the runner aborts."""
+
+
+def stopped(time, poses):
+    return poses if time < LOST else []
+
+
+@pytest.fixture(scope="module")
+def aborted(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run") / "a"
+    decisions = record_run(folder, saved_policy(folder.parent), seconds=6.0, poses=stopped)
+    return folder, decisions
+
+
+def test_a_bundle_replays_to_the_bit_and_says_where_it_went_wrong(aborted, capsys):
+    folder, decisions = aborted
+    turn = next(n for n, decision in enumerate(decisions) if decision.state == "abort")
+    before = decisions[turn - 1].state
+    bundle = pack(folder)
+    assert bundle.parent == folder.parent
+    assert main(["hil", "replay", str(bundle)]) == 0
+    out = capsys.readouterr().out
+    assert "all bit for bit the same" in out
+    told = out.splitlines()[-1]
+    assert told.startswith("It went wrong ")
+    assert f"s into '{before}': {decisions[turn].reason}; the vehicle was at (" in told
+    age = float(told.split(" ms old")[0].split()[-1])
+    assert age == pytest.approx(1e3 * (decisions[turn].time - LOST), abs=25.0)
+
+
+def test_a_run_that_was_killed_leaves_a_bundle_when_it_is_looked_at(tmp_path, capsys):
+    record_run(tmp_path / "b", saved_policy(tmp_path), seconds=2.0, close=False)
+    assert main(["hil", "replay", str(tmp_path / "b")]) == 1
+    out = capsys.readouterr().out
+    assert "b.zip  what there is of the run" in out
+    assert main(["hil", "replay", str(tmp_path / "b.zip")]) == 1
+    assert "the recording ends" in capsys.readouterr().out.splitlines()[-1]
+
+
+def test_a_good_run_did_not_go_wrong(tmp_path, capsys):
+    record_run(tmp_path / "c", saved_policy(tmp_path), seconds=8.0)
+    assert main(["hil", "replay", str(tmp_path / "c")]) == 0
+    assert capsys.readouterr().out.splitlines()[-1].startswith("It did not go wrong")
+
+
+def test_what_is_no_bundle(tmp_path, capsys):
+    (tmp_path / "no.zip").write_bytes(b"PK no")
+    assert main(["hil", "replay", str(tmp_path / "no.zip")]) == 2
+    assert "expected a folder of a run, or the bundle of one" in capsys.readouterr().err
+    with zipfile.ZipFile(tmp_path / "out.zip", "w") as bundle:
+        bundle.writestr("../outside.txt", "x")
+    assert main(["hil", "replay", str(tmp_path / "out.zip")]) == 2
+    assert not (tmp_path.parent / "outside.txt").exists()
