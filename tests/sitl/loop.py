@@ -51,7 +51,7 @@ def series(args: argparse.Namespace) -> list[dict]:
     found = [json.loads(text) for text in lines.read_text().splitlines()] if lines.exists() else []
     done = {(line["where"], line["distance"], line["seed"]) for line in found}
     for where in ("own", "firmware"):
-        for distance in DISTANCES:
+        for distance in args.distances:
             for seed in SEEDS:
                 if (where, distance, seed) not in done:
                     found.append(flown(where, distance, seed, args.policy, args.plant, args.out / args.name))
@@ -82,6 +82,7 @@ def main() -> None:
     parser.add_argument("--name", choices=("before", "after"), help="of the series to fly; left out: show the record")
     parser.add_argument("--policy", help="that throws: a shipped name or a file")
     parser.add_argument("--plant", default="vision_dropout", help="policy whose vehicle is behind the firmware")
+    parser.add_argument("--distances", type=float, nargs="+", default=DISTANCES)
     parser.add_argument("--out", type=Path, default=Path("out/loop"))
     parser.add_argument("--record", action="store_true", help="keep the series in the committed record")
     args = parser.parse_args()
