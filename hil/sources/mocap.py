@@ -38,7 +38,7 @@ class RigidBody:
     """
 
     body: str  # "vehicle", "payload" or "goal"
-    name: str  # of the rigid body; for natnet its streaming id
+    name: str  # of the rigid body; for natnet its streaming id, for ros2 TYPE:TOPIC
 
     def __post_init__(self) -> None:
         if self.body not in BODIES or not self.name:
@@ -49,15 +49,15 @@ class RigidBody:
 class MocapParams:
     """Where the motion-capture system is."""
 
-    # "natnet" through the package natnet, all others through motioncapture; "mock" sends nothing and is for tests.
+    # "natnet" through the package natnet, "ros2" through cyclonedds, all others through motioncapture; "mock" is for tests.
     system: Literal[
-        "vicon", "optitrack", "optitrack_closed_source", "qualisys", "nokov", "vrpn", "motionanalysis", "natnet", "mock"
+        "vicon", "optitrack", "optitrack_closed_source", "qualisys", "nokov", "vrpn", "motionanalysis", "natnet", "ros2", "mock"
     ]
-    host: str  # numeric address of the system's computer; link.remote must allow one that is not this machine
+    host: str  # numeric address of the system's computer (ros2: of our network card); link.remote must allow one other than loopback
     local: str = "127.0.0.1"  # natnet: address of our own network card
     multicast: bool = True  # natnet: as Motive's transmission type
     timeout: float = 5.0  # to connect [s]
-    settings: dict[str, str] = field(default_factory=dict)  # further options of motioncapture.connect
+    settings: dict[str, str] = field(default_factory=dict)  # further options of motioncapture.connect; for ros2 domain
 
 
 class MocapSource:
@@ -116,7 +116,7 @@ class MotionCaptureSource(MocapSource):
             SourceError: the package is missing, no body is named, or the system does not answer.
         """
         super().__init__(clock, link)
-        self._names = _names(bodies)
+        self._names = body_names(bodies)
         if module is None:
             module = load_extra("motioncapture", "motioncapture", "this source", SourceError)
             _probe(params)
@@ -170,7 +170,7 @@ class NatNetSource(MocapSource):
         wrong = [body.name for body in bodies if not body.name.isdecimal()]
         if wrong:
             raise SourceError(f"natnet bodies {', '.join(wrong)}; expected streaming ids, which are numbers")
-        self._names = {int(name): body for name, body in _names(bodies).items()}
+        self._names = {int(name): body for name, body in body_names(bodies).items()}
         self.untracked = 0
         module = module or load_extra("natnet", "natnet", "this source", SourceError)
         self._client = module.NatNetClient(
@@ -217,7 +217,12 @@ def open_mocap(
     return kind(params, bodies, clock, link)
 
 
-def _names(bodies: tuple[RigidBody, ...]) -> dict[str, str]:
+def body_names(bodies: tuple[RigidBody, ...]) -> dict[str, str]:
+    """Our body by the system's name.
+
+    Raises:
+        SourceError: none, or one twice.
+    """
     names = {body.name: body.body for body in bodies}
     if not names or len(names) != len(bodies) or len(set(names.values())) != len(bodies):
         raise SourceError(

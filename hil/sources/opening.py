@@ -19,6 +19,7 @@ from hil.sources.base import Recorded
 from hil.sources.mavlink import BESIDE, MavlinkSource
 from hil.sources.mocap import open_mocap
 from hil.sources.player import read_autopilot, read_table, read_tlog
+from hil.sources.ros2 import Ros2Source
 
 
 def read_poses(params: HilParams) -> list[Pose]:
@@ -95,6 +96,9 @@ def open_source(
     link = None
     if (source.kind == "mavlink" and not own) or params.backend in AUTOPILOTS:
         link = opened(params.link.device, TLOG, parties(params, source.kind == "mavlink" and not own, True))
+    if source.kind != "mavlink" and source.mocap.system == "ros2":
+        check_device(f"tcp:{source.mocap.host}:1", remote=params.link.remote)
+        return Ros2Source(source.mocap, source.bodies, clock.now, link), link, False
     if source.kind != "mavlink":
         return open_mocap(source.mocap, source.bodies, clock.now, params.link.remote, link), link, False
     if not own:
