@@ -81,6 +81,7 @@ class Known:
     ball_distance: tuple[float, float] | None = None  # of the ball from the lens [m], narrower than the parameters'
     ball_ray_c: np.ndarray | None = None  # to the ball a frame ago, unit, shape (3,)
     within: float = math.radians(12.0)  # of ball_ray_c [rad]
+    north_c: np.ndarray | None = None  # the world's x in the camera frame, unit, shape (3,)
 
 
 class Detector:
@@ -112,14 +113,22 @@ class Detector:
         Raises:
             ValueError: an image of another size or type.
         """
-        shape = (*self._in_view.shape, 3)
-        if image.shape != shape or image.dtype != np.uint8:
-            raise ValueError(f"image of shape {image.shape} and type {image.dtype} came; expected {shape} and uint8")
+        self.check(image)
         p, known = self.params, known or Known()
         colours = colours_of(image)
         ball = colour_maps(colours, p.ball_hue_deg, p.saturation, p.brightness, self._in_view, "yellow")
         goal = colour_maps(colours, p.goal_hue_deg, p.saturation, p.brightness, self._in_view, "green")
         return Seen(self._ball(*ball, known), self._goal(*goal, colours.bright, known))
+
+    def check(self, image: np.ndarray) -> None:
+        """Refuse an image of another size or type.
+
+        Raises:
+            ValueError: see there.
+        """
+        shape = (*self._in_view.shape, 3)
+        if image.shape != shape or image.dtype != np.uint8:
+            raise ValueError(f"image of shape {image.shape} and type {image.dtype} came; expected {shape} and uint8")
 
     def _ball(self, mask: np.ndarray, level: np.ndarray, known: Known) -> BallSeen | None:
         """The blob whose edge is the best cone."""

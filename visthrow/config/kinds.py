@@ -9,6 +9,7 @@ SCHEMAS = {
     "vehicle": "sim.params:VehicleParams",
     "rope": "sim.params:RopeParams",
     "camera": "camera.params:CameraParams",
+    "detector": "camera.detectors.fit:FitParams",
     "release": "sim.params:ReleaseParams",
     "sim": "sim.params:SimParams",
     "effects": "sim.effects.effect:EffectTables",

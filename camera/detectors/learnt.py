@@ -1,0 +1,286 @@
+"""Ball and goal square on fisheye frames by small learnt networks; beside `camera.detectors.contours`, with the same face.
+
+One network looks at the whole frame, halved, and names places: for each cell of a grid whether a ball (a square) has its middle
+there, where in the cell and how large. Two others look at those places, each in a patch that is rectified about its ray, so that no
+lens bends it: how sure, where and how large exactly, and to what accuracy. What comes out are rays. Confidences are calibrated on
+pictures that were not trained on, and told as probabilities.
+"""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from zipfile import BadZipFile
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from camera.detectors.contours import BallSeen, Detector, GoalSeen, Known, Seen
+from camera.fisheye import Fisheye
+
+SHIPPED = Path(__file__).parent / "learnt.npz"
+FORMAT = 1
+
+CELL = 16
+"""Side of a cell of the grid [px of the frame]."""
+
+KINDS = ("ball", "goal")
+PATCH = {"ball": 40, "goal": 56}
+"""Side of a patch [px]."""
+
+REACH = {"ball": 2.2, "goal": 1.9}
+"""Half side of a patch over the size: the ball's half-angle, the mean angle from the square's middle to its corners."""
+
+LEAST_REACH = {"ball": 0.05, "goal": 0.05}
+"""Half side of a patch at least, as a tangent: what is far is looked at with its surroundings."""
+
+PLACES = 3
+"""Of a kind that are looked at closely."""
+
+LEAST_PROBABILITY = 0.5
+
+
+def _block(inward: int, outward: int, stride: int) -> nn.Sequential:
+    return nn.Sequential(nn.Conv2d(inward, outward, 3, stride, 1), nn.SiLU())
+
+
+class Search(nn.Module):
+    """Whole frames, halved, (B, 3, H / 2, W / 2), to (B, 2, 4, H / 16, W / 16): logit, place in the cell [cells] and log size [cells]."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.body = nn.Sequential(
+            nn.Conv2d(3, 12, 5, 2, 2), nn.SiLU(), _block(12, 24, 2), _block(24, 40, 2), _block(40, 40, 1), _block(40, 40, 1),
+            nn.Conv2d(40, 8, 1),
+        )  # fmt: skip
+        with torch.no_grad():
+            self.body[-1].bias[0::4] = -5.0  # few cells of a frame show anything
+
+    def forward(self, frames: Tensor) -> Tensor:
+        """See the class."""
+        return self.body(frames).unflatten(1, (2, 4))
+
+
+class Look(nn.Module):
+    """Patches (B, 3, S, S) to (B, outputs): logit, log accuracy, and what is where, in half sides of the patch."""
+
+    def __init__(self, side: int, outputs: int) -> None:
+        super().__init__()
+        last = -(-side // 8)
+        self.body = nn.Sequential(
+            _block(3, 16, 1), _block(16, 24, 2), _block(24, 32, 2), _block(32, 24, 2), nn.Flatten(),
+            nn.Linear(24 * last * last, 48), nn.SiLU(), nn.Linear(48, outputs),
+        )  # fmt: skip
+
+    def forward(self, patches: Tensor) -> Tensor:
+        """See the class."""
+        return self.body(patches)
+
+
+class Networks(nn.Module):
+    """The three networks, and how their confidences are calibrated.
+
+    Attributes:
+        calibration: by kind, factor and offset of the logits, and factor of the accuracies.
+        made_by: what they were trained with.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.search, self.ball, self.goal = Search(), Look(PATCH["ball"], 5), Look(PATCH["goal"], 10)
+        self.calibration = {kind: (1.0, 0.0, 1.0) for kind in KINDS}
+        self.made_by: dict = {}
+
+    def save(self, path: str | Path) -> None:
+        """Write an ``.npz`` without pickle: the weights in half precision, and ``header``, JSON text."""
+        header = {"format_version": FORMAT, "calibration": self.calibration, "made_by": self.made_by}
+        arrays = {name: value.detach().cpu().numpy().astype(np.float16) for name, value in self.state_dict().items()}
+        with open(path, "wb") as file:
+            np.savez_compressed(file, header=np.frombuffer(json.dumps(header).encode(), np.uint8), **arrays)
+
+    @staticmethod
+    def load(path: str | Path = SHIPPED) -> "Networks":
+        """Read what `save` wrote.
+
+        Raises:
+            ValueError: no such file, or not of this format.
+        """
+        found = Networks()
+        try:
+            with np.load(path, allow_pickle=False) as arrays:
+                header = json.loads(arrays["header"].tobytes())
+                if header["format_version"] != FORMAT:
+                    raise ValueError(f"format version {header['format_version']}, this program reads {FORMAT}")
+                names = [name for name in arrays.files if name != "header"]
+                found.load_state_dict({name: torch.from_numpy(arrays[name].astype(np.float32)) for name in names})
+        except (OSError, KeyError, ValueError, RuntimeError, BadZipFile) as error:
+            raise ValueError(f"{path}: no detector written by `visthrow detector train`: {error}") from error
+        found.calibration = {kind: tuple(header["calibration"][kind]) for kind in KINDS}
+        found.made_by = header["made_by"]
+        return found.eval()
+
+
+def halved(frames: Tensor) -> Tensor:
+    """Frames as the search sees them: RGB in -1 to 1, (B, 3, H / 2, W / 2), of uint8 (B, H, W, 3)."""
+    return F.avg_pool2d(frames.permute(0, 3, 1, 2).float(), 2) / 127.5 - 1.0
+
+
+@dataclass(frozen=True)
+class Views:
+    """Patches about rays: an orthonormal frame each, and the half side."""
+
+    axes: Tensor  # rows right, down, ahead, shape (B, 3, 3), camera frame
+    reach: Tensor  # half side as a tangent, shape (B,)
+
+    def rays(self, points: Tensor) -> Tensor:
+        """Unit rays (B, K, 3) through points in half sides (B, K, 2)."""
+        across = points * self.reach[:, None, None]
+        ahead = torch.cat([across, torch.ones_like(across[..., :1])], -1)
+        return F.normalize(ahead @ self.axes, dim=-1)
+
+    def points(self, rays: Tensor) -> Tensor:
+        """The inverse of `rays`, of rays less than a right angle off (B, K, 3)."""
+        local = rays @ self.axes.transpose(1, 2)
+        return local[..., :2] / (local[..., 2:].clamp(min=1e-3) * self.reach[:, None, None])
+
+
+def views_about(rays: Tensor, reach: Tensor, north_c: Tensor) -> Views:
+    """Patches about unit rays, shape (B, 3), upright along a direction in the camera frame, shape (B, 3).
+
+    The world's x where the attitude is known, so that a square that is laid along the world's axes shows its corners in one order.
+    """
+    up = north_c - (north_c * rays).sum(-1, keepdim=True) * rays
+    spare = torch.tensor([[0.0, -1.0, 0.0]], dtype=rays.dtype, device=rays.device)
+    up = torch.where(up.norm(dim=-1, keepdim=True) > 0.1, up, spare - (spare * rays).sum(-1, keepdim=True) * rays)
+    down = -F.normalize(up, dim=-1)
+    right = torch.linalg.cross(down, rays)
+    return Views(torch.stack([right, down, rays], 1), reach)
+
+
+def patches_of(frames: Tensor, index: Tensor, views: Views, lens: Fisheye, side: int) -> Tensor:
+    """Rectified patches, RGB in -1 to 1, shape (B, 3, S, S).
+
+    Args:
+        frames: RGB, uint8, shape (F, H, W, 3). index: frame of each patch, shape (B,).
+        views: of the patches. lens: of the frames. side: S.
+    """
+    at = (torch.arange(side, device=frames.device) + 0.5) * (2.0 / side) - 1.0
+    grid = torch.stack([at[None, :].expand(side, -1), at[:, None].expand(-1, side)], -1).reshape(1, -1, 2)
+    rays = views.rays(grid.expand(len(index), -1, -1))
+    pixels, _ = lens.project(rays)
+    height, width = frames.shape[1:3]
+    u, v = pixels[..., 0].clamp(0.0, width - 1.001), pixels[..., 1].clamp(0.0, height - 1.001)
+    i, j = u.long(), v.long()
+    a, b = (u - i)[..., None], (v - j)[..., None]
+    e = index[:, None]
+    top = frames[e, j, i] * (1 - a) + frames[e, j, i + 1] * a
+    low = frames[e, j + 1, i] * (1 - a) + frames[e, j + 1, i + 1] * a
+    found = (top * (1 - b) + low * b) / 127.5 - 1.0
+    return found.unflatten(1, (side, side)).permute(0, 3, 1, 2)
+
+
+class LearntDetector(Detector):
+    """Finds ball and goal in frames of one lens by the networks; what is known narrows it as it does the OpenCV detector."""
+
+    def __init__(self, lens: Fisheye, payload_radius: float, goal_side: float, params=None, networks: Networks | None = None) -> None:
+        """Take the lens, the true sizes and the networks; left out, those that are shipped.
+
+        Raises:
+            ValueError: a frame whose sides are no multiples of a cell.
+        """
+        super().__init__(lens, payload_radius, goal_side, params)
+        if lens.params.height % CELL or lens.params.width % CELL:
+            raise ValueError(f"frames of {lens.params.width} x {lens.params.height} px; expected multiples of {CELL} px for the networks")
+        self.networks = networks or Networks.load()
+
+    @torch.inference_mode()
+    def detect(self, image: np.ndarray, known: Known | None = None) -> Seen:
+        """Find ball and goal; see `camera.detectors.contours.Detector.detect`."""
+        self.check(image)
+        known = known or Known()
+        frames = torch.from_numpy(np.ascontiguousarray(image[..., ::-1]))[None]
+        places = places_of(self.networks.search(halved(frames)), self.lens)
+        north = torch.tensor(known.north_c if known.north_c is not None else (0.0, -1.0, 0.0), dtype=torch.float32)
+        ball, goal = (self._closest(kind, frames, *places[kind], north) for kind in KINDS)
+        return Seen(self._best_ball(*ball, known), self._best_goal(*goal, known))
+
+    def _closest(self, kind: str, frames: Tensor, rays: Tensor, sizes: Tensor, north: Tensor) -> tuple[Tensor, Tensor]:
+        """Probabilities and findings at places, looked at twice: the second patch lies where the first found the thing."""
+        factor, offset, _ = self.networks.calibration[kind]
+        for _ in range(2):
+            views, found = looked(self.networks, kind, frames, torch.zeros(len(rays), dtype=torch.long), rays, sizes, self.lens, north)
+            rays, sizes = middle_of(kind, views, found)
+        probability = torch.sigmoid(factor * found[:, 0] + offset)
+        things = ball_of(views, found) if kind == "ball" else views.rays(found[:, 2:].unflatten(1, (4, 2)))
+        return probability, things
+
+    def _best_ball(self, probability: Tensor, things: Tensor, known: Known) -> BallSeen | None:
+        for i in probability.argsort(descending=True).tolist():
+            ray, half_angle = things[i, :3].double().numpy(), float(things[i, 3])
+            if probability[i] >= LEAST_PROBABILITY and self._in_place(ray, half_angle, known):
+                return BallSeen(ray, half_angle, float(probability[i]))
+        return None
+
+    def _best_goal(self, probability: Tensor, things: Tensor, known: Known) -> GoalSeen | None:
+        for i in probability.argsort(descending=True).tolist():
+            rays = things[i].double().numpy()
+            if probability[i] >= LEAST_PROBABILITY and self._right_size(rays, known):
+                return GoalSeen(rays, float(probability[i]))
+        return None
+
+
+def looked(
+    networks: Networks, kind: str, frames: Tensor, index: Tensor, rays: Tensor, sizes: Tensor, lens: Fisheye, north: Tensor
+) -> tuple[Views, Tensor]:
+    """Patches about places and what the network of a kind makes of them, shape (B, outputs)."""
+    reach = (REACH[kind] * sizes).clamp(LEAST_REACH[kind], 1.0)
+    views = views_about(rays, reach, north.expand_as(rays))
+    return views, getattr(networks, kind)(patches_of(frames, index, views, lens, PATCH[kind]))
+
+
+def middle_of(kind: str, views: Views, found: Tensor) -> tuple[Tensor, Tensor]:
+    """Ray to the middle, shape (B, 3), and size [rad], shape (B,), of what was found."""
+    if kind == "ball":
+        thing = ball_of(views, found)
+        return thing[:, :3], thing[:, 3]
+    corners = views.rays(found[:, 2:].unflatten(1, (4, 2)))
+    middle = F.normalize(corners.mean(1), dim=-1)
+    return middle, (corners @ middle[:, :, None])[..., 0].clamp(max=1.0 - 1e-7).acos().mean(1)
+
+
+def ball_of(views: Views, found: Tensor) -> Tensor:
+    """Unit ray and half-angle [rad] of balls, shape (B, 4)."""
+    ray = views.rays(found[:, None, 2:4])[:, 0]
+    return torch.cat([ray, (views.reach / REACH["ball"] * found[:, 4].clamp(-3.0, 1.5).exp())[:, None].clamp(1e-3, 1.2)], -1)
+
+
+def places_of(grids: Tensor, lens: Fisheye) -> dict[str, tuple[Tensor, Tensor]]:
+    """Likeliest places in one frame by kind: rays (PLACES, 3), and sizes [rad] (PLACES,).
+
+    Args:
+        grids: of `Search`, shape (1, 2, 4, h, w). lens: of the frame.
+    """
+    found = {}
+    for k, kind in enumerate(KINDS):
+        logits = grids[0, k, 0]
+        peak = F.max_pool2d(logits[None, None], 3, 1, 1)[0, 0]
+        best = torch.where(logits == peak, logits, logits.new_full((), -1e3)).flatten().topk(PLACES).indices
+        j, i = best // logits.shape[1], best % logits.shape[1]
+        du, dv, size = grids[0, k, 1:, j, i]
+        pixels = torch.stack([(i + 0.5 + du.clamp(-1, 1)) * CELL - 0.5, (j + 0.5 + dv.clamp(-1, 1)) * CELL - 0.5], -1)
+        rays, _ = lens.unproject(pixels)
+        found[kind] = (F.normalize(rays, dim=-1), size.clamp(-6.0, 3.0).exp() * (CELL / lens.params.fx))
+    return found
+
+
+def log_size(angle: Tensor, lens: Fisheye) -> Tensor:
+    """Sizes [rad] as `Search` tells them."""
+    return (angle.clamp(min=1e-4) * (lens.params.fx / CELL)).log()
+
+
+def spread_of(found: Tensor, views: Views) -> Tensor:
+    """Standard deviation of a direction [rad], before calibration, shape (B,)."""
+    return found[:, 1].clamp(-8.0, 3.0).exp() * views.reach
+
+

@@ -1,0 +1,143 @@
+"""The batched renderer: where things are in its pictures, against projection, motion and an independent renderer; seeds."""
+
+import math
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from camera.fisheye import Fisheye
+from camera.imaging.render import render_scene
+from camera.mount import nominal_rot_cb, rotation_from_vector
+from camera.params import CameraParams, FisheyeParams, KeypointNoiseParams, MountParams
+from camera.scenes.renderer import Renderer
+from camera.scenes.scene import Nuisances, posed_scenes, random_scenes, truth_of
+from camera.scenes.textures import photographs, pyramid
+
+pytest.importorskip("skimage", reason="photographs of visthrow[detector]")
+
+LENS = FisheyeParams(192, 192, 50.0, 50.0, 95.5, 95.5, k1=-0.01, fov_deg=200.0)
+CAMERA = CameraParams(LENS, MountParams(position_b=(0.03, 0.0, -0.02)), KeypointNoiseParams(), 0.25, 0.033)
+CENTRE = 0.2
+"""Of an evenly lit ball some pixels large, by the middle of its pixels against its projection [px]; the lens bends it a little."""
+
+
+@pytest.fixture(scope="module")
+def renderer():
+    return Renderer(LENS, samples=8)
+
+
+def hovering(ball=(0.05, 0.1, 1.0), goal=(0.7, 0.3), tilt=(0.1, -0.2, 0.05)):
+    """A plain scene, evenly lit, its ball without a seam."""
+    scenes = posed_scenes(
+        CAMERA, torch.tensor([[0.0, 0.0, 1.3]]), rotation_from_vector(torch.tensor([tilt])), torch.tensor([ball]), torch.tensor([goal]),
+        torch.tensor([False]),
+    )  # fmt: skip
+    scenes.light[:, 3] = 1.0
+    scenes.ball[:, 14:17] = scenes.ball[:, 11:14]
+    return scenes
+
+
+def centroid(mask: np.ndarray) -> np.ndarray:
+    v, u = np.nonzero(mask)
+    return np.array([u.mean(), v.mean()])
+
+
+def yellow(image) -> np.ndarray:
+    r, g, b = image.astype(int).transpose(2, 0, 1)
+    return (np.minimum(r, g) - b > 40) & (np.abs(r - g) < 60)
+
+
+def green(image) -> np.ndarray:
+    r, g, b = image.astype(int).transpose(2, 0, 1)
+    return (g - np.maximum(r, b)) > 25
+
+
+def test_ball_and_square_are_where_the_lens_puts_them(renderer):
+    scenes = hovering()
+    image = renderer.render(scenes)[0].numpy()
+    truth, lens = truth_of(scenes, Fisheye(LENS)), Fisheye(LENS)
+    ball, _ = lens.project(truth.ball_c)
+    corners, _ = lens.project(truth.corners_c)
+    area = cv2.moments(corners[0].float().numpy())  # of the quadrangle: its nearer half is the larger one
+    np.testing.assert_allclose(centroid(yellow(image)), ball[0].numpy(), atol=CENTRE)
+    np.testing.assert_allclose(centroid(green(image)), [area["m10"] / area["m00"], area["m01"] / area["m00"]], atol=CENTRE)
+    assert truth.ball_seen.all()
+    assert truth.goal_seen.all()
+    assert not image[0, 0].any(), "black outside the field of view"
+
+
+def test_the_other_renderer_draws_the_same_square_and_ball(renderer):
+    """Written before it and without Warp; shapes overlap but for pixels at the edges."""
+    scenes, lens = hovering(), Fisheye(LENS)
+    eye, mount = scenes.pose[0, :3], nominal_rot_cb(CAMERA.mount)
+    rot = rotation_from_vector(torch.tensor([0.1, -0.2, 0.05], dtype=torch.float64)) @ mount.T
+    other = render_scene(lens, eye, rot, scenes.goal[0, :2], scenes.ball[0, :3], supersample=3).numpy() * 255.0
+    ours = renderer.render(scenes)[0].numpy()
+    for shape in (yellow, green):
+        a, b = shape(ours), shape(other)
+        assert b.sum() > 30
+        assert (a & b).sum() / (a | b).sum() > 0.75
+
+
+def test_motion_and_rolling_shutter_move_things_as_the_truth_says(renderer):
+    """A fast ball is smeared about where it is when its rows are exposed, off its place at the middle of the frame."""
+    scenes = hovering(ball=(-0.35, 0.1, 1.0))
+    scenes.ball[:, 4:7] = torch.tensor([[0.0, 4.0, 0.0]])
+    scenes = replace(scenes, shutter=torch.tensor([[0.004, 0.04, 0.0]]))
+    lens = Fisheye(LENS)
+    rolled, _ = lens.project(truth_of(scenes, lens).ball_c)
+    still, _ = lens.project(truth_of(replace(scenes, shutter=torch.zeros(1, 3)), lens).ball_c)
+    assert (rolled - still).norm() > 3.0
+    np.testing.assert_allclose(centroid(yellow(renderer.render(scenes)[0].numpy())), rolled[0].numpy(), atol=2 * CENTRE)
+
+
+def test_a_seed_gives_the_same_bits_alone_and_in_a_batch(renderer):
+    scenes = random_scenes(CAMERA, renderer.textures, 3, 5)
+    again = random_scenes(CAMERA, renderer.textures, 3, 5)
+    images = renderer.render(scenes, 7)
+    assert torch.equal(images, renderer.render(again, 7))
+    assert torch.equal(images[1:2], renderer.render(scenes.part(slice(1, 2)), 7))
+    assert not torch.equal(images, renderer.render(scenes, 8))
+    assert not torch.equal(scenes.pose, random_scenes(CAMERA, renderer.textures, 3, 6).pose)
+
+
+def test_nuisances_are_off_and_on(renderer):
+    none = Nuisances(*(0.0,) * 8)
+    plain = random_scenes(CAMERA, renderer.textures, 4, 1, none)
+    assert not plain.shutter.any()
+    assert not plain.things[..., 0].any()
+    assert not plain.rope[:, 3].any()
+    torch.testing.assert_close(plain.sensor[:, :4], torch.tensor([[1.0, 0.0, 0.0, 1.0]]).expand(4, 4))
+    torch.testing.assert_close(plain.pose, random_scenes(CAMERA, renderer.textures, 4, 1).pose, msg="the same moments all the same")
+    scenes = hovering()
+    blurred = replace(scenes, shutter=torch.tensor([[0.0, 0.0, 1.5]]))
+    sharp, soft = (renderer.render(s)[0, 60:130, 60:130].float() for s in (scenes, blurred))
+    assert soft.diff(dim=1).square().mean() < 0.7 * sharp.diff(dim=1).square().mean()
+
+
+def test_photographs_and_what_is_none(tmp_path):
+    rows = pyramid(photographs(names=("grass",)))
+    assert rows.shape == (1, 3 * sum((512 >> k) ** 2 for k in range(7)))
+    finest, coarsest = rows[0, : 512 * 512 * 3].reshape(-1, 3), rows[0, -8 * 8 * 3 :].reshape(-1, 3)
+    np.testing.assert_allclose(finest.mean(0), coarsest.mean(0), atol=2.0)
+    with pytest.raises(ValueError, match="no photograph in"):
+        photographs(tmp_path)
+    (tmp_path / "a.png").write_bytes(b"no picture")
+    with pytest.raises(ValueError, match="no picture that OpenCV can read"):
+        pyramid(photographs(tmp_path))
+    with pytest.raises(ValueError, match="samples 0"):
+        Renderer(LENS, samples=0)
+
+
+def test_half_a_turn_of_the_lens_model_is_inverted(renderer):
+    """A ring of pixels at the edge of a bent lens's view is lit, and nothing beyond it."""
+    image = renderer.render(hovering())[0].numpy()
+    v, u = np.mgrid[:192, :192]
+    radius = np.hypot((u - 95.5) / 50.0, (v - 95.5) / 50.0)
+    edge = Fisheye(LENS).edge_radius
+    assert image[(radius < edge - 0.03)].max(-1).min() > 0
+    assert not image[radius > edge + 0.03].any()
+    assert edge < math.radians(100.0)

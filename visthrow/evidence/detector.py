@@ -1,0 +1,218 @@
+"""``visthrow detector``: train the learnt keypoint detector on rendered frames, and hold it against OpenCV's."""
+
+import argparse
+import math
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from visthrow import config
+from visthrow.common.arguments import add_common
+from visthrow.common.errors import VisthrowError
+from visthrow.training.device import resolve
+
+LEVELS = {
+    "clean": {},
+    "blur": {"blur": 1.0},
+    "motion": {"motion": 1.0},
+    "noise": {"noise": 1.0},
+    "light": {"light": 1.0},
+    "colours": {"look": 1.0},
+    "photographs": {"ground": 1.0},
+    "clutter": {"clutter": 1.0},
+    "rope": {"parts": 1.0},
+    "all, half": dict.fromkeys(("blur", "motion", "noise", "light", "look", "ground", "clutter", "parts"), 0.5),
+    "all": dict.fromkeys(("blur", "motion", "noise", "light", "look", "ground", "clutter", "parts"), 1.0),
+}
+"""Nuisances one by one, and together."""
+
+HIT = 4.0
+"""A detection whose points are off by more than this on average is of something else [px]."""
+
+CHECKPOINT, WEIGHTS = "checkpoint.pt", "learnt.npz"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
+    train = actions.add_parser("train", help="train it; rendering and learning on one device")
+    train.add_argument("name", nargs="?", default="small", metavar="NAME", help="of configs/detector, or a file (default: small)")
+    train.add_argument("--out", default="runs/detector", metavar="FOLDER", help="for checkpoint and weights (default: runs/detector)")
+    train.add_argument("--textures", metavar="FOLDER", help="photographs for ground and walls (default: those of scikit-image)")
+    train.add_argument("--minutes", type=float, metavar="N", help="stop after so long; --resume goes on")
+    train.add_argument("--resume", action="store_true", help="go on from the checkpoint in --out")
+    add_common(train, json=False)
+    check = actions.add_parser("check", help="recall and pixel error by nuisance, beside the OpenCV detector")
+    check.add_argument("--weights", metavar="FILE", help="of visthrow detector train (default: those that are shipped)")
+    check.add_argument("--frames", type=int, default=100, metavar="N", help="a nuisance (default: 100)")
+    check.add_argument("--textures", metavar="FOLDER", help="photographs (default: those of scikit-image that were not trained on)")
+    check.add_argument("--seed", type=int, default=0, help="of the scenes")
+    check.add_argument("--out", metavar="FILE", help="picture of the first frames of each nuisance with what was found, .png")
+    add_common(check)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Train, or check."""
+    return train(args) if args.action == "train" else check(args)
+
+
+def train(args: argparse.Namespace) -> int:
+    """Train and write the weights.
+
+    Raises:
+        VisthrowError: a folder that holds a training already, or none to go on from.
+    """
+    from camera.detectors.fit import Fit, FitParams
+    from camera.params import CameraParams
+    from camera.scenes.textures import photographs
+
+    params = config.load(FitParams, config.find("detector", args.name), args.overrides)
+    folder = Path(args.out)
+    saved = folder / CHECKPOINT
+    if saved.exists() != args.resume:
+        there = "holds a training; go on with --resume, or name another folder" if saved.exists() else "no checkpoint to resume from"
+        raise VisthrowError(f"{folder}: {there}")
+    files = None if args.textures is None else photographs(args.textures)
+    fit = Fit(params, config.load(CameraParams, config.find("camera", "fisheye")), resolve(args.device), files)
+    if args.resume:
+        fit.load(saved)
+    folder.mkdir(parents=True, exist_ok=True)
+    begin, first = time.monotonic(), fit.step
+
+    def tell(step: int, losses: dict[str, float]) -> None:
+        spent = time.monotonic() - begin
+        words = ", ".join(f"{name} {value:.3f}" for name, value in losses.items())
+        print(f"step {step} of {params.steps}, {spent:.0f} s, {1e3 * spent / (step - first):.0f} ms a step: {words}", flush=True)
+
+    done = fit.run(tell, begin + 60.0 * args.minutes if args.minutes is not None else math.inf, saved)
+    figures = fit.calibrate()
+    fit.networks.made_by = {"config": config.to_dict(params), "steps": fit.step, "calibration": figures}
+    fit.networks.save(folder / WEIGHTS)
+    print(f"{'trained' if done else 'stopped'} at step {fit.step}; calibration {figures}\n{folder / WEIGHTS}")
+    return 0
+
+
+def check(args: argparse.Namespace) -> int:
+    """Detect in frames of each nuisance with both detectors and print what became of them.
+
+    Raises:
+        VisthrowError: fewer than one frame.
+    """
+    from camera.detectors.contours import Detector
+    from camera.detectors.learnt import SHIPPED, LearntDetector, Networks
+    from camera.fisheye import Fisheye
+    from camera.params import CameraParams
+    from camera.scenes.renderer import Renderer
+    from camera.scenes.textures import HELD_OUT, photographs
+
+    if args.frames < 1:
+        raise VisthrowError(f"--frames {args.frames}; expected 1 or more")
+    camera = config.load(CameraParams, config.find("camera", "fisheye"), args.overrides)
+    lens = Fisheye(camera.fisheye)
+    renderer = Renderer(camera.fisheye, resolve(args.device), photographs(args.textures, HELD_OUT))
+    learnt = LearntDetector(lens, camera.payload_radius, camera.goal_side, networks=Networks.load(args.weights or SHIPPED))
+    detectors = {"learnt": learnt, "opencv": Detector(lens, camera.payload_radius, camera.goal_side)}
+    table, rows = {}, []
+    for level, nuisances in LEVELS.items():
+        counts, pictures = counted(camera, renderer, detectors, nuisances, args.frames, args.seed)
+        table[level] = {name: count.figures() for name, count in counts.items()}
+        rows.append(pictures)
+        _print(level, table[level], first=len(rows) == 1)
+    if args.out is not None:
+        import cv2
+
+        if not cv2.imwrite(args.out, np.vstack([np.hstack(row) for row in rows])):
+            raise VisthrowError(f"--out {args.out}: cannot be written; expected a .png")
+    if args.json is not None:
+        from visthrow.common.storage import write_json
+
+        write_json(args.json, table)
+    return 0
+
+
+class Count:
+    """What became of the frames of one nuisance, by one detector."""
+
+    def __init__(self) -> None:
+        self.there, self.reports, self.hits = ({"ball": 0, "goal": 0} for _ in range(3))
+        self.errors: dict[str, list[float]] = {"ball": [], "goal": []}
+        self.told: list[tuple[float, bool]] = []  # probability of a report, and whether it was a hit
+        self.spent: list[float] = []
+
+    def add(self, kind: str, there: bool, off: float | None, probability: float) -> None:
+        """Count one thing in one frame; ``off``: mean error of its points [px], None where nothing was reported."""
+        self.there[kind] += there
+        if off is None:
+            return
+        hit = there and off < HIT
+        self.reports[kind] += 1
+        self.hits[kind] += hit
+        self.told.append((probability, hit))
+        if hit:
+            self.errors[kind].append(off)
+
+    def figures(self) -> dict[str, float]:
+        """Recall, precision, median and 95th percentile of the pixel error by kind; median time [s]; mean probability less the hits."""
+        found: dict[str, float] = {}
+        for kind in ("ball", "goal"):
+            errors = self.errors[kind] or [math.nan]
+            found |= {
+                f"{kind}_there": self.there[kind], f"{kind}_recall": self.hits[kind] / max(self.there[kind], 1),
+                f"{kind}_precision": self.hits[kind] / max(self.reports[kind], 1),
+                f"{kind}_median_px": float(np.median(errors)), f"{kind}_p95_px": float(np.percentile(errors, 95)),
+            }  # fmt: skip
+        told = np.array(self.told or [(math.nan, False)], float)
+        return found | {"seconds": float(np.median(self.spent)), "overconfidence": float(told[:, 0].mean() - told[:, 1].mean())}
+
+
+def counted(camera, renderer, detectors: dict, nuisances: dict[str, float], frames: int, seed: int) -> tuple[dict[str, Count], list]:
+    """Counts of each detector in random frames, and pictures of the first four with what the first detector found."""
+    from camera.detectors.contours import Known, detected_keypoints
+    from camera.fisheye import Fisheye
+    from camera.imaging.overlay import draw_overlay
+    from camera.keypoints import GOAL_KEYPOINTS, KeypointCamera, payload_keypoints
+    from camera.mount import nominal_rot_cb
+    from camera.scenes.scene import Nuisances, random_scenes, truth_of
+
+    lens, eyes = Fisheye(camera.fisheye), KeypointCamera(replace(camera, noise=replace(camera.noise, invalid_reads="edge")))
+    none = dict.fromkeys(Nuisances.__dataclass_fields__, 0.0)
+    counts, pictures = {name: Count() for name in detectors}, []
+    for first in range(0, frames, 8):
+        number = 7_000_000 + 1000 * seed + first
+        scenes = random_scenes(camera, renderer.textures, min(8, frames - first), number, Nuisances(**none | nuisances))
+        truth, images = truth_of(scenes, lens), renderer.render(scenes, seed).cpu().numpy()
+        corners, _ = lens.project(truth.corners_c)
+        box, _ = payload_keypoints(eyes, truth.ball_c.float())
+        true = np.concatenate([corners.numpy(), lens.denormalize(box).numpy()], 1)
+        for e, image in enumerate(images[..., ::-1]):
+            rot_wc = truth.rot_wc[e].numpy()
+            known = Known(up_c=rot_wc[2], height=float(scenes.pose[e, 2]), north_c=rot_wc[0])
+            for name, detector in detectors.items():
+                begin = time.perf_counter()
+                seen = detector.detect(image, known)
+                counts[name].spent.append(time.perf_counter() - begin)
+                points, valid = detected_keypoints(eyes, seen, rot_wc @ nominal_rot_cb(camera.mount).numpy())
+                off = np.linalg.norm(lens.denormalize(points).numpy() - true[e], axis=1)
+                for kind, part in (("ball", slice(GOAL_KEYPOINTS, None)), ("goal", slice(0, GOAL_KEYPOINTS))):
+                    thing, there = getattr(seen, kind), bool(getattr(truth, f"{kind}_seen")[e])
+                    counts[name].add(kind, there, None if thing is None else float(off[part].mean()), getattr(thing, "score", 0.0))
+                if name == next(iter(detectors)) and len(pictures) < 4:
+                    pictures.append(draw_overlay(eyes, points, valid, np.ascontiguousarray(image)))
+    return counts, pictures
+
+
+def _print(level: str, figures: dict[str, dict[str, float]], first: bool) -> None:
+    """A line a detector."""
+    if first:
+        print("| nuisance | detector | ball: recall, precision | error: median, p95 | goal: recall, precision | error | a frame |")
+        print("|---|---|---|---|---|---|---|")
+    for name, f in figures.items():
+        parts = [
+            f"{f[f'{kind}_recall']:.3f}, {f[f'{kind}_precision']:.3f} | {f[f'{kind}_median_px']:.2f}, {f[f'{kind}_p95_px']:.2f} px"
+            for kind in ("ball", "goal")
+        ]
+        print(f"| {level} | {name} | {' | '.join(parts)} | {1e3 * f['seconds']:.0f} ms |")
+    sys.stdout.flush()

@@ -1,0 +1,356 @@
+"""Hover calibration: the camera's tilt and latency and the thrust, from seconds of hover that end in a small sway. Onboard-safe.
+
+A hanging ball shows where down is; a sway turns the camera against it. One least-squares problem holds it all: the vehicle's path,
+its attitude and the swing as unknowns at every step, tied by the momentum of both bodies, the pendulum and the gyro, and what
+calibration asks for as constants: the maximum a posteriori, as a Kalman smoother would find it, with the constants' covariance.
+What a run cannot tell (a lens out of place, biases of motion capture and keypoints) are constants too, each with its own spread,
+so that the answer's uncertainty has them in it.
+
+Source: Gauss-Newton on a Markov chain, Bell, "The iterated Kalman smoother as a Gauss-Newton method", SIAM J. Optim. 4(3), 1994.
+Convention: the latency is the keypoints' age beyond that of the poses that come with them. The camera's turn is a rotation vector
+in the body frame, ``rot_bc = exp(turn) rot_bc_nominal``, as in `camera.mount.extrinsics_with_error`.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from camera.keypoints import GOAL_KEYPOINTS, KeypointCamera, ball_extremes_c, box_midpoints, goal_corners_w
+from camera.mount import rotation_from_vector
+from visthrow.common.constants import GRAVITY
+from visthrow.common.errors import VisthrowError
+from visthrow.onboard.observations import rotation_from_quat
+
+STATE = {"pos": 3, "vel": 3, "turn": 3, "swing": 2, "swing_rate": 2}
+"""Unknowns of each step: vehicle [m, m/s], attitude from the measured one [rad], horizontal part of the rope's direction and its rate."""
+
+CONSTANTS = {
+    "camera": 3, "latency": 1, "thrust": 1, "length": 1, "attitude": 3, "gyro": 3, "wind": 2, "ball": 2, "corners": 2, "lens": 3, "goal": 2,
+}  # fmt: skip
+"""Unknowns that stay the same; see `Spreads`."""
+
+LEAST_STEPS, LEAST_SEEN = 75, 0.5
+"""Steps of a calibration, and share of them in which the ball is seen."""
+
+ROUNDS, SETTLED = 12, 1e-3
+"""Of Gauss-Newton at most, and the step of a constant in its spreads below which it has settled."""
+
+OUTLIER = 3.0
+"""Standard deviations beyond which a sighting counts less (Huber)."""
+
+
+@dataclass(frozen=True)
+class Spreads:
+    """Standard deviations. Of what is measured, each axis and step; of constants that are not asked for; of the model."""
+
+    pos: float = 0.01  # [m]
+    vel: float = 0.01  # [m/s]
+    attitude: float = 0.01  # [rad]
+    rate: float = 0.01  # [rad/s]
+    keypoint: float = 0.01  # normalised [-]
+    pose_bias: float = 0.001  # of attitude and gyro [rad, rad/s]
+    keypoint_bias: float = 0.001  # each keypoint [-]
+    lens: float = 0.0003  # place of the lens on the body [m]
+    goal: float = 0.001  # place of the goal [m]
+    length: float = 0.03  # of the rope, relative [-]
+    wind: float = 0.01  # steady horizontal push [m/s^2]
+    push: float = 0.1  # unsteady one on both bodies, each step [m/s^2]
+    pendulum: float = 0.05  # of the ball's equation of motion, each step [m/s^2]
+    tilt: float = 0.2  # before anything is known [rad]
+    latency: float = 0.05  # likewise [s]
+    thrust: float = 0.3  # likewise, relative [-]
+
+
+@dataclass(frozen=True)
+class Hovered:
+    """What came in a hover, a row a step, on one clock."""
+
+    time: np.ndarray  # [s], shape (N,)
+    pos_w: np.ndarray  # [m], shape (N, 3)
+    quat_wb: np.ndarray  # xyzw, shape (N, 4)
+    vel_w: np.ndarray  # [m/s], shape (N, 3)
+    rate_b: np.ndarray  # [rad/s], shape (N, 3)
+    thrust: np.ndarray  # commanded, collective [N], shape (N,)
+    keypoints: np.ndarray  # normalised [-], shape (N, 8, 2)
+    valid: np.ndarray  # shape (N, 8), bool
+    goal_w: np.ndarray  # [m], shape (3,)
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What a hover showed, each with its standard deviation."""
+
+    turn_b: tuple[float, float, float]  # of the camera from its nominal pose: roll, pitch, yaw [rad]
+    turn_sigma: tuple[float, float, float]  # [rad]
+    latency: float  # of the keypoints beyond the poses' [s]
+    latency_sigma: float  # [s]
+    thrust: float  # that acts, over what is commanded [-]
+    thrust_sigma: float  # [-]
+    misfit: float  # RMS of the sightings over their spread [-]
+    steps: int
+
+    def values(self) -> dict[str, Any]:
+        """As JSON has it."""
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in vars(self).items()}
+
+    def __str__(self) -> str:
+        """For the pilot."""
+        turns = [
+            f"{name} {np.degrees(x):+.2f} +- {np.degrees(sigma):.2f} deg" if name != "yaw" or sigma < UNKNOWN_YAW else "yaw unknown"
+            for name, x, sigma in zip(("roll", "pitch", "yaw"), self.turn_b, self.turn_sigma)
+        ]
+        return (
+            f"camera {', '.join(turns)}; latency {1e3 * self.latency:.0f} +- {1e3 * self.latency_sigma:.0f} ms; "
+            f"thrust {self.thrust:.3f} +- {self.thrust_sigma:.3f} of the commanded"
+        )
+
+
+UNKNOWN_YAW = math.radians(2.0)
+"""Standard deviation of the camera's yaw above which it is said to be unknown [rad]."""
+
+
+class CalibrationError(VisthrowError):
+    """A hover shows too little to calibrate by."""
+
+
+class Problem:
+    """Residuals of a hover, over their spreads; all arguments carry a batch axis B in front, for differences."""
+
+    def __init__(self, hovered: Hovered, camera: KeypointCamera, contract: dict[str, Any], spreads: Spreads) -> None:
+        """Take the measurements.
+
+        Args:
+            hovered: of a hover.
+            camera: nominal, float64.
+            contract: of the policy: masses, rope.
+            spreads: see there.
+
+        Raises:
+            CalibrationError: too few steps, or too few that show the ball.
+        """
+        count = len(hovered.time)
+        seen = hovered.valid[:, GOAL_KEYPOINTS:].all(1)
+        if count < LEAST_STEPS or seen.mean() < LEAST_SEEN:
+            raise CalibrationError(
+                f"calibration from {count} steps, the ball seen in {100 * seen.mean():.0f} % of them; expected {LEAST_STEPS} or more, and "
+                f"{100 * LEAST_SEEN:.0f} %"
+            )
+        tensor = lambda value: torch.tensor(np.asarray(value), dtype=torch.float64)  # noqa: E731
+        rope, body = contract["rope"], contract["vehicle"]["body"]
+        self.camera, self.spreads = camera, spreads
+        self.vehicle, self.load = body["mass"], rope["payload_mass"] + 0.5 * rope["rope_mass"]
+        self.length, self.mount = rope["length"] + rope["payload_offset"], tensor(rope["mount"])
+        self.time, self.goal = tensor(hovered.time), tensor(hovered.goal_w)
+        self.dt = self.time.diff()
+        self.pos, self.vel, self.rate, self.thrust = (tensor(getattr(hovered, n)) for n in ("pos_w", "vel_w", "rate_b", "thrust"))
+        self.base = rotation_from_quat(tensor(hovered.quat_wb))
+        points = tensor(hovered.keypoints)
+        self.ball, self.corners = points[:, GOAL_KEYPOINTS:].mean(1), points[:, :GOAL_KEYPOINTS].mean(1)
+        self.ball_seen = torch.from_numpy(seen)
+        self.corners_seen = torch.from_numpy(hovered.valid[:, :GOAL_KEYPOINTS].all(1))
+        s = spreads
+        spread = {"camera": s.tilt, "latency": s.latency, "thrust": s.thrust, "length": s.length, "attitude": s.pose_bias,
+                  "gyro": s.pose_bias, "wind": s.wind, "ball": 0.5 * s.keypoint_bias, "corners": 0.5 * s.keypoint_bias,
+                  "lens": s.lens, "goal": s.goal}  # fmt: skip
+        self.prior = torch.cat([torch.full((n,), max(spread[name], 1e-9), dtype=torch.float64) for name, n in CONSTANTS.items()])
+
+    def start(self) -> tuple[Tensor, Tensor]:
+        """Unknowns to begin from: what was measured and a rope at rest, shape (N, 13); constants, shape (C,)."""
+        zeros = torch.zeros(len(self.time), 7, dtype=torch.float64)
+        return torch.cat([self.pos, self.vel, zeros], -1), torch.zeros(len(self.prior), dtype=torch.float64)
+
+    def split(self, constants: Tensor) -> dict[str, Tensor]:
+        """Constants by name, each (B, n)."""
+        return dict(zip(CONSTANTS, constants.split(list(CONSTANTS.values()), -1)))
+
+    def steps(self, x: Tensor, constants: Tensor) -> Tensor:
+        """Residuals of steps k to k + 1 and of what was measured at k, shape (B, N - 1, 20).
+
+        Args:
+            x: unknowns, shape (B, N, 13). constants: shape (B, C).
+        """
+        c, s, dt = self.split(constants), self.spreads, self.dt[:, None]
+        pos, vel, turn, swing, swing_rate = x.split(list(STATE.values()), -1)
+        rot = self.base @ rotation_from_vector(turn)
+        rate = self.rate - c["gyro"][:, None]
+        rope, rope_rate = _rope(swing, swing_rate)
+        length = self.length * (1.0 + c["length"][:, None])
+        hung = vel + _turned(rot, torch.linalg.cross(rate, self.mount.expand_as(rate)))
+        ball = hung + length * rope_rate
+        mean = lambda value: 0.5 * (value[:, :-1] + value[:, 1:])  # noqa: E731
+        jump = lambda value: value[:, 1:] - value[:, :-1]  # noqa: E731
+        total = self.vehicle + self.load
+        lift = (1.0 + c["thrust"][:, None]) * self.thrust[:-1, None] / total
+        up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+        wind = torch.nn.functional.pad(c["wind"], (0, 1))[:, None]
+        momentum = (self.vehicle * jump(vel) + self.load * jump(ball)) / (total * dt) - lift * mean(rot[..., 2]) + GRAVITY * up - wind
+        falling, along = jump(ball) / dt + GRAVITY * up, mean(rope)
+        across = falling - along * (falling * along).sum(-1, keepdim=True)
+        turned = _vector(rot[:, :-1].transpose(-1, -2) @ rot[:, 1:]) - mean(rate) * dt
+        return torch.cat(
+            [
+                momentum / s.push,
+                across[..., :2] / s.pendulum,
+                (jump(pos) - mean(vel) * dt) / 1e-4,
+                (jump(swing) - mean(swing_rate) * dt) / 2e-4,
+                turned / (s.rate * dt + 1e-4),
+                (pos - self.pos)[:, :-1] / s.pos,
+                (vel - self.vel)[:, :-1] / s.vel,
+                (turn + c["attitude"][:, None])[:, :-1] / s.attitude,
+            ],
+            -1,
+        )
+
+    def places(self, latency: Tensor) -> tuple[Tensor, Tensor]:
+        """Steps j that sightings fall behind, and the share of the way to j + 1, each (N,)."""
+        when = (self.time - latency).clamp(min=self.time[0], max=self.time[-1] - 1e-9)
+        j = (torch.searchsorted(self.time, when, right=True) - 1).clamp(0, len(self.time) - 2)
+        return j, (when - self.time[j]) / self.dt[j]
+
+    def sightings(self, x: Tensor, constants: Tensor, j: Tensor) -> Tensor:
+        """Residuals of ball and goal in the image, over their spreads, shape (B, N, 4); zero where they were not seen.
+
+        Args:
+            x, constants: as of `steps`. j: steps that the sightings fall behind, shape (N,); held while differences are taken.
+        """
+        c, s = self.split(constants), self.spreads
+        dt = self.dt[j][:, None]
+        u = ((self.time - self.time[j]) - c["latency"])[..., None] / dt
+        pos, vel, turn, swing, swing_rate = x.split(list(STATE.values()), -1)
+        rate = self.rate - c["gyro"][:, None]
+        rot = self.base @ rotation_from_vector(turn)
+        chord = _vector(rot[:, j].transpose(-1, -2) @ rot[:, j + 1])
+        bend = u * (1 - u) * ((1 - u) * (rate[:, j] * dt - chord) - u * (rate[:, j + 1] * dt - chord))
+        here = rot[:, j] @ rotation_from_vector(u * chord + bend)
+        at, leaning = _cubic(pos, vel, j, u, dt), _cubic(swing, swing_rate, j, u, dt)
+        rope, _ = _rope(leaning, torch.zeros_like(leaning))
+        length = self.length * (1.0 + c["length"][:, None])
+        ball_w = at + _turned(here, self.mount.expand_as(at)) + length * rope
+        goal_w = self.goal + torch.nn.functional.pad(c["goal"], (0, 1))
+        corners_w = goal_corners_w(goal_w, square_w=self.camera.square_w)[:, None].expand(-1, at.shape[1], -1, -1)
+        seen = torch.cat([corners_w, ball_w[:, :, None]], 2) - at[:, :, None]
+        lens = self.camera.position_b + c["lens"]
+        in_body = torch.einsum("bnji,bnkj->bnki", here, seen) - lens[:, None, None]
+        rot_bc = rotation_from_vector(c["camera"]) @ self.camera.rot_cb.T
+        in_camera = torch.einsum("bji,bnkj->bnki", rot_bc, in_body)
+        rays = ball_extremes_c(self.camera.fisheye, in_camera[:, :, 4].flatten(0, 1), self.camera.params.payload_radius)
+        points, _ = self.camera.fisheye.project_normalized(
+            torch.cat([in_camera[:, :, :4].flatten(0, 1), rays], -2), clip=True
+        )
+        corners = points[:, :4].mean(1).unflatten(0, at.shape[:2]) + c["corners"][:, None]
+        ball = box_midpoints(points[:, 4:]).mean(1).unflatten(0, at.shape[:2]) + c["ball"][:, None]
+        off = torch.cat([(ball - self.ball) * self.ball_seen[:, None], (corners - self.corners) * self.corners_seen[:, None]], -1)
+        return off / (0.5 * s.keypoint + 1e-4)
+
+
+def _turned(rot: Tensor, vector: Tensor) -> Tensor:
+    """Vectors turned by rotations of the same batch."""
+    return (rot @ vector.unsqueeze(-1)).squeeze(-1)
+
+
+def _rope(swing: Tensor, rate: Tensor) -> tuple[Tensor, Tensor]:
+    """Direction of a hanging rope and its rate, from their horizontal parts."""
+    down = (1.0 - (swing * swing).sum(-1, keepdim=True)).clamp(min=1e-2).sqrt()
+    return torch.cat([swing, -down], -1), torch.cat([rate, (swing * rate).sum(-1, keepdim=True) / down], -1)
+
+
+def _vector(rot: Tensor) -> Tensor:
+    """Rotation vectors of small rotations."""
+    skew = 0.5 * torch.stack([rot[..., 2, 1] - rot[..., 1, 2], rot[..., 0, 2] - rot[..., 2, 0], rot[..., 1, 0] - rot[..., 0, 1]], -1)
+    sine2 = (skew * skew).sum(-1, keepdim=True)
+    return skew * (1.0 + sine2 / 6.0 + 3.0 * sine2 * sine2 / 40.0)  # arcsin(s) / s
+
+
+def _cubic(value: Tensor, slope: Tensor, j: Tensor, u: Tensor, dt: Tensor) -> Tensor:
+    """Cubic through values and slopes of steps j and j + 1 at a share u of the way."""
+    chord = value[:, j + 1] - value[:, j]
+    bend = (1 - u) * (slope[:, j] * dt - chord) - u * (slope[:, j + 1] * dt - chord)
+    return value[:, j] + u * chord + u * (1 - u) * bend
+
+
+def calibrate(hovered: Hovered, camera: KeypointCamera, contract: dict[str, Any], spreads: Spreads | None = None) -> Calibration:
+    """Find the camera's turn and latency and the thrust.
+
+    Args:
+        hovered: a hover of some 3 s that ends in a sway.
+        camera: nominal, of the policy, float64.
+        contract: of the policy.
+        spreads: of noise and of what is known; left out, those of the training.
+
+    Raises:
+        CalibrationError: it shows too little, or nothing fits.
+    """
+    problem = Problem(hovered, camera, contract, spreads or Spreads())
+    x, c = problem.start()
+    for _ in range(ROUNDS):
+        solve, gradient, misfit = _linearised(problem, x, c)
+        step = solve(-gradient)
+        width = x.numel()
+        x = x + torch.from_numpy(step[:width]).reshape(x.shape)
+        moved = torch.from_numpy(step[width:])
+        c = c + moved
+        if not bool(torch.isfinite(c).all()):
+            break
+        if float((moved / problem.prior).abs().max()) < SETTLED:
+            break
+    else:
+        raise CalibrationError(f"calibration did not settle in {ROUNDS} rounds; expected a hover that ends in a sway, its ball in view")
+    unit = np.zeros((width + len(c), len(c)))
+    unit[width:] = np.eye(len(c))
+    covariance = np.column_stack([solve(column)[width:] for column in unit.T])
+    sigma = problem.split(torch.from_numpy(np.sqrt(np.maximum(np.diag(covariance), 0.0)))[None])
+    found = problem.split(c[None])
+    of = lambda table, name: tuple(table[name][0].tolist())  # noqa: E731
+    return Calibration(
+        of(found, "camera"), of(sigma, "camera"), found["latency"].item(), sigma["latency"].item(),
+        1.0 + found["thrust"].item(), sigma["thrust"].item(), misfit, len(problem.time),
+    )  # fmt: skip
+
+
+def _linearised(problem: Problem, x: Tensor, c: Tensor) -> tuple[Any, np.ndarray, float]:
+    """Solver of the normal equations about unknowns, the gradient there, and the misfit of the sightings.
+
+    A residual hangs on two neighbouring steps at most, so two perturbations give a derivative for all of them.
+    """
+    from scipy import sparse
+    from scipy.sparse.linalg import splu
+
+    (count, width), h = x.shape, 1e-5
+    j, _ = problem.places(c[CONSTANTS["camera"]])
+    xs, cs = x.repeat(1 + 2 * width + len(c), 1, 1), c.repeat(1 + 2 * width + len(c), 1)
+    for i in range(width):
+        for parity in (0, 1):
+            xs[1 + 2 * i + parity, parity::2, i] += h
+    cs[1 + 2 * width :] += h * torch.eye(len(c), dtype=c.dtype)
+    parts, rows, first = [], [], 0
+    residuals = []
+    for values, step in ((problem.steps(xs, cs), torch.arange(count - 1)), (problem.sightings(xs, cs, j), j)):
+        base, off = values[0], (values[1:] - values[:1]) / h
+        if step is j:
+            misfit = float(base.square().sum().sqrt() / max(int((base != 0.0).sum()), 1) ** 0.5)
+            size = base.unflatten(-1, (2, 2)).norm(dim=-1, keepdim=True).clamp(min=1e-9)
+            weight = (OUTLIER / size).clamp(max=1.0).sqrt().expand(-1, -1, 2).flatten(1)
+            base, off = base * weight, off * weight
+        n, m = base.shape
+        row = first + torch.arange(n * m).reshape(n, m)
+        for i in range(width):
+            for parity in (0, 1):
+                at = step + (step % 2 != parity).long()
+                rows.append((row.flatten(), (at * width + i)[:, None].expand(n, m).flatten()))
+                parts.append(off[2 * i + parity].flatten())
+        for i in range(len(c)):
+            rows.append((row.flatten(), torch.full((n * m,), count * width + i)))
+            parts.append(off[2 * width + i].flatten())
+        residuals.append(base.flatten())
+        first += n * m
+    index = [torch.cat(side).numpy() for side in zip(*rows)]
+    size = (first, count * width + len(c))
+    jacobian = sparse.csr_matrix((torch.cat(parts).numpy(), index), shape=size)
+    prior = np.concatenate([np.zeros(count * width), 1.0 / problem.prior.numpy() ** 2])
+    normal = (jacobian.T @ jacobian + sparse.diags(prior + 1e-9)).tocsc()
+    gradient = jacobian.T @ torch.cat(residuals).numpy() + prior * np.concatenate([np.zeros(count * width), c.numpy()])
+    return splu(normal).solve, gradient, misfit
