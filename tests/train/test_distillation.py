@@ -65,7 +65,7 @@ def test_it_learns():
 def test_the_exported_policy_remembers_as_the_network_does(whole):
     trainer = Trainer(config.load(Experiment, whole / "config.toml"), "cpu", 1)
     trainer.load(whole / CHECKPOINT)
-    policy, network = Policy.load(whole / "policy.npz"), trainer.algorithm.network
+    policy, network = Policy.load(whole / "policy.npz"), trainer.algorithm.average.module
     obs = torch.randn(FLOWN, 5, policy.obs_dim)
     with torch.no_grad():
         estimates = network(obs, policy.estimator.mean, policy.estimator.std)

@@ -21,9 +21,13 @@ from visthrow.onboard.estimator import Estimator
 from visthrow.onboard.policy import Policy, find_policy
 from visthrow.task import Experiment, contract_of
 from visthrow.training.env import ThrowEnv
+from visthrow.training.ppo.network import averaged
 
-SCALES = (0.02, 0.05, 0.2, 0.02, 0.02, 0.01)
+SCALES = (0.02, 0.05, 0.2, 0.02, 0.01, 0.005)
 """Errors that count alike: of position [m], velocity [m/s], body rates [rad/s], rotation [-], goal and payload offsets [m]."""
+
+AVERAGED = 100
+"""Gradient steps that the exported weights are a mean of, at most."""
 
 WATCHED = 50
 """Iterations in which the observations' mean and spread are taken; from there they stand still."""
@@ -115,6 +119,7 @@ class Distillation:
         self._alive, self._led = torch.zeros(T, E, **make), torch.zeros(E, 1, device=device, dtype=torch.bool)
         self._history = torch.zeros(E, 1 + self._layout.history, self._layout.row, **make)
         self._flying = self.network.frozen()
+        self.average = averaged(self.network, AVERAGED)
         on_gpu = device.startswith("cuda")
         self.optimizer = torch.optim.Adam(self.network.parameters(), lr=self.p.learning_rate, fused=on_gpu)
         self.rollout = Replayed(self._fly) if on_gpu else self._fly
@@ -176,6 +181,7 @@ class Distillation:
                 loss.backward()
                 nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
                 self.optimizer.step()
+                self.average.update_parameters(self.network)
                 total += (alive * off).sum().detach() / alive.sum()
         self._refresh()
         return {"value": float(total) / (self.p.epochs * self.p.minibatches)}
@@ -188,7 +194,7 @@ class Distillation:
     def export(self, contract: dict, made_by: dict) -> Policy:
         """The policy as a file's content."""
         t = self.teacher.to("cpu")
-        estimator = Estimator(**{name: value.detach().cpu().clone() for name, value in vars(self.network.frozen()).items()})
+        estimator = Estimator(**{name: value.detach().cpu().clone() for name, value in vars(self._averaged().frozen()).items()})
         return Policy(t.weights, t.biases, t.activation, contract, made_by, t.mean, t.std, t.eps, estimator)
 
     def take_up(self, policy: Policy) -> None:
@@ -202,15 +208,22 @@ class Distillation:
         n.load_state_dict(n.state_dict() | parts)
         count, std = 1e8, (e.std - 0.01).double()
         n.sums.copy_(torch.stack([torch.full_like(std, count), count * e.mean, count * (std.square() + e.mean.double().square())]))
+        self.average.module.load_state_dict(n.state_dict())
         self._refresh()
+
+    def _averaged(self) -> Network:
+        """Network with averaged weights and the statistics of now."""
+        self.average.module.sums.copy_(self.network.sums)
+        return self.average.module
 
     def state_dict(self) -> dict:
         """All that the next iteration depends on, besides torch's generators."""
-        return {"network": self.network.state_dict(), "optimizer": self.optimizer.state_dict(), "env": self.env.state_dict()}
+        return {name: getattr(self, name).state_dict() for name in ("network", "average", "optimizer", "env")}
 
     def load_state_dict(self, saved: dict, own_throws: bool = True) -> None:
         """Take up a state of :meth:`state_dict`; its environment too where ``own_throws`` is set."""
         self.network.load_state_dict(saved["network"])
+        self.average.load_state_dict(saved["average"])
         self.optimizer.load_state_dict(saved["optimizer"])
         self._refresh()
         if own_throws:

@@ -19,7 +19,7 @@ from visthrow.training import rewards
 from visthrow.training.env import ThrowEnv
 from visthrow.training.first_order.backward import Setting, build_backward
 from visthrow.training.first_order.surrogate import Flights, Plants, Surrogate, fit
-from visthrow.training.ppo.network import Network
+from visthrow.training.ppo.network import Network, averaged
 
 BARRIER = 600.0
 """Barriers cost this times the square of how far a state is within their margins."""
@@ -28,6 +28,9 @@ MARGINS = {"altitude": 0.15, "ground": 0.1, "above": 0.08, "upright": 0.15}
 
 OUTLIER = 4.0
 """A flight's derivatives are shortened to this many times the median flight's."""
+
+AVERAGED = 100
+"""Gradient steps that the exported weights are a mean of, at most."""
 
 STEPS_AT_ONCE = 4
 """Of a flight whose Jacobians are taken together on the way: they fit a core's cache."""
@@ -89,6 +92,7 @@ class FirstOrder:
         self._figures: dict[str, Tensor] = {}
         self._adapting = False
         self._begin()
+        self.average = averaged(self.network.mlp, AVERAGED)
         on_gpu = device.startswith("cuda")
         rate = torch.tensor(self.p.learning_rate, **make) if on_gpu else self.p.learning_rate
         self.optimizer = torch.optim.Adam(self.network.mlp.parameters(), lr=rate, betas=(0.9, 0.95), capturable=on_gpu)
@@ -299,6 +303,7 @@ class FirstOrder:
         self._figures["gradient_norm"] = torch.nn.utils.clip_grad_norm_(parameters, self.p.max_grad_norm)
         self._figures["ended"] = (self.flights.steps < self.p.horizon).float().mean()
         self.optimizer.step()
+        self.average.update_parameters(self.network.mlp)
         self._watch(seen)
 
     def _watch(self, seen: Tensor) -> None:
@@ -311,21 +316,24 @@ class FirstOrder:
 
     def export(self, contract: dict, made_by: dict) -> Policy:
         """The policy as a file's content."""
-        return Policy.from_actor_state(self.network.state_dict(), self.cfg.ppo.activation, contract, made_by)
+        mean = {f"mlp.{name}": value for name, value in self.average.module.state_dict().items()}
+        return Policy.from_actor_state(self.network.state_dict() | mean, self.cfg.ppo.activation, contract, made_by)
 
     def take_up(self, policy: Policy) -> None:
         """Start from a policy of the same layers: it releases as it has learnt to, and the rate starts at that of adaptation."""
         self.network.take_up(policy)
+        self.average.module.load_state_dict(self.network.mlp.state_dict())
         self._adapting = True
 
     def state_dict(self) -> dict:
         """All that the next iteration depends on, besides torch's generators."""
-        parts = {"network": self.network.state_dict(), "optimizer": self.optimizer.state_dict(), "adapting": self._adapting}
-        return {**parts, "surrogate": vars(self.surrogate), "env": self.env.state_dict()}
+        learnt = {name: getattr(self, name).state_dict() for name in ("network", "average", "optimizer", "env")}
+        return {**learnt, "adapting": self._adapting, "surrogate": vars(self.surrogate)}
 
     def load_state_dict(self, saved: dict, own_throws: bool = True) -> None:
         """Take up a state of :meth:`state_dict`; its environment too where ``own_throws`` is set."""
         self.network.load_state_dict(saved["network"])
+        self.average.load_state_dict(saved["average"])
         self.optimizer.load_state_dict(saved["optimizer"])
         self.surrogate, self._adapting = Surrogate(**saved["surrogate"]), saved["adapting"]
         if own_throws:

@@ -10,6 +10,7 @@ from rsl_rl.models import MLPModel
 from rsl_rl.modules.distribution import GaussianDistribution
 from tensordict import TensorDict
 from torch import Tensor
+from torch.optim.swa_utils import AveragedModel
 
 from visthrow.onboard.policy import RSL_RL_EPS, Policy
 
@@ -71,3 +72,16 @@ class Network(MLPModel):
             for layer in hidden:
                 x = layer(x)
         return last(x.float())
+
+
+def averaged(module: torch.nn.Module, window: int) -> AveragedModel:
+    """Running mean of a module's weights over the last quarter of its updates, ``window`` of them at most.
+
+    One gradient step throws off what many agree on, and a throw's bias with it. Source: Polyak and Juditsky, SIAM J. Control and
+    Optimization 30(4), 1992.
+    """
+
+    def moved(mean: Tensor, now: Tensor, updates: int | Tensor) -> Tensor:
+        return mean + (now - mean) * torch.clamp(4.0 / (torch.as_tensor(updates) + 4.0), min=1.0 / window).to(mean.device)
+
+    return AveragedModel(module, avg_fn=moved)
