@@ -9,6 +9,7 @@ from sim.hybrid import HybridSim
 from sim.params import BodyParams, PlantParams, QueueParams, RopeParams, SimParams
 from sim.reference.scene import Scene
 from tests.plants import paper_plant
+from tests.scenes import wrench_at
 
 LOW, HIGH = (0.0, -10.0, -10.0, -4.0), (14.0, 10.0, 10.0, 4.0)
 """Full range of commands: collective thrust [N], body rates [rad/s]."""
@@ -66,7 +67,7 @@ def fly(scene: Scene, substep: float, precision: str, control_period: float = 0.
     sim = scene_sim(scene, substep, precision, control_period)
     status = 0
     for k in range(round(scene.duration / control_period)):
-        wrench = scene.wrench_at(k * control_period)
+        wrench = wrench_at(scene, k * control_period)
         sim.set_command([[wrench.force_b[2], *wrench.torque_b]])
         sim.step()
         status |= int(sim.get("status")[0])

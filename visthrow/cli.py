@@ -1,14 +1,13 @@
 """The command line. Each command is imported only when chosen, so that ``visthrow --help`` answers at once."""
 
 import argparse
-import importlib
 import os
 import sys
 from collections.abc import Sequence
 from typing import NoReturn
 
 from visthrow import __version__
-from visthrow.common.arguments import EXIT_BAD_INPUT, EXIT_INTERRUPTED
+from visthrow.common.arguments import EXIT_BAD_INPUT, EXIT_INTERRUPTED, add_commands, run_command
 from visthrow.common.errors import VisthrowError
 
 COMMANDS = {
@@ -18,7 +17,7 @@ COMMANDS = {
     "compare": ("throw many times with each policy and print landing errors and durations", "visthrow.throws.compare"),
     "detector": ("train the keypoint detector on rendered frames, and check it", "visthrow.evidence.detector"),
     "hil": ("fly a policy on motion-capture poses, live or recorded", "hil.cli"),
-    "baseline": ("throw with trajectory optimisation and MPC; its front against the policies", "visthrow.baseline.command"),
+    "baseline": ("throw with trajectory optimisation and MPC; its front against the policies", "visthrow.evidence.report.baseline"),
     "diagnose": ("say what the simulation gets wrong, from measured flights", "visthrow.diagnose.cli"),
     "sweep": ("work a list of training runs and throws, on several GPUs or a cluster", "visthrow.evidence.sweep.cli"),
     "report": ("write one page with the paper's tables and figures beside ours", "visthrow.evidence.report.command"),
@@ -26,8 +25,6 @@ COMMANDS = {
     "bench": ("measure the speed of the simulator and of the camera", "visthrow.evidence.bench"),
     "config": ("print a configuration with all its values filled in", "visthrow.config.command"),
 }
-"""Name -> (help, module). The module has ``add_arguments(parser)`` and ``run(args) -> int``."""
-
 TRACEBACK_VARIABLE = "VISTHROW_TRACEBACK"
 
 _EXTRAS = {"submitit": "slurm", "mujoco": "reference", "piqp": "baseline"}
@@ -49,16 +46,12 @@ examples:
 """
 
 
-def build_parser(chosen: str | None = None) -> argparse.ArgumentParser:
+def build_parser() -> argparse.ArgumentParser:
     """Build the parser; only the chosen command's module is imported and asked for its arguments."""
     form = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser("visthrow", description=_DESCRIPTION, epilog=_EPILOG, formatter_class=form)
     parser.add_argument("--version", action="version", version=f"visthrow {__version__}")
-    commands = parser.add_subparsers(dest="command", metavar="COMMAND", title="commands", required=True)
-    for name, (text, module) in COMMANDS.items():
-        sub = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".", formatter_class=form)
-        if name == chosen:
-            importlib.import_module(module).add_arguments(sub)
+    add_commands(parser, COMMANDS, "command", title="commands")
     return parser
 
 
@@ -68,11 +61,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns:
         The command's own status; 2 for a mistake of the user, told in one message; 130 after Ctrl-C.
     """
-    argv = list(sys.argv[1:] if argv is None else argv)
-    chosen = next((word for word in argv if not word.startswith("-")), None)
     try:
-        args = build_parser(chosen).parse_args(argv)
-        return int(importlib.import_module(COMMANDS[args.command][1]).run(args) or 0)
+        args = build_parser().parse_args(argv)
+        return run_command(COMMANDS, args.command, args)
     except KeyboardInterrupt:
         print("visthrow: interrupted", file=sys.stderr)
         return EXIT_INTERRUPTED

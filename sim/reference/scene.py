@@ -1,12 +1,8 @@
-"""Scenes: a quadrotor, a rope and a wrench schedule as a file, read by the tests of every plant of the project."""
+"""Scenes: a quadrotor, a rope and a schedule of wrenches, which every plant of the project flies."""
 
-import tomllib
-from dataclasses import dataclass, fields
-from pathlib import Path
+from dataclasses import dataclass
 
 import numpy as np
-
-from sim.params import GRAVITY
 
 
 @dataclass(frozen=True)
@@ -82,43 +78,3 @@ class Scene:
     def cable_vel_w(self) -> np.ndarray:
         """Time derivatives of the directions [1/s], shape (L, 3), world frame."""
         return np.cross(np.asarray(self.cable_rate_w, dtype=np.float64), self.cable_dir_w())
-
-    def wrench_at(self, time: float) -> Wrench:
-        """Return the entry that acts at ``time`` [s]; a switch acts from its ``t_start`` on."""
-        active = self.schedule[0]
-        for entry in self.schedule:
-            if entry.t_start <= time + 1e-9:
-                active = entry
-        return active
-
-
-def load_scene(path: str | Path) -> Scene:
-    """Read a scene from a TOML file.
-
-    Args:
-        path: file with every field of ``Scene``; ``schedule`` as an array of tables. A ``force_b`` may be given as
-            ``thrust_weights`` instead: a force along body z in units of the total weight.
-
-    Raises:
-        ValueError: unknown or missing key; the message names file and key.
-    """
-    with open(path, "rb") as file:
-        raw = tomllib.load(file)
-    known = {f.name for f in fields(Scene)}
-    if raw.keys() != known:
-        raise ValueError(
-            f"{path}: unknown keys {sorted(raw.keys() - known)}, missing keys {sorted(known - raw.keys())}"
-        )
-    entries = raw.pop("schedule")
-    values = {key: tuple(value) if isinstance(value, list) else value for key, value in raw.items()}
-    weight = (values["mass"] + values["segments"] * values["segment_mass"] + values["ball_mass"]) * GRAVITY
-    schedule = []
-    for entry in entries:
-        allowed = {"t_start", "torque_b", "thrust_weights"}, {"t_start", "torque_b", "force_b"}
-        if entry.keys() not in allowed:
-            raise ValueError(
-                f"{path}: schedule entry has {sorted(entry)}, expected t_start, torque_b and force_b or thrust_weights"
-            )
-        force = entry["force_b"] if "force_b" in entry else (0.0, 0.0, entry["thrust_weights"] * weight)
-        schedule.append(Wrench(float(entry["t_start"]), tuple(force), tuple(entry["torque_b"])))
-    return Scene(**values, schedule=tuple(schedule))

@@ -39,15 +39,18 @@ def measure(experiment, throws: int, core: int | None = None) -> Report:
         throws: a target and plant.
         core: that the process stays on, for the note.
     """
-    from visthrow.baseline import front
+    from visthrow.baseline import fly, thrower
 
-    study = front.Study(experiment, throws)
     rows, figures = [], []
     for target in TARGETS:
-        height, speed = front.default_release(target)
-        plan = study.plan(target, height, speed, study.params.duration, study.params.energy)
+        unit = thrower.unit("hybrid", "both", target, throws)
+        plan = thrower.plan_of(experiment, *(unit[key] for key in ("target", "height", "speed", "w_t", "rho", "bounds")))
+        delays = fly.delays_of(experiment, "both")
         for plant, name in (("pendulum", "own model"), ("hybrid", "training simulator")):
-            flown = study.flown(plan, plant, "both")
+            if plant == "pendulum":
+                flown = fly.fly_pendulum(plan, throws, 0, experiment.release.landing_height)
+            else:
+                flown = fly.fly_plant(plan, plant, experiment, delays, throws, 0)
             times = 1e3 * flown.step_times
             off = 100.0 * flown.tracking[flown.success]
             figure = {

@@ -15,7 +15,7 @@ from tests.bench.processes import Memory, Pair
 from visthrow.common.errors import VisthrowError
 from visthrow.evidence.bench.records import Report, Table
 
-STILL = ("--plant", "hil.fakes.level:make")
+STILL = ("--plant", "tests.level:make")
 """A vehicle without a simulator: it takes no time from the runner."""
 
 P50, P99 = 1.0, 3.0

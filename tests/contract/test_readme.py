@@ -25,7 +25,7 @@ def test_python_runs():
 @pytest.mark.parametrize("line", LINES)
 def test_commands_parse(line):
     words = shlex.split(line)[1:]
-    parsed = cli.build_parser(words[0]).parse_args(words)
+    parsed = cli.build_parser().parse_args(words)
     assert parsed.command == words[0]
 
 

@@ -8,11 +8,11 @@ import pytest
 from hil.backends import ArduPilot
 from hil.backends.ardupilot import GUIDED, LAND_MODE
 from hil.errors import RunError
-from hil.fakes.level import LevelPlant
 from hil.fakes.process import VEHICLE_ID, FakeAutopilot, MocapParams, Options, load_plant
 from hil.links.mavlink_link import Link, attitude_target
 from hil.params import HilParams
 from tests.hil_flight import simple_policy
+from tests.level import LevelPlant
 from tests.loopback.wire import pipe, throw
 from visthrow import config
 

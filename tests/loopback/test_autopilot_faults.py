@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from hil.control.decision import Words
-from hil.fakes.level import LevelPlant
 from hil.recording.record import Recorder
 from tests.hil_flight import simple_policy
+from tests.level import LevelPlant
 from tests.loopback.wire import cut, peers
 from visthrow.onboard.actions import hover_action
 

@@ -8,8 +8,8 @@ import pytest
 
 from hil.cli.terminal import ENDING, Terminal
 from hil.control.loop import fly
-from hil.fakes.level import LevelPlant
 from tests.hil_flight import simple_policy
+from tests.level import LevelPlant
 from tests.loopback.wire import peers
 from visthrow.onboard.actions import hover_action
 

@@ -9,10 +9,10 @@ import pytest
 
 from hil.control.decision import Words
 from hil.errors import RunError
-from hil.fakes.level import LevelPlant
 from hil.fakes.mocap import FAULTS, MocapFault
 from hil.poses.pose import VEHICLE, Pose
 from tests.hil_flight import simple_policy
+from tests.level import LevelPlant
 from tests.loopback.wire import cut, peers
 from visthrow.onboard.actions import hover_action
 

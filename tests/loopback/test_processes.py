@@ -49,7 +49,7 @@ def free_port(kind=socket.SOCK_DGRAM) -> int:
 class Pair:
     """A fake and a runner, each in a process of its own."""
 
-    def __init__(self, folder, kind, policy, plant=("--plant", "hil.fakes.level:make"), overrides=(), both=(), terminal=None):
+    def __init__(self, folder, kind, policy, plant=("--plant", "tests.level:make"), overrides=(), both=(), terminal=None):
         self.both, self.terminal = both, terminal  # further arguments of runner and fake; what the runner's controls it
         self.folder, poses, msp = folder, free_port(), free_port(socket.SOCK_STREAM)
         self.device, self.msp = f"127.0.0.1:{poses}", msp

@@ -10,6 +10,7 @@ from sim.reference.rope import RopeDynamics
 from sim.reference.rotations import cross, quat_dot, rotation_from_quat, turned
 from sim.reference.scene import Scene
 from sim.reference.stepping import halving_rk4
+from tests.scenes import wrench_at
 
 
 class BareScene:
@@ -47,7 +48,7 @@ class BareScene:
         """Integrate to ``time`` [s]."""
         switches = [w.t_start for w in self.scene.schedule if self.time < w.t_start < time]
         for stop in [*switches, time]:
-            wrench = self.scene.wrench_at(self.time)
+            wrench = wrench_at(self.scene, self.time)
             force_b, torque_b = np.array(wrench.force_b, float), np.array(wrench.torque_b, float)
             count = int(np.ceil((stop - self.time) / self.step_size - 1e-6))
             step = np.full(1, (stop - self.time) / count)

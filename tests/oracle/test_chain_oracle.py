@@ -12,8 +12,9 @@ import pytest
 
 from sim.arrays.state import NONFINITE
 from sim.reference.oracle import OracleRun, converged
-from sim.reference.scene import Scene, load_scene
+from sim.reference.scene import Scene
 from tests.plants import SCENES
+from tests.scenes import load_scene
 from tests.simulators import Flight, fly
 
 POSITION = 1e-3

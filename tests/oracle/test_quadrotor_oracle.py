@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from sim.params import QueueParams, VehicleParams
-from sim.reference.quadrotor import ReferenceQuadrotor
 from sim.standalone import QuadSim
+from tests.oracle.quadrotor import ReferenceQuadrotor
 from tests.plants import paper_plant
 from tests.simulators import random_commands
 

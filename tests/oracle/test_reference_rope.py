@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from sim.reference.oracle import converged, hinges_from_directions, matrix_from_quat
-from sim.reference.scene import load_scene
 from tests.oracle.bare_rope import BareScene
 from tests.plants import SCENES
+from tests.scenes import load_scene
 from visthrow.evidence.bench.sim.mujoco_c import implicitfast_scene, rk4_scene
 
 CONVERGED = 1e-6

@@ -8,7 +8,6 @@ import pytest
 from sim.params import GRAVITY
 from sim.reference import blocks
 from sim.reference.quadrotor import (
-    ReferenceQuadrotor,
     VehicleErrors,
     initial_blocks,
     rigid_body_rates,
@@ -16,6 +15,7 @@ from sim.reference.quadrotor import (
     vehicle_rates,
 )
 from sim.reference.stepping import rk4
+from tests.oracle.quadrotor import ReferenceQuadrotor
 from tests.plants import paper_plant, plain_vehicle
 
 EXACT = 1e-12

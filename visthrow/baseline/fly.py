@@ -54,17 +54,6 @@ class Flown(Throws):
     tracking: np.ndarray
     step_times: np.ndarray
 
-    def summary(self) -> dict[str, float]:
-        """Mean and deviation of the successful throws; times of a step in ms."""
-        good = self.success
-        out: dict[str, float] = {"throws": len(good), "success": float(good.mean())}
-        for name in ("error", "duration", "position_error", "velocity_error", "tracking"):
-            values = getattr(self, name)[good]
-            out |= {f"{name}_mean": float(values.mean()), f"{name}_std": float(values.std())} if good.any() else {}
-        if len(self.step_times):
-            out["step_p50_ms"], out["step_p99_ms"] = (1e3 * float(x) for x in np.percentile(self.step_times, (50, 99)))
-        return out
-
 
 def _off(plan: Plan, pos_w: np.ndarray, vel_w: np.ndarray, good: np.ndarray) -> dict[str, np.ndarray]:
     """How far payloads were from the planned release at separation; NaN where a throw failed."""

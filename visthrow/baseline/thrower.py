@@ -39,7 +39,8 @@ def title_of(plant: str, compensation: str) -> str:
 
 def unit(
     plant: str, compensation: str, target: float, throws: int, seed: int = 0, *,
-    speed: float | None = None, w_t: float | None = None, rho: float | None = None, bounds: str = "payload and thrust",
+    height: float | None = None, speed: float | None = None, w_t: float | None = None, rho: float | None = None,
+    bounds: str = "payload and thrust",
     config_name: str = "state", overrides: Sequence[str] = (), batch: int = 0,
 ) -> dict[str, Any]:  # fmt: skip
     """Unit of throws with the baseline.
@@ -50,17 +51,17 @@ def unit(
         target: [m] along x.
         throws: how many.
         seed: of starts and noise.
-        speed: at release [m/s]; default the learnt policy's.
+        height: of the payload at release [m]. speed: at release [m/s]; default the learnt policy's.
         w_t: duration weight; rho: energy weight; default those of :class:`visthrow.baseline.spline.PlanParams`.
         bounds: "payload and thrust", or "payload" as in the paper.
         config_name: train config whose plant is flown; overrides: its changes.
         batch: number of the batch on a reference plant.
     """
-    height, default_speed = default_release(target)
+    default_height, default_speed = default_release(target)
     params = PlanParams()
     return {
         "kind": NAME, "protocol": PROTOCOL, "plant": plant, "compensation": compensation, "target": float(target),
-        "height": round(height, 6), "speed": round(speed or default_speed, 6), "w_t": float(w_t or params.duration),
+        "height": round(height or default_height, 6), "speed": round(speed or default_speed, 6), "w_t": float(w_t or params.duration),
         "rho": float(rho or params.energy), "bounds": bounds, "throws": int(throws), "seed": int(seed),
         "config": config_name, "overrides": list(overrides), "batch": int(batch),
         "conditions": key_of(contract_of(_experiment(config_name, tuple(overrides)))),
@@ -80,10 +81,14 @@ def _experiment(name: str, overrides: tuple[str, ...]) -> Experiment:
 
 
 @lru_cache(maxsize=64)
-def _plan(
-    name: str, overrides: tuple[str, ...], target: float, height: float, speed: float, w_t: float, rho: float, bounds: str
+def _plan(name: str, overrides: tuple[str, ...], *how: Any) -> Plan:
+    return plan_of(_experiment(name, overrides), *how)
+
+
+def plan_of(
+    experiment: Experiment, target: float, height: float, speed: float, w_t: float, rho: float, bounds: str
 ) -> Plan:
-    experiment = _experiment(name, overrides)
+    """The plan of a unit, whose entries the arguments are."""
     params = replace(PlanParams(), duration=w_t, energy=rho)
     params = params if bounds == "payload and thrust" else payload_bounds_only(params)
     return plan_throw(

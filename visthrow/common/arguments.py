@@ -1,6 +1,12 @@
-"""Options that commands share, and the exit status of a process."""
+"""Commands and the options that they share, and the exit status of a process."""
 
 import argparse
+import importlib
+from collections.abc import Mapping
+from typing import Any
+
+Commands = Mapping[str, tuple[str, str]]
+"""Name -> (help, module). The module has ``add_arguments(parser)`` and ``run(args) -> int``; it is imported only when chosen."""
 
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
@@ -27,3 +33,32 @@ def add_common(parser: argparse.ArgumentParser, *, device: bool = True, json: bo
         )
     if json:
         parser.add_argument("--json", metavar="FILE", help="write the printed figures to this file as well")
+
+
+def add_commands(parser: argparse.ArgumentParser, commands: Commands, dest: str, **group: Any) -> None:
+    """Add commands, of which one must be chosen; its name goes to ``args.<dest>``."""
+    choices = parser.add_subparsers(dest=dest, metavar=dest.upper(), required=True, parser_class=_Lazy, **group)
+    form = argparse.RawDescriptionHelpFormatter
+    for name, (text, module) in commands.items():
+        about = text[0].upper() + text[1:] + "."
+        choices.add_parser(name, module=module, help=text, description=about, formatter_class=form)
+
+
+def run_command(commands: Commands, name: str, args: argparse.Namespace) -> int:
+    """Run the chosen command; returns its exit status."""
+    return int(importlib.import_module(commands[name][1]).run(args) or 0)
+
+
+class _Lazy(argparse.ArgumentParser):
+    """Asks its module for the arguments only when it is the chosen one."""
+
+    def __init__(self, *args: Any, module: str, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self._module: str | None = module
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """See the base class."""
+        if self._module is not None:
+            module, self._module = self._module, None
+            importlib.import_module(module).add_arguments(self)
+        return super().parse_known_args(args, namespace)

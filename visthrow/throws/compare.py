@@ -243,7 +243,7 @@ def write(
 ) -> list[Path]:  # fmt: skip
     """Write Markdown, CSV and scatter plot; returns their paths."""
     from visthrow.common.storage import atomic_write
-    from visthrow.view import scatter, tables
+    from visthrow.view import figures, tables
 
     stem = f"compare-{plant}"
     paths = [folder / f"{stem}.md", folder / f"{stem}.csv", folder / f"{stem}.png"]
@@ -253,5 +253,9 @@ def write(
 
     if subtitle is None:
         subtitle = f"{len(entries[0].throws[0].success)} throws each, {PLANTS[plant]}"
-    scatter.draw(paths[2], [(e.name, e.throws) for e in entries], subtitle)
+    panels = [
+        (f"target {of.target:.1f} m", [(e.name, e.throws[i].landing_w[e.throws[i].success] - (of.target, 0.0)) for e in entries])
+        for i, of in enumerate(entries[0].throws)
+    ]
+    atomic_write(paths[2], figures.scatter(panels, title=f"Landing points from above: {subtitle}"))
     return paths

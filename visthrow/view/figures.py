@@ -115,12 +115,12 @@ def _log_axis(which, name: str, axis) -> None:
     which.set_minor_formatter(NullFormatter())
 
 
-def scatter(panels: Sequence[tuple[str, Sequence[tuple[str, np.ndarray]]]], columns: int = 3) -> bytes:
+def scatter(panels: Sequence[tuple[str, Sequence[tuple[str, np.ndarray]]]], columns: int = 3, title: str = "") -> bytes:
     """Landing points from above, the throw upwards.
 
     Args:
         panels: title and, for each colour, its label and misses (N, 2) [m]: along the throw, to the left.
-        columns: panels side by side.
+        columns: panels side by side. title: above all of them.
     """
     style.use()
     import matplotlib.pyplot as plt
@@ -147,7 +147,9 @@ def scatter(panels: Sequence[tuple[str, Sequence[tuple[str, np.ndarray]]]], colu
         axis.set_ylabel("along the throw [m]")
     handles, labels = axes.flat[0].get_legend_handles_labels()
     if len(labels) > 1:
-        figure.legend(handles, labels, loc="outside upper center", ncols=len(labels))
+        figure.legend(handles, labels, loc="outside upper center", ncols=min(len(labels), 3))
+    if title:
+        figure.suptitle(title, fontsize=11.5)
     return png_of(figure)
 
 

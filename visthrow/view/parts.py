@@ -5,6 +5,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 
+def aligned(header: Sequence[str], rows: Sequence[Sequence[str]], heads: int | None = None) -> str:
+    """A table as Markdown, columns aligned: the first ``heads`` columns stand left, all of them without it, the others right."""
+    cells = [header, *rows]
+    width = [max(len(row[i]) for row in cells) for i in range(len(header))]
+    left = len(header) if heads is None else heads
+
+    def line(row: Sequence[str]) -> str:
+        return "| " + " | ".join(c.ljust(w) if i < left else c.rjust(w) for i, (c, w) in enumerate(zip(row, width))) + " |"
+
+    rule = "|" + "|".join("-" * (w + 2) if i < left else "-" * (w + 1) + ":" for i, w in enumerate(width)) + "|"
+    return "\n".join([line(header), rule, *map(line, rows)])
+
+
 @dataclass(frozen=True)
 class Text:
     """A paragraph; ``**bold**`` and ``code`` in backticks are marked in both outputs."""
@@ -25,16 +38,7 @@ class Grid:
 
     def markdown(self) -> str:
         """Text of the table, columns aligned."""
-        lines = [self.header, *self.rows]
-        width = [max(len(line[i]) for line in lines) for i in range(len(self.header))]
-
-        def line(cells: Sequence[str]) -> str:
-            padded = (c.ljust(w) if i < self.heads else c.rjust(w) for i, (c, w) in enumerate(zip(cells, width)))
-            return "| " + " | ".join(padded) + " |"
-
-        rule = "|" + "|".join("-" * (w + 2) if i < self.heads else "-" * (w + 1) + ":" for i, w in enumerate(width)) + "|"
-        body = "\n".join([line(self.header), rule, *map(line, self.rows)])
-        return f"**{self.title}**\n\n{body}" + (f"\n\n{self.note}" if self.note else "")
+        return f"**{self.title}**\n\n{aligned(self.header, self.rows, self.heads)}" + (f"\n\n{self.note}" if self.note else "")
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from visthrow.view.parts import aligned
+
 PAPER = {
     ("state", 1.5): (0.082, 0.035, 1.090, 0.009),
     ("state", 2.0): (0.105, 0.099, 1.154, 0.015),
@@ -47,16 +49,7 @@ def markdown(rows: Sequence[dict], title: str) -> str:
         rows: :meth:`visthrow.training.protocol.Throws.summary` with ``policy`` and ``layout`` added.
         title: what was measured where.
     """
-    cells = [COLUMNS, *map(_cells, rows)]
-    widths = [max(len(row[i]) for row in cells) for i in range(len(COLUMNS))]
-    left = {0}
-
-    def line(row: Sequence[str]) -> str:
-        padded = (cell.ljust(w) if i in left else cell.rjust(w) for i, (cell, w) in enumerate(zip(row, widths)))
-        return "| " + " | ".join(padded) + " |"
-
-    rule = "|" + "|".join("-" * (w + 2) if i in left else "-" * (w + 1) + ":" for i, w in enumerate(widths)) + "|"
-    return "\n".join([title, "", line(cells[0]), rule, *map(line, cells[1:]), ""])
+    return f"{title}\n\n{aligned(COLUMNS, [_cells(row) for row in rows], heads=1)}\n"
 
 
 def _cells(row: dict) -> tuple[str, ...]:

@@ -1,13 +1,12 @@
 """The baseline in flight: controller against closed forms, throws in its own model and on the plants, front and command."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from visthrow import cli, config
-from visthrow.baseline import front, report, spline
+from visthrow.baseline import front, spline
 from visthrow.baseline import pendulum as pm
 from visthrow.baseline.fly import (
     Delays,
@@ -24,6 +23,7 @@ from visthrow.baseline.spline import PlanParams
 from visthrow.common.errors import ConfigError
 from visthrow.common.statistics import pareto
 from visthrow.task import Experiment, plant_of
+from visthrow.throws import results
 from visthrow.throws.plants import HybridPlant
 from visthrow.throws.reference_protocol import batch_plant, place_in_hover
 from visthrow.training import protocol
@@ -184,7 +184,6 @@ def test_a_batch_on_a_reference_plant_starts_as_the_policies_do(plan, experiment
 
 def test_flown_throws_are_scored_as_policies_are(plan, experiment):
     flown = fly_plant(plan, "hybrid", experiment, delays_of(experiment), 2)
-    assert flown.summary()["error_mean"] == pytest.approx(flown.error.mean())
     assert flown.error == pytest.approx(np.linalg.norm(flown.landing_w - [2.0, 0.0], axis=1))
     assert np.all((flown.clearance > 0.2) & (flown.clearance < 2.0))
     assert np.all((flown.smoothness > 0.0) & (flown.smoothness < 1.0))
@@ -209,43 +208,26 @@ def test_front_and_hypervolume_by_hand():
     assert front.hypervolume(np.empty((0, 2))) == 0.0
 
 
-def test_correlation_and_who_beats_whom():
-    rows = [
-        {"plant": "pendulum", "success": 1.0, "error_mean": e, "duration_mean": d, "velocity_error_mean": 2.0 * e}
-        for e, d in ((0.4, 1.2), (0.2, 1.4), (0.1, 2.0))
-    ]
-    policies = [
-        {"policy": name, "plant": "hybrid", "duration_mean": d, "error_mean": e}
-        for name, d, e in (("fast", 1.1, 0.1), ("slow", 2.1, 0.3))
-    ]
-    found = front.summary([*rows, {**rows[0], "success": 0.5, "error_mean": 0.0}], policies)
-    assert found["pendulum"]["pearson"] == pytest.approx(1.0)
-    assert found["pendulum"]["landed_all"] == 3
-    assert not found["pendulum"]["beats fast on hybrid"]
-    assert found["pendulum"]["beats slow on hybrid"]
-
-
-def test_failed_throws_have_no_figures_in_the_table(plan):
-    flown = fly_pendulum(plan, 1)
-    lost = replace(flown, success=np.array([False])).summary()
-    assert lost["success"] == 0.0
-    row = {"plant": "pendulum", "compensation": "none", "target": 2.0, "speed": 1.7, "w_t": 1.0, "rho": 1.0, **lost}
-    assert "| 0 %" in report.markdown([row], [], [], {}, 1)
-
-
 def test_the_command_writes_tables_and_picture(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(spline, "LONGEST", (1.4,))  # one start of the optimisation instead of five
-    status = cli.main(["baseline", "--quick", "--targets", "1.5", "--policies", "state", "--out", str(tmp_path)])
-    assert status == 0
-    text = (tmp_path / "baseline.md").read_text()
-    assert "0.127 ± 0.019 m, 1.546 ± 0.010 s" in text
-    assert "own pendulum" in text
-    value = json.loads((tmp_path / "baseline.json").read_text())
-    assert [row["plant"] for row in value["sweep"]] == ["pendulum"] * 2
-    assert value["front"]["policies"]["hypervolume, state on hybrid"] > 0.0
-    assert (tmp_path / "baseline.png").stat().st_size > 10_000
-    assert (tmp_path / "baseline.csv").read_text().count("\n") == 4
+    monkeypatch.setattr("visthrow.training.device.cores", lambda: 1)
+    packed = tmp_path / "all.json"
+    words = ["baseline", "--quick", "--targets", "1.5", "--policies", "state", "--out", str(tmp_path), "--json", str(packed)]
+    assert cli.main(words) == 0
+    text = (tmp_path / "report.md").read_text()
+    assert "0.127 ± 0.019, 1.546 ± 0.010" in text, "the paper's TO+MPC stands beside the own model"
+    assert "learnt state policy, training simulator" in text
+    units = [result.unit for result in results.load(packed)]
+    assert sorted((u["kind"], u["plant"], u["throws"], u["target"]) for u in units) == [
+        ("baseline", "pendulum", 2, 1.5), ("baseline", "pendulum", 2, 2.0), ("baseline", "pendulum", 2, 2.0),
+        ("policy", "hybrid", 10, 2.0),
+    ]  # fmt: skip
+    assert {u["speed"] for u in units if u["kind"] == "baseline" and u["target"] == 2.0} == {2.2}
+    assert (tmp_path / "front.png").stat().st_size > 10_000
     assert text.splitlines()[0] in capsys.readouterr().out
+    kept = {path: path.stat().st_mtime_ns for path in (tmp_path / "throws").iterdir()}
+    assert cli.main(words) == 0
+    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "throws").iterdir()} == kept, "nothing is flown twice"
 
 
 def test_the_command_refuses_what_it_cannot_fly(tmp_path, capsys):

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from camera.params import CameraParams
-from sim.reference.scene import load_scene
 from tests.bench import detector, mpc
+from tests.scenes import load_scene
 from visthrow import cli, config
 from visthrow.common.errors import StorageError, VisthrowError
 from visthrow.evidence import bench
@@ -199,7 +199,7 @@ def test_mistakes_are_told(words, message, capsys):
 @pytest.mark.parametrize("kind", sorted(bench.KINDS.keys() - {"records"}))
 def test_every_measurement_can_be_kept(kind):
     logs = ["flight.npz"] if kind == "explain" else []
-    args = cli.build_parser("bench").parse_args(["bench", kind, *logs])
+    args = cli.build_parser().parse_args(["bench", kind, *logs])
     assert (args.json, args.record) == (None, None), "what the end of each one asks for"
 
 

@@ -9,9 +9,9 @@ from hil.backends.check import hover_of_run, told
 from hil.control.decision import Words
 from hil.control.loop import fly
 from hil.errors import RunError
-from hil.fakes.level import LevelPlant
 from hil.recording.record import CONFIG, TICKS, Recorder
 from tests.hil_flight import simple_policy
+from tests.level import LevelPlant
 from tests.loopback.wire import peers
 
 QUICK = ("states.check_hold=0.2",)

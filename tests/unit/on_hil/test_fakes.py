@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from hil.errors import LinkError, RunError
-from hil.fakes.level import LevelPlant
 from hil.fakes.process import ListeningPort, make_fake, read_options
 from hil.fakes.witness import Witness
 from hil.links.device import check_device, open_port
 from hil.links.mavlink_link import Link, attitude_target
 from hil.links.pymav import mav
+from tests.level import LevelPlant
 from tests.loopback.wire import pipe
 from visthrow.common.errors import ConfigError
 

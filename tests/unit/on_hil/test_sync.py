@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from hil.fakes.level import LevelPlant
 from hil.fakes.process import VEHICLE_ID, FakeAutopilot, MocapParams, Options
 from hil.links.clock import TimeSync
 from hil.links.mavlink_link import Link
 from hil.links.pymav import mav
 from hil.links.sync import LATE, LinkSync
 from hil.sources import BodyIds, MavlinkSource
+from tests.level import LevelPlant
 from tests.loopback.wire import HERE, pipe
 
 RATE = 10.0

@@ -11,6 +11,7 @@ from typing import Any
 from visthrow.common import provenance
 from visthrow.common.errors import StorageError, VisthrowError, suggest
 from visthrow.common.storage import write_json
+from visthrow.view.parts import aligned
 
 FOLDER = Path(__file__).resolve().parent / "records"
 FURTHER_PACKAGES = ("mujoco-warp",)
@@ -28,11 +29,7 @@ class Table:
 
     def markdown(self) -> str:
         """Text of the table, columns aligned."""
-        lines = [self.header, *self.rows]
-        width = [max(len(line[i]) for line in lines) for i in range(len(self.header))]
-        text = ["| " + " | ".join(cell.ljust(w) for cell, w in zip(line, width)) + " |" for line in lines]
-        text.insert(1, "|" + "|".join("-" * (w + 2) for w in width) + "|")
-        return "\n".join([f"**{self.title}**", "", *text])
+        return f"**{self.title}**\n\n{aligned(self.header, self.rows)}"
 
 
 @dataclass(frozen=True)

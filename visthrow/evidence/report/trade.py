@@ -41,7 +41,7 @@ def baseline_section(book: Book) -> Section:
             for compensation in ("none",) if plant == thrower.OWN else thrower.MADE_UP:
                 found = [r for r in book.baseline(plant, compensation, target=target) if _default(r)]
                 if found:
-                    rows.append(_row(max(found, key=lambda r: r.unit["throws"])))
+                    rows.append(max(found, key=lambda r: r.unit["throws"]))
                 elif plant != "reference-realistic" or compensation != "none":
                     missing.append(f"{SHORT[plant]}, {thrower.MADE_UP[compensation]}, {target:g} m")
     parts: list = [
@@ -51,16 +51,21 @@ def baseline_section(book: Book) -> Section:
              "none, most or all of the known delays made up for.")
     ]  # fmt: skip
     if rows:
-        head = ("target [m]", "plant", "made up for", "throws", "landed", "landing error [m]", "duration [s]", "e_p [cm]",
-                "e_v [cm/s]", "tracking [cm]", "the paper's own model: error [m], duration [s]")  # fmt: skip
-        note = ("e_p and e_v: payload's position and velocity at separation against the plan; tracking: root mean square "
-                "distance from the planned path until the release.")  # fmt: skip
-        parts.append(Grid("The baseline by target", head, tuple(rows), note, heads=3))
+        parts.append(by_target(rows))
         parts.append(Text(_bar(book), "finding"))
     parts += _steps()
     if missing:
         parts.append(Text("Not thrown: " + "; ".join(missing) + ".", "missing"))
     return Section("baseline", "The model-based baseline", tuple(parts))
+
+
+def by_target(found: Sequence[Result]) -> Grid:
+    """Table of throws by target and plant, the paper's beside those of the own model."""
+    head = ("target [m]", "plant", "made up for", "throws", "landed", "landing error [m]", "duration [s]", "e_p [cm]",
+            "e_v [cm/s]", "tracking [cm]", "the paper's own model: error [m], duration [s]")  # fmt: skip
+    note = ("e_p and e_v: payload's position and velocity at separation against the plan; tracking: root mean square "
+            "distance from the planned path until the release.")  # fmt: skip
+    return Grid("The baseline by target", head, tuple(map(_row, found)), note, heads=3)
 
 
 def _row(found: Result) -> tuple[str, ...]:
@@ -104,12 +109,18 @@ def _bar(book: Book) -> str:
     return "In its own model: " + "; ".join(words) + "."
 
 
-def front_section(book: Book) -> Section:
-    """The sweep on each plant with the policies on it, and who beats whom."""
+def front_section(book: Book, shown: Sequence[tuple] = PANELS, names: Sequence[str] = SHIPPED) -> Section:
+    """The sweep on each plant with the policies on it, and who beats whom.
+
+    Args:
+        book: the results.
+        shown: as :data:`PANELS`.
+        names: of the policies.
+    """
     panels, parts, said, sums, missing = [], [], [], [], []
-    for heading, plant, kinds, policies_on in PANELS:
+    for heading, plant, kinds, policies_on in shown:
         title = SHORT[plant]
-        policies = [(name, book.shipped(name, policies_on, FRONT_TARGET)) for name in SHIPPED]
+        policies = [(name, book.shipped(name, policies_on, FRONT_TARGET)) for name in names]
         policies = [(name, result) for name, result in policies if result is not None and result.good.any()]
         drawn = []
         for compensation, bounds in kinds:
@@ -252,4 +263,4 @@ def _breakdown(book: Book) -> list[Grid]:
         else:
             rows.append((*head, f"landed {100 * landed([r]):.0f} %", "-", "-", "-"))
     head = ("v [m/s]", "w_t", "rho", "plan", "landing error [m]", "duration [s]", "e_p [cm]", "e_v [cm/s]")
-    return [Grid("Breakdown of the front in the own model, ten throws each", head, tuple(rows), heads=0)]
+    return [Grid("Breakdown of the front in the own model; the paper's are of ten throws each", head, tuple(rows), heads=0)]

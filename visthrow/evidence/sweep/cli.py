@@ -9,8 +9,7 @@ import time
 from pathlib import Path
 
 DEFAULT_OUT = "runs/sweep"
-RELEASE_TARGET, RELEASE_COUNT = 2.0, 200  # as the throws of the ablations [m], and how many
-ACTIONS = ("run", "status", "collect", "releases", "work")
+ACTIONS = ("run", "status", "collect", "work")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -22,7 +21,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "  visthrow sweep run paper --slurm partition=gpu --devices 8 --minutes 60    as jobs of a cluster\n"
         "  visthrow sweep status paper                                   a line a run\n"
         "  visthrow sweep collect paper --records out/records            what is committed of it\n"
-        "  visthrow sweep releases paper --units state-1,state_rigid_cable-1    how these policies let go, at 2 m\n"
         "\nWhat is done is not done again: a training run is known by its resolved config and seed, throws by the policy's\n"
         "content and everything else they depend on. Ctrl-C, a kill or a power cut lose what was not yet in a checkpoint.\n"
     )
@@ -36,8 +34,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--minutes", type=float, help="end after so long with checkpoints; on a cluster the length of a job")
     add("--slurm", metavar="KEY=VALUE", action="append", help="submit jobs, with this option of sbatch; may be repeated")
     add("--records", metavar="FOLDER", help="collect: where to (default: records beside the results)")
-    add("--units", metavar="NAMES", help="work and releases: which, with commas between")
-    add("--device", default="auto", help="work and releases: where")
+    add("--units", metavar="NAMES", help="work: which, with commas between")
+    add("--device", default="auto", help="work: where")
     add("--parent", type=int, metavar="ID", help="work: process with which this one is to end")
     add(
         "--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE",
@@ -47,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run, tell, collect."""
-    actions = {"run": _run, "status": _status, "collect": _collect, "releases": _releases, "work": _work}
+    actions = {"run": _run, "status": _status, "collect": _collect, "work": _work}
     return actions[args.action](args)
 
 
@@ -142,27 +140,4 @@ def _collect(args: argparse.Namespace) -> int:
     out = Path(args.out)
     for path in collect(load_list(args.list, tuple(args.overrides)), out, Path(args.records or out / "records")):
         print(path)
-    return 0
-
-
-def _releases(args: argparse.Namespace) -> int:
-    from visthrow.common.errors import ConfigError, suggest
-    from visthrow.evidence.sweep.release import HEAD, releases, row
-    from visthrow.evidence.sweep.units import load_list
-    from visthrow.throws.loading import load_policy
-    from visthrow.training.device import resolve
-
-    work, out, device = load_list(args.list, tuple(args.overrides)), Path(args.out), resolve(args.device)
-    known = {source.name: source for source in work.sources if source.config and source.done(out)}
-    print(HEAD)
-    for name in (args.units or ",".join(known)).split(","):
-        if name not in known:
-            raise ConfigError(f"no trained policy '{name}' in {out}; {suggest(name, known)}")
-        source = known[name]
-        layout = source.experiment().task.observation.layout
-        vehicle = ("vehicle", "rope", "release", "observation.latency")
-        for where, config_name, changes in (("its own", source.config, source.changes), ("the full", layout, ())):
-            if where == "its own" or source.config != layout:
-                loaded = load_policy(source.policy(out), config_name, changes, vehicle)
-                print(row(name, where, releases(loaded, RELEASE_TARGET, RELEASE_COUNT, device)), flush=True)
     return 0

@@ -2,9 +2,15 @@
 
 Tells why a component of the simulator matters or does not: a policy trained without it reaches another release state on the
 full plant, or the same.
+
+    python -m tests.bench.releases paper --units state-1,state_rigid_cable-1    at 2 m
 """
 
+import argparse
+import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,9 +18,17 @@ import torch
 from tensordict import TensorDict
 
 from sim.hybrid import rope_variants
-from visthrow.throws.loading import Loaded
+from tests.bench import start
+from visthrow.common.arguments import add_common
+from visthrow.common.errors import ConfigError, suggest
+from visthrow.evidence.sweep.cli import DEFAULT_OUT
+from visthrow.evidence.sweep.units import load_list
+from visthrow.throws.loading import Loaded, load_policy
+from visthrow.training.device import resolve
 from visthrow.training.env import ThrowEnv
 from visthrow.training.protocol import throw
+
+TARGET, COUNT = 2.0, 200  # as the throws of the ablations [m], and how many
 
 
 @dataclass(frozen=True)
@@ -117,3 +131,34 @@ HEAD = (
     "| policy | flown in | separation | ball x, z | its velocity x, z | vehicle x, z | landing x | cable off straight, mean, most "
     "| shorter, mean, most |\n|---|---|---|---|---|---|---|---|---|"
 )
+
+
+def run(args: argparse.Namespace) -> None:
+    """Throw with the policies of a list, where they were trained and on the full plant."""
+    work, out, device = load_list(args.list, tuple(args.overrides)), Path(args.out), resolve(args.device)
+    known = {source.name: source for source in work.sources if source.config and source.done(out)}
+    print(HEAD)
+    for name in (args.units or ",".join(known)).split(","):
+        if name not in known:
+            raise ConfigError(f"no trained policy '{name}' in {out}; {suggest(name, known)}")
+        source = known[name]
+        layout = source.experiment().task.observation.layout
+        vehicle = ("vehicle", "rope", "release", "observation.latency")
+        for where, config_name, changes in (("its own", source.config, source.changes), ("the full", layout, ())):
+            if where == "its own" or source.config != layout:
+                loaded = load_policy(source.policy(out), config_name, changes, vehicle)
+                print(row(name, where, releases(loaded, TARGET, COUNT, device)), flush=True)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command."""
+    parser = start.parser_of(__doc__, record=False)
+    parser.add_argument("list", metavar="LIST", help="name of configs/sweep, or a TOML file of your own")
+    parser.add_argument("--units", metavar="NAMES", help="which, with commas between (default: all that are trained)")
+    parser.add_argument("--out", metavar="FOLDER", default=DEFAULT_OUT, help=f"of the sweep (default: {DEFAULT_OUT})")
+    add_common(parser, json=False)
+    return start.main(parser, run, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

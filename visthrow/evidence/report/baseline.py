@@ -1,0 +1,153 @@
+"""``visthrow baseline``: plan with splines, track with MPC, throw: by target, and its front with learnt policies on it."""
+
+import argparse
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from visthrow.common.arguments import add_common
+from visthrow.common.errors import ConfigError
+from visthrow.common.workers import status
+
+TARGETS = (1.5, 2.0, 2.5)
+POLICY_THROWS = 100
+"""Of each learnt policy for its point on the front."""
+
+TITLE = "Trajectory optimisation and MPC: {throws} throws a row, bounds on {bounds}"
+NOTE = (
+    "All our figures are simulated; the plant stands in each row. The paper's TO+MPC figures come from its own pendulum "
+    "model, its policies' from a real vehicle. Own-model throws vary in start only (position, velocity, attitude, cable; "
+    "configs/start/hover.toml); on the plants noise, latency and extras vary too."
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.epilog = (
+        "examples:\n"
+        "  visthrow baseline                              tables at three targets and the sweep at 2.0 m (minutes)\n"
+        "  visthrow baseline --quick                      two throws, a small sweep, own model alone\n"
+        "  visthrow baseline --plants hybrid reference-realistic --no-sweep\n"
+        "\nThe baseline plans the payload's path to a release state by projectile motion, with height and speed of a\n"
+        "learnt policy's release, and tracks it with a nonlinear MPC. It is flown in the MPC's own pendulum model, an\n"
+        "idealised upper bound, and on the plants, with and without making up for delays and the release's lag.\n"
+        "What is flown is kept in the output folder; interrupted and started again, the command goes on.\n"
+    )
+    parser.add_argument("--targets", type=float, nargs="+", default=list(TARGETS), metavar="M", help="along x [m]")
+    parser.add_argument("--throws", type=int, default=10, metavar="N", help="a row (default: 10, as in the paper)")
+    parser.add_argument(
+        "--plants", nargs="*", default=["hybrid"], metavar="NAME",
+        help="beside the own model: hybrid, reference, reference-realistic (default: hybrid)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--release-from", metavar="POLICY",
+        help="measure release height and speed on its throws (default: as measured on the shipped state policy)",
+    )  # fmt: skip
+    parser.add_argument("--policies", nargs="*", default=["state", "vision"], metavar="POLICY", help="points on the front")
+    parser.add_argument(
+        "--payload-bounds", action="store_true",
+        help="bound the payload's path alone, as the paper does, not the vehicle's thrust: plans that tracking may fail on",
+    )  # fmt: skip
+    parser.add_argument("--no-sweep", action="store_true", help="tables by target only")
+    parser.add_argument("--quick", action="store_true", help="two throws, one speed and two weights, own model alone")
+    parser.add_argument("--seed", type=int, default=0, help="of starts and noise (default: 0)")
+    parser.add_argument("--config", default="state", metavar="NAME", help="train config whose plant is flown (default: state)")
+    parser.add_argument("--out", default="out/baseline", metavar="FOLDER", help="for page, tables, pictures and the single results")
+    add_common(parser, device=False)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Plan, throw, print, write."""
+    from visthrow.baseline import thrower
+    from visthrow.common.errors import suggest
+    from visthrow.evidence.report import book, trade, wanted
+    from visthrow.evidence.report.throws import SHORT
+    from visthrow.throws import compare, results
+    from visthrow.throws.plants import PLANTS
+    from visthrow.training.device import cores
+    from visthrow.view import page
+    from visthrow.view.parts import Section
+
+    compare.check(args.targets, args.throws)
+    for plant in args.plants:
+        if plant not in PLANTS:
+            raise ConfigError(f"no plant '{plant}'; {suggest(plant, PLANTS)}")
+    out, bounds = Path(args.out), wanted.BOUNDS[args.payload_bounds]
+    compare.writable(out)
+    if args.quick:
+        args.throws, args.plants = min(args.throws, 2), []
+    by_target, swept = list(_by_target(args, bounds)), [] if args.no_sweep else list(_swept(args, bounds))
+    units = [unit for row in by_target for unit in row] + swept
+    known = results.work(units, out / "throws", thrower.fly_unit, None, cores(), lambda text: status(f"TO+MPC: {text}"))
+    rows = [results.join(known[results.key_of(unit)] for unit in row)[0] for row in by_target]
+    made, found = [Section("baseline", "By target", (trade.by_target(rows),))], [known[results.key_of(unit)] for unit in units]
+    if swept:
+        policies = [_thrown(name, args) for name in args.policies]
+        kinds = [(thrower.OWN, "none"), *((plant, "both") for plant in args.plants)]
+        shown = [(SHORT[plant], plant, ((made_up, bounds),), "hybrid") for plant, made_up in kinds]
+        front = results.join(known[results.key_of(unit)] for unit in swept)
+        names = [result.unit["policy"] for result in policies]
+        made.append(trade.front_section(book.Book((*front, *policies)), shown, names))
+        found += policies
+    status("")
+    title = TITLE.format(throws=args.throws, bounds=bounds)
+    print(page.markdown_of(title, NOTE, made))
+    for path in page.write(out, title, NOTE, made):
+        print(path)
+    if args.json:
+        results.pack(found, args.json)
+    return 0
+
+
+def _how(args: argparse.Namespace, bounds: str) -> dict[str, Any]:
+    return {"bounds": bounds, "config_name": args.config, "overrides": args.overrides, "seed": args.seed}
+
+
+def _by_target(args: argparse.Namespace, bounds: str) -> Iterator[list[dict[str, Any]]]:
+    """Units of each row: the own model first, then each plant under each compensation."""
+    from visthrow.baseline import thrower
+
+    releases = _releases(args)
+    for target in args.targets:
+        height, speed = releases.get(target, (None, None))
+        for plant, made_up in [(thrower.OWN, "none"), *((plant, made_up) for plant in args.plants for made_up in thrower.MADE_UP)]:
+            yield thrower.units(plant, made_up, target, args.throws, height=height, speed=speed, **_how(args, bounds))
+
+
+def _swept(args: argparse.Namespace, bounds: str) -> Iterator[dict[str, Any]]:
+    """Units of the sweep: in the own model and, all delays made up for, on the plants."""
+    from visthrow.baseline import front, thrower
+    from visthrow.evidence.report.wanted import FRONT_TARGET
+
+    speeds, weights = ((2.2,), front.WEIGHTS[2::2]) if args.quick else (front.SPEEDS, front.WEIGHTS)
+    for speed in speeds:
+        for w_t, rho in weights:
+            for plant, made_up in [(thrower.OWN, "none"), *((plant, "both") for plant in args.plants)]:
+                how = {"speed": speed, "w_t": w_t, "rho": rho, **_how(args, bounds)}
+                yield from thrower.units(plant, made_up, FRONT_TARGET, args.throws, **how)
+
+
+def _releases(args: argparse.Namespace) -> dict[float, tuple[float, float]]:
+    if not args.release_from:
+        return {}
+    from visthrow.baseline.release import measure
+    from visthrow.throws.loading import load_policy
+
+    loaded = load_policy(args.release_from)
+    status(f"measuring the releases of {loaded.name}")
+    return {target: measure(loaded, target, seed=args.seed) for target in args.targets}
+
+
+def _thrown(name: str, args: argparse.Namespace) -> Any:
+    """Throws of a learnt policy in the training simulator, as ``visthrow compare`` throws them."""
+    from visthrow.evidence.report.wanted import FRONT_TARGET
+    from visthrow.throws import results
+    from visthrow.throws.loading import load_policy
+    from visthrow.training.protocol import throw
+
+    loaded, count = load_policy(name), 10 if args.quick else POLICY_THROWS
+    status(f"throwing with {loaded.name}")
+    flown = throw(loaded.experiment, loaded.policy.actor(count), FRONT_TARGET, count, "cpu", args.seed)
+    layout = loaded.policy.contract["observation"]["layout"]
+    unit = results.policy_unit(loaded.name, "", layout, "hybrid", FRONT_TARGET, count, args.seed)
+    return results.Result(unit, results.columns_of(flown))
