@@ -52,9 +52,9 @@ def run_command(commands: Commands, name: str, args: argparse.Namespace) -> int:
 class _Lazy(argparse.ArgumentParser):
     """Asks its module for the arguments only when it is the chosen one."""
 
-    def __init__(self, *args: Any, module: str, **kwargs: Any) -> None:
+    def __init__(self, *args: Any, module: str | None = None, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        self._module: str | None = module
+        self._module = module
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """See the base class."""
