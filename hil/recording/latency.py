@@ -1,6 +1,5 @@
 """Where the time of a tick goes: percentiles and a histogram a stage, in memory that does not grow with the run."""
 
-import io
 import math
 from pathlib import Path
 from typing import Any
@@ -120,6 +119,7 @@ def draw(path: str | Path, stages: Stages, title: str) -> None:
     """
     from visthrow.common import style
     from visthrow.common.storage import atomic_write
+    from visthrow.view.parts import png_of
 
     style.use()
     import matplotlib.pyplot as plt
@@ -133,10 +133,7 @@ def draw(path: str | Path, stages: Stages, title: str) -> None:
     axes[-1, 0].set_xlabel("time [ms]; thin lines: p50, p95, p99; triangle: the longest")
     figure.suptitle(title, x=0.02, ha="left", fontsize=11.5)
     figure.tight_layout(h_pad=0.25)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png")
-    plt.close(figure)
-    atomic_write(path, buffer.getvalue())
+    atomic_write(path, png_of(figure))
 
 
 def _histogram(axis: Any, name: str, stage: Stage) -> None:

@@ -1,13 +1,10 @@
 """What is made of a run's folder when the run is over: flight logs, pictures, the report of its times."""
 
-import json
 from pathlib import Path
 from typing import Any
 
-from hil.errors import RunError
 from hil.recording.flightlogs import read, throws, whole
 from hil.recording.latency import Stages, draw, table
-from hil.recording.record import SUMMARY
 from visthrow.common.errors import VisthrowError
 from visthrow.logs.flightlog import FlightLog
 
@@ -93,26 +90,3 @@ def picture(folder: Path, number: int, log: FlightLog, camera: Any) -> Path:
     path = throw_path(folder, number, ".png")
     strip.draw(path, log, camera)
     return path
-
-
-def throw_logs(folder: str | Path) -> list[FlightLog]:
-    """Logs of a run's throws: as they were written, else made now.
-
-    Raises:
-        RunError: no folder of a run, or a damaged one.
-        LogError: a log that was written is damaged.
-    """
-    folder = Path(folder)
-    kept = sorted(folder.glob("throw-*.npz"))
-    if kept and len(kept) == _throws_flown(folder):
-        return [FlightLog.load(path) for path in kept]
-    return throws(read(folder))
-
-
-def _throws_flown(folder: Path) -> int | None:
-    try:
-        return json.loads((folder / SUMMARY).read_text(encoding="utf-8"))["throws"]
-    except OSError:
-        return None  # killed: there is no summary
-    except (ValueError, KeyError, TypeError) as error:
-        raise RunError(f"{folder / SUMMARY}: not the summary of a run: {error!r}") from error

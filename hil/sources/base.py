@@ -1,11 +1,11 @@
-"""What the runner needs of a source, and the source that plays recorded poses."""
+"""What the runner needs of a source, what live ones share, and the source that plays recorded poses."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Protocol
 
 from hil.errors import SourceError
 from hil.links.clock import Clock
-from hil.links.mavlink_link import Link
+from hil.links.mavlink_link import Link, wait
 from hil.poses.pose import Pose
 
 
@@ -26,6 +26,30 @@ class Source(Protocol):
 
     def close(self) -> None:
         """Give the port or file back."""
+
+
+class Linked:
+    """Links that a live source serves while it is polled."""
+
+    ended = False
+
+    def __init__(self, links: tuple[Link, ...], clock: Callable[[], float]) -> None:
+        """Serve links; ``clock`` gives the arrivals."""
+        self.links, self._clock = links, clock
+
+    def wait(self, clock: Clock, until: float) -> None:
+        """See `Source`."""
+        wait(self.links, clock, self._clock, until)
+
+    def hold(self, flying: bool) -> None:
+        """See `Source`."""
+        for link in self.links:
+            link.roster.flying = flying
+
+    def close(self) -> None:
+        """See `Source`."""
+        for link in self.links:
+            link.close()
 
 
 class Recorded:

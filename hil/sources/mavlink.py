@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from hil.errors import SourceError
-from hil.links.clock import Clock
-from hil.links.mavlink_link import Link, pose_from_message, pump, wait
+from hil.links.mavlink_link import Link, pose_from_message, pump
 from hil.poses.pose import BODIES, Pose
+from hil.sources.base import Linked
 from visthrow.common.errors import ConfigError
 
 POSE_MESSAGES = ("ATT_POS_MOCAP", "VISION_POSITION_ESTIMATE", "ODOMETRY", "LOCAL_POSITION_NED")
@@ -92,15 +92,13 @@ class MavlinkDecoder:
         )
 
 
-class MavlinkSource:
+class MavlinkSource(Linked):
     """Poses of a link. Polling it also serves the link's other listeners, and the autopilot's link where that is another one."""
-
-    ended = False
 
     def __init__(self, link: Link, bodies: tuple[BodyIds, ...], clock: Callable[[], float], beside: Link | None = None) -> None:
         """Listen to a link; ``clock`` gives the arrivals. ``beside`` is another link to serve."""
-        self._link, self._clock, self._decoder = link, clock, MavlinkDecoder(bodies)
-        self.links = (link,) if beside is None else (link, beside)
+        super().__init__((link,) if beside is None else (link, beside), clock)
+        self._link, self._decoder = link, MavlinkDecoder(bodies)
         self._waiting: list[Pose] = []
         link.listen(self._hear)
 
@@ -115,17 +113,3 @@ class MavlinkSource:
         pump(self.links, self._clock)
         poses, self._waiting = self._waiting, []
         return poses
-
-    def wait(self, clock: Clock, until: float) -> None:
-        """See `hil.sources.base.Source`."""
-        wait(self.links, clock, self._clock, until)
-
-    def hold(self, flying: bool) -> None:
-        """See `hil.sources.base.Source`."""
-        for link in self.links:
-            link.roster.flying = flying
-
-    def close(self) -> None:
-        """See `hil.sources.base.Source`."""
-        for link in self.links:
-            link.close()

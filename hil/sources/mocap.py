@@ -14,10 +14,10 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from hil.errors import SourceError
-from hil.links.clock import Clock
 from hil.links.device import check_device
-from hil.links.mavlink_link import Link, pump, wait
+from hil.links.mavlink_link import Link, pump
 from hil.poses.pose import BODIES, Pose
+from hil.sources.base import Linked
 from visthrow.common.errors import ConfigError, suggest
 from visthrow.common.extras import load_extra
 
@@ -60,18 +60,16 @@ class MocapParams:
     settings: dict[str, str] = field(default_factory=dict)  # further options of motioncapture.connect; for ros2 domain
 
 
-class MocapSource:
+class MocapSource(Linked):
     """Poses that a thread hands over; serves the autopilot's link as well where there is one.
 
     Attributes:
         failure: what ended the thread, or None; the bodies go stale then, which the runner acts on.
     """
 
-    ended = False
-
     def __init__(self, clock: Callable[[], float], link: Link | None = None) -> None:
         """Take the clock that arrivals are told by, and the link to serve."""
-        self._clock, self.links = clock, () if link is None else (link,)
+        super().__init__(() if link is None else (link,), clock)
         self._waiting: deque[Pose] = deque(maxlen=MOST_WAITING)
         self.failure: str | None = None
 
@@ -83,20 +81,6 @@ class MocapSource:
         """See `hil.sources.base.Source`."""
         pump(self.links, self._clock)
         return [self._waiting.popleft() for _ in range(len(self._waiting))]
-
-    def wait(self, clock: Clock, until: float) -> None:
-        """See `hil.sources.base.Source`."""
-        wait(self.links, clock, self._clock, until)
-
-    def hold(self, flying: bool) -> None:
-        """See `hil.sources.base.Source`."""
-        for link in self.links:
-            link.roster.flying = flying
-
-    def close(self) -> None:
-        """See `hil.sources.base.Source`."""
-        for link in self.links:
-            link.close()
 
 
 class MotionCaptureSource(MocapSource):

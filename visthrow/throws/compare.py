@@ -257,5 +257,5 @@ def write(
         (f"target {of.target:.1f} m", [(e.name, e.throws[i].landing_w[e.throws[i].success] - (of.target, 0.0)) for e in entries])
         for i, of in enumerate(entries[0].throws)
     ]
-    atomic_write(paths[2], figures.scatter(panels, title=f"Landing points from above: {subtitle}"))
+    atomic_write(paths[2], figures.scatter(panels, heading=f"Landing points from above: {subtitle}"))
     return paths

@@ -115,12 +115,12 @@ def _log_axis(which, name: str, axis) -> None:
     which.set_minor_formatter(NullFormatter())
 
 
-def scatter(panels: Sequence[tuple[str, Sequence[tuple[str, np.ndarray]]]], columns: int = 3, title: str = "") -> bytes:
+def scatter(panels: Sequence[tuple[str, Sequence[tuple[str, np.ndarray]]]], columns: int = 3, heading: str = "") -> bytes:
     """Landing points from above, the throw upwards.
 
     Args:
         panels: title and, for each colour, its label and misses (N, 2) [m]: along the throw, to the left.
-        columns: panels side by side. title: above all of them.
+        columns: panels side by side. heading: above all of them.
     """
     style.use()
     import matplotlib.pyplot as plt
@@ -130,9 +130,8 @@ def scatter(panels: Sequence[tuple[str, Sequence[tuple[str, np.ndarray]]]], colu
     far = max((np.abs(points).max() for _, series in panels for _, points in series if len(points)), default=0.2)
     half = float(np.clip(1.06 * far, 0.12, 0.7))
     size = WIDTH / max(columns, 3)
-    figure, axes = plt.subplots(
-        rows, columns, figsize=(size * columns, size * rows + 0.5), layout="constrained", squeeze=False, sharex=True, sharey=True
-    )
+    room = (max(size * columns, 6.4), size * rows + 1.1) if heading else (size * columns, size * rows + 0.8)
+    figure, axes = plt.subplots(rows, columns, figsize=room, layout="constrained", squeeze=False, sharex=True, sharey=True)
     for axis in axes.flat[len(panels) :]:
         axis.set_visible(False)
     for axis, (title, series) in zip(axes.flat, panels):
@@ -147,9 +146,9 @@ def scatter(panels: Sequence[tuple[str, Sequence[tuple[str, np.ndarray]]]], colu
         axis.set_ylabel("along the throw [m]")
     handles, labels = axes.flat[0].get_legend_handles_labels()
     if len(labels) > 1:
-        figure.legend(handles, labels, loc="outside upper center", ncols=min(len(labels), 3))
-    if title:
-        figure.suptitle(title, fontsize=11.5)
+        figure.legend(handles, labels, loc=f"outside {'lower' if heading else 'upper'} center", ncols=min(len(labels), 3))
+    if heading:
+        figure.suptitle(heading, fontsize=11.5)
     return png_of(figure)
 
 

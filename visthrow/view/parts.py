@@ -59,11 +59,11 @@ class Section:
     parts: tuple[Text | Grid | Picture, ...] = field(default=())
 
 
-def png_of(figure) -> bytes:
+def png_of(figure, dpi: float = 150.0) -> bytes:
     """Bytes of a matplotlib figure, which is closed."""
     import matplotlib.pyplot as plt
 
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=150)
+    figure.savefig(buffer, format="png", dpi=dpi)
     plt.close(figure)
     return buffer.getvalue()

@@ -1,6 +1,6 @@
 """A flight for the rerun viewer: the scene in 3D, the image plane, and all signals on one time line. Onboard-safe.
 
-The only module that imports rerun. Time zero is the policy's start. What a log does not hold is not shown: a flight on
+Time zero is the policy's start. What a log does not hold is not shown: a flight on
 motion capture knows no motor speeds, a simulated one no age of its poses. Sizes come from an experiment, or from anything
 with ``camera``, ``vehicle.rotors`` and ``rope.payload_radius``.
 """
@@ -59,7 +59,7 @@ def show(address: str, name: str, log: FlightLog, experiment: Any, landings_w: n
     stream.send_recording_name(name)
     whole(stream, log, experiment)
     places = np.column_stack((landings_w, np.full(len(landings_w), 0.004))).astype(np.float32)
-    stream.log("world/landings", rr.Points3D(places, radii=0.008, colors=[_colour(style.PAYLOAD, 150)]), static=True)
+    stream.log("world/landings", rr.Points3D(places, radii=0.008, colors=[colour_code(style.PAYLOAD, 150)]), static=True)
     stream.flush()
     stream.disconnect()
 
@@ -75,12 +75,12 @@ def whole(stream: rr.RecordingStream, log: FlightLog, experiment: Any) -> None:
 
 
 @contextmanager
-def recording(path: str | Path, layout: rrb.Blueprint) -> Iterator[rr.RecordingStream]:
+def recording(path: str | Path, layout: rrb.Blueprint | None = None) -> Iterator[rr.RecordingStream]:
     """Give a stream whose content becomes a ``.rrd`` file, whole or not at all.
 
     Args:
         path: The file.
-        layout: of the viewer that opens it.
+        layout: of the viewer that opens it; None leaves it to the viewer.
 
     Raises:
         StorageError: the place cannot be written.
@@ -103,7 +103,8 @@ def _times(log: FlightLog, name: str) -> rr.TimeColumn:
     return rr.TimeColumn(TIMELINE, duration=log[name].time - log.meta["times"]["policy_start"])
 
 
-def _colour(hexadecimal: str, alpha: int = 255) -> list[int]:
+def colour_code(hexadecimal: str, alpha: int = 255) -> list[int]:
+    """Red, green, blue and opacity of ``#rrggbb``."""
     return [*(int(hexadecimal[i : i + 2], 16) for i in (1, 3, 5)), alpha]
 
 
@@ -131,17 +132,17 @@ def still(stream: rr.RecordingStream, goal_w: Any, experiment: Any) -> None:
     stream.log("world/ground", floor, static=True)
     half = experiment.camera.goal_side / 2.0
     corners = half * np.array([[1, 1, 0], [1, -1, 0], [-1, -1, 0], [-1, 1, 0], [1, 1, 0]])
-    square = rr.LineStrips3D([corners + [0, 0, 0.003]], radii=0.006, colors=[_colour(style.GOAL)])
+    square = rr.LineStrips3D([corners + [0, 0, 0.003]], radii=0.006, colors=[colour_code(style.GOAL)])
     stream.log("world/goal", square, rr.Transform3D(translation=goal), static=True)
-    centre = rr.Points3D([[0.0, 0.0, 0.0]], radii=0.012, colors=[_colour(style.GOAL)])
+    centre = rr.Points3D([[0.0, 0.0, 0.0]], radii=0.012, colors=[colour_code(style.GOAL)])
     stream.log("world/goal/centre", centre, static=True)
     _vehicle(stream, experiment)
     radius = experiment.rope.payload_radius
-    ball = rr.Ellipsoids3D(half_sizes=[[radius] * 3], colors=[_colour(style.PAYLOAD)], fill_mode="solid")
+    ball = rr.Ellipsoids3D(half_sizes=[[radius] * 3], colors=[colour_code(style.PAYLOAD)], fill_mode="solid")
     stream.log("world/ball", ball, static=True)
-    stream.log("world/rope", rr.LineStrips3D.from_fields(radii=0.003, colors=[_colour(style.ROPE)]), static=True)
+    stream.log("world/rope", rr.LineStrips3D.from_fields(radii=0.003, colors=[colour_code(style.ROPE)]), static=True)
     for _, entity, colour in TRAILS:
-        stream.log(entity, rr.LineStrips3D.from_fields(radii=0.004, colors=[_colour(colour, 170)]), static=True)
+        stream.log(entity, rr.LineStrips3D.from_fields(radii=0.004, colors=[colour_code(colour, 170)]), static=True)
     _plane(stream, experiment.camera)
 
 
@@ -175,7 +176,7 @@ def _at_times(log: FlightLog, name: str, of: str) -> np.ndarray:
 
 def _landing(stream: rr.RecordingStream, log: FlightLog) -> None:
     label = f"{100 * log.meta['result']['error']:.1f} cm off"
-    mark = rr.Points3D.from_fields(radii=0.015, colors=[_colour(style.INK)], labels=[label])
+    mark = rr.Points3D.from_fields(radii=0.015, colors=[colour_code(style.INK)], labels=[label])
     stream.log("world/landing", mark, static=True)
     where = rr.Points3D.columns(positions=log["landing"].values.astype(np.float32))
     stream.send_columns("world/landing", [_times(log, "landing")], where)
@@ -185,13 +186,13 @@ def _vehicle(stream: rr.RecordingStream, experiment: Any) -> None:
     rotors = experiment.vehicle.rotors
     hubs = np.column_stack((rotors.x, rotors.y, np.full(4, rotors.z)))
     arms = [np.vstack(([0.0, 0.0, rotors.z], hub)) for hub in hubs]
-    dark = _colour(style.VEHICLE)
+    dark = colour_code(style.VEHICLE)
     stream.log("world/vehicle/arms", rr.LineStrips3D(arms, radii=0.005, colors=[dark]), static=True)
     hub_size = [[0.028, 0.018, 0.014]]
     stream.log("world/vehicle/body", rr.Boxes3D(half_sizes=hub_size, colors=[dark], fill_mode="solid"), static=True)
     discs = rr.Ellipsoids3D(
         centers=hubs + [0, 0, 0.008], half_sizes=[[rotors.radius, rotors.radius, 0.002]] * 4, fill_mode="solid",
-        colors=[_colour(style.COLOURS[0] if hub[0] > 0 else "#9AA5B1") for hub in hubs],  # the front ones stand out
+        colors=[colour_code(style.COLOURS[0] if hub[0] > 0 else "#9AA5B1") for hub in hubs],  # the front ones stand out
     )  # fmt: skip
     stream.log("world/vehicle/rotors", discs, static=True)
 
@@ -313,7 +314,7 @@ def _signals(stream: rr.RecordingStream, log: FlightLog) -> None:
     for entity, name, component, label, colour in _curves(log):
         values = log[name].values if component is None else log[name].values[:, component]
         scale = 1e3 if entity.split("/")[0] in MILLISECONDS else 1.0
-        stream.log(f"signals/{entity}", rr.SeriesLines(names=[label], colors=[_colour(colour)]), static=True)
+        stream.log(f"signals/{entity}", rr.SeriesLines(names=[label], colors=[colour_code(colour)]), static=True)
         column = rr.Scalars.columns(scalars=scale * values.astype(float))
         stream.send_columns(f"signals/{entity}", [_times(log, name)], column)
 

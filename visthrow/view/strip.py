@@ -1,7 +1,6 @@
 """The picture of one throw: the paper's strip of side views, and what the camera saw at the same instants."""
 
 import dataclasses
-import io
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +14,7 @@ from visthrow.common.errors import LogError
 from visthrow.common.storage import atomic_write
 from visthrow.logs.flightlog import FlightLog
 from visthrow.onboard.hover import rot_from_quat
+from visthrow.view.parts import png_of
 
 MARGIN = 0.35  # about what is seen [m]
 GROUND = 0.13  # of it seen below z = 0 [m]
@@ -85,10 +85,7 @@ def draw(path: str | Path, log: FlightLog, camera: CameraParams) -> None:
     field = f"{camera.fisheye.fov_deg:g}°"
     note = f"The same instants on the fisheye image ({field}): corners of the target square, box of the ball{unseen}"
     figure.text(y=(PANEL + 0.42) / height, s=note, **quiet)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png")
-    plt.close(figure)
-    atomic_write(path, buffer.getvalue())
+    atomic_write(path, png_of(figure))
 
 
 def _headline(log: FlightLog) -> str:

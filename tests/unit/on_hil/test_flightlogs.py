@@ -13,8 +13,9 @@ import pytest
 from hil.control.landing import Flight, separation
 from hil.errors import RunError
 from hil.recording import flightlogs, view
+from hil.recording.flightlogs import read, throws
 from hil.recording.record import load_run
-from hil.recording.report import finish, throw_logs
+from hil.recording.report import finish
 from tests.hil_flight import TICK
 from tests.hil_runs import record_run, saved_policy
 from visthrow.logs.export import columns
@@ -34,7 +35,7 @@ def run(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def logs(run):
-    return throw_logs(run[0])
+    return throws(read(run[0]))
 
 
 def test_a_log_a_throw_with_what_was_decided(run, logs):
@@ -82,13 +83,12 @@ def test_the_end_of_a_run_writes_logs_and_pictures(run):
     assert len(list(folder.glob("throw-*.npz"))) == 1
     picture = cv2.imread(str(folder / "throw-01.png"))
     assert picture.shape[1] > 1500
-    assert len(throw_logs(folder)) == 1
 
 
 def test_throws_without_a_landing_say_why(tmp_path):
     never = saved_policy(tmp_path, (-0.1269, 0, 0, 0, -1.0))
     record_run(tmp_path / "a", never, "throws=2", "states.throw=0.5", seconds=7.0)
-    logs = throw_logs(tmp_path / "a")
+    logs = throws(read(tmp_path / "a"))
     assert len(logs) == 2
     assert logs[0]["command"].time[-1] < logs[1]["command"].time[0], "no tick belongs to two throws"
     for log in logs:
@@ -107,10 +107,10 @@ def test_a_run_without_a_throw_is_logged_as_a_whole(tmp_path):
 
 def test_a_killed_run_and_no_run(tmp_path):
     record_run(tmp_path / "a", saved_policy(tmp_path), seconds=6.0, close=False)
-    (log,) = throw_logs(tmp_path / "a")
+    (log,) = throws(read(tmp_path / "a"))
     assert log.meta["result"]["success"]
     with pytest.raises(RunError, match="no folder of a run"):
-        throw_logs(tmp_path)
+        throws(read(tmp_path))
 
 
 def test_where_the_rope_let_go_is_found_in_noisy_poses():

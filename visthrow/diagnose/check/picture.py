@@ -5,9 +5,11 @@ from pathlib import Path
 import numpy as np
 
 from visthrow.common import style
+from visthrow.common.storage import atomic_write
 from visthrow.diagnose.check.run import Checked
 from visthrow.logs.check.rows import worst
 from visthrow.logs.flightlog import FlightLog
+from visthrow.view.parts import png_of
 
 MOST = 10
 """Channels in a picture."""
@@ -34,9 +36,7 @@ def draw(log: FlightLog, checked: Checked, path: str | Path) -> None:
     legend = "left bar: green ok, yellow warn, red bad; x, y, z: blue, red, green"
     axes[0, 0].set_title(f"{checked.name}: {checked.verdict} ({legend})", loc="left", fontsize=10)
     figure.tight_layout()
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path)
-    plt.close(figure)
+    atomic_write(path, png_of(figure))
 
 
 def _channel(axis, log: FlightLog, name: str) -> None:

@@ -1,18 +1,17 @@
 """The recording of a diagnosis for the rerun viewer: measured, simulated before and simulated after, flight by flight."""
 
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import rerun as rr
 
 from visthrow.common import style
-from visthrow.common.errors import StorageError
-from visthrow.common.storage import atomic_write
 from visthrow.diagnose.models.interface import Window
 from visthrow.diagnose.reporting.pictures import AFTER, BEFORE, left_over
 from visthrow.diagnose.select.result import Diagnosis
 from visthrow.logs.flightlog import FlightLog
+from visthrow.view.rerun_view import colour_code, recording
 
 TIMELINE = "flight_time"
 PATHS = ("pos_w", "payload_pos_w")
@@ -30,25 +29,13 @@ def write(path: str | Path, diagnosis: Diagnosis, logs: Sequence[FlightLog]) -> 
     Raises:
         StorageError: The place cannot be written.
     """
-    import rerun as rr
-
-    stream = rr.RecordingStream("visthrow_diagnose", recording_id=None)
     work = diagnosis.work
-    with tempfile.TemporaryDirectory() as folder:
-        whole = Path(folder) / "diagnosis.rrd"
-        try:
-            stream.save(whole)
-            stream.log("", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-            for before, after in zip(work.before.windows, work.after.windows):
-                log = logs[before.flight] if before.flight < len(logs) else None
-                for c, name in enumerate(work.problem.model.channels):
-                    _channel(stream, name, c, before, after, work.after.noise, log)
-            stream.flush()
-            stream.disconnect()
-            content = whole.read_bytes()
-        except OSError as error:
-            raise StorageError(f"cannot write the recording: {error}") from error
-    atomic_write(path, content)
+    with recording(path) as stream:
+        stream.log("", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        for before, after in zip(work.before.windows, work.after.windows):
+            log = logs[before.flight] if before.flight < len(logs) else None
+            for c, name in enumerate(work.problem.model.channels):
+                _channel(stream, name, c, before, after, work.after.noise, log)
 
 
 def _channel(stream, name: str, channel: int, before: Window, after: Window, noise, log: FlightLog | None) -> None:
@@ -76,22 +63,14 @@ def _channel(stream, name: str, channel: int, before: Window, after: Window, noi
 
 
 def _series(stream, entity: str, time: np.ndarray, values: np.ndarray, colour: str) -> None:
-    import rerun as rr
-
     count = values.shape[1]
-    stream.log(entity, rr.SeriesPoints(colors=[_rgb(colour)] * count, marker_sizes=[1.5] * count), static=True)
+    stream.log(entity, rr.SeriesPoints(colors=[colour_code(colour)] * count, marker_sizes=[1.5] * count), static=True)
     column = rr.TimeColumn(TIMELINE, duration=time)
     stream.send_columns(entity, [column], rr.Scalars.columns(scalars=np.ascontiguousarray(values, dtype=float)))
 
 
-def _rgb(colour: str) -> list[int]:
-    return [int(colour[i : i + 2], 16) for i in (1, 3, 5)]
-
-
 def _path(stream, entity: str, time: np.ndarray, points: np.ndarray, colour: str) -> None:
-    import rerun as rr
-
-    code = _rgb(colour)
+    code = colour_code(colour)
     stream.log(entity, rr.Points3D.from_fields(radii=0.006, colors=[code]), static=True)
     column = rr.TimeColumn(TIMELINE, duration=time)
     stream.send_columns(entity, [column], rr.Points3D.columns(positions=points.astype(np.float32)))
