@@ -9,9 +9,9 @@ import torch
 from hil.backends import DryRun, Status
 from hil.control.runner import Decision, Runner, Words
 from hil.params import HilParams
-from hil.poses.frames import multiply, rotate
 from hil.poses.pose import Pose
 from visthrow import config
+from visthrow.common.rotations import multiply, rotate_one
 from visthrow.onboard.policy import Policy, find_policy
 
 TICK, SUBSTEPS = 0.02, 2  # poses at 100 Hz
@@ -51,7 +51,7 @@ class Vehicle:
         thrust, *rates = command
         if released and self.payload is None:
             self.payload, self.payload_vel = self.pos - [0.0, 0.0, hang], self.vel.copy()
-        up = np.array(rotate(self.quat, (0.0, 0.0, 1.0)))
+        up = np.array(rotate_one(self.quat, (0.0, 0.0, 1.0)))
         self.vel = self.vel + dt * (thrust / mass[released] * up - [0.0, 0.0, 9.81])
         self.pos = self.pos + dt * self.vel
         turned = multiply(self.quat, (*(0.5 * dt * r for r in rates), 1.0))

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 from hil.poses.pose import Vector
 from hil.poses.track import BodyState
+from visthrow.common.rotations import tilt_and_heading
 
 
 @dataclass(frozen=True)
@@ -136,11 +137,9 @@ def failed_checks(
     failed = []
     if vehicle.quat is None:
         return ["the vehicle's source gives no attitude"]
-    x, y, z, w = vehicle.quat
-    tilt = math.degrees(math.acos(max(-1.0, min(1.0, 1.0 - 2.0 * (x * x + y * y)))))
+    tilt, heading = map(math.degrees, tilt_and_heading(vehicle.quat))
     if tilt > params.tilt_deg:
         failed.append(f"vehicle tilted by {tilt:.0f} deg (quaternion order or body axes wrong?)")
-    heading = math.degrees(math.atan2(2.0 * (x * y + w * z), 1.0 - 2.0 * (y * y + z * z)))
     off = (heading - params.heading_deg + 180.0) % 360.0 - 180.0
     if abs(off) > params.heading_tolerance_deg:
         failed.append(f"heading {heading:.0f} deg, not {params.heading_deg:g} (axes, yaw offset or quaternion wrong?)")

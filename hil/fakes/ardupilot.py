@@ -22,7 +22,8 @@ from hil.backends.ardupilot import (
 from hil.backends.thrust import ThrustParams
 from hil.fakes.mavlink import SERVO, FakeMavlink
 from hil.links.pymav import mav
-from visthrow.onboard.hover import GRAVITY, rot_from_quat
+from visthrow.common.rotations import matrix_of_quat
+from visthrow.onboard.hover import GRAVITY
 
 FULL_CLIMB = 2.5
 """Climb rate at full thrust where thrust is read as one: PILOT_SPEED_UP's default [m/s]."""
@@ -96,7 +97,7 @@ class FakeArduPilot(FakeMavlink):
         """The set-point as the parameters make it mean."""
         out = target.copy()
         now = self.plant.state
-        up = rot_from_quat(now["quat_wb"][None].astype(float))[0, 2, 2]
+        up = matrix_of_quat(now["quat_wb"][None].astype(float))[0, 2, 2]
         if not int(self.parameters["GUID_OPTIONS"]) & THRUST_AS_THRUST:
             climb = FULL_CLIMB * (2.0 * target[0] / self.plant.max_thrust - 1.0)
             out[0] = self.weight() * (1.0 + CLIMB_GAIN * (climb - now["vel_w"][2]) / GRAVITY)

@@ -19,8 +19,8 @@ from hil.links.device import MOST_CHUNKS, MOST_SHUT_OUT, Port
 from hil.links.pymav import Parser, mav
 from hil.links.roster import Address, Roster, Seen
 from hil.links.signing import Signed
-from hil.poses.frames import rotate
 from hil.poses.pose import Pose, Quaternion, Vector
+from visthrow.common.rotations import quat_of_euler, rotate_one
 
 LOCAL_FRAMES = (mav.MAV_FRAME_LOCAL_NED, mav.MAV_FRAME_LOCAL_FRD)
 BODY_FRAMES = (mav.MAV_FRAME_BODY_FRD, mav.MAV_FRAME_BODY_NED)
@@ -223,15 +223,8 @@ def quaternion_from_euler(roll: float, pitch: float, yaw: float) -> Quaternion:
     """Attitude wxyz of MAVLink's angles (yaw, then pitch, then roll) [rad]; NaN where one is not finite."""
     if not (math.isfinite(roll) and math.isfinite(pitch) and math.isfinite(yaw)):
         return NAN_QUATERNION
-    cr, sr = math.cos(roll / 2), math.sin(roll / 2)
-    cp, sp = math.cos(pitch / 2), math.sin(pitch / 2)
-    cy, sy = math.cos(yaw / 2), math.sin(yaw / 2)
-    return (
-        cr * cp * cy + sr * sp * sy,
-        sr * cp * cy - cr * sp * sy,
-        cr * sp * cy + sr * cp * sy,
-        cr * cp * sy - sr * sp * cy,
-    )
+    x, y, z, w = quat_of_euler(roll, pitch, yaw)
+    return (w, x, y, z)
 
 
 def pose_from_message(message: Any, body: str, arrival: float) -> Pose | None:
@@ -256,7 +249,7 @@ def pose_from_message(message: Any, body: str, arrival: float) -> Pose | None:
     quat = tuple(message.q)
     vel = _known((message.vx, message.vy, message.vz))
     if vel is not None and message.child_frame_id in BODY_FRAMES:
-        vel = rotate((*quat[1:], quat[0]), vel)
+        vel = rotate_one((*quat[1:], quat[0]), vel)
     elif message.child_frame_id not in LOCAL_FRAMES:
         vel = None
     rate = _known((message.rollspeed, message.pitchspeed, message.yawspeed))

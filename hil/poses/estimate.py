@@ -8,12 +8,11 @@ For slopes ``v = sum c_i p(t - a_i)`` of samples of age a_i the lag is ``-sum c_
 times that of a sample.
 """
 
-import math
 from collections import deque
 from dataclasses import dataclass
 
-from hil.poses.frames import conjugate, multiply
 from hil.poses.pose import Pose, Quaternion, Vector
+from visthrow.common.rotations import conjugate, multiply, rotation_vector
 
 MOST_GAP = 0.1
 """A gap longer than this empties the window: what lies before it says nothing of now [s]."""
@@ -157,9 +156,4 @@ def _turn(now: Quaternion, then: Quaternion | None) -> Vector:
     """Rotation vector from the attitude now to an earlier one, in the body frame of now [rad]."""
     if then is None:
         return (0.0, 0.0, 0.0)
-    x, y, z, w = multiply(conjugate(now), then)
-    if w < 0.0:
-        x, y, z, w = -x, -y, -z, -w
-    sine = math.sqrt(x * x + y * y + z * z)
-    scale = 2.0 * math.atan2(sine, w) / sine if sine > 1e-12 else 2.0
-    return (scale * x, scale * y, scale * z)
+    return rotation_vector(multiply(conjugate(now), then))

@@ -18,6 +18,7 @@ import numpy as np
 
 from hil.errors import FrameError
 from hil.poses.pose import Pose, Quaternion, Vector
+from visthrow.common.rotations import conjugate, cross_one, multiply, rotate_one
 from visthrow.logs.axes import turn_of
 
 
@@ -75,19 +76,19 @@ class Frames:
 
     def world_from_source(self, vector: Vector) -> Vector:
         """A vector of the source's world in ours."""
-        return rotate(self._world, vector)
+        return rotate_one(self._world, vector)
 
     def source_from_world(self, vector: Vector) -> Vector:
         """A vector of our world in the source's."""
-        return rotate(conjugate(self._world), vector)
+        return rotate_one(conjugate(self._world), vector)
 
     def body_from_source(self, vector: Vector) -> Vector:
         """A vector or rate of the source's body frame in ours."""
-        return rotate(self._body, vector)
+        return rotate_one(self._body, vector)
 
     def source_from_body(self, vector: Vector) -> Vector:
         """A vector or rate of our body frame in the source's."""
-        return rotate(conjugate(self._body), vector)
+        return rotate_one(conjugate(self._body), vector)
 
     def quat_from_source(self, quat: Quaternion) -> Quaternion:
         """An attitude as the source writes it, as ours (xyzw, body to world)."""
@@ -107,48 +108,22 @@ class Frames:
         vel = None if pose.vel is None else self.world_from_source(pose.vel)
         rate = None if pose.rate is None else self.body_from_source(pose.rate)
         if quat is not None and any(self._offset):
-            pos = _minus(pos, rotate(quat, self._offset))
+            pos = _minus(pos, rotate_one(quat, self._offset))
             if vel is not None and rate is not None:
-                vel = _minus(vel, rotate(quat, _cross(rate, self._offset)))
+                vel = _minus(vel, rotate_one(quat, cross_one(rate, self._offset)))
         return replace(pose, pos=pos, quat=quat, vel=vel, rate=rate)
 
     def source_from_pose(self, pose: Pose) -> Pose:
         """The inverse of :meth:`pose_from_source`: what the source would have said."""
         pos, vel = pose.pos, pose.vel
         if pose.quat is not None and any(self._offset):
-            pos = _plus(pos, rotate(pose.quat, self._offset))
+            pos = _plus(pos, rotate_one(pose.quat, self._offset))
             if vel is not None and pose.rate is not None:
-                vel = _plus(vel, rotate(pose.quat, _cross(pose.rate, self._offset)))
+                vel = _plus(vel, rotate_one(pose.quat, cross_one(pose.rate, self._offset)))
         quat = None if pose.quat is None else self.source_from_quat(pose.quat)
         rate = None if pose.rate is None else self.source_from_body(pose.rate)
         vel = None if vel is None else self.source_from_world(vel)
         return replace(pose, pos=self.source_from_world(pos), quat=quat, vel=vel, rate=rate)
-
-
-def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
-    """Hamilton product of quaternions xyzw: first b, then a."""
-    ax, ay, az, aw = a
-    bx, by, bz, bw = b
-    return (
-        aw * bx + ax * bw + ay * bz - az * by,
-        aw * by - ax * bz + ay * bw + az * bx,
-        aw * bz + ax * by - ay * bx + az * bw,
-        aw * bw - ax * bx - ay * by - az * bz,
-    )
-
-
-def conjugate(quat: Quaternion) -> Quaternion:
-    """The inverse turn of a unit quaternion xyzw."""
-    x, y, z, w = quat
-    return (-x, -y, -z, w)
-
-
-def rotate(quat: Quaternion, vector: Vector) -> Vector:
-    """Turn a vector by a unit quaternion xyzw: ``v + 2 q x (q x v + w v)``."""
-    x, y, z, w = quat
-    vx, vy, vz = vector
-    tx, ty, tz = y * vz - z * vy + w * vx, z * vx - x * vz + w * vy, x * vy - y * vx + w * vz
-    return (vx + 2.0 * (y * tz - z * ty), vy + 2.0 * (z * tx - x * tz), vz + 2.0 * (x * ty - y * tx))
 
 
 def _quaternion(matrix: np.ndarray) -> Quaternion:
@@ -176,7 +151,3 @@ def _plus(a: Vector, b: Vector) -> Vector:
 
 def _minus(a: Vector, b: Vector) -> Vector:
     return (a[0] - b[0], a[1] - b[1], a[2] - b[2])
-
-
-def _cross(a: Vector, b: Vector) -> Vector:
-    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])

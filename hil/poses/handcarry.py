@@ -14,9 +14,10 @@ import numpy as np
 
 from hil.errors import RunError
 from hil.links.clock import Clock
-from hil.poses.frames import FrameParams, Frames, conjugate, multiply, rotation_of
+from hil.poses.frames import FrameParams, Frames, rotation_of
 from hil.poses.pose import VEHICLE, Pose
 from hil.sources.base import Source
+from visthrow.common.rotations import conjugate, multiply, rotation_vector, tilt_and_heading
 from visthrow.logs.axes import TURNS
 
 SPEED, RATE = 0.06, 0.25
@@ -69,7 +70,8 @@ class Step:
     def turn(self, order: str) -> tuple[np.ndarray, np.ndarray]:
         """Rotation vectors [rad] of the change of attitude in the source's world and body, quaternions in a given order."""
         first, second = (_xyzw(pose.quat, order) for pose in (self.before, self.after))
-        return _vector(multiply(second, conjugate(first))), _vector(multiply(conjugate(first), second))
+        turns = multiply(second, conjugate(first)), multiply(conjugate(first), second)
+        return tuple(np.array(rotation_vector(turn)) for turn in turns)
 
 
 @dataclass(frozen=True)
@@ -196,7 +198,7 @@ def _line(move: Move, step: Step, frames: FrameParams) -> Line:
     if move.turn:
         quats = (ours.quat_from_source(pose.quat) for pose in (step.before, step.after))
         first, second = quats
-        went, size = _vector(multiply(conjugate(first), second)), "rad about"
+        went, size = np.array(rotation_vector(multiply(conjugate(first), second))), "rad about"
     else:
         went, size = np.array(ours.world_from_source(tuple(step.way))), "m along"
     length = float(np.linalg.norm(went))
@@ -208,9 +210,7 @@ def _line(move: Move, step: Step, frames: FrameParams) -> Line:
 
 def _start(pose: Pose, frames: FrameParams) -> Line:
     """The attitude at first, which is to be level with the nose along our x."""
-    x, y, z, w = Frames(frames).quat_from_source(pose.quat)
-    tilt = math.acos(max(-1.0, min(1.0, 1.0 - 2.0 * (x * x + y * y))))
-    heading = math.atan2(2.0 * (x * y + w * z), 1.0 - 2.0 * (y * y + z * z))
+    tilt, heading = tilt_and_heading(Frames(frames).quat_from_source(pose.quat))
     return Line(
         f"at first: tilted by {math.degrees(tilt):.0f} deg, nose {math.degrees(heading):+.0f} deg from our x (if the moves pass "
         "and this does not, define the rigid body anew, level and with its nose along x)",
@@ -259,10 +259,3 @@ def story(finding: Finding, frames: FrameParams) -> str:
 
 def _xyzw(quat: tuple[float, ...], order: str) -> tuple[float, ...]:
     return quat if order == "xyzw" else (*quat[1:], quat[0])
-
-
-def _vector(quat: tuple[float, ...]) -> np.ndarray:
-    """Rotation vector of a unit quaternion xyzw, below half a turn [rad]."""
-    *axis, w = quat if quat[3] >= 0.0 else tuple(-x for x in quat)
-    sine = math.hypot(*axis)
-    return np.array(axis) * (2.0 * math.atan2(sine, w) / sine if sine > 1e-12 else 2.0)

@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass
 
-Vector = tuple[float, float, float]
-Quaternion = tuple[float, float, float, float]
+from visthrow.common.rotations import Quaternion as Quaternion
+from visthrow.common.rotations import Vector as Vector
 
 VEHICLE, PAYLOAD, GOAL = "vehicle", "payload", "goal"
 BODIES = (VEHICLE, PAYLOAD, GOAL)

@@ -5,9 +5,10 @@ from collections import deque
 from dataclasses import dataclass, replace
 
 from hil.poses.estimate import EstimateParams, SlopeFilter, slope_weights
-from hil.poses.frames import FrameParams, Frames, multiply
+from hil.poses.frames import FrameParams, Frames
 from hil.poses.gate import Gate, GateParams, Tether
 from hil.poses.pose import Pose, Quaternion, Vector
+from visthrow.common.rotations import multiply
 
 MOST_PREDICTION = 0.1
 """Poses are carried forward by no more than this [s]; older ones are the timers' affair."""

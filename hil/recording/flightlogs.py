@@ -21,8 +21,8 @@ from hil.poses.pose import GOAL, PAYLOAD, VEHICLE, Pose
 from hil.recording.playback import Playback, Sample
 from hil.recording.record import PROVENANCE, load_run
 from visthrow import config
+from visthrow.common.rotations import matrix_of_quat
 from visthrow.logs.flightlog import FlightLog, FlightRecorder
-from visthrow.onboard.hover import rot_from_quat
 
 LEAD, AFTER = 2.0, 0.5
 """A throw's log begins this long before it and ends this long after its recovery [s]."""
@@ -175,7 +175,7 @@ class Samples:
             self.recorder.add(time, payload_pos_w=pose.pos, payload_vel_w=sample.vel_w)
             vehicle = self._vehicle
             if attached and vehicle is not None and vehicle.quat is not None:
-                mount = rot_from_quat(np.array([vehicle.quat]))[0] @ np.array(self.runner.mount_b)
+                mount = matrix_of_quat(np.array([vehicle.quat]))[0] @ np.array(self.runner.mount_b)
                 self.recorder.add(time, cable_points_w=np.stack([vehicle.pos + mount, pose.pos]))
         elif sample.body == VEHICLE:
             self._vehicle = pose

@@ -20,7 +20,7 @@ from visthrow.baseline.pendulum import Pendulum
 from visthrow.baseline.plan import Plan
 from visthrow.baseline.release import landing_point
 from visthrow.common.errors import ConfigError, suggest
-from visthrow.onboard.hover import rot_from_quat
+from visthrow.common.rotations import matrix_of_quat
 from visthrow.task import Experiment
 from visthrow.throws.flight import FALL_TIME, Decision, Flight, Pilots, Scores, Smoothness, hover, throw
 from visthrow.throws.plants import HybridPlant, Plant, Snapshot
@@ -144,7 +144,7 @@ def fly_pendulum(
 
 def pendulum_state(snapshot: Snapshot, mount_b: np.ndarray) -> np.ndarray:
     """State of the pendulum as a plant shows it, cable straight from mount to payload, shape (E, 16)."""
-    rot = rot_from_quat(snapshot.quat_wb)
+    rot = matrix_of_quat(snapshot.quat_wb)
     arm = rot @ mount_b
     cable = snapshot.payload_pos_w - snapshot.pos_w - arm
     length = np.linalg.norm(cable, axis=1, keepdims=True)

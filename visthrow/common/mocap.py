@@ -4,6 +4,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from visthrow.common.rotations import turned
+
 
 def measured(truth: Mapping[str, np.ndarray], noise: Mapping[str, float], rng: np.random.Generator) -> dict[str, np.ndarray]:
     """Add noise to poses.
@@ -19,10 +21,3 @@ def measured(truth: Mapping[str, np.ndarray], noise: Mapping[str, float], rng: n
         error = noise[name] * rng.standard_normal((len(values), 3))
         found[name] = turned(values, error) if name == "quat_wb" else values + error
     return found
-
-
-def turned(quat: np.ndarray, angle: np.ndarray) -> np.ndarray:
-    """Quaternions xyzw, shape (N, 4), turned about body axes by small angles [rad], shape (N, 3)."""
-    x, w, half = quat[:, :3], quat[:, 3:], 0.5 * angle
-    found = np.hstack((x + w * half + np.cross(x, half), w - np.sum(x * half, axis=1, keepdims=True)))
-    return found / np.linalg.norm(found, axis=1, keepdims=True)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from visthrow.common.constants import GRAVITY
+from visthrow.common.rotations import matrix_of_quat
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,7 @@ class HoverController:
             Collective thrust along body z [N] and body rates [rad/s], shape (E, 4).
         """
         params = self.params
-        rot_wb = rot_from_quat(np.asarray(quat_wb, dtype=float))
+        rot_wb = matrix_of_quat(np.asarray(quat_wb, dtype=float))
         thrust_w = self._acceleration(pos_w, vel_w, goal_w)
         thrust_w[:, 2] += GRAVITY
         thrust_w = _tilt_limited(thrust_w, params.max_tilt)
@@ -121,24 +122,6 @@ class HoverController:
         acceleration_w = params.velocity_gain * (asked_w - vel_w) + self._integral_w
         acceleration_w[:, 2] = np.clip(acceleration_w[:, 2], -params.max_acceleration, params.max_acceleration)
         return acceleration_w
-
-
-def rot_from_quat(quat_wb: np.ndarray) -> np.ndarray:
-    """Return the rotation matrices of unit quaternions.
-
-    Args:
-        quat_wb: xyzw, shape (E, 4); normalised here.
-
-    Returns:
-        ``rot_wb``, shape (E, 3, 3).
-    """
-    x, y, z, w = np.moveaxis(quat_wb / np.linalg.norm(quat_wb, axis=1, keepdims=True), 1, 0)
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
-        (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
-        (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
-    )
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def _tilt_limited(thrust_w: np.ndarray, max_tilt: float) -> np.ndarray:

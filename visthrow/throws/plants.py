@@ -10,6 +10,7 @@ import numpy as np
 from sim.params import RandomizationParams
 from visthrow import config
 from visthrow.common.errors import ConfigError, suggest
+from visthrow.common.rotations import turned
 from visthrow.task import Experiment, NoiseParams, plant_of
 from visthrow.throws.ballistics import flown
 from visthrow.throws.loose_rope import LooseRope
@@ -263,10 +264,9 @@ class HybridPlant:
         if self.noise is None:
             return now
         error = self._error
-        quat = now.quat_wb + 0.5 * _quat_times_vector(now.quat_wb, error[4])
         return replace(
             now, pos_w=now.pos_w + error[0], vel_w=now.vel_w + error[1], rate_b=now.rate_b + error[2],
-            payload_pos_w=now.payload_pos_w + error[3], quat_wb=quat / np.linalg.norm(quat, axis=1, keepdims=True),
+            payload_pos_w=now.payload_pos_w + error[3], quat_wb=turned(now.quat_wb, error[4]),
         )  # fmt: skip
 
     @property
@@ -364,12 +364,6 @@ def _late(states: Sequence[Snapshot], age: np.ndarray) -> Snapshot:
         late[name] = newer + share * (older - newer)
     late["quat_wb"] /= np.linalg.norm(late["quat_wb"], axis=1, keepdims=True)
     return replace(now, **late)
-
-
-def _quat_times_vector(quat: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """Product of quaternions xyzw, shape (E, 4), and pure quaternions of vectors, shape (E, 3)."""
-    imaginary = quat[:, 3:] * vector + np.cross(quat[:, :3], vector)
-    return np.column_stack((imaginary, -np.sum(quat[:, :3] * vector, axis=1)))
 
 
 def random_ropes(rng: np.random.Generator, count: int, segments: int, angle: float) -> np.ndarray:

@@ -8,6 +8,7 @@ import dataclasses
 import numpy as np
 
 from visthrow.common.constants import GRAVITY
+from visthrow.common.rotations import rotate_back
 from visthrow.task import Experiment, plant_of
 from visthrow.throws.loading import load_policy
 from visthrow.throws.plants import HybridPlant, random_ropes
@@ -157,19 +158,12 @@ class MotorPlant(WirePlant):
         self._look()
         if self._stand is None:
             push_w = (self._now["vel_w"] - vel_w) / self.period + np.array([0.0, 0.0, GRAVITY])
-            self.force_b = turned_back(self.quat_wb, push_w)
+            self.force_b = rotate_back(self.quat_wb, push_w)
         elif self._k_f * np.sum(self._now["motor_speed"] ** 2) < self.mass[0] * GRAVITY:
             self._plant.hold(self._stand)
             self._look()
         else:
             self._stand = None
-
-
-def turned_back(quat: np.ndarray, vector_w: np.ndarray) -> np.ndarray:
-    """A vector of the world frame in the frame of an attitude xyzw."""
-    axis, w = quat[:3], quat[3]
-    twice = 2.0 * np.cross(axis, vector_w)
-    return vector_w - w * twice + np.cross(axis, twice)
 
 
 def make_motors(policy: str, seed: int) -> MotorPlant:

@@ -11,9 +11,9 @@ from camera.keypoints import GOAL_KEYPOINTS, KeypointCamera, keypoints
 from camera.params import CameraParams
 from visthrow.common import style
 from visthrow.common.errors import LogError
+from visthrow.common.rotations import matrix_of_quat
 from visthrow.common.storage import atomic_write
 from visthrow.logs.flightlog import FlightLog
-from visthrow.onboard.hover import rot_from_quat
 from visthrow.view.parts import png_of
 
 MARGIN = 0.35  # about what is seen [m]
@@ -186,7 +186,7 @@ def _side_view(axis, log: FlightLog, time: float, side: tuple[float, float, floa
 def _vehicle(axis, log: FlightLog, time: float, alpha: float) -> None:
     """Arms and rotor discs as seen along y."""
     pos = _at(log, "pos_w", time)
-    rot = rot_from_quat(_at(log, "quat_wb", time)[None])[0]
+    rot = matrix_of_quat(_at(log, "quat_wb", time)[None])[0]
     reach = ARM / np.sqrt(2.0)
     for sx in (1.0, -1.0):
         hub = pos + rot @ np.array([sx * reach, 0.0, BLADE_HEIGHT])
@@ -205,7 +205,7 @@ def _camera_view(axis, log: FlightLog, camera: KeypointCamera, time: float, firs
     def one(name: str) -> torch.Tensor:
         return torch.tensor(_at(log, name, time)[None], dtype=torch.float32)
 
-    rot = torch.tensor(rot_from_quat(one("quat_wb").numpy().astype(float)), dtype=torch.float32)
+    rot = torch.tensor(matrix_of_quat(one("quat_wb").numpy().astype(float)), dtype=torch.float32)
     goal = torch.tensor([log.meta["goal_w"]], dtype=torch.float32)
     points, valid = keypoints(camera, one("pos_w"), rot, goal, one("payload_pos_w"))
     picture = draw_overlay(camera, points[0], valid[0])[:, :, ::-1]

@@ -7,11 +7,12 @@ import pytest
 
 from hil.errors import RunError
 from hil.links.clock import ManualClock
-from hil.poses.frames import FrameParams, Frames, multiply
+from hil.poses.frames import FrameParams, Frames
 from hil.poses.handcarry import MOVES, Step, collect, find_steps, judge, story
 from hil.poses.pose import Pose
 from hil.sources import Recorded
 from visthrow.cli import main
+from visthrow.common.rotations import multiply
 from visthrow.logs.axes import TURNS as AXES
 
 OURS = FrameParams("x,y,z", "x,y,z", "xyzw", 0.0, (0.0, 0.0, 0.0))

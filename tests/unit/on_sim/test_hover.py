@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from sim import params
-from visthrow.onboard.hover import GRAVITY, HoverController, HoverParams, rot_from_quat
+from visthrow.common.rotations import matrix_of_quat
+from visthrow.onboard.hover import GRAVITY, HoverController, HoverParams
 
 VEHICLE, PAYLOAD, LENGTH = 0.214, 0.058, 0.38
 """Vehicle with the rope [kg], ball [kg], mount to the ball's centre [m]: the paper's."""
@@ -57,7 +58,7 @@ class Pendulum:
             self.thrust += self.step / MOTOR_LAG * (self.active[:, 0] - self.thrust)
             self.rate_b += self.step / RATE_LAG * (self.active[:, 1:] - self.rate_b)
             self.quat_wb = turned(self.quat_wb, self.rate_b * self.step)
-            force_w = self.thrust[:, None] * rot_from_quat(self.quat_wb)[:, :, 2]
+            force_w = self.thrust[:, None] * matrix_of_quat(self.quat_wb)[:, :, 2]
             self.vel_w += self.step * self._acceleration(force_w)
             self.pos_w += self.step * self.vel_w
 
@@ -162,7 +163,7 @@ def test_hover_without_the_payload_and_yaw_turns():
     plant = Pendulum(GOAL + [[0.4, -0.3, 0.0]], payload=0.0)
     times, distances, _, _ = fly(plant, 6.0, yaw=2.0)
     assert settled(times, distances[:, 0], 0.03) < 3.5
-    rot_wb = rot_from_quat(plant.quat_wb)[0]
+    rot_wb = matrix_of_quat(plant.quat_wb)[0]
     assert np.arctan2(rot_wb[1, 0], rot_wb[0, 0]) == pytest.approx(2.0, abs=0.02)
 
 

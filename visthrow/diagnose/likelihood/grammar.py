@@ -21,6 +21,8 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from sim.effects.laws import LOWEST, SLOWEST
+from visthrow.common import rotations
+from visthrow.common.rotations import cross
 from visthrow.diagnose.models.interface import LATENT_BLOCKS, Window
 
 Unit = tuple[int, int, int]
@@ -102,25 +104,14 @@ class Term:
         return table_of([self], knots)[:, :, 0]
 
 
-def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Cross product over the last axis, of shapes that broadcast."""
-    out = np.empty(np.broadcast_shapes(a.shape, b.shape))
-    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        out[..., i] = a[..., j] * b[..., k] - a[..., k] * b[..., j]
-    return out
-
-
 def rotate(knots: Knots, vector_b: np.ndarray) -> np.ndarray:
     """Body to world at the knots, shape (k, 3)."""
-    q = np.asarray(knots["quat_wb"], dtype=float)
-    axis, w = q[:, :3], q[:, 3:]
-    twice = 2.0 * cross(axis, vector_b)
-    return vector_b + w * twice + cross(axis, twice)
+    return rotations.rotate(np.asarray(knots["quat_wb"], dtype=float), vector_b)
 
 
 def rotate_back(knots: Knots, vector_w: np.ndarray) -> np.ndarray:
     """World to body at the knots, shape (k, 3)."""
-    return rotate({"quat_wb": np.asarray(knots["quat_wb"]) * [-1.0, -1.0, -1.0, 1.0]}, vector_w)
+    return rotations.rotate_back(np.asarray(knots["quat_wb"], dtype=float), vector_w)
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:

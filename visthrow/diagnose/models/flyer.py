@@ -8,10 +8,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from visthrow.common.rotations import cross
 from visthrow.diagnose.models.flyer_effects import effects_of
 from visthrow.diagnose.models.flyer_params import FlyerParams
 from visthrow.diagnose.models.flyer_windows import FINE, stretches_of
-from visthrow.diagnose.models.numeric import Lanes, NumericModel, Stretch, cross, hermite, integrate, latent_force
+from visthrow.diagnose.models.numeric import Lanes, NumericModel, Stretch, hermite, integrate, latent_force
 from visthrow.logs.flightlog import FlightLog
 
 

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sim.reference.rotations import rotation_from_quat
 from visthrow.common.errors import LogError
+from visthrow.common.rotations import matrix_of_quat
 from visthrow.diagnose.models.flyer_params import FlyerParams
 from visthrow.diagnose.models.numeric import Stretch, latent_layout, sigma_of
 from visthrow.logs.flightlog import Channel, FlightLog
@@ -130,7 +130,7 @@ def _attitudes(channel: Channel, times: np.ndarray) -> np.ndarray:
     time, quat = time[near], quat[near]
     signs = np.sign(np.sum(quat[1:] * quat[:-1], axis=1))
     quat = quat * np.cumprod(np.concatenate([[1.0], np.where(signs == 0.0, 1.0, signs)]))[:, None]
-    return rotation_from_quat(np.column_stack([np.interp(times, time, column) for column in quat.T]))
+    return matrix_of_quat(np.column_stack([np.interp(times, time, column) for column in quat.T]))
 
 
 def _line(time: np.ndarray, values: np.ndarray, start: float) -> tuple[np.ndarray, np.ndarray]:

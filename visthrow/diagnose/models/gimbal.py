@@ -9,10 +9,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sim.reference.rotations import rotation_from_quat
 from visthrow.common.errors import LogError
+from visthrow.common.rotations import cross, matrix_of_quat
 from visthrow.diagnose.models.interface import Effect
-from visthrow.diagnose.models.numeric import Lanes, NumericModel, Stretch, cross, latent_layout, triangles
+from visthrow.diagnose.models.numeric import Lanes, NumericModel, Stretch, latent_layout, triangles
 from visthrow.logs.flightlog import FlightLog
 
 CHANNEL = "marker_pos_c"
@@ -127,7 +127,7 @@ def _tables(log: FlightLog, params: GimbalParams) -> tuple[np.ndarray, dict[str,
     time = vehicle.time[good]
     pos = np.column_stack([np.interp(time, payload.time[payload.valid], c) for c in payload.values[payload.valid].T])
     gap = pos + np.array([0.0, 0.0, params.marker_z]) - vehicle.values[good]
-    rot = rotation_from_quat(attitude.values[good])
+    rot = matrix_of_quat(attitude.values[good])
     angles = log["gimbal"].values[good] if "gimbal" in log else np.zeros((len(time), 2))
     gimbal = Rotation.from_euler("XY", angles).as_matrix()
     if params.stabilised:

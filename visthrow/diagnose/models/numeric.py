@@ -299,13 +299,6 @@ def hermite(time: np.ndarray, start: float, step: float, value: np.ndarray, rate
     return out + step * (s * (1 - s) ** 2 * da + s**2 * (s - 1) * db)
 
 
-def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Cross product over the last axis, in the way that is fast for many short vectors."""
-    from sim.reference.rotations import cross as fast
-
-    return fast(a, b)
-
-
 def triangles(time: np.ndarray, knots: np.ndarray) -> np.ndarray:
     """Weights of the knots at each time: linear between neighbours, shape (T, knots)."""
     return np.column_stack([np.interp(time, knots, row) for row in np.eye(len(knots))])

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from sim.effects.setting import Setting
 from sim.params import GRAVITY, PlantParams
 from sim.replay.kernel import ATTACHED, LOOSE, STATE_FIELDS
+from visthrow.common.rotations import cross
 from visthrow.diagnose.throw.cutting import Cut
 from visthrow.diagnose.throw.recorded import Recorded, Samples
 
@@ -202,7 +203,7 @@ def measured_state(flight: Recorded, at: float, setting: Setting, payload: int, 
     off = np.array(x.marker_offset) - np.array(plant.vehicle.body.com)
     pos, vel = level.apply([pos, vel]) / (1.0 + x.scale)
     out["pos_w"][0], out["quat_wb"][0] = pos - attitude.apply(off), attitude.as_quat()
-    out["vel_w"][0], out["rate_b"][0] = vel - attitude.apply(_cross(rate, off)), rate
+    out["vel_w"][0], out["rate_b"][0] = vel - attitude.apply(cross(rate, off)), rate
     if payload in (ATTACHED, LOOSE) and flight.payload is not None:
         seen = smoothed(flight.payload, at + x.payload_delay)
         if seen is not None:
@@ -218,7 +219,7 @@ def _hang(state: States, plant: PlantParams, attitude: Rotation, point: np.ndarr
     """Turn the rope, in the shape that it has, so that it reaches from the mount to the payload and follows both."""
     arm = np.array(plant.rope.mount) - np.array(plant.vehicle.body.com)
     mount = state["pos_w"][0] + attitude.apply(arm)
-    mount_vel = state["vel_w"][0] + attitude.apply(_cross(state["rate_b"][0], arm))
+    mount_vel = state["vel_w"][0] + attitude.apply(cross(state["rate_b"][0], arm))
     reach = point - mount
     distance = max(float(np.linalg.norm(reach)), 1e-3)
     n, u = state["cable_dir_w"][0], state["cable_vel_w"][0]
@@ -226,18 +227,13 @@ def _hang(state: States, plant: PlantParams, attitude: Rotation, point: np.ndarr
     link[-1] += plant.rope.payload_offset
     chord = np.sum(link * n, axis=0)
     chord /= np.linalg.norm(chord)
-    axis = _cross(chord, reach / distance)
+    axis = cross(chord, reach / distance)
     sine, cosine = float(np.linalg.norm(axis)), float(chord @ reach / distance)
     turn = Rotation.from_rotvec(axis * (np.arctan2(sine, cosine) / sine if sine > 1e-12 else 0.0))
     n, u = turn.apply(n), turn.apply(u)
     lacking = speed - mount_vel - np.sum(link * u, axis=0)
-    spin = _cross(reach, lacking) / distance**2
+    spin = cross(reach, lacking) / distance**2
     state["cable_dir_w"][0], state["cable_vel_w"][0] = n, u + np.cross(spin, n)
-
-
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Of two vectors; numpy's, which is for many, takes twenty times as long."""
-    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 
 def hover_state(flight: Recorded, plant: PlantParams, payload: int) -> States:
