@@ -99,6 +99,7 @@ def test_what_is_no_run(run_folder, tmp_path, capsys):
     ("words", "expected"),
     [
         ("run --seconds 0", "expected a number above 0"), ("check --seconds nan", "expected a number above 0"),
+        ("fake --after -3", "expected a number above 0"), ("fake --seed -1", "expected a whole number of 0 or more"),
     ],
 )  # fmt: skip
 def test_numbers_out_of_range_on_the_command_line(words, expected, capsys):
