@@ -4,53 +4,22 @@ Integration: classical RK4 over bodies, rope and block states together; MuJoCo g
 Command switches, the separation and the instants of motion-capture samples fall on step edges exactly.
 """
 
-from dataclasses import MISSING, dataclass, fields, replace
+from dataclasses import MISSING, fields, replace
 
 import numpy as np
 
 from sim.params import GRAVITY, PlantParams
 from sim.reference import blocks, payload
 from sim.reference.extras import ReferenceExtras
-from sim.reference.flight import crossing, segments_of_period
 from sim.reference.model import RopeModel
 from sim.reference.quadrotor import BLOCKS, BODY, VehicleErrors, initial_blocks, rigid_body_rates, vehicle_rates
 from sim.reference.rope import RopeDynamics
 from sim.reference.rotations import cross, quat_dot, rotation_from_quat, turned, turned_back
-from sim.reference.stepping import halving_rk4
+from sim.reference.state import Landings, Snapshot
+from sim.reference.stepping import crossing, halving_rk4, segments_of_period
 
 LARGEST_DECAY = 2.2
 """Decay rate times step that the plant allows itself [-]; RK4 is stable to 2.78 on the real axis."""
-
-
-@dataclass(frozen=True)
-class PlantState:
-    """State of E plants; world frame, quaternions xyzw.
-
-    Positions are of the frame's origin, not of a shifted centre of mass.
-    """
-
-    time: float  # [s]
-    pos_w: np.ndarray  # [m], shape (E, 3)
-    quat_wb: np.ndarray  # shape (E, 4)
-    vel_w: np.ndarray  # [m/s], shape (E, 3)
-    rate_b: np.ndarray  # [rad/s], shape (E, 3)
-    payload_pos_w: np.ndarray  # its centre [m], shape (E, 3); where it landed after landing
-    payload_vel_w: np.ndarray  # [m/s], shape (E, 3)
-    cable_points_w: np.ndarray  # upper end, joints, lower end of the rope [m], shape (E, L+1, 3)
-    motor_speed: np.ndarray  # [rad/s], shape (E, 4)
-    battery_voltage: np.ndarray  # [V], shape (E,)
-    attached: np.ndarray  # rope on the vehicle, shape (E,), bool
-    latched: np.ndarray  # release requested, shape (E,), bool
-
-
-@dataclass(frozen=True)
-class Landing:
-    """Where and when the payloads came down; NaN where they did not yet."""
-
-    landed: np.ndarray  # shape (E,), bool
-    point_w: np.ndarray  # of the payload's centre [m], shape (E, 3)
-    time: np.ndarray  # [s], shape (E,)
-    separation_time: np.ndarray  # [s], shape (E,)
 
 
 KNOWN_EXTENSIONS = {
@@ -392,13 +361,13 @@ class ReferencePlant:
             del self._samples[0]
 
     @property
-    def state(self) -> PlantState:
+    def state(self) -> Snapshot:
         """The true state now."""
         state = self._state
         rotation = rotation_from_quat(state[:, 3:7])
         offset = self._errors.com_offset
         points, ball, ball_vel = self._ropes.points(*self._upper_end(state), self._rope_of(state))
-        return PlantState(
+        return Snapshot(
             time=self.time,
             pos_w=state[:, 0:3] - turned(rotation, offset),
             quat_wb=state[:, 3:7].copy(),
@@ -414,12 +383,12 @@ class ReferencePlant:
         )
 
     @property
-    def landing(self) -> Landing:
+    def landing(self) -> Landings:
         """Where and when the payloads came down."""
         separated = np.where(self._attached, np.nan, self._separation)
-        return Landing(self._landed.copy(), self._landing_point.copy(), self._landing_time.copy(), separated)
+        return Landings(self._landed.copy(), self._landing_point.copy(), self._landing_time.copy(), separated)
 
-    def measured(self) -> PlantState:
+    def measured(self) -> Snapshot:
         """Return the state as motion capture and gyro give it: late by the latency, with noise drawn anew at each call.
 
         ``time`` is when the sample was taken. ``cable_points_w`` and the flags are not measured: points come without

@@ -2,12 +2,14 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
 
 from sim.params import RandomizationParams
+from sim.reference.state import Landings as Landings
+from sim.reference.state import Snapshot as Snapshot
 from visthrow import config
 from visthrow.common.errors import ConfigError, suggest
 from visthrow.common.rotations import turned
@@ -25,34 +27,6 @@ PLANTS = {
 
 BODIES = ("pos_w", "quat_wb", "vel_w", "rate_b", "cable_dir_w", "cable_vel_w")
 """State arrays of bodies and ropes."""
-
-
-@dataclass(frozen=True)
-class Snapshot:
-    """State of E plants at one time; world frame, quaternions xyzw."""
-
-    time: float  # [s]
-    pos_w: np.ndarray  # [m], shape (E, 3)
-    quat_wb: np.ndarray  # shape (E, 4)
-    vel_w: np.ndarray  # [m/s], shape (E, 3)
-    rate_b: np.ndarray  # [rad/s], shape (E, 3)
-    payload_pos_w: np.ndarray  # its centre [m], shape (E, 3)
-    payload_vel_w: np.ndarray  # [m/s], shape (E, 3)
-    cable_points_w: np.ndarray  # joints of the rope, mount end first [m], shape (E, L + 1, 3)
-    motor_speed: np.ndarray  # [rad/s], shape (E, 4)
-    battery_voltage: np.ndarray  # [V], shape (E,)
-    attached: np.ndarray  # shape (E,), bool
-    latched: np.ndarray  # shape (E,), bool
-
-
-@dataclass(frozen=True)
-class Landings:
-    """Where and when the payloads came down, on the plant's clock; NaN where they did not yet."""
-
-    landed: np.ndarray  # shape (E,), bool
-    point_w: np.ndarray  # of the payload's centre [m], shape (E, 3)
-    time: np.ndarray  # [s], shape (E,)
-    separation_time: np.ndarray  # [s], shape (E,)
 
 
 class Plant(Protocol):
@@ -319,11 +293,11 @@ class ReferenceAdapter:
     @property
     def state(self) -> Snapshot:
         """See `Plant`."""
-        return Snapshot(**vars(self._plant.state))
+        return self._plant.state
 
     def measured(self) -> Snapshot:
         """See `Plant`."""
-        self._sample = Snapshot(**vars(self._plant.measured()))
+        self._sample = self._plant.measured()
         return self._sample
 
     @property
@@ -334,8 +308,7 @@ class ReferenceAdapter:
     @property
     def landing(self) -> Landings:
         """See `Plant`."""
-        now = self._plant.landing
-        return Landings(now.landed, now.point_w, now.time, now.separation_time)
+        return self._plant.landing
 
 
 def make_plant(name: str, experiment: Experiment, count: int = 1, seed: int = 0, device: str = "cpu") -> Plant:

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from visthrow.common.rotations import cross
 from visthrow.diagnose.models.interface import Effect
 from visthrow.diagnose.models.numeric import (
     Lanes,
     NumericModel,
     Stretch,
-    cross,
     hermite,
     integrate,
     latent_force,

@@ -1,0 +1,36 @@
+"""What any plant says of its vehicles: their state at one time, and where their payloads came down."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """State of E plants at one time; world frame, quaternions xyzw.
+
+    Positions are of the frame's origin, not of a shifted centre of mass.
+    """
+
+    time: float  # [s]
+    pos_w: np.ndarray  # [m], shape (E, 3)
+    quat_wb: np.ndarray  # shape (E, 4)
+    vel_w: np.ndarray  # [m/s], shape (E, 3)
+    rate_b: np.ndarray  # [rad/s], shape (E, 3)
+    payload_pos_w: np.ndarray  # its centre [m], shape (E, 3); where it landed after landing
+    payload_vel_w: np.ndarray  # [m/s], shape (E, 3)
+    cable_points_w: np.ndarray  # joints of the rope, mount end first [m], shape (E, L + 1, 3)
+    motor_speed: np.ndarray  # [rad/s], shape (E, 4)
+    battery_voltage: np.ndarray  # [V], shape (E,)
+    attached: np.ndarray  # shape (E,), bool
+    latched: np.ndarray  # shape (E,), bool
+
+
+@dataclass(frozen=True)
+class Landings:
+    """Where and when the payloads came down, on the plant's clock; NaN where they did not yet."""
+
+    landed: np.ndarray  # shape (E,), bool
+    point_w: np.ndarray  # of the payload's centre [m], shape (E, 3)
+    time: np.ndarray  # [s], shape (E,)
+    separation_time: np.ndarray  # [s], shape (E,)
