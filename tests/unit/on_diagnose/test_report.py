@@ -357,15 +357,14 @@ def test_a_manoeuvre_in_which_the_payload_swings_too_far_is_not_proposed(monkeyp
 
 def test_the_report_holds_sentences_pictures_and_numbers(tmp_path, found, measured, hidden, degenerate):
     _, diagnosis = found
-    proposals = [plan.Proposal("circle", "drag", 10.0, 7.0, (("a", "b"),), 1, "z 1..2 m", "circle.csv")]
-    made = report.sections(diagnosis, measured, hidden, proposals, step_check={"pos_w": 0.03}, about={"logs": 7})
+    made = report.sections(diagnosis, measured, hidden, step_check={"pos_w": 0.03}, about={"logs": 7})
     paths = report.write(tmp_path, made, diagnosis, "A report")
     page = paths[0].read_text(encoding="utf-8")
     for text in ("KNOWN", "effect_03", "cause 4", "Held-out prediction error", "noise alone", "circle", "finer steps"):
         assert text in page
     assert page.count("data:image/png;base64") >= 6
     assert "http" not in page.replace("http-equiv", "")  # self-contained
-    write_json(tmp_path / "d.json", report.to_json(diagnosis, measured, hidden, proposals))
+    write_json(tmp_path / "d.json", report.to_json(diagnosis, measured, hidden))
     data = json.loads((tmp_path / "d.json").read_text(encoding="utf-8"))
     assert {f["verdict"] for f in data["findings"]} <= set(result.VERDICTS)
     assert set(data["theta"]) == set(TRUTH)

@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -16,8 +16,6 @@ from visthrow.diagnose.select import result
 from visthrow.diagnose.select.result import ChannelGain, Diagnosis, Finding
 from visthrow.view.parts import Grid, Picture, Section, Text
 
-if TYPE_CHECKING:
-    from visthrow.diagnose.planning.plan import Proposal
 
 def sentence_of(diagnosis: Diagnosis) -> str:
     """The overall verdict in a sentence."""
@@ -28,14 +26,7 @@ def sentence_of(diagnosis: Diagnosis) -> str:
 def summary(diagnosis: Diagnosis, gain: Gain | None = None) -> str:
     """What the command line prints."""
     lines = [sentence_of(diagnosis), *(f"  {reason}" for reason in diagnosis.reasons), ""]
-    for f in diagnosis.findings:
-        if f.verdict in result.NAMED:
-            lines.append(f"{f.verdict:6} {f.sentence}{_moves(f, gain)}")
-    lines += [f"OR     {line}" for line in instead(diagnosis)]
-    lines += [f"FOUND  {m.sentence}" for m in diagnosis.mistakes]
-    lines += [f"VARIES {s.sentence}" for s in diagnosis.scatter if s.found]
-    lines += [f"EVENT  {_event(diagnosis, flight)}" for flight in diagnosis.events]
-    lines += [f"COPY   flight {flight} repeats flight {of} and was left out" for flight, of in diagnosis.duplicates.items()]
+    lines += [f"{word:6} {text}" for word, text in _statements(diagnosis, gain)]
     counted = {v: sum(f.verdict == v for f in diagnosis.findings) for v in result.VERDICTS}
     lines.append(", ".join(f"{count} {verdict.lower()}" for verdict, count in counted.items() if count))
     told = gain or diagnosis.held_out
@@ -45,6 +36,16 @@ def summary(diagnosis: Diagnosis, gain: Gain | None = None) -> str:
         lines.append(landing_sentence(gain.landing))
     lines.append(f"{diagnosis.windows} windows of {diagnosis.flights} flights, {diagnosis.seconds:.1f} s")
     return "\n".join(lines)
+
+
+def _statements(diagnosis: Diagnosis, gain: Gain | None) -> list[tuple[str, str]]:
+    """What was found, each with the word that it stands under."""
+    found = [(f.verdict, f.sentence + _moves(f, gain) + _next(f)) for f in diagnosis.findings if f.verdict in result.NAMED]
+    found += [("OR", line) for line in instead(diagnosis)]
+    found += [("FOUND", m.sentence) for m in diagnosis.mistakes]
+    found += [("VARIES", s.sentence) for s in diagnosis.scatter if s.found]
+    found += [("EVENT", _event(diagnosis, flight)) for flight in diagnosis.events]
+    return found + [("COPY", f"flight {flight} repeats flight {of} and was left out") for flight, of in diagnosis.duplicates.items()]
 
 
 def _gain_line(c: ChannelGain) -> str:
@@ -106,21 +107,18 @@ def _moves(finding: Finding, gain: Gain | None) -> str:
 
 
 def to_json(
-    diagnosis: Diagnosis, gain: Gain | None = None, blind: Blind | None = None, proposals: Sequence["Proposal"] = (),
-    extra: Mapping[str, Any] | None = None,
-) -> dict[str, Any]:  # fmt: skip
+    diagnosis: Diagnosis, gain: Gain | None = None, blind: Blind | None = None, extra: Mapping[str, Any] | None = None
+) -> dict[str, Any]:
     """Everything the page says, as plain data."""
     value = diagnosis.to_dict()
     for name, part in (("gain", gain), ("blind", blind)):
         if part is not None:
             value[name] = dataclasses.asdict(part)
-    if proposals:
-        value["plan"] = [dataclasses.asdict(p) for p in proposals]
     return {**value, **(extra or {})}
 
 
 def sections(
-    diagnosis: Diagnosis, gain: Gain | None = None, blind: Blind | None = None, proposals: Sequence["Proposal"] = (),
+    diagnosis: Diagnosis, gain: Gain | None = None, blind: Blind | None = None,
     step_check: Mapping[str, float] | None = None, about: Mapping[str, Any] | None = None,
 ) -> list[Section]:  # fmt: skip
     """All sections of the page.
@@ -129,7 +127,6 @@ def sections(
         diagnosis: of the flights.
         gain: measured on held-out flights.
         blind: detection limits.
-        proposals: what to fly next.
         step_check: channel -> largest difference between the replay and one with finer steps, in sigmas.
         about: provenance.
     """
@@ -161,7 +158,7 @@ def sections(
             "confusion", pictures.confusion(diagnosis), "Correlation of the estimates with every effect free."),)))  # fmt: skip
     if blind is not None:
         made.append(_blind(blind, diagnosis))
-    following = _plan(proposals) if proposals else _next_flights(diagnosis)
+    following = _next_flights(diagnosis)
     made += [following] if following is not None else []
     made.append(_ground(diagnosis, step_check, about))
     return made
@@ -181,17 +178,10 @@ def write(folder: str | Path, made: Sequence[Section], diagnosis: Diagnosis, tit
 
 def _verdict(diagnosis: Diagnosis, gain: Gain | None) -> Section:
     parts: list[Text | Picture] = [Text(reason, "finding") for reason in diagnosis.reasons]
-    parts += [Text(f"**{f.verdict}.** {f.sentence}{_moves(f, gain)}{_next(f)}", "finding")
-              for f in diagnosis.findings if f.verdict in result.NAMED]  # fmt: skip
-    parts += [Text(f"**Or.** {line}.", "finding") for line in instead(diagnosis)]
+    parts += [Text(f"**{word}.** {text}", "finding") for word, text in _statements(diagnosis, gain)]
     if diagnosis.overall == result.UNKNOWN and diagnosis.laws:
         law = diagnosis.laws[0]
         parts.append(Text(f"**Law.** {law.formula} with c = {law.coefficient:.3g} ± {law.sd:.2g} {law.unit}.", "finding"))
-    parts += [Text(f"**FOUND.** {m.sentence}", "finding") for m in diagnosis.mistakes]
-    parts += [Text(f"**VARIES.** {s.sentence}", "finding") for s in diagnosis.scatter if s.found]
-    parts += [Text(f"**Event.** {_event(diagnosis, flight)}.", "finding") for flight in diagnosis.events]
-    parts += [Text(f"Flight {flight} repeats flight {of} and counts once.", "finding")
-              for flight, of in diagnosis.duplicates.items()]  # fmt: skip
     if gain is not None and gain.landing is not None:
         parts.append(Text(f"**Landing.** {landing_sentence(gain.landing)}", "finding"))
         if gain.landing.moved:
@@ -270,16 +260,6 @@ def _blind(blind: Blind, diagnosis: Diagnosis) -> Section:
     parts = (Picture("completeness", pictures.completeness(blind, floors), "Hidden effects named, over their size."),
              Grid("Detection limits in these flights", ("effect", "limit", "unit"), rows, note))  # fmt: skip
     return Section("blind", "What these flights can detect", parts)
-
-
-def _plan(proposals: Sequence["Proposal"]) -> Section:
-    rows = tuple(
-        (p.name, f"{p.seconds:.0f}", f"{p.nats:.1f}", ", ".join(" / ".join(pair) for pair in p.separates), p.limits)
-        for p in proposals
-    )
-    header = ("manoeuvre", "seconds", "nats", "separates", "abort at")
-    note = "Expected nats between the members of the class that is hardest to separate, after flying it once more."
-    return Section("plan", "What to fly next", (Grid("Manoeuvres", header, rows, note),))
 
 
 def _next_flights(diagnosis: Diagnosis) -> Section | None:
