@@ -280,7 +280,7 @@ class Experiment:
     ppo: PPOParams
     air: AirParams = field(default_factory=AirParams)
     laws: tuple[LawParams, ...] = ()  # found by a diagnosis, besides the blocks' own
-    sensing: SensingParams = field(default_factory=SensingParams)  # of the hall; the diagnosis alone reads it
+    sensing: SensingParams = field(default_factory=SensingParams)  # of the motion capture; the diagnosis alone reads it
     diagnosed: DiagnosedParams = field(default_factory=DiagnosedParams)
     algorithm: Literal["ppo", "first_order", "distillation"] = "ppo"
     first_order: FirstOrderParams = field(default_factory=FirstOrderParams)

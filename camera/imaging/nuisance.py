@@ -16,7 +16,7 @@ class NuisanceParams:
     gain: float = 0.0  # exposure off by up to this, as a power of two [-]
     gradient: float = 0.0  # of the light from one side of the picture to the other, up to this share [-]
     tint: float = 0.0  # red against blue off by up to this share [-]
-    clutter: int = 0  # things in the hall, half of them of colours like those of goal and payload
+    clutter: int = 0  # things in the room, half of them of colours like those of goal and payload
     occlusion: float = 0.0  # width of a bar across the ball against its diameter, up to this [-]
 
 

@@ -27,7 +27,7 @@ LIGHT_W = (0.35, 0.25, 0.9)
 
 @dataclass(frozen=True)
 class Clutter:
-    """Something in the hall that is neither goal nor payload."""
+    """Something in the room that is neither goal nor payload."""
 
     shape: Literal["disc", "rectangle", "ball"]  # the first two lie on the ground
     centre_w: tuple[float, float, float]  # [m], world frame; height 0 where it lies on the ground
@@ -148,7 +148,7 @@ def _rgb(red: float, green: float, blue: float) -> torch.Tensor:
 
 
 def _sky(rays_w: torch.Tensor) -> torch.Tensor:
-    """Walls and ceiling of a hall: brighter towards the top."""
+    """Walls and ceiling of a room: brighter towards the top."""
     height = rays_w[..., 2:3].clamp(0.0, 1.0)
     return _rgb(0.30, 0.33, 0.38) + height * _rgb(0.35, 0.36, 0.37)
 

@@ -79,7 +79,7 @@ class ArduPilot(MavlinkAutopilot):
             bits("GUID_OPTIONS", THRUST_AS_THRUST, "else thrust is read as a climb rate"),
             equal("ATC_ANGLE_BOOST", 0.0, "else thrust grows with tilt"),
             within("GUID_TIMEOUT", 0.0, 1.0, 0.5, "so long the last rates are flown when the runner is gone [s]"),
-            equal("EK3_SRC1_POSXY", 6.0, "holding after the throw needs the hall's position (ExternalNav)"),
+            equal("EK3_SRC1_POSXY", 6.0, "holding after the throw needs an external position (ExternalNav)"),
         ]
         function = f"SERVO{p.servo_output}_FUNCTION"
         if p.release == "servo":

@@ -63,10 +63,10 @@ class AutopilotCheck:
         out = [] if audit.fault() is None else [(False, audit.fault())]
         if not audit.done:
             out.append((False, f"parameters were not read: {status.note or 'the time was too short'}"))
-        return [*out, self.meter.story(mass)]
+        return [*out, self.meter.summary_text(mass)]
 
 
-def told(backend: Any, link: Any) -> dict[str, Any]:
+def autopilot_record(backend: Any, link: Any) -> dict[str, Any]:
     """What a run's summary keeps of its autopilot: parameters, the last release, texts, clocks of the link's peers.
 
     Args:

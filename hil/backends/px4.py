@@ -114,7 +114,7 @@ class Px4(MavlinkAutopilot):
             within("COM_OF_LOSS_T", 0.0, 1.0, 0.5, "so long the last rates are flown when the runner is gone [s]"),
             Rule("COM_OBL_RC_ACT", "4 (Land) or 5 (Hold)", "what follows when the runner is gone",
                  lambda v: v in LAND_OR_HOLD, lambda _: LAND_OR_HOLD[0]),
-            bits("EKF2_EV_CTRL", POSITION_BITS, "holding after the throw needs the hall's position"),
+            bits("EKF2_EV_CTRL", POSITION_BITS, "holding after the throw needs an external position"),
         ]  # fmt: skip
         if p.release == "gripper":
             rules += [

@@ -95,7 +95,7 @@ class HoverMeter:
         """Mean share; None with too few values."""
         return sum(self._shares) / len(self._shares) if len(self._shares) >= LEAST_SHARES else None
 
-    def story(self, mass: float) -> tuple[bool, str]:
+    def summary_text(self, mass: float) -> tuple[bool, str]:
         """Compare with the calibration.
 
         Args:

@@ -58,7 +58,7 @@ def _hand_carry(args: argparse.Namespace) -> int:
     with _opened(params, args) as (source, _, clock, recorded):
         steps = handcarry.collect(source, clock, args.seconds or CARRY, lambda text: print(text, flush=True), recorded)
     finding = handcarry.judge(steps, params.frames[VEHICLE])
-    print(handcarry.story(finding, params.frames[VEHICLE]))
+    print(handcarry.summary_text(finding, params.frames[VEHICLE]))
     return 0 if finding.passed else 1
 
 
@@ -80,16 +80,16 @@ def _listen(args: argparse.Namespace) -> int:
         found = autopilot.results(now, runner.mass)
         autopilot.backend.close()
     for name, track in runner.tracks.items():
-        print(_told(name, track, now, now - begin))
+        print(_body_line(name, track, now, now - begin))
     for one in source.links:
-        print("\n".join(_heard(one.roster, params, now - begin)))
+        print("\n".join(_link_lines(one.roster, params, now - begin)))
     problems = runner.problems() + unit_problems(poses, params.frames) + [text for good, text in found if not good]
     print("".join(f"{text}\n" for good, text in found if good), end="")
     print("\n".join(f"FAIL  {text}" for text in problems) or "PASS  all checks")
     return 1 if problems else 0
 
 
-def _told(name: str, track: Track, now: float, seconds: float) -> str:
+def _body_line(name: str, track: Track, now: float, seconds: float) -> str:
     """A body in a line."""
     state, refused = track.state(now), json.dumps(track.gate.refused) if track.gate.refused else "none"
     if state is None:
@@ -101,7 +101,7 @@ def _told(name: str, track: Track, now: float, seconds: float) -> str:
     )
 
 
-def _heard(roster: Roster, params: HilParams, seconds: float) -> list[str]:
+def _link_lines(roster: Roster, params: HilParams, seconds: float) -> list[str]:
     """Who was heard on a link with which ids; all of it where somebody expected was not, else what was refused."""
     silent = [party.name for party in roster.parties if party.name not in roster.at]
     lines = [f"{' and '.join(silent)} not heard; expected: {roster.expected()}"] if silent else []

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from hil.backends import make_backend, mechanism_lag, require_reach
-from hil.backends.check import told
+from hil.backends.check import autopilot_record
 from hil.cli.terminal import Terminal, Voice
 from hil.control.loop import fly as fly_loop
 from hil.control.realtime import keep, prepare
@@ -22,8 +22,8 @@ from hil.params import HilParams
 from hil.recording.bundle import pack
 from hil.recording.latency import Stages
 from hil.recording.record import Recorder
-from hil.recording.report import finish, story
-from hil.recording.view import beside
+from hil.recording.report import finish, summary_text
+from hil.recording.view import start_viewer
 from hil.sources.images import open_images
 from hil.sources.opening import open_source
 from visthrow import config
@@ -86,19 +86,19 @@ def fly(args: argparse.Namespace) -> int:
         voice.say(f"note: {text}")
     operator = Terminal(auto_arm, lambda: any(one.roster.simulated for one in source.links), voice.say)
     print(f"ready after {time.monotonic() - started:.2f} s; waiting for poses", file=sys.stderr, flush=True)
-    viewer, stages = beside(folder) if args.view else None, Stages()
+    viewer, stages = start_viewer(folder) if args.view else None, Stages()
     eyes = open_images(params.images, params.camera, clock.now) if params.keypoints == "detector" else None
     summary = fly_loop(
         runner, source, clock, operator, recorder, args.seconds or float("inf"), voice.decision, stages, eyes
     )  # fmt: skip
-    summary["autopilot"] = told(backend, link)
+    summary["autopilot"] = autopilot_record(backend, link)
     summary["links"] = [one.roster.summary() for one in source.links]
     _close(eyes, backend, source)
     recorder.close(summary)
     if viewer is not None:
         viewer.terminate()
     voice.close()
-    _show(story(summary, folder))
+    _show(summary_text(summary, folder))
     if not args.bare:
         _show("\n".join(finish(folder, stages)))
     if summary["aborted"] or summary["errors"]:

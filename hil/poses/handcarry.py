@@ -243,7 +243,7 @@ def collect(
     return find_steps(poses)
 
 
-def story(finding: Finding, frames: FrameParams) -> str:
+def summary_text(finding: Finding, frames: FrameParams) -> str:
     """The outcome in words."""
     lines = [f"{'PASS' if line.passed else 'FAIL'}  {line.text}" for line in finding.lines]
     if finding.mirrored:

@@ -11,7 +11,7 @@ from visthrow.logs.flightlog import FlightLog
 LATENCY_PICTURE, WHOLE = "latency.png", "flight.npz"
 
 
-def story(summary: dict[str, Any], folder: Path) -> str:
+def summary_text(summary: dict[str, Any], folder: Path) -> str:
     """A run in a few lines."""
     lines = [f"{'ABORTED' if summary['aborted'] else 'ended in ' + summary['state']}: {summary['reason']}"]
     lines.append(f"throws {summary['throws']}, released {summary['latches']}, cancelled {summary['cancelled']}")

@@ -204,7 +204,7 @@ def write(folder: str | Path, path: str | Path) -> None:
             show.take(course.ticks[first : first + MOST_SHOWN // 10])
 
 
-def beside(folder: Path) -> subprocess.Popen:
+def start_viewer(folder: Path) -> subprocess.Popen:
     """Start the live view of a run in a process of its own, at the lowest priority."""
     command = [sys.executable, "-m", "visthrow.cli", "hil", "view", str(folder), "--live"]
     lowest = (lambda: os.nice(19)) if hasattr(os, "nice") else None

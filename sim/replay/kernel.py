@@ -14,7 +14,7 @@ from sim.effects.laws import build_laws
 from sim.params import LawParams, SensingParams, VehicleParams
 from sim.quadrotor.rigid_body import build_flow
 from sim.quadrotor.thrust import rotor_thrust
-from sim.replay.telling import build_telling
+from sim.replay.sampling import build_sampling
 from sim.rope.chain import build_chain
 from sim.rope.coupling import build_coupled_step
 from sim.rope.loose import build_loose_step
@@ -69,7 +69,7 @@ LANE_FIELDS = {
     "keep": ("int", False),  # first row of its knots' states in the knot arrays, or -1
     "resume": ("int", False),  # row of the knot arrays at which it leaves the lane that kept it, or -1
     "parent": ("int", False),  # that lane, flown before, of the same window, plant and state
-    "rides": ("int", False),  # of a lane from a start: so many after it differ in how it is seen alone, and fly along with it
+    "shared": ("int", False),  # of a lane from a start: so many after it share its flight and differ in what sensors show of it
 }
 
 KNOT_FIELDS = {
@@ -134,8 +134,8 @@ def build_replay(t: Types, vehicle: VehicleParams, segments: int, laws: tuple[La
     flight_acceleration = build_flight(t, payload, extra)
     loose_step = build_loose_step(t, chain, payload)
     leaving = build_letting_go(t, EVERYTHING)
-    telling = build_telling(t, Sensing, Windows, Data)
-    Steps, Pointers, tell, inherit = telling.Steps, telling.Pointers, telling.tell, telling.inherit
+    sampling = build_sampling(t, Sensing, Windows, Data)
+    Steps, Pointers, sample, copy_samples = sampling.Steps, sampling.Pointers, sampling.sample, sampling.copy_samples
     load_quad, store_quad = st.build_access(t, State)
     Ball = make_struct("Ball", {"pos": vec3, "vel": vec3, "root": vec3, "root_vel": vec3, "tail": vec3, "tail_vel": vec3})
     Moment = make_struct("Moment", {
@@ -317,7 +317,7 @@ def build_replay(t: Types, vehicle: VehicleParams, segments: int, laws: tuple[La
                 n[i] = moment_dirs[resume, i]
                 u[i] = moment_vels[resume, i]
                 stiffness[i] = moment_stiffness[resume, i]
-            inherit(windows, w, at, lanes.parent[lane], lane, out)
+            copy_samples(windows, w, at, lanes.parent[lane], lane, out)
         while time < end - tiny:
             until = end
             while command + 1 < windows.command_last[w] and data.command_time[command + 1] + delay <= time + tiny:
@@ -420,11 +420,11 @@ def build_replay(t: Types, vehicle: VehicleParams, segments: int, laws: tuple[La
                 k.t1 = t0 + h
                 k.h = h
                 last = j == count - 1 and until >= end - tiny
-                at = tell(
+                at = sample(
                     p, x, data, windows, w, old, s, before, old_pay, old_pay_vel, pay, pay_vel, k, last, at, out, lane
                 )
-                for e in range(lane + 1, lane + 1 + lanes.rides[lane]):
-                    marks[e] = tell(
+                for e in range(lane + 1, lane + 1 + lanes.shared[lane]):
+                    marks[e] = sample(
                         p, sensings[lanes.plant[e]], data, windows, w, old, s, before, old_pay, old_pay_vel, pay, pay_vel, k, last,
                         marks[e], out, e,
                     )  # fmt: skip

@@ -149,7 +149,7 @@ class Replay:
         left_at = [wp.empty(moments, dtype=k.Moment, device=device), *ropes]
         marks = wp.zeros(count, dtype=k.Pointers, device=device)
         costs = recording.seconds[w] / np.asarray(lanes["substep"])
-        launches = [rows[np.argsort(-costs[rows], kind="stable")] for rows in _in_order(np.asarray(lanes["rides"]), resumed)]
+        launches = [rows[np.argsort(-costs[rows], kind="stable")] for rows in _in_order(np.asarray(lanes["shared"]), resumed)]
         order = wp.array(np.concatenate(launches), dtype=wp.int32, device=device)
         numerics = [knot_spacing, self._sim.gamma, self._sim.max_turn, self.gravity]
         told = (k.State, rk.STATE_FIELDS, starts), (k.Lanes, rk.LANE_FIELDS, lanes)
@@ -212,9 +212,9 @@ def _shared_out(costs: np.ndarray, pieces: int) -> list[int]:
     return np.unique([0, *inside.tolist(), len(costs)]).tolist()
 
 
-def _in_order(rides: np.ndarray, resumed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _in_order(shared: np.ndarray, resumed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Lanes that fly, those from a start and those that leave another lane on its way; the rest ride along."""
-    flies, number = np.ones(len(rides), dtype=bool), np.arange(len(rides))
-    for lane in np.flatnonzero(rides > 0):
-        flies[lane + 1 : lane + 1 + rides[lane]] = False
+    flies, number = np.ones(len(shared), dtype=bool), np.arange(len(shared))
+    for lane in np.flatnonzero(shared > 0):
+        flies[lane + 1 : lane + 1 + shared[lane]] = False
     return number[flies & ~resumed].astype(np.int32), number[flies & resumed].astype(np.int32)

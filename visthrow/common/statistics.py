@@ -146,26 +146,26 @@ class Bias:
     """Where throws land on average, and how they scatter about that place.
 
     Attributes:
-        along: mean miss along the throw, positive past the target [m]. aside: to the left of it [m].
+        along: mean miss along the throw, positive past the target [m]. lateral: to the left of it [m].
         offset: length of the mean miss [m].
         scatter: root mean square distance from the mean landing point [m].
         share: of the mean square miss that the offset makes up [-].
     """
 
     along: Interval
-    aside: Interval
+    lateral: Interval
     offset: float
     scatter: float
     share: float
 
     @property
-    def words(self) -> str:
+    def direction(self) -> str:
         """What the signs say, where the interval excludes zero: "undershoots, lands left", or "no bias"."""
         found = []
         if 0.0 not in self.along:
             found.append("overshoots" if self.along.value > 0.0 else "undershoots")
-        if 0.0 not in self.aside:
-            found.append("left" if self.aside.value > 0.0 else "right")
+        if 0.0 not in self.lateral:
+            found.append("left" if self.lateral.value > 0.0 else "right")
         return ", ".join(found) or "none that shows"
 
 
@@ -182,9 +182,9 @@ def bias(groups: Groups | np.ndarray, seed: int = 0, draws: int = DRAWS) -> Bias
     center = _mean(found)
     square = float(np.mean([(group**2).sum(1).mean() for group in found]))
     offset = float(np.hypot(*center))
-    along, aside = (_interval(float(center[i]), samples[:, i], len(found)) for i in range(2))
+    along, lateral = (_interval(float(center[i]), samples[:, i], len(found)) for i in range(2))
     scatter = float(np.sqrt(max(square - offset**2, 0.0)))
-    return Bias(along, aside, offset, scatter, offset**2 / square if square > 0.0 else 0.0)
+    return Bias(along, lateral, offset, scatter, offset**2 / square if square > 0.0 else 0.0)
 
 
 def pareto(points: np.ndarray) -> np.ndarray:

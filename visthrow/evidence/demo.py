@@ -53,7 +53,7 @@ def run(args: argparse.Namespace) -> int:
         with Throwing(*throws, together=True) as throwing:
             paths = _here(loaded, folder, args.throws)
             print(f"{few} throws a policy on the reference plant, which stands in for a real vehicle ...", flush=True)
-            paths += _told(loaded, throwing.results(), "reference-realistic", folder)
+            paths += _tabled(loaded, throwing.results(), "reference-realistic", folder)
     print(PAPER_NOTE + "\n\nFiles:")
     for path in paths:
         print(f"  {path}")
@@ -68,12 +68,12 @@ def _here(loaded: list, folder: Path, throws: int) -> list[Path]:
     print("One throw at a target 2 m ahead with the vision policy ...", flush=True)
     log = throw_once(loaded[1], [2.0, 0.0, 0.0], "hybrid", SEED)
     paths = fly.write(folder, log, loaded[1].experiment)
-    print(fly.story(log) + "\n")
+    print(fly.summary_text(log) + "\n")
     print(f"{throws} throws a policy and target in the training simulator ...", flush=True)
-    return paths + _told(loaded, compare.throw_hybrid(loaded, TARGETS, throws, "cpu", SEED), "hybrid", folder)
+    return paths + _tabled(loaded, compare.throw_hybrid(loaded, TARGETS, throws, "cpu", SEED), "hybrid", folder)
 
 
-def _told(loaded: list, throws: list, plant: str, folder: Path) -> list[Path]:
+def _tabled(loaded: list, throws: list, plant: str, folder: Path) -> list[Path]:
     """Print the table and write it with its plot."""
     from visthrow.view.tables import markdown
 

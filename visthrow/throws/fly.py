@@ -64,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
         print("flying on the reference plant; this takes about a minute", file=sys.stderr)
     log = fly(loaded, goal, args.plant, args.seed, resolve(args.device))
     paths = write(Path(args.out), log, loaded.experiment)
-    print(story(log))
+    print(summary_text(log))
     for path in paths:
         print(f"{path}  {FILES[path.name]}")
     if args.json:
@@ -85,7 +85,7 @@ def write(folder: Path, log, experiment) -> list[Path]:
     return paths
 
 
-def story(log) -> str:
+def summary_text(log) -> str:
     """What happened, in a few lines."""
     times, result, goal = log.meta["times"], log.meta["result"], log.meta["goal_w"]
     start = times["policy_start"]

@@ -130,7 +130,7 @@ class Picture:
             points = [(-float(y), float(x)) for x, y in offsets[good]]
         right = terminal.scatter(points, REACH, *SCATTER)
         heads = ["landing error: . training, o throws at 2.0 m"], [f"landings within {REACH:g} m: {self._said}"]
-        return terminal.beside([*heads[0], *left], [*heads[1], *right])
+        return terminal.side_by_side([*heads[0], *left], [*heads[1], *right])
 
 
 def evaluated(throws: Throws) -> dict[str, float]:

@@ -58,7 +58,7 @@ def scatter(points: Sequence[tuple[float, float]], reach: float, width: int, hei
     return [edge, *(f"|{row}|" for row in cells), edge]
 
 
-def beside(left: Sequence[str], right: Sequence[str], gap: int = 3) -> list[str]:
+def side_by_side(left: Sequence[str], right: Sequence[str], gap: int = 3) -> list[str]:
     """Two blocks of lines next to each other."""
     rows, width = max(len(left), len(right)), max(map(len, left), default=0)
     padded = [(block[i] if i < len(block) else "") for block in (left, right) for i in range(rows)]

@@ -18,9 +18,9 @@ from visthrow.common.errors import DiagnoseError
 from visthrow.config.effects import catalogue
 from visthrow.diagnose.likelihood.evidence import Priors
 from visthrow.diagnose.select.point import Problem, curvature, linearise, moved
-from visthrow.diagnose.throw import settling
+from visthrow.diagnose.throw import initial_fit
+from visthrow.diagnose.throw.initial_fit import InitialFit
 from visthrow.diagnose.throw.recorded import record_of
-from visthrow.diagnose.throw.settling import Settling
 from visthrow.diagnose.throw.throw_model import ThrowModel
 from visthrow.logs.flightlog import Channel, FlightLog
 
@@ -105,14 +105,14 @@ def test_landings_are_predicted_from_before_the_throw(planted):
 
 def test_dampings_tried_at_once_settle_states_sooner(planted, monkeypatch):
     """With the same cost in the end: a window that falls short of its promise looks for its damping in one round."""
-    logs, rounds, costs, seen, tried = planted[0], [], [], [], Settling._tried
-    monkeypatch.setattr(Settling, "_tried", lambda self, *a: seen.append(1) or tried(self, *a))
-    for ladder in (settling.LADDER, settling.LADDER[:1]):
+    logs, rounds, costs, seen, tried = planted[0], [], [], [], InitialFit._tried
+    monkeypatch.setattr(InitialFit, "_tried", lambda self, *a: seen.append(1) or tried(self, *a))
+    for ladder in (initial_fit.LADDER, initial_fit.LADDER[:1]):
         seen.clear()
-        monkeypatch.setattr(settling, "LADDER", ladder)
+        monkeypatch.setattr(initial_fit, "LADDER", ladder)
         model = ThrowModel(logs, paper_plant(), only=list(PLANTED))
         (states, _), windows = model._fitted(), np.arange(len(model.flights.cuts))
-        fit = model._settling(model.setting)
+        fit = model._initial_fit(model.setting)
         costs.append(sum(fit._cost(w, residual) for w, residual in zip(windows, fit._residuals(states, windows))))
         rounds.append(len(seen))
     assert rounds[0] < 0.8 * rounds[1]
@@ -122,11 +122,11 @@ def test_dampings_tried_at_once_settle_states_sooner(planted, monkeypatch):
 def test_one_throw_s_landing_rests_on_what_was_fitted_to_all(monkeypatch):
     """The same to the bit as by itself, without its states at theta = 0 fitted a second time."""
     logs = fly(setting_with(PLANTED), noise=0.2, free=0, throws=2, seconds=2.0)
-    wrong, fits, fit = {"release_lag": 0.01}, [], Settling.fit
+    wrong, fits, fit = {"release_lag": 0.01}, [], InitialFit.fit
     alone = ThrowModel(logs, paper_plant(), only=list(PLANTED)).landings(wrong, [1])
     model = ThrowModel(logs, paper_plant(), only=list(PLANTED))
     model.landings({})
-    monkeypatch.setattr(Settling, "fit", lambda self, *a: fits.append(self.setting) or fit(self, *a))
+    monkeypatch.setattr(InitialFit, "fit", lambda self, *a: fits.append(self.setting) or fit(self, *a))
     among = model.landings(wrong, [1])
     assert model.setting not in fits
     assert len(fits) == 2  # before the throw, and up to the separation
@@ -172,11 +172,11 @@ def test_rotors_begin_a_window_where_the_commands_left_them(planted):
 
 def test_each_window_begins_with_the_best_of_its_states(planted, monkeypatch):
     _, model = planted
-    monkeypatch.setattr(settling, "ROUNDS", 0)
+    monkeypatch.setattr(initial_fit, "ROUNDS", 0)
     good = model._fitted()[0]
     even = np.arange(len(good["pos_w"])) % 2 == 0
     mixed = [{**good, "pos_w": good["pos_w"] + 0.05 * np.where(rows, 1.0, 0.0)[:, None]} for rows in (even, ~even)]
-    found = model._settling(model.setting).fit(mixed)
+    found = model._initial_fit(model.setting).fit(mixed)
     told = model._told
     assert {0, 1} == set((told % 2).tolist())
     for name, value in good.items():

@@ -11,7 +11,7 @@ import pytest
 from tests import made_up_results as made_up
 from visthrow import cli
 from visthrow.baseline import spline, thrower
-from visthrow.evidence.report import ablations, beyond, book, command, gap, throws, trade, wanted
+from visthrow.evidence.report import ablations, baseline_units, beyond, command, gap, result_set, throws, trade
 from visthrow.evidence.sweep.units import load_list
 from visthrow.throws import results
 from visthrow.throws.results import Result
@@ -40,8 +40,8 @@ def texts(section, kind: str) -> str:
     return "\n".join(part.text for part in section.parts if isinstance(part, Text) and part.kind == kind)
 
 
-def only(*found) -> book.Book:
-    return book.Book(tuple(found))
+def only(*found) -> result_set.ResultSet:
+    return result_set.ResultSet(tuple(found))
 
 
 def test_of_alike_results_the_one_with_most_throws_counts():
@@ -64,7 +64,7 @@ def test_records_and_folders_are_read_and_batches_joined(tmp_path, full):
     results.pack([*parts, old], tmp_path / "throws" / "x.json")
     (tmp_path / "findings").mkdir()
     (tmp_path / "findings" / "front.md").write_text("Why.\n")
-    found = book.read([tmp_path])
+    found = result_set.read([tmp_path])
     assert [len(r.good) for r in found.results] == [8]
     assert found.findings == {"front": "Why."}
 
@@ -82,7 +82,7 @@ def test_every_section_is_complete_when_everything_was_thrown(written):
 
 
 def test_an_empty_book_says_everything_that_is_missing(tmp_path):
-    sections = command.sections(book.Book(()))
+    sections = command.sections(result_set.ResultSet(()))
     for section in sections:
         assert texts(section, "missing"), section.name
         assert not any(isinstance(part, Picture) for part in section.parts), section.name
@@ -195,7 +195,7 @@ def test_the_command_reports_from_records(tmp_path, full, capsys):
 def test_what_no_record_holds_is_flown_once(tmp_path, monkeypatch, capsys):
     pytest.importorskip("piqp")
     monkeypatch.setattr(spline, "LONGEST", (1.4,))  # one start of the optimisation instead of five
-    monkeypatch.setattr(wanted, "full", lambda: [thrower.unit(thrower.OWN, "none", target, 1) for target in (1.5, 2.0)])
+    monkeypatch.setattr(baseline_units, "full", lambda: [thrower.unit(thrower.OWN, "none", target, 1) for target in (1.5, 2.0)])
     words = ["report", "--measure", "--jobs", "1", "--records", str(tmp_path / "records"), "--out", str(tmp_path / "out")]
     record = tmp_path / "records" / "throws" / "baseline.json"
     results.pack([], record)
@@ -209,16 +209,16 @@ def test_what_no_record_holds_is_flown_once(tmp_path, monkeypatch, capsys):
 
 
 def test_what_the_report_stands_on_is_stated_once():
-    keys = [results.key_of(unit) for unit in wanted.full()]
+    keys = [results.key_of(unit) for unit in baseline_units.full()]
     assert len(set(keys)) == len(keys)
-    assert {unit["target"] for unit in wanted.full()} == {1.5, 2.0, 2.5}
-    assert len(wanted.quick()) == 5
+    assert {unit["target"] for unit in baseline_units.full()} == {1.5, 2.0, 2.5}
+    assert len(baseline_units.quick()) == 5
 
 
 def test_the_quick_list_can_do_without_the_reference_plant():
     plants = {}
     for changes in ((), command.NO_REFERENCE):
-        units = load_list(wanted.QUICK_LIST, changes).throws.values()
+        units = load_list(baseline_units.QUICK_LIST, changes).throws.values()
         plants[changes] = {unit.params.plant for row in units for unit in row}
     assert plants == {(): {"hybrid", "reference-realistic"}, command.NO_REFERENCE: {"hybrid"}}
 
@@ -245,10 +245,10 @@ DRIVER = """
 import sys
 from visthrow import cli
 from visthrow.baseline import spline, thrower
-from visthrow.evidence.report import wanted
+from visthrow.evidence.report import baseline_units
 spline.LONGEST = (1.4,)
-wanted.QUICK_LIST = sys.argv[1]
-wanted.quick = lambda: [thrower.unit("pendulum", "none", target, 1) for target in wanted.TARGETS]
+baseline_units.QUICK_LIST = sys.argv[1]
+baseline_units.quick = lambda: [thrower.unit("pendulum", "none", target, 1) for target in baseline_units.TARGETS]
 sys.exit(cli.main(["report", "--quick", "--jobs", "1", "--out", sys.argv[2]]))
 """
 

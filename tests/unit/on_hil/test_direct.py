@@ -59,7 +59,7 @@ def test_the_same_seed_gives_the_same_commands():
 
 
 def test_poses_are_as_old_as_over_the_wire():
-    """10 ms and up to a period of the motion capture, lost ones left aside."""
+    """10 ms and up to a period of the motion capture, lost ones left lateral."""
     kinds = {}
     for seed in range(20):
         direct = made(seed)

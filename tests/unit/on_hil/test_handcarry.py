@@ -8,7 +8,7 @@ import pytest
 from hil.errors import RunError
 from hil.links.clock import ManualClock
 from hil.poses.frames import FrameParams, Frames
-from hil.poses.handcarry import MOVES, Step, collect, find_steps, judge, story
+from hil.poses.handcarry import MOVES, Step, collect, find_steps, judge, summary_text
 from hil.poses.pose import Pose
 from hil.sources import Recorded
 from visthrow.cli import main
@@ -102,7 +102,7 @@ def test_any_mixture_is_named(steps):
 def test_each_line_says_which_axis_failed(steps):
     found = check(steps, made(axes="y,x,-z", body_axes="x,-y,-z", quaternion="wxyz"), made("x,-y,-z", "x,-y,-z", "wxyz"))
     assert [line.passed for line in found.lines] == [False, False, True, True, True, True, False], "a yaw of 90 deg"
-    told = story(found, made("x,-y,-z", "x,-y,-z", "wxyz"))
+    told = summary_text(found, made("x,-y,-z", "x,-y,-z", "wxyz"))
     assert 'would fit: axes = "y,x,-z"  (config: "x,-y,-z")' in told
     assert "quaternion" not in told.split("would fit", 1)[1]
     assert told.count("FAIL") == 3
@@ -113,7 +113,7 @@ def test_a_left_handed_world_is_told(track):
     found = judge(find_steps(mirrored), OURS)
     assert found.mirrored
     assert not found.passed
-    assert "mirrored world" in story(found, OURS)
+    assert "mirrored world" in summary_text(found, OURS)
 
 
 def test_moves_that_were_left_out_are_counted():

@@ -51,7 +51,7 @@ def test_the_measured_hover_is_held_against_the_calibration(off, good):
         meter.add(0.9, False)
         meter.add(None, True)
         meter.add(float("nan"), True)
-    found, text = meter.story(2.668 / GRAVITY)
+    found, text = meter.summary_text(2.668 / GRAVITY)
     assert found == good
     assert f"measured {0.37 * (1 + off):.3f}, by the config 0.370" in text
     assert ("calibrate" in text) == (not good)
@@ -61,7 +61,7 @@ def test_too_few_values_measure_nothing():
     meter = HoverMeter(BENT)
     meter.add(0.9, True)
     assert meter.share is None
-    assert meter.story(0.272) == (True, "hover share not measured: 1 of 50 values in steady hover")
+    assert meter.summary_text(0.272) == (True, "hover share not measured: 1 of 50 values in steady hover")
 
 
 @pytest.mark.parametrize(

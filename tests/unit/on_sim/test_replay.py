@@ -65,7 +65,7 @@ def replay(flight, plants, sensings=None, count=1, stamps=None, end=0.02 * PERIO
                "vehicle_first": 0, "vehicle_count": n, "payload_first": 0, "payload_count": m, "gyro_first": 0,
                "gyro_count": n}  # fmt: skip
     lanes = {"window": 0, "plant": 0, "state": 0, "axis": -1, "knot": 0, "size": 0.0, "substep": 0.002, "keep": -1, "resume": -1,
-             "parent": -1, "rides": 0} | lane  # fmt: skip
+             "parent": -1, "shared": 0} | lane  # fmt: skip
     lanes = {name: np.broadcast_to(value, count).copy() for name, value in lanes.items()}
     engine = Replay(plants, sensings or [SensingParams()] * len(plants))
     flown = engine.run(start, Recording({k: one(v) for k, v in windows.items()}, data), lanes, 0.1, 9)
@@ -153,10 +153,10 @@ def test_lanes_that_are_seen_otherwise_ride_along(flight):
     given = {"count": 4, "plant": np.array([0, 1, 2, 0]), "axis": np.array([-1, -1, -1, 2]), "size": 0.01, "knot": 4,
              "keep": np.array([0, -1, -1, -1])}  # fmt: skip
     alone, _ = replay(flight, [plant()] * 3, seen, **given)
-    riding, _ = replay(flight, [plant()] * 3, seen, **given, rides=np.array([2, 0, 0, 0]), resume=np.array([-1, -1, -1, 3]),
+    sharing, _ = replay(flight, [plant()] * 3, seen, **given, shared=np.array([2, 0, 0, 0]), resume=np.array([-1, -1, -1, 3]),
                        parent=np.array([-1, -1, -1, 0]))  # fmt: skip
     for name, value in alone.items():
-        np.testing.assert_array_equal(riding[name], value)
+        np.testing.assert_array_equal(sharing[name], value)
         assert np.any(value[:, 0] != value[:, 1]) or np.any(value[:, 0] != value[:, 2])
 
 

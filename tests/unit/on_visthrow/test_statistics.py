@@ -101,8 +101,8 @@ def test_bias_splits_the_mean_square():
     assert found.offset**2 + found.scatter**2 == pytest.approx((miss**2).sum(1).mean())
     assert found.scatter == pytest.approx(np.sqrt(miss.var(0).sum()))
     assert -0.05 in found.along
-    assert found.words == "undershoots"
-    assert st.bias(miss * [-1.0, 1.0] + [0.0, -0.02]).words == "overshoots, right"
+    assert found.direction == "undershoots"
+    assert st.bias(miss * [-1.0, 1.0] + [0.0, -0.02]).direction == "overshoots, right"
     assert st.bias(rng.normal(0.0, 0.02, (300, 2))).share < 0.05
 
 

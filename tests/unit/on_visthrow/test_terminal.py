@@ -41,7 +41,7 @@ def test_a_scatter_counts_by_place():
 
 
 def test_blocks_stand_side_by_side():
-    assert terminal.beside(["ab", "c"], ["x"], 2) == ["ab  x", "c"]
+    assert terminal.side_by_side(["ab", "c"], ["x"], 2) == ["ab  x", "c"]
 
 
 @pytest.mark.parametrize(("seconds", "text"), [(0, "0:00"), (65.2, "1:05"), (3661, "1:01:01"), (math.inf, "-")])

@@ -35,7 +35,7 @@ _HINTS = (
     ("position", r"pos|(^|[._])p$|loc|pose|translation|estimate|mocap|vicon|opti|uav|drone|quad|vehicle|copter|^$"),
 )  # fmt: skip
 _FIRMLY, _BELONGS = 0.8, 0.6  # correlations of what is the derivative of what
-_FASTEST, _WIDEST = 40.0, 60.0  # of vehicles in a hall [m/s], [m]
+_FASTEST, _WIDEST = 40.0, 60.0  # of vehicles in a room [m/s], [m]
 
 
 @dataclass
@@ -267,7 +267,7 @@ class _Chooser:
             self._take("payload_pos_w", pay[0], ChannelMap("payload_pos_w", pay[0].columns, pay[1]), pay[2])
 
     def _length_unit(self, group: Group) -> str:
-        """Unit of a position: as named, else that in which it is no faster and wider than a hall; "" where none fits."""
+        """Unit of a position: as named, else that in which it is no faster and wider than a room; "" where none fits."""
         if group.unit in ("mm", "cm", "m"):
             return group.unit
         good = np.all(np.isfinite(group.values), axis=1)

@@ -133,7 +133,7 @@ def lanes_of(
     effects = np.argsort(2 * ~fine + ~alike, kind="stable")
     told = [Lane(w, 1 + int(k), w, rough=not fine[k]) for k in effects]
     moved = [Lane(w, 0, (1 + d) * count + w, rough=not whips) for d in nuisances]
-    lanes = [Lane(w, 0, w, keep=kept, rides=int(alike.sum())), *[x for x in (*told, *moved) if not x.rough]]
+    lanes = [Lane(w, 0, w, keep=kept, shared=int(alike.sum())), *[x for x in (*told, *moved) if not x.rough]]
     split = len(lanes)
     lanes.append(Lane(w, 0, w, keep=kept + knots, rough=True))
     lanes += [x for x in (*told, *moved) if x.rough]

@@ -38,7 +38,7 @@ class Lane(NamedTuple):
     keep: int = -1
     resume: int = -1  # row of what another lane keeps, at which this one leaves it
     parent: int = -1  # that lane
-    rides: int = 0  # lanes after it that fly alike and see it otherwise
+    shared: int = 0  # lanes after it that share its flight and differ in what sensors show of it
     rough: bool = False  # whether it flies with longer steps
 
 

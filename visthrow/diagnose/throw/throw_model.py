@@ -21,14 +21,14 @@ from visthrow.diagnose.likelihood.threads import aside, each
 from visthrow.diagnose.likelihood.transfer import all_to_host, to_host
 from visthrow.diagnose.models.interface import Linearised, Window
 from visthrow.diagnose.throw.cutting import RINGING, Cut, around_slack, cut, thinned
+from visthrow.diagnose.throw.direct import channels_of, direct_measurements, needs_no_flight, with_direct
 from visthrow.diagnose.throw.effects import effects_for
+from visthrow.diagnose.throw.initial_fit import InitialFit, following, perturbed
 from visthrow.diagnose.throw.interface import Mistake
 from visthrow.diagnose.throw.landing import Landings, landings
 from visthrow.diagnose.throw.linearising import Plan, exact, lanes_of, still
 from visthrow.diagnose.throw.recorded import NEVER, Recorded, carriers, record_of
 from visthrow.diagnose.throw.replay import BATCH, CUDA_BATCH, Flights, Lane, carried, downloaded
-from visthrow.diagnose.throw.settling import Settling, following, perturbed
-from visthrow.diagnose.throw.sightings import channels_of, needs_no_flight, sightings, with_sightings
 from visthrow.diagnose.throw.states import (
     Direction,
     States,
@@ -114,7 +114,7 @@ class ThrowModel:
         self._settled_at: dict[frozenset[tuple[str, float]], States] = {}
         self._lock = threading.Lock()  # residuals may be asked for side by side
         self._follows: tuple[Linearised, dict[int, list[int]], np.ndarray] | None = None  # the last that was asked for
-        self._sightings = sightings(logs, flights, self.flights.cuts, self.setting)
+        self._direct = direct_measurements(logs, flights, self.flights.cuts, self.setting)
 
     def _cut(self, flights: Sequence[Recorded], cuts: Sequence[Cut], stride: int) -> Flights:
         """Return these windows of flights, in the time of their sensors."""
@@ -146,21 +146,21 @@ class ThrowModel:
                 dataclasses.replace(w, effects=np.hstack((w.effects, np.stack([c[i] for c in columns], axis=1))))
                 for i, w in enumerate(found)
             ]
-        return self._with_sightings(setting, theta, found)
+        return self._with_direct(setting, theta, found)
 
-    def _with_sightings(self, setting: Setting, theta: Mapping[str, float], windows: list[Window]) -> list[Window]:
+    def _with_direct(self, setting: Setting, theta: Mapping[str, float], windows: list[Window]) -> list[Window]:
         """Windows with what was seen besides poses, and columns of the effects that this alone shows."""
         whole = windows
         if self._sighted:
             blank = [np.zeros((len(w.residual), len(self._sighted))) for w in windows]
             whole = [dataclasses.replace(w, effects=np.hstack((w.effects, b))) for w, b in zip(windows, blank)]
-        if not self._sightings:
+        if not self._direct:
             return whole
         entries = list(self.entries.values())
         steps = np.array([0.0 if e.switch else self._step(e, theta.get(e.name, 0.0)) for e in entries])
         settings = [setting, *[setting if e.switch else e.apply(setting, step) for e, step in zip(entries, steps)]]
         return [
-            with_sightings(w, number, self._sightings, self.channels, settings, steps) for number, w in zip(self._told, whole)
+            with_direct(w, number, self._direct, self.channels, settings, steps) for number, w in zip(self._told, whole)
         ]
 
     def _secant(self, e: SettingEffect, theta: Mapping[str, float], windows: list[Window]) -> list[np.ndarray]:
@@ -224,7 +224,7 @@ class ThrowModel:
         return frozenset(e.name for e in self._switched if theta.get(e.name, 0.0) > 0.5)
 
     def _sighting_residuals(self, w: int, setting: Setting) -> list[np.ndarray]:
-        held = [(kind, kind.samples(w)[1]) for kind in self._sightings]
+        held = [(kind, kind.samples(w)[1]) for kind in self._direct]
         return [values - kind.predicted(w, setting) for kind, values in held if len(values)]
 
     def step_error(self, finer: int = 4) -> dict[str, float]:
@@ -282,9 +282,9 @@ class ThrowModel:
 
         return carried(self.flights, self._replay([setting]), setting, begin, self.substep)
 
-    def _settling(self, setting: Setting) -> Settling:
+    def _initial_fit(self, setting: Setting) -> InitialFit:
         """What fits initial states in a setting."""
-        return Settling(
+        return InitialFit(
             self.flights, self._told, directions(setting.plant), setting, lag=self.setting.plant.release.lag, substep=self.substep,
             device=self.device,
         )  # fmt: skip
@@ -295,9 +295,9 @@ class ThrowModel:
         if cuts not in self._fits:
             if states is None and (among := self._among_more(cuts)) is not None:
                 return among
-            settling = self._settling(self.setting)
-            fitted = settling.fit([self._through(self.setting)[0] if states is None else states])
-            self._fits[cuts] = fitted, settling.slopes
+            fitter = self._initial_fit(self.setting)
+            fitted = fitter.fit([self._through(self.setting)[0] if states is None else states])
+            self._fits[cuts] = fitted, fitter.slopes
         return self._fits[cuts]
 
     def _among_more(self, cuts: tuple[Cut, ...]) -> tuple[States, dict[int, np.ndarray]] | None:
@@ -314,10 +314,10 @@ class ThrowModel:
         states, slopes = self._fitted()
         if setting == self.setting:
             return states
-        settling = self._settling(setting)
+        fitter = self._initial_fit(setting)
         starts = [resampled(states, setting.plant.rope.segments), self._through(setting)[0]]
-        ways = [[(x.field, x.axis, x.part) for x in found] for found in (settling.directions, directions(self.setting.plant))]
-        return settling.fit(starts, slopes if ways[0] == ways[1] else None)
+        ways = [[(x.field, x.axis, x.part) for x in found] for found in (fitter.directions, directions(self.setting.plant))]
+        return fitter.fit(starts, slopes if ways[0] == ways[1] else None)
 
     @staticmethod
     def _step(e: SettingEffect, theta: float) -> float:

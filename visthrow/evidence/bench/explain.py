@@ -1,4 +1,4 @@
-"""How long a diagnosis takes: reading and settling, the verdicts, the report; on the logs of one's own flights."""
+"""How long a diagnosis takes: reading and the fit of initial states, the verdicts, the report; on the logs of one's own flights."""
 
 import argparse
 import tempfile

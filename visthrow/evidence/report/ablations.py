@@ -3,7 +3,7 @@
 import math
 
 from visthrow.common import statistics as st
-from visthrow.evidence.report.book import ANY, Book, durations, errors, landed, misses
+from visthrow.evidence.report.result_set import ANY, ResultSet, durations, errors, landed, misses
 from visthrow.evidence.report.throws import SHORT
 from visthrow.throws.results import Result
 from visthrow.view import figures
@@ -38,7 +38,7 @@ PLANTS = ("reference-realistic", "reference")
 SHORT_LAYOUT = {"state": "state policies", "vision": "vision policies"}
 
 
-def section(book: Book) -> Section:
+def section(thrown: ResultSet) -> Section:
     """Ratio to the full model with its interval, where the throws land, and what that says of each component."""
     parts: list = [
         Text("Each policy was trained with one component of the simulator removed and otherwise the same recipe, then flown "
@@ -49,7 +49,7 @@ def section(book: Book) -> Section:
     marks, missing, said = [], [], []
     for layout in ("state", "vision"):
         for plant in PLANTS:
-            rows = _rows(book, layout, plant, marks, missing, said)
+            rows = _rows(thrown, layout, plant, marks, missing, said)
             if rows:
                 head = ("configuration", "trainings", "throws", "landed", "landing error [m]", "ratio to full", "the paper's ratio",
                         "scatter [m]", "duration [s]", "bias along [m]", "bias left [m]", "lands", "the paper: lands")  # fmt: skip
@@ -60,7 +60,7 @@ def section(book: Book) -> Section:
         picture = figures.marks(marks, "mean landing error over the full model's", series, zero=1.0, log=True)
         text = "Error ratio to the full model with 95 % intervals; at 1 the component does not matter."
         parts.insert(1, Picture("ablations", picture, text))
-    scatter = _scatter(book)
+    scatter = _scatter(thrown)
     if scatter:
         parts.append(scatter)
     parts += [Text(text, "finding") for text in said]
@@ -69,14 +69,14 @@ def section(book: Book) -> Section:
     return Section("ablations", "What each component of the simulator is worth", tuple(parts))
 
 
-def _rows(book: Book, layout: str, plant: str, marks: list, missing: list, said: list) -> list[tuple[str, ...]]:
-    full = book.seeds(layout, "full", plant, TARGET, {})
+def _rows(thrown: ResultSet, layout: str, plant: str, marks: list, missing: list, said: list) -> list[tuple[str, ...]]:
+    full = thrown.seeds(layout, "full", plant, TARGET, {})
     if not full:
         missing.append(f"the full {layout} model's own trainings on the {SHORT[plant]}")
         return []
     rows = [_row("full", full, full)]
     for variant in (*PAPER_FOUR, *FURTHER):
-        found = book.seeds(layout, variant, plant, TARGET)
+        found = thrown.seeds(layout, variant, plant, TARGET)
         if not found:
             if layout == "state" or variant in PAPER_FOUR:
                 missing.append(f"{TITLES[variant]} ({layout}, {SHORT[plant]})")
@@ -104,11 +104,11 @@ def paper_ratio(variant: str) -> st.Interval | None:
 def _row(variant: str, found: list[Result], full: list[Result]) -> tuple[str, ...]:
     paper, bias = paper_ratio(variant), st.bias(misses(found))
     ratio = "1" if variant == "full" else st.ratio(errors(found), errors(full)).text(2)
-    along, aside = (of.text(sign=True) for of in (bias.along, bias.aside))
+    along, lateral = (of.text(sign=True) for of in (bias.along, bias.lateral))
     return (
         TITLES[variant], str(len(found)), str(sum(len(r.good) for r in found)), f"{100 * landed(found):.1f} %",
         st.mean(errors(found)).text(), ratio, "-" if paper is None or variant == "full" else paper.text(1),
-        f"{bias.scatter:.3f}", f"{st.mean(durations(found)).value:.3f}", along, aside, bias.words,
+        f"{bias.scatter:.3f}", f"{st.mean(durations(found)).value:.3f}", along, lateral, bias.direction,
         PAPER_ABLATIONS[variant][4] if variant in PAPER_ABLATIONS else "-",
     )  # fmt: skip
 
@@ -126,16 +126,16 @@ def _said(variant: str, ratio: st.Interval, found: list[Result]) -> str:
     beside = "" if paper is None else f"; the paper: {paper.text(2)}, {agree}"
     words = PAPER_ABLATIONS[variant][4] if variant in PAPER_ABLATIONS else ""
     bias = st.bias(misses(found))
-    signs = f" Bias here: {bias.words}, {100 * bias.share:.0f} % of the mean square miss"
+    signs = f" Bias here: {bias.direction}, {100 * bias.share:.0f} % of the mean square miss"
     signs += f"; the paper's throws: {words}." if words else "."
     seeds = "" if len(found) > 1 else " One training: the interval covers throws, not trainings."
     return f"{head}: {verdict}{beside}.{signs}{seeds}"
 
 
-def _scatter(book: Book) -> Picture | None:
+def _scatter(thrown: ResultSet) -> Picture | None:
     plant, panels = PLANTS[0], []
     for variant in ("full", *PAPER_FOUR, *FURTHER):
-        found = book.seeds("state", variant, plant, TARGET, {} if variant == "full" else ANY)
+        found = thrown.seeds("state", variant, plant, TARGET, {} if variant == "full" else ANY)
         if found:
             words = PAPER_ABLATIONS.get(variant)
             title = TITLES[variant] + ("" if words is None else f"\npaper: {words[4]}")

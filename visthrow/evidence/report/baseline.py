@@ -60,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
     """Plan, throw, print, write."""
     from visthrow.baseline import thrower
     from visthrow.common.errors import suggest
-    from visthrow.evidence.report import book, trade, wanted
+    from visthrow.evidence.report import baseline_units, result_set, trade
     from visthrow.evidence.report.throws import SHORT
     from visthrow.throws import compare, results
     from visthrow.throws.plants import PLANTS
@@ -72,7 +72,7 @@ def run(args: argparse.Namespace) -> int:
     for plant in args.plants:
         if plant not in PLANTS:
             raise ConfigError(f"no plant '{plant}'; {suggest(plant, PLANTS)}")
-    out, bounds = Path(args.out), wanted.BOUNDS[args.payload_bounds]
+    out, bounds = Path(args.out), baseline_units.BOUNDS[args.payload_bounds]
     compare.writable(out)
     if args.quick:
         args.throws, args.plants = min(args.throws, 2), []
@@ -87,7 +87,7 @@ def run(args: argparse.Namespace) -> int:
         shown = [(SHORT[plant], plant, ((made_up, bounds),), "hybrid") for plant, made_up in kinds]
         front = results.join(known[results.key_of(unit)] for unit in swept)
         names = [result.unit["policy"] for result in policies]
-        made.append(trade.front_section(book.Book((*front, *policies)), shown, names))
+        made.append(trade.front_section(result_set.ResultSet((*front, *policies)), shown, names))
         found += policies
     status("")
     title = TITLE.format(throws=args.throws, bounds=bounds)
@@ -117,7 +117,7 @@ def _by_target(args: argparse.Namespace, bounds: str) -> Iterator[list[dict[str,
 def _swept(args: argparse.Namespace, bounds: str) -> Iterator[dict[str, Any]]:
     """Units of the sweep: in the own model and, all delays made up for, on the plants."""
     from visthrow.baseline import front, thrower
-    from visthrow.evidence.report.wanted import FRONT_TARGET
+    from visthrow.evidence.report.baseline_units import FRONT_TARGET
 
     speeds, weights = ((2.2,), front.WEIGHTS[2::2]) if args.quick else (front.SPEEDS, front.WEIGHTS)
     for speed in speeds:
@@ -140,7 +140,7 @@ def _releases(args: argparse.Namespace) -> dict[float, tuple[float, float]]:
 
 def _thrown(name: str, args: argparse.Namespace) -> Any:
     """Throws of a learnt policy in the training simulator, as ``visthrow compare`` throws them."""
-    from visthrow.evidence.report.wanted import FRONT_TARGET
+    from visthrow.evidence.report.baseline_units import FRONT_TARGET
     from visthrow.throws import results
     from visthrow.throws.loading import load_policy
     from visthrow.training.protocol import throw

@@ -5,7 +5,7 @@ import json
 import numpy as np
 
 from visthrow.common import statistics as st
-from visthrow.evidence.report.book import SHIPPED, Book, landed
+from visthrow.evidence.report.result_set import SHIPPED, ResultSet, landed
 from visthrow.evidence.report.throws import SHORT
 from visthrow.throws.results import Result
 from visthrow.view import figures
@@ -23,25 +23,25 @@ TITLES = {
 }  # fmt: skip
 
 
-def section(book: Book) -> Section:
+def section(thrown: ResultSet) -> Section:
     """Moving targets, varied payloads, drag, far targets."""
     parts: list = [
         Text("Each is a switch of the task's config, off by default. Policies trained with it stand beside those trained without.")
     ]
     missing: list[str] = []
-    parts += _moving(book, missing)
+    parts += _moving(thrown, missing)
     rows = []
     for variant in VARIANTS[1:]:
-        found = [r for r in book.matching(kind="policy", variant=variant)]
+        found = [r for r in thrown.matching(kind="policy", variant=variant)]
         if not found:
             missing.append(TITLES[variant])
         rows += _rows(found)
-    rows += _rows([r for r in book.matching(kind="policy", variant="full") if r.unit["policy"] in SHIPPED and _beyond(r)])
+    rows += _rows([r for r in thrown.matching(kind="policy", variant="full") if r.unit["policy"] in SHIPPED and _beyond(r)])
     if rows:
         head = ("policy", "training", "plant", "flown with", "target [m]", "throws", "landed", "landing error [m]")
         note = "'its own': the conditions of its own training; else what was changed."
         parts.append(Grid("Payload, drag and distance", head, tuple(rows), note, heads=4))
-    parts += [Text(text, "finding") for text in _bars(book)]
+    parts += [Text(text, "finding") for text in _bars(thrown)]
     if missing:
         parts.append(Text("Not thrown yet: " + "; ".join(missing) + ".", "missing"))
     return Section("beyond", "Beyond the paper", tuple(parts))
@@ -76,26 +76,26 @@ def _changes(departures: dict) -> str:
     return ", ".join(f"{key.split('.')[-1]} {json.dumps(value)}" for key, value in departures.items()) or "its own"
 
 
-def _speeds(book: Book, policies: list[str], plant: str) -> dict[str, list[tuple[float, Result]]]:
+def _speeds(thrown: ResultSet, policies: list[str], plant: str) -> dict[str, list[tuple[float, Result]]]:
     """Policy -> ascending speeds of the target [m/s] and throws."""
     curves: dict[str, list[tuple[float, Result]]] = {}
     for policy in policies:
-        for r in book.matching(kind="policy", policy=policy, plant=plant, target=TARGET):
+        for r in thrown.matching(kind="policy", policy=policy, plant=plant, target=TARGET):
             speed = r.unit["departures"].get(SPEED_KEY)
             if speed is not None and len(r.unit["departures"]) == 1 and speed[0] == speed[1] and r.good.any():
                 curves.setdefault(policy, []).append((float(speed[1]), r))
     return {policy: sorted(points, key=lambda p: p[0]) for policy, points in curves.items()}
 
 
-def _moving(book: Book, missing: list[str]) -> list:
-    names = sorted({r.unit["policy"] for r in book.matching(kind="policy", variant="moving")})
+def _moving(thrown: ResultSet, missing: list[str]) -> list:
+    names = sorted({r.unit["policy"] for r in thrown.matching(kind="policy", variant="moving")})
     if not names:
         missing.append(TITLES["moving"])
     lines, rows = [], []
     for plant in ("hybrid", "reference-realistic"):
-        for policy, points in _speeds(book, [*names, *SHIPPED], plant).items():
+        for policy, points in _speeds(thrown, [*names, *SHIPPED], plant).items():
             if policy in SHIPPED and plant == "hybrid":
-                still = book.shipped(policy, plant, TARGET)
+                still = thrown.shipped(policy, plant, TARGET)
                 points = [(0.0, still), *points] if still is not None and points[0][0] > 0.0 else points
             if plant == "hybrid" and len(points) > 1:
                 label = f"{policy}, {TITLES['full']}" if policy in SHIPPED else policy
@@ -115,14 +115,14 @@ def _moving(book: Book, missing: list[str]) -> list:
     return parts
 
 
-def _bars(book: Book) -> list[str]:
+def _bars(thrown: ResultSet) -> list[str]:
     """What was asked for, and whether it was reached."""
     said = []
-    for policy, points in _speeds(book, sorted({r.unit["policy"] for r in book.matching(variant="moving")}), "hybrid").items():
+    for policy, points in _speeds(thrown, sorted({r.unit["policy"] for r in thrown.matching(variant="moving")}), "hybrid").items():
         for speed, r in points:
             if speed == 0.5:
                 said.append(_judged(f"{policy} at targets that move at 0.5 m/s", r, MOVING_BAR))
-    for r in book.matching(kind="policy", variant="payload", plant="hybrid", target=TARGET, departures={}):
+    for r in thrown.matching(kind="policy", variant="payload", plant="hybrid", target=TARGET, departures={}):
         said.append(_judged(f"{r.unit['policy']} with varied payload and cable", r, PAYLOAD_BAR))
     return said
 
@@ -133,17 +133,17 @@ def _judged(what: str, r: Result, bar: float) -> str:
     return f"**{what}**: {error.text()} m in the training simulator with noise; asked for: under {bar:.2f} m, {verdict}."
 
 
-def training_section(book: Book) -> Section:
+def training_section(thrown: ResultSet) -> Section:
     """Every training run with its time."""
     parts: list = []
-    if not book.runs:
+    if not thrown.runs:
         parts.append(Text("No training is recorded: `visthrow sweep run paper`, then `visthrow sweep collect paper`.", "missing"))
         return Section("training", "Training runs", tuple(parts))
-    total = sum(run.get("wall_s") or run.get("seconds") or 0.0 for run in book.runs)
-    parts.append(Text(f"{len(book.runs)} trainings, {total / 60:.0f} minutes in all, each on the device that its row names."))
+    total = sum(run.get("wall_s") or run.get("seconds") or 0.0 for run in thrown.runs)
+    parts.append(Text(f"{len(thrown.runs)} trainings, {total / 60:.0f} minutes in all, each on the device that its row names."))
     groups: dict[str, list[np.ndarray]] = {}
     rows = []
-    for run in book.runs:
+    for run in thrown.runs:
         curve = np.array([point for point in run.get("curve", []) if None not in point], dtype=float).reshape(-1, 3)
         if len(curve) > 1:
             groups.setdefault(run["run"].replace("_", " "), []).append(curve[:, [0, 2]].T)

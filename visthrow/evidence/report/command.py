@@ -41,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Throw if asked to, read, write."""
-    from visthrow.evidence.report import book
+    from visthrow.evidence.report import result_set
     from visthrow.throws.compare import writable
     from visthrow.throws.results import RECORDS
     from visthrow.training import device
@@ -58,11 +58,11 @@ def run(args: argparse.Namespace) -> int:
     writable(out)
     if args.quick:
         quick(out, jobs)
-        found = book.read((), [out / "quick" / UNITS, *folders], "quick: few throws, wide intervals")
+        found = result_set.read((), [out / "quick" / UNITS, *folders], "quick: few throws, wide intervals")
     else:
         if args.measure:
             measure(out, records, jobs)
-        found = book.read([records], folders)
+        found = result_set.read([records], folders)
     paths = page.write(out, TITLE, lead(found), sections(found))
     print(summary(found))
     for path in paths[:2]:
@@ -86,7 +86,7 @@ def quick(out: Path, jobs: int) -> None:
     """
     from importlib.util import find_spec
 
-    from visthrow.evidence.report import wanted
+    from visthrow.evidence.report import baseline_units
     from visthrow.evidence.sweep.pool import Local, Pool
     from visthrow.evidence.sweep.units import load_list
     from visthrow.throws import results
@@ -95,8 +95,8 @@ def quick(out: Path, jobs: int) -> None:
     if find_spec("mujoco") is None:
         changes = NO_REFERENCE
         _say("the reference plant is left out: it needs MuJoCo, pip install 'visthrow[reference]'")
-    local = Local(wanted.QUICK_LIST, folder, ["cpu"], jobs, changes)
-    outcome = Pool(load_list(wanted.QUICK_LIST, changes), folder, local, _say).run(None)
+    local = Local(baseline_units.QUICK_LIST, folder, ["cpu"], jobs, changes)
+    outcome = Pool(load_list(baseline_units.QUICK_LIST, changes), folder, local, _say).run(None)
     if outcome.failed:
         told = "; ".join(f"{name}: {reason}" for name, reason in outcome.failed.items())
         raise VisthrowError(f"throws failed: {told}; all that was printed is in {folder / 'logs'}")
@@ -107,7 +107,7 @@ def quick(out: Path, jobs: int) -> None:
         return
     from visthrow.baseline.thrower import fly_unit
 
-    results.work(wanted.quick(), folder / UNITS, fly_unit, None, jobs, lambda text: _say(f"TO+MPC: {text}"))
+    results.work(baseline_units.quick(), folder / UNITS, fly_unit, None, jobs, lambda text: _say(f"TO+MPC: {text}"))
 
 
 def measure(out: Path, records: Path, jobs: int) -> None:
@@ -115,13 +115,13 @@ def measure(out: Path, records: Path, jobs: int) -> None:
     import importlib
 
     from visthrow.baseline.thrower import fly_unit
-    from visthrow.evidence.report import wanted
+    from visthrow.evidence.report import baseline_units
     from visthrow.throws import results
 
     importlib.import_module("piqp")  # said here rather than by every worker
     path = records / "throws" / "baseline.json"
     known = results.load_all([path])
-    found = results.work(wanted.full(), out / UNITS, fly_unit, known, jobs, lambda text: _say(f"TO+MPC: {text}"))
+    found = results.work(baseline_units.full(), out / UNITS, fly_unit, known, jobs, lambda text: _say(f"TO+MPC: {text}"))
     results.pack(found.values(), path)
 
 

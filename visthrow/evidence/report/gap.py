@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from visthrow.common import statistics as st
-from visthrow.evidence.report.book import ANY, HARDENED, SHIPPED, Book, errors, landed
+from visthrow.evidence.report.result_set import ANY, HARDENED, SHIPPED, ResultSet, errors, landed
 from visthrow.evidence.report.throws import SHORT
 from visthrow.throws.results import Result
 from visthrow.view import figures
@@ -57,14 +57,14 @@ TRAINED = {
 """Variant of a vision training -> its name, in the order of the table."""
 
 
-def section(book: Book) -> Section:
+def section(thrown: ResultSet) -> Section:
     """Curves, what stands behind them, and the trainings."""
     panels, rows, missing = [], [], []
     for sweep in SWEEPS:
         lines = []
         for series, policy in enumerate((*SHIPPED[::-1], HARDENED)):
             if policy in sweep.policies:
-                points = curve(book, sweep, policy)
+                points = curve(thrown, sweep, policy)
                 if len(points) > 1:
                     lines.append(_line(sweep, policy, points, series))
                     rows += _rows(sweep, policy, points)
@@ -81,16 +81,16 @@ def section(book: Book) -> Section:
         parts.append(Picture("gap", figures.curves(panels, "landing error [m]", log=True), text))
         head = ("imperfection", "value", "policy", "throws", "landed", "landing error [m]", "added to its own [m]")
         parts.append(Grid("The curves in figures", head, tuple(rows), heads=1))
-    parts += _trained(book, missing)
+    parts += _trained(thrown, missing)
     if missing:
         parts.append(Text("Not thrown yet: " + "; ".join(missing) + ".", "missing"))
     return Section("gap", "What vision costs, and why", tuple(parts))
 
 
-def curve(book: Book, sweep: Sweep, policy: str) -> list[tuple[float, Result]]:
+def curve(thrown: ResultSet, sweep: Sweep, policy: str) -> list[tuple[float, Result]]:
     """Points of a curve, the policy's own value among them: value in the axis' units and throws, ascending."""
-    points = {round(sweep.scale(value), 9): r for value, r in book.by_departure(policy, sweep.key, PLANT, TARGET) if r.good.any()}
-    own = book.shipped(policy, PLANT, TARGET)
+    points = {round(sweep.scale(value), 9): r for value, r in thrown.by_departure(policy, sweep.key, PLANT, TARGET) if r.good.any()}
+    own = thrown.shipped(policy, PLANT, TARGET)
     if own is not None and points:
         points[sweep.own_of(policy)] = own
     return sorted(points.items())
@@ -112,14 +112,14 @@ def _rows(sweep: Sweep, policy: str, points: list[tuple[float, Result]]) -> list
     return rows
 
 
-def _trained(book: Book, missing: list[str]) -> list:
+def _trained(thrown: ResultSet, missing: list[str]) -> list:
     """Vision policies that were trained with other sight, each in its own simulator and on the reference plant."""
     marks, rows, plants = [], [], ("hybrid", "reference-realistic")
     for series, plant in enumerate(plants):
-        full = book.seeds("vision", "full", plant, TARGET, {})
+        full = thrown.seeds("vision", "full", plant, TARGET, {})
         for variant, title in TRAINED.items():
             own = {} if plant == "hybrid" else ANY  # a reference plant is what it is, whatever the training had
-            found = full if variant == "full" else book.seeds("vision", variant, plant, TARGET, own)
+            found = full if variant == "full" else thrown.seeds("vision", variant, plant, TARGET, own)
             if not found:
                 if variant in KNOWING:
                     continue

@@ -2,15 +2,15 @@
 
 from collections import defaultdict
 
-from visthrow.evidence.report.book import Book
+from visthrow.evidence.report.result_set import ResultSet
 from visthrow.evidence.report.throws import SHORT
 from visthrow.view.parts import Grid, Section, Text
 
 
-def section(book: Book) -> Section:
+def section(thrown: ResultSet) -> Section:
     """A row for each command and commit that made throws, and seeds."""
     groups: dict[tuple[str, ...], list] = defaultdict(list)
-    for r in book.results:
+    for r in thrown.results:
         made = r.provenance
         groups[(made.get("command", "-").split(" (")[0], str(made.get("commit", "-"))[:12], SHORT[r.unit["plant"]])].append(r)
     rows = []

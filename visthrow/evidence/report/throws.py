@@ -3,8 +3,8 @@
 import math
 
 from visthrow.common import statistics as st
-from visthrow.evidence.report.book import HARDENED, SHIPPED, Book, errors, landed, misses
-from visthrow.evidence.report.wanted import FRONT_TARGET, TARGETS
+from visthrow.evidence.report.baseline_units import FRONT_TARGET, TARGETS
+from visthrow.evidence.report.result_set import HARDENED, SHIPPED, ResultSet, errors, landed, misses
 from visthrow.throws.plants import PLANTS
 from visthrow.throws.results import Result
 from visthrow.view import figures
@@ -18,13 +18,13 @@ SHORT = {
 """Plant -> its name in tables."""
 
 
-def throws_section(book: Book) -> Section:
+def throws_section(thrown: ResultSet) -> Section:
     """Landing error and duration of the shipped policies on every plant, the paper's beside them."""
     rows, missing = [], []
     for name in (*SHIPPED, HARDENED):
         for target in TARGETS:
             for plant in PLANTS:
-                found = book.shipped(name, plant, target)
+                found = thrown.shipped(name, plant, target)
                 if found is None:
                     if wanted_there(plant, target):
                         missing.append(f"{name} at {target:g} m on the {SHORT[plant]}")
@@ -41,7 +41,7 @@ def throws_section(book: Book) -> Section:
         head = ("policy", "target [m]", "plant", "throws", "landed", "landing error [m], mean and 95 % interval", "deviation [m]",
                 "duration [s]", "bias along / left [m]", "the paper's vehicle: error [m], duration [s]")  # fmt: skip
         parts.append(Grid("Landing error and duration", head, tuple(rows), PAPER_NOTE, heads=3))
-    picture = _scatter(book)
+    picture = _scatter(thrown)
     if picture:
         parts.append(picture)
     if missing:
@@ -63,15 +63,15 @@ def _row(name: str, target: float, plant: str, found: Result) -> tuple[str, ...]
     bias = st.bias(misses([found]))
     return (
         *head, st.mean(errors([found])).text(), f"{found.of('error').std():.3f}", f"{found.of('duration').mean():.3f}",
-        f"{bias.along.value:+.3f} / {bias.aside.value:+.3f}", beside,
+        f"{bias.along.value:+.3f} / {bias.lateral.value:+.3f}", beside,
     )  # fmt: skip
 
 
-def _scatter(book: Book) -> Picture | None:
+def _scatter(thrown: ResultSet) -> Picture | None:
     for plant in ("reference-realistic", "hybrid"):
         panels = []
         for target in TARGETS:
-            found = [(name, book.shipped(name, plant, target)) for name in SHIPPED]
+            found = [(name, thrown.shipped(name, plant, target)) for name in SHIPPED]
             series = [(f"{name} policy", result.miss) for name, result in found if result is not None and result.good.any()]
             if series:
                 panels.append((f"target {target:.1f} m", series))
@@ -81,12 +81,12 @@ def _scatter(book: Book) -> Picture | None:
     return None
 
 
-def vision_section(book: Book) -> Section:
+def vision_section(thrown: ResultSet) -> Section:
     """What vision costs: difference of mean landing errors at each target, on each plant."""
     rows, marks, missing = [], [], []
     for i, plant in enumerate(PLANTS):
         for target in TARGETS:
-            pair = _groups(book, plant, target)
+            pair = _groups(thrown, plant, target)
             if pair is None:
                 if wanted_there(plant, target):
                     missing.append(f"{target:g} m on the {SHORT[plant]}")
@@ -123,12 +123,12 @@ def _minus(vision: list[Result], state: list[Result], name: str) -> st.Interval:
     return st.difference([r.of(name) for r in vision], [r.of(name) for r in state])
 
 
-def _groups(book: Book, plant: str, target: float) -> tuple[tuple[list[Result], list[Result]], str] | None:
+def _groups(thrown: ResultSet, plant: str, target: float) -> tuple[tuple[list[Result], list[Result]], str] | None:
     """Runs of both layouts: those trained for the comparison where two or more of each are there, else the shipped ones."""
-    trained = [book.seeds(layout, "full", plant, target, {}) for layout in ("vision", "state")]
+    trained = [thrown.seeds(layout, "full", plant, target, {}) for layout in ("vision", "state")]
     if min(map(len, trained)) >= 2:
         return (trained[0], trained[1]), f"{len(trained[0])} and {len(trained[1])} trainings"
-    shipped = [book.shipped(layout, plant, target) for layout in ("vision", "state")]
+    shipped = [thrown.shipped(layout, plant, target) for layout in ("vision", "state")]
     if any(result is None or not result.good.any() for result in shipped):
         return None
     return ([shipped[0]], [shipped[1]]), "shipped"

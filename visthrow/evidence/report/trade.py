@@ -6,9 +6,9 @@ import numpy as np
 
 from visthrow.baseline import front, thrower
 from visthrow.common import statistics as st
-from visthrow.evidence.report.book import SHIPPED, Book, landed
+from visthrow.evidence.report.baseline_units import BOUNDS, FRONT_TARGET, FRONT_THROWS, TARGETS
+from visthrow.evidence.report.result_set import SHIPPED, ResultSet, landed
 from visthrow.evidence.report.throws import SHORT
-from visthrow.evidence.report.wanted import BOUNDS, FRONT_TARGET, FRONT_THROWS, TARGETS
 from visthrow.throws.results import Result
 from visthrow.view import figures
 from visthrow.view.parts import Grid, Picture, Section, Text
@@ -33,13 +33,13 @@ def _default(result: Result) -> bool:
     return all(unit[name] == wanted[name] for name in ("speed", "w_t", "rho", "bounds"))
 
 
-def baseline_section(book: Book) -> Section:
+def baseline_section(thrown: ResultSet) -> Section:
     """Throws of the baseline by target, plant and compensation, broken down as in the paper."""
     rows, missing = [], []
     for target in TARGETS:
         for plant in (thrower.OWN, "hybrid", "reference-realistic"):
             for compensation in ("none",) if plant == thrower.OWN else thrower.MADE_UP:
-                found = [r for r in book.baseline(plant, compensation, target=target) if _default(r)]
+                found = [r for r in thrown.baseline(plant, compensation, target=target) if _default(r)]
                 if found:
                     rows.append(max(found, key=lambda r: r.unit["throws"]))
                 elif plant != "reference-realistic" or compensation != "none":
@@ -52,7 +52,7 @@ def baseline_section(book: Book) -> Section:
     ]  # fmt: skip
     if rows:
         parts.append(by_target(rows))
-        parts.append(Text(_bar(book), "finding"))
+        parts.append(Text(_bar(thrown), "finding"))
     parts += _steps()
     if missing:
         parts.append(Text("Not thrown: " + "; ".join(missing) + ".", "missing"))
@@ -97,11 +97,11 @@ def _steps() -> list[Grid | Text]:
     return grids
 
 
-def _bar(book: Book) -> str:
+def _bar(thrown: ResultSet) -> str:
     """Own-model errors and durations against the paper's: within 40 % of them, or better."""
     words = []
     for target in TARGETS:
-        found = [r for r in book.baseline(thrower.OWN, target=target) if _default(r) and r.good.any()]
+        found = [r for r in thrown.baseline(thrower.OWN, target=target) if _default(r) and r.good.any()]
         if found:
             best = max(found, key=lambda r: r.unit["throws"])
             error, duration, paper = best.of("error").mean(), best.of("duration").mean(), PAPER[("TO+MPC", target)]
@@ -109,22 +109,22 @@ def _bar(book: Book) -> str:
     return "In its own model: " + "; ".join(words) + "."
 
 
-def front_section(book: Book, shown: Sequence[tuple] = PANELS, names: Sequence[str] = SHIPPED) -> Section:
+def front_section(thrown: ResultSet, shown: Sequence[tuple] = PANELS, names: Sequence[str] = SHIPPED) -> Section:
     """The sweep on each plant with the policies on it, and who beats whom.
 
     Args:
-        book: the results.
+        thrown: the results.
         shown: as :data:`PANELS`.
         names: of the policies.
     """
     panels, parts, said, sums, missing = [], [], [], [], []
     for heading, plant, kinds, policies_on in shown:
         title = SHORT[plant]
-        policies = [(name, book.shipped(name, policies_on, FRONT_TARGET)) for name in names]
+        policies = [(name, thrown.shipped(name, policies_on, FRONT_TARGET)) for name in names]
         policies = [(name, result) for name, result in policies if result is not None and result.good.any()]
         drawn = []
         for compensation, bounds in kinds:
-            found = [r for r in book.baseline(plant, compensation, target=FRONT_TARGET, bounds=bounds)
+            found = [r for r in thrown.baseline(plant, compensation, target=FRONT_TARGET, bounds=bounds)
                      if r.unit["throws"] <= FRONT_THROWS or not _default(r)]  # fmt: skip
             label = _label(plant, compensation, bounds)
             if not found:
@@ -158,7 +158,7 @@ def front_section(book: Book, shown: Sequence[tuple] = PANELS, names: Sequence[s
         note = corner + "Correlations are over throws of all settings; the paper states that the error follows e_v."
         parts.append(Grid("Fronts in figures", head, tuple(sums), note, heads=2))
     parts += [Text(text, "finding") for text in said]
-    parts += _breakdown(book)
+    parts += _breakdown(thrown)
     if missing:
         parts.append(Text("Not swept: " + "; ".join(missing) + ".", "missing"))
     return Section("front", "Agility against accuracy", tuple(parts))
@@ -245,9 +245,9 @@ def _count(points: Sequence) -> str:
     return f"{len(points)} setting" + ("" if len(points) == 1 else "s")
 
 
-def _breakdown(book: Book) -> list[Grid]:
+def _breakdown(thrown: ResultSet) -> list[Grid]:
     """The paper's table of settings, and ours of the own model."""
-    found = [r for r in book.baseline(thrower.OWN, target=FRONT_TARGET) if r.unit["throws"] <= FRONT_THROWS or not _default(r)]
+    found = [r for r in thrown.baseline(thrower.OWN, target=FRONT_TARGET) if r.unit["throws"] <= FRONT_THROWS or not _default(r)]
     if not found:
         return []
     rows = [

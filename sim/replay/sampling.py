@@ -10,16 +10,16 @@ from sim.replay.sensing import build_sensing
 
 
 @dataclass(frozen=True)
-class Telling:
-    """Functions of :func:`build_telling` and the structs that they take."""
+class Sampling:
+    """Functions of :func:`build_sampling` and the structs that they take."""
 
-    tell: wp.Function
-    inherit: wp.Function
+    sample: wp.Function
+    copy_samples: wp.Function
     Steps: type  # a step's two ends and its length [s]
-    Pointers: type  # how many stamps of each sensor were told
+    Pointers: type  # how many stamps of each sensor were sampled
 
 
-def build_telling(t: Types, Sensing: type, Windows: type, Data: type) -> Telling:
+def build_sampling(t: Types, Sensing: type, Windows: type, Data: type) -> Sampling:
     """Build what a lane does at the end of each step.
 
     Args:
@@ -52,11 +52,11 @@ def build_telling(t: Types, Sensing: type, Windows: type, Data: type) -> Telling
         return stamp - delay - x.clock_rate * (stamp - windows.clock_zero[w])
 
     @wp.func
-    def tell(
+    def sample(
         p: Vehicle, x: Sensing, data: Data, windows: Windows, w: int, a: QuadState, b: QuadState, before: vec3,
         pa: vec3, va: vec3, pb: vec3, vb: vec3, k: Steps, last: bool, at: Pointers, out: wp.array2d(dtype=vec3), lane: int,
     ):  # fmt: skip
-        """Write every measured stamp that falls into a step; the window's last step tells all that is left."""
+        """Write every measured stamp that falls into a step; the window's last step samples all that is left."""
         next = at
         vehicles = windows.vehicle_count[w]
         payloads = windows.payload_count[w]
@@ -94,7 +94,7 @@ def build_telling(t: Types, Sensing: type, Windows: type, Data: type) -> Telling
         return next
 
     @wp.func
-    def inherit(windows: Windows, w: int, at: Pointers, parent: int, lane: int, out: wp.array2d(dtype=vec3)):
+    def copy_samples(windows: Windows, w: int, at: Pointers, parent: int, lane: int, out: wp.array2d(dtype=vec3)):
         """What was seen before a lane leaves another."""
         vehicles = windows.vehicle_count[w]
         for i in range(2 * at.vehicle):
@@ -105,4 +105,4 @@ def build_telling(t: Types, Sensing: type, Windows: type, Data: type) -> Telling
         for i in range(first, first + at.gyro):
             out[i, lane] = out[i, parent]
 
-    return Telling(tell, inherit, Steps, Pointers)
+    return Sampling(sample, copy_samples, Steps, Pointers)

@@ -54,7 +54,7 @@ class _Trial:
     residuals: list[np.ndarray]
 
 
-class Settling:
+class InitialFit:
     """Fits the states of the windows that count in one setting."""
 
     def __init__(

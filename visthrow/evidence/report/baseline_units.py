@@ -23,7 +23,7 @@ QUICK_LIST = "quick"
 
 
 def full() -> list[dict[str, Any]]:
-    """Units of the committed record ``baseline``: the cheap and telling ones first."""
+    """Units of the committed record ``baseline``: the cheap and informative ones first."""
     made_up = [*_front(), *_on_reference("both", 20, front.SPEEDS[1::2])]
     return [*_by_target(50), *made_up, *_late_front(), *_on_reference("delay", 20, front.SPEEDS[1:2])]
 

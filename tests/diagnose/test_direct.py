@@ -17,8 +17,8 @@ from tests.worlds.world import CAMERA_FLOORS, Recipe, fly_recipe, recorded
 from visthrow import config
 from visthrow.config.effects import catalogue
 from visthrow.diagnose.throw.cutting import cut
+from visthrow.diagnose.throw.direct import MEASURED, CameraView, _noise
 from visthrow.diagnose.throw.recorded import record_of
-from visthrow.diagnose.throw.sightings import MEASURED, CameraView, _noise
 from visthrow.task import Experiment, plant_of
 
 BOX = 0.5

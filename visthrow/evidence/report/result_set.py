@@ -22,7 +22,7 @@ ANY = object()
 
 
 @dataclass(frozen=True)
-class Book:
+class ResultSet:
     """Results, training runs and findings.
 
     Attributes:
@@ -92,7 +92,7 @@ def _first(value: Any) -> float:
     return float(value[0] if isinstance(value, list) else value)
 
 
-def read(records: Iterable[Path] = (RECORDS,), folders: Iterable[Path] = (), note: str = "") -> Book:
+def read(records: Iterable[Path] = (RECORDS,), folders: Iterable[Path] = (), note: str = "") -> ResultSet:
     """Read committed records, and folders of single results; what an older protocol flew is left out.
 
     Args:
@@ -113,7 +113,7 @@ def read(records: Iterable[Path] = (RECORDS,), folders: Iterable[Path] = (), not
         for path in sorted((place / "findings").glob("*.md")):
             findings[path.stem] = path.read_text(encoding="utf-8").strip()
     today = [result for result in found if result.unit.get("protocol") == PROTOCOL]
-    return Book(tuple(join(today)), tuple(runs.values()), findings, note)
+    return ResultSet(tuple(join(today)), tuple(runs.values()), findings, note)
 
 
 def _runs(path: Path) -> list[dict[str, Any]]:

@@ -1,4 +1,4 @@
-"""What is measured besides poses and told without a simulation: where payloads landed, and what a camera saw.
+"""Measurements that are predicted without a simulation: where payloads landed, and what a camera saw.
 
 Each kind predicts its samples from what motion capture saw, taken back through the setting's delays, frame and markers, so that
 it depends on sensors, camera and landing plane alone. Its samples stand behind the simulated ones of their window.
@@ -38,7 +38,7 @@ ACTS_ON = ("camera.", "plant.release.landing_height", "plant.rope.payload_radius
 """Numbers that nothing but these samples depends on: their effects need no simulation."""
 
 
-class Sighting(Protocol):
+class DirectMeasurement(Protocol):
     """Samples of one channel in each window."""
 
     channel: str
@@ -53,21 +53,23 @@ class Sighting(Protocol):
 
 
 def channels_of(logs: Sequence[FlightLog], flights: Sequence[Recorded], camera: CameraParams | None) -> list[str]:
-    """Channels of the sightings that the logs hold."""
+    """Channels of the direct measurements that the logs hold."""
     landed = any(f.landing_point is not None and f.latch != NEVER for f in flights)
     looked = camera is not None and any(seen_by_camera(log) and f.payload is not None for log, f in zip(logs, flights))
     return [LANDING] * landed + [KEYPOINTS] * looked
 
 
-def sightings(logs: Sequence[FlightLog], flights: Sequence[Recorded], cuts: Sequence[Cut], setting: Setting) -> list[Sighting]:
+def direct_measurements(
+    logs: Sequence[FlightLog], flights: Sequence[Recorded], cuts: Sequence[Cut], setting: Setting
+) -> list[DirectMeasurement]:
     """All that the logs hold of windows that count."""
     held = channels_of(logs, flights, setting.camera)
-    heights: list[Sighting] = [LandingHeight(flights, cuts)] if LANDING in held else []
+    heights: list[DirectMeasurement] = [LandingHeight(flights, cuts)] if LANDING in held else []
     return heights + ([CameraView(logs, flights, cuts, setting)] if KEYPOINTS in held else [])
 
 
 def needs_no_flight(e: SettingEffect) -> bool:
-    """Whether nothing but sightings shows an effect."""
+    """Whether nothing but direct measurements shows an effect."""
     return bool(e.changes) and all(key.path.startswith(ACTS_ON) for key in e.changes)
 
 
@@ -79,15 +81,15 @@ def seen_by_camera(log: FlightLog) -> bool:
     return seen and measured(log, KEYPOINTS) is not None and "keypoints_valid" in log
 
 
-def with_sightings(
-    window: Window, number: int, kinds: Sequence[Sighting], channels: Sequence[str], settings: Sequence[Setting], steps: np.ndarray
+def with_direct(
+    window: Window, number: int, kinds: Sequence[DirectMeasurement], channels: Sequence[str], settings: Sequence[Setting], steps: np.ndarray
 ) -> Window:
-    """A window with its sightings behind the simulated samples.
+    """A window with its direct measurements behind the simulated samples.
 
     Args:
         window: with a column for every effect.
         number: of the window.
-        kinds: of sightings.
+        kinds: of direct measurements.
         channels: of the model.
         settings: the one that is linearised about, then one for each effect, a step away.
         steps: of the effects, 0 for those without a derivative here, shape (K,).
@@ -134,14 +136,14 @@ class LandingHeight:
                 self._points[own[-1]] = flight.landing, flight.landing_point
 
     def samples(self, window: int) -> tuple[np.ndarray, np.ndarray, float]:
-        """See :class:`Sighting`."""
+        """See :class:`DirectMeasurement`."""
         if window not in self._points:
             return np.zeros(0), np.zeros(0), LANDING_SIGMA
         time, point = self._points[window]
         return np.array([time]), point[2:], LANDING_SIGMA
 
     def predicted(self, window: int, setting: Setting) -> np.ndarray:
-        """See :class:`Sighting`."""
+        """See :class:`DirectMeasurement`."""
         x, point = setting.sensing, self._points[window][1]
         there = _origin(x, point[None])[0] - np.array(x.payload_offset)
         there[2] = setting.plant.release.landing_height
@@ -168,7 +170,7 @@ class CameraView:
                     self._windows[w] = view
 
     def samples(self, window: int) -> tuple[np.ndarray, np.ndarray, float]:
-        """See :class:`Sighting`."""
+        """See :class:`DirectMeasurement`."""
         if window not in self._windows:
             return np.zeros(0), np.zeros(0), LEAST_KEYPOINT_SIGMA
         view = self._windows[window]
@@ -176,7 +178,7 @@ class CameraView:
         return time[view["valid"]].ravel(), view["points"][view["valid"]].ravel(), view["sigma"]
 
     def predicted(self, window: int, setting: Setting) -> np.ndarray:
-        """See :class:`Sighting`; NaN where the lens is none."""
+        """See :class:`DirectMeasurement`; NaN where the lens is none."""
         view, x = self._windows[window], setting.sensing
         try:
             lens = self._nominal.camera
