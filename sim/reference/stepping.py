@@ -18,21 +18,6 @@ LARGEST_TURN = 0.25
 MOST_HALVINGS = 6
 
 
-def rk4(rates: Callable[[np.ndarray], np.ndarray], state: np.ndarray, step: float | np.ndarray) -> np.ndarray:
-    """Take one classical Runge-Kutta step of order 4.
-
-    Args:
-        rates: function from state to its time derivative.
-        state: shape (E, N).
-        step: [s], a number or shape (E, 1).
-    """
-    k1 = rates(state)
-    k2 = rates(state + 0.5 * step * k1)
-    k3 = rates(state + 0.5 * step * k2)
-    k4 = rates(state + step * k3)
-    return state + step / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
-
-
 def halving_rk4(
     rates: Callable[[np.ndarray, np.ndarray], np.ndarray],
     state: np.ndarray,

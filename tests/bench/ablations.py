@@ -164,11 +164,11 @@ def on_held_back(base: str, theta: Mapping[str, float], lacks: str, logs: Sequen
 
     Returns:
         ``before``, ``after``: nats by which the throws are explained worse by the model as it was, and with what was named,
-        than by the model with the block that it lacks; see :func:`visthrow.diagnose.reporting.gain.shortfalls`. ``landing_before``,
+        than by the model with the block that it lacks; see :func:`tests.diagnose.shortfalls.shortfalls`. ``landing_before``,
         ``landing_after``, ``landing_whole``: mean distance of predicted and seen landings [m], open loop from a second before
         the separation; None where one never comes down.
     """
-    from visthrow.diagnose.reporting.gain import shortfalls
+    from tests.diagnose.shortfalls import shortfalls
     from visthrow.diagnose.throw.throw_model import ThrowModel
 
     sizes: list[Mapping[str, float]] = [{}, theta, {lacks: 1.0}]

@@ -18,10 +18,9 @@ from typing import Any
 import torch
 
 from tests.bench.figures import json_lines
-from tests.bench.processes import CONFIGS, ENDED, Pair, own_cores
+from tests.bench.processes import CONFIGS, ENDED, Pair, own_cores, side_by_side
 from tests.bench.soak import STILL, never_releasing
 from visthrow.common.errors import VisthrowError, suggest
-from visthrow.common.workers import side_by_side
 from visthrow.evidence.bench.records import Report, Table
 from visthrow.onboard.actions import hover_action
 from visthrow.onboard.hover import GRAVITY

@@ -9,7 +9,9 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor
+from concurrent.futures import wait as wait_for
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -48,6 +50,24 @@ def own_cores(jobs: int) -> list[tuple[int | None, int | None]]:
     if len(usable) <= 2 * jobs:
         return [(None, None)] * jobs
     return [(usable[2 * job], usable[2 * job + 1]) for job in range(jobs)]
+
+
+def side_by_side(what: Callable[[Any, Any], Any], items: Iterable[Any], places: Sequence[Any]) -> Iterator[Any]:
+    """Yield what is made of each item in a thread, as they are done; as many at once as there are places, one a place.
+
+    After an error nothing more is begun.
+    """
+    free, todo, running = list(reversed(places)), iter(items), {}
+    with ThreadPoolExecutor(len(places)) as pool:
+        while True:
+            while free and (item := next(todo, None)) is not None:
+                place = free.pop()
+                running[pool.submit(what, item, place)] = place
+            if not running:
+                return
+            for future in wait_for(running, return_when=FIRST_COMPLETED).done:
+                free.append(running.pop(future))
+                yield future.result()
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,9 @@ from typing import Any
 import numpy as np
 
 from tests.bench.figures import bootstrap_upper, finite, json_lines
-from tests.bench.processes import COMMAND, Pair, own_cores
+from tests.bench.processes import COMMAND, Pair, own_cores, side_by_side
 from visthrow.common import statistics
 from visthrow.common.errors import VisthrowError
-from visthrow.common.workers import side_by_side
 from visthrow.evidence.bench.records import Report, Table
 
 MEAN, RATIO = 0.10, 1.3

@@ -28,7 +28,7 @@ def named(path: Path) -> str:
 
 @pytest.mark.parametrize("path", FILES, ids=named)
 def test_fills_its_schema(path):
-    schema = kinds.schema_of_file(path)
+    schema = kinds.schema_of(path.parent.name, path.stem)
     loaded = config.load(schema, path)
     assert config.loads(schema, config.dumps(loaded)) == loaded
 

@@ -151,11 +151,11 @@ def ask(logs: list[Path], model: list[str], folder: Path, device: str = "cpu", t
 def on_held_back(recipe: Recipe, theta: dict[str, float], held: Path) -> dict[str, float]:
     """Nats by which the throws held back are explained worse by the model as it was, and by the verdict's sizes, than by the truth.
 
-    See :func:`~visthrow.diagnose.reporting.gain.shortfalls`; the truth is the ``oracle``, with 0, and ``samples`` their number. A law
+    See :func:`~tests.diagnose.shortfalls.shortfalls`; the truth is the ``oracle``, with 0, and ``samples`` their number. A law
     outside the catalogue has no size: it is the model as it was then that has 0.
     """
+    from tests.diagnose.shortfalls import shortfalls
     from visthrow import config
-    from visthrow.diagnose.reporting.gain import shortfalls
     from visthrow.diagnose.throw.throw_model import ThrowModel
     from visthrow.task import Experiment, plant_of
 

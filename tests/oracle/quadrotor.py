@@ -1,5 +1,6 @@
 """Quadrotors without a rope: the seven blocks of the reference plant on free rigid bodies, float64 RK4 in NumPy."""
 
+from collections.abc import Callable
 from itertools import pairwise
 
 import numpy as np
@@ -8,7 +9,21 @@ from sim.params import GRAVITY, VehicleParams
 from sim.reference import blocks
 from sim.reference.quadrotor import BODY, VehicleErrors, initial_blocks, rigid_body_rates, vehicle_rates
 from sim.reference.rotations import rotation_from_quat, turned, turned_back
-from sim.reference.stepping import rk4
+
+
+def rk4(rates: Callable[[np.ndarray], np.ndarray], state: np.ndarray, step: float | np.ndarray) -> np.ndarray:
+    """Take one classical Runge-Kutta step of order 4.
+
+    Args:
+        rates: function from state to its time derivative.
+        state: shape (E, N).
+        step: [s], a number or shape (E, 1).
+    """
+    k1 = rates(state)
+    k2 = rates(state + 0.5 * step * k1)
+    k3 = rates(state + 0.5 * step * k2)
+    k4 = rates(state + step * k3)
+    return state + step / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
 
 
 class ReferenceQuadrotor:

@@ -14,8 +14,7 @@ from sim.reference.quadrotor import (
     rotor_arms,
     vehicle_rates,
 )
-from sim.reference.stepping import rk4
-from tests.oracle.quadrotor import ReferenceQuadrotor
+from tests.oracle.quadrotor import ReferenceQuadrotor, rk4
 from tests.plants import paper_plant, plain_vehicle
 
 EXACT = 1e-12

@@ -1,4 +1,4 @@
-"""Work done side by side: computations in processes of their own, and what waits for other processes in threads.
+"""Work done side by side: computations in processes of their own.
 
 Results come as they are done. An error, Ctrl-C or leaving early ends the processes. To go on with what was interrupted, a caller
 keeps each result as it comes and leaves out what is there.
@@ -10,9 +10,7 @@ import signal
 import sys
 import time
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor
-from concurrent.futures import wait as wait_for
+from collections.abc import Callable, Iterable, Iterator
 from multiprocessing.connection import wait
 from typing import Any
 
@@ -126,21 +124,3 @@ def _serve(end: Any, work: bytes, taken: Any, shares: Any) -> None:
     except Exception as error:
         error.add_note(f"in a worker process:\n{traceback.format_exc()}")
         end.send((None, error))
-
-
-def side_by_side(what: Callable[[Any, Any], Any], items: Iterable[Any], places: Sequence[Any]) -> Iterator[Any]:
-    """Yield what is made of each item in a thread, as they are done; as many at once as there are places, one a place.
-
-    After an error nothing more is begun.
-    """
-    free, todo, running = list(reversed(places)), iter(items), {}
-    with ThreadPoolExecutor(len(places)) as pool:
-        while True:
-            while free and (item := next(todo, None)) is not None:
-                place = free.pop()
-                running[pool.submit(what, item, place)] = place
-            if not running:
-                return
-            for future in wait_for(running, return_when=FIRST_COMPLETED).done:
-                free.append(running.pop(future))
-                yield future.result()

@@ -1,7 +1,6 @@
 """Which schema each folder of configs, and each file that differs from its folder, is read with."""
 
 import importlib
-from pathlib import Path
 
 from visthrow.common.errors import ConfigError, suggest
 
@@ -41,9 +40,3 @@ def schema_of(kind: str, name: str = "") -> type:
 def kinds_of(schema: type) -> list[str]:
     """Return the folders of configs whose files fill a schema: none for one that no shipped config has."""
     return [key for key, target in SCHEMAS.items() if target == f"{schema.__module__}:{schema.__name__}" and "/" not in key]
-
-
-def schema_of_file(path: str | Path) -> type:
-    """Return the schema of a config file from its folder's and its own name."""
-    path = Path(path)
-    return schema_of(path.resolve().parent.name, path.stem)

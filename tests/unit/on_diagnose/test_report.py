@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from tests.diagnose.shortfalls import shortfalls
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
 from visthrow.common.errors import DiagnoseError
 from visthrow.common.storage import write_json
@@ -94,7 +95,7 @@ def test_shortfall_is_the_likelihood_ratio_of_a_linear_model(found):
     problem = replace(diagnosis.work.problem, kept=tuple(range(len(model.windows({})))))
     theta = np.array([TRUTH.get(e.name, 0.0) for e in EFFECTS])
     there = point.linearise(problem, theta)
-    (nats, same), samples = gain.shortfalls(model, [{}, problem.sizes(theta)])
+    (nats, same), samples = shortfalls(model, [{}, problem.sizes(theta)])
     expected = 0.5 * theta @ there.information @ theta + theta @ there.statistics.score.sum(0)
     assert same == 0.0
     assert samples == there.statistics.samples.sum()

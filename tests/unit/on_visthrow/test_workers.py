@@ -6,8 +6,9 @@ import time
 
 import pytest
 
+from tests.bench.processes import side_by_side
 from visthrow.common.errors import VisthrowError
-from visthrow.common.workers import Workers, done, progress, side_by_side
+from visthrow.common.workers import Workers, done, progress
 
 
 def squared(number: float) -> float:
