@@ -42,6 +42,12 @@ def rotate_back(quat: np.ndarray, vector: np.ndarray) -> np.ndarray:
     return rotate(quat * [-1.0, -1.0, -1.0, 1.0], vector)
 
 
+def continuous(quat: np.ndarray) -> np.ndarray:
+    """Return a series of quaternions, shape (T, 4), with signs under which neighbours differ least."""
+    signs = np.where(np.sum(quat[1:] * quat[:-1], axis=1) < 0.0, -1.0, 1.0)
+    return quat * np.cumprod(np.append(1.0, signs))[:, None]
+
+
 def turned(quat: np.ndarray, angle: np.ndarray) -> np.ndarray:
     """Return unit quaternions, shape (N, 4), turned about body axes by small angles [rad], shape (N, 3)."""
     x, w, half = quat[:, :3], quat[:, 3:], 0.5 * angle

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from visthrow.common.rotations import continuous
 from visthrow.logs.check.rows import Row
 from visthrow.logs.flightlog import Channel, FlightLog
 
@@ -173,8 +174,7 @@ def _railed(name: str, values: np.ndarray) -> list[Row]:
 def _jumps(name: str, values: np.ndarray, time: np.ndarray, unit: str) -> list[Row]:
     """Steps that no motion makes, from sample to sample and across gaps."""
     if "quat" in name:
-        signs = np.sign(np.sum(values[1:] * values[:-1], axis=1))
-        values = values * np.cumprod(np.concatenate([[1.0], np.where(signs == 0.0, 1.0, signs)]))[:, None]
+        values = continuous(values)
     size, steps = np.linalg.norm(np.diff(values, axis=0), axis=1), np.diff(time)
     usual = np.maximum(np.percentile(size, 99), 1e-9)
     near = steps < 5 * np.median(steps)

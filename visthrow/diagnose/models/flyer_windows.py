@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from visthrow.common.errors import LogError
-from visthrow.common.rotations import matrix_of_quat
+from visthrow.common.rotations import continuous, matrix_of_quat
 from visthrow.diagnose.models.flyer_params import FlyerParams
 from visthrow.diagnose.models.numeric import Stretch, latent_layout, sigma_of
 from visthrow.logs.flightlog import Channel, FlightLog
@@ -127,9 +127,7 @@ def _attitudes(channel: Channel, times: np.ndarray) -> np.ndarray:
     """Rotations at the half steps, shape (half steps, 3, 3): quaternions interpolated and brought to unit length."""
     time, quat = channel.time[channel.valid], channel.values[channel.valid].astype(float)
     near = slice(max(np.searchsorted(time, times[0]) - 2, 0), np.searchsorted(time, times[-1]) + 2)
-    time, quat = time[near], quat[near]
-    signs = np.sign(np.sum(quat[1:] * quat[:-1], axis=1))
-    quat = quat * np.cumprod(np.concatenate([[1.0], np.where(signs == 0.0, 1.0, signs)]))[:, None]
+    time, quat = time[near], continuous(quat[near])
     return matrix_of_quat(np.column_stack([np.interp(times, time, column) for column in quat.T]))
 
 

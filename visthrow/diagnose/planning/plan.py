@@ -198,15 +198,20 @@ def _classes(diagnosis: Diagnosis, new: np.ndarray, pairs: Sequence[tuple[int, i
     def gaps(count: int) -> list[float]:
         return [_gap(diagnosis, base.information, base.score, count * new, priors, pair) for pair in pairs]
 
-    once = gaps(1)
-    best, apart, repeats = 0, [], 0
+    apart = _most(lambda count: [pair for pair, gap in zip(pairs, gaps(count)) if gap > DECISIVE], len(pairs))
+    return float(min(gaps(1))), *apart
+
+
+def _most(settled: Callable[[int], list], all_of_them: int) -> tuple[list, int]:
+    """What the fewest flights settle that settle the most, and their number."""
+    best: tuple[list, int] = [], 0
     for count in range(1, MOST_REPEATS + 1):
-        now = [pair for pair, gap in zip(pairs, gaps(count)) if gap > DECISIVE]
-        if len(now) > best:
-            best, apart, repeats = len(now), now, count
-        if best == len(pairs):
+        now = settled(count)
+        if len(now) > len(best[0]):
+            best = now, count
+        if len(best[0]) == all_of_them:
             break
-    return float(min(once)), apart, repeats
+    return best
 
 
 def _shrinking(information: np.ndarray, new: np.ndarray, priors: Priors, vague: Sequence[int], active: Sequence[int]):
@@ -219,15 +224,12 @@ def _shrinking(information: np.ndarray, new: np.ndarray, priors: Priors, vague: 
         return 0.0, [], 0
     before, once = deviations(information), deviations(information + new)
     able = np.array([priors.slab[j] for j in vague]) * NAMEABLE
-    best, shown, repeats = 0, [], 0
-    for count in range(1, MOST_REPEATS + 1):
+
+    def shown(count: int) -> list[tuple[int]]:
         after = deviations(information + count * new)
-        now = [(j,) for j, shows in zip(vague, (after < able) & (able < before)) if shows]
-        if len(now) > best:
-            best, shown, repeats = len(now), now, count
-        if best == len(vague):
-            break
-    return float(np.mean(np.log(before / once))), shown, repeats
+        return [(j,) for j, shows in zip(vague, (after < able) & (able < before)) if shows]
+
+    return float(np.mean(np.log(before / once))), *_most(shown, len(vague))
 
 
 def write_references(folder: str | Path, manoeuvres: Sequence[Manoeuvre], proposals: Sequence[Proposal]) -> list[Proposal]:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from visthrow.common.errors import DiagnoseError
+from visthrow.common.rotations import continuous
 from visthrow.diagnose.likelihood.noise import highpass_sigma
 from visthrow.logs.check.relations import attitude_at
 from visthrow.logs.flightlog import Channel, FlightLog
@@ -80,9 +81,7 @@ def _samples(log: FlightLog, name: str) -> Samples | None:
         return None
     time, values = time[fresh], values[fresh]
     if name == "quat_wb":
-        values = values / np.linalg.norm(values, axis=1, keepdims=True)
-        flips = np.cumprod(np.sign(np.append(1.0, np.sum(values[1:] * values[:-1], axis=1)) + 1e-12))
-        values = values * np.sign(flips)[:, None]
+        values = continuous(values / np.linalg.norm(values, axis=1, keepdims=True))
         sigma = 2.0 * float(np.sqrt(np.sum(highpass_sigma(values) ** 2) / 3.0))  # an angle moves three of four by its half
     else:
         sigma = float(np.median(highpass_sigma(values)))

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from visthrow.common.rotations import continuous
 from visthrow.logs.axes import EVERY, MATRICES, is_mirror
 
 REACH = 0.4
@@ -167,5 +168,4 @@ def mean_over(time: np.ndarray, values: np.ndarray, at: np.ndarray, span: float)
 
 def attitude_at(time: np.ndarray, quat: np.ndarray, at: np.ndarray) -> Rotation:
     """Attitudes xyzw between samples, straight through the quaternions."""
-    signs = np.where(np.sum(quat[1:] * quat[:-1], axis=1) < 0.0, -1.0, 1.0)
-    return Rotation.from_quat(on_grid(time, quat * np.cumprod(np.concatenate([[1.0], signs]))[:, None], at))
+    return Rotation.from_quat(on_grid(time, continuous(quat), at))
