@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from sim.arrays.state import NONFINITE
-from sim.reference.oracle import OracleRun, converged
 from sim.reference.scene import Scene
+from tests.oracle.converged import OracleRun, converged
 from tests.plants import SCENES
 from tests.scenes import load_scene
 from tests.simulators import Flight, fly

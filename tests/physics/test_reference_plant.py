@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from sim.params import GRAVITY
-from sim.reference.oracle import converged
 from sim.reference.plant import ReferencePlant
 from sim.reference.scene import Wrench
 from tests.oracle.bare_rope import BareScene
+from tests.oracle.converged import converged
 from tests.oracle.quadrotor import ReferenceQuadrotor
 from tests.plants import SCENES, paper_plant, plain_plant
 from tests.scenes import load_scene

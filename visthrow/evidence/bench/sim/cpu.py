@@ -113,27 +113,23 @@ def longest_accurate_step(error: Callable[[float], float], duration: float, tole
 
 def contenders(plant: Any) -> tuple[dict[str, Any], dict[str, tuple[float, float]]]:
     """MuJoCo's two scenes, and how far (ball, vehicle) [m] each contender ends from the converged hard throw."""
-    from sim.reference.oracle import converged
-    from visthrow.evidence.bench.sim import mujoco_c as bench_scenes
-    from visthrow.evidence.bench.sim import scenes
+    from visthrow.evidence.bench.sim import mujoco_c, scenes
 
     hard = scenes.HARD_THROW
+    truth = mujoco_c.end_of_scene(hard)
 
-    def ends(**how: Any) -> tuple:
-        run = converged(hard, **how)
-        return run.ball_pos_w[-1], run.pos_w[-1]
+    def off(*how: Any) -> tuple[float, float]:
+        return scenes.distance(mujoco_c.end_of_scene(hard, *how), truth)
 
-    truth = ends()
-    step = longest_accurate_step(lambda h: max(scenes.distance(ends(step=h), truth)), hard.duration, TOLERANCE)
-    implicit = {"step": bench_scenes.IMPLICIT_STEP, "armature": bench_scenes.ARMATURE}
+    step = longest_accurate_step(lambda h: max(off(h)), hard.duration, TOLERANCE)
+    implicit = (mujoco_c.IMPLICIT_STEP, "implicitfast", mujoco_c.ARMATURE)
     errors = {
-        "ours": scenes.distance(scenes.end_of_scene(hard, plant), truth),
-        "RK4": scenes.distance(ends(step=step), truth),
-        "implicitfast": scenes.distance(ends(integrator="implicitfast", **implicit), truth),
-    }
+        "ours": scenes.distance(scenes.end_of_scene(hard, plant), truth), "RK4": off(step), "implicitfast": off(*implicit),
+    }  # fmt: skip
+    name = f"MuJoCo C, implicitfast, armature {mujoco_c.ARMATURE:g}, {mujoco_c.IMPLICIT_STEP * 1e3:g} ms"
     return {
-        "RK4": bench_scenes.rk4_scene(hard, step),
-        "implicitfast": bench_scenes.implicitfast_scene(hard, **implicit),
+        "RK4": mujoco_c.timed_scene(hard, f"MuJoCo C, RK4, {step * 1e3:g} ms", step),
+        "implicitfast": mujoco_c.timed_scene(hard, name, *implicit),
     }, errors
 
 

@@ -7,9 +7,10 @@ import dataclasses
 from collections.abc import Callable
 
 import mujoco
+import numpy as np
 
 from sim.reference.model import build_attached
-from sim.reference.oracle import initial_data, rope_from_scene
+from sim.reference.oracle import CONVERGED_STEP, initial_data, rope_from_scene
 from sim.reference.scene import Scene
 
 ARMATURE = 2e-7
@@ -26,12 +27,35 @@ class BenchScene:
     advance: Callable[[int], None]  # so many steps; starts the scene anew whenever it has ended
 
 
-def _build(scene: Scene, name: str, step: float, integrator: int, armature: float) -> BenchScene:
+def started(scene: Scene, step: float, integrator: str, armature: float) -> tuple[mujoco.MjModel, mujoco.MjData]:
+    """MuJoCo's model and data at the start of a scene, whose first wrench acts throughout.
+
+    Args:
+        scene: the rope and its start.
+        step: [s]. integrator: RK4 or implicitfast. armature: of the hinges [kg m^2].
+    """
     model = build_attached(rope_from_scene(scene), "universal", armature)
-    model.opt.timestep, model.opt.integrator = step, integrator
-    data = initial_data(model, scene)
+    model.opt.timestep, model.opt.integrator = step, getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
+    data, first = initial_data(model, scene), scene.schedule[0]
+    data.ctrl[:] = (*first.force_b, *first.torque_b)
+    return model, data
+
+
+def end_of_scene(
+    scene: Scene, step: float = CONVERGED_STEP, integrator: str = "RK4", armature: float = 0.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Positions of ball and vehicle at the end of a scene [m], shape (3,) each, world frame; arguments as of :func:`started`."""
+    model, data = started(scene, step, integrator, armature)
+    mujoco.mj_step(model, data, round(scene.duration / step))
+    mujoco.mj_forward(model, data)  # after mj_step the derived fields describe the state before it
+    direction = -data.xmat[-1].reshape(3, 3)[:, 2]
+    return data.xpos[-1] + (scene.segment_length + scene.ball_offset) * direction, data.qpos[:3].copy()
+
+
+def timed_scene(scene: Scene, name: str, step: float, integrator: str = "RK4", armature: float = 0.0) -> BenchScene:
+    """A rope that runs in C; arguments as of :func:`started`."""
+    model, data = started(scene, step, integrator, armature)
     start = data.qpos.copy(), data.qvel.copy()
-    first = scene.schedule[0]
     length, done = round(scene.duration / step), 0
 
     def advance(count: int) -> None:
@@ -44,21 +68,4 @@ def _build(scene: Scene, name: str, step: float, integrator: int, armature: floa
             done += stretch
             count -= stretch
 
-    data.ctrl[:] = (*first.force_b, *first.torque_b)
     return BenchScene(name, step, advance)
-
-
-def rk4_scene(scene: Scene, step: float) -> BenchScene:
-    """Return the physical rope with MuJoCo's RK4; the schedule's first wrench acts throughout.
-
-    Args:
-        scene: the rope and its start.
-        step: [s]; for a fair figure the longest that is accurate, see :mod:`visthrow.evidence.bench.sim.cpu`.
-    """
-    return _build(scene, f"MuJoCo C, RK4, {step * 1e3:g} ms", step, mujoco.mjtIntegrator.mjINT_RK4, 0.0)
-
-
-def implicitfast_scene(scene: Scene, step: float = IMPLICIT_STEP, armature: float = ARMATURE) -> BenchScene:
-    """Return the rope with armature and MuJoCo's implicitfast: fast, and about a centimetre off in the hard throw."""
-    name = f"MuJoCo C, implicitfast, armature {armature:g}, {step * 1e3:g} ms"
-    return _build(scene, name, step, mujoco.mjtIntegrator.mjINT_IMPLICITFAST, armature)

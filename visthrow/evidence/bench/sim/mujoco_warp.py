@@ -21,18 +21,9 @@ MISSING = (
 
 
 def _model() -> tuple[Any, Any]:
-    import mujoco
+    from visthrow.evidence.bench.sim import mujoco_c
 
-    from sim.reference.model import build_attached
-    from sim.reference.oracle import initial_data, rope_from_scene
-    from visthrow.evidence.bench.sim import mujoco_c as bench_scenes
-
-    model = build_attached(rope_from_scene(HARD_THROW), "universal", bench_scenes.ARMATURE)
-    model.opt.timestep, model.opt.integrator = bench_scenes.IMPLICIT_STEP, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    data = initial_data(model, HARD_THROW)
-    wrench = HARD_THROW.schedule[0]
-    data.ctrl[:] = (*wrench.force_b, *wrench.torque_b)
-    return model, data
+    return mujoco_c.started(HARD_THROW, mujoco_c.IMPLICIT_STEP, "implicitfast", mujoco_c.ARMATURE)
 
 
 class Worlds:

@@ -1,0 +1,29 @@
+"""How far models fall short of the true one on flights that none of them was found in."""
+
+from collections.abc import Mapping, Sequence
+
+from visthrow.diagnose.likelihood import designs
+from visthrow.diagnose.likelihood import noise as levels
+from visthrow.diagnose.likelihood.evidence import Priors
+from visthrow.diagnose.likelihood.marginal import gram_of, window_statistics
+from visthrow.diagnose.models.interface import Model
+
+
+def shortfalls(model: Model, sizes: Sequence[Mapping[str, float]]) -> tuple[list[float], int]:
+    """How much worse than by the last of some sizes flights are explained that none of them was found in.
+
+    Initial states and gusts are integrated out (a forecast without gusts would mostly measure those); the levels of noise and
+    gusts are those of the last sizes.
+
+    Returns:
+        Nats by which each likelihood falls short of the last one, and the number of samples.
+    """
+    channels, priors = len(model.channels), Priors.of(model.effects, model.channels)
+    told = [model.windows(theta) for theta in sizes]
+    raw = [[gram_of(w, priors.floor, channels) for w in windows] for windows in told]
+    noise, _ = levels.fit(told[-1], raw[-1])
+    squares = []
+    for windows, grams in zip(told, raw):
+        shaped = designs.correlated_of(grams, windows, noise.correlation_time, "cpu")
+        squares.append(sum(window_statistics(gram, noise, i).square for i, gram in enumerate(shaped)))
+    return [float(0.5 * (square - squares[-1])) for square in squares], sum(len(w.residual) for w in told[-1])
