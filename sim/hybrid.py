@@ -16,7 +16,7 @@ from sim.randomize import build_reset
 from sim.step import build_step
 
 PIECES = 2
-"""Of a batch for each core of a CPU; more than one, since a core may have other work too."""
+"""Number of pieces of a batch for each core of a CPU; more than one, since a core may have other work too."""
 
 FEWEST = 64
 """Environments of a piece: their step takes a millisecond, its launch a tenth."""

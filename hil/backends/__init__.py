@@ -21,7 +21,7 @@ MSP_LOG = "link.msp"
 """In a run's folder."""
 
 THRUST_SHORT = 0.98
-"""Of the thrust, and of the rates, that the policy was trained with: what a vehicle must reach at least."""
+"""Shares of the thrust, and of the rates, that the policy was trained with: what a vehicle must reach at least."""
 
 
 def mechanism_lag(params: Any) -> float:

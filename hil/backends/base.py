@@ -12,7 +12,7 @@ WAIT, FOLLOW, HOLD, LAND = "wait", "follow", "hold", "land"
 
 
 ROUNDING = 1e-6
-"""Of times that are sums [s]: a microsecond early is in time."""
+"""Tolerance of times that are sums [s]: a microsecond early is in time."""
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ LAND_OR_HOLD = (4.0, 5.0)
 """Values of COM_OBL_RC_ACT: Land, Hold."""
 
 POSITION_BITS = 3
-"""Of EKF2_EV_CTRL: horizontal and vertical position."""
+"""Bits of EKF2_EV_CTRL: horizontal and vertical position."""
 
 
 @dataclass(frozen=True)

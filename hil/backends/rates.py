@@ -12,13 +12,13 @@ RATES_TYPES = {"betaflight": 0, "actual": 3}
 """Numbers of rates_type; Raceflight (1), KISS (2) and Quick (4) are not spoken here."""
 
 RATE_LIMIT = 1998.0
-"""Of any set-point [deg/s]."""
+"""Largest rate of any set-point [deg/s]."""
 
 TRAVEL = 500
 """From the middle of a stick to its end [us]."""
 
 MIDDLE = 1500
-"""Of a stick [us]."""
+"""Middle of a stick [us]."""
 
 
 @dataclass(frozen=True)

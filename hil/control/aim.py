@@ -15,7 +15,7 @@ from hil.poses.track import BodyState
 from visthrow.onboard.hover import GRAVITY
 
 STEP = 0.01
-"""Of the free flight's midpoint rule [s]: exact without drag."""
+"""Step of the free flight's midpoint rule [s]: exact without drag."""
 
 LONGEST = 3.0
 """After which a payload that has not come down is not followed further [s]."""

@@ -12,7 +12,7 @@ HOVERED = 50
 """Ticks over which the thrust of the hover before a throw is taken: a second."""
 
 DESCENT = 0.4
-"""Of the hover point while landing [m/s]."""
+"""Speed of the hover point while landing [m/s]."""
 
 
 class Hovering:

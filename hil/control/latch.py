@@ -13,7 +13,7 @@ STUCK_AFTER = 0.6
 """A payload that still hangs this long after it should have separated was not released, whatever was answered [s]."""
 
 ROUNDING = 1e-9
-"""Of differences of times [s]."""
+"""Tolerance of differences of times [s]."""
 
 
 class Latch:

@@ -50,7 +50,7 @@ LEVEL_TIME = 0.5
 
 
 WARM_CALLS = 3
-"""Of the policy before it is to fly: code, data and the traced operations are at hand after two."""
+"""Calls of the policy before it is to fly: code, data and the traced operations are at hand after two."""
 
 MOST_ERRORS = 100
 """Tracebacks that are kept."""

@@ -29,7 +29,7 @@ FULL_CLIMB = 2.5
 """Climb rate at full thrust where thrust is read as one: PILOT_SPEED_UP's default [m/s]."""
 
 CLIMB_GAIN = 5.0
-"""Of the climb rate's loop, PSC_VELZ_P's default [1/s]."""
+"""Gain of the climb rate's loop, PSC_VELZ_P's default [1/s]."""
 
 
 class FakeArduPilot(FakeMavlink):

@@ -33,7 +33,7 @@ ANNOUNCED = 1.0
 """Between two words that nothing real flies, which `--auto-arm` asks for [s]."""
 
 DESCENT, TOUCH = 0.4, 0.12
-"""Of a landing below the vehicle [m]; height that counts as down [m]."""
+"""Set-point of a landing below the vehicle [m]; height that counts as down [m]."""
 
 
 class WirePlant(Protocol):
@@ -230,7 +230,7 @@ class Fake:
         self.witness.release(self.plant.time, self.armed, self.plant.state["payload_pos_w"])
 
     def weight(self) -> float:
-        """Of what flies now [N]."""
+        """Weight of what flies now [N]."""
         return self.plant.mass[0 if self.plant.state["attached"] else 1] * GRAVITY
 
     def hold(self, goal_w: np.ndarray) -> np.ndarray:

@@ -17,7 +17,7 @@ from visthrow.common.errors import suggest
 from visthrow.common.mocap import measured
 
 SLACK = 1e-9
-"""Of times that are sums of periods [s]."""
+"""Tolerance of times that are sums of periods [s]."""
 
 RARE = 0.2
 """Between two poses at 5 Hz [s]."""
@@ -26,7 +26,7 @@ JUMP = 0.5
 """[m]."""
 
 STEP = 1.0
-"""Of a clock [s]."""
+"""Jump of a clock [s]."""
 
 SHUFFLE = 0.03
 """Longest further delay of a pose that may be overtaken [s]."""

@@ -109,7 +109,7 @@ class FakePx4(FakeMavlink):
 
     @property
     def ends(self) -> tuple[int, int]:
-        """Of the mechanism's output, closed and open [us]: a gripper opens at the minimum, an actuator set's 1 is the maximum."""
+        """Ends of the mechanism's output, closed and open [us]: a gripper opens at the minimum, an actuator set's 1 is the maximum."""
         ends = int(self.parameters["PWM_AUX_MAX1"]), int(self.parameters["PWM_AUX_MIN1"])
         return ends if self.parameters["PWM_AUX_FUNC1"] == 430.0 else ends[::-1]
 

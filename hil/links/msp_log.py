@@ -12,7 +12,7 @@ HEAD = struct.Struct(">QcH")
 """Time since 1970 [us], b"<" to the flight controller or b">" from it, number of bytes."""
 
 MOST_BYTES = 65535
-"""Of a chunk in the file; a longer one is cut."""
+"""Length of a chunk in the file; a longer one is cut."""
 
 
 class LoggedPort:

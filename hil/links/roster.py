@@ -14,7 +14,7 @@ from hil.errors import LinkError
 from hil.links.pymav import mav
 
 Address = tuple[str, int] | None
-"""Of a datagram's sender; None on a stream, which has one peer."""
+"""Address of a datagram's sender; None on a stream, which has one peer."""
 
 SILENT = 1.5
 """After which another address may take a party's place on the ground: longer than a heartbeat's second [s]."""

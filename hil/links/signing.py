@@ -21,7 +21,7 @@ BEHIND = 6_000_000
 """That the first message of a stream may be behind our clock: a minute, in units of 10 us."""
 
 MOST_STREAMS = 256
-"""Of valid signatures; more than 255 link ids of one sender are none."""
+"""Streams of valid signatures; more than 255 link ids of one sender are none."""
 
 LEAST_WORD = 8
 """Characters of a pass phrase."""

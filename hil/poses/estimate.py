@@ -134,7 +134,7 @@ class SlopeFilter:
 
     @property
     def lag(self) -> float:
-        """Of the last estimates under constant acceleration [s]; 0 where the source gave both itself."""
+        """Lag of the last estimates under constant acceleration [s]; 0 where the source gave both itself."""
         if not self._window:
             return 0.0
         pose = self._window[0]

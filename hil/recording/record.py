@@ -31,7 +31,7 @@ POLICY, CONFIG, POSES, TICKS, TLOG, SUMMARY, PROVENANCE = (
 
 
 POSES_TLOG = "poses.tlog"
-"""Of poses that come on a port of their own."""
+"""Log of poses that come on a port of their own."""
 
 MOST_WAITING = 50_000
 """Lines that may wait for a slow disk, some minutes' worth; beyond them the recording has failed."""

@@ -9,7 +9,7 @@ from sim.effects.setting import AERODYNAMICS, Setting
 from sim.params import GRAVITY
 
 SEGMENTS = 15
-"""Of a rope that turns out to be flexible (the paper, Sec. III-B)."""
+"""Segments of a rope that turns out to be flexible (the paper, Sec. III-B)."""
 RELAX = 1.0 / (2.0 * math.pi * 15.0)
 """Time constant of Betaflight's default iterm_relax_cutoff, 15 Hz [s]."""
 LONGEST_OFFSET = 0.12

@@ -46,7 +46,7 @@ class Pendulum:
 
     @property
     def weight(self) -> float:
-        """Of both bodies [N]."""
+        """Weight of both bodies [N]."""
         return (self.vehicle_mass + self.payload_mass) * GRAVITY
 
 

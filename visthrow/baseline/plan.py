@@ -9,7 +9,7 @@ from visthrow.baseline.release import Release, release_for
 from visthrow.baseline.spline import PlanParams, Spline, flat_reference, optimise
 
 START_HEIGHT = 0.95
-"""Of the payload in hover (the paper, Sec. IV-A) [m]."""
+"""Height of the payload in hover (the paper, Sec. IV-A) [m]."""
 
 
 @dataclass(frozen=True)

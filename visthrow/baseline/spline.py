@@ -29,7 +29,7 @@ END = 5
 """Derivatives 0 to 4 are given at the release."""
 
 SAMPLES, DENSE = 30, 300
-"""Of a segment, for penalties and energy: while improving a path, and to judge it, as thrust has narrow peaks."""
+"""Samples of a segment, for penalties and energy: while improving a path, and to judge it, as thrust has narrow peaks."""
 
 
 class PlanError(VisthrowError):
@@ -53,7 +53,7 @@ DIFFERENCE = 1e-6
 """Step of the objective's slopes, in m and in logarithms of time."""
 
 EVALUATIONS = 100
-"""Of the objective at each duration, which starts from the path of the one before."""
+"""Evaluations of the objective at each duration, which starts from the path of the one before."""
 
 HOPELESS = 2.0
 """Ratio of objectives at which shortening ends."""
@@ -78,7 +78,7 @@ class PlanParams:
 
 
 def payload_bounds_only(params: PlanParams) -> PlanParams:
-    """The same without our bounds on the thrust: the paper's plan, which a vehicle need not be able to follow."""
+    """Return the parameters without our bounds on the thrust: the paper's plan, which a vehicle need not be able to follow."""
     return replace(params, max_thrust=np.inf, least_lift=-np.inf, max_turn=np.inf)
 
 

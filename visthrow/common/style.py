@@ -4,7 +4,7 @@ Source: Okabe and Ito, Color Universal Design, 2008, for the eight colours.
 """
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
-"""Of compared things, in order."""
+"""Colours of compared things, in order."""
 
 MARKERS = ("o", "^", "s", "D", "v", "P")
 """Beside the colour, so that it never stands alone."""

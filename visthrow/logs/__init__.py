@@ -14,7 +14,7 @@ BLACKBOX = (".bbl", ".bfl", ".bf")
 """Of Betaflight; the last is that of its software in the loop."""
 ENDINGS = (".npz", ".csv", ".csv.gz", ".csv.xz", ".txt", ".parquet", *BLACKBOX, ".ulg", ".bin", ".tlog")
 RECORDINGS = (".mat", ".h5", ".hdf5", ".bag", ".db3", ".mcap")
-"""Of other tools; the Crazyflie's card names its files without an ending."""
+"""Endings of other tools' recordings; the Crazyflie's card names its files without an ending."""
 TABLES = (".csv", ".csv.gz", ".csv.xz", ".txt", ".parquet")
 RUN_LOG = "flight.npz"
 """In the folder of a run of ``visthrow hil``: its flight log."""

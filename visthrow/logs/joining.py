@@ -15,7 +15,7 @@ from visthrow.logs.check import relations
 from visthrow.logs.flightlog import Channel, FlightLog
 
 RATE = 50.0
-"""Of the grid on which logs are first laid over one another [Hz]."""
+"""Rate of the grid on which logs are first laid over one another [Hz]."""
 LEAST = 0.6
 """Correlation of what was measured twice, below which two logs are not taken for one flight."""
 _FINE = 0.1  # around the coarse answer [s]

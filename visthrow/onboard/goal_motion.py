@@ -19,10 +19,10 @@ SUMS = 7
 """Width of the carried sums: w, w t, w t^2, w x, w y, w t x, w t y."""
 
 POSITION_SIGMA = 0.017
-"""Of one measured goal position of the state layout [m]: three measurements of 0.01 m each are added up."""
+"""Deviation of one measured goal position of the state layout [m]: three measurements of 0.01 m each are added up."""
 
 ANGLE_SIGMA = 0.02
-"""Of a corner's ray, camera and attitude together [rad]: 0.01 of a half field of view of 110 degrees."""
+"""Deviation of a corner's ray, camera and attitude together [rad]: 0.01 of a half field of view of 110 degrees."""
 
 SPEED_SIGMA = 0.4
 """Prior of each component of the velocity [m/s]: what speeds uniform up to 1 m/s have."""

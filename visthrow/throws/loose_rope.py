@@ -19,7 +19,7 @@ ITERATIONS = 4
 
 SINKING_STEP = 4e-3  # [s]
 SINKING_DAMPING = 6.0
-"""Of the rope on the ground [1/s]; a picture's taste, no measurement."""
+"""Damping of the rope on the ground [1/s]; a picture's taste, no measurement."""
 
 
 class LooseRope:

@@ -32,7 +32,7 @@ HOVER_TIME = 1.6
 """Before the policy takes over [s]; a whole number of control periods."""
 
 THROW_TIME = 1.3
-"""Of most throws until the landing, for what is said of the progress [s]."""
+"""Time of most throws until the landing, for the line of progress [s]."""
 
 FIELDS = ("success", "landing_w", "error", "duration", "clearance", "smoothness")
 

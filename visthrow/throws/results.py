@@ -51,7 +51,7 @@ class Result:
 
     @property
     def key(self) -> str:
-        """Of the unit."""
+        """Key of the unit."""
         return key_of(self.unit)
 
     @property

@@ -14,7 +14,7 @@ from visthrow.throws.loading import load_policy
 from visthrow.throws.plants import HybridPlant, random_ropes
 
 PERIOD = 0.005
-"""Of the plant behind the wire [s]: commands that come between two control periods wait no longer than this."""
+"""Step of the plant behind the wire [s]: commands that come between two control periods wait no longer than this."""
 
 
 MECHANISM = 0.06

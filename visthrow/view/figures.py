@@ -10,7 +10,7 @@ from visthrow.common.statistics import Interval, pareto
 from visthrow.view.parts import png_of
 
 WIDTH = 9.2
-"""Of a picture over the page's whole width [inch]."""
+"""Width of a picture over the whole page [inch]."""
 
 CIRCLES = (0.1, 0.2, 0.4)
 """About the target, in scatter panels [m]."""

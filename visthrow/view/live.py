@@ -13,7 +13,7 @@ from visthrow.common.errors import DeviceError
 
 HOST = "127.0.0.1"
 WEB_PORT, DATA_PORT = 9090, 9876
-"""Of the viewer's page and of its data; only this machine is listened to."""
+"""Ports of the viewer's page and of its data; only this machine is listened to."""
 
 
 @contextmanager

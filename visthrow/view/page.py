@@ -45,7 +45,7 @@ def html_of(title: str, lead: str, sections: Sequence[Section]) -> str:
 
 
 def markdown_of(title: str, lead: str, sections: Sequence[Section]) -> str:
-    """The same as Markdown; pictures are named as :func:`write` writes them."""
+    """Return the page as Markdown; pictures are named as :func:`write` writes them."""
     lines = [f"# {title}", lead]
     for section in sections:
         lines.append(f"## {section.title}")

@@ -19,7 +19,7 @@ from visthrow.view.parts import png_of
 MARGIN = 0.35  # about what is seen [m]
 GROUND = 0.13  # of it seen below z = 0 [m]
 WIDTH, LEFT, PANEL, GAP = 13.6, 0.62, 3.06, 0.22
-"""Of the picture, its left margin, a panel, and the gap between two [inch]."""
+"""Widths of the picture, its left margin, a panel, and the gap between two [inch]."""
 
 ARM = 0.097  # half the motor-to-motor diagonal, for drawing only [m]
 ROTOR = 0.0381  # propeller radius, for drawing only [m]
@@ -103,7 +103,7 @@ def _subline(log: FlightLog) -> str:
 
 
 def drawn_larger(camera: CameraParams) -> CameraParams:
-    """The same lens on fewer pixels, on which the overlay's strokes are thicker."""
+    """Return the lens on fewer pixels, on which the overlay's strokes are thicker."""
     lens = camera.fisheye
     scale = PIXELS / max(lens.width, lens.height)
     fewer = dataclasses.replace(

@@ -18,7 +18,7 @@ from visthrow.logs.flightlog import FlightLog
 from visthrow.onboard.hover import HoverController, HoverParams
 
 SAMPLE_PERIOD = 0.005
-"""Of the recorded poses [s]: motion capture at 200 Hz."""
+"""Period of the recorded poses [s]: motion capture at 200 Hz."""
 
 COARSE = 2.0
 """Steps of a promise, in those of the search."""

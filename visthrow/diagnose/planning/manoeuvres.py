@@ -16,7 +16,7 @@ SETTLE = 1.0
 """Hover before and after [s]."""
 
 HEIGHT = 1.5
-"""Of most manoeuvres above the floor [m]: out of ground effect, the payload 1.2 m up."""
+"""Height of most manoeuvres above the floor [m]: out of ground effect, the payload 1.2 m up."""
 
 RUN = 3.6
 """Way of a throw from rest to rest [m], released half way: over a shorter one the payload would trail as high as the rotors."""

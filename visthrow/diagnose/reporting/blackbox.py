@@ -16,7 +16,7 @@ from visthrow.diagnose.select.point import Point
 
 CENTRES = 20
 WIDTH = 1.5
-"""Of a radial function, in deviations of the inputs."""
+"""Width of a radial function, in deviations of the inputs."""
 REACHES = (0.03, 0.1, 0.3, 1.0, 3.0)
 """Prior deviations of the weights, in the block's strongest latent force; the likeliest is taken."""
 

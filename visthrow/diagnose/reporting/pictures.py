@@ -24,7 +24,7 @@ SHOWN_WINDOWS = 3
 SHOWN_EFFECTS = 14
 """Rows and columns of the confusion picture."""
 MOST_CURVES = 24
-"""Of the completeness picture; of more effects it shows where their curves rise."""
+"""Curves of the completeness picture; of more effects it shows where their curves rise."""
 SHOWN_HORIZONS = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
 """Ticks [s]."""
 STEPS_ACROSS = 3

@@ -11,11 +11,11 @@ from visthrow.view.parts import Grid, Picture, Section, Text
 from visthrow.view.tables import PAPER_ABLATIONS
 
 TARGET = 2.0
-"""Of Table V [m]."""
+"""Target of Table V [m]."""
 
 PAPER_FOUR = tuple(name for name in PAPER_ABLATIONS if name != "full")
 PAPER_THROWS, PAPER_FULL_THROWS = 5, 10
-"""Of each ablation and of the full model (the paper's figure of landing points)."""
+"""Number of throws of each ablation and of the full model (the paper's figure of landing points)."""
 
 NOTE = (
     "Scatter: root mean square distance from the mean landing point of all trainings; what is left of the error is bias. "

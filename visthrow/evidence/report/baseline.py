@@ -11,7 +11,7 @@ from visthrow.common.workers import status
 
 TARGETS = (1.5, 2.0, 2.5)
 POLICY_THROWS = 100
-"""Of each learnt policy for its point on the front."""
+"""Throws of each learnt policy for its point on the front."""
 
 TITLE = "Trajectory optimisation and MPC: {throws} throws a row, bounds on {bounds}"
 NOTE = (

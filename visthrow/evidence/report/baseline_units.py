@@ -7,10 +7,10 @@ from visthrow.baseline import front, thrower
 from visthrow.view.tables import PAPER
 
 TARGETS = tuple(sorted({target for _, target in PAPER}))
-"""Of the paper's tables [m]."""
+"""Targets of the paper's tables [m]."""
 
 FRONT_TARGET = 2.0
-"""Of the sweep (the paper, Table IV) [m]."""
+"""Target of the sweep (the paper, Table IV) [m]."""
 
 FRONT_THROWS = 10
 """A setting of the sweep, as in the paper."""

@@ -185,7 +185,7 @@ def _paper_points() -> tuple[tuple[str, np.ndarray], ...]:
 
 
 def hypervolume(found: Sequence[Result], seed: int = 0) -> st.Interval | None:
-    """Of the settings whose throws all landed, with its interval over throws; None without any."""
+    """Hypervolume of the settings whose throws all landed, with its interval over throws; None without any."""
     sets = [np.column_stack([r.of("duration"), r.of("error")]) for r in found if r.good.all()]
     if not sets:
         return None

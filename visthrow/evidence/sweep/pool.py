@@ -220,7 +220,7 @@ class Pool:
 
 
 def last_line(log: Path) -> str:
-    """Of what a task printed."""
+    """Return the last line of what a task printed."""
     try:
         lines = [line for line in log.read_text(errors="replace").splitlines() if line.strip()]
     except OSError:

@@ -12,7 +12,7 @@ from visthrow.evidence.sweep.work import PIECES, lock_of
 from visthrow.throws import results
 
 CURVE_POINTS = 60
-"""Of a run's learning curve in the record."""
+"""Points of a run's learning curve in the record."""
 
 
 def status(work: Work, out: Path) -> tuple[list[str], bool]:

@@ -50,7 +50,7 @@ class Source:
         return self.experiment().iterations
 
     def folder(self, out: Path) -> Path:
-        """Of the training run."""
+        """Folder of the training run."""
         return out / "train" / self.id
 
     def policy(self, out: Path) -> Path:

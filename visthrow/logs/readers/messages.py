@@ -197,7 +197,7 @@ class Forward(io.BytesIO):
         self._returns: Counter[int] = Counter()
 
     def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
-        """As of any file.
+        """Go to a byte, as in any file.
 
         Raises:
             LogError: It leads to a byte that was returned to too often.
