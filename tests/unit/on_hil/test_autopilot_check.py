@@ -5,7 +5,7 @@ import json
 import pytest
 
 from hil.backends import DryRun
-from hil.backends.check import hover_of_run, told
+from hil.backends.check import autopilot_record, hover_of_run
 from hil.control.decision import Words
 from hil.control.loop import fly
 from hil.errors import RunError
@@ -32,7 +32,7 @@ def run(tmp_path_factory):
     runner, source, clock, _ = peers(LevelPlant(), loaded=NEVER, overrides=QUICK)
     recorder = Recorder(folder, runner.params)
     summary = fly(runner, source, clock, Nobody(), recorder, 4.0)
-    summary["autopilot"] = told(runner.backend, source._link)
+    summary["autopilot"] = autopilot_record(runner.backend, source._link)
     recorder.close(summary)
     return folder
 
@@ -77,4 +77,4 @@ def test_the_summary_keeps_what_the_autopilot_said(run):
     assert kept["parameters"]["problems"] == kept["parameters"]["written"] == []
     assert kept["release"] == {"state": "idle", "note": "", "sends": 0}
     assert kept["clocks"]["peers"]["1 at 127.0.0.1:1"]["steps"] == 0
-    assert told(DryRun(), None) == {"backend": "dry-run"}
+    assert autopilot_record(DryRun(), None) == {"backend": "dry-run"}
