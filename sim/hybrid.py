@@ -238,24 +238,12 @@ class HybridSim:
         Raises:
             ValueError: a shape that does not fit.
         """
-        E, L = self.count, self.params.rope.segments
-        level, down = np.tile([0.0, 0.0, 0.0, 1.0], (E, 1)), np.tile([0.0, 0.0, -1.0], (E, L, 1))
+        zero, rows = np.zeros(3), np.zeros((self.params.rope.segments, 3))
         given = {
-            "pos_w": (pos_w, (E, 3), None),
-            "quat_wb": (quat_wb, (E, 4), level),
-            "vel_w": (vel_w, (E, 3), None),
-            "rate_b": (rate_b, (E, 3), None),
-            "cable_dir_w": (cable_dir_w, (E, L, 3), down),
-            "cable_vel_w": (cable_vel_w, (E, L, 3), None),
-        }
-        for name, (value, shape, default) in given.items():
-            value = (
-                (np.zeros(shape) if default is None else default) if value is None else np.asarray(value, dtype=float)
-            )
-            if value.shape != shape:
-                raise ValueError(f"{name} of shape {value.shape}: expected {shape}")
-            target = getattr(self.state, name)
-            target.assign((np.swapaxes(value, 0, 1) if len(shape) == 3 else value).astype(self._numpy))
+            "pos_w": (pos_w, zero), "quat_wb": (quat_wb, st.LEVEL), "vel_w": (vel_w, zero), "rate_b": (rate_b, zero),
+            "cable_dir_w": (cable_dir_w, rows - [0.0, 0.0, 1.0]), "cable_vel_w": (cable_vel_w, rows),
+        }  # fmt: skip
+        st.put(self.types, self.state, given, self.count)
         self.state.mass_scale.fill_(1.0)
         self._used.fill_(battery_used)
         wp.launch(
@@ -265,10 +253,6 @@ class HybridSim:
             device=self.device,
         )
         self._update_payload()
-
-    @property
-    def _numpy(self) -> type:
-        return np.float32 if self.types.real is wp.float32 else np.float64
 
     def _update_payload(self) -> None:
         self._launch(self._step.payload, [self._ropes, self.state, self.out])
@@ -299,21 +283,18 @@ class HybridSim:
         Raises:
             ValueError: another shape.
         """
-        command = np.asarray(command, dtype=self._numpy)
         asked = np.zeros(self.count) if release is None else np.asarray(release)
-        for name, value, shape in (("command", command, (self.count, 4)), ("release", asked, (self.count,))):
-            if value.shape != shape:
-                raise ValueError(f"{name} of shape {value.shape}: expected {shape}")
-        self.command.assign(command)
+        if asked.shape != (self.count,):
+            raise ValueError(f"release of shape {asked.shape}: expected {(self.count,)}")
+        st.put(self.types, self, {"command": (command, np.zeros(4))}, self.count)
         self.release.assign(asked.astype(np.int32))
 
     def get(self, name: str) -> np.ndarray:
         """Copy of a state or output array by name, environment first: shape (E, ...) or (E, L, ...)."""
         if name in st.STATE_FIELDS:
-            value = getattr(self.state, name).numpy()  # on the CPU a view of the simulator's memory
-            return np.array(np.swapaxes(value, 0, 1) if st.STATE_FIELDS[name][1] else value)
+            return st.fetched(getattr(self.state, name), st.STATE_FIELDS[name][1])
         if name in st.OUTPUT_FIELDS:
-            return np.array(getattr(self.out, name).numpy())
+            return st.fetched(getattr(self.out, name), False)
         raise ValueError(f"no array {name!r}; there are {sorted(st.STATE_FIELDS | st.OUTPUT_FIELDS)}")
 
     def cable_points_w(self) -> np.ndarray:

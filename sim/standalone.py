@@ -274,33 +274,22 @@ class QuadSim:
         Raises:
             ValueError: a shape that does not fit.
         """
-        level = np.array([0.0, 0.0, 0.0, 1.0])
         zero = np.zeros(3)
-        given = {"pos_w": (pos_w, zero), "quat_wb": (quat_wb, level), "vel_w": (vel_w, zero), "rate_b": (rate_b, zero)}
-        for name, (value, default) in given.items():
-            value = np.tile(default, (self.count, 1)) if value is None else value
-            self._assign(getattr(self.start, name), name, value, len(default))
+        given = {"pos_w": (pos_w, zero), "quat_wb": (quat_wb, st.LEVEL), "vel_w": (vel_w, zero), "rate_b": (rate_b, zero)}
+        st.put(self.types, self.start, given, self.count)
         self.start.charge_used.fill_(battery_used)
         self.reset()
 
-    def _assign(self, target: wp.array, name: str, value, width: int) -> None:
-        value = np.asarray(value, dtype=np.float32 if self.types.real is wp.float32 else np.float64)
-        if value.shape != (self.count, width):
-            raise ValueError(f"{name} of shape {value.shape}: expected {(self.count, width)}")
-        target.assign(value)
-
     def set_command(self, command: np.ndarray) -> None:
         """Copy commands [N, rad/s], shape (E, 4), to the device. Raises ValueError for another shape."""
-        self._assign(self.command, "command", command, 4)
+        st.put(self.types, self, {"command": (command, np.zeros(4))}, self.count)
 
     def set_wrench(self, force_w: np.ndarray, torque_b: np.ndarray) -> None:
         """Copy the external wrench [N], [N m], shapes (E, 3), to the device. Raises ValueError for another shape."""
-        self._assign(self.force_w, "force_w", force_w, 3)
-        self._assign(self.torque_b, "torque_b", torque_b, 3)
+        st.put(self.types, self, {"force_w": (force_w, np.zeros(3)), "torque_b": (torque_b, np.zeros(3))}, self.count)
 
     def get(self, name: str) -> np.ndarray:
         """Copy of a state array by name, shape (E, ...); the queue (E, D, 4). Raises ValueError for an unknown name."""
         if name not in FIELDS:
             raise ValueError(f"no array {name!r}; there are {sorted(FIELDS)}")
-        value = getattr(self.state, name).numpy()  # on the CPU a view of the simulator's memory
-        return np.array(np.swapaxes(value, 0, 1) if FIELDS[name][1] else value)
+        return st.fetched(getattr(self.state, name), FIELDS[name][1])

@@ -4,9 +4,15 @@ Shapes use E environments and L rope segments. Rope arrays stand segment first, 
 read neighbouring memory.
 """
 
+from collections.abc import Mapping
+
+import numpy as np
 import warp as wp
 
 from sim.arrays.structs import Types, make_struct
+
+LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
+"""Attitude of a level vehicle, xyzw."""
 
 NONFINITE = 1
 """Status bit: a state became non-finite or faster than any physical one; the environment was put back to its last good state.
@@ -72,6 +78,32 @@ def allocate(
         shape = (rows[name], count) if by_row else count
         setattr(out, name, wp.zeros(shape, dtype=scalar[kind], device=device))
     return out
+
+
+def put(t: Types, struct, given: Mapping[str, tuple[np.ndarray | None, np.ndarray]], count: int) -> None:
+    """Copy host arrays, environment first, into arrays of a struct, where the rope's stand segment first.
+
+    Args:
+        t: types of the arrays.
+        struct: of :func:`allocate`, or anything with arrays of these names.
+        given: name -> values, shape (E, ...), or None for every environment's default; and that default, shape (...).
+        count: E.
+
+    Raises:
+        ValueError: values of another shape.
+    """
+    real = np.float32 if t.real is wp.float32 else np.float64
+    for name, (value, default) in given.items():
+        value = np.broadcast_to(default, (count, *np.shape(default))) if value is None else np.asarray(value, dtype=float)
+        if value.shape != (count, *np.shape(default)):
+            raise ValueError(f"{name} of shape {value.shape}: expected {(count, *np.shape(default))}")
+        getattr(struct, name).assign((np.swapaxes(value, 0, 1) if value.ndim == 3 else value).astype(real))
+
+
+def fetched(array: wp.array, rows: bool) -> np.ndarray:
+    """Copy of a device array, environment first; ``rows``: it stands row first on the device."""
+    value = array.numpy()  # on the CPU a view of the simulator's memory
+    return np.array(np.swapaxes(value, 0, 1) if rows else value)
 
 
 def build_access(t: Types, State: type):
