@@ -8,8 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from hil.control.decision import Words
-from hil.control.states import State
 from visthrow.onboard.hover import GRAVITY
 
 MOST_KEPT = 10_000
@@ -64,11 +62,3 @@ class LevelPlant:
 def make(policy: str, seed: int) -> LevelPlant:
     """The plant, for any policy and seed; see `hil.fakes.process.load_plant`."""
     return LevelPlant()
-
-
-class AutoOperator:
-    """Arms whenever the run is ready: for simulated vehicles alone."""
-
-    def words(self, state: str) -> Words:
-        """See `hil.control.loop.Operator`."""
-        return Words(arm=state == State.READY)

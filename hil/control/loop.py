@@ -42,6 +42,14 @@ class Operator(Protocol):
         """What was said since the last tick; ``state`` is the runner's. Never waits."""
 
 
+class AutoOperator:
+    """Arms whenever the run is ready: for tests and for simulated vehicles, never for real ones."""
+
+    def words(self, state: str) -> Words:
+        """See `Operator`."""
+        return Words(arm=state == State.READY)
+
+
 def fly(
     runner: Runner, source: Source, clock: Clock, operator: Operator, recorder: Recorder | None = None,
     most: float = float("inf"), tell: Callable[[Decision], None] | None = None, stages: Stages | None = None,

@@ -6,12 +6,12 @@ import pytest
 from hil.backends.base import FOLLOW, HOLD, LAND, WAIT
 from hil.backends.check import AutopilotCheck
 from hil.control.decision import Words
-from hil.control.loop import fly
+from hil.control.loop import AutoOperator, fly
 from hil.fakes.px4 import LAND as PX4_LAND
 from hil.fakes.px4 import OFFBOARD, POSCTL, custom
 from hil.links import msp
 from tests.hil_flight import simple_policy
-from tests.level import AutoOperator, LevelPlant
+from tests.level import LevelPlant
 from tests.loopback.wire import peers, throw
 
 KINDS = ("ardupilot", "px4", "betaflight")

@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 
 from hil.backends.base import FAILED
+from hil.control.loop import AutoOperator
 from hil.links.pymav import mav
 from hil.links.signing import Signed
 from tests.bench.processes import free_port
 from tests.fuzz import EACH, SEEDS, any_message, mutated, noise
 from tests.hil_flight import simple_policy
-from tests.level import AutoOperator, LevelPlant
+from tests.level import LevelPlant
 from tests.loopback.wire import HERE, cut, peers, throw
 from visthrow.onboard.actions import hover_action
 

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from hil.backends import make_backend, mechanism_lag
-from hil.control.loop import fly
+from hil.control.loop import AutoOperator, fly
 from hil.control.runner import Runner
 from hil.links.clock import MonotonicClock
 from hil.links.device import check_device, open_port
@@ -20,7 +20,6 @@ from hil.params import HilParams
 from hil.recording.playback import replay
 from hil.recording.record import Recorder
 from hil.sources import MavlinkSource, read_tlog
-from tests.level import AutoOperator
 from tests.loopback.wire import throw
 from visthrow import config
 from visthrow.onboard.pilot import Pilot

@@ -3,7 +3,7 @@
 from collections import deque
 
 from hil.backends import Betaflight, make_backend, mechanism_lag
-from hil.control.loop import Loop
+from hil.control.loop import AutoOperator, Loop
 from hil.control.runner import Runner
 from hil.fakes import Fake
 from hil.fakes.process import VEHICLE_ID, MocapParams, Options, make_fake
@@ -12,7 +12,6 @@ from hil.links.roster import Roster
 from hil.links.sync import LinkSync
 from hil.sources import MavlinkSource
 from hil.sources.opening import parties
-from tests.level import AutoOperator
 from visthrow import config
 from visthrow.onboard.policy import Policy, find_policy
 

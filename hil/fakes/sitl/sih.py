@@ -17,10 +17,11 @@ from hil.fakes.base import Fake, Options
 from hil.fakes.mocap import MocapParams
 from hil.links.mavlink_link import Link
 from hil.links.pymav import mav
-from visthrow.onboard.hover import GRAVITY, rot_from_quat
+from visthrow.common.rotations import matrix_of_quat
+from visthrow.onboard.hover import GRAVITY
 
 STEP = 0.001
-"""Of the ball [s]."""
+"""Time step of the ball [s]."""
 
 STREAMS = {mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED: 0.01, mav.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: 0.01,
            mav.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW: 0.01}  # fmt: skip
@@ -70,7 +71,7 @@ class HangingBall:
 
     def step(self, command: np.ndarray, release: bool, after: float = 0.0) -> None:
         """Advance by a period; see `WirePlant`. The command is PX4's matter."""
-        mount = self._pos + rot_from_quat(self._quat[None])[0] @ self.mount_b
+        mount = self._pos + matrix_of_quat(self._quat) @ self.mount_b
         if self._mount is None:
             self._ball, self._mount = mount - [0.0, 0.0, self.length], mount
         if release and self._trip is None:

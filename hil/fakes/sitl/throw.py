@@ -21,8 +21,9 @@ from hil.fakes.sitl.firmware import Firmware, needed
 from hil.links.device import Device, check_device, open_port
 from hil.links.mavlink_link import Link
 from hil.params import HilParams
+from hil.recording.flightlogs import read, throws
 from hil.recording.record import Recorder
-from hil.recording.report import throw_logs, throw_path
+from hil.recording.report import throw_path
 from hil.sources.opening import open_source
 from visthrow.onboard.policy import Policy
 
@@ -108,7 +109,7 @@ def throw(
         recorder = Recorder(folder / "run", params)
         summary = _flown(Loop(runner, source, clock, AutoOperator(), recorder), fake)
         recorder.close(summary)
-        for number, log in enumerate(throw_logs(folder / "run"), start=1):
+        for number, log in enumerate(throws(read(folder / "run")), start=1):
             log.save(throw_path(folder / "run", number, ".npz"))
         return {**fake.report(), "run": summary}
     finally:

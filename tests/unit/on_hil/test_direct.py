@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from hil.fakes.direct import Direct, scored
-from hil.fakes.level import LevelPlant
 from hil.fakes.mocap import Mocap, MocapParams
 from hil.params import HilParams
 from tests.hil_flight import simple_policy
+from tests.level import LevelPlant
 from visthrow import config
 from visthrow.onboard.actions import hover_action
 
