@@ -29,7 +29,7 @@ def run(args: argparse.Namespace) -> int:
     from visthrow.common.errors import DiagnoseError, suggest
     from visthrow.common.storage import write_json
     from visthrow.diagnose.inputs import opening
-    from visthrow.diagnose.planning import manoeuvres, plan
+    from visthrow.diagnose.planning import excitation, manoeuvres, plan
     from visthrow.diagnose.planning.fly_manoeuvres import simulator_of
     from visthrow.diagnose.reporting import report
     from visthrow.diagnose.select import search
@@ -63,6 +63,7 @@ def run(args: argparse.Namespace) -> int:
     )
     write_json(Path(args.out) / "plan.json", value)
     print(f"references as CSV: {args.out}")
+    print(f"sweeps that autopilots fly by themselves: {', '.join(path.name for path in excitation.write(args.out))}")
     if args.json:
         write_json(args.json, value)
     return 0

@@ -89,6 +89,9 @@ TELEMETRY = (
     _t("SERVO_OUTPUT_RAW", "servo3_raw servo1_raw servo2_raw servo4_raw", "motor_output", "1", flip=False),
 )
 
+SWEEP, SWEEP_AXES = ("SIDS", "SIDD"), 7
+"""Messages of ArduPilot's SYSTEMID: its settings, and the sweep [deg/s]; its axes from which on it sweeps rates of roll, pitch, yaw."""
+
 READERS = {
     ".ulg": (read_ulog, ULOG),
     ".bin": (read_dataflash, DATAFLASH),
@@ -104,7 +107,7 @@ def log_of_autopilot(path: str | Path) -> FlightLog:
         LogError: It cannot be read, or holds nothing of a vehicle's motion.
     """
     reader, taps = READERS[Path(path).suffix.lower()]
-    found = reader(path, {tap.message for tap in taps})
+    found = reader(path, {tap.message for tap in taps} | set(SWEEP))
     channels, notes = {}, {}
     for tap in taps:
         fields = found.first(tap.message)
@@ -119,7 +122,24 @@ def log_of_autopilot(path: str | Path) -> FlightLog:
             values = np.column_stack([fields[field] for field in tap.fields]).astype(float)
         channels[tap.channel], noted = make_channel(np.asarray(fields["time"], float), values, entry, str(path))
         notes[tap.channel] = noted | {"clock": "autopilot", "message": tap.message}
+    _add_sweep(channels, notes, found)
     return _from_zero(channels, found, {"ingest": notes})
+
+
+def _add_sweep(channels: dict, notes: dict, found: Messages) -> None:
+    """Add a sweep of ArduPilot's SYSTEMID to the commanded rate of its axis, which the log tells without it."""
+    started, sweep, rates = found.first(SWEEP[0]), found.first(SWEEP[1]), channels.get("rate_setpoint_b")
+    if started is None or sweep is None or rates is None:
+        return
+    axis = int(np.asarray(started["Ax"])[-1]) - SWEEP_AXES
+    if not 0 <= axis < 3:
+        return
+    time, size = np.asarray(sweep["time"], float), np.radians(np.asarray(sweep["Targ"], float))
+    added = np.interp(rates.time, time, size, left=0.0, right=0.0) * (1.0 if axis == 0 else -1.0)
+    values = rates.values.copy()
+    values[:, axis] += added
+    channels["rate_setpoint_b"] = type(rates)(rates.time, values, rates.unit, rates.frame, rates.valid)
+    notes["rate_setpoint_b"] |= {"sweep": f"SIDD about axis {axis}, {time[0]:.1f} to {time[-1]:.1f} s"}
 
 
 def _from_zero(channels: dict, found: Messages, meta: dict) -> FlightLog:
