@@ -19,12 +19,13 @@ import sys
 import tempfile
 import time
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
 
-from tests.worlds.world import CAMERA_FLOORS, FLOORS, PLANTS, Recipe, draw, dust_of, fly_recipe, recorded
+from tests.worlds.world import CAMERA_FLOORS, COLOURS, FLOORS, PLANTS, Recipe, draw, dust_of, fly_recipe, recorded
 from visthrow.common.errors import VisthrowError
 from visthrow.diagnose.likelihood.threads import single
 from visthrow.logs.flightlog import Channel, FlightLog
@@ -37,7 +38,8 @@ class Blocker:
             raise ImportError("the tool asked for the tests")
 sys.meta_path.insert(0, Blocker())
 from visthrow.cli import main
-sys.exit(main(sys.argv[1:]))
+exec(sys.argv[1])
+sys.exit(main(sys.argv[2:]))
 """
 
 ALIKE = (
@@ -73,14 +75,23 @@ SIGHT = ("camera_tilt_x", "camera_latency", "marker_rot_x", "mocap_delay_quad")
 """Likewise with a camera, and what they may be taken for."""
 HELD = 3
 """Throws held back."""
+VARIES = {
+    "release_lag": (5e-3, 12e-3), "wind_x": (0.5, 1.2), "cmd_delay": (3e-3, 8e-3), "mass_payload": (3e-3, 8e-3),
+    "thrust_gain": (0.02, 0.05),
+}  # fmt: skip
+"""Effects that differ from flight to flight, with the range of their deviation."""
+SMALL = dict(free=2, free_seconds=4.0, throws=6)
+"""Flights of worlds that take seconds."""
+LOST = (0.05, 0.15)
+"""Share of commands that never arrive."""
 DUSTY, DUST = "+dust", 0.5
 """End of the kinds whose worlds have some of every other effect, and its deviation in floors."""
 SMALLEST, LARGEST = 3.0, 30.0
 """Sizes of the completeness curves [floors]."""
 NEAREST, NEXT = 3.0, 8.0
 """Those about the limits themselves, which lie at 4 to 9 floors."""
-LIMIT = "limit:"
-"""Begin of the kinds that hide one effect, by its name, about its limit."""
+LIMIT, NULL, VARYING = "limit:", "null:", "varies:"
+"""Begin of the kinds that hide one effect, by its name, about its limit; nothing; one that differs from flight to flight."""
 FAINTEST, PLAINEST = 1.0, 15.0
 """Those of the curves with a camera, whose limits lie at 5 or 6 floors."""
 
@@ -130,10 +141,19 @@ def hand_over(recipe: Recipe, folder: Path, held: Path | None = None) -> list[Pa
     return paths
 
 
-def ask(logs: list[Path], model: list[str], folder: Path, device: str = "cpu", timeout: float = 900.0) -> dict:
-    """Verdict of ``visthrow diagnose explain`` on logs, run apart; with ``error`` where it failed or took longer [s]."""
+def ask(logs: list[Path], model: list[str], folder: Path, device: str = "cpu", timeout: float = 900.0, patch: str = "") -> dict:
+    """Verdict of ``visthrow diagnose explain`` on logs, run apart; with ``error`` where it failed or took longer [s].
+
+    Args:
+        logs: to be explained.
+        model: overrides that state the model.
+        folder: where the tool runs.
+        device: of the diagnosis.
+        timeout: [s].
+        patch: Python that is run before the tool: an ablation.
+    """
     answer = folder / "verdict.json"
-    command = [sys.executable, "-c", WITHOUT_TESTS, "diagnose", "explain", *(p.name for p in logs)]
+    command = [sys.executable, "-c", WITHOUT_TESTS, patch, "diagnose", "explain", *(p.name for p in logs)]
     command += ["--device", device, "--json", answer.name, "--out", "report", "--no-report", *MEASURED]
     for item in model:
         command += ["--set", item]
@@ -221,6 +241,7 @@ def judge(recipe: Recipe, verdict: dict) -> dict:
         "missed": len(truth - hits), "named": [sorted(g) for g in groups], "overall": verdict["overall"],
         "extra": max(len(groups) - len(truth), 0), "own_class": own, "unknown": verdict["overall"].startswith("UNKNOWN"),
         "laws": [law["formula"] for law in verdict.get("laws", ())[:3]],
+        "varies": [own["name"] for own in verdict.get("scatter", ()) if own["found"]],
     }  # fmt: skip
 
 
@@ -235,7 +256,9 @@ def errors_of(recipe: Recipe, verdict: dict) -> list[dict]:
     ]
 
 
-def run_world(recipe: Recipe, device: str = "cpu", verdicts: Path | None = None, until: float = np.inf) -> dict:
+def run_world(
+    recipe: Recipe, device: str = "cpu", verdicts: Path | None = None, until: float = np.inf, patch: str = ""
+) -> dict:
     """One sealed world from drawing to judgement: a line of the ledger.
 
     Args:
@@ -243,6 +266,7 @@ def run_world(recipe: Recipe, device: str = "cpu", verdicts: Path | None = None,
         device: of the diagnosis.
         verdicts: folder for the whole verdict.
         until: when the verdict must be there, by ``time.time()`` [s].
+        patch: see :func:`ask`.
     """
     with tempfile.TemporaryDirectory() as name, tempfile.TemporaryDirectory() as apart:
         folder, held = Path(name), Path(apart)
@@ -250,7 +274,7 @@ def run_world(recipe: Recipe, device: str = "cpu", verdicts: Path | None = None,
         begin = time.perf_counter()
         logs = hand_over(recipe, folder, held)
         flown = time.perf_counter()
-        verdict = ask(logs, model_of(recipe), folder, device, float(np.clip(until - time.time(), 1.0, 900.0)))
+        verdict = ask(logs, model_of(recipe), folder, device, float(np.clip(until - time.time(), 1.0, 900.0)), patch)
         seconds = time.perf_counter() - flown
         digest = hashlib.sha256(json.dumps(verdict, sort_keys=True).encode()).hexdigest()
         if verdicts is not None:
@@ -268,12 +292,25 @@ def run_world(recipe: Recipe, device: str = "cpu", verdicts: Path | None = None,
     return line
 
 
+def _known(kind: str, begin: str, names: Iterable[str]) -> str:
+    """What stands behind the begin of a kind.
+
+    Raises:
+        ValueError: It is none of the names.
+    """
+    name = kind.removeprefix(begin)
+    if name not in names:
+        raise ValueError(f"kind {kind!r}: no effect or noise {name!r}; there are {', '.join(names)}")
+    return name
+
+
 def drawn(kind: str, number: int) -> Recipe:
     """A world of a kind: ``null``, ``law``, ``curve``, ``limit:NAME``, ``flights`` or ``EFFECTSxFLOORS``; those with a camera.
 
-    These are ``sight``, ``camera`` and ``clear``. ``curve`` and ``sight`` hide one of the effects whose limits are asked for,
-    ``limit:NAME`` the one that it names, about its limit, ``camera`` any of a camera's, ``clear`` none. ``KIND+dust`` is the same
-    with some of every other effect.
+    ``null:COLOUR`` hides nothing behind noise of one of COLOURS, ``varies:NAME`` an effect that differs from flight to flight, ``lost``
+    commands that never arrive. Those with a camera are ``sight``, ``camera`` and ``clear``. ``curve`` and ``sight`` hide one of the
+    effects whose limits are asked for, ``limit:NAME`` the one that it names, about its limit, ``camera`` any of a camera's, ``clear``
+    none. ``KIND+dust`` is the same with some of every other effect.
     """
     if kind.endswith(DUSTY):
         return replace(drawn(kind.removesuffix(DUSTY), number), dust=DUST)
@@ -285,10 +322,15 @@ def drawn(kind: str, number: int) -> Recipe:
         floors = float(np.exp(rng.uniform(*np.log(ends))))
         return draw(number, 1, floors, names=(str(rng.choice(names)),), camera=True)
     if kind.startswith(LIMIT):
-        name = kind.removeprefix(LIMIT)
-        if name not in FLOORS:
-            raise ValueError(f"kind {kind!r}: there is no effect {name!r}; there are {', '.join(FLOORS)}")
+        name = _known(kind, LIMIT, FLOORS)
         return draw(number, 1, float(np.exp(rng.uniform(*np.log((NEAREST, NEXT))))), names=(name,))
+    if kind.startswith(NULL):
+        return draw(number, 0, 0.0, colour=_known(kind, NULL, COLOURS))
+    if kind.startswith(VARYING):
+        name = _known(kind, VARYING, VARIES)
+        return draw(number, 0, 0.0, varies={name: float(rng.uniform(*VARIES[name]))})
+    if kind == "lost":
+        return draw(number, 0, 0.0, lost=float(rng.uniform(*LOST)))
     if kind == "null":
         rough = {"noise": float(rng.choice([0.5, 1.0, 2.0])), "gusts": float(rng.choice([0.5, 1.0, 2.0]))}
         return draw(number, 0, 0.0, dropouts=float(rng.choice([0.0, 0.1])), **rough)
@@ -324,12 +366,12 @@ def _alone(numbers) -> None:
     os.sched_setaffinity(0, {cores[mine % len(cores)]})
 
 
-def _one(task: tuple[str, Recipe, float, float, Path | None]) -> dict | None:
-    kind, recipe, begin, until, verdicts = task
+def _one(task: tuple[str, Recipe, float, float, Path | None, str]) -> dict | None:
+    kind, recipe, begin, until, verdicts, patch = task
     if time.time() > begin:
         return None
     try:
-        return {"kind": kind} | run_world(recipe, verdicts=verdicts, until=until)
+        return {"kind": kind, "patch": patch} | run_world(recipe, verdicts=verdicts, until=until, patch=patch)
     except (RuntimeError, ValueError) as error:
         return {"kind": kind, "recipe": asdict(recipe), "error": repr(error), "truth_sha256": recipe.digest()}
 
@@ -342,8 +384,9 @@ def warm(plant: str) -> None:
 
 def main() -> None:
     """Run a bank of sealed worlds and add it to a ledger; worlds that are there are not run again."""
-    parser = argparse.ArgumentParser(description=main.__doc__)
-    kinds = "null, law, curve, limit:NAME, flights, EFFECTSxFLOORS, any of these +dust; with a camera sight, camera, clear"
+    parser = argparse.ArgumentParser(description=main.__doc__, fromfile_prefix_chars="@", epilog="@FILE holds arguments, one a line")
+    kinds = "null, null:COLOUR, varies:NAME, lost, law, curve, limit:NAME, flights, EFFECTSxFLOORS, any of these +dust; "
+    kinds += "with a camera sight, camera, clear"
     parser.add_argument("worlds", nargs="*", metavar="KIND=COUNT", help=kinds)
     parser.add_argument("--seed", type=int, help="of the first world; drawn by the system where not given")
     parser.add_argument("--ledger", type=Path, default=Path("ledger.jsonl"))
@@ -352,6 +395,8 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=1e6, help="begin no world later than this")
     parser.add_argument("--end", type=float, default=1e6, help="minutes after which a verdict that is not there is none")
     parser.add_argument("--warm", choices=PLANTS, help="only compile what worlds of this plant need")
+    parser.add_argument("--small", action="store_true", help="short flights, as the default tests have them")
+    parser.add_argument("--patch", default="", metavar="PYTHON", help="run before the tool: an ablation; with a ledger of its own")
     args = parser.parse_args()
     single()
     if args.warm:
@@ -364,8 +409,10 @@ def main() -> None:
         done = {json.loads(line)["truth_sha256"] for line in args.ledger.read_text().splitlines()}
     sizes = {kind: int(count) for kind, count in (item.split("=") for item in args.worlds)}
     begin, end = (time.time() + 60.0 * minutes for minutes in (args.minutes, args.end))
-    worlds = [(kind, recipe) for kind, recipe in bank(first, sizes) if recipe.digest() not in done]
-    tasks = [(kind, recipe, begin, end, args.verdicts) for kind, recipe in worlds]
+    shorter = SMALL if args.small else {}
+    worlds = [(kind, replace(recipe, **shorter)) for kind, recipe in bank(first, sizes)]
+    worlds = [(kind, recipe) for kind, recipe in worlds if recipe.digest() not in done]
+    tasks = [(kind, recipe, begin, end, args.verdicts, args.patch) for kind, recipe in worlds]
     tally: dict[str, Counter] = {kind: Counter() for kind in sizes}
     context = mp.get_context("spawn")
     with context.Pool(args.jobs, _alone, (context.Value("i", 0),), maxtasksperchild=None) as pool:

@@ -164,5 +164,5 @@ def test_gain_is_a_share_of_the_oracles_and_harm_is_told():
 
 def test_worlds_about_a_limit_hide_an_effect_that_there_is():
     assert list(sealed.drawn("limit:wind_x", 3).effects) == ["wind_x"]
-    with pytest.raises(ValueError, match=r"no effect 'wnid_x'; there are .*wind_x"):
+    with pytest.raises(ValueError, match=r"no effect or noise 'wnid_x'; there are .*wind_x"):
         sealed.drawn("limit:wnid_x", 3)

@@ -177,7 +177,7 @@ def fly(*args, **options) -> Flights:
         return _fly(*args, **options)
 
 
-def _fly(kind, worlds, pilots, references, seconds, gusts, seed, used) -> Flights:
+def _fly(kind, worlds, pilots, references, seconds, gusts, seed, used, lost=0.0) -> Flights:
     """Fly lanes of a plant.
 
     Args:
@@ -189,6 +189,7 @@ def _fly(kind, worlds, pilots, references, seconds, gusts, seed, used) -> Flight
         gusts: standard deviations of force [N], torque [N m], force on the ball [N].
         seed: of the gusts.
         used: fraction of charge used at the start, shape (E,).
+        lost: share of commands that never arrive, where the last one stays for a period more.
     """
     wp.config.log_level = wp.LOG_WARNING
     lanes, ticks = len(worlds), round(seconds / PERIOD)
@@ -204,7 +205,7 @@ def _fly(kind, worlds, pilots, references, seconds, gusts, seed, used) -> Flight
     quat, sent, volts = np.empty((lanes, ticks * RECORDS + 1, 4)), np.empty((lanes, ticks, 4)), np.empty((lanes, ticks))
     pos[:, 0], quat[:, 0], rate[:, 0] = starts, (1.0, 0.0, 0.0, 0.0), 0.0
     ball[:, 0] = [s + w.mount - [0, 0, w.length + w.ball_reach] for s, w in zip(starts, worlds)]
-    asked = np.full(lanes, np.inf)
+    asked, link = np.full(lanes, np.inf), np.random.default_rng([seed, 9])
     for k in range(ticks):
         t, now = k * PERIOD, k * RECORDS
         b, hanging, tension = plant.look()
@@ -215,7 +216,8 @@ def _fly(kind, worlds, pilots, references, seconds, gusts, seed, used) -> Flight
                 asked[e] = t
                 excess = tension[e] - EARTH * w.ball_mass
                 plant.latch(e, t + w.release_lag + w.lag_per_newton * excess + w.lag_jitter * jitter[e])
-        queue = np.concatenate([queue[:, 1:], sent[:, k : k + 1]], 1)
+        arrived = np.where(link.random((lanes, 1)) < lost, queue[:, -1], sent[:, k])
+        queue = np.concatenate([queue[:, 1:], arrived[:, None]], 1)
         stamps = np.concatenate([stamps[:, 1:], np.full((lanes, 1), t)], 1)
         blow = np.zeros(lanes, dtype=Gust.numpy_dtype())
         for name, series in zip(("push", "twist", "ball"), blows):

@@ -9,10 +9,11 @@ import json
 from dataclasses import asdict, dataclass, field
 
 import numpy as np
+from scipy.signal import butter, lfilter
 
 from tests.worlds.camera import looked
 from tests.worlds.fly import Flights, fly
-from tests.worlds.numbers import LANDING_HEIGHT, hide
+from tests.worlds.numbers import CHANGES, LANDING_HEIGHT, hide
 from tests.worlds.pilot import PERIOD, FreeFlight, Throw, Tracker
 from tests.worlds.turns import matrix, quaternion, sampled, small_turn
 
@@ -39,6 +40,10 @@ PLANTS = ("chain", "string", "rod")
 GUSTS = (0.015, 1.5e-4, 6e-4)
 NOISE = {"pos": 5e-4, "att": np.radians(0.2), "ball": 8e-4, "volt": 2e-2}
 RATE = 200.0
+TIME, CUTOFF, TAILS, HELD = 0.03, 15.0, 3.0, 0.1
+"""Of a sensor's noise: correlation time [s] where it is coloured, cut-off [Hz] of a second-order filter, degrees of freedom of Student's
+distribution; share of frames that a tracker repeats."""
+COLOURS = ("coloured", "filtered", "tails", "held")
 
 
 @dataclass(frozen=True)
@@ -58,6 +63,9 @@ class Recipe:
     held: int = 0  # throws besides, which nobody is shown
     low: bool = False  # free flights near the ground
     camera: bool = False  # a camera looks down and a detector marks the goal and the ball
+    colour: str = ""  # of the sensors' noise, one of COLOURS; white where empty
+    varies: dict[str, float] = field(default_factory=dict)  # deviation of effects whose size is drawn anew for each flight
+    lost: float = 0.0  # share of commands that never arrive
     dust: float = 0.0  # deviation of every other effect, in its floor: what matters to nobody, and is there in every hall
 
     def digest(self) -> str:
@@ -97,6 +105,34 @@ def world_of(recipe: Recipe):
     return world
 
 
+def worlds_of(recipe: Recipe, first: int, count: int) -> list:
+    """The worlds of some flights, each with what it has of its own."""
+    out = []
+    for flight in range(first, first + count):
+        own = np.random.default_rng([recipe.seed, 8, flight])
+        sizes = {name: float(deviation * own.standard_normal()) for name, deviation in recipe.varies.items()}
+        world = world_of(recipe)
+        for name, size in sizes.items():
+            CHANGES[name](world, size)
+        out.append(world)
+    return out
+
+
+def sensor_noise(rng: np.random.Generator, colour: str, shape: tuple[int, int]) -> np.ndarray:
+    """Noise of deviation 1 of evenly sampled components, shape (T, C)."""
+    if colour == "tails":
+        return rng.standard_t(TAILS, shape) / np.sqrt(TAILS / (TAILS - 2.0))
+    if colour not in ("coloured", "filtered"):
+        return rng.normal(size=shape)
+    before = 200  # samples until it is stationary
+    white = rng.normal(size=(shape[0] + before, shape[1]))
+    a = np.exp(-1.0 / (RATE * TIME))
+    low, high = butter(2, CUTOFF / (RATE / 2.0)) if colour == "filtered" else ([np.sqrt(1.0 - a * a)], [1.0, -a])
+    out = lfilter(low, high, white, axis=0)[before:]
+    answer = lfilter(low, high, np.eye(1, 4000)[0])
+    return out / np.sqrt(np.sum(answer**2))
+
+
 def lanes_of(recipe: Recipe, rng: np.random.Generator):
     """References of all flights: free ones first, then throws at rising speeds, then those held back."""
     free = [FreeFlight(rng, height=0.75 if recipe.low else 1.9, speed=0.5 if recipe.low else 1.0) for _ in range(recipe.free)]
@@ -108,14 +144,15 @@ def lanes_of(recipe: Recipe, rng: np.random.Generator):
 def fly_recipe(recipe: Recipe) -> list[Flights]:
     """Fly the world: one :class:`Flights` of the free flights, one of the throws."""
     rng = np.random.default_rng(recipe.seed + 1)
-    world, known = world_of(recipe), hide({})
-    out = []
+    known, out, first = hide({}), [], 0
     for lanes, seconds in zip(lanes_of(recipe, rng), (recipe.free_seconds, 2.6)):
         if lanes:
             pilot = Tracker(lanes, known.mass, known.ball_mass + known.rope_mass, rng)
             gusts = [recipe.gusts * g for g in GUSTS]
             used = rng.uniform(0.0, 0.4, len(lanes))
-            out.append(fly(recipe.plant, [world] * len(lanes), pilot.command, lanes, seconds, gusts, recipe.seed + 2, used))
+            worlds = worlds_of(recipe, first, len(lanes))
+            out.append(fly(recipe.plant, worlds, pilot.command, lanes, seconds, gusts, recipe.seed + 2, used, recipe.lost))
+            first += len(lanes)
     return out
 
 
@@ -137,13 +174,16 @@ def recorded(recipe: Recipe, flights: list[Flights]) -> list[dict]:
             rot = matrix(q / np.linalg.norm(q, axis=1, keepdims=True))
             pos = (1 + w.frame_scale) * (sampled(f.time, f.pos[e], t - w.quad_stamp) + rot @ w.marker_off) @ tilt.T
             ball = (1 + w.frame_scale) * sampled(f.time, f.ball[e], t - w.ball_stamp) @ tilt.T
-            noise = small_turn(recipe.noise * NOISE["att"] * rng.normal(size=(len(t), 3)))
+            noise = small_turn(recipe.noise * NOISE["att"] * sensor_noise(rng, recipe.colour, (len(t), 3)))
             quat = quaternion(tilt @ rot @ turn @ noise)
-            pos = pos + recipe.noise * NOISE["pos"] * rng.normal(size=pos.shape)
-            ball = ball + recipe.noise * NOISE["ball"] * rng.normal(size=ball.shape)
+            pos = pos + recipe.noise * NOISE["pos"] * sensor_noise(rng, recipe.colour, pos.shape)
+            ball = ball + recipe.noise * NOISE["ball"] * sensor_noise(rng, recipe.colour, ball.shape)
             down = np.flatnonzero(f.ball[e][:, 2] <= LANDING_HEIGHT)
             landed = f.time[down[0]] if len(down) else np.inf
             ball[t > landed] = np.nan
+            if recipe.colour == "held":
+                fresh = np.maximum.accumulate(np.where(rng.random(len(t)) < HELD, 0, np.arange(len(t))))
+                pos, quat, ball = pos[fresh], quat[fresh], ball[fresh]
             lost = rng.random(len(t)) < recipe.dropouts
             pos[lost], quat[lost], ball[lost] = np.nan, np.nan, np.nan
             release = f.release_at[e] if np.isfinite(f.release_at[e]) else None

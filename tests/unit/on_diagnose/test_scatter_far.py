@@ -33,7 +33,8 @@ def world(seed: int, count: int = 12):
 
     def again(theta):
         left = seen - answer(theta[0])
-        return replace(found, square=INFORMATION * left**2, theta=theta) if abs(theta[0]) < 40.0 else None
+        there = replace(found, square=INFORMATION * left**2, score=INFORMATION * left[:, None] * np.eye(1, K), theta=theta)
+        return there if abs(theta[0]) < 40.0 else None
 
     return found, again
 

@@ -189,11 +189,12 @@ def test_what_happened_in_one_flight_is_an_event_and_no_cause():
     assert diagnosis.events == (4,)
 
 
-def test_signs_that_change_from_flight_to_flight_are_no_cause():
+def test_signs_that_change_from_flight_to_flight_are_told_as_what_varies():
     model = altered(lambda m, w: pushed(m, w, 15.0 * (-1) ** w.flight), throws=9)
     diagnosis = search.explain(model, laws=False)
     assert not diagnosis.theta
-    assert diagnosis.overall in (result.INCONSISTENT, result.NO_EFFECT)
+    assert [(s.name, s.of) for s in diagnosis.scatter if s.found] == [("effect_03_by_flight", ("effect_03",))]
+    assert diagnosis.overall == result.KNOWN
 
 
 def test_flights_differ_by_more_than_form_and_noise():

@@ -118,12 +118,17 @@ def grams_of(windows: Sequence[Window], floors: np.ndarray, channels: int, devic
     Raises:
         DiagnoseError: A window's arrays do not fit together, or hold NaN or infinity.
     """
-    if device == "cpu" or not windows:
+    if device == "cpu" or not windows or _correlated(windows):
         return each(lambda w: gram_of(w, floors, channels), windows)
     each(lambda w: check(w, len(floors), channels), windows)
     design = _designed(windows, floors, channels, device)
     products = zip(windows, design.inner(), design.products([w.residual for w in windows]))
     return [replace(gram_with(w, inner.of, cross, square), there=inner) for w, inner, (cross, square) in products]
+
+
+def _correlated(windows: Sequence[Window]) -> bool:
+    """Whether noise of windows is to be whitened, which is done on the CPU."""
+    return any(window.correlated for window in windows)
 
 
 def _on_both(values: torch.Tensor, widths: Sequence[int]) -> list[There]:
@@ -206,7 +211,7 @@ def with_residuals(
         residuals: of each window, shape (N,).
         device: where to calculate.
     """
-    if device == "cpu":
+    if device == "cpu" or _correlated(windows):
         return each(lambda w: with_residual(grams[w], windows[w], floors, residuals[w]), range(len(grams)))
     design = _designed(windows, floors, len(grams[0].count), device)
     return [replace(gram, cross=cross, square=square) for gram, (cross, square) in zip(grams, design.products(residuals))]

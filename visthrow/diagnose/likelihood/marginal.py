@@ -5,8 +5,9 @@ Initial states b and latent forces a are integrated out. With U = [X, G], prior 
     V = W^-1 + U P U',   V^-1 = W - W U (P^-1 + U'W U)^-1 U'W   (Woodbury)
 
 so a window of thousands of samples becomes a few inner products (:class:`Gram`), and a change of noise levels costs one small
-factorisation. The latent forces of one block and axis are an Ornstein-Uhlenbeck process at the knots; its Cholesky factor is
-multiplied into G once, after which P is diagonal.
+factorisation. Where noise is correlated (:mod:`visthrow.diagnose.likelihood.correlation`), they are those of whitened columns. The
+latent forces of one block and axis are an Ornstein-Uhlenbeck process at the knots; its Cholesky factor is multiplied into G once,
+after which P is diagonal.
 
 Effects are measured in floors throughout: theta = 1 is the size below which an effect does not matter.
 """
@@ -163,9 +164,17 @@ def without_effects(gram: Gram) -> Gram:
     return replace(gram, inner=there.of, cross=gram.cross[:, :size], there=there)
 
 
+def whitened(window: Window, values: np.ndarray) -> np.ndarray:
+    """Columns in sigmas, shape (N, P), turned into some whose noise is white, in place."""
+    for rows, factor in window.correlated:
+        own = values[rows].reshape(len(rows), -1)
+        values[rows] = lapack.dtrtrs(factor, own, lower=1)[0].reshape(*rows.shape, -1)
+    return values
+
+
 def _inner_products(window: Window, z: np.ndarray, channels: int) -> Gram:
-    z /= window.sigma[:, None]
-    r = window.residual / window.sigma
+    z = whitened(window, z / window.sigma[:, None])
+    r = whitened(window, (window.residual / window.sigma)[:, None])[:, 0]
     inner = np.zeros((channels, z.shape[1], z.shape[1]))
     cross, square = np.zeros((channels, z.shape[1])), np.zeros(channels)
     for c in np.unique(window.channel):
@@ -179,8 +188,9 @@ def gram_with(window: Window, inner: np.ndarray, cross: np.ndarray, square: np.n
     """The gram of a window whose inner products are known, see :class:`Gram`; its latents are at the knots."""
     count = np.bincount(window.channel, minlength=len(square)).astype(float)
     blocks, states = np.asarray(window.latent_block, dtype=int), window.nuisance.shape[1]
+    turned = sum(rows.shape[1] * float(np.log(np.diag(factor)).sum()) for rows, factor in window.correlated)
     return Gram(window.flight, window.phase, count, inner, cross, square, states, blocks, np.eye(len(blocks)),
-                _shown(inner, states, blocks), float(np.log(window.sigma).sum()))  # fmt: skip
+                _shown(inner, states, blocks), float(np.log(window.sigma).sum()) + turned)  # fmt: skip
 
 
 def _shown(inner: np.ndarray, begin: int, blocks: np.ndarray) -> dict[int, float]:
@@ -256,12 +266,21 @@ def _knots(group: np.ndarray, time: np.ndarray) -> int:
 def with_residual(gram: Gram, window: Window, floors: np.ndarray, residual: np.ndarray) -> Gram:
     """The same derivatives with the residuals of another size of the effects."""
     weighted = np.zeros((len(residual), len(gram.count)))
-    weighted[np.arange(len(residual)), window.channel] = residual / window.sigma**2
+    white = whitened(window, (residual / window.sigma)[:, None])[:, 0]
+    weighted[np.arange(len(residual)), window.channel] = _back(window, white) / window.sigma
     by_state = (window.nuisance.T @ weighted).T * window.nuisance_sd
     by_latent = (window.latent.T @ weighted).T @ gram.factor if gram.latents else np.zeros((len(gram.count), 0))
     by_effect = (window.effects.T @ weighted).T * floors
-    square = np.bincount(window.channel, (residual / window.sigma) ** 2, len(gram.count))
+    square = np.bincount(window.channel, white**2, len(gram.count))
     return replace(gram, cross=np.hstack((by_state, by_latent, by_effect)), square=square)
+
+
+def _back(window: Window, white: np.ndarray) -> np.ndarray:
+    """Transpose of :func:`whitened`, of one column, shape (N,)."""
+    out = white.copy()
+    for rows, factor in window.correlated:
+        out[rows] = lapack.dtrtrs(factor, white[rows], lower=1, trans=1)[0]
+    return out
 
 
 def left_of(window: Window, fit: np.ndarray) -> np.ndarray:

@@ -144,6 +144,11 @@ def only(noise: Noise, grams: Sequence[Gram], windows: Sequence[int]) -> Noise:
     return replace(noise, share=noise.share[list(windows)], latent_sd=levels)
 
 
+def roughly(grams: Sequence[Gram]) -> tuple[Noise, float]:
+    """Rough levels of grams with correlated latents, and their log-likelihood."""
+    return _maximise(grams, _first_guess(grams), "cpu", ROUGHLY_NATS)
+
+
 def _first_guess(grams: Sequence[Gram]) -> Noise:
     """Sensor noise as stated, latent forces where they just become visible."""
     scale = np.ones(len(grams[0].count))
@@ -312,7 +317,7 @@ def without_outliers(windows: Sequence[Window], grams: Sequence[Gram], floors: n
     left, given, bare = list(range(len(windows))), list(windows), [without_effects(gram) for gram in grams]
     for again in range(CLEANINGS):
         where = "cpu" if again else device  # few are looked at once more
-        residuals = designs.left_by(given, floors, len(grams[0].count), _widely_fitted(given, bare, where), where)
+        residuals = designs.left_by(given, floors, len(grams[0].count), widely_fitted(given, bare, where), where)
         far = {w: _far(windows[w], residual) for w, residual in zip(left, residuals)}
         left = [w for w in left if np.any(far[w] > 1.0)]
         if not left:
@@ -324,7 +329,7 @@ def without_outliers(windows: Sequence[Window], grams: Sequence[Gram], floors: n
     return [_mended(window, sigma) for window, sigma in zip(windows, sigmas)]
 
 
-def _widely_fitted(windows: Sequence[Window], bare: Sequence[Gram], device: str) -> list[np.ndarray]:
+def widely_fitted(windows: Sequence[Window], bare: Sequence[Gram], device: str) -> list[np.ndarray]:
     """Initial states in prior deviations and latents at the knots that explain most, with wide priors of the latents."""
     time = CORRELATION_TIMES[0]
     shaped = designs.correlated_of(bare, windows, time, device)

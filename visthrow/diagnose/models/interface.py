@@ -44,6 +44,9 @@ class Window:
     ``pos_w``, ``vel_w``, ``quat_wb``, ``rate_b``, ``thrust`` [N], ``payload_pos_w``, ``payload_vel_w``, ``cable_dir_w``,
     ``tension`` [N], ``mount_b`` (of the rope, from the centre of mass) [m, body frame]."""
     shaken: bool = False  # whether it begins in a motion that nobody can know, such as a rope's that has just come taut
+    correlated: tuple[tuple[np.ndarray, np.ndarray], ...] = ()
+    """Of channels whose noise is not white: rows of their samples, shape (stamps, components), and the lower Cholesky factor of the
+    correlation of a component's noise, shape (stamps, stamps)."""
 
 
 @dataclass(frozen=True)

@@ -9,15 +9,13 @@ from scipy.stats import chi2
 from visthrow.diagnose.likelihood.evidence import Priors, additions, estimate
 from visthrow.diagnose.models.interface import Window
 from visthrow.diagnose.select.point import Point
+from visthrow.diagnose.select.scatter import SHARE
 
 LEAST_FLIGHTS = 4
 """Fewer cannot outvote one."""
 
 CONTRADICTION = 16.0
 """Squared distance of one flight from the others, in their joint deviation (4 sigma), from which it contradicts them."""
-
-SHARE = 0.3
-"""Part of an effect by which flights may differ: the effect's form is never exact."""
 
 CHANCE = 0.1
 """Probability that random signs of the flights would say as much, from which an effect is no property of the vehicle."""

@@ -1,7 +1,7 @@
 """The state of a search: the model linearised at some sizes of its effects, with the noise levels that belong there."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -9,6 +9,7 @@ import numpy as np
 
 from visthrow.diagnose.likelihood import noise as levels
 from visthrow.diagnose.likelihood import stack
+from visthrow.diagnose.likelihood.correlation import Correlation, with_correlations
 from visthrow.diagnose.likelihood.designs import grams_of, with_residuals
 from visthrow.diagnose.likelihood.evidence import Priors, covariance, estimate, log_evidence
 from visthrow.diagnose.likelihood.marginal import (
@@ -46,6 +47,8 @@ class Problem:
     model: Model
     priors: Priors
     kept: tuple[int, ...]  # windows that are looked at
+    correlated: Mapping[int, Correlation] = field(default_factory=dict)  # channels whose noise is not white
+    varies: Mapping[int, float] = field(default_factory=dict)  # effects that differ from flight to flight: deviation in floors
 
     @property
     def switches(self) -> np.ndarray:
@@ -70,10 +73,16 @@ class Point:
     raw: Sequence[Gram]  # latents at the knots
     grams: Sequence[Gram]  # latents correlated
     noise: Noise
-    statistics: Statistics
+    plain: Statistics  # of flights without anything of their own
+    varies: Mapping[int, float]  # see :attr:`Problem.varies`
     integrals: stack.Integrals  # of the grams under these noise levels
     about: Linearised | None  # where the derivatives were taken; None: with another kind of block than the residuals
     device: str  # where the model simulates, and the algebra of all windows with it
+
+    @cached_property
+    def statistics(self) -> Statistics:
+        """What flights say of what they share: that which each has of its own is integrated out."""
+        return freed(self.plain, self.varies)
 
     @cached_property
     def information(self) -> np.ndarray:
@@ -101,7 +110,7 @@ def regathered(point: Point, integrals: stack.Integrals | None = None, **changes
     """
     changed = replace(point, **changes)
     integrals = stack.integrals(changed.grams, changed.noise, changed.device) if integrals is None else integrals
-    return replace(changed, integrals=integrals, statistics=_statistics(changed.grams, integrals, changed.noise, changed.theta))
+    return replace(changed, integrals=integrals, plain=_statistics(changed.grams, integrals, changed.noise, changed.theta))
 
 
 def _statistics(grams: Sequence[Gram], integrals: stack.Integrals, noise: Noise, theta: np.ndarray) -> Statistics:
@@ -123,7 +132,7 @@ def linearise(problem: Problem, theta: np.ndarray, start: Noise | None = None, w
     """
     windows = problem.model.windows(problem.sizes(theta)) if windows is None else windows
     channels = len(problem.model.channels)
-    found = [windows[i] for i in problem.kept]
+    found = with_correlations([windows[i] for i in problem.kept], problem.correlated)
     device, floors = getattr(problem.model, "device", "cpu"), problem.priors.floor
     first = grams_of(found, floors, channels, device)
     kept = levels.without_outliers(found, first, floors, device)
@@ -133,7 +142,7 @@ def linearise(problem: Problem, theta: np.ndarray, start: Noise | None = None, w
     noise, grams = levels.fit(kept, raw, start, device)
     integrals, at = stack.integrals(grams, noise, device), np.array(theta, dtype=float)
     about = Linearised(problem.sizes(theta), dict(zip(problem.kept, kept)))
-    return Point(at, kept, raw, grams, noise, _statistics(grams, integrals, noise, at), integrals, about, device)
+    return Point(at, kept, raw, grams, noise, _statistics(grams, integrals, noise, at), problem.varies, integrals, about, device)
 
 
 def only(point: Point, windows: Sequence[int]) -> Point:
@@ -226,7 +235,7 @@ def with_all_effects_noise(problem: Problem, point: Point) -> Point:
     return _with_noise_at(point, estimate(point.information, point.score, problem.priors, visible))
 
 
-def with_floors_noise(problem: Problem, point: Point, active: Sequence[int], varies: Mapping[int, float] | None = None) -> Point:
+def with_floors_noise(problem: Problem, point: Point, active: Sequence[int]) -> Point:
     """The same with the noise levels that remain when every effect has its most probable size, those not named below their floors.
 
     What a dozen effects below their floors leave is no gust, but it is nothing that is missing either; nor is what an effect
@@ -236,17 +245,20 @@ def with_floors_noise(problem: Problem, point: Point, active: Sequence[int], var
         problem: of the search.
         point: whose derivatives and residuals are taken.
         active: effects named.
-        varies: deviation in floors of effects that differ from flight to flight.
     """
-    mean = freed(point.statistics, varies or {})
-    theta = covariance(mean.information.sum(0), problem.priors.deviation(list(active))) @ mean.absolute.sum(0)
-    return _with_noise_at(point, theta, own_shares(point.statistics, theta, varies or {}))
+    theta = covariance(point.information, problem.priors.deviation(list(active))) @ point.score
+    return _with_noise_at(point, theta, own_shares(point.plain, theta, point.varies))
+
+
+def with_varying(point: Point, varies: Mapping[int, float]) -> Point:
+    """The same in which other effects differ from flight to flight, with the noise levels that this leaves."""
+    return _with_noise_at(replace(point, varies=varies), point.theta, own_shares(point.plain, point.theta, varies))
 
 
 def _with_noise_at(point: Point, theta: np.ndarray, own: np.ndarray | None = None) -> Point:
     """The same with noise levels estimated from the residuals at ``theta``, and each flight's ``own`` beside it, shape (F, K)."""
-    at = np.tile(theta - point.theta, (len(point.statistics.flights), 1)) + (0.0 if own is None else own)
-    row = {flight: f for f, flight in enumerate(point.statistics.flights.tolist())}
+    at = np.tile(theta - point.theta, (len(point.plain.flights), 1)) + (0.0 if own is None else own)
+    row = {flight: f for f, flight in enumerate(point.plain.flights.tolist())}
     moves = [at[row[window.flight]] for window in point.windows]
     grams = [shifted(gram, move) for gram, move in zip(point.grams, moves)]
     return regathered(point, noise=levels.refit(grams, point.noise, point.device))

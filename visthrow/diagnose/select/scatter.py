@@ -1,9 +1,11 @@
-"""What varies from flight to flight: the deviation of an effect among flights, from the scatter of the flights' own scores.
+"""What varies from flight to flight: random effects, each weighed by the same evidence as a name.
 
-About the sizes that were found, the score u of an effect in flight f is normal with variance i + i^2 theta^2: i is the flight's
-information, theta the deviation that is looked for. What all flights share of the effect is no scatter: it may have any size that
-its prior allows. Effects that are not named stay below their floors and add what they could.
+A flight has its own share of an effect, normal about what all flights share, with a deviation theta that is looked for. The shares
+are integrated out of the flights' statistics (:func:`freed`), the size that all share may be any that its prior allows, and effects
+that are not named stay below their floors. The evidence of theta against that of none says whether the effect varies.
 A flight far from the others is simulated again at other sizes: a release 40 ms early tells twice of it by its derivative.
+
+Source: Laird and Ware 1982 (random effects).
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -12,23 +14,25 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from sim.effects.effect import RandomEffect
+from sim.effects.effect import Effect, RandomEffect
 from visthrow.config.effects import random_effects
-from visthrow.diagnose.likelihood.evidence import SPIKE, Priors
+from visthrow.diagnose.likelihood.evidence import Priors, covariance, log_evidence
 from visthrow.diagnose.likelihood.marginal import Statistics
 
 LEAST_FLIGHTS = 4
 """With fewer a deviation is anybody's guess."""
-REACH = np.geomspace(0.02, 6.0, 400)
-"""Deviations that are tried, in their prior's."""
+REACH, LOOK = np.geomspace(0.02, 6.0, 25), 5
+"""Deviations that are tried, in their prior's; every which of them, where flights are left out."""
+SHARE = 0.3
+"""Part of an effect by which flights may differ: the effect's form is never exact."""
 FAR = 3.0
 """Floors of a flight's own estimate from which its derivative is not relied upon."""
 SIZES = np.array([-1.0, -0.7, -0.45, -0.25, -0.1, 0.0, 0.1, 0.25, 0.45, 0.7, 1.0])
 """At which flights are simulated again, in the largest estimate of any flight."""
 FINE = 400
-"""Places between two of them at which the best fit is looked for."""
-STEEPEST = 10.0
-"""By which a flight's information may differ from that of its derivative, either way."""
+"""Places between them at which a curve is looked at."""
+MOST_VARYING = 3
+"""A longer list is a wrong form."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +63,7 @@ class Scatter:
 
 def varying(
     statistics: Statistics, theta: np.ndarray, priors: Priors, names: Sequence[str], least: float,
-    again: Callable[[np.ndarray], Statistics | None] | None = None,
+    again: Callable[[np.ndarray], Statistics | None] | None = None, others: Sequence[RandomEffect] = (), active: Sequence[int] = (),
 ) -> tuple[Scatter, ...]:  # fmt: skip
     """Verdicts on everything that may vary among these flights.
 
@@ -70,32 +74,47 @@ def varying(
         names: of the effects.
         least: nats that a finding needs.
         again: the flights simulated at other sizes, in floors; None where that fails.
+        others: what may vary besides the catalogue's random effects; told where it does.
+        active: effects that are named.
     """
-    known, told = list(names), {}
-    drawn = np.zeros(len(theta))  # variances of what is known to vary, in floors
-    may_vary = random_effects()
-    for _ in may_vary:
-        free = [v for v in may_vary if not (v.name in told and told[v.name].found)]
-        at = {v.name: [known.index(name) for name in v.of if name in known] for v in free}
-        new = [s for v in free if (s := _verdict(v, statistics, theta, priors, at[v.name], least, drawn)) is not None]
-        best = max((s for s in new if s.found), key=lambda s: s.nats, default=None)
-        if best is not None and again is not None and len(at[best.name]) == 1:
-            v = next(v for v in free if v.name == best.name)
-            statistics = straightened(statistics, theta, priors, at[v.name][0], again)
-            sized = _verdict(v, statistics, theta, priors, at[v.name], least, drawn)
-            new = [sized if s is best else s for s in new]
-            best = sized if sized.found else None
-        told |= {s.name: s for s in new if not s.found or s is best}
+    known, told, drawn = list(names), {}, {}
+    may_vary = [*random_effects(), *others]
+    at = {v.name: [j for j in map(known.index, set(v.of) & set(known)) if priors.visible[j]] for v in may_vary}
+    price = {v: least + (np.log(len(theta)) if v in others else 0.0) for v in may_vary}  # of all effects, one varies more by chance
+    for _ in range(MOST_VARYING):
+        given = priors, drawn, active
+        likely = _likely(freed(statistics, drawn), priors, active, least) if others else ()
+        free = [v for v in may_vary if not (v.name in told and told[v.name].found) and (v not in others or likely[at[v.name]].any())]
+        new = {v: s for v in free if (s := _verdict(v, statistics, at[v.name], price[v], *given)) is not None}
+        found = [v for v, s in new.items() if s.found and not _one_alone(v, statistics, at[v.name], *given)]
+        told |= {v.name: replace(s, found=False) for v, s in new.items() if v not in others}
+        best = max(found, key=lambda v: new[v].nats, default=None)
         if best is None:
             break
-        drawn[at[best.name]] = (best.size / priors.floor[at[best.name]]) ** 2
+        told[best.name] = new[best]
+        if again is not None and len(at[best.name]) == 1:
+            statistics = straightened(statistics, theta, priors, at[best.name][0], again)
+            told[best.name] = _verdict(best, statistics, at[best.name], price[best], *given)
+            if not told[best.name].found:
+                break
+        drawn = drawn | {j: told[best.name].size / float(priors.floor[j]) for j in at[best.name]}
     return tuple(told.values())
+
+
+def by_flight(effects: Sequence[Effect]) -> tuple[RandomEffect, ...]:
+    """Every effect as one that differs from flight to flight, but for those of the catalogue's random effects."""
+    known = {name for v in random_effects() for name in v.of}
+    return tuple(
+        RandomEffect(f"{e.name}_by_flight", f"{e.cause}, now more, now less", f"{e.name} ~ N({e.name}, theta^2) in each flight",
+                     (e.name,), e.unit, e.block, e.prior_sd, e.floor, e.source, manoeuvres=tuple(e.manoeuvres))
+        for e in effects if e.name not in known
+    )  # fmt: skip
 
 
 def straightened(
     statistics: Statistics, theta: np.ndarray, priors: Priors, j: int, again: Callable[[np.ndarray], Statistics | None]
 ) -> Statistics:
-    """Statistics whose score and information of one effect are those about the size at which each flight fits best by itself.
+    """Statistics whose scores are those about the size of one effect at which each flight fits best by itself.
 
     Args:
         statistics: of the flights.
@@ -109,73 +128,72 @@ def straightened(
     reach = np.abs(np.divide(score, own, out=np.zeros_like(own), where=own > 0.0)).max(initial=0.0)
     if reach < FAR:
         return statistics
-    sizes, squares = [], []
+    sizes, found = [], []
     for size in np.unique(np.clip(theta[j] + reach * SIZES, priors.low[j], priors.high[j]) - theta[j]):
         there = again(np.where(np.arange(len(theta)) == j, theta + size, theta))
         if there is not None:
-            sizes, squares = [*sizes, size], [*squares, there.square]
+            sizes, found = [*sizes, size], [*found, there]
     if len(sizes) < len(SIZES) // 2:
         return statistics
-    curve, fit, information = CubicSpline(sizes, squares), score.copy(), own.copy()
-    best = np.argmin(squares, axis=0)
+    squares = np.array([there.square for there in found])
+    curve, best, scores = CubicSpline(sizes, squares), np.argmin(squares, axis=0), statistics.score.copy()
     for f in np.flatnonzero(own > 0.0):
         near = np.linspace(sizes[max(best[f] - 1, 0)], sizes[min(best[f] + 1, len(sizes) - 1)], FINE)
-        size = near[np.argmin(curve(near)[:, f])]
-        information[f] = np.clip(0.5 * curve(size, 2)[f], own[f] / STEEPEST, own[f] * STEEPEST)
-        fit[f] = information[f] * size
-    whole, scores = statistics.information.copy(), statistics.score.copy()
-    steeper = np.sqrt(np.divide(information, own, out=np.ones_like(own), where=own > 0.0))[:, None]
-    whole[:, j, :] *= steeper
-    whole[:, :, j] *= steeper
-    scores[:, j] = fit + (whole @ (theta - statistics.theta))[:, j]
-    return replace(statistics, information=whole, score=scores)
+        at = np.where(np.arange(len(theta)) == j, theta + near[np.argmin(curve(near)[:, f])], theta)
+        information, left = statistics.information[f], found[best[f]].score[f]
+        scores[f] = left - information[:, j] * left[j] / own[f] + information @ (at - statistics.theta)
+    return replace(statistics, score=scores)
+
+
+def _likely(statistics: Statistics, priors: Priors, active: Sequence[int], least: float) -> np.ndarray:
+    """Which effects may vary by more than ``least`` nats, as if there were no other that could in their stead, shape (K,)."""
+    theta = covariance(statistics.information.sum(0), priors.deviation(list(active))) @ statistics.absolute.sum(0)
+    own = np.maximum(np.diagonal(statistics.information, axis1=1, axis2=2), 1e-12)
+    square = (statistics.absolute - statistics.information @ theta) ** 2 / own
+    part = own * (REACH[::LOOK, None, None] * priors.slab) ** 2
+    return (0.5 * (square * part / (1.0 + part) - np.log1p(part)).sum(1)).max(0) > least
 
 
 def _verdict(
-    v: RandomEffect, statistics: Statistics, theta: np.ndarray, priors: Priors, at: Sequence[int], least: float,
-    drawn: np.ndarray,
-) -> Scatter | None:
-    at = [j for j in at if priors.visible[j]]
-    own = statistics.information[:, at, at] if at else np.zeros((0, 0))
-    seen = (own > 0.0).any(axis=1) if at else np.zeros(0, dtype=bool)
+    v: RandomEffect, statistics: Statistics, at: Sequence[int], least: float, priors: Priors, drawn: Mapping[int, float],
+    active: Sequence[int],
+) -> Scatter | None:  # fmt: skip
+    """The verdict on one quantity; None where too few flights say something of it."""
+    seen = (statistics.information[:, at, at] > 0.0).any(axis=1)
     if np.count_nonzero(seen) < LEAST_FLIGHTS:
         return None
-    score = statistics.score - statistics.information @ (theta - statistics.theta)
-    size = np.append(0.0, REACH * v.prior_sd)
-    value = np.zeros(len(size))
-    for j in at:
-        i, u = statistics.information[seen, j, j], score[seen, j]
-        shared = np.where(np.arange(len(theta)) == j, 0.0, SPIKE**2 + drawn)
-        plain = i + statistics.information[seen][:, j] ** 2 @ shared
-        spread = plain[:, None] + (i[:, None] * size / priors.floor[j]) ** 2
-        value += _about_a_mean(i, u, spread, priors.slab[j])
+    reach = REACH * v.prior_sd
+    size = np.append(0.0, np.geomspace(reach[0], reach[-1], FINE))
+    ahead = CubicSpline(np.log(reach), _ahead(statistics, at, reach, priors, drawn, active))
+    value = np.append(0.0, ahead(np.log(size[1:])))
     weight = np.gradient(size) * np.sqrt(2.0 / np.pi) / v.prior_sd * np.exp(-0.5 * (size / v.prior_sd) ** 2)
     best = value.max()
     density = np.exp(value - best) * weight
     share = np.cumsum(density) / density.sum()
     low, high = (float(size[np.searchsorted(share, q)]) for q in (0.025, 0.975))
-    nats = float(np.log(density.sum()) + best - value[0])
-    most = float(size[np.argmax(density / np.gradient(size))])
+    nats, most = float(np.log(density.sum()) + best), float(size[np.argmax(density / np.gradient(size))])
     return Scatter(v.name, v.cause, v.equation, v.block, v.unit, tuple(v.of), nats > least and most > v.floor, most, low, high,
                    v.floor, nats, int(np.count_nonzero(seen)), v.manoeuvres)  # fmt: skip
 
 
-def _about_a_mean(information: np.ndarray, score: np.ndarray, spread: np.ndarray, slab: float) -> np.ndarray:
-    """Log-likelihood of flights' scores that share a size of their own, which is integrated out.
+def _ahead(
+    statistics: Statistics, at: Sequence[int], sizes: np.ndarray, priors: Priors, drawn: Mapping[int, float], active: Sequence[int]
+) -> np.ndarray:
+    """Nats of deviations of some effects against none, beside what varies already; all flights may share any size of these effects."""
+    named = sorted({*active, *at})
 
-    Args:
-        information: of each flight, shape (F,).
-        score: of each flight, shape (F,).
-        spread: variances of the scores, shape (F, S).
-        slab: deviation of the size that they share, in floors.
+    def evidence(varies: Mapping[int, float]) -> float:
+        left = freed(statistics, varies)
+        return log_evidence(left.information.sum(0), left.absolute.sum(0), priors, named) - 0.5 * float(left.absolute_square.sum())
 
-    Returns:
-        Shape (S,).
-    """
-    i, u = information[:, None], score[:, None]
-    alone = (-0.5 * np.log(spread) - 0.5 * u**2 / spread).sum(axis=0)
-    known, towards = (i**2 / spread).sum(axis=0), (i * u / spread).sum(axis=0)
-    return alone + 0.5 * towards**2 / (known + slab**-2.0) - 0.5 * np.log1p(slab**2 * known)
+    nothing = evidence(drawn)
+    return np.array([evidence({**drawn, **{j: size / priors.floor[j] for j in at}}) - nothing for size in sizes])
+
+
+def _one_alone(v: RandomEffect, statistics: Statistics, at: Sequence[int], *given) -> bool:
+    """Whether it is one flight alone that differs: that is an event there."""
+    flights = np.arange(len(statistics.flights))
+    return any(_ahead(statistics.only(flights != f), at, REACH[::LOOK] * v.prior_sd, *given).max() <= 0.0 for f in flights)
 
 
 def freed(statistics: Statistics, deviation: Mapping[int, float]) -> Statistics:

@@ -72,7 +72,7 @@ def calmed(point: Point) -> tuple[Point, list[WindowStatistics]]:
     limits = {block: ROUGHER * usual(levels, block) for block in {block for block, _ in levels}}
     noise = replace(point.noise, latent_sd={key: min(level, limits[key[0]]) for key, level in levels.items()})
     parts = statistics(point.grams, noise, point.device)
-    return replace(point, noise=noise, statistics=gather(point.grams, parts, point.theta)), parts
+    return replace(point, noise=noise, plain=gather(point.grams, parts, point.theta)), parts
 
 
 def screen(point: Point, parts: Sequence[WindowStatistics], block: str, known: Sequence[grammar.Known]) -> Screen | None:

@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from visthrow.common.errors import DiagnoseError
-from visthrow.config.effects import random_effects
 from visthrow.diagnose.likelihood import memory
+from visthrow.diagnose.likelihood.correlation import correlations
 from visthrow.diagnose.likelihood.evidence import (
     Priors,
     additions,
@@ -38,12 +38,13 @@ from visthrow.diagnose.select.point import (
     only,
     with_all_effects_noise,
     with_floors_noise,
+    with_varying,
 )
 from visthrow.diagnose.select.result import Diagnosis, Step
 from visthrow.diagnose.select.rivals import CLOSE, rivals
 from visthrow.diagnose.select.scatter import deviations
 from visthrow.diagnose.select.state import SearchState
-from visthrow.diagnose.select.unknown import outside
+from visthrow.diagnose.select.unknown import follows_a_law, outside
 from visthrow.diagnose.select.verdicts import conclude, out_of_domain
 
 MOST_NAMES = 6
@@ -93,7 +94,7 @@ class Search(SearchState):
             self.point = self.origin = self.nominal
         compared: set[int] | None = None
         for _ in range(EXCHANGES):
-            while len(self.active) < MOST_NAMES and (self._forward() or self._mean()):
+            while len(self.active) < MOST_NAMES and (self._vary() or self._forward() or self._vary(last=True)):
                 self._backward()
                 if self.laws and len(self.active) == CHAIN and outside(self) and not (self.nearer() and not outside(self)):
                     self.progress("a law that the catalogue does not hold explains this better than one name after the other")
@@ -182,27 +183,25 @@ class Search(SearchState):
         whole = self.point.evidence(self.priors, self.active)
         return {j: whole - self.point.evidence(self.priors, [k for k in self.active if k != j]) for j in self.active}
 
-    def _mean(self) -> bool:
-        """Name an effect that was refused because it varies, if the flights agree on its mean; False where there is none."""
-        names, may_vary = [e.name for e in self.problem.model.effects], {name for v in random_effects() for name in v.of}
-        for j in sorted((j for j in self.refused if self.name(j) in may_vary), key=self.refused.get, reverse=True):
-            active = [*self.active, j]
-            drawn = deviations(self.scatter(active), self.priors, names)
-            if j not in drawn:
-                continue
-            found = self.about_means(active, {j: drawn[j]})
-            information, score = found.information.sum(0), found.absolute.sum(0)
-            nats = float(additions(information, score, self.priors, self.active)[j])
-            there = replace(self.point, statistics=found, theta=estimate(information, score, self.priors, active))
-            if nats > self.least and self._sure(there, active, j):
-                self.progress(f"{self.name(j)} named, which varies: {nats:.1f} nats that its mean is not 0")
-                ladder = {self.name(j): nats}
-                self.steps.append(Step(self.name(j), nats, self.least, ladder, ladder))
-                self.active = active
-                self.point = self._settle(candidate(self.problem, self.point, active), active)
-                self.refused.clear()
-                return True
-        return False
+    def _vary(self, last: bool = False) -> bool:
+        """Let effects differ from flight to flight, where that says more than any name; False where nothing new does.
+
+        Args:
+            last: there is no name any more: any effect may be what varies, if no law is why flights differ.
+        """
+        scatter = [s for s in self.scatter(self.active, every=last) if s.found]
+        varies = deviations(scatter, self.priors, [e.name for e in self.problem.model.effects])
+        new = [s for s in scatter if not {self.name(j) for j in self.problem.varies} & set(s.of)]
+        if not new or (not last and max(s.nats for s in new) < self._screen(self.point).max()):
+            return False
+        if last and self.laws and follows_a_law(self):
+            return False
+        for s in new:
+            self.progress(f"{', '.join(s.of)} differs from flight to flight: {s.size:.3g} {s.unit}, {s.nats:.1f} nats")
+        self.problem = replace(self.problem, varies=varies)
+        self.nominal, self.origin, self.point = (with_varying(p, varies) for p in (self.nominal, self.origin, self.point))
+        self.refused.clear()
+        return True
 
     def _agreed(self, point: Point, j: int) -> tuple[Consistency | None, Point]:
         """Why a candidate is no cause or None, and the candidate, linearised where it lies if the flights differ at first."""
@@ -380,7 +379,10 @@ def explain(
     kept = tuple(i for i, w in enumerate(windows) if finite[i] and w.flight not in left_out)
     if len(kept) < 0.5 * sum(w.flight not in left_out for w in windows) or not kept:
         return out_of_domain(model, windows, sum(finite), seed)
-    problem = Problem(model, priors, kept)
+    correlated = correlations([windows[i] for i in kept], priors.slab * priors.floor, len(model.channels))
+    for c, own in correlated.items():
+        say(f"noise of {model.channels[c]} is correlated over {1e3 * own.time:.0f} ms, for {own.share:.1%} of its variance")
+    problem = Problem(model, priors, kept, correlated)
     nominal = linearise(problem, np.zeros(len(model.effects)), windows=windows)
     for _ in range(LOSSES):
         if not (gone := lost(nominal)):

@@ -10,7 +10,7 @@ from visthrow.diagnose.likelihood.evidence import Priors, estimate
 from visthrow.diagnose.likelihood.marginal import Statistics
 from visthrow.diagnose.select.point import Point, Problem, fitted, linearise, moved
 from visthrow.diagnose.select.result import Step
-from visthrow.diagnose.select.scatter import Scatter, freed, straightened, varying
+from visthrow.diagnose.select.scatter import Scatter, by_flight, freed, straightened, varying
 
 NEAR = 0.1
 """Distance from where derivatives were taken, in floors, within which they hold for a law as well."""
@@ -43,6 +43,7 @@ class SearchState:
     dropped: set[int] = field(default_factory=set)  # effects that a later one made superfluous; they are not tried again
     events: list[int] = field(default_factory=list)
     sets: list[tuple[tuple[int, ...], float]] = field(default_factory=list)
+    varied: Any = None  # of :meth:`scatter`, and what it was asked about
     answer: Any = None  # of :func:`visthrow.diagnose.select.unknown.find_laws`, and the state that it was given in
 
     @property
@@ -54,10 +55,20 @@ class SearchState:
         """Return the name of an effect by its number."""
         return self.problem.model.effects[j].name
 
-    def scatter(self, active: Sequence[int]) -> tuple[Scatter, ...]:
-        """Return the verdicts on what varies from flight to flight about the sizes of a set of effects."""
-        names = [e.name for e in self.problem.model.effects]
-        return varying(self.point.statistics, self.sizes(active), self.priors, names, self.least, self.again)
+    def scatter(self, active: Sequence[int], *, every: bool = False) -> tuple[Scatter, ...]:
+        """Return the verdicts on what varies from flight to flight about the sizes of a set of effects.
+
+        Args:
+            active: the set.
+            every: ask about all effects, not only those of the catalogue's random effects and those that are known to vary.
+        """
+        asked = self.point, tuple(active), every
+        if self.varied is None or self.varied[0][0] is not self.point or self.varied[0][1:] != asked[1:]:
+            effects, about = self.problem.model.effects, self.sizes(active)
+            others = by_flight([e for j, e in enumerate(effects) if j in self.problem.varies or (every and not e.switch)])
+            self.varied = asked, varying(self.point.plain, about, self.priors, [e.name for e in effects], self.least, self.again,
+                                         others, active)  # fmt: skip
+        return self.varied[1]
 
     def sizes(self, active: Sequence[int]) -> np.ndarray:
         """Return the most probable sizes of a set of effects, in floors, shape (K,)."""
@@ -66,7 +77,7 @@ class SearchState:
     def again(self, theta: np.ndarray) -> Statistics | None:
         """Return statistics of the flights simulated at other sizes, given in floors; None where that fails."""
         there = moved(self.problem, self.point, theta)
-        return None if there is None else there.statistics
+        return None if there is None else there.plain
 
     def about_means(self, active: Sequence[int], varies: Mapping[int, float]) -> Statistics:
         """Return what the flights say of the means of effects that vary; flights far from the mean are simulated again at their own size.
@@ -75,7 +86,7 @@ class SearchState:
             active: effects named.
             varies: deviation in floors of an effect among flights.
         """
-        statistics, theta = self.point.statistics, self.sizes(active)
+        statistics, theta = self.point.plain, self.sizes(active)
         for j in sorted(set(varies) & set(active)):
             statistics = straightened(statistics, theta, self.priors, j, self.again)
         return freed(statistics, varies)

@@ -100,12 +100,12 @@ class Hypothesis:
         """The point with the terms at their best coefficients, their residuals taken out, for the catalogue's effects."""
         count = len(self.point.theta) - len(self.terms)
         best = (covariance(self.point.information, self.priors.deviation(self.active)) @ self.point.score)[count:]
-        statistics = self.point.statistics
+        statistics = self.point.plain
         taken = statistics.information[:, :count, count:] @ best
         inner = replace(statistics, information=statistics.information[:, :count, :count],
                         score=statistics.score[:, :count] - taken, theta=statistics.theta[:count])  # fmt: skip
         theta = estimate(inner.information.sum(0), inner.absolute.sum(0), self.catalogue, self.names)
-        return replace(self.point, theta=theta, statistics=inner)
+        return replace(self.point, theta=theta, plain=inner)
 
 
 def _extended(
@@ -245,6 +245,12 @@ def outside(search: SearchState) -> bool:
     """
     answer = find_laws(search, lambda h: len(beats_the_catalogue(search, Answer((h,)))[1]) > 1)
     return len(beats_the_catalogue(search, answer)[1]) > 1
+
+
+def follows_a_law(search: SearchState) -> bool:
+    """Whether a term that the catalogue does not hold explains the flights better than what a search has named."""
+    answer = find_laws(search, lambda h: beats_the_catalogue(search, Answer((h,)))[0] is not None)
+    return beats_the_catalogue(search, answer)[0] is not None
 
 
 def find_laws(search: SearchState, enough: Callable[[Hypothesis], bool] | None = None) -> Answer:

@@ -9,7 +9,7 @@ from visthrow.diagnose.likelihood.evidence import NORMAL_95, OWN_FLOOR, Priors, 
 from visthrow.diagnose.models.interface import Model, Window
 from visthrow.diagnose.select import result, unknown
 from visthrow.diagnose.select.excess import acts_on, levels, too_strong
-from visthrow.diagnose.select.point import Point, with_floors_noise
+from visthrow.diagnose.select.point import Point, with_floors_noise, with_varying
 from visthrow.diagnose.select.result import Diagnosis, Finding, Law, Level
 from visthrow.diagnose.select.scatter import deviations, freed
 from visthrow.diagnose.select.state import SearchState, Work
@@ -47,7 +47,9 @@ def conclude(search: SearchState, *, laws: bool) -> Diagnosis:
     point, model = search.point, search.problem.model
     scatter = search.scatter(search.active)
     varies = deviations(scatter, search.priors, [e.name for e in model.effects])
-    found = levels(search.problem, search.nominal, with_floors_noise(search.problem, point, search.active, varies), search.least)
+    if varies or point.varies:
+        point = search.point = with_varying(point, varies)
+    found = levels(search.problem, search.nominal, with_floors_noise(search.problem, point, search.active), search.least)
     drawn = {name for s in scatter if s.found for name in s.of}
     search.refused = {j: nats for j, nats in search.refused.items() if search.name(j) not in drawn}
     overall, block, reasons, withdrawn = _overall(search, found, *law)
@@ -67,7 +69,7 @@ def conclude(search: SearchState, *, laws: bool) -> Diagnosis:
     elif law[0] is not None and active:
         point = law[0].without_terms()
     here = point is search.point
-    point = replace(point, statistics=search.about_means(active, varies) if here else freed(point.statistics, varies))
+    point = replace(point, plain=search.about_means(active, varies) if here else freed(point.plain, varies), varies={})
     point = replace(point, theta=estimate(point.information, point.score, search.priors, active))
     spread = covariance(point.information, search.priors.deviation(active))
     findings = tuple(_finding(search, point, j, active, spread, withdrawn) for j in range(len(model.effects)))

@@ -1,0 +1,92 @@
+"""Correlated measurement noise: the algebra against dense covariances, the estimate against planted noise, and what it is there for."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from tests.synthetic_diagnosis import SyntheticModel, catalogue
+from visthrow.diagnose.likelihood import marginal
+from visthrow.diagnose.likelihood.correlation import Correlation, components, correlations, with_correlations
+from visthrow.diagnose.likelihood.evidence import Priors
+from visthrow.diagnose.select import result, search
+
+RATE, TIME = 200, 0.03
+SOME = 16  # effects
+
+
+def noise(rng, count: int, colour: str) -> np.ndarray:
+    """Noise of deviation 1, shape (count, 3)."""
+    white = rng.normal(size=(count + 400, 3))
+    a = np.exp(-1.0 / (RATE * TIME))
+    first = lfilter([np.sqrt(1.0 - a * a)], [1.0, -a], white, axis=0)
+    second = lfilter([np.sqrt((1.0 - a * a) ** 3 / (1.0 + a * a))], [1.0, -2.0 * a, a * a], white, axis=0)
+    return {"white": white, "first": first, "second": second}[colour][400:]
+
+
+def flown(seed: int, colour: str, **options) -> SyntheticModel:
+    """Flights whose sensors have noise of a colour."""
+    model = SyntheticModel(effects=catalogue(SOME), seed=seed, noise=1e-6, rate=RATE, throws=4, **options)
+    rng = np.random.default_rng([seed, 1])
+    for i, window in enumerate(model._windows):
+        own = [noise(rng, len(window.residual) // 6, colour).ravel() for _ in range(2)]
+        model._windows[i] = replace(window, residual=window.residual + window.sigma * np.concatenate(own))
+    return model
+
+
+def estimated(model: SyntheticModel) -> dict[int, Correlation]:
+    priors = Priors.of(model.effects, model.channels)
+    return correlations(model.windows({}), priors.slab * priors.floor, 2)
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_inner_products_are_those_of_the_dense_covariance(order):
+    window = flown(1, "white").windows({})[0]
+    known = Correlation(0.02, 0.9, order, 1.7)
+    (told,) = with_correlations([window], {1: known})
+    dense = np.diag(window.sigma**2)
+    for part in components(window, 1).T:
+        lag = window.time[part][:, None] - window.time[part]
+        dense[np.ix_(part, part)] = (1.7 * window.sigma[part[0]]) ** 2 * known.at(lag)
+    floors = np.ones(SOME)
+    z, gram = marginal.columns(window, floors), marginal.gram_of(told, floors, 2)
+    inverse = np.linalg.inv(dense)
+    np.testing.assert_allclose(gram.inner.sum(0), z.T @ inverse @ z, rtol=1e-6, atol=1e-9 * np.abs(gram.inner).max())
+    assert gram.square.sum() == pytest.approx(window.residual @ inverse @ window.residual)
+    assert 2.0 * gram.log_sigma == pytest.approx(np.linalg.slogdet(dense)[1])
+    other = np.random.default_rng(0).normal(size=len(window.residual)) * window.sigma
+    again = marginal.with_residual(gram, told, floors, other)
+    np.testing.assert_allclose(again.cross.sum(0), z.T @ inverse @ other, rtol=1e-6, atol=1e-9 * np.abs(again.cross).max())
+    assert again.square.sum() == pytest.approx(other @ inverse @ other)
+
+
+def test_white_noise_is_white():
+    assert not estimated(flown(2, "white"))
+    assert not estimated(flown(2, "white", truth={"effect_02": 60.0, "effect_04": 40.0})), "causes are not noise"
+
+
+@pytest.mark.parametrize(("colour", "order"), [("first", 1), ("second", 2)])
+def test_time_order_and_size_are_those_planted(colour, order):
+    for seed in (3,):
+        found = estimated(flown(seed, colour))
+        assert set(found) == {0, 1}
+        for own in found.values():
+            assert own.order == order
+            assert TIME / 2.0 < own.time < 2.0 * TIME
+            assert own.share > 0.9
+            assert 0.7 < own.scale < 1.4
+
+
+def test_noise_that_is_correlated_is_no_cause(monkeypatch):
+    """Taken for white, it is told as names or as something unknown."""
+    said = [search.explain(flown(seed, "first")) for seed in (0, 7)]
+    assert [d.overall for d in said] == [result.NO_EFFECT] * 2
+    monkeypatch.setattr(search, "correlations", lambda *_: {})
+    assert any(search.explain(flown(seed, "first")).overall != result.NO_EFFECT for seed in (0, 7))
+
+
+def test_a_cause_is_found_behind_it():
+    diagnosis = search.explain(flown(5, "first", truth={"effect_01": 15.0}))
+    assert diagnosis.named == ("effect_01",)
+    assert diagnosis["effect_01"].low < 15.0 * catalogue(SOME)[1].floor < diagnosis["effect_01"].high

@@ -1,0 +1,170 @@
+"""Measurement noise that is correlated: what filters and a tracker's own dynamics leave between neighbouring samples.
+
+The noise of a channel's component is white for a part, and for a share w it follows a filter of first or second order (Matern 1/2
+and 3/2):
+
+    c(t) = (1 - w) [t = 0] + w k(t / tau),   k_1(x) = exp(-x),   k_2(x) = (1 + x) exp(-x)
+
+Every window gets the Cholesky factors of these correlations at its own stamps; the inner products of
+:mod:`visthrow.diagnose.likelihood.marginal` are those of whitened columns, so that evidence, thresholds and intervals know of them.
+Noise of samples that neighbour each other says nothing about the noise at low frequencies, where causes lie: time, share and order
+are the likeliest of whole windows, with initial states, latent forces and every effect integrated out, so that no cause is taken for noise.
+
+Source: Rasmussen and Williams 2006, section 4.2.1 (kernels) and 5.4.1 (marginal likelihood).
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from visthrow.diagnose.likelihood import designs, noise
+from visthrow.diagnose.likelihood.evidence import VERY_STRONG
+from visthrow.diagnose.likelihood.marginal import hidden_gram, left_of
+from visthrow.diagnose.likelihood.threads import each
+from visthrow.diagnose.models.interface import Window
+
+SUSPECT = 0.1
+"""Correlation of neighbouring samples from which a channel is looked at: of ten thousand white ones it has a deviation of 0.01."""
+
+PERIODS = 2.0 ** np.arange(0.0, 5.25, 0.25)
+"""Correlation times that are tried, in the samples' period: at low frequencies, noise of second order goes with the time's fourth power."""
+STRIDES = (4, 2, 1)
+"""Steps among them, one after the other."""
+
+SHARES = (0.5, 0.8, 0.95, 0.99, 0.999)
+"""Correlated parts of the variance that are tried; the rest keeps the correlations' inverse within what doubles hold."""
+
+LOOKED_AT = 8
+"""Windows that the estimate is made of."""
+
+
+@dataclass(frozen=True)
+class Correlation:
+    """Correlated noise of one channel."""
+
+    time: float  # [s]
+    share: float  # of the variance
+    order: int  # of the filter: 1 or 2
+    scale: float = 1.0  # of the deviation that is stated
+
+    def at(self, lag: np.ndarray) -> np.ndarray:
+        """Correlation of samples ``lag`` [s] apart."""
+        x = np.abs(lag) / self.time
+        return self.share * np.exp(-x) * (1.0 + x if self.order == 2 else 1.0) + (1.0 - self.share) * (lag == 0.0)
+
+
+def components(window: Window, channel: int) -> np.ndarray | None:
+    """Rows of a channel's samples, shape (stamps, components), in the order of time; None where stamps differ by component."""
+    rows = np.flatnonzero(window.channel == channel)
+    stamps, counts = np.unique(window.time[rows], return_counts=True)
+    if len(stamps) < 4 or np.any(counts != counts[0]):
+        return None
+    return rows[np.argsort(window.time[rows], kind="stable")].reshape(len(stamps), counts[0])
+
+
+def with_correlations(windows: Sequence[Window], known: Mapping[int, Correlation]) -> list[Window]:
+    """Tell windows of the correlations of their channels' noise.
+
+    Args:
+        windows: of white noise.
+        known: of channels, by number.
+    """
+    return each(lambda window: _told(window, known), windows) if known else list(windows)
+
+
+def _told(window: Window, known: Mapping[int, Correlation]) -> Window:
+    factors, sigma = [], window.sigma.copy()
+    for channel, correlation in known.items():
+        rows = components(window, channel)
+        if rows is not None:
+            time = window.time[rows[:, 0]]
+            factors.append((rows, np.linalg.cholesky(correlation.at(time[:, None] - time))))
+            sigma[rows] *= correlation.scale
+    return replace(window, sigma=sigma, correlated=tuple(factors))
+
+
+def correlations(windows: Sequence[Window], slabs: np.ndarray, channels: int) -> dict[int, Correlation]:
+    """Estimate which channels' noise is correlated, and how.
+
+    Args:
+        windows: of the flights.
+        slabs: prior deviation of each effect in its unit, shape (K,).
+        channels: number of the model's channels.
+
+    Returns:
+        Channel -> its noise, where that is surely not white.
+    """
+    chosen = [windows[i] for i in np.unique(np.linspace(0, len(windows) - 1, LOOKED_AT).astype(int))]
+    free = [_with_free_effects(window, slabs) for window in chosen]
+    bare = each(lambda window: hidden_gram(window, channels), free)
+    left = each(lambda pair: left_of(*pair), zip(free, noise.widely_fitted(free, bare, "cpu")))
+    suspects = {c: scale for c in range(channels) if (scale := _suspected(free, left, c)) is not None}
+    known: dict[int, Correlation] = {}
+    for channel, scale in suspects.items():
+        best, ahead = _climbed(free, channels, known, channel, scale)
+        if ahead > VERY_STRONG:
+            known[channel] = best
+    return known
+
+
+def _with_free_effects(window: Window, slabs: np.ndarray) -> Window:
+    """A window in which every effect may have a size of its own."""
+    states = np.hstack((window.nuisance, window.effects))
+    return replace(window, nuisance=states, nuisance_sd=np.append(window.nuisance_sd, slabs), effects=window.effects[:, :0])
+
+
+def _suspected(windows: Sequence[Window], left: Sequence[np.ndarray], channel: int) -> float | None:
+    """Deviation of what is left of a channel, in that which is stated; None where its neighbours are hardly correlated."""
+    parts = [r[rows] / w.sigma[rows] for w, r in zip(windows, left) if (rows := components(w, channel)) is not None]
+    if not parts:
+        return None
+    far = noise.HUBER * noise.MAD_TO_SIGMA * np.median(np.abs(np.concatenate([p.ravel() for p in parts])))
+    parts = [np.clip(p, -far, far) for p in parts]
+    square = sum(float((p**2).sum()) for p in parts)
+    if sum(float((p[1:] * p[:-1]).sum()) for p in parts) < SUSPECT * square:
+        return None
+    return float(np.sqrt(square / sum(p.size for p in parts)))
+
+
+def _climbed(
+    windows: Sequence[Window], channels: int, known: Mapping[int, Correlation], channel: int, scale: float
+) -> tuple[Correlation, float]:
+    """The likeliest correlation of a channel beside those known, uphill over a grid, and its nats above white noise."""
+    stamps = [np.unique(w.time[w.channel == channel]) for w in windows]
+    period = float(np.median(np.concatenate([np.diff(own) for own in stamps])))
+    found: dict[tuple[int, int, int], tuple[float, Correlation]] = {}
+
+    def tried(place: tuple[int, int, int]) -> float:
+        if place not in found:
+            own = Correlation(PERIODS[place[0]] * period, SHARES[place[1]], place[2], scale)
+            value, scales = _likelihood(windows, channels, {**known, channel: own})
+            found[place] = value, replace(own, scale=own.scale * scales[channel])
+        return found[place][0]
+
+    best = max(((time, 2, order) for order in (1, 2) for time in (4, 12)), key=tried)
+    for stride in STRIDES:
+        while tried(better := max(_near(best, stride), key=tried)) > tried(best):
+            best = better
+    white = max(_likelihood([replace(w, sigma=w.sigma * np.where(w.channel == channel, s, 1.0)) for w in windows], channels, known)[0]
+                for s in (1.0, scale))  # fmt: skip
+    value, own = found[best]
+    return own, value - white
+
+
+def _near(place: tuple[int, int, int], stride: int) -> list[tuple[int, int, int]]:
+    """Places beside one: other times, and while these are far apart, other shares and the other order."""
+    time, share, order = place
+    near = [(time + step, share, order) for step in (-stride, stride)]
+    if stride == STRIDES[0]:
+        near += [(time, share - 1, order), (time, share + 1, order), (time, share, 3 - order)]
+    return [p for p in near if 0 <= p[0] < len(PERIODS) and 0 <= p[1] < len(SHARES)]
+
+
+def _likelihood(windows: Sequence[Window], channels: int, known: Mapping[int, Correlation]) -> tuple[float, np.ndarray]:
+    """Log marginal likelihood of windows, and their channels' scales, shape (C,)."""
+    told = with_correlations(windows, known)
+    grams = each(lambda window: hidden_gram(window, channels), told)
+    shaped = designs.correlated_of(grams, told, noise.CORRELATION_TIMES[1], "cpu")
+    levels, value = noise.roughly(shaped)
+    return value, levels.scale
