@@ -168,7 +168,8 @@ def attitude(time: np.ndarray) -> Rotation:
     return Rotation.from_euler("ZYX", angles)
 
 
-def fly(seconds=6.0, gain=1.0, drag=0.0, cable=None, payload_drag=0.0, volts_slope=0.0, noise=2e-4, seed=0) -> FlightLog:
+def fly(seconds=6.0, gain=1.0, drag=0.0, cable=None, payload_drag=0.0, volts_slope=0.0, noise=2e-4, seed=0, *, wind=0.0, late=0.0,
+        fade=0.0) -> FlightLog:  # fmt: skip
     """A vehicle with an attitude of closed form and motors that hold it up; equations and integrator of the test's own."""
     rng = np.random.default_rng(seed)
     mass, payload, step = 0.03, 0.008, 0.005
@@ -178,11 +179,11 @@ def fly(seconds=6.0, gain=1.0, drag=0.0, cable=None, payload_drag=0.0, volts_slo
     rot = attitude(half).as_matrix()
     told = load * G / rot[:, 2, 2] * (1.0 + 0.15 * np.sin(3.1 * half + phases[0]) + 0.1 * np.sin(1.3 * half + phases[1]))
     volts = 4.1 - 0.05 * half
-    level = gain * (1.0 + volts_slope * (volts - 3.8))
+    level = gain * (1.0 + volts_slope * (volts - 3.8)) * (1.0 + fade * half)
 
     def slope(i, state):
         p, v, thrust = state[:3], state[3:6], state[6]
-        body = rot[i].T @ v
+        body = rot[i].T @ (v - [wind, 0.0, 0.0])
         force = rot[i] @ np.array([-drag * body[0], -drag * body[1], thrust * level[i]]) - [0, 0, mass * G]
         lag = [(told[i] - thrust) / 0.03]
         if cable is None:
@@ -209,7 +210,7 @@ def fly(seconds=6.0, gain=1.0, drag=0.0, cable=None, payload_drag=0.0, volts_slo
         return Channel(time, columns + rng.normal(0, noise, (len(time), 3)), "m", "world")
 
     channels = {
-        "pos_w": seen(path[:, :3]), "quat_wb": Channel(time, attitude(time).as_quat(), "1", "world"),
+        "pos_w": seen(path[:, :3]), "quat_wb": Channel(time, attitude(time - late).as_quat(), "1", "world"),
         "motor_command": Channel(time, np.tile(command[:, None], 4), "1"),
         "battery_voltage": Channel(time, 4.1 - 0.05 * time, "V"),
     }  # fmt: skip
@@ -233,6 +234,14 @@ class TestFlyer:
         assert near(estimates, "battery_sag", 0.08), estimates
         assert near(estimates, "frame_tilt_x", 0.0), estimates
         assert near(estimates, "cmd_delay", LATE), estimates
+
+    def test_wind_a_late_attitude_and_thrust_that_fades_are_found(self):
+        log = fly(6.0, drag=0.03, wind=1.5, late=0.02, fade=-0.004)
+        params = FlyerParams(**{**vars(FLYER), "drag_xy": 0.03})
+        dark = FlightLog({k: v for k, v in log.channels.items() if k != "battery_voltage"})
+        estimates = found(FlyerModel([dark], params), ["wind_x", "wind_y", "attitude_delay", "thrust_fade", "cmd_delay", "thrust_gain"])
+        truth = {"wind_x": 1.5, "wind_y": 0.0, "attitude_delay": 0.02, "thrust_fade": -0.004, "cmd_delay": LATE}
+        assert all(near(estimates, name, size) for name, size in truth.items()), estimates
 
     @pytest.mark.slow
     def test_cable_length_and_payload(self):

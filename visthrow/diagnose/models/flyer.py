@@ -11,7 +11,7 @@ import numpy as np
 from visthrow.common.rotations import cross
 from visthrow.diagnose.models.flyer_effects import effects_of
 from visthrow.diagnose.models.flyer_params import FlyerParams
-from visthrow.diagnose.models.flyer_windows import FINE, stretches_of
+from visthrow.diagnose.models.flyer_windows import FINE, spare, stretches_of
 from visthrow.diagnose.models.numeric import Lanes, NumericModel, Stretch, hermite, integrate, latent_force
 from visthrow.logs.flightlog import FlightLog
 
@@ -36,12 +36,14 @@ class FlyerModel(NumericModel):
             channels.append("rate_b")
         stretches = stretches_of(logs, params, channels)
         inputs = [params.attitude, params.input, *(["battery_voltage"] if self.has_voltage else [])]
-        super().__init__(effects_of(params), channels, stretches, inputs)
+        super().__init__(effects_of(params, self.has_voltage), channels, stretches, inputs)
         self.steps = round(params.window / params.step)
         self._names = {effect.name: i for i, effect in enumerate(self.effects)}
-        self._rot = np.array([s.data["rot"] for s in stretches])  # (S, half steps, 3, 3)
+        self._rot = np.array([s.data["rot"] for s in stretches])  # (S, half steps, 3, 3), some before the start
         self._input = np.array([s.data["input"] for s in stretches])  # (S, fine steps, motors)
         self._volts = np.array([s.data["volts"] for s in stretches])  # (S,)
+        self._since = np.array([s.data["since"] for s in stretches])  # [s], shape (S,)
+        self._spare = spare(params.step)
         self._direction = np.array([s.data["direction"] for s in stretches])  # (S, 3)
         self._blocks = 1 + (params.cable is not None) + (params.torque is not None)
         self._rate_at = 12 if params.cable is not None else 6
@@ -71,13 +73,15 @@ class FlyerModel(NumericModel):
         scale = self._scale(lanes)
         curve, hover = get("thrust_curve")[:, None], self._hover()
         mass = (p.mass + get("mass_quad"))[:, None]
+        fade, since = get("thrust_fade")[:, None], self._since[lanes.owner][:, None]
         dynamics = _Dynamics(self, lanes, mass)
 
         def slope(half: int, state: np.ndarray) -> np.ndarray:
             thrust = state[:, -self._input.shape[2] :]
             told = self._wanted(lanes, half, delay)
             lag = (told - thrust) / tau
-            real = thrust * scale * (1.0 + curve * (thrust / hover - 1.0))
+            faded = 1.0 + fade * (since + 0.5 * p.step * half)
+            real = thrust * scale * (1.0 + curve * (thrust / hover - 1.0)) * faded
             return np.concatenate([dynamics(half, state, real, forces[half]), lag], 1)
 
         start = np.concatenate([dynamics.start(lanes), self._wanted(lanes, 0, delay)], 1)
@@ -130,7 +134,7 @@ class FlyerModel(NumericModel):
         """Shift of the measured point by the marker's lever, shape (B, N, 3)."""
         lever = np.stack([self._theta(lanes, f"marker_{axis}") for axis in "xyz"], 1)
         at = np.clip(((time - stretch.data["start"]) / (0.5 * self.params.step)).round().astype(int), 0, 2 * self.steps)
-        return np.einsum("nij,bj->bni", stretch.data["rot"][at], lever)
+        return np.einsum("nij,bj->bni", stretch.data["rot"][at + self._spare], lever)
 
 
 class _Dynamics:
@@ -146,6 +150,8 @@ class _Dynamics:
         self.turn = np.stack([get("marker_rot_x"), get("marker_rot_y"), 0.0 * mass[:, 0]], 1)
         tilt = np.stack([get("frame_tilt_y"), -get("frame_tilt_x"), 0.0 * mass[:, 0] - 1.0], 1)
         self.gravity = p.gravity * tilt
+        self.wind = np.stack([get("wind_x"), get("wind_y"), 0.0 * mass[:, 0]], 1)
+        self.late = get("attitude_delay") / (0.5 * p.step)
         self.drag = np.stack([p.drag_xy + get("rotor_drag_xy")] * 2 + [p.drag_z + get("rotor_drag_z")], 1)
         self.parasitic, self.lift = get("parasitic")[:, None], get("translational_lift")[:, None]
         if p.cable is not None:
@@ -155,6 +161,13 @@ class _Dynamics:
         if p.torque is not None:
             self.inertia = np.array(p.torque.inertia) * (1.0 + np.stack([get("inertia_xy")] * 2 + [get("inertia_z")], 1))
             self.com = np.stack([get("com_x"), get("com_y")], 1)
+
+    def _attitude(self, half: int) -> np.ndarray:
+        """Rotations at a half step, shape (B, 3, 3)."""
+        at = half + self.model._spare + self.late
+        left = np.clip(at.astype(int), 0, self.model._rot.shape[1] - 2)
+        share = (at - left)[:, None, None]
+        return (1.0 - share) * self.model._rot[self.owner, left] + share * self.model._rot[self.owner, left + 1]
 
     def start(self, lanes: Lanes) -> np.ndarray:
         """States from the unknowns at the window's start."""
@@ -175,9 +188,9 @@ class _Dynamics:
 
     def __call__(self, half: int, state: np.ndarray, thrust: np.ndarray, latent: np.ndarray) -> np.ndarray:
         """Derivative of all but the motors' thrusts."""
-        rot = self.model._rot[self.owner, half]
+        rot = self._attitude(half)
         vel = state[:, 3:6]
-        vel_b = np.einsum("bji,bj->bi", rot, vel)
+        vel_b = np.einsum("bji,bj->bi", rot, vel - self.wind)
         total = np.sum(thrust, 1, keepdims=True)
         level = vel_b[:, :1] ** 2 + vel_b[:, 1:2] ** 2
         speed = np.sqrt(level + vel_b[:, 2:3] ** 2)
@@ -197,7 +210,7 @@ class _Dynamics:
     def _with_cable(self, state: np.ndarray, vel: np.ndarray, force: np.ndarray, latent: np.ndarray) -> list[np.ndarray]:
         """Acceleration of the vehicle, rate of the cable's vector, its acceleration; a cable pulls and never pushes."""
         gap, gap_rate = state[:, 6:9], state[:, 9:12]
-        vel_p = vel + gap_rate
+        vel_p = vel + gap_rate - self.wind
         drag = -self.payload_drag * np.linalg.norm(vel_p, axis=1, keepdims=True) * vel_p
         free_q, free_p = force / self.mass + self.gravity, (drag + latent) / self.payload + self.gravity
         length = np.linalg.norm(gap, axis=1, keepdims=True)

@@ -1,16 +1,22 @@
 """Catalogue of a quadrotor that is driven by its logged commands and its measured attitude."""
 
 from visthrow.diagnose.models.flyer_params import FlyerParams
+from visthrow.diagnose.models.flyer_windows import MOST_LATE
 from visthrow.diagnose.models.interface import Effect
 
 _SCALE = ("hover with and without a weighed load",)
 _YAW = ("hover at two yaw angles half a turn apart",)
 
 
-def effects_of(params: FlyerParams) -> list[Effect]:
+def effects_of(params: FlyerParams, has_voltage: bool) -> list[Effect]:
     """Entries that apply, with priors in proportion to the vehicle's weight where a force is meant."""
     seen = (params.position, params.attitude, params.input)
     found = [*_thrust(params, seen), *_aero(params, seen), *_sensing(params, seen)]
+    if not has_voltage:
+        found.append(
+            Effect("thrust_fade", "the thrust's change through a flight", "T (1 + theta t), t since the log's begin", "1/s", "battery",
+                   (-0.02, 0.02), 2e-3, 2e-5, seen, "packs and motors that warm", ("thrust_gain",), ("a long hover",))
+        )  # fmt: skip
     if params.torque is not None:
         found += _torque(params, (params.input, "rate_b"))
     if params.cable is not None:
@@ -48,6 +54,9 @@ def _aero(params: FlyerParams, seen: tuple[str, ...]) -> list[Effect]:
                0.01 * weight, 1e-3 * weight, seen, "NeuroBEM 2021", ("rotor_drag_xy",), ("speed sweep",)),
         Effect("translational_lift", "more thrust in level flight", "T (1 + theta v_xy^2)", "s^2/m^2", "aero", (-0.2, 0.2), 0.01,
                1e-3, seen, "Svacha et al. 2017", (), ("level passes at several speeds",)),
+        *(Effect(f"wind_{axis}", f"air that moves along the world's {axis} axis", f"drag of v - theta e_{axis}", "m/s", "environment",
+                 (-10.0, 10.0), 0.5, 0.03, seen, "Faessler et al. 2018", (f"frame_tilt_{other}", "marker_rot_x", "marker_rot_y"), _YAW)
+          for axis, other in ("xy", "yx")),
     ]  # fmt: skip
 
 
@@ -55,10 +64,12 @@ def _sensing(params: FlyerParams, seen: tuple[str, ...]) -> list[Effect]:
     found = [
         Effect("pose_delay", "the delay of the measured position", "y(t) = x(t - theta)", "s", "sensing", (-0.1, 0.1), 5e-3, 5e-4,
                seen, "motion capture pipelines", ("cmd_delay",), ()),
+        Effect("attitude_delay", "the delay of the measured attitude", "R_meas(t) = R(t - theta)", "s", "sensing",
+               (-MOST_LATE, MOST_LATE), 1e-2, 1e-3, seen, "streams of several clocks", ("pose_delay", "cmd_delay"), ("quick turns",)),
     ]  # fmt: skip
     for axis in "xy":
         found += [
-            Effect(f"frame_tilt_{axis}", f"the capture's frame is turned about its {axis} axis, or there is wind",
+            Effect(f"frame_tilt_{axis}", f"the capture's frame is turned about its {axis} axis",
                    f"gravity seen turned by theta about {axis}", "rad", "sensing", (-0.15, 0.15), 0.0175, 4e-4, seen,
                    "wand calibration", ("marker_rot_x", "marker_rot_y"), _YAW),
             Effect(f"marker_rot_{axis}", f"the measured attitude is turned about the body's {axis} axis",

@@ -12,6 +12,8 @@ from visthrow.logs.flightlog import Channel, FlightLog
 
 FINE = 16
 """Steps of the commands' table in a step of the integration: commands switch at their own times."""
+MOST_LATE = 0.15
+"""By which attitudes may be late or early [s]."""
 KNOTS = 8
 """Of the latent forces over a window."""
 _GUESS = 0.25
@@ -96,7 +98,8 @@ def _window(log, number: int, params: FlyerParams, channels, sigma, start: float
     thrust = sum(c * inputs**power for power, c in enumerate(params.thrust_map)).sum(axis=1)
     if np.min(thrust[len(thrust) // 2 :]) < _IDLE * params.mass * params.gravity:
         return None
-    halves = start + 0.5 * params.step * np.arange(2 * round(params.window / params.step) + 1)
+    margin = spare(params.step)
+    halves = start + 0.5 * params.step * np.arange(-margin, 2 * round(params.window / params.step) + 1 + margin)
     volts = log["battery_voltage"].hold(np.array([start + 0.5 * params.window]))[0] if "battery_voltage" in log else 0.0
     guess, spread, direction = _guess(rows, channels, params)
     blocks = [0, *([2] if params.cable is not None else []), *([1] if params.torque is not None else [])]
@@ -106,8 +109,14 @@ def _window(log, number: int, params: FlyerParams, channels, sigma, start: float
         np.concatenate([values.ravel() for _, values in rows]),
         np.concatenate([np.tile(sigma[name], len(time)) for name, (time, _) in zip(channels, rows)]), guess, spread,
         {"start": start, "rot": _attitudes(log[params.attitude], halves), "input": inputs, "volts": float(volts),
-         "direction": direction}, **latent_layout(start, end, KNOTS, blocks),
+         "direction": direction, "since": start - float(log[params.input].time[0])},
+        **latent_layout(start, end, KNOTS, blocks),
     )  # fmt: skip
+
+
+def spare(step: float) -> int:
+    """Half steps of attitudes before a window and behind it, for what may be late."""
+    return int(np.ceil(MOST_LATE / (0.5 * step))) + 1
 
 
 def _samples(channel: Channel, start: float, end: float, every: int) -> tuple[np.ndarray, np.ndarray]:
