@@ -8,6 +8,7 @@ from hil.backends.ardupilot import ArduPilotParams
 from hil.backends.betaflight import BetaflightParams
 from hil.backends.px4 import Px4Params
 from hil.control.aim import AimParams
+from hil.control.calibrating import CalibrationParams
 from hil.control.realtime import RealtimeParams
 from hil.control.safety import CheckParams, FenceParams, GuardParams
 from hil.control.states import StateParams
@@ -121,12 +122,15 @@ class HilParams:
     images: ImageParams | None = None  # of the detector
     realtime: RealtimeParams = field(default_factory=RealtimeParams)
     aim: AimParams | None = None  # which releases are held back; None: none
+    calibration: CalibrationParams | None = None  # of a camera, in the hover before the first throw; None: none
 
     def __post_init__(self) -> None:
         if not {VEHICLE, PAYLOAD} <= set(self.frames) <= set(BODIES):
             raise ConfigError(f"frames of {', '.join(self.frames)}; expected vehicle and payload, goal if it moves")
         if self.keypoints == "detector" and self.images is None:
             raise ConfigError("keypoints of a detector, but no table [images]; expected its kind and path or device")
+        if self.calibration is not None and self.keypoints != "detector":
+            raise ConfigError("calibration of a camera, but keypoints of poses; expected keypoints = \"detector\"")
         if self.throws < 1:
             raise ConfigError(f"throws {self.throws}; expected 1 or more")
         if self.source.kind not in LIVE and self.source.file is None:

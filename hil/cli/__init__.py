@@ -8,6 +8,7 @@ ACTIONS = {
     "view": "look at a run in 3D: live, or from its folder as a recording, pictures and flight logs",
     "replay": "run a recorded run again and compare every action, bit for bit",
     "check": "look at the poses that come, and at what speaks against a throw",
+    "calibrate": "hover, sway, tell the camera's tilt and latency and the thrust in hover, and land; no throw",
     "record": "record the poses that come and what the policy would make of them; never arms, sends nothing",
     "fake": "a fake autopilot with the simulator's vehicle, to throw over the wire",
     "direct": "the fake's throws without wire, autopilot and real time: what the wire costs is measured against them",
@@ -15,7 +16,8 @@ ACTIONS = {
 
 
 DOES = {
-    "run": ("flight", "fly"), "record": ("flight", "fly"), "view": ("recorded", "view"), "replay": ("recorded", "again"),
+    "run": ("flight", "fly"), "record": ("flight", "fly"), "calibrate": ("flight", "fly"),
+    "view": ("recorded", "view"), "replay": ("recorded", "again"),
     "check": ("check", "check"), "fake": ("simulated", "fake"), "direct": ("simulated", "direct"),
 }  # fmt: skip
 """Module and function of each action, imported only when it was chosen."""
@@ -54,14 +56,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
     subs = {name: actions.add_parser(name, help=text, description=text) for name, text in ACTIONS.items()}
-    for name in ("run", "check", "record"):
+    for name in ("run", "check", "record", "calibrate"):
         sub = subs[name]
         sub.add_argument("--config", default="dry_run", metavar="NAME", help="of configs/hil, or a file")
         sub.add_argument("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE")
         sub.add_argument("--seconds", type=above_zero, default=None, help="end after this time")
         sub.add_argument("--speed", type=float, default=1.0, help="of the clock; below 1 with a fake of the same speed")
         sub.add_argument("--sign", default=None, metavar="KEYFILE", help="sign MAVLink messages, and hear none that is not signed")
-    for name in ("run", "record"):
+    for name in ("run", "record", "calibrate"):
         subs[name].add_argument(
             "--out", default=None, metavar="FOLDER", help="of the run (default: a new one in runs/hil)"
         )

@@ -11,10 +11,12 @@ from typing import Any
 from hil.backends import make_backend, mechanism_lag, require_reach
 from hil.backends.check import autopilot_record
 from hil.cli.terminal import Terminal, Voice
+from hil.control.calibrating import Solver
+from hil.control.loop import Lander
 from hil.control.loop import fly as fly_loop
 from hil.control.realtime import keep, prepare
 from hil.control.runner import Runner
-from hil.errors import RunError
+from hil.errors import ConfigError, RunError
 from hil.links.clock import ManualClock, MonotonicClock
 from hil.links.device import check_device
 from hil.links.signing import read_key
@@ -69,7 +71,10 @@ def fly(args: argparse.Namespace) -> int:
     params = params_of(args)
     if recording:
         params = dataclasses.replace(params, backend="dry-run", observe=True)
-    auto_arm = not recording and args.auto_arm
+    calibrates = args.action == "calibrate"
+    if calibrates and params.calibration is None:
+        raise ConfigError(f"config '{args.config}' has no table [calibration]; expected one, as of configs/hil/detector.toml")
+    auto_arm = args.action == "run" and args.auto_arm
     if auto_arm:
         require_fake(params)
     folder = Path(args.out or f"runs/hil/{time.strftime('%Y%m%d-%H%M%S')}")
@@ -77,7 +82,7 @@ def fly(args: argparse.Namespace) -> int:
     source, link, recorded = open_source(params, folder, MonotonicClock(args.speed), key_of(args), voice.say)
     clock = ManualClock(source.start) if recorded else MonotonicClock(args.speed)
     require_reach(params, policy.contract)
-    backend = make_backend(params, link, not recording and args.write_parameters, voice.say, folder)
+    backend = make_backend(params, link, args.action == "run" and args.write_parameters, voice.say, folder)
     runner = Runner(params, policy, backend, mechanism_lag(params))
     refused = prepare(params.realtime)
     runner.warm_up()
@@ -88,12 +93,14 @@ def fly(args: argparse.Namespace) -> int:
     print(f"ready after {time.monotonic() - started:.2f} s; waiting for poses", file=sys.stderr, flush=True)
     viewer, stages = start_viewer(folder) if args.view else None, Stages()
     eyes = open_images(params.images, params.camera, clock.now) if params.keypoints == "detector" else None
+    solver = None if runner.calibrating is None else Solver(params.camera, policy.contract, params.calibration.spreads)
     summary = fly_loop(
-        runner, source, clock, operator, recorder, args.seconds or float("inf"), voice.decision, stages, eyes
+        runner, source, clock, Lander(operator, runner.calibrating) if calibrates else operator, recorder,
+        args.seconds or float("inf"), voice.decision, stages, eyes, solver,
     )  # fmt: skip
     summary["autopilot"] = autopilot_record(backend, link)
     summary["links"] = [one.roster.summary() for one in source.links]
-    _close(eyes, backend, source)
+    _close(eyes, solver, backend, source)
     recorder.close(summary)
     if viewer is not None:
         viewer.terminate()

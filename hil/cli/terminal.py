@@ -11,6 +11,7 @@ from collections.abc import Callable
 from typing import Any
 
 from hil.control.decision import Decision, Words
+from visthrow.onboard.calibration import Calibration
 
 ENDING = tuple(
     getattr(signal, name)
@@ -55,6 +56,9 @@ class Voice:
         if decision.state != self._before[0]:
             self.say(head + (decision.reason if decision.reason != self._before[1] else ""))
             self._before = decision.state, decision.reason
+        if decision.calibration is not None:
+            found = decision.calibration
+            self.say(f"{head}calibration: {found if isinstance(found, str) else Calibration.of(found)}")
         if decision.waits:
             self.say(f"{head}waits: {decision.waits}")
 

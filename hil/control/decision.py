@@ -29,3 +29,4 @@ class Decision:
     note: str = ""
     waits: str = ""  # why it does not go on
     seen: list | None = None  # of a camera's newest frame since the last tick; see `hil.poses.sight.Sight`
+    calibration: dict | str | None = None  # that came with this tick, or why there is none; see `visthrow.onboard.calibration`

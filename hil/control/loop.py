@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 from hil.backends.base import Backend, DryRun
+from hil.control.calibrating import Calibrating, Solver
 from hil.control.decision import Decision, Words
 from hil.control.realtime import collected
 from hil.control.runner import Runner
@@ -42,6 +43,19 @@ class Operator(Protocol):
         """What was said since the last tick; ``state`` is the runner's. Never waits."""
 
 
+class Lander:
+    """Another operator, who lands too once the camera is calibrated: for a run that is flown for nothing else."""
+
+    def __init__(self, operator: Operator, calibrating: Calibrating) -> None:
+        """Take the operator whose words count, and what is waited for."""
+        self._operator, self._calibrating = operator, calibrating
+
+    def words(self, state: str) -> Words:
+        """See `Operator`."""
+        said = self._operator.words(state)
+        return replace(said, arm=False, land=said.land or self._calibrating.found is not None)
+
+
 class AutoOperator:
     """Arms whenever the run is ready: for tests and for simulated vehicles, never for real ones."""
 
@@ -53,7 +67,7 @@ class AutoOperator:
 def fly(
     runner: Runner, source: Source, clock: Clock, operator: Operator, recorder: Recorder | None = None,
     most: float = float("inf"), tell: Callable[[Decision], None] | None = None, stages: Stages | None = None,
-    eyes: Eyes | None = None,
+    eyes: Eyes | None = None, solver: Solver | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """Run until the state machine is done, the recorded poses have ended, or for ``most`` seconds.
 
@@ -67,12 +81,13 @@ def fly(
         tell: called with the first decision of each state, and of each reason why it does not go on.
         stages: filled with the times of each stage.
         eyes: a camera, where keypoints are a detector's.
+        solver: of its calibration, where the run's config asks for one.
 
     Returns:
         The runner's summary with ticks, misses (those that a tick of ours caused by taking too long, and all), and the
         times of each stage.
     """
-    loop = Loop(runner, source, clock, operator, recorder, tell, stages or Stages(), eyes)
+    loop = Loop(runner, source, clock, operator, recorder, tell, stages or Stages(), eyes, solver)
     begin, backend = clock.now(), runner.backend
     with collected():
         while runner.machine.state is not State.DONE and not source.ended:
@@ -102,6 +117,7 @@ class Loop:
     tell: Callable[[Decision], None] | None = None
     stages: Stages = field(default_factory=Stages)
     eyes: Eyes | None = None
+    solver: Solver | None = None
     ours: int = 0  # ticks that were missed because one of ours took too long
     count: int = 0
     throws: list[float] = field(default_factory=list)  # times of the latches [s]
@@ -134,7 +150,11 @@ class Loop:
         if self.eyes is not None:
             self.eyes.tell(runner.hint(now))
             runner.look(self.eyes.poll(now))
+        if self.solver is not None and (result := self.solver.poll()) is not None:
+            runner.calibrated(result)
         decision = runner.tick(now, late, status, words, recording)
+        if self.solver is not None and (hovered := runner.calibrating.due()) is not None:
+            self.solver.submit(hovered)
         times = {"late": ticker.late, "poll": polled - start, **self.stages.poses(early + late, now), **runner.spent}
         if "total" in times:
             times["total"] += asked - start
@@ -155,6 +175,8 @@ class Loop:
         kind = NUMBER.sub("", waits)
         if decision.state != self._state:
             self._state, self._said = decision.state, {}
+        elif decision.calibration is not None:
+            pass
         elif not waits or waits == self._waits or now - self._said.get(kind, -math.inf) < SAY_AGAIN:
             return
         self._said[kind], self._waits = now, waits

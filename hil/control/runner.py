@@ -17,6 +17,7 @@ import numpy as np
 from hil.backends.base import FAILED, FOLLOW, LAND, PENDING, Backend, Status
 from hil.backends.base import HOLD as HELD
 from hil.control.aim import Aim
+from hil.control.calibrating import Calibrating
 from hil.control.decision import Decision, Words
 from hil.control.hovering import Hovering
 from hil.control.latch import Latch
@@ -28,6 +29,7 @@ from hil.poses.pose import GOAL, PAYLOAD, VEHICLE, Pose, Vector
 from hil.poses.sight import Sight, Sights
 from hil.poses.track import BodyState, Track
 from hil.sources.images import Hint
+from visthrow.onboard.calibration import Calibration
 from visthrow.onboard.hover import GRAVITY
 from visthrow.onboard.pilot import Pilot, PilotOutput
 from visthrow.onboard.policy import Policy
@@ -81,6 +83,7 @@ class Runner:
 
     Attributes:
         machine: the state. pilot: the policy. guard: with its counts.
+        calibrating: of the camera in the hover; None where none is asked for.
         tracks: by body. latch: of the release, with the landings so far.
         hovering: on poses, where no policy flies. errors: tracebacks of what was caught.
         mass: of vehicle, rope and payload [kg]. alone: of the vehicle [kg].
@@ -129,6 +132,9 @@ class Runner:
         self.watcher: Callable[[str, Track], None] | None = None
         self.sights = Sights(self.pilot.camera, params.images.hold) if params.keypoints == "detector" else None
         self._sight: Sight | None = None
+        wants = params.calibration is not None and self.sights is not None
+        self.calibrating = Calibrating(params.calibration, lambda: self.seen_goal_w) if wants else None
+        self._calibration: Calibration | str | None = None
 
     def tick(self, now: float, poses: list[Pose], status: Status, words: Words, recording: bool = True) -> Decision:
         """Decide one tick and send its command.
@@ -218,6 +224,8 @@ class Runner:
         decision, state = self._decide(now, seen, status, words, recording)
         self.spent["estimate"] = perf_counter() - begin
         wanted = self._command(now, state, seen, decision)
+        if self.calibrating is not None:
+            wanted = self._calibrated(now, state, seen, status, wanted, decision)
         self._ask(now, state, seen.vehicle, status)
         if self.params.observe and decision.action is None and seen.known and seen.vehicle.quat:
             self._show(seen, decision)
@@ -256,8 +264,11 @@ class Runner:
         if self._sight is not None and self.sights is not None:
             decision.seen = self._sight.values()
             if seen.vehicle is not None and seen.vehicle.quat is not None:
-                self.sights.take(self._sight, seen.vehicle.quat)
+                self.sights.along(now, seen.vehicle.pos, seen.vehicle.quat)
+                self.sights.take(self._sight, seen.vehicle.quat, self._aged)
             self._sight = None
+        elif self.sights is not None and seen.vehicle is not None and seen.vehicle.quat is not None:
+            self.sights.along(now, seen.vehicle.pos, seen.vehicle.quat)
         return decision, state
 
     def _ours(self, state: State, status: Status) -> bool:
@@ -265,6 +276,31 @@ class Runner:
         if status.mode in (HELD, LAND) and state not in (State.READY, State.ARMED):
             return False
         return state is not State.ABORT or (status.connected and self.machine.flown)
+
+    def calibrated(self, result: Calibration | str) -> None:
+        """Take in, before a tick, what the sums of a hover's calibration gave."""
+        self._calibration = result
+
+    def _calibrated(
+        self, now: float, state: State, seen: Seen, status: Status, wanted: tuple[float, ...] | None, decision: Decision
+    ) -> tuple[float, ...] | None:
+        """The command with the sway of a calibration; what came in this tick is taken down."""
+        calibrating, result = self.calibrating, self._calibration
+        if result is not None:
+            self._calibration = None
+            calibrating.take(result)
+            decision.calibration = result if isinstance(result, str) else result.values()
+            if isinstance(result, Calibration) and self.sights is not None:
+                self.sights.correct(result)
+        ours = state is State.READY and status.mode == FOLLOW and seen.known and seen.vehicle.quat is not None
+        if not ours or wanted is None:
+            calibrating.stop()
+            return wanted
+        roll, pitch = calibrating.rates(now, self._still(seen.vehicle, seen.payload, False))
+        if decision.seen is not None and self.sights.fresh is not None:
+            stamp, points, valid = self.sights.fresh
+            calibrating.note(now, seen.vehicle, wanted[0], points, valid, now - self._aged - stamp)
+        return (wanted[0], wanted[1] + roll, wanted[2] + pitch, wanted[3])
 
     def _guarded(self, now: float, wanted: tuple[float, ...] | None, decision: Decision) -> tuple[float, ...] | None:
         """A command within its limits; one that is not finite ends the run."""
@@ -343,6 +379,8 @@ class Runner:
             if GOAL in self.tracks and self.tracks[GOAL].gate.level(now) >= HOLD:
                 checks.append("the goal's pose is stale")
             checks += self._thrust_off()
+            if self.calibrating is not None and state in (State.READY, State.ARMED):
+                checks += self.calibrating.problems()
         return Inputs(
             self.tracks[VEHICLE].gate.level(now),
             self.tracks[PAYLOAD].gate.level(now),
@@ -480,5 +518,6 @@ class Runner:
                 for name, track in self.tracks.items()
             },
             "left_fence": self.machine.left_fence,
+            "calibration": None if self.calibrating is None or self.calibrating.found is None else self.calibrating.found.values(),
             "errors": self.errors,
         }

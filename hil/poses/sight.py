@@ -4,18 +4,25 @@ What is not seen reads where it was for a while, then as dropped out. To a polic
 in place of what is out of view, what was last seen near the edge reads as its direction there.
 """
 
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 
 from camera.detectors.contours import BallSeen, GoalSeen, Seen, detected_keypoints
 from camera.keypoints import GOAL_KEYPOINTS, KEYPOINTS, KeypointCamera
-from hil.poses.pose import Quaternion
+from camera.mount import rotation_from_vector
+from hil.poses.pose import Quaternion, Vector
+from visthrow.onboard.calibration import Calibration
 from visthrow.onboard.observations import rotation_from_quat
 
 NEAR_EDGE = 0.85
 """Radius in the image beyond which what is not seen any more has left the field of view, of 1."""
+
+PATH = 25
+"""Ticks that the vehicle's way is kept for: half a second."""
 
 Corners = tuple[tuple[float, float, float], ...]
 
@@ -45,8 +52,17 @@ class Sight:
         return Seen(ball, goal)
 
 
+def _rotation(quat: Quaternion) -> np.ndarray:
+    """Body to world, shape (3, 3)."""
+    return rotation_from_quat(torch.tensor([quat], dtype=torch.float64))[0].numpy()
+
+
 class Sights:
-    """Keypoints by the sights so far."""
+    """Keypoints by the sights so far.
+
+    Attributes:
+        fresh: stamp [s], keypoints (8, 2) and validity (8,) of the last frame that was taken.
+    """
 
     def __init__(self, camera: KeypointCamera, hold: float) -> None:
         """Start with nothing seen.
@@ -59,15 +75,65 @@ class Sights:
         self._points = torch.zeros(KEYPOINTS, 2)
         self._valid = torch.zeros(KEYPOINTS, dtype=torch.bool)
         self._times = {"goal": -np.inf, "ball": -np.inf}
+        self._turn: np.ndarray | None = None  # from the camera as it is mounted to that of training
+        self._latency = 0.0
+        self._path: deque[tuple[float, np.ndarray, np.ndarray]] = deque(maxlen=PATH)
+        self.fresh: tuple[float, np.ndarray, np.ndarray] | None = None
 
-    def take(self, sight: Sight, quat: Quaternion) -> None:
-        """Take a frame in; the vehicle's attitude, body to world, xyzw, says which corner is which."""
+    def correct(self, found: Calibration) -> None:
+        """Turn rays and carry them forward from now on by what a calibration found."""
+        rot_cb = self._camera.rot_cb.double()
+        turn = rotation_from_vector(torch.tensor(found.turn_b, dtype=torch.float64))
+        self._turn, self._latency = (rot_cb @ turn @ rot_cb.T).numpy(), max(found.latency, 0.0)
+
+    def along(self, now: float, pos: Vector, quat: Quaternion) -> None:
+        """Note where the vehicle is at a tick, as of the poses, for frames that are older than these."""
+        self._path.append((now, np.array(pos), _rotation(quat)))
+
+    def take(self, sight: Sight, quat: Quaternion, aged: float = 0.0) -> None:
+        """Take a frame in.
+
+        Args:
+            sight: of the frame.
+            quat: the vehicle's attitude, body to world, xyzw: says which corner is which.
+            aged: age that poses have at a tick [s].
+        """
         seen = sight.seen()
-        rot_wb = rotation_from_quat(torch.tensor([quat], dtype=torch.float64))[0].numpy()
+        rot_wb = _rotation(quat)
+        if self._turn is not None and self._path:
+            seen = self._carried(seen, sight.stamp - self._latency + aged)
         points, valid = detected_keypoints(self._camera, seen, rot_wb)
+        self.fresh = sight.stamp, points.numpy(), valid.numpy()
         for name, part in (("goal", slice(0, GOAL_KEYPOINTS)), ("ball", slice(GOAL_KEYPOINTS, None))):
             if getattr(seen, name) is not None and sight.stamp > self._times[name]:
                 self._points[part], self._valid[part], self._times[name] = points[part], valid[part], sight.stamp
+
+    def _carried(self, seen: Seen, when: float) -> Seen:
+        """What was seen at a time as the camera of training would see it now: the goal lies, the ball goes with the vehicle."""
+        _, pos_now, rot_now = self._path[-1]
+        pos, rot = self._pose(when)
+        rot_bc, lens = self._camera.rot_cb.double().numpy().T, self._camera.position_b.double().numpy()
+        turn, ball, goal = self._turn, seen.ball, seen.goal
+        if ball is not None:
+            ball = BallSeen(rot_bc.T @ rot_now.T @ rot @ rot_bc @ turn @ ball.ray_c, ball.half_angle, ball.score)
+        if goal is not None:
+            eye, rays_w = pos + rot @ lens, goal.rays_c @ (rot @ rot_bc @ turn).T
+            reach = eye[2] / np.maximum(-rays_w[:, 2:], 0.05)
+            from_now = eye + reach * rays_w - (pos_now + rot_now @ lens)
+            rays = from_now @ (rot_now @ rot_bc)
+            goal = GoalSeen(rays / np.linalg.norm(rays, axis=1, keepdims=True), goal.score)
+        return Seen(ball, goal)
+
+    def _pose(self, when: float) -> tuple[np.ndarray, np.ndarray]:
+        """Place and attitude at a time on the path, by straight lines; its ends beyond them."""
+        path = list(self._path)
+        after = next((i for i, (time, _, _) in enumerate(path) if time >= when), len(path) - 1)
+        if after == 0 or path[after][0] <= when:
+            return path[after][1:]
+        (begin, pos, rot), (end, pos_after, rot_after) = path[after - 1], path[after]
+        share = (when - begin) / (end - begin)
+        way = Rotation.from_matrix(rot.T @ rot_after).as_rotvec()
+        return pos + share * (pos_after - pos), rot @ Rotation.from_rotvec(share * way).as_matrix()
 
     def keypoints(self, now: float) -> tuple[np.ndarray, np.ndarray]:
         """Keypoints at a time [s]: normalised, float32, shape (1, 8, 2), and validity, shape (1, 8)."""

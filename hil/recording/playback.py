@@ -18,6 +18,7 @@ from hil.poses.sight import Sight
 from hil.poses.track import Track
 from hil.recording.bundle import sentence
 from hil.recording.record import SUMMARY, load_run
+from visthrow.onboard.calibration import Calibration
 from visthrow.onboard.policy import Policy
 
 
@@ -53,6 +54,8 @@ class Playback:
         self._samples = []
         if line.get("seen") is not None:
             self.runner.look([Sight.of(line["seen"])])
+        if (found := line.get("calibration")) is not None:
+            self.runner.calibrated(found if isinstance(found, str) else Calibration.of(found))
         decision = self.runner.tick(line["time"], poses, Status(*line["status"]), Words(*line["words"]), line["recording"])
         return decision, self._samples
 

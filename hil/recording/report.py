@@ -7,6 +7,7 @@ from hil.recording.flightlogs import read, throws, whole
 from hil.recording.latency import Stages, draw, table
 from visthrow.common.errors import VisthrowError
 from visthrow.logs.flightlog import FlightLog
+from visthrow.onboard.calibration import Calibration
 
 LATENCY_PICTURE, WHOLE = "latency.png", "flight.npz"
 
@@ -15,6 +16,8 @@ def summary_text(summary: dict[str, Any], folder: Path) -> str:
     """A run in a few lines."""
     lines = [f"{'ABORTED' if summary['aborted'] else 'ended in ' + summary['state']}: {summary['reason']}"]
     lines.append(f"throws {summary['throws']}, released {summary['latches']}, cancelled {summary['cancelled']}")
+    if summary.get("calibration"):
+        lines.append(f"calibration: {Calibration.of(summary['calibration'])}")
     if summary["stuck"]:
         lines.append(f"{summary['stuck']} released payload still hung on the vehicle: look at the mechanism")
     if summary["left_fence"]:

@@ -1,4 +1,4 @@
-"""Pictures of a real camera as a source of keypoints: a folder, a video or a live camera, looked at by `camera.detectors.contours`.
+"""Pictures of a real camera as a source of keypoints: a folder, a video or a live camera, looked at by one of `camera.detectors`.
 
 Times of recorded pictures are on the clock of the recorded poses, counted from their first arrival. Frames wait for no tick: of
 those that have come the newest is looked at, live ones in a thread of their own.
@@ -17,6 +17,7 @@ import numpy as np
 import torch
 
 from camera.detectors.contours import Detector, DetectorParams, Known
+from camera.detectors.learnt import LearntDetector
 from camera.fisheye import Fisheye
 from camera.mount import nominal_rot_cb
 from camera.params import CameraParams, FisheyeParams, MountParams
@@ -49,6 +50,7 @@ class ImageParams:
     fisheye: FisheyeParams | None = None  # the lens; left out, that of training
     mount: MountParams | None = None  # left out, that of training
     detector: DetectorParams = field(default_factory=DetectorParams)
+    by: Literal["contours", "learnt"] = "contours"  # colour and shape with OpenCV, or the learnt networks
 
     def __post_init__(self) -> None:
         if self.kind != "camera" and self.path is None:
@@ -98,7 +100,8 @@ class Looker:
                 f"images.mount.position_b is {1e3 * apart:.0f} mm from that of training; expected {1e3 * SAME_PLACE:g} at most: "
                 "another lens at the same place can be converted, another place cannot"
             )
-        self.detector = Detector(Fisheye(lens), training.payload_radius, training.goal_side, params.detector)
+        kind = LearntDetector if params.by == "learnt" else Detector
+        self.detector = kind(Fisheye(lens), training.payload_radius, training.goal_side, params.detector)
         self._rot_cb = nominal_rot_cb(mount).numpy()
         self._position_b = np.array(mount.position_b)
         # From the camera of the pictures to that of training.
@@ -127,7 +130,7 @@ class Looker:
         rot_wc = self._rot_wc(hint)
         height = hint.pos_w[2] + float((rot_wc @ self._rot_cb)[2] @ self._position_b)
         ball_c = None if self._ball_w is None else rot_wc.T @ self._ball_w
-        return Known(rot_wc[2], height, hint.ball_distance, ball_c)
+        return Known(rot_wc[2], height, hint.ball_distance, ball_c, north_c=rot_wc[0])
 
     def _rot_wc(self, hint: Hint) -> np.ndarray:
         """Camera to world, shape (3, 3)."""

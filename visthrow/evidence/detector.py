@@ -54,9 +54,56 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_common(check)
 
 
+    throw = actions.add_parser("throw", help="throws closed loop on rendered pictures: render, detect, policy, simulate")
+    throw.add_argument("--policy", default="vision_dropout", metavar="POLICY", help="a shipped name or a file (default: vision_dropout)")
+    throw.add_argument("--by", default="learnt", choices=("learnt", "contours"), help="detector (default: learnt)")
+    throw.add_argument("--weights", metavar="FILE", help="of the learnt detector (default: those that are shipped)")
+    throw.add_argument("--target", type=float, default=2.0, metavar="M", help="distance (default: 2.0)")
+    throw.add_argument("--throws", type=int, default=20, metavar="N", help="each in a hall of its own (default: 20)")
+    throw.add_argument("--plant", default="hybrid", metavar="NAME", help="hybrid, reference or reference-realistic")
+    throw.add_argument("--seed", type=int, default=0, help="of everything random")
+    add_common(throw)
+
+
 def run(args: argparse.Namespace) -> int:
-    """Train, or check."""
-    return train(args) if args.action == "train" else check(args)
+    """Train, check, or throw."""
+    return {"train": train, "check": check, "throw": throw}[args.action](args)
+
+
+def throw(args: argparse.Namespace) -> int:
+    """Throw on pictures and print the landing errors.
+
+    Raises:
+        VisthrowError: no throws, no such plant, or a policy that sees no keypoints.
+    """
+    from visthrow.common.errors import suggest
+    from visthrow.throws.loading import load_policy
+    from visthrow.throws.plants import PLANTS
+    from visthrow.throws.reference_protocol import Job, fly_batch
+    from visthrow.training.protocol import Throws
+    from visthrow.view.eyes import Eyes
+
+    if args.plant not in PLANTS:
+        raise VisthrowError(f"no plant '{args.plant}'; {suggest(args.plant, PLANTS)}")
+    loaded = load_policy(args.policy, None, args.overrides)
+    if args.throws < 1 or loaded.policy.contract["observation"]["layout"] != "vision":
+        raise VisthrowError(f"--throws {args.throws} with policy '{loaded.name}'; expected 1 or more, and a vision policy")
+    eyes = Eyes(loaded.experiment.camera, args.throws, args.seed, resolve(args.device), args.by, weights=args.weights)
+    columns = fly_batch([loaded], args.plant, Job((0,), args.target, 0, args.throws, args.seed), eyes)
+    share = {name: eyes.found[name] / max(eyes.found["frames"], 1) for name in ("ball", "goal")}
+    figures = Throws(args.target, **columns).summary() | share
+    error = columns["error"][np.isfinite(columns["error"])]
+    width = 1.96 * float(error.std(ddof=1)) / math.sqrt(len(error)) if len(error) > 1 else math.nan
+    print(
+        f"{loaded.name} by {args.by} on {args.plant}, {args.target:g} m: {len(error)} of {args.throws} landed, error "
+        f"{error.mean() if len(error) else math.nan:.3f} +- {width:.3f} m (95 %), ball found in {100 * figures['ball']:.1f} %, "
+        f"goal in {100 * figures['goal']:.1f} % of {eyes.found['frames']} frames"
+    )
+    if args.json is not None:
+        from visthrow.common.storage import write_json
+
+        write_json(args.json, figures | {"errors": error.tolist()})
+    return 0
 
 
 def train(args: argparse.Namespace) -> int:

@@ -78,6 +78,7 @@ class Hovered:
     keypoints: np.ndarray  # normalised [-], shape (N, 8, 2)
     valid: np.ndarray  # shape (N, 8), bool
     goal_w: np.ndarray  # [m], shape (3,)
+    age: np.ndarray | None = None  # of the keypoints beyond the poses', as far as it is stated [s], shape (N,); None: 0
 
 
 @dataclass(frozen=True)
@@ -86,7 +87,7 @@ class Calibration:
 
     turn_b: tuple[float, float, float]  # of the camera from its nominal pose: roll, pitch, yaw [rad]
     turn_sigma: tuple[float, float, float]  # [rad]
-    latency: float  # of the keypoints beyond the poses' [s]
+    latency: float  # of the keypoints beyond the poses' and beyond what is stated [s]
     latency_sigma: float  # [s]
     thrust: float  # that acts, over what is commanded [-]
     thrust_sigma: float  # [-]
@@ -96,6 +97,11 @@ class Calibration:
     def values(self) -> dict[str, Any]:
         """As JSON has it."""
         return {name: list(value) if isinstance(value, tuple) else value for name, value in vars(self).items()}
+
+    @classmethod
+    def of(cls, values: dict[str, Any]) -> "Calibration":
+        """The inverse of `values`."""
+        return cls(**{name: tuple(value) if isinstance(value, list) else value for name, value in values.items()})
 
     def __str__(self) -> str:
         """For the pilot."""
@@ -146,6 +152,7 @@ class Problem:
         self.length, self.mount = rope["length"] + rope["payload_offset"], tensor(rope["mount"])
         self.time, self.goal = tensor(hovered.time), tensor(hovered.goal_w)
         self.dt = self.time.diff()
+        self.age = tensor(np.zeros(count) if hovered.age is None else hovered.age)
         self.pos, self.vel, self.rate, self.thrust = (tensor(getattr(hovered, n)) for n in ("pos_w", "vel_w", "rate_b", "thrust"))
         self.base = rotation_from_quat(tensor(hovered.quat_wb))
         points = tensor(hovered.keypoints)
@@ -207,7 +214,7 @@ class Problem:
 
     def places(self, latency: Tensor) -> tuple[Tensor, Tensor]:
         """Steps j that sightings fall behind, and the share of the way to j + 1, each (N,)."""
-        when = (self.time - latency).clamp(min=self.time[0], max=self.time[-1] - 1e-9)
+        when = (self.time - self.age - latency).clamp(min=self.time[0], max=self.time[-1] - 1e-9)
         j = (torch.searchsorted(self.time, when, right=True) - 1).clamp(0, len(self.time) - 2)
         return j, (when - self.time[j]) / self.dt[j]
 
@@ -219,7 +226,7 @@ class Problem:
         """
         c, s = self.split(constants), self.spreads
         dt = self.dt[j][:, None]
-        u = ((self.time - self.time[j]) - c["latency"])[..., None] / dt
+        u = ((self.time - self.age - self.time[j]) - c["latency"])[..., None] / dt
         pos, vel, turn, swing, swing_rate = x.split(list(STATE.values()), -1)
         rate = self.rate - c["gyro"][:, None]
         rot = self.base @ rotation_from_vector(turn)

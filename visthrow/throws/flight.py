@@ -7,6 +7,7 @@ payload, and the hover controller, which runs along, what has let go or failed. 
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,6 +17,9 @@ from visthrow.task import Experiment
 from visthrow.throws.loading import Loaded
 from visthrow.throws.plants import Plant, Snapshot
 from visthrow.training import terminations
+
+if TYPE_CHECKING:
+    from visthrow.view.eyes import Eyes
 
 FALL_TIME = 1.5
 """Longest flight after separation that is waited for [s]."""
@@ -56,8 +60,18 @@ class Pilots:
 class Policies(Pilots):
     """Learnt policies that share a batch, each with the same number of vehicles, the first policy's first."""
 
-    def __init__(self, loaded: Sequence[Loaded], goal_w: np.ndarray, goal_vel_w: np.ndarray | None = None, draws: bool = False) -> None:
-        """Begin with policies that were trained for one plant; ``draws``: state policies too have a camera, to be drawn."""
+    def __init__(
+        self, loaded: Sequence[Loaded], goal_w: np.ndarray, goal_vel_w: np.ndarray | None = None, draws: bool = False,
+        eyes: "Eyes | None" = None,
+    ) -> None:  # fmt: skip
+        """Begin with policies that were trained for one plant.
+
+        Args:
+            loaded, goal_w, goal_vel_w: see `Pilots`.
+            draws: state policies too have a camera, to be drawn.
+            eyes: whose rendered pictures keypoints come from; None: they are what measured poses project to.
+        """
+        self.eyes = eyes
         share = len(goal_w) // len(loaded)
         self.slices = [slice(i * share, (i + 1) * share) for i in range(len(loaded))]
         looks = [draws or item.policy.contract["observation"]["layout"] == "vision" for item in loaded]
@@ -67,8 +81,12 @@ class Policies(Pilots):
     def decide(self, flight: "Flight", seen: Snapshot, held: np.ndarray) -> Decision:
         """See `Pilots`."""
         outs, goal_w = [], flight.goal_at(seen.time)
+        looked = None
+        if self.eyes is not None:  # nobody looks any more once all have let go
+            looked = self.eyes.look(flight.now, seen, goal_w, seen.attached) if np.any(flight.flown) else self.eyes.seen
         for pilot, part in zip(self.pilots, self.slices):
-            outs.append(pilot.act(*(getattr(seen, name)[part] for name in VIEWS), goal_w[part], seen.attached[part]))
+            keypoints = None if looked is None else (looked[0][part], looked[1][part])
+            outs.append(pilot.act(*(getattr(seen, name)[part] for name in VIEWS), goal_w[part], seen.attached[part], keypoints))
         names = ("command", "release", "action", *(["observation"] if len(outs) == 1 else []))
         return Decision(*(np.concatenate([getattr(out, name) for out in outs]) for name in names))
 

@@ -10,6 +10,7 @@ FILES = {
     "flight.npz": "every signal of the flight; read it with visthrow.logs.flightlog.FlightLog.load",
     "throw.rrd": "the scene in 3D, the image plane and all signals; open it with: rerun",
     "throw.png": "the throw in four pictures",
+    "pixels.png": "frames of the throw with what the detector saw",
 }
 
 
@@ -38,6 +39,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--plant", default="hybrid", metavar="NAME", help=plants)
     parser.add_argument("--seed", type=int, default=0, help="of start, measurements and plant (default: 0)")
     parser.add_argument("--config", metavar="NAME", help="fly in this train config instead of the policy's own")
+    parser.add_argument(
+        "--pixels", choices=("learnt", "contours"), help="keypoints by a detector from rendered pictures, in place of projected ones"
+    )
     parser.add_argument("--out", default="out/fly", metavar="FOLDER", help="for the files (default: out/fly)")
     add_common(parser)
 
@@ -62,8 +66,17 @@ def run(args: argparse.Namespace) -> int:
     writable(Path(args.out))
     if args.plant != "hybrid":
         print("flying on the reference plant; this takes about a minute", file=sys.stderr)
-    log = fly(loaded, goal, args.plant, args.seed, resolve(args.device))
+    eyes = None
+    if args.pixels is not None:
+        from visthrow.view.eyes import Eyes
+
+        if loaded.policy.contract["observation"]["layout"] != "vision":
+            raise ConfigError(f"--pixels with policy '{loaded.name}', which sees states; expected a vision policy")
+        eyes = Eyes(loaded.experiment.camera, 1, args.seed, by=args.pixels, keep=True)
+    log = fly(loaded, goal, args.plant, args.seed, resolve(args.device), eyes)
     paths = write(Path(args.out), log, loaded.experiment)
+    if eyes is not None:
+        paths.append(eyes.sheet(Path(args.out) / "pixels.png"))
     print(summary_text(log))
     for path in paths:
         print(f"{path}  {FILES[path.name]}")
@@ -76,7 +89,7 @@ def write(folder: Path, log, experiment) -> list[Path]:
     """Write log, recording and, for a throw that landed, the picture; returns their paths."""
     from visthrow.view import rerun_view, strip
 
-    paths = [folder / name for name in FILES]
+    paths = [folder / name for name in list(FILES)[:3]]
     log.save(paths[0])
     rerun_view.write(paths[1], log, experiment)
     if "landing" not in log:

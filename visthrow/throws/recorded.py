@@ -1,7 +1,7 @@
 """Recorded throws: one from hover to the vehicle hovering again, and what any flight is recorded by."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,6 +13,9 @@ from visthrow.throws.flight import Decision, Flight, Phase, Policies, Recorder
 from visthrow.throws.loading import Loaded
 from visthrow.throws.loose_rope import LooseRope
 from visthrow.throws.plants import PLANTS, Snapshot, make_plant, random_ropes
+
+if TYPE_CHECKING:
+    from visthrow.view.eyes import Eyes
 
 START_SPREAD = 0.10  # of the start about the hover point [m]
 START_SWING = 0.05  # of the rope at the start [rad]
@@ -72,7 +75,8 @@ class _Full(Recording):
         recorder, now, throws = self.recorders[0], flight.now, sent.action is not None
         if sent.release[0] and self.latch is None:
             self.latch = now.time
-        points, valid = self.pilots.pilots[0].see(seen.pos_w, seen.quat_wb, seen.payload_pos_w, self.pilots.goal_w)
+        looked = self.pilots.eyes.seen if self.pilots.eyes is not None and throws else None
+        points, valid = looked or self.pilots.pilots[0].see(seen.pos_w, seen.quat_wb, seen.payload_pos_w, self.pilots.goal_w)
         recorder.add(now.time, goal_w=self.pilots.goal_w[0], mode=int(throws), keypoints=points[0], keypoints_valid=valid[0])
         if throws:
             recorder.add(now.time, action=sent.action[0], observation=sent.observation[0])
@@ -106,7 +110,7 @@ class _Full(Recording):
 
 
 def fly(
-    loaded: Loaded, goal_w: np.ndarray, plant_name: str = "hybrid", seed: int = 0, device: str = "cpu"
+    loaded: Loaded, goal_w: np.ndarray, plant_name: str = "hybrid", seed: int = 0, device: str = "cpu", eyes: "Eyes | None" = None
 ) -> FlightLog:
     """Hover until the swing is quiet, throw, and hover again at the start.
 
@@ -119,6 +123,7 @@ def fly(
         plant_name: of :data:`visthrow.throws.plants.PLANTS`.
         seed: of start, plant and measurements.
         device: of the training simulator.
+        eyes: of one vehicle, whose rendered pictures keypoints come from; recorded are those that the policy was shown.
 
     Returns:
         The flight with all standard channels; ``meta["result"]`` says how it ended, ``meta["times"]`` when.
@@ -133,7 +138,7 @@ def fly(
     rng = np.random.default_rng(seed)
     place = home[None] + START_SPREAD * rng.uniform(-1, 1, (1, 3))
     plant.reset(place, random_ropes(rng, 1, experiment.rope.segments, START_SWING))
-    pilots = Policies([loaded], np.asarray(goal_w, dtype=float)[None], draws=True)
+    pilots = Policies([loaded], np.asarray(goal_w, dtype=float)[None], draws=True, eyes=eyes)
     recording = _Full(pilots, _meta(loaded, plant_name, goal_w, seed))
     flight = Flight(plant, pilots, recording, home)
     hangs_still = _hovering(lambda now: np.linalg.norm(now.payload_vel_w[0]) < QUIET_SPEED, home, HOVER_LEAST, HOVER_MOST)

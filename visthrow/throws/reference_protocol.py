@@ -11,6 +11,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -24,6 +25,9 @@ from visthrow.throws.loading import Loaded
 from visthrow.throws.plants import Plant, Snapshot, make_plant, random_ropes
 from visthrow.training.device import cores
 from visthrow.training.protocol import Throws
+
+if TYPE_CHECKING:
+    from visthrow.view.eyes import Eyes
 
 BATCH = 100
 """Throws that share one plant: about 23 s of one core a batch and 1 s a throw."""
@@ -67,13 +71,14 @@ def place_in_hover(
     return home
 
 
-def fly_batch(loaded: Sequence[Loaded], plant_name: str, job: Job) -> dict[str, np.ndarray]:
+def fly_batch(loaded: Sequence[Loaded], plant_name: str, job: Job, eyes: "Eyes | None" = None) -> dict[str, np.ndarray]:
     """Fly one batch.
 
     Args:
         loaded: the policies; those that share the batch are trained for one plant.
         plant_name: of :data:`visthrow.throws.plants.PLANTS`.
         job: target, count and seed.
+        eyes: of as many vehicles, whose rendered pictures keypoints come from.
 
     Returns:
         :data:`FIELDS` of :class:`visthrow.training.protocol.Throws`, the first policy's throws first, and ``goal_w`` where goals
@@ -83,7 +88,7 @@ def fly_batch(loaded: Sequence[Loaded], plant_name: str, job: Job) -> dict[str, 
     experiment, count = flown[0].experiment, job.count * len(flown)
     plant, rng = batch_plant(experiment, plant_name, job.target, job.batch, count, job.seed)
     home = place_in_hover(plant, experiment, config.load(RandomizationParams, config.find("start", "hover")), rng)
-    pilots = Policies(flown, np.tile([job.target, 0.0, 0.0], (count, 1)), _goal_velocities(experiment, count, rng))
+    pilots = Policies(flown, np.tile([job.target, 0.0, 0.0], (count, 1)), _goal_velocities(experiment, count, rng), eyes=eyes)
     flight = Flight(plant, pilots, scores := _Scores(pilots), home)
     flight.run([hover(HOVER_TIME), throw()])
     return scores.columns(flight)

@@ -1,0 +1,133 @@
+"""Keypoints from rendered pictures: what a camera on each vehicle of a plant would take, and what a detector makes of it."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from camera.detectors.contours import Detector, Known, Seen, detected_keypoints
+from camera.detectors.learnt import LearntDetector, Networks
+from camera.fisheye import Fisheye
+from camera.keypoints import KEYPOINTS, KeypointCamera
+from camera.params import CameraParams
+from camera.scenes.renderer import Renderer
+from camera.scenes.scene import Draw, Nuisances, Scenes, dressed, posed_scenes
+from camera.scenes.textures import HELD_OUT, photographs
+from visthrow.onboard.observations import rotation_from_quat
+
+HANGING = (0.2, 0.6)
+"""Distance of a hanging ball from the lens [m]."""
+
+BY = ("learnt", "contours")
+"""Detectors."""
+
+
+class Eyes:
+    """A camera, a hall and a detector for each of E vehicles; the halls were not seen in the detector's training.
+
+    Attributes:
+        frames: of the first vehicle, BGR, each with what was found: image, keypoints (8, 2), validity (8,).
+        seen: keypoints and validity of the last look, (E, 8, 2) and (E, 8).
+        found: how often ball and goal were found, and frames looked at.
+    """
+
+    def __init__(
+        self, params: CameraParams, count: int, seed: int, device: str = "cpu", by: str = "learnt", samples: int = 4,
+        nuisances: Nuisances | None = None, weights: str | None = None, keep: bool = False,
+    ) -> None:  # fmt: skip
+        """Draw the halls.
+
+        Args:
+            params: camera. count: E. seed: of halls and sensors. device: of the renderer.
+            by: one of `BY`. samples: rays a pixel.
+            nuisances: of the pictures; left out, all. weights: of the learnt detector; left out, those that are shipped.
+            keep: whether frames are kept.
+
+        Raises:
+            ValueError: another detector, no weights, no photographs.
+        """
+        if by not in BY:
+            raise ValueError(f"detector '{by}'; expected one of {', '.join(BY)}")
+        self.params, self.count, self._keep = params, count, keep
+        self.renderer = Renderer(params.fisheye, device, photographs(names=HELD_OUT), samples)
+        self._draw, self._nuisances = (count, seed), nuisances or Nuisances()
+        lens = Fisheye(params.fisheye)
+        if by == "learnt":
+            networks = Networks.load(weights) if weights else Networks.load()
+            self.detector: Detector = LearntDetector(lens, params.payload_radius, params.goal_side, networks=networks)
+        else:
+            self.detector = Detector(lens, params.payload_radius, params.goal_side)
+        self.camera = KeypointCamera(params)
+        self._hall: Scenes | None = None
+        self._looks = 0
+        self.frames: list[tuple[np.ndarray, torch.Tensor, torch.Tensor]] = []
+        self.seen: tuple[np.ndarray, np.ndarray] | None = None
+        self.found = {"ball": 0, "goal": 0, "frames": 0}
+
+    def look(self, now: Any, measured: Any, goal_w: np.ndarray, carried: Sequence[bool] | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Take and look at a picture of each vehicle.
+
+        Args:
+            now: truth, a `visthrow.throws.plants.Snapshot`. measured: likewise, what poses tell: attitude and height help the detector.
+            goal_w: [m], shape (E, 3).
+            carried: which payloads hang, shape (E,).
+
+        Returns:
+            Normalised keypoints, float32, shape (E, 8, 2), and validity, shape (E, 8).
+        """
+        pictures = self.renderer.render(self._scenes(now, goal_w, np.asarray(carried)), self._looks).cpu().numpy()
+        self._looks += 1
+        points, valid = np.zeros((self.count, KEYPOINTS, 2), np.float32), np.zeros((self.count, KEYPOINTS), bool)
+        rots = rotation_from_quat(torch.from_numpy(np.array(measured.quat_wb, float))).numpy()
+        rot_cb, lens_b = self.camera.rot_cb.double().numpy(), np.array(self.params.mount.position_b)
+        for e in range(self.count):
+            rot_cw = rot_cb @ rots[e].T
+            height = float(measured.pos_w[e, 2] + rots[e][2] @ lens_b)
+            known = Known(rot_cw[:, 2], height, HANGING if carried[e] else None, north_c=rot_cw[:, 0])
+            seen: Seen = self.detector.detect(np.ascontiguousarray(pictures[e, ..., ::-1]), known)
+            one, ok = detected_keypoints(self.camera, seen, rots[e])
+            points[e], valid[e] = one.numpy(), ok.numpy()
+            self.found["frames"] += 1
+            for name in ("ball", "goal"):
+                self.found[name] += getattr(seen, name) is not None
+            if e == 0 and self._keep:
+                self.frames.append((np.ascontiguousarray(pictures[0, ..., ::-1]), one, ok))
+        self.seen = points, valid
+        return points, valid
+
+    def sheet(self, path: Path, columns: int = 3) -> Path:
+        """Draw six of the kept frames, spread over the throw, with what was found; returns the path.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        import cv2
+
+        from camera.imaging.overlay import draw_overlay
+
+        chosen = [self.frames[i] for i in np.linspace(0, len(self.frames) - 1, 2 * columns).round().astype(int)]
+        drawn = [draw_overlay(self.camera, points, ok, image) for image, points, ok in chosen]
+        if not cv2.imwrite(str(path), np.vstack([np.hstack(drawn[:columns]), np.hstack(drawn[columns:])])):
+            raise OSError(f"{path} cannot be written")
+        return path
+
+    def _scenes(self, now: Any, goal_w: np.ndarray, carried: np.ndarray) -> Scenes:
+        """The halls with vehicles, balls and squares where they are."""
+        tensor = lambda value: torch.from_numpy(np.array(value, float)).float()  # noqa: E731
+        rot = rotation_from_quat(tensor(now.quat_wb))
+        plain = posed_scenes(self.params, tensor(now.pos_w), rot, tensor(now.payload_pos_w), tensor(goal_w), torch.from_numpy(carried))
+        if self._hall is None:
+            draw = Draw(*self._draw)
+            self._hall = dressed(plain, draw, self.renderer.textures, self._nuisances)
+        hall = self._hall
+        rate = tensor(now.rate_b)
+        turned = rate @ self.camera.rot_cb.T
+        lens = torch.linalg.cross(rate, self.camera.position_b.expand(self.count, 3))
+        vel = tensor(now.vel_w) + torch.einsum("eij,ej->ei", rot, lens)
+        rope = torch.cat([plain.rope[:, :3], hall.rope[:, 3:4] * torch.from_numpy(carried)[:, None], hall.rope[:, 4:]], -1)
+        ball = torch.cat([plain.ball[:, :4], tensor(now.payload_vel_w), hall.ball[:, 7:]], -1)
+        return replace(hall, pose=torch.cat([plain.pose[:, :7], vel, turned], -1), ball=ball, rope=rope,
+                       goal=torch.cat([plain.goal[:, :2], hall.goal[:, 2:]], -1))  # fmt: skip
