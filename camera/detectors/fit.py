@@ -335,7 +335,7 @@ class Fit:
             for name in ("networks", "optimizer", "rates"):
                 getattr(self, name).load_state_dict(saved[name])
             self.step = saved["step"]
-        except (OSError, KeyError, RuntimeError, ValueError) as error:
+        except Exception as error:  # of a file that is none, torch raises what its bytes lead to
             raise ValueError(f"{path}: no checkpoint of this training: {error}") from error
 
     @torch.no_grad()

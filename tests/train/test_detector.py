@@ -1,0 +1,106 @@
+"""`visthrow detector`: a training of two steps, resumed; keypoints from rendered pictures in a flight; what is refused."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from camera.detectors.learnt import Networks
+from camera.keypoints import KeypointCamera, keypoints
+from camera.params import CameraParams
+from camera.scenes.scene import Nuisances
+from visthrow import cli, config
+from visthrow.throws.loading import load_policy
+from visthrow.throws.reference_protocol import Job, fly_batch
+from visthrow.view.eyes import Eyes
+
+SMALL = ["fresh=2", "pool=4", "reuse=1", "batch=2", "patches=8", "samples=1", "calibration=2"]
+NEAR = 0.01
+"""Of a keypoint that OpenCV finds on a clean picture from where it projects to [-]: 3 px of 320."""
+
+
+def train(folder, *words: str) -> int:
+    sets = [word for name in SMALL for word in ("--set", name)]
+    return cli.main(["detector", "train", "--out", str(folder), "--device", "cpu", *sets, *words])
+
+
+def test_a_training_is_resumed_and_leaves_weights(tmp_path, capsys):
+    folder = tmp_path / "run"
+    assert train(folder, "--set", "steps=2", "--minutes", "1e-9") == 0
+    assert "stopped at step 0" in capsys.readouterr().out
+    assert train(folder, "--set", "steps=2") == 2
+    assert "go on with --resume" in capsys.readouterr().err
+    assert train(folder, "--set", "steps=2", "--resume") == 0
+    assert "trained at step 2" in capsys.readouterr().out
+    made = Networks.load(folder / "learnt.npz")
+    assert made.made_by["steps"] == 2
+    assert made.made_by["config"]["batch"] == 2
+    assert (folder / "learnt.npz").stat().st_size < 500_000
+    (folder / "checkpoint.pt").write_bytes(b"broken")
+    assert train(folder, "--set", "steps=2", "--resume") == 2
+    assert "no checkpoint of this training" in capsys.readouterr().err
+    assert train(tmp_path / "none", "--resume") == 2
+    assert "no checkpoint to resume from" in capsys.readouterr().err
+
+
+def test_keypoints_of_a_picture_are_those_that_poses_project_to():
+    camera = config.load(CameraParams, config.find("camera", "fisheye"))
+    eyes = Eyes(camera, 1, 3, by="contours", nuisances=Nuisances(*(0.0,) * 8), keep=True)
+    zero = np.zeros((1, 3))
+    now = SimpleNamespace(
+        pos_w=np.array([[0.0, 0.0, 1.3]]), quat_wb=np.array([[0.0, 0.1, 0.0, 0.995]]), vel_w=zero, rate_b=zero,
+        payload_pos_w=np.array([[0.05, -0.03, 0.93]]), payload_vel_w=zero,
+    )  # fmt: skip
+    goal = np.array([[1.0, 0.2, 0.0]])
+    points, valid = eyes.look(now, now, goal, np.array([True]))
+    pilot = KeypointCamera(camera, dtype=torch.float64)
+    quat = torch.tensor(now.quat_wb / np.linalg.norm(now.quat_wb))
+    from visthrow.onboard.observations import rotation_from_quat
+
+    tensors = torch.tensor(now.pos_w), rotation_from_quat(quat), torch.tensor(goal), torch.tensor(now.payload_pos_w)
+    true, _ = keypoints(pilot, *tensors)
+    assert valid.all()
+    assert np.abs(points - true.numpy()).max() < NEAR
+    assert eyes.found == {"ball": 1, "goal": 1, "frames": 1}
+    with pytest.raises(ValueError, match="expected one of learnt, contours"):
+        Eyes(camera, 1, 0, by="magic")
+
+
+class Blind:
+    """Eyes that see nothing; counts how often they are asked."""
+
+    def __init__(self) -> None:
+        self.looks, self.seen = 0, None
+
+    def look(self, now, measured, goal_w, carried):
+        self.looks += 1
+        assert now.pos_w.shape == measured.pos_w.shape == goal_w.shape
+        self.seen = np.zeros((len(goal_w), 8, 2), np.float32), np.zeros((len(goal_w), 8), bool)
+        return self.seen
+
+
+def test_a_throw_flies_on_what_its_eyes_see_alone():
+    """With eyes that see nothing no throw comes near the goal; without eyes the same throws do."""
+    loaded, job = load_policy("vision_dropout"), Job((0,), 2.0, 0, 2, 0)
+    blind = Blind()
+    without, seeing = fly_batch([loaded], "hybrid", job, blind), fly_batch([loaded], "hybrid", job)
+    assert blind.looks > 20
+    assert seeing["success"].all()
+    assert seeing["error"].max() < 0.2
+    assert not (without["success"] & (without["error"] < 0.5)).any()
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["throw", "--policy", "state"], "a vision policy"),
+        (["throw", "--plant", "hal"], "no plant 'hal'"),
+        (["check", "--frames", "0"], "--frames 0"),
+        (["check", "--weights", "none.npz"], "no detector written by"),
+        (["train", "nothing"], "no detector config 'nothing'"),
+    ],
+)
+def test_what_cannot_be_done_is_refused(capsys, words, said):
+    assert cli.main(["detector", *words]) == 2
+    assert said in capsys.readouterr().err
