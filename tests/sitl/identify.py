@@ -83,7 +83,7 @@ def fly(folder: Path, seconds: float, seed: int = 0) -> dict[str, np.ndarray]:
                 now = plant.look()
                 pos = plant.state["pos_w"]
                 answered = desk.fake.answered
-                rows.append((plant.time, *now["rate_b"], *now["quat_wb"], *now["vel_w"], *pos, *command, answered))
+                rows.append((plant.time, *now["rate_b"], *now["quat_wb"], *now["vel_w"], *pos, *command, answered, now["voltage"], now["charge_used"]))
                 desk.fake.step()
     finally:
         desk.close()
@@ -131,6 +131,8 @@ class Windows:
         sim = HybridSim(dataclasses.replace(self.plant, vehicle=vehicle), len(rows))
         start = rows[:, 0]
         sim.place(start[:, 11:14], start[:, 4:8], start[:, 8:11], start[:, 1:4])
+        sim.state.voltage.assign(start[:, 19].astype(np.float32))
+        sim.state.charge_used.assign(start[:, 20].astype(np.float32))
         depth = sim.state.queue.shape[0]
         newest_first = self.earlier[chosen][:, ::-1][:, np.minimum(np.arange(depth), self.earlier.shape[1] - 1)]
         sim.state.queue.assign(np.swapaxes(newest_first, 0, 1).astype(np.float32))

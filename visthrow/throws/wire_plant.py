@@ -131,8 +131,8 @@ class MotorPlant(WirePlant):
         self.force_b = np.array([0.0, 0.0, GRAVITY])
 
     def look(self) -> dict[str, np.ndarray]:
-        """Attitude, velocity, rates, motor_speed [rad/s] and voltage [V] now: what a period needs."""
-        names = ("quat_wb", "vel_w", "rate_b", "motor_speed", "voltage")
+        """Attitude, velocity, rates, motor_speed [rad/s], voltage [V] and used share of the charge now."""
+        names = ("quat_wb", "vel_w", "rate_b", "motor_speed", "voltage", "charge_used")
         return {name: value[0] for name, value in zip(names, self._plant.look(*names))}
 
     def _look(self) -> None:

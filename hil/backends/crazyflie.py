@@ -1,0 +1,190 @@
+"""Crazyflie over CRTP: body rates and thrust as legacy set-points in rate mode, the release as a parameter, poses to its estimator.
+
+It has no hold of its own that takes over in mid flight here: the runner's hover controller flies before and after the throw. Silence of 0.5 s
+levels it, of 2 s stops the motors (its commander's watchdog). Thrust stays locked until a set-point without thrust came. A set-point means
+rates only after ``flightmode.stabModeRoll`` and ``stabModePitch`` were set to 0, which is done, and answered, before anything is armed.
+
+Source: crazyflie-firmware, crtp_commander_rpyt.c, commander.c (COMMANDER_WDT_TIMEOUT), supervisor.c, param_logic.c (paramSetByName).
+"""
+
+import math
+from dataclasses import dataclass
+
+from hil.backends.base import ACCEPTED, FOLLOW, PENDING, WAIT, Release, Status
+from hil.backends.thrust import ThrustParams
+from hil.links import crtp
+from hil.links.device import MOST_CHUNKS, Port
+from hil.poses.pose import VEHICLE
+from hil.poses.track import Track
+
+FULL = 60000
+"""Most of 65535 that the firmware takes (MAX_THRUST)."""
+
+MODES = ("flightmode.stabModeRoll", "flightmode.stabModePitch")
+"""Parameters that are 0 for rates."""
+
+ASK, KEEP_ALIVE, SET_AGAIN = 0.1, 0.02, 0.2
+"""Between two questions for its state, two set-points before it is flown, two tries of a parameter [s]."""
+
+BLOCKS = {crtp.TUMBLED: "tumbled", crtp.LOCKED: "locked: restart it"}
+
+
+@dataclass(frozen=True)
+class CrazyflieParams:
+    """The vehicle on the other side.
+
+    Raises:
+        ValueError: a number out of its range, or a parameter without a group.
+    """
+
+    device: str  # radio://0/80/2M/E7E7E7E7E7, usb://0, or udpout:127.0.0.1:19850 of its software in the loop
+    remote: bool  # whether a network device may leave this machine
+    thrust: ThrustParams
+    release_parameter: str  # of eight bits that opens the mechanism at 1: group.name of an app or a deck
+    mechanism_lag: float  # from the parameter's change to separation [s]
+    release_timeout: float  # without an answer the release has failed [s]
+    silence: float  # after which it counts as lost [s]
+    external_pose: bool = True  # send the vehicle's poses to its estimator
+
+    def __post_init__(self) -> None:
+        if min(self.release_timeout, self.silence) <= 0.0 or self.mechanism_lag < 0.0:
+            raise ValueError(
+                f"crazyflie: release_timeout {self.release_timeout}, silence {self.silence}, mechanism_lag {self.mechanism_lag} s; "
+                "expected times above 0, a lag of 0 or more"
+            )
+        if not all(self.release_parameter.partition(".")[::2]) or len(crtp.set_parameter(self.release_parameter, 1)) > crtp.MOST:
+            raise ValueError(f"crazyflie.release_parameter '{self.release_parameter}'; expected group.name of at most 25 letters")
+
+
+class Crazyflie:
+    """See `hil.backends.base.Backend`.
+
+    Attributes:
+        release_record: of this throw. poses: that went to its estimator. dropped: packets that could not be sent.
+    """
+
+    name = "crazyflie"
+    holds = False
+
+    def __init__(self, port: Port, params: CrazyflieParams) -> None:
+        """Speak CRTP on an open port."""
+        self.params, self._port = params, port
+        self.release_record = Release(params.release_timeout)
+        self.poses = self.dropped = 0
+        self._state, self._heard = 0, -1e9
+        self._taken = self._raised = self._over = False
+        self._told: dict[str, bool] = dict.fromkeys(MODES, False)  # whether its answer came
+        self._asked = self._sent = self._set = -1e9
+
+    def status(self, now: float) -> Status:
+        """See `Backend`."""
+        note, mode = self._note(now)
+        said = note or ("it is being armed" if self._taken and not self._raised else "") or self.release_record.note
+        return Status(not note, said, self.release_record.state, mode, None)
+
+    def _note(self, now: float) -> tuple[str, str]:
+        if now - self._heard > self.params.silence:
+            return "no answer by CRTP" if self._heard < 0.0 else f"no answer by CRTP for {now - self._heard:.1f} s", WAIT
+        if not all(self._told.values()):
+            return "its set-points are being set to rates", WAIT
+        blocked = [text for bit, text in BLOCKS.items() if self._state & bit]
+        if blocked:
+            return ", ".join(blocked), WAIT
+        armed = bool(self._state & crtp.ARMED)
+        if armed and self._taken:
+            self._raised = True
+            return "", FOLLOW
+        return ("disarmed" if self._raised else ""), WAIT
+
+    def place(self, body: str, track: Track) -> None:
+        """Hand a pose of the vehicle to its estimator, as it was taken; for `Runner.watcher`."""
+        pose = track.sample()[0]
+        if body == VEHICLE and self.params.external_pose and pose.quat is not None:
+            self.poses += self._write(crtp.external_pose(pose.pos, pose.quat))
+
+    def send(self, command: tuple[float, ...], now: float) -> bool:
+        """See `Backend`."""
+        thrust, *rates = command
+        armed = bool(self._state & crtp.ARMED) and self._taken
+        share = self.params.thrust.share(thrust) if armed else 0.0
+        x, y, z = (math.degrees(rate) for rate in rates)
+        self._sent = now
+        return self._write(crtp.set_point(round(FULL * share), (x, y, z) if armed else (0.0, 0.0, 0.0)))
+
+    def ask(self, mode: str, now: float) -> None:
+        """See `Backend`: takes the vehicle; it neither holds nor lands by itself."""
+        self._taken |= mode == FOLLOW
+
+    def release(self, when: float) -> None:
+        """See `Backend`."""
+        self.release_record.start(when)
+
+    def stop_release(self) -> None:
+        """See `Backend`."""
+        self.release_record.stop()
+
+    def rearm(self) -> None:
+        """See `Backend`: the mechanism closes, so that the next payload can be hung on."""
+        self.release_record.reset()
+        self._write(crtp.set_parameter(self.params.release_parameter, 0))
+
+    def service(self, now: float) -> None:
+        """See `Backend`."""
+        self._pump(now)
+        if now - self._asked >= ASK:
+            self._asked = now
+            self._write(crtp.ask_state())
+        if now - self._set >= SET_AGAIN:
+            self._set = now
+            for name, told in self._told.items():
+                if not told:
+                    self._write(crtp.set_parameter(name, 0))
+            ready = self._taken and not self._over and all(self._told.values())
+            if ready and not self._state & crtp.ARMED and not self._raised:
+                self._write(crtp.arm(True))
+        if self.release_record.due(now):
+            self._write(crtp.set_parameter(self.params.release_parameter, 1))
+        if now - self._sent >= KEEP_ALIVE and not self._raised and not self._over:
+            self.send((0.0, 0.0, 0.0, 0.0), now)  # without thrust: unlocks it
+
+    def due(self) -> float | None:
+        """See `Backend`."""
+        return self.release_record.at
+
+    def abort(self, now: float) -> None:
+        """See `Backend`: nothing to ask for; where the runner falls silent, the commander's watchdog acts."""
+
+    def finish(self, now: float) -> None:
+        """See `Backend`: motors off."""
+        self._over = True
+        self._write(crtp.set_point(0, (0.0, 0.0, 0.0)))
+        self._write(crtp.arm(False))
+
+    def close(self) -> None:
+        """See `Backend`."""
+        self._port.close()
+
+    def _write(self, data: bytes) -> bool:
+        taken = self._port.write(data)
+        self.dropped += not taken
+        return taken
+
+    def _pump(self, now: float) -> None:
+        for _ in range(MOST_CHUNKS):
+            data = self._port.read()
+            if data is None:
+                return
+            packet = crtp.unpack(data)
+            if packet is not None:
+                self._hear(packet, now)
+
+    def _hear(self, packet: crtp.Packet, now: float) -> None:
+        if (packet.port, packet.channel) == (crtp.SUPERVISOR, crtp.INFO) and packet.data[:1] == bytes([crtp.STATE | crtp.ANSWER]):
+            self._heard, self._state = now, int.from_bytes(packet.data[1:5], "little")
+        elif (packet.port, packet.channel) == (crtp.PARAM, crtp.BY_NAME) and packet.data[:1] == bytes([crtp.SET_BY_NAME]):
+            name, _, error = packet.data[1:].rpartition(b"\0")
+            known, refused = name + b"\0", error[:1] != b"\0" and error[:1] != b""
+            for mode in MODES:
+                self._told[mode] |= known == crtp.named(mode) and not refused
+            if known == crtp.named(self.params.release_parameter) and self.release_record.state in (PENDING, ACCEPTED):
+                self.release_record.answer(not refused, "the parameter is not known to the firmware")
