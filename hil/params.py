@@ -6,6 +6,7 @@ from typing import Literal
 from camera.params import CameraParams
 from hil.backends.ardupilot import ArduPilotParams
 from hil.backends.betaflight import BetaflightParams
+from hil.backends.crazyflie import CrazyflieParams
 from hil.backends.px4 import Px4Params
 from hil.control.aim import AimParams
 from hil.control.calibrating import CalibrationParams
@@ -97,7 +98,7 @@ class HilParams:
 
     policy: str  # name of a shipped policy, or a file
     camera: CameraParams
-    backend: Literal["dry-run", "ardupilot", "px4", "betaflight"]
+    backend: Literal["dry-run", "ardupilot", "px4", "betaflight", "crazyflie"]
     # Show the policy every tick, not only those of a throw; what it says then is recorded, never sent. Such a run waits
     # for poses and checks for ever.
     observe: bool
@@ -118,6 +119,7 @@ class HilParams:
     ardupilot: ArduPilotParams
     px4: Px4Params
     betaflight: BetaflightParams
+    crazyflie: CrazyflieParams | None = None  # where it is the back-end
     keypoints: Literal["projection", "detector"] = "projection"  # of the poses, or of what a camera sees
     images: ImageParams | None = None  # of the detector
     realtime: RealtimeParams = field(default_factory=RealtimeParams)
@@ -131,6 +133,8 @@ class HilParams:
             raise ConfigError("keypoints of a detector, but no table [images]; expected its kind and path or device")
         if self.calibration is not None and self.keypoints != "detector":
             raise ConfigError("calibration of a camera, but keypoints of poses; expected keypoints = \"detector\"")
+        if self.backend == "crazyflie" and self.crazyflie is None:
+            raise ConfigError("backend crazyflie without a table [crazyflie]; expected its device and thrust, as in crazyflie.toml")
         if self.throws < 1:
             raise ConfigError(f"throws {self.throws}; expected 1 or more")
         if self.source.kind not in LIVE and self.source.file is None:

@@ -1,5 +1,5 @@
 """Back-ends: where commands go. ``dry-run`` (the default) sends nothing, ``ardupilot`` and ``px4`` speak MAVLink on the link
-that the poses may share, ``betaflight`` speaks MSP on a port of its own."""
+that the poses may share, ``betaflight`` speaks MSP and ``crazyflie`` CRTP on a port of its own."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -9,8 +9,10 @@ from hil.backends.ardupilot import ArduPilot, ArduPilotParams
 from hil.backends.autopilot import MavlinkAutopilot
 from hil.backends.base import Backend, DryRun, Status
 from hil.backends.betaflight import Betaflight, BetaflightParams
+from hil.backends.crazyflie import Crazyflie, CrazyflieParams
 from hil.backends.px4 import Px4, Px4Params
 from hil.errors import RunError
+from hil.links.crtp import open_crtp
 from hil.links.device import check_device, open_port
 from hil.links.msp_log import LoggedPort
 
@@ -55,6 +57,8 @@ def make_backend(
         port = open_port(device)
         port = port if folder is None else LoggedPort(port, folder / MSP_LOG)
         return Betaflight(port, params.betaflight, write, tell)
+    if params.backend == "crazyflie":
+        return Crazyflie(open_crtp(params.crazyflie.device, params.crazyflie.remote), params.crazyflie)
     if link is None:
         raise RunError(f"backend {params.backend} without a MAVLink link; expected source.kind mavlink")
     return AUTOPILOTS[params.backend](link, getattr(params, params.backend), write, tell)
@@ -92,6 +96,7 @@ def require_reach(params: Any, contract: dict[str, Any]) -> None:
 
 
 __all__ = [
-    "AUTOPILOTS", "ArduPilot", "ArduPilotParams", "Backend", "Betaflight", "BetaflightParams", "DryRun", "Px4", "Px4Params", "Status",
+    "AUTOPILOTS", "ArduPilot", "ArduPilotParams", "Backend", "Betaflight", "BetaflightParams", "Crazyflie",
+    "CrazyflieParams", "DryRun", "Px4", "Px4Params", "Status",
     "make_backend", "mechanism_lag", "require_reach",
 ]  # fmt: skip

@@ -1,8 +1,9 @@
 """Crazyflie over CRTP: body rates and thrust as legacy set-points in rate mode, the release as a parameter, poses to its estimator.
 
-It has no hold of its own that takes over in mid flight here: the runner's hover controller flies before and after the throw. Silence of 0.5 s
-levels it, of 2 s stops the motors (its commander's watchdog). Thrust stays locked until a set-point without thrust came. A set-point means
-rates only after ``flightmode.stabModeRoll`` and ``stabModePitch`` were set to 0, which is done, and answered, before anything is armed.
+It has no hold of its own that takes over in mid flight here: the runner's hover controller flies before and after the throw. Silence
+of 0.5 s levels it, of 2 s stops the motors (its commander's watchdog). Thrust stays locked until a set-point without thrust came. A
+set-point means rates only after ``flightmode.stabModeRoll`` and ``stabModePitch`` were set to 0, which is done, and answered, before
+anything is armed.
 
 Source: crazyflie-firmware, crtp_commander_rpyt.c, commander.c (COMMANDER_WDT_TIMEOUT), supervisor.c, param_logic.c (paramSetByName).
 """
@@ -182,8 +183,7 @@ class Crazyflie:
         if (packet.port, packet.channel) == (crtp.SUPERVISOR, crtp.INFO) and packet.data[:1] == bytes([crtp.STATE | crtp.ANSWER]):
             self._heard, self._state = now, int.from_bytes(packet.data[1:5], "little")
         elif (packet.port, packet.channel) == (crtp.PARAM, crtp.BY_NAME) and packet.data[:1] == bytes([crtp.SET_BY_NAME]):
-            name, _, error = packet.data[1:].rpartition(b"\0")
-            known, refused = name + b"\0", error[:1] != b"\0" and error[:1] != b""
+            known, refused = packet.data[1:-1], packet.data[-1] != 0
             for mode in MODES:
                 self._told[mode] |= known == crtp.named(mode) and not refused
             if known == crtp.named(self.params.release_parameter) and self.release_record.state in (PENDING, ACCEPTED):

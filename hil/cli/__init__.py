@@ -116,11 +116,11 @@ def _add_simulated(fake: argparse.ArgumentParser, direct: argparse.ArgumentParse
     )
     fake.add_argument(
         "--kind", default="ardupilot",
-        help="of autopilot: ardupilot, px4, betaflight; or a bridge to one in software: betaflight-sitl, ardupilot-sitl, px4-sih",
+        help="of autopilot: ardupilot, px4, betaflight, crazyflie; or a bridge to software: betaflight-sitl, ardupilot-sitl, px4-sih",
     )
     fake.add_argument("--autopilot", default="udp:127.0.0.1:14550", help="where px4-sih hears PX4 itself: its port for ground stations")
     fake.add_argument("--config", default="betaflight_sitl", metavar="NAME", help="of the run that the firmware is set up for")
-    fake.add_argument("--msp-port", type=int, default=14561, help="where the fake Betaflight listens")
+    fake.add_argument("--msp-port", type=int, default=14561, help="where the fake Betaflight or Crazyflie listens")
     fake.add_argument(
         "--option", dest="overrides", action="append", default=[], metavar="KEY=VALUE",
         help="of hil.fakes.Options: silent_after=12, command_delay=0.03, parameters.GUID_OPTIONS=0, ...",

@@ -18,6 +18,7 @@ from hil.control.realtime import keep, prepare
 from hil.control.runner import Runner
 from hil.errors import ConfigError, RunError
 from hil.links.clock import ManualClock, MonotonicClock
+from hil.links.crtp import CFLIB
 from hil.links.device import check_device
 from hil.links.signing import read_key
 from hil.params import HilParams
@@ -49,8 +50,8 @@ def require_fake(params: HilParams) -> None:
         RunError: a device that is no loopback address, or poses that do not come by MAVLink.
     """
     devices = [params.link.device, params.source.device or params.link.device]
-    devices += [params.betaflight.device] if params.backend == "betaflight" else []
-    far = [text for text in devices if text.startswith("serial:") or not _loopback(text)]
+    devices += [getattr(params, params.backend).device] if params.backend in ("betaflight", "crazyflie") else []
+    far = [text for text in devices if text.startswith(("serial:", *CFLIB)) or not _loopback(text)]
     if params.source.kind == "mocap":
         far.append(f"source.kind {params.source.kind}")
     if far:
@@ -84,6 +85,7 @@ def fly(args: argparse.Namespace) -> int:
     require_reach(params, policy.contract)
     backend = make_backend(params, link, args.action == "run" and args.write_parameters, voice.say, folder)
     runner = Runner(params, policy, backend, mechanism_lag(params))
+    runner.watcher = getattr(backend, "place", None)  # who wants the vehicle's poses
     refused = prepare(params.realtime)
     runner.warm_up()
     recorder = Recorder(folder, params)

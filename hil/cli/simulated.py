@@ -13,7 +13,7 @@ from hil.errors import RunError
 from hil.fakes.base import Options
 from hil.fakes.direct import Direct, scored
 from hil.fakes.mocap import MocapParams
-from hil.fakes.process import VEHICLE_ID, ListeningPort, load_plant, make_fake, read_options, serve
+from hil.fakes.process import VEHICLE_ID, AnsweringPort, ListeningPort, load_plant, make_fake, read_options, serve
 from hil.fakes.sitl import SLOW, ArduPilotSitl, BetaflightSitl, Firmware, HangingBall, MotorPlant, Px4Sih, needed, throw
 from hil.links.clock import Clock, MonotonicClock
 from hil.links.device import check_device, open_port
@@ -61,6 +61,8 @@ def fake(args: argparse.Namespace) -> int:
         _tell_late(report, plant.period, args.speed)
     else:
         port = ListeningPort(args.msp_port) if args.kind == "betaflight" else None
+        if args.kind == "crazyflie":
+            port = AnsweringPort(open_port(check_device(f"udp:127.0.0.1:{args.msp_port}")))
         flown = make_fake(args.kind, plant, link, mocap, args.seed, options, port)
         print(f"the fake {args.kind} flies", file=sys.stderr, flush=True)
         report = serve(flown, clock, args.seconds, out, args.after)

@@ -14,7 +14,7 @@ from hil.fakes import KINDS, VEHICLE_ID, Fake, Options, WirePlant
 from hil.fakes import FakeArduPilot as FakeAutopilot
 from hil.fakes.mocap import MocapParams
 from hil.links.clock import Clock
-from hil.links.device import LARGEST_DATAGRAM
+from hil.links.device import LARGEST_DATAGRAM, Port
 from hil.links.mavlink_link import Link
 from visthrow import config
 from visthrow.common.errors import suggest
@@ -102,6 +102,32 @@ class ListeningPort:
             self._peer.close()
 
 
+class AnsweringPort:
+    """A UDP port that answers whoever spoke last: what a vehicle in software offers."""
+
+    whole, sender, peer = True, None, None
+
+    def __init__(self, port: Port) -> None:
+        """Take a port that listens."""
+        self._port = port
+
+    def read(self) -> bytes | None:
+        """See `hil.links.device.Port`."""
+        return self._port.read()
+
+    def write(self, data: bytes, to: tuple[str, int] | None = None) -> bool:
+        """See `hil.links.device.Port`."""
+        return self._port.write(data, to or self._port.sender)
+
+    def fileno(self) -> int:
+        """See `hil.links.device.Port`."""
+        return self._port.fileno()
+
+    def close(self) -> None:
+        """See `hil.links.device.Port`."""
+        self._port.close()
+
+
 def make_fake(
     kind: str, plant: WirePlant, link: Link, mocap: MocapParams | None = None, seed: int = 0,
     options: Options | None = None, port: Any = None,
@@ -111,14 +137,14 @@ def make_fake(
     Args:
         kind: of `hil.fakes.KINDS`.
         plant, link, mocap, seed, options: see `hil.fakes.Fake`.
-        port: of MSP, for Betaflight.
+        port: of MSP for Betaflight, of CRTP for the Crazyflie.
 
     Raises:
         RunError: an unknown kind.
     """
     if kind not in KINDS:
         raise RunError(f"fake of kind '{kind}'; {suggest(kind, KINDS)}")
-    more = {"port": port} if kind == "betaflight" else {}
+    more = {"port": port} if kind in ("betaflight", "crazyflie") else {}
     return KINDS[kind](plant, link, mocap, seed, options, **more)
 
 
@@ -184,6 +210,6 @@ def serve(
 
 
 __all__ = [
-    "KINDS", "VEHICLE_ID", "FakeAutopilot", "ListeningPort", "MocapParams", "Options", "Paced", "WirePlant", "load_plant",
+    "KINDS", "VEHICLE_ID", "AnsweringPort", "FakeAutopilot", "ListeningPort", "MocapParams", "Options", "Paced", "WirePlant", "load_plant",
     "make_fake", "read_options", "serve",
 ]  # fmt: skip

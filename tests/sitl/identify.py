@@ -83,7 +83,8 @@ def fly(folder: Path, seconds: float, seed: int = 0) -> dict[str, np.ndarray]:
                 now = plant.look()
                 pos = plant.state["pos_w"]
                 answered = desk.fake.answered
-                rows.append((plant.time, *now["rate_b"], *now["quat_wb"], *now["vel_w"], *pos, *command, answered, now["voltage"], now["charge_used"]))
+                battery = (now["voltage"], now["charge_used"])
+                rows.append((plant.time, *now["rate_b"], *now["quat_wb"], *now["vel_w"], *pos, *command, answered, *battery))
                 desk.fake.step()
     finally:
         desk.close()

@@ -169,3 +169,25 @@ def test_a_broken_covariance_is_refused():
     bad = DiagnosedParams(("rope_length", "mass_quad"), ((1e-6, 1e-5), (1e-5, 1e-6)), 4)
     with pytest.raises(ConfigError, match="no covariance"):
         drawn_plants(replace(shipped(), diagnosed=bad), 0)
+
+
+def test_a_blackbox_gives_its_firmwares_rate_controller(tmp_path, capsys):
+    """The settings in the header become the block, the delay is as told, and what the block cannot say is named."""
+    log, out = tmp_path / "LOG00001.BFL", tmp_path / "firmware.toml"
+    header = {
+        "Firmware revision": "Betaflight 4.6.0", "rollPID": "11,20,8", "pitchPID": "12,21,9", "yawPID": "45,80,0", "ff_weight": "0,0,0",
+        "iterm_relax_cutoff": "15", "motor_idle": "550", "pidsum_limit": "1000", "iterm_windup": "80", "gyro_lpf2_static_hz": "500",
+        "tpa_rate": "65", "Field I name": "loopIteration,time", "Field I signed": "0,0", "Field I predictor": "0,0",
+        "Field I encoding": "1,1", "Field P predictor": "6,2", "Field P encoding": "9,0",
+    }  # fmt: skip
+    text = "H Product:Blackbox flight data recorder by Nicholas Sherlock\nH Data version:2\n"
+    log.write_bytes((text + "".join(f"H {name}:{value}\n" for name, value in header.items())).encode() + b"I\x00\x05")
+    command = ["diagnose", "apply", str(log), "--plant", "vision_dropout", "--out", str(out)]
+    assert cli.main(command) == 2
+    assert "--hover" in capsys.readouterr().err
+    assert cli.main([*command, "--hover", "0.3645", "--delay", "0.003"]) == 0
+    after = config.load(Experiment, out)
+    assert after.vehicle.controller.kind == "motor_mixing"
+    assert after.vehicle.controller.p_gain[0] == pytest.approx(0.01748, rel=1e-3)
+    assert after.vehicle.queue.delay == 0.003
+    assert "# Not in the block: tpa_rate 65" in out.read_text()

@@ -31,6 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="write the laws of the N-th best explanation outside the catalogue, which belong together, as well (default: 0, none)",
     )
     parser.add_argument("--hover", type=float, metavar="SHARE", help="with a blackbox: throttle in hover, 0 to 1")
+    parser.add_argument("--delay", type=float, metavar="S", help="with a blackbox: from a command to the mixer, where it is known [s]")
     parser.add_argument("--anyway", action="store_true", help="write it even if held-out flights saw no gain")
 
 
@@ -49,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
         if args.hover is None:
             raise DiagnoseError("a blackbox without --hover; expected the share of throttle in hover, such as --hover 0.36")
         base, experiment = _diagnosed(args.plant)
-        atomic_write(args.out, firmware.text(args.diagnosis, base, experiment, args.hover))
+        atomic_write(args.out, firmware.text(args.diagnosis, base, experiment, args.hover, args.delay))
         config.load(Experiment, Path(args.out))
         print(f"{args.out}: the rate controller of {args.diagnosis} on top of {base}")
         return 0

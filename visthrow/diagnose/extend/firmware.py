@@ -12,13 +12,14 @@ from visthrow.logs.readers.blackbox.decoder import read_blackbox
 from visthrow.task import Experiment, plant_of
 
 
-def text(path: str | Path, base: str, experiment: Experiment, hover: float) -> str:
+def text(path: str | Path, base: str, experiment: Experiment, hover: float, delay: float | None = None) -> str:
     """A configuration that flies the firmware's controller.
 
     Args:
         path: of the blackbox, whose header tells the settings.
         base: name of the configuration below. experiment: what it says.
         hover: share of throttle in hover, 0 to 1, with the payload.
+        delay: from a command to the mixer [s]; None: as the configuration has it.
 
     Raises:
         DiagnoseError: settings are missing. LogError: no blackbox.
@@ -33,4 +34,5 @@ def text(path: str | Path, base: str, experiment: Experiment, hover: float) -> s
     changed = differences(dataclasses.asdict(plant.vehicle.controller), dataclasses.asdict(controller))
     lines = [f"# Controller by the settings of {settings.get('Firmware revision', 'a firmware').strip()} in {Path(path).name}."]
     lines += [f"# Not in the block: {words}." for words in left_out(settings)]
-    return "\n".join([*lines, dumps({"base": base, "vehicle": {"controller": changed}})])
+    vehicle = {"controller": changed} | ({} if delay is None else {"queue": {"delay": delay}})
+    return "\n".join([*lines, dumps({"base": base, "vehicle": vehicle})])

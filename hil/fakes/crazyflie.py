@@ -1,0 +1,141 @@
+"""A fake Crazyflie on a CRTP port; the poses come from the motion capture's bridge beside it.
+
+Set-points are angles until both modes were set to rates, and fly nothing until one without thrust unlocked it and it was armed. Pitch is
+nose down. Silence of its commander levels it after 0.5 s and stops its motors after 2 s. An unknown parameter is answered with an error.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from hil.backends.crazyflie import FULL, MODES
+from hil.backends.thrust import ThrustParams
+from hil.fakes.base import Fake, Options, WirePlant
+from hil.fakes.mocap import MocapParams
+from hil.links import crtp
+from hil.links.device import MOST_CHUNKS, Port
+from hil.links.mavlink_link import Link
+
+LEVELS_AFTER, STOPS_AFTER = 0.5, 2.0
+"""Silence of set-points [s]: COMMANDER_WDT_TIMEOUT_STABILIZE and _SHUTDOWN."""
+
+LEAST = 1000
+"""Thrust below this is none (MIN_THRUST)."""
+
+ENOENT = 2
+
+
+class FakeCrazyflie(Fake):
+    """See the head of this module.
+
+    Attributes:
+        placed: external poses that came, position [m] and attitude xyzw. parameters: values by name.
+    """
+
+    thrust_map = ThrustParams(2.668, 0.1906, 1.0, 0.1, 0.0)
+
+    def __init__(
+        self, plant: WirePlant, link: Link, mocap: MocapParams | None = None, seed: int = 0, options: Options | None = None,
+        port: Port | None = None,
+    ) -> None:  # fmt: skip
+        """See `Fake`.
+
+        Args:
+            plant, link, mocap, seed, options: see `Fake`.
+            port: that CRTP comes on.
+        """
+        super().__init__(plant, link, mocap, seed, options)
+        self.port, self.armed = port, False
+        self.parameters: dict[str, float] = {**dict.fromkeys(MODES, 1), "hook.open": 0, **self.options.parameters}
+        self.placed: list[tuple[tuple[float, ...], tuple[float, ...]]] = []
+        self._locked, self._heard, self._stopped = True, -math.inf, False
+
+    def hear(self) -> None:
+        """See `Fake`."""
+        for _ in range(MOST_CHUNKS):
+            data = None if self.port is None else self.port.read()
+            if data is None:
+                break
+            self.heard, packet = self.wall(), crtp.unpack(data)
+            if packet is not None and not self.silent:
+                self._hear(packet)
+        super().hear()
+
+    def _hear(self, packet: crtp.Packet) -> None:
+        place, data = (packet.port, packet.channel), packet.data
+        if place == (crtp.COMMANDER, 0) and len(data) == crtp.SET_POINT.size:
+            self._set_point(*crtp.SET_POINT.unpack(data))
+        elif place == (crtp.LOCALIZATION, crtp.GENERIC) and len(data) == crtp.POSE.size and data[0] == crtp.EXTERNAL_POSE:
+            values = crtp.POSE.unpack(data)[1:]
+            self.placed.append((values[:3], values[3:]))
+        elif place == (crtp.SUPERVISOR, crtp.INFO) and data[:1] == bytes([crtp.STATE]):
+            self._answer(crtp.SUPERVISOR, crtp.INFO, bytes([crtp.STATE | crtp.ANSWER]) + self._state().to_bytes(4, "little"))
+        elif place == (crtp.SUPERVISOR, crtp.COMMAND) and data[:1] == bytes([crtp.ARM]) and len(data) == 2:
+            self.armed = bool(data[1]) and self.options.arming and not self._stopped
+            self.happened("armed" if self.armed else "disarmed")
+        elif place == (crtp.PARAM, crtp.BY_NAME) and data[:1] == bytes([crtp.SET_BY_NAME]):
+            self._set_parameter(data)
+
+    def _answer(self, port: int, channel: int, data: bytes) -> None:
+        self.later(self.options.answer_delay, lambda: self.port.write(crtp.Packet(port, channel, data).pack()))
+
+    def _state(self) -> int:
+        return crtp.CAN_FLY | crtp.ARMED * self.armed | crtp.FLYING * bool(self.last_thrust > 0.0) | crtp.LOCKED * self._stopped
+
+    def _set_parameter(self, data: bytes) -> None:
+        group, name, rest = data[1:].split(b"\0", 2)
+        known = f"{group.decode()}.{name.decode()}"
+        error = 0 if known in self.parameters and len(rest) == 2 else ENOENT
+        if not error:
+            self.parameters[known] = rest[1]
+        if known == "hook.open" and rest[1:] == b"\1":
+            self.note_release()
+            if self.options.answer == "silent":
+                return
+            self.witness.answered()
+            error = ENOENT if self.options.answer == "denied" else error
+            self.open_mechanism()
+        self._answer(crtp.PARAM, crtp.BY_NAME, data[: -len(rest)] + bytes([error]))
+
+    def _set_point(self, roll: float, pitch: float, yaw: float, thrust: int) -> None:
+        self._heard = self.plant.time
+        self._locked &= thrust != 0
+        rates = tuple(math.radians(rate) for rate in (roll, -pitch, yaw))
+        command = (self.thrust_map.thrust(min(thrust, FULL) / FULL) if thrust >= LEAST else 0.0, *rates)
+        self.witness.command(self.plant.time, command)
+        if self.armed and not self._locked and not any(self.parameters[mode] for mode in MODES):
+            self.steer(command)
+        else:
+            self.ignored += 1
+
+    def take(self) -> None:
+        """See `Fake`: there is no pilot beside the runner; its emergency stop ends all."""
+        self.armed, self._stopped = False, True
+        self.happened("emergency stop")
+
+    def flown(self) -> np.ndarray:
+        """See `Fake`; before the runner has it somebody holds it in the hand."""
+        quiet = self.plant.time - self._heard
+        if self._target is None or not self.followed:
+            return self.hold(self._place)
+        if quiet > STOPS_AFTER or not self.armed:
+            self.happened("motors off")
+            return np.zeros(4)
+        if quiet > LEVELS_AFTER:
+            self.happened("commander: level")
+            return np.array([self._target[0], 0.0, 0.0, 0.0])
+        return self._target
+
+    def speak(self) -> None:
+        """See `Fake`: it speaks when it is asked."""
+
+    def report(self) -> dict[str, Any]:
+        """See `Fake`."""
+        return {**super().report(), "poses": len(self.placed), "parameters": self.parameters}
+
+    def close(self) -> None:
+        """See `Fake`."""
+        super().close()
+        if self.port is not None:
+            self.port.close()
