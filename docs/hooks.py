@@ -14,7 +14,7 @@ import re
 
 from visthrow import cli
 
-os.environ["COLUMNS"] = "100"
+os.environ["COLUMNS"] = "88"
 HELP, FIELDS = re.compile(r"<!-- help: ([\w ]+) -->"), re.compile(r"<!-- fields: ([\w.]+) -->")
 FIELD = re.compile(r"^    (\w+): ([^#\n]+?)(?:  # (.*))?$", re.MULTILINE)
 SHIM, OWN_SHIM = "https://unpkg.com/iframe-worker/shim", "assets/iframe-worker.js"
