@@ -15,6 +15,7 @@ from hil.recording.record import Recorder, lines, read_poses
 from tests.contract.test_pilot import quiet
 from tests.hil_flight import TICK, Spy, params
 from tests.hil_runs import record_run, saved_policy
+from visthrow.onboard.pilot import by_own_rule
 from visthrow.onboard.policy import Policy, find_policy
 from visthrow.training.env import ThrowEnv
 
@@ -84,7 +85,9 @@ def seen_by_the_runner(flown, poses, policy: str) -> tuple[np.ndarray, np.ndarra
 def shown_by_the_environment(flown, actions: np.ndarray, policy: str, device: str) -> np.ndarray:
     """Observations of the environment for the same states and actions, all streams at once."""
     streams, steps = flown["pos_w"].shape[:2]
-    env = ThrowEnv(quiet(policy), device, count=streams)
+    experiment = quiet(policy)
+    camera = by_own_rule(Policy.load(find_policy(policy)), experiment.camera)
+    env = ThrowEnv(dataclasses.replace(experiment, camera=camera), device, count=streams)
     states, out = env.views.state, []
     env.views.goal_w.copy_(torch.from_numpy(flown["goal_w"][:, 0]))
     states["attached"].fill_(1)
