@@ -81,20 +81,20 @@ def test_without_lost_windows_the_search_goes_on_from_names_that_stand_alone(act
     assert len(at.point.windows) == len(at.origin.windows) == len(left)
 
 
-def test_windows_soon_after_slack_are_shaken(monkeypatch):
+def test_windows_soon_after_slack_are_marked(monkeypatch):
     """The rope whips for some time: what begins calmly is left with less freedom than it has."""
     logs = fly(setting_with({}), noise=0.2, free=1, throws=0, seconds=5.0)
     model = ThrowModel(logs, paper_plant(), only=["rope_length"])
     cuts = model.flights.cuts
     never = np.array([c.start - 1.0 for c in cuts])
-    assert not any(c.shaken for c in model._without_slack({"slack_first": never, "slack_last": never}))
+    assert not any(c.after_slack for c in model._without_slack({"slack_first": never, "slack_last": never}))
     last = never.copy()
     last[1] = cuts[1].start + 0.1
     first = np.where(np.arange(len(cuts)) == 1, cuts[1].start + 0.05, never)
     after = model._without_slack({"slack_first": first, "slack_last": last})
     for c in after:
-        assert c.shaken == (c.told and last[1] < c.start < last[1] + RINGING), c
-    assert sum(c.shaken for c in after) == 2
+        assert c.after_slack == (c.retained and last[1] < c.start < last[1] + RINGING), c
+    assert sum(c.after_slack for c in after) == 2
 
 
 def test_a_rope_that_hung_still_begins_straighter():
@@ -104,9 +104,9 @@ def test_a_rope_that_hung_still_begins_straighter():
     before, spreads = None, set()
     for c in model.flights.cuts:
         phase = c.phase if before is None or before.flight != c.flight else before.phase
-        assert c.hung == (phase == "hover"), c
-        assert bend.spread(c) == pytest.approx((HUNG if c.hung else 1.0) * bend.calm)
-        assert bend.spread(replace(c, shaken=True)) == bend.sd > bend.calm
+        assert c.at_rest == (phase == "hover"), c
+        assert bend.spread(c) == pytest.approx((HUNG if c.at_rest else 1.0) * bend.calm)
+        assert bend.spread(replace(c, after_slack=True)) == bend.sd > bend.calm
         before = c
-        spreads.add(c.hung)
+        spreads.add(c.at_rest)
     assert spreads == {True, False}

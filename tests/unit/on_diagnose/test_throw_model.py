@@ -177,7 +177,7 @@ def test_each_window_begins_with_the_best_of_its_states(planted, monkeypatch):
     even = np.arange(len(good["pos_w"])) % 2 == 0
     mixed = [{**good, "pos_w": good["pos_w"] + 0.05 * np.where(rows, 1.0, 0.0)[:, None]} for rows in (even, ~even)]
     found = model._initial_fit(model.setting).fit(mixed)
-    told = model._told
+    told = model._retained
     assert {0, 1} == set((told % 2).tolist())
     for name, value in good.items():
         assert np.array_equal(found[name][told], value[told])

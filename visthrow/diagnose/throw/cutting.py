@@ -29,9 +29,9 @@ class Cut:
     start: float  # [s]
     end: float  # [s]
     payload: int  # ATTACHED, LOOSE or NO_PAYLOAD, at its start
-    shaken: bool = False  # whether the rope came taut not long before
-    hung: bool = False  # whether the rope hung still until its start
-    told: bool = True  # whether its residuals count; otherwise it is only flown through
+    after_slack: bool = False  # whether the rope came taut not long before
+    at_rest: bool = False  # whether the rope hung still until its start
+    retained: bool = True  # whether its residuals count; otherwise it is only flown through
 
 
 def _split(first: float, last: float) -> list[tuple[float, float]]:
@@ -84,7 +84,7 @@ def cut(flight: Recorded, number: int, lag: float, landing_height: float, carrie
         spans += [(a, b, "", NO_PAYLOAD) for a, b in _split(max(end, after), last)]
     cuts = [Cut(number, phase or _phase(flight, a, b), a, b, mode) for a, b, phase, mode in spans]
     until = [cuts[max(i - 1, 0)].phase for i in range(len(cuts))]  # the first window's own: nothing is known of before
-    return [replace(c, hung=phase == "hover") for c, phase in zip(cuts, until) if _seen(flight, c)]
+    return [replace(c, at_rest=phase == "hover") for c, phase in zip(cuts, until) if _seen(flight, c)]
 
 
 def thinned(cuts: list[Cut], most: int = MOST) -> list[Cut]:
@@ -107,10 +107,10 @@ def around_slack(c: Cut, first: float, last: float, separation: float) -> list[C
     """
     free = c.start < separation < min(last + LEAST_TAUT, c.end)
     last = min(max(last, separation + LATE), c.end) if free else min(last, c.end)
-    rest = replace(c, start=last, payload=LOOSE, phase="ballistic") if free else replace(c, start=last, shaken=True)
+    rest = replace(c, start=last, payload=LOOSE, phase="ballistic") if free else replace(c, start=last, after_slack=True)
     before = replace(c, end=first, phase="flight" if c.phase == "throw" else c.phase)
-    pieces = [before, replace(c, start=first, end=last, told=False), rest]
-    return [replace(p, told=p.told and p.end - p.start > LEAST) for p in pieces if p.end - p.start > 1e-6]
+    pieces = [before, replace(c, start=first, end=last, retained=False), rest]
+    return [replace(p, retained=p.retained and p.end - p.start > LEAST) for p in pieces if p.end - p.start > 1e-6]
 
 
 def _seen(flight: Recorded, c: Cut) -> bool:

@@ -131,7 +131,7 @@ class LandingHeight:
         """Give each landing to the last window of its flight that counts."""
         self._points: dict[int, tuple[float, np.ndarray]] = {}
         for n, flight in enumerate(flights):
-            own = [w for w, c in enumerate(cuts) if c.flight == n and c.told]
+            own = [w for w, c in enumerate(cuts) if c.flight == n and c.retained]
             if flight.landing_point is not None and flight.latch != NEVER and own:
                 self._points[own[-1]] = flight.landing, flight.landing_point
 
@@ -164,7 +164,7 @@ class CameraView:
         """
         self._nominal, self._windows = setting, {}
         for w, c in enumerate(cuts):
-            if c.told and seen_by_camera(logs[c.flight]) and flights[c.flight].payload is not None:
+            if c.retained and seen_by_camera(logs[c.flight]) and flights[c.flight].payload is not None:
                 view = _view(logs[c.flight], flights[c.flight], c, setting.sensing)
                 if view is not None:
                     self._windows[w] = view

@@ -33,7 +33,7 @@ SHRINKING = 0.1
 """Of what the next step promises against what the last one did, below which derivatives from elsewhere lead to the goal."""
 TRUE, WHOLE = 0.5, 0.8
 """Of what a step promised, that it must bring, and of what the least damped one promised, for derivatives to be used further."""
-ONWARD = 0.1  # flown after the last sample that tells of the start: sensors may be early [s]
+ONWARD = 0.1  # flown after the last sample that depends on the start: sensors may be early [s]
 EARLIER = 0.05  # by which a payload may leave before it is expected to [s]
 SEEN = 0.25  # before that, without which an initial state is fitted to the whole window [s]
 TRUSTED = ("motor_speed",)
@@ -60,7 +60,7 @@ class InitialFit:
     def __init__(
         self,
         flights: Flights,
-        told: np.ndarray,
+        retained: np.ndarray,
         directions: tuple[Direction, ...],
         setting: Setting,
         *,
@@ -72,14 +72,14 @@ class InitialFit:
 
         Args:
             flights: cut into windows.
-            told: windows that count.
+            retained: windows that count.
             directions: in which states may be wrong.
             setting: what is simulated.
             lag: of the release, as far as known [s].
             substep: largest integration step [s].
             device: of the replay.
         """
-        self.flights, self.told, self.directions, self.setting = flights, told, directions, setting
+        self.flights, self.retained, self.directions, self.setting = flights, retained, directions, setting
         self.substep = substep
         self.slopes: dict[int, np.ndarray] = {}  # of windows' samples by their states, where they were taken last
         self.replay = Replay([setting.plant], [setting.sensing], device, download=downloaded)
@@ -90,7 +90,7 @@ class InitialFit:
         self._gusts = np.ones(len(flights.cuts))  # of each window, against the drift that is thought possible
         self._spreads: dict[int, tuple[float, np.ndarray]] = {}  # and the samples' deviation with these
         self._scales: dict[int, tuple] = {}  # the last slopes and deviations of a window, and what comes of them
-        self._tells, ends = zip(*[told_of_start(flights, w, lag) for w in range(len(flights.cuts))])
+        self._sensitive, ends = zip(*[sensitive_samples(flights, w, lag) for w in range(len(flights.cuts))])
         self._shortened = flights.ended(ends)
 
     def fit(self, starts: Sequence[States], slopes: Mapping[int, np.ndarray] | None = None) -> States:
@@ -102,7 +102,7 @@ class InitialFit:
         """
         count = len(self.flights.cuts)
         moves, damping = np.zeros((count, len(self.directions))), np.full(count, DAMPING)
-        left, promised = self.told, np.full(count, np.inf)
+        left, promised = self.retained, np.full(count, np.inf)
         self.slopes |= slopes or {}
         aged = np.isin(np.arange(count), list(self.slopes))  # derivatives come from elsewhere
         states, residuals = self._best(starts)
@@ -134,7 +134,7 @@ class InitialFit:
             promised = np.where(better, hoped, promised)
             aged, cost = aged | better, np.where(better, tried, cost)
             for w in left[settled[left]]:
-                if self._calmed(w, residuals[w]):
+                if self._lower_gusts(w, residuals[w]):
                     settled[w], promised[w] = False, np.inf
                     cost[w] = self._cost(w, residuals[w])
             left = left[~settled[left] & (damping[left] < DAMPING_MOST)]
@@ -144,14 +144,14 @@ class InitialFit:
 
     def _best(self, starts: Sequence[States]) -> tuple[States, dict[int, np.ndarray]]:
         """The best of each window's states, and what they leave; all are flown at once."""
-        told, count = self.told, len(self.told)
-        seen = self._residuals(stacked([rows_of(states, told) for states in starts]), np.tile(told, len(starts)))
-        cost = np.array([self._cost(w, residual) for w, residual in zip(np.tile(told, len(starts)), seen)])
+        retained, count = self.retained, len(self.retained)
+        seen = self._residuals(stacked([rows_of(states, retained) for states in starts]), np.tile(retained, len(starts)))
+        cost = np.array([self._cost(w, residual) for w, residual in zip(np.tile(retained, len(starts)), seen)])
         which = cost.reshape(len(starts), count).argmin(axis=0)
         best = {name: value.copy() for name, value in starts[-1].items()}
         for name, value in best.items():
-            value[told] = np.stack([states[name][told] for states in starts])[which, np.arange(count)]
-        return best, {w: seen[start * count + row] for row, (w, start) in enumerate(zip(told, which))}
+            value[retained] = np.stack([states[name][retained] for states in starts])[which, np.arange(count)]
+        return best, {w: seen[start * count + row] for row, (w, start) in enumerate(zip(retained, which))}
 
     def _tried(
         self, states: States, left: np.ndarray, residuals: Mapping[int, np.ndarray], moves: np.ndarray, damping: np.ndarray,
@@ -162,8 +162,8 @@ class InitialFit:
         which, first = np.repeat(left, rungs), np.cumsum(rungs) - rungs
         dampings = [damping[w] * LADDER[:n] for w, n in zip(left, rungs)]
         each(self._scaled, left)
-        told = [self._increments(w, residuals[w], moves[w], its) for w, its in zip(left, dampings)]
-        tries, (steps, hoped) = np.concatenate(dampings), map(np.concatenate, zip(*told))
+        found = [self._increments(w, residuals[w], moves[w], its) for w, its in zip(left, dampings)]
+        tries, (steps, hoped) = np.concatenate(dampings), map(np.concatenate, zip(*found))
         there = moved_along(rows_of(states, which), self.directions, steps)
         seen = self._residuals(there, which)
         cost = np.array([self._cost(w, residual) for w, residual in zip(which, seen)])
@@ -172,10 +172,10 @@ class InitialFit:
         return _Trial(rows_of(there, best), steps[best], tries[best], hoped[best], hoped[first], cost[best], rest)
 
     def _residuals(self, states: States, which: np.ndarray) -> list[np.ndarray]:
-        """Residuals of windows, of what tells of their initial states; a row of the states for each."""
+        """Residuals of windows, of what depends on their initial states; a row of the states for each."""
         f, lanes = self.flights, [Lane(w, 0, row) for row, w in enumerate(which)]
         seen = f.fly(self.replay, [self.setting], states, lanes, self.substep, self._shortened).seen
-        return [self._tells[w] * f.residual(seen, w, lane) for lane, w in enumerate(which)]
+        return [self._sensitive[w] * f.residual(seen, w, lane) for lane, w in enumerate(which)]
 
     def _costs(self, residuals: Mapping[int, np.ndarray]) -> np.ndarray:
         """Costs of windows, infinite where there is no residual, shape (W,)."""
@@ -198,11 +198,11 @@ class InitialFit:
             self._spreads[w] = float(self._gusts[w]), spread
         return spread
 
-    def _calmed(self, w: int, residual: np.ndarray) -> bool:
+    def _lower_gusts(self, w: int, residual: np.ndarray) -> bool:
         """Take a window's gusts for as strong as what is left of it says, if that is much less than was thought."""
         square, noise, drift = residual**2, self.flights.sigma(w) ** 2, self._drift[w] ** 2
-        told = np.count_nonzero(self._tells[w])
-        calmer = [g for g in CALMER if g < self._gusts[w] and np.sum(square / (noise + g * g * drift)) < told]
+        samples = np.count_nonzero(self._sensitive[w])
+        calmer = [g for g in CALMER if g < self._gusts[w] and np.sum(square / (noise + g * g * drift)) < samples]
         if not calmer:
             return False
         self._gusts[w] = min(calmer)
@@ -224,7 +224,7 @@ class InitialFit:
             ds, rows = self._free[w], int(self.flights.rows[w])
             flat = np.swapaxes(seen[:rows, at : at + 1 + len(ds)], 1, 2).reshape(3 * rows, -1)
             steps = np.array([self.directions[d].step for d in ds])
-            slopes[w] = (flat[:, 1:] - flat[:, :1]) / steps * self._tells[w][:, None]
+            slopes[w] = (flat[:, 1:] - flat[:, :1]) / steps * self._sensitive[w][:, None]
         return slopes
 
     def _scaled(self, w: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -271,7 +271,7 @@ def drift(flights: Flights, w: int) -> np.ndarray:
     return flights.spread(w, *DRIFT) * since ** flights.spread(w, *GROWTH)
 
 
-def told_of_start(flights: Flights, w: int, lag: float) -> tuple[np.ndarray, float]:
+def sensitive_samples(flights: Flights, w: int, lag: float) -> tuple[np.ndarray, float]:
     """Which samples tell of a window's start, and how long it is flown for their sake [s].
 
     They are 1 before the payload may have left, 0 later, for these tell of the release; all 1 where few are left.
@@ -297,7 +297,7 @@ def following(flights: Flights, w: int, window: Window, free: np.ndarray, lag: f
         Changes in the state's units by the effects' sizes, shape (D, K).
     """
     samples = len(flights.time(w))  # and those of a camera, which tell nothing of states
-    weight = (told_of_start(flights, w, lag)[0] / np.hypot(flights.sigma(w), drift(flights, w)))[:, None]
+    weight = (sensitive_samples(flights, w, lag)[0] / np.hypot(flights.sigma(w), drift(flights, w)))[:, None]
     sd = window.nuisance_sd[free]
     by_state = window.nuisance[:samples, free] * sd * weight
     by_effect = (by_state * weight).T @ window.effects[:samples]

@@ -50,8 +50,8 @@ def put_right(logs: Sequence[FlightLog], plant: PlantParams) -> tuple[list[Fligh
     mended, found = _from_throttle(logs, weight)
     relation = [_followed(log) for log in mended]
     for look in (_axes, _rate_unit):
-        told = [r for r in relation if r is not None]
-        mistake = look(told) if told else None
+        followed = [r for r in relation if r is not None]
+        mistake = look(followed) if followed else None
         if mistake is None:
             continue
         trial = [_commanded(log, matrix=mistake[1]) for log in mended]
@@ -77,10 +77,10 @@ def _from_throttle(logs: Sequence[FlightLog], weight: float) -> tuple[list[Fligh
     for i, log in enumerate(logs):
         if "command" in log or "throttle" not in log or "rate_setpoint_b" not in log:
             continue
-        told = _calibrated(log)
-        if told is None:
+        calibration = _calibrated(log)
+        if calibration is None:
             continue
-        hover, slope, start, end = told
+        hover, slope, start, end = calibration
         rates = log["rate_setpoint_b"]
         share = log["throttle"].hold(rates.time)
         thrust_n = np.maximum(weight * (1.0 + slope * (share / hover - 1.0)), 0.0)

@@ -116,7 +116,7 @@ def _spans(model: FlownModel, number: int) -> tuple[tuple[float, float], tuple[f
     own = [c for c in model.flights.cuts if c.flight == number and c.start < separation]
     if not own:
         return None
-    slack = [(c.start, c.end) for c in own if not c.told]
+    slack = [(c.start, c.end) for c in own if not c.retained]
     end = min([separation - LEAD + HEAD, *[first for first, last in slack if last > separation - LEAD]])
     last = max([separation - BEFORE, own[0].start, *[last for _, last in slack]])
     head = max(end - HEAD, own[0].start), end
@@ -129,11 +129,11 @@ def _fly(model: FlownModel, theta: Mapping[str, float], spans: Mapping[int, tupl
     cuts = [c for n, (begin, end) in spans.items() for c in _approach(model, n, begin, end)]
     setting, states = model.beside(cuts).begun(theta)
     release, x = setting.plant.release, model.setting.sensing
-    told = [w for w, c in enumerate(cuts) if c.told]
-    flown = [replace(cuts[w], end=ends[cuts[w].flight]) for w in told]
+    retained = [w for w, c in enumerate(cuts) if c.retained]
+    flown = [replace(cuts[w], end=ends[cuts[w].flight]) for w in retained]
     looked = [_with_path(f, ends.get(n)) for n, f in enumerate(model.flights.flights)]
     onward = Flights(looked, flown, (x.vehicle_delay, x.payload_delay, x.gyro_delay))
-    lanes = [Lane(i, 0, w) for i, w in enumerate(told)]
+    lanes = [Lane(i, 0, w) for i, w in enumerate(retained)]
     replay = Replay([setting.plant], [setting.sensing], model.device, download=downloaded)
     seen = onward.fly(replay, [setting], states, lanes, model.substep).seen
     out = np.full((len(flown), 3), np.nan)
@@ -147,7 +147,7 @@ def _fly(model: FlownModel, theta: Mapping[str, float], spans: Mapping[int, tupl
 def _approach(model: FlownModel, number: int, begin: float, end: float) -> list[Cut]:
     """A flight's windows before ``begin``, only flown through, and the one that its state is fitted over."""
     before = [c for c in model.flights.cuts if c.flight == number and c.start < begin - 1e-3]
-    through = [replace(c, end=min(c.end, begin), told=False) for c in before]
+    through = [replace(c, end=min(c.end, begin), retained=False) for c in before]
     return [*through, Cut(number, "throw", begin, end, ATTACHED)]
 
 

@@ -52,8 +52,8 @@ def still(window: Window, blocks: Sequence[str], wind_w: Sequence[float]) -> Win
     calm = {"vel_w": np.zeros_like(knots["vel_w"])}
     if "payload_vel_w" in knots and np.sqrt(np.mean(np.sum(knots["payload_vel_w"] ** 2, axis=1))) < STILL:
         calm["payload_vel_w"] = np.zeros_like(knots["payload_vel_w"])
-    told = np.array([block != AERODYNAMIC for block in blocks])
-    return replace(window, effects=window.effects * told, knots={**knots, **calm})
+    unaffected = np.array([block != AERODYNAMIC for block in blocks])
+    return replace(window, effects=window.effects * unaffected, knots={**knots, **calm})
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ class Plan:
             c.flight, c.phase, f.time(w), channel, residual, f.sigma(w), effects, states,
             np.array([directions[d].spread(c) for d in self.nuisances]), latents,
             np.array([axis // 3 for axis, _ in self.latents]), np.array([axis % 3 for axis, _ in self.latents]),
-            np.array([c.start + KNOT_SPACING * knot for _, knot in self.latents]), at_knots(f, setting, w, own), c.shaken,
+            np.array([c.start + KNOT_SPACING * knot for _, knot in self.latents]), at_knots(f, setting, w, own), c.after_slack,
         )  # fmt: skip
 
 
@@ -126,17 +126,17 @@ def lanes_of(
         kept: first row of the knots; twice as many as the window's are taken.
     """
     c, count, knots = flights.cuts[w], len(flights.cuts), int(flights.knots[w])
-    whips = c.phase in FINENESS or c.shaken
+    whips = c.phase in FINENESS or c.after_slack
     nuisances = tuple(d for d, x in enumerate(directions) if concerns(x, c))
     latents = tuple((axis, knot) for axis in range(6 if c.payload == NO_PAYLOAD else 9) for knot in range(knots))
     fine = alike | needs | whips
     effects = np.argsort(2 * ~fine + ~alike, kind="stable")
-    told = [Lane(w, 1 + int(k), w, rough=not fine[k]) for k in effects]
+    derivatives = [Lane(w, 1 + int(k), w, rough=not fine[k]) for k in effects]
     moved = [Lane(w, 0, (1 + d) * count + w, rough=not whips) for d in nuisances]
-    lanes = [Lane(w, 0, w, keep=kept, shared=int(alike.sum())), *[x for x in (*told, *moved) if not x.rough]]
+    lanes = [Lane(w, 0, w, keep=kept, shared=int(alike.sum())), *[x for x in (*derivatives, *moved) if not x.rough]]
     split = len(lanes)
     lanes.append(Lane(w, 0, w, keep=kept + knots, rough=True))
-    lanes += [x for x in (*told, *moved) if x.rough]
+    lanes += [x for x in (*derivatives, *moved) if x.rough]
     begin, parent = kept + knots, first + split
     pushed = len(lanes)
     lanes += [
@@ -155,14 +155,14 @@ def at_knots(flights: Flights, setting: Setting, w: int, knots: Mapping[str, np.
     """Simulated quantities at the knots, those of the payload where there is one."""
     c = flights.cuts[w]
     time = c.start + KNOT_SPACING * np.arange(len(knots["thrust"]))
-    told = {"time": np.minimum(time, c.end)} | {name: value.copy() for name, value in knots.items()}
+    values = {"time": np.minimum(time, c.end)} | {name: value.copy() for name, value in knots.items()}
     if c.payload == NO_PAYLOAD:
-        return {name: value for name, value in told.items() if not name.startswith("payload") and name != "tension"}
+        return {name: value for name, value in values.items() if not name.startswith("payload") and name != "tension"}
     arm = np.array(setting.plant.rope.mount) - np.array(setting.plant.vehicle.body.com)
-    reach = told["payload_pos_w"] - told["pos_w"] - Rotation.from_quat(told["quat_wb"]).apply(arm)
-    told["cable_dir_w"] = reach / np.linalg.norm(reach, axis=1, keepdims=True)
-    told["mount_b"] = np.tile(arm, (len(time), 1))
+    reach = values["payload_pos_w"] - values["pos_w"] - Rotation.from_quat(values["quat_wb"]).apply(arm)
+    values["cable_dir_w"] = reach / np.linalg.norm(reach, axis=1, keepdims=True)
+    values["mount_b"] = np.tile(arm, (len(time), 1))
     f = flights.flights[c.flight]
     if f.latch != NEVER:
-        told["tension"][told["time"] > f.latch + setting.plant.release.lag] = 0.0
-    return told
+        values["tension"][values["time"] > f.latch + setting.plant.release.lag] = 0.0
+    return values

@@ -47,7 +47,7 @@ class Recorded:
     payload: Samples | None
     gyro: Samples | None
     voltage: float | None  # at the start [V]
-    hung: bool | None = None  # whether the log says that a payload hung below at its start; None where it does not
+    hanging: bool | None = None  # whether the log says that a payload hung below at its start; None where it does not
     landing_point: np.ndarray | None = None  # where the log says that the payload came down [m], shape (3,)
 
     @property
@@ -107,7 +107,7 @@ def record_of(log: FlightLog, number: int = 0) -> Recorded:
     return Recorded(
         command.time[command.valid], np.asarray(command.values, dtype=float)[command.valid], _latch(log), _landing(log),
         pos, quat, _payload(log), _samples(log, "rate_b"),
-        _voltage(log), _hung(log), _landing_point(log),
+        _voltage(log), _hanging(log), _landing_point(log),
     )  # fmt: skip
 
 
@@ -137,10 +137,10 @@ def carriers(flights: Sequence[Recorded]) -> list[bool]:
     measured_somewhere = any(f.payload is not None for f in flights)
     released_somewhere = any(f.latch != NEVER for f in flights)
     seen = [f.payload is not None or f.latch != NEVER if measured_somewhere else released_somewhere for f in flights]
-    return [own if f.hung is None else f.hung for f, own in zip(flights, seen)]
+    return [own if f.hanging is None else f.hanging for f, own in zip(flights, seen)]
 
 
-def _hung(log: FlightLog) -> bool | None:
+def _hanging(log: FlightLog) -> bool | None:
     if "attached" not in log or not np.any(log["attached"].valid):
         return None
     return bool(log["attached"].values[log["attached"].valid][0])

@@ -124,13 +124,13 @@ class Flights:
 
     def time(self, w: int) -> np.ndarray:
         """Stamps of a window's samples [s], shape (N,)."""
-        return self._told("time", w)
+        return self._of_samples("time", w)
 
     def sigma(self, w: int) -> np.ndarray:
         """Noise of a window's samples, shape (N,)."""
-        return self._told("sigma", w)
+        return self._of_samples("sigma", w)
 
-    def _told(self, what: str, w: int) -> np.ndarray:
+    def _of_samples(self, what: str, w: int) -> np.ndarray:
         if (what, w) not in self._known:
             names = ("vehicle", "vehicle" if what == "time" else "attitude", "payload", "gyro")
             groups = [getattr(self.samples[name][w], what) for name in names]

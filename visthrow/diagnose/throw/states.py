@@ -51,9 +51,9 @@ class Direction:
 
     def spread(self, c: Cut) -> float:
         """The prior's deviation in a window."""
-        if self.calm is None or c.shaken:
+        if self.calm is None or c.after_slack:
             return self.sd
-        return HUNG * self.calm if c.hung else self.calm
+        return HUNG * self.calm if c.at_rest else self.calm
 
 
 def directions(plant: PlantParams) -> tuple[Direction, ...]:
@@ -80,7 +80,7 @@ def directions(plant: PlantParams) -> tuple[Direction, ...]:
 def concerns(direction: Direction, c: Cut) -> bool:
     """Whether the state at the start of a window has the direction: higher bends only a rope that has just come taut."""
     if direction.field.startswith("cable"):
-        return c.payload == ATTACHED and (c.shaken or direction.part in ("all", "last", 1))
+        return c.payload == ATTACHED and (c.after_slack or direction.part in ("all", "last", 1))
     return c.payload == LOOSE if direction.field.startswith("payload") else True
 
 

@@ -108,7 +108,7 @@ class ThrowModel:
         if (without_slack := self._without_slack(ends)) != cuts:
             self.flights = self._cut(flights, without_slack, stride)
             states, _ = self._through(self.setting)
-        self._told = np.array([w for w, c in enumerate(self.flights.cuts) if c.told])
+        self._retained = np.array([w for w, c in enumerate(self.flights.cuts) if c.retained])
         self._fits: dict[tuple[Cut, ...], tuple[States, dict[int, np.ndarray]]] = {}
         self._latest: dict[frozenset[str], States] = {frozenset(): self._fitted(states)[0]}
         self._settled_at: dict[frozenset[tuple[str, float]], States] = {}
@@ -160,7 +160,7 @@ class ThrowModel:
         steps = np.array([0.0 if e.switch else self._step(e, theta.get(e.name, 0.0)) for e in entries])
         settings = [setting, *[setting if e.switch else e.apply(setting, step) for e, step in zip(entries, steps)]]
         return [
-            with_direct(w, number, self._direct, self.channels, settings, steps) for number, w in zip(self._told, whole)
+            with_direct(w, number, self._direct, self.channels, settings, steps) for number, w in zip(self._retained, whole)
         ]
 
     def _secant(self, e: SettingEffect, theta: Mapping[str, float], windows: list[Window]) -> list[np.ndarray]:
@@ -171,24 +171,24 @@ class ThrowModel:
         on = theta.get(e.name, 0.0) > 0.5
         elsewhere = {**theta, e.name: 0.0 if on else 1.0}
         other = apply(self.entries, self.setting, elsewhere)
-        lanes = [Lane(w, 0, w) for w in self._told]
+        lanes = [Lane(w, 0, w) for w in self._retained]
         start = self._latest[self._switches(elsewhere)] = self._settled(other)
         seen = self.flights.fly(self._replay([other]), [other], start, lanes, self.substep).seen
         sign = -1.0 if on else 1.0
-        return [sign * (x.residual - self.flights.residual(seen, w, lane)) for lane, (w, x) in enumerate(zip(self._told, windows))]
+        return [sign * (x.residual - self.flights.residual(seen, w, lane)) for lane, (w, x) in enumerate(zip(self._retained, windows))]
 
     def residuals(self, theta: Mapping[str, float], about: Linearised | None = None) -> list[np.ndarray]:
         """See :class:`visthrow.diagnose.models.interface.Model`; by default from the states settled last with the same kinds of blocks."""
         setting = apply(self.entries, self.setting, theta)
-        lanes = [Lane(w, 0, w) for w in self._told]
+        lanes = [Lane(w, 0, w) for w in self._retained]
         states, moves = self._latest.get(self._switches(theta), self._fitted()[0]), {}
         if about is not None:
             states, moves = self._following(setting, theta, about)
         states = resampled(states, setting.plant.rope.segments)
         seen = self.flights.fly(self._replay([setting]), [setting], states, lanes, self.substep).seen
-        flown = [self.flights.residual(seen, w, lane) for lane, w in enumerate(self._told)]
-        told = [np.concatenate((r, *self._sighting_residuals(w, setting))) for r, w in zip(flown, self._told)]
-        return [r + about.windows[i].nuisance @ moves[i] if i in moves else r for i, r in enumerate(told)]
+        flown = [self.flights.residual(seen, w, lane) for lane, w in enumerate(self._retained)]
+        full = [np.concatenate((r, *self._direct_residuals(w, setting))) for r, w in zip(flown, self._retained)]
+        return [r + about.windows[i].nuisance @ moves[i] if i in moves else r for i, r in enumerate(full)]
 
     def _following(
         self, setting: Setting, theta: Mapping[str, float], about: Linearised
@@ -203,27 +203,27 @@ class ThrowModel:
             _, owns, by_effect = self._follows
         sizes = by_effect @ change
         states = moved_along(self._settled_at[_key(about.theta)], found, sizes)
-        return states, {i: sizes[self._told[i], own] for i, own in owns.items()}
+        return states, {i: sizes[self._retained[i], own] for i, own in owns.items()}
 
     def _ways(self, found: Sequence[Direction], about: Linearised, effects: int) -> tuple[dict[int, list[int]], np.ndarray]:
         """Which directions each window's state has, and how it follows the effects in them, shape (W, directions, K)."""
         cuts = self.flights.cuts
-        owns = {i: [d for d, x in enumerate(found) if concerns(x, cuts[self._told[i]])] for i in about.windows}
+        owns = {i: [d for d, x in enumerate(found) if concerns(x, cuts[self._retained[i]])] for i in about.windows}
 
         def way(i: int) -> np.ndarray:
             free = np.array([found[d].follows for d in owns[i]], dtype=bool)
-            return following(self.flights, self._told[i], about.windows[i], free, self.setting.plant.release.lag)
+            return following(self.flights, self._retained[i], about.windows[i], free, self.setting.plant.release.lag)
 
         by_effect = np.zeros((len(cuts), len(found), effects))
         for i, moves in zip(owns, each(way, owns)):
-            by_effect[self._told[i], owns[i]] = moves
+            by_effect[self._retained[i], owns[i]] = moves
         return owns, by_effect
 
     def _switches(self, theta: Mapping[str, float]) -> frozenset[str]:
         """Which other kinds of blocks are on."""
         return frozenset(e.name for e in self._switched if theta.get(e.name, 0.0) > 0.5)
 
-    def _sighting_residuals(self, w: int, setting: Setting) -> list[np.ndarray]:
+    def _direct_residuals(self, w: int, setting: Setting) -> list[np.ndarray]:
         held = [(kind, kind.samples(w)[1]) for kind in self._direct]
         return [values - kind.predicted(w, setting) for kind, values in held if len(values)]
 
@@ -231,11 +231,11 @@ class ThrowModel:
         """Largest change of any sample of each channel when the step is so many times finer, in its noise."""
         fine = dataclasses.replace(self.setting, step_square=1.0 / finer**2)
         settings = [self.setting, fine]
-        count, f = len(self._told), self.flights
-        lanes = [Lane(w, s, w) for s in range(2) for w in self._told]
+        count, f = len(self._retained), self.flights
+        lanes = [Lane(w, s, w) for s in range(2) for w in self._retained]
         seen = f.fly(self._replay(settings), settings, self._fitted()[0], lanes, self.substep).seen
         worst = dict.fromkeys(self.channels, 0.0)
-        for lane, w in enumerate(self._told):
+        for lane, w in enumerate(self._retained):
             off = np.abs(f.residual(seen, w, lane) - f.residual(seen, w, count + lane)) / f.sigma(w)
             for i, name in enumerate(self.channels):
                 here = off[self._channel(w) == i]
@@ -255,7 +255,7 @@ class ThrowModel:
         other = copy.copy(self)
         other._settled_at, other._follows = {}, None  # states of other windows
         other.flights = self._cut(self.flights.flights, cuts, self.flights.stride)
-        other._told = np.array([w for w, c in enumerate(cuts) if c.told])
+        other._retained = np.array([w for w, c in enumerate(cuts) if c.retained])
         return other
 
     def begun(self, theta: Mapping[str, float]) -> tuple[Setting, States]:
@@ -285,7 +285,7 @@ class ThrowModel:
     def _initial_fit(self, setting: Setting) -> InitialFit:
         """What fits initial states in a setting."""
         return InitialFit(
-            self.flights, self._told, directions(setting.plant), setting, lag=self.setting.plant.release.lag, substep=self.substep,
+            self.flights, self._retained, directions(setting.plant), setting, lag=self.setting.plant.release.lag, substep=self.substep,
             device=self.device,
         )  # fmt: skip
 
@@ -328,7 +328,7 @@ class ThrowModel:
     def _batches(self) -> list[list[int]]:
         """Windows in groups whose lanes fit a run."""
         batches, room = [], 0
-        for w in self._told:
+        for w in self._retained:
             lanes = 2 + len(self._graded) + len(self._directions) + 9 * int(self.flights.knots[w])
             if not batches or room < lanes:
                 batches.append([])
@@ -373,14 +373,14 @@ class ThrowModel:
         return self.flights.spread(w, 0, 1, at.get("payload_pos_w", -1), at.get("rate_b", -1)).astype(int)
 
     def _without_slack(self, ends: States) -> list[Cut]:
-        """The windows, with the time in which the rope was slack until their ends cut out; those soon after it are shaken."""
+        """The windows, with the time in which the rope was slack until their ends cut out; those soon after it are marked so."""
         cuts: list[Cut] = []
         rings: dict[int, float] = {}  # flight -> until when
         for w, c in enumerate(self.flights.cuts):
             first, last = float(ends["slack_first"][w]), float(ends["slack_last"][w])
             separation = self.flights.flights[c.flight].latch + self.setting.plant.release.lag
             if c.payload == ATTACHED and c.start < rings.get(c.flight, -np.inf):
-                c = dataclasses.replace(c, shaken=True)
+                c = dataclasses.replace(c, after_slack=True)
             if last >= c.start:
                 rings[c.flight] = last + RINGING
             cuts += [c] if last < c.start else around_slack(c, first, last + AFTER_SLACK, separation)
