@@ -92,7 +92,7 @@ class MavlinkAutopilot:
         """
         self.params, self._link, self._write, self._tell = params, link, write, tell
         self._heartbeat: Any = None
-        self._heard = self._told = self._asked_at = self._streamed = -1e9
+        self._heard = self._beat_at = self._asked_at = self._streamed = -1e9
         self._wanted: str | None = None
         self._may: set[str | None] = set()  # the last role that was ours, and those asked for since
         self._reached = False
@@ -270,8 +270,8 @@ class MavlinkAutopilot:
 
     def service(self, now: float) -> None:
         """See `Backend`."""
-        if now - self._told >= 1.0:
-            self._told = now
+        if now - self._beat_at >= 1.0:
+            self._beat_at = now
             self._link.send(mav.MAVLink_heartbeat_message(mav.MAV_TYPE_ONBOARD_CONTROLLER, 8, 0, 0, 4, 3))
         if self._heartbeat is not None:
             self.audit.service(now)

@@ -20,7 +20,7 @@ class Latch:
     """Whether the payload hangs, by what was asked for and by its own poses.
 
     Attributes:
-        at: of the release [s]; None until there is one in this throw. told: when the mechanism is told of it [s].
+        at: of the release [s]; None until there is one in this throw. commanded: when the mechanism is told of it [s].
         lag: trained, from latch to separation [s]. count: releases so far. stuck: payloads that stayed on.
         landings: of the throws so far.
     """
@@ -49,7 +49,7 @@ class Latch:
         self.lag, self._wait = lag, max(0.0, lag + later - mechanism_lag)
         self._hang, self._tolerance, self._height = hang, tolerance, height
         self.at: float | None = None
-        self.told = -math.inf
+        self.commanded = -math.inf
         self.count = self.stuck = 0
         self.landings: list[Landing] = []
         self._begun = 0.0
@@ -65,9 +65,9 @@ class Latch:
 
     def trip(self, now: float, goal_w: Vector) -> float:
         """Latch at a time [s]; returns when the mechanism is to be told, so that it separates after the trained lag [s]."""
-        self.at, self.told, self.count = now, now + self._wait, self.count + 1
+        self.at, self.commanded, self.count = now, now + self._wait, self.count + 1
         self._flight = Flight(goal_w, self._begun, now, self._height, self.lag)
-        return self.told
+        return self.commanded
 
     def separated(self, now: float) -> bool:
         """Whether the payload is off by now [s], as far as latch and lag tell."""

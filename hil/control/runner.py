@@ -426,7 +426,7 @@ class Runner:
         """What a change of state brings with it."""
         if before is State.THROW:
             # A fast mechanism may have to be told only after the policy's own time of separation, where commands act late.
-            self._stop_at = self.latch.told if state is State.RECOVER and self.latch.at is not None else now
+            self._stop_at = self.latch.commanded if state is State.RECOVER and self.latch.at is not None else now
         if state is State.ARMED:
             self.latch.rearm()
             self.backend.rearm()

@@ -88,7 +88,7 @@ class FakeArduPilot(FakeMavlink):
             return self.descend()
         if self.mode not in (GUIDED, GUIDED_NOGPS) or self._target is None:
             return self.hold(self._place)
-        if self.plant.time - self._told > self.parameters["GUID_TIMEOUT"]:
+        if self.plant.time - self._last_command > self.parameters["GUID_TIMEOUT"]:
             self.happened("levelled: no set-points")
             return np.array([self.weight(), 0.0, 0.0, 0.0])
         return self._meant(self._target)

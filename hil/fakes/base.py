@@ -163,7 +163,7 @@ class Fake:
         self.armed = self.options.armed
         self._place = np.array(plant.home_w, dtype=float)
         self._target: np.ndarray | None = None  # of the set-points that act in this period
-        self._told = float("-inf")  # when the last set-point was followed [s]
+        self._last_command = float("-inf")  # when the last set-point was followed [s]
         self._trip: float | None = None  # when the latch of the plant trips [s]
         self.followed = self.ignored = 0
         self.release_time: float | None = None
@@ -203,7 +203,7 @@ class Fake:
     def steer(self, command: tuple[float, ...]) -> None:
         """Follow a set-point that was just heard, thrust [N] and body rates [rad/s]; a number that is none is 0, and it falls."""
         self.followed += 1
-        self._told = self.plant.time
+        self._last_command = self.plant.time
         delay = self.options.command_delay
         delay = self.usual_delay if delay is None else delay
         self._set_points.add(self.heard + delay, np.nan_to_num(np.array(command)))
@@ -326,7 +326,7 @@ class Fake:
         return {
             **self.plant.landing, "followed": self.followed, "ignored": self.ignored, "releases": w.releases,
             "release_time": self.release_time, "armed": self.armed, "commands": w.commands, "worst": w.worst,
-            "breaches": w.breaches, "events": self.events, "last_command": self._told,
+            "breaches": w.breaches, "events": self.events, "last_command": self._last_command,
             "end_w": self.plant.state["pos_w"].tolist(), "time": self.plant.time,
         }  # fmt: skip
 

@@ -72,11 +72,11 @@ class Show:
                 if sample.body in self._trails:
                     self._trails[sample.body].append(sample.pose.pos)
         log = self._samples.flush()
-        told = events(ticks)
-        if told and self._said is not None and told[0][1:] == self._said[1:]:
-            told = told[1:]
-        self._said = told[-1] if told else self._said
-        log.meta["events"] = told
+        shown = events(ticks)
+        if shown and self._said is not None and shown[0][1:] == self._said[1:]:
+            shown = shown[1:]
+        self._said = shown[-1] if shown else self._said
+        log.meta["events"] = shown
         self._view.send(self._stream, log)
         now = ticks[-1].line["time"] - self._meta["times"]["policy_start"]
         for body, points in self._trails.items():

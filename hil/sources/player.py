@@ -220,33 +220,33 @@ def _of_messages(log: Messages, body: LogBody, known: dict[str, PoseMessage]) ->
     data = log.fields.get((body.message, body.instance))
     if data is None:
         return []
-    told = known[body.message]
+    kind = known[body.message]
     if body.message == "POS":
         data = data | _from_globe(data, log.first("ORGN"))
     try:
-        pos, quat, vel, rate = (_told(data, told, name) for name in ("pos", "quat", "vel", "rate"))
+        pos, quat, vel, rate = (_columns_of(data, kind, name) for name in ("pos", "quat", "vel", "rate"))
         count, arrivals, stamps = len(pos), data["arrival"], data["time"]
-        if told.attitude:
-            beside = log.first(told.attitude)
-            if beside is None:
-                raise LogError(f"{log.path}: {body.message} gives no attitude, and the log holds no {told.attitude}")
-            quat = _paired(beside, _BESIDE[told.attitude], "quat", stamps)
-        if told.rates and (beside := log.first(told.rates)) is not None:
-            rate = _paired(beside, _BESIDE[told.rates], "rate", stamps)
+        if kind.attitude:
+            other = log.first(kind.attitude)
+            if other is None:
+                raise LogError(f"{log.path}: {body.message} gives no attitude, and the log holds no {kind.attitude}")
+            quat = _paired(other, _BESIDE[kind.attitude], "quat", stamps)
+        if kind.rates and (other := log.first(kind.rates)) is not None:
+            rate = _paired(other, _BESIDE[kind.rates], "rate", stamps)
     except KeyError as error:
         listed = ", ".join(sorted(data.keys() - {"time", "arrival"}))
         raise LogError(f"{log.path}: no field {error}; {body.message} has {listed}") from error
     vel = _in_world(vel, quat, data.get("velocity_frame"))
-    counters = [data[name].astype(int) for name in told.resets if name in data]
+    counters = [data[name].astype(int) for name in kind.resets if name in data]
     resets = sum(counters) if counters else np.zeros(count, int)
     return [
         Pose(float(stamps[i]), float(arrivals[i]), body.body, tuple(pos[i].tolist()), _known(quat, i), _known(vel, i),
              _known(rate, i), int(resets[i]))
-        for i in range(count) if not told.attitude or _known(quat, i) is not None
+        for i in range(count) if not kind.attitude or _known(quat, i) is not None
     ]  # fmt: skip
 
 
-def _told(data: Fields, message: PoseMessage, what: str) -> np.ndarray | None:
+def _columns_of(data: Fields, message: PoseMessage, what: str) -> np.ndarray | None:
     """Columns of what a message tells, shape (T, 3 or 4); None where it tells nothing of it."""
     if what == "quat" and message.angles:
         from scipy.spatial.transform import Rotation
@@ -262,10 +262,10 @@ def _columns(data: Fields, choices: tuple[tuple[str, ...], ...]) -> np.ndarray:
     return np.column_stack([data[name] for name in names]).astype(float)
 
 
-def _paired(beside: Fields, message: PoseMessage, what: str, stamps: np.ndarray) -> np.ndarray:
+def _paired(other: Fields, message: PoseMessage, what: str, stamps: np.ndarray) -> np.ndarray:
     """Another message's last value at or before each stamp, NaN where there is none or an old one."""
-    index = _before(beside["time"], stamps)
-    values = _told(beside, message, what)[np.maximum(index, 0)]
+    index = _before(other["time"], stamps)
+    values = _columns_of(other, message, what)[np.maximum(index, 0)]
     values[index < 0] = np.nan
     return values
 

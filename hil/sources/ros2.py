@@ -137,8 +137,8 @@ class Ros2Source(MocapSource):
         quality = core.Qos(core.Policy.Reliability.BestEffort, core.Policy.History.KeepLast(10))
         self._readers = []
         for kind, place, frames, body in wanted:
-            told = topic.Topic(self._domain[1], f"rt{place}", types[kind])
-            self._readers.append(sub.DataReader(self._domain[1], told, qos=quality, listener=self._listener(core, kind, body, frames)))
+            described = topic.Topic(self._domain[1], f"rt{place}", types[kind])
+            self._readers.append(sub.DataReader(self._domain[1], described, qos=quality, listener=self._listener(core, kind, body, frames)))
 
     def _listener(self, core: Any, kind: str, body: str, frames: str) -> Any:
         source = self

@@ -262,7 +262,7 @@ def test_the_runner_is_killed_in_mid_throw(way):
     fake, _, told = run(kind, START + 0.6 * all_channels, **more)
     assert told[-1][0] == "throw"
     fake.step()  # hears the last one
-    last, before = fake._told, len(fake.events)
+    last, before = fake._last_command, len(fake.events)
     for _ in range(round(2.5 / fake.plant.period)):
         fake.step()
     after = [(time - last, text) for time, text in fake.events[before:]]

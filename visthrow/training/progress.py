@@ -85,7 +85,7 @@ class TrainLog:
         if self._picture is not None:
             self._picture.draw(text, figures, throws)
         elif throws is not None:
-            print(f"{text}  at 2.0 m: {told(figures)}", flush=True)
+            print(f"{text}  at 2.0 m: {figures_text(figures)}", flush=True)
         elif figures["iteration"] % 25 == 0:
             print(text, flush=True)
 
@@ -110,7 +110,7 @@ class Picture:
         self._training.append((figures["wall_s"], figures["landing_error"]))
         if throws is not None:
             self._thrown.append((figures["wall_s"], figures["error_2m"]))
-            self._last, self._said = throws, told(figures)
+            self._last, self._said = throws, figures_text(figures)
         now = time.perf_counter()
         if throws is None and now - self._drawn < REDRAWN:
             return
@@ -139,7 +139,7 @@ def evaluated(throws: Throws) -> dict[str, float]:
     return {"error_2m": row.get("error_mean", nan), "duration_2m": row.get("duration_mean", nan), "landed_2m": row["success"]}
 
 
-def told(figures: dict) -> str:
+def figures_text(figures: dict) -> str:
     """An evaluation in words."""
     return f"{figures['error_2m']:.4f} m, {figures['duration_2m']:.3f} s, landed {100 * figures['landed_2m']:.1f} %"
 

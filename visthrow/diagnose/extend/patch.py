@@ -122,10 +122,10 @@ def laws_of(report: Mapping[str, Any], path: str, rank: int) -> list[LawParams]:
     Raises:
         DiagnoseError: It holds fewer.
     """
-    told = report.get("explanations") or [[law] for law in report.get("laws") or []]
-    if rank > len(told):
-        raise DiagnoseError(f"{path}: {len(told)} explanations by laws outside the catalogue; --laws asks for number {rank}")
-    laws = told[rank - 1] if rank else []
+    explanations = report.get("explanations") or [[law] for law in report.get("laws") or []]
+    if rank > len(explanations):
+        raise DiagnoseError(f"{path}: {len(explanations)} explanations by laws outside the catalogue; --laws asks for number {rank}")
+    laws = explanations[rank - 1] if rank else []
     return [LawParams(x["block"], tuple(x["factors"]), x["vector"], float(x["coefficient"])) for x in laws]
 
 

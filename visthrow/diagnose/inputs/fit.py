@@ -39,7 +39,7 @@ class Fitted:
     units: tuple[str, ...]
     theta: np.ndarray  # in the effects' units, shape (K,)
     covariance: np.ndarray  # shape (K, K)
-    told: tuple[bool, ...]  # by the logs, not the prior
+    identified: tuple[bool, ...]  # by the logs, not the prior
     rms_before: Mapping[str, float]  # residual by channel, in its unit
     rms_after: Mapping[str, float]
     middle_speed: float = 0.0  # of a stand's steps, to which its linear part refers [rad/s]
@@ -83,12 +83,12 @@ def fit(model: Model, free: Sequence[str]) -> Fitted:
     posterior = np.linalg.inv(point.information[np.ix_(at, at)] + np.diag(slab**-2.0))
     floors = problem.priors.floor[at]
     sizes = point.theta[at] * floors
-    told = tuple(bool(s < UNKNOWN_SHARE * prior) for s, prior in zip(np.sqrt(np.diag(posterior)), slab))
+    identified = tuple(bool(s < UNKNOWN_SHARE * prior) for s, prior in zip(np.sqrt(np.diag(posterior)), slab))
     after = model.residuals(problem.sizes(point.theta))
     units = tuple(model.effects[i].unit for i in at)
     covariance = posterior * np.outer(floors, floors) + np.diag(floors**2)
     rms = [_rms(model, before, residuals) for residuals in ([w.residual for w in before], after)]
-    return Fitted(tuple(free), units, sizes, covariance, told, *rms, middle_speed=getattr(model, "middle", 0.0))
+    return Fitted(tuple(free), units, sizes, covariance, identified, *rms, middle_speed=getattr(model, "middle", 0.0))
 
 
 def _rms(model: Model, windows: Sequence[Any], residuals: Sequence[np.ndarray]) -> dict[str, float]:
@@ -172,7 +172,7 @@ def write(folder: str | Path, name: str, setup: Setup, found: Fitted, logs: Sequ
     sources = {str(log.meta.get("source", "")): _digest(log) for log in logs}
     record = {
         "setup": name, "effects": list(found.names), "units": list(found.units), "theta": found.theta.tolist(),
-        "covariance": found.covariance.tolist(), "told_by_logs": list(found.told), "rms_before": dict(found.rms_before),
+        "covariance": found.covariance.tolist(), "told_by_logs": list(found.identified), "rms_before": dict(found.rms_before),
         "rms_after": dict(found.rms_after), "logs": sources,
     }  # fmt: skip
     write_json(folder / "fit.json", record)
@@ -187,7 +187,7 @@ def _head(name: str, found: Fitted, sources: Mapping[str, str]) -> str:
     lines = [f"# Fitted by `visthrow diagnose fit` with the setup '{name}'; covariance and provenance also in fit.json."]
     for i, (effect, unit) in enumerate(zip(found.names, found.units)):
         low, high = found.interval(i)
-        note = "" if found.told[i] else " (the prior: these logs do not tell)"
+        note = "" if found.identified[i] else " (the prior: these logs do not tell)"
         lines.append(f"# {effect} = {found.theta[i]:.6g} {unit}, 95 % [{low:.6g}, {high:.6g}]{note}")
     lines.append(f"# covariance, row by row: {json.dumps([[float(f'{x:.4g}') for x in row] for row in found.covariance])}")
     lines += [f"# log {Path(source).name}: {digest}" for source, digest in sources.items()]

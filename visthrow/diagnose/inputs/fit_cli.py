@@ -39,7 +39,7 @@ def run(args: argparse.Namespace) -> int:
     found = fitting.fit(model, free)
     for i, name in enumerate(found.names):
         low, high = found.interval(i)
-        note = "" if found.told[i] else "   not told by these logs"
+        note = "" if found.identified[i] else "   not told by these logs"
         print(f"{name:<20} {found.theta[i]:+.5g}  [{low:+.5g}, {high:+.5g}] {found.units[i]}{note}")
     for channel, before in found.rms_before.items():
         print(f"residual of {channel}: {before:.4g} before, {found.rms_after[channel]:.4g} after")

@@ -114,13 +114,13 @@ def _clock(numbers: Table, found: Proposal) -> tuple[TimeColumn, np.ndarray]:
         found.questions.append("no column rises as a clock does: how far are the rows apart? row_period = 0.01 [s] is a guess")
         return TimeColumn(row_period=0.01), 0.01 * np.arange(count)
     step = float(np.nanmedian(np.diff(numbers[name])))
-    told = _SUFFIX.get(_words(name)[-1], "")
+    suffix = _SUFFIX.get(_words(name)[-1], "")
     rate = re.search(r"(\d+) ?hz", name, re.IGNORECASE)
     if rate and f"1/{rate[1]} s" in UNITS:
-        told = f"1/{rate[1]} s"
+        suffix = f"1/{rate[1]} s"
     fitting = [unit for unit in ("s", "ms", "us", "ns") if 2e-4 <= step * UNITS[unit][1] <= 0.25]
-    unit = told if told in UNITS and UNITS[told][0] == "s" else fitting[0] if fitting else "s"
-    if not told and len(fitting) != 1:
+    unit = suffix if suffix in UNITS and UNITS[suffix][0] == "s" else fitting[0] if fitting else "s"
+    if not suffix and len(fitting) != 1:
         found.questions.append(f"time '{name}': a step of {step:g} fits the units {', '.join(fitting) or 'of none'}; '{unit}' is a guess")
     if not named:
         found.questions.append(f"is '{name}', the first column that rises, the time?")
@@ -253,8 +253,8 @@ class _Chooser:
         pay = self._payload(paths)
         vehicles = [(g, u) for g, u in paths if pay is None or g is not pay[0]]
         for group, unit in vehicles:
-            told = "est_pos_w" if _ESTIMATE.search(group.stem) else "mocap_pos_w" if _CAPTURE.search(group.stem) else "pos_w"
-            name = next((n for n in (["pos_w", told] if len(vehicles) == 1 or told == "pos_w" or group is vehicles[0][0] else [told])
+            usual = "est_pos_w" if _ESTIMATE.search(group.stem) else "mocap_pos_w" if _CAPTURE.search(group.stem) else "pos_w"
+            name = next((n for n in (["pos_w", usual] if len(vehicles) == 1 or usual == "pos_w" or group is vehicles[0][0] else [usual])
                          if n not in self.made), "")  # fmt: skip
             if name:
                 wide = float(np.nanmax(np.nanstd(group.values, axis=0)))
@@ -430,14 +430,14 @@ def _corrected(table: Table, source: str, found: Proposal, weighed: float | None
 
 def _flyer(log: FlightLog, found: Proposal, weighed: float | None) -> dict | None:
     """A flying model to begin with: thrust scaled so that it carries the vehicle, the rest as of a small quadrotor at rest air."""
-    told = thrust.thrust_of(log)
-    if told is None or "quat_wb" not in log or "pos_w" not in log or np.median(told[2]) <= 0.0:
+    applied = thrust.thrust_of(log)
+    if applied is None or "quat_wb" not in log or "pos_w" not in log or np.median(applied[2]) <= 0.0:
         return None
     mass, gap = thrust.mass_of(log), None
     if "payload_pos_w" in log:
         (time, pos), (time_p, pos_p) = physics.valid(log["pos_w"]), physics.valid(log["payload_pos_w"])
         gap = float(np.median(np.linalg.norm(pos_p - relations.on_grid(time, pos, time_p), axis=1)))
-    name, _, total = told
+    name, _, total = applied
     motors = 1 if name in ("thrust_command", "throttle") else 4
     hover = float(np.median(total[total > 0.5 * np.percentile(total, 90)])) / motors
     share = 0.85 if gap else 1.0  # of the vehicle in what flies, until both are weighed

@@ -99,9 +99,9 @@ def known(name: str | Path | None, plant: str | None = None) -> Known:
     from visthrow import config
     from visthrow.task import Experiment, plant_of
 
-    told = plant_of(config.load(Experiment, config.find("train", plant)))
-    rope = told.rope
-    return Known(rope.length + rope.payload_offset, told.vehicle.body.mass + rope.rope_mass + rope.payload_mass)
+    trained = plant_of(config.load(Experiment, config.find("train", plant)))
+    rope = trained.rope
+    return Known(rope.length + rope.payload_offset, trained.vehicle.body.mass + rope.rope_mass + rope.payload_mass)
 
 
 def read_logs(paths: Sequence[str | Path], name: str | Path | None = None) -> list[FlightLog]:

@@ -91,8 +91,8 @@ def propose(
             nats, separated, repeats = _classes(diagnosis, new, pairs)
         else:
             nats, separated, repeats = _shrinking(base.information, new, priors, vague, work.active)
-        told = tuple(tuple(names[j] for j in group) for group in separated)
-        proposals.append(Proposal(manoeuvre.name, manoeuvre.purpose, manoeuvre.seconds, nats, told, repeats,
+        separates = tuple(tuple(names[j] for j in group) for group in separated)
+        proposals.append(Proposal(manoeuvre.name, manoeuvre.purpose, manoeuvre.seconds, nats, separates, repeats,
                                   manoeuvre.reference().limits()))  # fmt: skip
     return sorted([*proposals, *_measured(diagnosis, names, pairs)], key=_worth, reverse=True)
 
@@ -236,15 +236,15 @@ def write_references(folder: str | Path, manoeuvres: Sequence[Manoeuvre], propos
     """Write each proposal's reference as CSV; returns the proposals with their files' names."""
     from visthrow.common.storage import atomic_write
 
-    by_name, told = {m.name: m for m in manoeuvres}, []
+    by_name, written = {m.name: m for m in manoeuvres}, []
     for p in proposals:
         if p.name not in by_name:  # measured on the ground
-            told.append(p)
+            written.append(p)
             continue
         name = "".join(c if c.isalnum() else "_" for c in p.name) + ".csv"
         atomic_write(Path(folder) / name, by_name[p.name].reference().csv())
-        told.append(replace(p, reference=name))
-    return told
+        written.append(replace(p, reference=name))
+    return written
 
 
 def log_of(reference: Reference, sampled: Mapping[str, np.ndarray], commands: np.ndarray, *, payload: bool) -> FlightLog:

@@ -53,8 +53,8 @@ def run(args: argparse.Namespace) -> int:
     ranked = plan.write_references(args.out, flights, ranked)
     print(f"{'manoeuvre or measurement':28} {'seconds':>7} {'nats':>8} {'times':>7}  separates")
     for p in ranked:
-        told = "; ".join(" from ".join(group) for group in p.separates) or "-"
-        print(f"{p.name:28} {p.seconds:7.1f} {p.nats:8.1f} {p.repeats or '-':>7}  {told}")
+        separates = "; ".join(" from ".join(group) for group in p.separates) or "-"
+        print(f"{p.name:28} {p.seconds:7.1f} {p.nats:8.1f} {p.repeats or '-':>7}  {separates}")
     session = plan.session(ranked)
     if session:
         print(f"together they settle the most: {', '.join(p.name + f' x{p.repeats}' * (p.repeats > 1) for p in session)}")

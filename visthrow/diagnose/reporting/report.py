@@ -29,9 +29,9 @@ def summary(diagnosis: Diagnosis, gain: Gain | None = None) -> str:
     lines += [f"{word:6} {text}" for word, text in _statements(diagnosis, gain)]
     counted = {v: sum(f.verdict == v for f in diagnosis.findings) for v in result.VERDICTS}
     lines.append(", ".join(f"{count} {verdict.lower()}" for verdict, count in counted.items() if count))
-    told = gain or diagnosis.held_out
-    if told is not None and (diagnosis.theta or gain is None):
-        lines += [_gain_line(c) for c in told.channels]
+    compared = gain or diagnosis.held_out
+    if compared is not None and (diagnosis.theta or gain is None):
+        lines += [_gain_line(c) for c in compared.channels]
     if gain is not None and gain.landing is not None:
         lines.append(landing_sentence(gain.landing))
     lines.append(f"{diagnosis.windows} windows of {diagnosis.flights} flights, {diagnosis.seconds:.1f} s")

@@ -23,15 +23,15 @@ def measure(args: argparse.Namespace) -> dict[str, float]:
     model, logs = opening.open_model(args)
     opened = time.perf_counter()
     diagnosis = search.explain(model, seed=args.seed, without=opening.numbers(args.without))
-    told = time.perf_counter()
+    explained = time.perf_counter()
     found = {
-        "open": opened - begun, "explain": told - opened, "verdict": told - begun, "logs": len(logs),
+        "open": opened - begun, "explain": explained - opened, "verdict": explained - begun, "logs": len(logs),
         "effects": len(model.effects), "windows": diagnosis.windows, "named": len(diagnosis.theta),
     }  # fmt: skip
     if not args.no_report and diagnosis.work is not None:
         with tempfile.TemporaryDirectory() as folder:
             explain_cli.write_report(Path(folder), diagnosis, model, logs, args.seed)
-        found["report"] = time.perf_counter() - told
+        found["report"] = time.perf_counter() - explained
     return found
 
 

@@ -98,8 +98,8 @@ def quick(out: Path, jobs: int) -> None:
     local = Local(baseline_units.QUICK_LIST, folder, ["cpu"], jobs, changes)
     outcome = Pool(load_list(baseline_units.QUICK_LIST, changes), folder, local, _say).run(None)
     if outcome.failed:
-        told = "; ".join(f"{name}: {reason}" for name, reason in outcome.failed.items())
-        raise VisthrowError(f"throws failed: {told}; all that was printed is in {folder / 'logs'}")
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in outcome.failed.items())
+        raise VisthrowError(f"throws failed: {reasons}; all that was printed is in {folder / 'logs'}")
     if outcome.stopped:
         raise KeyboardInterrupt
     if find_spec("piqp") is None:
