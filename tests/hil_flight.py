@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from hil.backends import DryRun, Status
-from hil.control.runner import Decision, Runner, Words
+from hil.control.runner import Decision, OperatorInput, Runner
 from hil.params import HilParams
 from hil.poses.pose import Pose
 from visthrow import config
@@ -97,7 +97,7 @@ def fly(
     seconds: float,
     poses: Callable[[float, list[Pose]], list[Pose]] = lambda time, poses: poses,
     status: Callable[[float], Status] = lambda time: Status(True),
-    words: Callable[[float, str], Words] = lambda time, state: Words(arm=state == "ready"),
+    words: Callable[[float, str], OperatorInput] = lambda time, state: OperatorInput(arm=state == "ready"),
     late: Callable[[float], float] = lambda time: 0.0,
     watch: Callable[[float, Decision], None] | None = None,
     recording: Callable[[float], bool] = lambda time: True,

@@ -12,7 +12,7 @@ from typing import Any
 from hil.backends import DryRun, make_backend
 from hil.backends.check import AutopilotCheck, hover_of_run
 from hil.cli.flight import key_of, params_of
-from hil.control.decision import Words
+from hil.control.decision import OperatorInput
 from hil.control.runner import Runner
 from hil.links.clock import Clock, ManualClock, MonotonicClock
 from hil.links.roster import Roster
@@ -73,7 +73,7 @@ def _listen(args: argparse.Namespace) -> int:
             now = clock.now()
             came = source.poll(now)
             poses += came
-            runner.tick(now, came, runner.backend.status(now), Words())
+            runner.tick(now, came, runner.backend.status(now), OperatorInput())
             autopilot.tick(now, runner)
             clock.sleep_until(now + runner.pilot.period)
         now = clock.now()

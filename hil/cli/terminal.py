@@ -10,7 +10,7 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
-from hil.control.decision import Decision, Words
+from hil.control.decision import Decision, OperatorInput
 from visthrow.onboard.calibration import Calibration
 
 ENDING = tuple(
@@ -104,7 +104,7 @@ class Terminal:
             name = signal.Signals(number).name
             self._why = "the operator said abort (Ctrl-C)" if number == signal.SIGINT else f"the process was told to end ({name})"
 
-    def words(self, state: str) -> Words:
+    def words(self, state: str) -> OperatorInput:
         """See `hil.control.loop.Operator`."""
         said = self._lines()
         arm = "arm" in said
@@ -113,7 +113,7 @@ class Terminal:
             if not arm and not self._warned:
                 self._warned = True
                 self._say("--auto-arm: this vehicle does not say that it is simulated (`visthrow hil fake` does); type arm")
-        return Words(arm, "land" in said, "abort" in said or bool(self._why), self._why)
+        return OperatorInput(arm, "land" in said, "abort" in said or bool(self._why), self._why)
 
     def _lines(self) -> set[str]:
         """Lines that were typed since the last call; half a line waits for its end."""

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
-class Words:
+class OperatorInput:
     """What the operator said since the last tick."""
 
     arm: bool = False

@@ -10,7 +10,7 @@ from typing import Any, Protocol
 
 from hil.backends.base import Backend, DryRun
 from hil.control.calibrating import Calibrating, Solver
-from hil.control.decision import Decision, Words
+from hil.control.decision import Decision, OperatorInput
 from hil.control.realtime import collected
 from hil.control.runner import Runner
 from hil.control.states import State
@@ -39,7 +39,7 @@ COLLECT_ALL = 50
 class Operator(Protocol):
     """Who arms."""
 
-    def words(self, state: str) -> Words:
+    def words(self, state: str) -> OperatorInput:
         """What was said since the last tick; ``state`` is the runner's. Never waits."""
 
 
@@ -50,7 +50,7 @@ class Lander:
         """Take the operator whose words count, and what is waited for."""
         self._operator, self._calibrating = operator, calibrating
 
-    def words(self, state: str) -> Words:
+    def words(self, state: str) -> OperatorInput:
         """See `Operator`."""
         said = self._operator.words(state)
         return replace(said, arm=False, land=said.land or self._calibrating.found is not None)
@@ -59,9 +59,9 @@ class Lander:
 class AutoOperator:
     """Arms whenever the run is ready: for tests and for simulated vehicles, never for real ones."""
 
-    def words(self, state: str) -> Words:
+    def words(self, state: str) -> OperatorInput:
         """See `Operator`."""
-        return Words(arm=state == State.READY)
+        return OperatorInput(arm=state == State.READY)
 
 
 def fly(

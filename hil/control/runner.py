@@ -18,7 +18,7 @@ from hil.backends.base import FAILED, FOLLOW, LAND, PENDING, Backend, Status
 from hil.backends.base import HOLD as HELD
 from hil.control.aim import Aim
 from hil.control.calibrating import Calibrating
-from hil.control.decision import Decision, Words
+from hil.control.decision import Decision, OperatorInput
 from hil.control.hovering import Hovering
 from hil.control.latch import Latch
 from hil.control.safety import Guard, failed_checks, fence_broken, outside
@@ -136,7 +136,7 @@ class Runner:
         self.calibrating = Calibrating(params.calibration, lambda: self.seen_goal_w) if wants else None
         self._calibration: Calibration | str | None = None
 
-    def tick(self, now: float, poses: list[Pose], status: Status, words: Words, recording: bool = True) -> Decision:
+    def tick(self, now: float, poses: list[Pose], status: Status, words: OperatorInput, recording: bool = True) -> Decision:
         """Decide one tick and send its command.
 
         Args:
@@ -218,7 +218,7 @@ class Runner:
             if took and pose.body == PAYLOAD:
                 self.latch.follow(pose.arrival - pose.transit(self.params.delay.source), track.gate.last.pos)
 
-    def _tick(self, now: float, poses: list[Pose], status: Status, words: Words, recording: bool) -> Decision:
+    def _tick(self, now: float, poses: list[Pose], status: Status, words: OperatorInput, recording: bool) -> Decision:
         begin = perf_counter()
         seen = self._estimate(now, poses)
         decision, state = self._decide(now, seen, status, words, recording)
@@ -249,7 +249,7 @@ class Runner:
         self.seen_goal_w = self._goal(bodies)
         return Seen(bodies[VEHICLE], bodies[PAYLOAD], self.seen_goal_w)
 
-    def _decide(self, now: float, seen: Seen, status: Status, words: Words, recording: bool) -> tuple[Decision, State]:
+    def _decide(self, now: float, seen: Seen, status: Status, words: OperatorInput, recording: bool) -> tuple[Decision, State]:
         """Move the state machine on, and do what a change of state brings with it."""
         inputs = self._inputs(now, seen, status, words, recording)
         state = self.machine.step(now, inputs)
@@ -365,7 +365,7 @@ class Runner:
         goal = bodies[GOAL]
         return None if goal is None else goal.pos
 
-    def _inputs(self, now: float, seen: Seen, status: Status, words: Words, recording: bool) -> Inputs:
+    def _inputs(self, now: float, seen: Seen, status: Status, words: OperatorInput, recording: bool) -> Inputs:
         p, state = self.params, self.machine.state
         vehicle, payload, goal_w = seen.vehicle, seen.payload, seen.goal_w
         hanging = payload if self.latch.at is None else None

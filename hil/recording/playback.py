@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from hil.backends.base import DryRun, Status
-from hil.control.decision import Decision, Words
+from hil.control.decision import Decision, OperatorInput
 from hil.control.runner import Runner
 from hil.control.states import State
 from hil.params import HilParams
@@ -56,7 +56,7 @@ class Playback:
             self.runner.look([Sight.of(line["seen"])])
         if (found := line.get("calibration")) is not None:
             self.runner.calibrated(found if isinstance(found, str) else Calibration.of(found))
-        decision = self.runner.tick(line["time"], poses, Status(*line["status"]), Words(*line["words"]), line["recording"])
+        decision = self.runner.tick(line["time"], poses, Status(*line["status"]), OperatorInput(*line["words"]), line["recording"])
         return decision, self._samples
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from hil.backends.base import Status
-from hil.control.decision import Decision, Words
+from hil.control.decision import Decision, OperatorInput
 from hil.errors import RunError
 from hil.params import HilParams
 from hil.poses.pose import Pose
@@ -69,7 +69,7 @@ class Recorder:
         self._thread.start()
 
     def tick(
-        self, index: int, poses: list[Pose], status: Status, words: Words, recording: bool, decision: Decision,
+        self, index: int, poses: list[Pose], status: Status, words: OperatorInput, recording: bool, decision: Decision,
         times: dict[str, float],
     ) -> None:  # fmt: skip
         """Record one tick; never raises and never waits."""

@@ -11,7 +11,7 @@ from hil.sources.base import Linked
 from visthrow.common.errors import ConfigError
 
 POSE_MESSAGES = ("ATT_POS_MOCAP", "VISION_POSITION_ESTIMATE", "ODOMETRY", "LOCAL_POSITION_NED")
-BESIDE = {"LOCAL_POSITION_NED": ("LOCAL_POSITION_NED", "ATTITUDE_QUATERNION")}
+COMPANIONS = {"LOCAL_POSITION_NED": ("LOCAL_POSITION_NED", "ATTITUDE_QUATERNION")}
 """Messages that make up a pose, where it is more than one."""
 
 PAIR_AGE = 0.05

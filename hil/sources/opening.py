@@ -16,7 +16,7 @@ from hil.poses.plausible import unit_problems
 from hil.poses.pose import Pose
 from hil.recording.record import POSES_TLOG, TLOG
 from hil.sources.base import Recorded
-from hil.sources.mavlink import BESIDE, MavlinkSource
+from hil.sources.mavlink import COMPANIONS, MavlinkSource
 from hil.sources.mocap import open_mocap
 from hil.sources.player import read_autopilot, read_table, read_tlog
 from hil.sources.ros2 import Ros2Source
@@ -46,7 +46,7 @@ def parties(params: HilParams, poses: bool, autopilot: bool) -> list[Party]:
     found = []
     if poses:
         for ids in params.source.senders:
-            kinds = frozenset(BESIDE.get(ids.message, (ids.message,)))
+            kinds = frozenset(COMPANIONS.get(ids.message, (ids.message,)))
             found.append(Party(ids.body, ids.system, ids.component, kinds))
     if autopilot and params.backend in AUTOPILOTS:
         vehicle = getattr(params, params.backend)

@@ -86,8 +86,10 @@ ULOG = {
     ),
     "vehicle_odometry": ODOMETRY, "vehicle_visual_odometry": ODOMETRY, "vehicle_mocap_odometry": ODOMETRY,
 }  # fmt: skip
-_BESIDE = {"ATT": PoseMessage((), angles=_ANGLES), "ORGN": PoseMessage((("Lat", "Lng", "Alt"),)),
-           "vehicle_attitude": PoseMessage((), _Q), "vehicle_angular_velocity": PoseMessage((), rate=_three("xyz"))}  # fmt: skip
+_COMPANIONS = {
+    "ATT": PoseMessage((), angles=_ANGLES), "ORGN": PoseMessage((("Lat", "Lng", "Alt"),)),
+    "vehicle_attitude": PoseMessage((), _Q), "vehicle_angular_velocity": PoseMessage((), rate=_three("xyz")),
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -203,7 +205,7 @@ def read_autopilot(path: str | Path, bodies: tuple[LogBody, ...], kind: str) -> 
         if body.message not in known:
             raise SourceError(f"message '{body.message}' of the {body.body} carries no pose; {suggest(body.message, known)}")
         with _as_source():
-            found = _of_messages(reader(body.file or path, [*known, *_BESIDE]), body, known)
+            found = _of_messages(reader(body.file or path, [*known, *_COMPANIONS]), body, known)
         if not found:
             raise SourceError(
                 f"{body.file or path}: {body.message} (instance {body.instance}) holds no pose of the {body.body}"
@@ -230,9 +232,9 @@ def _of_messages(log: Messages, body: LogBody, known: dict[str, PoseMessage]) ->
             other = log.first(kind.attitude)
             if other is None:
                 raise LogError(f"{log.path}: {body.message} gives no attitude, and the log holds no {kind.attitude}")
-            quat = _paired(other, _BESIDE[kind.attitude], "quat", stamps)
+            quat = _paired(other, _COMPANIONS[kind.attitude], "quat", stamps)
         if kind.rates and (other := log.first(kind.rates)) is not None:
-            rate = _paired(other, _BESIDE[kind.rates], "rate", stamps)
+            rate = _paired(other, _COMPANIONS[kind.rates], "rate", stamps)
     except KeyError as error:
         listed = ", ".join(sorted(data.keys() - {"time", "arrival"}))
         raise LogError(f"{log.path}: no field {error}; {body.message} has {listed}") from error

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from hil.backends import Status
-from hil.control.runner import Runner, Words
+from hil.control.runner import OperatorInput, Runner
 from hil.poses.pose import PAYLOAD, VEHICLE, Pose
 from hil.recording.playback import replay
 from hil.recording.record import Recorder, lines, read_poses
@@ -53,13 +53,13 @@ def recorded(flown: dict[str, np.ndarray], folder) -> dict[int, list[Pose]]:
     recorder = Recorder(folder, wanted)
     count = flown["pos_w"].shape[0] * flown["pos_w"].shape[1]
     flat = {name: values.reshape(count, -1).astype(float).tolist() for name, values in flown.items()}
-    idle = Runner(wanted, Policy.load(find_policy("state")), Spy()).tick(0.0, [], Status(True), Words())
+    idle = Runner(wanted, Policy.load(find_policy("state")), Spy()).tick(0.0, [], Status(True), OperatorInput())
     for n in range(count):
         at = TICK * n
         views = (flat[name][n] for name in ("pos_w", "quat_wb", "vel_w", "rate_b"))
         vehicle = Pose(at, at, VEHICLE, *map(tuple, views))
         payload = Pose(at, at, PAYLOAD, tuple(flat["payload"][n]))
-        recorder.tick(n, [vehicle, payload], Status(True), Words(), True, idle, {})
+        recorder.tick(n, [vehicle, payload], Status(True), OperatorInput(), True, idle, {})
     recorder.close({})
     return read_poses(folder)
 
@@ -74,7 +74,7 @@ def seen_by_the_runner(flown, poses, policy: str) -> tuple[np.ndarray, np.ndarra
         if n % steps == 0:
             runner.params = dataclasses.replace(runner.params, goal_w=goal_w)
             runner.pilot.start()
-        decision = runner.tick(TICK * n, poses[n], Status(True), Words())
+        decision = runner.tick(TICK * n, poses[n], Status(True), OperatorInput())
         observations.append(decision.observation)
         actions.append(decision.action)
     assert not runner.errors
@@ -150,7 +150,7 @@ def patchy(rng: np.random.Generator):
 
 RUNS = {
     "drop-outs": {"poses": patchy(np.random.default_rng(1)), "seconds": 3.0},
-    "operator's abort": {"words": lambda t, s: Words(arm=s == "ready", abort=t > 1.0), "seconds": 2.0},
+    "operator's abort": {"words": lambda t, s: OperatorInput(arm=s == "ready", abort=t > 1.0), "seconds": 2.0},
     "mocap gone": {"poses": lambda t, poses: poses if t < 0.9 else [], "seconds": 2.0},
     "autopilot gone": {"status": lambda t: Status(t < 0.9, "silent"), "seconds": 2.0},
     "back after a second": {"poses": lambda t, poses: [] if 0.3 < t < 1.6 else poses, "seconds": 6.0},

@@ -12,7 +12,7 @@ import time
 import numpy as np
 import pytest
 
-from hil.control.decision import Words
+from hil.control.decision import OperatorInput
 from hil.recording.record import Recorder
 from tests.hil_flight import simple_policy
 from tests.level import LevelPlant
@@ -38,8 +38,8 @@ class OneWord:
     def __init__(self, abort: float = math.inf):
         self.abort, self.clock = abort, None
 
-    def words(self, state: str) -> Words:
-        return Words(arm=state == "ready", abort=self.clock.now() >= self.abort)
+    def words(self, state: str) -> OperatorInput:
+        return OperatorInput(arm=state == "ready", abort=self.clock.now() >= self.abort)
 
 
 def run(kind, seconds, loaded=NEVER, watch=None, operator=None, overrides=(), plant=None, recorder=None, **options):

@@ -5,7 +5,7 @@ import pytest
 
 from hil.backends.base import FOLLOW, HOLD, LAND, WAIT
 from hil.backends.check import AutopilotCheck
-from hil.control.decision import Words
+from hil.control.decision import OperatorInput
 from hil.control.loop import AutoOperator, fly
 from hil.fakes.px4 import LAND as PX4_LAND
 from hil.fakes.px4 import OFFBOARD, POSCTL, custom
@@ -335,7 +335,7 @@ def test_two_throws_with_the_autopilots_own_hold_between_them():
             if state == "ready" and plant.released is not None:
                 plant.released, fake._trip, fake.release_time = None, None, None
                 fake.witness._answered = False
-            return Words(arm=state == "ready")
+            return OperatorInput(arm=state == "ready")
 
     runner, source, clock, fake = peers(plant, kind="ardupilot", loaded=AT_ONCE, overrides=(*QUICK, "throws=2"))
     summary = fly(runner, source, clock, HangOn(), None, 9.0)

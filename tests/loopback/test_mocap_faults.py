@@ -7,7 +7,7 @@ import math
 
 import pytest
 
-from hil.control.decision import Words
+from hil.control.decision import OperatorInput
 from hil.errors import RunError
 from hil.fakes.mocap import FAULTS, MocapFault
 from hil.poses.pose import VEHICLE, Pose
@@ -42,8 +42,8 @@ FLOWN_THROUGH = {"none", "clock-forth", "clock-back", "shuffle", "double"}
 class OneWord:
     """Arms one throw."""
 
-    def words(self, state: str) -> Words:
-        return Words(arm=state == "ready")
+    def words(self, state: str) -> OperatorInput:
+        return OperatorInput(arm=state == "ready")
 
 
 def spoiled(name: str, seconds: float = 0.7, loaded=NEVER):

@@ -6,7 +6,7 @@ import pytest
 
 from hil.backends import DryRun
 from hil.backends.check import autopilot_record, hover_of_run
-from hil.control.decision import Words
+from hil.control.decision import OperatorInput
 from hil.control.loop import fly
 from hil.errors import RunError
 from hil.recording.record import CONFIG, TICKS, Recorder
@@ -22,7 +22,7 @@ class Nobody:
     """Never arms: the vehicle hovers."""
 
     def words(self, state):
-        return Words()
+        return OperatorInput()
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from camera.keypoints import KeypointCamera, goal_corners_w, keypoints
 from camera.mount import rotation_from_vector
 from hil.backends import DryRun
 from hil.control.calibrating import Calibrating, CalibrationParams, solved
-from hil.control.decision import Words
+from hil.control.decision import OperatorInput
 from hil.control.runner import Runner
 from hil.params import HilParams
 from hil.poses.pose import Pose
@@ -83,7 +83,7 @@ class Hall:
             if (due := self.runner.calibrating.due()) is not None:
                 p = self.runner.params
                 self.runner.calibrated(solved(due, p.camera, self.runner.pilot.policy.contract, p.calibration.spreads))
-            decision = self.runner.tick(now, poses, self.runner.backend.status(now), Words(arm=arm))
+            decision = self.runner.tick(now, poses, self.runner.backend.status(now), OperatorInput(arm=arm))
             self.decisions.append(decision)
             if decision.command is not None:
                 self.command = np.array(decision.command)

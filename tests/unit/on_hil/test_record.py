@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hil.backends import Status
-from hil.control.runner import Runner, Words
+from hil.control.runner import OperatorInput, Runner
 from hil.errors import RunError
 from hil.recording.record import Recorder, lines, load_run
 from tests.bench.processes import free_port
@@ -146,7 +146,7 @@ def test_a_full_disk_fails_the_recording_and_nothing_else(tmp_path):
     recorder._files.update({"ticks.jsonl": Full(), "poses.jsonl": Full()})
     runner = Runner(params(), Policy.load(find_policy("state")), Spy())
     for n in range(3):
-        status, words = Status(True), Words()
+        status, words = Status(True), OperatorInput()
         recorder.tick(n, [], status, words, True, runner.tick(0.02 * n, [], status, words), {})
     recorder.close({})
     assert "No space left" in recorder.failed

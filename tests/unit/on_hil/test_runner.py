@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hil.backends import Status
-from hil.control.runner import WARM_CALLS, Runner, Words
+from hil.control.runner import WARM_CALLS, OperatorInput, Runner
 from hil.errors import RunError
 from hil.params import HilParams
 from tests.hil_flight import TICK, Spy, changes, fly, params, simple_policy
@@ -93,11 +93,11 @@ def test_a_warm_up_changes_no_bit(monkeypatch):
 
 
 def test_nothing_is_released_without_the_operators_word():
-    pilot, decisions = thrown(words=lambda time, state: Words(), seconds=8.0)
+    pilot, decisions = thrown(words=lambda time, state: OperatorInput(), seconds=8.0)
     assert changes(decisions)[-1][0] == "ready"
     assert not pilot.backend.release_times
     pilot, decisions = thrown(
-        overrides=("throws=2",), seconds=20.0, words=lambda t, s: Words(arm=s == "ready" and t < 3)
+        overrides=("throws=2",), seconds=20.0, words=lambda t, s: OperatorInput(arm=s == "ready" and t < 3)
     )
     assert decisions[-1].state == "ready", "one word, one throw"
 
@@ -109,7 +109,7 @@ def test_a_policy_that_never_releases_is_stopped():
 
 def test_operators_abort_in_mid_throw():
     pilot, decisions = thrown(
-        action=NEVER, words=lambda t, s: Words(arm=s == "ready", abort=s == "throw" and t > 3.0), seconds=8.0
+        action=NEVER, words=lambda t, s: OperatorInput(arm=s == "ready", abort=s == "throw" and t > 3.0), seconds=8.0
     )
     assert ("abort", "the operator said abort") in changes(decisions)
     assert pilot.backend.aborts > 0

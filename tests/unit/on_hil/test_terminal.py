@@ -9,7 +9,7 @@ import pytest
 
 from hil.cli.flight import require_fake
 from hil.cli.terminal import ENDING, PAUSING, Terminal, Voice
-from hil.control.decision import Decision, Words
+from hil.control.decision import Decision, OperatorInput
 from hil.errors import RunError
 from hil.params import HilParams
 from visthrow import config
@@ -31,16 +31,16 @@ def typed(monkeypatch):
 def test_lines_are_words_and_half_a_line_holds_nobody_up(typed):
     terminal = Terminal()
     os.write(typed, b"ar")
-    assert terminal.words("ready") == Words()
+    assert terminal.words("ready") == OperatorInput()
     os.write(typed, b"m\nLAND \nnonsense\n")
-    assert terminal.words("ready") == Words(arm=True, land=True)
-    assert terminal.words("ready") == Words()
+    assert terminal.words("ready") == OperatorInput(arm=True, land=True)
+    assert terminal.words("ready") == OperatorInput()
     os.write(typed, b"\xff\xfe\xe9\nabort\n")
-    assert terminal.words("ready") == Words(abort=True), "bytes that are no text raise nothing"
+    assert terminal.words("ready") == OperatorInput(abort=True), "bytes that are no text raise nothing"
     os.write(typed, b"arm")
     os.close(typed)
-    assert terminal.words("ready") == Words(arm=True), "the last line needs no end"
-    assert terminal.words("ready") == Words()
+    assert terminal.words("ready") == OperatorInput(arm=True), "the last line needs no end"
+    assert terminal.words("ready") == OperatorInput()
 
 
 @pytest.mark.parametrize("number", ENDING)
