@@ -14,7 +14,7 @@ COMMANDS = {
     "demo": ("throw once with the shipped vision policy and compare it with the state policy", "visthrow.evidence.demo"),
     "train": ("train a throwing policy from scratch", "visthrow.training.command"),
     "fly": ("fly one throw and write a 3D recording and a picture of it", "visthrow.throws.fly"),
-    "compare": ("throw many times with each policy and print landing errors and durations", "visthrow.throws.compare"),
+    "compare": ("throw many times with each policy and print landing errors and durations", "visthrow.evidence.compare"),
     "detector": ("train the keypoint detector on rendered frames, and check it", "visthrow.evidence.detector"),
     "hil": ("fly a policy on motion-capture poses, live or recorded", "hil.cli"),
     "baseline": ("throw with trajectory optimisation and MPC; its front against the policies", "visthrow.evidence.report.baseline"),

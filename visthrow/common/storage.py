@@ -46,6 +46,20 @@ def atomic_write(path: str | Path, content: bytes | str) -> None:
                 os.unlink(temporary)
 
 
+def writable(folder: Path) -> None:
+    """Make the folder of the results now, so that no work is done for results that could not be written.
+
+    Raises:
+        StorageError: it cannot be made or written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StorageError(f"cannot make the folder {folder}: {error.strerror or error}") from error
+    if not os.access(folder, os.W_OK):
+        raise StorageError(f"the folder {folder} cannot be written")
+
+
 def write_json(path: str | Path, value: Any) -> None:
     """Write a value as indented JSON, atomically; NaN and infinity become null, as JSON has neither.
 

@@ -5,7 +5,9 @@ import time
 from pathlib import Path
 
 from visthrow.common.errors import ConfigError
-from visthrow.throws import compare, fly
+from visthrow.common.storage import writable
+from visthrow.evidence import compare
+from visthrow.throws import fly
 
 THROWS, TARGETS = 100, (1.5, 2.0, 2.5)
 """In the training simulator, for each policy; ``--throws`` asks for another number."""
@@ -41,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
     begin, few = time.perf_counter(), min(args.throws, REFERENCE_THROWS)
     loaded = [load_policy(name) for name in POLICIES]
     folder = Path(args.out)
-    compare.writable(folder)
+    writable(folder)
     if importlib.util.find_spec("mujoco") is None:
         paths = _here(loaded, folder, args.throws)
         print("The reference plant is left out: it needs MuJoCo, pip install 'visthrow[reference]'\n")

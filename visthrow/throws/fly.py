@@ -49,8 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Fly, write, tell."""
     from visthrow.common.errors import ConfigError, suggest
-    from visthrow.common.storage import write_json
-    from visthrow.throws.compare import writable
+    from visthrow.common.storage import writable, write_json
     from visthrow.throws.loading import load_policy
     from visthrow.throws.plants import PLANTS
     from visthrow.throws.recorded import check_goal, fly

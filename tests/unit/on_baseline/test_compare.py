@@ -6,7 +6,8 @@ import pytest
 
 from visthrow import cli
 from visthrow.baseline import spline, thrower
-from visthrow.throws import compare, results
+from visthrow.evidence import compare
+from visthrow.throws import results
 from visthrow.throws.reference_protocol import BATCH
 
 pytest.importorskip("piqp")

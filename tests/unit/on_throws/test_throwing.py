@@ -14,11 +14,11 @@ import torch
 from visthrow import config
 from visthrow.cli import main
 from visthrow.common.errors import ConfigError, MismatchError, PolicyError
-from visthrow.evidence import demo
+from visthrow.evidence import compare, demo
 from visthrow.logs.flightlog import STANDARD_CHANNELS, FlightLog
 from visthrow.onboard.policy import Policy
 from visthrow.task import Experiment, contract_of
-from visthrow.throws import compare, reference_protocol
+from visthrow.throws import reference_protocol
 from visthrow.throws.flight import Flight
 from visthrow.throws.loading import load_policy, unique_names
 from visthrow.throws.loose_rope import LooseRope

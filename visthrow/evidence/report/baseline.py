@@ -60,9 +60,11 @@ def run(args: argparse.Namespace) -> int:
     """Plan, throw, print, write."""
     from visthrow.baseline import thrower
     from visthrow.common.errors import suggest
+    from visthrow.common.storage import writable
+    from visthrow.evidence import compare
     from visthrow.evidence.report import baseline_units, result_set, trade
     from visthrow.evidence.report.throws import SHORT
-    from visthrow.throws import compare, results
+    from visthrow.throws import results
     from visthrow.throws.plants import PLANTS
     from visthrow.training.device import cores
     from visthrow.view import page
@@ -73,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
         if plant not in PLANTS:
             raise ConfigError(f"no plant '{plant}'; {suggest(plant, PLANTS)}")
     out, bounds = Path(args.out), baseline_units.BOUNDS[args.payload_bounds]
-    compare.writable(out)
+    writable(out)
     if args.quick:
         args.throws, args.plants = min(args.throws, 2), []
     by_target, swept = list(_by_target(args, bounds)), [] if args.no_sweep else list(_swept(args, bounds))

@@ -41,8 +41,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Throw if asked to, read, write."""
+    from visthrow.common.storage import writable
     from visthrow.evidence.report import result_set
-    from visthrow.throws.compare import writable
     from visthrow.throws.results import RECORDS
     from visthrow.training import device
     from visthrow.view import page

@@ -3,12 +3,12 @@
 import argparse
 import importlib
 import math
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
 from visthrow.common.arguments import add_common
-from visthrow.common.errors import ConfigError, StorageError
+from visthrow.common.errors import ConfigError
+from visthrow.common.storage import writable
 from visthrow.common.workers import status
 from visthrow.throws.results import Entry
 
@@ -167,20 +167,6 @@ def check(targets: Sequence[float], throws: int) -> None:
             )
     if len(set(targets)) < len(targets):
         raise ConfigError(f"--targets {' '.join(f'{x:g}' for x in targets)}: the same one twice")
-
-
-def writable(folder: Path) -> None:
-    """Make the folder of the results now, so that no work is done for results that could not be written.
-
-    Raises:
-        StorageError: it cannot be made or written.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise StorageError(f"cannot make the folder {folder}: {error.strerror or error}") from error
-    if not os.access(folder, os.W_OK):
-        raise StorageError(f"the folder {folder} cannot be written")
 
 
 def throw_hybrid(
