@@ -72,7 +72,7 @@ class Fisheye:
             and params.cy - reach_y >= top
             and params.cy + reach_y <= bottom
         )
-        self._constants: dict = {}
+        self._constants: dict[tuple[torch.device, torch.dtype], tuple[torch.Tensor, torch.Tensor]] = {}
 
     def angle(
         self, points_c: torch.Tensor, epsilon: float = AXIS_EPSILON

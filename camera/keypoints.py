@@ -147,7 +147,8 @@ def box_midpoints(extremes: torch.Tensor) -> torch.Tensor:
     """
     left, top, right, bottom = extremes[:, 0, 0], extremes[:, 1, 1], extremes[:, 2, 0], extremes[:, 3, 1]
     u, v = (left + right) * 0.5, (top + bottom) * 0.5
-    return torch.stack([left, v, u, top, right, v, u, bottom], -1).unflatten(-1, (4, 2))
+    middles: torch.Tensor = torch.stack([left, v, u, top, right, v, u, bottom], -1).unflatten(-1, (4, 2))
+    return middles
 
 
 def payload_keypoints(camera: KeypointCamera, ball_c: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

@@ -33,7 +33,8 @@ def rotation_from_vector(vector: torch.Tensor) -> torch.Tensor:
         b * x * y + a * z, 1.0 - b * (x * x + z * z), b * y * z - a * x,
         b * x * z - a * y, b * y * z + a * x, 1.0 - b * (x * x + y * y),
     ]  # fmt: skip
-    return torch.stack(rows, -1).unflatten(-1, (3, 3))
+    rot: torch.Tensor = torch.stack(rows, -1).unflatten(-1, (3, 3))
+    return rot
 
 
 def nominal_rot_cb(mount: MountParams) -> torch.Tensor:
@@ -42,7 +43,8 @@ def nominal_rot_cb(mount: MountParams) -> torch.Tensor:
     axes = torch.diag(torch.tensor([roll, pitch, yaw], dtype=torch.float64))
     about_x, about_y, about_z = rotation_from_vector(axes)
     down = torch.tensor(DOWNWARD_ROT_CB, dtype=torch.float64)
-    return down @ (about_z @ about_y @ about_x).T
+    rot_cb: torch.Tensor = down @ (about_z @ about_y @ about_x).T
+    return rot_cb
 
 
 def extrinsics_with_error(

@@ -1,6 +1,7 @@
 """HybridSim: a batch of quadrotors with a rope and a payload each, stepped one control period at a time."""
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -21,10 +22,10 @@ PIECES = 2
 FEWEST = 64
 """Environments of a piece: their step takes a millisecond, its launch a tenth."""
 
-_BUILDS: dict = {}
+_BUILDS: dict[tuple[Any, ...], tuple[Any, Any, Any]] = {}
 
 
-def _kernels(params: PlantParams, direct: bool, motors: bool, extensions: frozenset[str]):
+def _kernels(params: PlantParams, direct: bool, motors: bool, extensions: frozenset[str]) -> tuple[Any, Any, Any]:
     """Kernels of one choice of blocks; built once a process."""
     blocks = (kinds_of(params.vehicle), direct, motors, extensions)
     key = (params.sim.precision, params.rope.segments, blocks, structure(params.laws))
@@ -144,10 +145,10 @@ class HybridSim:
         self.extensions = extensions_of(vehicles, ropes, airs, releases, params.laws) | extensions
         self.types, self._step, self._reset = _kernels(params, direct, motors, self.extensions)
         t = self.types
-        self._vehicles = wp.array(pack_vehicle(t, vehicles, kinds_of(params.vehicle)), dtype=t.Vehicle, device=device)
-        self._ropes = wp.array(pack_rope(t, ropes_on(vehicles, ropes)), dtype=t.Rope, device=device)
-        self._airs = wp.array(pack_air(t, airs, [params.laws] * len(airs)), dtype=t.Air, device=device)
-        self._release = wp.array(pack(t.Release, *releases), dtype=t.Release, device=device)
+        self._vehicles: Any = wp.array(pack_vehicle(t, vehicles, kinds_of(params.vehicle)), dtype=t.Vehicle, device=device)
+        self._ropes: Any = wp.array(pack_rope(t, ropes_on(vehicles, ropes)), dtype=t.Rope, device=device)
+        self._airs: Any = wp.array(pack_air(t, airs, [params.laws] * len(airs)), dtype=t.Air, device=device)
+        self._release: Any = wp.array(pack(t.Release, *releases), dtype=t.Release, device=device)
         self._allocate(max(queue_depth(v.queue.delay, params.sim.control_period) for v in vehicles))
         self.place(pos_w=np.zeros((count, 3)))
 
@@ -163,7 +164,7 @@ class HybridSim:
         self.goal_w = wp.zeros(count, dtype=t.vec3, device=device)
         self._all = wp.full(count, 1, dtype=wp.int32, device=device)
         self._used = wp.zeros(count, dtype=t.real, device=device)
-        self._spreads: tuple[RandomizationParams, wp.array] | None = None
+        self._spreads: tuple[RandomizationParams, wp.array[Any]] | None = None
 
     def step(self) -> None:
         """Advance every plant by one control period under ``command`` and ``release``."""
@@ -193,7 +194,7 @@ class HybridSim:
         inputs = [self._vehicles, self._ropes, self._release, self._airs, self.gravity, self.state, self.foreseen]
         self._launch(self._step.foresee, inputs, block_dim=64)
 
-    def randomize(self, spreads: RandomizationParams, mask: wp.array | None = None) -> None:
+    def randomize(self, spreads: RandomizationParams, mask: "wp.array[Any] | None" = None) -> None:
         """Start new episodes where ``mask`` (shape (E,), int) is non-zero; everywhere without one."""
         if self._spreads is None or self._spreads[0] != spreads:
             packed = pack(self.types.Randomization, spreads)
@@ -257,7 +258,7 @@ class HybridSim:
     def _update_payload(self) -> None:
         self._launch(self._step.payload, [self._ropes, self.state, self.out])
 
-    def _launch(self, kernel: wp.Kernel, arguments: list, block_dim: int = 256) -> None:
+    def _launch(self, kernel: wp.Kernel, arguments: list[Any], block_dim: int = 256) -> None:
         """Launch a kernel for all plants, on a CPU in pieces that run side by side."""
         count, device = self.count, self.device
         pieces = min(PIECES * self.threads, count // FEWEST) if device == "cpu" and self.threads > 1 else 1
@@ -304,4 +305,5 @@ class HybridSim:
         q, r = self.get("quat_wb").astype(float), ropes["mount"][rows].astype(float)
         mount = self.get("pos_w") + r + 2 * np.cross(q[:, :3], np.cross(q[:, :3], r) + q[:, 3:] * r)
         steps = ropes["segment_length"][rows][:, None, None] * self.get("cable_dir_w")
-        return mount[:, None, :] + np.concatenate([np.zeros((self.count, 1, 3)), np.cumsum(steps, axis=1)], axis=1)
+        below = np.concatenate([np.zeros((self.count, 1, 3)), np.cumsum(steps, axis=1)], axis=1)
+        return np.asarray(mount[:, None, :] + below)

@@ -5,7 +5,7 @@ parameters; :func:`plant_of` gives what the simulator needs of it.
 """
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 from camera.params import CameraParams
 from sim.params import (
@@ -295,11 +295,13 @@ class Experiment:
     @property
     def samples(self) -> int:
         """Environment steps an iteration."""
-        return self.ppo.environments * (self.ppo.steps if self.algorithm == "ppo" else self._chosen.horizon)
+        chosen = self._chosen
+        return self.ppo.environments * (chosen.steps if isinstance(chosen, PPOParams) else chosen.horizon)
 
     @property
     def _chosen(self) -> PPOParams | FirstOrderParams | DistillationParams:
-        return getattr(self, self.algorithm)
+        chosen: PPOParams | FirstOrderParams | DistillationParams = getattr(self, self.algorithm)
+        return chosen
 
     def __post_init__(self) -> None:
         if abs(self.camera.payload_radius - self.rope.payload_radius) > 1e-9:
@@ -314,7 +316,7 @@ def plant_of(experiment: Experiment) -> PlantParams:
     return PlantParams(experiment.vehicle, experiment.rope, experiment.release, experiment.sim, experiment.air, experiment.laws)
 
 
-def contract_of(experiment: Experiment) -> dict:
+def contract_of(experiment: Experiment) -> dict[str, Any]:
     """What whoever flies a policy must share with its training; see :mod:`visthrow.onboard.policy`.
 
     The camera enters for vision policies only. Noise and randomisation are training matters and stay out. An entry whose

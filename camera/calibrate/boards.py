@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -50,7 +50,7 @@ class BoardParams:
         x, y = np.meshgrid(np.arange(self.columns), np.arange(self.rows))
         return np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)]) * self.square_size
 
-    def charuco(self):
+    def charuco(self) -> Any:
         """OpenCV's object of a ChArUco board: one square more each way than inner corners."""
         import cv2
 
@@ -165,8 +165,8 @@ def calibrate_from_boards(
         )  # fmt: skip
     except cv2.error as error:
         raise ValueError(f"OpenCV found no fisheye for {len(views)} boards: {str(error).strip()}") from error
-    values = [float(x) for x in (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *k.ravel())]
-    params = FisheyeParams(width, height, *values, fov_deg=fov_deg)
+    fx, fy, cx, cy, k1, k2, k3, k4 = map(float, (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *k.ravel()))
+    params = FisheyeParams(width, height, fx, fy, cx, cy, k1, k2, k3, k4, fov_deg)
     project = _projection(Fisheye(params))
     poses = iter(zip(rotations, translations, strict=True))
     return params, _report([None if v is None else _residual(project, v, np.concatenate(next(poses)).ravel()) for v in found])
@@ -225,23 +225,31 @@ def board_pose(lens: Fisheye, view: View) -> np.ndarray:
     plane = rays[before, :2] / rays[before, 2:]
     _, turn, place = cv2.solvePnP(view.points_m[before], plane, np.eye(3), np.zeros(4), flags=cv2.SOLVEPNP_IPPE)
     project, start = _projection(lens), np.concatenate([turn, place]).ravel()
-    return least_squares(lambda pose: _residual(project, view, pose), start, x_scale="jac", method="lm").x
+
+    def residual(pose: np.ndarray) -> np.ndarray:
+        return _residual(project, view, pose)
+
+    return np.asarray(least_squares(residual, start, x_scale="jac", method="lm").x)
 
 
 def reprojected(lens: Fisheye, view: View) -> np.ndarray:
     """Pixels [px], shape (N, 2), at which a lens expects the points of a board whose pose was fitted."""
-    return view.pixels + _residual(_projection(lens), view, board_pose(lens, view)).reshape(-1, 2)
+    return np.asarray(view.pixels + _residual(_projection(lens), view, board_pose(lens, view)).reshape(-1, 2))
 
 
 def _projection(lens: Fisheye) -> Callable[[np.ndarray], np.ndarray]:
-    return lambda points_c: lens.project(torch.from_numpy(points_c))[0].numpy()
+    def project(points_c: np.ndarray) -> np.ndarray:
+        return np.asarray(lens.project(torch.from_numpy(points_c))[0].numpy())
+
+    return project
 
 
 def _residual(project: Callable[[np.ndarray], np.ndarray], view: View, pose: np.ndarray) -> np.ndarray:
     """Reprojected less seen pixels [px], shape (2 N,), of a board at a pose (rotation vector, place)."""
     import cv2
 
-    return (project(view.points_m @ cv2.Rodrigues(pose[:3])[0].T + pose[3:]) - view.pixels).ravel()
+    points_c = view.points_m @ np.asarray(cv2.Rodrigues(pose[:3])[0]).T + pose[3:]
+    return np.asarray(project(points_c) - view.pixels).ravel()
 
 
 def _report(residuals: list[np.ndarray | None]) -> BoardReport:

@@ -223,14 +223,15 @@ def image_fov_deg(fisheye: FisheyeParams) -> float:
     return 2.0 * math.degrees(float(widest.angle(rays)[0].max()))
 
 
-def _params(path, size, values, own_fov, asked_fov) -> FisheyeParams:
+def _params(path: str | Path, size: list[Any], values: tuple[float, ...], own_fov: Any, asked_fov: float | None) -> FisheyeParams:
     """Assemble and check intrinsics; the message of a refusal names the file."""
     width, height = (int(s) for s in _floats(path, "image size", size, 2))
+    named = dict(zip(_KB4, values, strict=True))
     try:
         fov = own_fov if own_fov is not None else asked_fov
         if fov is None:
-            fov = image_fov_deg(FisheyeParams(width, height, *values, fov_deg=1.0))
-        params = FisheyeParams(width, height, *values, fov_deg=_floats(path, "fov_deg", [fov], 1)[0])
+            fov = image_fov_deg(FisheyeParams(width, height, **named, fov_deg=1.0))
+        params = FisheyeParams(width, height, **named, fov_deg=_floats(path, "fov_deg", [fov], 1)[0])
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
     return params
@@ -241,7 +242,7 @@ def _matrix(fisheye: FisheyeParams) -> list[float]:
     return [fisheye.fx, 0.0, fisheye.cx, 0.0, fisheye.fy, fisheye.cy, 0.0, 0.0, 1.0]
 
 
-def _from_matrix(path, values) -> tuple[float, float, float, float]:
+def _from_matrix(path: str | Path, values: Any) -> tuple[float, float, float, float]:
     """fx, cx, fy, cy of a camera matrix without skew."""
     fx, skew, cx, _, fy, cy, *_ = _floats(path, "camera_matrix", values, 9)
     if abs(skew) > 1e-9 * abs(fx):
@@ -249,7 +250,7 @@ def _from_matrix(path, values) -> tuple[float, float, float, float]:
     return fx, cx, fy, cy
 
 
-def _text(path, whole_lines: bool = True) -> str:
+def _text(path: str | Path, whole_lines: bool = True) -> str:
     """Text of a file that exists and, where the format has no closing bracket, does not end within a line."""
     if not Path(path).is_file():
         raise ValueError(f"{path} is not a file; expected a calibration file")
@@ -260,7 +261,7 @@ def _text(path, whole_lines: bool = True) -> str:
     return text
 
 
-def _yaml(path) -> dict:
+def _yaml(path: str | Path) -> dict[str, Any]:
     import yaml
 
     try:
@@ -270,45 +271,45 @@ def _yaml(path) -> dict:
     return _mapping(path, "the file", tree)
 
 
-def _dump_yaml(path, tree: dict) -> None:
+def _dump_yaml(path: str | Path, tree: dict[str, Any]) -> None:
     import yaml
 
     Path(path).write_text(yaml.safe_dump(tree, sort_keys=False))
 
 
-def _mapping(path, name: str, value) -> dict:
+def _mapping(path: str | Path, name: str, value: Any) -> dict[str, Any]:
     if not isinstance(value, dict):
         raise ValueError(f"{path}: {name} is {_short(value)}; expected a mapping of keys to values")
     return value
 
 
-def _get(path, tree: dict, key: str, exists: list[str] | None = None):
+def _get(path: str | Path, tree: dict[str, Any], key: str, exists: list[str] | None = None) -> Any:
     if key not in tree:
         exists = sorted(map(str, tree)) if exists is None else exists
         raise ValueError(f"{path} lacks the key {key!r} (cut short?); it has {exists}")
     return tree[key]
 
 
-def _item(path, name: str, values, index: int):
+def _item(path: str | Path, name: str, values: Any, index: int) -> Any:
     if not isinstance(values, list) or not 0 <= index < len(values):
         count = len(values) if isinstance(values, list) else 0
         raise ValueError(f"{path}: camera {index} asked for; expected below {count}, the number of {name} in the file")
     return values[index]
 
 
-def _floats(path, name: str, values, count: int) -> list[float]:
+def _floats(path: str | Path, name: str, values: Any, count: int) -> list[float]:
     listed = isinstance(values, list | tuple) and len(values) == count
     if not listed or not all(isinstance(v, int | float) and not isinstance(v, bool) for v in values):
         raise ValueError(f"{path}: {name} is {_short(values)}; expected {count} numbers")
     return [float(v) for v in values]
 
 
-def _expect(path, tree: dict, key: str, choices: tuple[str, ...]) -> None:
+def _expect(path: str | Path, tree: dict[str, Any], key: str, choices: tuple[str, ...]) -> None:
     value = _get(path, tree, key)
     if value not in choices:
         raise ValueError(f"{path}: {key} is {_short(value)}; expected one of {list(choices)}")
 
 
-def _short(value) -> str:
+def _short(value: Any) -> str:
     text = repr(value)
     return text if len(text) <= 80 else text[:77] + "..."

@@ -47,7 +47,8 @@ def load(schema: type[T], path: str | Path, overrides: Iterable[str] = ()) -> T:
     tree = _read(schema, Path(path), ())
     for override in overrides:
         _override(schema, tree, override)
-    return _schema.build(schema, tree)
+    built: T = _schema.build(schema, tree)
+    return built
 
 
 def loads(schema: type[T], text: str, overrides: Iterable[str] = (), name: str = "(text)") -> T:
@@ -65,7 +66,8 @@ def loads(schema: type[T], text: str, overrides: Iterable[str] = (), name: str =
     tree = _parse(schema, text, name, configs_root(), ())
     for override in overrides:
         _override(schema, tree, override)
-    return _schema.build(schema, tree)
+    built: T = _schema.build(schema, tree)
+    return built
 
 
 def configs_root() -> Path:
@@ -138,10 +140,10 @@ def dumps(config: Any) -> str:
     return toml_text.dumps(_without_none(to_dict(config)))
 
 
-def _is_default(field: dataclasses.Field, value: Any) -> bool:
+def _is_default(field: "dataclasses.Field[Any]", value: Any) -> bool:
     if field.default_factory is not dataclasses.MISSING:
-        return value == field.default_factory()
-    return field.default is not dataclasses.MISSING and value == field.default
+        return bool(value == field.default_factory())
+    return field.default is not dataclasses.MISSING and bool(value == field.default)
 
 
 def _plain(value: Any, defaults: bool) -> Any:
@@ -192,7 +194,7 @@ def _parse(schema: type, text: str, name: str, folder: Path, stack: tuple[Path, 
         raise ConfigError(f"{name}: no valid TOML: {error}") from None
     # A schema may itself have a field called "base"; then the word is an ordinary key.
     base = raw.pop(BASE_KEY, None) if BASE_KEY not in _schema.hints(schema) else None
-    tree = _schema.as_node(raw, name)
+    tree = _schema.as_table(raw, name)
     _include(schema, tree, folder, stack, "")
     if base is None:
         return tree

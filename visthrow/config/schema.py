@@ -235,9 +235,12 @@ def _build_scalar(annotation: Any, node: Leaf, path: str) -> Any:
 
 def as_node(value: Any, source: str) -> Leaf | Table:
     """Wrap a parsed TOML value, tables recursively."""
-    if isinstance(value, dict):
-        return Table(source, {key: as_node(item, source) for key, item in value.items()})
-    return Leaf(value, source)
+    return as_table(value, source) if isinstance(value, dict) else Leaf(value, source)
+
+
+def as_table(values: dict[str, Any], source: str) -> Table:
+    """Wrap a parsed TOML table, recursively."""
+    return Table(source, {key: as_node(item, source) for key, item in values.items()})
 
 
 def _wrong_type(annotation: Any, node: Leaf | Table, path: str) -> typing.NoReturn:

@@ -102,7 +102,7 @@ class Channel:
         Raises:
             LogError: If no sample is valid.
         """
-        known = np.flatnonzero(self.valid)
+        known = np.flatnonzero(np.asarray(self.valid))
         if not len(known):
             raise LogError("no sample of the channel is valid")
         at = np.searchsorted(self.time[known], np.asarray(time, dtype=float), side="right") - 1
@@ -159,7 +159,7 @@ class FlightLog:
         except (TypeError, ValueError) as error:
             raise LogError(f"the metadata holds what JSON cannot: {error}") from error
         for name, channel in self.channels.items():
-            arrays |= {f"{name}/time": channel.time, f"{name}/values": channel.values, f"{name}/valid": channel.valid}
+            arrays |= {f"{name}/time": channel.time, f"{name}/values": channel.values, f"{name}/valid": np.asarray(channel.valid)}
         savez(path, arrays)
 
     @staticmethod

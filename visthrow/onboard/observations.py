@@ -24,6 +24,7 @@ The rotation is the first two columns of rot_wb (Zhou et al., CVPR 2019), column
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -64,7 +65,7 @@ class Layout:
         return beside + self.row * (1 + self.history) + 1 + self.motion
 
 
-def layout_of(params) -> Layout:
+def layout_of(params: Any) -> Layout:
     """Layout of :class:`visthrow.task.ObservationParams` (or anything with its fields).
 
     Raises:
@@ -107,7 +108,8 @@ def rotation_from_quat(quat: Tensor) -> Tensor:
     products = quat.unsqueeze(-1) * (quat + quat).unsqueeze(-2)  # of all pairs at once
     xx, xy, xz, _, _, yy, yz, _, _, _, zz, _, wx, wy, wz, _ = products.flatten(-2).unbind(-1)
     rows = [1 - (yy + zz), xy - wz, xz + wy, xy + wz, 1 - (xx + zz), yz - wx, xz - wy, yz + wx, 1 - (xx + yy)]
-    return torch.stack(rows, -1).unflatten(-1, (3, 3))
+    rot_wb: Tensor = torch.stack(rows, -1).unflatten(-1, (3, 3))
+    return rot_wb
 
 
 def vehicle_part(pos_w: Tensor, vel_w: Tensor, rate_b: Tensor, rot_wb: Tensor) -> Tensor:
@@ -121,7 +123,8 @@ def state_part(pos_w: Tensor, goal_w: Tensor, payload_w: Tensor) -> Tensor:
 
 
 def vision_part(
-    camera: KeypointCamera, pos_w: Tensor, rot_wb: Tensor, goal_w: Tensor, payload_w: Tensor, extrinsics=None
+    camera: KeypointCamera, pos_w: Tensor, rot_wb: Tensor, goal_w: Tensor, payload_w: Tensor,
+    extrinsics: tuple[Tensor, Tensor] | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Goal and payload of a vision frame.
 
@@ -157,8 +160,8 @@ def observe(
         Observation, shape (E, layout.dimension), and the new history.
     """
     goal_end = VEHICLE + layout.goal
-    bits = [valid.to(frame.dtype)] if layout.validity else []
-    moving = [goal_vel_w] if layout.motion else []
+    bits = [valid.to(frame.dtype)] if layout.validity and valid is not None else []
+    moving = [goal_vel_w] if layout.motion and goal_vel_w is not None else []
     if layout.whole:
         history = push(history, torch.cat([frame, previous_action, *bits], dim=-1), fresh)
         return torch.cat([history.flatten(1), attached.unsqueeze(-1), *moving], dim=-1), history

@@ -16,11 +16,11 @@ from torch import Tensor
 from camera.keypoints import KeypointCamera
 from camera.params import CameraParams
 from visthrow import config
+from visthrow.common.constants import GRAVITY
 from visthrow.common.errors import PolicyError
 from visthrow.onboard import actions as act
 from visthrow.onboard import goal_motion
 from visthrow.onboard import observations as ob
-from visthrow.onboard.hover import GRAVITY
 from visthrow.onboard.policy import Policy
 from visthrow.onboard.traced import Traced
 
@@ -185,10 +185,11 @@ class Pilot:
 
     def _seen(self, views: Tensor, given: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
         """What `_observed` makes of a step's measurements and all that was before; ``given``: keypoints of a detector."""
-        carried = (self._previous, self._history, self._fresh)
+        carried: tuple[Tensor, ...] = (self._previous, self._history, self._fresh)
         if self.layout.motion:
             carried += (self._goal_fit, torch.full((self.count,), self._steps * self.period))
-        return (self._observe_given if given else self._observe)(views, *carried, *given)
+        observed: tuple[Tensor, ...] = (self._observe_given if given else self._observe)(views, *carried, *given)
+        return observed
 
     def _bridged(self, now: float, newest: Tensor) -> bool:
         """Make the history one of steps a period apart, as in training; whether steps before this one were late or missing.
@@ -241,13 +242,16 @@ class Pilot:
         seen = further[moving:]
         if not seen and self.camera is not None:
             seen = ob.vision_part(self.camera, pos, rot, goal, payload)
-        points, valid = seen or (None, None)
-        part = points.flatten(1) if self.layout.name == "vision" else ob.state_part(pos, goal, payload)
+        points, valid = (seen[0], seen[1]) if seen else (None, None)
+        part = ob.state_part(pos, goal, payload)
+        if points is not None and self.layout.name == "vision":
+            part = points.flatten(1)
         frame = torch.cat([ob.vehicle_part(pos, vel, rate, rot), part], dim=-1)
-        sums, velocity = (), None
+        sums: tuple[Tensor, ...] = ()
+        velocity = None
         if moving:
             place, weight = goal_motion.measured_goal(self.layout, frame, valid, self.camera)
-            fitted, velocity = goal_motion.fit(*further[:2], place, weight, fresh)
+            fitted, velocity = goal_motion.fit(further[0], further[1], place, weight, fresh)
             sums = (fitted,)
         observation, history = ob.observe(self.layout, frame, valid, previous, attached[:, 0], history, fresh, velocity)
         return observation, history, *sums, *seen

@@ -37,7 +37,7 @@ RELATIVE_TOLERANCE = 1e-9
 RSL_RL_EPS = 1e-2
 """What rsl_rl 5.5's EmpiricalNormalization adds to the standard deviation; it is not part of its state."""
 
-_ACTIVATIONS = {
+_ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
     "elu": F.elu,
     "selu": F.selu,
     "relu": F.relu,
@@ -97,7 +97,7 @@ class Policy:
     def total_mass(self) -> float:
         """Mass of the vehicle with all that hangs on it, by the contract [kg]."""
         rope = self.contract["rope"]
-        return self.contract["vehicle"]["body"]["mass"] + (rope["rope_mass"] + rope["payload_mass"])
+        return float(self.contract["vehicle"]["body"]["mass"] + (rope["rope_mass"] + rope["payload_mass"]))
 
     @torch.no_grad()
     def act(self, obs: Tensor) -> Tensor:
@@ -153,7 +153,7 @@ class Policy:
 
     def decide(self, x: Tensor) -> Tensor:
         """Action of the perceptron alone, shape (E, A), for what it looks at, shape (E, S); differentiable."""
-        if self.mean is not None:
+        if self.mean is not None and self.std is not None:
             x = (x - self.mean) / (self.std + self.eps)
         activation = _ACTIVATIONS[self.activation]
         for weight, bias in zip(self.weights[:-1], self.biases[:-1]):
@@ -167,8 +167,8 @@ class Policy:
             return None if tensor is None else tensor.to(device)
 
         return Policy(
-            tuple(map(move, self.weights)),
-            tuple(map(move, self.biases)),
+            tuple(weight.to(device) for weight in self.weights),
+            tuple(bias.to(device) for bias in self.biases),
             self.activation,
             self.contract,
             self.made_by,
@@ -228,9 +228,9 @@ class Policy:
             raise PolicyError(f"contract or made_by holds what JSON cannot: {error}") from error
         for i, (weight, bias) in enumerate(zip(self.weights, self.biases)):
             arrays[f"layer{i}_weight"], arrays[f"layer{i}_bias"] = weight.cpu().numpy(), bias.cpu().numpy()
-        if self.mean is not None:
+        if self.mean is not None and self.std is not None:
             arrays["normalizer_mean"], arrays["normalizer_std"] = self.mean.cpu().numpy(), self.std.cpu().numpy()
-            arrays["normalizer_eps"] = np.float64(self.eps)
+            arrays["normalizer_eps"] = np.array(self.eps)
         if self.estimator is not None:
             arrays |= {f"estimator_{field.name}": getattr(self.estimator, field.name).cpu().numpy() for field in fields(Estimator)}
         savez(path, arrays)
@@ -364,7 +364,7 @@ def _check_shapes(policy: Policy) -> None:
 
 def _header(array: np.ndarray, path: str | Path) -> dict[str, Any]:
     try:
-        header = from_json_array(array)
+        header: dict[str, Any] = from_json_array(array)
         version = header["format_version"]
     except (ValueError, KeyError, TypeError) as error:
         raise PolicyError(f"{path}: its header is not readable: {error!r}") from error

@@ -69,7 +69,7 @@ def _within(policy: Policy, experiment: Experiment) -> tuple[str, ...]:
     return ("observation.latency", "observation.latency_jitter") if jitter and inside else ()
 
 
-def _learning(policy: Policy) -> dict:
+def _learning(policy: Policy) -> dict[str, Any]:
     """Learning parameters of today's config: they play no part in flight, and an older policy may lack a newer one."""
     layout = policy.contract.get("observation", {}).get("layout", "state")
     return config.to_dict(config.load(Experiment, config.find("train", layout)).ppo)

@@ -78,7 +78,7 @@ class _Full(Recording):
         looked = self.pilots.eyes.seen if self.pilots.eyes is not None and throws else None
         points, valid = looked or self.pilots.pilots[0].see(seen.pos_w, seen.quat_wb, seen.payload_pos_w, self.pilots.goal_w)
         recorder.add(now.time, goal_w=self.pilots.goal_w[0], mode=int(throws), keypoints=points[0], keypoints_valid=valid[0])
-        if throws:
+        if sent.action is not None and sent.observation is not None:
             recorder.add(now.time, action=sent.action[0], observation=sent.observation[0])
         self.sample(flight)
 
@@ -96,8 +96,8 @@ class _Full(Recording):
     def _rope(self, flight: Flight) -> np.ndarray:
         """Rope now; after the landing it sinks to the ground instead of standing still as the plants leave it."""
         now, landing, before, period = flight.now, flight.plant.landing, self._before, flight.plant.period
-        if not landing.landed[0]:
-            return now.cable_points_w[0].copy()
+        if not landing.landed[0] or before is None:
+            return np.array(now.cable_points_w[0])
         if self._resting is None:
             age = max(landing.time[0] - before.time, 1e-3)
             points, ball = now.cable_points_w[0], now.payload_pos_w[0]
@@ -141,12 +141,12 @@ def fly(
     pilots = Policies([loaded], np.asarray(goal_w, dtype=float)[None], draws=True, eyes=eyes)
     recording = _Full(pilots, _meta(loaded, plant_name, goal_w, seed))
     flight = Flight(plant, pilots, recording, home)
-    hangs_still = _hovering(lambda now: np.linalg.norm(now.payload_vel_w[0]) < QUIET_SPEED, home, HOVER_LEAST, HOVER_MOST)
+    hangs_still = _hovering(lambda now: bool(np.linalg.norm(now.payload_vel_w[0]) < QUIET_SPEED), home, HOVER_LEAST, HOVER_MOST)
     flight.run([hangs_still, Phase(True, lambda flight: not np.any(flight.open & flight.now.attached))])
     recovery = plant.time
 
     def recovered(now: Snapshot) -> bool:  # the payload lies on the ground or hangs still
-        return np.linalg.norm(now.vel_w[0]) < QUIET_SPEED and (plant.landing.landed[0] or now.attached[0])
+        return bool(np.linalg.norm(now.vel_w[0]) < QUIET_SPEED and (plant.landing.landed[0] or now.attached[0]))
 
     flight.run([_hovering(recovered, home, 0.0, RECOVERY_MOST)])
     return _finished(flight, recording, recovery)
@@ -214,7 +214,7 @@ def _finished(flight: Flight, recording: _Full, recovery: float) -> FlightLog:
     recorder.meta |= {"times": times, "result": result}
     log = recorder.log()
     if "separation" in times:
-        payload, when = log["payload_pos_w"], np.array([times["separation"]])
-        at = np.column_stack([np.interp(when, payload.time, payload.values[:, i]) for i in range(3)])
-        log.channels["separation"] = Channel(when, at, "m", "world")
+        payload, begins = log["payload_pos_w"], np.array([times["separation"]])
+        at = np.column_stack([np.interp(begins, payload.time, payload.values[:, i]) for i in range(3)])
+        log.channels["separation"] = Channel(begins, at, "m", "world")
     return log
