@@ -84,7 +84,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         more = ", or its bundle" if name == "replay" else ""
         subs[name].add_argument("folder", metavar="FOLDER", help=f"of a run{more}")
     subs["view"].add_argument("--live", action="store_true", help="serve the run while it goes on, on 127.0.0.1 alone")
-    subs["view"].add_argument("--out", default=None, metavar="FILE", help="of the recording (default: run.rrd in the folder)")
+    out = "of the recording: .rrd (rerun) or .mcap (Foxglove); default: run.rrd in the folder"
+    subs["view"].add_argument("--out", default=None, metavar="FILE", help=out)
     subs["view"].add_argument("--web-port", type=int, default=9090, metavar="N", help="of the live view (default: 9090)")
     subs["view"].add_argument("--data-port", type=int, default=9876, metavar="N", help="of its data (default: 9876)")
     _add_simulated(subs["fake"], subs["direct"])

@@ -38,6 +38,22 @@ TRAIL = 300
 BODY_CHANNELS = {VEHICLE: "pos_w", PAYLOAD: "payload_pos_w"}
 
 
+class Attached:
+    """Tells of ticks in their order whether the payload hangs on the vehicle: until the release's lag is over."""
+
+    def __init__(self, playback: Playback) -> None:
+        self._lag = playback.runner.latch.lag
+        self._latch: float | None = None
+
+    def at(self, tick: Tick) -> bool:
+        """Whether it does at a tick."""
+        if tick.decision.release:
+            self._latch = tick.line["time"]
+        elif tick.decision.state == "armed":
+            self._latch = None
+        return self._latch is None or tick.line["time"] < self._latch + self._lag
+
+
 class Show:
     """Sends ticks to a stream of rerun."""
 
@@ -51,23 +67,18 @@ class Show:
         """
         from visthrow.view import rerun_view
 
-        self._stream, self._view, self._playback = stream, rerun_view, playback
+        self._stream, self._view = stream, rerun_view
         self._meta = meta_of(params, playback, provenance, start)
         self._samples = Samples(params, playback, self._meta)
         self._trails: dict[str, deque] = {name: deque(maxlen=TRAIL) for name in BODY_CHANNELS}
-        self._latch: float | None = None
+        self._attached = Attached(playback)
         self._said: list | None = None
         rerun_view.still(stream, self._meta["goal_w"], sizes(playback.runner.pilot))
 
     def take(self, ticks: list[Tick]) -> None:
         """Send some ticks, in order."""
-        lag = self._playback.runner.latch.lag
         for tick in ticks:
-            if tick.decision.release:
-                self._latch = tick.line["time"]
-            elif tick.decision.state == "armed":
-                self._latch = None
-            self._samples.add(tick, self._latch is None or tick.line["time"] < self._latch + lag)
+            self._samples.add(tick, self._attached.at(tick))
             for sample in tick.samples:
                 if sample.body in self._trails:
                     self._trails[sample.body].append(sample.pose.pos)
@@ -204,6 +215,20 @@ def write(folder: str | Path, path: str | Path) -> None:
             show.take(course.ticks[first : first + MOST_SHOWN // 10])
 
 
+def write_mcap(folder: str | Path, path: str | Path) -> None:
+    """Write a whole run as an MCAP file; errors as of :func:`write`, and `LogError` where the package mcap is not installed."""
+    from visthrow.view import mcap_view
+
+    course = read(folder)
+    meta = meta_of(course.params, course.playback, course.provenance, course.ticks[0].line["time"])
+    samples, attached = Samples(course.params, course.playback, meta), Attached(course.playback)
+    for tick in course.ticks:
+        samples.add(tick, attached.at(tick))
+    log = samples.flush()
+    log.meta["events"] = events(course.ticks)
+    mcap_view.write(path, log, sizes(course.playback.runner.pilot))
+
+
 def start_viewer(folder: Path) -> subprocess.Popen:
     """Start the live view of a run in a process of its own, at the lowest priority."""
     command = [sys.executable, "-m", "visthrow.cli", "hil", "view", str(folder), "--live"]
@@ -226,7 +251,11 @@ def run(folder: Path, live: bool, out: str | None, web_port: int, data_port: int
             while True:
                 time.sleep(1.0)
     path = Path(out) if out is not None else folder / "run.rrd"
-    write(folder, path)
-    print(f"{path}  the run in 3D, image plane and signals; open it with: rerun {path}")
+    if path.suffix == ".mcap":
+        write_mcap(folder, path)
+        print(f"{path}  the run in 3D, image plane and signals; open it with Foxglove")
+    else:
+        write(folder, path)
+        print(f"{path}  the run in 3D, image plane and signals; open it with: rerun {path}")
     print("\n".join(finish(folder)))
     return 0

@@ -20,7 +20,15 @@ class PolicyError(VisthrowError):
 
 
 class MismatchError(PolicyError):
-    """A policy was trained under other conditions than those it is to be used in."""
+    """A policy was trained under other conditions than those it is to be used in.
+
+    Attributes:
+        keys: of its contract that differ, dotted.
+    """
+
+    def __init__(self, message: str, keys: tuple[str, ...] = ()) -> None:
+        super().__init__(message)
+        self.keys = keys
 
 
 class LogError(VisthrowError):

@@ -206,7 +206,8 @@ class Policy:
             f"  {key}: trained with {_show(trained, key)}, here {_show(now, key)}" for key in differing if key not in allowed
         ]
         if refused:
-            raise MismatchError("the policy was trained under other conditions:\n" + "\n".join(refused))
+            keys = tuple(key for key in differing if key not in allowed)
+            raise MismatchError("the policy was trained under other conditions:\n" + "\n".join(refused), keys)
         return {key: now.get(key) for key in allowed}
 
     def save(self, path: str | Path) -> None:

@@ -43,6 +43,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--pixels", choices=("learnt", "contours"), help="keypoints by a detector from rendered pictures, in place of projected ones"
     )
     parser.add_argument("--out", default="out/fly", metavar="FOLDER", help="for the files (default: out/fly)")
+    parser.add_argument(
+        "--allow", action="append", default=[], metavar="KEY",
+        help="fly although the config breaks this part of the policy's contract, for instance rope.length; may be repeated",
+    )  # fmt: skip
+    parser.add_argument(
+        "--export", action="append", default=[], metavar="FILE",
+        help="also write the flight for other programs: .mcap (Foxglove), .parquet or .csv; may be repeated",
+    )  # fmt: skip
     add_common(parser)
 
 
@@ -59,7 +67,9 @@ def run(args: argparse.Namespace) -> int:
         raise ConfigError(f"no plant '{args.plant}'; {suggest(args.plant, PLANTS)}")
     if len(args.target) > 2:
         raise ConfigError(f"--target {' '.join(f'{x:g}' for x in args.target)}; expected a distance, or x and y")
-    loaded = load_policy(args.policy, args.config, args.overrides)
+    for path in args.export:
+        check_format(path)
+    loaded = load_policy(args.policy, args.config, args.overrides, args.allow)
     goal = [args.target[0], args.target[1] if len(args.target) == 2 else 0.0, 0.0]
     check_goal(loaded, goal)
     writable(Path(args.out))
@@ -77,6 +87,11 @@ def run(args: argparse.Namespace) -> int:
     if eyes is not None:
         paths.append(eyes.sheet(Path(args.out) / "pixels.png"))
     print(summary_text(log))
+    for key, value in loaded.departures.items():
+        print(f"flown with another {key} than trained with: {value}")
+    for path in args.export:
+        export(path, log, loaded.experiment)
+        print(f"{path}  the flight for other programs")
     for path in paths:
         print(f"{path}  {FILES[path.name]}")
     if args.json:
@@ -97,7 +112,34 @@ def write(folder: Path, log, experiment) -> list[Path]:
     return paths
 
 
+<<<<<<< HEAD
 def summary_text(log) -> str:
+=======
+def check_format(path: str) -> None:
+    """Refuse a file to export to whose ending no writer has.
+
+    Raises:
+        ConfigError: the message names the endings.
+    """
+    from visthrow.common.errors import ConfigError
+    from visthrow.logs.export import FORMATS
+
+    if Path(path).suffix not in (*FORMATS, ".mcap"):
+        raise ConfigError(f"--export {path}: ending '{Path(path).suffix}'; expected one of {', '.join((*FORMATS, '.mcap'))}")
+
+
+def export(path: str, log, experiment) -> None:
+    """Write a flight for other programs, by the ending of the path."""
+    from visthrow.logs import export as tables
+    from visthrow.view import mcap_view
+
+    if Path(path).suffix == ".mcap":
+        mcap_view.write(path, log, experiment)
+    else:
+        tables.export(log, path)
+
+
+def story(log) -> str:
     """What happened, in a few lines."""
     times, result, goal = log.meta["times"], log.meta["result"], log.meta["goal_w"]
     start = times["policy_start"]

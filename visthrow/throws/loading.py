@@ -7,7 +7,7 @@ from typing import Any
 
 from visthrow import config
 from visthrow.common import toml_text
-from visthrow.common.errors import PolicyError
+from visthrow.common.errors import MismatchError, PolicyError
 from visthrow.onboard.policy import Policy, find_policy
 from visthrow.task import Experiment, contract_of
 
@@ -56,7 +56,11 @@ def load_policy(
         experiment = config.loads(Experiment, text, overrides, name=f"{path} (the config it was trained with)")
     else:
         raise PolicyError(f"{path} does not carry the config it was trained with; name one with --config")
-    departures = policy.require(contract_of(experiment), allow=(*allow, *_within(policy, experiment)))
+    try:
+        departures = policy.require(contract_of(experiment), allow=(*allow, *_within(policy, experiment)))
+    except MismatchError as error:
+        allowing = " ".join(f"--allow {key}" for key in error.keys)
+        raise MismatchError(f"{error}\nto throw all the same (fly and compare take it): {allowing}", error.keys) from None
     return Loaded(path.stem if path.stem != "policy" else path.resolve().parent.name, policy, experiment, departures)
 
 

@@ -1,0 +1,83 @@
+"""A flight as MCAP, read back by the library's own reader; throws on another rope by allowance; tables beside it."""
+
+import base64
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from visthrow.cli import main
+from visthrow.logs.flightlog import FlightLog
+
+reader = pytest.importorskip("mcap.reader")
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory):
+    """Folder of one throw, exported to all formats."""
+    folder = tmp_path_factory.mktemp("flown")
+    exports = [word for ending in ("mcap", "parquet", "csv") for word in ("--export", str(folder / f"flight.{ending}"))]
+    assert main(["fly", "--device", "cpu", "--out", str(folder), "--target", "1.5", *exports]) == 0
+    return folder
+
+
+def messages(folder, topic: str) -> list[tuple[str, int, dict]]:
+    """Schema, log time [ns] and content of a topic's messages."""
+    with (folder / "flight.mcap").open("rb") as file:
+        found = reader.make_reader(file).iter_messages(topics=[topic])
+        return [(schema.name, message.log_time, json.loads(message.data)) for schema, _, message in found]
+
+
+def test_poses_and_commands_read_back_as_they_were_flown(flown):
+    log = FlightLog.load(flown / "flight.npz")
+    begin = min(channel.time[0] for channel in log.channels.values())
+    moved = messages(flown, "/tf")
+    assert {name for name, _, _ in moved} == {"foxglove.FrameTransform"}
+    places = [[content["translation"][axis] for axis in "xyz"] for _, _, content in moved]
+    np.testing.assert_array_equal(places, log["pos_w"].values)
+    np.testing.assert_allclose([1e-9 * stamp for _, stamp, _ in moved], log["pos_w"].time - begin, atol=1e-9)
+    turned = [[content["rotation"][axis] for axis in "xyzw"] for _, _, content in moved]
+    np.testing.assert_array_equal(turned, log["quat_wb"].values)
+    sent = [[c["thrust_n"], c["rate_x"], c["rate_y"], c["rate_z"]] for _, _, c in messages(flown, "/command")]
+    np.testing.assert_array_equal(sent, log["command"].values)
+
+
+def test_pictures_decode_and_show_keypoints(flown):
+    pictures = messages(flown, "/camera/keypoints")
+    assert {name for name, _, _ in pictures} == {"foxglove.CompressedImage"}
+    assert len(pictures) > 50
+    image = cv2.imdecode(np.frombuffer(base64.b64decode(pictures[40][2]["data"]), np.uint8), cv2.IMREAD_COLOR)
+    assert image.shape == (640, 640, 3)
+    green = (image[..., 1] > 150) & (image[..., 2] < 110)
+    assert green.sum() > 20, "the goal's corners"
+
+
+def test_every_channel_is_there_with_its_unit_and_schema(flown):
+    log = FlightLog.load(flown / "flight.npz")
+    with (flown / "flight.mcap").open("rb") as file:
+        summary = reader.make_reader(file).get_summary()
+        file.seek(0)
+        about = {record.name: record.metadata for record in reader.make_reader(file).iter_metadata()}
+    topics = {channel.topic: channel for channel in summary.channels.values()}
+    assert {f"/signals/{name}" for name in log.channels} <= set(topics)
+    assert topics["/signals/pos_w"].metadata == {"unit": "m", "frame": "world"}
+    for schema in summary.schemas.values():
+        assert schema.encoding == "jsonschema"
+        assert json.loads(schema.data)["type"] == "object"
+    assert json.loads(about["flight"]["policy"]) == "vision"
+
+
+def test_tables_beside_it_and_an_ending_that_no_writer_has(flown, tmp_path, capsys):
+    assert (flown / "flight.csv").read_text().startswith("time [s],")
+    assert (flown / "flight.parquet").stat().st_size > 0
+    assert main(["fly", "--out", str(tmp_path), "--export", "flight.xyz"]) == 2
+    assert "'.xyz'; expected one of .csv, .parquet, .mcap" in capsys.readouterr().err
+
+
+def test_fly_allows_another_rope_when_asked(tmp_path, capsys):
+    words = ["fly", "--policy", "state", "--device", "cpu", "--out", str(tmp_path), "--set", "rope.length=0.4"]
+    assert main(words) == 2
+    assert "--allow rope.length" in capsys.readouterr().err
+    assert main([*words, "--allow", "rope.length"]) == 0
+    assert "flown with another rope.length than trained with: 0.4" in capsys.readouterr().out
