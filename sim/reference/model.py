@@ -75,14 +75,18 @@ def _add_joints(body: "mujoco.MjsBody", index: int, joints: str, damping: float,
         joint.armature = armature
 
 
-def _new_spec(gravity: float) -> "mujoco.MjSpec":
+def new_spec(gravity: float, constraints: bool = False) -> "mujoco.MjSpec":
+    """An empty model without contacts, and without other constraints unless they are asked for."""
     spec = mujoco.MjSpec()
     spec.option.gravity = [0.0, 0.0, -gravity]
-    spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT) | int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+    spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+    if not constraints:
+        spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
     return spec
 
 
-def _add_vehicle(spec: "mujoco.MjSpec", rope: RopeModel) -> "mujoco.MjsBody":
+def add_vehicle(spec: "mujoco.MjSpec", rope: RopeModel) -> "mujoco.MjsBody":
+    """The quadrotor on a free joint, with actuators for force and torque in its own frame."""
     vehicle = spec.worldbody.add_body(name="vehicle")
     vehicle.add_freejoint(name="root")
     _set_inertial(vehicle, rope.mass, 0.0, rope.inertia)
@@ -113,20 +117,20 @@ def build_attached(
     Returns:
         Compiled model with the bodies ``vehicle``, ``rod0`` .. and, with ``stretch``, ``payload``.
     """
-    spec = _new_spec(rope.gravity)
-    parent, anchor = _add_vehicle(spec, rope), list(rope.mount)
-    _add_chain(spec, rope, parent, anchor, joints, armature, stretch, free_root=False)
+    spec = new_spec(rope.gravity)
+    parent, anchor = add_vehicle(spec, rope), list(rope.mount)
+    add_chain(spec, rope, parent, anchor, joints, armature, stretch, free_root=False)
     return spec.compile()
 
 
 def build_free(rope: RopeModel, stretch: tuple[float, float] | None = None) -> "mujoco.MjModel":
     """Build the rope and the payload alone: first rod on a free joint, ball joints below."""
-    spec = _new_spec(rope.gravity)
-    _add_chain(spec, rope, spec.worldbody, [0.0, 0.0, 0.0], "ball", 0.0, stretch, free_root=True)
+    spec = new_spec(rope.gravity)
+    add_chain(spec, rope, spec.worldbody, [0.0, 0.0, 0.0], "ball", 0.0, stretch, free_root=True)
     return spec.compile()
 
 
-def _add_chain(
+def add_chain(
     spec: "mujoco.MjSpec",
     rope: RopeModel,
     parent: "mujoco.MjsBody",
@@ -135,10 +139,12 @@ def _add_chain(
     armature: float,
     stretch: tuple[float, float] | None,
     free_root: bool,
-) -> None:
+    load: bool = True,
+) -> "mujoco.MjsBody":
+    """Rods, the last with the payload (``load``) or without; returns the last body. See :func:`build_attached`."""
     for i in range(rope.segments):
         rod = parent.add_body(name=f"rod{i}", pos=anchor)
-        mass, centre, inertia = _rod_inertial(rope, i == rope.segments - 1, stretch is None, AXIAL_INERTIA)
+        mass, centre, inertia = _rod_inertial(rope, i == rope.segments - 1, load and stretch is None, AXIAL_INERTIA)
         if joints == "ball":
             # Without twist in the joints the axial inertia enters nothing; this one keeps the mass matrix well scaled.
             inertia = (inertia[0], inertia[1], inertia[0])
@@ -148,9 +154,13 @@ def _add_chain(
         else:
             _add_joints(rod, i, joints, rope.joint_damping, armature)
         parent, anchor = rod, [0.0, 0.0, -rope.segment_length]
+    if stretch is None and load:
+        parent.add_site(name="payload", pos=[0.0, 0.0, -rope.segment_length - rope.payload_offset])
     if stretch is not None:
         payload = parent.add_body(name="payload", pos=[0.0, 0.0, -rope.segment_length - rope.payload_offset])
         _set_inertial(payload, rope.payload_mass, 0.0, (rope.payload_inertia,) * 3)
         slide = payload.add_joint(name="stretch", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 0, -1])
         slide.stiffness[0] = stretch[0]
         slide.damping[0] = stretch[1]
+        return payload
+    return parent
