@@ -71,6 +71,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except ModuleNotFoundError as error:
+        if hider := _hidden(error):
+            return _refuse(f"{hider} hides visthrow's own package of that name; rename it, or run the command from another folder")
         extra = _EXTRAS.get((error.name or "").split(".")[0])
         if extra is None:
             raise
@@ -79,6 +81,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         if os.environ.get(TRACEBACK_VARIABLE):
             raise
         return _refuse(str(error) or type(error).__name__)
+
+
+def _hidden(error: ModuleNotFoundError) -> str | None:
+    """File of a foreign module or package that stands where one of ours is looked for, as a ``camera.py`` in the working folder."""
+    name = (error.name or "").partition(".")[0]
+    found = sys.modules.get(name)
+    here = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
+    place = getattr(found, "__file__", None)
+    if name not in ("camera", "sim", "hil") or place is None or os.path.abspath(place).startswith(os.path.join(here, name)):
+        return None
+    return str(place)
 
 
 def _refuse(message: str) -> int:

@@ -21,7 +21,7 @@ class GuardParams:
 
     def __post_init__(self) -> None:
         if min(self.slew_thrust, *self.slew_rate) <= 0.0:
-            raise ValueError(f"guard {vars(self)}: expected limits above 0")
+            raise ValueError(f"slew_thrust is {self.slew_thrust}, slew_rate {self.slew_rate}; expected limits above 0")
 
 
 class Guard:
@@ -72,9 +72,11 @@ class FenceParams:
     deceleration: float  # that the vehicle brakes with [m/s^2]
 
     def __post_init__(self) -> None:
-        boxes = ((self.vehicle_low, self.vehicle_high), (self.payload_low, self.payload_high))
-        if any(low >= high for box in boxes for low, high in zip(*box)) or self.deceleration <= 0.0:
-            raise ValueError(f"fence {vars(self)}: expected ascending corners and a deceleration above 0")
+        for body, lowest, highest in (("vehicle", self.vehicle_low, self.vehicle_high), ("payload", self.payload_low, self.payload_high)):
+            if any(low >= high for low, high in zip(lowest, highest)):
+                raise ValueError(f"{body}_low is {lowest} m, {body}_high {highest} m; expected ascending corners")
+        if not self.deceleration > 0.0:
+            raise ValueError(f"deceleration is {self.deceleration} m/s^2; expected a number above 0")
 
 
 def braking_point(state: BodyState, deceleration: float) -> Vector:

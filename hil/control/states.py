@@ -52,8 +52,9 @@ class StateParams:
     abort: float  # after which an aborted run ends
 
     def __post_init__(self) -> None:
-        if min(vars(self).values()) <= 0.0:
-            raise ValueError(f"states {vars(self)}: expected times above 0 s")
+        for name, value in vars(self).items():
+            if not value > 0.0:
+                raise ValueError(f"{name} is {value} s; expected a time above 0")
 
 
 @dataclass(frozen=True)

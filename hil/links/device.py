@@ -5,6 +5,7 @@ port. HOST is a numeric address; other than loopback ones only where the config 
 """
 
 import ipaddress
+import os
 import re
 import socket
 from dataclasses import dataclass
@@ -190,7 +191,8 @@ class SerialPort:
         try:
             self._port = serial.Serial(device.host, device.port, timeout=0, write_timeout=0)
         except (serial.SerialException, ValueError) as error:
-            raise LinkError(f"cannot open {device.host}: {error}") from error
+            number = getattr(error, "errno", None)  # pyserial's text names port and reason twice
+            raise LinkError(f"cannot open {device.host}: {os.strerror(number) if number else error}") from error
 
     def read(self) -> bytes | None:
         """See `Port`."""

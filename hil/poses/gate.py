@@ -52,8 +52,9 @@ class GateParams:
     abort: float  # content age [s]
 
     def __post_init__(self) -> None:
-        if min(vars(self).values()) <= 0.0:
-            raise ValueError(f"gate {vars(self)}: expected every limit above 0")
+        for name, value in vars(self).items():
+            if not value > 0.0:
+                raise ValueError(f"{name} is {value}; expected a number above 0")
         if not self.warn < self.hold < self.abort:
             raise ValueError(f"gate: warn {self.warn}, hold {self.hold}, abort {self.abort} s; expected them ascending")
 

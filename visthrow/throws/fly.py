@@ -69,6 +69,9 @@ def run(args: argparse.Namespace) -> int:
         raise ConfigError(f"--target {' '.join(f'{x:g}' for x in args.target)}; expected a distance, or x and y")
     for path in args.export:
         check_format(path)
+    for override in args.overrides:
+        if override.startswith("task.noise.command"):
+            raise ConfigError(f"--set {override}: fly sends commands as they are, without training's noise; compare throws with it")
     loaded = load_policy(args.policy, args.config, args.overrides, args.allow)
     goal = [args.target[0], args.target[1] if len(args.target) == 2 else 0.0, 0.0]
     check_goal(loaded, goal)
@@ -112,9 +115,6 @@ def write(folder: Path, log, experiment) -> list[Path]:
     return paths
 
 
-<<<<<<< HEAD
-def summary_text(log) -> str:
-=======
 def check_format(path: str) -> None:
     """Refuse a file to export to whose ending no writer has.
 
@@ -139,7 +139,7 @@ def export(path: str, log, experiment) -> None:
         tables.export(log, path)
 
 
-def story(log) -> str:
+def summary_text(log) -> str:
     """What happened, in a few lines."""
     times, result, goal = log.meta["times"], log.meta["result"], log.meta["goal_w"]
     start = times["policy_start"]

@@ -1,5 +1,6 @@
 """Flight logs made of run folders: channels, times, release and landing; the view of them, live and recorded."""
 
+import json
 import math
 import subprocess
 import sys
@@ -164,6 +165,22 @@ def test_the_recording_of_a_run_holds_all(run, tmp_path):
     for entity in ("/world/vehicle", "/world/ball", "/world/trail/ball", "/camera/goal", "/camera/payload", "/events",
                    "/camera/body_axes", "/signals/age/vehicle", "/signals/tick/observation", "/signals/phase/state"):  # fmt: skip
         assert entity in entities, entity
+
+
+def test_the_same_run_as_mcap(run, tmp_path, capsys):
+    """`hil view --out run.mcap`, read back by the library's own reader."""
+    reader = pytest.importorskip("mcap.reader")
+    assert view.run(run[0], False, str(tmp_path / "run.mcap"), 0, 0) == 0
+    assert "open it with Foxglove" in capsys.readouterr().out
+    found = {}
+    with (tmp_path / "run.mcap").open("rb") as file:
+        for schema, channel, message in reader.make_reader(file).iter_messages():
+            found.setdefault(channel.topic, []).append((schema.name, json.loads(message.data)))
+    assert found["/camera/keypoints"][0][0] == "foxglove.CompressedImage"
+    places = [tuple(content["pose"]["position"].values()) for _, content in found["/vehicle"]]
+    assert len(places) > 100
+    assert len(set(places)) > 100
+    assert any(content["message"].startswith("throw") for _, content in found["/events"])
 
 
 def stored_entities(path) -> str:

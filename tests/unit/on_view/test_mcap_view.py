@@ -81,3 +81,8 @@ def test_fly_allows_another_rope_when_asked(tmp_path, capsys):
     assert "--allow rope.length" in capsys.readouterr().err
     assert main([*words, "--allow", "rope.length"]) == 0
     assert "flown with another rope.length than trained with: 0.4" in capsys.readouterr().out
+
+
+def test_fly_refuses_a_switch_that_would_change_nothing(tmp_path, capsys):
+    assert main(["fly", "--out", str(tmp_path), "--set", "task.noise.command_step=0"]) == 2
+    assert "fly sends commands as they are" in capsys.readouterr().err

@@ -1,9 +1,11 @@
 """The command line: quick help, one clear message for a mistake, exit statuses."""
 
+import os
 import subprocess
 import sys
 import time
 import types
+from pathlib import Path
 
 import pytest
 
@@ -12,6 +14,8 @@ from visthrow.common import arguments
 from visthrow.common.errors import ConfigError, DeviceError, VisthrowError, suggest
 from visthrow.config import kinds
 from visthrow.training import device
+
+ROOT = Path(__file__).resolve().parents[3]
 
 HELP_BUDGET = 0.5
 """[s], bar of the project for ``visthrow --help``, interpreter start included; the best of a few runs counts."""
@@ -52,6 +56,16 @@ def test_help_is_quick_and_names_every_command():
     assert all(name in result.stdout for name in cli.COMMANDS)
     assert "examples:" in result.stdout
     assert best < HELP_BUDGET
+
+
+def test_a_file_that_hides_a_package_of_ours_is_named(tmp_path):
+    """``python -m visthrow.cli`` looks into the working folder first; a user's ``camera.py`` lies there."""
+    (tmp_path / "camera.py").write_text("")
+    words = [sys.executable, "-m", "visthrow.cli", "config", "camera", "fisheye"]
+    result = subprocess.run(words, capture_output=True, text=True, cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT)})
+    assert result.returncode == 2
+    assert f"{tmp_path / 'camera.py'} hides visthrow's own package" in result.stderr
+    assert "Traceback" not in result.stderr
 
 
 def test_help_imports_nothing_heavy():
