@@ -1,4 +1,4 @@
-"""MuJoCo's bodies behind the seam (:class:`sim.reference.seam.Bodies`): the rope with a ball, a box on the rope, a box on two cables.
+"""MuJoCo's bodies behind the seam (:class:`sim.seam.Bodies`): the rope with a ball, a box on the rope, a box on two cables.
 
 MuJoCo C, batched by ``mujoco.batch``; integrator RK4. Other payloads are other models: a ``vehicle`` on a free joint with the six
 actuators of :mod:`sim.reference.model`, and a site ``payload``.
@@ -11,7 +11,7 @@ import numpy as np
 from mujoco.batch import Batch
 
 from sim.reference.model import RopeModel, add_chain, add_vehicle, new_spec
-from sim.reference.seam import Root
+from sim.reference.state import Root
 
 ROPE_STEP = 5e-4
 """Step at which the hard throw has converged [s]: half of it moves nothing by a micrometre; at 1 ms RK4 is 34 mm off, at 2 ms unstable."""

@@ -9,7 +9,7 @@ from dataclasses import MISSING, fields, replace
 import numpy as np
 
 from sim.params import GRAVITY, PlantParams
-from sim.reference import blocks, payload
+from sim.reference import blocks
 from sim.reference.extras import ReferenceExtras
 from sim.reference.model import RopeModel
 from sim.reference.quadrotor import BLOCKS, BODY, VehicleErrors, initial_blocks, rigid_body_rates, vehicle_rates
@@ -219,7 +219,7 @@ class ReferencePlant:
         rope = self._rope_of(state)
         root = self._upper_end(state)
         lift_w = rotation[:, :, 2] * thrust.sum(axis=1, keepdims=True)
-        drag_w = payload.force(
+        drag_w = blocks.payload_force(
             self.params.rope, self.extras.payload_drag, self._ropes.points(*root, rope)[2], wind_w, rope[0][:, -1], lift_w,
             self._attached,
         )  # fmt: skip
@@ -270,7 +270,7 @@ class ReferencePlant:
         self._queue_commands.append(np.broadcast_to(np.asarray(command, dtype=np.float64), (self.count, 4)).copy())
         lag = self.params.release.lag
         if self.params.release.lag_tension:
-            lag = payload.lag(self.params.release, self._pull(), self._payload_mass)
+            lag = blocks.release_lag(self.params.release, self._pull(), self._payload_mass)
         lag = lag + extras.release_lag_jitter * rng.uniform(-1.0, 1.0, self.count)
         tripped = np.broadcast_to(np.asarray(release, dtype=bool), (self.count,)) & ~self._latched
         self._separation = np.where(tripped, start + np.maximum(lag, 0.0), self._separation)
@@ -318,7 +318,7 @@ class ReferencePlant:
         due = self._attached & (self._separation <= clock + blocks.TIME_TOLERANCE)
         if np.any(due):
             pos, vel = self._upper_end(self._state)
-            vel = vel + payload.kick(self.params.release, self._rope_of(self._state)[0][:, -1])
+            vel = vel + blocks.release_kick(self.params.release, self._rope_of(self._state)[0][:, -1])
             self._state[due, BODY + BLOCKS : BODY + BLOCKS + 6] = np.hstack((pos, vel))[due]
             self._attached = self._attached & ~due
 

@@ -1,6 +1,7 @@
 """What any plant says of its vehicles: their state at one time, and where their payloads came down."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -34,3 +35,12 @@ class Landings:
     point_w: np.ndarray  # of the payload's centre [m], shape (E, 3)
     time: np.ndarray  # [s], shape (E,)
     separation_time: np.ndarray  # [s], shape (E,)
+
+
+class Root(NamedTuple):
+    """Kinematics of E vehicles' centres of mass; world frame, quaternions xyzw."""
+
+    pos_w: np.ndarray  # [m], shape (E, 3)
+    quat_wb: np.ndarray  # shape (E, 4)
+    vel_w: np.ndarray  # [m/s], shape (E, 3)
+    rate_b: np.ndarray  # [rad/s], body frame, shape (E, 3)

@@ -8,10 +8,9 @@ import pytest
 
 from sim.reference.bodies import CABLE_STEP, MujocoBodies, rope_and_ball, rope_and_box, two_cables
 from sim.reference.oracle import initial_data, rope_from_scene
-from sim.reference.scene import load_scene
-from sim.reference.seam import SeamSim
-from sim.seam import FusedChain
+from sim.seam import FusedChain, SeamSim
 from tests.plants import SCENES, paper_plant
+from tests.scenes import load_scene
 from tests.simulators import scene_plant
 from visthrow.onboard.hover import HoverController, HoverParams
 
