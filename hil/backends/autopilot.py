@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from hil.backends.audit import Audit, Rule
-from hil.backends.base import FOLLOW, HOLD, LAND, WAIT, Release, Status
+from hil.backends.base import FOLLOW, HOLD, LAND, WAIT, Release, Releasing, Status
 from hil.backends.thrust import ThrustParams
 from hil.links.mavlink_link import Link, attitude_target
 from hil.links.pymav import mav
@@ -67,7 +67,7 @@ class AutopilotParams:
             )
 
 
-class MavlinkAutopilot:
+class MavlinkAutopilot(Releasing):
     """See `hil.backends.base.Backend`; the children say which modes there are and what the parameters must be.
 
     Attributes:
@@ -256,18 +256,6 @@ class MavlinkAutopilot:
             self._asked_at = now
             self._command(mav.MAV_CMD_COMPONENT_ARM_DISARM, 0, 1.0)
 
-    def release(self, when: float) -> None:
-        """See `Backend`."""
-        self.release_record.start(when)
-
-    def stop_release(self) -> None:
-        """See `Backend`."""
-        self.release_record.stop()
-
-    def rearm(self) -> None:
-        """See `Backend`."""
-        self.release_record.reset()
-
     def service(self, now: float) -> None:
         """See `Backend`."""
         if now - self._beat_at >= 1.0:
@@ -282,10 +270,6 @@ class MavlinkAutopilot:
         if self.release_record.due(now):
             number, values = self._release_command()
             self._command(number, self.release_record.sends - 1, *values)
-
-    def due(self) -> float | None:
-        """See `Backend`."""
-        return self.release_record.at
 
     def abort(self, now: float) -> None:
         """See `Backend`."""

@@ -4,6 +4,8 @@ from dataclasses import dataclass
 from time import perf_counter
 from typing import Any, Protocol
 
+from hil.links.device import Port
+
 IDLE, PENDING, ACCEPTED, FAILED = "idle", "pending", "accepted", "failed"
 """How far a release has come."""
 
@@ -149,6 +151,63 @@ class Release:
 
     def _end(self, state: str, note: str) -> None:
         self.state, self.note, self.at = state, note, None
+
+
+class Releasing:
+    """What back-ends do alike whose release is a `Release`; see `Backend`.
+
+    Attributes:
+        release_record: of this throw.
+    """
+
+    release_record: Release
+
+    def release(self, when: float) -> None:
+        """See `Backend`."""
+        self.release_record.start(when)
+
+    def stop_release(self) -> None:
+        """See `Backend`."""
+        self.release_record.stop()
+
+    def rearm(self) -> None:
+        """See `Backend`."""
+        self.release_record.reset()
+
+    def due(self) -> float | None:
+        """See `Backend`."""
+        return self.release_record.at
+
+
+class OnPort(Releasing):
+    """A flight controller on a port of its own that neither holds nor lands by itself: it is taken, and given up by silence.
+
+    Attributes:
+        dropped: packets that could not be sent.
+    """
+
+    holds = False
+
+    def __init__(self, port: Port) -> None:
+        """Take an open port."""
+        self._port, self.dropped = port, 0
+        self._taken = self._raised = self._over = False  # asked for; has followed; over
+
+    def ask(self, mode: str, now: float) -> None:
+        """See `Backend`: takes the vehicle."""
+        self._taken |= mode == FOLLOW
+
+    def abort(self, now: float) -> None:
+        """See `Backend`: nothing to ask for; where the runner falls silent, the vehicle's own failsafe or watchdog acts."""
+
+    def close(self) -> None:
+        """See `Backend`."""
+        self._port.close()
+
+    def _put(self, data: bytes) -> bool:
+        taken = self._port.write(data)
+        self.dropped += not taken
+        return taken
 
 
 class DryRun:

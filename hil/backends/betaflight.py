@@ -19,11 +19,11 @@ from dataclasses import dataclass
 from typing import Any
 
 from hil.backends.audit import Audit, Rule, equal
-from hil.backends.base import ACCEPTED, FOLLOW, PENDING, WAIT, Release, Status
+from hil.backends.base import ACCEPTED, FOLLOW, PENDING, WAIT, OnPort, Release, Status
 from hil.backends.rates import MIDDLE, RATES_TYPES, RatesParams, Sticks
 from hil.backends.thrust import ThrustParams
 from hil.links import msp
-from hil.links.device import MOST_CHUNKS, Port
+from hil.links.device import Port, chunks
 
 BOX_ARM, BOX_OVERRIDE = 0, 50
 """Permanent ids of flight modes."""
@@ -103,7 +103,7 @@ class BetaflightParams:
             )
 
 
-class Betaflight:
+class Betaflight(OnPort):
     """See `hil.backends.base.Backend`.
 
     Attributes:
@@ -112,7 +112,6 @@ class Betaflight:
     """
 
     name = "betaflight"
-    holds = False
 
     def __init__(
         self, port: Port, params: BetaflightParams, write: bool = False, tell: Callable[[str], None] | None = None
@@ -125,7 +124,8 @@ class Betaflight:
             write: whether wrong rates are written.
             tell: is handed the table of settings.
         """
-        self.params, self._port, self.parser = params, port, msp.Parser()
+        super().__init__(port)
+        self.params, self.parser = params, msp.Parser()
         self.sticks = Sticks(params.rates)
         self.release_record = Release(params.release_timeout, params.servo_output > 0)
         rules = self._rules() if params.audit else ()
@@ -137,12 +137,11 @@ class Betaflight:
         self._heard = self._framed = self._boxed = self._read_back = -1e9
         self._flags = self._blocks = 0
         self._free_since: float | None = None  # since when nothing speaks against arming, with ARM low
-        self._taken = self._over = self._raised = False  # asked for; over; has followed
         self._sticks_us = (MIDDLE, MIDDLE, MIDDLE, LOW)  # roll, pitch, yaw, throttle
         self._opened: float | None = None
         self.share: float | None = None
         self.voltage: float | None = None
-        self.refused = self.dropped = 0
+        self.refused = 0
 
     def _rules(self) -> list[Rule]:
         p = self.params
@@ -238,24 +237,15 @@ class Betaflight:
             return False
         return self._box(BOX_ARM) or (self._free_since is not None and now - self._free_since >= ARM_LOW)
 
-    def ask(self, mode: str, now: float) -> None:
-        """See `Backend`: takes the vehicle; it neither holds nor lands by itself."""
-        if mode == FOLLOW:
-            self._taken = True
-
-    def release(self, when: float) -> None:
-        """See `Backend`."""
-        self.release_record.start(when)
-
     def stop_release(self) -> None:
         """See `Backend`: a channel that was not read back goes back, so that nothing opens later."""
-        self.release_record.stop()
+        super().stop_release()
         if self.release_record.state != ACCEPTED:
             self._opened = None
 
     def rearm(self) -> None:
         """See `Backend`."""
-        self.release_record.reset()
+        super().rearm()
         self._opened = None
 
     def service(self, now: float) -> None:
@@ -285,13 +275,6 @@ class Betaflight:
         if self.params.arm_channel and not self._taken and not self._over and now - self._framed >= KEEP_ALIVE:
             self._frame(now)
 
-    def due(self) -> float | None:
-        """See `Backend`."""
-        return self.release_record.at
-
-    def abort(self, now: float) -> None:
-        """See `Backend`: nothing to ask for; where the runner falls silent, the flight controller's failsafe acts."""
-
     def finish(self, now: float) -> None:
         """See `Backend`: disarms where the arming channel is ours."""
         self._over = True
@@ -299,20 +282,11 @@ class Betaflight:
         if self.params.arm_channel:
             self._frame(now)
 
-    def close(self) -> None:
-        """See `Backend`."""
-        self._port.close()
-
     def _write(self, command: int, payload: bytes = b"") -> bool:
-        taken = self._port.write(msp.pack(msp.Frame(command, payload)))
-        self.dropped += not taken
-        return taken
+        return self._put(msp.pack(msp.Frame(command, payload)))
 
     def _pump(self, now: float) -> None:
-        for _ in range(MOST_CHUNKS):
-            data = self._port.read()
-            if data is None:
-                return
+        for data in chunks(self._port):
             for frame in self.parser.parse(data):
                 if frame.direction == msp.ANSWER:
                     self._hear(frame, now)

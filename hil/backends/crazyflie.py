@@ -11,10 +11,10 @@ Source: crazyflie-firmware, crtp_commander_rpyt.c, commander.c (COMMANDER_WDT_TI
 import math
 from dataclasses import dataclass
 
-from hil.backends.base import ACCEPTED, FOLLOW, PENDING, WAIT, Release, Status
+from hil.backends.base import ACCEPTED, FOLLOW, PENDING, WAIT, OnPort, Release, Status
 from hil.backends.thrust import ThrustParams
 from hil.links import crtp
-from hil.links.device import MOST_CHUNKS, Port
+from hil.links.device import Port, chunks
 from hil.poses.pose import VEHICLE
 from hil.poses.track import Track
 
@@ -57,23 +57,22 @@ class CrazyflieParams:
             raise ValueError(f"crazyflie.release_parameter '{self.release_parameter}'; expected group.name of at most 25 letters")
 
 
-class Crazyflie:
+class Crazyflie(OnPort):
     """See `hil.backends.base.Backend`.
 
     Attributes:
-        release_record: of this throw. poses: that went to its estimator. dropped: packets that could not be sent.
+        release_record: of this throw. poses: that went to its estimator.
     """
 
     name = "crazyflie"
-    holds = False
 
     def __init__(self, port: Port, params: CrazyflieParams) -> None:
         """Speak CRTP on an open port."""
-        self.params, self._port = params, port
+        super().__init__(port)
+        self.params = params
         self.release_record = Release(params.release_timeout)
-        self.poses = self.dropped = 0
+        self.poses = 0
         self._state, self._heard = 0, -1e9
-        self._taken = self._raised = self._over = False
         self._told: dict[str, bool] = dict.fromkeys(MODES, False)  # whether its answer came
         self._asked = self._sent = self._set = -1e9
 
@@ -101,7 +100,7 @@ class Crazyflie:
         """Hand a pose of the vehicle to its estimator, as it was taken; for `Runner.watcher`."""
         pose = track.sample()[0]
         if body == VEHICLE and self.params.external_pose and pose.quat is not None:
-            self.poses += self._write(crtp.external_pose(pose.pos, pose.quat))
+            self.poses += self._put(crtp.external_pose(pose.pos, pose.quat))
 
     def send(self, command: tuple[float, ...], now: float) -> bool:
         """See `Backend`."""
@@ -110,71 +109,40 @@ class Crazyflie:
         share = self.params.thrust.share(thrust) if armed else 0.0
         x, y, z = (math.degrees(rate) for rate in rates)
         self._sent = now
-        return self._write(crtp.set_point(round(FULL * share), (x, y, z) if armed else (0.0, 0.0, 0.0)))
-
-    def ask(self, mode: str, now: float) -> None:
-        """See `Backend`: takes the vehicle; it neither holds nor lands by itself."""
-        self._taken |= mode == FOLLOW
-
-    def release(self, when: float) -> None:
-        """See `Backend`."""
-        self.release_record.start(when)
-
-    def stop_release(self) -> None:
-        """See `Backend`."""
-        self.release_record.stop()
+        return self._put(crtp.set_point(round(FULL * share), (x, y, z) if armed else (0.0, 0.0, 0.0)))
 
     def rearm(self) -> None:
         """See `Backend`: the mechanism closes, so that the next payload can be hung on."""
-        self.release_record.reset()
-        self._write(crtp.set_parameter(self.params.release_parameter, 0))
+        super().rearm()
+        self._put(crtp.set_parameter(self.params.release_parameter, 0))
 
     def service(self, now: float) -> None:
         """See `Backend`."""
         self._pump(now)
         if now - self._asked >= ASK:
             self._asked = now
-            self._write(crtp.ask_state())
+            self._put(crtp.ask_state())
         if now - self._set >= SET_AGAIN:
             self._set = now
             for name, told in self._told.items():
                 if not told:
-                    self._write(crtp.set_parameter(name, 0))
+                    self._put(crtp.set_parameter(name, 0))
             ready = self._taken and not self._over and all(self._told.values())
             if ready and not self._state & crtp.ARMED and not self._raised:
-                self._write(crtp.arm(True))
+                self._put(crtp.arm(True))
         if self.release_record.due(now):
-            self._write(crtp.set_parameter(self.params.release_parameter, 1))
+            self._put(crtp.set_parameter(self.params.release_parameter, 1))
         if now - self._sent >= KEEP_ALIVE and not self._raised and not self._over:
             self.send((0.0, 0.0, 0.0, 0.0), now)  # without thrust: unlocks it
-
-    def due(self) -> float | None:
-        """See `Backend`."""
-        return self.release_record.at
-
-    def abort(self, now: float) -> None:
-        """See `Backend`: nothing to ask for; where the runner falls silent, the commander's watchdog acts."""
 
     def finish(self, now: float) -> None:
         """See `Backend`: motors off."""
         self._over = True
-        self._write(crtp.set_point(0, (0.0, 0.0, 0.0)))
-        self._write(crtp.arm(False))
-
-    def close(self) -> None:
-        """See `Backend`."""
-        self._port.close()
-
-    def _write(self, data: bytes) -> bool:
-        taken = self._port.write(data)
-        self.dropped += not taken
-        return taken
+        self._put(crtp.set_point(0, (0.0, 0.0, 0.0)))
+        self._put(crtp.arm(False))
 
     def _pump(self, now: float) -> None:
-        for _ in range(MOST_CHUNKS):
-            data = self._port.read()
-            if data is None:
-                return
+        for data in chunks(self._port):
             packet = crtp.unpack(data)
             if packet is not None:
                 self._hear(packet, now)

@@ -11,6 +11,7 @@ import numpy as np
 from hil.backends.thrust import ThrustParams
 from hil.fakes.mocap import SLACK, Mocap, MocapFault, MocapParams
 from hil.fakes.witness import Witness
+from hil.links.device import Port, chunks
 from hil.links.mavlink_link import Link
 from hil.links.pymav import mav
 from hil.links.roster import SIMULATED
@@ -333,3 +334,34 @@ class Fake:
     def close(self) -> None:
         """Give the ports back."""
         self.link.close()
+
+
+class PortFake(Fake):
+    """An autopilot whose commands come by a port of its own, beside the link of the motion capture."""
+
+    thrust_map = ThrustParams(2.668, 0.1906, 1.0, 0.1, 0.0)
+
+    def __init__(
+        self, plant: WirePlant, link: Link, mocap: MocapParams | None = None, seed: int = 0, options: Options | None = None,
+        port: Port | None = None,
+    ) -> None:  # fmt: skip
+        """See `Fake`; ``port`` is that commands come on."""
+        super().__init__(plant, link, mocap, seed, options)
+        self.port = port
+
+    def came(self, data: bytes) -> None:
+        """Take what came on the port."""
+        raise NotImplementedError
+
+    def hear(self) -> None:
+        """See `Fake`."""
+        for data in () if self.port is None else chunks(self.port):
+            self.heard = self.wall()
+            self.came(data)
+        super().hear()
+
+    def close(self) -> None:
+        """See `Fake`."""
+        super().close()
+        if self.port is not None:
+            self.port.close()

@@ -14,12 +14,8 @@ import numpy as np
 
 from hil.backends.betaflight import BOX_ARM, BOX_OVERRIDE, FORWARDING, HIGH, LOW, STICKS, TUNING
 from hil.backends.rates import RATES_TYPES, RatesParams, Sticks
-from hil.backends.thrust import ThrustParams
-from hil.fakes.base import Fake, Options, WirePlant
-from hil.fakes.mocap import MocapParams
+from hil.fakes.base import PortFake
 from hil.links import msp
-from hil.links.device import MOST_CHUNKS, Port
-from hil.links.mavlink_link import Link
 
 IDLE_AFTER, DISARM_AFTER = 0.36, 1.6
 """Silence after which the motors idle, and after which it disarms, with all channels by MSP [s]."""
@@ -42,23 +38,13 @@ ORDER = (0, 1, 3, 2)
 RELEASE_AUX, ARM_AUX, MINIMUM = 4, 1, 1050
 
 
-class FakeBetaflight(Fake):
+class FakeBetaflight(PortFake):
     """See the head of this module."""
 
-    thrust_map = ThrustParams(2.668, 0.1906, 1.0, 0.1, 0.0)
-
-    def __init__(
-        self, plant: WirePlant, link: Link, mocap: MocapParams | None = None, seed: int = 0, options: Options | None = None,
-        port: Port | None = None,
-    ) -> None:  # fmt: skip
-        """See `Fake`.
-
-        Args:
-            plant, link, mocap, seed, options: see `Fake`.
-            port: that MSP comes on.
-        """
-        super().__init__(plant, link, mocap, seed, options)
-        self.port, self.parser = port, msp.Parser()
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        """See `PortFake`; the port is that of MSP."""
+        super().__init__(*args, **kwargs)
+        self.parser = msp.Parser()
         if self.options.all_channels:
             self.armed = False
         tuning = {"rates_type": RATES_TYPES["actual"], "roll_rc_rate": 60, "pitch_rc_rate": 60, "yaw_rc_rate": 30,
@@ -80,17 +66,11 @@ class FakeBetaflight(Fake):
         three = ([int(p[f"{axis}_{what}"]) for axis in axes] for what in ("rc_rate", "rate", "expo"))
         self._sticks = Sticks(RatesParams(kinds[int(p["rates_type"])], *map(tuple, three)))
 
-    def hear(self) -> None:
-        """See `Fake`."""
-        for _ in range(MOST_CHUNKS):
-            data = None if self.port is None else self.port.read()
-            if data is None:
-                break
-            self.heard = self.wall()
-            for frame in self.parser.parse(data):
-                if frame.direction == msp.TO_CONTROLLER and not self.silent:
-                    self._hear(frame)
-        super().hear()
+    def came(self, data: bytes) -> None:
+        """See `PortFake`."""
+        for frame in self.parser.parse(data):
+            if frame.direction == msp.TO_CONTROLLER and not self.silent:
+                self._hear(frame)
 
     def _hear(self, frame: msp.Frame) -> None:
         answers: dict[int, Callable[[], bytes]] = {
@@ -238,9 +218,3 @@ class FakeBetaflight(Fake):
     def report(self) -> dict[str, Any]:
         """See `Fake`."""
         return {**super().report(), "override": self.override, "parameters": self.parameters}
-
-    def close(self) -> None:
-        """See `Fake`."""
-        super().close()
-        if self.port is not None:
-            self.port.close()

@@ -10,12 +10,8 @@ from typing import Any
 import numpy as np
 
 from hil.backends.crazyflie import FULL, MODES
-from hil.backends.thrust import ThrustParams
-from hil.fakes.base import Fake, Options, WirePlant
-from hil.fakes.mocap import MocapParams
+from hil.fakes.base import PortFake
 from hil.links import crtp
-from hil.links.device import MOST_CHUNKS, Port
-from hil.links.mavlink_link import Link
 
 LEVELS_AFTER, STOPS_AFTER = 0.5, 2.0
 """Silence of set-points [s]: COMMANDER_WDT_TIMEOUT_STABILIZE and _SHUTDOWN."""
@@ -26,41 +22,26 @@ LEAST = 1000
 ENOENT = 2
 
 
-class FakeCrazyflie(Fake):
+class FakeCrazyflie(PortFake):
     """See the head of this module.
 
     Attributes:
         placed: external poses that came, position [m] and attitude xyzw. parameters: values by name.
     """
 
-    thrust_map = ThrustParams(2.668, 0.1906, 1.0, 0.1, 0.0)
-
-    def __init__(
-        self, plant: WirePlant, link: Link, mocap: MocapParams | None = None, seed: int = 0, options: Options | None = None,
-        port: Port | None = None,
-    ) -> None:  # fmt: skip
-        """See `Fake`.
-
-        Args:
-            plant, link, mocap, seed, options: see `Fake`.
-            port: that CRTP comes on.
-        """
-        super().__init__(plant, link, mocap, seed, options)
-        self.port, self.armed = port, False
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        """See `PortFake`; the port is that of CRTP."""
+        super().__init__(*args, **kwargs)
+        self.armed = False
         self.parameters: dict[str, float] = {**dict.fromkeys(MODES, 1), "hook.open": 0, **self.options.parameters}
         self.placed: list[tuple[tuple[float, ...], tuple[float, ...]]] = []
         self._locked, self._heard, self._stopped = True, -math.inf, False
 
-    def hear(self) -> None:
-        """See `Fake`."""
-        for _ in range(MOST_CHUNKS):
-            data = None if self.port is None else self.port.read()
-            if data is None:
-                break
-            self.heard, packet = self.wall(), crtp.unpack(data)
-            if packet is not None and not self.silent:
-                self._hear(packet)
-        super().hear()
+    def came(self, data: bytes) -> None:
+        """See `PortFake`."""
+        packet = crtp.unpack(data)
+        if packet is not None and not self.silent:
+            self._hear(packet)
 
     def _hear(self, packet: crtp.Packet) -> None:
         place, data = (packet.port, packet.channel), packet.data
@@ -133,9 +114,3 @@ class FakeCrazyflie(Fake):
     def report(self) -> dict[str, Any]:
         """See `Fake`."""
         return {**super().report(), "poses": len(self.placed), "parameters": self.parameters}
-
-    def close(self) -> None:
-        """See `Fake`."""
-        super().close()
-        if self.port is not None:
-            self.port.close()

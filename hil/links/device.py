@@ -8,6 +8,7 @@ import ipaddress
 import os
 import re
 import socket
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -83,6 +84,15 @@ class Port(Protocol):
 
     def close(self) -> None:
         """Give the port back."""
+
+
+def chunks(port: Port) -> Iterator[bytes]:
+    """What has arrived at a port, at most `MOST_CHUNKS` chunks of it."""
+    for _ in range(MOST_CHUNKS):
+        data = port.read()
+        if data is None:
+            return
+        yield data
 
 
 class _SocketPort:
