@@ -16,8 +16,8 @@ from visthrow.throws.reference_protocol import Job, fly_batch
 from visthrow.view.eyes import Eyes
 
 SMALL = ["fresh=2", "pool=4", "reuse=1", "batch=2", "patches=8", "samples=1", "calibration=2"]
-NEAR = 0.01
-"""Of a keypoint that OpenCV finds on a clean picture from where it projects to [-]: 3 px of 320."""
+NEAR = {"contours": 0.01, "learnt": 0.015}
+"""Of a keypoint that is found on a clean picture from where it projects to [-]: 3 and 5 px of 320."""
 
 
 def train(folder, *words: str) -> int:
@@ -44,9 +44,10 @@ def test_a_training_is_resumed_and_leaves_weights(tmp_path, capsys):
     assert "no checkpoint to resume from" in capsys.readouterr().err
 
 
-def test_keypoints_of_a_picture_are_those_that_poses_project_to():
+@pytest.mark.parametrize("by", sorted(NEAR))
+def test_keypoints_of_a_picture_are_those_that_poses_project_to(by):
     camera = config.load(CameraParams, config.find("camera", "fisheye"))
-    eyes = Eyes(camera, 1, 3, by="contours", nuisances=Nuisances(*(0.0,) * 8), keep=True)
+    eyes = Eyes(camera, 1, 3, by=by, nuisances=Nuisances(*(0.0,) * 8), keep=True)
     zero = np.zeros((1, 3))
     now = SimpleNamespace(
         pos_w=np.array([[0.0, 0.0, 1.3]]), quat_wb=np.array([[0.0, 0.1, 0.0, 0.995]]), vel_w=zero, rate_b=zero,
@@ -61,7 +62,7 @@ def test_keypoints_of_a_picture_are_those_that_poses_project_to():
     tensors = torch.tensor(now.pos_w), rotation_from_quat(quat), torch.tensor(goal), torch.tensor(now.payload_pos_w)
     true, _ = keypoints(pilot, *tensors)
     assert valid.all()
-    assert np.abs(points - true.numpy()).max() < NEAR
+    assert np.abs(points - true.numpy()).max() < NEAR[by]
     assert eyes.found == {"ball": 1, "goal": 1, "frames": 1}
     with pytest.raises(ValueError, match="expected one of learnt, contours"):
         Eyes(camera, 1, 0, by="magic")
