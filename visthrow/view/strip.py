@@ -91,7 +91,7 @@ def draw(path: str | Path, log: FlightLog, camera: CameraParams) -> None:
 def _headline(log: FlightLog) -> str:
     result, goal = log.meta["result"], log.meta["goal_w"]
     return (
-        f"{log.meta['policy'].capitalize()} policy, target {np.hypot(goal[0], goal[1]):.1f} m: the ball lands "
+        f"Policy {log.meta['policy']}, target {np.hypot(goal[0], goal[1]):.1f} m: the ball lands "
         f"{100 * result['error']:.1f} cm from it, {result['duration']:.2f} s after the start"
     )
 
