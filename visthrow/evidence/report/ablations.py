@@ -44,8 +44,8 @@ def section(thrown: ResultSet) -> Section:
         Text("Each policy was trained with one component of the simulator removed and otherwise the same recipe, then flown "
              "without retraining on the full reference plants at 2.0 m: other code and noise, the same equations, so that policies land "
              "nearer there than in training. They stand in for a vehicle and are none. The ratio is its mean landing error over that of "
-             "the full model trained alike; intervals draw trainings first and throws within them where there are several trainings (seeds). "
-             "The paper's ratios come from five throws a variant of a real vehicle.")
+             "the full model trained alike; intervals draw trainings first and throws within them where there are several "
+             "trainings (seeds). The paper's ratios come from five throws a variant of a real vehicle.")
     ]  # fmt: skip
     marks, missing, said = [], [], []
     for layout in ("state", "vision"):
