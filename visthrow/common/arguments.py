@@ -35,6 +35,11 @@ def add_common(parser: argparse.ArgumentParser, *, device: bool = True, json: bo
         parser.add_argument("--json", metavar="FILE", help="write the printed figures to this file as well")
 
 
+def add_out(parser: argparse.ArgumentParser, default: str, what: str) -> None:
+    """Add ``--out``: the folder of what a command writes."""
+    parser.add_argument("--out", default=default, metavar="FOLDER", help=f"{what} (default: {default})")
+
+
 def add_commands(parser: argparse.ArgumentParser, commands: Commands, dest: str, **group: Any) -> None:
     """Add commands, of which one must be chosen; its name goes to ``args.<dest>``."""
     choices = parser.add_subparsers(dest=dest, metavar=dest.upper(), required=True, parser_class=_Lazy, **group)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
-from visthrow.common.arguments import add_common
+from visthrow.common.arguments import add_common, add_out
 from visthrow.common.errors import ConfigError
 from visthrow.common.storage import writable
 from visthrow.common.workers import status
@@ -48,9 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--config", metavar="NAME", help="fly in this train config instead of each policy's own")
     allow = "part of a policy's contract that --config and --set may break (vehicle, rope.length); told above the table"
     parser.add_argument("--allow", action="append", default=[], metavar="KEY", help=f"{allow}; may be repeated")
-    parser.add_argument(
-        "--out", default="out/compare", metavar="FOLDER", help="for table, CSV and plot (default: out/compare)"
-    )
+    add_out(parser, "out/compare", "for table, CSV and plot")
     add_common(parser)
 
 

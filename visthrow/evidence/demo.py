@@ -4,6 +4,7 @@ import argparse
 import time
 from pathlib import Path
 
+from visthrow.common.arguments import add_out
 from visthrow.common.errors import ConfigError
 from visthrow.common.storage import writable
 from visthrow.evidence import compare
@@ -22,9 +23,7 @@ SEED = 0
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.epilog = "Takes less than a minute on two CPU cores. No GPU is needed and none is used.\n"
-    parser.add_argument(
-        "--out", default="out/demo", metavar="FOLDER", help="for pictures, tables and recording (default: out/demo)"
-    )
+    add_out(parser, "out/demo", "for pictures, tables and recording")
     parser.add_argument(
         "--throws", type=int, default=THROWS, metavar="N",
         help=f"for each policy and target in the training simulator (default: {THROWS}); on the reference plant {REFERENCE_THROWS} at most",

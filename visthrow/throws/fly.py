@@ -4,7 +4,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from visthrow.common.arguments import add_common
+from visthrow.common.arguments import add_common, add_out
 
 FILES = {
     "flight.npz": "every signal of the flight; read it with visthrow.logs.flightlog.FlightLog.load",
@@ -42,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--pixels", choices=("learnt", "contours"), help="keypoints by a detector from rendered pictures, in place of projected ones"
     )
-    parser.add_argument("--out", default="out/fly", metavar="FOLDER", help="for the files (default: out/fly)")
+    add_out(parser, "out/fly", "for the files")
     parser.add_argument(
         "--allow", action="append", default=[], metavar="KEY",
         help="fly although the config breaks this part of the policy's contract, for instance rope.length; may be repeated",

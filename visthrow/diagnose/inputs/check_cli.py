@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-DEFAULT_OUT = "out/check"
+from visthrow.common.arguments import add_out
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -19,7 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--config", metavar="NAME", help="of configs/diagnose, or a file: how a table's columns are read")
     parser.add_argument("--plant", metavar="NAME", help="of configs/train, or a file: cable and mass that the logs must have")
     parser.add_argument("--all", action="store_true", help="print every row, fine ones too")
-    parser.add_argument("--out", default=DEFAULT_OUT, metavar="FOLDER", help=f"of the pictures (default: {DEFAULT_OUT})")
+    add_out(parser, "out/check", "of the pictures")
     parser.add_argument("--no-pictures", action="store_true", help="draw none")
     parser.add_argument("--json", metavar="FILE", help="write all rows to this file")
 

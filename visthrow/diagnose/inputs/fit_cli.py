@@ -2,6 +2,8 @@
 
 import argparse
 
+from visthrow.common.arguments import add_out
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the action."""
@@ -15,7 +17,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--config", required=True, metavar="NAME", help="of configs/diagnose, or a file; with a model in it")
     parser.add_argument("--free", nargs="+", default=[], metavar="EFFECT", help="what is fitted (default: by the model)")
     parser.add_argument("--vehicle", default="paper", metavar="NAME", help="lends all that is not fitted (default: paper)")
-    parser.add_argument("--out", default="out/fit", metavar="FOLDER", help="for vehicle.toml and fit.json (default: out/fit)")
+    add_out(parser, "out/fit", "for vehicle.toml and fit.json")
     parser.add_argument("--json", metavar="FILE", help="write the printed figures to this file as well")
 
 

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-DEFAULT_OUT = "out/blind"
+from visthrow.common.arguments import add_out
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -18,7 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     shared(parser)
     parser.add_argument("--verify", type=int, default=0, metavar="N", help="also hide N effects in the measurements themselves")
     parser.add_argument("--floors", type=float, default=10.0, help="size of those, in floors (default: 10)")
-    parser.add_argument("--out", default=DEFAULT_OUT, metavar="FOLDER", help=f"of picture and JSON (default: {DEFAULT_OUT})")
+    add_out(parser, "out/blind", "of picture and JSON")
 
 
 def run(args: argparse.Namespace) -> int:

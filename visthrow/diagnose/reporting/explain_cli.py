@@ -4,10 +4,9 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
+from visthrow.common.arguments import add_out
 from visthrow.diagnose.inputs.opening import THROW
 from visthrow.diagnose.select.result import INCONSISTENT, OUT_OF_DOMAIN, OVERALL
-
-DEFAULT_OUT = "out/explain"
 
 MOST_SPOILED = 0.5
 """Share of the logs that may contradict themselves and be left out; where more do, nothing is to be learnt from any."""
@@ -27,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "  visthrow diagnose explain swing.csv --config pendulum       another model, tables read by its mapping\n"
     )
     shared(parser)
-    parser.add_argument("--out", default=DEFAULT_OUT, metavar="FOLDER", help=f"of the report (default: {DEFAULT_OUT})")
+    add_out(parser, "out/explain", "of the report")
     parser.add_argument("--no-report", action="store_true", help="print the verdicts only; no gain, no page, no recording")
     parser.add_argument("--no-blind", action="store_true", help="leave the detection limits out of the report")
 

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-DEFAULT_OUT = "out/plan"
+from visthrow.common.arguments import add_out
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -19,7 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     shared(parser)
     parser.add_argument("--manoeuvres", metavar="NAMES", help="choose among these, by commas; default all")
     parser.add_argument("--about", metavar="NAMES", default="", help="plan for these effects, by commas; default: all unclear ones")
-    parser.add_argument("--out", default=DEFAULT_OUT, metavar="FOLDER", help=f"of references and JSON (default: {DEFAULT_OUT})")
+    add_out(parser, "out/plan", "of references and JSON")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -5,6 +5,7 @@ import sys
 import time
 from pathlib import Path
 
+from visthrow.common.arguments import add_out
 from visthrow.common.errors import StorageError, VisthrowError
 
 TITLE = "Throwing with a quadrotor: the paper's evidence and ours"
@@ -36,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="folder of records (default: those of the package); --measure writes baseline.json there",
     )
     parser.add_argument("--jobs", type=int, metavar="N", help="processes at once (default: one a core)")
-    parser.add_argument("--out", default="out/report", metavar="FOLDER", help="for page, tables and pictures (default: out/report)")
+    add_out(parser, "out/report", "for page, tables and pictures")
 
 
 def run(args: argparse.Namespace) -> int:
