@@ -34,11 +34,6 @@ def push(history: torch.Tensor, new: torch.Tensor, reset_mask: torch.Tensor) -> 
     return torch.where(mask, front, torch.cat([front, history[:, :-1]], 1))
 
 
-def push_(history: torch.Tensor, new: torch.Tensor, reset_mask: torch.Tensor) -> torch.Tensor:
-    """`push` into the same storage, for buffers whose address a CUDA graph holds; returns history."""
-    return history.copy_(push(history, new, reset_mask))
-
-
 def at_latency(history: torch.Tensor, latency: torch.Tensor) -> torch.Tensor:
     """Value that is ``latency`` steps old, linear between the two stored neighbours.
 

@@ -1,7 +1,7 @@
 """Imperfections of a keypoint detector: noise, per-episode bias, drop-out, latency, and what an invalid point reads.
 
-The randomness is an argument (`draw_step`, `draw_episode` make it from a torch.Generator): the functions that apply it
-are pure, so that a CUDA graph can replay them on refilled buffers and the HIL runner can pass zeros.
+The randomness is an argument: the functions that apply it are pure, so that a CUDA graph can replay them on refilled buffers and the
+HIL runner can pass zeros.
 """
 
 from typing import NamedTuple
@@ -21,26 +21,6 @@ class StepDraw(NamedTuple):
     normals: torch.Tensor
     uniforms: torch.Tensor
     wrong: torch.Tensor | None = None
-
-
-def draw_step(
-    environments: int, keypoints: int, generator: torch.Generator, dtype: torch.dtype = torch.float32
-) -> StepDraw:
-    """Draw the randomness of one step on the generator's device."""
-    options = {"generator": generator, "device": generator.device, "dtype": dtype}
-    return StepDraw(torch.randn(environments, keypoints, 2, **options), torch.rand(environments, keypoints, **options))
-
-
-def draw_episode(
-    params: KeypointNoiseParams,
-    environments: int,
-    keypoints: int,
-    generator: torch.Generator,
-    dtype: torch.dtype = torch.float32,
-) -> torch.Tensor:
-    """Draw per-episode biases [-], shape (E, K, 2), on the generator's device."""
-    normals = torch.randn(environments, keypoints, 2, generator=generator, device=generator.device, dtype=dtype)
-    return normals * params.bias_std
 
 
 def apply_noise(

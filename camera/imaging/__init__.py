@@ -1,1 +1,1 @@
-"""Images of the fisheye camera: rendering, rectified views, nuisances, overlays."""
+"""Images of the fisheye camera: rendering, rectified views, overlays."""

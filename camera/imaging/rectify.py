@@ -1,4 +1,4 @@
-"""Image side of the camera, on kornia: rectified views, rotations and photometric augmentation of fisheye frames.
+"""Image side of the camera, on kornia: rectified views and photometric augmentation of fisheye frames.
 
 Frames are torch images: float in [0, 1], shape (B, C, H, W), as kornia has them.
 """
@@ -100,25 +100,6 @@ def rectify(frames: torch.Tensor, lens: Fisheye, view: ViewParams) -> torch.Tens
     batch = frames.shape[0]
     map_x, map_y = (pixels[..., i].expand(batch, -1, -1) for i in (0, 1))
     return remap(frames, map_x, map_y, mode="bilinear", align_corners=True) * valid.to(frames)
-
-
-def rotate_frames(frames: torch.Tensor, angle_deg: torch.Tensor, lens: Fisheye) -> torch.Tensor:
-    """Turn frames about the principal point: what the camera sees when it is turned about its optical axis.
-
-    Exact for a fisheye with fx = fy, whatever its distortion.
-
-    Args:
-        frames: Shape (B, C, H, W).
-        angle_deg: Angle by which the picture turns, counter-clockwise as seen [deg], shape (B,).
-        lens: The lens.
-
-    Returns:
-        Shape (B, C, H, W).
-    """
-    from kornia.geometry.transform import rotate as kornia_rotate
-
-    centre = frames.new_tensor([[lens.params.cx, lens.params.cy]]).expand(frames.shape[0], -1)
-    return kornia_rotate(frames, angle_deg.to(frames), center=centre, mode="bilinear", align_corners=True)
 
 
 def augment(frames: torch.Tensor, params: AugmentParams, seed: int) -> torch.Tensor:

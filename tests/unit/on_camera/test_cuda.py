@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from camera.history import filled, push_
+from camera.history import filled, push
 from camera.keypoints import KeypointCamera, keypoints
 from camera.mount import rotation_from_vector
 from camera.noise import StepDraw, apply_noise
@@ -29,7 +29,7 @@ def test_graph_replay_equals_eager():
     def step():
         points, valid = keypoints(camera, *pose, extrinsics)
         noisy, seen = apply_noise(params.noise, points, valid, bias, draw)
-        push_(history, noisy, reset)
+        history.copy_(push(history, noisy, reset))
         return noisy, seen
 
     stream = torch.cuda.Stream()

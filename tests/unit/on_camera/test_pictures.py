@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from camera.imaging.overlay import draw_overlay
-from camera.imaging.rectify import AugmentParams, ViewParams, augment, rectify, rotate_frames, view_map
+from camera.imaging.rectify import AugmentParams, ViewParams, augment, rectify, view_map
 from camera.imaging.render import pixel_rays, render_scene
 from camera.keypoints import KeypointCamera, keypoints
 from camera.mount import rotation_from_vector
@@ -113,14 +113,6 @@ def test_turned_view_looks_where_it_says():
     assert torch.allclose(up[20, 20], torch.tensor([159.5, 159.5 - 83.3 * math.radians(50.0)], dtype=torch.float64))
     _, past = view_map(CAMERA.fisheye, ViewParams(41, 41, 90.0, yaw_deg=100.0))
     assert not past[20, 40]
-
-
-def test_turned_frame_turns_the_keypoints():
-    _, _, frame = throw_scene(0.0)
-    frames = frame.permute(2, 0, 1)[None]
-    turned = rotate_frames(frames, torch.tensor([90.0]), CAMERA.fisheye)[0]
-    # A quarter turn counter-clockwise about the middle of a square picture is a transpose and a flip.
-    assert (turned - frames[0].rot90(1, (1, 2))).abs().max() < 1e-3
 
 
 def test_augmentation_is_photometric_and_seeded():
