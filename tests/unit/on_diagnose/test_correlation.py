@@ -10,7 +10,7 @@ from tests.synthetic_diagnosis import SyntheticModel, catalogue
 from visthrow.diagnose.likelihood import marginal
 from visthrow.diagnose.likelihood.correlation import Correlation, components, correlations, with_correlations
 from visthrow.diagnose.likelihood.evidence import Priors
-from visthrow.diagnose.select import result, search
+from visthrow.diagnose.select import point, result, search
 
 RATE, TIME = 200, 0.03
 SOME = 16  # effects
@@ -82,7 +82,7 @@ def test_noise_that_is_correlated_is_no_cause(monkeypatch):
     """Taken for white, it is told as names or as something unknown."""
     said = [search.explain(flown(seed, "first")) for seed in (0, 7)]
     assert [d.overall for d in said] == [result.NO_EFFECT] * 2
-    monkeypatch.setattr(search, "correlations", lambda *_: {})
+    monkeypatch.setattr(point, "correlations", lambda *_: {})
     assert any(search.explain(flown(seed, "first")).overall != result.NO_EFFECT for seed in (0, 7))
 
 

@@ -7,6 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
+from tests.diagnose import beside_aeroid
 from visthrow import cli, config
 from visthrow.common.errors import ConfigError, DiagnoseError, LogError
 from visthrow.diagnose.inputs import fit as fitting
@@ -18,6 +19,7 @@ from visthrow.diagnose.models.gimbal import GimbalModel, GimbalParams
 from visthrow.diagnose.models.pendulum import PendulumModel, PendulumParams
 from visthrow.diagnose.models.stand import StandModel, StandParams
 from visthrow.diagnose.models.trim import TrimModel, TrimParams
+from visthrow.diagnose.select import search
 from visthrow.logs.export import export
 from visthrow.logs.flightlog import Channel, FlightLog
 
@@ -90,6 +92,19 @@ class TestBall:
         logs = [ball_log(spin=(0.0, 0.0, 0.3), seed=i, heading=2.1 * i) for i in range(3)]
         estimates = found(BallModel(logs, BALL), ["side_spin", "ball_drag"])
         assert estimates["side_spin"][0] == pytest.approx(0.3, rel=0.05)
+
+    def test_wind_shows_where_the_drag_is(self):
+        """Without drag there is no wind: derivatives of the model as it stands say nothing of it."""
+        truth, stamps, paths = beside_aeroid.world(240000100)
+        seen = paths + np.random.default_rng(1).normal(0.0, 5e-4, paths.shape)
+        diagnosis = search.explain(beside_aeroid.model_of(stamps, seen), laws=False)
+        assert diagnosis.overall == "KNOWN"
+        assert set(diagnosis.theta) == set(truth)
+        assert all(abs(diagnosis[name].estimate - size) < 3.0 * diagnosis[name].sd for name, size in truth.items())
+
+    def test_a_fast_ball_falls_too(self):
+        log = ball_log(drag=0.12, spin=(0.0, 0.0, 1.2), seed=1)
+        assert len(BallModel([log], BALL).stretches) == 1
 
     def test_nothing_that_falls(self):
         time = np.arange(0, 3, 0.01)

@@ -60,7 +60,6 @@ def fit(model: Model, free: Sequence[str]) -> Fitted:
     Raises:
         DiagnoseError: A name that the model does not have, or none.
     """
-    from visthrow.diagnose.likelihood.evidence import Priors
     from visthrow.diagnose.select.point import Problem, fitted, linearise
 
     known = [effect.name for effect in model.effects]
@@ -71,7 +70,7 @@ def fit(model: Model, free: Sequence[str]) -> Fitted:
         raise DiagnoseError(f"nothing to fit; name effects with --free: {', '.join(known)}")
     at = [known.index(name) for name in free]
     before = model.windows({})
-    problem = Problem(model, Priors.of(tuple(model.effects), tuple(model.channels)), tuple(range(len(before))))
+    problem = Problem.of(model, before, range(len(before)))
     point = linearise(problem, np.zeros(len(known)), windows=before)
     for _ in range(ROUNDS):
         start = point.theta

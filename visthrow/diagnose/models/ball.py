@@ -26,6 +26,8 @@ from visthrow.logs.flightlog import FlightLog
 CHANNEL = "payload_pos_w"
 STEPS = 80
 """Of a free flight's integration: about 10 ms, at which the path is exact to a thousandth of a millimetre."""
+FALLS = 0.7
+"""Acceleration besides gravity's, in its, below which a ball is in flight: drag and lift of fast, spinning balls; at rest it is 1."""
 KNOTS = 9
 """Of the latent force over a free flight."""
 
@@ -128,13 +130,13 @@ def _flights(log: FlightLog, number: int, params: BallParams) -> list[Stretch]:
 
 
 def _free(time: np.ndarray, pos: np.ndarray, params: BallParams) -> list[tuple[float, float]]:
-    """First and last time of the stretches that fall: acceleration near gravity, over a tenth of a second each way."""
+    """First and last time of the stretches that fall: nearer to gravity than to rest, over a tenth of a second each way."""
     at, vel = derivative(time, pos, 0.05)
     if len(at) < 20:
         return []
     at, acc = derivative(at, vel, 0.05)
     off = np.linalg.norm(acc + np.array([0.0, 0.0, params.gravity]), axis=1)
-    falls = off < 0.35 * params.gravity
+    falls = off < FALLS * params.gravity
     edges = np.flatnonzero(np.diff(np.concatenate([[False], falls, [False]]).astype(int)))
     spans = [(at[a] + params.edge, at[b - 1] - params.edge) for a, b in zip(edges[::2], edges[1::2])]
     return [(a, b) for a, b in spans if b - a >= params.shortest]

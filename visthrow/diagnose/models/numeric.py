@@ -61,6 +61,7 @@ class Lanes:
 class NumericModel:
     """Implements :class:`visthrow.diagnose.models.interface.Model` on :meth:`simulate` and :meth:`measure`."""
 
+    cheap = True  # derivatives are taken anew wherever the search goes
     latent_step = 1.0  # of the differences by latent forces [N or N m]
 
     def __init__(

@@ -9,7 +9,7 @@ import numpy as np
 
 from visthrow.diagnose.likelihood import noise as levels
 from visthrow.diagnose.likelihood import stack
-from visthrow.diagnose.likelihood.correlation import Correlation, with_correlations
+from visthrow.diagnose.likelihood.correlation import Correlation, correlations, with_correlations
 from visthrow.diagnose.likelihood.designs import grams_of, with_residuals
 from visthrow.diagnose.likelihood.evidence import Priors, covariance, estimate, log_evidence
 from visthrow.diagnose.likelihood.marginal import (
@@ -49,6 +49,13 @@ class Problem:
     kept: tuple[int, ...]  # windows that are looked at
     correlated: Mapping[int, Correlation] = field(default_factory=dict)  # channels whose noise is not white
     varies: Mapping[int, float] = field(default_factory=dict)  # effects that differ from flight to flight: deviation in floors
+
+    @staticmethod
+    def of(model: Model, windows: Sequence[Window], kept: Sequence[int]) -> "Problem":
+        """The problem of some of a model's windows, with the correlation of their channels' noise."""
+        priors = Priors.of(tuple(model.effects), tuple(model.channels))
+        known = correlations([windows[i] for i in kept], priors.slab * priors.floor, len(model.channels))
+        return Problem(model, priors, tuple(kept), known)
 
     @property
     def switches(self) -> np.ndarray:

@@ -12,7 +12,6 @@ import numpy as np
 
 from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.likelihood import memory
-from visthrow.diagnose.likelihood.correlation import correlations
 from visthrow.diagnose.likelihood.evidence import (
     Priors,
     additions,
@@ -256,7 +255,8 @@ class Search(SearchState):
         """
         kinds = self.problem.switches
         same = np.array_equal(self.origin.theta[kinds] != 0.0, point.theta[kinds] != 0.0)
-        if same and curvature(self.problem, self.origin, point) < STRAIGHT:
+        cheap = getattr(self.problem.model, "cheap", False)  # what shows nothing at one place, as wind without drag, may at another
+        if same and not cheap and curvature(self.problem, self.origin, point) < STRAIGHT:
             return point
         for _ in range(LINEARISATIONS):
             self.origin = linearise(self.problem, point.theta, point.noise)
@@ -369,7 +369,6 @@ def explain(
     """
     begun, say = time.monotonic(), progress or (lambda _: None)
     memory.keep()
-    priors = Priors.of(tuple(model.effects), tuple(model.channels))
     windows = model.windows({})
     if not windows:
         raise DiagnoseError("the model found no stretch of flight to look at in these logs")
@@ -379,10 +378,10 @@ def explain(
     kept = tuple(i for i, w in enumerate(windows) if finite[i] and w.flight not in left_out)
     if len(kept) < 0.5 * sum(w.flight not in left_out for w in windows) or not kept:
         return out_of_domain(model, windows, sum(finite), seed)
-    correlated = correlations([windows[i] for i in kept], priors.slab * priors.floor, len(model.channels))
-    for c, own in correlated.items():
+    problem = Problem.of(model, windows, kept)
+    priors = problem.priors
+    for c, own in problem.correlated.items():
         say(f"noise of {model.channels[c]} is correlated over {1e3 * own.time:.0f} ms, for {own.share:.1%} of its variance")
-    problem = Problem(model, priors, kept, correlated)
     nominal = linearise(problem, np.zeros(len(model.effects)), windows=windows)
     for _ in range(LOSSES):
         if not (gone := lost(nominal)):
