@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 
 from sim.params import LawParams
+from tests.unit.on_diagnose.test_models import ball_log
 from visthrow import cli, config
-from visthrow.common.errors import ConfigError
+from visthrow.common.errors import ConfigError, LogError
 from visthrow.config.effects import catalogue
 from visthrow.diagnose.extend import patch
+from visthrow.diagnose.inputs import setup as setups
 from visthrow.task import DiagnosedParams, Experiment, contract_of, plant_of
 from visthrow.training.posterior import drawn_plants
 
@@ -159,6 +161,33 @@ def test_mistakes_are_told(diagnosis, changes, message, tmp_path, capsys):
 def test_nothing_named_writes_nothing(diagnosis, tmp_path, capsys):
     assert cli.main(["diagnose", "apply", diagnosis(theta={}, covariance=[]), "--out", str(tmp_path / "x.toml")]) == 0
     assert "nothing was named" in capsys.readouterr().out
+
+
+BALL = {"model": "ball", "theta": {"ball_drag": 0.03}, "covariance": [[1e-8]], "findings": [{"name": "ball_drag", "unit": "1/m"}]}
+
+
+def test_other_models_have_extended_setups(diagnosis, tmp_path):
+    """Sizes are counted from there by whoever loads the setup, in the next diagnosis and the next extension, too."""
+    out, again = tmp_path / "once.toml", tmp_path / "twice.toml"
+    assert cli.main(["diagnose", "apply", diagnosis(**BALL), "--config", "jugglebot", "--out", str(out)]) == 0
+    assert cli.main(["diagnose", "apply", diagnosis(**BALL), "--config", str(out), "--out", str(again)]) == 0
+    assert setups.load(out).effects == {"ball_drag": 0.03}
+    assert setups.load(again).effects == pytest.approx({"ball_drag": 0.06})
+    logs = [ball_log(drag=0.03, seed=1)]
+    plain, extended = (setups.model_of(setups.load(name), logs) for name in ("jugglebot", out))
+    np.testing.assert_allclose(extended.residuals({})[0], plain.residuals({"ball_drag": 0.03})[0], atol=1e-9)
+    assert extended.effects[0].bounds[0] == pytest.approx(plain.effects[0].bounds[0] - 0.03)
+
+
+def test_what_does_not_belong_to_a_setup_is_refused(diagnosis, tmp_path, capsys):
+    out = tmp_path / "x.toml"
+    assert cli.main(["diagnose", "apply", diagnosis(**BALL), "--config", "pendulum_encoder", "--out", str(out)]) == 2
+    assert "a diagnosis of the model 'ball'; the model of diagnose/pendulum_encoder.toml is pendulum" in capsys.readouterr().err
+    for theta, message in (({"ball_drag": 9.0}, "ball_drag = 9 1/m; this model has it from"), ({"thrust": 1.0}, "no effect 'thrust'")):
+        report = diagnosis(**{**BALL, "theta": theta})
+        assert cli.main(["diagnose", "apply", report, "--config", "jugglebot", "--out", str(out)]) == 0
+        with pytest.raises(LogError, match=message):
+            setups.model_of(setups.load(out), [ball_log(seed=1)])
 
 
 def test_a_broken_covariance_is_refused():

@@ -19,6 +19,7 @@ from visthrow.diagnose.models.gimbal import GimbalModel, GimbalParams
 from visthrow.diagnose.models.pendulum import PendulumModel, PendulumParams
 from visthrow.diagnose.models.stand import StandModel, StandParams
 from visthrow.diagnose.models.trim import TrimModel, TrimParams
+from visthrow.diagnose.reporting.gain import on_others
 from visthrow.diagnose.select import search
 from visthrow.logs.export import export
 from visthrow.logs.flightlog import Channel, FlightLog
@@ -101,6 +102,11 @@ class TestBall:
         assert diagnosis.overall == "KNOWN"
         assert set(diagnosis.theta) == set(truth)
         assert all(abs(diagnosis[name].estimate - size) < 3.0 * diagnosis[name].sd for name, size in truth.items())
+        unseen = paths + np.random.default_rng(2).normal(0.0, 5e-4, paths.shape)
+        errors = on_others(beside_aeroid.model_of(stamps, unseen), diagnosis.theta, diagnosis.work.after.noise)
+        before, after, noise = errors["payload_pos_w"]
+        assert before > 20.0 * noise
+        assert 0.7 * noise < after < 1.3 * noise
 
     def test_a_fast_ball_falls_too(self):
         log = ball_log(drag=0.12, spin=(0.0, 0.0, 1.2), seed=1)

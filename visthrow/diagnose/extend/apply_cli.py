@@ -16,11 +16,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "  visthrow diagnose apply out/explain/diagnosis.json --out mine.toml   a configuration on top of the diagnosed one\n"
         "  visthrow train mine.toml                                             train in it\n"
         "  visthrow diagnose explain flights --plant mine.toml                  and diagnose it again: nothing should be left\n"
+        "  visthrow diagnose apply out/explain/diagnosis.json --config cf_payload --out mine.toml     of another model\n"
+        "  visthrow diagnose explain others.csv --config mine.toml              what it is worth on flights that it never saw\n"
     )
     parser.add_argument("diagnosis", metavar="FILE", help="diagnosis.json of an explain, or a blackbox: its firmware's rate controller")
     parser.add_argument(
         "--plant", metavar="NAME", default=DEFAULT_PLANT, help=f"the configuration that was diagnosed (default: {DEFAULT_PLANT})"
     )
+    parser.add_argument("--config", metavar="NAME", help="the setup that was diagnosed, of another model than the throw")
     parser.add_argument("--out", metavar="FILE", default="extended.toml", help="to write (default: extended.toml)")
     parser.add_argument(
         "--plants", type=int, default=DEFAULT_PLANTS, metavar="N",
@@ -58,15 +61,17 @@ def run(args: argparse.Namespace) -> int:
         report = json.loads(Path(args.diagnosis).read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise DiagnoseError(f"{args.diagnosis}: not readable as a diagnosis: {error}") from error
-    theta, covariance = patch.with_scatter(*patch.read(report, args.diagnosis), report)
+    if args.config:
+        return _extend_setup(args, report)
+    found = patch.read(report, args.diagnosis)
+    patch.refuse_strange(report, args.diagnosis, found[0])
+    theta, covariance = patch.with_scatter(*found, report)
     laws = patch.laws_of(report, args.diagnosis, args.laws)
     if not theta and not laws:
         unused = ", but a law outside the catalogue explains the flights: --laws 1 writes it" if report.get("laws") else ""
         print(f"nothing was named{unused}; the configuration stands as it is")
         return 0
-    doubts = harm(report)
-    if doubts and not args.anyway:
-        raise DiagnoseError(f"held-out flights do not bear this out: {'; '.join(doubts)}; --anyway writes it all the same")
+    _bear_out(report, args.anyway)
     base, experiment = _diagnosed(args.plant)
     content = patch.text(base, experiment, theta, covariance, args.plants, origin(report, args.diagnosis), laws)
     atomic_write(args.out, content)
@@ -76,14 +81,52 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
+def _extend_setup(args: argparse.Namespace, report: dict) -> int:
+    """Write the extended setup of another model than the throw."""
+    from visthrow.common.storage import atomic_write
+    from visthrow.diagnose.extend import patch
+    from visthrow.diagnose.inputs import setup
+
+    if not report.get("theta"):
+        print("nothing was named; the setup stands as it is")
+        return 0
+    _bear_out(report, args.anyway)
+    base = _named("diagnose", args.config)
+    content = patch.of_setup(base, setup.load(args.config), report, args.diagnosis, origin(report, args.diagnosis))
+    atomic_write(args.out, content)
+    setup.load(args.out)
+    print(f"{args.out}: {', '.join(report['theta'])} on top of {base}")
+    return 0
+
+
+def _bear_out(report: dict, anyway: bool) -> None:
+    """Refuse what held-out flights deny.
+
+    Raises:
+        DiagnoseError: They do, and nobody wants it all the same.
+    """
+    from visthrow.common.errors import DiagnoseError
+
+    doubts = harm(report)
+    if doubts and not anyway:
+        raise DiagnoseError(f"held-out flights do not bear this out: {'; '.join(doubts)}; --anyway writes it all the same")
+
+
 def _diagnosed(plant: str):
     """Name that another configuration finds the diagnosed one under, and what it says."""
     from visthrow import config
     from visthrow.task import Experiment
 
-    path = config.find("train", plant)
+    return _named("train", plant), config.load(Experiment, config.find("train", plant))
+
+
+def _named(folder: str, name: str) -> str:
+    """Path under which another configuration finds one."""
+    from visthrow import config
+
+    path = config.find(folder, name)
     shipped = path.is_relative_to(config.configs_root())
-    return path.relative_to(config.configs_root()).as_posix() if shipped else str(path.resolve()), config.load(Experiment, path)
+    return path.relative_to(config.configs_root()).as_posix() if shipped else str(path.resolve())
 
 
 def harm(report: dict) -> list[str]:

@@ -15,6 +15,7 @@ from visthrow.common.errors import DiagnoseError
 from visthrow.common.toml_text import dumps
 from visthrow.config.effects import catalogue, chosen
 from visthrow.diagnose.inputs.opening import THROW
+from visthrow.diagnose.inputs.setup import Setup
 from visthrow.diagnose.select.scatter import variances
 from visthrow.task import Experiment, plant_of
 
@@ -133,7 +134,7 @@ def read(report: Mapping[str, Any], path: str) -> tuple[dict[str, float], list[l
     """Sizes and covariance from the JSON that ``explain`` wrote.
 
     Raises:
-        DiagnoseError: Something is missing, or effects of another model than the throw.
+        DiagnoseError: Something is missing.
     """
     try:
         theta = {str(name): float(size) for name, size in report["theta"].items()}
@@ -142,11 +143,36 @@ def read(report: Mapping[str, Any], path: str) -> tuple[dict[str, float], list[l
         raise DiagnoseError(f"{path}: no diagnosis that `visthrow diagnose explain` wrote: {error!r}") from error
     if len(covariance) != len(theta) or any(len(row) != len(theta) for row in covariance):
         raise DiagnoseError(f"{path}: {len(theta)} effects and a covariance of {len(covariance)} rows; expected one each")
-    _refuse_strange(report, path, theta)
     return theta, covariance
 
 
-def _refuse_strange(report: Mapping[str, Any], path: str, theta: Mapping[str, float]) -> None:
+def of_setup(base: str, setup: Setup, report: Mapping[str, Any], path: str, provenance: Sequence[str]) -> str:
+    """The TOML file of a setup of another model than the throw, extended by the sizes that a diagnosis of it found.
+
+    Args:
+        base: path of the diagnosed setup, as ``base =`` is to name it.
+        setup: that setup.
+        report: JSON that ``explain`` wrote.
+        path: of the report.
+        provenance: lines that say where it comes from.
+
+    Raises:
+        DiagnoseError: The diagnosis is of another model, or no diagnosis.
+    """
+    theta, covariance = read(report, path)
+    if [report.get("model", THROW)] != setup.named():
+        own = ', '.join(setup.named()) or 'none'
+        raise DiagnoseError(f"{path}: a diagnosis of the model '{report.get('model', THROW)}'; the model of {base} is {own}")
+    units = {f["name"]: f["unit"] for f in report["findings"]}
+    lines = [f"# {line}" for line in provenance] + [f"# covariance of {', '.join(theta)}:"]
+    lines += [f"#   {'  '.join(f'{x: .3e}' for x in row)}" for row in covariance] + [dumps({"base": base}).strip(), "", "[effects]"]
+    for i, (name, size) in enumerate(theta.items()):
+        before = setup.effects.get(name, 0.0)
+        lines.append(f"{name} = {before + size:.9g}  # {size:+.4g} +- {covariance[i][i] ** 0.5:.2g} {units.get(name, '')}".rstrip())
+    return "\n".join(lines) + "\n"
+
+
+def refuse_strange(report: Mapping[str, Any], path: str, theta: Mapping[str, float]) -> None:
     """Refuse effects of another model, though they may bear the same name, and sizes that the throw's simulator cannot have.
 
     Raises:
@@ -154,10 +180,7 @@ def _refuse_strange(report: Mapping[str, Any], path: str, theta: Mapping[str, fl
     """
     model = report.get("model", THROW)
     if model != THROW:
-        raise DiagnoseError(
-            f"{path}: a diagnosis of the model '{model}'; apply writes configurations of the whole throw alone, and "
-            f"`visthrow diagnose fit` those of a vehicle by itself"
-        )
+        raise DiagnoseError(f"{path}: a diagnosis of the model '{model}'; --config names the setup that was diagnosed")
     known = catalogue()
     strange = [name for name in theta if name not in known]
     if strange:

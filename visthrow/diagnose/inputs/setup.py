@@ -2,7 +2,7 @@
 
 import importlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from visthrow.common.errors import ConfigError
@@ -44,6 +44,7 @@ class Setup:
     gimbal: GimbalParams | None = None
     flyer: FlyerParams | None = None
     trim: TrimParams | None = None
+    effects: dict[str, float] = field(default_factory=dict)  # sizes that a diagnosis found, written by apply
 
     def __post_init__(self) -> None:
         if len(self.named()) > 1:
@@ -59,13 +60,15 @@ def model_of(setup: Setup, logs: Sequence[FlightLog]) -> Model:
 
     Raises:
         ConfigError: The setup has none.
-        LogError: The logs hold nothing that the model could be held against.
+        LogError: The logs hold nothing that the model could be held against; the setup has effects that are none of the model's.
     """
     if not setup.named():
         raise ConfigError(f"the setup '{setup.about}' has no model; expected a table of one of: {', '.join(MODELS)}")
     name = setup.named()[0]
     module, attribute = MODELS[name].split(":")
-    return getattr(importlib.import_module(module), attribute)(logs, getattr(setup, name))
+    model = getattr(importlib.import_module(module), attribute)(logs, getattr(setup, name))
+    model.extend(setup.effects)
+    return model
 
 
 def load(name: str | Path) -> Setup:

@@ -85,6 +85,21 @@ class NumericModel:
         self.channels, self.stretches = tuple(channels), list(stretches)
         self._start = np.array([stretch.nuisance for stretch in self.stretches], dtype=float)
         self._slopes: list[np.ndarray] | None = None
+        self._base = np.zeros(len(self.effects))  # sizes that the model has before anything is found
+
+    def extend(self, sizes: Mapping[str, float]) -> None:
+        """Give the model what a diagnosis found: sizes of its effects are counted, and bounded, from there.
+
+        Raises:
+            LogError: An effect that the model does not know, or a size outside its bounds.
+        """
+        base = self.size(sizes)
+        for effect, size in zip(self.effects, base):
+            if not effect.bounds[0] <= size <= effect.bounds[1]:
+                low, high = effect.bounds
+                raise LogError(f"{effect.name} = {size:.4g} {effect.unit}; this model has it from {low:g} to {high:g}")
+        self._base = base
+        self.effects = tuple(replace(e, bounds=(e.bounds[0] - b, e.bounds[1] - b)) for e, b in zip(self.effects, base.tolist()))
 
     def simulate(self, lanes: Lanes) -> np.ndarray:
         """Simulate lanes; the result has the lane as its first axis. Models without a state need not override it."""
@@ -99,7 +114,7 @@ class NumericModel:
         return {}
 
     def size(self, theta: Mapping[str, float]) -> np.ndarray:
-        """Sizes of all effects in order, shape (K,).
+        """Sizes of all effects in order, with those that the model has before, shape (K,).
 
         Raises:
             LogError: An effect that the model does not know.
@@ -108,7 +123,7 @@ class NumericModel:
         for name in theta:
             if name not in names:
                 raise LogError(f"no effect '{name}'; {suggest(name, names)}")
-        return np.array([float(theta.get(name, 0.0)) for name in names])
+        return self._base + np.array([float(theta.get(name, 0.0)) for name in names])
 
     def windows(self, theta: Mapping[str, float]) -> list[Window]:
         """See :class:`visthrow.diagnose.models.interface.Model`."""

@@ -26,6 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "  visthrow diagnose explain swing.csv --config pendulum       another model, tables read by its mapping\n"
     )
     shared(parser)
+    parser.add_argument("--test", metavar="LOG", nargs="+", default=[], help="say what the names are worth on these flights, too")
     add_out(parser, "out/explain", "of the report")
     parser.add_argument("--no-report", action="store_true", help="print the verdicts only; no gain, no page, no recording")
     parser.add_argument("--no-blind", action="store_true", help="leave the detection limits out of the report")
@@ -60,11 +61,28 @@ def run(args: argparse.Namespace) -> int:
     if not args.no_report and diagnosis.work is not None:
         gain = write_report(Path(args.out), diagnosis, model, logs, args.seed, not args.no_blind, opening.model_name(args))
     print("\n" + report.summary(diagnosis, gain))
+    tested = _tested(args, diagnosis) if args.test and diagnosis.theta else {}
     if not args.no_report and diagnosis.work is not None:
         print(f"page, JSON, pictures and recording: {args.out}")
     if args.json:
-        write_json(args.json, report.to_json(diagnosis, gain, extra={"model": opening.model_name(args)}))
+        write_json(args.json, report.to_json(diagnosis, gain, extra={"model": opening.model_name(args), "tested": tested}))
     return REFUSED if diagnosis.overall in (INCONSISTENT, OUT_OF_DOMAIN) else 0
+
+
+def _tested(args: argparse.Namespace, diagnosis) -> dict[str, tuple[float, float, float]]:
+    """Prediction errors of other flights before and after, and of noise alone; printed."""
+    from visthrow.diagnose.inputs import opening
+    from visthrow.diagnose.likelihood.forms import READABLE, unit_of
+    from visthrow.diagnose.reporting.gain import on_others
+
+    model, _ = opening.open_model(argparse.Namespace(**{**vars(args), "logs": args.test}))
+    errors = on_others(model, diagnosis.theta, diagnosis.work.after.noise)
+    for channel, found in errors.items():
+        factor, unit = READABLE.get(unit_of(channel), (1.0, unit_of(channel)))
+        before, after, floor = (factor * x for x in found)
+        won = f", {(before - after) / (before - floor):.0%} of what is above it" if before > floor else ""
+        print(f"on the tested flights, {channel}: {before:.3g} -> {after:.3g} {unit}, noise alone {floor:.3g}{won}")
+    return errors
 
 
 def write_report(folder: Path, diagnosis, model, logs, seed: int, limits: bool = True, name: str = THROW):

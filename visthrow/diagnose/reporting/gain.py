@@ -4,12 +4,14 @@ Each flight is left out in turn; the search is repeated on the others by their s
 Beside it stand the noise floor, which cannot be beaten, and a black box trained on the same flights.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from visthrow.diagnose.likelihood.forms import forms
+from visthrow.diagnose.likelihood.marginal import Noise
+from visthrow.diagnose.models.interface import Model
 from visthrow.diagnose.reporting.blackbox import table_of, train
 from visthrow.diagnose.reporting.landing_gain import LandingGain, landing_gain
 from visthrow.diagnose.select.held_out import DRAWS, Crossed, channel_gains, crossed, regrouped
@@ -52,6 +54,27 @@ def measure(diagnosis: Diagnosis, *, seed: int = 0, draws: int = DRAWS) -> Gain:
     whole = all(w.nuisance.shape[1] == 0 for w in work.after.windows)
     nats = _nats(work.before, work.after, cross)
     return Gain(gains, nats, shares, len(cross.folds), cross.left_out, landing, whole)
+
+
+def on_others(model: Model, theta: Mapping[str, float], noise: Noise) -> dict[str, tuple[float, float, float]]:
+    """Prediction errors of flights that nothing was estimated from.
+
+    Args:
+        model: of these flights, as it stood before the diagnosis.
+        theta: sizes that were found on others.
+        noise: levels that were found there.
+
+    Returns:
+        Channel -> root mean square error before and after, and of the sensors' noise and the initial state's uncertainty alone.
+    """
+    errors = []
+    for sizes in ({}, theta):
+        windows = [w for w in model.windows(sizes) if np.all(np.isfinite(w.residual))]
+        found = forms(windows, [w.flight for w in windows], noise, [w.residual[:, None] for w in windows], len(model.channels))
+        errors.append(found.error(np.ones(1)).sum((0, 2)))
+    count, floor = np.maximum(found.count.sum((0, 2)), 1.0), found.floor.sum((0, 2))
+    sigma = [np.median(np.concatenate([w.sigma[w.channel == c] for w in windows])) for c in range(len(model.channels))]
+    return {name: tuple(float(np.sqrt(x[c] / count[c]) * sigma[c]) for x in (*errors, floor)) for c, name in enumerate(model.channels)}
 
 
 def _blackbox(before: Point, groups: Sequence[int], folds, after: Point, channels: int, rng: np.random.Generator):
