@@ -66,6 +66,12 @@ def test_white_noise_is_white():
     assert not estimated(flown(2, "white", truth={"effect_02": 60.0, "effect_04": 40.0})), "causes are not noise"
 
 
+def test_what_lasts_for_longer_than_a_filter_is_no_noise():
+    slow = [replace(w, time=30.0 * w.time) for w in flown(3, "first").windows({})]
+    priors = Priors.of(catalogue(SOME), ("pos_w", "payload_pos_w"))
+    assert not correlations(slow, priors.slab * priors.floor, 2)
+
+
 @pytest.mark.parametrize(("colour", "order"), [("first", 1), ("second", 2)])
 def test_time_order_and_size_are_those_planted(colour, order):
     for seed in (3,):

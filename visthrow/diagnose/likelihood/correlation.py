@@ -29,6 +29,8 @@ SUSPECT = 0.1
 
 PERIODS = 2.0 ** np.arange(0.0, 5.25, 0.25)
 """Correlation times that are tried, in the samples' period: at low frequencies, noise of second order goes with the time's fourth power."""
+LONGEST = 0.15
+"""Of correlation times [s]: what is left of a sensor's filter for longer is no noise but something that the model lacks."""
 STRIDES = (4, 2, 1)
 """Steps among them, one after the other."""
 
@@ -134,6 +136,9 @@ def _climbed(
     stamps = [np.unique(w.time[w.channel == channel]) for w in windows]
     period = float(np.median(np.concatenate([np.diff(own) for own in stamps])))
     found: dict[tuple[int, int, int], tuple[float, Correlation]] = {}
+    times = int(np.searchsorted(PERIODS * period, LONGEST))
+    if not times:
+        return Correlation(period, 0.0, 1), 0.0
 
     def tried(place: tuple[int, int, int]) -> float:
         if place not in found:
@@ -142,23 +147,25 @@ def _climbed(
             found[place] = value, replace(own, scale=own.scale * scales[channel])
         return found[place][0]
 
-    best = max(((time, 2, order) for order in (1, 2) for time in (4, 12)), key=tried)
+    best = max(((min(time, times - 1), 2, order) for order in (1, 2) for time in (4, 12)), key=tried)
     for stride in STRIDES:
-        while tried(better := max(_near(best, stride), key=tried)) > tried(best):
+        while tried(better := max(_near(best, stride, times), key=tried, default=best)) > tried(best):
             best = better
+    if best[0] == times - 1:  # it would last for still longer
+        return found[best][1], 0.0
     white = max(_likelihood([replace(w, sigma=w.sigma * np.where(w.channel == channel, s, 1.0)) for w in windows], channels, known)[0]
                 for s in (1.0, scale))  # fmt: skip
     value, own = found[best]
     return own, value - white
 
 
-def _near(place: tuple[int, int, int], stride: int) -> list[tuple[int, int, int]]:
-    """Places beside one: other times, and while these are far apart, other shares and the other order."""
+def _near(place: tuple[int, int, int], stride: int, times: int) -> list[tuple[int, int, int]]:
+    """Places beside one: others of so many times, and while these are far apart, other shares and the other order."""
     time, share, order = place
     near = [(time + step, share, order) for step in (-stride, stride)]
     if stride == STRIDES[0]:
         near += [(time, share - 1, order), (time, share + 1, order), (time, share, 3 - order)]
-    return [p for p in near if 0 <= p[0] < len(PERIODS) and 0 <= p[1] < len(SHARES)]
+    return [p for p in near if 0 <= p[0] < times and 0 <= p[1] < len(SHARES)]
 
 
 def _likelihood(windows: Sequence[Window], channels: int, known: Mapping[int, Correlation]) -> tuple[float, np.ndarray]:

@@ -19,6 +19,8 @@ from visthrow.config.effects import random_effects
 from visthrow.diagnose.likelihood.evidence import Priors, covariance, log_evidence
 from visthrow.diagnose.likelihood.marginal import Statistics
 
+BY_FLIGHT = "_by_flight"
+"""End of the names of effects that differ from flight to flight and are none of the catalogue's random effects."""
 LEAST_FLIGHTS = 4
 """With fewer a deviation is anybody's guess."""
 REACH, LOOK = np.geomspace(0.02, 6.0, 25), 5
@@ -105,7 +107,7 @@ def by_flight(effects: Sequence[Effect]) -> tuple[RandomEffect, ...]:
     """Every effect as one that differs from flight to flight, but for those of the catalogue's random effects."""
     known = {name for v in random_effects() for name in v.of}
     return tuple(
-        RandomEffect(f"{e.name}_by_flight", f"{e.cause}, now more, now less", f"{e.name} ~ N({e.name}, theta^2) in each flight",
+        RandomEffect(f"{e.name}{BY_FLIGHT}", f"{e.cause}, now more, now less", f"{e.name} ~ N({e.name}, theta^2) in each flight",
                      (e.name,), e.unit, e.block, e.prior_sd, e.floor, e.source, manoeuvres=tuple(e.manoeuvres))
         for e in effects if e.name not in known
     )  # fmt: skip

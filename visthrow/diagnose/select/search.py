@@ -193,6 +193,8 @@ class Search(SearchState):
         new = [s for s in scatter if not {self.name(j) for j in self.problem.varies} & set(s.of)]
         if not new or (not last and max(s.nats for s in new) < self._screen(self.point).max()):
             return False
+        if last and self.nearer():  # differences may be what the derivatives lack
+            return self._vary(last)
         if last and self.laws and follows_a_law(self):
             return False
         for s in new:
@@ -255,8 +257,9 @@ class Search(SearchState):
         """
         kinds = self.problem.switches
         same = np.array_equal(self.origin.theta[kinds] != 0.0, point.theta[kinds] != 0.0)
-        cheap = getattr(self.problem.model, "cheap", False)  # what shows nothing at one place, as wind without drag, may at another
-        if same and not cheap and curvature(self.problem, self.origin, point) < STRAIGHT:
+        silent = self.priors.visible & (np.diag(self.origin.information) <= 0.0)  # such as wind without drag: it may show elsewhere
+        anew = getattr(self.problem.model, "cheap", False) and np.any(silent)
+        if same and not anew and curvature(self.problem, self.origin, point) < STRAIGHT:
             return point
         for _ in range(LINEARISATIONS):
             self.origin = linearise(self.problem, point.theta, point.noise)

@@ -11,7 +11,7 @@ from visthrow.diagnose.select import result, unknown
 from visthrow.diagnose.select.excess import acts_on, levels, too_strong
 from visthrow.diagnose.select.point import Point, with_floors_noise, with_varying
 from visthrow.diagnose.select.result import Diagnosis, Finding, Law, Level
-from visthrow.diagnose.select.scatter import deviations, freed
+from visthrow.diagnose.select.scatter import BY_FLIGHT, deviations, freed
 from visthrow.diagnose.select.state import SearchState, Work
 from visthrow.diagnose.select.unknown import Answer, Hypothesis
 
@@ -57,6 +57,10 @@ def conclude(search: SearchState, *, laws: bool) -> Diagnosis:
     if overall == result.NO_EFFECT and (drawn or mistakes):
         besides = [m.name for m in mistakes] + [s.name for s in scatter if s.found]
         overall, reasons = result.KNOWN, [f"besides {' and '.join(besides)}, {reasons[0]}"]
+    forms = [s.name for s in scatter if s.found and s.name.endswith(BY_FLIGHT)]
+    if len(forms) > 1 and overall == result.KNOWN:
+        reasons = [f"flights differ in {', '.join(forms)} at once; the form is another"]
+        overall, block = result.UNKNOWN, next(s.block for s in scatter if s.name == forms[0])
     known = overall != result.UNKNOWN  # a term that is weaker than the names says nothing
     terms = [] if known else _different(answer.strongest)
     explanations = () if known else tuple(tuple(h.laws()) for h in answer.strongest)
