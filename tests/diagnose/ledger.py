@@ -4,6 +4,9 @@
 
 A world in which the tool failed counts as one in which nothing was named. One whose verdict was not waited for, because the bank's
 time was over, counts for nothing but the column that says how many there are.
+
+Of the 1,924 seeds that the shipped ledger's banks asked for, 13 have no line, and no reason was kept: 11 of them are of the bank of
+b5d7a9d, among these five of its 15 laws (seeds 89700501 and on). 23 lines are of worlds that ran out of time, nine of them laws.
 """
 
 import argparse
