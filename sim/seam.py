@@ -3,6 +3,9 @@
 What hangs below a vehicle is a matter of the solver alone: the fused chain of the batched simulator, or MuJoCo's bodies
 (:mod:`sim.reference.bodies`): a rope with a ball, a box, two cables. Blocks see the root's kinematics, the solver sees a wrench, and
 nothing else passes.
+
+The price, on one core with 256 vehicles and an exchange each 2 ms: MuJoCo C (RK4, 0.5 ms, its converged step) takes 86 times as long
+as the fused chain (``pytest -s -m slow tests/oracle/test_seam.py``).
 """
 
 import dataclasses
