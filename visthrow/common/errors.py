@@ -59,6 +59,10 @@ class StorageError(VisthrowError):
     """A result could not be written: full disk, no permission, missing folder."""
 
 
+MANY = 30
+"""Names beyond which those near to a misspelt one are listed in place of all."""
+
+
 def suggest(name: str, known: Iterable[str]) -> str:
     """Say what exists, and which of it is closest to a name that does not.
 
@@ -73,5 +77,8 @@ def suggest(name: str, known: Iterable[str]) -> str:
     if not names:
         return "nothing is known here"
     close = get_close_matches(name, names, n=1)
+    if close and len(names) > MANY:
+        near = get_close_matches(name, names, n=5, cutoff=0.0)
+        return f"did you mean '{close[0]}'? Near it: {', '.join(near)}; {len(names) - len(near)} more exist"
     listed = ", ".join(names)
     return f"did you mean '{close[0]}'? Known: {listed}" if close else f"known: {listed}"

@@ -160,6 +160,9 @@ def test_devices_that_are_not_there_are_refused():
 def test_suggestions():
     assert suggest("mas", ["mass", "inertia"]) == "did you mean 'mass'? Known: inertia, mass"
     assert suggest("xyz", ["mass"]) == "known: mass"
+    many = suggest("stat", ["state", *(f"name{i}" for i in range(40))])
+    assert many.startswith("did you mean 'state'? Near it: state, ")
+    assert many.endswith("; 36 more exist")
     assert suggest("xyz", []) == "nothing is known here"
     assert issubclass(ConfigError, VisthrowError)
     with pytest.raises(ConfigError, match="no kind of config 'nothing'"):
