@@ -178,7 +178,7 @@ def on_held_back(base: str, theta: Mapping[str, float], lacks: str, logs: Sequen
     (before, after, _), samples = shortfalls(model, sizes)
     found = {"before": before, "after": after, "samples": samples}
     for who, theta_ in zip(("before", "after", "whole"), sizes):
-        off = model.landing_errors(theta_)
+        off = model.landings(theta_).errors
         found[f"landing_{who}"] = float(np.mean(off)) if len(off) and np.isfinite(off).all() else None
     return found
 

@@ -246,10 +246,6 @@ class ThrowModel:
         """See :func:`visthrow.diagnose.throw.landing.landings`."""
         return landings(self, theta, flights)
 
-    def landing_errors(self, theta: Mapping[str, float]) -> np.ndarray:
-        """Distance of each throw's predicted landing from the measured one [m], shape (throws,)."""
-        return self.landings(theta).errors
-
     def beside(self, cuts: Sequence[Cut]) -> "ThrowModel":
         """The same model of other windows of its flights."""
         other = copy.copy(self)
