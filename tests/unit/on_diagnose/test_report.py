@@ -397,7 +397,7 @@ def test_an_event_is_left_out_or_weighs_little(found):
     assert f"flight {max(flights) + 1} " in out
     assert out.endswith("left out")
     page = [part.text for part in report.sections(told)[0].parts if hasattr(part, "text")]
-    assert sum(text.startswith("**Event.**") for text in page) == 2
+    assert sum(text.startswith("**EVENT.**") for text in page) == 2
 
 
 def test_errors_are_told_in_millimetres(found, measured):
