@@ -93,15 +93,16 @@ def test_what_it_cannot_train_is_refused(tmp_path, capsys):
     assert "expected at least 7" in capsys.readouterr().err
     assert cli.main(words(tmp_path / "b", "--set", "task.target.speed=[0.0,0.5]")) == 2
     assert "stand still" in capsys.readouterr().err
+    assert cli.main(words(tmp_path / "c", "--set", 'task.observation.layout="vision"')) == 2
+    assert "layout = \"state\"" in capsys.readouterr().err
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize("name", ["state", "vision"])
-def test_replayed_from_graphs_it_computes_what_it_computes_eagerly(name):
+def test_replayed_from_graphs_it_computes_what_it_computes_eagerly():
     """Six iterations: three that warm up, one that captures, two that replay, with fresh noise each."""
 
     def errors(eager):
-        trainer = Trainer(config.load(Experiment, config.find("train", name), SMALL), "cuda:0", 1)
+        trainer = Trainer(config.load(Experiment, config.find("train", "state"), SMALL), "cuda:0", 1)
         if eager:
             trainer.algorithm.rollout = trainer.algorithm._fly
         return [trainer.step()["cost"] for _ in range(6)]

@@ -59,9 +59,9 @@ class FirstOrder:
         """
         self.cfg, self.p, p = experiment, experiment.first_order, experiment.ppo
         seen = experiment.task.observation
-        if seen.history_of != "payload" or seen.oldest > experiment.sim.control_period:
-            came = f'history_of = "{seen.history_of}" and measurements up to {seen.oldest} s old'
-            raise ConfigError(f'algorithm = "first_order" takes a history of the payload and a latency of one period at most; got {came}')
+        if seen.layout != "state" or seen.history_of != "payload" or seen.oldest > experiment.sim.control_period:
+            expected = 'layout = "state", history_of = "payload" and a latency of one period at most'
+            raise ConfigError(f'algorithm = "first_order" takes an observation of {expected}; "distillation" makes a vision policy of it')
         if ranks or experiment.task.target.moves:
             raise ConfigError('algorithm = "first_order" trains in one process and throws at goals that stand still; "ppo" does both')
         self.env = env = ThrowEnv(experiment, device, seed)
@@ -213,8 +213,7 @@ class FirstOrder:
         env, task, p = self.env, self.cfg.task, Setting()
         p.max_thrust, p.max_rate = task.action.max_thrust, wp.vec3(*task.action.max_rate)
         p.period, p.decay = self.cfg.sim.control_period, self.p.decay
-        lens = self._lens() if env.layout.name == "vision" else torch.zeros(1, 1, 1, 3, device=env.device)
-        vectors = {"mount": self.plants.mount, "goal": self.goal, "corners": env.camera.square_w, "lens": lens}
+        vectors = {"mount": self.plants.mount, "goal": self.goal}
         plain = {"mass": self.flights.mass, "load_mass": self.plants.load_mass, "age": self.age, "network": self._jacobian()}
         for name, tensor in {**vars(self.surrogate), **plain, **vectors}.items():
             kind = wp.vec3 if name in vectors else wp.vec4 if name == "response" else wp.float32
@@ -243,30 +242,6 @@ class FirstOrder:
                 product = (product * slope[:, None]) @ linear.weight.detach()
             jacobian.append((product / scale).view(-1, self.env.num_envs, *product.shape[1:]))
         return torch.cat(jacobian)
-
-    def _lens(self) -> Tensor:
-        """Derivatives of each image coordinate by its point's place in the body frame, shape (T, E, 16, 3).
-
-        To move the camera by -e is to move every point by e, so three directions give them all.
-        """
-        env, f, T = self.env, self.flights.x, self.p.horizon
-        late = (self.age / self.cfg.sim.control_period)[:, None]
-        rot = ob.rotation_from_quat(f["quat"])
-        pose = torch.cat([f["pos"], rot[..., 0], rot[..., 1], f["load_pos"]], -1)[:T]
-        pose = torch.lerp(pose, torch.cat([pose[:1], pose[:-1]]), late).flatten(0, 1)
-        pos, x_axis, y_axis, load = pose.split(3, -1)
-        rot = torch.stack([x_axis, y_axis, torch.linalg.cross(x_axis, y_axis)], -1)
-        goal = self.goal.repeat(T, 1)
-        extrinsics = env.extrinsics()
-        if extrinsics is not None:
-            extrinsics = tuple(part.repeat(T, *(1,) * (part.dim() - 1)) for part in extrinsics)
-
-        def image(pos: Tensor) -> Tensor:
-            return ob.vision_part(env.camera, pos, rot, goal, load, extrinsics)[0].flatten(1)
-
-        columns = [torch.func.jvp(image, (pos,), (-rot[..., i].contiguous(),))[1] for i in range(3)]
-        kept = 1.0 - self.cfg.camera.noise.drop_probability
-        return kept * torch.stack(columns, -1).unflatten(0, (T, env.num_envs))
 
     def step(self, done: float) -> dict[str, float]:
         """One rollout and one step of Adam at this share of the training; returns its figures."""

@@ -1,4 +1,4 @@
-"""Backward pass of flights through the surrogate, the camera and the network: one kernel, a thread a flight.
+"""Backward pass of flights through the surrogate and the network: one kernel, a thread a flight.
 
 Derivatives are written by hand; a rotation's is that by a turn about the body axes, R exp(turn). Equations:
 :mod:`visthrow.training.first_order.surrogate`.
@@ -34,8 +34,6 @@ class Setting:
     decay: float  # of derivatives, per step
     age: wp.array(dtype=float)  # of poses [s]
     goal: wp.array(dtype=wp.vec3)
-    corners: wp.array(dtype=wp.vec3)  # of the goal square, from the goal
-    lens: wp.array3d(dtype=wp.vec3)  # (T, E, 16): of image coordinates by points in the body frame
     network: wp.array4d(dtype=float)  # (T, E, 5, D): of actions by observations
 
 
@@ -107,8 +105,8 @@ def step_back(p: Setting, x: Course, adj: Course, k: int, e: int):
 
 @lru_cache
 def build_backward(layout: ob.Layout) -> wp.Kernel:
-    """Backward pass of whole flights whose actor sees a layout, a thread a flight."""
-    vision, history, width = layout.name == "vision", layout.history, layout.payload
+    """Backward pass of whole flights whose actor sees a state layout, a thread a flight."""
+    history, width = layout.history, layout.payload
     previous_at, goal_at, load_at = ob.VEHICLE, ob.VEHICLE + 5, ob.VEHICLE + 5 + layout.goal
 
     @wp.func
@@ -124,12 +122,6 @@ def build_backward(layout: ob.Layout) -> wp.Kernel:
         return wp.vec3(by(p, g, k, e, i), by(p, g, k, e, i + 1), by(p, g, k, e, i + 2))
 
     @wp.func
-    def point_back(x: Course, adj: Course, i: int, e: int, point_w: wp.vec3, g_b: wp.vec3):
-        """From the derivative by a point in the body frame to those by the pose that it is seen from."""
-        adj.pos[i, e] -= wp.quat_rotate(x.quat[i, e], g_b)
-        adj.turn[i, e] += wp.cross(g_b, wp.quat_rotate_inv(x.quat[i, e], point_w - x.pos[i, e]))
-
-    @wp.func
     def vehicle_back(p: Setting, x: Course, adj: Course, g: VEC5, k: int, i: int, e: int, share: float):
         """From observation k to state i, of which ``share`` is in it: the vehicle and the goal."""
         adj.pos[i, e] += share * by_three(p, g, k, e, 0)
@@ -138,28 +130,15 @@ def build_backward(layout: ob.Layout) -> wp.Kernel:
         adj.response[i, e] += wp.vec4(0.0, rate[0], rate[1], rate[2])
         x_axis = turned(x.quat[i, e], wp.vec3(1.0, 0.0, 0.0), by_three(p, g, k, e, 9))
         adj.turn[i, e] += share * (x_axis + turned(x.quat[i, e], wp.vec3(0.0, 1.0, 0.0), by_three(p, g, k, e, 12)))
-        if wp.static(vision):
-            for j in range(4):
-                at = goal_at + 2 * j
-                g_b = by(p, g, k, e, at) * p.lens[k, e, 2 * j] + by(p, g, k, e, at + 1) * p.lens[k, e, 2 * j + 1]
-                point_back(x, adj, i, e, p.goal[e] + p.corners[j], share * g_b)
-        else:
-            adj.load_pos[i, e] -= share * wp.vec3(by(p, g, k, e, goal_at), by(p, g, k, e, goal_at + 1), 0.0)
+        adj.load_pos[i, e] -= share * wp.vec3(by(p, g, k, e, goal_at), by(p, g, k, e, goal_at + 1), 0.0)
 
     @wp.func
     def load_back(p: Setting, x: Course, adj: Course, g: VEC5, k: int, age: int, i: int, e: int, share: float):
         """From observation k to state i: the payload as it was ``age`` observations ago."""
         at = load_at + width * age
-        if wp.static(vision):
-            g_b = wp.vec3(0.0, 0.0, 0.0)
-            for j in range(8):
-                g_b += share * by(p, g, k, e, at + j) * p.lens[wp.max(k - age, 0), e, 8 + j]
-            point_back(x, adj, i, e, x.load_pos[i, e], g_b)
-            adj.load_pos[i, e] += wp.quat_rotate(x.quat[i, e], g_b)
-        else:
-            offset = share * by_three(p, g, k, e, at)
-            adj.load_pos[i, e] += offset
-            adj.pos[i, e] -= offset
+        offset = share * by_three(p, g, k, e, at)
+        adj.load_pos[i, e] += offset
+        adj.pos[i, e] -= offset
 
     @wp.kernel(module="unique", enable_backward=False)
     def backward_kernel(
