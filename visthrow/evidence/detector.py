@@ -4,7 +4,7 @@ import argparse
 import math
 import sys
 import time
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -67,6 +67,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     throw.add_argument("--target", type=float, default=2.0, metavar="M", help="distance (default: 2.0)")
     throw.add_argument("--throws", type=int, default=20, metavar="N", help="each in a hall of its own (default: 20)")
     throw.add_argument("--plant", default="hybrid", metavar="NAME", help="hybrid, reference or reference-realistic")
+    throw.add_argument("--nuisances", type=float, default=0.5, metavar="X", help="0: clean, 1: as bad as in training (default: 0.5)")
     throw.add_argument("--seed", type=int, default=0, help="of everything random")
     add_common(throw)
 
@@ -82,6 +83,7 @@ def throw(args: argparse.Namespace) -> int:
     Raises:
         VisthrowError: no throws, no such plant, or a policy that sees no keypoints.
     """
+    from camera.scenes.scene import Nuisances
     from visthrow.common.errors import suggest
     from visthrow.throws.loading import load_policy
     from visthrow.throws.plants import PLANTS
@@ -94,7 +96,8 @@ def throw(args: argparse.Namespace) -> int:
     loaded = load_policy(args.policy, None, args.overrides)
     if args.throws < 1 or loaded.policy.contract["observation"]["layout"] != "vision":
         raise VisthrowError(f"--throws {args.throws} with policy '{loaded.name}'; expected 1 or more, and a vision policy")
-    eyes = Eyes(loaded.experiment.camera, args.throws, args.seed, resolve(args.device), args.by, weights=args.weights)
+    bad = Nuisances(*(args.nuisances,) * len(fields(Nuisances)))
+    eyes = Eyes(loaded.experiment.camera, args.throws, args.seed, resolve(args.device), args.by, nuisances=bad, weights=args.weights)
     columns = fly_batch([loaded], args.plant, Job((0,), args.target, 0, args.throws, args.seed), eyes)
     share = {name: eyes.found[name] / max(eyes.found["frames"], 1) for name in ("ball", "goal")}
     figures = Throws(args.target, **columns).summary() | share

@@ -11,7 +11,7 @@ import torch
 from camera.detectors.contours import Detector, Known, Seen, detected_keypoints
 from camera.detectors.learnt import LearntDetector, Networks
 from camera.fisheye import Fisheye
-from camera.keypoints import KEYPOINTS, KeypointCamera
+from camera.keypoints import GOAL_KEYPOINTS, KEYPOINTS, KeypointCamera
 from camera.params import CameraParams
 from camera.scenes.renderer import Renderer
 from camera.scenes.scene import Draw, Nuisances, Scenes, dressed, posed_scenes
@@ -20,6 +20,9 @@ from visthrow.onboard.observations import rotation_from_quat
 
 HANGING = (0.2, 0.6)
 """Distance of a hanging ball from the lens [m]."""
+
+HOLD = 5
+"""Frames for which a thing that is not seen any more reads where it was, as in a run (`hil.poses.sight`)."""
 
 BY = ("learnt", "contours")
 """Detectors."""
@@ -63,6 +66,8 @@ class Eyes:
         self.camera = KeypointCamera(params)
         self._hall: Scenes | None = None
         self._looks = 0
+        self._ball_w: list[np.ndarray | None] = [None] * count  # ray to the ball a frame ago, world frame
+        self._unseen = {name: [HOLD] * count for name in ("ball", "goal")}  # frames since it was seen
         self.frames: list[tuple[np.ndarray, torch.Tensor, torch.Tensor]] = []
         self.seen: tuple[np.ndarray, np.ndarray] | None = None
         self.found = {"ball": 0, "goal": 0, "frames": 0}
@@ -86,13 +91,19 @@ class Eyes:
         for e in range(self.count):
             rot_cw = rot_cb @ rots[e].T
             height = float(measured.pos_w[e, 2] + rots[e][2] @ lens_b)
-            known = Known(rot_cw[:, 2], height, HANGING if carried[e] else None, north_c=rot_cw[:, 0])
+            before = None if self._ball_w[e] is None else rot_cw @ self._ball_w[e]
+            known = Known(rot_cw[:, 2], height, HANGING if carried[e] else None, before, north_c=rot_cw[:, 0])
             seen: Seen = self.detector.detect(np.ascontiguousarray(pictures[e, ..., ::-1]), known)
             one, ok = detected_keypoints(self.camera, seen, rots[e])
             points[e], valid[e] = one.numpy(), ok.numpy()
+            self._ball_w[e] = None if seen.ball is None else rot_cw.T @ seen.ball.ray_c
             self.found["frames"] += 1
-            for name in ("ball", "goal"):
-                self.found[name] += getattr(seen, name) is not None
+            for name, part in (("ball", slice(GOAL_KEYPOINTS, None)), ("goal", slice(0, GOAL_KEYPOINTS))):
+                there = getattr(seen, name) is not None
+                self.found[name] += there
+                self._unseen[name][e] = 0 if there else self._unseen[name][e] + 1
+                if not there and self._unseen[name][e] <= HOLD and self.seen is not None:
+                    points[e, part], valid[e, part] = self.seen[0][e, part], self.seen[1][e, part]
             if e == 0 and self._keep:
                 self.frames.append((np.ascontiguousarray(pictures[0, ..., ::-1]), one, ok))
         self.seen = points, valid
