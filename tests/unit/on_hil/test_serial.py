@@ -114,3 +114,10 @@ def test_a_full_disk_troubles_nobody(wire, tmp_path):
     logged._file.close()
     assert logged.write(b"abc")
     assert logged.failed == 1
+
+
+def test_a_port_that_is_not_there_is_named_once():
+    pytest.importorskip("serial")
+    with pytest.raises(LinkError) as caught:
+        SerialPort(Device("serial", "/dev/no_such_port", 115200))
+    assert str(caught.value) == "cannot open /dev/no_such_port: No such file or directory"

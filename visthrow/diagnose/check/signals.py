@@ -158,8 +158,8 @@ def _railed(name: str, values: np.ndarray) -> list[Row]:
     worst, where = 0.0, ""
     for column in values.T:
         low, high = np.min(column), np.max(column)
-        if high == low or np.all((column == low) | (column == high)):
-            continue  # constant, or a switch
+        if high == low:
+            continue
         for rail, words in ((low, "lowest"), (high, "highest")):
             if rail == low and any(word in name for word in _STOPS_AT_ZERO):
                 continue  # switched off is no rail
