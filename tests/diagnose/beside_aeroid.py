@@ -3,7 +3,7 @@
 Both get the same throws of a ball under motion capture and the same names: drag and wind. Then the names are taken away, which
 leaves the diagnosis alone. Worlds come from scipy's integrator; noise is white, or correlated over 30 ms as a tracker's filter leaves it.
 
-    pip install aeroid==0.5.0
+    pip install -c constraints.txt "visthrow[beside]"
     python -m tests.diagnose.beside_aeroid 10 --out tests/diagnose/beside-aeroid.json
 """
 
