@@ -17,6 +17,7 @@ import dataclasses
 import hashlib
 import os
 import re
+import runpy
 import shlex
 import shutil
 import subprocess
@@ -180,9 +181,22 @@ def parse(block: Block) -> None:
 def _one(words: list[str], place: str) -> None:
     if words[0] == "visthrow":  # in this process: most of a command's time is what it imports
         status = cli.main(words[1:])
+    elif words[0].startswith("python ") and words[0].split()[1].endswith(".py"):  # as above
+        status = _program(shlex.split(words[0])[1:])
     else:
         status = subprocess.run(["bash", "-ec", words[0]], env=_environment()).returncode
     assert status == 0, f"{place}: status {status}: {' '.join(words)}"
+
+
+def _program(argv: list[str]) -> int:
+    before, sys.argv = sys.argv, argv
+    try:
+        runpy.run_path(argv[0], run_name="__main__")
+    except SystemExit as end:
+        return int(end.code or 0)
+    finally:
+        sys.argv = before
+    return 0
 
 
 def _side_by_side(jobs: list[list[str]], place: str) -> None:
