@@ -24,6 +24,9 @@ from hil.sources.images import ImageParams
 from visthrow.common.errors import ConfigError
 from visthrow.logs.mapping import ChannelMap, TableMap, TimeColumn
 
+MOST_HOLD = 0.05
+"""For which a command may wait [s]: beyond it the policy was trained for another link altogether."""
+
 LIVE = ("mavlink", "mocap")
 """Kinds of source that are no recording."""
 
@@ -86,6 +89,7 @@ class DelayParams:
     compensate: bool  # carry poses forward to the age that the policy was trained with
     # By which commands and releases act later than in the policy's training; poses are carried as much further [s].
     command: float = 0.0
+    hold: float = 0.0  # for which each command waits: by so much the vehicle acts sooner than the policy was trained for [s]
 
 
 @dataclass(frozen=True)
@@ -160,5 +164,10 @@ class HilParams:
                 )
         if not 0.0 <= self.delay.source <= 0.5:
             raise ConfigError(f"delay.source {self.delay.source} s; expected 0 to 0.5")
+        if not 0.0 <= self.delay.hold <= MOST_HOLD or (self.delay.hold and self.delay.command):
+            raise ConfigError(
+                f"delay.hold {self.delay.hold} s, delay.command {self.delay.command} s; expected 0 to {MOST_HOLD:g}, and one of them 0: "
+                "a vehicle acts sooner than the policy was trained for, or later"
+            )
         if not 0.0 <= self.delay.command <= MOST_PREDICTION:
             raise ConfigError(f"delay.command {self.delay.command} s; expected 0 to {MOST_PREDICTION:g}: so far poses are carried")

@@ -10,6 +10,7 @@ from hil.backends.autopilot import MavlinkAutopilot
 from hil.backends.base import Backend, DryRun, Status
 from hil.backends.betaflight import Betaflight, BetaflightParams
 from hil.backends.crazyflie import Crazyflie, CrazyflieParams
+from hil.backends.held import Held
 from hil.backends.px4 import Px4, Px4Params
 from hil.errors import RunError
 from hil.links.crtp import open_crtp
@@ -50,6 +51,11 @@ def make_backend(
     """
     if params.backend == "dry-run":
         return DryRun()
+    backend = _made(params, link, write, tell, folder)
+    return Held(backend, params.delay.hold) if params.delay.hold else backend
+
+
+def _made(params: Any, link: Any, write: bool, tell: Callable[[str], None] | None, folder: Path | None) -> Backend:
     if params.backend == "betaflight":
         device = check_device(params.betaflight.device, remote=params.betaflight.remote)
         if device.kind not in ("tcp", "serial"):

@@ -22,6 +22,10 @@ MECHANISM = 0.06
 within the lag that the policies were trained with."""
 
 
+CARRIED = 0.8
+"""Share of its weight at which a vehicle leaves its stand: whoever hovers it asks for less than all where it stands too high."""
+
+
 class WirePlant:
     """One vehicle with its payload; NumPy in and out, batch axis left out.
 
@@ -110,7 +114,7 @@ class MotorPlant(WirePlant):
 
     Electronic speed controllers turn the rotors at ``full_speed * command * voltage / reference_voltage``: thrust goes with
     the square of the command and of the battery's voltage. The vehicle stands still at its start, the rope hanging, until its
-    rotors carry its weight.
+    rotors nearly carry its weight.
 
     Attributes:
         force_b: specific force, what an accelerometer shows [m/s^2], body frame. held: whether it still stands.
@@ -159,7 +163,7 @@ class MotorPlant(WirePlant):
         if self._stand is None:
             push_w = (self._now["vel_w"] - vel_w) / self.period + np.array([0.0, 0.0, GRAVITY])
             self.force_b = rotate_back(self.quat_wb, push_w)
-        elif self._k_f * np.sum(self._now["motor_speed"] ** 2) < self.mass[0] * GRAVITY:
+        elif self._k_f * np.sum(self._now["motor_speed"] ** 2) < CARRIED * self.mass[0] * GRAVITY:
             self._plant.hold(self._stand)
             self._look()
         else:

@@ -19,7 +19,7 @@ from hil.links import msp
 from hil.links.device import LARGEST_DATAGRAM, MOST_CHUNKS, Device, Port, TcpPort
 from hil.links.mavlink_link import Link
 
-ASK = {msp.RC: 0.01, msp.STATUS: 0.1}
+ASK = {msp.RC: 0.004, msp.STATUS: 0.1}
 """What the firmware is asked for, and how often [s]."""
 
 SLOW = 0.01
