@@ -84,7 +84,8 @@ def fly(folder: Path, seconds: float, seed: int = 0) -> dict[str, np.ndarray]:
                 pos = plant.state["pos_w"]
                 answered = desk.fake.answered
                 battery = (now["voltage"], now["charge_used"])
-                rows.append((plant.time, *now["rate_b"], *now["quat_wb"], *now["vel_w"], *pos, *command, answered, *battery))
+                moving = (plant.time, *now["rate_b"], *now["quat_wb"], *now["vel_w"], *pos)
+                rows.append((*moving, *command, answered, *battery, *np.ravel(plant.rope())))
                 desk.fake.step()
     finally:
         desk.close()
@@ -131,7 +132,8 @@ class Windows:
         rows = self.rows[chosen]
         sim = HybridSim(dataclasses.replace(self.plant, vehicle=vehicle), len(rows))
         start = rows[:, 0]
-        sim.place(start[:, 11:14], start[:, 4:8], start[:, 8:11], start[:, 1:4])
+        cable_dir, cable_vel = np.moveaxis(start[:, 21:].reshape(len(start), 2, -1, 3), 1, 0)
+        sim.place(start[:, 11:14], start[:, 4:8], start[:, 8:11], start[:, 1:4], cable_dir, cable_vel)
         sim.state.voltage.assign(start[:, 19].astype(np.float32))
         sim.state.charge_used.assign(start[:, 20].astype(np.float32))
         depth = sim.state.queue.shape[0]

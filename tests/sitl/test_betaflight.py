@@ -45,6 +45,9 @@ STEP = np.array([1.5, 1.5, 1.0])
 HALF_STEP = 0.15
 """Time to half of a step [s]: 55 to 90 ms were measured; a period of the commands and a late machine besides."""
 
+STIFF = {"p": "11", "i": "20", "d": "8", "d_max": "8"}
+"""Gains of roll and pitch that hold a rate against the swinging ball."""
+
 OTHERS = 0.25
 """Rate of the other axes beside a step, as a share of it: 0.03 of 1.5 rad/s were measured on a quiet machine."""
 
@@ -139,6 +142,18 @@ def bench(tmp_path, settings):
     desk.close()
 
 
+@pytest.fixture
+def stiff(tmp_path):
+    """With `STIFF` gains: those of the throws hold no rate against the ball, as the training's do not."""
+    params = config.load(HilParams, config.find("hil", "betaflight_sitl")).betaflight
+    gains = {f"{gain}_{axis}": value for axis in ("roll", "pitch") for gain, value in STIFF.items()}
+    folder = tmp_path / "stiff"
+    Firmware(program(), folder).set_up({**needed(params), **gains})
+    desk = Bench(tmp_path, folder)
+    yield desk
+    desk.close()
+
+
 def test_settings_are_written_and_read_back(settings):
     params = config.load(HilParams, config.find("hil", "betaflight_sitl")).betaflight
     assert settings[1] == needed(params)
@@ -146,8 +161,9 @@ def test_settings_are_written_and_read_back(settings):
     assert settings[1]["blackbox_device"] == "VIRTUAL"
 
 
-def test_it_is_taken_armed_and_follows_steps(bench):
+def test_it_is_taken_armed_and_follows_steps(stiff):
     """Sign, axis, scale and time of each rate and of thrust, by the vehicle's own motion."""
+    bench = stiff
     hover = bench.take()
     assert bench.fake.armed
     assert not bench.backend.audit.problems

@@ -139,6 +139,10 @@ class MotorPlant(WirePlant):
         names = ("quat_wb", "vel_w", "rate_b", "motor_speed", "voltage", "charge_used")
         return {name: value[0] for name, value in zip(names, self._plant.look(*names))}
 
+    def rope(self) -> list[np.ndarray]:
+        """Directions of the rope's segments and their derivatives [1/s], shapes (L, 3), world frame."""
+        return [value[0] for value in self._plant.look("cable_dir_w", "cable_vel_w")]
+
     def _look(self) -> None:
         self._now = self.look()
         self.quat_wb, self.rate_b = self._now["quat_wb"], self._now["rate_b"]
