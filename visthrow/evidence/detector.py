@@ -181,9 +181,9 @@ def check(args: argparse.Namespace) -> int:
         table[level] = {name: count.figures() for name, count in counts.items()}
         rows.append(pictures)
         _print(level, table[level], first=len(rows) == 1)
-    table["photographs"] = mistaken(detectors)
-    print(f"of {table['photographs']['looks']} looks at photographs with neither: " + ", ".join(
-        f"{name} reported {table['photographs'][name]['ball']} balls and {table['photographs'][name]['goal']} squares" for name in detectors
+    table["neither"] = mistaken(detectors)
+    print(f"of {table['neither']['looks']} looks at photographs with neither: " + ", ".join(
+        f"{name} reported {table['neither'][name]['ball']} balls and {table['neither'][name]['goal']} squares" for name in detectors
     ))
     if args.out is not None:
         import cv2
