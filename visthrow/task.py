@@ -45,6 +45,7 @@ class ObservationParams:
     latency: tuple[float, float]  # age of all that is measured, drawn per episode from this range [s]
     latency_jitter: float = 0.0  # of that age, uniform up to this to either side, drawn per step [s]
     goal_velocity: bool = False  # whether the actor is given a fit of the goal's velocity; see visthrow.onboard.goal_motion
+    located: bool = False  # vision: whether the actor is given where the keypoints lie too; see visthrow.onboard.located
     history_of: Literal["payload", "frame"] = "payload"  # what a measurement of the history holds; frame: all, and the action before
 
     @property
@@ -233,15 +234,13 @@ class DistillationParams:
     learning_rate: float = 2e-3  # at the first iteration
     final_rate: float = 5e-5  # at the last one; half a cosine between
     action_weight: float = 0.3  # of what an error of the estimate does to the action
-    alone: float = 0.3  # share of the training after which the estimator flies alone
-    led: float = 0.05  # share of the throws that are flown on what there is, then too
 
     def __post_init__(self) -> None:
         require_positive(
             "distillation", iterations=self.iterations, horizon=self.horizon, hidden=self.hidden, memory=self.memory,
-            epochs=self.epochs, minibatches=self.minibatches, learning_rate=self.learning_rate, alone=self.alone,
+            epochs=self.epochs, minibatches=self.minibatches, learning_rate=self.learning_rate,
         )  # fmt: skip
-        require_not_negative("distillation", final_rate=self.final_rate, action_weight=self.action_weight, led=self.led)
+        require_not_negative("distillation", final_rate=self.final_rate, action_weight=self.action_weight)
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ def overrides(*extra):
 
 
 def words(folder, *extra):
-    sets = overrides("distillation.iterations=4", "distillation.horizon=12", "task.bounds.time_limit=0.4")
+    sets = overrides("task.observation.located=true", "distillation.iterations=4", "distillation.horizon=12", "task.bounds.time_limit=0.4")
     return ["train", "vision", "--device", "cpu", "--out", str(folder), "--checkpoint-every", "1", *sets, *extra]
 
 

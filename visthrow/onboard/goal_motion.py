@@ -76,6 +76,20 @@ def measured_goal(
         offset, hanging = frame[:, VEHICLE : VEHICLE + 2], frame[:, VEHICLE + 2 : VEHICLE + 4]
         goal_xy = frame[:, :2] + hanging + offset
         return goal_xy, torch.full_like(goal_xy[:, 0], POSITION_SIGMA**-2)
+    goals, weight = goal_by_corner(layout, frame, valid, camera)
+    total = weight.sum(-1)
+    return (weight[..., None] * goals).sum(1) / total.clamp(min=1e-9)[:, None], total
+
+
+def goal_by_corner(layout: Layout, frame: Tensor, valid: Tensor, camera: KeypointCamera) -> tuple[Tensor, Tensor]:
+    """Goal in the world as each corner of one vision frame shows it.
+
+    Args:
+        layout, frame, valid, camera: see :func:`measured_goal`.
+
+    Returns:
+        Positions [m], shape (E, 4, 2), world frame, and their inverse variances [1/m^2], shape (E, 4); 0 where a corner is not seen.
+    """
     corners = frame[:, VEHICLE : VEHICLE + layout.goal].unflatten(1, (GOAL_KEYPOINTS, 2))
     rays_c, _ = camera.fisheye.unproject(camera.fisheye.denormalize(corners))
     x_axis, y_axis = frame[:, 9:12], frame[:, 12:15]
@@ -86,6 +100,4 @@ def measured_goal(
     reach = height / (-rays_w[..., 2]).clamp(min=GRAZING)
     goals = lens_w[:, None, :2] + reach[..., None] * rays_w[..., :2] - camera.square_w[:, :2]
     followed = valid[:, :GOAL_KEYPOINTS] & (rays_w[..., 2] < -GRAZING)
-    weight = followed * (height / (ANGLE_SIGMA * reach * reach)).square()
-    total = weight.sum(-1)
-    return (weight[..., None] * goals).sum(1) / total.clamp(min=1e-9)[:, None], total
+    return goals, followed * (height / (ANGLE_SIGMA * reach * reach)).square()

@@ -13,7 +13,8 @@ pushes the payload's part into the history and assembles the actor's input. With
     position 3 | velocity 3 | body rates 3 | rotation 6 | previous action 5 | goal corners 8
     | payload keypoints, now and H steps back 8 (1 + H) | attached 1 | validity of goal and payload keypoints 8
 
-and either one, where goals move, has the fit of the goal's velocity 2 (:mod:`visthrow.onboard.goal_motion`) at its end.
+With ``located`` it has where the keypoints lie 6 after them (:mod:`visthrow.onboard.located`). Either one, where goals move, has the
+fit of the goal's velocity 2 (:mod:`visthrow.onboard.goal_motion`) at its end.
 
 With ``history_of = "frame"`` the actor remembers more than the payload. Either layout is then, with the goal's fit at its end::
 
@@ -35,6 +36,9 @@ from camera.keypoints import KEYPOINTS, KeypointCamera, keypoints
 VEHICLE = 15
 """Width of the vehicle's own part."""
 
+LOCATED = 6
+"""Width of where keypoints lie (:mod:`visthrow.onboard.located`)."""
+
 
 @dataclass(frozen=True)
 class Layout:
@@ -47,6 +51,7 @@ class Layout:
     validity: int  # width of the validity bits
     motion: int = 0  # width of the goal's velocity
     whole: bool = False  # whether the history holds whole frames
+    located: int = 0  # width of where the keypoints lie
 
     @property
     def frame(self) -> int:
@@ -62,7 +67,7 @@ class Layout:
     def dimension(self) -> int:
         """Width of the actor's input."""
         beside = 0 if self.whole else VEHICLE + 5 + self.goal + self.validity
-        return beside + self.row * (1 + self.history) + 1 + self.motion
+        return beside + self.row * (1 + self.history) + 1 + self.motion + self.located
 
 
 def layout_of(params: Any) -> Layout:
@@ -78,7 +83,8 @@ def layout_of(params: Any) -> Layout:
     if params.layout == "state":
         return Layout("state", 2, 3, params.history, 0, motion, whole)
     if params.layout == "vision":
-        return Layout("vision", 8, 8, params.history, KEYPOINTS if params.validity else 0, motion, whole)
+        bits, places = (KEYPOINTS if params.validity else 0), (LOCATED if getattr(params, "located", False) else 0)
+        return Layout("vision", 8, 8, params.history, bits, motion, whole, places)
     raise ValueError(f"observation layout {params.layout!r}: expected 'state' or 'vision'")
 
 
@@ -143,6 +149,7 @@ def observe(
     history: Tensor,
     fresh: Tensor,
     goal_vel_w: Tensor | None = None,
+    places: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Assemble the actor's input and move the history on.
 
@@ -155,13 +162,15 @@ def observe(
         history: measurements now and earlier, newest first, shape (E, 1 + H, layout.row).
         fresh: episodes that begin here, bool, shape (E,): their history is filled with the current value.
         goal_vel_w: fit of the goal's horizontal velocity [m/s], shape (E, 2); None where the layout has none.
+        places: where the keypoints lie, shape (E, 6); None where the layout has none.
 
     Returns:
         Observation, shape (E, layout.dimension), and the new history.
     """
     goal_end = VEHICLE + layout.goal
     bits = [valid.to(frame.dtype)] if layout.validity and valid is not None else []
-    moving = [goal_vel_w] if layout.motion and goal_vel_w is not None else []
+    moving = [places] if layout.located and places is not None else []
+    moving += [goal_vel_w] if layout.motion and goal_vel_w is not None else []
     if layout.whole:
         history = push(history, torch.cat([frame, previous_action, *bits], dim=-1), fresh)
         return torch.cat([history.flatten(1), attached.unsqueeze(-1), *moving], dim=-1), history

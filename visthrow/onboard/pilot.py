@@ -21,6 +21,7 @@ from visthrow.common.errors import PolicyError
 from visthrow.onboard import actions as act
 from visthrow.onboard import goal_motion
 from visthrow.onboard import observations as ob
+from visthrow.onboard.located import located
 from visthrow.onboard.policy import Policy
 from visthrow.onboard.traced import Traced
 
@@ -253,7 +254,10 @@ class Pilot:
             place, weight = goal_motion.measured_goal(self.layout, frame, valid, self.camera)
             fitted, velocity = goal_motion.fit(further[0], further[1], place, weight, fresh)
             sums = (fitted,)
-        observation, history = ob.observe(self.layout, frame, valid, previous, attached[:, 0], history, fresh, velocity)
+        places = None
+        if self.layout.located and valid is not None and self.camera is not None:
+            places = located(self.layout, frame, valid, self.camera)
+        observation, history = ob.observe(self.layout, frame, valid, previous, attached[:, 0], history, fresh, velocity, places)
         return observation, history, *sums, *seen
 
     def _decision(self, observation: Tensor, memory: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -1,9 +1,9 @@
 """A vision policy with a memory, distilled from a state policy: an estimator learns what the state policy looks at.
 
 The state policy decides; in place of its observation it is given the estimate that a recurrent network makes of all that a
-vision policy has seen (:mod:`visthrow.onboard.estimator`). The network flies, first with the state policy's exact observation
-in some throws and then alone, and is fitted by regression to that exact observation on the states that it meets (DAgger: Ross
-et al., AISTATS 2011), with backpropagation through the whole throw.
+vision policy has seen (:mod:`visthrow.onboard.estimator`). The network flies from the first iteration on, and is fitted by
+regression to the exact observation on the states that it meets (DAgger: Ross et al., AISTATS 2011), with backpropagation
+through the whole throw. Throws that the exact observation flies would teach it to read the truth out of the action before.
 """
 
 import math
@@ -116,7 +116,7 @@ class Distillation:
         make = {"device": device, "dtype": torch.float32}
         self._scales = torch.cat([torch.full((width,), scale, **make) for width, scale in zip(widths, scales)])
         self._obs, self._truth = torch.zeros(T, E, env.layout.dimension, **make), torch.zeros(T, E, self._layout.dimension, **make)
-        self._alive, self._led = torch.zeros(T, E, **make), torch.zeros(E, 1, device=device, dtype=torch.bool)
+        self._alive = torch.zeros(T, E, **make)
         self._history = torch.zeros(E, 1 + self._layout.history, self._layout.row, **make)
         self._flying = self.network.frozen()
         self.average = averaged(self.network, AVERAGED)
@@ -129,7 +129,8 @@ class Distillation:
         """Fly one batch from new starts and record what was seen, what there was, and until when each throw lasted."""
         env, policy = self.env, self.teacher
         seen, memory = env.reset()["actor"], torch.zeros(env.num_envs, self.p.memory, device=env.device)
-        fresh, alive = torch.ones_like(self._led[:, 0]), torch.ones_like(self._alive[0])
+        alive = torch.ones_like(self._alive[0])
+        fresh = alive > 0.0
         for k in range(self.p.horizon):
             self._obs[k].copy_(seen)
             truth, history = ob.observe(
@@ -140,15 +141,12 @@ class Distillation:
             self._truth[k].copy_(truth)
             self._alive[k].copy_(alive)
             estimate, memory = self._flying.step(seen, memory)
-            action = policy.decide(torch.where(self._led, truth, estimate))
-            observations, _, done, _ = env.step(action)
+            observations, _, done, _ = env.step(policy.decide(estimate))
             seen, alive = observations["actor"], alive * (done == 0)
 
     def step(self, done: float) -> dict[str, float]:
         """One rollout and the gradient steps on it at this share of the training; returns its figures."""
         p, start = self.p, time.perf_counter()
-        led = self.env.num_envs * max(1.0 - done / p.alone, p.led)
-        self._led.copy_((torch.arange(self.env.num_envs, device=self.env.device) < led)[:, None])
         self.env.clear_totals()
         self.rollout()
         if self.env.device.startswith("cuda"):
@@ -232,10 +230,10 @@ class Distillation:
 
 def _passed(seen: ob.Layout, wanted: ob.Layout) -> tuple[Tensor, Tensor]:
     """Which entry of a vision observation each entry of a state observation corrects, and which of these are learnt."""
-    none, vehicle = seen.dimension, list(range(ob.VEHICLE + 5))
-    attached = seen.dimension - seen.validity - seen.motion - 1
-    between = wanted.dimension - len(vehicle) - 1
-    kept = torch.tensor([*vehicle, *[none] * between, attached])
+    none, vehicle, places = seen.dimension, list(range(ob.VEHICLE + 5)), seen.dimension - seen.motion - seen.located
+    goal = [places, places + 1] if seen.located else [none, none]
+    between = wanted.dimension - len(vehicle) - len(goal) - 1
+    kept = torch.tensor([*vehicle, *goal, *[none] * between, places - seen.validity - 1])
     learnt = torch.ones(wanted.dimension, dtype=torch.bool)
     learnt[ob.VEHICLE : ob.VEHICLE + 5] = learnt[-1] = False  # the action before and the latch are known
     return kept, learnt

@@ -21,6 +21,7 @@ from sim.params import GRAVITY
 from visthrow.onboard import actions as act
 from visthrow.onboard import goal_motion
 from visthrow.onboard import observations as ob
+from visthrow.onboard.located import located
 from visthrow.task import Experiment, plant_of
 from visthrow.training import rewards, terminations
 from visthrow.training.posterior import drawn_plants
@@ -348,8 +349,9 @@ class ThrowEnv(VecEnv):
             place, weight = goal_motion.measured_goal(self.layout, measured, valid, self.camera)
             sums, goal_vel = goal_motion.fit(memory["goal_fit"], time, place, weight, fresh)
             memory["goal_fit"].copy_(sums)
+        places = located(self.layout, measured, valid, self.camera) if self.layout.located and valid is not None else None
         actor, history = ob.observe(
-            self.layout, measured, valid, memory["previous"], attached, memory["history"], fresh, goal_vel
+            self.layout, measured, valid, memory["previous"], attached, memory["history"], fresh, goal_vel, places
         )
         memory["history"].copy_(history)
         observed = {"actor": actor, "critic": self._privileged(actor, exact, time, fresh)}

@@ -1,0 +1,72 @@
+"""Where keypoints lie: the truth without noise, one wrong point outvoted, nothing where nothing is seen."""
+
+import dataclasses
+
+import torch
+
+from camera.keypoints import KeypointCamera
+from camera.mount import rotation_from_vector
+from visthrow import config
+from visthrow.onboard import observations as ob
+from visthrow.onboard.located import located, middle
+from visthrow.task import Experiment
+
+EXACT = 2e-3
+"""Of float32 at 2 m, and of the box's middle, which is not quite the image of the ball's centre [m], [-]."""
+
+
+def scene():
+    """Layout, camera, a frame of noise-free keypoints of eight poses, their validity, goal - vehicle and lens - payload's ray."""
+    params = config.load(Experiment, config.find("train", "laptop_vision"))
+    layout, camera = ob.layout_of(params.task.observation), KeypointCamera(params.camera)
+    torch.manual_seed(1)
+    pos = torch.tensor([0.0, 0.0, 1.3]) + 0.2 * torch.randn(8, 3)
+    rot = rotation_from_vector(0.2 * torch.randn(8, 3))
+    goal = torch.cat([torch.randn(8, 2), torch.zeros(8, 1)], -1)
+    load = pos + torch.tensor([0.0, 0.0, -0.38]) + 0.08 * torch.randn(8, 3)
+    points, valid = ob.vision_part(camera, pos, rot, goal, load)
+    frame = torch.cat([ob.vehicle_part(pos, torch.zeros(8, 3), torch.zeros(8, 3), rot), points.flatten(1)], -1)
+    ray = load - pos - (rot @ camera.position_b)
+    return layout, camera, frame, valid, (goal - pos)[:, :2], ray / ray.norm(dim=-1, keepdim=True)
+
+
+def test_without_noise_it_is_the_truth():
+    layout, camera, frame, valid, offset, ray = scene()
+    assert valid.all()
+    found = located(layout, frame, valid, camera)
+    torch.testing.assert_close(found[:, :2], offset, rtol=0, atol=EXACT)
+    torch.testing.assert_close(found[:, 2:5], ray, rtol=0, atol=EXACT)
+    assert (found[:, 5] == 1.0).all()
+
+
+def test_one_wrong_point_of_each_is_outvoted():
+    layout, camera, frame, valid, offset, ray = scene()
+    for wrong in (15, 16, 25, 26):  # of the first corner, of the box's second side
+        frame[:, wrong] = 0.4
+    found = located(layout, frame, valid, camera)
+    assert (found[:, :2] - offset).abs().max() < 0.05  # the square's corners disagree by the middle's neighbours
+    assert (found[:, 2:5] - ray).norm(dim=-1).max() < 0.1  # half of the ball's angle
+
+
+def test_what_is_not_seen_is_nought():
+    layout, camera, frame, valid, _, ray = scene()
+    valid = valid.clone()
+    valid[:4, :4] = False
+    valid[4:, 4:] = False
+    found = located(layout, frame, valid, camera)
+    assert found[:4, [0, 1, 5]].abs().max() == 0.0
+    assert found[4:, 2:5].abs().max() == 0.0
+    assert (found[4:, 5] == 1.0).all()
+    torch.testing.assert_close(found[:4, 2:5], ray[:4], rtol=0, atol=EXACT)
+
+
+def test_middle_is_the_median_of_what_is_valid():
+    torch.manual_seed(0)
+    points, valid = torch.randn(200, 4, 2), torch.rand(200, 4) > 0.4
+    expected = torch.where(valid.unsqueeze(-1), points, torch.nan).nanquantile(0.5, dim=1).nan_to_num(0.0)
+    torch.testing.assert_close(middle(points, valid), expected)
+
+
+def test_a_layout_counts_it():
+    params = config.load(Experiment, config.find("train", "laptop_vision")).task.observation
+    assert ob.layout_of(params).dimension == ob.layout_of(dataclasses.replace(params, located=False)).dimension + 6
