@@ -2,6 +2,9 @@
 
 MuJoCo C, batched by ``mujoco.batch``; integrator RK4. Other payloads are other models: a ``vehicle`` on a free joint with the six
 actuators of :mod:`sim.reference.model`, and a site ``payload``.
+
+MuJoCo Warp 4.0 takes the same models and ends the hard throw where C does (RK4, 0.5 ms: 0.14 mm of the ball and 0.19 mm of the
+vehicle from the fused chain); on a CPU core it compiles for 80 s and makes 26 steps a second.
 """
 
 from collections.abc import Sequence
