@@ -4,7 +4,10 @@ import contextlib
 import importlib
 import inspect
 import json
+import signal
 import socket
+import threading
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -188,6 +191,29 @@ class Paced:
         fake.emit()
 
 
+@contextlib.contextmanager
+def interruptible() -> Iterator[threading.Event]:
+    """Event that the first Ctrl-C sets; the second interrupts.
+
+    An interrupt that is raised anywhere is lost where it meets a destructor: Python prints it and goes on.
+    """
+    asked = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield asked
+        return
+
+    def take(number: int, frame: object) -> None:
+        if asked.is_set():
+            raise KeyboardInterrupt
+        asked.set()
+
+    before = signal.signal(signal.SIGINT, take)
+    try:
+        yield asked
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 def serve(
     fake: Fake, clock: Clock, most: float, out: Path | None = None, after: float = AFTER_LANDING
 ) -> dict[str, Any]:  # fmt: skip
@@ -197,8 +223,8 @@ def serve(
         The report, with the number of periods that took longer than real time has.
     """
     paced, begun = Paced(fake, clock), fake.plant.time
-    with contextlib.suppress(KeyboardInterrupt), collected():  # a collection of all takes a tenth of a second
-        while fake.plant.time - begun < most:
+    with contextlib.suppress(KeyboardInterrupt), interruptible() as asked, collected():  # a collection of all takes a tenth of a second
+        while fake.plant.time - begun < most and not asked.is_set():
             paced.step()
             landed = fake.plant.landing["landing_time"]
             if landed is not None and fake.plant.time > landed + after:
