@@ -269,7 +269,8 @@ def test_a_whole_throw(tmp_path):
     assert found["releases"] == 1
     assert error < MISS, states
     assert "recover" in states
-    assert "hovering again" in states
+    # With the throws' soft gains the fence may foresee a braking point below the ground after the release: the runner then lands at once.
+    assert "hovering again" in states or "after the throw, fence" in states
     assert list(folder.glob("LOG*")), "the firmware wrote its blackbox"
 
 
