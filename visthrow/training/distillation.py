@@ -111,7 +111,7 @@ class Distillation:
         self._age = sum(contract["latency"]) / 2.0
         kept, learnt = _passed(env.layout, self._layout)
         self.network = Network(kept, learnt, env.layout.dimension, self.p.hidden, self.p.memory).to(device)
-        widths = (3, 3, 3, 6, ob.VEHICLE - 15 + 5, 2, 3 * (1 + self._layout.history), 1)
+        widths = (3, 3, 3, 6, act.ACTIONS, 2, 3 * (1 + self._layout.history), 1)
         scales = [SCALES[0], SCALES[1], SCALES[2], SCALES[3], 1.0, SCALES[4], SCALES[5], 1.0]
         make = {"device": device, "dtype": torch.float32}
         self._scales = torch.cat([torch.full((width,), scale, **make) for width, scale in zip(widths, scales)])
