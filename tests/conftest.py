@@ -1,5 +1,18 @@
 """One thread a product for all tests: see :mod:`visthrow.diagnose.likelihood.threads`."""
 
+import pytest
+
 from visthrow.diagnose.likelihood.threads import single
 
 single()
+
+
+@pytest.fixture
+def one_thread():
+    """One thread for torch: small work; the same bits need the same number of threads."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)

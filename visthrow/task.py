@@ -40,13 +40,12 @@ class ObservationParams:
     """What the actor sees; see :mod:`visthrow.onboard.observations`."""
 
     layout: Literal["state", "vision"]
-    history: int  # earlier measurements beside the current one
+    history: int  # earlier payload measurements beside the current one
     validity: bool  # vision: whether the actor is told which keypoints are valid
     latency: tuple[float, float]  # age of all that is measured, drawn per episode from this range [s]
     latency_jitter: float = 0.0  # of that age, uniform up to this to either side, drawn per step [s]
     goal_velocity: bool = False  # whether the actor is given a fit of the goal's velocity; see visthrow.onboard.goal_motion
     located: bool = False  # vision: whether the actor is given where the keypoints lie too; see visthrow.onboard.located
-    history_of: Literal["payload", "frame"] = "payload"  # what a measurement of the history holds; frame: all, and the action before
 
     @property
     def oldest(self) -> float:
@@ -284,7 +283,7 @@ class Experiment:
     algorithm: Literal["ppo", "first_order", "distillation"] = "ppo"
     first_order: FirstOrderParams = field(default_factory=FirstOrderParams)
     distillation: DistillationParams = field(default_factory=DistillationParams)
-    flown_as: str = ""  # train config whose conditions a policy of this training is flown in; empty: its own
+    flown: tuple[str, ...] = ()  # key=value changes of this configuration that its policies are flown and measured with
 
     @property
     def iterations(self) -> int:

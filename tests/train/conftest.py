@@ -1,13 +1,33 @@
-"""One thread for torch in every test of training."""
+"""What the tests of training share."""
+
+import os
 
 import pytest
-import torch
+
+from visthrow import cli
 
 
 @pytest.fixture(autouse=True)
-def one_thread():
+def same_bits(one_thread):
     """The same bits need the same number of threads."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+
+
+@pytest.fixture
+def signalled(monkeypatch):
+    """Function that runs a command's training of four iterations, sends a signal in the second, and resumes it."""
+
+    def run(algorithm, words, number):
+        step = algorithm.step
+
+        def interrupted(self, done):
+            figures = step(self, done)
+            if done == 1 / 4:
+                os.kill(os.getpid(), number)
+            return figures
+
+        monkeypatch.setattr(algorithm, "step", interrupted)
+        assert cli.main(words) == 130
+        monkeypatch.setattr(algorithm, "step", step)
+        assert cli.main([*words, "--resume"]) == 0
+
+    return run

@@ -1,6 +1,5 @@
 """Distillation: it learns, its policy remembers on board as in training, and it goes on bit for bit after a stop."""
 
-import os
 import signal
 
 import numpy as np
@@ -68,7 +67,7 @@ def test_the_exported_policy_remembers_as_the_network_does(whole):
     policy, network = Policy.load(whole / "policy.npz"), trainer.algorithm.average.module
     obs = torch.randn(FLOWN, 5, policy.obs_dim)
     with torch.no_grad():
-        estimates = network(obs, policy.estimator.mean, policy.estimator.std)
+        estimates = network(obs)
     memory = policy.begin(5)
     for seen, wanted in zip(obs, estimates):
         estimate, memory = policy.estimator.step(seen, memory)
@@ -96,22 +95,25 @@ def test_the_pilot_remembers_as_training_does(whole):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_stop_keeps_what_was_done(whole, tmp_path, monkeypatch, number):
-    folder, step = tmp_path / "run", Distillation.step
-
-    def interrupted(self, done):
-        figures = step(self, done)
-        if done == 1 / 4:
-            os.kill(os.getpid(), number)  # in the second iteration
-        return figures
-
-    monkeypatch.setattr(Distillation, "step", interrupted)
-    assert cli.main(words(folder)) == 130
-    monkeypatch.setattr(Distillation, "step", step)
-    assert cli.main(words(folder, "--resume")) == 0
+def test_a_stop_keeps_what_was_done(whole, tmp_path, signalled, number):
+    folder = tmp_path / "run"
+    signalled(Distillation, words(folder), number)
     one, two = (Policy.load(run / "policy.npz").estimator for run in (whole, folder))
     for name, value in vars(one).items():
         np.testing.assert_array_equal(value.numpy(), getattr(two, name).numpy(), err_msg=name)
+
+
+def test_a_training_starts_from_a_distilled_policy_and_no_other(whole, tmp_path, capsys):
+    policy, start = Policy.load(whole / "policy.npz"), ["--from", str(whole / "policy.npz")]
+    trainer = Trainer(config.load(Experiment, whole / "config.toml"), "cpu", 2)
+    trainer.take_up(policy)
+    taken = trainer.algorithm.export(policy.contract, {})
+    for name, value in vars(policy.estimator).items():
+        torch.testing.assert_close(getattr(taken.estimator, name), value, rtol=0, atol=AGREES)
+    assert cli.main([*words(tmp_path / "a"), *start, "--set", 'algorithm="ppo"']) == 2
+    assert "the policy is one with a memory" in capsys.readouterr().err
+    assert cli.main([*words(tmp_path / "b"), "--from", "vision", "--set", "task.observation.located=false"]) == 2
+    assert "the policy is one without a memory" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -119,7 +121,6 @@ def test_a_stop_keeps_what_was_done(whole, tmp_path, monkeypatch, number):
     [
         ('distillation.teacher="vision"', "has the layout 'vision'; expected 'state'"),
         ('task.observation.layout="state"', 'observation.layout = "vision"'),
-        ('task.observation.history_of="frame"', 'observation.history_of = "payload"'),
         ("distillation.memory=0", "memory"),
     ],
 )

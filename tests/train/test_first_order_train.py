@@ -56,19 +56,9 @@ def test_its_policy_is_one_like_any_other(whole):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_keeps_what_was_done(whole, tmp_path, monkeypatch, number):
-    folder, step = tmp_path / "run", FirstOrder.step
-
-    def interrupted(self, done):
-        figures = step(self, done)
-        if done == 1 / 4:
-            os.kill(os.getpid(), number)  # in the second iteration
-        return figures
-
-    monkeypatch.setattr(FirstOrder, "step", interrupted)
-    assert cli.main(words(folder)) == 130
-    monkeypatch.setattr(FirstOrder, "step", step)
-    assert cli.main(words(folder, "--resume")) == 0
+def test_a_signal_keeps_what_was_done(whole, tmp_path, signalled, number):
+    folder = tmp_path / "run"
+    signalled(FirstOrder, words(folder), number)
     assert same(whole, folder)
 
 

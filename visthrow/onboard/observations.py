@@ -16,11 +16,6 @@ pushes the payload's part into the history and assembles the actor's input. With
 With ``located`` it has where the keypoints lie 6 after them (:mod:`visthrow.onboard.located`). Either one, where goals move, has the
 fit of the goal's velocity 2 (:mod:`visthrow.onboard.goal_motion`) at its end.
 
-With ``history_of = "frame"`` the actor remembers more than the payload. Either layout is then, with the goal's fit at its end::
-
-    (position 3 | velocity 3 | body rates 3 | rotation 6 | goal 2 or 8 | payload 3 or 8 | previous action 5 | validity 0 or 8),
-    now and H steps back | attached 1
-
 The rotation is the first two columns of rot_wb (Zhou et al., CVPR 2019), column after column.
 """
 
@@ -50,7 +45,6 @@ class Layout:
     history: int  # H
     validity: int  # width of the validity bits
     motion: int = 0  # width of the goal's velocity
-    whole: bool = False  # whether the history holds whole frames
     located: int = 0  # width of where the keypoints lie
 
     @property
@@ -59,15 +53,10 @@ class Layout:
         return VEHICLE + self.goal + self.payload
 
     @property
-    def row(self) -> int:
-        """Width of one measurement in the history."""
-        return self.frame + 5 + self.validity if self.whole else self.payload
-
-    @property
     def dimension(self) -> int:
         """Width of the actor's input."""
-        beside = 0 if self.whole else VEHICLE + 5 + self.goal + self.validity
-        return beside + self.row * (1 + self.history) + 1 + self.motion + self.located
+        beside = self.validity + self.motion + self.located
+        return VEHICLE + 5 + self.goal + self.payload * (1 + self.history) + 1 + beside
 
 
 def layout_of(params: Any) -> Layout:
@@ -79,12 +68,11 @@ def layout_of(params: Any) -> Layout:
     if params.history < 0:
         raise ValueError(f"observation history {params.history}: expected 0 or more")
     motion = 2 if getattr(params, "goal_velocity", False) else 0  # contracts hold what differs from the default
-    whole = getattr(params, "history_of", "payload") == "frame"
     if params.layout == "state":
-        return Layout("state", 2, 3, params.history, 0, motion, whole)
+        return Layout("state", 2, 3, params.history, 0, motion)
     if params.layout == "vision":
         bits, places = (KEYPOINTS if params.validity else 0), (LOCATED if getattr(params, "located", False) else 0)
-        return Layout("vision", 8, 8, params.history, bits, motion, whole, places)
+        return Layout("vision", 8, 8, params.history, bits, motion, places)
     raise ValueError(f"observation layout {params.layout!r}: expected 'state' or 'vision'")
 
 
@@ -92,13 +80,13 @@ def resampled(history: Tensor, newest: Tensor, ages: list[float], period: float)
     """Histories as they would be if a step had come each period before now, by straight lines between those that came.
 
     Args:
-        history: measurements of earlier steps, newest first, shape (E, 1 + H, layout.row).
-        newest: of this step, shape (E, layout.row).
+        history: measurements of earlier steps, newest first, shape (E, 1 + H, layout.payload).
+        newest: of this step, shape (E, layout.payload).
         ages: of the steps in the history, newest first, ascending [s]; rows beyond them are copies of the oldest.
         period: [s].
 
     Returns:
-        Rows that are 1, 2, ... periods old, shape (E, 1 + H, layout.row); what is older than all that came is the oldest.
+        Rows that are 1, 2, ... periods old, shape (E, 1 + H, layout.payload); what is older than all that came is the oldest.
     """
     knots, rows, out = [0.0, *ages], torch.cat([newest[:, None], history], dim=1), []
     for k in range(1, 1 + history.shape[1]):
@@ -159,7 +147,7 @@ def observe(
         valid: validity of the keypoints, shape (E, 8); None where the layout has none.
         previous_action: clipped, shape (E, 5).
         attached: 1 while the payload hangs on the vehicle, shape (E,), float.
-        history: measurements now and earlier, newest first, shape (E, 1 + H, layout.row).
+        history: measurements now and earlier, newest first, shape (E, 1 + H, layout.payload).
         fresh: episodes that begin here, bool, shape (E,): their history is filled with the current value.
         goal_vel_w: fit of the goal's horizontal velocity [m/s], shape (E, 2); None where the layout has none.
         places: where the keypoints lie, shape (E, 6); None where the layout has none.
@@ -171,9 +159,6 @@ def observe(
     bits = [valid.to(frame.dtype)] if layout.validity and valid is not None else []
     moving = [places] if layout.located and places is not None else []
     moving += [goal_vel_w] if layout.motion and goal_vel_w is not None else []
-    if layout.whole:
-        history = push(history, torch.cat([frame, previous_action, *bits], dim=-1), fresh)
-        return torch.cat([history.flatten(1), attached.unsqueeze(-1), *moving], dim=-1), history
     history = push(history, frame[:, goal_end:], fresh)
     parts = [frame[:, :VEHICLE], previous_action, frame[:, VEHICLE:goal_end], history.flatten(1), attached.unsqueeze(-1)]
     return torch.cat(parts + bits + moving, dim=-1), history

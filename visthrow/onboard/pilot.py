@@ -122,7 +122,7 @@ class Pilot:
     def start(self) -> None:
         """Begin a throw from hover: the next call fills the history."""
         self._previous = self._first.repeat(self.count, 1)
-        self._history = torch.zeros(self.count, 1 + self.layout.history, self.layout.row)
+        self._history = torch.zeros(self.count, 1 + self.layout.history, self.layout.payload)
         self._memory = self.policy.begin(self.count)
         self._fresh = torch.ones(self.count, dtype=torch.bool)
         self._goal_fit, self._steps = goal_motion.empty_sums(self.count), 0
@@ -196,7 +196,7 @@ class Pilot:
         """Make the history one of steps a period apart, as in training; whether steps before this one were late or missing.
 
         Args:
-            now: of this step [s]. newest: its measurement, shape (E, layout.row).
+            now: of this step [s]. newest: its measurement, shape (E, layout.payload).
         """
         times, period, rows = self._times, self.period, 1 + self.layout.history
         ages = [now - time for time in times]

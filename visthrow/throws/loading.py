@@ -33,7 +33,7 @@ def load_policy(
 
     Args:
         name: of a shipped policy, or a file.
-        config_name: a config of ``configs/train`` to fly in instead of the policy's own (the one that its training names).
+        config_name: a config of ``configs/train`` to fly in instead of the policy's own, as its training says that it is flown.
         overrides: ``key=value`` changes of that config.
         allow: parts of the contract that may be broken, as of :meth:`visthrow.onboard.policy.Policy.require`.
 
@@ -45,15 +45,14 @@ def load_policy(
     path = find_policy(name)
     policy = Policy.load(path)
     trained = policy.made_by.get("config")
-    if config_name is None and isinstance(trained, dict):
-        config_name = trained.get("flown_as") or None
     if config_name is not None:
         rule = policy.contract.get("camera", {}).get("invalid_reads")
         own = [] if rule is None else [f"camera.noise.invalid_reads={rule}"]  # of the program, not of the camera
         experiment = config.load(Experiment, config.find("train", config_name), [*own, *overrides])
     elif isinstance(trained, dict):
         text = toml_text.dumps({**trained, "ppo": _learning(policy)})
-        experiment = config.loads(Experiment, text, overrides, name=f"{path} (the config it was trained with)")
+        flown = [*trained.get("flown", ()), *overrides]
+        experiment = config.loads(Experiment, text, flown, name=f"{path} (the config it was trained with)")
     else:
         raise PolicyError(f"{path} does not carry the config it was trained with; name one with --config")
     try:
@@ -70,7 +69,7 @@ def _within(policy: Policy, experiment: Experiment) -> tuple[str, ...]:
     low, high = trained.get("latency", (0.0, 0.0))
     jitter = trained.get("latency_jitter", 0.0)
     inside = low - jitter <= seen.latency[0] - seen.latency_jitter and seen.oldest <= high + jitter
-    return ("observation.latency", "observation.latency_jitter") if jitter and inside else ()
+    return ("observation.latency", "observation.latency_jitter") if inside else ()
 
 
 def _learning(policy: Policy) -> dict[str, Any]:

@@ -8,9 +8,11 @@ through the whole throw. Throws that the exact observation flies would teach it 
 
 import math
 import time
+from types import SimpleNamespace
 
 import torch
 import torch.nn.functional as F
+from rsl_rl.modules import EmpiricalNormalization
 from torch import Tensor, nn
 
 from sim.arrays.torch_bridge import Replayed
@@ -21,7 +23,7 @@ from visthrow.onboard.estimator import Estimator
 from visthrow.onboard.policy import Policy, find_policy
 from visthrow.task import Experiment, contract_of
 from visthrow.training.env import ThrowEnv
-from visthrow.training.ppo.network import averaged
+from visthrow.training.ppo.network import averaged, normalizer_state
 
 SCALES = (0.02, 0.05, 0.2, 0.02, 0.01, 0.005)
 """Errors that count alike: of position [m], velocity [m/s], body rates [rad/s], rotation [-], goal and payload offsets [m]."""
@@ -49,28 +51,21 @@ class Network(nn.Module):
         with torch.no_grad():
             self.output.weight.mul_(0.1)
             self.output.bias.zero_()
-        for name, value in (("kept", kept), ("learnt", learnt.float()), ("sums", torch.zeros(3, width, dtype=torch.float64))):
-            self.register_buffer(name, value)
-
-    def watch(self, obs: Tensor) -> None:
-        """Take observations, shape (N, D), into their mean and spread."""
-        x = obs.double()
-        self.sums.add_(torch.stack([torch.full_like(x[0], len(x)), x.sum(0), x.square().sum(0)]))
+        self.normalizer = EmpiricalNormalization(width)
+        self.register_buffer("kept", kept)
+        self.register_buffer("learnt", learnt.float())
 
     def frozen(self) -> Estimator:
         """The estimator that flies; it shares the parameters."""
-        count, total, squares = self.sums
-        mean = total / count.clamp(min=1.0)
-        std = (squares / count.clamp(min=1.0) - mean.square()).clamp(min=0.0).sqrt()
-        mask, gru = self.learnt, self.gru
-        parts = [mean.float(), torch.where(count > 0, std, torch.ones_like(std)).float() + 0.01, self.encoder.weight, self.encoder.bias]
+        mask, gru, seen = self.learnt, self.gru, self.normalizer
+        parts = [seen.mean, seen.std + seen.eps, self.encoder.weight, self.encoder.bias]
         parts += [gru.weight_ih_l0, gru.bias_ih_l0, gru.weight_hh_l0, gru.bias_hh_l0]
         parts += [self.output.weight * mask[:, None], self.output.bias * mask, self.kept]
         return Estimator(*(part.detach() for part in parts))
 
-    def forward(self, obs: Tensor, mean: Tensor, std: Tensor) -> Tensor:
-        """Estimates, shape (T, E, S), along throws, shape (T, E, D), under the estimator's normaliser."""
-        x, _ = self.gru(F.elu(self.encoder((obs - mean) / std)))
+    def forward(self, obs: Tensor) -> Tensor:
+        """Estimates, shape (T, E, S), along throws, shape (T, E, D)."""
+        x, _ = self.gru(F.elu(self.encoder(self.normalizer(obs))))
         return F.pad(obs, (0, 1))[..., self.kept] + self.output(x) * self.learnt
 
 
@@ -91,23 +86,23 @@ class Distillation:
             ranks: of a distributed run.
 
         Raises:
-            ConfigError: A distributed run, moving goals, or no vision layout with a history of the payload.
+            ConfigError: A distributed run, moving goals, another layout than vision, or a teacher that is no state policy for still goals.
             MismatchError: The state policy acts otherwise than this task.
         """
         self.cfg, self.p = experiment, experiment.distillation
         seen = experiment.task.observation
-        if ranks or experiment.task.target.moves or seen.layout != "vision" or seen.history_of != "payload":
-            expected = 'one process, goals that stand still, observation.layout = "vision" and observation.history_of = "payload"'
-            raise ConfigError(f'algorithm = "distillation" takes {expected}')
+        if ranks or experiment.task.target.moves or seen.layout != "vision":
+            raise ConfigError('algorithm = "distillation" takes one process, goals that stand still and observation.layout = "vision"')
         self.teacher = Policy.load(find_policy(self.p.teacher), device)
         self.teacher.require(contract_of(experiment), ("action", "control_period", "release"))
         contract = self.teacher.contract["observation"]
-        if contract["layout"] != "state" or self.teacher.estimator is not None:
-            raise ConfigError(f"distillation.teacher {self.p.teacher!r} has the layout {contract['layout']!r}; expected 'state'")
+        self._layout = ob.layout_of(SimpleNamespace(**contract))
+        if self._layout.name != "state" or self._layout.motion:
+            came = f"{self._layout.name!r}" + " with the goal's velocity" * bool(self._layout.motion)
+            raise ConfigError(f"distillation.teacher {self.p.teacher!r} has the layout {came}; expected 'state' without it")
         self.env = env = ThrowEnv(experiment, device, seed)
         self.iterations, E, T = self.p.iterations, env.num_envs, self.p.horizon
         self.samples = E * T
-        self._layout = ob.Layout("state", 2, 3, contract["history"], 0)
         self._age = sum(contract["latency"]) / 2.0
         kept, learnt = _passed(env.layout, self._layout)
         self.network = Network(kept, learnt, env.layout.dimension, self.p.hidden, self.p.memory).to(device)
@@ -117,7 +112,7 @@ class Distillation:
         self._scales = torch.cat([torch.full((width,), scale, **make) for width, scale in zip(widths, scales)])
         self._obs, self._truth = torch.zeros(T, E, env.layout.dimension, **make), torch.zeros(T, E, self._layout.dimension, **make)
         self._alive = torch.zeros(T, E, **make)
-        self._history = torch.zeros(E, 1 + self._layout.history, self._layout.row, **make)
+        self._history = torch.zeros(E, 1 + self._layout.history, self._layout.payload, **make)
         self._flying = self.network.frozen()
         self.average = averaged(self.network, AVERAGED)
         on_gpu = device.startswith("cuda")
@@ -156,20 +151,18 @@ class Distillation:
         for group in self.optimizer.param_groups:
             group["lr"] = rate
         if done * self.iterations < WATCHED:
-            self.network.watch(self._obs.flatten(0, 1))
+            self.network.normalizer.update(self._obs.flatten(0, 1))
         figures = self._descend()
         times = {"rollout_s": middle - start, "learning_s": time.perf_counter() - middle}
         return figures | self.env.episode_means() | times | {"learning_rate": rate}
 
     def _descend(self) -> dict[str, float]:
         """Fit the last rollout, each throw once an epoch."""
-        self._refresh()
-        mean, std = self._flying.mean, self._flying.std
         total = torch.zeros((), device=self.env.device)
         for _ in range(self.p.epochs):
             for rows in torch.randperm(self.env.num_envs, device=self.env.device).chunk(self.p.minibatches):
                 obs, truth, alive = self._obs[:, rows], self._truth[:, rows], self._alive[:, rows]
-                estimate = self.network(obs, mean, std)
+                estimate = self.network(obs)
                 off = F.smooth_l1_loss(estimate / self._scales, truth / self._scales, reduction="none").mean(-1)
                 wanted, action = act.clip_action(self.teacher.decide(truth)), self.teacher.decide(estimate)
                 wrong = (act.clip_action(action) - wanted).detach()  # beyond the limits only the way back counts
@@ -192,7 +185,7 @@ class Distillation:
     def export(self, contract: dict, made_by: dict) -> Policy:
         """The policy as a file's content."""
         t = self.teacher.to("cpu")
-        estimator = Estimator(**{name: value.detach().cpu().clone() for name, value in vars(self._averaged().frozen()).items()})
+        estimator = Estimator(**{name: value.detach().cpu().clone() for name, value in vars(self.average.module.frozen()).items()})
         return Policy(t.weights, t.biases, t.activation, contract, made_by, t.mean, t.std, t.eps, estimator)
 
     def take_up(self, policy: Policy) -> None:
@@ -204,15 +197,9 @@ class Distillation:
                  "gru.bias_ih_l0": e.input_bias, "gru.weight_hh_l0": e.memory_weight, "gru.bias_hh_l0": e.memory_bias,
                  "output.weight": e.output_weight, "output.bias": e.output_bias}  # fmt: skip
         n.load_state_dict(n.state_dict() | parts)
-        count, std = 1e8, (e.std - 0.01).double()
-        n.sums.copy_(torch.stack([torch.full_like(std, count), count * e.mean, count * (std.square() + e.mean.double().square())]))
+        n.normalizer.load_state_dict(normalizer_state(e.mean, e.std - n.normalizer.eps))
         self.average.module.load_state_dict(n.state_dict())
         self._refresh()
-
-    def _averaged(self) -> Network:
-        """Network with averaged weights and the statistics of now."""
-        self.average.module.sums.copy_(self.network.sums)
-        return self.average.module
 
     def state_dict(self) -> dict:
         """All that the next iteration depends on, besides torch's generators."""

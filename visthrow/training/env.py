@@ -96,7 +96,7 @@ class ThrowEnv(VecEnv):
         seen, latency, device = task.observation, self.cfg.camera.noise.history_length, self.device
         memory = {
             "previous": torch.zeros(E, act.ACTIONS, **make),
-            "history": torch.zeros(E, 1 + self.layout.history, self.layout.row, **make),
+            "history": torch.zeros(E, 1 + self.layout.history, self.layout.payload, **make),
             "true_history": torch.zeros(E, 1 + self.layout.history, 3, **make),
             "frame_bias": torch.zeros(E, ob.VEHICLE + 5, **make),
             "command_bias": torch.zeros(E, act.COMMANDS, **make),

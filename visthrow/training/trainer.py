@@ -88,6 +88,9 @@ def fitted(experiment: Experiment, policy: Policy) -> Experiment:
         policy.require(contract_of(experiment), TASK, allow=("observation.latency",))
     except MismatchError as error:
         raise MismatchError(f"--from: the task of this run is not the policy's; {error}") from None
+    if (policy.estimator is None) == (experiment.algorithm == "distillation"):
+        kinds = ("without", "with") if policy.estimator is None else ("with", "without")
+        raise MismatchError(f'--from: the policy is one {kinds[0]} a memory; algorithm = "{experiment.algorithm}" trains those {kinds[1]}')
     p, hidden = experiment.ppo, tuple(len(bias) for bias in policy.biases[:-1])
     layers = {"hidden": hidden, "critic": p.critic or p.hidden, "activation": policy.activation}
     return dataclasses.replace(experiment, ppo=dataclasses.replace(p, **layers, normalize=policy.mean is not None))

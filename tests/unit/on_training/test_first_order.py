@@ -28,13 +28,7 @@ LEARNT = 0.5
 """Landing error that the small task is brought under [m]; goals lie within 1 m, dropped payloads 0.65 m off on average."""
 
 
-@pytest.fixture(autouse=True)
-def one_thread():
-    """Small work; the same bits need the same number of threads."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def first_order(name="state", *changes):

@@ -55,13 +55,13 @@ class FirstOrder:
             ranks: of a distributed run.
 
         Raises:
-            ConfigError: A distributed run, goals that move, a history of whole frames, or a horizon too short for a release.
+            ConfigError: A distributed run, goals that move, a vision layout, or a horizon too short for a release.
         """
         self.cfg, self.p, p = experiment, experiment.first_order, experiment.ppo
         seen = experiment.task.observation
-        if seen.layout != "state" or seen.history_of != "payload" or seen.oldest > experiment.sim.control_period:
-            expected = 'layout = "state", history_of = "payload" and a latency of one period at most'
-            raise ConfigError(f'algorithm = "first_order" takes an observation of {expected}; "distillation" makes a vision policy of it')
+        if seen.layout != "state" or seen.oldest > experiment.sim.control_period:
+            expected = 'observation.layout = "state" and a latency of one period at most'
+            raise ConfigError(f'algorithm = "first_order" takes {expected}; "distillation" makes a vision policy of its policy')
         if ranks or experiment.task.target.moves:
             raise ConfigError('algorithm = "first_order" trains in one process and throws at goals that stand still; "ppo" does both')
         self.env = env = ThrowEnv(experiment, device, seed)

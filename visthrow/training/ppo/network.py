@@ -21,6 +21,12 @@ SEEN = 10**8
 """Observations that a policy's normaliser counts for when it is taken up: about those of its training, which no file tells."""
 
 
+def normalizer_state(mean: Tensor, std: Tensor) -> dict[str, Tensor]:
+    """State of rsl_rl's normaliser that has seen :data:`SEEN` observations of this mean and spread, shape (D,)."""
+    state = {"_mean": mean, "_std": std, "_var": std.square()}
+    return {name: value[None] for name, value in state.items()} | {"count": torch.tensor(SEEN)}
+
+
 class CapturableGaussian(GaussianDistribution):
     """rsl_rl's Gaussian with a sample that a CUDA graph can hold: torch.normal copies its spread's minimum to the host."""
 
@@ -52,9 +58,7 @@ class Network(MLPModel):
             layer.weight.copy_(weight)
             layer.bias.copy_(bias)
         if policy.mean is not None:
-            std = policy.std + (policy.eps - RSL_RL_EPS)
-            state = {"_mean": policy.mean, "_std": std, "_var": std.square(), "count": torch.tensor(SEEN)}
-            self.obs_normalizer.load_state_dict({k: v.view_as(getattr(self.obs_normalizer, k)) for k, v in state.items()})
+            self.obs_normalizer.load_state_dict(normalizer_state(policy.mean, policy.std + (policy.eps - RSL_RL_EPS)))
 
     def prepared(self, obs: TensorDict) -> Tensor:
         """Normalised observations as :meth:`output` takes them at its fastest, on a GPU filled up with columns of zeros."""
@@ -81,7 +85,7 @@ def averaged(module: torch.nn.Module, window: int) -> AveragedModel:
     Optimization 30(4), 1992.
     """
 
-    def moved(mean: Tensor, now: Tensor, updates: int | Tensor) -> Tensor:
-        return mean + (now - mean) * torch.clamp(4.0 / (torch.as_tensor(updates) + 4.0), min=1.0 / window).to(mean.device)
+    def moved(mean: Tensor, now: Tensor, updates: Tensor) -> Tensor:
+        return mean + (now - mean) * torch.clamp(4.0 / (updates + 4.0), min=1.0 / window)
 
     return AveragedModel(module, avg_fn=moved)
