@@ -29,7 +29,7 @@ def diagnosis(tmp_path):
     """A diagnosis as explain writes it; a function that changes entries."""
 
     def write(**changes):
-        value = {"theta": THETA, "covariance": COVARIANCE.tolist(), "overall": "KNOWN", "flights": 12,
+        value = {"plant": "state", "theta": THETA, "covariance": COVARIANCE.tolist(), "overall": "KNOWN", "flights": 12,
                  "gain": {"channels": [{"channel": "pos_w", "before": 2.0, "after": 1.0}], "nats_per_sample": 0.4,
                           "landing": {"throws": 9, "before": 0.11, "after": 0.02}}}  # fmt: skip
         path = tmp_path / "diagnosis.json"
@@ -73,12 +73,26 @@ def test_applied_twice_is_applied_once_more(diagnosis, tmp_path, capsys):
     """A second diagnosis goes on top of the first."""
     first, second = tmp_path / "first.toml", tmp_path / "second.toml"
     assert cli.main(["diagnose", "apply", diagnosis(), "--out", str(first)]) == 0
-    more = diagnosis(theta={"rope_length": 0.001}, covariance=[[1e-8]])
-    assert cli.main(["diagnose", "apply", more, "--plant", str(first), "--out", str(second)]) == 0
+    more = diagnosis(plant=str(first), theta={"rope_length": 0.001}, covariance=[[1e-8]])
+    assert cli.main(["diagnose", "apply", more, "--out", str(second)]) == 0
     capsys.readouterr()
     after = config.load(Experiment, second)
     assert after.rope.length == pytest.approx(shipped().rope.length - 0.003)
     np.testing.assert_allclose(after.vehicle.thrust.gain, 1.03)
+
+
+def test_sizes_count_from_the_model_that_was_diagnosed(diagnosis, tmp_path, capsys):
+    """The plant and the overrides that the diagnosis was made with, whatever the shipped one says; of another nothing is written."""
+    quick, out = tmp_path / "quick.toml", tmp_path / "mended.toml"
+    quick.write_text('base = "train/state.toml"\n[release]\nlag = 0.08\n')
+    found = {"theta": {"release_lag": 0.03}, "covariance": [[1e-6]], "overrides": ["rope.length=0.5"]}
+    for plant, option, message in ((str(quick), ["--plant", "state"], "do not count from state"), (None, [], "names no plant")):
+        assert cli.main(["diagnose", "apply", diagnosis(plant=plant, **found), *option, "--out", str(out)]) == 2
+        assert message in capsys.readouterr().err
+    assert not out.exists()
+    assert cli.main(["diagnose", "apply", diagnosis(plant=str(quick), **found), "--out", str(out)]) == 0
+    after = config.load(Experiment, out)
+    assert (after.release.lag, after.rope.length) == pytest.approx((0.11, 0.5))
 
 
 def test_a_law_is_written_as_a_block(diagnosis, tmp_path, capsys):
@@ -169,7 +183,7 @@ BALL = {"model": "ball", "theta": {"ball_drag": 0.03}, "covariance": [[1e-8]], "
 def test_other_models_have_extended_setups(diagnosis, tmp_path):
     """Sizes are counted from there by whoever loads the setup, in the next diagnosis and the next extension, too."""
     out, again = tmp_path / "once.toml", tmp_path / "twice.toml"
-    assert cli.main(["diagnose", "apply", diagnosis(**BALL), "--config", "jugglebot", "--out", str(out)]) == 0
+    assert cli.main(["diagnose", "apply", diagnosis(**BALL, config="jugglebot"), "--out", str(out)]) == 0
     assert cli.main(["diagnose", "apply", diagnosis(**BALL), "--config", str(out), "--out", str(again)]) == 0
     assert setups.load(out).effects == {"ball_drag": 0.03}
     assert setups.load(again).effects == pytest.approx({"ball_drag": 0.06})

@@ -39,7 +39,8 @@ def test_a_copied_log_counts_once(flights, tmp_path):
     again, twice = explained([*flights, flights[0]], tmp_path)
     assert status == again == 0
     assert twice["duplicates"] == {"3": 0}
-    assert (twice["flights"], once["model"]) == (3, "throw")
+    assert (twice["flights"], once["model"], once["plant"]) == (3, "throw", "state")
+    assert once["overrides"] == ["rope.segments=1"]
     assert twice["theta"] == pytest.approx(once["theta"])
 
 

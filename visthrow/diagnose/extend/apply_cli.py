@@ -1,6 +1,7 @@
 """``visthrow diagnose apply``: write the extended configuration that a diagnosis asks for."""
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 
 DEFAULT_PLANTS = 64
@@ -16,14 +17,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "  visthrow diagnose apply out/explain/diagnosis.json --out mine.toml   a configuration on top of the diagnosed one\n"
         "  visthrow train mine.toml                                             train in it\n"
         "  visthrow diagnose explain flights --plant mine.toml                  and diagnose it again: nothing should be left\n"
-        "  visthrow diagnose apply out/explain/diagnosis.json --config cf_payload --out mine.toml     of another model\n"
-        "  visthrow diagnose explain others.csv --config mine.toml              what it is worth on flights that it never saw\n"
+        "  visthrow diagnose explain others.csv --config mine.toml              of another model: its worth on flights that it never saw\n"
     )
     parser.add_argument("diagnosis", metavar="FILE", help="diagnosis.json of an explain, or a blackbox: its firmware's rate controller")
     parser.add_argument(
-        "--plant", metavar="NAME", default=DEFAULT_PLANT, help=f"the configuration that was diagnosed (default: {DEFAULT_PLANT})"
+        "--plant", metavar="NAME", help=f"the configuration that was diagnosed (default: as it says; with a blackbox {DEFAULT_PLANT})"
     )
-    parser.add_argument("--config", metavar="NAME", help="the setup that was diagnosed, of another model than the throw")
+    parser.add_argument("--config", metavar="NAME", help="likewise the setup, of another model than the throw")
     parser.add_argument("--out", metavar="FILE", default="extended.toml", help="to write (default: extended.toml)")
     parser.add_argument(
         "--plants", type=int, default=DEFAULT_PLANTS, metavar="N",
@@ -46,13 +46,14 @@ def run(args: argparse.Namespace) -> int:
     from visthrow.common.errors import DiagnoseError
     from visthrow.common.storage import atomic_write
     from visthrow.diagnose.extend import firmware, patch
+    from visthrow.diagnose.inputs.opening import DEFAULT_PLANT, THROW
     from visthrow.logs import BLACKBOX
     from visthrow.task import Experiment
 
     if Path(args.diagnosis).suffix.lower() in BLACKBOX:
         if args.hover is None:
             raise DiagnoseError("a blackbox without --hover; expected the share of throttle in hover, such as --hover 0.36")
-        base, experiment = _diagnosed(args.plant)
+        base, experiment = _diagnosed(args.plant or DEFAULT_PLANT)
         atomic_write(args.out, firmware.text(args.diagnosis, base, experiment, args.hover, args.delay))
         config.load(Experiment, Path(args.out))
         print(f"{args.out}: the rate controller of {args.diagnosis} on top of {base}")
@@ -61,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
         report = json.loads(Path(args.diagnosis).read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise DiagnoseError(f"{args.diagnosis}: not readable as a diagnosis: {error}") from error
-    if args.config:
+    if args.config or report.get("model", THROW) != THROW:
         return _extend_setup(args, report)
     found = patch.read(report, args.diagnosis)
     patch.refuse_strange(report, args.diagnosis, found[0])
@@ -72,7 +73,7 @@ def run(args: argparse.Namespace) -> int:
         print(f"nothing was named{unused}; the configuration stands as it is")
         return 0
     _bear_out(report, args.anyway)
-    base, experiment = _diagnosed(args.plant)
+    base, experiment = _diagnosed(_made_with(report, args, "plant"), report.get("overrides", ()))
     content = patch.text(base, experiment, theta, covariance, args.plants, origin(report, args.diagnosis), laws)
     atomic_write(args.out, content)
     config.load(Experiment, Path(args.out))  # what was written is what training will read
@@ -91,8 +92,9 @@ def _extend_setup(args: argparse.Namespace, report: dict) -> int:
         print("nothing was named; the setup stands as it is")
         return 0
     _bear_out(report, args.anyway)
-    base = _named("diagnose", args.config)
-    content = patch.of_setup(base, setup.load(args.config), report, args.diagnosis, origin(report, args.diagnosis))
+    name = _made_with(report, args, "config")
+    base = _named("diagnose", name)
+    content = patch.of_setup(base, setup.load(name), report, args.diagnosis, origin(report, args.diagnosis))
     atomic_write(args.out, content)
     setup.load(args.out)
     print(f"{args.out}: {', '.join(report['theta'])} on top of {base}")
@@ -112,12 +114,30 @@ def _bear_out(report: dict, anyway: bool) -> None:
         raise DiagnoseError(f"held-out flights do not bear this out: {'; '.join(doubts)}; --anyway writes it all the same")
 
 
-def _diagnosed(plant: str):
-    """Name that another configuration finds the diagnosed one under, and what it says."""
+def _made_with(report: dict, args: argparse.Namespace, option: str) -> str:
+    """Name of the plant or config that was diagnosed: sizes are counted from there.
+
+    Raises:
+        DiagnoseError: Another one is asked for; neither the diagnosis nor the option names one.
+    """
+    from visthrow.common.errors import DiagnoseError
+
+    told, asked = report.get(option), getattr(args, option)
+    if not (told or asked):
+        model = report.get("model", "throw")
+        raise DiagnoseError(f"{args.diagnosis}: a diagnosis of the model '{model}' names no {option}; expected --{option} NAME")
+    folder = {"plant": "train", "config": "diagnose"}[option]
+    if told and asked and _named(folder, told) != _named(folder, asked):
+        raise DiagnoseError(f"{args.diagnosis}: made with --{option} {told}; its sizes do not count from {asked}")
+    return told or asked
+
+
+def _diagnosed(plant: str, overrides: Sequence[str] = ()):
+    """Name that another configuration finds the diagnosed one under, and what it says with overrides."""
     from visthrow import config
     from visthrow.task import Experiment
 
-    return _named("train", plant), config.load(Experiment, config.find("train", plant))
+    return _named("train", plant), config.load(Experiment, config.find("train", plant), overrides)
 
 
 def _named(folder: str, name: str) -> str:

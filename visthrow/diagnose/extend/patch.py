@@ -66,7 +66,7 @@ def text(
 
     Args:
         base: path of the diagnosed configuration, as ``base =`` is to name it.
-        experiment: that configuration.
+        experiment: that configuration, with the overrides of the diagnosis.
         theta: sizes of the named effects.
         covariance: of theta, in its order.
         plants: to draw in training from the joint posterior.
@@ -79,7 +79,8 @@ def text(
         laws=(*experiment.laws, *laws),
     )
     check_laws(after.laws)
-    changed = differences(config.to_dict(experiment), config.to_dict(after))
+    plain = config.load(Experiment, config.find("train", base))
+    changed = differences(config.to_dict(plain), config.to_dict(after))
     lines = [f"# {line}" for line in provenance] + [dumps({"base": base}).strip(), ""]
     about = touched(theta)
     sd = {name: covariance[i][i] ** 0.5 for i, name in enumerate(theta)}
@@ -173,14 +174,11 @@ def of_setup(base: str, setup: Setup, report: Mapping[str, Any], path: str, prov
 
 
 def refuse_strange(report: Mapping[str, Any], path: str, theta: Mapping[str, float]) -> None:
-    """Refuse effects of another model, though they may bear the same name, and sizes that the throw's simulator cannot have.
+    """Refuse effects that are none of the throw's, though they may bear the same name, and sizes that the throw's simulator cannot have.
 
     Raises:
-        DiagnoseError: It is of another model; an effect or its unit is none of the catalogue's; a size lies outside its bounds.
+        DiagnoseError: An effect or its unit is none of the catalogue's; a size lies outside its bounds.
     """
-    model = report.get("model", THROW)
-    if model != THROW:
-        raise DiagnoseError(f"{path}: a diagnosis of the model '{model}'; --config names the setup that was diagnosed")
     known = catalogue()
     strange = [name for name in theta if name not in known]
     if strange:

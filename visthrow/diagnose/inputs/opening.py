@@ -2,6 +2,7 @@
 
 import argparse
 from collections.abc import Sequence
+from typing import Any
 
 from visthrow.common.errors import ConfigError, DiagnoseError, suggest
 from visthrow.diagnose.models.interface import Model
@@ -52,6 +53,11 @@ def model_name(args: argparse.Namespace) -> str:
 
     own = setup.load(args.config).named() if args.config else []
     return own[0] if own else THROW
+
+
+def made_with(args: argparse.Namespace) -> dict[str, Any]:
+    """Entries of a diagnosis' JSON that say what was diagnosed: ``apply`` builds on nothing else."""
+    return {"model": model_name(args), "plant": args.plant, "config": args.config, "overrides": args.overrides}
 
 
 def _opened(args: argparse.Namespace) -> tuple[Model, list[FlightLog]]:

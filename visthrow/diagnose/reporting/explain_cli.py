@@ -1,11 +1,12 @@
 """``visthrow diagnose explain``: what the model gets wrong about measured flights."""
 
 import argparse
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from visthrow.common.arguments import add_out
-from visthrow.diagnose.inputs.opening import THROW
 from visthrow.diagnose.select.result import INCONSISTENT, OUT_OF_DOMAIN, OVERALL
 
 MOST_SPOILED = 0.5
@@ -59,13 +60,13 @@ def run(args: argparse.Namespace) -> int:
     diagnosis = replace(diagnosis, reasons=(*diagnosis.reasons, *left_out), duplicates={**doubled, **diagnosis.duplicates})
     gain = None
     if not args.no_report and diagnosis.work is not None:
-        gain = write_report(Path(args.out), diagnosis, model, logs, args.seed, not args.no_blind, opening.model_name(args))
+        gain = write_report(Path(args.out), diagnosis, model, logs, args.seed, not args.no_blind, opening.made_with(args))
     print("\n" + report.summary(diagnosis, gain))
     tested = _tested(args, diagnosis) if args.test and diagnosis.theta else {}
     if not args.no_report and diagnosis.work is not None:
         print(f"page, JSON, pictures and recording: {args.out}")
     if args.json:
-        write_json(args.json, report.to_json(diagnosis, gain, extra={"model": opening.model_name(args), "tested": tested}))
+        write_json(args.json, report.to_json(diagnosis, gain, extra={**opening.made_with(args), "tested": tested}))
     return REFUSED if diagnosis.overall in (INCONSISTENT, OUT_OF_DOMAIN) else 0
 
 
@@ -85,8 +86,11 @@ def _tested(args: argparse.Namespace, diagnosis) -> dict[str, tuple[float, float
     return errors
 
 
-def write_report(folder: Path, diagnosis, model, logs, seed: int, limits: bool = True, name: str = THROW):
-    """Write page, JSON, pictures and recording; returns the gain on held-out flights. ``name``: of the model."""
+def write_report(folder: Path, diagnosis, model, logs, seed: int, limits: bool = True, made_with: Mapping[str, Any] | None = None):
+    """Write page, JSON, pictures and recording; returns the gain on held-out flights.
+
+    ``made_with``: see :func:`visthrow.diagnose.inputs.opening.made_with`.
+    """
     from visthrow.common import provenance
     from visthrow.common.storage import write_json
     from visthrow.diagnose.reporting import blackbox, blind, gain, recording, report
@@ -101,7 +105,7 @@ def write_report(folder: Path, diagnosis, model, logs, seed: int, limits: bool =
     made = report.sections(diagnosis, measured, hidden, step_check=steps, about=about)
     report.write(folder, made, diagnosis, "What the simulation gets wrong about these flights")
     table = blackbox.unexplained(diagnosis.work.after, seed) if diagnosis.overall == result.UNKNOWN else None
-    extra = {"model": name, "step_error_sigma": steps, "provenance": origin, "table": table}
+    extra = {**(made_with or {}), "step_error_sigma": steps, "provenance": origin, "table": table}
     whole = report.to_json(diagnosis, measured, hidden, extra=extra)
     write_json(folder / "diagnosis.json", whole)
     recording.write(folder / "diagnosis.rrd", diagnosis, logs)
