@@ -38,8 +38,7 @@ class Blocker:
             raise ImportError("the tool asked for the tests")
 sys.meta_path.insert(0, Blocker())
 from visthrow.cli import main
-exec(sys.argv[1])
-sys.exit(main(sys.argv[2:]))
+sys.exit(main(sys.argv[1:]))
 """
 
 ALIKE = (
@@ -141,19 +140,10 @@ def hand_over(recipe: Recipe, folder: Path, held: Path | None = None) -> list[Pa
     return paths
 
 
-def ask(logs: list[Path], model: list[str], folder: Path, device: str = "cpu", timeout: float = 900.0, patch: str = "") -> dict:
-    """Verdict of ``visthrow diagnose explain`` on logs, run apart; with ``error`` where it failed or took longer [s].
-
-    Args:
-        logs: to be explained.
-        model: overrides that state the model.
-        folder: where the tool runs.
-        device: of the diagnosis.
-        timeout: [s].
-        patch: Python that is run before the tool: an ablation.
-    """
+def ask(logs: list[Path], model: list[str], folder: Path, device: str = "cpu", timeout: float = 900.0) -> dict:
+    """Verdict of ``visthrow diagnose explain`` on logs, run apart; with ``error`` where it failed or took longer [s]."""
     answer = folder / "verdict.json"
-    command = [sys.executable, "-c", WITHOUT_TESTS, patch, "diagnose", "explain", *(p.name for p in logs)]
+    command = [sys.executable, "-c", WITHOUT_TESTS, "diagnose", "explain", *(p.name for p in logs)]
     command += ["--device", device, "--json", answer.name, "--out", "report", "--no-report", *MEASURED]
     for item in model:
         command += ["--set", item]
@@ -256,9 +246,7 @@ def errors_of(recipe: Recipe, verdict: dict) -> list[dict]:
     ]
 
 
-def run_world(
-    recipe: Recipe, device: str = "cpu", verdicts: Path | None = None, until: float = np.inf, patch: str = ""
-) -> dict:
+def run_world(recipe: Recipe, device: str = "cpu", verdicts: Path | None = None, until: float = np.inf) -> dict:
     """One sealed world from drawing to judgement: a line of the ledger.
 
     Args:
@@ -266,7 +254,6 @@ def run_world(
         device: of the diagnosis.
         verdicts: folder for the whole verdict.
         until: when the verdict must be there, by ``time.time()`` [s].
-        patch: see :func:`ask`.
     """
     with tempfile.TemporaryDirectory() as name, tempfile.TemporaryDirectory() as apart:
         folder, held = Path(name), Path(apart)
@@ -274,7 +261,7 @@ def run_world(
         begin = time.perf_counter()
         logs = hand_over(recipe, folder, held)
         flown = time.perf_counter()
-        verdict = ask(logs, model_of(recipe), folder, device, float(np.clip(until - time.time(), 1.0, 900.0)), patch)
+        verdict = ask(logs, model_of(recipe), folder, device, float(np.clip(until - time.time(), 1.0, 900.0)))
         seconds = time.perf_counter() - flown
         digest = hashlib.sha256(json.dumps(verdict, sort_keys=True).encode()).hexdigest()
         if verdicts is not None:
@@ -366,12 +353,12 @@ def _alone(numbers) -> None:
     os.sched_setaffinity(0, {cores[mine % len(cores)]})
 
 
-def _one(task: tuple[str, Recipe, float, float, Path | None, str]) -> dict | None:
-    kind, recipe, begin, until, verdicts, patch = task
+def _one(task: tuple[str, Recipe, float, float, Path | None]) -> dict | None:
+    kind, recipe, begin, until, verdicts = task
     if time.time() > begin:
         return None
     try:
-        return {"kind": kind, "patch": patch} | run_world(recipe, verdicts=verdicts, until=until, patch=patch)
+        return {"kind": kind} | run_world(recipe, verdicts=verdicts, until=until)
     except (RuntimeError, ValueError) as error:
         return {"kind": kind, "recipe": asdict(recipe), "error": repr(error), "truth_sha256": recipe.digest()}
 
@@ -396,7 +383,6 @@ def main() -> None:
     parser.add_argument("--end", type=float, default=1e6, help="minutes after which a verdict that is not there is none")
     parser.add_argument("--warm", choices=PLANTS, help="only compile what worlds of this plant need")
     parser.add_argument("--small", action="store_true", help="short flights, as the default tests have them")
-    parser.add_argument("--patch", default="", metavar="PYTHON", help="run before the tool: an ablation; with a ledger of its own")
     args = parser.parse_args()
     single()
     if args.warm:
@@ -412,7 +398,7 @@ def main() -> None:
     shorter = SMALL if args.small else {}
     worlds = [(kind, replace(recipe, **shorter)) for kind, recipe in bank(first, sizes)]
     worlds = [(kind, recipe) for kind, recipe in worlds if recipe.digest() not in done]
-    tasks = [(kind, recipe, begin, end, args.verdicts, args.patch) for kind, recipe in worlds]
+    tasks = [(kind, recipe, begin, end, args.verdicts) for kind, recipe in worlds]
     tally: dict[str, Counter] = {kind: Counter() for kind in sizes}
     context = mp.get_context("spawn")
     with context.Pool(args.jobs, _alone, (context.Value("i", 0),), maxtasksperchild=None) as pool:

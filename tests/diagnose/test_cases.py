@@ -63,6 +63,11 @@ def test_scrambled_logs_keep_their_poses_and_exchange_their_commands(logs):
     np.testing.assert_array_equal(mixed[2]["command"].values, logs[1]["command"].values)
 
 
+def test_the_tool_is_asked_apart(tmp_path):
+    """What all sealed worlds, cases and bad logs start."""
+    assert "--plant" in cases.tool(tmp_path, "diagnose", "explain", "--help")
+
+
 def test_a_proposed_manoeuvre_is_flown_on_the_plant():
     """The pilot follows a reference to a decimetre; without payload its log shows none, and such a flight counts as bare."""
     known = {m.name: m for m in catalogue()}
