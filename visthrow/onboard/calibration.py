@@ -301,7 +301,7 @@ def calibrate(hovered: Hovered, camera: KeypointCamera, contract: dict[str, Any]
         moved = torch.from_numpy(step[width:])
         c = c + moved
         if not bool(torch.isfinite(c).all()):
-            break
+            raise CalibrationError("calibration found no finite answer; expected finite poses, thrusts and keypoints")
         if float((moved / problem.prior).abs().max()) < SETTLED:
             break
     else:

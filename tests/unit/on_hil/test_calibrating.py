@@ -175,3 +175,5 @@ def test_a_hover_that_shows_too_little_is_told():
         np.zeros((rows, 8, 2)), np.zeros((rows, 8), bool), np.array([2.0, 0.0, 0.0]),
     )  # fmt: skip
     assert "the ball seen in 0 % of them; expected 75 or more, and 50 %" in solved(hovered, params.camera, contract, Spreads())
+    broken = replace(hovered, valid=np.ones((rows, 8), bool), thrust=np.full(rows, 1e150))
+    assert "no finite answer" in str(solved(broken, params.camera, contract, Spreads()))
