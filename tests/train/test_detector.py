@@ -98,6 +98,7 @@ def test_a_throw_flies_on_what_its_eyes_see_alone():
         (["throw", "--policy", "state"], "a vision policy"),
         (["throw", "--plant", "hal"], "no plant 'hal'"),
         (["check", "--frames", "0"], "--frames 0"),
+        (["check", "--out", "sheet.bin"], "--out sheet.bin; expected"),
         (["check", "--weights", "none.npz"], "no detector written by"),
         (["train", "nothing"], "no detector config 'nothing'"),
     ],

@@ -58,8 +58,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     check.add_argument("--seed", type=int, default=0, help="of the scenes")
     check.add_argument("--out", metavar="FILE", help="picture of the first frames of each nuisance with what was found, .png")
     add_common(check)
-
-
     throw = actions.add_parser("throw", help="throws closed loop on rendered pictures: render, detect, policy, simulate")
     throw.add_argument("--policy", default="vision_dropout", metavar="POLICY", help="a shipped name or a file (default: vision_dropout)")
     throw.add_argument("--by", default="learnt", choices=("learnt", "contours"), help="detector (default: learnt)")
@@ -155,7 +153,7 @@ def check(args: argparse.Namespace) -> int:
     """Detect in frames of each nuisance with both detectors and print what became of them.
 
     Raises:
-        VisthrowError: fewer than one frame.
+        VisthrowError: fewer than one frame, or a picture that is no .png or cannot be written.
     """
     from camera.detectors.contours import Detector
     from camera.detectors.learnt import SHIPPED, LearntDetector, Networks
@@ -164,8 +162,8 @@ def check(args: argparse.Namespace) -> int:
     from camera.scenes.renderer import Renderer
     from camera.scenes.textures import HELD_OUT, photographs
 
-    if args.frames < 1:
-        raise VisthrowError(f"--frames {args.frames}; expected 1 or more")
+    if args.frames < 1 or Path(args.out or "sheet.png").suffix != ".png":
+        raise VisthrowError(f"--frames {args.frames}, --out {args.out}; expected 1 or more, and a .png")
     camera = config.load(CameraParams, config.find("camera", "fisheye"), args.overrides)
     lens = Fisheye(camera.fisheye)
     renderer = Renderer(camera.fisheye, resolve(args.device), photographs(args.textures, HELD_OUT))
@@ -188,8 +186,9 @@ def check(args: argparse.Namespace) -> int:
     if args.out is not None:
         import cv2
 
-        if not cv2.imwrite(args.out, np.vstack([np.hstack(row) for row in rows])):
-            raise VisthrowError(f"--out {args.out}: cannot be written; expected a .png")
+        from visthrow.common.storage import atomic_write
+
+        atomic_write(args.out, cv2.imencode(".png", np.vstack([np.hstack(row) for row in rows]))[1].tobytes())
     if args.json is not None:
         from visthrow.common.storage import write_json
 
