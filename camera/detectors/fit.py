@@ -25,7 +25,6 @@ from camera.detectors.learnt import (
     halved,
     log_size,
     looked,
-    middle_of,
     patches_of,
     places_of,
     spread_of,
@@ -367,10 +366,7 @@ def findings(networks: Networks, frame: Tensor, labels: Labels, lens: Fisheye) -
     places, found = places_of(networks.search(halved(frame)), lens), {}
     for kind in KINDS:
         rays, sizes = places[kind]
-        for _ in range(2):
-            views, out = looked(networks, kind, frame, torch.zeros(len(rays), dtype=torch.long, device=rays.device), rays, sizes, lens,
-                                labels.north)  # fmt: skip
-            rays, sizes = middle_of(kind, views, out)
+        views, out, rays, sizes = looked(networks, kind, frame, rays, sizes, lens, labels.north)
         error = _apart(rays, labels.rays[kind])
         hit = labels.seen[kind] & (error < NEAR * labels.sizes[kind]) & ((sizes / labels.sizes[kind]).log().abs() < 0.5)
         if kind == "goal":

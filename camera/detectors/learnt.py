@@ -206,11 +206,9 @@ class LearntDetector(Detector):
         return Seen(self._best_ball(*ball, known), self._best_goal(*goal, known))
 
     def _closest(self, kind: str, frames: Tensor, rays: Tensor, sizes: Tensor, north: Tensor) -> tuple[Tensor, Tensor]:
-        """Probabilities and findings at places, looked at twice: the second patch lies where the first found the thing."""
+        """Probabilities and findings at places."""
         factor, offset, _ = self.networks.calibration[kind]
-        for _ in range(2):
-            views, found = looked(self.networks, kind, frames, torch.zeros(len(rays), dtype=torch.long), rays, sizes, self.lens, north)
-            rays, sizes = middle_of(kind, views, found)
+        views, found, _, _ = looked(self.networks, kind, frames, rays, sizes, self.lens, north)
         probability = torch.sigmoid(factor * found[:, 0] + offset)
         things = ball_of(views, found) if kind == "ball" else views.rays(found[:, 2:].unflatten(1, (4, 2)))
         return probability, things
@@ -231,12 +229,18 @@ class LearntDetector(Detector):
 
 
 def looked(
-    networks: Networks, kind: str, frames: Tensor, index: Tensor, rays: Tensor, sizes: Tensor, lens: Fisheye, north: Tensor
-) -> tuple[Views, Tensor]:
-    """Patches about places and what the network of a kind makes of them, shape (B, outputs)."""
-    reach = (REACH[kind] * sizes).clamp(LEAST_REACH[kind], 1.0)
-    views = views_about(rays, reach, north.expand_as(rays))
-    return views, getattr(networks, kind)(patches_of(frames, index, views, lens, PATCH[kind]))
+    networks: Networks, kind: str, frame: Tensor, rays: Tensor, sizes: Tensor, lens: Fisheye, north: Tensor
+) -> tuple[Views, Tensor, Tensor, Tensor]:
+    """Patches about places of one frame, what the network of a kind makes of them, shape (B, outputs), and `middle_of` that.
+
+    They are looked at twice: the second patch lies where the first found the thing.
+    """
+    index = torch.zeros(len(rays), dtype=torch.long, device=rays.device)
+    for _ in range(2):
+        views = views_about(rays, (REACH[kind] * sizes).clamp(LEAST_REACH[kind], 1.0), north.expand_as(rays))
+        found = getattr(networks, kind)(patches_of(frame, index, views, lens, PATCH[kind]))
+        rays, sizes = middle_of(kind, views, found)
+    return views, found, rays, sizes
 
 
 def middle_of(kind: str, views: Views, found: Tensor) -> tuple[Tensor, Tensor]:
@@ -282,5 +286,3 @@ def log_size(angle: Tensor, lens: Fisheye) -> Tensor:
 def spread_of(found: Tensor, views: Views) -> Tensor:
     """Standard deviation of a direction [rad], before calibration, shape (B,)."""
     return found[:, 1].clamp(-8.0, 3.0).exp() * views.reach
-
-
