@@ -6,7 +6,6 @@ no branches on data, no boolean-mask indexing. Only elementwise operations whose
 the CPU.
 """
 
-
 import torch
 
 from camera.params import FisheyeParams
@@ -16,22 +15,6 @@ AXIS_EPSILON = 1e-20
 
 NEWTON_STEPS = 16
 """Safeguarded Newton steps of the inverse: bisection where a Newton step would leave the bracket."""
-
-
-def transfer_pixels(pixels: torch.Tensor, source: "Fisheye", target: "Fisheye") -> tuple[torch.Tensor, torch.Tensor]:
-    """Normalised coordinates in one lens of what another lens at the same place sees.
-
-    Args:
-        pixels: Pixels of the source [px], shape (..., 2).
-        source: The lens that took them.
-        target: The lens, say of training, whose coordinates are wanted.
-
-    Returns:
-        Normalised coordinates of the target [-], shape (..., 2), and validity (bool), shape (...): both lenses see it.
-    """
-    rays, seen = source.unproject(pixels)
-    normalized, valid = target.project_normalized(rays)
-    return normalized, seen & valid
 
 
 class Fisheye:

@@ -1,7 +1,7 @@
-"""Calibration files of the field: OpenCV YAML, Kalibr camchain, ROS camera_info and basalt JSON, in and out.
+"""Calibration files of the field: OpenCV YAML, Kalibr camchain, ROS camera_info and basalt JSON.
 
 Convention: all four count pixels from the centre of the top left one and x right, y down, z forward, as `FisheyeParams`
-does. None of them holds a field of view; ours is written as an extra key ``fov_deg`` that their own readers ignore. A
+does. None of them holds a field of view; it is read from an extra key ``fov_deg``, which their own readers ignore. A
 file without it gets the ``fov_deg`` of the call or, that left out, the angle that the farthest corner of the image
 sees.
 """
@@ -58,27 +58,6 @@ def read_opencv(path: str | Path, fov_deg: float | None = None) -> FisheyeParams
     return _params(path, size, (fx, fy, cx, cy, *k), tree.get("fov_deg"), fov_deg)
 
 
-def write_opencv(path: str | Path, fisheye: FisheyeParams) -> None:
-    """Write an OpenCV YAML file.
-
-    Raises:
-        ValueError: The file cannot be opened.
-    """
-    import cv2
-    import numpy as np
-
-    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_FORMAT_YAML)
-    if not storage.isOpened():
-        raise ValueError(f"{path} cannot be written; expected a folder that exists and can be written to")
-    storage.write("fisheye_model", 1)
-    storage.write("fov_deg", float(fisheye.fov_deg))
-    storage.write("image_width", fisheye.width)
-    storage.write("image_height", fisheye.height)
-    storage.write("camera_matrix", np.array(_matrix(fisheye)).reshape(3, 3))
-    storage.write("distortion_coefficients", np.array(fisheye.coefficients).reshape(4, 1))
-    storage.release()
-
-
 def read_kalibr(path: str | Path, camera: int = 0, fov_deg: float | None = None) -> FisheyeParams:
     """Read one camera of a Kalibr camchain (``pinhole`` + ``equidistant``, which is Kannala-Brandt).
 
@@ -98,22 +77,6 @@ def read_kalibr(path: str | Path, camera: int = 0, fov_deg: float | None = None)
     k = _floats(path, "distortion_coeffs", _get(path, tree, "distortion_coeffs"), 4)
     size = _floats(path, "resolution", _get(path, tree, "resolution"), 2)
     return _params(path, size, (fx, fy, cx, cy, *k), tree.get("fov_deg"), fov_deg)
-
-
-def write_kalibr(path: str | Path, fisheye: FisheyeParams, topic: str = "/cam0/image_raw") -> None:
-    """Write a Kalibr camchain of one camera."""
-    tree = {
-        "cam0": {
-            "fov_deg": fisheye.fov_deg,
-            "camera_model": "pinhole",
-            "intrinsics": [fisheye.fx, fisheye.fy, fisheye.cx, fisheye.cy],
-            "distortion_model": "equidistant",
-            "distortion_coeffs": list(fisheye.coefficients),
-            "resolution": [fisheye.width, fisheye.height],
-            "rostopic": topic,
-        }
-    }
-    _dump_yaml(path, tree)
 
 
 def read_ros(path: str | Path, fov_deg: float | None = None) -> FisheyeParams:
@@ -139,23 +102,6 @@ def read_ros(path: str | Path, fov_deg: float | None = None) -> FisheyeParams:
         _floats(path, f"{key}.data", _get(path, _mapping(path, key, _get(path, tree, key)), "data"), count)
     size = [_get(path, tree, key) for key in ("image_width", "image_height")]
     return _params(path, size, (fx, fy, cx, cy, *k), tree.get("fov_deg"), fov_deg)
-
-
-def write_ros(path: str | Path, fisheye: FisheyeParams, name: str = "camera") -> None:
-    """Write a ROS camera_info YAML."""
-    fx, _, cx, _, fy, cy, *_ = _matrix(fisheye)
-    tree = {
-        "fov_deg": fisheye.fov_deg,
-        "image_width": fisheye.width,
-        "image_height": fisheye.height,
-        "camera_name": name,
-        "camera_matrix": {"rows": 3, "cols": 3, "data": _matrix(fisheye)},
-        "distortion_model": "equidistant",
-        "distortion_coefficients": {"rows": 1, "cols": 4, "data": list(fisheye.coefficients)},
-        "rectification_matrix": {"rows": 3, "cols": 3, "data": [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]},
-        "projection_matrix": {"rows": 3, "cols": 4, "data": [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0]},
-    }
-    _dump_yaml(path, tree)
 
 
 def read_basalt(path: str | Path, camera: int = 0, fov_deg: float | None = None) -> tuple[FisheyeParams, FitReport]:
@@ -194,24 +140,6 @@ def read_basalt(path: str | Path, camera: int = 0, fov_deg: float | None = None)
         raise ValueError(f"{path}: {error}") from error
 
 
-def write_basalt(path: str | Path, fisheye: FisheyeParams) -> None:
-    """Write a basalt JSON of one ``kb4`` camera at the IMU; sensor noise is left zero for its owner to fill in."""
-    pose = {"px": 0.0, "py": 0.0, "pz": 0.0, "qx": 0.0, "qy": 0.0, "qz": 0.0, "qw": 1.0}
-    values = dict(zip(_KB4, (fisheye.fx, fisheye.fy, fisheye.cx, fisheye.cy, *fisheye.coefficients), strict=True))
-    tree = {
-        "T_imu_cam": [pose],
-        "intrinsics": [{"camera_type": "kb4", "intrinsics": values, "fov_deg": fisheye.fov_deg}],
-        "resolution": [[fisheye.width, fisheye.height]],
-        "calib_accel_bias": [0.0] * 9,
-        "calib_gyro_bias": [0.0] * 12,
-        "imu_update_rate": 200.0,
-        **{f"{sensor}_{kind}_std": [0.0] * 3 for sensor in ("accel", "gyro") for kind in ("noise", "bias")},
-        "cam_time_offset_ns": 0,
-        "vignette": [],
-    }
-    Path(path).write_text(json.dumps({"value0": tree}, indent=4) + "\n")
-
-
 def image_fov_deg(fisheye: FisheyeParams) -> float:
     """Full field of view that the farthest corner of the image sees [deg], cut to where theta_d stops growing and to
     360."""
@@ -235,11 +163,6 @@ def _params(path: str | Path, size: list[Any], values: tuple[float, ...], own_fo
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
     return params
-
-
-def _matrix(fisheye: FisheyeParams) -> list[float]:
-    """Camera matrix, row by row."""
-    return [fisheye.fx, 0.0, fisheye.cx, 0.0, fisheye.fy, fisheye.cy, 0.0, 0.0, 1.0]
 
 
 def _from_matrix(path: str | Path, values: Any) -> tuple[float, float, float, float]:
@@ -269,12 +192,6 @@ def _yaml(path: str | Path) -> dict[str, Any]:
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ValueError(f"{path} is no complete YAML (cut short?): {error}") from error
     return _mapping(path, "the file", tree)
-
-
-def _dump_yaml(path: str | Path, tree: dict[str, Any]) -> None:
-    import yaml
-
-    Path(path).write_text(yaml.safe_dump(tree, sort_keys=False))
 
 
 def _mapping(path: str | Path, name: str, value: Any) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Image side of the camera, on kornia: rectified views and photometric augmentation of fisheye frames.
+"""Rectified views of fisheye frames, on kornia.
 
 Frames are torch images: float in [0, 1], shape (B, C, H, W), as kornia has them.
 """
@@ -24,18 +24,6 @@ class ViewParams:
     fov_deg: float  # full horizontal field of view, below 180 [deg]
     yaw_deg: float = 0.0  # [deg]
     pitch_deg: float = 0.0  # [deg]
-
-
-@dataclass(frozen=True)
-class AugmentParams:
-    """Photometric augmentation; each factor is drawn uniformly within its half-width, per frame."""
-
-    brightness: float = 0.2  # [-]
-    contrast: float = 0.2  # [-]
-    saturation: float = 0.2  # [-]
-    hue: float = 0.02  # [turns]
-    noise_std: float = 0.02  # Gaussian, of the full scale [-]
-    blur_probability: float = 0.3  # of a 3 x 3 Gaussian blur [-]
 
 
 def view_rotation(view: ViewParams) -> torch.Tensor:
@@ -100,27 +88,3 @@ def rectify(frames: torch.Tensor, lens: Fisheye, view: ViewParams) -> torch.Tens
     batch = frames.shape[0]
     map_x, map_y = (pixels[..., i].expand(batch, -1, -1) for i in (0, 1))
     return remap(frames, map_x, map_y, mode="bilinear", align_corners=True) * valid.to(frames)
-
-
-def augment(frames: torch.Tensor, params: AugmentParams, seed: int) -> torch.Tensor:
-    """Vary brightness, contrast, saturation, hue, blur and noise of rendered frames; the geometry stays.
-
-    Args:
-        frames: RGB, shape (B, 3, H, W).
-        params: How much.
-        seed: Seed of this call; torch's global random state is left as it was.
-
-    Returns:
-        Shape (B, 3, H, W), in [0, 1].
-    """
-    from kornia.augmentation import AugmentationSequential, ColorJitter, RandomGaussianBlur, RandomGaussianNoise
-
-    steps = AugmentationSequential(
-        ColorJitter(params.brightness, params.contrast, params.saturation, params.hue, p=1.0),
-        RandomGaussianBlur((3, 3), (0.3, 1.2), p=params.blur_probability),
-        RandomGaussianNoise(0.0, params.noise_std, p=1.0),
-        data_keys=["input"],
-    )
-    with torch.random.fork_rng(devices=[frames.device] if frames.is_cuda else []):
-        torch.manual_seed(seed)
-        return steps(frames).clamp(0.0, 1.0)

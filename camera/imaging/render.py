@@ -12,7 +12,6 @@ from typing import Literal
 
 import torch
 
-from camera.calibrate.boards import BoardParams
 from camera.fisheye import Fisheye
 from camera.mount import rotate
 from camera.params import FisheyeParams
@@ -104,37 +103,6 @@ def render_scene(
     colour = torch.where(hit.unsqueeze(-1), _ball(normal_w), colour)
     colour = colour * seen.unsqueeze(-1)
     return _average(colour, supersample)
-
-
-def render_board(
-    lens: Fisheye, board: BoardParams, rot_cm: torch.Tensor, origin_c: torch.Tensor, supersample: int = 3
-) -> torch.Tensor:
-    """Draw a chessboard.
-
-    Args:
-        lens: The lens.
-        board: The board; one square of margin and a white border of another surround the inner corners.
-        rot_cm: Board to camera, shape (3, 3).
-        origin_c: First inner corner [m], shape (3,), camera frame.
-        supersample: Samples a pixel along each axis, averaged.
-
-    Returns:
-        Grey picture, uint8, shape (H, W).
-    """
-    rays_c, seen = pixel_rays(lens, supersample)
-    to_board = rot_cm.double().T
-    eye_m = -(to_board @ origin_c.double())
-    rays_m = rotate(to_board, rays_c)
-    slope = rays_m[..., 2]
-    depth = -eye_m[2] / torch.where(slope.abs() < 1e-12, torch.full_like(slope, 1e-12), slope)
-    square = (eye_m + rays_m * depth.unsqueeze(-1))[..., :2] / board.square_size
-    x, y = square.unbind(-1)
-    hit = seen & (depth > 0.0)
-    printed = hit & (x > -1) & (x < board.columns) & (y > -1) & (y < board.rows)
-    paper = hit & (x > -2) & (x < board.columns + 1) & (y > -2) & (y < board.rows + 1)
-    black = printed & ((x.floor() + y.floor()) % 2 == 0)
-    grey = torch.where(paper, torch.where(black, 0.05, 0.95), 0.45 * seen)
-    return (_average(grey.unsqueeze(-1), supersample)[..., 0] * 255.0).round().to(torch.uint8)
 
 
 def _average(colour: torch.Tensor, s: int) -> torch.Tensor:

@@ -15,8 +15,6 @@ from camera.params import CameraParams, FisheyeParams
 THINGS = 10
 """Most things on the ground and about the hall."""
 
-WIDTHS = {"lens": 10, "pose": 13, "shutter": 3, "ball": 17, "goal": 15, "ground": 8, "walls": 5, "light": 8, "rope": 7, "sensor": 6}
-
 
 @dataclass(frozen=True)
 class Scenes:

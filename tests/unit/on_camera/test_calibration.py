@@ -12,22 +12,24 @@ from camera.calibrate import files as files
 from camera.calibrate.boards import BoardParams, calibrate_from_boards
 from camera.calibrate.foreign import fit_fisheye
 from camera.fisheye import Fisheye
-from camera.imaging.render import render_board
-from camera.mount import rotation_from_vector
+from camera.imaging.render import pixel_rays
+from camera.mount import rotate, rotation_from_vector
 from camera.params import FisheyeParams
+from tests import lens_files
 
 DATA = Path(__file__).parents[2] / "data" / "basalt_calib"
 LENS = FisheyeParams(640, 480, 160.1, 150.2, 310.3, 245.4, 0.02, -0.01, 0.002, -0.0002, 200.0)
 FORMATS = {
-    "opencv.yaml": (files.write_opencv, files.read_opencv),
-    "kalibr.yaml": (files.write_kalibr, files.read_kalibr),
-    "ros.yaml": (files.write_ros, files.read_ros),
-    "basalt.json": (files.write_basalt, lambda path: files.read_basalt(path)[0]),
+    "opencv.yaml": (lens_files.write_opencv, files.read_opencv),
+    "kalibr.yaml": (lens_files.write_kalibr, files.read_kalibr),
+    "ros.yaml": (lens_files.write_ros, files.read_ros),
+    "basalt.json": (lens_files.write_basalt, lambda path: files.read_basalt(path)[0]),
 }
 EVERY_FORMAT = pytest.mark.parametrize("name", list(FORMATS))
 
 FIT_RMS_PX = 1e-3  # measured 5.5e-4 px on the worst of the four cameras over its whole image
 FIT_MAX_PX = 0.02  # measured 0.015 px in the corners of the 512 px image, where ds and eucm end
+SUPERSAMPLE = 3  # samples a pixel along each axis
 MODELS_AGREE_PX = 0.05  # two published models of one camera, calibrated separately: measured 0.011 px in the mean
 
 
@@ -87,7 +89,7 @@ def test_wrong_content_is_named(tmp_path, name, old, new, message):
 
 def test_a_lens_that_folds_inside_its_field_of_view_is_refused(tmp_path):
     path = tmp_path / "ros.yaml"
-    files.write_ros(path, FisheyeParams(640, 480, 160.0, 160.0, 320.0, 240.0, k1=-0.3, fov_deg=100.0))
+    lens_files.write_ros(path, FisheyeParams(640, 480, 160.0, 160.0, 320.0, 240.0, k1=-0.3, fov_deg=100.0))
     path.write_text(path.read_text().replace("100.0", "200.0"))
     with pytest.raises(ValueError, match=r"ros\.yaml: theta_d"):
         files.read_ros(path)
@@ -95,7 +97,7 @@ def test_a_lens_that_folds_inside_its_field_of_view_is_refused(tmp_path):
 
 def test_field_of_view_without_the_key(tmp_path):
     path = tmp_path / "kalibr.yaml"
-    files.write_kalibr(path, FisheyeParams(641, 481, 200.0, 200.0, 320.0, 240.0))
+    lens_files.write_kalibr(path, FisheyeParams(641, 481, 200.0, 200.0, 320.0, 240.0))
     path.write_text("\n".join(line for line in path.read_text().splitlines() if "fov_deg" not in line) + "\n")
     # Equidistant: the corner's outer edge, (320.5, 240.5) px from the centre, is seen at its distance / fx.
     expected = 2.0 * math.degrees(math.hypot(320.5, 240.5) / 200.0)
@@ -143,6 +145,30 @@ def test_basalt_refusals(tmp_path):
         fit_fisheye("fov", {}, 10, 10)
 
 
+def board_picture(lens: Fisheye, board: BoardParams, rot_cm: torch.Tensor, origin_c: torch.Tensor) -> np.ndarray:
+    """A chessboard, grey, uint8, shape (H, W), with a square of margin and a white border of another about the inner corners.
+
+    Args:
+        lens: of the picture. board: what is drawn.
+        rot_cm: board to camera, shape (3, 3). origin_c: first inner corner [m], shape (3,), camera frame.
+    """
+    rays_c, seen = pixel_rays(lens, SUPERSAMPLE)
+    to_board = rot_cm.double().T
+    eye_m = -(to_board @ origin_c.double())
+    rays_m = rotate(to_board, rays_c)
+    slope = rays_m[..., 2]
+    depth = -eye_m[2] / torch.where(slope.abs() < 1e-12, torch.full_like(slope, 1e-12), slope)
+    square = (eye_m + rays_m * depth.unsqueeze(-1))[..., :2] / board.square_size
+    x, y = square.unbind(-1)
+    hit = seen & (depth > 0.0)
+    printed = hit & (x > -1) & (x < board.columns) & (y > -1) & (y < board.rows)
+    paper = hit & (x > -2) & (x < board.columns + 1) & (y > -2) & (y < board.rows + 1)
+    black = printed & ((x.floor() + y.floor()) % 2 == 0)
+    grey = torch.where(paper, torch.where(black, 0.05, 0.95), 0.45 * seen)
+    averaged = grey.unflatten(1, (-1, SUPERSAMPLE)).unflatten(0, (-1, SUPERSAMPLE)).mean((1, 3)).float()
+    return (averaged * 255.0).round().to(torch.uint8).numpy()
+
+
 def test_calibration_from_rendered_boards():
     truth = FisheyeParams(320, 320, 96.0, 97.0, 161.0, 157.0, 0.01, -0.004, fov_deg=190.0)
     board = BoardParams(7, 5, 0.04)
@@ -158,7 +184,7 @@ def test_calibration_from_rendered_boards():
     for tilt, *place in zip(tilts, x, y, strict=True):
         rot_cm = rotation_from_vector(torch.tensor(tilt, dtype=torch.float64))
         origin = torch.tensor([*place, 0.18], dtype=torch.float64) - rot_cm @ middle
-        pictures.append(render_board(lens, board, rot_cm, origin).numpy())
+        pictures.append(board_picture(lens, board, rot_cm, origin))
     pictures.append(np.full((320, 320), 128, np.uint8))
     found, report = calibrate_from_boards(pictures, board, fov_deg=160.0)
     assert math.isnan(report.image_rms_px[-1])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from camera.fisheye import Fisheye, transfer_pixels
+from camera.fisheye import Fisheye
 from camera.params import FisheyeParams
 
 EQUIDISTANT = FisheyeParams(640, 640, 166.6786, 166.6786, 319.5, 319.5)
@@ -184,17 +184,6 @@ def test_monotonic_limit_closed_form():
     Fisheye(fits)
     with pytest.raises(ValueError, match=r"114\.59"):
         Fisheye(FisheyeParams(640, 640, 100.0, 100.0, 320.0, 320.0, k1=-1 / 12, fov_deg=2 * 115.0))
-
-
-def test_pixels_of_another_lens_are_taken_over():
-    source, target = Fisheye(NARROW), Fisheye(EQUIDISTANT)
-    rays = sphere(math.radians(109.0))
-    pixels, _ = source.project(rays)
-    expected, _ = target.project_normalized(rays)
-    moved, valid = transfer_pixels(pixels, source, target)
-    theta = torch.atan2(rays[:, :2].norm(dim=-1), rays[:, 2])
-    assert torch.equal(valid, theta <= source.half_fov)
-    assert torch.allclose(moved[valid], expected[valid], atol=ANGLE_TOLERANCE)
 
 
 def test_same_bits_for_any_batch_and_memory_layout():

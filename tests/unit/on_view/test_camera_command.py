@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 import torch
 
-from camera.calibrate import files
 from camera.calibrate.boards import BoardParams
 from camera.calibrate.formats import format_of, read
 from camera.fisheye import Fisheye
 from camera.imaging.render import pixel_rays
 from camera.mount import rotation_from_vector
 from camera.params import CameraParams, FisheyeParams
+from tests import lens_files
 from visthrow import config
 from visthrow.cli import main
 from visthrow.onboard.policy import Policy
@@ -26,7 +26,7 @@ BOARDS = {
     "circles": BoardParams(7, 5, 0.04, "circles"),
     "charuco": BoardParams(7, 5, 0.04, "charuco", 0.03),
 }
-WRITERS = {"opencv": files.write_opencv, "kalibr": files.write_kalibr, "ros": files.write_ros, "basalt": files.write_basalt}
+WRITERS = {name: getattr(lens_files, f"write_{name}") for name in ("opencv", "kalibr", "ros", "basalt")}
 
 OCAM = """#polynomial coefficients for the DIRECT mapping function (ocam_model.ss in MATLAB). These are used by cam2world
 
@@ -160,7 +160,7 @@ def test_every_calibration_becomes_a_config_that_trains_and_flies(kind, tmp_path
 
 def test_check_tells_a_lens_that_fits_from_one_that_does_not(tmp_path, boards, capsys):
     right = tmp_path / "kalibr.yaml"
-    files.write_kalibr(right, LENS)
+    lens_files.write_kalibr(right, LENS)
     assert main(["camera", "calibrate", str(right), "--out", str(tmp_path / "right.toml")]) == 0
     asked = [str(boards("chessboard")), *words(BOARDS["chessboard"])]
     assert main(["camera", "check", str(tmp_path / "right.toml"), *asked]) == 0
@@ -175,7 +175,7 @@ def test_check_tells_a_lens_that_fits_from_one_that_does_not(tmp_path, boards, c
 
 
 def test_show_draws_corners_keypoints_and_a_straight_view(tmp_path, boards, capsys):
-    files.write_ros(tmp_path / "ros.yaml", LENS)
+    lens_files.write_ros(tmp_path / "ros.yaml", LENS)
     camera, out = tmp_path / "camera.toml", tmp_path / "seen.png"
     assert main(["camera", "calibrate", str(tmp_path / "ros.yaml"), "--out", str(camera)]) == 0
     frame = str(boards("chessboard") / "0.png")
