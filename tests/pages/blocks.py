@@ -29,8 +29,8 @@ from visthrow import cli
 
 ROOT = Path(__file__).resolve().parents[2]
 REASONS = {
-    "a GPU", "a vehicle", "a motion-capture hall", "a camera", "an autopilot's firmware", "flights of yours", "files of yours",
-    "hours", "many minutes", "it installs software", "it opens a window", "a cluster",
+    "a GPU", "a vehicle", "a motion-capture hall", "a camera", "an autopilot's firmware", "flights of yours", "hours", "many minutes",
+    "it installs software", "it opens a window", "a cluster",
 }  # fmt: skip
 SEEN = ("tests", "configs", "docs")
 """Folders of the repository that a page's commands may read."""
