@@ -5,6 +5,7 @@ stops commanding and asks for nothing any more, an abort included.
 """
 
 import struct
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -67,7 +68,7 @@ class AutopilotParams:
             )
 
 
-class MavlinkAutopilot(Releasing):
+class MavlinkAutopilot(Releasing, ABC):
     """See `hil.backends.base.Backend`; the children say which modes there are and what the parameters must be.
 
     Attributes:
@@ -122,20 +123,21 @@ class MavlinkAutopilot(Releasing):
             self._streamed = -1e9
             self._begin_audit()
 
+    @abstractmethod
     def _rules(self) -> list[Rule]:
-        raise NotImplementedError
+        """What its parameters must be."""
 
+    @abstractmethod
     def _role(self, mode: int) -> str | None:
         """FOLLOW, HOLD or LAND by a heartbeat's custom mode; None for another one."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _mode_numbers(self, mode: str) -> tuple[float, float]:
         """Second and third parameter of DO_SET_MODE."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _release_command(self) -> tuple[int, tuple[float, ...]]:
         """Command that opens the mechanism, and its parameters."""
-        raise NotImplementedError
 
     def _stored(self, value: float, kind: int) -> float:
         """A parameter's value out of a PARAM_VALUE's field."""
@@ -220,8 +222,9 @@ class MavlinkAutopilot(Releasing):
     def _mode_text(self, mode: int) -> str:
         return str(mode)
 
+    @abstractmethod
     def _expected_modes(self) -> str:
-        raise NotImplementedError
+        """Modes that a throw may begin in, in words."""
 
     def status(self, now: float) -> Status:
         """See `Backend`."""

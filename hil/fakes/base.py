@@ -1,6 +1,7 @@
 """What all fakes share: plant, motion capture on the wire, a queue of things that take their time, a hold of their own."""
 
 import heapq
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -120,7 +121,7 @@ class SetPoints:
         return None if self._acting is None else mean + (begin + period - since) / period * self._acting
 
 
-class Fake:
+class Fake(ABC):
     """The vehicle and the motion capture of both bodies; the children add an autopilot's protocol.
 
     Attributes:
@@ -248,17 +249,17 @@ class Fake:
             self.happened("landed, disarmed")
         return self.hold(np.array([self._place[0], self._place[1], max(pos[2] - DESCENT, 0.05)]))
 
+    @abstractmethod
     def take(self) -> None:
         """The pilot takes the vehicle over, and holds it."""
-        raise NotImplementedError
 
+    @abstractmethod
     def flown(self) -> np.ndarray:
         """Command of this period, by whoever flies."""
-        raise NotImplementedError
 
+    @abstractmethod
     def speak(self) -> None:
         """Say what is due: heartbeats, streams."""
-        raise NotImplementedError
 
     def hear(self) -> None:
         """Take in what has come."""
@@ -349,9 +350,9 @@ class PortFake(Fake):
         super().__init__(plant, link, mocap, seed, options)
         self.port = port
 
+    @abstractmethod
     def came(self, data: bytes) -> None:
         """Take what came on the port."""
-        raise NotImplementedError
 
     def hear(self) -> None:
         """See `Fake`."""

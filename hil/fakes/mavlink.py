@@ -1,5 +1,6 @@
 """What the fakes of ArduPilot and PX4 share: commands and their answers, parameters, TIMESYNC, heartbeats, streams."""
 
+from abc import abstractmethod
 from typing import Any
 
 import numpy as np
@@ -80,18 +81,18 @@ class FakeMavlink(Fake):
         else:
             self.ignored += 1
 
+    @abstractmethod
     def listens(self) -> bool:
         """Whether set-points are followed now."""
-        raise NotImplementedError
 
     def take(self) -> None:
         """See `Fake`."""
         self.enter(self.pilots_mode)
         self.beat_soon()
 
+    @abstractmethod
     def enter(self, mode: int) -> int:
         """Enter a custom mode; the result of the command."""
-        raise NotImplementedError
 
     def _command(self, message: Any) -> None:
         number, answer = message.command, self.options.answer
@@ -120,9 +121,9 @@ class FakeMavlink(Fake):
         """Whether a command opens the mechanism."""
         return message.command == mav.MAV_CMD_DO_GRIPPER and message.param2 == mav.GRIPPER_ACTION_RELEASE
 
+    @abstractmethod
     def answer_release(self, message: Any) -> None:
         """Answer and do it, each as the options say."""
-        raise NotImplementedError
 
     def _arm(self, message: Any) -> None:
         wanted = message.param1 == 1.0

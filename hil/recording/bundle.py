@@ -2,6 +2,7 @@
 
 import tempfile
 import zipfile
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -59,7 +60,7 @@ def opened(path: str | Path) -> Iterator[Path]:
                     raise RunError(f"{path}: unpacks to more than {MOST >> 30} GiB; expected the bundle of a run")
                 for entry in entries:
                     bundle.extract(entry, folder)
-        except (zipfile.BadZipFile, OSError) as error:
+        except (zipfile.BadZipFile, zlib.error, RuntimeError, OSError) as error:  # RuntimeError: locked by a password, an unknown method
             raise RunError(f"{path}: {error}; expected a folder of a run, or the bundle of one") from error
         yield Path(folder)
 

@@ -16,7 +16,7 @@ from hil.fakes.mocap import MocapParams
 from hil.fakes.sitl.firmware import PORTS
 from hil.fakes.sitl.packets import MOTORS, Sensors, motors
 from hil.links import msp
-from hil.links.device import LARGEST_DATAGRAM, MOST_CHUNKS, Device, Port, TcpPort
+from hil.links.device import LARGEST_DATAGRAM, Device, Port, TcpPort, chunks
 from hil.links.mavlink_link import Link
 
 ASK = {msp.RC: 0.004, msp.STATUS: 0.1}
@@ -105,17 +105,11 @@ class BetaflightSitl(Fake):
     def hear(self) -> None:
         """See `Fake`: motors, and what the firmware says of itself."""
         super().hear()
-        for _ in range(MOST_CHUNKS):
-            packet = self.port.read()
-            if packet is None:
-                break
+        for packet in chunks(self.port):
             outputs = motors(packet)
             if outputs is not None:
                 self.motors, self._fresh = outputs, True
-        for _ in range(MOST_CHUNKS):
-            data = self._msp.read()
-            if data is None:
-                return
+        for data in chunks(self._msp):
             self.heard = self.wall()
             for frame in self._parser.parse(data):
                 self._hear(frame)

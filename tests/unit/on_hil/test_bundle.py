@@ -62,3 +62,12 @@ def test_what_is_no_bundle(tmp_path, capsys):
         bundle.writestr("../outside.txt", "x")
     assert main(["hil", "replay", str(tmp_path / "out.zip")]) == 2
     assert not (tmp_path.parent / "outside.txt").exists()
+
+
+def test_a_damaged_bundle_is_refused_in_a_sentence(aborted, tmp_path, capsys):
+    whole = bytearray(pack(aborted[0]).read_bytes())
+    for at in range(200, 6000):  # within what is packed: bytes that no deflated block begins with
+        whole[at] ^= 0xFF
+    (tmp_path / "damaged.zip").write_bytes(whole)
+    assert main(["hil", "replay", str(tmp_path / "damaged.zip")]) == 2
+    assert "expected a folder of a run, or the bundle of one" in capsys.readouterr().err
