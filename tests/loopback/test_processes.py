@@ -28,10 +28,13 @@ PATIENCE = 120.0
 """For anything to happen on a busy machine [s]."""
 
 ONE_THROW, MOST_LATE = 0.25, 100
-"""Landing error of a single throw on a busy machine [m], and periods of the fake that may be late: late commands, all of them."""
+"""Landing error of a single throw [m], and periods of the fake that may be late: late commands, all of them."""
 
 FEW_MISSED = 3
 """Ticks of a run that may be missed where its throw is to land in its place."""
+
+SPEEDS = (1.0, 0.5, 0.25)
+"""Of both processes' clocks: the next one is flown where the machine was too busy for the one before; the last one counts as it is."""
 
 START = 5.0
 """After which a run whose output is not read has begun to listen [s]."""
@@ -127,6 +130,17 @@ class Pair:
                 process.communicate()
 
 
+def kept_up(folder, fly):
+    """What ``fly(folder, speed)`` gives, with whether the machine was late, at the first of `SPEEDS` at which it was not."""
+    for speed in SPEEDS:
+        place = folder / f"at-{speed:g}"
+        place.mkdir()
+        *found, late = fly(place, speed)
+        if not late:
+            break
+    return *found, place
+
+
 @pytest.fixture
 def never(tmp_path):
     """A policy that hovers and never releases, as a file."""
@@ -143,20 +157,22 @@ OWN = {"ardupilot": "levelled: no set-points", "px4": "left OFFBOARD: no set-poi
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["ardupilot", "px4", "betaflight"])
 def test_the_runner_is_killed_in_mid_throw(tmp_path, kind, never):
-    with Pair(tmp_path, kind, never, overrides=QUICK) as pair:
-        pair.wait_for("throw")
-        pair.wait_for_actions(10)
-        os.kill(pair.runner.pid, signal.SIGKILL)
-        pair.runner.wait(PATIENCE)
-        time.sleep(2.5)
-        report = pair.report()
-    if report["late_periods"] > MOST_LATE and OWN[kind] not in [text for _, text in report["events"]]:
-        pytest.skip(f"{report['late_periods']} late periods: the fake has not flown on for long enough to do anything by itself")
+    def fly(folder, speed):
+        with Pair(folder, kind, never, overrides=QUICK, both=("--speed", str(speed))) as pair:
+            pair.wait_for("throw")
+            pair.wait_for_actions(10)
+            os.kill(pair.runner.pid, signal.SIGKILL)
+            pair.runner.wait(PATIENCE)
+            time.sleep(2.5 / speed)
+            report = pair.report()
+        return report, report["late_periods"] > MOST_LATE
+
+    report, folder = kept_up(tmp_path, fly)
     assert OWN[kind] in [text for _, text in report["events"]]
     happened = next(at for at, text in report["events"] if text == OWN[kind] and at > report["last_command"])
     assert 0.29 < happened - report["last_command"] < 0.6
     assert (report["breaches"], report["releases"]) == ([], 0)
-    found = replay(tmp_path / "run")
+    found = replay(folder / "run")
     assert found["differences"] == [], "what was written until then runs again to the bit"
     assert found["actions"] > 5
 
@@ -217,21 +233,23 @@ def test_the_disk_fills_up_in_mid_throw(tmp_path, never):
 @pytest.mark.parametrize("policy", ["state", "vision"])
 @pytest.mark.parametrize("kind", ["ardupilot", "px4", "betaflight"])
 def test_a_throw_with_each_kind(tmp_path, kind, policy):
-    """In real time, with the simulator's vehicle and the shipped policies."""
-    with Pair(tmp_path, kind, policy, plant=("--policy", policy), overrides=("states.abort=0.5",)) as pair:
-        out, _ = pair.runner.communicate(timeout=PATIENCE)
-        report = pair.report(end=False)
+    """In real time where the machine keeps up, with the simulator's vehicle and the shipped policies."""
+    def fly(folder, speed):
+        both = ("--speed", str(speed))
+        with Pair(folder, kind, policy, plant=("--policy", policy), overrides=("states.abort=0.5",), both=both) as pair:
+            out, _ = pair.runner.communicate(timeout=PATIENCE)
+            report = pair.report(end=False)
+        summary = json.loads((folder / "run" / "summary.json").read_text())
+        return out, report, summary, report["late_periods"] > MOST_LATE or summary["missed"] > FEW_MISSED
+
+    out, report, summary, folder = kept_up(tmp_path, fly)
     assert report["landing_w"] is not None, out
     assert (report["breaches"], report["releases"]) == ([], 1)
-    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert (summary["latches"], summary["errors"]) == (1, [])
     autopilot = summary["autopilot"]
     assert (autopilot["backend"], autopilot["parameters"]["problems"]) == (kind, [])
     assert autopilot["release"]["state"] == "accepted"
-    assert replay(tmp_path / "run")["differences"] == []
-    if report["late_periods"] > MOST_LATE or summary["missed"] > FEW_MISSED:
-        late = f"{report['late_periods']} late periods, {summary['missed']} missed ticks"
-        pytest.skip(f"{late}: the machine is too busy for where the payload lands to say anything")
+    assert replay(folder / "run")["differences"] == []
     # A fake that is late has a clock that stands still and then hurries.
     assert autopilot["clocks"]["foreign_stamps"] == 0 or kind == "betaflight"
     assert np.hypot(report["landing_w"][0] - 2.0, report["landing_w"][1]) < ONE_THROW

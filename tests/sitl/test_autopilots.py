@@ -1,6 +1,6 @@
 """The same suite against real autopilots in software: connect, audit, arm, a step of a body rate, the release, the hold.
 
-Each is run where its address stands in the environment, and skipped where nothing answers:
+Each is run where its address stands in the environment, and fails where nothing answers there:
 
     VISTHROW_SITL_ARDUPILOT=tcp:127.0.0.1:5760     arducopter --model quad, or sim_vehicle.py
     VISTHROW_SITL_PX4=udp:127.0.0.1:14540          PX4's offboard port, make px4_sitl sihsim_quadx
@@ -16,7 +16,6 @@ import pytest
 from hil.backends import make_backend
 from hil.backends.autopilot import ARMED
 from hil.backends.base import FOLLOW, HOLD
-from hil.errors import LinkError
 from hil.links.device import check_device, open_port
 from hil.links.mavlink_link import Link
 from hil.links.pymav import mav
@@ -55,10 +54,7 @@ class Bench:
         names = {"ardupilot": "fake", "px4": "fake_px4"}
         self.kind = kind
         self.params = config.load(HilParams, config.find("hil", names[kind]), (*HOVER_SHARE[kind], *overrides))
-        try:
-            port = open_port(check_device(address))
-        except LinkError as error:
-            pytest.skip(str(error))
+        port = open_port(check_device(address))
         self.rates, self.placed = [], False
         self.tables: list[str] = []
         self.link = Link(port, 245, 191, roster=Roster(parties(self.params, False, True)))
@@ -94,8 +90,7 @@ class Bench:
         return self.backend._heartbeat is not None
 
     def connect(self):
-        if not self.turn(ANSWER, until=self.heard):
-            pytest.skip("nothing answers")
+        assert self.turn(ANSWER, until=self.heard), "nothing answers"
         for number in (mav.MAVLINK_MSG_ID_ATTITUDE, mav.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW):
             values = (mav.MAV_CMD_SET_MESSAGE_INTERVAL, 0, number, 10_000.0, 0.0, 0.0, 0.0, 0.0, 0.0)
             self.link.send(mav.MAVLink_command_long_message(1, 1, *values))
