@@ -32,11 +32,14 @@ def pack(folder: str | Path) -> Path:
     path = folder.with_name(folder.name + ENDING)
     found = [folder / name for name in PARTS if (folder / name).is_file()]
     found += sorted(file for pattern in RECORDS for file in folder.glob(pattern))
+    part = path.with_name(f".{path.name}.tmp")
     try:
-        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as bundle:
+        with zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED) as bundle:
             for file in found:
                 bundle.write(file, file.name)
+        part.replace(path)
     except OSError as error:
+        part.unlink(missing_ok=True)
         raise RunError(f"{path}: cannot be written: {error.strerror}") from error
     return path
 

@@ -1,9 +1,12 @@
 """A run that ended other than well: one file that replays it, and where it went wrong in a sentence."""
 
+import errno
+import shutil
 import zipfile
 
 import pytest
 
+from hil.errors import RunError
 from hil.recording.bundle import pack
 from tests.hil_runs import record_run, saved_policy
 from visthrow.cli import main
@@ -37,6 +40,21 @@ def test_a_bundle_replays_to_the_bit_and_says_where_it_went_wrong(aborted, capsy
     assert f"s into '{before}': {decisions[turn].reason}; the vehicle was at (" in told
     age = float(told.split(" ms old")[0].split()[-1])
     assert age == pytest.approx(1e3 * (decisions[turn].time - LOST), abs=25.0)
+
+
+def test_a_full_disk_leaves_no_half_bundle(aborted, tmp_path, monkeypatch):
+    folder = shutil.copytree(aborted[0], tmp_path / "full")
+    write = zipfile.ZipFile.write
+
+    def full(bundle, file, name):
+        if name == "poses.jsonl":
+            raise OSError(errno.ENOSPC, "No space left on device")
+        write(bundle, file, name)
+
+    monkeypatch.setattr(zipfile.ZipFile, "write", full)
+    with pytest.raises(RunError, match="cannot be written: No space left"):
+        pack(folder)
+    assert [path.name for path in tmp_path.iterdir()] == ["full"]
 
 
 def test_a_run_that_was_killed_leaves_a_bundle_when_it_is_looked_at(tmp_path, capsys):
