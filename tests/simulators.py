@@ -7,9 +7,8 @@ import numpy as np
 
 from sim.hybrid import HybridSim
 from sim.params import BodyParams, PlantParams, QueueParams, RopeParams, SimParams
-from sim.reference.scene import Scene
 from tests.plants import paper_plant
-from tests.scenes import wrench_at
+from tests.scenes import Scene, wrench_at
 
 LOW, HIGH = (0.0, -10.0, -10.0, -4.0), (14.0, 10.0, 10.0, 4.0)
 """Full range of commands: collective thrust [N], body rates [rad/s]."""

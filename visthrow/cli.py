@@ -22,7 +22,7 @@ COMMANDS = {
     "sweep": ("work a list of training runs and throws, on several GPUs or a cluster", "visthrow.evidence.sweep.cli"),
     "report": ("write one page with the paper's tables and figures beside ours", "visthrow.evidence.report.command"),
     "camera": ("make a camera configuration from a calibration, check it, look at what it sees", "visthrow.view.camera.command"),
-    "bench": ("measure the speed of the simulator and of the camera", "visthrow.evidence.bench"),
+    "bench": ("measure how long training and diagnosis take; what was measured before", "visthrow.evidence.bench"),
     "config": ("print a configuration with all its values filled in", "visthrow.config.command"),
 }
 TRACEBACK_VARIABLE = "VISTHROW_TRACEBACK"

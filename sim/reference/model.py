@@ -19,7 +19,7 @@ from typing import Literal
 
 import mujoco
 
-from sim.params import GRAVITY
+from sim.params import GRAVITY, RopeParams, VehicleParams
 
 AXIAL_INERTIA = 1e-12
 """Inertia of a rod about its axis with universal joints [kg m^2]: they pass twist on, so that it must not matter."""
@@ -40,6 +40,15 @@ class RopeModel:
     payload_offset: float  # payload's centre past the end of the last segment [m]
     joint_damping: float  # [N m s]
     gravity: float = GRAVITY  # [m/s^2]
+
+    @staticmethod
+    def of(vehicle: VehicleParams, rope: RopeParams) -> "RopeModel":
+        """Return those of a vehicle and its rope."""
+        body, count = vehicle.body, rope.segments
+        return RopeModel(
+            body.mass, body.inertia, rope.mount, count, rope.length / count, rope.rope_mass / count, rope.payload_mass,
+            rope.payload_inertia, rope.payload_offset, rope.joint_damping,
+        )  # fmt: skip
 
 
 def _set_inertial(body: "mujoco.MjsBody", mass: float, centre_z: float, inertia: tuple[float, float, float]) -> None:

@@ -152,18 +152,8 @@ class ReferencePlant:
             extras.payload_mass_sigma or extras.rope_length_sigma or any(extras.com_offset_sigma)
         ):
             return
-        base = RopeModel(
-            mass=vehicle.body.mass,
-            inertia=vehicle.body.inertia,
-            mount=rope.mount,
-            segments=rope.segments,
-            segment_length=rope.length / rope.segments,
-            segment_mass=rope.rope_mass / rope.segments,
-            payload_mass=rope.payload_mass,
-            payload_inertia=rope.payload_inertia,
-            payload_offset=rope.payload_offset,
-            joint_damping=rope.joint_damping + extras.extra_joint_damping,
-        )
+        base = RopeModel.of(vehicle, rope)
+        base = replace(base, joint_damping=base.joint_damping + extras.extra_joint_damping)
         models = [
             replace(
                 base,

@@ -7,12 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from tests.bench import start
+from tests.bench.sim import on_one_core
 from visthrow import config
 from visthrow.common.arguments import add_common
 from visthrow.common.errors import VisthrowError
 from visthrow.evidence.bench import records
 from visthrow.evidence.bench.records import Report, Table
-from visthrow.evidence.bench.sim.cpu import on_one_core
 
 TARGETS = (1.5, 2.0, 2.5)
 LIMIT_MS = 10.0

@@ -5,12 +5,11 @@ Held against ``oracle.converged`` it shows what twist in the joints is worth and
 
 import numpy as np
 
-from sim.reference.oracle import rope_from_scene
 from sim.reference.rope import RopeDynamics
 from sim.reference.rotations import cross, quat_dot, rotation_from_quat, turned
-from sim.reference.scene import Scene
 from sim.reference.stepping import halving_rk4
-from tests.scenes import wrench_at
+from tests.oracle.start import rope_from_scene
+from tests.scenes import Scene, wrench_at
 
 
 class BareScene:

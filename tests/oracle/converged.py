@@ -6,8 +6,8 @@ import mujoco
 import numpy as np
 
 from sim.reference.model import build_attached
-from sim.reference.oracle import CONVERGED_STEP, initial_data, rope_from_scene
-from sim.reference.scene import Scene
+from tests.oracle.start import CONVERGED_STEP, initial_data, rope_from_scene
+from tests.scenes import Scene
 
 
 @dataclass(frozen=True)

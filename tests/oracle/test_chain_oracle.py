@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 
 from sim.arrays.state import NONFINITE
-from sim.reference.scene import Scene
 from tests.oracle.converged import OracleRun, converged
 from tests.plants import SCENES
-from tests.scenes import load_scene
+from tests.scenes import Scene, load_scene
 from tests.simulators import Flight, fly
 
 POSITION = 1e-3

@@ -5,12 +5,12 @@ import dataclasses
 import numpy as np
 import pytest
 
-from sim.reference.oracle import hinges_from_directions, matrix_from_quat
+from tests.bench.mujoco_c import timed_scene
 from tests.oracle.bare_rope import BareScene
 from tests.oracle.converged import converged
+from tests.oracle.start import hinges_from_directions, matrix_from_quat
 from tests.plants import SCENES
 from tests.scenes import load_scene
-from visthrow.evidence.bench.sim.mujoco_c import end_of_scene, timed_scene
 
 CONVERGED = 1e-6
 """Doubling the oracle's step moves the whip, the harsher scene, by 1.7e-7 m, halving it by 1.4e-11 m [m]."""
@@ -108,9 +108,3 @@ def test_bench_scenes_run():
     for bench in (timed_scene(scene, "RK4", 8e-4), timed_scene(scene, "implicitfast", 2e-3, "implicitfast", 2e-7)):
         bench.advance(2000)
         assert bench.step in (8e-4, 2e-3)
-
-
-def test_the_end_that_benchmarks_compare_is_that_of_a_converged_run():
-    run, (ball, vehicle) = converged(hard_throw(), 40e-6), end_of_scene(hard_throw(), 40e-6)
-    np.testing.assert_allclose(ball, run.ball_pos_w[-1], rtol=0, atol=1e-15)
-    np.testing.assert_allclose(vehicle, run.pos_w[-1], rtol=0, atol=1e-15)

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from sim.reference.bodies import CABLE_STEP, MujocoBodies, rope_and_ball, rope_and_box, two_cables
-from sim.reference.oracle import initial_data, rope_from_scene
 from sim.seam import FusedChain, SeamSim
+from tests.oracle.start import initial_data, rope_from_scene
 from tests.plants import SCENES, paper_plant
 from tests.scenes import load_scene
 from tests.simulators import scene_plant

@@ -7,9 +7,8 @@ import pytest
 
 from sim.hybrid import HybridSim
 from sim.params import GRAVITY, LawParams
-from sim.reference.scene import Wrench
 from tests.plants import SCENES
-from tests.scenes import load_scene
+from tests.scenes import Wrench, load_scene
 from tests.simulators import energy, momentum, rotate, scene_plant, scene_sim
 
 DRIFT = 5e-3

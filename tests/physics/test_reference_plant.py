@@ -7,12 +7,11 @@ import pytest
 
 from sim.params import GRAVITY
 from sim.reference.plant import ReferencePlant
-from sim.reference.scene import Wrench
 from tests.oracle.bare_rope import BareScene
 from tests.oracle.converged import converged
 from tests.oracle.quadrotor import ReferenceQuadrotor
 from tests.plants import SCENES, paper_plant, plain_plant
-from tests.scenes import load_scene
+from tests.scenes import Wrench, load_scene
 
 ROUND_OFF = 1e-9
 """Some thousand additions of numbers of order 1, and MuJoCo's factorisation [m]."""

@@ -5,12 +5,22 @@ import tempfile
 import time
 from pathlib import Path
 
-from visthrow.evidence.bench.records import Report, Table, finish
+from visthrow.evidence.bench.records import Report, Table, add_arguments_of_measurements, finish
 
 VERDICT_S = {"cpu": 90.0, "cuda": 5.0}
 """Bars for ten throws and a minute of flight with the whole catalogue: two quiet CPU cores, an H200."""
 REPORT_S = 120.0
 """What the report may take on top."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the action."""
+    from visthrow.diagnose.inputs import opening
+
+    opening.add_arguments(parser)
+    parser.add_argument("--no-report", action="store_true", help="measure the verdicts only")
+    add_arguments_of_measurements(parser, 2)
+    parser.set_defaults(device="cpu")
 
 
 def measure(args: argparse.Namespace) -> dict[str, float]:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from visthrow import config
+from visthrow.common.arguments import add_common
 from visthrow.common.errors import VisthrowError
 from visthrow.evidence.bench import records
 from visthrow.evidence.bench.records import Report, Table, rate
@@ -120,6 +121,18 @@ def split(total: dict[str, float], parts: dict[str, float]) -> dict[str, float]:
         "storage": storage,
         "learning": total["learning"],
     }
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the action."""
+    add = parser.add_argument
+    add("configs", metavar="CONFIG", nargs="*", default=["state"], help="training configurations (default: state)")
+    add("--iterations", type=int, default=5, metavar="N", help="iterations measured (default: 5)")
+    add("--until", type=float, nargs="+", metavar="ERROR", help="train until throws at 2.0 m land so near on average [m], and time that")
+    add("--seeds", type=int, nargs="+", default=[1, 2, 3, 4, 5], metavar="N", help="of the trainings (default: 1 to 5)")
+    add("--minutes", type=float, default=30.0, metavar="T", help="that a training may take (default: 30)")
+    records.add_arguments_of_measurements(parser, 5)
+    add_common(parser)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -121,6 +121,18 @@ def load(path: Path) -> dict[str, Any]:
     return record
 
 
+def add_arguments_of_measurements(parser: argparse.ArgumentParser, repeats: int) -> None:
+    """Add ``--repeats`` and ``--record``; what :func:`finish` asks for besides, ``--json``, is among the common ones."""
+    text = f"measurements; the median counts (default: {repeats})"
+    parser.add_argument("--repeats", type=int, default=repeats, metavar="N", help=text)
+    parser.add_argument("--record", metavar="NAME", help="keep the result in the package's records under this name")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the action."""
+    parser.add_argument("names", metavar="NAME", nargs="*", help="records to print (default: all)")
+
+
 def run(args: argparse.Namespace) -> int:
     """Print records."""
     kept = {path.stem: path for path in sorted(FOLDER.glob("*.json"))}
@@ -131,5 +143,5 @@ def run(args: argparse.Namespace) -> int:
         record = load(kept[name])
         print(f"## {name}\n\n{origin(record)}\n\n{body(record)}\n")
     if not kept:
-        print("nothing is recorded yet; measure with: visthrow bench sim --record NAME")
+        print("nothing is recorded yet; measure with: visthrow bench train --record NAME")
     return 0

@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 
 from sim.reference.model import RopeModel
-from sim.reference.scene import Scene
+from tests.scenes import Scene
 
 CONVERGED_STEP = 20e-6
 """Step of a converged run [s]: half of it moves the ball of both scenes by less than a micrometre."""

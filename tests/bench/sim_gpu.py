@@ -7,8 +7,8 @@ from typing import Any
 import warp as wp
 
 from sim.hybrid import HybridSim, tether_lengths
+from tests.bench import commands
 from visthrow.evidence.bench.records import Report, Table, rate
-from visthrow.evidence.bench.sim import commands
 from visthrow.task import Experiment, plant_of
 from visthrow.training.device import device_name
 
@@ -84,7 +84,7 @@ def measure(
     }
     tables = [_sweep_table(rows, plant.rope.segments)]
     if with_mujoco:
-        from visthrow.evidence.bench.sim import mujoco_warp
+        from tests.bench import mujoco_warp
 
         found = mujoco_warp.measure(device, min(repeats, 3), plant.sim.control_period)
         figures["mujoco_warp"] = found

@@ -7,11 +7,14 @@ import dataclasses
 from collections.abc import Callable
 
 import mujoco
-import numpy as np
 
 from sim.reference.model import build_attached
-from sim.reference.oracle import CONVERGED_STEP, initial_data, rope_from_scene
-from sim.reference.scene import Scene
+from tests.oracle.start import initial_data, rope_from_scene
+from tests.plants import SCENES
+from tests.scenes import Scene, load_scene
+
+HARD_THROW = load_scene(SCENES / "hard_throw.toml")
+"""2.2 times the total weight along body z, the rope straight but far from hanging."""
 
 ARMATURE = 2e-7
 """Reflected inertia of the hinges that lets implicitfast stand 2 ms [kg m^2]."""
@@ -39,17 +42,6 @@ def started(scene: Scene, step: float, integrator: str, armature: float) -> tupl
     data, first = initial_data(model, scene), scene.schedule[0]
     data.ctrl[:] = (*first.force_b, *first.torque_b)
     return model, data
-
-
-def end_of_scene(
-    scene: Scene, step: float = CONVERGED_STEP, integrator: str = "RK4", armature: float = 0.0
-) -> tuple[np.ndarray, np.ndarray]:
-    """Positions of ball and vehicle at the end of a scene [m], shape (3,) each, world frame; arguments as of :func:`started`."""
-    model, data = started(scene, step, integrator, armature)
-    mujoco.mj_step(model, data, round(scene.duration / step))
-    mujoco.mj_forward(model, data)  # after mj_step the derived fields describe the state before it
-    direction = -data.xmat[-1].reshape(3, 3)[:, 2]
-    return data.xpos[-1] + (scene.segment_length + scene.ball_offset) * direction, data.qpos[:3].copy()
 
 
 def timed_scene(scene: Scene, name: str, step: float, integrator: str = "RK4", armature: float = 0.0) -> BenchScene:

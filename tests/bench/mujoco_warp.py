@@ -9,21 +9,20 @@ import numpy as np
 import warp as wp
 
 from visthrow.evidence.bench.records import Table, rate
-from visthrow.evidence.bench.sim.scenes import HARD_THROW
 
 BATCHES = (8192, 16384, 32768, 65536)
 SUBSTEPS = 10  # in the graph: one control step of ours
 STRETCH = 25  # replays from one start: the 0.5 s of the hard throw
 MISSING = (
     "MuJoCo Warp was not measured: the package '{package}' is not installed; "
-    "install it with: pip install 'visthrow[bench]'"
+    "install it with: pip install {package}"
 )
 
 
 def _model() -> tuple[Any, Any]:
-    from visthrow.evidence.bench.sim import mujoco_c
+    from tests.bench import mujoco_c
 
-    return mujoco_c.started(HARD_THROW, mujoco_c.IMPLICIT_STEP, "implicitfast", mujoco_c.ARMATURE)
+    return mujoco_c.started(mujoco_c.HARD_THROW, mujoco_c.IMPLICIT_STEP, "implicitfast", mujoco_c.ARMATURE)
 
 
 class Worlds:

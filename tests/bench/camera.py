@@ -1,10 +1,11 @@
-"""``visthrow bench camera``: keypoints of many environments against kornia's and OpenCV's fisheye projection."""
+"""The camera: keypoints of many environments against kornia's and OpenCV's fisheye projection."""
 
 import argparse
 import math
 import statistics
+import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,11 +13,12 @@ import torch
 
 from camera.keypoints import KEYPOINTS, KeypointCamera, keypoints
 from camera.mount import points_c_from_w
+from tests.bench import start
+from tests.bench.sim import on_one_core
 from visthrow import config
+from visthrow.common.arguments import add_common
 from visthrow.common.errors import VisthrowError
-from visthrow.evidence.bench import records
-from visthrow.evidence.bench.records import Report, Table, rate
-from visthrow.evidence.bench.sim.cpu import on_one_core
+from visthrow.evidence.bench.records import Report, Table, finish, rate
 from visthrow.training.device import device_name
 
 STRETCH = 0.2  # [s], wall time of one measurement, about
@@ -159,7 +161,7 @@ def run(args: argparse.Namespace) -> int:
     from visthrow.training.device import resolve
 
     params = config.load(CameraParams, config.find("camera", "fisheye"), args.overrides)
-    return records.finish(measure(params, args.environments, resolve(args.device), args.repeats), args)
+    return finish(measure(params, args.environments, resolve(args.device), args.repeats), args)
 
 
 def measure(params: Any, count: int, device: str, repeats: int, stretch: float = STRETCH) -> Report:
@@ -213,3 +215,16 @@ _LABELS = {
     "kornia, CUDA graph": "kornia, projection alone, CUDA graph",
     "OpenCV": "OpenCV, projection alone",
 }
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command."""
+    parser = start.parser_of(__doc__)
+    parser.add_argument("--environments", type=int, default=16384, metavar="N", help="batch size (default: 16384)")
+    parser.add_argument("--repeats", type=int, default=5, metavar="N", help="measurements; the median counts (default: 5)")
+    add_common(parser, json=False)
+    return start.main(parser, run, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

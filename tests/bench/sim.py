@@ -1,19 +1,28 @@
-"""One CPU core: wall time a simulated second of one environment, against MuJoCo C on the same rope."""
+"""The simulator: on one CPU core against MuJoCo C on the same rope, on a GPU over batches and against MuJoCo Warp.
 
+On the core: wall time a simulated second of one environment.
+"""
+
+import argparse
 import contextlib
 import os
 import statistics
+import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
 from sim.arrays.state import OUTPUT_FIELDS, STATE_FIELDS
 from sim.hybrid import HybridSim, tether_lengths
+from tests.bench import commands, start
+from tests.oracle.converged import converged
+from tests.simulators import fly
+from visthrow import config
+from visthrow.common.arguments import add_common
 from visthrow.common.errors import VisthrowError
-from visthrow.evidence.bench.records import Report, Table
-from visthrow.evidence.bench.sim import commands
+from visthrow.evidence.bench.records import Report, Table, finish
 from visthrow.task import Experiment, plant_of
 
 BATCH = 1024
@@ -72,7 +81,7 @@ class Batch:
 
 
 def cost_in_c(scene: Any, seconds: float) -> float:
-    """Wall time [s] a simulated second of a scene of ``visthrow.evidence.bench.sim.mujoco_c``, measured for about ``seconds``."""
+    """Wall time [s] a simulated second of a scene of `tests.bench.mujoco_c`, measured for about ``seconds``."""
     chunk = round(0.5 / scene.step)
     spent, steps = 0.0, 0
     while spent < seconds:
@@ -113,23 +122,26 @@ def longest_accurate_step(error: Callable[[float], float], duration: float, tole
 
 def contenders(plant: Any) -> tuple[dict[str, Any], dict[str, tuple[float, float]]]:
     """MuJoCo's two scenes, and how far (ball, vehicle) [m] each contender ends from the converged hard throw."""
-    from visthrow.evidence.bench.sim import mujoco_c, scenes
+    from tests.bench import mujoco_c
 
-    hard = scenes.HARD_THROW
-    truth = mujoco_c.end_of_scene(hard)
+    hard, numerics = mujoco_c.HARD_THROW, plant.sim
+    truth = converged(hard)
 
-    def off(*how: Any) -> tuple[float, float]:
-        return scenes.distance(mujoco_c.end_of_scene(hard, *how), truth)
+    def off(ball_w: np.ndarray, pos_w: np.ndarray) -> tuple[float, float]:
+        return float(np.linalg.norm(ball_w - truth.ball_pos_w[-1])), float(np.linalg.norm(pos_w - truth.pos_w[-1]))
 
-    step = longest_accurate_step(lambda h: max(off(h)), hard.duration, TOLERANCE)
-    implicit = (mujoco_c.IMPLICIT_STEP, "implicitfast", mujoco_c.ARMATURE)
-    errors = {
-        "ours": scenes.distance(scenes.end_of_scene(hard, plant), truth), "RK4": off(step), "implicitfast": off(*implicit),
-    }  # fmt: skip
+    def of_mujoco(**how: Any) -> tuple[float, float]:
+        run = converged(hard, **how)
+        return off(run.ball_pos_w[-1], run.pos_w[-1])
+
+    step = longest_accurate_step(lambda h: max(of_mujoco(step=h)), hard.duration, TOLERANCE)
+    implicit = {"step": mujoco_c.IMPLICIT_STEP, "integrator": "implicitfast", "armature": mujoco_c.ARMATURE}
+    ours = fly(hard, numerics.substep, numerics.precision, numerics.control_period)
+    errors = {"ours": off(ours.ball_pos_w, ours.pos_w), "RK4": of_mujoco(step=step), "implicitfast": of_mujoco(**implicit)}
     name = f"MuJoCo C, implicitfast, armature {mujoco_c.ARMATURE:g}, {mujoco_c.IMPLICIT_STEP * 1e3:g} ms"
     return {
         "RK4": mujoco_c.timed_scene(hard, f"MuJoCo C, RK4, {step * 1e3:g} ms", step),
-        "implicitfast": mujoco_c.timed_scene(hard, name, *implicit),
+        "implicitfast": mujoco_c.timed_scene(hard, name, **implicit),
     }, errors
 
 
@@ -236,3 +248,51 @@ def _notes(figures: dict[str, Any]) -> tuple[str, ...]:
         bars = ", ".join(f"{n} {r['ratio']:.1f} (at least {r['bar']:g})" for n, r in figures["rivals"].items())
         notes.append(f"Bars: {bars}.")
     return tuple(notes)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure the simulator."""
+    if args.seconds <= 0 or args.repeats < 1 or args.threads < 1 or any(n < 1 for n in args.batch or ()):
+        raise VisthrowError(
+            f"--seconds {args.seconds}, --repeats {args.repeats}, --batch {args.batch}, --threads {args.threads}: "
+            "expected positive numbers"
+        )
+    experiment = config.load(Experiment, config.find("train", args.config), args.overrides)
+    if args.device == "cpu":
+        if args.batch and len(args.batch) > 1:
+            raise VisthrowError(f"--batch {args.batch}: one core is measured at one batch size")
+        batch = args.batch[0] if args.batch else BATCH
+        if args.threads > 1:
+            report = measure_threads(experiment, batch, args.repeats, args.seconds, args.threads)
+        else:
+            report = measure(experiment, batch, args.repeats, args.seconds, args.core, not args.without_mujoco)
+    else:
+        from tests.bench import sim_gpu
+        from visthrow.training import device
+
+        name = device.resolve(args.device)
+        if name == "cpu":
+            raise VisthrowError(f"--device {args.device}: no GPU here; measure the CPU with --device cpu")
+        report = sim_gpu.measure(experiment, name, args.batch or sim_gpu.BATCHES, args.repeats, not args.without_mujoco)
+    return finish(report, args)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command."""
+    parser = start.parser_of(__doc__)
+    batch = "environments; several on a GPU (default: 1024 on the CPU, 4096 to 524288 on a GPU)"
+    parser.add_argument("--batch", type=int, nargs="+", metavar="N", help=batch)
+    parser.add_argument("--seconds", type=float, default=1.0, metavar="S", help="wall time of one measurement, about (default: 1)")
+    threads = "measure N threads of a CPU against one instead of MuJoCo (default: 1)"
+    parser.add_argument("--threads", type=int, default=1, metavar="N", help=threads)
+    parser.add_argument("--without-mujoco", action="store_true", help="measure this simulator alone")
+    parser.add_argument("--repeats", type=int, default=5, metavar="N", help="measurements; the median counts (default: 5)")
+    parser.add_argument("--core", type=int, metavar="N", help="CPU core to stay on (default: the last one)")
+    parser.add_argument("--config", default="state", metavar="NAME", help="training configuration whose plant is measured")
+    add_common(parser, json=False)
+    parser.set_defaults(device="cpu")
+    return start.main(parser, run, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
