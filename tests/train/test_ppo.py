@@ -15,6 +15,7 @@ from visthrow.task import PPOParams
 from visthrow.training.ppo.algorithm import rsl_rl_config
 from visthrow.training.ppo.network import CapturableGaussian
 from visthrow.training.ppo.update import CapturedPPO
+from visthrow.training.ranks import Ranks
 
 ENVIRONMENTS, STEPS, SEEN, KNOWN, ACTIONS = 32, 8, 7, 9, 5
 
@@ -40,7 +41,7 @@ def observations(device: str = "cpu") -> TensorDict:
 
 def build(p: PPOParams, own: bool, device: str = "cpu") -> PPO:
     """Our algorithm or rsl_rl's with rsl_rl's networks, from the same weights."""
-    cfg = rsl_rl_config(p, None)
+    cfg = rsl_rl_config(p, Ranks(device))
     if not own:
         cfg["algorithm"]["class_name"] = "PPO"
         for name in ("actor", "critic"):

@@ -234,16 +234,3 @@ def test_unknown_names_and_indivisible_batches_are_refused(tmp_path, capsys):
     assert "state" in capsys.readouterr().err
     assert train(tmp_path / "b", "--set", "ppo.minibatches=7") == 2
     assert "minibatches" in capsys.readouterr().err
-
-
-def test_further_ranks_resume_with_data_of_their_own(whole):
-    """A checkpoint holds the first rank's environments; copied to all, several GPUs would collect the same batch."""
-    experiment = config.load(Experiment, whole / "config.toml")
-    first, second = (Trainer(experiment, "cpu", 1) for _ in range(2))
-    second.ranks = {"global_rank": 1, "local_rank": 1, "world_size": 2}
-    first.load(whole / CHECKPOINT)
-    second.load(whole / CHECKPOINT)
-    assert first.iteration == second.iteration == 4
-    weight = next(first.algorithm.alg.actor.parameters()), next(second.algorithm.alg.actor.parameters())
-    torch.testing.assert_close(*weight, rtol=0, atol=0)
-    assert not torch.equal(first.algorithm.env.views.state["pos_w"], second.algorithm.env.views.state["pos_w"])

@@ -55,33 +55,29 @@ def run(args: argparse.Namespace) -> int:
     """Train."""
     from visthrow import config
     from visthrow.common import provenance
-    from visthrow.common.errors import TrainError
     from visthrow.training import device
+    from visthrow.training.ranks import Ranks
     from visthrow.training.trainer import CHECKPOINT, Trainer
 
     _check(args)
-    ranks = _ranks()
-    if ranks and (args.minutes or args.until):
-        raise TrainError("--minutes and --until would stop one of several processes and leave the others; use --iterations")
     experiment, policy, folder, seed = _resumed(args) if args.resume else _begun(args)
-    lead = ranks is None or ranks["global_rank"] == 0
-    name = f"cuda:{ranks['local_rank']}" if ranks else device.resolve(args.device)
+    name = device.resolve(args.device)
+    ranks = Ranks.join(name != "cpu") if int(os.environ.get("WORLD_SIZE", "1")) > 1 else Ranks(name)
     start = time.perf_counter()
-    trainer = Trainer(experiment, name, seed, ranks)  # refuses what cannot be trained before a folder is made
+    trainer = Trainer(experiment, ranks.device, seed, ranks)  # refuses what cannot be trained before a folder is made
     if args.resume:
         trainer.load(folder / CHECKPOINT)
     elif policy is not None:
         trainer.take_up(policy)
     last = args.iterations or trainer.algorithm.iterations
-    if not lead:
-        while trainer.iteration < last:
-            trainer.step()
-        return 0
-    told = {"seed": seed} | ({"from": _origin(args.start, policy)} if policy is not None else {})
-    provenance.write_run_folder(folder, config.dumps(experiment), resume=args.resume, **told)
+    if ranks.lead:
+        told = {"seed": seed, "processes": ranks.world} | ({"from": _origin(args.start, policy)} if policy is not None else {})
+        provenance.write_run_folder(folder, config.dumps(experiment), resume=args.resume, **told)
     why = _loop(args, trainer, folder, last)
-    _report(args, trainer, folder, time.perf_counter() - start, finished=why in (DONE, REACHED))
-    if why in (DONE, REACHED):
+    ranks.leave()
+    if ranks.lead:
+        _report(args, trainer, folder, time.perf_counter() - start, finished=why != STOPPED)
+    if why != STOPPED:
         return 0
     words = ["visthrow train --resume", f"--out {folder}", *([f"--iterations {args.iterations}"] if args.iterations else [])]
     print(f"\n{why} after iteration {trainer.iteration} of {last}; go on with: {' '.join(words)}", file=sys.stderr)
@@ -162,18 +158,6 @@ def _origin(name: str, policy) -> dict:
     return {"policy": Path(name).name, **{k: policy.made_by[k] for k in ("commit", "command", "seed") if k in policy.made_by}}
 
 
-def _ranks() -> dict | None:
-    world = int(os.environ.get("WORLD_SIZE", "1"))
-    if world == 1:
-        return None
-    import torch
-
-    rank, local = int(os.environ["RANK"]), int(os.environ["LOCAL_RANK"])
-    torch.cuda.set_device(local)
-    torch.distributed.init_process_group(backend="nccl", rank=rank, world_size=world)
-    return {"global_rank": rank, "local_rank": local, "world_size": world}
-
-
 class StopRequest:
     """Ctrl-C and SIGTERM taken down while it is entered, so that no iteration is cut in two; a second Ctrl-C interrupts.
 
@@ -199,7 +183,7 @@ class StopRequest:
         print("\nstopping after this iteration", file=sys.stderr)
 
 
-DONE, REACHED, STOPPED = "finished", "reached the error that was asked for", "stopped"
+DONE, REACHED, STOPPED = ENDS = ("finished", "reached the error that was asked for", "stopped")
 """Why a loop ended."""
 
 
@@ -241,18 +225,19 @@ def _loop(args: argparse.Namespace, trainer, folder: Path, last: int) -> str:
     from visthrow.training.progress import TrainLog
     from visthrow.training.trainer import CHECKPOINT
 
-    start, kept, why = time.perf_counter(), trainer.iteration, DONE
+    start, kept, why, ranks = time.perf_counter(), trainer.iteration, DONE, trainer.ranks
     evaluations = Evaluations(args.evaluate_every, bool(args.until or args.view or sys.stdout.isatty()))
-    log = TrainLog(folder / "progress.csv", trainer.algorithm.samples, last, kept, args.minutes)
+    log = TrainLog(folder / "progress.csv", trainer.algorithm.samples, last, kept, args.minutes) if ranks.lead else None
     try:
-        with log, StopRequest() as stop, _viewer(args.view, trainer) as show:
+        with log or contextlib.nullcontext(), StopRequest() as stop, _viewer(args.view and ranks.lead, trainer) as show:
             while trainer.iteration < last and why == DONE:
                 figures, throws = trainer.step(), None
-                if evaluations.due(trainer.iteration):
+                if ranks.lead and evaluations.due(trainer.iteration):
                     with evaluations.timed():
                         throws = trainer.throw(EVALUATION_TARGET)
                         show(throws)
-                log.row(figures, throws)
+                if log:
+                    log.row(figures, throws)
                 if trainer.iteration % args.checkpoint_every == 0:
                     trainer.save(folder / CHECKPOINT)
                     kept = trainer.iteration
@@ -260,6 +245,7 @@ def _loop(args: argparse.Namespace, trainer, folder: Path, last: int) -> str:
                     why = REACHED
                 elif stop.asked or (args.minutes and time.perf_counter() - start > 60 * args.minutes):
                     why = STOPPED if trainer.iteration < last else DONE
+                why = ENDS[ranks.agree(ENDS.index(why))]
             trainer.save(folder / CHECKPOINT)
     except (OSError, StorageError) as error:
         state = f"the checkpoint of iteration {kept} is whole; make room and go on with --resume" if kept else "no checkpoint yet"

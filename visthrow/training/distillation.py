@@ -24,6 +24,7 @@ from visthrow.onboard.policy import Policy, find_policy
 from visthrow.task import Experiment, contract_of
 from visthrow.training.env import ThrowEnv
 from visthrow.training.ppo.network import averaged, normalizer_state
+from visthrow.training.ranks import Ranks
 
 SCALES = (0.02, 0.05, 0.2, 0.02, 0.01, 0.005)
 """Errors that count alike: of position [m], velocity [m/s], body rates [rad/s], rotation [-], goal and payload offsets [m]."""
@@ -76,23 +77,24 @@ class Distillation:
         teacher: the state policy. network: what is fitted.
     """
 
-    def __init__(self, experiment: Experiment, device: str, seed: int, ranks: dict | None = None):
+    def __init__(self, experiment: Experiment, device: str, seed: int, ranks: Ranks):
         """Load the state policy and start the network.
 
         Args:
             experiment: the run's configuration; the environments of ``ppo`` are the throws of an iteration.
             device: "cpu" or "cuda:0".
             seed: of the environment; torch's own generators are the caller's to seed.
-            ranks: of a distributed run.
+            ranks: this process among those of the training.
 
         Raises:
-            ConfigError: A distributed run, moving goals, another layout than vision, or a teacher that is no state policy for still goals.
+            ConfigError: Moving goals, another layout than vision, or a teacher that is no state policy for still goals.
             MismatchError: The state policy acts otherwise than this task.
         """
         self.cfg, self.p = experiment, experiment.distillation
         seen = experiment.task.observation
-        if ranks or experiment.task.target.moves or seen.layout != "vision":
-            raise ConfigError('algorithm = "distillation" takes one process, goals that stand still and observation.layout = "vision"')
+        if experiment.task.target.moves or seen.layout != "vision":
+            raise ConfigError('algorithm = "distillation" takes goals that stand still and observation.layout = "vision"')
+        self._ranks = ranks
         self.teacher = Policy.load(find_policy(self.p.teacher), device)
         self.teacher.require(contract_of(experiment), ("action", "control_period", "release"))
         contract = self.teacher.contract["observation"]
@@ -102,10 +104,11 @@ class Distillation:
             raise ConfigError(f"distillation.teacher {self.p.teacher!r} has the layout {came}; expected 'state' without it")
         self.env = env = ThrowEnv(experiment, device, seed)
         self.iterations, E, T = self.p.iterations, env.num_envs, self.p.horizon
-        self.samples = E * T
+        self.samples = E * T * ranks.world
         self._age = sum(contract["latency"]) / 2.0
         kept, learnt = _passed(env.layout, self._layout)
         self.network = Network(kept, learnt, env.layout.dimension, self.p.hidden, self.p.memory).to(device)
+        ranks.share(self.network)
         widths = (3, 3, 3, 6, act.ACTIONS, 2, 3 * (1 + self._layout.history), 1)
         scales = [SCALES[0], SCALES[1], SCALES[2], SCALES[3], 1.0, SCALES[4], SCALES[5], 1.0]
         make = {"device": device, "dtype": torch.float32}
@@ -170,6 +173,7 @@ class Distillation:
                 loss = (alive * (off + self.p.action_weight * acted)).sum() / alive.sum()
                 self.optimizer.zero_grad(set_to_none=True)
                 loss.backward()
+                self._ranks.average(self.network.parameters())
                 nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
                 self.optimizer.step()
                 self.average.update_parameters(self.network)

@@ -18,13 +18,13 @@ from camera.noise import StepDraw, apply_latency, apply_noise
 from sim.arrays.torch_bridge import TorchViews, on_torch_stream
 from sim.hybrid import HybridSim, rope_variants
 from sim.params import GRAVITY
+from visthrow.config.effects import drawn_plants
 from visthrow.onboard import actions as act
 from visthrow.onboard import goal_motion
 from visthrow.onboard import observations as ob
 from visthrow.onboard.located import located
 from visthrow.task import Experiment, plant_of
 from visthrow.training import rewards, terminations
-from visthrow.training.posterior import drawn_plants
 
 RESULTS = ("episodes", "released", "landing_error", "duration")
 """Sums over finished episodes; landing error [m] and duration [s] over the released ones."""
@@ -64,7 +64,7 @@ class ThrowEnv(VecEnv):
         self.num_actions = act.ACTIONS
         self.device = device
         self.max_episode_length = round(task.bounds.time_limit / experiment.sim.control_period)
-        plants = drawn_plants(experiment, seed)
+        plants = drawn_plants(experiment.diagnosed, plant_of(experiment), experiment.sensing, seed)
         ropes = [rope for plant in plants for rope in rope_variants(plant.rope, task.start)]
         share = len(ropes) // len(plants)
         each = {name: [getattr(plant, name) for plant in plants for _ in range(share)] for name in ("vehicle", "air", "release")}

@@ -15,6 +15,7 @@ from visthrow.onboard.policy import Policy
 from visthrow.task import Experiment, contract_of
 from visthrow.training import protocol
 from visthrow.training.env import ThrowEnv
+from visthrow.training.ranks import Ranks
 
 CHECKPOINT, POLICY, SUMMARY, EVALUATION = "checkpoint.pt", "policy.npz", "summary.json", "evaluation.json"
 """Of a run's folder: the last iteration's state, the policy, the figures of a run that came to its end, and of one that did not."""
@@ -60,10 +61,10 @@ class Algorithm(Protocol):
         """Tensors and numbers that the next iteration depends on, besides torch's generators."""
 
     def load_state_dict(self, saved: dict, own_throws: bool = True) -> None:
-        """Take up a state of :meth:`state_dict`, bit for bit; without ``own_throws`` episodes start anew (a further rank)."""
+        """Take up a state of :meth:`state_dict`, bit for bit; without ``own_throws`` episodes start anew."""
 
 
-def build(experiment: Experiment, device: str, seed: int, ranks: dict | None) -> Algorithm:
+def build(experiment: Experiment, device: str, seed: int, ranks: Ranks) -> Algorithm:
     """Algorithm that the experiment names; imported only when chosen."""
     if experiment.algorithm == "first_order":
         from visthrow.training.first_order.algorithm import FirstOrder
@@ -104,22 +105,22 @@ class Trainer:
         seconds: wall time spent in rollouts and in learning since the start or the resume.
     """
 
-    def __init__(self, experiment: Experiment, device: str, seed: int, ranks: dict | None = None):
+    def __init__(self, experiment: Experiment, device: str, seed: int, ranks: Ranks | None = None):
         """Build the algorithm.
 
         Args:
             experiment: the run's configuration.
             device: "cpu" or "cuda:0".
             seed: of everything random.
-            ranks: rsl_rl's ``multi_gpu`` dictionary in a distributed run.
+            ranks: of a training in several processes.
         """
-        rank = ranks["global_rank"] if ranks else 0
-        torch.manual_seed(seed * 1000 + rank)
+        ranks = ranks or Ranks(device)
+        torch.manual_seed(seed * 1000 + ranks.rank)
         if device.startswith("cuda"):
             torch.cuda.set_device(device)  # captures and synchronisation go to the current device
             torch.backends.cuda.matmul.allow_tf32 = True
         self.experiment, self.device, self.seed, self.ranks = experiment, device, seed, ranks
-        self.algorithm = build(experiment, device, seed * 1000 + rank, ranks)
+        self.algorithm = build(experiment, device, seed * 1000 + ranks.rank, ranks)
         self.iteration = 0
         self.seconds = {"rollout": 0.0, "learning": 0.0}
 
@@ -145,27 +146,28 @@ class Trainer:
         return self.throw(target, count, seed).summary()
 
     def save(self, path: Path) -> None:
-        """Write a checkpoint that a resumed run goes on from as if it had not stopped; all or nothing."""
-        content = {
+        """Write a checkpoint that a resumed run goes on from as if it had not stopped, all processes' in one; all or nothing."""
+        own = {
             "algorithm": self.algorithm.state_dict(),
-            "iteration": self.iteration,
-            "seed": self.seed,
-            "config": config.dumps(self.experiment),
             "rng": torch.get_rng_state(),
             "cuda_rng": torch.cuda.get_rng_state(self.device) if self.device.startswith("cuda") else None,
         }
+        ranks = self.ranks.gather(own)
+        if not self.ranks.lead:
+            return
+        content = {"ranks": ranks, "iteration": self.iteration, "seed": self.seed, "config": config.dumps(self.experiment)}
         buffer = io.BytesIO()
         torch.save(content, buffer)
         atomic_write(path, buffer.getvalue())
 
     def load(self, path: Path) -> None:
-        """Take up a checkpoint. In a distributed run the further ranks start new episodes under new seeds.
+        """Take up a checkpoint, each process its own part; one that has none starts new episodes under a new seed.
 
         Raises:
             CheckpointError: a broken file, or one of another configuration or seed.
         """
         try:
-            saved = torch.load(path, map_location=self.device, weights_only=True)
+            saved = torch.load(path, map_location="cpu", weights_only=True)
         except FileNotFoundError:
             raise CheckpointError(f"{path}: no checkpoint there; expected a file that `visthrow train` wrote") from None
         except Exception as error:
@@ -175,14 +177,17 @@ class Trainer:
                 f"{path}: written by a run of another configuration or seed; resume with the same ones"
             )
         self.iteration = saved["iteration"]
-        rank = self.ranks["global_rank"] if self.ranks else 0
-        self.algorithm.load_state_dict(saved["algorithm"], own_throws=rank == 0)
-        if rank > 0:  # the checkpoint holds the first rank's episodes; with them every rank would collect the same data
+        rank, parts = self.ranks.rank, saved["ranks"]
+        known = rank < len(parts)
+        part = io.BytesIO(parts[rank if known else 0].numpy().tobytes())
+        own = torch.load(part, map_location=self.device, weights_only=True)
+        self.algorithm.load_state_dict(own["algorithm"], own_throws=known)
+        if not known:  # with another's episodes it would collect the same data
             torch.manual_seed((self.seed * 1000 + rank) * 100_003 + self.iteration)
             return
-        torch.set_rng_state(saved["rng"].cpu())
-        if saved["cuda_rng"] is not None and self.device.startswith("cuda"):
-            torch.cuda.set_rng_state(saved["cuda_rng"].cpu(), self.device)
+        torch.set_rng_state(own["rng"].cpu())
+        if own["cuda_rng"] is not None and self.device.startswith("cuda"):
+            torch.cuda.set_rng_state(own["cuda_rng"].cpu(), self.device)
 
 
 def finish(trainer: Trainer, folder: Path, figures: dict, finished: bool = True) -> Policy:

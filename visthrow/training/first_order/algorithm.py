@@ -20,6 +20,7 @@ from visthrow.training.env import ThrowEnv
 from visthrow.training.first_order.backward import Setting, build_backward
 from visthrow.training.first_order.surrogate import Flights, Plants, Surrogate, fit
 from visthrow.training.ppo.network import Network, averaged
+from visthrow.training.ranks import Ranks
 
 BARRIER = 600.0
 """Barriers cost this times the square of how far a state is within their margins."""
@@ -45,28 +46,29 @@ class FirstOrder:
         rollout: flies one batch without release.
     """
 
-    def __init__(self, experiment: Experiment, device: str, seed: int, ranks: dict | None = None):
+    def __init__(self, experiment: Experiment, device: str, seed: int, ranks: Ranks):
         """Fit the surrogate and start the network near hover.
 
         Args:
             experiment: the run's configuration; the environments of ``ppo`` are the throws of a gradient, its network the policy's.
             device: "cpu" or "cuda:0".
             seed: of the environment; torch's own generators are the caller's to seed.
-            ranks: of a distributed run.
+            ranks: this process among those of the training.
 
         Raises:
-            ConfigError: A distributed run, goals that move, a vision layout, or a horizon too short for a release.
+            ConfigError: Goals that move, a vision layout, or a horizon too short for a release.
         """
         self.cfg, self.p, p = experiment, experiment.first_order, experiment.ppo
         seen = experiment.task.observation
         if seen.layout != "state" or seen.oldest > experiment.sim.control_period:
             expected = 'observation.layout = "state" and a latency of one period at most'
             raise ConfigError(f'algorithm = "first_order" takes {expected}; "distillation" makes a vision policy of its policy')
-        if ranks or experiment.task.target.moves:
-            raise ConfigError('algorithm = "first_order" trains in one process and throws at goals that stand still; "ppo" does both')
+        if experiment.task.target.moves:
+            raise ConfigError('algorithm = "first_order" throws at goals that stand still; "ppo" at those that move too')
+        self._ranks = ranks
         self.env = env = ThrowEnv(experiment, device, seed)
         E, T, self.iterations = env.num_envs, self.p.horizon, self.p.iterations
-        self.samples = E * T
+        self.samples = E * T * ranks.world
         seen = env.get_observations()
         self.network = Network(seen, {"actor": ["actor"]}, "actor", act.ACTIONS, p.hidden, p.activation, p.normalize).to(device)
         lag = experiment.release.lag / experiment.sim.control_period
@@ -92,6 +94,7 @@ class FirstOrder:
         self._figures: dict[str, Tensor] = {}
         self._adapting = False
         self._begin()
+        ranks.share(self.network)
         self.average = averaged(self.network.mlp, AVERAGED)
         on_gpu = device.startswith("cuda")
         rate = torch.tensor(self.p.learning_rate, **make) if on_gpu else self.p.learning_rate
@@ -275,6 +278,7 @@ class FirstOrder:
         gradients = torch.autograd.grad(output, parameters, by_action.flatten(0, 1))
         for parameter, gradient in zip(parameters, gradients, strict=True):
             parameter.grad = gradient
+        self._ranks.average(parameters)
         self._figures["gradient_norm"] = torch.nn.utils.clip_grad_norm_(parameters, self.p.max_grad_norm)
         self._figures["ended"] = (self.flights.steps < self.p.horizon).float().mean()
         self.optimizer.step()

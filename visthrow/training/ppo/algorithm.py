@@ -15,12 +15,13 @@ from visthrow.task import Experiment, PPOParams
 from visthrow.training.env import ThrowEnv
 from visthrow.training.ppo.network import CapturableGaussian, Network
 from visthrow.training.ppo.update import CapturedPPO
+from visthrow.training.ranks import Ranks
 
 WARM_UP_RATE = 2e-3
 """Learning rate of a critic that learns alone; nothing that it moves is flown."""
 
 
-def rsl_rl_config(p: PPOParams, ranks: dict | None) -> dict:
+def rsl_rl_config(p: PPOParams, ranks: Ranks) -> dict:
     """Configuration dictionary of rsl_rl 5.5 for our parameters; both observation groups are named."""
     network = {
         "class_name": Network,
@@ -50,7 +51,7 @@ def rsl_rl_config(p: PPOParams, ranks: dict | None) -> dict:
         "critic": {**network, "hidden_dims": list(p.critic or p.hidden)},
         "algorithm": algorithm,
         "obs_groups": {"actor": ["actor"], "critic": ["critic"]},
-        "multi_gpu": ranks,
+        "multi_gpu": ranks.rsl_rl,
     }
 
 
@@ -61,14 +62,14 @@ class PPOTraining:
         alg: rsl_rl's algorithm object.
     """
 
-    def __init__(self, experiment: Experiment, device: str, seed: int, ranks: dict | None = None):
+    def __init__(self, experiment: Experiment, device: str, seed: int, ranks: Ranks):
         """Build environment and networks.
 
         Args:
             experiment: the run's configuration.
             device: "cpu" or "cuda:0".
             seed: of the environment; torch's own generators are the caller's to seed.
-            ranks: rsl_rl's ``multi_gpu`` dictionary in a distributed run.
+            ranks: this process among those of the training.
 
         Raises:
             ConfigError: samples that do not divide into minibatches.
@@ -78,13 +79,12 @@ class PPOTraining:
             raise ConfigError(f"ppo: {p.environments} x {p.steps} samples do not divide into {p.minibatches} minibatches")
         self.experiment, self.device = experiment, device
         self.iterations = p.iterations
-        self.samples = p.environments * p.steps * (ranks["world_size"] if ranks else 1)
+        self.samples = p.environments * p.steps * ranks.world
         self.env = ThrowEnv(experiment, device, seed)
         with contextlib.redirect_stdout(io.StringIO()):
             self.alg: CapturedPPO = PPO.construct_algorithm(self.env.get_observations(), self.env, rsl_rl_config(p, ranks), device)
         self.alg.train_mode()
-        if ranks:
-            self.alg.broadcast_parameters()
+        ranks.share(self.alg.actor, self.alg.critic)
         self._obs = self.env.get_observations()
         self._graph: torch.cuda.CUDAGraph | None = None
         self._rollouts = 0

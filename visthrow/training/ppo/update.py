@@ -98,13 +98,13 @@ class CapturedPPO(PPO):
         """All epochs over the stored samples; returns mean losses. From the second on a GPU replays a captured graph."""
         self.target_kl.fill_(self.desired_kl)
         self._order.copy_(torch.randperm(len(self._order), device=self.device))
-        if not self._cuda or self.is_multi_gpu or self._updates == 0:
+        if not self._cuda or self._updates == 0:
             self._epochs()
         else:
             if self._graph is None:
                 torch.cuda.synchronize()
                 self._graph = torch.cuda.CUDAGraph()
-                with torch.cuda.graph(self._graph):
+                with torch.cuda.graph(self._graph, capture_error_mode="thread_local"):  # NCCL's watchdog asks beside
                     self._epochs()
             self._graph.replay()
         self._updates += 1
