@@ -1,4 +1,4 @@
-"""Fit of a moving goal's velocity from what the actor measures anyway. Onboard-safe.
+"""Fit of the goal's place, and of its velocity where it moves, from what the actor measures anyway. Onboard-safe.
 
 A history of a few goal measurements cannot serve: with the paper's noise (0.01 m a step) the slope through four of them,
 20 ms apart, is known to 0.2 m/s, which is 0.15 m at the landing. So every control step yields one measured goal position in
@@ -56,6 +56,20 @@ def fit(sums: Tensor, time: Tensor, goal_xy: Tensor, weight: Tensor, fresh: Tens
     mean = first / total.clamp(min=1e-9)
     velocity = (moved - mean * place) / ((second - mean * first).clamp(min=0.0) + SPEED_SIGMA**-2)
     return sums, velocity
+
+
+def place(sums: Tensor, time: Tensor, velocity: Tensor | None = None) -> Tensor:
+    """Goal by all steps so far [m], shape (E, 2), world frame; 0 where none has seen it.
+
+    Args:
+        sums: of :func:`fit`. time: of this step [s], shape (E,).
+        velocity: of a goal that moves [m/s], shape (E, 2).
+    """
+    total = sums[:, :1].clamp(min=1e-9)
+    mean = sums[:, 3:5] / total
+    if velocity is None:
+        return mean
+    return mean + velocity * (time[:, None] - sums[:, 1:2] / total) * (sums[:, :1] > 0.0)
 
 
 def measured_goal(

@@ -1,6 +1,7 @@
 """Where keypoints lie by the camera as it is configured: what the actor may be given beside them. Onboard-safe.
 
-The estimate that a memory makes (:mod:`visthrow.onboard.estimator`) need then not learn the lens, but what is wrong with it.
+The network need then not learn the lens, but what is wrong with it. The goal is the mean of all steps of the throw, each weighted by
+what its distance leaves: noise averages out, and it is known while it is out of view.
 """
 
 import torch
@@ -11,28 +12,55 @@ from visthrow.onboard import goal_motion
 from visthrow.onboard.observations import VEHICLE, Layout
 
 
-def located(layout: Layout, frame: Tensor, valid: Tensor, camera: KeypointCamera) -> Tensor:
-    """Goal and payload in the world as one vision frame shows them.
+def goal_in_frame(layout: Layout, frame: Tensor, valid: Tensor, camera: KeypointCamera) -> tuple[Tensor, Tensor]:
+    """Goal as one vision frame shows it, and its inverse variance; as :func:`goal_motion.measured_goal`, but a wrong corner is outvoted."""
+    goals, weight = goal_motion.goal_by_corner(layout, frame, valid, camera)
+    return middle(goals, weight > 0.0), weight.sum(-1)
+
+
+def located(layout: Layout, frame: Tensor, valid: Tensor, camera: KeypointCamera, goal_xy: Tensor, known: Tensor) -> Tensor:
+    """Goal and payload in the world.
 
     Args:
         layout: of the frame.
         frame: shape (E, layout.frame), with its noise.
         valid: validity of the keypoints, shape (E, 8).
         camera: with its nominal mount.
+        goal_xy: goal by the steps so far [m], shape (E, 2), world frame. known: whether one has seen it, bool, shape (E,).
 
     Returns:
-        Goal - vehicle, horizontal [m], 2; direction from lens to payload, 3; whether the goal is seen, 1; world frame, shape (E, 6).
-        What is not seen is 0.
+        Goal - vehicle, horizontal [m], 2; direction from lens to payload, 3; whether the goal is known, 1; world frame, shape (E, 6).
+        What is not known is 0.
     """
-    goals, weight = goal_motion.goal_by_corner(layout, frame, valid, camera)
     box, bits = frame[:, VEHICLE + layout.goal :].unflatten(1, (-1, 2)), valid[:, GOAL_KEYPOINTS:]
-    goal_xy, centre = middle(goals, weight > 0.0), middle(box, bits)
+    centre = middle(box, bits)
     ray_c, _ = camera.fisheye.unproject(camera.fisheye.denormalize(centre))
     x_axis, y_axis = frame[:, 9:12], frame[:, 12:15]
     rot_wb = torch.stack([x_axis, y_axis, torch.linalg.cross(x_axis, y_axis)], dim=-1)
     ray_w = (ray_c[:, None] @ camera.rot_cb @ rot_wb.transpose(1, 2))[:, 0]
-    seen, hangs = (weight > 0.0).any(-1, keepdim=True), bits.any(-1, keepdim=True)
-    return torch.cat([(goal_xy - frame[:, :2]) * seen, ray_w * hangs, seen.to(frame.dtype)], dim=-1)
+    hangs = bits.any(-1, keepdim=True)
+    return torch.cat([(goal_xy - frame[:, :2]) * known[:, None], ray_w * hangs, known[:, None].to(frame.dtype)], dim=-1)
+
+
+def fitted_goal(
+    layout: Layout, frame: Tensor, valid: Tensor | None, camera: KeypointCamera | None, sums: Tensor, time: Tensor, fresh: Tensor
+) -> tuple[Tensor, Tensor | None, Tensor | None]:
+    """Take one frame into the goal's fit.
+
+    Args:
+        layout, frame, valid, camera: see :func:`goal_motion.measured_goal`.
+        sums, time, fresh: see :func:`goal_motion.fit`.
+
+    Returns:
+        The new sums; the goal's velocity [m/s], shape (E, 2), where the layout has it; where the keypoints lie, shape (E, 6), likewise.
+    """
+    measured = goal_in_frame if layout.located else goal_motion.measured_goal
+    sums, velocity = goal_motion.fit(sums, time, *measured(layout, frame, valid, camera), fresh)
+    moves = velocity if layout.motion else None
+    if not layout.located:
+        return sums, moves, None
+    goal_xy = goal_motion.place(sums, time, moves)
+    return sums, moves, located(layout, frame, valid, camera, goal_xy, sums[:, 0] > 0.0)
 
 
 def middle(points: Tensor, valid: Tensor) -> Tensor:

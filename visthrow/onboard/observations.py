@@ -48,6 +48,11 @@ class Layout:
     located: int = 0  # width of where the keypoints lie
 
     @property
+    def fits(self) -> bool:
+        """Whether the goal is fitted over the steps of a throw (:mod:`visthrow.onboard.goal_motion`)."""
+        return bool(self.motion or self.located)
+
+    @property
     def frame(self) -> int:
         """Width of a frame without the validity bits: what noise is added to."""
         return VEHICLE + self.goal + self.payload

@@ -21,7 +21,7 @@ from visthrow.common.errors import PolicyError
 from visthrow.onboard import actions as act
 from visthrow.onboard import goal_motion
 from visthrow.onboard import observations as ob
-from visthrow.onboard.located import located
+from visthrow.onboard.located import fitted_goal
 from visthrow.onboard.policy import Policy
 from visthrow.onboard.traced import Traced
 
@@ -170,7 +170,7 @@ class Pilot:
         observation, *rest = self._seen(views, given)
         if now is not None and self._bridged(now, rest[0][:, 0]):
             observation, *rest = self._seen(views, given)
-        self._history, self._goal_fit, *seen = rest if self.layout.motion else (rest[0], self._goal_fit, *rest[1:])
+        self._history, self._goal_fit, *seen = rest if self.layout.fits else (rest[0], self._goal_fit, *rest[1:])
         decided = time.perf_counter()
         action, command, release, self._memory = self._decide(observation, self._memory)
         self._unasked = self._previous[:, 4]
@@ -187,7 +187,7 @@ class Pilot:
     def _seen(self, views: Tensor, given: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
         """What `_observed` makes of a step's measurements and all that was before; ``given``: keypoints of a detector."""
         carried: tuple[Tensor, ...] = (self._previous, self._history, self._fresh)
-        if self.layout.motion:
+        if self.layout.fits:
             carried += (self._goal_fit, torch.full((self.count,), self._steps * self.period))
         observed: tuple[Tensor, ...] = (self._observe_given if given else self._observe)(views, *carried, *given)
         return observed
@@ -232,15 +232,15 @@ class Pilot:
 
         Args:
             views: shape (E, 20). previous, history, fresh: see `visthrow.onboard.observations.observe`.
-            further: sums of the goal's fit and time [s], where the layout has its velocity; then keypoints and validity that
+            further: sums of the goal's fit and time [s], where the layout fits it; then keypoints and validity that
                 a detector saw, else what the camera sees of goal and payload is computed, where there is one.
 
         Returns:
             Observation, new history, new sums of the goal's fit, keypoints and validity; the latter where there are any.
         """
         pos, quat, vel, rate, payload, goal, attached = views.split(list(VIEWS.values()), -1)
-        rot, moving = ob.rotation_from_quat(quat), 2 if self.layout.motion else 0
-        seen = further[moving:]
+        rot, fitted = ob.rotation_from_quat(quat), 2 if self.layout.fits else 0
+        seen = further[fitted:]
         if not seen and self.camera is not None:
             seen = ob.vision_part(self.camera, pos, rot, goal, payload)
         points, valid = (seen[0], seen[1]) if seen else (None, None)
@@ -249,14 +249,10 @@ class Pilot:
             part = points.flatten(1)
         frame = torch.cat([ob.vehicle_part(pos, vel, rate, rot), part], dim=-1)
         sums: tuple[Tensor, ...] = ()
-        velocity = None
-        if moving:
-            place, weight = goal_motion.measured_goal(self.layout, frame, valid, self.camera)
-            fitted, velocity = goal_motion.fit(further[0], further[1], place, weight, fresh)
-            sums = (fitted,)
-        places = None
-        if self.layout.located and valid is not None and self.camera is not None:
-            places = located(self.layout, frame, valid, self.camera)
+        velocity = places = None
+        if fitted:
+            new, velocity, places = fitted_goal(self.layout, frame, valid, self.camera, further[0], further[1], fresh)
+            sums = (new,)
         observation, history = ob.observe(self.layout, frame, valid, previous, attached[:, 0], history, fresh, velocity, places)
         return observation, history, *sums, *seen
 

@@ -22,7 +22,7 @@ from visthrow.config.effects import drawn_plants
 from visthrow.onboard import actions as act
 from visthrow.onboard import goal_motion
 from visthrow.onboard import observations as ob
-from visthrow.onboard.located import located
+from visthrow.onboard.located import fitted_goal
 from visthrow.task import Experiment, plant_of
 from visthrow.training import rewards, terminations
 
@@ -114,7 +114,7 @@ class ThrowEnv(VecEnv):
         }
         if task.target.moves:
             memory["goal_vel"] = torch.zeros(E, 3, **make)
-        if self.layout.motion:
+        if self.layout.fits:
             memory["goal_fit"] = goal_motion.empty_sums(E, device)
         return memory
 
@@ -344,12 +344,10 @@ class ThrowEnv(VecEnv):
             points, valid = self._see(pose[:, :3], rot_wb, late_goal, pose[:, ob.VEHICLE :], fresh)
             measured = torch.cat([measured[:, : ob.VEHICLE], points.flatten(1)], dim=-1)
         time = self.episode_length_buf.to(torch.float32) * self.cfg.sim.control_period
-        goal_vel = None
-        if self.layout.motion:
-            place, weight = goal_motion.measured_goal(self.layout, measured, valid, self.camera)
-            sums, goal_vel = goal_motion.fit(memory["goal_fit"], time, place, weight, fresh)
+        goal_vel = places = None
+        if self.layout.fits:
+            sums, goal_vel, places = fitted_goal(self.layout, measured, valid, self.camera, memory["goal_fit"], time, fresh)
             memory["goal_fit"].copy_(sums)
-        places = located(self.layout, measured, valid, self.camera) if self.layout.located and valid is not None else None
         actor, history = ob.observe(
             self.layout, measured, valid, memory["previous"], attached, memory["history"], fresh, goal_vel, places
         )

@@ -1,4 +1,4 @@
-"""Where keypoints lie: the truth without noise, one wrong point outvoted, nothing where nothing is seen."""
+"""Where keypoints lie: the truth without noise, one wrong point outvoted, nothing where nothing is seen, the goal kept in mind."""
 
 import dataclasses
 
@@ -7,8 +7,9 @@ import torch
 from camera.keypoints import KeypointCamera
 from camera.mount import rotation_from_vector
 from visthrow import config
+from visthrow.onboard import goal_motion
 from visthrow.onboard import observations as ob
-from visthrow.onboard.located import located, middle
+from visthrow.onboard.located import fitted_goal, middle
 from visthrow.task import Experiment
 
 EXACT = 2e-3
@@ -30,10 +31,44 @@ def scene():
     return layout, camera, frame, valid, (goal - pos)[:, :2], ray / ray.norm(dim=-1, keepdim=True)
 
 
+def places(layout, frame, valid, camera):
+    """Of a throw's first frame."""
+    begin = torch.zeros(len(frame)), torch.ones(len(frame), dtype=torch.bool)
+    return fitted_goal(layout, frame, valid, camera, goal_motion.empty_sums(len(frame)), *begin)[2]
+
+
+def test_the_goal_is_the_mean_of_a_throw_and_stays_known_out_of_view():
+    layout, camera, frame, valid, offset, _ = scene()
+    sums, fresh = goal_motion.empty_sums(8), torch.ones(8, dtype=torch.bool)
+    off = []
+    for k in range(40):
+        noisy = frame + 0.01 * torch.randn_like(frame)
+        sums, _, found = fitted_goal(layout, noisy, valid, camera, sums, torch.full((8,), 0.02 * k), fresh)
+        off.append((found[:, :2] + noisy[:, :2] - frame[:, :2] - offset).norm(dim=-1))
+        fresh = torch.zeros_like(fresh)
+    assert torch.stack(off[-5:]).mean() < 0.4 * torch.stack(off[:1]).mean()
+    _, _, blind = fitted_goal(layout, frame, torch.zeros_like(valid), camera, sums, torch.full((8,), 0.8), fresh)
+    torch.testing.assert_close(blind[:, :2] + frame[:, :2], found[:, :2] + noisy[:, :2], rtol=0, atol=1e-5)
+    assert (blind[:, 5] == 1.0).all()
+
+
+def test_a_goal_that_moves_is_where_it_is_now():
+    layout, camera, frame, valid, offset, _ = scene()
+    layout = dataclasses.replace(layout, motion=2)
+    sums, fresh, speed = goal_motion.empty_sums(8), torch.ones(8, dtype=torch.bool), torch.tensor([0.5, -0.3])
+    for k in range(60):  # the vehicle moves with the goal: what it sees stays as it is
+        moved = frame.clone()
+        moved[:, :2] += speed * 0.02 * k
+        sums, velocity, found = fitted_goal(layout, moved, valid, camera, sums, torch.full((8,), 0.02 * k), fresh)
+        fresh = torch.zeros_like(fresh)
+    torch.testing.assert_close(velocity, speed.expand(8, 2), rtol=0, atol=0.02)
+    torch.testing.assert_close(found[:, :2], offset, rtol=0, atol=0.02)
+
+
 def test_without_noise_it_is_the_truth():
     layout, camera, frame, valid, offset, ray = scene()
     assert valid.all()
-    found = located(layout, frame, valid, camera)
+    found = places(layout, frame, valid, camera)
     torch.testing.assert_close(found[:, :2], offset, rtol=0, atol=EXACT)
     torch.testing.assert_close(found[:, 2:5], ray, rtol=0, atol=EXACT)
     assert (found[:, 5] == 1.0).all()
@@ -43,7 +78,7 @@ def test_one_wrong_point_of_each_is_outvoted():
     layout, camera, frame, valid, offset, ray = scene()
     for wrong in (15, 16, 25, 26):  # of the first corner, of the box's second side
         frame[:, wrong] = 0.4
-    found = located(layout, frame, valid, camera)
+    found = places(layout, frame, valid, camera)
     assert (found[:, :2] - offset).abs().max() < 0.05  # the square's corners disagree by the middle's neighbours
     assert (found[:, 2:5] - ray).norm(dim=-1).max() < 0.1  # half of the ball's angle
 
@@ -53,7 +88,7 @@ def test_what_is_not_seen_is_nought():
     valid = valid.clone()
     valid[:4, :4] = False
     valid[4:, 4:] = False
-    found = located(layout, frame, valid, camera)
+    found = places(layout, frame, valid, camera)
     assert found[:4, [0, 1, 5]].abs().max() == 0.0
     assert found[4:, 2:5].abs().max() == 0.0
     assert (found[4:, 5] == 1.0).all()
