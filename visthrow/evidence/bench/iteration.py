@@ -131,16 +131,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--until", type=float, nargs="+", metavar="ERROR", help="train until throws at 2.0 m land so near on average [m], and time that")
     add("--seeds", type=int, nargs="+", default=[1, 2, 3, 4, 5], metavar="N", help="of the trainings (default: 1 to 5)")
     add("--minutes", type=float, default=30.0, metavar="T", help="that a training may take (default: 30)")
+    add("--evaluate-every", type=int, metavar="N", help="iterations between throws (default: a twentieth of the time)")
     records.add_arguments_of_measurements(parser, 5)
     add_common(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Measure a training iteration."""
-    wrong = args.iterations < 1 or args.repeats < 1 or args.minutes <= 0.0 or any(error <= 0.0 for error in args.until or ())
-    if wrong:
+    numbers = (args.iterations, args.repeats, args.minutes, args.evaluate_every or 1, *(args.until or ()))
+    if min(numbers) <= 0:
         raise VisthrowError(
-            f"--iterations {args.iterations}, --repeats {args.repeats}, --minutes {args.minutes}, --until {args.until}: "
+            f"--iterations {args.iterations}, --repeats {args.repeats}, --minutes {args.minutes}, --until {args.until}, "
+            f"--evaluate-every {args.evaluate_every}: "
             "expected positive numbers"
         )
     from visthrow.task import Experiment
@@ -152,7 +154,7 @@ def run(args: argparse.Namespace) -> int:
     if args.until:
         from visthrow.evidence.bench import time_to_error
 
-        return records.finish(time_to_error.measure(experiments, name, args.until, args.seeds, args.minutes), args)
+        return records.finish(time_to_error.measure(experiments, name, args.until, args.seeds, args.minutes, args.evaluate_every), args)
     if len(experiments) > 1:
         raise VisthrowError(f"{' '.join(experiments)}: an iteration is measured of one configuration; several with --until")
     (stem, experiment), *_ = experiments.items()
