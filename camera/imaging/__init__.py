@@ -1,1 +1,1 @@
-"""Images of the fisheye camera: rendering, rectified views, overlays."""
+"""Images of the fisheye camera: rectified views, overlays."""

@@ -7,12 +7,13 @@ the gamma. Rows of the arrays are described in `camera.scenes.scene.Scenes`. The
 
 import warp as wp
 
+from camera.scenes import textures
+
 LENS_STEPS = wp.constant(12)
 """Newton's steps to the angle of a pixel; the lens is monotonic."""
 
-MIPS = wp.constant(7)
-SIZE = wp.constant(512)
-"""Textures: side of the finest level [px], and the number of levels, each half as large."""
+MIPS = wp.constant(textures.MIPS)
+SIZE = wp.constant(textures.SIZE)
 
 
 @wp.func

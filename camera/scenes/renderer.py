@@ -22,7 +22,7 @@ class Renderer:
 
         Args:
             lens: size of the pictures. device: "cpu" or "cuda:0".
-            files: photographs; left out, those of the training.
+            files: photographs; left out, those of the training; without any, scenes are plain.
             samples: rays a pixel.
 
         Raises:
@@ -32,8 +32,9 @@ class Renderer:
 
         if samples < 1:
             raise ValueError(f"renderer: samples {samples}; expected 1 or more")
+        wp.config.log_level = wp.LOG_WARNING
         self.lens, self.device, self.samples = lens, device, samples
-        pixels = pyramid(files or photographs())
+        pixels = pyramid(photographs() if files is None else files)
         self.textures = len(pixels)
         self._pixels = wp.array(pixels, dtype=wp.uint8, device=device)
 

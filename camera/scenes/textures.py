@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 SIZE, MIPS = 512, 7
-"""Side of the finest level [px], and the number of levels; as the kernel has them."""
+"""Side of the finest level [px], and the number of levels, each half as large."""
 
 TRAINING = ("brick", "gravel", "coffee", "motorcycle_left", "rocket", "color", "coins")
 HELD_OUT = ("grass", "chelsea", "motorcycle_right", "astronaut", "moon")
@@ -61,4 +61,4 @@ def pyramid(files: list[Path]) -> np.ndarray:
             level = cv2.resize(level, (level.shape[1] // 2, level.shape[0] // 2), interpolation=cv2.INTER_AREA)
             levels.append(level)
         rows.append(np.concatenate([np.ascontiguousarray(one).reshape(-1) for one in levels]))
-    return np.stack(rows)
+    return np.stack(rows) if rows else np.zeros((0, 1), np.uint8)

@@ -1,8 +1,6 @@
 """Effects that the reference plant can show and the training simulator lacks; every one is off by default."""
 
-import tomllib
 from dataclasses import dataclass, fields
-from pathlib import Path
 
 Vector = tuple[float, float, float]
 
@@ -53,19 +51,3 @@ class ReferenceExtras:
             value = getattr(self, item.name)
             if item.name not in signed and min(value if isinstance(value, tuple) else (value,)) < 0.0:
                 raise ValueError(f"extras: {item.name} is {value}, expected 0 or more")
-
-
-def load_extras(path: str | Path) -> ReferenceExtras:
-    """Read extras from a TOML file; every key must be a field, every field must be given.
-
-    Raises:
-        ValueError: unknown or missing key; the message names file and key.
-    """
-    with open(path, "rb") as file:
-        raw = tomllib.load(file)
-    known = {f.name for f in fields(ReferenceExtras)}
-    if raw.keys() != known:
-        raise ValueError(
-            f"{path}: unknown keys {sorted(raw.keys() - known)}, missing keys {sorted(known - raw.keys())}"
-        )
-    return ReferenceExtras(**{key: tuple(value) if isinstance(value, list) else value for key, value in raw.items()})

@@ -14,12 +14,12 @@ import numpy as np
 import torch
 
 from camera.detectors.contours import Detector, Known, Seen, detected_keypoints
-from camera.imaging.render import Clutter, render_scene
 from camera.keypoints import GOAL_KEYPOINTS, KeypointCamera, keypoints
 from camera.mount import rotation_from_vector
 from camera.params import CameraParams
 from tests.bench import start
 from tests.bench.nuisance import NuisanceParams, degrade
+from tests.drawn import Clutter, render_scene
 from visthrow import config
 from visthrow.common.arguments import add_common
 from visthrow.common.errors import VisthrowError

@@ -264,12 +264,12 @@ class ReferenceAdapter:
             seed: of everything random.
             realistic: with the extras of ``configs/vehicle/reference_realistic.toml``.
         """
-        from sim.reference.extras import ReferenceExtras, load_extras
+        from sim.reference.extras import ReferenceExtras
         from sim.reference.plant import ReferencePlant
 
         known = {"payload_drag": experiment.rope.payload_drag}
         trained = ReferenceExtras(mocap_latency=float(np.mean(experiment.task.observation.latency)), **known)
-        extras = load_extras(config.find("vehicle", "reference_realistic")) if realistic else trained
+        extras = config.load(ReferenceExtras, config.find("vehicle", "reference_realistic")) if realistic else trained
         self.name = "reference-realistic" if realistic else "reference"
         self.params, self.count = plant_of(experiment), count
         self.period = self.params.sim.control_period

@@ -12,10 +12,10 @@ from camera.calibrate import files as files
 from camera.calibrate.boards import BoardParams, calibrate_from_boards
 from camera.calibrate.foreign import fit_fisheye
 from camera.fisheye import Fisheye
-from camera.imaging.render import pixel_rays
 from camera.mount import rotate, rotation_from_vector
 from camera.params import FisheyeParams
 from tests import lens_files
+from tests.drawn import pixel_rays
 
 DATA = Path(__file__).parents[2] / "data" / "basalt_calib"
 LENS = FisheyeParams(640, 480, 160.1, 150.2, 310.3, 245.4, 0.02, -0.01, 0.002, -0.0002, 200.0)

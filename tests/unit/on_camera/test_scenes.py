@@ -9,12 +9,12 @@ import pytest
 import torch
 
 from camera.fisheye import Fisheye
-from camera.imaging.render import render_scene
 from camera.mount import nominal_rot_cb, rotation_from_vector
 from camera.params import CameraParams, FisheyeParams, KeypointNoiseParams, MountParams
 from camera.scenes.renderer import Renderer
 from camera.scenes.scene import Nuisances, posed_scenes, random_scenes, truth_of
 from camera.scenes.textures import photographs, pyramid
+from tests.drawn import render_scene
 
 pytest.importorskip("skimage", reason="photographs of visthrow[detector]")
 

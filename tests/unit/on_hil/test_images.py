@@ -11,7 +11,6 @@ import pytest
 import torch
 
 from camera.fisheye import Fisheye
-from camera.imaging.render import render_scene
 from camera.keypoints import KeypointCamera, keypoints
 from camera.mount import rotation_from_vector
 from camera.params import FisheyeParams
@@ -20,6 +19,7 @@ from hil.params import HilParams
 from hil.poses.sight import Sight, Sights
 from hil.recording.record import lines
 from hil.sources.images import STAMPS, Hint, ImageParams, LiveImages, Looker, RecordedImages
+from tests.drawn import render_scene
 from visthrow import config
 from visthrow.cli import main
 from visthrow.common.errors import ConfigError

@@ -10,10 +10,10 @@ import torch
 from camera.calibrate.boards import BoardParams
 from camera.calibrate.formats import format_of, read
 from camera.fisheye import Fisheye
-from camera.imaging.render import pixel_rays
 from camera.mount import rotation_from_vector
 from camera.params import CameraParams, FisheyeParams
 from tests import lens_files
+from tests.drawn import pixel_rays
 from visthrow import config
 from visthrow.cli import main
 from visthrow.onboard.policy import Policy

@@ -11,7 +11,6 @@ from camera.calibrate.boards import find_board, reprojected
 from camera.fisheye import Fisheye
 from camera.imaging.overlay import draw_overlay
 from camera.imaging.rectify import ViewParams, rectify
-from camera.imaging.render import render_scene
 from camera.keypoints import KeypointCamera, keypoints
 from camera.params import CameraParams
 from visthrow import config
@@ -20,6 +19,8 @@ from visthrow.common.storage import atomic_write
 from visthrow.view.camera.calibration import PICTURES, board_of, pictures_of, sentence
 
 BLUE, YELLOW = (230, 120, 40), (60, 210, 240)
+SAMPLES = 16
+"""Rays a pixel of a rendered frame."""
 
 
 def show(args: argparse.Namespace) -> int:
@@ -29,9 +30,7 @@ def show(args: argparse.Namespace) -> int:
     pos_w, rot_wb = torch.tensor([0.0, 0.0, args.height]), torch.eye(3)
     ball_w, goal_w = pos_w - torch.tensor([0.0, 0.0, args.hangs]), torch.tensor([*args.target, 0.0])
     if args.picture is None:
-        eye_w, rot_wc = pos_w + rot_wb @ camera.position_b, rot_wb @ camera.rot_cb.T
-        scene = render_scene(lens, eye_w, rot_wc, goal_w, ball_w, params.payload_radius, params.goal_side)
-        image = np.ascontiguousarray((scene * 255.0).round().to(torch.uint8).numpy()[..., ::-1])
+        image = _rendered(params, pos_w, rot_wb, ball_w, goal_w)
     else:
         image = pictures_of([args.picture])[1][0]
     points, valid = keypoints(camera, pos_w[None], rot_wb[None], goal_w[None], ball_w[None])
@@ -51,6 +50,17 @@ def show(args: argparse.Namespace) -> int:
     print(f"in view: {sum(seen[:4])} of 4 keypoints of the goal, {sum(seen[4:])} of 4 of the payload")
     print("\n".join(map(str, pictures)))
     return 0
+
+
+def _rendered(
+    params: CameraParams, pos_w: torch.Tensor, rot_wb: torch.Tensor, ball_w: torch.Tensor, goal_w: torch.Tensor
+) -> np.ndarray:
+    """Frame of a grey hall with ball and goal square, BGR, uint8."""
+    from camera.scenes.renderer import Renderer
+    from camera.scenes.scene import posed_scenes
+
+    scenes = posed_scenes(params, pos_w[None], rot_wb[None], ball_w[None], goal_w[None], torch.tensor([True]))
+    return np.ascontiguousarray(Renderer(params.fisheye, files=[], samples=SAMPLES).render(scenes)[0].numpy()[..., ::-1])
 
 
 def _draw_board(drawn: np.ndarray, image: np.ndarray, lens: Fisheye, args: argparse.Namespace) -> None:

@@ -1,7 +1,6 @@
-"""A small renderer of synthetic fisheye frames: one ray a pixel, through our own unprojection.
+"""A small renderer of fisheye frames in torch, written before `camera.scenes` and without it: one ray a pixel, no noise.
 
-For pictures, for tests, and to train a detector on later: ground plane z = 0 with a chequered texture, goal square,
-ball.
+Ground plane z = 0 with a chequered texture, goal square, ball.
 """
 
 import math
