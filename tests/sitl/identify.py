@@ -47,6 +47,8 @@ STALL = 3
 """Periods without a motor output that count as a stall of the firmware."""
 
 NAMES = ("delay", "gyro", "voltage", "p", "i", "d", "p_yaw", "i_yaw")
+REST = ("integral_x", "integral_y", "integral_z")
+"""What the firmware's integrals held when the recording began, over their gains [rad]."""
 
 
 def fly(folder: Path, seconds: float, seed: int = 0) -> dict[str, np.ndarray]:
@@ -83,9 +85,9 @@ def fly(folder: Path, seconds: float, seed: int = 0) -> dict[str, np.ndarray]:
                 now = plant.look()
                 pos = plant.state["pos_w"]
                 answered = desk.fake.answered
-                battery = (now["voltage"], now["charge_used"])
+                inside = (now["voltage"], now["charge_used"], *now["motor_speed"])
                 moving = (plant.time, *now["rate_b"], *now["quat_wb"], *now["vel_w"], *pos)
-                rows.append((*moving, *command, answered, *battery, *np.ravel(plant.rope())))
+                rows.append((*moving, *command, answered, *inside, *np.ravel(plant.rope())))
                 desk.fake.step()
     finally:
         desk.close()
@@ -121,21 +123,42 @@ class Windows:
         # Where the firmware was not scheduled for a while its outputs stand still: such a doublet says nothing of its controller.
         stood = np.array([np.diff(rows[at - round(BEFORE / PERIOD) : at + count, 18][::STALL]).min() == 0 for at in first])
         self.starts, self.stalled, first = flight["starts"][: len(first)][~stood], int(stood.sum()), first[~stood]
+        self.flight, self.first = rows, first
         self.rows = np.stack([rows[at : at + count] for at in first])  # (E, T, fields)
         lead = round(0.1 / PERIOD)
         self.earlier = np.stack([rows[at - lead : at, 14:18] for at in first])  # commands before a window, for the queue
         plant = plant_of(load_policy(policy).experiment)
         self.plant = dataclasses.replace(plant, sim=dataclasses.replace(plant.sim, control_period=PERIOD))
 
-    def rates(self, vehicle: VehicleParams, chosen: np.ndarray) -> np.ndarray:
-        """Rates by the simulator under the same commands [rad/s], shape (E, T, 3)."""
+    def controller(self, vehicle: VehicleParams, rest: np.ndarray) -> dict[str, np.ndarray]:
+        """Integral, smoothed set-point and gyro of the block at each period of the whole flight, by what it was asked and flew."""
+        c, rows = vehicle.controller, self.flight
+        late = np.searchsorted(rows[:, 0], rows[:, 0] - vehicle.queue.delay + 1e-6) - 1
+        asked, rate = rows[np.maximum(late, 0), 15:18], rows[:, 1:4]
+
+        def smoothed(values: np.ndarray, time_constant: float) -> np.ndarray:
+            share = 1.0 - np.exp(-PERIOD / time_constant)
+            return lfilter([share], [1.0, share - 1.0], values, axis=0, zi=(1.0 - share) * values[:1])[0]
+
+        setpoint, gyro = smoothed(asked, c.setpoint_time_constant), smoothed(rate, c.gyro_time_constant)
+        if c.kind != "motor_mixing":
+            return {"setpoint": setpoint, "gyro": gyro, "integral": np.zeros_like(rate)}
+        error = asked - gyro
+        error[:, :2] *= np.maximum(1.0 - np.abs(asked - setpoint)[:, :2] / c.relax_threshold, 0.0)
+        return {"setpoint": setpoint, "gyro": gyro, "integral": c.i_gain * (rest + PERIOD * np.cumsum(error, axis=0))}
+
+    def rates(self, vehicle: VehicleParams, chosen: np.ndarray, rest: np.ndarray) -> np.ndarray:
+        """Rates by the simulator under the same commands [rad/s], shape (E, T, 3); rest: see `REST`."""
         rows = self.rows[chosen]
         sim = HybridSim(dataclasses.replace(self.plant, vehicle=vehicle), len(rows))
         start = rows[:, 0]
-        cable_dir, cable_vel = np.moveaxis(start[:, 21:].reshape(len(start), 2, -1, 3), 1, 0)
+        cable_dir, cable_vel = np.moveaxis(start[:, 25:].reshape(len(start), 2, -1, 3), 1, 0)
         sim.place(start[:, 11:14], start[:, 4:8], start[:, 8:11], start[:, 1:4], cable_dir, cable_vel)
         sim.state.voltage.assign(start[:, 19].astype(np.float32))
         sim.state.charge_used.assign(start[:, 20].astype(np.float32))
+        sim.state.motor_speed.assign(start[:, 21:25].astype(np.float32))
+        for name, value in self.controller(vehicle, rest).items():
+            getattr(sim.state, name).assign(value[self.first[chosen] - 1].astype(np.float32))
         depth = sim.state.queue.shape[0]
         newest_first = self.earlier[chosen][:, ::-1][:, np.minimum(np.arange(depth), self.earlier.shape[1] - 1)]
         sim.state.queue.assign(np.swapaxes(newest_first, 0, 1).astype(np.float32))
@@ -146,23 +169,24 @@ class Windows:
             sim.step()
         return out
 
-    def miss(self, vehicle: VehicleParams, chosen: np.ndarray) -> float:
+    def miss(self, vehicle: VehicleParams, chosen: np.ndarray, rest: np.ndarray) -> float:
         """Rms of the difference over the rms of the firmware's rates."""
         flown = self.rows[chosen][:, :, 1:4]
-        return float(np.sqrt(((self.rates(vehicle, chosen) - flown) ** 2).mean() / (flown**2).mean()))
+        return float(np.sqrt(((self.rates(vehicle, chosen, rest) - flown) ** 2).mean() / (flown**2).mean()))
 
 
 def fit(windows: Windows, chosen: np.ndarray) -> np.ndarray:
     """Numbers of :func:`changed` that fit the chosen windows best."""
     vehicle = windows.plant.vehicle
-    start = np.array([0.004, 0.002, 16.5, *np.ones(5)])
-    low = np.array([0.0, 5e-4, 14.0, *np.full(5, -3.0)])
-    high = np.array([0.06, 0.03, 18.0, *np.full(5, 5.0)])
+    start = np.array([0.004, 0.002, 16.5, *np.ones(5), *np.zeros(3)])
+    low = np.array([0.0, 5e-4, 14.0, *np.full(5, -3.0), *np.full(3, -5.0)])
+    high = np.array([0.06, 0.03, 18.0, *np.full(8, 5.0)])
+    scale = [5e-3, 2e-3, 0.3, *np.full(5, 0.5), *np.full(3, 0.1)]
 
     def off(theta: np.ndarray) -> np.ndarray:
-        return (windows.rates(changed(vehicle, theta), chosen) - windows.rows[chosen][:, :, 1:4]).ravel()
+        return (windows.rates(changed(vehicle, theta[:8]), chosen, theta[8:]) - windows.rows[chosen][:, :, 1:4]).ravel()
 
-    found = least_squares(off, start, bounds=(low, high), x_scale=[5e-3, 2e-3, 0.3, *np.full(5, 0.5)], diff_step=1e-2, max_nfev=25)
+    found = least_squares(off, start, bounds=(low, high), x_scale=scale, diff_step=1e-2, max_nfev=25)
     return found.x
 
 

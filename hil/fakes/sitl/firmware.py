@@ -24,14 +24,11 @@ from hil.fakes.sitl.packets import StillSensors, stood
 PORTS = (5761, 5762)
 """TCP ports of the first two serial ports: the first is the runner's, the second the bridge's."""
 
-START, ANSWER, REBOOT = 20.0, 20.0, 10.0
-"""Time for a start, for an answer of the command line and for the end after ``save`` [s]."""
+START, ANSWER, END = 20.0, 20.0, 10.0
+"""Time for a start, for an answer of the command line and for the process's end [s]."""
 
 FREED = 90.0
 """After which a port that the last firmware left is free again [s]: TIME_WAIT is 60 s."""
-
-SETTLED = 0.5
-"""From listening to ready for samples [s]: one that comes before its sensors are begun stops the firmware for ever."""
 
 GAINS = {
     "p_roll": 5, "i_roll": 2, "d_roll": 5, "d_max_roll": 5,
@@ -122,43 +119,36 @@ class Firmware:
         self._process: subprocess.Popen | None = None
         self.stands: int | None = None
 
-    def start(self, lockstep: bool = True) -> None:
-        """Start it and wait until it listens.
-
-        Args:
-            lockstep: whether its clock goes by the stamps of its samples; else by the wall's.
+    def start(self) -> None:
+        """Start it, its clock by the stamps of its samples, and wait until it is ready for them: one that came before its sensors are
+        begun would stop it for ever.
 
         Raises:
             RunError: it ends, does not listen in time, or another one is already there; no compiler for ``lockstep.c``.
         """
         end = time.monotonic() + FREED
-        while "failed" in (words := self._started(lockstep)):  # a connection of the last one may still be in TIME_WAIT
+        while "failed" in (words := self._started()):  # a connection of the last one may still be in TIME_WAIT
             self.stop()
             if time.monotonic() > end:
                 raise RunError(f"the firmware cannot listen: {words!r}")
             time.sleep(1.0)
-        if self.stands is None:
-            time.sleep(SETTLED)
-        elif not stood(self.stands, START):
+        if not stood(self.stands, START):
             self.stop()
             raise RunError(f"the firmware does not come to stand {START:g} s after its start; its words: {words!r}")
 
-    def _started(self, lockstep: bool) -> str:
+    def _started(self) -> str:
         """Start the process; its words once it listens, or cannot."""
         if _listens(PORTS[0]):
             raise RunError(f"something listens on port {PORTS[0]} already; expected no other firmware beside this one")
-        said, environment = -1, dict(os.environ)
-        if lockstep:
-            self.stands, said = os.pipe()
-            environment |= {"LD_PRELOAD": str(compiled(self.folder)), "VISTHROW_STANDS": str(said)}
+        self.stands, said = os.pipe()
+        environment = {**os.environ, "LD_PRELOAD": str(compiled(self.folder)), "VISTHROW_STANDS": str(said)}
         told = self.folder / "firmware.txt"  # its errors; of what it prints, most are the words of its memory
         with open(told, "wb") as errors:
             self._process = subprocess.Popen(
                 [self.program], cwd=self.folder, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=errors,
-                preexec_fn=_end_with_parent, env=environment, pass_fds=[said] if lockstep else [],
+                preexec_fn=_end_with_parent, env=environment, pass_fds=[said],
             )  # fmt: skip
-        if lockstep:
-            os.close(said)
+        os.close(said)
         end = time.monotonic() + START
         while f"bind port {PORTS[0]} for UART1" not in (words := told.read_text(errors="replace")):
             if not self.runs or time.monotonic() > end:
@@ -173,19 +163,23 @@ class Firmware:
         return self._process is not None and self._process.poll() is None
 
     def stop(self) -> None:
-        """End it: politely, then for good."""
+        """End it."""
+        self._end()
+        if self.stands is not None:
+            os.close(self.stands)
+            self.stands = None
+
+    def _end(self) -> None:
+        """End the process, politely, then for good; whoever feeds it hears of it by its pipe."""
         if self._process is None:
             return
         self._process.terminate()
         try:
-            self._process.wait(REBOOT)
+            self._process.wait(END)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
         self._process = None
-        if self.stands is not None:
-            os.close(self.stands)
-            self.stands = None
 
     def set_up(self, settings: dict[str, str]) -> dict[str, str]:
         """Write settings, start anew, and read them back; it is not running afterwards.
@@ -206,14 +200,15 @@ class Firmware:
         return kept
 
     def _written(self, settings: dict[str, str]) -> dict[str, str]:
-        self.start(lockstep=False)
-        with StillSensors(), CommandLine() as line:
+        self.start()
+        with StillSensors(self.stands), CommandLine() as line:
             for name, value in settings.items():
                 line.ask(line_of(name, value))
             line.save()
-        self._process.wait(REBOOT)
-        self.start(lockstep=False)
-        with StillSensors(), CommandLine() as line:
+            self._end()
+        self.stop()
+        self.start()
+        with StillSensors(self.stands), CommandLine() as line:
             return {name: line.read(name) for name in settings}
 
 
@@ -253,10 +248,10 @@ class CommandLine:
     def __exit__(self, *_: object) -> None:
         self._socket.close()
 
-    def _heard(self) -> str:
-        """What is said up to the next prompt."""
+    def _heard(self, last: bytes = PROMPT) -> str:
+        """What is said up to the next prompt, or to other last words."""
         data, end = b"", time.monotonic() + ANSWER
-        while not data.endswith(PROMPT):
+        while not data.endswith(last):
             self._socket.settimeout(max(end - time.monotonic(), 1e-3))
             try:
                 chunk = self._socket.recv(65536)
@@ -290,20 +285,13 @@ class CommandLine:
         return ""
 
     def save(self) -> None:
-        """Keep the settings; the firmware ends, where a board would restart.
+        """Keep the settings: they are in its file when it says that it restarts.
 
         Raises:
             RunError: it does not.
         """
         self._socket.sendall(b"save\n")
-        self._socket.settimeout(REBOOT)
-        try:
-            while self._socket.recv(65536):
-                pass
-        except ConnectionError:
-            pass
-        except TimeoutError:
-            raise RunError(f"the firmware does not end {REBOOT:g} s after `save`") from None
+        self._heard(b"Rebooting")
 
 
 def _listens(port: int) -> bool:

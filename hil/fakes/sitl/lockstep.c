@@ -5,7 +5,12 @@ START_NS, and from then on at the stamp of each packet of samples, the main thre
 it says so on a pipe (VISTHROW_STANDS), and waits for the next packet. What has come on the ports meanwhile is taken in before it goes
 on. So a flight is the same on any machine, as slow or as fast as it is.
 
-Source: betaflight 4.6, src/platform/SIMULATOR/sitl.c (micros64, updateState, udpThread, tcpThread), lib/main/dyad. */
+The firmware opens its ports in the main thread while the ports' thread begins to serve them. Where that thread is late, it takes a port
+that is half open for a closed one and frees it: peers connect and are never heard. So the main thread binds nothing before that thread
+waits for its first turn.
+
+Source: betaflight 4.6, src/platform/SIMULATOR/sitl.c (micros64, updateState, udpThread, tcpThread), lib/main/dyad
+(dyad_newStream, destroyClosedStreams). */
 
 #define _GNU_SOURCE
 #include <pthread.h>
@@ -70,6 +75,13 @@ int nanosleep(const struct timespec *want, struct timespec *left) {
     int64_t ns = __atomic_add_fetch(&now_ns, want->tv_sec * 1000000000LL + want->tv_nsec, __ATOMIC_SEQ_CST);
     if (ns >= __atomic_load_n(&limit_ns, __ATOMIC_SEQ_CST)) stand();
     return 0;
+}
+
+int bind(int fd, const struct sockaddr *address, socklen_t length) {
+    pthread_mutex_lock(&lock);
+    while (is_main() && !waits) pthread_cond_wait(&moved, &lock);
+    pthread_mutex_unlock(&lock);
+    return syscall(SYS_bind, fd, address, length);
 }
 
 ssize_t recvfrom(int fd, void *data, size_t size, int flags, struct sockaddr *from, socklen_t *length) {

@@ -110,15 +110,21 @@ class Sensors:
 class StillSensors:
     """A vehicle at rest, while nothing flies yet: the firmware calibrates its gyro and answers only with samples."""
 
+    def __init__(self, stands: int | None) -> None:
+        """See `Sensors`."""
+        self._done, self._sensors = threading.Event(), Sensors(stands)
+
     def __enter__(self) -> "StillSensors":
-        self._done, self._sensors = threading.Event(), Sensors()
         self._thread = threading.Thread(target=self._feed, daemon=True)
         self._thread.start()
         return self
 
     def _feed(self) -> None:
-        while not self._done.wait(STILL):
-            self._sensors.rest(0.0)
+        try:
+            while not self._done.wait(STILL / 10.0):
+                self._sensors.rest(STILL)
+        except RunError:  # the firmware has ended, as it does where it is told to keep its settings
+            pass
 
     def __exit__(self, *_: object) -> None:
         self._done.set()

@@ -59,7 +59,8 @@ STUB = r"""
 #include <string.h>
 #include <sys/select.h>
 #include <time.h>
-static int state;
+#include <unistd.h>
+static int state, serves;
 static void *samples(void *unused) {
     for (;;) {
         double data[18]; fd_set set; struct timeval most = {0, 100000};
@@ -68,20 +69,24 @@ static void *samples(void *unused) {
     }
 }
 static void *ports(void *unused) {
+    usleep(50000); serves = 1;
     for (;;) { struct timeval most = {0, 9999}; select(0, NULL, NULL, NULL, &most); }
 }
 int main(int argc, char **argv) {
     struct sockaddr_in at = {.sin_family = AF_INET}; pthread_t a, b; long turns = 0;
     int port; sscanf(argv[1], "%d", &port); at.sin_port = htons(port); at.sin_addr.s_addr = htonl(INADDR_LOOPBACK);
+    pthread_create(&b, NULL, ports, NULL);
     state = socket(AF_INET, SOCK_DGRAM, 0); bind(state, (struct sockaddr *)&at, sizeof at);
-    pthread_create(&a, NULL, samples, NULL); pthread_create(&b, NULL, ports, NULL);
+    if (!serves) return 1;
+    pthread_create(&a, NULL, samples, NULL);
     for (;;) {
         struct timespec now, nap = {0, 50000}; clock_gettime(CLOCK_MONOTONIC, &now); nanosleep(&nap, NULL);
         printf("%ld %ld.%09ld\n", ++turns, now.tv_sec, now.tv_nsec); fflush(stdout);
     }
 }
 """
-"""A program with the firmware's threads: one for samples, one for ports, and a loop that sleeps for 50 us and tells its clock."""
+"""A program with the firmware's threads: one for samples, one for ports, and a loop that sleeps for 50 us and tells its clock. It opens
+a port only once the thread of ports serves."""
 
 
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="no C compiler")
