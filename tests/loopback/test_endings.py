@@ -19,6 +19,9 @@ NEVER = simple_policy((hover_action(9.81 * 0.272, 14.0)[0], 0.0, 0.0, 0.0, -1.0)
 STATES = {"armed": ("states.armed_least=9.0",), "throw": ()}
 """In hover, and in a throw that the policy never ends."""
 
+OVER = 2.4
+"""The time of a run that is over in flight [s]."""
+
 LANDS = {"ardupilot": "mode 9", "px4": "mode 4.6"}
 """What is asked for; Betaflight has no landing of its own: the runner flies a descent."""
 
@@ -26,9 +29,8 @@ LANDS = {"ardupilot": "mode 9", "px4": "mode 4.6"}
 class Told:
     """The terminal's signals, the loop's parts that raise, the end of the time: done a few ticks into a state."""
 
-    def __init__(self, way: str, state: str, kind: str, monkeypatch):
-        overrides = (*QUICK, *STATES[state], *(() if kind == "betaflight" else (f"{kind}.take=true",)))
-        self.runner, source, self.clock, self.fake = peers(LevelPlant(), kind=kind, loaded=NEVER, overrides=overrides)
+    def __init__(self, way: str, state: str, parts, monkeypatch):
+        self.runner, source, self.clock, self.fake = parts
         self.way, self.state, self.done_at, self.ticks = way, state, None, 0
         monkeypatch.setattr("sys.stdin", None)
         self.saved = {number: signal.getsignal(number) for number in ENDING}
@@ -50,7 +52,7 @@ class Told:
 
         self.runner.tick, source.poll = ticked, polled
         try:
-            most = 2.4 if way == "time over" else float("inf")
+            most = OVER if way == "time over" else float("inf")
             self.summary = fly(self.runner, source, self.clock, operator, None, most, self.tell)
         finally:
             for number, handler in self.saved.items():
@@ -73,6 +75,12 @@ class Told:
         return [(round(at - self.done_at, 2), text) for at, text in self.fake.events if at >= self.done_at - 1e-6]
 
 
+def with_fake(kind: str, state: str):
+    """Runner, source, clock and fake."""
+    overrides = (*QUICK, *STATES[state], *(() if kind == "betaflight" else (f"{kind}.take=true",)))
+    return peers(LevelPlant(), kind=kind, loaded=NEVER, overrides=overrides)
+
+
 REASONS = {
     "SIGINT": "the operator said abort (Ctrl-C)", "SIGTERM": "the process was told to end (SIGTERM)",
     "SIGHUP": "the process was told to end (SIGHUP)", "SIGQUIT": "the process was told to end (SIGQUIT)",
@@ -84,7 +92,7 @@ REASONS = {
 @pytest.mark.parametrize("state", STATES)
 @pytest.mark.parametrize("way", REASONS)
 def test_it_ends_by_landing(way, state, kind, monkeypatch):
-    run = Told(way, state, kind, monkeypatch)
+    run = Told(way, state, with_fake(kind, state), monkeypatch)
     assert (run.summary["aborted"], run.summary["reason"], run.summary["state"]) == (True, REASONS[way], "done")
     assert (run.fake.witness.breaches, run.fake.witness.releases) == ([], 0)
     if kind == "betaflight":
@@ -111,7 +119,7 @@ def test_a_second_ctrl_c_ends_it_at_once_and_it_lands_all_the_same(kind, monkeyp
         return found
 
     monkeypatch.setattr(Terminal, "words", words)
-    run = Told("SIGINT", "throw", kind, monkeypatch)
+    run = Told("SIGINT", "throw", with_fake(kind, "throw"), monkeypatch)
     assert run.summary["aborted"]
     assert run.summary["ticks"] > 5
     assert run.runner.errors == []
@@ -123,7 +131,7 @@ def test_a_second_ctrl_c_ends_it_at_once_and_it_lands_all_the_same(kind, monkeyp
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_output_that_raises_ends_a_throw_by_landing(kind, monkeypatch):
-    run = Told("output raises", "throw", kind, monkeypatch)
+    run = Told("output raises", "throw", with_fake(kind, "throw"), monkeypatch)
     assert (run.summary["aborted"], run.summary["reason"]) == (True, "BrokenPipeError: nobody reads")
     if kind != "betaflight":
         assert LANDS[kind] in [text for _, text in run.fake.events]

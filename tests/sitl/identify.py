@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 from scipy.optimize import least_squares
+from scipy.signal import lfilter
 
 from hil.fakes.sitl import Firmware, needed
 from hil.fakes.sitl.firmware import GAINS
@@ -175,8 +176,8 @@ class Windows:
         return float(np.sqrt(((self.rates(vehicle, chosen, rest) - flown) ** 2).mean() / (flown**2).mean()))
 
 
-def fit(windows: Windows, chosen: np.ndarray) -> np.ndarray:
-    """Numbers of :func:`changed` that fit the chosen windows best."""
+def fit(windows: Windows, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Numbers of :func:`changed`, and `REST`, that fit the chosen windows best."""
     vehicle = windows.plant.vehicle
     start = np.array([0.004, 0.002, 16.5, *np.ones(5), *np.zeros(3)])
     low = np.array([0.0, 5e-4, 14.0, *np.full(5, -3.0), *np.full(3, -5.0)])
@@ -187,7 +188,7 @@ def fit(windows: Windows, chosen: np.ndarray) -> np.ndarray:
         return (windows.rates(changed(vehicle, theta[:8]), chosen, theta[8:]) - windows.rows[chosen][:, :, 1:4]).ravel()
 
     found = least_squares(off, start, bounds=(low, high), x_scale=scale, diff_step=1e-2, max_nfev=25)
-    return found.x
+    return found.x[:8], found.x[8:]
 
 
 def make_fitted(policy: str, seed: int) -> WirePlant:
@@ -212,12 +213,12 @@ def main() -> None:
     every = np.arange(len(windows.rows))
     seen, held_out = every[every % 3 != 2], every[every % 3 == 2]
     shipped = windows.plant.vehicle
-    theta = fit(windows, seen)
+    theta, rest = fit(windows, seen)
     fitted = changed(shipped, theta)
     (args.out / "vehicle.toml").write_text(config.dumps(fitted))
     figures = {
-        "doublets": len(every), "stalled": windows.stalled, "shipped": windows.miss(shipped, held_out),
-        "fitted": windows.miss(fitted, held_out), "seen": windows.miss(fitted, seen),
+        "doublets": len(every), "stalled": windows.stalled, "shipped": windows.miss(shipped, held_out, rest),
+        "fitted": windows.miss(fitted, held_out, rest), "seen": windows.miss(fitted, seen, rest),
         **{name: float(v if k < 3 else np.exp(v - 1.0)) for k, (name, v) in enumerate(zip(NAMES, theta))},
     }  # fmt: skip
     (args.out / "fit.json").write_text(json.dumps(figures, indent=2) + "\n")

@@ -6,7 +6,8 @@ The same seed gives the same throw on any machine that is not out of memory, as 
 
 import select
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from hil.params import HilParams
 from hil.recording.flightlogs import read, throws
 from hil.recording.record import Recorder
 from hil.recording.report import throw_path
+from hil.sources import Source
 from hil.sources.opening import open_source
 from visthrow.onboard.policy import Policy
 
@@ -74,6 +76,33 @@ def set_up(program: str | Path, folder: Path, params: HilParams) -> Path:
     return settings / "eeprom.bin"
 
 
+@contextmanager
+def opened(
+    program: str | Path, folder: Path, params: HilParams, policy: Policy, plant: MotorPlant, mocap: MocapParams, seed: int
+) -> Iterator[tuple[Runner, Source, FlightClock, BetaflightSitl]]:  # fmt: skip
+    """Runner, its source and clock, and the bridge, joined to a firmware that stands ready; all ended afterwards. See `throw`."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    shutil.copy(set_up(program, folder.parent, params), folder)
+    firmware, fake, parts = Firmware(program, folder), None, []
+    try:
+        firmware.start()
+        port = check_device(params.source.device or params.link.device).port
+        link = Link(open_port(Device("udpout", "127.0.0.1", port)), *VEHICLE_ID)
+        fake = BetaflightSitl(plant, link, mocap, seed, Options(), params.betaflight, firmware.stands)
+        clock = FlightClock(fake)
+        source, link, _ = open_source(params, folder / "run", clock)
+        backend = make_backend(params, link, folder=folder / "run")
+        parts = [source, backend]
+        fake.sensors.start()
+        yield Runner(params, policy, backend, mechanism_lag(params)), source, clock, fake
+    finally:
+        for part in [*parts, fake]:
+            if part is not None:
+                part.close()
+        firmware.stop()
+
+
 def throw(
     program: str | Path, folder: Path, params: HilParams, policy: Policy, plant: MotorPlant, mocap: MocapParams, seed: int
 ) -> dict[str, Any]:  # fmt: skip
@@ -91,32 +120,13 @@ def throw(
     Raises:
         RunError: the firmware does not run.
     """
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(parents=True)
-    shutil.copy(set_up(program, folder.parent, params), folder)
-    firmware, fake, parts = Firmware(program, folder), None, []
-    try:
-        firmware.start()
-        port = check_device(params.source.device or params.link.device).port
-        link = Link(open_port(Device("udpout", "127.0.0.1", port)), *VEHICLE_ID)
-        fake = BetaflightSitl(plant, link, mocap, seed, Options(), params.betaflight, firmware.stands)
-        clock = FlightClock(fake)
-        source, link, _ = open_source(params, folder / "run", clock)
-        backend = make_backend(params, link, folder=folder / "run")
-        parts = [source, backend]
-        fake.sensors.start()
-        runner = Runner(params, policy, backend, mechanism_lag(params))
+    with opened(program, folder, params, policy, plant, mocap, seed) as (runner, source, clock, fake):
         recorder = Recorder(folder / "run", params)
         summary = _flown(Loop(runner, source, clock, AutoOperator(), recorder), fake)
         recorder.close(summary)
         for number, log in enumerate(throws(read(folder / "run")), start=1):
             log.save(throw_path(folder / "run", number, ".npz"))
         return {**fake.report(), "run": summary}
-    finally:
-        for part in [*parts, fake]:
-            if part is not None:
-                part.close()
-        firmware.stop()
 
 
 def _flown(loop: Loop, fake: BetaflightSitl) -> dict[str, Any]:
