@@ -75,6 +75,15 @@ def build_step(
         return total < vec3_limit
 
     @wp.func
+    def load_rope(
+        state: State, env: int, n: wp.array(dtype=vec3), u: wp.array(dtype=vec3), stiffness: wp.array(dtype=real),
+    ):  # fmt: skip
+        for i in range(L):
+            n[i] = state.cable_dir_w[i, env]
+            u[i] = state.cable_vel_w[i, env]
+            stiffness[i] = state.stiffness[i, env]
+
+    @wp.func
     def rope_in_rotor(p: Vehicle, rope: Rope, s: QuadState, n: wp.array(dtype=vec3)):
         """Whether a joint of the rope stands within a propeller disc, one centimetre thick."""
         hit = bool(False)
@@ -91,18 +100,9 @@ def build_step(
 
     @wp.func
     def separate(
-        p: Vehicle,
-        rope: Rope,
-        r: Release,
-        air: Air,
-        s: QuadState,
-        n: wp.array(dtype=vec3),
-        u: wp.array(dtype=vec3),
-        gravity: real,
-        out: Output,
-        env: int,
-        elapsed: real,
-    ):
+        p: Vehicle, rope: Rope, r: Release, air: Air, s: QuadState, n: wp.array(dtype=vec3), u: wp.array(dtype=vec3),
+        gravity: real, out: Output, env: int, elapsed: real,
+    ):  # fmt: skip
         """Write what follows from the payload's state at separation."""
         mount = s.pos_w + wp.quat_rotate(s.quat_wb, rope.mount)
         mount_vel = coupled.mount_velocity(rope, s)
@@ -149,10 +149,7 @@ def build_step(
         n = wp.zeros(shape=(L,), dtype=vec3)
         u = wp.zeros(shape=(L,), dtype=vec3)
         stiffness = wp.zeros(shape=(L,), dtype=real)
-        for i in range(L):
-            n[i] = state.cable_dir_w[i, env]
-            u[i] = state.cable_vel_w[i, env]
-            stiffness[i] = state.stiffness[i, env]
+        load_rope(state, env, n, u, stiffness)
         rope = chain.stretched(natural, natural, stiffness, u, real(0.0))
         s = load(state, env)
 
@@ -215,9 +212,7 @@ def build_step(
         else:
             status = status | nonfinite
             s = load(state, env)
-            for i in range(L):
-                n[i] = state.cable_dir_w[i, env]
-                u[i] = state.cable_vel_w[i, env]
+            load_rope(state, env, n, u, stiffness)
         if attached != 0:
             mount = s.pos_w + wp.quat_rotate(s.quat_wb, rope.mount)
             pos, vel = chain.payload(rope, mount, coupled.mount_velocity(rope, s), n, u)
@@ -245,10 +240,7 @@ def build_step(
         n = wp.zeros(shape=(L,), dtype=vec3)
         u = wp.zeros(shape=(L,), dtype=vec3)
         stiffness = wp.zeros(shape=(L,), dtype=real)
-        for i in range(L):
-            n[i] = state.cable_dir_w[i, env]
-            u[i] = state.cable_vel_w[i, env]
-            stiffness[i] = state.stiffness[i, env]
+        load_rope(state, env, n, u, stiffness)
         rope = chain.stretched(natural, natural, stiffness, u, real(0.0))
         if state.attached[env] != 0:
             mount = s.pos_w + wp.quat_rotate(s.quat_wb, rope.mount)
@@ -276,10 +268,7 @@ def build_step(
         n = wp.zeros(shape=(L,), dtype=vec3)
         u = wp.zeros(shape=(L,), dtype=vec3)
         stiffness = wp.zeros(shape=(L,), dtype=real)
-        for i in range(L):
-            n[i] = state.cable_dir_w[i, env]
-            u[i] = state.cable_vel_w[i, env]
-            stiffness[i] = state.stiffness[i, env]
+        load_rope(state, env, n, u, stiffness)
         rope = chain.stretched(natural, natural, stiffness, u, real(0.0))
         r = releases[env % releases.shape[0]]
         separate(p, rope, r, airs[env % airs.shape[0]], load(state, env), n, u, gravity, out, env, real(0.0))

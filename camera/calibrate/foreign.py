@@ -25,17 +25,14 @@ class FitReport:
     points: int  # rays compared
 
 
+Unprojection = Callable[[dict[str, float], np.ndarray], tuple[np.ndarray, np.ndarray]]
+"""Of intrinsics (fx, fy, cx, cy [px], the model's own [-]) and pixels [px], shape (N, 2): unit rays, shape (N, 3), and validity, (N,)."""
+
+
 def unproject_ds(values: dict[str, float], pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rays of the double-sphere model.
+    """Rays of the double-sphere model, as `Unprojection` says.
 
     Source: Usenko, Demmel, Cremers, "The Double Sphere Camera Model", 3DV 2018, eqs. 46 to 52.
-
-    Args:
-        values: fx, fy, cx, cy [px], xi, alpha [-].
-        pixels: Pixels [px], shape (N, 2).
-
-    Returns:
-        Unit rays, shape (N, 3), and validity, shape (N,).
     """
     xi, alpha = values["xi"], values["alpha"]
     m, radius2 = _plane(values, pixels)
@@ -49,16 +46,9 @@ def unproject_ds(values: dict[str, float], pixels: np.ndarray) -> tuple[np.ndarr
 
 
 def unproject_eucm(values: dict[str, float], pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rays of the extended unified camera model.
+    """Rays of the extended unified camera model, as `Unprojection` says.
 
     Source: Khomutenko, Garcia, Martinet, "An Enhanced Unified Camera Model", RA-L 1(1), 2016, eqs. 5 and 8.
-
-    Args:
-        values: fx, fy, cx, cy [px], alpha, beta [-].
-        pixels: Pixels [px], shape (N, 2).
-
-    Returns:
-        Unit rays, shape (N, 3), and validity, shape (N,).
     """
     alpha, beta = values["alpha"], values["beta"]
     m, radius2 = _plane(values, pixels)
@@ -68,7 +58,7 @@ def unproject_eucm(values: dict[str, float], pixels: np.ndarray) -> tuple[np.nda
     return rays / np.linalg.norm(rays, axis=1, keepdims=True), discriminant >= 0.0
 
 
-FOREIGN_MODELS: dict[str, tuple[tuple[str, ...], Callable]] = {
+FOREIGN_MODELS: dict[str, tuple[tuple[str, ...], Unprojection]] = {
     "ds": (("fx", "fy", "cx", "cy", "xi", "alpha"), unproject_ds),
     "eucm": (("fx", "fy", "cx", "cy", "alpha", "beta"), unproject_eucm),
 }

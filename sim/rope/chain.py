@@ -152,21 +152,10 @@ def build_chain(t: Types, segments: int, extensions: frozenset[str] = frozenset(
     def build_up(direction, rate, terms):
         @wp.func
         def up(
-            rope: Rope,
-            n: wp.array(dtype=vec3),
-            u: wp.array(dtype=vec3),
-            n2: wp.array(dtype=vec3),
-            k1: wp.array(dtype=vec3),
-            stiffness: wp.array(dtype=real),
-            root_rate_w: vec3,
-            gravity: vec3,
-            load: vec3,
-            gamma: real,
-            h: real,
-            c1: wp.array(dtype=vec3),
-            c2: wp.array(dtype=vec3),
-            hs: wp.array(dtype=vec2),
-        ):
+            rope: Rope, n: wp.array(dtype=vec3), u: wp.array(dtype=vec3), n2: wp.array(dtype=vec3),
+            k1: wp.array(dtype=vec3), stiffness: wp.array(dtype=real), root_rate_w: vec3, gravity: vec3, load: vec3,
+            gamma: real, h: real, c1: wp.array(dtype=vec3), c2: wp.array(dtype=vec3), hs: wp.array(dtype=vec2),
+        ):  # fmt: skip
             l = rope.segment_length
             l2 = l * l
             gh = gamma * h
@@ -247,18 +236,10 @@ def build_chain(t: Types, segments: int, extensions: frozenset[str] = frozenset(
 
     @wp.func
     def down_first(
-        rope: Rope,
-        n: wp.array(dtype=vec3),
-        u: wp.array(dtype=vec3),
-        mount_acc_w: vec3,
-        gamma: real,
-        h: real,
-        c1: wp.array(dtype=vec3),
-        c2: wp.array(dtype=vec3),
-        hs: wp.array(dtype=vec2),
-        n2: wp.array(dtype=vec3),
+        rope: Rope, n: wp.array(dtype=vec3), u: wp.array(dtype=vec3), mount_acc_w: vec3, gamma: real, h: real,
+        c1: wp.array(dtype=vec3), c2: wp.array(dtype=vec3), hs: wp.array(dtype=vec2), n2: wp.array(dtype=vec3),
         k1: wp.array(dtype=vec3),
-    ):
+    ):  # fmt: skip
         """Fill k1 and n2; return the largest squared rate [1/s^2] of the state and the predicted state."""
         a = mount_acc_w
         fastest = real(0.0)
@@ -275,22 +256,11 @@ def build_chain(t: Types, segments: int, extensions: frozenset[str] = frozenset(
 
     @wp.func
     def down_second(
-        rope: Rope,
-        n: wp.array(dtype=vec3),
-        u: wp.array(dtype=vec3),
-        stiffness: wp.array(dtype=real),
-        mount_acc_w: vec3,
-        mount_force_w: vec3,
-        gravity: vec3,
-        load: vec3,
-        gamma: real,
-        h: real,
-        c1: wp.array(dtype=vec3),
-        c2: wp.array(dtype=vec3),
-        hs: wp.array(dtype=vec2),
-        n2: wp.array(dtype=vec3),
+        rope: Rope, n: wp.array(dtype=vec3), u: wp.array(dtype=vec3), stiffness: wp.array(dtype=real),
+        mount_acc_w: vec3, mount_force_w: vec3, gravity: vec3, load: vec3, gamma: real, h: real,
+        c1: wp.array(dtype=vec3), c2: wp.array(dtype=vec3), hs: wp.array(dtype=vec2), n2: wp.array(dtype=vec3),
         k1: wp.array(dtype=vec3),
-    ):
+    ):  # fmt: skip
         """Advance n, u, stiffness; ``mount_force_w`` is the vehicle's force on the chain. Return the new momentum."""
         a = mount_acc_w
         pull = mount_force_w

@@ -129,20 +129,9 @@ def build_coupled_step(
 
     @wp.func
     def step(
-        p: Vehicle,
-        rope: Rope,
-        air: Air,
-        s: QuadState,
-        total: vec3,
-        command: vec4,
-        n: wp.array(dtype=vec3),
-        u: wp.array(dtype=vec3),
-        stiffness: wp.array(dtype=real),
-        gravity: vec3,
-        gamma: real,
-        max_turn: real,
-        h: real,
-    ):
+        p: Vehicle, rope: Rope, air: Air, s: QuadState, total: vec3, command: vec4, n: wp.array(dtype=vec3),
+        u: wp.array(dtype=vec3), stiffness: wp.array(dtype=real), gravity: vec3, gamma: real, max_turn: real, h: real,
+    ):  # fmt: skip
         k1 = wp.zeros(shape=(L,), dtype=vec3)
         n2 = wp.zeros(shape=(L,), dtype=vec3)
         c1 = wp.zeros(shape=(L,), dtype=vec3)

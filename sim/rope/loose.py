@@ -24,18 +24,9 @@ def build_loose_step(t: Types, chain, payload):
 
     @wp.func
     def step(
-        rope: Rope,
-        air: Air,
-        pos_w: vec3,
-        vel_w: vec3,
-        n: wp.array(dtype=vec3),
-        u: wp.array(dtype=vec3),
-        stiffness: wp.array(dtype=real),
-        gravity: vec3,
-        gamma: real,
-        max_turn: real,
-        h: real,
-    ):
+        rope: Rope, air: Air, pos_w: vec3, vel_w: vec3, n: wp.array(dtype=vec3), u: wp.array(dtype=vec3),
+        stiffness: wp.array(dtype=real), gravity: vec3, gamma: real, max_turn: real, h: real,
+    ):  # fmt: skip
         k1 = wp.zeros(shape=(L,), dtype=vec3)
         n2 = wp.zeros(shape=(L,), dtype=vec3)
         c1 = wp.zeros(shape=(L,), dtype=vec3)
