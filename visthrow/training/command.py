@@ -74,13 +74,15 @@ def run(args: argparse.Namespace) -> int:
         told = {"seed": seed, "processes": ranks.world} | ({"from": _origin(args.start, policy)} if policy is not None else {})
         provenance.write_run_folder(folder, config.dumps(experiment), resume=args.resume, **told)
     why = _loop(args, trainer, folder, last)
-    ranks.leave()
     if ranks.lead:
         _report(args, trainer, folder, time.perf_counter() - start, finished=why != STOPPED)
+    iteration = trainer.iteration
+    del trainer  # its captured graphs hold the processes' communicator
+    ranks.leave()
     if why != STOPPED:
         return 0
     words = ["visthrow train --resume", f"--out {folder}", *([f"--iterations {args.iterations}"] if args.iterations else [])]
-    print(f"\n{why} after iteration {trainer.iteration} of {last}; go on with: {' '.join(words)}", file=sys.stderr)
+    print(f"\n{why} after iteration {iteration} of {last}; go on with: {' '.join(words)}", file=sys.stderr)
     return EXIT_INTERRUPTED
 
 

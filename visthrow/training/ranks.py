@@ -1,5 +1,6 @@
 """The processes of one training, a GPU or a share of the cores each: what they agree on and what they share."""
 
+import gc
 import io
 import os
 from collections.abc import Iterable
@@ -78,6 +79,7 @@ class Ranks:
         return [torch.frombuffer(bytearray(content), dtype=torch.uint8) for content in saved] if self.lead else []
 
     def leave(self) -> None:
-        """Part from the others."""
+        """Part from the others. No CUDA graph with collectives may be left: NCCL would wait for it for ever."""
         if self.world > 1:
+            gc.collect()
             distributed.destroy_process_group()
