@@ -13,6 +13,9 @@ from sim.params import ControllerParams, VehicleParams
 P_SCALE, I_SCALE, D_SCALE, F_SCALE, MIXER_SCALE = 0.032029, 0.244381, 0.000529, 0.013754, 1000.0
 """Output of a gain of 1 for an error of 1 deg/s, 1 deg, 1 deg/s^2, feedforward of 1 deg/s^2; output that is all of a motor's command."""
 
+YAW_I = 2.5
+"""Times the setting, about yaw (pid_init.c, pidInitConfig)."""
+
 DEGREE = math.degrees(1.0)
 
 NOT_SAID = {
@@ -73,7 +76,8 @@ def controller_of(vehicle: VehicleParams, settings: Mapping[str, str], mix_thrus
     torques = [arm * thrust / MIXER_SCALE * DEGREE for arm in arms]  # for an output of 1 a degree [N m]
     axes = [numbers(settings, f"{axis}PID") for axis in ("roll", "pitch", "yaw")]
     forward = numbers(settings, "ff_weight")
-    limit = numbers(settings, "pidsum_limit")[0] * numbers(settings, "iterm_windup")[0] * 0.01
+    most = [numbers(settings, name, settings["pidsum_limit"])[0] for name in ("pidsum_limit", "pidsum_limit", "pidsum_limit_yaw")]
+    windup = 0.01 * numbers(settings, "iterm_windup")[0] / DEGREE
 
     def gains(scale: float, values: list[float]) -> tuple[float, float, float]:
         x, y, z = (scale * value * torque for value, torque in zip(values, torques, strict=True))
@@ -81,9 +85,10 @@ def controller_of(vehicle: VehicleParams, settings: Mapping[str, str], mix_thrus
 
     named = ("gyro_lpf1_static_hz", "gyro_lpf2_static_hz", "dterm_lpf1_static_hz", "dterm_lpf2_static_hz")
     cutoffs = [numbers(settings, name)[0] for name in named]
-    x, y, z = (limit / DEGREE * torque for torque in torques)
+    x, y, z = (windup * limit * torque for limit, torque in zip(most, torques, strict=True))
     return dataclasses.replace(
-        c, kind="motor_mixing", p_gain=gains(P_SCALE, [a[0] for a in axes]), i_gain=gains(I_SCALE, [a[1] for a in axes]),
+        c, kind="motor_mixing", p_gain=gains(P_SCALE, [a[0] for a in axes]),
+        i_gain=gains(I_SCALE, [times * a[1] for times, a in zip((1.0, 1.0, YAW_I), axes)]),
         d_gain=gains(D_SCALE, [a[2] for a in axes]), feedforward_gain=gains(F_SCALE, forward), integral_limit=(x, y, z),
         setpoint_time_constant=1.0 / (2.0 * math.pi * numbers(settings, "iterm_relax_cutoff")[0]),
         gyro_time_constant=sum(1.0 / (2.0 * math.pi * hz) for hz in cutoffs if hz > 0.0),

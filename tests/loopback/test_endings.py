@@ -31,7 +31,7 @@ class Told:
 
     def __init__(self, way: str, state: str, parts, monkeypatch):
         self.runner, source, self.clock, self.fake = parts
-        self.way, self.state, self.done_at, self.ticks = way, state, None, 0
+        self.way, self.state, self.done_at, self.ticks, self.heights = way, state, None, 0, {}
         monkeypatch.setattr("sys.stdin", None)
         self.saved = {number: signal.getsignal(number) for number in ENDING}
         operator = Terminal(True, lambda: True, lambda text: None)
@@ -59,15 +59,13 @@ class Told:
                 signal.signal(number, handler)
 
     def tell(self, decision):
+        self.heights.setdefault(decision.state, self.fake.plant.state["pos_w"][2])
         if self.way == "output raises" and decision.state == self.state:
             raise BrokenPipeError("nobody reads")
 
     def act(self):
         if self.way.startswith("SIG"):
             os.kill(os.getpid(), getattr(signal, self.way))
-        if self.way == "Ctrl-C twice":
-            os.kill(os.getpid(), signal.SIGINT)
-            self.way = "SIGINT again"
 
     @property
     def after(self):
@@ -106,10 +104,8 @@ def test_it_ends_by_landing(way, state, kind, monkeypatch):
             assert next(at for at, text in run.after if text == LANDS[kind]) <= 0.06
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_second_ctrl_c_ends_it_at_once_and_it_lands_all_the_same(kind, monkeypatch):
-    """The landing was asked for by the first one; the summary is there."""
-    run = None
+def twice(monkeypatch):
+    """A second Ctrl-C as soon as the first one has taken effect."""
     original = Terminal.words
 
     def words(terminal, state):
@@ -119,6 +115,12 @@ def test_a_second_ctrl_c_ends_it_at_once_and_it_lands_all_the_same(kind, monkeyp
         return found
 
     monkeypatch.setattr(Terminal, "words", words)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_second_ctrl_c_ends_it_at_once_and_it_lands_all_the_same(kind, monkeypatch):
+    """The landing was asked for by the first one; the summary is there."""
+    twice(monkeypatch)
     run = Told("SIGINT", "throw", with_fake(kind, "throw"), monkeypatch)
     assert run.summary["aborted"]
     assert run.summary["ticks"] > 5

@@ -19,10 +19,12 @@ from scipy.signal import lfilter
 from hil.fakes.sitl import Firmware, needed
 from hil.fakes.sitl.firmware import GAINS
 from hil.params import HilParams
+from sim.effects.firmware import calibrated_voltage, controller_of
 from sim.hybrid import HybridSim
-from sim.params import VehicleParams
+from sim.params import GRAVITY, VehicleParams
 from tests.sitl import test_betaflight as bench
 from visthrow import config
+from visthrow.logs.readers.blackbox.decoder import read_blackbox
 from visthrow.onboard.hover import HoverController, HoverParams
 from visthrow.task import plant_of
 from visthrow.throws.loading import load_policy
@@ -212,12 +214,18 @@ def main() -> None:
     windows = Windows(flight, args.policy)
     every = np.arange(len(windows.rows))
     seen, held_out = every[every % 3 != 2], every[every % 3 == 2]
-    shipped = windows.plant.vehicle
+    shipped, configured = windows.plant.vehicle, config.load(VehicleParams, config.find("vehicle", "betaflight_sitl"))
     theta, rest = fit(windows, seen)
     fitted = changed(shipped, theta)
+    settings = read_blackbox(next((args.out / "run").glob("LOG*")))[0].header
+    hover = config.load(HilParams, config.find("hil", "betaflight_sitl")).betaflight.thrust.hover
+    weight = 0.25 * windows.plant.total_mass * GRAVITY
+    alone = controller_of(shipped, settings, weight, calibrated_voltage(shipped, settings, weight, hover))
     (args.out / "vehicle.toml").write_text(config.dumps(fitted))
     figures = {
         "doublets": len(every), "stalled": windows.stalled, "shipped": windows.miss(shipped, held_out, rest),
+        "settings": windows.miss(dataclasses.replace(fitted, controller=alone), held_out, rest),
+        "configured": windows.miss(dataclasses.replace(configured, queue=fitted.queue), held_out, rest),
         "fitted": windows.miss(fitted, held_out, rest), "seen": windows.miss(fitted, seen, rest),
         **{name: float(v if k < 3 else np.exp(v - 1.0)) for k, (name, v) in enumerate(zip(NAMES, theta))},
     }  # fmt: skip

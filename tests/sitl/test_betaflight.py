@@ -23,10 +23,11 @@ from hil.backends.base import FOLLOW
 from hil.fakes.base import Options
 from hil.fakes.mocap import MocapParams
 from hil.fakes.process import VEHICLE_ID
-from hil.fakes.sitl import BetaflightSitl, Firmware, needed, throw
+from hil.fakes.sitl import BetaflightSitl, Firmware, needed, opened, throw
 from hil.links.device import Device, UdpPort, check_device, open_port
 from hil.links.mavlink_link import Link
 from hil.params import HilParams
+from tests.loopback import test_endings as endings
 from visthrow import config
 from visthrow.onboard.policy import Policy, find_policy
 from visthrow.throws.wire_plant import make_motors
@@ -62,6 +63,9 @@ MISS = 0.35
 
 ON = 10.0
 """Flown on after a landing [s]: the runner hovers again 3 s and has landed 6 s after it."""
+
+OVER = {"armed": 4.0, "throw": 5.0}
+"""The time of a run that is over in hover and in a throw [s]."""
 
 LONG = 200.0
 """A run on a busy machine [s]."""
@@ -232,6 +236,33 @@ def test_throws_in_lock_step_are_the_same_to_the_bit(tmp_path, settings, monkeyp
     assert list((tmp_path / "first").glob("LOG*")), "the firmware wrote its blackbox"
 
 
+@pytest.mark.parametrize("state", endings.STATES)
+@pytest.mark.parametrize("way", [*endings.REASONS, "output raises", "SIGINT twice"])
+def test_every_way_to_end_brings_it_down(tmp_path, settings, way, state, monkeypatch):
+    """In hover and in a throw: the runner descends, except where it is gone at once, and the firmware disarms when it falls silent."""
+    shutil.copytree(settings[0], tmp_path / "settings")
+    overrides = (*endings.QUICK, "states.abort=1.5", *endings.STATES[state])
+    params = config.load(HilParams, config.find("hil", "betaflight_sitl"), overrides)
+    monkeypatch.setattr(endings, "OVER", OVER[state])
+    if way == "SIGINT twice":
+        endings.twice(monkeypatch)
+    reason = {"output raises": "BrokenPipeError: nobody reads", "SIGINT twice": endings.REASONS["SIGINT"]} | endings.REASONS
+    plant = make_motors("vision_dropout", 0)
+    with opened(program(), tmp_path / way, params, endings.NEVER, plant, MocapParams(), 0) as parts:
+        run = endings.Told(way.split(" twice")[0], state, parts, monkeypatch)
+        fake, clock = run.fake, run.clock
+        assert fake.armed, "up to the end of the run"
+        low = plant.state["pos_w"][2]
+        clock.sleep_until(clock.now() + DISARM[1])
+    print(f"\n{way}, {state}: {run.summary['reason']}, {low - run.heights.get('abort', low):+.2f} m, {fake.events}")
+    assert run.summary["aborted"]
+    assert reason[way] in run.summary["reason"]
+    assert fake.report()["releases"] == 0
+    assert not fake.armed
+    if way not in ("source raises", "SIGINT twice"):
+        assert low < run.heights["abort"] - 0.3, "a descent of 0.4 m/s, for 1.5 s"
+
+
 def visthrow(*words, **more):
     return subprocess.Popen([sys.executable, "-m", "visthrow.cli", *words], text=True, **more)
 
@@ -281,8 +312,11 @@ def test_a_whole_throw(tmp_path):
     assert list(folder.glob("LOG*")), "the firmware wrote its blackbox"
 
 
-def test_a_runner_that_is_killed_leaves_the_firmware_to_its_failsafe(tmp_path):
-    """SIGKILL in hover: the motors stop and it disarms, with nothing of the runner left."""
+@pytest.mark.parametrize("state", endings.STATES)
+def test_a_runner_that_is_killed_leaves_the_firmware_to_its_failsafe(tmp_path, state):
+    """SIGKILL in hover and in a throw: the motors stop and it disarms, with nothing of the runner left."""
+    endings.NEVER.save(tmp_path / "never.npz")
+    overrides = (f'policy="{tmp_path / "never.npz"}"', *endings.QUICK, *endings.STATES[state])
     report, run = tmp_path / "report.json", tmp_path / "run"
     bridge = visthrow(
         "hil", "fake", "--kind", "betaflight-sitl", "--firmware", str(program()), "--folder", str(tmp_path / "firmware"),
@@ -292,11 +326,11 @@ def test_a_runner_that_is_killed_leaves_the_firmware_to_its_failsafe(tmp_path):
     try:
         wait_for(bridge, "it flies")
         runner = visthrow(
-            "hil", "run", "--config", "betaflight_sitl", "--bare", "--speed", str(SPEED), "--out", str(run),
-            stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
+            "hil", "run", "--config", "betaflight_sitl", "--auto-arm", "--bare", "--speed", str(SPEED), "--out", str(run),
+            *(word for text in overrides for word in ("--set", text)), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
         )  # fmt: skip
-        wait_for(runner, "checks passed")
-        time.sleep(1.5 / SPEED)
+        wait_for(runner, f" s  {state} ")
+        time.sleep(0.3 / SPEED)
         runner.kill()
         time.sleep(2.0 * DISARM[1] / SPEED)
         bridge.send_signal(signal.SIGINT)

@@ -4,6 +4,6 @@ from hil.fakes.sitl.ardupilot import ArduPilotSitl
 from hil.fakes.sitl.betaflight import SLOW, BetaflightSitl, MotorPlant
 from hil.fakes.sitl.firmware import Firmware, needed
 from hil.fakes.sitl.sih import HangingBall, Px4Sih
-from hil.fakes.sitl.throw import throw
+from hil.fakes.sitl.throw import opened, throw
 
-__all__ = ["SLOW", "ArduPilotSitl", "BetaflightSitl", "Firmware", "HangingBall", "MotorPlant", "Px4Sih", "needed", "throw"]
+__all__ = ["SLOW", "ArduPilotSitl", "BetaflightSitl", "Firmware", "HangingBall", "MotorPlant", "Px4Sih", "needed", "opened", "throw"]

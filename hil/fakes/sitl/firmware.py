@@ -33,7 +33,7 @@ FREED = 90.0
 GAINS = {
     "p_roll": 5, "i_roll": 2, "d_roll": 5, "d_max_roll": 5,
     "p_pitch": 5, "i_pitch": 2, "d_pitch": 5, "d_max_pitch": 5,
-    "p_yaw": 45, "i_yaw": 20,
+    "p_yaw": 45, "i_yaw": 8,
 }  # fmt: skip
 """Those of the training's rate controller by `sim.effects.firmware.controller_of`, in whole numbers: 0.0080 N m s/rad, 0.024 N m/rad and
 1.3e-4 N m s^2/rad about roll and pitch. A policy that was trained on one response is flown on that response, not on a stiffer one: at
@@ -141,7 +141,8 @@ class Firmware:
         if _listens(PORTS[0]):
             raise RunError(f"something listens on port {PORTS[0]} already; expected no other firmware beside this one")
         self.stands, said = os.pipe()
-        environment = {**os.environ, "LD_PRELOAD": str(compiled(self.folder)), "VISTHROW_STANDS": str(said)}
+        library = compiled(self.folder).name  # by its place in the folder that it runs in: a path may hold no space
+        environment = {**os.environ, "LD_PRELOAD": f"./{library}", "VISTHROW_STANDS": str(said)}
         told = self.folder / "firmware.txt"  # its errors; of what it prints, most are the words of its memory
         with open(told, "wb") as errors:
             self._process = subprocess.Popen(

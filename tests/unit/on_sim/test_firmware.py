@@ -26,6 +26,9 @@ def test_a_gain_is_the_torque_that_the_motors_make_of_it():
     assert c.p_gain[2] * math.radians(1.0) == pytest.approx(
         2.0 * 45.0 / 11.0 * rise * vehicle.thrust.torque_ratio, rel=1e-6
     )
+    # pid_init.c: an I of 1 is 0.244381 of 1000 a degree, about yaw 2.5 times that; P of 1 is 0.032029 a degree a second.
+    assert c.i_gain[0] / c.p_gain[0] == pytest.approx(0.244381 * 20 / (0.032029 * 11))
+    assert c.i_gain[2] / c.p_gain[2] == pytest.approx(2.5 * 0.244381 * 80 / (0.032029 * 45))
     assert c.gyro_time_constant == pytest.approx((1 / 250 + 1 / 500 + 1 / 150) / (2 * math.pi))
     assert c.min_thrust == pytest.approx(3.5 * 0.055**2)
 
