@@ -21,6 +21,7 @@ from visthrow.diagnose.select.point import Problem, curvature, linearise, moved
 from visthrow.diagnose.throw import initial_fit
 from visthrow.diagnose.throw.initial_fit import InitialFit
 from visthrow.diagnose.throw.recorded import record_of
+from visthrow.diagnose.throw.states import hover_state
 from visthrow.diagnose.throw.throw_model import ThrowModel
 from visthrow.logs.flightlog import Channel, FlightLog
 
@@ -296,6 +297,15 @@ def test_what_a_simplified_simulator_lacks_stands_out(part, kind, name):
     assert right < 0.7 * wrong, (wrong, right)
     states = {"aerodynamics": 0, "controller_kind": 3, "motor_lag": 4, "rope_flexible": 8}  # integrals, rotors, bends of the rope
     assert whole[0].nuisance.shape[1] - plain[0].nuisance.shape[1] == states[name]
+
+
+def test_a_charge_that_nobody_logged_is_that_of_the_throttles_calibration(planted):
+    """Where a controller makes up for no voltage: it carries the weight at the share of throttle that was told."""
+    flight, plant = dataclasses.replace(record_of(planted[0][0]), voltage=None), paper_plant()
+    mixing = dataclasses.replace(plant.vehicle.controller, kind="motor_mixing", calibration_voltage=16.5)
+    told = hover_state(flight, dataclasses.replace(plant, vehicle=dataclasses.replace(plant.vehicle, controller=mixing)), 1)
+    assert told["voltage"][0] == pytest.approx(16.5, abs=0.02)
+    assert hover_state(flight, plant, 1)["charge_used"][0] == 0.2
 
 
 def test_the_charge_is_told_by_more_than_one_voltage(planted):

@@ -259,10 +259,12 @@ def hover_state(flight: Recorded, plant: PlantParams, payload: int) -> States:
 
 
 def _charge(flight: Recorded, plant: PlantParams, power: float) -> float:
-    """Fraction of the charge used at the start, from the first voltage under load; a fifth where none was logged."""
-    cell = plant.vehicle.battery
-    if flight.voltage is None or cell.kind != "sag":
+    """Fraction of the charge used at the start, from the first voltage under load. Where none was logged: from the voltage in hover that
+    throttle was calibrated at, where the controller makes up for no other; else a fifth."""
+    cell, c = plant.vehicle.battery, plant.vehicle.controller
+    volts = c.calibration_voltage if flight.voltage is None and c.kind == "motor_mixing" else flight.voltage
+    if volts is None or cell.kind != "sag":
         return 0.2 if cell.kind == "sag" else 0.0
     grid = np.linspace(0.0, 1.0, 201)
-    open_volts = flight.voltage + cell.resistance * power / flight.voltage
+    open_volts = volts + cell.resistance * power / volts
     return float(np.interp(-open_volts, -np.polynomial.polynomial.polyval(grid, cell.ocv), grid))
