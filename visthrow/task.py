@@ -336,3 +336,34 @@ def contract_of(experiment: Experiment) -> dict[str, Any]:
     if experiment.task.observation.layout == "vision":
         contract["camera"] = camera_conditions(experiment.camera)
     return contract
+
+
+def drawn_plants(experiment: Experiment, seed: int) -> list[PlantParams]:
+    """Return ``diagnosed.plants`` plants about the experiment's; that one itself where it is 1 or nothing is uncertain.
+
+    A draw that an effect's physical bounds forbid is put on the bound.
+
+    Raises:
+        ConfigError: An effect that the catalogue does not hold, or a covariance that is none.
+    """
+    diagnosed, plant = experiment.diagnosed, plant_of(experiment)
+    if diagnosed.plants == 1 or not diagnosed.effects:
+        return [plant]
+    import numpy as np
+
+    from sim.effects.effect import apply
+    from sim.effects.setting import Setting, generalised, specialised
+    from visthrow.config.effects import chosen
+
+    covariance = np.array(diagnosed.covariance)
+    values, vectors = np.linalg.eigh(covariance)
+    if not np.allclose(covariance, covariance.T) or values.min() < -1e-9 * values.max():
+        raise ConfigError("diagnosed.covariance is no covariance: it is not symmetric, or has a negative eigenvalue")
+    normal = np.random.default_rng(seed).standard_normal((diagnosed.plants, len(diagnosed.effects)))
+    base = generalised(Setting(plant, experiment.sensing))
+    effects = {name: effect.bounded(base) for name, effect in chosen(diagnosed.effects).items()}
+    plants = []
+    for draw in normal * np.sqrt(np.maximum(values, 0.0)) @ vectors.T:
+        theta = {name: float(np.clip(x, *effects[name].bounds)) for name, x in zip(diagnosed.effects, draw)}
+        plants.append(specialised(apply(effects, base, theta).plant, plant))
+    return plants

@@ -19,9 +19,9 @@ from tensordict import TensorDict
 
 from sim.hybrid import rope_variants
 from tests.bench import start
+from visthrow.cli.sweep import DEFAULT_OUT
 from visthrow.common.arguments import add_common
 from visthrow.common.errors import ConfigError, suggest
-from visthrow.evidence.sweep.cli import DEFAULT_OUT
 from visthrow.evidence.sweep.units import load_list
 from visthrow.throws.loading import Loaded, load_policy
 from visthrow.training.device import resolve

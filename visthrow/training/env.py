@@ -18,12 +18,11 @@ from camera.noise import StepDraw, apply_latency, apply_noise
 from sim.arrays.torch_bridge import TorchViews, on_torch_stream
 from sim.hybrid import HybridSim, rope_variants
 from sim.params import GRAVITY
-from visthrow.config.effects import drawn_plants
 from visthrow.onboard import actions as act
 from visthrow.onboard import goal_motion
 from visthrow.onboard import observations as ob
 from visthrow.onboard.located import fitted_goal
-from visthrow.task import Experiment, plant_of
+from visthrow.task import Experiment, drawn_plants, plant_of
 from visthrow.training import rewards, terminations
 
 RESULTS = ("episodes", "released", "landing_error", "duration")
@@ -64,7 +63,7 @@ class ThrowEnv(VecEnv):
         self.num_actions = act.ACTIONS
         self.device = device
         self.max_episode_length = round(task.bounds.time_limit / experiment.sim.control_period)
-        plants = drawn_plants(experiment.diagnosed, plant_of(experiment), experiment.sensing, seed)
+        plants = drawn_plants(experiment, seed)
         ropes = [rope for plant in plants for rope in rope_variants(plant.rope, task.start)]
         share = len(ropes) // len(plants)
         each = {name: [getattr(plant, name) for plant in plants for _ in range(share)] for name in ("vehicle", "air", "release")}

@@ -6,7 +6,7 @@ import pytest
 
 from visthrow import cli
 from visthrow.baseline import spline, thrower
-from visthrow.evidence import compare
+from visthrow.cli import compare
 from visthrow.throws import results
 from visthrow.throws.reference_protocol import BATCH
 

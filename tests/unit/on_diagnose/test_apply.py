@@ -9,18 +9,14 @@ from sim.params import LawParams
 from tests.unit.on_diagnose.test_models import ball_log
 from visthrow import cli, config
 from visthrow.common.errors import ConfigError, LogError
-from visthrow.config.effects import catalogue, drawn_plants
+from visthrow.config.effects import catalogue
 from visthrow.diagnose.extend import patch
 from visthrow.diagnose.inputs import setup as setups
-from visthrow.task import DiagnosedParams, Experiment, contract_of, plant_of
+from visthrow.task import DiagnosedParams, Experiment, contract_of, drawn_plants, plant_of
 
 THETA = {"thrust_gain": 0.03, "mass_quad": 0.006, "rope_length": -0.004, "wind_x": 0.2, "frame_tilt_x": 0.01}
 COVARIANCE = np.diag([0.01, 0.002, 0.0005, 0.02, 0.001]) ** 2
 COVARIANCE[0, 1] = COVARIANCE[1, 0] = 0.99 * 0.01 * 0.002
-
-
-def drawn(experiment, seed):
-    return drawn_plants(experiment.diagnosed, plant_of(experiment), experiment.sensing, seed)
 
 
 def shipped() -> Experiment:
@@ -57,7 +53,7 @@ def test_apply_writes_what_training_reads(diagnosis, tmp_path, capsys):
     assert after.sensing.frame_tilt == (0.01, 0.0, 0.0)
     assert after.diagnosed.effects == ("thrust_gain", "mass_quad", "rope_length", "wind_x", "release_lag")  # no tilted frame
     np.testing.assert_allclose(np.array(after.diagnosed.covariance)[:4, :4], COVARIANCE[:4, :4])
-    lags = [plant.release.lag for plant in drawn(after, 0)]  # what varies from throw to throw does so in training
+    lags = [plant.release.lag for plant in drawn_plants(after, 0)]  # what varies from throw to throw does so in training
     assert np.std(lags) == pytest.approx(0.01, rel=0.5)
     assert len(set(lags)) == 8
     assert after.vehicle.motor == before.vehicle.motor
@@ -140,13 +136,13 @@ def test_draws_keep_what_is_pinned_together():
     loose = DiagnosedParams(("thrust_gain", "mass_quad"), tuple(map(tuple, COVARIANCE[:2, :2])), 400)
     from dataclasses import replace
 
-    plants = drawn(replace(before, diagnosed=loose), 1)
+    plants = drawn_plants(replace(before, diagnosed=loose), 1)
     gain = np.array([p.vehicle.thrust.gain[0] for p in plants]) - 1.0
     mass = np.array([p.vehicle.body.mass for p in plants]) - before.vehicle.body.mass
     assert np.std(gain) == pytest.approx(0.01, rel=0.15)
     assert np.corrcoef(gain, mass)[0, 1] > 0.97
-    assert drawn(before, 1) == [plant_of(before)]
-    assert drawn(replace(before, diagnosed=loose), 1) == plants
+    assert drawn_plants(before, 1) == [plant_of(before)]
+    assert drawn_plants(replace(before, diagnosed=loose), 1) == plants
 
 
 def test_a_config_without_diagnosis_keeps_its_contract():
@@ -214,7 +210,7 @@ def test_a_broken_covariance_is_refused():
 
     bad = DiagnosedParams(("rope_length", "mass_quad"), ((1e-6, 1e-5), (1e-5, 1e-6)), 4)
     with pytest.raises(ConfigError, match="no covariance"):
-        drawn(replace(shipped(), diagnosed=bad), 0)
+        drawn_plants(replace(shipped(), diagnosed=bad), 0)
 
 
 def test_a_blackbox_gives_its_firmwares_rate_controller(tmp_path, capsys):

@@ -15,8 +15,8 @@ from tests.bench import commands, detector, mpc, sim_gpu
 from tests.bench import mujoco_warp as bench_mujoco_warp
 from tests.bench import sim as sim_cpu
 from visthrow import cli, config
+from visthrow.cli import bench
 from visthrow.common.errors import StorageError, VisthrowError
-from visthrow.evidence import bench
 from visthrow.evidence.bench import records
 from visthrow.task import Experiment, plant_of
 

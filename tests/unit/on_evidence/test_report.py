@@ -11,7 +11,8 @@ import pytest
 from tests import made_up_results as made_up
 from visthrow import cli
 from visthrow.baseline import spline, thrower
-from visthrow.evidence.report import ablations, baseline_units, beyond, command, gap, result_set, throws, trade
+from visthrow.cli import report as command
+from visthrow.evidence.report import ablations, baseline_units, beyond, gap, result_set, throws, trade
 from visthrow.evidence.sweep.units import load_list
 from visthrow.throws import results
 from visthrow.throws.results import Result

@@ -12,9 +12,8 @@ import pytest
 import torch
 
 from visthrow import config
-from visthrow.cli import main
+from visthrow.cli import compare, demo, main
 from visthrow.common.errors import ConfigError, MismatchError, PolicyError
-from visthrow.evidence import compare, demo
 from visthrow.logs.flightlog import STANDARD_CHANNELS, FlightLog
 from visthrow.onboard.policy import Policy
 from visthrow.task import Experiment, contract_of

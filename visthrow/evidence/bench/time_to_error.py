@@ -19,7 +19,7 @@ def train(experiment: Any, device: str, seed: int, errors: Sequence[float], minu
         ``curve``: (wall time without evaluations [s], environment steps, error [m]) of each evaluation; ``reached``: error as
         text -> first of them within it, None where there is none.
     """
-    from visthrow.training.command import Evaluations
+    from visthrow.training.session import Evaluations
     from visthrow.training.trainer import Trainer
 
     trainer, evaluations = Trainer(experiment, device, seed), Evaluations(every, True)

@@ -1,6 +1,5 @@
 """Doing of units in this process: a piece of a training run, throws. What is done, or is being done elsewhere, is left alone."""
 
-import argparse
 import shutil
 import sys
 import time
@@ -66,24 +65,21 @@ def work(work: Work, out: Path, ids: Sequence[str], device: str, minutes: float 
 
 def train(source: Source, out: Path, device: str, minutes: float | None, checkpoint_every: int) -> int:
     """Train, or go on, to the end or for some minutes; returns the exit status of ``visthrow train``."""
-    from visthrow.training import command as train_cli
+    from visthrow.training import session
     from visthrow.training.trainer import CHECKPOINT
 
     folder = source.folder(out)
     resume = (folder / CHECKPOINT).is_file()
     if folder.exists() and not resume:  # killed before its first checkpoint
         shutil.rmtree(folder)
-    parser = argparse.ArgumentParser()
-    train_cli.add_arguments(parser)
-    words = [source.config, "--seed", str(source.seed), "--out", str(folder), "--device", device]
-    words += ["--checkpoint-every", str(checkpoint_every), *(["--resume"] if resume else [])]
-    words += ["--minutes", f"{minutes:.3f}"] if minutes is not None else []
-    for change in source.changes:
-        words += ["--set", change]
+    asked = session.Options(
+        source.config, source.seed, str(folder), minutes=minutes, checkpoint_every=checkpoint_every, resume=resume, device=device,
+        overrides=source.changes,
+    )  # fmt: skip
     start, began = time.perf_counter(), datetime.now(UTC).isoformat(timespec="seconds")
     status = 1
     try:
-        status = train_cli.run(parser.parse_args(words))
+        status = session.run(asked)
     finally:
         piece = {"start": began, "seconds": round(time.perf_counter() - start, 2), "status": status, "commit": provenance.commit()}
         write_json(folder / PIECES / f"{time.time_ns()}.json", {**piece, "processors": provenance.processors()})

@@ -59,9 +59,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Plan, throw, print, write."""
     from visthrow.baseline import thrower
+    from visthrow.cli import compare
     from visthrow.common.errors import suggest
     from visthrow.common.storage import writable
-    from visthrow.evidence import compare
     from visthrow.evidence.report import baseline_units, result_set, trade
     from visthrow.evidence.report.throws import SHORT
     from visthrow.throws import results

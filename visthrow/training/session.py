@@ -1,15 +1,17 @@
-"""``visthrow train``: train a policy, from scratch or from another, with progress, evaluation, checkpoints, resume."""
+"""A training from its beginning or a checkpoint to its policy: log, evaluations on the way, checkpoints, an orderly stop."""
 
-import argparse
 import contextlib
 import os
 import signal
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from visthrow.common.arguments import EXIT_INTERRUPTED, add_common
+from visthrow.common.arguments import EXIT_INTERRUPTED
 
 EVALUATION_TARGET = 2.0  # [m]
 
@@ -17,42 +19,31 @@ EVALUATION_SHARE = 0.05
 """Of the wall time that evaluations may take where their number is left to the command."""
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the command."""
-    parser.epilog = (
-        "examples:\n"
-        "  visthrow train laptop                          a state policy on the cores of a laptop\n"
-        "  visthrow train laptop --until 0.04             stop once throws at 2.0 m land within 4 cm on average\n"
-        "  visthrow train mine.toml --from state          adapt the shipped policy to a vehicle of your own\n"
-        "  visthrow train vision --seed 2 --out runs/v2   another seed, in a folder of its own\n"
-        "  visthrow train --resume --out runs/v2          go on where an interrupted run stopped\n"
-        "  torchrun --nproc-per-node 2 -m visthrow.cli train state   on two GPUs\n"
-    )
-    names = "a name of configs/train (state, vision, vision_dropout, laptop, laptop_vision, paper, ...) or a TOML file of your own"
-    parser.add_argument("config", metavar="CONFIG", nargs="?", help=f"{names}; a resumed run has it in its folder")
-    parser.add_argument("--seed", type=int, help="of everything random (default: 1, or that of the resumed run)")
-    parser.add_argument("--out", metavar="FOLDER", help="folder of the run (default: runs/CONFIG-SEED)")
-    parser.add_argument(
-        "--from", dest="start", metavar="POLICY",
-        help="start from this policy, a shipped name or a file, with the short schedule of configs/ppo/adapt.toml",
-    )  # fmt: skip
-    parser.add_argument("--iterations", type=int, metavar="N", help="stop after iteration N (default: the configuration's last)")
-    parser.add_argument("--minutes", type=float, metavar="T", help="stop after this time")
-    parser.add_argument("--until", type=float, metavar="ERROR", help="stop once throws at 2.0 m land so near on average [m]")
-    parser.add_argument(
-        "--evaluate-every", type=int, metavar="N",
-        help="throw 200 times every N iterations (default: a twentieth of the time on a terminal, with --until and --view)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--checkpoint-every", type=int, default=100, metavar="N", help="iterations between checkpoints (default: 100)"
-    )
-    parser.add_argument("--view", action="store_true", help="show a throw of each evaluation in this machine's browser")
-    parser.add_argument("--resume", action="store_true", help="go on from the folder's checkpoint")
-    add_common(parser)
+@dataclass(frozen=True)
+class Options:
+    """What ``visthrow train`` is asked for; its help says what each of them is."""
+
+    config: str | None = None
+    seed: int | None = None
+    out: str | None = None
+    start: str | None = None  # policy to start from
+    iterations: int | None = None
+    minutes: float | None = None
+    until: float | None = None  # [m]
+    evaluate_every: int | None = None
+    checkpoint_every: int = 100
+    resume: bool = False
+    device: str = "auto"
+    overrides: Sequence[str] = ()
+    json: str | None = None
 
 
-def run(args: argparse.Namespace) -> int:
-    """Train."""
+Viewer = Callable[[Any], AbstractContextManager[Callable[[Any], None]]]
+"""Of a trainer: while it is entered, a function that shows an evaluation's throws."""
+
+
+def run(args: Options, viewer: Viewer | None = None) -> int:
+    """Train; returns the exit status of the command."""
     from visthrow import config
     from visthrow.common import provenance
     from visthrow.training import device
@@ -73,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
     if ranks.lead:
         told = {"seed": seed, "processes": ranks.world} | ({"from": _origin(args.start, policy)} if policy is not None else {})
         provenance.write_run_folder(folder, config.dumps(experiment), resume=args.resume, **told)
-    why = _loop(args, trainer, folder, last)
+    why = _loop(args, trainer, folder, last, viewer)
     if ranks.lead:
         _report(args, trainer, folder, time.perf_counter() - start, finished=why != STOPPED)
     iteration = trainer.iteration
@@ -86,7 +77,7 @@ def run(args: argparse.Namespace) -> int:
     return EXIT_INTERRUPTED
 
 
-def _check(args: argparse.Namespace) -> None:
+def _check(args: Options) -> None:
     """Refuse numbers that stop nothing or everything.
 
     Raises:
@@ -106,7 +97,7 @@ def _check(args: argparse.Namespace) -> None:
         raise TrainError("no CONFIG; name one of configs/train, such as laptop, or a TOML file")
 
 
-def _begun(args: argparse.Namespace) -> tuple:
+def _begun(args: Options) -> tuple:
     """Experiment, policy to start from or None, folder and seed of a new run.
 
     Raises:
@@ -127,7 +118,7 @@ def _begun(args: argparse.Namespace) -> tuple:
     return fitted(config.load(Experiment, path, [ADAPTATION, *args.overrides]), policy), policy, folder, seed
 
 
-def _resumed(args: argparse.Namespace) -> tuple:
+def _resumed(args: Options) -> tuple:
     """Experiment, None, folder and seed of the run in the folder; what is named besides must agree with it.
 
     Raises:
@@ -217,7 +208,7 @@ class Evaluations:
         self._cost = self._after - begin
 
 
-def _loop(args: argparse.Namespace, trainer, folder: Path, last: int) -> str:
+def _loop(args: Options, trainer, folder: Path, last: int, viewer: Viewer | None) -> str:
     """Train with log, evaluation and checkpoints, the last one at the end; return why it ended.
 
     Raises:
@@ -228,10 +219,11 @@ def _loop(args: argparse.Namespace, trainer, folder: Path, last: int) -> str:
     from visthrow.training.trainer import CHECKPOINT
 
     start, kept, why, ranks = time.perf_counter(), trainer.iteration, DONE, trainer.ranks
-    evaluations = Evaluations(args.evaluate_every, bool(args.until or args.view or sys.stdout.isatty()))
+    evaluations = Evaluations(args.evaluate_every, bool(args.until or viewer or sys.stdout.isatty()))
+    shown = viewer(trainer) if viewer and ranks.lead else contextlib.nullcontext(lambda throws: None)
     log = TrainLog(folder / "progress.csv", trainer.algorithm.samples, last, kept, args.minutes) if ranks.lead else None
     try:
-        with log or contextlib.nullcontext(), StopRequest() as stop, _viewer(args.view and ranks.lead, trainer) as show:
+        with log or contextlib.nullcontext(), StopRequest() as stop, shown as show:
             while trainer.iteration < last and why == DONE:
                 figures, throws = trainer.step(), None
                 if ranks.lead and evaluations.due(trainer.iteration):
@@ -255,33 +247,7 @@ def _loop(args: argparse.Namespace, trainer, folder: Path, last: int) -> str:
     return why
 
 
-@contextlib.contextmanager
-def _viewer(wanted: bool, trainer) -> Iterator:
-    """Function that shows an evaluation in rerun, one of its throws and where all came down; where wanted."""
-    if not wanted:
-        yield lambda throws: None
-        return
-    import numpy as np
-    import torch
-
-    from visthrow.task import contract_of
-    from visthrow.throws.loading import Loaded
-    from visthrow.throws.recorded import fly
-    from visthrow.view import live, rerun_view
-
-    with live.served() as address:
-
-        def show(throws) -> None:
-            policy = trainer.algorithm.export(contract_of(trainer.experiment), {})
-            with torch.random.fork_rng(devices=[]):
-                log = fly(Loaded("training", policy, trainer.experiment), np.array([throws.target, 0.0, 0.0]))
-            name = f"iteration {trainer.iteration}: {throws.summary().get('error_mean', float('nan')):.3f} m"
-            rerun_view.show(address, name, log, trainer.experiment, throws.landing_w[throws.success])
-
-        yield show
-
-
-def _report(args: argparse.Namespace, trainer, folder: Path, wall: float, finished: bool) -> None:
+def _report(args: Options, trainer, folder: Path, wall: float, finished: bool) -> None:
     """Throw at all targets, write the policy with what came of it, and print it."""
     from visthrow.common.storage import write_json
     from visthrow.training.protocol import TARGETS

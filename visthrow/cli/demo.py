@@ -4,11 +4,10 @@ import argparse
 import time
 from pathlib import Path
 
+from visthrow.cli import compare, fly
 from visthrow.common.arguments import add_out
 from visthrow.common.errors import ConfigError
 from visthrow.common.storage import writable
-from visthrow.evidence import compare
-from visthrow.throws import fly
 
 THROWS, TARGETS = 100, (1.5, 2.0, 2.5)
 """In the training simulator, for each policy; ``--throws`` asks for another number."""

@@ -1,29 +1,31 @@
-"""The command line. Each command is imported only when chosen, so that ``visthrow --help`` answers at once."""
+"""The command line, a module a command; each is imported only when chosen, so that ``visthrow --help`` answers at once.
+
+``hil`` and ``diagnose`` keep their own.
+"""
 
 import argparse
 import os
 import sys
 from collections.abc import Sequence
-from typing import NoReturn
 
 from visthrow import __version__
 from visthrow.common.arguments import EXIT_BAD_INPUT, EXIT_INTERRUPTED, add_commands, run_command
 from visthrow.common.errors import VisthrowError
 
 COMMANDS = {
-    "demo": ("throw once with the shipped vision policy and compare it with the state policy", "visthrow.evidence.demo"),
-    "train": ("train a throwing policy from scratch", "visthrow.training.command"),
-    "fly": ("fly one throw and write a 3D recording and a picture of it", "visthrow.throws.fly"),
-    "compare": ("throw many times with each policy and print landing errors and durations", "visthrow.evidence.compare"),
-    "detector": ("train the keypoint detector on rendered frames, and check it", "visthrow.evidence.detector"),
+    "demo": ("throw once with the shipped vision policy and compare it with the state policy", "visthrow.cli.demo"),
+    "train": ("train a throwing policy from scratch", "visthrow.cli.train"),
+    "fly": ("fly one throw and write a 3D recording and a picture of it", "visthrow.cli.fly"),
+    "compare": ("throw many times with each policy and print landing errors and durations", "visthrow.cli.compare"),
+    "detector": ("train the keypoint detector on rendered frames, and check it", "visthrow.cli.detector"),
     "hil": ("fly a policy on motion-capture poses, live or recorded", "hil.cli"),
-    "baseline": ("throw with trajectory optimisation and MPC; its front against the policies", "visthrow.evidence.report.baseline"),
+    "baseline": ("throw with trajectory optimisation and MPC; its front against the policies", "visthrow.cli.baseline"),
     "diagnose": ("say what the simulation gets wrong, from measured flights", "visthrow.diagnose.cli"),
-    "sweep": ("work a list of training runs and throws, on several GPUs or a cluster", "visthrow.evidence.sweep.cli"),
-    "report": ("write one page with the paper's tables and figures beside ours", "visthrow.evidence.report.command"),
-    "camera": ("make a camera configuration from a calibration, check it, look at what it sees", "visthrow.view.camera.command"),
-    "bench": ("measure how long training and diagnosis take; what was measured before", "visthrow.evidence.bench"),
-    "config": ("print a configuration with all its values filled in", "visthrow.config.command"),
+    "sweep": ("work a list of training runs and throws, on several GPUs or a cluster", "visthrow.cli.sweep"),
+    "report": ("write one page with the paper's tables and figures beside ours", "visthrow.cli.report"),
+    "camera": ("make a camera configuration from a calibration, check it, look at what it sees", "visthrow.cli.camera"),
+    "bench": ("measure how long training and diagnosis take; what was measured before", "visthrow.cli.bench"),
+    "config": ("print a configuration with all its values filled in", "visthrow.cli.config"),
 }
 TRACEBACK_VARIABLE = "VISTHROW_TRACEBACK"
 
@@ -87,7 +89,7 @@ def _hidden(error: ModuleNotFoundError) -> str | None:
     """File of a foreign module or package that stands where one of ours is looked for, as a ``camera.py`` in the working folder."""
     name = (error.name or "").partition(".")[0]
     found = sys.modules.get(name)
-    here = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
+    here = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
     place = getattr(found, "__file__", None)
     if name not in ("camera", "sim", "hil") or place is None or os.path.abspath(place).startswith(os.path.join(here, name)):
         return None
@@ -97,12 +99,3 @@ def _hidden(error: ModuleNotFoundError) -> str | None:
 def _refuse(message: str) -> int:
     print(f"visthrow: error: {message}", file=sys.stderr)
     return EXIT_BAD_INPUT
-
-
-def entry() -> NoReturn:
-    """Run ``main`` as a process (``python -m visthrow.cli``)."""
-    sys.exit(main())
-
-
-if __name__ == "__main__":
-    entry()

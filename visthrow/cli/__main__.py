@@ -1,0 +1,7 @@
+"""``python -m visthrow.cli``."""
+
+import sys
+
+from visthrow.cli import main
+
+sys.exit(main())

@@ -1,0 +1,74 @@
+"""``visthrow train``: train a policy, from scratch or from another, with progress, evaluation, checkpoints, resume."""
+
+import argparse
+import contextlib
+from collections.abc import Callable, Iterator
+from dataclasses import fields
+from typing import Any
+
+from visthrow.common.arguments import add_common
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.epilog = (
+        "examples:\n"
+        "  visthrow train laptop                          a state policy on the cores of a laptop\n"
+        "  visthrow train laptop --until 0.04             stop once throws at 2.0 m land within 4 cm on average\n"
+        "  visthrow train mine.toml --from state          adapt the shipped policy to a vehicle of your own\n"
+        "  visthrow train vision --seed 2 --out runs/v2   another seed, in a folder of its own\n"
+        "  visthrow train --resume --out runs/v2          go on where an interrupted run stopped\n"
+        "  torchrun --nproc-per-node 2 -m visthrow.cli train state   on two GPUs\n"
+    )
+    names = "a name of configs/train (state, vision, vision_dropout, laptop, laptop_vision, paper, ...) or a TOML file of your own"
+    parser.add_argument("config", metavar="CONFIG", nargs="?", help=f"{names}; a resumed run has it in its folder")
+    parser.add_argument("--seed", type=int, help="of everything random (default: 1, or that of the resumed run)")
+    parser.add_argument("--out", metavar="FOLDER", help="folder of the run (default: runs/CONFIG-SEED)")
+    parser.add_argument(
+        "--from", dest="start", metavar="POLICY",
+        help="start from this policy, a shipped name or a file, with the short schedule of configs/ppo/adapt.toml",
+    )  # fmt: skip
+    parser.add_argument("--iterations", type=int, metavar="N", help="stop after iteration N (default: the configuration's last)")
+    parser.add_argument("--minutes", type=float, metavar="T", help="stop after this time")
+    parser.add_argument("--until", type=float, metavar="ERROR", help="stop once throws at 2.0 m land so near on average [m]")
+    parser.add_argument(
+        "--evaluate-every", type=int, metavar="N",
+        help="throw 200 times every N iterations (default: a twentieth of the time on a terminal, with --until and --view)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--checkpoint-every", type=int, default=100, metavar="N", help="iterations between checkpoints (default: 100)"
+    )
+    parser.add_argument("--view", action="store_true", help="show a throw of each evaluation in this machine's browser")
+    parser.add_argument("--resume", action="store_true", help="go on from the folder's checkpoint")
+    add_common(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Train."""
+    from visthrow.training import session
+
+    options = session.Options(**{item.name: getattr(args, item.name) for item in fields(session.Options)})
+    return session.run(options, viewer if args.view else None)
+
+
+@contextlib.contextmanager
+def viewer(trainer: Any) -> Iterator[Callable[[Any], None]]:
+    """Function that shows an evaluation in rerun: one of its throws, and where all came down."""
+    import numpy as np
+    import torch
+
+    from visthrow.task import contract_of
+    from visthrow.throws.loading import Loaded
+    from visthrow.throws.recorded import fly
+    from visthrow.view import live, rerun_view
+
+    with live.served() as address:
+
+        def show(throws) -> None:
+            policy = trainer.algorithm.export(contract_of(trainer.experiment), {})
+            with torch.random.fork_rng(devices=[]):
+                log = fly(Loaded("training", policy, trainer.experiment), np.array([throws.target, 0.0, 0.0]))
+            name = f"iteration {trainer.iteration}: {throws.summary().get('error_mean', float('nan')):.3f} m"
+            rerun_view.show(address, name, log, trainer.experiment, throws.landing_w[throws.success])
+
+        yield show
