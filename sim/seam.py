@@ -114,11 +114,9 @@ class FusedChain:
         self.count, self.interval, self.total_mass = count, interval, params.total_mass
 
     def root(self) -> Root:
-        """See `Bodies`."""
         return Root(*(self.sim.get(name).astype(float) for name in ("pos_w", "quat_wb", "vel_w", "rate_b")))
 
     def payload_w(self) -> np.ndarray:
-        """See `Bodies`."""
         return self.sim.get("payload_pos_w").astype(float)
 
     def advance(self, force_b: np.ndarray, torque_b: np.ndarray, duration: float) -> None:

@@ -58,7 +58,6 @@ class Search(nn.Module):
             self.body[-1].bias[0::4] = -5.0  # few cells of a frame show anything
 
     def forward(self, frames: Tensor) -> Tensor:
-        """See the class."""
         return self.body(frames).unflatten(1, (2, 4))
 
 
@@ -74,7 +73,6 @@ class Look(nn.Module):
         )  # fmt: skip
 
     def forward(self, patches: Tensor) -> Tensor:
-        """See the class."""
         return self.body(patches)
 
 

@@ -227,13 +227,11 @@ class MavlinkAutopilot(Releasing, ABC):
         """Modes that a throw may begin in, in words."""
 
     def status(self, now: float) -> Status:
-        """See `Backend`."""
         note, mode = self._note(now)
         fault = self.audit.fault()
         return Status(not note and fault is None, note or self.release_record.note, self.release_record.state, mode, fault)
 
     def send(self, command: tuple[float, ...], now: float) -> bool:
-        """See `Backend`."""
         p = self.params
         thrust, x, y, z = command
         share = p.thrust.share(thrust, self.voltage)
@@ -260,7 +258,6 @@ class MavlinkAutopilot(Releasing, ABC):
             self._command(mav.MAV_CMD_COMPONENT_ARM_DISARM, 0, 1.0)
 
     def service(self, now: float) -> None:
-        """See `Backend`."""
         if now - self._beat_at >= 1.0:
             self._beat_at = now
             self._link.send(mav.MAVLink_heartbeat_message(mav.MAV_TYPE_ONBOARD_CONTROLLER, 8, 0, 0, 4, 3))
@@ -275,7 +272,6 @@ class MavlinkAutopilot(Releasing, ABC):
             self._command(number, self.release_record.sends - 1, *values)
 
     def abort(self, now: float) -> None:
-        """See `Backend`."""
         self.ask(LAND, now)
 
     def finish(self, now: float) -> None:

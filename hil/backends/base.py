@@ -163,19 +163,15 @@ class Releasing:
     release_record: Release
 
     def release(self, when: float) -> None:
-        """See `Backend`."""
         self.release_record.start(when)
 
     def stop_release(self) -> None:
-        """See `Backend`."""
         self.release_record.stop()
 
     def rearm(self) -> None:
-        """See `Backend`."""
         self.release_record.reset()
 
     def due(self) -> float | None:
-        """See `Backend`."""
         return self.release_record.at
 
 
@@ -201,7 +197,6 @@ class OnPort(Releasing):
         """See `Backend`: nothing to ask for; where the runner falls silent, the vehicle's own failsafe or watchdog acts."""
 
     def close(self) -> None:
-        """See `Backend`."""
         self._port.close()
 
     def _put(self, data: bytes) -> bool:
@@ -222,25 +217,20 @@ class DryRun:
         self._release = IDLE
 
     def status(self, now: float) -> Status:
-        """See `Backend`."""
         return Status(True, "dry run", self._release)
 
     def send(self, command: tuple[float, ...], now: float) -> bool:
-        """See `Backend`."""
         self.commands += 1
         return True
 
     def release(self, when: float) -> None:
-        """See `Backend`."""
         self.releases += 1
         self._release = ACCEPTED
 
     def rearm(self) -> None:
-        """See `Backend`."""
         self._release = IDLE
 
     def due(self) -> float | None:
-        """See `Backend`."""
         return None
 
     def _nothing(self, *_: Any) -> None:

@@ -173,7 +173,6 @@ class Betaflight(OnPort):
         return rules
 
     def status(self, now: float) -> Status:
-        """See `Backend`."""
         fault = self.audit.fault()
         note, mode = self._note(now)
         said = note or self._hint() or self.release_record.note
@@ -209,7 +208,6 @@ class Betaflight(OnPort):
         return number in self._boxes and bool(self._flags >> self._boxes.index(number) & 1)
 
     def send(self, command: tuple[float, ...], now: float) -> bool:
-        """See `Backend`."""
         thrust, *rates = command
         share = self.params.thrust.share(thrust, self.voltage)
         low = self.params.minimum_us
@@ -244,12 +242,10 @@ class Betaflight(OnPort):
             self._opened = None
 
     def rearm(self) -> None:
-        """See `Backend`."""
         super().rearm()
         self._opened = None
 
     def service(self, now: float) -> None:
-        """See `Backend`."""
         self._pump(now)
         for command, period in POLLS.items():
             if now - self._polled[command] >= period and (command != msp.SERVO or self.release_record.read_back):

@@ -77,7 +77,6 @@ class Crazyflie(OnPort):
         self._asked = self._sent = self._set = -1e9
 
     def status(self, now: float) -> Status:
-        """See `Backend`."""
         note, mode = self._note(now)
         said = note or ("it is being armed" if self._taken and not self._raised else "") or self.release_record.note
         return Status(not note, said, self.release_record.state, mode, None)
@@ -103,7 +102,6 @@ class Crazyflie(OnPort):
             self.poses += self._put(crtp.external_pose(pose.pos, pose.quat))
 
     def send(self, command: tuple[float, ...], now: float) -> bool:
-        """See `Backend`."""
         thrust, *rates = command
         armed = bool(self._state & crtp.ARMED) and self._taken
         share = self.params.thrust.share(thrust) if armed else 0.0
@@ -117,7 +115,6 @@ class Crazyflie(OnPort):
         self._put(crtp.set_parameter(self.params.release_parameter, 0))
 
     def service(self, now: float) -> None:
-        """See `Backend`."""
         self._pump(now)
         if now - self._asked >= ASK:
             self._asked = now

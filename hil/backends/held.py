@@ -27,13 +27,11 @@ class Held:
         return self._taken
 
     def service(self, now: float) -> None:
-        """See `Backend`."""
         while self._waiting and self._waiting[0][0] <= now + ROUNDING:
             self._taken = self._backend.send(self._waiting.popleft()[1], now)
         self._backend.service(now)
 
     def due(self) -> float | None:
-        """See `Backend`."""
         times = [time for time in (self._backend.due(), self._waiting[0][0] if self._waiting else None) if time is not None]
         return min(times, default=None)
 

@@ -81,7 +81,6 @@ class Px4(MavlinkAutopilot):
         return "OFFBOARD (6.0)" + (", or Hold (4.3) or Position (3.0) to take it" if self.params.take else "")
 
     def send(self, command: tuple[float, ...], now: float) -> bool:
-        """See `Backend`."""
         if now - self._sent_at > STREAM_GAP:
             self._stream_since = now
         self._sent_at = now

@@ -105,7 +105,6 @@ class Terminal:
             self._why = "the operator said abort (Ctrl-C)" if number == signal.SIGINT else f"the process was told to end ({name})"
 
     def words(self, state: str) -> OperatorInput:
-        """See `hil.control.loop.Operator`."""
         said = self._lines()
         arm = "arm" in said
         if self._auto and state == "ready" and not arm:

@@ -51,7 +51,6 @@ class Lander:
         self._operator, self._calibrating = operator, calibrating
 
     def words(self, state: str) -> OperatorInput:
-        """See `Operator`."""
         said = self._operator.words(state)
         return replace(said, arm=False, land=said.land or self._calibrating.found is not None)
 
@@ -60,7 +59,6 @@ class AutoOperator:
     """Arms whenever the run is ready: for tests and for simulated vehicles, never for real ones."""
 
     def words(self, state: str) -> OperatorInput:
-        """See `Operator`."""
         return OperatorInput(arm=state == State.READY)
 
 

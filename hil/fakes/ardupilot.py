@@ -45,11 +45,9 @@ class FakeArduPilot(FakeMavlink):
     }  # fmt: skip
 
     def listens(self) -> bool:
-        """See `FakeMavlink`."""
         return self.armed and self.mode in (GUIDED, GUIDED_NOGPS)
 
     def enter(self, mode: int) -> int:
-        """See `FakeMavlink`."""
         if mode not in (GUIDED, GUIDED_NOGPS, LOITER, BRAKE, LAND_MODE):
             return mav.MAV_RESULT_FAILED
         if mode != self.mode:
@@ -60,12 +58,10 @@ class FakeArduPilot(FakeMavlink):
         return mav.MAV_RESULT_ACCEPTED
 
     def is_release(self, message: Any) -> bool:
-        """See `FakeMavlink`."""
         servo = message.command == mav.MAV_CMD_DO_SET_SERVO and message.param1 == SERVO
         return servo or super().is_release(message)
 
     def answer_release(self, message: Any) -> None:
-        """See `FakeMavlink`."""
         answer, result = self.options.answer, mav.MAV_RESULT_ACCEPTED
         function = self.parameters[f"SERVO{SERVO}_FUNCTION"]
         if message.command == mav.MAV_CMD_DO_SET_SERVO:
@@ -83,7 +79,6 @@ class FakeArduPilot(FakeMavlink):
         self.acknowledge(message.command, result)
 
     def flown(self) -> np.ndarray:
-        """See `Fake`."""
         if self.mode == LAND_MODE:
             return self.descend()
         if self.mode not in (GUIDED, GUIDED_NOGPS) or self._target is None:

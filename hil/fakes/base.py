@@ -355,14 +355,12 @@ class PortFake(Fake):
         """Take what came on the port."""
 
     def hear(self) -> None:
-        """See `Fake`."""
         for data in () if self.port is None else chunks(self.port):
             self.heard = self.wall()
             self.came(data)
         super().hear()
 
     def close(self) -> None:
-        """See `Fake`."""
         super().close()
         if self.port is not None:
             self.port.close()

@@ -67,7 +67,6 @@ class FakeBetaflight(PortFake):
         self._sticks = Sticks(RatesParams(kinds[int(p["rates_type"])], *map(tuple, three)))
 
     def came(self, data: bytes) -> None:
-        """See `PortFake`."""
         for frame in self.parser.parse(data):
             if frame.direction == msp.TO_CONTROLLER and not self.silent:
                 self._hear(frame)
@@ -192,7 +191,6 @@ class FakeBetaflight(PortFake):
         self.happened("override off")
 
     def flown(self) -> np.ndarray:
-        """See `Fake`."""
         quiet = self.plant.time - self._heard
         if not (self.options.all_channels or self.taken) and self._first is not None and self.plant.time - self._first >= REACTION:
             self.override = self.armed
@@ -216,5 +214,4 @@ class FakeBetaflight(PortFake):
         """See `Fake`: it speaks when it is asked."""
 
     def report(self) -> dict[str, Any]:
-        """See `Fake`."""
         return {**super().report(), "override": self.override, "parameters": self.parameters}

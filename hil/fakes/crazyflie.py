@@ -38,7 +38,6 @@ class FakeCrazyflie(PortFake):
         self._locked, self._heard, self._stopped = True, -math.inf, False
 
     def came(self, data: bytes) -> None:
-        """See `PortFake`."""
         packet = crtp.unpack(data)
         if packet is not None and not self.silent:
             self._hear(packet)
@@ -112,5 +111,4 @@ class FakeCrazyflie(PortFake):
         """See `Fake`: it speaks when it is asked."""
 
     def report(self) -> dict[str, Any]:
-        """See `Fake`."""
         return {**super().report(), "poses": len(self.placed), "parameters": self.parameters}

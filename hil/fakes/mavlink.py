@@ -30,7 +30,6 @@ class FakeMavlink(Fake):
     def __init__(
         self, plant: WirePlant, link: Link, mocap: MocapParams | None = None, seed: int = 0, options: Options | None = None
     ) -> None:  # fmt: skip
-        """See `Fake`."""
         super().__init__(plant, link, mocap, seed, options)
         self.mode = self.usual_mode if self.options.mode is None else self.options.mode
         self.parameters = {**self.defaults, **self.options.parameters}
@@ -86,7 +85,6 @@ class FakeMavlink(Fake):
         """Whether set-points are followed now."""
 
     def take(self) -> None:
-        """See `Fake`."""
         self.enter(self.pilots_mode)
         self.beat_soon()
 
@@ -158,7 +156,6 @@ class FakeMavlink(Fake):
             self.say(mav.MAVLink_param_value_message(name.encode(), field, kind, 1, 0), self.options.answer_delay)
 
     def speak(self) -> None:
-        """See `Fake`."""
         time = self.plant.time
         if time >= self._next_beat:
             self._next_beat = time + 1.0
@@ -188,5 +185,4 @@ class FakeMavlink(Fake):
             self.link.send(mav.MAVLink_attitude_target_message(boot, 0, [1.0, 0.0, 0.0, 0.0], 0.0, 0.0, 0.0, share))
 
     def report(self) -> dict[str, Any]:
-        """See `Fake`."""
         return {**super().report(), "mode": self.mode, "parameters": self.parameters}

@@ -68,7 +68,6 @@ class ListeningPort:
         self._peer: socket.socket | None = None
 
     def read(self) -> bytes | None:
-        """See `hil.links.device.Port`."""
         if self._peer is None:
             try:
                 self._peer, _ = self._server.accept()
@@ -88,18 +87,15 @@ class ListeningPort:
         return data or None
 
     def write(self, data: bytes, to: tuple[str, int] | None = None) -> bool:
-        """See `hil.links.device.Port`."""
         try:
             return self._peer is not None and self._peer.send(data) == len(data)
         except OSError:
             return False
 
     def fileno(self) -> int:
-        """See `hil.links.device.Port`."""
         return (self._peer or self._server).fileno()
 
     def close(self) -> None:
-        """See `hil.links.device.Port`."""
         self._server.close()
         if self._peer is not None:
             self._peer.close()
@@ -115,19 +111,15 @@ class AnsweringPort:
         self._port = port
 
     def read(self) -> bytes | None:
-        """See `hil.links.device.Port`."""
         return self._port.read()
 
     def write(self, data: bytes, to: tuple[str, int] | None = None) -> bool:
-        """See `hil.links.device.Port`."""
         return self._port.write(data, to or self._port.sender)
 
     def fileno(self) -> int:
-        """See `hil.links.device.Port`."""
         return self._port.fileno()
 
     def close(self) -> None:
-        """See `hil.links.device.Port`."""
         self._port.close()
 
 

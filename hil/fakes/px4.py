@@ -53,15 +53,12 @@ class FakePx4(FakeMavlink):
         super()._set_point(message)
 
     def listens(self) -> bool:
-        """See `FakeMavlink`."""
         return self.armed and self.mode == OFFBOARD
 
     def custom_mode(self, message: Any) -> int:
-        """See `FakeMavlink`."""
         return custom(int(message.param2), int(message.param3))
 
     def enter(self, mode: int) -> int:
-        """See `FakeMavlink`."""
         time = self.plant.time
         streamed = time - self._stream_since > STREAM_FIRST and time - self._last <= STREAM_GAP
         if mode not in (OFFBOARD, HOLD, LAND, POSCTL):
@@ -77,12 +74,10 @@ class FakePx4(FakeMavlink):
         return mav.MAV_RESULT_ACCEPTED
 
     def is_release(self, message: Any) -> bool:
-        """See `FakeMavlink`."""
         set_one = message.command == mav.MAV_CMD_DO_SET_ACTUATOR and np.isfinite(message.param1)
         return set_one or super().is_release(message)
 
     def answer_release(self, message: Any) -> None:
-        """See `FakeMavlink`."""
         answer, number = self.options.answer, message.command
         gripper = number == mav.MAV_CMD_DO_GRIPPER
         if answer == "denied":
@@ -98,13 +93,11 @@ class FakePx4(FakeMavlink):
             self.acknowledge(number, mav.MAV_RESULT_ACCEPTED)
 
     def field(self, name: str) -> tuple[float, int]:
-        """See `FakeMavlink`."""
         if name in INTEGERS:
             return integer_to_bytes(self.parameters[name]), mav.MAV_PARAM_TYPE_INT32
         return super().field(name)
 
     def value(self, field: float, kind: int) -> float:
-        """See `FakeMavlink`."""
         return bytes_to_integer(field) if kind == mav.MAV_PARAM_TYPE_INT32 else field
 
     @property
@@ -114,7 +107,6 @@ class FakePx4(FakeMavlink):
         return ends if self.parameters["PWM_AUX_FUNC1"] == 430.0 else ends[::-1]
 
     def flown(self) -> np.ndarray:
-        """See `Fake`."""
         if self.mode == OFFBOARD and self.plant.time - self._last > self.parameters["COM_OF_LOSS_T"]:
             self.happened("left OFFBOARD: no set-points")
             self.enter(LAND if self.parameters["COM_OBL_RC_ACT"] == LAND_OR_HOLD[0] else HOLD)

@@ -35,17 +35,14 @@ class MonotonicClock:
         self._speed = speed
 
     def now(self) -> float:
-        """See `Clock`."""
         return time.monotonic() * self._speed
 
     def sleep_until(self, when: float) -> None:
-        """See `Clock`."""
         left = (when - self.now()) / self._speed
         if left > 0.0:
             time.sleep(left)
 
     def wait_for(self, files: Sequence[Any], when: float) -> None:
-        """See `Clock`."""
         left = (when - self.now()) / self._speed
         if left > 0.0:
             select.select(files, [], [], left)
@@ -59,15 +56,12 @@ class ManualClock:
         self.time = start
 
     def now(self) -> float:
-        """See `Clock`."""
         return self.time
 
     def sleep_until(self, when: float) -> None:
-        """See `Clock`."""
         self.time = max(self.time, when)
 
     def wait_for(self, files: Sequence[Any], when: float) -> None:
-        """See `Clock`."""
         self.sleep_until(when)
 
 

@@ -110,12 +110,10 @@ class CflibPort:
         self.lost = message
 
     def read(self) -> bytes | None:
-        """See `Port`."""
         packet = self._link.receive_packet(0)
         return None if packet is None else bytes([packet.header]) + bytes(packet.data)
 
     def write(self, data: bytes, to: tuple[str, int] | None = None) -> bool:
-        """See `Port`."""
         packet = self._packet(data[0])
         packet.data = data[1:]
         self._link.send_packet(packet)
@@ -126,7 +124,6 @@ class CflibPort:
         return -1
 
     def close(self) -> None:
-        """See `Port`."""
         self._link.close()
 
 

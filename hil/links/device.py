@@ -101,11 +101,9 @@ class _SocketPort:
     _socket: socket.socket
 
     def fileno(self) -> int:
-        """See `Port`."""
         return self._socket.fileno()
 
     def close(self) -> None:
-        """See `Port`."""
         self._socket.close()
 
 
@@ -133,7 +131,6 @@ class UdpPort(_SocketPort):
             raise LinkError(f"cannot open {device.kind}:{device.host}:{device.port}: {error.strerror}") from error
 
     def read(self) -> bytes | None:
-        """See `Port`."""
         try:
             data, sender = self._socket.recvfrom(LARGEST_DATAGRAM)
         except OSError:  # there is none, or the peer's port is closed: ICMP, reported here
@@ -142,7 +139,6 @@ class UdpPort(_SocketPort):
         return data
 
     def write(self, data: bytes, to: tuple[str, int] | None = None) -> bool:
-        """See `Port`."""
         to = self.peer or to
         try:
             return to is not None and self._socket.sendto(data, to) == len(data)
@@ -169,14 +165,12 @@ class TcpPort(_SocketPort):
         self._socket.setblocking(False)
 
     def read(self) -> bytes | None:
-        """See `Port`."""
         try:
             return self._socket.recv(LARGEST_DATAGRAM) or None
         except OSError:
             return None
 
     def write(self, data: bytes, to: tuple[str, int] | None = None) -> bool:
-        """See `Port`."""
         try:
             return self._socket.send(data) == len(data)
         except OSError:
@@ -205,25 +199,21 @@ class SerialPort:
             raise LinkError(f"cannot open {device.host}: {os.strerror(number) if number else error}") from error
 
     def read(self) -> bytes | None:
-        """See `Port`."""
         try:
             return self._port.read(self._port.in_waiting or 1) or None
         except OSError:
             return None
 
     def write(self, data: bytes, to: tuple[str, int] | None = None) -> bool:
-        """See `Port`."""
         try:
             return self._port.write(data) == len(data)
         except OSError:
             return False
 
     def fileno(self) -> int:
-        """See `Port`."""
         return self._port.fileno()
 
     def close(self) -> None:
-        """See `Port`."""
         self._port.close()
 
 

@@ -44,25 +44,21 @@ class LoggedPort:
             self.failed += 1
 
     def read(self) -> bytes | None:
-        """See `hil.links.device.Port`."""
         data = self._port.read()
         if data:
             self._note(b">", data)
         return data
 
     def write(self, data: bytes, to: tuple[str, int] | None = None) -> bool:
-        """See `hil.links.device.Port`."""
         taken = self._port.write(data)
         if taken:
             self._note(b"<", data)
         return taken
 
     def fileno(self) -> int:
-        """See `hil.links.device.Port`."""
         return self._port.fileno()
 
     def close(self) -> None:
-        """See `hil.links.device.Port`."""
         self._port.close()
         try:
             self._file.close()

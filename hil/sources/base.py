@@ -38,16 +38,13 @@ class Linked:
         self.links, self._clock = links, clock
 
     def wait(self, clock: Clock, until: float) -> None:
-        """See `Source`."""
         wait(self.links, clock, self._clock, until)
 
     def hold(self, flying: bool) -> None:
-        """See `Source`."""
         for link in self.links:
             link.roster.flying = flying
 
     def close(self) -> None:
-        """See `Source`."""
         for link in self.links:
             link.close()
 
@@ -70,7 +67,6 @@ class Recorded:
 
     @property
     def ended(self) -> bool:
-        """See `Source`."""
         return self._next >= len(self.poses)
 
     @property
@@ -79,14 +75,12 @@ class Recorded:
         return self.poses[0].arrival
 
     def poll(self, now: float) -> list[Pose]:
-        """See `Source`."""
         first = self._next
         while self._next < len(self.poses) and self.poses[self._next].arrival <= now:
             self._next += 1
         return self.poses[first : self._next]
 
     def wait(self, clock: Clock, until: float) -> None:
-        """See `Source`."""
         clock.sleep_until(until)
 
     def hold(self, flying: bool) -> None:

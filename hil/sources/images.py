@@ -153,7 +153,6 @@ class RecordedImages:
         self._next = 0
 
     def tell(self, hint: Hint | None) -> None:
-        """See `Eyes`."""
         self._hint = hint
 
     def poll(self, now: float) -> list[Sight]:
@@ -219,16 +218,13 @@ class LiveImages:
             print(f"camera stopped: {self.failure}", file=sys.stderr, flush=True)
 
     def tell(self, hint: Hint | None) -> None:
-        """See `Eyes`."""
         self._hint = hint
 
     def poll(self, now: float) -> list[Sight]:
-        """See `Eyes`."""
         sight, self._newest = self._newest, None
         return [] if sight is None else [sight]
 
     def close(self) -> None:
-        """See `Eyes`."""
         self._stop.set()
         self._thread.join(timeout=2.0)
         self._capture.release()

@@ -109,7 +109,6 @@ class MavlinkSource(Linked):
             self._waiting.append(pose if sync is None else sync.dated(pose, message.get_srcSystem()))
 
     def poll(self, now: float) -> list[Pose]:
-        """See `hil.sources.base.Source`."""
         pump(self.links, self._clock)
         poses, self._waiting = self._waiting, []
         return poses

@@ -78,7 +78,6 @@ class MocapSource(Linked):
         self._waiting.append(pose)
 
     def poll(self, now: float) -> list[Pose]:
-        """See `hil.sources.base.Source`."""
         pump(self.links, self._clock)
         return [self._waiting.popleft() for _ in range(len(self._waiting))]
 
@@ -129,7 +128,6 @@ class MotionCaptureSource(MocapSource):
             self._ready.set()
 
     def close(self) -> None:
-        """See `hil.sources.base.Source`."""
         self._stop.set()
         super().close()
 
@@ -182,7 +180,6 @@ class NatNetSource(MocapSource):
             self.hand_over(Pose(float(frame.suffix.timestamp), arrival, body, tuple(found.pos), tuple(found.rot)))
 
     def close(self) -> None:
-        """See `hil.sources.base.Source`."""
         self._client.shutdown()
         super().close()
 

@@ -153,7 +153,6 @@ class Ros2Source(MocapSource):
         return Listener()
 
     def close(self) -> None:
-        """See `hil.sources.base.Source`."""
         for reader in self._readers:
             reader.set_listener(None)
         self._readers.clear()

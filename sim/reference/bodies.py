@@ -48,12 +48,10 @@ class MujocoBodies:
         self._batch.forward()
 
     def root(self) -> Root:
-        """See `Bodies`."""
         q, v = self._batch.qpos, self._batch.qvel
         return Root(q[:, :3].copy(), np.roll(q[:, 3:7], -1, axis=1), v[:, :3].copy(), v[:, 3:6].copy())
 
     def payload_w(self) -> np.ndarray:
-        """See `Bodies`."""
         return np.array(self._sites).reshape(self.count, -1, 3)[:, self._site]
 
     def advance(self, force_b: np.ndarray, torque_b: np.ndarray, duration: float) -> None:

@@ -290,7 +290,6 @@ class _Tracking(Scores):
         self._sum, self._due, self._period = np.zeros(count), np.zeros(count), 0
 
     def after(self, flight: Flight, seen: Snapshot, sent: Decision) -> None:
-        """See `Recorder`."""
         super().after(flight, seen, sent)
         if sent.action is None:
             return

@@ -62,7 +62,6 @@ class _Lazy(argparse.ArgumentParser):
         self._module = module
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """See the base class."""
         if self._module is not None:
             module, self._module = self._module, None
             importlib.import_module(module).add_arguments(self)

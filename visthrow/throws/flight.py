@@ -79,7 +79,6 @@ class Policies(Pilots):
         super().__init__(loaded[0].experiment, goal_w, np.vstack([pilot.previous_action for pilot in self.pilots]), goal_vel_w)
 
     def decide(self, flight: "Flight", seen: Snapshot, held: np.ndarray) -> Decision:
-        """See `Pilots`."""
         outs, goal_w = [], flight.goal_at(seen.time)
         looked = None
         if self.eyes is not None:  # nobody looks any more once all have let go
@@ -167,7 +166,6 @@ class Flight:
 
     @property
     def elapsed(self) -> float:
-        """See the class."""
         return self.plant.time - self._phase_begin
 
     def lasted(self, time: float) -> bool:
@@ -279,7 +277,6 @@ class Scores(Recorder):
         self.clearance, self.smoothness = np.full(len(pilots.goal_w), np.inf), Smoothness(pilots.first_action)
 
     def after(self, flight: Flight, seen: Snapshot, sent: Decision) -> None:
-        """See `Recorder`."""
         if sent.action is None:
             return
         now = flight.now

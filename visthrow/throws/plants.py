@@ -106,7 +106,6 @@ class HybridPlant:
             self._begin()
 
     def reset(self, pos_w: np.ndarray, cable_dir_w: np.ndarray | None = None) -> None:
-        """See `Plant`."""
         self._sim.place(pos_w=pos_w, cable_dir_w=cable_dir_w)
         self._begin()
 
@@ -122,7 +121,6 @@ class HybridPlant:
         self._past = [self.state] * max(math.ceil(self.latency[1] / self.period - 1e-9), 1)  # newest first
 
     def step(self, command: np.ndarray, release: np.ndarray | bool = False) -> None:
-        """See `Plant`."""
         release = np.broadcast_to(np.asarray(release, dtype=bool), (self.count,))
         if np.any(self._age):
             self._past = [self.state, *self._past[:-1]]
@@ -204,7 +202,6 @@ class HybridPlant:
 
     @property
     def state(self) -> Snapshot:
-        """See `Plant`."""
         sim = self._sim
         ball, ball_vel = self._ball()
         points = sim.cable_points_w()
@@ -245,7 +242,6 @@ class HybridPlant:
 
     @property
     def landing(self) -> Landings:
-        """See `Plant`."""
         impact = self._separation + self._sim.get("time_to_impact")
         landed = ~np.isnan(self._separation) & (impact <= self.time + 1e-9)
         point = np.where(landed[:, None], self._sim.get("landing_w").astype(float), np.nan)
@@ -277,7 +273,6 @@ class ReferenceAdapter:
         self.reset(np.tile([0.0, 0.0, experiment.task.start.spawn_height], (count, 1)))
 
     def reset(self, pos_w: np.ndarray, cable_dir_w: np.ndarray | None = None) -> None:
-        """See `Plant`."""
         level, still = np.tile([0.0, 0.0, 0.0, 1.0], (self.count, 1)), np.zeros((self.count, 3))
         self._plant.reset(pos_w, level, still, still, cable_dir_w)
 
@@ -287,16 +282,13 @@ class ReferenceAdapter:
         return self._plant.time
 
     def step(self, command: np.ndarray, release: np.ndarray | bool = False) -> None:
-        """See `Plant`."""
         self._plant.step(command, release)
 
     @property
     def state(self) -> Snapshot:
-        """See `Plant`."""
         return self._plant.state
 
     def measured(self) -> Snapshot:
-        """See `Plant`."""
         self._sample = self._plant.measured()
         return self._sample
 
@@ -307,7 +299,6 @@ class ReferenceAdapter:
 
     @property
     def landing(self) -> Landings:
-        """See `Plant`."""
         return self._plant.landing
 
 

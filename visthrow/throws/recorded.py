@@ -44,7 +44,6 @@ class Recording(Recorder):
         self.names, self.recorders = names, [FlightRecorder(meta) for _ in range(count)]
 
     def before(self, flight: Flight, seen: Snapshot, sent: Decision) -> None:
-        """See `Recorder`."""
         now = flight.now
         for e, recorder in enumerate(self.recorders):
             recorder.add(now.time, **{name: getattr(now, name)[e] for name in self.names})
@@ -70,7 +69,6 @@ class _Full(Recording):
         self._sampled = -np.inf  # stamp of the last measured sample [s]
 
     def before(self, flight: Flight, seen: Snapshot, sent: Decision) -> None:
-        """See `Recorder`."""
         super().before(flight, seen, sent)
         recorder, now, throws = self.recorders[0], flight.now, sent.action is not None
         if sent.release[0] and self.latch is None:

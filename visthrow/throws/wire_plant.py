@@ -124,7 +124,6 @@ class MotorPlant(WirePlant):
     period = 0.002
 
     def __init__(self, experiment: Experiment, seed: int) -> None:
-        """See `WirePlant`."""
         super().__init__(experiment, seed)
         controller, thrust, battery = experiment.vehicle.controller, experiment.vehicle.thrust, experiment.vehicle.battery
         self._full_speed = (controller.max_thrust / thrust.k_f) ** 0.5

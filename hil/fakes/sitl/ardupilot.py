@@ -146,12 +146,10 @@ class ArduPilotSitl(Fake):
         """See `Fake`: the pilot is the autopilot's."""
 
     def report(self) -> dict[str, Any]:
-        """See `Fake`."""
         known = {name: value for name, value in super().report().items() if name not in UNKNOWN}
         return {**known, "held": self.plant.held, "frames": self.frames, "repeated": self.repeated, "restarts": self.restarts}
 
     def close(self) -> None:
-        """See `Fake`."""
         super().close()
         self._socket.close()
 

@@ -47,7 +47,6 @@ class MotorPort:
         self._socket.setblocking(False)
 
     def read(self) -> bytes | None:
-        """See `Port`."""
         try:
             return self._socket.recv(LARGEST_DATAGRAM)
         except OSError:
@@ -58,11 +57,9 @@ class MotorPort:
         return False
 
     def fileno(self) -> int:
-        """See `Port`."""
         return self._socket.fileno()
 
     def close(self) -> None:
-        """See `Port`."""
         self._socket.close()
 
 
@@ -156,14 +153,12 @@ class BetaflightSitl(Fake):
         """See `Fake`: there is no pilot; all channels are the runner's."""
 
     def report(self) -> dict[str, Any]:
-        """See `Fake`."""
         loop = float(np.median(self.cycles)) if self.cycles else None
         unknown = ("followed", "ignored", "commands", "worst", "breaches", "last_command")  # the runner's link passes us by
         known = {name: value for name, value in super().report().items() if name not in unknown}
         return {**known, "held": self.plant.held, "motor_packets": self.answered, "loop_us": loop}
 
     def close(self) -> None:
-        """See `Fake`."""
         super().close()
         for port in (self.port, self.sensors, self._msp):
             port.close()

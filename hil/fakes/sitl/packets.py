@@ -111,7 +111,6 @@ class StillSensors:
     """A vehicle at rest, while nothing flies yet: the firmware calibrates its gyro and answers only with samples."""
 
     def __init__(self, stands: int | None) -> None:
-        """See `Sensors`."""
         self._done, self._sensors = threading.Event(), Sensors(stands)
 
     def __enter__(self) -> "StillSensors":

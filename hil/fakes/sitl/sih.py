@@ -104,7 +104,6 @@ class HangingBall:
 
     @property
     def state(self) -> dict[str, np.ndarray]:
-        """See `WirePlant`."""
         return {
             "pos_w": self._pos, "quat_wb": self._quat, "vel_w": self._vel, "rate_b": self._rate, "payload_pos_w": self._ball,
             "attached": np.array(self.attached),
@@ -189,6 +188,5 @@ class Px4Sih(Fake):
         """See `Fake`: the pilot is PX4's."""
 
     def close(self) -> None:
-        """See `Fake`."""
         super().close()
         self.autopilot.close()

@@ -44,7 +44,6 @@ class FlightClock:
         self._fake, self._now = fake, fake.plant.time
 
     def now(self) -> float:
-        """See `Clock`."""
         return self._now
 
     def sleep_until(self, when: float) -> None:

@@ -24,7 +24,6 @@ class Job:
         self._job, self._task, self._lost = job, task, lost
 
     def poll(self) -> int | None:
-        """See `visthrow.evidence.sweep.pool.Running`."""
         from submitit.core.utils import FailedJobError, UncompletedJobError
 
         if not self._job.done():
@@ -42,7 +41,6 @@ class Job:
         self._job.cancel()
 
     def kill(self) -> None:
-        """See `stop`."""
         self._job.cancel()
 
 
@@ -80,7 +78,6 @@ class Cluster:
             raise ConfigError(f"options of the cluster {self.options}: {error}") from error
 
     def start(self, task: Task, device: str, minutes: float | None) -> Job:
-        """See `visthrow.evidence.sweep.pool.Starter`."""
         self._executor.update_parameters(name=task.name, gpus_per_node=1 if task.gpu and self.executor == "slurm" else 0)
         piece = self.minutes if minutes is None else min(minutes, self.minutes)
         where = (self.list_name, str(self.out.resolve()), self.changes, os.getcwd())

@@ -73,7 +73,6 @@ class Process(subprocess.Popen):
             )
 
     def stop(self) -> None:
-        """See `Running`."""
         self.send_signal(signal.SIGINT)
 
 
@@ -88,7 +87,6 @@ class Local:
     changes: tuple[str, ...] = ()
 
     def start(self, task: Task, device: str, minutes: float | None) -> Process:
-        """See `Starter`."""
         words = [sys.executable, "-m", "visthrow.cli", "sweep", "work", self.list_name, "--out", str(self.out)]
         words += ["--units", ",".join(task.ids), "--parent", str(os.getpid())]
         if device.startswith("cuda"):  # the process sees its own GPU alone, and puts no context on the others
