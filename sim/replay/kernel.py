@@ -19,7 +19,7 @@ from sim.rope.chain import build_chain
 from sim.rope.coupling import build_coupled_step
 from sim.rope.loose import build_loose_step
 from sim.rope.payload import build_flight, build_payload
-from sim.rope.release import build_letting_go
+from sim.rope.release import build_letting_go, build_step_in_flight
 
 EVERYTHING = frozenset(EXTENSIONS)
 """The replay has every extension built in, so that lanes may differ in all of them."""
@@ -134,6 +134,7 @@ def build_replay(t: Types, vehicle: VehicleParams, segments: int, laws: tuple[La
     flight_acceleration = build_flight(t, payload, extra)
     loose_step = build_loose_step(t, chain, payload)
     leaving = build_letting_go(t, EVERYTHING)
+    fly_ball = build_step_in_flight(t, flight_acceleration)
     sampling = build_sampling(t, Sensing, Windows, Data)
     Steps, Pointers, sample, copy_samples = sampling.Steps, sampling.Pointers, sampling.sample, sampling.copy_samples
     load_quad, store_quad = st.build_access(t, State)
@@ -162,23 +163,6 @@ def build_replay(t: Types, vehicle: VehicleParams, segments: int, laws: tuple[La
     @wp.func
     def payload_now(r: Release, ball: Ball):
         return ball.pos + r.rope_tail * (ball.tail - ball.pos), ball.vel + r.rope_tail * (ball.tail_vel - ball.vel)
-
-    @wp.func
-    def fly_ball(rope: Rope, air: Air, ball: Ball, g: vec3, h: real):
-        """RK4 step of the payload alone."""
-        out = ball
-        half = real(0.5) * h
-        a1 = flight_acceleration(rope, air, ball.vel, g)
-        v2 = ball.vel + half * a1
-        a2 = flight_acceleration(rope, air, v2, g)
-        v3 = ball.vel + half * a2
-        a3 = flight_acceleration(rope, air, v3, g)
-        v4 = ball.vel + h * a3
-        a4 = flight_acceleration(rope, air, v4, g)
-        two = real(2.0)
-        out.pos = ball.pos + (h / real(6.0)) * (ball.vel + two * v2 + two * v3 + v4)
-        out.vel = ball.vel + (h / real(6.0)) * (a1 + two * a2 + two * a3 + a4)
-        return out
 
     @wp.func
     def let_go(r: Release, rope: Rope, s: QuadState, n: wp.array(dtype=vec3), u: wp.array(dtype=vec3)):
@@ -402,7 +386,9 @@ def build_replay(t: Types, vehicle: VehicleParams, segments: int, laws: tuple[La
                 else:
                     s = coupled.step_alone(p, pushed, s, active, g, h)
                     if mode == loose_code:
-                        ball = fly_ball(rope, pushed, ball, g, h)
+                        flown_pos, flown_vel = fly_ball(rope, pushed, ball.pos, ball.vel, g, h)
+                        ball.pos = flown_pos
+                        ball.vel = flown_vel
                         if r.rope_tail > real(0.0):
                             root, root_vel = loose_step(
                                 rope, pushed, ball.root, ball.root_vel, n, u, stiffness, g, gamma, max_turn, h

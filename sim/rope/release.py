@@ -88,6 +88,32 @@ def build_letting_go(t: Types, extensions: frozenset[str]) -> SimpleNamespace:
     )
 
 
+def build_step_in_flight(t: Types, acceleration):
+    """Return ``step(rope, air, pos_w, vel_w, gravity_w, h)``: position and velocity of the payload alone after h seconds, by RK4.
+
+    Args:
+        t: types of the wanted precision.
+        acceleration: ``(rope, air, vel_w, gravity_w)`` -> [m/s^2], world frame.
+    """
+    real, vec3, Rope, Air = t.real, t.vec3, t.Rope, t.Air
+
+    @wp.func
+    def step(rope: Rope, air: Air, pos_w: vec3, vel_w: vec3, gravity_w: vec3, h: real):
+        half = real(0.5) * h
+        a1 = acceleration(rope, air, vel_w, gravity_w)
+        v2 = vel_w + half * a1
+        a2 = acceleration(rope, air, v2, gravity_w)
+        v3 = vel_w + half * a2
+        a3 = acceleration(rope, air, v3, gravity_w)
+        v4 = vel_w + h * a3
+        a4 = acceleration(rope, air, v4, gravity_w)
+        sixth = h / real(6.0)
+        two = real(2.0)
+        return pos_w + sixth * (vel_w + two * v2 + two * v3 + v4), vel_w + sixth * (a1 + two * a2 + two * a3 + a4)
+
+    return step
+
+
 def build_ballistic(t: Types, acceleration, dragging: bool) -> SimpleNamespace:
     """Flight of the payload alone: in closed form in still, thin air, by RK4 under drag.
 
@@ -120,22 +146,11 @@ def build_ballistic(t: Types, acceleration, dragging: bool) -> SimpleNamespace:
     if not dragging:
         return SimpleNamespace(time_to_height=closed_time, after=closed_after, clearance=closed_clearance)
 
+    step = build_step_in_flight(t, acceleration)
+
     @wp.func
     def fly(rope: Rope, air: Air, pos_w: vec3, vel_w: vec3, gravity: real, h: real):
-        """One RK4 step of h seconds."""
-        half = real(0.5) * h
-        g = vec3(real(0.0), real(0.0), -gravity)
-        a1 = acceleration(rope, air, vel_w, g)
-        v2 = vel_w + half * a1
-        a2 = acceleration(rope, air, v2, g)
-        v3 = vel_w + half * a2
-        a3 = acceleration(rope, air, v3, g)
-        v4 = vel_w + h * a3
-        a4 = acceleration(rope, air, v4, g)
-        sixth = h / real(6.0)
-        two = real(2.0)
-        pos = pos_w + sixth * (vel_w + two * v2 + two * v3 + v4)
-        return pos, vel_w + sixth * (a1 + two * a2 + two * a3 + a4)
+        return step(rope, air, pos_w, vel_w, vec3(real(0.0), real(0.0), -gravity), h)
 
     @wp.func
     def after(rope: Rope, air: Air, pos_w: vec3, vel_w: vec3, gravity: real, time: real):

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 from visthrow.common.arguments import add_common, add_out
-from visthrow.common.errors import ConfigError
 from visthrow.common.workers import status
 
 TARGETS = (1.5, 2.0, 2.5)
@@ -60,20 +59,18 @@ def run(args: argparse.Namespace) -> int:
     """Plan, throw, print, write."""
     from visthrow.baseline import thrower
     from visthrow.cli import compare
-    from visthrow.common.errors import suggest
     from visthrow.common.storage import writable
     from visthrow.evidence.report import baseline_units, result_set, trade
     from visthrow.evidence.report.throws import SHORT
     from visthrow.throws import results
-    from visthrow.throws.plants import PLANTS
+    from visthrow.throws.plants import known_plant
     from visthrow.training.device import cores
     from visthrow.view import page
     from visthrow.view.parts import Section
 
     compare.check(args.targets, args.throws)
     for plant in args.plants:
-        if plant not in PLANTS:
-            raise ConfigError(f"no plant '{plant}'; {suggest(plant, PLANTS)}")
+        known_plant(plant)
     out, bounds = Path(args.out), baseline_units.BOUNDS[args.payload_bounds]
     writable(out)
     if args.quick:

@@ -58,13 +58,11 @@ def run(args: argparse.Namespace) -> int:
         return _from_runs(args)
     check(args.targets, args.throws)
     from visthrow.baseline.thrower import NAME
-    from visthrow.common.errors import suggest
     from visthrow.throws.loading import load_policy, unique_names
-    from visthrow.throws.plants import PLANTS
+    from visthrow.throws.plants import known_plant
     from visthrow.training.device import resolve
 
-    if args.plant not in PLANTS:
-        raise ConfigError(f"no plant '{args.plant}'; {suggest(args.plant, PLANTS)}")
+    known_plant(args.plant)
     wanted = args.policies or DEFAULT_POLICIES
     loaded = [load_policy(name, args.config, args.overrides, args.allow) for name in wanted if name != NAME]
     writable(Path(args.out))
@@ -82,15 +80,23 @@ def run(args: argparse.Namespace) -> int:
     entries = entries_of(loaded, unique_names(loaded), throws)
     if NAME in wanted:
         entries += throw_baseline(args)
+    departures = {item.name: item.departures for item in loaded if item.departures}
     title, rows = title_of(args.plant, args.seed) + departures_note(loaded), rows_of(entries)
-    print(report(title, rows))
-    for path in write(Path(args.out), entries, rows, args.plant, title):
+    told = {"plant": args.plant, "seed": args.seed, "rows": rows, "departures": departures}
+    return _tell(args, entries, rows, told, title)
+
+
+def _tell(
+    args: argparse.Namespace, entries: Sequence[Entry], rows: Sequence[dict], told: dict, title: str, *more: str | None
+) -> int:
+    """Print and write a table; ``told`` is its JSON, ``more`` subtitle and note of :func:`write`."""
+    from visthrow.common.storage import write_json
+
+    print(report(title, rows, *more[1:]))
+    for path in write(Path(args.out), entries, rows, told["plant"], title, *more):
         print(path)
     if args.json:
-        from visthrow.common.storage import write_json
-
-        departures = {item.name: item.departures for item in loaded if item.departures}
-        write_json(args.json, {"plant": args.plant, "seed": args.seed, "rows": rows, "departures": departures})
+        write_json(args.json, told)
     return 0
 
 
@@ -100,7 +106,6 @@ def _from_runs(args: argparse.Namespace) -> int:
     Raises:
         ConfigError: policies were named as well.
     """
-    from visthrow.common.storage import write_json
     from visthrow.throws import from_runs
 
     if args.policies:
@@ -111,12 +116,8 @@ def _from_runs(args: argparse.Namespace) -> int:
     rows = [row for row in rows_of(entries) if row["throws"]]
     how = ", ".join(sorted({log.meta["plant_meaning"] for log in logs}))
     title = f"Throws from hover on {how}: {len(logs)} throws of {len(args.runs)} runs"
-    print(report(title, rows, from_runs.NOTE))
-    for path in write(Path(args.out), entries, rows, "runs", title, f"{len(logs)} throws of HIL runs", from_runs.NOTE):
-        print(path)
-    if args.json:
-        write_json(args.json, {"plant": "runs", "runs": args.runs, "rows": rows})
-    return 0
+    told = {"plant": "runs", "runs": args.runs, "rows": rows}
+    return _tell(args, entries, rows, told, title, f"{len(logs)} throws of HIL runs", from_runs.NOTE)
 
 
 def entries_of(loaded: Sequence, names: Sequence[str], throws: Sequence[Sequence]) -> list[Entry]:

@@ -82,15 +82,13 @@ def throw(args: argparse.Namespace) -> int:
         VisthrowError: no throws, no such plant, or a policy that sees no keypoints.
     """
     from camera.scenes.scene import Nuisances
-    from visthrow.common.errors import suggest
     from visthrow.throws.loading import load_policy
-    from visthrow.throws.plants import PLANTS
+    from visthrow.throws.plants import known_plant
     from visthrow.throws.reference_protocol import Job, fly_batch
     from visthrow.training.protocol import Throws
     from visthrow.view.eyes import Eyes
 
-    if args.plant not in PLANTS:
-        raise VisthrowError(f"no plant '{args.plant}'; {suggest(args.plant, PLANTS)}")
+    known_plant(args.plant)
     loaded = load_policy(args.policy, None, args.overrides)
     if args.throws < 1 or loaded.policy.contract["observation"]["layout"] != "vision":
         raise VisthrowError(f"--throws {args.throws} with policy '{loaded.name}'; expected 1 or more, and a vision policy")

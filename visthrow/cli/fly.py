@@ -56,15 +56,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Fly, write, tell."""
-    from visthrow.common.errors import ConfigError, suggest
+    from visthrow.common.errors import ConfigError
     from visthrow.common.storage import writable, write_json
     from visthrow.throws.loading import load_policy
-    from visthrow.throws.plants import PLANTS
+    from visthrow.throws.plants import known_plant
     from visthrow.throws.recorded import check_goal, fly
     from visthrow.training.device import resolve
 
-    if args.plant not in PLANTS:
-        raise ConfigError(f"no plant '{args.plant}'; {suggest(args.plant, PLANTS)}")
+    known_plant(args.plant)
     if len(args.target) > 2:
         raise ConfigError(f"--target {' '.join(f'{x:g}' for x in args.target)}; expected a distance, or x and y")
     for path in args.export:

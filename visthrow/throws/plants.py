@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -23,6 +23,17 @@ PLANTS = {
     "reference-realistic": "the realistic reference plant",
 }
 """Name -> what pictures call it."""
+
+
+def known_plant(name: str) -> str:
+    """Return a name of :data:`PLANTS`.
+
+    Raises:
+        ConfigError: no plant of that name.
+    """
+    if name not in PLANTS:
+        raise ConfigError(f"no plant '{name}'; {suggest(name, PLANTS)}")
+    return name
 
 
 BODIES = ("pos_w", "quat_wb", "vel_w", "rate_b", "cable_dir_w", "cable_vel_w")
@@ -276,30 +287,14 @@ class ReferenceAdapter:
         level, still = np.tile([0.0, 0.0, 0.0, 1.0], (self.count, 1)), np.zeros((self.count, 3))
         self._plant.reset(pos_w, level, still, still, cable_dir_w)
 
-    @property
-    def time(self) -> float:
-        """Since the reset [s]."""
-        return self._plant.time
-
-    def step(self, command: np.ndarray, release: np.ndarray | bool = False) -> None:
-        self._plant.step(command, release)
-
-    @property
-    def state(self) -> Snapshot:
-        return self._plant.state
+    def __getattr__(self, name: str) -> Any:
+        """``time``, ``step``, ``state`` and ``landing`` are the plant's own."""
+        return getattr(self._plant, name)
 
     def measured(self) -> Snapshot:
-        self._sample = self._plant.measured()
-        return self._sample
-
-    @property
-    def sample(self) -> Snapshot:
-        """See `Plant`; the plant's latency is that of whole samples."""
-        return self._sample
-
-    @property
-    def landing(self) -> Landings:
-        return self._plant.landing
+        """The plant's latency is that of whole samples: what is told is the sample itself."""
+        self.sample = self._plant.measured()
+        return self.sample
 
 
 def make_plant(name: str, experiment: Experiment, count: int = 1, seed: int = 0, device: str = "cpu") -> Plant:
@@ -308,11 +303,9 @@ def make_plant(name: str, experiment: Experiment, count: int = 1, seed: int = 0,
     Raises:
         ConfigError: no plant of that name.
     """
-    if name == "hybrid":
+    if known_plant(name) == "hybrid":
         return HybridPlant(experiment, count, seed, device, experiment.task.noise, experiment.task.observation.latency)
-    if name in PLANTS:
-        return ReferenceAdapter(experiment, count, seed, realistic=name == "reference-realistic")
-    raise ConfigError(f"no plant '{name}'; {suggest(name, PLANTS)}")
+    return ReferenceAdapter(experiment, count, seed, realistic=name == "reference-realistic")
 
 
 def _late(states: Sequence[Snapshot], age: np.ndarray) -> Snapshot:

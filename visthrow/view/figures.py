@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -59,6 +60,20 @@ class Trade:
 
 def _look(series: int) -> tuple[str, str]:
     return style.COLOURS[series % len(style.COLOURS)], style.MARKERS[series % len(style.MARKERS)]
+
+
+def _axes(count: int, columns: int, width: float, height: float, more: float, sharex: bool = False) -> tuple[Any, Any]:
+    """A figure so wide [inch] with axes for ``count`` panels, each row so high, and some room more."""
+    style.use()
+    import matplotlib.pyplot as plt
+
+    rows = -(-count // columns)
+    figure, axes = plt.subplots(
+        rows, columns, figsize=(width, height * rows + more), layout="constrained", squeeze=False, sharex=sharex, sharey=True
+    )
+    for axis in axes.flat[count:]:
+        axis.set_visible(False)
+    return figure, axes
 
 
 def marks(rows: Sequence[Mark], xlabel: str, series: Sequence[str], zero: float | None = None, log: bool = False) -> bytes:
@@ -122,18 +137,12 @@ def scatter(panels: Sequence[tuple[str, Sequence[tuple[str, np.ndarray]]]], colu
         panels: title and, for each colour, its label and misses (N, 2) [m]: along the throw, to the left.
         columns: panels side by side. heading: above all of them.
     """
-    style.use()
-    import matplotlib.pyplot as plt
-
-    columns = min(columns, len(panels))
-    rows = -(-len(panels) // columns)
     far = max((np.abs(points).max() for _, series in panels for _, points in series if len(points)), default=0.2)
     half = float(np.clip(1.06 * far, 0.12, 0.7))
+    columns = min(columns, len(panels))
     size = WIDTH / max(columns, 3)
-    room = (max(size * columns, 6.4), size * rows + 1.1) if heading else (size * columns, size * rows + 0.8)
-    figure, axes = plt.subplots(rows, columns, figsize=room, layout="constrained", squeeze=False, sharex=True, sharey=True)
-    for axis in axes.flat[len(panels) :]:
-        axis.set_visible(False)
+    wide, more = (max(size * columns, 6.4), 1.1) if heading else (size * columns, 0.8)
+    figure, axes = _axes(len(panels), columns, wide, size, more, sharex=True)
     for axis, (title, series) in zip(axes.flat, panels):
         _target(axis, half)
         for i, (label, points) in enumerate(series):
@@ -184,12 +193,7 @@ def _landings(axis, points: np.ndarray, half: float, series: int, label: str) ->
 
 def trades(panels: Sequence[Trade]) -> bytes:
     """Agility against accuracy, a panel a plant; lines join the settings that no other one beats."""
-    style.use()
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(
-        1, len(panels), figsize=(WIDTH, 5.2), layout="constrained", sharex=True, sharey=True, squeeze=False
-    )
+    figure, axes = _axes(len(panels), len(panels), WIDTH, 5.2, 0.0, sharex=True)
     labels: dict[str, object] = {}
     for axis, panel in zip(axes[0], panels):
         for series, label, points in panel.fronts:
@@ -222,17 +226,8 @@ def trades(panels: Sequence[Trade]) -> bytes:
 
 def curves(panels: Sequence[Panel], ylabel: str, columns: int = 3, log: bool = False) -> bytes:
     """Curves with bands of their intervals, one scale for all panels; a ring marks the policy's own value."""
-    style.use()
-    import matplotlib.pyplot as plt
-
     columns = min(columns, len(panels))
-    rows = -(-len(panels) // columns)
-    figure, axes = plt.subplots(
-        rows, columns, figsize=(WIDTH if columns > 1 else 0.62 * WIDTH, 2.75 * rows + 0.4), layout="constrained", squeeze=False,
-        sharey=True,
-    )  # fmt: skip
-    for axis in axes.flat[len(panels) :]:
-        axis.set_visible(False)
+    figure, axes = _axes(len(panels), columns, WIDTH if columns > 1 else 0.62 * WIDTH, 2.75, 0.4)
     labels: dict[str, object] = {}
     for axis, panel in zip(axes.flat, panels):
         for line in panel.lines:
@@ -266,16 +261,7 @@ def _curve(axis, line: Line):
 
 def learning(groups: Sequence[tuple[str, Sequence[np.ndarray]]]) -> bytes:
     """Landing error over training: a panel a group, each run its environment steps (N,) and errors (N,) as rows."""
-    style.use()
-    import matplotlib.pyplot as plt
-
-    columns = min(6, len(groups))
-    rows = -(-len(groups) // columns)
-    figure, axes = plt.subplots(
-        rows, columns, figsize=(WIDTH, 1.5 * rows + 0.3), layout="constrained", squeeze=False, sharex=True, sharey=True
-    )
-    for axis in axes.flat[len(groups) :]:
-        axis.set_visible(False)
+    figure, axes = _axes(len(groups), min(6, len(groups)), WIDTH, 1.5, 0.3, sharex=True)
     for axis, (title, runs) in zip(axes.flat, groups):
         for i, run in enumerate(runs):
             axis.plot(run[0] / 1e6, run[1], color=style.COLOURS[i % len(style.COLOURS)], lw=1.2)

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from visthrow.common.errors import ConfigError, suggest
-from visthrow.throws.plants import PLANTS
+from visthrow.throws.plants import known_plant
 
 
 @dataclass(frozen=True)
@@ -20,8 +20,7 @@ class ThrowParams:
     allow: tuple[str, ...] = ()  # parts of the policy's contract that may be broken so; recorded as departures
 
     def __post_init__(self) -> None:
-        if self.plant not in PLANTS:
-            raise ConfigError(f"no plant '{self.plant}'; {suggest(self.plant, PLANTS)}")
+        known_plant(self.plant)
         if self.count < 1 or not self.targets:
             raise ConfigError(f"{self.count} throws at the targets {self.targets}; expected 1 or more of each")
 
