@@ -100,6 +100,7 @@ def fly(args: argparse.Namespace) -> int:
         runner, source, clock, Lander(operator, runner.calibrating) if calibrates else operator, recorder,
         args.seconds or float("inf"), voice.decision, stages, eyes, solver,
     )  # fmt: skip
+    summary["speed"] = args.speed
     summary["autopilot"] = autopilot_record(backend, link)
     summary["links"] = [one.roster.summary() for one in source.links]
     _close(eyes, solver, backend, source)
@@ -109,7 +110,7 @@ def fly(args: argparse.Namespace) -> int:
     voice.close()
     _show(summary_text(summary, folder))
     if not args.bare:
-        _show("\n".join(finish(folder, stages)))
+        _show("\n".join(finish(folder, stages, args.speed)))
     if summary["aborted"] or summary["errors"]:
         with contextlib.suppress(RunError):
             _show(f"{pack(folder)}  the run in one file: `visthrow hil replay` says where it went wrong")

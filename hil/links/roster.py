@@ -236,7 +236,7 @@ class Roster:
         """Who was heard from where, and what was refused, most first."""
         refused = sorted(((n, seen) for seen, n in self.seen.items() if seen.why or seen is OTHERS), key=lambda row: -row[0])
         return {
-            "at": {name: shown(address) for name, address in self.at.items()},
+            "at": {name: shown(address) for name, address in self.at.items()}, "simulated": self.simulated,
             "refused": self.refused,
             "refused_most": [{"count": n, "what": seen.text()} for n, seen in refused[:MOST_SAID]],
         }

@@ -19,7 +19,7 @@ from hil.errors import RunError
 from hil.params import HilParams
 from hil.poses.pose import GOAL, PAYLOAD, VEHICLE, Pose
 from hil.recording.playback import Playback, Sample
-from hil.recording.record import PROVENANCE, load_run
+from hil.recording.record import PROVENANCE, SUMMARY, load_run
 from visthrow import config
 from visthrow.common.rotations import matrix_of_quat
 from visthrow.logs.flightlog import FlightLog, FlightRecorder
@@ -106,12 +106,18 @@ def read(folder: str | Path) -> Course:
     if not lines:
         raise RunError(f"{folder}: the run ended before its first tick; there is nothing to show")
     playback = Playback(params, policy)
-    try:
-        provenance = json.loads((folder / PROVENANCE).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        provenance = {}
+    provenance = _known(folder / PROVENANCE)
+    provenance["simulated"] = any(link.get("simulated") for link in _known(folder / SUMMARY).get("links", []))
     ticks = [tick_of(playback, line, poses.get(line["n"], [])) for line in lines]
     return Course(folder, params, playback, ticks, provenance)
+
+
+def _known(path: Path) -> dict[str, Any]:
+    """What a file of a run says; nothing where the run was killed before it was written whole."""
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
 
 
 class Samples:
@@ -188,10 +194,11 @@ def meta_of(params: HilParams, playback: Playback, provenance: dict[str, Any], s
     """What is known of a run from its beginning on; ``start`` [s] is the zero of its pictures."""
     policy = playback.runner.pilot.policy
     goal_w = playback.runner.seen_goal_w or params.goal_w
+    simulated = ", of a simulated vehicle" if provenance.get("simulated") else ""
     return {
         "policy": provenance.get("policy", Path(params.policy).stem), "policy_sha256": provenance.get("policy_sha256"),
         "layout": policy.contract["observation"]["layout"], "plant": "poses", "seed": None,
-        "plant_meaning": f"poses of {params.source.kind}, back-end {params.backend}", "goal_w": list(goal_w),
+        "plant_meaning": f"poses of {params.source.kind}, back-end {params.backend}{simulated}", "goal_w": list(goal_w),
         "home_w": list(params.home_w), "states": list(STATES), "config": config.to_dict(params), "provenance": provenance,
         "times": {"policy_start": start}, "result": {"success": False, "failure": None}, "events": [],
     }  # fmt: skip

@@ -21,6 +21,8 @@ STAGES = {
     "ack": "from the release command to its answer",
 }
 """Stage -> what it is, in the order of the report."""
+OF_CLOCK = ("transport", "arrival", "late", "ack")
+"""Stages between two readings of the run's clock, which ``--speed`` slows; the others are taken in real time."""
 
 LEAST, GROWTH, BINS = 1e-6, 1.01, 1640
 """Lower edge of the first bin [s], ratio of two edges, number of bins: up to 12 s, within 1 per cent."""
@@ -92,13 +94,18 @@ class Stages:
         return {name: stage.summary() for name, stage in self.stages.items()}
 
 
-def table(latency: dict[str, dict[str, float]]) -> list[str]:
+def slowed(speed: float) -> str:
+    """Whose milliseconds they are, where the run's clock is not real time; else nothing."""
+    return "" if speed == 1.0 else f"; {', '.join(OF_CLOCK)}: by the run's clock, at {speed:g} of real time"
+
+
+def table(latency: dict[str, dict[str, float]], speed: float = 1.0) -> list[str]:
     """Lines of a report: a stage a line.
 
     Args:
-        latency: of :meth:`Stages.summary`.
+        latency: of :meth:`Stages.summary`. speed: of the run's clock.
     """
-    lines = [f"{'stage':11}     p50     p95     p99     max [ms]"]
+    lines = [f"{'stage':11}     p50     p95     p99     max [ms]{slowed(speed)}"]
     for name, values in latency.items():
         if values:
             numbers = "".join(f" {values[k]:7.3f}" for k in ("p50_ms", "p95_ms", "p99_ms", "max_ms"))
@@ -126,7 +133,7 @@ def draw(path: str | Path, stages: Stages, title: str) -> None:
 
     shown = {name: stage for name, stage in stages.stages.items() if stage.counts.any()}
     rows = max(len(shown), 1)
-    figure, axes = plt.subplots(rows, 1, figsize=(8.6, 0.9 + 0.78 * rows), sharex=True, squeeze=False)
+    figure, axes = plt.subplots(rows, 1, figsize=(8.6, 0.9 + 0.88 * rows), sharex=True, squeeze=False)
     for axis, (name, stage) in zip(axes[:, 0], shown.items()):
         _histogram(axis, name, stage)
     axes[-1, 0].set_xscale("log")
@@ -149,5 +156,6 @@ def _histogram(axis: Any, name: str, stage: Stage) -> None:
         axis.axvline(1e3 * stage.percentile(share), color=style.INK, lw=0.8)
     axis.plot(1e3 * max(stage.most, LEAST), 0.0, "v", color=style.COLOURS[1], ms=7, clip_on=False, zorder=4)
     axis.set_ylabel(name, rotation=0, ha="right", va="center")
+    axis.set_title(STAGES[name], loc="left", fontsize=8.0, pad=2.0)
     axis.set_yticks([])
     axis.spines["left"].set_visible(False)

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from hil.recording.flightlogs import read, throws, whole
-from hil.recording.latency import Stages, draw, table
+from hil.recording.latency import Stages, draw, slowed, table
 from visthrow.common.errors import VisthrowError
 from visthrow.logs.flightlog import FlightLog
 from visthrow.onboard.calibration import Calibration
@@ -38,7 +38,7 @@ def summary_text(summary: dict[str, Any], folder: Path) -> str:
             lines.append(f"refused on the link: {link['refused']} messages, most often {link['refused_most'][0]['what']}")
     ours = summary["missed_ours"]
     lines.append(f"ticks {summary['ticks']}, missed {summary['missed']}, {ours} of them by taking too long ourselves")
-    lines += table(summary["latency"])
+    lines += table(summary["latency"], summary.get("speed", 1.0))
     lines += [f"error: {text.strip().splitlines()[-1]}" for text in summary["errors"]]
     return "\n".join([*lines, f"{folder}  the run; `visthrow hil replay {folder}` runs it again"])
 
@@ -48,12 +48,13 @@ def throw_path(folder: Path, number: int, ending: str) -> Path:
     return folder / f"throw-{number:02d}{ending}"
 
 
-def finish(folder: str | Path, stages: Stages | None = None) -> list[str]:
+def finish(folder: str | Path, stages: Stages | None = None, speed: float = 1.0) -> list[str]:
     """Write latency picture, and a flight log and picture a throw; of a run without throws one log of all of it.
 
     Args:
         folder: of a run that is over.
         stages: its times; None where they are not at hand.
+        speed: of the run's clock.
 
     Returns:
         Lines that say what was written, and what could not be.
@@ -61,7 +62,7 @@ def finish(folder: str | Path, stages: Stages | None = None) -> list[str]:
     folder, said = Path(folder), []
     try:
         if stages is not None:
-            draw(folder / LATENCY_PICTURE, stages, f"Times of each stage, run {folder.name}")
+            draw(folder / LATENCY_PICTURE, stages, f"Times of each stage, run {folder.name}{slowed(speed)}")
             said.append(f"{folder / LATENCY_PICTURE}  times of each stage")
         course = read(folder)
         if not course.throws:

@@ -77,8 +77,8 @@ def suggest(name: str, known: Iterable[str]) -> str:
     if not names:
         return "nothing is known here"
     close = get_close_matches(name, names, n=1)
-    if close and len(names) > MANY:
+    listed, known = ", ".join(names), "known"
+    if len(names) > MANY:
         near = get_close_matches(name, names, n=5, cutoff=0.0)
-        return f"did you mean '{close[0]}'? Near it: {', '.join(near)}; {len(names) - len(near)} more exist"
-    listed = ", ".join(names)
-    return f"did you mean '{close[0]}'? Known: {listed}" if close else f"known: {listed}"
+        listed, known = f"{', '.join(near)}; {len(names) - len(near)} more exist", "near it"
+    return f"did you mean '{close[0]}'? {known.capitalize()}: {listed}" if close else f"{known}: {listed}"

@@ -36,10 +36,9 @@ def turn_of(axes: str) -> np.ndarray:
     """
     matrix = matrix_of(axes)
     if is_mirror(axes):
-        raise ValueError(
-            f"axes '{axes}' mirror the world: no rotation turns them into ours; turn one sign or exchange two letters. "
-            f"The 24 turns: {' '.join(TURNS)}"
-        )
+        signs = [np.where(np.arange(3) == row, -1.0, 1.0)[:, None] * matrix for row in range(3)]
+        near = " ".join(next(name for name, known in zip(EVERY, MATRICES) if np.array_equal(known, one)) for one in signs)
+        raise ValueError(f"axes '{axes}' mirror the world: no rotation turns them into ours; expected one sign less or more: {near}")
     return matrix
 
 

@@ -2,6 +2,7 @@
 
 import json
 import math
+import shutil
 import subprocess
 import sys
 import threading
@@ -104,6 +105,16 @@ def test_a_run_without_a_throw_is_logged_as_a_whole(tmp_path):
     log = FlightLog.load(tmp_path / "a" / "flight.npz")
     assert len(log["pos_w"].time) == len(log["payload_pos_w"].time) > 50
     assert log.meta["events"][-1][1] == "check"
+
+
+def test_the_log_says_where_nothing_real_flew(run, logs, tmp_path):
+    """A run at `visthrow hil fake` is not taken for one of a vehicle."""
+    assert logs[0].meta["plant_meaning"] == "poses of mavlink, back-end dry-run"
+    shutil.copytree(run[0], tmp_path / "a")
+    path = tmp_path / "a" / "summary.json"
+    summary = json.loads(path.read_text())
+    path.write_text(json.dumps({**summary, "links": [{"simulated": False}, {"simulated": True}]}))
+    assert throws(read(tmp_path / "a"))[0].meta["plant_meaning"].endswith("of a simulated vehicle")
 
 
 def test_a_killed_run_and_no_run(tmp_path):

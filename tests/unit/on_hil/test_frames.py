@@ -39,8 +39,9 @@ def test_there_are_24_turns_and_24_mirrors_are_refused():
         for signs in product(("", "-"), repeat=3)
     }
     for axes in every - set(AXES):
-        with pytest.raises(FrameError, match="mirror the world"):
+        with pytest.raises(FrameError, match="mirror the world") as caught:
             rotation_of(axes)
+        assert set(str(caught.value).split(": ")[-1].split()) < set(AXES), "what it proposes are turns"
 
 
 @pytest.mark.parametrize("axes", ["x,y", "x,x,z", "a,b,c", "", "x,y,z,x", "xy,z,x", "--x,y,z", "x,,z"])

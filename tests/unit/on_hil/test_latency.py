@@ -6,6 +6,7 @@ import pytest
 
 from hil.poses.pose import PAYLOAD, VEHICLE, Pose
 from hil.recording.latency import STAGES, Stage, Stages, draw, table
+from visthrow.view import parts
 
 BIN = 0.011
 """Relative width of a bin and a little: what a percentile may be off."""
@@ -43,7 +44,9 @@ def test_transport_is_counted_from_the_fastest_pose_and_starts_anew_at_a_step():
     assert stages.poses([pose(5.0, 100.06, PAYLOAD), pose(float("nan"), 100.06)], 100.07) == {}
 
 
-def test_report_and_picture(tmp_path):
+def test_report_and_picture(tmp_path, monkeypatch):
+    figures, png_of = [], parts.png_of
+    monkeypatch.setattr(parts, "png_of", lambda figure: figures.append(figure) or png_of(figure))
     stages, rng = Stages(), np.random.default_rng(0)
     for _ in range(500):
         stages.add({name: float(x) for name, x in zip(("poll", "observation", "total"), rng.gamma(4.0, 1e-4, 3))})
@@ -54,4 +57,7 @@ def test_report_and_picture(tmp_path):
     picture = cv2.imread(str(tmp_path / "latency.png"))
     assert picture.shape[1] > 1000
     assert np.ptp(picture) > 200
+    assert all(word not in lines[0] for word in ("clock", "real"))
+    assert "transport, arrival, late, ack: by the run's clock, at 0.2 of real time" in table(stages.summary(), 0.2)[0]
+    assert [axis.get_title("left") for axis in figures[0].axes] == [STAGES[name] for name in ("poll", "observation", "total")]
     draw(tmp_path / "empty.png", Stages(), "nothing flown")

@@ -152,3 +152,4 @@ def test_a_fake_says_that_it_is_one():
     assert not who.simulated
     who.admit(word, A, 0.1)
     assert who.simulated
+    assert who.summary()["simulated"]
