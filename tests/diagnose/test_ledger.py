@@ -1,6 +1,8 @@
 """The statistics of ledgers, on worlds made up so that the answer is known."""
 
+import json
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -94,6 +96,54 @@ def test_limits_stand_in_the_unit_in_which_they_are_asked_for_and_worlds_with_a_
     assert rows["rope_length"][-1].startswith("too few worlds")
     ledger.draw(worlds, tmp_path / "completeness.png")
     assert (tmp_path / "completeness.png").stat().st_size > 10_000
+
+
+SHIPPED = {name: [json.loads(line) for line in (Path(__file__).parent / name).read_text().splitlines()]
+           for name in ("ledger.jsonl", "ledger-earlier.jsonl")}  # fmt: skip
+TRUST = (Path(__file__).parents[2] / "docs" / "explanation" / "diagnosis_trust.md").read_text().split("## Hidden worlds")[1].split("\n## ")[0]
+KINDS = {
+    "nothing; noise": "null", "one effect, 15": "1x15", "one effect, 10 floors |": "1x10", "one effect, 6": "1x6", "one effect, 3": "curve",
+    "a delay": "limit:cmd_delay", "thrust, off": "limit:thrust_gain", "two effects": "2x12", "three effects": "3x12", "a law": "law",
+    "1 to 15 floors": "sight", "nothing, and some": "null+dust", "one effect, 10 floors, and": "1x10+dust",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("begins", "kind"), KINDS.items())
+def test_the_page_says_what_the_shipped_ledger_says(begins, kind):
+    """Worlds, found, names up to class, exact, more names than causes: cell by cell; none is left out of any row."""
+    group = [w for w in ledger.answered(SHIPPED["ledger.jsonl"]) if w["kind"] == kind]
+    (row,) = [line for line in TRUST.splitlines() if line.startswith(f"| {begins}")]
+    cells = [cell.strip() for cell in row.strip("|").split("|")][1:]
+    given, right, exact, found = np.sum([ledger.names(w) for w in group], axis=0)
+    hidden = sum(len(ledger.truth_of(w)) for w in group)
+    more = sum(ledger.names(w)[0] > len(ledger.truth_of(w)) for w in group)
+    quiet = sum(w["overall"] == "NO EFFECT" for w in group)
+    if kind == "law":
+        ranks = [(w["laws"] + [None])[:3] for w in group]
+        terms = [sealed.TERMS[next(iter(w["recipe"]["effects"]))] for w in group]
+        first, among = sum(r[0] == t for r, t in zip(ranks, terms)), sum(t in r for r, t in zip(ranks, terms))
+        expected = [f"UNKNOWN in {len(group)}", f"true term first in {first}, among three in {among}", "-", "wrong names beside it in one [0, 5]"]
+        assert [w.get("unknown") for w in group] == [True] * len(group)
+        assert more == 1
+    elif hidden:
+        total = f" of {hidden}" if kind in ("2x12", "3x12") else ""
+        expected = [f"{found}{total}", f"{right} of {given}", str(exact), str(more)]
+    else:
+        expected = ["-", f"NO EFFECT in {quiet}", "-", str(more)]
+    assert cells[0] == str(len(group))
+    assert [cell.replace(" [99, 100]", "") for cell in cells[1:]] == expected
+
+
+def test_the_page_says_what_the_ledgers_intervals_hold_and_whose_worlds_are_counted():
+    kept = SHIPPED["ledger.jsonl"]
+    for group in ([w for w in kept if not ledger.dusty(w)], [w for w in kept if ledger.dusty(w)]):
+        (line,) = [line for line in ledger.coverage(group) if line.startswith("- 95")]
+        assert line.split(": ")[1].replace("/", " of ") in TRUST
+    before = [w for w in SHIPPED["ledger-earlier.jsonl"] if w["commit"] == "88f7402"]
+    counts = {name: len(size) for name, (size, _) in ledger.singles(ledger.answered(kept + before)).items()}
+    assert f"over {sum(counts.values())} worlds with one effect" in TRUST
+    assert f"| rope length | 1.6 mm | {counts['rope_length']} |" in TRUST
+    assert f"| thrust | 0.99 % [0.94, 1.1] | {counts['thrust_gain']} |" in TRUST
 
 
 def test_names_are_counted_up_to_class_and_alone():

@@ -1,0 +1,58 @@
+"""Follow pages to the letter, as a stranger does: every block as it is shown, nothing added, nothing reused, processes of their own.
+
+    python -m tests.pages.follow docs/howto/rope.md docs/howto/report.md    # from the root of a clone, its environment active
+
+It prints minutes a block and a page, beside the processor's. What is marked with a reason of :data:`LEFT` is not followed.
+"""
+
+import argparse
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from tests.pages.blocks import Block, blocks_of
+
+LEFT = {"a GPU", "a vehicle", "a motion-capture hall", "a camera", "an autopilot's firmware", "flights of yours", "hours", "a cluster",
+        "it installs software", "it opens a window", "many minutes"}  # fmt: skip
+"""Reasons for which a stranger with two cores and ten minutes skips a block, too."""
+
+
+def follow(block: Block) -> bool:
+    """Do what a block says, in the working folder; returns whether all went well."""
+    if block.title:
+        Path(block.title).write_text(block.text, encoding="utf-8")
+        return True
+    if block.language == "python":
+        return subprocess.run([sys.executable, "-c", block.text]).returncode == 0
+    if block.language != "sh":
+        return True
+    lines = block.text.replace("\\\n", " ").splitlines() if block.terminals else [block.text]
+    shells = [subprocess.Popen(["bash", "-ec", line]) for line in lines if line.strip()]
+    return not any([shell.wait() for shell in shells])
+
+
+def main() -> int:
+    """Follow the pages that are named; returns 1 where one stumbles."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("pages", nargs="+", type=Path)
+    parser.add_argument("--with", dest="reasons", action="append", default=[], choices=sorted(LEFT), help="follow these all the same")
+    args, rows = parser.parse_args(), []
+    for page in args.pages:
+        begin, spent, stumbled = time.perf_counter(), sum(os.times()[2:4]), []
+        for block in blocks_of(page.resolve(), Path.cwd()):
+            start = time.perf_counter()
+            if block.reason in LEFT - set(args.reasons):
+                continue
+            if not follow(block):
+                stumbled.append(block.place)
+            print(f"-- {block.place}: {time.perf_counter() - start:.1f} s", flush=True)
+        wall, own = time.perf_counter() - begin, sum(os.times()[2:4]) - spent
+        rows.append(f"{page}: {wall / 60:.1f} min, {own / 60:.1f} of a processor; " + (f"STUMBLED at {stumbled}" if stumbled else "well"))
+    print(*rows, sep="\n")
+    return int("STUMBLED" in "".join(rows))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
