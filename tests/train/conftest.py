@@ -5,11 +5,18 @@ import os
 import pytest
 
 from visthrow import cli
+from visthrow.training import trainer
 
 
 @pytest.fixture(autouse=True)
 def same_bits(one_thread):
     """The same bits need the same number of threads."""
+
+
+@pytest.fixture(autouse=True)
+def few_throws(monkeypatch):
+    """An evaluation throws 20 times for 200: that it is made, written and printed does not hang on how many."""
+    monkeypatch.setattr(trainer, "EVALUATED", 20)
 
 
 @pytest.fixture

@@ -125,10 +125,12 @@ def test_a_process_that_is_killed_goes_on_bit_for_bit(whole, tmp_path):
 
 def test_minutes_leave_a_policy(tmp_path, capsys):
     folder = tmp_path / "run"
-    assert train(folder, "--minutes", "1e-6") == 130
+    assert train(folder, "--minutes", "1e-6") == 0, "what was asked for was done: a script goes on"
     assert iterations_of(folder) == [1]
     assert Policy.load(folder / "policy.npz").made_by["figures"]["iterations"] == 1
-    assert "success" not in capsys.readouterr().out
+    told = capsys.readouterr()
+    assert "success" not in told.out
+    assert "the time is over after iteration 1 of 4; go on with: visthrow train --resume" in told.err
 
 
 def test_a_policy_is_taken_up_and_an_error_that_it_has_ends_the_run(tmp_path, capsys):

@@ -50,6 +50,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _run(args: argparse.Namespace) -> int:
+    from visthrow.common.arguments import EXIT_INTERRUPTED
     from visthrow.common.errors import ConfigError
     from visthrow.evidence.sweep.pool import Local, Pool
     from visthrow.evidence.sweep.units import load_list
@@ -77,7 +78,8 @@ def _run(args: argparse.Namespace) -> int:
         print(f"{name} failed: {reason}; all it printed is in {out / 'logs'}", file=sys.stderr)
     if outcome.stopped:
         print("stopped before the end; the same command goes on", file=sys.stderr)
-        return 130
+    if outcome.interrupted:
+        return EXIT_INTERRUPTED
     return 1 if outcome.failed else 0
 
 

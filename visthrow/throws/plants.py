@@ -123,6 +123,7 @@ class HybridPlant:
     def _begin(self) -> None:
         self.time = 0.0
         count = self.count
+        self._state: Snapshot | None = None  # since the last step; made when somebody asks
         self._latched, self._separation = np.zeros(count, bool), np.full(count, np.nan)
         self._ropes: list[LooseRope | None] = [None] * count
         bias = 0.0 if self.noise is None else self.noise.observation_bias
@@ -137,6 +138,7 @@ class HybridPlant:
             self._past = [self.state, *self._past[:-1]]
         self._sim.set_command(command if self._start is None else self._disturbed(command), release)
         self._sim.step()
+        self._state = None
         self._latched = self._latched | release
         separated = self._sim.get("separated") != 0
         landed = self.landing.landed
@@ -160,6 +162,7 @@ class HybridPlant:
         Returns:
             State arrays of bodies and ropes.
         """
+        self._state = None
         for name, value in (names or {}).items():
             getattr(self._sim.state, name).assign(value)
         return names or {name: getattr(self._sim.state, name).numpy().copy() for name in BODIES}
@@ -170,6 +173,7 @@ class HybridPlant:
 
     def stop_motors(self) -> None:
         """Let the rotors stand still."""
+        self._state = None
         self._sim.state.motor_speed.zero_()
 
     def postpone(self, time: float) -> None:
@@ -213,6 +217,11 @@ class HybridPlant:
 
     @property
     def state(self) -> Snapshot:
+        """See `Plant`; whoever asks within a period gets the same one."""
+        self._state = self._state or self._snapshot()
+        return self._state
+
+    def _snapshot(self) -> Snapshot:
         sim = self._sim
         ball, ball_vel = self._ball()
         points = sim.cable_points_w()

@@ -66,15 +66,15 @@ def run(args: Options, viewer: Viewer | None = None) -> int:
         provenance.write_run_folder(folder, config.dumps(experiment), resume=args.resume, **told)
     why = _loop(args, trainer, folder, last, viewer)
     if ranks.lead:
-        _report(args, trainer, folder, time.perf_counter() - start, finished=why != STOPPED)
+        _report(args, trainer, folder, time.perf_counter() - start, finished=why in (DONE, REACHED))
     iteration = trainer.iteration
     del trainer  # its captured graphs hold the processes' communicator
     ranks.leave()
-    if why != STOPPED:
+    if why in (DONE, REACHED):
         return 0
     words = ["visthrow train --resume", f"--out {folder}", *([f"--iterations {args.iterations}"] if args.iterations else [])]
     print(f"\n{why} after iteration {iteration} of {last}; go on with: {' '.join(words)}", file=sys.stderr)
-    return EXIT_INTERRUPTED
+    return 0 if why == OVER else EXIT_INTERRUPTED
 
 
 def _check(args: Options) -> None:
@@ -176,7 +176,7 @@ class StopRequest:
         print("\nstopping after this iteration", file=sys.stderr)
 
 
-DONE, REACHED, STOPPED = ENDS = ("finished", "reached the error that was asked for", "stopped")
+DONE, REACHED, OVER, STOPPED = ENDS = ("finished", "reached the error that was asked for", "the time is over", "stopped")
 """Why a loop ended."""
 
 
@@ -237,8 +237,9 @@ def _loop(args: Options, trainer, folder: Path, last: int, viewer: Viewer | None
                     kept = trainer.iteration
                 if args.until and throws is not None and throws.within(args.until):
                     why = REACHED
-                elif stop.asked or (args.minutes and time.perf_counter() - start > 60 * args.minutes):
-                    why = STOPPED if trainer.iteration < last else DONE
+                elif trainer.iteration < last:
+                    spent = args.minutes and time.perf_counter() - start > 60 * args.minutes
+                    why = STOPPED if stop.asked else OVER if spent else DONE
                 why = ENDS[ranks.agree(ENDS.index(why))]
             trainer.save(folder / CHECKPOINT)
     except (OSError, StorageError) as error:

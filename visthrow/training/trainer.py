@@ -23,6 +23,9 @@ CHECKPOINT, POLICY, SUMMARY, EVALUATION = "checkpoint.pt", "policy.npz", "summar
 ADAPTATION = 'ppo="ppo/adapt.toml"'
 """Override that puts the schedule of a training from a policy in the place of the configuration's own."""
 
+EVALUATED = 200
+"""Throws of an evaluation."""
+
 TASK = ("observation", "action", "control_period")
 """Parts of a policy's contract that its network cannot do without; plant, camera and release may differ from its training's."""
 
@@ -136,12 +139,13 @@ class Trainer:
         """Start from a policy that :func:`fitted` found to fit."""
         self.algorithm.take_up(policy)
 
-    def throw(self, target: float, count: int = 200, seed: int = 12345) -> protocol.Throws:
-        """Throws from hover with the current policy; see :mod:`visthrow.training.protocol`."""
+    def throw(self, target: float, count: int | None = None, seed: int = 12345) -> protocol.Throws:
+        """Throws from hover with the current policy, :data:`EVALUATED` if not said; see :mod:`visthrow.training.protocol`."""
+        count = count or EVALUATED
         policy = self.algorithm.export(contract_of(self.experiment), {}).to(self.device)
         return protocol.throw(self.experiment, policy.actor(count), target, count, self.device, seed)
 
-    def evaluate(self, target: float, count: int = 200, seed: int = 12345) -> dict[str, float]:
+    def evaluate(self, target: float, count: int | None = None, seed: int = 12345) -> dict[str, float]:
         """Summary of :meth:`throw`."""
         return self.throw(target, count, seed).summary()
 

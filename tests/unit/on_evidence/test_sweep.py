@@ -226,6 +226,7 @@ def test_the_time_limit_stops_what_runs(path, tmp_path, monkeypatch):
     monkeypatch.setattr(FakeRun, "_finish", lambda self: None)
     starter, outcome = run(path, tmp_path, minutes=0.001)
     assert outcome.stopped
+    assert not outcome.interrupted, "it was asked to end then: status 0"
     assert [r.stopped for r in starter.alive] == [True, True]
 
 

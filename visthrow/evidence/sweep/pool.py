@@ -107,6 +107,7 @@ class Outcome:
 
     failed: dict[str, str] = field(default_factory=dict)  # task -> last line of its log
     stopped: bool = False  # before everything was done
+    interrupted: bool = False  # by Ctrl-C or SIGTERM, not by the clock
 
 
 def tasks(work: Work, out: Path, done: set[str]) -> Iterator[Task]:
@@ -161,7 +162,7 @@ class Pool:
                     self._todo = list(tasks(self.work, self.out, self._done))
                 self._todo = [task for task in self._todo if task.name not in self.outcome.failed]
         except KeyboardInterrupt:
-            self.outcome.stopped = True
+            self.outcome.stopped = self.outcome.interrupted = True
         finally:
             self._stop()
         return self.outcome

@@ -80,6 +80,7 @@ def train(source: Source, out: Path, device: str, minutes: float | None, checkpo
     status = 1
     try:
         status = session.run(asked)
+        status = status if status or source.done(out) else EXIT_STOPPED  # by the clock
     finally:
         piece = {"start": began, "seconds": round(time.perf_counter() - start, 2), "status": status, "commit": provenance.commit()}
         write_json(folder / PIECES / f"{time.time_ns()}.json", {**piece, "processors": provenance.processors()})
