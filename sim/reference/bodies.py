@@ -4,7 +4,7 @@ MuJoCo C, batched by ``mujoco.batch``; integrator RK4. Other payloads are other 
 actuators of :mod:`sim.reference.model`, and a site ``payload``.
 
 MuJoCo Warp 4.0 takes the same models and ends the hard throw where C does (RK4, 0.5 ms: 0.14 mm of the ball and 0.19 mm of the
-vehicle from the fused chain); on a CPU core it compiles for 80 s and makes 26 steps a second.
+vehicle from the fused chain); on a CPU core it compiles for 80 s and makes 26 steps a second (`tests/oracle/test_seam.py`, slow).
 """
 
 from collections.abc import Sequence

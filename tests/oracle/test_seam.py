@@ -3,8 +3,10 @@
 import dataclasses
 import time
 
+import mujoco
 import numpy as np
 import pytest
+import warp as wp
 
 from sim.reference.bodies import CABLE_STEP, MujocoBodies, rope_and_ball, rope_and_box, two_cables
 from sim.seam import FusedChain, SeamSim
@@ -51,6 +53,54 @@ def test_two_solvers_agree_on_the_hard_throw():
     ours, theirs, finer = hard_throw(fused()), hard_throw(in_mujoco(5e-4)), hard_throw(in_mujoco(2.5e-4))
     for a, b, c in zip(ours, theirs, finer, strict=True):
         assert np.linalg.norm(b - c) < 0.1 * AGREE, "MuJoCo has converged"
+        assert np.linalg.norm(a - b) < AGREE
+
+
+class WarpBodies(MujocoBodies):
+    """The same bodies, stepped by MuJoCo Warp on a CPU in float32."""
+
+    def __init__(self, model, step: float) -> None:
+        super().__init__(model, step=step)
+        self.warp = pytest.importorskip("mujoco_warp", reason="pip install 'visthrow[bench]'")
+
+    def place(self, qpos, qvel) -> None:
+        super().place(qpos, qvel)
+        data = mujoco.MjData(self.model)
+        data.qpos[:], data.qvel[:] = qpos, qvel
+        mujoco.mj_forward(self.model, data)
+        with wp.ScopedDevice("cpu"):
+            self.there, self.state = self.warp.put_model(self.model), self.warp.put_data(self.model, data, nworld=1)
+
+    def advance(self, force_b, torque_b, duration) -> None:
+        with wp.ScopedDevice("cpu"):
+            self.state.ctrl.assign(np.concatenate([force_b, torque_b], axis=1).astype(np.float32))
+            for _ in range(round(duration / self.step)):
+                self.warp.step(self.there, self.state)
+        super().place(self.state.qpos.numpy(), self.state.qvel.numpy())  # whoever looks sees C's copy
+
+
+@pytest.mark.slow
+def test_mujoco_warp_ends_the_hard_throw_there_too(capsys):
+    """At its own converged step; and what it takes beside the fused chain, one vehicle on a CPU, in one run."""
+    fused_chain = fused()
+    ours, seconds, ends = hard_throw(fused_chain), {}, {}
+    for step in (5e-4, 2.5e-4):
+        bodies = WarpBodies(rope_and_ball(ROPE), step)
+        data = initial_data(bodies.model, SCENE)
+        bodies.place(data.qpos, data.qvel)
+        bodies.advance(np.zeros((1, 3)), np.zeros((1, 3)), 0.002)  # compiles
+        bodies.place(data.qpos, data.qvel)
+        start = time.perf_counter()
+        ends[step] = hard_throw(bodies)
+        seconds[step] = time.perf_counter() - start
+    start = time.perf_counter()
+    hard_throw(fused())
+    plain = time.perf_counter() - start
+    off = [1e3 * np.linalg.norm(a - b) for a, b in zip(ours, ends[5e-4], strict=True)]
+    with capsys.disabled():
+        print(f"\nMuJoCo Warp: ball {off[0]:.3f} mm, vehicle {off[1]:.3f} mm; {seconds[5e-4] / plain:.0f} times the fused chain's seconds")
+    for a, b, c in zip(ours, ends[5e-4], ends[2.5e-4], strict=True):
+        assert np.linalg.norm(b - c) < 0.1 * AGREE, "it has converged"
         assert np.linalg.norm(a - b) < AGREE
 
 
