@@ -11,7 +11,7 @@ from tests.unit.on_diagnose import test_search as searches
 from tests.worlds.world import Recipe
 from visthrow.diagnose.likelihood import designs, evidence, marginal, noise
 from visthrow.diagnose.likelihood.evidence import Priors
-from visthrow.diagnose.select import held_out, search
+from visthrow.diagnose.select import held_out, selector
 from visthrow.logs.flightlog import FlightLog
 
 pytestmark = pytest.mark.slow
@@ -20,8 +20,8 @@ pytestmark = pytest.mark.slow
 def swapped_names(monkeypatch) -> None:
     """Two effects are called by each other's names."""
     names = {"effect_03": "effect_09", "effect_09": "effect_03"}
-    plain = search.Search.name
-    monkeypatch.setattr(search.Search, "name", lambda self, j: names.get(plain(self, j), plain(self, j)))
+    plain = selector.Selector.name
+    monkeypatch.setattr(selector.Selector, "name", lambda self, j: names.get(plain(self, j), plain(self, j)))
 
 
 def no_latent_forces(monkeypatch) -> None:

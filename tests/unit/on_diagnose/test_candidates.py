@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
+from visthrow.diagnose.likelihood.evidence import Priors
 from visthrow.diagnose.select import point as points
-from visthrow.diagnose.select import result, search, unknown
-from visthrow.diagnose.select.point import fitted, linearise
+from visthrow.diagnose.select import result, search, selector
+from visthrow.diagnose.select.point import Problem, fitted, linearise
 
 EFFECTS = catalogue(12)
 NAME, SIZE = "effect_03", 10.0  # in floors
@@ -71,7 +72,7 @@ class Luckier(SyntheticModel):
 
 def test_initial_states_that_were_fitted_anew_are_no_evidence_for_the_candidate(monkeypatch):
     """Without it they explain the flights as well, which the simulation shows and derivatives do not."""
-    monkeypatch.setattr(search.Search, "_closer", lambda self, point, active: fitted(
+    monkeypatch.setattr(selector.Selector, "_settle", lambda self, point, active, doubted=None: point if doubted is None else fitted(
         self.problem, linearise(self.problem, point.theta, point.noise), active))  # fmt: skip
     model = Luckier(effects=EFFECTS, truth={NAME: 2.0}, seed=8)
     assert not search.explain(model, laws=False).named
@@ -87,30 +88,18 @@ def test_what_whips_where_nothing_is_hidden_is_not_named():
 def test_a_candidate_that_is_not_sure_where_it_leads_is_not_followed_further(begin, sure, monkeypatch):
     """Derivatives of a rope of 24 segments are a fifth of a minute; those of one without a size yet are taken where they point."""
     model = SyntheticModel(effects=EFFECTS, truth={NAME: SIZE}, seed=5)
-    plain, taken = search.linearise, []
-    monkeypatch.setattr(search, "linearise", lambda *given: (taken.append(given), plain(*given))[1])
-    monkeypatch.setattr(search, "curvature", lambda *_: np.inf)
-    monkeypatch.setattr(search, "fitted", lambda problem, point, active: replace(point, theta=point.theta + 2.0))
-    monkeypatch.setattr(search.Search, "_sure", lambda *_: sure)
-    problem = search.Problem(model, search.Priors.of(EFFECTS, model.channels), tuple(range(len(model.windows({})))))
+    plain, taken = selector.linearise, []
+    monkeypatch.setattr(selector, "linearise", lambda *given: (taken.append(given), plain(*given))[1])
+    monkeypatch.setattr(selector, "curvature", lambda *_: np.inf)
+    monkeypatch.setattr(selector, "fitted", lambda problem, point, active: replace(point, theta=point.theta + 2.0))
+    monkeypatch.setattr(selector.Selector, "_sure", lambda *_: sure)
+    monkeypatch.setattr(selector.Selector, "_best", lambda *_: False)
+    problem = Problem(model, Priors.of(EFFECTS, model.channels), tuple(range(len(model.windows({})))))
     nominal = plain(problem, np.zeros(len(EFFECTS)))
-    looked_at = search.Search(problem, nominal, 5.0, lambda _: None, origin=nominal)
-    looked_at._closer(replace(nominal, theta=nominal.theta + begin), [3])
-    assert len(taken) == (search.LINEARISATIONS + (begin == 0.0) if sure else 1)
-
-
-def test_a_candidate_that_is_refused_leaves_no_derivatives_behind(monkeypatch):
-    origins = []
-
-    def closer(self, point, active):
-        self.origin = point
-        return point
-
-    monkeypatch.setattr(search.Search, "_closer", closer)
-    monkeypatch.setattr(search.Search, "_stands", lambda self, *_: False)
-    monkeypatch.setattr(search.Search, "_joint", lambda self: origins.append(self.origin is self.nominal))
-    explained(SIZE)
-    assert origins == [True]
+    looked_at = selector.Selector(problem, nominal, 5.0, lambda _: None, origin=nominal, point=nominal)
+    looked_at._closer(selector.Move((3,), 9.0, replace(nominal, theta=nominal.theta + begin)), {})
+    assert len(taken) == (selector.LINEARISATIONS + (begin == 0.0) if sure else begin == 0.0)
+    assert looked_at.origin is nominal  # a candidate that is refused leaves no derivatives behind
 
 
 @pytest.mark.parametrize("alike", [(), ("effect_05", "effect_07")])
@@ -131,29 +120,25 @@ def test_what_looks_like_the_best_candidate_is_simulated_as_well(alike, monkeypa
 
 def test_a_law_is_believed_only_where_derivatives_were_taken_at_the_causes(monkeypatch):
     """Here one that explains what the bend of an effect leaves: it is gone where the effect is linearised."""
-    asked = []
-
-    def law(hunt, answer):
-        asked.append(hunt.origin.theta[3])
-        return None if abs(asked[-1]) > 1.0 else "a law", set(), "a law explains this"
-
-    monkeypatch.setattr(unknown, "find_laws", lambda *_: unknown.Answer())
-    monkeypatch.setattr(unknown, "beats_the_catalogue", law)
-    monkeypatch.setattr(search, "curvature", lambda *_: 0.0)  # the search stays with its first derivatives
-    diagnosis = search.explain(SyntheticModel(effects=EFFECTS, truth={NAME: SIZE}, seed=5))
-    assert diagnosis.overall == result.KNOWN
-    assert asked == [0.0, pytest.approx(SIZE, rel=0.1)]
+    asked, plain = [], selector.Selector._stands
+    monkeypatch.setattr(selector, "curvature", lambda *_: 0.0)  # the search stays with its first derivatives
+    monkeypatch.setattr(selector.Selector, "_lawful", lambda hunt, *_: asked.append(hunt.origin.theta[3]) or True)
+    monkeypatch.setattr(selector.Selector, "_stands", lambda hunt, point, active, j: hunt._is_term(j) or plain(hunt, point, active, j))
+    model = SyntheticModel(effects=EFFECTS, law="swirl", law_size=0.01, truth={NAME: SIZE}, seed=5)
+    assert search.explain(model).overall == result.UNKNOWN
+    assert asked[-1] == pytest.approx(SIZE, rel=0.1)
+    assert 0.0 not in asked[1:]
 
 
 def test_a_name_that_a_later_one_left_with_hardly_any_size_is_dropped(monkeypatch):
     """However many nats it brings: they are those of what the derivatives lack."""
-    plain, other = search.Search._sure, 6
+    plain, other = selector.Selector._sure, 6
 
     def sure(self, point, active, j):
         return plain(self, point, active, j) and not (j == other and len(active) > 1 and active[-1] != other)
 
-    monkeypatch.setattr(search.Search, "_sure", sure)
-    monkeypatch.setattr(search.Search, "_joint", lambda _: None)  # alone it would be a better answer than the other alone
+    monkeypatch.setattr(selector.Selector, "_sure", sure)
+    monkeypatch.setattr(selector.Selector, "_exchange", lambda _: False)  # alone it would be a better answer than the other alone
     hidden = {NAME: SIZE, EFFECTS[other].name: 3.0 * SIZE}
     said = []
     diagnosis = search.explain(SyntheticModel(effects=EFFECTS, truth=hidden, seed=5), laws=False, progress=said.append)

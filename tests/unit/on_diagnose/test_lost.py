@@ -9,7 +9,7 @@ from tests.flown import fly, setting_with
 from tests.plants import paper_plant
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
 from visthrow.diagnose.likelihood.evidence import Priors
-from visthrow.diagnose.select import result, search
+from visthrow.diagnose.select import result, search, selector
 from visthrow.diagnose.select.point import Problem, candidate, linearise, lost, only
 from visthrow.diagnose.throw.cutting import RINGING
 from visthrow.diagnose.throw.states import HUNG
@@ -74,7 +74,7 @@ def test_without_lost_windows_the_search_goes_on_from_names_that_stand_alone(act
     model = SyntheticModel(effects=EFFECTS, truth={"effect_00": 15.0}, throws=8, seed=4)
     problem = Problem(model, Priors.of(tuple(model.effects), tuple(model.channels)), tuple(range(len(model.windows({})))))
     nominal = linearise(problem, np.zeros(len(EFFECTS)))
-    at = search.Search(problem, nominal, 5.0, lambda _: None, active=active, origin=nominal)
+    at = selector.Selector(problem, nominal, 5.0, lambda _: None, active=active, origin=nominal)
     at.point = candidate(at.problem, nominal, active)
     left = [i for i in problem.kept if i != BAD]
     assert at.stands_without([BAD], problem.only(left), only(nominal, left), 5.0) == stands

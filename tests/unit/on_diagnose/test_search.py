@@ -9,8 +9,9 @@ from tests.synthetic_diagnosis import SyntheticModel, catalogue
 from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.likelihood import evidence
 from visthrow.diagnose.likelihood.evidence import Priors
-from visthrow.diagnose.select import held_out, result, search
-from visthrow.diagnose.select.consistency import differ
+from visthrow.diagnose.likelihood.marginal import Statistics
+from visthrow.diagnose.select import held_out, result, search, selector
+from visthrow.diagnose.select.scatter import SHARE, disagreement
 
 EFFECTS = catalogue(12)
 
@@ -97,7 +98,7 @@ def test_two_effects_that_hide_each_other_are_named_together(beside):
     named = [{"effect_03", "effect_07"} & set(step.named.split(", ")) for step in diagnosis.steps]
     assert sorted(map(len, named)) == [*[0] * len(beside), 2]
     last = diagnosis.steps[-1]
-    assert last.nats == last.refitted[last.named] > last.least == search.AHEAD
+    assert last.nats == last.refitted[last.named] > last.least == selector.AHEAD
     assert last.named in list(last.screened)[:3]
 
 
@@ -197,14 +198,22 @@ def test_signs_that_change_from_flight_to_flight_are_told_as_what_varies():
     assert diagnosis.overall == result.KNOWN
 
 
-def test_flights_differ_by_more_than_form_and_noise():
-    own = np.full(8, 4.0)  # information: half a floor's deviation each
+def test_flights_disagree_by_more_than_form_and_noise():
+    priors = replace(_priors(1), slab=np.full(1, 20.0))
+
+    def verdict(sizes, share=SHARE):
+        own = np.full((8, 1, 1), 4.0)  # information: half a floor's deviation each
+        none = np.zeros(8)
+        statistics = Statistics(np.arange(8), own, 4.0 * np.array(sizes)[:, None], none, none, np.zeros(1))
+        return disagreement(statistics, priors, {}, [0], 0, 5.0, share)
+
     sizes = np.array([9.0, 11.0, 8.0, 12.0, 10.0, 9.5, 10.5, 10.0])
-    assert not differ(own, own * sizes)
-    assert differ(own, own * sizes * (-1.0) ** np.arange(8))
+    assert verdict(sizes) is None
+    assert verdict(sizes * (-1.0) ** np.arange(8)) == (None,)
     far = sizes + np.array([0.0, 0.0, 0.0, 25.0, 0.0, -18.0, 0.0, 0.0])
-    assert differ(own, own * far)
-    assert not differ(own, own * far, share=1.0)
+    assert verdict(far) == (None,)
+    assert verdict(far, share=2.0) is None
+    assert verdict(np.where(np.arange(8) == 3, 25.0, 0.0)) == (3,)
 
 
 def test_a_copied_flight_counts_once():
@@ -311,8 +320,6 @@ def _priors(count: int) -> Priors:
 
 
 def _threshold(count: int) -> float:
-    from visthrow.diagnose.likelihood.marginal import Statistics
-
     information = _information(count)[None]
     one = np.zeros((1, count))
     return evidence.threshold(Statistics(np.arange(1), information, one, one[:, 0], one[:, 0], one[0]), _priors(count),
@@ -372,9 +379,9 @@ def test_a_window_that_no_force_explains_is_left_out():
 
 
 def test_a_candidate_that_cannot_stand_does_not_end_the_search(monkeypatch):
-    sure = search.Search._sure
+    sure = selector.Selector._sure
     refusing = lambda self, point, active, j: self.name(j) != "effect_03" and sure(self, point, active, j)  # noqa: E731
-    monkeypatch.setattr(search.Search, "_sure", refusing)
+    monkeypatch.setattr(selector.Selector, "_sure", refusing)
     diagnosis = search.explain(world(truth={"effect_03": 12.0, "effect_07": 8.0}, seed=4), laws=False)
     assert [step.named for step in diagnosis.steps][:1] == ["effect_07"]
     assert "effect_03" not in diagnosis.theta  # nor is it exchanged for what was named

@@ -11,7 +11,7 @@ from visthrow.diagnose.likelihood import grammar
 from visthrow.diagnose.likelihood.evidence import Priors
 from visthrow.diagnose.models.interface import LATENT_BLOCKS
 from visthrow.diagnose.reporting.blackbox import Table, table_of, train, unexplained
-from visthrow.diagnose.select import result, screening, search, unknown, verdicts
+from visthrow.diagnose.select import result, search, selector, terms, verdicts
 from visthrow.diagnose.select.excess import acts_on
 from visthrow.diagnose.select.point import Problem, candidate, linearise
 
@@ -56,10 +56,10 @@ def test_terms_turn_with_the_world(block):
     knots, angle = random_knots(), 0.7
     c, s = np.cos(angle), np.sin(angle)
     turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) if block not in IN_THE_BODY else np.eye(3)
-    terms = grammar.terms(block, KNOTS)
-    assert len(terms) > 300
-    values = grammar.table_of(terms, knots)
-    again = grammar.table_of(terms, turned(knots, angle))
+    every = grammar.terms(block, KNOTS)
+    assert len(every) > 300
+    values = grammar.table_of(every, knots)
+    again = grammar.table_of(every, turned(knots, angle))
     np.testing.assert_allclose(again, np.einsum("ij,kjt->kit", turn, values), atol=1e-9 * np.abs(values).max())
 
 
@@ -179,23 +179,6 @@ def test_a_law_beside_a_known_cause_leaves_the_cause_its_name():
     assert len(set(formulas)) == len(formulas)
 
 
-def test_one_term_is_enough_where_derivatives_are_taken_anew(monkeypatch):
-    """And a search that stands where it was asked about is not asked again."""
-    weighed, before, hunts, weigh, nearer = [], [], [], unknown._weigh, search.Search.nearer
-    monkeypatch.setattr(unknown, "_weigh", lambda *given: weighed.append(1) or weigh(*given))
-    monkeypatch.setattr(search.Search, "nearer", lambda hunt: before.append(len(weighed)) or hunts.append(hunt) or nearer(hunt))
-    diagnosis = search.explain(SyntheticModel(effects=EFFECTS, law="swirl", law_size=0.01, truth={"effect_03": 12.0}, seed=3))
-    assert diagnosis.overall == result.UNKNOWN
-    assert before == [1]
-    assert len(weighed) > 5
-    whole = len(weighed)
-    answer = unknown.find_laws(hunts[0])
-    assert len(weighed) == whole
-    hunts[0].active = []
-    assert unknown.find_laws(hunts[0]) is not answer
-    assert len(weighed) > whole
-
-
 def with_a_name_for_the_law(most: float) -> SyntheticModel:
     """A hidden drag of 0.02, and an effect of the very same form that is unusual beyond 0.005 and cannot exceed ``most``."""
     model = SyntheticModel(effects=EFFECTS, law="speed", law_size=0.02, seed=3)
@@ -219,38 +202,55 @@ def test_a_name_that_would_have_to_exceed_its_bound_stays_none():
     assert not diagnosis.named
 
 
-def beside_a_law(model: SyntheticModel, active: list[int]) -> tuple[search.Search, unknown.Hypothesis]:
-    """A search that has come to some names, and the hypothesis of the model's drag beside them."""
-    priors = Priors.of(model.effects, model.channels)
-    problem = Problem(model, priors, tuple(range(len(model._windows))))
-    nominal = linearise(problem, np.zeros(len(model.effects)))
-    at = search.Search(problem, nominal, 4.0, lambda _: None, active=active)
-    at.point = candidate(at.problem, nominal, active)
-    term = grammar.Term("vehicle force", ("speed",), "vel")
-    return at, unknown._weigh(at.point, priors, active, term, 0.1, 7.0, unknown._known(at.point))
+DRAG = grammar.Term("vehicle force", ("speed",), "vel")
+
+
+def beside_a_law(model: SyntheticModel, active: list[int], *laws: grammar.Term) -> selector.Selector:
+    """A search that has come to some names and laws."""
+    problem = Problem(model, Priors.of(model.effects, model.channels), tuple(range(len(model._windows))))
+    point = linearise(problem, np.zeros(len(model.effects)))
+    if laws:
+        problem, point = terms.extended(problem, point, [terms._effect(term, 0.1, 7.0) for term in laws])
+    named = [*active, *range(len(model.effects), len(problem.priors.floor))]
+    return selector.Selector(problem, point, 4.0, lambda _: None, active=named, point=candidate(problem, point, named))
 
 
 @pytest.mark.parametrize("block", ["vehicle force", "payload force"])
 def test_all_terms_at_once_say_what_each_says_as_an_effect(block):
     """Information and score of a column that the windows' inner products were given, and of no further simulation."""
-    at, _ = beside_a_law(SyntheticModel(effects=catalogue(4), law="speed", law_size=0.2, throws=4), [1])
-    known = unknown._known(at.point)
-    of = screening.screen(at.point, screening.statistics(at.point.grams, at.point.noise, "cpu"), block, known)
+    at = beside_a_law(SyntheticModel(effects=catalogue(4), law="speed", law_size=0.2, throws=4), [1])
+    known = terms.grammar_known(at.point)
+    of = terms.screen(at.point, terms.statistics(at.point.grams, at.point.noise, "cpu"), block, known)
     for i in (0, 7, len(of.terms) // 2, len(of.terms) - 1):
-        point, wide = unknown._extended(at.point, at.priors, of.terms[i], 1.0, known)
-        scale = wide.floor[-1]
+        problem, point = terms.extended(at.problem, at.point, [terms._effect(of.terms[i], 1.0, 0.0)])
+        scale = problem.priors.floor[-1]
         assert point.information[-1, -1] == pytest.approx(scale**2 * of.own[i], rel=1e-6)
         assert point.score[-1] == pytest.approx(scale * of.score[i], rel=1e-5, abs=1e-9 * scale * np.sqrt(of.own[i]))
         cross, most = scale * of.cross, scale * np.abs(of.cross).max()
         np.testing.assert_allclose(point.information[-1, :-1], cross[i], rtol=1e-5, atol=1e-9 * most)
 
 
+def test_a_term_is_an_effect_of_the_model_that_can_be_taken_off_again():
+    """Appended to what the windows say it is the column that a linearisation gives; without it nothing has changed."""
+    model = SyntheticModel(effects=EFFECTS, law="speed", law_size=0.02, seed=3)
+    at, plain = beside_a_law(model, [3], DRAG), beside_a_law(model, [3])
+    again = linearise(at.problem, np.zeros(len(EFFECTS) + 1))
+    np.testing.assert_allclose(at.nominal.information, again.information, rtol=1e-2)
+    law = terms.laws(at.problem, at.point, at.active, 0.0)[0]
+    assert law.coefficient == pytest.approx(-0.02, rel=0.05)
+    assert at.point.theta[-1] * at.priors.floor[-1] == pytest.approx(law.coefficient, rel=0.05)
+    problem, off = terms.bare(at.problem, at.nominal)
+    assert problem.model is model
+    np.testing.assert_allclose(off.information, plain.nominal.information, rtol=1e-9)
+    np.testing.assert_allclose(off.score, plain.nominal.score, rtol=1e-9)
+
+
 def test_names_in_the_block_of_a_law_are_withdrawn_and_others_stay():
     """What acts where the law acts may be a part of its form; a force on the payload is none."""
     truth = {"effect_03": 15.0, "effect_06": 15.0}
-    at, law = beside_a_law(SyntheticModel(effects=EFFECTS, law="speed", law_size=0.02, truth=truth, seed=3), [3, 6])
-    assert [acts_on(at.point, j) for j in at.active] == ["vehicle force", "payload force"]
-    assert unknown.withdrawn_for(at, law) == {3}
+    at = beside_a_law(SyntheticModel(effects=EFFECTS, law="speed", law_size=0.02, truth=truth, seed=3), [3, 6], DRAG)
+    assert [acts_on(at.point, j) for j in at.names] == ["vehicle force", "payload force"]
+    assert at.law()[0] == {3}
 
 
 def test_names_that_differ_by_a_force_in_the_block_of_a_law_are_withdrawn():
@@ -258,45 +258,15 @@ def test_names_that_differ_by_a_force_in_the_block_of_a_law_are_withdrawn():
     model = SyntheticModel(effects=EFFECTS, law="speed", law_size=0.02, seed=3)
     for w in model._windows:
         w.effects[:, 8] = w.effects[:, 6] + 0.2 * w.effects[:, 3]
-    at, law = beside_a_law(model, [6, 8])
-    assert [acts_on(at.point, j) for j in at.active] == ["payload force"] * 2
-    assert [acts_on(at.point, j, beside=[14 - j]) for j in at.active] == ["vehicle force"] * 2
-    assert unknown.withdrawn_for(at, law) == {6, 8}
+    at = beside_a_law(model, [6, 8], DRAG)
+    assert [acts_on(at.point, j) for j in at.names] == ["payload force"] * 2
+    assert [acts_on(at.point, j, beside=[14 - j]) for j in at.names] == ["vehicle force"] * 2
+    assert at.law()[0] == {6, 8}
 
 
 def test_what_was_named_for_a_withdrawn_name_alone_goes_with_it():
     model = SyntheticModel(effects=EFFECTS, law="speed", law_size=0.02, truth={"effect_03": 15.0}, seed=3)
-    at, law = beside_a_law(model, [3, 6])
-    assert unknown.withdrawn_for(at, law) == {3, 6}
-
-
-def test_laws_are_weighed_as_they_are_told():
-    """Beside a name for a part of the drag a wrong form explains about as much; the right one needs no name."""
-    model = with_a_name_for_the_law(0.1)
-    for w in model._windows:
-        drag = np.zeros((6, 11))
-        drag[:3] = -w.knots["vel_w"].T
-        w.effects[:, 1] = w.latent @ (drag @ grammar.between(11).T).ravel()
-    at, right = beside_a_law(model, [1])
-    cubic = grammar.Term("vehicle force", ("speed", "speed"), "vel")
-    wrong = unknown._weigh(at.point, at.priors, at.active, cubic, 0.1, 7.0, unknown._known(at.point))
-    told = unknown._as_told(at, [wrong, right])
-    assert [h.names for h in told] == [(), ()]
-    apart = right.net(4.0) - wrong.net(4.0)
-    assert told[1].net(4.0) - told[0].net(4.0) > apart + 50.0
-    assert told[1].laws()[0].coefficient == pytest.approx(-0.02, rel=0.05)
-    real, beside = beside_a_law(SyntheticModel(effects=EFFECTS, law="speed", law_size=0.01, truth={"effect_03": 60.0}, seed=3), [3])
-    assert [h.names for h in unknown._as_told(real, [beside])] == [(3,)]  # no drag explains that
-
-
-def test_names_that_a_law_hardly_needs_come_after_a_law_without():
-    def hypothesis(nats: float, *names: int) -> tuple[SimpleNamespace, None]:
-        return SimpleNamespace(net=lambda least: nats, names=names), None
-
-    found = [hypothesis(100.0, 1, 2), hypothesis(97.0), hypothesis(98.0, 1), hypothesis(80.0)]
-    assert [h.net(4.0) for h, _ in unknown._ordered(found, 4.0)] == [97.0, 98.0, 100.0, 80.0]
-    assert unknown._ordered([*found, hypothesis(120.0, 1)], 4.0)[0][0].net(4.0) == 120.0
-    assert unknown._ordered([], 4.0) == []
+    assert beside_a_law(model, [3, 6], DRAG).law()[0] == {3, 6}
 
 
 def test_known_causes_and_gusts_are_no_laws():

@@ -18,7 +18,7 @@ from visthrow.diagnose.models.interface import LATENT_BLOCKS, Model
 from visthrow.diagnose.planning.manoeuvres import PERIOD, Manoeuvre, Reference
 from visthrow.diagnose.select import result
 from visthrow.diagnose.select.result import Diagnosis
-from visthrow.diagnose.select.rivals import CLOSE
+from visthrow.diagnose.select.selector import CLOSE
 from visthrow.logs.flightlog import Channel, FlightLog
 
 DECISIVE = 11.0

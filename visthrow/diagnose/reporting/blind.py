@@ -13,7 +13,7 @@ import numpy as np
 from visthrow.diagnose.likelihood.evidence import additions
 from visthrow.diagnose.models.interface import Linearised, Model, Window
 from visthrow.diagnose.select.result import Diagnosis
-from visthrow.diagnose.select.rivals import CLOSE
+from visthrow.diagnose.select.selector import CLOSE
 
 SIZES = np.geomspace(1.0, 64.0, 13)
 """Hidden sizes [floors]."""

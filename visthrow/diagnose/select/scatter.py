@@ -16,7 +16,7 @@ from scipy.interpolate import CubicSpline
 
 from sim.effects.effect import Effect, RandomEffect
 from visthrow.config.effects import random_effects
-from visthrow.diagnose.likelihood.evidence import Priors, covariance, log_evidence
+from visthrow.diagnose.likelihood.evidence import Priors, additions, covariance, estimate, log_evidence
 from visthrow.diagnose.likelihood.marginal import Statistics
 
 BY_FLIGHT = "_by_flight"
@@ -190,6 +190,47 @@ def _ahead(
 
     nothing = evidence(drawn)
     return np.array([evidence({**drawn, **{j: size / priors.floor[j] for j in at}}) - nothing for size in sizes])
+
+
+def disagreement(
+    statistics: Statistics, priors: Priors, drawn: Mapping[int, float], active: Sequence[int], j: int, least: float, share: float = SHARE
+) -> tuple[int | None] | None:
+    """Whether flights disagree on an effect of a set: shares of their own say more than a floor and a part of the effect's size would.
+
+    Args:
+        statistics: of the flights.
+        priors: of the effects.
+        drawn: deviation in floors of effects that vary.
+        active: the set.
+        j: the effect.
+        least: nats that a finding needs.
+        share: of the effect, by which flights may differ for its form alone.
+
+    Returns:
+        The flight that alone disagrees, or None in its place where all do; None where they agree, too few can say, or other effects
+        that are still missing may be why they differ.
+    """
+    if np.count_nonzero(statistics.information[:, j, j] > 0.0) < LEAST_FLIGHTS:
+        return None
+
+    def apart(statistics: Statistics, active: Sequence[int]) -> bool:
+        left = freed(statistics, drawn)
+        size = estimate(left.information.sum(0), left.absolute.sum(0), priors, active)[j]
+        allowed = max(np.hypot(1.0, share * size), drawn.get(j, 0.0))
+        reach = allowed * np.geomspace(1.0, max(REACH[-1] * priors.slab[j] / allowed, 2.0), len(REACH[::LOOK]))
+        nats = _ahead(statistics, [j], reach * priors.floor[j], priors, drawn, active)
+        return bool(nats.max() - nats[0] > least)
+
+    if not all(apart(statistics, named) for named in (active, np.flatnonzero(priors.visible).tolist())):
+        return None
+    rest = [k for k in active if k != j]
+    for f in range(len(statistics.flights)):
+        others = statistics.only(np.arange(len(statistics.flights)) != f)
+        told = freed(others, drawn)
+        alone = additions(told.information.sum(0), told.absolute.sum(0), priors, rest)[j]
+        if alone < least and not apart(others, active):
+            return (int(statistics.flights[f]),)
+    return (None,)
 
 
 def _one_alone(v: RandomEffect, statistics: Statistics, at: Sequence[int], *given) -> bool:

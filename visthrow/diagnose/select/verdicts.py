@@ -7,13 +7,13 @@ import numpy as np
 
 from visthrow.diagnose.likelihood.evidence import NORMAL_95, OWN_FLOOR, Priors, certainty, covariance, estimate
 from visthrow.diagnose.models.interface import Model, Window
-from visthrow.diagnose.select import result, unknown
+from visthrow.diagnose.select import result
 from visthrow.diagnose.select.excess import acts_on, levels, too_strong
-from visthrow.diagnose.select.point import Point, with_floors_noise, with_varying
+from visthrow.diagnose.select.point import Point, moved, with_fitted_noise, with_floors_noise, with_varying
 from visthrow.diagnose.select.result import Diagnosis, Finding, Law, Level
 from visthrow.diagnose.select.scatter import BY_FLIGHT, deviations, freed
-from visthrow.diagnose.select.state import SearchState, Work
-from visthrow.diagnose.select.unknown import Answer, Hypothesis
+from visthrow.diagnose.select.selector import Selector, Work
+from visthrow.diagnose.select.terms import WithTerms, bare
 
 HALF_PRIOR = 0.5
 """An effect whose posterior deviation exceeds this share of its prior's was not seen."""
@@ -32,18 +32,12 @@ AT_BOUND = 1e-3
 
 
 
-def conclude(search: SearchState, *, laws: bool) -> Diagnosis:
+def conclude(search: Selector) -> Diagnosis:
     """Turn a finished search into verdicts.
 
     Args:
         search: that has run.
-        laws: whether to look for laws outside the catalogue.
     """
-    answer = unknown.find_laws(search, lambda h: unknown.beats_the_catalogue(search, Answer((h,)))[0] is not None) if laws else Answer()
-    law = unknown.beats_the_catalogue(search, answer)
-    if law[0] is not None and search.nearer():
-        answer = unknown.find_laws(search)
-        law = unknown.beats_the_catalogue(search, answer)
     point, model = search.point, search.problem.model
     scatter = search.scatter(search.active)
     varies = deviations(scatter, search.priors, [e.name for e in model.effects])
@@ -52,7 +46,7 @@ def conclude(search: SearchState, *, laws: bool) -> Diagnosis:
     found = levels(search.problem, search.nominal, with_floors_noise(search.problem, point, search.active), search.least)
     drawn = {name for s in scatter if s.found for name in s.of}
     search.refused = {j: nats for j, nats in search.refused.items() if search.name(j) not in drawn}
-    overall, block, reasons, withdrawn = _overall(search, found, *law)
+    overall, block, reasons, withdrawn = _overall(search, found)
     mistakes = tuple(getattr(model, "mistakes", ()))
     if overall == result.NO_EFFECT and (drawn or mistakes):
         besides = [m.name for m in mistakes] + [s.name for s in scatter if s.found]
@@ -61,18 +55,16 @@ def conclude(search: SearchState, *, laws: bool) -> Diagnosis:
     if len(forms) > 1 and overall == result.KNOWN:
         reasons = [f"flights differ in {', '.join(forms)} at once; the form is another"]
         overall, block = result.UNKNOWN, next(s.block for s in scatter if s.name == forms[0])
-    known = overall != result.UNKNOWN  # a term that is weaker than the names says nothing
-    terms = [] if known else _different(answer.strongest)
-    explanations = () if known else tuple(tuple(h.laws()) for h in answer.strongest)
+    explanations = search.explanations() if overall == result.UNKNOWN else []  # a term that is weaker than the names says nothing
+    search, here = _without_laws(search, point), not search.terms
     active = [j for j in search.active if j not in withdrawn]
-    if law[0] is not None:
-        active = _sure(law[0].without_terms(), search.priors, active)
+    point, model = search.point, search.problem.model
+    if not here:
+        active = _sure(point, search.priors, active)
         withdrawn = set(search.active) - set(active)
+    here = here and bool(active or not search.active)
     if not active and search.active:
         point = search.nominal
-    elif law[0] is not None and active:
-        point = law[0].without_terms()
-    here = point is search.point
     point = replace(point, plain=search.about_means(active, varies) if here else freed(point.plain, varies), varies={})
     point = replace(point, theta=estimate(point.information, point.score, search.priors, active))
     spread = covariance(point.information, search.priors.deviation(active))
@@ -83,11 +75,12 @@ def conclude(search: SearchState, *, laws: bool) -> Diagnosis:
     return Diagnosis(
         overall, block, tuple(reasons), findings, {search.name(j): float(point.theta[j] * floor[j]) for j in active},
         tuple(tuple(map(float, row)) for row in scaled), search.least, tuple(search.steps),
-        tuple((tuple(map(search.name, s)), n) for s, n in search.sets), found, tuple(terms), _events(search, point),
+        tuple((tuple(map(search.name, m.active)), 0.0 - m.nats) for m in search.sets), found, _different(explanations),
+        _events(search, point),
         sensor_scale={name: float(point.noise.scale[c]) for c, name in enumerate(model.channels)},
-        scatter=scatter, mistakes=mistakes, explanations=explanations,
+        scatter=scatter, mistakes=mistakes, explanations=tuple(explanations),
         flights=len(point.statistics.flights), windows=len(point.windows), samples=int(point.statistics.samples.sum()),
-        work=Work(search.problem, search.nominal, search.point if active else search.nominal, tuple(active)),
+        work=Work(search.problem, search.nominal, search.work if active else search.nominal, tuple(active)),
     )  # fmt: skip
 
 
@@ -103,15 +96,28 @@ def _sure(point: Point, priors: Priors, active: Sequence[int]) -> list[int]:
     return left
 
 
-def _different(hypotheses: Sequence[Hypothesis]) -> tuple[Law, ...]:
-    """Laws of hypotheses, each formula once, with the coefficient of the best."""
+def _without_laws(search: Selector, point: Point) -> Selector:
+    """The search as if the laws of its set were known: what they explain is left out of the residuals."""
+    if not isinstance(search.problem.model, WithTerms):
+        return replace(search, work=point)
+    alone = moved(search.problem, point, np.where(search.term_columns, 0.0, point.theta)) or point
+    problem = bare(search.problem, point)[0]
+    nominal, origin, without, work = (bare(search.problem, p)[1] for p in (search.nominal, search.origin, point, alone))
+    names = search.names
+    sets = [m for m in search.sets if max(m.active, default=0) < len(problem.priors.floor)]
+    return replace(search, problem=problem, nominal=nominal, origin=origin, point=without, work=with_fitted_noise(work), active=names,
+                   sets=sets)  # fmt: skip
+
+
+def _different(explanations: Sequence[Sequence[Law]]) -> tuple[Law, ...]:
+    """Laws, each formula once, with the coefficient of the best."""
     laws: dict[str, Law] = {}
-    for law in (law for hypothesis in hypotheses for law in hypothesis.laws()):
+    for law in (law for together in explanations for law in together):
         laws.setdefault(law.formula, law)
     return tuple(laws.values())
 
 
-def _events(search: SearchState, point: Point) -> tuple[int, ...]:
+def _events(search: Selector, point: Point) -> tuple[int, ...]:
     """Flights that were left out for what happened there, and flights with a window far rougher than its phase."""
     rough = {window.flight for window, share in zip(point.windows, point.noise.share) if share.max() > ROUGH}
     return tuple(sorted({*search.events, *rough}))
@@ -131,7 +137,7 @@ def out_of_domain(model: Model, windows: Sequence[Window], usable: int, seed: in
 
 
 def _overall(
-    search: SearchState, found: Sequence[Level], law: Hypothesis | None, idle: set[int], said: str
+    search: Selector, found: Sequence[Level]
 ) -> tuple[str, str, list[str], set[int]]:
     """Overall verdict, block of an unknown effect, reasons, and the names that are withdrawn for it."""
     point, every = search.point, set(search.active)
@@ -140,14 +146,14 @@ def _overall(
         reason = (f"after everything the catalogue can do, forces above {IMPLAUSIBLE_FORCE:.0%} of the thrust are missing in the "
                   f"phases {', '.join(strong)}: commands and poses, units or axes do not belong together")  # fmt: skip
         return result.INCONSISTENT, "", [reason], every
-    if search.refused and not search.active and (law is None or law.nats < max(search.refused.values())):
+    if search.refused and not search.active:
         names = ", ".join(search.name(j) for j in sorted(search.refused))
         return result.INCONSISTENT, "", [f"what looks like {names} changes its sign from flight to flight"], every
     excessive = [level for level in found if level.excessive]
     reasons = [_excess(level) for level in excessive]
-    if law is not None:
-        reasons.insert(0, said)
-        return result.UNKNOWN, law.terms[0].block, reasons, idle | unknown.withdrawn_for(search, law)
+    if search.terms:
+        untold, said = search.law()
+        return result.UNKNOWN, search.problem.model.effects[search.terms[0]].block, [said, *reasons], untold
     stuck = [j for j in search.active if _on_bound(search, j)]
     if stuck:
         names = ", ".join(map(search.name, stuck))
@@ -167,7 +173,7 @@ def _excess(level: Level) -> str:
             f"quietest phase ({level.nats:.0f} nats)")  # fmt: skip
 
 
-def _withdrawn(search: SearchState, excessive: Sequence[Level]) -> set[int]:
+def _withdrawn(search: Selector, excessive: Sequence[Level]) -> set[int]:
     """Names that stand for the unknown effect's wrong form: a chain of them in its block, or one that left it as it was."""
     through = {j: acts_on(search.point, j) for j in search.active}
     inside = {j for j, block in through.items() if block in {level.block for level in excessive}}
@@ -177,7 +183,7 @@ def _withdrawn(search: SearchState, excessive: Sequence[Level]) -> set[int]:
     return {j for j in inside if not eased.get(through[j], True)}
 
 
-def _on_bound(search: SearchState, j: int) -> bool:
+def _on_bound(search: Selector, j: int) -> bool:
     """Whether an estimate lies on its bound and the flights push it on by more than the threshold."""
     point, priors = search.point, search.priors
     at = min(abs(point.theta[j] - priors.low[j]), abs(point.theta[j] - priors.high[j])) < AT_BOUND
@@ -185,7 +191,7 @@ def _on_bound(search: SearchState, j: int) -> bool:
     return bool(at and push * point.theta[j] > 0.0 and 0.5 * push**2 / point.information[j, j] > search.least)
 
 
-def _finding(search: SearchState, point: Point, j: int, active: list[int], spread: np.ndarray, withdrawn: set[int]) -> Finding:
+def _finding(search: Selector, point: Point, j: int, active: list[int], spread: np.ndarray, withdrawn: set[int]) -> Finding:
     effect, priors = search.problem.model.effects[j], search.priors
     blank = Finding(effect.name, result.UNOBSERVABLE, effect.block, effect.cause, effect.equation, effect.unit, 0.0,
                     effect.prior_sd, *effect.bounds, effect.floor, 0.0, manoeuvres=tuple(effect.manoeuvres))  # fmt: skip
@@ -225,11 +231,11 @@ def _worth(point: Point, priors: Priors, j: int, active: Sequence[int]) -> float
     return point.evidence(priors, [*rest, j]) - point.evidence(priors, rest)
 
 
-def _class_of(search: SearchState, j: int, active: Sequence[int]) -> tuple[tuple[int, ...], int]:
+def _class_of(search: Selector, j: int, active: Sequence[int]) -> tuple[tuple[int, ...], int]:
     """Partners of an effect, and the named member in whose place it may stand."""
     for home in active:
         exchanged = {home}
-        for members, _ in search.sets:
+        for members in (move.active for move in search.sets):
             new = set(members) - set(active)
             if len(members) == len(active) and len(new) == 1 and set(active) - set(members) == {home}:
                 exchanged |= new
@@ -238,7 +244,7 @@ def _class_of(search: SearchState, j: int, active: Sequence[int]) -> tuple[tuple
     return (), j
 
 
-def _named(search: SearchState, point: Point, blank: Finding, j: int, home: int, partners: tuple[int, ...], active: list[int],
+def _named(search: Selector, point: Point, blank: Finding, j: int, home: int, partners: tuple[int, ...], active: list[int],
            spread: np.ndarray) -> Finding:  # fmt: skip
     priors, floor = search.priors, blank.floor
     if j in active:
@@ -264,7 +270,7 @@ def _named(search: SearchState, point: Point, blank: Finding, j: int, home: int,
     return replace(blank, verdict=result.CLASS, partners=names, joint=joint, sentence=sentence)
 
 
-def _joint(search: SearchState, point: Point, members: list[int], rest: list[int]) -> str:
+def _joint(search: Selector, point: Point, members: list[int], rest: list[int]) -> str:
     """The best known combination of a class: first eigenvector of its members' information in prior deviations."""
     priors, effects = search.priors, search.problem.model.effects
     others = np.setdiff1d(np.arange(len(effects)), members)

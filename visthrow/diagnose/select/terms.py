@@ -1,0 +1,392 @@
+"""Terms of laws outside the catalogue, as further effects of a model.
+
+The column of a term is G A v: G are the derivatives by the latent forces, A the latent forces that anything exerted at the knots
+stands for, v the term's values there. So thousands of terms are screened at once without a simulation: a window needs A' G' V^-1 G A
+alone, with V as in :mod:`visthrow.diagnose.likelihood.marginal`, and all terms are a product of tables. The best become effects of
+the model (:class:`WithTerms`) and are weighed like any other.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.linalg import lapack
+
+from sim.effects.effect import Effect
+from visthrow.diagnose.likelihood import grammar
+from visthrow.diagnose.likelihood.evidence import Priors, covariance
+from visthrow.diagnose.likelihood.marginal import Gram, WindowStatistics, gather
+from visthrow.diagnose.likelihood.stack import BATCH, statistics
+from visthrow.diagnose.likelihood.threads import each
+from visthrow.diagnose.likelihood.transfer import all_to_host, side_by_side
+from visthrow.diagnose.models.interface import LATENT_BLOCKS, Linearised, Model, Window
+from visthrow.diagnose.select.point import Point, Problem, regathered
+from visthrow.diagnose.select.result import Law
+
+LAW = 6.0
+"""Nats that a term needs beyond the threshold and the logarithm of the number of terms as simple as it."""
+
+REACH = 3.0
+"""Prior deviation of a term's root mean square force, in the block's strongest latent force."""
+
+NARROW = 1e-3
+"""Floor of a term in its prior deviation: a term is there or it is not."""
+
+MATERIAL = 0.5
+"""Root mean square force of a term, in the block's usual latent force, below which it does not matter: that of a gust moves a
+landing by 5 mm within half a second."""
+
+WEIGHED = 5
+"""Terms that become effects to be weighed."""
+
+ROUGHER = 2.0
+"""While terms are screened, no phase is rougher than so many times the usual."""
+
+
+@lru_cache(maxsize=32)
+def _terms(block: str, known: tuple[str, ...]) -> tuple[grammar.Term, ...]:
+    return tuple(grammar.terms(block, known))
+
+
+@lru_cache(maxsize=32)
+def _layout(block: str, known: tuple[str, ...]) -> grammar.Layout | None:
+    terms = _terms(block, known)
+    return grammar.Layout.of(terms) if terms else None
+
+
+@dataclass
+class Screen:
+    """Information of all terms about one point, summed over windows."""
+
+    terms: tuple[grammar.Term, ...]
+    size: np.ndarray  # root mean square over the knots, shape (T,)
+    own: np.ndarray  # shape (T,)
+    score: np.ndarray
+    cross: np.ndarray  # with the effects, shape (T, K)
+
+
+def felt(block: str) -> str:
+    """Latent block whose levels a term's size is measured in."""
+    return "vehicle torque" if block == grammar.JOINT else block
+
+
+def carries(latent_block: np.ndarray, block: str) -> bool:
+    """Whether a window has all latents that terms of a block act through."""
+    return set(map(LATENT_BLOCKS.index, grammar.acting(block))) <= set(np.unique(latent_block).tolist())
+
+
+def usual(levels: Mapping[tuple[int, str], float], block: int) -> float:
+    """The lower median of a block's levels; the least of a phase with few windows may be anything."""
+    own = sorted(level for (b, _), level in levels.items() if b == block)
+    return own[(len(own) - 1) // 2]
+
+
+def calmed(point: Point) -> tuple[Point, list[WindowStatistics]]:
+    """The point as if no phase were much rougher than is usual in its block, and the statistics of its windows.
+
+    A force that the model lacks is taken for gusts in the phases in which it acts; there no term of it would stand out.
+    """
+    levels = point.noise.latent_sd
+    limits = {block: ROUGHER * usual(levels, block) for block in {block for block, _ in levels}}
+    noise = replace(point.noise, latent_sd={key: min(level, limits[key[0]]) for key, level in levels.items()})
+    parts = statistics(point.grams, noise, point.device)
+    return replace(point, noise=noise, plain=gather(point.grams, parts, point.theta)), parts
+
+
+def screen(point: Point, parts: Sequence[WindowStatistics], block: str, known: Sequence[grammar.Known]) -> Screen | None:
+    """Gather what each term of a block says; None where the windows carry no knots for any.
+
+    Args:
+        point: that the terms are about.
+        parts: statistics of its windows.
+        block: of the terms.
+        known: quantities at the knots of its windows.
+    """
+    through = [w for w, gram in enumerate(point.grams) if carries(gram.latent_block, block)]
+    names = [set(point.windows[w].knots) for w in through]
+    shared = tuple(sorted(set.intersection(*names))) if names else ()
+    layout = _layout(block, shared) if "time" in shared else None
+    if layout is None:
+        return None
+    own, size = LATENT_BLOCKS.index(felt(block)), BATCH if point.device == "cpu" else len(through)
+
+    ends = np.cumsum([len(known[w]["time"]) for w in through])[:-1]
+    factors = zip(*(np.split(values, ends) for values in layout.factors(grammar.joined([known[w] for w in through], shared))))
+    exerted = each(lambda w: _exerted(point, parts[w], w, block, known[w], own), through)
+    told = [(*one, *at_knots) for one, at_knots in zip(exerted, factors)]
+    batches = [told[first : first + size] for first in range(0, len(told), size)]
+    shares = each(lambda batch: _products(batch, layout, point.device), batches)
+    square, information, score, cross = map(sum, zip(*shares))
+    rows = sum(int((point.grams[w].latent_block == own).sum()) // 3 for w in through)
+    return Screen(_terms(block, shared), np.sqrt(square / max(rows, 1)), information, score, cross)
+
+
+def _exerted(point: Point, part: WindowStatistics, w: int, block: str, known: grammar.Known, own: int) -> tuple[np.ndarray, ...]:
+    """Of what is exerted at a window's knots: square and information, score and cross information."""
+    through = grammar.through_latents(point.windows[w], known, block)
+    here = through[point.grams[w].latent_block == own]
+    score = part.latent_score + part.latent_effects @ point.theta
+    return here.T @ here, through.T @ part.latent_information @ through, through.T @ score, through.T @ part.latent_effects
+
+
+def _products(windows: Sequence[tuple[np.ndarray, ...]], layout: grammar.Layout, device: str) -> tuple[np.ndarray, ...]:
+    """Square, information, score and cross information of all terms, of these windows together.
+
+    Args:
+        windows: of each, what is exerted at its knots, and the scalars and vectors there.
+        layout: of the terms.
+        device: where to calculate.
+    """
+    longest = max((len(scalars) for *_, scalars, _ in windows), default=0)
+    square, information, score, cross, scalars, vectors = (
+        _padded(arrays, axes, longest, device)
+        for arrays, axes in zip(zip(*windows), ((3, 3), (3, 3), (3,), (3, None), (1, None), (1, None, None)))
+    )
+    values = vectors[..., torch.from_numpy(layout.vector).to(device)]
+    for which in layout.scalar:
+        values *= scalars[:, :, None, torch.from_numpy(which).to(device)]
+    values = values.reshape(len(windows), 3 * longest, -1)
+    flat, cross = values.reshape(-1, values.shape[-1]), cross.reshape(-1, cross.shape[-1])
+    squares = [((inner @ values) * values).sum((0, 1)) for inner in (square, information)]
+    return tuple(all_to_host((*squares, score.reshape(-1) @ flat, flat.T @ cross)))
+
+
+def _padded(arrays: Sequence[np.ndarray], axes: Sequence[int | None], longest: int, device: str) -> torch.Tensor:
+    """Arrays side by side, with zeros up to so many knots along each axis that has some entries a knot."""
+    shape = tuple(size if per is None else per * longest for size, per in zip(arrays[0].shape, axes))
+    return side_by_side([[array] for array in arrays], shape, device)
+
+
+def gains(point: Point, priors: Priors, active: Sequence[int], of: Screen, reach: float) -> tuple[np.ndarray, np.ndarray]:
+    """Nats of each term beside a set of names, and its prior deviation, which makes it ``reach`` strong at the knots."""
+    sigma = covariance(point.information, priors.deviation(list(active)))
+    own = np.maximum(of.own - np.einsum("tk,kl,tl->t", of.cross, sigma, of.cross, optimize=True), 0.0)
+    score = of.score - of.cross @ (sigma @ point.score)
+    prior = reach / np.maximum(of.size, 1e-12 * of.size.max() + 1e-300)
+    gain = -0.5 * np.log1p(prior**2 * own) + 0.5 * score**2 / (own + prior**-2.0)
+    gain[of.size <= 1e-9 * of.size.max()] = -np.inf
+    return gain, prior
+
+
+def distinct(gain: np.ndarray, of: Screen, most: int) -> list[int]:
+    """The best terms, without those that are a simpler one in other words in these flights."""
+    kept: list[int] = []
+    unit = of.score / np.maximum(of.size, 1e-300)
+    for i in np.argsort(-gain, kind="stable")[: 8 * most]:
+        if len(kept) == most or not np.isfinite(gain[i]):
+            break
+        if not any(np.isclose(abs(unit[i]), abs(unit[k]), rtol=1e-3) for k in kept):
+            kept.append(int(i))
+    return kept
+
+
+@dataclass(frozen=True)
+class TermEffect(Effect):
+    """A term as an effect of a model; its size is the coefficient."""
+
+    term: grammar.Term | None = None
+    price: float = 0.0  # of its name, beyond the threshold [nats]
+
+
+class WithTerms:
+    """A model whose last effects are terms: their columns are those of the forces that they exert at the knots."""
+
+    def __init__(self, model: Model, terms: Sequence[TermEffect]):
+        """Add terms to a model, which may have some already."""
+        self.model, self.terms = (model.model, (*model.terms, *terms)) if isinstance(model, WithTerms) else (model, tuple(terms))
+        self.columns: dict[int, np.ndarray] = {}  # of the terms where derivatives were taken last, by number of the window
+        self._about: tuple[Linearised | None, Linearised | None] = None, None  # with terms, and without
+        self._last: tuple[Mapping[str, float] | None, list[np.ndarray]] = None, []
+
+    def __getattr__(self, name: str) -> Any:
+        """Return what the model itself has."""
+        return getattr(self.__dict__["model"], name)
+
+    @cached_property
+    def effects(self) -> tuple[Effect, ...]:
+        """Effects of the model, and the terms."""
+        return (*self.model.effects, *self.terms)
+
+    def windows(self, theta: Mapping[str, float]) -> list[Window]:
+        """See :class:`Model`."""
+        found = each(lambda w: with_columns(w, self.terms), self.model.windows(self._own(theta)))
+        self.columns = dict(enumerate(w.effects[:, -len(self.terms) :] for w in found))
+        return [replace(w, residual=w.residual - self.columns[i] @ self._sizes(theta)) for i, w in enumerate(found)]
+
+    def residuals(self, theta: Mapping[str, float], about: Linearised | None = None) -> list[np.ndarray]:
+        """See :class:`Model`; a term's column stays that of the place where derivatives were taken."""
+        own, sizes = self._own(theta), self._sizes(theta)
+        if about is not self._about[0]:
+            self._about = about, about and without_columns(about, self.terms)
+            self._last = None, []
+        if about is not None:
+            self.columns = {i: w.effects[:, -len(sizes) :] for i, w in about.windows.items()}
+        if self._last[0] != own:
+            self._last = own, self.model.residuals(own, self._about[1])
+        return [r - self.columns[i] @ sizes if i in self.columns else r for i, r in enumerate(self._last[1])]
+
+    def _own(self, theta: Mapping[str, float]) -> dict[str, float]:
+        return _without_terms(theta, self.terms)
+
+    def _sizes(self, theta: Mapping[str, float]) -> np.ndarray:
+        return np.array([theta.get(e.name, 0.0) for e in self.terms])
+
+
+def with_columns(window: Window, terms: Sequence[TermEffect]) -> Window:
+    """The window with the terms as its last effects."""
+    through = forces(window, grammar.Known(window.knots), terms)
+    return replace(window, effects=np.hstack((window.effects, window.latent @ through)))
+
+
+def without_columns(about: Linearised, terms: Sequence[TermEffect]) -> Linearised:
+    """The same without its last effects, which are terms."""
+    windows = {i: replace(w, effects=w.effects[:, : -len(terms)]) for i, w in about.windows.items()}
+    return Linearised(_without_terms(about.theta, terms), windows)
+
+
+def _without_terms(theta: Mapping[str, float], terms: Sequence[TermEffect]) -> dict[str, float]:
+    names = {e.name for e in terms}
+    return {name: size for name, size in theta.items() if name not in names}
+
+
+def forces(window: Window, known: grammar.Known, terms: Sequence[TermEffect]) -> np.ndarray:
+    """Latent forces at a window's knots that a coefficient of 1 of each term stands for, shape (L, T)."""
+    out = np.zeros((len(window.latent_block), len(terms)))
+    for i, effect in enumerate(terms):
+        if carries(window.latent_block, effect.term.block):
+            values = grammar.Layout.of([effect.term]).table(known).ravel()
+            out[:, i] = grammar.through_latents(window, known, effect.term.block) @ values
+    return out
+
+
+def extended(problem: Problem, point: Point, terms: Sequence[TermEffect]) -> tuple[Problem, Point]:
+    """The problem and a point of it with more terms as effects, at 0; nothing is simulated again."""
+    model, known = WithTerms(problem.model, terms), grammar_known(point)
+    priors, count = Priors.of(tuple(model.effects), tuple(model.channels)), len(terms)
+    through = each(lambda w: forces(point.windows[w], known[w], terms), range(len(known)))
+
+    def longer(window: Window, w: int) -> Window:
+        return replace(window, effects=np.hstack((window.effects, window.latent @ through[w])))
+
+    def column(w: int) -> Gram:
+        gram, own = point.grams[w], through[w] * priors.floor[-count:]
+        return _appended(gram, lapack.dtrtrs(gram.factor, own, lower=1)[0] if gram.latents else own)
+
+    windows, grams = each(lambda w: longer(point.windows[w], w), range(len(known))), each(column, range(len(known)))
+    about = point.about
+    if about is not None:
+        own = {i: longer(about.windows[i], w) for w, i in enumerate(problem.kept) if i in about.windows}
+        about = replace(about, windows=own)
+    at = np.append(point.theta, np.zeros(count))
+    wide = regathered(point, theta=at, windows=windows, grams=grams, about=about)
+    return replace(problem, model=model, priors=priors), wide
+
+
+def _appended(gram: Gram, columns: np.ndarray) -> Gram:
+    """Append G columns as effects; ``columns`` are in the gram's own latents, shape (L, T)."""
+    part, size, count = slice(gram.nuisances, gram.nuisances + gram.latents), gram.inner.shape[1], columns.shape[1]
+    along = gram.inner[:, :, part] @ columns
+    inner = np.empty((len(along), size + count, size + count))
+    inner[:, :size, :size], inner[:, :size, size:], inner[:, size:, :size] = gram.inner, along, along.transpose(0, 2, 1)
+    inner[:, size:, size:] = columns.T @ along[:, part]
+    return replace(gram, inner=inner, cross=np.concatenate((gram.cross, gram.cross[:, part] @ columns), axis=1))
+
+
+def bare(problem: Problem, point: Point) -> tuple[Problem, Point]:
+    """The problem and a point of it without its terms, whose shares are left out of the residuals where they are not 0."""
+    model = problem.model
+    if not isinstance(model, WithTerms):
+        return problem, point
+    count = len(model.model.effects)
+    windows = [replace(w, effects=w.effects[:, :count]) for w in point.windows]
+    grams = [_without(gram, len(model.terms)) for gram in point.grams]
+    about = point.about
+    if about is not None:
+        about = without_columns(about, model.terms)
+    priors = Priors.of(tuple(model.model.effects), tuple(model.channels))
+    at = regathered(point, theta=point.theta[:count], windows=windows, grams=grams, about=about)
+    return replace(problem, model=model.model, priors=priors), at
+
+
+def _without(gram: Gram, count: int) -> Gram:
+    return replace(gram, inner=gram.inner[:, :-count, :-count], cross=gram.cross[:, :-count])
+
+
+def grammar_known(point: Point) -> list[grammar.Known]:
+    """Quantities at the knots of each window."""
+    return [grammar.Known(window.knots) for window in point.windows]
+
+
+def shortlist(problem: Problem, point: Point, active: Sequence[int], strongest: Mapping[str, float], least: float) -> list[TermEffect]:
+    """The terms that say most beside a set of names, by the linear statistics.
+
+    Args:
+        problem: of the search.
+        point: of the set.
+        active: the set.
+        strongest: latent force of each block where the model stood alone [N or N m].
+        least: nats that a term must bring beyond its price.
+    """
+    calm, parts = calmed(point)
+    known = grammar_known(point)
+    screens = {block: of for block in strongest if (of := screen(calm, parts, block, known)) is not None}
+    depths = [term.depth for of in screens.values() for term in of.terms]
+    price = {depth: float(np.log(sum(d <= depth for d in depths))) for depth in set(depths)}
+    found: list[tuple[float, grammar.Term, float]] = []
+    for block, of in screens.items():
+        gain, prior = gains(calm, problem.priors, active, of, REACH * strongest[block])
+        gain -= [price[term.depth] for term in of.terms]
+        found += [(float(gain[i]), of.terms[i], float(prior[i])) for i in distinct(gain, of, WEIGHED)]
+    there = {e.term for e in problem.model.effects if isinstance(e, TermEffect)}
+    best = sorted((f for f in found if f[0] > least and f[1] not in there), key=lambda f: -f[0])[:WEIGHED]
+    return [_effect(term, prior, price[term.depth]) for _, term, prior in best]
+
+
+def _effect(term: grammar.Term, prior: float, price: float) -> TermEffect:
+    return TermEffect(term.formula, "a law that the catalogue does not hold", term.formula, term.unit, term.block, (-np.inf, np.inf),
+                      prior, NARROW * prior, (), "grammar", term=term, price=price + LAW)  # fmt: skip
+
+
+def strongest_forces(point: Point) -> dict[str, float]:
+    """Latent force of each block in the phase where it is strongest [N or N m]; none where a window has no knots."""
+    strongest: dict[str, float] = {}
+    for (block, _), level in point.noise.latent_sd.items():
+        name = LATENT_BLOCKS[block]
+        strongest[name] = max(strongest.get(name, 0.0), level)
+    if set(strongest) == set(LATENT_BLOCKS):
+        strongest[grammar.JOINT] = strongest[felt(grammar.JOINT)]
+    return strongest if all(w.knots for w in point.windows) else {}
+
+
+def matters(problem: Problem, point: Point, j: int, size: float) -> bool:
+    """Whether a term's force, in the phase where it is strongest, exceeds what does not matter in a block it acts in.
+
+    Args:
+        problem: with the term.
+        point: of it.
+        j: number of the term among the effects.
+        size: its coefficient.
+    """
+    term = problem.model.effects[j].term
+    layout = grammar.Layout.of([term])
+    square: dict[tuple[int, str], list[float]] = {}
+    for window, gram, own in zip(point.windows, point.grams, grammar_known(point)):
+        if carries(gram.latent_block, term.block):
+            for block, values in grammar.loads(term.block, own, layout.table(own)).items():
+                square.setdefault((LATENT_BLOCKS.index(block), window.phase), []).append(float((values**2).sum((1, 2)).mean()))
+    common = {block: usual(point.noise.latent_sd, block) for block, _ in square}
+    return any(abs(size) * np.sqrt(np.mean(values)) > MATERIAL * common[block] for (block, _), values in square.items())
+
+
+def laws(problem: Problem, point: Point, active: Sequence[int], nats: float) -> tuple[Law, ...]:
+    """The terms of a set with coefficients and deviations; ``nats`` is what they bring."""
+    sigma = covariance(point.information, problem.priors.deviation(list(active)))
+    mean, sd, effects = sigma @ point.score, np.sqrt(np.diag(sigma)), problem.model.effects
+    told = [(effects[j].term, effects[j].floor, j) for j in active if isinstance(effects[j], TermEffect)]
+    return tuple(
+        Law(t.formula, t.block, t.factors, t.vector, float(mean[j] * floor), float(sd[j] * floor), t.unit, float(nats))
+        for t, floor, j in told
+    )
