@@ -8,7 +8,7 @@ import pytest
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
 from visthrow.diagnose.likelihood.evidence import Priors
 from visthrow.diagnose.select import point as points
-from visthrow.diagnose.select import result, search, selector
+from visthrow.diagnose.select import result, search, selector, state
 from visthrow.diagnose.select.point import Problem, fitted, linearise
 
 EFFECTS = catalogue(12)
@@ -72,7 +72,7 @@ class Luckier(SyntheticModel):
 
 def test_initial_states_that_were_fitted_anew_are_no_evidence_for_the_candidate(monkeypatch):
     """Without it they explain the flights as well, which the simulation shows and derivatives do not."""
-    monkeypatch.setattr(selector.Selector, "_settle", lambda self, point, active, doubted=None: point if doubted is None else fitted(
+    monkeypatch.setattr(selector.Selector, "settle", lambda self, point, active, doubted=None: point if doubted is None else fitted(
         self.problem, linearise(self.problem, point.theta, point.noise), active))  # fmt: skip
     model = Luckier(effects=EFFECTS, truth={NAME: 2.0}, seed=8)
     assert not search.explain(model, laws=False).named
@@ -89,16 +89,17 @@ def test_a_candidate_that_is_not_sure_where_it_leads_is_not_followed_further(beg
     """Derivatives of a rope of 24 segments are a fifth of a minute; those of one without a size yet are taken where they point."""
     model = SyntheticModel(effects=EFFECTS, truth={NAME: SIZE}, seed=5)
     plain, taken = selector.linearise, []
-    monkeypatch.setattr(selector, "linearise", lambda *given: (taken.append(given), plain(*given))[1])
-    monkeypatch.setattr(selector, "curvature", lambda *_: np.inf)
-    monkeypatch.setattr(selector, "fitted", lambda problem, point, active: replace(point, theta=point.theta + 2.0))
-    monkeypatch.setattr(selector.Selector, "_sure", lambda *_: sure)
+    monkeypatch.setattr(state, "curvature", lambda *_: np.inf)
+    for module in (selector, state):
+        monkeypatch.setattr(module, "linearise", lambda *given: (taken.append(given), plain(*given))[1])
+        monkeypatch.setattr(module, "fitted", lambda problem, point, active: replace(point, theta=point.theta + 2.0))
+    monkeypatch.setattr(selector.Selector, "sure", lambda *_: sure)
     monkeypatch.setattr(selector.Selector, "_best", lambda *_: False)
     problem = Problem(model, Priors.of(EFFECTS, model.channels), tuple(range(len(model.windows({})))))
     nominal = plain(problem, np.zeros(len(EFFECTS)))
     looked_at = selector.Selector(problem, nominal, 5.0, lambda _: None, origin=nominal, point=nominal)
-    looked_at._closer(selector.Move((3,), 9.0, replace(nominal, theta=nominal.theta + begin)), {})
-    assert len(taken) == (selector.LINEARISATIONS + (begin == 0.0) if sure else begin == 0.0)
+    looked_at._closer(state.Move((3,), 9.0, replace(nominal, theta=nominal.theta + begin)), {})
+    assert len(taken) == (state.LINEARISATIONS + (begin == 0.0) if sure else begin == 0.0)
     assert looked_at.origin is nominal  # a candidate that is refused leaves no derivatives behind
 
 
@@ -120,10 +121,10 @@ def test_what_looks_like_the_best_candidate_is_simulated_as_well(alike, monkeypa
 
 def test_a_law_is_believed_only_where_derivatives_were_taken_at_the_causes(monkeypatch):
     """Here one that explains what the bend of an effect leaves: it is gone where the effect is linearised."""
-    asked, plain = [], selector.Selector._stands
-    monkeypatch.setattr(selector, "curvature", lambda *_: 0.0)  # the search stays with its first derivatives
+    asked, plain = [], selector.Selector.stands
+    monkeypatch.setattr(state, "curvature", lambda *_: 0.0)  # the search stays with its first derivatives
     monkeypatch.setattr(selector.Selector, "_lawful", lambda hunt, *_: asked.append(hunt.origin.theta[3]) or True)
-    monkeypatch.setattr(selector.Selector, "_stands", lambda hunt, point, active, j: hunt._is_term(j) or plain(hunt, point, active, j))
+    monkeypatch.setattr(selector.Selector, "stands", lambda hunt, point, active, j: hunt.is_term(j) or plain(hunt, point, active, j))
     model = SyntheticModel(effects=EFFECTS, law="swirl", law_size=0.01, truth={NAME: SIZE}, seed=5)
     assert search.explain(model).overall == result.UNKNOWN
     assert asked[-1] == pytest.approx(SIZE, rel=0.1)
@@ -132,12 +133,12 @@ def test_a_law_is_believed_only_where_derivatives_were_taken_at_the_causes(monke
 
 def test_a_name_that_a_later_one_left_with_hardly_any_size_is_dropped(monkeypatch):
     """However many nats it brings: they are those of what the derivatives lack."""
-    plain, other = selector.Selector._sure, 6
+    plain, other = selector.Selector.sure, 6
 
     def sure(self, point, active, j):
         return plain(self, point, active, j) and not (j == other and len(active) > 1 and active[-1] != other)
 
-    monkeypatch.setattr(selector.Selector, "_sure", sure)
+    monkeypatch.setattr(selector.Selector, "sure", sure)
     monkeypatch.setattr(selector.Selector, "_exchange", lambda _: False)  # alone it would be a better answer than the other alone
     hidden = {NAME: SIZE, EFFECTS[other].name: 3.0 * SIZE}
     said = []

@@ -379,9 +379,9 @@ def test_a_window_that_no_force_explains_is_left_out():
 
 
 def test_a_candidate_that_cannot_stand_does_not_end_the_search(monkeypatch):
-    sure = selector.Selector._sure
+    sure = selector.Selector.sure
     refusing = lambda self, point, active, j: self.name(j) != "effect_03" and sure(self, point, active, j)  # noqa: E731
-    monkeypatch.setattr(selector.Selector, "_sure", refusing)
+    monkeypatch.setattr(selector.Selector, "sure", refusing)
     diagnosis = search.explain(world(truth={"effect_03": 12.0, "effect_07": 8.0}, seed=4), laws=False)
     assert [step.named for step in diagnosis.steps][:1] == ["effect_07"]
     assert "effect_03" not in diagnosis.theta  # nor is it exchanged for what was named

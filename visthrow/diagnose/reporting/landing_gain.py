@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from visthrow.common.statistics import mean
-from visthrow.diagnose.select.selector import Work
+from visthrow.diagnose.select.state import Work
 from visthrow.diagnose.throw.landing import Landings
 
 

@@ -14,7 +14,7 @@ from visthrow.diagnose.reporting.gain import Gain
 from visthrow.diagnose.reporting.landing_gain import LandingGain
 from visthrow.diagnose.select import result
 from visthrow.diagnose.select.result import Diagnosis
-from visthrow.diagnose.select.selector import Work
+from visthrow.diagnose.select.state import Work
 from visthrow.view.parts import png_of
 
 WIDTH = 9.2

@@ -28,7 +28,8 @@ from visthrow.diagnose.select.excess import UNKNOWN_RATIO
 from visthrow.diagnose.select.point import Point
 from visthrow.diagnose.select.result import ChannelGain, Diagnosis, Finding, HeldOut
 from visthrow.diagnose.select.scatter import deviations, freed
-from visthrow.diagnose.select.selector import CLOSE, Work
+from visthrow.diagnose.select.selector import CLOSE
+from visthrow.diagnose.select.state import Work
 
 DRAWS = 10_000
 MOST_FOLDS = 12

@@ -12,7 +12,7 @@ from visthrow.diagnose.likelihood.evidence import Priors, threshold
 from visthrow.diagnose.likelihood.threads import each
 from visthrow.diagnose.models.interface import Model
 from visthrow.diagnose.select import held_out
-from visthrow.diagnose.select.consistency import repeated_flights
+from visthrow.diagnose.select.copies import repeated_flights
 from visthrow.diagnose.select.point import Point, Problem, linearise, lost, only
 from visthrow.diagnose.select.result import Diagnosis
 from visthrow.diagnose.select.selector import Selector

@@ -42,6 +42,9 @@ landing by 5 mm within half a second."""
 WEIGHED = 5
 """Terms that become effects to be weighed."""
 
+ANY_SIZE = 1e3
+"""Prior deviation of a name of any size, in its usual one."""
+
 ROUGHER = 2.0
 """While terms are screened, no phase is rougher than so many times the usual."""
 
@@ -390,3 +393,17 @@ def laws(problem: Problem, point: Point, active: Sequence[int], nats: float) -> 
         Law(t.formula, t.block, t.factors, t.vector, float(mean[j] * floor), float(sd[j] * floor), t.unit, float(nats))
         for t, floor, j in told
     )
+
+
+def beyond(point: Point, priors: Priors, active: Sequence[int], term: int, name: int) -> float:
+    """Nats that a term explains and a name, whatever its size, does not; none where both are the same form.
+
+    A term has neither bounds nor a usual size. It must not take the place of a name that says the same only because the name lies
+    at its bound, or is larger than was expected.
+    """
+    deviation = priors.deviation([k for k in active if k != term])
+    deviation[[name, term]] = ANY_SIZE * priors.slab[name], 0.0
+    information, score = point.information, point.score
+    known = covariance(information, deviation) @ np.column_stack((information[:, term], score))
+    own, left = information[term, term] - information[term] @ known[:, 0], score[term] - information[term] @ known[:, 1]
+    return float(0.5 * left**2 / max(own, 1e-300))

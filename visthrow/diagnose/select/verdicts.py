@@ -12,7 +12,8 @@ from visthrow.diagnose.select.excess import acts_on, levels, too_strong
 from visthrow.diagnose.select.point import Point, moved, with_fitted_noise, with_floors_noise, with_varying
 from visthrow.diagnose.select.result import Diagnosis, Finding, Law, Level
 from visthrow.diagnose.select.scatter import BY_FLIGHT, deviations, freed
-from visthrow.diagnose.select.selector import Selector, Work
+from visthrow.diagnose.select.selector import Selector
+from visthrow.diagnose.select.state import Work
 from visthrow.diagnose.select.terms import WithTerms, bare
 
 HALF_PRIOR = 0.5

@@ -1,0 +1,255 @@
+"""The state of a search: the set that it has come to, where it stands, what that is worth, and what every move asks of it."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from visthrow.diagnose.likelihood import grammar
+from visthrow.diagnose.likelihood.evidence import Priors, certainty, estimate, log_evidence
+from visthrow.diagnose.likelihood.marginal import Statistics
+from visthrow.diagnose.select import terms
+from visthrow.diagnose.select.excess import acts_on
+from visthrow.diagnose.select.point import Point, Problem, advantage, curvature, fitted, linearise, moved
+from visthrow.diagnose.select.result import Law, Step
+from visthrow.diagnose.select.scatter import SHARE, Scatter, by_flight, disagreement, freed, straightened, varying
+
+STRAIGHT = 0.5
+"""Size in floors that the simulation's distance from its linearisation may fake before the derivatives are taken anew."""
+
+WHOLE = 0.7
+"""Of another kind of block that flights must ask for: of one that is not there, whose state has more freedom, a part is taken."""
+
+LINEARISATIONS = 3
+"""At most so many times in a row, each where the last led."""
+
+NEAR = 0.1
+"""Distance from where derivatives were taken, in floors, within which they hold for a law as well."""
+
+
+@dataclass(frozen=True)
+class Work:
+    """What a diagnosis leaves behind for gain, report, plan and blind: the search's problem, its first and its last point."""
+
+    problem: Problem
+    before: Point
+    after: Point
+    active: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Move:
+    """A set that may take the place of the one that a search stands at."""
+
+    active: tuple[int, ...]
+    nats: float  # by which it is ahead
+    point: Point | None = None  # where the simulation was run with it
+
+
+@dataclass
+class SearchState:
+    """A search: the set that it has come to, the point where it stands, and what was said on the way."""
+
+    problem: Problem
+    nominal: Point
+    least: float  # threshold [nats]
+    progress: Callable[[str], None]
+    laws: bool = True  # whether terms are candidates
+    active: list[int] = field(default_factory=list)
+    point: Point | None = None
+    origin: Point | None = None  # where the derivatives were taken last
+    steps: list[Step] = field(default_factory=list)
+    refused: dict[int, float] = field(default_factory=dict)  # effects that are not the same in all flights, with their nats
+    events: list[int] = field(default_factory=list)
+    sets: list[Move] = field(default_factory=list)  # that are possible as well
+    proposed: set[frozenset[int]] = field(default_factory=set)  # sets beside which terms were looked for
+    linearised: set[frozenset[int]] = field(default_factory=set)  # sets at whose sizes derivatives were taken for laws' sake
+    visited: set[frozenset[int]] = field(default_factory=set)
+    acting: dict[int, tuple[str, str]] = field(default_factory=dict)  # blocks that effects act in, without the joint and with it
+    work: Point | None = None  # what is left for report and plan: without laws
+    varied: Any = None  # of :meth:`scatter`, and what it was asked about
+
+    @property
+    def priors(self) -> Priors:
+        """Return the priors of the candidates."""
+        return self.problem.priors
+
+    @property
+    def terms(self) -> list[int]:
+        """Return the terms of laws in the set."""
+        return [j for j in self.active if self.is_term(j)]
+
+    @property
+    def names(self) -> list[int]:
+        """Return the effects of the set."""
+        return [j for j in self.active if not self.is_term(j)]
+
+    def name(self, j: int) -> str:
+        """Return the name of a candidate by its number."""
+        return self.problem.model.effects[j].name
+
+    @property
+    def prices(self) -> np.ndarray:
+        """Return what the name of each candidate costs [nats], shape (K,)."""
+        return self.least + np.array([getattr(e, "price", 0.0) for e in self.problem.model.effects])
+
+    def price(self, active: Sequence[int]) -> float:
+        """Return what the names of a set cost [nats]: those that act in a law's block may be a part of its form, and cost as much."""
+        prices, lawful = self.prices, [j for j in active if self.is_term(j)]
+        beside = [j for j in active if j not in lawful and self._acts_beside(j, lawful)]
+        return float(prices[list(active)].sum() + len(beside) * max((prices[j] for j in lawful), default=0.0))
+
+    def _acts_beside(self, j: int, laws: Sequence[int]) -> bool:
+        """Whether an effect acts in the block of one of some laws."""
+        blocks = {self.problem.model.effects[k].block for k in laws}
+        if blocks and j not in self.acting:
+            self.acting[j] = acts_on(self.nominal, j), acts_on(self.nominal, j, joint=True)
+        return bool(blocks) and self.acting[j][grammar.JOINT in blocks] in blocks
+
+    def ahead(self, first: tuple[Point, Sequence[int]], second: tuple[Point, Sequence[int]]) -> float:
+        """Return the nats by which a set at its point is worth more than another at its own."""
+        evidence = advantage(self.priors, first, second, self.problem.switches)
+        return float(evidence - self.price(first[1]) + self.price(second[1]))
+
+    def is_term(self, j: int) -> bool:
+        """Tell whether a candidate is a term of a law."""
+        return isinstance(self.problem.model.effects[j], terms.TermEffect)
+
+    @property
+    def term_columns(self) -> np.ndarray:
+        """Return which candidates are terms, shape (K,), bool."""
+        return np.array([self.is_term(j) for j in range(len(self.priors.floor))])
+
+    def linear(self, active: Sequence[int], point: Point) -> float:
+        """Return what a set is worth by the statistics of a point alone."""
+        return log_evidence(point.information, point.score, self.priors, list(active)) - self.price(active)
+
+    def worth(self, active: Sequence[int] | None = None) -> dict[int, float]:
+        """Return what each name of a set, by default that of the search, adds to the others, in nats."""
+        active = self.active if active is None else active
+        whole = self.point.evidence(self.priors, active)
+        return {j: whole - self.point.evidence(self.priors, [k for k in active if k != j]) for j in active}
+
+    def sizes(self, active: Sequence[int], point: Point | None = None) -> np.ndarray:
+        """Return the most probable sizes of a set of effects at a point, by default the search's, in floors, shape (K,)."""
+        point = self.point if point is None else point
+        return estimate(point.information, point.score, self.priors, list(active))
+
+    def _again(self, theta: np.ndarray) -> Statistics | None:
+        there = moved(self.problem, self.point, theta)
+        return None if there is None else there.plain
+
+    def about_means(self, active: Sequence[int], varies: Mapping[int, float]) -> Statistics:
+        """Return what the flights say of the means of effects that vary; flights far from the mean are simulated again at their own size.
+
+        Args:
+            active: effects named.
+            varies: deviation in floors of an effect among flights.
+        """
+        statistics, theta = self.point.plain, self.sizes(active)
+        for j in sorted(set(varies) & set(active)):
+            statistics = straightened(statistics, theta, self.priors, j, self._again)
+        return freed(statistics, varies)
+
+    def scatter(self, active: Sequence[int], *, every: bool = False) -> tuple[Scatter, ...]:
+        """Return the verdicts on what varies from flight to flight about the sizes of a set of effects.
+
+        Args:
+            active: the set.
+            every: ask about all effects, not only those of the catalogue's random effects and those that are known to vary.
+        """
+        asked = self.point, tuple(active), every
+        if self.varied is None or self.varied[0][0] is not self.point or self.varied[0][1:] != asked[1:]:
+            effects, about = self.problem.model.effects, self.sizes(active)
+            others = by_flight([e for j, e in enumerate(effects)
+                                if j in self.problem.varies or (every and not e.switch and not self.is_term(j))])  # fmt: skip
+            self.varied = asked, varying(self.point.plain, about, self.priors, [e.name for e in effects], self.least, self._again,
+                                         others, active)  # fmt: skip
+        return self.varied[1]
+
+    def stands(self, point: Point, active: Sequence[int], j: int) -> bool:
+        """Tell whether a candidate of a set could be named at all, however many nats it brings."""
+        if self.problem.switches[j]:
+            share = estimate(point.information, point.score, self.priors, list(active))[j] * self.priors.floor[j]
+            if share < WHOLE:
+                self.progress(f"{self.name(j)} is there or not, and these flights ask for a part of it; it is not named")
+                return False
+        if not self.sure(point, active, j):
+            self.progress(f"{self.name(j)} would be no larger than what it cannot be told from; it is not named")
+            return False
+        return True
+
+    def sure(self, point: Point, active: Sequence[int], j: int) -> bool:
+        """Tell whether an effect of a set is surely not 0, whatever half a floor of it is."""
+        return bool(certainty(point.information, point.theta, self.priors, active)[list(active).index(j)] > 1.0)
+
+    def disagreement_on(self, point: Point, active: Sequence[int], j: int, share: float = SHARE) -> tuple[int | None] | None:
+        """Return whether flights disagree on an effect of a set: see :func:`visthrow.diagnose.select.scatter.disagreement`."""
+        return disagreement(point.plain, self.priors, point.varies, active, j, self.least, share)
+
+    def settle(self, point: Point, active: Sequence[int], doubted: int | None = None) -> Point:
+        """Linearise where the search stands, unless the last derivatives still hold, and step on where that moved the optimum.
+
+        Args:
+            point: where it stands.
+            active: the set.
+            doubted: an effect of it without which the point is of no use, so that it ends where this one is not sure.
+        """
+        kinds = self.problem.switches
+        same = np.array_equal(self.origin.theta[kinds] != 0.0, point.theta[kinds] != 0.0)
+        silent = self.priors.visible & (np.diag(self.origin.information) <= 0.0)  # such as wind without drag: it may show elsewhere
+        anew = getattr(self.problem.model, "cheap", False) and np.any(silent)
+        if same and not anew and curvature(self.problem, self.origin, point) < STRAIGHT:
+            return point
+        for _ in range(LINEARISATIONS):
+            self.origin = linearise(self.problem, point.theta, point.noise)
+            before, point = point, fitted(self.problem, self.origin, active)
+            if doubted is not None and not self.sure(point, active, doubted):
+                break
+            if np.abs(point.theta - before.theta).max() <= 0.5 or curvature(self.problem, self.origin, point) <= STRAIGHT:
+                break
+        return point
+
+    def nearer(self) -> bool:
+        """Linearise where the search stands; False where that was done. Before a law is believed: it may explain what bends do."""
+        here = frozenset(self.active)
+        if here in self.linearised or np.abs(self.origin.theta - self.point.theta)[~self.term_columns].max(initial=0.0) <= NEAR:
+            return False
+        self.linearised.add(here)
+        self.progress("derivatives are taken where the causes are, for a law may explain what they lack")
+        self.origin = linearise(self.problem, self.point.theta, self.point.noise)
+        self.point = fitted(self.problem, self.origin, self.active)
+        return True
+
+    def law(self) -> tuple[set[int], str]:
+        """Return the names that are not told beside the set's laws, and why there are laws in words.
+
+        Names that act in a law's block may be a part of its form. A name acts there by its column or by what the other names cannot
+        stand in for, as two delays that differ by a force. What is worth nothing without those is not told either.
+        """
+        effects, names = self.problem.model.effects, self.names
+        blocks = {effects[j].block for j in self.terms}
+        joint = grammar.JOINT in blocks
+        near = {j for j in names if acts_on(self.point, j, joint=joint) in blocks}
+        near |= {j for j in set(names) - near if len(names) > 1
+                 and acts_on(self.point, j, joint=joint, beside=[k for k in names if k != j]) in blocks}  # fmt: skip
+        left = [j for j in self.active if j not in near]
+        while near and (worth := {j: w for j, w in self.worth(left).items() if j in names}):
+            weakest = min(worth, key=worth.get)
+            if worth[weakest] > self.least:
+                break
+            left.remove(weakest)
+        told = terms.laws(self.problem, self.point, self.active, 0.0)
+        text = " and ".join(f"{law.formula}, c = {law.coefficient:.3g} ± {law.sd:.2g} {law.unit}" for law in told)
+        return set(names) - set(left), f"{text} explains what no cause of the catalogue does"
+
+    def explanations(self) -> list[tuple[Law, ...]]:
+        """Return the laws of the set, then others one by one in their place, best first."""
+        if not self.terms:
+            return []
+        point, found = self.point, [(*self.names, j) for j in np.flatnonzero(self.term_columns).tolist()]
+        value = {s: point.evidence(self.priors, s) - self.price(s) for s in {*found, tuple(self.active)}}
+        without = point.evidence(self.priors, self.names) - self.price(self.names)
+        best = [tuple(self.active), *sorted((s for s in found if set(s) != set(self.active)), key=value.get, reverse=True)]
+        return [terms.laws(self.problem, point, s, value[s] - without) for s in best if value[s] > without]
