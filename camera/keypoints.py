@@ -7,7 +7,7 @@ batch of one.
 import torch
 
 from camera.fisheye import AXIS_EPSILON, Fisheye
-from camera.mount import extrinsics_with_error, nominal_rot_cb, points_c_from_w
+from camera.mount import extrinsics_with_error, nominal_rot_cb, points_c_from_w, rotation_from_vector
 from camera.params import CameraParams
 
 GOAL_KEYPOINTS = 4
@@ -149,6 +149,27 @@ def box_midpoints(extremes: torch.Tensor) -> torch.Tensor:
     u, v = (left + right) * 0.5, (top + bottom) * 0.5
     middles: torch.Tensor = torch.stack([left, v, u, top, right, v, u, bottom], -1).unflatten(-1, (4, 2))
     return middles
+
+
+def corrected_keypoints(
+    camera: KeypointCamera, points: torch.Tensor, valid: torch.Tensor, turn_b: torch.Tensor, scale: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Keypoints of a camera that is turned and whose focal length is another one, as the nominal camera would see them.
+
+    Args:
+        camera: Nominal.
+        points: Normalised [-], shape (E, K, 2). valid: shape (E, K), bool.
+        turn_b: Rotation vectors by which the cameras are turned on the body [rad], shape (E, 3), body frame.
+        scale: Relative errors of their focal lengths [-], shape (E,).
+
+    Returns:
+        Points [-], shape (E, K, 2), and validity, shape (E, K); what falls outside of the nominal field of view is invalid and reads zero.
+    """
+    rays_c, _ = camera.fisheye.unproject(camera.fisheye.denormalize(points / (1.0 + scale[:, None, None])))
+    turn_c = camera.rot_cb @ rotation_from_vector(turn_b) @ camera.rot_cb.T
+    seen, inside = camera.fisheye.project_normalized(rays_c @ turn_c.transpose(-1, -2), clip=True)
+    valid = valid & inside
+    return seen * valid.unsqueeze(-1), valid
 
 
 def payload_keypoints(camera: KeypointCamera, ball_c: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

@@ -5,7 +5,6 @@ they gave is recorded with the tick that it came in, so that a replay decides al
 outside of what was trained or is not known well enough.
 """
 
-import math
 from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import dataclass, field
@@ -18,7 +17,7 @@ from camera.params import CameraParams
 from hil.poses.pose import Vector
 from hil.poses.track import BodyState
 from visthrow.common.errors import ConfigError, VisthrowError
-from visthrow.onboard.calibration import Calibration, Hovered, Spreads, calibrate
+from visthrow.onboard.calibration import Calibration, Hovered, Spreads, calibrate, sway
 
 
 @dataclass(frozen=True)
@@ -126,8 +125,7 @@ class Calibrating:
         if since >= p.sway:
             self._finish()
             return 0.0, 0.0
-        phase = 2.0 * math.pi * p.frequency * since
-        return p.rate * min(1.0, phase) * math.cos(phase), p.rate * math.sin(phase)
+        return sway(since, p.rate, p.frequency)
 
     def note(
         self, now: float, vehicle: BodyState, thrust: float, points: np.ndarray, valid: np.ndarray, age: float

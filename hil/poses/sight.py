@@ -76,7 +76,7 @@ class Sights:
         self._valid = torch.zeros(KEYPOINTS, dtype=torch.bool)
         self._times = {"goal": -np.inf, "ball": -np.inf}
         self._turn: np.ndarray | None = None  # from the camera as it is mounted to that of training
-        self._latency = 0.0
+        self._scale, self._latency = 0.0, 0.0
         self._path: deque[tuple[float, np.ndarray, np.ndarray]] = deque(maxlen=PATH)
         self.fresh: tuple[float, np.ndarray, np.ndarray] | None = None
 
@@ -84,7 +84,7 @@ class Sights:
         """Turn rays and carry them forward from now on by what a calibration found."""
         rot_cb = self._camera.rot_cb.double()
         turn = rotation_from_vector(torch.tensor(found.turn_b, dtype=torch.float64))
-        self._turn, self._latency = (rot_cb @ turn @ rot_cb.T).numpy(), max(found.latency, 0.0)
+        self._turn, self._scale, self._latency = (rot_cb @ turn @ rot_cb.T).numpy(), found.scale, max(found.latency, 0.0)
 
     def along(self, now: float, pos: Vector, quat: Quaternion) -> None:
         """Note where the vehicle is at a tick, as of the poses, for frames that are older than these."""
@@ -115,14 +115,22 @@ class Sights:
         rot_bc, lens = self._camera.rot_cb.double().numpy().T, self._camera.position_b.double().numpy()
         turn, ball, goal = self._turn, seen.ball, seen.goal
         if ball is not None:
-            ball = BallSeen(rot_bc.T @ rot_now.T @ rot @ rot_bc @ turn @ ball.ray_c, ball.half_angle, ball.score)
+            ray = rot_bc.T @ rot_now.T @ rot @ rot_bc @ turn @ self._to_scale(ball.ray_c[None])[0]
+            ball = BallSeen(ray, ball.half_angle / (1.0 + self._scale), ball.score)
         if goal is not None:
-            eye, rays_w = pos + rot @ lens, goal.rays_c @ (rot @ rot_bc @ turn).T
+            eye, rays_w = pos + rot @ lens, self._to_scale(goal.rays_c) @ (rot @ rot_bc @ turn).T
             reach = eye[2] / np.maximum(-rays_w[:, 2:], 0.05)
             from_now = eye + reach * rays_w - (pos_now + rot_now @ lens)
             rays = from_now @ (rot_now @ rot_bc)
             goal = GoalSeen(rays / np.linalg.norm(rays, axis=1, keepdims=True), goal.score)
         return Seen(ball, goal)
+
+    def _to_scale(self, rays_c: np.ndarray) -> np.ndarray:
+        """Rays, shape (N, 3), by the focal length that was found."""
+        lens = self._camera.fisheye
+        points, _ = lens.project_normalized(torch.from_numpy(np.ascontiguousarray(rays_c)))
+        rays: np.ndarray = lens.unproject(lens.denormalize(points / (1.0 + self._scale)))[0].numpy()
+        return rays
 
     def _pose(self, when: float) -> tuple[np.ndarray, np.ndarray]:
         """Place and attitude at a time on the path, by straight lines; its ends beyond them."""

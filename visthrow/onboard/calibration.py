@@ -1,4 +1,4 @@
-"""Hover calibration: the camera's tilt and latency and the thrust, from seconds of hover that end in a small sway. Onboard-safe.
+"""Hover calibration: the camera's tilt, scale and latency and the thrust, from seconds of hover that end in a small sway. Onboard-safe.
 
 A hanging ball shows where down is; a sway turns the camera against it. One least-squares problem holds it all: the vehicle's path,
 its attitude and the swing as unknowns at every step, tied by the momentum of both bodies, the pendulum and the gyro, and what
@@ -29,7 +29,7 @@ STATE = {"pos": 3, "vel": 3, "turn": 3, "swing": 2, "swing_rate": 2}
 """Unknowns of each step: vehicle [m, m/s], attitude from the measured one [rad], horizontal part of the rope's direction and its rate."""
 
 CONSTANTS = {
-    "camera": 3, "latency": 1, "thrust": 1, "length": 1, "attitude": 3, "gyro": 3, "wind": 2, "ball": 2, "corners": 2, "lens": 3, "goal": 2,
+    "camera": 3, "scale": 1, "latency": 1, "thrust": 1, "length": 1, "attitude": 3, "gyro": 3, "wind": 2, "ball": 2, "corners": 2, "lens": 3, "goal": 2,
 }  # fmt: skip
 """Unknowns that stay the same; see `Spreads`."""
 
@@ -61,6 +61,7 @@ class Spreads:
     push: float = 0.1  # unsteady one on both bodies, each step [m/s^2]
     pendulum: float = 0.05  # of the ball's equation of motion, each step [m/s^2]
     tilt: float = 0.2  # before anything is known [rad]
+    scale: float = 0.03  # of the focal length, likewise, relative [-]
     latency: float = 0.05  # likewise [s]
     thrust: float = 0.3  # likewise, relative [-]
 
@@ -93,6 +94,8 @@ class Calibration:
     thrust_sigma: float  # [-]
     misfit: float  # RMS of the sightings over their spread [-]
     steps: int
+    scale: float = 0.0  # of the focal length over the nominal one, less 1 [-]
+    scale_sigma: float = 0.0  # [-]
 
     def values(self) -> dict[str, Any]:
         """As JSON has it."""
@@ -110,7 +113,7 @@ class Calibration:
             for name, x, sigma in zip(("roll", "pitch", "yaw"), self.turn_b, self.turn_sigma)
         ]
         return (
-            f"camera {', '.join(turns)}; latency {1e3 * self.latency:.0f} +- {1e3 * self.latency_sigma:.0f} ms; "
+            f"camera {', '.join(turns)}; scale {1.0 + self.scale:.3f} +- {self.scale_sigma:.3f}; latency {1e3 * self.latency:.0f} +- {1e3 * self.latency_sigma:.0f} ms; "
             f"thrust {self.thrust:.3f} +- {self.thrust_sigma:.3f} of the commanded"
         )
 
@@ -121,6 +124,12 @@ UNKNOWN_YAW = math.radians(2.0)
 
 class CalibrationError(VisthrowError):
     """A hover shows too little to calibrate by."""
+
+
+def sway(since: float, rate: float, frequency: float) -> tuple[float, float]:
+    """Roll and pitch rate of the sway [rad/s], so long after its begin [s]: a circle of an amplitude and a frequency [rad/s, Hz]."""
+    phase = 2.0 * math.pi * frequency * since
+    return rate * min(1.0, phase) * math.cos(phase), rate * math.sin(phase)
 
 
 class Problem:
@@ -160,7 +169,7 @@ class Problem:
         self.ball_seen = torch.from_numpy(seen)
         self.corners_seen = torch.from_numpy(hovered.valid[:, :GOAL_KEYPOINTS].all(1))
         s = spreads
-        spread = {"camera": s.tilt, "latency": s.latency, "thrust": s.thrust, "length": s.length, "attitude": s.pose_bias,
+        spread = {"camera": s.tilt, "scale": s.scale, "latency": s.latency, "thrust": s.thrust, "length": s.length, "attitude": s.pose_bias,
                   "gyro": s.pose_bias, "wind": s.wind, "ball": 0.5 * s.keypoint_bias, "corners": 0.5 * s.keypoint_bias,
                   "lens": s.lens, "goal": s.goal}  # fmt: skip
         self.prior = torch.cat([torch.full((n,), max(spread[name], 1e-9), dtype=torch.float64) for name, n in CONSTANTS.items()])
@@ -248,8 +257,9 @@ class Problem:
         points, _ = self.camera.fisheye.project_normalized(
             torch.cat([in_camera[:, :, :4].flatten(0, 1), rays], -2), clip=True
         )
-        corners = points[:, :4].mean(1).unflatten(0, at.shape[:2]) + c["corners"][:, None]
-        ball = box_midpoints(points[:, 4:]).mean(1).unflatten(0, at.shape[:2]) + c["ball"][:, None]
+        size = 1.0 + c["scale"][:, None]
+        corners = size * points[:, :4].mean(1).unflatten(0, at.shape[:2]) + c["corners"][:, None]
+        ball = size * box_midpoints(points[:, 4:]).mean(1).unflatten(0, at.shape[:2]) + c["ball"][:, None]
         off = torch.cat([(ball - self.ball) * self.ball_seen[:, None], (corners - self.corners) * self.corners_seen[:, None]], -1)
         return off / (0.5 * s.keypoint + 1e-4)
 
@@ -314,7 +324,7 @@ def calibrate(hovered: Hovered, camera: KeypointCamera, contract: dict[str, Any]
     of = lambda table, name: tuple(table[name][0].tolist())  # noqa: E731
     return Calibration(
         of(found, "camera"), of(sigma, "camera"), found["latency"].item(), sigma["latency"].item(),
-        1.0 + found["thrust"].item(), sigma["thrust"].item(), misfit, len(problem.time),
+        1.0 + found["thrust"].item(), sigma["thrust"].item(), misfit, len(problem.time), found["scale"].item(), sigma["scale"].item(),
     )  # fmt: skip
 
 
@@ -327,7 +337,7 @@ def _linearised(problem: Problem, x: Tensor, c: Tensor) -> tuple[Any, np.ndarray
     from scipy.sparse.linalg import splu
 
     (count, width), h = x.shape, 1e-5
-    j, _ = problem.places(c[CONSTANTS["camera"]])
+    j, _ = problem.places(problem.split(c[None])["latency"][0, 0])
     xs, cs = x.repeat(1 + 2 * width + len(c), 1, 1), c.repeat(1 + 2 * width + len(c), 1)
     for i in range(width):
         for parity in (0, 1):

@@ -13,7 +13,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from camera import history as hist
-from camera.keypoints import KEYPOINTS, KeypointCamera
+from camera.keypoints import KEYPOINTS, KeypointCamera, corrected_keypoints
 from camera.noise import StepDraw, apply_latency, apply_noise
 from sim.arrays.torch_bridge import TorchViews, on_torch_stream
 from sim.hybrid import HybridSim, rope_variants
@@ -71,6 +71,7 @@ class ThrowEnv(VecEnv):
         self.sim = HybridSim(plant_of(experiment), self.num_envs, device, seed, ropes=ropes, **many)
         self.views = TorchViews(self.sim)
         self.layout = ob.layout_of(task.observation)
+        self._found: tuple[Tensor, Tensor] | None = None  # by a calibration
         self.camera = KeypointCamera(experiment.camera, device)
         E, make = self.num_envs, {"device": device, "dtype": torch.float32}
         weight = GRAVITY * plant_of(experiment).total_mass
@@ -105,6 +106,7 @@ class ThrowEnv(VecEnv):
             "pose_age": torch.zeros(E, **make),
             "poses": torch.zeros(E, 1 + max(math.ceil(seen.oldest / self.cfg.sim.control_period - 1e-9), 1), POSE, **make),
             "scale_error": torch.zeros(E, 1, 1, **make),
+            "field": torch.ones(E, 1, **make),
             "held_points": torch.zeros(E, KEYPOINTS, 2, **make),
             "held_valid": torch.zeros(E, KEYPOINTS, device=device, dtype=torch.bool),
             "late_points": torch.zeros(E, latency, KEYPOINTS, 2, **make),
@@ -140,6 +142,20 @@ class ThrowEnv(VecEnv):
         pose = torch.lerp(newer, older, age / self.cfg.sim.control_period)
         offset = ob.state_part(pose[:, :3], self.views.goal_w, pose[:, ob.VEHICLE :])
         return torch.cat([pose[:, : ob.VEHICLE], offset], dim=-1)
+
+    def begin_throws(self, found: tuple[Tensor, Tensor]) -> TensorDict:
+        """Begin throws where the vehicles are, with what a calibration in the hover before found.
+
+        Args:
+            found: the cameras' turns [rad], shape (E, 3), and relative errors of their focal lengths [-], shape (E,), that keypoints are
+                corrected for from here on.
+        """
+        self._found = found
+        fresh = torch.ones(self.num_envs, device=self.device, dtype=torch.bool)
+        self.episode_length_buf.zero_()
+        self._memory["previous"].copy_(self._start_action.expand_as(self._memory["previous"]))
+        self._observations = self._observe(fresh)
+        return self._observations
 
     def fix_goal(self, goal_w: Tensor | None) -> None:
         """Use one goal [m], shape (3,), for all episodes from the next reset on, or drawn ones again (None)."""
@@ -296,6 +312,10 @@ class ThrowEnv(VecEnv):
                 old = memory[name]
                 mask = fresh.view(-1, *(1,) * (old.dim() - 1))
                 old.copy_(torch.where(mask, torch.randn_like(old) * std, old))
+        least, most = camera.noise.field
+        if least < 1.0:
+            field = memory["field"]
+            field.copy_(torch.where(fresh[:, None], least + (most - least) * torch.rand_like(field), field))
         low, high = self.cfg.task.observation.latency
         if high > 0.0:
             age = memory["pose_age"]
@@ -397,6 +417,8 @@ class ThrowEnv(VecEnv):
         points, valid = ob.vision_part(self.camera, pos_w, rot_wb, goal_w, payload_w, self.extrinsics())
         if camera.noise.scale_std > 0.0:
             points = points * (1.0 + memory["scale_error"])
+        if camera.noise.field[0] < 1.0:
+            valid = valid & (points.norm(dim=-1) <= memory["field"])
         if camera.noise.latency > 0.0:
             memory["late_points"].copy_(hist.push(memory["late_points"], points, fresh))
             memory["late_valid"].copy_(hist.push(memory["late_valid"], valid, fresh))
@@ -411,7 +433,7 @@ class ThrowEnv(VecEnv):
             valid = torch.where(held[:, None], memory["held_valid"], valid)
             memory["held_points"].copy_(points)
             memory["held_valid"].copy_(valid)
-        return points, valid
+        return (points, valid) if self._found is None else corrected_keypoints(self.camera, points, valid, *self._found)
 
     def _tensors(self) -> dict[str, Tensor]:
         """All that the next step depends on, besides torch's generators."""

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from tensordict import TensorDict
 
 from sim.params import RandomizationParams
 from visthrow import config
@@ -81,7 +82,7 @@ def hover_start(experiment: Experiment) -> Experiment:
 
 def throw(
     experiment: Experiment, policy, target: float, count: int, device: str = "cpu", seed: int = 0,
-    build: Callable[..., ThrowEnv] = ThrowEnv,
+    build: Callable[..., ThrowEnv] = ThrowEnv, begin: Callable[[ThrowEnv], TensorDict] = ThrowEnv.reset,
 ) -> Throws:  # fmt: skip
     """Throw ``count`` times in the training simulator, with all its noise.
 
@@ -93,17 +94,18 @@ def throw(
         device: of the simulator and the policy.
         seed: of starts and noise; torch's generators are put back afterwards.
         build: makes the environment, as the class does.
+        begin: brings it to where the throws begin and returns what is observed there.
     """
     devices = [device] if device.startswith("cuda") else []
     with torch.random.fork_rng(devices=devices), torch.inference_mode():
         torch.manual_seed(seed)
         env = build(hover_start(experiment), device, seed, count)
         env.fix_goal(torch.tensor([target, 0.0, 0.0], device=device))
-        return _fly(env, policy, target, count)
+        return _fly(env, policy, target, count, begin)
 
 
-def _fly(env: ThrowEnv, policy, target: float, count: int) -> Throws:
-    observations = env.reset()
+def _fly(env: ThrowEnv, policy, target: float, count: int, begin: Callable[[ThrowEnv], TensorDict]) -> Throws:
+    observations = begin(env)
     open_ = torch.ones(count, dtype=torch.bool, device=env.device)
     kept: dict[str, torch.Tensor] = {}
     previous = env.previous_action.clone()

@@ -1,0 +1,115 @@
+"""Throws in the training simulator that begin as a runner's do with a camera of its own: a hover, a sway, a calibration.
+
+What the simulator draws of each vehicle and its camera stays the same in the hover and in the throw. The calibration is given what the
+actor measures, with its noise, and where the goal is, as a motion-capture hall has it.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+from tensordict import TensorDict
+
+from camera.keypoints import KEYPOINTS, KeypointCamera
+from sim.arrays.cores import cores
+from visthrow.common.errors import ConfigError
+from visthrow.common.workers import Workers
+from visthrow.onboard import actions as act
+from visthrow.onboard import observations as ob
+from visthrow.onboard.calibration import Calibration, CalibrationError, Hovered, calibrate, sway
+from visthrow.onboard.hover import HoverController, HoverParams
+from visthrow.task import Experiment, contract_of
+from visthrow.training.env import ThrowEnv
+
+STILL, SWAY, SETTLE = 1.5, 1.5, 3.0
+"""Of a hover: before the sway, the sway, until the swing that it leaves has died down [s]."""
+
+RATE, FREQUENCY = 1.0, 1.5
+"""Of the sway [rad/s], [Hz]."""
+
+
+def calibrated_start(experiment: Experiment, found: list[Calibration | None]) -> Callable[[ThrowEnv], TensorDict]:
+    """What :func:`visthrow.training.protocol.throw` begins with.
+
+    Args:
+        experiment: of a vision policy.
+        found: takes the calibration of each throw; None where there was none, and keypoints stay as they came.
+
+    Raises:
+        ConfigError: another layout than vision, without validity bits, or goals that move.
+    """
+    seen = experiment.task.observation
+    if seen.layout != "vision" or not seen.validity or experiment.task.target.moves:
+        raise ConfigError(
+            f"calibration in the hover with observation.layout = {seen.layout!r}, validity = {seen.validity}; expected 'vision' with "
+            "validity and goals that stand still"
+        )
+
+    def begin(env: ThrowEnv) -> TensorDict:
+        found[:] = _calibrations(experiment, _hovered(env))
+        turn = [c.turn_b if c else (0.0, 0.0, 0.0) for c in found]
+        scale = [c.scale if c else 0.0 for c in found]
+        return env.begin_throws((torch.tensor(turn, device=env.device), torch.tensor(scale, device=env.device)))
+
+    return begin
+
+
+def _hovered(env: ThrowEnv) -> list[Hovered]:
+    """Hover, sway and settle; what was measured till the end of the sway, of each vehicle."""
+    cfg, period = env.cfg, env.cfg.sim.control_period
+    steps, last = round((STILL + SWAY) / period), round((STILL + SWAY + SETTLE) / period)
+    controller = HoverController(HoverParams(), period, env.num_envs)
+    rate = torch.tensor(cfg.task.action.max_rate)
+    seen = env.reset()["actor"]
+    home, rows = env.views.state["pos_w"].cpu().numpy().copy(), []
+    mass = cfg.vehicle.body.mass + cfg.rope.payload_mass + cfg.rope.rope_mass
+    for k in range(last):
+        measured = _measured(env.layout, seen.cpu())
+        command = controller.step(*measured[:3], home, mass)
+        since = k * period - STILL
+        if 0.0 <= since < SWAY:
+            command[:, 1:3] += sway(since, RATE, FREQUENCY)
+        if k < steps:
+            rows.append((np.full(env.num_envs, k * period), *measured[:4], command[:, 0], *measured[4:]))
+        action = act.action_from_command(torch.from_numpy(command).float(), cfg.task.action.max_thrust, rate)
+        env.episode_length_buf.zero_()  # a hover has no time limit
+        seen = env.step(torch.cat([action, -torch.ones(env.num_envs, 1)], -1).to(env.device), hold=True)[0]["actor"]
+    time, pos, quat, vel, rates, thrust, points, valid = (np.stack(column, 1) for column in zip(*rows))
+    goal = env.views.goal_w.cpu().numpy()
+    return [
+        Hovered(time[i], pos[i], quat[i], vel[i], rates[i], thrust[i], points[i], valid[i], goal[i]) for i in range(env.num_envs)
+    ]
+
+
+def _measured(layout: ob.Layout, seen: torch.Tensor) -> tuple[np.ndarray, ...]:
+    """Position, attitude xyzw, velocity, body rates, keypoints (E, 8, 2) and validity (E, 8) in observations, shape (E, D)."""
+    vehicle, goal = seen[:, : ob.VEHICLE].double().numpy(), ob.VEHICLE + act.ACTIONS
+    x, y = vehicle[:, 9:12], vehicle[:, 12:15]
+    x = x / np.linalg.norm(x, axis=1, keepdims=True)
+    y = y - x * (x * y).sum(1, keepdims=True)
+    y /= np.linalg.norm(y, axis=1, keepdims=True)
+    quat = Rotation.from_matrix(np.stack([x, y, np.cross(x, y)], -1)).as_quat()
+    points = seen[:, goal : goal + 2 * KEYPOINTS].unflatten(1, (KEYPOINTS, 2)).double().numpy()  # goal, then the payload now
+    bits = seen.shape[1] - layout.motion - layout.located - KEYPOINTS
+    valid = seen[:, bits : bits + KEYPOINTS].numpy() > 0.5
+    return vehicle[:, :3], quat, vehicle[:, 3:6], vehicle[:, 6:9], points, valid
+
+
+def _solve(task: tuple) -> Calibration | None:
+    """The calibration of one hover; None where it shows too little."""
+    hovered, camera, contract = task
+    torch.set_num_threads(1)
+    try:
+        return calibrate(hovered, KeypointCamera(camera, dtype=torch.float64), contract)
+    except CalibrationError:
+        return None
+
+
+def _calibrations(experiment: Experiment, hovered: list[Hovered]) -> list[Calibration | None]:
+    contract = contract_of(experiment)
+    found: list[Calibration | None] = [None] * len(hovered)
+    with Workers(_solve, [(one, experiment.camera, contract) for one in hovered], cores(), "calibrations") as workers:
+        for place, result in workers:
+            found[place] = result
+    return found
