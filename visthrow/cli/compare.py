@@ -48,6 +48,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--config", metavar="NAME", help="fly in this train config instead of each policy's own")
     allow = "part of a policy's contract that --config and --set may break (vehicle, rope.length); told above the table"
     parser.add_argument("--allow", action="append", default=[], metavar="KEY", help=f"{allow}; may be repeated")
+    parser.add_argument(
+        "--calibrate", action="store_true",
+        help="begin each throw with a hover that calibrates its camera, as the runner does (vision policies, plant hybrid)",
+    )  # fmt: skip
     add_out(parser, "out/compare", "for table, CSV and plot")
     add_common(parser)
 
@@ -63,6 +67,8 @@ def run(args: argparse.Namespace) -> int:
     from visthrow.training.device import resolve
 
     known_plant(args.plant)
+    if args.calibrate and args.plant != "hybrid":
+        raise ConfigError(f"--calibrate on plant '{args.plant}'; expected 'hybrid', whose cameras differ from throw to throw")
     wanted = args.policies or DEFAULT_POLICIES
     loaded = [load_policy(name, args.config, args.overrides, args.allow) for name in wanted if name != NAME]
     writable(Path(args.out))
@@ -71,7 +77,7 @@ def run(args: argparse.Namespace) -> int:
     if not loaded:
         throws = []
     elif args.plant == "hybrid":
-        throws = throw_hybrid(loaded, args.targets, args.throws, resolve(args.device), args.seed)
+        throws = throw_hybrid(loaded, args.targets, args.throws, resolve(args.device), args.seed, args.calibrate)
     else:
         from visthrow.throws.reference_protocol import Throwing
 
@@ -169,9 +175,11 @@ def check(targets: Sequence[float], throws: int) -> None:
 
 
 def throw_hybrid(
-    loaded: Sequence, targets: Sequence[float], count: int, device: str, seed: int
+    loaded: Sequence, targets: Sequence[float], count: int, device: str, seed: int, calibrate: bool = False
 ) -> list[list]:
-    """Throw in the training simulator; for each policy a `Throws` a target."""
+    """Throw in the training simulator, after a calibration in the hover where asked; for each policy a `Throws` a target."""
+    from visthrow.throws.calibrated import calibrated_start
+    from visthrow.training.env import ThrowEnv
     from visthrow.training.protocol import throw
 
     rows: list[list] = []
@@ -180,7 +188,8 @@ def throw_hybrid(
         rows.append(row)
         for target in targets:
             status(f"throws in the training simulator: {sum(map(len, rows))} of {len(loaded) * len(targets)} sets")
-            row.append(throw(item.experiment, policy.actor(count), target, count, device, seed))
+            begin = calibrated_start(item.experiment) if calibrate else ThrowEnv.reset
+            row.append(throw(item.experiment, policy.actor(count), target, count, device, seed, begin=begin))
     status("")
     return rows
 

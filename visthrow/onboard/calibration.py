@@ -29,7 +29,8 @@ STATE = {"pos": 3, "vel": 3, "turn": 3, "swing": 2, "swing_rate": 2}
 """Unknowns of each step: vehicle [m, m/s], attitude from the measured one [rad], horizontal part of the rope's direction and its rate."""
 
 CONSTANTS = {
-    "camera": 3, "scale": 1, "latency": 1, "thrust": 1, "length": 1, "attitude": 3, "gyro": 3, "wind": 2, "ball": 2, "corners": 2, "lens": 3, "goal": 2,
+    "camera": 3, "scale": 1, "latency": 1, "thrust": 1, "length": 1, "attitude": 3, "gyro": 3, "wind": 2, "ball": 2, "corners": 2,
+    "lens": 3, "goal": 2,
 }  # fmt: skip
 """Unknowns that stay the same; see `Spreads`."""
 
@@ -113,7 +114,8 @@ class Calibration:
             for name, x, sigma in zip(("roll", "pitch", "yaw"), self.turn_b, self.turn_sigma)
         ]
         return (
-            f"camera {', '.join(turns)}; scale {1.0 + self.scale:.3f} +- {self.scale_sigma:.3f}; latency {1e3 * self.latency:.0f} +- {1e3 * self.latency_sigma:.0f} ms; "
+            f"camera {', '.join(turns)}; scale {1.0 + self.scale:.3f} +- {self.scale_sigma:.3f}; "
+            f"latency {1e3 * self.latency:.0f} +- {1e3 * self.latency_sigma:.0f} ms; "
             f"thrust {self.thrust:.3f} +- {self.thrust_sigma:.3f} of the commanded"
         )
 

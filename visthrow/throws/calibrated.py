@@ -29,12 +29,12 @@ RATE, FREQUENCY = 1.0, 1.5
 """Of the sway [rad/s], [Hz]."""
 
 
-def calibrated_start(experiment: Experiment, found: list[Calibration | None]) -> Callable[[ThrowEnv], TensorDict]:
+def calibrated_start(experiment: Experiment, kept: list[Calibration | None] | None = None) -> Callable[[ThrowEnv], TensorDict]:
     """What :func:`visthrow.training.protocol.throw` begins with.
 
     Args:
         experiment: of a vision policy.
-        found: takes the calibration of each throw; None where there was none, and keypoints stay as they came.
+        kept: takes the calibration of each throw; None where there was none, and keypoints stay as they came.
 
     Raises:
         ConfigError: another layout than vision, without validity bits, or goals that move.
@@ -47,7 +47,9 @@ def calibrated_start(experiment: Experiment, found: list[Calibration | None]) ->
         )
 
     def begin(env: ThrowEnv) -> TensorDict:
-        found[:] = _calibrations(experiment, _hovered(env))
+        found = _calibrations(experiment, _hovered(env))
+        if kept is not None:
+            kept[:] = found
         turn = [c.turn_b if c else (0.0, 0.0, 0.0) for c in found]
         scale = [c.scale if c else 0.0 for c in found]
         return env.begin_throws((torch.tensor(turn, device=env.device), torch.tensor(scale, device=env.device)))

@@ -28,6 +28,8 @@ from visthrow.throws.wire_plant import WirePlant
 TILT_DEG, LATENCY = (1.6, -2.3, 1.1), 0.024
 DELAY = 0.03
 """Of a frame, stated [s]; it is older than that by LATENCY."""
+SCALE = 0.02
+"""Relative error of the focal length."""
 OURS = [f"frames.{b}.{k}" for b in ("vehicle", "payload") for k in ('axes="x,y,z"', 'body_axes="x,y,z"', 'quaternion="xyzw"')]
 
 
@@ -61,7 +63,9 @@ class Hall:
         far = np.linalg.norm(rays, axis=1)
         unit = rays / far[:, None] + 1e-3 * self.rng.standard_normal((5, 3))
         unit /= np.linalg.norm(unit, axis=1, keepdims=True)
-        radius = self.runner.params.camera.payload_radius
+        lens, radius = self.camera.fisheye, self.runner.params.camera.payload_radius
+        seen = (1.0 + SCALE) * lens.project_normalized(torch.from_numpy(unit))[0]
+        unit = lens.unproject(lens.denormalize(seen))[0].numpy()  # a detector knows the nominal lens
         return Sight(now - DELAY, tuple(map(tuple, unit[:4].tolist())), (*unit[4].tolist(), math.asin(radius / far[4])))
 
     def fly(self, seconds: float, arm: bool = False) -> None:
@@ -114,6 +118,7 @@ def test_tilt_latency_and_thrust_are_found_in_the_runners_own_hover(hall):
     np.testing.assert_allclose(np.degrees(found.turn_b), TILT_DEG, atol=0.15)
     assert found.latency == pytest.approx(LATENCY, abs=0.004)
     assert found.thrust == pytest.approx(1.0, abs=0.02)
+    assert found.scale == pytest.approx(SCALE, abs=0.004)
     told = next(d for d in hall.decisions if d.calibration is not None)
     assert Calibration.of(told.calibration) == found
     assert hall.runner.summary()["calibration"] == found.values()

@@ -1,0 +1,62 @@
+"""Throws that begin with a calibration in the hover: what is wrong with each camera is found, and made up for."""
+
+import numpy as np
+import pytest
+import torch
+
+from camera.keypoints import KeypointCamera, corrected_keypoints, keypoints
+from camera.mount import rotation_from_vector
+from visthrow import config
+from visthrow.common.errors import ConfigError
+from visthrow.task import Experiment
+from visthrow.throws.calibrated import calibrated_start
+from visthrow.training.env import ThrowEnv
+from visthrow.training.protocol import hover_start
+
+BAD = ["camera.mount.rotation_error_std=0.05", "camera.noise.scale_std=0.03"]
+COUNT = 3
+
+
+def experiment(*changes):
+    return config.load(Experiment, config.find("train", "vision"), changes)
+
+
+def test_a_hover_finds_each_camera_and_the_throw_sees_as_the_nominal_one():
+    flown = hover_start(experiment(*BAD))
+    torch.manual_seed(2)
+    with torch.inference_mode():
+        env, found = ThrowEnv(flown, "cpu", 2, COUNT), []
+        env.fix_goal(torch.tensor([2.0, 0.0, 0.0]))
+        calibrated_start(flown, found)(env)
+        turn, scale = env._memory["extrinsic_rotation"].numpy(), env._memory["scale_error"].flatten().numpy()
+        assert np.abs(turn).max() > 0.03
+        assert np.abs(scale).max() > 0.01
+        for one, is_turned, is_scaled in zip(found, turn, scale, strict=True):
+            np.testing.assert_allclose(one.turn_b, is_turned, atol=4.0 * max(one.turn_sigma))
+            assert max(one.turn_sigma) < np.radians(0.2)
+            assert one.scale == pytest.approx(is_scaled, abs=4.0 * one.scale_sigma)
+            assert one.scale_sigma < 0.005
+        assert (env.episode_length_buf == 0).all()
+        assert env.views.state["vel_w"].norm(dim=-1).max() < 0.3, "it hovers again"
+
+
+def test_corrected_keypoints_are_those_of_the_nominal_camera():
+    torch.manual_seed(1)
+    camera = KeypointCamera(experiment().camera)
+    pos = torch.tensor([0.0, 0.0, 1.3]) + 0.1 * torch.randn(8, 3)
+    rot, load = rotation_from_vector(0.2 * torch.randn(8, 3)), pos + torch.tensor([0.0, 0.0, -0.38])
+    turn, scale = 0.05 * torch.randn(8, 3), 0.03 * torch.randn(8)
+    goal = torch.randn(8, 3)
+    nominal, _ = keypoints(camera, pos, rot, goal, load)
+    seen, valid = keypoints(camera, pos, rot, goal, load, camera.extrinsics(turn, torch.zeros(8, 3)))
+    got, left = corrected_keypoints(camera, seen * (1.0 + scale[:, None, None]), valid, turn, scale)
+    assert left.all()
+    torch.testing.assert_close(got[:, :4], nominal[:, :4], rtol=0, atol=1e-4)
+    torch.testing.assert_close(got[:, 4:], nominal[:, 4:], rtol=0, atol=5e-3)  # a box is upright in each image
+    torch.testing.assert_close(got[:, 4:].mean(1), nominal[:, 4:].mean(1), rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize("change", ['task.observation.validity=false', 'task.target.speed=[0.1,0.2]'])
+def test_what_cannot_be_calibrated_is_refused(change):
+    with pytest.raises(ConfigError, match="calibration in the hover"):
+        calibrated_start(experiment(change))
