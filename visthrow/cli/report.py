@@ -23,19 +23,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "  visthrow report                                the page, from the committed records\n"
         "  visthrow report --quick                        few throws of the shipped policies and the baseline, made now\n"
         "  visthrow report --results runs/sweep/throws    with throws of your own sweep on top\n"
-        "  visthrow report --measure --jobs 30            fly what no record holds of the baseline's throws; needs piqp\n"
         "\nEverything is a unit of work that is kept when it is done: killed at any moment and started again, the command goes\n"
         "on where it was. Trainings and throws of policies are the matter of 'visthrow sweep run paper' and 'gap'.\n"
     )
     parser.add_argument("--quick", action="store_true", help="throw now, few throws, instead of reading records")
-    parser.add_argument("--measure", action="store_true", help="fly the baseline's throws that no record holds, then report")
     parser.add_argument(
         "--results", nargs="+", action="extend", default=[], metavar="FOLDER", help="folders with further results of throws"
     )
-    parser.add_argument(
-        "--records", metavar="FOLDER",
-        help="folder of records (default: those of the package); --measure writes baseline.json there",
-    )
+    parser.add_argument("--records", metavar="FOLDER", help="folder of records (default: those of the package)")
     parser.add_argument("--jobs", type=int, metavar="N", help="processes at once (default: one a core)")
     add_out(parser, "out/report", "for page, tables and pictures")
 
@@ -49,8 +44,6 @@ def run(args: argparse.Namespace) -> int:
     from visthrow.view import page
 
     begin = time.perf_counter()
-    if args.quick and args.measure:
-        raise VisthrowError("--quick and --measure: expected one of them; --quick throws few, --measure what the records lack")
     if args.jobs is not None and args.jobs < 1:
         raise VisthrowError(f"--jobs {args.jobs}; expected 1 or more")
     out, jobs = Path(args.out), args.jobs or device.cores()
@@ -61,8 +54,6 @@ def run(args: argparse.Namespace) -> int:
         quick(out, jobs)
         found = result_set.read((), [out / "quick" / UNITS, *folders], "quick: few throws, wide intervals")
     else:
-        if args.measure:
-            measure(out, records, jobs)
         found = result_set.read([records], folders)
     paths = page.write(out, TITLE, lead(found), sections(found))
     print(summary(found))
@@ -109,21 +100,6 @@ def quick(out: Path, jobs: int) -> None:
     from visthrow.baseline.thrower import fly_unit
 
     results.work(baseline_units.quick(), folder / UNITS, fly_unit, None, jobs, lambda text: _say(f"TO+MPC: {text}"))
-
-
-def measure(out: Path, records: Path, jobs: int) -> None:
-    """Fly the baseline's throws that ``records`` lacks, and write the record anew."""
-    import importlib
-
-    from visthrow.baseline.thrower import fly_unit
-    from visthrow.evidence.report import baseline_units
-    from visthrow.throws import results
-
-    importlib.import_module("piqp")  # said here rather than by every worker
-    path = records / "throws" / "baseline.json"
-    known = results.load_all([path])
-    found = results.work(baseline_units.full(), out / UNITS, fly_unit, known, jobs, lambda text: _say(f"TO+MPC: {text}"))
-    results.pack(found.values(), path)
 
 
 def _say(text: str) -> None:
