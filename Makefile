@@ -40,12 +40,13 @@ lint: $(STAMP)
 install: $(STAMP)
 
 # torch comes first and from the constraints: resolved with the rest, a newer build with its CUDA libraries might be taken.
+# What is imported is compiled then; to compile all of it here takes three times as long.
 $(STAMP): pyproject.toml constraints.txt
 	@test -n "$(PYTHON)" || { echo "make: no Python 3.11 or newer with venv was found; install one, or say PYTHON=/path/to/python3" >&2; exit 1; }
 	@echo "make: installing into $(VENV); about 2.4 GB on disk, some minutes, and pip says nothing until it is done"
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet -c constraints.txt torch
-	$(BIN)/python -m pip install --quiet -c constraints.txt -e ".[dev]"
+	$(BIN)/python -m pip install --quiet --no-compile -c constraints.txt torch
+	$(BIN)/python -m pip install --quiet --no-compile -c constraints.txt -e ".[dev]"
 	touch $@
 
 clean:
