@@ -11,7 +11,7 @@ from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.likelihood import designs, marginal, noise
 from visthrow.diagnose.likelihood import stack as stacks
 from visthrow.diagnose.likelihood.evidence import Priors
-from visthrow.diagnose.likelihood.stack import BATCH, Stack
+from visthrow.diagnose.likelihood.stack import BATCH, Stack, integrals, statistics
 from visthrow.diagnose.models.interface import Window
 from visthrow.diagnose.select.point import Problem, linearise, only
 
@@ -20,7 +20,12 @@ EFFECTS = catalogue(6)
 
 def likelihood(gram, levels, window):
     """Logarithm of it, of one window by itself, but for the powers of 2 pi."""
-    return -0.5 * marginal.integral(gram, levels, window).share(gram, levels).square
+    return -0.5 * alone(gram, levels, window).square
+
+
+def alone(gram, levels, window, latents=False):
+    """What a window says by itself."""
+    return Stack([gram], windows=[window]).integrals(levels, latents=latents).shares([gram], levels)[0]
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +50,7 @@ def test_information_and_score_are_those_of_the_dense_covariance(fitted):
     _, windows, floors, levels, grams = fitted
     for at in (0, 7):
         v, s = dense(windows[at], grams[at], levels, floors, at)
-        part = marginal.window_statistics(grams[at], levels, at)
+        part = statistics(grams, levels)[at]
         inverse = np.linalg.inv(v)
         np.testing.assert_allclose(part.information, s.T @ inverse @ s, rtol=1e-6, atol=1e-6)
         np.testing.assert_allclose(part.score, s.T @ inverse @ windows[at].residual, rtol=1e-6, atol=1e-6)
@@ -77,23 +82,19 @@ def test_windows_side_by_side_are_what_they_are_alone(fitted):
     shorter = [marginal.correlated(marginal.gram_of(w, floors, 2), w, levels.correlation_time) for w in lean]
     mixed = [*grams, *shorter]
     rows = [*range(len(grams)), *range(0, len(grams), 3)]
-    alone = [likelihood(gram, levels, w) for gram, w in zip(mixed, rows)]
+    values = [likelihood(gram, levels, w) for gram, w in zip(mixed, rows)]
     assert len(mixed) > BATCH
     stack = Stack(mixed, windows=rows)
-    np.testing.assert_allclose(stack.values(levels), alone, rtol=1e-8)
-    np.testing.assert_allclose(stack.look(levels)[0], alone, rtol=1e-8)
+    np.testing.assert_allclose(stack.values(levels), values, rtol=1e-8)
+    np.testing.assert_allclose(stack.look(levels)[0], values, rtol=1e-8)
     for latents in (False, True):
-        resident = stack.integrals(levels, latents=latents)
-        told = zip(resident, resident.shares(mixed, levels), resident.log_dets, mixed, rows, strict=True)
-        for found, at_once, log_det, gram, w in told:
-            single = marginal.integral(gram, levels, w, gram.nuisances if latents else None)
-            size, other = np.abs(single.information).max(), single.share(gram, levels)
-            np.testing.assert_allclose(found.information, single.information, atol=1e-9 * size)
-            assert log_det == pytest.approx(single.log_det, rel=1e-12)
-            for share in (found.share(gram, levels), at_once):
-                np.testing.assert_allclose(share.information, single.information, atol=1e-9 * size)
-                np.testing.assert_allclose(share.score, other.score, atol=1e-9 * size)
-                assert share.square == pytest.approx(other.square, rel=1e-9)
+        together = stack.integrals(levels, latents=latents).shares(mixed, levels)
+        for share, gram, w in zip(together, mixed, rows, strict=True):
+            single = alone(gram, levels, w, latents)
+            size = np.abs(single.information).max()
+            np.testing.assert_allclose(share.information, single.information, atol=1e-9 * size)
+            np.testing.assert_allclose(share.score, single.score, atol=1e-9 * size)
+            assert share.square == pytest.approx(single.square, rel=1e-9)
 
 
 def test_grams_and_other_residuals_are_the_same_side_by_side(fitted):
@@ -145,10 +146,10 @@ def test_latents_are_correlated_the_same_side_by_side(fitted):
 def test_other_residuals_leave_the_information(fitted):
     _, _, floors, levels, grams = fitted
     theta = np.linspace(-1.0, 1.0, len(floors))
-    shares = [marginal.integral(g, levels, w).share(g, levels) for w, g in enumerate(grams)]
+    shares = integrals(grams, levels).shares(grams, levels)
     known = marginal.gather(grams, shares, np.zeros(len(floors)))
     other = [replace(g, cross=0.5 * g.cross, square=0.25 * g.square) for g in grams]
-    shares = [marginal.integral(g, levels, w).share(g, levels) for w, g in enumerate(other)]
+    shares = integrals(other, levels).shares(other, levels)
     plain, again = marginal.gather(other, shares, theta), marginal.rescored(known, other, shares, theta)
     for name in ("flights", "information", "score", "square", "samples", "theta", "absolute", "absolute_square"):
         np.testing.assert_allclose(getattr(again, name), getattr(plain, name), rtol=1e-12)
@@ -201,8 +202,7 @@ def test_a_single_huge_state_does_not_leak_into_the_effects(fitted):
     """Initial states are vague: a shift of 0.1 m changes the score by rounding alone."""
     _, windows, floors, levels, grams = fitted
     shifted = windows[0].residual + windows[0].nuisance @ np.full(12, 0.1)
-    plain = marginal.window_statistics(grams[0], levels, 0)
-    moved = marginal.window_statistics(marginal.with_residual(grams[0], windows[0], floors, shifted), levels, 0)
+    plain, moved = (alone(g, levels, 0) for g in (grams[0], marginal.with_residual(grams[0], windows[0], floors, shifted)))
     own = np.sqrt(np.diag(plain.information))
     assert np.max(np.abs(moved.score - plain.score) / own) < 0.1
 
@@ -316,15 +316,15 @@ def test_a_model_without_latent_forces_works():
     window = Window(0, "swing", np.arange(n) / 50.0, np.zeros(n, dtype=int), s @ [0.3, 0.0] + rng.normal(size=n) * 0.1,
                     np.full(n, 0.1), s, x, np.ones(1), latent=np.zeros((n, 0)))  # fmt: skip
     levels, grams = noise.fit([window], [marginal.gram_of(window, np.ones(2), 1)])
-    part = marginal.window_statistics(grams[0], levels, 0)
+    part = alone(grams[0], levels, 0)
     assert np.linalg.solve(part.information, part.score) == pytest.approx([0.3, 0.0], abs=0.05)
 
 
 def test_rounding_leaves_no_negative_information(fitted):
     """Two effects that are one but for rounding: a wide prior would turn the negative eigenvalue into evidence."""
     *_, levels, grams = fitted
-    part = marginal.window_statistics(grams[0], levels, 0)
+    part = alone(grams[0], levels, 0)
     nearly = np.array([[1.0, 1.0 + 1e-7], [1.0 + 1e-7, 1.0]])
-    statistics = marginal.gather(grams[:1], [replace(part, information=1e6 * nearly, score=np.zeros(2))], np.zeros(2))
+    found = marginal.gather(grams[:1], [replace(part, information=1e6 * nearly, score=np.zeros(2))], np.zeros(2))
     assert np.linalg.eigvalsh(1e6 * nearly).min() < 0.0
-    assert np.linalg.eigvalsh(statistics.information.sum(0)).min() >= 0.0
+    assert np.linalg.eigvalsh(found.information.sum(0)).min() >= 0.0

@@ -27,9 +27,6 @@ TAIL = 6.0
 """Degrees of freedom of the latent forces' scale mixture: from window to window their deviation varies by some 30 %, and a window
 in which something happened may have ten times as much at the price of 11 nats."""
 
-ROUNDING = 1e-10
-"""Relative growth of the normal equations' diagonal where they are positive definite but for rounding."""
-
 
 class There(NamedTuple):
     """An array on a GPU, where it was calculated."""
@@ -297,28 +294,6 @@ def recorrelated(gram: Gram, raw: Gram) -> Gram:
     return replace(gram, cross=cross, square=raw.square)
 
 
-def _factor(gram: Gram, noise: Noise, level: np.ndarray) -> tuple[np.ndarray, float]:
-    """Lower Cholesky factor of 1 + P^1/2 U' W U P^1/2, and log det V.
-
-    Raises:
-        DiagnoseError: The normal equations are not positive definite, which only broken derivatives can cause.
-    """
-    size = len(level)
-    normal = (noise.scale**-2.0 @ gram.hidden).reshape(size, size)
-    normal *= level[:, None]
-    normal *= level
-    normal.flat[:: size + 1] += 1.0
-    lower, failed = lapack.dpotrf(normal, lower=1, clean=1)
-    if failed and np.all(np.isfinite(normal)):
-        # Levels of many orders of magnitude, as a search for them may try, leave the identity below rounding.
-        normal.flat[:: size + 1] *= 1.0 + ROUNDING
-        lower, failed = lapack.dpotrf(normal, lower=1, clean=1)
-    if failed:
-        raise DiagnoseError(f"window of flight {gram.flight}, phase {gram.phase}: the normal equations are singular")
-    sensor = gram.log_sigma + gram.count @ np.log(noise.scale)
-    return lower, 2.0 * float(np.log(np.diag(lower)).sum() + sensor)
-
-
 @dataclass(frozen=True)
 class Share:
     """One window's share of :class:`Statistics`."""
@@ -335,53 +310,6 @@ class WindowStatistics(Share):
     latent_information: np.ndarray  # G' V^-1 G, shape (L, L)
     latent_score: np.ndarray  # G' V^-1 r, shape (L,)
     latent_effects: np.ndarray  # G' V^-1 S, shape (L, K)
-
-
-@dataclass(frozen=True)
-class Integral:
-    """What is left of the last J columns of a window when initial state and latent forces are integrated out; of no residual."""
-
-    information: np.ndarray  # shape (J, J)
-    half: np.ndarray  # L^-1 P^1/2 U' W times the columns, with L of the posterior's precision, shape (D + L, J)
-    factor: np.ndarray  # L
-    level: np.ndarray  # prior deviation of [X, G], shape (D + L,)
-    log_det: float  # of V
-
-    def share(self, gram: Gram, noise: Noise) -> Share:
-        """With the residuals of a gram of the same derivatives."""
-        weight = noise.scale**-2.0
-        cross, size = weight @ gram.cross, len(self.level)
-        along = np.ravel(lapack.dtrtrs(self.factor, self.level * cross[:size], lower=1)[0])
-        score = cross[len(cross) - len(self.information) :] - self.half.T @ along
-        return Share(self.information, score, float(weight @ gram.square - along @ along + self.log_det))
-
-
-def integral(gram: Gram, noise: Noise, window: int, first: int | None = None) -> Integral:
-    """Integrate initial state and latent forces out of one window's columns from ``first`` on; default: of its effects."""
-    level = noise.deviation(gram, window)
-    size = len(level)
-    begin = size if first is None else first
-    factor, log_det = _factor(gram, noise, level)
-    inner = np.tensordot(noise.scale**-2.0, gram.inner[:, :, begin:], 1)
-    half, _ = lapack.dtrtrs(factor, level[:, None] * inner[:size], lower=1)
-    reduced = inner[begin:] - half.T @ half
-    return Integral(0.5 * (reduced + reduced.T), half, factor, level, log_det)
-
-
-def window_statistics(gram: Gram, noise: Noise, window: int) -> WindowStatistics:
-    """Integrate initial state and latent forces out of one window."""
-    return statistics_of(integral(gram, noise, window, gram.nuisances), gram, noise)
-
-
-def statistics_of(whole: Integral, gram: Gram, noise: Noise) -> WindowStatistics:
-    """What the integral of a gram's latents and effects says with the gram's residuals."""
-    share, latents = whole.share(gram, noise), gram.latents
-    back = lapack.dtrtri(gram.factor, lower=1)[0] if latents else gram.factor  # from unit latents to knots
-    return WindowStatistics(
-        whole.information[latents:, latents:], share.score[latents:], share.square,
-        back.T @ whole.information[:latents, :latents] @ back, back.T @ share.score[:latents],
-        back.T @ whole.information[:latents, latents:],
-    )  # fmt: skip
 
 
 def gather(

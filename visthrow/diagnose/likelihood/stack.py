@@ -11,27 +11,19 @@ from typing import TypeVar
 
 import numpy as np
 import torch
+from scipy.linalg import lapack
 
 from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.likelihood.designs import Same, padded
-from visthrow.diagnose.likelihood.marginal import (
-    ROUNDING,
-    Gram,
-    Integral,
-    Noise,
-    Share,
-    Statistics,
-    There,
-    WindowStatistics,
-    integral,
-    statistics_of,
-    window_statistics,
-)
+from visthrow.diagnose.likelihood.marginal import Gram, Noise, Share, Statistics, There, WindowStatistics
 from visthrow.diagnose.likelihood.threads import each
 from visthrow.diagnose.likelihood.transfer import all_to_host
 from visthrow.diagnose.models.interface import LATENT_BLOCKS
 
 T = TypeVar("T")
+
+ROUNDING = 1e-10
+"""Relative growth of the normal equations' diagonal where they are positive definite but for rounding."""
 
 BATCH = 8  # windows of a batch on the CPU
 BLOCKS = len(LATENT_BLOCKS)
@@ -106,49 +98,24 @@ class _Solved:
     value: torch.Tensor  # log-likelihood of the residuals, but for the powers of 2 pi, shape (W,)
 
 
-class Integrals(Sequence[Integral]):
-    """What windows say of their effects, whatever their residuals are.
-
-    Attributes:
-        gathered: by flights with some residuals, once it was asked for.
-    """
-
-    gathered: Statistics | None = None
-
-    def __init__(self, of_windows: Sequence[Integral]):
-        """Keep those of some windows."""
-        self._of_windows = of_windows
-
-    def __len__(self) -> int:
-        """Number of windows."""
-        return len(self._of_windows)
-
-    def __getitem__(self, window):
-        """That of a window."""
-        return self._of_windows[window]
-
-    @property
-    def log_dets(self) -> list[float]:
-        """Of each window's V."""
-        return [known.log_det for known in self]
-
-    def shares(self, grams: Sequence[Gram], noise: Noise) -> list[Share]:
-        """With the residuals of grams of the same derivatives; ``noise`` is what they were integrated with."""
-        return [known.share(gram, noise) for known, gram in zip(self, grams)]
-
-
-def integrals(grams: Sequence[Gram], noise: Noise, device: str) -> Integrals:
-    """Integrate initial states and latent forces out of windows: side by side on a GPU; on a CPU copies would cost more."""
-    if device == "cpu":
-        return Integrals(each(lambda w: integral(grams[w], noise, w), range(len(grams))))
+def integrals(grams: Sequence[Gram], noise: Noise, device: str = "cpu") -> "Integrals":
+    """Integrate initial states and latent forces out of windows."""
     return Stack(grams, device).integrals(noise)
 
 
-def statistics(grams: Sequence[Gram], noise: Noise, device: str) -> list[WindowStatistics]:
-    """The same, and what the windows say of their latent forces as if they were effects."""
-    if device == "cpu":
-        return each(lambda w: window_statistics(grams[w], noise, w), range(len(grams)))
-    return each(lambda pair: statistics_of(*pair, noise), zip(Stack(grams, device).integrals(noise, latents=True), grams))
+def statistics(grams: Sequence[Gram], noise: Noise, device: str = "cpu") -> list[WindowStatistics]:
+    """What windows say of their effects, and of their latent forces at the knots as if they were effects."""
+    whole = Stack(grams, device).integrals(noise, latents=True)
+    return each(lambda pair: _of_latents(*pair), zip(whole.shares(grams, noise), grams))
+
+
+def _of_latents(share: Share, gram: Gram) -> WindowStatistics:
+    latents, whole = gram.latents, share.information
+    back = lapack.dtrtri(gram.factor, lower=1)[0] if latents else gram.factor  # from unit latents to knots
+    return WindowStatistics(
+        whole[latents:, latents:], share.score[latents:], share.square,
+        back.T @ whole[:latents, :latents] @ back, back.T @ share.score[:latents], back.T @ whole[:latents, latents:],
+    )  # fmt: skip
 
 
 class Stack:
@@ -225,15 +192,13 @@ class Stack:
         found = self._each(lambda batch: _curved(batch, _solved(batch, noise)))
         return tuple(self._in_order([part[i] for part in found]) for i in range(3))
 
-    def integrals(self, noise: Noise, *, latents: bool = False) -> Integrals:
+    def integrals(self, noise: Noise, *, latents: bool = False) -> "Integrals":
         """What is left of the effects' columns of each window, or of those of latent forces and effects.
-
-        See :func:`visthrow.diagnose.likelihood.marginal.integral`.
 
         Raises:
             DiagnoseError: As :meth:`values`.
         """
-        return _Resident(self._order, each(lambda batch: _integrated(batch, noise, latents), self._batches))
+        return Integrals(self._order, each(lambda batch: _integrated(batch, noise, latents), self._batches))
 
     def _each(self, function) -> list[tuple[np.ndarray, ...]]:
         return each(lambda batch: tuple(all_to_host(function(batch))), self._batches)
@@ -311,17 +276,8 @@ class _Integrated:
     batch: _Batch
     left: list[np.ndarray]  # which of the J columns are a window's own
     at: _Solved
-    half: torch.Tensor  # as :class:`Integral` has it, shape (W, n, J)
+    half: torch.Tensor  # L^-1 P^1/2 U' W times the columns, with L of the posterior's precision, shape (W, n, J)
     information: list[np.ndarray]  # of each window
-
-    def of_windows(self) -> list[Integral]:
-        """Each window's, without what pads it."""
-        arrays = all_to_host((self.half, self.at.factor, self.at.level, self.at.log_det))
-        found = []
-        for gram, left, information, half, factor, level, log_det in zip(self.batch.grams, self.left, self.information, *arrays):
-            size = gram.nuisances + gram.latents
-            found.append(Integral(information, half[:size, left], factor[:size, :size], level[:size], float(log_det)))
-        return found
 
     def shares(self, grams: Sequence[Gram], noise: Noise) -> list[Share]:
         """With the residuals of grams of the same derivatives."""
@@ -340,11 +296,17 @@ class _Integrated:
         ]
 
 
-class _Resident(Integrals):
-    """Those that stay where they were calculated until a window is asked for."""
+class Integrals:
+    """What windows say of their effects, whatever their residuals are; it stays where it was calculated.
+
+    Attributes:
+        gathered: by flights with some residuals, once it was asked for.
+    """
+
+    gathered: Statistics | None = None
 
     def __init__(self, order: Sequence[Sequence[int]], batches: Sequence[_Integrated]):
-        """Keep them.
+        """Keep it.
 
         Args:
             order: numbers of each batch's windows.
@@ -352,26 +314,18 @@ class _Resident(Integrals):
         """
         self._order, self._parts = order, batches
 
-    def __len__(self) -> int:
-        """Number of windows."""
-        return sum(map(len, self._order))
-
-    @cached_property
-    def _of_windows(self) -> list[Integral]:
-        return self._by_window([part.of_windows() for part in self._parts])
-
     @property
     def log_dets(self) -> list[float]:
-        """See :attr:`Integrals.log_dets`."""
+        """Of each window's V."""
         return self._by_window([part.at.log_det.tolist() for part in self._parts])
 
     def shares(self, grams: Sequence[Gram], noise: Noise) -> list[Share]:
-        """See :meth:`Integrals.shares`."""
+        """With the residuals of grams of the same derivatives; ``noise`` is what they were integrated with."""
         return self._by_window([part.shares([grams[w] for w in own], noise) for own, part in zip(self._order, self._parts)])
 
     def _by_window(self, parts: Sequence[Sequence[T]]) -> list[T]:
         found = {w: value for own, part in zip(self._order, parts) for w, value in zip(own, part)}
-        return [found[w] for w in range(len(self))]
+        return [found[w] for w in sorted(found)]
 
 
 def _integrated(batch: _Batch, noise: Noise, latents: bool) -> _Integrated:

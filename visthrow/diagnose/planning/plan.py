@@ -13,7 +13,8 @@ import numpy as np
 from visthrow.common.errors import DiagnoseError, suggest
 from visthrow.diagnose.inputs.measures import MEASUREMENTS, Measurement, narrowed
 from visthrow.diagnose.likelihood.evidence import Priors, covariance, log_evidence
-from visthrow.diagnose.likelihood.marginal import Noise, correlated, gram_of, window_statistics
+from visthrow.diagnose.likelihood.marginal import Noise, correlated, gram_of
+from visthrow.diagnose.likelihood.stack import integrals
 from visthrow.diagnose.models.interface import LATENT_BLOCKS, Model
 from visthrow.diagnose.planning.manoeuvres import PERIOD, Manoeuvre, Reference
 from visthrow.diagnose.select import result
@@ -157,7 +158,7 @@ def expected_information(
                   for b in np.unique(gram.latent_block)}  # fmt: skip
         alike = np.ones((1, len(LATENT_BLOCKS)))
         expected = replace(noise, scale=np.ones(len(model.channels)), latent_sd=levels, share=alike)
-        part = window_statistics(gram, expected, 0).information
+        part = integrals([gram], expected).shares([gram], expected)[0].information
         total[np.ix_(at, at)] += part[np.ix_(own, own)]
     return total * np.outer(*[_ratio(model, names, priors)] * 2)
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from visthrow.diagnose.likelihood import grammar
-from visthrow.diagnose.likelihood.marginal import window_statistics
+from visthrow.diagnose.likelihood.stack import statistics
 from visthrow.diagnose.models.interface import LATENT_BLOCKS, Window
 from visthrow.diagnose.select.point import Point
 
@@ -118,8 +118,8 @@ def train(point: Point, table: Table, groups: Sequence[int], theta: np.ndarray |
     names = np.array(sorted(set(groups)))
     size = table.columns(point.windows[0]).shape[1]
     information, score = np.zeros((len(names), size, size)), np.zeros((len(names), size))
-    for w, (window, group) in enumerate(zip(point.windows, groups)):
-        columns, part = table.columns(window), window_statistics(point.grams[w], point.noise, w)
+    for window, part, group in zip(point.windows, statistics(point.grams, point.noise, point.device), groups):
+        columns = table.columns(window)
         f = int(np.searchsorted(names, group))
         information[f] += columns.T @ part.latent_information @ columns
         score[f] += columns.T @ (part.latent_score + part.latent_effects @ back)

@@ -22,7 +22,7 @@ from visthrow.diagnose.likelihood.evidence import (
     log_evidence,
 )
 from visthrow.diagnose.likelihood.forms import HORIZONS, READABLE, Forms, forms, left_ahead, unit_of
-from visthrow.diagnose.likelihood.marginal import Statistics, gather, window_statistics
+from visthrow.diagnose.likelihood.marginal import Statistics, gather
 from visthrow.diagnose.select import result
 from visthrow.diagnose.select.excess import UNKNOWN_RATIO
 from visthrow.diagnose.select.point import Point
@@ -104,7 +104,7 @@ def groups_of(point: Point, kept: Sequence[int]) -> tuple[list[int], str]:
 
 
 def regrouped(point: Point, groups: Sequence[int]) -> Statistics:
-    parts = [window_statistics(gram, point.noise, w) for w, gram in enumerate(point.grams)]
+    parts = point.integrals.shares(point.grams, point.noise)
     return gather([replace(gram, flight=g) for gram, g in zip(point.grams, groups)], parts, point.theta)
 
 
