@@ -5,7 +5,8 @@ from collections.abc import Mapping, Sequence
 from visthrow.diagnose.likelihood import designs
 from visthrow.diagnose.likelihood import noise as levels
 from visthrow.diagnose.likelihood.evidence import Priors
-from visthrow.diagnose.likelihood.marginal import gram_of, window_statistics
+from visthrow.diagnose.likelihood.marginal import gram_of
+from visthrow.diagnose.likelihood.stack import integrals
 from visthrow.diagnose.models.interface import Model
 
 
@@ -25,5 +26,5 @@ def shortfalls(model: Model, sizes: Sequence[Mapping[str, float]]) -> tuple[list
     squares = []
     for windows, grams in zip(told, raw):
         shaped = designs.correlated_of(grams, windows, noise.correlation_time, "cpu")
-        squares.append(sum(window_statistics(gram, noise, i).square for i, gram in enumerate(shaped)))
+        squares.append(sum(share.square for share in integrals(shaped, noise).shares(shaped, noise)))
     return [float(0.5 * (square - squares[-1])) for square in squares], sum(len(w.residual) for w in told[-1])
