@@ -112,8 +112,8 @@ def make(policy: str, seed: int) -> WirePlant:
 class MotorPlant(WirePlant):
     """The same vehicle without its rate controller, for a firmware that puts out motor commands.
 
-    Electronic speed controllers turn the rotors at ``full_speed * command * voltage / reference_voltage``: thrust goes with
-    the square of the command and of the battery's voltage. The vehicle stands still at its start, the rope hanging, until its
+    Electronic speed controllers turn the rotors at ``full_speed * command * voltage / reference``: thrust goes with the square of
+    the command and of the battery's voltage. The reference is the voltage that the controller's full thrust holds at. The vehicle stands still at its start, the rope hanging, until its
     rotors nearly carry its weight.
 
     Attributes:
@@ -127,7 +127,8 @@ class MotorPlant(WirePlant):
         super().__init__(experiment, seed)
         controller, thrust, battery = experiment.vehicle.controller, experiment.vehicle.thrust, experiment.vehicle.battery
         self._full_speed = (controller.max_thrust / thrust.k_f) ** 0.5
-        self._k_f, self._reference = thrust.k_f, battery.reference_voltage
+        mixing = controller.kind == "motor_mixing"
+        self._k_f, self._reference = thrust.k_f, controller.calibration_voltage if mixing else battery.reference_voltage
         self._plant.stop_motors()
         self._stand: dict[str, np.ndarray] | None = self._plant.hold()
         self._look()

@@ -1,0 +1,121 @@
+"""From the newest pose on the wire to the command on the wire, through the firmware's own link, beside the runner's own share.
+
+    python tests/sitl/alone.py python -m tests.sitl.latency --seconds 25
+
+Bridge and runner are processes of their own, in real time. The kernel stamps each packet on the loopback interface (a packet socket, which
+a network namespace of one's own grants): poses of the vehicle go to the runner by MAVLink, sticks to the firmware by MSP. Commands are
+not held back here. The runner's own share is its stage ``total``: from its look for messages to the command's bytes out.
+"""
+
+import argparse
+import json
+import signal
+import socket
+import struct
+import subprocess
+import tempfile
+import threading
+from pathlib import Path
+
+import numpy as np
+
+from hil.links import msp
+from hil.links.pymav import mav
+from tests.sitl.test_betaflight import program, visthrow, wait_for
+
+POSES, COMMANDS = 14560, 5761
+"""Ports of the runner's poses (UDP) and of the firmware's first serial port (TCP)."""
+
+STAMP = struct.Struct("qq")
+SO_TIMESTAMPNS = 35
+ETH_P_IP = 0x0800
+IP, ETHER, UDP = 20, 14, 8
+
+
+class Wire(threading.Thread):
+    """What goes over the loopback interface: kernel's stamps [s] of the vehicle's poses and of set sticks."""
+
+    def __init__(self) -> None:
+        super().__init__(daemon=True)
+        self._socket = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(ETH_P_IP))
+        self._socket.bind(("lo", 0))
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 24)
+        self._socket.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+        self.poses, self.commands = [], []
+        self._mavlink, self._msp = mav.MAVLink(None), msp.Parser()
+        self._mavlink.robust_parsing = True
+
+    def run(self) -> None:
+        """Listen until the process ends."""
+        while True:
+            data, more, _, where = self._socket.recvmsg(65536, 256)
+            if where[2] == socket.PACKET_OUTGOING:  # each packet is seen as it goes out and as it comes in
+                continue
+            seconds, nanoseconds = STAMP.unpack(more[0][2])
+            self._take(data[ETHER:], seconds + 1e-9 * nanoseconds)
+
+    def _take(self, packet: bytes, stamp: float) -> None:
+        head = 4 * (packet[0] & 15)
+        packet = packet[: struct.unpack("!H", packet[2:4])[0]]
+        port = struct.unpack("!H", packet[head + 2 : head + 4])[0]
+        if packet[9] == socket.IPPROTO_UDP and port == POSES:
+            for message in self._mavlink.parse_buffer(packet[head + UDP :]) or ():
+                if message.get_type() == "ATT_POS_MOCAP" and message.get_srcComponent() == 1:
+                    self.poses.append(stamp)
+        elif packet[9] == socket.IPPROTO_TCP and port == COMMANDS:
+            body = packet[head + 4 * (packet[head + 12] >> 4) :]
+            self.commands += [stamp for frame in self._msp.parse(body) if frame.command == msp.SET_RAW_RC]
+
+    def times(self) -> np.ndarray:
+        """Of each command, since the newest pose before it [s]."""
+        poses, commands = np.array(self.poses), np.array(self.commands)
+        newest = np.searchsorted(poses, commands) - 1
+        return (commands - poses[newest])[newest >= 0]
+
+
+def flown(folder: Path, seconds: float, speed: float) -> dict:
+    """Hover through the firmware for a time; the report."""
+    wire = Wire()
+    words = ("--speed", str(speed))
+    bridge = visthrow(
+        "hil", "fake", "--kind", "betaflight-sitl", "--firmware", str(program()), "--folder", str(folder / "firmware"), *words,
+        "--out", str(folder / "bridge.json"), stderr=subprocess.PIPE, stdout=subprocess.DEVNULL,
+    )  # fmt: skip
+    try:
+        wait_for(bridge, "it flies")
+        sets = (f"states.armed_least={seconds}", f"states.armed={seconds + 20.0}", "delay.hold=0.0")
+        runner = visthrow(
+            "hil", "run", "--config", "betaflight_sitl", "--auto-arm", "--bare", *words, "--out", str(folder / "run"),
+            *(word for text in sets for word in ("--set", text)), stderr=subprocess.PIPE, stdout=subprocess.DEVNULL,
+        )  # fmt: skip
+        wait_for(runner, " s  armed ")
+        wire.start()
+        with_time = threading.Timer(seconds / speed, runner.send_signal, (signal.SIGINT,))
+        with_time.start()
+        runner.communicate()
+        bridge.send_signal(signal.SIGINT)
+        bridge.communicate()
+    finally:
+        bridge.kill()
+    summary, report = (json.loads((folder / name).read_text()) for name in ("run/summary.json", "bridge.json"))
+    p50, p99 = (1e3 * float(np.quantile(wire.times(), share)) for share in (0.5, 0.99))
+    own = summary["latency"]["total"]
+    return {
+        "commands": len(wire.commands), "poses": len(wire.poses), "pose_to_command_ms": {"p50": p50, "p99": p99},
+        "own_ms": {"p50": own["p50_ms"], "p99": own["p99_ms"]}, "late_periods": report["late_periods"],
+        "periods": round(report["time"] / 0.002), "missed_ticks": summary["missed"], "speed": speed,
+    }  # fmt: skip
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--seconds", type=float, default=25.0)
+    parser.add_argument("--speed", type=float, default=1.0, help="of both clocks")
+    args = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        print(json.dumps(flown(Path(folder), args.seconds, args.speed), indent=1))
+
+
+if __name__ == "__main__":
+    main()
