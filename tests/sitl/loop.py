@@ -50,7 +50,7 @@ def series(args: argparse.Namespace) -> list[dict]:
     lines = args.out / f"{args.name}.jsonl"
     found = [json.loads(text) for text in lines.read_text().splitlines()] if lines.exists() else []
     done = {(line["where"], line["distance"], line["seed"]) for line in found}
-    for where in ("own", "firmware"):
+    for where in ("firmware", "own"):
         for distance in args.distances:
             for seed in SEEDS:
                 if (where, distance, seed) not in done:
