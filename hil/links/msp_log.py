@@ -2,10 +2,9 @@
 
 import struct
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
-from hil.errors import LinkError, RunError
+from hil.errors import LinkError
 from hil.links.device import Port
 
 HEAD = struct.Struct(">QcH")
@@ -65,22 +64,3 @@ class LoggedPort:
         except OSError:
             self.failed += 1
 
-
-def read_log(path: str | Path) -> Iterator[tuple[float, bytes, bytes]]:
-    """Time since 1970 [s], direction and bytes of each chunk; one that was cut short at the end is left out.
-
-    Raises:
-        RunError: no such file, or not of this kind.
-    """
-    try:
-        data = Path(path).read_bytes()
-    except OSError as error:
-        raise RunError(f"{path}: cannot be read: {error.strerror}; expected the MSP log of a run") from error
-    at = 0
-    while at + HEAD.size <= len(data):
-        stamp, direction, count = HEAD.unpack_from(data, at)
-        if direction not in (b"<", b">"):
-            raise RunError(f"{path}: damaged at byte {at}; expected the MSP log of a run")
-        at += HEAD.size + count
-        if at <= len(data):
-            yield stamp / 1e6, direction, data[at - count : at]

@@ -8,10 +8,10 @@ import tty
 import pytest
 
 from hil.backends import Betaflight
-from hil.errors import LinkError, RunError
+from hil.errors import LinkError
 from hil.links import msp
 from hil.links.device import Device, SerialPort
-from hil.links.msp_log import LoggedPort, read_log
+from hil.links.msp_log import HEAD, LoggedPort
 from hil.params import HilParams
 from visthrow import config
 
@@ -81,6 +81,15 @@ def test_a_port_that_is_none():
         SerialPort(Device("serial", "/dev/ttyNONE", 115200))
 
 
+def read_log(path):
+    """Direction and bytes of each chunk."""
+    data = path.read_bytes()
+    while data:
+        _, direction, count = HEAD.unpack_from(data)
+        yield direction, data[HEAD.size : HEAD.size + count]
+        data = data[HEAD.size + count :]
+
+
 def test_what_went_over_the_port_is_written_down(wire, tmp_path):
     controller, port = wire
     logged = LoggedPort(port, tmp_path / "run" / "link.msp")
@@ -94,16 +103,9 @@ def test_what_went_over_the_port_is_written_down(wire, tmp_path):
     assert logged.fileno() == port.fileno()
     logged.close()
     path = tmp_path / "run" / "link.msp"
-    chunks = [(way, data) for _, way, data in read_log(path)]
+    chunks = [(way, data) for way, data in read_log(path)]
     assert chunks[0] == (b"<", b"abc")
     assert b"".join(data for way, data in chunks if way == b">") == b"defg", "in pieces, as they came"
-    path.write_bytes(path.read_bytes()[:-1])
-    assert [(w, d) for _, w, d in read_log(path)] == chunks[:-1], "a killed run: what was cut short is left out"
-    path.write_bytes(b"x" * 100)
-    with pytest.raises(RunError, match="damaged at byte 0"):
-        list(read_log(path))
-    with pytest.raises(RunError, match="expected the MSP log of a run"):
-        list(read_log(tmp_path / "none"))
     with pytest.raises(LinkError, match="cannot write"):
         LoggedPort(port, tmp_path)
 

@@ -12,9 +12,10 @@ FULL = 3.5
 """Thrust of a rotor at full command and that voltage [N]."""
 
 
-@pytest.fixture
-def plant():
-    return make_motors("vision_dropout", 3)
+@pytest.fixture(params=["vision_dropout", "vision_betaflight"])
+def plant(request):
+    """The paper's vehicle: by its own controller's full thrust, and by that of a firmware's at the voltage of its calibration."""
+    return make_motors(request.param, 3)
 
 
 def command_for(plant, thrust):
