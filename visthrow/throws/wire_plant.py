@@ -113,8 +113,8 @@ class MotorPlant(WirePlant):
     """The same vehicle without its rate controller, for a firmware that puts out motor commands.
 
     Electronic speed controllers turn the rotors at ``full_speed * command * voltage / reference``: thrust goes with the square of
-    the command and of the battery's voltage. The reference is the voltage that the controller's full thrust holds at. The vehicle stands still at its start, the rope hanging, until its
-    rotors nearly carry its weight.
+    the command and of the battery's voltage. The reference is the voltage that the controller's full thrust holds at. The vehicle
+    stands still at its start, the rope hanging, until its rotors nearly carry its weight.
 
     Attributes:
         force_b: specific force, what an accelerometer shows [m/s^2], body frame. held: whether it still stands.
