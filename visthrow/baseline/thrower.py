@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from visthrow import config
+from visthrow.baseline import NAME
 from visthrow.baseline.fly import delays_of, fly_pendulum, fly_plant
 from visthrow.baseline.pendulum import pendulum_of
 from visthrow.baseline.plan import Plan, plan_throw
@@ -17,9 +18,6 @@ from visthrow.task import Experiment, contract_of, plant_of
 from visthrow.throws.reference_protocol import batches
 from visthrow.throws.results import PROTOCOL, Result, columns_of, join, key_of, work
 from visthrow.training.device import resolve
-
-NAME = "baseline"
-"""What compare calls it beside the policies."""
 
 OWN = "pendulum"
 """The controller's own model, beside the plants of :data:`visthrow.throws.plants.PLANTS`."""

@@ -17,7 +17,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "examples:\n"
         "  visthrow bench train state --device cuda       simulation, environment, inference and learning\n"
         "  visthrow bench train laptop --until 0.06 0.04  seconds of a whole training to these errors, over seeds\n"
-        "  visthrow bench explain monday/*.npz            seconds of a diagnosis and of its report\n"
+        "  visthrow bench explain flights/*.npz            seconds of a diagnosis and of its report\n"
         "  visthrow bench records                         what was measured before, on which machine and commit\n"
     )
     add_commands(parser, ACTIONS, "bench")

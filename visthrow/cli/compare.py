@@ -6,10 +6,12 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
+from visthrow.baseline import NAME
 from visthrow.common.arguments import add_common, add_out
 from visthrow.common.errors import ConfigError
 from visthrow.common.storage import writable
 from visthrow.common.workers import status
+from visthrow.onboard.shipped import find_policy
 from visthrow.throws.results import Entry
 
 DEFAULT_POLICIES = ("state", "vision")
@@ -61,7 +63,9 @@ def run(args: argparse.Namespace) -> int:
     if args.runs:
         return _from_runs(args)
     check(args.targets, args.throws)
-    from visthrow.baseline.thrower import NAME
+    for name in args.policies or ():
+        if name != NAME:
+            find_policy(name)  # said before anything heavy is imported
     from visthrow.throws.loading import load_policy, unique_names
     from visthrow.throws.plants import known_plant
     from visthrow.training.device import resolve

@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 
 from visthrow.common.arguments import add_common, add_out
+from visthrow.onboard.shipped import find_policy
 
 FILES = {
     "flight.npz": "every signal of the flight; read it with visthrow.logs.flightlog.FlightLog.load",
@@ -56,6 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Fly, write, tell."""
+    find_policy(args.policy)  # said before anything heavy is imported
     from visthrow.common.errors import ConfigError
     from visthrow.common.storage import writable, write_json
     from visthrow.throws.loading import load_policy

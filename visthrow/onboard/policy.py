@@ -27,6 +27,7 @@ from torch import Tensor
 from visthrow.common.errors import MismatchError, PolicyError, suggest
 from visthrow.common.storage import from_json_array, json_array, loadz, savez
 from visthrow.onboard.estimator import Estimator
+from visthrow.onboard.shipped import find_policy as find_policy
 
 FORMAT_VERSIONS = (1, 2)
 """Without and with an estimator."""
@@ -315,22 +316,6 @@ class Policy:
             eps if normalized else 0.0,
         )
 
-
-SHIPPED = Path(__file__).resolve().parent / "policies"
-"""Folder of the policies that come with the package."""
-
-
-def find_policy(name: str | Path) -> Path:
-    """Find a policy by the name of a shipped one (``vision``) or by the path of a file.
-
-    Raises:
-        PolicyError: If there is neither; the message lists what exists.
-    """
-    for candidate in (Path(name), SHIPPED / f"{name}.npz"):
-        if candidate.is_file():
-            return candidate
-    shipped = suggest(str(name), (path.stem for path in SHIPPED.glob("*.npz")))
-    raise PolicyError(f"no policy '{name}': neither a file nor one that comes with visthrow; {shipped}")
 
 
 _ABSENT = object()

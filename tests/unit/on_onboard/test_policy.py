@@ -170,7 +170,7 @@ def test_other_files_and_missing_files_are_refused(policy, tmp_path):
 
 
 def test_policies_are_found_by_shipped_name_or_path(policy, tmp_path, monkeypatch):
-    monkeypatch.setattr("visthrow.onboard.policy.SHIPPED", tmp_path / "shipped")
+    monkeypatch.setattr("visthrow.onboard.shipped.SHIPPED", tmp_path / "shipped")
     policy.save(tmp_path / "shipped" / "vision.npz")
     policy.save(tmp_path / "mine.npz")
     assert find_policy("vision") == tmp_path / "shipped" / "vision.npz"

@@ -1,6 +1,7 @@
 """The command line: quick help, one clear message for a mistake, exit statuses."""
 
 import os
+import re
 import subprocess
 import sys
 import time
@@ -68,10 +69,25 @@ def test_a_file_that_hides_a_package_of_ours_is_named(tmp_path):
     assert "Traceback" not in result.stderr
 
 
+@pytest.mark.parametrize(
+    "does", [["config", "train", "vision"], ["compare", "visoin"], ["fly", "--policy", "visoin"]]
+)
+def test_configurations_and_misspelt_names_import_neither_torch_nor_warp(does):
+    code = f"import sys; from visthrow.cli import main; main({does}); print(*sys.modules)"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert {"torch", "warp"}.isdisjoint(result.stdout.split())
+
+
 def test_help_imports_nothing_heavy():
     code = "import sys; from visthrow.cli import build_parser; build_parser().format_help(); print(*sys.modules)"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert HEAVY.isdisjoint(result.stdout.split())
+
+
+def test_help_of_train_names_the_policies_that_the_readme_shows():
+    shown = re.findall(r"^\| (\w+): ", (ROOT / "README.md").read_text(), re.MULTILINE)
+    assert shown == ["state", "vision", "vision_robust"]
+    assert set(shown) <= set(re.findall(r"\w+", run("train", "--help").stdout))
 
 
 def test_no_command_and_unknown_command_list_the_commands():

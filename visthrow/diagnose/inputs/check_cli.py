@@ -12,7 +12,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "examples:\n"
         "  visthrow diagnose check flight.npz                     a log of ours\n"
         "  visthrow diagnose check LOG00001.BFL                   Betaflight's blackbox, as it comes\n"
-        "  visthrow diagnose check monday/*.csv --config mine.toml    tables, with a mapping of their columns\n"
+        "  visthrow diagnose check flights/*.csv --config mine.toml    tables, with a mapping of their columns\n"
         "\nExit status: 0 all logs ok or with warnings, 1 at least one is bad.\n"
     )
     parser.add_argument("logs", metavar="LOG", nargs="+", help="files, or folders of runs")

@@ -12,8 +12,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
     parser.epilog = (
         "examples:\n"
-        "  visthrow diagnose blind monday/*.npz                 detection limits of every effect in these flights\n"
-        "  visthrow diagnose blind monday/*.npz --verify 5      and five hidden in the measurements, each searched for anew\n"
+        "  visthrow diagnose blind flights/*.npz                 detection limits of every effect in these flights\n"
+        "  visthrow diagnose blind flights/*.npz --verify 5      and five hidden in the measurements, each searched for anew\n"
     )
     shared(parser)
     parser.add_argument("--verify", type=int, default=0, metavar="N", help="also hide N effects in the measurements themselves")

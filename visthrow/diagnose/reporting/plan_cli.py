@@ -12,9 +12,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
     parser.epilog = (
         "examples:\n"
-        "  visthrow diagnose plan monday/*.npz                                the next flight after these\n"
-        "  visthrow diagnose plan monday/*.npz --about ground_effect          what would show this effect\n"
-        "  visthrow diagnose plan monday/*.npz --manoeuvres hover,circle      choose among some\n"
+        "  visthrow diagnose plan flights/*.npz                                the next flight after these\n"
+        "  visthrow diagnose plan flights/*.npz --about ground_effect          what would show this effect\n"
+        "  visthrow diagnose plan flights/*.npz --manoeuvres hover,circle      choose among some\n"
     )
     shared(parser)
     parser.add_argument("--manoeuvres", metavar="NAMES", help="choose among these, by commas; default all")

@@ -1,0 +1,21 @@
+"""Where policies lie; quick to import, so that a misspelt name is told at once. Onboard-safe."""
+
+from pathlib import Path
+
+from visthrow.common.errors import PolicyError, suggest
+
+SHIPPED = Path(__file__).resolve().parent / "policies"
+"""Folder of the policies that come with the package."""
+
+
+def find_policy(name: str | Path) -> Path:
+    """Find a policy by the name of a shipped one (``vision``) or by the path of a file.
+
+    Raises:
+        PolicyError: If there is neither; the message lists what exists.
+    """
+    for candidate in (Path(name), SHIPPED / f"{name}.npz"):
+        if candidate.is_file():
+            return candidate
+    shipped = suggest(str(name), (path.stem for path in SHIPPED.glob("*.npz")))
+    raise PolicyError(f"no policy '{name}': neither a file nor one that comes with visthrow; {shipped}")
