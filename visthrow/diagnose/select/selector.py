@@ -297,9 +297,10 @@ class Selector(SearchState):
         if self.terms:
             return False
         left = [i for i in range(len(self.problem.kept)) if i not in set(gone)]
+        origin, point = (only(terms.bare(self.problem, p)[1], left) for p in (self.origin, self.point))
         self.problem, self.nominal, self.least = problem, nominal, least
-        self.origin, self.point = only(self.origin, left), candidate(self.problem, only(self.point, left), self.active)
-        self.refused, self.visited = {}, set()
+        self.origin, self.point = origin, candidate(problem, point, self.active)
+        self.refused, self.visited, self.proposed = {}, set(), set()
         worth = self.worth()
         return bool(worth) and all(nats > least and self.stands(self.point, self.active, j) for j, nats in worth.items())
 
