@@ -193,6 +193,29 @@ def fit(windows: Windows, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return found.x[:8], found.x[8:]
 
 
+def draw(path: Path, windows: Windows, chosen: np.ndarray, vehicles: dict[str, VehicleParams], rest: np.ndarray) -> None:
+    """Draw the largest of some doublets about each axis: the firmware's rate, and those of vehicles under the same commands."""
+    from visthrow.common import style
+
+    style.use()
+    import matplotlib.pyplot as plt
+
+    rates = {name: windows.rates(vehicle, chosen, rest) for name, vehicle in vehicles.items()}
+    time = 1e3 * (PERIOD * np.arange(windows.rows.shape[1]) - BEFORE)
+    figure, axes = plt.subplots(1, 3, figsize=(9.6, 3.0))
+    for axis, name in enumerate(("roll", "pitch", "yaw")):
+        sizes = np.where(windows.starts[chosen, 1] == axis, np.abs(windows.starts[chosen, 2]), 0.0)
+        at = int(np.argmax(sizes))
+        for i, (what, values) in enumerate(rates.items()):
+            axes[axis].plot(time, values[at, :, axis], color=style.COLOURS[i + 1], lw=1.6, ls=("--", "-")[i % 2], label=what)
+        axes[axis].plot(time, windows.rows[chosen][at, :, 1 + axis], color=style.INK, lw=1.0, label="Betaflight 4.6")
+        axes[axis].set(xlabel="time [ms]", title=name)
+    axes[0].set_ylabel("rate [rad/s]")
+    axes[2].legend(fontsize=8)
+    figure.tight_layout()
+    figure.savefig(path, dpi=110)
+
+
 def make_fitted(policy: str, seed: int) -> WirePlant:
     """The training's plant with the fitted vehicle of ``VISTHROW_FITTED``."""
     experiment = load_policy(policy).experiment
@@ -231,6 +254,7 @@ def main() -> None:
     }  # fmt: skip
     (args.out / "fit.json").write_text(json.dumps(figures, indent=2) + "\n")
     print(json.dumps(figures, indent=2))
+    draw(args.out / "doublets.png", windows, held_out, {"the training's block": shipped, "fitted": fitted}, rest)
 
 
 if __name__ == "__main__":

@@ -76,6 +76,27 @@ def table(record: dict) -> str:
     return "\n".join(out)
 
 
+def draw(path: Path, record: dict) -> None:
+    """Draw where the throws through the firmware landed: a panel a distance, the goal in the middle."""
+    from visthrow.common import style
+
+    style.use()
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(1, len(DISTANCES), figsize=(9.6, 2.7), sharex=True, sharey=True)
+    for axis, distance in zip(axes, sorted(DISTANCES)):
+        for i, one in enumerate(record.values()):
+            points = [t["landing_w"] for t in one["throws"] if t["where"] == "firmware" and t["distance"] == distance]
+            x, y = 100.0 * (np.array(points)[:, :2] - [distance, 0.0]).T
+            axis.plot(x, y, "ox"[i % 2], color=style.COLOURS[i], ms=4.5, label=one["policy"])
+        axis.add_patch(plt.Circle((0.0, 0.0), 3.0, fill=False, color=style.INK, lw=0.8))
+        axis.set(xlabel="beyond the goal [cm]", title=f"{distance:g} m", aspect="equal")
+    axes[0].set_ylabel("to the left [cm]")
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="lower center", ncols=len(record), fontsize=8, bbox_to_anchor=(0.5, -0.07))
+    figure.tight_layout()
+    figure.savefig(path, dpi=110, bbox_inches="tight")
+
+
 def main() -> None:
     """Show the record, or make a series of it anew."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -85,6 +106,7 @@ def main() -> None:
     parser.add_argument("--distances", type=float, nargs="+", default=DISTANCES)
     parser.add_argument("--out", type=Path, default=Path("out/loop"))
     parser.add_argument("--record", action="store_true", help="keep the series in the committed record")
+    parser.add_argument("--picture", type=Path, metavar="FILE", help="draw the record's landings")
     args = parser.parse_args()
     record = json.loads(RECORD.read_text())
     if args.name:
@@ -93,6 +115,8 @@ def main() -> None:
         if args.record:
             RECORD.write_text(json.dumps(record, indent=1) + "\n")
     print(table(record["loop"]))
+    if args.picture:
+        draw(args.picture, record["loop"])
 
 
 if __name__ == "__main__":
