@@ -210,7 +210,7 @@ def beside_a_law(model: SyntheticModel, active: list[int], *laws: grammar.Term) 
     problem = Problem(model, Priors.of(model.effects, model.channels), tuple(range(len(model._windows))))
     point = linearise(problem, np.zeros(len(model.effects)))
     if laws:
-        problem, point = terms.extended(problem, point, [terms._effect(term, 0.1, 7.0) for term in laws])
+        problem, point = terms.extended(problem, point, [terms.as_effect(term, 0.1, 7.0) for term in laws])
     named = [*active, *range(len(model.effects), len(problem.priors.floor))]
     return selector.Selector(problem, point, 4.0, lambda _: None, active=named, point=candidate(problem, point, named))
 
@@ -219,10 +219,10 @@ def beside_a_law(model: SyntheticModel, active: list[int], *laws: grammar.Term) 
 def test_all_terms_at_once_say_what_each_says_as_an_effect(block):
     """Information and score of a column that the windows' inner products were given, and of no further simulation."""
     at = beside_a_law(SyntheticModel(effects=catalogue(4), law="speed", law_size=0.2, throws=4), [1])
-    known = terms.grammar_known(at.point)
+    known = terms.knots_of(at.point)
     of = terms.screen(at.point, terms.statistics(at.point.grams, at.point.noise, "cpu"), block, known)
     for i in (0, 7, len(of.terms) // 2, len(of.terms) - 1):
-        problem, point = terms.extended(at.problem, at.point, [terms._effect(of.terms[i], 1.0, 0.0)])
+        problem, point = terms.extended(at.problem, at.point, [terms.as_effect(of.terms[i], 1.0, 0.0)])
         scale = problem.priors.floor[-1]
         assert point.information[-1, -1] == pytest.approx(scale**2 * of.own[i], rel=1e-6)
         assert point.score[-1] == pytest.approx(scale * of.score[i], rel=1e-5, abs=1e-9 * scale * np.sqrt(of.own[i]))

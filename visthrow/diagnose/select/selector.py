@@ -210,19 +210,21 @@ class Selector(SearchState):
 
     def _tried(self, point: Point, sets: Sequence[Sequence[int]]) -> list[Move]:
         """Simulate sets from a point."""
-        bare = [i for i, s in enumerate(sets) if all(map(self.is_term, s))]
-        found = dict(zip(bare, candidates(self.problem, self.nominal, [sets[i] for i in bare])))
-        rest = [i for i in range(len(sets)) if i not in found]
-        found |= zip(rest, candidates(self.problem, point, [sets[i] for i in rest]))
-        found, here = [found[i] for i in range(len(sets))], (self.point, self.active)
-        return [Move(tuple(s), self.ahead((there, s), here), there) for s, there in zip(sets, found)]
+        here = self.point, self.active
+        moves = [Move(tuple(s), self.ahead((there, s), here), there) for s, there in zip(sets, candidates(self.problem, point, sets))]
+        bare = [i for i, s in enumerate(sets) if all(map(self.is_term, s))]  # where the names are, or where the model stands alone
+        for i, there in zip(bare, candidates(self.problem, self.nominal, [sets[i] for i in bare])):
+            nats = self.ahead((there, sets[i]), here)
+            moves[i] = max(moves[i], Move(tuple(sets[i]), nats, there), key=lambda move: move.nats)
+        return moves
 
     def _best(self, tried: Sequence[Move], listed: Mapping[tuple[int, ...], float], enough: float) -> bool:
         """Go over to the best of some sets that may be named; False where none is worth enough more."""
         for move in sorted(tried, key=lambda move: -move.nats):
-            if move.nats <= enough or not self._believed(move):
-                continue
             new = [j for j in move.active if j not in self.active]
+            joins = any(map(self.is_term, new)) and set(self.active) < set(move.active)
+            if move.nats <= (terms.LAW if joins else enough) or not self._believed(move):
+                continue
             if any(map(self.is_term, new)) and self.nearer():
                 return True
             if len(new) == 1 and len(move.active) > len(self.active) and (done := self._differing(move, new[0])):

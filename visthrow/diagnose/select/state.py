@@ -94,11 +94,16 @@ class SearchState:
         """Return what the name of each candidate costs [nats], shape (K,)."""
         return self.least + np.array([getattr(e, "price", 0.0) for e in self.problem.model.effects])
 
-    def price(self, active: Sequence[int]) -> float:
-        """Return what the names of a set cost [nats]: those that act in a law's block may be a part of its form, and cost as much."""
-        prices, lawful = self.prices, [j for j in active if self.is_term(j)]
-        beside = [j for j in active if j not in lawful and self._acts_beside(j, lawful)]
-        return float(prices[list(active)].sum() + len(beside) * max((prices[j] for j in lawful), default=0.0))
+    def price(self, active: Sequence[int], beside: bool = True) -> float:
+        """Return what the names of a set cost [nats].
+
+        Args:
+            active: the set.
+            beside: whether those that act in a law's block, and may be a part of its form, cost more.
+        """
+        prices, lawful = self.prices, [j for j in active if self.is_term(j)] if beside else []
+        more = [j for j in active if j not in lawful and self._acts_beside(j, lawful)]
+        return float(prices[list(active)].sum() + len(more) * max((terms.LAW + prices[j] for j in lawful), default=0.0))
 
     def _acts_beside(self, j: int, laws: Sequence[int]) -> bool:
         """Whether an effect acts in the block of one of some laws."""
@@ -110,7 +115,8 @@ class SearchState:
     def ahead(self, first: tuple[Point, Sequence[int]], second: tuple[Point, Sequence[int]]) -> float:
         """Return the nats by which a set at its point is worth more than another at its own."""
         evidence = advantage(self.priors, first, second, self.problem.switches)
-        return float(evidence - self.price(first[1]) + self.price(second[1]))
+        beside = all(any(map(self.is_term, active)) for _, active in (first, second))  # law against law
+        return float(evidence - self.price(first[1], beside) + self.price(second[1], beside))
 
     def is_term(self, j: int) -> bool:
         """Tell whether a candidate is a term of a law."""
@@ -123,7 +129,7 @@ class SearchState:
 
     def linear(self, active: Sequence[int], point: Point) -> float:
         """Return what a set is worth by the statistics of a point alone."""
-        return log_evidence(point.information, point.score, self.priors, list(active)) - self.price(active)
+        return log_evidence(point.information, point.score, self.priors, list(active)) - self.price(active, bool(self.terms))
 
     def worth(self, active: Sequence[int] | None = None) -> dict[int, float]:
         """Return what each name of a set, by default that of the search, adds to the others, in nats."""
@@ -252,4 +258,4 @@ class SearchState:
         value = {s: point.evidence(self.priors, s) - self.price(s) for s in {*found, tuple(self.active)}}
         without = point.evidence(self.priors, self.names) - self.price(self.names)
         best = [tuple(self.active), *sorted((s for s in found if set(s) != set(self.active)), key=value.get, reverse=True)]
-        return [terms.laws(self.problem, point, s, value[s] - without) for s in best if value[s] > without]
+        return [terms.laws(self.problem, point, s, value[s] - without) for s in best if s == best[0] or value[s] > without]

@@ -27,7 +27,7 @@ from visthrow.diagnose.select.point import Point, Problem, regathered
 from visthrow.diagnose.select.result import Law
 
 LAW = 6.0
-"""Nats that a term needs beyond the threshold and the logarithm of the number of terms as simple as it."""
+"""Nats by which a term must be ahead where it takes the place of no name, and which a name costs more where a law acts."""
 
 REACH = 3.0
 """Prior deviation of a term's root mean square force, in the block's strongest latent force."""
@@ -267,7 +267,7 @@ def forces(window: Window, known: grammar.Known, terms: Sequence[TermEffect]) ->
 
 def extended(problem: Problem, point: Point, terms: Sequence[TermEffect]) -> tuple[Problem, Point]:
     """The problem and a point of it with more terms as effects, at 0; nothing is simulated again."""
-    model, known = WithTerms(problem.model, terms), grammar_known(point)
+    model, known = WithTerms(problem.model, terms), knots_of(point)
     priors, count = Priors.of(tuple(model.effects), tuple(model.channels)), len(terms)
     through = each(lambda w: forces(point.windows[w], known[w], terms), range(len(known)))
 
@@ -318,7 +318,7 @@ def _without(gram: Gram, count: int) -> Gram:
     return replace(gram, inner=gram.inner[:, :-count, :-count], cross=gram.cross[:, :-count])
 
 
-def grammar_known(point: Point) -> list[grammar.Known]:
+def knots_of(point: Point) -> list[grammar.Known]:
     """Quantities at the knots of each window."""
     return [grammar.Known(window.knots) for window in point.windows]
 
@@ -334,7 +334,7 @@ def shortlist(problem: Problem, point: Point, active: Sequence[int], strongest: 
         least: nats that a term must bring beyond its price.
     """
     calm, parts = calmed(point)
-    known = grammar_known(point)
+    known = knots_of(point)
     screens = {block: of for block in strongest if (of := screen(calm, parts, block, known)) is not None}
     depths = [term.depth for of in screens.values() for term in of.terms]
     price = {depth: float(np.log(sum(d <= depth for d in depths))) for depth in set(depths)}
@@ -345,12 +345,13 @@ def shortlist(problem: Problem, point: Point, active: Sequence[int], strongest: 
         found += [(float(gain[i]), of.terms[i], float(prior[i])) for i in distinct(gain, of, WEIGHED)]
     there = {e.term for e in problem.model.effects if isinstance(e, TermEffect)}
     best = sorted((f for f in found if f[0] > least and f[1] not in there), key=lambda f: -f[0])[:WEIGHED]
-    return [_effect(term, prior, price[term.depth]) for _, term, prior in best]
+    return [as_effect(term, prior, price[term.depth]) for _, term, prior in best]
 
 
-def _effect(term: grammar.Term, prior: float, price: float) -> TermEffect:
+def as_effect(term: grammar.Term, prior: float, price: float) -> TermEffect:
+    """A term as an effect, with the prior deviation of its coefficient and what it costs beyond the threshold [nats]."""
     return TermEffect(term.formula, "a law that the catalogue does not hold", term.formula, term.unit, term.block, (-np.inf, np.inf),
-                      prior, NARROW * prior, (), "grammar", term=term, price=price + LAW)  # fmt: skip
+                      prior, NARROW * prior, (), "grammar", term=term, price=price)  # fmt: skip
 
 
 def strongest_forces(point: Point) -> dict[str, float]:
@@ -376,7 +377,7 @@ def matters(problem: Problem, point: Point, j: int, size: float) -> bool:
     term = problem.model.effects[j].term
     layout = grammar.Layout.of([term])
     square: dict[tuple[int, str], list[float]] = {}
-    for window, gram, own in zip(point.windows, point.grams, grammar_known(point)):
+    for window, gram, own in zip(point.windows, point.grams, knots_of(point)):
         if carries(gram.latent_block, term.block):
             for block, values in grammar.loads(term.block, own, layout.table(own)).items():
                 square.setdefault((LATENT_BLOCKS.index(block), window.phase), []).append(float((values**2).sum((1, 2)).mean()))
