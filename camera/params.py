@@ -122,7 +122,6 @@ class KeypointNoiseParams:
     wrong_probability: float = 0.0  # per step and keypoint that something else is taken for it [-]
     held_probability: float = 0.0  # per step that the last image's keypoints come again [-]
     scale_std: float = 0.0  # Gaussian per episode: relative error of the focal length [-]
-    field: tuple[float, float] = (1.0, 1.0)  # drawn per episode: radius of the image beyond which nothing is seen [-]
     invalid_reads: Literal["edge", "zero"] = "edge"
 
     @property
@@ -142,8 +141,6 @@ class KeypointNoiseParams:
         for name in ("drop_probability", "wrong_probability", "held_probability"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ValueError(f"keypoint noise {name} is {getattr(self, name)}; expected a number in [0, 1]")
-        if not 0.0 < self.field[0] <= self.field[1] <= 1.0:
-            raise ValueError(f"keypoint noise field is {self.field}; expected two ascending numbers above 0 and up to 1")
         if self.invalid_reads not in ("edge", "zero"):
             raise ValueError(f"keypoint noise invalid_reads is {self.invalid_reads!r}; expected one of 'edge', 'zero'")
 

@@ -106,7 +106,6 @@ class ThrowEnv(VecEnv):
             "pose_age": torch.zeros(E, **make),
             "poses": torch.zeros(E, 1 + max(math.ceil(seen.oldest / self.cfg.sim.control_period - 1e-9), 1), POSE, **make),
             "scale_error": torch.zeros(E, 1, 1, **make),
-            "field": torch.ones(E, 1, **make),
             "held_points": torch.zeros(E, KEYPOINTS, 2, **make),
             "held_valid": torch.zeros(E, KEYPOINTS, device=device, dtype=torch.bool),
             "late_points": torch.zeros(E, latency, KEYPOINTS, 2, **make),
@@ -312,10 +311,6 @@ class ThrowEnv(VecEnv):
                 old = memory[name]
                 mask = fresh.view(-1, *(1,) * (old.dim() - 1))
                 old.copy_(torch.where(mask, torch.randn_like(old) * std, old))
-        least, most = camera.noise.field
-        if least < 1.0:
-            field = memory["field"]
-            field.copy_(torch.where(fresh[:, None], least + (most - least) * torch.rand_like(field), field))
         low, high = self.cfg.task.observation.latency
         if high > 0.0:
             age = memory["pose_age"]
@@ -417,8 +412,6 @@ class ThrowEnv(VecEnv):
         points, valid = ob.vision_part(self.camera, pos_w, rot_wb, goal_w, payload_w, self.extrinsics())
         if camera.noise.scale_std > 0.0:
             points = points * (1.0 + memory["scale_error"])
-        if camera.noise.field[0] < 1.0:
-            valid = valid & (points.norm(dim=-1) <= memory["field"])
         if camera.noise.latency > 0.0:
             memory["late_points"].copy_(hist.push(memory["late_points"], points, fresh))
             memory["late_valid"].copy_(hist.push(memory["late_valid"], valid, fresh))
