@@ -122,6 +122,7 @@ class KeypointNoiseParams:
     wrong_probability: float = 0.0  # per step and keypoint that something else is taken for it [-]
     held_probability: float = 0.0  # per step that the last image's keypoints come again [-]
     scale_std: float = 0.0  # Gaussian per episode: relative error of the focal length [-]
+    seen_radius: float = 1.0  # of the image beyond which nothing is seen: a narrower lens, read by its own calibration [-]
     invalid_reads: Literal["edge", "zero"] = "edge"
 
     @property
@@ -141,6 +142,8 @@ class KeypointNoiseParams:
         for name in ("drop_probability", "wrong_probability", "held_probability"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ValueError(f"keypoint noise {name} is {getattr(self, name)}; expected a number in [0, 1]")
+        if not 0.0 < self.seen_radius <= 1.0:
+            raise ValueError(f"keypoint noise seen_radius is {self.seen_radius}; expected a number above 0 and up to 1")
         if self.invalid_reads not in ("edge", "zero"):
             raise ValueError(f"keypoint noise invalid_reads is {self.invalid_reads!r}; expected one of 'edge', 'zero'")
 

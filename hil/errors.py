@@ -12,7 +12,7 @@ class LinkError(VisthrowError):
 
 
 class SourceError(VisthrowError):
-    """A recording cannot be read, or its columns are not what the mapping says."""
+    """A source cannot be opened or read: a recording, a mapping of its columns, a client that is missing, a camera without a picture."""
 
 
 class RunError(VisthrowError):

@@ -56,7 +56,7 @@ def test_corrected_keypoints_are_those_of_the_nominal_camera():
     torch.testing.assert_close(got[:, 4:].mean(1), nominal[:, 4:].mean(1), rtol=0, atol=1e-3)
 
 
-@pytest.mark.parametrize("change", ['task.observation.validity=false', 'task.target.speed=[0.1,0.2]'])
+@pytest.mark.parametrize("change", ['task.observation.layout="state"', 'task.target.speed=[0.1,0.2]'])
 def test_what_cannot_be_calibrated_is_refused(change):
     with pytest.raises(ConfigError, match="calibration in the hover"):
         calibrated_start(experiment(change))

@@ -1,4 +1,5 @@
 """The record of one flight: channels, each with its own time stamps, and what is known about the flight as a whole.
+`STANDARD_CHANNELS` lists the channels.
 
 Onboard-safe (numpy only). The same record serves simulated throws, throws of the reference plant and flights of a real
 vehicle, so that whatever reads one reads them all.

@@ -1,13 +1,17 @@
 """Where keypoints lie by the camera as it is configured: what the actor may be given beside them. Onboard-safe.
 
 The network need then not learn the lens, but what is wrong with it. The goal is the mean of all steps of the throw, each weighted by
-what its distance leaves: noise averages out, and it is known while it is out of view.
+what its distance leaves: noise averages out, and it is known while it is out of view. A corner that is not seen then reads where the
+fitted goal would be seen.
 """
+
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from camera.keypoints import GOAL_KEYPOINTS, KeypointCamera
+from camera.keypoints import GOAL_KEYPOINTS, KeypointCamera, goal_corners_w
+from camera.mount import points_c_from_w
 from visthrow.onboard import goal_motion
 from visthrow.onboard.observations import VEHICLE, Layout
 
@@ -42,25 +46,49 @@ def located(layout: Layout, frame: Tensor, valid: Tensor, camera: KeypointCamera
     return torch.cat([(goal_xy - frame[:, :2]) * known[:, None], ray_w * hangs, known[:, None].to(frame.dtype)], dim=-1)
 
 
+class Fitted(NamedTuple):
+    """What :func:`fitted_goal` makes of a frame."""
+
+    sums: Tensor
+    velocity: Tensor | None  # of the goal [m/s], shape (E, 2), where the layout has it
+    places: Tensor | None  # where the keypoints lie, shape (E, 6), where the layout has it
+    frame: Tensor  # with corners that were not seen where they would be
+    valid: Tensor | None
+
+
 def fitted_goal(
     layout: Layout, frame: Tensor, valid: Tensor | None, camera: KeypointCamera | None, sums: Tensor, time: Tensor, fresh: Tensor
-) -> tuple[Tensor, Tensor | None, Tensor | None]:
+) -> Fitted:
     """Take one frame into the goal's fit.
 
     Args:
         layout, frame, valid, camera: see :func:`goal_motion.measured_goal`.
         sums, time, fresh: see :func:`goal_motion.fit`.
-
-    Returns:
-        The new sums; the goal's velocity [m/s], shape (E, 2), where the layout has it; where the keypoints lie, shape (E, 6), likewise.
     """
     measured = goal_in_frame if layout.located else goal_motion.measured_goal
     sums, velocity = goal_motion.fit(sums, time, *measured(layout, frame, valid, camera), fresh)
     moves = velocity if layout.motion else None
     if not layout.located:
-        return sums, moves, None
-    goal_xy = goal_motion.place(sums, time, moves)
-    return sums, moves, located(layout, frame, valid, camera, goal_xy, sums[:, 0] > 0.0)
+        return Fitted(sums, moves, None, frame, valid)
+    goal_xy, known = goal_motion.place(sums, time, moves), sums[:, 0] > 0.0
+    places = located(layout, frame, valid, camera, goal_xy, known)
+    return Fitted(sums, moves, places, *predicted(layout, frame, valid, camera, goal_xy, known))
+
+
+def predicted(
+    layout: Layout, frame: Tensor, valid: Tensor, camera: KeypointCamera, goal_xy: Tensor, known: Tensor
+) -> tuple[Tensor, Tensor]:
+    """The frame, and its validity, with corners that are not seen where the goal so far would be seen; arguments as of :func:`located`."""
+    x_axis, y_axis = frame[:, 9:12], frame[:, 12:15]
+    rot_wb = torch.stack([x_axis, y_axis, torch.linalg.cross(x_axis, y_axis)], dim=-1)
+    corners_w = goal_corners_w(goal_xy, square_w=camera.square_w)
+    corners_c = points_c_from_w(corners_w, frame[:, :3], rot_wb, camera.rot_cb, camera.position_b)
+    points, inside = camera.fisheye.project_normalized(corners_c, clip=True)
+    seen, end = valid[:, :GOAL_KEYPOINTS], VEHICLE + layout.goal
+    filled = ~seen & inside & known[:, None]
+    corners = torch.where(filled[..., None], points, frame[:, VEHICLE:end].unflatten(1, (GOAL_KEYPOINTS, 2)))
+    frame = torch.cat([frame[:, :VEHICLE], corners.flatten(1), frame[:, end:]], dim=-1)
+    return frame, torch.cat([seen | filled, valid[:, GOAL_KEYPOINTS:]], dim=-1)
 
 
 def middle(points: Tensor, valid: Tensor) -> Tensor:

@@ -251,7 +251,7 @@ class Pilot:
         sums: tuple[Tensor, ...] = ()
         velocity = places = None
         if fitted:
-            new, velocity, places = fitted_goal(self.layout, frame, valid, self.camera, further[0], further[1], fresh)
+            new, velocity, places, frame, valid = fitted_goal(self.layout, frame, valid, self.camera, further[0], further[1], fresh)
             sums = (new,)
         observation, history = ob.observe(self.layout, frame, valid, previous, attached[:, 0], history, fresh, velocity, places)
         return observation, history, *sums, *seen

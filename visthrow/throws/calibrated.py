@@ -37,14 +37,11 @@ def calibrated_start(experiment: Experiment, kept: list[Calibration | None] | No
         kept: takes the calibration of each throw; None where there was none, and keypoints stay as they came.
 
     Raises:
-        ConfigError: another layout than vision, without validity bits, or goals that move.
+        ConfigError: another layout than vision, or goals that move.
     """
     seen = experiment.task.observation
-    if seen.layout != "vision" or not seen.validity or experiment.task.target.moves:
-        raise ConfigError(
-            f"calibration in the hover with observation.layout = {seen.layout!r}, validity = {seen.validity}; expected 'vision' with "
-            "validity and goals that stand still"
-        )
+    if seen.layout != "vision" or experiment.task.target.moves:
+        raise ConfigError(f"calibration in the hover: layout {seen.layout!r}; expected 'vision' and goals that stand still")
 
     def begin(env: ThrowEnv) -> TensorDict:
         found = _calibrations(experiment, _hovered(env))
@@ -63,11 +60,11 @@ def _hovered(env: ThrowEnv) -> list[Hovered]:
     steps, last = round((STILL + SWAY) / period), round((STILL + SWAY + SETTLE) / period)
     controller = HoverController(HoverParams(), period, env.num_envs)
     rate = torch.tensor(cfg.task.action.max_rate)
-    seen = env.reset()["actor"]
+    env.reset()
     home, rows = env.views.state["pos_w"].cpu().numpy().copy(), []
     mass = cfg.vehicle.body.mass + cfg.rope.payload_mass + cfg.rope.rope_mass
     for k in range(last):
-        measured = _measured(env.layout, seen.cpu())
+        measured = _measured(env)
         command = controller.step(*measured[:3], home, mass)
         since = k * period - STILL
         if 0.0 <= since < SWAY:
@@ -76,7 +73,7 @@ def _hovered(env: ThrowEnv) -> list[Hovered]:
             rows.append((np.full(env.num_envs, k * period), *measured[:4], command[:, 0], *measured[4:]))
         action = act.action_from_command(torch.from_numpy(command).float(), cfg.task.action.max_thrust, rate)
         env.episode_length_buf.zero_()  # a hover has no time limit
-        seen = env.step(torch.cat([action, -torch.ones(env.num_envs, 1)], -1).to(env.device), hold=True)[0]["actor"]
+        env.step(torch.cat([action, -torch.ones(env.num_envs, 1)], -1).to(env.device), hold=True)
     time, pos, quat, vel, rates, thrust, points, valid = (np.stack(column, 1) for column in zip(*rows))
     goal = env.views.goal_w.cpu().numpy()
     return [
@@ -84,18 +81,17 @@ def _hovered(env: ThrowEnv) -> list[Hovered]:
     ]
 
 
-def _measured(layout: ob.Layout, seen: torch.Tensor) -> tuple[np.ndarray, ...]:
-    """Position, attitude xyzw, velocity, body rates, keypoints (E, 8, 2) and validity (E, 8) in observations, shape (E, D)."""
-    vehicle, goal = seen[:, : ob.VEHICLE].double().numpy(), ob.VEHICLE + act.ACTIONS
+def _measured(env: ThrowEnv) -> tuple[np.ndarray, ...]:
+    """Position, attitude xyzw, velocity, body rates, keypoints (E, 8, 2) and validity (E, 8) of this step."""
+    frame, valid = (part.cpu() for part in env.measured)
+    vehicle = frame[:, : ob.VEHICLE].double().numpy()
     x, y = vehicle[:, 9:12], vehicle[:, 12:15]
     x = x / np.linalg.norm(x, axis=1, keepdims=True)
     y = y - x * (x * y).sum(1, keepdims=True)
     y /= np.linalg.norm(y, axis=1, keepdims=True)
     quat = Rotation.from_matrix(np.stack([x, y, np.cross(x, y)], -1)).as_quat()
-    points = seen[:, goal : goal + 2 * KEYPOINTS].unflatten(1, (KEYPOINTS, 2)).double().numpy()  # goal, then the payload now
-    bits = seen.shape[1] - layout.motion - layout.located - KEYPOINTS
-    valid = seen[:, bits : bits + KEYPOINTS].numpy() > 0.5
-    return vehicle[:, :3], quat, vehicle[:, 3:6], vehicle[:, 6:9], points, valid
+    points = frame[:, ob.VEHICLE :].unflatten(1, (KEYPOINTS, 2)).double().numpy()
+    return vehicle[:, :3], quat, vehicle[:, 3:6], vehicle[:, 6:9], points, valid.numpy()
 
 
 def _solve(task: tuple) -> Calibration | None:

@@ -357,11 +357,13 @@ class ThrowEnv(VecEnv):
                 rot_wb = torch.stack([x_axis, y_axis, torch.linalg.cross(x_axis, y_axis)], dim=-1)
             points, valid = self._see(pose[:, :3], rot_wb, late_goal, pose[:, ob.VEHICLE :], fresh)
             measured = torch.cat([measured[:, : ob.VEHICLE], points.flatten(1)], dim=-1)
+        self.measured = measured, valid
         time = self.episode_length_buf.to(torch.float32) * self.cfg.sim.control_period
         goal_vel = places = None
         if self.layout.fits:
-            sums, goal_vel, places = fitted_goal(self.layout, measured, valid, self.camera, memory["goal_fit"], time, fresh)
-            memory["goal_fit"].copy_(sums)
+            fitted = fitted_goal(self.layout, measured, valid, self.camera, memory["goal_fit"], time, fresh)
+            memory["goal_fit"].copy_(fitted.sums)
+            _, goal_vel, places, measured, valid = fitted
         actor, history = ob.observe(
             self.layout, measured, valid, memory["previous"], attached, memory["history"], fresh, goal_vel, places
         )
@@ -410,6 +412,8 @@ class ThrowEnv(VecEnv):
         """Keypoints as the detector reports them: errors of mount and focal length, latency, noise, drop-out, held images."""
         memory, camera = self._memory, self.cfg.camera
         points, valid = ob.vision_part(self.camera, pos_w, rot_wb, goal_w, payload_w, self.extrinsics())
+        if camera.noise.seen_radius < 1.0:
+            valid = valid & (points.square().sum(-1) <= camera.noise.seen_radius**2)
         if camera.noise.scale_std > 0.0:
             points = points * (1.0 + memory["scale_error"])
         if camera.noise.latency > 0.0:

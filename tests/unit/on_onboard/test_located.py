@@ -43,13 +43,16 @@ def test_the_goal_is_the_mean_of_a_throw_and_stays_known_out_of_view():
     off = []
     for k in range(40):
         noisy = frame + 0.01 * torch.randn_like(frame)
-        sums, _, found = fitted_goal(layout, noisy, valid, camera, sums, torch.full((8,), 0.02 * k), fresh)
+        sums, _, found, _, _ = fitted_goal(layout, noisy, valid, camera, sums, torch.full((8,), 0.02 * k), fresh)
         off.append((found[:, :2] + noisy[:, :2] - frame[:, :2] - offset).norm(dim=-1))
         fresh = torch.zeros_like(fresh)
     assert torch.stack(off[-5:]).mean() < 0.4 * torch.stack(off[:1]).mean()
-    _, _, blind = fitted_goal(layout, frame, torch.zeros_like(valid), camera, sums, torch.full((8,), 0.8), fresh)
+    _, _, blind, shown, counts = fitted_goal(layout, frame, torch.zeros_like(valid), camera, sums, torch.full((8,), 0.8), fresh)
     torch.testing.assert_close(blind[:, :2] + frame[:, :2], found[:, :2] + noisy[:, :2], rtol=0, atol=1e-5)
     assert (blind[:, 5] == 1.0).all()
+    assert counts[:, :4].all(), "corners read where the goal would be seen"
+    assert not counts[:, 4:].any(), "the payload does not"
+    torch.testing.assert_close(shown[:, 15:23], frame[:, 15:23], rtol=0, atol=0.02)
 
 
 def test_a_goal_that_moves_is_where_it_is_now():
@@ -59,7 +62,7 @@ def test_a_goal_that_moves_is_where_it_is_now():
     for k in range(60):  # the vehicle moves with the goal: what it sees stays as it is
         moved = frame.clone()
         moved[:, :2] += speed * 0.02 * k
-        sums, velocity, found = fitted_goal(layout, moved, valid, camera, sums, torch.full((8,), 0.02 * k), fresh)
+        sums, velocity, found, _, _ = fitted_goal(layout, moved, valid, camera, sums, torch.full((8,), 0.02 * k), fresh)
         fresh = torch.zeros_like(fresh)
     torch.testing.assert_close(velocity, speed.expand(8, 2), rtol=0, atol=0.02)
     torch.testing.assert_close(found[:, :2], offset, rtol=0, atol=0.02)
