@@ -33,6 +33,7 @@ class CalibrationParams:
     rate: float = 1.0  # amplitude of the sway's body rates [rad/s]
     frequency: float = 1.5  # of the sway [Hz]
     most_tilt_deg: float = 10.0  # of the camera, which is corrected for; beyond it the field of view is another one
+    most_scale: float = 0.06  # of the focal length off the nominal one, which is corrected for [-]
     most_latency: float = 0.06  # of the keypoints, which is made up for [s]
     thrust: float = 0.1  # off the commanded one: twice the spread of masses in training
     sure_tilt_deg: float = 0.5  # standard deviation at most
@@ -176,6 +177,7 @@ class Calibrating:
         limits = {
             f"camera tilted by {np.abs(tilt).max():.1f} deg, {p.most_tilt_deg:g} at most": np.abs(tilt).max() > p.most_tilt_deg,
             f"camera's tilt known to {tilts.max():.2f} deg, {p.sure_tilt_deg:g} at most": tilts.max() > p.sure_tilt_deg,
+            f"focal length off by {100 * abs(found.scale):.1f} %, {100 * p.most_scale:g} at most": abs(found.scale) > p.most_scale,
             f"keypoints {1e3 * found.latency:.0f} ms late, {1e3 * p.most_latency:g} at most": found.latency > p.most_latency,
             f"keypoints' latency known to {1e3 * found.latency_sigma:.1f} ms, {1e3 * p.sure_latency:g} at most": found.latency_sigma
             > p.sure_latency,
