@@ -59,6 +59,9 @@ MEASURED = ("--measured", "air_density=0.003")
 NOT_WAITED = "timeout"
 """Error of a world whose verdict was not waited for."""
 
+JUDGED = ("exact", "class", "own_class", "wrong", "missed")
+"""What is counted of the worlds that were answered."""
+
 TERMS = {
     "law_ball_swirl": "F_p = c (z x v_p)", "law_vehicle_swirl": "F = c (e_z x v)", "law_speed_thrust": "F = c T v_xy e_z",
     "law_slew_thrust": "F = c dT/dt e_z", "law_joint_square": "M_j = c |Ω| Ω",
@@ -154,7 +157,7 @@ def ask(logs: list[Path], model: list[str], folder: Path, device: str = "cpu", t
     except subprocess.TimeoutExpired:
         return {"overall": "ERROR", "error": NOT_WAITED, "findings": []}
     if not answer.exists():
-        return {"overall": "ERROR", "error": (done.stdout + done.stderr)[-2000:], "findings": []}
+        return {"overall": "ERROR", "error": (done.stdout + done.stderr).strip().rpartition("\n")[2], "findings": []}
     return json.loads(answer.read_text())
 
 
@@ -407,7 +410,8 @@ def main() -> None:
                 continue
             with args.ledger.open("a") as out:
                 out.write(json.dumps(line) + "\n")
-            tally[line["kind"]].update(["worlds"] + [k for k in ("exact", "class", "own_class", "wrong", "missed") if line.get(k)])
+            failed = line["overall"] == "ERROR"
+            tally[line["kind"]].update(["worlds"] + ["failed"] * failed + [k for k in JUDGED if line.get(k) and not failed])
             told = {k: line.get(k) for k in ("overall", "named", "explain_s", "error") if k in line}
             print(line["kind"], line["recipe"]["plant"], line["recipe"]["effects"], told, flush=True)
     for kind, count in tally.items():
