@@ -17,7 +17,17 @@ from camera.params import CameraParams
 from hil.poses.pose import Vector
 from hil.poses.track import BodyState
 from visthrow.common.errors import ConfigError, VisthrowError
-from visthrow.onboard.calibration import Calibration, Hovered, Spreads, calibrate, sway
+from visthrow.onboard.calibration import (
+    STILL,
+    SWAY,
+    SWAY_FREQUENCY,
+    SWAY_RATE,
+    Calibration,
+    Hovered,
+    Spreads,
+    calibrate,
+    sway,
+)
 
 
 @dataclass(frozen=True)
@@ -28,10 +38,10 @@ class CalibrationParams:
         ConfigError: a time, a rate or a limit of 0 or less.
     """
 
-    still: float = 1.5  # of hover before the sway [s]
-    sway: float = 1.5  # [s]
-    rate: float = 1.0  # amplitude of the sway's body rates [rad/s]
-    frequency: float = 1.5  # of the sway [Hz]
+    still: float = STILL  # of hover before the sway [s]
+    sway: float = SWAY  # [s]
+    rate: float = SWAY_RATE  # amplitude of the sway's body rates [rad/s]
+    frequency: float = SWAY_FREQUENCY  # of the sway [Hz]
     most_tilt_deg: float = 10.0  # of the camera, which is corrected for; beyond it the field of view is another one
     most_scale: float = 0.06  # of the focal length off the nominal one, which is corrected for [-]
     most_latency: float = 0.06  # of the keypoints, which is made up for [s]

@@ -265,7 +265,7 @@ class Runner:
             decision.seen = self._sight.values()
             if seen.vehicle is not None and seen.vehicle.quat is not None:
                 self.sights.along(now, seen.vehicle.pos, seen.vehicle.quat)
-                self.sights.take(self._sight, seen.vehicle.quat, self._aged)
+                self.sights.take(self._sight, seen.vehicle.quat, self._shown_age(now))
             self._sight = None
         elif self.sights is not None and seen.vehicle is not None and seen.vehicle.quat is not None:
             self.sights.along(now, seen.vehicle.pos, seen.vehicle.quat)
@@ -299,7 +299,7 @@ class Runner:
         roll, pitch = calibrating.rates(now, self._still(seen.vehicle, seen.payload, False))
         if decision.seen is not None and self.sights.fresh is not None:
             stamp, points, valid = self.sights.fresh
-            calibrating.note(now, seen.vehicle, wanted[0], points, valid, now - self._aged - stamp)
+            calibrating.note(now, seen.vehicle, wanted[0], points, valid, now - self._shown_age(now) - stamp)
         return (wanted[0], wanted[1] + roll, wanted[2] + pitch, wanted[3])
 
     def _guarded(self, now: float, wanted: tuple[float, ...] | None, decision: Decision) -> tuple[float, ...] | None:
@@ -353,11 +353,19 @@ class Runner:
 
     def _state(self, track: Track, now: float) -> BodyState | None:
         """State of a body, carried forward to the age that the policy was trained with where the config says so."""
-        delay = self.params.delay
-        last = track.gate.last
-        age = track.gate.age(now) + (delay.source if last is None else last.transit(delay.source))
+        delay, age = self.params.delay, self._age(track, now)
         ahead = age - self._aged + delay.command if delay.compensate and math.isfinite(age) else 0.0
         return track.state(now, ahead)
+
+    def _age(self, track: Track, now: float) -> float:
+        """Age of a body's last pose [s]."""
+        last, source = track.gate.last, self.params.delay.source
+        return track.gate.age(now) + (source if last is None else last.transit(source))
+
+    def _shown_age(self, now: float) -> float:
+        """Age of the vehicle's pose as the policy is shown it [s]: younger ones than it was trained with stay so."""
+        age = self._age(self.tracks[VEHICLE], now)
+        return min(age, self._aged) if self.params.delay.compensate else age
 
     def _goal(self, bodies: dict[str, BodyState | None]) -> Vector | None:
         if GOAL not in self.tracks:

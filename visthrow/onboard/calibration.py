@@ -128,7 +128,14 @@ class CalibrationError(VisthrowError):
     """A hover shows too little to calibrate by."""
 
 
-def sway(since: float, rate: float, frequency: float) -> tuple[float, float]:
+STILL, SWAY = 1.5, 1.5
+"""Of a hover before the sway, and of the sway [s]."""
+
+SWAY_RATE, SWAY_FREQUENCY = 1.0, 1.5
+"""Amplitude of the sway's body rates, 6 deg of tilt to each side [rad/s]; above the swing's frequency: the rope does not follow [Hz]."""
+
+
+def sway(since: float, rate: float = SWAY_RATE, frequency: float = SWAY_FREQUENCY) -> tuple[float, float]:
     """Roll and pitch rate of the sway [rad/s], so long after its begin [s]: a circle of an amplitude and a frequency [rad/s, Hz]."""
     phase = 2.0 * math.pi * frequency * since
     return rate * min(1.0, phase) * math.cos(phase), rate * math.sin(phase)

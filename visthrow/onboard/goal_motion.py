@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from camera.keypoints import GOAL_KEYPOINTS, KeypointCamera
-from visthrow.onboard.observations import VEHICLE, Layout
+from visthrow.onboard.observations import VEHICLE, Layout, rotation_in
 
 SUMS = 7
 """Width of the carried sums: w, w t, w t^2, w x, w y, w t x, w t y."""
@@ -106,8 +106,7 @@ def goal_by_corner(layout: Layout, frame: Tensor, valid: Tensor, camera: Keypoin
     """
     corners = frame[:, VEHICLE : VEHICLE + layout.goal].unflatten(1, (GOAL_KEYPOINTS, 2))
     rays_c, _ = camera.fisheye.unproject(camera.fisheye.denormalize(corners))
-    x_axis, y_axis = frame[:, 9:12], frame[:, 12:15]
-    rot_wb = torch.stack([x_axis, y_axis, torch.linalg.cross(x_axis, y_axis)], dim=-1)
+    rot_wb = rotation_in(frame)
     rays_w = rays_c @ camera.rot_cb @ rot_wb.transpose(1, 2)  # rows: (R_wb R_bc r)^T
     lens_w = frame[:, :3] + (rot_wb @ camera.position_b)
     height = lens_w[:, None, 2].clamp(min=0.1)

@@ -13,7 +13,7 @@ from torch import Tensor
 from camera.keypoints import GOAL_KEYPOINTS, KeypointCamera, goal_corners_w
 from camera.mount import points_c_from_w
 from visthrow.onboard import goal_motion
-from visthrow.onboard.observations import VEHICLE, Layout
+from visthrow.onboard.observations import VEHICLE, Layout, rotation_in
 
 
 def goal_in_frame(layout: Layout, frame: Tensor, valid: Tensor, camera: KeypointCamera) -> tuple[Tensor, Tensor]:
@@ -39,8 +39,7 @@ def located(layout: Layout, frame: Tensor, valid: Tensor, camera: KeypointCamera
     box, bits = frame[:, VEHICLE + layout.goal :].unflatten(1, (-1, 2)), valid[:, GOAL_KEYPOINTS:]
     centre = middle(box, bits)
     ray_c, _ = camera.fisheye.unproject(camera.fisheye.denormalize(centre))
-    x_axis, y_axis = frame[:, 9:12], frame[:, 12:15]
-    rot_wb = torch.stack([x_axis, y_axis, torch.linalg.cross(x_axis, y_axis)], dim=-1)
+    rot_wb = rotation_in(frame)
     ray_w = (ray_c[:, None] @ camera.rot_cb @ rot_wb.transpose(1, 2))[:, 0]
     hangs = bits.any(-1, keepdim=True)
     return torch.cat([(goal_xy - frame[:, :2]) * known[:, None], ray_w * hangs, known[:, None].to(frame.dtype)], dim=-1)
@@ -79,8 +78,7 @@ def predicted(
     layout: Layout, frame: Tensor, valid: Tensor, camera: KeypointCamera, goal_xy: Tensor, known: Tensor
 ) -> tuple[Tensor, Tensor]:
     """The frame, and its validity, with corners that are not seen where the goal so far would be seen; arguments as of :func:`located`."""
-    x_axis, y_axis = frame[:, 9:12], frame[:, 12:15]
-    rot_wb = torch.stack([x_axis, y_axis, torch.linalg.cross(x_axis, y_axis)], dim=-1)
+    rot_wb = rotation_in(frame)
     corners_w = goal_corners_w(goal_xy, square_w=camera.square_w)
     corners_c = points_c_from_w(corners_w, frame[:, :3], rot_wb, camera.rot_cb, camera.position_b)
     points, inside = camera.fisheye.project_normalized(corners_c, clip=True)

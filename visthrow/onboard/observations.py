@@ -111,6 +111,12 @@ def rotation_from_quat(quat: Tensor) -> Tensor:
     return rot_wb
 
 
+def rotation_in(frame: Tensor) -> Tensor:
+    """Measured attitude rot_wb, shape (E, 3, 3), of frames, shape (E, F): with noise its columns are not quite a rotation's."""
+    x_axis, y_axis = frame[:, 9:12], frame[:, 12:15]
+    return torch.stack([x_axis, y_axis, torch.linalg.cross(x_axis, y_axis)], dim=-1)
+
+
 def vehicle_part(pos_w: Tensor, vel_w: Tensor, rate_b: Tensor, rot_wb: Tensor) -> Tensor:
     """Vehicle's part of a frame, shape (E, 15)."""
     return torch.cat([pos_w, vel_w, rate_b, rot_wb[..., 0], rot_wb[..., 1]], dim=-1)

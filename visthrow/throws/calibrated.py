@@ -17,16 +17,13 @@ from visthrow.common.errors import ConfigError
 from visthrow.common.workers import Workers
 from visthrow.onboard import actions as act
 from visthrow.onboard import observations as ob
-from visthrow.onboard.calibration import Calibration, CalibrationError, Hovered, calibrate, sway
+from visthrow.onboard.calibration import STILL, SWAY, Calibration, CalibrationError, Hovered, calibrate, sway
 from visthrow.onboard.hover import HoverController, HoverParams
-from visthrow.task import Experiment, contract_of
+from visthrow.task import Experiment, contract_of, plant_of
 from visthrow.training.env import ThrowEnv
 
-STILL, SWAY, SETTLE = 1.5, 1.5, 3.0
-"""Of a hover: before the sway, the sway, until the swing that it leaves has died down [s]."""
-
-RATE, FREQUENCY = 1.0, 1.5
-"""Of the sway [rad/s], [Hz]."""
+SETTLE = 3.0
+"""After the sway, until the swing that it leaves has died down [s]."""
 
 
 def calibrated_start(experiment: Experiment, kept: list[Calibration | None] | None = None) -> Callable[[ThrowEnv], TensorDict]:
@@ -62,13 +59,13 @@ def _hovered(env: ThrowEnv) -> list[Hovered]:
     rate = torch.tensor(cfg.task.action.max_rate)
     env.reset()
     home, rows = env.views.state["pos_w"].cpu().numpy().copy(), []
-    mass = cfg.vehicle.body.mass + cfg.rope.payload_mass + cfg.rope.rope_mass
+    mass = plant_of(cfg).total_mass
     for k in range(last):
         measured = _measured(env)
         command = controller.step(*measured[:3], home, mass)
         since = k * period - STILL
         if 0.0 <= since < SWAY:
-            command[:, 1:3] += sway(since, RATE, FREQUENCY)
+            command[:, 1:3] += sway(since)
         if k < steps:
             rows.append((np.full(env.num_envs, k * period), *measured[:4], command[:, 0], *measured[4:]))
         action = act.action_from_command(torch.from_numpy(command).float(), cfg.task.action.max_thrust, rate)
@@ -85,11 +82,7 @@ def _measured(env: ThrowEnv) -> tuple[np.ndarray, ...]:
     """Position, attitude xyzw, velocity, body rates, keypoints (E, 8, 2) and validity (E, 8) of this step."""
     frame, valid = (part.cpu() for part in env.measured)
     vehicle = frame[:, : ob.VEHICLE].double().numpy()
-    x, y = vehicle[:, 9:12], vehicle[:, 12:15]
-    x = x / np.linalg.norm(x, axis=1, keepdims=True)
-    y = y - x * (x * y).sum(1, keepdims=True)
-    y /= np.linalg.norm(y, axis=1, keepdims=True)
-    quat = Rotation.from_matrix(np.stack([x, y, np.cross(x, y)], -1)).as_quat()
+    quat = Rotation.from_matrix(ob.rotation_in(frame.double()).numpy()).as_quat()  # the nearest rotation
     points = frame[:, ob.VEHICLE :].unflatten(1, (KEYPOINTS, 2)).double().numpy()
     return vehicle[:, :3], quat, vehicle[:, 3:6], vehicle[:, 6:9], points, valid.numpy()
 

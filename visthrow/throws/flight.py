@@ -5,6 +5,7 @@ payload, and the hover controller, which runs along, what has let go or failed. 
 """
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -38,7 +39,7 @@ class Decision:
     observation: np.ndarray | None = None  # of a policy, shape (E, D)
 
 
-class Pilots:
+class Pilots(ABC):
     """Who throws with E vehicles; the children decide."""
 
     def __init__(self, experiment: Experiment, goal_w: np.ndarray, first_action: np.ndarray, goal_vel_w: np.ndarray | None = None):
@@ -52,9 +53,9 @@ class Pilots:
         self.experiment, self.goal_w, self.first_action = experiment, goal_w, first_action
         self.goal_vel_w = np.zeros_like(goal_w) if goal_vel_w is None else goal_vel_w
 
+    @abstractmethod
     def decide(self, flight: "Flight", seen: Snapshot, held: np.ndarray) -> Decision:
         """Decide for all vehicles, of which those of ``flight.flown`` follow; ``held`` are the hover controller's commands."""
-        raise NotImplementedError
 
 
 class Policies(Pilots):

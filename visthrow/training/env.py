@@ -353,8 +353,7 @@ class ThrowEnv(VecEnv):
         valid = None
         if self.layout.name == "vision":
             if self.cfg.task.observation.oldest > 0.0:
-                x_axis, y_axis = pose[:, 9:12], pose[:, 12:15]
-                rot_wb = torch.stack([x_axis, y_axis, torch.linalg.cross(x_axis, y_axis)], dim=-1)
+                rot_wb = ob.rotation_in(pose)
             points, valid = self._see(pose[:, :3], rot_wb, late_goal, pose[:, ob.VEHICLE :], fresh)
             measured = torch.cat([measured[:, : ob.VEHICLE], points.flatten(1)], dim=-1)
         self.measured = measured, valid

@@ -76,8 +76,9 @@ def run(args: Options, viewer: Viewer | None = None) -> int:
     ranks.leave()
     if why in (DONE, REACHED):
         return 0
-    words = ["visthrow train --resume", f"--out {folder}", *([f"--iterations {args.iterations}"] if args.iterations else [])]
-    print(f"\n{why} after iteration {iteration} of {last}; go on with: {' '.join(words)}", file=sys.stderr)
+    if ranks.lead:
+        words = ["visthrow train --resume", f"--out {folder}", *([f"--iterations {args.iterations}"] if args.iterations else [])]
+        print(f"\n{why} after iteration {iteration} of {last}; go on with: {' '.join(words)}", file=sys.stderr)
     return 0 if why == OVER else EXIT_INTERRUPTED
 
 

@@ -269,8 +269,7 @@ def test_a_video_with_stamps_beside_it(folder, pictures, tmp_path):
 
     path = tmp_path / "flight.avi"
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 20.0, (280, 280))
-    if not writer.isOpened():
-        pytest.skip("this OpenCV writes no video")
+    assert writer.isOpened(), "OpenCV's wheel writes MJPG by itself"
     for frame in pictures:
         writer.write(frame)
     writer.release()

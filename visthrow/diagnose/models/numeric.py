@@ -4,6 +4,7 @@ A lane is one simulation of one window with sizes of effects, unknowns at its st
 known at the start is fitted before the linearisation, so that the linearisation is about a path near the measured one.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -58,7 +59,7 @@ class Lanes:
         return Lanes(self.owner[rows], self.theta[rows], self.nuisance[rows], self.latent[rows])
 
 
-class NumericModel:
+class NumericModel(ABC):
     """Implements :class:`visthrow.diagnose.models.interface.Model` on :meth:`simulate` and :meth:`measure`."""
 
     cheap = True  # derivatives are taken anew wherever the search goes
@@ -105,9 +106,9 @@ class NumericModel:
         """Simulate lanes; the result has the lane as its first axis. Models without a state need not override it."""
         return np.empty((len(lanes.owner), 0))
 
+    @abstractmethod
     def measure(self, stretch: Stretch, path: np.ndarray, lanes: Lanes) -> np.ndarray:
         """What the sensors would have measured in lanes of one stretch, shape (L, N)."""
-        raise NotImplementedError
 
     def knots(self, stretch: Stretch, path: np.ndarray) -> Mapping[str, np.ndarray]:
         """Simulated quantities at the knots of the latent forces, for laws outside the catalogue; none by default."""
