@@ -24,8 +24,8 @@ SIDES = (0.08, 0.06, 0.05)
 """Of the box [m]."""
 
 
-def fused(interval: float = 0.002) -> FusedChain:
-    bodies = FusedChain(scene_plant(SCENE, 2e-3, "float32"), interval=interval)
+def fused(interval: float = 0.002, device: str = "cpu") -> FusedChain:
+    bodies = FusedChain(scene_plant(SCENE, 2e-3, "float32"), interval=interval, device=device)
     start = {"pos_w": SCENE.pos_w, "quat_wb": SCENE.quat_wb, "vel_w": SCENE.vel_w, "rate_b": SCENE.rate_b}
     rope = {"cable_dir_w": SCENE.cable_dir_w()[None], "cable_vel_w": SCENE.cable_vel_w()[None]}
     bodies.sim.place(**{name: np.array([value]) for name, value in start.items()}, **rope)
@@ -57,10 +57,11 @@ def test_two_solvers_agree_on_the_hard_throw():
 
 
 class WarpBodies(MujocoBodies):
-    """The same bodies, stepped by MuJoCo Warp on a CPU in float32."""
+    """The same bodies, stepped by MuJoCo Warp in float32."""
 
-    def __init__(self, model, step: float) -> None:
+    def __init__(self, model, step: float, device: str) -> None:
         super().__init__(model, step=step)
+        self.device = device
         self.warp = pytest.importorskip("mujoco_warp", reason="pip install 'visthrow[bench]'")
 
     def place(self, qpos, qvel) -> None:
@@ -68,24 +69,24 @@ class WarpBodies(MujocoBodies):
         data = mujoco.MjData(self.model)
         data.qpos[:], data.qvel[:] = qpos, qvel
         mujoco.mj_forward(self.model, data)
-        with wp.ScopedDevice("cpu"):
+        with wp.ScopedDevice(self.device):
             self.there, self.state = self.warp.put_model(self.model), self.warp.put_data(self.model, data, nworld=1)
 
     def advance(self, force_b, torque_b, duration) -> None:
-        with wp.ScopedDevice("cpu"):
+        with wp.ScopedDevice(self.device):
             self.state.ctrl.assign(np.concatenate([force_b, torque_b], axis=1).astype(np.float32))
             for _ in range(round(duration / self.step)):
                 self.warp.step(self.there, self.state)
         super().place(self.state.qpos.numpy(), self.state.qvel.numpy())  # whoever looks sees C's copy
 
 
-@pytest.mark.slow
-def test_mujoco_warp_ends_the_hard_throw_there_too(capsys):
-    """At its own converged step; and what it takes beside the fused chain, one vehicle on a CPU, in one run."""
-    fused_chain = fused()
+@pytest.mark.parametrize("device", [pytest.param("cpu", marks=pytest.mark.slow), pytest.param("cuda:0", marks=pytest.mark.gpu)])
+def test_mujoco_warp_ends_the_hard_throw_there_too(capsys, device):
+    """At its own converged step; and what it takes beside the fused chain, one vehicle on the same device, in one run."""
+    fused_chain = fused(device=device)
     ours, seconds, ends = hard_throw(fused_chain), {}, {}
     for step in (5e-4, 2.5e-4):
-        bodies = WarpBodies(rope_and_ball(ROPE), step)
+        bodies = WarpBodies(rope_and_ball(ROPE), step, device)
         data = initial_data(bodies.model, SCENE)
         bodies.place(data.qpos, data.qvel)
         bodies.advance(np.zeros((1, 3)), np.zeros((1, 3)), 0.002)  # compiles
@@ -93,12 +94,13 @@ def test_mujoco_warp_ends_the_hard_throw_there_too(capsys):
         start = time.perf_counter()
         ends[step] = hard_throw(bodies)
         seconds[step] = time.perf_counter() - start
+    again = fused(device=device)
     start = time.perf_counter()
-    hard_throw(fused())
+    hard_throw(again)
     plain = time.perf_counter() - start
     off = [1e3 * np.linalg.norm(a - b) for a, b in zip(ours, ends[5e-4], strict=True)]
     with capsys.disabled():
-        print(f"\nMuJoCo Warp: ball {off[0]:.3f} mm, vehicle {off[1]:.3f} mm; {seconds[5e-4] / plain:.0f} times the fused chain's seconds")
+        print(f"\nMuJoCo Warp, {device}: ball {off[0]:.3f} mm, vehicle {off[1]:.3f} mm; {seconds[5e-4] / plain:.0f} times the fused chain's seconds")
     for a, b, c in zip(ours, ends[5e-4], ends[2.5e-4], strict=True):
         assert np.linalg.norm(b - c) < 0.1 * AGREE, "it has converged"
         assert np.linalg.norm(a - b) < AGREE
