@@ -6,7 +6,7 @@ from visthrow.baseline import front, thrower
 from visthrow.evidence.report import baseline_units
 from visthrow.evidence.report.ablations import FURTHER, PAPER_FOUR
 from visthrow.evidence.report.gap import SWEEPS, TRAINED
-from visthrow.evidence.report.result_set import HARDENED, SHIPPED, ResultSet
+from visthrow.evidence.report.result_set import SHIPPED, ResultSet
 from visthrow.throws import results
 from visthrow.throws.results import Result
 
@@ -112,7 +112,7 @@ def runs() -> tuple[dict, ...]:
 def everything(seed: int = 0) -> ResultSet:
     """A book with a result for every question of the report."""
     rng = np.random.default_rng(seed)
-    names = (*SHIPPED, HARDENED)
+    names = SHIPPED
     shipped = [policy(rng, name, name.partition("_")[0], plant, target, 0.02 if name == "state" else 0.024) for name in names
                for plant in PLANTS for target in baseline_units.TARGETS]  # fmt: skip
     made = [*shipped, *_ablations(rng), *_baselines(rng), *_gap(rng), *_beyond(rng)]

@@ -37,7 +37,7 @@ def env():
 
 
 def test_layouts_have_the_papers_sizes():
-    params = experiment("vision").task.observation
+    params = experiment("vision_ideal").task.observation
     assert observations.layout_of(experiment().task.observation).dimension == 35
     assert observations.layout_of(params).dimension == 69
     assert observations.layout_of(dataclasses.replace(params, validity=False)).dimension == 61

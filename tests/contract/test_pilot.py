@@ -11,7 +11,7 @@ from camera.keypoints import KeypointCamera
 from visthrow import config
 from visthrow.common.errors import MismatchError, PolicyError
 from visthrow.onboard.pilot import Pilot, camera_conditions
-from visthrow.onboard.policy import Policy, find_policy
+from visthrow.onboard.policy import Policy
 from visthrow.task import Experiment, contract_of
 from visthrow.throws.loading import load_policy
 from visthrow.training.env import ThrowEnv
@@ -30,11 +30,12 @@ def quiet(name: str) -> Experiment:
     camera = dataclasses.replace(
         experiment.camera,
         noise=dataclasses.replace(
-            experiment.camera.noise, step_std=0.0, bias_std=0.0, drop_probability=0.0, latency=0.0
+            experiment.camera.noise, step_std=0.0, bias_std=0.0, drop_probability=0.0, latency=0.0, wrong_probability=0.0,
+            held_probability=0.0, scale_std=0.0,
         ),
         mount=dataclasses.replace(experiment.camera.mount, rotation_error_std=0.0, position_error_std=0.0),
     )
-    observation = dataclasses.replace(experiment.task.observation, latency=(0.0, 0.0))
+    observation = dataclasses.replace(experiment.task.observation, latency=(0.0, 0.0), latency_jitter=0.0)
     task = dataclasses.replace(experiment.task, noise=noise, observation=observation)
     return dataclasses.replace(experiment, task=task, camera=camera)
 
@@ -49,7 +50,7 @@ def random_policy(experiment: Experiment, seed: int = 0) -> Policy:
     return Policy(weights, (torch.randn(16), bias), "tanh", contract)
 
 
-@pytest.mark.parametrize("name", ["state", "vision"])
+@pytest.mark.parametrize("name", ["state", "vision", "vision_ideal"])
 def test_observation_equals_the_environments(name):
     experiment, count = quiet(name), 3
     policy = random_policy(experiment)
@@ -111,13 +112,16 @@ def test_camera_conditions_are_those_of_the_contract():
     assert camera_conditions(experiment.camera) == contract_of(experiment)["camera"]
 
 
-def test_a_policy_keeps_its_own_rule_for_what_is_out_of_view():
+def test_a_policy_keeps_its_own_rule_for_what_is_out_of_view(tmp_path):
     camera = config.load(Experiment, config.find("train", "vision")).camera
     assert camera.noise.invalid_reads == "zero"
-    assert Pilot(Policy.load(find_policy("vision")), camera).camera.edge_reads
-    assert load_policy("vision", "vision").experiment.camera.noise.invalid_reads == "edge"
+    older = random_policy(config.load(Experiment, config.find("train", "vision_ideal"), ["camera.noise.invalid_reads=edge"]))
+    path = tmp_path / "older.npz"
+    older.save(path)
+    assert Pilot(Policy.load(path), camera).camera.edge_reads
+    assert load_policy(path, "vision_ideal").experiment.camera.noise.invalid_reads == "edge"
     with pytest.raises(MismatchError, match="invalid_reads: trained with 'edge', here 'zero'"):
-        load_policy("vision", None, ["camera.noise.invalid_reads=zero"])
+        load_policy(path, "vision_ideal", ["camera.noise.invalid_reads=zero"])
 
 
 def test_another_camera_is_refused():

@@ -177,11 +177,11 @@ def test_speeds_that_make_no_range_are_refused():
 
 def test_a_policy_is_flown_without_what_only_its_training_had():
     """``flown`` of its configuration comes before what the user names; a latency that it was trained for is no refusal."""
-    own, named = load_policy("vision_robust"), load_policy("vision_robust", overrides=["camera.noise.drop_probability=0.3"])
-    trained = experiment("vision_robust")
+    own, named = load_policy("vision"), load_policy("vision", overrides=["camera.noise.drop_probability=0.3"])
+    trained = experiment("vision")
     assert trained.camera.noise.drop_probability == 0.1
-    assert own.experiment.camera.noise == experiment("vision").camera.noise
+    assert own.experiment.camera.noise == experiment("vision_ideal").camera.noise
     assert own.experiment.task.observation.latency == (0.008, 0.012)
     assert (named.experiment.camera.noise.drop_probability, named.experiment.camera.noise.scale_std) == (0.3, 0.0)
     with pytest.raises(MismatchError, match="latency"):
-        load_policy("vision_robust", overrides=["task.observation.latency=[0.06,0.06]"])
+        load_policy("vision", overrides=["task.observation.latency=[0.06,0.06]"])

@@ -47,7 +47,7 @@ def servos(*motors, hook=1100):
 def bridge():
     params = config.load(HilParams, config.find("hil", "ardupilot_sitl")).ardupilot
     link = Link(UdpPort(Device("udpout", "127.0.0.1", 14998)), *VEHICLE_ID)
-    made = ArduPilotSitl(make_motors("vision_dropout", 0), link, MocapParams(), 0, Options(), params)
+    made = ArduPilotSitl(make_motors("vision", 0), link, MocapParams(), 0, Options(), params)
     yield made
     made.close()
 

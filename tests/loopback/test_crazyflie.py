@@ -36,7 +36,7 @@ class Desk:
         self.params = config.load(HilParams, config.find("hil", "fake_crazyflie"), over)
         port = AnsweringPort(UdpPort(Device("udp", "127.0.0.1", self.number)))
         link = Link(UdpPort(Device("udpout", "127.0.0.1", poses)), *VEHICLE_ID)
-        self.fake = FakeCrazyflie(make("vision_dropout", 0), link, MocapParams(), 0, Options(**options), port)
+        self.fake = FakeCrazyflie(make("vision", 0), link, MocapParams(), 0, Options(**options), port)
         self.backend = make_backend(self.params)
 
     def turn(self, seconds, command=None, ask=None):
@@ -75,7 +75,7 @@ def test_a_whole_throw(desk, tmp_path):
     one = desk()
     clock = FlightClock(one.fake)
     source, _, _ = open_source(one.params, tmp_path, clock)
-    runner = Runner(one.params, Policy.load(find_policy("vision_dropout")), one.backend, mechanism_lag(one.params))
+    runner = Runner(one.params, Policy.load(find_policy("vision")), one.backend, mechanism_lag(one.params))
     runner.watcher = one.backend.place
     loop = Loop(runner, source, clock, AutoOperator())
     while one.fake.plant.time < 9.0 and one.fake.plant.landing["landing_time"] is None:

@@ -22,7 +22,7 @@ STILL = np.zeros(3)
 
 def test_a_small_swing_has_the_period_of_a_pendulum():
     """2 pi sqrt(l / g), by the times at which the ball passes below the mount."""
-    ball = make_ball("vision_dropout", 0)
+    ball = make_ball("vision", 0)
     ball.follow(np.array([0.0, 0.0, 2.0]), STILL, LEVEL, STILL)
     ball.step(np.zeros(4), False)
     ball.follow(np.array([0.02, 0.0, 2.0]), STILL, LEVEL, STILL)  # the mount jumps: the ball hangs beside it now
@@ -39,7 +39,7 @@ def test_a_small_swing_has_the_period_of_a_pendulum():
 
 def test_a_release_at_a_steady_speed_falls_by_the_parabola():
     """The ball leaves with the vehicle's speed, and lands where g takes it."""
-    ball, speed = make_ball("vision_dropout", 0), np.array([1.0, 0.5, 0.0])
+    ball, speed = make_ball("vision", 0), np.array([1.0, 0.5, 0.0])
     place = np.array([0.0, 0.0, 2.0])
     for n in range(1600):
         ball.follow(place + n * ball.period * speed, speed, LEVEL, STILL)
@@ -75,7 +75,7 @@ def test_the_bridge_hears_places_and_the_mechanism():
     port, params = free_port(), config.load(HilParams, config.find("hil", "px4")).px4
     own = Link(UdpPort(Device("udp", "127.0.0.1", port)), 254, 190)
     poses = Link(UdpPort(Device("udpout", "127.0.0.1", free_port())), *VEHICLE_ID)
-    bridge = Px4Sih(make_ball("vision_dropout", 0), poses, MocapParams(), 0, Options(), params, own)
+    bridge = Px4Sih(make_ball("vision", 0), poses, MocapParams(), 0, Options(), params, own)
     px4 = OtherSide(port)
     for n in range(400):
         px4.say(0.005 * n, (1.0, 2.0, -3.0), 0.3, 2000 if n < 300 else params.servo_open_us)

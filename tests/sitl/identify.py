@@ -228,7 +228,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("out/identify"))
     parser.add_argument("--seconds", type=float, default=60.0)
-    parser.add_argument("--policy", default="vision_dropout")
+    parser.add_argument("--policy", default="vision")
     args = parser.parse_args()
     file = args.out / "flight.npz"
     if not file.exists():

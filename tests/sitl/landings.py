@@ -21,7 +21,7 @@ from visthrow.diagnose.extend import firmware
 from visthrow.diagnose.inputs import opening
 from visthrow.task import Experiment
 
-BASE, DELAY = "vision_dropout", 0.028
+BASE, DELAY = "vision", 0.028
 """The vehicle that the policy was trained in; from a decision to the firmware's mixer, with the wait of `delay.hold` [s]."""
 
 

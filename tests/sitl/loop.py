@@ -2,7 +2,7 @@
 
     python -m tests.sitl.loop                                                             # the committed record
     python tests/sitl/alone.py python -m tests.sitl.loop --name after                     # and again
-    python tests/sitl/alone.py python -m tests.sitl.loop --name gains --policy vision_dropout
+    python tests/sitl/alone.py python -m tests.sitl.loop --name gains --policy vision
 
 Each series is twenty throws at 1.5, 2.0 and 2.5 m through the firmware, in lock step, poses with 1 mm and 0.2 deg of noise at 100 Hz, and
 the same throws on our own block with the policy's own vehicle (``own``). A series that was cut goes on where it was. The record
@@ -102,7 +102,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--name", choices=("gains", "after"), help="of the series to fly; left out: show the record")
     parser.add_argument("--policy", default="vision_betaflight", help="that throws: a shipped name or a file")
-    parser.add_argument("--plant", default="vision_dropout", help="policy whose vehicle is behind the firmware")
+    parser.add_argument("--plant", default="vision", help="policy whose vehicle is behind the firmware")
     parser.add_argument("--distances", type=float, nargs="+", default=DISTANCES)
     parser.add_argument("--out", type=Path, default=Path("out/loop"))
     parser.add_argument("--record", action="store_true", help="keep the series in the committed record")

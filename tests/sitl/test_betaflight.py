@@ -97,7 +97,7 @@ class Bench:
         self.params = config.load(HilParams, config.find("hil", "betaflight_sitl")).betaflight
         self.firmware = Firmware(program(), folder)
         self.firmware.start()
-        self.plant = make_motors("vision_dropout", 0)
+        self.plant = make_motors("vision", 0)
         nobody = Link(UdpPort(Device("udpout", "127.0.0.1", 14999)), *VEHICLE_ID)
         self.fake = BetaflightSitl(self.plant, nobody, MocapParams(), 0, Options(), self.params, self.firmware.stands)
         self.backend = Betaflight(open_port(check_device(self.params.device)), self.params)
@@ -247,7 +247,7 @@ def test_every_way_to_end_brings_it_down(tmp_path, settings, way, state, monkeyp
     if way == "SIGINT twice":
         endings.twice(monkeypatch)
     reason = {"output raises": "BrokenPipeError: nobody reads", "SIGINT twice": endings.REASONS["SIGINT"]} | endings.REASONS
-    plant = make_motors("vision_dropout", 0)
+    plant = make_motors("vision", 0)
     with opened(program(), tmp_path / way, params, endings.NEVER, plant, MocapParams(), 0) as parts:
         run = endings.Told(way.split(" twice")[0], state, parts, monkeypatch)
         fake, clock = run.fake, run.clock
@@ -282,7 +282,7 @@ def test_a_whole_throw(tmp_path):
     report, folder = tmp_path / "report.json", tmp_path / "firmware"
     bridge = visthrow(
         "hil", "fake", "--kind", "betaflight-sitl", "--firmware", str(program()), "--folder", str(folder), "--policy",
-        "vision_dropout", "--speed", str(SPEED), "--after", "9", "--out", str(report), stderr=subprocess.PIPE,
+        "vision", "--speed", str(SPEED), "--after", "9", "--out", str(report), stderr=subprocess.PIPE,
         stdout=subprocess.DEVNULL,
     )  # fmt: skip
     runner = None

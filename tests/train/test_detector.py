@@ -83,7 +83,7 @@ class Blind:
 
 def test_a_throw_flies_on_what_its_eyes_see_alone():
     """With eyes that see nothing no throw comes near the goal; without eyes the same throws do."""
-    loaded, job = load_policy("vision_dropout"), Job((0,), 2.0, 0, 2, 0)
+    loaded, job = load_policy("vision"), Job((0,), 2.0, 0, 2, 0)
     blind = Blind()
     without, seeing = fly_batch([loaded], "hybrid", job, blind), fly_batch([loaded], "hybrid", job)
     assert blind.looks > 20

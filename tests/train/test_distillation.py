@@ -27,7 +27,7 @@ def overrides(*extra):
 
 def words(folder, *extra):
     sets = overrides("task.observation.located=true", "distillation.iterations=4", "distillation.horizon=12", "task.bounds.time_limit=0.4")
-    return ["train", "vision", "--device", "cpu", "--out", str(folder), "--checkpoint-every", "1", *sets, *extra]
+    return ["train", "vision_ideal", "--device", "cpu", "--out", str(folder), "--checkpoint-every", "1", *sets, *extra]
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +43,7 @@ def trained(iterations, sign=1.0):
     """Trainer after so many iterations of a short schedule; ``sign`` turns every gradient."""
     sets = (*SMALL[:2], "distillation.iterations=14", "distillation.horizon=60", "distillation.hidden=128", "distillation.memory=64",
             "distillation.epochs=2", "distillation.learning_rate=0.005")  # fmt: skip
-    trainer = Trainer(config.load(Experiment, config.find("train", "vision"), sets), "cpu", 1)
+    trainer = Trainer(config.load(Experiment, config.find("train", "vision_ideal"), sets), "cpu", 1)
     for parameter in trainer.algorithm.network.parameters():
         parameter.register_hook(lambda gradient: sign * gradient)
     losses = [trainer.step()["value"] for _ in range(iterations)]
@@ -112,7 +112,8 @@ def test_a_training_starts_from_a_distilled_policy_and_no_other(whole, tmp_path,
         torch.testing.assert_close(getattr(taken.estimator, name), value, rtol=0, atol=AGREES)
     assert cli.main([*words(tmp_path / "a"), *start, "--set", 'algorithm="ppo"']) == 2
     assert "the policy is one with a memory" in capsys.readouterr().err
-    assert cli.main([*words(tmp_path / "b"), "--from", "vision", "--set", "task.observation.located=false"]) == 2
+    late = ("task.observation.latency=[0.004,0.04]", "task.observation.latency_jitter=0.004")  # as it was trained
+    assert cli.main([*words(tmp_path / "b"), "--from", "vision", *overrides(*late)]) == 2
     assert "the policy is one without a memory" in capsys.readouterr().err
 
 

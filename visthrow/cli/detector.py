@@ -59,7 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     check.add_argument("--out", metavar="FILE", help="picture of the first frames of each nuisance with what was found, .png")
     add_common(check)
     throw = actions.add_parser("throw", help="throws closed loop on rendered pictures: render, detect, policy, simulate")
-    throw.add_argument("--policy", default="vision_dropout", metavar="POLICY", help="a shipped name or a file (default: vision_dropout)")
+    throw.add_argument("--policy", default="vision", metavar="POLICY", help="a shipped name or a file (default: vision)")
     throw.add_argument("--by", default="learnt", choices=("learnt", "contours"), help="detector (default: learnt)")
     throw.add_argument("--weights", metavar="FILE", help="of the learnt detector (default: those that are shipped)")
     throw.add_argument("--target", type=float, default=2.0, metavar="M", help="distance (default: 2.0)")

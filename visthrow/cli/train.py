@@ -20,7 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "  visthrow train --resume --out runs/v2          go on where an interrupted run stopped\n"
         "  torchrun --nproc-per-node 2 -m visthrow.cli train state   on two GPUs\n"
     )
-    names = "a name of configs/train (state, vision, vision_robust, laptop, laptop_vision, paper, ...) or a TOML file of your own"
+    names = "a name of configs/train (state, vision, laptop, laptop_vision, paper, ...) or a TOML file of your own"
     parser.add_argument("config", metavar="CONFIG", nargs="?", help=f"{names}; a resumed run has it in its folder")
     parser.add_argument("--seed", type=int, help="of everything random (default: 1, or that of the resumed run)")
     parser.add_argument("--out", metavar="FOLDER", help="folder of the run (default: runs/CONFIG-SEED)")

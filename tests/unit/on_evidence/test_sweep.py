@@ -316,7 +316,7 @@ def test_shipped_lists_name_what_exists():
         assert len(work.sources) == len({source.id for source in work.sources})
     paper = [source for source in load_list("paper").sources if source.config]
     ablations = ("no_aerodynamics", "no_motor_lag", "simple_controller", "rigid_cable")
-    for name in ("state", "vision", *(f"state_{ablation}" for ablation in ablations)):
+    for name in ("state", "vision_ideal", *(f"state_{ablation}" for ablation in ablations)):
         assert sorted(s.seed for s in paper if s.config == name) == [1, 2, 3], name
     assert sum(s.iterations * (0.142 if s.config.startswith("state") else 0.153) for s in paper) < 3 * 3600, "hours of one H200"
 

@@ -194,7 +194,7 @@ def test_the_bridge_sees_arming_and_the_release_channel(params, monkeypatch):
     monkeypatch.setattr(betaflight, "MOTORS", motor)
     serial = ListeningPort(mine)
     fake = BetaflightSitl(
-        make_motors("vision_dropout", 0), Link(UdpPort(Device("udpout", "127.0.0.1", 14999)), *VEHICLE_ID), MocapParams(), 0,
+        make_motors("vision", 0), Link(UdpPort(Device("udpout", "127.0.0.1", 14999)), *VEHICLE_ID), MocapParams(), 0,
         Options(), params, None,
     )  # fmt: skip
     parser, channels = msp.Parser(), [1500, 1500, 1500, 1000, LOW, LOW, LOW, LOW]

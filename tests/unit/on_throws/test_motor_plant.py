@@ -12,7 +12,7 @@ FULL = 3.5
 """Thrust of a rotor at full command and that voltage [N]."""
 
 
-@pytest.fixture(params=["vision_dropout", "vision_betaflight"])
+@pytest.fixture(params=["vision", "vision_betaflight"])
 def plant(request):
     """The paper's vehicle: by its own controller's full thrust, and by that of a firmware's at the voltage of its calibration."""
     return make_motors(request.param, 3)

@@ -29,7 +29,7 @@ def test_the_command_refuses(kind, name, change, message, capsys):
     assert message in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("name", ["vision", "vision_dropout", "state_far"])
+@pytest.mark.parametrize("name", ["vision", "vision_ideal", "state_far"])
 def test_a_copy_elsewhere_finds_its_base(name, tmp_path):
     shipped = config.find("train", name)
     copy = tmp_path / "mine.toml"

@@ -14,9 +14,6 @@ from visthrow.throws.results import PROTOCOL, RECORDS, Result, join, load_all
 SHIPPED = ("state", "vision")
 """The paper's two policies, as they come with the package."""
 
-HARDENED = "vision_dropout"
-"""Comes with the package too: trained with keypoints that drop out, for vehicles."""
-
 ANY = object()
 """Any departures."""
 
@@ -70,7 +67,7 @@ class ResultSet:
     def seeds(self, layout: str, variant: str, plant: str, target: float, departures: Any = ANY) -> list[Result]:
         """Throws of runs that were trained for the comparison, shipped policies left out; one result a training seed."""
         found = self.policies(plant, target, layout=layout, variant=variant, departures=departures)
-        return [result for result in found if result.unit["policy"] not in (*SHIPPED, HARDENED) and result.good.any()]
+        return [result for result in found if result.unit["policy"] not in SHIPPED and result.good.any()]
 
     def matching(self, **wanted: Any) -> list[Result]:
         """Results whose unit has these entries."""

@@ -4,7 +4,7 @@ import math
 
 from visthrow.common import statistics as st
 from visthrow.evidence.report.baseline_units import FRONT_TARGET, TARGETS
-from visthrow.evidence.report.result_set import HARDENED, SHIPPED, ResultSet, errors, landed, misses
+from visthrow.evidence.report.result_set import SHIPPED, ResultSet, errors, landed, misses
 from visthrow.throws.plants import PLANTS
 from visthrow.throws.results import Result
 from visthrow.view import figures
@@ -21,7 +21,7 @@ SHORT = {
 def throws_section(thrown: ResultSet) -> Section:
     """Landing error and duration of the shipped policies on every plant, the paper's beside them."""
     rows, missing = [], []
-    for name in (*SHIPPED, HARDENED):
+    for name in SHIPPED:
         for target in TARGETS:
             for plant in PLANTS:
                 found = thrown.shipped(name, plant, target)
@@ -33,8 +33,7 @@ def throws_section(thrown: ResultSet) -> Section:
     parts: list = [
         Text(
             "Throws of the shipped policies from hover. In training goals lie within 2 m, so 2.5 m is out of distribution. The "
-            "training simulator has all noise of the training; the reference plants were never seen in it. vision_dropout was "
-            "trained with a tenth of all keypoints lost, and is thrown so in the training simulator."
+            "training simulator has all noise of the training; the reference plants were never seen in it."
         )
     ]
     if rows:

@@ -15,7 +15,7 @@ class ThrowParams:
     targets: tuple[float, ...]  # along x [m]
     count: int  # of each policy at each target
     seed: int = 0  # of starts and noise
-    fly_in: Literal["own", "full"] = "own"  # the policy's training config, or its layout's full one (state, vision)
+    fly_in: Literal["own", "full"] = "own"  # the policy's training config, or its layout's full one (state, vision_ideal)
     changes: tuple[str, ...] = ()  # key=value of that config
     allow: tuple[str, ...] = ()  # parts of the policy's contract that may be broken so; recorded as departures
 

@@ -20,6 +20,9 @@ from visthrow.task import Experiment
 from visthrow.throws import results
 from visthrow.throws.reference_protocol import batches
 
+FULL = {"state": "state", "vision": "vision_ideal"}
+"""Layout -> the training config whose variants are compared with it."""
+
 POLICY, SUMMARY, PROGRESS = "policy.npz", "summary.json", "progress.csv"
 
 
@@ -113,7 +116,7 @@ class ThrowUnit:
 
     def flown_in(self, layout: str) -> str | None:
         """Config of ``configs/train`` to fly in; None for the policy's own."""
-        return layout if self.params.fly_in == "full" else None
+        return FULL[layout] if self.params.fly_in == "full" else None
 
     def done(self, out: Path) -> bool:
         """Whether the result is there."""
@@ -150,7 +153,7 @@ def variant_of(run: str) -> str:
     """What a training config lacks or has more of than its layout's full one: ``state_no_delay`` -> ``no_delay``."""
     stem = Path(run).stem
     layout, _, rest = stem.partition("_")
-    return (rest or "full") if layout in ("state", "vision") else stem
+    return "full" if stem in FULL.values() else rest if layout in FULL and rest else stem
 
 
 def load_list(name: str, overrides: tuple[str, ...] = ()) -> Work:
