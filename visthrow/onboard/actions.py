@@ -18,12 +18,12 @@ def clip_action(action: Tensor) -> Tensor:
     return action.clamp(-1.0, 1.0)
 
 
-def command_from_action(action: Tensor, max_thrust: float, max_rate: Tensor) -> Tensor:
+def command_from_action(action: Tensor, max_thrust: float | Tensor, max_rate: Tensor) -> Tensor:
     """Command of a clipped action.
 
     Args:
         action: normalised, shape (E, 5) or (E, 4); noise may carry it slightly past 1 and is clipped again.
-        max_thrust: collective thrust at +1 [N].
+        max_thrust: collective thrust at +1 [N]; one for all, or shape (E, 1).
         max_rate: body rates at +-1 [rad/s], shape (3,).
 
     Returns:

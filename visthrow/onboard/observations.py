@@ -16,6 +16,9 @@ pushes the payload's part into the history and assembles the actor's input. With
 With ``located`` it has where the keypoints lie 6 after them (:mod:`visthrow.onboard.located`). Either one, where goals move, has the
 fit of the goal's velocity 2 (:mod:`visthrow.onboard.goal_motion`) at its end.
 
+A policy for many vehicles has besides what ``response`` earlier steps were like, velocity 3 | body rates 3 | previous action 4 each,
+newest first, and the vehicle's set-up (:mod:`visthrow.task.fleet`) at its end.
+
 The rotation is the first two columns of rot_wb (Zhou et al., CVPR 2019), column after column.
 """
 
@@ -30,6 +33,12 @@ from camera.keypoints import KEYPOINTS, KeypointCamera, keypoints
 
 VEHICLE = 15
 """Width of the vehicle's own part."""
+
+RESPONSE = 10
+"""Width of one earlier step of a vehicle's response."""
+
+SETUPS = {"none": 0, "told": 4, "exact": 24}
+"""Widths of a vehicle's set-up, by what ``setup`` says."""
 
 LOCATED = 6
 """Width of where keypoints lie (:mod:`visthrow.onboard.located`)."""
@@ -46,6 +55,8 @@ class Layout:
     validity: int  # width of the validity bits
     motion: int = 0  # width of the goal's velocity
     located: int = 0  # width of where the keypoints lie
+    response: int = 0  # earlier steps of the vehicle's response
+    setup: int = 0  # width of the vehicle's set-up
 
     @property
     def fits(self) -> bool:
@@ -60,7 +71,7 @@ class Layout:
     @property
     def dimension(self) -> int:
         """Width of the actor's input."""
-        beside = self.validity + self.motion + self.located
+        beside = self.validity + self.motion + self.located + self.response * RESPONSE + self.setup
         return VEHICLE + 5 + self.goal + self.payload * (1 + self.history) + 1 + beside
 
 
@@ -73,11 +84,12 @@ def layout_of(params: Any) -> Layout:
     if params.history < 0:
         raise ValueError(f"observation history {params.history}: expected 0 or more")
     motion = 2 if getattr(params, "goal_velocity", False) else 0  # contracts hold what differs from the default
+    response, setup = getattr(params, "response", 0), SETUPS[getattr(params, "setup", "none")]
     if params.layout == "state":
-        return Layout("state", 2, 3, params.history, 0, motion)
+        return Layout("state", 2, 3, params.history, 0, motion, 0, response, setup)
     if params.layout == "vision":
         bits, places = (KEYPOINTS if params.validity else 0), (LOCATED if getattr(params, "located", False) else 0)
-        return Layout("vision", 8, 8, params.history, bits, motion, places)
+        return Layout("vision", 8, 8, params.history, bits, motion, places, response, setup)
     raise ValueError(f"observation layout {params.layout!r}: expected 'state' or 'vision'")
 
 
@@ -139,6 +151,11 @@ def vision_part(
     return keypoints(camera, pos_w, rot_wb, goal_w, payload_w, extrinsics)
 
 
+def answer(frame: Tensor, previous_action: Tensor) -> Tensor:
+    """What one step shows of the vehicle's response, shape (E, 10): velocity, body rates, and the action before it."""
+    return torch.cat([frame[:, 3:9], previous_action[:, :4]], dim=-1)
+
+
 def observe(
     layout: Layout,
     frame: Tensor,
@@ -149,6 +166,8 @@ def observe(
     fresh: Tensor,
     goal_vel_w: Tensor | None = None,
     places: Tensor | None = None,
+    answers: Tensor | None = None,
+    setup: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Assemble the actor's input and move the history on.
 
@@ -162,6 +181,8 @@ def observe(
         fresh: episodes that begin here, bool, shape (E,): their history is filled with the current value.
         goal_vel_w: fit of the goal's horizontal velocity [m/s], shape (E, 2); None where the layout has none.
         places: where the keypoints lie, shape (E, 6); None where the layout has none.
+        answers: earlier steps, newest first, shape (E, R, 10): of :func:`answer`; None where the layout has none.
+        setup: of the vehicle, shape (E, layout.setup); None where the layout has none.
 
     Returns:
         Observation, shape (E, layout.dimension), and the new history.
@@ -170,6 +191,8 @@ def observe(
     bits = [valid.to(frame.dtype)] if layout.validity and valid is not None else []
     moving = [places] if layout.located and places is not None else []
     moving += [goal_vel_w] if layout.motion and goal_vel_w is not None else []
+    moving += [answers.flatten(1)] if layout.response and answers is not None else []
+    moving += [setup] if layout.setup and setup is not None else []
     history = push(history, frame[:, goal_end:], fresh)
     parts = [frame[:, :VEHICLE], previous_action, frame[:, VEHICLE:goal_end], history.flatten(1), attached.unsqueeze(-1)]
     return torch.cat(parts + bits + moving, dim=-1), history

@@ -1,7 +1,7 @@
 """A policy together with the experiment that it is flown in."""
 
 from collections.abc import Collection, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +10,7 @@ from visthrow.common import toml_text
 from visthrow.common.errors import MismatchError, PolicyError
 from visthrow.onboard.policy import Policy, find_policy
 from visthrow.task import Experiment, contract_of
+from visthrow.task.fleet import specialised
 
 
 @dataclass(frozen=True)
@@ -44,23 +45,36 @@ def load_policy(
     """
     path = find_policy(name)
     policy = Policy.load(path)
-    trained = policy.made_by.get("config")
     if config_name is not None:
         rule = policy.contract.get("camera", {}).get("invalid_reads")
         own = [] if rule is None else [f"camera.noise.invalid_reads={rule}"]  # of the program, not of the camera
         experiment = config.load(Experiment, config.find("train", config_name), [*own, *overrides])
-    elif isinstance(trained, dict):
-        text = toml_text.dumps({**trained, "ppo": _learning(policy)})
-        flown = [*trained.get("flown", ()), *overrides]
-        experiment = config.loads(Experiment, text, flown, name=f"{path} (the config it was trained with)")
     else:
-        raise PolicyError(f"{path} does not carry the config it was trained with; name one with --config")
+        experiment = trained_in(policy, path, overrides)
     try:
         departures = policy.require(contract_of(experiment), allow=(*allow, *_within(policy, experiment)))
     except MismatchError as error:
         allowing = " ".join(f"--allow {key}" for key in error.keys)
         raise MismatchError(f"{error}\nto throw all the same (fly and compare take it): {allowing}", error.keys) from None
+    if experiment.fleet is not None:  # one vehicle is flown, that of the config
+        policy, experiment = specialised(policy, replace(experiment, fleet=replace(experiment.fleet, count=0)))
     return Loaded(path.stem if path.stem != "policy" else path.resolve().parent.name, policy, experiment, departures)
+
+
+def trained_in(policy: Policy, path: str | Path, overrides: Iterable[str] = ()) -> Experiment:
+    """Experiment that a policy was trained in, as its training says that it is flown, with changes.
+
+    Raises:
+        PolicyError: the policy does not carry its config.
+        ConfigError: a wrong override.
+    """
+    trained = policy.made_by.get("config")
+    if not isinstance(trained, dict):
+        raise PolicyError(f"{path} does not carry the config it was trained with; name one with --config")
+    text = toml_text.dumps({**trained, "ppo": _learning(policy)})
+    return config.loads(
+        Experiment, text, [*trained.get("flown", ()), *overrides], name=f"{path} (the config it was trained with)"
+    )
 
 
 def _within(policy: Policy, experiment: Experiment) -> tuple[str, ...]:

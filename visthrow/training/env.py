@@ -23,6 +23,7 @@ from visthrow.onboard import goal_motion
 from visthrow.onboard import observations as ob
 from visthrow.onboard.located import fitted_goal
 from visthrow.task import Experiment, drawn_plants, plant_of
+from visthrow.task.fleet import members
 from visthrow.training import rewards, terminations
 
 RESULTS = ("episodes", "released", "landing_error", "duration")
@@ -39,7 +40,8 @@ class ThrowEnv(VecEnv):
     the actor's observation. ``payload_velocity`` [m/s]. ``release_timer``: to separation [s]. ``time``: since the start [s].
     ``mass``: the vehicle's scale. ``voltage``: of the battery [V]. ``goal_velocity`` [m/s] and ``cargo``, the scales of payload
     mass and cable length, where the task has them. ``mount``: the camera's rotation [rad] and offset [m] from its nominal
-    pose. ``pose_age``: of what is measured [s]. The paper's critic (Sec. III-C and IV-C; 38 numbers) is told the first two.
+    pose. ``pose_age``: of what is measured [s]. ``vehicle``: of a fleet, all of its set-up. The paper's critic (Sec. III-C and
+    IV-C; 38 numbers) is told the first two.
 
     Attributes:
         last: what the last step ended: ``released``, ``negative`` (bool), ``landing_error`` [m], ``duration`` [s] from the
@@ -63,19 +65,30 @@ class ThrowEnv(VecEnv):
         self.num_actions = act.ACTIONS
         self.device = device
         self.max_episode_length = round(task.bounds.time_limit / experiment.sim.control_period)
-        plants = drawn_plants(experiment, seed)
+        fleet = members(experiment)
+        plants = [member.plant for member in fleet] or drawn_plants(experiment, seed)
         ropes = [rope for plant in plants for rope in rope_variants(plant.rope, task.start)]
         share = len(ropes) // len(plants)
         each = {name: [getattr(plant, name) for plant in plants for _ in range(share)] for name in ("vehicle", "air", "release")}
-        many = {f"{name}s": parts for name, parts in each.items()} if len(plants) > 1 else {}
+        many = {f"{name}s": parts for name, parts in each.items()} if fleet or len(plants) > 1 else {}
         self.sim = HybridSim(plant_of(experiment), self.num_envs, device, seed, ropes=ropes, **many)
         self.views = TorchViews(self.sim)
         self.layout = ob.layout_of(task.observation)
         self._found: tuple[Tensor, Tensor] | None = None  # by a calibration
         self.camera = KeypointCamera(experiment.camera, device)
         E, make = self.num_envs, {"device": device, "dtype": torch.float32}
-        weight = GRAVITY * plant_of(experiment).total_mass
-        self._start_action = torch.tensor(act.hover_action(weight, task.action.max_thrust), **make)
+        self._max_thrust: float | Tensor = task.action.max_thrust
+        self._start_action = torch.tensor(act.hover_action(GRAVITY * plant_of(experiment).total_mass, self._max_thrust), **make)
+        self._setup = self._known = self._clock = None
+        if fleet:
+            each_of = torch.arange(E, device=device) % len(ropes) // share
+
+            def of(values: list) -> Tensor:
+                return torch.tensor(values, **make)[each_of]
+
+            self._max_thrust, self._start_action = of([[m.max_thrust] for m in fleet]), of([m.first_action for m in fleet])
+            self._setup, self._known = of([m.setup(task.observation.setup) for m in fleet]), of([m.exact for m in fleet])
+            self._clock = of([m.units.time for m in fleet])
         self._max_rate = torch.tensor(task.action.max_rate, **make)
         self._rate_weights = torch.tensor(task.reward.rate_command, **make)
         self._change_weights = torch.tensor(task.reward.command_change, **make)
@@ -94,6 +107,7 @@ class ThrowEnv(VecEnv):
         """What an episode carries from step to step beside the simulator's state."""
         task, E, make = self.cfg.task, self.num_envs, {"device": self.device, "dtype": torch.float32}
         seen, latency, device = task.observation, self.cfg.camera.noise.history_length, self.device
+        oldest = seen.oldest if self._clock is None else seen.oldest / float(self._clock.min())
         memory = {
             "previous": torch.zeros(E, act.ACTIONS, **make),
             "history": torch.zeros(E, 1 + self.layout.history, self.layout.payload, **make),
@@ -104,7 +118,7 @@ class ThrowEnv(VecEnv):
             "extrinsic_rotation": torch.zeros(E, 3, **make),
             "extrinsic_offset": torch.zeros(E, 3, **make),
             "pose_age": torch.zeros(E, **make),
-            "poses": torch.zeros(E, 1 + max(math.ceil(seen.oldest / self.cfg.sim.control_period - 1e-9), 1), POSE, **make),
+            "poses": torch.zeros(E, 1 + max(math.ceil(oldest / self.cfg.sim.control_period - 1e-6), 1), POSE, **make),
             "scale_error": torch.zeros(E, 1, 1, **make),
             "held_points": torch.zeros(E, KEYPOINTS, 2, **make),
             "held_valid": torch.zeros(E, KEYPOINTS, device=device, dtype=torch.bool),
@@ -112,6 +126,8 @@ class ThrowEnv(VecEnv):
             "late_valid": torch.zeros(E, latency, KEYPOINTS, device=device, dtype=torch.bool),
             "totals": torch.zeros(len(RESULTS), device=device, dtype=torch.float64),
         }
+        if self.layout.response:
+            memory["answers"] = torch.zeros(E, 1 + self.layout.response, ob.RESPONSE, **make)
         if task.target.moves:
             memory["goal_vel"] = torch.zeros(E, 3, **make)
         if self.layout.fits:
@@ -214,7 +230,7 @@ class ThrowEnv(VecEnv):
         action = act.clip_action(actions)
         noisy = action[:, : act.COMMANDS] + torch.randn_like(memory["command_bias"]) * task.noise.command_step
         noisy = noisy + memory["command_bias"]
-        self.views.command.copy_(act.command_from_action(noisy, task.action.max_thrust, self._max_rate))
+        self.views.command.copy_(act.command_from_action(noisy, self._max_thrust, self._max_rate))
         self.views.release.copy_(act.release_asked(actions, self.cfg.release.threshold) & (not hold))
         with on_torch_stream(self.device):
             self.sim.step()
@@ -314,7 +330,8 @@ class ThrowEnv(VecEnv):
         low, high = self.cfg.task.observation.latency
         if high > 0.0:
             age = memory["pose_age"]
-            age.copy_(torch.where(fresh, low + (high - low) * torch.rand_like(age), age))
+            drawn = low + (high - low) * torch.rand_like(age)
+            age.copy_(torch.where(fresh, drawn if self._clock is None else drawn / self._clock, age))
         slow, fast = self.cfg.task.target.speed
         if fast > 0.0:
             velocity = memory["goal_vel"]
@@ -363,8 +380,13 @@ class ThrowEnv(VecEnv):
             fitted = fitted_goal(self.layout, measured, valid, self.camera, memory["goal_fit"], time, fresh)
             memory["goal_fit"].copy_(fitted.sums)
             _, goal_vel, places, measured, valid = fitted
+        answers = None
+        if self.layout.response:
+            memory["answers"].copy_(hist.push(memory["answers"], ob.answer(measured, memory["previous"]), fresh))
+            answers = memory["answers"][:, 1:]
         actor, history = ob.observe(
-            self.layout, measured, valid, memory["previous"], attached, memory["history"], fresh, goal_vel, places
+            self.layout, measured, valid, memory["previous"], attached, memory["history"], fresh, goal_vel, places, answers,
+            self._setup,
         )
         memory["history"].copy_(history)
         observed = {"actor": actor, "critic": self._privileged(actor, exact, time, fresh)}
@@ -397,6 +419,8 @@ class ThrowEnv(VecEnv):
             parts += [memory["extrinsic_rotation"], memory["extrinsic_offset"]]
         if "pose_age" in named:
             parts.append(memory["pose_age"][:, None])
+        if "vehicle" in named and self._known is not None:
+            parts.append(self._known)
         return torch.cat(parts, dim=-1)
 
     def _late_goal(self) -> Tensor:

@@ -21,6 +21,7 @@ from sim.params import (
     require_not_negative,
     require_positive,
 )
+from sim.quadrotor.fleet import FleetParams
 from visthrow.common.errors import ConfigError, suggest
 
 
@@ -46,6 +47,8 @@ class ObservationParams:
     latency_jitter: float = 0.0  # of that age, uniform up to this to either side, drawn per step [s]
     goal_velocity: bool = False  # whether the actor is given a fit of the goal's velocity; see visthrow.onboard.goal_motion
     located: bool = False  # vision: whether the actor is given where the keypoints lie too; see visthrow.onboard.located
+    response: int = 0  # earlier steps of which the actor is given velocity, body rates and action: how this vehicle answers
+    setup: Literal["none", "told", "exact"] = "none"  # of a fleet's vehicle, what the actor is given; see visthrow.task.fleet
 
     @property
     def oldest(self) -> float:
@@ -143,6 +146,7 @@ class TaskParams:
 
 PRIVILEGED = (
     "exact", "payload_velocity", "release_timer", "time", "mass", "voltage", "goal_velocity", "cargo", "mount", "pose_age",
+    "vehicle",
 )  # fmt: skip
 """What a critic may be told beyond the actor's observation; see :class:`visthrow.training.env.ThrowEnv`."""
 
@@ -283,6 +287,7 @@ class Experiment:
     algorithm: Literal["ppo", "first_order", "distillation"] = "ppo"
     first_order: FirstOrderParams = field(default_factory=FirstOrderParams)
     distillation: DistillationParams = field(default_factory=DistillationParams)
+    fleet: FleetParams | None = None  # with it, policies are trained for many vehicles; task and sim are in its units
     flown: tuple[str, ...] = ()  # key=value changes of this configuration that its policies are flown and measured with
 
     @property
@@ -335,6 +340,10 @@ def contract_of(experiment: Experiment) -> dict[str, Any]:
     }
     if experiment.task.observation.layout == "vision":
         contract["camera"] = camera_conditions(experiment.camera)
+    if experiment.fleet is not None:  # for any vehicle: conditions of one are not the policy's
+        contract["fleet"] = {"rope_length": experiment.fleet.rope_length, "total_mass": experiment.fleet.total_mass}
+        contract["action"] = {"max_rate": list(experiment.task.action.max_rate), "dimension": 5}
+        contract = {key: value for key, value in contract.items() if key not in ("vehicle", "rope", "release")}
     return contract
 
 

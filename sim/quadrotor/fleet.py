@@ -1,0 +1,132 @@
+"""A class of vehicles: one that is known, made larger or smaller as real ones are, and changed at random about that.
+
+Vehicles of one shape and density whose motion looks alike (equal Froude number) have arms as the cube root of the mass, thrust as
+the mass, inertia as mass times arm squared, and times as the square root of the arm: this is :class:`sim.quadrotor.units.Units`
+applied to the known vehicle. Every factor multiplies what that gives. What does not follow size, links and sensors, stays in seconds.
+"""
+
+import math
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from sim.params import GRAVITY, PlantParams, RopeParams, VehicleParams, require_positive
+from sim.quadrotor.units import Units, in_units
+
+Range = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class FleetParams:
+    """Ranges that vehicle, rope and release are drawn from, log-uniform; factors are relative to the known vehicle made to size.
+
+    The task and the numerics of an experiment with a fleet are stated in units of ``rope_length`` and ``total_mass``: what is
+    0.33 m there is a rope's length for each.
+    """
+
+    count: int  # vehicles drawn; 0: the experiment's own, which is stated in SI units
+    first: int  # number of the first one: vehicle k is the same in every draw
+    seed: int
+    rope_length: float  # [m]
+    total_mass: float  # vehicle and all that hangs on it [kg]
+    least_thrust: float  # full thrust over the weight of all, of the heaviest payload that a vehicle is given [-]
+    mass: Range  # of the vehicle [kg]
+    thrust: Range  # factor of the full thrust
+    arm: Range  # factor
+    inertia: Range  # factor, besides the arm squared
+    yaw_inertia: Range  # factor of the inertia about z, besides the last one
+    motor_lag: Range  # factor
+    propeller: Range  # factor of the radius
+    torque_ratio: Range  # factor, besides the propeller's
+    rotor_inertia: Range  # factor, besides the propeller's radius squared
+    p_gain: Range  # factor; the gains follow the inertia, p_gain the motor's lag too
+    i_gain: Range  # factor
+    d_gain: Range  # factor
+    feedforward: Range  # factor
+    filters: Range  # factor of the controller's time constants
+    delay: Range  # of commands [s]
+    resistance: Range  # factor of the battery's
+    compensation: Range  # of the voltage [-]
+    drag: Range  # factor of all aerodynamic coefficients
+    rope: Range  # factor of the length
+    payload: Range  # factor of the mass, at most what least_thrust leaves
+    payload_size: Range  # factor of the radius
+    rope_mass: Range  # factor of the mass for a length
+    mount: Range  # factor of the mount's distance from the centre of mass
+    lag: Range  # of the release [s]
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for ranges that nothing can be drawn from."""
+        require_positive("fleet", rope_length=self.rope_length, total_mass=self.total_mass, least_thrust=self.least_thrust)
+        if self.count < 0 or self.first < 0 or self.seed < 0:
+            raise ValueError(f"fleet.count is {self.count}, first {self.first}, seed {self.seed}: expected 0 or more of each")
+        for name, (low, high) in self.ranges.items():
+            if not 0.0 < low <= high < math.inf:
+                raise ValueError(f"fleet.{name} is {low} to {high}: expected an ascending range above 0")
+
+    @property
+    def ranges(self) -> dict[str, Range]:
+        """Ranges by name, in their order."""
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.type == Range}
+
+    def units_of(self, plant: PlantParams) -> Units:
+        """Units in which a plant's rope and total mass have this class's numbers."""
+        return Units(plant.rope.length / self.rope_length, plant.total_mass / self.total_mass)
+
+
+def draw(fleet: FleetParams, known: PlantParams, number: int) -> PlantParams:
+    """Vehicle of that number with its rope and release, SI units; numerics and air are those of the known plant."""
+    low, high = np.log(list(fleet.ranges.values())).T
+    drawn = np.exp(np.random.default_rng((fleet.seed, number)).uniform(low, high))
+    x = dict(zip(fleet.ranges, drawn.tolist()))
+    ratio = known.vehicle.body.mass / x["mass"]
+    alike = Units(ratio ** (1 / 3), ratio)  # in these units the known vehicle has the mass that was drawn
+    vehicle, rope = _vehicle(in_units(known.vehicle, alike), x), in_units(known.rope, alike)
+    own = vehicle.body.mass + rope.rope_mass * x["rope"] * x["rope_mass"]
+    most = 4.0 * vehicle.controller.max_thrust / (fleet.least_thrust * GRAVITY) - own
+    x["payload"] = min(x["payload"], most / rope.payload_mass)
+    return replace(known, vehicle=vehicle, rope=_rope(rope, x), release=replace(known.release, lag=x["lag"]))
+
+
+def _vehicle(v: VehicleParams, x: dict[str, float]) -> VehicleParams:
+    """A vehicle with the factors drawn."""
+    arm, blade, lag = x["arm"], x["arm"] * x["propeller"], x["motor_lag"]
+    stiff = x["inertia"] * arm**2
+    turn = np.array([stiff, stiff, stiff * x["yaw_inertia"]])
+
+    def scaled(gains: tuple[float, ...], factor: float) -> tuple[float, ...]:
+        return tuple((np.array(gains) * turn * factor).tolist())
+
+    c, aero = v.controller, v.aero
+    fast = x["p_gain"] / lag  # a rate loop is tuned to what its motors follow
+    controller = replace(
+        c, p_gain=scaled(c.p_gain, fast), i_gain=scaled(c.i_gain, fast * x["i_gain"]), d_gain=scaled(c.d_gain, x["d_gain"]),
+        feedforward_gain=scaled(c.feedforward_gain, x["feedforward"]), integral_limit=scaled(c.integral_limit, 1.0),
+        setpoint_time_constant=c.setpoint_time_constant * x["filters"], gyro_time_constant=c.gyro_time_constant * x["filters"],
+        min_thrust=c.min_thrust * x["thrust"], max_thrust=c.max_thrust * x["thrust"], voltage_compensation=x["compensation"],
+    )  # fmt: skip
+    return replace(
+        v,
+        body=replace(v.body, inertia=scaled(v.body.inertia, 1.0)),
+        rotors=replace(
+            v.rotors, x=tuple(arm * a for a in v.rotors.x), y=tuple(arm * a for a in v.rotors.y), z=arm * v.rotors.z,
+            radius=blade * v.rotors.radius, inertia=blade**2 * x["rotor_inertia"] * v.rotors.inertia,
+        ),
+        queue=replace(v.queue, delay=x["delay"]),
+        controller=controller,
+        motor=replace(v.motor, time_constant=lag * v.motor.time_constant, time_constant_down=lag * v.motor.time_constant_down),
+        battery=replace(v.battery, resistance=x["resistance"] * v.battery.resistance),
+        thrust=replace(v.thrust, k_f=x["thrust"] * v.thrust.k_f, torque_ratio=blade * x["torque_ratio"] * v.thrust.torque_ratio),
+        aero=replace(aero, **{f.name: getattr(aero, f.name) * x["drag"] for f in fields(aero) if f.name != "kind"}),
+        collision_radius=arm * v.collision_radius,
+    )  # fmt: skip
+
+
+def _rope(r: RopeParams, x: dict[str, float]) -> RopeParams:
+    """A rope and its payload with the factors drawn."""
+    length, size, mass = r.length * x["rope"], x["payload_size"], x["payload"]
+    return replace(
+        r, length=length, rope_mass=r.rope_mass * x["rope"] * x["rope_mass"], payload_mass=r.payload_mass * mass,
+        payload_inertia=r.payload_inertia * mass * size**2, payload_offset=r.payload_offset * size,
+        payload_radius=r.payload_radius * size, mount=tuple(x["mount"] * a for a in r.mount),
+    )  # fmt: skip

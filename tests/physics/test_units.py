@@ -1,0 +1,83 @@
+"""A plant in other units of length, mass and time flies the same flight: the dimension of every field is right."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from sim.hybrid import HybridSim
+from sim.params import PlantParams
+from sim.quadrotor.units import Units, in_units
+from visthrow import config
+from visthrow.task import Experiment, TaskParams, plant_of
+from visthrow.task.fleet import TASK
+
+UNITS = Units(2.5, 0.3)
+ROUNDING = 1e-7
+"""Of a difference after half a second in float64, whose operations round differently in other units; the landing is iterated to 1e-9 m."""
+
+
+def plant() -> PlantParams:
+    """The shipped plant in float64, with a number in every field of the usual blocks that is 0 there."""
+    p = plant_of(config.load(Experiment, config.find("train", "state")))
+    rope = dataclasses.replace(
+        p.rope, payload_drag=2e-3, mount_damping=1e-4, swing_damping=2e-3, downwash=0.05, payload_side=1e-4, payload_lift=2e-4,
+        compliance=1e-3,
+    )  # fmt: skip
+    release = dataclasses.replace(
+        p.release, lag_tension=2e-3, kick_w=(0.1, 0.05, 0.02), kick_along=0.1, rope_tail=0.3
+    )
+    air = dataclasses.replace(p.air, wind_w=(0.5, -0.3, 0.1), ground_effect=1.0)
+    thrust = dataclasses.replace(p.vehicle.thrust, k_1=2e-5)
+    body = dataclasses.replace(p.vehicle.body, com=(1e-3, -2e-3, 1e-3))
+    vehicle = dataclasses.replace(p.vehicle, thrust=thrust, body=body)
+    return dataclasses.replace(p, vehicle=vehicle, rope=rope, release=release, air=air, sim=dataclasses.replace(p.sim, precision="float64"))
+
+
+def flown(p: PlantParams, units: Units) -> dict[str, np.ndarray]:
+    """A hard throw of a plant that is stated in these units; all that comes of it in SI units."""
+    sim = HybridSim(p, 1)
+    sim.place(np.array([[0.0, 0.0, 2.0]]) / units.length)
+    force, rate = units.size((1, 1, -2)), 1.0 / units.time
+    rng = np.random.default_rng(0)
+    for k in range(30):
+        thrust, rates = rng.uniform(1.0, 9.0), rng.uniform(-6.0, 6.0, 3)
+        sim.set_command(np.array([[thrust / force, *(rates / rate)]]), np.array([k >= 18]))
+        sim.step()
+    sizes = {
+        "pos_w": units.length, "vel_w": units.length / units.time, "rate_b": rate, "quat_wb": 1.0, "motor_speed": rate,
+        "voltage": 1.0, "charge_used": 1.0, "landing_w": units.length, "time_to_impact": units.time, "clearance": units.length,
+        "separation_time": units.time,
+    }  # fmt: skip
+    assert sim.get("attached")[0] == 0
+    return {name: sim.get(name) * size for name, size in sizes.items()}
+
+
+@pytest.mark.parametrize("kind", ["betaflight", "motor_mixing", "geometric"])
+def test_a_plant_in_other_units_flies_the_same_flight(kind):
+    p = plant()
+    vehicle = dataclasses.replace(p.vehicle, controller=dataclasses.replace(p.vehicle.controller, kind=kind))
+    p = dataclasses.replace(p, vehicle=vehicle)
+    usual, other = flown(p, Units(1.0, 1.0)), flown(in_units(p, UNITS), UNITS)
+    for name, value in usual.items():
+        np.testing.assert_allclose(other[name], value, rtol=ROUNDING, atol=ROUNDING, err_msg=name)
+
+
+def test_units_lead_back():
+    there = in_units(plant(), UNITS)
+    for got, expected in zip(numbers(in_units(there, UNITS.inverse)), numbers(plant())):
+        assert got == pytest.approx(expected, rel=1e-12)
+
+
+def numbers(value: object) -> list[float]:
+    """All numbers of nested dataclasses."""
+    if dataclasses.is_dataclass(value):
+        return [x for f in dataclasses.fields(value) for x in numbers(getattr(value, f.name))]
+    return [x for item in value for x in numbers(item)] if isinstance(value, tuple) else [value] if isinstance(value, float) else []
+
+
+def test_every_field_of_plant_and_task_has_a_dimension():
+    task = config.load(Experiment, config.find("train", "any")).task
+    assert isinstance(in_units(task, UNITS, TASK), TaskParams)
+    with pytest.raises(ValueError, match="control_period: no dimension told"):
+        in_units(plant().sim, UNITS, {})
