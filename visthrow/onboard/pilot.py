@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from camera.history import push
 from camera.keypoints import KeypointCamera
 from camera.params import CameraParams
 from visthrow import config
@@ -123,6 +124,7 @@ class Pilot:
         """Begin a throw from hover: the next call fills the history."""
         self._previous = self._first.repeat(self.count, 1)
         self._history = torch.zeros(self.count, 1 + self.layout.history, self.layout.payload)
+        self._answers = torch.zeros(self.count, 1 + self.layout.response, ob.RESPONSE)
         self._memory = self.policy.begin(self.count)
         self._fresh = torch.ones(self.count, dtype=torch.bool)
         self._goal_fit, self._steps = goal_motion.empty_sums(self.count), 0
@@ -170,7 +172,11 @@ class Pilot:
         observation, *rest = self._seen(views, given)
         if now is not None and self._bridged(now, rest[0][:, 0]):
             observation, *rest = self._seen(views, given)
-        self._history, self._goal_fit, *seen = rest if self.layout.fits else (rest[0], self._goal_fit, *rest[1:])
+        self._history, *seen = rest
+        if self.layout.response:
+            self._answers, *seen = seen
+        if self.layout.fits:
+            self._goal_fit, *seen = seen
         decided = time.perf_counter()
         action, command, release, self._memory = self._decide(observation, self._memory)
         self._unasked = self._previous[:, 4]
@@ -187,6 +193,8 @@ class Pilot:
     def _seen(self, views: Tensor, given: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
         """What `_observed` makes of a step's measurements and all that was before; ``given``: keypoints of a detector."""
         carried: tuple[Tensor, ...] = (self._previous, self._history, self._fresh)
+        if self.layout.response:
+            carried += (self._answers,)
         if self.layout.fits:
             carried += (self._goal_fit, torch.full((self.count,), self._steps * self.period))
         observed: tuple[Tensor, ...] = (self._observe_given if given else self._observe)(views, *carried, *given)
@@ -232,12 +240,16 @@ class Pilot:
 
         Args:
             views: shape (E, 20). previous, history, fresh: see `visthrow.onboard.observations.observe`.
-            further: sums of the goal's fit and time [s], where the layout fits it; then keypoints and validity that
-                a detector saw, else what the camera sees of goal and payload is computed, where there is one.
+            further: the vehicle's response, where the layout has it; sums of the goal's fit and time [s], where it fits it; then
+                keypoints and validity that a detector saw, else what the camera sees of goal and payload is computed, where
+                there is one.
 
         Returns:
-            Observation, new history, new sums of the goal's fit, keypoints and validity; the latter where there are any.
+            Observation, new history, new response, new sums of the goal's fit, keypoints and validity; where there are any.
         """
+        answers: tuple[Tensor, ...] = ()
+        if self.layout.response:
+            answers, further = further[:1], further[1:]
         pos, quat, vel, rate, payload, goal, attached = views.split(list(VIEWS.values()), -1)
         rot, fitted = ob.rotation_from_quat(quat), 2 if self.layout.fits else 0
         seen = further[fitted:]
@@ -253,8 +265,12 @@ class Pilot:
         if fitted:
             new, velocity, places, frame, valid = fitted_goal(self.layout, frame, valid, self.camera, further[0], further[1], fresh)
             sums = (new,)
-        observation, history = ob.observe(self.layout, frame, valid, previous, attached[:, 0], history, fresh, velocity, places)
-        return observation, history, *sums, *seen
+        answers = tuple(push(held, ob.answer(frame, previous), fresh) for held in answers)
+        earlier = answers[0][:, 1:] if answers else None
+        observation, history = ob.observe(
+            self.layout, frame, valid, previous, attached[:, 0], history, fresh, velocity, places, earlier
+        )
+        return observation, history, *answers, *sums, *seen
 
     def _decision(self, observation: Tensor, memory: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Clipped action, command, whether a release is asked for, and the policy's memory."""
