@@ -27,7 +27,7 @@ def setting_with(theta: dict[str, float], plant: PlantParams | None = None) -> S
 
 
 def fly(
-    setting: Setting, seed: int = 0, free: int = 2, throws: int = 2, seconds: float = 4.0, noise: float = 1.0
+    setting: Setting, seed: int = 0, free: int = 2, throws: int = 2, seconds: float = 4.0, noise: float = 1.0, lost: float = 0.0
 ) -> list[FlightLog]:
     """Fly a plant and record it as motion capture would.
 
@@ -38,6 +38,7 @@ def fly(
         throws: of throws.
         seconds: of a free flight [s].
         noise: times :data:`NOISE`.
+        lost: share of the commands that never arrive, where the last one stays; the log holds what was sent.
     """
     rng = np.random.default_rng(seed)
     references = [FreeFlight(rng) for _ in range(free)]
@@ -50,7 +51,7 @@ def fly(
     sim.place(np.array([r.at(0.0)[0] for r in references]), battery_used=0.2)
     tracks: dict[str, list] = {name: [] for name in ("pos_w", "quat_wb", "payload_pos_w", "command", "voltage")}
     separated = np.full(len(references), np.inf)
-    left = [None] * len(references)
+    left, link, arrived = [None] * len(references), np.random.default_rng([seed, 1]), None
     ticks = round(max(seconds, 2.6) / TICK)
     for k in range(ticks):
         t = k * TICK
@@ -59,7 +60,9 @@ def fly(
             command = pilot.command(t, sim.get("pos_w"), sim.get("vel_w"), quat, sim.get("attached") != 0)
             tracks["command"].append(command)
             tracks["voltage"].append(sim.get("voltage"))
-            sim.set_command(command, np.array([t >= r.release - 1e-9 for r in references]))
+            gone = link.random((len(references), 1)) < lost
+            arrived = command if arrived is None else np.where(gone, arrived, command)
+            sim.set_command(arrived, np.array([t >= r.release - 1e-9 for r in references]))
         sim.step()
         ball = sim.get("payload_pos_w").copy()
         for e in np.flatnonzero(sim.get("separated")):

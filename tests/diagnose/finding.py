@@ -51,30 +51,36 @@ class Kind:
 
     hidden: tuple[str, ...]  # effects, or a law
     plant: str
+    lost: float = 0.0  # share of the commands
 
     def draw(self, seed: int) -> Recipe:
         """A world of this kind."""
         if self.hidden and self.hidden[0] in LAWS:
             sign = np.random.default_rng(seed).choice([-1.0, 1.0])
             return Recipe(seed, self.plant, {self.hidden[0]: float(sign * LAW_SIZE * LAWS[self.hidden[0]])}, **SMALL)
-        return draw(seed, len(self.hidden), SIZE, names=self.hidden, plants=(self.plant,), **SMALL)
+        return draw(seed, len(self.hidden), SIZE, names=self.hidden, plants=(self.plant,), lost=self.lost, **SMALL)
 
 
 def kinds(rng: np.random.Generator) -> list[Kind]:
-    """Seven single effects, a pair, a law and two with nothing hidden, drawn anew in every run."""
+    """Seven single effects, a pair, a law, lost commands and two with nothing hidden, drawn anew in every run."""
     singles = [Kind((str(name),), "rod") for name in rng.permutation(SINGLE)[:7]]
     singles[-1] = replace(singles[-1], plant="string")
     pair = Kind(tuple(map(str, rng.choice(PAIRED, 2, replace=False))), "rod")
     law = Kind((str(rng.choice(UNKNOWN_LAWS)),), "rod")
-    return [*singles, pair, law, Kind((), "rod"), Kind((), "string")]
+    return [*singles, pair, law, Kind((), "rod", lost=0.15), Kind((), "rod"), Kind((), "string")]
 
 
 def right(recipe: Recipe, verdict: dict) -> bool:
-    """The hidden effects up to class with their sizes, and no other; of a law its term and no name; of nothing NO EFFECT."""
+    """The hidden effects up to class with their sizes, and no other; of a law its term and no name; of nothing NO EFFECT.
+
+    Lost commands are told, and named for nothing else.
+    """
     said = judge(recipe, verdict)
     laws = [name for name in recipe.effects if name in LAWS]
     if laws:
         return said["unknown"] and not said["named"] and TERMS[laws[0]] in said["laws"]
+    if recipe.lost:
+        return said["overall"] == "KNOWN" and not said["named"] and said["varies"] == ["dropped_commands"]
     sized = all(size_is(verdict, name, size) for name, size in recipe.effects.items())
     return said["class"] and sized and said["overall"] == ("KNOWN" if recipe.effects else "NO EFFECT")
 
@@ -105,7 +111,8 @@ def require(tool: Tool, chosen: list[Kind], seed: int) -> None:
             if right(recipe, verdict):
                 break
             said = judge(recipe, verdict)
-            wrong.append(f"{recipe.effects or 'nothing'} on the {recipe.plant}, seed {recipe.seed}: {said['overall']} {said['named']}")
+            hidden = recipe.effects or recipe.lost or "nothing"
+            wrong.append(f"{hidden} on the {recipe.plant}, seed {recipe.seed}: {said['overall']} {said['named']}")
         assert len(wrong) < 2, "; ".join(wrong)
 
 
@@ -169,12 +176,13 @@ def main() -> None:
             recipe = kind.draw(seed + 100 * i)
             with contextlib.redirect_stdout(io.StringIO()):
                 verdict = asked(explain, recipe)
-            what = f"{kind.plant}: {'a law' if set(kind.hidden) & set(LAWS) else f'{len(kind.hidden)} hidden'}"
+            what = "lost commands" if kind.lost else "a law" if set(kind.hidden) & set(LAWS) else f"{len(kind.hidden)} hidden"
+            what = f"{kind.plant}: {what}"
             asked_of[what] += 1
             good[what] += right(recipe, verdict)
             if not right(recipe, verdict):
                 said = judge(recipe, verdict)
-                print("  wrong:", recipe.effects, recipe.seed, said["overall"], said["named"], said["laws"], flush=True)
+                print("  wrong:", recipe.effects, recipe.lost, recipe.seed, said["overall"], said["named"], said["laws"], flush=True)
         print(f"{suite + 1} suites:", ", ".join(f"{what} {good[what]} of {n}" for what, n in sorted(asked_of.items())), flush=True)
 
 

@@ -1,12 +1,14 @@
 """What varies from flight to flight: found where it does, silent where it does not, and handed on to training."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from visthrow.config.effects import catalogue, random_effects
 from visthrow.diagnose.extend import patch
 from visthrow.diagnose.likelihood.evidence import Priors
 from visthrow.diagnose.likelihood.marginal import Statistics
-from visthrow.diagnose.select.scatter import varying
+from visthrow.diagnose.select.scatter import DAY, FLIGHT, Varies, freed, own_shares, varying
 
 NAMES = ("release_lag", "payload_drag", "wind_x", "wind_y", "wind_z")
 EFFECTS = tuple(catalogue()[name] for name in NAMES)
@@ -24,6 +26,54 @@ def flights(rng, count=10, **deviation):
     noise = np.einsum("fij,fj->fi", np.linalg.cholesky(information), rng.normal(size=(count, K)))
     score = np.einsum("fij,fj->fi", information, theta) + noise
     return Statistics(F, information, score, np.zeros(count), np.full(count, 500), np.zeros(K))
+
+
+def campaign(rng, days, by_day, by_flight):
+    """Flights of some days, three a day, whose release lag is drawn anew each day and each flight with these deviations."""
+    found, floor = flights(rng, 3 * days, release_lag=by_flight), PRIORS.floor[0]
+    own = np.repeat(rng.normal(size=days) * by_day / floor, 3)
+    return replace(found, score=found.score + found.information[:, :, 0] * own[:, None]), np.repeat(np.arange(days), 3).tolist()
+
+
+def on_days(rng, *deviations):
+    statistics, days = campaign(rng, 5, *deviations)
+    return next(s for s in varying(statistics, np.zeros(len(NAMES)), PRIORS, NAMES, LEAST, days=days) if s.name == "lag_jitter")
+
+
+def test_what_is_drawn_anew_each_day_drifts():
+    rng = np.random.default_rng(8)
+    worlds = [on_days(rng, 0.012, 0.0) for _ in range(40)]
+    assert all(w.by == DAY for w in worlds if w.found)
+    assert np.mean([w.found for w in worlds]) > 0.8
+    assert "drifts, a value for each day" in worlds[0].sentence
+    assert "5 days" in worlds[0].sentence
+    assert not any(on_days(rng, 0.0, 0.0).found for _ in range(100))
+
+
+def test_what_is_drawn_anew_each_flight_does_not_drift():
+    rng = np.random.default_rng(9)
+    worlds = [on_days(rng, 0.0, 0.012) for _ in range(40)]
+    assert np.mean([w.found and w.by == FLIGHT for w in worlds]) > 0.9
+    assert "15 flights" in worlds[0].sentence
+
+
+def test_a_mean_is_as_sure_as_there_are_days():
+    """Three flights of a day tell no more of what all days share than one does."""
+    statistics, days = campaign(np.random.default_rng(10), 5, 0.012, 0.0)
+    size = {0: 6.0}  # floors
+    by_flight, by_day = freed(statistics, Varies(days, flights=size)), freed(statistics, Varies(days, drifts=size))
+    assert len(by_day.flights) == 5
+    sd = [1.0 / np.sqrt(s.information.sum(0)[0, 0]) for s in (by_flight, by_day)]
+    np.testing.assert_allclose(sd, 6.0 / np.sqrt([15.0, 5.0]), rtol=0.02)
+
+
+def test_shares_of_days_come_before_those_of_flights():
+    statistics, days = campaign(np.random.default_rng(11), 5, 0.0, 0.0)
+    moved = np.repeat([4.0, -4.0, 2.0, -2.0, 0.0], 3) + np.tile([1.0, 0.0, -1.0], 5)
+    statistics = replace(statistics, score=moved[:, None] * statistics.information[:, :, 0])
+    shares = own_shares(statistics, np.zeros(len(NAMES)), Varies(days, {0: 1.0}, {0: 10.0}))
+    np.testing.assert_allclose(shares[:, 0], moved, atol=0.5)
+    assert np.all(shares[:, 1:] == 0.0)
 
 
 def told(rng, **deviation):

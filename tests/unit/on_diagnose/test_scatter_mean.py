@@ -8,7 +8,7 @@ import pytest
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
 from tests.unit.on_diagnose.test_scatter import LEAST, NAMES, PRIORS, flights
 from visthrow.diagnose.select import result, search
-from visthrow.diagnose.select.scatter import freed, varying
+from visthrow.diagnose.select.scatter import Varies, freed, varying
 
 EFFECTS = tuple(replace(e, name="cmd_delay") if i == 4 else e for i, e in enumerate(catalogue(12)))
 FLOOR = EFFECTS[4].floor
@@ -56,7 +56,7 @@ def test_a_deviation_is_about_the_mean():
 
 def test_what_flights_have_of_their_own_is_integrated_out():
     found, K, j, size = flights(np.random.default_rng(3), count=1), len(NAMES), 2, 1.7
-    left, own, score = freed(found, {j: size}), found.information[0], found.score[0]
+    left, own, score = freed(found, Varies(flights={j: size})), found.information[0], found.score[0]
     theta = np.random.default_rng(4).normal(size=K)
 
     def misfit(x):

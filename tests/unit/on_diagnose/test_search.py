@@ -11,7 +11,7 @@ from visthrow.diagnose.likelihood import evidence
 from visthrow.diagnose.likelihood.evidence import Priors
 from visthrow.diagnose.likelihood.marginal import Statistics
 from visthrow.diagnose.select import held_out, result, search, selector
-from visthrow.diagnose.select.scatter import SHARE, disagreement
+from visthrow.diagnose.select.scatter import SHARE, Varies, disagreement
 
 EFFECTS = catalogue(12)
 
@@ -205,7 +205,7 @@ def test_flights_disagree_by_more_than_form_and_noise():
         own = np.full((8, 1, 1), 4.0)  # information: half a floor's deviation each
         none = np.zeros(8)
         statistics = Statistics(np.arange(8), own, 4.0 * np.array(sizes)[:, None], none, none, np.zeros(1))
-        return disagreement(statistics, priors, {}, [0], 0, 5.0, share)
+        return disagreement(statistics, priors, Varies(), [0], 0, 5.0, share)
 
     sizes = np.array([9.0, 11.0, 8.0, 12.0, 10.0, 9.5, 10.5, 10.0])
     assert verdict(sizes) is None

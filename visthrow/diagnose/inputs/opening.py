@@ -2,6 +2,7 @@
 
 import argparse
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from visthrow.common.errors import ConfigError, DiagnoseError, suggest
@@ -44,7 +45,15 @@ def open_model(args: argparse.Namespace) -> tuple[Model, list[FlightLog]]:
     model, logs = _opened(args)
     if args.measured:
         model.effects = measures.narrowed(model.effects, measures.parsed(args.measured))
+    model.days = days_of(logs)
     return model, logs
+
+
+def days_of(logs: Sequence[FlightLog]) -> tuple[int, ...]:
+    """Day of each flight, from 0: what its log says (``day`` in its metadata), else those of one folder are of one."""
+    names = [str(log.meta.get("day") or Path(str(log.meta.get("source", ""))).parent) for log in logs]
+    known = list(dict.fromkeys(names))
+    return tuple(map(known.index, names))
 
 
 def model_name(args: argparse.Namespace) -> str:

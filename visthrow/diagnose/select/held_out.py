@@ -117,8 +117,8 @@ def crossed(diagnosis: Diagnosis) -> Crossed:
     work, least = diagnosis.work, diagnosis.threshold
     point, priors = work.after, work.problem.priors
     groups, left_out = groups_of(point, work.problem.kept)
-    varies = deviations(diagnosis.scatter, priors, [e.name for e in work.problem.model.effects])
-    statistics = freed(regrouped(point, groups), varies)
+    varies = deviations(diagnosis.scatter, priors, [e.name for e in work.problem.model.effects], ())
+    statistics = freed(regrouped(point, groups), varies.by_flight)
     count, folds = len(statistics.flights), folds_of(len(statistics.flights))
     trained, named = np.zeros((count, len(priors.floor))), Counter()
     for fold in folds:

@@ -22,7 +22,7 @@ from visthrow.diagnose.likelihood.marginal import (
 )
 from visthrow.diagnose.likelihood.threads import beside
 from visthrow.diagnose.models.interface import Linearised, Model, Window
-from visthrow.diagnose.select.scatter import freed, own_shares
+from visthrow.diagnose.select.scatter import Varies, freed, own_shares
 
 STEPS = 3
 """Gauss-Newton steps between two linearisations."""
@@ -48,14 +48,14 @@ class Problem:
     priors: Priors
     kept: tuple[int, ...]  # windows that are looked at
     correlated: Mapping[int, Correlation] = field(default_factory=dict)  # channels whose noise is not white
-    varies: Mapping[int, float] = field(default_factory=dict)  # effects that differ from flight to flight: deviation in floors
+    varies: Varies = field(default_factory=Varies)  # effects that differ from flight to flight, or from day to day
 
     @staticmethod
     def of(model: Model, windows: Sequence[Window], kept: Sequence[int]) -> "Problem":
         """The problem of some of a model's windows, with the correlation of their channels' noise."""
         priors = Priors.of(tuple(model.effects), tuple(model.channels))
         known = correlations([windows[i] for i in kept], priors.slab * priors.floor, len(model.channels))
-        return Problem(model, priors, tuple(kept), known)
+        return Problem(model, priors, tuple(kept), known, Varies(getattr(model, "days", ())))
 
     @property
     def switches(self) -> np.ndarray:
@@ -81,7 +81,7 @@ class Point:
     grams: Sequence[Gram]  # latents correlated
     noise: Noise
     plain: Statistics  # of flights without anything of their own
-    varies: Mapping[int, float]  # see :attr:`Problem.varies`
+    varies: Varies  # see :attr:`Problem.varies`
     integrals: stack.Integrals  # of the grams under these noise levels
     about: Linearised | None  # where the derivatives were taken; None: with another kind of block than the residuals
     device: str  # where the model simulates, and the algebra of all windows with it
@@ -257,7 +257,7 @@ def with_floors_noise(problem: Problem, point: Point, active: Sequence[int]) -> 
     return _with_noise_at(point, theta, own_shares(point.plain, theta, point.varies))
 
 
-def with_varying(point: Point, varies: Mapping[int, float]) -> Point:
+def with_varying(point: Point, varies: Varies) -> Point:
     """The same in which other effects differ from flight to flight, with the noise levels that this leaves."""
     return _with_noise_at(replace(point, varies=varies), point.theta, own_shares(point.plain, point.theta, varies))
 

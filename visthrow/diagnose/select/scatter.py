@@ -1,15 +1,16 @@
-"""What varies from flight to flight: random effects, each weighed by the same evidence as a name.
+"""What varies from flight to flight or from day to day: random effects, each weighed by the same evidence as a name.
 
-A flight has its own share of an effect, normal about what all flights share, with a deviation theta that is looked for. The shares
-are integrated out of the flights' statistics (:func:`freed`), the size that all share may be any that its prior allows, and effects
-that are not named stay below their floors. The evidence of theta against that of none says whether the effect varies.
+A flight, or a day, has its own share of an effect, normal about what all share, with a deviation theta that is looked for. The shares
+are integrated out of the statistics (:func:`freed`), the size that all share may be any that its prior allows, and effects that are
+not named stay below their floors. The evidence of theta against that of none says whether the effect varies, and more evidence for
+shares of days than for shares of flights that it drifts.
 A flight far from the others is simulated again at other sizes: a release 40 ms early tells twice of it by its derivative.
 
 Source: Laird and Ware 1982 (random effects).
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -19,10 +20,12 @@ from visthrow.config.effects import random_effects
 from visthrow.diagnose.likelihood.evidence import Priors, additions, covariance, estimate, log_evidence
 from visthrow.diagnose.likelihood.marginal import Statistics
 
-BY_FLIGHT = "_by_flight"
-"""End of the names of effects that differ from flight to flight and are none of the catalogue's random effects."""
+FLIGHT, DAY, COMMAND = "flight", "day", "command"
+"""What has a share of its own."""
+FORM = "_by_"
+"""Before these, at the end of the names of effects that differ and are none of the catalogue's random effects."""
 LEAST_FLIGHTS = 4
-"""With fewer a deviation is anybody's guess."""
+"""Or days: with fewer a deviation is anybody's guess."""
 REACH, LOOK = np.geomspace(0.02, 6.0, 25), 5
 """Deviations that are tried, in their prior's; every which of them, where flights are left out."""
 SHARE = 0.3
@@ -53,19 +56,54 @@ class Scatter:
     high: float
     floor: float  # [unit]
     nats: float  # of evidence that it varies at all
-    flights: int  # that say something about it
+    flights: int  # or days or commands, that say something about it
     manoeuvres: tuple[str, ...] = ()
+    by: str = FLIGHT  # or DAY, or COMMAND
 
     @property
     def sentence(self) -> str:
         """For people."""
         size = f"{self.name} = {self.size:.3g} {self.unit} (95 %: {self.low:.3g} to {self.high:.3g})"
-        return f"{self.cause}: {size}, {self.nats:.0f} nats from {self.flights} flights."
+        drifts = "drifts, a value for each day. " if self.by == DAY else ""
+        return f"{drifts}{self.cause}: {size}, {self.nats:.0f} nats from {self.flights} {self.by}s."
+
+
+@dataclass(frozen=True)
+class Varies:
+    """Effects that have shares of their own: by the effect's number, the deviation of the shares in its floor."""
+
+    days: Sequence[int] = ()  # of each flight, by its number; none where nobody told
+    flights: Mapping[int, float] = field(default_factory=dict)  # shares of flights
+    drifts: Mapping[int, float] = field(default_factory=dict)  # shares of days
+
+    def __bool__(self) -> bool:
+        return bool(self.flights or self.drifts)
+
+    @property
+    def effects(self) -> dict[int, float]:
+        """Deviations of all."""
+        return {**self.flights, **self.drifts}
+
+    @property
+    def by_flight(self) -> "Varies":
+        """The same as if every flight were a day: of days of which only some flights are looked at."""
+        return Varies((), self.effects)
+
+    def also(self, at: Sequence[int], size: Mapping[int, float], by: str = FLIGHT) -> "Varies":
+        """The same with shares of more effects."""
+        new = {j: size[j] for j in at}
+        return replace(self, drifts={**self.drifts, **new}) if by == DAY else replace(self, flights={**self.flights, **new})
+
+    def levels(self, statistics: Statistics) -> tuple[str, ...]:
+        """What may have shares: days too, where there are enough of them, each of several flights."""
+        days = {self.days[f] for f in statistics.flights.tolist()} if self.days else ()
+        return (FLIGHT, DAY) if LEAST_FLIGHTS <= len(days) < len(statistics.flights) else (FLIGHT,)
 
 
 def varying(
     statistics: Statistics, theta: np.ndarray, priors: Priors, names: Sequence[str], least: float,
     again: Callable[[np.ndarray], Statistics | None] | None = None, others: Sequence[RandomEffect] = (), active: Sequence[int] = (),
+    days: Sequence[int] = (),
 ) -> tuple[Scatter, ...]:  # fmt: skip
     """Verdicts on everything that may vary among these flights.
 
@@ -78,9 +116,10 @@ def varying(
         again: the flights simulated at other sizes, in floors; None where that fails.
         others: what may vary besides the catalogue's random effects; told where it does.
         active: effects that are named.
+        days: of each flight, by its number; none where nobody told.
     """
-    known, told, drawn = list(names), {}, {}
-    may_vary = [*random_effects(), *others]
+    known, told, drawn = list(names), {}, Varies(days)
+    may_vary = [*(v for v in random_effects() if v.of), *others]
     at = {v.name: [j for j in map(known.index, set(v.of) & set(known)) if priors.visible[j]] for v in may_vary}
     price = {v: least + (np.log(len(theta)) if v in others else 0.0) for v in may_vary}  # of all effects, one varies more by chance
     for _ in range(MOST_VARYING):
@@ -99,15 +138,20 @@ def varying(
             told[best.name] = _verdict(best, statistics, at[best.name], price[best], *given)
             if not told[best.name].found:
                 break
-        drawn = drawn | {j: told[best.name].size / float(priors.floor[j]) for j in at[best.name]}
-    return tuple(told.values())
+        drawn = drawn.also(at[best.name], told[best.name].size / priors.floor, told[best.name].by)
+    return tuple(_named(s, s.name in {v.name for v in others}) for s in told.values())
+
+
+def _named(s: Scatter, other: bool) -> Scatter:
+    """A verdict whose name says what has the shares, where it is none of the catalogue's random effects."""
+    return replace(s, name=f"{s.name}{FORM}{s.by}") if other else s
 
 
 def by_flight(effects: Sequence[Effect]) -> tuple[RandomEffect, ...]:
     """Every effect as one that differs from flight to flight, but for those of the catalogue's random effects."""
     known = {name for v in random_effects() for name in v.of}
     return tuple(
-        RandomEffect(f"{e.name}{BY_FLIGHT}", f"{e.cause}, now more, now less", f"{e.name} ~ N({e.name}, theta^2) in each flight",
+        RandomEffect(e.name, f"{e.cause}, now more, now less", f"{e.name} ~ N({e.name}, theta^2) in each flight",
                      (e.name,), e.unit, e.block, e.prior_sd, e.floor, e.source, manoeuvres=tuple(e.manoeuvres))
         for e in effects if e.name not in known
     )  # fmt: skip
@@ -157,16 +201,31 @@ def _likely(statistics: Statistics, priors: Priors, active: Sequence[int], least
 
 
 def _verdict(
-    v: RandomEffect, statistics: Statistics, at: Sequence[int], least: float, priors: Priors, drawn: Mapping[int, float],
-    active: Sequence[int],
+    v: RandomEffect, statistics: Statistics, at: Sequence[int], least: float, priors: Priors, drawn: Varies, active: Sequence[int],
 ) -> Scatter | None:  # fmt: skip
-    """The verdict on one quantity; None where too few flights say something of it."""
-    seen = (statistics.information[:, at, at] > 0.0).any(axis=1)
-    if np.count_nonzero(seen) < LEAST_FLIGHTS:
-        return None
-    reach = REACH * v.prior_sd
+    """The verdict on one quantity, at the level that says more; None where too few flights say something of it."""
+    reach, found = REACH * v.prior_sd, []
+    for by in drawn.levels(statistics):
+        groups = by_day(statistics, drawn.days) if by == DAY else statistics
+        seen = np.count_nonzero((groups.information[:, at, at] > 0.0).any(axis=1))
+        if seen >= LEAST_FLIGHTS:
+            found.append(judged(v, reach, _ahead(statistics, at, reach, priors, drawn, active, by), least, int(seen), by))
+    return max(found, key=lambda s: s.nats, default=None)
+
+
+def judged(v: RandomEffect, reach: np.ndarray, nats: np.ndarray, least: float, flights: int, by: str = FLIGHT) -> Scatter:
+    """The verdict on a quantity by the evidence of its sizes.
+
+    Args:
+        v: the quantity.
+        reach: sizes that were tried, from small to large, above 0.
+        nats: of evidence of each against none.
+        least: that a finding needs.
+        flights: or days or commands, that say something of it.
+        by: what has shares.
+    """
     size = np.append(0.0, np.geomspace(reach[0], reach[-1], FINE))
-    ahead = CubicSpline(np.log(reach), _ahead(statistics, at, reach, priors, drawn, active))
+    ahead = CubicSpline(np.log(reach), nats)
     value = np.append(0.0, ahead(np.log(size[1:])))
     weight = np.gradient(size) * np.sqrt(2.0 / np.pi) / v.prior_sd * np.exp(-0.5 * (size / v.prior_sd) ** 2)
     best = value.max()
@@ -175,32 +234,33 @@ def _verdict(
     low, high = (float(size[np.searchsorted(share, q)]) for q in (0.025, 0.975))
     nats, most = float(np.log(density.sum()) + best), float(size[np.argmax(density / np.gradient(size))])
     return Scatter(v.name, v.cause, v.equation, v.block, v.unit, tuple(v.of), nats > least and most > v.floor, most, low, high,
-                   v.floor, nats, int(np.count_nonzero(seen)), v.manoeuvres)  # fmt: skip
+                   v.floor, nats, flights, v.manoeuvres, by)  # fmt: skip
 
 
 def _ahead(
-    statistics: Statistics, at: Sequence[int], sizes: np.ndarray, priors: Priors, drawn: Mapping[int, float], active: Sequence[int]
-) -> np.ndarray:
+    statistics: Statistics, at: Sequence[int], sizes: np.ndarray, priors: Priors, drawn: Varies, active: Sequence[int],
+    by: str = FLIGHT,
+) -> np.ndarray:  # fmt: skip
     """Nats of deviations of some effects against none, beside what varies already; all flights may share any size of these effects."""
     named = sorted({*active, *at})
 
-    def evidence(varies: Mapping[int, float]) -> float:
+    def evidence(varies: Varies) -> float:
         left = freed(statistics, varies)
         return log_evidence(left.information.sum(0), left.absolute.sum(0), priors, named) - 0.5 * float(left.absolute_square.sum())
 
     nothing = evidence(drawn)
-    return np.array([evidence({**drawn, **{j: size / priors.floor[j] for j in at}}) - nothing for size in sizes])
+    return np.array([evidence(drawn.also(at, size / priors.floor, by)) - nothing for size in sizes])
 
 
 def disagreement(
-    statistics: Statistics, priors: Priors, drawn: Mapping[int, float], active: Sequence[int], j: int, least: float, share: float = SHARE
+    statistics: Statistics, priors: Priors, drawn: Varies, active: Sequence[int], j: int, least: float, share: float = SHARE
 ) -> tuple[int | None] | None:
     """Whether flights disagree on an effect of a set: shares of their own say more than a floor and a part of the effect's size would.
 
     Args:
         statistics: of the flights.
         priors: of the effects.
-        drawn: deviation in floors of effects that vary.
+        drawn: effects that vary.
         active: the set.
         j: the effect.
         least: nats that a finding needs.
@@ -216,7 +276,7 @@ def disagreement(
     def apart(statistics: Statistics, active: Sequence[int]) -> bool:
         left = freed(statistics, drawn)
         size = estimate(left.information.sum(0), left.absolute.sum(0), priors, active)[j]
-        allowed = max(np.hypot(1.0, share * size), drawn.get(j, 0.0))
+        allowed = max(np.hypot(1.0, share * size), drawn.effects.get(j, 0.0))
         reach = allowed * np.geomspace(1.0, max(REACH[-1] * priors.slab[j] / allowed, 2.0), len(REACH[::LOOK]))
         nats = _ahead(statistics, [j], reach * priors.floor[j], priors, drawn, active)
         return bool(nats.max() - nats[0] > least)
@@ -239,13 +299,29 @@ def _one_alone(v: RandomEffect, statistics: Statistics, at: Sequence[int], *give
     return any(_ahead(statistics.only(flights != f), at, REACH[::LOOK] * v.prior_sd, *given).max() <= 0.0 for f in flights)
 
 
-def freed(statistics: Statistics, deviation: Mapping[int, float]) -> Statistics:
-    """Statistics of flights each of which has its own share of some effects, integrated out: what is left tells of the mean.
+def freed(statistics: Statistics, varies: Varies) -> Statistics:
+    """Statistics of what flights, or days, share: the shares that each has of its own are integrated out.
 
     Args:
         statistics: of the flights.
-        deviation: of such an effect among flights, in floors.
+        varies: effects that have such shares. Where days have some, what is returned is of days.
     """
+    left = _integrated(statistics, varies.flights)
+    return _integrated(by_day(left, varies.days), varies.drifts) if varies.drifts else left
+
+
+def by_day(statistics: Statistics, days: Sequence[int]) -> Statistics:
+    """Statistics of flights added up by day; ``days`` are theirs, by the flight's number."""
+    names, row = np.unique([days[f] for f in statistics.flights.tolist()], return_inverse=True)
+    member = (row == np.arange(len(names))[:, None]).astype(float)
+    return replace(
+        statistics, flights=names, information=np.tensordot(member, statistics.information, 1), score=member @ statistics.score,
+        square=member @ statistics.square, samples=member @ statistics.samples,
+    )  # fmt: skip
+
+
+def _integrated(statistics: Statistics, deviation: Mapping[int, float]) -> Statistics:
+    """Statistics without the shares that each row has of some effects; ``deviation`` is theirs, in floors."""
     for j, size in deviation.items():
         column, score = statistics.information[:, :, j], statistics.score
         own = column[:, j]
@@ -259,27 +335,39 @@ def freed(statistics: Statistics, deviation: Mapping[int, float]) -> Statistics:
     return statistics
 
 
-def own_shares(statistics: Statistics, theta: np.ndarray, deviation: Mapping[int, float]) -> np.ndarray:
+def own_shares(statistics: Statistics, theta: np.ndarray, varies: Varies) -> np.ndarray:
     """Most probable share of each flight of the effects that vary, beside the sizes of all, in floors, shape (F, K).
 
     Args:
         statistics: of the flights.
         theta: sizes that all flights share, in floors.
-        deviation: of an effect among flights, in floors.
+        varies: effects that have shares. Those of days come first, and flights share what is left of them.
     """
-    own = np.zeros(statistics.score.shape)
-    at = list(deviation)
+    at = np.tile(theta, (len(statistics.flights), 1))
+    if varies.drifts:
+        left = by_day(_integrated(statistics, varies.flights), varies.days)
+        row = np.searchsorted(left.flights, [varies.days[f] for f in statistics.flights.tolist()])
+        at = at + _shares(left, np.tile(theta, (len(left.flights), 1)), varies.drifts)[row]
+    return at + _shares(statistics, at, varies.flights) - theta
+
+
+def _shares(statistics: Statistics, theta: np.ndarray, deviation: Mapping[int, float]) -> np.ndarray:
+    """Most probable shares of each row, beside its sizes ``theta`` (F, K)."""
+    own, at = np.zeros(statistics.score.shape), list(deviation)
     if at:
-        left = (statistics.score - statistics.information @ (theta - statistics.theta))[:, at]
+        left = (statistics.score - np.einsum("fij,fj->fi", statistics.information, theta - statistics.theta))[:, at]
         inside = statistics.information[:, at][:, :, at] + np.diag([size**-2.0 for size in deviation.values()])
         own[:, at] = np.linalg.solve(inside, left[..., None])[..., 0]
     return own
 
 
-def deviations(scatter: Sequence[Scatter], priors: Priors, names: Sequence[str]) -> dict[int, float]:
-    """Deviation in floors of each effect that was found to vary, by its number."""
-    known = list(names)
-    return {j: s.size / float(priors.floor[j]) for s in scatter if s.found for j in map(known.index, set(s.of) & set(known))}
+def deviations(scatter: Sequence[Scatter], priors: Priors, names: Sequence[str], days: Sequence[int]) -> Varies:
+    """What was found to vary, of effects of these names; ``days`` are the flights'."""
+    known, found = list(names), Varies(days)
+    for s in scatter:
+        if s.found:
+            found = found.also([j for j in map(known.index, set(s.of) & set(known))], s.size / priors.floor, s.by)
+    return found
 
 
 def variances(scatter: Sequence[Mapping]) -> dict[str, float]:

@@ -79,7 +79,7 @@ def explain(
 def _least(nominal: Point, priors: Priors, seed: int, say: Callable[[str], None]) -> float:
     """The threshold [nats]."""
     least = threshold(nominal.statistics, priors, np.random.default_rng(seed))
-    say(f"{len(nominal.windows)} windows of {len(nominal.statistics.flights)} flights; a cause needs {least:.1f} nats")
+    say(f"{len(nominal.windows)} windows of {len(nominal.plain.flights)} flights; a cause needs {least:.1f} nats")
     return least
 
 

@@ -14,7 +14,7 @@ from itertools import combinations
 import numpy as np
 
 from visthrow.diagnose.likelihood.evidence import additions, estimate, log_evidence, pair_additions
-from visthrow.diagnose.select import terms
+from visthrow.diagnose.select import dropped, terms
 from visthrow.diagnose.select.excess import levels
 from visthrow.diagnose.select.point import (
     Point,
@@ -296,7 +296,7 @@ class Selector(SearchState):
             nominal: point without them.
             least: threshold without them.
         """
-        if self.terms:
+        if self.terms or self.dropped is not None:
             return False
         left = [i for i in range(len(self.problem.kept)) if i not in set(gone)]
         origin, point = (only(terms.bare(self.problem, p)[1], left) for p in (self.origin, self.point))
@@ -313,20 +313,48 @@ class Selector(SearchState):
             last: there is no name any more: any effect may be what varies, if no law is why flights differ.
         """
         scatter = [s for s in self.scatter(self.active, every=last) if s.found]
-        varies = deviations(scatter, self.priors, [e.name for e in self.problem.model.effects])
-        new = [s for s in scatter if not {self.name(j) for j in self.problem.varies} & set(s.of)]
-        if not new or (not last and max(s.nats for s in new) < self._additions(self.point, self._usable()).max()):
+        varies = deviations(scatter, self.priors, [e.name for e in self.problem.model.effects], self.problem.varies.days)
+        new = [s for s in scatter if not {self.name(j) for j in self.problem.varies.effects} & set(s.of)]
+        most = max((s.nats for s in new), default=0.0)
+        best = 0.0 if last else max(self._additions(self.point, self._usable()).max(), 0.0)
+        rival = max(most, best, *self.refused.values())
+        if (last or new or not self.active) and self._drop_commands(rival, last):
+            return True
+        if not new or most < best:
             return False
         if last and self.nearer():  # differences may be what the derivatives lack
             return self._vary(last)
         if last and self._propose() and (self._add() or self._exchange()):
             return True
         for s in new:
-            self.progress(f"{', '.join(s.of)} differs from flight to flight: {s.size:.3g} {s.unit}, {s.nats:.1f} nats")
+            self.progress(f"{', '.join(s.of)} differs from {s.by} to {s.by}: {s.size:.3g} {s.unit}, {s.nats:.1f} nats")
         self.problem = replace(self.problem, varies=varies)
         self.nominal, self.origin, self.point = (with_varying(p, varies) for p in (self.nominal, self.origin, self.point))
         self.refused.clear()
         self.visited = {frozenset(self.active)}
+        return True
+
+    def _drop_commands(self, rival: float, last: bool) -> bool:
+        """Let commands have got lost, if that says more than what varies and than any name; False where it does not.
+
+        Args:
+            rival: nats of what says most beside it.
+            last: whether to look for laws before, whose form commands that are late have in part.
+        """
+        if self.dropped is not None or self.terms:
+            return False
+        found = dropped.verdict(self.problem, self.point, self.active, self.least)
+        if found is None or not found.found or found.nats <= rival + self.varying_brings():
+            return False
+        if last and self._propose() and (self._add() or self._exchange()):
+            return True
+        problem, point = terms.bare(self.problem, self.point)
+        self.progress(f"commands got lost: {found.size:.1%} of them, {found.nats:.1f} nats")
+        self.dropped, self.problem = found, dropped.lost(problem, found.size)
+        self.nominal, self.origin = (linearise(self.problem, theta, point.noise) for theta in (np.zeros_like(point.theta), point.theta))
+        self.point = candidate(self.problem, self.origin, self.active)
+        self.dropped = dropped.sized(self.problem, self.nominal, found)
+        self.refused, self.visited, self.proposed = {}, {frozenset(self.active)}, set()
         return True
 
     def _propose(self) -> bool:

@@ -1,7 +1,7 @@
 """The state of a search: the set that it has come to, where it stands, what that is worth, and what every move asks of it."""
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,16 @@ from visthrow.diagnose.select import terms
 from visthrow.diagnose.select.excess import acts_on
 from visthrow.diagnose.select.point import Point, Problem, advantage, curvature, fitted, linearise, moved
 from visthrow.diagnose.select.result import Law, Step
-from visthrow.diagnose.select.scatter import SHARE, Scatter, by_flight, disagreement, freed, straightened, varying
+from visthrow.diagnose.select.scatter import (
+    SHARE,
+    Scatter,
+    Varies,
+    by_flight,
+    disagreement,
+    freed,
+    straightened,
+    varying,
+)
 
 STRAIGHT = 0.5
 """Size in floors that the simulation's distance from its linearisation may fake before the derivatives are taken anew."""
@@ -69,6 +78,7 @@ class SearchState:
     acting: dict[int, tuple[str, str]] = field(default_factory=dict)  # blocks that effects act in, without the joint and with it
     work: Point | None = None  # what is left for report and plan: without laws
     varied: Any = None  # of :meth:`scatter`, and what it was asked about
+    dropped: Scatter | None = None  # the verdict on lost commands, where the model has them
 
     @property
     def priors(self) -> Priors:
@@ -146,15 +156,15 @@ class SearchState:
         there = moved(self.problem, self.point, theta)
         return None if there is None else there.plain
 
-    def about_means(self, active: Sequence[int], varies: Mapping[int, float]) -> Statistics:
+    def about_means(self, active: Sequence[int], varies: Varies) -> Statistics:
         """Return what the flights say of the means of effects that vary; flights far from the mean are simulated again at their own size.
 
         Args:
             active: effects named.
-            varies: deviation in floors of an effect among flights.
+            varies: what differs among flights.
         """
         statistics, theta = self.point.plain, self.sizes(active)
-        for j in sorted(set(varies) & set(active)):
+        for j in sorted(set(varies.effects) & set(active)):
             statistics = straightened(statistics, theta, self.priors, j, self._again)
         return freed(statistics, varies)
 
@@ -169,10 +179,15 @@ class SearchState:
         if self.varied is None or self.varied[0][0] is not self.point or self.varied[0][1:] != asked[1:]:
             effects, about = self.problem.model.effects, self.sizes(active)
             others = by_flight([e for j, e in enumerate(effects)
-                                if j in self.problem.varies or (every and not e.switch and not self.is_term(j))])  # fmt: skip
+                                if j in self.problem.varies.effects or (every and not e.switch and not self.is_term(j))])  # fmt: skip
             self.varied = asked, varying(self.point.plain, about, self.priors, [e.name for e in effects], self.least, self._again,
-                                         others, active)  # fmt: skip
+                                         others, active, self.problem.varies.days)  # fmt: skip
         return self.varied[1]
+
+    def varying_brings(self) -> float:
+        """Return the nats that what varies from flight to flight brings to the set."""
+        same = replace(self.point, varies=Varies())
+        return max(self.point.evidence(self.priors, self.active) - same.evidence(self.priors, self.active), 0.0)
 
     def stands(self, point: Point, active: Sequence[int], j: int) -> bool:
         """Tell whether a candidate of a set could be named at all, however many nats it brings."""

@@ -11,7 +11,7 @@ from visthrow.diagnose.select import result
 from visthrow.diagnose.select.excess import acts_on, levels, too_strong
 from visthrow.diagnose.select.point import Point, moved, with_fitted_noise, with_floors_noise, with_varying
 from visthrow.diagnose.select.result import Diagnosis, Finding, Law, Level
-from visthrow.diagnose.select.scatter import BY_FLIGHT, deviations, freed
+from visthrow.diagnose.select.scatter import FORM, Varies, deviations, freed
 from visthrow.diagnose.select.selector import Selector
 from visthrow.diagnose.select.state import Work
 from visthrow.diagnose.select.terms import WithTerms, bare
@@ -40,8 +40,8 @@ def conclude(search: Selector) -> Diagnosis:
         search: that has run.
     """
     point, model = search.point, search.problem.model
-    scatter = search.scatter(search.active)
-    varies = deviations(scatter, search.priors, [e.name for e in model.effects])
+    scatter = (*search.scatter(search.active), *([search.dropped] if search.dropped else []))
+    varies = deviations(scatter, search.priors, [e.name for e in model.effects], search.problem.varies.days)
     if varies or point.varies:
         point = search.point = with_varying(point, varies)
     found = levels(search.problem, search.nominal, with_floors_noise(search.problem, point, search.active), search.least)
@@ -49,10 +49,10 @@ def conclude(search: Selector) -> Diagnosis:
     search.refused = {j: nats for j, nats in search.refused.items() if search.name(j) not in drawn}
     overall, block, reasons, withdrawn = _overall(search, found)
     mistakes = tuple(getattr(model, "mistakes", ()))
-    if overall == result.NO_EFFECT and (drawn or mistakes):
+    if overall == result.NO_EFFECT and (any(s.found for s in scatter) or mistakes):
         besides = [m.name for m in mistakes] + [s.name for s in scatter if s.found]
         overall, reasons = result.KNOWN, [f"besides {' and '.join(besides)}, {reasons[0]}"]
-    forms = [s.name for s in scatter if s.found and s.name.endswith(BY_FLIGHT)]
+    forms = [s.name for s in scatter if s.found and s.name.endswith(f"{FORM}{s.by}")]
     if len(forms) > 1 and overall == result.KNOWN:
         reasons = [f"flights differ in {', '.join(forms)} at once; the form is another"]
         overall, block = result.UNKNOWN, next(s.block for s in scatter if s.name == forms[0])
@@ -66,7 +66,7 @@ def conclude(search: Selector) -> Diagnosis:
     here = here and bool(active or not search.active)
     if not active and search.active:
         point = search.nominal
-    point = replace(point, plain=search.about_means(active, varies) if here else freed(point.plain, varies), varies={})
+    point = replace(point, plain=search.about_means(active, varies) if here else freed(point.plain, varies), varies=Varies())
     point = replace(point, theta=estimate(point.information, point.score, search.priors, active))
     spread = covariance(point.information, search.priors.deviation(active))
     findings = tuple(_finding(search, point, j, active, spread, withdrawn) for j in range(len(model.effects)))
@@ -80,7 +80,7 @@ def conclude(search: Selector) -> Diagnosis:
         _events(search, point),
         sensor_scale={name: float(point.noise.scale[c]) for c, name in enumerate(model.channels)},
         scatter=scatter, mistakes=mistakes, explanations=tuple(explanations),
-        flights=len(point.statistics.flights), windows=len(point.windows), samples=int(point.statistics.samples.sum()),
+        flights=len(search.point.plain.flights), windows=len(point.windows), samples=int(point.statistics.samples.sum()),
         work=Work(search.problem, search.nominal, search.work if active else search.nominal, tuple(active)),
     )  # fmt: skip
 

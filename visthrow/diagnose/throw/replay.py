@@ -1,5 +1,6 @@
 """Recorded flights cut into windows, ready to be replayed in any setting: the arrays that all lanes of a batch share."""
 
+import copy
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -182,6 +183,12 @@ class Flights:
         kept = given["keep"] >= 0
         knots = max(1, int(np.max((given["keep"] + self.knots[given["window"]])[kept], initial=1)))
         return replay.run(states, recording or self.recording, given, KNOT_SPACING, knots)
+
+    def repeated(self, windows: np.ndarray) -> "Flights":
+        """The same as it concerns :meth:`fly`, of windows that stand there more than once."""
+        other = copy.copy(self)
+        other.knots, other._fineness = self.knots[windows], self._fineness[windows]
+        return other
 
     def ended(self, ends: Sequence[float]) -> Recording:
         """The windows that end earlier [s]; what is seen afterwards says nothing."""

@@ -22,6 +22,7 @@ from visthrow.diagnose.likelihood.transfer import all_to_host, to_host
 from visthrow.diagnose.models.interface import Linearised, Window
 from visthrow.diagnose.throw.cutting import RINGING, Cut, around_slack, cut, thinned
 from visthrow.diagnose.throw.direct import channels_of, direct_measurements, needs_no_flight, with_direct
+from visthrow.diagnose.throw.dropped import without_each_command
 from visthrow.diagnose.throw.effects import effects_for
 from visthrow.diagnose.throw.initial_fit import InitialFit, following, perturbed
 from visthrow.diagnose.throw.interface import Mistake
@@ -189,6 +190,16 @@ class ThrowModel:
         flown = [self.flights.residual(seen, w, lane) for lane, w in enumerate(self._retained)]
         full = [np.concatenate((r, *self._direct_residuals(w, setting))) for r, w in zip(flown, self._retained)]
         return [r + about.windows[i].nuisance @ moves[i] if i in moves else r for i, r in enumerate(full)]
+
+    def without_commands(self, theta: Mapping[str, float]) -> list[np.ndarray]:
+        """Change of each window's replayed samples by each command that does not come: the one before stays. Shape (N, T).
+
+        Args:
+            theta: sizes of the effects, at which :meth:`windows` was asked for before.
+        """
+        setting = apply(self.entries, self.setting, theta)
+        states, known = self._settled_at.get(_key(theta), self._fitted()[0]), self.setting.plant.vehicle.queue.delay
+        return without_each_command(self.flights, self._retained, known, setting, states, self.substep, self.device)
 
     def _following(
         self, setting: Setting, theta: Mapping[str, float], about: Linearised

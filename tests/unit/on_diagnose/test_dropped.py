@@ -1,0 +1,95 @@
+"""Commands that got lost: what each would have changed, and that they are found and told beside what else there is."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from sim.replay.lanes import Recording
+from tests.flown import fly, setting_with
+from tests.plants import paper_plant
+from visthrow.diagnose.select import dropped, search
+from visthrow.diagnose.select.point import Problem, linearise, moved
+from visthrow.diagnose.throw.replay import Lane
+from visthrow.diagnose.throw.throw_model import ThrowModel
+
+SHARE = 0.12
+ONLY = ("cmd_delay", "com_x", "rate_gain", "wind_x", "payload_drag")
+
+
+@cache
+def model_of(lost: float, **theta: float) -> ThrowModel:
+    return ThrowModel(fly(setting_with(theta), seed=4, free=1, throws=3, seconds=3.0, lost=lost), paper_plant(), only=ONLY)
+
+
+def test_a_column_is_what_the_missing_command_changes():
+    model = model_of(SHARE)
+    model.windows({})
+    columns, (setting, states), flights = model.without_commands({}), model.begun({}), model.flights
+    w = int(model._retained[len(columns) // 2])
+    c = flights.cuts[w]
+    f = flights.flights[c.flight]
+    acts = f.command_time + setting.plant.vehicle.queue.delay
+    first = int(flights.windows["command_first"][w])
+    inside = np.flatnonzero((np.append(acts[1:], np.inf) > c.start) & (acts < c.end) & (np.arange(len(acts)) > 0))
+    assert columns[len(columns) // 2].shape[1] == len(inside)
+    lane, largest = [Lane(w, 0, w, rough=True)], 0.0
+    replay = model._replay([setting])
+    plain = flights.fly(replay, [setting], states, lane, model.substep).seen
+    for column, k in zip(columns[len(columns) // 2].T[::9], inside[::9]):
+        sent = flights.recording.data["command"].copy()
+        sent[first + k] = sent[first + k - 1]
+        recording = Recording(flights.recording.windows, flights.recording.data | {"command": sent})
+        seen = flights.fly(replay, [setting], states, lane, model.substep, recording).seen
+        change = (seen - plain)[: int(flights.rows[w]), 0].ravel()
+        np.testing.assert_allclose(column, change, atol=1e-12)
+        largest = max(largest, np.abs(change).max())
+    assert largest > 1e-3  # a turn of that [rad], else nothing is compared
+
+
+def test_a_model_with_lost_commands_says_the_same_both_ways():
+    model = dropped.WithDropped(model_of(SHARE), SHARE)
+    windows = model.windows({})
+    problem = Problem.of(model, windows, tuple(range(len(windows))))
+    point = linearise(problem, np.zeros(len(model.effects)), windows=windows)
+    again = moved(problem, point, point.theta)
+    for i, (w, own, there) in enumerate(zip(windows, model.model.windows({}), again.windows)):
+        np.testing.assert_allclose(there.residual, w.residual, atol=1e-9)
+        bare, columns = model.parted(w, i)
+        np.testing.assert_allclose(bare.residual, own.residual, atol=1e-12)
+        assert bare.nuisance.shape == own.nuisance.shape
+        assert np.all(w.nuisance_sd[len(own.nuisance_sd) :] == pytest.approx(np.sqrt(SHARE * (1.0 - SHARE))))
+        np.testing.assert_allclose(own.residual - w.residual, SHARE * columns.sum(1), atol=1e-12)
+
+
+def told(diagnosis):
+    return [s for s in diagnosis.scatter if s.found]
+
+
+def test_lost_commands_are_found():
+    diagnosis = search.explain(model_of(SHARE))
+    assert [s.name for s in told(diagnosis)] == [dropped.NAME]
+    assert (diagnosis.overall, diagnosis.named) == ("KNOWN", ())
+    found = told(diagnosis)[0]
+    assert found.low < SHARE < found.high
+    assert found.nats > 50.0
+
+
+def test_lost_commands_are_found_beside_a_cause():
+    diagnosis = search.explain(model_of(SHARE, com_x=0.003))
+    assert (diagnosis.overall, diagnosis.named, [s.name for s in told(diagnosis)]) == ("KNOWN", ("com_x",), [dropped.NAME])
+    assert abs(diagnosis.theta["com_x"] - 0.003) < 3e-4
+
+
+@pytest.mark.parametrize("theta", [{}, {"cmd_delay": 0.015}])
+def test_commands_that_came_are_not_lost(theta):
+    diagnosis = search.explain(model_of(0.0, **theta))
+    assert not told(diagnosis)
+    assert diagnosis.named == tuple(theta)
+
+
+def test_another_model_without_commands_is_not_asked():
+    class Other:
+        effects, channels = (), ()
+
+    assert dropped.verdict(type("Problem", (), {"model": Other()})(), None, (), 5.0) is None

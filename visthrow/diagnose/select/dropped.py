@@ -1,0 +1,176 @@
+"""Commands that got lost: a random effect of every single command.
+
+Whether command k came is m_k, 0 or 1 with probability theta. A window shows the sum of C m, with C the change of its samples by each
+command that did not come; m is taken for normal with mean theta and variance theta (1 - theta), and integrated out. What a model
+shows with it (:class:`WithDropped`) differs by the mean, and has the rest of C m among what is not known of a window.
+
+Source: an innovation variance (Harvey 1989) of the command channel; the likelihood of its size is that of a random effect.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.stats import beta
+
+from sim.effects.effect import RandomEffect
+from visthrow.config.effects import random_effects
+from visthrow.diagnose.likelihood import stack
+from visthrow.diagnose.likelihood.designs import correlated_of, grams_of
+from visthrow.diagnose.likelihood.evidence import Priors, log_evidence
+from visthrow.diagnose.models.interface import Linearised, Model, Window
+from visthrow.diagnose.select.point import Point, Problem
+from visthrow.diagnose.select.scatter import COMMAND, REACH, Scatter, Varies, judged
+
+NAME = "dropped_commands"
+"""Of the random effect in the catalogue."""
+
+EITHER, CLEAR = 0.5, 0.25
+"""Mean and deviation of m where either is as likely; the deviation from which 0 and 1 are told apart: half way is two from both."""
+
+
+def effect() -> RandomEffect:
+    """Return the catalogue's entry."""
+    return next(v for v in random_effects() if v.name == NAME)
+
+
+class WithDropped:
+    """A model some of whose commands did not come."""
+
+    def __init__(self, model: Model, share: float):
+        """Take a share of the commands away.
+
+        Args:
+            model: that tells what each command does.
+            share: of the commands, above 0 and below 1.
+        """
+        self.model, self.share = model, share
+        self._last: list[np.ndarray] = []  # columns of each window where derivatives were taken last
+        self._about: tuple[Linearised | None, Linearised | None] = None, None  # with them, and without
+
+    def __getattr__(self, name: str) -> Any:
+        """Return what the model itself has."""
+        return getattr(self.__dict__["model"], name)
+
+    def windows(self, theta: Mapping[str, float]) -> list[Window]:
+        """See :class:`Model`."""
+        found = self.model.windows(theta)
+        self._last = [_padded(own, len(w.residual), own.shape[1]) for own, w in zip(self.model.without_commands(theta), found)]
+        return [self._widened(w, columns) for w, columns in zip(found, self._last)]
+
+    def _widened(self, w: Window, columns: np.ndarray) -> Window:
+        deviation = np.full(columns.shape[1], np.sqrt(self.share * (1.0 - self.share)))
+        return replace(w, residual=w.residual - self.share * columns.sum(1), nuisance=np.hstack((w.nuisance, columns)),
+                       nuisance_sd=np.append(w.nuisance_sd, deviation))  # fmt: skip
+
+    def residuals(self, theta: Mapping[str, float], about: Linearised | None = None) -> list[np.ndarray]:
+        """See :class:`Model`; the columns stay those of the place where derivatives were taken."""
+        if about is not self._about[0]:
+            bare = about and Linearised(about.theta, {i: self.parted(w, i)[0] for i, w in about.windows.items()})
+            self._about = about, bare
+        found, last = self.model.residuals(theta, self._about[1]), dict(enumerate(self._last))
+        if about is not None:
+            last |= {i: self.parted(w, i)[1] for i, w in about.windows.items()}
+        return [r - self.share * last[i].sum(1) for i, r in enumerate(found)]
+
+    def parted(self, w: Window, i: int) -> tuple[Window, np.ndarray]:
+        """A window, by its number, as if all commands had come, and the columns of its commands."""
+        own = w.nuisance.shape[1] - self._last[i].shape[1]
+        columns = w.nuisance[:, own:]
+        return replace(w, residual=w.residual + self.share * columns.sum(1), nuisance=w.nuisance[:, :own],
+                       nuisance_sd=w.nuisance_sd[:own]), columns  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Told:
+    """What windows say of K effects and T commands each, about 0; windows of fewer commands have columns of 0."""
+
+    information: np.ndarray  # shape (W, K + T, K + T)
+    score: np.ndarray  # shape (W, K + T)
+    commands: int  # T
+
+    @staticmethod
+    def of(problem: Problem, point: Point, windows: Sequence[Window], columns: Sequence[np.ndarray]) -> "Told":
+        """Ask windows under a point's noise levels.
+
+        Args:
+            problem: of the search.
+            point: where the windows' residuals are.
+            windows: whose initial states and latent forces are integrated out.
+            columns: of each window's commands, shape (N, T).
+        """
+        most, known = max(own.shape[1] for own in columns), len(point.theta)
+        wide = [np.hstack((w.effects, _padded(own, len(w.residual), most))) for w, own in zip(windows, columns)]
+        windows = [replace(w, effects=effects) for w, effects in zip(windows, wide)]
+        grams = grams_of(windows, np.append(problem.priors.floor, np.ones(most)), len(problem.model.channels), point.device)
+        grams = correlated_of(grams, windows, point.noise.correlation_time, point.device)
+        shares = stack.integrals(grams, point.noise, point.device).shares(grams, point.noise)
+        information = np.array([own.information for own in shares])
+        return Told(information, np.array([own.score for own in shares]) + information[:, :, :known] @ point.theta, most)
+
+    def ahead(self, shares: np.ndarray, priors: Priors, active: Sequence[int]) -> np.ndarray:
+        """Nats of these shares of dropped commands against none, beside a set of effects."""
+        return np.array([self._evidence(float(p), priors, active) for p in shares]) - self._evidence(0.0, priors, active)
+
+    def _evidence(self, share: float, priors: Priors, active: Sequence[int]) -> float:
+        e, c = (slice(0, -self.commands), slice(-self.commands, None))
+        information, score, value = self.information[:, e, e], self.score[:, e], 0.0
+        if share > 0.0:
+            variance, beside = share * (1.0 - share), self.information[:, c, e]
+            own, mean = self.information[:, c, c], np.full(self.commands, share)
+            left, moved = self.score[:, c] - own @ mean, score - mean @ beside
+            factor = np.linalg.cholesky(variance * own + np.eye(self.commands))
+            half = np.linalg.solve(factor, np.sqrt(variance) * np.concatenate((left[..., None], beside), axis=2))
+            tells, through = half[..., 0], half[..., 1:]
+            value = float((mean @ (self.score[:, c] + left).T).sum() + (tells**2).sum()) / 2.0
+            value -= float(np.log(np.diagonal(factor, axis1=1, axis2=2)).sum())
+            information = information - through.transpose(0, 2, 1) @ through
+            score = moved - (tells[:, None] @ through)[:, 0]
+        return value + log_evidence(information.sum(0), score.sum(0), priors, list(active))
+
+
+def verdict(problem: Problem, point: Point, active: Sequence[int], least: float) -> Scatter | None:
+    """Whether commands got lost, beside a set of effects or beside any that are still missing; None where a model cannot tell.
+
+    Args:
+        problem: of the search.
+        point: of the set.
+        active: the set.
+        least: nats that a finding needs.
+    """
+    if not hasattr(problem.model, "without_commands"):
+        return None
+    columns, priors, v = problem.model.without_commands(problem.sizes(point.theta)), problem.priors, effect()
+    told, reach = Told.of(problem, point, point.windows, [columns[i] for i in problem.kept]), REACH * v.prior_sd
+    nats = np.minimum(*(told.ahead(reach, priors, named) for named in (active, np.flatnonzero(priors.visible).tolist())))
+    return judged(v, reach, nats, least, sum(columns[i].shape[1] for i in problem.kept), COMMAND)
+
+
+def lost(problem: Problem, share: float) -> Problem:
+    """The problem of a model some of whose commands did not come; nothing else varies yet."""
+    return replace(problem, model=WithDropped(problem.model, share), varies=Varies(problem.varies.days))
+
+
+def sized(problem: Problem, point: Point, found: Scatter) -> Scatter:
+    """The verdict with the share of those commands of which a window tells by itself whether they came, with Jeffreys' interval.
+
+    Args:
+        problem: of a model with lost commands.
+        point: of it, with the noise levels that these leave.
+        found: the verdict before.
+    """
+    told = Told.of(problem, point, *zip(*(problem.model.parted(w, i) for w, i in zip(point.windows, problem.kept))))
+    own, score = told.information[:, -told.commands :, -told.commands :], told.score[:, -told.commands :]
+    spread = np.linalg.inv(own + np.eye(told.commands) / EITHER**2)
+    off = (spread @ (score - EITHER * own.sum(2))[..., None])[..., 0]  # from half way
+    clear = np.sqrt(np.diagonal(spread, axis1=1, axis2=2)) < CLEAR
+    count, gone = np.count_nonzero(clear), np.count_nonzero(clear & (off > 0.0))
+    if not count:
+        return found
+    size, low, high = (float(x) for x in beta.ppf((0.5, 0.025, 0.975), gone + 0.5, count - gone + 0.5))
+    return replace(found, size=size, low=low, high=high)
+
+
+def _padded(columns: np.ndarray, rows: int, width: int) -> np.ndarray:
+    return np.pad(columns, ((0, rows - len(columns)), (0, width - columns.shape[1])))

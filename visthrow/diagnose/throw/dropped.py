@@ -1,0 +1,81 @@
+"""Commands that did not come: what a window would have shown had the command before stayed for one period more.
+
+A radio link loses commands or brings them late, and the vehicle goes on with what it has; the log holds what was sent. Each window
+is flown once for each of its commands, with the one before in its place.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from sim.effects.setting import Setting
+from sim.replay.lanes import Recording, Replay
+from visthrow.diagnose.throw.replay import BATCH, Flights, Lane, downloaded
+from visthrow.diagnose.throw.states import States
+
+
+def without_each_command(
+    flights: Flights, windows: Sequence[int], known: float, setting: Setting, states: States, substep: float, device: str
+) -> list[np.ndarray]:
+    """Change of windows' samples by each of their commands that the one before takes the place of.
+
+    Args:
+        flights: cut into windows.
+        windows: their numbers.
+        known: delay of the commands by which those that act in a window are told [s]: their number is the same in all settings.
+        setting: what is simulated.
+        states: initial ones, of all windows.
+        substep: largest integration step [s].
+        device: of the replay.
+
+    Returns:
+        Of each of these windows, shape (N, T), with the T commands that differ from the one before.
+    """
+    replay = Replay([setting.plant], [setting.sensing], device, download=downloaded)
+    commands = [_acting(flights, w, known) for w in windows]
+    found, first = [], 0
+    while first < len(windows):
+        fits = int(np.searchsorted(np.cumsum([1 + len(own) for own in commands[first:]]), BATCH, "right"))
+        part = slice(first, first + max(fits, 1))
+        found += _flown(flights, windows[part], commands[part], replay, setting, states, substep)
+        first = part.stop
+    return found
+
+
+def _acting(flights: Flights, w: int, delay: float) -> np.ndarray:
+    """Numbers of the commands that act in a window and differ from the one before."""
+    c, f = flights.cuts[w], flights.flights[flights.cuts[w].flight]
+    acts = f.command_time + delay
+    inside = (np.append(acts[1:], np.inf) > c.start) & (acts < c.end)
+    changed = np.append(False, np.any(np.diff(f.command, axis=0) != 0.0, axis=1))
+    return np.flatnonzero(inside & changed)
+
+
+def _flown(
+    flights: Flights, windows: Sequence[int], commands: Sequence[np.ndarray], replay: Replay, setting: Setting, states: States,
+    substep: float,
+) -> list[np.ndarray]:  # fmt: skip
+    """Of a few windows: a lane with all commands, then one without each of them."""
+    lanes, times, sent = [], [], []
+    for w, own in zip(windows, commands):
+        f = flights.flights[flights.cuts[w].flight]
+        part = slice(max(own.min(initial=1) - 1, 0), own.max(initial=len(f.command_time) - 2) + 2)
+        for k in (None, *own.tolist()):
+            flown = f.command[part].copy()
+            if k is not None:
+                flown[k - part.start] = f.command[k - 1]
+            lanes.append(w)
+            times.append(f.command_time[part])
+            sent.append(flown)
+    ends, at = np.cumsum([len(own) for own in times]), np.array(lanes)
+    fields = {name: values[at] for name, values in flights.recording.windows.items()}
+    fields |= {"command_first": np.append(0, ends[:-1]), "command_last": ends}
+    data = flights.recording.data | {"command_time": np.concatenate(times), "command": np.concatenate(sent)}
+    run = [Lane(i, 0, w, rough=True) for i, w in enumerate(lanes)]
+    seen = flights.repeated(at).fly(replay, [setting], states, run, substep, Recording(fields, data)).seen
+    found, first = [], 0
+    for w, own in zip(windows, commands):
+        part = seen[: int(flights.rows[w]), first : first + len(own) + 1]
+        found.append(np.moveaxis(part[:, 1:] - part[:, :1], 1, 2).reshape(-1, len(own)))
+        first += len(own) + 1
+    return found
