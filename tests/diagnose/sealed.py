@@ -92,14 +92,16 @@ SMALLEST, LARGEST = 3.0, 30.0
 """Sizes of the completeness curves [floors]."""
 NEAREST, NEXT = 3.0, 8.0
 """Those about the limits themselves, which lie at 4 to 9 floors."""
-LIMIT, NULL, VARYING = "limit:", "null:", "varies:"
-"""Begin of the kinds that hide one effect, by its name, about its limit; nothing; one that differs from flight to flight."""
+LIMIT, NULL, VARYING, DRIFTING = "limit:", "null:", "varies:", "drifts:"
+"""Begin of the kinds that hide one effect, by its name, about its limit; nothing; one that differs from flight to flight, or by day."""
+DAYS = 4
+"""Of worlds with effects that drift."""
 FAINTEST, PLAINEST = 1.0, 15.0
 """Those of the curves with a camera, whose limits lie at 5 or 6 floors."""
 
 
-def flight_log(record: dict) -> FlightLog:
-    """The recording of a world as the package's flight log."""
+def flight_log(record: dict, day: int | None = None) -> FlightLog:
+    """The recording of a world as the package's flight log; with the ``day`` that it is of, if there are several."""
     t = record["time"]
     seen = np.isfinite(record["pos"][:, 0])
     ball_seen = np.isfinite(record["ball"][:, 0])
@@ -119,7 +121,7 @@ def flight_log(record: dict) -> FlightLog:
         channels["keypoints"] = Channel(stamps, record["look"], "1", "image", kept)
         channels["keypoints_valid"] = Channel(stamps, record["look_seen"], "bool")
         channels["goal_w"] = Channel(np.zeros(1), record["goal"][None], "m", "world")
-    return FlightLog(channels, {})
+    return FlightLog(channels, {} if day is None else {"day": f"day {day}"})
 
 
 def model_of(recipe: Recipe) -> list[str]:
@@ -138,7 +140,7 @@ def hand_over(recipe: Recipe, folder: Path, held: Path | None = None) -> list[Pa
     for i, record in enumerate(records):
         if i < shown or held is not None:
             path = (folder if i < shown else held) / f"flight_{i:02d}.npz"
-            flight_log(record).save(path)
+            flight_log(record, i % recipe.days if recipe.days else None).save(path)
             paths += [path] if i < shown else []
     return paths
 
@@ -235,6 +237,7 @@ def judge(recipe: Recipe, verdict: dict) -> dict:
         "extra": max(len(groups) - len(truth), 0), "own_class": own, "unknown": verdict["overall"].startswith("UNKNOWN"),
         "laws": [law["formula"] for law in verdict.get("laws", ())[:3]],
         "varies": [own["name"] for own in verdict.get("scatter", ()) if own["found"]],
+        "drifts": [own["of"] for own in verdict.get("scatter", ()) if own["found"] and own.get("by") == "day"],
     }  # fmt: skip
 
 
@@ -297,8 +300,8 @@ def _known(kind: str, begin: str, names: Iterable[str]) -> str:
 def drawn(kind: str, number: int) -> Recipe:
     """A world of a kind: ``null``, ``law``, ``curve``, ``limit:NAME``, ``flights`` or ``EFFECTSxFLOORS``; those with a camera.
 
-    ``null:COLOUR`` hides nothing behind noise of one of COLOURS, ``varies:NAME`` an effect that differs from flight to flight, ``lost``
-    commands that never arrive. Those with a camera are ``sight``, ``camera`` and ``clear``. ``curve`` and ``sight`` hide one of the
+    ``null:COLOUR`` hides nothing behind noise of one of COLOURS, ``varies:NAME`` an effect that differs from flight to flight,
+    ``drifts:NAME`` one that differs from day to day, ``lost`` commands that never arrive. Those with a camera are ``sight``, ``camera`` and ``clear``. ``curve`` and ``sight`` hide one of the
     effects whose limits are asked for, ``limit:NAME`` the one that it names, about its limit, ``camera`` any of a camera's, ``clear``
     none. ``KIND+dust`` is the same with some of every other effect.
     """
@@ -319,6 +322,8 @@ def drawn(kind: str, number: int) -> Recipe:
     if kind.startswith(VARYING):
         name = _known(kind, VARYING, VARIES)
         return draw(number, 0, 0.0, varies={name: float(rng.uniform(*VARIES[name]))})
+    if kind.startswith(DRIFTING):
+        return replace(drawn(kind.replace(DRIFTING, VARYING), number), days=DAYS)
     if kind == "lost":
         return draw(number, 0, 0.0, lost=float(rng.uniform(*LOST)))
     if kind == "null":
@@ -375,7 +380,7 @@ def warm(plant: str) -> None:
 def main() -> None:
     """Run a bank of sealed worlds and add it to a ledger; worlds that are there are not run again."""
     parser = argparse.ArgumentParser(description=main.__doc__, fromfile_prefix_chars="@", epilog="@FILE holds arguments, one a line")
-    kinds = "null, null:COLOUR, varies:NAME, lost, law, curve, limit:NAME, flights, EFFECTSxFLOORS, any of these +dust; "
+    kinds = "null, null:COLOUR, varies:NAME, drifts:NAME, lost, law, curve, limit:NAME, flights, EFFECTSxFLOORS, any of these +dust; "
     kinds += "with a camera sight, camera, clear"
     parser.add_argument("worlds", nargs="*", metavar="KIND=COUNT", help=kinds)
     parser.add_argument("--seed", type=int, help="of the first world; drawn by the system where not given")

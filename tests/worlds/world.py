@@ -65,6 +65,7 @@ class Recipe:
     camera: bool = False  # a camera looks down and a detector marks the goal and the ball
     colour: str = ""  # of the sensors' noise, one of COLOURS; white where empty
     varies: dict[str, float] = field(default_factory=dict)  # deviation of effects whose size is drawn anew for each flight
+    days: int = 0  # on which flights are flown by turns; then for each day, not for each flight
     lost: float = 0.0  # share of commands that never arrive
     dust: float = 0.0  # deviation of every other effect, in its floor: what matters to nobody, and is there in every hall
 
@@ -109,7 +110,7 @@ def worlds_of(recipe: Recipe, first: int, count: int) -> list:
     """The worlds of some flights, each with what it has of its own."""
     out = []
     for flight in range(first, first + count):
-        own = np.random.default_rng([recipe.seed, 8, flight])
+        own = np.random.default_rng([recipe.seed, 8, flight % recipe.days if recipe.days else flight])
         sizes = {name: float(deviation * own.standard_normal()) for name, deviation in recipe.varies.items()}
         world = world_of(recipe)
         for name, size in sizes.items():
