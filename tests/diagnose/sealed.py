@@ -301,9 +301,9 @@ def drawn(kind: str, number: int) -> Recipe:
     """A world of a kind: ``null``, ``law``, ``curve``, ``limit:NAME``, ``flights`` or ``EFFECTSxFLOORS``; those with a camera.
 
     ``null:COLOUR`` hides nothing behind noise of one of COLOURS, ``varies:NAME`` an effect that differs from flight to flight,
-    ``drifts:NAME`` one that differs from day to day, ``lost`` commands that never arrive. Those with a camera are ``sight``, ``camera`` and ``clear``. ``curve`` and ``sight`` hide one of the
-    effects whose limits are asked for, ``limit:NAME`` the one that it names, about its limit, ``camera`` any of a camera's, ``clear``
-    none. ``KIND+dust`` is the same with some of every other effect.
+    ``drifts:NAME`` one that differs from day to day, ``lost`` commands that never arrive. Those with a camera are ``sight``,
+    ``camera`` and ``clear``. ``curve`` and ``sight`` hide one of the effects whose limits are asked for, ``limit:NAME`` the one that
+    it names, about its limit, ``camera`` any of a camera's, ``clear`` none. ``KIND+dust`` is the same with some of every other effect.
     """
     if kind.endswith(DUSTY):
         return replace(drawn(kind.removesuffix(DUSTY), number), dust=DUST)
