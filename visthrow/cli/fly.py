@@ -43,6 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--pixels", choices=("learnt", "contours"), help="keypoints by a detector from rendered pictures, in place of projected ones"
     )
+    parser.add_argument("--save", metavar="FILE", help="write the policy as it is flown here; one for any vehicle becomes one for this, as hil flies it")
     add_out(parser, "out/fly", "for the files")
     parser.add_argument(
         "--allow", action="append", default=[], metavar="KEY",
@@ -77,6 +78,8 @@ def run(args: argparse.Namespace) -> int:
     goal = [args.target[0], args.target[1] if len(args.target) == 2 else 0.0, 0.0]
     check_goal(loaded, goal)
     writable(Path(args.out))
+    if args.save:
+        loaded.policy.save(args.save)
     if args.plant != "hybrid":
         print("flying on the reference plant; this takes about a minute", file=sys.stderr)
     eyes = None

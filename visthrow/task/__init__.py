@@ -307,7 +307,7 @@ class Experiment:
         return chosen
 
     def __post_init__(self) -> None:
-        if abs(self.camera.payload_radius - self.rope.payload_radius) > 1e-9:
+        if self.fleet is None and abs(self.camera.payload_radius - self.rope.payload_radius) > 1e-9:
             raise ConfigError(
                 f"camera.payload_radius is {self.camera.payload_radius} m and rope.payload_radius {self.rope.payload_radius} m; "
                 "expected the same ball"

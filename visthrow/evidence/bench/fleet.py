@@ -94,9 +94,7 @@ def _named(experiment: Any, name: str) -> Any:
 
     vehicle = config.load(VehicleParams, config.find("vehicle", name))
     rope, fleet = config.load(RopeParams, config.find("rope", name)), replace(experiment.fleet, count=0)
-    return replace(
-        experiment, vehicle=vehicle, rope=rope, fleet=fleet, camera=replace(experiment.camera, payload_radius=rope.payload_radius)
-    )
+    return replace(experiment, vehicle=vehicle, rope=rope, fleet=fleet)
 
 
 def _thrown(name: str, policy: Any, experiment: Any, vehicles: Sequence[str], each: int, device: str, seed: int) -> list[Row]:

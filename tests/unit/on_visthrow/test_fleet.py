@@ -1,0 +1,194 @@
+"""Vehicles of a class: drawn as stated, flown in their own units, and one policy for all as an ordinary one for each."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from sim.hybrid import HybridSim
+from sim.params import GRAVITY
+from sim.quadrotor.fleet import draw
+from sim.quadrotor.units import Units, in_units
+from visthrow import config
+from visthrow.common.errors import PolicyError
+from visthrow.onboard import actions as act
+from visthrow.onboard.pilot import Pilot
+from visthrow.onboard.policy import Policy
+from visthrow.task import Experiment, contract_of, plant_of
+from visthrow.task.fleet import alone, members, specialised
+from visthrow.training.env import ThrowEnv
+
+SAME = 3e-4
+"""Of float32 numbers whose units differ, after a network that reacts to each."""
+
+NAMED = ("paper", "crazyflie_brushless", "five_inch", "x500")
+
+
+def experiment(*overrides: str) -> Experiment:
+    return config.load(Experiment, config.find("train", "any"), ["fleet.count=3", *overrides])
+
+
+def of(name: str) -> Experiment:
+    return experiment(f'vehicle="vehicle/{name}.toml"', f'rope="rope/{name}.toml"', "fleet.count=0")
+
+
+def random_policy(of: Experiment, seed: int = 0) -> Policy:
+    torch.manual_seed(seed)
+    contract = contract_of(of)
+    width = contract["observation"]["dimension"]
+    mean, std = 0.3 * torch.randn(width), 0.2 + torch.rand(width)
+    return Policy(
+        (0.3 * torch.randn(16, width), 0.3 * torch.randn(5, 16)), (torch.randn(16), torch.randn(5)), "tanh", contract, {}, mean, std, 0.01
+    )
+
+
+def test_a_vehicle_is_the_same_in_every_draw_and_another_under_another_seed():
+    few, many = experiment("fleet.count=2", "fleet.first=7"), experiment("fleet.count=5", "fleet.first=4")
+    assert members(few) == members(many)[3:]
+    assert members(few)[0] != members(experiment("fleet.count=2", "fleet.first=7", "fleet.seed=2"))[0]
+    assert len({m.units.mass for m in members(many)}) == 5
+
+
+def test_drawn_vehicles_lie_in_the_ranges_and_follow_size():
+    base = experiment()
+    fleet, known = base.fleet, plant_of(base)
+    drawn = [draw(fleet, known, k) for k in range(300)]
+    mass = np.array([p.vehicle.body.mass for p in drawn])
+    assert fleet.mass[0] <= mass.min() < 0.04
+    assert 1.5 < mass.max() <= fleet.mass[1]
+    strength = np.array([4 * p.vehicle.controller.max_thrust / (p.total_mass * GRAVITY) for p in drawn])
+    assert fleet.least_thrust - 1e-9 <= strength.min() < 6.0 < strength.max()
+    size = mass / known.vehicle.body.mass
+    for name, exponent, value, reference in (
+        ("arm", 1 / 3, [p.vehicle.rotors.x[0] for p in drawn], known.vehicle.rotors.x[0]),
+        ("thrust", 1.0, [p.vehicle.controller.max_thrust for p in drawn], known.vehicle.controller.max_thrust),
+        ("motor_lag", 1 / 6, [p.vehicle.motor.time_constant for p in drawn], known.vehicle.motor.time_constant),
+        ("rope", 1 / 3, [p.rope.length for p in drawn], known.rope.length),
+        ("delay", 0.0, [p.vehicle.queue.delay for p in drawn], 1.0),
+        ("lag", 0.0, [p.release.lag for p in drawn], 1.0),
+    ):
+        factor, (low, high) = np.array(value) / reference / size**exponent, getattr(fleet, name)
+        near = 0.15 * (high - low)  # both ends are reached
+        assert low * (1 - 1e-9) <= factor.min() < low + near, name
+        assert high - near < factor.max() <= high * (1 + 1e-9), name
+
+
+@pytest.mark.parametrize("name", NAMED)
+def test_named_vehicles_lie_in_the_class(name):
+    base = experiment()
+    fleet, known, plant = base.fleet, plant_of(base), plant_of(of(name))
+    v, ratio = plant.vehicle, known.vehicle.body.mass / plant.vehicle.body.mass
+    alike = in_units(known, Units(ratio ** (1 / 3), ratio))
+    arm = np.hypot(v.rotors.x[0], v.rotors.y[0]) / np.hypot(alike.vehicle.rotors.x[0], alike.vehicle.rotors.y[0])
+    factors = {
+        "thrust": v.controller.max_thrust / alike.vehicle.controller.max_thrust,
+        "arm": arm,
+        "inertia": v.body.inertia[0] / alike.vehicle.body.inertia[0] / arm**2,
+        "motor_lag": v.motor.time_constant / alike.vehicle.motor.time_constant,
+        "propeller": v.rotors.radius / alike.vehicle.rotors.radius / arm,
+        "rope": plant.rope.length / alike.rope.length,
+        "payload": plant.rope.payload_mass / alike.rope.payload_mass,
+        "payload_size": plant.rope.payload_radius / alike.rope.payload_radius,
+        "delay": v.queue.delay,
+        "mass": v.body.mass,
+    }
+    outside = {key: x for key, x in factors.items() if not getattr(fleet, key)[0] <= x <= getattr(fleet, key)[1]}
+    assert not outside
+    assert 4 * v.controller.max_thrust / (plant.total_mass * GRAVITY) >= fleet.least_thrust
+
+
+def test_a_vehicle_flies_the_same_in_a_batch_as_alone_to_the_bit():
+    plants = [member.plant for member in members(experiment())]
+    parts = {f"{name}s": [getattr(p, name) for p in plants] for name in ("vehicle", "rope", "release")}
+    together = HybridSim(plants[0], 6, **parts)
+    commands = np.random.default_rng(0).uniform((1.0, -3.0, -3.0, -1.0), (6.0, 3.0, 3.0, 1.0), (25, 1, 4))
+
+    def fly(sim: HybridSim) -> dict[str, np.ndarray]:
+        sim.place(np.tile([0.0, 0.0, 1.3], (sim.count, 1)))
+        for k, command in enumerate(commands):
+            sim.set_command(np.repeat(command, sim.count, 0), np.full(sim.count, k >= 16))
+            sim.step()
+        return {name: sim.get(name) for name in ("pos_w", "quat_wb", "motor_speed", "landing_w", "time_to_impact", "cable_dir_w")}
+
+    batch = fly(together)
+    for k, plant in enumerate(plants):
+        single = fly(HybridSim(plant, 1))
+        for name, value in single.items():
+            np.testing.assert_array_equal(batch[name][[k, k + 3]], np.repeat(value, 2, 0), err_msg=f"{k}: {name}")
+    assert len(np.unique(batch["landing_w"][:, 0])) == 3
+
+
+def test_the_environment_flies_every_vehicle_with_its_own_limits_and_tells_them():
+    env = ThrowEnv(experiment("task.start.tether_variants=2"), "cpu", seed=1, count=12)
+    drawn, told = members(env.cfg), env.get_observations()["actor"][:, -4:]
+    for e in range(12):
+        own = drawn[e % 6 // 2]
+        assert told[e].tolist() == pytest.approx(own.told, rel=1e-6)
+        assert float(env.pose_age[e]) * own.units.time <= env.cfg.task.observation.latency[1] + 1e-6
+    env.step(torch.ones(12, 5), hold=True)
+    queued = env.views.command[:, 0]
+    for e in range(12):
+        assert float(queued[e]) == pytest.approx(drawn[e % 6 // 2].max_thrust, rel=0.1)  # noise of commands
+
+
+def quiet(base: Experiment) -> Experiment:
+    """The experiment without noise, latency or other masses and ropes."""
+    task = base.task
+    noise = dataclasses.replace(task.noise, observation_step=0.0, observation_bias=0.0, command_step=0.0, command_bias=0.0)
+    start = dataclasses.replace(task.start, mass=0.0, tether_variants=1)
+    observation = dataclasses.replace(task.observation, latency=(0.0, 0.0))
+    return dataclasses.replace(base, task=dataclasses.replace(task, noise=noise, start=start, observation=observation))
+
+
+@pytest.mark.parametrize("name", NAMED)
+def test_a_pilot_decides_in_si_units_what_the_policy_decides_in_the_vehicles(name):
+    base = quiet(of(name))
+    policy, env = random_policy(base), ThrowEnv(base, "cpu", seed=1, count=4)
+    own, one = specialised(policy, base)
+    pilot, units = Pilot(own, None, 4), members(base)[0].units
+    assert pilot.period == pytest.approx(0.02 * units.time)
+    assert own.total_mass == pytest.approx(plant_of(base).total_mass)
+    most, rates = members(base)[0].max_thrust, torch.tensor(base.task.action.max_rate)
+    shown, on = env.get_observations()["actor"], np.ones(4, bool)
+    for _ in range(15):
+        wanted = policy.act(shown)
+        state, size = {k: v.numpy() for k, v in env.views.state.items()}, units.length
+        payload, goal = env.views.out["payload_pos_w"].numpy() * size, env.views.goal_w.numpy() * size
+        out = pilot.act(
+            state["pos_w"] * size, state["quat_wb"], state["vel_w"] * size / units.time, state["rate_b"] / units.time, payload, goal
+        )
+        np.testing.assert_allclose(out.action[on], act.clip_action(wanted).numpy()[on], atol=SAME)
+        command = act.command_from_action(torch.from_numpy(out.action), most, rates)
+        np.testing.assert_allclose(out.command[:, 0], command[:, 0] * units.size((1, 1, -2)), rtol=SAME)
+        np.testing.assert_allclose(out.command[:, 1:], command[:, 1:] / units.time, rtol=SAME, atol=SAME)
+        shown, _, done, _ = env.step(wanted, hold=True)
+        shown, on = shown["actor"], on & (done.numpy() == 0)
+    assert on.any()
+    assert one.rope.length == plant_of(base).rope.length
+
+
+def test_one_vehicles_experiment_is_the_same_task_at_its_size():
+    one = alone(of("x500"))
+    size, usual = 0.8 / 0.33, config.load(Experiment, config.find("train", "any"))
+    assert one.fleet is None
+    assert one.task.observation.setup == "none"
+    assert one.task.bounds.horizontal == pytest.approx(usual.task.bounds.horizontal * size)
+    assert one.release.landing_height == pytest.approx(usual.release.landing_height * size)
+    assert one.release.lag == pytest.approx(usual.release.lag)
+    assert one.sim.control_period == pytest.approx(0.02 * np.sqrt(size))
+    assert one.task.action.max_thrust == pytest.approx(4 * one.vehicle.controller.max_thrust)
+    assert config.loads(Experiment, config.dumps(one)) == one
+
+
+def test_a_policy_of_one_vehicle_is_not_specialised():
+    base = config.load(Experiment, config.find("train", "state"))
+    with pytest.raises(PolicyError, match="contract of one vehicle; expected one that was trained for a fleet"):
+        specialised(random_policy(base), of("x500"))
+
+
+def test_ranges_that_nothing_can_be_drawn_from_are_refused():
+    with pytest.raises(config.ConfigError, match=r"fleet\.mass is 2\.0 to 0\.03: expected an ascending range above 0"):
+        experiment("fleet.mass=[2.0, 0.03]")
+    with pytest.raises(config.ConfigError, match=r"fleet\.count is -1"):
+        experiment("fleet.count=-1")
