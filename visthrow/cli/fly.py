@@ -43,7 +43,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--pixels", choices=("learnt", "contours"), help="keypoints by a detector from rendered pictures, in place of projected ones"
     )
-    parser.add_argument("--save", metavar="FILE", help="write the policy as it is flown here; one for any vehicle becomes one for this, as hil flies it")
+    saved = "write the policy as it is flown here: one for any vehicle becomes one for this vehicle, as hil takes it"
+    parser.add_argument("--save", metavar="FILE", help=saved)
     add_out(parser, "out/fly", "for the files")
     parser.add_argument(
         "--allow", action="append", default=[], metavar="KEY",
