@@ -30,6 +30,7 @@ class FleetParams:
     rope_length: float  # [m]
     total_mass: float  # vehicle and all that hangs on it [kg]
     least_thrust: float  # full thrust over the weight of all, of the heaviest payload that a vehicle is given [-]
+    yaw_loop: float  # at most this times as fast as the known vehicle's, or its gains are turned down; see :func:`yaw_rate`
     mass: Range  # of the vehicle [kg]
     thrust: Range  # factor of the full thrust
     arm: Range  # factor
@@ -57,7 +58,8 @@ class FleetParams:
 
     def __post_init__(self) -> None:
         """Raise ValueError for ranges that nothing can be drawn from."""
-        require_positive("fleet", rope_length=self.rope_length, total_mass=self.total_mass, least_thrust=self.least_thrust)
+        require_positive("fleet", rope_length=self.rope_length, total_mass=self.total_mass)
+        require_positive("fleet", least_thrust=self.least_thrust, yaw_loop=self.yaw_loop)
         if self.count < 0 or self.first < 0 or self.seed < 0:
             raise ValueError(f"fleet.count is {self.count}, first {self.first}, seed {self.seed}: expected 0 or more of each")
         for name, (low, high) in self.ranges.items():
@@ -81,11 +83,32 @@ def draw(fleet: FleetParams, known: PlantParams, number: int) -> PlantParams:
     x = dict(zip(fleet.ranges, drawn.tolist()))
     ratio = known.vehicle.body.mass / x["mass"]
     alike = Units(ratio ** (1 / 3), ratio)  # in these units the known vehicle has the mass that was drawn
-    vehicle, rope = _vehicle(in_units(known.vehicle, alike), x), in_units(known.rope, alike)
+    usual, rope = in_units(known.vehicle, alike), in_units(known.rope, alike)
+    vehicle = _vehicle(usual, x)
+    vehicle = _calm(vehicle, fleet.yaw_loop * yaw_rate(usual) / yaw_rate(vehicle))
     own = vehicle.body.mass + rope.rope_mass * x["rope"] * x["rope_mass"]
     most = 4.0 * vehicle.controller.max_thrust / (fleet.least_thrust * GRAVITY) - own
     x["payload"] = min(x["payload"], most / rope.payload_mass)
     return replace(known, vehicle=vehicle, rope=_rope(rope, x), release=replace(known.release, lag=x["lag"]))
+
+
+def yaw_rate(v: VehicleParams) -> float:
+    """Bandwidth of the yaw loop by its rotors' inertia alone [1/s], in hover.
+
+    A rotor that is made to turn faster pushes the body at once, by ``J_r`` over the motor's lag: on many vehicles more than by
+    its drag. Where that is faster than a flight controller's clock, yaw swings up.
+    """
+    speed = math.sqrt(v.body.mass * GRAVITY / (4.0 * v.thrust.k_f))
+    push = v.rotors.inertia / (2.0 * v.thrust.k_f * speed * v.motor.time_constant * v.thrust.torque_ratio)
+    return push * v.controller.p_gain[2] / v.body.inertia[2]
+
+
+def _calm(v: VehicleParams, share: float) -> VehicleParams:
+    """The vehicle with its yaw gains turned down to a share of them, if that is below 1."""
+    c, share = v.controller, min(share, 1.0)
+    names = ("p_gain", "i_gain", "feedforward_gain")
+    gains = {name: (*getattr(c, name)[:2], share * getattr(c, name)[2]) for name in names}
+    return replace(v, controller=replace(c, **gains))
 
 
 def _vehicle(v: VehicleParams, x: dict[str, float]) -> VehicleParams:
