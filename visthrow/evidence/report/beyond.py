@@ -36,7 +36,7 @@ def section(thrown: ResultSet) -> Section:
         if not found:
             missing.append(TITLES[variant])
         rows += _rows(found)
-    rows += _rows([r for r in thrown.matching(kind="policy", variant="full") if r.unit["policy"] in SHIPPED and _beyond(r)])
+    rows += _rows([r for r in thrown.matching(kind="policy") if r.unit["policy"] in SHIPPED and _beyond(r)])
     if rows:
         head = ("policy", "training", "plant", "flown with", "target [m]", "throws", "landed", "landing error [m]")
         note = "'its own': the conditions of its own training; else what was changed."

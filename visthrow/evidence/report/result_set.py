@@ -35,7 +35,7 @@ class ResultSet:
     note: str = ""
 
     def policies(
-        self, plant: str, target: float, *, layout: str | None = None, variant: str = "full", policy: str | None = None,
+        self, plant: str, target: float, *, layout: str | None = None, variant: str | None = None, policy: str | None = None,
         departures: Any = ANY,
     ) -> list[Result]:  # fmt: skip
         """Throws of learnt policies, one result a policy: of several alike the one with most throws.
@@ -44,11 +44,12 @@ class ResultSet:
             plant: of :data:`visthrow.throws.plants.PLANTS`.
             target: [m].
             layout: "state" or "vision"; None for either.
-            variant: of the training.
+            variant: of the training; None for any.
             policy: by its name alone; None for all.
             departures: that the throws were flown with; a dictionary, or :data:`ANY`.
         """
-        wanted = {"kind": "policy", "plant": plant, "target": target, "variant": variant}
+        wanted = {"kind": "policy", "plant": plant, "target": target}
+        wanted |= {} if variant is None else {"variant": variant}
         wanted |= {} if layout is None else {"layout": layout}
         wanted |= {} if policy is None else {"policy": policy}
         wanted |= {} if departures is ANY else {"departures": departures}
@@ -80,7 +81,7 @@ class ResultSet:
 
     def by_departure(self, policy: str, key: str, plant: str = "hybrid", target: float = 2.0) -> list[tuple[Any, Result]]:
         """A shipped policy's throws with one value of the config changed: the value and the throws, ascending."""
-        found = [r for r in self.matching(kind="policy", policy=policy, plant=plant, target=target, variant="full")
+        found = [r for r in self.matching(kind="policy", policy=policy, plant=plant, target=target)
                  if list(r.unit["departures"]) == [key]]  # fmt: skip
         return sorted(((r.unit["departures"][key], r) for r in found), key=lambda pair: _first(pair[0]))
 
