@@ -19,8 +19,8 @@ from sim.step import build_step
 PIECES = 2
 """Number of pieces of a batch for each core of a CPU; more than one, since a core may have other work too."""
 
-FEWEST = 64
-"""Environments of a piece: their step takes a millisecond, its launch a tenth."""
+FEWEST = 32
+"""Environments of a piece: their step takes half a millisecond, its launch a tenth."""
 
 _BUILDS: dict[tuple[Any, ...], tuple[Any, Any, Any]] = {}
 

@@ -91,7 +91,7 @@ def test_the_pilot_remembers_as_training_does(whole):
             out = pilot.act(*views, env.views.out["payload_pos_w"].numpy().copy(), env.views.goal_w.numpy().copy(), state["attached"])
             action = act(seen)
             np.testing.assert_allclose(out.action, action.clamp(-1.0, 1.0).numpy(), atol=AGREES)
-            seen = env.step(action, hold=True)[0]["actor"]
+            seen = env.carry(action)["actor"]
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

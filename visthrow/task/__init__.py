@@ -202,24 +202,23 @@ class FirstOrderParams:
 
     iterations: int = 1000  # gradients
     horizon: int = 48  # of a flight [control steps]; the latch trips near the 35th
-    decay: float = 0.97  # of derivatives, per step backward; with 0.92 500 gradients of 4,096 throws end at 0.059 m, with 0.97 at 0.041 m
+    decay: float = 0.985  # of derivatives, per step backward
     learning_rate: float = 2e-3  # at the first iteration
     adapting_rate: float = 3e-4  # in its place where the training starts from a policy
     final_rate: float = 5e-5  # at the last one; half a cosine between
     max_grad_norm: float = 1.0
     width: float = 0.5  # of the hazard at the first iteration, in units of the fifth action
-    final_width: float = 0.05
-    sharp: float = 0.7  # share of the training after which the width is the final one; geometric till then
-    first_release: int = 24  # step before which nothing is released at the beginning: else the payload is dropped at once
-    free: tuple[float, float] = (0.2, 0.5)  # shares of the training between which that step comes down to 0
+    final_width: float = 0.2
+    shaping: float = 0.3  # share of the training after which the release is the latch's own; before, it is smooth, and held shut at first:
+    first_release: int = 24  # step before which nothing is released at the first iteration, or the payload is dropped at once
     initial_release: float = -2.0  # fifth action of the untrained network
     saturation: float = 1.0  # cost of the square that an action is past its limits by
 
     def __post_init__(self) -> None:
-        if not (self.iterations > 0 and 0.0 <= self.free[0] < self.free[1] and self.sharp > 0.0 and 0.0 < self.final_width <= self.width):
+        if not (self.iterations > 0 and self.shaping > 0.0 and 0.0 < self.final_width <= self.width):
             raise ConfigError(
-                f"first_order: iterations {self.iterations}, free {self.free}, sharp {self.sharp}, widths {self.width} to "
-                f"{self.final_width}; expected 1 or more, an ascending range, a share above 0, widths above 0 that do not grow"
+                f"first_order: iterations {self.iterations}, shaping {self.shaping}, widths {self.width} to {self.final_width}; "
+                "expected 1 or more, a share above 0, widths above 0 that do not grow"
             )
 
 

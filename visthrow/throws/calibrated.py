@@ -70,7 +70,7 @@ def _hovered(env: ThrowEnv) -> list[Hovered]:
             rows.append((np.full(env.num_envs, k * period), *measured[:4], command[:, 0], *measured[4:]))
         action = act.action_from_command(torch.from_numpy(command).float(), cfg.task.action.max_thrust, rate)
         env.episode_length_buf.zero_()  # a hover has no time limit
-        env.step(torch.cat([action, -torch.ones(env.num_envs, 1)], -1).to(env.device), hold=True)
+        env.carry(torch.cat([action, -torch.ones(env.num_envs, 1)], -1).to(env.device))
     time, pos, quat, vel, rates, thrust, points, valid = (np.stack(column, 1) for column in zip(*rows))
     goal = env.views.goal_w.cpu().numpy()
     return [

@@ -125,6 +125,7 @@ class ThrowEnv(VecEnv):
             "late_points": torch.zeros(E, latency, KEYPOINTS, 2, **make),
             "late_valid": torch.zeros(E, latency, KEYPOINTS, device=device, dtype=torch.bool),
             "totals": torch.zeros(len(RESULTS), device=device, dtype=torch.float64),
+            "continued": torch.zeros(E, device=device, dtype=torch.bool),
         }
         if self.layout.response:
             memory["answers"] = torch.zeros(E, 1 + self.layout.response, ob.RESPONSE, **make)
@@ -215,17 +216,34 @@ class ThrowEnv(VecEnv):
         """Observations of the current step."""
         return self._observations.clone()
 
-    def step(self, actions: Tensor, hold: bool = False) -> tuple[TensorDict, Tensor, Tensor, dict]:
-        """Apply actions, shape (E, 5), for one control period; finished episodes start anew.
+    def carry(self, actions: Tensor) -> TensorDict:
+        """Apply unclipped actions, shape (E, 5), for one control period with the latch shut, whatever becomes of it: no episode ends.
 
-        Args:
-            actions: unclipped.
-            hold: keep the latch shut whatever is asked.
+        Returns:
+            Observations.
+        """
+        self._memory["previous"].copy_(self._apply(actions, hold=True))
+        self._observations = self._observe(self._memory["continued"])
+        return self._observations
+
+    def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict]:
+        """Apply unclipped actions, shape (E, 5), for one control period; finished episodes start anew.
 
         Returns:
             Observations, rewards (E,), dones (E,), and an empty dictionary: the time limit is a negative end and must not
             be bootstrapped, so there are no ``time_outs``.
         """
+        action = self._apply(actions)
+        reward, done = self._judge(action)
+        self._tally(done)
+        self._start(done)
+        self._memory["previous"].copy_(action)
+        self._begin(done)
+        self._observations = self._observe(done)
+        return self._observations, reward, done.to(torch.float32), {}
+
+    def _apply(self, actions: Tensor, hold: bool = False) -> Tensor:
+        """Fly one control period; returns the clipped actions."""
         task, memory = self.cfg.task, self._memory
         action = act.clip_action(actions)
         noisy = action[:, : act.COMMANDS] + torch.randn_like(memory["command_bias"]) * task.noise.command_step
@@ -237,13 +255,7 @@ class ThrowEnv(VecEnv):
         if task.target.moves:
             self.views.goal_w.add_(memory["goal_vel"] * self.cfg.sim.control_period)
         self.episode_length_buf += 1
-        reward, done = self._judge(action)
-        self._tally(done)
-        self._start(done)
-        memory["previous"].copy_(action)
-        self._begin(done)
-        self._observations = self._observe(done)
-        return self._observations, reward, done.to(torch.float32), {}
+        return action
 
     def _mask(self, done: Tensor):
         """Warp view of a boolean mask."""

@@ -1,5 +1,6 @@
 """First-order training on the throwing task, as a trainer drives it."""
 
+import dataclasses
 import math
 import time
 from types import SimpleNamespace
@@ -19,7 +20,7 @@ from visthrow.training import rewards
 from visthrow.training.env import ThrowEnv
 from visthrow.training.first_order.backward import Setting, build_backward
 from visthrow.training.first_order.surrogate import Flights, Plants, Surrogate, fit
-from visthrow.training.ppo.network import Network, averaged
+from visthrow.training.ppo.network import Network
 from visthrow.training.ranks import Ranks
 
 BARRIER = 600.0
@@ -27,14 +28,11 @@ BARRIER = 600.0
 MARGINS = {"altitude": 0.15, "ground": 0.1, "above": 0.08, "upright": 0.15}
 """Reach of the barriers: of altitude, payload over ground, payload below vehicle [m], cosine of the tilt."""
 
+ROUND = 0.02
+"""Landing errors are smooth below this [m]: the slope of a distance turns round at the goal, which is noise where throws are good."""
+
 OUTLIER = 4.0
 """A flight's derivatives are shortened to this many times the median flight's."""
-
-AVERAGED = 100
-"""Gradient steps that the exported weights are a mean of, at most."""
-
-STEPS_AT_ONCE = 4
-"""Of a flight whose Jacobians are taken together on the way: they fit a core's cache."""
 
 
 class FirstOrder:
@@ -66,7 +64,7 @@ class FirstOrder:
         if experiment.task.target.moves:
             raise ConfigError('algorithm = "first_order" throws at goals that stand still; "ppo" at those that move too')
         self._ranks = ranks
-        self.env = env = ThrowEnv(experiment, device, seed)
+        self.env = env = ThrowEnv(dataclasses.replace(experiment, ppo=dataclasses.replace(p, privileged=())), device, seed)  # without a critic
         E, T, self.iterations = env.num_envs, self.p.horizon, self.p.iterations
         self.samples = E * T * ranks.world
         seen = env.get_observations()
@@ -90,12 +88,11 @@ class FirstOrder:
         k = torch.arange(self.releases, device=device)
         self._separation = [(w, (k + self.lag + int(a)).clamp(0, T)) for a, w in zip(nodes, shares)]
         self._drop = torch.tensor([0.0, 0.0, 0.5 * GRAVITY], **make)
-        self._width, self._first = torch.zeros((), **make), torch.zeros((), **make)
+        self._latched = 0.0  # share of the latch in the hazard
         self._figures: dict[str, Tensor] = {}
         self._adapting = False
         self._begin()
         ranks.share(self.network)
-        self.average = averaged(self.network.mlp, AVERAGED)
         on_gpu = device.startswith("cuda")
         rate = torch.tensor(self.p.learning_rate, **make) if on_gpu else self.p.learning_rate
         self.optimizer = torch.optim.Adam(self.network.mlp.parameters(), lr=rate, betas=(0.9, 0.95), capturable=on_gpu)
@@ -146,7 +143,7 @@ class FirstOrder:
         path = (x.load_pos - x.pos)[:, :, None] + share[..., None] * x.load_vel[:, :, None] - share[..., None] ** 2 * self._drop
         clearance = (path.square().sum(-1) + 1e-12).sqrt().amin(-1)
         landing, fall, clearance = (sum(w * value[i] for w, i in self._separation) for value in (landing, fall, clearance))
-        error = ((landing - self.goal[:, :2]).square().sum(-1) + 1e-8).sqrt()
+        error = ((landing - self.goal[:, :2]).square().sum(-1) + ROUND**2).sqrt()
         reward = rewards.landing(p, error) + rewards.time_of_flight(p, fall)
         return reward + rewards.proximity(p, clearance, release.clearance_margin), error, fall
 
@@ -175,7 +172,10 @@ class FirstOrder:
         p, K, steps = self.cfg.task.reward, self.releases, self.flights.steps
         k = torch.arange(self.p.horizon, device=steps.device)[:, None]
         reward, error, fall = self._rewards_at_release(x)
-        hazard = torch.sigmoid((x.action[:K, :, act.COMMANDS] - self.cfg.release.threshold) / self._width) * (k[:K] >= self._first)
+        asked = x.action[:K, :, act.COMMANDS] - self.cfg.release.threshold
+        hazard = torch.sigmoid(asked / (self.p.width * (self.p.final_width / self.p.width) ** self._latched))
+        hazard = hazard + self._latched * ((asked > 0.0).float() - hazard).detach()  # the slope stays that of the smooth one
+        hazard = hazard * (k[:K] >= self.p.first_release * (1.0 - self._latched))
         ended, cut = k[:K] > steps, k[:K] + self.lag + 2 > steps
         hazard = torch.where(ended, 1.0, hazard)
         reward = torch.where(cut, -p.termination, reward)
@@ -186,6 +186,7 @@ class FirstOrder:
         gain = (chance * reward).sum(0) + (carried * self._carrying(x)).sum(0) - p.termination * survival[-1]
         done = (chance * ~cut).detach()
         total = done.sum().clamp(min=1e-6)
+        error = (error.square() - ROUND**2).clamp(min=0.0).sqrt()
         duration = (k[:K] + 1) * self.cfg.sim.control_period + self.cfg.release.lag + fall
         figures = {"released": done.sum() / done.shape[1], "landing_error": (done * error).sum() / total,
                    "duration": (done * duration).sum() / total}  # fmt: skip
@@ -228,30 +229,15 @@ class FirstOrder:
 
     def _jacobian(self) -> Tensor:
         """Derivatives of the network's actions by the observations of the last rollout, shape (T, E, 5, D)."""
-        *hidden, last = self.network.mlp
-        normalizer = self.network.obs_normalizer
-        scale = normalizer._std + normalizer.eps if self.network.obs_normalization else 1.0
-        jacobian = []
-        for x in self.obs.split(STEPS_AT_ONCE):
-            x, slopes = normalizer(x.flatten(0, 1)), []
-            for linear, activation in zip(hidden[::2], hidden[1::2], strict=True):
-                with torch.enable_grad():
-                    x = linear(x).detach().requires_grad_()
-                    y = activation(x)
-                    slopes.append(torch.autograd.grad(y.sum(), x)[0])
-                x = y.detach()
-            product = last.weight.detach().expand(len(x), -1, -1)
-            for linear, slope in zip(hidden[-2::-2], reversed(slopes), strict=True):
-                product = (product * slope[:, None]) @ linear.weight.detach()
-            jacobian.append((product / scale).view(-1, self.env.num_envs, *product.shape[1:]))
-        return torch.cat(jacobian)
+        seen = self.obs.clone().requires_grad_()
+        with torch.enable_grad():
+            by_action = [action.sum() for action in self.act(seen).unbind(-1)]
+        return torch.stack([torch.autograd.grad(action, seen, retain_graph=True)[0] for action in by_action], 2)
 
     def step(self, done: float) -> dict[str, float]:
         """One rollout and one step of Adam at this share of the training; returns its figures."""
         p, start = self.p, time.perf_counter()
-        learnt = 1.0 if self._adapting else done
-        self._width.fill_(p.width * (p.final_width / p.width) ** min(learnt / p.sharp, 1.0))
-        self._first.fill_(p.first_release * min(max((p.free[1] - learnt) / (p.free[1] - p.free[0]), 0.0), 1.0))
+        self._latched = 1.0 if self._adapting else min(done / p.shaping, 1.0)
         highest = p.adapting_rate if self._adapting else p.learning_rate
         rate = p.final_rate + 0.5 * (highest - p.final_rate) * (1.0 + math.cos(math.pi * done))
         for group in self.optimizer.param_groups:
@@ -268,7 +254,7 @@ class FirstOrder:
     def _descend(self) -> None:
         """Gradient of the last rollout, Adam, observation statistics."""
         by_action, self._figures = self.derivatives()
-        flown = torch.arange(self.p.horizon, device=self.env.device)[:, None] <= self.flights.steps
+        flown = self.flights.flown()
         by_action = by_action * flown[..., None]
         size = by_action.square().sum((0, 2)).sqrt()  # a few wild flights must not outweigh the rest
         by_action = by_action * (OUTLIER * size.sort().values[len(size) // 2] / size.clamp(min=1e-12)).clamp(max=1.0)[:, None]
@@ -282,8 +268,7 @@ class FirstOrder:
         self._figures["gradient_norm"] = torch.nn.utils.clip_grad_norm_(parameters, self.p.max_grad_norm)
         self._figures["ended"] = (self.flights.steps < self.p.horizon).float().mean()
         self.optimizer.step()
-        self.average.update_parameters(self.network.mlp)
-        self._watch(seen)
+        self._watch(self.obs[flown])
 
     def _watch(self, seen: Tensor) -> None:
         """Take observations, shape (N, D), into the normaliser's statistics."""
@@ -295,24 +280,20 @@ class FirstOrder:
 
     def export(self, contract: dict, made_by: dict) -> Policy:
         """The policy as a file's content."""
-        mean = {f"mlp.{name}": value for name, value in self.average.module.state_dict().items()}
-        return Policy.from_actor_state(self.network.state_dict() | mean, self.cfg.ppo.activation, contract, made_by)
+        return Policy.from_actor_state(self.network.state_dict(), self.cfg.ppo.activation, contract, made_by)
 
     def take_up(self, policy: Policy) -> None:
         """Start from a policy of the same layers: it releases as it has learnt to, and the rate starts at that of adaptation."""
         self.network.take_up(policy)
-        self.average.module.load_state_dict(self.network.mlp.state_dict())
         self._adapting = True
 
     def state_dict(self) -> dict:
         """All that the next iteration depends on, besides torch's generators."""
-        learnt = {name: getattr(self, name).state_dict() for name in ("network", "average", "optimizer", "env")}
+        learnt = {name: getattr(self, name).state_dict() for name in ("network", "optimizer", "env")}
         return {**learnt, "adapting": self._adapting, "surrogate": vars(self.surrogate)}
 
     def load_state_dict(self, saved: dict, own_throws: bool = True) -> None:
-        """Take up a state of :meth:`state_dict`; its environment too where ``own_throws`` is set."""
         self.network.load_state_dict(saved["network"])
-        self.average.load_state_dict(saved["average"])
         self.optimizer.load_state_dict(saved["optimizer"])
         self.surrogate, self._adapting = Surrogate(**saved["surrogate"]), saved["adapting"]
         if own_throws:

@@ -24,6 +24,7 @@ from torch import Tensor
 from sim.params import GRAVITY
 from sim.quadrotor.queue import queue_depth
 from visthrow.onboard import observations as ob
+from visthrow.training import terminations
 from visthrow.training.env import ThrowEnv
 
 EXCITED, KEPT = (0.35, 0.5, 0.5, 0.5, 0.0), 0.7
@@ -81,26 +82,33 @@ class Flights:
         for name, kind in kinds.items():
             setattr(self.course, name, wp.from_torch(self.x[name], dtype=kind))
         self.steps, self.mass = torch.zeros(count, device=device, dtype=torch.int32), torch.zeros(count, device=device)
+        self.status = torch.zeros(steps + 1, count, device=device, dtype=torch.int32)
+
+    def flown(self) -> Tensor:
+        """Whether the flight had not ended, shape (T, E), at each of its steps."""
+        return torch.arange(len(self.status) - 1, device=self.steps.device)[:, None] <= self.steps
 
     def fly(self, env: ThrowEnv, plants: Plants, act: Callable[[int, Tensor], Tensor], passed: Callable[[int], None]) -> None:
         """Fly from new starts without release; ``act(k, observations)``, then ``passed(k)`` at each state k, the last included."""
-        state, out, x = env.views.state, env.views.out, self.x
+        state, out, x, T = env.views.state, env.views.out, self.x, len(self.status) - 1
         seen = env.reset()
         self.mass.copy_(plants.body_mass * state["mass_scale"] + plants.rope_mass)
-        self.steps.zero_()
-        alive = torch.ones_like(self.steps)
-        for k in range(len(x["pos"])):
+        for k in range(T + 1):
             for name, source in (("pos", state["pos_w"]), ("vel", state["vel_w"]), ("quat", state["quat_wb"]),
                                  ("load_pos", out["payload_pos_w"]), ("load_vel", out["payload_vel_w"])):  # fmt: skip
                 x[name][k].copy_(source)
             x["response"][k, :, 0].copy_(plants.thrust_factor * state["motor_speed"].square().sum(-1))
             x["response"][k, :, 1:].copy_(state["rate_b"])
+            self.status[k].copy_(state["status"])
             passed(k)
-            if k < len(x["pos"]) - 1:
-                seen, _, done, _ = env.step(act(k, seen["actor"]), hold=True)
+            if k < T:
+                seen = env.carry(act(k, seen["actor"]))
                 x["command"][k].copy_(env.views.command)
-                alive = alive * (done == 0)
-                self.steps += alive
+        flown = (x["pos"][1:], ob.rotation_from_quat(x["quat"][1:]), x["load_pos"][1:], self.status[1:])
+        pos, rot, load_pos, status = (value.flatten(0, 1) for value in flown)
+        held, time = torch.zeros_like(status, dtype=torch.bool), torch.zeros_like(pos[:, 0])
+        ends = terminations.negative(env.cfg.task.bounds, pos, rot, load_pos, status, held, time, env.cfg.release.landing_height)
+        self.steps.copy_((~ends).view(T, -1).int().cumprod(0).sum(0))
 
 
 @dataclass
@@ -113,7 +121,7 @@ class Surrogate:
 
 
 def fit(env: ThrowEnv, plants: Plants, watch: Callable[[Tensor], None], steps: int = 40) -> Surrogate:
-    """Fit the surrogate to random flights; ``watch`` is shown the actor's observations, shape (E, D), of each step."""
+    """Fit the surrogate to random flights; ``watch`` is shown what the actor observed in them, shape (N, D)."""
     period = env.cfg.sim.control_period
     lags = max(queue_depth(v.queue.delay, period) for v in env.sim.vehicles)
     flights, parts = Flights(steps, env.num_envs, env.device), []
@@ -121,12 +129,14 @@ def fit(env: ThrowEnv, plants: Plants, watch: Callable[[Tensor], None], steps: i
     swing = torch.randn_like(hover) * spread
 
     def act(k: int, seen: Tensor) -> Tensor:
-        watch(seen)
+        observed.append(seen)
         swing.mul_(KEPT).add_((1.0 - KEPT**2) ** 0.5 * spread * torch.randn_like(swing))
         return hover + swing
 
     for _ in range(FITTED // (env.num_envs * steps) + 1):
+        observed: list[Tensor] = []
         flights.fly(env, plants, act, lambda k: None)
+        watch(torch.stack(observed)[flights.flown()])
         parts.append(_regressors(flights, plants, lags, period))
     rows = {name: torch.cat([part[name] for part in parts]).double() for name in parts[0]}
     response = [_solve(rows["lagged"][..., c], rows["next"][:, c])[:-1] for c in range(4)]
