@@ -208,17 +208,20 @@ class FirstOrderParams:
     final_rate: float = 5e-5  # at the last one; half a cosine between
     max_grad_norm: float = 1.0
     width: float = 0.5  # of the hazard at the first iteration, in units of the fifth action
-    final_width: float = 0.2
-    shaping: float = 0.3  # share of the training after which the release is the latch's own; before, it is smooth, and held shut at first:
-    first_release: int = 24  # step before which nothing is released at the first iteration, or the payload is dropped at once
+    final_width: float = 0.35
+    sharp: float = 0.3  # share of the training after which the width is the final one; geometric till then
+    latched: tuple[float, float] = (0.1, 0.2)  # shares of the training between which the hazard's value becomes the latch's
+    first_release: int = 24  # step before which nothing is released at the beginning: else the payload is dropped at once
+    free: tuple[float, float] = (0.05, 0.15)  # shares of the training between which that step comes down to 0
     initial_release: float = -2.0  # fifth action of the untrained network
     saturation: float = 1.0  # cost of the square that an action is past its limits by
 
     def __post_init__(self) -> None:
-        if not (self.iterations > 0 and self.shaping > 0.0 and 0.0 < self.final_width <= self.width):
+        ascending = all(0.0 <= low < high for low, high in (self.free, self.latched))
+        if not (self.iterations > 0 and ascending and self.sharp > 0.0 and 0.0 < self.final_width <= self.width):
             raise ConfigError(
-                f"first_order: iterations {self.iterations}, shaping {self.shaping}, widths {self.width} to {self.final_width}; "
-                "expected 1 or more, a share above 0, widths above 0 that do not grow"
+                f"first_order: iterations {self.iterations}, free {self.free}, latched {self.latched}, sharp {self.sharp}, "
+                f"widths {self.width} to {self.final_width}; expected 1 or more, ascending ranges, a share above 0, falling widths above 0"
             )
 
 

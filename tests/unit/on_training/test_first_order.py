@@ -194,7 +194,8 @@ def small_task():
     words += [f"task.start.{name}=0" for name in ("mass", "cable_angle_deg", "cable_rate_deg")]
     words += ["task.start.goal_radius=1.0", "ppo.environments=32", "ppo.hidden=[32,32]", "ppo.minibatches=1"]
     words += [f"first_order.{word}" for word in ("horizon=40", "iterations=100", "learning_rate=4e-3", "initial_release=-0.5",
-                                                 "final_width=0.1", "first_release=20", "shaping=2.0")]  # fmt: skip
+                                                 "final_width=0.1", "first_release=20", "latched=[2.0,3.0]", "free=[2.0,3.0]",
+                                                 "sharp=0.7")]  # fmt: skip
     return config.load(Experiment, config.find("train", "state"), ['algorithm="first_order"', *words])
 
 

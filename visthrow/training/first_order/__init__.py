@@ -7,8 +7,8 @@ mean over the step of release: with the survival S[k] = prod_(j < k) (1 - h[j]),
 
     - sum_k S[k] h[k] (reward at release k) - sum_k S[k - lag] (rewards while carrying) + S[end] (penalty of an end)
 
-On a schedule the width falls and the value of h becomes the latch's, 0 or 1, while its slope stays the sigmoid's: what is flown
-is then what is judged, and the width is that of a kernel estimate of how many releases a change would move. Soft barriers stand before the bounds, where rewards have no
-slope. The derivatives by states and actions run backward through the surrogate and the network's Jacobian in one
-kernel; decaying by a factor each step, they stay bounded.
+On a schedule the width falls and the value of h becomes the latch's, 0 or 1, while its slope stays the sigmoid's: what
+is differentiated is then what is flown, and the width is that of a kernel estimate of how many releases a change moves.
+Soft barriers stand before the bounds, where rewards have no slope. The derivatives by states and actions run backward
+through the surrogate and the network's Jacobian in one kernel; decaying by a factor each step, they stay bounded.
 """

@@ -64,7 +64,8 @@ class FirstOrder:
         if experiment.task.target.moves:
             raise ConfigError('algorithm = "first_order" throws at goals that stand still; "ppo" at those that move too')
         self._ranks = ranks
-        self.env = env = ThrowEnv(dataclasses.replace(experiment, ppo=dataclasses.replace(p, privileged=())), device, seed)  # without a critic
+        blind = dataclasses.replace(experiment, ppo=dataclasses.replace(p, privileged=()))  # there is no critic
+        self.env = env = ThrowEnv(blind, device, seed)
         E, T, self.iterations = env.num_envs, self.p.horizon, self.p.iterations
         self.samples = E * T * ranks.world
         seen = env.get_observations()
@@ -88,7 +89,7 @@ class FirstOrder:
         k = torch.arange(self.releases, device=device)
         self._separation = [(w, (k + self.lag + int(a)).clamp(0, T)) for a, w in zip(nodes, shares)]
         self._drop = torch.tensor([0.0, 0.0, 0.5 * GRAVITY], **make)
-        self._latched = 0.0  # share of the latch in the hazard
+        self._schedule(0.0)
         self._figures: dict[str, Tensor] = {}
         self._adapting = False
         self._begin()
@@ -97,6 +98,13 @@ class FirstOrder:
         rate = torch.tensor(self.p.learning_rate, **make) if on_gpu else self.p.learning_rate
         self.optimizer = torch.optim.Adam(self.network.mlp.parameters(), lr=rate, betas=(0.9, 0.95), capturable=on_gpu)
         self.rollout = Replayed(self._fly) if on_gpu else self._fly
+
+    def _schedule(self, done: float) -> None:
+        """Width of the hazard, share of the latch in it, and first step that it counts at, at this share of the training."""
+        p = self.p
+        self._width = p.width * (p.final_width / p.width) ** min(done / p.sharp, 1.0)
+        self._latched, freed = (min(max((done - low) / (high - low), 0.0), 1.0) for low, high in (p.latched, p.free))
+        self._first = p.first_release * (1.0 - freed)
 
     def _begin(self) -> None:
         """Hover with the latch at rest, whatever is seen."""
@@ -173,9 +181,9 @@ class FirstOrder:
         k = torch.arange(self.p.horizon, device=steps.device)[:, None]
         reward, error, fall = self._rewards_at_release(x)
         asked = x.action[:K, :, act.COMMANDS] - self.cfg.release.threshold
-        hazard = torch.sigmoid(asked / (self.p.width * (self.p.final_width / self.p.width) ** self._latched))
+        hazard = torch.sigmoid(asked / self._width)
         hazard = hazard + self._latched * ((asked > 0.0).float() - hazard).detach()  # the slope stays that of the smooth one
-        hazard = hazard * (k[:K] >= self.p.first_release * (1.0 - self._latched))
+        hazard = hazard * (k[:K] >= self._first)
         ended, cut = k[:K] > steps, k[:K] + self.lag + 2 > steps
         hazard = torch.where(ended, 1.0, hazard)
         reward = torch.where(cut, -p.termination, reward)
@@ -237,7 +245,7 @@ class FirstOrder:
     def step(self, done: float) -> dict[str, float]:
         """One rollout and one step of Adam at this share of the training; returns its figures."""
         p, start = self.p, time.perf_counter()
-        self._latched = 1.0 if self._adapting else min(done / p.shaping, 1.0)
+        self._schedule(1.0 if self._adapting else done)
         highest = p.adapting_rate if self._adapting else p.learning_rate
         rate = p.final_rate + 0.5 * (highest - p.final_rate) * (1.0 + math.cos(math.pi * done))
         for group in self.optimizer.param_groups:
