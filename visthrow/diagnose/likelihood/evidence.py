@@ -27,8 +27,9 @@ of 85 sizes that were hidden in plants of other code than the simulator's."""
 
 NORMAL_95 = 1.96
 
-VERY_STRONG = 5.0
-"""Nats that any cause needs, however few are in question: Bayes factors above 150 are very strong (Kass and Raftery 1995)."""
+STRONG, VERY_STRONG = 3.0, 5.0
+"""Nats: Bayes factors above 20 are strong, above 150 very strong (Kass and Raftery 1995). What is less than strongly behind counts as
+possible; any cause must be very strong, however few are in question."""
 
 CALIBRATION_DRAWS = 4000
 CALIBRATION_QUANTILE = 0.995

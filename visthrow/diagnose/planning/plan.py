@@ -12,14 +12,13 @@ import numpy as np
 
 from visthrow.common.errors import DiagnoseError, suggest
 from visthrow.diagnose.inputs.measures import MEASUREMENTS, Measurement, narrowed
-from visthrow.diagnose.likelihood.evidence import Priors, covariance, log_evidence
+from visthrow.diagnose.likelihood.evidence import STRONG, Priors, covariance, log_evidence
 from visthrow.diagnose.likelihood.marginal import Noise, correlated, gram_of
 from visthrow.diagnose.likelihood.stack import integrals
 from visthrow.diagnose.models.interface import LATENT_BLOCKS, Model
 from visthrow.diagnose.planning.manoeuvres import PERIOD, Manoeuvre, Reference
 from visthrow.diagnose.select import result
 from visthrow.diagnose.select.result import Diagnosis
-from visthrow.diagnose.select.selector import CLOSE
 from visthrow.logs.flightlog import Channel, FlightLog
 
 DECISIVE = 11.0
@@ -181,7 +180,7 @@ def _gap(diagnosis: Diagnosis, information: np.ndarray, score: np.ndarray, new: 
     gaps = []
     now = {j: log_evidence(information, score, priors, [*rest, j]) for j in pair}
     for truth, other in (pair, pair[::-1]):
-        if now[truth] < now[other] - CLOSE:
+        if now[truth] < now[other] - STRONG:
             continue
         theta = np.zeros(len(priors.floor))
         for j in [*rest, truth]:

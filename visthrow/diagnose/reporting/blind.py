@@ -10,10 +10,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visthrow.diagnose.likelihood.evidence import additions
+from visthrow.diagnose.likelihood.evidence import STRONG, additions
 from visthrow.diagnose.models.interface import Linearised, Model, Window
 from visthrow.diagnose.select.result import Diagnosis
-from visthrow.diagnose.select.selector import CLOSE
 
 SIZES = np.geomspace(1.0, 64.0, 13)
 """Hidden sizes [floors]."""
@@ -85,7 +84,7 @@ def hide(diagnosis: Diagnosis, *, seed: int = 0, draws: int = DRAWS) -> Blind:
             score = np.vstack([worlds() + s * size * information[j] for s in signs])
             gain, found = named(score)
             best = gain.argmax(axis=1) == j
-            close = gain[:, j] > gain.max(axis=1) - CLOSE
+            close = gain[:, j] > gain.max(axis=1) - STRONG
             rows.append((size, np.mean(found & best), np.mean(found & close), np.mean(found & ~close)))
         curves.append(_curve(effect.name, effect.unit, effect.floor, rows))
     _, alarms = named(np.vstack([worlds() for _ in range(10)]))

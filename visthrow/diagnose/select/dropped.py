@@ -26,8 +26,8 @@ from visthrow.diagnose.select.scatter import COMMAND, REACH, Scatter, Varies, ju
 NAME = "dropped_commands"
 """Of the random effect in the catalogue."""
 
-EITHER, CLEAR = 0.5, 0.25
-"""Mean and deviation of m where either is as likely; the deviation from which 0 and 1 are told apart: half way is two from both."""
+EITHER = 0.5
+"""Mean and deviation of m where either is as likely. From half of it as a deviation 0 and 1 are told apart: half way is two from both."""
 
 
 def effect() -> RandomEffect:
@@ -164,7 +164,7 @@ def sized(problem: Problem, point: Point, found: Scatter) -> Scatter:
     own, score = told.information[:, -told.commands :, -told.commands :], told.score[:, -told.commands :]
     spread = np.linalg.inv(own + np.eye(told.commands) / EITHER**2)
     off = (spread @ (score - EITHER * own.sum(2))[..., None])[..., 0]  # from half way
-    clear = np.sqrt(np.diagonal(spread, axis1=1, axis2=2)) < CLEAR
+    clear = np.sqrt(np.diagonal(spread, axis1=1, axis2=2)) < 0.5 * EITHER
     count, gone = np.count_nonzero(clear), np.count_nonzero(clear & (off > 0.0))
     if not count:
         return found

@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from visthrow.diagnose.likelihood.evidence import NORMAL_95
 from visthrow.diagnose.likelihood.grammar import JOINT, JOINT_NEEDS, Known, through_latents
 from visthrow.diagnose.likelihood.marginal import Gram
 from visthrow.diagnose.likelihood.stack import Stack
@@ -23,9 +24,6 @@ UNKNOWN_RATIO = 3.0
 LANDING = 5e-3
 """Distance [m] that a latent force must move a body along an axis within a window, else it does not matter: a cause that moves a
 landing by less is below its floor as well."""
-
-LIMIT_NATS = 2.0
-"""Loss of log-likelihood that marks the upper limit of a level (one-sided 97.5 %)."""
 
 STEP, MOST_STEPS = 1.4, 60
 """Factor from one level to the next above the best, until one is too high. A level that nothing holds up lies anywhere below."""
@@ -89,11 +87,11 @@ class _Phase:
         return float(self.stack.values(noise).sum())
 
     def upper_limit(self, block: int) -> float:
-        """Largest level of a block that the residuals allow."""
+        """Largest level of a block that the residuals allow, one-sided 97.5 %."""
         best = self.noise.latent_sd[block, self.phase]
         top = self.likelihood(block, best)
         for step in range(1, MOST_STEPS):
-            if self.likelihood(block, best * STEP**step) < top - LIMIT_NATS:
+            if self.likelihood(block, best * STEP**step) < top - 0.5 * NORMAL_95**2:
                 break
         return float(best * STEP**step)
 

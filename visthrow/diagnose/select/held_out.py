@@ -15,6 +15,7 @@ from scipy.special import stdtrit
 from visthrow.diagnose.likelihood.evidence import (
     NORMAL_95,
     OWN_FLOOR,
+    STRONG,
     Priors,
     additions,
     covariance,
@@ -28,16 +29,14 @@ from visthrow.diagnose.select.excess import UNKNOWN_RATIO
 from visthrow.diagnose.select.point import Point
 from visthrow.diagnose.select.result import ChannelGain, Diagnosis, Finding, HeldOut
 from visthrow.diagnose.select.scatter import deviations, freed
-from visthrow.diagnose.select.selector import CLOSE
+from visthrow.diagnose.select.selector import MOST_NAMES
 from visthrow.diagnose.select.state import Work
 
 DRAWS = 10_000
 MOST_FOLDS = 12
-FEWEST_FLIGHTS = 3
-"""With fewer, parts of flights are left out instead, and the report says so."""
 PARTS = 3
+"""With fewer flights so many parts of each are left out instead, and the report says so: two sets that were trained on differ."""
 FEW_GROUPS = 8
-MOST_NAMES = 6
 FIRM = 2.0 / 3.0
 """More of the folds than this share must name a cause, or one of its class: of three folds that leave a flight out, all."""
 TELLING = 0.1
@@ -97,7 +96,7 @@ def _without_idle(
 
 def groups_of(point: Point, kept: Sequence[int]) -> tuple[list[int], str]:
     flights = [w.flight for w in point.windows]
-    if len(set(flights)) >= FEWEST_FLIGHTS or len(flights) < PARTS:
+    if len(set(flights)) >= PARTS or len(flights) < PARTS:
         return flights, "flights"
     order = {f: [i for i, g in enumerate(flights) if g == f] for f in set(flights)}
     return [f * PARTS + PARTS * order[f].index(i) // len(order[f]) for i, f in enumerate(flights)], "parts of flights"
@@ -128,7 +127,7 @@ def crossed(diagnosis: Diagnosis) -> Crossed:
         information, score = statistics.information[rest].sum(0), statistics.absolute[rest].sum(0)
         anew, active = (select(information, score, priors, least, begin=begin) for begin in ((), work.active))
         worth = [log_evidence(information, score, priors, s) - least * len(s) for s in (anew, active)]
-        if worth[0] > worth[1] + CLOSE:  # else the rest cannot tell these names from others, and does not deny them
+        if worth[0] > worth[1] + STRONG:  # else the rest cannot tell these names from others, and does not deny them
             active = anew
         trained[fold] = estimate(information, score, priors, active)
         named.update(active)

@@ -11,7 +11,7 @@ from visthrow.diagnose.likelihood import noise as levels
 from visthrow.diagnose.likelihood import stack
 from visthrow.diagnose.likelihood.correlation import Correlation, correlations, with_correlations
 from visthrow.diagnose.likelihood.designs import grams_of, with_residuals
-from visthrow.diagnose.likelihood.evidence import Priors, covariance, estimate, log_evidence
+from visthrow.diagnose.likelihood.evidence import OWN_FLOOR, Priors, covariance, estimate, log_evidence
 from visthrow.diagnose.likelihood.marginal import (
     Gram,
     Noise,
@@ -24,8 +24,9 @@ from visthrow.diagnose.likelihood.threads import beside
 from visthrow.diagnose.models.interface import Linearised, Model, Window
 from visthrow.diagnose.select.scatter import Varies, freed, own_shares
 
-STEPS = 3
-"""Gauss-Newton steps between two linearisations."""
+ROUNDS = 3
+"""Gauss-Newton steps between two linearisations, linearisations in a row each where the last led, and rounds of lost windows: each
+round has some tenth of what the one before had to do."""
 
 LOST, LOST_SHARE = 3.0, 0.15
 """Squared residual a sample, in noise and latent forces, from which a window is lost; share of windows beyond which none is."""
@@ -33,8 +34,8 @@ LOST, LOST_SHARE = 3.0, 0.15
 SHAKEN_LOST = 1.3
 """Of the median window's, from which a shaken one is lost: what its unknown motion does is no effect's doing."""
 
-SMALL_STEP = 0.05
-"""In floors: a step that is not worth a simulation."""
+SMALL_STEP = 0.5 * OWN_FLOOR
+"""In floors: a step that is not worth a simulation, and the distance at which an estimate lies on its bound."""
 
 TURNS, TURNED = 8, 0.5
 """Times that sizes and noise levels are estimated in turn, while the levels leave a step of the sizes worth so many nats."""
@@ -291,7 +292,7 @@ def fitted(problem: Problem, point: Point, active: Sequence[int]) -> Point:
     best = point if np.all(point.theta[~inside] == 0.0) else moved(problem, point, np.where(inside, point.theta, 0.0))
     if best is None:
         return point
-    for _ in range(STEPS):
+    for _ in range(ROUNDS):
         goal = estimate(best.information, best.score, problem.priors, active)
         goal[problem.switches] = best.theta[problem.switches]  # no step turns a block into another
         trial = _step(problem, best, goal)

@@ -36,8 +36,9 @@ SIZES = np.array([-1.0, -0.7, -0.45, -0.25, -0.1, 0.0, 0.1, 0.25, 0.45, 0.7, 1.0
 """At which flights are simulated again, in the largest estimate of any flight."""
 FINE = 400
 """Places between them at which a curve is looked at."""
-MOST_VARYING = 3
-"""A longer list is a wrong form."""
+CHAIN = 2
+"""More effects that differ, or more names, are a wrong form, which brings one after the other: terms are weighed at once, and in a block
+whose latent forces stay excessive none is told."""
 
 
 @dataclass(frozen=True)
@@ -122,7 +123,7 @@ def varying(
     may_vary = [*(v for v in random_effects() if v.of), *others]
     at = {v.name: [j for j in map(known.index, set(v.of) & set(known)) if priors.visible[j]] for v in may_vary}
     price = {v: least + (np.log(len(theta)) if v in others else 0.0) for v in may_vary}  # of all effects, one varies more by chance
-    for _ in range(MOST_VARYING):
+    for _ in range(CHAIN + 1):
         given = priors, drawn, active
         likely = _likely(freed(statistics, drawn), priors, active, least) if others else ()
         free = [v for v in may_vary if not (v.name in told and told[v.name].found) and (v not in others or likely[at[v.name]].any())]

@@ -13,13 +13,10 @@ from visthrow.diagnose.likelihood.threads import each
 from visthrow.diagnose.models.interface import Model
 from visthrow.diagnose.select import held_out
 from visthrow.diagnose.select.copies import repeated_flights
-from visthrow.diagnose.select.point import Point, Problem, linearise, lost, only
+from visthrow.diagnose.select.point import ROUNDS, Point, Problem, linearise, lost, only
 from visthrow.diagnose.select.result import Diagnosis
 from visthrow.diagnose.select.selector import Selector
 from visthrow.diagnose.select.verdicts import conclude, out_of_domain
-
-LOSSES = 3
-"""Rounds in which windows are left out that the simulation does not follow: the worst hide others."""
 
 
 def explain(
@@ -56,14 +53,14 @@ def explain(
     for c, own in problem.correlated.items():
         say(f"noise of {model.channels[c]} is correlated over {1e3 * own.time:.0f} ms, for {own.share:.1%} of its variance")
     nominal = linearise(problem, np.zeros(len(model.effects)), windows=windows)
-    for _ in range(LOSSES):
+    for _ in range(ROUNDS):  # the worst hide others
         if not (gone := lost(nominal)):
             break
         problem, nominal = _left_out(problem, nominal, gone, say)
     least = _least(nominal, priors, seed, say)
     search = Selector(problem, nominal, least, say, laws)
     search.run()
-    for _ in range(LOSSES - 1):
+    for _ in range(ROUNDS - 1):
         gone = lost(search.point)  # where the causes are in the simulation, it may lose windows that it followed without
         if not gone or search.events:
             break

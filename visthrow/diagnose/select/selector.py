@@ -13,7 +13,7 @@ from itertools import combinations
 
 import numpy as np
 
-from visthrow.diagnose.likelihood.evidence import additions, estimate, log_evidence, pair_additions
+from visthrow.diagnose.likelihood.evidence import STRONG, additions, estimate, log_evidence, pair_additions
 from visthrow.diagnose.select import dropped, terms
 from visthrow.diagnose.select.excess import levels
 from visthrow.diagnose.select.point import (
@@ -29,36 +29,30 @@ from visthrow.diagnose.select.point import (
     with_varying,
 )
 from visthrow.diagnose.select.result import Step
-from visthrow.diagnose.select.scatter import deviations
+from visthrow.diagnose.select.scatter import CHAIN, deviations
 from visthrow.diagnose.select.state import Move, SearchState
 
 MOST_NAMES = 6
 """A longer list of causes is a wrong form, not a finding."""
 
-CHAIN = 3
-"""Names from which on terms are weighed at once: a wrong form brings one name after the other."""
-
 SHORTLIST = 3
 """Additions whose simulation is run again in each round."""
 
-HOPE = 0.6
-"""Of the threshold: linear statistics from which an addition's simulation is run again."""
+DOUBT = 15.0
+"""Nats behind up to which a set is simulated, where statistics of other sizes may be wrong; up to ``STRONG`` it counts as possible."""
 
-DOUBT, CLOSE = 15.0, 3.0
-"""Nats behind up to which a set is simulated, where statistics of other sizes may be wrong; and up to which it counts as possible."""
-
-MOST, MOST_CLOSE = 6, 16
-"""Sets that are simulated so, and how many where they are ``CLOSE``: of what hover shows, a dozen causes may be the reason."""
+MOST, MOST_NEAR = 6, 16
+"""Sets that are simulated so, and how many where they are that near: of what hover shows, a dozen causes may be the reason."""
 
 AHEAD = 1.0
-"""Nats by which an exchange must be ahead."""
+"""Nats by which an exchange must be ahead: less is not worth more than a bare mention (Kass and Raftery 1995)."""
 
 SHOWN = 10
 """Sets that a step keeps for the report."""
 
 HOPELESS = 0.5
-"""Of what names bring where the model stands alone, by the linear statistics, that a term instead of them must bring to be weighed.
-Of three laws that the catalogue does not hold the true term brought 1.9, 7 and 107 times as much as the names that stood for it."""
+"""Of what the best or what stands there brings, by the linear statistics, that another must bring to be simulated. Of three laws that
+the catalogue does not hold the true term brought 1.9, 7 and 107 times as much as the names that stood for it."""
 
 
 class Selector(SearchState):
@@ -77,7 +71,7 @@ class Selector(SearchState):
                     continue
                 return
             if len(self.active) < MOST_NAMES and (self._vary() or self._add()):
-                if len(self.active) >= CHAIN and self._propose():
+                if len(self.active) > CHAIN and self._propose():
                     self._exchange()
                 continue
             if len(self.active) < MOST_NAMES and self._vary(last=True):
@@ -97,9 +91,10 @@ class Selector(SearchState):
         """Add the best candidate; False where none is good enough."""
         free, usable = with_all_effects_noise(self.problem, self.point), self._usable()
         screened, under_free = (self._additions(point, usable) for point in (self.point, free))
-        worth = HOPE * self.least
-        short = [int(j) for j in usable[np.argsort(-under_free[usable])][:SHORTLIST] if under_free[j] > max(worth, 0.3 * under_free.max())]
-        short += [int(j) for j in usable[np.argsort(-screened[usable])][:2] if screened[j] > worth and j not in short]
+        worth = self.least - STRONG
+        best = usable[np.argsort(-under_free[usable])][:SHORTLIST].tolist()
+        short = [j for j in best if under_free[j] > max(worth, HOPELESS * under_free.max())]
+        short += [j for j in usable[np.argsort(-screened[usable])][:SHORTLIST].tolist() if screened[j] > worth and j not in short]
         if not short:
             return False
         alike = self._alike(short[int(np.argmax(under_free[short]))])
@@ -172,7 +167,7 @@ class Selector(SearchState):
         listed = {move.active: move.nats for move in ranked}
         if self._best(tried, listed, AHEAD):
             return True
-        self.sets = [Move(tuple(self.active), 0.0), *(move for move in tried if -CLOSE < move.nats <= AHEAD)]
+        self.sets = [Move(tuple(self.active), 0.0), *(move for move in tried if -STRONG < move.nats <= AHEAD)]
         return False
 
     def _rivals(self) -> list[Move]:
@@ -187,16 +182,16 @@ class Selector(SearchState):
             singles |= {(*rest, k): base + alone[k] - self.prices[k] for k in new.tolist()}
             plain = usable[~self.problem.switches[usable]]
             gain, each = pair_additions(*known)[np.ix_(plain, plain)], alone[plain]
-            reached = np.triu(gain - np.maximum.outer(each, each) > self.least - CLOSE)  # worth a name beside the other
+            reached = np.triu(gain - np.maximum.outer(each, each) > self.least - STRONG)  # worth a name beside the other
             gain += base - np.add.outer(self.prices[plain], self.prices[plain])
-            near = reached & (gain > (-DOUBT if len(rest) + 2 == len(active) else -CLOSE))
+            near = reached & (gain > (-DOUBT if len(rest) + 2 == len(active) else -STRONG))
             pairs |= {(*rest, int(plain[a]), int(plain[b])): float(gain[a, b]) for a, b in np.argwhere(near)}
         if active:  # far from nothing, derivatives there may tell too little of what has no share of it
             alone = additions(self.nominal.information, self.nominal.score, self.priors, ()) - self.prices
             alone += self.linear((), self.nominal) - self.linear(active, self.nominal)
             singles |= {(k,): max(singles.get((k,), -np.inf), alone[k]) for k in usable.tolist()}
         ranked = _ranked(singles, DOUBT)
-        ranked = [m for i, m in enumerate(ranked) if i < MOST or (i < MOST_CLOSE and abs(m.nats) < CLOSE)]
+        ranked = [m for i, m in enumerate(ranked) if i < MOST or (i < MOST_NEAR and abs(m.nats) < STRONG)]
         alone = [] if self.terms else [Move((k,), 0.0) for k in usable.tolist() if self.is_term(k)]  # not to be told from here
         return [*ranked, *_ranked(pairs, DOUBT)[:SHORTLIST], *(m for m in alone if m.active not in [r.active for r in ranked])]
 

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 
 from visthrow.diagnose.likelihood import grammar
-from visthrow.diagnose.likelihood.evidence import Priors, certainty, estimate, log_evidence
+from visthrow.diagnose.likelihood.evidence import OWN_FLOOR, SPIKE, Priors, certainty, estimate, log_evidence
 from visthrow.diagnose.likelihood.marginal import Statistics
 from visthrow.diagnose.select import terms
 from visthrow.diagnose.select.excess import acts_on
-from visthrow.diagnose.select.point import Point, Problem, advantage, curvature, fitted, linearise, moved
+from visthrow.diagnose.select.point import ROUNDS, Point, Problem, advantage, curvature, fitted, linearise, moved
 from visthrow.diagnose.select.result import Law, Step
 from visthrow.diagnose.select.scatter import (
     SHARE,
@@ -24,17 +24,8 @@ from visthrow.diagnose.select.scatter import (
     varying,
 )
 
-STRAIGHT = 0.5
-"""Size in floors that the simulation's distance from its linearisation may fake before the derivatives are taken anew."""
-
 WHOLE = 0.7
 """Of another kind of block that flights must ask for: of one that is not there, whose state has more freedom, a part is taken."""
-
-LINEARISATIONS = 3
-"""At most so many times in a row, each where the last led."""
-
-NEAR = 0.1
-"""Distance from where derivatives were taken, in floors, within which they hold for a law as well."""
 
 
 @dataclass(frozen=True)
@@ -221,21 +212,21 @@ class SearchState:
         same = np.array_equal(self.origin.theta[kinds] != 0.0, point.theta[kinds] != 0.0)
         silent = self.priors.visible & (np.diag(self.origin.information) <= 0.0)  # such as wind without drag: it may show elsewhere
         anew = getattr(self.problem.model, "cheap", False) and np.any(silent)
-        if same and not anew and curvature(self.problem, self.origin, point) < STRAIGHT:
+        if same and not anew and curvature(self.problem, self.origin, point) < SPIKE:  # what it would fake may go unnamed
             return point
-        for _ in range(LINEARISATIONS):
+        for _ in range(ROUNDS):
             self.origin = linearise(self.problem, point.theta, point.noise)
             before, point = point, fitted(self.problem, self.origin, active)
             if doubted is not None and not self.sure(point, active, doubted):
                 break
-            if np.abs(point.theta - before.theta).max() <= 0.5 or curvature(self.problem, self.origin, point) <= STRAIGHT:
+            if np.abs(point.theta - before.theta).max() <= 0.5 or curvature(self.problem, self.origin, point) <= SPIKE:
                 break
         return point
 
     def nearer(self) -> bool:
         """Linearise where the search stands; False where that was done. Before a law is believed: it may explain what bends do."""
         here = frozenset(self.active)
-        if here in self.linearised or np.abs(self.origin.theta - self.point.theta)[~self.term_columns].max(initial=0.0) <= NEAR:
+        if here in self.linearised or np.abs(self.origin.theta - self.point.theta)[~self.term_columns].max(initial=0.0) <= OWN_FLOOR:
             return False
         self.linearised.add(here)
         self.progress("derivatives are taken where the causes are, for a law may explain what they lack")

@@ -17,7 +17,7 @@ from scipy.linalg import lapack
 
 from sim.effects.effect import Effect
 from visthrow.diagnose.likelihood import grammar
-from visthrow.diagnose.likelihood.evidence import Priors, covariance
+from visthrow.diagnose.likelihood.evidence import STRONG, Priors, covariance
 from visthrow.diagnose.likelihood.marginal import Gram, WindowStatistics, gather
 from visthrow.diagnose.likelihood.stack import BATCH, statistics
 from visthrow.diagnose.likelihood.threads import each
@@ -26,14 +26,14 @@ from visthrow.diagnose.models.interface import LATENT_BLOCKS, Linearised, Model,
 from visthrow.diagnose.select.point import Point, Problem, regathered
 from visthrow.diagnose.select.result import Law
 
-LAW = 6.0
+LAW = 2.0 * STRONG
 """Nats by which a term must be ahead where it takes the place of no name, and which a name costs more where a law acts."""
 
 REACH = 3.0
 """Prior deviation of a term's root mean square force, in the block's strongest latent force."""
 
 NARROW = 1e-3
-"""Floor of a term in its prior deviation: a term is there or it is not."""
+"""Floor of a term in its prior deviation: a term is there or it is not; the usual deviation of a name in that of one of any size."""
 
 MATERIAL = 0.5
 """Root mean square force of a term, in the block's usual latent force, below which it does not matter: that of a gust moves a
@@ -41,9 +41,6 @@ landing by 5 mm within half a second."""
 
 WEIGHED = 5
 """Terms that become effects to be weighed."""
-
-ANY_SIZE = 1e3
-"""Prior deviation of a name of any size, in its usual one."""
 
 ROUGHER = 2.0
 """While terms are screened, no phase is rougher than so many times the usual."""
@@ -403,7 +400,7 @@ def beyond(point: Point, priors: Priors, active: Sequence[int], term: int, name:
     at its bound, or is larger than was expected.
     """
     deviation = priors.deviation([k for k in active if k != term])
-    deviation[[name, term]] = ANY_SIZE * priors.slab[name], 0.0
+    deviation[[name, term]] = priors.slab[name] / NARROW, 0.0
     information, score = point.information, point.score
     known = covariance(information, deviation) @ np.column_stack((information[:, term], score))
     own, left = information[term, term] - information[term] @ known[:, 0], score[term] - information[term] @ known[:, 1]

@@ -9,9 +9,9 @@ from visthrow.diagnose.likelihood.evidence import NORMAL_95, OWN_FLOOR, Priors, 
 from visthrow.diagnose.models.interface import Model, Window
 from visthrow.diagnose.select import result
 from visthrow.diagnose.select.excess import acts_on, levels, too_strong
-from visthrow.diagnose.select.point import Point, moved, with_fitted_noise, with_floors_noise, with_varying
+from visthrow.diagnose.select.point import SMALL_STEP, Point, moved, with_fitted_noise, with_floors_noise, with_varying
 from visthrow.diagnose.select.result import Diagnosis, Finding, Law, Level
-from visthrow.diagnose.select.scatter import FORM, Varies, deviations, freed
+from visthrow.diagnose.select.scatter import CHAIN, FORM, Varies, deviations, freed
 from visthrow.diagnose.select.selector import Selector
 from visthrow.diagnose.select.state import Work
 from visthrow.diagnose.select.terms import WithTerms, bare
@@ -19,19 +19,11 @@ from visthrow.diagnose.select.terms import WithTerms, bare
 HALF_PRIOR = 0.5
 """An effect whose posterior deviation exceeds this share of its prior's was not seen."""
 
-CHAIN = 2
-"""More names than this in one block, with its latent forces still excessive, are one wrong form and no causes."""
-
 IMPLAUSIBLE_FORCE = 0.3
 """Latent force, in the thrust that carries the vehicle, that no missing cause explains: the channels do not belong together."""
 
 ROUGH = 4.0
 """Latent force of a window, in its phase's, from which something happened there."""
-
-AT_BOUND = 1e-3
-"""Distance from a physical bound, in floors, at which an estimate lies on it."""
-
-
 
 def conclude(search: Selector) -> Diagnosis:
     """Turn a finished search into verdicts.
@@ -187,7 +179,7 @@ def _withdrawn(search: Selector, excessive: Sequence[Level]) -> set[int]:
 def _on_bound(search: Selector, j: int) -> bool:
     """Whether an estimate lies on its bound and the flights push it on by more than the threshold."""
     point, priors = search.point, search.priors
-    at = min(abs(point.theta[j] - priors.low[j]), abs(point.theta[j] - priors.high[j])) < AT_BOUND
+    at = min(abs(point.theta[j] - priors.low[j]), abs(point.theta[j] - priors.high[j])) < SMALL_STEP
     push = point.statistics.score[:, j].sum()
     return bool(at and push * point.theta[j] > 0.0 and 0.5 * push**2 / point.information[j, j] > search.least)
 
