@@ -12,7 +12,7 @@ b5d7a9d, among these five of its 15 laws (seeds 89700501 and on). 23 lines are o
 import argparse
 import json
 import math
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -35,6 +35,8 @@ LIMITS = {
 }  # fmt: skip
 """Effect -> limit that is asked for (SI), factor and unit to print."""
 
+RANDOM = {"release_lag": "lag_jitter", "cmd_delay": "cmd_jitter", "wind_x": "gust"}
+"""Random effects of the catalogue: effect -> its name where it differs from flight to flight."""
 LEVELS = (50, 80, 95)
 MATTERS = 5.0
 """Nats on unseen throws that the truth must be worth for a gain to be counted."""
@@ -336,11 +338,42 @@ def summary(worlds: Sequence[dict]) -> str:
     """All tables as Markdown."""
     told = answered(worlds)
     parts = {
-        "What was named": accuracy(worlds), "By plant": plants(told), "Completeness": completeness(told),
+        "What was named": accuracy(worlds), "By kind": kinds(told), "By plant": plants(told), "Completeness": completeness(told),
         "Intervals": intervals(told), "Gain on throws that were held back": gains(told), "Laws outside the catalogue": laws(told),
         "What went wrong": failures(told),
     }  # fmt: skip
     return "\n".join(f"## {title}\n\n" + "\n".join(lines) + "\n" for title, lines in parts.items() if lines)
+
+
+def right(world: dict) -> bool:
+    """Whether a world was told as what it is, in the headline too.
+
+    Nothing hidden: NO EFFECT. A law: UNKNOWN and no name. Lost commands, and what differs from flight to flight or from day to day: KNOWN
+    for it, and no name. Effects: KNOWN, each up to class, and no other name.
+    """
+    recipe, overall, named = world["recipe"], world.get("overall"), world.get("named")
+    varies, told = recipe.get("varies") or {}, world.get("varies", ())
+    if recipe.get("lost"):
+        return overall == "KNOWN" and not named and "dropped_commands" in told
+    if recipe.get("days"):
+        return overall == "KNOWN" and not named and any(set(varies) & set(of) for of in world.get("drifts", ()))
+    if varies:
+        expected = {RANDOM.get(name, f"{name}_by_flight") for name in varies}
+        return overall == "KNOWN" and not named and bool(expected & set(told))
+    if any(name in TERMS for name in recipe["effects"]):
+        return bool(world.get("unknown")) and not named
+    return bool(world.get("class")) and overall == "KNOWN" if recipe["effects"] else overall == "NO EFFECT" and not named
+
+
+def kinds(worlds: Sequence[dict]) -> list[str]:
+    """How many worlds of each kind were told as what they are, and how they were told otherwise."""
+    lines = ["| kind | told as what it is | else | seconds |", "|---|---|---|---|"]
+    for kind, group in sorted(grouped(worlds, lambda w: w["kind"]).items()):
+        else_told = Counter(w.get("overall") for w in group if not right(w))
+        other = ", ".join(f"{overall} {count}" for overall, count in sorted(else_told.items()))
+        seconds = np.median([w["explain_s"] for w in group])
+        lines.append(f"| {kind} | {share(sum(map(right, group)), len(group))} | {other} | {seconds:.0f} |")
+    return lines
 
 
 def plants(worlds: Sequence[dict]) -> list[str]:

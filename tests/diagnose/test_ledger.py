@@ -22,6 +22,29 @@ def world(effects: dict, named: list, kind: str = "1x10", **more) -> dict:
     return {"kind": kind, "recipe": recipe, "named": named, "overall": overall, "explain_s": 1.0} | more
 
 
+def told(overall: str, recipe: dict, named=(), **more) -> bool:
+    made = world(recipe.pop("effects", {}), list(named), **more)
+    return ledger.right(made | {"overall": overall, "unknown": overall == "UNKNOWN", "recipe": made["recipe"] | recipe})
+
+
+@pytest.mark.parametrize(("recipe", "right", "more", "wrong"), [
+    ({}, "NO EFFECT", {}, "KNOWN"),
+    ({"effects": {"law_ball_swirl": 0.02}}, "UNKNOWN", {}, "NO EFFECT"),
+    ({"lost": 0.1}, "KNOWN", {"varies": ["dropped_commands"]}, "UNKNOWN"),
+    ({"varies": {"cmd_delay": 0.01}}, "KNOWN", {"varies": ["cmd_jitter"]}, "UNKNOWN"),
+    ({"varies": {"mass_payload": 0.01}}, "KNOWN", {"varies": ["mass_payload_by_flight"]}, "NO EFFECT"),
+    ({"varies": {"cmd_delay": 0.01}, "days": 4}, "KNOWN", {"varies": ["cmd_jitter"], "drifts": [["cmd_delay"]]}, "UNKNOWN"),
+    ({"effects": {"com_x": 0.01}}, "KNOWN", {"class": True}, "UNKNOWN"),
+])  # fmt: skip
+def test_what_is_told_as_what_it_is(recipe, right, more, wrong):
+    assert told(right, dict(recipe), **more)
+    assert not told(wrong, dict(recipe), **more)
+    if not recipe.get("effects", {}).keys() & {"com_x"}:
+        assert not told(right, dict(recipe), [["com_x"]], **more)
+    if more:
+        assert not told(right, dict(recipe))
+
+
 def test_wilson_by_the_textbook():
     """8 of 10: Newcombe 1998 and others give 0.490 to 0.943."""
     assert ledger.wilson(8, 10) == pytest.approx((0.8, 0.4902, 0.9433), abs=1e-4)

@@ -346,7 +346,8 @@ class Selector(SearchState):
         problem, point = terms.bare(self.problem, self.point)
         self.progress(f"commands got lost: {found.size:.1%} of them, {found.nats:.1f} nats")
         self.dropped, self.problem = found, dropped.lost(problem, found.size)
-        self.nominal, self.origin = (linearise(self.problem, theta, point.noise) for theta in (np.zeros_like(point.theta), point.theta))
+        self.nominal = linearise(self.problem, np.zeros_like(point.theta), point.noise)
+        self.origin = linearise(self.problem, point.theta, point.noise) if self.active else self.nominal
         self.point = candidate(self.problem, self.origin, self.active)
         self.dropped = dropped.sized(self.problem, self.nominal, found)
         self.refused, self.visited, self.proposed = {}, {frozenset(self.active)}, set()
