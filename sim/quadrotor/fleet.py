@@ -30,7 +30,6 @@ class FleetParams:
     rope_length: float  # [m]
     total_mass: float  # vehicle and all that hangs on it [kg]
     least_thrust: float  # full thrust over the weight of all, of the heaviest payload that a vehicle is given [-]
-    yaw_loop: float  # at most this times as fast as the known vehicle's, or its gains are turned down; see :func:`yaw_rate`
     mass: Range  # of the vehicle [kg]
     thrust: Range  # factor of the full thrust
     arm: Range  # factor
@@ -55,11 +54,12 @@ class FleetParams:
     rope_mass: Range  # factor of the mass for a length
     mount: Range  # factor of the mount's distance from the centre of mass
     lag: Range  # of the release [s]
+    yaw_loop: float | None = None  # with it, yaw gains are turned down until :func:`yaw_rate` is this times the known vehicle's at most
 
     def __post_init__(self) -> None:
         """Raise ValueError for ranges that nothing can be drawn from."""
         require_positive("fleet", rope_length=self.rope_length, total_mass=self.total_mass)
-        require_positive("fleet", least_thrust=self.least_thrust, yaw_loop=self.yaw_loop)
+        require_positive("fleet", least_thrust=self.least_thrust, yaw_loop=1.0 if self.yaw_loop is None else self.yaw_loop)
         if self.count < 0 or self.first < 0 or self.seed < 0:
             raise ValueError(f"fleet.count is {self.count}, first {self.first}, seed {self.seed}: expected 0 or more of each")
         for name, (low, high) in self.ranges.items():
@@ -85,7 +85,8 @@ def draw(fleet: FleetParams, known: PlantParams, number: int) -> PlantParams:
     alike = Units(ratio ** (1 / 3), ratio)  # in these units the known vehicle has the mass that was drawn
     usual, rope = in_units(known.vehicle, alike), in_units(known.rope, alike)
     vehicle = _vehicle(usual, x)
-    vehicle = _calm(vehicle, fleet.yaw_loop * yaw_rate(usual) / yaw_rate(vehicle))
+    if fleet.yaw_loop is not None:
+        vehicle = _calm(vehicle, fleet.yaw_loop * yaw_rate(usual) / yaw_rate(vehicle))
     own = vehicle.body.mass + rope.rope_mass * x["rope"] * x["rope_mass"]
     most = 4.0 * vehicle.controller.max_thrust / (fleet.least_thrust * GRAVITY) - own
     x["payload"] = min(x["payload"], most / rope.payload_mass)

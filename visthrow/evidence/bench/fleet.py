@@ -20,6 +20,8 @@ from visthrow.common.workers import status
 TARGETS = (1.5, 2.0, 2.5)
 NAMED = ("paper", "crazyflie_brushless", "five_inch", "x500")
 RIVAL = "state_fast"
+DRAWN, OWN = "drawn", "its own"
+"""What tables call all drawn vehicles, and a policy that was trained for one vehicle."""
 THROWS = 1200
 """Throws at each target on one vehicle."""
 
@@ -54,25 +56,28 @@ class Row:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Throw, train, throw, print, write."""
+    """Train, throw, print, write."""
     from visthrow.onboard.policy import Policy, find_policy
     from visthrow.throws.loading import trained_in
     from visthrow.training.device import resolve
 
-    begin, device, folder = time.monotonic(), resolve(args.device), Path(args.out)
-    rows: list[Row] = []
-    paths = [find_policy(name) for name in args.policies]
-    for path in paths:
-        name = path.stem if path.stem != "policy" else path.resolve().parent.name
-        policy = Policy.load(path)
-        experiment = trained_in(policy, path, args.overrides)
-        for names, group in _groups(experiment, args):
-            status(f"{name} on {len(names)} vehicles")
-            rows += _thrown(name, policy, group, names, args.throws if len(names) > 1 else THROWS, device, args.seed)
+    device, folder, rows = resolve(args.device), Path(args.out), []
+    paths = {(path.stem if path.stem != "policy" else path.resolve().parent.name): path for path in map(find_policy, args.policies)}
+    policies = {name: Policy.load(path) for name, path in paths.items()}
+    experiments = {name: trained_in(policies[name], path, args.overrides) for name, path in paths.items()}
+    rivals = _rivals(next(iter(experiments.values())), args, folder / "rivals", device)
+    for name, policy in policies.items():
+        groups = _groups(experiments[name], args) | {_label(k): _one(experiments[name], k) for k in rivals}
+        for label, group in groups.items():
+            status(f"{name} on {label}")
+            vehicles = [str(k) for k in range(args.vehicles)] if label == DRAWN else [label]
+            rows += _thrown(name, policy, group, vehicles, args.throws if label == DRAWN else THROWS, device, args.seed)
         _write(folder, rows, {})
-    experiment = trained_in(Policy.load(paths[0]), paths[0], args.overrides)
-    seconds = _rivals(experiment, args, folder, device, rows, begin)
+    for k, (rival, own) in rivals.items():
+        status(f"own policy on {_label(k)}")
+        rows += _thrown(OWN, rival, own, [_label(k)], THROWS, device, args.seed)
     status("")
+    seconds = {k: rival.made_by["seconds"] for k, (rival, _) in rivals.items()}
     _write(folder, rows, seconds)
     print(_told(rows, seconds))
     if args.json:
@@ -80,11 +85,22 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _groups(experiment: Any, args: argparse.Namespace) -> list[tuple[list[str], Any]]:
+def _groups(experiment: Any, args: argparse.Namespace) -> dict[str, Any]:
     """Batches of vehicles: those drawn, then each of the named."""
     drawn = replace(experiment, fleet=replace(experiment.fleet, count=args.vehicles, first=0))
-    groups = [([str(k) for k in range(args.vehicles)], drawn)] if args.vehicles else []
-    return groups + [([name], _named(experiment, name)) for name in args.named]
+    return ({DRAWN: drawn} if args.vehicles else {}) | {name: _one(experiment, name) for name in args.named}
+
+
+def _label(vehicle: str) -> str:
+    """What a table calls a vehicle by its name or number."""
+    return f"vehicle {vehicle}" if vehicle.isdigit() else vehicle
+
+
+def _one(experiment: Any, vehicle: str) -> Any:
+    """Experiment of one vehicle, by its name or the number of its draw."""
+    if vehicle.isdigit():
+        return replace(experiment, fleet=replace(experiment.fleet, count=1, first=int(vehicle)))
+    return _named(experiment, vehicle)
 
 
 def _named(experiment: Any, name: str) -> Any:
@@ -115,10 +131,8 @@ def _thrown(name: str, policy: Any, experiment: Any, vehicles: Sequence[str], ea
     return rows
 
 
-def _rivals(
-    experiment: Any, args: argparse.Namespace, folder: Path, device: str, rows: list[Row], begin: float
-) -> dict[str, float]:
-    """Train a policy for each of some vehicles, as far as the time goes, and throw with it; adds rows, returns seconds a training."""
+def _rivals(experiment: Any, args: argparse.Namespace, folder: Path, device: str) -> dict[str, tuple[Any, Any]]:
+    """Train a policy for each of some vehicles, as far as the time goes: vehicle -> policy and experiment."""
     from visthrow import config
     from visthrow.onboard.policy import Policy
     from visthrow.task import Experiment
@@ -126,23 +140,17 @@ def _rivals(
     recipe = config.load(Experiment, config.find("train", RIVAL))
     ppo = replace(recipe.ppo, iterations=args.rival_iterations or recipe.ppo.iterations)
     task = replace(experiment.task, observation=replace(experiment.task.observation, setup="none", response=0))
-    base = replace(experiment, ppo=ppo, task=task)
-    chosen = {str(k): replace(base, fleet=replace(base.fleet, count=1, first=k)) for k in range(args.rivals)}
-    chosen |= {name: _named(base, name) for name in (args.named if args.named_rivals else ())}
-    seconds: dict[str, float] = {}
-    for name, own in chosen.items():
-        path = folder / "rivals" / f"{name}.npz"
-        longest = max(seconds.values(), default=0.0)
-        if not path.exists():
-            if time.monotonic() - begin + longest > 60.0 * args.minutes:
-                continue
-            status(f"training for vehicle {name}, {len(seconds) + 1} of {len(chosen)}")
-            _trained(own, device).save(path)
-        policy = Policy.load(path)
-        seconds[name] = policy.made_by["seconds"]
-        rows += _thrown("own", policy, own, [name], THROWS, device, args.seed)
-        _write(folder, rows, seconds)
-    return seconds
+    base, begin = replace(experiment, ppo=ppo, task=task), time.monotonic()
+    wanted, longest = [*map(str, range(args.rivals)), *(args.named if args.named_rivals else ())], 0.0
+    for vehicle in wanted:
+        path, start = folder / f"{vehicle}.npz", time.monotonic()
+        if path.exists() or start - begin + longest > 60.0 * args.minutes:
+            continue
+        status(f"training for {_label(vehicle)}, of {len(wanted)}")
+        _trained(_one(base, vehicle), device).save(path)
+        longest = max(longest, time.monotonic() - start)
+    found = {vehicle: folder / f"{vehicle}.npz" for vehicle in wanted}
+    return {vehicle: (Policy.load(path), _one(base, vehicle)) for vehicle, path in found.items() if path.exists()}
 
 
 def _trained(experiment: Any, device: str) -> Any:
@@ -166,26 +174,27 @@ def _write(folder: Path, rows: Sequence[Row], seconds: dict[str, float]) -> None
 
 
 def _told(rows: Sequence[Row], seconds: dict[str, float]) -> str:
-    """Tables: all drawn vehicles; those with a policy of their own, and the named."""
+    """Table: all drawn vehicles, the named, those with a policy of their own one by one and in the mean."""
     from visthrow.view.parts import aligned
 
-    def mean(policy: str, target: float, wanted: Any) -> tuple[float, float, int]:
-        of = [row for row in rows if row.policy == policy and row.target == target and wanted(row.vehicle)]
-        landed, throws = sum(row.landed for row in of), sum(row.throws for row in of)
-        errors = [row.error for row in of if row.landed]
-        return float(np.mean(errors)) if errors else math.nan, landed / max(throws, 1), len(of)
+    def cells(label: str, policy: str, vehicles: Sequence[str]) -> tuple[str, ...]:
+        of = [[r for r in rows if r.policy == policy and r.vehicle in vehicles and r.target == target] for target in TARGETS]
+        errors = [f"{np.nanmean([r.error for r in row]):.3f}" for row in of]
+        landed = min(sum(r.landed for r in row) / sum(r.throws for r in row) for row in of)
+        return label, policy, str(len(of[0])), *errors, f"{100 * landed:.1f}"
 
+    seen = list(dict.fromkeys(row.vehicle for row in rows))
+    rivals = [_label(k) for k in seconds]
+    groups = {DRAWN: [v for v in seen if v.isdigit()]} | {v: [v] for v in seen if not v.isdigit()}
+    groups |= {"those with a policy of their own": rivals} if len(rivals) > 1 else {}
+    found = {(row.policy, row.vehicle) for row in rows}
     policies = list(dict.fromkeys(row.policy for row in rows))
-    named = list(dict.fromkeys(row.vehicle for row in rows if not row.vehicle.isdigit()))
-    groups = [("drawn", str.isdigit), ("drawn, with a policy of their own", lambda v: v.isdigit() and v in seconds)]
-    groups += [(name, lambda v, name=name: v == name) for name in named]
-    cells = []
-    for label, wanted in groups:
-        for policy in policies:
-            found = [mean(policy, target, wanted) for target in TARGETS]
-            if found[0][2] and not (policy == "own" and label == "drawn"):
-                least = f"{100 * min(share for _, share, _ in found):.1f}"
-                cells.append((label, policy, str(found[0][2]), *(f"{error:.3f}" for error, _, _ in found), least))
+    body = [
+        cells(label, policy, vehicles)
+        for label, vehicles in groups.items()
+        for policy in policies
+        if vehicles and all((policy, vehicle) in found for vehicle in vehicles)
+    ]
     header = ("vehicles", "policy", "n", *(f"{target:g} m" for target in TARGETS), "landed, least [%]")
     spent = f"\nTraining one policy: {np.mean(list(seconds.values())):.0f} s, mean of {len(seconds)}.\n" if seconds else "\n"
-    return f"Mean landing error [m at a rope of 0.33 m]\n\n{aligned(header, cells)}\n{spent}"
+    return f"Mean landing error [m at a rope of 0.33 m]\n\n{aligned(header, body)}\n{spent}"
