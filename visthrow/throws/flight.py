@@ -157,7 +157,9 @@ class Flight:
         self.open, self.flown, self.failed = np.ones(count, bool), np.zeros(count, bool), np.zeros(count, bool)
         self.failures: list[str | None] = [None] * count
         self.commands: list[np.ndarray] = []
-        self._hover = HoverController(HoverParams(), plant.period, count)
+        most = pilots.experiment.task.action.max_thrust
+        limits = HoverParams(min_thrust=min(HoverParams.min_thrust, most / 70.0), max_thrust=most)
+        self._hover = HoverController(limits, plant.period, count)
 
     @property
     def now(self) -> Snapshot:

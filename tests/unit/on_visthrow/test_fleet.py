@@ -17,10 +17,15 @@ from visthrow.onboard.pilot import Pilot
 from visthrow.onboard.policy import Policy
 from visthrow.task import Experiment, contract_of, plant_of
 from visthrow.task.fleet import alone, members, specialised
+from visthrow.throws.loading import load_policy
+from visthrow.throws.recorded import fly
 from visthrow.training.env import ThrowEnv
 
 SAME = 3e-4
 """Of float32 numbers whose units differ, after a network that reacts to each."""
+
+FAR = 0.12
+"""Of a throw whose mean error is 0.02 m at a rope of 0.33 m."""
 
 NAMED = ("paper", "crazyflie_brushless", "five_inch", "x500")
 
@@ -183,6 +188,19 @@ def test_a_policy_of_one_vehicle_is_not_specialised():
     base = config.load(Experiment, config.find("train", "state"))
     with pytest.raises(PolicyError, match="contract of one vehicle; expected one that was trained for a fleet"):
         specialised(random_policy(base), of("x500"))
+
+
+@pytest.mark.parametrize("name", ["crazyflie_brushless", "x500"])
+def test_the_shipped_policy_throws_with_a_named_vehicle_through_the_pilot(name, tmp_path):
+    loaded = load_policy("any", overrides=[f'vehicle="vehicle/{name}.toml"', f'rope="rope/{name}.toml"'])
+    size = loaded.experiment.rope.length / 0.33
+    log = fly(loaded, [2.0 * size, 0.0, 0.0])
+    assert log.meta["result"]["success"]
+    assert log.meta["result"]["error"] < FAR * size
+    loaded.policy.save(tmp_path / "own.npz")  # an ordinary policy, which hil takes
+    again = load_policy(tmp_path / "own.npz")
+    assert again.experiment == loaded.experiment
+    assert Pilot(again.policy).period == loaded.experiment.sim.control_period
 
 
 def test_ranges_that_nothing_can_be_drawn_from_are_refused():
