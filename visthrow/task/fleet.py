@@ -129,7 +129,7 @@ def alone(experiment: Experiment, number: int = 0) -> Experiment:
     parts = {name: getattr(plant, name) for name in ("vehicle", "rope", "release", "sim", "air")}
     latency = experiment.task.observation.latency  # sensors do not know of ropes
     task = replace(task, observation=replace(task.observation, latency=latency))
-    return replace(experiment, **parts, task=task, camera=camera, fleet=None)
+    return replace(experiment, **parts, task=task, camera=camera, fleet=None, flown=())
 
 
 def specialised(policy: Policy, experiment: Experiment, number: int = 0) -> tuple[Policy, Experiment]:
