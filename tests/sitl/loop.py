@@ -27,7 +27,7 @@ from visthrow.onboard.policy import Policy, find_policy
 from visthrow.throws.wire_plant import make, make_motors
 
 RECORD = Path(__file__).with_name("betaflight-4.6.0.json")
-DISTANCES, SEEDS = (2.0, 1.5, 2.5), range(20)
+DISTANCES = (2.0, 1.5, 2.5)
 
 
 def flown(where: str, distance: float, seed: int, policy: str, plant: str, folder: Path) -> dict:
@@ -52,7 +52,7 @@ def series(args: argparse.Namespace) -> list[dict]:
     done = {(line["where"], line["distance"], line["seed"]) for line in found}
     for where in ("firmware", "own"):
         for distance in args.distances:
-            for seed in SEEDS:
+            for seed in range(args.seeds):
                 if (where, distance, seed) not in done:
                     found.append(flown(where, distance, seed, args.policy, args.plant, args.out / args.name))
                     with open(lines, "a") as out:
@@ -103,6 +103,7 @@ def main() -> None:
     parser.add_argument("--name", choices=("gains", "after"), help="of the series to fly; left out: show the record")
     parser.add_argument("--policy", default="vision_betaflight", help="that throws: a shipped name or a file")
     parser.add_argument("--plant", default="vision", help="policy whose vehicle is behind the firmware")
+    parser.add_argument("--seeds", type=int, default=20, metavar="N", help="throws of each distance (default: 20)")
     parser.add_argument("--distances", type=float, nargs="+", default=DISTANCES)
     parser.add_argument("--out", type=Path, default=Path("out/loop"))
     parser.add_argument("--record", action="store_true", help="keep the series in the committed record")
