@@ -378,6 +378,11 @@ class ReferencePlant:
         separated = np.where(self._attached, np.nan, self._separation)
         return Landings(self._landed.copy(), self._landing_point.copy(), self._landing_time.copy(), separated)
 
+    @property
+    def exposed(self) -> Snapshot:
+        """The truth of which :meth:`measured` tells."""
+        return self._samples[0][1]
+
     def measured(self) -> Snapshot:
         """Return the state as motion capture and gyro give it: late by the latency, with noise drawn anew at each call.
 

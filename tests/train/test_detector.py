@@ -10,6 +10,7 @@ from camera.detectors.learnt import Networks
 from camera.keypoints import KeypointCamera, keypoints
 from camera.params import CameraParams
 from camera.scenes.scene import Nuisances
+from sim.params import RopeParams
 from visthrow import cli, config
 from visthrow.throws.loading import load_policy
 from visthrow.throws.reference_protocol import Job, fly_batch
@@ -47,7 +48,8 @@ def test_a_training_is_resumed_and_leaves_weights(tmp_path, capsys):
 @pytest.mark.parametrize("by", sorted(NEAR))
 def test_keypoints_of_a_picture_are_those_that_poses_project_to(by):
     camera = config.load(CameraParams, config.find("camera", "fisheye"))
-    eyes = Eyes(camera, 1, 3, by=by, nuisances=Nuisances(*(0.0,) * 8), keep=True)
+    rope = config.load(RopeParams, config.find("rope", "paper"))
+    eyes = Eyes(camera, rope, 1, 3, by=by, nuisances=Nuisances(*(0.0,) * 8), keep=True)
     zero = np.zeros((1, 3))
     now = SimpleNamespace(
         pos_w=np.array([[0.0, 0.0, 1.3]]), quat_wb=np.array([[0.0, 0.1, 0.0, 0.995]]), vel_w=zero, rate_b=zero,
@@ -65,7 +67,7 @@ def test_keypoints_of_a_picture_are_those_that_poses_project_to(by):
     assert np.abs(points - true.numpy()).max() < NEAR[by]
     assert eyes.found == {"ball": 1, "goal": 1, "frames": 1}
     with pytest.raises(ValueError, match="expected one of learnt, contours"):
-        Eyes(camera, 1, 0, by="magic")
+        Eyes(camera, rope, 1, 0, by="magic")
 
 
 class Blind:

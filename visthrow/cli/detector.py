@@ -5,6 +5,8 @@ import math
 import sys
 import time
 from dataclasses import fields, replace
+from functools import partial
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +40,9 @@ BENT = {"fx": 232.0, "fy": 232.0, "k1": 0.05, "k2": -0.006, "fov_deg": 145.0}
 HIT = 4.0
 """A detection whose points are off by more than this on average is of something else [px]."""
 
+TOGETHER = 20
+"""Throws in one process at a time."""
+
 CHECKPOINT, WEIGHTS = "checkpoint.pt", "learnt.npz"
 
 
@@ -60,10 +65,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_common(check)
     throw = actions.add_parser("throw", help="throws closed loop on rendered pictures: render, detect, policy, simulate")
     throw.add_argument("--policy", default="vision", metavar="POLICY", help="a shipped name or a file (default: vision)")
-    throw.add_argument("--by", default="learnt", choices=("learnt", "contours"), help="detector (default: learnt)")
+    throw.add_argument("--by", default="contours", choices=("learnt", "contours"), help="detector (default: contours)")
     throw.add_argument("--weights", metavar="FILE", help="of the learnt detector (default: those that are shipped)")
     throw.add_argument("--target", type=float, default=2.0, metavar="M", help="distance (default: 2.0)")
     throw.add_argument("--throws", type=int, default=20, metavar="N", help="each in a hall of its own (default: 20)")
+    throw.add_argument("--jobs", type=int, default=1, metavar="N", help="processes; the throws do not depend on them (default: 1)")
     throw.add_argument("--plant", default="hybrid", metavar="NAME", help="hybrid, reference or reference-realistic")
     throw.add_argument("--nuisances", type=float, default=0.5, metavar="X", help="0: clean, 1: as bad as in training (default: 0.5)")
     throw.add_argument("--seed", type=int, default=0, help="of everything random")
@@ -81,34 +87,48 @@ def throw(args: argparse.Namespace) -> int:
     Raises:
         VisthrowError: no throws, no such plant, or a policy that sees no keypoints.
     """
-    from camera.scenes.scene import Nuisances
+    from visthrow.common.workers import done
     from visthrow.throws.loading import load_policy
     from visthrow.throws.plants import known_plant
-    from visthrow.throws.reference_protocol import Job, fly_batch
+    from visthrow.throws.reference_protocol import plan
     from visthrow.training.protocol import Throws
-    from visthrow.view.eyes import Eyes
 
     known_plant(args.plant)
     loaded = load_policy(args.policy, None, args.overrides)
-    if args.throws < 1 or loaded.policy.contract["observation"]["layout"] != "vision":
-        raise VisthrowError(f"--throws {args.throws} with policy '{loaded.name}'; expected 1 or more, and a vision policy")
-    bad = Nuisances(*(args.nuisances,) * len(fields(Nuisances)))
-    eyes = Eyes(loaded.experiment.camera, args.throws, args.seed, resolve(args.device), args.by, nuisances=bad, weights=args.weights)
-    columns = fly_batch([loaded], args.plant, Job((0,), args.target, 0, args.throws, args.seed), eyes)
-    share = {name: eyes.found[name] / max(eyes.found["frames"], 1) for name in ("ball", "goal")}
+    if min(args.throws, args.jobs) < 1 or loaded.policy.contract["observation"]["layout"] != "vision":
+        given = f"--throws {args.throws}, --jobs {args.jobs} with policy '{loaded.name}'"
+        raise VisthrowError(f"{given}; expected 1 or more of each, and a vision policy")
+    looks = {"device": resolve(args.device), "by": args.by, "weights": args.weights, "nuisances": args.nuisances}
+    jobs = plan(1, (args.target,), args.throws, args.seed, size=TOGETHER)
+    parts = [part for _, part in sorted(done(partial(_thrown, loaded, args.plant, looks), jobs, args.jobs), key=itemgetter(0))]
+    columns = {name: np.concatenate([part[0][name] for part in parts]) for name in parts[0][0]}
+    found = {name: sum(part[1][name] for part in parts) for name in ("ball", "goal", "frames")}
+    share = {name: found[name] / max(found["frames"], 1) for name in ("ball", "goal")}
     figures = Throws(args.target, **columns).summary() | share
     error = columns["error"][np.isfinite(columns["error"])]
     width = 1.96 * float(error.std(ddof=1)) / math.sqrt(len(error)) if len(error) > 1 else math.nan
     print(
         f"{loaded.name} by {args.by} on {args.plant}, {args.target:g} m: {len(error)} of {args.throws} landed, error "
         f"{error.mean() if len(error) else math.nan:.3f} +- {width:.3f} m (95 %), ball found in {100 * figures['ball']:.1f} %, "
-        f"goal in {100 * figures['goal']:.1f} % of {eyes.found['frames']} frames"
+        f"goal in {100 * figures['goal']:.1f} % of {found['frames']} frames"
     )
     if args.json is not None:
         from visthrow.common.storage import write_json
 
         write_json(args.json, figures | {"errors": error.tolist()})
     return 0
+
+
+def _thrown(loaded, plant: str, looks: dict[str, Any], job) -> tuple[dict[str, np.ndarray], dict[str, int]]:
+    """Throws of one batch, in halls of their own, and what was found in how many frames."""
+    from camera.scenes.scene import Nuisances
+    from visthrow.throws.reference_protocol import fly_batch
+    from visthrow.view.eyes import Eyes
+
+    bad = Nuisances(*(looks["nuisances"],) * len(fields(Nuisances)))
+    camera, rope, halls = loaded.experiment.camera, loaded.experiment.rope, 1000 * job.seed + job.batch
+    eyes = Eyes(camera, rope, job.count, halls, **looks | {"nuisances": bad})
+    return fly_batch([loaded], plant, job, eyes), eyes.found
 
 
 def train(args: argparse.Namespace) -> int:

@@ -89,7 +89,7 @@ def run(args: argparse.Namespace) -> int:
 
         if loaded.policy.contract["observation"]["layout"] != "vision":
             raise ConfigError(f"--pixels with policy '{loaded.name}', which sees states; expected a vision policy")
-        eyes = Eyes(loaded.experiment.camera, 1, args.seed, by=args.pixels, keep=True)
+        eyes = Eyes(loaded.experiment.camera, loaded.experiment.rope, 1, args.seed, by=args.pixels, keep=True)
     log = fly(loaded, goal, args.plant, args.seed, resolve(args.device), eyes)
     paths = write(Path(args.out), log, loaded.experiment)
     if eyes is not None:

@@ -83,7 +83,7 @@ class Policies(Pilots):
         outs, goal_w = [], flight.goal_at(seen.time)
         looked = None
         if self.eyes is not None:  # nobody looks any more once all have let go
-            looked = self.eyes.look(flight.now, seen, goal_w, seen.attached) if np.any(flight.flown) else self.eyes.seen
+            looked = self.eyes.look(flight.plant.exposed, seen, goal_w, seen.attached) if np.any(flight.flown) else self.eyes.seen
         for pilot, part in zip(self.pilots, self.slices):
             keypoints = None if looked is None else (looked[0][part], looked[1][part])
             outs.append(pilot.act(*(getattr(seen, name)[part] for name in VIEWS), goal_w[part], seen.attached[part], keypoints))

@@ -62,6 +62,10 @@ class Plant(Protocol):
         """What the pilot is told: with noise and latency where the plant has them."""
 
     @property
+    def exposed(self) -> Snapshot:
+        """The truth of which :meth:`measured` tells: what a camera sees that is triggered with motion capture."""
+
+    @property
     def sample(self) -> Snapshot:
         """What motion capture and gyro took down behind the last :meth:`measured`; ``time`` is when it was true."""
 
@@ -240,7 +244,11 @@ class HybridPlant:
         if self.noise is not None:
             step = self.noise.observation_step * self._rng.standard_normal((5, self.count, 3))
             self._error = self._bias + step
-        return self._erring(_late([self.state, *self._past], self._age / self.period))
+        return self._erring(self.exposed)
+
+    @property
+    def exposed(self) -> Snapshot:
+        return _late([self.state, *self._past], self._age / self.period)
 
     @property
     def sample(self) -> Snapshot:
@@ -297,7 +305,7 @@ class ReferenceAdapter:
         self._plant.reset(pos_w, level, still, still, cable_dir_w)
 
     def __getattr__(self, name: str) -> Any:
-        """``time``, ``step``, ``state`` and ``landing`` are the plant's own."""
+        """``time``, ``step``, ``state``, ``exposed`` and ``landing`` are the plant's own."""
         return getattr(self._plant, name)
 
     def measured(self) -> Snapshot:

@@ -1,5 +1,6 @@
 """Keypoints from rendered pictures: what a camera on each vehicle of a plant would take, and what a detector makes of it."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -8,21 +9,25 @@ from typing import Any
 import numpy as np
 import torch
 
-from camera.detectors.contours import Detector, Known, Seen, detected_keypoints
+from camera.detectors.contours import BallSeen, Detector, Known, Seen, detected_keypoints
 from camera.detectors.learnt import LearntDetector, Networks
 from camera.fisheye import Fisheye
-from camera.keypoints import GOAL_KEYPOINTS, KEYPOINTS, KeypointCamera
+from camera.keypoints import KEYPOINTS, KeypointCamera
 from camera.params import CameraParams
 from camera.scenes.renderer import Renderer
 from camera.scenes.scene import Draw, Nuisances, Scenes, dressed, posed_scenes
 from camera.scenes.textures import HELD_OUT, photographs
+from sim.params import RopeParams
 from visthrow.onboard.observations import rotation_from_quat
 
 HANGING = (0.2, 0.6)
 """Distance of a hanging ball from the lens [m]."""
 
 HOLD = 5
-"""Frames for which a thing that is not seen any more reads where it was, as in a run (`hil.poses.sight`)."""
+"""Frames for which a ball that is not seen reads as if it went on hanging as it did."""
+
+WITHIN = math.radians(12.0)
+"""Of where the ball was a frame ago it is looked for, and so much further with each frame in which it was not seen [rad]."""
 
 BY = ("learnt", "contours")
 """Detectors."""
@@ -38,13 +43,13 @@ class Eyes:
     """
 
     def __init__(
-        self, params: CameraParams, count: int, seed: int, device: str = "cpu", by: str = "learnt", samples: int = 4,
+        self, params: CameraParams, rope: RopeParams, count: int, seed: int, device: str = "cpu", by: str = "learnt", samples: int = 4,
         nuisances: Nuisances | None = None, weights: str | None = None, keep: bool = False,
     ) -> None:  # fmt: skip
         """Draw the halls.
 
         Args:
-            params: camera. count: E. seed: of halls and sensors. device: of the renderer.
+            params: camera. rope: that the ball hangs on. count: E. seed: of halls and sensors. device: of the renderer.
             by: one of `BY`. samples: rays a pixel.
             nuisances: of the pictures; left out, all. weights: of the learnt detector; left out, those that are shipped.
             keep: whether frames are kept.
@@ -54,7 +59,7 @@ class Eyes:
         """
         if by not in BY:
             raise ValueError(f"detector '{by}'; expected one of {', '.join(BY)}")
-        self.params, self.count, self._keep = params, count, keep
+        self.params, self.count, self._keep, self._rope = params, count, keep, rope
         self.renderer = Renderer(params.fisheye, device, photographs(names=HELD_OUT), samples)
         self._draw, self._nuisances = (count, seed), nuisances or Nuisances()
         lens = Fisheye(params.fisheye)
@@ -66,8 +71,8 @@ class Eyes:
         self.camera = KeypointCamera(params)
         self._hall: Scenes | None = None
         self._looks = 0
-        self._ball_w: list[np.ndarray | None] = [None] * count  # ray to the ball a frame ago, world frame
-        self._unseen = {name: [HOLD] * count for name in ("ball", "goal")}  # frames since it was seen
+        self._balls: list[tuple[np.ndarray, float]] = []  # last seen: ray in the world frame, and half-angle [rad]
+        self._unseen = np.zeros(count, int)  # frames since then
         self.frames: list[tuple[np.ndarray, torch.Tensor, torch.Tensor]] = []
         self.seen: tuple[np.ndarray, np.ndarray] | None = None
         self.found = {"ball": 0, "goal": 0, "frames": 0}
@@ -87,27 +92,41 @@ class Eyes:
         self._looks += 1
         points, valid = np.zeros((self.count, KEYPOINTS, 2), np.float32), np.zeros((self.count, KEYPOINTS), bool)
         rots = rotation_from_quat(torch.from_numpy(np.array(measured.quat_wb, float))).numpy()
-        rot_cb, lens_b = self.camera.rot_cb.double().numpy(), np.array(self.params.mount.position_b)
+        if not self._balls:
+            self._balls = [self._hanging(rot) for rot in rots]
         for e in range(self.count):
-            rot_cw = rot_cb @ rots[e].T
-            height = float(measured.pos_w[e, 2] + rots[e][2] @ lens_b)
-            before = None if self._ball_w[e] is None else rot_cw @ self._ball_w[e]
-            known = Known(rot_cw[:, 2], height, HANGING if carried[e] else None, before, north_c=rot_cw[:, 0])
-            seen: Seen = self.detector.detect(np.ascontiguousarray(pictures[e, ..., ::-1]), known)
+            seen = self._looked(np.ascontiguousarray(pictures[e, ..., ::-1]), e, measured.pos_w[e], rots[e], bool(carried[e]))
             one, ok = detected_keypoints(self.camera, seen, rots[e])
             points[e], valid[e] = one.numpy(), ok.numpy()
-            self._ball_w[e] = None if seen.ball is None else rot_cw.T @ seen.ball.ray_c
-            self.found["frames"] += 1
-            for name, part in (("ball", slice(GOAL_KEYPOINTS, None)), ("goal", slice(0, GOAL_KEYPOINTS))):
-                there = getattr(seen, name) is not None
-                self.found[name] += there
-                self._unseen[name][e] = 0 if there else self._unseen[name][e] + 1
-                if not there and self._unseen[name][e] <= HOLD and self.seen is not None:
-                    points[e, part], valid[e, part] = self.seen[0][e, part], self.seen[1][e, part]
             if e == 0 and self._keep:
                 self.frames.append((np.ascontiguousarray(pictures[0, ..., ::-1]), one, ok))
         self.seen = points, valid
         return points, valid
+
+    def _hanging(self, rot_wb: np.ndarray) -> tuple[np.ndarray, float]:
+        """Ray in the world frame and half-angle of a ball that hangs still below a vehicle: where it is looked for first."""
+        length = self._rope.length + self._rope.payload_offset
+        down = rot_wb @ (np.array(self._rope.mount) - np.array(self.params.mount.position_b)) - [0.0, 0.0, length]
+        distance = float(np.linalg.norm(down))
+        return down / distance, math.asin(self.params.payload_radius / distance)
+
+    def _looked(self, picture: np.ndarray, e: int, pos_w: np.ndarray, rot_wb: np.ndarray, carried: bool) -> Seen:
+        """What the detector finds, or of a ball that it misses where it would hang; vehicle e and its measured pose."""
+        rot_cw = self.camera.rot_cb.double().numpy() @ rot_wb.T
+        height = float(pos_w[2] + rot_wb[2] @ np.array(self.params.mount.position_b))
+        ray_w, half_angle = self._balls[e]
+        known = Known(
+            rot_cw[:, 2], height, HANGING if carried else None, rot_cw @ ray_w, WITHIN * (1 + self._unseen[e]), north_c=rot_cw[:, 0]
+        )
+        seen = self.detector.detect(picture, known)
+        self.found["frames"] += 1
+        for name in ("ball", "goal"):
+            self.found[name] += getattr(seen, name) is not None
+        if seen.ball is not None:
+            self._balls[e], self._unseen[e] = (rot_cw.T @ seen.ball.ray_c, seen.ball.half_angle), 0
+            return seen
+        self._unseen[e] += 1
+        return replace(seen, ball=BallSeen(rot_cw @ ray_w, half_angle, 0.0)) if self._unseen[e] <= HOLD else seen
 
     def sheet(self, path: Path, columns: int = 3) -> Path:
         """Draw six of the kept frames, spread over the throw, with what was found; returns the path.
