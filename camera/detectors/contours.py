@@ -28,6 +28,9 @@ from camera.detectors.edges import (
 from camera.fisheye import Fisheye
 from camera.keypoints import GOAL_KEYPOINTS, PAYLOAD_KEYPOINTS, KeypointCamera, by_rule, payload_keypoints
 
+ABOVE = 0.5
+"""Share of the ball's colour, as it is where the ball is expected, that a ground of its hue may have."""
+
 DISTANCE_ERROR = 0.15
 """Of a ball's distance by the size of its cone, a far and blurred one [-]."""
 
@@ -131,9 +134,13 @@ class Detector:
             raise ValueError(f"image of shape {image.shape} and type {image.dtype} came; expected {shape} and uint8")
 
     def _ball(self, mask: np.ndarray, level: np.ndarray, known: Known) -> BallSeen | None:
-        """The blob whose edge is the best cone."""
+        """The blob whose edge is the best cone; where none is, what stands out by its colour from where the ball is expected."""
+        best = self._best_cone(circles_of(mask), level, known)
+        return self._expected(level, known) if best is None and known.ball_ray_c is not None else best
+
+    def _best_cone(self, circles: list[tuple[np.ndarray, float]], level: np.ndarray, known: Known) -> BallSeen | None:
         best: BallSeen | None = None
-        for centre, radius in circles_of(mask):
+        for centre, radius in circles:
             found = self._cone(level, centre, radius)
             if found is None or not self._in_place(found.ray_c, found.half_angle, known):
                 continue
@@ -143,6 +150,22 @@ class Detector:
             if best is None or score > best.score:
                 best = BallSeen(found.ray_c, found.half_angle, score)
         return best
+
+    def _expected(self, level: np.ndarray, known: Known) -> BallSeen | None:
+        """A ball on a ground or beside a thing that has its colour too, about where it is expected."""
+        import cv2
+
+        middle, inside = self.lens.project(torch.from_numpy(np.ascontiguousarray(known.ball_ray_c, np.float64)[None]))
+        if not bool(inside):
+            return None
+        low, high = known.ball_distance or self.params.ball_distance
+        radius = self.lens.params.fx * self.radius / math.sqrt(low * high)
+        u, v = (int(x) for x in middle[0].round())
+        near = level[max(v - 3, 0) : v + 4, max(u - 3, 0) : u + 4]
+        distinct = cv2.subtract(level, ABOVE * float(np.median(near)) if near.size else 0.0)
+        mask = ((distinct > 0.0) & (self._in_view > 0)).astype(np.uint8)
+        circles = [(centre, size) for centre, size in circles_of(mask) if size < 2.0 * radius]
+        return self._best_cone([(middle[0].numpy(), radius), *circles], distinct, known)
 
     def _cone(self, level: np.ndarray, centre: np.ndarray, radius: float) -> BallSeen | None:
         """The cone about a circle [px]; looked for again from where it was found, as part of a ball may hide."""

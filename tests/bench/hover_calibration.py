@@ -28,7 +28,7 @@ def main() -> None:
     args = parser.parse_args()
     torch.set_num_threads(1)
     torch.manual_seed(args.seed)
-    flown = hover_start(config.load(Experiment, config.find("train", "vision"), DRAWN))
+    flown = hover_start(config.load(Experiment, config.find("train", "vision_ideal"), DRAWN))
     found: list = []
     with torch.inference_mode():
         env = ThrowEnv(flown, "cpu", args.seed, args.count)

@@ -29,7 +29,7 @@ STATE = {"pos": 3, "vel": 3, "turn": 3, "swing": 2, "swing_rate": 2}
 """Unknowns of each step: vehicle [m, m/s], attitude from the measured one [rad], horizontal part of the rope's direction and its rate."""
 
 CONSTANTS = {
-    "camera": 3, "scale": 1, "latency": 1, "thrust": 1, "length": 1, "attitude": 3, "gyro": 3, "wind": 2, "ball": 2, "corners": 2,
+    "camera": 3, "scale": 1, "latency": 1, "thrust": 1, "length": 1, "attitude": 3, "gyro": 3, "wind": 2, "ball": 3, "corners": 2,
     "lens": 3, "goal": 2,
 }  # fmt: skip
 """Unknowns that stay the same; see `Spreads`."""
@@ -128,6 +128,8 @@ class CalibrationError(VisthrowError):
     """A hover shows too little to calibrate by."""
 
 
+NO_ANSWER = "calibration found no finite answer; expected finite poses, thrusts and keypoints"
+
 STILL, SWAY = 1.5, 1.5
 """Of a hover before the sway, and of the sway [s]."""
 
@@ -168,13 +170,16 @@ class Problem:
         self.camera, self.spreads = camera, spreads
         self.vehicle, self.load = body["mass"], rope["payload_mass"] + 0.5 * rope["rope_mass"]
         self.length, self.mount = rope["length"] + rope["payload_offset"], tensor(rope["mount"])
+        moment = rope["payload_mass"] * self.length + 0.5 * rope["rope_mass"] * rope["length"]
+        inertia = rope["payload_mass"] * self.length**2 + rope["payload_inertia"] + rope["rope_mass"] * rope["length"] ** 2 / 3.0
+        self.swung = inertia / moment  # to the centre of oscillation [m]
         self.time, self.goal = tensor(hovered.time), tensor(hovered.goal_w)
         self.dt = self.time.diff()
         self.age = tensor(np.zeros(count) if hovered.age is None else hovered.age)
         self.pos, self.vel, self.rate, self.thrust = (tensor(getattr(hovered, n)) for n in ("pos_w", "vel_w", "rate_b", "thrust"))
         self.base = rotation_from_quat(tensor(hovered.quat_wb))
         points = tensor(hovered.keypoints)
-        self.ball, self.corners = points[:, GOAL_KEYPOINTS:].mean(1), points[:, :GOAL_KEYPOINTS].mean(1)
+        self.ball, self.corners = _box(points[:, GOAL_KEYPOINTS:]), points[:, :GOAL_KEYPOINTS].mean(1)
         self.ball_seen = torch.from_numpy(seen)
         self.corners_seen = torch.from_numpy(hovered.valid[:, :GOAL_KEYPOINTS].all(1))
         s = spreads
@@ -203,9 +208,8 @@ class Problem:
         rot = self.base @ rotation_from_vector(turn)
         rate = self.rate - c["gyro"][:, None]
         rope, rope_rate = _rope(swing, swing_rate)
-        length = self.length * (1.0 + c["length"][:, None])
         hung = vel + _turned(rot, torch.linalg.cross(rate, self.mount.expand_as(rate)))
-        ball = hung + length * rope_rate
+        ball, swung = (hung + length * (1.0 + c["length"][:, None]) * rope_rate for length in (self.length, self.swung))
         mean = lambda value: 0.5 * (value[:, :-1] + value[:, 1:])  # noqa: E731
         jump = lambda value: value[:, 1:] - value[:, :-1]  # noqa: E731
         total = self.vehicle + self.load
@@ -213,9 +217,10 @@ class Problem:
         up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
         wind = torch.nn.functional.pad(c["wind"], (0, 1))[:, None]
         momentum = (self.vehicle * jump(vel) + self.load * jump(ball)) / (total * dt) - lift * mean(rot[..., 2]) + GRAVITY * up - wind
-        falling, along = jump(ball) / dt + GRAVITY * up, mean(rope)
+        falling, along = jump(swung) / dt + GRAVITY * up, mean(rope)
         across = falling - along * (falling * along).sum(-1, keepdim=True)
-        turned = _vector(rot[:, :-1].transpose(-1, -2) @ rot[:, 1:]) - mean(rate) * dt
+        coning = torch.linalg.cross(rate[:, :-1], rate[:, 1:]) * dt * dt / 12.0  # Magnus: of a rate that is linear in a step
+        turned = _vector(rot[:, :-1].transpose(-1, -2) @ rot[:, 1:]) - mean(rate) * dt - coning
         return torch.cat(
             [
                 momentum / s.push,
@@ -237,7 +242,7 @@ class Problem:
         return j, (when - self.time[j]) / self.dt[j]
 
     def sightings(self, x: Tensor, constants: Tensor, j: Tensor) -> Tensor:
-        """Residuals of ball and goal in the image, over their spreads, shape (B, N, 4); zero where they were not seen.
+        """Residuals of ball, its size and goal in the image, over their spreads, shape (B, N, 5); zero where they were not seen.
 
         Args:
             x, constants: as of `steps`. j: steps that the sightings fall behind, shape (N,); held while differences are taken.
@@ -268,9 +273,15 @@ class Problem:
         )
         size = 1.0 + c["scale"][:, None]
         corners = size * points[:, :4].mean(1).unflatten(0, at.shape[:2]) + c["corners"][:, None]
-        ball = size * box_midpoints(points[:, 4:]).mean(1).unflatten(0, at.shape[:2]) + c["ball"][:, None]
+        ball = size * _box(box_midpoints(points[:, 4:])).unflatten(0, at.shape[:2]) + c["ball"][:, None]
         off = torch.cat([(ball - self.ball) * self.ball_seen[:, None], (corners - self.corners) * self.corners_seen[:, None]], -1)
         return off / (0.5 * s.keypoint + 1e-4)
+
+
+def _box(points: Tensor) -> Tensor:
+    """Middle and mean half side of boxes by their edges' midpoints, shape (N, 4, 2): shape (N, 3)."""
+    left, top, right, bottom = points[:, 0, 0], points[:, 1, 1], points[:, 2, 0], points[:, 3, 1]
+    return torch.cat([points.mean(1), 0.25 * (right - left + bottom - top)[:, None]], -1)
 
 
 def _turned(rot: Tensor, vector: Tensor) -> Tensor:
@@ -313,14 +324,17 @@ def calibrate(hovered: Hovered, camera: KeypointCamera, contract: dict[str, Any]
     problem = Problem(hovered, camera, contract, spreads or Spreads())
     x, c = problem.start()
     for _ in range(ROUNDS):
-        solve, gradient, misfit = _linearised(problem, x, c)
+        try:
+            solve, gradient, misfit = _linearised(problem, x, c)
+        except RuntimeError as error:  # of a factorisation
+            raise CalibrationError(f"{NO_ANSWER}: {error}") from error
         step = solve(-gradient)
         width = x.numel()
         x = x + torch.from_numpy(step[:width]).reshape(x.shape)
         moved = torch.from_numpy(step[width:])
         c = c + moved
         if not bool(torch.isfinite(c).all()):
-            raise CalibrationError("calibration found no finite answer; expected finite poses, thrusts and keypoints")
+            raise CalibrationError(NO_ANSWER)
         if float((moved / problem.prior).abs().max()) < SETTLED:
             break
     else:
@@ -358,8 +372,9 @@ def _linearised(problem: Problem, x: Tensor, c: Tensor) -> tuple[Any, np.ndarray
         base, off = values[0], (values[1:] - values[:1]) / h
         if step is j:
             misfit = float(base.square().sum().sqrt() / max(int((base != 0.0).sum()), 1) ** 0.5)
-            size = base.unflatten(-1, (2, 2)).norm(dim=-1, keepdim=True).clamp(min=1e-9)
-            weight = (OUTLIER / size).clamp(max=1.0).sqrt().expand(-1, -1, 2).flatten(1)
+            parts_of = base.split((3, 2), -1)  # ball and goal
+            sizes = torch.cat([one.norm(dim=-1, keepdim=True).expand_as(one) for one in parts_of], -1).clamp(min=1e-9)
+            weight = (OUTLIER / sizes).clamp(max=1.0).sqrt()
             base, off = base * weight, off * weight
         n, m = base.shape
         row = first + torch.arange(n * m).reshape(n, m)
