@@ -54,19 +54,19 @@ class FirstOrder:
             ranks: this process among those of the training.
 
         Raises:
-            ConfigError: Goals that move, a vision layout, or a horizon too short for a release.
+            ConfigError: Goals that move, a fleet, a vision layout, or a horizon too short for a release.
         """
         self.cfg, self.p, p = experiment, experiment.first_order, experiment.ppo
         seen = experiment.task.observation
         if seen.layout != "state" or seen.oldest > experiment.sim.control_period:
             expected = 'observation.layout = "state" and a latency of one period at most'
             raise ConfigError(f'algorithm = "first_order" takes {expected}; "distillation" makes a vision policy of its policy')
-        if experiment.task.target.moves:
-            raise ConfigError('algorithm = "first_order" throws at goals that stand still; "ppo" at those that move too')
+        if experiment.task.target.moves or experiment.fleet is not None:
+            raise ConfigError('algorithm = "first_order" trains for one vehicle and goals that stand still; "ppo" for the others too')
         self._ranks = ranks
         blind = dataclasses.replace(experiment, ppo=dataclasses.replace(p, privileged=()))  # there is no critic
         self.env = env = ThrowEnv(blind, device, seed)
-        E, T, self.iterations = env.num_envs, self.p.horizon, self.p.iterations
+        E, T = env.num_envs, self.p.horizon
         self.samples = E * T * ranks.world
         seen = env.get_observations()
         self.network = Network(seen, {"actor": ["actor"]}, "actor", act.ACTIONS, p.hidden, p.activation, p.normalize).to(device)
@@ -89,9 +89,9 @@ class FirstOrder:
         k = torch.arange(self.releases, device=device)
         self._separation = [(w, (k + self.lag + int(a)).clamp(0, T)) for a, w in zip(nodes, shares)]
         self._drop = torch.tensor([0.0, 0.0, 0.5 * GRAVITY], **make)
-        self._schedule(0.0)
         self._figures: dict[str, Tensor] = {}
         self._adapting = False
+        self._schedule(0.0)
         self._begin()
         ranks.share(self.network)
         on_gpu = device.startswith("cuda")
@@ -99,10 +99,15 @@ class FirstOrder:
         self.optimizer = torch.optim.Adam(self.network.mlp.parameters(), lr=rate, betas=(0.9, 0.95), capturable=on_gpu)
         self.rollout = Replayed(self._fly) if on_gpu else self._fly
 
+    @property
+    def iterations(self) -> int:
+        """Gradients of a whole training."""
+        return self.p.adapting if self._adapting else self.p.iterations
+
     def _schedule(self, done: float) -> None:
         """Width of the hazard, share of the latch in it, and first step that it counts at, at this share of the training."""
         p = self.p
-        self._width = p.width * (p.final_width / p.width) ** min(done / p.sharp, 1.0)
+        self._width = p.adapting_width if self._adapting else p.width * (p.final_width / p.width) ** min(done / p.sharp, 1.0)
         self._latched, freed = (min(max((done - low) / (high - low), 0.0), 1.0) for low, high in (p.latched, p.free))
         self._first = p.first_release * (1.0 - freed)
 
@@ -246,8 +251,8 @@ class FirstOrder:
         """One rollout and one step of Adam at this share of the training; returns its figures."""
         p, start = self.p, time.perf_counter()
         self._schedule(1.0 if self._adapting else done)
-        highest = p.adapting_rate if self._adapting else p.learning_rate
-        rate = p.final_rate + 0.5 * (highest - p.final_rate) * (1.0 + math.cos(math.pi * done))
+        highest, lowest = (p.adapting_rate, 0.1 * p.adapting_rate) if self._adapting else (p.learning_rate, p.final_rate)
+        rate = lowest + 0.5 * (highest - lowest) * (1.0 + math.cos(math.pi * done))
         for group in self.optimizer.param_groups:
             group["lr"] = group["lr"].fill_(rate) if isinstance(group["lr"], Tensor) else rate
         self.rollout()
