@@ -21,7 +21,7 @@ from visthrow.diagnose.likelihood.designs import correlated_of, grams_of
 from visthrow.diagnose.likelihood.evidence import Priors, log_evidence
 from visthrow.diagnose.models.interface import Linearised, Model, Window
 from visthrow.diagnose.select.point import Point, Problem
-from visthrow.diagnose.select.scatter import COMMAND, REACH, Scatter, Varies, judged
+from visthrow.diagnose.select.scatter import COMMAND, LOOK, REACH, Scatter, Varies, judged
 
 NAME = "dropped_commands"
 """Of the random effect in the catalogue."""
@@ -131,7 +131,7 @@ class Told:
 
 
 def verdict(problem: Problem, point: Point, active: Sequence[int], least: float) -> Scatter | None:
-    """Whether commands got lost, beside a set of effects or beside any that are still missing; None where a model cannot tell.
+    """Whether commands got lost, beside a set of effects or any that are still missing; None where none was, or a model cannot tell.
 
     Args:
         problem: of the search.
@@ -143,6 +143,8 @@ def verdict(problem: Problem, point: Point, active: Sequence[int], least: float)
         return None
     columns, priors, v = problem.model.without_commands(problem.sizes(point.theta)), problem.priors, effect()
     told, reach = Told.of(problem, point, point.windows, [columns[i] for i in problem.kept]), REACH * v.prior_sd
+    if told.ahead(reach[::LOOK], priors, active).max() <= 0.0:  # in most flights all came, and a few shares tell
+        return None
     nats = np.minimum(*(told.ahead(reach, priors, named) for named in (active, np.flatnonzero(priors.visible).tolist())))
     return judged(v, reach, nats, least, sum(columns[i].shape[1] for i in problem.kept), COMMAND)
 

@@ -336,9 +336,10 @@ class Selector(SearchState):
             rival: nats of what says most beside it.
             last: whether to look for laws before, whose form commands that are late have in part.
         """
-        if self.dropped is not None or self.terms:
+        if self.dropped is not None or self.terms or self.came is self.point:
             return False
         found = dropped.verdict(self.problem, self.point, self.active, self.least)
+        self.came = self.point if found is None else None
         if found is None or not found.found or found.nats <= rival + self.varying_brings():
             return False
         if last and self._propose() and (self._add() or self._exchange()):

@@ -70,6 +70,7 @@ class SearchState:
     work: Point | None = None  # what is left for report and plan: without laws
     varied: Any = None  # of :meth:`scatter`, and what it was asked about
     dropped: Scatter | None = None  # the verdict on lost commands, where the model has them
+    came: Point | None = None  # where they were asked for last and none was lost
 
     @property
     def priors(self) -> Priors:
