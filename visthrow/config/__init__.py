@@ -137,7 +137,7 @@ def to_dict(config: Any, *, defaults: bool = True) -> dict[str, Any]:
 
 def dumps(config: Any) -> str:
     """Write a config as TOML that loads back to an equal config."""
-    return toml_text.dumps(_without_none(to_dict(config)))
+    return toml_text.dumps(without_none(to_dict(config)))
 
 
 def _is_default(field: "dataclasses.Field[Any]", value: Any) -> bool:
@@ -156,12 +156,13 @@ def _plain(value: Any, defaults: bool) -> Any:
     return value
 
 
-def _without_none(value: Any) -> Any:
+def without_none(value: Any) -> Any:
+    """Return nested values with the word that stands for None in TOML in its place."""
     if value is None:
         return NONE_WORD
     if isinstance(value, dict):
-        return {key: _without_none(item) for key, item in value.items()}
-    return [_without_none(item) for item in value] if isinstance(value, list) else value
+        return {key: without_none(item) for key, item in value.items()}
+    return [without_none(item) for item in value] if isinstance(value, list) else value
 
 
 def _shown(path: Path) -> str:

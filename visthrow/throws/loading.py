@@ -71,7 +71,7 @@ def trained_in(policy: Policy, path: str | Path, overrides: Iterable[str] = ()) 
     trained = policy.made_by.get("config")
     if not isinstance(trained, dict):
         raise PolicyError(f"{path} does not carry the config it was trained with; name one with --config")
-    text = toml_text.dumps({**trained, "ppo": _learning(policy)})
+    text = toml_text.dumps(config.without_none({**trained, "ppo": _learning(policy)}))
     return config.loads(
         Experiment, text, [*trained.get("flown", ()), *overrides], name=f"{path} (the config it was trained with)"
     )
