@@ -49,7 +49,7 @@ def test_a_training_is_resumed_and_leaves_weights(tmp_path, capsys):
 def test_keypoints_of_a_picture_are_those_that_poses_project_to(by):
     camera = config.load(CameraParams, config.find("camera", "fisheye"))
     rope = config.load(RopeParams, config.find("rope", "paper"))
-    eyes = Eyes(camera, rope, 1, 3, by=by, nuisances=Nuisances(*(0.0,) * 8), keep=True)
+    eyes = Eyes(camera, rope.mount, rope.length + rope.payload_offset, 1, 3, by=by, nuisances=Nuisances(*(0.0,) * 8), keep=True)
     zero = np.zeros((1, 3))
     now = SimpleNamespace(
         pos_w=np.array([[0.0, 0.0, 1.3]]), quat_wb=np.array([[0.0, 0.1, 0.0, 0.995]]), vel_w=zero, rate_b=zero,
@@ -67,7 +67,7 @@ def test_keypoints_of_a_picture_are_those_that_poses_project_to(by):
     assert np.abs(points - true.numpy()).max() < NEAR[by]
     assert eyes.found == {"ball": 1, "goal": 1, "frames": 1}
     with pytest.raises(ValueError, match="expected one of learnt, contours"):
-        Eyes(camera, rope, 1, 0, by="magic")
+        Eyes(camera, rope.mount, rope.length + rope.payload_offset, 1, 0, by="magic")
 
 
 class Blind:

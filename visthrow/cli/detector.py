@@ -127,7 +127,7 @@ def _thrown(loaded, plant: str, looks: dict[str, Any], job) -> tuple[dict[str, n
 
     bad = Nuisances(*(looks["nuisances"],) * len(fields(Nuisances)))
     camera, rope, halls = loaded.experiment.camera, loaded.experiment.rope, 1000 * job.seed + job.batch
-    eyes = Eyes(camera, rope, job.count, halls, **looks | {"nuisances": bad})
+    eyes = Eyes(camera, rope.mount, rope.length + rope.payload_offset, job.count, halls, **looks | {"nuisances": bad})
     return fly_batch([loaded], plant, job, eyes), eyes.found
 
 

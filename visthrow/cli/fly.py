@@ -83,13 +83,13 @@ def run(args: argparse.Namespace) -> int:
         loaded.policy.save(args.save)
     if args.plant != "hybrid":
         print("flying on the reference plant; this takes about a minute", file=sys.stderr)
-    eyes = None
+    eyes, rope = None, loaded.experiment.rope
     if args.pixels is not None:
         from visthrow.view.eyes import Eyes
 
         if loaded.policy.contract["observation"]["layout"] != "vision":
             raise ConfigError(f"--pixels with policy '{loaded.name}', which sees states; expected a vision policy")
-        eyes = Eyes(loaded.experiment.camera, loaded.experiment.rope, 1, args.seed, by=args.pixels, keep=True)
+        eyes = Eyes(loaded.experiment.camera, rope.mount, rope.length + rope.payload_offset, 1, args.seed, by=args.pixels, keep=True)
     log = fly(loaded, goal, args.plant, args.seed, resolve(args.device), eyes)
     paths = write(Path(args.out), log, loaded.experiment)
     if eyes is not None:

@@ -52,7 +52,9 @@ def load_policy(
     else:
         experiment = trained_in(policy, path, overrides)
     try:
-        departures = policy.require(contract_of(experiment), allow=(*allow, *_within(policy, experiment)))
+        within = _within(policy, experiment)
+        departures = policy.require(contract_of(experiment), allow=(*allow, *within))
+        departures = {key: value for key, value in departures.items() if key.split("[")[0] not in within}
     except MismatchError as error:
         allowing = " ".join(f"--allow {key}" for key in error.keys)
         raise MismatchError(f"{error}\nto throw all the same (fly and compare take it): {allowing}", error.keys) from None

@@ -17,7 +17,6 @@ from camera.params import CameraParams
 from camera.scenes.renderer import Renderer
 from camera.scenes.scene import Draw, Nuisances, Scenes, dressed, posed_scenes
 from camera.scenes.textures import HELD_OUT, photographs
-from sim.params import RopeParams
 from visthrow.onboard.observations import rotation_from_quat
 
 HANGING = (0.2, 0.6)
@@ -43,13 +42,14 @@ class Eyes:
     """
 
     def __init__(
-        self, params: CameraParams, rope: RopeParams, count: int, seed: int, device: str = "cpu", by: str = "learnt", samples: int = 4,
-        nuisances: Nuisances | None = None, weights: str | None = None, keep: bool = False,
+        self, params: CameraParams, mount_b: Sequence[float], below: float, count: int, seed: int, device: str = "cpu",
+        by: str = "learnt", samples: int = 4, nuisances: Nuisances | None = None, weights: str | None = None, keep: bool = False,
     ) -> None:  # fmt: skip
         """Draw the halls.
 
         Args:
-            params: camera. rope: that the ball hangs on. count: E. seed: of halls and sensors. device: of the renderer.
+            params: camera. mount_b: of the rope [m], body frame. below: the ball's centre hangs so far below it [m].
+            count: E. seed: of halls and sensors. device: of the renderer.
             by: one of `BY`. samples: rays a pixel.
             nuisances: of the pictures; left out, all. weights: of the learnt detector; left out, those that are shipped.
             keep: whether frames are kept.
@@ -59,7 +59,8 @@ class Eyes:
         """
         if by not in BY:
             raise ValueError(f"detector '{by}'; expected one of {', '.join(BY)}")
-        self.params, self.count, self._keep, self._rope = params, count, keep, rope
+        self.params, self.count, self._keep = params, count, keep
+        self._mount_b, self._below = np.array(mount_b, float), below
         self.renderer = Renderer(params.fisheye, device, photographs(names=HELD_OUT), samples)
         self._draw, self._nuisances = (count, seed), nuisances or Nuisances()
         lens = Fisheye(params.fisheye)
@@ -105,8 +106,7 @@ class Eyes:
 
     def _hanging(self, rot_wb: np.ndarray) -> tuple[np.ndarray, float]:
         """Ray in the world frame and half-angle of a ball that hangs still below a vehicle: where it is looked for first."""
-        length = self._rope.length + self._rope.payload_offset
-        down = rot_wb @ (np.array(self._rope.mount) - np.array(self.params.mount.position_b)) - [0.0, 0.0, length]
+        down = rot_wb @ (self._mount_b - np.array(self.params.mount.position_b)) - [0.0, 0.0, self._below]
         distance = float(np.linalg.norm(down))
         return down / distance, math.asin(self.params.payload_radius / distance)
 

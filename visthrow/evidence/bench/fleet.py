@@ -7,15 +7,16 @@ import argparse
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from visthrow.common.arguments import add_common, add_out
-from visthrow.common.storage import atomic_write, write_json
+from visthrow.common.storage import atomic_write
 from visthrow.common.workers import status
+from visthrow.evidence.bench.records import Report, Table, body, finish
 
 TARGETS = (1.5, 2.0, 2.5)
 NAMED = ("paper", "crazyflie_brushless", "five_inch", "x500")
@@ -39,6 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--minutes", type=float, default=math.inf, metavar="T", help="begin no training that would end later")
     parser.add_argument("--seed", type=int, default=0, help="of starts and noise (default: 0)")
     add_out(parser, "out/fleet", "for tables and the rivals' policies")
+    parser.add_argument("--record", metavar="NAME", help="keep the result in the package's records under this name")
     add_common(parser)
 
 
@@ -78,11 +80,7 @@ def run(args: argparse.Namespace) -> int:
         rows += _thrown(OWN, rival, own, [_label(k)], THROWS, device, args.seed)
     status("")
     seconds = {k: rival.made_by["seconds"] for k, (rival, _) in rivals.items()}
-    _write(folder, rows, seconds)
-    print(_told(rows, seconds))
-    if args.json:
-        write_json(args.json, {"rows": [vars(row) for row in rows], "seconds": seconds})
-    return 0
+    return finish(_write(folder, rows, seconds), args)
 
 
 def _groups(experiment: Any, args: argparse.Namespace) -> dict[str, Any]:
@@ -166,16 +164,17 @@ def _trained(experiment: Any, device: str) -> Any:
     return trainer.algorithm.export(contract_of(experiment), told)
 
 
-def _write(folder: Path, rows: Sequence[Row], seconds: dict[str, float]) -> None:
+def _write(folder: Path, rows: Sequence[Row], seconds: dict[str, float]) -> Report:
     """Rows as CSV; the table."""
+    report = _report(rows, seconds)
     lines = [",".join(Row.__dataclass_fields__), *(",".join(str(x) for x in vars(row).values()) for row in rows)]
     atomic_write(folder / "fleet.csv", "\n".join(lines) + "\n")
-    atomic_write(folder / "fleet.md", _told(rows, seconds))
+    atomic_write(folder / "fleet.md", body(asdict(report)) + "\n")
+    return report
 
 
-def _told(rows: Sequence[Row], seconds: dict[str, float]) -> str:
-    """Table: all drawn vehicles, the named, those with a policy of their own one by one and in the mean."""
-    from visthrow.view.parts import aligned
+def _report(rows: Sequence[Row], seconds: dict[str, float]) -> Report:
+    """All drawn vehicles, the named, those with a policy of their own one by one and in the mean."""
 
     def cells(label: str, policy: str, vehicles: Sequence[str]) -> tuple[str, ...]:
         of = [[r for r in rows if r.policy == policy and r.vehicle in vehicles and r.target == target] for target in TARGETS]
@@ -189,12 +188,13 @@ def _told(rows: Sequence[Row], seconds: dict[str, float]) -> str:
     groups |= {"those with a policy of their own": rivals} if len(rivals) > 1 else {}
     found = {(row.policy, row.vehicle) for row in rows}
     policies = list(dict.fromkeys(row.policy for row in rows))
-    body = [
+    table = [
         cells(label, policy, vehicles)
         for label, vehicles in groups.items()
         for policy in policies
         if vehicles and all((policy, vehicle) in found for vehicle in vehicles)
     ]
     header = ("vehicles", "policy", "n", *(f"{target:g} m" for target in TARGETS), "landed, least [%]")
-    spent = f"\nTraining one policy: {np.mean(list(seconds.values())):.0f} s, mean of {len(seconds)}.\n" if seconds else "\n"
-    return f"Mean landing error [m at a rope of 0.33 m]\n\n{aligned(header, body)}\n{spent}"
+    spent = (f"Training one policy: {np.mean(list(seconds.values())):.0f} s, mean of {len(seconds)}.",) if seconds else ()
+    tables = (Table("Mean landing error [m at a rope of 0.33 m]", header, tuple(table)),)
+    return Report("fleet", "One policy for many vehicles", tables, spent, {"rows": [vars(row) for row in rows], "seconds": seconds})
