@@ -99,13 +99,13 @@ def resampled(history: Tensor, newest: Tensor, ages: list[float], period: float)
     Args:
         history: measurements of earlier steps, newest first, shape (E, 1 + H, layout.payload).
         newest: of this step, shape (E, layout.payload).
-        ages: of the steps in the history, newest first, ascending [s]; rows beyond them are copies of the oldest.
+        ages: of earlier steps, newest first, ascending [s]; rows of the history beyond them are copies of the oldest.
         period: [s].
 
     Returns:
         Rows that are 1, 2, ... periods old, shape (E, 1 + H, layout.payload); what is older than all that came is the oldest.
     """
-    knots, rows, out = [0.0, *ages], torch.cat([newest[:, None], history], dim=1), []
+    knots, rows, out = [0.0, *ages[: history.shape[1]]], torch.cat([newest[:, None], history], dim=1), []
     for k in range(1, 1 + history.shape[1]):
         after = next((i for i, age in enumerate(knots) if age >= k * period), len(knots) - 1)
         gap = knots[after] - knots[after - 1]

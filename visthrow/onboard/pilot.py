@@ -5,6 +5,7 @@ a batch of one on board; only the noise is missing.
 """
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any
@@ -128,7 +129,7 @@ class Pilot:
         self._memory = self.policy.begin(self.count)
         self._fresh = torch.ones(self.count, dtype=torch.bool)
         self._goal_fit, self._steps = goal_motion.empty_sums(self.count), 0
-        self._times: tuple[float, ...] = ()  # of the history's rows, newest first; those beyond are copies of the oldest [s]
+        self._times: tuple[float, ...] = ()  # of the rows of history and response, newest first; those beyond are copies of the oldest [s]
         self._unasked = self._previous[:, 4]  # what the action before the last one said of the release
 
     @property
@@ -170,7 +171,7 @@ class Pilot:
         views = self._measured(pos_w, quat_wb, vel_w, rate_b, payload_w, goal_w, attached)
         given = () if keypoints is None else tuple(torch.from_numpy(np.array(part)) for part in keypoints)
         observation, *rest = self._seen(views, given)
-        if now is not None and self._bridged(now, rest[0][:, 0]):
+        if now is not None and self._bridged(now, rest):
             observation, *rest = self._seen(views, given)
         self._history, *seen = rest
         if self.layout.response:
@@ -200,18 +201,20 @@ class Pilot:
         observed: tuple[Tensor, ...] = (self._observe_given if given else self._observe)(views, *carried, *given)
         return observed
 
-    def _bridged(self, now: float, newest: Tensor) -> bool:
-        """Make the history one of steps a period apart, as in training; whether steps before this one were late or missing.
+    def _bridged(self, now: float, seen: Sequence[Tensor]) -> bool:
+        """Make history and response those of steps a period apart, as in training; whether steps before this one were late or missing.
 
         Args:
-            now: of this step [s]. newest: its measurement, shape (E, layout.payload).
+            now: of this step [s]. seen: history and response with this step in them, newest first.
         """
-        times, period, rows = self._times, self.period, 1 + self.layout.history
+        times, period, rows = self._times, self.period, 1 + max(self.layout.history, self.layout.response)
         ages = [now - time for time in times]
         due = [now - k * period for k in range(1, 1 + rows) if ages and k * period < ages[-1] + JITTER]
         late = len(due) != len(times) or any(abs(time - when) > JITTER for time, when in zip(times, due))
         if late:
-            self._history = ob.resampled(self._history, newest, ages, period)
+            self._history = ob.resampled(self._history, seen[0][:, 0], ages, period)
+            if self.layout.response:
+                self._answers = ob.resampled(self._answers, seen[1][:, 0], ages, period)
             self._steps += max(round(ages[0] / period) - 1, 0)
             times = tuple(due)
         self._times = (now, *times[: rows - 1])

@@ -5,8 +5,9 @@ import pytest
 import torch
 
 from tests.hil_flight import simple_policy
-from visthrow.onboard.observations import resampled
+from visthrow.onboard.observations import RESPONSE, resampled
 from visthrow.onboard.pilot import Pilot
+from visthrow.onboard.policy import Policy
 
 PERIOD = 0.02
 LEVEL = np.array([[0.0, 0.0, 0.0, 1.0]])
@@ -16,12 +17,21 @@ STILL, GOAL = np.zeros((1, 3)), np.array([2.0, 0.0, 0.0])
 def seen(pilot: Pilot, time: float, now: float | None):
     """Observation of a payload that moves evenly."""
     payload = np.array([[0.1 + 0.9 * time, -0.4 * time, -0.38 + 0.2 * time]])
-    return pilot.act(STILL, LEVEL, STILL, STILL, payload, GOAL, True, None, now).observation
+    speed = np.array([[1.5 * time, -time, 0.3]])
+    return pilot.act(STILL, LEVEL, speed, 2.0 * speed, payload, GOAL, True, None, now).observation
 
 
-def flown(times, timed=True):
+def responsive(response=8):
+    """A policy that is given the response of earlier steps too."""
+    policy = simple_policy((-0.1, 0.0, 0.0, 0.0, -1.0))
+    contract = {**policy.contract, "observation": {**policy.contract["observation"], "response": response}}
+    contract["observation"]["dimension"] = policy.obs_dim + response * RESPONSE
+    return Policy((torch.zeros(5, contract["observation"]["dimension"]),), policy.biases, "relu", contract)
+
+
+def flown(times, timed=True, policy=None):
     """Observations of a pilot whose steps come at some times [periods]."""
-    pilot = Pilot(simple_policy((-0.1, 0.0, 0.0, 0.0, -1.0)))
+    pilot = Pilot(policy or simple_policy((-0.1, 0.0, 0.0, 0.0, -1.0)))
     return [seen(pilot, PERIOD * t, PERIOD * t if timed else None) for t in times][-1]
 
 
@@ -40,6 +50,14 @@ def test_a_history_with_gaps_is_that_of_regular_steps(times):
     even = flown(range(7), timed=False)
     np.testing.assert_allclose(flown(times), even, atol=2e-6)
     assert np.abs(flown(times, timed=False) - even).max() > 5e-3, "without the times it is not"
+
+
+@pytest.mark.parametrize("times", [[0, 1, 2, 3, 4, 6], [0, 1, 2, 9], [0, 1, 2, 3, 3.7, 4.2, 5, 6, 7, 8, 9, 10.7, 11]])
+def test_a_response_with_gaps_is_that_of_regular_steps(times):
+    speeds = [flown(t, timed, responsive())[:, -8 * RESPONSE :].reshape(8, RESPONSE)[:, :6]
+              for t, timed in ((times, True), (range(times[-1] + 1), False), (times, False))]  # fmt: skip
+    np.testing.assert_allclose(speeds[0], speeds[1], atol=2e-6)
+    assert np.abs(speeds[2] - speeds[1]).max() > 5e-3, "without the times it is not"
 
 
 def test_steps_in_time_are_the_same_bits():

@@ -68,6 +68,11 @@ class Source:
         """What it is trained in."""
         return _experiment(self.config, self.changes + changes)
 
+    @property
+    def flown(self) -> tuple[str, ...]:
+        """Changes of the config that its policy is flown with."""
+        return self.changes + self.experiment().flown
+
 
 @dataclass(frozen=True)
 class ThrowUnit:
@@ -102,14 +107,14 @@ class ThrowUnit:
     def experiments(self, out: Path) -> tuple[dict, dict]:
         """The policy's own config and the one it is flown in, without the learning parameters."""
         if self.source.config:
-            own = config.to_dict(self.source.experiment())
+            own = config.to_dict(self.source.experiment(self.source.flown))
         else:
             own = _shipped_config(self.source.policy(out))
         flown_in = self.flown_in(own["task"]["observation"]["layout"])
         if flown_in is not None:
             flown = config.to_dict(_experiment(flown_in, self.params.changes))
         elif self.source.config:
-            flown = config.to_dict(self.source.experiment(self.params.changes))
+            flown = config.to_dict(self.source.experiment(self.source.flown + self.params.changes))
         else:
             flown = _shipped_config(self.source.policy(out), self.params.changes)
         return {k: v for k, v in own.items() if k != "ppo"}, {k: v for k, v in flown.items() if k != "ppo"}

@@ -116,5 +116,5 @@ def load(unit: ThrowUnit, out: Path) -> Loaded:
     source, changes = unit.source, unit.params.changes
     flown_in = unit.flown_in(unit.experiments(out)[0]["task"]["observation"]["layout"])
     if flown_in is None and source.config:  # the list's config: that of the file may have fields of another version
-        flown_in, changes = source.config, source.changes + changes
+        flown_in, changes = source.config, source.flown + changes
     return load_policy(source.policy(out), flown_in, changes, unit.params.allow)
