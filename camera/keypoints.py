@@ -31,6 +31,7 @@ class KeypointCamera:
         fisheye: The lens.
         rot_cb: Nominal extrinsic rotation, body to camera, shape (3, 3).
         position_b: Nominal lens position [m], shape (3,), body frame.
+        radius: Of the ball [m]; shape (E,) where vehicles carry different ones.
         square_w: Goal corners from the goal [m], shape (4, 3), world frame.
         edge_reads: Whether points outside the field of view read as its edge (else as zero).
     """
@@ -41,6 +42,7 @@ class KeypointCamera:
         self.fisheye = Fisheye(params.fisheye)
         self.rot_cb = nominal_rot_cb(params.mount).to(device=device, dtype=dtype)
         self.position_b = torch.tensor(params.mount.position_b, device=device, dtype=dtype)
+        self.radius: float | torch.Tensor = params.payload_radius
         self.square_w = goal_square(params.goal_side).to(device=device, dtype=dtype)
         self.edge_reads = params.noise.invalid_reads == "edge"
         self._identity = torch.eye(2, device=device, dtype=dtype)
@@ -89,7 +91,7 @@ def goal_corners_w(goal_w: torch.Tensor, side: float = 0.25, square_w: torch.Ten
 
 
 def ball_extremes_c(
-    fisheye: Fisheye, ball_c: torch.Tensor, radius: float, identity: torch.Tensor | None = None
+    fisheye: Fisheye, ball_c: torch.Tensor, radius: float | torch.Tensor, identity: torch.Tensor | None = None
 ) -> torch.Tensor:
     """Rays to the leftmost, topmost, rightmost and bottommost point of a ball's outline in the image.
 
@@ -104,7 +106,7 @@ def ball_extremes_c(
     Args:
         fisheye: The lens.
         ball_c: Centre of the ball [m], shape (E, 3), camera frame.
-        radius: Radius of the ball [m].
+        radius: Radius of the ball [m], one or shape (E,).
         identity: eye(2) on the ball's device, to save making it.
 
     Returns:
@@ -184,7 +186,7 @@ def payload_keypoints(camera: KeypointCamera, ball_c: torch.Tensor) -> tuple[tor
         outline's point on that side is inside the field of view and on the sensor. Extremes beyond the field of view
         are clipped to its edge first.
     """
-    rays = ball_extremes_c(camera.fisheye, ball_c, camera.params.payload_radius, camera._identity)
+    rays = ball_extremes_c(camera.fisheye, ball_c, camera.radius, camera._identity)
     extremes, valid = camera.fisheye.project_normalized(rays, clip=True)
     return box_midpoints(extremes), valid
 
@@ -217,7 +219,7 @@ def keypoints(
     rot_cb, position_b = (camera.rot_cb, camera.position_b) if extrinsics is None else extrinsics
     corners_w = goal_corners_w(goal_w, square_w=camera.square_w)
     points_c = points_c_from_w(torch.cat([corners_w, payload_w.unsqueeze(-2)], -2), pos_w, rot_wb, rot_cb, position_b)
-    rays_c = ball_extremes_c(camera.fisheye, points_c[:, 4], camera.params.payload_radius, camera._identity)
+    rays_c = ball_extremes_c(camera.fisheye, points_c[:, 4], camera.radius, camera._identity)
     seen, valid = camera.fisheye.project_normalized(torch.cat([points_c[:, :4], rays_c], -2), clip=True)
     points = torch.cat([seen[:, :4], box_midpoints(seen[:, 4:])], -2)
     return by_rule(camera, points, valid)

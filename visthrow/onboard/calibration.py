@@ -51,6 +51,7 @@ class Spreads:
     pos: float = 0.01  # [m]
     vel: float = 0.01  # [m/s]
     attitude: float = 0.01  # [rad]
+    heading: float = 0.7071  # of attitude about the body's z over that about x and y, bias too [-]: two columns of the rotation tell it
     rate: float = 0.01  # [rad/s]
     keypoint: float = 0.01  # normalised [-]
     pose_bias: float = 0.001  # of attitude and gyro [rad, rad/s]
@@ -133,14 +134,18 @@ NO_ANSWER = "calibration found no finite answer; expected finite poses, thrusts 
 STILL, SWAY = 1.5, 1.5
 """Of a hover before the sway, and of the sway [s]."""
 
-SWAY_RATE, SWAY_FREQUENCY = 1.0, 1.5
-"""Amplitude of the sway's body rates, 6 deg of tilt to each side [rad/s]; above the swing's frequency: the rope does not follow [Hz]."""
+SWAY_RATE, SWAY_FREQUENCY = 1.0, 4.0 / 3.0
+"""Amplitude of the sway's roll rate, 7 deg of tilt to each side [rad/s]; above the swing's frequency: the rope does not follow [Hz]."""
 
 
 def sway(since: float, rate: float = SWAY_RATE, frequency: float = SWAY_FREQUENCY) -> tuple[float, float]:
-    """Roll and pitch rate of the sway [rad/s], so long after its begin [s]: a circle of an amplitude and a frequency [rad/s, Hz]."""
+    """Roll and pitch rate of the sway [rad/s], so long after its begin [s]: a figure of eight of equal tilts to all sides.
+
+    A camera's yaw turns the path that the ball takes in the image, latency puts it off along itself. On a circle the two are the same; the
+    sum of their products is the area that a path encloses, and an eight encloses none.
+    """
     phase = 2.0 * math.pi * frequency * since
-    return rate * min(1.0, phase) * math.cos(phase), rate * math.sin(phase)
+    return rate * math.cos(phase), 2.0 * rate * math.cos(2.0 * phase)
 
 
 class Problem:
@@ -187,6 +192,8 @@ class Problem:
                   "gyro": s.pose_bias, "wind": s.wind, "ball": 0.5 * s.keypoint_bias, "corners": 0.5 * s.keypoint_bias,
                   "lens": s.lens, "goal": s.goal}  # fmt: skip
         self.prior = torch.cat([torch.full((n,), max(spread[name], 1e-9), dtype=torch.float64) for name, n in CONSTANTS.items()])
+        self.attitude = tensor([s.attitude, s.attitude, s.heading * s.attitude])
+        self.split(self.prior[None])["attitude"][0, 2] *= s.heading
 
     def start(self) -> tuple[Tensor, Tensor]:
         """Unknowns to begin from: what was measured and a rope at rest, shape (N, 13); constants, shape (C,)."""
@@ -230,7 +237,7 @@ class Problem:
                 turned / (s.rate * dt + 1e-4),
                 (pos - self.pos)[:, :-1] / s.pos,
                 (vel - self.vel)[:, :-1] / s.vel,
-                (turn + c["attitude"][:, None])[:, :-1] / s.attitude,
+                (turn + c["attitude"][:, None])[:, :-1] / self.attitude,
             ],
             -1,
         )

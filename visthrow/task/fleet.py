@@ -4,6 +4,9 @@ The task of such an experiment is stated for a rope of ``fleet.rope_length`` and
 flown in units in which its own have these numbers (:mod:`sim.quadrotor.units`): the same task for all, targets, fence and rewards too,
 and control steps that are as long as the square root of the rope. What stays different is what makes vehicles different.
 
+A vision policy's camera is stated in these units too: on a vehicle with a rope twice as long the lens is twice as far from its middle, and
+the square on the ground twice as wide. The ball has its own size.
+
 The actor is given a vehicle's set-up, ``told``: the throttle that holds it in hover, the share of what hangs in the total mass, the lag
 of the release, and the unit of time [s], by which links and sensors are older or younger. ``exact`` adds :data:`HIDDEN`, which nobody
 knows on board: an upper bound, and what the critic is given.
@@ -125,10 +128,12 @@ def alone(experiment: Experiment, number: int = 0) -> Experiment:
     plant, task = in_units(chosen.plant, back), in_units(experiment.task, back, TASK)
     action = replace(task.action, max_thrust=4.0 * plant.vehicle.controller.max_thrust)
     task = replace(task, action=action, observation=replace(task.observation, setup="none"))
-    camera = replace(experiment.camera, payload_radius=plant.rope.payload_radius)
+    size, camera = chosen.units.length, experiment.camera
+    mount = replace(camera.mount, position_b=tuple(size * x for x in camera.mount.position_b))
+    camera = replace(camera, mount=mount, payload_radius=plant.rope.payload_radius, goal_side=size * camera.goal_side)
     parts = {name: getattr(plant, name) for name in ("vehicle", "rope", "release", "sim", "air")}
-    latency = experiment.task.observation.latency  # sensors do not know of ropes
-    task = replace(task, observation=replace(task.observation, latency=latency))
+    sensors = {name: getattr(experiment.task.observation, name) for name in ("latency", "latency_jitter")}  # do not know of ropes
+    task = replace(task, observation=replace(task.observation, **sensors))
     return replace(experiment, **parts, task=task, camera=camera, fleet=None, flown=())
 
 
@@ -164,12 +169,14 @@ def _plain(experiment: Experiment) -> dict[str, Any]:
 
 
 def _sizes(layout: ob.Layout, units: Units) -> torch.Tensor:
-    """Size in SI units of each entry of a state observation without the set-up, shape (D,)."""
+    """Size in SI units of each entry of an observation without the set-up, shape (D,)."""
     length, speed, rate = units.length, units.length / units.time, 1.0 / units.time
     vehicle = [length] * 3 + [speed] * 3 + [rate] * 3 + [1.0] * 6
-    offsets = [length] * (layout.goal + layout.payload * (1 + layout.history))
+    thing = 1.0 if layout.name == "vision" else length  # images have no size
+    offsets = [thing] * (layout.goal + layout.payload * (1 + layout.history))
+    places = ([length] * 2 + [1.0] * 4)[: layout.located]
     motion, step = [speed] * layout.motion, [speed] * 3 + [rate] * 3 + [1.0] * 4
-    return torch.tensor(vehicle + [1.0] * 5 + offsets + [1.0] + motion + step * layout.response)
+    return torch.tensor(vehicle + [1.0] * 5 + offsets + [1.0] * (1 + layout.validity) + places + motion + step * layout.response)
 
 
 def check_dimensions(schema: type) -> list[str]:

@@ -89,6 +89,7 @@ class ThrowEnv(VecEnv):
             self._max_thrust, self._start_action = of([[m.max_thrust] for m in fleet]), of([m.first_action for m in fleet])
             self._setup, self._known = of([m.setup(task.observation.setup) for m in fleet]), of([m.exact for m in fleet])
             self._clock = of([m.units.time for m in fleet])
+            self.camera.radius = of([m.plant.rope.payload_radius for m in fleet])
         self._max_rate = torch.tensor(task.action.max_rate, **make)
         self._rate_weights = torch.tensor(task.reward.rate_command, **make)
         self._change_weights = torch.tensor(task.reward.command_change, **make)
@@ -360,7 +361,8 @@ class ThrowEnv(VecEnv):
         if seen.oldest == 0.0:
             return pose
         if seen.latency_jitter > 0.0:
-            age = age + seen.latency_jitter * (2.0 * torch.rand_like(age) - 1.0)
+            off = seen.latency_jitter * (2.0 * torch.rand_like(age) - 1.0)
+            age = age + (off if self._clock is None else off / self._clock)
         age = age / self.cfg.sim.control_period
         before = age.floor().clamp(max=poses.shape[1] - 2.0)
         row = before.long()[:, None, None].expand(-1, 1, poses.shape[2])

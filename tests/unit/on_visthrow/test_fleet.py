@@ -30,12 +30,12 @@ FAR = 0.12
 NAMED = ("paper", "crazyflie_brushless", "five_inch", "x500")
 
 
-def experiment(*overrides: str) -> Experiment:
-    return config.load(Experiment, config.find("train", "any"), ["fleet.count=3", *overrides])
+def experiment(*overrides: str, policy: str = "any") -> Experiment:
+    return config.load(Experiment, config.find("train", policy), ["fleet.count=3", *overrides])
 
 
-def of(name: str) -> Experiment:
-    return experiment(f'vehicle="vehicle/{name}.toml"', f'rope="rope/{name}.toml"', "fleet.count=0")
+def of(name: str, policy: str = "any") -> Experiment:
+    return experiment(f'vehicle="vehicle/{name}.toml"', f'rope="rope/{name}.toml"', "fleet.count=0", policy=policy)
 
 
 def random_policy(of: Experiment, seed: int = 0) -> Policy:
@@ -138,20 +138,24 @@ def test_the_environment_flies_every_vehicle_with_its_own_limits_and_tells_them(
 
 
 def quiet(base: Experiment) -> Experiment:
-    """The experiment without noise, latency or other masses and ropes."""
+    """The experiment without noise, latency, faults of the camera or other masses and ropes."""
     task = base.task
+    clear = dict.fromkeys(("step_std", "bias_std", "drop_probability", "wrong_probability", "held_probability", "scale_std"), 0.0)
+    mount = dataclasses.replace(base.camera.mount, rotation_error_std=0.0, position_error_std=0.0)
+    camera = dataclasses.replace(base.camera, mount=mount, noise=dataclasses.replace(base.camera.noise, **clear))
     noise = dataclasses.replace(task.noise, observation_step=0.0, observation_bias=0.0, command_step=0.0, command_bias=0.0)
     start = dataclasses.replace(task.start, mass=0.0, tether_variants=1)
-    observation = dataclasses.replace(task.observation, latency=(0.0, 0.0))
-    return dataclasses.replace(base, task=dataclasses.replace(task, noise=noise, start=start, observation=observation))
+    observation = dataclasses.replace(task.observation, latency=(0.0, 0.0), latency_jitter=0.0)
+    return dataclasses.replace(base, camera=camera, task=dataclasses.replace(task, noise=noise, start=start, observation=observation))
 
 
+@pytest.mark.parametrize("kind", ["any", "any_vision"])
 @pytest.mark.parametrize("name", NAMED)
-def test_a_pilot_decides_in_si_units_what_the_policy_decides_in_the_vehicles(name):
-    base = quiet(of(name))
+def test_a_pilot_decides_in_si_units_what_the_policy_decides_in_the_vehicles(name, kind):
+    base = quiet(of(name, kind))
     policy, env = random_policy(base), ThrowEnv(base, "cpu", seed=1, count=4)
     own, one = specialised(policy, base)
-    pilot, units = Pilot(own, None, 4), members(base)[0].units
+    pilot, units = Pilot(own, one.camera if kind == "any_vision" else None, 4), members(base)[0].units
     assert pilot.period == pytest.approx(0.02 * units.time)
     assert own.total_mass == pytest.approx(plant_of(base).total_mass)
     most, rates = members(base)[0].max_thrust, torch.tensor(base.task.action.max_rate)
