@@ -21,7 +21,7 @@ from visthrow.onboard.hover import HoverController, HoverParams
 from visthrow.task import Experiment, contract_of, plant_of
 from visthrow.throws.calibrated import calibrated_start
 from visthrow.throws.reference_protocol import HOVER_TIME, batch_plant, place_in_hover
-from visthrow.training.device import cores
+from visthrow.training.device import cores, resolve
 from visthrow.training.env import ThrowEnv
 from visthrow.training.protocol import hover_start
 
@@ -35,15 +35,15 @@ PIXEL = 0.5 / 320.0
 GOAL = (2.0, 0.0, 0.0)
 
 
-def in_training(flown: Experiment, count: int, seed: int) -> tuple[list, np.ndarray, np.ndarray]:
+def in_training(flown: Experiment, count: int, seed: int, device: str) -> tuple[list, np.ndarray, np.ndarray]:
     """Calibrations, or None, in the training simulator; turns [rad] and errors of the focal length [-] that were drawn."""
     found: list = []
     torch.manual_seed(seed)
     with torch.inference_mode():
-        env = ThrowEnv(flown, "cpu", seed, count)
-        env.fix_goal(torch.tensor(GOAL))
+        env = ThrowEnv(flown, device, seed, count)
+        env.fix_goal(torch.tensor(GOAL, device=device))
         calibrated_start(flown, found)(env)
-        return found, env._memory["extrinsic_rotation"].numpy(), env._memory["scale_error"].flatten().numpy()
+        return found, env._memory["extrinsic_rotation"].cpu().numpy(), env._memory["scale_error"].flatten().cpu().numpy()
 
 
 def on_reference(flown: Experiment, name: str, count: int, seed: int) -> tuple[list, np.ndarray, np.ndarray]:
@@ -95,11 +95,12 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=100)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--plant", choices=("hybrid", "reference", "reference-realistic"), default="hybrid")
+    parser.add_argument("--device", default="cpu", help="of the training simulator (default: cpu)")
     args = parser.parse_args()
     torch.set_num_threads(1)
     flown, asked = hover_start(config.load(Experiment, config.find("train", "vision_ideal"), DRAWN)), TILT_DEG
     if args.plant == "hybrid":
-        found, turn, scale = in_training(flown, args.count, args.seed)
+        found, turn, scale = in_training(flown, args.count, args.seed, resolve(args.device))
     else:
         (found, turn, scale), asked = on_reference(flown, args.plant, args.count, args.seed), 0.5 * TILT_DEG
     known = [i for i, one in enumerate(found) if one is not None]
