@@ -12,8 +12,9 @@ from camera.params import CameraParams
 from camera.scenes.scene import Nuisances
 from sim.params import RopeParams
 from visthrow import cli, config
+from visthrow.throws.flight import Flight, Policies, hover, throw
 from visthrow.throws.loading import load_policy
-from visthrow.throws.reference_protocol import Job, fly_batch
+from visthrow.throws.reference_protocol import Job, batch_plant, fly_batch, place_in_hover
 from visthrow.view.eyes import Eyes
 
 SMALL = ["fresh=2", "pool=4", "reuse=1", "batch=2", "patches=8", "samples=1", "calibration=2"]
@@ -65,16 +66,19 @@ def test_keypoints_of_a_picture_are_those_that_poses_project_to(by):
     true, _ = keypoints(pilot, *tensors)
     assert valid.all()
     assert np.abs(points - true.numpy()).max() < NEAR[by]
-    assert eyes.found == {"ball": 1, "goal": 1, "frames": 1}
+    assert eyes.found == {"ball": 1, "goal": 1, "frames": 1, "refused": 0}
     with pytest.raises(ValueError, match="expected one of learnt, contours"):
         Eyes(camera, rope.mount, rope.length + rope.payload_offset, 1, 0, by="magic")
 
 
 class Blind:
-    """Eyes that see nothing; counts how often they are asked."""
+    """Eyes that see nothing, and say of some vehicles that they do not; counts how often they are asked."""
 
-    def __init__(self) -> None:
-        self.looks, self.seen = 0, None
+    def __init__(self, lost=(False, False)) -> None:
+        self.looks, self.seen, self._lost = 0, None, np.array(lost)
+
+    def lost(self):
+        return self._lost
 
     def look(self, now, measured, goal_w, carried):
         self.looks += 1
@@ -92,6 +96,19 @@ def test_a_throw_flies_on_what_its_eyes_see_alone():
     assert seeing["success"].all()
     assert seeing["error"].max() < 0.2
     assert not (without["success"] & (without["error"] < 0.5)).any()
+
+
+def test_a_throw_is_refused_where_the_hover_sees_no_ball():
+    loaded = load_policy("vision")
+    plant, rng = batch_plant(loaded.experiment, "hybrid", 2.0, 0, 2, 0)
+    home = place_in_hover(plant, loaded.experiment, loaded.experiment.task.start, rng)
+    pilots = Policies([loaded], np.tile([2.0, 0.0, 0.0], (2, 1)), eyes=Blind((True, False)))
+    flight = Flight(plant, pilots, home_w=home)
+    flight.run([hover(0.5), throw(0.2)])
+    assert flight.failures == ["refused: the ball is not seen in the hover", None]
+    assert flight.open.tolist() == [False, True]
+    off = np.linalg.norm(plant.state.pos_w - home, axis=1)
+    assert off[0] < 0.3, "it hovers on"
 
 
 @pytest.mark.parametrize(

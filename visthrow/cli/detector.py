@@ -102,13 +102,14 @@ def throw(args: argparse.Namespace) -> int:
     jobs = plan(1, (args.target,), args.throws, args.seed, size=TOGETHER)
     parts = [part for _, part in sorted(done(partial(_thrown, loaded, args.plant, looks), jobs, args.jobs), key=itemgetter(0))]
     columns = {name: np.concatenate([part[0][name] for part in parts]) for name in parts[0][0]}
-    found = {name: sum(part[1][name] for part in parts) for name in ("ball", "goal", "frames")}
+    found = {name: sum(part[1][name] for part in parts) for name in parts[0][1]}
     share = {name: found[name] / max(found["frames"], 1) for name in ("ball", "goal")}
-    figures = Throws(args.target, **columns).summary() | share
+    figures = Throws(args.target, **columns).summary() | share | {"refused": found["refused"]}
     error = columns["error"][np.isfinite(columns["error"])]
     width = 1.96 * float(error.std(ddof=1)) / math.sqrt(len(error)) if len(error) > 1 else math.nan
     print(
-        f"{loaded.name} by {args.by} on {args.plant}, {args.target:g} m: {len(error)} of {args.throws} landed, error "
+        f"{loaded.name} by {args.by} on {args.plant}, {args.target:g} m: {len(error)} of {args.throws} landed, "
+        f"{found['refused']} refused, error "
         f"{error.mean() if len(error) else math.nan:.3f} +- {width:.3f} m (95 %), ball found in {100 * figures['ball']:.1f} %, "
         f"goal in {100 * figures['goal']:.1f} % of {found['frames']} frames"
     )

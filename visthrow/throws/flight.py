@@ -25,6 +25,9 @@ if TYPE_CHECKING:
 FALL_TIME = 1.5
 """Longest flight after separation that is waited for [s]."""
 
+LOOK_EVERY = 8
+"""Periods of a hover between two looks at pictures."""
+
 VIEWS = ("pos_w", "quat_wb", "vel_w", "rate_b", "payload_pos_w")
 """What a policy is shown of a vehicle."""
 
@@ -58,6 +61,11 @@ class Pilots(ABC):
         """Decide for all vehicles, of which those of ``flight.flown`` follow; ``held`` are the hover controller's commands."""
 
 
+    def wait(self, flight: "Flight", seen: Snapshot) -> dict[int, str]:
+        """Vehicles that are not to throw if the hover ended here, and why; called each period of the hover before the throw."""
+        return {}
+
+
 class Policies(Pilots):
     """Learnt policies that share a batch, each with the same number of vehicles, the first policy's first."""
 
@@ -72,12 +80,20 @@ class Policies(Pilots):
             draws: state policies too have a camera, to be drawn.
             eyes: whose rendered pictures keypoints come from; None: they are what measured poses project to.
         """
-        self.eyes = eyes
+        self.eyes, self._waited = eyes, 0
+        self._lost: dict[int, str] = {}
         share = len(goal_w) // len(loaded)
         self.slices = [slice(i * share, (i + 1) * share) for i in range(len(loaded))]
         looks = [draws or item.policy.contract["observation"]["layout"] == "vision" for item in loaded]
         self.pilots = [Pilot(item.policy, item.experiment.camera if look else None, share) for item, look in zip(loaded, looks)]
         super().__init__(loaded[0].experiment, goal_w, np.vstack([pilot.previous_action for pilot in self.pilots]), goal_vel_w)
+
+    def wait(self, flight: "Flight", seen: Snapshot) -> dict[int, str]:
+        self._waited += 1
+        if self.eyes is not None and self._waited % LOOK_EVERY == 0:
+            self.eyes.look(flight.plant.exposed, seen, self.goal_w, seen.attached)
+            self._lost = dict.fromkeys(np.flatnonzero(self.eyes.lost()), "refused: the ball is not seen in the hover")
+        return self._lost
 
     def decide(self, flight: "Flight", seen: Snapshot, held: np.ndarray) -> Decision:
         outs, goal_w = [], flight.goal_at(seen.time)
@@ -157,6 +173,7 @@ class Flight:
         self.open, self.flown, self.failed = np.ones(count, bool), np.zeros(count, bool), np.zeros(count, bool)
         self.failures: list[str | None] = [None] * count
         self.commands: list[np.ndarray] = []
+        self._refused: dict[int, str] = {}  # by the pilots, in the hover
         most = pilots.experiment.task.action.max_thrust
         limits = HoverParams(min_thrust=min(HoverParams.min_thrust, most / 70.0), max_thrust=most)
         self._hover = HoverController(limits, plant.period, count)
@@ -187,6 +204,9 @@ class Flight:
                 self._hover.reset()
             elif math.isnan(self.begin):
                 self.begin = self.plant.time
+                for vehicle, cause in self._refused.items():
+                    self.fail(vehicle, cause)
+                self.open &= ~self.failed
             self._period(phase.throws)
             while not phase.over(self):
                 self._period(phase.throws)
@@ -202,6 +222,8 @@ class Flight:
         held = self._held(seen)
         self.flown = self.open & seen.attached & throws
         sent = Decision(held, np.zeros(plant.count, bool))
+        if math.isnan(self.begin):
+            self._refused = self.pilots.wait(self, seen)
         if throws:
             asked = self.pilots.decide(self, seen, held)
             command = np.where(self.flown[:, None], asked.command, held)

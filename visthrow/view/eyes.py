@@ -28,6 +28,9 @@ HOLD = 5
 WITHIN = math.radians(12.0)
 """Of where the ball was a frame ago it is looked for, and so much further with each frame in which it was not seen [rad]."""
 
+SURE = 0.5
+"""Share of the looks in a hover in which the ball must be found."""
+
 BY = ("learnt", "contours")
 """Detectors."""
 
@@ -38,7 +41,7 @@ class Eyes:
     Attributes:
         frames: of the first vehicle, BGR, each with what was found: image, keypoints (8, 2), validity (8,).
         seen: keypoints and validity of the last look, (E, 8, 2) and (E, 8).
-        found: how often ball and goal were found, and frames looked at.
+        found: how often ball and goal were found, frames looked at, and throws that were refused.
     """
 
     def __init__(
@@ -76,7 +79,8 @@ class Eyes:
         self._unseen = np.zeros(count, int)  # frames since then
         self.frames: list[tuple[np.ndarray, torch.Tensor, torch.Tensor]] = []
         self.seen: tuple[np.ndarray, np.ndarray] | None = None
-        self.found = {"ball": 0, "goal": 0, "frames": 0}
+        self.found = {"ball": 0, "goal": 0, "frames": 0, "refused": 0}
+        self._hits = np.zeros(count, int)  # looks of each vehicle in which its ball was found
 
     def look(self, now: Any, measured: Any, goal_w: np.ndarray, carried: Sequence[bool] | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Take and look at a picture of each vehicle.
@@ -104,6 +108,12 @@ class Eyes:
         self.seen = points, valid
         return points, valid
 
+    def lost(self) -> np.ndarray:
+        """Vehicles whose ball was found too seldom to throw with, shape (E,), bool; asked in a hover."""
+        lost: np.ndarray = self._hits < SURE * self._looks
+        self.found["refused"] = int(lost.sum())
+        return lost
+
     def _hanging(self, rot_wb: np.ndarray) -> tuple[np.ndarray, float]:
         """Ray in the world frame and half-angle of a ball that hangs still below a vehicle: where it is looked for first."""
         down = rot_wb @ (self._mount_b - np.array(self.params.mount.position_b)) - [0.0, 0.0, self._below]
@@ -122,6 +132,7 @@ class Eyes:
         self.found["frames"] += 1
         for name in ("ball", "goal"):
             self.found[name] += getattr(seen, name) is not None
+        self._hits[e] += seen.ball is not None
         if seen.ball is not None:
             self._balls[e], self._unseen[e] = (rot_cw.T @ seen.ball.ray_c, seen.ball.half_angle), 0
             return seen
