@@ -135,17 +135,17 @@ STILL, SWAY = 1.5, 1.5
 """Of a hover before the sway, and of the sway [s]."""
 
 SWAY_RATE, SWAY_FREQUENCY = 1.0, 4.0 / 3.0
-"""Amplitude of the sway's roll rate, 7 deg of tilt to each side [rad/s]; above the swing's frequency: the rope does not follow [Hz]."""
+"""Amplitude of roll and pitch rate, 7 deg of tilt about either axis [rad/s]; above the swing's frequency: the rope does not follow [Hz]."""
 
 
 def sway(since: float, rate: float = SWAY_RATE, frequency: float = SWAY_FREQUENCY) -> tuple[float, float]:
-    """Roll and pitch rate of the sway [rad/s], so long after its begin [s]: a figure of eight of equal tilts to all sides.
+    """Roll and pitch rate of the sway [rad/s], so long after its begin [s]: once to and fro along a diagonal, then along the other one.
 
     A camera's yaw turns the path that the ball takes in the image, latency puts it off along itself. On a circle the two are the same; the
-    sum of their products is the area that a path encloses, and an eight encloses none.
+    sum of their products is the area that a path encloses, and lines enclose none.
     """
-    phase = 2.0 * math.pi * frequency * since
-    return rate * math.cos(phase), 2.0 * rate * math.cos(2.0 * phase)
+    swung = rate * math.cos(2.0 * math.pi * frequency * since)
+    return swung, swung if int(frequency * since + 1e-9) % 2 == 0 else -swung
 
 
 class Problem:
@@ -294,7 +294,7 @@ def _box(points: Tensor) -> Tensor:
 def _means(values: Tensor) -> Tensor:
     """Mean over each step between values that are evenly apart, shape (N, 3): by the cubic through four of them, at the ends by the chord.
 
-    A chord is short by (frequency dt)^2 / 12 of a swing: by 1 % of the sway's faster part, which would pass for another focal length.
+    A chord is short by (frequency dt)^2 / 12 of a swing, 0.2 % of the sway, which would pass for another focal length.
     """
     chord = 0.5 * (values[1:] + values[:-1])
     inner = (13.0 * (values[1:-2] + values[2:-1]) - values[:-3] - values[3:]) / 24.0
