@@ -265,7 +265,7 @@ class HybridSim:
         if pieces <= 1:
             wp.launch(kernel, count, [0, *arguments], device=device, block_dim=block_dim)
             return
-        kernel.module.load(device)  # by one thread
+        kernel.module.load(device, block_dim=1)  # by one thread, as a launch there would
 
         def launch(first: int, last: int) -> None:
             wp.launch(kernel, last - first, [first, *arguments], device=device)
