@@ -18,7 +18,7 @@ REAL = Path(__file__).resolve().parents[2] / "data" / "real"
 FLIGHTS = {n: setup.read_logs([REAL / "payload_cf_single" / f"log{n}.csv.gz"], "cf_payload")[0] for n in (204, 205, 206)}
 """Flights along x, along y, and in place."""
 CRAZYFLIE = setup.known("cf_payload")
-PATHS = ("pos_w", "vel_w", "payload_pos_w", "payload_vel_w", "mocap_pos_w")
+PATHS = ("pos_w", "vel_w", "payload_pos_w", "payload_vel_w", "est_pos_w")
 LATE = 0.1
 
 
