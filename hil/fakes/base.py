@@ -270,6 +270,9 @@ class Fake(ABC):
         while self._later and self._later[0][0] <= time + SLACK:
             heapq.heappop(self._later)[2]()
 
+    def run_on(self, when: float) -> None:  # noqa: B027  most fakes have no clock of their own
+        """Let the autopilot work up to a time within this period [s], where its clock is ours: what comes then was not there before."""
+
     def fly(self) -> None:
         """Hear what has come, and fly one period."""
         self.hear()

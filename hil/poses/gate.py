@@ -5,7 +5,8 @@ time since a pose last *differed* from the one before. A body that jumps is refu
 where the last accepted one and its velocity put the body, within a room that grows with the time in which *nothing* came,
 not with the time in which wrong poses came. So two bodies that the system has swapped never become right again by waiting;
 their timers run out and the runner ends the throw. Swapped after a gap, which leaves room for both, they are known by the
-cable: a pose that fits the body at its other end better than its own is not taken, nor one farther off than the cable is long.
+cable: of poses off their way, one that fits the body at the cable's other end better is not taken, nor one farther off than the cable
+is long. A body that goes its way is followed, however far: a payload that has come off takes no pose of the vehicle with it.
 Poses that keep coming, but more rarely than ``hold``, are as good as none.
 """
 
@@ -157,9 +158,9 @@ class Gate:
         p = self.params
         expected = tuple(x + age * v for x, v in zip(last.pos, velocity or (0.0, 0.0, 0.0)))
         off = math.dist(pose.pos, expected)
-        if tether is not None:
+        if tether is not None and off > p.max_jump:
             apart = math.dist(pose.pos, tether.pos)
-            if apart < off and off > p.max_jump:
+            if apart < off:
                 return "swapped"
             if apart > tether.length:
                 return "cable"
