@@ -390,6 +390,7 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=1e6, help="begin no world later than this")
     parser.add_argument("--end", type=float, default=1e6, help="minutes after which a verdict that is not there is none")
     parser.add_argument("--warm", choices=PLANTS, help="only compile what worlds of this plant need")
+    parser.add_argument("--plants", nargs="+", choices=PLANTS, default=PLANTS, help="leave worlds of others out, such as without MuJoCo")
     parser.add_argument("--small", action="store_true", help="short flights, as the default tests have them")
     args = parser.parse_args()
     single()
@@ -404,7 +405,8 @@ def main() -> None:
     sizes = {kind: int(count) for kind, count in (item.split("=") for item in args.worlds)}
     begin, end = (time.time() + 60.0 * minutes for minutes in (args.minutes, args.end))
     shorter = SMALL if args.small else {}
-    worlds = [(kind, replace(recipe, **shorter)) for kind, recipe in bank(first, sizes)]
+    worlds = [(kind, replace(recipe, **shorter)) for kind, recipe in bank(first, sizes) if recipe.plant in args.plants]
+    print(f"{len(worlds)} of {sum(sizes.values())} worlds are of the plants {', '.join(args.plants)}", flush=True)
     worlds = [(kind, recipe) for kind, recipe in worlds if recipe.digest() not in done]
     tasks = [(kind, recipe, begin, end, args.verdicts) for kind, recipe in worlds]
     tally: dict[str, Counter] = {kind: Counter() for kind in sizes}

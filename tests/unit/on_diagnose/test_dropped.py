@@ -1,5 +1,6 @@
 """Commands that got lost: what each would have changed, and that they are found and told beside what else there is."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -24,8 +25,8 @@ def model_of(lost: float, **theta: float) -> ThrowModel:
 
 def test_a_column_is_what_the_missing_command_changes():
     model = model_of(SHARE)
-    model.windows({})
-    columns, (setting, states), flights = model.without_commands({}), model.begun({}), model.flights
+    columns = model.without_commands({}, range(len(model.windows({}))))
+    (setting, states), flights = model.begun({}), model.flights
     w = int(model._retained[len(columns) // 2])
     c = flights.cuts[w]
     f = flights.flights[c.flight]
@@ -47,19 +48,18 @@ def test_a_column_is_what_the_missing_command_changes():
     assert largest > 1e-3  # a turn of that [rad], else nothing is compared
 
 
-def test_a_model_with_lost_commands_says_the_same_both_ways():
-    model = dropped.WithDropped(model_of(SHARE), SHARE)
+def test_a_problem_with_lost_commands_says_the_same_both_ways():
+    model = model_of(SHARE)
     windows = model.windows({})
-    problem = Problem.of(model, windows, tuple(range(len(windows))))
+    problem = replace(Problem.of(model, windows, tuple(range(len(windows)))), lost=SHARE)
     point = linearise(problem, np.zeros(len(model.effects)), windows=windows)
-    again = moved(problem, point, point.theta)
-    for i, (w, own, there) in enumerate(zip(windows, model.model.windows({}), again.windows)):
+    again = moved(problem, point, np.append(1e-9, point.theta[1:]))
+    for w, own, there, columns in zip(point.windows, windows, again.windows, point.commands):
         np.testing.assert_allclose(there.residual, w.residual, atol=1e-9)
-        bare, columns = model.parted(w, i)
-        np.testing.assert_allclose(bare.residual, own.residual, atol=1e-12)
-        assert bare.nuisance.shape == own.nuisance.shape
+        assert w.nuisance.shape[1] == own.nuisance.shape[1] + columns.shape[1]
         assert np.all(w.nuisance_sd[len(own.nuisance_sd) :] == pytest.approx(np.sqrt(SHARE * (1.0 - SHARE))))
         np.testing.assert_allclose(own.residual - w.residual, SHARE * columns.sum(1), atol=1e-12)
+    assert all(w.nuisance.shape == windows[i].nuisance.shape for i, w in point.about.windows.items())
 
 
 def told(diagnosis):

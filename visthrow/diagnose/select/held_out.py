@@ -116,7 +116,7 @@ def crossed(diagnosis: Diagnosis) -> Crossed:
     work, least = diagnosis.work, diagnosis.threshold
     point, priors = work.after, work.problem.priors
     groups, left_out = groups_of(point, work.problem.kept)
-    varies = deviations(diagnosis.scatter, priors, [e.name for e in work.problem.model.effects], ())
+    varies = deviations(diagnosis.scatter, priors, [e.name for e in work.problem.effects], ())
     statistics = freed(regrouped(point, groups), varies.by_flight)
     count, folds = len(statistics.flights), folds_of(len(statistics.flights))
     trained, named = np.zeros((count, len(priors.floor))), Counter()
@@ -241,7 +241,7 @@ def studentised(before: np.ndarray, after: np.ndarray, rng: np.random.Generator,
 def measure(diagnosis: Diagnosis, seed: int = 0) -> HeldOut:
     """Ask held-out flights about the names of a search; ``seed``: of the bootstrap."""
     work, cross = diagnosis.work, crossed(diagnosis)
-    effects = work.problem.model.effects
+    effects = work.problem.effects
     sizes = np.array([diagnosis.theta.get(e.name, 0.0) for e in effects]) / work.problem.priors.floor
     share = borne_out(cross.statistics, cross.trained, sizes)
     named = {effects[j].name: n / len(cross.folds) for j, n in cross.named.items()}
@@ -317,7 +317,7 @@ def _demoted(diagnosis: Diagnosis, names: Sequence[str], verdict: str, why: str)
 
 def _sized(work: Work, names: Sequence[str]) -> tuple[dict[str, float], tuple[tuple[float, ...], ...], Work]:
     """Sizes with which some of the names alone explain the flights, their covariance, and the work of these."""
-    known, priors, point = [e.name for e in work.problem.model.effects], work.problem.priors, work.after
+    known, priors, point = [e.name for e in work.problem.effects], work.problem.priors, work.after
     active = [known.index(name) for name in names]
     if not active:
         return {}, (), replace(work, after=work.before, active=())

@@ -89,12 +89,12 @@ class SearchState:
 
     def name(self, j: int) -> str:
         """Return the name of a candidate by its number."""
-        return self.problem.model.effects[j].name
+        return self.problem.effects[j].name
 
     @property
     def prices(self) -> np.ndarray:
         """Return what the name of each candidate costs [nats], shape (K,)."""
-        return self.least + np.array([getattr(e, "price", 0.0) for e in self.problem.model.effects])
+        return self.least + np.array([getattr(e, "price", 0.0) for e in self.problem.effects])
 
     def price(self, active: Sequence[int], beside: bool = True) -> float:
         """Return what the names of a set cost [nats].
@@ -109,7 +109,7 @@ class SearchState:
 
     def _acts_beside(self, j: int, laws: Sequence[int]) -> bool:
         """Whether an effect acts in the block of one of some laws."""
-        blocks = {self.problem.model.effects[k].block for k in laws}
+        blocks = {self.problem.effects[k].block for k in laws}
         if blocks and j not in self.acting:
             self.acting[j] = acts_on(self.nominal, j), acts_on(self.nominal, j, joint=True)
         return bool(blocks) and self.acting[j][grammar.JOINT in blocks] in blocks
@@ -122,12 +122,12 @@ class SearchState:
 
     def is_term(self, j: int) -> bool:
         """Tell whether a candidate is a term of a law."""
-        return isinstance(self.problem.model.effects[j], terms.TermEffect)
+        return j >= len(self.problem.model.effects)
 
     @property
     def term_columns(self) -> np.ndarray:
         """Return which candidates are terms, shape (K,), bool."""
-        return np.array([self.is_term(j) for j in range(len(self.priors.floor))])
+        return np.arange(len(self.priors.floor)) >= len(self.problem.model.effects)
 
     def linear(self, active: Sequence[int], point: Point) -> float:
         """Return what a set is worth by the statistics of a point alone."""
@@ -169,7 +169,7 @@ class SearchState:
         """
         asked = self.point, tuple(active), every
         if self.varied is None or self.varied[0][0] is not self.point or self.varied[0][1:] != asked[1:]:
-            effects, about = self.problem.model.effects, self.sizes(active)
+            effects, about = self.problem.effects, self.sizes(active)
             others = by_flight([e for j, e in enumerate(effects)
                                 if j in self.problem.varies.effects or (every and not e.switch and not self.is_term(j))])  # fmt: skip
             self.varied = asked, varying(self.point.plain, about, self.priors, [e.name for e in effects], self.least, self._again,
@@ -241,7 +241,7 @@ class SearchState:
         Names that act in a law's block may be a part of its form. A name acts there by its column or by what the other names cannot
         stand in for, as two delays that differ by a force. What is worth nothing without those is not told either.
         """
-        effects, names = self.problem.model.effects, self.names
+        effects, names = self.problem.effects, self.names
         blocks = {effects[j].block for j in self.terms}
         joint = grammar.JOINT in blocks
         near = {j for j in names if acts_on(self.point, j, joint=joint) in blocks}

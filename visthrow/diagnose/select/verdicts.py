@@ -14,7 +14,7 @@ from visthrow.diagnose.select.result import Diagnosis, Finding, Law, Level
 from visthrow.diagnose.select.scatter import CHAIN, FORM, Varies, deviations, freed
 from visthrow.diagnose.select.selector import Selector
 from visthrow.diagnose.select.state import Work
-from visthrow.diagnose.select.terms import WithTerms, bare
+from visthrow.diagnose.select.terms import bare
 
 HALF_PRIOR = 0.5
 """An effect whose posterior deviation exceeds this share of its prior's was not seen."""
@@ -91,7 +91,7 @@ def _sure(point: Point, priors: Priors, active: Sequence[int]) -> list[int]:
 
 def _without_laws(search: Selector, point: Point) -> Selector:
     """The search as if the laws of its set were known: what they explain is left out of the residuals."""
-    if not isinstance(search.problem.model, WithTerms):
+    if not search.problem.terms:
         return replace(search, work=point)
     alone = moved(search.problem, point, np.where(search.term_columns, 0.0, point.theta)) or point
     problem = bare(search.problem, point)[0]
@@ -146,12 +146,12 @@ def _overall(
     reasons = [_excess(level) for level in excessive]
     if search.terms:
         untold, said = search.law()
-        return result.UNKNOWN, search.problem.model.effects[search.terms[0]].block, [said, *reasons], untold
+        return result.UNKNOWN, search.problem.effects[search.terms[0]].block, [said, *reasons], untold
     stuck = [j for j in search.active if _on_bound(search, j)]
     if stuck:
         names = ", ".join(map(search.name, stuck))
         reasons.append(f"{names} would have to lie outside what is physically possible; the form is another")
-        return result.UNKNOWN, acts_on(point, stuck[0]) or search.problem.model.effects[stuck[0]].block, reasons, every
+        return result.UNKNOWN, acts_on(point, stuck[0]) or search.problem.effects[stuck[0]].block, reasons, every
     if excessive:
         worst = max(excessive, key=lambda level: level.nats)
         return result.UNKNOWN, worst.block, reasons, _withdrawn(search, excessive)
@@ -185,7 +185,7 @@ def _on_bound(search: Selector, j: int) -> bool:
 
 
 def _finding(search: Selector, point: Point, j: int, active: list[int], spread: np.ndarray, withdrawn: set[int]) -> Finding:
-    effect, priors = search.problem.model.effects[j], search.priors
+    effect, priors = search.problem.effects[j], search.priors
     blank = Finding(effect.name, result.UNOBSERVABLE, effect.block, effect.cause, effect.equation, effect.unit, 0.0,
                     effect.prior_sd, *effect.bounds, effect.floor, 0.0, manoeuvres=tuple(effect.manoeuvres))  # fmt: skip
     if not priors.visible[j]:
@@ -265,7 +265,7 @@ def _named(search: Selector, point: Point, blank: Finding, j: int, home: int, pa
 
 def _joint(search: Selector, point: Point, members: list[int], rest: list[int]) -> str:
     """The best known combination of a class: first eigenvector of its members' information in prior deviations."""
-    priors, effects = search.priors, search.problem.model.effects
+    priors, effects = search.priors, search.problem.effects
     others = np.setdiff1d(np.arange(len(effects)), members)
     information, slab = point.information, priors.slab[members]
     nuisance = information[np.ix_(others, others)] + np.diag(priors.deviation(rest)[others] ** -2.0)

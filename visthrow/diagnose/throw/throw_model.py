@@ -191,15 +191,16 @@ class ThrowModel:
         full = [np.concatenate((r, *self._direct_residuals(w, setting))) for r, w in zip(flown, self._retained)]
         return [r + about.windows[i].nuisance @ moves[i] if i in moves else r for i, r in enumerate(full)]
 
-    def without_commands(self, theta: Mapping[str, float]) -> list[np.ndarray]:
-        """Change of each window's replayed samples by each command that does not come: the one before stays. Shape (N, T).
+    def without_commands(self, theta: Mapping[str, float], windows: Sequence[int]) -> list[np.ndarray]:
+        """Change of some windows' replayed samples by each command that does not come: the one before stays. Shape (N, T) each.
 
         Args:
             theta: sizes of the effects, at which :meth:`windows` was asked for before.
+            windows: numbers among those that came.
         """
         setting = apply(self.entries, self.setting, theta)
         states, known = self._settled_at.get(_key(theta), self._fitted()[0]), self.setting.plant.vehicle.queue.delay
-        return without_each_command(self.flights, self._retained, known, setting, states, self.substep, self.device)
+        return without_each_command(self.flights, self._retained[list(windows)], known, setting, states, self.substep, self.device)
 
     def _following(
         self, setting: Setting, theta: Mapping[str, float], about: Linearised
