@@ -102,13 +102,14 @@ def verdict(problem: Problem, point: Point, active: Sequence[int], least: float)
         return None
     v, priors, sizes = effect(), problem.priors, problem.sizes(point.theta)
     reach = REACH * v.prior_sd
-    for every in (FIRST, 1):
+    sets = active, np.flatnonzero(priors.visible).tolist()  # what is still missing must not be why
+    for every, shares in ((FIRST, reach[::LOOK]), (1, reach)):
         rows = range(0, len(problem.kept), every)
         columns = problem.model.without_commands(sizes, [problem.kept[w] for w in rows])
         told = Told.of(problem, point, [point.windows[w] for w in rows], columns, rows)
-        if told.ahead(reach[::LOOK], priors, active).max() <= 0.0:  # in most flights all came, and a few windows and shares tell
+        nats = np.minimum(*(told.ahead(shares, priors, named) for named in sets))
+        if nats.max() <= 0.0:
             return None
-    nats = np.minimum(*(told.ahead(reach, priors, named) for named in (active, np.flatnonzero(priors.visible).tolist())))
     return judged(v, reach, nats, least, sum(own.shape[1] for own in columns), COMMAND)
 
 
