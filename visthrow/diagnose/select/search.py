@@ -73,7 +73,7 @@ def explain(
         if not search.stands_without(gone, problem, nominal, least):
             search = Selector(problem, nominal, least, say, laws)
         search.run()
-    diagnosis = held_out.judged(conclude(search), seed)
+    diagnosis = held_out.judged(conclude(search))
     return replace(diagnosis, duplicates=duplicates, seconds=time.monotonic() - begun, seed=seed)
 
 

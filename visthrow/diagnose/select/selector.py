@@ -32,17 +32,14 @@ from visthrow.diagnose.select.result import Step
 from visthrow.diagnose.select.scatter import CHAIN, Varies, deviations
 from visthrow.diagnose.select.state import Move, SearchState
 
-MOST_NAMES = 6
+MOST_NAMES = 3 * CHAIN
 """A longer list of causes is a wrong form, not a finding."""
 
 SHORTLIST = 3
-"""Additions whose simulation is run again in each round."""
+"""Sets of a kind whose simulation is run again in each round, of exchanges twice as many."""
 
 DOUBT = 15.0
 """Nats behind up to which a set is simulated, where statistics of other sizes may be wrong; up to ``STRONG`` it counts as possible."""
-
-MOST, MOST_NEAR = 6, 16
-"""Sets that are simulated so, and how many where they are that near: of what hover shows, a dozen causes may be the reason."""
 
 AHEAD = 1.0
 """Nats by which an exchange must be ahead: less is not worth more than a bare mention (Kass and Raftery 1995)."""
@@ -191,7 +188,7 @@ class Selector(SearchState):
             alone += self.linear((), self.nominal) - self.linear(active, self.nominal)
             singles |= {(k,): max(singles.get((k,), -np.inf), alone[k]) for k in usable.tolist()}
         ranked = _ranked(singles, DOUBT)
-        ranked = [m for i, m in enumerate(ranked) if i < MOST or (i < MOST_NEAR and abs(m.nats) < STRONG)]
+        ranked = [m for i, m in enumerate(ranked) if i < 2 * SHORTLIST or abs(m.nats) < STRONG]
         alone = [] if self.terms else [Move((k,), 0.0) for k in usable.tolist() if self.is_term(k)]  # not to be told from here
         return [*ranked, *_ranked(pairs, DOUBT)[:SHORTLIST], *(m for m in alone if m.active not in [r.active for r in ranked])]
 

@@ -22,6 +22,7 @@ from visthrow.diagnose.likelihood.stack import BATCH, statistics
 from visthrow.diagnose.likelihood.threads import each
 from visthrow.diagnose.likelihood.transfer import all_to_host, side_by_side
 from visthrow.diagnose.models.interface import LATENT_BLOCKS
+from visthrow.diagnose.select.excess import UNKNOWN_RATIO
 from visthrow.diagnose.select.point import Point, Problem, regathered
 from visthrow.diagnose.select.result import Law
 
@@ -38,11 +39,8 @@ MATERIAL = 0.5
 """Root mean square force of a term, in the block's usual latent force, below which it does not matter: that of a gust moves a
 landing by 5 mm within half a second."""
 
-WEIGHED = 5
-"""Terms that become effects to be weighed."""
-
-ROUGHER = 2.0
-"""While terms are screened, no phase is rougher than so many times the usual."""
+WEIGHED = 6
+"""Terms that become effects to be weighed: as many as other sets that are simulated in their place."""
 
 
 @lru_cache(maxsize=32)
@@ -84,7 +82,7 @@ def calmed(point: Point) -> tuple[Point, list[WindowStatistics]]:
     A force that the model lacks is taken for gusts in the phases in which it acts; there no term of it would stand out.
     """
     levels = point.noise.latent_sd
-    limits = {block: ROUGHER * usual(levels, block) for block in {block for block, _ in levels}}
+    limits = {block: UNKNOWN_RATIO * usual(levels, block) for block in {block for block, _ in levels}}
     noise = replace(point.noise, latent_sd={key: min(level, limits[key[0]]) for key, level in levels.items()})
     parts = statistics(point.grams, noise, point.device)
     return replace(point, noise=noise, plain=gather(point.grams, parts, point.theta)), parts

@@ -4,8 +4,18 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.stats import chi2
 
-from visthrow.diagnose.likelihood.evidence import NORMAL_95, OWN_FLOOR, Priors, certainty, covariance, estimate
+from visthrow.diagnose.likelihood.evidence import (
+    CALIBRATION_QUANTILE,
+    NORMAL_95,
+    OWN_FLOOR,
+    Priors,
+    certainty,
+    covariance,
+    estimate,
+)
+from visthrow.diagnose.likelihood.marginal import TAIL
 from visthrow.diagnose.models.interface import Model, Window
 from visthrow.diagnose.select import result
 from visthrow.diagnose.select.excess import acts_on, levels, too_strong
@@ -16,14 +26,12 @@ from visthrow.diagnose.select.selector import Selector
 from visthrow.diagnose.select.state import Work
 from visthrow.diagnose.select.terms import bare
 
-HALF_PRIOR = 0.5
-"""An effect whose posterior deviation exceeds this share of its prior's was not seen."""
+BIT = 0.5
+"""An effect whose posterior deviation exceeds this share of its prior's was not seen: flights say less than a bit about it."""
 
 IMPLAUSIBLE_FORCE = 0.3
 """Latent force, in the thrust that carries the vehicle, that no missing cause explains: the channels do not belong together."""
 
-ROUGH = 4.0
-"""Latent force of a window, in its phase's, from which something happened there."""
 
 def conclude(search: Selector) -> Diagnosis:
     """Turn a finished search into verdicts.
@@ -112,7 +120,8 @@ def _different(explanations: Sequence[Sequence[Law]]) -> tuple[Law, ...]:
 
 def _events(search: Selector, point: Point) -> tuple[int, ...]:
     """Flights that were left out for what happened there, and flights with a window far rougher than its phase."""
-    rough = {window.flight for window, share in zip(point.windows, point.noise.share) if share.max() > ROUGH}
+    square = TAIL / chi2.ppf((1.0 - CALIBRATION_QUANTILE) / point.noise.share.size, TAIL)  # of the roughest, with Student's tails
+    rough = {window.flight for window, share in zip(point.windows, point.noise.share) if share.max() ** 2 > square}
     return tuple(sorted({*search.events, *rough}))
 
 
@@ -203,7 +212,7 @@ def _finding(search: Selector, point: Point, j: int, active: list[int], spread: 
     if j in withdrawn:
         text = f"{effect.name}: explains a part of what is missing, but not its form; the name is withdrawn."
         return replace(blank, verdict=result.NOT_IDENTIFIABLE, sentence=text)
-    if wide[1] > HALF_PRIOR * priors.slab[j]:
+    if wide[1] > BIT * priors.slab[j]:
         text = f"{effect.name}: these flights say hardly more than was known ({own:.2g} of {effect.prior_sd:.2g} {effect.unit})."
         return replace(blank, verdict=result.NOT_IDENTIFIABLE, sentence=text)
     text = f"{effect.name}: between {low:.3g} and {high:.3g} {effect.unit}, if there at all."
