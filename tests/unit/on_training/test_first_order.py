@@ -151,7 +151,7 @@ def test_weights_get_what_autograd_gives_them():
     """With some flights counting less than others."""
     fo = first_order("state")
     fo.rollout()
-    figures = fo.derivatives()
+    assert fo.derivatives()["cost"].isfinite()
     shares = torch.rand(24, generator=torch.Generator().manual_seed(0))
     fo.layers.gradients(fo.obs, shares)
     by_action = fo.layers.by_action * shares[:, None]
@@ -159,7 +159,24 @@ def test_weights_get_what_autograd_gives_them():
     expected = torch.autograd.grad(decided(fo, fo.obs), parameters, by_action)
     for parameter, gradient in zip(parameters, expected, strict=True):
         torch.testing.assert_close(parameter.grad, gradient, rtol=1e-4, atol=1e-5 * gradient.abs().max().item())
-    assert figures["cost"].isfinite() and by_action.any(), "nothing was differentiated"
+    assert by_action.any(), "nothing was differentiated"
+
+
+def test_flights_stop_where_nothing_counts_any_more():
+    """Flown on to the horizon, which a latch that is not quite one asks for, they have the same derivatives."""
+    fo, found = first_order("state", "first_order.initial_release=1.0", "first_order.horizon=20"), []
+    start = fo.env.state_dict()
+    for latched in (1.0, 1.0 - 1e-12):
+        fo.env.load_state_dict(start)
+        torch.manual_seed(0)
+        fo._latched, fo._first = latched, 0
+        fo.rollout()
+        fo.derivatives()
+        found.append((fo.flights.flown, fo.layers.by_action.clone()))
+    (short, stopped), (long, flown) = found
+    assert short < long == fo.p.horizon
+    assert flown.any()
+    torch.testing.assert_close(stopped, flown, rtol=0, atol=0)
 
 
 SLOWER = ["vehicle.queue.delay=0.045", "vehicle.motor.time_constant=0.06", "rope.payload_mass=0.08", "rope.length=0.5"]

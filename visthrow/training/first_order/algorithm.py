@@ -125,13 +125,13 @@ class FirstOrder:
     @torch.no_grad()
     def _fly(self) -> None:
         """Fly one batch without release."""
-        env, threshold, on_gpu = self.env, self.cfg.release.threshold, self.env.device.startswith("cuda")
+        env, stops = self.env, self._latched == 1.0 and self.env.device == "cpu"
 
         def decide(k: int, seen: Tensor) -> Tensor | None:
-            over = k - self.lag - 2  # a flight whose latch has tripped twice earns nothing from there
-            if self._latched == 1.0 and not on_gpu and over > 0 and bool(((self.action[:over, :, act.COMMANDS] > threshold).sum(0) > 1).all()):
-                return None
             self.obs[k].copy_(seen)
+            asked = self.action[: max(k - self.lag - 2, 0), :, act.COMMANDS] > self.cfg.release.threshold
+            if stops and bool((asked.sum(0) > 1).all()):  # of no flight a later step counts: its latch has tripped, or would have
+                return None
             return self.layers.forward(k, seen)
 
         def foresee(k: int) -> None:
@@ -196,7 +196,7 @@ class FirstOrder:
         survival = torch.cat([torch.ones_like(hazard[:1]), (1.0 - hazard).cumprod(0)])
         chance = survival[:-1] * hazard
         carried = survival[(k[:, 0] - self.lag).clamp(0, K)] * (k < steps)
-        past = (x.action.abs() - 1.0).clamp(min=0.0).square().sum(-1) * (k < steps)
+        past = (x.action.abs() - 1.0).clamp(min=0.0).square().sum(-1) * carried.detach()
         gain = (chance * reward).sum(0) + (carried * self._carrying(x)).sum(0) - p.termination * survival[-1]
         done = (chance * ~cut).detach()
         total = done.sum().clamp(min=1e-6)
@@ -238,11 +238,10 @@ class FirstOrder:
             kind = wp.vec3 if name == "mount" else wp.vec4 if name == "response" else wp.float32
             setattr(p, name, wp.from_torch(tensor.contiguous(), dtype=kind))
         ins = [self.flights.course, *map(wp.from_torch, (self.flights.steps, self.action, self.layers.by_seen))]
-        outs, state, kernel = [wp.from_torch(self.layers.by_action)], [self.adjoint.course, wp.from_torch(self.by_clipped)], build_backward(env.layout)
-        return [
-            wp.launch(kernel, env.num_envs, [p, k, *state, *ins, *outs], device=env.device, block_dim=64, record_cmd=True)
-            for k in reversed(range(self.p.horizon))
-        ]
+        state, out = (self.adjoint.course, wp.from_torch(self.by_clipped)), wp.from_torch(self.layers.by_action)
+        how = {"device": env.device, "block_dim": 64, "record_cmd": True}
+        kernel = build_backward(env.layout)
+        return [wp.launch(kernel, env.num_envs, [p, k, *state, *ins, out], **how) for k in reversed(range(self.p.horizon))]
 
     @torch.no_grad()
     def _back(self) -> None:
