@@ -24,8 +24,7 @@ from hil.poses.track import Track
 from hil.sources.opening import open_source
 from visthrow.onboard.policy import Policy, find_policy
 
-LISTEN, CARRY = 5.0, 180.0
-"""How long poses are looked at, and a vehicle is carried about, where nothing else is said [s]."""
+LISTEN, CARRY = 5.0, 180.0  # how long poses are looked at, and a vehicle is carried about, where nothing else is said [s]
 
 
 def check(args: argparse.Namespace) -> int:

@@ -6,7 +6,6 @@ import dataclasses
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
 from hil.backends import make_backend, mechanism_lag, require_reach
 from hil.backends.check import autopilot_record
@@ -44,30 +43,19 @@ def key_of(args: argparse.Namespace) -> bytes | None:
 
 
 def require_fake(params: HilParams) -> None:
-    """Refuse ``--auto-arm`` where a real vehicle could be at the other end.
-
-    Raises:
-        RunError: a device that is no loopback address, or poses that do not come by MAVLink.
-    """
+    """Raise `RunError` for ``--auto-arm`` where a real vehicle could be at the other end: no loopback address, or no MAVLink poses."""
     devices = [params.link.device, params.source.device or params.link.device]
     devices += [getattr(params, params.backend).device] if params.backend in ("betaflight", "crazyflie") else []
-    far = [text for text in devices if text.startswith(("serial:", *CFLIB)) or not _loopback(text)]
+    loopback = lambda text: check_device(text, remote=True).host.startswith(("127.", "::1"))  # noqa: E731
+    far = [text for text in devices if text.startswith(("serial:", *CFLIB)) or not loopback(text)]
     if params.source.kind == "mocap":
         far.append(f"source.kind {params.source.kind}")
     if far:
         raise RunError(f"--auto-arm with {', '.join(far)}; it is for `visthrow hil fake` on this machine alone: type 'arm' instead")
 
 
-def _loopback(text: str) -> bool:
-    return check_device(text, remote=True).host.startswith(("127.", "::1"))
-
-
 def fly(args: argparse.Namespace) -> int:
-    """Fly, or run dry, and write the run's folder.
-
-    Returns:
-        1 for a run that was aborted or in which something raised, else 0.
-    """
+    """Fly, or run dry, and write the run's folder; 1 for a run that was aborted or in which something raised, else 0."""
     started, recording = time.monotonic(), args.action == "record"
     params = params_of(args)
     if recording:
@@ -103,7 +91,9 @@ def fly(args: argparse.Namespace) -> int:
     summary["speed"] = args.speed
     summary["autopilot"] = autopilot_record(backend, link)
     summary["links"] = [one.roster.summary() for one in source.links]
-    _close(eyes, solver, backend, source)
+    for part in (eyes, solver, backend, source):
+        if part is not None:
+            part.close()
     recorder.close(summary)
     if viewer is not None:
         viewer.terminate()
@@ -122,9 +112,3 @@ def _show(text: str) -> None:
     """Print where somebody still reads: the terminal may have gone with the run."""
     with contextlib.suppress(OSError):
         print(text, flush=True)
-
-
-def _close(*parts: Any) -> None:
-    for part in parts:
-        if part is not None:
-            part.close()

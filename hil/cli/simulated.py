@@ -25,11 +25,8 @@ from visthrow.onboard.policy import Policy, find_policy
 PLANT, MOTORS, BALL = "visthrow.throws.wire_plant:make", "visthrow.throws.wire_plant:make_motors", "hil.cli.simulated:make_ball"
 """What makes the vehicle behind a fake, and behind a firmware; the ball below a firmware's own vehicle."""
 
-BRIDGE_ID = (254, 190)
-"""MAVLink ids of the bridge where it listens to an autopilot itself."""
-
-BALL_LAG = 0.06
-"""From the mechanism's output to separation below PX4's vehicle [s], as `visthrow.throws.wire_plant.MECHANISM`."""
+BRIDGE_ID = (254, 190)  # MAVLink ids of the bridge where it listens to an autopilot itself
+BALL_LAG = 0.06  # from the mechanism's output to separation below PX4's vehicle [s], as `visthrow.throws.wire_plant.MECHANISM`
 
 
 def direct(args: argparse.Namespace) -> int:

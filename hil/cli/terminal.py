@@ -25,14 +25,9 @@ terminal; and those that nobody means."""
 PAUSING = tuple(getattr(signal, name) for name in ("SIGTSTP", "SIGTTIN", "SIGTTOU") if hasattr(signal, name))
 """Signals that would stop the process in mid flight: Ctrl-Z, and a terminal that belongs to another job."""
 
-MOST_UNSAID = 1000
-"""Lines that wait for a terminal that takes none; those beyond are lost."""
-
-LAST_WORDS = 2.0
-"""That the end of a run waits for its lines to be taken [s]."""
-
-MOST_TYPED = 4096
-"""Bytes of a line without an end."""
+MOST_UNSAID = 1000  # lines that wait for a terminal that takes none; those beyond are lost
+LAST_WORDS = 2.0  # that the end of a run waits for its lines to be taken [s]
+MOST_TYPED = 4096  # bytes of a line without an end
 
 
 class Voice:
@@ -81,8 +76,7 @@ class Terminal:
         """Take over the signals.
 
         Args:
-            auto_arm: whether the word is given whenever the run is ready.
-            simulated: whether the vehicle has said that it is; no other is armed so.
+            auto_arm: whether the word is given whenever the run is ready, to a vehicle that has said that it is simulated and to no other.
             say: never waits.
         """
         self._auto, self._simulated, self._say = auto_arm, simulated, say

@@ -16,7 +16,8 @@ import numpy as np
 from camera.params import CameraParams
 from hil.poses.pose import Vector
 from hil.poses.track import BodyState
-from visthrow.common.errors import ConfigError, VisthrowError
+from visthrow.common.errors import VisthrowError
+from visthrow.config.bounds import Bounded, Positive
 from visthrow.onboard.calibration import (
     STILL,
     SWAY,
@@ -31,29 +32,20 @@ from visthrow.onboard.calibration import (
 
 
 @dataclass(frozen=True)
-class CalibrationParams:
-    """How to calibrate, and which findings a throw may begin with.
+class CalibrationParams(Bounded):
+    """How to calibrate, and which findings a throw may begin with."""
 
-    Raises:
-        ConfigError: a time, a rate or a limit of 0 or less.
-    """
-
-    still: float = STILL  # of hover before the sway [s]
-    sway: float = SWAY  # [s]
-    rate: float = SWAY_RATE  # amplitude of the sway's body rates [rad/s]
-    frequency: float = SWAY_FREQUENCY  # of the sway [Hz]
-    most_tilt_deg: float = 10.0  # of the camera, which is corrected for; beyond it the field of view is another one
-    most_scale: float = 0.06  # of the focal length off the nominal one, which is corrected for [-]
-    most_latency: float = 0.06  # of the keypoints, which is made up for [s]
-    thrust: float = 0.1  # off the commanded one: twice the spread of masses in training
-    sure_tilt_deg: float = 0.5  # standard deviation at most
-    sure_latency: float = 0.005  # likewise [s]
+    still: Positive = STILL  # of hover before the sway [s]
+    sway: Positive = SWAY  # [s]
+    rate: Positive = SWAY_RATE  # amplitude of the sway's body rates [rad/s]
+    frequency: Positive = SWAY_FREQUENCY  # of the sway [Hz]
+    most_tilt_deg: Positive = 10.0  # of the camera, which is corrected for; beyond it the field of view is another one
+    most_scale: Positive = 0.06  # of the focal length off the nominal one, which is corrected for [-]
+    most_latency: Positive = 0.06  # of the keypoints, which is made up for [s]
+    thrust: Positive = 0.1  # off the commanded one: twice the spread of masses in training
+    sure_tilt_deg: Positive = 0.5  # standard deviation at most
+    sure_latency: Positive = 0.005  # likewise [s]
     spreads: Spreads = field(default_factory=Spreads)  # of poses and keypoints
-
-    def __post_init__(self) -> None:
-        numbers = {name: value for name, value in vars(self).items() if name != "spreads"}
-        if min(numbers.values()) <= 0.0:
-            raise ConfigError(f"calibration {numbers}; expected numbers above 0")
 
 
 def solved(hovered: Hovered, camera: CameraParams, contract: dict[str, Any], spreads: Spreads) -> Calibration | str:
@@ -105,11 +97,7 @@ def _warm() -> None:
 
 
 class Calibrating:
-    """The hover and the sway of a run.
-
-    Attributes:
-        found: the calibration; None before it came.
-    """
+    """The hover and the sway of a run; ``found`` is the calibration, None before it came."""
 
     def __init__(self, params: CalibrationParams, goal: Callable[[], Vector | None]) -> None:
         """Begin with nothing; ``goal``: where the goal is [m]."""
@@ -138,9 +126,7 @@ class Calibrating:
             return 0.0, 0.0
         return sway(since, p.rate, p.frequency)
 
-    def note(
-        self, now: float, vehicle: BodyState, thrust: float, points: np.ndarray, valid: np.ndarray, age: float
-    ) -> None:
+    def note(self, now: float, vehicle: BodyState, thrust: float, points: np.ndarray, valid: np.ndarray, age: float) -> None:
         """Take down a tick.
 
         Args:

@@ -38,24 +38,19 @@ STILL_OFFSET, STILL_SPEED = 0.05, 0.25
 """Vehicle off its hover point [m], vehicle and payload speed over 0.2 s [m/s] that count as quiet: half of what the
 policies were trained to start from."""
 
-REACQUIRE = 1.0
-"""Before the vehicle is ours, a body that was refused or gone for this long is taken wherever it is [s]."""
+REACQUIRE = 1.0  # before the vehicle is ours, a body that was refused or gone for this long is taken wherever it is [s]
 
 HAND_OVER_SPEED, HAND_OVER_TILT = 1.0, math.radians(20.0)
 """Below these the autopilot's own hold takes over after a throw: braking out of 60 deg is done on poses [m/s, rad]."""
 
-GROUND = 0.12
-"""Height of the vehicle that counts as landed [m]."""
+GROUND = 0.12  # height of the vehicle that counts as landed [m]
 
 LEVEL_TIME = 0.5
 """An aborted run without poses levels the vehicle for this long and then falls silent: the autopilot's failsafes act [s]."""
 
 
-WARM_CALLS = 3
-"""Calls of the policy before it is to fly: code, data and the traced operations are at hand after two."""
-
-MOST_ERRORS = 100
-"""Tracebacks that are kept."""
+WARM_CALLS = 3  # calls of the policy before it is to fly: code, data and the traced operations are at hand after two
+MOST_ERRORS = 100  # tracebacks that are kept
 
 
 @dataclass(frozen=True)
@@ -93,13 +88,7 @@ class Runner:
     """
 
     def __init__(self, params: HilParams, policy: Policy, backend: Backend, mechanism_lag: float = 0.0) -> None:
-        """Build all parts.
-
-        Args:
-            params: the run.
-            policy: on the CPU.
-            backend: where commands go.
-            mechanism_lag: of the release mechanism, from its command to separation [s].
+        """Build all parts; the mechanism's lag is from its command to separation [s].
 
         Raises:
             MismatchError: the camera is not the one that the policy was trained with.
@@ -140,11 +129,8 @@ class Runner:
         """Decide one tick and send its command.
 
         Args:
-            now: on the runner's clock [s].
-            poses: raw, that have come since the last tick.
-            status: of the back-end, at this tick.
-            words: of the operator.
-            recording: whether all was recorded so far.
+            now: on the runner's clock [s]. poses: raw, that have come since the last tick. status: of the back-end, at this tick.
+            words: of the operator. recording: whether all was recorded so far.
         """
         self.spent = {}
         try:
@@ -153,11 +139,7 @@ class Runner:
             return self.fail(now, error)
 
     def fail(self, now: float, error: BaseException) -> Decision:
-        """End the run because of an exception: abort, and no further release. The autopilot is asked to land, tick by tick.
-
-        Args:
-            now: [s]. error: as it was caught.
-        """
+        """End the run because of an exception: abort, and no further release. The autopilot is asked to land, tick by tick."""
         if len(self.errors) < MOST_ERRORS and isinstance(error, Exception):
             self.errors.append("".join(traceback.format_exception(error)))
         what = "Ctrl-C twice" if isinstance(error, KeyboardInterrupt) else f"{type(error).__name__}: {error}"
@@ -173,11 +155,7 @@ class Runner:
         return self.machine.flown and self.machine.state is not State.DONE
 
     def warm_up(self, vehicle: BodyState | None = None) -> None:
-        """Call the policy a few times on a copy, so that the first calls of a throw find code and data at hand.
-
-        Args:
-            vehicle: as it hovers; any place will do.
-        """
+        """Call the policy a few times on a copy, so that the first calls of a throw find code and data at hand."""
         pilot, pos = copy.copy(self.pilot), np.array([self.params.home_w if vehicle is None else vehicle.pos])
         still, goal_w = np.zeros((1, 3)), np.array(self.params.goal_w)
         for _ in range(WARM_CALLS):
@@ -261,14 +239,13 @@ class Runner:
             self.backend.stop_release()
             self._stop_at = math.inf
         decision = Decision(now, state.value, self.machine.reason, waits=self.machine.waits(inputs))
-        if self._sight is not None and self.sights is not None:
-            decision.seen = self._sight.values()
-            if seen.vehicle is not None and seen.vehicle.quat is not None:
-                self.sights.along(now, seen.vehicle.pos, seen.vehicle.quat)
-                self.sights.take(self._sight, seen.vehicle.quat, self._shown_age(now))
-            self._sight = None
-        elif self.sights is not None and seen.vehicle is not None and seen.vehicle.quat is not None:
+        sight, self._sight = self._sight, None
+        if self.sights is not None and sight is not None:
+            decision.seen = sight.values()
+        if self.sights is not None and seen.vehicle is not None and seen.vehicle.quat is not None:
             self.sights.along(now, seen.vehicle.pos, seen.vehicle.quat)
+            if sight is not None:
+                self.sights.take(sight, seen.vehicle.quat, self._shown_age(now))
         return decision, state
 
     def _ours(self, state: State, status: Status) -> bool:
@@ -368,10 +345,8 @@ class Runner:
         return min(age, self._aged) if self.params.delay.compensate else age
 
     def _goal(self, bodies: dict[str, BodyState | None]) -> Vector | None:
-        if GOAL not in self.tracks:
-            return self.params.goal_w
-        goal = bodies[GOAL]
-        return None if goal is None else goal.pos
+        goal = bodies.get(GOAL)
+        return self.params.goal_w if GOAL not in self.tracks else None if goal is None else goal.pos
 
     def _inputs(self, now: float, seen: Seen, status: Status, words: OperatorInput, recording: bool) -> Inputs:
         p, state = self.params, self.machine.state
@@ -389,37 +364,22 @@ class Runner:
             checks += self._thrust_off()
             if self.calibrating is not None and state in (State.READY, State.ARMED):
                 checks += self.calibrating.problems()
+        # What has not been answered is not over: the payload may yet come off.
+        over = vehicle is not None and state in (State.ARMED, State.RECOVER) and status.release != PENDING
+        # While landing the fence's floor is left on purpose.
+        fence = fence_broken(p.fence, vehicle, hanging) if vehicle is not None and state is not State.LAND else None
         return Inputs(
-            self.tracks[VEHICLE].gate.level(now),
-            self.tracks[PAYLOAD].gate.level(now),
-            status.connected,
-            tuple(checks),
-            # While landing the fence's floor is left on purpose.
-            fence_broken(p.fence, vehicle, hanging) if vehicle is not None and state is not State.LAND else None,
-            # What has not been answered is not over: the payload may yet come off.
-            vehicle is not None and state in (State.ARMED, State.RECOVER) and status.release != PENDING
-            and self._still(vehicle, payload, status.mode == HELD),
-            self.latch.separated(now),
-            self.latch.at is not None,
-            self.aim.given_up(now),
-            vehicle is not None and vehicle.pos[2] < GROUND,
-            failure,
-            words.arm,
-            words.land,
-            words.abort,
-            recording,
-            status.mode == FOLLOW,
-            status.note,
-            words.why,
-        )
+            self.tracks[VEHICLE].gate.level(now), self.tracks[PAYLOAD].gate.level(now), status.connected, tuple(checks), fence,
+            over and self._still(vehicle, payload, status.mode == HELD), self.latch.separated(now), self.latch.at is not None,
+            self.aim.given_up(now), vehicle is not None and vehicle.pos[2] < GROUND, failure,
+            words.arm, words.land, words.abort, recording, status.mode == FOLLOW, status.note, words.why,
+        )  # fmt: skip
 
     def _thrust_off(self) -> list[str]:
         """Whether hovering takes another thrust than the weight: then the calibration is wrong, or the battery low."""
         p, ratio = self.params, self.hovering.share()
-        if p.backend == "dry-run" or ratio is None:
-            return []
-        allowed = getattr(p, p.backend).thrust.tolerance
-        if abs(ratio - 1.0) <= allowed:
+        allowed = math.inf if p.backend == "dry-run" else getattr(p, p.backend).thrust.tolerance
+        if ratio is None or abs(ratio - 1.0) <= allowed:
             return []
         return [f"hovering takes {ratio:.2f} times the weight, within {allowed:g} of 1 expected: calibrate the thrust"]
 
@@ -510,22 +470,15 @@ class Runner:
 
     def summary(self) -> dict[str, Any]:
         """Counts of the run so far."""
-        return {
-            "state": self.machine.state.value,
-            "reason": self.machine.reason,
-            "aborted": self.machine.aborted,
-            "throws": self.machine.throws,
-            "cancelled": self.machine.cancelled,
-            "latches": self.latch.count,
-            "stuck": self.latch.stuck,
-            "held_back": self.aim.held,
-            "landings": [asdict(landing) for landing in self.latch.landings],
-            "guard": {k: getattr(self.guard, k) for k in ("clipped", "slewed", "refused")},
-            "bodies": {
-                name: {"accepted": track.accepted, "refused": track.gate.refused, "filter_lag": track.filter.lag}
-                for name, track in self.tracks.items()
-            },
-            "left_fence": self.machine.left_fence,
-            "calibration": None if self.calibrating is None or self.calibrating.found is None else self.calibrating.found.values(),
-            "errors": self.errors,
+        machine, found = self.machine, None if self.calibrating is None else self.calibrating.found
+        bodies = {
+            name: {"accepted": track.accepted, "refused": track.gate.refused, "filter_lag": track.filter.lag}
+            for name, track in self.tracks.items()
         }
+        return {
+            "state": machine.state.value, "reason": machine.reason, "aborted": machine.aborted, "throws": machine.throws,
+            "cancelled": machine.cancelled, "latches": self.latch.count, "stuck": self.latch.stuck, "held_back": self.aim.held,
+            "landings": [asdict(landing) for landing in self.latch.landings],
+            "guard": {k: getattr(self.guard, k) for k in ("clipped", "slewed", "refused")}, "bodies": bodies,
+            "left_fence": machine.left_fence, "calibration": None if found is None else found.values(), "errors": self.errors,
+        }  # fmt: skip

@@ -5,8 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-ROOM = 1.01
-"""Over a limit: whole microseconds of a stick, float32 on the wire."""
+ROOM = 1.01  # over a limit: whole microseconds of a stick, float32 on the wire
 
 MOST_KEPT = 100
 

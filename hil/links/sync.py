@@ -55,12 +55,7 @@ class LinkSync:
             peer.take(message.tc1, message.ts1, arrival)
 
     def dated(self, pose: Pose, system: int) -> Pose:
-        """A pose with the time of its measurement on our clock, where its sender's clock is known and the stamp is of it.
-
-        Args:
-            pose: with its sender's stamp.
-            system: MAVLink id of the sender, whose message the link has just handed on.
-        """
+        """A pose dated on our clock, where its sender's is known, whose message the link has just handed on, and the stamp is of it."""
         peer = self.peers.get((system, self._link.sender))
         if peer is None or peer.offset is None:
             return pose

@@ -14,16 +14,12 @@ import math
 from dataclasses import dataclass
 
 from hil.poses.pose import Pose, Vector
+from visthrow.common.errors import ConfigError
+from visthrow.config.bounds import Bounded, Positive
 
-OK, WARN, HOLD, ABORT = range(4)
-"""Levels of staleness."""
-
-MOST_ACCELERATION = 40.0
-"""By which a body may have changed its velocity while nothing came [m/s^2]."""
-
-
-RARE = 3
-"""Gaps longer than ``hold`` in a row that count as no poses at all."""
+OK, WARN, HOLD, ABORT = range(4)  # levels of staleness
+MOST_ACCELERATION = 40.0  # by which a body may have changed its velocity while nothing came [m/s^2]
+RARE = 3  # gaps longer than ``hold`` in a row that count as no poses at all
 
 
 @dataclass(frozen=True)
@@ -35,41 +31,34 @@ class Tether:
 
 
 @dataclass(frozen=True)
-class GateParams:
-    """Limits of one body.
+class GateParams(Bounded):
+    """Limits of one body."""
 
-    Raises:
-        ValueError: limits that are not above 0 or not ascending.
-    """
-
-    quat_tolerance: float  # of a quaternion's norm from 1 [-]
-    max_jump: float  # from where the last pose and velocity put the body [m]
-    max_speed: float  # [m/s]
-    max_turn: float  # between two poses, beyond max_turn_rate times the time in which nothing came [rad]
-    max_turn_rate: float  # [rad/s]
-    clock_step: float  # stamps that leave the arrivals by more than this are a step of the source's clock [s]
-    warn: float  # content age [s]
-    hold: float  # content age [s]
-    abort: float  # content age [s]
+    quat_tolerance: Positive  # of a quaternion's norm from 1 [-]
+    max_jump: Positive  # from where the last pose and velocity put the body [m]
+    max_speed: Positive  # [m/s]
+    max_turn: Positive  # between two poses, beyond max_turn_rate times the time in which nothing came [rad]
+    max_turn_rate: Positive  # [rad/s]
+    clock_step: Positive  # stamps that leave the arrivals by more than this are a step of the source's clock [s]
+    warn: Positive  # content age [s]
+    hold: Positive  # content age [s]
+    abort: Positive  # content age [s]
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not value > 0.0:
-                raise ValueError(f"{name} is {value}; expected a number above 0")
+        super().__post_init__()
         if not self.warn < self.hold < self.abort:
-            raise ValueError(f"gate: warn {self.warn}, hold {self.hold}, abort {self.abort} s; expected them ascending")
+            raise ConfigError(f"gate: warn {self.warn}, hold {self.hold}, abort {self.abort} s; expected them ascending")
 
 
 class Gate:
     """Decides about the poses of one body.
 
     Attributes:
-        refused: number of refused poses by reason.
+        last: accepted pose. refused: number of refused poses by reason.
         jumped: the source's reset counter has changed since the last :meth:`restart`.
     """
 
     def __init__(self, params: GateParams) -> None:
-        """Start without a pose."""
         self.params = params
         self.refused: dict[str, int] = {}
         self.restart()
@@ -83,12 +72,7 @@ class Gate:
         self._gaps = 0  # longer than hold, in a row
 
     def check(self, pose: Pose, velocity: Vector | None = None, tether: Tether | None = None) -> str | None:
-        """Judge a pose, in our frames.
-
-        Args:
-            pose: with a stamp of the source's clock.
-            velocity: of the body at its last accepted pose [m/s].
-            tether: the cable's other end, where one hangs.
+        """Judge a pose, in our frames, by the body's velocity at its last accepted pose [m/s] and the cable's other end, where one hangs.
 
         Returns:
             Why it is refused, or None where it is accepted: "finite", "quaternion", "old" (reordered or doubled),
@@ -108,9 +92,7 @@ class Gate:
     def stepped(self, pose: Pose) -> bool:
         """Whether the source's clock was set between the last accepted pose and this one."""
         last = self.last
-        return last is not None and (
-            abs((pose.stamp - last.stamp) - (pose.arrival - last.arrival)) > self.params.clock_step
-        )
+        return last is not None and abs((pose.stamp - last.stamp) - (pose.arrival - last.arrival)) > self.params.clock_step
 
     def _reason(self, pose: Pose, velocity: Vector | None, tether: Tether | None) -> str | None:
         last = self.last
@@ -127,9 +109,7 @@ class Gate:
         if pose.pos == last.pos and pose.quat == last.quat:
             return "repeated"
         # A clock that was set says nothing of how long ago the last pose was; the arrivals do.
-        age, gap = (
-            max(pose.arrival - then.arrival if stepped else pose.stamp - then.stamp, 0.0) for then in (last, came)
-        )
+        age, gap = (max(pose.arrival - then.arrival if stepped else pose.stamp - then.stamp, 0.0) for then in (last, came))
         return self._motion(pose, last, velocity, tether, age, gap)
 
     def _itself(self, pose: Pose) -> str | None:
@@ -144,17 +124,8 @@ class Gate:
             return "speed"
         return None
 
-    def _motion(
-        self, pose: Pose, last: Pose, velocity: Vector | None, tether: Tether | None, age: float, gap: float
-    ) -> str | None:
-        """What is wrong with the way from the last accepted pose.
-
-        Args:
-            pose, last: in our frames.
-            velocity, tether: see :meth:`check`.
-            age: of the last accepted pose [s].
-            gap: in which nothing came at all [s].
-        """
+    def _motion(self, pose: Pose, last: Pose, velocity: Vector | None, tether: Tether | None, age: float, gap: float) -> str | None:
+        """What is wrong with the way from the last accepted pose of an age [s], after a gap in which nothing came at all [s]."""
         p = self.params
         expected = tuple(x + age * v for x, v in zip(last.pos, velocity or (0.0, 0.0, 0.0)))
         off = math.dist(pose.pos, expected)

@@ -20,18 +20,12 @@ from hil.sources.base import Source
 from visthrow.common.rotations import conjugate, multiply, rotation_vector, tilt_and_heading
 from visthrow.logs.axes import TURNS
 
-SPEED, RATE = 0.06, 0.25
-"""Below both the vehicle rests [m/s], [rad/s]: noise of a millimetre and of 0.3 deg stays below."""
-SPAN = 0.2
-"""Over which speed and rate are taken [s]."""
-REST = 0.5
-"""The vehicle rests only after it has for this long [s]."""
-LEAST_WAY, LEAST_TURN = 0.2, math.radians(15.0)
-"""Smaller moves than these are no moves [m], [rad]."""
-LOOK = 0.25
-"""Between two looks at what came [s]."""
-TOLERANCE = math.radians(30.0)
-"""Between a move and its axis: people do not walk straight [rad]."""
+SPEED, RATE = 0.06, 0.25  # below both the vehicle rests [m/s], [rad/s]: noise of a millimetre and of 0.3 deg stays below
+SPAN = 0.2  # over which speed and rate are taken [s]
+REST = 0.5  # the vehicle rests only after it has for this long [s]
+LEAST_WAY, LEAST_TURN = 0.2, math.radians(15.0)  # smaller moves than these are no moves [m], [rad]
+LOOK = 0.25  # between two looks at what came [s]
+TOLERANCE = math.radians(30.0)  # between a move and its axis: people do not walk straight [rad]
 
 
 @dataclass(frozen=True)
@@ -74,12 +68,7 @@ class Step:
         return tuple(np.array(rotation_vector(turn)) for turn in turns)
 
 
-@dataclass(frozen=True)
-class Line:
-    """Judgement of one move."""
-
-    text: str
-    passed: bool
+Line = tuple[str, bool]  # judgement of one move: in words, and whether it passed
 
 
 @dataclass(frozen=True)
@@ -93,14 +82,7 @@ class Finding:
 
 
 def find_steps(poses: Sequence[Pose]) -> list[Step]:
-    """Moves between rests.
-
-    Args:
-        poses: raw, of the vehicle, in order.
-
-    Raises:
-        RunError: a pose without attitude.
-    """
+    """Moves between rests, of raw poses of the vehicle in order; raises `RunError` for one without attitude."""
     if any(pose.quat is None for pose in poses):
         raise RunError("hand-carry: the vehicle's source gives no attitude; expected a rigid body, not a marker")
     good = [p for p in poses if np.isfinite([*p.pos, *p.quat]).all() and math.hypot(*p.quat) > 0.5]
@@ -137,14 +119,10 @@ def _mean(poses: Sequence[Pose], rest: slice) -> Pose:
 
 
 def judge(steps: Sequence[Step], frames: FrameParams) -> Finding:
-    """Say of each move whether it went where it was meant to, and which frames would fit.
-
-    Args:
-        steps: one for each of `MOVES`.
-        frames: of the config.
+    """Say of each move whether it went where it was meant to by the config's frames, and which frames would fit.
 
     Raises:
-        RunError: another number of moves.
+        RunError: another number of moves than `MOVES`.
     """
     if len(steps) != len(MOVES):
         seen = "; ".join(f"{i}. {move.text}" for i, move in enumerate(MOVES, start=1))
@@ -157,7 +135,7 @@ def judge(steps: Sequence[Step], frames: FrameParams) -> Finding:
     fitting = replace(frames, axes=world, body_axes=body, quaternion=order, yaw_offset_deg=_yaw(ways, rotation_of(world)))
     lines = [_line(move, step, frames) for move, step in pairs if move.axis is not None]
     lines.append(_start(steps[0].before, frames))
-    return Finding(tuple(lines), fitting, mirrored, all(line.passed for line in lines))
+    return Finding(tuple(lines), fitting, mirrored, all(passed for _, passed in lines))
 
 
 def _world_axes(ways: list[tuple[int, np.ndarray]]) -> tuple[str, bool]:
@@ -170,15 +148,13 @@ def _world_axes(ways: list[tuple[int, np.ndarray]]) -> tuple[str, bool]:
 
 def _body_axes(turns: list[tuple[int, Step]], world: np.ndarray) -> tuple[str, str]:
     """Quaternion order and axis case of the body under which the turns went about their axes, in the world and on the body."""
-    best = (-math.inf, "xyzw", "x,y,z")
+    scores = {}
     for order in ("xyzw", "wxyz"):
         vectors = [(axis, *step.turn(order)) for axis, step in turns]
         in_world = _agreement([(axis, world @ w) for axis, w, _ in vectors])
         for axes in TURNS:
-            score = in_world + _agreement([(axis, rotation_of(axes) @ b) for axis, _, b in vectors])
-            if score > best[0] + 1e-9:
-                best = (score, order, axes)
-    return best[1], best[2]
+            scores[order, axes] = round(in_world + _agreement([(axis, rotation_of(axes) @ b) for axis, _, b in vectors]), 9)
+    return max(scores, key=scores.get)
 
 
 def _agreement(vectors: list[tuple[int, np.ndarray]]) -> float:
@@ -196,8 +172,7 @@ def _yaw(ways: list[tuple[int, np.ndarray]], world: np.ndarray) -> float:
 def _line(move: Move, step: Step, frames: FrameParams) -> Line:
     ours = Frames(frames)
     if move.turn:
-        quats = (ours.quat_from_source(pose.quat) for pose in (step.before, step.after))
-        first, second = quats
+        first, second = (ours.quat_from_source(pose.quat) for pose in (step.before, step.after))
         went, size = np.array(rotation_vector(multiply(conjugate(first), second))), "rad about"
     else:
         went, size = np.array(ours.world_from_source(tuple(step.way))), "m along"
@@ -205,13 +180,13 @@ def _line(move: Move, step: Step, frames: FrameParams) -> Line:
     off = math.acos(max(-1.0, min(1.0, went[move.axis] / max(length, 1e-12))))
     passed = off <= TOLERANCE and length >= (LEAST_TURN if move.turn else LEAST_WAY)
     told = ", ".join(f"{axis} {value:+.2f}" for axis, value in zip("xyz", went))
-    return Line(f"{move.text.split(',')[0]}: {told} ({size} our axes), {math.degrees(off):.0f} deg off", passed)
+    return f"{move.text.split(',')[0]}: {told} ({size} our axes), {math.degrees(off):.0f} deg off", passed
 
 
 def _start(pose: Pose, frames: FrameParams) -> Line:
     """The attitude at first, which is to be level with the nose along our x."""
     tilt, heading = tilt_and_heading(Frames(frames).quat_from_source(pose.quat))
-    return Line(
+    return (
         f"at first: tilted by {math.degrees(tilt):.0f} deg, nose {math.degrees(heading):+.0f} deg from our x (if the moves pass "
         "and this does not, define the rigid body anew, level and with its nose along x)",
         max(tilt, abs(heading)) <= TOLERANCE,
@@ -221,14 +196,7 @@ def _start(pose: Pose, frames: FrameParams) -> Line:
 def collect(
     source: Source, clock: Clock, seconds: float, tell: Callable[[str], None] = lambda text: None, recorded: bool = False
 ) -> list[Step]:
-    """Take in the vehicle's poses until all moves were made, or for a time.
-
-    Args:
-        source: of raw poses. clock: to wait by.
-        seconds: after which a live source is given up [s].
-        tell: called with the next move to make.
-        recorded: a recording is taken to its end, whatever the time.
-    """
+    """Take in the vehicle's poses until all moves were made, or for a time [s]; a recording to its end. ``tell`` hears each move."""
     poses: list[Pose] = []
     steps: list[Step] = []
     begin, told = clock.now(), -1
@@ -245,7 +213,7 @@ def collect(
 
 def summary_text(finding: Finding, frames: FrameParams) -> str:
     """The outcome in words."""
-    lines = [f"{'PASS' if line.passed else 'FAIL'}  {line.text}" for line in finding.lines]
+    lines = [f"{'PASS' if passed else 'FAIL'}  {text}" for text, passed in finding.lines]
     if finding.mirrored:
         lines.append(
             "the moves fit a mirrored world: it was not carried forward, left and up in this order, or the source is left-handed"

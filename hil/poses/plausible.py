@@ -10,18 +10,12 @@ from hil.sources.player import CHANNELS
 from visthrow.logs.check import physics
 from visthrow.logs.flightlog import Channel, FlightLog
 
-LEAST = 50
-"""Poses below which nothing is said."""
+LEAST = 50  # poses below which nothing is said
 _KINDS = {"pos": ("m", "world"), "quat": ("1", "world"), "vel": ("m/s", "world"), "rate": ("rad/s", "body")}
 
 
 def unit_problems(poses: Iterable[Pose], frames: dict[str, FrameParams]) -> list[str]:
-    """What in the poses of a recording no vehicle does; each says which unit would make sense of it.
-
-    Args:
-        poses: raw, of all bodies.
-        frames: of each body.
-    """
+    """What in a recording's raw poses no vehicle does, by the frames of each body; each says which unit would make sense of it."""
     poses, channels = list(poses), {}
     for body, params in frames.items():
         channels |= _channels([pose for pose in poses if pose.body == body], Frames(params), CHANNELS[body])

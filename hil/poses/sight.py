@@ -1,7 +1,7 @@
-"""What a camera saw, as the policy is to be shown it: rays of one frame, and what they read while nothing is seen.
+"""What a camera saw, as the policy is to be shown it: rays of one frame, and what they read until the next.
 
-What is not seen reads where it was for a while, then as dropped out. To a policy that was trained with the exact direction at the edge
-in place of what is out of view, what was last seen near the edge reads as its direction there.
+A frame counts for a while, then all reads as dropped out; what is not in it at once. To a policy that was trained with the exact
+direction at the edge in place of what is out of view, what was last seen near the edge reads as its direction there.
 """
 
 from collections import deque
@@ -18,12 +18,10 @@ from hil.poses.pose import Quaternion, Vector
 from visthrow.onboard.calibration import Calibration
 from visthrow.onboard.observations import rotation_from_quat
 
-NEAR_EDGE = 0.85
-"""Radius in the image beyond which what is not seen any more has left the field of view, of 1."""
+NEAR_EDGE = 0.85  # radius in the image beyond which what is not seen any more has left the field of view, of 1
+PATH = 25  # ticks that the vehicle's way is kept for: half a second
 
-PATH = 25
-"""Ticks that the vehicle's way is kept for: half a second."""
-
+PARTS = {"goal": slice(0, GOAL_KEYPOINTS), "ball": slice(GOAL_KEYPOINTS, None)}  # of the keypoints
 Corners = tuple[tuple[float, float, float], ...]
 
 
@@ -58,23 +56,15 @@ def _rotation(quat: Quaternion) -> np.ndarray:
 
 
 class Sights:
-    """Keypoints by the sights so far.
-
-    Attributes:
-        fresh: stamp [s], keypoints (8, 2) and validity (8,) of the last frame that was taken.
-    """
+    """Keypoints by the sights so far; ``fresh`` holds stamp [s], keypoints (8, 2) and validity (8,) of the last frame that was taken."""
 
     def __init__(self, camera: KeypointCamera, hold: float) -> None:
-        """Start with nothing seen.
-
-        Args:
-            camera: of training.
-            hold: for which a thing that is not seen any more reads where it was [s].
-        """
+        """Start with nothing seen by the camera of training; ``hold``: for which a frame counts [s]."""
         self._camera, self._hold = camera, hold
         self._points = torch.zeros(KEYPOINTS, 2)
         self._valid = torch.zeros(KEYPOINTS, dtype=torch.bool)
-        self._times = {"goal": -np.inf, "ball": -np.inf}
+        self._times = {"goal": -np.inf, "ball": -np.inf}  # of the last frame, where it holds the thing
+        self._newest = -np.inf
         self._turn: np.ndarray | None = None  # from the camera as it is mounted to that of training
         self._scale, self._latency = 0.0, 0.0
         self._path: deque[tuple[float, np.ndarray, np.ndarray]] = deque(maxlen=PATH)
@@ -91,22 +81,20 @@ class Sights:
         self._path.append((now, np.array(pos), _rotation(quat)))
 
     def take(self, sight: Sight, quat: Quaternion, aged: float = 0.0) -> None:
-        """Take a frame in.
-
-        Args:
-            sight: of the frame.
-            quat: the vehicle's attitude, body to world, xyzw: says which corner is which.
-            aged: age that poses have at a tick [s].
-        """
+        """Take a frame in; the vehicle's attitude says which corner is which, and poses have an age at a tick [s]."""
         seen = sight.seen()
         rot_wb = _rotation(quat)
         if self._turn is not None and self._path:
             seen = self._carried(seen, sight.stamp - self._latency + aged)
         points, valid = detected_keypoints(self._camera, seen, rot_wb)
         self.fresh = sight.stamp, points.numpy(), valid.numpy()
-        for name, part in (("goal", slice(0, GOAL_KEYPOINTS)), ("ball", slice(GOAL_KEYPOINTS, None))):
-            if getattr(seen, name) is not None and sight.stamp > self._times[name]:
-                self._points[part], self._valid[part], self._times[name] = points[part], valid[part], sight.stamp
+        if sight.stamp <= self._newest:
+            return
+        self._newest = sight.stamp
+        for name, part in PARTS.items():
+            self._times[name] = -np.inf if getattr(seen, name) is None else sight.stamp
+            if getattr(seen, name) is not None:
+                self._points[part], self._valid[part] = points[part], valid[part]
 
     def _carried(self, seen: Seen, when: float) -> Seen:
         """What was seen at a time as the camera of training would see it now: the goal lies, the ball goes with the vehicle."""
@@ -146,7 +134,7 @@ class Sights:
     def keypoints(self, now: float) -> tuple[np.ndarray, np.ndarray]:
         """Keypoints at a time [s]: normalised, float32, shape (1, 8, 2), and validity, shape (1, 8)."""
         points, valid = self._points.clone(), self._valid.clone()
-        for name, part in (("goal", slice(0, GOAL_KEYPOINTS)), ("ball", slice(GOAL_KEYPOINTS, None))):
+        for name, part in PARTS.items():
             if now - self._times[name] > self._hold:
                 radius = points[part].norm(dim=-1, keepdim=True)
                 left = self._camera.edge_reads and bool((radius > NEAR_EDGE).any())

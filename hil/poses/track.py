@@ -4,22 +4,20 @@ import math
 from collections import deque
 from dataclasses import dataclass, replace
 
-from hil.poses.estimate import EstimateParams, SlopeFilter, slope_weights
+from hil.poses.estimate import EstimateParams, SlopeFilter, fit_weights
 from hil.poses.frames import FrameParams, Frames
 from hil.poses.gate import Gate, GateParams, Tether
 from hil.poses.pose import Pose, Quaternion, Vector
 from visthrow.common.rotations import multiply
 
-MOST_PREDICTION = 0.1
-"""Poses are carried forward by no more than this [s]; older ones are the timers' affair."""
+MOST_PREDICTION = 0.1  # poses are carried forward by no more than this [s]; older ones are the timers' affair
 
 TRUST = 0.5
 """Share of the estimated accelerations that velocity and rate are carried forward with: they are about as noisy as they are right.
 In 160 simulated throws with poses 20 ms old (1 mm, 0.2 deg, 100 Hz) state and vision policy landed 0.029 and 0.028 m off with it,
 0.043 and 0.035 m with all of the linear and none of the angular acceleration."""
 
-CALM_SAMPLES = 20
-"""Poses over which :meth:`Track.calm_speed` is taken: enough that noise of millimetres does not count as motion."""
+CALM_SAMPLES = 20  # poses over which :meth:`Track.calm_speed` is taken: enough that noise of millimetres does not count as motion
 
 
 @dataclass(frozen=True)
@@ -101,16 +99,11 @@ class Track:
         if len(self._slow) < CALM_SAMPLES:
             return math.inf
         newest = self._slow[0][0]
-        weights = slope_weights([newest - time for time, _ in self._slow], 1)
+        weights = fit_weights([newest - time for time, _ in self._slow], 1)[0]
         return math.hypot(*(sum(c * pos[i] for c, (_, pos) in zip(weights, self._slow)) for i in range(3)))
 
     def state(self, now: float, ahead: float = 0.0) -> BodyState | None:
-        """State by the last accepted pose, carried forward with part of what is known of its accelerations.
-
-        Args:
-            now: on the runner's clock [s].
-            ahead: by how much to carry it [s]; see :data:`MOST_PREDICTION`.
-        """
+        """State at a time [s] by the last accepted pose, carried ahead [s] with part of what is known of its accelerations."""
         pose = self._pose
         if pose is None:
             return None

@@ -6,7 +6,7 @@ Where the payload let go and came down is found in its own poses.
 """
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,11 +24,10 @@ from visthrow import config
 from visthrow.common.rotations import matrix_of_quat
 from visthrow.logs.flightlog import FlightLog, FlightRecorder
 
-LEAD, AFTER = 2.0, 0.5
-"""A throw's log begins this long before it and ends this long after its recovery [s]."""
-
-LEAST_STEP = 1e-6
-"""Between two samples of a channel [s]: poses that were taken in together keep their order."""
+LEAD, AFTER = 2.0, 0.5  # a throw's log begins this long before it and ends this long after its recovery [s]
+LEAST_STEP = 1e-6  # between two samples of a channel [s]: poses that were taken in together keep their order
+ABOUT = 25  # poses on either side that a clock's offset is the median of: jitter of the transport goes, drift stays
+AFTERWARDS = (State.THROW, State.RECOVER, State.ABORT)  # states that belong to a throw
 
 STATES = tuple(state.value for state in State)
 
@@ -41,6 +40,7 @@ class Tick:
     decision: Decision
     samples: list[Sample]
     ages: dict[str, float]  # of the poses' content by body [s]
+    attached: bool  # whether the payload hangs on the vehicle: until the release's lag is over
     goal_w: tuple[float, float, float] | None
 
 
@@ -74,17 +74,9 @@ class Course:
                 sample.time = float(time)
 
 
-ABOUT = 25
-"""Poses on either side that a clock's offset is the median of: jitter of the transport goes, drift stays."""
-
-
 def measured(sample: Sample, params: HilParams) -> float:
     """When a pose was measured by its arrival alone [s]."""
     return sample.pose.arrival - sample.pose.transit(params.delay.source)
-
-
-AFTERWARDS = (State.THROW, State.RECOVER, State.ABORT)
-"""States that belong to a throw."""
 
 
 def tick_of(playback: Playback, line: dict[str, Any], poses: list) -> Tick:
@@ -92,15 +84,11 @@ def tick_of(playback: Playback, line: dict[str, Any], poses: list) -> Tick:
     decision, samples = playback.feed(line, poses)
     runner = playback.runner
     ages = {name: track.gate.age(line["time"]) for name, track in runner.tracks.items()}
-    return Tick(line, decision, samples, ages, runner.seen_goal_w)
+    return Tick(line, decision, samples, ages, not runner.latch.separated(line["time"]), runner.seen_goal_w)
 
 
 def read(folder: str | Path) -> Course:
-    """Play a run back.
-
-    Raises:
-        RunError: no folder of a run, or a damaged one.
-    """
+    """Play a run back; raises `RunError` for what is no folder of a run, or a damaged one."""
     folder = Path(folder)
     params, policy, lines, poses = load_run(folder)
     if not lines:
@@ -124,11 +112,7 @@ class Samples:
     """Fills a recorder with ticks."""
 
     def __init__(self, params: HilParams, playback: Playback, meta: dict) -> None:
-        """Begin.
-
-        Args:
-            params: of the run. playback: whose ticks come. meta: of the log.
-        """
+        """Begin with nothing; ``meta``: of the log."""
         self.params, self.runner = params, playback.runner
         self.recorder = FlightRecorder(meta)
         self._declare()
@@ -152,8 +136,9 @@ class Samples:
         self._last[name] = time
         return time
 
-    def add(self, tick: Tick, attached: bool) -> None:
+    def add(self, tick: Tick) -> None:
         """Add all that one tick holds."""
+        attached = tick.attached
         for sample in tick.samples:
             self._pose(sample, attached)
         d, now = tick.decision, tick.line["time"]
@@ -219,21 +204,18 @@ def log_of(course: Course, first: int, last: int, throw: int | None = None) -> F
     ticks, runner = course.ticks[first : last + 1], course.playback.runner
     start = course.ticks[course.throws[throw][0]].line["time"] if throw is not None else ticks[0].line["time"]
     samples = Samples(course.params, course.playback, meta_of(course.params, course.playback, course.provenance, start))
-    landing = None if throw is None else _landing(runner.latch.landings, start)
+    landings = [] if throw is None else [landing for landing in runner.latch.landings if abs(landing.start - start) < 1e-9]
+    landing = next(iter(landings), None)
     latch = next((t.line["time"] for t in ticks if t.decision.release and t.line["time"] >= start), None)
     apart = np.inf if latch is None else (landing.separation if landing and landing.separation else latch + runner.latch.lag)
     for tick in ticks:
-        samples.add(tick, tick.line["time"] < apart)
+        samples.add(replace(tick, attached=tick.line["time"] < apart))
     meta = samples.recorder.meta
     meta["events"] = events(ticks)
     meta["goal_w"] = list(next((t.goal_w for t in ticks if t.line["time"] >= start and t.goal_w), course.params.goal_w))
     if throw is not None:
         _judge(samples.recorder, landing, latch, ticks, start)
     return samples.recorder.log()
-
-
-def _landing(landings: list[Landing], start: float) -> Landing | None:
-    return next((landing for landing in landings if abs(landing.start - start) < 1e-9), None)
 
 
 def _judge(recorder: FlightRecorder, landing: Landing | None, latch: float | None, ticks: list[Tick], start: float) -> None:

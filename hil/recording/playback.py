@@ -34,11 +34,7 @@ class Sample:
 
 
 class Playback:
-    """Feeds recorded ticks to a runner of their config and policy.
-
-    Attributes:
-        runner: after the last tick fed.
-    """
+    """Feeds recorded ticks to a ``runner`` of their config and policy."""
 
     def __init__(self, params: HilParams, policy: Policy) -> None:
         """Start before the first tick; see `hil.recording.record.load_run` for both."""
@@ -60,19 +56,15 @@ class Playback:
         return decision, self._samples
 
 
-COMPARED = ("state", "command", "action", "observation", "keypoints", "valid", "release")
-"""What a replay must give again, bit for bit."""
+COMPARED = ("state", "command", "action", "observation", "keypoints", "valid", "release")  # what a replay must give again, bit for bit
 
 
 def replay(folder: str | Path) -> dict[str, Any]:
-    """Run the recorded poses, statuses and words of a run through the runner again.
+    """Run the recorded poses, statuses and words of a run through the runner again; raises `RunError` for a folder that is none.
 
     Returns:
         Number of ticks and actions compared, the bodies, the differences (tick, name, recorded value, value now), and what is
         missing of the recording, or None; ``story``: where it went wrong, in a sentence.
-
-    Raises:
-        RunError: no folder of a run, or a damaged one.
     """
     params, policy, ticks, poses = load_run(folder)
     playback, turn, last = Playback(params, policy), None, None
@@ -95,13 +87,9 @@ def replay(folder: str | Path) -> dict[str, Any]:
                 differences.append((line["n"], name, was, now))
     cut = _cut(folder, len(ticks))
     return {
-        "ticks": len(ticks),
-        "actions": actions,
+        "ticks": len(ticks), "actions": actions, "differences": differences, "cut": cut, "story": sentence(turn, last, cut),
         "bodies": sorted({pose.body for group in poses.values() for pose in group} & set(playback.runner.tracks)),
-        "differences": differences,
-        "cut": cut,
-        "story": sentence(turn, last, cut),
-    }
+    }  # fmt: skip
 
 
 def _cut(folder: str | Path, ticks: int) -> str | None:

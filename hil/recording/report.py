@@ -51,11 +51,6 @@ def throw_path(folder: Path, number: int, ending: str) -> Path:
 def finish(folder: str | Path, stages: Stages | None = None, speed: float = 1.0) -> list[str]:
     """Write latency picture, and a flight log and picture a throw; of a run without throws one log of all of it.
 
-    Args:
-        folder: of a run that is over.
-        stages: its times; None where they are not at hand.
-        speed: of the run's clock.
-
     Returns:
         Lines that say what was written, and what could not be.
     """

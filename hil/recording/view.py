@@ -26,59 +26,31 @@ from hil.recording.record import CONFIG, POLICY, POSES, PROVENANCE, SUMMARY, TIC
 from visthrow import config
 from visthrow.onboard.policy import Policy
 
-EVERY = 0.1
-"""Between two looks at the folder [s]."""
-
-MOST_SHOWN = 100
-"""Ticks sent at a time; of more, where the viewer fell behind, the last ones."""
-
-TRAIL = 300
-"""Poses whose places stay drawn: three seconds at 100 Hz."""
+EVERY = 0.1  # between two looks at the folder [s]
+MOST_SHOWN = 100  # ticks sent at a time; of more, where the viewer fell behind, the last ones
+TRAIL = 300  # poses whose places stay drawn: three seconds at 100 Hz
 
 BODY_CHANNELS = {VEHICLE: "pos_w", PAYLOAD: "payload_pos_w"}
-
-
-class Attached:
-    """Tells of ticks in their order whether the payload hangs on the vehicle: until the release's lag is over."""
-
-    def __init__(self, playback: Playback) -> None:
-        self._lag = playback.runner.latch.lag
-        self._latch: float | None = None
-
-    def at(self, tick: Tick) -> bool:
-        """Whether it does at a tick."""
-        if tick.decision.release:
-            self._latch = tick.line["time"]
-        elif tick.decision.state == "armed":
-            self._latch = None
-        return self._latch is None or tick.line["time"] < self._latch + self._lag
 
 
 class Show:
     """Sends ticks to a stream of rerun."""
 
     def __init__(self, stream: Any, params: HilParams, playback: Playback, provenance: dict[str, Any], start: float) -> None:
-        """Send what does not move.
-
-        Args:
-            stream: a recording stream.
-            params: of the run. playback: whose ticks come. provenance: of the run.
-            start: zero of the viewer's time [s].
-        """
+        """Send what does not move; ``start`` is the zero of the viewer's time [s]."""
         from visthrow.view import rerun_view
 
         self._stream, self._view = stream, rerun_view
         self._meta = meta_of(params, playback, provenance, start)
         self._samples = Samples(params, playback, self._meta)
         self._trails: dict[str, deque] = {name: deque(maxlen=TRAIL) for name in BODY_CHANNELS}
-        self._attached = Attached(playback)
         self._said: list | None = None
         rerun_view.still(stream, self._meta["goal_w"], sizes(playback.runner.pilot))
 
     def take(self, ticks: list[Tick]) -> None:
         """Send some ticks, in order."""
         for tick in ticks:
-            self._samples.add(tick, self._attached.at(tick))
+            self._samples.add(tick)
             for sample in tick.samples:
                 if sample.body in self._trails:
                     self._trails[sample.body].append(sample.pose.pos)
@@ -131,11 +103,7 @@ class Follower:
     """Plays back a run while it is written."""
 
     def __init__(self, folder: Path) -> None:
-        """Read config, policy and provenance, which a run writes before it waits for poses.
-
-        Raises:
-            RunError: no folder of a run.
-        """
+        """Read config, policy and provenance, which a run writes before it waits for poses; raises `RunError` for no folder of a run."""
         if not all((folder / name).is_file() for name in (CONFIG, POLICY, PROVENANCE)):
             raise RunError(f"{folder}: no folder of a run; expected {CONFIG}, {POLICY} and {PROVENANCE} in it")
         self.folder, self.params = folder, config.load(HilParams, folder / CONFIG)
@@ -163,22 +131,13 @@ class Follower:
         return (self.folder / SUMMARY).is_file()
 
     def close(self) -> None:
-        """Close the files."""
+        """Close its files."""
         for tail in self._tails.values():
             tail.close()
 
 
 def follow(folder: str | Path, stream: Any, going: Callable[[], bool] = lambda: True) -> int:
-    """Send a run to a stream while it is written, until it is over.
-
-    Args:
-        folder: of the run.
-        stream: of rerun.
-        going: whether to go on.
-
-    Returns:
-        Number of ticks that were left out.
-    """
+    """Send a run to a stream of rerun while it is written, until it is over; returns the number of ticks that were left out."""
     follower, show, dropped = Follower(Path(folder)), None, 0
     try:
         while going():
@@ -199,12 +158,7 @@ def follow(folder: str | Path, stream: Any, going: Callable[[], bool] = lambda: 
 
 
 def write(folder: str | Path, path: str | Path) -> None:
-    """Write a whole run as a ``.rrd`` file.
-
-    Raises:
-        RunError: no folder of a run, or a damaged one.
-        StorageError: the place cannot be written.
-    """
+    """Write a whole run as a ``.rrd`` file; errors as of :func:`hil.recording.flightlogs.read`, and where the place cannot be written."""
     from visthrow.view import rerun_view
 
     course = read(folder)
@@ -221,9 +175,9 @@ def write_mcap(folder: str | Path, path: str | Path) -> None:
 
     course = read(folder)
     meta = meta_of(course.params, course.playback, course.provenance, course.ticks[0].line["time"])
-    samples, attached = Samples(course.params, course.playback, meta), Attached(course.playback)
+    samples = Samples(course.params, course.playback, meta)
     for tick in course.ticks:
-        samples.add(tick, attached.at(tick))
+        samples.add(tick)
     log = samples.flush()
     log.meta["events"] = events(course.ticks)
     mcap_view.write(path, log, sizes(course.playback.runner.pilot))

@@ -55,11 +55,7 @@ class Recorded:
     links = ()
 
     def __init__(self, poses: Iterable[Pose]) -> None:
-        """Sort by arrival; poses that arrived together keep their order.
-
-        Raises:
-            SourceError: there is none.
-        """
+        """Sort by arrival; poses that arrived together keep their order. Raises `SourceError` where there is none."""
         self.poses = sorted(poses, key=lambda pose: pose.arrival)
         if not self.poses:
             raise SourceError("the recording holds no pose of a body that the config names")

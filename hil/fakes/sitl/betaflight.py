@@ -138,7 +138,7 @@ class BetaflightSitl(Fake):
             self._open = opened
 
     def _hear_status(self, frame: msp.Frame) -> None:
-        flags, cycle = frame.u32(6) or 0, frame.u16(0)
+        flags, cycle = frame.number("<I", 6) or 0, frame.number("<H", 0)
         armed = BOX_ARM in self._boxes and bool(flags >> self._boxes.index(BOX_ARM) & 1)
         if armed != self.armed:
             self.happened("armed" if armed else "disarmed")

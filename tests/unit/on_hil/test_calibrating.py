@@ -178,7 +178,7 @@ def test_what_is_not_sure_is_refused_and_a_failure_is_tried_again():
     calibrating.take(fine)
     assert calibrating.problems() == []
     assert "yaw unknown" in str(replace(fine, turn_sigma=(1e-3, 1e-3, 0.2)))
-    with pytest.raises(ConfigError, match="expected numbers above 0"):
+    with pytest.raises(ConfigError, match="expected above 0"):
         CalibrationParams(rate=0.0)
     with pytest.raises(ConfigError, match="expected keypoints"):
         config.load(HilParams, config.find("hil", "dry_run"), ["calibration.rate=1.0"])

@@ -11,6 +11,7 @@ from hil.poses.frames import FrameParams
 from hil.poses.gate import ABORT, HOLD, OK, WARN, Gate, GateParams, Tether
 from hil.poses.pose import Pose
 from hil.poses.track import Track
+from visthrow.common.errors import ConfigError
 
 PARAMS = GateParams(0.02, 0.12, 8.0, 0.3, 15.0, 0.5, 0.04, 0.1, 0.25)
 LEVEL = (0.0, 0.0, 0.0, 1.0)
@@ -120,9 +121,9 @@ def test_a_marker_has_no_attitude():
 
 
 def test_wrong_limits():
-    with pytest.raises(ValueError, match="ascending"):
+    with pytest.raises(ConfigError, match="ascending"):
         GateParams(0.02, 0.12, 8.0, 0.3, 15.0, 0.5, 0.1, 0.04, 0.25)
-    with pytest.raises(ValueError, match="above 0"):
+    with pytest.raises(ConfigError, match=r"quat_tolerance is 0.0; expected above 0"):
         GateParams(0.0, 0.12, 8.0, 0.3, 15.0, 0.5, 0.04, 0.1, 0.25)
 
 

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 import torch
 
+from camera.detectors.contours import Seen
+from camera.detectors.following import WITHIN
 from camera.fisheye import Fisheye
 from camera.keypoints import KeypointCamera, keypoints
 from camera.mount import rotation_from_vector
@@ -119,16 +121,31 @@ def test_pictures_of_another_lens_give_the_keypoints_of_training(folder):
     assert source.poll(99.0) == []
 
 
+def told(looker, picture, stamp, hint, blind=False):
+    """A sight, and what the detector was told for it; a blind one sees nothing."""
+    kept, detect = [], looker.detector.detect
+
+    def listen(image, known):
+        kept.append(known)
+        return Seen(None, None) if blind else detect(image, known)
+
+    looker.detector.detect = listen
+    sight = looker.look(picture, stamp, hint)
+    looker.detector.detect = detect
+    return sight, kept[0]
+
+
 def test_a_turn_of_the_vehicle_does_not_lose_the_ball(folder, pictures):
     """Where the ball was is kept in the world: after a turn of 40 deg it is looked for elsewhere in the picture."""
     pos, vector, ball = pose(0)
     looker = Looker(params(folder), training())
-    assert looker.known(None).ball_ray_c is None
+    assert told(looker, pictures[0], 0.0, None)[1].ball_ray_c is None
     hint = Hint(tuple(pos.tolist()), quaternion(vector), (0.2, 0.6))
-    assert looker.known(hint).ball_ray_c is None
-    assert looker.look(pictures[0], 0.0, hint).ball is not None
+    sight, known = told(looker, pictures[0], 0.0, hint)
+    assert known.ball_ray_c is None
+    assert sight.ball is not None
     turned = torch.tensor([[0.0, 0.7, 0.0]], dtype=torch.float64)
-    known = looker.known(Hint(tuple(pos.tolist()), quaternion(turned), None))
+    missed, known = told(looker, pictures[0], 0.05, Hint(tuple(pos.tolist()), quaternion(turned), None), blind=True)
     camera = KeypointCamera(training(), dtype=torch.float64)
     rot = rotation_from_vector(turned)[0]
     eye = torch.tensor(pos) + rot @ camera.position_b
@@ -137,6 +154,22 @@ def test_a_turn_of_the_vehicle_does_not_lose_the_ball(folder, pictures):
     assert math.acos(cosine) < known.within, "but for the lens's own way of 2 cm"
     np.testing.assert_allclose(known.up_c, (camera.rot_cb @ rot.T)[:, 2].numpy(), atol=1e-6)
     assert known.height == pytest.approx(float(eye[2]), abs=1e-6)
+    np.testing.assert_allclose(missed.ball[:3], known.ball_ray_c, atol=1e-9, err_msg="missed, it reads where it would hang")
+
+
+def test_a_ball_that_is_missed_is_looked_for_ever_wider_and_reads_as_it_hung_for_a_while(folder, pictures):
+    looker = Looker(params(folder), training())
+    pos, vector, _ = pose(0)
+    hint = Hint(tuple(pos.tolist()), quaternion(vector), (0.2, 0.6))
+    first, _ = told(looker, pictures[0], 0.0, hint)
+    for n, stamp in enumerate((0.04, 0.08, 0.12), start=1):
+        sight, known = told(looker, pictures[0], stamp, hint, blind=True)
+        assert known.within == pytest.approx(n * WITHIN)
+        assert sight.corners is None, "a goal that is missed is not held"
+        assert (sight.ball is not None) == (stamp <= 0.1)
+        if sight.ball is not None:
+            np.testing.assert_allclose(sight.ball, first.ball, atol=1e-9)
+    assert told(looker, pictures[0], 0.16, hint)[0].ball == pytest.approx(first.ball), "and it is found again"
 
 
 def test_only_the_newest_of_several_pictures_is_looked_at(folder):
@@ -144,6 +177,11 @@ def test_only_the_newest_of_several_pictures_is_looked_at(folder):
     assert source.poll(0.02) == [], "it takes its time to arrive"
     (sight,) = source.poll(PERIOD * 2 + 0.031)
     assert sight.stamp == pytest.approx(PERIOD * 2)
+
+
+SQUARE = tuple(tuple((np.array([x, y, 1.0]) / math.sqrt(x * x + y * y + 1.0)).tolist()) for x, y in
+               ((0.1, 0.1), (0.2, 0.1), (0.2, 0.2), (0.1, 0.2)))  # fmt: skip
+"""Rays to the corners of a goal below the vehicle."""
 
 
 @pytest.mark.parametrize("reads", ["edge", "zero"])
@@ -166,8 +204,14 @@ def test_what_is_not_seen_any_more(reads):
     assert not valid.any()
     np.testing.assert_allclose(np.linalg.norm(points[0, 4:], axis=-1), 1.0 if reads == "edge" else 0.0, atol=1e-6)
     assert bool((points[0, 4:, 1] < -0.9).all()) == (reads == "edge"), "gone over the upper edge, it reads there by the rule of edges alone"
-    sights.take(Sight(1.5, None, below.ball), level)
-    again, _ = sights.keypoints(2.2)
+    sights.take(Sight(3.0, SQUARE, below.ball), level)
+    assert sights.keypoints(3.01)[1].all()
+    sights.take(Sight(3.02, None, below.ball), level)
+    points, valid = sights.keypoints(3.03)
+    assert valid.tolist() == [[False] * 4 + [True] * 4], "a goal that a frame lacks has dropped out with it"
+    assert not points[0, :4].any()
+    sights.take(Sight(1.5, None, ahead.ball), level)
+    again, _ = sights.keypoints(3.03)
     np.testing.assert_array_equal(again, points, "an older frame changes nothing")
 
 
