@@ -125,28 +125,27 @@ class HilParams(Bounded):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        kind, fence = self.source.kind, self.fence
         if not {VEHICLE, PAYLOAD} <= set(self.frames) <= set(BODIES):
             raise ConfigError(f"frames of {', '.join(self.frames)}; expected vehicle and payload, goal if it moves")
-        if self.keypoints == "detector" and self.images is None:
-            raise ConfigError("keypoints of a detector, but no table [images]; expected its kind and path or device")
-        if self.calibration is not None and self.keypoints != "detector":
-            raise ConfigError("calibration of a camera, but keypoints of poses; expected keypoints = \"detector\"")
-        if self.backend == "crazyflie" and self.crazyflie is None:
-            raise ConfigError("backend crazyflie without a table [crazyflie]; expected its device and thrust, as in crazyflie.toml")
-        if self.source.kind not in LIVE and self.source.file is None:
-            raise ConfigError(f"source.file is none; expected the file of the {self.source.kind} source")
-        if self.backend != "dry-run" and self.source.kind not in LIVE:
-            raise ConfigError(f"backend {self.backend} with recorded poses ({self.source.kind}); a recording flies dry")
-        if self.source.kind == "mocap" and self.source.mocap is None:
-            raise ConfigError("source.mocap is missing; expected its system and host")
-        f = self.fence
-        if not all(a <= x <= b for a, x, b in zip(f.vehicle_low, self.home_w, f.vehicle_high)):
-            raise ConfigError(f"home_w {self.home_w} m; expected within the vehicle's fence, {f.vehicle_low} to {f.vehicle_high} m")
-        if not f.payload_low[2] <= self.landing_height <= f.payload_high[2]:
-            raise ConfigError(
-                f"landing_height {self.landing_height} m; expected within the payload's fence, {f.payload_low[2]} to "
-                f"{f.payload_high[2]} m of height"
-            )
+        inside = all(a <= x <= b for a, x, b in zip(fence.vehicle_low, self.home_w, fence.vehicle_high))
+        for wrong, text in (
+            (self.keypoints == "detector" and self.images is None,
+             "keypoints of a detector, but no table [images]; expected its kind and path or device"),
+            (self.calibration is not None and self.keypoints != "detector",
+             "calibration of a camera, but keypoints of poses; expected keypoints = \"detector\""),
+            (self.backend == "crazyflie" and self.crazyflie is None,
+             "backend crazyflie without a table [crazyflie]; expected its device and thrust, as in crazyflie.toml"),
+            (kind not in LIVE and self.source.file is None, f"source.file is none; expected the file of the {kind} source"),
+            (self.backend != "dry-run" and kind not in LIVE, f"backend {self.backend} with recorded poses ({kind}); a recording flies dry"),
+            (kind == "mocap" and self.source.mocap is None, "source.mocap is missing; expected its system and host"),
+            (not inside, f"home_w {self.home_w} m; expected within the vehicle's fence, {fence.vehicle_low} to {fence.vehicle_high} m"),
+            (not fence.payload_low[2] <= self.landing_height <= fence.payload_high[2],
+             f"landing_height {self.landing_height} m; expected within the payload's fence, {fence.payload_low[2]} to "
+             f"{fence.payload_high[2]} m of height"),
+        ):  # fmt: skip
+            if wrong:
+                raise ConfigError(text)
         angles = {channel.name for channel in self.source.columns if channel.kind == "euler"}
         for name, frames in self.frames.items():
             written = "xyzw" if CHANNELS[name][1] in angles else ORDERS.get(self.source.kind)

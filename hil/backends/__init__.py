@@ -24,14 +24,14 @@ THRUST_SHORT = 0.98  # shares of the thrust, and of the rates, that the policy w
 
 
 def mechanism_lag(params: Any) -> float:
-    """Time from the release command to separation [s] of the mechanism of a run's back-end; 0 for a dry run."""
+    """Return time from the release command to separation [s] of the mechanism of a run's back-end; 0 for a dry run."""
     return 0.0 if params.backend == "dry-run" else getattr(params, params.backend).mechanism_lag
 
 
 def make_backend(
     params: Any, link: Any = None, write: bool = False, tell: Callable[[str], None] | None = None, folder: Path | None = None
 ) -> Backend | Held:
-    """The back-end of a run.
+    """Return the back-end of a run.
 
     Args:
         params: `hil.params.HilParams`. link: MAVLink link of the run; None where poses are recorded ones.

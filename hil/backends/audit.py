@@ -24,17 +24,17 @@ class Rule:
 
 
 def equal(name: str, value: float, why: str, writable: bool = True) -> Rule:
-    """A parameter that must have a value."""
+    """Return a parameter that must have a value."""
     return Rule(name, f"{value:g}", why, lambda v: abs(v - value) < 1e-6, (lambda _: value) if writable else None)
 
 
 def bits(name: str, mask: int, why: str) -> Rule:
-    """A parameter some of whose bits must be set."""
+    """Return a parameter some of whose bits must be set."""
     return Rule(name, f"with the bits of {mask} set", why, lambda v: int(v) & mask == mask, lambda v: int(v) | mask)
 
 
 def within(name: str, low: float, high: float, value: float, why: str) -> Rule:
-    """A parameter above ``low`` and not above ``high``; ``value`` is written."""
+    """Return a parameter above ``low`` and not above ``high``; ``value`` is written."""
     return Rule(name, f"above {low:g}, at most {high:g}", why, lambda v: low < v <= high + 1e-6, lambda _: value)
 
 
@@ -111,12 +111,12 @@ class Audit:
                 self._ask(name)
 
     def _wrong(self) -> list[Rule]:
-        """Rules that what was found breaks."""
+        """Return rules that what was found breaks."""
         found = self.found
         return [r for r in self.rules.values() if not (r.good(found[r.name]) if r.name in found else r.optional)]
 
     def fault(self) -> str | None:
-        """What ends the run, in short; the table has it in full."""
+        """Return what ends the run, in short; the table has it in full."""
         if not self.problems:
             return None
         names = [rule.name for rule in self._wrong()]
@@ -124,7 +124,7 @@ class Audit:
         return f"parameter audit: {', '.join(names[:MOST_NAMED])}{more} wrong, see the table"
 
     def table(self) -> str:
-        """Parameter, found, expected, why, a line each."""
+        """Return parameter, found, expected, why, a line each."""
         rows, wrong = [("", "parameter", "found", "expected", "why")], self._wrong()
         for name, rule in self.rules.items():
             shown = f"{self.found[name]:g}" if name in self.found else self.refused.get(name, "no answer")

@@ -82,7 +82,7 @@ class MavlinkAutopilot(Autopilot, ABC):
         self.audit = Audit(rules, self._ask_parameter, self._write_parameter if self._write else None, self._tell)
 
     def _came_back(self, party: Party) -> None:
-        """From another address it may be another vehicle of the same ids."""
+        """Begin anew with what speaks from another address: it may be another vehicle of the same ids."""
         if party.name == "autopilot":
             self._heartbeat = None
             self._streamed = -1e9
@@ -90,26 +90,26 @@ class MavlinkAutopilot(Autopilot, ABC):
 
     @abstractmethod
     def _rules(self) -> list[Rule]:
-        """What its parameters must be."""
+        """Return what its parameters must be."""
 
     @abstractmethod
     def _role(self, mode: int) -> str | None:
-        """FOLLOW, HOLD or LAND by a heartbeat's custom mode; None for another one."""
+        """Return FOLLOW, HOLD or LAND by a heartbeat's custom mode; None for another one."""
 
     @abstractmethod
     def _mode_numbers(self, mode: str) -> tuple[float, float]:
-        """Second and third parameter of DO_SET_MODE."""
+        """Return second and third parameter of DO_SET_MODE."""
 
     @abstractmethod
     def _release_command(self) -> tuple[int, tuple[float, ...]]:
-        """Command that opens the mechanism, and its parameters."""
+        """Return command that opens the mechanism, and its parameters."""
 
     def _stored(self, value: float, kind: int) -> float:
-        """A parameter's value out of a PARAM_VALUE's field."""
+        """Return a parameter's value out of a PARAM_VALUE's field."""
         return value
 
     def _field(self, value: float, kind: int) -> float:
-        """A PARAM_SET's field for a value; inverse of :meth:`_stored`."""
+        """Return a PARAM_SET's field for a value; inverse of :meth:`_stored`."""
         return value
 
     def _hear(self, message: Any, arrival: float) -> None:
@@ -140,7 +140,7 @@ class MavlinkAutopilot(Autopilot, ABC):
             self.voltage = 1e-3 * message.voltage_battery
 
     def _judge_mode(self) -> None:
-        """Whether the mode is still one of ours."""
+        """Judge whether the mode is still one of ours."""
         role = self._role(self._heartbeat.custom_mode)
         if self._wanted is None:
             return
@@ -188,7 +188,7 @@ class MavlinkAutopilot(Autopilot, ABC):
 
     @abstractmethod
     def _expected_modes(self) -> str:
-        """Modes that a throw may begin in, in words."""
+        """Return modes that a throw may begin in, in words."""
 
     def send(self, command: tuple[float, ...], now: float) -> bool:
         p = self.params
@@ -248,10 +248,10 @@ class MavlinkAutopilot(Autopilot, ABC):
 
 
 def bytes_to_integer(value: float) -> float:
-    """The integer whose bytes stand in a float field, as PX4 writes them."""
+    """Return the integer whose bytes stand in a float field, as PX4 writes them."""
     return float(struct.unpack("<i", struct.pack("<f", value))[0])
 
 
 def integer_to_bytes(value: float) -> float:
-    """The float field whose bytes are those of an integer."""
+    """Return the float field whose bytes are those of an integer."""
     return struct.unpack("<f", struct.pack("<i", int(value)))[0]

@@ -32,7 +32,7 @@ class Backend:
     holds = False  # whether the autopilot has modes of its own that hold a place and land
 
     def status(self, now: float) -> Status:
-        """What is known now."""
+        """Return what is known now."""
         raise NotImplementedError
 
     def send(self, command: tuple[float, ...], now: float) -> bool:
@@ -55,7 +55,7 @@ class Backend:
         """Do what is due: heartbeats, the release, its repetition."""
 
     def due(self) -> float | None:
-        """When :meth:`service` is to be called at the latest [s]; None for the next tick."""
+        """Return when :meth:`service` is to be called at the latest [s]; None for the next tick."""
         return None
 
     def abort(self, now: float) -> None:
@@ -149,7 +149,7 @@ class Release:
             self._judge()
 
     def due(self, now: float) -> bool:
-        """Whether to send it now; the caller does."""
+        """Return whether to send it now; the caller does."""
         if self.state != PENDING:
             return False
         if now - self._first > self.timeout:
@@ -188,11 +188,11 @@ class Autopilot(Backend):
         self.texts: list[str] = []
 
     def _note(self, now: float) -> tuple[str, str]:
-        """What is wrong, or nothing; and what the autopilot does."""
+        """Return what is wrong, or nothing; and what the autopilot does."""
         raise NotImplementedError
 
     def _hint(self) -> str:
-        """What it waits for, though nothing is wrong."""
+        """Return what it waits for, though nothing is wrong."""
         return ""
 
     def status(self, now: float) -> Status:
@@ -236,7 +236,7 @@ class OnPort(Autopilot):
         return f"no answer by {self.protocol}" + (f" for {silence:.1f} s" if self._heard >= 0.0 else ""), WAIT
 
     def _known(self) -> tuple[str, str]:
-        """As `_note`, of one that is heard."""
+        """Return the same as `_note`, of one that is heard."""
         raise NotImplementedError
 
     def ask(self, mode: str, now: float) -> None:

@@ -180,7 +180,7 @@ class Betaflight(OnPort):
         return self._write(msp.SET_RAW_RC, struct.pack(f"<{len(channels)}H", *channels))
 
     def _arms(self, now: float) -> bool:
-        """Whether ARM is to be high: not before nothing has spoken against it for a while, and low again where something does."""
+        """Return whether ARM is to be high: not before nothing has spoken against it for a while, and low again where something does."""
         if not self._taken or self._over:
             return False
         return self._box(BOX_ARM) or (self._free_since is not None and now - self._free_since >= ARM_LOW)
@@ -268,7 +268,7 @@ class Betaflight(OnPort):
         self._blocks = frame.number("<I", 17 + (count & 15)) or 0
 
     def _hear_channels(self, channels: tuple[int, ...]) -> None:
-        """MSP_RC tells roll, pitch, yaw, throttle, AUX 1 and on, whatever the map."""
+        """Take MSP_RC: roll, pitch, yaw, throttle, AUX 1 and on, whatever the map."""
         p = self.params
         if len(channels) < STICKS:
             return
@@ -299,7 +299,7 @@ class Told:
     scale: float = 1.0
 
     def read(self, frame: msp.Frame) -> float | None:
-        """Its value in an answer; None where that is cut short."""
+        """Return its value in an answer; None where that is cut short."""
         number = frame.number(self.code, self.at)
         return None if number is None else self.scale * number
 
@@ -318,13 +318,13 @@ SETTINGS = {
 
 
 def blocked(flags: int) -> str:
-    """What speaks against arming, in words."""
+    """Return what speaks against arming, in words."""
     named = [text for bit, text in enumerate(BLOCKS) if flags >> bit & 1]
     return f"{', '.join(named) or 'ARM switch'} (flags {flags:#x})"
 
 
 def settings(frame: msp.Frame, params: BetaflightParams) -> dict[str, float]:
-    """Settings that an answer tells; what is cut short tells nothing."""
+    """Return settings that an answer tells; what is cut short tells nothing."""
     read = {name: told.read(frame) for name, told in SETTINGS.items() if told.command == frame.command}
     found = {name: float(value) for name, value in read.items() if value is not None}
     if "api_version" in found:
@@ -338,7 +338,7 @@ def settings(frame: msp.Frame, params: BetaflightParams) -> dict[str, float]:
 
 
 def _aux(frame: msp.Frame, box: int, preferred: int) -> float:
-    """AUX, from 1, of a flight mode by MSP_MODE_RANGES: box, channel, first and last step of 25 us; 0: none."""
+    """Return AUX, from 1, of a flight mode by MSP_MODE_RANGES: box, channel, first and last step of 25 us; 0: none."""
     found = [
         frame.payload[i + 1] + 1
         for i in range(0, len(frame.payload) - 3, 4)

@@ -38,7 +38,7 @@ class AutopilotCheck:
         self.backend.share = None  # each report counts once
 
     def results(self, now: float, mass: float) -> list[tuple[bool, str]]:
-        """What was found with a mass [kg] that hovers: whether it is good, and in words."""
+        """Return what was found with a mass [kg] that hovers: whether it is good, and in words."""
         if self.meter is None:
             return []
         audit, status = self.backend.audit, self.backend.status(now)
@@ -51,7 +51,7 @@ class AutopilotCheck:
 
 
 def autopilot_record(backend: Any, link: Any) -> dict[str, Any]:
-    """What a run's summary keeps of its autopilot: parameters, the last release, texts, clocks of the link's peers, if there is one."""
+    """Return what a run's summary keeps of its autopilot: parameters, the last release, texts, clocks of the link's peers."""
     out: dict[str, Any] = {"backend": backend.name}
     if hasattr(backend, "audit"):
         audit, release = backend.audit, backend.release_record
@@ -64,7 +64,7 @@ def autopilot_record(backend: Any, link: Any) -> dict[str, Any]:
 
 
 def hover_of_run(folder: str | Path) -> tuple[bool, str]:
-    """Whether the hover of a recorded run took the weight, by what the runner commanded before its throws; and that in words.
+    """Return whether the hover of a recorded run took the weight, by what the runner commanded before its throws; and that in words.
 
     Raises:
         RunError: no folder of a run, or no steady hover in it.

@@ -30,7 +30,7 @@ While a run goes on, type 'arm' (one throw), 'land' or 'abort' and Enter; Ctrl-C
 
 
 def above_zero(text: str) -> float:
-    """A number above 0 of the command line."""
+    """Return a number above 0 of the command line."""
     try:
         value = float(text)
     except ValueError:
@@ -41,7 +41,7 @@ def above_zero(text: str) -> float:
 
 
 def seed(text: str) -> int:
-    """A whole number from 0 on of the command line."""
+    """Return a whole number from 0 on of the command line."""
     if not text.isdecimal():
         raise argparse.ArgumentTypeError(f"'{text}'; expected a whole number of 0 or more")
     return int(text)

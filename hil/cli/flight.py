@@ -9,7 +9,7 @@ from pathlib import Path
 
 from hil.backends import make_backend, mechanism_lag, require_reach
 from hil.backends.check import autopilot_record
-from hil.cli.terminal import Terminal, Voice
+from hil.cli.terminal import Console, Terminal
 from hil.control.calibrating import Solver
 from hil.control.loop import Lander
 from hil.control.loop import fly as fly_loop
@@ -33,12 +33,12 @@ from visthrow.onboard.policy import Policy, find_policy
 
 
 def params_of(args: argparse.Namespace) -> HilParams:
-    """The configuration that a command names."""
+    """Return the configuration that a command names."""
     return config.load(HilParams, config.find("hil", args.config), args.overrides)
 
 
 def key_of(args: argparse.Namespace) -> bytes | None:
-    """The key that ``--sign`` names, or None."""
+    """Return the key that ``--sign`` names, or None."""
     return None if args.sign is None else read_key(args.sign)
 
 
@@ -67,26 +67,26 @@ def fly(args: argparse.Namespace) -> int:
     if auto_arm:
         require_fake(params)
     folder = Path(args.out or f"runs/hil/{time.strftime('%Y%m%d-%H%M%S')}")
-    policy, voice = Policy.load(find_policy(params.policy)), Voice()
-    source, link, recorded = open_source(params, folder, MonotonicClock(args.speed), key_of(args), voice.say)
+    policy, console = Policy.load(find_policy(params.policy)), Console()
+    source, link, recorded = open_source(params, folder, MonotonicClock(args.speed), key_of(args), console.say)
     clock = ManualClock(source.start) if recorded else MonotonicClock(args.speed)
     require_reach(params, policy.contract)
-    backend = make_backend(params, link, args.action == "run" and args.write_parameters, voice.say, folder)
+    backend = make_backend(params, link, args.action == "run" and args.write_parameters, console.say, folder)
     runner = Runner(params, policy, backend, mechanism_lag(params))
     runner.watcher = getattr(backend, "place", None)  # who wants the vehicle's poses
     refused = prepare(params.realtime)
     runner.warm_up()
     recorder = Recorder(folder, params)
     for text in refused or keep(params.realtime):  # the recorder's thread holds what the flying one waits for; others do not
-        voice.say(f"note: {text}")
-    operator = Terminal(auto_arm, lambda: any(one.roster.simulated for one in source.links), voice.say)
+        console.say(f"note: {text}")
+    operator = Terminal(auto_arm, lambda: any(one.roster.simulated for one in source.links), console.say)
     print(f"ready after {time.monotonic() - started:.2f} s; waiting for poses", file=sys.stderr, flush=True)
     viewer, stages = start_viewer(folder) if args.view else None, Stages()
     eyes = open_images(params.images, params.camera, clock.now) if params.keypoints == "detector" else None
     solver = None if runner.calibrating is None else Solver(params.camera, policy.contract, params.calibration.spreads)
     summary = fly_loop(
         runner, source, clock, Lander(operator, runner.calibrating) if calibrates else operator, recorder,
-        args.seconds or float("inf"), voice.decision, stages, eyes, solver,
+        args.seconds or float("inf"), console.decision, stages, eyes, solver,
     )  # fmt: skip
     summary["speed"] = args.speed
     summary["autopilot"] = autopilot_record(backend, link)
@@ -97,7 +97,7 @@ def fly(args: argparse.Namespace) -> int:
     recorder.close(summary)
     if viewer is not None:
         viewer.terminate()
-    voice.close()
+    console.close()
     _show(summary_text(summary, folder))
     if not args.bare:
         _show("\n".join(finish(folder, stages, args.speed)))

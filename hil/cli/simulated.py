@@ -116,7 +116,7 @@ def _fly_px4(
 
 
 def make_ball(policy: str, seed: int) -> HangingBall:
-    """Rope and ball that a policy was trained with, below a vehicle that is told where it is."""
+    """Return rope and ball that a policy was trained with, below a vehicle that is told where it is."""
     contract = Policy.load(find_policy(policy)).contract
     rope, alone = contract["rope"], contract["vehicle"]["body"]["mass"]
     return HangingBall(

@@ -30,13 +30,12 @@ LAST_WORDS = 2.0  # that the end of a run waits for its lines to be taken [s]
 MOST_TYPED = 4096  # bytes of a line without an end
 
 
-class Voice:
+class Console:
     """Says lines on standard error by a thread of its own: a terminal that is gone or stands still holds up no tick."""
 
     def __init__(self) -> None:
-        """Begin to listen."""
         self._lines: queue.Queue[str | None] = queue.Queue(MOST_UNSAID)
-        self._thread = threading.Thread(target=self._speak, name="voice", daemon=True)
+        self._thread = threading.Thread(target=self._speak, name="console", daemon=True)
         self._thread.start()
         self._before: tuple[str, str] = ("", "")
 
@@ -109,7 +108,7 @@ class Terminal:
         return OperatorInput(arm, "land" in said, "abort" in said or bool(self._why), self._why)
 
     def _lines(self) -> set[str]:
-        """Lines that were typed since the last call; half a line waits for its end."""
+        """Return lines that were typed since the last call; half a line waits for its end."""
         while self._file >= 0 and select.select([self._file], [], [], 0)[0]:
             try:
                 data = os.read(self._file, MOST_TYPED)

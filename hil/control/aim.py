@@ -43,11 +43,11 @@ class Aim:
         self._first: float | None = None  # that was held back in this throw [s]
 
     def begin(self) -> None:
-        """A throw begins."""
+        """Begin a throw."""
         self._first = None
 
     def landing(self, payload: BodyState) -> tuple[float, float]:
-        """Where a payload in this state would land [m], world frame, if the latch tripped now."""
+        """Return where a payload in this state would land [m], world frame, if the latch tripped now."""
         vel = payload.vel
         pos = tuple(x + self._ahead * v for x, v in zip(payload.pos, vel))
         time = 0.0
@@ -66,7 +66,7 @@ class Aim:
         return (through * vel[0], through * vel[1], through * vel[2] - GRAVITY)
 
     def astray(self, now: float, payload: BodyState, goal_w: Vector) -> str | None:
-        """Why a release that was asked for at a time [s] is held back, or None."""
+        """Return why a release that was asked for at a time [s] is held back, or None."""
         if self._params is None:
             return None
         x, y = self.landing(payload)
@@ -78,5 +78,5 @@ class Aim:
         return f"it would land at ({x:.2f}, {y:.2f}) m, {off:.2f} m from the goal, within {self._params.bound:g} m expected"
 
     def given_up(self, now: float) -> bool:
-        """Whether this throw is over at a time [s]: nothing better came within the patience after what was held back."""
+        """Return whether this throw is over at a time [s]: nothing better came within the patience after what was held back."""
         return self._first is not None and now - self._first >= self._params.patience

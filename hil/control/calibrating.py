@@ -49,7 +49,7 @@ class CalibrationParams(Bounded):
 
 
 def solved(hovered: Hovered, camera: CameraParams, contract: dict[str, Any], spreads: Spreads) -> Calibration | str:
-    """The calibration of a hover, or why there is none."""
+    """Return the calibration of a hover, or why there is none."""
     import torch
 
     from camera.keypoints import KeypointCamera
@@ -75,7 +75,7 @@ class Solver:
         self._coming = self._pool.submit(solved, hovered, *self._with)
 
     def poll(self) -> Calibration | str | None:
-        """What came of it, once; None while there is nothing new."""
+        """Return what came of it, once; None while there is nothing new."""
         if self._coming is None or not self._coming.done():
             return None
         coming, self._coming = self._coming, None
@@ -110,7 +110,7 @@ class Calibrating:
         self._waits = False
 
     def rates(self, now: float, quiet: bool) -> tuple[float, float]:
-        """Roll and pitch rate to add to the hover's at a time [rad/s]; ``quiet``: the vehicle hovers and nothing swings."""
+        """Return roll and pitch rate to add to the hover's at a time [rad/s]; ``quiet``: the vehicle hovers and nothing swings."""
         p = self.params
         if self.found is not None or self._waits:
             return 0.0, 0.0
@@ -152,7 +152,7 @@ class Calibrating:
         self._due, self._waits = Hovered(*columns[:8], np.array(goal), columns[8]), True
 
     def due(self) -> Hovered | None:
-        """A hover that is to be solved, once."""
+        """Return a hover that is to be solved, once."""
         due, self._due = self._due, None
         return due
 
@@ -165,7 +165,7 @@ class Calibrating:
             self._why = result
 
     def problems(self) -> list[str]:
-        """Why a throw has to wait, or is refused."""
+        """Return why a throw has to wait, or is refused."""
         p, found = self.params, self.found
         if found is None:
             return ["calibrating in the hover" + (f" again: {self._why}" if self._why else "")]

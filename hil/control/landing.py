@@ -57,7 +57,7 @@ class Flight:
         return self._landing()
 
     def overdue(self, now: float) -> Landing | None:
-        """The landing of a ball that by a time [s] was lost from sight shortly before the ground."""
+        """Return the landing of a ball that by a time [s] was lost from sight shortly before the ground."""
         seen = self._times
         free = len(seen) >= NEAR and seen[-NEAR] > self.latch + self.lag
         if not free or now - seen[-1] < UNSEEN:
@@ -82,7 +82,7 @@ class Flight:
 
 
 def separation(times: np.ndarray, points: np.ndarray, expected: float) -> tuple[float, Vector] | None:
-    """When and where the rope let go: where the poses leave the free fall after it, carried backwards.
+    """Return when and where the rope let go: where the poses leave the free fall after it, carried backwards.
 
     While the rope holds, its pull bends the path away from the free fall by ``a (t_s - t)^2 / 2``; the root of the distance is
     a line in time that ends at the separation.
@@ -112,7 +112,7 @@ def separation(times: np.ndarray, points: np.ndarray, expected: float) -> tuple[
 
 
 def _parabola(times: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Position and velocity at time 0 of the free fall that fits poses best, shape (3,) each."""
+    """Return position and velocity at time 0 of the free fall that fits poses best, shape (3,) each."""
     lifted = points + [0.0, 0.0, 0.5 * GRAVITY] * times[:, None] ** 2
     fit = np.linalg.lstsq(np.column_stack((np.ones_like(times), times)), lifted, rcond=None)[0]
     return fit[0], fit[1]

@@ -61,11 +61,11 @@ class Latch:
         return self.commanded
 
     def separated(self, now: float) -> bool:
-        """Whether the payload is off by now [s], as far as latch and lag tell."""
+        """Return whether the payload is off by now [s], as far as latch and lag tell."""
         return self.at is not None and now - self.at >= self.lag - ROUNDING
 
     def hangs_still(self, now: float, vehicle_w: Vector, payload_w: Vector | None) -> bool:
-        """Whether the payload hangs on the vehicle at a time [s], by the latch and then both places [m]; None: no fresh pose of it."""
+        """Return whether the payload hangs on the vehicle at a time [s], by the latch and then by both places [m], if known."""
         if self.at is None:
             return True
         if payload_w is None or now - self.at < self.lag + STUCK_AFTER:

@@ -39,7 +39,7 @@ class Operator(Protocol):
     """Who arms."""
 
     def words(self, state: str) -> OperatorInput:
-        """What was said since the last tick; ``state`` is the runner's. Never waits."""
+        """Return what was said since the last tick; ``state`` is the runner's. Never waits."""
 
 
 class Lander:
@@ -123,7 +123,7 @@ class Loop:
         self.ticker = Ticker(self.clock, self.runner.pilot.period)
 
     def turn(self, over: bool) -> None:
-        """One tick; ``over``: the run's time is, and what flies is to come down."""
+        """Do one tick; ``over``: the run's time is, and what flies is to come down."""
         runner, source, clock, ticker, backend = self.runner, self.source, self.clock, self.ticker, self.runner.backend
         source.hold(runner.in_flight)
         _wait(clock, ticker.due() - AHEAD - AHEAD_SPREAD * (self.count * GOLDEN % 1.0), backend, source)

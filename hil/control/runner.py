@@ -24,9 +24,9 @@ from hil.control.latch import Latch
 from hil.control.safety import Guard, failed_checks, fence_broken, outside
 from hil.control.states import FLYING, Inputs, Machine, State
 from hil.params import HilParams
+from hil.poses.detection import Detection, Detections
 from hil.poses.gate import HOLD, Tether
 from hil.poses.pose import GOAL, PAYLOAD, VEHICLE, Pose, Vector
-from hil.poses.sight import Sight, Sights
 from hil.poses.track import BodyState, Track
 from hil.sources.images import Hint
 from visthrow.onboard.calibration import Calibration
@@ -68,7 +68,7 @@ class Seen:
 
 
 def calm(vehicle: BodyState) -> bool:
-    """Whether a vehicle is slow and level enough to be handed over."""
+    """Return whether a vehicle is slow and level enough to be handed over."""
     x, y, _, _ = vehicle.quat or (0.0, 0.0, 0.0, 1.0)
     return math.hypot(*vehicle.vel) < HAND_OVER_SPEED and 1.0 - 2.0 * (x * x + y * y) > math.cos(HAND_OVER_TILT)
 
@@ -119,9 +119,9 @@ class Runner:
         self.spent: dict[str, float] = {}
         self._untaken: Exception | None = None
         self.watcher: Callable[[str, Track], None] | None = None
-        self.sights = Sights(self.pilot.camera, params.images.hold) if params.keypoints == "detector" else None
-        self._sight: Sight | None = None
-        wants = params.calibration is not None and self.sights is not None
+        self.detections = Detections(self.pilot.camera, params.images.hold) if params.keypoints == "detector" else None
+        self._detection: Detection | None = None
+        wants = params.calibration is not None and self.detections is not None
         self.calibrating = Calibrating(params.calibration, lambda: self.seen_goal_w) if wants else None
         self._calibration: Calibration | str | None = None
 
@@ -161,13 +161,13 @@ class Runner:
         for _ in range(WARM_CALLS):
             pilot.act(pos, np.array([[0.0, 0.0, 0.0, 1.0]]), still, still, pos - [0.0, 0.0, self.hang], goal_w)
 
-    def look(self, sights: list[Sight]) -> None:
+    def look(self, detections: list[Detection]) -> None:
         """Take in what a camera saw since the last tick; of several frames the newest counts."""
-        if sights:
-            self._sight = sights[-1]
+        if detections:
+            self._detection = detections[-1]
 
     def hint(self, now: float) -> Hint | None:
-        """What a detector is told before it looks: vehicle and, while the payload hangs, how far off it can be."""
+        """Return what a detector is told before it looks: vehicle and, while the payload hangs, how far off it can be."""
         vehicle = self.tracks[VEHICLE].state(now)
         if vehicle is None or vehicle.quat is None or self.tracks[VEHICLE].gate.level(now) >= HOLD:
             return None
@@ -239,17 +239,17 @@ class Runner:
             self.backend.stop_release()
             self._stop_at = math.inf
         decision = Decision(now, state.value, self.machine.reason, waits=self.machine.waits(inputs))
-        sight, self._sight = self._sight, None
-        if self.sights is not None and sight is not None:
-            decision.seen = sight.values()
-        if self.sights is not None and seen.vehicle is not None and seen.vehicle.quat is not None:
-            self.sights.along(now, seen.vehicle.pos, seen.vehicle.quat)
-            if sight is not None:
-                self.sights.take(sight, seen.vehicle.quat, self._shown_age(now))
+        detection, self._detection = self._detection, None
+        if self.detections is not None and detection is not None:
+            decision.seen = detection.values()
+        if self.detections is not None and seen.vehicle is not None and seen.vehicle.quat is not None:
+            self.detections.along(now, seen.vehicle.pos, seen.vehicle.quat)
+            if detection is not None:
+                self.detections.take(detection, seen.vehicle.quat, self._shown_age(now))
         return decision, state
 
     def _ours(self, state: State, status: Status) -> bool:
-        """Whether commands are sent: not where it was handed over, nor to what has been taken over, hears nothing or was never ours."""
+        """Return whether commands are sent: not to what was handed or taken over, hears nothing or was never ours."""
         if status.mode in (HELD, LAND) and state not in (State.READY, State.ARMED):
             return False
         return state is not State.ABORT or (status.connected and self.machine.flown)
@@ -261,26 +261,26 @@ class Runner:
     def _calibrated(
         self, now: float, state: State, seen: Seen, status: Status, wanted: tuple[float, ...] | None, decision: Decision
     ) -> tuple[float, ...] | None:
-        """The command with the sway of a calibration; what came in this tick is taken down."""
+        """Return the command with the sway of a calibration; what came in this tick is taken down."""
         calibrating, result = self.calibrating, self._calibration
         if result is not None:
             self._calibration = None
             calibrating.take(result)
             decision.calibration = result if isinstance(result, str) else result.values()
-            if isinstance(result, Calibration) and self.sights is not None:
-                self.sights.correct(result)
+            if isinstance(result, Calibration) and self.detections is not None:
+                self.detections.correct(result)
         ours = state is State.READY and status.mode == FOLLOW and seen.known and seen.vehicle.quat is not None
         if not ours or wanted is None:
             calibrating.stop()
             return wanted
         roll, pitch = calibrating.rates(now, self._still(seen.vehicle, seen.payload, False))
-        if decision.seen is not None and self.sights.fresh is not None:
-            stamp, points, valid = self.sights.fresh
+        if decision.seen is not None and self.detections.fresh is not None:
+            stamp, points, valid = self.detections.fresh
             calibrating.note(now, seen.vehicle, wanted[0], points, valid, now - self._shown_age(now) - stamp)
         return (wanted[0], wanted[1] + roll, wanted[2] + pitch, wanted[3])
 
     def _guarded(self, now: float, wanted: tuple[float, ...] | None, decision: Decision) -> tuple[float, ...] | None:
-        """A command within its limits; one that is not finite ends the run."""
+        """Return a command within its limits; one that is not finite ends the run."""
         if wanted is None:
             self.guard.reset()
             return None
@@ -307,7 +307,7 @@ class Runner:
             self.backend.abort(now)
 
     def _tether(self, pose: Pose) -> Tether | None:
-        """The cable's other end for a pose of vehicle or payload while the payload hangs; None on the ground and after."""
+        """Return the cable's other end for a pose of vehicle or payload while the payload hangs; None on the ground and after."""
         other = {VEHICLE: PAYLOAD, PAYLOAD: VEHICLE}.get(pose.body)
         if other is None or self.latch.at is not None or self.machine.state not in FLYING:
             return None
@@ -329,18 +329,18 @@ class Runner:
             self.backend.ask(LAND, now)
 
     def _state(self, track: Track, now: float) -> BodyState | None:
-        """State of a body, carried forward to the age that the policy was trained with where the config says so."""
+        """Return state of a body, carried forward to the age that the policy was trained with where the config says so."""
         delay, age = self.params.delay, self._age(track, now)
         ahead = age - self._aged + delay.command if delay.compensate and math.isfinite(age) else 0.0
         return track.state(now, ahead)
 
     def _age(self, track: Track, now: float) -> float:
-        """Age of a body's last pose [s]."""
+        """Return age of a body's last pose [s]."""
         last, source = track.gate.last, self.params.delay.source
         return track.gate.age(now) + (source if last is None else last.transit(source))
 
     def _shown_age(self, now: float) -> float:
-        """Age of the vehicle's pose as the policy is shown it [s]: younger ones than it was trained with stay so."""
+        """Return age of the vehicle's pose as the policy is shown it [s]: younger ones than it was trained with stay so."""
         age = self._age(self.tracks[VEHICLE], now)
         return min(age, self._aged) if self.params.delay.compensate else age
 
@@ -376,7 +376,7 @@ class Runner:
         )  # fmt: skip
 
     def _thrust_off(self) -> list[str]:
-        """Whether hovering takes another thrust than the weight: then the calibration is wrong, or the battery low."""
+        """Return whether hovering takes another thrust than the weight: then the calibration is wrong, or the battery low."""
         p, ratio = self.params, self.hovering.share()
         allowed = math.inf if p.backend == "dry-run" else getattr(p, p.backend).thrust.tolerance
         if ratio is None or abs(ratio - 1.0) <= allowed:
@@ -384,14 +384,14 @@ class Runner:
         return [f"hovering takes {ratio:.2f} times the weight, within {allowed:g} of 1 expected: calibrate the thrust"]
 
     def _still(self, vehicle: BodyState, payload: BodyState | None, held: bool) -> bool:
-        """Whether all is quiet, at the hover point or where the autopilot holds the vehicle."""
+        """Return whether all is quiet, at the hover point or where the autopilot holds the vehicle."""
         if not held and math.dist(vehicle.pos, self.params.home_w) > STILL_OFFSET:
             return False
         moving = [VEHICLE] + ([PAYLOAD] if self.latch.at is None and payload is not None else [])
         return all(self.tracks[name].calm_speed() < STILL_SPEED for name in moving)
 
     def _entered(self, now: float, before: State, state: State, vehicle: BodyState | None) -> None:
-        """What a change of state brings with it."""
+        """Do what a change of state brings with it."""
         if before is State.THROW:
             # A fast mechanism may have to be told only after the policy's own time of separation, where commands act late.
             self._stop_at = self.latch.commanded if state is State.RECOVER and self.latch.at is not None else now
@@ -409,7 +409,7 @@ class Runner:
             self.hovering.hold(vehicle.pos)
 
     def _command(self, now: float, state: State, seen: Seen, decision: Decision) -> tuple[float, ...] | None:
-        """What to send in a state, before the guard; None for nothing."""
+        """Return what to send in a state, before the guard; None for nothing."""
         if state not in FLYING and state is not State.ABORT:
             return None
         vehicle = seen.vehicle
@@ -426,7 +426,7 @@ class Runner:
         return self.hovering.command(vehicle, mass)
 
     def _carries(self, now: float, vehicle: BodyState | None, payload: BodyState | None) -> bool:
-        """Whether the payload hangs on the vehicle, by the latch and by its own poses."""
+        """Return whether the payload hangs on the vehicle, by the latch and by its own poses."""
         fresh = payload is not None and self.tracks[PAYLOAD].gate.level(now) < HOLD
         if vehicle is None:
             return self.latch.at is None
@@ -449,7 +449,7 @@ class Runner:
         vehicle, payload = seen.vehicle, seen.payload
         attached = not self.latch.separated(decision.time)
         views = [np.array([v]) for v in (vehicle.pos, vehicle.quat, vehicle.vel, vehicle.rate, payload.pos)]
-        keypoints = None if self.sights is None else self.sights.keypoints(decision.time)
+        keypoints = None if self.detections is None else self.detections.keypoints(decision.time)
         out: PilotOutput = self.pilot.act(*views, np.array(seen.goal_w), attached, keypoints, decision.time)
         self.spent["observation"], self.spent["policy"] = self.pilot.spent
         decision.action = out.action[0].tolist()
@@ -459,7 +459,7 @@ class Runner:
         return out
 
     def problems(self) -> list[str]:
-        """What speaks against a throw as of the last poses."""
+        """Return what speaks against a throw as of the last poses."""
         bodies = {name: track.state(0.0) for name, track in self.tracks.items()}
         goal_w = self._goal(bodies)
         missing = [f"no good pose of the {name}" for name, state in bodies.items() if state is None]
@@ -469,7 +469,7 @@ class Runner:
         return failed_checks(p.check, p.fence, bodies[VEHICLE], bodies[PAYLOAD], goal_w, p.home_w, self.hang)
 
     def summary(self) -> dict[str, Any]:
-        """Counts of the run so far."""
+        """Return counts of the run so far."""
         machine, found = self.machine, None if self.calibrating is None else self.calibrating.found
         bodies = {
             name: {"accepted": track.accepted, "refused": track.gate.refused, "filter_lag": track.filter.lag}

@@ -33,7 +33,7 @@ class Guard:
         self._last = None
 
     def check(self, command: tuple[float, ...]) -> tuple[float, ...] | None:
-        """The command that may be sent, [N, rad/s], or None where it is not finite."""
+        """Return the command that may be sent, [N, rad/s], or None where it is not finite."""
         if len(command) != 4 or not all(map(math.isfinite, command)):
             self.refused += 1
             return None
@@ -65,7 +65,7 @@ class FenceParams(Bounded):
 
 
 def outside(point: Vector, low: Vector, high: Vector) -> str | None:
-    """The first axis along which a point lies outside of a box, with its value; None inside."""
+    """Return the first axis along which a point lies outside of a box, with its value; None inside."""
     for axis, x, least, most in zip("xyz", point, low, high):
         if not least <= x <= most:
             return f"{axis} {x:.2f} m beyond {least:g} to {most:g} m"
@@ -73,7 +73,7 @@ def outside(point: Vector, low: Vector, high: Vector) -> str | None:
 
 
 def fence_broken(params: FenceParams, vehicle: BodyState, payload: BodyState | None) -> str | None:
-    """Which fence is broken, or will be at the end of braking; None where all is well. A payload that flies freely, None, cannot brake."""
+    """Return which fence is broken, or will be at the end of braking, or None. A payload that flies freely, None, cannot brake."""
     stop = tuple(x + v * abs(v) / (2.0 * params.deceleration) for x, v in zip(vehicle.pos, vehicle.vel))
     bodies = [("vehicle", vehicle.pos, "vehicle"), ("vehicle's braking point", stop, "vehicle")]
     bodies += [] if payload is None else [("payload", payload.pos, "payload")]
@@ -99,7 +99,7 @@ def failed_checks(
     params: CheckParams, fence: FenceParams, vehicle: BodyState, payload: BodyState, goal_w: Vector, home_w: Vector,
     hang: float,
 ) -> list[str]:  # fmt: skip
-    """What speaks against a throw, in words; ``hang`` is what the payload hangs below the vehicle at rest [m]."""
+    """Return what speaks against a throw, in words; ``hang`` is what the payload hangs below the vehicle at rest [m]."""
     failed = []
     if vehicle.quat is None:
         return ["the vehicle's source gives no attitude"]

@@ -72,7 +72,7 @@ class Inputs:
     why: str = ""  # of the abort, where it was no word
 
     def missing(self) -> list[str]:
-        """What has to be there before anything is checked, and is not."""
+        """Return what has to be there before anything is checked, and is not."""
         found = [f"no fresh pose of the {n}" for n, level in (("vehicle", self.vehicle), ("payload", self.payload)) if level >= HOLD]
         return found if self.connected else [*found, "autopilot not ready" + (f" ({self.note})" if self.note else "")]
 
@@ -137,7 +137,7 @@ class Machine:
         self.aborted |= state is State.ABORT
 
     def waits(self, seen: Inputs) -> str:
-        """Why it does not go on, in words; empty where nothing is in the way but time."""
+        """Return why it does not go on, in words; empty where nothing is in the way but time."""
         texts: list[str] = []
         if self.state in (State.IDLE, State.CHECK, State.READY, State.ARMED):
             texts = seen.missing() if self.state in (State.IDLE, State.CHECK) else []
@@ -153,7 +153,7 @@ class Machine:
         return "; ".join(texts)
 
     def _lasted(self, now: float, holds: bool, time: float) -> bool:
-        """Whether a condition has now held for a time."""
+        """Return whether a condition has now held for a time."""
         if not holds:
             self._held = None
             return False

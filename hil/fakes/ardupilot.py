@@ -60,7 +60,7 @@ class FakeArduPilot(FakeMavlink):
         return self._meant(self._target)
 
     def _meant(self, target: np.ndarray) -> np.ndarray:
-        """The set-point as the parameters make it mean."""
+        """Return the set-point as the parameters make it mean."""
         out, now = target.copy(), self.plant.state
         if not int(self.parameters["GUID_OPTIONS"]) & THRUST_AS_THRUST:
             climb = FULL_CLIMB * (2.0 * target[0] / self.plant.max_thrust - 1.0)

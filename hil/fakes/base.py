@@ -80,7 +80,6 @@ class SetPoints:
     """Set-points that begin to act at any time, flown by a plant in periods of its own: those that came, and from when on they act."""
 
     def __init__(self) -> None:
-        """Start with none."""
         self._acting: np.ndarray | None = None
         self._coming: deque[tuple[float, np.ndarray]] = deque()
 
@@ -89,12 +88,12 @@ class SetPoints:
         self._coming.append((when, target))
 
     def forget(self) -> None:
-        """Nothing that came so far counts any more."""
+        """Forget what came so far."""
         self._acting = None
         self._coming.clear()
 
     def flown(self, begin: float, period: float) -> np.ndarray | None:
-        """What acts in the period from a time on [s]: the mean, where it changes within it; None before the first one."""
+        """Return what acts in the period from a time on [s]: the mean, where it changes within it; None before the first one."""
         mean, since = np.zeros(4), begin
         while self._coming and self._coming[0][0] < begin + period - SLACK:
             when, target = self._coming.popleft()
@@ -170,7 +169,7 @@ class Fake(ABC):
         heapq.heappush(self._later, (self.plant.time + delay, self._count, what))
 
     def clock(self) -> float:
-        """Time on the vehicle's own clock [s]."""
+        """Return time on the vehicle's own clock [s]."""
         return self.plant.time + self.options.clock_offset
 
     @property
@@ -200,7 +199,7 @@ class Fake(ABC):
         self._set_points.forget()
 
     def open_mechanism(self) -> None:
-        """The output moves, and what hangs on it lets go some time later; with "accepted" alone."""
+        """Move the output; what hangs on it lets go some time later. With "accepted" alone."""
         if self.options.answer != "accepted" or self.release_time is not None:
             return
         self.release_time = self.heard + self.options.servo_delay
@@ -212,21 +211,21 @@ class Fake(ABC):
         return self.release_time is not None and self.plant.time >= self.release_time
 
     def note_release(self) -> None:
-        """A release command has come."""
+        """Note that a release command has come."""
         self.witness.release(self.plant.time, self.armed, self.plant.state["payload_pos_w"])
 
     def weight(self) -> float:
-        """Weight of what flies now [N]."""
+        """Return weight of what flies now [N]."""
         return self.plant.mass[0 if self.plant.state["attached"] else 1] * GRAVITY
 
     def hold(self, goal_w: np.ndarray) -> np.ndarray:
-        """Command that holds a place [m]: of the autopilot, or of the pilot's hands."""
+        """Return command that holds a place [m]: of the autopilot, or of the pilot's hands."""
         now = self.plant.state
         views = [now[name].astype(float)[None] for name in ("pos_w", "quat_wb", "vel_w")]
         return self._hover.step(*views, goal_w, self.weight() / GRAVITY)[0]
 
     def descend(self) -> np.ndarray:
-        """Command that lands where the vehicle is; it disarms once it is down."""
+        """Return command that lands where the vehicle is; it disarms once it is down."""
         pos = self.plant.state["pos_w"]
         if pos[2] < TOUCH:
             self.armed = False
@@ -235,11 +234,11 @@ class Fake(ABC):
 
     @abstractmethod
     def take(self) -> None:
-        """The pilot takes the vehicle over, and holds it."""
+        """Let the pilot take the vehicle over, and hold it."""
 
     @abstractmethod
     def flown(self) -> np.ndarray:
-        """Command of this period, by whoever flies."""
+        """Return command of this period, by whoever flies."""
 
     def speak(self) -> None:  # noqa: B027 - one that speaks when it is asked says nothing here
         """Say what is due: heartbeats, streams."""
@@ -284,7 +283,7 @@ class Fake(ABC):
             self.speak()
 
     def step(self) -> None:
-        """One period."""
+        """Fly one period."""
         self.fly()
         self.emit()
 
@@ -309,7 +308,7 @@ class Fake(ABC):
             self.link.send(message)
 
     def report(self) -> dict[str, Any]:
-        """What happened to the payload, on the plant's clock, and to the messages."""
+        """Return what happened to the payload, on the plant's clock, and to the messages."""
         w = self.witness
         return {
             **self.plant.landing, "followed": self.followed, "ignored": self.ignored, "releases": w.releases,

@@ -85,7 +85,7 @@ class FakeBetaflight(PortFake):
         self._answer(msp.Frame(frame.command, answer, direction))
 
     def _settings(self, command: int) -> bytes:
-        """Answer that tells settings."""
+        """Return answer that tells settings."""
         out = bytearray(SIZES[command])
         for name, told in SETTINGS.items():
             if told.command == command:
@@ -124,7 +124,7 @@ class FakeBetaflight(PortFake):
             self.armed = self.override = False
 
     def _release_channel(self) -> None:
-        """Only while the channels are ours, and on the change to open."""
+        """Release on the change to open, while the channels are ours."""
         at = STICKS + RELEASE_AUX - 1
         opened = self.override and at < len(self.channels) and self.channels[at] > 1700
         if opened and not self._asked_open:

@@ -71,7 +71,7 @@ class FakeMavlink(Fake):
 
     @abstractmethod
     def listens(self) -> bool:
-        """Whether set-points are followed now."""
+        """Return whether set-points are followed now."""
 
     def take(self) -> None:
         self.enter(self.pilots_mode)
@@ -90,7 +90,7 @@ class FakeMavlink(Fake):
         return mav.MAV_RESULT_ACCEPTED
 
     def mode_text(self, mode: int) -> str:
-        """A custom mode as people write it."""
+        """Return a custom mode as people write it."""
         return str(mode)
 
     def _command(self, message: Any) -> None:
@@ -113,11 +113,11 @@ class FakeMavlink(Fake):
                 self.answer_release(message)
 
     def custom_mode(self, message: Any) -> int:
-        """Custom mode that DO_SET_MODE names."""
+        """Return custom mode that DO_SET_MODE names."""
         return int(message.param2)
 
     def is_release(self, message: Any) -> bool:
-        """Whether a command opens the mechanism."""
+        """Return whether a command opens the mechanism."""
         return message.command == mav.MAV_CMD_DO_GRIPPER and message.param2 == mav.GRIPPER_ACTION_RELEASE
 
     @abstractmethod
@@ -139,11 +139,11 @@ class FakeMavlink(Fake):
             self.acknowledge(message.command, mav.MAV_RESULT_ACCEPTED)
 
     def field(self, name: str) -> tuple[float, int]:
-        """Field and type of a PARAM_VALUE."""
+        """Return field and type of a PARAM_VALUE."""
         return self.parameters[name], mav.MAV_PARAM_TYPE_REAL32
 
     def value(self, field: float, kind: int) -> float:
-        """Value in a PARAM_SET's field."""
+        """Return value in a PARAM_SET's field."""
         return field
 
     def _tell_parameter(self, name: str) -> None:

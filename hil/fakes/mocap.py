@@ -45,7 +45,7 @@ class Mocap:
         self._next = 0.0
 
     def due(self, time: float) -> bool:
-        """Whether a measurement is due at a time [s]."""
+        """Return whether a measurement is due at a time [s]."""
         return time >= self._next - SLACK
 
     def measure(self, time: float, truth: dict[str, Any]) -> list[Pose]:
@@ -68,7 +68,7 @@ Spoil = Callable[[list[Pose], "MocapFault"], list[Pose]]
 
 
 def _each(change: Callable[[Pose], dict[str, Any]]) -> Spoil:
-    """A fault that changes fields of every pose."""
+    """Return a fault that changes fields of every pose."""
     return lambda poses, fault: [replace(p, **change(p)) for p in poses]
 
 
@@ -122,7 +122,7 @@ class MocapFault:
         self.kept: dict[str, float] = {}  # stamps of those let through, by body
 
     def spoil(self, poses: list[Pose], time: float) -> list[Pose]:
-        """What becomes of the poses that were measured at a time [s], as the source writes them."""
+        """Return what becomes of the poses that were measured at a time [s], as the source writes them."""
         if time < self.start:
             self.last.update({p.body: p for p in poses})
             return poses

@@ -12,7 +12,7 @@ class Clock(Protocol):
     """A clock that never goes back."""
 
     def now(self) -> float:
-        """[s]."""
+        """Return the time [s]."""
 
     def sleep_until(self, when: float) -> None:
         """Wait until a time [s]; at once where it has passed."""
@@ -78,7 +78,7 @@ class Ticker:
     _start: float | None = None
 
     def due(self) -> float:
-        """Time of the next tick [s]."""
+        """Return time of the next tick [s]."""
         if self._start is None:
             self._start = self.clock.now()
         return self._start + (self.index + 1) * self.period
@@ -122,7 +122,7 @@ class TimeSync:
 
     @staticmethod
     def stamp(now: float) -> int:
-        """A time [s] as TIMESYNC has it [ns]."""
+        """Return a time [s] as TIMESYNC has it [ns]."""
         return int(now * 1e9)
 
     def take(self, tc1: int, ts1: int, now: float) -> None:

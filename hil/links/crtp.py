@@ -38,43 +38,43 @@ class Packet:
     data: bytes
 
     def pack(self) -> bytes:
-        """As it goes out."""
+        """Return its bytes as they go out."""
         return bytes([(self.port & 0xF) << 4 | self.channel & 3]) + self.data
 
 
 def unpack(data: bytes) -> Packet | None:
-    """The packet of some bytes; None where they are none."""
+    """Return the packet of some bytes; None where they are none."""
     return Packet(data[0] >> 4, data[0] & 3, data[1:]) if 1 <= len(data) <= MOST else None
 
 
 def set_point(thrust: int, rates_dps: tuple[float, float, float]) -> bytes:
-    """Legacy set-point: thrust of 65535, body rates forward, left, up [deg/s]; the firmware's pitch is nose down."""
+    """Return legacy set-point: thrust of 65535, body rates forward, left, up [deg/s]; the firmware's pitch is nose down."""
     roll, pitch, yaw = rates_dps
     return Packet(COMMANDER, 0, SET_POINT.pack(roll, -pitch, yaw, thrust)).pack()
 
 
 def external_pose(pos: tuple[float, ...], quat: tuple[float, ...]) -> bytes:
-    """Position [m], z up, and attitude xyzw for its estimator."""
+    """Return position [m], z up, and attitude xyzw for its estimator."""
     return Packet(LOCALIZATION, GENERIC, POSE.pack(EXTERNAL_POSE, *pos, *quat)).pack()
 
 
 def named(name: str) -> bytes:
-    """A parameter's name ``group.name`` as packets have it."""
+    """Return a parameter's name ``group.name`` as packets have it."""
     return name.replace(".", "\0").encode() + b"\0"
 
 
 def set_parameter(name: str, value: int) -> bytes:
-    """A parameter of eight bits, by its name."""
+    """Return a parameter of eight bits, by its name."""
     return Packet(PARAM, BY_NAME, bytes([SET_BY_NAME]) + named(name) + bytes([UINT8, value])).pack()
 
 
 def arm(on: bool) -> bytes:
-    """Request to arm or disarm."""
+    """Return request to arm or disarm."""
     return Packet(SUPERVISOR, COMMAND, bytes([ARM, on])).pack()
 
 
 def ask_state() -> bytes:
-    """Question for the supervisor's state."""
+    """Return question for the supervisor's state."""
     return Packet(SUPERVISOR, INFO, bytes([STATE])).pack()
 
 
@@ -110,7 +110,7 @@ class CflibPort:
         return self.lost is None
 
     def fileno(self) -> int:
-        """-1: its packets come by a thread; nothing can be waited for."""
+        """Return -1: its packets come by a thread; nothing can be waited for."""
         return -1
 
     def close(self) -> None:

@@ -67,20 +67,20 @@ class Port(Protocol):
     peer: tuple[str, int] | None  # that the device names; None where it names none
 
     def read(self) -> bytes | None:
-        """The next chunk; None where there is none."""
+        """Return the next chunk; None where there is none."""
 
     def write(self, data: bytes, to: tuple[str, int] | None = None) -> bool:
-        """Whether the bytes were taken; on UDP for an address, where the device does not name it."""
+        """Return whether the bytes were taken; on UDP for an address, where the device does not name it."""
 
     def fileno(self) -> int:
-        """For waiting until there is something to read."""
+        """Return what can be waited for until there is something to read."""
 
     def close(self) -> None:
         """Give the port back."""
 
 
 def chunks(port: Port) -> Iterator[bytes]:
-    """What has arrived at a port, at most `MOST_CHUNKS` chunks of it."""
+    """Yield what has arrived at a port, at most `MOST_CHUNKS` chunks of it."""
     for _ in range(MOST_CHUNKS):
         data = port.read()
         if data is None:

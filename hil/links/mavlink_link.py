@@ -58,7 +58,7 @@ class Link:
         self.received = self.sent = self.dropped = 0
 
     def packer(self, system: int, component: int) -> mav.MAVLink:
-        """What packs messages of ids of their own for this link, signed where it is."""
+        """Return what packs messages of ids of their own for this link, signed where it is."""
         return mav.MAVLink(None, system, component) if self._key is None else Signed(self._key, system, component)
 
     @property
@@ -141,7 +141,7 @@ def wait(links: Sequence[Link], clock: Clock, arrivals: Callable[[], float], unt
 
 
 def quaternion_from_euler(roll: float, pitch: float, yaw: float) -> Quaternion:
-    """Attitude wxyz of MAVLink's angles (yaw, then pitch, then roll) [rad]; NaN where one is not finite."""
+    """Return attitude wxyz of MAVLink's angles (yaw, then pitch, then roll) [rad]; NaN where one is not finite."""
     if not (math.isfinite(roll) and math.isfinite(pitch) and math.isfinite(yaw)):
         return NAN_QUATERNION
     x, y, z, w = quat_of_euler(roll, pitch, yaw)
@@ -149,7 +149,7 @@ def quaternion_from_euler(roll: float, pitch: float, yaw: float) -> Quaternion:
 
 
 def pose_from_message(message: Any, body: str, arrival: float) -> Pose | None:
-    """A body's pose in SI units, still in MAVLink's frames: world north east down or the like, quaternion wxyz.
+    """Return a body's pose in SI units, still in MAVLink's frames: world north east down or the like, quaternion wxyz.
 
     None for what is no ATT_POS_MOCAP, VISION_POSITION_ESTIMATE or ODOMETRY, and for an ODOMETRY in another frame than LOCAL_NED or
     LOCAL_FRD.
@@ -174,11 +174,11 @@ def pose_from_message(message: Any, body: str, arrival: float) -> Pose | None:
 
 
 def _known(vector: Vector) -> Vector | None:
-    """MAVLink writes NaN for a quantity that is not known."""
+    """Return a vector; None for NaN, which MAVLink writes for a quantity that is not known."""
     return None if any(math.isnan(x) for x in vector) else vector
 
 
 def attitude_target(time_s: float, target: tuple[int, int], thrust: float, rate_frd: Vector) -> Any:
-    """SET_ATTITUDE_TARGET at a time [s], to system and component: collective thrust, 0 to 1, body rates forward, right, down [rad/s]."""
+    """Return SET_ATTITUDE_TARGET at a time [s]: collective thrust, 0 to 1, body rates forward, right, down [rad/s]."""
     stamp = int(time_s * 1e3) & 0xFFFFFFFF
     return mav.MAVLink_set_attitude_target_message(stamp, *target, IGNORE_ATTITUDE, [1.0, 0.0, 0.0, 0.0], *rate_frd, thrust)

@@ -28,19 +28,19 @@ class Frame:
     direction: bytes = TO_CONTROLLER
 
     def number(self, code: str, at: int) -> int | None:
-        """Number at a place, coded as of `struct`; None beyond the end."""
+        """Return number at a place, coded as of `struct`; None beyond the end."""
         try:
             return struct.unpack_from(code, self.payload, at)[0]
         except struct.error:
             return None
 
     def words(self) -> tuple[int, ...]:
-        """The payload as numbers of two bytes; an odd last byte is left out."""
+        """Return the payload as numbers of two bytes; an odd last byte is left out."""
         return struct.unpack_from(f"<{len(self.payload) // 2}H", self.payload)
 
 
 def pack(frame: Frame) -> bytes:
-    """Bytes of a frame; raises `ValueError` where command or payload are too large."""
+    """Return bytes of a frame; raises `ValueError` where command or payload are too large."""
     count = len(frame.payload)
     if not (0 <= frame.command <= 255 and count <= MOST_PAYLOAD):
         raise ValueError(f"MSP 1: command {frame.command} with {count} bytes; expected at most 255, and {MOST_PAYLOAD} bytes")
@@ -49,7 +49,7 @@ def pack(frame: Frame) -> bytes:
 
 
 def xor(data: bytes) -> int:
-    """Checksum of bytes."""
+    """Return checksum of bytes."""
     return reduce(operator.xor, data, 0)
 
 
@@ -61,7 +61,7 @@ class Parser:
         self._buffer = bytearray()
 
     def parse(self, data: bytes) -> list[Frame]:
-        """Frames that are complete by now."""
+        """Return frames that are complete by now."""
         buffer, frames = self._buffer, []
         buffer += data
         while (start := buffer.find(b"$")) >= 0:

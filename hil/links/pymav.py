@@ -30,7 +30,7 @@ class Parser:
         self._mav.robust_parsing = True
 
     def parse(self, data: bytes, whole: bool = True) -> list:
-        """Messages in a byte string: a whole datagram, of which nothing is kept for the next one, or a piece of a stream."""
+        """Return messages in a byte string: a whole datagram, of which nothing is kept for the next one, or a piece of a stream."""
         self.forged = []
         try:
             found = self._mav.parse_buffer(data) or []

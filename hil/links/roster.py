@@ -40,7 +40,7 @@ class Party:
     autopilot: int | None = None  # MAV_AUTOPILOT that its HEARTBEAT must name
 
     def has(self, system: int, component: int) -> bool:
-        """Whether ids are those of the party."""
+        """Return whether ids are those of the party."""
         return self.system == system and self.component in (0, component)
 
 
@@ -55,7 +55,7 @@ class Seen:
     why: str = ""  # it was refused; empty where it was taken
 
     def text(self) -> str:
-        """In words."""
+        """Return it in words."""
         ids = "" if self.system is None else f" of system {self.system}, component {self.component}"
         return f"{self.kind}{ids} from {shown(self.address)}" + (f": {self.why}" if self.why else "")
 
@@ -64,14 +64,14 @@ OTHERS = Seen(None, None, None, "others")
 
 
 def shown(address: Address) -> str:
-    """An address in words."""
+    """Return an address in words."""
     if address is None:
         return "the link's peer"
     return f"[{address[0]}]:{address[1]}" if ":" in address[0] else f"{address[0]}:{address[1]}"
 
 
 def autopilot_name(number: int) -> str:
-    """Name of a MAV_AUTOPILOT."""
+    """Return name of a MAV_AUTOPILOT."""
     entry = mav.enums["MAV_AUTOPILOT"].get(number)
     return str(number) if entry is None else entry.name.removeprefix("MAV_AUTOPILOT_")
 
@@ -116,7 +116,7 @@ class Roster:
         self._said: set[tuple] = set()
 
     def shuts_out(self, address: Address) -> bool:
-        """Whether a datagram is not even looked into: not from the device's peer, not on the list, or from nobody's address in flight."""
+        """Return whether a datagram is not even looked into: not from the device's peer, not on the list, from nobody in flight."""
         why = None
         if address is not None and self.only not in (None, address):
             why = f"the link's device is {shown(self.only)}"
@@ -142,7 +142,7 @@ class Roster:
         self.seen[seen] = self.seen.get(seen, 0) + 1
 
     def admit(self, message: Any, address: Address, now: float) -> bool:
-        """Whether a message is one of a party's; binds the party to its sender's address at a time [s]."""
+        """Return whether a message is one of a party's; binds the party to its sender's address at a time [s]."""
         kind, system, component = message.get_type(), message.get_srcSystem(), message.get_srcComponent()
         party = self._party(kind, system, component, address)
         if party is None and any(p.has(system, component) and self.at.get(p.name, ...) == address for p in self.parties):
@@ -172,7 +172,7 @@ class Roster:
         return True
 
     def _party(self, kind: str, system: int, component: int, address: Address) -> Party | None:
-        """Whose message it is by kind and ids; of a shared kind, one of theirs at this address first."""
+        """Return whose message it is by kind and ids; of a shared kind, one of theirs at this address first."""
         ours = [party for party in self.parties if party.has(system, component)]
         if kind in SHARED:
             here = [party for party in ours if party.name in self.at and self.at[party.name] == address]
@@ -180,7 +180,7 @@ class Roster:
         return next((p for p in ours if kind in p.kinds), next((p for p in ours if not p.kinds), None))
 
     def _objection(self, party: Party | None, message: Any, kind: str, address: Address, now: float) -> str | None:
-        """Why a message is not taken, or None."""
+        """Return why a message is not taken, or None."""
         if party is None:
             return f"nobody of this run, which expects {self.expected()}"
         if party.autopilot is not None and kind == "HEARTBEAT" and message.autopilot != party.autopilot:
@@ -196,7 +196,7 @@ class Roster:
         return None if not first or kind in first.split(", ") else f"{NOT_YET} {first}"
 
     def expected(self) -> str:
-        """The parties in words."""
+        """Return the parties in words."""
         texts = []
         for p in self.parties:
             what = "/".join(sorted(p.kinds)) if p.kinds else "all"
@@ -205,13 +205,13 @@ class Roster:
         return ", ".join(texts) or "anybody"
 
     def addresses(self, message: Any) -> tuple[Address, ...]:
-        """Where a message of ours goes: what names a target to the autopilot, the rest to all."""
+        """Return where a message of ours goes: what names a target to the autopilot, the rest to all."""
         if hasattr(message, "target_system") and "autopilot" in self.at:
             return (self.at["autopilot"],)
         return tuple(dict.fromkeys(self.at.values()))
 
     def summary(self) -> dict[str, Any]:
-        """Who was heard from where, and what was refused, most first."""
+        """Return who was heard from where, and what was refused, most first."""
         refused = sorted(((n, seen) for seen, n in self.seen.items() if seen.why or seen is OTHERS), key=lambda row: -row[0])
         return {
             "at": {name: shown(address) for name, address in self.at.items()}, "simulated": self.simulated,

@@ -48,7 +48,7 @@ def read_key(path: str | Path) -> bytes:
 
 
 def stamp_now() -> int:
-    """The time as signatures have it [10 us]."""
+    """Return the time as signatures have it [10 us]."""
     return int((time.time() - EPOCH) * 1e5)
 
 
@@ -67,7 +67,7 @@ class Signed(mav.MAVLink):
         self.signing.timestamp = max(self.signing.timestamp, stamp_now())
 
     def check_signature(self, msgbuf: bytearray, srcSystem: int, srcComponent: int) -> bool:
-        """Whether a signature is valid, and newer than the last valid one of its stream.
+        """Return whether a signature is valid, and newer than the last valid one of its stream.
 
         The library's own notes the time of a message before it has looked at the signature: one forged message with a late time
         would shut the true sender out.

@@ -22,8 +22,7 @@ MOST_BYTES = 65535  # length of a chunk of MSP in the file; a longer one is cut
 class Writer:
     """A file that is added to; putting never waits and never raises. After a failure nothing is taken any more.
 
-    Attributes:
-        failed: chunks that could not be written. why: the first one could not, or None.
+    ``failed`` counts chunks that could not be written; ``why`` the first one could not, or None.
     """
 
     def __init__(self, path: str | Path) -> None:

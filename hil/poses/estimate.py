@@ -29,7 +29,7 @@ class EstimateParams(Bounded):
 
 
 def fit_weights(ages: list[float], order: int) -> tuple[list[float], list[float]]:
-    """Weights c_i of samples of given ages [s], newest first, in the slope at age 0 [1/s], and in the second derivative [1/s^2].
+    """Return weights c_i of samples of given ages [s], newest first, in the slope at age 0 [1/s], and in the second derivative [1/s^2].
 
     With too few samples for the order the order is lowered; with one sample the slope is 0. The second one of a line is 0.
     """
@@ -57,12 +57,9 @@ def fit_weights(ages: list[float], order: int) -> tuple[list[float], list[float]
 
 
 class SlopeFilter:
-    """Velocity and body rate of one body.
+    """Velocity, acceleration and body rate of one body; ``acceleration`` is of the last estimate [m/s^2], world frame, 0 for a line.
 
     The rate is worked out when it is asked for: many poses may come between two ticks, and a bare ball's is never asked for.
-
-    Attributes:
-        acceleration: of the last estimate [m/s^2], world frame; 0 for a line.
     """
 
     def __init__(self, params: EstimateParams) -> None:
@@ -80,7 +77,7 @@ class SlopeFilter:
         self._window.clear()
 
     def update(self, pose: Pose) -> Vector:
-        """Velocity, world frame [m/s], at a new pose in our frames, its stamp above the last one's; the source's own where it gives one."""
+        """Return the velocity, world frame [m/s], at a pose in our frames newer than the last; the source's own where it gives one."""
         window, params, stamp = self._window, self.params, pose.stamp
         if window and not 0.0 < stamp - window[0].stamp <= MOST_GAP:
             window.clear()
@@ -132,7 +129,7 @@ def _sum(weights: list[float], vectors: list[Vector]) -> Vector:
 
 
 def _turn(now: Quaternion, then: Quaternion | None) -> Vector:
-    """Rotation vector from the attitude now to an earlier one, in the body frame of now [rad]."""
+    """Return rotation vector from the attitude now to an earlier one, in the body frame of now [rad]."""
     if then is None:
         return (0.0, 0.0, 0.0)
     return rotation_vector(multiply(conjugate(now), then))

@@ -62,21 +62,21 @@ class Frames:
         self._offset = tuple(float(x) for x in params.marker_offset_b)
 
     def world_from_source(self, vector: Vector) -> Vector:
-        """A vector of the source's world in ours."""
+        """Return a vector of the source's world in ours."""
         return rotate_one(self._world, vector)
 
     def source_from_world(self, vector: Vector) -> Vector:
-        """A vector of our world in the source's."""
+        """Return a vector of our world in the source's."""
         return rotate_one(conjugate(self._world), vector)
 
     def quat_from_source(self, quat: Quaternion) -> Quaternion:
-        """An attitude as the source writes it, as ours (xyzw, body to world)."""
+        """Return an attitude as the source writes it, as ours (xyzw, body to world)."""
         if self.params.quaternion == "wxyz":
             quat = (*quat[1:], quat[0])
         return multiply(multiply(self._world, quat), conjugate(self._body))
 
     def pose_from_source(self, pose: Pose) -> Pose:
-        """A source's pose in our frames, moved from the tracked point to the centre of mass."""
+        """Return a source's pose in our frames, moved from the tracked point to the centre of mass."""
         pos = self.world_from_source(pose.pos)
         quat = None if pose.quat is None else self.quat_from_source(pose.quat)
         vel = None if pose.vel is None else self.world_from_source(pose.vel)
@@ -88,7 +88,7 @@ class Frames:
         return replace(pose, pos=pos, quat=quat, vel=vel, rate=rate)
 
     def source_from_pose(self, pose: Pose) -> Pose:
-        """The inverse of :meth:`pose_from_source`: what the source would have said."""
+        """Return the inverse of :meth:`pose_from_source`: what the source would have said."""
         pos, vel = pose.pos, pose.vel
         if pose.quat is not None and any(self._offset):
             pos = _plus(pos, rotate_one(pose.quat, self._offset))
@@ -103,7 +103,7 @@ class Frames:
 
 
 def _quaternion(matrix: np.ndarray) -> Quaternion:
-    """Quaternion xyzw of one of the 24 turns: its numbers, 0, 1/2, sqrt(1/2) or 1, exactly, so that "x,y,z" changes no bit."""
+    """Return quaternion xyzw of one of the 24 turns: its numbers, 0, 1/2, sqrt(1/2) or 1, exactly, so that "x,y,z" changes no bit."""
     exact = np.array([0.0, 0.5, math.sqrt(0.5), 1.0])
     x, y, z, w = (math.copysign(float(exact[np.argmin(np.abs(exact - abs(v)))]), v) for v in Rotation.from_matrix(matrix).as_quat())
     sign = math.copysign(1.0, next(v for v in (w, x, y, z) if v))

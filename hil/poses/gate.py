@@ -51,11 +51,9 @@ class GateParams(Bounded):
 
 
 class Gate:
-    """Decides about the poses of one body.
+    """Decides about the poses of one body; ``last`` is the accepted one, ``refused`` counts by reason.
 
-    Attributes:
-        last: accepted pose. refused: number of refused poses by reason.
-        jumped: the source's reset counter has changed since the last :meth:`restart`.
+    ``jumped``: the source's reset counter has changed since the last :meth:`restart`.
     """
 
     def __init__(self, params: GateParams) -> None:
@@ -90,7 +88,7 @@ class Gate:
         return None
 
     def stepped(self, pose: Pose) -> bool:
-        """Whether the source's clock was set between the last accepted pose and this one."""
+        """Return whether the source's clock was set between the last accepted pose and this one."""
         last = self.last
         return last is not None and abs((pose.stamp - last.stamp) - (pose.arrival - last.arrival)) > self.params.clock_step
 
@@ -113,7 +111,7 @@ class Gate:
         return self._motion(pose, last, velocity, tether, age, gap)
 
     def _itself(self, pose: Pose) -> str | None:
-        """What is wrong with a pose, whatever came before."""
+        """Return what is wrong with a pose, whatever came before."""
         p = self.params
         numbers = (pose.stamp, pose.arrival, *pose.pos, *(pose.quat or ()), *(pose.vel or ()), *(pose.rate or ()))
         if not all(map(math.isfinite, numbers)):
@@ -125,7 +123,7 @@ class Gate:
         return None
 
     def _motion(self, pose: Pose, last: Pose, velocity: Vector | None, tether: Tether | None, age: float, gap: float) -> str | None:
-        """What is wrong with the way from the last accepted pose of an age [s], after a gap in which nothing came at all [s]."""
+        """Return what is wrong with the way from the last accepted pose of an age [s], after a gap in which nothing came at all [s]."""
         p = self.params
         expected = tuple(x + age * v for x, v in zip(last.pos, velocity or (0.0, 0.0, 0.0)))
         off = math.dist(pose.pos, expected)
@@ -146,11 +144,11 @@ class Gate:
         return None
 
     def age(self, now: float) -> float:
-        """Time since the content last changed [s]; infinite before the first pose."""
+        """Return time since the content last changed [s]; infinite before the first pose."""
         return now - self._changed
 
     def level(self, now: float) -> int:
-        """:data:`OK`, :data:`WARN`, :data:`HOLD` or :data:`ABORT` by the content's age; ABORT where content is rare."""
+        """Return :data:`OK`, :data:`WARN`, :data:`HOLD` or :data:`ABORT` by the content's age; ABORT where content is rare."""
         if self._gaps >= RARE:
             return ABORT
         age = self.age(now)

@@ -15,7 +15,7 @@ _KINDS = {"pos": ("m", "world"), "quat": ("1", "world"), "vel": ("m/s", "world")
 
 
 def unit_problems(poses: Iterable[Pose], frames: dict[str, FrameParams]) -> list[str]:
-    """What in a recording's raw poses no vehicle does, by the frames of each body; each says which unit would make sense of it."""
+    """Return what in a recording's raw poses no vehicle does, by the frames of each body; each says which unit would make sense of it."""
     poses, channels = list(poses), {}
     for body, params in frames.items():
         channels |= _channels([pose for pose in poses if pose.body == body], Frames(params), CHANNELS[body])
@@ -23,7 +23,7 @@ def unit_problems(poses: Iterable[Pose], frames: dict[str, FrameParams]) -> list
 
 
 def _channels(poses: list[Pose], frames: Frames, names: tuple[str, ...]) -> dict[str, Channel]:
-    """Poses of one body as channels in our frames; what some of them lack is left out."""
+    """Return poses of one body as channels in our frames; what some of them lack is left out."""
     ours = [frames.pose_from_source(p) for p in poses if np.all(np.isfinite((p.stamp, p.arrival, *p.pos)))]
     # A clock may be set in between: stamps that do not ascend are left to the gate.
     ours = [p for p, before in zip(ours, [None, *ours]) if before is None or p.stamp > before.stamp]

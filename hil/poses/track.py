@@ -32,12 +32,7 @@ class BodyState:
 
 
 class Track:
-    """Follows one body.
-
-    Attributes:
-        gate: with the counts of what was refused. filter: with its lag.
-        accepted: number of poses taken.
-    """
+    """Follows one body with a ``gate``, which counts what was refused, and a ``filter``; ``accepted`` counts poses taken."""
 
     def __init__(self, frames: FrameParams, gate: GateParams, estimate: EstimateParams, turns: bool = True) -> None:
         """Start without a pose; ``turns``: whether the body rate is wanted, which a bare ball does without."""
@@ -77,7 +72,7 @@ class Track:
             _ = self.filter.rate
 
     def expected(self, time: float) -> Vector | None:
-        """Where the last pose and velocity put the body at a time of arrival [s]; None before the first pose."""
+        """Return where the last pose and velocity put the body at a time of arrival [s]; None before the first pose."""
         pose = self._pose
         if pose is None:
             return None
@@ -85,7 +80,7 @@ class Track:
         return tuple(x + age * v for x, v in zip(pose.pos, self._vel))
 
     def sample(self) -> tuple[Pose, Vector, Vector]:
-        """Last pose taken, its stamp freed of steps of the source's clock, with the estimates of velocity and body rate.
+        """Return last pose taken, its stamp freed of steps of the source's clock, with the estimates of velocity and body rate.
 
         Raises:
             ValueError: there is none yet.
@@ -95,7 +90,7 @@ class Track:
         return replace(self._pose, stamp=self._pose.stamp + self._shift), self._vel, self.filter.rate
 
     def calm_speed(self) -> float:
-        """Speed by a line through the last poses [m/s]: late, but free of noise; infinite with too few of them."""
+        """Return speed by a line through the last poses [m/s]: late, but free of noise; infinite with too few of them."""
         if len(self._slow) < CALM_SAMPLES:
             return math.inf
         newest = self._slow[0][0]
@@ -103,7 +98,7 @@ class Track:
         return math.hypot(*(sum(c * pos[i] for c, (_, pos) in zip(weights, self._slow)) for i in range(3)))
 
     def state(self, now: float, ahead: float = 0.0) -> BodyState | None:
-        """State at a time [s] by the last accepted pose, carried ahead [s] with part of what is known of its accelerations."""
+        """Return state at a time [s] by the last accepted pose, carried ahead [s] with part of what is known of its accelerations."""
         pose = self._pose
         if pose is None:
             return None

@@ -63,7 +63,7 @@ def opened(path: str | Path) -> Iterator[Path]:
 
 
 def sentence(turn: dict[str, Any] | None, last: dict[str, Any] | None, cut: str | None) -> str:
-    """Where a run went wrong.
+    """Return where a run went wrong.
 
     Args:
         turn: the first tick in abort: ``time`` [s], ``state`` before it, ``since`` when that lasted [s], ``reason``, and ``vehicle``

@@ -45,7 +45,7 @@ class Tick:
 
 
 @dataclass
-class Course:
+class PlayedRun:
     """A whole run, played back."""
 
     folder: Path
@@ -75,7 +75,7 @@ class Course:
 
 
 def measured(sample: Sample, params: HilParams) -> float:
-    """When a pose was measured by its arrival alone [s]."""
+    """Return when a pose was measured by its arrival alone [s]."""
     return sample.pose.arrival - sample.pose.transit(params.delay.source)
 
 
@@ -87,7 +87,7 @@ def tick_of(playback: Playback, line: dict[str, Any], poses: list) -> Tick:
     return Tick(line, decision, samples, ages, not runner.latch.separated(line["time"]), runner.seen_goal_w)
 
 
-def read(folder: str | Path) -> Course:
+def read(folder: str | Path) -> PlayedRun:
     """Play a run back; raises `RunError` for what is no folder of a run, or a damaged one."""
     folder = Path(folder)
     params, policy, lines, poses = load_run(folder)
@@ -97,11 +97,11 @@ def read(folder: str | Path) -> Course:
     provenance = _known(folder / PROVENANCE)
     provenance["simulated"] = any(link.get("simulated") for link in _known(folder / SUMMARY).get("links", []))
     ticks = [tick_of(playback, line, poses.get(line["n"], [])) for line in lines]
-    return Course(folder, params, playback, ticks, provenance)
+    return PlayedRun(folder, params, playback, ticks, provenance)
 
 
 def _known(path: Path) -> dict[str, Any]:
-    """What a file of a run says; nothing where the run was killed before it was written whole."""
+    """Return what a file of a run says; nothing where the run was killed before it was written whole."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -120,7 +120,7 @@ class Samples:
         self._vehicle: Pose | None = None  # the last one: where the rope hangs
 
     def flush(self) -> FlightLog:
-        """The log of what was added since the last call."""
+        """Return the log of what was added since the last call."""
         log, self.recorder = self.recorder.log(), FlightRecorder(self.recorder.meta)
         self._declare()
         return log
@@ -131,7 +131,7 @@ class Samples:
         self.recorder.declare("state", "1")
 
     def _later(self, name: str, time: float) -> float:
-        """The time, or a moment after the channel's last sample."""
+        """Return the time, or a moment after the channel's last sample."""
         time = max(time, self._last.get(name, -np.inf) + LEAST_STEP)
         self._last[name] = time
         return time
@@ -176,7 +176,7 @@ class Samples:
 
 
 def meta_of(params: HilParams, playback: Playback, provenance: dict[str, Any], start: float) -> dict[str, Any]:
-    """What is known of a run from its beginning on; ``start`` [s] is the zero of its pictures."""
+    """Return what is known of a run from its beginning on; ``start`` [s] is the zero of its pictures."""
     policy = playback.runner.pilot.policy
     goal_w = playback.runner.seen_goal_w or params.goal_w
     simulated = ", of a simulated vehicle" if provenance.get("simulated") else ""
@@ -190,7 +190,7 @@ def meta_of(params: HilParams, playback: Playback, provenance: dict[str, Any], s
 
 
 def events(ticks: list[Tick]) -> list[list]:
-    """Time, state and reason of each change."""
+    """Return time, state and reason of each change."""
     found: list[list] = []
     for tick in ticks:
         now = [tick.line["time"], tick.decision.state, tick.decision.reason]
@@ -199,11 +199,11 @@ def events(ticks: list[Tick]) -> list[list]:
     return found
 
 
-def log_of(course: Course, first: int, last: int, throw: int | None = None) -> FlightLog:
-    """Log of the ticks from ``first`` to ``last``, both included; of one throw where its number is given."""
-    ticks, runner = course.ticks[first : last + 1], course.playback.runner
-    start = course.ticks[course.throws[throw][0]].line["time"] if throw is not None else ticks[0].line["time"]
-    samples = Samples(course.params, course.playback, meta_of(course.params, course.playback, course.provenance, start))
+def log_of(played: PlayedRun, first: int, last: int, throw: int | None = None) -> FlightLog:
+    """Return log of the ticks from ``first`` to ``last``, both included; of one throw where its number is given."""
+    ticks, runner = played.ticks[first : last + 1], played.playback.runner
+    start = played.ticks[played.throws[throw][0]].line["time"] if throw is not None else ticks[0].line["time"]
+    samples = Samples(played.params, played.playback, meta_of(played.params, played.playback, played.provenance, start))
     landings = [] if throw is None else [landing for landing in runner.latch.landings if abs(landing.start - start) < 1e-9]
     landing = next(iter(landings), None)
     latch = next((t.line["time"] for t in ticks if t.decision.release and t.line["time"] >= start), None)
@@ -212,14 +212,14 @@ def log_of(course: Course, first: int, last: int, throw: int | None = None) -> F
         samples.add(replace(tick, attached=tick.line["time"] < apart))
     meta = samples.recorder.meta
     meta["events"] = events(ticks)
-    meta["goal_w"] = list(next((t.goal_w for t in ticks if t.line["time"] >= start and t.goal_w), course.params.goal_w))
+    meta["goal_w"] = list(next((t.goal_w for t in ticks if t.line["time"] >= start and t.goal_w), played.params.goal_w))
     if throw is not None:
         _judge(samples.recorder, landing, latch, ticks, start)
     return samples.recorder.log()
 
 
 def _judge(recorder: FlightRecorder, landing: Landing | None, latch: float | None, ticks: list[Tick], start: float) -> None:
-    """How a throw ended."""
+    """Note how a throw ended."""
     after = [tick for tick in ticks if tick.line["time"] >= start]
     ended = next((tick for tick in after if tick.decision.state != State.THROW), after[-1])
     times: dict[str, Any] = {"policy_start": start, "latch": latch, "recovery": ended.line["time"]}
@@ -240,19 +240,19 @@ def _judge(recorder: FlightRecorder, landing: Landing | None, latch: float | Non
     recorder.meta |= {"times": times, "result": result}
 
 
-def throws(course: Course) -> list[FlightLog]:
-    """A log a throw."""
+def throws(played: PlayedRun) -> list[FlightLog]:
+    """Return a log a throw."""
     logs, before = [], 0
-    for number, (first, last) in enumerate(course.throws):
-        period = course.playback.runner.pilot.period
+    for number, (first, last) in enumerate(played.throws):
+        period = played.playback.runner.pilot.period
         begin = max(before, first - round(LEAD / period))
-        until = course.throws[number + 1][0] - 1 if number + 1 < len(course.throws) else len(course.ticks) - 1
+        until = played.throws[number + 1][0] - 1 if number + 1 < len(played.throws) else len(played.ticks) - 1
         until = min(until, last + round(AFTER / period))
-        logs.append(log_of(course, begin, until, number))
+        logs.append(log_of(played, begin, until, number))
         before = until + 1
     return logs
 
 
-def whole(course: Course) -> FlightLog:
-    """One log of the whole run."""
-    return log_of(course, 0, len(course.ticks) - 1)
+def whole(played: PlayedRun) -> FlightLog:
+    """Return one log of the whole run."""
+    return log_of(played, 0, len(played.ticks) - 1)

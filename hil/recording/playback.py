@@ -13,8 +13,8 @@ from hil.control.decision import Decision, OperatorInput
 from hil.control.runner import Runner
 from hil.control.states import State
 from hil.params import HilParams
+from hil.poses.detection import Detection
 from hil.poses.pose import VEHICLE, Pose, Vector
-from hil.poses.sight import Sight
 from hil.poses.track import Track
 from hil.recording.bundle import sentence
 from hil.recording.record import SUMMARY, load_run
@@ -49,7 +49,7 @@ class Playback:
         """Run one recorded tick; returns what was decided, and the poses that were taken in it."""
         self._samples = []
         if line.get("seen") is not None:
-            self.runner.look([Sight.of(line["seen"])])
+            self.runner.look([Detection.of(line["seen"])])
         if (found := line.get("calibration")) is not None:
             self.runner.calibrated(found if isinstance(found, str) else Calibration.of(found))
         decision = self.runner.tick(line["time"], poses, Status(*line["status"]), OperatorInput(*line["words"]), line["recording"])
@@ -93,7 +93,7 @@ def replay(folder: str | Path) -> dict[str, Any]:
 
 
 def _cut(folder: str | Path, ticks: int) -> str | None:
-    """What is missing of a recording, in words."""
+    """Return what is missing of a recording, in words."""
     try:
         flown = json.loads((Path(folder) / SUMMARY).read_text(encoding="utf-8"))["ticks"]
     except OSError:

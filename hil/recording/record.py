@@ -77,7 +77,7 @@ class Recorder:
 
 
 def lines(path: Path) -> Iterator[Any]:
-    """Values of a file of lines; a last line that was cut short is left out.
+    """Yield values of a file of lines; a last line that was cut short is left out.
 
     Raises:
         RunError: no such file, or a line before the last one is damaged.
@@ -97,14 +97,14 @@ def lines(path: Path) -> Iterator[Any]:
 
 
 def pose_of(row: list) -> tuple[int, Pose]:
-    """Number of the tick and the raw pose of a line of :data:`POSES`."""
+    """Return number of the tick and the raw pose of a line of :data:`POSES`."""
     index, stamp, arrival, body, *vectors, reset, measured = row
     pos, quat, vel, rate = (None if v is None else tuple(v) for v in vectors)
     return index, Pose(stamp, arrival, body, pos, quat, vel, rate, reset, measured)
 
 
 def read_poses(folder: Path) -> dict[int, list[Pose]]:
-    """Raw poses of a run by tick; raises `RunError` where the file is missing or damaged."""
+    """Return raw poses of a run by tick; raises `RunError` where the file is missing or damaged."""
     found: dict[int, list[Pose]] = {}
     try:
         for row in lines(folder / POSES):
@@ -122,7 +122,7 @@ def require_run(folder: Path) -> None:
 
 
 def _replayable(path: Path) -> str:
-    """Config of a run without what only reads the recording's source: its poses are here, and its form has changed before."""
+    """Return config of a run without what only reads the recording's source: its poses are here, and its form has changed before."""
     try:
         tree = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
@@ -133,7 +133,7 @@ def _replayable(path: Path) -> str:
 
 
 def load_run(folder: str | Path) -> tuple[HilParams, Policy, list[dict[str, Any]], dict[int, list[Pose]]]:
-    """Config, policy, ticks and raw poses of a run; a config or policy that cannot be read raises as where it was given.
+    """Return config, policy, ticks and raw poses of a run; a config or policy that cannot be read raises as where it was given.
 
     Raises:
         RunError: no folder of a run, or a damaged one.

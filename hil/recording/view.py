@@ -68,7 +68,7 @@ class Show:
 
 
 def sizes(pilot: Any) -> SimpleNamespace:
-    """What `visthrow.view.rerun_view` draws by, from the policy's contract."""
+    """Return what `visthrow.view.rerun_view` draws by, from the policy's contract."""
     contract = pilot.policy.contract
     rotors = SimpleNamespace(**contract["vehicle"]["rotors"])
     rope = SimpleNamespace(payload_radius=contract["rope"]["payload_radius"])
@@ -83,7 +83,7 @@ class Tail:
         self._path, self._file, self._rest = path, None, ""
 
     def lines(self) -> Iterator[Any]:
-        """Values of the lines that were completed since the last call."""
+        """Yield values of the lines that were completed since the last call."""
         if self._file is None:
             if not self._path.is_file():
                 return
@@ -114,7 +114,7 @@ class Follower:
         self._poses: dict[int, list[Pose]] = {}
 
     def ticks(self) -> list[Tick]:
-        """Ticks that were written since the last call, with all their poses."""
+        """Return ticks that were written since the last call, with all their poses."""
         for row in self._tails[POSES].lines():
             index, pose = pose_of(row)
             self._poses.setdefault(index, []).append(pose)
@@ -161,26 +161,26 @@ def write(folder: str | Path, path: str | Path) -> None:
     """Write a whole run as a ``.rrd`` file; errors as of :func:`hil.recording.flightlogs.read`, and where the place cannot be written."""
     from visthrow.view import rerun_view
 
-    course = read(folder)
-    layout = rerun_view.blueprint(np.array(course.params.goal_w), {"state"})
+    played = read(folder)
+    layout = rerun_view.blueprint(np.array(played.params.goal_w), {"state"})
     with rerun_view.recording(path, layout) as stream:
-        show = Show(stream, course.params, course.playback, course.provenance, course.ticks[0].line["time"])
-        for first in range(0, len(course.ticks), MOST_SHOWN // 10):
-            show.take(course.ticks[first : first + MOST_SHOWN // 10])
+        show = Show(stream, played.params, played.playback, played.provenance, played.ticks[0].line["time"])
+        for first in range(0, len(played.ticks), MOST_SHOWN // 10):
+            show.take(played.ticks[first : first + MOST_SHOWN // 10])
 
 
 def write_mcap(folder: str | Path, path: str | Path) -> None:
     """Write a whole run as an MCAP file; errors as of :func:`write`, and `LogError` where the package mcap is not installed."""
     from visthrow.view import mcap_view
 
-    course = read(folder)
-    meta = meta_of(course.params, course.playback, course.provenance, course.ticks[0].line["time"])
-    samples = Samples(course.params, course.playback, meta)
-    for tick in course.ticks:
+    played = read(folder)
+    meta = meta_of(played.params, played.playback, played.provenance, played.ticks[0].line["time"])
+    samples = Samples(played.params, played.playback, meta)
+    for tick in played.ticks:
         samples.add(tick)
     log = samples.flush()
-    log.meta["events"] = events(course.ticks)
-    mcap_view.write(path, log, sizes(course.playback.runner.pilot))
+    log.meta["events"] = events(played.ticks)
+    mcap_view.write(path, log, sizes(played.playback.runner.pilot))
 
 
 def start_viewer(folder: Path) -> subprocess.Popen:
@@ -191,7 +191,7 @@ def start_viewer(folder: Path) -> subprocess.Popen:
 
 
 def run(folder: Path, live: bool, out: str | None, web_port: int, data_port: int) -> int:
-    """What ``visthrow hil view`` does: serve the live view, or write files."""
+    """Return what ``visthrow hil view`` does: serve the live view, or write files."""
     from hil.recording.report import finish
 
     if live:

@@ -23,8 +23,8 @@ from camera.fisheye import Fisheye
 from camera.mount import nominal_rot_cb
 from camera.params import CameraParams, FisheyeParams, MountParams
 from hil.errors import SourceError
+from hil.poses.detection import Detection
 from hil.poses.pose import Quaternion, Vector
-from hil.poses.sight import Sight
 from visthrow.common.errors import ConfigError
 from visthrow.config.bounds import Bound, Bounded
 from visthrow.onboard.observations import rotation_from_quat
@@ -66,20 +66,20 @@ class Hint:
 
 
 class Eyes(Protocol):
-    """A source of sights."""
+    """A source of detections."""
 
     def tell(self, hint: Hint | None) -> None:
         """Say what is known now."""
 
-    def poll(self, now: float) -> list[Sight]:
-        """Sights that have come by a time [s]; never waits."""
+    def poll(self, now: float) -> list[Detection]:
+        """Return detections that have come by a time [s]; never waits."""
 
     def close(self) -> None:
         """Give the camera back."""
 
 
 class Looker:
-    """Makes sights of pictures."""
+    """Makes detections of pictures."""
 
     def __init__(self, params: ImageParams, training: CameraParams) -> None:
         """Take lens and mount of the pictures; raises `ConfigError` for a lens that is not where that of training is."""
@@ -98,7 +98,7 @@ class Looker:
         self._turn = nominal_rot_cb(training.mount).numpy() @ self._rot_cb.T
         self._ball = Following(params.hold)
 
-    def look(self, picture: np.ndarray, stamp: float, hint: Hint | None) -> Sight:
+    def look(self, picture: np.ndarray, stamp: float, hint: Hint | None) -> Detection:
         """Look at a picture, BGR, uint8, exposed at a time [s]; raises `SourceError` for one of another size."""
         known, rot_wc = Known(), None
         if hint is not None:
@@ -111,7 +111,7 @@ class Looker:
             raise SourceError(f"{error}: the pictures' size is not that of images.fisheye") from error
         corners = None if seen.goal is None else tuple(map(tuple, (seen.goal.rays_c @ self._turn.T).tolist()))
         ball = None if seen.ball is None else (*(self._turn @ seen.ball.ray_c).tolist(), seen.ball.half_angle)
-        return Sight(stamp, corners, ball)
+        return Detection(stamp, corners, ball)
 
 
 class RecordedImages:
@@ -127,8 +127,8 @@ class RecordedImages:
     def tell(self, hint: Hint | None) -> None:
         self._hint = hint
 
-    def poll(self, now: float) -> list[Sight]:
-        """Sights that have come; of several pictures only the newest is looked at. Raises `SourceError` for one that cannot be read."""
+    def poll(self, now: float) -> list[Detection]:
+        """Return detections that have come, of several pictures the newest; raises `SourceError` for one that cannot be read."""
         first = self._next
         while self._next < len(self._times) and self._times[self._next] <= now:
             self._next += 1
@@ -153,7 +153,7 @@ class LiveImages:
         if not self._capture.isOpened():
             raise SourceError(f"camera {params.device} cannot be opened; expected the number of a camera, such as 0")
         self._hint: Hint | None = None
-        self._newest: Sight | None = None
+        self._newest: Detection | None = None
         self.failure: str | None = None
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._watch, name="camera", daemon=True)
@@ -174,9 +174,9 @@ class LiveImages:
     def tell(self, hint: Hint | None) -> None:
         self._hint = hint
 
-    def poll(self, now: float) -> list[Sight]:
-        sight, self._newest = self._newest, None
-        return [] if sight is None else [sight]
+    def poll(self, now: float) -> list[Detection]:
+        detection, self._newest = self._newest, None
+        return [] if detection is None else [detection]
 
     def close(self) -> None:
         self._stop.set()
@@ -190,7 +190,7 @@ def open_images(params: ImageParams, training: CameraParams, clock: Callable[[],
 
 
 def _folder(path: Path) -> tuple[Callable[[int], np.ndarray], list[float]]:
-    """Reader of the pictures of a folder, and their times [s]."""
+    """Return reader of the pictures of a folder, and their times [s]."""
     rows = _stamps(path / STAMPS, ("file", "time_s"))
     missing = [name for name, _ in rows if not (path / name).is_file()]
     if missing:
@@ -208,7 +208,7 @@ def _folder(path: Path) -> tuple[Callable[[int], np.ndarray], list[float]]:
 
 
 def _video(path: Path) -> tuple[Callable[[int], np.ndarray], list[float]]:
-    """Reader of the frames of a video, and their times [s]; by its own rate where no stamps stand beside it."""
+    """Return reader of the frames of a video, and their times [s]; by its own rate where no stamps stand beside it."""
     import cv2
 
     video = cv2.VideoCapture(str(path))
@@ -238,7 +238,7 @@ def _video(path: Path) -> tuple[Callable[[int], np.ndarray], list[float]]:
 
 
 def _stamps(path: Path, header: tuple[str, str]) -> list[tuple[str, float]]:
-    """Rows of a file of stamps, times ascending; raises `SourceError` where it is missing, empty, or not as it must be."""
+    """Return rows of a file of stamps, times ascending; raises `SourceError` where it is missing, empty, or not as it must be."""
     try:
         rows = list(csv.reader(path.read_text(encoding="utf-8").splitlines()))
         found = [(name.strip(), float(time)) for name, time in rows[1:]]

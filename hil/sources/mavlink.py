@@ -41,7 +41,7 @@ class MavlinkDecoder:
         self._attitudes: dict[tuple[int, int], Any] = {}
 
     def feed(self, message: Any, arrival: float) -> Pose | None:
-        """The pose in a message, if it is one of ours."""
+        """Return the pose in a message, if it is one of ours."""
         kind, sender = message.get_type(), (message.get_srcSystem(), message.get_srcComponent())
         if kind == "ATTITUDE_QUATERNION":
             self._attitudes[sender] = message
@@ -53,7 +53,7 @@ class MavlinkDecoder:
         return None
 
     def _paired(self, message: Any, sender: tuple[int, int], body: str, arrival: float) -> Pose | None:
-        """LOCAL_POSITION_NED with the sender's last attitude."""
+        """Return LOCAL_POSITION_NED with the sender's last attitude."""
         attitude = self._attitudes.get(sender)
         if attitude is None or abs(message.time_boot_ms - attitude.time_boot_ms) > 1e3 * PAIR_AGE:
             return None

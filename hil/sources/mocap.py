@@ -181,7 +181,7 @@ def open_mocap(
 
 
 def body_names(bodies: tuple[RigidBody, ...]) -> dict[str, str]:
-    """Our body by the system's name; raises `SourceError` for none, or one twice."""
+    """Return our body by the system's name; raises `SourceError` for none, or one twice."""
     names = {body.name: body.body for body in bodies}
     if not names or len(names) != len(bodies) or len(set(names.values())) != len(bodies):
         raise SourceError(

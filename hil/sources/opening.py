@@ -24,7 +24,7 @@ from hil.sources.ros2 import Ros2Source
 
 
 def read_poses(params: HilParams) -> list[Pose]:
-    """All raw poses of the recording that a config names; raises `SourceError` where the file cannot be read."""
+    """Return all raw poses of the recording that a config names; raises `SourceError` where the file cannot be read."""
     source = params.source
     if source.kind == "tlog":
         return read_tlog(source.file, source.senders)
@@ -34,7 +34,7 @@ def read_poses(params: HilParams) -> list[Pose]:
 
 
 def parties(params: HilParams, poses: bool, autopilot: bool) -> list[Party]:
-    """Who may speak on a link that carries MAVLink poses, or the autopilot where that speaks MAVLink, or both."""
+    """Return who may speak on a link that carries MAVLink poses, or the autopilot where that speaks MAVLink, or both."""
     found = []
     if poses:
         for ids in params.source.senders:

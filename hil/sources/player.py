@@ -111,7 +111,7 @@ def _as_source() -> Iterator[None]:
 
 
 def read_table(path: str | Path, mapping: TableMap | None) -> list[Pose]:
-    """Poses of a table, or of any file that ``visthrow.logs`` reads; arrivals are the stamps, counted from the first.
+    """Return poses of a table, or of any file that ``visthrow.logs`` reads; arrivals are the stamps, counted from the first.
 
     Raises:
         SourceError: the file cannot be read, lacks a column, or holds no position of any body.
@@ -128,7 +128,7 @@ def read_table(path: str | Path, mapping: TableMap | None) -> list[Pose]:
 
 
 def _of_channels(log: FlightLog, body: str) -> list[Pose]:
-    """Poses of one body; a sample that is not valid is NaN, for the gate to refuse."""
+    """Return poses of one body; a sample that is not valid is NaN, for the gate to refuse."""
     if CHANNELS[body][0] not in log:
         return []
     times, rows = log[CHANNELS[body][0]].time, []
@@ -143,13 +143,13 @@ def _of_channels(log: FlightLog, body: str) -> list[Pose]:
 
 
 def _before(times: np.ndarray, stamps: np.ndarray) -> np.ndarray:
-    """Index of the last time at or before each stamp; -1 where there is none, or an old one."""
+    """Return index of the last time at or before each stamp; -1 where there is none, or an old one."""
     index = np.searchsorted(times, stamps, side="right") - 1
     return np.where((index >= 0) & (stamps - times[np.maximum(index, 0)] <= PAIR_AGE), index, -1)
 
 
 def read_tlog(path: str | Path, bodies: tuple[BodyIds, ...]) -> list[Pose]:
-    """Poses of a .tlog; arrivals are seconds from its first message. Raises `SourceError` where nothing in it is a message."""
+    """Return poses of a .tlog; arrivals are seconds from its first message. Raises `SourceError` where nothing in it is a message."""
     decoder, poses, first = MavlinkDecoder(bodies), [], None
     with _as_source():
         for arrival, message in messages.telemetry(path):
@@ -161,7 +161,7 @@ def read_tlog(path: str | Path, bodies: tuple[BodyIds, ...]) -> list[Pose]:
 
 
 def read_autopilot(path: str | Path, bodies: tuple[LogBody, ...], kind: str) -> list[Pose]:
-    """Poses of all bodies in a log of kind "bin" or "ulg", arrivals counted from the first one.
+    """Return poses of all bodies in a log of kind "bin" or "ulg", arrivals counted from the first one.
 
     Raises:
         SourceError: no body, no such file, a package is missing, or a message carries no pose or is not in the log.
@@ -216,7 +216,7 @@ def _of_messages(log: Messages, body: LogBody, known: dict[str, PoseMessage]) ->
 
 
 def _columns_of(data: Fields, message: PoseMessage, what: str) -> np.ndarray | None:
-    """Columns of what a message tells, shape (T, 3 or 4); None where it tells nothing of it."""
+    """Return columns of what a message tells, shape (T, 3 or 4); None where it tells nothing of it."""
     if what == "quat" and message.angles:
         from scipy.spatial.transform import Rotation
 
@@ -232,7 +232,7 @@ def _columns(data: Fields, choices: tuple[tuple[str, ...], ...]) -> np.ndarray:
 
 
 def _paired(other: Fields, message: PoseMessage, what: str, stamps: np.ndarray) -> np.ndarray:
-    """Another message's last value at or before each stamp, NaN where there is none or an old one."""
+    """Return another message's last value at or before each stamp, NaN where there is none or an old one."""
     index = _before(other["time"], stamps)
     values = _columns_of(other, message, what)[np.maximum(index, 0)]
     values[index < 0] = np.nan
@@ -240,7 +240,7 @@ def _paired(other: Fields, message: PoseMessage, what: str, stamps: np.ndarray) 
 
 
 def _in_world(vel: np.ndarray | None, quat: np.ndarray | None, frame: np.ndarray | None) -> np.ndarray | None:
-    """Velocities in the world, those of the body turned; NaN where the attitude is not known."""
+    """Return velocities in the world, those of the body turned; NaN where the attitude is not known."""
     if vel is None or frame is None:
         return vel
     from scipy.spatial.transform import Rotation
@@ -255,12 +255,12 @@ def _in_world(vel: np.ndarray | None, quat: np.ndarray | None, frame: np.ndarray
 
 
 def _known(values: np.ndarray | None, i: int) -> tuple[float, ...] | None:
-    """A row; None where there is none or it holds NaN, PX4's word for unknown."""
+    """Return a row; None where there is none or it holds NaN, PX4's word for unknown."""
     return None if values is None or np.isnan(values[i]).any() else tuple(values[i].tolist())
 
 
 def _from_globe(data: Fields, origins: Fields | None) -> Fields:
-    """North, east and down [m] from the estimator's origin, else from the first position."""
+    """Return North, east and down [m] from the estimator's origin, else from the first position."""
     at = np.flatnonzero(origins["Type"] == 0.0) if origins is not None and "Type" in origins else []
     lat, lng = (origins[n][at[-1]] if len(at) else data[n][0] for n in ("Lat", "Lng"))
     return {

@@ -31,7 +31,7 @@ NETWORK = '<CycloneDDS><Domain><General><Interfaces><NetworkInterface address="{
 
 
 def message_types() -> dict[str, Any]:
-    """The messages that are read, by name, as Cyclone DDS has them; raises `SourceError` where the package is missing."""
+    """Return the messages that are read, by name, as Cyclone DDS has them; raises `SourceError` where the package is missing."""
     idl = load_extra("cyclonedds.idl", "ros2", "ROS 2 topics", SourceError)
     types = load_extra("cyclonedds.idl.types", "ros2", "ROS 2 topics", SourceError)
 
@@ -60,7 +60,7 @@ def message_types() -> dict[str, Any]:
 
 
 def domain(params: MocapParams) -> Any:
-    """What joins the ROS domain of ``settings.domain``, 0 where it is left out.
+    """Return what joins the ROS domain of ``settings.domain``, 0 where it is left out.
 
     Raises:
         SourceError: the package is missing, the number is none, or the address is not this machine's.
@@ -77,7 +77,7 @@ def domain(params: MocapParams) -> Any:
 
 
 def placed(kind: str, message: Any, frames: str) -> Iterator[tuple[float, tuple[float, ...], tuple[float, ...]]]:
-    """Stamp [s], position [m] and quaternion xyzw of a message; of TF of the transform ``PARENT/CHILD``."""
+    """Yield stamp [s], position [m] and quaternion xyzw of a message; of TF of the transform ``PARENT/CHILD``."""
     parent, _, child = frames.rpartition("/")
     if kind == KINDS[2]:
         wanted = [t for t in message.transforms if (t.header.frame_id.lstrip("/"), t.child_frame_id.lstrip("/")) == (parent, child)]
@@ -90,7 +90,7 @@ def placed(kind: str, message: Any, frames: str) -> Iterator[tuple[float, tuple[
 
 
 def _topic(name: str) -> tuple[str, str, str]:
-    """Type, topic and, of TF, ``PARENT/CHILD`` of a body's name."""
+    """Return type, topic and, of TF, ``PARENT/CHILD`` of a body's name."""
     kind, _, rest = name.partition(":")
     place, _, frames = rest.partition(":")
     if kind not in KINDS or not place.startswith("/") or (kind == KINDS[2]) != ("/" in frames):
