@@ -17,6 +17,7 @@ from sim.effects.effect import RandomEffect
 from visthrow.config.effects import random_effects
 from visthrow.diagnose.likelihood import noise as levels
 from visthrow.diagnose.likelihood import stack
+from visthrow.diagnose.likelihood.correlation import few_of
 from visthrow.diagnose.likelihood.designs import correlated_of, grams_of
 from visthrow.diagnose.likelihood.evidence import Priors, log_evidence
 from visthrow.diagnose.models.interface import Window
@@ -25,9 +26,6 @@ from visthrow.diagnose.select.scatter import COMMAND, LOOK, REACH, Scatter, judg
 
 NAME = "dropped_commands"
 """Of the random effect in the catalogue."""
-
-FIRST = 8
-"""Every which window is asked first: in most flights all commands came, and some windows tell."""
 
 EITHER = 0.5
 """Mean and deviation of m where either is as likely. From half of it as a deviation 0 and 1 are told apart: half way is two from both."""
@@ -103,8 +101,8 @@ def verdict(problem: Problem, point: Point, active: Sequence[int], least: float)
     v, priors, sizes = effect(), problem.priors, problem.sizes(point.theta)
     reach = REACH * v.prior_sd
     sets = active, np.flatnonzero(priors.visible).tolist()  # what is still missing must not be why
-    for every, shares in ((FIRST, reach[::LOOK]), (1, reach)):
-        rows = range(0, len(problem.kept), every)
+    every = range(len(problem.kept))
+    for rows, shares in ((few_of(every), reach[::LOOK]), (every, reach)):
         columns = problem.model.without_commands(sizes, [problem.kept[w] for w in rows])
         told = Told.of(problem, point, [point.windows[w] for w in rows], columns, rows)
         nats = np.minimum(*(told.ahead(shares, priors, named) for named in sets))

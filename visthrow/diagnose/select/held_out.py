@@ -25,8 +25,7 @@ from visthrow.diagnose.likelihood.evidence import (
 from visthrow.diagnose.likelihood.forms import HORIZONS, READABLE, Forms, forms, left_ahead, unit_of
 from visthrow.diagnose.likelihood.marginal import Statistics, gather
 from visthrow.diagnose.select import result
-from visthrow.diagnose.select.excess import UNKNOWN_RATIO
-from visthrow.diagnose.select.point import Point
+from visthrow.diagnose.select.point import UNKNOWN_RATIO, Point
 from visthrow.diagnose.select.result import ChannelGain, Diagnosis, Finding, HeldOut
 from visthrow.diagnose.select.scatter import deviations, freed
 from visthrow.diagnose.select.selector import MOST_NAMES

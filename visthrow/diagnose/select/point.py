@@ -11,7 +11,7 @@ from visthrow.diagnose.likelihood import noise as levels
 from visthrow.diagnose.likelihood import stack
 from visthrow.diagnose.likelihood.correlation import Correlation, correlations, with_correlations
 from visthrow.diagnose.likelihood.designs import grams_of, with_residuals
-from visthrow.diagnose.likelihood.evidence import OWN_FLOOR, Priors, covariance, estimate, log_evidence
+from visthrow.diagnose.likelihood.evidence import INEXACT, OWN_FLOOR, Priors, covariance, estimate, log_evidence
 from visthrow.diagnose.likelihood.grammar import TermEffect, forces
 from visthrow.diagnose.likelihood.marginal import (
     Gram,
@@ -29,11 +29,11 @@ ROUNDS = 3
 """Gauss-Newton steps between two linearisations, linearisations in a row each where the last led, and rounds of lost windows: each
 round has some tenth of what the one before had to do."""
 
-LOST, LOST_SHARE = 3.0, 0.15
-"""Squared residual a sample, in noise and latent forces, from which a window is lost; share of windows beyond which none is."""
+UNKNOWN_RATIO = 3.0
+"""What is so many times the noise, or the quietest phase's gusts, is neither."""
 
-SHAKEN_LOST = 1.3
-"""Of the median window's, from which a shaken one is lost: what its unknown motion does is no effect's doing."""
+LOST_SHARE = 0.15
+"""Share of windows that the simulation may lose; where more are so far off, something is missing."""
 
 SMALL_STEP = 0.5 * OWN_FLOOR
 """In floors: a step that is not worth a simulation, and the distance at which an estimate lies on its bound."""
@@ -201,7 +201,8 @@ def lost(point: Point) -> list[int]:
     shares, log_dets = point.integrals.shares(point.grams, point.noise), point.integrals.log_dets
     misfit = [(own.square - log_det) / max(gram.count.sum(), 1.0) for own, log_det, gram in zip(shares, log_dets, point.grams)]
     shaken = np.array([window.shaken for window in point.windows], dtype=bool)
-    far = np.flatnonzero(np.array(misfit) > np.where(shaken, min(SHAKEN_LOST * np.median(misfit), LOST), LOST))
+    most = min((1.0 + INEXACT) * np.median(misfit), UNKNOWN_RATIO)  # what an unknown motion does is no effect's doing
+    far = np.flatnonzero(np.array(misfit) > np.where(shaken, most, UNKNOWN_RATIO))
     return far.tolist() if len(far) <= LOST_SHARE * len(misfit) else []
 
 

@@ -89,9 +89,8 @@ class Selector(SearchState):
         free, usable = with_all_effects_noise(self.problem, self.point), self._usable()
         screened, under_free = (self._additions(point, usable) for point in (self.point, free))
         worth = self.least - STRONG
-        best = usable[np.argsort(-under_free[usable])][:SHORTLIST].tolist()
-        short = [j for j in best if under_free[j] > max(worth, HOPELESS * under_free.max())]
-        short += [j for j in usable[np.argsort(-screened[usable])][:SHORTLIST].tolist() if screened[j] > worth and j not in short]
+        best = [(gain, usable[np.argsort(-gain[usable])][:SHORTLIST].tolist()) for gain in (under_free, screened)]
+        short = list(dict.fromkeys(j for gain, own in best for j in own if gain[j] > max(worth, HOPELESS * gain.max())))
         if not short:
             return False
         alike = self._alike(short[int(np.argmax(under_free[short]))])

@@ -7,14 +7,13 @@ from typing import Any
 import numpy as np
 
 from visthrow.diagnose.likelihood import grammar
-from visthrow.diagnose.likelihood.evidence import OWN_FLOOR, SPIKE, Priors, certainty, estimate, log_evidence
+from visthrow.diagnose.likelihood.evidence import INEXACT, OWN_FLOOR, SPIKE, Priors, certainty, estimate, log_evidence
 from visthrow.diagnose.likelihood.marginal import Statistics
 from visthrow.diagnose.select import terms
 from visthrow.diagnose.select.excess import acts_on
 from visthrow.diagnose.select.point import ROUNDS, Point, Problem, advantage, curvature, fitted, linearise, moved
 from visthrow.diagnose.select.result import Law, Step
 from visthrow.diagnose.select.scatter import (
-    SHARE,
     Scatter,
     Varies,
     by_flight,
@@ -23,9 +22,6 @@ from visthrow.diagnose.select.scatter import (
     straightened,
     varying,
 )
-
-WHOLE = 0.7
-"""Of another kind of block that flights must ask for: of one that is not there, whose state has more freedom, a part is taken."""
 
 
 @dataclass(frozen=True)
@@ -185,7 +181,7 @@ class SearchState:
         """Tell whether a candidate of a set could be named at all, however many nats it brings."""
         if self.problem.switches[j]:
             share = estimate(point.information, point.score, self.priors, list(active))[j] * self.priors.floor[j]
-            if share < WHOLE:
+            if share < 1.0 - INEXACT:  # of one that is not there, whose state has more freedom, a part is taken
                 self.progress(f"{self.name(j)} is there or not, and these flights ask for a part of it; it is not named")
                 return False
         if not self.sure(point, active, j):
@@ -197,7 +193,7 @@ class SearchState:
         """Tell whether an effect of a set is surely not 0, whatever half a floor of it is."""
         return bool(certainty(point.information, point.theta, self.priors, active)[list(active).index(j)] > 1.0)
 
-    def disagreement_on(self, point: Point, active: Sequence[int], j: int, share: float = SHARE) -> tuple[int | None] | None:
+    def disagreement_on(self, point: Point, active: Sequence[int], j: int, share: float = INEXACT) -> tuple[int | None] | None:
         """Return whether flights disagree on an effect of a set: see :func:`visthrow.diagnose.select.scatter.disagreement`."""
         return disagreement(point.plain, self.priors, point.varies, active, j, self.least, share)
 

@@ -22,22 +22,15 @@ from visthrow.diagnose.likelihood.stack import BATCH, statistics
 from visthrow.diagnose.likelihood.threads import each
 from visthrow.diagnose.likelihood.transfer import all_to_host, side_by_side
 from visthrow.diagnose.models.interface import LATENT_BLOCKS
-from visthrow.diagnose.select.excess import UNKNOWN_RATIO
-from visthrow.diagnose.select.point import Point, Problem, regathered
+from visthrow.diagnose.select.excess import floors_of
+from visthrow.diagnose.select.point import UNKNOWN_RATIO, Point, Problem, regathered
 from visthrow.diagnose.select.result import Law
 
 LAW = 2.0 * STRONG
 """Nats by which a term must be ahead where it takes the place of no name, and which a name costs more where a law acts."""
 
-REACH = 3.0
-"""Prior deviation of a term's root mean square force, in the block's strongest latent force."""
-
 NARROW = 1e-3
 """Floor of a term in its prior deviation: a term is there or it is not; the usual deviation of a name in that of one of any size."""
-
-MATERIAL = 0.5
-"""Root mean square force of a term, in the block's usual latent force, below which it does not matter: that of a gust moves a
-landing by 5 mm within half a second."""
 
 WEIGHED = 6
 """Terms that become effects to be weighed: as many as other sets that are simulated in their place."""
@@ -234,7 +227,7 @@ def shortlist(problem: Problem, point: Point, active: Sequence[int], strongest: 
     price = {depth: float(np.log(sum(d <= depth for d in depths))) for depth in set(depths)}
     found: list[tuple[float, grammar.Term, float]] = []
     for block, of in screens.items():
-        gain, prior = gains(calm, problem.priors, active, of, REACH * strongest[block])
+        gain, prior = gains(calm, problem.priors, active, of, UNKNOWN_RATIO * strongest[block])
         gain -= [price[term.depth] for term in of.terms]
         found += [(float(gain[i]), of.terms[i], float(prior[i])) for i in distinct(gain, of, WEIGHED)]
     there = {e.term for e in problem.effects if isinstance(e, TermEffect)}
@@ -260,7 +253,7 @@ def strongest_forces(point: Point) -> dict[str, float]:
 
 
 def matters(problem: Problem, point: Point, j: int, size: float) -> bool:
-    """Whether a term's force, in the phase where it is strongest, exceeds what does not matter in a block it acts in.
+    """Whether a term's force, in a phase, exceeds what does not move a landing in a block it acts in.
 
     Args:
         problem: with the term.
@@ -275,8 +268,8 @@ def matters(problem: Problem, point: Point, j: int, size: float) -> bool:
         if carries(gram.latent_block, term.block):
             for block, values in grammar.loads(term.block, own, layout.table(own)).items():
                 square.setdefault((LATENT_BLOCKS.index(block), window.phase), []).append(float((values**2).sum((1, 2)).mean()))
-    common = {block: usual(point.noise.latent_sd, block) for block, _ in square}
-    return any(abs(size) * np.sqrt(np.mean(values)) > MATERIAL * common[block] for (block, _), values in square.items())
+    floors = floors_of(problem, point)
+    return any(abs(size) * np.sqrt(np.mean(values)) > floors.get(key, 0.0) for key, values in square.items())
 
 
 def laws(problem: Problem, point: Point, active: Sequence[int], nats: float) -> tuple[Law, ...]:

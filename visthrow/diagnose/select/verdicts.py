@@ -8,6 +8,7 @@ from scipy.stats import chi2
 
 from visthrow.diagnose.likelihood.evidence import (
     CALIBRATION_QUANTILE,
+    INEXACT,
     NORMAL_95,
     OWN_FLOOR,
     Priors,
@@ -28,9 +29,6 @@ from visthrow.diagnose.select.terms import bare
 
 BIT = 0.5
 """An effect whose posterior deviation exceeds this share of its prior's was not seen: flights say less than a bit about it."""
-
-IMPLAUSIBLE_FORCE = 0.3
-"""Latent force, in the thrust that carries the vehicle, that no missing cause explains: the channels do not belong together."""
 
 
 def conclude(search: Selector) -> Diagnosis:
@@ -143,9 +141,9 @@ def _overall(
 ) -> tuple[str, str, list[str], set[int]]:
     """Overall verdict, block of an unknown effect, reasons, and the names that are withdrawn for it."""
     point, every = search.point, set(search.active)
-    strong = too_strong(point, IMPLAUSIBLE_FORCE)
+    strong = too_strong(point, INEXACT)  # what no missing cause explains: the channels do not belong together
     if strong:
-        reason = (f"after everything the catalogue can do, forces above {IMPLAUSIBLE_FORCE:.0%} of the thrust are missing in the "
+        reason = (f"after everything the catalogue can do, forces above {INEXACT:.0%} of the thrust are missing in the "
                   f"phases {', '.join(strong)}: commands and poses, units or axes do not belong together")  # fmt: skip
         return result.INCONSISTENT, "", [reason], every
     if search.refused and not search.active:

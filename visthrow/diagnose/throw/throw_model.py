@@ -113,6 +113,7 @@ class ThrowModel:
         self._fits: dict[tuple[Cut, ...], tuple[States, dict[int, np.ndarray]]] = {}
         self._latest: dict[frozenset[str], States] = {frozenset(): self._fitted(states)[0]}
         self._settled_at: dict[frozenset[tuple[str, float]], States] = {}
+        self._secants: dict[str, list[np.ndarray]] = {}  # of other kinds of blocks, by their name, where they were asked for first
         self._lock = threading.Lock()  # residuals may be asked for side by side
         self._follows: tuple[Linearised, dict[int, list[int]], np.ndarray] | None = None  # the last that was asked for
         self._direct = direct_measurements(logs, flights, self.flights.cuts, self.setting)
@@ -141,7 +142,10 @@ class ThrowModel:
         found: list[Window] = []
         for batch in self._batches():
             found += self._linearised(replay, settings, np.array(steps), states, batch)
-        columns = [self._secant(e, theta, found) for e in self._switched]
+        for e in self._switched:  # they are screened by these, and judged where they are flown
+            if e.name not in self._secants:
+                self._secants[e.name] = self._secant(e, theta, found)
+        columns = [self._secants[e.name] for e in self._switched]
         if columns:
             found = [
                 dataclasses.replace(w, effects=np.hstack((w.effects, np.stack([c[i] for c in columns], axis=1))))
@@ -261,7 +265,7 @@ class ThrowModel:
     def beside(self, cuts: Sequence[Cut]) -> "ThrowModel":
         """The same model of other windows of its flights."""
         other = copy.copy(self)
-        other._settled_at, other._follows = {}, None  # states of other windows
+        other._settled_at, other._follows, other._secants = {}, None, {}  # of other windows
         other.flights = self._cut(self.flights.flights, cuts, self.flights.stride)
         other._retained = np.array([w for w, c in enumerate(cuts) if c.retained])
         return other
