@@ -89,8 +89,9 @@ class Selector(SearchState):
         free, usable = with_all_effects_noise(self.problem, self.point), self._usable()
         screened, under_free = (self._additions(point, usable) for point in (self.point, free))
         worth = self.least - STRONG * ~self.problem.switches  # columns of other kinds of blocks are differences of simulations already
-        best = [(gain, usable[np.argsort(-gain[usable])][:SHORTLIST].tolist()) for gain in (under_free, screened)]
-        short = list(dict.fromkeys(j for gain, own in best for j in own if gain[j] > max(worth[j], HOPELESS * gain.max())))
+        hope = np.maximum(worth, HOPELESS * under_free.max())
+        best = [(gain, least, usable[np.argsort(-gain[usable])][:SHORTLIST]) for gain, least in ((under_free, hope), (screened, worth))]
+        short = list(dict.fromkeys(int(j) for gain, least, own in best for j in own if gain[j] > least[j]))
         if not short:
             return False
         alike = self._alike(short[int(np.argmax(under_free[short]))])
