@@ -113,7 +113,6 @@ class ThrowModel:
         self._fits: dict[tuple[Cut, ...], tuple[States, dict[int, np.ndarray]]] = {}
         self._latest: dict[frozenset[str], States] = {frozenset(): self._fitted(states)[0]}
         self._settled_at: dict[frozenset[tuple[str, float]], States] = {}
-        self._secants: dict[str, list[np.ndarray]] = {}  # of other kinds of blocks, by their name, where they were asked for first
         self._lock = threading.Lock()  # residuals may be asked for side by side
         self._follows: tuple[Linearised, dict[int, list[int]], np.ndarray] | None = None  # the last that was asked for
         self._direct = direct_measurements(logs, flights, self.flights.cuts, self.setting)
@@ -130,6 +129,7 @@ class ThrowModel:
         self._switched = [e for e in effects.values() if e.switch]
         self.effects = (*self._graded, *self._switched, *self._sighted)
         self.entries = {e.name: e for e in self.effects}
+        self._secants: dict[str, list[np.ndarray]] = {}  # of other kinds of blocks, by their name, where they were asked for first
 
     def windows(self, theta: Mapping[str, float]) -> list[Window]:
         """See :class:`visthrow.diagnose.models.interface.Model`."""
