@@ -1,5 +1,8 @@
 """Axes, signs and units of commands that a log has otherwise than the simulation: each hidden, named, put right."""
 
+import json
+from dataclasses import asdict
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -88,10 +91,11 @@ def test_the_simulation_decides_what_is_put_right(monkeypatch, change, names):
     both = (lambda u: WRONG["rate_unit"](WRONG[change](u))) if change else (lambda u: u)
     wrong = [changed(log, both) for log in flights]
     if not change:  # as a relation by chance would have it
-        turned = np.diag([1.0, 1.0, 1.0, -1.0])
+        turned = interface._rows(np.diag([1.0, 1.0, 1.0, -1.0]))
         monkeypatch.setattr(interface, "suspected", lambda *_: [interface.Mistake("rate_sign", "c", "e", 0.0, 2, 48, turned)])
     model, logs = put_right(wrong, PLANT, simulated)
     assert [m.name for m in model.mistakes] == names
     assert all(m.nats > 100.0 for m in model.mistakes)
+    assert len(json.dumps([asdict(m) for m in model.mistakes])) >= 2
     for log, meant in zip(logs, flights):
         np.testing.assert_allclose(log["command"].values, meant["command"].values, rtol=1e-4, atol=1e-9)

@@ -102,7 +102,10 @@ def put_right(
     here = built(kept)
     for mistake in list(kept):
         rest = [k for k in kept if k is not mistake]
-        there = built(rest)
+        try:
+            there = built(rest)
+        except DiagnoseError:  # no flight can be replayed without it
+            continue
         nats = ahead(here[0], there[0])
         if nats > VERY_STRONG + np.log(mistake.ways):
             kept = [replace(k, nats=nats) if k is mistake else k for k in kept]

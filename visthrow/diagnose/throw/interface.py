@@ -7,7 +7,7 @@ effect ``cmd_delay`` on its bound, the link's delay less.)
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -34,7 +34,7 @@ class Mistake:
     nats: float  # by which it beats the log as it stands
     logs: int  # that can tell
     ways: int = 1  # that commands may be wrong in so: their logarithm is the price
-    change: np.ndarray = field(default_factory=lambda: np.eye(4), compare=False)  # of the command (thrust and rates), shape (4, 4)
+    change: tuple[tuple[float, ...], ...] = ()  # of the command (thrust and rates), shape (4, 4); none where it was made anew
 
     @property
     def sentence(self) -> str:
@@ -46,7 +46,7 @@ class Mistake:
         if "command" not in log:
             return log
         c = log["command"]
-        values = np.asarray(c.values, dtype=float) @ self.change.T
+        values = np.asarray(c.values, dtype=float) @ np.array(self.change).T
         return FlightLog({**log.channels, "command": Channel(c.time, values, c.unit, c.frame, c.valid)}, log.meta)
 
 
@@ -161,7 +161,7 @@ def _axes(relation: Sequence[relations.Relation]) -> Mistake | None:
     change = np.eye(4)
     change[1:, 1:] = matrix_of(text)
     nats = sum(r.nats for r in clear)
-    return Mistake(name, cause, f"x, y, z of the vehicle are ({text}) of the command", nats, len(clear), len(EVERY), change)
+    return Mistake(name, cause, f"x, y, z of the vehicle are ({text}) of the command", nats, len(clear), len(EVERY), _rows(change))
 
 
 def _rate_unit(relation: Sequence[relations.Relation]) -> Mistake | None:
@@ -172,7 +172,7 @@ def _rate_unit(relation: Sequence[relations.Relation]) -> Mistake | None:
     if factor == 1.0:
         return None
     change, equation = np.diag([1.0, factor, factor, factor]), f"rates times {factor:.5g}"
-    return Mistake("rate_unit", f"Commanded rates are in {words[factor]}", equation, 0.0, len(relation), len(words), change)
+    return Mistake("rate_unit", f"Commanded rates are in {words[factor]}", equation, 0.0, len(relation), len(words), _rows(change))
 
 
 def _thrust_unit(logs: Sequence[FlightLog], weight: float, units: Mapping[str, float]) -> Mistake | None:
@@ -186,4 +186,8 @@ def _thrust_unit(logs: Sequence[FlightLog], weight: float, units: Mapping[str, f
         return None
     change = np.diag([units[unit], 1.0, 1.0, 1.0])
     equation = f"thrust times {units[unit]:.5g}"
-    return Mistake("thrust_unit", f"Commanded thrust is in {unit}", equation, 0.0, len(medians), len(units), change)
+    return Mistake("thrust_unit", f"Commanded thrust is in {unit}", equation, 0.0, len(medians), len(units), _rows(change))
+
+
+def _rows(matrix: np.ndarray) -> tuple[tuple[float, ...], ...]:
+    return tuple(map(tuple, matrix.tolist()))
