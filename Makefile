@@ -31,6 +31,7 @@ test-sitl: $(STAMP) firmware
 # Needs nothing of .venv, so that it is compiled while that is installed. An older pip knows no groups.
 firmware: $(FIRMWARE)/.built
 $(FIRMWARE)/.built: pyproject.toml
+	rm -rf $(FIRMWARE)
 	$(PYTHON) -m venv $(FIRMWARE)/venv
 	$(FIRMWARE)/venv/bin/python -m pip install --quiet "pip>=25.1"
 	$(FIRMWARE)/venv/bin/python -m pip wheel --quiet --no-deps --wheel-dir $(FIRMWARE) --group sitl
