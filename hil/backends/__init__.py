@@ -24,7 +24,7 @@ THRUST_SHORT = 0.98  # shares of the thrust, and of the rates, that the policy w
 
 
 def mechanism_lag(params: Any) -> float:
-    """Return time from the release command to separation [s] of the mechanism of a run's back-end; 0 for a dry run."""
+    """Return the time from the release command to separation [s] of the mechanism of a run's back-end; 0 for a dry run."""
     return 0.0 if params.backend == "dry-run" else getattr(params, params.backend).mechanism_lag
 
 

@@ -24,17 +24,17 @@ class Rule:
 
 
 def equal(name: str, value: float, why: str, writable: bool = True) -> Rule:
-    """Return a parameter that must have a value."""
+    """Return the rule of a parameter that must have a value."""
     return Rule(name, f"{value:g}", why, lambda v: abs(v - value) < 1e-6, (lambda _: value) if writable else None)
 
 
 def bits(name: str, mask: int, why: str) -> Rule:
-    """Return a parameter some of whose bits must be set."""
+    """Return the rule of a parameter some of whose bits must be set."""
     return Rule(name, f"with the bits of {mask} set", why, lambda v: int(v) & mask == mask, lambda v: int(v) | mask)
 
 
 def within(name: str, low: float, high: float, value: float, why: str) -> Rule:
-    """Return a parameter above ``low`` and not above ``high``; ``value`` is written."""
+    """Return the rule of a parameter above ``low`` and not above ``high``; ``value`` is written."""
     return Rule(name, f"above {low:g}, at most {high:g}", why, lambda v: low < v <= high + 1e-6, lambda _: value)
 
 

@@ -98,11 +98,11 @@ class MavlinkAutopilot(Autopilot, ABC):
 
     @abstractmethod
     def _mode_numbers(self, mode: str) -> tuple[float, float]:
-        """Return second and third parameter of DO_SET_MODE."""
+        """Return the second and third parameter of DO_SET_MODE."""
 
     @abstractmethod
     def _release_command(self) -> tuple[int, tuple[float, ...]]:
-        """Return command that opens the mechanism, and its parameters."""
+        """Return the command that opens the mechanism, and its parameters."""
 
     def _stored(self, value: float, kind: int) -> float:
         """Return a parameter's value out of a PARAM_VALUE's field."""

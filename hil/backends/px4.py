@@ -110,7 +110,7 @@ class Px4(MavlinkAutopilot):
         return rules
 
     def _ends(self) -> list[Rule]:
-        """Return the end of the output at which the mechanism is open is the one that is read back."""
+        """Return the rule that the end of the output at which the mechanism is open is the one that is read back."""
         p = self.params
         open_end = {-1.0: "MIN", 1.0: "MAX"}.get(-1.0 if p.release == "gripper" else p.actuator_open)
         if not p.servo_output or open_end is None or "FUNC" not in p.output_parameter:

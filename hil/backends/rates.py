@@ -30,7 +30,7 @@ class RatesParams(Bounded):
     expo: tuple[Percent, Percent, Percent]  # in hundredths
 
     def rate(self, axis: int, stick: float) -> float:
-        """Return body rate [rad/s] in the stick's direction; axis 0 roll, 1 pitch, 2 yaw, stick -1 to 1."""
+        """Return the body rate [rad/s] in the stick's direction; axis 0 roll, 1 pitch, 2 yaw, stick -1 to 1."""
         size = abs(stick)
         curve = self._betaflight if self.type == "betaflight" else self._actual
         return math.copysign(math.radians(min(curve(axis, size), RATE_LIMIT)), stick)
@@ -66,13 +66,13 @@ class Sticks:
         return tuple(table[-1] for table in self._tables)
 
     def position(self, axis: int, rate: float) -> int:
-        """Return position [us] that gives a body rate [rad/s] about our axis, as near as whole microseconds allow."""
+        """Return the position [us] that gives a body rate [rad/s] about our axis, as near as whole microseconds allow."""
         table, wanted = self._tables[axis], abs(rate)
         above = min(bisect_left(table, wanted), TRAVEL)
         near = above if above == 0 or table[above] - wanted <= wanted - table[above - 1] else above - 1
         return MIDDLE + int(math.copysign(near, self.SIGNS[axis] * rate))
 
     def rate(self, axis: int, us: float) -> float:
-        """Return body rate [rad/s] about our axis at a position [us]."""
+        """Return the body rate [rad/s] about our axis at a position [us]."""
         stick = min(max((us - MIDDLE) / TRAVEL, -1.0), 1.0)
         return self.SIGNS[axis] * math.copysign(self._tables[axis][round(abs(stick) * TRAVEL)], stick)

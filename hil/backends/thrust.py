@@ -37,7 +37,7 @@ class ThrustParams(Bounded):
     idle: Annotated[float, Bound(0.0, 0.5, "[)")] = 0.0  # motors' command at share 0, 0 to 1
 
     def share(self, thrust: float, voltage: float | None = None) -> float:
-        """Return share of full thrust, 0 to 1, for a thrust [N], at the battery's voltage [V] where it is known."""
+        """Return the share of full thrust, 0 to 1, for a thrust [N], at the battery's voltage [V] where it is known."""
         relative = max(0.0, 1.0 + (thrust / self.weight - 1.0) / self.slope) ** (1.0 / self.exponent)
         share = (relative * self._command(self.hover) - self.idle) / (1.0 - self.idle)
         if self.voltage > 0.0 and voltage is not None:
@@ -47,12 +47,12 @@ class ThrustParams(Bounded):
         return min(max(share, 0.0), 1.0)
 
     def thrust(self, share: float) -> float:
-        """Return thrust [N] at a share, at the calibration's voltage; 0 or more."""
+        """Return the thrust [N] at a share, at the calibration's voltage; 0 or more."""
         relative = (self._command(share) / self._command(self.hover)) ** self.exponent
         return max(0.0, self.weight * (1.0 + self.slope * (relative - 1.0)))
 
     def _command(self, share: float) -> float:
-        """Return motors' command, 0 to 1, at a share."""
+        """Return the motors' command, 0 to 1, at a share."""
         return self.idle + (1.0 - self.idle) * share
 
     @property

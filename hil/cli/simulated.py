@@ -101,7 +101,7 @@ def _bridge(args: argparse.Namespace, vehicle: tuple[Any, ...], ends: ExitStack)
 
 
 def make_ball(policy: str, seed: int) -> HangingBall:
-    """Return rope and ball that a policy was trained with, below a vehicle that is told where it is."""
+    """Return the rope and ball that a policy was trained with, below a vehicle that is told where it is."""
     contract = Policy.load(find_policy(policy)).contract
     rope, alone = contract["rope"], contract["vehicle"]["body"]["mass"]
     return HangingBall(

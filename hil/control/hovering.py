@@ -36,7 +36,7 @@ class Hovering:
         self.place_w = (x, y, max(z - DESCENT * self._period, 0.0))
 
     def command(self, vehicle: BodyState, mass: float) -> tuple[float, ...]:
-        """Return thrust [N] and body rates [rad/s] for a vehicle of a mass [kg] with all that hangs on it."""
+        """Return the thrust [N] and body rates [rad/s] for a vehicle of a mass [kg] with all that hangs on it."""
         found = self._controller.step(
             np.array([vehicle.pos]), np.array([vehicle.quat]), np.array([vehicle.vel]), np.array(self.place_w), mass, self._heading
         )
@@ -50,5 +50,5 @@ class Hovering:
             self._shares.append(share)
 
     def share(self) -> float | None:
-        """Return mean thrust over the weight; None before there is a second of it."""
+        """Return the mean thrust over the weight; None before there is a second of it."""
         return sum(self._shares) / HOVERED if len(self._shares) == HOVERED else None

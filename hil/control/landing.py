@@ -112,7 +112,7 @@ def separation(times: np.ndarray, points: np.ndarray, expected: float) -> tuple[
 
 
 def _parabola(times: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return position and velocity at time 0 of the free fall that fits poses best, shape (3,) each."""
+    """Return the position and velocity at time 0 of the free fall that fits poses best, shape (3,) each."""
     lifted = points + [0.0, 0.0, 0.5 * GRAVITY] * times[:, None] ** 2
     fit = np.linalg.lstsq(np.column_stack((np.ones_like(times), times)), lifted, rcond=None)[0]
     return fit[0], fit[1]

@@ -329,18 +329,18 @@ class Runner:
             self.backend.ask(LAND, now)
 
     def _state(self, track: Track, now: float) -> BodyState | None:
-        """Return state of a body, carried forward to the age that the policy was trained with where the config says so."""
+        """Return the state of a body, carried forward to the age that the policy was trained with where the config says so."""
         delay, age = self.params.delay, self._age(track, now)
         ahead = age - self._aged + delay.command if delay.compensate and math.isfinite(age) else 0.0
         return track.state(now, ahead)
 
     def _age(self, track: Track, now: float) -> float:
-        """Return age of a body's last pose [s]."""
+        """Return the age of a body's last pose [s]."""
         last, source = track.gate.last, self.params.delay.source
         return track.gate.age(now) + (source if last is None else last.transit(source))
 
     def _shown_age(self, now: float) -> float:
-        """Return age of the vehicle's pose as the policy is shown it [s]: younger ones than it was trained with stay so."""
+        """Return the age of the vehicle's pose as the policy is shown it [s]: younger ones than it was trained with stay so."""
         age = self._age(self.tracks[VEHICLE], now)
         return min(age, self._aged) if self.params.delay.compensate else age
 

@@ -169,7 +169,7 @@ class Fake(ABC):
         heapq.heappush(self._later, (self.plant.time + delay, self._count, what))
 
     def clock(self) -> float:
-        """Return time on the vehicle's own clock [s]."""
+        """Return the time on the vehicle's own clock [s]."""
         return self.plant.time + self.options.clock_offset
 
     @property
@@ -215,17 +215,17 @@ class Fake(ABC):
         self.witness.release(self.plant.time, self.armed, self.plant.state["payload_pos_w"])
 
     def weight(self) -> float:
-        """Return weight of what flies now [N]."""
+        """Return the weight of what flies now [N]."""
         return self.plant.mass[0 if self.plant.state["attached"] else 1] * GRAVITY
 
     def hold(self, goal_w: np.ndarray) -> np.ndarray:
-        """Return command that holds a place [m]: of the autopilot, or of the pilot's hands."""
+        """Return the command that holds a place [m]: of the autopilot, or of the pilot's hands."""
         now = self.plant.state
         views = [now[name].astype(float)[None] for name in ("pos_w", "quat_wb", "vel_w")]
         return self._hover.step(*views, goal_w, self.weight() / GRAVITY)[0]
 
     def descend(self) -> np.ndarray:
-        """Return command that lands where the vehicle is; it disarms once it is down."""
+        """Return the command that lands where the vehicle is; it disarms once it is down."""
         pos = self.plant.state["pos_w"]
         if pos[2] < TOUCH:
             self.armed = False
@@ -238,7 +238,7 @@ class Fake(ABC):
 
     @abstractmethod
     def flown(self) -> np.ndarray:
-        """Return command of this period, by whoever flies."""
+        """Return the command of this period, by whoever flies."""
 
     def speak(self) -> None:  # noqa: B027 - one that speaks when it is asked says nothing here
         """Say what is due: heartbeats, streams."""

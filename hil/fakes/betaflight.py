@@ -85,7 +85,7 @@ class FakeBetaflight(PortFake):
         self._answer(msp.Frame(frame.command, answer, direction))
 
     def _settings(self, command: int) -> bytes:
-        """Return answer that tells settings."""
+        """Return the answer that tells settings."""
         out = bytearray(SIZES[command])
         for name, told in SETTINGS.items():
             if told.command == command:

@@ -83,7 +83,7 @@ class FakeCrazyflie(PortFake):
         self.happened("emergency stop")
 
     def flown(self) -> np.ndarray:
-        """Return command of this period; before the runner has it somebody holds it in the hand."""
+        """Return the command of this period; before the runner has it somebody holds it in the hand."""
         quiet = self.plant.time - self._heard
         if self._target is None or not self.followed:
             return self.hold(self._place)

@@ -115,7 +115,7 @@ class Direct:
 
 
 def scored(report: dict[str, Any], params: HilParams, start: float | None) -> dict[str, Any]:
-    """Return error [m] and duration [s] of a plant's true landing; both None where there is none."""
+    """Return the error [m] and duration [s] of a plant's true landing; both None where there is none."""
     landed, when = report["landing_w"], report["landing_time"]
     if landed is None:
         return {"error": None, "duration": None}

@@ -113,7 +113,7 @@ class FakeMavlink(Fake):
                 self.answer_release(message)
 
     def custom_mode(self, message: Any) -> int:
-        """Return custom mode that DO_SET_MODE names."""
+        """Return the custom mode that DO_SET_MODE names."""
         return int(message.param2)
 
     def is_release(self, message: Any) -> bool:
@@ -139,11 +139,11 @@ class FakeMavlink(Fake):
             self.acknowledge(message.command, mav.MAV_RESULT_ACCEPTED)
 
     def field(self, name: str) -> tuple[float, int]:
-        """Return field and type of a PARAM_VALUE."""
+        """Return the field and type of a PARAM_VALUE."""
         return self.parameters[name], mav.MAV_PARAM_TYPE_REAL32
 
     def value(self, field: float, kind: int) -> float:
-        """Return value in a PARAM_SET's field."""
+        """Return the value in a PARAM_SET's field."""
         return field
 
     def _tell_parameter(self, name: str) -> None:

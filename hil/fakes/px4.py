@@ -22,7 +22,7 @@ INTEGERS = ("COM_OBL_RC_ACT", "EKF2_EV_CTRL", "PWM_AUX_FUNC1", "PWM_AUX_MIN1", "
 
 
 def custom(main: int, sub: int = 0) -> int:
-    """Return custom mode of a heartbeat."""
+    """Return the custom mode of a heartbeat."""
     return main << 16 | sub << 24
 
 

@@ -78,7 +78,7 @@ class Ticker:
     _start: float | None = None
 
     def due(self) -> float:
-        """Return time of the next tick [s]."""
+        """Return the time of the next tick [s]."""
         if self._start is None:
             self._start = self.clock.now()
         return self._start + (self.index + 1) * self.period

@@ -48,13 +48,13 @@ def unpack(data: bytes) -> Packet | None:
 
 
 def set_point(thrust: int, rates_dps: tuple[float, float, float]) -> bytes:
-    """Return legacy set-point: thrust of 65535, body rates forward, left, up [deg/s]; the firmware's pitch is nose down."""
+    """Return the legacy set-point: thrust of 65535, body rates forward, left, up [deg/s]; the firmware's pitch is nose down."""
     roll, pitch, yaw = rates_dps
     return Packet(COMMANDER, 0, SET_POINT.pack(roll, -pitch, yaw, thrust)).pack()
 
 
 def external_pose(pos: tuple[float, ...], quat: tuple[float, ...]) -> bytes:
-    """Return position [m], z up, and attitude xyzw for its estimator."""
+    """Return the position [m], z up, and attitude xyzw for its estimator."""
     return Packet(LOCALIZATION, GENERIC, POSE.pack(EXTERNAL_POSE, *pos, *quat)).pack()
 
 
@@ -69,12 +69,12 @@ def set_parameter(name: str, value: int) -> bytes:
 
 
 def arm(on: bool) -> bytes:
-    """Return request to arm or disarm."""
+    """Return the request to arm or disarm."""
     return Packet(SUPERVISOR, COMMAND, bytes([ARM, on])).pack()
 
 
 def ask_state() -> bytes:
-    """Return question for the supervisor's state."""
+    """Return the question for the supervisor's state."""
     return Packet(SUPERVISOR, INFO, bytes([STATE])).pack()
 
 

@@ -141,7 +141,7 @@ def wait(links: Sequence[Link], clock: Clock, arrivals: Callable[[], float], unt
 
 
 def quaternion_from_euler(roll: float, pitch: float, yaw: float) -> Quaternion:
-    """Return attitude wxyz of MAVLink's angles (yaw, then pitch, then roll) [rad]; NaN where one is not finite."""
+    """Return the attitude wxyz of MAVLink's angles (yaw, then pitch, then roll) [rad]; NaN where one is not finite."""
     if not (math.isfinite(roll) and math.isfinite(pitch) and math.isfinite(yaw)):
         return NAN_QUATERNION
     x, y, z, w = quat_of_euler(roll, pitch, yaw)

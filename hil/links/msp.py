@@ -28,7 +28,7 @@ class Frame:
     direction: bytes = TO_CONTROLLER
 
     def number(self, code: str, at: int) -> int | None:
-        """Return number at a place, coded as of `struct`; None beyond the end."""
+        """Return the number at a place, coded as of `struct`; None beyond the end."""
         try:
             return struct.unpack_from(code, self.payload, at)[0]
         except struct.error:
@@ -49,7 +49,7 @@ def pack(frame: Frame) -> bytes:
 
 
 def xor(data: bytes) -> int:
-    """Return checksum of bytes."""
+    """Return the checksum of bytes."""
     return reduce(operator.xor, data, 0)
 
 

@@ -71,7 +71,7 @@ def shown(address: Address) -> str:
 
 
 def autopilot_name(number: int) -> str:
-    """Return name of a MAV_AUTOPILOT."""
+    """Return the name of a MAV_AUTOPILOT."""
     entry = mav.enums["MAV_AUTOPILOT"].get(number)
     return str(number) if entry is None else entry.name.removeprefix("MAV_AUTOPILOT_")
 

@@ -51,7 +51,7 @@ class Detection:
 
 
 def _rotation(quat: Quaternion) -> np.ndarray:
-    """Return body to world, shape (3, 3)."""
+    """Return the rotation from body to world, shape (3, 3)."""
     return rotation_from_quat(torch.tensor([quat], dtype=torch.float64))[0].numpy()
 
 
@@ -121,7 +121,7 @@ class Detections:
         return rays
 
     def _pose(self, when: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return place and attitude at a time on the path, by straight lines; its ends beyond them."""
+        """Return the place and attitude at a time on the path, by straight lines; its ends beyond them."""
         path = list(self._path)
         after = next((i for i, (time, _, _) in enumerate(path) if time >= when), len(path) - 1)
         if after == 0 or path[after][0] <= when:

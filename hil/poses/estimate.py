@@ -129,7 +129,7 @@ def _sum(weights: list[float], vectors: list[Vector]) -> Vector:
 
 
 def _turn(now: Quaternion, then: Quaternion | None) -> Vector:
-    """Return rotation vector from the attitude now to an earlier one, in the body frame of now [rad]."""
+    """Return the rotation vector from the attitude now to an earlier one, in the body frame of now [rad]."""
     if then is None:
         return (0.0, 0.0, 0.0)
     return rotation_vector(multiply(conjugate(now), then))

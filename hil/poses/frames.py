@@ -103,7 +103,7 @@ class Frames:
 
 
 def _quaternion(matrix: np.ndarray) -> Quaternion:
-    """Return quaternion xyzw of one of the 24 turns: its numbers, 0, 1/2, sqrt(1/2) or 1, exactly, so that "x,y,z" changes no bit."""
+    """Return the quaternion xyzw of one of the 24 turns: its numbers, 0, 1/2, sqrt(1/2) or 1, exactly, so that "x,y,z" changes no bit."""
     exact = np.array([0.0, 0.5, math.sqrt(0.5), 1.0])
     x, y, z, w = (math.copysign(float(exact[np.argmin(np.abs(exact - abs(v)))]), v) for v in Rotation.from_matrix(matrix).as_quat())
     sign = math.copysign(1.0, next(v for v in (w, x, y, z) if v))

@@ -144,7 +144,7 @@ class Gate:
         return None
 
     def age(self, now: float) -> float:
-        """Return time since the content last changed [s]; infinite before the first pose."""
+        """Return the time since the content last changed [s]; infinite before the first pose."""
         return now - self._changed
 
     def level(self, now: float) -> int:

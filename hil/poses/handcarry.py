@@ -113,7 +113,7 @@ def _rests(poses: Sequence[Pose]) -> list[slice]:
 
 
 def _mean(poses: Sequence[Pose], rest: slice) -> Pose:
-    """Return mean of the poses of a rest next to a move."""
+    """Return the mean of the poses of a rest next to a move."""
     near = [p for p in poses[: rest.stop - rest.start] if abs(p.arrival - poses[0].arrival) <= REST]
     quats = np.array([p.quat for p in near])
     quats[np.sum(quats * quats[0], axis=1) < 0.0] *= -1.0
@@ -153,7 +153,7 @@ def _agreement(vectors: list[tuple[int, np.ndarray]]) -> float:
 
 
 def _yaw(ways: list[tuple[int, np.ndarray]], world: np.ndarray) -> float:
-    """Return turn about our z that is left after the exchange of axes [deg]; 0 where it may be the walker's."""
+    """Return the turn about our z that is left after the exchange of axes [deg]; 0 where it may be the walker's."""
     forward, left = (world @ ways[i][1] for i in (0, 1))
     off = math.degrees(math.atan2(-forward[1] + left[0], forward[0] + left[1]))
     return round(off, 0) if abs(off) > 10.0 else 0.0

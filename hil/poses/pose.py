@@ -26,5 +26,5 @@ class Pose:
     measured: float | None = None  # on the runner's clock [s], where the source's clock is known
 
     def transit(self, usual: float) -> float:
-        """Return time from measurement to arrival [s]: known, or what is usual."""
+        """Return the time from measurement to arrival [s]: known, or what is usual."""
         return usual if self.measured is None else self.arrival - self.measured

@@ -80,7 +80,7 @@ class Track:
         return tuple(x + age * v for x, v in zip(pose.pos, self._vel))
 
     def sample(self) -> tuple[Pose, Vector, Vector]:
-        """Return last pose taken, its stamp freed of steps of the source's clock, with the estimates of velocity and body rate.
+        """Return the last pose taken, its stamp freed of steps of the source's clock, with the estimates of velocity and body rate.
 
         Raises:
             ValueError: there is none yet.
@@ -90,7 +90,7 @@ class Track:
         return replace(self._pose, stamp=self._pose.stamp + self._shift), self._vel, self.filter.rate
 
     def calm_speed(self) -> float:
-        """Return speed by a line through the last poses [m/s]: late, but free of noise; infinite with too few of them."""
+        """Return the speed by a line through the last poses [m/s]: late, but free of noise; infinite with too few of them."""
         if len(self._slow) < CALM_SAMPLES:
             return math.inf
         newest = self._slow[0][0]
@@ -98,7 +98,7 @@ class Track:
         return math.hypot(*(sum(c * pos[i] for c, (_, pos) in zip(weights, self._slow)) for i in range(3)))
 
     def state(self, now: float, ahead: float = 0.0) -> BodyState | None:
-        """Return state at a time [s] by the last accepted pose, carried ahead [s] with part of what is known of its accelerations."""
+        """Return the state at a time [s] by the last accepted pose, carried ahead [s] with part of what is known of its accelerations."""
         pose = self._pose
         if pose is None:
             return None

@@ -200,7 +200,7 @@ def events(ticks: list[Tick]) -> list[list]:
 
 
 def log_of(played: PlayedRun, first: int, last: int, throw: int | None = None) -> FlightLog:
-    """Return log of the ticks from ``first`` to ``last``, both included; of one throw where its number is given."""
+    """Return the log of the ticks from ``first`` to ``last``, both included; of one throw where its number is given."""
     ticks, runner = played.ticks[first : last + 1], played.playback.runner
     start = played.ticks[played.throws[throw][0]].line["time"] if throw is not None else ticks[0].line["time"]
     samples = Samples(played.params, played.playback, meta_of(played.params, played.playback, played.provenance, start))

@@ -44,7 +44,7 @@ class Stage:
         self.most = max(self.most, seconds)
 
     def percentile(self, share: float) -> float:
-        """Return time [s] below which a share of all lie, 0 to 1; to one per cent, and never above the largest."""
+        """Return the time [s] below which a share of all lie, 0 to 1; to one per cent, and never above the largest."""
         reached = np.searchsorted(np.cumsum(self.counts), share * self.counts.sum())
         return min(LEAST * GROWTH ** (float(reached) + 0.5), self.most)
 

@@ -1,6 +1,6 @@
 """One folder a run: config, policy, every raw pose, every tick, the link's .tlog; and what is made of it afterwards.
 
-``poses.jsonl`` and ``ticks.jsonl`` hold a JSON value a line and survive a kill up to the last lines; floats are written so
+``poses.jsonl`` and ``ticks.jsonl`` hold a JSON value a line and survive a kill but for a tenth of a second; floats are written so
 that they read back to the same bits. Lines are written by a thread of their own, so that a slow disk delays no tick.
 """
 
@@ -97,7 +97,7 @@ def lines(path: Path) -> Iterator[Any]:
 
 
 def pose_of(row: list) -> tuple[int, Pose]:
-    """Return number of the tick and the raw pose of a line of :data:`POSES`."""
+    """Return the number of the tick and the raw pose of a line of :data:`POSES`."""
     index, stamp, arrival, body, *vectors, reset, measured = row
     pos, quat, vel, rate = (None if v is None else tuple(v) for v in vectors)
     return index, Pose(stamp, arrival, body, pos, quat, vel, rate, reset, measured)

@@ -44,7 +44,7 @@ def summary_text(summary: dict[str, Any], folder: Path) -> str:
 
 
 def throw_path(folder: Path, number: int, ending: str) -> Path:
-    """Return file of a throw, counted from 1."""
+    """Return the file of a throw, counted from 1."""
     return folder / f"throw-{number:02d}{ending}"
 
 

@@ -191,7 +191,7 @@ def start_viewer(folder: Path) -> subprocess.Popen:
 
 
 def run(folder: Path, live: bool, out: str | None, web_port: int, data_port: int) -> int:
-    """Return what ``visthrow hil view`` does: serve the live view, or write files."""
+    """Serve the live view, or write files: ``visthrow hil view``."""
     from hil.recording.report import finish
 
     if live:

@@ -190,7 +190,7 @@ def open_images(params: ImageParams, training: CameraParams, clock: Callable[[],
 
 
 def _folder(path: Path) -> tuple[Callable[[int], np.ndarray], list[float]]:
-    """Return reader of the pictures of a folder, and their times [s]."""
+    """Return the reader of the pictures of a folder, and their times [s]."""
     rows = _stamps(path / STAMPS, ("file", "time_s"))
     missing = [name for name, _ in rows if not (path / name).is_file()]
     if missing:
@@ -208,7 +208,7 @@ def _folder(path: Path) -> tuple[Callable[[int], np.ndarray], list[float]]:
 
 
 def _video(path: Path) -> tuple[Callable[[int], np.ndarray], list[float]]:
-    """Return reader of the frames of a video, and their times [s]; by its own rate where no stamps stand beside it."""
+    """Return the reader of the frames of a video, and their times [s]; by its own rate where no stamps stand beside it."""
     import cv2
 
     video = cv2.VideoCapture(str(path))

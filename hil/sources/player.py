@@ -143,7 +143,7 @@ def _of_channels(log: FlightLog, body: str) -> list[Pose]:
 
 
 def _before(times: np.ndarray, stamps: np.ndarray) -> np.ndarray:
-    """Return index of the last time at or before each stamp; -1 where there is none, or an old one."""
+    """Return the index of the last time at or before each stamp; -1 where there is none, or an old one."""
     index = np.searchsorted(times, stamps, side="right") - 1
     return np.where((index >= 0) & (stamps - times[np.maximum(index, 0)] <= PAIR_AGE), index, -1)
 
@@ -260,7 +260,7 @@ def _known(values: np.ndarray | None, i: int) -> tuple[float, ...] | None:
 
 
 def _from_globe(data: Fields, origins: Fields | None) -> Fields:
-    """Return North, east and down [m] from the estimator's origin, else from the first position."""
+    """Return north, east and down [m] from the estimator's origin, else from the first position."""
     at = np.flatnonzero(origins["Type"] == 0.0) if origins is not None and "Type" in origins else []
     lat, lng = (origins[n][at[-1]] if len(at) else data[n][0] for n in ("Lat", "Lng"))
     return {

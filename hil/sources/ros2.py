@@ -77,7 +77,7 @@ def domain(params: MocapParams) -> Any:
 
 
 def placed(kind: str, message: Any, frames: str) -> Iterator[tuple[float, tuple[float, ...], tuple[float, ...]]]:
-    """Yield stamp [s], position [m] and quaternion xyzw of a message; of TF of the transform ``PARENT/CHILD``."""
+    """Yield the stamp [s], position [m] and quaternion xyzw of a message; of TF of the transform ``PARENT/CHILD``."""
     parent, _, child = frames.rpartition("/")
     if kind == KINDS[2]:
         wanted = [t for t in message.transforms if (t.header.frame_id.lstrip("/"), t.child_frame_id.lstrip("/")) == (parent, child)]
