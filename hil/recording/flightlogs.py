@@ -12,13 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from hil.control.decision import Decision
 from hil.control.landing import Landing
 from hil.control.states import State
 from hil.errors import RunError
 from hil.params import HilParams
 from hil.poses.pose import GOAL, PAYLOAD, VEHICLE, Pose
-from hil.recording.playback import Playback, Sample
+from hil.recording.playback import Playback, Sample, Tick
 from hil.recording.record import PROVENANCE, SUMMARY, load_run
 from visthrow import config
 from visthrow.common.rotations import matrix_of_quat
@@ -33,23 +32,9 @@ STATES = tuple(state.value for state in State)
 
 
 @dataclass
-class Tick:
-    """One tick of a run: as recorded, as decided, and the poses that were taken in it."""
-
-    line: dict[str, Any]
-    decision: Decision
-    samples: list[Sample]
-    ages: dict[str, float]  # of the poses' content by body [s]
-    attached: bool  # whether the payload hangs on the vehicle: until the release's lag is over
-    goal_w: tuple[float, float, float] | None
-
-
-@dataclass
 class PlayedRun:
     """A whole run, played back."""
 
-    folder: Path
-    params: HilParams
     playback: Playback
     ticks: list[Tick]
     provenance: dict[str, Any]
@@ -67,7 +52,7 @@ class PlayedRun:
                 by_body.setdefault(sample.body, []).append(sample)
         for samples in by_body.values():
             stamps = np.array([sample.pose.stamp for sample in samples])
-            apart = np.array([measured(sample, self.params) for sample in samples]) - stamps
+            apart = np.array([measured(sample, self.playback.params) for sample in samples]) - stamps
             around = np.pad(apart, ABOUT, mode="edge")
             offset = np.median(np.lib.stride_tricks.sliding_window_view(around, 2 * ABOUT + 1), axis=1)
             for sample, time in zip(samples, stamps + offset):
@@ -79,14 +64,6 @@ def measured(sample: Sample, params: HilParams) -> float:
     return sample.pose.arrival - sample.pose.transit(params.delay.source)
 
 
-def tick_of(playback: Playback, line: dict[str, Any], poses: list) -> Tick:
-    """Play one tick back."""
-    decision, samples = playback.feed(line, poses)
-    runner = playback.runner
-    ages = {name: track.gate.age(line["time"]) for name, track in runner.tracks.items()}
-    return Tick(line, decision, samples, ages, not runner.latch.separated(line["time"]), runner.seen_goal_w)
-
-
 def read(folder: str | Path) -> PlayedRun:
     """Play a run back; raises `RunError` for what is no folder of a run, or a damaged one."""
     folder = Path(folder)
@@ -96,8 +73,7 @@ def read(folder: str | Path) -> PlayedRun:
     playback = Playback(params, policy)
     provenance = _known(folder / PROVENANCE)
     provenance["simulated"] = any(link.get("simulated") for link in _known(folder / SUMMARY).get("links", []))
-    ticks = [tick_of(playback, line, poses.get(line["n"], [])) for line in lines]
-    return PlayedRun(folder, params, playback, ticks, provenance)
+    return PlayedRun(playback, [playback.feed(line, poses.get(line["n"], [])) for line in lines], provenance)
 
 
 def _known(path: Path) -> dict[str, Any]:
@@ -111,9 +87,9 @@ def _known(path: Path) -> dict[str, Any]:
 class Samples:
     """Fills a recorder with ticks."""
 
-    def __init__(self, params: HilParams, playback: Playback, meta: dict) -> None:
+    def __init__(self, playback: Playback, meta: dict) -> None:
         """Begin with nothing; ``meta``: of the log."""
-        self.params, self.runner = params, playback.runner
+        self.params, self.runner = playback.params, playback.runner
         self.recorder = FlightRecorder(meta)
         self._declare()
         self._last: dict[str, float] = {}
@@ -175,9 +151,9 @@ class Samples:
                 self.recorder.add(time, quat_wb=pose.quat, rate_b=sample.rate_b)
 
 
-def meta_of(params: HilParams, playback: Playback, provenance: dict[str, Any], start: float) -> dict[str, Any]:
+def meta_of(playback: Playback, provenance: dict[str, Any], start: float) -> dict[str, Any]:
     """Return what is known of a run from its beginning on; ``start`` [s] is the zero of its pictures."""
-    policy = playback.runner.pilot.policy
+    params, policy = playback.params, playback.runner.pilot.policy
     goal_w = playback.runner.seen_goal_w or params.goal_w
     simulated = ", of a simulated vehicle" if provenance.get("simulated") else ""
     return {
@@ -203,7 +179,7 @@ def log_of(played: PlayedRun, first: int, last: int, throw: int | None = None) -
     """Return the log of the ticks from ``first`` to ``last``, both included; of one throw where its number is given."""
     ticks, runner = played.ticks[first : last + 1], played.playback.runner
     start = played.ticks[played.throws[throw][0]].line["time"] if throw is not None else ticks[0].line["time"]
-    samples = Samples(played.params, played.playback, meta_of(played.params, played.playback, played.provenance, start))
+    samples = Samples(played.playback, meta_of(played.playback, played.provenance, start))
     landings = [] if throw is None else [landing for landing in runner.latch.landings if abs(landing.start - start) < 1e-9]
     landing = next(iter(landings), None)
     latch = next((t.line["time"] for t in ticks if t.decision.release and t.line["time"] >= start), None)
@@ -212,7 +188,7 @@ def log_of(played: PlayedRun, first: int, last: int, throw: int | None = None) -
         samples.add(replace(tick, attached=tick.line["time"] < apart))
     meta = samples.recorder.meta
     meta["events"] = events(ticks)
-    meta["goal_w"] = list(next((t.goal_w for t in ticks if t.line["time"] >= start and t.goal_w), played.params.goal_w))
+    meta["goal_w"] = list(next((t.goal_w for t in ticks if t.line["time"] >= start and t.goal_w), played.playback.params.goal_w))
     if throw is not None:
         _judge(samples.recorder, landing, latch, ticks, start)
     return samples.recorder.log()

@@ -68,7 +68,7 @@ def finish(folder: str | Path, stages: Stages | None = None, speed: float = 1.0)
             log.save(path)
             said.append(f"{path}  throw {number}: {outcome(log)}")
             if "landing" in log:
-                picture(folder, number, log, played.params.camera)
+                picture(folder, number, log, played.playback.params.camera)
     except VisthrowError as error:
         said.append(f"not all could be written: {error}")
     return said

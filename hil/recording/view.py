@@ -20,8 +20,8 @@ import numpy as np
 from hil.errors import RunError
 from hil.params import HilParams
 from hil.poses.pose import PAYLOAD, VEHICLE, Pose
-from hil.recording.flightlogs import Samples, Tick, events, meta_of, read, tick_of
-from hil.recording.playback import Playback
+from hil.recording.flightlogs import Samples, events, meta_of, read
+from hil.recording.playback import Playback, Tick
 from hil.recording.record import CONFIG, POLICY, POSES, PROVENANCE, SUMMARY, TICKS, pose_of
 from visthrow import config
 from visthrow.onboard.policy import Policy
@@ -36,13 +36,13 @@ BODY_CHANNELS = {VEHICLE: "pos_w", PAYLOAD: "payload_pos_w"}
 class Show:
     """Sends ticks to a stream of rerun."""
 
-    def __init__(self, stream: Any, params: HilParams, playback: Playback, provenance: dict[str, Any], start: float) -> None:
+    def __init__(self, stream: Any, playback: Playback, provenance: dict[str, Any], start: float) -> None:
         """Send what does not move; ``start`` is the zero of the viewer's time [s]."""
         from visthrow.view import rerun_view
 
         self._stream, self._view = stream, rerun_view
-        self._meta = meta_of(params, playback, provenance, start)
-        self._samples = Samples(params, playback, self._meta)
+        self._meta = meta_of(playback, provenance, start)
+        self._samples = Samples(playback, self._meta)
         self._trails: dict[str, deque] = {name: deque(maxlen=TRAIL) for name in BODY_CHANNELS}
         self._said: list | None = None
         rerun_view.still(stream, self._meta["goal_w"], sizes(playback.runner.pilot))
@@ -122,7 +122,7 @@ class Follower:
         found = []
         while self._lines and len(self._poses.get(self._lines[0]["n"], ())) >= self._lines[0]["poses"]:
             line = self._lines.popleft()
-            found.append(tick_of(self.playback, line, self._poses.pop(line["n"], [])))
+            found.append(self.playback.feed(line, self._poses.pop(line["n"], [])))
         return found
 
     @property
@@ -146,8 +146,7 @@ def follow(folder: str | Path, stream: Any, going: Callable[[], bool] = lambda: 
             dropped += max(0, len(ticks) - MOST_SHOWN)
             if ticks:
                 if show is None:
-                    start = ticks[0].line["time"]
-                    show = Show(stream, follower.params, follower.playback, follower.provenance, start)
+                    show = Show(stream, follower.playback, follower.provenance, ticks[0].line["time"])
                 show.take(ticks[-MOST_SHOWN:])
             elif over:
                 break
@@ -162,9 +161,9 @@ def write(folder: str | Path, path: str | Path) -> None:
     from visthrow.view import rerun_view
 
     played = read(folder)
-    layout = rerun_view.blueprint(np.array(played.params.goal_w), {"state"})
+    layout = rerun_view.blueprint(np.array(played.playback.params.goal_w), {"state"})
     with rerun_view.recording(path, layout) as stream:
-        show = Show(stream, played.params, played.playback, played.provenance, played.ticks[0].line["time"])
+        show = Show(stream, played.playback, played.provenance, played.ticks[0].line["time"])
         for first in range(0, len(played.ticks), MOST_SHOWN // 10):
             show.take(played.ticks[first : first + MOST_SHOWN // 10])
 
@@ -174,8 +173,8 @@ def write_mcap(folder: str | Path, path: str | Path) -> None:
     from visthrow.view import mcap_view
 
     played = read(folder)
-    meta = meta_of(played.params, played.playback, played.provenance, played.ticks[0].line["time"])
-    samples = Samples(played.params, played.playback, meta)
+    meta = meta_of(played.playback, played.provenance, played.ticks[0].line["time"])
+    samples = Samples(played.playback, meta)
     for tick in played.ticks:
         samples.add(tick)
     log = samples.flush()
