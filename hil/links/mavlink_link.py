@@ -61,11 +61,6 @@ class Link:
         """Return what packs messages of ids of their own for this link, signed where it is."""
         return mav.MAVLink(None, system, component) if self._key is None else Signed(self._key, system, component)
 
-    @property
-    def recorded(self) -> bool:
-        """Whether all was recorded so far."""
-        return self._tlog is None or not self._tlog.failed
-
     def listen(self, listener: Callable[[Any, float], None]) -> None:
         """Call ``listener(message, arrival)`` for every message from now on."""
         self._listeners.append(listener)
