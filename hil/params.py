@@ -1,7 +1,7 @@
 """Configuration of a run: one file of ``configs/hil``. SI units; nothing about frames has a default."""
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Literal
 
 from camera.params import CameraParams
 from hil.backends.ardupilot import ArduPilotParams
@@ -13,7 +13,7 @@ from hil.control.calibrating import CalibrationParams
 from hil.control.realtime import RealtimeParams
 from hil.control.safety import CheckParams, FenceParams, GuardParams
 from hil.control.states import StateParams
-from hil.links.roster import check_allowed
+from hil.links.roster import MavlinkId, check_allowed
 from hil.poses.estimate import EstimateParams
 from hil.poses.frames import FrameParams
 from hil.poses.gate import GateParams
@@ -22,36 +22,26 @@ from hil.poses.track import MOST_PREDICTION
 from hil.sources import CHANNELS, BodyIds, LogBody, MocapParams, RigidBody
 from hil.sources.images import ImageParams
 from visthrow.common.errors import ConfigError
+from visthrow.config.bounds import Bound, Bounded
 from visthrow.logs.mapping import ChannelMap, TableMap, TimeColumn
 
-MOST_HOLD = 0.05
-"""For which a command may wait [s]: beyond it the policy was trained for another link altogether."""
-
-LIVE = ("mavlink", "mocap")
-"""Kinds of source that are no recording."""
-
-ORDERS = {"bin": "wxyz", "ulg": "wxyz", "mocap": "xyzw"}
-"""Order of quaternions of the sources that know only one."""
+MOST_HOLD = 0.05  # for which a command may wait [s]: beyond it the policy was trained for another link altogether
+LIVE = ("mavlink", "mocap")  # kinds of source that are no recording
+ORDERS = {"bin": "wxyz", "ulg": "wxyz", "mocap": "xyzw"}  # order of quaternions of the sources that know only one
 
 
 @dataclass(frozen=True)
-class LinkParams:
-    """The MAVLink link of source and autopilot.
-
-    Raises:
-        ConfigError: an id that MAVLink does not have.
-        LinkError: an allowed sender that is no address.
-    """
+class LinkParams(Bounded):
+    """The MAVLink link of source and autopilot."""
 
     device: str  # see hil.links.device
     remote: bool  # whether the device may leave this machine
-    system: int  # our own id, 1 to 255
-    component: int  # likewise
+    system: MavlinkId  # our own
+    component: MavlinkId  # likewise
     allow: tuple[str, ...] = ()  # senders of datagrams that are heard, ADDRESS or ADDRESS:PORT; none: any
 
     def __post_init__(self) -> None:
-        if not (1 <= self.system <= 255 and 1 <= self.component <= 255):
-            raise ConfigError(f"link.system {self.system}, component {self.component}; expected 1 to 255 each")
+        super().__post_init__()
         check_allowed(self.allow)
 
 
@@ -81,24 +71,27 @@ class SourceParams:
 
 
 @dataclass(frozen=True)
-class DelayParams:
+class DelayParams(Bounded):
     """Ages of poses, and their compensation."""
 
-    source: float  # of a pose when it arrives [s], where its sender's clock is not known
+    source: Annotated[float, Bound(0.0, 0.5)]  # of a pose when it arrives [s], where its sender's clock is not known
     synchronise: bool  # ask the senders of poses for their clock by TIMESYNC, and take ages from it where they answer
     compensate: bool  # carry poses forward to the age that the policy was trained with
     # By which commands and releases act later than in the policy's training; poses are carried as much further [s].
-    command: float = 0.0
-    hold: float = 0.0  # for which each command waits: by so much the vehicle acts sooner than the policy was trained for [s]
+    command: Annotated[float, Bound(0.0, MOST_PREDICTION)] = 0.0
+    # For which each command waits: by so much the vehicle acts sooner than the policy was trained for [s].
+    hold: Annotated[float, Bound(0.0, MOST_HOLD)] = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.hold and self.command:
+            raise ConfigError(f"hold {self.hold} s, command {self.command} s; expected one of them 0: a vehicle acts sooner than the "
+                              "policy was trained for, or later")  # fmt: skip
 
 
 @dataclass(frozen=True)
-class HilParams:
-    """A run.
-
-    Raises:
-        ConfigError: a body without frames, or parts that contradict each other.
-    """
+class HilParams(Bounded):
+    """A run; raises `ConfigError` for a body without frames and for parts that contradict each other."""
 
     policy: str  # name of a shipped policy, or a file
     camera: CameraParams
@@ -106,7 +99,7 @@ class HilParams:
     # Show the policy every tick, not only those of a throw; what it says then is recorded, never sent. Such a run waits
     # for poses and checks for ever.
     observe: bool
-    throws: int  # after which the run lands
+    throws: Annotated[int, Bound(1)]  # after which the run lands
     goal_w: tuple[float, float, float]  # target where no body is the goal [m]
     home_w: tuple[float, float, float]  # hover point [m]
     landing_height: float  # of the payload's centre as it lands [m]
@@ -131,30 +124,28 @@ class HilParams:
     calibration: CalibrationParams | None = None  # of a camera, in the hover before the first throw; None: none
 
     def __post_init__(self) -> None:
+        super().__post_init__()
+        kind, fence = self.source.kind, self.fence
         if not {VEHICLE, PAYLOAD} <= set(self.frames) <= set(BODIES):
             raise ConfigError(f"frames of {', '.join(self.frames)}; expected vehicle and payload, goal if it moves")
-        if self.keypoints == "detector" and self.images is None:
-            raise ConfigError("keypoints of a detector, but no table [images]; expected its kind and path or device")
-        if self.calibration is not None and self.keypoints != "detector":
-            raise ConfigError("calibration of a camera, but keypoints of poses; expected keypoints = \"detector\"")
-        if self.backend == "crazyflie" and self.crazyflie is None:
-            raise ConfigError("backend crazyflie without a table [crazyflie]; expected its device and thrust, as in crazyflie.toml")
-        if self.throws < 1:
-            raise ConfigError(f"throws {self.throws}; expected 1 or more")
-        if self.source.kind not in LIVE and self.source.file is None:
-            raise ConfigError(f"source.file is none; expected the file of the {self.source.kind} source")
-        if self.backend != "dry-run" and self.source.kind not in LIVE:
-            raise ConfigError(f"backend {self.backend} with recorded poses ({self.source.kind}); a recording flies dry")
-        if self.source.kind == "mocap" and self.source.mocap is None:
-            raise ConfigError("source.mocap is missing; expected its system and host")
-        f = self.fence
-        if not all(a <= x <= b for a, x, b in zip(f.vehicle_low, self.home_w, f.vehicle_high)):
-            raise ConfigError(f"home_w {self.home_w} m; expected within the vehicle's fence, {f.vehicle_low} to {f.vehicle_high} m")
-        if not f.payload_low[2] <= self.landing_height <= f.payload_high[2]:
-            raise ConfigError(
-                f"landing_height {self.landing_height} m; expected within the payload's fence, {f.payload_low[2]} to "
-                f"{f.payload_high[2]} m of height"
-            )
+        inside = all(a <= x <= b for a, x, b in zip(fence.vehicle_low, self.home_w, fence.vehicle_high))
+        for wrong, text in (
+            (self.keypoints == "detector" and self.images is None,
+             "keypoints of a detector, but no table [images]; expected its kind and path or device"),
+            (self.calibration is not None and self.keypoints != "detector",
+             "calibration of a camera, but keypoints of poses; expected keypoints = \"detector\""),
+            (self.backend == "crazyflie" and self.crazyflie is None,
+             "backend crazyflie without a table [crazyflie]; expected its device and thrust, as in crazyflie.toml"),
+            (kind not in LIVE and self.source.file is None, f"source.file is none; expected the file of the {kind} source"),
+            (self.backend != "dry-run" and kind not in LIVE, f"backend {self.backend} with recorded poses ({kind}); a recording flies dry"),
+            (kind == "mocap" and self.source.mocap is None, "source.mocap is missing; expected its system and host"),
+            (not inside, f"home_w {self.home_w} m; expected within the vehicle's fence, {fence.vehicle_low} to {fence.vehicle_high} m"),
+            (not fence.payload_low[2] <= self.landing_height <= fence.payload_high[2],
+             f"landing_height {self.landing_height} m; expected within the payload's fence, {fence.payload_low[2]} to "
+             f"{fence.payload_high[2]} m of height"),
+        ):  # fmt: skip
+            if wrong:
+                raise ConfigError(text)
         angles = {channel.name for channel in self.source.columns if channel.kind == "euler"}
         for name, frames in self.frames.items():
             written = "xyzw" if CHANNELS[name][1] in angles else ORDERS.get(self.source.kind)
@@ -162,12 +153,3 @@ class HilParams:
                 raise ConfigError(
                     f"frames.{name}.quaternion is '{frames.quaternion}'; a source of kind {self.source.kind} writes '{written}'"
                 )
-        if not 0.0 <= self.delay.source <= 0.5:
-            raise ConfigError(f"delay.source {self.delay.source} s; expected 0 to 0.5")
-        if not 0.0 <= self.delay.hold <= MOST_HOLD or (self.delay.hold and self.delay.command):
-            raise ConfigError(
-                f"delay.hold {self.delay.hold} s, delay.command {self.delay.command} s; expected 0 to {MOST_HOLD:g}, and one of them 0: "
-                "a vehicle acts sooner than the policy was trained for, or later"
-            )
-        if not 0.0 <= self.delay.command <= MOST_PREDICTION:
-            raise ConfigError(f"delay.command {self.delay.command} s; expected 0 to {MOST_PREDICTION:g}: so far poses are carried")

@@ -16,8 +16,8 @@ from sim.quadrotor.queue import queue_depth
 from sim.randomize import build_reset
 from sim.step import build_step
 
-PIECES = 2
-"""Number of pieces of a batch for each core of a CPU; more than one, since a core may have other work too."""
+PIECES = 8
+"""Number of pieces of a batch for each core of a CPU: a core that has other work for a while leaves its pieces to the rest."""
 
 FEWEST = 32
 """Environments of a piece: their step takes half a millisecond, its launch a tenth."""
@@ -265,7 +265,7 @@ class HybridSim:
         if pieces <= 1:
             wp.launch(kernel, count, [0, *arguments], device=device, block_dim=block_dim)
             return
-        kernel.module.load(device)  # by one thread
+        kernel.module.load(device, block_dim=1)  # by one thread, as a launch there would
 
         def launch(first: int, last: int) -> None:
             wp.launch(kernel, last - first, [first, *arguments], device=device)

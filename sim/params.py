@@ -84,9 +84,10 @@ class ControllerParams:
     [f_min, f_max]. ``f_max = max_thrust (u / u_ref)^2`` follows the battery voltage u. Motor-speed set-point:
     ``Omega* = sqrt(f_i / k_f) (1 + (1 - voltage_compensation) (u / u_ref - 1))``.
 
-    ``motor_mixing`` (Betaflight's firmware, without set-point smoothing): P and I act on ``w_cmd - g``, r is the low-pass of
-    ``iterm_relax`` alone, which holds the integral of roll and pitch while the command moves:
-    ``i' = i_gain (w_cmd - g) max(0, 1 - |w_cmd - r| / relax_threshold)``, 0 at the limit where it would grow. The mixer
+    ``motor_mixing`` (Betaflight's firmware, without set-point smoothing): g has the lag of D, which has filters of its own; P and I
+    see a share of it, ``e = w_cmd - w - gyro_share (g - w)``. r is the low-pass of ``iterm_relax`` alone, which holds the integral
+    of roll and pitch while the command moves:
+    ``i' = i_gain e max(0, 1 - |w_cmd - r| / relax_threshold)``, 0 at the limit where it would grow. The mixer
     adds to motor commands: with ``u_c = sqrt(c / (4 max_thrust))`` and m_i the thrust that the mixer above gives a motor for
     tau, ``u_i = u_c + m_i / (2 sqrt(mix_thrust max_thrust))``; all m_i are scaled where their range exceeds that from idle
     ``sqrt(min_thrust / max_thrust)`` to 1, then u_c is shifted so that every u_i lies in it. The gains hold at ``mix_thrust`` a
@@ -113,6 +114,7 @@ class ControllerParams:
     mix_thrust: float = 0.667  # of a motor, at which the gains of ``motor_mixing`` hold [N]; hover with the payload
     calibration_voltage: float = 15.2  # at which a command of ``motor_mixing`` gives the thrust that it names [V]
     relax_threshold: float = 0.698  # of iterm_relax, ITERM_RELAX_SETPOINT_THRESHOLD: 40 deg/s [rad/s]
+    gyro_share: tuple[float, float, float] = (1.0, 1.0, 1.0)  # of the lag of g that P and I of ``motor_mixing`` see [-]
 
 
 @dataclass(frozen=True)

@@ -14,24 +14,16 @@ from hil.backends.audit import Rule, bits, equal, within
 from hil.backends.autopilot import AutopilotParams, MavlinkAutopilot
 from hil.backends.base import FOLLOW, HOLD, LAND
 from hil.links.pymav import mav
+from visthrow.common.errors import ConfigError
 
-GUIDED, LOITER, LAND_MODE, BRAKE, GUIDED_NOGPS = 4, 5, 9, 17, 20
-"""Mode numbers of ArduCopter."""
-
-THRUST_AS_THRUST = 8
-"""Bit 3 of GUID_OPTIONS."""
-
-SERVO_GRIPPER, SERVO_DISABLED = 28, 0
-"""Values of SERVOn_FUNCTION."""
+GUIDED, LOITER, LAND_MODE, BRAKE, GUIDED_NOGPS = 4, 5, 9, 17, 20  # mode numbers of ArduCopter
+THRUST_AS_THRUST = 8  # bit 3 of GUID_OPTIONS
+SERVO_GRIPPER, SERVO_DISABLED = 28, 0  # values of SERVOn_FUNCTION
 
 
 @dataclass(frozen=True)
 class ArduPilotParams(AutopilotParams):
-    """The vehicle on the other side.
-
-    Raises:
-        ValueError: a mode that neither holds nor lands, or a number out of its range.
-    """
+    """The vehicle on the other side."""
 
     follow_mode: int  # GUIDED (4) or GUIDED_NOGPS (20)
     hold_mode: int  # LOITER (5) or BRAKE (17): who holds after the throw
@@ -41,16 +33,16 @@ class ArduPilotParams(AutopilotParams):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.follow_mode not in (GUIDED, GUIDED_NOGPS) or self.hold_mode not in (LOITER, BRAKE):
-            raise ValueError(
+            raise ConfigError(
                 f"follow_mode {self.follow_mode}, hold_mode {self.hold_mode}; expected GUIDED (4) or GUIDED_NOGPS (20), and "
                 "LOITER (5) or BRAKE (17)"
             )
         if self.release == "servo" and not self.servo_output:
-            raise ValueError("release 'servo' with servo_output 0; expected the output that the mechanism hangs on")
+            raise ConfigError("release 'servo' with servo_output 0; expected the output that the mechanism hangs on")
 
 
 class ArduPilot(MavlinkAutopilot):
-    """See `hil.backends.base.Backend`."""
+    """An ArduCopter."""
 
     name, autopilot = "ardupilot", mav.MAV_AUTOPILOT_ARDUPILOTMEGA
     params: ArduPilotParams

@@ -4,20 +4,11 @@ unless the operator said so."""
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
-ASK_AGAIN = 0.2
-"""Between two questions for a value that has not come [s]."""
-
-SETTLE = 0.5
-"""After a value was written, answers may still be on their way that were given before; then it is read back [s]."""
-
-GIVE_UP, GIVE_UP_OPTIONAL = 5.0, 1.0
-"""A value that has not come within this time is missing [s]."""
-
-NO_SUCH_PARAMETER = 1
-"""MAV_PARAM_ERROR_DOES_NOT_EXIST."""
-
-MOST_NAMED = 4
-"""Parameters that a fault names; the table has all."""
+ASK_AGAIN = 0.2  # between two questions for a value that has not come [s]
+SETTLE = 0.5  # after a value was written, answers may still be on their way that were given before; then it is read back [s]
+GIVE_UP, GIVE_UP_OPTIONAL = 5.0, 1.0  # a value that has not come within this time is missing [s]
+NO_SUCH_PARAMETER = 1  # MAV_PARAM_ERROR_DOES_NOT_EXIST
+MOST_NAMED = 4  # parameters that a fault names; the table has all
 
 
 @dataclass(frozen=True)
@@ -33,17 +24,17 @@ class Rule:
 
 
 def equal(name: str, value: float, why: str, writable: bool = True) -> Rule:
-    """A parameter that must have a value."""
+    """Return the rule of a parameter that must have a value."""
     return Rule(name, f"{value:g}", why, lambda v: abs(v - value) < 1e-6, (lambda _: value) if writable else None)
 
 
 def bits(name: str, mask: int, why: str) -> Rule:
-    """A parameter some of whose bits must be set."""
+    """Return the rule of a parameter some of whose bits must be set."""
     return Rule(name, f"with the bits of {mask} set", why, lambda v: int(v) & mask == mask, lambda v: int(v) | mask)
 
 
 def within(name: str, low: float, high: float, value: float, why: str) -> Rule:
-    """A parameter above ``low`` and not above ``high``; ``value`` is written."""
+    """Return the rule of a parameter above ``low`` and not above ``high``; ``value`` is written."""
     return Rule(name, f"above {low:g}, at most {high:g}", why, lambda v: low < v <= high + 1e-6, lambda _: value)
 
 
@@ -56,18 +47,17 @@ class Audit:
     """
 
     def __init__(
-        self, rules: Iterable[Rule], ask: Callable[[str], None], write: Callable[[str, float], None] | None = None,
-        tell: Callable[[str], None] | None = None,
+        self, rules: Iterable[Rule] = (), ask: Callable[[str], None] = lambda name: None,
+        write: Callable[[str, float], None] | None = None, tell: Callable[[str], None] | None = None,
     ) -> None:  # fmt: skip
         """Begin with nothing asked.
 
         Args:
-            rules: of the back-end.
-            ask: sends a question for a parameter.
-            write: sends a new value; None: nothing is ever written.
+            rules: of the back-end; without any the audit is done.
+            ask: sends a question for a parameter. write: sends a new value; None: nothing is ever written.
             tell: is handed the table, once.
         """
-        self.rules, self._ask, self._write, self._tell = tuple(rules), ask, write, tell
+        self.rules, self._ask, self._write, self._tell = {rule.name: rule for rule in rules}, ask, write, tell
         self.found: dict[str, float] = {}
         self.refused: dict[str, str] = {}
         self.written: list[str] = []
@@ -79,23 +69,17 @@ class Audit:
         self.problems: list[str] = []
 
     def refuse(self, name: str, error: int) -> None:
-        """Take an answer that there is no value.
-
-        Args:
-            name: of the parameter.
-            error: MAV_PARAM_ERROR.
-        """
-        if not self.done and any(rule.name == name for rule in self.rules):
+        """Take an answer that there is no value: a MAV_PARAM_ERROR."""
+        if not self.done and name in self.rules:
             self.refused[name] = "no such parameter" if error == NO_SUCH_PARAMETER else f"refused with error {error}"
 
     def feed(self, name: str, value: float) -> None:
         """Take an answer."""
-        rule = next((rule for rule in self.rules if rule.name == name), None)
+        rule = self.rules.get(name)
         if self.done or rule is None or self._settling(name):
             return
         self.found[name] = value
-        wrong = not rule.good(value)
-        if wrong and self._write is not None and rule.value is not None and name not in self.written:
+        if not rule.good(value) and self._write is not None and rule.value is not None and name not in self.written:
             self.written.append(name)
             self._written_at[name] = self._now
             del self.found[name]  # it counts when it was read back
@@ -109,15 +93,15 @@ class Audit:
         self._now = now
         if self.done:
             return
-        if self._begun is None:
-            self._begun = now
+        self._begun = now if self._begun is None else self._begun
         waited = now - self._begun
-        missing = [
-            rule.name for rule in self.rules
-            if rule.name not in self.found and rule.name not in self.refused and not (rule.optional and waited > GIVE_UP_OPTIONAL)
-        ]  # fmt: skip
+        told = self.found.keys() | self.refused.keys()
+        missing = [r.name for r in self.rules.values() if r.name not in told and not (r.optional and waited > GIVE_UP_OPTIONAL)]
         if not missing or waited > GIVE_UP:
-            self.done, self.problems = True, self._mismatches()
+            self.done = True
+            found = {name: f" is {value:g}" for name, value in self.found.items()}
+            found |= {name: f": {why}" for name, why in self.refused.items() if name not in found}
+            self.problems = [f"{r.name}{found.get(r.name, ' was not told')}; expected {r.expected}" for r in self._wrong()]
             if self._tell is not None:
                 self._tell(self.table())
             return
@@ -126,38 +110,28 @@ class Audit:
                 self._asked[name] = now
                 self._ask(name)
 
-    def _judged(self, rule: Rule) -> bool:
-        value = self.found.get(rule.name)
-        return rule.optional if value is None else rule.good(value)
-
-    def _mismatches(self) -> list[str]:
-        out = []
-        for rule in self.rules:
-            value = self.found.get(rule.name)
-            what = f": {self.refused[rule.name]}" if rule.name in self.refused else " was not told"
-            if not self._judged(rule):
-                out.append(f"{rule.name}{what if value is None else f' is {value:g}'}; expected {rule.expected}")
-        return out
+    def _wrong(self) -> list[Rule]:
+        """Return rules that what was found breaks."""
+        found = self.found
+        return [r for r in self.rules.values() if not (r.good(found[r.name]) if r.name in found else r.optional)]
 
     def fault(self) -> str | None:
-        """What ends the run, in short; the table has it in full."""
+        """Return what ends the run, in short; the table has it in full."""
         if not self.problems:
             return None
-        names = [rule.name for rule in self.rules if not self._judged(rule)]
+        names = [rule.name for rule in self._wrong()]
         more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
         return f"parameter audit: {', '.join(names[:MOST_NAMED])}{more} wrong, see the table"
 
     def table(self) -> str:
-        """Parameter, found, expected, why, a line each."""
-        rows = [("", "parameter", "found", "expected", "why")]
-        for rule in self.rules:
-            value = self.found.get(rule.name)
-            mark = "ok" if self._judged(rule) else "WRONG"
-            shown = self.refused.get(rule.name, "no answer") if value is None else f"{value:g}"
-            shown += " (written)" if rule.name in self.written else ""
-            rows.append((mark, rule.name, shown, rule.expected, rule.why))
+        """Return parameter, found, expected, why, a line each."""
+        rows, wrong = [("", "parameter", "found", "expected", "why")], self._wrong()
+        for name, rule in self.rules.items():
+            shown = f"{self.found[name]:g}" if name in self.found else self.refused.get(name, "no answer")
+            shown += " (written)" if name in self.written else ""
+            rows.append(("WRONG" if rule in wrong else "ok", name, shown, rule.expected, rule.why))
         widths = [max(len(row[i]) for row in rows) for i in range(4)]
         lines = ["  ".join([*(cell.ljust(w) for cell, w in zip(row, widths)), row[4]]).rstrip() for row in rows]
-        if any(row[0] == "WRONG" for row in rows):
+        if wrong:
             lines.append("The runner does not fly with these; set them, or let it write them with --write-parameters.")
         return "\n".join(lines)

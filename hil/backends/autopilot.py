@@ -8,17 +8,17 @@ import struct
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 from hil.backends.audit import Audit, Rule
-from hil.backends.base import FOLLOW, HOLD, LAND, WAIT, Release, Releasing, Status
+from hil.backends.base import FOLLOW, HOLD, LAND, WAIT, Autopilot, Release
 from hil.backends.thrust import ThrustParams
 from hil.links.mavlink_link import Link, attitude_target
 from hil.links.pymav import mav
-from hil.links.roster import Party
+from hil.links.roster import MavlinkId, Party
+from visthrow.config.bounds import Bound, Bounded, NotNegative, Positive
 
-ASK_AGAIN = 0.1
-"""Between two requests for a mode or for arming [s]."""
+ASK_AGAIN = 0.1  # between two requests for a mode or for arming [s]
 
 STREAM = (
     (mav.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW, 5_000), (mav.MAVLINK_MSG_ID_ATTITUDE_TARGET, 50_000),
@@ -27,70 +27,38 @@ STREAM = (
 """Messages asked for at connect and their periods [us]: read-back of the mechanism, share of thrust in hover, and the mode, which a
 heartbeat of 1 Hz tells up to a second late."""
 
-SERVO_NEAR = 50
-"""An output this near to where the mechanism is open counts as open [us]."""
+SERVO_NEAR = 50  # an output this near to where the mechanism is open counts as open [us]
 
 ARMED = mav.MAV_MODE_FLAG_SAFETY_ARMED
 CUSTOM = mav.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
 
 
 @dataclass(frozen=True)
-class AutopilotParams:
-    """A vehicle that speaks MAVLink.
+class AutopilotParams(Bounded):
+    """A vehicle that speaks MAVLink."""
 
-    Raises:
-        ValueError: a number out of its range.
-    """
-
-    system: int  # MAVLink id of the vehicle
-    component: int  # of its autopilot
+    system: MavlinkId  # MAVLink id of the vehicle
+    component: MavlinkId  # of its autopilot
     thrust: ThrustParams
-    mechanism_lag: float  # from the release command to separation [s]
-    release_timeout: float  # without a final answer the release has failed [s]
-    heartbeat_timeout: float  # silence after which the autopilot counts as lost [s]
+    mechanism_lag: NotNegative  # from the release command to separation [s]
+    release_timeout: Positive  # without a final answer the release has failed [s]
+    heartbeat_timeout: Positive  # silence after which the autopilot counts as lost [s]
     take: bool  # take the vehicle out of its holding mode when all is ready; else the pilot's switch hands it over
     arm: bool  # arm it when it is taken: bench and software only; else the pilot arms
     audit: bool  # read parameters at connect and refuse to fly on a mismatch
-    servo_output: int  # output of SERVO_OUTPUT_RAW that the mechanism hangs on, from 1; 0: not read back
-    servo_open_us: int  # there, with the mechanism open [us]
-
-    def __post_init__(self) -> None:
-        if min(self.release_timeout, self.heartbeat_timeout) <= 0.0 or self.mechanism_lag < 0.0:
-            raise ValueError(
-                f"autopilot: release_timeout {self.release_timeout}, heartbeat_timeout {self.heartbeat_timeout}, mechanism_lag "
-                f"{self.mechanism_lag} s; expected time-outs above 0, a lag of 0 or more"
-            )
-        if not (1 <= self.system <= 255 and 1 <= self.component <= 255):
-            raise ValueError(f"autopilot system {self.system}, component {self.component}; expected 1 to 255 each")
-        if not (0 <= self.servo_output <= 16 and 500 <= self.servo_open_us <= 2500):
-            raise ValueError(
-                f"servo_output {self.servo_output}, servo_open_us {self.servo_open_us}; expected 0 to 16, 500 to 2500"
-            )
+    servo_output: Annotated[int, Bound(0, 16)]  # output of SERVO_OUTPUT_RAW that the mechanism hangs on, from 1; 0: not read back
+    servo_open_us: Annotated[int, Bound(500, 2500)]  # there, with the mechanism open [us]
 
 
-class MavlinkAutopilot(Releasing, ABC):
-    """See `hil.backends.base.Backend`; the children say which modes there are and what the parameters must be.
+class MavlinkAutopilot(Autopilot, ABC):
+    """An autopilot on a MAVLink link; the children say which modes there are and what the parameters must be."""
 
-    Attributes:
-        audit: of the parameters. release_record: of this throw. texts: STATUSTEXTs, the newest last.
-        share: last share of thrust that the autopilot reported, 0 to 1. voltage: of its battery [V].
-    """
-
-    name = "autopilot"
     autopilot = mav.MAV_AUTOPILOT_GENERIC
     holds = True
 
-    def __init__(
-        self, link: Link, params: AutopilotParams, write: bool = False, tell: Callable[[str], None] | None = None
-    ) -> None:  # fmt: skip
-        """Listen to the vehicle on a link.
-
-        Args:
-            link: shared with the pose source.
-            params: the vehicle.
-            write: whether wrong parameters are written.
-            tell: is handed the table of parameters.
-        """
+    def __init__(self, link: Link, params: AutopilotParams, write: bool = False, tell: Callable[[str], None] | None = None) -> None:
+        """Listen on a link, which the pose source may share; ``tell`` is handed the audit's table. Wrong parameters are written or not."""
+        super().__init__()
         self.params, self._link, self._write, self._tell = params, link, write, tell
         self._heartbeat: Any = None
         self._heard = self._beat_at = self._asked_at = self._streamed = -1e9
@@ -105,10 +73,7 @@ class MavlinkAutopilot(Releasing, ABC):
         self.release_record = Release(params.release_timeout, params.servo_output > 0)
         self._servo = f"servo{params.servo_output}_raw"  # one string for good: Python's cache of attributes keeps each new one
         self._begin_audit()
-        self.texts: list[str] = []
-        self.share: float | None = None
-        self._exact = False
-        self.voltage: float | None = None
+        self._exact = False  # of the share
         link.listen(self._hear)
         link.roster.moved.append(self._came_back)
 
@@ -117,7 +82,7 @@ class MavlinkAutopilot(Releasing, ABC):
         self.audit = Audit(rules, self._ask_parameter, self._write_parameter if self._write else None, self._tell)
 
     def _came_back(self, party: Party) -> None:
-        """From another address it may be another vehicle of the same ids."""
+        """Begin anew with what speaks from another address: it may be another vehicle of the same ids."""
         if party.name == "autopilot":
             self._heartbeat = None
             self._streamed = -1e9
@@ -125,26 +90,26 @@ class MavlinkAutopilot(Releasing, ABC):
 
     @abstractmethod
     def _rules(self) -> list[Rule]:
-        """What its parameters must be."""
+        """Return what its parameters must be."""
 
     @abstractmethod
     def _role(self, mode: int) -> str | None:
-        """FOLLOW, HOLD or LAND by a heartbeat's custom mode; None for another one."""
+        """Return FOLLOW, HOLD or LAND by a heartbeat's custom mode; None for another one."""
 
     @abstractmethod
     def _mode_numbers(self, mode: str) -> tuple[float, float]:
-        """Second and third parameter of DO_SET_MODE."""
+        """Return the second and third parameter of DO_SET_MODE."""
 
     @abstractmethod
     def _release_command(self) -> tuple[int, tuple[float, ...]]:
-        """Command that opens the mechanism, and its parameters."""
+        """Return the command that opens the mechanism, and its parameters."""
 
     def _stored(self, value: float, kind: int) -> float:
-        """A parameter's value out of a PARAM_VALUE's field."""
+        """Return a parameter's value out of a PARAM_VALUE's field."""
         return value
 
     def _field(self, value: float, kind: int) -> float:
-        """A PARAM_SET's field for a value; inverse of :meth:`_stored`."""
+        """Return a PARAM_SET's field for a value; inverse of :meth:`_stored`."""
         return value
 
     def _hear(self, message: Any, arrival: float) -> None:
@@ -175,7 +140,7 @@ class MavlinkAutopilot(Releasing, ABC):
             self.voltage = 1e-3 * message.voltage_battery
 
     def _judge_mode(self) -> None:
-        """Whether the mode is still one of ours."""
+        """Judge whether the mode is still one of ours."""
         role = self._role(self._heartbeat.custom_mode)
         if self._wanted is None:
             return
@@ -199,7 +164,6 @@ class MavlinkAutopilot(Releasing, ABC):
             self._arm_refused = f"arming refused with result {result}" + (f": {self.texts[-1]}" if self.texts else "")
 
     def _note(self, now: float) -> tuple[str, str]:
-        """What is wrong, or nothing; and what the autopilot does."""
         p, beat = self.params, self._heartbeat
         if beat is None or now - self._heard > p.heartbeat_timeout:
             return "no heartbeat" if beat is None else f"no heartbeat for {now - self._heard:.1f} s", WAIT
@@ -224,12 +188,7 @@ class MavlinkAutopilot(Releasing, ABC):
 
     @abstractmethod
     def _expected_modes(self) -> str:
-        """Modes that a throw may begin in, in words."""
-
-    def status(self, now: float) -> Status:
-        note, mode = self._note(now)
-        fault = self.audit.fault()
-        return Status(not note and fault is None, note or self.release_record.note, self.release_record.state, mode, fault)
+        """Return modes that a throw may begin in, in words."""
 
     def send(self, command: tuple[float, ...], now: float) -> bool:
         p = self.params
@@ -238,7 +197,7 @@ class MavlinkAutopilot(Releasing, ABC):
         return self._link.send(attitude_target(now, (p.system, p.component), share, (x, -y, -z)))
 
     def ask(self, mode: str, now: float) -> None:
-        """See `Backend`: asks until the heartbeat shows the mode."""
+        """Ask until the heartbeat shows the mode."""
         if mode != self._wanted:
             if self._wanted is None and self._heartbeat is not None:  # the first one that is ours was the pilot's
                 self._may.add(self._role(self._heartbeat.custom_mode))
@@ -274,17 +233,10 @@ class MavlinkAutopilot(Releasing, ABC):
     def abort(self, now: float) -> None:
         self.ask(LAND, now)
 
-    def finish(self, now: float) -> None:
-        """See `Backend`: its landing mode disarms it."""
-
-    def close(self) -> None:
-        """See `Backend`: the link is the source's."""
-
     def _command(self, number: int, confirmation: int, *values: float) -> None:
         p = self.params
         seven = [*map(float, values), *([0.0] * (7 - len(values)))]
-        message = mav.MAVLink_command_long_message(p.system, p.component, number, min(confirmation, 255), *seven)
-        self._link.send(message)
+        self._link.send(mav.MAVLink_command_long_message(p.system, p.component, number, min(confirmation, 255), *seven))
 
     def _ask_parameter(self, name: str) -> None:
         p = self.params
@@ -292,15 +244,14 @@ class MavlinkAutopilot(Releasing, ABC):
 
     def _write_parameter(self, name: str, value: float) -> None:
         p, kind = self.params, self._kinds.get(name, mav.MAV_PARAM_TYPE_REAL32)
-        field = self._field(value, kind)
-        self._link.send(mav.MAVLink_param_set_message(p.system, p.component, name.encode(), field, kind))
+        self._link.send(mav.MAVLink_param_set_message(p.system, p.component, name.encode(), self._field(value, kind), kind))
 
 
 def bytes_to_integer(value: float) -> float:
-    """The integer whose bytes stand in a float field, as PX4 writes them."""
+    """Return the integer whose bytes stand in a float field, as PX4 writes them."""
     return float(struct.unpack("<i", struct.pack("<f", value))[0])
 
 
 def integer_to_bytes(value: float) -> float:
-    """The float field whose bytes are those of an integer."""
+    """Return the float field whose bytes are those of an integer."""
     return struct.unpack("<f", struct.pack("<i", int(value)))[0]

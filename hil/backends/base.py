@@ -2,19 +2,16 @@
 
 from dataclasses import dataclass
 from time import perf_counter
-from typing import Any, Protocol
 
+from hil.backends.audit import Audit
 from hil.links.device import Port
 
-IDLE, PENDING, ACCEPTED, FAILED = "idle", "pending", "accepted", "failed"
-"""How far a release has come."""
+IDLE, PENDING, ACCEPTED, FAILED = "idle", "pending", "accepted", "failed"  # how far a release has come
 
 WAIT, FOLLOW, HOLD, LAND = "wait", "follow", "hold", "land"
 """What the autopilot does: it is in other hands, follows commands, holds its place by itself, lands by itself."""
 
-
-ROUNDING = 1e-6
-"""Tolerance of times that are sums [s]: a microsecond early is in time."""
+ROUNDING = 1e-6  # tolerance of times that are sums [s]: a microsecond early is in time
 
 
 @dataclass(frozen=True)
@@ -28,20 +25,22 @@ class Status:
     fault: str | None = None  # what ends the run, whatever else is well: a parameter audit that failed
 
 
-class Backend(Protocol):
-    """Where commands go; no call waits or raises."""
+class Backend:
+    """Where commands go; no call waits or raises. What a child leaves out does nothing."""
 
-    name: str
-    holds: bool  # whether the autopilot has modes of its own that hold a place and land
+    name = ""
+    holds = False  # whether the autopilot has modes of its own that hold a place and land
 
     def status(self, now: float) -> Status:
-        """What is known now."""
+        """Return what is known now."""
+        raise NotImplementedError
 
     def send(self, command: tuple[float, ...], now: float) -> bool:
         """Send collective thrust [N] and body rates [rad/s], body frame x forward, y left, z up; whether it was taken."""
+        raise NotImplementedError
 
     def ask(self, mode: str, now: float) -> None:
-        """Ask for FOLLOW, HOLD or LAND; called at every tick while it is wanted. Does nothing where there is none."""
+        """Ask for FOLLOW, HOLD or LAND; called at every tick while it is wanted."""
 
     def release(self, when: float) -> None:
         """Open the mechanism at a time [s] on the runner's clock; called once a throw."""
@@ -56,36 +55,55 @@ class Backend(Protocol):
         """Do what is due: heartbeats, the release, its repetition."""
 
     def due(self) -> float | None:
-        """When :meth:`service` is to be called at the latest [s]; None for the next tick."""
+        """Return when :meth:`service` is to be called at the latest [s]; None for the next tick."""
+        return None
 
     def abort(self, now: float) -> None:
         """Ask the autopilot to land; called at every tick of an aborted run. A pilot who has taken over is left alone."""
 
     def finish(self, now: float) -> None:
-        """The run is over: put the autopilot at rest as far as that is ours."""
+        """Put the autopilot at rest, as far as that is ours: the run is over."""
 
     def close(self) -> None:
         """Give back ports of its own."""
+
+
+class DryRun(Backend):
+    """Sends nothing; counts what it was given."""
+
+    name = "dry-run"
+
+    def __init__(self) -> None:
+        self.commands = self.releases = 0
+        self._release = IDLE
+
+    def status(self, now: float) -> Status:
+        return Status(True, "dry run", self._release)
+
+    def send(self, command: tuple[float, ...], now: float) -> bool:
+        self.commands += 1
+        return True
+
+    def release(self, when: float) -> None:
+        self.releases += 1
+        self._release = ACCEPTED
+
+    def rearm(self) -> None:
+        self._release = IDLE
 
 
 class Release:
     """One release: sent at its time, repeated until it is answered, never again once it was answered or stopped.
 
     Attributes:
-        state: IDLE, PENDING, ACCEPTED or FAILED. sends: of this throw. note: how it ended.
+        state: IDLE, PENDING, ACCEPTED or FAILED. sends: of this throw. note: how it ended. at: of the next send [s].
         answers: of all throws, from the first send to the first answer [s].
     """
 
-    REPEAT = 0.04
-    """Between two sends that have no answer yet [s]; answers take 1 to 3 ms."""
+    REPEAT = 0.04  # between two sends that have no answer yet [s]; answers take 1 to 3 ms
 
     def __init__(self, timeout: float, read_back: bool = False) -> None:
-        """Start at rest.
-
-        Args:
-            timeout: without a final answer, and a movement where it is read back, the release has failed [s].
-            read_back: whether an acceptance counts only when the mechanism was seen to move.
-        """
+        """Start at rest. Without a final answer within the time-out [s], and a movement where it is read back, it has failed."""
         self.timeout, self.read_back = timeout, read_back
         self.answers: list[float] = []
         self.reset()
@@ -93,7 +111,7 @@ class Release:
     def reset(self) -> None:
         """Forget the last throw."""
         self.state, self.note, self.sends = IDLE, "", 0
-        self.at: float | None = None  # of the next send [s]
+        self.at: float | None = None
         self._first = 0.0
         self._sent: float | None = None  # until the first answer
         self._answered = self._moved = self._closed = False
@@ -124,14 +142,14 @@ class Release:
             self._judge()
 
     def output(self, is_open: bool) -> None:
-        """The mechanism's output was seen; it has moved when it is open, and was seen closed in this throw before."""
+        """Note where the mechanism's output is; it has moved when it is open, and was seen closed in this throw before."""
         self._closed |= not is_open
         if is_open and self._closed and self.state == PENDING and self.sends:
             self._moved = True
             self._judge()
 
     def due(self, now: float) -> bool:
-        """Whether to send it now; the caller does."""
+        """Return whether to send it now; the caller does."""
         if self.state != PENDING:
             return False
         if now - self._first > self.timeout:
@@ -153,14 +171,35 @@ class Release:
         self.state, self.note, self.at = state, note, None
 
 
-class Releasing:
-    """What back-ends do alike whose release is a `Release`; see `Backend`.
+class Autopilot(Backend):
+    """An autopilot with a release that is answered and settings that are audited; the children speak its protocol.
 
     Attributes:
-        release_record: of this throw.
+        audit: of its settings. release_record: of this throw. texts: that it said, the newest last.
+        share: last share of thrust that it reported, 0 to 1. voltage: of its battery [V].
     """
 
+    audit = Audit()
     release_record: Release
+    share: float | None = None
+    voltage: float | None = None
+
+    def __init__(self) -> None:
+        self.texts: list[str] = []
+
+    def _note(self, now: float) -> tuple[str, str]:
+        """Return what is wrong, or nothing; and what the autopilot does."""
+        raise NotImplementedError
+
+    def _hint(self) -> str:
+        """Return what it waits for, though nothing is wrong."""
+        return ""
+
+    def status(self, now: float) -> Status:
+        note, mode = self._note(now)
+        fault = self.audit.fault()
+        said = note or self._hint() or self.release_record.note
+        return Status(not note and fault is None, said, self.release_record.state, mode, fault)
 
     def release(self, when: float) -> None:
         self.release_record.start(when)
@@ -175,26 +214,33 @@ class Releasing:
         return self.release_record.at
 
 
-class OnPort(Releasing):
+class OnPort(Autopilot):
     """A flight controller on a port of its own that neither holds nor lands by itself: it is taken, and given up by silence.
 
-    Attributes:
-        dropped: packets that could not be sent.
+    Where the runner falls silent its own failsafe or watchdog acts; so an abort has nothing to ask for. ``dropped`` counts packets that
+    could not be sent.
     """
 
-    holds = False
+    protocol = ""
 
-    def __init__(self, port: Port) -> None:
-        """Take an open port."""
-        self._port, self.dropped = port, 0
+    def __init__(self, port: Port, silence: float) -> None:
+        """Take an open port; after a silence [s] the controller counts as lost."""
+        super().__init__()
+        self._port, self._silence, self._heard, self.dropped = port, silence, -1e9, 0
         self._taken = self._raised = self._over = False  # asked for; has followed; over
 
-    def ask(self, mode: str, now: float) -> None:
-        """See `Backend`: takes the vehicle."""
-        self._taken |= mode == FOLLOW
+    def _note(self, now: float) -> tuple[str, str]:
+        silence = now - self._heard
+        if silence <= self._silence:
+            return self._known()
+        return f"no answer by {self.protocol}" + (f" for {silence:.1f} s" if self._heard >= 0.0 else ""), WAIT
 
-    def abort(self, now: float) -> None:
-        """See `Backend`: nothing to ask for; where the runner falls silent, the vehicle's own failsafe or watchdog acts."""
+    def _known(self) -> tuple[str, str]:
+        """Return the same as `_note`, of one that is heard."""
+        raise NotImplementedError
+
+    def ask(self, mode: str, now: float) -> None:
+        self._taken |= mode == FOLLOW
 
     def close(self) -> None:
         self._port.close()
@@ -203,37 +249,3 @@ class OnPort(Releasing):
         taken = self._port.write(data)
         self.dropped += not taken
         return taken
-
-
-class DryRun:
-    """Sends nothing; counts what it was given."""
-
-    name = "dry-run"
-    holds = False
-
-    def __init__(self) -> None:
-        """Start with nothing sent."""
-        self.commands = self.releases = 0
-        self._release = IDLE
-
-    def status(self, now: float) -> Status:
-        return Status(True, "dry run", self._release)
-
-    def send(self, command: tuple[float, ...], now: float) -> bool:
-        self.commands += 1
-        return True
-
-    def release(self, when: float) -> None:
-        self.releases += 1
-        self._release = ACCEPTED
-
-    def rearm(self) -> None:
-        self._release = IDLE
-
-    def due(self) -> float | None:
-        return None
-
-    def _nothing(self, *_: Any) -> None:
-        """See `Backend`."""
-
-    ask = stop_release = service = abort = finish = close = _nothing

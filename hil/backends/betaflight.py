@@ -16,38 +16,25 @@ msp_box.c (permanent ids); src/main/fc/runtime_config.c (armingDisableFlagNames)
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated
 
 from hil.backends.audit import Audit, Rule, equal
-from hil.backends.base import ACCEPTED, FOLLOW, PENDING, WAIT, OnPort, Release, Status
+from hil.backends.base import ACCEPTED, FOLLOW, PENDING, WAIT, OnPort, Release
 from hil.backends.rates import MIDDLE, RATES_TYPES, RatesParams, Sticks
 from hil.backends.thrust import ThrustParams
 from hil.links import msp
 from hil.links.device import Port, chunks
+from visthrow.common.errors import ConfigError
+from visthrow.config.bounds import Bound, Bounded, NotNegative, Positive
 
-BOX_ARM, BOX_OVERRIDE = 0, 50
-"""Permanent ids of flight modes."""
-
-STICKS = 4
-"""Channels before the first AUX."""
-
-LOW, HIGH = 1000, 2000
-"""Ends of a channel [us]."""
-
-NEAR = 50
-"""A channel or output this near to its target has arrived [us]."""
-
-KEEP_ALIVE = 0.02
-"""Between two frames while nothing is commanded yet: a receiver that is silent cannot be armed [s]."""
-
-OPEN_TIME = 2.0
-"""After which the mechanism closes again, so that the next payload can be hung on [s]."""
-
-ARM_LOW = 0.5
-"""For which nothing may speak against arming before ARM is raised, or raised again [s]."""
-
-FORWARDING = 1 << 20
-"""Bit of CHANNEL_FORWARDING in MSP_FEATURE_CONFIG."""
+BOX_ARM, BOX_OVERRIDE = 0, 50  # permanent ids of flight modes
+STICKS = 4  # channels before the first AUX
+LOW, HIGH = 1000, 2000  # ends of a channel [us]
+NEAR = 50  # a channel or output this near to its target has arrived [us]
+KEEP_ALIVE = 0.02  # between two frames while nothing is commanded yet: a receiver that is silent cannot be armed [s]
+OPEN_TIME = 2.0  # after which the mechanism closes again, so that the next payload can be hung on [s]
+ARM_LOW = 0.5  # for which nothing may speak against arming before ARM is raised, or raised again [s]
+FORWARDING = 1 << 20  # bit of CHANNEL_FORWARDING in MSP_FEATURE_CONFIG
 
 BLOCKS = (
     "no gyro", "failsafe", "receiver lost", "the receiver is back: ARM must go low first", "failsafe switch", "runaway take-off",
@@ -58,8 +45,7 @@ BLOCKS = (
 """Bits of the arming-disabled flags of MSP_STATUS in words; the highest of a version is the ARM switch itself, which is raised while
 another one is set."""
 
-POLLS = {msp.STATUS: 0.1, msp.RC: 0.1, msp.SERVO: 0.1, msp.ANALOG: 1.0}
-"""What is asked for all the time, and how often [s]."""
+POLLS = {msp.STATUS: 0.1, msp.RC: 0.1, msp.SERVO: 0.1, msp.ANALOG: 1.0}  # what is asked for all the time, and how often [s]
 
 READ_BACK = 0.04
 """Between two questions for the release [s]. The firmware takes one command in a turn of its serial ports, 100 turns a second by its
@@ -69,78 +55,53 @@ AXES = ("roll", "pitch", "yaw")
 
 
 @dataclass(frozen=True)
-class BetaflightParams:
-    """The vehicle on the other side.
-
-    Raises:
-        ValueError: a number out of its range.
-    """
+class BetaflightParams(Bounded):
+    """The vehicle on the other side."""
 
     device: str  # of MSP, see hil.links.device
     remote: bool  # whether the device may leave this machine
     thrust: ThrustParams
     rates: RatesParams
-    minimum_us: int  # min_check: throttle that counts as 0 [us]
-    arm_channel: int  # AUX that arms, from 1; 0: the pilot arms and hands over by MSP OVERRIDE
-    release_channel: int  # AUX that opens the mechanism, from 1
+    minimum_us: Annotated[int, Bound(900, 1200)]  # min_check: throttle that counts as 0 [us]
+    arm_channel: Annotated[int, Bound(0, 12)]  # AUX that arms, from 1; 0: the pilot arms and hands over by MSP OVERRIDE
+    release_channel: Annotated[int, Bound(1, 12)]  # AUX that opens the mechanism, from 1
     servo_output: int  # of MSP_SERVO that the mechanism hangs on, from 1; 0: not read back
     servo_open_us: int  # there, with the mechanism open [us]
-    mechanism_lag: float  # from the AUX's change to separation [s]
-    release_timeout: float  # without a read-back the release has failed [s]
-    silence: float  # after which the flight controller counts as lost [s]
+    mechanism_lag: NotNegative  # from the AUX's change to separation [s]
+    release_timeout: Positive  # without a read-back the release has failed [s]
+    silence: Positive  # after which the flight controller counts as lost [s]
     audit: bool  # read settings at connect and refuse to fly on a mismatch
 
     def __post_init__(self) -> None:
-        if min(self.release_timeout, self.silence) <= 0.0 or self.mechanism_lag < 0.0 or not 900 <= self.minimum_us <= 1200:
-            raise ValueError(
-                f"betaflight: release_timeout {self.release_timeout}, silence {self.silence}, mechanism_lag "
-                f"{self.mechanism_lag} s, minimum_us {self.minimum_us}; expected times above 0, a lag of 0 or more, 900 to 1200"
-            )
-        if not (0 <= self.arm_channel <= 12 and 1 <= self.release_channel <= 12 and self.arm_channel != self.release_channel):
-            raise ValueError(
-                f"arm_channel {self.arm_channel}, release_channel {self.release_channel}; expected AUX 0 to 12 and 1 to 12, "
-                "not the same"
-            )
+        super().__post_init__()
+        if self.arm_channel == self.release_channel:
+            raise ConfigError(f"arm_channel and release_channel are both AUX {self.arm_channel}; expected two")
 
 
 class Betaflight(OnPort):
-    """See `hil.backends.base.Backend`.
+    """A Betaflight flight controller; ``refused`` counts commands that it did not know."""
 
-    Attributes:
-        audit: of the settings. release_record: of this throw. refused: commands that the flight controller did not know.
-        share: last share of thrust by its own channels, 0 to 1. voltage: of its battery [V].
-    """
+    name, protocol = "betaflight", "MSP"
 
-    name = "betaflight"
-
-    def __init__(
-        self, port: Port, params: BetaflightParams, write: bool = False, tell: Callable[[str], None] | None = None
-    ) -> None:  # fmt: skip
-        """Speak MSP on an open port.
-
-        Args:
-            port: of the flight controller.
-            params: the vehicle.
-            write: whether wrong rates are written.
-            tell: is handed the table of settings.
-        """
-        super().__init__(port)
+    def __init__(self, port: Port, params: BetaflightParams, write: bool = False, tell: Callable[[str], None] | None = None) -> None:
+        """Speak MSP on an open port; ``tell`` is handed the table of settings, and wrong rates are written or not."""
+        super().__init__(port, params.silence)
         self.params, self.parser = params, msp.Parser()
         self.sticks = Sticks(params.rates)
         self.release_record = Release(params.release_timeout, params.servo_output > 0)
-        rules = self._rules() if params.audit else ()
-        self.audit = Audit(rules, self._ask_setting, self._write_setting if write else None, tell)
+        self.audit = Audit(
+            self._rules() if params.audit else (), lambda name: self._write(SETTINGS[name].command),
+            self._write_setting if write else None, tell,
+        )  # fmt: skip
         self._order: list[int] = []  # rcmap: where roll, pitch, yaw, throttle stand in a frame; empty: not told yet
         self._boxes: tuple[int, ...] = ()
         self._tuning = b""
         self._polled = dict.fromkeys(POLLS, -1e9)
-        self._heard = self._framed = self._boxed = self._read_back = -1e9
+        self._framed = self._boxed = self._read_back = -1e9
         self._flags = self._blocks = 0
         self._free_since: float | None = None  # since when nothing speaks against arming, with ARM low
         self._sticks_us = (MIDDLE, MIDDLE, MIDDLE, LOW)  # roll, pitch, yaw, throttle
         self._opened: float | None = None
-        self.share: float | None = None
-        self.voltage: float | None = None
         self.refused = 0
 
     def _rules(self) -> list[Rule]:
@@ -149,10 +110,8 @@ class Betaflight(OnPort):
             Rule("api_version", "1.43 or newer", "older ones do not tell their rates type", lambda v: v >= 1.43),
             equal("rates_type", RATES_TYPES[p.rates.type], "the curve that sticks are computed by"),
         ]
-        for i, axis in enumerate(AXES):
-            rules.append(equal(f"{axis}_rc_rate", p.rates.rc_rates[i], "as above"))
-            rules.append(equal(f"{axis}_rate", p.rates.rates[i], "as above"))
-            rules.append(equal(f"{axis}_expo", p.rates.expo[i], "as above"))
+        curves = {"rc_rate": p.rates.rc_rates, "rate": p.rates.rates, "expo": p.rates.expo}
+        rules += [equal(f"{axis}_{name}", values[i], "as above") for i, axis in enumerate(AXES) for name, values in curves.items()]
         rules += [
             equal("throttle_limit_type", 0.0, "else full throttle is not full", False),
             equal("throttle_expo", 0.0, "thrust is computed for a straight line", False),
@@ -172,24 +131,15 @@ class Betaflight(OnPort):
             rules.append(Rule("override_aux", "any AUX", "the pilot's switch of MSP OVERRIDE", lambda v: v > 0.0))
         return rules
 
-    def status(self, now: float) -> Status:
-        fault = self.audit.fault()
-        note, mode = self._note(now)
-        said = note or self._hint() or self.release_record.note
-        return Status(not note and fault is None, said, self.release_record.state, mode, fault)
-
     def _hint(self) -> str:
-        """What it waits for, though nothing is wrong."""
         if not self._taken or self._raised:
             return ""
         if self.params.arm_channel:
             return f"arming disabled: {blocked(self._blocks)}" if self._blocks else "it is being armed"
         return "" if self._box(BOX_OVERRIDE) else "MSP OVERRIDE is off: switch it on to hand over"
 
-    def _note(self, now: float) -> tuple[str, str]:
+    def _known(self) -> tuple[str, str]:
         p = self.params
-        if now - self._heard > p.silence:
-            return "no answer by MSP" if self._heard < 0.0 else f"no answer by MSP for {now - self._heard:.1f} s", WAIT
         if not (self.audit.done and self._boxes and self._order):
             return "settings are being read", WAIT
         armed, ours = self._box(BOX_ARM), p.arm_channel > 0 or self._box(BOX_OVERRIDE)
@@ -230,13 +180,13 @@ class Betaflight(OnPort):
         return self._write(msp.SET_RAW_RC, struct.pack(f"<{len(channels)}H", *channels))
 
     def _arms(self, now: float) -> bool:
-        """Whether ARM is to be high: not before nothing has spoken against it for a while, and low again where something does."""
+        """Return whether ARM is to be high: not before nothing has spoken against it for a while, and low again where something does."""
         if not self._taken or self._over:
             return False
         return self._box(BOX_ARM) or (self._free_since is not None and now - self._free_since >= ARM_LOW)
 
     def stop_release(self) -> None:
-        """See `Backend`: a channel that was not read back goes back, so that nothing opens later."""
+        """Send no release any more; a channel that was not read back goes back, so that nothing opens later."""
         super().stop_release()
         if self.release_record.state != ACCEPTED:
             self._opened = None
@@ -246,7 +196,12 @@ class Betaflight(OnPort):
         self._opened = None
 
     def service(self, now: float) -> None:
-        self._pump(now)
+        for data in chunks(self._port):
+            for frame in self.parser.parse(data):
+                if frame.direction == msp.ANSWER:
+                    self._hear(frame, now)
+                elif frame.direction == msp.REFUSAL:
+                    self.refused += 1
         for command, period in POLLS.items():
             if now - self._polled[command] >= period and (command != msp.SERVO or self.release_record.read_back):
                 self._polled[command] = now
@@ -272,7 +227,7 @@ class Betaflight(OnPort):
             self._frame(now)
 
     def finish(self, now: float) -> None:
-        """See `Backend`: disarms where the arming channel is ours."""
+        """Disarm where the arming channel is ours."""
         self._over = True
         self._sticks_us = (MIDDLE, MIDDLE, MIDDLE, LOW)
         if self.params.arm_channel:
@@ -281,45 +236,40 @@ class Betaflight(OnPort):
     def _write(self, command: int, payload: bytes = b"") -> bool:
         return self._put(msp.pack(msp.Frame(command, payload)))
 
-    def _pump(self, now: float) -> None:
-        for data in chunks(self._port):
-            for frame in self.parser.parse(data):
-                if frame.direction == msp.ANSWER:
-                    self._hear(frame, now)
-                elif frame.direction == msp.REFUSAL:
-                    self.refused += 1
-
     def _hear(self, frame: msp.Frame, now: float) -> None:
-        readers: dict[int, Callable[[msp.Frame], Any]] = {
-            msp.STATUS: self._hear_status, msp.RC: self._hear_channels, msp.ANALOG: self._hear_analog,
-            msp.SERVO: self._hear_servo, msp.BOXIDS: self._hear_boxes, msp.RX_MAP: self._hear_map,
-        }  # fmt: skip
+        p = self.params
         if frame.command == msp.STATUS:
             self._heard = now
-        if frame.command in readers:
-            readers[frame.command](frame)
-        if frame.command == msp.STATUS:
+            self._hear_status(frame)
             self._free_since = None if self._blocks else now if self._free_since is None else self._free_since
-        if frame.command == msp.RC_TUNING and not self.audit.written:
+        elif frame.command == msp.RC:
+            self._hear_channels(frame.words())
+        elif frame.command == msp.ANALOG and (volts := frame.number("<H", 7)):
+            self.voltage = 0.01 * volts
+        elif frame.command == msp.SERVO and 1 <= p.servo_output <= len(outputs := frame.words()):
+            self.release_record.output(abs(outputs[p.servo_output - 1] - p.servo_open_us) <= NEAR)
+        elif frame.command == msp.BOXIDS:
+            self._boxes = tuple(frame.payload)
+        elif frame.command == msp.RX_MAP and sorted(first := list(frame.payload[:STICKS])) == list(range(STICKS)):
+            self._order = first
+        elif frame.command == msp.RC_TUNING and not self.audit.written:
             self._tuning = frame.payload
-        for name, value in settings(frame, self.params).items():
+        for name, value in settings(frame, p).items():
             self.audit.feed(name, value)
             if name == "channel_forwarding" and value:
                 self.release_record.read_back = False
 
     def _hear_status(self, frame: msp.Frame) -> None:
-        flags = frame.u32(6)
-        count = frame.u8(15)  # bytes of further flags, in the low half
+        flags, count = frame.number("<I", 6), frame.number("B", 15)  # bytes of further flags, in the low half
         if flags is None or count is None:
             return
         more = frame.payload[16 : 16 + (count & 15)]
         self._flags = flags | int.from_bytes(more, "little") << 32
-        blocks = frame.u32(17 + (count & 15))
-        self._blocks = 0 if blocks is None else blocks
+        self._blocks = frame.number("<I", 17 + (count & 15)) or 0
 
-    def _hear_channels(self, frame: msp.Frame) -> None:
-        """MSP_RC tells roll, pitch, yaw, throttle, AUX 1 and on, whatever the map."""
-        channels, p = frame.words(), self.params
+    def _hear_channels(self, channels: tuple[int, ...]) -> None:
+        """Take MSP_RC: roll, pitch, yaw, throttle, AUX 1 and on, whatever the map."""
+        p = self.params
         if len(channels) < STICKS:
             return
         self.share = min(max((channels[3] - p.minimum_us) / (HIGH - p.minimum_us), 0.0), 1.0)
@@ -327,82 +277,68 @@ class Betaflight(OnPort):
         if at < len(channels) and abs(channels[at] - HIGH) <= NEAR:
             self.release_record.answer(True)
 
-    def _hear_analog(self, frame: msp.Frame) -> None:
-        volts = frame.u16(7)
-        self.voltage = 0.01 * volts if volts else self.voltage
-
-    def _hear_servo(self, frame: msp.Frame) -> None:
-        outputs, at = frame.words(), self.params.servo_output - 1
-        if 0 <= at < len(outputs):
-            self.release_record.output(abs(outputs[at] - self.params.servo_open_us) <= NEAR)
-
-    def _hear_boxes(self, frame: msp.Frame) -> None:
-        self._boxes = tuple(frame.payload)
-
-    def _hear_map(self, frame: msp.Frame) -> None:
-        first = list(frame.payload[:STICKS])
-        if sorted(first) == list(range(STICKS)):
-            self._order = first
-
-    def _ask_setting(self, name: str) -> None:
-        self._write(next((command for command, names in TOLD.items() if name in names), msp.MODE_RANGES))
-
     def _write_setting(self, name: str, value: float) -> None:
         """Write a number of the rate profile, and keep it; never while armed."""
-        if name not in TUNING or len(self._tuning) <= TUNING[name] or self._box(BOX_ARM):
+        told = SETTINGS[name]
+        if told.command != msp.RC_TUNING or len(self._tuning) <= told.at or self._box(BOX_ARM):
             return
         changed = bytearray(self._tuning)
-        changed[TUNING[name]] = int(value)
+        changed[told.at] = int(value)
         self._tuning = bytes(changed)
         self._write(msp.SET_RC_TUNING, self._tuning)
         self._write(msp.EEPROM_WRITE)
 
 
-TUNING = {
-    "roll_rc_rate": 0, "roll_expo": 1, "roll_rate": 2, "pitch_rate": 3, "yaw_rate": 4, "throttle_expo": 7, "yaw_expo": 10,
-    "yaw_rc_rate": 11, "pitch_rc_rate": 12, "pitch_expo": 13, "throttle_limit_type": 14, "rates_type": 22,
-}  # fmt: skip
-"""Places in MSP_RC_TUNING."""
+@dataclass(frozen=True)
+class Told:
+    """Where an answer tells a setting."""
 
-TOLD = {
-    msp.API_VERSION: ("api_version",), msp.RC_TUNING: tuple(TUNING), msp.RC_DEADBAND: ("deadband", "yaw_deadband"),
-    msp.RX_CONFIG: ("mid_rc", "min_check"), msp.FAILSAFE_CONFIG: ("failsafe_delay",),
-    msp.MODE_RANGES: ("arm_aux", "override_aux"), msp.FEATURE_CONFIG: ("channel_forwarding",),
+    command: int
+    at: int  # of the payload
+    code: str = "B"  # as of `struct`
+    scale: float = 1.0
+
+    def read(self, frame: msp.Frame) -> float | None:
+        """Return its value in an answer; None where that is cut short."""
+        number = frame.number(self.code, self.at)
+        return None if number is None else self.scale * number
+
+
+SETTINGS = {
+    "api_version": Told(msp.API_VERSION, 1), "deadband": Told(msp.RC_DEADBAND, 0), "yaw_deadband": Told(msp.RC_DEADBAND, 1),
+    "mid_rc": Told(msp.RX_CONFIG, 3, "<H"), "min_check": Told(msp.RX_CONFIG, 5, "<H"),
+    "failsafe_delay": Told(msp.FAILSAFE_CONFIG, 0, "B", 0.1), "channel_forwarding": Told(msp.FEATURE_CONFIG, 0, "<I"),
+    "arm_aux": Told(msp.MODE_RANGES, 0), "override_aux": Told(msp.MODE_RANGES, 0),
+    **{name: Told(msp.RC_TUNING, at) for name, at in {
+        "roll_rc_rate": 0, "roll_expo": 1, "roll_rate": 2, "pitch_rate": 3, "yaw_rate": 4, "throttle_expo": 7, "yaw_expo": 10,
+        "yaw_rc_rate": 11, "pitch_rc_rate": 12, "pitch_expo": 13, "throttle_limit_type": 14, "rates_type": 22,
+    }.items()},
 }  # fmt: skip
-"""Which answer tells which setting."""
+"""Which answer tells which setting. Four hold more than a number: see :func:`settings`."""
 
 
 def blocked(flags: int) -> str:
-    """What speaks against arming, in words."""
+    """Return what speaks against arming, in words."""
     named = [text for bit, text in enumerate(BLOCKS) if flags >> bit & 1]
     return f"{', '.join(named) or 'ARM switch'} (flags {flags:#x})"
 
 
 def settings(frame: msp.Frame, params: BetaflightParams) -> dict[str, float]:
-    """Settings that an answer tells; what is cut short tells nothing."""
-    raw: dict[str, float | None] = {}
-    if frame.command == msp.API_VERSION:
-        major, minor = frame.u8(1), frame.u8(2)
-        raw["api_version"] = None if major is None or minor is None else major + 0.01 * minor
-    elif frame.command == msp.RC_TUNING:
-        raw = {name: frame.u8(at) for name, at in TUNING.items()}
-    elif frame.command == msp.RC_DEADBAND:
-        raw = {"deadband": frame.u8(0), "yaw_deadband": frame.u8(1)}
-    elif frame.command == msp.RX_CONFIG:
-        raw = {"mid_rc": frame.u16(3), "min_check": frame.u16(5)}
-    elif frame.command == msp.FAILSAFE_CONFIG:
-        tenths = frame.u8(0)
-        raw["failsafe_delay"] = None if tenths is None else 0.1 * tenths
-    elif frame.command == msp.FEATURE_CONFIG:
-        bits = frame.u32(0)
-        raw["channel_forwarding"] = None if bits is None else float(bool(bits & FORWARDING))
-    elif frame.command == msp.MODE_RANGES:
-        raw = {"arm_aux": _aux(frame, BOX_ARM, params.arm_channel), "override_aux": _aux(frame, BOX_OVERRIDE, 0)}
-    return {name: float(value) for name, value in raw.items() if value is not None}
+    """Return settings that an answer tells; what is cut short tells nothing."""
+    read = {name: told.read(frame) for name, told in SETTINGS.items() if told.command == frame.command}
+    found = {name: float(value) for name, value in read.items() if value is not None}
+    if "api_version" in found:
+        minor = frame.number("B", 2)
+        found = {} if minor is None else {"api_version": found["api_version"] + 0.01 * minor}
+    if "channel_forwarding" in found:
+        found["channel_forwarding"] = float(bool(int(found["channel_forwarding"]) & FORWARDING))
+    if frame.command == msp.MODE_RANGES:
+        found = {"arm_aux": _aux(frame, BOX_ARM, params.arm_channel), "override_aux": _aux(frame, BOX_OVERRIDE, 0)}
+    return found
 
 
 def _aux(frame: msp.Frame, box: int, preferred: int) -> float:
-    """AUX, from 1, of a flight mode by MSP_MODE_RANGES: box, channel, first and last step of 25 us; 0: none."""
+    """Return AUX, from 1, of a flight mode by MSP_MODE_RANGES: box, channel, first and last step of 25 us; 0: none."""
     found = [
         frame.payload[i + 1] + 1
         for i in range(0, len(frame.payload) - 3, 4)

@@ -15,51 +15,35 @@ from hil.poses.pose import VEHICLE
 from hil.recording.record import CONFIG, TICKS, lines, require_run
 from visthrow.onboard.hover import GRAVITY
 
-CALM = 0.15
-"""Speed below which a hover counts as steady [m/s]."""
-
-LIFTED = 0.3
-"""Height above which a vehicle counts as flying [m]."""
-
-SETTLING = 50
-"""Ticks at the beginning of a hover that are left out: a second."""
+CALM = 0.15  # speed below which a hover counts as steady [m/s]
+LIFTED = 0.3  # height above which a vehicle counts as flying [m]
+SETTLING = 50  # ticks at the beginning of a hover that are left out: a second
 
 
 class AutopilotCheck:
     """Listens to an autopilot without commanding it."""
 
     def __init__(self, params: Any, backend: Any) -> None:
-        """Begin with nothing heard.
-
-        Args:
-            params: `hil.params.HilParams`; a dry run has no autopilot.
-            backend: of the run.
-        """
+        """Begin with nothing heard of the back-end; a dry run has no autopilot."""
         self.backend = backend
         self.meter = None if params.backend == "dry-run" else HoverMeter(getattr(params, params.backend).thrust)
 
     def tick(self, now: float, runner: Any) -> None:
         """Listen; the runner knows whether the vehicle hovers."""
         self.backend.service(now)
-        if self.meter is None:
-            return
         track = runner.tracks[VEHICLE]
         state = track.state(now)
-        still = state is not None and state.pos[2] > LIFTED and track.calm_speed() < CALM
-        self.meter.add(self.backend.share, still)
+        if self.meter is not None and state is not None and state.pos[2] > LIFTED and track.calm_speed() < CALM:
+            self.meter.add(self.backend.share)
         self.backend.share = None  # each report counts once
 
     def results(self, now: float, mass: float) -> list[tuple[bool, str]]:
-        """What was found: whether it is good, and in words.
-
-        Args:
-            now: [s].
-            mass: of what hovers [kg].
-        """
+        """Return what was found with a mass [kg] that hovers: whether it is good, and in words."""
         if self.meter is None:
             return []
         audit, status = self.backend.audit, self.backend.status(now)
-        print(audit.table())
+        if audit.rules:
+            print(audit.table())
         out = [] if audit.fault() is None else [(False, audit.fault())]
         if not audit.done:
             out.append((False, f"parameters were not read: {status.note or 'the time was too short'}"))
@@ -67,12 +51,7 @@ class AutopilotCheck:
 
 
 def autopilot_record(backend: Any, link: Any) -> dict[str, Any]:
-    """What a run's summary keeps of its autopilot: parameters, the last release, texts, clocks of the link's peers.
-
-    Args:
-        backend: of the run.
-        link: of the run, or None.
-    """
+    """Return what a run's summary keeps of its autopilot: parameters, the last release, texts, clocks of the link's peers."""
     out: dict[str, Any] = {"backend": backend.name}
     if hasattr(backend, "audit"):
         audit, release = backend.audit, backend.release_record
@@ -85,10 +64,7 @@ def autopilot_record(backend: Any, link: Any) -> dict[str, Any]:
 
 
 def hover_of_run(folder: str | Path) -> tuple[bool, str]:
-    """Whether the hover of a recorded run took the weight, by what the runner commanded before its throws.
-
-    Args:
-        folder: of the run.
+    """Return whether the hover of a recorded run took the weight, by what the runner commanded before its throws; and that in words.
 
     Raises:
         RunError: no folder of a run, or no steady hover in it.

@@ -11,18 +11,17 @@ Source: crazyflie-firmware, crtp_commander_rpyt.c, commander.c (COMMANDER_WDT_TI
 import math
 from dataclasses import dataclass
 
-from hil.backends.base import ACCEPTED, FOLLOW, PENDING, WAIT, OnPort, Release, Status
+from hil.backends.base import ACCEPTED, FOLLOW, PENDING, WAIT, OnPort, Release
 from hil.backends.thrust import ThrustParams
 from hil.links import crtp
 from hil.links.device import Port, chunks
 from hil.poses.pose import VEHICLE
 from hil.poses.track import Track
+from visthrow.common.errors import ConfigError
+from visthrow.config.bounds import Bounded, NotNegative, Positive
 
-FULL = 60000
-"""Most of 65535 that the firmware takes (MAX_THRUST)."""
-
-MODES = ("flightmode.stabModeRoll", "flightmode.stabModePitch")
-"""Parameters that are 0 for rates."""
+FULL = 60000  # most of 65535 that the firmware takes (MAX_THRUST)
+MODES = ("flightmode.stabModeRoll", "flightmode.stabModePitch")  # parameters that are 0 for rates
 
 ASK, KEEP_ALIVE, SET_AGAIN = 0.1, 0.02, 0.2
 """Between two questions for its state, two set-points before it is flown, two tries of a parameter [s]."""
@@ -31,59 +30,43 @@ BLOCKS = {crtp.TUMBLED: "tumbled", crtp.LOCKED: "locked: restart it"}
 
 
 @dataclass(frozen=True)
-class CrazyflieParams:
-    """The vehicle on the other side.
-
-    Raises:
-        ValueError: a number out of its range, or a parameter without a group.
-    """
+class CrazyflieParams(Bounded):
+    """The vehicle on the other side."""
 
     device: str  # radio://0/80/2M/E7E7E7E7E7, usb://0, or udpout:127.0.0.1:19850 of its software in the loop
     remote: bool  # whether a network device may leave this machine
     thrust: ThrustParams
     release_parameter: str  # of eight bits that opens the mechanism at 1: group.name of an app or a deck
-    mechanism_lag: float  # from the parameter's change to separation [s]
-    release_timeout: float  # without an answer the release has failed [s]
-    silence: float  # after which it counts as lost [s]
+    mechanism_lag: NotNegative  # from the parameter's change to separation [s]
+    release_timeout: Positive  # without an answer the release has failed [s]
+    silence: Positive  # after which it counts as lost [s]
     external_pose: bool = True  # send the vehicle's poses to its estimator
 
     def __post_init__(self) -> None:
-        if min(self.release_timeout, self.silence) <= 0.0 or self.mechanism_lag < 0.0:
-            raise ValueError(
-                f"crazyflie: release_timeout {self.release_timeout}, silence {self.silence}, mechanism_lag {self.mechanism_lag} s; "
-                "expected times above 0, a lag of 0 or more"
-            )
+        super().__post_init__()
         if not all(self.release_parameter.partition(".")[::2]) or len(crtp.set_parameter(self.release_parameter, 1)) > crtp.MOST:
-            raise ValueError(f"crazyflie.release_parameter '{self.release_parameter}'; expected group.name of at most 25 letters")
+            raise ConfigError(f"crazyflie.release_parameter '{self.release_parameter}'; expected group.name of at most 25 letters")
 
 
 class Crazyflie(OnPort):
-    """See `hil.backends.base.Backend`.
+    """A Crazyflie; ``poses`` counts those that went to its estimator."""
 
-    Attributes:
-        release_record: of this throw. poses: that went to its estimator.
-    """
-
-    name = "crazyflie"
+    name, protocol = "crazyflie", "CRTP"
 
     def __init__(self, port: Port, params: CrazyflieParams) -> None:
         """Speak CRTP on an open port."""
-        super().__init__(port)
+        super().__init__(port, params.silence)
         self.params = params
         self.release_record = Release(params.release_timeout)
         self.poses = 0
-        self._state, self._heard = 0, -1e9
+        self._state = 0
         self._told: dict[str, bool] = dict.fromkeys(MODES, False)  # whether its answer came
         self._asked = self._sent = self._set = -1e9
 
-    def status(self, now: float) -> Status:
-        note, mode = self._note(now)
-        said = note or ("it is being armed" if self._taken and not self._raised else "") or self.release_record.note
-        return Status(not note, said, self.release_record.state, mode, None)
+    def _hint(self) -> str:
+        return "it is being armed" if self._taken and not self._raised else ""
 
-    def _note(self, now: float) -> tuple[str, str]:
-        if now - self._heard > self.params.silence:
-            return "no answer by CRTP" if self._heard < 0.0 else f"no answer by CRTP for {now - self._heard:.1f} s", WAIT
+    def _known(self) -> tuple[str, str]:
         if not all(self._told.values()):
             return "its set-points are being set to rates", WAIT
         blocked = [text for bit, text in BLOCKS.items() if self._state & bit]
@@ -110,12 +93,14 @@ class Crazyflie(OnPort):
         return self._put(crtp.set_point(round(FULL * share), (x, y, z) if armed else (0.0, 0.0, 0.0)))
 
     def rearm(self) -> None:
-        """See `Backend`: the mechanism closes, so that the next payload can be hung on."""
+        """Forget the last release; the mechanism closes, so that the next payload can be hung on."""
         super().rearm()
         self._put(crtp.set_parameter(self.params.release_parameter, 0))
 
     def service(self, now: float) -> None:
-        self._pump(now)
+        for data in chunks(self._port):
+            if (packet := crtp.unpack(data)) is not None:
+                self._hear(packet, now)
         if now - self._asked >= ASK:
             self._asked = now
             self._put(crtp.ask_state())
@@ -133,16 +118,10 @@ class Crazyflie(OnPort):
             self.send((0.0, 0.0, 0.0, 0.0), now)  # without thrust: unlocks it
 
     def finish(self, now: float) -> None:
-        """See `Backend`: motors off."""
+        """Stop the motors."""
         self._over = True
         self._put(crtp.set_point(0, (0.0, 0.0, 0.0)))
         self._put(crtp.arm(False))
-
-    def _pump(self, now: float) -> None:
-        for data in chunks(self._port):
-            packet = crtp.unpack(data)
-            if packet is not None:
-                self._hear(packet, now)
 
     def _hear(self, packet: crtp.Packet, now: float) -> None:
         if (packet.port, packet.channel) == (crtp.SUPERVISOR, crtp.INFO) and packet.data[:1] == bytes([crtp.STATE | crtp.ANSWER]):

@@ -22,7 +22,7 @@ class Held:
         return getattr(self._backend, name)
 
     def send(self, command: tuple[float, ...], now: float) -> bool:
-        """See `Backend`: whether the last one that went out was taken."""
+        """Let a command wait; whether the last one that went out was taken."""
         self._waiting.append((now + self._hold, command))
         return self._taken
 
@@ -36,6 +36,6 @@ class Held:
         return min(times, default=None)
 
     def finish(self, now: float) -> None:
-        """See `Backend`: nothing goes out after it."""
+        """End; nothing goes out after it."""
         self._waiting.clear()
         self._backend.finish(now)

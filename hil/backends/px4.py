@@ -9,54 +9,35 @@ PD_GRIPPER_EN up to 1.16); the output functions (Peripheral via Actuator Set 1 i
 """
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 from hil.backends.audit import Rule, bits, equal, within
 from hil.backends.autopilot import SERVO_NEAR, AutopilotParams, MavlinkAutopilot, bytes_to_integer, integer_to_bytes
 from hil.backends.base import FOLLOW, HOLD, LAND
 from hil.links.pymav import mav
+from visthrow.config.bounds import Bound
 
-MAIN_POSCTL, MAIN_AUTO, MAIN_OFFBOARD = 3, 4, 6
-"""Main modes, bits 16 to 23 of a heartbeat's custom mode."""
-
-AUTO_LOITER, AUTO_LAND = 3, 6
-"""Sub-modes of AUTO, bits 24 to 31."""
-
-STREAM_FIRST = 1.2
-"""Set-points are streamed for this long before OFFBOARD is asked for; PX4 wants more than 1 s [s]."""
-
-STREAM_GAP = 0.3
-"""A longer pause begins the stream anew: PX4 counts on at least 2 Hz [s]."""
-
-LAND_OR_HOLD = (4.0, 5.0)
-"""Values of COM_OBL_RC_ACT: Land, Hold."""
-
-POSITION_BITS = 3
-"""Bits of EKF2_EV_CTRL: horizontal and vertical position."""
+MAIN_POSCTL, MAIN_AUTO, MAIN_OFFBOARD = 3, 4, 6  # main modes, bits 16 to 23 of a heartbeat's custom mode
+AUTO_LOITER, AUTO_LAND = 3, 6  # sub-modes of AUTO, bits 24 to 31
+STREAM_FIRST = 1.2  # set-points are streamed for this long before OFFBOARD is asked for; PX4 wants more than 1 s [s]
+STREAM_GAP = 0.3  # a longer pause begins the stream anew: PX4 counts on at least 2 Hz [s]
+LAND_OR_HOLD = (4.0, 5.0)  # values of COM_OBL_RC_ACT: Land, Hold
+POSITION_BITS = 3  # bits of EKF2_EV_CTRL: horizontal and vertical position
 
 
 @dataclass(frozen=True)
 class Px4Params(AutopilotParams):
-    """The vehicle on the other side.
-
-    Raises:
-        ValueError: a number out of its range.
-    """
+    """The vehicle on the other side."""
 
     hold: Literal["hold", "position"]  # who holds after the throw: Hold (AUTO.LOITER), or Position with the pilot's sticks
     release: Literal["gripper", "actuator"]  # DO_GRIPPER or DO_SET_ACTUATOR
-    gripper: int  # number of the gripper, or of the actuator set from 1 to 6
-    actuator_open: float  # value of DO_SET_ACTUATOR that opens, -1 to 1
+    gripper: Annotated[int, Bound(1, 6)]  # number of the gripper, or of the actuator set from 1 to 6
+    actuator_open: Annotated[float, Bound(-1.0, 1.0)]  # value of DO_SET_ACTUATOR that opens
     output_parameter: str  # that says what drives the mechanism's output, such as PWM_AUX_FUNC1; "" to leave it unread
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not (1 <= self.gripper <= 6 and -1.0 <= self.actuator_open <= 1.0):
-            raise ValueError(f"gripper {self.gripper}, actuator_open {self.actuator_open}; expected 1 to 6, -1 to 1")
 
 
 class Px4(MavlinkAutopilot):
-    """See `hil.backends.base.Backend`."""
+    """A PX4 multicopter."""
 
     name, autopilot = "px4", mav.MAV_AUTOPILOT_PX4
     params: Px4Params
@@ -87,7 +68,7 @@ class Px4(MavlinkAutopilot):
         return super().send(command, now)
 
     def ask(self, mode: str, now: float) -> None:
-        """See `Backend`; for OFFBOARD set-points are streamed first."""
+        """Ask for a mode; for OFFBOARD set-points are streamed first."""
         streamed = now - self._stream_since >= STREAM_FIRST and now - self._sent_at <= STREAM_GAP
         if mode != FOLLOW or streamed:
             super().ask(mode, now)
@@ -129,7 +110,7 @@ class Px4(MavlinkAutopilot):
         return rules
 
     def _ends(self) -> list[Rule]:
-        """The end of the output at which the mechanism is open is the one that is read back."""
+        """Return the rule that the end of the output at which the mechanism is open is the one that is read back."""
         p = self.params
         open_end = {-1.0: "MIN", 1.0: "MAX"}.get(-1.0 if p.release == "gripper" else p.actuator_open)
         if not p.servo_output or open_end is None or "FUNC" not in p.output_parameter:

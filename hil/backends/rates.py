@@ -6,47 +6,31 @@ Source: betaflight, src/main/fc/rc.c, applyBetaflightRates and applyActualRates;
 import math
 from bisect import bisect_left
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
-RATES_TYPES = {"betaflight": 0, "actual": 3}
-"""Numbers of rates_type; Raceflight (1), KISS (2) and Quick (4) are not spoken here."""
+from visthrow.config.bounds import Bound, Bounded
 
-RATE_LIMIT = 1998.0
-"""Largest rate of any set-point [deg/s]."""
+RATES_TYPES = {"betaflight": 0, "actual": 3}  # numbers of rates_type; Raceflight (1), KISS (2) and Quick (4) are not spoken here
+RATE_LIMIT = 1998.0  # largest rate of any set-point [deg/s]
+TRAVEL = 500  # from the middle of a stick to its end [us]
+MIDDLE = 1500  # middle of a stick [us]
 
-TRAVEL = 500
-"""From the middle of a stick to its end [us]."""
 
-MIDDLE = 1500
-"""Middle of a stick [us]."""
+Steep, Byte, Percent = Annotated[int, Bound(1, 255)], Annotated[int, Bound(0, 255)], Annotated[int, Bound(0, 100)]
 
 
 @dataclass(frozen=True)
-class RatesParams:
-    """A rate profile, in the numbers that the flight controller stores; roll, pitch, yaw.
-
-    Raises:
-        ValueError: a number that a byte cannot hold, or a curve that does not rise.
-    """
+class RatesParams(Bounded):
+    """A rate profile, in the numbers that the flight controller stores; roll, pitch, yaw."""
 
     type: Literal["betaflight", "actual"]
-    rc_rates: tuple[int, int, int]  # betaflight: RC rate in hundredths; actual: rate around the middle in 10 deg/s
-    rates: tuple[int, int, int]  # betaflight: super rate in hundredths; actual: rate at the end in 10 deg/s
-    expo: tuple[int, int, int]  # in hundredths
-
-    def __post_init__(self) -> None:
-        if not all(0 <= v <= 255 for v in (*self.rc_rates, *self.rates)) or not all(0 <= v <= 100 for v in self.expo):
-            raise ValueError(f"rates {vars(self)}: expected rc_rates and rates of 0 to 255, expo of 0 to 100")
-        if min(self.rc_rates) < 1:
-            raise ValueError(f"rates: rc_rates {self.rc_rates}; expected 1 or more, else the curve is flat in the middle")
+    # betaflight: RC rate in hundredths; actual: rate around the middle in 10 deg/s. At 0 the curve would be flat there.
+    rc_rates: tuple[Steep, Steep, Steep]
+    rates: tuple[Byte, Byte, Byte]  # betaflight: super rate in hundredths; actual: rate at the end in 10 deg/s
+    expo: tuple[Percent, Percent, Percent]  # in hundredths
 
     def rate(self, axis: int, stick: float) -> float:
-        """Body rate [rad/s], in the stick's direction.
-
-        Args:
-            axis: 0 roll, 1 pitch, 2 yaw.
-            stick: -1 to 1.
-        """
+        """Return the body rate [rad/s] in the stick's direction; axis 0 roll, 1 pitch, 2 yaw, stick -1 to 1."""
         size = abs(stick)
         curve = self._betaflight if self.type == "betaflight" else self._actual
         return math.copysign(math.radians(min(curve(axis, size), RATE_LIMIT)), stick)
@@ -74,7 +58,6 @@ class Sticks:
     SIGNS = (1.0, 1.0, -1.0)
 
     def __init__(self, params: RatesParams) -> None:
-        """Tabulate the curves."""
         self._tables = [[params.rate(axis, us / TRAVEL) for us in range(TRAVEL + 1)] for axis in range(3)]
 
     @property
@@ -83,13 +66,13 @@ class Sticks:
         return tuple(table[-1] for table in self._tables)
 
     def position(self, axis: int, rate: float) -> int:
-        """Position [us] that gives a body rate [rad/s] about our axis, as near as whole microseconds allow."""
+        """Return the position [us] that gives a body rate [rad/s] about our axis, as near as whole microseconds allow."""
         table, wanted = self._tables[axis], abs(rate)
         above = min(bisect_left(table, wanted), TRAVEL)
         near = above if above == 0 or table[above] - wanted <= wanted - table[above - 1] else above - 1
         return MIDDLE + int(math.copysign(near, self.SIGNS[axis] * rate))
 
     def rate(self, axis: int, us: float) -> float:
-        """Body rate [rad/s] about our axis at a position [us]."""
+        """Return the body rate [rad/s] about our axis at a position [us]."""
         stick = min(max((us - MIDDLE) / TRAVEL, -1.0), 1.0)
         return self.SIGNS[axis] * math.copysign(self._tables[axis][round(abs(stick) * TRAVEL)], stick)

@@ -13,47 +13,31 @@ Source: betaflight 4.6, src/main/flight/pid.c, pidApplyThrustLinearization and p
 import math
 from collections import deque
 from dataclasses import dataclass
+from typing import Annotated
 
+from visthrow.config.bounds import Bound, Bounded, NotNegative, Positive
 from visthrow.onboard.hover import GRAVITY
 
-LEAST_SHARES = 50
-"""Values that a mean share of hover is taken over: 5 s at 10 Hz."""
+Inside = Annotated[float, Bound(0.0, 1.0, "()")]
 
-VOLTAGE_RANGE = (0.8, 1.25)
-"""Voltages further from the calibration's are no battery's, but a wrong reading; the correction stops there."""
+LEAST_SHARES = 50  # values that a mean share of hover is taken over: 5 s at 10 Hz
+VOLTAGE_RANGE = (0.8, 1.25)  # voltages further from the calibration's are no battery's, but a wrong reading; the correction stops there
 
 
 @dataclass(frozen=True)
-class ThrustParams:
-    """The calibration of one vehicle.
+class ThrustParams(Bounded):
+    """The calibration of one vehicle."""
 
-    Raises:
-        ValueError: a number out of its range.
-    """
-
-    weight: float  # thrust of the hover that was measured [N]
-    hover: float  # share of full thrust in that hover, 0 to 1
-    slope: float  # of the thrust over the share around hover, relative to weight / hover
-    tolerance: float  # of a measured share of hover, relative; beyond it the runner does not fly
-    voltage: float  # of the battery in that hover [V]; 0: no correction for its voltage
-    exponent: float = 1.0  # of thrust over the motors' command, where the autopilot does not straighten it
-    idle: float = 0.0  # motors' command at share 0, 0 to 1
-
-    def __post_init__(self) -> None:
-        if not (self.weight > 0.0 and 0.0 < self.hover < 1.0 and 0.3 <= self.slope <= 2.0):
-            raise ValueError(
-                f"thrust: weight {self.weight} N, hover {self.hover}, slope {self.slope}; expected a weight above 0, a share "
-                "of hover between 0 and 1, and a slope of 0.3 to 2"
-            )
-        if not (1.0 <= self.exponent <= 3.0 and 0.0 <= self.idle < 0.5):
-            raise ValueError(f"thrust: exponent {self.exponent}, idle {self.idle}; expected 1 to 3, and 0 to below 0.5")
-        if not 0.0 < self.tolerance < 1.0 or self.voltage < 0.0:
-            raise ValueError(
-                f"thrust: tolerance {self.tolerance}, voltage {self.voltage} V; expected above 0 and below 1, and 0 or more"
-            )
+    weight: Positive  # thrust of the hover that was measured [N]
+    hover: Inside  # share of full thrust in that hover, 0 to 1
+    slope: Annotated[float, Bound(0.3, 2.0)]  # of the thrust over the share around hover, relative to weight / hover
+    tolerance: Inside  # of a measured share of hover, relative; beyond it the runner does not fly
+    voltage: NotNegative  # of the battery in that hover [V]; 0: no correction for its voltage
+    exponent: Annotated[float, Bound(1.0, 3.0)] = 1.0  # of thrust over the motors' command, where the autopilot does not straighten it
+    idle: Annotated[float, Bound(0.0, 0.5, "[)")] = 0.0  # motors' command at share 0, 0 to 1
 
     def share(self, thrust: float, voltage: float | None = None) -> float:
-        """Share of full thrust, 0 to 1, for a thrust [N], at the battery's voltage [V] where it is known."""
+        """Return the share of full thrust, 0 to 1, for a thrust [N], at the battery's voltage [V] where it is known."""
         relative = max(0.0, 1.0 + (thrust / self.weight - 1.0) / self.slope) ** (1.0 / self.exponent)
         share = (relative * self._command(self.hover) - self.idle) / (1.0 - self.idle)
         if self.voltage > 0.0 and voltage is not None:
@@ -63,12 +47,12 @@ class ThrustParams:
         return min(max(share, 0.0), 1.0)
 
     def thrust(self, share: float) -> float:
-        """Thrust [N] at a share, at the calibration's voltage; 0 or more."""
+        """Return the thrust [N] at a share, at the calibration's voltage; 0 or more."""
         relative = (self._command(share) / self._command(self.hover)) ** self.exponent
         return max(0.0, self.weight * (1.0 + self.slope * (relative - 1.0)))
 
     def _command(self, share: float) -> float:
-        """Motors' command, 0 to 1, at a share."""
+        """Return the motors' command, 0 to 1, at a share."""
         return self.idle + (1.0 - self.idle) * share
 
     @property
@@ -81,13 +65,12 @@ class HoverMeter:
     """Mean share of thrust while the vehicle hovers by itself."""
 
     def __init__(self, params: ThrustParams) -> None:
-        """Start empty."""
         self.params = params
         self._shares: deque[float] = deque(maxlen=20 * LEAST_SHARES)
 
-    def add(self, share: float | None, still: bool) -> None:
-        """Take a share; None where the autopilot has said none since the last call, and only those of a still vehicle count."""
-        if share is not None and still and math.isfinite(share):
+    def add(self, share: float | None) -> None:
+        """Take a share of a still vehicle; None where the autopilot has said none since the last call."""
+        if share is not None and math.isfinite(share):
             self._shares.append(share)
 
     @property
@@ -96,14 +79,7 @@ class HoverMeter:
         return sum(self._shares) / len(self._shares) if len(self._shares) >= LEAST_SHARES else None
 
     def summary_text(self, mass: float) -> tuple[bool, str]:
-        """Compare with the calibration.
-
-        Args:
-            mass: that hovered [kg].
-
-        Returns:
-            Whether it agrees, or was not measured; and that in words.
-        """
+        """Compare with the calibration for a mass that hovered [kg]: whether it agrees, or was not measured, and that in words."""
         if self.share is None:
             return True, f"hover share not measured: {len(self._shares)} of {LEAST_SHARES} values in steady hover"
         want = self.params.share(mass * GRAVITY)

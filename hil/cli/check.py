@@ -24,8 +24,7 @@ from hil.poses.track import Track
 from hil.sources.opening import open_source
 from visthrow.onboard.policy import Policy, find_policy
 
-LISTEN, CARRY = 5.0, 180.0
-"""How long poses are looked at, and a vehicle is carried about, where nothing else is said [s]."""
+LISTEN, CARRY = 5.0, 180.0  # how long poses are looked at, and a vehicle is carried about, where nothing else is said [s]
 
 
 def check(args: argparse.Namespace) -> int:
@@ -90,7 +89,7 @@ def _listen(args: argparse.Namespace) -> int:
 
 
 def _body_line(name: str, track: Track, now: float, seconds: float) -> str:
-    """A body in a line."""
+    """Return a body in a line."""
     state, refused = track.state(now), json.dumps(track.gate.refused) if track.gate.refused else "none"
     if state is None:
         return f"{name}: no pose; refused by the gate: {refused}"
@@ -102,7 +101,7 @@ def _body_line(name: str, track: Track, now: float, seconds: float) -> str:
 
 
 def _link_lines(roster: Roster, params: HilParams, seconds: float) -> list[str]:
-    """Who was heard on a link with which ids; all of it where somebody expected was not, else what was refused."""
+    """Return who was heard on a link with which ids; all of it where somebody expected was not, else what was refused."""
     silent = [party.name for party in roster.parties if party.name not in roster.at]
     lines = [f"{' and '.join(silent)} not heard; expected: {roster.expected()}"] if silent else []
     for seen, count in sorted(roster.seen.items(), key=lambda row: -row[1]):

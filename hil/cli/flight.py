@@ -6,11 +6,10 @@ import dataclasses
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
 from hil.backends import make_backend, mechanism_lag, require_reach
 from hil.backends.check import autopilot_record
-from hil.cli.terminal import Terminal, Voice
+from hil.cli.terminal import Console, Terminal
 from hil.control.calibrating import Solver
 from hil.control.loop import Lander
 from hil.control.loop import fly as fly_loop
@@ -34,40 +33,29 @@ from visthrow.onboard.policy import Policy, find_policy
 
 
 def params_of(args: argparse.Namespace) -> HilParams:
-    """The configuration that a command names."""
+    """Return the configuration that a command names."""
     return config.load(HilParams, config.find("hil", args.config), args.overrides)
 
 
 def key_of(args: argparse.Namespace) -> bytes | None:
-    """The key that ``--sign`` names, or None."""
+    """Return the key that ``--sign`` names, or None."""
     return None if args.sign is None else read_key(args.sign)
 
 
 def require_fake(params: HilParams) -> None:
-    """Refuse ``--auto-arm`` where a real vehicle could be at the other end.
-
-    Raises:
-        RunError: a device that is no loopback address, or poses that do not come by MAVLink.
-    """
+    """Raise `RunError` for ``--auto-arm`` where a real vehicle could be at the other end: no loopback address, or no MAVLink poses."""
     devices = [params.link.device, params.source.device or params.link.device]
     devices += [getattr(params, params.backend).device] if params.backend in ("betaflight", "crazyflie") else []
-    far = [text for text in devices if text.startswith(("serial:", *CFLIB)) or not _loopback(text)]
+    loopback = lambda text: check_device(text, remote=True).host.startswith(("127.", "::1"))  # noqa: E731
+    far = [text for text in devices if text.startswith(("serial:", *CFLIB)) or not loopback(text)]
     if params.source.kind == "mocap":
         far.append(f"source.kind {params.source.kind}")
     if far:
         raise RunError(f"--auto-arm with {', '.join(far)}; it is for `visthrow hil fake` on this machine alone: type 'arm' instead")
 
 
-def _loopback(text: str) -> bool:
-    return check_device(text, remote=True).host.startswith(("127.", "::1"))
-
-
 def fly(args: argparse.Namespace) -> int:
-    """Fly, or run dry, and write the run's folder.
-
-    Returns:
-        1 for a run that was aborted or in which something raised, else 0.
-    """
+    """Fly, or run dry, and write the run's folder; 1 for a run that was aborted or in which something raised, else 0."""
     started, recording = time.monotonic(), args.action == "record"
     params = params_of(args)
     if recording:
@@ -79,35 +67,37 @@ def fly(args: argparse.Namespace) -> int:
     if auto_arm:
         require_fake(params)
     folder = Path(args.out or f"runs/hil/{time.strftime('%Y%m%d-%H%M%S')}")
-    policy, voice = Policy.load(find_policy(params.policy)), Voice()
-    source, link, recorded = open_source(params, folder, MonotonicClock(args.speed), key_of(args), voice.say)
+    policy, console = Policy.load(find_policy(params.policy)), Console()
+    source, link, recorded = open_source(params, folder, MonotonicClock(args.speed), key_of(args), console.say)
     clock = ManualClock(source.start) if recorded else MonotonicClock(args.speed)
     require_reach(params, policy.contract)
-    backend = make_backend(params, link, args.action == "run" and args.write_parameters, voice.say, folder)
+    backend = make_backend(params, link, args.action == "run" and args.write_parameters, console.say, folder)
     runner = Runner(params, policy, backend, mechanism_lag(params))
     runner.watcher = getattr(backend, "place", None)  # who wants the vehicle's poses
     refused = prepare(params.realtime)
     runner.warm_up()
     recorder = Recorder(folder, params)
     for text in refused or keep(params.realtime):  # the recorder's thread holds what the flying one waits for; others do not
-        voice.say(f"note: {text}")
-    operator = Terminal(auto_arm, lambda: any(one.roster.simulated for one in source.links), voice.say)
+        console.say(f"note: {text}")
+    operator = Terminal(auto_arm, lambda: any(one.roster.simulated for one in source.links), console.say)
     print(f"ready after {time.monotonic() - started:.2f} s; waiting for poses", file=sys.stderr, flush=True)
     viewer, stages = start_viewer(folder) if args.view else None, Stages()
     eyes = open_images(params.images, params.camera, clock.now) if params.keypoints == "detector" else None
     solver = None if runner.calibrating is None else Solver(params.camera, policy.contract, params.calibration.spreads)
     summary = fly_loop(
         runner, source, clock, Lander(operator, runner.calibrating) if calibrates else operator, recorder,
-        args.seconds or float("inf"), voice.decision, stages, eyes, solver,
+        args.seconds or float("inf"), console.decision, stages, eyes, solver,
     )  # fmt: skip
     summary["speed"] = args.speed
     summary["autopilot"] = autopilot_record(backend, link)
     summary["links"] = [one.roster.summary() for one in source.links]
-    _close(eyes, solver, backend, source)
+    for part in (eyes, solver, backend, source):
+        if part is not None:
+            part.close()
     recorder.close(summary)
     if viewer is not None:
         viewer.terminate()
-    voice.close()
+    console.close()
     _show(summary_text(summary, folder))
     if not args.bare:
         _show("\n".join(finish(folder, stages, args.speed)))
@@ -122,9 +112,3 @@ def _show(text: str) -> None:
     """Print where somebody still reads: the terminal may have gone with the run."""
     with contextlib.suppress(OSError):
         print(text, flush=True)
-
-
-def _close(*parts: Any) -> None:
-    for part in parts:
-        if part is not None:
-            part.close()

@@ -8,11 +8,7 @@ from hil.recording.playback import replay
 
 
 def again(args: argparse.Namespace) -> int:
-    """Run a recorded run again, and compare.
-
-    Returns:
-        1 where anything differs or the recording was cut, else 0.
-    """
+    """Run a recorded run again, and compare; 1 where anything differs or the recording was cut, else 0."""
     with opened(args.folder) as folder:
         found = replay(folder)
     for n, name, was, now in found["differences"][:10]:

@@ -25,23 +25,17 @@ terminal; and those that nobody means."""
 PAUSING = tuple(getattr(signal, name) for name in ("SIGTSTP", "SIGTTIN", "SIGTTOU") if hasattr(signal, name))
 """Signals that would stop the process in mid flight: Ctrl-Z, and a terminal that belongs to another job."""
 
-MOST_UNSAID = 1000
-"""Lines that wait for a terminal that takes none; those beyond are lost."""
-
-LAST_WORDS = 2.0
-"""That the end of a run waits for its lines to be taken [s]."""
-
-MOST_TYPED = 4096
-"""Bytes of a line without an end."""
+MOST_UNSAID = 1000  # lines that wait for a terminal that takes none; those beyond are lost
+LAST_WORDS = 2.0  # that the end of a run waits for its lines to be taken [s]
+MOST_TYPED = 4096  # bytes of a line without an end
 
 
-class Voice:
+class Console:
     """Says lines on standard error by a thread of its own: a terminal that is gone or stands still holds up no tick."""
 
     def __init__(self) -> None:
-        """Begin to listen."""
         self._lines: queue.Queue[str | None] = queue.Queue(MOST_UNSAID)
-        self._thread = threading.Thread(target=self._speak, name="voice", daemon=True)
+        self._thread = threading.Thread(target=self._speak, name="console", daemon=True)
         self._thread.start()
         self._before: tuple[str, str] = ("", "")
 
@@ -81,8 +75,7 @@ class Terminal:
         """Take over the signals.
 
         Args:
-            auto_arm: whether the word is given whenever the run is ready.
-            simulated: whether the vehicle has said that it is; no other is armed so.
+            auto_arm: whether the word is given whenever the run is ready, to a vehicle that has said that it is simulated and to no other.
             say: never waits.
         """
         self._auto, self._simulated, self._say = auto_arm, simulated, say
@@ -115,7 +108,7 @@ class Terminal:
         return OperatorInput(arm, "land" in said, "abort" in said or bool(self._why), self._why)
 
     def _lines(self) -> set[str]:
-        """Lines that were typed since the last call; half a line waits for its end."""
+        """Return lines that were typed since the last call; half a line waits for its end."""
         while self._file >= 0 and select.select([self._file], [], [], 0)[0]:
             try:
                 data = os.read(self._file, MOST_TYPED)

@@ -9,48 +9,32 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-from hil.errors import ConfigError
 from hil.poses.pose import Vector
 from hil.poses.track import BodyState
+from visthrow.config.bounds import Bounded, Positive
 from visthrow.onboard.hover import GRAVITY
 
-STEP = 0.01
-"""Step of the free flight's midpoint rule [s]: exact without drag."""
-
-LONGEST = 3.0
-"""After which a payload that has not come down is not followed further [s]."""
+STEP = 0.01  # step of the free flight's midpoint rule [s]: exact without drag
+LONGEST = 3.0  # after which a payload that has not come down is not followed further [s]
 
 
 @dataclass(frozen=True)
-class AimParams:
-    """What is done about releases that would lead astray.
+class AimParams(Bounded):
+    """What is done about releases that would lead astray."""
 
-    Raises:
-        ConfigError: a bound or a time of 0 or less.
-    """
-
-    bound: float  # a release whose predicted landing is further from the goal than this is held back [m]
-    patience: float  # so long after the first one that was held back the throw ends without a release [s]
-
-    def __post_init__(self) -> None:
-        if min(self.bound, self.patience) <= 0.0:
-            raise ConfigError(f"aim.bound {self.bound} m, aim.patience {self.patience} s; expected both above 0")
+    bound: Positive  # a release whose predicted landing is further from the goal than this is held back [m]
+    patience: Positive  # so long after the first one that was held back the throw ends without a release [s]
 
 
 class Aim:
-    """Judges the releases that a policy asks for.
-
-    Attributes:
-        held: releases held back so far in this run.
-    """
+    """Judges the releases that a policy asks for; ``held`` counts those held back so far in this run."""
 
     def __init__(self, params: AimParams | None, ahead: float, height: float, rope: dict[str, Any]) -> None:
         """Take what the policy was trained with.
 
         Args:
-            params: None holds nothing back.
+            params: None holds nothing back. height: of the payload's centre as it lands [m].
             ahead: from the time that a state stands for to separation, if the latch trips now [s].
-            height: of the payload's centre as it lands [m].
             rope: of the policy's contract: mass and drag of the payload.
         """
         self._params, self._ahead, self._height = params, ahead, height
@@ -59,11 +43,11 @@ class Aim:
         self._first: float | None = None  # that was held back in this throw [s]
 
     def begin(self) -> None:
-        """A throw begins."""
+        """Begin a throw."""
         self._first = None
 
     def landing(self, payload: BodyState) -> tuple[float, float]:
-        """Where a payload in this state would land [m], world frame, if the latch tripped now."""
+        """Return where a payload in this state would land [m], world frame, if the latch tripped now."""
         vel = payload.vel
         pos = tuple(x + self._ahead * v for x, v in zip(payload.pos, vel))
         time = 0.0
@@ -82,7 +66,7 @@ class Aim:
         return (through * vel[0], through * vel[1], through * vel[2] - GRAVITY)
 
     def astray(self, now: float, payload: BodyState, goal_w: Vector) -> str | None:
-        """Why a release that was asked for at a time [s] is held back, or None."""
+        """Return why a release that was asked for at a time [s] is held back, or None."""
         if self._params is None:
             return None
         x, y = self.landing(payload)
@@ -94,5 +78,5 @@ class Aim:
         return f"it would land at ({x:.2f}, {y:.2f}) m, {off:.2f} m from the goal, within {self._params.bound:g} m expected"
 
     def given_up(self, now: float) -> bool:
-        """Whether this throw is over at a time [s]: nothing better came within the patience after what was held back."""
+        """Return whether this throw is over at a time [s]: nothing better came within the patience after what was held back."""
         return self._first is not None and now - self._first >= self._params.patience

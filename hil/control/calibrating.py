@@ -16,7 +16,8 @@ import numpy as np
 from camera.params import CameraParams
 from hil.poses.pose import Vector
 from hil.poses.track import BodyState
-from visthrow.common.errors import ConfigError, VisthrowError
+from visthrow.common.errors import VisthrowError
+from visthrow.config.bounds import Bounded, Positive
 from visthrow.onboard.calibration import (
     STILL,
     SWAY,
@@ -31,33 +32,24 @@ from visthrow.onboard.calibration import (
 
 
 @dataclass(frozen=True)
-class CalibrationParams:
-    """How to calibrate, and which findings a throw may begin with.
+class CalibrationParams(Bounded):
+    """How to calibrate, and which findings a throw may begin with."""
 
-    Raises:
-        ConfigError: a time, a rate or a limit of 0 or less.
-    """
-
-    still: float = STILL  # of hover before the sway [s]
-    sway: float = SWAY  # [s]
-    rate: float = SWAY_RATE  # amplitude of the sway's body rates [rad/s]
-    frequency: float = SWAY_FREQUENCY  # of the sway [Hz]
-    most_tilt_deg: float = 10.0  # of the camera, which is corrected for; beyond it the field of view is another one
-    most_scale: float = 0.06  # of the focal length off the nominal one, which is corrected for [-]
-    most_latency: float = 0.06  # of the keypoints, which is made up for [s]
-    thrust: float = 0.1  # off the commanded one: twice the spread of masses in training
-    sure_tilt_deg: float = 0.5  # standard deviation at most
-    sure_latency: float = 0.005  # likewise [s]
+    still: Positive = STILL  # of hover before the sway [s]
+    sway: Positive = SWAY  # [s]
+    rate: Positive = SWAY_RATE  # amplitude of the sway's body rates [rad/s]
+    frequency: Positive = SWAY_FREQUENCY  # of the sway [Hz]
+    most_tilt_deg: Positive = 10.0  # of the camera, which is corrected for; beyond it the field of view is another one
+    most_scale: Positive = 0.06  # of the focal length off the nominal one, which is corrected for [-]
+    most_latency: Positive = 0.06  # of the keypoints, which is made up for [s]
+    thrust: Positive = 0.1  # off the commanded one: twice the spread of masses in training
+    sure_tilt_deg: Positive = 0.5  # standard deviation at most
+    sure_latency: Positive = 0.005  # likewise [s]
     spreads: Spreads = field(default_factory=Spreads)  # of poses and keypoints
-
-    def __post_init__(self) -> None:
-        numbers = {name: value for name, value in vars(self).items() if name != "spreads"}
-        if min(numbers.values()) <= 0.0:
-            raise ConfigError(f"calibration {numbers}; expected numbers above 0")
 
 
 def solved(hovered: Hovered, camera: CameraParams, contract: dict[str, Any], spreads: Spreads) -> Calibration | str:
-    """The calibration of a hover, or why there is none."""
+    """Return the calibration of a hover, or why there is none."""
     import torch
 
     from camera.keypoints import KeypointCamera
@@ -83,7 +75,7 @@ class Solver:
         self._coming = self._pool.submit(solved, hovered, *self._with)
 
     def poll(self) -> Calibration | str | None:
-        """What came of it, once; None while there is nothing new."""
+        """Return what came of it, once; None while there is nothing new."""
         if self._coming is None or not self._coming.done():
             return None
         coming, self._coming = self._coming, None
@@ -105,11 +97,7 @@ def _warm() -> None:
 
 
 class Calibrating:
-    """The hover and the sway of a run.
-
-    Attributes:
-        found: the calibration; None before it came.
-    """
+    """The hover and the sway of a run; ``found`` is the calibration, None before it came."""
 
     def __init__(self, params: CalibrationParams, goal: Callable[[], Vector | None]) -> None:
         """Begin with nothing; ``goal``: where the goal is [m]."""
@@ -122,7 +110,7 @@ class Calibrating:
         self._waits = False
 
     def rates(self, now: float, quiet: bool) -> tuple[float, float]:
-        """Roll and pitch rate to add to the hover's at a time [rad/s]; ``quiet``: the vehicle hovers and nothing swings."""
+        """Return roll and pitch rate to add to the hover's at a time [rad/s]; ``quiet``: the vehicle hovers and nothing swings."""
         p = self.params
         if self.found is not None or self._waits:
             return 0.0, 0.0
@@ -138,9 +126,7 @@ class Calibrating:
             return 0.0, 0.0
         return sway(since, p.rate, p.frequency)
 
-    def note(
-        self, now: float, vehicle: BodyState, thrust: float, points: np.ndarray, valid: np.ndarray, age: float
-    ) -> None:
+    def note(self, now: float, vehicle: BodyState, thrust: float, points: np.ndarray, valid: np.ndarray, age: float) -> None:
         """Take down a tick.
 
         Args:
@@ -166,7 +152,7 @@ class Calibrating:
         self._due, self._waits = Hovered(*columns[:8], np.array(goal), columns[8]), True
 
     def due(self) -> Hovered | None:
-        """A hover that is to be solved, once."""
+        """Return a hover that is to be solved, once."""
         due, self._due = self._due, None
         return due
 
@@ -179,7 +165,7 @@ class Calibrating:
             self._why = result
 
     def problems(self) -> list[str]:
-        """Why a throw has to wait, or is refused."""
+        """Return why a throw has to wait, or is refused."""
         p, found = self.params, self.found
         if found is None:
             return ["calibrating in the hover" + (f" again: {self._why}" if self._why else "")]

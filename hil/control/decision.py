@@ -28,5 +28,5 @@ class Decision:
     release: bool = False  # the policy asked for it and it was done
     note: str = ""
     waits: str = ""  # why it does not go on
-    seen: list | None = None  # of a camera's newest frame since the last tick; see `hil.poses.sight.Sight`
+    seen: list | None = None  # of a camera's newest frame since the last tick; see `hil.poses.detection.Detection`
     calibration: dict | str | None = None  # that came with this tick, or why there is none; see `visthrow.onboard.calibration`

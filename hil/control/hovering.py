@@ -8,28 +8,15 @@ from hil.poses.pose import Vector
 from hil.poses.track import BodyState
 from visthrow.onboard.hover import HoverController, HoverParams
 
-HOVERED = 50
-"""Ticks over which the thrust of the hover before a throw is taken: a second."""
-
-DESCENT = 0.4
-"""Speed of the hover point while landing [m/s]."""
+HOVERED = 50  # ticks over which the thrust of the hover before a throw is taken: a second
+DESCENT = 0.4  # speed of the hover point while landing [m/s]
 
 
 class Hovering:
-    """A hover controller with the place that it holds.
-
-    Attributes:
-        place_w: to be held [m].
-    """
+    """A hover controller with the place ``place_w`` that it holds [m]."""
 
     def __init__(self, place_w: Vector, heading: float, max_thrust: float, period: float) -> None:
-        """Start at a place.
-
-        Args:
-            place_w: to be held [m]. heading: likewise [rad].
-            max_thrust: of the vehicle [N].
-            period: between two commands [s].
-        """
+        """Start at a place [m] and heading [rad]; the period is between two commands [s]."""
         self.place_w, self._heading, self._period = place_w, heading, period
         self._controller = HoverController(HoverParams(max_thrust=max_thrust), period)
         self._shares: deque[float] = deque(maxlen=HOVERED)  # thrust over weight
@@ -49,7 +36,7 @@ class Hovering:
         self.place_w = (x, y, max(z - DESCENT * self._period, 0.0))
 
     def command(self, vehicle: BodyState, mass: float) -> tuple[float, ...]:
-        """Thrust [N] and body rates [rad/s] for a vehicle of a mass [kg] with all that hangs on it."""
+        """Return the thrust [N] and body rates [rad/s] for a vehicle of a mass [kg] with all that hangs on it."""
         found = self._controller.step(
             np.array([vehicle.pos]), np.array([vehicle.quat]), np.array([vehicle.vel]), np.array(self.place_w), mass, self._heading
         )
@@ -63,5 +50,5 @@ class Hovering:
             self._shares.append(share)
 
     def share(self) -> float | None:
-        """Mean thrust over the weight; None before there is a second of it."""
+        """Return the mean thrust over the weight; None before there is a second of it."""
         return sum(self._shares) / HOVERED if len(self._shares) == HOVERED else None

@@ -15,9 +15,7 @@ BENT, BENT_MOST = 5e-3, 0.1
 """Distance from the free fall carried backwards, from which on poses say when the rope held [m]; noise stays below. Poses up
 to so long before the expected separation are looked at [s]."""
 
-NEAR = 8
-"""Poses before the ground that the landing is carried forward from: free fall needs no model of drag over 0.1 s."""
-
+NEAR = 8  # poses before the ground that the landing is carried forward from: free fall needs no model of drag over 0.1 s
 
 UNSEEN, MOST_BLIND = 0.1, 0.15
 """A ball whose poses ended this long ago [s], and no longer than that before the ground [s], has landed where its fall leads: the
@@ -44,49 +42,28 @@ class Flight:
     """Collects a payload's poses from the latch on until it is down."""
 
     def __init__(self, goal_w: Vector, start: float, latch: float, height: float, lag: float = 0.0) -> None:
-        """Begin at the latch.
-
-        Args:
-            goal_w: [m]. start: of the throw [s]. latch: of the release [s].
-            height: of the payload's centre as it lands [m].
-            lag: expected from latch to separation [s].
-        """
+        """Begin at the latch [s] of a throw; the payload's centre lands at a height [m], and separates a lag after the latch [s]."""
         self.goal_w, self.start, self.latch, self.height, self.lag = goal_w, start, latch, height, lag
         self._times: list[float] = []
         self._points: list[Vector] = []
 
     def add(self, time: float, pos: Vector) -> Landing | None:
-        """Take a pose of the payload, in our frames.
-
-        Args:
-            time: of its measurement [s].
-            pos: [m].
-
-        Returns:
-            The landing, once the payload has come down.
-        """
+        """Take a pose of the payload, measured at a time [s], in our frames [m]; the landing, once it has come down."""
         self._times.append(time)
         self._points.append(pos)
         # The ball may be measured for the last time some centimetres above the ground, or bounce in between.
-        if len(self._times) < NEAR or pos[2] > self.height + 0.05 or self._rising():
+        if len(self._times) < NEAR or pos[2] > self.height + 0.05 or pos[2] > self._points[-2][2]:
             return None
         return self._landing()
 
     def overdue(self, now: float) -> Landing | None:
-        """The landing of a ball that was lost from sight shortly before the ground.
-
-        Args:
-            now: [s].
-        """
+        """Return the landing of a ball that by a time [s] was lost from sight shortly before the ground."""
         seen = self._times
         free = len(seen) >= NEAR and seen[-NEAR] > self.latch + self.lag
         if not free or now - seen[-1] < UNSEEN:
             return None
         landing = self._landing()
         return landing if landing.time - seen[-1] < MOST_BLIND and landing.time < now - UNSEEN else None
-
-    def _rising(self) -> bool:
-        return self._points[-1][2] > self._points[-2][2]
 
     def _landing(self) -> Landing:
         times, points = np.array(self._times), np.array(self._points)
@@ -101,13 +78,11 @@ class Flight:
         landed = tuple(point.tolist())
         error = float(np.hypot(landed[0] - self.goal_w[0], landed[1] - self.goal_w[1]))
         found = separation(times, points, self.latch + self.lag)
-        return Landing(
-            self.goal_w, self.start, self.latch, when, landed, error, when - self.start, self.lag, *(found or (None, None))
-        )
+        return Landing(self.goal_w, self.start, self.latch, when, landed, error, when - self.start, self.lag, *(found or (None, None)))
 
 
 def separation(times: np.ndarray, points: np.ndarray, expected: float) -> tuple[float, Vector] | None:
-    """When and where the rope let go: where the poses leave the free fall after it, carried backwards.
+    """Return when and where the rope let go: where the poses leave the free fall after it, carried backwards.
 
     While the rope holds, its pull bends the path away from the free fall by ``a (t_s - t)^2 / 2``; the root of the distance is
     a line in time that ends at the separation.
@@ -137,7 +112,7 @@ def separation(times: np.ndarray, points: np.ndarray, expected: float) -> tuple[
 
 
 def _parabola(times: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Position and velocity at time 0 of the free fall that fits poses best, shape (3,) each."""
+    """Return the position and velocity at time 0 of the free fall that fits poses best, shape (3,) each."""
     lifted = points + [0.0, 0.0, 0.5 * GRAVITY] * times[:, None] ** 2
     fit = np.linalg.lstsq(np.column_stack((np.ones_like(times), times)), lifted, rcond=None)[0]
     return fit[0], fit[1]

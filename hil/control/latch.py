@@ -6,14 +6,9 @@ from hil.control.landing import Flight, Landing
 from hil.errors import RunError
 from hil.poses.pose import Vector
 
-LAG_TOLERANCE = 5e-3
-"""What the mechanism may take longer than the trained lag [s]."""
-
-STUCK_AFTER = 0.6
-"""A payload that still hangs this long after it should have separated was not released, whatever was answered [s]."""
-
-ROUNDING = 1e-9
-"""Tolerance of differences of times [s]."""
+LAG_TOLERANCE = 5e-3  # what the mechanism may take longer than the trained lag [s]
+STUCK_AFTER = 0.6  # a payload that still hangs this long after it should have separated was not released, whatever was answered [s]
+ROUNDING = 1e-9  # tolerance of differences of times [s]
 
 
 class Latch:
@@ -25,16 +20,12 @@ class Latch:
         landings: of the throws so far.
     """
 
-    def __init__(
-        self, lag: float, mechanism_lag: float, hang: float, tolerance: float, height: float, later: float = 0.0
-    ) -> None:  # fmt: skip
+    def __init__(self, lag: float, mechanism_lag: float, hang: float, tolerance: float, height: float, later: float = 0.0) -> None:
         """Start with the payload hanging.
 
         Args:
-            lag: trained, from latch to separation [s].
-            mechanism_lag: of the release mechanism, from its command to separation [s].
-            hang: of the payload's centre below the vehicle's at rest [m].
-            tolerance: of that distance, within which the payload counts as hanging [m].
+            lag: trained, from latch to separation [s]. mechanism_lag: of the mechanism, from its command to separation [s].
+            hang: of the payload's centre below the vehicle's at rest [m]. tolerance: within which the payload counts as hanging [m].
             height: of the payload's centre as it lands [m].
             later: by which all that the policy decides comes about later than in its training [s], the separation as well.
 
@@ -70,17 +61,11 @@ class Latch:
         return self.commanded
 
     def separated(self, now: float) -> bool:
-        """Whether the payload is off by now [s], as far as latch and lag tell."""
+        """Return whether the payload is off by now [s], as far as latch and lag tell."""
         return self.at is not None and now - self.at >= self.lag - ROUNDING
 
     def hangs_still(self, now: float, vehicle_w: Vector, payload_w: Vector | None) -> bool:
-        """Whether the payload hangs on the vehicle at a time [s], by the latch and then by the poses.
-
-        Args:
-            now: [s].
-            vehicle_w: its place [m].
-            payload_w: likewise; None without a fresh pose of it.
-        """
+        """Return whether the payload hangs on the vehicle at a time [s], by the latch and then by both places [m], if known."""
         if self.at is None:
             return True
         if payload_w is None or now - self.at < self.lag + STUCK_AFTER:

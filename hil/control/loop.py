@@ -27,8 +27,7 @@ point of their periods."""
 
 GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
 
-SAY_AGAIN = 3.0
-"""Between two words on why it does not go on that differ in their numbers alone [s]."""
+SAY_AGAIN = 3.0  # between two words on why it does not go on that differ in their numbers alone [s]
 
 NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?")
 
@@ -40,7 +39,7 @@ class Operator(Protocol):
     """Who arms."""
 
     def words(self, state: str) -> OperatorInput:
-        """What was said since the last tick; ``state`` is the runner's. Never waits."""
+        """Return what was said since the last tick; ``state`` is the runner's. Never waits."""
 
 
 class Lander:
@@ -73,13 +72,9 @@ def fly(
     goes on until it has ended. A second Ctrl-C ends it at once, after one more request to land.
 
     Args:
-        runner: with its back-end. source: of poses. clock: of the ticks. operator: who arms.
-        recorder: of the run's folder; None records nothing.
-        most: [s].
+        runner: with its back-end. source: of poses. clock: of the ticks. operator: who arms. recorder: of the run's folder, if any.
         tell: called with the first decision of each state, and of each reason why it does not go on.
-        stages: filled with the times of each stage.
-        eyes: a camera, where keypoints are a detector's.
-        solver: of its calibration, where the run's config asks for one.
+        stages: filled with the times of each stage. eyes: a camera, where keypoints are a detector's. solver: of its calibration.
 
     Returns:
         The runner's summary with ticks, misses (those that a tick of ours caused by taking too long, and all), and the
@@ -128,7 +123,7 @@ class Loop:
         self.ticker = Ticker(self.clock, self.runner.pilot.period)
 
     def turn(self, over: bool) -> None:
-        """One tick; ``over``: the run's time is, and what flies is to come down."""
+        """Do one tick; ``over``: the run's time is, and what flies is to come down."""
         runner, source, clock, ticker, backend = self.runner, self.source, self.clock, self.ticker, self.runner.backend
         source.hold(runner.in_flight)
         _wait(clock, ticker.due() - AHEAD - AHEAD_SPREAD * (self.count * GOLDEN % 1.0), backend, source)

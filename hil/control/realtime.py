@@ -11,30 +11,20 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Annotated
 
-from visthrow.common.errors import ConfigError
+from visthrow.config.bounds import Bound, Bounded
 
-SWITCH = 5e-4
-"""After which one thread gives way to another [s]; Python's 5 ms are a quarter of a tick."""
-
-LOCK_CURRENT, LOCK_FUTURE = 1, 2
-"""Flags of mlockall(2)."""
+SWITCH = 5e-4  # after which one thread gives way to another [s]; Python's 5 ms are a quarter of a tick
+LOCK_CURRENT, LOCK_FUTURE = 1, 2  # Flags of mlockall(2)
 
 
 @dataclass(frozen=True)
-class RealtimeParams:
-    """What is done for ticks in time.
+class RealtimeParams(Bounded):
+    """What is done for ticks in time."""
 
-    Raises:
-        ConfigError: a priority out of range.
-    """
-
-    priority: int = 0  # of SCHED_FIFO, 1 to 99; 0: as any process
+    priority: Annotated[int, Bound(0, 99)] = 0  # of SCHED_FIFO, 1 to 99; 0: as any process
     lock_memory: bool = False  # no page of the process leaves the memory
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.priority <= 99:
-            raise ConfigError(f"realtime.priority {self.priority}; expected 0 (as any process) or 1 to 99 of SCHED_FIFO")
 
 
 @contextmanager

@@ -24,9 +24,9 @@ from hil.control.latch import Latch
 from hil.control.safety import Guard, failed_checks, fence_broken, outside
 from hil.control.states import FLYING, Inputs, Machine, State
 from hil.params import HilParams
+from hil.poses.detection import Detection, Detections
 from hil.poses.gate import HOLD, Tether
 from hil.poses.pose import GOAL, PAYLOAD, VEHICLE, Pose, Vector
-from hil.poses.sight import Sight, Sights
 from hil.poses.track import BodyState, Track
 from hil.sources.images import Hint
 from visthrow.onboard.calibration import Calibration
@@ -38,24 +38,19 @@ STILL_OFFSET, STILL_SPEED = 0.05, 0.25
 """Vehicle off its hover point [m], vehicle and payload speed over 0.2 s [m/s] that count as quiet: half of what the
 policies were trained to start from."""
 
-REACQUIRE = 1.0
-"""Before the vehicle is ours, a body that was refused or gone for this long is taken wherever it is [s]."""
+REACQUIRE = 1.0  # before the vehicle is ours, a body that was refused or gone for this long is taken wherever it is [s]
 
 HAND_OVER_SPEED, HAND_OVER_TILT = 1.0, math.radians(20.0)
 """Below these the autopilot's own hold takes over after a throw: braking out of 60 deg is done on poses [m/s, rad]."""
 
-GROUND = 0.12
-"""Height of the vehicle that counts as landed [m]."""
+GROUND = 0.12  # height of the vehicle that counts as landed [m]
 
 LEVEL_TIME = 0.5
 """An aborted run without poses levels the vehicle for this long and then falls silent: the autopilot's failsafes act [s]."""
 
 
-WARM_CALLS = 3
-"""Calls of the policy before it is to fly: code, data and the traced operations are at hand after two."""
-
-MOST_ERRORS = 100
-"""Tracebacks that are kept."""
+WARM_CALLS = 3  # calls of the policy before it is to fly: code, data and the traced operations are at hand after two
+MOST_ERRORS = 100  # tracebacks that are kept
 
 
 @dataclass(frozen=True)
@@ -73,7 +68,7 @@ class Seen:
 
 
 def calm(vehicle: BodyState) -> bool:
-    """Whether a vehicle is slow and level enough to be handed over."""
+    """Return whether a vehicle is slow and level enough to be handed over."""
     x, y, _, _ = vehicle.quat or (0.0, 0.0, 0.0, 1.0)
     return math.hypot(*vehicle.vel) < HAND_OVER_SPEED and 1.0 - 2.0 * (x * x + y * y) > math.cos(HAND_OVER_TILT)
 
@@ -93,13 +88,7 @@ class Runner:
     """
 
     def __init__(self, params: HilParams, policy: Policy, backend: Backend, mechanism_lag: float = 0.0) -> None:
-        """Build all parts.
-
-        Args:
-            params: the run.
-            policy: on the CPU.
-            backend: where commands go.
-            mechanism_lag: of the release mechanism, from its command to separation [s].
+        """Build all parts; the mechanism's lag is from its command to separation [s].
 
         Raises:
             MismatchError: the camera is not the one that the policy was trained with.
@@ -130,9 +119,9 @@ class Runner:
         self.spent: dict[str, float] = {}
         self._untaken: Exception | None = None
         self.watcher: Callable[[str, Track], None] | None = None
-        self.sights = Sights(self.pilot.camera, params.images.hold) if params.keypoints == "detector" else None
-        self._sight: Sight | None = None
-        wants = params.calibration is not None and self.sights is not None
+        self.detections = Detections(self.pilot.camera, params.images.hold) if params.keypoints == "detector" else None
+        self._detection: Detection | None = None
+        wants = params.calibration is not None and self.detections is not None
         self.calibrating = Calibrating(params.calibration, lambda: self.seen_goal_w) if wants else None
         self._calibration: Calibration | str | None = None
 
@@ -140,11 +129,8 @@ class Runner:
         """Decide one tick and send its command.
 
         Args:
-            now: on the runner's clock [s].
-            poses: raw, that have come since the last tick.
-            status: of the back-end, at this tick.
-            words: of the operator.
-            recording: whether all was recorded so far.
+            now: on the runner's clock [s]. poses: raw, that have come since the last tick. status: of the back-end, at this tick.
+            words: of the operator. recording: whether all was recorded so far.
         """
         self.spent = {}
         try:
@@ -153,11 +139,7 @@ class Runner:
             return self.fail(now, error)
 
     def fail(self, now: float, error: BaseException) -> Decision:
-        """End the run because of an exception: abort, and no further release. The autopilot is asked to land, tick by tick.
-
-        Args:
-            now: [s]. error: as it was caught.
-        """
+        """End the run because of an exception: abort, and no further release. The autopilot is asked to land, tick by tick."""
         if len(self.errors) < MOST_ERRORS and isinstance(error, Exception):
             self.errors.append("".join(traceback.format_exception(error)))
         what = "Ctrl-C twice" if isinstance(error, KeyboardInterrupt) else f"{type(error).__name__}: {error}"
@@ -173,23 +155,19 @@ class Runner:
         return self.machine.flown and self.machine.state is not State.DONE
 
     def warm_up(self, vehicle: BodyState | None = None) -> None:
-        """Call the policy a few times on a copy, so that the first calls of a throw find code and data at hand.
-
-        Args:
-            vehicle: as it hovers; any place will do.
-        """
+        """Call the policy a few times on a copy, so that the first calls of a throw find code and data at hand."""
         pilot, pos = copy.copy(self.pilot), np.array([self.params.home_w if vehicle is None else vehicle.pos])
         still, goal_w = np.zeros((1, 3)), np.array(self.params.goal_w)
         for _ in range(WARM_CALLS):
             pilot.act(pos, np.array([[0.0, 0.0, 0.0, 1.0]]), still, still, pos - [0.0, 0.0, self.hang], goal_w)
 
-    def look(self, sights: list[Sight]) -> None:
+    def look(self, detections: list[Detection]) -> None:
         """Take in what a camera saw since the last tick; of several frames the newest counts."""
-        if sights:
-            self._sight = sights[-1]
+        if detections:
+            self._detection = detections[-1]
 
     def hint(self, now: float) -> Hint | None:
-        """What a detector is told before it looks: vehicle and, while the payload hangs, how far off it can be."""
+        """Return what a detector is told before it looks: vehicle and, while the payload hangs, how far off it can be."""
         vehicle = self.tracks[VEHICLE].state(now)
         if vehicle is None or vehicle.quat is None or self.tracks[VEHICLE].gate.level(now) >= HOLD:
             return None
@@ -261,18 +239,17 @@ class Runner:
             self.backend.stop_release()
             self._stop_at = math.inf
         decision = Decision(now, state.value, self.machine.reason, waits=self.machine.waits(inputs))
-        if self._sight is not None and self.sights is not None:
-            decision.seen = self._sight.values()
-            if seen.vehicle is not None and seen.vehicle.quat is not None:
-                self.sights.along(now, seen.vehicle.pos, seen.vehicle.quat)
-                self.sights.take(self._sight, seen.vehicle.quat, self._shown_age(now))
-            self._sight = None
-        elif self.sights is not None and seen.vehicle is not None and seen.vehicle.quat is not None:
-            self.sights.along(now, seen.vehicle.pos, seen.vehicle.quat)
+        detection, self._detection = self._detection, None
+        if self.detections is not None and detection is not None:
+            decision.seen = detection.values()
+        if self.detections is not None and seen.vehicle is not None and seen.vehicle.quat is not None:
+            self.detections.along(now, seen.vehicle.pos, seen.vehicle.quat)
+            if detection is not None:
+                self.detections.take(detection, seen.vehicle.quat, self._shown_age(now))
         return decision, state
 
     def _ours(self, state: State, status: Status) -> bool:
-        """Whether commands are sent: not where it was handed over, nor to what has been taken over, hears nothing or was never ours."""
+        """Return whether commands are sent: not to what was handed or taken over, hears nothing or was never ours."""
         if status.mode in (HELD, LAND) and state not in (State.READY, State.ARMED):
             return False
         return state is not State.ABORT or (status.connected and self.machine.flown)
@@ -284,26 +261,26 @@ class Runner:
     def _calibrated(
         self, now: float, state: State, seen: Seen, status: Status, wanted: tuple[float, ...] | None, decision: Decision
     ) -> tuple[float, ...] | None:
-        """The command with the sway of a calibration; what came in this tick is taken down."""
+        """Return the command with the sway of a calibration; what came in this tick is taken down."""
         calibrating, result = self.calibrating, self._calibration
         if result is not None:
             self._calibration = None
             calibrating.take(result)
             decision.calibration = result if isinstance(result, str) else result.values()
-            if isinstance(result, Calibration) and self.sights is not None:
-                self.sights.correct(result)
+            if isinstance(result, Calibration) and self.detections is not None:
+                self.detections.correct(result)
         ours = state is State.READY and status.mode == FOLLOW and seen.known and seen.vehicle.quat is not None
         if not ours or wanted is None:
             calibrating.stop()
             return wanted
         roll, pitch = calibrating.rates(now, self._still(seen.vehicle, seen.payload, False))
-        if decision.seen is not None and self.sights.fresh is not None:
-            stamp, points, valid = self.sights.fresh
+        if decision.seen is not None and self.detections.fresh is not None:
+            stamp, points, valid = self.detections.fresh
             calibrating.note(now, seen.vehicle, wanted[0], points, valid, now - self._shown_age(now) - stamp)
         return (wanted[0], wanted[1] + roll, wanted[2] + pitch, wanted[3])
 
     def _guarded(self, now: float, wanted: tuple[float, ...] | None, decision: Decision) -> tuple[float, ...] | None:
-        """A command within its limits; one that is not finite ends the run."""
+        """Return a command within its limits; one that is not finite ends the run."""
         if wanted is None:
             self.guard.reset()
             return None
@@ -330,7 +307,7 @@ class Runner:
             self.backend.abort(now)
 
     def _tether(self, pose: Pose) -> Tether | None:
-        """The cable's other end for a pose of vehicle or payload while the payload hangs; None on the ground and after."""
+        """Return the cable's other end for a pose of vehicle or payload while the payload hangs; None on the ground and after."""
         other = {VEHICLE: PAYLOAD, PAYLOAD: VEHICLE}.get(pose.body)
         if other is None or self.latch.at is not None or self.machine.state not in FLYING:
             return None
@@ -352,26 +329,24 @@ class Runner:
             self.backend.ask(LAND, now)
 
     def _state(self, track: Track, now: float) -> BodyState | None:
-        """State of a body, carried forward to the age that the policy was trained with where the config says so."""
+        """Return the state of a body, carried forward to the age that the policy was trained with where the config says so."""
         delay, age = self.params.delay, self._age(track, now)
         ahead = age - self._aged + delay.command if delay.compensate and math.isfinite(age) else 0.0
         return track.state(now, ahead)
 
     def _age(self, track: Track, now: float) -> float:
-        """Age of a body's last pose [s]."""
+        """Return the age of a body's last pose [s]."""
         last, source = track.gate.last, self.params.delay.source
         return track.gate.age(now) + (source if last is None else last.transit(source))
 
     def _shown_age(self, now: float) -> float:
-        """Age of the vehicle's pose as the policy is shown it [s]: younger ones than it was trained with stay so."""
+        """Return the age of the vehicle's pose as the policy is shown it [s]: younger ones than it was trained with stay so."""
         age = self._age(self.tracks[VEHICLE], now)
         return min(age, self._aged) if self.params.delay.compensate else age
 
     def _goal(self, bodies: dict[str, BodyState | None]) -> Vector | None:
-        if GOAL not in self.tracks:
-            return self.params.goal_w
-        goal = bodies[GOAL]
-        return None if goal is None else goal.pos
+        goal = bodies.get(GOAL)
+        return self.params.goal_w if GOAL not in self.tracks else None if goal is None else goal.pos
 
     def _inputs(self, now: float, seen: Seen, status: Status, words: OperatorInput, recording: bool) -> Inputs:
         p, state = self.params, self.machine.state
@@ -389,49 +364,34 @@ class Runner:
             checks += self._thrust_off()
             if self.calibrating is not None and state in (State.READY, State.ARMED):
                 checks += self.calibrating.problems()
+        # What has not been answered is not over: the payload may yet come off.
+        over = vehicle is not None and state in (State.ARMED, State.RECOVER) and status.release != PENDING
+        # While landing the fence's floor is left on purpose.
+        fence = fence_broken(p.fence, vehicle, hanging) if vehicle is not None and state is not State.LAND else None
         return Inputs(
-            self.tracks[VEHICLE].gate.level(now),
-            self.tracks[PAYLOAD].gate.level(now),
-            status.connected,
-            tuple(checks),
-            # While landing the fence's floor is left on purpose.
-            fence_broken(p.fence, vehicle, hanging) if vehicle is not None and state is not State.LAND else None,
-            # What has not been answered is not over: the payload may yet come off.
-            vehicle is not None and state in (State.ARMED, State.RECOVER) and status.release != PENDING
-            and self._still(vehicle, payload, status.mode == HELD),
-            self.latch.separated(now),
-            self.latch.at is not None,
-            self.aim.given_up(now),
-            vehicle is not None and vehicle.pos[2] < GROUND,
-            failure,
-            words.arm,
-            words.land,
-            words.abort,
-            recording,
-            status.mode == FOLLOW,
-            status.note,
-            words.why,
-        )
+            self.tracks[VEHICLE].gate.level(now), self.tracks[PAYLOAD].gate.level(now), status.connected, tuple(checks), fence,
+            over and self._still(vehicle, payload, status.mode == HELD), self.latch.separated(now), self.latch.at is not None,
+            self.aim.given_up(now), vehicle is not None and vehicle.pos[2] < GROUND, failure,
+            words.arm, words.land, words.abort, recording, status.mode == FOLLOW, status.note, words.why,
+        )  # fmt: skip
 
     def _thrust_off(self) -> list[str]:
-        """Whether hovering takes another thrust than the weight: then the calibration is wrong, or the battery low."""
+        """Return whether hovering takes another thrust than the weight: then the calibration is wrong, or the battery low."""
         p, ratio = self.params, self.hovering.share()
-        if p.backend == "dry-run" or ratio is None:
-            return []
-        allowed = getattr(p, p.backend).thrust.tolerance
-        if abs(ratio - 1.0) <= allowed:
+        allowed = math.inf if p.backend == "dry-run" else getattr(p, p.backend).thrust.tolerance
+        if ratio is None or abs(ratio - 1.0) <= allowed:
             return []
         return [f"hovering takes {ratio:.2f} times the weight, within {allowed:g} of 1 expected: calibrate the thrust"]
 
     def _still(self, vehicle: BodyState, payload: BodyState | None, held: bool) -> bool:
-        """Whether all is quiet, at the hover point or where the autopilot holds the vehicle."""
+        """Return whether all is quiet, at the hover point or where the autopilot holds the vehicle."""
         if not held and math.dist(vehicle.pos, self.params.home_w) > STILL_OFFSET:
             return False
         moving = [VEHICLE] + ([PAYLOAD] if self.latch.at is None and payload is not None else [])
         return all(self.tracks[name].calm_speed() < STILL_SPEED for name in moving)
 
     def _entered(self, now: float, before: State, state: State, vehicle: BodyState | None) -> None:
-        """What a change of state brings with it."""
+        """Do what a change of state brings with it."""
         if before is State.THROW:
             # A fast mechanism may have to be told only after the policy's own time of separation, where commands act late.
             self._stop_at = self.latch.commanded if state is State.RECOVER and self.latch.at is not None else now
@@ -449,7 +409,7 @@ class Runner:
             self.hovering.hold(vehicle.pos)
 
     def _command(self, now: float, state: State, seen: Seen, decision: Decision) -> tuple[float, ...] | None:
-        """What to send in a state, before the guard; None for nothing."""
+        """Return what to send in a state, before the guard; None for nothing."""
         if state not in FLYING and state is not State.ABORT:
             return None
         vehicle = seen.vehicle
@@ -466,7 +426,7 @@ class Runner:
         return self.hovering.command(vehicle, mass)
 
     def _carries(self, now: float, vehicle: BodyState | None, payload: BodyState | None) -> bool:
-        """Whether the payload hangs on the vehicle, by the latch and by its own poses."""
+        """Return whether the payload hangs on the vehicle, by the latch and by its own poses."""
         fresh = payload is not None and self.tracks[PAYLOAD].gate.level(now) < HOLD
         if vehicle is None:
             return self.latch.at is None
@@ -489,7 +449,7 @@ class Runner:
         vehicle, payload = seen.vehicle, seen.payload
         attached = not self.latch.separated(decision.time)
         views = [np.array([v]) for v in (vehicle.pos, vehicle.quat, vehicle.vel, vehicle.rate, payload.pos)]
-        keypoints = None if self.sights is None else self.sights.keypoints(decision.time)
+        keypoints = None if self.detections is None else self.detections.keypoints(decision.time)
         out: PilotOutput = self.pilot.act(*views, np.array(seen.goal_w), attached, keypoints, decision.time)
         self.spent["observation"], self.spent["policy"] = self.pilot.spent
         decision.action = out.action[0].tolist()
@@ -499,7 +459,7 @@ class Runner:
         return out
 
     def problems(self) -> list[str]:
-        """What speaks against a throw as of the last poses."""
+        """Return what speaks against a throw as of the last poses."""
         bodies = {name: track.state(0.0) for name, track in self.tracks.items()}
         goal_w = self._goal(bodies)
         missing = [f"no good pose of the {name}" for name, state in bodies.items() if state is None]
@@ -509,23 +469,16 @@ class Runner:
         return failed_checks(p.check, p.fence, bodies[VEHICLE], bodies[PAYLOAD], goal_w, p.home_w, self.hang)
 
     def summary(self) -> dict[str, Any]:
-        """Counts of the run so far."""
-        return {
-            "state": self.machine.state.value,
-            "reason": self.machine.reason,
-            "aborted": self.machine.aborted,
-            "throws": self.machine.throws,
-            "cancelled": self.machine.cancelled,
-            "latches": self.latch.count,
-            "stuck": self.latch.stuck,
-            "held_back": self.aim.held,
-            "landings": [asdict(landing) for landing in self.latch.landings],
-            "guard": {k: getattr(self.guard, k) for k in ("clipped", "slewed", "refused")},
-            "bodies": {
-                name: {"accepted": track.accepted, "refused": track.gate.refused, "filter_lag": track.filter.lag}
-                for name, track in self.tracks.items()
-            },
-            "left_fence": self.machine.left_fence,
-            "calibration": None if self.calibrating is None or self.calibrating.found is None else self.calibrating.found.values(),
-            "errors": self.errors,
+        """Return counts of the run so far."""
+        machine, found = self.machine, None if self.calibrating is None else self.calibrating.found
+        bodies = {
+            name: {"accepted": track.accepted, "refused": track.gate.refused, "filter_lag": track.filter.lag}
+            for name, track in self.tracks.items()
         }
+        return {
+            "state": machine.state.value, "reason": machine.reason, "aborted": machine.aborted, "throws": machine.throws,
+            "cancelled": machine.cancelled, "latches": self.latch.count, "stuck": self.latch.stuck, "held_back": self.aim.held,
+            "landings": [asdict(landing) for landing in self.latch.landings],
+            "guard": {k: getattr(self.guard, k) for k in ("clipped", "slewed", "refused")}, "bodies": bodies,
+            "left_fence": machine.left_fence, "calibration": None if found is None else found.values(), "errors": self.errors,
+        }  # fmt: skip

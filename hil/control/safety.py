@@ -5,31 +5,21 @@ from dataclasses import dataclass
 
 from hil.poses.pose import Vector
 from hil.poses.track import BodyState
+from visthrow.common.errors import ConfigError
 from visthrow.common.rotations import tilt_and_heading
+from visthrow.config.bounds import Bounded, Positive
 
 
 @dataclass(frozen=True)
-class GuardParams:
-    """Limits on the change of a command from one tick to the next. Its bounds are those of the policy's training.
+class GuardParams(Bounded):
+    """Limits on the change of a command from one tick to the next. Its bounds are those of the policy's training."""
 
-    Raises:
-        ValueError: a limit of 0 or less.
-    """
-
-    slew_thrust: float  # [N]
-    slew_rate: tuple[float, float, float]  # [rad/s]
-
-    def __post_init__(self) -> None:
-        if min(self.slew_thrust, *self.slew_rate) <= 0.0:
-            raise ValueError(f"slew_thrust is {self.slew_thrust}, slew_rate {self.slew_rate}; expected limits above 0")
+    slew_thrust: Positive  # [N]
+    slew_rate: tuple[Positive, Positive, Positive]  # [rad/s]
 
 
 class Guard:
-    """Clips and slew-limits commands, and refuses those that are not finite.
-
-    Attributes:
-        clipped, slewed, refused: number of commands that were changed, or not let through.
-    """
+    """Clips and slew-limits commands, and refuses those that are not finite; counts what it clipped, slewed and refused."""
 
     def __init__(self, params: GuardParams, max_thrust: float, max_rate: Vector) -> None:
         """Take the limits: collective thrust within 0 and ``max_thrust`` [N], body rates within ``max_rate`` [rad/s]."""
@@ -43,7 +33,7 @@ class Guard:
         self._last = None
 
     def check(self, command: tuple[float, ...]) -> tuple[float, ...] | None:
-        """The command that may be sent, [N, rad/s], or None where it is not finite."""
+        """Return the command that may be sent, [N, rad/s], or None where it is not finite."""
         if len(command) != 4 or not all(map(math.isfinite, command)):
             self.refused += 1
             return None
@@ -58,34 +48,24 @@ class Guard:
 
 
 @dataclass(frozen=True)
-class FenceParams:
-    """Boxes in our world that vehicle and payload may not leave, and the goal may not lie outside of.
-
-    Raises:
-        ValueError: a box whose corners are not ascending, or a deceleration of 0 or less.
-    """
+class FenceParams(Bounded):
+    """Boxes in our world that vehicle and payload may not leave, and the goal may not lie outside of."""
 
     vehicle_low: tuple[float, float, float]  # [m]
     vehicle_high: tuple[float, float, float]  # [m]
     payload_low: tuple[float, float, float]  # [m]
     payload_high: tuple[float, float, float]  # [m]
-    deceleration: float  # that the vehicle brakes with [m/s^2]
+    deceleration: Positive  # that the vehicle brakes with [m/s^2]
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         for body, lowest, highest in (("vehicle", self.vehicle_low, self.vehicle_high), ("payload", self.payload_low, self.payload_high)):
             if any(low >= high for low, high in zip(lowest, highest)):
-                raise ValueError(f"{body}_low is {lowest} m, {body}_high {highest} m; expected ascending corners")
-        if not self.deceleration > 0.0:
-            raise ValueError(f"deceleration is {self.deceleration} m/s^2; expected a number above 0")
-
-
-def braking_point(state: BodyState, deceleration: float) -> Vector:
-    """Where a body comes to rest that brakes along each axis, ``x + v |v| / (2 a)`` [m], world frame."""
-    return tuple(x + v * abs(v) / (2.0 * deceleration) for x, v in zip(state.pos, state.vel))
+                raise ConfigError(f"{body}_low is {lowest} m, {body}_high {highest} m; expected ascending corners")
 
 
 def outside(point: Vector, low: Vector, high: Vector) -> str | None:
-    """The first axis along which a point lies outside of a box, with its value; None inside."""
+    """Return the first axis along which a point lies outside of a box, with its value; None inside."""
     for axis, x, least, most in zip("xyz", point, low, high):
         if not least <= x <= most:
             return f"{axis} {x:.2f} m beyond {least:g} to {most:g} m"
@@ -93,22 +73,13 @@ def outside(point: Vector, low: Vector, high: Vector) -> str | None:
 
 
 def fence_broken(params: FenceParams, vehicle: BodyState, payload: BodyState | None) -> str | None:
-    """Which fence is broken, or will be at the end of braking; None where all is well.
-
-    Args:
-        params: the fences.
-        vehicle: its state.
-        payload: its state while it hangs; None when it flies freely, which nothing can brake.
-    """
-    stop = braking_point(vehicle, params.deceleration)
-    for name, point in (("vehicle", vehicle.pos), ("vehicle's braking point", stop)):
-        found = outside(point, params.vehicle_low, params.vehicle_high)
-        if found:
+    """Return which fence is broken, or will be at the end of braking, or None. A payload that flies freely, None, cannot brake."""
+    stop = tuple(x + v * abs(v) / (2.0 * params.deceleration) for x, v in zip(vehicle.pos, vehicle.vel))
+    bodies = [("vehicle", vehicle.pos, "vehicle"), ("vehicle's braking point", stop, "vehicle")]
+    bodies += [] if payload is None else [("payload", payload.pos, "payload")]
+    for name, point, box in bodies:
+        if found := outside(point, getattr(params, f"{box}_low"), getattr(params, f"{box}_high")):
             return f"{name} {found}"
-    if payload is not None:
-        found = outside(payload.pos, params.payload_low, params.payload_high)
-        if found:
-            return f"payload {found}"
     return None
 
 
@@ -128,14 +99,7 @@ def failed_checks(
     params: CheckParams, fence: FenceParams, vehicle: BodyState, payload: BodyState, goal_w: Vector, home_w: Vector,
     hang: float,
 ) -> list[str]:  # fmt: skip
-    """What speaks against a throw, in words; empty where nothing does.
-
-    Args:
-        params: limits. fence: for goal and bodies.
-        vehicle, payload: states.
-        goal_w: [m]. home_w: where the vehicle hovers [m].
-        hang: of the payload's centre below the vehicle's at rest [m].
-    """
+    """Return what speaks against a throw, in words; ``hang`` is what the payload hangs below the vehicle at rest [m]."""
     failed = []
     if vehicle.quat is None:
         return ["the vehicle's source gives no attitude"]
@@ -154,10 +118,8 @@ def failed_checks(
     speed = math.hypot(*vehicle.vel)
     if speed > params.speed:
         failed.append(f"vehicle moves at {speed:.2f} m/s")
-    found = outside(goal_w, fence.payload_low, fence.payload_high)
-    if found:
+    if found := outside(goal_w, fence.payload_low, fence.payload_high):
         failed.append(f"goal {found}")
-    broken = fence_broken(fence, vehicle, payload)
-    if broken:
+    if broken := fence_broken(fence, vehicle, payload):
         failed.append(broken)
     return failed

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from hil.poses.gate import ABORT, HOLD
+from visthrow.config.bounds import Bounded, Positive
 
 
 class State(StrEnum):
@@ -27,34 +28,24 @@ class State(StrEnum):
     DONE = "done"
 
 
-FLYING = (State.READY, State.ARMED, State.THROW, State.RECOVER, State.LAND)
-"""States in which the runner commands the vehicle."""
+FLYING = (State.READY, State.ARMED, State.THROW, State.RECOVER, State.LAND)  # states in which the runner commands the vehicle
 
 
 @dataclass(frozen=True)
-class StateParams:
-    """Time-outs and durations [s].
+class StateParams(Bounded):
+    """Time-outs and durations [s]."""
 
-    Raises:
-        ValueError: one of them is 0 or less.
-    """
-
-    idle: float  # for poses and autopilot to appear; then abort
-    check: float  # for the checks to pass; then abort
-    check_hold: float  # for which all checks must hold
-    ready: float  # for the operator; then land
-    armed: float  # for the swing to become quiet; then back to ready, not armed
-    armed_least: float  # in armed before the throw
-    quiet: float  # for which vehicle and payload must be quiet
-    throw: float  # for the policy to release; then recover with the payload
-    recover: float  # for the hover to become quiet again; then land
-    land: float  # for the descent; then done
-    abort: float  # after which an aborted run ends
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not value > 0.0:
-                raise ValueError(f"{name} is {value} s; expected a time above 0")
+    idle: Positive  # for poses and autopilot to appear; then abort
+    check: Positive  # for the checks to pass; then abort
+    check_hold: Positive  # for which all checks must hold
+    ready: Positive  # for the operator; then land
+    armed: Positive  # for the swing to become quiet; then back to ready, not armed
+    armed_least: Positive  # in armed before the throw
+    quiet: Positive  # for which vehicle and payload must be quiet
+    throw: Positive  # for the policy to release; then recover with the payload
+    recover: Positive  # for the hover to become quiet again; then land
+    land: Positive  # for the descent; then done
+    abort: Positive  # after which an aborted run ends
 
 
 @dataclass(frozen=True)
@@ -81,7 +72,7 @@ class Inputs:
     why: str = ""  # of the abort, where it was no word
 
     def missing(self) -> list[str]:
-        """What has to be there before anything is checked, and is not."""
+        """Return what has to be there before anything is checked, and is not."""
         found = [f"no fresh pose of the {n}" for n, level in (("vehicle", self.vehicle), ("payload", self.payload)) if level >= HOLD]
         return found if self.connected else [*found, "autopilot not ready" + (f" ({self.note})" if self.note else "")]
 
@@ -97,13 +88,7 @@ class Machine:
     """
 
     def __init__(self, params: StateParams, throws: int, patient: bool = False) -> None:
-        """Begin in idle.
-
-        Args:
-            params: time-outs.
-            throws: number after which the run lands.
-            patient: whether idle and check may last for ever, as where poses are only looked at.
-        """
+        """Begin in idle, which with check may last for ever if ``patient``, as where poses are only looked at; lands after some throws."""
         self.params, self.most, self.patient = params, throws, patient
         self.state, self.reason = State.IDLE, "start"
         self.since: float | None = None
@@ -152,7 +137,7 @@ class Machine:
         self.aborted |= state is State.ABORT
 
     def waits(self, seen: Inputs) -> str:
-        """Why it does not go on, in words; empty where nothing is in the way but time."""
+        """Return why it does not go on, in words; empty where nothing is in the way but time."""
         texts: list[str] = []
         if self.state in (State.IDLE, State.CHECK, State.READY, State.ARMED):
             texts = seen.missing() if self.state in (State.IDLE, State.CHECK) else []
@@ -168,7 +153,7 @@ class Machine:
         return "; ".join(texts)
 
     def _lasted(self, now: float, holds: bool, time: float) -> bool:
-        """Whether a condition has now held for a time."""
+        """Return whether a condition has now held for a time."""
         if not holds:
             self._held = None
             return False

@@ -10,34 +10,24 @@ from typing import Any
 
 import numpy as np
 
-from hil.backends.ardupilot import (
-    BRAKE,
-    GUIDED,
-    GUIDED_NOGPS,
-    LAND_MODE,
-    LOITER,
-    SERVO_GRIPPER,
-    THRUST_AS_THRUST,
-)
+from hil.backends.ardupilot import BRAKE, GUIDED, GUIDED_NOGPS, LAND_MODE, LOITER, SERVO_GRIPPER, THRUST_AS_THRUST
 from hil.backends.thrust import ThrustParams
 from hil.fakes.mavlink import SERVO, FakeMavlink
 from hil.links.pymav import mav
 from visthrow.common.rotations import matrix_of_quat
 from visthrow.onboard.hover import GRAVITY
 
-FULL_CLIMB = 2.5
-"""Climb rate at full thrust where thrust is read as one: PILOT_SPEED_UP's default [m/s]."""
-
-CLIMB_GAIN = 5.0
-"""Gain of the climb rate's loop, PSC_VELZ_P's default [1/s]."""
+FULL_CLIMB = 2.5  # climb rate at full thrust where thrust is read as one: PILOT_SPEED_UP's default [m/s]
+CLIMB_GAIN = 5.0  # gain of the climb rate's loop, PSC_VELZ_P's default [1/s]
+ANSWERS = {"denied": mav.MAV_RESULT_DENIED, "in-progress": mav.MAV_RESULT_IN_PROGRESS}  # to a release, where it is not accepted
 
 
 class FakeArduPilot(FakeMavlink):
     """See the head of this module."""
 
     autopilot = mav.MAV_AUTOPILOT_ARDUPILOTMEGA
-    usual_mode = GUIDED
-    pilots_mode = LOITER
+    modes = (GUIDED, GUIDED_NOGPS, LOITER, BRAKE, LAND_MODE)
+    usual_mode, pilots_mode = GUIDED, LOITER
     thrust_map = ThrustParams(2.668, 0.1906, 1.0, 0.1, 0.0)
     defaults = {  # noqa: RUF012 - copied by each instance
         "GUID_OPTIONS": 8.0, "ATC_ANGLE_BOOST": 0.0, "GUID_TIMEOUT": 0.5, "EK3_SRC1_POSXY": 6.0, "GRIP_ENABLE": 1.0,
@@ -47,36 +37,17 @@ class FakeArduPilot(FakeMavlink):
     def listens(self) -> bool:
         return self.armed and self.mode in (GUIDED, GUIDED_NOGPS)
 
-    def enter(self, mode: int) -> int:
-        if mode not in (GUIDED, GUIDED_NOGPS, LOITER, BRAKE, LAND_MODE):
-            return mav.MAV_RESULT_FAILED
-        if mode != self.mode:
-            self.happened(f"mode {mode}")
-            self.mode, self._place = mode, self.plant.state["pos_w"].astype(float)
-            self.forget()
-            self._hover.reset()
-        return mav.MAV_RESULT_ACCEPTED
-
     def is_release(self, message: Any) -> bool:
         servo = message.command == mav.MAV_CMD_DO_SET_SERVO and message.param1 == SERVO
         return servo or super().is_release(message)
 
     def answer_release(self, message: Any) -> None:
-        answer, result = self.options.answer, mav.MAV_RESULT_ACCEPTED
-        function = self.parameters[f"SERVO{SERVO}_FUNCTION"]
-        if message.command == mav.MAV_CMD_DO_SET_SERVO:
-            moves = function == 0.0
-        else:
-            moves = function == SERVO_GRIPPER
-            if not self.parameters["GRIP_ENABLE"]:
-                moves, result = False, mav.MAV_RESULT_FAILED
-        if answer == "denied":
-            result = mav.MAV_RESULT_DENIED
-        elif answer == "in-progress":
-            result = mav.MAV_RESULT_IN_PROGRESS
-        if moves:
+        servo, function = message.command == mav.MAV_CMD_DO_SET_SERVO, self.parameters[f"SERVO{SERVO}_FUNCTION"]
+        able = servo or bool(self.parameters["GRIP_ENABLE"])
+        if able and function == (0.0 if servo else SERVO_GRIPPER):
             self.open_mechanism()
-        self.acknowledge(message.command, result)
+        result = mav.MAV_RESULT_ACCEPTED if able else mav.MAV_RESULT_FAILED
+        self.acknowledge(message.command, ANSWERS.get(self.options.answer, result))
 
     def flown(self) -> np.ndarray:
         if self.mode == LAND_MODE:
@@ -89,14 +60,12 @@ class FakeArduPilot(FakeMavlink):
         return self._meant(self._target)
 
     def _meant(self, target: np.ndarray) -> np.ndarray:
-        """The set-point as the parameters make it mean."""
-        out = target.copy()
-        now = self.plant.state
-        up = matrix_of_quat(now["quat_wb"][None].astype(float))[0, 2, 2]
+        """Return the set-point as the parameters make it mean."""
+        out, now = target.copy(), self.plant.state
         if not int(self.parameters["GUID_OPTIONS"]) & THRUST_AS_THRUST:
             climb = FULL_CLIMB * (2.0 * target[0] / self.plant.max_thrust - 1.0)
             out[0] = self.weight() * (1.0 + CLIMB_GAIN * (climb - now["vel_w"][2]) / GRAVITY)
         elif self.parameters["ATC_ANGLE_BOOST"]:
-            out[0] /= max(up, 0.5)
+            out[0] /= max(matrix_of_quat(now["quat_wb"][None].astype(float))[0, 2, 2], 0.5)
         out[0] = min(max(out[0], 0.0), self.plant.max_thrust)
         return out

@@ -18,24 +18,16 @@ from hil.links.pymav import mav
 from hil.links.roster import SIMULATED
 from hil.poses.frames import FrameParams, Frames
 from hil.poses.pose import PAYLOAD, Pose
+from visthrow.config.bounds import Bounded, NotNegative
 from visthrow.onboard.hover import GRAVITY, HoverController, HoverParams
 
-VEHICLE_ID, PAYLOAD_ID = (1, 1), (1, 25)
-"""MAVLink system and component that poses of vehicle and payload come from."""
-
-ANSWERS = ("accepted", "in-progress", "denied", "silent", "stuck")
-"""What a release is answered; "stuck" says accepted and moves nothing, and so does nobody but "accepted"."""
-
-MAX_RATES = (10.0, 10.0, 4.0)
-"""Largest body rates that the policies were trained with [rad/s]."""
+VEHICLE_ID, PAYLOAD_ID = (1, 1), (1, 25)  # MAVLink system and component that poses of vehicle and payload come from
+MAX_RATES = (10.0, 10.0, 4.0)  # largest body rates that the policies were trained with [rad/s]
 
 MOST_EVENTS = 200
 
-ANNOUNCED = 1.0
-"""Between two words that nothing real flies, which `--auto-arm` asks for [s]."""
-
-DESCENT, TOUCH = 0.4, 0.12
-"""Set-point of a landing below the vehicle [m]; height that counts as down [m]."""
+ANNOUNCED = 1.0  # between two words that nothing real flies, which `--auto-arm` asks for [s]
+DESCENT, TOUCH = 0.4, 0.12  # set-point of a landing below the vehicle [m]; height that counts as down [m]
 
 
 class WirePlant(Protocol):
@@ -60,23 +52,20 @@ class WirePlant(Protocol):
 
 
 @dataclass(frozen=True)
-class Options:
-    """How a fake behaves.
+class Options(Bounded):
+    """How a fake behaves."""
 
-    Raises:
-        ValueError: an unknown answer, or a negative time.
-    """
-
-    answer: str = "accepted"  # of ANSWERS: to a release
+    # To a release; "stuck" says accepted and moves nothing, and nobody but "accepted" moves anything.
+    answer: Literal["accepted", "in-progress", "denied", "silent", "stuck"] = "accepted"
     armed: bool = True  # at the start
     arming: bool = True  # whether it can be armed
     mode: int | None = None  # custom mode at the start, where there are modes; None: the usual one
     parameters: dict[str, float] = field(default_factory=dict)  # that differ from a well set-up vehicle's
-    command_delay: float | None = None  # from a set-point's arrival to its effect [s]; None: the kind's
-    answer_delay: float = 0.002  # 1 to 3 ms were measured [s]
-    servo_delay: float = 0.002  # from a release to the output's movement; 1 to 3 ms were measured [s]
+    command_delay: NotNegative | None = None  # from a set-point's arrival to its effect [s]; None: the kind's
+    answer_delay: NotNegative = 0.002  # 1 to 3 ms were measured [s]
+    servo_delay: NotNegative = 0.002  # from a release to the output's movement; 1 to 3 ms were measured [s]
     timesync_delay: float = 0.0  # of an answer to TIMESYNC; 1.3 to 10.5 ms were measured, of which the best counts [s]
-    mechanism: float = 0.0  # from a release to the latch of the plant, whose own lag, the output's movement in it, follows [s]
+    mechanism: NotNegative = 0.0  # from a release to the latch of the plant, whose own lag, the output's movement in it, follows [s]
     clock_offset: float = 0.0  # of its clock [s]
     silent_after: float = float("inf")  # it says nothing any more from this time on [s]
     taken_after: float = float("inf")  # when the pilot takes the vehicle over [s]
@@ -86,17 +75,11 @@ class Options:
     prompt: bool | None = None  # a heartbeat follows a change of mode at once, or only when it is due; None: as of the kind
     all_channels: bool = False  # Betaflight: all channels come by MSP, the arming one as well
 
-    def __post_init__(self) -> None:
-        times = (self.command_delay or 0.0, self.answer_delay, self.servo_delay, self.mechanism)
-        if self.answer not in ANSWERS or min(times) < 0.0:
-            raise ValueError(f"fake {vars(self)}: expected an answer of {', '.join(ANSWERS)}, times of 0 s or more")
-
 
 class SetPoints:
     """Set-points that begin to act at any time, flown by a plant in periods of its own: those that came, and from when on they act."""
 
     def __init__(self) -> None:
-        """Start with none."""
         self._acting: np.ndarray | None = None
         self._coming: deque[tuple[float, np.ndarray]] = deque()
 
@@ -105,12 +88,12 @@ class SetPoints:
         self._coming.append((when, target))
 
     def forget(self) -> None:
-        """Nothing that came so far counts any more."""
+        """Forget what came so far."""
         self._acting = None
         self._coming.clear()
 
     def flown(self, begin: float, period: float) -> np.ndarray | None:
-        """What acts in the period from a time on [s]: the mean, where it changes within it; None before the first one."""
+        """Return what acts in the period from a time on [s]: the mean, where it changes within it; None before the first one."""
         mean, since = np.zeros(4), begin
         while self._coming and self._coming[0][0] < begin + period - SLACK:
             when, target = self._coming.popleft()
@@ -139,15 +122,7 @@ class Fake(ABC):
     def __init__(
         self, plant: WirePlant, link: Link, mocap: MocapParams | None = None, seed: int = 0, options: Options | None = None
     ) -> None:  # fmt: skip
-        """Begin in the hands of a pilot.
-
-        Args:
-            plant: what flies.
-            link: that the poses go out on, with the vehicle's ids.
-            mocap: its faults.
-            seed: of noise and loss.
-            options: see `Options`.
-        """
+        """Begin in the hands of a pilot; the poses go out on the link, with the vehicle's ids."""
         self.plant, self.link, self.options = plant, link, options or Options()
         self.port: Any = link.port
         self.mocap = Mocap(mocap or MocapParams(), seed)
@@ -194,7 +169,7 @@ class Fake(ABC):
         heapq.heappush(self._later, (self.plant.time + delay, self._count, what))
 
     def clock(self) -> float:
-        """Time on the vehicle's own clock [s]."""
+        """Return the time on the vehicle's own clock [s]."""
         return self.plant.time + self.options.clock_offset
 
     @property
@@ -202,22 +177,30 @@ class Fake(ABC):
         """Whether the autopilot has fallen silent; the motion capture goes on."""
         return self.plant.time >= self.options.silent_after
 
-    def steer(self, command: tuple[float, ...]) -> None:
-        """Follow a set-point that was just heard, thrust [N] and body rates [rad/s]; a number that is none is 0, and it falls."""
+    def set_point(self, command: tuple[float, ...], listens: bool) -> None:
+        """Take a set-point that was just heard, thrust [N] and body rates [rad/s], and follow it or not; what is no number is 0."""
+        self.witness.command(self.plant.time, command)
+        if not listens:
+            self.ignored += 1
+            return
         self.followed += 1
         self._last_command = self.plant.time
         delay = self.options.command_delay
         delay = self.usual_delay if delay is None else delay
         self._set_points.add(self.heard + delay, np.nan_to_num(np.array(command)))
 
+    def stay(self) -> None:
+        """Hold this place from now on."""
+        self._place = self.plant.state["pos_w"].astype(float)
+
     def forget(self) -> None:
-        """Who flies from now on follows no set-point that came before."""
+        """Follow no set-point that came before: another one flies from now on."""
         self._target = None
         self._set_points.forget()
 
     def open_mechanism(self) -> None:
-        """The output moves, and what hangs on it lets go some time later; with "accepted" alone."""
-        if self.options.answer not in ("accepted",) or self.release_time is not None:
+        """Move the output; what hangs on it lets go some time later. With "accepted" alone."""
+        if self.options.answer != "accepted" or self.release_time is not None:
             return
         self.release_time = self.heard + self.options.servo_delay
         self._trip = self.heard + self.options.mechanism
@@ -228,21 +211,21 @@ class Fake(ABC):
         return self.release_time is not None and self.plant.time >= self.release_time
 
     def note_release(self) -> None:
-        """A release command has come."""
+        """Note that a release command has come."""
         self.witness.release(self.plant.time, self.armed, self.plant.state["payload_pos_w"])
 
     def weight(self) -> float:
-        """Weight of what flies now [N]."""
+        """Return the weight of what flies now [N]."""
         return self.plant.mass[0 if self.plant.state["attached"] else 1] * GRAVITY
 
     def hold(self, goal_w: np.ndarray) -> np.ndarray:
-        """Command that holds a place [m]: of the autopilot, or of the pilot's hands."""
+        """Return the command that holds a place [m]: of the autopilot, or of the pilot's hands."""
         now = self.plant.state
         views = [now[name].astype(float)[None] for name in ("pos_w", "quat_wb", "vel_w")]
         return self._hover.step(*views, goal_w, self.weight() / GRAVITY)[0]
 
     def descend(self) -> np.ndarray:
-        """Command that lands where the vehicle is; it disarms once it is down."""
+        """Return the command that lands where the vehicle is; it disarms once it is down."""
         pos = self.plant.state["pos_w"]
         if pos[2] < TOUCH:
             self.armed = False
@@ -251,14 +234,13 @@ class Fake(ABC):
 
     @abstractmethod
     def take(self) -> None:
-        """The pilot takes the vehicle over, and holds it."""
+        """Let the pilot take the vehicle over, and hold it."""
 
     @abstractmethod
     def flown(self) -> np.ndarray:
-        """Command of this period, by whoever flies."""
+        """Return the command of this period, by whoever flies."""
 
-    @abstractmethod
-    def speak(self) -> None:
+    def speak(self) -> None:  # noqa: B027 - one that speaks when it is asked says nothing here
         """Say what is due: heartbeats, streams."""
 
     def hear(self) -> None:
@@ -269,6 +251,9 @@ class Fake(ABC):
         """Do what was put off until a time [s]."""
         while self._later and self._later[0][0] <= time + SLACK:
             heapq.heappop(self._later)[2]()
+
+    def run_on(self, when: float) -> None:  # noqa: B027  most fakes have no clock of their own
+        """Let the autopilot work up to a time within this period [s], where its clock is ours: what comes then was not there before."""
 
     def fly(self) -> None:
         """Hear what has come, and fly one period."""
@@ -298,7 +283,7 @@ class Fake(ABC):
             self.speak()
 
     def step(self) -> None:
-        """One period."""
+        """Fly one period."""
         self.fly()
         self.emit()
 
@@ -323,7 +308,7 @@ class Fake(ABC):
             self.link.send(message)
 
     def report(self) -> dict[str, Any]:
-        """What happened to the payload, on the plant's clock, and to the messages."""
+        """Return what happened to the payload, on the plant's clock, and to the messages."""
         w = self.witness
         return {
             **self.plant.landing, "followed": self.followed, "ignored": self.ignored, "releases": w.releases,
@@ -342,12 +327,9 @@ class PortFake(Fake):
 
     thrust_map = ThrustParams(2.668, 0.1906, 1.0, 0.1, 0.0)
 
-    def __init__(
-        self, plant: WirePlant, link: Link, mocap: MocapParams | None = None, seed: int = 0, options: Options | None = None,
-        port: Port | None = None,
-    ) -> None:  # fmt: skip
-        """See `Fake`; ``port`` is that commands come on."""
-        super().__init__(plant, link, mocap, seed, options)
+    def __init__(self, *args: Any, port: Port | None = None, **kwargs: Any) -> None:
+        """Take the port that commands come on; else as of `Fake`."""
+        super().__init__(*args, **kwargs)
         self.port = port
 
     @abstractmethod

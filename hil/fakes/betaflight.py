@@ -12,37 +12,27 @@ from typing import Any
 
 import numpy as np
 
-from hil.backends.betaflight import BOX_ARM, BOX_OVERRIDE, FORWARDING, HIGH, LOW, STICKS, TUNING
+from hil.backends.betaflight import BOX_ARM, BOX_OVERRIDE, FORWARDING, HIGH, LOW, SETTINGS, STICKS
 from hil.backends.rates import RATES_TYPES, RatesParams, Sticks
 from hil.fakes.base import PortFake
 from hil.links import msp
 
-IDLE_AFTER, DISARM_AFTER = 0.36, 1.6
-"""Silence after which the motors idle, and after which it disarms, with all channels by MSP [s]."""
-
-OVERRIDE_GONE = 0.3
-"""Silence after which the receiver's channels count again, under MSP OVERRIDE [s]."""
-
-RECEIVER_LOST, LOW_FIRST, ARM_SWITCH = 1 << 2, 1 << 3, 1 << 29
-"""Bits of the arming-disabled flags."""
-
-REACTION = 0.5
-"""Of the pilot, from the first stick frame to the override switch [s]."""
-
-BOXES = (BOX_ARM, 1, 27, BOX_OVERRIDE)
-"""Permanent ids in the order of the flags: arm, angle, failsafe, MSP override."""
-
-ORDER = (0, 1, 3, 2)
-"""rcmap AETR: where roll, pitch, yaw, throttle stand in a frame."""
+IDLE_AFTER, DISARM_AFTER = 0.36, 1.6  # silence after which the motors idle, and after which it disarms, with all channels by MSP [s]
+OVERRIDE_GONE = 0.3  # silence after which the receiver's channels count again, under MSP OVERRIDE [s]
+RECEIVER_LOST, LOW_FIRST, ARM_SWITCH = 1 << 2, 1 << 3, 1 << 29  # bits of the arming-disabled flags
+REACTION = 0.5  # of the pilot, from the first stick frame to the override switch [s]
+BOXES = (BOX_ARM, 1, 27, BOX_OVERRIDE)  # permanent ids in the order of the flags: arm, angle, failsafe, MSP override
+ORDER = (0, 1, 3, 2)  # rcmap AETR: where roll, pitch, yaw, throttle stand in a frame
 
 RELEASE_AUX, ARM_AUX, MINIMUM = 4, 1, 1050
+
+SIZES = {msp.RC_TUNING: 24, msp.RC_DEADBAND: 5, msp.RX_CONFIG: 7, msp.FAILSAFE_CONFIG: 8}  # bytes of the answers that tell settings
 
 
 class FakeBetaflight(PortFake):
     """See the head of this module."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
-        """See `PortFake`; the port is that of MSP."""
         super().__init__(*args, **kwargs)
         self.parser = msp.Parser()
         if self.options.all_channels:
@@ -76,23 +66,31 @@ class FakeBetaflight(PortFake):
             msp.API_VERSION: lambda: bytes([0, 1, 47]), msp.FC_VARIANT: lambda: b"BTFL", msp.STATUS: self._status,
             msp.RX_MAP: lambda: bytes([*ORDER, 4, 5, 6, 7]), msp.BOXIDS: lambda: bytes(BOXES), msp.RC: self._rc,
             msp.SERVO: self._servo, msp.ANALOG: lambda: struct.pack("<BHHhH", 111, 0, 0, 0, 1110),
-            msp.RC_TUNING: self._tuning, msp.RC_DEADBAND: self._deadband, msp.RX_CONFIG: self._rx_config,
-            msp.FAILSAFE_CONFIG: self._failsafe, msp.MODE_RANGES: self._ranges, msp.EEPROM_WRITE: lambda: b"",
+            msp.MODE_RANGES: self._ranges, msp.EEPROM_WRITE: lambda: b"",
             msp.FEATURE_CONFIG: lambda: struct.pack("<I", FORWARDING if self.parameters["channel_forwarding"] else 0),
         }  # fmt: skip
+        answer, direction = b"", msp.ANSWER
         if frame.command == msp.SET_RAW_RC:
             self._sticks_came(list(frame.words()))
-            answer = b""
         elif frame.command == msp.SET_RC_TUNING and not self.armed:
-            self.parameters.update({name: frame.payload[at] for name, at in TUNING.items() if at < len(frame.payload)})
+            told = {name: told.at for name, told in SETTINGS.items() if told.command == msp.RC_TUNING}
+            self.parameters.update({name: frame.payload[at] for name, at in told.items() if at < len(frame.payload)})
             self._set_rates()
-            answer = b""
+        elif frame.command in SIZES:
+            answer = self._settings(frame.command)
         elif frame.command in answers:
             answer = answers[frame.command]()
         else:
-            self._answer(msp.Frame(frame.command, b"", msp.REFUSAL))
-            return
-        self._answer(msp.Frame(frame.command, answer, msp.ANSWER))
+            direction = msp.REFUSAL
+        self._answer(msp.Frame(frame.command, answer, direction))
+
+    def _settings(self, command: int) -> bytes:
+        """Return the answer that tells settings."""
+        out = bytearray(SIZES[command])
+        for name, told in SETTINGS.items():
+            if told.command == command:
+                struct.pack_into(told.code, out, told.at, round(self.parameters.get(name, 0) / told.scale))
+        return bytes(out)
 
     def _answer(self, frame: msp.Frame) -> None:
         self.later(self.options.answer_delay, lambda: self.port.write(msp.pack(frame)))
@@ -107,17 +105,12 @@ class FakeBetaflight(PortFake):
         rates = tuple(self._sticks.rate(i, us) for i, us in enumerate((roll, pitch, yaw)))
         share = min(max((throttle - MINIMUM) / (HIGH - MINIMUM), 0.0), 1.0)
         idle = throttle <= MINIMUM
-        command = (0.0 if idle else self.thrust_map.thrust(share), *rates)
-        self.witness.command(self.plant.time, command)
         back = self.plant.time - self._heard > IDLE_AFTER
         self.channels, self._heard = channels, self.plant.time
         self._low_first |= back and not self.armed and channels[STICKS + ARM_AUX - 1] > 1700
         self._first = self.plant.time if self._first is None else self._first
         self._arm_channel(throttle)
-        if self.override:
-            self.steer(command)
-        else:
-            self.ignored += 1
+        self.set_point((0.0 if idle else self.thrust_map.thrust(share), *rates), self.override)
         self._release_channel()
 
     def _arm_channel(self, throttle: int) -> None:
@@ -131,7 +124,7 @@ class FakeBetaflight(PortFake):
             self.armed = self.override = False
 
     def _release_channel(self) -> None:
-        """Only while the channels are ours, and on the change to open."""
+        """Release on the change to open, while the channels are ours."""
         at = STICKS + RELEASE_AUX - 1
         opened = self.override and at < len(self.channels) and self.channels[at] > 1700
         if opened and not self._asked_open:
@@ -163,31 +156,15 @@ class FakeBetaflight(PortFake):
         shown = 1500 if self.parameters["channel_forwarding"] else HIGH if self.moved else LOW
         return struct.pack("<8H", shown, *([1500] * 7))
 
-    def _tuning(self) -> bytes:
-        out = bytearray(24)
-        out[6] = 50  # throttle's middle
-        for name, at in TUNING.items():
-            out[at] = int(self.parameters.get(name, 0))
-        return bytes(out)
-
-    def _deadband(self) -> bytes:
-        return bytes([int(self.parameters["deadband"]), int(self.parameters["yaw_deadband"]), 0, 0, 0])
-
-    def _rx_config(self) -> bytes:
-        return struct.pack("<BHHH", 0, 1900, int(self.parameters["mid_rc"]), int(self.parameters["min_check"]))
-
-    def _failsafe(self) -> bytes:
-        return struct.pack("<BBHBHB", round(10 * self.parameters["failsafe_delay"]), 10, 1000, 0, 100, 1)
-
     def _ranges(self) -> bytes:
         arm = [BOX_ARM, ARM_AUX - 1, 28, 48]
         switch = [] if self.options.all_channels else [BOX_OVERRIDE, 2, 28, 48]
         return bytes([*arm, *switch, 0, 0, 0, 0])
 
     def take(self) -> None:
-        """See `Fake`: the override switch goes off."""
+        """Switch the override off."""
         self.override = False
-        self._place = self.plant.state["pos_w"].astype(float)
+        self.stay()
         self.happened("override off")
 
     def flown(self) -> np.ndarray:
@@ -199,7 +176,7 @@ class FakeBetaflight(PortFake):
             return np.zeros(4) if gone else self.hold(self._place)
         if not self.options.all_channels:
             if quiet <= OVERRIDE_GONE:
-                self._place = self.plant.state["pos_w"].astype(float)
+                self.stay()
                 return self._target
             self.happened("override: the pilot's sticks count again")
             return self.hold(self._place)
@@ -209,9 +186,6 @@ class FakeBetaflight(PortFake):
             self.armed, self.override, self._disarmed = False, False, True
             self.happened("failsafe: disarmed")
         return np.zeros(4) if quiet > IDLE_AFTER else self._target
-
-    def speak(self) -> None:
-        """See `Fake`: it speaks when it is asked."""
 
     def report(self) -> dict[str, Any]:
         return {**super().report(), "override": self.override, "parameters": self.parameters}

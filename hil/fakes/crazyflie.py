@@ -13,24 +13,16 @@ from hil.backends.crazyflie import FULL, MODES
 from hil.fakes.base import PortFake
 from hil.links import crtp
 
-LEVELS_AFTER, STOPS_AFTER = 0.5, 2.0
-"""Silence of set-points [s]: COMMANDER_WDT_TIMEOUT_STABILIZE and _SHUTDOWN."""
-
-LEAST = 1000
-"""Thrust below this is none (MIN_THRUST)."""
+LEVELS_AFTER, STOPS_AFTER = 0.5, 2.0  # silence of set-points [s]: COMMANDER_WDT_TIMEOUT_STABILIZE and _SHUTDOWN
+LEAST = 1000  # Thrust below this is none (MIN_THRUST)
 
 ENOENT = 2
 
 
 class FakeCrazyflie(PortFake):
-    """See the head of this module.
-
-    Attributes:
-        placed: external poses that came, position [m] and attitude xyzw. parameters: values by name.
-    """
+    """See the head of this module; ``placed`` holds external poses that came, position [m] and attitude xyzw."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
-        """See `PortFake`; the port is that of CRTP."""
         super().__init__(*args, **kwargs)
         self.armed = False
         self.parameters: dict[str, float] = {**dict.fromkeys(MODES, 1), "hook.open": 0, **self.options.parameters}
@@ -83,19 +75,15 @@ class FakeCrazyflie(PortFake):
         self._locked &= thrust != 0
         rates = tuple(math.radians(rate) for rate in (roll, -pitch, yaw))
         command = (self.thrust_map.thrust(min(thrust, FULL) / FULL) if thrust >= LEAST else 0.0, *rates)
-        self.witness.command(self.plant.time, command)
-        if self.armed and not self._locked and not any(self.parameters[mode] for mode in MODES):
-            self.steer(command)
-        else:
-            self.ignored += 1
+        self.set_point(command, self.armed and not self._locked and not any(self.parameters[mode] for mode in MODES))
 
     def take(self) -> None:
-        """See `Fake`: there is no pilot beside the runner; its emergency stop ends all."""
+        """Stop all: there is no pilot beside the runner, but its emergency stop."""
         self.armed, self._stopped = False, True
         self.happened("emergency stop")
 
     def flown(self) -> np.ndarray:
-        """See `Fake`; before the runner has it somebody holds it in the hand."""
+        """Return the command of this period; before the runner has it somebody holds it in the hand."""
         quiet = self.plant.time - self._heard
         if self._target is None or not self.followed:
             return self.hold(self._place)
@@ -106,9 +94,6 @@ class FakeCrazyflie(PortFake):
             self.happened("commander: level")
             return np.array([self._target[0], 0.0, 0.0, 0.0])
         return self._target
-
-    def speak(self) -> None:
-        """See `Fake`: it speaks when it is asked."""
 
     def report(self) -> dict[str, Any]:
         return {**super().report(), "poses": len(self.placed), "parameters": self.parameters}

@@ -30,8 +30,7 @@ SETTLED = 0.1
 """What checks and arming take over the wire beyond the times that the configuration asks for [s]: 5 ticks. A throw that begins at
 the same time meets the same noise."""
 
-MOST = 8.0
-"""After which a throw is given up [s]."""
+MOST = 8.0  # after which a throw is given up [s]
 
 OURS = FrameParams("x,y,z", "x,y,z", "xyzw", 0.0, (0.0, 0.0, 0.0))
 
@@ -40,12 +39,7 @@ class Direct:
     """One vehicle, from poses to commands in one loop."""
 
     def __init__(self, plant: WirePlant, policy: Policy, params: HilParams, mocap: MocapParams, seed: int) -> None:
-        """Begin at the plant's start.
-
-        Args:
-            plant: what flies. policy: on the CPU. params: of the run whose estimator, autopilot and goal are used.
-            mocap: its faults. seed: of noise and loss.
-        """
+        """Begin at the plant's start, with a policy on the CPU and the run's estimator, autopilot and goal; ``seed``: of noise and loss."""
         self.plant, self.params = plant, params
         self.pilot = Pilot(policy, params.camera)
         self.mocap = Mocap(mocap, seed)
@@ -78,11 +72,7 @@ class Direct:
             self._tracks[pose.body].update(pose)
 
     def throw(self) -> dict[str, Any]:
-        """Hover where the vehicle is, as in other hands, then at the hover point, throw, and wait for the landing.
-
-        Returns:
-            The plant's landing, the start of the throw and its latch [s].
-        """
+        """Hover where the vehicle is, as in other hands, then at the hover point, throw, wait for the landing; its report."""
         latch, start = None, None
         tick = self._phase * self.plant.period
         level = np.array([self.plant.mass[0] * GRAVITY, 0.0, 0.0, 0.0])
@@ -125,7 +115,7 @@ class Direct:
 
 
 def scored(report: dict[str, Any], params: HilParams, start: float | None) -> dict[str, Any]:
-    """Error [m] and duration [s] of a plant's true landing; both None where there is none."""
+    """Return the error [m] and duration [s] of a plant's true landing; both None where there is none."""
     landed, when = report["landing_w"], report["landing_time"]
     if landed is None:
         return {"error": None, "duration": None}

@@ -6,37 +6,32 @@ from typing import Any
 import numpy as np
 
 from hil.backends.autopilot import ARMED, CUSTOM
-from hil.fakes.base import VEHICLE_ID, Fake, Options, WirePlant
-from hil.fakes.mocap import MocapParams
-from hil.links.mavlink_link import IGNORE_ATTITUDE, Link
+from hil.fakes.base import VEHICLE_ID, Fake
+from hil.links.mavlink_link import IGNORE_ATTITUDE
 from hil.links.pymav import mav
 
-FORCE = 21196
-"""Second parameter of COMPONENT_ARM_DISARM that disarms in flight."""
-
-SERVO = 9
-"""Output of the mechanism, from 1."""
+FORCE = 21196  # second parameter of COMPONENT_ARM_DISARM that disarms in flight
+SERVO = 9  # output of the mechanism, from 1
 
 
 class FakeMavlink(Fake):
     """An autopilot on the poses' link."""
 
     autopilot = mav.MAV_AUTOPILOT_GENERIC
+    modes: tuple[int, ...]  # custom modes that it can be in
     usual_mode = pilots_mode = 0
     defaults: dict[str, float]  # parameters of a vehicle that is set up well
     tells_unknown = False  # by PARAM_ERROR, of a parameter that it does not have; else it is silent
     ends = (1100, 1900)  # of the mechanism's output, closed and open [us]
 
-    def __init__(
-        self, plant: WirePlant, link: Link, mocap: MocapParams | None = None, seed: int = 0, options: Options | None = None
-    ) -> None:  # fmt: skip
-        super().__init__(plant, link, mocap, seed, options)
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
         self.mode = self.usual_mode if self.options.mode is None else self.options.mode
         self.parameters = {**self.defaults, **self.options.parameters}
         self._next_beat = 0.0
         self._streams: dict[int, tuple[float, float]] = {}  # by message: time of the next one, and period [s]
         self.refusals: list[str] = []
-        link.listen(self._hear)
+        self.link.listen(self._hear)
 
     def _hear(self, message: Any, arrival: float) -> None:
         kind, self.heard = message.get_type(), arrival
@@ -48,8 +43,7 @@ class FakeMavlink(Fake):
             self._command(message)
         elif kind == "TIMESYNC" and message.tc1 == 0:
             now = arrival + self.question_lag + self.options.clock_offset
-            answer = mav.MAVLink_timesync_message(int(now * 1e9), message.ts1)
-            self.say(answer, self.options.timesync_delay)
+            self.say(mav.MAVLink_timesync_message(int(now * 1e9), message.ts1), self.options.timesync_delay)
         elif kind == "PARAM_REQUEST_READ" and message.target_system == VEHICLE_ID[0]:
             self._tell_parameter(message.param_id)
         elif kind == "PARAM_SET" and message.param_id in self.parameters:
@@ -57,11 +51,11 @@ class FakeMavlink(Fake):
             self._tell_parameter(message.param_id)
 
     def beat_soon(self) -> None:
-        """Mode or arming have changed."""
+        """Say that mode or arming have changed, where it is prompt with that."""
         if self.usually_prompt if self.options.prompt is None else self.options.prompt:
             self._next_beat = 0.0
 
-    def say(self, message: Any, delay: float = 0.0) -> None:
+    def say(self, message: Any, delay: float) -> None:
         """Send a message after a delay [s]."""
         self.later(delay, lambda: self.link.send(message))
 
@@ -70,30 +64,37 @@ class FakeMavlink(Fake):
         self.say(mav.MAVLink_command_ack_message(command, result), self.options.answer_delay if delay is None else delay)
 
     def _set_point(self, message: Any) -> None:
-        rates = (message.body_roll_rate, -message.body_pitch_rate, -message.body_yaw_rate)
         thrust = self.thrust_map.thrust(message.thrust) if np.isfinite(message.thrust) else message.thrust
-        command = (thrust, *rates)
-        self.witness.command(self.plant.time, command)
+        command = (thrust, message.body_roll_rate, -message.body_pitch_rate, -message.body_yaw_rate)
         ours = message.target_system == VEHICLE_ID[0] and message.type_mask == IGNORE_ATTITUDE
-        if ours and self.listens():
-            self.steer(command)
-        else:
-            self.ignored += 1
+        self.set_point(command, ours and self.listens())
 
     @abstractmethod
     def listens(self) -> bool:
-        """Whether set-points are followed now."""
+        """Return whether set-points are followed now."""
 
     def take(self) -> None:
         self.enter(self.pilots_mode)
         self.beat_soon()
 
-    @abstractmethod
     def enter(self, mode: int) -> int:
         """Enter a custom mode; the result of the command."""
+        if mode not in self.modes:
+            return mav.MAV_RESULT_DENIED
+        if mode != self.mode:
+            self.happened(f"mode {self.mode_text(mode)}")
+            self.mode = mode
+            self.stay()
+            self.forget()
+            self._hover.reset()
+        return mav.MAV_RESULT_ACCEPTED
+
+    def mode_text(self, mode: int) -> str:
+        """Return a custom mode as people write it."""
+        return str(mode)
 
     def _command(self, message: Any) -> None:
-        number, answer = message.command, self.options.answer
+        number = message.command
         if number == mav.MAV_CMD_DO_SET_MODE:
             self.acknowledge(number, self.enter(self.custom_mode(message)))
             self.beat_soon()
@@ -107,16 +108,16 @@ class FakeMavlink(Fake):
             self.acknowledge(number, mav.MAV_RESULT_ACCEPTED)
         elif self.is_release(message):
             self.note_release()
-            if answer != "silent":
+            if self.options.answer != "silent":
                 self.witness.answered()
                 self.answer_release(message)
 
     def custom_mode(self, message: Any) -> int:
-        """Custom mode that DO_SET_MODE names."""
+        """Return the custom mode that DO_SET_MODE names."""
         return int(message.param2)
 
     def is_release(self, message: Any) -> bool:
-        """Whether a command opens the mechanism."""
+        """Return whether a command opens the mechanism."""
         return message.command == mav.MAV_CMD_DO_GRIPPER and message.param2 == mav.GRIPPER_ACTION_RELEASE
 
     @abstractmethod
@@ -127,7 +128,7 @@ class FakeMavlink(Fake):
         wanted = message.param1 == 1.0
         flying = self.plant.state["pos_w"][2] > 0.3
         if wanted and not self.options.arming:
-            self.say(mav.MAVLink_statustext_message(mav.MAV_SEVERITY_CRITICAL, b"Arm: battery below minimum"))
+            self.link.send(mav.MAVLink_statustext_message(mav.MAV_SEVERITY_CRITICAL, b"Arm: battery below minimum"))
             self.acknowledge(message.command, mav.MAV_RESULT_FAILED)
         elif not wanted and flying and message.param2 != FORCE:
             self.acknowledge(message.command, mav.MAV_RESULT_FAILED)
@@ -138,50 +139,46 @@ class FakeMavlink(Fake):
             self.acknowledge(message.command, mav.MAV_RESULT_ACCEPTED)
 
     def field(self, name: str) -> tuple[float, int]:
-        """Field and type of a PARAM_VALUE."""
+        """Return the field and type of a PARAM_VALUE."""
         return self.parameters[name], mav.MAV_PARAM_TYPE_REAL32
 
     def value(self, field: float, kind: int) -> float:
-        """Value in a PARAM_SET's field."""
+        """Return the value in a PARAM_SET's field."""
         return field
 
     def _tell_parameter(self, name: str) -> None:
-        if name not in self.parameters:
-            if not self.tells_unknown:
-                return
-            error = mav.MAVLink_param_error_message(245, 191, name.encode(), -1, mav.MAV_PARAM_ERROR_DOES_NOT_EXIST)
-            self.say(error, self.options.answer_delay)
-        else:
+        if name in self.parameters:
             field, kind = self.field(name)
             self.say(mav.MAVLink_param_value_message(name.encode(), field, kind, 1, 0), self.options.answer_delay)
+        elif self.tells_unknown:
+            error = mav.MAVLink_param_error_message(245, 191, name.encode(), -1, mav.MAV_PARAM_ERROR_DOES_NOT_EXIST)
+            self.say(error, self.options.answer_delay)
 
     def speak(self) -> None:
         time = self.plant.time
         if time >= self._next_beat:
             self._next_beat = time + 1.0
-            self._beat()
+            self._stream(mav.MAVLINK_MSG_ID_HEARTBEAT)
         for number, (due, period) in self._streams.items():
             if time >= due - 1e-9:
                 self._streams[number] = (due + period, period)
                 self._stream(number)
 
-    def _beat(self) -> None:
-        flags = CUSTOM | (ARMED if self.armed else 0)
-        self.link.send(mav.MAVLink_heartbeat_message(mav.MAV_TYPE_QUADROTOR, self.autopilot, flags, self.mode, 4, 3))
-
     def _stream(self, number: int) -> None:
-        """Send one of the messages that were asked for."""
+        """Send one of the messages that are said by themselves or were asked for."""
+        boot = int(self.clock() * 1e3) & 0xFFFFFFFF
         if number == mav.MAVLINK_MSG_ID_HEARTBEAT:
-            self._beat()
+            flags = CUSTOM | (ARMED if self.armed else 0)
+            self.link.send(mav.MAVLink_heartbeat_message(mav.MAV_TYPE_QUADROTOR, self.autopilot, flags, self.mode, 4, 3))
         elif number == mav.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW:
             outputs = [0] * 16
             outputs[SERVO - 1] = self.ends[self.moved]
             self.link.send(mav.MAVLink_servo_output_raw_message(int(self.clock() * 1e6) & 0xFFFFFFFF, 0, *outputs))
         elif number == mav.MAVLINK_MSG_ID_ATTITUDE:
             x, y, z = map(float, self.plant.state["rate_b"])
-            self.link.send(mav.MAVLink_attitude_message(int(self.clock() * 1e3) & 0xFFFFFFFF, 0.0, 0.0, 0.0, x, -y, -z))
+            self.link.send(mav.MAVLink_attitude_message(boot, 0.0, 0.0, 0.0, x, -y, -z))
         elif number == mav.MAVLINK_MSG_ID_ATTITUDE_TARGET:
-            share, boot = self.thrust_map.share(self.last_thrust), int(self.clock() * 1e3) & 0xFFFFFFFF
+            share = self.thrust_map.share(self.last_thrust)
             self.link.send(mav.MAVLink_attitude_target_message(boot, 0, [1.0, 0.0, 0.0, 0.0], 0.0, 0.0, 0.0, share))
 
     def report(self) -> dict[str, Any]:

@@ -7,7 +7,7 @@ goes wrong with it begins at a stated time, is drawn from a seed as well, and is
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -15,69 +15,43 @@ from hil.errors import RunError
 from hil.poses.pose import PAYLOAD, VEHICLE, Pose
 from visthrow.common.errors import suggest
 from visthrow.common.mocap import measured
+from visthrow.config.bounds import Bound, Bounded, NotNegative, Positive
 
-SLACK = 1e-9
-"""Tolerance of times that are sums of periods [s]."""
-
-RARE = 0.2
-"""Between two poses at 5 Hz [s]."""
-
-JUMP = 0.5
-"""[m]."""
-
-STEP = 1.0
-"""Jump of a clock [s]."""
-
-SHUFFLE = 0.03
-"""Longest further delay of a pose that may be overtaken [s]."""
+SLACK = 1e-9  # tolerance of times that are sums of periods [s]
+RARE = 0.2  # between two poses at 5 Hz [s]
+JUMP = 0.5  # [m]
+STEP = 1.0  # jump of a clock [s]
+SHUFFLE = 0.03  # longest further delay of a pose that may be overtaken [s]
 
 
 @dataclass(frozen=True)
-class MocapParams:
-    """What the motion capture makes of the truth.
+class MocapParams(Bounded):
+    """What the motion capture makes of the truth."""
 
-    Raises:
-        ValueError: a negative number, no rate, or a loss of 1 or more.
-    """
-
-    rate: float = 100.0  # poses a second of each body [Hz]
-    position_noise: float = 1e-3  # standard deviation [m]
-    angle_noise_deg: float = 0.2  # standard deviation about each axis
-    latency: float = 0.01  # from the instant of a pose to its sending [s]
-    loss: float = 0.02  # share of poses that never come
-
-    def __post_init__(self) -> None:
-        if min(vars(self).values()) < 0.0 or not self.rate > 0.0 or not self.loss < 1.0:
-            raise ValueError(f"mocap {vars(self)}: expected numbers of 0 or more, a rate above 0, a loss below 1")
+    rate: Positive = 100.0  # poses a second of each body [Hz]
+    position_noise: NotNegative = 1e-3  # standard deviation [m]
+    angle_noise_deg: NotNegative = 0.2  # standard deviation about each axis
+    latency: NotNegative = 0.01  # from the instant of a pose to its sending [s]
+    loss: Annotated[float, Bound(0.0, 1.0, "[)")] = 0.02  # share of poses that never come
 
 
 class Mocap:
     """Measures vehicle and payload."""
 
     def __init__(self, params: MocapParams, seed: int = 0) -> None:
-        """Begin with a measurement at time 0.
-
-        Args:
-            params: its faults.
-            seed: of noise and loss.
-        """
+        """Begin with a measurement at time 0; ``seed``: of noise and loss."""
         self.params = params
         self._rng = np.random.default_rng(seed)
         self._next = 0.0
 
     def due(self, time: float) -> bool:
-        """Whether a measurement is due at a time [s]."""
+        """Return whether a measurement is due at a time [s]."""
         return time >= self._next - SLACK
 
     def measure(self, time: float, truth: dict[str, Any]) -> list[Pose]:
-        """Measure both bodies at this instant, which is the due one.
+        """Measure both bodies at this time [s], which is the due one, of their true ``pos_w``, ``quat_wb`` and ``payload_pos_w``.
 
-        Args:
-            time: [s].
-            truth: ``pos_w`` [m], ``quat_wb`` (xyzw) and ``payload_pos_w`` [m].
-
-        Returns:
-            Those that are not lost, vehicle first, in our frames; their arrival is the latency after the instant.
+        Those that are not lost come back, vehicle first, in our frames; their arrival is the latency after the instant.
         """
         self._next += 1.0 / self.params.rate
         p, rng = self.params, self._rng
@@ -90,47 +64,16 @@ class Mocap:
         return [pose for pose, gone in zip(poses, lost) if not gone]
 
 
-def _stop(poses: list[Pose], fault: "MocapFault") -> list[Pose]:
-    return []
+Spoil = Callable[[list[Pose], "MocapFault"], list[Pose]]
+
+
+def _each(change: Callable[[Pose], dict[str, Any]]) -> Spoil:
+    """Return a fault that changes fields of every pose."""
+    return lambda poses, fault: [replace(p, **change(p)) for p in poses]
 
 
 def _repeat(poses: list[Pose], fault: "MocapFault") -> list[Pose]:
     return [replace(fault.last.get(p.body, p), stamp=p.stamp, arrival=p.arrival) for p in poses]
-
-
-def _lose_payload(poses: list[Pose], fault: "MocapFault") -> list[Pose]:
-    return [p for p in poses if p.body != PAYLOAD]
-
-
-def _swap(poses: list[Pose], fault: "MocapFault") -> list[Pose]:
-    other = {VEHICLE: PAYLOAD, PAYLOAD: VEHICLE}
-    return [replace(p, body=other[p.body]) for p in poses]
-
-
-def _turned(quat: tuple[float, ...]) -> Callable[[list[Pose], "MocapFault"], list[Pose]]:
-    def change(poses: list[Pose], fault: "MocapFault") -> list[Pose]:
-        return [replace(p, quat=quat) for p in poses]
-
-    return change
-
-
-def _order(poses: list[Pose], fault: "MocapFault") -> list[Pose]:
-    return [replace(p, quat=(*p.quat[1:], p.quat[0])) for p in poses]
-
-
-def _jump(poses: list[Pose], fault: "MocapFault") -> list[Pose]:
-    return [replace(p, pos=(p.pos[0] + JUMP, *p.pos[1:])) for p in poses]
-
-
-def _clock(by: float) -> Callable[[list[Pose], "MocapFault"], list[Pose]]:
-    def change(poses: list[Pose], fault: "MocapFault") -> list[Pose]:
-        return [replace(p, stamp=p.stamp + by) for p in poses]
-
-    return change
-
-
-def _reset(poses: list[Pose], fault: "MocapFault") -> list[Pose]:
-    return [replace(p, reset=p.reset + 1) for p in poses]
 
 
 def _rare(poses: list[Pose], fault: "MocapFault") -> list[Pose]:
@@ -143,37 +86,29 @@ def _shuffle(poses: list[Pose], fault: "MocapFault") -> list[Pose]:
     return [replace(p, arrival=p.arrival + SHUFFLE * float(fault.rng.random())) for p in poses]
 
 
-def _double(poses: list[Pose], fault: "MocapFault") -> list[Pose]:
-    return [p for p in poses for _ in range(2)]
-
-
-FAULTS: dict[str, tuple[str, Callable[[list[Pose], "MocapFault"], list[Pose]]]] = {
+FAULTS: dict[str, tuple[str, Spoil]] = {
     "none": ("nothing goes wrong", lambda poses, fault: poses),
-    "stop": ("motion capture stops", _stop),
+    "stop": ("motion capture stops", lambda poses, fault: []),
     "repeat": ("the last pose is repeated", _repeat),
-    "payload-lost": ("the payload is lost, the vehicle is not", _lose_payload),
-    "swap": ("vehicle and payload are exchanged", _swap),
-    "jump": ("both bodies jump by 0.5 m", _jump),
-    "order": ("quaternions written x, y, z, w for w, x, y, z", _order),
-    "zero-quaternion": ("quaternions of four zeros", _turned((0.0,) * 4)),
-    "nan-quaternion": ("quaternions that are no numbers", _turned((math.nan,) * 4)),
-    "clock-forth": ("the source's clock jumps a second ahead", _clock(STEP)),
-    "clock-back": ("the source's clock jumps a second back", _clock(-STEP)),
-    "reset": ("the source's reset counter counts on", _reset),
+    "payload-lost": ("the payload is lost, the vehicle is not", lambda poses, fault: [p for p in poses if p.body != PAYLOAD]),
+    "swap": ("vehicle and payload are exchanged", _each(lambda p: {"body": {VEHICLE: PAYLOAD, PAYLOAD: VEHICLE}[p.body]})),
+    "jump": ("both bodies jump by 0.5 m", _each(lambda p: {"pos": (p.pos[0] + JUMP, *p.pos[1:])})),
+    "order": ("quaternions written x, y, z, w for w, x, y, z", _each(lambda p: {"quat": (*p.quat[1:], p.quat[0])})),
+    "zero-quaternion": ("quaternions of four zeros", _each(lambda p: {"quat": (0.0,) * 4})),
+    "nan-quaternion": ("quaternions that are no numbers", _each(lambda p: {"quat": (math.nan,) * 4})),
+    "clock-forth": ("the source's clock jumps a second ahead", _each(lambda p: {"stamp": p.stamp + STEP})),
+    "clock-back": ("the source's clock jumps a second back", _each(lambda p: {"stamp": p.stamp - STEP})),
+    "reset": ("the source's reset counter counts on", _each(lambda p: {"reset": p.reset + 1})),
     "rare": ("poses at 5 Hz", _rare),
     "shuffle": ("packets overtake each other, by up to 30 ms", _shuffle),
-    "double": ("every packet comes twice", _double),
+    "double": ("every packet comes twice", lambda poses, fault: [p for p in poses for _ in range(2)]),
 }
-"""Name -> what happens, and the function that makes it happen."""
+"""Name -> what happens, and what makes it happen."""
 
 
 @dataclass
 class MocapFault:
-    """One fault from a time on.
-
-    Raises:
-        RunError: an unknown name.
-    """
+    """One fault from a time on; raises `RunError` for an unknown name."""
 
     name: str
     start: float  # on the plant's clock [s]
@@ -187,7 +122,7 @@ class MocapFault:
         self.kept: dict[str, float] = {}  # stamps of those let through, by body
 
     def spoil(self, poses: list[Pose], time: float) -> list[Pose]:
-        """What becomes of the poses that were measured at a time [s], as the source writes them."""
+        """Return what becomes of the poses that were measured at a time [s], as the source writes them."""
         if time < self.start:
             self.last.update({p.body: p for p in poses})
             return poses

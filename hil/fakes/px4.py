@@ -16,14 +16,13 @@ from hil.backends.thrust import ThrustParams
 from hil.fakes.mavlink import FakeMavlink
 from hil.links.pymav import mav
 
-STREAM_FIRST, STREAM_GAP = 1.0, 0.5
-"""Set-points before OFFBOARD, and the longest gap in them: 2 Hz [s]."""
+STREAM_FIRST, STREAM_GAP = 1.0, 0.5  # set-points before OFFBOARD, and the longest gap in them: 2 Hz [s]
 
 INTEGERS = ("COM_OBL_RC_ACT", "EKF2_EV_CTRL", "PWM_AUX_FUNC1", "PWM_AUX_MIN1", "PWM_AUX_MAX1")
 
 
 def custom(main: int, sub: int = 0) -> int:
-    """Custom mode of a heartbeat."""
+    """Return the custom mode of a heartbeat."""
     return main << 16 | sub << 24
 
 
@@ -35,6 +34,7 @@ class FakePx4(FakeMavlink):
     """See the head of this module."""
 
     autopilot = mav.MAV_AUTOPILOT_PX4
+    modes = (OFFBOARD, HOLD, LAND, POSCTL)
     usual_mode = pilots_mode = POSCTL
     usual_delay = 0.017
     usually_prompt, tells_unknown = False, True
@@ -61,17 +61,13 @@ class FakePx4(FakeMavlink):
     def enter(self, mode: int) -> int:
         time = self.plant.time
         streamed = time - self._stream_since > STREAM_FIRST and time - self._last <= STREAM_GAP
-        if mode not in (OFFBOARD, HOLD, LAND, POSCTL):
-            return mav.MAV_RESULT_DENIED
         if mode == OFFBOARD and not streamed:
             self.refusals.append(f"{time:.3f} s: OFFBOARD before the stream")
             return mav.MAV_RESULT_TEMPORARILY_REJECTED
-        if mode != self.mode:
-            self.happened(f"mode {mode >> 16 & 255}.{mode >> 24}")
-            self.mode, self._place = mode, self.plant.state["pos_w"].astype(float)
-            self.forget()
-            self._hover.reset()
-        return mav.MAV_RESULT_ACCEPTED
+        return super().enter(mode)
+
+    def mode_text(self, mode: int) -> str:
+        return f"{mode >> 16 & 255}.{mode >> 24}"
 
     def is_release(self, message: Any) -> bool:
         set_one = message.command == mav.MAV_CMD_DO_SET_ACTUATOR and np.isfinite(message.param1)
@@ -87,10 +83,8 @@ class FakePx4(FakeMavlink):
             self.open_mechanism()
         if gripper:
             self.acknowledge(number, mav.MAV_RESULT_IN_PROGRESS)
-            if answer != "in-progress":
-                self.acknowledge(number, mav.MAV_RESULT_ACCEPTED, self.parameters["PD_GRIPPER_TO"])
-        elif answer != "in-progress":
-            self.acknowledge(number, mav.MAV_RESULT_ACCEPTED)
+        if answer != "in-progress":
+            self.acknowledge(number, mav.MAV_RESULT_ACCEPTED, self.parameters["PD_GRIPPER_TO"] if gripper else None)
 
     def field(self, name: str) -> tuple[float, int]:
         if name in INTEGERS:

@@ -5,8 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-ROOM = 1.01
-"""Over a limit: whole microseconds of a stick, float32 on the wire."""
+ROOM = 1.01  # over a limit: whole microseconds of a stick, float32 on the wire
 
 MOST_KEPT = 100
 
@@ -32,7 +31,7 @@ class Witness:
     _answered: bool = False
 
     def command(self, time: float, command: tuple[float, ...]) -> None:
-        """A set-point has come: thrust [N], body rates [rad/s]."""
+        """Note a set-point: thrust [N], body rates [rad/s]."""
         self.commands += 1
         if not all(map(math.isfinite, command)):
             self._note(time, f"command {command} is not finite")
@@ -42,7 +41,7 @@ class Witness:
             self._note(time, f"command {command} beyond {self.limits}")
 
     def release(self, time: float, armed: bool, payload_w: np.ndarray) -> None:
-        """A command to open the mechanism has come."""
+        """Note a command to open the mechanism."""
         self.releases += 1
         low, high = self.fence
         if self._answered:
@@ -53,7 +52,7 @@ class Witness:
             self._note(time, f"released with the payload at {np.round(payload_w, 2).tolist()}, outside of its fence")
 
     def answered(self) -> None:
-        """The release was acknowledged: none may follow."""
+        """Note that the release was acknowledged: none may follow."""
         self._answered = True
 
     def _note(self, time: float, text: str) -> None:

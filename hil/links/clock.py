@@ -12,7 +12,7 @@ class Clock(Protocol):
     """A clock that never goes back."""
 
     def now(self) -> float:
-        """[s]."""
+        """Return the time [s]."""
 
     def sleep_until(self, when: float) -> None:
         """Wait until a time [s]; at once where it has passed."""
@@ -25,11 +25,7 @@ class MonotonicClock:
     """The machine's monotonic clock; at ``speed`` 0.5 its second takes two."""
 
     def __init__(self, speed: float = 1.0) -> None:
-        """Set the speed.
-
-        Raises:
-            ValueError: a speed of 0 or less.
-        """
+        """Set the speed; raises `ValueError` for 0 or less."""
         if not speed > 0.0:
             raise ValueError(f"clock speed {speed}; expected above 0")
         self._speed = speed
@@ -51,8 +47,7 @@ class MonotonicClock:
 class ManualClock:
     """A clock that is where it was put: for tests and replay."""
 
-    def __init__(self, start: float = 0.0) -> None:
-        """Begin at a time [s]."""
+    def __init__(self, start: float = 0.0) -> None:  # [s]
         self.time = start
 
     def now(self) -> float:
@@ -83,7 +78,7 @@ class Ticker:
     _start: float | None = None
 
     def due(self) -> float:
-        """Time of the next tick [s]."""
+        """Return the time of the next tick [s]."""
         if self._start is None:
             self._start = self.clock.now()
         return self._start + (self.index + 1) * self.period
@@ -116,11 +111,8 @@ class TimeSync:
         steps: how often a clock was set.
     """
 
-    DRIFT = 1e-3
-    """That clocks may part by within the window: 200 parts in a million over 5 s [s]."""
-
-    STEP_AFTER = 3
-    """Contradicting exchanges in a row that make a step."""
+    DRIFT = 1e-3  # that clocks may part by within the window: 200 parts in a million over 5 s [s]
+    STEP_AFTER = 3  # contradicting exchanges in a row that make a step
 
     def __init__(self, window: int = 50) -> None:
         """Remember the last ``window`` exchanges."""
@@ -130,16 +122,11 @@ class TimeSync:
 
     @staticmethod
     def stamp(now: float) -> int:
-        """A time [s] as TIMESYNC has it [ns]."""
+        """Return a time [s] as TIMESYNC has it [ns]."""
         return int(now * 1e9)
 
     def take(self, tc1: int, ts1: int, now: float) -> None:
-        """Take the answer to a request of ours.
-
-        Args:
-            tc1: the peer's time [ns]. ts1: of our request [ns].
-            now: of the answer's arrival [s].
-        """
+        """Take the answer to a request of ours, at a time [s]: the peer's time and the request's [ns]."""
         sent = ts1 / 1e9
         trip, offset = now - sent, tc1 / 1e9 - 0.5 * (sent + now)
         if self._exchanges and abs(offset - self.offset) > 0.5 * (trip + self.round_trip) + self.DRIFT:

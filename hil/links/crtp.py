@@ -15,22 +15,16 @@ from hil.errors import LinkError
 from hil.links.device import check_device, open_port
 from visthrow.common.extras import load_extra
 
-PARAM, COMMANDER, LOCALIZATION, SUPERVISOR = 2, 3, 6, 9
-"""Ports."""
+PARAM, COMMANDER, LOCALIZATION, SUPERVISOR = 2, 3, 6, 9  # ports
 
 BY_NAME, GENERIC, INFO, COMMAND = 3, 1, 0, 1
 """Channels: of parameters by name, of localization's further messages, of the supervisor's state and commands."""
 
 SET_POINT, POSE = struct.Struct("<fffH"), struct.Struct("<B7f")
 
-EXTERNAL_POSE, SET_BY_NAME, UINT8, STATE, ARM, ANSWER = 8, 0, 0x08, 0x0C, 0x01, 0x80
-"""Types within packets."""
-
-ARMED, CAN_FLY, FLYING, TUMBLED, LOCKED = 1 << 1, 1 << 3, 1 << 4, 1 << 5, 1 << 6
-"""Bits of the supervisor's state."""
-
-MOST = 31
-"""Bytes of a packet."""
+EXTERNAL_POSE, SET_BY_NAME, UINT8, STATE, ARM, ANSWER = 8, 0, 0x08, 0x0C, 0x01, 0x80  # types within packets
+ARMED, CAN_FLY, FLYING, TUMBLED, LOCKED = 1 << 1, 1 << 3, 1 << 4, 1 << 5, 1 << 6  # bits of the supervisor's state
+MOST = 31  # bytes of a packet
 
 CFLIB = ("radio://", "usb://", "serial://")
 
@@ -44,43 +38,43 @@ class Packet:
     data: bytes
 
     def pack(self) -> bytes:
-        """As it goes out."""
+        """Return its bytes as they go out."""
         return bytes([(self.port & 0xF) << 4 | self.channel & 3]) + self.data
 
 
 def unpack(data: bytes) -> Packet | None:
-    """The packet of some bytes; None where they are none."""
+    """Return the packet of some bytes; None where they are none."""
     return Packet(data[0] >> 4, data[0] & 3, data[1:]) if 1 <= len(data) <= MOST else None
 
 
 def set_point(thrust: int, rates_dps: tuple[float, float, float]) -> bytes:
-    """Legacy set-point: thrust of 65535, body rates forward, left, up [deg/s]; the firmware's pitch is nose down."""
+    """Return the legacy set-point: thrust of 65535, body rates forward, left, up [deg/s]; the firmware's pitch is nose down."""
     roll, pitch, yaw = rates_dps
     return Packet(COMMANDER, 0, SET_POINT.pack(roll, -pitch, yaw, thrust)).pack()
 
 
 def external_pose(pos: tuple[float, ...], quat: tuple[float, ...]) -> bytes:
-    """Position [m], z up, and attitude xyzw for its estimator."""
+    """Return the position [m], z up, and attitude xyzw for its estimator."""
     return Packet(LOCALIZATION, GENERIC, POSE.pack(EXTERNAL_POSE, *pos, *quat)).pack()
 
 
 def named(name: str) -> bytes:
-    """A parameter's name ``group.name`` as packets have it."""
+    """Return a parameter's name ``group.name`` as packets have it."""
     return name.replace(".", "\0").encode() + b"\0"
 
 
 def set_parameter(name: str, value: int) -> bytes:
-    """A parameter of eight bits, by its name."""
+    """Return a parameter of eight bits, by its name."""
     return Packet(PARAM, BY_NAME, bytes([SET_BY_NAME]) + named(name) + bytes([UINT8, value])).pack()
 
 
 def arm(on: bool) -> bytes:
-    """Request to arm or disarm."""
+    """Return the request to arm or disarm."""
     return Packet(SUPERVISOR, COMMAND, bytes([ARM, on])).pack()
 
 
 def ask_state() -> bytes:
-    """Question for the supervisor's state."""
+    """Return the question for the supervisor's state."""
     return Packet(SUPERVISOR, INFO, bytes([STATE])).pack()
 
 
@@ -90,11 +84,7 @@ class CflibPort:
     whole, sender, peer = True, None, None
 
     def __init__(self, address: str) -> None:
-        """Open it.
-
-        Raises:
-            LinkError: cflib is missing, or the link cannot be opened.
-        """
+        """Open it; raises `LinkError` where cflib is missing, or the link cannot be opened."""
         crtp = load_extra("cflib.crtp", "crazyflie", f"the Crazyflie at {address}", LinkError)
         self._packet = load_extra("cflib.crtp.crtpstack", "crazyflie", "the Crazyflie", LinkError).CRTPPacket
         self.lost: str | None = None
@@ -120,7 +110,7 @@ class CflibPort:
         return self.lost is None
 
     def fileno(self) -> int:
-        """See `Port`: its packets come by a thread; nothing can be waited for."""
+        """Return -1: its packets come by a thread; nothing can be waited for."""
         return -1
 
     def close(self) -> None:
@@ -128,9 +118,5 @@ class CflibPort:
 
 
 def open_crtp(device: str, remote: bool) -> Any:
-    """The port of a device.
-
-    Raises:
-        LinkError: it is refused, or cannot be opened.
-    """
+    """Open the port of a device; raises `LinkError` where it is refused, or cannot be opened."""
     return CflibPort(device) if device.startswith(CFLIB) else open_port(check_device(device, remote=remote))

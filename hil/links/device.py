@@ -17,8 +17,7 @@ from hil.errors import LinkError
 _NETWORK = re.compile(r"(udp|udpout|tcp):([0-9.]+|\[[0-9a-fA-F:]+\]|localhost):([0-9]{1,5})")
 _SERIAL = re.compile(r"serial:(/dev/(?:tty[A-Za-z0-9]+|serial/by-id/[\w.:+-]+|cu\.[\w-]+)):([0-9]{4,7})")
 LARGEST_DATAGRAM = 65536
-MOST_CHUNKS = 256
-"""Datagrams, or pieces of a stream, read in one go: a flood must not hold up the tick."""
+MOST_CHUNKS = 256  # datagrams, or pieces of a stream, read in one go: a flood must not hold up the tick
 
 MOST_SHUT_OUT = 4096
 """Datagrams of strangers thrown away in one go, unread: 5 ms; they must not stand in the way of those that are ours."""
@@ -34,11 +33,7 @@ class Device:
 
 
 def check_device(text: str, *, remote: bool = False) -> Device:
-    """Read a device string against the whitelist.
-
-    Args:
-        text: as described at the head of this module.
-        remote: whether addresses other than loopback ones are allowed.
+    """Read a device string against the whitelist; addresses other than loopback ones only with ``remote``.
 
     Raises:
         LinkError: anything else, and what is allowed.
@@ -60,9 +55,7 @@ def check_device(text: str, *, remote: bool = False) -> Device:
     if not 0 < port < 65536:
         raise LinkError(f"device {text!r}: port {port}; expected 1 to 65535")
     if not address.is_loopback and not remote:
-        raise LinkError(
-            f"device {text!r} leaves this machine; set link.remote = true in the config where that is what you want"
-        )
+        raise LinkError(f"device {text!r} leaves this machine; set link.remote = true in the config where that is what you want")
     return Device(found[1], host, port)
 
 
@@ -74,20 +67,20 @@ class Port(Protocol):
     peer: tuple[str, int] | None  # that the device names; None where it names none
 
     def read(self) -> bytes | None:
-        """The next chunk; None where there is none."""
+        """Return the next chunk; None where there is none."""
 
     def write(self, data: bytes, to: tuple[str, int] | None = None) -> bool:
-        """Whether the bytes were taken; on UDP for an address, where the device does not name it."""
+        """Return whether the bytes were taken; on UDP for an address, where the device does not name it."""
 
     def fileno(self) -> int:
-        """For waiting until there is something to read."""
+        """Return what can be waited for until there is something to read."""
 
     def close(self) -> None:
         """Give the port back."""
 
 
 def chunks(port: Port) -> Iterator[bytes]:
-    """What has arrived at a port, at most `MOST_CHUNKS` chunks of it."""
+    """Yield what has arrived at a port, at most `MOST_CHUNKS` chunks of it."""
     for _ in range(MOST_CHUNKS):
         data = port.read()
         if data is None:
@@ -113,11 +106,7 @@ class UdpPort(_SocketPort):
     whole = True
 
     def __init__(self, device: Device) -> None:
-        """Open it.
-
-        Raises:
-            LinkError: the address is taken or not this machine's.
-        """
+        """Open it; raises `LinkError` where the address is taken or not this machine's."""
         family = socket.AF_INET6 if ":" in device.host else socket.AF_INET
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
@@ -152,11 +141,7 @@ class TcpPort(_SocketPort):
     whole, sender, peer = False, None, None
 
     def __init__(self, device: Device) -> None:
-        """Connect.
-
-        Raises:
-            LinkError: nobody answers.
-        """
+        """Connect; raises `LinkError` where nobody answers."""
         try:
             self._socket = socket.create_connection((device.host, device.port), timeout=2.0)
         except OSError as error:
@@ -183,11 +168,7 @@ class SerialPort:
     whole, sender, peer = False, None, None
 
     def __init__(self, device: Device) -> None:
-        """Open it.
-
-        Raises:
-            LinkError: pyserial is missing, or the port cannot be opened.
-        """
+        """Open it; raises `LinkError` where pyserial is missing, or the port cannot be opened."""
         try:
             import serial
         except ModuleNotFoundError:
@@ -218,9 +199,5 @@ class SerialPort:
 
 
 def open_port(device: Device) -> Port:
-    """Open the port of a checked device string.
-
-    Raises:
-        LinkError: it cannot be opened.
-    """
+    """Open the port of a checked device string; raises `LinkError` where it cannot be opened."""
     return {"udp": UdpPort, "udpout": UdpPort, "tcp": TcpPort, "serial": SerialPort}[device.kind](device)

@@ -6,19 +6,15 @@ the boundary between MAVLink's units and orders and ours.
 
 import math
 import struct
-import threading
-import time
-from collections import deque
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
-from hil.errors import LinkError
 from hil.links.clock import Clock
 from hil.links.device import MOST_CHUNKS, MOST_SHUT_OUT, Port
 from hil.links.pymav import Parser, mav
 from hil.links.roster import Address, Roster, Seen
 from hil.links.signing import Signed
+from hil.links.writer import TlogWriter
 from hil.poses.pose import Pose, Quaternion, Vector
 from visthrow.common.rotations import quat_of_euler, rotate_one
 
@@ -26,70 +22,7 @@ LOCAL_FRAMES = (mav.MAV_FRAME_LOCAL_NED, mav.MAV_FRAME_LOCAL_FRD)
 BODY_FRAMES = (mav.MAV_FRAME_BODY_FRD, mav.MAV_FRAME_BODY_NED)
 NAN_QUATERNION = (math.nan,) * 4
 
-IGNORE_ATTITUDE = 128
-"""type_mask of SET_ATTITUDE_TARGET: rates and thrust, no attitude. Other bits beside it are silently not followed."""
-
-
-MOST_WAITING = 100_000
-"""Messages that may wait for a slow disk, some minutes' worth; those beyond are lost, and counted."""
-
-
-WRITE_EVERY = 0.1
-"""Between two looks for messages to write [s]: woken by each one, the thread would take the core from the flying one."""
-
-
-class TlogWriter:
-    """Writes a .tlog: for each message the time [us, big-endian] and its bytes; by a thread of its own, so that a slow disk delays
-    no tick. A write that fails is counted.
-    """
-
-    def __init__(self, path: str | Path) -> None:
-        """Open the file.
-
-        Raises:
-            LinkError: it cannot be written.
-        """
-        try:
-            self._file = open(path, "wb", buffering=1 << 16)  # noqa: SIM115 - closed in close()
-        except OSError as error:
-            raise LinkError(f"cannot write {path}: {error.strerror}") from error
-        self.failed = 0
-        self._waiting: deque[bytes] = deque()
-        self._over = threading.Event()
-        self._thread = threading.Thread(target=self._write, name="tlog", daemon=True)
-        self._thread.start()
-
-    def write(self, message: Any, unix_time: float | None = None) -> None:
-        """Append one message; never raises and never waits.
-
-        Args:
-            message: as parsed or packed.
-            unix_time: [s]; now where it is left out.
-        """
-        stamp = int((time.time() if unix_time is None else unix_time) * 1e6)
-        if len(self._waiting) >= MOST_WAITING:
-            self.failed += 1
-            return
-        self._waiting.append(struct.pack(">Q", stamp) + bytes(message.get_msgbuf()))
-
-    def _write(self) -> None:
-        over = False
-        while not over:
-            over = self._over.wait(WRITE_EVERY)
-            while self._waiting:
-                try:
-                    self._file.write(self._waiting.popleft())
-                except (OSError, ValueError):
-                    self.failed += 1
-
-    def close(self) -> None:
-        """Write what is left and close."""
-        self._over.set()
-        self._thread.join()
-        try:
-            self._file.close()
-        except OSError:
-            self.failed += 1
+IGNORE_ATTITUDE = 128  # type_mask of SET_ATTITUDE_TARGET: rates and thrust, no attitude. Other bits beside it are silently not followed
 
 
 class Link:
@@ -109,10 +42,8 @@ class Link:
         """Wrap an open port.
 
         Args:
-            port: from :func:`hil.links.device.open_port`.
-            system: our own id. component: likewise; 191 is an onboard computer.
-            tlog: written both ways; closed with the link.
-            roster: who may speak; None takes anybody.
+            port: see `hil.links.device`. system, component: our own ids; component 191 is an onboard computer.
+            tlog: written both ways; closed with the link. roster: who may speak; None takes anybody.
             key: that messages are signed with, and have to be; None: neither.
         """
         self.port, self.roster, self._tlog = port, roster or Roster(), tlog
@@ -127,13 +58,8 @@ class Link:
         self.received = self.sent = self.dropped = 0
 
     def packer(self, system: int, component: int) -> mav.MAVLink:
-        """What packs messages of ids of their own for this link, signed where it is."""
+        """Return what packs messages of ids of their own for this link, signed where it is."""
         return mav.MAVLink(None, system, component) if self._key is None else Signed(self._key, system, component)
-
-    @property
-    def recorded(self) -> bool:
-        """Whether all was recorded so far."""
-        return self._tlog is None or not self._tlog.failed
 
     def listen(self, listener: Callable[[Any, float], None]) -> None:
         """Call ``listener(message, arrival)`` for every message from now on."""
@@ -171,12 +97,7 @@ class Link:
         return count
 
     def send(self, message: Any, to: Address = None) -> bool:
-        """Send a message; whether the port took it.
-
-        Args:
-            message: not packed yet.
-            to: one address; left out, the autopilot's where the message names a target, else those of all parties.
-        """
+        """Send a message, to one address or to the autopilot's where it names a target, else to all parties'; whether the port took it."""
         try:
             if isinstance(self._mav, Signed):
                 self._mav.touch()
@@ -206,12 +127,7 @@ def pump(links: Sequence[Link], clock: Callable[[], float]) -> int:
 
 
 def wait(links: Sequence[Link], clock: Clock, arrivals: Callable[[], float], until: float) -> None:
-    """Wait until a time [s], handing on what comes in the meantime.
-
-    Args:
-        links: to look at. clock: to wait by. arrivals: clock of what arrives.
-        until: [s].
-    """
+    """Wait by a clock until a time [s], handing on what comes in the meantime; ``arrivals`` is the clock of that."""
     while links and clock.now() < until:
         clock.wait_for([link.port for link in links], until)
         if not pump(links, arrivals):
@@ -220,7 +136,7 @@ def wait(links: Sequence[Link], clock: Clock, arrivals: Callable[[], float], unt
 
 
 def quaternion_from_euler(roll: float, pitch: float, yaw: float) -> Quaternion:
-    """Attitude wxyz of MAVLink's angles (yaw, then pitch, then roll) [rad]; NaN where one is not finite."""
+    """Return the attitude wxyz of MAVLink's angles (yaw, then pitch, then roll) [rad]; NaN where one is not finite."""
     if not (math.isfinite(roll) and math.isfinite(pitch) and math.isfinite(yaw)):
         return NAN_QUATERNION
     x, y, z, w = quat_of_euler(roll, pitch, yaw)
@@ -228,22 +144,17 @@ def quaternion_from_euler(roll: float, pitch: float, yaw: float) -> Quaternion:
 
 
 def pose_from_message(message: Any, body: str, arrival: float) -> Pose | None:
-    """A pose message in SI units, still in MAVLink's frames (world north east down or the like, quaternion wxyz).
+    """Return a body's pose in SI units, still in MAVLink's frames: world north east down or the like, quaternion wxyz.
 
-    Args:
-        message: ATT_POS_MOCAP, VISION_POSITION_ESTIMATE or ODOMETRY.
-        body: whose it is.
-        arrival: on the runner's clock [s].
-
-    Returns:
-        None for another message, and for an ODOMETRY in another frame than LOCAL_NED or LOCAL_FRD.
+    None for what is no ATT_POS_MOCAP, VISION_POSITION_ESTIMATE or ODOMETRY, and for an ODOMETRY in another frame than LOCAL_NED or
+    LOCAL_FRD.
     """
     kind = message.get_type()
     if kind == "ATT_POS_MOCAP":
-        return Pose(message.time_usec / 1e6, arrival, body, _position(message), tuple(message.q))
+        return Pose(message.time_usec / 1e6, arrival, body, (message.x, message.y, message.z), tuple(message.q))
     if kind == "VISION_POSITION_ESTIMATE":
-        quat = quaternion_from_euler(message.roll, message.pitch, message.yaw)
-        return Pose(message.usec / 1e6, arrival, body, _position(message), quat, reset=message.reset_counter)
+        quat, pos = quaternion_from_euler(message.roll, message.pitch, message.yaw), (message.x, message.y, message.z)
+        return Pose(message.usec / 1e6, arrival, body, pos, quat, reset=message.reset_counter)
     if kind != "ODOMETRY" or message.frame_id not in LOCAL_FRAMES:
         return None
     quat = tuple(message.q)
@@ -253,28 +164,16 @@ def pose_from_message(message: Any, body: str, arrival: float) -> Pose | None:
     elif message.child_frame_id not in LOCAL_FRAMES:
         vel = None
     rate = _known((message.rollspeed, message.pitchspeed, message.yawspeed))
-    return Pose(message.time_usec / 1e6, arrival, body, _position(message), quat, vel, rate, message.reset_counter)
-
-
-def _position(message: Any) -> Vector:
-    return (message.x, message.y, message.z)
+    pos = (message.x, message.y, message.z)
+    return Pose(message.time_usec / 1e6, arrival, body, pos, quat, vel, rate, message.reset_counter)
 
 
 def _known(vector: Vector) -> Vector | None:
-    """MAVLink writes NaN for a quantity that is not known."""
+    """Return a vector; None for NaN, which MAVLink writes for a quantity that is not known."""
     return None if any(math.isnan(x) for x in vector) else vector
 
 
 def attitude_target(time_s: float, target: tuple[int, int], thrust: float, rate_frd: Vector) -> Any:
-    """SET_ATTITUDE_TARGET of a thrust and body rates.
-
-    Args:
-        time_s: on our clock [s].
-        target: system and component of the autopilot.
-        thrust: collective, 0 to 1.
-        rate_frd: [rad/s], body frame forward, right, down.
-    """
+    """Return SET_ATTITUDE_TARGET at a time [s]: collective thrust, 0 to 1, body rates forward, right, down [rad/s]."""
     stamp = int(time_s * 1e3) & 0xFFFFFFFF
-    return mav.MAVLink_set_attitude_target_message(
-        stamp, *target, IGNORE_ATTITUDE, [1.0, 0.0, 0.0, 0.0], *rate_frd, thrust
-    )
+    return mav.MAVLink_set_attitude_target_message(stamp, *target, IGNORE_ATTITUDE, [1.0, 0.0, 0.0, 0.0], *rate_frd, thrust)

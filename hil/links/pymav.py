@@ -9,8 +9,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 
 __all__ = ["Parser", "mav"]
 
-FORGED = "Invalid signature"
-"""What pymavlink calls a message without a valid signature, where one is asked for."""
+FORGED = "Invalid signature"  # what pymavlink calls a message without a valid signature, where one is asked for
 
 
 class Parser:
@@ -21,11 +20,7 @@ class Parser:
     """
 
     def __init__(self, make: Callable[[], mav.MAVLink] = lambda: mav.MAVLink(None)) -> None:
-        """Start empty.
-
-        Args:
-            make: of pymavlink's parser, which may ask for signatures.
-        """
+        """Take what makes pymavlink's parser, which may ask for signatures."""
         self.errors, self._make = 0, make
         self.forged: list[bytes] = []
         self._fresh()
@@ -35,12 +30,7 @@ class Parser:
         self._mav.robust_parsing = True
 
     def parse(self, data: bytes, whole: bool = True) -> list:
-        """Messages in a byte string.
-
-        Args:
-            data: what arrived.
-            whole: a datagram: nothing of it is kept for the next one. Else a piece of a stream.
-        """
+        """Return messages in a byte string: a whole datagram, of which nothing is kept for the next one, or a piece of a stream."""
         self.forged = []
         try:
             found = self._mav.parse_buffer(data) or []

@@ -8,31 +8,25 @@ address (a bridge that was started again); in flight none may.
 import ipaddress
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 from hil.errors import LinkError
 from hil.links.pymav import mav
+from visthrow.config.bounds import Bound
 
-Address = tuple[str, int] | None
-"""Address of a datagram's sender; None on a stream, which has one peer."""
+MavlinkId = Annotated[int, Bound(1, 255)]
 
-SILENT = 1.5
-"""After which another address may take a party's place on the ground: longer than a heartbeat's second [s]."""
+Address = tuple[str, int] | None  # address of a datagram's sender; None on a stream, which has one peer
 
-MOST_KEPT = 256
-"""Kinds of messages of all senders that are told apart; the rest is counted together."""
-
-MOST_SAID = 20
-"""Senders that are said while a run goes on; the summary has the others."""
-
-NOT_YET = "before its first"
-"""Why a message of a party is not taken that has not been heard as the one that it is to be."""
+SILENT = 1.5  # after which another address may take a party's place on the ground: longer than a heartbeat's second [s]
+MOST_KEPT = 256  # kinds of messages of all senders that are told apart; the rest is counted together
+MOST_SAID = 20  # senders that are said while a run goes on; the summary has the others
+NOT_YET = "before its first"  # why a message of a party is not taken that has not been heard as the one that it is to be
 
 SHARED = frozenset({"TIMESYNC", "NAMED_VALUE_INT"})
 """Messages that a party may send beside its own: its clock, and whether it is simulated."""
 
-SIMULATED = "SIMULATED"
-"""Name of the NAMED_VALUE_INT by which a fake says that nothing real flies."""
+SIMULATED = "SIMULATED"  # name of the NAMED_VALUE_INT by which a fake says that nothing real flies
 
 
 @dataclass(frozen=True)
@@ -46,7 +40,7 @@ class Party:
     autopilot: int | None = None  # MAV_AUTOPILOT that its HEARTBEAT must name
 
     def has(self, system: int, component: int) -> bool:
-        """Whether ids are those of the party."""
+        """Return whether ids are those of the party."""
         return self.system == system and self.component in (0, component)
 
 
@@ -61,7 +55,7 @@ class Seen:
     why: str = ""  # it was refused; empty where it was taken
 
     def text(self) -> str:
-        """In words."""
+        """Return it in words."""
         ids = "" if self.system is None else f" of system {self.system}, component {self.component}"
         return f"{self.kind}{ids} from {shown(self.address)}" + (f": {self.why}" if self.why else "")
 
@@ -70,24 +64,20 @@ OTHERS = Seen(None, None, None, "others")
 
 
 def shown(address: Address) -> str:
-    """An address in words."""
+    """Return an address in words."""
     if address is None:
         return "the link's peer"
     return f"[{address[0]}]:{address[1]}" if ":" in address[0] else f"{address[0]}:{address[1]}"
 
 
 def autopilot_name(number: int) -> str:
-    """Name of a MAV_AUTOPILOT."""
+    """Return the name of a MAV_AUTOPILOT."""
     entry = mav.enums["MAV_AUTOPILOT"].get(number)
     return str(number) if entry is None else entry.name.removeprefix("MAV_AUTOPILOT_")
 
 
 def check_allowed(senders: Iterable[str]) -> tuple[tuple[str, int | None], ...]:
-    """Read a list of allowed senders, ``ADDRESS`` or ``ADDRESS:PORT`` each.
-
-    Raises:
-        LinkError: what is neither.
-    """
+    """Read a list of allowed senders, ``ADDRESS`` or ``ADDRESS:PORT`` each; raises `LinkError` for what is neither."""
     out = []
     for text in senders:
         host, _, port = text.rpartition(":") if text.count(":") == 1 or (text.startswith("[") and "]:" in text) else (text, "", "")
@@ -111,12 +101,9 @@ class Roster:
     """
 
     def __init__(self, parties: Iterable[Party] = (), allow: Iterable[str] = (), tell: Callable[[str], None] | None = None) -> None:
-        """Wait for them all.
+        """Wait for all parties; without one, the first valid message of anybody says who is heard and answered.
 
-        Args:
-            parties: without one, the first valid message of anybody says who is heard and answered.
-            allow: addresses that may send at all; none: any.
-            tell: see above; never waits.
+        ``allow``: addresses that may send at all; none: any.
         """
         self.parties, self._allow, self.tell = tuple(parties), check_allowed(allow), tell
         self.at: dict[str, Address] = {}
@@ -129,19 +116,17 @@ class Roster:
         self._said: set[tuple] = set()
 
     def shuts_out(self, address: Address) -> bool:
-        """Whether a datagram is not even looked into: not from the device's peer, not on the list, or from nobody's address in flight."""
-        if address is None:
-            return False
-        if self.only not in (None, address):
-            self.refuse(Seen(address, None, None, "datagram", f"the link's device is {shown(self.only)}"))
-            return True
-        if self._allow and not any(host == address[0] and port in (None, address[1]) for host, port in self._allow):
-            self.refuse(Seen(address, None, None, "datagram", "not on link.allow"))
-            return True
-        if self.flying and self.parties and address not in self.at.values():
-            self.refuse(Seen(address, None, None, "datagram", "another sender while it flies"))
-            return True
-        return False
+        """Return whether a datagram is not even looked into: not from the device's peer, not on the list, from nobody in flight."""
+        why = None
+        if address is not None and self.only not in (None, address):
+            why = f"the link's device is {shown(self.only)}"
+        elif address is not None and self._allow and not any(h == address[0] and port in (None, address[1]) for h, port in self._allow):
+            why = "not on link.allow"
+        elif address is not None and self.flying and self.parties and address not in self.at.values():
+            why = "another sender while it flies"
+        if why is not None:
+            self.refuse(Seen(address, None, None, "datagram", why))
+        return why is not None
 
     def refuse(self, seen: Seen) -> None:
         """Count what is not taken, and say who sent it."""
@@ -157,11 +142,7 @@ class Roster:
         self.seen[seen] = self.seen.get(seen, 0) + 1
 
     def admit(self, message: Any, address: Address, now: float) -> bool:
-        """Whether a message is one of a party's; binds the party to its address.
-
-        Args:
-            message: as parsed. address: of its sender. now: [s].
-        """
+        """Return whether a message is one of a party's; binds the party to its sender's address at a time [s]."""
         kind, system, component = message.get_type(), message.get_srcSystem(), message.get_srcComponent()
         party = self._party(kind, system, component, address)
         if party is None and any(p.has(system, component) and self.at.get(p.name, ...) == address for p in self.parties):
@@ -171,22 +152,19 @@ class Roster:
             why = self._objection(party, message, kind, address, now)
         else:
             why = None if self.at.setdefault("peer", address) == address else "a second sender"
-        if why is not None and why.startswith(NOT_YET):
-            self._count(Seen(address, system, component, kind, why))  # of no stranger: its first one is on its way
-            return False
-        if why is not None:
-            self.refuse(Seen(address, system, component, kind, why))
-            return False
-        self._count(Seen(address, system, component, kind))
-        if party is None:
-            return True
+        seen = Seen(address, system, component, kind, why or "")
+        if why is not None and not why.startswith(NOT_YET):  # that of no stranger: its first one is on its way
+            self.refuse(seen)
+        else:
+            self._count(seen)
+        if why is not None or party is None:
+            return why is None
         self.heard[party.name] = now
         if kind == "NAMED_VALUE_INT" and message.name == SIMULATED:
             self.simulated = bool(message.value)
-        if party.name not in self.at:
-            self.at[party.name] = address
-        elif self.at[party.name] != address:
-            self.at[party.name] = address
+        before = self.at.get(party.name, address)
+        self.at[party.name] = address
+        if before != address:
             if self.tell is not None:
                 self.tell(f"the {party.name} speaks from {shown(address)} now")
             for call in self.moved:
@@ -194,7 +172,7 @@ class Roster:
         return True
 
     def _party(self, kind: str, system: int, component: int, address: Address) -> Party | None:
-        """Whose message it is by kind and ids; of a shared kind, one of theirs at this address first."""
+        """Return whose message it is by kind and ids; of a shared kind, one of theirs at this address first."""
         ours = [party for party in self.parties if party.has(system, component)]
         if kind in SHARED:
             here = [party for party in ours if party.name in self.at and self.at[party.name] == address]
@@ -202,7 +180,7 @@ class Roster:
         return next((p for p in ours if kind in p.kinds), next((p for p in ours if not p.kinds), None))
 
     def _objection(self, party: Party | None, message: Any, kind: str, address: Address, now: float) -> str | None:
-        """Why a message is not taken, or None."""
+        """Return why a message is not taken, or None."""
         if party is None:
             return f"nobody of this run, which expects {self.expected()}"
         if party.autopilot is not None and kind == "HEARTBEAT" and message.autopilot != party.autopilot:
@@ -218,7 +196,7 @@ class Roster:
         return None if not first or kind in first.split(", ") else f"{NOT_YET} {first}"
 
     def expected(self) -> str:
-        """The parties in words."""
+        """Return the parties in words."""
         texts = []
         for p in self.parties:
             what = "/".join(sorted(p.kinds)) if p.kinds else "all"
@@ -227,13 +205,13 @@ class Roster:
         return ", ".join(texts) or "anybody"
 
     def addresses(self, message: Any) -> tuple[Address, ...]:
-        """Where a message of ours goes: what names a target to the autopilot, the rest to all."""
+        """Return where a message of ours goes: what names a target to the autopilot, the rest to all."""
         if hasattr(message, "target_system") and "autopilot" in self.at:
             return (self.at["autopilot"],)
         return tuple(dict.fromkeys(self.at.values()))
 
     def summary(self) -> dict[str, Any]:
-        """Who was heard from where, and what was refused, most first."""
+        """Return who was heard from where, and what was refused, most first."""
         refused = sorted(((n, seen) for seen, n in self.seen.items() if seen.why or seen is OTHERS), key=lambda row: -row[0])
         return {
             "at": {name: shown(address) for name, address in self.at.items()}, "simulated": self.simulated,

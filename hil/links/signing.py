@@ -14,17 +14,10 @@ from pathlib import Path
 from hil.errors import LinkError
 from hil.links.pymav import mav
 
-EPOCH = 1_420_070_400.0
-"""2015-01-01, where time stamps of signatures begin [s since 1970]."""
-
-BEHIND = 6_000_000
-"""That the first message of a stream may be behind our clock: a minute, in units of 10 us."""
-
-MOST_STREAMS = 256
-"""Streams of valid signatures; more than 255 link ids of one sender are none."""
-
-LEAST_WORD = 8
-"""Characters of a pass phrase."""
+EPOCH = 1_420_070_400.0  # 2015-01-01, where time stamps of signatures begin [s since 1970]
+BEHIND = 6_000_000  # that the first message of a stream may be behind our clock: a minute, in units of 10 us
+MOST_STREAMS = 256  # streams of valid signatures; more than 255 link ids of one sender are none
+LEAST_WORD = 8  # characters of a pass phrase
 
 
 def read_key(path: str | Path) -> bytes:
@@ -55,7 +48,7 @@ def read_key(path: str | Path) -> bytes:
 
 
 def stamp_now() -> int:
-    """The time as signatures have it [10 us]."""
+    """Return the time as signatures have it [10 us]."""
     return int((time.time() - EPOCH) * 1e5)
 
 
@@ -63,13 +56,7 @@ class Signed(mav.MAVLink):
     """Packs signed messages, and parses those alone that are."""
 
     def __init__(self, key: bytes, system: int = 0, component: int = 0, streams: dict | None = None) -> None:
-        """Take the key.
-
-        Args:
-            key: of 32 bytes.
-            system, component: of the sender.
-            streams: times of the last valid signatures, of another parser of the same link.
-        """
+        """Take a key of 32 bytes, ids of the sender, and times of the last valid signatures, of another parser of the same link."""
         super().__init__(None, system, component)
         self.signing.secret_key, self.signing.sign_outgoing = key, True
         self.signing.stream_timestamps = {} if streams is None else streams
@@ -80,7 +67,7 @@ class Signed(mav.MAVLink):
         self.signing.timestamp = max(self.signing.timestamp, stamp_now())
 
     def check_signature(self, msgbuf: bytearray, srcSystem: int, srcComponent: int) -> bool:
-        """Whether a signature is valid, and newer than the last valid one of its stream.
+        """Return whether a signature is valid, and newer than the last valid one of its stream.
 
         The library's own notes the time of a message before it has looked at the signature: one forged message with a late time
         would shut the true sender out.

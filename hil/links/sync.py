@@ -19,11 +19,9 @@ EARLY, LATE = 0.005, 0.2
 
 
 class LinkSync:
-    """Keeps the clocks of all peers of a link.
+    """Keeps the clocks of all peers of a link, by MAVLink system and address: two senders of one system may have two clocks.
 
-    Attributes:
-        peers: by MAVLink system and address: two senders of one system may have two clocks.
-        foreign: poses whose stamps are not of their sender's TIMESYNC clock.
+    ``foreign`` counts poses whose stamps are not of their sender's TIMESYNC clock.
     """
 
     def __init__(self, link: Link) -> None:
@@ -55,12 +53,7 @@ class LinkSync:
             peer.take(message.tc1, message.ts1, arrival)
 
     def dated(self, pose: Pose, system: int) -> Pose:
-        """A pose with the time of its measurement on our clock, where its sender's clock is known and the stamp is of it.
-
-        Args:
-            pose: with its sender's stamp.
-            system: MAVLink id of the sender, whose message the link has just handed on.
-        """
+        """Return a pose of the message just handed on, dated on our clock where its sender's is known and the stamp is of it."""
         peer = self.peers.get((system, self._link.sender))
         if peer is None or peer.offset is None:
             return pose
@@ -71,7 +64,7 @@ class LinkSync:
         return replace(pose, measured=min(measured, pose.arrival))
 
     def summary(self) -> dict[str, Any]:
-        """Offsets and round trips [s] by system and address."""
+        """Return offsets and round trips [s] by system and address."""
         return {
             "peers": {
                 f"{system} at {shown(address)}": {"offset": peer.offset, "round_trip": peer.round_trip, "steps": peer.steps}

@@ -10,45 +10,29 @@ times that of a sample.
 
 from collections import deque
 from dataclasses import dataclass
+from typing import Annotated
 
 from hil.poses.pose import Pose, Quaternion, Vector
 from visthrow.common.rotations import conjugate, multiply, rotation_vector
+from visthrow.config.bounds import Bound, Bounded
 
-MOST_GAP = 0.1
-"""A gap longer than this empties the window: what lies before it says nothing of now [s]."""
-
-MOST_SAMPLES = 32
-"""In a window, whatever the source's rate: the fit's cost stays bounded."""
+MOST_GAP = 0.1  # a gap longer than this empties the window: what lies before it says nothing of now [s]
+MOST_SAMPLES = 32  # in a window, whatever the source's rate: the fit's cost stays bounded
 
 
 @dataclass(frozen=True)
-class EstimateParams:
-    """The filter.
+class EstimateParams(Bounded):
+    """The filter."""
 
-    Raises:
-        ValueError: an order other than 1 or 2, or a window that is empty or longer than :data:`MOST_GAP`.
-    """
-
-    window: float  # age of the oldest sample, where there are enough younger ones [s]
-    order: int  # 1: line, 2: parabola
-
-    def __post_init__(self) -> None:
-        if self.order not in (1, 2) or not 0.0 < self.window <= MOST_GAP:
-            raise ValueError(
-                f"order {self.order} over a window of {self.window} s; expected 1 or 2, and above 0 to {MOST_GAP} s"
-            )
-
-
-def slope_weights(ages: list[float], order: int) -> list[float]:
-    """Weights c_i of samples of given ages [s] (newest first, 0 first) in the slope at age 0 [1/s].
-
-    With too few samples for the order the order is lowered; with one sample the slope is 0.
-    """
-    return fit_weights(ages, order)[0]
+    window: Annotated[float, Bound(0.0, MOST_GAP, "(]")]  # age of the oldest sample, where there are enough younger ones [s]
+    order: Annotated[int, Bound(1, 2)]  # 1: line, 2: parabola
 
 
 def fit_weights(ages: list[float], order: int) -> tuple[list[float], list[float]]:
-    """Weights of the samples in the slope at age 0 [1/s], and in the second derivative [1/s^2] (0 for a line)."""
+    """Return weights c_i of samples of given ages [s], newest first, in the slope at age 0 [1/s], and in the second derivative [1/s^2].
+
+    With too few samples for the order the order is lowered; with one sample the slope is 0. The second one of a line is 0.
+    """
     order, none = min(order, len(ages) - 1), [0.0] * len(ages)
     if order < 1:
         return none, none
@@ -73,16 +57,12 @@ def fit_weights(ages: list[float], order: int) -> tuple[list[float], list[float]
 
 
 class SlopeFilter:
-    """Velocity and body rate of one body.
+    """Velocity, acceleration and body rate of one body; ``acceleration`` is of the last estimate [m/s^2], world frame, 0 for a line.
 
     The rate is worked out when it is asked for: many poses may come between two ticks, and a bare ball's is never asked for.
-
-    Attributes:
-        acceleration: of the last estimate [m/s^2], world frame; 0 for a line.
     """
 
     def __init__(self, params: EstimateParams) -> None:
-        """Start empty."""
         self.params = params
         self.acceleration: Vector = (0.0, 0.0, 0.0)
         self._window: deque[Pose] = deque(maxlen=MOST_SAMPLES)
@@ -97,11 +77,7 @@ class SlopeFilter:
         self._window.clear()
 
     def update(self, pose: Pose) -> Vector:
-        """Velocity, world frame [m/s], at a new pose; the source's own where it gives one.
-
-        Args:
-            pose: in our frames, its stamp above the last one's.
-        """
+        """Return the velocity, world frame [m/s], at a pose in our frames newer than the last; the source's own where it gives one."""
         window, params, stamp = self._window, self.params, pose.stamp
         if window and not 0.0 < stamp - window[0].stamp <= MOST_GAP:
             window.clear()
@@ -153,7 +129,7 @@ def _sum(weights: list[float], vectors: list[Vector]) -> Vector:
 
 
 def _turn(now: Quaternion, then: Quaternion | None) -> Vector:
-    """Rotation vector from the attitude now to an earlier one, in the body frame of now [rad]."""
+    """Return the rotation vector from the attitude now to an earlier one, in the body frame of now [rad]."""
     if then is None:
         return (0.0, 0.0, 0.0)
     return rotation_vector(multiply(conjugate(now), then))

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from hil.errors import FrameError
 from hil.poses.pose import Pose, Quaternion, Vector
@@ -24,11 +25,7 @@ from visthrow.logs.axes import turn_of
 
 @dataclass(frozen=True)
 class FrameParams:
-    """How a source describes poses. Every entry is stated; none has a default.
-
-    Raises:
-        FrameError: axes that are no turn, or an unknown quaternion order.
-    """
+    """How a source describes poses. Every entry is stated; none has a default. Raises `FrameError` for axes that are no turn."""
 
     axes: str  # our world axes in the source's, for instance "y,x,-z"
     body_axes: str  # our body axes in those of the source's body, for instance "x,-y,-z" for forward, right, down
@@ -39,20 +36,10 @@ class FrameParams:
     def __post_init__(self) -> None:
         rotation_of(self.axes)
         rotation_of(self.body_axes)
-        if self.quaternion not in ("xyzw", "wxyz"):
-            raise FrameError(f"quaternion order '{self.quaternion}'; expected 'xyzw' or 'wxyz'")
-        if not np.all(np.isfinite([self.yaw_offset_deg, *self.marker_offset_b])):
-            raise FrameError(
-                f"yaw offset {self.yaw_offset_deg}, marker offset {self.marker_offset_b}: expected finite numbers"
-            )
 
 
 def rotation_of(axes: str) -> np.ndarray:
-    """Return the matrix of a set of axes: ``v_ours = matrix @ v_source``, shape (3, 3).
-
-    Raises:
-        FrameError: not three signed letters, one of them twice, or a mirrored set.
-    """
+    """Return the matrix of a set of axes: ``v_ours = matrix @ v_source``, shape (3, 3); raises `FrameError` for what is no turn."""
     try:
         return turn_of(axes)
     except ValueError as error:
@@ -75,38 +62,25 @@ class Frames:
         self._offset = tuple(float(x) for x in params.marker_offset_b)
 
     def world_from_source(self, vector: Vector) -> Vector:
-        """A vector of the source's world in ours."""
+        """Return a vector of the source's world in ours."""
         return rotate_one(self._world, vector)
 
     def source_from_world(self, vector: Vector) -> Vector:
-        """A vector of our world in the source's."""
+        """Return a vector of our world in the source's."""
         return rotate_one(conjugate(self._world), vector)
 
-    def body_from_source(self, vector: Vector) -> Vector:
-        """A vector or rate of the source's body frame in ours."""
-        return rotate_one(self._body, vector)
-
-    def source_from_body(self, vector: Vector) -> Vector:
-        """A vector or rate of our body frame in the source's."""
-        return rotate_one(conjugate(self._body), vector)
-
     def quat_from_source(self, quat: Quaternion) -> Quaternion:
-        """An attitude as the source writes it, as ours (xyzw, body to world)."""
+        """Return an attitude as the source writes it, as ours (xyzw, body to world)."""
         if self.params.quaternion == "wxyz":
             quat = (*quat[1:], quat[0])
         return multiply(multiply(self._world, quat), conjugate(self._body))
 
-    def source_from_quat(self, quat: Quaternion) -> Quaternion:
-        """Our attitude as the source would write it."""
-        x, y, z, w = multiply(multiply(conjugate(self._world), quat), self._body)
-        return (w, x, y, z) if self.params.quaternion == "wxyz" else (x, y, z, w)
-
     def pose_from_source(self, pose: Pose) -> Pose:
-        """A source's pose in our frames, moved from the tracked point to the centre of mass."""
+        """Return a source's pose in our frames, moved from the tracked point to the centre of mass."""
         pos = self.world_from_source(pose.pos)
         quat = None if pose.quat is None else self.quat_from_source(pose.quat)
         vel = None if pose.vel is None else self.world_from_source(pose.vel)
-        rate = None if pose.rate is None else self.body_from_source(pose.rate)
+        rate = None if pose.rate is None else rotate_one(self._body, pose.rate)
         if quat is not None and any(self._offset):
             pos = _minus(pos, rotate_one(quat, self._offset))
             if vel is not None and rate is not None:
@@ -114,35 +88,26 @@ class Frames:
         return replace(pose, pos=pos, quat=quat, vel=vel, rate=rate)
 
     def source_from_pose(self, pose: Pose) -> Pose:
-        """The inverse of :meth:`pose_from_source`: what the source would have said."""
+        """Return the inverse of :meth:`pose_from_source`: what the source would have said."""
         pos, vel = pose.pos, pose.vel
         if pose.quat is not None and any(self._offset):
             pos = _plus(pos, rotate_one(pose.quat, self._offset))
             if vel is not None and pose.rate is not None:
                 vel = _plus(vel, rotate_one(pose.quat, cross_one(pose.rate, self._offset)))
-        quat = None if pose.quat is None else self.source_from_quat(pose.quat)
-        rate = None if pose.rate is None else self.source_from_body(pose.rate)
+        quat = None if pose.quat is None else multiply(multiply(conjugate(self._world), pose.quat), self._body)
+        if quat is not None and self.params.quaternion == "wxyz":
+            quat = (quat[3], *quat[:3])
+        rate = None if pose.rate is None else rotate_one(conjugate(self._body), pose.rate)
         vel = None if vel is None else self.source_from_world(vel)
         return replace(pose, pos=self.source_from_world(pos), quat=quat, vel=vel, rate=rate)
 
 
 def _quaternion(matrix: np.ndarray) -> Quaternion:
-    """Quaternion xyzw of one of the 24 turns: the eigenvector of largest eigenvalue of Bar-Itzhack's matrix."""
-    m = matrix
-    k = np.array(
-        [
-            [m[0, 0] - m[1, 1] - m[2, 2], m[1, 0] + m[0, 1], m[2, 0] + m[0, 2], m[2, 1] - m[1, 2]],
-            [m[1, 0] + m[0, 1], m[1, 1] - m[0, 0] - m[2, 2], m[2, 1] + m[1, 2], m[0, 2] - m[2, 0]],
-            [m[2, 0] + m[0, 2], m[2, 1] + m[1, 2], m[2, 2] - m[0, 0] - m[1, 1], m[1, 0] - m[0, 1]],
-            [m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1], m[0, 0] + m[1, 1] + m[2, 2]],
-        ]
-    )
-    vector = np.linalg.eigh(k)[1][:, -1]
-    # The entries of these turns are 0, 1/2, 1/sqrt(2) or 1; written exactly, so that "x,y,z" changes no bit.
+    """Return the quaternion xyzw of one of the 24 turns: its numbers, 0, 1/2, sqrt(1/2) or 1, exactly, so that "x,y,z" changes no bit."""
     exact = np.array([0.0, 0.5, math.sqrt(0.5), 1.0])
-    rounded = [math.copysign(float(exact[np.argmin(np.abs(exact - abs(v)))]), v) for v in vector]
-    lead = rounded[3] if rounded[3] else next(v for v in rounded if v)
-    return tuple((v + 0.0 if lead > 0 else -v + 0.0) for v in rounded)
+    x, y, z, w = (math.copysign(float(exact[np.argmin(np.abs(exact - abs(v)))]), v) for v in Rotation.from_matrix(matrix).as_quat())
+    sign = math.copysign(1.0, next(v for v in (w, x, y, z) if v))
+    return (sign * x + 0.0, sign * y + 0.0, sign * z + 0.0, sign * w + 0.0)
 
 
 def _plus(a: Vector, b: Vector) -> Vector:

@@ -5,7 +5,8 @@ time since a pose last *differed* from the one before. A body that jumps is refu
 where the last accepted one and its velocity put the body, within a room that grows with the time in which *nothing* came,
 not with the time in which wrong poses came. So two bodies that the system has swapped never become right again by waiting;
 their timers run out and the runner ends the throw. Swapped after a gap, which leaves room for both, they are known by the
-cable: a pose that fits the body at its other end better than its own is not taken, nor one farther off than the cable is long.
+cable: of poses off their way, one that fits the body at the cable's other end better is not taken, nor one farther off than the cable
+is long. A body that goes its way is followed, however far: a payload that has come off takes no pose of the vehicle with it.
 Poses that keep coming, but more rarely than ``hold``, are as good as none.
 """
 
@@ -13,16 +14,12 @@ import math
 from dataclasses import dataclass
 
 from hil.poses.pose import Pose, Vector
+from visthrow.common.errors import ConfigError
+from visthrow.config.bounds import Bounded, Positive
 
-OK, WARN, HOLD, ABORT = range(4)
-"""Levels of staleness."""
-
-MOST_ACCELERATION = 40.0
-"""By which a body may have changed its velocity while nothing came [m/s^2]."""
-
-
-RARE = 3
-"""Gaps longer than ``hold`` in a row that count as no poses at all."""
+OK, WARN, HOLD, ABORT = range(4)  # levels of staleness
+MOST_ACCELERATION = 40.0  # by which a body may have changed its velocity while nothing came [m/s^2]
+RARE = 3  # gaps longer than ``hold`` in a row that count as no poses at all
 
 
 @dataclass(frozen=True)
@@ -34,41 +31,32 @@ class Tether:
 
 
 @dataclass(frozen=True)
-class GateParams:
-    """Limits of one body.
+class GateParams(Bounded):
+    """Limits of one body."""
 
-    Raises:
-        ValueError: limits that are not above 0 or not ascending.
-    """
-
-    quat_tolerance: float  # of a quaternion's norm from 1 [-]
-    max_jump: float  # from where the last pose and velocity put the body [m]
-    max_speed: float  # [m/s]
-    max_turn: float  # between two poses, beyond max_turn_rate times the time in which nothing came [rad]
-    max_turn_rate: float  # [rad/s]
-    clock_step: float  # stamps that leave the arrivals by more than this are a step of the source's clock [s]
-    warn: float  # content age [s]
-    hold: float  # content age [s]
-    abort: float  # content age [s]
+    quat_tolerance: Positive  # of a quaternion's norm from 1 [-]
+    max_jump: Positive  # from where the last pose and velocity put the body [m]
+    max_speed: Positive  # [m/s]
+    max_turn: Positive  # between two poses, beyond max_turn_rate times the time in which nothing came [rad]
+    max_turn_rate: Positive  # [rad/s]
+    clock_step: Positive  # stamps that leave the arrivals by more than this are a step of the source's clock [s]
+    warn: Positive  # content age [s]
+    hold: Positive  # content age [s]
+    abort: Positive  # content age [s]
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not value > 0.0:
-                raise ValueError(f"{name} is {value}; expected a number above 0")
+        super().__post_init__()
         if not self.warn < self.hold < self.abort:
-            raise ValueError(f"gate: warn {self.warn}, hold {self.hold}, abort {self.abort} s; expected them ascending")
+            raise ConfigError(f"gate: warn {self.warn}, hold {self.hold}, abort {self.abort} s; expected them ascending")
 
 
 class Gate:
-    """Decides about the poses of one body.
+    """Decides about the poses of one body; ``last`` is the accepted one, ``refused`` counts by reason.
 
-    Attributes:
-        refused: number of refused poses by reason.
-        jumped: the source's reset counter has changed since the last :meth:`restart`.
+    ``jumped``: the source's reset counter has changed since the last :meth:`restart`.
     """
 
     def __init__(self, params: GateParams) -> None:
-        """Start without a pose."""
         self.params = params
         self.refused: dict[str, int] = {}
         self.restart()
@@ -82,12 +70,7 @@ class Gate:
         self._gaps = 0  # longer than hold, in a row
 
     def check(self, pose: Pose, velocity: Vector | None = None, tether: Tether | None = None) -> str | None:
-        """Judge a pose, in our frames.
-
-        Args:
-            pose: with a stamp of the source's clock.
-            velocity: of the body at its last accepted pose [m/s].
-            tether: the cable's other end, where one hangs.
+        """Judge a pose, in our frames, by the body's velocity at its last accepted pose [m/s] and the cable's other end, where one hangs.
 
         Returns:
             Why it is refused, or None where it is accepted: "finite", "quaternion", "old" (reordered or doubled),
@@ -105,11 +88,9 @@ class Gate:
         return None
 
     def stepped(self, pose: Pose) -> bool:
-        """Whether the source's clock was set between the last accepted pose and this one."""
+        """Return whether the source's clock was set between the last accepted pose and this one."""
         last = self.last
-        return last is not None and (
-            abs((pose.stamp - last.stamp) - (pose.arrival - last.arrival)) > self.params.clock_step
-        )
+        return last is not None and abs((pose.stamp - last.stamp) - (pose.arrival - last.arrival)) > self.params.clock_step
 
     def _reason(self, pose: Pose, velocity: Vector | None, tether: Tether | None) -> str | None:
         last = self.last
@@ -126,13 +107,11 @@ class Gate:
         if pose.pos == last.pos and pose.quat == last.quat:
             return "repeated"
         # A clock that was set says nothing of how long ago the last pose was; the arrivals do.
-        age, gap = (
-            max(pose.arrival - then.arrival if stepped else pose.stamp - then.stamp, 0.0) for then in (last, came)
-        )
+        age, gap = (max(pose.arrival - then.arrival if stepped else pose.stamp - then.stamp, 0.0) for then in (last, came))
         return self._motion(pose, last, velocity, tether, age, gap)
 
     def _itself(self, pose: Pose) -> str | None:
-        """What is wrong with a pose, whatever came before."""
+        """Return what is wrong with a pose, whatever came before."""
         p = self.params
         numbers = (pose.stamp, pose.arrival, *pose.pos, *(pose.quat or ()), *(pose.vel or ()), *(pose.rate or ()))
         if not all(map(math.isfinite, numbers)):
@@ -143,23 +122,14 @@ class Gate:
             return "speed"
         return None
 
-    def _motion(
-        self, pose: Pose, last: Pose, velocity: Vector | None, tether: Tether | None, age: float, gap: float
-    ) -> str | None:
-        """What is wrong with the way from the last accepted pose.
-
-        Args:
-            pose, last: in our frames.
-            velocity, tether: see :meth:`check`.
-            age: of the last accepted pose [s].
-            gap: in which nothing came at all [s].
-        """
+    def _motion(self, pose: Pose, last: Pose, velocity: Vector | None, tether: Tether | None, age: float, gap: float) -> str | None:
+        """Return what is wrong with the way from the last accepted pose of an age [s], after a gap in which nothing came at all [s]."""
         p = self.params
         expected = tuple(x + age * v for x, v in zip(last.pos, velocity or (0.0, 0.0, 0.0)))
         off = math.dist(pose.pos, expected)
-        if tether is not None:
+        if tether is not None and off > p.max_jump:
             apart = math.dist(pose.pos, tether.pos)
-            if apart < off and off > p.max_jump:
+            if apart < off:
                 return "swapped"
             if apart > tether.length:
                 return "cable"
@@ -174,11 +144,11 @@ class Gate:
         return None
 
     def age(self, now: float) -> float:
-        """Time since the content last changed [s]; infinite before the first pose."""
+        """Return the time since the content last changed [s]; infinite before the first pose."""
         return now - self._changed
 
     def level(self, now: float) -> int:
-        """:data:`OK`, :data:`WARN`, :data:`HOLD` or :data:`ABORT` by the content's age; ABORT where content is rare."""
+        """Return :data:`OK`, :data:`WARN`, :data:`HOLD` or :data:`ABORT` by the content's age; ABORT where content is rare."""
         if self._gaps >= RARE:
             return ABORT
         age = self.age(now)

@@ -8,7 +8,7 @@ move went where it was meant to is named.
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import pairwise, product
 
 import numpy as np
 
@@ -20,18 +20,12 @@ from hil.sources.base import Source
 from visthrow.common.rotations import conjugate, multiply, rotation_vector, tilt_and_heading
 from visthrow.logs.axes import TURNS
 
-SPEED, RATE = 0.06, 0.25
-"""Below both the vehicle rests [m/s], [rad/s]: noise of a millimetre and of 0.3 deg stays below."""
-SPAN = 0.2
-"""Over which speed and rate are taken [s]."""
-REST = 0.5
-"""The vehicle rests only after it has for this long [s]."""
-LEAST_WAY, LEAST_TURN = 0.2, math.radians(15.0)
-"""Smaller moves than these are no moves [m], [rad]."""
-LOOK = 0.25
-"""Between two looks at what came [s]."""
-TOLERANCE = math.radians(30.0)
-"""Between a move and its axis: people do not walk straight [rad]."""
+SPEED, RATE = 0.06, 0.25  # below both the vehicle rests [m/s], [rad/s]: noise of a millimetre and of 0.3 deg stays below
+SPAN = 0.2  # over which speed and rate are taken [s]
+REST = 0.5  # the vehicle rests only after it has for this long [s]
+LEAST_WAY, LEAST_TURN = 0.2, math.radians(15.0)  # smaller moves than these are no moves [m], [rad]
+LOOK = 0.25  # between two looks at what came [s]
+TOLERANCE = math.radians(30.0)  # between a move and its axis: people do not walk straight [rad]
 
 
 @dataclass(frozen=True)
@@ -67,19 +61,18 @@ class Step:
         """Change of place [m], shape (3,), source's world."""
         return np.subtract(self.after.pos, self.before.pos)
 
-    def turn(self, order: str) -> tuple[np.ndarray, np.ndarray]:
-        """Rotation vectors [rad] of the change of attitude in the source's world and body, quaternions in a given order."""
-        first, second = (_xyzw(pose.quat, order) for pose in (self.before, self.after))
-        turns = multiply(second, conjugate(first)), multiply(conjugate(first), second)
-        return tuple(np.array(rotation_vector(turn)) for turn in turns)
+    @property
+    def turn(self) -> float:
+        """Angle of the change of attitude [rad], whatever the order of the quaternions."""
+        return 2.0 * math.acos(min(abs(float(np.dot(self.before.quat, self.after.quat))), 1.0))
+
+    def turns(self, frames: Frames) -> tuple[np.ndarray, np.ndarray]:
+        """Return the rotation vectors [rad] of the change of attitude in our world and body."""
+        first, second = (frames.quat_from_source(pose.quat) for pose in (self.before, self.after))
+        return tuple(np.array(rotation_vector(q)) for q in (multiply(second, conjugate(first)), multiply(conjugate(first), second)))
 
 
-@dataclass(frozen=True)
-class Line:
-    """Judgement of one move."""
-
-    text: str
-    passed: bool
+Line = tuple[str, bool]  # judgement of one move: in words, and whether it passed
 
 
 @dataclass(frozen=True)
@@ -93,24 +86,17 @@ class Finding:
 
 
 def find_steps(poses: Sequence[Pose]) -> list[Step]:
-    """Moves between rests.
-
-    Args:
-        poses: raw, of the vehicle, in order.
-
-    Raises:
-        RunError: a pose without attitude.
-    """
+    """Return moves between rests, of raw poses of the vehicle in order; raises `RunError` for one without attitude."""
     if any(pose.quat is None for pose in poses):
         raise RunError("hand-carry: the vehicle's source gives no attitude; expected a rigid body, not a marker")
     good = [p for p in poses if np.isfinite([*p.pos, *p.quat]).all() and math.hypot(*p.quat) > 0.5]
     rests = _rests(good)
     steps = [Step(_mean(good[a.stop - 1 :: -1], a), _mean(good[b.start :], b)) for a, b in pairwise(rests)]
-    return [s for s in steps if np.linalg.norm(s.way) > LEAST_WAY or np.linalg.norm(s.turn("xyzw")[0]) > LEAST_TURN]
+    return [s for s in steps if np.linalg.norm(s.way) > LEAST_WAY or s.turn > LEAST_TURN]
 
 
 def _rests(poses: Sequence[Pose]) -> list[slice]:
-    """Stretches in which the vehicle rests."""
+    """Return stretches in which the vehicle rests."""
     if len(poses) < 3:
         return []
     times = np.array([p.arrival for p in poses])
@@ -127,7 +113,7 @@ def _rests(poses: Sequence[Pose]) -> list[slice]:
 
 
 def _mean(poses: Sequence[Pose], rest: slice) -> Pose:
-    """Mean of the poses of a rest next to a move."""
+    """Return the mean of the poses of a rest next to a move."""
     near = [p for p in poses[: rest.stop - rest.start] if abs(p.arrival - poses[0].arrival) <= REST]
     quats = np.array([p.quat for p in near])
     quats[np.sum(quats * quats[0], axis=1) < 0.0] *= -1.0
@@ -137,57 +123,37 @@ def _mean(poses: Sequence[Pose], rest: slice) -> Pose:
 
 
 def judge(steps: Sequence[Step], frames: FrameParams) -> Finding:
-    """Say of each move whether it went where it was meant to, and which frames would fit.
-
-    Args:
-        steps: one for each of `MOVES`.
-        frames: of the config.
+    """Say of each move whether it went where it was meant to by the config's frames, and which frames would fit.
 
     Raises:
-        RunError: another number of moves.
+        RunError: another number of moves than `MOVES`.
     """
     if len(steps) != len(MOVES):
         seen = "; ".join(f"{i}. {move.text}" for i, move in enumerate(MOVES, start=1))
         raise RunError(f"hand-carry: {len(steps)} moves between rests; expected {len(MOVES)}, a second of rest around each: {seen}")
-    pairs = list(zip(MOVES, steps))
+    pairs = [(move, step) for move, step in zip(MOVES, steps) if move.axis is not None]
     ways = [(move.axis, step.way) for move, step in pairs if not move.turn]
-    turns = [(move.axis, step) for move, step in pairs if move.turn and move.axis is not None]
-    world, mirrored = _world_axes(ways)
-    order, body = _body_axes(turns, rotation_of(world))
+    turns = [(move.axis, step) for move, step in pairs if move.turn]
+    world = max(TURNS, key=lambda axes: _agreement([(i, rotation_of(axes) @ way) for i, way in ways]))
+
+    def fits(order: str, body: str) -> float:
+        ours = Frames(replace(frames, axes=world, body_axes=body, quaternion=order, yaw_offset_deg=0.0))
+        return round(_agreement([(i, vector) for i, step in turns for vector in step.turns(ours)]), 9)
+
+    order, body = max(product(("xyzw", "wxyz"), TURNS), key=lambda case: fits(*case))
     fitting = replace(frames, axes=world, body_axes=body, quaternion=order, yaw_offset_deg=_yaw(ways, rotation_of(world)))
-    lines = [_line(move, step, frames) for move, step in pairs if move.axis is not None]
-    lines.append(_start(steps[0].before, frames))
-    return Finding(tuple(lines), fitting, mirrored, all(line.passed for line in lines))
-
-
-def _world_axes(ways: list[tuple[int, np.ndarray]]) -> tuple[str, bool]:
-    """The axis case under which the places went along their axes, and whether a mirrored one would fit better."""
-    scores = {axes: _agreement([(i, rotation_of(axes) @ way) for i, way in ways]) for axes in TURNS}
-    best = max(scores, key=scores.get)
-    matrix = np.column_stack([way / np.linalg.norm(way) for _, way in ways])
-    return best, bool(np.linalg.det(matrix) < -0.5)
-
-
-def _body_axes(turns: list[tuple[int, Step]], world: np.ndarray) -> tuple[str, str]:
-    """Quaternion order and axis case of the body under which the turns went about their axes, in the world and on the body."""
-    best = (-math.inf, "xyzw", "x,y,z")
-    for order in ("xyzw", "wxyz"):
-        vectors = [(axis, *step.turn(order)) for axis, step in turns]
-        in_world = _agreement([(axis, world @ w) for axis, w, _ in vectors])
-        for axes in TURNS:
-            score = in_world + _agreement([(axis, rotation_of(axes) @ b) for axis, _, b in vectors])
-            if score > best[0] + 1e-9:
-                best = (score, order, axes)
-    return best[1], best[2]
+    lines = [*(_line(move, step, frames) for move, step in pairs), _start(steps[0].before, frames)]
+    mirrored = bool(np.linalg.det(np.column_stack([way / np.linalg.norm(way) for _, way in ways])) < -0.5)
+    return Finding(tuple(lines), fitting, mirrored, all(passed for _, passed in lines))
 
 
 def _agreement(vectors: list[tuple[int, np.ndarray]]) -> float:
-    """Sum of the cosines between vectors and the axes that they belong to."""
+    """Return the sum of the cosines between vectors and the axes that they belong to."""
     return sum(float(v[axis] / max(np.linalg.norm(v), 1e-12)) for axis, v in vectors)
 
 
 def _yaw(ways: list[tuple[int, np.ndarray]], world: np.ndarray) -> float:
-    """Turn about our z that is left after the exchange of axes [deg]; 0 where it may be the walker's."""
+    """Return the turn about our z that is left after the exchange of axes [deg]; 0 where it may be the walker's."""
     forward, left = (world @ ways[i][1] for i in (0, 1))
     off = math.degrees(math.atan2(-forward[1] + left[0], forward[0] + left[1]))
     return round(off, 0) if abs(off) > 10.0 else 0.0
@@ -195,23 +161,19 @@ def _yaw(ways: list[tuple[int, np.ndarray]], world: np.ndarray) -> float:
 
 def _line(move: Move, step: Step, frames: FrameParams) -> Line:
     ours = Frames(frames)
-    if move.turn:
-        quats = (ours.quat_from_source(pose.quat) for pose in (step.before, step.after))
-        first, second = quats
-        went, size = np.array(rotation_vector(multiply(conjugate(first), second))), "rad about"
-    else:
-        went, size = np.array(ours.world_from_source(tuple(step.way))), "m along"
+    went = step.turns(ours)[1] if move.turn else np.array(ours.world_from_source(tuple(step.way)))
+    size = "rad about" if move.turn else "m along"
     length = float(np.linalg.norm(went))
     off = math.acos(max(-1.0, min(1.0, went[move.axis] / max(length, 1e-12))))
     passed = off <= TOLERANCE and length >= (LEAST_TURN if move.turn else LEAST_WAY)
     told = ", ".join(f"{axis} {value:+.2f}" for axis, value in zip("xyz", went))
-    return Line(f"{move.text.split(',')[0]}: {told} ({size} our axes), {math.degrees(off):.0f} deg off", passed)
+    return f"{move.text.split(',')[0]}: {told} ({size} our axes), {math.degrees(off):.0f} deg off", passed
 
 
 def _start(pose: Pose, frames: FrameParams) -> Line:
-    """The attitude at first, which is to be level with the nose along our x."""
+    """Return the attitude at first, which is to be level with the nose along our x."""
     tilt, heading = tilt_and_heading(Frames(frames).quat_from_source(pose.quat))
-    return Line(
+    return (
         f"at first: tilted by {math.degrees(tilt):.0f} deg, nose {math.degrees(heading):+.0f} deg from our x (if the moves pass "
         "and this does not, define the rigid body anew, level and with its nose along x)",
         max(tilt, abs(heading)) <= TOLERANCE,
@@ -221,14 +183,7 @@ def _start(pose: Pose, frames: FrameParams) -> Line:
 def collect(
     source: Source, clock: Clock, seconds: float, tell: Callable[[str], None] = lambda text: None, recorded: bool = False
 ) -> list[Step]:
-    """Take in the vehicle's poses until all moves were made, or for a time.
-
-    Args:
-        source: of raw poses. clock: to wait by.
-        seconds: after which a live source is given up [s].
-        tell: called with the next move to make.
-        recorded: a recording is taken to its end, whatever the time.
-    """
+    """Take in the vehicle's poses until all moves were made, or for a time [s]; a recording to its end. ``tell`` hears each move."""
     poses: list[Pose] = []
     steps: list[Step] = []
     begin, told = clock.now(), -1
@@ -244,8 +199,8 @@ def collect(
 
 
 def summary_text(finding: Finding, frames: FrameParams) -> str:
-    """The outcome in words."""
-    lines = [f"{'PASS' if line.passed else 'FAIL'}  {line.text}" for line in finding.lines]
+    """Return the outcome in words."""
+    lines = [f"{'PASS' if passed else 'FAIL'}  {text}" for text, passed in finding.lines]
     if finding.mirrored:
         lines.append(
             "the moves fit a mirrored world: it was not carried forward, left and up in this order, or the source is left-handed"
@@ -255,7 +210,3 @@ def summary_text(finding: Finding, frames: FrameParams) -> str:
         if was != fits and not finding.passed:
             lines.append(f"would fit: {name} = {fits!r}".replace("'", '"') + f"  (config: {was!r})".replace("'", '"'))
     return "\n".join(lines)
-
-
-def _xyzw(quat: tuple[float, ...], order: str) -> tuple[float, ...]:
-    return quat if order == "xyzw" else (*quat[1:], quat[0])

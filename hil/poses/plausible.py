@@ -10,18 +10,12 @@ from hil.sources.player import CHANNELS
 from visthrow.logs.check import physics
 from visthrow.logs.flightlog import Channel, FlightLog
 
-LEAST = 50
-"""Poses below which nothing is said."""
+LEAST = 50  # poses below which nothing is said
 _KINDS = {"pos": ("m", "world"), "quat": ("1", "world"), "vel": ("m/s", "world"), "rate": ("rad/s", "body")}
 
 
 def unit_problems(poses: Iterable[Pose], frames: dict[str, FrameParams]) -> list[str]:
-    """What in the poses of a recording no vehicle does; each says which unit would make sense of it.
-
-    Args:
-        poses: raw, of all bodies.
-        frames: of each body.
-    """
+    """Return what in a recording's raw poses no vehicle does, by the frames of each body; each says which unit would make sense of it."""
     poses, channels = list(poses), {}
     for body, params in frames.items():
         channels |= _channels([pose for pose in poses if pose.body == body], Frames(params), CHANNELS[body])
@@ -29,7 +23,7 @@ def unit_problems(poses: Iterable[Pose], frames: dict[str, FrameParams]) -> list
 
 
 def _channels(poses: list[Pose], frames: Frames, names: tuple[str, ...]) -> dict[str, Channel]:
-    """Poses of one body as channels in our frames; what some of them lack is left out."""
+    """Return poses of one body as channels in our frames; what some of them lack is left out."""
     ours = [frames.pose_from_source(p) for p in poses if np.all(np.isfinite((p.stamp, p.arrival, *p.pos)))]
     # A clock may be set in between: stamps that do not ascend are left to the gate.
     ours = [p for p, before in zip(ours, [None, *ours]) if before is None or p.stamp > before.stamp]

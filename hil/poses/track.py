@@ -4,22 +4,20 @@ import math
 from collections import deque
 from dataclasses import dataclass, replace
 
-from hil.poses.estimate import EstimateParams, SlopeFilter, slope_weights
+from hil.poses.estimate import EstimateParams, SlopeFilter, fit_weights
 from hil.poses.frames import FrameParams, Frames
 from hil.poses.gate import Gate, GateParams, Tether
 from hil.poses.pose import Pose, Quaternion, Vector
 from visthrow.common.rotations import multiply
 
-MOST_PREDICTION = 0.1
-"""Poses are carried forward by no more than this [s]; older ones are the timers' affair."""
+MOST_PREDICTION = 0.1  # poses are carried forward by no more than this [s]; older ones are the timers' affair
 
 TRUST = 0.5
 """Share of the estimated accelerations that velocity and rate are carried forward with: they are about as noisy as they are right.
 In 160 simulated throws with poses 20 ms old (1 mm, 0.2 deg, 100 Hz) state and vision policy landed 0.029 and 0.028 m off with it,
 0.043 and 0.035 m with all of the linear and none of the angular acceleration."""
 
-CALM_SAMPLES = 20
-"""Poses over which :meth:`Track.calm_speed` is taken: enough that noise of millimetres does not count as motion."""
+CALM_SAMPLES = 20  # poses over which :meth:`Track.calm_speed` is taken: enough that noise of millimetres does not count as motion
 
 
 @dataclass(frozen=True)
@@ -34,12 +32,7 @@ class BodyState:
 
 
 class Track:
-    """Follows one body.
-
-    Attributes:
-        gate: with the counts of what was refused. filter: with its lag.
-        accepted: number of poses taken.
-    """
+    """Follows one body with a ``gate``, which counts what was refused, and a ``filter``; ``accepted`` counts poses taken."""
 
     def __init__(self, frames: FrameParams, gate: GateParams, estimate: EstimateParams, turns: bool = True) -> None:
         """Start without a pose; ``turns``: whether the body rate is wanted, which a bare ball does without."""
@@ -79,7 +72,7 @@ class Track:
             _ = self.filter.rate
 
     def expected(self, time: float) -> Vector | None:
-        """Where the last pose and velocity put the body at a time of arrival [s]; None before the first pose."""
+        """Return where the last pose and velocity put the body at a time of arrival [s]; None before the first pose."""
         pose = self._pose
         if pose is None:
             return None
@@ -87,7 +80,7 @@ class Track:
         return tuple(x + age * v for x, v in zip(pose.pos, self._vel))
 
     def sample(self) -> tuple[Pose, Vector, Vector]:
-        """Last pose taken, its stamp freed of steps of the source's clock, with the estimates of velocity and body rate.
+        """Return the last pose taken, its stamp freed of steps of the source's clock, with the estimates of velocity and body rate.
 
         Raises:
             ValueError: there is none yet.
@@ -97,20 +90,15 @@ class Track:
         return replace(self._pose, stamp=self._pose.stamp + self._shift), self._vel, self.filter.rate
 
     def calm_speed(self) -> float:
-        """Speed by a line through the last poses [m/s]: late, but free of noise; infinite with too few of them."""
+        """Return the speed by a line through the last poses [m/s]: late, but free of noise; infinite with too few of them."""
         if len(self._slow) < CALM_SAMPLES:
             return math.inf
         newest = self._slow[0][0]
-        weights = slope_weights([newest - time for time, _ in self._slow], 1)
+        weights = fit_weights([newest - time for time, _ in self._slow], 1)[0]
         return math.hypot(*(sum(c * pos[i] for c, (_, pos) in zip(weights, self._slow)) for i in range(3)))
 
     def state(self, now: float, ahead: float = 0.0) -> BodyState | None:
-        """State by the last accepted pose, carried forward with part of what is known of its accelerations.
-
-        Args:
-            now: on the runner's clock [s].
-            ahead: by how much to carry it [s]; see :data:`MOST_PREDICTION`.
-        """
+        """Return the state at a time [s] by the last accepted pose, carried ahead [s] with part of what is known of its accelerations."""
         pose = self._pose
         if pose is None:
             return None

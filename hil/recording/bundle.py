@@ -12,21 +12,15 @@ from hil.errors import RunError
 from hil.poses.track import BodyState
 from hil.recording.record import CONFIG, POLICY, POSES, PROVENANCE, SUMMARY, TICKS, require_run
 
-PARTS = (CONFIG, POLICY, POSES, TICKS, SUMMARY, PROVENANCE)
-"""Files of a bundle, beside the links' own records."""
+PARTS = (CONFIG, POLICY, POSES, TICKS, SUMMARY, PROVENANCE)  # files of a bundle, beside the links' own records
 
 RECORDS = ("*.tlog", "*.msp")
 
-ENDING, MOST = ".zip", 2 << 30
-"""Bytes that a bundle may unpack to; a run of an hour has a tenth of it."""
+ENDING, MOST = ".zip", 2 << 30  # bytes that a bundle may unpack to; a run of an hour has a tenth of it
 
 
 def pack(folder: str | Path) -> Path:
-    """Write the bundle of a run beside its folder; returns its path.
-
-    Raises:
-        RunError: no folder of a run, or it cannot be written.
-    """
+    """Write the bundle of a run beside its folder and return its path; raises `RunError` where that cannot be."""
     folder = Path(folder).resolve()
     require_run(folder)
     path = folder.with_name(folder.name + ENDING)
@@ -69,23 +63,19 @@ def opened(path: str | Path) -> Iterator[Path]:
 
 
 def sentence(turn: dict[str, Any] | None, last: dict[str, Any] | None, cut: str | None) -> str:
-    """Where a run went wrong.
+    """Return where a run went wrong.
 
     Args:
         turn: the first tick in abort: ``time`` [s], ``state`` before it, ``since`` when that lasted [s], ``reason``, and ``vehicle``
-            as it was seen.
-        last: the last tick, in the same form; None where there is none.
-        cut: what is missing of the recording.
+            as it was seen. last: the last tick, in the same form, if any. cut: what is missing of the recording.
     """
     at = turn or (last if cut else None)
     if at is None:
         return "It did not go wrong." if last is None else f"It did not go wrong: it ended in {last['state']} ({last['reason']})."
     why = turn["reason"] if turn else "the recording ends"
-    return f"It went wrong {at['time'] - at['since']:.2f} s into '{at['state']}': {why}; {_where(at['vehicle'])}."
-
-
-def _where(vehicle: BodyState | None) -> str:
-    if vehicle is None:
-        return "the vehicle had not been seen"
-    place, speed = ", ".join(f"{x:.2f}" for x in vehicle.pos), sum(v * v for v in vehicle.vel) ** 0.5
-    return f"the vehicle was at ({place}) m with {speed:.1f} m/s, its pose {1e3 * vehicle.age:.0f} ms old"
+    vehicle: BodyState | None = at["vehicle"]
+    where = "had not been seen"
+    if vehicle is not None:
+        place, speed = ", ".join(f"{x:.2f}" for x in vehicle.pos), sum(v * v for v in vehicle.vel) ** 0.5
+        where = f"was at ({place}) m with {speed:.1f} m/s, its pose {1e3 * vehicle.age:.0f} ms old"
+    return f"It went wrong {at['time'] - at['since']:.2f} s into '{at['state']}': {why}; the vehicle {where}."

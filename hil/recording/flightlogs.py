@@ -6,50 +6,35 @@ Where the payload let go and came down is found in its own poses.
 """
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from hil.control.decision import Decision
 from hil.control.landing import Landing
 from hil.control.states import State
 from hil.errors import RunError
 from hil.params import HilParams
 from hil.poses.pose import GOAL, PAYLOAD, VEHICLE, Pose
-from hil.recording.playback import Playback, Sample
+from hil.recording.playback import Playback, Sample, Tick
 from hil.recording.record import PROVENANCE, SUMMARY, load_run
 from visthrow import config
 from visthrow.common.rotations import matrix_of_quat
 from visthrow.logs.flightlog import FlightLog, FlightRecorder
 
-LEAD, AFTER = 2.0, 0.5
-"""A throw's log begins this long before it and ends this long after its recovery [s]."""
-
-LEAST_STEP = 1e-6
-"""Between two samples of a channel [s]: poses that were taken in together keep their order."""
+LEAD, AFTER = 2.0, 0.5  # a throw's log begins this long before it and ends this long after its recovery [s]
+LEAST_STEP = 1e-6  # between two samples of a channel [s]: poses that were taken in together keep their order
+ABOUT = 25  # poses on either side that a clock's offset is the median of: jitter of the transport goes, drift stays
+AFTERWARDS = (State.THROW, State.RECOVER, State.ABORT)  # states that belong to a throw
 
 STATES = tuple(state.value for state in State)
 
 
 @dataclass
-class Tick:
-    """One tick of a run: as recorded, as decided, and the poses that were taken in it."""
-
-    line: dict[str, Any]
-    decision: Decision
-    samples: list[Sample]
-    ages: dict[str, float]  # of the poses' content by body [s]
-    goal_w: tuple[float, float, float] | None
-
-
-@dataclass
-class Course:
+class PlayedRun:
     """A whole run, played back."""
 
-    folder: Path
-    params: HilParams
     playback: Playback
     ticks: list[Tick]
     provenance: dict[str, Any]
@@ -67,40 +52,20 @@ class Course:
                 by_body.setdefault(sample.body, []).append(sample)
         for samples in by_body.values():
             stamps = np.array([sample.pose.stamp for sample in samples])
-            apart = np.array([measured(sample, self.params) for sample in samples]) - stamps
+            apart = np.array([measured(sample, self.playback.params) for sample in samples]) - stamps
             around = np.pad(apart, ABOUT, mode="edge")
             offset = np.median(np.lib.stride_tricks.sliding_window_view(around, 2 * ABOUT + 1), axis=1)
             for sample, time in zip(samples, stamps + offset):
                 sample.time = float(time)
 
 
-ABOUT = 25
-"""Poses on either side that a clock's offset is the median of: jitter of the transport goes, drift stays."""
-
-
 def measured(sample: Sample, params: HilParams) -> float:
-    """When a pose was measured by its arrival alone [s]."""
+    """Return when a pose was measured by its arrival alone [s]."""
     return sample.pose.arrival - sample.pose.transit(params.delay.source)
 
 
-AFTERWARDS = (State.THROW, State.RECOVER, State.ABORT)
-"""States that belong to a throw."""
-
-
-def tick_of(playback: Playback, line: dict[str, Any], poses: list) -> Tick:
-    """Play one tick back."""
-    decision, samples = playback.feed(line, poses)
-    runner = playback.runner
-    ages = {name: track.gate.age(line["time"]) for name, track in runner.tracks.items()}
-    return Tick(line, decision, samples, ages, runner.seen_goal_w)
-
-
-def read(folder: str | Path) -> Course:
-    """Play a run back.
-
-    Raises:
-        RunError: no folder of a run, or a damaged one.
-    """
+def read(folder: str | Path) -> PlayedRun:
+    """Play a run back; raises `RunError` for what is no folder of a run, or a damaged one."""
     folder = Path(folder)
     params, policy, lines, poses = load_run(folder)
     if not lines:
@@ -108,12 +73,11 @@ def read(folder: str | Path) -> Course:
     playback = Playback(params, policy)
     provenance = _known(folder / PROVENANCE)
     provenance["simulated"] = any(link.get("simulated") for link in _known(folder / SUMMARY).get("links", []))
-    ticks = [tick_of(playback, line, poses.get(line["n"], [])) for line in lines]
-    return Course(folder, params, playback, ticks, provenance)
+    return PlayedRun(playback, [playback.feed(line, poses.get(line["n"], [])) for line in lines], provenance)
 
 
 def _known(path: Path) -> dict[str, Any]:
-    """What a file of a run says; nothing where the run was killed before it was written whole."""
+    """Return what a file of a run says; nothing where the run was killed before it was written whole."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -123,20 +87,16 @@ def _known(path: Path) -> dict[str, Any]:
 class Samples:
     """Fills a recorder with ticks."""
 
-    def __init__(self, params: HilParams, playback: Playback, meta: dict) -> None:
-        """Begin.
-
-        Args:
-            params: of the run. playback: whose ticks come. meta: of the log.
-        """
-        self.params, self.runner = params, playback.runner
+    def __init__(self, playback: Playback, meta: dict) -> None:
+        """Begin with nothing; ``meta``: of the log."""
+        self.params, self.runner = playback.params, playback.runner
         self.recorder = FlightRecorder(meta)
         self._declare()
         self._last: dict[str, float] = {}
         self._vehicle: Pose | None = None  # the last one: where the rope hangs
 
     def flush(self) -> FlightLog:
-        """The log of what was added since the last call."""
+        """Return the log of what was added since the last call."""
         log, self.recorder = self.recorder.log(), FlightRecorder(self.recorder.meta)
         self._declare()
         return log
@@ -147,13 +107,14 @@ class Samples:
         self.recorder.declare("state", "1")
 
     def _later(self, name: str, time: float) -> float:
-        """The time, or a moment after the channel's last sample."""
+        """Return the time, or a moment after the channel's last sample."""
         time = max(time, self._last.get(name, -np.inf) + LEAST_STEP)
         self._last[name] = time
         return time
 
-    def add(self, tick: Tick, attached: bool) -> None:
+    def add(self, tick: Tick) -> None:
         """Add all that one tick holds."""
+        attached = tick.attached
         for sample in tick.samples:
             self._pose(sample, attached)
         d, now = tick.decision, tick.line["time"]
@@ -190,9 +151,9 @@ class Samples:
                 self.recorder.add(time, quat_wb=pose.quat, rate_b=sample.rate_b)
 
 
-def meta_of(params: HilParams, playback: Playback, provenance: dict[str, Any], start: float) -> dict[str, Any]:
-    """What is known of a run from its beginning on; ``start`` [s] is the zero of its pictures."""
-    policy = playback.runner.pilot.policy
+def meta_of(playback: Playback, provenance: dict[str, Any], start: float) -> dict[str, Any]:
+    """Return what is known of a run from its beginning on; ``start`` [s] is the zero of its pictures."""
+    params, policy = playback.params, playback.runner.pilot.policy
     goal_w = playback.runner.seen_goal_w or params.goal_w
     simulated = ", of a simulated vehicle" if provenance.get("simulated") else ""
     return {
@@ -205,7 +166,7 @@ def meta_of(params: HilParams, playback: Playback, provenance: dict[str, Any], s
 
 
 def events(ticks: list[Tick]) -> list[list]:
-    """Time, state and reason of each change."""
+    """Return time, state and reason of each change."""
     found: list[list] = []
     for tick in ticks:
         now = [tick.line["time"], tick.decision.state, tick.decision.reason]
@@ -214,30 +175,27 @@ def events(ticks: list[Tick]) -> list[list]:
     return found
 
 
-def log_of(course: Course, first: int, last: int, throw: int | None = None) -> FlightLog:
-    """Log of the ticks from ``first`` to ``last``, both included; of one throw where its number is given."""
-    ticks, runner = course.ticks[first : last + 1], course.playback.runner
-    start = course.ticks[course.throws[throw][0]].line["time"] if throw is not None else ticks[0].line["time"]
-    samples = Samples(course.params, course.playback, meta_of(course.params, course.playback, course.provenance, start))
-    landing = None if throw is None else _landing(runner.latch.landings, start)
+def log_of(played: PlayedRun, first: int, last: int, throw: int | None = None) -> FlightLog:
+    """Return the log of the ticks from ``first`` to ``last``, both included; of one throw where its number is given."""
+    ticks, runner = played.ticks[first : last + 1], played.playback.runner
+    start = played.ticks[played.throws[throw][0]].line["time"] if throw is not None else ticks[0].line["time"]
+    samples = Samples(played.playback, meta_of(played.playback, played.provenance, start))
+    landings = [] if throw is None else [landing for landing in runner.latch.landings if abs(landing.start - start) < 1e-9]
+    landing = next(iter(landings), None)
     latch = next((t.line["time"] for t in ticks if t.decision.release and t.line["time"] >= start), None)
     apart = np.inf if latch is None else (landing.separation if landing and landing.separation else latch + runner.latch.lag)
     for tick in ticks:
-        samples.add(tick, tick.line["time"] < apart)
+        samples.add(replace(tick, attached=tick.line["time"] < apart))
     meta = samples.recorder.meta
     meta["events"] = events(ticks)
-    meta["goal_w"] = list(next((t.goal_w for t in ticks if t.line["time"] >= start and t.goal_w), course.params.goal_w))
+    meta["goal_w"] = list(next((t.goal_w for t in ticks if t.line["time"] >= start and t.goal_w), played.playback.params.goal_w))
     if throw is not None:
         _judge(samples.recorder, landing, latch, ticks, start)
     return samples.recorder.log()
 
 
-def _landing(landings: list[Landing], start: float) -> Landing | None:
-    return next((landing for landing in landings if abs(landing.start - start) < 1e-9), None)
-
-
 def _judge(recorder: FlightRecorder, landing: Landing | None, latch: float | None, ticks: list[Tick], start: float) -> None:
-    """How a throw ended."""
+    """Note how a throw ended."""
     after = [tick for tick in ticks if tick.line["time"] >= start]
     ended = next((tick for tick in after if tick.decision.state != State.THROW), after[-1])
     times: dict[str, Any] = {"policy_start": start, "latch": latch, "recovery": ended.line["time"]}
@@ -258,19 +216,19 @@ def _judge(recorder: FlightRecorder, landing: Landing | None, latch: float | Non
     recorder.meta |= {"times": times, "result": result}
 
 
-def throws(course: Course) -> list[FlightLog]:
-    """A log a throw."""
+def throws(played: PlayedRun) -> list[FlightLog]:
+    """Return a log a throw."""
     logs, before = [], 0
-    for number, (first, last) in enumerate(course.throws):
-        period = course.playback.runner.pilot.period
+    for number, (first, last) in enumerate(played.throws):
+        period = played.playback.runner.pilot.period
         begin = max(before, first - round(LEAD / period))
-        until = course.throws[number + 1][0] - 1 if number + 1 < len(course.throws) else len(course.ticks) - 1
+        until = played.throws[number + 1][0] - 1 if number + 1 < len(played.throws) else len(played.ticks) - 1
         until = min(until, last + round(AFTER / period))
-        logs.append(log_of(course, begin, until, number))
+        logs.append(log_of(played, begin, until, number))
         before = until + 1
     return logs
 
 
-def whole(course: Course) -> FlightLog:
-    """One log of the whole run."""
-    return log_of(course, 0, len(course.ticks) - 1)
+def whole(played: PlayedRun) -> FlightLog:
+    """Return one log of the whole run."""
+    return log_of(played, 0, len(played.ticks) - 1)

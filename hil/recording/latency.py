@@ -27,15 +27,13 @@ OF_CLOCK = ("transport", "arrival", "late", "ack")
 LEAST, GROWTH, BINS = 1e-6, 1.01, 1640
 """Lower edge of the first bin [s], ratio of two edges, number of bins: up to 12 s, within 1 per cent."""
 
-CLOCK_STEP = 0.3
-"""A change of a source's clock against ours by more than this is a step of it [s]."""
+CLOCK_STEP = 0.3  # a change of a source's clock against ours by more than this is a step of it [s]
 
 
 class Stage:
     """Times of one stage: counts in bins that grow by one per cent, and the largest one exactly."""
 
     def __init__(self) -> None:
-        """Start empty."""
         self.counts = np.zeros(BINS, dtype=np.int64)
         self.most = 0.0
 
@@ -46,12 +44,12 @@ class Stage:
         self.most = max(self.most, seconds)
 
     def percentile(self, share: float) -> float:
-        """Time [s] below which a share of all lie, 0 to 1; to one per cent, and never above the largest."""
+        """Return the time [s] below which a share of all lie, 0 to 1; to one per cent, and never above the largest."""
         reached = np.searchsorted(np.cumsum(self.counts), share * self.counts.sum())
         return min(LEAST * GROWTH ** (float(reached) + 0.5), self.most)
 
     def summary(self) -> dict[str, float]:
-        """p50, p95, p99 and max [ms] and the count; empty where nothing was counted."""
+        """Return p50, p95, p99 and max [ms] and the count; empty where nothing was counted."""
         count = int(self.counts.sum())
         if not count:
             return {}
@@ -63,7 +61,6 @@ class Stages:
     """All stages of a run."""
 
     def __init__(self) -> None:
-        """Start empty."""
         self.stages = {name: Stage() for name in STAGES}
         self._fastest: float | None = None
 
@@ -73,7 +70,7 @@ class Stages:
             self.stages[name].add(seconds)
 
     def poses(self, poses: list[Pose], now: float) -> dict[str, float]:
-        """Times of the vehicle's poses that have come for a tick at ``now`` [s]; transport is counted a pose."""
+        """Return times of the vehicle's poses that have come for a tick at ``now`` [s]; transport is counted a pose."""
         newest = None
         for pose in poses:
             if pose.body != VEHICLE or not (math.isfinite(pose.stamp) and math.isfinite(pose.arrival)):
@@ -90,21 +87,17 @@ class Stages:
         return {} if newest is None else {"arrival": now - newest}
 
     def summary(self) -> dict[str, dict[str, float]]:
-        """Summaries by stage."""
+        """Return summaries by stage."""
         return {name: stage.summary() for name, stage in self.stages.items()}
 
 
 def slowed(speed: float) -> str:
-    """Whose milliseconds they are, where the run's clock is not real time; else nothing."""
+    """Return whose milliseconds they are, where the run's clock is not real time; else nothing."""
     return "" if speed == 1.0 else f"; {', '.join(OF_CLOCK)}: by the run's clock, at {speed:g} of real time"
 
 
 def table(latency: dict[str, dict[str, float]], speed: float = 1.0) -> list[str]:
-    """Lines of a report: a stage a line.
-
-    Args:
-        latency: of :meth:`Stages.summary`. speed: of the run's clock.
-    """
+    """Return lines of a report, a stage a line, of :meth:`Stages.summary` and the speed of the run's clock."""
     lines = [f"{'stage':11}     p50     p95     p99     max [ms]{slowed(speed)}"]
     for name, values in latency.items():
         if values:
@@ -114,16 +107,7 @@ def table(latency: dict[str, dict[str, float]], speed: float = 1.0) -> list[str]
 
 
 def draw(path: str | Path, stages: Stages, title: str) -> None:
-    """Draw a histogram a stage, on one axis of time.
-
-    Args:
-        path: PNG file.
-        stages: of a run.
-        title: what run.
-
-    Raises:
-        StorageError: the place cannot be written.
-    """
+    """Draw a histogram a stage, on one axis of time, as a PNG file; raises `StorageError` where it cannot be written."""
     from visthrow.common import style
     from visthrow.common.storage import atomic_write
     from visthrow.view.parts import png_of

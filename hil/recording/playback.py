@@ -13,9 +13,8 @@ from hil.control.decision import Decision, OperatorInput
 from hil.control.runner import Runner
 from hil.control.states import State
 from hil.params import HilParams
+from hil.poses.detection import Detection
 from hil.poses.pose import VEHICLE, Pose, Vector
-from hil.poses.sight import Sight
-from hil.poses.track import Track
 from hil.recording.bundle import sentence
 from hil.recording.record import SUMMARY, load_run
 from visthrow.onboard.calibration import Calibration
@@ -33,53 +32,55 @@ class Sample:
     time: float | None = None  # of the measurement on the runner's clock [s], once it was worked out from the whole run
 
 
-class Playback:
-    """Feeds recorded ticks to a runner of their config and policy.
+@dataclass
+class Tick:
+    """One tick of a run: as recorded, as decided, and the poses that were taken in it."""
 
-    Attributes:
-        runner: after the last tick fed.
-    """
+    line: dict[str, Any]
+    decision: Decision
+    samples: list[Sample]
+    ages: dict[str, float]  # of the poses' content by body [s]
+    attached: bool  # whether the payload hangs on the vehicle: until the release's lag is over
+    goal_w: Vector | None
+
+
+class Playback:
+    """Feeds recorded ticks to a ``runner`` of their config and policy."""
 
     def __init__(self, params: HilParams, policy: Policy) -> None:
         """Start before the first tick; see `hil.recording.record.load_run` for both."""
-        self.runner = Runner(params, policy, DryRun())
-        self.runner.watcher = self._take
+        self.params, self.runner = params, Runner(params, policy, DryRun())
+        self.runner.watcher = lambda body, track: self._samples.append(Sample(body, *track.sample()))
         self._samples: list[Sample] = []
 
-    def _take(self, body: str, track: Track) -> None:
-        self._samples.append(Sample(body, *track.sample()))
-
-    def feed(self, line: dict[str, Any], poses: list[Pose]) -> tuple[Decision, list[Sample]]:
-        """Run one recorded tick; returns what was decided, and the poses that were taken in it."""
-        self._samples = []
+    def feed(self, line: dict[str, Any], poses: list[Pose]) -> Tick:
+        """Run one recorded tick."""
+        self._samples, runner, now = [], self.runner, line["time"]
         if line.get("seen") is not None:
-            self.runner.look([Sight.of(line["seen"])])
+            runner.look([Detection.of(line["seen"])])
         if (found := line.get("calibration")) is not None:
-            self.runner.calibrated(found if isinstance(found, str) else Calibration.of(found))
-        decision = self.runner.tick(line["time"], poses, Status(*line["status"]), OperatorInput(*line["words"]), line["recording"])
-        return decision, self._samples
+            runner.calibrated(found if isinstance(found, str) else Calibration.of(found))
+        decision = runner.tick(now, poses, Status(*line["status"]), OperatorInput(*line["words"]), line["recording"])
+        ages = {name: track.gate.age(now) for name, track in runner.tracks.items()}
+        return Tick(line, decision, self._samples, ages, not runner.latch.separated(now), runner.seen_goal_w)
 
 
-COMPARED = ("state", "command", "action", "observation", "keypoints", "valid", "release")
-"""What a replay must give again, bit for bit."""
+COMPARED = ("state", "command", "action", "observation", "keypoints", "valid", "release")  # what a replay must give again, bit for bit
 
 
 def replay(folder: str | Path) -> dict[str, Any]:
-    """Run the recorded poses, statuses and words of a run through the runner again.
+    """Run the recorded poses, statuses and words of a run through the runner again; raises `RunError` for a folder that is none.
 
     Returns:
         Number of ticks and actions compared, the bodies, the differences (tick, name, recorded value, value now), and what is
         missing of the recording, or None; ``story``: where it went wrong, in a sentence.
-
-    Raises:
-        RunError: no folder of a run, or a damaged one.
     """
     params, policy, ticks, poses = load_run(folder)
     playback, turn, last = Playback(params, policy), None, None
     differences: list[tuple[int, str, Any, Any]] = []
     actions = 0
     for line in ticks:
-        decision, _ = playback.feed(line, poses.get(line["n"], []))
+        decision = playback.feed(line, poses.get(line["n"], [])).decision
         actions += decision.action is not None
         seen = {"time": decision.time, "state": decision.state, "reason": decision.reason, "since": decision.time}
         if last is not None and decision.state == last["state"]:
@@ -95,17 +96,13 @@ def replay(folder: str | Path) -> dict[str, Any]:
                 differences.append((line["n"], name, was, now))
     cut = _cut(folder, len(ticks))
     return {
-        "ticks": len(ticks),
-        "actions": actions,
+        "ticks": len(ticks), "actions": actions, "differences": differences, "cut": cut, "story": sentence(turn, last, cut),
         "bodies": sorted({pose.body for group in poses.values() for pose in group} & set(playback.runner.tracks)),
-        "differences": differences,
-        "cut": cut,
-        "story": sentence(turn, last, cut),
-    }
+    }  # fmt: skip
 
 
 def _cut(folder: str | Path, ticks: int) -> str | None:
-    """What is missing of a recording, in words."""
+    """Return what is missing of a recording, in words."""
     try:
         flown = json.loads((Path(folder) / SUMMARY).read_text(encoding="utf-8"))["ticks"]
     except OSError:

@@ -13,7 +13,7 @@ LATENCY_PICTURE, WHOLE = "latency.png", "flight.npz"
 
 
 def summary_text(summary: dict[str, Any], folder: Path) -> str:
-    """A run in a few lines."""
+    """Return a run in a few lines."""
     lines = [f"{'ABORTED' if summary['aborted'] else 'ended in ' + summary['state']}: {summary['reason']}"]
     lines.append(f"throws {summary['throws']}, released {summary['latches']}, cancelled {summary['cancelled']}")
     if summary.get("calibration"):
@@ -44,17 +44,12 @@ def summary_text(summary: dict[str, Any], folder: Path) -> str:
 
 
 def throw_path(folder: Path, number: int, ending: str) -> Path:
-    """File of a throw, counted from 1."""
+    """Return the file of a throw, counted from 1."""
     return folder / f"throw-{number:02d}{ending}"
 
 
 def finish(folder: str | Path, stages: Stages | None = None, speed: float = 1.0) -> list[str]:
     """Write latency picture, and a flight log and picture a throw; of a run without throws one log of all of it.
-
-    Args:
-        folder: of a run that is over.
-        stages: its times; None where they are not at hand.
-        speed: of the run's clock.
 
     Returns:
         Lines that say what was written, and what could not be.
@@ -64,23 +59,23 @@ def finish(folder: str | Path, stages: Stages | None = None, speed: float = 1.0)
         if stages is not None:
             draw(folder / LATENCY_PICTURE, stages, f"Times of each stage, run {folder.name}{slowed(speed)}")
             said.append(f"{folder / LATENCY_PICTURE}  times of each stage")
-        course = read(folder)
-        if not course.throws:
-            whole(course).save(folder / WHOLE)
+        played = read(folder)
+        if not played.throws:
+            whole(played).save(folder / WHOLE)
             said.append(f"{folder / WHOLE}  flight log of the whole run")
-        for number, log in enumerate(throws(course), start=1):
+        for number, log in enumerate(throws(played), start=1):
             path = throw_path(folder, number, ".npz")
             log.save(path)
             said.append(f"{path}  throw {number}: {outcome(log)}")
             if "landing" in log:
-                picture(folder, number, log, course.params.camera)
+                picture(folder, number, log, played.playback.params.camera)
     except VisthrowError as error:
         said.append(f"not all could be written: {error}")
     return said
 
 
 def outcome(log: FlightLog) -> str:
-    """How a throw ended, in words."""
+    """Return how a throw ended, in words."""
     result = log.meta["result"]
     if not result["success"]:
         return f"no landing counted: {result['failure']}"

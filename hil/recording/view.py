@@ -20,65 +20,37 @@ import numpy as np
 from hil.errors import RunError
 from hil.params import HilParams
 from hil.poses.pose import PAYLOAD, VEHICLE, Pose
-from hil.recording.flightlogs import Samples, Tick, events, meta_of, read, tick_of
-from hil.recording.playback import Playback
+from hil.recording.flightlogs import Samples, events, meta_of, read
+from hil.recording.playback import Playback, Tick
 from hil.recording.record import CONFIG, POLICY, POSES, PROVENANCE, SUMMARY, TICKS, pose_of
 from visthrow import config
 from visthrow.onboard.policy import Policy
 
-EVERY = 0.1
-"""Between two looks at the folder [s]."""
-
-MOST_SHOWN = 100
-"""Ticks sent at a time; of more, where the viewer fell behind, the last ones."""
-
-TRAIL = 300
-"""Poses whose places stay drawn: three seconds at 100 Hz."""
+EVERY = 0.1  # between two looks at the folder [s]
+MOST_SHOWN = 100  # ticks sent at a time; of more, where the viewer fell behind, the last ones
+TRAIL = 300  # poses whose places stay drawn: three seconds at 100 Hz
 
 BODY_CHANNELS = {VEHICLE: "pos_w", PAYLOAD: "payload_pos_w"}
-
-
-class Attached:
-    """Tells of ticks in their order whether the payload hangs on the vehicle: until the release's lag is over."""
-
-    def __init__(self, playback: Playback) -> None:
-        self._lag = playback.runner.latch.lag
-        self._latch: float | None = None
-
-    def at(self, tick: Tick) -> bool:
-        """Whether it does at a tick."""
-        if tick.decision.release:
-            self._latch = tick.line["time"]
-        elif tick.decision.state == "armed":
-            self._latch = None
-        return self._latch is None or tick.line["time"] < self._latch + self._lag
 
 
 class Show:
     """Sends ticks to a stream of rerun."""
 
-    def __init__(self, stream: Any, params: HilParams, playback: Playback, provenance: dict[str, Any], start: float) -> None:
-        """Send what does not move.
-
-        Args:
-            stream: a recording stream.
-            params: of the run. playback: whose ticks come. provenance: of the run.
-            start: zero of the viewer's time [s].
-        """
+    def __init__(self, stream: Any, playback: Playback, provenance: dict[str, Any], start: float) -> None:
+        """Send what does not move; ``start`` is the zero of the viewer's time [s]."""
         from visthrow.view import rerun_view
 
         self._stream, self._view = stream, rerun_view
-        self._meta = meta_of(params, playback, provenance, start)
-        self._samples = Samples(params, playback, self._meta)
+        self._meta = meta_of(playback, provenance, start)
+        self._samples = Samples(playback, self._meta)
         self._trails: dict[str, deque] = {name: deque(maxlen=TRAIL) for name in BODY_CHANNELS}
-        self._attached = Attached(playback)
         self._said: list | None = None
         rerun_view.still(stream, self._meta["goal_w"], sizes(playback.runner.pilot))
 
     def take(self, ticks: list[Tick]) -> None:
         """Send some ticks, in order."""
         for tick in ticks:
-            self._samples.add(tick, self._attached.at(tick))
+            self._samples.add(tick)
             for sample in tick.samples:
                 if sample.body in self._trails:
                     self._trails[sample.body].append(sample.pose.pos)
@@ -96,7 +68,7 @@ class Show:
 
 
 def sizes(pilot: Any) -> SimpleNamespace:
-    """What `visthrow.view.rerun_view` draws by, from the policy's contract."""
+    """Return what `visthrow.view.rerun_view` draws by, from the policy's contract."""
     contract = pilot.policy.contract
     rotors = SimpleNamespace(**contract["vehicle"]["rotors"])
     rope = SimpleNamespace(payload_radius=contract["rope"]["payload_radius"])
@@ -111,7 +83,7 @@ class Tail:
         self._path, self._file, self._rest = path, None, ""
 
     def lines(self) -> Iterator[Any]:
-        """Values of the lines that were completed since the last call."""
+        """Yield values of the lines that were completed since the last call."""
         if self._file is None:
             if not self._path.is_file():
                 return
@@ -131,11 +103,7 @@ class Follower:
     """Plays back a run while it is written."""
 
     def __init__(self, folder: Path) -> None:
-        """Read config, policy and provenance, which a run writes before it waits for poses.
-
-        Raises:
-            RunError: no folder of a run.
-        """
+        """Read config, policy and provenance, which a run writes before it waits for poses; raises `RunError` for no folder of a run."""
         if not all((folder / name).is_file() for name in (CONFIG, POLICY, PROVENANCE)):
             raise RunError(f"{folder}: no folder of a run; expected {CONFIG}, {POLICY} and {PROVENANCE} in it")
         self.folder, self.params = folder, config.load(HilParams, folder / CONFIG)
@@ -146,7 +114,7 @@ class Follower:
         self._poses: dict[int, list[Pose]] = {}
 
     def ticks(self) -> list[Tick]:
-        """Ticks that were written since the last call, with all their poses."""
+        """Return ticks that were written since the last call, with all their poses."""
         for row in self._tails[POSES].lines():
             index, pose = pose_of(row)
             self._poses.setdefault(index, []).append(pose)
@@ -154,7 +122,7 @@ class Follower:
         found = []
         while self._lines and len(self._poses.get(self._lines[0]["n"], ())) >= self._lines[0]["poses"]:
             line = self._lines.popleft()
-            found.append(tick_of(self.playback, line, self._poses.pop(line["n"], [])))
+            found.append(self.playback.feed(line, self._poses.pop(line["n"], [])))
         return found
 
     @property
@@ -163,22 +131,13 @@ class Follower:
         return (self.folder / SUMMARY).is_file()
 
     def close(self) -> None:
-        """Close the files."""
+        """Close its files."""
         for tail in self._tails.values():
             tail.close()
 
 
 def follow(folder: str | Path, stream: Any, going: Callable[[], bool] = lambda: True) -> int:
-    """Send a run to a stream while it is written, until it is over.
-
-    Args:
-        folder: of the run.
-        stream: of rerun.
-        going: whether to go on.
-
-    Returns:
-        Number of ticks that were left out.
-    """
+    """Send a run to a stream of rerun while it is written, until it is over; returns the number of ticks that were left out."""
     follower, show, dropped = Follower(Path(folder)), None, 0
     try:
         while going():
@@ -187,8 +146,7 @@ def follow(folder: str | Path, stream: Any, going: Callable[[], bool] = lambda: 
             dropped += max(0, len(ticks) - MOST_SHOWN)
             if ticks:
                 if show is None:
-                    start = ticks[0].line["time"]
-                    show = Show(stream, follower.params, follower.playback, follower.provenance, start)
+                    show = Show(stream, follower.playback, follower.provenance, ticks[0].line["time"])
                 show.take(ticks[-MOST_SHOWN:])
             elif over:
                 break
@@ -199,34 +157,29 @@ def follow(folder: str | Path, stream: Any, going: Callable[[], bool] = lambda: 
 
 
 def write(folder: str | Path, path: str | Path) -> None:
-    """Write a whole run as a ``.rrd`` file.
-
-    Raises:
-        RunError: no folder of a run, or a damaged one.
-        StorageError: the place cannot be written.
-    """
+    """Write a whole run as a ``.rrd`` file; errors as of :func:`hil.recording.flightlogs.read`, and where the place cannot be written."""
     from visthrow.view import rerun_view
 
-    course = read(folder)
-    layout = rerun_view.blueprint(np.array(course.params.goal_w), {"state"})
+    played = read(folder)
+    layout = rerun_view.blueprint(np.array(played.playback.params.goal_w), {"state"})
     with rerun_view.recording(path, layout) as stream:
-        show = Show(stream, course.params, course.playback, course.provenance, course.ticks[0].line["time"])
-        for first in range(0, len(course.ticks), MOST_SHOWN // 10):
-            show.take(course.ticks[first : first + MOST_SHOWN // 10])
+        show = Show(stream, played.playback, played.provenance, played.ticks[0].line["time"])
+        for first in range(0, len(played.ticks), MOST_SHOWN // 10):
+            show.take(played.ticks[first : first + MOST_SHOWN // 10])
 
 
 def write_mcap(folder: str | Path, path: str | Path) -> None:
     """Write a whole run as an MCAP file; errors as of :func:`write`, and `LogError` where the package mcap is not installed."""
     from visthrow.view import mcap_view
 
-    course = read(folder)
-    meta = meta_of(course.params, course.playback, course.provenance, course.ticks[0].line["time"])
-    samples, attached = Samples(course.params, course.playback, meta), Attached(course.playback)
-    for tick in course.ticks:
-        samples.add(tick, attached.at(tick))
+    played = read(folder)
+    meta = meta_of(played.playback, played.provenance, played.ticks[0].line["time"])
+    samples = Samples(played.playback, meta)
+    for tick in played.ticks:
+        samples.add(tick)
     log = samples.flush()
-    log.meta["events"] = events(course.ticks)
-    mcap_view.write(path, log, sizes(course.playback.runner.pilot))
+    log.meta["events"] = events(played.ticks)
+    mcap_view.write(path, log, sizes(played.playback.runner.pilot))
 
 
 def start_viewer(folder: Path) -> subprocess.Popen:
@@ -237,7 +190,7 @@ def start_viewer(folder: Path) -> subprocess.Popen:
 
 
 def run(folder: Path, live: bool, out: str | None, web_port: int, data_port: int) -> int:
-    """What ``visthrow hil view`` does: serve the live view, or write files."""
+    """Serve the live view, or write files: ``visthrow hil view``."""
     from hil.recording.report import finish
 
     if live:

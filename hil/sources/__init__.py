@@ -9,17 +9,6 @@ from hil.sources.mocap import MocapParams, RigidBody, open_mocap
 from hil.sources.player import CHANNELS, LogBody, read_autopilot, read_table, read_tlog
 
 __all__ = [
-    "CHANNELS",
-    "BodyIds",
-    "LogBody",
-    "MavlinkDecoder",
-    "MavlinkSource",
-    "MocapParams",
-    "Recorded",
-    "RigidBody",
-    "Source",
-    "open_mocap",
-    "read_autopilot",
-    "read_table",
-    "read_tlog",
-]
+    "CHANNELS", "BodyIds", "LogBody", "MavlinkDecoder", "MavlinkSource", "MocapParams", "Recorded", "RigidBody", "Source", "open_mocap",
+    "read_autopilot", "read_table", "read_tlog",
+]  # fmt: skip

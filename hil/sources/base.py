@@ -1,7 +1,6 @@
 """What the runner needs of a source, what live ones share, and the source that plays recorded poses."""
 
 from collections.abc import Callable, Iterable
-from typing import Protocol
 
 from hil.errors import SourceError
 from hil.links.clock import Clock
@@ -9,29 +8,33 @@ from hil.links.mavlink_link import Link, wait
 from hil.poses.pose import Pose
 
 
-class Source(Protocol):
+class Source:
     """Where poses come from; polling never waits and never raises."""
 
-    ended: bool  # nothing will come any more
-    links: tuple[Link, ...]  # that are served by polling
+    ended: bool = False  # nothing will come any more
+    links: tuple[Link, ...] = ()  # that are served by polling
 
     def poll(self, now: float) -> list[Pose]:
-        """Raw poses that have arrived by ``now`` [s] on the runner's clock, in order of arrival."""
+        """Return raw poses that have arrived by ``now`` [s] on the runner's clock, in order of arrival."""
+        raise NotImplementedError
 
     def wait(self, clock: Clock, until: float) -> None:
         """Wait until a time [s], taking in what comes in the meantime, so that its arrival is known."""
+        clock.sleep_until(until)
 
     def hold(self, flying: bool) -> None:
         """Say whether the vehicle is ours in flight: then nobody's address on the links may change."""
+        for link in self.links:
+            link.roster.flying = flying
 
     def close(self) -> None:
-        """Give the port or file back."""
+        """Give ports and files back."""
+        for link in self.links:
+            link.close()
 
 
-class Linked:
+class Linked(Source):
     """Links that a live source serves while it is polled."""
-
-    ended = False
 
     def __init__(self, links: tuple[Link, ...], clock: Callable[[], float]) -> None:
         """Serve links; ``clock`` gives the arrivals."""
@@ -40,33 +43,19 @@ class Linked:
     def wait(self, clock: Clock, until: float) -> None:
         wait(self.links, clock, self._clock, until)
 
-    def hold(self, flying: bool) -> None:
-        for link in self.links:
-            link.roster.flying = flying
 
-    def close(self) -> None:
-        for link in self.links:
-            link.close()
-
-
-class Recorded:
+class Recorded(Source):
     """Recorded poses, each handed on when the runner's clock has reached its arrival."""
 
-    links = ()
-
     def __init__(self, poses: Iterable[Pose]) -> None:
-        """Sort by arrival; poses that arrived together keep their order.
-
-        Raises:
-            SourceError: there is none.
-        """
+        """Sort by arrival; poses that arrived together keep their order. Raises `SourceError` where there is none."""
         self.poses = sorted(poses, key=lambda pose: pose.arrival)
         if not self.poses:
             raise SourceError("the recording holds no pose of a body that the config names")
         self._next = 0
 
     @property
-    def ended(self) -> bool:
+    def ended(self) -> bool:  # type: ignore[override]
         return self._next >= len(self.poses)
 
     @property
@@ -79,12 +68,3 @@ class Recorded:
         while self._next < len(self.poses) and self.poses[self._next].arrival <= now:
             self._next += 1
         return self.poses[first : self._next]
-
-    def wait(self, clock: Clock, until: float) -> None:
-        clock.sleep_until(until)
-
-    def hold(self, flying: bool) -> None:
-        """See `Source`."""
-
-    def close(self) -> None:
-        """See `Source`."""

@@ -11,20 +11,22 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Annotated, Any, Literal, Protocol
 
 import numpy as np
 import torch
 
 from camera.detectors.contours import Detector, DetectorParams, Known
+from camera.detectors.following import Following
 from camera.detectors.learnt import LearntDetector
 from camera.fisheye import Fisheye
 from camera.mount import nominal_rot_cb
 from camera.params import CameraParams, FisheyeParams, MountParams
 from hil.errors import SourceError
+from hil.poses.detection import Detection
 from hil.poses.pose import Quaternion, Vector
-from hil.poses.sight import Sight
 from visthrow.common.errors import ConfigError
+from visthrow.config.bounds import Bound, Bounded
 from visthrow.onboard.observations import rotation_from_quat
 
 STAMPS = "stamps.csv"
@@ -35,28 +37,23 @@ SAME_PLACE = 0.01
 
 
 @dataclass(frozen=True)
-class ImageParams:
-    """Where pictures come from, and the camera that takes them.
-
-    Raises:
-        ConfigError: no path, or times that are none.
-    """
+class ImageParams(Bounded):
+    """Where pictures come from, and the camera that takes them."""
 
     kind: Literal["folder", "video", "camera"]
     path: str | None = None  # of the folder or video
     device: int = 0  # number of a live camera
-    delay: float = 0.0  # from the exposure to the arrival of a picture [s]
-    hold: float = 0.1  # for which a thing that is not seen any more reads where it was [s]
+    delay: Annotated[float, Bound(0.0, 0.5)] = 0.0  # from the exposure to the arrival of a picture [s]
+    hold: Annotated[float, Bound(0.0, 0.5, "(]")] = 0.1  # for which a picture counts, and a ball that one misses reads as it hung [s]
     fisheye: FisheyeParams | None = None  # the lens; left out, that of training
     mount: MountParams | None = None  # left out, that of training
     detector: DetectorParams = field(default_factory=DetectorParams)
     by: Literal["contours", "learnt"] = "contours"  # colour and shape with OpenCV, or the learnt networks
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.kind != "camera" and self.path is None:
             raise ConfigError(f"images.path is none; expected the {self.kind} of the pictures")
-        if not (0.0 <= self.delay <= 0.5 and 0.0 < self.hold <= 0.5):
-            raise ConfigError(f"images.delay {self.delay} s, hold {self.hold} s; expected 0 to 0.5, and above 0 to 0.5")
 
 
 @dataclass(frozen=True)
@@ -69,30 +66,23 @@ class Hint:
 
 
 class Eyes(Protocol):
-    """A source of sights."""
+    """A source of detections."""
 
     def tell(self, hint: Hint | None) -> None:
         """Say what is known now."""
 
-    def poll(self, now: float) -> list[Sight]:
-        """Sights that have come by a time [s]; never waits."""
+    def poll(self, now: float) -> list[Detection]:
+        """Return detections that have come by a time [s]; never waits."""
 
     def close(self) -> None:
         """Give the camera back."""
 
 
 class Looker:
-    """Makes sights of pictures."""
+    """Makes detections of pictures."""
 
     def __init__(self, params: ImageParams, training: CameraParams) -> None:
-        """Take lens and mount of the pictures.
-
-        Args:
-            params: of the pictures. training: camera that the policy was trained with.
-
-        Raises:
-            ConfigError: the lens is not where that of training is; directions could not be carried over.
-        """
+        """Take lens and mount of the pictures; raises `ConfigError` for a lens that is not where that of training is."""
         lens, mount = params.fisheye or training.fisheye, params.mount or training.mount
         apart = math.dist(mount.position_b, training.mount.position_b)
         if apart > SAME_PLACE:
@@ -106,47 +96,29 @@ class Looker:
         self._position_b = np.array(mount.position_b)
         # From the camera of the pictures to that of training.
         self._turn = nominal_rot_cb(training.mount).numpy() @ self._rot_cb.T
-        self._ball_w: np.ndarray | None = None  # ray to the ball a frame ago: a turn of the vehicle moves it little
+        self._ball = Following(params.hold)
 
-    def look(self, picture: np.ndarray, stamp: float, hint: Hint | None) -> Sight:
-        """Look at a picture, BGR, uint8, exposed at a time [s].
-
-        Raises:
-            ValueError: a picture of another size.
-        """
-        seen = self.detector.detect(picture, self.known(hint))
-        rot_wc = None if hint is None else self._rot_wc(hint)
-        self._ball_w = None if seen.ball is None or rot_wc is None else rot_wc @ seen.ball.ray_c
+    def look(self, picture: np.ndarray, stamp: float, hint: Hint | None) -> Detection:
+        """Look at a picture, BGR, uint8, exposed at a time [s]; raises `SourceError` for one of another size."""
+        known, rot_wc = Known(), None
+        if hint is not None:
+            rot_wb = rotation_from_quat(torch.tensor([hint.quat], dtype=torch.float64))[0].numpy()
+            rot_wc = rot_wb @ self._rot_cb.T
+            known = self._ball.known(rot_wc, hint.pos_w[2] + float(rot_wb[2] @ self._position_b), hint.ball_distance)
+        try:
+            seen = self._ball.take(self.detector.detect(picture, known), rot_wc, stamp)
+        except ValueError as error:
+            raise SourceError(f"{error}: the pictures' size is not that of images.fisheye") from error
         corners = None if seen.goal is None else tuple(map(tuple, (seen.goal.rays_c @ self._turn.T).tolist()))
-        ball = None
-        if seen.ball is not None:
-            ball = (*(self._turn @ seen.ball.ray_c).tolist(), seen.ball.half_angle)
-        return Sight(stamp, corners, ball)
-
-    def known(self, hint: Hint | None) -> Known:
-        """What the detector is told: attitude, height and distance by the hint, and where the ball was a frame ago."""
-        if hint is None:
-            return Known()
-        rot_wc = self._rot_wc(hint)
-        height = hint.pos_w[2] + float((rot_wc @ self._rot_cb)[2] @ self._position_b)
-        ball_c = None if self._ball_w is None else rot_wc.T @ self._ball_w
-        return Known(rot_wc[2], height, hint.ball_distance, ball_c, north_c=rot_wc[0])
-
-    def _rot_wc(self, hint: Hint) -> np.ndarray:
-        """Camera to world, shape (3, 3)."""
-        rot_wb = rotation_from_quat(torch.tensor([hint.quat], dtype=torch.float64))[0].numpy()
-        return rot_wb @ self._rot_cb.T
+        ball = None if seen.ball is None else (*(self._turn @ seen.ball.ray_c).tolist(), seen.ball.half_angle)
+        return Detection(stamp, corners, ball)
 
 
 class RecordedImages:
     """Pictures of a folder or a video, each looked at when the runner's clock has reached its arrival."""
 
     def __init__(self, params: ImageParams, training: CameraParams) -> None:
-        """Read the time stamps.
-
-        Raises:
-            SourceError: no pictures, no stamps, or a video that cannot be opened.
-        """
+        """Read the time stamps; raises `SourceError` for no pictures, no stamps, or a video that cannot be opened."""
         self._params, self._looker, self._hint = params, Looker(params, training), None
         self._read, times = (_folder if params.kind == "folder" else _video)(Path(params.path))
         self._times = [time + params.delay for time in times]
@@ -155,43 +127,25 @@ class RecordedImages:
     def tell(self, hint: Hint | None) -> None:
         self._hint = hint
 
-    def poll(self, now: float) -> list[Sight]:
-        """See `Eyes`; of several pictures that have come only the newest is looked at.
-
-        Raises:
-            SourceError: a picture cannot be read, or has another size than the lens.
-        """
+    def poll(self, now: float) -> list[Detection]:
+        """Return detections that have come, of several pictures the newest; raises `SourceError` for one that cannot be read."""
         first = self._next
         while self._next < len(self._times) and self._times[self._next] <= now:
             self._next += 1
         if self._next == first:
             return []
         index = self._next - 1
-        return [_looked(self._looker, self._read(index), self._times[index] - self._params.delay, self._hint)]
+        return [self._looker.look(self._read(index), self._times[index] - self._params.delay, self._hint)]
 
     def close(self) -> None:
-        """See `Eyes`."""
+        pass
 
 
 class LiveImages:
-    """A camera, read and looked at in a thread of its own.
+    """A camera, read and looked at in a thread of its own; ``failure`` is what ended it, and the keypoints go stale then."""
 
-    Attributes:
-        failure: what ended the thread, or None; the keypoints go stale then.
-    """
-
-    def __init__(
-        self, params: ImageParams, training: CameraParams, clock: Callable[[], float], capture: Any = None
-    ) -> None:
-        """Open the camera.
-
-        Args:
-            params: of the pictures. training: camera of training. clock: of the arrivals.
-            capture: anything with OpenCV's ``read``; left out, the device.
-
-        Raises:
-            SourceError: there is no such camera.
-        """
+    def __init__(self, params: ImageParams, training: CameraParams, clock: Callable[[], float], capture: Any = None) -> None:
+        """Open the camera, or take anything with OpenCV's ``read``; raises `SourceError` where there is none of this number."""
         import cv2
 
         self._params, self._looker, self._clock = params, Looker(params, training), clock
@@ -199,7 +153,7 @@ class LiveImages:
         if not self._capture.isOpened():
             raise SourceError(f"camera {params.device} cannot be opened; expected the number of a camera, such as 0")
         self._hint: Hint | None = None
-        self._newest: Sight | None = None
+        self._newest: Detection | None = None
         self.failure: str | None = None
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._watch, name="camera", daemon=True)
@@ -212,7 +166,7 @@ class LiveImages:
                 arrival = self._clock()
                 if not good:
                     raise SourceError(f"camera {self._params.device} gave no picture")
-                self._newest = _looked(self._looker, picture, arrival - self._params.delay, self._hint)
+                self._newest = self._looker.look(picture, arrival - self._params.delay, self._hint)
         except Exception as error:  # of the driver, or a picture of another size
             self.failure = f"{type(error).__name__}: {error}"
             print(f"camera stopped: {self.failure}", file=sys.stderr, flush=True)
@@ -220,9 +174,9 @@ class LiveImages:
     def tell(self, hint: Hint | None) -> None:
         self._hint = hint
 
-    def poll(self, now: float) -> list[Sight]:
-        sight, self._newest = self._newest, None
-        return [] if sight is None else [sight]
+    def poll(self, now: float) -> list[Detection]:
+        detection, self._newest = self._newest, None
+        return [] if detection is None else [detection]
 
     def close(self) -> None:
         self._stop.set()
@@ -235,15 +189,8 @@ def open_images(params: ImageParams, training: CameraParams, clock: Callable[[],
     return LiveImages(params, training, clock) if params.kind == "camera" else RecordedImages(params, training)
 
 
-def _looked(looker: Looker, picture: np.ndarray, stamp: float, hint: Hint | None) -> Sight:
-    try:
-        return looker.look(picture, stamp, hint)
-    except ValueError as error:
-        raise SourceError(f"{error}: the pictures' size is not that of images.fisheye") from error
-
-
 def _folder(path: Path) -> tuple[Callable[[int], np.ndarray], list[float]]:
-    """Reader of the pictures of a folder, and their times [s]."""
+    """Return the reader of the pictures of a folder, and their times [s]."""
     rows = _stamps(path / STAMPS, ("file", "time_s"))
     missing = [name for name, _ in rows if not (path / name).is_file()]
     if missing:
@@ -261,7 +208,7 @@ def _folder(path: Path) -> tuple[Callable[[int], np.ndarray], list[float]]:
 
 
 def _video(path: Path) -> tuple[Callable[[int], np.ndarray], list[float]]:
-    """Reader of the frames of a video, and their times [s]; by its own rate where no stamps stand beside it."""
+    """Return the reader of the frames of a video, and their times [s]; by its own rate where no stamps stand beside it."""
     import cv2
 
     video = cv2.VideoCapture(str(path))
@@ -291,11 +238,7 @@ def _video(path: Path) -> tuple[Callable[[int], np.ndarray], list[float]]:
 
 
 def _stamps(path: Path, header: tuple[str, str]) -> list[tuple[str, float]]:
-    """Rows of a file of stamps, times ascending.
-
-    Raises:
-        SourceError: it is missing, empty, or not as it must be.
-    """
+    """Return rows of a file of stamps, times ascending; raises `SourceError` where it is missing, empty, or not as it must be."""
     try:
         rows = list(csv.reader(path.read_text(encoding="utf-8").splitlines()))
         found = [(name.strip(), float(time)) for name, time in rows[1:]]

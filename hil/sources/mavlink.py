@@ -2,94 +2,66 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from itertools import combinations
+from typing import Annotated, Any, Literal
 
 from hil.errors import SourceError
 from hil.links.mavlink_link import Link, pose_from_message, pump
-from hil.poses.pose import BODIES, Pose
+from hil.links.roster import MavlinkId
+from hil.poses.pose import Body, Pose
 from hil.sources.base import Linked
-from visthrow.common.errors import ConfigError
+from visthrow.config.bounds import Bound, Bounded
 
-POSE_MESSAGES = ("ATT_POS_MOCAP", "VISION_POSITION_ESTIMATE", "ODOMETRY", "LOCAL_POSITION_NED")
 COMPANIONS = {"LOCAL_POSITION_NED": ("LOCAL_POSITION_NED", "ATTITUDE_QUATERNION")}
 """Messages that make up a pose, where it is more than one."""
 
-PAIR_AGE = 0.05
-"""An attitude older than this against the position that it is to be paired with is none [s]."""
+PAIR_AGE = 0.05  # an attitude older than this against the position that it is to be paired with is none [s]
 
 
 @dataclass(frozen=True)
-class BodyIds:
-    """Which sender speaks of which body, and in which message.
+class BodyIds(Bounded):
+    """Which sender speaks of which body, and in which message."""
 
-    Raises:
-        ConfigError: ids out of range, or an unknown body or message.
-    """
-
-    body: str  # "vehicle", "payload" or "goal"
-    message: str  # one of POSE_MESSAGES; LOCAL_POSITION_NED is paired with ATTITUDE_QUATERNION
-    system: int  # MAVLink system id, 1 to 255
-    component: int  # MAVLink component id; 0 for any
-
-    def __post_init__(self) -> None:
-        if self.body not in BODIES or self.message not in POSE_MESSAGES:
-            raise ConfigError(
-                f"body '{self.body}' in {self.message}; expected one of {', '.join(BODIES)} in one of "
-                f"{', '.join(POSE_MESSAGES)}"
-            )
-        if not (1 <= self.system <= 255 and 0 <= self.component <= 255):
-            raise ConfigError(
-                f"system {self.system}, component {self.component}; expected 1 to 255, and 0 (any) to 255"
-            )
+    body: Body
+    # LOCAL_POSITION_NED is paired with ATTITUDE_QUATERNION.
+    message: Literal["ATT_POS_MOCAP", "VISION_POSITION_ESTIMATE", "ODOMETRY", "LOCAL_POSITION_NED"]
+    system: MavlinkId
+    component: Annotated[int, Bound(0, 255)]  # 0 for any
 
 
 class MavlinkDecoder:
     """Messages to poses; bodies told apart by their senders."""
 
     def __init__(self, bodies: tuple[BodyIds, ...]) -> None:
-        """Take the senders.
-
-        Raises:
-            SourceError: none, or the same sender and message for two bodies.
-        """
+        """Take the senders; raises `SourceError` for none, or the same sender and message for two bodies."""
         keys = [(ids.message, ids.system, ids.component) for ids in bodies]
-        clash = any(
-            a != b and a[:2] == b[:2] and (a[2] == b[2] or 0 in (a[2], b[2])) for a in keys for b in keys
-        ) or len(set(keys)) != len(keys)
-        if not bodies or clash:
-            raise SourceError(
-                f"senders {keys}; expected at least one, and no two bodies with the same message, system and component"
-            )
+        if not bodies or any(a[:2] == b[:2] and (a[2] == b[2] or 0 in (a[2], b[2])) for a, b in combinations(keys, 2)):
+            raise SourceError(f"senders {keys}; expected at least one, and no two bodies with the same message, system and component")
         self._bodies = bodies
         self._attitudes: dict[tuple[int, int], Any] = {}
 
     def feed(self, message: Any, arrival: float) -> Pose | None:
-        """The pose in a message, if it is one of ours."""
+        """Return the pose in a message, if it is one of ours."""
         kind, sender = message.get_type(), (message.get_srcSystem(), message.get_srcComponent())
         if kind == "ATTITUDE_QUATERNION":
             self._attitudes[sender] = message
             return None
         for ids in self._bodies:
             if ids.message == kind and ids.system == sender[0] and ids.component in (0, sender[1]):
-                return self._paired(message, sender, ids.body, arrival) if kind == "LOCAL_POSITION_NED" else (
-                    pose_from_message(message, ids.body, arrival)
-                )  # fmt: skip
+                paired = kind == "LOCAL_POSITION_NED"
+                return self._paired(message, sender, ids.body, arrival) if paired else pose_from_message(message, ids.body, arrival)
         return None
 
     def _paired(self, message: Any, sender: tuple[int, int], body: str, arrival: float) -> Pose | None:
-        """LOCAL_POSITION_NED with the sender's last attitude."""
+        """Return the pose of a LOCAL_POSITION_NED with the sender's last attitude."""
         attitude = self._attitudes.get(sender)
         if attitude is None or abs(message.time_boot_ms - attitude.time_boot_ms) > 1e3 * PAIR_AGE:
             return None
         return Pose(
-            message.time_boot_ms / 1e3,
-            arrival,
-            body,
-            (message.x, message.y, message.z),
-            (attitude.q1, attitude.q2, attitude.q3, attitude.q4),
-            (message.vx, message.vy, message.vz),
+            message.time_boot_ms / 1e3, arrival, body, (message.x, message.y, message.z),
+            (attitude.q1, attitude.q2, attitude.q3, attitude.q4), (message.vx, message.vy, message.vz),
             (attitude.rollspeed, attitude.pitchspeed, attitude.yawspeed),
-        )
+        )  # fmt: skip
 
 
 class MavlinkSource(Linked):

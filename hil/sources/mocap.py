@@ -16,13 +16,12 @@ from typing import Any, Literal
 from hil.errors import SourceError
 from hil.links.device import check_device
 from hil.links.mavlink_link import Link, pump
-from hil.poses.pose import BODIES, Pose
+from hil.poses.pose import BODIES, Body, Pose
 from hil.sources.base import Linked
 from visthrow.common.errors import ConfigError, suggest
 from visthrow.common.extras import load_extra
 
-MOST_WAITING = 2000
-"""Poses that are kept between two polls; older ones are dropped."""
+MOST_WAITING = 2000  # poses that are kept between two polls; older ones are dropped
 
 
 PROBE = "import json, os, sys, motioncapture; motioncapture.connect(sys.argv[1], json.loads(sys.argv[2])); os._exit(0)"
@@ -31,18 +30,14 @@ PROBE = "import json, os, sys, motioncapture; motioncapture.connect(sys.argv[1],
 
 @dataclass(frozen=True)
 class RigidBody:
-    """What the motion-capture system calls a body.
+    """What the motion-capture system calls a body."""
 
-    Raises:
-        ConfigError: an unknown body, or an empty name.
-    """
-
-    body: str  # "vehicle", "payload" or "goal"
+    body: Body
     name: str  # of the rigid body; for natnet its streaming id, for ros2 TYPE:TOPIC
 
     def __post_init__(self) -> None:
-        if self.body not in BODIES or not self.name:
-            raise ConfigError(f"body '{self.body}' named '{self.name}'; expected one of {', '.join(BODIES)} and a name")
+        if not self.name:
+            raise ConfigError(f"the {self.body} has an empty name; expected what the system calls it")
 
 
 @dataclass(frozen=True)
@@ -59,12 +54,16 @@ class MocapParams:
     timeout: float = 5.0  # to connect [s]
     settings: dict[str, str] = field(default_factory=dict)  # further options of motioncapture.connect; for ros2 domain
 
+    @property
+    def options(self) -> dict[str, str]:
+        """Of motioncapture.connect."""
+        return {"hostname": self.host, **self.settings}
+
 
 class MocapSource(Linked):
     """Poses that a thread hands over; serves the autopilot's link as well where there is one.
 
-    Attributes:
-        failure: what ended the thread, or None; the bodies go stale then, which the runner acts on.
+    ``failure`` is what ended the thread, or None; the bodies go stale then, which the runner acts on.
     """
 
     def __init__(self, clock: Callable[[], float], link: Link | None = None) -> None:
@@ -89,11 +88,7 @@ class MotionCaptureSource(MocapSource):
         self, params: MocapParams, bodies: tuple[RigidBody, ...], clock: Callable[[], float], link: Link | None = None,
         module: Any = None,
     ) -> None:  # fmt: skip
-        """Connect.
-
-        Args:
-            params: which system. bodies: names. clock: of the arrivals. link: to serve.
-            module: with the package's ``connect``; left out, the package itself.
+        """Connect; ``clock`` gives the arrivals, ``link`` is served, ``module`` has the package's ``connect`` where it is not the package.
 
         Raises:
             SourceError: the package is missing, no body is named, or the system does not answer.
@@ -103,17 +98,16 @@ class MotionCaptureSource(MocapSource):
         if module is None:
             module = load_extra("motioncapture", "motioncapture", "this source", SourceError)
             _probe(params)
-        connect = module.connect
         self._stop, self._ready = threading.Event(), threading.Event()
         # A daemon: waiting for a frame of a system that has gone silent cannot be called off.
-        threading.Thread(target=self._listen, args=(connect, params), name="motioncapture", daemon=True).start()
+        threading.Thread(target=self._listen, args=(module.connect, params), name="motioncapture", daemon=True).start()
         if not self._ready.wait(params.timeout) or self.failure is not None:
             self._stop.set()
             raise _no_answer(params, self.failure)
 
     def _listen(self, connect: Callable[[str, dict[str, str]], Any], params: MocapParams) -> None:
         try:
-            system = connect(params.system, _options(params))
+            system = connect(params.system, params.options)
             self._ready.set()
             while not self._stop.is_set():
                 system.waitForNextFrame()
@@ -124,7 +118,8 @@ class MotionCaptureSource(MocapSource):
                         position = tuple(float(x) for x in found.position)
                         self.hand_over(Pose(arrival, arrival, self._names[name], position, (q.x, q.y, q.z, q.w)))
         except Exception as error:  # whatever the package raises, the runner sees poses that stop
-            _failed(self, error)
+            self.failure = f"{type(error).__name__}: {error}"
+            print(f"motion capture stopped: {self.failure}", file=sys.stderr, flush=True)
             self._ready.set()
 
     def close(self) -> None:
@@ -135,19 +130,14 @@ class MotionCaptureSource(MocapSource):
 class NatNetSource(MocapSource):
     """Rigid bodies of Motive by streaming id, through the package natnet; stamps are Motive's.
 
-    Attributes:
-        untracked: poses that Motive itself calls not tracked, which it sends on with the last position; dropped.
+    ``untracked`` counts poses that Motive itself calls not tracked, which it sends on with the last position; they are dropped.
     """
 
     def __init__(
         self, params: MocapParams, bodies: tuple[RigidBody, ...], clock: Callable[[], float], link: Link | None = None,
         module: Any = None,
     ) -> None:  # fmt: skip
-        """Connect; arguments and errors as `MotionCaptureSource`.
-
-        Raises:
-            SourceError: as there; or a name that is no number.
-        """
+        """Connect; arguments and errors as `MotionCaptureSource`, and a name that is no number."""
         super().__init__(clock, link)
         wrong = [body.name for body in bodies if not body.name.isdecimal()]
         if wrong:
@@ -155,18 +145,15 @@ class NatNetSource(MocapSource):
         self._names = {int(name): body for name, body in body_names(bodies).items()}
         self.untracked = 0
         module = module or load_extra("natnet", "natnet", "this source", SourceError)
-        self._client = module.NatNetClient(
-            server_ip_address=params.host, local_ip_address=params.local, use_multicast=params.multicast
-        )
+        self._client = module.NatNetClient(server_ip_address=params.host, local_ip_address=params.local, use_multicast=params.multicast)
         self._client.on_data_frame_received_event.handlers.append(self._frame)
         try:
             self._client.connect(timeout=params.timeout)
             self._client.run_async()
         except Exception as error:  # sockets, time-outs, and the package's own
-            raise SourceError(
-                f"natnet at {params.host} (our address {params.local}, {'multi' if params.multicast else 'uni'}cast): "
-                f"{str(error) or f'no answer within {params.timeout:g} s'}; expected Motive that streams"
-            ) from error
+            cast, why = "multi" if params.multicast else "uni", str(error) or f"no answer within {params.timeout:g} s"
+            text = f"natnet at {params.host} (our address {params.local}, {cast}cast): {why}; expected Motive that streams"
+            raise SourceError(text) from error
 
     def _frame(self, frame: Any) -> None:
         arrival = self._clock()
@@ -187,23 +174,14 @@ class NatNetSource(MocapSource):
 def open_mocap(
     params: MocapParams, bodies: tuple[RigidBody, ...], clock: Callable[[], float], remote: bool, link: Link | None = None
 ) -> MocapSource:
-    """Connect to a system.
-
-    Raises:
-        LinkError: the host is no numeric address, or leaves this machine where the config does not allow it.
-        SourceError: see the sources.
-    """
+    """Connect to a system; raises `LinkError` for a host that is no numeric address, or leaves this machine without the config's leave."""
     check_device(f"tcp:{params.host}:1", remote=remote)
     kind = NatNetSource if params.system == "natnet" else MotionCaptureSource
     return kind(params, bodies, clock, link)
 
 
 def body_names(bodies: tuple[RigidBody, ...]) -> dict[str, str]:
-    """Our body by the system's name.
-
-    Raises:
-        SourceError: none, or one twice.
-    """
+    """Return our body by the system's name; raises `SourceError` for none, or one twice."""
     names = {body.name: body.body for body in bodies}
     if not names or len(names) != len(bodies) or len(set(names.values())) != len(bodies):
         raise SourceError(
@@ -213,32 +191,17 @@ def body_names(bodies: tuple[RigidBody, ...]) -> dict[str, str]:
     return names
 
 
-def _options(params: MocapParams) -> dict[str, str]:
-    return {"hostname": params.host, **params.settings}
-
-
 def _no_answer(params: MocapParams, why: str | None) -> SourceError:
-    return SourceError(
-        f"{params.system} at {params.host}: {why or f'no answer within {params.timeout:g} s'}; "
-        "expected a motion-capture system that streams"
-    )
+    why = why or f"no answer within {params.timeout:g} s"
+    return SourceError(f"{params.system} at {params.host}: {why}; expected a motion-capture system that streams")
 
 
 def _probe(params: MocapParams) -> None:
-    """Try whether the system answers. The package's connect holds the interpreter until it does: it would hold the run as well.
-
-    Raises:
-        SourceError: it does not, or refuses.
-    """
-    command = [sys.executable, "-c", PROBE, params.system, json.dumps(_options(params))]
+    """Try whether the system answers: the package's connect holds the interpreter until it does, and would hold the run as well."""
+    command = [sys.executable, "-c", PROBE, params.system, json.dumps(params.options)]
     try:
         tried = subprocess.run(command, timeout=params.timeout, capture_output=True, text=True, check=False)
     except subprocess.TimeoutExpired:
         raise _no_answer(params, None) from None
     if tried.returncode:
         raise _no_answer(params, (tried.stderr.strip().splitlines() or [f"status {tried.returncode}"])[-1])
-
-
-def _failed(source: MocapSource, error: Exception) -> None:
-    source.failure = f"{type(error).__name__}: {error}"
-    print(f"motion capture stopped: {source.failure}", file=sys.stderr, flush=True)

@@ -5,12 +5,13 @@ from pathlib import Path
 from typing import Any
 
 from hil.backends import AUTOPILOTS
-from hil.errors import LinkError, SourceError
+from hil.errors import SourceError
 from hil.links.clock import Clock
 from hil.links.device import check_device, open_port
-from hil.links.mavlink_link import Link, TlogWriter
+from hil.links.mavlink_link import Link
 from hil.links.roster import Party, Roster
 from hil.links.sync import LinkSync
+from hil.links.writer import TlogWriter
 from hil.params import LIVE, HilParams
 from hil.poses.plausible import unit_problems
 from hil.poses.pose import Pose
@@ -23,11 +24,7 @@ from hil.sources.ros2 import Ros2Source
 
 
 def read_poses(params: HilParams) -> list[Pose]:
-    """All raw poses of the recording that a config names.
-
-    Raises:
-        SourceError: the file cannot be read, or is not what the config says.
-    """
+    """Return all raw poses of the recording that a config names; raises `SourceError` where the file cannot be read."""
     source = params.source
     if source.kind == "tlog":
         return read_tlog(source.file, source.senders)
@@ -37,12 +34,7 @@ def read_poses(params: HilParams) -> list[Pose]:
 
 
 def parties(params: HilParams, poses: bool, autopilot: bool) -> list[Party]:
-    """Who may speak on a link.
-
-    Args:
-        params: the run.
-        poses: whether the link carries MAVLink poses. autopilot: whether it carries the autopilot, where that speaks MAVLink.
-    """
+    """Return who may speak on a link that carries MAVLink poses, or the autopilot where that speaks MAVLink, or both."""
     found = []
     if poses:
         for ids in params.source.senders:
@@ -57,14 +49,7 @@ def parties(params: HilParams, poses: bool, autopilot: bool) -> list[Party]:
 def open_source(
     params: HilParams, folder: Path, clock: Clock, key: bytes | None = None, tell: Callable[[str], None] | None = None
 ) -> tuple[Any, Link | None, bool]:  # fmt: skip
-    """Open a source.
-
-    Args:
-        params: the run.
-        folder: of the run, where a link's .tlog goes.
-        clock: of what arrives.
-        key: that the links' messages are signed with; None: they are not.
-        tell: is handed who is refused; never waits.
+    """Open a source; ``key`` signs the links' messages, ``tell`` is handed who is refused and never waits.
 
     Returns:
         Source of poses, the autopilot's link where there is one, and whether the poses are recorded ones.
@@ -83,10 +68,6 @@ def open_source(
 
     def opened(device: str, tlog: str, who: list[Party]) -> Link:
         port = open_port(check_device(device, remote=params.link.remote))
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise LinkError(f"cannot make {folder}: {error.strerror}; expected a folder that can be written (--out)") from error
         roster = Roster(who, params.link.allow, tell)
         link = Link(port, params.link.system, params.link.component, TlogWriter(folder / tlog), roster, key)
         if params.delay.synchronise:

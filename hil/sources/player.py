@@ -21,15 +21,17 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 
 from hil.errors import SourceError
-from hil.poses.pose import BODIES, GOAL, PAYLOAD, VEHICLE, Pose
+from hil.poses.pose import BODIES, GOAL, PAYLOAD, VEHICLE, Body, Pose
 from hil.sources.mavlink import PAIR_AGE, BodyIds, MavlinkDecoder
-from visthrow.common.errors import ConfigError, LogError, suggest
+from visthrow.common.errors import LogError, suggest
+from visthrow.config.bounds import Bound, Bounded
 from visthrow.logs import read
-from visthrow.logs.flightlog import Channel, FlightLog
+from visthrow.logs.flightlog import FlightLog
 from visthrow.logs.mapping import TableMap
 from visthrow.logs.readers import messages
 from visthrow.logs.readers.messages import Fields, Messages
@@ -41,44 +43,41 @@ CHANNELS = {
 }
 """Channels of a flight log that hold position, attitude, velocity and rates of each body."""
 
-EARTH_RADIUS = 6378100.0
-"""ArduPilot's scale of latitude [m]."""
-BODY_FRAME = 3
-"""VELOCITY_FRAME_BODY_FRD."""
+EARTH_RADIUS = 6378100.0  # ArduPilot's scale of latitude [m]
+BODY_FRAME = 3  # VELOCITY_FRAME_BODY_FRD
 
-_ANGLES = (("Roll", "Pitch", "Yaw"), ("R", "P", "Y"))
-_Q = (tuple(f"q[{i}]" for i in range(4)),)
-
-
-def _three(name: str, *older: tuple[str, ...]) -> tuple[tuple[str, ...], ...]:
-    return (tuple(f"{name}[{i}]" for i in range(3)), *older)
+Names = tuple[tuple[str, ...], ...]  # fields; of several sets the first that is there is taken
 
 
 @dataclass(frozen=True)
 class PoseMessage:
-    """Fields of a message that make a pose; of several names of one thing the first that is there is taken."""
+    """Fields of a message that make a pose, or part of one."""
 
-    pos: tuple[tuple[str, ...], ...]
-    quat: tuple[tuple[str, ...], ...] = ()  # wxyz
-    angles: tuple[tuple[str, ...], ...] = ()  # roll, pitch, yaw [deg]
-    vel: tuple[tuple[str, ...], ...] = ()
-    rate: tuple[tuple[str, ...], ...] = ()
+    pos: Names = ()
+    quat: Names = ()  # wxyz
+    angles: Names = ()  # roll, pitch, yaw [deg], in place of a quaternion
+    vel: Names = ()
+    rate: Names = ()
     resets: tuple[str, ...] = ()  # counters; their sum is the pose's
     attitude: str = ""  # message of its attitude, of the same vehicle
     rates: str = ""  # likewise of its rates
 
 
+def _index(name: str, count: int = 3) -> tuple[str, ...]:
+    return tuple(f"{name}[{i}]" for i in range(count))
+
+
+ANGLES, QUAT = (("Roll", "Pitch", "Yaw"), ("R", "P", "Y")), (_index("q", 4),)
+EKF = PoseMessage((("PN", "PE", "PD"),), angles=ANGLES, vel=(("VN", "VE", "VD"),))
 ODOMETRY = PoseMessage(
-    _three("position", ("x", "y", "z")), _Q, vel=_three("velocity", ("vx", "vy", "vz")),
-    rate=_three("angular_velocity", ("rollspeed", "pitchspeed", "yawspeed")), resets=("reset_counter",),
+    (_index("position"), ("x", "y", "z")), QUAT, vel=(_index("velocity"), ("vx", "vy", "vz")),
+    rate=(_index("angular_velocity"), ("rollspeed", "pitchspeed", "yawspeed")), resets=("reset_counter",),
 )  # fmt: skip
 LOCAL_RESETS = tuple(f"{name}_reset_counter" for name in ("xy", "vxy", "z", "vz", "heading"))
 DATAFLASH = {
-    "VISP": PoseMessage((("PX", "PY", "PZ"),), angles=_ANGLES, resets=("Rst", "RstCnt")),
-    "XKF1": PoseMessage((("PN", "PE", "PD"),), angles=_ANGLES, vel=(("VN", "VE", "VD"),)),
-    "NKF1": PoseMessage((("PN", "PE", "PD"),), angles=_ANGLES, vel=(("VN", "VE", "VD"),)),
+    "VISP": PoseMessage((("PX", "PY", "PZ"),), angles=ANGLES, resets=("Rst", "RstCnt")), "XKF1": EKF, "NKF1": EKF,
     "POS": PoseMessage((("N", "E", "D"),), attitude="ATT"),
-}
+}  # fmt: skip
 ULOG = {
     "vehicle_local_position": PoseMessage(
         (("x", "y", "z"),), vel=(("vx", "vy", "vz"),), resets=LOCAL_RESETS,
@@ -87,30 +86,20 @@ ULOG = {
     "vehicle_odometry": ODOMETRY, "vehicle_visual_odometry": ODOMETRY, "vehicle_mocap_odometry": ODOMETRY,
 }  # fmt: skip
 _COMPANIONS = {
-    "ATT": PoseMessage((), angles=_ANGLES), "ORGN": PoseMessage((("Lat", "Lng", "Alt"),)),
-    "vehicle_attitude": PoseMessage((), _Q), "vehicle_angular_velocity": PoseMessage((), rate=_three("xyz")),
+    "ATT": PoseMessage(angles=ANGLES), "ORGN": PoseMessage((("Lat", "Lng", "Alt"),)),
+    "vehicle_attitude": PoseMessage(quat=QUAT), "vehicle_angular_velocity": PoseMessage(rate=(_index("xyz"),)),
 }  # fmt: skip
 
 
 @dataclass(frozen=True)
-class LogBody:
-    """The message of one body in an autopilot's log.
+class LogBody(Bounded):
+    """The message of one body in an autopilot's log."""
 
-    Raises:
-        ConfigError: an unknown body, or an instance below 0.
-    """
-
-    body: str  # "vehicle", "payload" or "goal"
+    body: Body
     message: str  # one of DATAFLASH or ULOG
-    instance: int = 0  # core of XKF1; instance of a ULog topic
+    instance: Annotated[int, Bound(0)] = 0  # core of XKF1; instance of a ULog topic
     file: str | None = None  # of a logger of its own, say on the payload; else the source's file
     time_offset: float = 0.0  # added to this log's times [s]: loggers do not share a clock
-
-    def __post_init__(self) -> None:
-        if self.body not in BODIES:
-            raise ConfigError(f"body '{self.body}'; {suggest(self.body, BODIES)}")
-        if self.instance < 0 or not math.isfinite(self.time_offset):
-            raise ConfigError(f"instance {self.instance}, time_offset {self.time_offset}; expected 0 or more, and a time")
 
 
 @contextmanager
@@ -122,11 +111,7 @@ def _as_source() -> Iterator[None]:
 
 
 def read_table(path: str | Path, mapping: TableMap | None) -> list[Pose]:
-    """Poses of a table, or of any file that ``visthrow.logs`` reads; arrivals are the stamps, counted from the first.
-
-    Args:
-        path: see :data:`visthrow.logs.ENDINGS`.
-        mapping: of a table's columns to :data:`CHANNELS`.
+    """Return poses of a table, or of any file that ``visthrow.logs`` reads; arrivals are the stamps, counted from the first.
 
     Raises:
         SourceError: the file cannot be read, lacks a column, or holds no position of any body.
@@ -143,39 +128,28 @@ def read_table(path: str | Path, mapping: TableMap | None) -> list[Pose]:
 
 
 def _of_channels(log: FlightLog, body: str) -> list[Pose]:
-    """Poses of one body; a sample that is not valid is NaN, for the gate to refuse."""
-    place, *others = CHANNELS[body]
-    if place not in log:
+    """Return poses of one body; a sample that is not valid is NaN, for the gate to refuse."""
+    if CHANNELS[body][0] not in log:
         return []
-    times = log[place].time
-    rows = [_rows(_samples(log[place]), np.arange(len(times)))]
-    for name in others:
-        rows.append(_rows(_samples(log[name]), _before(log[name].time, times)) if name in log else [None] * len(times))
+    times, rows = log[CHANNELS[body][0]].time, []
+    for name in CHANNELS[body]:
+        found: list[tuple | None] = [None] * len(times)
+        if name in log:
+            values = np.where(log[name].valid[:, None], log[name].values.astype(float), np.nan).tolist()
+            found = [tuple(values[i]) if i >= 0 else None for i in _before(log[name].time, times)]
+        rows.append(found)
     start = min(float(channel.time[0]) for channel in log.channels.values() if len(channel.time))
     return [Pose(t, t - start, body, *parts) for t, *parts in zip(times.tolist(), *rows)]
 
 
-def _samples(channel: Channel) -> np.ndarray:
-    return np.where(channel.valid[:, None], channel.values.astype(float), np.nan)
-
-
-def _rows(values: np.ndarray, index: np.ndarray) -> list[tuple | None]:
-    """Rows of an array as tuples of floats; None for an index below 0."""
-    return [tuple(values[i].tolist()) if i >= 0 else None for i in index]
-
-
 def _before(times: np.ndarray, stamps: np.ndarray) -> np.ndarray:
-    """Index of the last time at or before each stamp; -1 where there is none, or an old one."""
+    """Return the index of the last time at or before each stamp; -1 where there is none, or an old one."""
     index = np.searchsorted(times, stamps, side="right") - 1
     return np.where((index >= 0) & (stamps - times[np.maximum(index, 0)] <= PAIR_AGE), index, -1)
 
 
 def read_tlog(path: str | Path, bodies: tuple[BodyIds, ...]) -> list[Pose]:
-    """Poses of a .tlog; arrivals are seconds from its first message.
-
-    Raises:
-        SourceError: no such file, or nothing in it is a message.
-    """
+    """Return poses of a .tlog; arrivals are seconds from its first message. Raises `SourceError` where nothing in it is a message."""
     decoder, poses, first = MavlinkDecoder(bodies), [], None
     with _as_source():
         for arrival, message in messages.telemetry(path):
@@ -187,12 +161,7 @@ def read_tlog(path: str | Path, bodies: tuple[BodyIds, ...]) -> list[Pose]:
 
 
 def read_autopilot(path: str | Path, bodies: tuple[LogBody, ...], kind: str) -> list[Pose]:
-    """Poses of all bodies, arrivals counted from the first one.
-
-    Args:
-        path: of the source.
-        bodies: which message of which file speaks of whom.
-        kind: "bin" or "ulg".
+    """Return poses of all bodies in a log of kind "bin" or "ulg", arrivals counted from the first one.
 
     Raises:
         SourceError: no body, no such file, a package is missing, or a message carries no pose or is not in the log.
@@ -207,9 +176,7 @@ def read_autopilot(path: str | Path, bodies: tuple[LogBody, ...], kind: str) -> 
         with _as_source():
             found = _of_messages(reader(body.file or path, [*known, *_COMPANIONS]), body, known)
         if not found:
-            raise SourceError(
-                f"{body.file or path}: {body.message} (instance {body.instance}) holds no pose of the {body.body}"
-            )
+            raise SourceError(f"{body.file or path}: {body.message} (instance {body.instance}) holds no pose of the {body.body}")
         poses += [replace(pose, arrival=pose.arrival + body.time_offset) for pose in found]
     start = min(pose.arrival for pose in poses)
     return [replace(pose, arrival=pose.arrival - start) for pose in poses]
@@ -249,7 +216,7 @@ def _of_messages(log: Messages, body: LogBody, known: dict[str, PoseMessage]) ->
 
 
 def _columns_of(data: Fields, message: PoseMessage, what: str) -> np.ndarray | None:
-    """Columns of what a message tells, shape (T, 3 or 4); None where it tells nothing of it."""
+    """Return columns of what a message tells, shape (T, 3 or 4); None where it tells nothing of it."""
     if what == "quat" and message.angles:
         from scipy.spatial.transform import Rotation
 
@@ -265,7 +232,7 @@ def _columns(data: Fields, choices: tuple[tuple[str, ...], ...]) -> np.ndarray:
 
 
 def _paired(other: Fields, message: PoseMessage, what: str, stamps: np.ndarray) -> np.ndarray:
-    """Another message's last value at or before each stamp, NaN where there is none or an old one."""
+    """Return another message's last value at or before each stamp, NaN where there is none or an old one."""
     index = _before(other["time"], stamps)
     values = _columns_of(other, message, what)[np.maximum(index, 0)]
     values[index < 0] = np.nan
@@ -273,7 +240,7 @@ def _paired(other: Fields, message: PoseMessage, what: str, stamps: np.ndarray) 
 
 
 def _in_world(vel: np.ndarray | None, quat: np.ndarray | None, frame: np.ndarray | None) -> np.ndarray | None:
-    """Velocities in the world, those of the body turned; NaN where the attitude is not known."""
+    """Return velocities in the world, those of the body turned; NaN where the attitude is not known."""
     if vel is None or frame is None:
         return vel
     from scipy.spatial.transform import Rotation
@@ -288,12 +255,12 @@ def _in_world(vel: np.ndarray | None, quat: np.ndarray | None, frame: np.ndarray
 
 
 def _known(values: np.ndarray | None, i: int) -> tuple[float, ...] | None:
-    """A row; None where there is none or it holds NaN, PX4's word for unknown."""
+    """Return a row; None where there is none or it holds NaN, PX4's word for unknown."""
     return None if values is None or np.isnan(values[i]).any() else tuple(values[i].tolist())
 
 
 def _from_globe(data: Fields, origins: Fields | None) -> Fields:
-    """North, east and down [m] from the estimator's origin, else from the first position."""
+    """Return north, east and down [m] from the estimator's origin, else from the first position."""
     at = np.flatnonzero(origins["Type"] == 0.0) if origins is not None and "Type" in origins else []
     lat, lng = (origins[n][at[-1]] if len(at) else data[n][0] for n in ("Lat", "Lng"))
     return {

@@ -21,8 +21,7 @@ from visthrow.common.extras import load_extra
 
 KINDS = ("geometry_msgs/PoseStamped", "nav_msgs/Odometry", "tf2_msgs/TFMessage")
 
-MOST_TAKEN = 100
-"""Messages of a topic taken in one go."""
+MOST_TAKEN = 100  # messages of a topic taken in one go
 
 LOOPBACK = """<CycloneDDS><Domain><General><Interfaces><NetworkInterface address="127.0.0.1"/></Interfaces>
 <AllowMulticast>false</AllowMulticast></General><Discovery><ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>100</MaxAutoParticipantIndex>
@@ -32,11 +31,7 @@ NETWORK = '<CycloneDDS><Domain><General><Interfaces><NetworkInterface address="{
 
 
 def message_types() -> dict[str, Any]:
-    """The messages that are read, by name, as Cyclone DDS has them.
-
-    Raises:
-        SourceError: the package is missing.
-    """
+    """Return the messages that are read, by name, as Cyclone DDS has them; raises `SourceError` where the package is missing."""
     idl = load_extra("cyclonedds.idl", "ros2", "ROS 2 topics", SourceError)
     types = load_extra("cyclonedds.idl.types", "ros2", "ROS 2 topics", SourceError)
 
@@ -65,7 +60,7 @@ def message_types() -> dict[str, Any]:
 
 
 def domain(params: MocapParams) -> Any:
-    """What joins the ROS domain of ``settings.domain``, 0 where it is left out.
+    """Return what joins the ROS domain of ``settings.domain``, 0 where it is left out.
 
     Raises:
         SourceError: the package is missing, the number is none, or the address is not this machine's.
@@ -82,31 +77,20 @@ def domain(params: MocapParams) -> Any:
 
 
 def placed(kind: str, message: Any, frames: str) -> Iterator[tuple[float, tuple[float, ...], tuple[float, ...]]]:
-    """Stamp [s], position [m] and quaternion xyzw of a message; of TF of the transform ``PARENT/CHILD``."""
+    """Yield the stamp [s], position [m] and quaternion xyzw of a message; of TF of the transform ``PARENT/CHILD``."""
+    parent, _, child = frames.rpartition("/")
     if kind == KINDS[2]:
-        parent, _, child = frames.rpartition("/")
-        for one in message.transforms:
-            if (one.header.frame_id.lstrip("/"), one.child_frame_id.lstrip("/")) == (parent, child):
-                yield _seconds(one.header), _xyz(one.transform.translation), _xyzw(one.transform.rotation)
-        return
-    pose = message.pose if kind == KINDS[0] else message.pose.pose
-    yield _seconds(message.header), _xyz(pose.position), _xyzw(pose.orientation)
-
-
-def _seconds(header: Any) -> float:
-    return float(header.stamp.sec) + 1e-9 * float(header.stamp.nanosec)
-
-
-def _xyz(of: Any) -> tuple[float, ...]:
-    return of.x, of.y, of.z
-
-
-def _xyzw(of: Any) -> tuple[float, ...]:
-    return of.x, of.y, of.z, of.w
+        wanted = [t for t in message.transforms if (t.header.frame_id.lstrip("/"), t.child_frame_id.lstrip("/")) == (parent, child)]
+        found = [(t.header, t.transform.translation, t.transform.rotation) for t in wanted]
+    else:
+        pose = message.pose if kind == KINDS[0] else message.pose.pose
+        found = [(message.header, pose.position, pose.orientation)]
+    for header, p, q in found:
+        yield float(header.stamp.sec) + 1e-9 * float(header.stamp.nanosec), (p.x, p.y, p.z), (q.x, q.y, q.z, q.w)
 
 
 def _topic(name: str) -> tuple[str, str, str]:
-    """Type, topic and, of TF, ``PARENT/CHILD`` of a body's name."""
+    """Return type, topic and, of TF, ``PARENT/CHILD`` of a body's name."""
     kind, _, rest = name.partition(":")
     place, _, frames = rest.partition(":")
     if kind not in KINDS or not place.startswith("/") or (kind == KINDS[2]) != ("/" in frames):
@@ -125,11 +109,7 @@ class Ros2Source(MocapSource):
     def __init__(
         self, params: MocapParams, bodies: tuple[RigidBody, ...], clock: Callable[[], float], link: Link | None = None
     ) -> None:  # fmt: skip
-        """Subscribe; arguments as `hil.sources.mocap.MotionCaptureSource`.
-
-        Raises:
-            SourceError: the package is missing, or a name is no ``TYPE:TOPIC``.
-        """
+        """Subscribe; arguments and errors as `hil.sources.mocap.MotionCaptureSource`, and a name that is no ``TYPE:TOPIC``."""
         super().__init__(clock, link)
         wanted = [(*_topic(name), body) for name, body in body_names(bodies).items()]
         types, self._domain = message_types(), domain(params)

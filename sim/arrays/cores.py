@@ -12,25 +12,30 @@ def cores() -> int:
 
 
 def in_pieces(launch: Callable[[int, int], None], marks: Sequence[int], threads: int) -> None:
-    """Call ``launch(first, last)`` for each stretch between two marks, so many at a time, and wait for all.
+    """Call ``launch(first, last)`` for each stretch between two marks, so many at a time, this thread's among them; wait for all.
 
     Args:
         launch: of rows that depend on no others; together they leave the bits that one call for all would.
         marks: ascending, from 0 to the number of rows.
         threads: at most.
     """
-    stretches = list(zip(marks[:-1], marks[1:]))
-    if threads == 1 or len(stretches) == 1:
+    stretches = iter(list(zip(marks[:-1], marks[1:])))
+
+    def work() -> None:
         for first, last in stretches:
             launch(first, last)
-        return
-    for done in [_pool(threads).submit(launch, *stretch) for stretch in stretches]:
-        done.result()
+
+    helpers = [_pool(threads).submit(work) for _ in range(min(threads, len(marks) - 1) - 1)]
+    try:
+        work()
+    finally:
+        for helper in helpers:
+            helper.result()
 
 
 @cache
 def _pool(threads: int) -> ThreadPoolExecutor:
-    """Threads that launch pieces; kept, since there are thousands of launches."""
+    """Threads that launch pieces beside the caller's; kept, since there are thousands of launches."""
     return ThreadPoolExecutor(threads, "launch")
 
 

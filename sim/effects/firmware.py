@@ -24,6 +24,7 @@ NOT_SAID = {
     "gyro_lpf1_dyn_hz": "opens the gyro's filter with the throttle", "dterm_lpf1_dyn_hz": "opens the filter of D with the throttle",
     "d_max": "raises D in fast moves", "thrust_linear": "bends the mixer's output",
     "vbat_sag_compensation": "raises the output as the battery sags", "dshot_bidir": "idles by the rotors' speed",
+    "yaw_lowpass_hz": "smooths P of yaw: of the gyro's part the block has the lag, of the command's none",
 }  # fmt: skip
 """Settings that the block has no number for, and what they do where they are not 0."""
 
@@ -57,7 +58,8 @@ def controller_of(vehicle: VehicleParams, settings: Mapping[str, str], mix_thrus
     Args:
         vehicle: whose rotors the firmware drives; its ``max_thrust`` is at the battery's reference voltage.
         settings: by their names in the blackbox's header: rollPID, pitchPID, yawPID, ff_weight, iterm_relax_cutoff, motor_idle,
-            gyro_lpf1_static_hz, gyro_lpf2_static_hz, dterm_lpf1_static_hz, dterm_lpf2_static_hz, pidsum_limit, iterm_windup.
+            gyro_lpf1_static_hz, gyro_lpf2_static_hz, dterm_lpf1_static_hz, dterm_lpf2_static_hz, yaw_lowpass_hz, pidsum_limit,
+            iterm_windup.
         mix_thrust: of a motor in hover [N].
         voltage: at which the throttle was calibrated [V].
 
@@ -83,14 +85,18 @@ def controller_of(vehicle: VehicleParams, settings: Mapping[str, str], mix_thrus
         x, y, z = (scale * value * torque for value, torque in zip(values, torques, strict=True))
         return x, y, z
 
-    named = ("gyro_lpf1_static_hz", "gyro_lpf2_static_hz", "dterm_lpf1_static_hz", "dterm_lpf2_static_hz")
-    cutoffs = [numbers(settings, name)[0] for name in named]
+    def lag(*names: str) -> float:
+        """Of low-passes one after the other [s]; 0 Hz are none."""
+        return sum(1.0 / (2.0 * math.pi * hz) for name in names if (hz := numbers(settings, name)[0]) > 0.0)
+
+    gyro = lag("gyro_lpf1_static_hz", "gyro_lpf2_static_hz")
+    whole = gyro + lag("dterm_lpf1_static_hz", "dterm_lpf2_static_hz")
+    share, yaw_share = ((gyro + more) / whole if whole > 0.0 else 1.0 for more in (0.0, lag("yaw_lowpass_hz")))
     x, y, z = (windup * limit * torque for limit, torque in zip(most, torques, strict=True))
     return dataclasses.replace(
         c, kind="motor_mixing", p_gain=gains(P_SCALE, [a[0] for a in axes]),
         i_gain=gains(I_SCALE, [times * a[1] for times, a in zip((1.0, 1.0, YAW_I), axes)]),
         d_gain=gains(D_SCALE, [a[2] for a in axes]), feedforward_gain=gains(F_SCALE, forward), integral_limit=(x, y, z),
-        setpoint_time_constant=1.0 / (2.0 * math.pi * numbers(settings, "iterm_relax_cutoff")[0]),
-        gyro_time_constant=sum(1.0 / (2.0 * math.pi * hz) for hz in cutoffs if hz > 0.0),
+        setpoint_time_constant=lag("iterm_relax_cutoff"), gyro_time_constant=whole, gyro_share=(share, share, yaw_share),
         min_thrust=full * idle**2, max_thrust=full, voltage_compensation=0.0, mix_thrust=mix_thrust, calibration_voltage=voltage,
     )  # fmt: skip

@@ -118,7 +118,7 @@ def rate_controller_motor_mixing(
     asked = type(rate_b)(command[1], command[2], command[3])
     setpoint_rate = (asked - setpoint) / c.setpoint_time_constant
     gyro_rate = (rate_b - gyro) / c.gyro_time_constant
-    error = asked - gyro
+    error = asked - rate_b - wp.cw_mul(c.gyro_share, gyro - rate_b)
     integral_rate = wp.cw_mul(c.i_gain, error)
     for i in range(3):
         if i < 2:

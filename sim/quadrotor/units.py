@@ -25,7 +25,7 @@ PLANT: dict[str, dict[Dimension, str]] = {
     "RotorParams": {LENGTH: "x y z radius", NONE: "spin", INERTIA: "inertia"},
     "QueueParams": {TIME: "delay"},
     "ControllerParams": {
-        NONE: "kind voltage_compensation calibration_voltage", ANGULAR_DAMPING: "p_gain", TORQUE: "i_gain integral_limit",
+        NONE: "kind voltage_compensation calibration_voltage gyro_share", ANGULAR_DAMPING: "p_gain", TORQUE: "i_gain integral_limit",
         INERTIA: "d_gain feedforward_gain", TIME: "setpoint_time_constant gyro_time_constant",
         FORCE: "min_thrust max_thrust mix_thrust", RATE: "geometric_gain relax_threshold",
     },

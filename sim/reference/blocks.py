@@ -137,11 +137,12 @@ def motor_mixing(
     asked = command[:, 1:]
     low_dot = (asked - low) / gains.setpoint_time_constant
     gyro_dot = (rate - gyro) / gains.gyro_time_constant
-    torque = np.array(gains.p_gain) * (asked - gyro) + integral
+    error = asked - rate - np.array(gains.gyro_share) * (gyro - rate)
+    torque = np.array(gains.p_gain) * error + integral
     torque = torque - np.array(gains.d_gain) * gyro_dot + np.array(gains.feedforward_gain) * low_dot
     relaxed = np.clip(1.0 - np.abs(asked - low) / gains.relax_threshold, 0.0, None)
     relaxed[:, 2] = 1.0
-    integral_dot = np.array(gains.i_gain) * (asked - gyro) * relaxed
+    integral_dot = np.array(gains.i_gain) * error * relaxed
     windup = (np.abs(integral) >= np.array(gains.integral_limit)) & (integral_dot * integral > 0.0)
     tilt, yaw = _motor_shares(torque, vehicle.rotors, vehicle.thrust.torque_ratio)
     added = (tilt + yaw) * 0.5 / np.sqrt(gains.mix_thrust * gains.max_thrust)

@@ -178,7 +178,7 @@ class Replay:
             wp.launch(self.kernel.replay, len(costs), [*before, begin, *after], device=device, block_dim=64)
             wp.synchronize_device(device)
             return
-        self.kernel.replay.module.load("cpu")
+        self.kernel.replay.module.load("cpu", block_dim=1)  # by one thread, as a launch there would
 
         def launch(first: int, last: int) -> None:
             wp.launch(self.kernel.replay, last - first, [*before, begin + first, *after], device="cpu")

@@ -127,3 +127,10 @@ def test_importing_visthrow_and_the_command_line_is_cheap():
     code = "import sys, visthrow.cli; print(*sys.modules)"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
     assert {"torch", "numpy", "warp", "cv2"}.isdisjoint(result.stdout.split())
+
+
+def test_a_process_that_throws_on_the_reference_plant_needs_no_trainer():
+    """Tensordict brings torch's compiler along, which takes about as long to import as torch itself."""
+    code = "import sys, visthrow.throws.reference_protocol, visthrow.throws.loading; print(*sys.modules)"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
+    assert {"tensordict", "rsl_rl", "torch._dynamo"}.isdisjoint(result.stdout.split())

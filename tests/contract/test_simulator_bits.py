@@ -86,6 +86,7 @@ def test_slices_on_several_threads_equal_the_whole(threads, monkeypatch):
         assert bool(launched) == (number > 1)
     assert_same(*states)
     assert {n for _, n in launched} == {threads}
+    assert all(len(kernel.module.execs) == 1 for kernel in (sim._step.step, sim._reset.randomize)), "compiled once"
     assert all(marks[0] == 0 and marks[-1] == count and len(marks) > threads for marks, _ in launched)
     assert not np.array_equal(states[0]["attached"], np.ones(count))
 

@@ -52,6 +52,8 @@ LAWS = {
     "law_ball_swirl": 0.02, "law_vehicle_swirl": 0.05, "law_speed_thrust": 0.02, "law_slew_thrust": 0.008, "law_joint_square": 2e-4,
 }  # fmt: skip
 """Terms that no entry of the catalogue has, with sizes that show: see :class:`tests.worlds.vehicle.Numbers`."""
+BEYOND = {"law_power_drag": 0.06, "law_sink_push": 0.08}
+"""Laws that no term of the tool's grammar has: an exponent between, a switch."""
 
 MEASURED = ("--measured", "air_density=0.003")
 """What whoever asks has measured: barometer and thermometer of the hall. In all these worlds the air is as dense as the model's."""
@@ -301,9 +303,10 @@ def drawn(kind: str, number: int) -> Recipe:
     """A world of a kind: ``null``, ``law``, ``curve``, ``limit:NAME``, ``flights`` or ``EFFECTSxFLOORS``; those with a camera.
 
     ``null:COLOUR`` hides nothing behind noise of one of COLOURS, ``varies:NAME`` an effect that differs from flight to flight,
-    ``drifts:NAME`` one that differs from day to day, ``lost`` commands that never arrive. Those with a camera are ``sight``,
-    ``camera`` and ``clear``. ``curve`` and ``sight`` hide one of the effects whose limits are asked for, ``limit:NAME`` the one that
-    it names, about its limit, ``camera`` any of a camera's, ``clear`` none. ``KIND+dust`` is the same with some of every other effect.
+    ``drifts:NAME`` one that differs from day to day, ``lost`` commands that never arrive, ``beyond`` a law outside the tool's grammar.
+    Those with a camera are ``sight``, ``camera`` and ``clear``. ``curve`` and ``sight`` hide one of the effects whose limits are asked
+    for, ``limit:NAME`` the one that it names, about its limit, ``camera`` any of a camera's, ``clear`` none. ``KIND+dust`` is the same
+    with some of every other effect.
     """
     if kind.endswith(DUSTY):
         return replace(drawn(kind.removesuffix(DUSTY), number), dust=DUST)
@@ -334,6 +337,10 @@ def drawn(kind: str, number: int) -> Recipe:
         only_brakes = name == "law_joint_square"  # and makes the string's masses unstable
         size = LAWS[name] * float(np.exp(rng.uniform(-0.3, 0.7))) * (1.0 if only_brakes else float(rng.choice([-1.0, 1.0])))
         return replace(draw(number, 0, 0.0, plants=("rod",) if only_brakes else ("rod", "string")), effects={name: size})
+    if kind == "beyond":
+        name = str(rng.choice(list(BEYOND)))
+        size = BEYOND[name] * float(np.exp(rng.uniform(-0.3, 0.7))) * float(rng.choice([-1.0, 1.0]))
+        return replace(draw(number, 0, 0.0, plants=("rod", "string")), effects={name: size})
     if kind in ("curve", "flights"):
         floors = float(np.exp(rng.uniform(np.log(SMALLEST), np.log(LARGEST))))
         if kind == "curve":
@@ -380,8 +387,8 @@ def warm(plant: str) -> None:
 def main() -> None:
     """Run a bank of sealed worlds and add it to a ledger; worlds that are there are not run again."""
     parser = argparse.ArgumentParser(description=main.__doc__, fromfile_prefix_chars="@", epilog="@FILE holds arguments, one a line")
-    kinds = "null, null:COLOUR, varies:NAME, drifts:NAME, lost, law, curve, limit:NAME, flights, EFFECTSxFLOORS, any of these +dust; "
-    kinds += "with a camera sight, camera, clear"
+    kinds = "null, null:COLOUR, varies:NAME, drifts:NAME, lost, law, beyond, curve, limit:NAME, flights, EFFECTSxFLOORS, "
+    kinds += "any of these +dust; with a camera sight, camera, clear"
     parser.add_argument("worlds", nargs="*", metavar="KIND=COUNT", help=kinds)
     parser.add_argument("--seed", type=int, help="of the first world; drawn by the system where not given")
     parser.add_argument("--ledger", type=Path, default=Path("ledger.jsonl"))
@@ -390,6 +397,7 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=1e6, help="begin no world later than this")
     parser.add_argument("--end", type=float, default=1e6, help="minutes after which a verdict that is not there is none")
     parser.add_argument("--warm", choices=PLANTS, help="only compile what worlds of this plant need")
+    parser.add_argument("--plants", nargs="+", choices=PLANTS, default=PLANTS, help="leave worlds of others out, such as without MuJoCo")
     parser.add_argument("--small", action="store_true", help="short flights, as the default tests have them")
     args = parser.parse_args()
     single()
@@ -404,7 +412,8 @@ def main() -> None:
     sizes = {kind: int(count) for kind, count in (item.split("=") for item in args.worlds)}
     begin, end = (time.time() + 60.0 * minutes for minutes in (args.minutes, args.end))
     shorter = SMALL if args.small else {}
-    worlds = [(kind, replace(recipe, **shorter)) for kind, recipe in bank(first, sizes)]
+    worlds = [(kind, replace(recipe, **shorter)) for kind, recipe in bank(first, sizes) if recipe.plant in args.plants]
+    print(f"{len(worlds)} of {sum(sizes.values())} worlds are of the plants {', '.join(args.plants)}", flush=True)
     worlds = [(kind, recipe) for kind, recipe in worlds if recipe.digest() not in done]
     tasks = [(kind, recipe, begin, end, args.verdicts) for kind, recipe in worlds]
     tally: dict[str, Counter] = {kind: Counter() for kind in sizes}

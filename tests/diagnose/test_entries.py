@@ -53,7 +53,7 @@ def test_held_out_landings_come_near_the_truth():
     model = diagnosis.work.problem.model
     seen = model.landings(recipe.effects)
     assert np.linalg.norm((seen.measured - truth)[:, :2], axis=1).max() < 5e-3
-    landing = gain.measure(dataclasses.replace(diagnosis), draws=200).landing
+    landing = gain.measure(dataclasses.replace(diagnosis)).landing
     assert diagnosis.named == ("release_lag",)
     assert landing.held_out
     assert landing.released_after < 0.3 * landing.released_before

@@ -54,14 +54,14 @@ def no_bounds(monkeypatch) -> None:
     monkeypatch.setattr(Priors, "of", staticmethod(of))
 
 
-def bootstrap_of_one_flight(monkeypatch) -> None:
-    """Every resample holds one flight alone, many times: intervals of the gain are those of the scatter within it."""
-    plain = held_out.studentised
+def jackknife_of_one_flight(monkeypatch) -> None:
+    """One flight stands for all, many times: intervals of the gain are those of the scatter within it."""
+    plain = held_out.jackknifed
 
-    def one(before, after, rng, draws):
-        return plain(np.repeat(before[:1], len(before)), np.repeat(after[:1], len(after)), rng, draws)
+    def one(before, after):
+        return plain(np.repeat(before[:1], len(before)), np.repeat(after[:1], len(after)))
 
-    monkeypatch.setattr(held_out, "studentised", one)
+    monkeypatch.setattr(held_out, "jackknifed", one)
 
 
 def truth_in_the_log(monkeypatch) -> None:
@@ -91,7 +91,7 @@ MUTATIONS = {
     "no latent forces": (no_latent_forces, searches.test_gusts_are_no_causes),
     "no floors": (no_floors, searches.test_causes_at_their_floors_are_not_named),
     "no bounds": (no_bounds, searches.test_an_estimate_stays_within_its_physical_bounds),
-    "bootstrap of one flight": (bootstrap_of_one_flight, gains_intervals_hold),
+    "jackknife of one flight": (jackknife_of_one_flight, gains_intervals_hold),
     "truth in the log": (truth_in_the_log, logs_are_clean),
 }
 """What is spoiled, and the test that must fail for it."""

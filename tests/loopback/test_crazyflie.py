@@ -36,7 +36,7 @@ class Desk:
         self.params = config.load(HilParams, config.find("hil", "fake_crazyflie"), over)
         port = AnsweringPort(UdpPort(Device("udp", "127.0.0.1", self.number)))
         link = Link(UdpPort(Device("udpout", "127.0.0.1", poses)), *VEHICLE_ID)
-        self.fake = FakeCrazyflie(make("vision", 0), link, MocapParams(), 0, Options(**options), port)
+        self.fake = FakeCrazyflie(make("vision", 0), link, MocapParams(), 0, Options(**options), port=port)
         self.backend = make_backend(self.params)
 
     def turn(self, seconds, command=None, ask=None):

@@ -15,7 +15,8 @@ from hil.control.loop import AutoOperator, fly
 from hil.control.runner import Runner
 from hil.links.clock import MonotonicClock
 from hil.links.device import check_device, open_port
-from hil.links.mavlink_link import Link, TlogWriter
+from hil.links.mavlink_link import Link
+from hil.links.writer import TlogWriter
 from hil.params import HilParams
 from hil.recording.playback import replay
 from hil.recording.record import Recorder

@@ -29,6 +29,8 @@ def vehicle_with(delay: float = 0.0213, **kinds: str) -> VehicleParams:
     """The paper's vehicle; its command switches inside a substep."""
     vehicle = dataclasses.replace(paper_plant().vehicle, queue=QueueParams(delay))
     parts = {name: dataclasses.replace(getattr(vehicle, name), kind=kind) for name, kind in kinds.items()}
+    if kinds.get("controller") == "motor_mixing":
+        parts["controller"] = dataclasses.replace(parts["controller"], gyro_share=(0.4, 0.5, 1.3))
     return dataclasses.replace(vehicle, **parts)
 
 

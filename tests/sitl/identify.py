@@ -146,7 +146,7 @@ class Windows:
         setpoint, gyro = smoothed(asked, c.setpoint_time_constant), smoothed(rate, c.gyro_time_constant)
         if c.kind != "motor_mixing":
             return {"setpoint": setpoint, "gyro": gyro, "integral": np.zeros_like(rate)}
-        error = asked - gyro
+        error = asked - rate - np.array(c.gyro_share) * (gyro - rate)
         error[:, :2] *= np.maximum(1.0 - np.abs(asked - setpoint)[:, :2] / c.relax_threshold, 0.0)
         return {"setpoint": setpoint, "gyro": gyro, "integral": c.i_gain * (rest + PERIOD * np.cumsum(error, axis=0))}
 

@@ -49,6 +49,12 @@ HALF_STEP = 0.15
 STIFF = {"p": "11", "i": "20", "d": "8", "d_max": "8"}
 """Gains of roll and pitch that hold a rate against the swinging ball."""
 
+FASTER, SETTLED, RAMP = 20.0, 0.03, 0.15
+"""Angular acceleration [rad/s^2], from when to when its answer is looked at [s]."""
+
+LEAD = 5 * 0.000529 / (5 * 0.032029) - 1.0 / (2.0 * np.pi * 250.0) - 1.0 / (2.0 * np.pi * 500.0)
+"""Of the output before the rate while it grows, 15.6 ms: D over P of roll (pid.h), less what the gyro's two filters cost [s]."""
+
 OTHERS = 0.25
 """Rate of the other axes beside a step, as a share of it: 0.03 of 1.5 rad/s were measured on a quiet machine."""
 
@@ -197,6 +203,24 @@ def test_it_is_taken_armed_and_follows_steps(stiff):
         asked = share * hover[0] / bench.plant.mass[0]
         print(f"thrust x {share}: {force:.2f} of {asked:.2f} m/s^2")
         assert force == pytest.approx(asked, rel=LIFT)
+
+
+def test_its_d_and_its_gyro_are_those_of_its_settings(bench):
+    """The vehicle turns faster and faster: motors lead its rate by D and lag it by the gyro's filters. A sample a period: 11.1 ms."""
+    hover, plant, rows = bench.take(), bench.plant, []
+
+    def turned(motors, *_):
+        rows.append((motors[[0, 2]] - motors[[1, 3]]).mean())
+        plant.rate_b = plant.rate_b + [FASTER * plant.period, 0.0, 0.0]
+        plant._plant.time += plant.period
+
+    plant.rate_b, plant.step = np.zeros(3), turned
+    bench.turn(RAMP, hover)
+    time = plant.period * (np.arange(len(rows)) + 0.5)
+    seen = time > SETTLED
+    _, slope, offset = np.polyfit(time[seen], np.array(rows)[seen], 2)
+    print(f"\nlead {1e3 * offset / slope:.2f} ms, {1e3 * LEAD:.2f} by the settings")
+    assert offset / slope == pytest.approx(LEAD, rel=0.05)
 
 
 def test_silence_idles_the_motors_and_disarms(bench):

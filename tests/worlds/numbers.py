@@ -33,6 +33,7 @@ def nominal() -> SimpleNamespace:
         rotor_gain=np.ones(4), drag=np.array([a["drag_x"], a["drag_y"], a["drag_z"]]), parasitic=a["parasitic"],
         inflow=a["inflow"], torque_inflow=a["torque_inflow"], lift=a["translational_lift"], flapping=a["flapping"],
         ground=0.0, wind=np.zeros(3), speed_thrust=0.0, slew_thrust=0.0, yaw_swirl=0.0,
+        power_drag=0.0, sink_push=0.0,
         mount=np.array(r["mount"]), length=r["length"], rope_mass=r["rope_mass"], ball_mass=r["payload_mass"],
         ball_reach=r["payload_offset"], ball_inertia=r["payload_inertia"], joint_damping=r["joint_damping"],
         joint_damping_square=0.0, bending=0.0, stretch=0.0, rope_drag=0.0, ball_drag=0.0, ball_side=0.0, ball_lift=0.0,
@@ -122,6 +123,7 @@ CHANGES = {
     # Laws outside the catalogue.
     "law_speed_thrust": _add("speed_thrust"), "law_slew_thrust": _add("slew_thrust"), "law_vehicle_swirl": _add("yaw_swirl"),
     "law_ball_swirl": _add("ball_swirl"), "law_joint_square": _add("joint_damping_square"), "law_bending": _add("bending"),
+    "law_power_drag": _add("power_drag"), "law_sink_push": _add("sink_push"),
     # The paper's ablations, as what the plant lacks or has.
     "no_aero": _no_aero, "geometric": _geometric,
 }  # fmt: skip

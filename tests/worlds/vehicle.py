@@ -8,6 +8,7 @@ import warp as wp
 
 REAL = wp.float64
 V3, V4, M3 = wp.vec3d, wp.vec4d, wp.mat33d
+SINKING = wp.constant(wp.float64(0.3))  # [m/s]
 EARTH = 9.81
 
 
@@ -67,6 +68,8 @@ class Numbers:
     speed_thrust: REAL  # thrust grows with |v_xy| [s/m]: a law outside the catalogue
     slew_thrust: REAL  # thrust grows with the collective's change [s]: likewise
     yaw_swirl: REAL  # side force e_z x v [kg/s]: likewise
+    power_drag: REAL  # drag along -|v|^1/2 v [kg/s (s/m)^1/2]: outside the grammar of laws as well
+    sink_push: REAL  # force along body z wherever the vehicle sinks faster than SINKING [N]: likewise
     mount: V3  # from the frame's origin
     length: REAL
     rope_mass: REAL
@@ -250,6 +253,9 @@ def vehicle_load(p: Numbers, b: Body, command: V4, push: V3, twist: V3):
         momentum -= p.rotor_inertia * p.spin[i] * speed[i]
     force += V3(REAL(0.0), REAL(0.0), p.slew_thrust * slew)
     force += p.yaw_swirl * V3(-air[1], air[0], REAL(0.0))
+    force -= p.power_drag * wp.sqrt(wp.length(air)) * air
+    if air[2] < -SINKING:
+        force += V3(REAL(0.0), REAL(0.0), p.sink_push)
     torque += p.flapping * total * V3(-air[1], air[0], REAL(0.0))
     torque -= wp.cross(b.w, V3(REAL(0.0), REAL(0.0), momentum))
     if p.ideal_battery == 0:

@@ -22,10 +22,10 @@ from visthrow.baseline.release import landing_point
 from visthrow.common.errors import ConfigError, suggest
 from visthrow.common.rotations import matrix_of_quat
 from visthrow.task import Experiment
+from visthrow.task.measurement import Throws
 from visthrow.throws.flight import FALL_TIME, Decision, Flight, Pilots, Scores, Smoothness, hover, throw
 from visthrow.throws.plants import HybridPlant, Plant, Snapshot
 from visthrow.throws.reference_protocol import HOVER_TIME, batch_plant, place_in_hover
-from visthrow.training.protocol import Throws
 
 FINE = 4
 """Runge-Kutta steps of the flown pendulum in one control period; the controller predicts with one."""

@@ -141,9 +141,9 @@ def throw_baseline(args: argparse.Namespace) -> list[Entry]:
     import tempfile
 
     from visthrow.baseline import thrower
+    from visthrow.task.measurement import Throws
     from visthrow.throws.reference_protocol import FIELDS
     from visthrow.training.device import cores
-    from visthrow.training.protocol import Throws
 
     with tempfile.TemporaryDirectory() as folder:
         found = thrower.compared(

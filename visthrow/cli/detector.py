@@ -88,10 +88,10 @@ def throw(args: argparse.Namespace) -> int:
         VisthrowError: no throws, no such plant, or a policy that sees no keypoints.
     """
     from visthrow.common.workers import done
+    from visthrow.task.measurement import Throws
     from visthrow.throws.loading import load_policy
     from visthrow.throws.plants import known_plant
     from visthrow.throws.reference_protocol import plan
-    from visthrow.training.protocol import Throws
 
     known_plant(args.plant)
     loaded = load_policy(args.policy, None, args.overrides)

@@ -290,7 +290,7 @@ class Smoothness:
 
 
 class Scores(Recorder):
-    """Measures what :class:`visthrow.training.protocol.Throws` holds.
+    """Measures what :class:`visthrow.task.measurement.Throws` holds.
 
     Attributes:
         clearance: least distance of the payload from the vehicle in flight [m], shape (E,); infinite before.

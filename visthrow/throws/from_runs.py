@@ -8,8 +8,8 @@ import numpy as np
 from visthrow.common.errors import LogError
 from visthrow.logs.flightlog import FlightLog
 from visthrow.onboard.observations import VEHICLE
+from visthrow.task.measurement import Throws
 from visthrow.throws.results import Entry
-from visthrow.training.protocol import Throws
 
 PATTERN = "throw-*.npz"
 

@@ -1,4 +1,4 @@
-"""The paper's measurement on the reference plant: throws from hover, scored as :mod:`visthrow.training.protocol` scores them.
+"""The paper's measurement on the reference plant: throws from hover, scored as :mod:`visthrow.task.measurement` says.
 
 Each throw hovers first under the hover controller, so that battery, integrals and swing are those of a hover, and sees
 the plant's own measurements. Keypoints come from measured poses, as in the paper's hardware-in-the-loop tests. Throws
@@ -20,11 +20,11 @@ from visthrow import config
 from visthrow.common.errors import ConfigError
 from visthrow.common.workers import Workers, progress
 from visthrow.task import Experiment, plant_of
+from visthrow.task.measurement import Throws
 from visthrow.throws.flight import Decision, Flight, Policies, Scores, hover, throw
 from visthrow.throws.loading import Loaded
 from visthrow.throws.plants import Plant, Snapshot, make_plant, random_ropes
 from visthrow.training.device import cores
-from visthrow.training.protocol import Throws
 
 if TYPE_CHECKING:
     from visthrow.view.eyes import Eyes
@@ -81,7 +81,7 @@ def fly_batch(loaded: Sequence[Loaded], plant_name: str, job: Job, eyes: "Eyes |
         eyes: of as many vehicles, whose rendered pictures keypoints come from.
 
     Returns:
-        :data:`FIELDS` of :class:`visthrow.training.protocol.Throws`, the first policy's throws first, and ``goal_w`` where goals
+        :data:`FIELDS` of :class:`visthrow.task.measurement.Throws`, the first policy's throws first, and ``goal_w`` where goals
         move; NaN where a throw failed.
     """
     flown = [loaded[i] for i in job.policies]
@@ -162,7 +162,7 @@ class Throwing(Workers):
         """Wait, with a progress line on a terminal.
 
         Returns:
-            For each policy, a :class:`visthrow.training.protocol.Throws` a target.
+            For each policy, a :class:`visthrow.task.measurement.Throws` a target.
         """
         self.label *= show
         found = dict(self)

@@ -119,7 +119,7 @@ def policy_unit(
 
 
 def columns_of(throws: Any) -> dict[str, np.ndarray]:
-    """Per-throw arrays of a dataclass of throws (:class:`visthrow.training.protocol.Throws`, :class:`visthrow.baseline.fly.Flown`)."""
+    """Per-throw arrays of a dataclass of throws (:class:`visthrow.task.measurement.Throws`, :class:`visthrow.baseline.fly.Flown`)."""
     count = len(throws.success)
     found = {name: np.asarray(value) for name, value in vars(throws).items() if isinstance(value, np.ndarray)}
     return {name: value for name, value in found.items() if value.ndim and len(value) == count}

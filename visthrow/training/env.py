@@ -318,15 +318,15 @@ class ThrowEnv(VecEnv):
         return self.views.goal_w + self._memory["goal_vel"] * left[:, None]
 
     def _tally(self, done: Tensor) -> None:
-        hit = self.last["released"].to(torch.float64)
-        sums = [done.to(torch.float64), hit, self.last["landing_error"] * hit, self.last["duration"] * hit]
-        self._memory["totals"] += torch.stack([s.sum() for s in sums])
+        hit = self.last["released"].to(torch.float32)
+        rows = torch.stack([done.to(torch.float32), hit, self.last["landing_error"] * hit, self.last["duration"] * hit])
+        self._memory["totals"] += rows.sum(-1, dtype=torch.float64)
 
     def _begin(self, fresh: Tensor) -> None:
         """Draw what holds for an episode where one begins."""
         memory, noise, camera = self._memory, self.cfg.task.noise, self.cfg.camera
         self.episode_length_buf.masked_fill_(fresh, 0)
-        memory["previous"].copy_(torch.where(fresh[:, None], self._start_action, memory["previous"]))
+        torch.where(fresh[:, None], self._start_action, memory["previous"], out=memory["previous"])
         spreads = {
             "frame_bias": noise.observation_bias,
             "command_bias": noise.command_bias,
@@ -339,12 +339,12 @@ class ThrowEnv(VecEnv):
             if std > 0.0:
                 old = memory[name]
                 mask = fresh.view(-1, *(1,) * (old.dim() - 1))
-                old.copy_(torch.where(mask, torch.randn_like(old) * std, old))
+                torch.where(mask, torch.randn_like(old) * std, old, out=old)
         low, high = self.cfg.task.observation.latency
         if high > 0.0:
             age = memory["pose_age"]
             drawn = low + (high - low) * torch.rand_like(age)
-            age.copy_(torch.where(fresh, drawn if self._clock is None else drawn / self._clock, age))
+            torch.where(fresh, drawn if self._clock is None else drawn / self._clock, age, out=age)
         slow, fast = self.cfg.task.target.speed
         if fast > 0.0:
             velocity = memory["goal_vel"]

@@ -9,7 +9,7 @@ from pathlib import Path
 from types import TracebackType
 
 from visthrow.common.storage import atomic_write
-from visthrow.training.protocol import Throws
+from visthrow.task.measurement import Throws
 from visthrow.view import terminal
 
 COLUMNS = (

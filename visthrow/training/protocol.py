@@ -1,13 +1,7 @@
-"""The paper's measurement: throws from hover at targets ahead, scored by where and when the payload lands.
-
-Landing error is the horizontal distance of the landing point from the goal, duration the time from the policy's start to
-the landing (Sec. IV-A). A throw succeeds when the payload was released and landed; one that ends otherwise has no
-landing error and counts against the success rate.
-"""
+"""The paper's measurement in the training simulator: throws from hover, scored as :mod:`visthrow.task.measurement` says."""
 
 import dataclasses
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -16,60 +10,8 @@ from tensordict import TensorDict
 from sim.params import RandomizationParams
 from visthrow import config
 from visthrow.task import Experiment
+from visthrow.task.measurement import Throws
 from visthrow.training.env import ThrowEnv
-
-TARGETS = (1.5, 2.0, 2.5)
-"""Targets along x [m]; the last lies outside the training distribution."""
-
-LANDED = 0.95
-"""Share of throws that must land before their mean error says anything of a policy."""
-
-
-@dataclass(frozen=True)
-class Throws:
-    """Results of N throws at one target; entries of failed throws are NaN.
-
-    Attributes:
-        target: [m] along x.
-        success: shape (N,), bool.
-        landing_w: [m], shape (N, 2). error: [m], shape (N,). duration: [s], shape (N,). clearance: [m], shape (N,).
-        smoothness: root mean square change of the normalised commands from step to step, shape (N,).
-        goal_w: where a moving goal is at impact [m], shape (N, 2); None where goals stand still.
-    """
-
-    target: float
-    success: np.ndarray
-    landing_w: np.ndarray
-    error: np.ndarray
-    duration: np.ndarray
-    clearance: np.ndarray
-    smoothness: np.ndarray
-    goal_w: np.ndarray | None = None
-
-    def within(self, error: float) -> bool:
-        """Whether they land so near on average [m], and all but one in twenty land."""
-        return bool(self.success.mean() >= LANDED) and float(self.error[self.success].mean()) <= error
-
-    def summary(self) -> dict[str, float]:
-        """Mean and deviation of the successful throws, with the success rate."""
-        if not self.success.any():
-            return {"target": self.target, "throws": len(self.success), "success": 0.0}
-        good = self.success
-        goal = np.array([[self.target, 0.0]]) if self.goal_w is None else self.goal_w[good]
-        bias = (self.landing_w[good] - goal).mean(axis=0)
-        return {
-            "target": self.target,
-            "throws": len(good),
-            "success": float(good.mean()),
-            "error_mean": float(self.error[good].mean()),
-            "error_std": float(self.error[good].std()),
-            "duration_mean": float(self.duration[good].mean()),
-            "duration_std": float(self.duration[good].std()),
-            "bias_x": float(bias[0]),
-            "bias_y": float(bias[1]),
-            "clearance_min": float(self.clearance[good].min()),
-            "smoothness": float(self.smoothness[good].mean()),
-        }
 
 
 def hover_start(experiment: Experiment) -> Experiment:

@@ -256,7 +256,7 @@ def _loop(args: Options, trainer, folder: Path, last: int, viewer: Viewer | None
 def _report(args: Options, trainer, folder: Path, wall: float, finished: bool) -> None:
     """Throw at all targets, write the policy with what came of it, and print it."""
     from visthrow.common.storage import write_json
-    from visthrow.training.protocol import TARGETS
+    from visthrow.task.measurement import TARGETS
     from visthrow.training.trainer import finish
 
     rows = [trainer.evaluate(target) for target in TARGETS]

@@ -13,6 +13,7 @@ from visthrow.common.errors import CheckpointError, MismatchError
 from visthrow.common.storage import atomic_write, write_json
 from visthrow.onboard.policy import Policy
 from visthrow.task import Experiment, contract_of
+from visthrow.task.measurement import Throws
 from visthrow.training import protocol
 from visthrow.training.env import ThrowEnv
 from visthrow.training.ranks import Ranks
@@ -139,7 +140,7 @@ class Trainer:
         """Start from a policy that :func:`fitted` found to fit."""
         self.algorithm.take_up(policy)
 
-    def throw(self, target: float, count: int | None = None, seed: int = 12345) -> protocol.Throws:
+    def throw(self, target: float, count: int | None = None, seed: int = 12345) -> Throws:
         """Throws from hover with the current policy, :data:`EVALUATED` if not said; see :mod:`visthrow.training.protocol`."""
         count = count or EVALUATED
         policy = self.algorithm.export(contract_of(self.experiment), {}).to(self.device)

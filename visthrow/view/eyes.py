@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from camera.detectors.contours import BallSeen, Detector, Known, Seen, detected_keypoints
+from camera.detectors.contours import Detector, Seen, detected_keypoints
+from camera.detectors.following import Following
 from camera.detectors.learnt import LearntDetector, Networks
 from camera.fisheye import Fisheye
 from camera.keypoints import KEYPOINTS, KeypointCamera
@@ -24,9 +25,6 @@ HANGING = (0.2, 0.6)
 
 HOLD = 5
 """Frames for which a ball that is not seen reads as if it went on hanging as it did."""
-
-WITHIN = math.radians(12.0)
-"""Of where the ball was a frame ago it is looked for, and so much further with each frame in which it was not seen [rad]."""
 
 SURE = 0.5
 """Share of the looks in a hover in which the ball must be found."""
@@ -75,8 +73,7 @@ class Eyes:
         self.camera = KeypointCamera(params)
         self._hall: Scenes | None = None
         self._looks = 0
-        self._balls: list[tuple[np.ndarray, float]] = []  # last seen: ray in the world frame, and half-angle [rad]
-        self._unseen = np.zeros(count, int)  # frames since then
+        self._balls: list[Following] = []
         self.frames: list[tuple[np.ndarray, torch.Tensor, torch.Tensor]] = []
         self.seen: tuple[np.ndarray, np.ndarray] | None = None
         self.found = {"ball": 0, "goal": 0, "frames": 0, "refused": 0}
@@ -114,30 +111,22 @@ class Eyes:
         self.found["refused"] = int(lost.sum())
         return lost
 
-    def _hanging(self, rot_wb: np.ndarray) -> tuple[np.ndarray, float]:
-        """Ray in the world frame and half-angle of a ball that hangs still below a vehicle: where it is looked for first."""
+    def _hanging(self, rot_wb: np.ndarray) -> Following:
+        """A ball that hangs still below a vehicle: where it is looked for first."""
         down = rot_wb @ (self._mount_b - np.array(self.params.mount.position_b)) - [0.0, 0.0, self._below]
         distance = float(np.linalg.norm(down))
-        return down / distance, math.asin(self.params.payload_radius / distance)
+        return Following(HOLD, down / distance, math.asin(self.params.payload_radius / distance))
 
     def _looked(self, picture: np.ndarray, e: int, pos_w: np.ndarray, rot_wb: np.ndarray, carried: bool) -> Seen:
         """What the detector finds, or of a ball that it misses where it would hang; vehicle e and its measured pose."""
-        rot_cw = self.camera.rot_cb.double().numpy() @ rot_wb.T
+        rot_wc = rot_wb @ self.camera.rot_cb.double().numpy().T
         height = float(pos_w[2] + rot_wb[2] @ np.array(self.params.mount.position_b))
-        ray_w, half_angle = self._balls[e]
-        known = Known(
-            rot_cw[:, 2], height, HANGING if carried else None, rot_cw @ ray_w, WITHIN * (1 + self._unseen[e]), north_c=rot_cw[:, 0]
-        )
-        seen = self.detector.detect(picture, known)
+        seen = self.detector.detect(picture, self._balls[e].known(rot_wc, height, HANGING if carried else None))
         self.found["frames"] += 1
         for name in ("ball", "goal"):
             self.found[name] += getattr(seen, name) is not None
         self._hits[e] += seen.ball is not None
-        if seen.ball is not None:
-            self._balls[e], self._unseen[e] = (rot_cw.T @ seen.ball.ray_c, seen.ball.half_angle), 0
-            return seen
-        self._unseen[e] += 1
-        return replace(seen, ball=BallSeen(rot_cw @ ray_w, half_angle, 0.0)) if self._unseen[e] <= HOLD else seen
+        return self._balls[e].take(seen, rot_wc, self._looks)
 
     def sheet(self, path: Path, columns: int = 3) -> Path:
         """Draw six of the kept frames, spread over the throw, with what was found; returns the path.

@@ -46,7 +46,7 @@ def markdown(rows: Sequence[dict], title: str) -> str:
     """Table of summaries.
 
     Args:
-        rows: :meth:`visthrow.training.protocol.Throws.summary` with ``policy`` and ``layout`` added.
+        rows: :meth:`visthrow.task.measurement.Throws.summary` with ``policy`` and ``layout`` added.
         title: what was measured where.
     """
     return f"{title}\n\n{aligned(COLUMNS, [_cells(row) for row in rows], heads=1)}\n"
@@ -73,7 +73,7 @@ def csv_text(throws: Sequence[tuple[str, str, object]]) -> str:
     """One row a throw.
 
     Args:
-        throws: policy's name, plant's name and :class:`visthrow.training.protocol.Throws`.
+        throws: policy's name, plant's name and :class:`visthrow.task.measurement.Throws`.
     """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")

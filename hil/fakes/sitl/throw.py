@@ -11,6 +11,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from hil.backends import make_backend, mechanism_lag
 from hil.control.loop import AutoOperator, Loop
 from hil.control.runner import Runner
@@ -55,6 +57,7 @@ class FlightClock:
         plant = self._fake.plant
         while self._now < when - SLACK:
             if when < plant.time + plant.period - SLACK:  # within a period nothing comes
+                self._fake.run_on(when)
                 self._now = when
                 return
             self._fake.step()
@@ -120,6 +123,8 @@ def throw(
         RunError: the firmware does not run.
     """
     with opened(program, folder, params, policy, plant, mocap, seed) as (runner, source, clock, fake):
+        # Ticks and motion capture know nothing of each other: the seed says how old the newest pose is at a tick.
+        clock.sleep_until(clock.now() + np.random.default_rng([seed, 1]).uniform(0.0, 1.0 / mocap.rate))
         recorder = Recorder(folder / "run", params)
         summary = _flown(Loop(runner, source, clock, AutoOperator(), recorder), fake)
         recorder.close(summary)

@@ -1,5 +1,6 @@
 """Commands that got lost: what each would have changed, and that they are found and told beside what else there is."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 from sim.replay.lanes import Recording
 from tests.flown import fly, setting_with
 from tests.plants import paper_plant
+from visthrow.diagnose.likelihood.correlation import LOOKED_AT
 from visthrow.diagnose.select import dropped, search
 from visthrow.diagnose.select.point import Problem, linearise, moved
 from visthrow.diagnose.throw.replay import Lane
@@ -24,8 +26,8 @@ def model_of(lost: float, **theta: float) -> ThrowModel:
 
 def test_a_column_is_what_the_missing_command_changes():
     model = model_of(SHARE)
-    model.windows({})
-    columns, (setting, states), flights = model.without_commands({}), model.begun({}), model.flights
+    columns = model.without_commands({}, range(len(model.windows({}))))
+    (setting, states), flights = model.begun({}), model.flights
     w = int(model._retained[len(columns) // 2])
     c = flights.cuts[w]
     f = flights.flights[c.flight]
@@ -47,19 +49,18 @@ def test_a_column_is_what_the_missing_command_changes():
     assert largest > 1e-3  # a turn of that [rad], else nothing is compared
 
 
-def test_a_model_with_lost_commands_says_the_same_both_ways():
-    model = dropped.WithDropped(model_of(SHARE), SHARE)
+def test_a_problem_with_lost_commands_says_the_same_both_ways():
+    model = model_of(SHARE)
     windows = model.windows({})
-    problem = Problem.of(model, windows, tuple(range(len(windows))))
+    problem = replace(Problem.of(model, windows, tuple(range(len(windows)))), lost=SHARE)
     point = linearise(problem, np.zeros(len(model.effects)), windows=windows)
-    again = moved(problem, point, point.theta)
-    for i, (w, own, there) in enumerate(zip(windows, model.model.windows({}), again.windows)):
+    again = moved(problem, point, np.append(1e-9, point.theta[1:]))
+    for w, own, there, columns in zip(point.windows, windows, again.windows, point.commands):
         np.testing.assert_allclose(there.residual, w.residual, atol=1e-9)
-        bare, columns = model.parted(w, i)
-        np.testing.assert_allclose(bare.residual, own.residual, atol=1e-12)
-        assert bare.nuisance.shape == own.nuisance.shape
+        assert w.nuisance.shape[1] == own.nuisance.shape[1] + columns.shape[1]
         assert np.all(w.nuisance_sd[len(own.nuisance_sd) :] == pytest.approx(np.sqrt(SHARE * (1.0 - SHARE))))
         np.testing.assert_allclose(own.residual - w.residual, SHARE * columns.sum(1), atol=1e-12)
+    assert all(w.nuisance.shape == windows[i].nuisance.shape for i, w in point.about.windows.items())
 
 
 def told(diagnosis):
@@ -75,10 +76,15 @@ def test_lost_commands_are_found_beside_a_cause():
     assert found.nats > 50.0
 
 
-def test_commands_that_all_come_late_are_not_lost():
-    diagnosis = search.explain(model_of(0.0, cmd_delay=0.015))
+def test_commands_that_all_come_late_are_not_lost_and_few_windows_say_so(monkeypatch):
+    model, asked = model_of(0.0, cmd_delay=0.015), []
+    plain = model.without_commands
+    monkeypatch.setattr(model, "without_commands", lambda theta, windows: asked.append(len(windows)) or plain(theta, windows))
+    diagnosis = search.explain(model)
     assert not told(diagnosis)
     assert diagnosis.named == ("cmd_delay",)
+    assert len(asked) <= 2
+    assert max(asked) <= LOOKED_AT < diagnosis.windows
 
 
 def test_another_model_without_commands_is_not_asked():

@@ -1,12 +1,19 @@
 """Axes, signs and units of commands that a log has otherwise than the simulation: each hidden, named, put right."""
 
+import json
+from dataclasses import asdict
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from sim.params import GRAVITY
+from tests.flown import fly, setting_with
 from tests.plants import paper_plant
-from visthrow.diagnose.throw.interface import put_right
+from visthrow.diagnose.select.search import put_right
+from visthrow.diagnose.throw import interface
+from visthrow.diagnose.throw.interface import suspected
+from visthrow.diagnose.throw.throw_model import ThrowModel
 from visthrow.logs.flightlog import Channel, FlightLog
 
 PLANT = paper_plant()
@@ -49,26 +56,46 @@ def changed(log, change):
 
 
 @pytest.mark.parametrize("name", WRONG)
-def test_each_mistake_is_named_and_put_right(name):
-    logs, found = put_right([changed(log, WRONG[name]) for log in LOGS], PLANT)
+def test_each_mistake_is_suspected_and_put_right(name):
+    logs = [changed(log, WRONG[name]) for log in LOGS]
+    found = suspected(logs, PLANT)
     assert [m.name for m in found] == [name.split(" ")[0]]
     assert found[0].logs == 3
-    assert found[0].nats > 3.0
-    for mended, log in zip(logs, LOGS):
-        np.testing.assert_allclose(mended["command"].values, log["command"].values, rtol=1e-4, atol=1e-9)
+    for log, meant in zip(logs, LOGS):
+        np.testing.assert_allclose(found[0].mended(log)["command"].values, meant["command"].values, rtol=1e-4, atol=1e-9)
 
 
 def test_two_mistakes_at_once():
     wrong = [changed(log, lambda u: u[:, [0, 1, 3, 2]] * [101.97, -57.29578, 57.29578, 57.29578]) for log in LOGS]
-    _, found = put_right(wrong, PLANT)
-    assert [m.name for m in found] == ["rate_axes", "rate_unit", "thrust_unit"]
+    assert [m.name for m in suspected(wrong, PLANT)] == ["rate_axes", "rate_unit", "thrust_unit"]
 
 
-def test_good_logs_and_logs_that_disagree_stay_as_they_are():
-    assert put_right(LOGS, PLANT) == (LOGS, ())
+def test_good_logs_and_logs_that_disagree_are_not_suspected():
+    assert suspected(LOGS, PLANT) == []
     mixed = [changed(LOGS[0], WRONG["rate_axes"]), *LOGS[1:]]
-    assert put_right(mixed, PLANT)[1] == ()
+    assert suspected(mixed, PLANT) == []
     strangers = [changed(log, lambda u, other=other: other["command"].values) for log, other in zip(LOGS, [*LOGS[1:], LOGS[0]])]
-    assert put_right(strangers, PLANT)[1] == ()
+    assert suspected(strangers, PLANT) == []
     heavier = [changed(log, lambda u: u * [1.6, 1.0, 1.0, 1.0]) for log in LOGS]
-    assert put_right(heavier, PLANT)[1] == ()
+    assert suspected(heavier, PLANT) == []
+
+
+def simulated(logs, mistakes):
+    return ThrowModel(logs, PLANT, only=["com_x"], mistakes=mistakes)
+
+
+@pytest.mark.parametrize(("change", "names"), [("rate_axes", ["rate_axes", "rate_unit"]), ("", [])])
+def test_the_simulation_decides_what_is_put_right(monkeypatch, change, names):
+    """A mistake that is there stays put right; one that is suspected without reason is dropped again."""
+    flights = fly(setting_with({}), free=2, throws=0, seconds=4.0, seed=3)
+    both = (lambda u: WRONG["rate_unit"](WRONG[change](u))) if change else (lambda u: u)
+    wrong = [changed(log, both) for log in flights]
+    if not change:  # as a relation by chance would have it
+        turned = interface._rows(np.diag([1.0, 1.0, 1.0, -1.0]))
+        monkeypatch.setattr(interface, "suspected", lambda *_: [interface.Mistake("rate_sign", "c", "e", 0.0, 2, 48, turned)])
+    model, logs = put_right(wrong, PLANT, simulated)
+    assert [m.name for m in model.mistakes] == names
+    assert all(m.nats > 100.0 for m in model.mistakes)
+    assert len(json.dumps([asdict(m) for m in model.mistakes])) >= 2
+    for log, meant in zip(logs, flights):
+        np.testing.assert_allclose(log["command"].values, meant["command"].values, rtol=1e-4, atol=1e-9)

@@ -16,7 +16,7 @@ from visthrow.diagnose.check.run import check, contradictions
 from visthrow.diagnose.inputs import setup
 from visthrow.diagnose.inputs.map_cli import toml_of
 from visthrow.diagnose.inputs.proposal import propose
-from visthrow.diagnose.throw.interface import put_right
+from visthrow.diagnose.throw.interface import commanded
 from visthrow.diagnose.throw.recorded import record_of
 from visthrow.logs import read, table_of
 from visthrow.logs.flightlog import Channel, FlightLog
@@ -156,7 +156,7 @@ def test_a_throttle_becomes_a_command_in_newtons(tmp_path):
     })  # fmt: skip
     (log,) = read(tmp_path / "a.ulg")
     assert "command" not in log
-    (made,), (mistake,) = put_right([log], plant)
+    (made,), (mistake,) = commanded([log], plant)
     assert mistake.name == "throttle"
     assert "throttle / 0.37" in mistake.equation
     command = made["command"]

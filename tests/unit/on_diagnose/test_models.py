@@ -8,6 +8,7 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from tests.diagnose import beside_aeroid
+from tests.diagnose.flown import LATE, G, attitude, ball_log, fly
 from visthrow import cli, config
 from visthrow.common.errors import ConfigError, DiagnoseError, LogError
 from visthrow.diagnose.inputs import fit as fitting
@@ -24,33 +25,12 @@ from visthrow.diagnose.select import search
 from visthrow.logs.export import export
 from visthrow.logs.flightlog import Channel, FlightLog
 
-G = 9.81
-TIGHT = {"rtol": 1e-10, "atol": 1e-12}
-
 BALL = BallParams(G, 0.0, 0.02, 0.3, 1)
 SWING = PendulumParams(G, 0.2, 0.0, 0.0, 0.0, 0.0, 2.0, 0.01, 2)
 STAND = StandParams(1.5e-6, 2e-8, 0.0, 0.1, 11.0, 0.02, 0.01, 0.05, 0.02, 100.0)
 FLYER = FlyerParams(
     "motor_command", "pos_w", "quat_wb", 0.03, G, (0.0, 0.06, 0.1), 0.03, 0.0, 3.8, 0.0, 0.0, 0.0, -10.0, 1.0, 0.02, 1, 40
 )
-
-
-def ball_log(drag=0.0, wind=(0.0, 0.0), spin=(0.0, 0.0, 0.0), noise=1e-4, seed=0, heading=0.0) -> FlightLog:
-    """A throw, held before and after: scipy's integrator."""
-    rng = np.random.default_rng(seed)
-    speed = rng.uniform(2.5, 4.0)
-    start = np.array([0, 0, 1.5, speed * np.cos(heading), speed * np.sin(heading), 2.5])
-
-    def slope(_, state):
-        air = state[3:] - [*wind, 0.0]
-        return [*state[3:], *(-drag * np.linalg.norm(air) * air + np.cross(spin, air) + [0, 0, -G])]
-
-    time = np.arange(0.0, 0.8, 1 / 240)
-    path = solve_ivp(slope, (0, 0.8), start, t_eval=time, **TIGHT).y[:3].T
-    rest = np.arange(1, 60) / 240
-    time = np.concatenate([time, 0.8 + rest])
-    path = np.concatenate([path, np.tile(path[-1], (len(rest), 1))])
-    return FlightLog({"payload_pos_w": Channel(time, path + rng.normal(0, noise, path.shape), "m", "world")})
 
 
 def swing_log(length=0.2, viscous=0.0, coulomb=0.0, quadratic=0.0, offset=0.0, noise=2e-4, seconds=12.0) -> FlightLog:
@@ -180,64 +160,6 @@ class TestStand:
         assert np.max(np.abs(residual[:12]) / model.stretches[0].sigma[:12]) < 3.0
 
 
-LATE = -0.005
-"""The test's motors follow a smooth command; its samples, held, come half a sample late [s]."""
-
-
-def attitude(time: np.ndarray) -> Rotation:
-    angles = np.column_stack([0.6 * np.sin(0.5 * time), 0.35 * np.sin(2.3 * time + 1), 0.35 * np.sin(1.7 * time)])
-    return Rotation.from_euler("ZYX", angles)
-
-
-def fly(seconds=6.0, gain=1.0, drag=0.0, cable=None, payload_drag=0.0, volts_slope=0.0, noise=2e-4, seed=0, *, wind=0.0, late=0.0,
-        fade=0.0) -> FlightLog:  # fmt: skip
-    """A vehicle with an attitude of closed form and motors that hold it up; equations and integrator of the test's own."""
-    rng = np.random.default_rng(seed)
-    mass, payload, step = 0.03, 0.008, 0.005
-    load = mass + (payload if cable else 0.0)
-    phases = rng.uniform(0, 6, 2)
-    half = np.arange(0.0, seconds + step, 0.5 * step)
-    rot = attitude(half).as_matrix()
-    told = load * G / rot[:, 2, 2] * (1.0 + 0.15 * np.sin(3.1 * half + phases[0]) + 0.1 * np.sin(1.3 * half + phases[1]))
-    volts = 4.1 - 0.05 * half
-    level = gain * (1.0 + volts_slope * (volts - 3.8)) * (1.0 + fade * half)
-
-    def slope(i, state):
-        p, v, thrust = state[:3], state[3:6], state[6]
-        body = rot[i].T @ (v - [wind, 0.0, 0.0])
-        force = rot[i] @ np.array([-drag * body[0], -drag * body[1], thrust * level[i]]) - [0, 0, mass * G]
-        lag = [(told[i] - thrust) / 0.03]
-        if cable is None:
-            return np.concatenate([v, force / mass, lag])
-        vp = state[10:13]
-        along = (state[7:10] - p) / np.sqrt(np.sum((state[7:10] - p) ** 2))
-        weight = -payload_drag * np.sqrt(vp @ vp) * vp - [0, 0, payload * G]
-        pull = (along @ (weight / payload - force / mass) + (vp - v) @ (vp - v) / cable) / (1 / mass + 1 / payload)
-        return np.concatenate([v, (force + pull * along) / mass, lag, vp, (weight - pull * along) / payload])
-
-    state = np.array([0, 0, 5.0, 0, 0, 0, told[0]] + ([0.1 * cable, 0, 5.0 - cable * np.sqrt(0.99), 0, 0, 0] if cable else []))
-    path = [state]
-    for i in range(0, len(half) - 2, 2):
-        k1 = slope(i, state)
-        k2 = slope(i + 1, state + 0.5 * step * k1)
-        k3 = slope(i + 1, state + 0.5 * step * k2)
-        state = state + step / 6 * (k1 + 2 * k2 + 2 * k3 + slope(i + 2, state + step * k3))
-        path.append(state)
-    path, time = np.array(path)[::2], half[::4][: len(path[::2])]
-    thrust = told[::4][: len(time)] / 4.0
-    command = (-0.06 + np.sqrt(0.06**2 + 0.4 * thrust)) / 0.2
-
-    def seen(columns):
-        return Channel(time, columns + rng.normal(0, noise, (len(time), 3)), "m", "world")
-
-    channels = {
-        "pos_w": seen(path[:, :3]), "quat_wb": Channel(time, attitude(time - late).as_quat(), "1", "world"),
-        "motor_command": Channel(time, np.tile(command[:, None], 4), "1"),
-        "battery_voltage": Channel(time, 4.1 - 0.05 * time, "V"),
-    }  # fmt: skip
-    return FlightLog(channels | ({"payload_pos_w": seen(path[:, 7:10])} if cable else {}))
-
-
 class TestFlyer:
     def test_the_truth_leaves_noise(self):
         model = FlyerModel([fly(6.0, drag=0.02)], FLYER)
@@ -263,6 +185,36 @@ class TestFlyer:
         estimates = found(FlyerModel([dark], params), ["wind_x", "wind_y", "attitude_delay", "thrust_fade", "cmd_delay", "thrust_gain"])
         truth = {"wind_x": 1.5, "wind_y": 0.0, "attitude_delay": 0.02, "thrust_fade": -0.004, "cmd_delay": LATE}
         assert all(near(estimates, name, size) for name, size in truth.items()), estimates
+
+    def test_an_estimate_that_takes_drag_for_tilt(self):
+        """The log's attitude leans by a filter of the test's own: a' = rate (F_xy / F_z - a), and by a gyro's offset over the rate."""
+        log, rate, offset = fly(8.0, drag=0.03), 1.5, np.array([0.012, -0.009, 0.0])
+        time = log["pos_w"].time
+        true, speed = attitude(time), np.gradient(log["pos_w"].values, time, axis=0)
+        acc_w = np.gradient(speed, time, axis=0)
+        force = true.inv().apply(np.convolve(acc_w[:, 2], np.ones(9) / 9, "same")[:, None] * [0, 0, 1] + [0, 0, G])
+        force[:, :2] = -0.03 / 0.03 * true.inv().apply(speed)[:, :2]  # drag over mass
+        lean = np.zeros((len(time), 2))
+        for i in range(1, len(time)):
+            share = force[i, :2] / force[i, 2]
+            lean[i] = lean[i - 1] + (time[i] - time[i - 1]) * rate * (share - lean[i - 1])
+        lean = lean + [offset[1] / rate, -offset[0] / rate]
+        turn = np.column_stack([-lean[:, 1], lean[:, 0], 0.0 * time])  # the estimate's axis stands where the force points
+        leaning = true * Rotation.from_rotvec(turn)
+        step = leaning[:-1].inv() * leaning[1:]
+        gyro = step.as_rotvec() / np.diff(time)[:, None] + offset  # in the mean of the flight the lean does not change
+        channels = {
+            "quat_wb": Channel(time, leaning.as_quat(), "1", "world"), "acc_b": Channel(time, force, "m/s^2", "body"),
+            "rate_b": Channel(time[1:], gyro, "rad/s", "body"),
+        }  # fmt: skip
+        params = FlyerParams(**{**vars(FLYER), "estimator_rate": rate})
+        model = FlyerModel([FlightLog({**log.channels, **channels})], params)
+        names = ["estimator_lean", "rotor_drag_xy", "cmd_delay", "thrust_gain", "marker_rot_x", "marker_rot_y"]
+        estimates = found(model, names)
+        assert estimates["estimator_lean"][0] == pytest.approx(1.0, abs=0.1), estimates
+        assert estimates["rotor_drag_xy"][0] == pytest.approx(0.03, rel=0.1), estimates
+        alone = found(model, names[1:])
+        assert alone["rotor_drag_xy"][0] < 0.025, alone  # without it the drag is taken for less
 
     @pytest.mark.slow
     def test_cable_length_and_payload(self):

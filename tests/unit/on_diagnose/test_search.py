@@ -8,10 +8,10 @@ import pytest
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
 from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.likelihood import evidence
-from visthrow.diagnose.likelihood.evidence import Priors
+from visthrow.diagnose.likelihood.evidence import INEXACT, Priors
 from visthrow.diagnose.likelihood.marginal import Statistics
 from visthrow.diagnose.select import held_out, result, search, selector
-from visthrow.diagnose.select.scatter import SHARE, Varies, disagreement
+from visthrow.diagnose.select.scatter import Varies, disagreement
 
 EFFECTS = catalogue(12)
 
@@ -201,7 +201,7 @@ def test_signs_that_change_from_flight_to_flight_are_told_as_what_varies():
 def test_flights_disagree_by_more_than_form_and_noise():
     priors = replace(_priors(1), slab=np.full(1, 20.0))
 
-    def verdict(sizes, share=SHARE):
+    def verdict(sizes, share=INEXACT):
         own = np.full((8, 1, 1), 4.0)  # information: half a floor's deviation each
         none = np.zeros(8)
         statistics = Statistics(np.arange(8), own, 4.0 * np.array(sizes)[:, None], none, none, np.zeros(1))
@@ -392,7 +392,7 @@ def test_what_gusts_held_goes_over_to_the_sizes(monkeypatch):
 
     Where one flight alone can tell, none that was held out can confirm it: that is not asked here.
     """
-    monkeypatch.setattr(held_out, "judged", lambda diagnosis, seed: diagnosis)
+    monkeypatch.setattr(held_out, "judged", lambda diagnosis: diagnosis)
     model = SyntheticModel(effects=EFFECTS, throws=1, free=2, law="speed", law_size=0.0, seed=4)
     model.effects = (EFFECTS[0], replace(EFFECTS[1], floor=1e-3, prior_sd=4e-3), *EFFECTS[2:])
     model.law_size = 1.0

@@ -68,7 +68,7 @@ def test_what_is_held_back_and_when_it_is_given_up():
 
 @pytest.mark.parametrize("wrong", [{"bound": 0.0, "patience": 0.4}, {"bound": 0.5, "patience": -1.0}])
 def test_numbers_that_hold_nothing_back(wrong):
-    with pytest.raises(ConfigError, match="expected both above 0"):
+    with pytest.raises(ConfigError, match="expected above 0"):
         AimParams(**wrong)
 
 

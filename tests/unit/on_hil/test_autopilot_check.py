@@ -4,15 +4,20 @@ import json
 
 import pytest
 
-from hil.backends import DryRun
-from hil.backends.check import autopilot_record, hover_of_run
+from hil.backends import Crazyflie, DryRun
+from hil.backends.check import AutopilotCheck, autopilot_record, hover_of_run
+from hil.backends.thrust import LEAST_SHARES
 from hil.control.decision import OperatorInput
 from hil.control.loop import fly
+from hil.control.runner import Runner
 from hil.errors import RunError
+from hil.params import HilParams
 from hil.recording.record import CONFIG, TICKS, Recorder
 from tests.hil_flight import simple_policy
 from tests.level import LevelPlant
-from tests.loopback.wire import peers
+from tests.loopback.wire import peers, pipe
+from visthrow import config
+from visthrow.onboard.policy import Policy, find_policy
 
 QUICK = ("states.check_hold=0.2",)
 NEVER = simple_policy((-0.1269, 0.0, 0.0, 0.0, -1.0))
@@ -78,3 +83,12 @@ def test_the_summary_keeps_what_the_autopilot_said(run):
     assert kept["release"] == {"state": "idle", "note": "", "sends": 0}
     assert kept["clocks"]["peers"]["1 at 127.0.0.1:1"]["steps"] == 0
     assert autopilot_record(DryRun(), None) == {"backend": "dry-run"}
+
+
+def test_an_autopilot_without_settings_to_audit_is_listened_to(capsys):
+    params = config.load(HilParams, config.find("hil", "fake_crazyflie"))
+    check = AutopilotCheck(params, Crazyflie(pipe()[0], params.crazyflie))
+    runner = Runner(params, Policy.load(find_policy("state")), DryRun())
+    check.tick(0.0, runner)
+    assert check.results(0.0, runner.mass) == [(True, f"hover share not measured: 0 of {LEAST_SHARES} values in steady hover")]
+    assert capsys.readouterr().out == "", "there is no table to show"

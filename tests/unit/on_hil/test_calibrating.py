@@ -16,8 +16,8 @@ from hil.control.calibrating import Calibrating, CalibrationParams, solved
 from hil.control.decision import OperatorInput
 from hil.control.runner import Runner
 from hil.params import HilParams
+from hil.poses.detection import Detection
 from hil.poses.pose import Pose
-from hil.poses.sight import Sight
 from visthrow import config
 from visthrow.common.errors import ConfigError
 from visthrow.onboard.calibration import Calibration, Hovered, Spreads
@@ -55,7 +55,7 @@ class Hall:
         runner.backend.release = self.release
         self.worst_off = 0.0
 
-    def sight(self, now: float) -> Sight:
+    def detection(self, now: float) -> Detection:
         """What the camera saw when it did."""
         _, state = min(self.path, key=lambda row: abs(row[0] - (now - self.late)))
         rot = rotation_from_quat(torch.tensor(state["quat_wb"][None]).double())[0].numpy()
@@ -68,7 +68,7 @@ class Hall:
         lens, radius = self.camera.fisheye, self.runner.params.camera.payload_radius
         seen = (1.0 + SCALE) * lens.project_normalized(torch.from_numpy(unit))[0]
         unit = lens.unproject(lens.denormalize(seen))[0].numpy()  # a detector knows the nominal lens
-        return Sight(now - DELAY, tuple(map(tuple, unit[:4].tolist())), (*unit[4].tolist(), math.asin(radius / far[4])))
+        return Detection(now - DELAY, tuple(map(tuple, unit[:4].tolist())), (*unit[4].tolist(), math.asin(radius / far[4])))
 
     def release(self, when: float) -> None:
         """The back-end's: the mechanism opens."""
@@ -89,7 +89,7 @@ class Hall:
                         Pose(now - 0.01, now, "payload", tuple((old["payload_pos_w"] + noise[1]).tolist()), (0.0, 0.0, 0.0, 1.0)),
                     ]
             if now > self.late + 0.02:
-                self.runner.look([self.sight(now)])
+                self.runner.look([self.detection(now)])
             if (due := self.runner.calibrating.due()) is not None:
                 p = self.runner.params
                 self.runner.calibrated(solved(due, p.camera, self.runner.pilot.policy.contract, p.calibration.spreads))
@@ -103,7 +103,7 @@ class Hall:
         _, state = min(self.path, key=lambda row: abs(row[0] - (self.plant.time - 0.01)))
         tensors = [torch.tensor(state[name][None]).double() for name in ("pos_w", "quat_wb", "payload_pos_w")]
         true, _ = keypoints(self.camera, tensors[0], rotation_from_quat(tensors[1]), self.goal, tensors[2])
-        shown, valid = self.runner.sights.keypoints(self.plant.time)
+        shown, valid = self.runner.detections.keypoints(self.plant.time)
         assert valid.all()
         return float(np.sqrt(np.square(shown - true.numpy()).mean()))
 
@@ -178,7 +178,7 @@ def test_what_is_not_sure_is_refused_and_a_failure_is_tried_again():
     calibrating.take(fine)
     assert calibrating.problems() == []
     assert "yaw unknown" in str(replace(fine, turn_sigma=(1e-3, 1e-3, 0.2)))
-    with pytest.raises(ConfigError, match="expected numbers above 0"):
+    with pytest.raises(ConfigError, match="expected above 0"):
         CalibrationParams(rate=0.0)
     with pytest.raises(ConfigError, match="expected keypoints"):
         config.load(HilParams, config.find("hil", "dry_run"), ["calibration.rate=1.0"])

@@ -9,6 +9,7 @@ from hil.params import HilParams
 from tests.hil_flight import simple_policy
 from tests.level import LevelPlant
 from visthrow import config
+from visthrow.common.errors import ConfigError
 from visthrow.onboard.actions import hover_action
 
 HOVER = hover_action(9.81 * 0.272, 14.0)[0]
@@ -91,5 +92,5 @@ def test_motion_capture_of_a_seed():
     assert np.sqrt(np.mean(angles**2)) == pytest.approx(np.sqrt(3) * np.radians(0.2), rel=0.1)
     assert all(p.arrival == pytest.approx(p.stamp + 0.01) for p in out)
     for wrong in ({"rate": 0.0}, {"loss": 1.0}, {"latency": -0.1}):
-        with pytest.raises(ValueError, match="expected numbers of 0 or more"):
+        with pytest.raises(ConfigError, match=f"{next(iter(wrong))} is"):
             MocapParams(**wrong)

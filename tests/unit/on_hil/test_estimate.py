@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hil.poses.estimate import EstimateParams, SlopeFilter, slope_weights
+from hil.poses.estimate import EstimateParams, SlopeFilter, fit_weights
 from hil.poses.frames import FrameParams
 from hil.poses.gate import GateParams
 from hil.poses.pose import Pose
 from hil.poses.track import TRUST, Track
+from visthrow.common.errors import ConfigError
 
 PERIOD = 0.01
 ROUNDING = 1e-9
@@ -51,7 +52,7 @@ def test_a_parabola_is_not_late_on_uneven_stamps_either(window):
 def test_noise_is_what_the_weights_say():
     """A line over n even samples: sigma sqrt(12 / (n (n^2 - 1))) / T."""
     n = 5
-    weights = slope_weights([i * PERIOD for i in range(n)], 1)
+    weights = fit_weights([i * PERIOD for i in range(n)], 1)[0]
     assert np.sqrt(np.sum(np.square(weights))) == pytest.approx(np.sqrt(12 / (n * (n * n - 1))) / PERIOD)
 
 
@@ -90,7 +91,7 @@ def test_the_window_is_one_of_time():
 
 def test_wrong_parameters():
     for seconds, order in ((0.0, 1), (0.2, 2), (0.05, 3), (float("nan"), 1)):
-        with pytest.raises(ValueError, match="expected 1 or 2"):
+        with pytest.raises(ConfigError, match=r"window is|order is 3; expected 1 to 2"):
             EstimateParams(seconds, order)
 
 

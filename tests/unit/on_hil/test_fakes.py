@@ -113,9 +113,9 @@ def test_options_of_a_fake():
     assert (options.silent_after, options.parameters, options.answer) == (12.0, {"GUID_OPTIONS": 0.0}, "silent")
     with pytest.raises(ConfigError, match="did you mean 'silent_after'"):
         read_options(["silent_aftr=12"])
-    with pytest.raises(ConfigError, match="expected an answer of accepted, in-progress"):
+    with pytest.raises(ConfigError, match="expected one of 'accepted', 'in-progress'"):
         read_options(["answer=maybe"])
-    with pytest.raises(ConfigError, match="times of 0 s or more"):
+    with pytest.raises(ConfigError, match=r"servo_delay is -0.1; expected 0 or more"):
         read_options(["servo_delay=-0.1"])
     with pytest.raises(RunError, match="did you mean 'px4'"):
         make_fake("px5", LevelPlant(), None)

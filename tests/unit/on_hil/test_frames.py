@@ -7,8 +7,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hil.errors import FrameError
+from hil.params import HilParams
 from hil.poses.frames import FrameParams, Frames, rotation_of
 from hil.poses.pose import Pose
+from visthrow import config
+from visthrow.common.errors import ConfigError
 from visthrow.logs.axes import TURNS
 
 AXES = TURNS
@@ -118,7 +121,6 @@ def test_marker_offset_follows_the_attitude():
 
 
 def test_wrong_order_and_numbers_are_refused():
-    with pytest.raises(FrameError, match="expected 'xyzw' or 'wxyz'"):
-        frames(quaternion="zyxw")
-    with pytest.raises(FrameError, match="expected finite numbers"):
-        frames(yaw=float("nan"))
+    for wrong, message in (('quaternion="zyxw"', "one of 'xyzw', 'wxyz'"), ("yaw_offset_deg=nan", "nan"), ('axes="x,y"', "signed")):
+        with pytest.raises(ConfigError, match=message):
+            config.load(HilParams, config.find("hil", "dry_run"), [f"frames.vehicle.{wrong}"])

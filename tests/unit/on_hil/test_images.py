@@ -10,13 +10,15 @@ import numpy as np
 import pytest
 import torch
 
+from camera.detectors.contours import Seen
+from camera.detectors.following import WITHIN
 from camera.fisheye import Fisheye
 from camera.keypoints import KeypointCamera, keypoints
 from camera.mount import rotation_from_vector
 from camera.params import FisheyeParams
 from hil.errors import SourceError
 from hil.params import HilParams
-from hil.poses.sight import Sight, Sights
+from hil.poses.detection import Detection, Detections
 from hil.recording.record import lines
 from hil.sources.images import STAMPS, Hint, ImageParams, LiveImages, Looker, RecordedImages
 from tests.drawn import render_scene
@@ -107,28 +109,43 @@ def test_pictures_of_another_lens_give_the_keypoints_of_training(folder):
         pos, vector, _ = pose(i)
         quat = quaternion(vector)
         source.tell(Hint(tuple(pos.tolist()), quat, (0.2, 0.6)))
-        (sight,) = source.poll(PERIOD * i + 1e-9)
-        assert sight.stamp == pytest.approx(PERIOD * i)
-        again = Sight.of(json.loads(json.dumps(sight.values())))
-        assert again == sight
-        sights = Sights(camera, 0.1)
-        sights.take(sight, quat)
-        points, valid = sights.keypoints(sight.stamp)
+        (detection,) = source.poll(PERIOD * i + 1e-9)
+        assert detection.stamp == pytest.approx(PERIOD * i)
+        again = Detection.of(json.loads(json.dumps(detection.values())))
+        assert again == detection
+        detections = Detections(camera, 0.1)
+        detections.take(detection, quat)
+        points, valid = detections.keypoints(detection.stamp)
         assert valid.all()
         assert np.abs(points[0] - true_keypoints(i)).max() < WORST
     assert source.poll(99.0) == []
+
+
+def told(looker, picture, stamp, hint, blind=False):
+    """A detection, and what the detector was told for it; a blind one sees nothing."""
+    kept, detect = [], looker.detector.detect
+
+    def listen(image, known):
+        kept.append(known)
+        return Seen(None, None) if blind else detect(image, known)
+
+    looker.detector.detect = listen
+    detection = looker.look(picture, stamp, hint)
+    looker.detector.detect = detect
+    return detection, kept[0]
 
 
 def test_a_turn_of_the_vehicle_does_not_lose_the_ball(folder, pictures):
     """Where the ball was is kept in the world: after a turn of 40 deg it is looked for elsewhere in the picture."""
     pos, vector, ball = pose(0)
     looker = Looker(params(folder), training())
-    assert looker.known(None).ball_ray_c is None
+    assert told(looker, pictures[0], 0.0, None)[1].ball_ray_c is None
     hint = Hint(tuple(pos.tolist()), quaternion(vector), (0.2, 0.6))
-    assert looker.known(hint).ball_ray_c is None
-    assert looker.look(pictures[0], 0.0, hint).ball is not None
+    detection, known = told(looker, pictures[0], 0.0, hint)
+    assert known.ball_ray_c is None
+    assert detection.ball is not None
     turned = torch.tensor([[0.0, 0.7, 0.0]], dtype=torch.float64)
-    known = looker.known(Hint(tuple(pos.tolist()), quaternion(turned), None))
+    missed, known = told(looker, pictures[0], 0.05, Hint(tuple(pos.tolist()), quaternion(turned), None), blind=True)
     camera = KeypointCamera(training(), dtype=torch.float64)
     rot = rotation_from_vector(turned)[0]
     eye = torch.tensor(pos) + rot @ camera.position_b
@@ -137,37 +154,64 @@ def test_a_turn_of_the_vehicle_does_not_lose_the_ball(folder, pictures):
     assert math.acos(cosine) < known.within, "but for the lens's own way of 2 cm"
     np.testing.assert_allclose(known.up_c, (camera.rot_cb @ rot.T)[:, 2].numpy(), atol=1e-6)
     assert known.height == pytest.approx(float(eye[2]), abs=1e-6)
+    np.testing.assert_allclose(missed.ball[:3], known.ball_ray_c, atol=1e-9, err_msg="missed, it reads where it would hang")
+
+
+def test_a_ball_that_is_missed_is_looked_for_ever_wider_and_reads_as_it_hung_for_a_while(folder, pictures):
+    looker = Looker(params(folder), training())
+    pos, vector, _ = pose(0)
+    hint = Hint(tuple(pos.tolist()), quaternion(vector), (0.2, 0.6))
+    first, _ = told(looker, pictures[0], 0.0, hint)
+    for n, stamp in enumerate((0.04, 0.08, 0.12), start=1):
+        detection, known = told(looker, pictures[0], stamp, hint, blind=True)
+        assert known.within == pytest.approx(n * WITHIN)
+        assert detection.corners is None, "a goal that is missed is not held"
+        assert (detection.ball is not None) == (stamp <= 0.1)
+        if detection.ball is not None:
+            np.testing.assert_allclose(detection.ball, first.ball, atol=1e-9)
+    assert told(looker, pictures[0], 0.16, hint)[0].ball == pytest.approx(first.ball), "and it is found again"
 
 
 def test_only_the_newest_of_several_pictures_is_looked_at(folder):
     source = RecordedImages(params(folder, delay=0.03), training())
     assert source.poll(0.02) == [], "it takes its time to arrive"
-    (sight,) = source.poll(PERIOD * 2 + 0.031)
-    assert sight.stamp == pytest.approx(PERIOD * 2)
+    (detection,) = source.poll(PERIOD * 2 + 0.031)
+    assert detection.stamp == pytest.approx(PERIOD * 2)
+
+
+SQUARE = tuple(tuple((np.array([x, y, 1.0]) / math.sqrt(x * x + y * y + 1.0)).tolist()) for x, y in
+               ((0.1, 0.1), (0.2, 0.1), (0.2, 0.2), (0.1, 0.2)))  # fmt: skip
+"""Rays to the corners of a goal below the vehicle."""
 
 
 @pytest.mark.parametrize("reads", ["edge", "zero"])
 def test_what_is_not_seen_any_more(reads):
     lens = training()
     camera = KeypointCamera(dataclasses.replace(lens, noise=dataclasses.replace(lens.noise, invalid_reads=reads)))
-    sights, level = Sights(camera, 0.1), (0.0, 0.0, 0.0, 1.0)
-    points, valid = sights.keypoints(0.0)
+    detections, level = Detections(camera, 0.1), (0.0, 0.0, 0.0, 1.0)
+    points, valid = detections.keypoints(0.0)
     assert not valid.any()
     assert not points.any()
-    below = Sight(1.0, None, (0.0, 0.1, math.sqrt(0.99), 0.08))
-    sights.take(below, level)
-    assert sights.keypoints(1.09)[1].tolist() == [[False] * 4 + [True] * 4]
-    points, valid = sights.keypoints(1.11)
+    below = Detection(1.0, None, (0.0, 0.1, math.sqrt(0.99), 0.08))
+    detections.take(below, level)
+    assert detections.keypoints(1.09)[1].tolist() == [[False] * 4 + [True] * 4]
+    points, valid = detections.keypoints(1.11)
     assert not valid.any()
     assert not points.any(), "gone from the middle: dropped out"
-    ahead = Sight(2.0, None, (0.0, -math.sin(1.75), math.cos(1.75), 0.08))
-    sights.take(ahead, level)
-    points, valid = sights.keypoints(2.2)
+    ahead = Detection(2.0, None, (0.0, -math.sin(1.75), math.cos(1.75), 0.08))
+    detections.take(ahead, level)
+    points, valid = detections.keypoints(2.2)
     assert not valid.any()
     np.testing.assert_allclose(np.linalg.norm(points[0, 4:], axis=-1), 1.0 if reads == "edge" else 0.0, atol=1e-6)
     assert bool((points[0, 4:, 1] < -0.9).all()) == (reads == "edge"), "gone over the upper edge, it reads there by the rule of edges alone"
-    sights.take(Sight(1.5, None, below.ball), level)
-    again, _ = sights.keypoints(2.2)
+    detections.take(Detection(3.0, SQUARE, below.ball), level)
+    assert detections.keypoints(3.01)[1].all()
+    detections.take(Detection(3.02, None, below.ball), level)
+    points, valid = detections.keypoints(3.03)
+    assert valid.tolist() == [[False] * 4 + [True] * 4], "a goal that a frame lacks has dropped out with it"
+    assert not points[0, :4].any()
+    detections.take(Detection(1.5, None, ahead.ball), level)
+    again, _ = detections.keypoints(3.03)
     np.testing.assert_array_equal(again, points, "an older frame changes nothing")
 
 
@@ -191,9 +235,9 @@ def test_a_live_camera_is_read_in_a_thread_of_its_own(pictures):
     deadline = time.monotonic() + 60.0
     while eyes.failure is None and time.monotonic() < deadline:
         time.sleep(0.01)
-    (sight,) = eyes.poll(0.0)
-    assert sight.stamp == pytest.approx(6.98)
-    assert sight.ball is not None
+    (detection,) = eyes.poll(0.0)
+    assert detection.stamp == pytest.approx(6.98)
+    assert detection.ball is not None
     assert eyes.poll(0.0) == []
     assert "gave no picture" in eyes.failure
     eyes.close()
@@ -274,9 +318,9 @@ def test_a_video_with_stamps_beside_it(folder, pictures, tmp_path):
         writer.write(frame)
     writer.release()
     source = RecordedImages(params(path, kind="video"), training())
-    (sight,) = source.poll(PERIOD * 2 + 1e-6)
-    assert sight.stamp == pytest.approx(PERIOD * 2), "by the video's own rate"
+    (detection,) = source.poll(PERIOD * 2 + 1e-6)
+    assert detection.stamp == pytest.approx(PERIOD * 2), "by the video's own rate"
     path.with_suffix(f".{STAMPS}").write_text("frame,time_s\n" + "\n".join(f"{i},{1.0 + i}" for i in range(FRAMES)) + "\n")
-    (sight,) = RecordedImages(params(path, kind="video"), training()).poll(3.5)
-    assert sight.stamp == pytest.approx(3.0)
-    assert sight.ball is not None
+    (detection,) = RecordedImages(params(path, kind="video"), training()).poll(3.5)
+    assert detection.stamp == pytest.approx(3.0)
+    assert detection.ball is not None

@@ -10,9 +10,10 @@ from scipy.spatial.transform import Rotation
 
 from hil.errors import LinkError
 from hil.links.device import check_device, open_port
-from hil.links.mavlink_link import Link, TlogWriter, attitude_target, pose_from_message, quaternion_from_euler
+from hil.links.mavlink_link import Link, attitude_target, pose_from_message, quaternion_from_euler
 from hil.links.pymav import Parser, mav
 from hil.links.roster import Roster
+from hil.links.writer import TlogWriter
 from tests.bench.processes import free_port
 from tests.fuzz import EACH, SEEDS, any_message, mutated, noise
 

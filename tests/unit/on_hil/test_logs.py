@@ -273,7 +273,7 @@ def test_configs_of_logs():
         ((*LOG, 'frames.vehicle.quaternion="xyzw"'), "kind bin writes 'wxyz'"),
         ((*LOG, 'backend="ardupilot"'), "a recording flies dry"),
         (LOG[:1], "expected the file of the bin source"),
-        ((*LOG[:2], 'source.logs=[{body="drone", message="VISP"}]'), "known: goal, payload, vehicle"),
+        ((*LOG[:2], 'source.logs=[{body="drone", message="VISP"}]'), "one of 'vehicle', 'payload', 'goal'"),
     ):
         with pytest.raises(ConfigError, match=message):
             config.load(HilParams, config.find("hil", "dry_run"), overrides)

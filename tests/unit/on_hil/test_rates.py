@@ -5,6 +5,7 @@ import math
 import pytest
 
 from hil.backends.rates import RatesParams, Sticks
+from visthrow.common.errors import ConfigError
 
 LINEAR = RatesParams("actual", (60, 60, 30), (60, 60, 30), (0, 0, 0))
 ACTUAL = RatesParams("actual", (7, 20, 10), (67, 90, 40), (0, 54, 100))
@@ -60,8 +61,8 @@ def test_which_way_is_which():
 
 
 @pytest.mark.parametrize(
-    ("change", "message"), [((300, 1, 1), "0 to 255"), ((0, 60, 60), "flat in the middle"), ((-1, 60, 60), "0 to 255")]
+    ("change", "message"), [((300, 1, 1), "rc_rates is .*; expected 1 to 255"), ((0, 60, 60), "1 to 255"), ((-1, 60, 60), "1 to 255")]
 )
 def test_profiles_that_are_none(change, message):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ConfigError, match=message):
         RatesParams("actual", change, (60, 60, 60), (0, 0, 0))

@@ -57,5 +57,5 @@ def test_the_recorder_has_the_priority_and_what_is_started_later_has_not():
 
 
 def test_a_priority_out_of_range():
-    with pytest.raises(ConfigError, match="priority 100; expected 0"):
+    with pytest.raises(ConfigError, match="priority is 100; expected 0 to 99"):
         RealtimeParams(priority=100)

@@ -112,7 +112,7 @@ def test_a_folder_that_cannot_be_made(tmp_path, capsys):
     (tmp_path / "file").touch()
     device = f'link.device="udp:127.0.0.1:{free_port()}"'
     assert main(["hil", "run", "--out", str(tmp_path / "file" / "run"), "--set", device]) == 2
-    assert "cannot make" in (said := capsys.readouterr().err)
+    assert "cannot write" in (said := capsys.readouterr().err)
     assert "--out" in said
 
 
@@ -141,9 +141,9 @@ def test_a_full_disk_fails_the_recording_and_nothing_else(tmp_path):
             pass
 
     recorder = Recorder(tmp_path / "a", params())
-    recorder._files["poses.jsonl"].close()
-    recorder._files["ticks.jsonl"].close()
-    recorder._files.update({"ticks.jsonl": Full(), "poses.jsonl": Full()})
+    for writer in recorder._writers.values():
+        writer._file.close()
+        writer._file = Full()
     runner = Runner(params(), Policy.load(find_policy("state")), Spy())
     for n in range(3):
         status, words = Status(True), OperatorInput()

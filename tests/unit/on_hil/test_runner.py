@@ -423,7 +423,7 @@ def test_another_camera_is_refused():
         ("gaol_w=[1.0]", "did you mean 'goal_w'"),
         ("guard.slew_thrust=0.0", "above 0"),
         ("fence.vehicle_low=[9.0, 0.0, 0.0]", "ascending corners"),
-        ("states.armed=-1.0", "armed is -1.0 s; expected a time above 0"),
+        ("states.armed=-1.0", "armed is -1.0; expected above 0"),
         ("home_w=[0.0, 0.0, 30.0]", "expected within the vehicle's fence"),
         ("landing_height=-3.0", "expected within the payload's fence"),
         ("link.system=300", "expected 1 to 255"),

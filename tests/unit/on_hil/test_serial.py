@@ -11,9 +11,10 @@ from hil.backends import Betaflight
 from hil.errors import LinkError
 from hil.links import msp
 from hil.links.device import Device, SerialPort
-from hil.links.msp_log import HEAD, LoggedPort
+from hil.links.writer import HEAD, LoggedPort
 from hil.params import HilParams
 from visthrow import config
+from visthrow.common.errors import StorageError
 
 PARAMS = config.load(HilParams, config.find("hil", "fake_betaflight"), ["betaflight.audit=false"]).betaflight
 STATUS = struct.pack("<HHHIBHHBBI", 125, 0, 33, 1, 0, 10, 0, 0, 29, 0)
@@ -106,16 +107,17 @@ def test_what_went_over_the_port_is_written_down(wire, tmp_path):
     chunks = [(way, data) for way, data in read_log(path)]
     assert chunks[0] == (b"<", b"abc")
     assert b"".join(data for way, data in chunks if way == b">") == b"defg", "in pieces, as they came"
-    with pytest.raises(LinkError, match="cannot write"):
+    with pytest.raises(StorageError, match="cannot write"):
         LoggedPort(port, tmp_path)
 
 
 def test_a_full_disk_troubles_nobody(wire, tmp_path):
     _, port = wire
     logged = LoggedPort(port, tmp_path / "link.msp")
-    logged._file.close()
+    logged.log._file.close()
     assert logged.write(b"abc")
-    assert logged.failed == 1
+    logged.close()
+    assert logged.log.failed == 1
 
 
 def test_a_port_that_is_not_there_is_named_once():

@@ -1,4 +1,4 @@
-"""The operator's terminal: lines, half lines, what is no text, signals; and a voice that holds nobody up."""
+"""The operator's terminal: lines, half lines, what is no text, signals; and a console that holds nobody up."""
 
 import os
 import signal
@@ -8,7 +8,7 @@ import time
 import pytest
 
 from hil.cli.flight import require_fake
-from hil.cli.terminal import ENDING, PAUSING, Terminal, Voice
+from hil.cli.terminal import ENDING, PAUSING, Console, Terminal
 from hil.control.decision import Decision, OperatorInput
 from hil.errors import RunError
 from hil.params import HilParams
@@ -108,18 +108,18 @@ def test_a_terminal_that_takes_nothing_holds_nobody_up(monkeypatch):
             pass
 
     monkeypatch.setattr("sys.stderr", Stuck())
-    voice, start = Voice(), time.monotonic()
+    console, start = Console(), time.monotonic()
     for _ in range(5000):
-        voice.say("x")
+        console.say("x")
     assert time.monotonic() - start < 1.0
     gate.set()
-    voice.close()
+    console.close()
 
 
 def test_a_reason_is_not_said_twice(capsys):
-    voice = Voice()
+    console = Console()
     for state, reason, waits in (("abort", "no", ""), ("done", "no", ""), ("idle", "start", "no pose"), ("idle", "start", "disarmed")):
-        voice.decision(Decision(1.0, state, reason, waits=waits))
-    voice.close()
+        console.decision(Decision(1.0, state, reason, waits=waits))
+    console.close()
     said = [line.split(maxsplit=2)[2] for line in capsys.readouterr().err.splitlines()]
     assert [" ".join(line.split()) for line in said] == ["abort no", "done", "idle start", "idle waits: no pose", "idle waits: disarmed"]

@@ -13,7 +13,7 @@ from sim.arrays.structs import EXTENSIONS
 from sim.hybrid import HybridSim
 from sim.params import SensingParams
 from sim.replay import kernel as rk
-from sim.replay.lanes import Recording, Replay, _shared_out
+from sim.replay.lanes import _BUILDS, Recording, Replay, _shared_out
 from tests.plants import paper_plant
 
 PERIODS, RELEASED_AT = 40, 20
@@ -81,6 +81,7 @@ def test_replay_is_the_simulator(flight):
     assert np.abs(seen["turn"]).max() < ROUNDING
     assert np.abs(seen["payload"][:, 0] - truth["payload_pos_w"][: len(seen["payload"])]).max() < ROUNDING
     assert np.abs(seen["rate"][:, 0] - truth["rate_b"]).max() < 1e3 * ROUNDING
+    assert all(len(build.replay.module.execs) == 1 for build in _BUILDS.values()), "compiled once"
 
 
 def test_commands_switch_where_they_should(flight):

@@ -10,8 +10,8 @@ from tests.hil_runs import record_run, saved_policy
 from visthrow.cli import main
 from visthrow.common.errors import LogError
 from visthrow.logs.flightlog import FlightLog, FlightRecorder
+from visthrow.task.measurement import Throws
 from visthrow.throws import from_runs
-from visthrow.training.protocol import Throws
 
 
 def log(policy="vision", goal=(2.0, 0.0, 0.0), landed=(2.1, 0.05, 0.04), sha="a", home=(0.0, 0.0, 1.333)) -> FlightLog:

@@ -17,13 +17,13 @@ from visthrow.common.errors import ConfigError, MismatchError, PolicyError
 from visthrow.logs.flightlog import STANDARD_CHANNELS, FlightLog
 from visthrow.onboard.policy import Policy
 from visthrow.task import Experiment, contract_of
+from visthrow.task.measurement import Throws
 from visthrow.throws import reference_protocol
 from visthrow.throws.flight import Flight
 from visthrow.throws.loading import load_policy, unique_names
 from visthrow.throws.loose_rope import LooseRope
 from visthrow.throws.plants import HybridPlant, make_plant
 from visthrow.throws.recorded import fly
-from visthrow.training.protocol import Throws
 from visthrow.view.tables import csv_text, markdown
 
 LINK_ERROR = 1e-5  # of a link's length [m]: Newton's last step

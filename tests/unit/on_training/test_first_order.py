@@ -1,6 +1,5 @@
 """First-order training: its backward pass against torch's autograd of the same surrogate and against the simulator itself."""
 
-import dataclasses
 import itertools
 from types import SimpleNamespace
 
@@ -37,6 +36,11 @@ def first_order(name="state", *changes):
     with torch.no_grad():
         found.network.mlp[-1].weight.mul_(5.0)
     return found
+
+
+def decided(fo, obs):
+    """The network's actions for observations, with torch's derivatives."""
+    return fo.network.mlp(fo.network.obs_normalizer(obs))
 
 
 def slowed(x, decay):
@@ -107,7 +111,7 @@ def reference(fo, by):
         fresh = torch.full((24,), k == 0)
         obs, history = ob.observe(layout, frame, None, previous, torch.ones(24), history, fresh)
         obs = at(b.obs[k], obs)
-        action = fo.act(obs) + extra[k]
+        action = decided(fo, obs) + extra[k]
         previous = at(act.clip_action(b.action[k]), action)
         throttle = (0.5 * (b.action[k, :, :1] + 1.0)).clamp(0.05, 1.0)
         scale = torch.cat([fo.cfg.task.action.max_thrust * throttle, fo.env._max_rate.expand(24, -1)], -1)
@@ -122,9 +126,11 @@ def backward(fo, by):
     """The same by the kernel."""
     for name, tensor in fo.adjoint.x.items():
         tensor.copy_(by[name]) if name in by else tensor.zero_()
-    found = torch.zeros_like(fo.action)
-    fo._backward(torch.zeros_like(found), found)
-    return found
+    for tensor in (fo.by_clipped, fo.layers.by_action):
+        tensor.zero_()
+    fo.layers.prepare()
+    fo.backward()
+    return fo.layers.by_action.clone()
 
 
 def test_backward_pass_equals_autograd_of_the_same_surrogate():
@@ -141,6 +147,38 @@ def test_backward_pass_equals_autograd_of_the_same_surrogate():
     assert (off[size > 0] / size[size > 0]).max() < SECOND_ORDER
 
 
+def test_weights_get_what_autograd_gives_them():
+    """With some flights counting less than others."""
+    fo = first_order("state")
+    fo.rollout()
+    assert fo.derivatives()["cost"].isfinite()
+    shares = torch.rand(24, generator=torch.Generator().manual_seed(0))
+    fo.layers.gradients(fo.obs, shares)
+    by_action = fo.layers.by_action * shares[:, None]
+    parameters = list(fo.network.mlp.parameters())
+    expected = torch.autograd.grad(decided(fo, fo.obs), parameters, by_action)
+    for parameter, gradient in zip(parameters, expected, strict=True):
+        torch.testing.assert_close(parameter.grad, gradient, rtol=1e-4, atol=1e-5 * gradient.abs().max().item())
+    assert by_action.any(), "nothing was differentiated"
+
+
+def test_flights_stop_where_nothing_counts_any_more():
+    """Flown on to the horizon, which a latch that is not quite one asks for, they have the same derivatives."""
+    fo, found = first_order("state", "first_order.initial_release=1.0", "first_order.horizon=20"), []
+    start = fo.env.state_dict()
+    for latched in (1.0, 1.0 - 1e-12):
+        fo.env.load_state_dict(start)
+        torch.manual_seed(0)
+        fo._latched, fo._first = latched, 0
+        fo.rollout()
+        fo.derivatives()
+        found.append((fo.flights.flown, fo.layers.by_action.clone()))
+    (short, stopped), (long, flown) = found
+    assert short < long == fo.p.horizon
+    assert flown.any()
+    torch.testing.assert_close(stopped, flown, rtol=0, atol=0)
+
+
 SLOWER = ["vehicle.queue.delay=0.045", "vehicle.motor.time_constant=0.06", "rope.payload_mass=0.08", "rope.length=0.5"]
 
 
@@ -150,7 +188,7 @@ def test_slopes_are_those_of_the_simulator(vehicle, monkeypatch):
 
     Yaw moves the landing by a thirtieth of what the others do, which is less than what a surrogate leaves.
     """
-    fo = first_order("state", *QUIET, *vehicle, "task.start.tether_variants=1")
+    fo = first_order("state", *QUIET, *vehicle, "task.start.tether_variants=1", "first_order.decay=1.0")
     torch.manual_seed(5)
     plan = fo.env._start_action + torch.randn(fo.p.horizon, 24, 5) * torch.tensor([0.1, 0.25, 0.25, 0.25, 0.0])
     start = fo.env.state_dict()
@@ -158,7 +196,7 @@ def test_slopes_are_those_of_the_simulator(vehicle, monkeypatch):
     def fly(actions):
         fo.env.load_state_dict(start)
         left = iter(actions)
-        monkeypatch.setattr(fo, "act", lambda obs: next(left))
+        monkeypatch.setattr(fo.layers, "forward", lambda k, seen: fo.action[k].copy_(next(left)))
         fo.rollout()
         return fo.landing[-1].clone()
 
@@ -169,8 +207,7 @@ def test_slopes_are_those_of_the_simulator(vehicle, monkeypatch):
     time = (up + (up.square() + 2 * GRAVITY * (x["load_pos"][-1, :, 2] - fo.cfg.release.landing_height)).sqrt()) / GRAVITY
     point = x["load_pos"][-1, :, :2] + x["load_vel"][-1, :, :2] * time[:, None]
     torch.testing.assert_close(point.detach(), fo.landing[-1], atol=1e-4, rtol=0)
-    monkeypatch.setattr(fo, "_jacobian", lambda: torch.zeros(*plan.shape, fo.env.layout.dimension))
-    fo.p = dataclasses.replace(fo.p, decay=1.0)
+    monkeypatch.setattr(fo.layers, "back", lambda k: None)
     found = []
     for axis in range(2):
         by = dict(zip(x, torch.autograd.grad(point[:, axis].sum(), list(x.values()), retain_graph=True), strict=True))

@@ -6,8 +6,8 @@ import io
 import numpy as np
 import pytest
 
+from visthrow.task.measurement import Throws
 from visthrow.training import progress
-from visthrow.training.protocol import Throws
 
 FIGURES = {"released": 1.0, "landing_error": 0.5, "rollout_s": 0.1, "learning_s": 0.1}
 

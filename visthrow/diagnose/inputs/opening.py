@@ -86,7 +86,7 @@ def throw_model(args: argparse.Namespace, logs: Sequence[FlightLog]) -> tuple[Mo
     """The whole throw, with the plant of an experiment, and its logs with their commands put right."""
     from visthrow import config
     from visthrow.diagnose.likelihood import memory
-    from visthrow.diagnose.throw.interface import put_right
+    from visthrow.diagnose.select.search import put_right
     from visthrow.diagnose.throw.throw_model import ThrowModel
     from visthrow.task import Experiment, plant_of
     from visthrow.training.device import resolve
@@ -94,10 +94,10 @@ def throw_model(args: argparse.Namespace, logs: Sequence[FlightLog]) -> tuple[Mo
     memory.keep()
     experiment = config.load(Experiment, config.find("train", args.plant), args.overrides)
     only = args.only.split(",") if args.only else None
-    known = {"sensing": experiment.sensing, "camera": experiment.camera}
-    right, mistakes = put_right(logs, plant_of(experiment))
-    known["mistakes"] = mistakes
-    return ThrowModel(right, plant_of(experiment), device=resolve(args.device), only=only, simpler=only is not None, **known), right
+    known = {"sensing": experiment.sensing, "camera": experiment.camera, "device": resolve(args.device)}
+    known |= {"only": only, "simpler": only is not None}
+    plant = plant_of(experiment)
+    return put_right(logs, plant, lambda logs, mistakes: ThrowModel(logs, plant, mistakes=mistakes, **known))
 
 
 class _Part:

@@ -15,6 +15,7 @@ Source: Rasmussen and Williams 2006, section 4.2.1 (kernels) and 5.4.1 (marginal
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 
@@ -23,6 +24,8 @@ from visthrow.diagnose.likelihood.evidence import VERY_STRONG
 from visthrow.diagnose.likelihood.marginal import hidden_gram, left_of
 from visthrow.diagnose.likelihood.threads import each
 from visthrow.diagnose.models.interface import Window
+
+T = TypeVar("T")
 
 SUSPECT = 0.1
 """Correlation of neighbouring samples from which a channel is looked at: of ten thousand white ones it has a deviation of 0.01."""
@@ -38,7 +41,7 @@ SHARES = (0.5, 0.8, 0.95, 0.99, 0.999)
 """Correlated parts of the variance that are tried; the rest keeps the correlations' inverse within what doubles hold."""
 
 LOOKED_AT = 8
-"""Windows that the estimate is made of."""
+"""Windows that the estimate is made of, and that tell whether a question is worth asking all."""
 
 
 @dataclass(frozen=True)
@@ -97,8 +100,7 @@ def correlations(windows: Sequence[Window], slabs: np.ndarray, channels: int) ->
     Returns:
         Channel -> its noise, where that is surely not white.
     """
-    chosen = [windows[i] for i in np.unique(np.linspace(0, len(windows) - 1, LOOKED_AT).astype(int))]
-    free = [_with_free_effects(window, slabs) for window in chosen]
+    free = [_with_free_effects(window, slabs) for window in few_of(windows)]
     bare = each(lambda window: hidden_gram(window, channels), free)
     left = each(lambda pair: left_of(*pair), zip(free, noise.widely_fitted(free, bare, "cpu")))
     suspects = {c: scale for c in range(channels) if (scale := _suspected(free, left, c)) is not None}
@@ -108,6 +110,11 @@ def correlations(windows: Sequence[Window], slabs: np.ndarray, channels: int) ->
         if ahead > VERY_STRONG:
             known[channel] = best
     return known
+
+
+def few_of(items: Sequence[T]) -> list[T]:
+    """Some of them, spread evenly."""
+    return [items[i] for i in np.unique(np.linspace(0, len(items) - 1, LOOKED_AT).astype(int))]
 
 
 def _with_free_effects(window: Window, slabs: np.ndarray) -> Window:

@@ -31,6 +31,10 @@ STRONG, VERY_STRONG = 3.0, 5.0
 """Nats: Bayes factors above 20 are strong, above 150 very strong (Kass and Raftery 1995). What is less than strongly behind counts as
 possible; any cause must be very strong, however few are in question."""
 
+INEXACT = 0.3
+"""Part by which the form of anything may be off: of an effect from flight to flight, of another kind of block, of a force against the
+thrust, of the misfit of a window that begins in a motion that nobody knows."""
+
 CALIBRATION_DRAWS = 4000
 CALIBRATION_QUANTILE = 0.995
 

@@ -20,6 +20,7 @@ from itertools import combinations_with_replacement
 import numpy as np
 from scipy.interpolate import CubicSpline
 
+from sim.effects.effect import Effect
 from sim.effects.laws import LOWEST, SLOWEST
 from visthrow.common import rotations
 from visthrow.common.rotations import cross
@@ -391,3 +392,26 @@ def _hats(window: Window, time: np.ndarray, block: str) -> np.ndarray:
     at = np.abs(window.latent_time[rows, None] - time).argmin(axis=1)
     out[rows, :, window.latent_axis[rows].astype(int)] = between(len(time))[at]
     return out.reshape(len(out), -1)
+
+
+@dataclass(frozen=True)
+class TermEffect(Effect):
+    """A term as an effect of a model; its size is the coefficient."""
+
+    term: Term | None = None
+    price: float = 0.0  # of its name, beyond the threshold [nats]
+
+
+def carries(latent_block: np.ndarray, block: str) -> bool:
+    """Whether a window has all latents that terms of a block act through."""
+    return set(map(LATENT_BLOCKS.index, acting(block))) <= set(np.unique(latent_block).tolist())
+
+
+def forces(window: Window, terms_: Sequence[TermEffect]) -> np.ndarray:
+    """Latent forces at a window's knots that a coefficient of 1 of each term stands for, shape (L, T)."""
+    out, known = np.zeros((len(window.latent_block), len(terms_))), Known(window.knots)
+    for i, effect in enumerate(terms_):
+        if carries(window.latent_block, effect.term.block):
+            values = Layout.of([effect.term]).table(known).ravel()
+            out[:, i] = through_latents(window, known, effect.term.block) @ values
+    return out

@@ -35,7 +35,8 @@ class FlyerModel(NumericModel):
         if params.torque is not None:
             channels.append("rate_b")
         stretches = stretches_of(logs, params, channels)
-        inputs = [params.attitude, params.input, *(["battery_voltage"] if self.has_voltage else [])]
+        there = [name for name in ("battery_voltage", "acc_b", "rate_b") if all(name in log for log in logs)]
+        inputs = [params.attitude, params.input, *there]
         super().__init__(effects_of(params, self.has_voltage), channels, stretches, inputs)
         self.steps = round(params.window / params.step)
         self._names = {effect.name: i for i, effect in enumerate(self.effects)}
@@ -44,6 +45,7 @@ class FlyerModel(NumericModel):
         self._volts = np.array([s.data["volts"] for s in stretches])  # (S,)
         self._since = np.array([s.data["since"] for s in stretches])  # [s], shape (S,)
         self._spare = spare(params.step)
+        self._lean = np.array([s.data["lean"] for s in stretches])  # (S, half steps, 3)
         self._direction = np.array([s.data["direction"] for s in stretches])  # (S, 3)
         self._blocks = 1 + (params.cable is not None) + (params.torque is not None)
         self._rate_at = 12 if params.cable is not None else 6
@@ -148,6 +150,7 @@ class _Dynamics:
             return model._theta(lanes, name)
 
         self.turn = np.stack([get("marker_rot_x"), get("marker_rot_y"), 0.0 * mass[:, 0]], 1)
+        self.lean = get("estimator_lean")[:, None]
         tilt = np.stack([get("frame_tilt_y"), -get("frame_tilt_x"), 0.0 * mass[:, 0] - 1.0], 1)
         self.gravity = p.gravity * tilt
         self.wind = np.stack([get("wind_x"), get("wind_y"), 0.0 * mass[:, 0]], 1)
@@ -196,7 +199,8 @@ class _Dynamics:
         speed = np.sqrt(level + vel_b[:, 2:3] ** 2)
         force_b = -(self.drag + self.parasitic * speed) * vel_b
         force_b[:, 2:3] += total * (1.0 + self.lift * level)
-        force_b = force_b + cross(self.turn, force_b)
+        lean = self.lean * self.model._lean[self.owner, half + self.model._spare]
+        force_b = force_b + cross(self.turn + lean, force_b)
         force = np.einsum("bij,bj->bi", rot, force_b) + latent[0]
         parts = [vel]
         if self.p.cable is None:

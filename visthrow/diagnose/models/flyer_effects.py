@@ -66,6 +66,9 @@ def _sensing(params: FlyerParams, seen: tuple[str, ...]) -> list[Effect]:
                seen, "motion capture pipelines", ("cmd_delay",), ()),
         Effect("attitude_delay", "the delay of the measured attitude", "R_meas(t) = R(t - theta)", "s", "sensing",
                (-MOST_LATE, MOST_LATE), 1e-2, 1e-3, seen, "streams of several clocks", ("pose_delay", "cmd_delay"), ("quick turns",)),
+        Effect("estimator_lean", "an attitude estimate that takes forces level with the rotors for tilt", "R = R_meas (1 + theta [a])",
+               "1", "sensing", (0.0, 2.0), 0.5, 0.02, (*seen, "acc_b", "rate_b"), "Mueller, Hamer and D'Andrea 2015",
+               ("payload_drag", "rotor_drag_xy"), ("attitude from several markers",)),
     ]  # fmt: skip
     for axis in "xy":
         found += [

@@ -50,6 +50,7 @@ class FlyerParams:
     step: float  # of the integration [s]
     every: int  # the position samples taken: each so-manieth
     most_windows: int  # spread evenly over all logs
+    estimator_rate: float = 1.0  # at which an estimate of the attitude takes other forces than thrust for tilt [1/s]
     torque: TorqueParams | None = None  # None: rates are not simulated
     cable: CableParams | None = None  # None: no payload
 

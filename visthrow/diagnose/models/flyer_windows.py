@@ -3,11 +3,15 @@
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.signal import lfilter
 
+from visthrow.common.constants import GRAVITY
 from visthrow.common.errors import LogError
 from visthrow.common.rotations import continuous, matrix_of_quat
 from visthrow.diagnose.models.flyer_params import FlyerParams
 from visthrow.diagnose.models.numeric import Stretch, latent_layout, sigma_of
+from visthrow.logs.check.physics import valid
+from visthrow.logs.check.relations import mean_over, on_grid, rates_of
 from visthrow.logs.flightlog import Channel, FlightLog
 
 FINE = 16
@@ -109,7 +113,8 @@ def _window(log, number: int, params: FlyerParams, channels, sigma, start: float
         np.concatenate([values.ravel() for _, values in rows]),
         np.concatenate([np.tile(sigma[name], len(time)) for name, (time, _) in zip(channels, rows)]), guess, spread,
         {"start": start, "rot": _attitudes(log[params.attitude], halves), "input": inputs, "volts": float(volts),
-         "direction": direction, "since": start - float(log[params.input].time[0])},
+         "direction": direction, "lean": _lean(log, params.attitude, params.estimator_rate, halves),
+         "since": start - float(log[params.input].time[0])},
         **latent_layout(start, end, KNOTS, blocks),
     )  # fmt: skip
 
@@ -138,6 +143,35 @@ def _attitudes(channel: Channel, times: np.ndarray) -> np.ndarray:
     near = slice(max(np.searchsorted(time, times[0]) - 2, 0), np.searchsorted(time, times[-1]) + 2)
     time, quat = time[near], continuous(quat[near])
     return matrix_of_quat(np.column_stack([np.interp(times, time, column) for column in quat.T]))
+
+
+def _lean(log: FlightLog, attitude: str, rate: float, times: np.ndarray) -> np.ndarray:
+    """Turn from a leaning estimate of the attitude to the true one, shape (half steps, 3); 0 where nothing tells it.
+
+    In flight the accelerometer tells thrust alone; a filter that knows it as thrust alone takes what pushes level with the rotors for
+    tilt, at ``rate``. A gyro's offset tilts it as well: the tilt stays at which the correction, the gyro less the estimate's own rate,
+    holds it up. Of the force the flight's middle is taken off: a mount that is not level makes a constant.
+
+    Source: Mueller, Hamer and D'Andrea 2015; firmware of the Crazyflie, kalman_core.c (only acceleration in z).
+    """
+    if "acc_b" not in log or not np.any(log["acc_b"].valid):
+        return np.zeros((len(times), 3))
+    time, force = valid(log["acc_b"])
+    share = force[:, :2] / np.maximum(force[:, 2:], _IDLE * GRAVITY)
+    step = float(np.median(np.diff(time)))
+    even = np.arange(time[0], time[-1], step)
+    keep = np.exp(-rate * step)
+    tilt = lfilter([1.0 - keep], [1.0, -keep], on_grid(time, share - np.median(share, axis=0), even), axis=0)
+    turn = np.column_stack([tilt[:, 1], -tilt[:, 0], 0.0 * tilt[:, 0]])
+    if "rate_b" in log and np.any(log["rate_b"].valid):
+        turn[:, :2] -= _offset(log, attitude)[:2] / rate
+    return on_grid(even, turn, times)
+
+
+def _offset(log: FlightLog, attitude: str) -> np.ndarray:
+    """Gyro less the rate of the estimated attitude, in the middle of the flight [rad/s], shape (3,)."""
+    time, rate = rates_of(*valid(log[attitude]))
+    return np.median(mean_over(*valid(log["rate_b"]), time, 0.06) - rate, axis=0)
 
 
 def _line(time: np.ndarray, values: np.ndarray, start: float) -> tuple[np.ndarray, np.ndarray]:

@@ -1,13 +1,13 @@
 """``visthrow diagnose explain``: what the model gets wrong about measured flights."""
 
 import argparse
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from visthrow.common.arguments import add_out
-from visthrow.diagnose.select.result import INCONSISTENT, OUT_OF_DOMAIN, OVERALL
+from visthrow.diagnose.select.result import INCONSISTENT, OUT_OF_DOMAIN, Diagnosis
 
 MOST_SPOILED = 0.5
 """Share of the logs that may contradict themselves and be left out; where more do, nothing is to be learnt from any."""
@@ -36,28 +36,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Read, search, print, write."""
     from visthrow.common.storage import write_json
-    from visthrow.diagnose.check.run import check, contradictions, copies
     from visthrow.diagnose.inputs import opening, setup
     from visthrow.diagnose.reporting import report
-    from visthrow.diagnose.select import search
 
     model, logs = opening.open_model(args)
-    checked = check(logs, setup.known(args.config))
-    reasons, spoiled = contradictions(checked), tuple(i for i, log in enumerate(checked) if contradictions([log]))
-    if len(spoiled) > MOST_SPOILED * len(logs):
-        print(f"{INCONSISTENT}: {OVERALL[INCONSISTENT]}\n" + "\n".join(f"  {reason}" for reason in reasons))
-        if args.json:
-            write_json(args.json, {"overall": INCONSISTENT, "reasons": reasons, "findings": []})
-        return REFUSED
-    print(f"{len(logs)} log(s), {len(model.effects)} effects on {', '.join(model.channels)}", flush=True)
-    doubled = {i: other for i, other in copies(checked).items() if i not in spoiled}
-    reasons += [f"{checked[i].name}: a copy of another log, which counts once" for i in doubled]
-    for reason in reasons:
-        print(f"  left out: {reason}", flush=True)
-    without = (*opening.numbers(args.without), *spoiled, *doubled)
-    diagnosis = search.explain(model, seed=args.seed, without=without, progress=lambda line: print(f"  {line}", flush=True))
-    left_out = (f"left out: {reason}" for reason in reasons)
-    diagnosis = replace(diagnosis, reasons=(*diagnosis.reasons, *left_out), duplicates={**doubled, **diagnosis.duplicates})
+    diagnosis = explained(model, logs, setup.known(args.config), args.seed, opening.numbers(args.without), lambda x: print(x, flush=True))
     gain = None
     if not args.no_report and diagnosis.work is not None:
         gain = write_report(Path(args.out), diagnosis, model, logs, args.seed, not args.no_blind, opening.made_with(args))
@@ -68,6 +51,34 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         write_json(args.json, report.to_json(diagnosis, gain, extra={**opening.made_with(args), "tested": tested}))
     return REFUSED if diagnosis.overall in (INCONSISTENT, OUT_OF_DOMAIN) else 0
+
+
+def explained(model, logs, known, seed: int = 0, without: Sequence[int] = (), say: Callable[[str], None] = lambda _: None) -> Diagnosis:
+    """Leave out what contradicts itself, or repeats another log, and search for causes in the rest.
+
+    Args:
+        model: of the logs.
+        logs: in the model's order.
+        known: what the setup says of the vehicle.
+        seed: of the null worlds.
+        without: flights to leave out.
+        say: is told each step in a line.
+    """
+    from visthrow.diagnose.check.run import check, contradictions, copies
+    from visthrow.diagnose.select import search
+
+    checked = check(logs, known)
+    reasons, spoiled = contradictions(checked), tuple(i for i, log in enumerate(checked) if contradictions([log]))
+    if len(spoiled) > MOST_SPOILED * len(logs):
+        return Diagnosis(INCONSISTENT, "", tuple(reasons), (), {}, (), 0.0)
+    say(f"{len(logs)} log(s), {len(model.effects)} effects on {', '.join(model.channels)}")
+    doubled = {i: other for i, other in copies(checked).items() if i not in spoiled}
+    reasons += [f"{checked[i].name}: a copy of another log, which counts once" for i in doubled]
+    for reason in reasons:
+        say(f"  left out: {reason}")
+    found = search.explain(model, seed=seed, without=(*without, *spoiled, *doubled), progress=lambda line: say(f"  {line}"))
+    told = (*found.reasons, *(f"left out: {reason}" for reason in reasons))
+    return replace(found, reasons=told, duplicates={**doubled, **found.duplicates})
 
 
 def _tested(args: argparse.Namespace, diagnosis) -> dict[str, tuple[float, float, float]]:

@@ -14,7 +14,7 @@ from visthrow.diagnose.likelihood.marginal import Noise
 from visthrow.diagnose.models.interface import Model
 from visthrow.diagnose.reporting.blackbox import table_of, train
 from visthrow.diagnose.reporting.landing_gain import LandingGain, landing_gain
-from visthrow.diagnose.select.held_out import DRAWS, Crossed, channel_gains, crossed, regrouped
+from visthrow.diagnose.select.held_out import Crossed, channel_gains, crossed, regrouped
 from visthrow.diagnose.select.point import Point
 from visthrow.diagnose.select.result import ChannelGain, Diagnosis
 
@@ -35,18 +35,17 @@ class Gain:
         return next(c for c in self.channels if c.channel == channel)
 
 
-def measure(diagnosis: Diagnosis, *, seed: int = 0, draws: int = DRAWS) -> Gain:
+def measure(diagnosis: Diagnosis, *, seed: int = 0) -> Gain:
     """Measure the gain of a diagnosis on held-out flights.
 
     Args:
         diagnosis: of :func:`visthrow.diagnose.select.search.explain`.
-        seed: of the bootstrap and of the black box's basis.
-        draws: of the bootstrap.
+        seed: of the black box's basis.
     """
     work, rng = diagnosis.work, np.random.default_rng(seed)
     cross = crossed(diagnosis)
     box = _blackbox(work.before, cross.groups, cross.folds, work.after, len(work.problem.model.channels), rng)
-    gains = channel_gains(work, cross, rng, draws, box)
+    gains = channel_gains(work, cross, box)
     shares = {work.problem.model.effects[j].name: n / len(cross.folds) for j, n in cross.named.items()}
     sizes = cross.trained if cross.left_out == "flights" and diagnosis.theta else ()
     trained = {int(f): work.problem.sizes(size) for f, size in zip(cross.statistics.flights, sizes)}

@@ -199,7 +199,7 @@ def _gain(gain: Gain, diagnosis: Diagnosis) -> Section:
     for c in gain.channels:
         unit, before, after, floor, box = _errors(c)
         less = f"{percent(c.gain, 1)} % [{percent(c.low)}, {percent(c.high)}]"
-        rows.append((c.channel, unit, before, after, less, floor, box or "-", "worse" if c.harmed else ""))
+        rows.append((c.channel, unit, before, after, less, floor, box or "-", "worse" if c.high < 0.0 else ""))
     named = ", ".join(f"{name} in {100 * share:.0f} %" for name, share in gain.named_in.items()) or "nothing in any"
     of = "whole windows" if gain.whole else f"predictions from the first {HEAD_SECONDS:g} s of each window"
     note = (f"Root mean square errors of {of}, {gain.left_out} left out in {gain.folds} folds, the selection repeated in each "

@@ -1,27 +1,28 @@
 """Commands that got lost: a random effect of every single command.
 
 Whether command k came is m_k, 0 or 1 with probability theta. A window shows the sum of C m, with C the change of its samples by each
-command that did not come; m is taken for normal with mean theta and variance theta (1 - theta), and integrated out. What a model
-shows with it (:class:`WithDropped`) differs by the mean, and has the rest of C m among what is not known of a window.
+command that did not come; m is taken for normal with mean theta and variance theta (1 - theta), and integrated out. Windows of a
+:attr:`visthrow.diagnose.select.point.Problem.lost` share differ by the mean, and have the rest of C m among what is not known of them.
 
 Source: an innovation variance (Harvey 1989) of the command channel; the likelihood of its size is that of a random effect.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from scipy.stats import beta
 
 from sim.effects.effect import RandomEffect
 from visthrow.config.effects import random_effects
+from visthrow.diagnose.likelihood import noise as levels
 from visthrow.diagnose.likelihood import stack
+from visthrow.diagnose.likelihood.correlation import few_of
 from visthrow.diagnose.likelihood.designs import correlated_of, grams_of
 from visthrow.diagnose.likelihood.evidence import Priors, log_evidence
-from visthrow.diagnose.models.interface import Linearised, Model, Window
+from visthrow.diagnose.models.interface import Window
 from visthrow.diagnose.select.point import Point, Problem
-from visthrow.diagnose.select.scatter import COMMAND, LOOK, REACH, Scatter, Varies, judged
+from visthrow.diagnose.select.scatter import COMMAND, LOOK, REACH, Scatter, judged
 
 NAME = "dropped_commands"
 """Of the random effect in the catalogue."""
@@ -35,53 +36,6 @@ def effect() -> RandomEffect:
     return next(v for v in random_effects() if v.name == NAME)
 
 
-class WithDropped:
-    """A model some of whose commands did not come."""
-
-    def __init__(self, model: Model, share: float):
-        """Take a share of the commands away.
-
-        Args:
-            model: that tells what each command does.
-            share: of the commands, above 0 and below 1.
-        """
-        self.model, self.share = model, share
-        self._last: list[np.ndarray] = []  # columns of each window where derivatives were taken last
-        self._about: tuple[Linearised | None, Linearised | None] = None, None  # with them, and without
-
-    def __getattr__(self, name: str) -> Any:
-        """Return what the model itself has."""
-        return getattr(self.__dict__["model"], name)
-
-    def windows(self, theta: Mapping[str, float]) -> list[Window]:
-        """See :class:`Model`."""
-        found = self.model.windows(theta)
-        self._last = [_padded(own, len(w.residual), own.shape[1]) for own, w in zip(self.model.without_commands(theta), found)]
-        return [self._widened(w, columns) for w, columns in zip(found, self._last)]
-
-    def _widened(self, w: Window, columns: np.ndarray) -> Window:
-        deviation = np.full(columns.shape[1], np.sqrt(self.share * (1.0 - self.share)))
-        return replace(w, residual=w.residual - self.share * columns.sum(1), nuisance=np.hstack((w.nuisance, columns)),
-                       nuisance_sd=np.append(w.nuisance_sd, deviation))  # fmt: skip
-
-    def residuals(self, theta: Mapping[str, float], about: Linearised | None = None) -> list[np.ndarray]:
-        """See :class:`Model`; the columns stay those of the place where derivatives were taken."""
-        if about is not self._about[0]:
-            bare = about and Linearised(about.theta, {i: self.parted(w, i)[0] for i, w in about.windows.items()})
-            self._about = about, bare
-        found, last = self.model.residuals(theta, self._about[1]), dict(enumerate(self._last))
-        if about is not None:
-            last |= {i: self.parted(w, i)[1] for i, w in about.windows.items()}
-        return [r - self.share * last[i].sum(1) for i, r in enumerate(found)]
-
-    def parted(self, w: Window, i: int) -> tuple[Window, np.ndarray]:
-        """A window, by its number, as if all commands had come, and the columns of its commands."""
-        own = w.nuisance.shape[1] - self._last[i].shape[1]
-        columns = w.nuisance[:, own:]
-        return replace(w, residual=w.residual + self.share * columns.sum(1), nuisance=w.nuisance[:, :own],
-                       nuisance_sd=w.nuisance_sd[:own]), columns  # fmt: skip
-
-
 @dataclass(frozen=True)
 class Told:
     """What windows say of K effects and T commands each, about 0; windows of fewer commands have columns of 0."""
@@ -91,7 +45,7 @@ class Told:
     commands: int  # T
 
     @staticmethod
-    def of(problem: Problem, point: Point, windows: Sequence[Window], columns: Sequence[np.ndarray]) -> "Told":
+    def of(problem: Problem, point: Point, windows: Sequence[Window], columns: Sequence[np.ndarray], rows: Sequence[int]) -> "Told":
         """Ask windows under a point's noise levels.
 
         Args:
@@ -99,13 +53,16 @@ class Told:
             point: where the windows' residuals are.
             windows: whose initial states and latent forces are integrated out.
             columns: of each window's commands, shape (N, T).
+            rows: numbers of the windows among the point's.
         """
         most, known = max(own.shape[1] for own in columns), len(point.theta)
-        wide = [np.hstack((w.effects, _padded(own, len(w.residual), most))) for w, own in zip(windows, columns)]
+        wide = [np.hstack((w.effects, np.pad(own, ((0, len(w.residual) - len(own)), (0, most - own.shape[1])))))
+                for w, own in zip(windows, columns)]  # fmt: skip
         windows = [replace(w, effects=effects) for w, effects in zip(windows, wide)]
         grams = grams_of(windows, np.append(problem.priors.floor, np.ones(most)), len(problem.model.channels), point.device)
         grams = correlated_of(grams, windows, point.noise.correlation_time, point.device)
-        shares = stack.integrals(grams, point.noise, point.device).shares(grams, point.noise)
+        noise = levels.only(point.noise, grams, rows)
+        shares = stack.integrals(grams, noise, point.device).shares(grams, noise)
         information = np.array([own.information for own in shares])
         return Told(information, np.array([own.score for own in shares]) + information[:, :, :known] @ point.theta, most)
 
@@ -141,17 +98,17 @@ def verdict(problem: Problem, point: Point, active: Sequence[int], least: float)
     """
     if not hasattr(problem.model, "without_commands"):
         return None
-    columns, priors, v = problem.model.without_commands(problem.sizes(point.theta)), problem.priors, effect()
-    told, reach = Told.of(problem, point, point.windows, [columns[i] for i in problem.kept]), REACH * v.prior_sd
-    if told.ahead(reach[::LOOK], priors, active).max() <= 0.0:  # in most flights all came, and a few shares tell
-        return None
-    nats = np.minimum(*(told.ahead(reach, priors, named) for named in (active, np.flatnonzero(priors.visible).tolist())))
-    return judged(v, reach, nats, least, sum(columns[i].shape[1] for i in problem.kept), COMMAND)
-
-
-def lost(problem: Problem, share: float) -> Problem:
-    """The problem of a model some of whose commands did not come; nothing else varies yet."""
-    return replace(problem, model=WithDropped(problem.model, share), varies=Varies(problem.varies.days))
+    v, priors, sizes = effect(), problem.priors, problem.sizes(point.theta)
+    reach = REACH * v.prior_sd
+    sets = active, np.flatnonzero(priors.visible).tolist()  # what is still missing must not be why
+    every = range(len(problem.kept))
+    for rows, shares in ((few_of(every), reach[::LOOK]), (every, reach)):
+        columns = problem.model.without_commands(sizes, [problem.kept[w] for w in rows])
+        told = Told.of(problem, point, [point.windows[w] for w in rows], columns, rows)
+        nats = np.minimum(*(told.ahead(shares, priors, named) for named in sets))
+        if nats.max() <= 0.0:
+            return None
+    return judged(v, reach, nats, least, sum(own.shape[1] for own in columns), COMMAND)
 
 
 def sized(problem: Problem, point: Point, found: Scatter) -> Scatter:
@@ -162,7 +119,7 @@ def sized(problem: Problem, point: Point, found: Scatter) -> Scatter:
         point: of it, with the noise levels that these leave.
         found: the verdict before.
     """
-    told = Told.of(problem, point, *zip(*(problem.model.parted(w, i) for w, i in zip(point.windows, problem.kept))))
+    told = Told.of(problem, point, [point.about.windows[i] for i in problem.kept], point.commands, range(len(problem.kept)))
     own, score = told.information[:, -told.commands :, -told.commands :], told.score[:, -told.commands :]
     spread = np.linalg.inv(own + np.eye(told.commands) / EITHER**2)
     off = (spread @ (score - EITHER * own.sum(2))[..., None])[..., 0]  # from half way
@@ -172,7 +129,3 @@ def sized(problem: Problem, point: Point, found: Scatter) -> Scatter:
         return found
     size, low, high = (float(x) for x in beta.ppf((0.5, 0.025, 0.975), gone + 0.5, count - gone + 0.5))
     return replace(found, size=size, low=low, high=high)
-
-
-def _padded(columns: np.ndarray, rows: int, width: int) -> np.ndarray:
-    return np.pad(columns, ((0, rows - len(columns)), (0, width - columns.shape[1])))

@@ -14,12 +14,9 @@ from visthrow.diagnose.likelihood.grammar import JOINT, JOINT_NEEDS, Known, thro
 from visthrow.diagnose.likelihood.marginal import Gram
 from visthrow.diagnose.likelihood.stack import Stack
 from visthrow.diagnose.models.interface import LATENT_BLOCKS, Window
-from visthrow.diagnose.select.point import Point, Problem
+from visthrow.diagnose.select.point import UNKNOWN_RATIO, Point, Problem
 from visthrow.diagnose.select.result import Level
 from visthrow.logs.flightlog import STANDARD_CHANNELS
-
-UNKNOWN_RATIO = 3.0
-"""Latent forces above this many times the quietest phase's are no gusts."""
 
 LANDING = 5e-3
 """Distance [m] that a latent force must move a body along an axis within a window, else it does not matter: a cause that moves a
@@ -41,7 +38,7 @@ def levels(problem: Problem, before: Point, after: Point, least: float) -> tuple
     found, least = [], least + np.log(max(len(after.noise.latent_sd), 1))
     blocks = sorted({block for block, _ in after.noise.latent_sd})
     of = {phase: _Phase(after, phase) for _, phase in after.noise.latent_sd}
-    floors = _floors(after, _positions(problem.model.channels))
+    floors = floors_of(problem, after)
     for block in blocks:
         phases = [phase for b, phase in after.noise.latent_sd if b == block]
         limits = {phase: of[phase].upper_limit(block) for phase in phases}
@@ -57,14 +54,10 @@ def levels(problem: Problem, before: Point, after: Point, least: float) -> tuple
     return tuple(found)
 
 
-def _positions(channels: Sequence[str]) -> list[int]:
-    """Numbers of the channels that hold positions [m]."""
-    return [c for c, name in enumerate(channels) if name in STANDARD_CHANNELS and STANDARD_CHANNELS[name].unit == "m"]
-
-
-def _floors(point: Point, positions: Sequence[int]) -> dict[tuple[int, str], float]:
+def floors_of(problem: Problem, point: Point) -> dict[tuple[int, str], float]:
     """Latent deviation [N or N m] of each block and phase that moves a position by ``LANDING`` within the median window."""
-    moves: dict[tuple[int, str], list[float]] = {}
+    channels, moves = problem.model.channels, {}
+    positions = [c for c, name in enumerate(channels) if name in STANDARD_CHANNELS and STANDARD_CHANNELS[name].unit == "m"]
     for gram, window in zip(point.grams, point.windows):
         seen = np.isin(window.channel, positions)
         for block in np.unique(gram.latent_block) if seen.any() else ():

@@ -25,18 +25,15 @@ from visthrow.diagnose.likelihood.evidence import (
 from visthrow.diagnose.likelihood.forms import HORIZONS, READABLE, Forms, forms, left_ahead, unit_of
 from visthrow.diagnose.likelihood.marginal import Statistics, gather
 from visthrow.diagnose.select import result
-from visthrow.diagnose.select.excess import UNKNOWN_RATIO
-from visthrow.diagnose.select.point import Point
+from visthrow.diagnose.select.point import UNKNOWN_RATIO, Point
 from visthrow.diagnose.select.result import ChannelGain, Diagnosis, Finding, HeldOut
 from visthrow.diagnose.select.scatter import deviations, freed
 from visthrow.diagnose.select.selector import MOST_NAMES
 from visthrow.diagnose.select.state import Work
 
-DRAWS = 10_000
 MOST_FOLDS = 12
 PARTS = 3
 """With fewer flights so many parts of each are left out instead, and the report says so: two sets that were trained on differ."""
-FEW_GROUPS = 8
 FIRM = 2.0 / 3.0
 """More of the folds than this share must name a cause, or one of its class: of three folds that leave a flight out, all."""
 TELLING = 0.1
@@ -116,7 +113,7 @@ def crossed(diagnosis: Diagnosis) -> Crossed:
     work, least = diagnosis.work, diagnosis.threshold
     point, priors = work.after, work.problem.priors
     groups, left_out = groups_of(point, work.problem.kept)
-    varies = deviations(diagnosis.scatter, priors, [e.name for e in work.problem.model.effects], ())
+    varies = deviations(diagnosis.scatter, priors, [e.name for e in work.problem.effects], ())
     statistics = freed(regrouped(point, groups), varies.by_flight)
     count, folds = len(statistics.flights), folds_of(len(statistics.flights))
     trained, named = np.zeros((count, len(priors.floor))), Counter()
@@ -158,16 +155,12 @@ def borne_out(statistics: Statistics, trained: np.ndarray, theta: np.ndarray) ->
     return float(value), float(value - reach), float(value + reach)
 
 
-def channel_gains(
-    work: Work, cross: Crossed, rng: np.random.Generator, draws: int = DRAWS, box: np.ndarray | None = None
-) -> tuple[ChannelGain, ...]:
+def channel_gains(work: Work, cross: Crossed, box: np.ndarray | None = None) -> tuple[ChannelGain, ...]:
     """Prediction errors on held-out flights of every measured channel.
 
     Args:
         work: of the diagnosis.
         cross: searches that leave flights out.
-        rng: of the bootstrap.
-        draws: of the bootstrap.
         box: squared errors of a black box, shape (F, C, H).
     """
     before, after, names = work.before, work.after, work.problem.model.channels
@@ -177,13 +170,13 @@ def channel_gains(
     combination = np.hstack((np.ones((len(cross.trained), 1)), after.theta - cross.trained))
     errors = plain.error(np.ones(1)), own.error(combination)
     return tuple(
-        _channel(name, c, after, own, errors[0][:, c], errors[1][:, c], None if box is None else box[:, c], rng, draws)
+        _channel(name, c, after, own, errors[0][:, c], errors[1][:, c], None if box is None else box[:, c])
         for c, name in enumerate(names)
         if own.count[:, c].sum() > 0
     )
 
 
-def _channel(name, c, after: Point, own: Forms, before, error, box, rng, draws: int) -> ChannelGain:
+def _channel(name, c, after: Point, own: Forms, before, error, box) -> ChannelGain:
     count = own.count[:, c].sum()
     rows = [w.sigma[w.channel == c] for w in after.windows if np.any(w.channel == c)]
     sigma = float(np.median(np.concatenate(rows)))
@@ -191,7 +184,7 @@ def _channel(name, c, after: Point, own: Forms, before, error, box, rng, draws: 
     def rms(square: np.ndarray) -> float:
         return float(np.sqrt(np.maximum(square.sum(), 0.0) / max(count, 1.0)) * sigma)
 
-    value, low, high = studentised(before.sum(1), error.sum(1), rng, draws)
+    value, low, high = jackknifed(before.sum(1), error.sum(1))
     by_horizon = own.count[:, c].sum(0)
     seen = by_horizon > 0
     curves = [np.sqrt(np.maximum(x.sum(0)[seen], 0.0) / by_horizon[seen]) for x in (before, error, own.floor[:, c])]
@@ -200,18 +193,14 @@ def _channel(name, c, after: Point, own: Forms, before, error, box, rng, draws: 
                        float("nan") if box is None else rms(box), value, low, high, horizons)  # fmt: skip
 
 
-def studentised(before: np.ndarray, after: np.ndarray, rng: np.random.Generator, draws: int) -> tuple[float, float, float]:
-    """Gain 1 - sqrt(sum after / sum before) with a 95 % interval by the studentised bootstrap over groups.
-
-    Of few groups many resamples hold little else than one of them, and say nothing of the spread: there it is Student's interval.
+def jackknifed(before: np.ndarray, after: np.ndarray) -> tuple[float, float, float]:
+    """Gain 1 - sqrt(sum after / sum before) with a 95 % interval by the jackknife over groups.
 
     Args:
         before: sums of squares by group, shape (F,).
         after: the same afterwards.
-        rng: for the draws.
-        draws: number of bootstrap samples.
 
-    Source: Efron and Tibshirani 1993, ch. 12, on the logarithm of the ratio.
+    Source: Efron and Tibshirani 1993, ch. 11, on the logarithm of the ratio; Student's quantile.
     """
     n = len(before)
     if before.sum() <= 0.0 or after.sum() <= 0.0:
@@ -219,48 +208,29 @@ def studentised(before: np.ndarray, after: np.ndarray, rng: np.random.Generator,
     value = np.log(after.sum() / before.sum())
     if n < 2:
         return float(1.0 - np.exp(0.5 * value)), float("nan"), float("nan")
-
-    def spread(w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        a, b = w @ after, w @ before
-        influence = after / a[:, None] - before / b[:, None]
-        return np.log(a / b), np.sqrt(n / (n - 1.0) * (w * influence**2).sum(1))
-
-    _, own = spread(np.ones((1, n)))
-    if n < FEW_GROUPS:
-        reach = 0.5 * stdtrit(n - 1, 0.975) * own[0]
-        return tuple(float(1.0 - np.exp(0.5 * value + side)) for side in (0.0, reach, -reach))
-    weights = rng.multinomial(n, np.full(n, 1.0 / n), size=draws)
-    usable = weights @ before > 0.0
-    ratio, error = spread(weights[usable])
-    t = (ratio - value) / np.maximum(error, 1e-3 * own[0] + 1e-300)
-    upper, lower = np.quantile(t, (0.025, 0.975))
-    low, high = 1.0 - np.exp(0.5 * (value - upper * own[0])), 1.0 - np.exp(0.5 * (value - lower * own[0]))
-    return float(1.0 - np.exp(0.5 * value)), float(low), float(high)
+    with np.errstate(divide="ignore", invalid="ignore"):  # one group may hold everything
+        without = np.log((after.sum() - after) / (before.sum() - before))
+    reach = 0.5 * stdtrit(n - 1, 0.975) * np.sqrt((n - 1.0) / n * ((without - without.mean()) ** 2).sum())
+    return tuple(float(1.0 - np.exp(0.5 * value + side)) for side in (0.0, reach, -reach))
 
 
-def measure(diagnosis: Diagnosis, seed: int = 0) -> HeldOut:
-    """Ask held-out flights about the names of a search; ``seed``: of the bootstrap."""
+def measure(diagnosis: Diagnosis) -> HeldOut:
+    """Ask held-out flights about the names of a search."""
     work, cross = diagnosis.work, crossed(diagnosis)
-    effects = work.problem.model.effects
+    effects = work.problem.effects
     sizes = np.array([diagnosis.theta.get(e.name, 0.0) for e in effects]) / work.problem.priors.floor
     share = borne_out(cross.statistics, cross.trained, sizes)
     named = {effects[j].name: n / len(cross.folds) for j, n in cross.named.items()}
-    channels = channel_gains(work, cross, np.random.default_rng(seed))
-    return HeldOut(*share, channels, named, len(cross.folds), cross.left_out)
+    return HeldOut(*share, channel_gains(work, cross), named, len(cross.folds), cross.left_out)
 
 
-def judged(diagnosis: Diagnosis, seed: int = 0) -> Diagnosis:
-    """A diagnosis as held-out flights leave it.
-
-    Args:
-        diagnosis: of a search.
-        seed: of the bootstrap.
-    """
+def judged(diagnosis: Diagnosis) -> Diagnosis:
+    """A diagnosis as held-out flights leave it."""
     if not diagnosis.theta or diagnosis.overall not in (result.KNOWN, result.UNKNOWN):
         return diagnosis
-    held, alone = measure(diagnosis, seed), not _compares_phases(diagnosis.work.after)
+    held, alone = measure(diagnosis), not _compares_phases(diagnosis.work.after)
     names = list(diagnosis.theta)
-    harmed = [c for c in held.channels if alone and c.harmed and c.high < 0.0]
+    harmed = [c for c in held.channels if alone and c.high < 0.0]
     if held.share <= 0.0 or harmed:
         how = ", ".join(f"{c.channel} by {-100 * c.gain:.0f} %" for c in harmed) or _share(held)
         reason = f"held-out {held.left_out} are explained worse with {', '.join(names)} ({how}); withdrawn"
@@ -317,7 +287,7 @@ def _demoted(diagnosis: Diagnosis, names: Sequence[str], verdict: str, why: str)
 
 def _sized(work: Work, names: Sequence[str]) -> tuple[dict[str, float], tuple[tuple[float, ...], ...], Work]:
     """Sizes with which some of the names alone explain the flights, their covariance, and the work of these."""
-    known, priors, point = [e.name for e in work.problem.model.effects], work.problem.priors, work.after
+    known, priors, point = [e.name for e in work.problem.effects], work.problem.priors, work.after
     active = [known.index(name) for name in names]
     if not active:
         return {}, (), replace(work, after=work.before, active=())

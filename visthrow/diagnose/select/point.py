@@ -11,7 +11,8 @@ from visthrow.diagnose.likelihood import noise as levels
 from visthrow.diagnose.likelihood import stack
 from visthrow.diagnose.likelihood.correlation import Correlation, correlations, with_correlations
 from visthrow.diagnose.likelihood.designs import grams_of, with_residuals
-from visthrow.diagnose.likelihood.evidence import OWN_FLOOR, Priors, covariance, estimate, log_evidence
+from visthrow.diagnose.likelihood.evidence import INEXACT, OWN_FLOOR, Priors, covariance, estimate, log_evidence
+from visthrow.diagnose.likelihood.grammar import TermEffect, forces
 from visthrow.diagnose.likelihood.marginal import (
     Gram,
     Noise,
@@ -20,19 +21,19 @@ from visthrow.diagnose.likelihood.marginal import (
     recorrelated,
     rescored,
 )
-from visthrow.diagnose.likelihood.threads import beside
-from visthrow.diagnose.models.interface import Linearised, Model, Window
+from visthrow.diagnose.likelihood.threads import beside, each
+from visthrow.diagnose.models.interface import Effect, Linearised, Model, Window
 from visthrow.diagnose.select.scatter import Varies, freed, own_shares
 
 ROUNDS = 3
 """Gauss-Newton steps between two linearisations, linearisations in a row each where the last led, and rounds of lost windows: each
 round has some tenth of what the one before had to do."""
 
-LOST, LOST_SHARE = 3.0, 0.15
-"""Squared residual a sample, in noise and latent forces, from which a window is lost; share of windows beyond which none is."""
+UNKNOWN_RATIO = 3.0
+"""What is so many times the noise, or the quietest phase's gusts, is neither."""
 
-SHAKEN_LOST = 1.3
-"""Of the median window's, from which a shaken one is lost: what its unknown motion does is no effect's doing."""
+LOST_SHARE = 0.15
+"""Share of windows that the simulation may lose; where more are so far off, something is missing."""
 
 SMALL_STEP = 0.5 * OWN_FLOOR
 """In floors: a step that is not worth a simulation, and the distance at which an estimate lies on its bound."""
@@ -50,6 +51,8 @@ class Problem:
     kept: tuple[int, ...]  # windows that are looked at
     correlated: Mapping[int, Correlation] = field(default_factory=dict)  # channels whose noise is not white
     varies: Varies = field(default_factory=Varies)  # effects that differ from flight to flight, or from day to day
+    terms: tuple[TermEffect, ...] = ()  # of laws: further effects, whose columns follow from those of the latent forces
+    lost: float = 0.0  # share of the commands that did not come
 
     @staticmethod
     def of(model: Model, windows: Sequence[Window], kept: Sequence[int]) -> "Problem":
@@ -59,16 +62,21 @@ class Problem:
         return Problem(model, priors, tuple(kept), known, Varies(getattr(model, "days", ())))
 
     @property
+    def effects(self) -> tuple[Effect, ...]:
+        """The model's, then the terms: K in all."""
+        return (*self.model.effects, *self.terms)
+
+    @property
     def switches(self) -> np.ndarray:
         """Which effects are another kind of block, shape (K,), bool."""
-        return np.array([e.switch for e in self.model.effects], dtype=bool)
+        return np.array([e.switch for e in self.effects], dtype=bool)
 
     def only(self, windows: Sequence[int]) -> "Problem":
         """The same of some of the windows that are looked at."""
         return replace(self, kept=tuple(self.kept[w] for w in windows))
 
     def sizes(self, theta: np.ndarray) -> dict[str, float]:
-        """Sizes in the effects' units, of those that are not 0; ``theta`` is in floors."""
+        """Sizes of the model's effects in their units, of those that are not 0; ``theta`` is in floors."""
         return {e.name: float(t * e.floor) for e, t in zip(self.model.effects, theta) if t != 0.0}
 
 
@@ -84,7 +92,8 @@ class Point:
     plain: Statistics  # of flights without anything of their own
     varies: Varies  # see :attr:`Problem.varies`
     integrals: stack.Integrals  # of the grams under these noise levels
-    about: Linearised | None  # where the derivatives were taken; None: with another kind of block than the residuals
+    about: Linearised | None  # where the model's derivatives were taken; None: with another kind of block than the residuals
+    commands: Sequence[np.ndarray]  # change of each window by each command that did not come, shape (N, T); none: all came
     device: str  # where the model simulates, and the algebra of all windows with it
 
     @cached_property
@@ -138,9 +147,13 @@ def linearise(problem: Problem, theta: np.ndarray, start: Noise | None = None, w
         start: noise levels to start from.
         windows: what the model gave there, if it was asked already.
     """
-    windows = problem.model.windows(problem.sizes(theta)) if windows is None else windows
-    channels = len(problem.model.channels)
-    found = with_correlations([windows[i] for i in problem.kept], problem.correlated)
+    sizes, channels = problem.sizes(theta), len(problem.model.channels)
+    windows = problem.model.windows(sizes) if windows is None else windows
+    own = with_correlations([windows[i] for i in problem.kept], problem.correlated)
+    commands = problem.model.without_commands(sizes, problem.kept) if problem.lost else ()
+    commands = [_padded(c, w) for c, w in zip(commands, own)]
+    found = own if not problem.terms else each(lambda w: with_terms(w, problem.terms, theta), own)
+    found = found if not commands else [_losing(w, c, problem.lost) for w, c in zip(found, commands)]
     device, floors = getattr(problem.model, "device", "cpu"), problem.priors.floor
     first = grams_of(found, floors, channels, device)
     kept = levels.without_outliers(found, first, floors, device)
@@ -149,13 +162,33 @@ def linearise(problem: Problem, theta: np.ndarray, start: Noise | None = None, w
     raw = [again.get(w, gram) for w, gram in enumerate(first)]
     noise, grams = levels.fit(kept, raw, start, device)
     integrals, at = stack.integrals(grams, noise, device), np.array(theta, dtype=float)
-    about = Linearised(problem.sizes(theta), dict(zip(problem.kept, kept)))
-    return Point(at, kept, raw, grams, noise, _statistics(grams, integrals, noise, at), problem.varies, integrals, about, device)
+    about = Linearised(sizes, {i: w if found is own else replace(o, sigma=w.sigma) for i, w, o in zip(problem.kept, kept, own)})
+    said = _statistics(grams, integrals, noise, at)
+    return Point(at, kept, raw, grams, noise, said, problem.varies, integrals, about, commands, device)
+
+
+def with_terms(window: Window, terms: Sequence[TermEffect], theta: np.ndarray) -> Window:
+    """A window with terms as its last effects, about their sizes at ``theta`` (in floors)."""
+    columns = window.latent @ forces(window, terms)
+    sizes = theta[-len(terms) :] * [e.floor for e in terms]
+    return replace(window, effects=np.hstack((window.effects, columns)), residual=window.residual - columns @ sizes)
+
+
+def _losing(window: Window, columns: np.ndarray, share: float) -> Window:
+    """A window some of whose commands did not come: of each that share, and its deviation among what nobody knows."""
+    sd = np.append(window.nuisance_sd, np.full(columns.shape[1], np.sqrt(share * (1.0 - share))))
+    nuisance = np.hstack((window.nuisance, columns))
+    return replace(window, residual=window.residual - share * columns.sum(1), nuisance=nuisance, nuisance_sd=sd)
+
+
+def _padded(columns: np.ndarray, window: Window) -> np.ndarray:
+    """Columns that say nothing of what stands behind a window's replayed samples."""
+    return np.pad(columns, ((0, len(window.residual) - len(columns)), (0, 0)))
 
 
 def only(point: Point, windows: Sequence[int]) -> Point:
     """The same of some of its windows, with noise levels estimated from these."""
-    own = {name: [getattr(point, name)[w] for w in windows] for name in ("windows", "raw", "grams")}
+    own = {name: [getattr(point, name)[w] for w in windows] for name in ("windows", "raw", "grams", "commands") if getattr(point, name)}
     noise = levels.refit(own["grams"], levels.only(point.noise, own["grams"], windows), point.device)
     return regathered(point, noise=noise, **own)
 
@@ -168,7 +201,8 @@ def lost(point: Point) -> list[int]:
     shares, log_dets = point.integrals.shares(point.grams, point.noise), point.integrals.log_dets
     misfit = [(own.square - log_det) / max(gram.count.sum(), 1.0) for own, log_det, gram in zip(shares, log_dets, point.grams)]
     shaken = np.array([window.shaken for window in point.windows], dtype=bool)
-    far = np.flatnonzero(np.array(misfit) > np.where(shaken, min(SHAKEN_LOST * np.median(misfit), LOST), LOST))
+    most = min((1.0 + INEXACT) * np.median(misfit), UNKNOWN_RATIO)  # what an unknown motion does is no effect's doing
+    far = np.flatnonzero(np.array(misfit) > np.where(shaken, most, UNKNOWN_RATIO))
     return far.tolist() if len(far) <= LOST_SHARE * len(misfit) else []
 
 
@@ -176,8 +210,14 @@ def moved(problem: Problem, point: Point, theta: np.ndarray) -> Point | None:
     """Simulate at ``theta`` but keep the derivatives and noise levels of ``point``; None where the simulation fails there."""
     kinds = problem.switches
     about = point.about if np.array_equal(theta[kinds], point.theta[kinds]) else None
-    residuals = problem.model.residuals(problem.sizes(theta), about)
-    residuals = [residuals[i] for i in problem.kept]
+    own = len(problem.model.effects)  # a term's column stays that of the place where derivatives were taken
+    sizes, change = problem.priors.floor * theta, problem.priors.floor * (theta - point.theta)
+    if np.array_equal(theta[:own], point.theta[:own]):
+        residuals = [w.residual - w.effects[:, own:] @ change[own:] for w in point.windows]
+    else:
+        found = problem.model.residuals(problem.sizes(theta), about)
+        residuals = [found[i] - w.effects[:, own:] @ sizes[own:] for i, w in zip(problem.kept, point.windows)]
+        residuals = [r - problem.lost * c.sum(1) for r, c in zip(residuals, point.commands)] if point.commands else residuals
     if not all(np.all(np.isfinite(r)) for r in residuals):
         return None
     windows = [replace(w, residual=r) for w, r in zip(point.windows, residuals)]

@@ -24,9 +24,6 @@ VERDICTS = {
 
 NO_EFFECT, KNOWN, IN_PART, UNKNOWN = "NO EFFECT", "KNOWN", "EXPLAINED IN PART", "UNKNOWN"
 INCONSISTENT, OUT_OF_DOMAIN = "DATA INCONSISTENT", "OUT OF DOMAIN"
-HARM = 0.01
-"""Share by which a prediction may get worse before it counts as harmed."""
-
 OVERALL = {
     NO_EFFECT: "the model explains the flights",
     KNOWN: "the causes named explain the flights",
@@ -117,11 +114,6 @@ class ChannelGain:
     low: float  # 95 % interval of the gain, by bootstrap over flights
     high: float
     horizons: tuple[tuple[float, float, float, float], ...]  # horizon [s], before, after, floor, in sigmas
-
-    @property
-    def harmed(self) -> bool:
-        """Whether the prediction got worse by more than a per cent."""
-        return self.after > (1.0 + HARM) * self.before
 
 
 @dataclass(frozen=True)

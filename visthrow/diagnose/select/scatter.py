@@ -17,7 +17,7 @@ from scipy.interpolate import CubicSpline
 
 from sim.effects.effect import Effect, RandomEffect
 from visthrow.config.effects import random_effects
-from visthrow.diagnose.likelihood.evidence import Priors, additions, covariance, estimate, log_evidence
+from visthrow.diagnose.likelihood.evidence import INEXACT, Priors, additions, covariance, estimate, log_evidence
 from visthrow.diagnose.likelihood.marginal import Statistics
 
 FLIGHT, DAY, COMMAND = "flight", "day", "command"
@@ -28,8 +28,6 @@ LEAST_FLIGHTS = 4
 """Or days: with fewer a deviation is anybody's guess."""
 REACH, LOOK = np.geomspace(0.02, 6.0, 25), 5
 """Deviations that are tried, in their prior's; every which of them, where flights are left out."""
-SHARE = 0.3
-"""Part of an effect by which flights may differ: the effect's form is never exact."""
 FAR = 3.0
 """Floors of a flight's own estimate from which its derivative is not relied upon."""
 SIZES = np.array([-1.0, -0.7, -0.45, -0.25, -0.1, 0.0, 0.1, 0.25, 0.45, 0.7, 1.0])
@@ -254,7 +252,7 @@ def _ahead(
 
 
 def disagreement(
-    statistics: Statistics, priors: Priors, drawn: Varies, active: Sequence[int], j: int, least: float, share: float = SHARE
+    statistics: Statistics, priors: Priors, drawn: Varies, active: Sequence[int], j: int, least: float, share: float = INEXACT
 ) -> tuple[int | None] | None:
     """Whether flights disagree on an effect of a set: shares of their own say more than a floor and a part of the effect's size would.
 

@@ -6,17 +6,21 @@ from dataclasses import replace
 
 import numpy as np
 
+from sim.params import PlantParams
 from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.likelihood import memory
-from visthrow.diagnose.likelihood.evidence import Priors, threshold
+from visthrow.diagnose.likelihood.evidence import VERY_STRONG, Priors, threshold
 from visthrow.diagnose.likelihood.threads import each
-from visthrow.diagnose.models.interface import Model
+from visthrow.diagnose.models.interface import Model, Window
 from visthrow.diagnose.select import held_out
 from visthrow.diagnose.select.copies import repeated_flights
 from visthrow.diagnose.select.point import ROUNDS, Point, Problem, linearise, lost, only
 from visthrow.diagnose.select.result import Diagnosis
 from visthrow.diagnose.select.selector import Selector
 from visthrow.diagnose.select.verdicts import conclude, out_of_domain
+from visthrow.diagnose.throw import interface
+from visthrow.diagnose.throw.interface import Mistake
+from visthrow.logs.flightlog import FlightLog
 
 
 def explain(
@@ -42,12 +46,12 @@ def explain(
     windows = model.windows({})
     if not windows:
         raise DiagnoseError("the model found no stretch of flight to look at in these logs")
-    finite = each(lambda w: all(np.all(np.isfinite(a)) for a in (w.residual, w.effects, w.nuisance, w.latent)), windows)
+    simulated = each(finite, windows)
     duplicates = repeated_flights(windows)
     left_out = {*without, *duplicates}
-    kept = tuple(i for i, w in enumerate(windows) if finite[i] and w.flight not in left_out)
+    kept = tuple(i for i, w in enumerate(windows) if simulated[i] and w.flight not in left_out)
     if len(kept) < 0.5 * sum(w.flight not in left_out for w in windows) or not kept:
-        return out_of_domain(model, windows, sum(finite), seed)
+        return out_of_domain(model, windows, sum(simulated), seed)
     problem = Problem.of(model, windows, kept)
     priors = problem.priors
     for c, own in problem.correlated.items():
@@ -69,8 +73,65 @@ def explain(
         if not search.stands_without(gone, problem, nominal, least):
             search = Selector(problem, nominal, least, say, laws)
         search.run()
-    diagnosis = held_out.judged(conclude(search), seed)
+    diagnosis = held_out.judged(conclude(search))
     return replace(diagnosis, duplicates=duplicates, seconds=time.monotonic() - begun, seed=seed)
+
+
+def put_right(
+    logs: Sequence[FlightLog], plant: PlantParams, build: Callable[[Sequence[FlightLog], tuple[Mistake, ...]], Model]
+) -> tuple[Model, list[FlightLog]]:
+    """A model of logs whose commands are as the simulation takes them: without each suspected mistake that does not earn its price.
+
+    Args:
+        logs: of flights.
+        plant: that the commands are for.
+        build: makes a model of logs, given the mistakes that were put right in them.
+
+    Returns:
+        The model, and its logs.
+    """
+    made, known = interface.commanded(logs, plant)
+    kept = interface.suspected(made, plant)
+
+    def built(mistakes: Sequence[Mistake]) -> tuple[Model, list[FlightLog]]:
+        mended = list(made)
+        for mistake in mistakes:
+            mended = [mistake.mended(log) for log in mended]
+        return build(mended, (*known, *mistakes)), mended
+
+    here = built(kept)
+    for mistake in list(kept):
+        rest = [k for k in kept if k is not mistake]
+        try:
+            there = built(rest)
+        except DiagnoseError:  # no flight can be replayed without it
+            continue
+        nats = ahead(here[0], there[0])
+        if nats > VERY_STRONG + np.log(mistake.ways):
+            kept = [replace(k, nats=nats) if k is mistake else k for k in kept]
+        else:
+            kept, here = rest, there
+    here[0].mistakes = (*known, *kept)
+    return here
+
+
+def ahead(model: Model, other: Model) -> float:
+    """Nats by which a model explains the windows that it shares with another better, nothing named in either."""
+    windows = [m.windows({}) for m in (model, other)]
+    at = [{(w.flight, w.time[0], len(w.time)): i for i, w in enumerate(own) if finite(w)} for own in windows]
+    shared = sorted(at[0].keys() & at[1].keys())
+    if 2 * len(at[1]) < len(windows[1]) or not shared:  # the other fails in most
+        return np.inf if 2 * len(at[0]) >= len(windows[0]) else -np.inf
+    value = []
+    for m, own, number in zip((model, other), windows, at):
+        problem = Problem.of(m, own, [number[key] for key in shared])
+        value.append(linearise(problem, np.zeros(len(m.effects)), windows=own).evidence(problem.priors, ()))
+    return value[0] - value[1]
+
+
+def finite(window: Window) -> bool:
+    """Whether a window was simulated."""
+    return all(np.all(np.isfinite(a)) for a in (window.residual, window.effects, window.nuisance, window.latent))
 
 
 def _least(nominal: Point, priors: Priors, seed: int, say: Callable[[str], None]) -> float:

@@ -29,20 +29,17 @@ from visthrow.diagnose.select.point import (
     with_varying,
 )
 from visthrow.diagnose.select.result import Step
-from visthrow.diagnose.select.scatter import CHAIN, deviations
+from visthrow.diagnose.select.scatter import CHAIN, Varies, deviations
 from visthrow.diagnose.select.state import Move, SearchState
 
-MOST_NAMES = 6
+MOST_NAMES = 3 * CHAIN
 """A longer list of causes is a wrong form, not a finding."""
 
 SHORTLIST = 3
-"""Additions whose simulation is run again in each round."""
+"""Sets of a kind whose simulation is run again in each round, of exchanges twice as many."""
 
 DOUBT = 15.0
 """Nats behind up to which a set is simulated, where statistics of other sizes may be wrong; up to ``STRONG`` it counts as possible."""
-
-MOST, MOST_NEAR = 6, 16
-"""Sets that are simulated so, and how many where they are that near: of what hover shows, a dozen causes may be the reason."""
 
 AHEAD = 1.0
 """Nats by which an exchange must be ahead: less is not worth more than a bare mention (Kass and Raftery 1995)."""
@@ -76,7 +73,7 @@ class Selector(SearchState):
                 continue
             if len(self.active) < MOST_NAMES and self._vary(last=True):
                 continue
-            if self._exchange() or self._propose():
+            if self._exchange() or self._propose() or self._lose_commands(0.0):
                 continue
             return
 
@@ -91,10 +88,10 @@ class Selector(SearchState):
         """Add the best candidate; False where none is good enough."""
         free, usable = with_all_effects_noise(self.problem, self.point), self._usable()
         screened, under_free = (self._additions(point, usable) for point in (self.point, free))
-        worth = self.least - STRONG
-        best = usable[np.argsort(-under_free[usable])][:SHORTLIST].tolist()
-        short = [j for j in best if under_free[j] > max(worth, HOPELESS * under_free.max())]
-        short += [j for j in usable[np.argsort(-screened[usable])][:SHORTLIST].tolist() if screened[j] > worth and j not in short]
+        worth = self.least - STRONG * ~self.problem.switches  # columns of other kinds of blocks are differences of simulations already
+        hope = np.maximum(worth, HOPELESS * under_free.max())
+        best = [(gain, least, usable[np.argsort(-gain[usable])][:SHORTLIST]) for gain, least in ((under_free, hope), (screened, worth))]
+        short = list(dict.fromkeys(int(j) for gain, least, own in best for j in own if gain[j] > least[j]))
         if not short:
             return False
         alike = self._alike(short[int(np.argmax(under_free[short]))])
@@ -113,7 +110,7 @@ class Selector(SearchState):
 
     def _alike(self, j: int) -> list[int]:
         """What the catalogue says looks like an effect: where a rope whips, derivatives may promise far too little."""
-        names = self.problem.model.effects[j].confused_with
+        names = self.problem.effects[j].confused_with
         return [k for k in np.flatnonzero(~self.problem.switches).tolist() if self.name(k) in names]
 
     def _contradicted(self) -> float:
@@ -191,14 +188,14 @@ class Selector(SearchState):
             alone += self.linear((), self.nominal) - self.linear(active, self.nominal)
             singles |= {(k,): max(singles.get((k,), -np.inf), alone[k]) for k in usable.tolist()}
         ranked = _ranked(singles, DOUBT)
-        ranked = [m for i, m in enumerate(ranked) if i < MOST or (i < MOST_NEAR and abs(m.nats) < STRONG)]
+        ranked = [m for i, m in enumerate(ranked) if i < 2 * SHORTLIST or abs(m.nats) < STRONG]
         alone = [] if self.terms else [Move((k,), 0.0) for k in usable.tolist() if self.is_term(k)]  # not to be told from here
         return [*ranked, *_ranked(pairs, DOUBT)[:SHORTLIST], *(m for m in alone if m.active not in [r.active for r in ranked])]
 
     def _rests(self) -> Iterator[tuple[int, ...]]:
         """The set, it without one or two of its names, and without those that act in a law's block."""
         lawful = np.flatnonzero(self.term_columns).tolist()
-        blocks = {self.problem.model.effects[j].block: j for j in lawful}
+        blocks = {self.problem.effects[j].block: j for j in lawful}
         yield from {(*(j for j in self.names if not self._acts_beside(j, [k])), *self.terms) for k in blocks.values()}
         for gone in range(min(2, len(self.active)) + 1):
             yield from combinations(self.active, len(self.active) - gone)
@@ -308,12 +305,12 @@ class Selector(SearchState):
             last: there is no name any more: any effect may be what varies, if no law is why flights differ.
         """
         scatter = [s for s in self.scatter(self.active, every=last) if s.found]
-        varies = deviations(scatter, self.priors, [e.name for e in self.problem.model.effects], self.problem.varies.days)
+        varies = deviations(scatter, self.priors, [e.name for e in self.problem.effects], self.problem.varies.days)
         new = [s for s in scatter if not {self.name(j) for j in self.problem.varies.effects} & set(s.of)]
         most = max((s.nats for s in new), default=0.0)
         best = 0.0 if last else max(self._additions(self.point, self._usable()).max(), 0.0)
         rival = max(most, best, *self.refused.values())
-        if (last or new or not self.active) and self._drop_commands(rival, last):
+        if not (last or self.active) and self._lose_commands(rival):
             return True
         if not new or most < best:
             return False
@@ -329,24 +326,22 @@ class Selector(SearchState):
         self.visited = {frozenset(self.active)}
         return True
 
-    def _drop_commands(self, rival: float, last: bool) -> bool:
+    def _lose_commands(self, rival: float) -> bool:
         """Let commands have got lost, if that says more than what varies and than any name; False where it does not.
+
+        It is asked before anything is named, and where the search would end.
 
         Args:
             rival: nats of what says most beside it.
-            last: whether to look for laws before, whose form commands that are late have in part.
         """
         if self.dropped is not None or self.terms or self.came is self.point:
             return False
-        found = dropped.verdict(self.problem, self.point, self.active, self.least)
-        self.came = self.point if found is None else None
-        if found is None or not found.found or found.nats <= rival + self.varying_brings():
+        found, self.came = dropped.verdict(*terms.bare(self.problem, self.point), self.active, self.least), self.point
+        if found is None or not found.found or found.nats <= max(rival, *self.refused.values(), 0.0) + self.varying_brings():
             return False
-        if last and self._propose() and (self._add() or self._exchange()):
-            return True
         problem, point = terms.bare(self.problem, self.point)
         self.progress(f"commands got lost: {found.size:.1%} of them, {found.nats:.1f} nats")
-        self.dropped, self.problem = found, dropped.lost(problem, found.size)
+        self.problem = replace(problem, lost=found.size, varies=Varies(problem.varies.days))
         self.nominal = linearise(self.problem, np.zeros_like(point.theta), point.noise)
         self.origin = linearise(self.problem, point.theta, point.noise) if self.active else self.nominal
         self.point = candidate(self.problem, self.origin, self.active)

@@ -7,14 +7,13 @@ from typing import Any
 import numpy as np
 
 from visthrow.diagnose.likelihood import grammar
-from visthrow.diagnose.likelihood.evidence import OWN_FLOOR, SPIKE, Priors, certainty, estimate, log_evidence
+from visthrow.diagnose.likelihood.evidence import INEXACT, OWN_FLOOR, SPIKE, Priors, certainty, estimate, log_evidence
 from visthrow.diagnose.likelihood.marginal import Statistics
 from visthrow.diagnose.select import terms
 from visthrow.diagnose.select.excess import acts_on
 from visthrow.diagnose.select.point import ROUNDS, Point, Problem, advantage, curvature, fitted, linearise, moved
 from visthrow.diagnose.select.result import Law, Step
 from visthrow.diagnose.select.scatter import (
-    SHARE,
     Scatter,
     Varies,
     by_flight,
@@ -23,9 +22,6 @@ from visthrow.diagnose.select.scatter import (
     straightened,
     varying,
 )
-
-WHOLE = 0.7
-"""Of another kind of block that flights must ask for: of one that is not there, whose state has more freedom, a part is taken."""
 
 
 @dataclass(frozen=True)
@@ -89,12 +85,12 @@ class SearchState:
 
     def name(self, j: int) -> str:
         """Return the name of a candidate by its number."""
-        return self.problem.model.effects[j].name
+        return self.problem.effects[j].name
 
     @property
     def prices(self) -> np.ndarray:
         """Return what the name of each candidate costs [nats], shape (K,)."""
-        return self.least + np.array([getattr(e, "price", 0.0) for e in self.problem.model.effects])
+        return self.least + np.array([getattr(e, "price", 0.0) for e in self.problem.effects])
 
     def price(self, active: Sequence[int], beside: bool = True) -> float:
         """Return what the names of a set cost [nats].
@@ -109,7 +105,7 @@ class SearchState:
 
     def _acts_beside(self, j: int, laws: Sequence[int]) -> bool:
         """Whether an effect acts in the block of one of some laws."""
-        blocks = {self.problem.model.effects[k].block for k in laws}
+        blocks = {self.problem.effects[k].block for k in laws}
         if blocks and j not in self.acting:
             self.acting[j] = acts_on(self.nominal, j), acts_on(self.nominal, j, joint=True)
         return bool(blocks) and self.acting[j][grammar.JOINT in blocks] in blocks
@@ -122,12 +118,12 @@ class SearchState:
 
     def is_term(self, j: int) -> bool:
         """Tell whether a candidate is a term of a law."""
-        return isinstance(self.problem.model.effects[j], terms.TermEffect)
+        return j >= len(self.problem.model.effects)
 
     @property
     def term_columns(self) -> np.ndarray:
         """Return which candidates are terms, shape (K,), bool."""
-        return np.array([self.is_term(j) for j in range(len(self.priors.floor))])
+        return np.arange(len(self.priors.floor)) >= len(self.problem.model.effects)
 
     def linear(self, active: Sequence[int], point: Point) -> float:
         """Return what a set is worth by the statistics of a point alone."""
@@ -169,7 +165,7 @@ class SearchState:
         """
         asked = self.point, tuple(active), every
         if self.varied is None or self.varied[0][0] is not self.point or self.varied[0][1:] != asked[1:]:
-            effects, about = self.problem.model.effects, self.sizes(active)
+            effects, about = self.problem.effects, self.sizes(active)
             others = by_flight([e for j, e in enumerate(effects)
                                 if j in self.problem.varies.effects or (every and not e.switch and not self.is_term(j))])  # fmt: skip
             self.varied = asked, varying(self.point.plain, about, self.priors, [e.name for e in effects], self.least, self._again,
@@ -185,7 +181,7 @@ class SearchState:
         """Tell whether a candidate of a set could be named at all, however many nats it brings."""
         if self.problem.switches[j]:
             share = estimate(point.information, point.score, self.priors, list(active))[j] * self.priors.floor[j]
-            if share < WHOLE:
+            if share < 1.0 - INEXACT:  # of one that is not there, whose state has more freedom, a part is taken
                 self.progress(f"{self.name(j)} is there or not, and these flights ask for a part of it; it is not named")
                 return False
         if not self.sure(point, active, j):
@@ -197,7 +193,7 @@ class SearchState:
         """Tell whether an effect of a set is surely not 0, whatever half a floor of it is."""
         return bool(certainty(point.information, point.theta, self.priors, active)[list(active).index(j)] > 1.0)
 
-    def disagreement_on(self, point: Point, active: Sequence[int], j: int, share: float = SHARE) -> tuple[int | None] | None:
+    def disagreement_on(self, point: Point, active: Sequence[int], j: int, share: float = INEXACT) -> tuple[int | None] | None:
         """Return whether flights disagree on an effect of a set: see :func:`visthrow.diagnose.select.scatter.disagreement`."""
         return disagreement(point.plain, self.priors, point.varies, active, j, self.least, share)
 
@@ -241,7 +237,7 @@ class SearchState:
         Names that act in a law's block may be a part of its form. A name acts there by its column or by what the other names cannot
         stand in for, as two delays that differ by a force. What is worth nothing without those is not told either.
         """
-        effects, names = self.problem.model.effects, self.names
+        effects, names = self.problem.effects, self.names
         blocks = {effects[j].block for j in self.terms}
         joint = grammar.JOINT in blocks
         near = {j for j in names if acts_on(self.point, j, joint=joint) in blocks}

@@ -3,47 +3,37 @@
 The column of a term is G A v: G are the derivatives by the latent forces, A the latent forces that anything exerted at the knots
 stands for, v the term's values there. So thousands of terms are screened at once without a simulation: a window needs A' G' V^-1 G A
 alone, with V as in :mod:`visthrow.diagnose.likelihood.marginal`, and all terms are a product of tables. The best become effects of
-the model (:class:`WithTerms`) and are weighed like any other.
+the problem (:attr:`visthrow.diagnose.select.point.Problem.terms`) and are weighed like any other.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
-from typing import Any
+from functools import lru_cache
 
 import numpy as np
 import torch
 from scipy.linalg import lapack
 
-from sim.effects.effect import Effect
 from visthrow.diagnose.likelihood import grammar
 from visthrow.diagnose.likelihood.evidence import STRONG, Priors, covariance
+from visthrow.diagnose.likelihood.grammar import TermEffect, carries, forces
 from visthrow.diagnose.likelihood.marginal import Gram, WindowStatistics, gather
 from visthrow.diagnose.likelihood.stack import BATCH, statistics
 from visthrow.diagnose.likelihood.threads import each
 from visthrow.diagnose.likelihood.transfer import all_to_host, side_by_side
-from visthrow.diagnose.models.interface import LATENT_BLOCKS, Linearised, Model, Window
-from visthrow.diagnose.select.point import Point, Problem, regathered
+from visthrow.diagnose.models.interface import LATENT_BLOCKS
+from visthrow.diagnose.select.excess import floors_of
+from visthrow.diagnose.select.point import UNKNOWN_RATIO, Point, Problem, regathered
 from visthrow.diagnose.select.result import Law
 
 LAW = 2.0 * STRONG
 """Nats by which a term must be ahead where it takes the place of no name, and which a name costs more where a law acts."""
 
-REACH = 3.0
-"""Prior deviation of a term's root mean square force, in the block's strongest latent force."""
-
 NARROW = 1e-3
 """Floor of a term in its prior deviation: a term is there or it is not; the usual deviation of a name in that of one of any size."""
 
-MATERIAL = 0.5
-"""Root mean square force of a term, in the block's usual latent force, below which it does not matter: that of a gust moves a
-landing by 5 mm within half a second."""
-
-WEIGHED = 5
-"""Terms that become effects to be weighed."""
-
-ROUGHER = 2.0
-"""While terms are screened, no phase is rougher than so many times the usual."""
+WEIGHED = 6
+"""Terms that become effects to be weighed: as many as other sets that are simulated in their place."""
 
 
 @lru_cache(maxsize=32)
@@ -73,11 +63,6 @@ def felt(block: str) -> str:
     return "vehicle torque" if block == grammar.JOINT else block
 
 
-def carries(latent_block: np.ndarray, block: str) -> bool:
-    """Whether a window has all latents that terms of a block act through."""
-    return set(map(LATENT_BLOCKS.index, grammar.acting(block))) <= set(np.unique(latent_block).tolist())
-
-
 def usual(levels: Mapping[tuple[int, str], float], block: int) -> float:
     """The lower median of a block's levels; the least of a phase with few windows may be anything."""
     own = sorted(level for (b, _), level in levels.items() if b == block)
@@ -90,7 +75,7 @@ def calmed(point: Point) -> tuple[Point, list[WindowStatistics]]:
     A force that the model lacks is taken for gusts in the phases in which it acts; there no term of it would stand out.
     """
     levels = point.noise.latent_sd
-    limits = {block: ROUGHER * usual(levels, block) for block in {block for block, _ in levels}}
+    limits = {block: UNKNOWN_RATIO * usual(levels, block) for block in {block for block, _ in levels}}
     noise = replace(point.noise, latent_sd={key: min(level, limits[key[0]]) for key, level in levels.items()})
     parts = statistics(point.grams, noise, point.device)
     return replace(point, noise=noise, plain=gather(point.grams, parts, point.theta)), parts
@@ -183,106 +168,19 @@ def distinct(gain: np.ndarray, of: Screen, most: int) -> list[int]:
     return kept
 
 
-@dataclass(frozen=True)
-class TermEffect(Effect):
-    """A term as an effect of a model; its size is the coefficient."""
-
-    term: grammar.Term | None = None
-    price: float = 0.0  # of its name, beyond the threshold [nats]
-
-
-class WithTerms:
-    """A model whose last effects are terms: their columns are those of the forces that they exert at the knots."""
-
-    def __init__(self, model: Model, terms: Sequence[TermEffect]):
-        """Add terms to a model, which may have some already."""
-        self.model, self.terms = (model.model, (*model.terms, *terms)) if isinstance(model, WithTerms) else (model, tuple(terms))
-        self.columns: dict[int, np.ndarray] = {}  # of the terms where derivatives were taken last, by number of the window
-        self._about: tuple[Linearised | None, Linearised | None] = None, None  # with terms, and without
-        self._last: tuple[Mapping[str, float] | None, list[np.ndarray]] = None, []
-
-    def __getattr__(self, name: str) -> Any:
-        """Return what the model itself has."""
-        return getattr(self.__dict__["model"], name)
-
-    @cached_property
-    def effects(self) -> tuple[Effect, ...]:
-        """Effects of the model, and the terms."""
-        return (*self.model.effects, *self.terms)
-
-    def windows(self, theta: Mapping[str, float]) -> list[Window]:
-        """See :class:`Model`."""
-        found = each(lambda w: with_columns(w, self.terms), self.model.windows(self._own(theta)))
-        self.columns = dict(enumerate(w.effects[:, -len(self.terms) :] for w in found))
-        return [replace(w, residual=w.residual - self.columns[i] @ self._sizes(theta)) for i, w in enumerate(found)]
-
-    def residuals(self, theta: Mapping[str, float], about: Linearised | None = None) -> list[np.ndarray]:
-        """See :class:`Model`; a term's column stays that of the place where derivatives were taken."""
-        own, sizes = self._own(theta), self._sizes(theta)
-        if about is not self._about[0]:
-            self._about = about, about and without_columns(about, self.terms)
-            self._last = None, []
-        if about is not None:
-            self.columns = {i: w.effects[:, -len(sizes) :] for i, w in about.windows.items()}
-        if self._last[0] != own:
-            self._last = own, self.model.residuals(own, self._about[1])
-        return [r - self.columns[i] @ sizes if i in self.columns else r for i, r in enumerate(self._last[1])]
-
-    def _own(self, theta: Mapping[str, float]) -> dict[str, float]:
-        return _without_terms(theta, self.terms)
-
-    def _sizes(self, theta: Mapping[str, float]) -> np.ndarray:
-        return np.array([theta.get(e.name, 0.0) for e in self.terms])
-
-
-def with_columns(window: Window, terms: Sequence[TermEffect]) -> Window:
-    """The window with the terms as its last effects."""
-    through = forces(window, grammar.Known(window.knots), terms)
-    return replace(window, effects=np.hstack((window.effects, window.latent @ through)))
-
-
-def without_columns(about: Linearised, terms: Sequence[TermEffect]) -> Linearised:
-    """The same without its last effects, which are terms."""
-    windows = {i: replace(w, effects=w.effects[:, : -len(terms)]) for i, w in about.windows.items()}
-    return Linearised(_without_terms(about.theta, terms), windows)
-
-
-def _without_terms(theta: Mapping[str, float], terms: Sequence[TermEffect]) -> dict[str, float]:
-    names = {e.name for e in terms}
-    return {name: size for name, size in theta.items() if name not in names}
-
-
-def forces(window: Window, known: grammar.Known, terms: Sequence[TermEffect]) -> np.ndarray:
-    """Latent forces at a window's knots that a coefficient of 1 of each term stands for, shape (L, T)."""
-    out = np.zeros((len(window.latent_block), len(terms)))
-    for i, effect in enumerate(terms):
-        if carries(window.latent_block, effect.term.block):
-            values = grammar.Layout.of([effect.term]).table(known).ravel()
-            out[:, i] = grammar.through_latents(window, known, effect.term.block) @ values
-    return out
-
-
 def extended(problem: Problem, point: Point, terms: Sequence[TermEffect]) -> tuple[Problem, Point]:
     """The problem and a point of it with more terms as effects, at 0; nothing is simulated again."""
-    model, known = WithTerms(problem.model, terms), knots_of(point)
-    priors, count = Priors.of(tuple(model.effects), tuple(model.channels)), len(terms)
-    through = each(lambda w: forces(point.windows[w], known[w], terms), range(len(known)))
-
-    def longer(window: Window, w: int) -> Window:
-        return replace(window, effects=np.hstack((window.effects, window.latent @ through[w])))
+    wide = replace(problem, terms=(*problem.terms, *terms))
+    wide = replace(wide, priors=Priors.of(wide.effects, tuple(problem.model.channels)))
+    through = each(lambda window: forces(window, terms), point.windows)
 
     def column(w: int) -> Gram:
-        gram, own = point.grams[w], through[w] * priors.floor[-count:]
+        gram, own = point.grams[w], through[w] * wide.priors.floor[-len(terms) :]
         return _appended(gram, lapack.dtrtrs(gram.factor, own, lower=1)[0] if gram.latents else own)
 
-    windows, grams = each(lambda w: longer(point.windows[w], w), range(len(known))), each(column, range(len(known)))
-    about = point.about
-    if about is not None:
-        own = {i: longer(about.windows[i], w) for w, i in enumerate(problem.kept) if i in about.windows}
-        about = replace(about, windows=own)
-    at = np.append(point.theta, np.zeros(count))
-    wide = regathered(point, theta=at, windows=windows, grams=grams, about=about)
-    return replace(problem, model=model, priors=priors), wide
+    windows = [replace(w, effects=np.hstack((w.effects, w.latent @ own))) for w, own in zip(point.windows, through)]
+    at = np.append(point.theta, np.zeros(len(terms)))
+    return wide, regathered(point, theta=at, windows=windows, grams=each(column, range(len(windows))))
 
 
 def _appended(gram: Gram, columns: np.ndarray) -> Gram:
@@ -297,22 +195,14 @@ def _appended(gram: Gram, columns: np.ndarray) -> Gram:
 
 def bare(problem: Problem, point: Point) -> tuple[Problem, Point]:
     """The problem and a point of it without its terms, whose shares are left out of the residuals where they are not 0."""
-    model = problem.model
-    if not isinstance(model, WithTerms):
+    if not problem.terms:
         return problem, point
-    count = len(model.model.effects)
+    own = replace(problem, terms=())
+    own, count = replace(own, priors=Priors.of(own.effects, tuple(problem.model.channels))), len(own.effects)
     windows = [replace(w, effects=w.effects[:, :count]) for w in point.windows]
-    grams = [_without(gram, len(model.terms)) for gram in point.grams]
-    about = point.about
-    if about is not None:
-        about = without_columns(about, model.terms)
-    priors = Priors.of(tuple(model.model.effects), tuple(model.channels))
-    at = regathered(point, theta=point.theta[:count], windows=windows, grams=grams, about=about)
-    return replace(problem, model=model.model, priors=priors), at
-
-
-def _without(gram: Gram, count: int) -> Gram:
-    return replace(gram, inner=gram.inner[:, :-count, :-count], cross=gram.cross[:, :-count])
+    more = len(problem.terms)
+    grams = [replace(g, inner=g.inner[:, :-more, :-more], cross=g.cross[:, :-more]) for g in point.grams]
+    return own, regathered(point, theta=point.theta[:count], windows=windows, grams=grams)
 
 
 def knots_of(point: Point) -> list[grammar.Known]:
@@ -337,10 +227,10 @@ def shortlist(problem: Problem, point: Point, active: Sequence[int], strongest: 
     price = {depth: float(np.log(sum(d <= depth for d in depths))) for depth in set(depths)}
     found: list[tuple[float, grammar.Term, float]] = []
     for block, of in screens.items():
-        gain, prior = gains(calm, problem.priors, active, of, REACH * strongest[block])
+        gain, prior = gains(calm, problem.priors, active, of, UNKNOWN_RATIO * strongest[block])
         gain -= [price[term.depth] for term in of.terms]
         found += [(float(gain[i]), of.terms[i], float(prior[i])) for i in distinct(gain, of, WEIGHED)]
-    there = {e.term for e in problem.model.effects if isinstance(e, TermEffect)}
+    there = {e.term for e in problem.effects if isinstance(e, TermEffect)}
     best = sorted((f for f in found if f[0] > least and f[1] not in there), key=lambda f: -f[0])[:WEIGHED]
     return [as_effect(term, prior, price[term.depth]) for _, term, prior in best]
 
@@ -363,7 +253,7 @@ def strongest_forces(point: Point) -> dict[str, float]:
 
 
 def matters(problem: Problem, point: Point, j: int, size: float) -> bool:
-    """Whether a term's force, in the phase where it is strongest, exceeds what does not matter in a block it acts in.
+    """Whether a term's force, in a phase, exceeds what does not move a landing in a block it acts in.
 
     Args:
         problem: with the term.
@@ -371,21 +261,21 @@ def matters(problem: Problem, point: Point, j: int, size: float) -> bool:
         j: number of the term among the effects.
         size: its coefficient.
     """
-    term = problem.model.effects[j].term
+    term = problem.effects[j].term
     layout = grammar.Layout.of([term])
     square: dict[tuple[int, str], list[float]] = {}
     for window, gram, own in zip(point.windows, point.grams, knots_of(point)):
         if carries(gram.latent_block, term.block):
             for block, values in grammar.loads(term.block, own, layout.table(own)).items():
                 square.setdefault((LATENT_BLOCKS.index(block), window.phase), []).append(float((values**2).sum((1, 2)).mean()))
-    common = {block: usual(point.noise.latent_sd, block) for block, _ in square}
-    return any(abs(size) * np.sqrt(np.mean(values)) > MATERIAL * common[block] for (block, _), values in square.items())
+    floors = floors_of(problem, point)
+    return any(abs(size) * np.sqrt(np.mean(values)) > floors.get(key, 0.0) for key, values in square.items())
 
 
 def laws(problem: Problem, point: Point, active: Sequence[int], nats: float) -> tuple[Law, ...]:
     """The terms of a set with coefficients and deviations; ``nats`` is what they bring."""
     sigma = covariance(point.information, problem.priors.deviation(list(active)))
-    mean, sd, effects = sigma @ point.score, np.sqrt(np.diag(sigma)), problem.model.effects
+    mean, sd, effects = sigma @ point.score, np.sqrt(np.diag(sigma)), problem.effects
     told = [(effects[j].term, effects[j].floor, j) for j in active if isinstance(effects[j], TermEffect)]
     return tuple(
         Law(t.formula, t.block, t.factors, t.vector, float(mean[j] * floor), float(sd[j] * floor), t.unit, float(nats))

@@ -4,8 +4,19 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.stats import chi2
 
-from visthrow.diagnose.likelihood.evidence import NORMAL_95, OWN_FLOOR, Priors, certainty, covariance, estimate
+from visthrow.diagnose.likelihood.evidence import (
+    CALIBRATION_QUANTILE,
+    INEXACT,
+    NORMAL_95,
+    OWN_FLOOR,
+    Priors,
+    certainty,
+    covariance,
+    estimate,
+)
+from visthrow.diagnose.likelihood.marginal import TAIL
 from visthrow.diagnose.models.interface import Model, Window
 from visthrow.diagnose.select import result
 from visthrow.diagnose.select.excess import acts_on, levels, too_strong
@@ -14,16 +25,11 @@ from visthrow.diagnose.select.result import Diagnosis, Finding, Law, Level
 from visthrow.diagnose.select.scatter import CHAIN, FORM, Varies, deviations, freed
 from visthrow.diagnose.select.selector import Selector
 from visthrow.diagnose.select.state import Work
-from visthrow.diagnose.select.terms import WithTerms, bare
+from visthrow.diagnose.select.terms import bare
 
-HALF_PRIOR = 0.5
-"""An effect whose posterior deviation exceeds this share of its prior's was not seen."""
+BIT = 0.5
+"""An effect whose posterior deviation exceeds this share of its prior's was not seen: flights say less than a bit about it."""
 
-IMPLAUSIBLE_FORCE = 0.3
-"""Latent force, in the thrust that carries the vehicle, that no missing cause explains: the channels do not belong together."""
-
-ROUGH = 4.0
-"""Latent force of a window, in its phase's, from which something happened there."""
 
 def conclude(search: Selector) -> Diagnosis:
     """Turn a finished search into verdicts.
@@ -91,7 +97,7 @@ def _sure(point: Point, priors: Priors, active: Sequence[int]) -> list[int]:
 
 def _without_laws(search: Selector, point: Point) -> Selector:
     """The search as if the laws of its set were known: what they explain is left out of the residuals."""
-    if not isinstance(search.problem.model, WithTerms):
+    if not search.problem.terms:
         return replace(search, work=point)
     alone = moved(search.problem, point, np.where(search.term_columns, 0.0, point.theta)) or point
     problem = bare(search.problem, point)[0]
@@ -112,7 +118,8 @@ def _different(explanations: Sequence[Sequence[Law]]) -> tuple[Law, ...]:
 
 def _events(search: Selector, point: Point) -> tuple[int, ...]:
     """Flights that were left out for what happened there, and flights with a window far rougher than its phase."""
-    rough = {window.flight for window, share in zip(point.windows, point.noise.share) if share.max() > ROUGH}
+    square = TAIL / chi2.ppf((1.0 - CALIBRATION_QUANTILE) / point.noise.share.size, TAIL)  # of the roughest, with Student's tails
+    rough = {window.flight for window, share in zip(point.windows, point.noise.share) if share.max() ** 2 > square}
     return tuple(sorted({*search.events, *rough}))
 
 
@@ -134,9 +141,9 @@ def _overall(
 ) -> tuple[str, str, list[str], set[int]]:
     """Overall verdict, block of an unknown effect, reasons, and the names that are withdrawn for it."""
     point, every = search.point, set(search.active)
-    strong = too_strong(point, IMPLAUSIBLE_FORCE)
+    strong = too_strong(point, INEXACT)  # what no missing cause explains: the channels do not belong together
     if strong:
-        reason = (f"after everything the catalogue can do, forces above {IMPLAUSIBLE_FORCE:.0%} of the thrust are missing in the "
+        reason = (f"after everything the catalogue can do, forces above {INEXACT:.0%} of the thrust are missing in the "
                   f"phases {', '.join(strong)}: commands and poses, units or axes do not belong together")  # fmt: skip
         return result.INCONSISTENT, "", [reason], every
     if search.refused and not search.active:
@@ -146,12 +153,12 @@ def _overall(
     reasons = [_excess(level) for level in excessive]
     if search.terms:
         untold, said = search.law()
-        return result.UNKNOWN, search.problem.model.effects[search.terms[0]].block, [said, *reasons], untold
+        return result.UNKNOWN, search.problem.effects[search.terms[0]].block, [said, *reasons], untold
     stuck = [j for j in search.active if _on_bound(search, j)]
     if stuck:
         names = ", ".join(map(search.name, stuck))
         reasons.append(f"{names} would have to lie outside what is physically possible; the form is another")
-        return result.UNKNOWN, acts_on(point, stuck[0]) or search.problem.model.effects[stuck[0]].block, reasons, every
+        return result.UNKNOWN, acts_on(point, stuck[0]) or search.problem.effects[stuck[0]].block, reasons, every
     if excessive:
         worst = max(excessive, key=lambda level: level.nats)
         return result.UNKNOWN, worst.block, reasons, _withdrawn(search, excessive)
@@ -185,7 +192,7 @@ def _on_bound(search: Selector, j: int) -> bool:
 
 
 def _finding(search: Selector, point: Point, j: int, active: list[int], spread: np.ndarray, withdrawn: set[int]) -> Finding:
-    effect, priors = search.problem.model.effects[j], search.priors
+    effect, priors = search.problem.effects[j], search.priors
     blank = Finding(effect.name, result.UNOBSERVABLE, effect.block, effect.cause, effect.equation, effect.unit, 0.0,
                     effect.prior_sd, *effect.bounds, effect.floor, 0.0, manoeuvres=tuple(effect.manoeuvres))  # fmt: skip
     if not priors.visible[j]:
@@ -203,7 +210,7 @@ def _finding(search: Selector, point: Point, j: int, active: list[int], spread: 
     if j in withdrawn:
         text = f"{effect.name}: explains a part of what is missing, but not its form; the name is withdrawn."
         return replace(blank, verdict=result.NOT_IDENTIFIABLE, sentence=text)
-    if wide[1] > HALF_PRIOR * priors.slab[j]:
+    if wide[1] > BIT * priors.slab[j]:
         text = f"{effect.name}: these flights say hardly more than was known ({own:.2g} of {effect.prior_sd:.2g} {effect.unit})."
         return replace(blank, verdict=result.NOT_IDENTIFIABLE, sentence=text)
     text = f"{effect.name}: between {low:.3g} and {high:.3g} {effect.unit}, if there at all."
@@ -265,7 +272,7 @@ def _named(search: Selector, point: Point, blank: Finding, j: int, home: int, pa
 
 def _joint(search: Selector, point: Point, members: list[int], rest: list[int]) -> str:
     """The best known combination of a class: first eigenvector of its members' information in prior deviations."""
-    priors, effects = search.priors, search.problem.model.effects
+    priors, effects = search.priors, search.problem.effects
     others = np.setdiff1d(np.arange(len(effects)), members)
     information, slab = point.information, priors.slab[members]
     nuisance = information[np.ix_(others, others)] + np.diag(priors.deviation(rest)[others] ** -2.0)

@@ -1,8 +1,9 @@
 """Mistakes between a log and the simulation that are either there or not: axes, signs and units of the commands.
 
-They are looked for before any effect is estimated: such a mistake is gross, and no small deviation stands for it. Each hypothesis
-must hold in all logs that can tell; the commands are then put right and the diagnosis goes on. (Commands that bear the time of
-their arrival are no gross mistake: they show as the effect ``cmd_delay`` on its bound, the link's delay less.)
+Here they are suspected, from how measured rates follow commanded ones and from the weight that commands carry. They are candidates of
+the selection like any other: :func:`visthrow.diagnose.select.search.put_right` simulates the flights with and without each, and keeps
+what raises the evidence by more than it costs. (Commands that bear the time of their arrival are no gross mistake: they show as the
+effect ``cmd_delay`` on its bound, the link's delay less.)
 """
 
 from collections.abc import Mapping, Sequence
@@ -12,59 +13,61 @@ import numpy as np
 
 from sim.params import GRAVITY, PlantParams
 from visthrow.diagnose.throw.recorded import measured
-from visthrow.logs.axes import matrix_of
+from visthrow.logs.axes import EVERY, matrix_of
 from visthrow.logs.check import relations, thrust
 from visthrow.logs.flightlog import Channel, FlightLog
 
-FIRMLY, CLEARLY = 0.8, 0.15
-"""Correlation of commanded and measured rates that a hypothesis needs, and by how much it must beat the log as it stands."""
-WORSE = 0.05
-"""What a log whose own axes tell little may lose by the hypothesis."""
+FOLLOWS = 0.8
+"""Correlation of commanded and measured rates, with whichever axes, from which a log tells of its commands."""
 MOVES = 0.3  # rates that say something about their axes [rad/s]
-AXES_NATS = float(np.log(48.0))  # so many ways to exchange and turn around three axes
 LIFTED = 0.15  # above where it stood, from which a vehicle flies [m]
 VARIED, LATE, SLOPES = 0.05, 0.05, (0.3, 2.0)  # of the throttle's hover, motors [s], plausible slopes of thrust over throttle
-NEAR = 0.25  # of the logarithm of a ratio: hover thrust against weight, gain of the rates
-FAR = 0.8  # the same from which another unit is considered at all
 
 
 @dataclass(frozen=True)
 class Mistake:
-    """One hypothesis that the logs bear out."""
+    """One hypothesis about the logs' commands."""
 
     name: str
     cause: str  # in words
     equation: str  # what puts it right
     nats: float  # by which it beats the log as it stands
     logs: int  # that can tell
+    ways: int = 1  # that commands may be wrong in so: their logarithm is the price
+    change: tuple[tuple[float, ...], ...] = ()  # of the command (thrust and rates), shape (4, 4); none where it was made anew
 
     @property
     def sentence(self) -> str:
         """For people."""
         return f"{self.cause}: {self.name}, {self.equation}; {self.nats:.0f} nats from {self.logs} logs. It was put right."
 
+    def mended(self, log: FlightLog) -> FlightLog:
+        """The log with the commands that were meant."""
+        if "command" not in log:
+            return log
+        c = log["command"]
+        values = np.asarray(c.values, dtype=float) @ np.array(self.change).T
+        return FlightLog({**log.channels, "command": Channel(c.time, values, c.unit, c.frame, c.valid)}, log.meta)
 
-def put_right(logs: Sequence[FlightLog], plant: PlantParams) -> tuple[list[FlightLog], tuple[Mistake, ...]]:
-    """Logs with their commands as the simulation takes them, and what was wrong with them."""
-    weight = GRAVITY * (plant.vehicle.body.mass + plant.rope.payload_mass + plant.rope.rope_mass)
-    mended, found = _from_throttle(logs, weight)
-    relation = [_followed(log) for log in mended]
-    for look in (_axes, _rate_unit):
-        followed = [r for r in relation if r is not None]
-        mistake = look(followed) if followed else None
-        if mistake is None:
-            continue
-        trial = [_commanded(log, matrix=mistake[1]) for log in mended]
-        again = [_followed(log) for log in trial]
-        if all(r is None or (s is not None and s.correlation > r.correlation - WORSE) for r, s in zip(relation, again)):
-            found.append(mistake[0])
-            mended, relation = trial, again
-    weight = GRAVITY * plant.total_mass
-    mistake = _thrust_unit(mended, weight, thrust.UNITS | {"shares of the full thrust": 4.0 * plant.vehicle.controller.max_thrust})
-    if mistake is not None:
-        found.append(mistake[0])
-        mended = [_commanded(log, scale=mistake[1]) for log in mended]
+
+def commanded(logs: Sequence[FlightLog], plant: PlantParams) -> tuple[list[FlightLog], tuple[Mistake, ...]]:
+    """Logs of autopilots with commands made of their throttle, and what was made."""
+    mended, found = _from_throttle(logs, GRAVITY * (plant.vehicle.body.mass + plant.rope.payload_mass + plant.rope.rope_mass))
     return mended, tuple(found)
+
+
+def suspected(logs: Sequence[FlightLog], plant: PlantParams) -> list[Mistake]:
+    """What may be wrong with the commands of all logs, in the order in which it is put right; not weighed yet."""
+    found: list[Mistake] = []
+    for look in (_axes, _rate_unit):
+        relation = [r for log in logs if (r := _followed(log)) is not None]
+        mistake = look(relation) if relation else None
+        if mistake is not None:
+            found.append(mistake)
+            logs = [mistake.mended(log) for log in logs]
+    units = thrust.UNITS | {"shares of the full thrust": 4.0 * plant.vehicle.controller.max_thrust}
+    mistake = _thrust_unit(logs, GRAVITY * plant.total_mass, units)
+    return found if mistake is None else [*found, mistake]
 
 
 def _from_throttle(logs: Sequence[FlightLog], weight: float) -> tuple[list[FlightLog], list[Mistake]]:
@@ -142,59 +145,49 @@ def _followed(log: FlightLog) -> relations.Relation | None:
     if len(time) < 50 or len(wanted) < 20 or np.max(np.std(rate, axis=0)) < MOVES:
         return None
     found = relations.relate(command.time[command.valid], wanted, time, rate)
-    return found if found is not None and found.axes_correlation > FIRMLY else None
+    return found if found is not None and found.axes_correlation > FOLLOWS else None
 
 
-def _axes(relation: Sequence[relations.Relation]) -> tuple[Mistake, np.ndarray] | None:
-    """Exchanged or turned axes of the commanded rates, where all logs that can tell say the same, and they are most."""
-    clear = [r for r in relation if r.axes_correlation > r.correlation + CLEARLY]
+def _axes(relation: Sequence[relations.Relation]) -> Mistake | None:
+    """Exchanged or turned axes of the commanded rates, where all logs that say so say the same, and they are most."""
+    clear = [r for r in relation if r.nats > 0.0]
     names = {r.axes for r in clear}
-    nats = sum(r.nats for r in clear)
-    if len(names) != 1 or 2 * len(clear) < len(relation) or nats < AXES_NATS:
+    if len(names) != 1 or 2 * len(clear) < len(relation):
         return None
     text = names.pop()
     axes = text.split(",")
     turned = sorted(axis[-1] for axis in axes) == [axis[-1] for axis in axes]
     name, cause = ("rate_sign", "A commanded rate has the other sign") if turned else ("rate_axes", "Commanded rates are exchanged")
-    return Mistake(name, cause, f"x, y, z of the vehicle are ({text}) of the command", nats, len(clear)), matrix_of(text)
+    change = np.eye(4)
+    change[1:, 1:] = matrix_of(text)
+    nats = sum(r.nats for r in clear)
+    return Mistake(name, cause, f"x, y, z of the vehicle are ({text}) of the command", nats, len(clear), len(EVERY), _rows(change))
 
 
-def _rate_unit(relation: Sequence[relations.Relation]) -> tuple[Mistake, np.ndarray] | None:
+def _rate_unit(relation: Sequence[relations.Relation]) -> Mistake | None:
     """Degrees for radians, or radians for degrees, in the commanded rates."""
-    gain = float(np.median([r.scale for r in relation if r.correlation > FIRMLY] or [1.0]))
-    for factor, words in ((np.pi / 180.0, "degrees a second"), (180.0 / np.pi, "radians that were converted twice")):
-        if gain > 0.0 and abs(np.log(gain / factor)) < NEAR:
-            nats = float(len(relation) * 0.5 * (np.log(gain) / NEAR) ** 2)
-            mistake = Mistake("rate_unit", f"Commanded rates are in {words}", f"rates times {factor:.5g}", nats, len(relation))
-            return mistake, factor * np.eye(3)
-    return None
+    gain = float(np.median([r.scale for r in relation if r.correlation > FOLLOWS] or [1.0]))
+    words = {1.0: "", np.pi / 180.0: "degrees a second", 180.0 / np.pi: "radians that were converted twice"}
+    factor = min(words, key=lambda f: abs(np.log(gain / f))) if gain > 0.0 else 1.0
+    if factor == 1.0:
+        return None
+    change, equation = np.diag([1.0, factor, factor, factor]), f"rates times {factor:.5g}"
+    return Mistake("rate_unit", f"Commanded rates are in {words[factor]}", equation, 0.0, len(relation), len(words), _rows(change))
 
 
-def _thrust_unit(logs: Sequence[FlightLog], weight: float, units: Mapping[str, float]) -> tuple[Mistake, float] | None:
-    """Another unit of the commanded thrust, from its median against the weight that it carries [N]."""
+def _thrust_unit(logs: Sequence[FlightLog], weight: float, units: Mapping[str, float]) -> Mistake | None:
+    """Another unit of the commanded thrust: that in which its median comes nearest to the weight that it carries [N]."""
     medians = [float(np.median(c.values[c.valid, 0])) for log in logs if "command" in log and np.any((c := log["command"]).valid)]
-    if not medians:
+    ratio = float(np.median(medians)) / weight if medians else 0.0
+    if not 0.0 < ratio < np.inf:
         return None
-    ratio = float(np.median(medians)) / weight
-    if not 0.0 < ratio < np.inf or abs(np.log(ratio)) < FAR:
+    unit = min(units, key=lambda unit: abs(np.log(ratio * units[unit])))
+    if unit == "N":
         return None
-    fits = {unit: abs(np.log(ratio * newtons)) for unit, newtons in units.items()}
-    unit = min(fits, key=fits.get)
-    if fits[unit] > NEAR or unit == "N":
-        return None
-    nats = float(len(medians) * 0.5 * (np.log(ratio) / NEAR) ** 2)
-    mistake = Mistake("thrust_unit", f"Commanded thrust is in {unit}", f"thrust times {units[unit]:.5g}", nats, len(medians))
-    return mistake, units[unit]
+    change = np.diag([units[unit], 1.0, 1.0, 1.0])
+    equation = f"thrust times {units[unit]:.5g}"
+    return Mistake("thrust_unit", f"Commanded thrust is in {unit}", equation, 0.0, len(medians), len(units), _rows(change))
 
 
-def _commanded(log: FlightLog, matrix: np.ndarray | None = None, scale: float = 1.0) -> FlightLog:
-    """The log with other commands."""
-    if "command" not in log:
-        return log
-    c = log["command"]
-    values = np.array(c.values, dtype=float)
-    values[:, 0] *= scale
-    if matrix is not None:
-        values[:, 1:] = values[:, 1:] @ matrix.T
-    return FlightLog({**log.channels, "command": Channel(c.time, values, c.unit, c.frame, c.valid)}, log.meta)
-
+def _rows(matrix: np.ndarray) -> tuple[tuple[float, ...], ...]:
+    return tuple(map(tuple, matrix.tolist()))

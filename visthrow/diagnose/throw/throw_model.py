@@ -129,6 +129,7 @@ class ThrowModel:
         self._switched = [e for e in effects.values() if e.switch]
         self.effects = (*self._graded, *self._switched, *self._sighted)
         self.entries = {e.name: e for e in self.effects}
+        self._secants: dict[str, list[np.ndarray]] = {}  # of other kinds of blocks, by their name, where they were asked for first
 
     def windows(self, theta: Mapping[str, float]) -> list[Window]:
         """See :class:`visthrow.diagnose.models.interface.Model`."""
@@ -141,7 +142,10 @@ class ThrowModel:
         found: list[Window] = []
         for batch in self._batches():
             found += self._linearised(replay, settings, np.array(steps), states, batch)
-        columns = [self._secant(e, theta, found) for e in self._switched]
+        for e in self._switched:  # they are screened by these, and judged where they are flown
+            if e.name not in self._secants:
+                self._secants[e.name] = self._secant(e, theta, found)
+        columns = [self._secants[e.name] for e in self._switched]
         if columns:
             found = [
                 dataclasses.replace(w, effects=np.hstack((w.effects, np.stack([c[i] for c in columns], axis=1))))
@@ -191,15 +195,16 @@ class ThrowModel:
         full = [np.concatenate((r, *self._direct_residuals(w, setting))) for r, w in zip(flown, self._retained)]
         return [r + about.windows[i].nuisance @ moves[i] if i in moves else r for i, r in enumerate(full)]
 
-    def without_commands(self, theta: Mapping[str, float]) -> list[np.ndarray]:
-        """Change of each window's replayed samples by each command that does not come: the one before stays. Shape (N, T).
+    def without_commands(self, theta: Mapping[str, float], windows: Sequence[int]) -> list[np.ndarray]:
+        """Change of some windows' replayed samples by each command that does not come: the one before stays. Shape (N, T) each.
 
         Args:
             theta: sizes of the effects, at which :meth:`windows` was asked for before.
+            windows: numbers among those that came.
         """
         setting = apply(self.entries, self.setting, theta)
         states, known = self._settled_at.get(_key(theta), self._fitted()[0]), self.setting.plant.vehicle.queue.delay
-        return without_each_command(self.flights, self._retained, known, setting, states, self.substep, self.device)
+        return without_each_command(self.flights, self._retained[list(windows)], known, setting, states, self.substep, self.device)
 
     def _following(
         self, setting: Setting, theta: Mapping[str, float], about: Linearised
@@ -260,7 +265,7 @@ class ThrowModel:
     def beside(self, cuts: Sequence[Cut]) -> "ThrowModel":
         """The same model of other windows of its flights."""
         other = copy.copy(self)
-        other._settled_at, other._follows = {}, None  # states of other windows
+        other._settled_at, other._follows, other._secants = {}, None, {}  # of other windows
         other.flights = self._cut(self.flights.flights, cuts, self.flights.stride)
         other._retained = np.array([w for w, c in enumerate(cuts) if c.retained])
         return other

@@ -19,7 +19,8 @@ from visthrow.task import Experiment
 from visthrow.training import rewards
 from visthrow.training.env import ThrowEnv
 from visthrow.training.first_order.backward import Setting, build_backward
-from visthrow.training.first_order.surrogate import Flights, Plants, Surrogate, fit
+from visthrow.training.first_order.layers import Layers
+from visthrow.training.first_order.surrogate import Flights, Plants, fit
 from visthrow.training.ppo.network import Network
 from visthrow.training.ranks import Ranks
 
@@ -81,7 +82,8 @@ class FirstOrder:
         self.flights, self.adjoint = Flights(T, E, device), Flights(T, E, device)
         make = {"device": device, "dtype": torch.float32}
         self.obs = torch.zeros(T, E, env.layout.dimension, **make)
-        self.action = torch.zeros(T, E, act.ACTIONS, **make)
+        self.layers = Layers(self.network, T, E, env.layout.dimension, device)
+        self.action, self.by_clipped = self.layers.action, torch.zeros_like(self.layers.action)
         self.landing, self.time = torch.zeros(T + 1, E, 2, **make), torch.zeros(T + 1, E, **make)
         self.age, self.goal = torch.zeros(E, **make), torch.zeros(E, 3, **make)
         nodes = (-1.0, 0.0, 1.0, 2.0)  # of the cubic through the steps about the separation
@@ -91,13 +93,14 @@ class FirstOrder:
         self._drop = torch.tensor([0.0, 0.0, 0.5 * GRAVITY], **make)
         self._figures: dict[str, Tensor] = {}
         self._adapting = False
+        self._launches = self._recorded()
         self._schedule(0.0)
         self._begin()
         ranks.share(self.network)
         on_gpu = device.startswith("cuda")
         rate = torch.tensor(self.p.learning_rate, **make) if on_gpu else self.p.learning_rate
         self.optimizer = torch.optim.Adam(self.network.mlp.parameters(), lr=rate, betas=(0.9, 0.95), capturable=on_gpu)
-        self.rollout = Replayed(self._fly) if on_gpu else self._fly
+        self.rollout, self.backward = (Replayed(work) if on_gpu else work for work in (self._fly, self._back))
 
     @property
     def iterations(self) -> int:
@@ -119,19 +122,17 @@ class FirstOrder:
             last.bias.copy_(self.env._start_action)
             last.bias[act.COMMANDS] = self.p.initial_release
 
-    def act(self, obs: Tensor) -> Tensor:
-        """Actions, shape (E, 5), for observations, shape (E, D)."""
-        return self.network.mlp(self.network.obs_normalizer(obs))
-
     @torch.no_grad()
     def _fly(self) -> None:
         """Fly one batch without release."""
-        env = self.env
+        env, stops = self.env, self._latched == 1.0 and self.env.device == "cpu"
 
-        def decide(k: int, seen: Tensor) -> Tensor:
+        def decide(k: int, seen: Tensor) -> Tensor | None:
             self.obs[k].copy_(seen)
-            self.action[k].copy_(self.act(seen))
-            return self.action[k]
+            asked = self.action[: max(k - self.lag - 2, 0), :, act.COMMANDS] > self.cfg.release.threshold
+            if stops and bool((asked.sum(0) > 1).all()):  # of no flight a later step counts: its latch has tripped, or would have
+                return None
+            return self.layers.forward(k, seen)
 
         def foresee(k: int) -> None:
             if k == 0:
@@ -195,7 +196,7 @@ class FirstOrder:
         survival = torch.cat([torch.ones_like(hazard[:1]), (1.0 - hazard).cumprod(0)])
         chance = survival[:-1] * hazard
         carried = survival[(k[:, 0] - self.lag).clamp(0, K)] * (k < steps)
-        past = (x.action.abs() - 1.0).clamp(min=0.0).square().sum(-1) * (k < steps)
+        past = (x.action.abs() - 1.0).clamp(min=0.0).square().sum(-1) * carried.detach()
         gain = (chance * reward).sum(0) + (carried * self._carrying(x)).sum(0) - p.termination * survival[-1]
         done = (chance * ~cut).detach()
         total = done.sum().clamp(min=1e-6)
@@ -205,8 +206,8 @@ class FirstOrder:
                    "duration": (done * duration).sum() / total}  # fmt: skip
         return (self.p.saturation * past.sum(0) - gain).mean() * p.scale, figures
 
-    def derivatives(self) -> tuple[Tensor, dict[str, Tensor]]:
-        """Derivatives of the cost of the last rollout by the actions, shape (T, E, 5), and figures."""
+    def derivatives(self) -> dict[str, Tensor]:
+        """Derivatives of the cost of the last rollout by the actions, as the layers hold them; returns figures."""
         f, adjoint, states = self.flights.x, self.adjoint.x, ("pos", "vel", "load_pos", "load_vel", "response")
         tilt = ob.rotation_from_quat(f["quat"])[..., 2, :]  # world z in the body frame
         x = SimpleNamespace(**{name: f[name].clone() for name in states})
@@ -221,31 +222,34 @@ class FirstOrder:
             adjoint[name].copy_(by[name])
         adjoint["turn"].copy_(torch.stack([-tilt[..., 1], tilt[..., 0], torch.zeros_like(tilt[..., 0])], -1) * by["upright"][..., None])
         adjoint["command"].zero_()
-        by_clipped, by_action = by["clipped"].contiguous(), by["action"].contiguous()
-        self._backward(by_clipped, by_action)
-        return by_action, figures | {"cost": cost.detach()}
+        self.by_clipped.copy_(by["clipped"])
+        self.layers.by_action.copy_(by["action"])
+        self.layers.prepare()
+        self.backward()
+        return figures | {"cost": cost.detach()}
 
-    def _backward(self, by_clipped: Tensor, by_action: Tensor) -> None:
-        """Run the backward kernel over the last rollout; ``by_action`` becomes the whole derivative."""
+    def _recorded(self) -> list[wp.Launch]:
+        """Launches of the backward kernel, from the last step to the first."""
         env, task, p = self.env, self.cfg.task, Setting()
         p.max_thrust, p.max_rate = task.action.max_thrust, wp.vec3(*task.action.max_rate)
         p.period, p.decay = self.cfg.sim.control_period, self.p.decay
-        vectors = {"mount": self.plants.mount, "goal": self.goal}
-        plain = {"mass": self.flights.mass, "load_mass": self.plants.load_mass, "age": self.age, "network": self._jacobian()}
-        for name, tensor in {**vars(self.surrogate), **plain, **vectors}.items():
-            kind = wp.vec3 if name in vectors else wp.vec4 if name == "response" else wp.float32
+        plants = {"mass": self.flights.mass, "load_mass": self.plants.load_mass, "age": self.age, "mount": self.plants.mount}
+        for name, tensor in {**vars(self.surrogate), **plants}.items():
+            kind = wp.vec3 if name == "mount" else wp.vec4 if name == "response" else wp.float32
             setattr(p, name, wp.from_torch(tensor.contiguous(), dtype=kind))
-        arrays = [wp.from_torch(tensor) for tensor in (self.flights.steps, self.action, by_clipped, by_action)]
-        with on_torch_stream(env.device):
-            inputs = [p, self.adjoint.course, self.flights.course, *arrays]
-            wp.launch(build_backward(env.layout), env.num_envs, inputs, device=env.device, block_dim=64)
+        ins = [self.flights.course, *map(wp.from_torch, (self.flights.steps, self.action, self.layers.by_seen))]
+        state, out = (self.adjoint.course, wp.from_torch(self.by_clipped)), wp.from_torch(self.layers.by_action)
+        how = {"device": env.device, "block_dim": 64, "record_cmd": True}
+        kernel = build_backward(env.layout)
+        return [wp.launch(kernel, env.num_envs, [p, k, *state, *ins, out], **how) for k in reversed(range(self.p.horizon))]
 
-    def _jacobian(self) -> Tensor:
-        """Derivatives of the network's actions by the observations of the last rollout, shape (T, E, 5, D)."""
-        seen = self.obs.clone().requires_grad_()
-        with torch.enable_grad():
-            by_action = [action.sum() for action in self.act(seen).unbind(-1)]
-        return torch.stack([torch.autograd.grad(action, seen, retain_graph=True)[0] for action in by_action], 2)
+    @torch.no_grad()
+    def _back(self) -> None:
+        """From the derivatives of the cost by states and actions to whole derivatives by the actions."""
+        for k, launch in zip(reversed(range(self.p.horizon)), self._launches):
+            with on_torch_stream(self.env.device):
+                launch.launch()
+            self.layers.back(k)
 
     def step(self, done: float) -> dict[str, float]:
         """One rollout and one step of Adam at this share of the training; returns its figures."""
@@ -264,24 +268,17 @@ class FirstOrder:
         times = {"rollout_s": middle - start, "learning_s": time.perf_counter() - middle}
         return figures | times | {"learning_rate": rate, "episodes": float(self.env.num_envs)}
 
+    @torch.no_grad()
     def _descend(self) -> None:
         """Gradient of the last rollout, Adam, observation statistics."""
-        by_action, self._figures = self.derivatives()
-        flown = self.flights.flown()
-        by_action = by_action * flown[..., None]
-        size = by_action.square().sum((0, 2)).sqrt()  # a few wild flights must not outweigh the rest
-        by_action = by_action * (OUTLIER * size.sort().values[len(size) // 2] / size.clamp(min=1e-12)).clamp(max=1.0)[:, None]
-        seen, parameters = self.obs.flatten(0, 1), list(self.network.mlp.parameters())
-        with torch.enable_grad():
-            output = self.act(seen)
-        gradients = torch.autograd.grad(output, parameters, by_action.flatten(0, 1))
-        for parameter, gradient in zip(parameters, gradients, strict=True):
-            parameter.grad = gradient
+        self._figures, parameters = self.derivatives(), list(self.network.mlp.parameters())
+        size = self.layers.by_action.square().sum((0, 2)).sqrt()  # a few wild flights must not outweigh the rest
+        self.layers.gradients(self.obs, (OUTLIER * size.sort().values[len(size) // 2] / size.clamp(min=1e-12)).clamp(max=1.0))
         self._ranks.average(parameters)
         self._figures["gradient_norm"] = torch.nn.utils.clip_grad_norm_(parameters, self.p.max_grad_norm)
-        self._figures["ended"] = (self.flights.steps < self.p.horizon).float().mean()
+        self._figures["ended"] = (self.flights.steps < self.flights.flown).float().mean()
         self.optimizer.step()
-        self._watch(self.obs[flown])
+        self._watch(self.obs[self.flights.whole()])
 
     def _watch(self, seen: Tensor) -> None:
         """Take observations, shape (N, D), into the normaliser's statistics."""
@@ -308,6 +305,8 @@ class FirstOrder:
     def load_state_dict(self, saved: dict, own_throws: bool = True) -> None:
         self.network.load_state_dict(saved["network"])
         self.optimizer.load_state_dict(saved["optimizer"])
-        self.surrogate, self._adapting = Surrogate(**saved["surrogate"]), saved["adapting"]
+        self._adapting = saved["adapting"]
+        for name, value in saved["surrogate"].items():
+            getattr(self.surrogate, name).copy_(value)
         if own_throws:
             self.env.load_state_dict(saved["env"])

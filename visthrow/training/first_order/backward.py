@@ -1,4 +1,4 @@
-"""Backward pass of flights through the surrogate and the network: one kernel, a thread a flight.
+"""Backward pass of flights through the surrogate, a kernel a step, a thread a flight; the network's part lies between two of them.
 
 Derivatives are written by hand; a rotation's is that by a turn about the body axes, R exp(turn). Equations:
 :mod:`visthrow.training.first_order.surrogate`.
@@ -14,8 +14,6 @@ from visthrow.training.first_order.surrogate import TAUT, Course
 
 SLACK_THROTTLE = 0.05
 """Least throttle at which the slope of the thrust is taken: at none it is nought, and nothing would lead away from there."""
-
-VEC5 = wp.types.vector(5, float)
 
 
 @wp.struct
@@ -34,7 +32,6 @@ class Setting:
     decay: float  # of derivatives, per step
     age: wp.array(dtype=float)  # of poses [s]
     goal: wp.array(dtype=wp.vec3)
-    network: wp.array4d(dtype=float)  # (T, E, 5, D): of actions by observations
 
 
 @wp.func
@@ -105,38 +102,29 @@ def step_back(p: Setting, x: Course, adj: Course, k: int, e: int):
 
 @lru_cache
 def build_backward(layout: ob.Layout) -> wp.Kernel:
-    """Backward pass of whole flights whose actor sees a state layout, a thread a flight."""
+    """Backward pass of step k of flights whose actor sees a state layout."""
     history, width = layout.history, layout.payload
     previous_at, goal_at, load_at = ob.VEHICLE, ob.VEHICLE + 5, ob.VEHICLE + 5 + layout.goal
 
     @wp.func
-    def by(p: Setting, g: VEC5, k: int, e: int, i: int):
-        """Derivative by entry i of observation k."""
-        total = g[0] * p.network[k, e, 0, i]
-        for j in range(1, 5):
-            total += g[j] * p.network[k, e, j, i]
-        return total
+    def three(by_seen: wp.array2d(dtype=float), e: int, i: int):
+        return wp.vec3(by_seen[e, i], by_seen[e, i + 1], by_seen[e, i + 2])
 
     @wp.func
-    def by_three(p: Setting, g: VEC5, k: int, e: int, i: int):
-        return wp.vec3(by(p, g, k, e, i), by(p, g, k, e, i + 1), by(p, g, k, e, i + 2))
-
-    @wp.func
-    def vehicle_back(p: Setting, x: Course, adj: Course, g: VEC5, k: int, i: int, e: int, share: float):
-        """From observation k to state i, of which ``share`` is in it: the vehicle and the goal."""
-        adj.pos[i, e] += share * by_three(p, g, k, e, 0)
-        adj.vel[i, e] += share * by_three(p, g, k, e, 3)
-        rate = share * by_three(p, g, k, e, 6)
+    def vehicle_back(by_seen: wp.array2d(dtype=float), x: Course, adj: Course, i: int, e: int, share: float):
+        """From an observation to state i, of which ``share`` is in it: the vehicle and the goal."""
+        adj.pos[i, e] += share * three(by_seen, e, 0)
+        adj.vel[i, e] += share * three(by_seen, e, 3)
+        rate = share * three(by_seen, e, 6)
         adj.response[i, e] += wp.vec4(0.0, rate[0], rate[1], rate[2])
-        x_axis = turned(x.quat[i, e], wp.vec3(1.0, 0.0, 0.0), by_three(p, g, k, e, 9))
-        adj.turn[i, e] += share * (x_axis + turned(x.quat[i, e], wp.vec3(0.0, 1.0, 0.0), by_three(p, g, k, e, 12)))
-        adj.load_pos[i, e] -= share * wp.vec3(by(p, g, k, e, goal_at), by(p, g, k, e, goal_at + 1), 0.0)
+        x_axis = turned(x.quat[i, e], wp.vec3(1.0, 0.0, 0.0), three(by_seen, e, 9))
+        adj.turn[i, e] += share * (x_axis + turned(x.quat[i, e], wp.vec3(0.0, 1.0, 0.0), three(by_seen, e, 12)))
+        adj.load_pos[i, e] -= share * wp.vec3(by_seen[e, goal_at], by_seen[e, goal_at + 1], 0.0)
 
     @wp.func
-    def load_back(p: Setting, x: Course, adj: Course, g: VEC5, k: int, age: int, i: int, e: int, share: float):
-        """From observation k to state i: the payload as it was ``age`` observations ago."""
-        at = load_at + width * age
-        offset = share * by_three(p, g, k, e, at)
+    def load_back(by_seen: wp.array2d(dtype=float), adj: Course, age: int, i: int, e: int, share: float):
+        """From an observation to state i: the payload as it was ``age`` observations ago."""
+        offset = share * three(by_seen, e, load_at + width * age)
         adj.load_pos[i, e] += offset
         adj.pos[i, e] -= offset
 
@@ -144,43 +132,39 @@ def build_backward(layout: ob.Layout) -> wp.Kernel:
     def backward_kernel(
         # Params:
         p: Setting,
+        k: int,
         # State in:
         adj: Course,
+        by_clipped: wp.array3d(dtype=float),
         # In:
         x: Course,
         steps: wp.array(dtype=wp.int32),
         action: wp.array3d(dtype=float),
+        by_seen: wp.array2d(dtype=float),  # by observation k + 1
         # Out:
-        by_clipped: wp.array3d(dtype=float),
         by_action: wp.array3d(dtype=float),
     ):
         e = wp.tid()
         late = p.age[e] / p.period
-        for back in range(action.shape[0]):
-            k = action.shape[0] - 1 - back
-            if k <= steps[e]:
-                if k < steps[e]:
-                    step_back(p, x, adj, k, e)
-                throttle = wp.clamp(0.5 * (action[k, e, 0] + 1.0), SLACK_THROTTLE, 1.0)
-                scale = wp.vec4(p.max_thrust * throttle, p.max_rate[0], p.max_rate[1], p.max_rate[2])
-                command = wp.cw_mul(scale, adj.command[k, e])
-                g = VEC5()
-                for j in range(5):
-                    clipped = by_clipped[k, e, j]
-                    if j < 4:
-                        clipped += command[j]
-                    if wp.abs(action[k, e, j]) > 1.0:
-                        clipped = 0.0
-                    g[j] = by_action[k, e, j] + clipped
-                    by_action[k, e, j] = g[j]
-                before = wp.max(k - 1, 0)
-                if k > 0:
-                    for j in range(5):
-                        by_clipped[before, e, j] += by(p, g, k, e, previous_at + j)
-                vehicle_back(p, x, adj, g, k, k, e, 1.0 - late)
-                vehicle_back(p, x, adj, g, k, before, e, late)
-                for age in range(history + 1):
-                    load_back(p, x, adj, g, k, age, wp.max(k - age, 0), e, 1.0 - late)
-                    load_back(p, x, adj, g, k, age, wp.max(k - age - 1, 0), e, late)
+        command = wp.vec4()
+        if k < steps[e]:
+            for j in range(5):
+                by_clipped[k, e, j] += by_seen[e, previous_at + j]
+            vehicle_back(by_seen, x, adj, k + 1, e, 1.0 - late)
+            vehicle_back(by_seen, x, adj, k, e, late)
+            for age in range(history + 1):
+                load_back(by_seen, adj, age, wp.max(k + 1 - age, 0), e, 1.0 - late)
+                load_back(by_seen, adj, age, wp.max(k - age, 0), e, late)
+            step_back(p, x, adj, k, e)
+            throttle = wp.clamp(0.5 * (action[k, e, 0] + 1.0), SLACK_THROTTLE, 1.0)
+            scale = wp.vec4(p.max_thrust * throttle, p.max_rate[0], p.max_rate[1], p.max_rate[2])
+            command = wp.cw_mul(scale, adj.command[k, e])
+        for j in range(5):
+            total = by_clipped[k, e, j]
+            if j < 4:
+                total += command[j]
+            if wp.abs(action[k, e, j]) > 1.0:
+                total = 0.0
+            by_action[k, e, j] = wp.where(k > steps[e], 0.0, by_action[k, e, j] + total)
 
     return backward_kernel

@@ -82,14 +82,17 @@ class Flights:
         for name, kind in kinds.items():
             setattr(self.course, name, wp.from_torch(self.x[name], dtype=kind))
         self.steps, self.mass = torch.zeros(count, device=device, dtype=torch.int32), torch.zeros(count, device=device)
-        self.status = torch.zeros(steps + 1, count, device=device, dtype=torch.int32)
+        self.status, self.flown = torch.zeros(steps + 1, count, device=device, dtype=torch.int32), steps
 
-    def flown(self) -> Tensor:
+    def whole(self) -> Tensor:
         """Whether the flight had not ended, shape (T, E), at each of its steps."""
         return torch.arange(len(self.status) - 1, device=self.steps.device)[:, None] <= self.steps
 
-    def fly(self, env: ThrowEnv, plants: Plants, act: Callable[[int, Tensor], Tensor], passed: Callable[[int], None]) -> None:
-        """Fly from new starts without release; ``act(k, observations)``, then ``passed(k)`` at each state k, the last included."""
+    def fly(self, env: ThrowEnv, plants: Plants, act: Callable[[int, Tensor], Tensor | None], passed: Callable[[int], None]) -> None:
+        """Fly from new starts without release: ``passed(k)`` at each state k, the last included, then ``act(k, observations)``.
+
+        Where it has no actions, flights end; what was recorded of earlier flights stands beyond.
+        """
         state, out, x, T = env.views.state, env.views.out, self.x, len(self.status) - 1
         seen = env.reset()
         self.mass.copy_(plants.body_mass * state["mass_scale"] + plants.rope_mass)
@@ -101,14 +104,17 @@ class Flights:
             x["response"][k, :, 1:].copy_(state["rate_b"])
             self.status[k].copy_(state["status"])
             passed(k)
-            if k < T:
-                seen = env.carry(act(k, seen["actor"]))
-                x["command"][k].copy_(env.views.command)
+            action = act(k, seen["actor"]) if k < T else None
+            if action is None:
+                break
+            seen = env.carry(action)
+            x["command"][k].copy_(env.views.command)
+        self.flown = k
         flown = (x["pos"][1:], ob.rotation_from_quat(x["quat"][1:]), x["load_pos"][1:], self.status[1:])
         pos, rot, load_pos, status = (value.flatten(0, 1) for value in flown)
         held, time = torch.zeros_like(status, dtype=torch.bool), torch.zeros_like(pos[:, 0])
         ends = terminations.negative(env.cfg.task.bounds, pos, rot, load_pos, status, held, time, env.cfg.release.landing_height)
-        self.steps.copy_((~ends).view(T, -1).int().cumprod(0).sum(0))
+        self.steps.copy_((~ends).view(T, -1).int().cumprod(0).sum(0).clamp(max=self.flown))
 
 
 @dataclass
@@ -136,7 +142,7 @@ def fit(env: ThrowEnv, plants: Plants, watch: Callable[[Tensor], None], steps: i
     for _ in range(FITTED // (env.num_envs * steps) + 1):
         observed: list[Tensor] = []
         flights.fly(env, plants, act, lambda k: None)
-        watch(torch.stack(observed)[flights.flown()])
+        watch(torch.stack(observed)[flights.whole()])
         parts.append(_regressors(flights, plants, lags, period))
     rows = {name: torch.cat([part[name] for part in parts]).double() for name in parts[0]}
     response = [_solve(rows["lagged"][..., c], rows["next"][:, c])[:-1] for c in range(4)]

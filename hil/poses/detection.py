@@ -1,7 +1,7 @@
-"""What a camera saw, as the policy is to be shown it: rays of one frame, and what they read while nothing is seen.
+"""What a camera saw, as the policy is to be shown it: rays of one frame, and what they read until the next.
 
-What is not seen reads where it was for a while, then as dropped out. To a policy that was trained with the exact direction at the edge
-in place of what is out of view, what was last seen near the edge reads as its direction there.
+A frame counts for a while, then all reads as dropped out; what is not in it at once. To a policy that was trained with the exact
+direction at the edge in place of what is out of view, what was last seen near the edge reads as its direction there.
 """
 
 from collections import deque
@@ -18,17 +18,15 @@ from hil.poses.pose import Quaternion, Vector
 from visthrow.onboard.calibration import Calibration
 from visthrow.onboard.observations import rotation_from_quat
 
-NEAR_EDGE = 0.85
-"""Radius in the image beyond which what is not seen any more has left the field of view, of 1."""
+NEAR_EDGE = 0.85  # radius in the image beyond which what is not seen any more has left the field of view, of 1
+PATH = 25  # ticks that the vehicle's way is kept for: half a second
 
-PATH = 25
-"""Ticks that the vehicle's way is kept for: half a second."""
-
+PARTS = {"goal": slice(0, GOAL_KEYPOINTS), "ball": slice(GOAL_KEYPOINTS, None)}  # of the keypoints
 Corners = tuple[tuple[float, float, float], ...]
 
 
 @dataclass(frozen=True)
-class Sight:
+class Detection:
     """One frame, plain floats as they are recorded; rays in the camera frame of training."""
 
     stamp: float  # of the exposure, on the runner's clock [s]
@@ -36,45 +34,37 @@ class Sight:
     ball: tuple[float, float, float, float] | None  # unit ray to the ball's centre, and half-angle [rad]
 
     def values(self) -> list:
-        """As JSON has it."""
+        """Return it as JSON has it."""
         return [self.stamp, self.corners, self.ball]
 
     @classmethod
-    def of(cls, values: list) -> "Sight":
-        """The inverse of :meth:`values`."""
+    def of(cls, values: list) -> "Detection":
+        """Return the inverse of :meth:`values`."""
         stamp, corners, ball = values
         return cls(stamp, None if corners is None else tuple(map(tuple, corners)), None if ball is None else tuple(ball))
 
     def seen(self) -> Seen:
-        """As `camera.detectors.contours` has it."""
+        """Return it as `camera.detectors.contours` has it."""
         goal = None if self.corners is None else GoalSeen(np.array(self.corners), 1.0)
         ball = None if self.ball is None else BallSeen(np.array(self.ball[:3]), self.ball[3], 1.0)
         return Seen(ball, goal)
 
 
 def _rotation(quat: Quaternion) -> np.ndarray:
-    """Body to world, shape (3, 3)."""
+    """Return the rotation from body to world, shape (3, 3)."""
     return rotation_from_quat(torch.tensor([quat], dtype=torch.float64))[0].numpy()
 
 
-class Sights:
-    """Keypoints by the sights so far.
-
-    Attributes:
-        fresh: stamp [s], keypoints (8, 2) and validity (8,) of the last frame that was taken.
-    """
+class Detections:
+    """Keypoints by the detections so far; ``fresh``: stamp [s], keypoints (8, 2) and validity (8,) of the last frame that was taken."""
 
     def __init__(self, camera: KeypointCamera, hold: float) -> None:
-        """Start with nothing seen.
-
-        Args:
-            camera: of training.
-            hold: for which a thing that is not seen any more reads where it was [s].
-        """
+        """Start with nothing seen by the camera of training; ``hold``: for which a frame counts [s]."""
         self._camera, self._hold = camera, hold
         self._points = torch.zeros(KEYPOINTS, 2)
         self._valid = torch.zeros(KEYPOINTS, dtype=torch.bool)
-        self._times = {"goal": -np.inf, "ball": -np.inf}
+        self._times = {"goal": -np.inf, "ball": -np.inf}  # of the last frame, where it holds the thing
+        self._newest = -np.inf
         self._turn: np.ndarray | None = None  # from the camera as it is mounted to that of training
         self._scale, self._latency = 0.0, 0.0
         self._path: deque[tuple[float, np.ndarray, np.ndarray]] = deque(maxlen=PATH)
@@ -90,26 +80,24 @@ class Sights:
         """Note where the vehicle is at a tick, as of the poses, for frames that are older than these."""
         self._path.append((now, np.array(pos), _rotation(quat)))
 
-    def take(self, sight: Sight, quat: Quaternion, aged: float = 0.0) -> None:
-        """Take a frame in.
-
-        Args:
-            sight: of the frame.
-            quat: the vehicle's attitude, body to world, xyzw: says which corner is which.
-            aged: age that poses have at a tick [s].
-        """
-        seen = sight.seen()
+    def take(self, detection: Detection, quat: Quaternion, aged: float = 0.0) -> None:
+        """Take a frame in; the vehicle's attitude says which corner is which, and poses have an age at a tick [s]."""
+        seen = detection.seen()
         rot_wb = _rotation(quat)
         if self._turn is not None and self._path:
-            seen = self._carried(seen, sight.stamp - self._latency + aged)
+            seen = self._carried(seen, detection.stamp - self._latency + aged)
         points, valid = detected_keypoints(self._camera, seen, rot_wb)
-        self.fresh = sight.stamp, points.numpy(), valid.numpy()
-        for name, part in (("goal", slice(0, GOAL_KEYPOINTS)), ("ball", slice(GOAL_KEYPOINTS, None))):
-            if getattr(seen, name) is not None and sight.stamp > self._times[name]:
-                self._points[part], self._valid[part], self._times[name] = points[part], valid[part], sight.stamp
+        self.fresh = detection.stamp, points.numpy(), valid.numpy()
+        if detection.stamp <= self._newest:
+            return
+        self._newest = detection.stamp
+        for name, part in PARTS.items():
+            self._times[name] = -np.inf if getattr(seen, name) is None else detection.stamp
+            if getattr(seen, name) is not None:
+                self._points[part], self._valid[part] = points[part], valid[part]
 
     def _carried(self, seen: Seen, when: float) -> Seen:
-        """What was seen at a time as the camera of training would see it now: the goal lies, the ball goes with the vehicle."""
+        """Return what was seen at a time as the camera of training would see it now: the goal lies, the ball goes with the vehicle."""
         _, pos_now, rot_now = self._path[-1]
         pos, rot = self._pose(when)
         rot_bc, lens = self._camera.rot_cb.double().numpy().T, self._camera.position_b.double().numpy()
@@ -126,14 +114,14 @@ class Sights:
         return Seen(ball, goal)
 
     def _to_scale(self, rays_c: np.ndarray) -> np.ndarray:
-        """Rays, shape (N, 3), by the focal length that was found."""
+        """Return rays, shape (N, 3), by the focal length that was found."""
         lens = self._camera.fisheye
         points, _ = lens.project_normalized(torch.from_numpy(np.ascontiguousarray(rays_c)))
         rays: np.ndarray = lens.unproject(lens.denormalize(points / (1.0 + self._scale)))[0].numpy()
         return rays
 
     def _pose(self, when: float) -> tuple[np.ndarray, np.ndarray]:
-        """Place and attitude at a time on the path, by straight lines; its ends beyond them."""
+        """Return the place and attitude at a time on the path, by straight lines; its ends beyond them."""
         path = list(self._path)
         after = next((i for i, (time, _, _) in enumerate(path) if time >= when), len(path) - 1)
         if after == 0 or path[after][0] <= when:
@@ -144,9 +132,9 @@ class Sights:
         return pos + share * (pos_after - pos), rot @ Rotation.from_rotvec(share * way).as_matrix()
 
     def keypoints(self, now: float) -> tuple[np.ndarray, np.ndarray]:
-        """Keypoints at a time [s]: normalised, float32, shape (1, 8, 2), and validity, shape (1, 8)."""
+        """Return keypoints at a time [s]: normalised, float32, shape (1, 8, 2), and validity, shape (1, 8)."""
         points, valid = self._points.clone(), self._valid.clone()
-        for name, part in (("goal", slice(0, GOAL_KEYPOINTS)), ("ball", slice(GOAL_KEYPOINTS, None))):
+        for name, part in PARTS.items():
             if now - self._times[name] > self._hold:
                 radius = points[part].norm(dim=-1, keepdim=True)
                 left = self._camera.edge_reads and bool((radius > NEAR_EDGE).any())

@@ -1,0 +1,117 @@
+"""What goes over links, and a run's lines, in files: written by a thread each, so that a slow disk delays no tick."""
+
+import struct
+import threading
+import time
+from collections import deque
+from pathlib import Path
+from typing import Any
+
+from hil.links.device import Port
+from visthrow.common.errors import StorageError
+
+MOST_WAITING = 100_000  # chunks that may wait for a slow disk, some minutes' worth; those beyond are lost, and counted
+
+WRITE_EVERY = 0.1
+"""Between two looks for what is to be written [s]: woken by each chunk, the thread would take the core from the flying one."""
+
+HEAD = struct.Struct(">QcH")  # of a chunk of MSP: time since 1970 [us], b"<" to the flight controller or b">" from it, number of bytes
+MOST_BYTES = 65535  # length of a chunk of MSP in the file; a longer one is cut
+
+
+class Writer:
+    """A file that is added to; putting never waits and never raises. After a failure nothing is taken any more.
+
+    ``failed`` counts chunks that could not be written; ``why`` the first one could not, or None.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        """Open the file; raises `StorageError` where it cannot be written."""
+        try:
+            Path(path).parent.mkdir(parents=True, exist_ok=True)
+            self._file = open(path, "wb", buffering=1 << 16)  # noqa: SIM115 - closed in close()
+        except OSError as error:
+            raise StorageError(f"cannot write {path}: {error.strerror}; expected a folder that can be written (--out)") from error
+        self._name, self.failed, self.why = Path(path).name, 0, None
+        self._waiting: deque[bytes] = deque()
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._write, name=self._name, daemon=True)
+        self._thread.start()
+
+    def put(self, data: bytes) -> None:
+        """Add bytes."""
+        if self.why is None and len(self._waiting) < MOST_WAITING:
+            self._waiting.append(data)
+        else:
+            self._fail("the disk is too slow")
+
+    def _fail(self, why: Any) -> None:
+        self.failed += 1
+        self.why = self.why or f"cannot write {self._name}: {why}"
+
+    def _write(self) -> None:
+        over = False
+        while not over:
+            over = self._over.wait(WRITE_EVERY)
+            try:
+                while self._waiting:
+                    self._file.write(self._waiting.popleft())
+                self._file.flush()
+            except (OSError, ValueError) as error:
+                self._fail(error)
+                self.failed += len(self._waiting)
+                self._waiting.clear()
+
+    def close(self) -> None:
+        """Write what is left and close."""
+        self._over.set()
+        self._thread.join()
+        try:
+            self._file.close()
+        except OSError as error:
+            self._fail(error)
+
+
+class TlogWriter(Writer):
+    """A .tlog: for each message the time [us, big-endian] and its bytes."""
+
+    def write(self, message: Any, unix_time: float | None = None) -> None:
+        """Append a message, parsed or packed, of a time [s]; of now where it is left out."""
+        stamp = int((time.time() if unix_time is None else unix_time) * 1e6)
+        self.put(struct.pack(">Q", stamp) + bytes(message.get_msgbuf()))
+
+
+class LoggedPort:
+    """A port whose traffic is written down, both ways; see :data:`HEAD`."""
+
+    def __init__(self, port: Port, path: str | Path) -> None:
+        """Open the file; raises `StorageError` where it cannot be written."""
+        self._port, self.whole, self.sender, self.peer = port, port.whole, None, None
+        try:
+            self.log = Writer(path)
+        except StorageError:
+            port.close()
+            raise
+
+    def _note(self, direction: bytes, data: bytes) -> None:
+        data = data[:MOST_BYTES]
+        self.log.put(HEAD.pack(int(time.time() * 1e6), direction, len(data)) + data)
+
+    def read(self) -> bytes | None:
+        data = self._port.read()
+        if data:
+            self._note(b">", data)
+        return data
+
+    def write(self, data: bytes, to: tuple[str, int] | None = None) -> bool:
+        taken = self._port.write(data)
+        if taken:
+            self._note(b"<", data)
+        return taken
+
+    def fileno(self) -> int:
+        return self._port.fileno()
+
+    def close(self) -> None:
+        self._port.close()
+        self.log.close()
