@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from hil.recording.record import Recorder, lines, read_poses
 from tests.contract.test_pilot import quiet
 from tests.hil_flight import TICK, Spy, params
 from tests.hil_runs import record_run, saved_policy
+from visthrow.onboard.observations import RESPONSE, layout_of
 from visthrow.onboard.pilot import by_own_rule
 from visthrow.onboard.policy import Policy, find_policy
 from visthrow.training.env import ThrowEnv
@@ -112,7 +114,9 @@ def test_ten_thousand_poses_of_the_vision_policy(tmp_path):
     seen, shown = both("vision", 100, 100, tmp_path / "a")
     assert seen.shape[:2] == (100, 100)
     np.testing.assert_array_equal(seen, shown)
-    valid = seen[..., -8:]
+    layout = layout_of(SimpleNamespace(**Policy.load(find_policy("vision")).contract["observation"]))
+    after = layout.located + layout.response * RESPONSE
+    valid = seen[..., -after - layout.validity : -after]
     assert 0.1 < valid.mean() < 0.95, "points inside and outside of the field of view"
 
 

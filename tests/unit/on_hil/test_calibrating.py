@@ -114,7 +114,7 @@ def hall():
     made = Hall(Runner(params, Policy.load(find_policy(params.policy)), DryRun()))
     made.fly(3.0)
     made.before = made.off()
-    made.fly(5.0)
+    made.fly(9.0)  # still, sway, and until the swing that it leaves has died down
     return made
 
 
