@@ -283,6 +283,7 @@ def run(task: tuple[Case, Path]) -> dict:
             "varies": [s.name for s in diagnosis.scatter if s.found],
             "gain": {c.channel: [c.before, c.after, c.floor, c.gain, c.low, c.high] for c in held},
             "sizes": {f.name: [f.estimate, f.low, f.high, f.verdict] for f in diagnosis.findings if f.high > f.low},
+            "partners": {name: diagnosis[name].partners for name in diagnosis.theta},
         }  # fmt: skip
         if case.expect:
             row["ok"] = bool(re.search(case.expect, said))
@@ -309,16 +310,25 @@ def won_back(errors: Sequence[float]) -> float:
 
 
 def agreement(rows: Sequence[dict]) -> list[tuple[str, str, str, bool]]:
-    """Of pairs of parts of one vehicle and each effect that one of them names: whether the two sizes are one within both intervals."""
+    """Of pairs of parts of one vehicle and each name of either: whether both tell one size, within both intervals taken together.
+
+    Of a class it is said that one of its members is the cause: it agrees where one of them does.
+    """
     found = []
     for a, b in combinations(rows, 2):
         if a["of"] != b["of"]:
             continue
-        for name in sorted({*a["named"], *b["named"]} & a["sizes"].keys() & b["sizes"].keys()):
-            (low_a, high_a), (low_b, high_b) = a["sizes"][name][1:3], b["sizes"][name][1:3]
-            apart = abs(0.5 * (low_a + high_a) - 0.5 * (low_b + high_b))
-            found.append((a["case"], b["case"], name, apart <= 0.5 * float(np.hypot(high_a - low_a, high_b - low_b))))
+        names = {name: {name, *one["partners"][name]} for one in (a, b) for name in one["named"]}
+        for name, members in sorted(names.items()):
+            both = [m for m in members if m in a["sizes"] and m in b["sizes"]]
+            if both:
+                found.append((a["case"], b["case"], name, any(_one_size(a["sizes"][m], b["sizes"][m]) for m in both)))
     return found
+
+
+def _one_size(a: Sequence, b: Sequence) -> bool:
+    apart, width = abs(a[1] + a[2] - b[1] - b[2]), float(np.hypot(a[2] - a[1], b[2] - b[1]))
+    return apart <= width
 
 
 def table(rows: Sequence[dict]) -> str:
