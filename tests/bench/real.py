@@ -9,6 +9,7 @@
 """
 
 import argparse
+import json
 import re
 import resource
 import tempfile
@@ -279,10 +280,11 @@ def run(task: tuple[Case, Path]) -> dict:
             return {"case": case.name, "said": said, "overall": "error", "ok": bool(case.expect and re.search(case.expect, said))}
         held = diagnosis.held_out.channels if diagnosis.held_out else ()
         row = {
-            "case": case.name, "of": case.of, "overall": diagnosis.overall, "named": list(diagnosis.theta), "said": said,
+            "case": case.name, "of": case.of, "overall": diagnosis.overall, "named": list(diagnosis.theta),
+            "said": said.split("\n\n")[0],
             "varies": [s.name for s in diagnosis.scatter if s.found],
             "gain": {c.channel: [c.before, c.after, c.floor, c.gain, c.low, c.high] for c in held},
-            "sizes": {f.name: [f.estimate, f.low, f.high, f.verdict] for f in diagnosis.findings if f.high > f.low},
+            "sizes": {f.name: [f.estimate, f.low, f.high, f.verdict] for f in diagnosis.findings if f.high > f.low and case.of},
             "partners": {name: diagnosis[name].partners for name in diagnosis.theta},
         }  # fmt: skip
         if case.expect:
@@ -355,11 +357,14 @@ def table(rows: Sequence[dict]) -> str:
 def main() -> None:
     """Run the cases, print the tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--data", type=Path, required=True, help="folder of the full sets")
+    parser.add_argument("--data", type=Path, help="folder of the full sets")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--only", default="", help="cases whose names hold this")
     parser.add_argument("--json", help="write the answers to this file, each as it comes")
+    parser.add_argument("--show", help="print the tables of such a file, and run nothing")
     args = parser.parse_args()
+    if args.show:
+        return print(table(json.loads(Path(args.show).read_text())["rows"]))
     cases = [case for case in (*SETS, *TRAPS, *PARTS) if args.only in case.name]
     rows: list[dict] = []
     for _, row in workers.done(_run_index, [(case.name, args.data) for case in cases], args.jobs):
