@@ -14,6 +14,7 @@ from scipy.special import stdtrit
 from scipy.stats import chi2
 
 from visthrow.diagnose.likelihood.evidence import (
+    CALIBRATION_QUANTILE,
     NORMAL_95,
     OWN_FLOOR,
     STRONG,
@@ -41,8 +42,6 @@ TELLING = 0.1
 """Of what flights promise in the mean, from which one counts among those that can tell."""
 MOSTLY = 0.6
 """Share of what is left from which it is said to lie in one axis or one flight."""
-SURE = 0.95
-"""Probability with which flights that agree are not told to differ."""
 SEEN = 1e-6
 """Share of the strongest direction below which a group says nothing of another."""
 
@@ -139,7 +138,7 @@ def birge(groups: Statistics, priors: Priors, active: Sequence[int], theta: np.n
         square += float(((vectors.T @ (score[named] / scale))[told] ** 2 / values[told]).sum())
         seen += int(told.sum())
     free = seen - len(named)
-    return max(square / free, 1.0) if free > 0 and square > chi2.ppf(SURE, free) else 1.0
+    return max(square / free, 1.0) if free > 0 and square > chi2.ppf(CALIBRATION_QUANTILE, free) else 1.0
 
 
 def folds_of(count: int) -> list[np.ndarray]:
