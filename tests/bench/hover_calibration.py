@@ -1,7 +1,7 @@
 """How well a hover's calibration knows the camera, over many draws: ``python -m tests.bench.hover_calibration --count 100``.
 
 Each draw hovers, sways and is calibrated as :mod:`visthrow.throws.calibrated` does it, with all the training's noise; then what was found
-is held against what was drawn.
+is compared with what was drawn.
 """
 
 import argparse
