@@ -239,30 +239,23 @@ def sigma_of(channel: Channel, least: float) -> np.ndarray:
     return np.maximum(np.where(np.isfinite(seen), seen, 10.0 * least), least)
 
 
-def rk4(slope: Callable[[int, np.ndarray], np.ndarray], state: np.ndarray, at: int, step: np.ndarray) -> np.ndarray:
-    """One Runge-Kutta step of fourth order.
+def integrate(slope: Callable[[int, np.ndarray], np.ndarray], state: np.ndarray, steps: int, step: np.ndarray) -> np.ndarray:
+    """Path of lanes on their grids by Runge-Kutta steps of fourth order, shape (B, steps + 1, S).
 
     Args:
         slope: Of the half step counted from the start, and the state.
-        state: Shape (B, S).
-        at: Number of the half step at which it begins.
+        state: At the start, shape (B, S).
+        steps: Their number.
         step: [s], shape (B, 1).
     """
-    half = 0.5 * step
-    k1 = slope(at, state)
-    k2 = slope(at + 1, state + half * k1)
-    k3 = slope(at + 1, state + half * k2)
-    k4 = slope(at + 2, state + step * k3)
-    return state + step / 6.0 * (k1 + 2.0 * (k2 + k3) + k4)
-
-
-def integrate(slope: Callable[[int, np.ndarray], np.ndarray], state: np.ndarray, steps: int, step: np.ndarray) -> np.ndarray:
-    """Path of lanes on their grids, shape (B, steps + 1, S)."""
-    path = np.empty((len(state), steps + 1, state.shape[1]))
+    path, half = np.empty((len(state), steps + 1, state.shape[1])), 0.5 * step
     path[:, 0] = state
     for i in range(steps):
-        state = rk4(slope, state, 2 * i, step)
-        path[:, i + 1] = state
+        k1 = slope(2 * i, state)
+        k2 = slope(2 * i + 1, state + half * k1)
+        k3 = slope(2 * i + 1, state + half * k2)
+        k4 = slope(2 * i + 2, state + step * k3)
+        state = path[:, i + 1] = state + step / 6.0 * (k1 + 2.0 * (k2 + k3) + k4)
     return path
 
 
