@@ -11,6 +11,9 @@ PYTHON ?= $(firstword $(foreach name,python3 python3.13 python3.12 python3.11,$(
 # Test files at once, each with one thread; a file's tests stay in one process, which shares what it compiled and flew.
 JOBS ?= 2
 
+# Containers often forbid it; then each process compiles anew what it imports: torch and tensordict for 5 s of a core.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: demo docs firmware test test-all test-sitl lint clean install
 .DELETE_ON_ERROR:
 

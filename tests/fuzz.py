@@ -34,7 +34,7 @@ def noise(rng: np.random.Generator) -> bytes:
 
 
 def mutated(rng: np.random.Generator, good: list[bytes]) -> bytes:
-    """One of some messages with up to five bytes changed, cut, or run together with another."""
+    """Return one of some messages with up to five bytes changed, cut, or run together with another."""
     data = bytearray(good[rng.integers(len(good))])
     for _ in range(int(rng.integers(0, 6))):
         data[rng.integers(len(data))] = rng.integers(256)

@@ -62,7 +62,7 @@ class Vehicle:
             self.payload_vel = self.payload_vel - [0.0, 0.0, 9.81 * dt]
 
     def poses(self, hang: float) -> list[Pose]:
-        """Both bodies; a tenth of a millimetre of noise keeps their content fresh."""
+        """Return poses of both bodies; a tenth of a millimetre of noise keeps their content fresh."""
         noise = 1e-4 * self.rng.standard_normal((2, 3))
         ball = self.pos - [0.0, 0.0, hang] if self.payload is None else self.payload
         return [

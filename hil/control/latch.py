@@ -66,8 +66,8 @@ class Latch:
 
     def hangs_still(self, now: float, vehicle_w: Vector, payload_w: Vector | None) -> bool:
         """Return whether the payload hangs on the vehicle at a time [s], by the latch and then by both places [m], if known."""
-        if self.at is None:
-            return True
+        if self.at is None:  # it may have come off by itself
+            return payload_w is None or math.dist(vehicle_w, payload_w) < self._hang + self._tolerance
         if payload_w is None or now - self.at < self.lag + STUCK_AFTER:
             return False
         hangs = abs(math.dist(vehicle_w, payload_w) - self._hang) < self._tolerance

@@ -362,8 +362,9 @@ class Runner:
             if GOAL in self.tracks and self.tracks[GOAL].gate.level(now) >= HOLD:
                 checks.append("the goal's pose is stale")
             checks += self._thrust_off()
-            if self.calibrating is not None and state in (State.READY, State.ARMED):
-                checks += self.calibrating.problems()
+            if self.detections is not None and state in (State.READY, State.ARMED):
+                checks += self.detections.problems(now)
+                checks += self.calibrating.problems() if self.calibrating is not None else []
         # What has not been answered is not over: the payload may yet come off.
         over = vehicle is not None and state in (State.ARMED, State.RECOVER) and status.release != PENDING
         # While landing the fence's floor is left on purpose.
@@ -371,7 +372,8 @@ class Runner:
         return Inputs(
             self.tracks[VEHICLE].gate.level(now), self.tracks[PAYLOAD].gate.level(now), status.connected, tuple(checks), fence,
             over and self._still(vehicle, payload, status.mode == HELD), self.latch.separated(now), self.latch.at is not None,
-            self.aim.given_up(now), vehicle is not None and vehicle.pos[2] < GROUND, failure,
+            self.latch.at is None and not self._carries(now, vehicle, payload), self.aim.given_up(now),
+            vehicle is not None and vehicle.pos[2] < GROUND, failure,
             words.arm, words.land, words.abort, recording, status.mode == FOLLOW, status.note, words.why,
         )  # fmt: skip
 

@@ -60,6 +60,7 @@ class Inputs:
     still: bool = False  # vehicle at home and vehicle and payload slow
     separated: bool = False  # latch plus trained lag has passed in this throw
     released: bool = False  # the latch has tripped in this throw
+    lost: bool = False  # the payload has come off by itself
     astray: bool = False  # releases that were asked for were held back, and nothing better came
     grounded: bool = False  # the descent has arrived
     failure: str | None = None  # of policy, guard, release or of the runner itself
@@ -201,6 +202,8 @@ class Machine:
             return  # what is latched cannot be taken back: fly on until it is off
         elif max(seen.vehicle, seen.payload) >= HOLD:
             self._go(now, State.RECOVER, "stale poses")
+        elif seen.lost:
+            self._go(now, State.RECOVER, "the payload has come off by itself")
         elif seen.astray:
             self._go(now, State.RECOVER, "the policy released where it would miss")
         elif self._late(now):

@@ -20,7 +20,7 @@ MOST_BYTES = 65535  # length of a chunk of MSP in the file; a longer one is cut
 
 
 class Writer:
-    """A file that is added to; putting never waits and never raises. After a failure nothing is taken any more.
+    """A file that is added to; putting never waits and never raises.
 
     ``failed`` counts chunks that could not be written; ``why`` the first one could not, or None.
     """
@@ -40,7 +40,7 @@ class Writer:
 
     def put(self, data: bytes) -> None:
         """Add bytes."""
-        if self.why is None and len(self._waiting) < MOST_WAITING:
+        if len(self._waiting) < MOST_WAITING:
             self._waiting.append(data)
         else:
             self._fail("the disk is too slow")

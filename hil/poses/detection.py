@@ -96,6 +96,10 @@ class Detections:
             if getattr(seen, name) is not None:
                 self._points[part], self._valid[part] = points[part], valid[part]
 
+    def problems(self, now: float) -> list[str]:
+        """Return what speaks against a throw at a time [s]: a ball that hangs in view is seen."""
+        return ["the pictures show no ball"] if now - self._times["ball"] > self._hold else []
+
     def _carried(self, seen: Seen, when: float) -> Seen:
         """Return what was seen at a time as the camera of training would see it now: the goal lies, the ball goes with the vehicle."""
         _, pos_now, rot_now = self._path[-1]

@@ -140,6 +140,7 @@ class Samples:
         time = self._later(sample.body, measured(sample, self.params) if sample.time is None else sample.time)
         if sample.body == PAYLOAD:
             self.recorder.add(time, payload_pos_w=pose.pos, payload_vel_w=sample.vel_w)
+            self._note(payload_vel_w=pose.vel)
             vehicle = self._vehicle
             if attached and vehicle is not None and vehicle.quat is not None:
                 mount = matrix_of_quat(np.array([vehicle.quat]))[0] @ np.array(self.runner.mount_b)
@@ -149,6 +150,12 @@ class Samples:
             self.recorder.add(time, pos_w=pose.pos, vel_w=sample.vel_w)
             if pose.quat is not None:
                 self.recorder.add(time, quat_wb=pose.quat, rate_b=sample.rate_b)
+            self._note(vel_w=pose.vel, rate_b=pose.rate)
+
+    def _note(self, **given: Any) -> None:
+        """Note in the metadata which channels are the runner's own, of what the source gave of each."""
+        estimated = self.recorder.meta.setdefault("estimated", [])
+        estimated += [name for name, value in given.items() if value is None and name not in estimated]
 
 
 def meta_of(playback: Playback, provenance: dict[str, Any], start: float) -> dict[str, Any]:

@@ -104,26 +104,27 @@ class LogBody(Bounded):
 
 @contextmanager
 def _as_source() -> Iterator[None]:
+    """Raise what a log's reader says as `SourceError`."""
     try:
         yield
     except LogError as error:
         raise SourceError(str(error)) from error
 
 
+@_as_source()
 def read_table(path: str | Path, mapping: TableMap | None) -> list[Pose]:
     """Return poses of a table, or of any file that ``visthrow.logs`` reads; arrivals are the stamps, counted from the first.
 
     Raises:
         SourceError: the file cannot be read, lacks a column, or holds no position of any body.
     """
-    with _as_source():
-        logs = read(path, mapping)
-        if len(logs) > 1:
-            raise LogError(f"{path}: {len(logs)} flights in one file; expected one, named as FILE:PART")
-        poses = [pose for body in BODIES for pose in _of_channels(logs[0], body)]
-        if not poses:
-            known = ", ".join(names[0] for names in CHANNELS.values())
-            raise LogError(f"{path}: no position of a body; expected one of the channels {known}; it has {', '.join(logs[0].channels)}")
+    logs = read(path, mapping)
+    if len(logs) > 1:
+        raise LogError(f"{path}: {len(logs)} flights in one file; expected one, named as FILE:PART")
+    poses = [pose for body in BODIES for pose in _of_channels(logs[0], body)]
+    if not poses:
+        known = ", ".join(names[0] for names in CHANNELS.values())
+        raise LogError(f"{path}: no position of a body; expected one of the channels {known}; it has {', '.join(logs[0].channels)}")
     return poses
 
 
@@ -148,18 +149,19 @@ def _before(times: np.ndarray, stamps: np.ndarray) -> np.ndarray:
     return np.where((index >= 0) & (stamps - times[np.maximum(index, 0)] <= PAIR_AGE), index, -1)
 
 
+@_as_source()
 def read_tlog(path: str | Path, bodies: tuple[BodyIds, ...]) -> list[Pose]:
     """Return poses of a .tlog; arrivals are seconds from its first message. Raises `SourceError` where nothing in it is a message."""
     decoder, poses, first = MavlinkDecoder(bodies), [], None
-    with _as_source():
-        for arrival, message in messages.telemetry(path):
-            first = arrival if first is None else first
-            pose = decoder.feed(message, arrival - first)
-            if pose is not None:
-                poses.append(pose)
+    for arrival, message in messages.telemetry(path):
+        first = arrival if first is None else first
+        pose = decoder.feed(message, arrival - first)
+        if pose is not None:
+            poses.append(pose)
     return poses
 
 
+@_as_source()
 def read_autopilot(path: str | Path, bodies: tuple[LogBody, ...], kind: str) -> list[Pose]:
     """Return poses of all bodies in a log of kind "bin" or "ulg", arrivals counted from the first one.
 
@@ -173,8 +175,7 @@ def read_autopilot(path: str | Path, bodies: tuple[LogBody, ...], kind: str) -> 
     for body in bodies:
         if body.message not in known:
             raise SourceError(f"message '{body.message}' of the {body.body} carries no pose; {suggest(body.message, known)}")
-        with _as_source():
-            found = _of_messages(reader(body.file or path, [*known, *_COMPANIONS]), body, known)
+        found = _of_messages(reader(body.file or path, [*known, *_COMPANIONS]), body, known)
         if not found:
             raise SourceError(f"{body.file or path}: {body.message} (instance {body.instance}) holds no pose of the {body.body}")
         poses += [replace(pose, arrival=pose.arrival + body.time_offset) for pose in found]

@@ -113,7 +113,7 @@ def types(precision: str) -> Types:
 
 @lru_cache
 def _numpy_type(struct: type) -> np.dtype:
-    """Of the rows of a struct; Warp works it out anew each time."""
+    """Return the NumPy type of a struct's rows; Warp works it out anew each time."""
     return struct.numpy_dtype()
 
 

@@ -86,7 +86,7 @@ def controller_of(vehicle: VehicleParams, settings: Mapping[str, str], mix_thrus
         return x, y, z
 
     def lag(*names: str) -> float:
-        """Of low-passes one after the other [s]; 0 Hz are none."""
+        """Return the delay of low-passes one after the other [s]; 0 Hz are none."""
         return sum(1.0 / (2.0 * math.pi * hz) for name in names if (hz := numbers(settings, name)[0]) > 0.0)
 
     gyro = lag("gyro_lpf1_static_hz", "gyro_lpf2_static_hz")

@@ -259,7 +259,7 @@ def build_joint(t: Types, Around: type, torque) -> object:
 
 
 def build_no_joint(t: Types, Around: type) -> object:
-    """The same without any."""
+    """Build what stands in the joint's place where a plant has no law of it."""
     Air = t.Air
 
     @wp.func

@@ -12,7 +12,7 @@ AERODYNAMICS = ("drag_x", "drag_y", "drag_z", "parasitic", "inflow", "torque_inf
 
 @dataclass(frozen=True)
 class Setting:
-    """All that a replay simulates: the plant that training reads too, the sensors, and the step."""
+    """What a replay simulates: the plant that training reads too, the sensors, and the step."""
 
     plant: PlantParams
     sensing: SensingParams = dataclasses.field(default_factory=SensingParams)

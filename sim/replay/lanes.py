@@ -45,7 +45,7 @@ class Recording:
         self._there: dict[tuple[rk.ReplayKernel, str], tuple] = {}
 
     def on(self, kernel: rk.ReplayKernel, t: Types, device: str) -> tuple:
-        """Both as a kernel's structs on a device."""
+        """Return windows and recorded data as a kernel's structs on a device."""
         if (kernel, device) not in self._there:
             structs = (kernel.Windows, rk.WINDOW_FIELDS, self.windows), (kernel.Data, rk.DATA_FIELDS, self.data)
             self._there[kernel, device] = tuple(_struct(t, *given, device) for given in structs)

@@ -48,7 +48,7 @@ def first_stage_terms(stiffness: Any, damping: Any, u: Any, k1: Any, gh: Any, h:
 
 @wp.func
 def second_stage_terms(stiffness: Any, damping: Any, u2: Any, k1: Any, gh: Any, h: Any):
-    """The same for the second stage, from ``(I - gh J) k2 = f2 - 2 k1`` with ``z = k2 + 2 k1``."""
+    """Right-hand side that the W-method adds in the second stage, from ``(I - gh J) k2 = f2 - 2 k1`` with ``z = k2 + 2 k1``."""
     two = type(h)(2.0)
     return gh * stiffness * u2 + two * gh * (stiffness * (two * gh - h) + damping) * k1
 
@@ -331,7 +331,7 @@ def build_chain(t: Types, segments: int, extensions: frozenset[str] = frozenset(
 
     @wp.func
     def pull_of_one(rope: Rope, stiffness: wp.array(dtype=real), u: wp.array(dtype=vec3)):
-        """The same of a single rod: what it and the payload weigh, and what keeps them on their circle."""
+        """Force [N] along a single rod at the mount: what it and the payload weigh, and what keeps them on their circle."""
         return stiffness[0] / rope.last_center + rope.last_mass * rope.last_center * wp.dot(u[0], u[0])
 
     @wp.func
@@ -344,7 +344,7 @@ def build_chain(t: Types, segments: int, extensions: frozenset[str] = frozenset(
 
     @wp.func
     def speed_second(rope: Rope, mount_vel_w: vec3, u: wp.array(dtype=vec3), k1: wp.array(dtype=vec3), h: real):
-        """The same at the predicted state."""
+        """Velocity of the payload's centre at the predicted state [m/s], world frame."""
         vel = mount_vel_w
         for i in range(L):
             vel += rope.segment_length * (u[i] + h * k1[i])

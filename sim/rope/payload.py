@@ -26,7 +26,7 @@ def no_spin(rope: Any, force: Any, air_vel_w: Any):
 
 @wp.func
 def spin_force(rope: Any, force: Any, air_vel_w: Any):
-    """The same [N], world frame, with the side force and the lift of a ball that spins."""
+    """Air's force on the payload [N], world frame, with the side force and the lift of a ball that spins."""
     zero = air_vel_w[0] - air_vel_w[0]
     side = type(air_vel_w)(-air_vel_w[1], air_vel_w[0], zero)
     across = wp.normalize(side)

@@ -1,4 +1,4 @@
-"""The paper's ablations as hidden defects: a model that lacks a block is held against flights of a plant that has it.
+"""The paper's ablations as hidden defects: a model that lacks a block is compared with flights of a plant that has it.
 
 The shipped policy throws on the reference plant, which has everything; the same flights are diagnosed with four models, each
 without one block. What must be named is the block. Nothing is trained. Throws that no diagnosis saw say what the name is worth.

@@ -169,7 +169,7 @@ CASES = {
 
 
 def known_cases() -> dict[str, Case]:
-    """All faults by name."""
+    """Return the faults by name."""
     mocap = import_module("hil.fakes.mocap").FAULTS  # the onboard side is not imported by name: it must not need this one
     return {**{name: _mocap(name, text) for name, (text, _) in mocap.items()}, **CASES}
 

@@ -1,7 +1,7 @@
 """How well a hover's calibration knows the camera, over many draws: ``python -m tests.bench.hover_calibration --count 100``.
 
 Each draw hovers, sways and is calibrated as :mod:`visthrow.throws.calibrated` does it, with all the training's noise; then what was found
-is held against what was drawn. ``--plant reference-realistic`` does so on the reference plant: poses with its noise, keypoints of what
+is compared with what was drawn. ``--plant reference-realistic`` does so on the reference plant: poses with its noise, keypoints of what
 was exposed with half a pixel of noise, as the OpenCV detector has (``visthrow detector check``).
 """
 

@@ -26,7 +26,8 @@ def fly(seconds=6.0, gain=1.0, drag=0.0, cable=None, payload_drag=0.0, volts_slo
     load = mass + (payload if cable else 0.0)
     phases = rng.uniform(0, 6, 2)
     half = np.arange(0.0, seconds + step, 0.5 * step)
-    rot = attitude(half).as_matrix()
+    begin = 10.0 * seed  # no two flights turn alike
+    rot = attitude(half + begin).as_matrix()
     told = load * G / rot[:, 2, 2] * (1.0 + 0.15 * np.sin(3.1 * half + phases[0]) + 0.1 * np.sin(1.3 * half + phases[1]))
     volts = 4.1 - 0.05 * half
     level = gain * (1.0 + volts_slope * (volts - 3.8)) * (1.0 + fade * half)
@@ -60,7 +61,7 @@ def fly(seconds=6.0, gain=1.0, drag=0.0, cable=None, payload_drag=0.0, volts_slo
         return Channel(time, columns + rng.normal(0, noise, (len(time), 3)), "m", "world")
 
     channels = {
-        "pos_w": seen(path[:, :3]), "quat_wb": Channel(time, attitude(time - late).as_quat(), "1", "world"),
+        "pos_w": seen(path[:, :3]), "quat_wb": Channel(time, attitude(time + begin - late).as_quat(), "1", "world"),
         "motor_command": Channel(time, np.tile(command[:, None], 4), "1"),
         "battery_voltage": Channel(time, 4.1 - 0.05 * time, "V"),
     }  # fmt: skip

@@ -44,21 +44,13 @@ def errors(flight: Flight, run: OracleRun) -> tuple[float, float, float]:
 
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 @pytest.mark.parametrize("name", ["hard_throw", "pull_back"])
-def test_two_milliseconds_are_accurate(name, precision):
+@pytest.mark.parametrize(("step", "near", "slow"), [(2e-3, POSITION, VELOCITY), (2.5e-4, FINE_POSITION, np.inf)])
+def test_a_throw_is_as_accurate_as_its_step(step, near, slow, name, precision):
     scene = load_scene(SCENES / f"{name}.toml")
-    vehicle, ball, velocity = errors(fly(scene, 2e-3, precision), oracle(scene))
-    assert vehicle < POSITION
-    assert ball < POSITION
-    assert velocity < VELOCITY
-
-
-@pytest.mark.parametrize("precision", ["float32", "float64"])
-@pytest.mark.parametrize("name", ["hard_throw", "pull_back"])
-def test_a_quarter_millisecond_is_ten_times_better(name, precision):
-    scene = load_scene(SCENES / f"{name}.toml")
-    vehicle, ball, _ = errors(fly(scene, 2.5e-4, precision), oracle(scene))
-    assert vehicle < FINE_POSITION
-    assert ball < FINE_POSITION
+    vehicle, ball, velocity = errors(fly(scene, step, precision), oracle(scene))
+    assert vehicle < near
+    assert ball < near
+    assert velocity < slow
 
 
 def test_the_violent_whip_converges():

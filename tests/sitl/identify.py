@@ -17,7 +17,6 @@ from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
 from hil.fakes.sitl import Firmware, needed
-from hil.fakes.sitl.firmware import GAINS
 from hil.params import HilParams
 from sim.effects.firmware import calibrated_voltage, controller_of
 from sim.hybrid import HybridSim
@@ -43,13 +42,13 @@ SIZES = ((1.0, 2.5, 5.0, 8.0), (1.0, 2.5, 5.0, 8.0), (0.5, 1.0, 2.0, 3.0))
 LIFTS = (0.6, 1.0, 1.5, 2.2)
 """Thrust during a doublet, times that of the hover."""
 
-RELAX, IDLE = 1.0 / (2.0 * np.pi * 15.0), 0.055
-"""Of iterm_relax_cutoff, 15 Hz [s]; motor_idle, 5.5 %."""
+IDLE = 0.055
+"""motor_idle, 5.5 %."""
 
 STALL = 3
 """Periods without a motor output that count as a stall of the firmware."""
 
-NAMES = ("delay", "gyro", "voltage", "p", "i", "d", "p_yaw", "i_yaw")
+NAMES = ("delay", "voltage", "gyro", "p", "i", "d", "p_yaw", "i_yaw")
 REST = ("integral_x", "integral_y", "integral_z")
 """What the firmware's integrals held when the recording began, over their gains [rad]."""
 
@@ -98,19 +97,15 @@ def fly(folder: Path, seconds: float, seed: int = 0) -> dict[str, np.ndarray]:
 
 
 def changed(vehicle: VehicleParams, theta: np.ndarray) -> VehicleParams:
-    """The vehicle with the firmware's controller; numbers of it by `NAMES`: times [s], voltage [V], 1 + logarithms of factors of gains."""
-    delay, gyro, voltage = theta[:3].tolist()
-    p, i, d, p_yaw, i_yaw = np.exp(theta[3:] - 1.0).tolist()
+    """A vehicle with the settings' controller, changed by `NAMES`: delay [s], voltage [V], 1 + logarithms of factors of the others."""
+    delay, voltage = theta[:2].tolist()
+    gyro, p, i, d, p_yaw, i_yaw = np.exp(theta[2:] - 1.0).tolist()
     c = vehicle.controller
-    scale = lambda gain, both, yaw, of: (  # noqa: E731
-        gain[0] * both, gain[1] * both * GAINS[f"{of}_pitch"] / GAINS[f"{of}_roll"], gain[2] * yaw,
-    )  # fmt: skip
-    full = c.max_thrust * (voltage / vehicle.battery.reference_voltage) ** 2
+    scale = lambda gain, both, yaw: (gain[0] * both, gain[1] * both, gain[2] * yaw)  # noqa: E731
+    full = c.max_thrust * (voltage / c.calibration_voltage) ** 2
     controller = dataclasses.replace(
-        c, kind="motor_mixing", setpoint_time_constant=RELAX, gyro_time_constant=gyro, p_gain=scale(c.p_gain, p, p_yaw, "p"),
-        i_gain=scale(c.i_gain, i, i_yaw, "i"), d_gain=scale(c.d_gain, d, 1.0, "d"), feedforward_gain=(0.0, 0.0, 0.0),
-        integral_limit=tuple(10.0 * limit for limit in c.integral_limit), max_thrust=full, min_thrust=full * IDLE**2,
-        calibration_voltage=voltage, voltage_compensation=0.0,
+        c, gyro_time_constant=gyro * c.gyro_time_constant, p_gain=scale(c.p_gain, p, p_yaw), i_gain=scale(c.i_gain, i, i_yaw),
+        d_gain=scale(c.d_gain, d, 1.0), max_thrust=full, min_thrust=full * IDLE**2, calibration_voltage=voltage,
     )  # fmt: skip
     return dataclasses.replace(vehicle, controller=controller, queue=dataclasses.replace(vehicle.queue, delay=delay))
 
@@ -178,13 +173,12 @@ class Windows:
         return float(np.sqrt(((self.rates(vehicle, chosen, rest) - flown) ** 2).mean() / (flown**2).mean()))
 
 
-def fit(windows: Windows, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def fit(windows: Windows, vehicle: VehicleParams, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Numbers of :func:`changed`, and `REST`, that fit the chosen windows best."""
-    vehicle = windows.plant.vehicle
-    start = np.array([0.004, 0.002, 16.5, *np.ones(5), *np.zeros(3)])
-    low = np.array([0.0, 5e-4, 14.0, *np.full(5, -3.0), *np.full(3, -5.0)])
-    high = np.array([0.06, 0.03, 18.0, *np.full(8, 5.0)])
-    scale = [5e-3, 2e-3, 0.3, *np.full(5, 0.5), *np.full(3, 0.1)]
+    start = np.array([0.001, vehicle.controller.calibration_voltage, *np.ones(6), *np.zeros(3)])
+    low = np.array([0.0, 14.0, *np.full(6, -3.0), *np.full(3, -5.0)])
+    high = np.array([0.06, 18.0, *np.full(9, 5.0)])
+    scale = [5e-3, 0.3, *np.full(6, 0.5), *np.full(3, 0.1)]
 
     def off(theta: np.ndarray) -> np.ndarray:
         return (windows.rates(changed(vehicle, theta[:8]), chosen, theta[8:]) - windows.rows[chosen][:, :, 1:4]).ravel()
@@ -238,19 +232,20 @@ def main() -> None:
     every = np.arange(len(windows.rows))
     seen, held_out = every[every % 3 != 2], every[every % 3 == 2]
     shipped, configured = windows.plant.vehicle, config.load(VehicleParams, config.find("vehicle", "betaflight_sitl"))
-    theta, rest = fit(windows, seen)
-    fitted = changed(shipped, theta)
     settings = read_blackbox(next((args.out / "run").glob("LOG*")))[0].header
     hover = config.load(HilParams, config.find("hil", "betaflight_sitl")).betaflight.thrust.hover
     weight = 0.25 * windows.plant.total_mass * GRAVITY
     alone = controller_of(shipped, settings, weight, calibrated_voltage(shipped, settings, weight, hover))
+    named = dataclasses.replace(shipped, controller=alone)
+    theta, rest = fit(windows, named, seen)
+    fitted = changed(named, theta)
     (args.out / "vehicle.toml").write_text(config.dumps(fitted))
     figures = {
         "doublets": len(every), "stalled": windows.stalled, "shipped": windows.miss(shipped, held_out, rest),
-        "settings": windows.miss(dataclasses.replace(fitted, controller=alone), held_out, rest),
+        "settings": windows.miss(dataclasses.replace(named, queue=fitted.queue), held_out, rest),
         "configured": windows.miss(dataclasses.replace(configured, queue=fitted.queue), held_out, rest),
         "fitted": windows.miss(fitted, held_out, rest), "seen": windows.miss(fitted, seen, rest),
-        **{name: float(v if k < 3 else np.exp(v - 1.0)) for k, (name, v) in enumerate(zip(NAMES, theta))},
+        **{name: float(v if k < 2 else np.exp(v - 1.0)) for k, (name, v) in enumerate(zip(NAMES, theta))},
     }  # fmt: skip
     (args.out / "fit.json").write_text(json.dumps(figures, indent=2) + "\n")
     print(json.dumps(figures, indent=2))

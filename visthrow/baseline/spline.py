@@ -91,7 +91,7 @@ class Spline:
 
     @property
     def duration(self) -> float:
-        """[s]."""
+        """Time from start to release [s]."""
         return float(self.times.sum())
 
     def sample(self, time: np.ndarray, derivatives: int = 6) -> np.ndarray:

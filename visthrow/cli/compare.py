@@ -111,7 +111,7 @@ def _tell(
 
 
 def _from_runs(args: argparse.Namespace) -> int:
-    """The same table and files from the folders of HIL runs.
+    """Print and write the table of the throws in folders of HIL runs.
 
     Raises:
         ConfigError: policies were named as well.

@@ -117,7 +117,7 @@ def lead(found) -> str:
 
 
 def sections(found) -> list:
-    """All sections, each followed by what somebody wrote beside its data."""
+    """Return the sections, each followed by what somebody wrote beside its data."""
     from dataclasses import replace
 
     from visthrow.evidence.report import ablations, beyond, gap, origin, throws, trade

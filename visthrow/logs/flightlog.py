@@ -147,6 +147,11 @@ class FlightLog:
     def __contains__(self, name: str) -> bool:
         return name in self.channels
 
+    def measured(self) -> "FlightLog":
+        """Return the log without the channels that were worked out of others: ``estimated`` of the metadata names them."""
+        left_out = self.meta.get("estimated", ())
+        return FlightLog({name: channel for name, channel in self.channels.items() if name not in left_out}, self.meta)
+
     def save(self, path: str | Path) -> None:
         """Write the log as an ``.npz`` without pickle, whole or not at all.
 

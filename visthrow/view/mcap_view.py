@@ -90,7 +90,7 @@ def write(path: str | Path, log: FlightLog, experiment: Any) -> None:
 
 
 def _messages(log: FlightLog, experiment: Any, begin: float) -> Iterator[Message]:
-    """All of a flight, topic after topic."""
+    """Messages of a whole flight, topic after topic."""
     if "pos_w" in log and "quat_wb" in log:
         turns = log["quat_wb"].hold(log["pos_w"].time)
         for time, place, turn in zip(log["pos_w"].time, log["pos_w"].values, turns, strict=True):

@@ -172,12 +172,12 @@ def test_the_correlation_time_is_the_likeliest_of_all(gust_time, monkeypatch):
     assert found == max(noise.CORRELATION_TIMES, key=value)
 
 
-def test_derivatives_are_moved_to_a_gpu_once(fitted):
+def test_derivatives_are_laid_side_by_side_once(fitted):
     """With other residuals and noise levels they are the same; with other ones they are not."""
     inner = [gram.inner for gram in fitted[4]]
-    kept = stacks._kept(designs.Same(inner), tuple([1] * len(inner)), "cpu")
-    assert stacks._kept(designs.Same(list(inner)), tuple([1] * len(inner)), "cpu") is kept
-    assert stacks._kept(designs.Same([inner[0].copy(), *inner[1:]]), tuple([1] * len(inner)), "cpu") is not kept
+    kept = stacks._ON_GPU(designs.Same(inner), tuple([1] * len(inner)), "cpu")
+    assert stacks._ON_GPU(designs.Same(list(inner)), tuple([1] * len(inner)), "cpu") is kept
+    assert stacks._ON_GPU(designs.Same([inner[0].copy(), *inner[1:]]), tuple([1] * len(inner)), "cpu") is not kept
 
 
 def test_a_point_of_some_windows_is_the_point_that_they_give(fitted):

@@ -71,6 +71,8 @@ def test_what_the_other_tools_read_of_it(run, logs, tmp_path):
         assert len(log[name].time) > (5 if name in ("observation", "keypoints") else 50), name
     assert np.median(np.diff(log["pos_w"].time)) == pytest.approx(TICK / 2, abs=1e-6)
     assert np.median(np.diff(log["command"].time)) == pytest.approx(TICK, abs=1e-6)
+    worked_out = {"vel_w", "rate_b", "payload_vel_w"}
+    assert set(log.channels) - set(log.measured().channels) == worked_out, "no gyro gave rates: they are the runner's, of the poses"
     log.save(tmp_path / "log.npz")
     again = FlightLog.load(tmp_path / "log.npz")
     assert again.meta["events"] == log.meta["events"]

@@ -10,6 +10,7 @@ from hil.backends import Status
 from hil.control.runner import WARM_CALLS, OperatorInput, Runner
 from hil.errors import RunError
 from hil.params import HilParams
+from hil.poses.detection import Detection, Detections
 from tests.hil_flight import TICK, Spy, changes, fly, params, simple_policy
 from visthrow import config
 from visthrow.common.errors import ConfigError, MismatchError
@@ -254,6 +255,36 @@ def test_the_checks_before_a_throw(overrides, message):
     assert state == "abort"
     assert any(word in reason for word in message.split("|")), reason
     assert not pilot.backend.sent, "nothing was ever sent"
+
+
+def test_a_payload_that_comes_off_takes_no_pose_of_the_vehicle_with_it():
+    """Nobody told the runner; the vehicle, rid of it, goes its own way, and is followed. The throw is over."""
+    begun = START + 0.02
+
+    def spoil(time, poses):
+        fall = min(max(time - begun, 0.0) ** 2 * 0.5 * 9.81, 0.8)
+        return [dataclasses.replace(p, pos=(*p.pos[:2], p.pos[2] - fall * (p.body == "payload"))) for p in poses]
+
+    pilot, decisions = thrown(action=NEVER, poses=spoil, seconds=START + 0.6)
+    assert pilot.tracks["vehicle"].gate.refused == {}
+    assert changes(decisions)[-1] == ("recover", "the payload has come off by itself")
+    assert when(decisions, "recover") < begun + 0.2, "a fall of the tolerance, 10 cm"
+
+
+def test_no_throw_on_pictures_that_show_no_ball():
+    """Seen in the hover and then lost, it goes back to ready; seen again, it throws."""
+    hidden = (1.6, 2.6)
+    pilot = runner(NEVER)
+    pilot.detections = Detections(pilot.pilot.camera, 0.1)
+
+    def watch(time, decision):
+        ball = None if hidden[0] <= time < hidden[1] else (0.0, 0.1, math.sqrt(0.99), 0.08)
+        pilot.look([Detection(time, None, ball)])
+
+    decisions = fly(pilot, hidden[1] + 2.0, watch=watch)
+    begun = when(decisions, "throw")
+    assert hidden[1] < begun < hidden[1] + 1.5
+    assert any("the pictures show no ball" in d.waits for d in decisions)
 
 
 def test_bodies_exchanged_from_the_start_are_noticed():

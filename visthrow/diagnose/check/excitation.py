@@ -6,6 +6,7 @@ import numpy as np
 
 from visthrow.logs.check import relations
 from visthrow.logs.check.rows import Row
+from visthrow.logs.check.thrust import IDLE_SHARE, IDLE_SPEED
 from visthrow.logs.flightlog import FlightLog
 
 POSITIONS = ("pos_w", "est_pos_w", "mocap_pos_w")
@@ -175,7 +176,7 @@ def _standing(log: FlightLog, figures: dict) -> None:
     if thrust is not None and len(log[thrust].time):
         values = log[thrust].values.astype(float)
         top = float(np.percentile(values, 95))
-        idle = top < (100.0 if thrust == "motor_speed" else 0.12)
+        idle = top < (IDLE_SPEED if thrust == "motor_speed" else IDLE_SHARE)
     if "throttle" in log and np.ptp(log["throttle"].values) == 0.0:
         idle = True
     if name is not None:

@@ -64,10 +64,8 @@ class _Columns:
         return padded(self._inner, part, (self._channels, height, width), self._device)
 
 
-@lru_cache(maxsize=2)
-def _kept(inner: Same, sizes: tuple[int, ...], device: str) -> _Columns:
-    """Those that a GPU has already: residuals and noise levels change far more often than derivatives do."""
-    return _Columns(inner, sizes, device)
+_ON_GPU, _ON_CPU = (lru_cache(maxsize=most)(_Columns) for most in (2, 32))
+"""Columns that are laid side by side already: residuals and noise levels change far more often than derivatives do."""
 
 
 @dataclass(frozen=True)
@@ -150,7 +148,7 @@ class Stack:
         log_sigma = np.array([gram.log_sigma for gram in grams])
         arrays = [torch.from_numpy(a).to(self.device) for a in (cross, square, counts, log_sigma, member, known)]
         inner = [gram.placed for gram in grams]
-        columns = _Columns(inner, sizes, self.device) if self.device == "cpu" else _kept(Same(inner), tuple(sizes), self.device)
+        columns = (_ON_CPU if self.device == "cpu" else _ON_GPU)(Same(inner), tuple(sizes), self.device)
         phases, phase = np.unique([gram.phase for gram in grams], return_inverse=True)
         return _Batch(windows, (phases.tolist(), phase), list(grams), columns, *arrays)
 

@@ -130,7 +130,7 @@ class NumericModel(ABC):
         """See :class:`visthrow.diagnose.models.interface.Model`."""
         size = self.size(theta)
         residuals = self._settle(size, fresh=True)
-        slopes, effects, latent = self._by_nuisance(size), self._by_effect(size), self._by_latent(size)
+        slopes, effects, latent = (self._by(size, name) for name in ("nuisance", "theta", "latent"))
         self._slopes = slopes
         path = self.simulate(self._lanes(size))
         return [
@@ -173,7 +173,7 @@ class NumericModel(ABC):
         if not self._start.shape[1]:
             return residuals
         if self._slopes is None or fresh:
-            self._slopes = self._by_nuisance(size)
+            self._slopes = self._by(size, "nuisance")
         costs = self._costs(residuals, self._start)
         for _ in range(SETTLE_STEPS):
             steps = np.array([self._newton(i, residual) for i, residual in enumerate(residuals)])
@@ -209,51 +209,23 @@ class NumericModel(ABC):
         aim = np.concatenate([residual * weight, (s.nuisance - self._start[i]) * prior])
         return np.linalg.lstsq(rows, aim, rcond=None)[0]
 
-    def _differences(self, size: np.ndarray, theta: np.ndarray, nuisance: np.ndarray, latent: np.ndarray) -> list[np.ndarray]:
-        """Half the difference between going along and against each direction, one (directions, N) a stretch.
-
-        Args:
-            size: Where it is taken.
-            theta: Steps of the effects, shape (directions, K).
-            nuisance: Of the unknowns, shape (stretches, directions, D).
-            latent: Of the latent forces, shape (directions, G).
-        """
-        count, directions = len(self.stretches), len(theta)
-        owner = np.repeat(np.arange(count), directions)
-        base = np.repeat(self._start, directions, axis=0)
-        step = nuisance.reshape(count * directions, -1)
-        tiled, forces = np.tile(theta, (count, 1)), np.tile(latent, (count, 1))
-        plus = self._run(Lanes(owner, size + tiled, base + step, forces))
-        minus = self._run(Lanes(owner, size - tiled, base - step, -forces))
-        half = [0.5 * (a - b) for a, b in zip(plus, minus)]
-        return [np.array(half[i * directions : (i + 1) * directions]) for i in range(count)]
-
-    def _zero(self, directions: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        s = self.stretches[0]
-        shape = (len(self.stretches), directions, len(s.nuisance))
-        return np.zeros((directions, len(self.effects))), np.zeros(shape), np.zeros((directions, len(s.latent_block)))
-
-    def _by_nuisance(self, size: np.ndarray) -> list[np.ndarray]:
-        count = len(self.stretches[0].nuisance)
-        if not count:
-            return [np.zeros((len(s.measured), 0)) for s in self.stretches]
-        theta, nuisance, latent = self._zero(count)
-        steps = NUISANCE_STEP * np.array([s.nuisance_sd for s in self.stretches])
-        nuisance += steps[:, :, None] * np.eye(count)
-        return [(half / step[:, None]).T for half, step in zip(self._differences(size, theta, nuisance, latent), steps)]
-
-    def _by_effect(self, size: np.ndarray) -> list[np.ndarray]:
-        steps = EFFECT_STEP * np.array([effect.prior_sd for effect in self.effects])
-        _, nuisance, latent = self._zero(len(steps))
-        return [(half / steps[:, None]).T for half in self._differences(size, np.diag(steps), nuisance, latent)]
-
-    def _by_latent(self, size: np.ndarray) -> list[np.ndarray]:
-        count = len(self.stretches[0].latent_block)
-        if not count:
-            return [np.zeros((len(s.measured), 0)) for s in self.stretches]
-        theta, nuisance, _ = self._zero(count)
-        steps = self.latent_step * np.eye(count)
-        return [(half / self.latent_step).T for half in self._differences(size, theta, nuisance, steps)]
+    def _by(self, size: np.ndarray, name: str) -> list[np.ndarray]:
+        """Derivatives of the samples by the unknowns of one name of :class:`Lanes`, by central differences; (N, directions) a stretch."""
+        stretches, first = len(self.stretches), self.stretches[0]
+        counts = {"theta": len(self.effects), "nuisance": len(first.nuisance), "latent": len(first.latent_block)}
+        count = counts[name]
+        steps = np.broadcast_to({
+            "theta": np.array([EFFECT_STEP * effect.prior_sd for effect in self.effects]),
+            "nuisance": NUISANCE_STEP * np.array([s.nuisance_sd for s in self.stretches]),
+            "latent": np.full(count, self.latent_step),
+        }[name], (stretches, count))  # fmt: skip
+        moves = {key: np.zeros((stretches * count, n)) for key, n in counts.items()}
+        moves[name] = (steps[:, :, None] * np.eye(count)).reshape(stretches * count, count)
+        still = Lanes(np.repeat(np.arange(stretches), count), size, np.repeat(self._start, count, axis=0), 0.0)
+        moved = [Lanes(still.owner, *(getattr(still, key) + sign * move for key, move in moves.items())) for sign in (1.0, -1.0)]
+        sides = [self._run(lanes) for lanes in moved]
+        slopes = [0.5 * (a - b) / step for a, b, step in zip(*sides, steps.ravel())]
+        return [np.reshape(slopes[i * count : (i + 1) * count], (count, len(s.measured))).T for i, s in enumerate(self.stretches)]
 
 
 def sigma_of(channel: Channel, least: float) -> np.ndarray:
@@ -267,30 +239,23 @@ def sigma_of(channel: Channel, least: float) -> np.ndarray:
     return np.maximum(np.where(np.isfinite(seen), seen, 10.0 * least), least)
 
 
-def rk4(slope: Callable[[int, np.ndarray], np.ndarray], state: np.ndarray, at: int, step: np.ndarray) -> np.ndarray:
-    """One Runge-Kutta step of fourth order.
+def integrate(slope: Callable[[int, np.ndarray], np.ndarray], state: np.ndarray, steps: int, step: np.ndarray) -> np.ndarray:
+    """Path of lanes on their grids by Runge-Kutta steps of fourth order, shape (B, steps + 1, S).
 
     Args:
         slope: Of the half step counted from the start, and the state.
-        state: Shape (B, S).
-        at: Number of the half step at which it begins.
+        state: At the start, shape (B, S).
+        steps: Their number.
         step: [s], shape (B, 1).
     """
-    half = 0.5 * step
-    k1 = slope(at, state)
-    k2 = slope(at + 1, state + half * k1)
-    k3 = slope(at + 1, state + half * k2)
-    k4 = slope(at + 2, state + step * k3)
-    return state + step / 6.0 * (k1 + 2.0 * (k2 + k3) + k4)
-
-
-def integrate(slope: Callable[[int, np.ndarray], np.ndarray], state: np.ndarray, steps: int, step: np.ndarray) -> np.ndarray:
-    """Path of lanes on their grids, shape (B, steps + 1, S)."""
-    path = np.empty((len(state), steps + 1, state.shape[1]))
+    path, half = np.empty((len(state), steps + 1, state.shape[1])), 0.5 * step
     path[:, 0] = state
     for i in range(steps):
-        state = rk4(slope, state, 2 * i, step)
-        path[:, i + 1] = state
+        k1 = slope(2 * i, state)
+        k2 = slope(2 * i + 1, state + half * k1)
+        k3 = slope(2 * i + 1, state + half * k2)
+        k4 = slope(2 * i + 2, state + step * k3)
+        state = path[:, i + 1] = state + step / 6.0 * (k1 + 2.0 * (k2 + k3) + k4)
     return path
 
 

@@ -77,7 +77,8 @@ def explained(model, logs, known, seed: int = 0, without: Sequence[int] = (), sa
     for reason in reasons:
         say(f"  left out: {reason}")
     found = search.explain(model, seed=seed, without=(*without, *spoiled, *doubled), progress=lambda line: say(f"  {line}"))
-    told = (*found.reasons, *(f"left out: {reason}" for reason in reasons))
+    noted = [f"{one.name}: {row.text}" for one in checked for row in one.rows if (row.topic, row.verdict) == ("thrust", "warn")]
+    told = (*found.reasons, *(f"left out: {reason}" for reason in reasons), *(f"check: {text}" for text in noted))
     return replace(found, reasons=told, duplicates={**doubled, **found.duplicates})
 
 

@@ -20,6 +20,7 @@ from visthrow.diagnose.likelihood.marginal import TAIL
 from visthrow.diagnose.models.interface import Model, Window
 from visthrow.diagnose.select import result
 from visthrow.diagnose.select.excess import acts_on, levels, too_strong
+from visthrow.diagnose.select.held_out import PARTS, groups_of, regrouped, tempered
 from visthrow.diagnose.select.point import SMALL_STEP, Point, moved, with_fitted_noise, with_floors_noise, with_varying
 from visthrow.diagnose.select.result import Diagnosis, Finding, Law, Level
 from visthrow.diagnose.select.scatter import CHAIN, FORM, Varies, deviations, freed
@@ -66,6 +67,9 @@ def conclude(search: Selector) -> Diagnosis:
         point = search.nominal
     point = replace(point, plain=search.about_means(active, varies) if here else freed(point.plain, varies), varies=Varies())
     point = replace(point, theta=estimate(point.information, point.score, search.priors, active))
+    few = len(point.plain.flights) < PARTS
+    groups = regrouped(point, groups_of(point, search.problem.kept)[0]) if few else point.plain
+    point = tempered(point, groups, search.priors, active)
     spread = covariance(point.information, search.priors.deviation(active))
     findings = tuple(_finding(search, point, j, active, spread, withdrawn) for j in range(len(model.effects)))
     floor = search.priors.floor

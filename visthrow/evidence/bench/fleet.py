@@ -174,7 +174,7 @@ def _write(folder: Path, rows: Sequence[Row], seconds: dict[str, float]) -> Repo
 
 
 def _report(rows: Sequence[Row], seconds: dict[str, float]) -> Report:
-    """All drawn vehicles, the named, those with a policy of their own one by one and in the mean."""
+    """Report the drawn vehicles, the named, those with a policy of their own one by one and in the mean."""
 
     def cells(label: str, policy: str, vehicles: Sequence[str]) -> tuple[str, ...]:
         of = [[r for r in rows if r.policy == policy and r.vehicle in vehicles and r.target == target] for target in TARGETS]

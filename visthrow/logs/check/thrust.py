@@ -22,6 +22,7 @@ _DELAYS = np.arange(-0.2, 0.4001, 0.01)  # that are tried [s]
 _LATEST, _MOTORS = 0.16, 0.07  # motors and their filters take 0 to 0.12 s, usually 0.07 [s]
 _CLEARER = 0.04  # of correlation, by which a delay that no motor has must be better
 _MASS_WARN, _MASS_BAD = 0.15, 1.0  # of the logarithm of thrust over weight: a battery's charge; another unit or map
+IDLE_SPEED, IDLE_SHARE = 100.0, 0.12  # a vehicle whose rotors stay below has not flown [rad/s], [1]
 _UNEVEN = 0.4  # of the logarithm of a rotor over the others: an arm's weight or a cut blade makes 0.25 of a speed
 
 
@@ -158,7 +159,7 @@ def _rotors(log: FlightLog) -> list[Row]:
         _, values = valid(log[name])
         total = np.mean(values, axis=1)
         flies = total > 0.5 * np.percentile(total, 90)
-        if len(values) < 50 or np.percentile(total, 90) <= 0.0:
+        if len(values) < 50 or np.percentile(total, 90) <= (IDLE_SPEED if name == "motor_speed" else IDLE_SHARE):
             continue
         each = np.median(values[flies], axis=0)
         for i, rotor in enumerate(NAMES):
