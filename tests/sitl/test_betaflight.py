@@ -265,7 +265,8 @@ def test_throws_in_lock_step_are_the_same_to_the_bit(tmp_path, settings, monkeyp
 def test_every_way_to_end_brings_it_down(tmp_path, settings, way, state, monkeypatch):
     """In hover and in a throw: the runner descends, except where it is gone at once, and the firmware disarms when it falls silent."""
     shutil.copytree(settings[0], tmp_path / "settings")
-    overrides = (*endings.QUICK, "states.abort=1.5", *endings.STATES[state])
+    abort = 1.2 if way == "source raises" else 1.5  # [s]; without poses nothing is sent, and after 1.5 s the firmware would disarm
+    overrides = (*endings.QUICK, f"states.abort={abort}", *endings.STATES[state])
     params = config.load(HilParams, config.find("hil", "betaflight_sitl"), overrides)
     monkeypatch.setattr(endings, "OVER", OVER[state])
     if way == "SIGINT twice":
