@@ -99,9 +99,9 @@ def test_what_the_configuration_knows_of_the_sensors_is_read(monkeypatch):
     from visthrow.diagnose.inputs import opening
     from visthrow.diagnose.throw import throw_model
 
-    monkeypatch.setattr(throw_model, "ThrowModel", lambda logs, plant, **options: options)
+    monkeypatch.setattr(throw_model, "ThrowModel", lambda logs, plant, **options: argparse.Namespace(**options))
     args = argparse.Namespace(plant="state", overrides=["sensing.frame_tilt=[0.01, 0.0, 0.0]"], only=None, device="cpu")
-    assert opening.throw_model(args, [])[0]["sensing"].frame_tilt == (0.01, 0.0, 0.0)
+    assert opening.throw_model(args, [])[0].sensing.frame_tilt == (0.01, 0.0, 0.0)
 
 
 def test_of_hours_of_flight_all_throws_are_looked_at():

@@ -47,9 +47,9 @@ def test_a_base_that_is_nowhere_suggests_its_own_kind(tmp_path):
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("gate.max_speed=-1", "gate: max_speed is -1.0; expected a number above 0"),
-        ("fence.deceleration=0", "fence: deceleration is 0.0 m/s^2; expected a number above 0"),
-        ("states.throw=-1", "states: throw is -1.0 s; expected a time above 0"),
+        ("gate.max_speed=-1", "gate: max_speed is -1.0; expected above 0"),
+        ("fence.deceleration=0", "fence: deceleration is 0.0; expected above 0"),
+        ("states.throw=-1", "states: throw is -1.0; expected above 0"),
     ],
 )
 def test_a_range_error_names_the_one_key(override, message):
