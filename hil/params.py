@@ -1,4 +1,7 @@
-"""Configuration of a run: one file of ``configs/hil``. SI units; nothing about frames has a default."""
+"""Configuration of a run, one file of ``configs/hil``: its tables, whose fields stand beside the code that reads them.
+
+SI units; nothing about frames has a default.
+"""
 
 from dataclasses import dataclass, field
 from typing import Annotated, Literal

@@ -1,5 +1,5 @@
-"""Parameter audit at connect: what was found, what is expected, why; a mismatch refuses to fly, and nothing is written
-unless the operator said so."""
+"""Audit of an autopilot's parameters at connect, whose rules each back-end holds; a mismatch refuses to fly, and nothing is
+written unless the operator said so."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""The state machine of a run: pure logic, a time-out in every state.
+"""State machine of a run: what stale poses, fences, time-outs and a silent autopilot lead to; pure logic.
 
     idle -> check -> ready -> armed -> throw -> recover -> ready (more throws) or land -> done
     any -> abort -> done

@@ -1,4 +1,4 @@
-"""The gate that every pose passes, one for each body with its own timer.
+"""Gate of a body: refuses wrong poses, and says how old the last new one is (warn, hold, abort: ``[gate]``).
 
 A motion-capture system that has lost a body goes on sending its *last* pose, so staleness is judged on content: the
 time since a pose last *differed* from the one before. A body that jumps is refused and stays refused: a pose must lie

@@ -1,4 +1,4 @@
-"""What the runner needs of a source, what live ones share, and the source that plays recorded poses."""
+"""Source of poses: what the runner needs of it, what it may raise, what live ones share, and the one that plays recorded poses."""
 
 from collections.abc import Callable, Iterable
 

@@ -112,7 +112,8 @@ def test_a_training_starts_from_a_distilled_policy_and_no_other(whole, tmp_path,
         torch.testing.assert_close(getattr(taken.estimator, name), value, rtol=0, atol=AGREES)
     assert cli.main([*words(tmp_path / "a"), *start, "--set", 'algorithm="ppo"']) == 2
     assert "the policy is one with a memory" in capsys.readouterr().err
-    late = ("task.observation.latency=[0.004,0.04]", "task.observation.latency_jitter=0.004", "task.observation.response=8")  # as it was trained
+    # as it was trained
+    late = ("task.observation.latency=[0.004,0.04]", "task.observation.latency_jitter=0.004", "task.observation.response=8")
     assert cli.main([*words(tmp_path / "b"), "--from", "vision", *overrides(*late)]) == 2
     assert "the policy is one without a memory" in capsys.readouterr().err
 

@@ -1,4 +1,4 @@
-"""Logs of any kind into :class:`visthrow.logs.flightlog.FlightLog`."""
+"""Logs of any kind, opened by their ending, into :class:`visthrow.logs.flightlog.FlightLog`."""
 
 from collections.abc import Sequence
 from fnmatch import fnmatchcase

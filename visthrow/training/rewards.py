@@ -1,7 +1,7 @@
-"""The paper's reward, term by term (Eqs. 2 to 5, Table II). Each term is a function of tensors over the batch.
+"""The paper's reward, term by term (Eqs. 2 to 5, Table II), with coefficients from ``[reward]`` of ``configs/task``.
 
-``u`` is the clipped normalised action; its rates enter ``command`` and its four commands ``change`` (the paper leaves the
-unit of u open; normalised, chosen so that Table II's weights are of one order).
+Each term is a function of tensors over the batch. ``u`` is the clipped normalised action; its rates enter ``command`` and its
+four commands ``change`` (the paper leaves the unit of u open; normalised, chosen so that Table II's weights are of one order).
 """
 
 from torch import Tensor

@@ -1,4 +1,4 @@
-"""First-order training on the throwing task, as a trainer drives it."""
+"""First-order training: the cost of flights, in which a hazard weighs a release at every step, and its descent."""
 
 import dataclasses
 import math
