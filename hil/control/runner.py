@@ -80,7 +80,7 @@ class Runner:
         machine: the state. pilot: the policy. guard: with its counts.
         calibrating: of the camera in the hover; None where none is asked for.
         tracks: by body. latch: of the release, with the landings so far.
-        hovering: on poses, where no policy flies. errors: tracebacks of what was caught.
+        hovering: on poses, where no policy flies. errors: tracebacks of what was caught, each once.
         mass: of vehicle, rope and payload [kg]. alone: of the vehicle [kg].
         mount_b: where the rope hangs on the vehicle [m]. seen_goal_w: target as of the last tick [m].
         spent: time that parts of the last tick took [s]; those that it did not do are missing.
@@ -140,8 +140,9 @@ class Runner:
 
     def fail(self, now: float, error: BaseException) -> Decision:
         """End the run because of an exception: abort, and no further release. The autopilot is asked to land, tick by tick."""
-        if len(self.errors) < MOST_ERRORS and isinstance(error, Exception):
-            self.errors.append("".join(traceback.format_exception(error)))
+        told = "".join(traceback.format_exception(error))
+        if isinstance(error, Exception) and told not in self.errors and len(self.errors) < MOST_ERRORS:
+            self.errors.append(told)
         what = "Ctrl-C twice" if isinstance(error, KeyboardInterrupt) else f"{type(error).__name__}: {error}"
         self.machine.step(now, Inputs(3, 3, failure=what))
         self.backend.stop_release()
