@@ -13,9 +13,10 @@ from visthrow import cli, config
 from visthrow.common.errors import BusyError, ConfigError
 from visthrow.common.storage import write_json
 from visthrow.evidence.sweep import pool, units
+from visthrow.evidence.sweep.lists import RunGroup, SweepList
 from visthrow.evidence.sweep.lock import Lock, held
 from visthrow.evidence.sweep.record import collect, status
-from visthrow.evidence.sweep.units import load_list
+from visthrow.evidence.sweep.units import expand, load_list
 from visthrow.throws import results
 
 LIST = """
@@ -91,6 +92,18 @@ def test_a_run_is_its_resolved_config_and_seed(path):
     assert not set(keys('commit="same"').values()) & set(plain.values()) - {""}
     changed = keys('runs.trained.changes=["ppo.discount=0.98"]')
     assert not (set(changed.values()) & set(plain.values())) - {""}
+
+
+def test_runs_that_differ_by_changes_alone_are_kept_apart(tmp_path):
+    """A list of one change at a time: a name and a line of the record for each."""
+    groups = {"plain": (), "discount": ("ppo.discount=0.98",), "spread": ("ppo.initial_std=0.3",)}
+    runs = {name: RunGroup(throws=(), configs=("state",), changes=changes) for name, changes in groups.items()}
+    work = expand("changes", SweepList(runs=runs, throws={}))
+    assert [source.name for source in work.sources] == ["state-1", "state-discount-1", "state-spread-1"]
+    for source in work.sources:
+        finish(source, tmp_path)
+    training, _ = collect(work, tmp_path, tmp_path / "records")
+    assert [run["name"] for run in json.loads(training.read_text())["runs"]] == [source.name for source in work.sources]
 
 
 def test_a_field_added_later_changes_no_key(path):

@@ -31,7 +31,7 @@ class Source:
     """A policy: to be trained, or there already.
 
     Attributes:
-        name: what it is called, ``<config>-<seed>`` where it is trained.
+        name: what it is called: ``<config>-<seed>`` where it is trained, ``<config>-<group>-<seed>`` with changes of its group.
         config: of ``configs/train``; empty for a policy that is there already.
         key: of the training; empty likewise.
     """
@@ -180,9 +180,9 @@ def expand(name: str, params: SweepList) -> Work:
     sources: dict[str, Source] = {}
     throws: dict[str, list[ThrowUnit]] = {}
     commit = provenance.commit() if params.commit == "same" else ""
-    for group in params.runs.values():
-        changes = params.changes + group.changes
-        trained = [_trained(item, changes, seed, commit) for seed in group.seeds for item in group.configs]
+    for called, group in params.runs.items():
+        changes, mark = params.changes + group.changes, f"{called}-" if group.changes else ""
+        trained = [_trained(item, mark, changes, seed, commit) for seed in group.seeds for item in group.configs]
         for source in [*(Source(str(policy)) for policy in group.policies), *trained]:
             sources.setdefault(source.id, source)
             listed = throws.setdefault(source.id, [])
@@ -206,10 +206,10 @@ def differences(own: dict, flown: dict, path: str = "") -> dict[str, Any]:
     return found
 
 
-def _trained(name: str, changes: tuple[str, ...], seed: int, commit: str) -> Source:
+def _trained(name: str, mark: str, changes: tuple[str, ...], seed: int, commit: str) -> Source:
     stated = config.to_dict(_experiment(name, changes), defaults=False)  # a field that is added later changes no key
     key = results.key_of({"config": stated, "seed": seed, **({"commit": commit} if commit else {})})
-    return Source(f"{Path(name).stem}-{seed}", name, changes, seed, key)
+    return Source(f"{Path(name).stem}-{mark}{seed}", name, changes, seed, key)
 
 
 def _throws(source: Source, name: str, params: ThrowParams) -> list[ThrowUnit]:
