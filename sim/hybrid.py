@@ -20,7 +20,9 @@ PIECES = 8
 """Number of pieces of a batch for each core of a CPU: a core that has other work for a while leaves its pieces to the rest."""
 
 FEWEST = 32
-"""Environments of a piece: their step takes half a millisecond, its launch a tenth."""
+"""Environments of a piece of a step, at least: they take half a millisecond, the launch a tenth."""
+LOOK = 0.01
+"""What a kernel that looks at each state once does for an environment, in steps."""
 
 _BUILDS: dict[tuple[Any, ...], tuple[Any, Any, Any]] = {}
 
@@ -166,33 +168,17 @@ class HybridSim:
         self._used = wp.zeros(count, dtype=t.real, device=device)
         self._spreads: tuple[RandomizationParams, wp.array[Any]] | None = None
 
-    def step(self) -> None:
-        """Advance every plant by one control period under ``command`` and ``release``."""
-        s = self.params.sim
-        self._launch(
-            self._step.step,
-            [
-                self._vehicles,
-                self._ropes,
-                self._release,
-                self._airs,
-                s.control_period,
-                s.substep,
-                s.gamma,
-                s.max_turn,
-                self.gravity,
-                self.state,
-                self.command,
-                self.release,
-                self.out,
-            ],
-            block_dim=64,
-        )
+    def step(self, mask: "wp.array[Any] | None" = None) -> None:
+        """Advance every plant by one control period under ``command`` and ``release``; with a ``mask``, shape (E,), where it is not 0."""
+        s, parts = self.params.sim, [self._vehicles, self._ropes, self._release, self._airs]
+        numerics = [s.control_period, s.substep, s.gamma, s.max_turn, self.gravity]
+        mask = self._all if mask is None else mask
+        self._launch(self._step.step, [*parts, *numerics, self.state, self.command, self.release, mask, self.out], block_dim=64)
 
     def foresee(self) -> None:
         """Write into ``foreseen`` what follows if every payload separates now; the plants stay as they are."""
         inputs = [self._vehicles, self._ropes, self._release, self._airs, self.gravity, self.state, self.foreseen]
-        self._launch(self._step.foresee, inputs, block_dim=64)
+        self._launch(self._step.foresee, inputs, block_dim=64, work=LOOK)
 
     def randomize(self, spreads: RandomizationParams, mask: "wp.array[Any] | None" = None) -> None:
         """Start new episodes where ``mask`` (shape (E,), int) is non-zero; everywhere without one."""
@@ -200,20 +186,8 @@ class HybridSim:
             packed = pack(self.types.Randomization, spreads)
             self._spreads = (spreads, wp.array(packed, dtype=self.types.Randomization, device=self.device))
         mask = self._all if mask is None else mask
-        self._launch(
-            self._reset.randomize,
-            [
-                self._vehicles,
-                self._ropes,
-                self._spreads[1],
-                self.gravity,
-                self.seed,
-                self.state,
-                self.episode,
-                mask,
-                self.goal_w,
-            ],
-        )
+        inputs = [self._vehicles, self._ropes, self._spreads[1], self.gravity, self.seed, self.state, self.episode, mask, self.goal_w]
+        self._launch(self._reset.randomize, inputs)
         self._update_payload()
 
     def place(
@@ -256,12 +230,12 @@ class HybridSim:
         self._update_payload()
 
     def _update_payload(self) -> None:
-        self._launch(self._step.payload, [self._ropes, self.state, self.out])
+        self._launch(self._step.payload, [self._ropes, self.state, self.out], work=LOOK)
 
-    def _launch(self, kernel: wp.Kernel, arguments: list[Any], block_dim: int = 256) -> None:
+    def _launch(self, kernel: wp.Kernel, arguments: list[Any], block_dim: int = 256, work: float = 1.0) -> None:
         """Launch a kernel for all plants, on a CPU in pieces that run side by side."""
         count, device = self.count, self.device
-        pieces = min(PIECES * self.threads, count // FEWEST) if device == "cpu" and self.threads > 1 else 1
+        pieces = min(PIECES * self.threads, int(count * work) // FEWEST) if device == "cpu" and self.threads > 1 else 1
         if pieces <= 1:
             wp.launch(kernel, count, [0, *arguments], device=device, block_dim=block_dim)
             return

@@ -136,10 +136,13 @@ def build_step(
         # In:
         command: wp.array(dtype=vec4),
         release: wp.array(dtype=wp.int32),
+        mask: wp.array(dtype=wp.int32),
         # Out:
         out: Output,
     ):
         env = wp.tid() + first
+        if mask[env] == 0:
+            return
         p = vehicle[env % vehicle.shape[0]]
         natural = ropes[env % ropes.shape[0]]
         r = releases[env % releases.shape[0]]

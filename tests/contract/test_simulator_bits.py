@@ -165,6 +165,22 @@ def test_a_masked_reset_leaves_the_rest():
     assert np.all(sim.get("status")[fresh] == 0)
 
 
+def test_a_masked_step_leaves_the_rest():
+    """Plants outside the mask stand still to the bit, the others move as without one."""
+    plant, count = paper_plant(), 5
+    masked, whole = (HybridSim(plant, count) for _ in range(2))
+    mask = np.array([0, 1, 0, 0, 1], dtype=np.int32)
+    for sim in (masked, whole):
+        sim.place(**poses(4, count))
+        drive(sim, np.full((2, count, 4), [3.0, 0.5, -0.2, 0.1]))
+    before = everything(masked)
+    masked.step(wp.array(mask, device="cpu"))
+    whole.step()
+    assert_same(everything(masked), before, mask == 0, mask == 0)
+    assert_same(everything(masked), everything(whole), mask == 1, mask == 1)
+    assert (whole.get("pos_w") != before["pos_w"]).any()
+
+
 def test_a_reset_leaves_nothing_of_the_last_episode():
     """An environment that flew wildly and was put back flies to the bit as one that never did."""
     used, fresh = (HybridSim(paper_plant(), COUNT, seed=7) for _ in range(2))

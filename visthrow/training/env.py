@@ -217,13 +217,17 @@ class ThrowEnv(VecEnv):
         """Observations of the current step."""
         return self._observations.clone()
 
-    def carry(self, actions: Tensor) -> TensorDict:
+    def carry(self, actions: Tensor, mask: wp.array | None = None) -> TensorDict:
         """Apply unclipped actions, shape (E, 5), for one control period with the latch shut, whatever becomes of it: no episode ends.
+
+        Args:
+            actions: of all.
+            mask: plants that move on, shape (E,), int32; default all.
 
         Returns:
             Observations.
         """
-        self._memory["previous"].copy_(self._apply(actions, hold=True))
+        self._memory["previous"].copy_(self._apply(actions, True, mask))
         self._observations = self._observe(self._memory["continued"])
         return self._observations
 
@@ -243,7 +247,7 @@ class ThrowEnv(VecEnv):
         self._observations = self._observe(done)
         return self._observations, reward, done.to(torch.float32), {}
 
-    def _apply(self, actions: Tensor, hold: bool = False) -> Tensor:
+    def _apply(self, actions: Tensor, hold: bool = False, mask: wp.array | None = None) -> Tensor:
         """Fly one control period; returns the clipped actions."""
         task, memory = self.cfg.task, self._memory
         action = act.clip_action(actions)
@@ -252,7 +256,7 @@ class ThrowEnv(VecEnv):
         self.views.command.copy_(act.command_from_action(noisy, self._max_thrust, self._max_rate))
         self.views.release.copy_(act.release_asked(actions, self.cfg.release.threshold) & (not hold))
         with on_torch_stream(self.device):
-            self.sim.step()
+            self.sim.step(mask)
         if task.target.moves:
             self.views.goal_w.add_(memory["goal_vel"] * self.cfg.sim.control_period)
         self.episode_length_buf += 1

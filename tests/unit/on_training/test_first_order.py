@@ -63,18 +63,19 @@ def exponential(vector):
 
 def advance(fo, true, k, x, response, commands):
     """The surrogate's step in torch, from state ``x`` to the dictionary of state k + 1, before the decay."""
-    s, dt, pl = fo.surrogate, fo.cfg.sim.control_period, fo.plants
-    M, m = fo.flights.mass[:, None], pl.load_mass[:, None]
-    y = s.response[0] * response[k] + (s.response[1] * response[k - 1] if k else 0.0)
-    y = y + sum(s.response[2 + j] * commands[k - j] for j in range(len(s.response) - 2) if k >= j)
+    dt, pl = fo.cfg.sim.control_period, fo.flights
+    M, m = pl.mass[:, None], pl.load_mass[:, None]
+    response_of, force, tension = (fo.surrogate[name] for name in ("response", "force", "tension"))
+    y = response_of[0] * response[k] + (response_of[1] * response[k - 1] if k else 0.0)
+    y = y + sum(response_of[2 + j] * commands[k - j] for j in range(len(response_of) - 2) if k >= j)
     y = at(true.response[k + 1], y)
     turned = x["rot"] @ exponential(0.5 * dt * (response[k] + y)[:, 1:])
     rots = ob.rotation_from_quat(true.quat)
     rot = rots[k + 1] @ turned.detach().mT @ turned
     z = 0.5 * (x["rot"][..., 2] + rot[..., 2])
     axes = x["rot"].detach()
-    drag = (axes * s.force[1:]) @ axes.mT @ x["vel"][..., None]
-    f = s.force[0] * 0.5 * (response[k] + y)[:, :1] * z - drag[..., 0]
+    drag = (axes * force[1:]) @ axes.mT @ x["vel"][..., None]
+    f = force[0] * 0.5 * (response[k] + y)[:, :1] * z - drag[..., 0]
     arms = true.load_pos - true.pos - (rots @ pl.mount[..., None])[..., 0]
     arm = x["load_pos"] - x["pos"] - (x["rot"] @ pl.mount[..., None])[..., 0] + 0.5 * dt * (x["load_vel"] - x["vel"])
     arm = at(0.5 * (arms[k] + arms[k + 1]), arm)
@@ -82,7 +83,7 @@ def advance(fo, true, k, x, response, commands):
     length = arm.norm(dim=-1, keepdim=True)
     n = arm / length
     dot = lambda a, b: (a * b).sum(-1, keepdim=True)  # noqa: E731
-    a, b = s.tension
+    a, b = tension
     pull = M * m / (M + m) * (-a * dot(n, f) / M + b * (dot(u, u) - dot(n, u) ** 2) / length)
     g = torch.tensor([0.0, 0.0, GRAVITY])
     measured = -dot(n, m * ((true.load_vel[k + 1] - true.load_vel[k]) / dt + g)).detach()
@@ -98,7 +99,7 @@ def reference(fo, by):
     """Derivatives by the actions of ``sum_k <by[k], state k>`` through the closed loop, by torch's autograd."""
     true, b, layout = SimpleNamespace(**fo.flights.x), fo, fo.env.layout
     extra = torch.zeros_like(b.action, requires_grad=True)
-    rots, late = ob.rotation_from_quat(true.quat), (b.age / fo.cfg.sim.control_period)[:, None]
+    rots, late = ob.rotation_from_quat(true.quat), (b.env.pose_age / fo.cfg.sim.control_period)[:, None]
     x = {name: getattr(true, name)[0].clone() for name in ("pos", "vel", "load_pos", "load_vel", "response")} | {"rot": rots[0]}
     poses, responses, commands, cost = [], [], [], 0.0
     previous, history = fo.env._start_action.expand(24, -1), torch.zeros(24, 1 + layout.history, layout.payload)
@@ -107,10 +108,10 @@ def reference(fo, by):
         pose = torch.cat([ob.vehicle_part(x["pos"], x["vel"], x["response"][:, 1:], x["rot"]), x["load_pos"]], -1)
         poses.append(pose)
         seen = torch.lerp(pose, poses[max(k - 1, 0)], late)
-        frame = torch.cat([seen[:, :15], ob.state_part(seen[:, :3], b.goal, seen[:, 15:])], -1)
+        frame = torch.cat([seen[:, :15], ob.state_part(seen[:, :3], b.env.views.goal_w, seen[:, 15:])], -1)
         fresh = torch.full((24,), k == 0)
         obs, history = ob.observe(layout, frame, None, previous, torch.ones(24), history, fresh)
-        obs = at(b.obs[k], obs)
+        obs = at(b.flights.obs[k], obs)
         action = decided(fo, obs) + extra[k]
         previous = at(act.clip_action(b.action[k]), action)
         throttle = (0.5 * (b.action[k, :, :1] + 1.0)).clamp(0.05, 1.0)
@@ -124,11 +125,11 @@ def reference(fo, by):
 
 def backward(fo, by):
     """The same by the kernel."""
-    for name, tensor in fo.adjoint.x.items():
+    for name, tensor in fo.adjoint.items():
         tensor.copy_(by[name]) if name in by else tensor.zero_()
     for tensor in (fo.by_clipped, fo.layers.by_action):
         tensor.zero_()
-    fo.layers.prepare()
+    fo.layers.prepare(fo.flights.last)
     fo.backward()
     return fo.layers.by_action.clone()
 
@@ -153,10 +154,10 @@ def test_weights_get_what_autograd_gives_them():
     fo.rollout()
     assert fo.derivatives()["cost"].isfinite()
     shares = torch.rand(24, generator=torch.Generator().manual_seed(0))
-    fo.layers.gradients(fo.obs, shares)
+    fo.layers.gradients(fo.flights.obs, shares)
     by_action = fo.layers.by_action * shares[:, None]
     parameters = list(fo.network.mlp.parameters())
-    expected = torch.autograd.grad(decided(fo, fo.obs), parameters, by_action)
+    expected = torch.autograd.grad(decided(fo, fo.flights.obs), parameters, by_action)
     for parameter, gradient in zip(parameters, expected, strict=True):
         torch.testing.assert_close(parameter.grad, gradient, rtol=1e-4, atol=1e-5 * gradient.abs().max().item())
     assert by_action.any(), "nothing was differentiated"
@@ -172,11 +173,14 @@ def test_flights_stop_where_nothing_counts_any_more():
         fo._latched, fo._first = latched, 0
         fo.rollout()
         fo.derivatives()
-        found.append((fo.flights.flown, fo.layers.by_action.clone()))
-    (short, stopped), (long, flown) = found
+        found.append((fo.flights.last, fo.flights.steps.clone(), fo.layers.by_action[: fo.flights.last].clone()))
+    (short, stopped_at, stopped), (long, flown_to, flown) = found
     assert short < long == fo.p.horizon
+    assert len(set(stopped_at.tolist())) > 1, "flights stop one by one"
+    assert (stopped_at < flown_to).all()
     assert flown.any()
-    torch.testing.assert_close(stopped, flown, rtol=0, atol=0)
+    assert not flown[short:].any()
+    torch.testing.assert_close(stopped, flown[:short], rtol=0, atol=0)
 
 
 SLOWER = ["vehicle.queue.delay=0.045", "vehicle.motor.time_constant=0.06", "rope.payload_mass=0.08", "rope.length=0.5"]
@@ -198,7 +202,7 @@ def test_slopes_are_those_of_the_simulator(vehicle, monkeypatch):
         left = iter(actions)
         monkeypatch.setattr(fo.layers, "forward", lambda k, seen: fo.action[k].copy_(next(left)))
         fo.rollout()
-        return fo.landing[-1].clone()
+        return fo.flights.landing[-1].clone()
 
     fly(plan)
     assert (fo.flights.steps == fo.p.horizon).all()
@@ -206,7 +210,7 @@ def test_slopes_are_those_of_the_simulator(vehicle, monkeypatch):
     up = x["load_vel"][-1, :, 2]
     time = (up + (up.square() + 2 * GRAVITY * (x["load_pos"][-1, :, 2] - fo.cfg.release.landing_height)).sqrt()) / GRAVITY
     point = x["load_pos"][-1, :, :2] + x["load_vel"][-1, :, :2] * time[:, None]
-    torch.testing.assert_close(point.detach(), fo.landing[-1], atol=1e-4, rtol=0)
+    torch.testing.assert_close(point.detach(), fo.flights.landing[-1], atol=1e-4, rtol=0)
     monkeypatch.setattr(fo.layers, "back", lambda k: None)
     found = []
     for axis in range(2):
@@ -254,4 +258,4 @@ def test_it_learns():
 
 def test_with_a_sign_turned_it_does_not_learn():
     """What the test above asserts does not hold where the commands' effect has the wrong sign."""
-    assert not learnt(*thrown(lambda surrogate: surrogate.response[2:].neg_()))
+    assert not learnt(*thrown(lambda surrogate: surrogate["response"][2:].neg_()))

@@ -10,7 +10,8 @@ import warp as wp
 
 from sim.params import GRAVITY
 from visthrow.onboard import observations as ob
-from visthrow.training.first_order.surrogate import TAUT, Course
+from visthrow.training.first_order.flights import Course
+from visthrow.training.first_order.surrogate import TAUT
 
 SLACK_THROTTLE = 0.05
 """Least throttle at which the slope of the thrust is taken: at none it is nought, and nothing would lead away from there."""
@@ -31,7 +32,6 @@ class Setting:
     period: float
     decay: float  # of derivatives, per step
     age: wp.array(dtype=float)  # of poses [s]
-    goal: wp.array(dtype=wp.vec3)
 
 
 @wp.func

@@ -17,30 +17,28 @@ class Layers:
         action: output. by_action: derivatives by it. by_seen: those by the observations of the last step that :meth:`back` was called for.
     """
 
-    def __init__(self, network: Network, steps: int, count: int, seen: int, device: str):
-        make = {"device": device, "dtype": torch.float32}
+    def __init__(self, network: Network, obs: Tensor):
+        """Make room for observations, shape (T, E, D)."""
         self._network, self._linear = network, [layer for layer in network.mlp if isinstance(layer, nn.Linear)]
-        self._activation = network.mlp[1]
-        self._inner, self._by_inner = ([torch.zeros(steps, count, layer.out_features, **make) for layer in self._linear] for _ in range(2))
+        self._inner, self._by_inner = ([obs.new_zeros(*obs.shape[:2], layer.out_features) for layer in self._linear] for _ in range(2))
         self._slope = [torch.zeros_like(inner) for inner in self._inner[:-1]]
         self._first = torch.zeros_like(self._linear[0].weight)  # with the normaliser's spread
-        self.action, self.by_action = self._inner[-1], self._by_inner[-1]
-        self.by_seen = torch.zeros(count, seen, **make)
+        self.action, self.by_action, self.by_seen = self._inner[-1], self._by_inner[-1], torch.zeros_like(obs[0])
 
     def forward(self, k: int, seen: Tensor) -> Tensor:
         """Actions of step k, shape (E, 5), for observations, shape (E, D)."""
         x = self._network.obs_normalizer(seen)
-        for layer, inner in zip(self._linear, self._inner, strict=True):
+        for layer, inner in zip(self._linear, self._inner):
             torch.addmm(layer.bias, x, layer.weight.T, out=inner[k])
-            x = self._activation(inner[k]) if inner is not self.action else inner[k]
+            x = self._network.mlp[1](inner[k]) if inner is not self.action else inner[k]
         return x
 
-    def prepare(self) -> None:
-        """Begin a way back."""
+    def prepare(self, steps: int) -> None:
+        """Begin a way back from this step."""
         for inner, slope in zip(self._inner, self._slope):
             with torch.enable_grad():
-                inner = inner.detach().requires_grad_()
-                slope.copy_(torch.autograd.grad(self._activation(inner).sum(), inner)[0])
+                inner = inner[:steps].detach().requires_grad_()
+                slope[:steps] = torch.autograd.grad(self._network.mlp[1](inner).sum(), inner)[0]
         normalizer = self._network.obs_normalizer
         spread = normalizer.std + normalizer.eps if self._network.obs_normalization else 1.0
         self._first.copy_(self._linear[0].weight.detach() / spread)
@@ -54,9 +52,9 @@ class Layers:
         torch.mm(self._by_inner[0][k], self._first, out=self.by_seen)
 
     def gradients(self, seen: Tensor, shares: Tensor) -> None:
-        """Give the weights their derivatives; flights, shape (E,), count by these shares. seen: observations, shape (T, E, D)."""
-        x = self._network.obs_normalizer(seen)
-        for layer, inner, by_inner in zip(self._linear, self._inner, self._by_inner, strict=True):
-            by = (by_inner * shares[:, None]).flatten(0, 1)
+        """Give the weights their derivatives; flights, shape (E,), count by these shares. seen: the first observations, shape (T, E, D)."""
+        x, steps = self._network.obs_normalizer(seen), len(seen)
+        for layer, inner, by_inner in zip(self._linear, self._inner, self._by_inner):
+            by = (by_inner[:steps] * shares[:, None]).flatten(0, 1)
             layer.weight.grad, layer.bias.grad = by.mT @ x.flatten(0, 1), by.sum(0)
-            x = self._activation(inner)
+            x = self._network.mlp[1](inner[:steps])
