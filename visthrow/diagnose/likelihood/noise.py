@@ -56,8 +56,9 @@ WIDE = 30.0
 """Latent forces while outliers are looked for, in the level at which they become visible."""
 
 ITERATIONS = 40
-ENOUGH_NATS, ROUGHLY_NATS = 0.02, 1.0
-"""A step that promises or brings less ends the search for the levels; while correlation times are compared."""
+ENOUGH_NATS, ROUGHLY_NATS = 0.2, 1.0
+"""A step that promises less is the last in the search for the levels, and leaves some twentieth of it; while correlation times are
+compared."""
 LONGEST_FALL = 1.0
 """Of the logarithm of a level in one step: its variance may be predicted to fall below 0."""
 HALVINGS = 8
@@ -167,6 +168,7 @@ class _Layout:
 
     keys: list[tuple[int, str]]  # (block, phase)
     pairs: np.ndarray  # (window, block) of each share, shape (S, 2)
+    phases: np.ndarray  # of each share, the number of its phase's level, shape (S,)
     seen: np.ndarray  # channels with samples
     slopes: np.ndarray  # of each entry of the windows' own gradients that counts: its place there, and its parameter, shape (2, E)
     curvatures: np.ndarray  # the same of their own curvatures, and pairs of parameters
@@ -178,6 +180,7 @@ class _Layout:
         index = {key: i for i, key in enumerate(keys)}
         present = [[b for b in range(blocks) if (b, gram.phase) in index and np.any(gram.latent_block == b)] for gram in grams]
         pairs = np.array([(w, b) for w, own in enumerate(present) for b in own], dtype=int).reshape(-1, 2)
+        phases = np.array([index[b, gram.phase] for gram, own in zip(grams, present) for b in own], dtype=int)
         seen = np.flatnonzero(sum(gram.count for gram in grams) > 0)
         first = len(keys) + len(pairs)
         size, width, at = first + len(seen), blocks + len(grams[0].count), len(keys)
@@ -189,7 +192,7 @@ class _Layout:
             slopes.append((w * width + part, to))
             curvatures.append([(w * width * width + np.add.outer(width * part, part)).ravel(), np.add.outer(size * to, to).ravel()])
             at += len(own)
-        return _Layout(keys, pairs, seen, np.hstack(slopes), np.hstack(curvatures))
+        return _Layout(keys, pairs, phases, seen, np.hstack(slopes), np.hstack(curvatures))
 
     def pack(self, noise: Noise) -> np.ndarray:
         """Logarithms of all levels, shape (P,)."""
@@ -223,21 +226,21 @@ def _maximise(grams: Sequence[Gram], noise: Noise, device: str, enough: float = 
         grams: of the windows.
         noise: where the search starts.
         device: where to calculate.
-        enough: nats below which a step ends it.
+        enough: nats; a step that promises less is the last.
     """
     layout, stack = _Layout.of(grams, noise), Stack(grams, device)
     low, high = layout.limits(grams)
     x = np.clip(layout.pack(noise), low, high)
 
-    def look(x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-        return _likelihood(stack, layout.unpack(x, noise), layout)
+    def look(x: np.ndarray, first: bool = False) -> tuple[float, np.ndarray, np.ndarray]:
+        return _likelihood(stack, layout.unpack(x, noise), layout, first)
 
-    value, slope, curvature = look(x)
+    value, slope, curvature = look(x, first=True)
     last = np.zeros_like(x)
     for _ in range(ITERATIONS):
-        plain, promised = _scoring_step(x, slope, curvature, low, high)
-        if promised < enough:
-            break
+        plain, promised = _scoring_step(layout, x, slope, curvature, low, high)
+        if promised < enough:  # and leaves less than a tenth of that: it is taken without another look
+            return layout.unpack(x + plain, noise), value + 0.5 * promised
         step, last = np.clip(x + _stride(plain, last) * plain, low, high) - x, plain
         for _ in range(HALVINGS):
             tried, its_slope, expected = look(x + step)
@@ -246,9 +249,7 @@ def _maximise(grams: Sequence[Gram], noise: Noise, device: str, enough: float = 
             step = step / 3.0
         else:
             break
-        gained, x, value, slope, curvature = tried - value, x + step, tried, its_slope, expected
-        if gained < enough:
-            break
+        x, value, slope, curvature = x + step, tried, its_slope, expected
     return layout.unpack(x, noise), value
 
 
@@ -263,12 +264,12 @@ def _stride(step: np.ndarray, last: np.ndarray) -> float:
 
 
 def _scoring_step(
-    x: np.ndarray, slope: np.ndarray, curvature: np.ndarray, low: np.ndarray, high: np.ndarray
+    layout: _Layout, x: np.ndarray, slope: np.ndarray, curvature: np.ndarray, low: np.ndarray, high: np.ndarray
 ) -> tuple[np.ndarray, float]:
     """Fisher's step of the variances within the limits, as logarithms of levels, and the nats that it promises.
 
     What a limit holds back stays there, and the others move without it. A variance far too small shows in no likelihood's
-    logarithm, but its own step is finite.
+    logarithm, but its own step is finite. A window's variance takes the steps of its phase's level and of its share together.
     """
     known = np.diag(curvature)
     free = (known > 0.0) & ~((x <= low + STALLED) & (slope < 0.0)) & ~((x >= high - STALLED) & (slope > 0.0))
@@ -283,11 +284,17 @@ def _scoring_step(
     _, found, indefinite = lapack.dposv(part, slope[free] / size, lower=1)
     step[free] = (np.linalg.solve(part, slope[free] / size) if indefinite else found) / size
     promised = float(slope @ step)
-    step = np.where(step > 0.0, 0.5 * np.log1p(2.0 * np.maximum(step, 0.0)), np.maximum(step, -LONGEST_FALL))
-    return np.clip(x + step, low, high) - x, promised
+    shares, turned = slice(len(layout.keys), len(layout.keys) + len(layout.pairs)), _logarithms(step)
+    turned[shares] = _logarithms(step[shares] + step[layout.phases]) - turned[layout.phases]
+    return np.clip(x + turned, low, high) - x, promised
 
 
-def _likelihood(stack: Stack, noise: Noise, layout: _Layout) -> tuple[float, np.ndarray, np.ndarray]:
+def _logarithms(step: np.ndarray) -> np.ndarray:
+    """Changes of levels' logarithms by steps of their variances, which are linear in small ones."""
+    return 0.5 * np.log1p(np.maximum(2.0 * step, np.expm1(-2.0 * LONGEST_FALL)))
+
+
+def _likelihood(stack: Stack, noise: Noise, layout: _Layout, first: bool = False) -> tuple[float, np.ndarray, np.ndarray]:
     """Log-likelihood with the prior of the windows' shares, its gradient by the parameters, and its expected curvature."""
     size = len(layout.keys) + len(layout.pairs) + len(layout.seen)
     value, slope, curvature = noise.log_prior, np.zeros(size), np.zeros((size, size))
@@ -295,7 +302,7 @@ def _likelihood(stack: Stack, noise: Noise, layout: _Layout) -> tuple[float, np.
     inverse = noise.share[tuple(layout.pairs.T)] ** -2.0
     slope[own] = TAIL * (inverse - 1.0)
     curvature[own, own] = 2.0 * TAIL * np.clip(inverse, *PRIOR_CURVATURE)
-    values, slopes, curvatures = stack.look(noise)
+    values, slopes, curvatures = stack.look(noise, first)
     (own, to), (both, pair) = layout.slopes, layout.curvatures
     slope += np.bincount(to, slopes.ravel()[own], size)
     curvature += np.bincount(pair, curvatures.ravel()[both], size * size).reshape(size, size)

@@ -7,6 +7,7 @@ batches that fit its cache.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from threading import Lock
 from typing import TypeVar
 
 import numpy as np
@@ -43,6 +44,14 @@ class _Columns:
         self._inner, self._sizes, self._device = inner, sizes, device
         whole = inner[0].of if isinstance(inner[0], There) else inner[0]
         self._channels, self._effects = len(whole), whole.shape[1] - sizes[0]
+        self._begun, self._lock = (None, None), Lock()
+
+    def begun(self, noise: tuple, shaped: Callable[[], T]) -> T:
+        """What belongs to noise levels at which several searches begin, calculated by the first of them."""
+        with self._lock:
+            if self._begun[0] != noise:
+                self._begun = noise, shaped()
+            return self._begun[1]
 
     @cached_property
     def hidden(self) -> torch.Tensor:
@@ -85,14 +94,20 @@ class _Batch:
 
 
 @dataclass(frozen=True)
-class _Solved:
-    """A batch at some noise levels."""
+class _Shape:
+    """A batch at some noise levels, whatever its residuals are."""
 
     weight: torch.Tensor  # of the channels, shape (C,)
     level: torch.Tensor  # prior deviation of the columns, shape (W, n)
     factor: torch.Tensor  # lower Cholesky factor of 1 + P^1/2 U' W U P^1/2, shape (W, n, n)
-    mean: torch.Tensor  # of [b, a] in prior deviations, shape (W, n)
     log_det: torch.Tensor  # of V, shape (W,)
+
+
+@dataclass(frozen=True)
+class _Solved:
+    """A shape with the batch's residuals."""
+
+    mean: torch.Tensor  # of [b, a] in prior deviations, shape (W, n)
     value: torch.Tensor  # log-likelihood of the residuals, but for the powers of 2 pi, shape (W,)
 
 
@@ -158,7 +173,7 @@ class Stack:
         Raises:
             DiagnoseError: The normal equations are not positive definite, which only broken derivatives can cause.
         """
-        return self._in_order([part for (part,) in self._each(lambda batch: (_solved(batch, noise).value,))])
+        return self._in_order([part for (part,) in self._each(lambda batch: (_solved(_shape(batch, noise), batch).value,))])
 
     def fitted(self, noise: Noise) -> list[np.ndarray]:
         """Most probable initial state and unit latent forces of each window, shape (D + L,).
@@ -168,17 +183,18 @@ class Stack:
         """
 
         def found(batch: _Batch) -> tuple[torch.Tensor]:
-            at = _solved(batch, noise)
-            return (at.level * at.mean,)
+            at = _shape(batch, noise)
+            return (at.level * _solved(at, batch).mean,)
 
         by_window = {w: row for own, (rows,) in zip(self._order, self._each(found)) for w, row in zip(own, rows)}
         return [by_window[w][:size] for w, size in enumerate(self._sizes)]
 
-    def look(self, noise: Noise) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def look(self, noise: Noise, first: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Log-likelihood, its gradient and expected curvature by the logarithms of the windows' own levels.
 
         Args:
             noise: levels.
+            first: whether others may look at these levels as well, with other residuals.
 
         Returns:
             Values (W,); gradients (W, B + C) by the B blocks' deviations and the C channels' scales; curvatures (W, B + C, B + C).
@@ -187,7 +203,7 @@ class Stack:
         Raises:
             DiagnoseError: As :meth:`values`.
         """
-        found = self._each(lambda batch: _curved(batch, _solved(batch, noise)))
+        found = self._each(lambda batch: _looked(batch, noise, first))
         return tuple(self._in_order([part[i] for part in found]) for i in range(3))
 
     def integrals(self, noise: Noise, *, latents: bool = False) -> "Integrals":
@@ -208,10 +224,15 @@ class Stack:
         return out
 
 
-def _solved(batch: _Batch, noise: Noise) -> _Solved:
+def _levels(batch: _Batch, noise: Noise) -> np.ndarray:
+    """Deviation of each window's latent forces by block, shape (W, B)."""
     phases, phase = batch.phases
     shared = np.array([[noise.latent_sd.get((b, name), 0.0) for b in range(BLOCKS)] for name in phases])
-    by_block = batch.square.new_tensor(shared[phase] * noise.share[batch.windows])
+    return shared[phase] * noise.share[batch.windows]
+
+
+def _shape(batch: _Batch, noise: Noise) -> _Shape:
+    by_block = batch.square.new_tensor(_levels(batch, noise))
     level = batch.known + (batch.member @ by_block[:, :, None])[..., 0]
     scale = batch.square.new_tensor(noise.scale)
     weight = scale**-2.0
@@ -228,11 +249,24 @@ def _solved(batch: _Batch, noise: Noise) -> _Solved:
             w = int(torch.nonzero(failed)[0, 0])
             where = f"window of flight {batch.grams[w].flight}, phase {batch.grams[w].phase}"
             raise DiagnoseError(f"{where}: the normal equations are singular")
-    right = level * (weight @ batch.cross)
-    mean = torch.cholesky_solve(right[:, :, None], factor)[..., 0]
     log_det = 2.0 * (factor.diagonal(dim1=1, dim2=2).log().sum(-1) + batch.log_sigma + batch.count @ scale.log())
-    value = -0.5 * (batch.square @ weight - (right * mean).sum(-1) + log_det)
-    return _Solved(weight, level, factor, mean, log_det, value)
+    return _Shape(weight, level, factor, log_det)
+
+
+def _solved(at: _Shape, batch: _Batch) -> _Solved:
+    """A shape with the residuals of a batch of the same derivatives."""
+    right = (at.level * (at.weight @ batch.cross))[:, :, None]
+    along = torch.linalg.solve_triangular(at.factor, right, upper=False)
+    mean = torch.linalg.solve_triangular(at.factor.mT, along, upper=True)[..., 0]
+    return _Solved(mean, -0.5 * (batch.square @ at.weight - along.square().sum((1, 2)) + at.log_det))
+
+
+def _inverse(factor: torch.Tensor) -> torch.Tensor:
+    """Inverse of matrices whose lower Cholesky factors these are; a GPU's own goes through them one by one."""
+    if not factor.is_cuda:
+        return torch.cholesky_inverse(factor)
+    back = torch.linalg.solve_triangular(factor, torch.eye(factor.shape[1], dtype=factor.dtype, device=factor.device), upper=False)
+    return back.mT @ back
 
 
 def _weighed(weight: torch.Tensor, inner: torch.Tensor) -> torch.Tensor:
@@ -241,39 +275,50 @@ def _weighed(weight: torch.Tensor, inner: torch.Tensor) -> torch.Tensor:
     return (weight @ inner.reshape(count, channels, -1)).reshape(count, *shape)
 
 
-def _curved(batch: _Batch, at: _Solved) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Value, gradient and curvature by [blocks, scales]."""
-    covariance = torch.cholesky_inverse(at.factor)
-    variance, (count, channels) = covariance.diagonal(dim1=1, dim2=2), batch.count.shape
-    in_blocks = batch.member.transpose(1, 2)
-    by_block = (in_blocks @ (variance + at.mean**2 - 1.0)[:, :, None])[..., 0]
-    moved = at.level * at.mean
+def _curved(at: _Shape, batch: _Batch) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Posterior variances of [b, a] (W, n), what these leave of each channel's squares (W, C), and curvature by [blocks, scales]."""
+    covariance = _inverse(at.factor)
+    variance, (count, channels) = covariance.diagonal(dim1=1, dim2=2).clone(), batch.count.shape
+    in_blocks = batch.member.mT
     scaled = covariance * at.level[:, :, None] * at.level[:, None]
-    hidden = batch.columns.hidden
-    spread = (hidden * scaled[:, None]).sum((2, 3))  # as products of matrices they take ten times as long on a GPU
-    bent = ((hidden @ moved[:, None, :, None])[..., 0] * moved[:, None]).sum(-1)
-    left = batch.square - 2.0 * (batch.cross @ moved[:, :, None])[..., 0] + bent + spread
+    spread = (batch.columns.hidden * scaled[:, None]).sum((2, 3))  # as products of matrices they take ten times as long on a GPU
     # Degrees of freedom that the columns take from each channel; rounding of huge derivatives is kept from taking others.
     taken = torch.minimum(torch.clamp(at.weight * spread, min=0.0), batch.count)
-    squared = covariance**2
+    squared = covariance.square_()
     shared = (in_blocks @ (variance - squared.sum(-1))[:, :, None])[..., 0]
     squared.diagonal(dim1=1, dim2=2).copy_((1.0 - variance) ** 2)
     curvature = at.level.new_zeros(count, BLOCKS + channels, BLOCKS + channels)
     curvature[:, :BLOCKS, :BLOCKS] = 2.0 * in_blocks @ squared @ batch.member
     mixed = 2.0 * shared[:, :, None] * (taken / torch.clamp(taken.sum(-1, keepdim=True), min=1e-300))[:, None]
     curvature[:, :BLOCKS, BLOCKS:] = mixed
-    curvature[:, BLOCKS:, :BLOCKS] = mixed.transpose(1, 2)
+    curvature[:, BLOCKS:, :BLOCKS] = mixed.mT
     curvature[:, BLOCKS:, BLOCKS:].diagonal(dim1=1, dim2=2).copy_(2.0 * torch.clamp(batch.count - taken, min=0.0))
-    return at.value, torch.cat((by_block, left * at.weight - batch.count), -1), curvature
+    return variance, spread, curvature
+
+
+def _looked(batch: _Batch, noise: Noise, first: bool) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Value, gradient and curvature by [blocks, scales]."""
+
+    def shaped() -> tuple[_Shape, tuple[torch.Tensor, ...]]:
+        at = _shape(batch, noise)
+        return at, _curved(at, batch)
+
+    levels = noise.scale.tobytes(), _levels(batch, noise).tobytes()
+    at, (variance, spread, curvature) = batch.columns.begun(levels, shaped) if first else shaped()
+    solved = _solved(at, batch)
+    by_block = (batch.member.mT @ (variance + solved.mean**2 - 1.0)[:, :, None])[..., 0]
+    moved = at.level * solved.mean
+    bent = ((batch.columns.hidden @ moved[:, None, :, None])[..., 0] * moved[:, None]).sum(-1)
+    left = batch.square - 2.0 * (batch.cross @ moved[:, :, None])[..., 0] + bent + spread
+    return solved.value, torch.cat((by_block, left * at.weight - batch.count), -1), curvature
 
 
 @dataclass(frozen=True)
 class _Integrated:
     """What is left of the last J columns of a batch."""
 
-    batch: _Batch
     left: list[np.ndarray]  # which of the J columns are a window's own
-    at: _Solved
+    at: _Shape
     half: torch.Tensor  # L^-1 P^1/2 U' W times the columns, with L of the posterior's precision, shape (W, n, J)
     information: list[np.ndarray]  # of each window
 
@@ -327,7 +372,7 @@ class Integrals:
 
 
 def _integrated(batch: _Batch, noise: Noise, latents: bool) -> _Integrated:
-    at, columns = _solved(batch, noise), batch.columns
+    at, columns = _shape(batch, noise), batch.columns
     right, own = _weighed(at.weight, columns.beside), _weighed(at.weight, columns.own)
     n = right.shape[1]
     if latents:
@@ -340,4 +385,4 @@ def _integrated(batch: _Batch, noise: Noise, latents: bool) -> _Integrated:
     sizes, width = [(gram.nuisances, gram.nuisances + gram.latents) for gram in batch.grams], whole.shape[1]
     left = [np.r_[begin:end, n:width] if latents else np.arange(width) for begin, end in sizes]
     information = [own[np.ix_(columns, columns)] for own, columns in zip(whole, left)]
-    return _Integrated(batch, left, at, half, information)
+    return _Integrated(left, at, half, information)

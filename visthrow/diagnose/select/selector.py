@@ -159,12 +159,15 @@ class Selector(SearchState):
 
     def _exchange(self) -> bool:
         """Simulate all sets that may be worth as much, and go over to the best of them; what is left is possible as well."""
+        if self.rivalled is self.point:
+            return False
         ranked = [move for move in self._rivals() if frozenset(move.active) not in self.visited]
         tried = self._tried(self.point, [move.active for move in ranked])
         listed = {move.active: move.nats for move in ranked}
         if self._best(tried, listed, AHEAD):
             return True
         self.sets = [Move(tuple(self.active), 0.0), *(move for move in tried if -STRONG < move.nats <= AHEAD)]
+        self.rivalled = self.point
         return False
 
     def _rivals(self) -> list[Move]:

@@ -59,6 +59,7 @@ class SearchState:
     refused: dict[int, float] = field(default_factory=dict)  # effects that are not the same in all flights, with their nats
     events: list[int] = field(default_factory=list)
     sets: list[Move] = field(default_factory=list)  # that are possible as well
+    rivalled: Point | None = None  # where all sets were simulated that may be worth as much
     proposed: set[frozenset[int]] = field(default_factory=set)  # sets beside which terms were looked for
     linearised: set[frozenset[int]] = field(default_factory=set)  # sets at whose sizes derivatives were taken for laws' sake
     visited: set[frozenset[int]] = field(default_factory=set)
