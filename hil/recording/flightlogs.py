@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from hil.backends.base import FOLLOW, Status
 from hil.control.landing import Landing
 from hil.control.states import State
 from hil.errors import RunError
@@ -125,7 +126,9 @@ class Samples:
         values |= {f"age_{name}": age for name, age in tick.ages.items() if np.isfinite(age)}
         if tick.goal_w is not None:
             values["goal_w"] = tick.goal_w
-        for name in ("command", "action", "observation", "keypoints"):
+        if d.command is not None:  # what goes out before the autopilot follows moves nothing
+            self.recorder.add(now, Status(*tick.line["status"]).mode == FOLLOW, command=np.array(d.command, dtype=float))
+        for name in ("action", "observation", "keypoints"):
             if getattr(d, name) is not None:
                 values[name] = np.array(getattr(d, name), dtype=float)
         if d.valid is not None:

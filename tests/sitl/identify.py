@@ -3,7 +3,8 @@
     python tests/sitl/alone.py python tests/sitl/identify.py --out out/identify --seconds 36
 
 Writes ``flight.npz``, ``vehicle.toml`` and ``fit.json``: relative rms of the rates on doublets that were not fitted, by the shipped block
-and by the fitted one. ``visthrow hil direct --plant tests.sitl.identify:make_fitted`` throws with the fitted vehicle.
+and by the fitted one. ``visthrow hil direct --plant tests.sitl.identify:make_fitted`` throws with the fitted vehicle. ``doublets.npz`` is
+the flight as motion capture and runner see it: `diagnose explain` takes it with the firmware's blackbox. Commands wait as in a throw.
 """
 
 import argparse
@@ -16,13 +17,17 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
-from hil.fakes.sitl import Firmware, needed
+from hil.backends.held import Held
+from hil.fakes.mocap import SLACK, Mocap, MocapParams
+from hil.fakes.sitl.throw import FlightClock, set_up
 from hil.params import HilParams
+from hil.poses.pose import PAYLOAD
 from sim.effects.firmware import calibrated_voltage, controller_of
 from sim.hybrid import HybridSim
 from sim.params import GRAVITY, VehicleParams
 from tests.sitl import test_betaflight as bench
 from visthrow import config
+from visthrow.logs.flightlog import FlightRecorder
 from visthrow.logs.readers.blackbox.decoder import read_blackbox
 from visthrow.onboard.hover import HoverController, HoverParams
 from visthrow.task import plant_of
@@ -55,17 +60,20 @@ REST = ("integral_x", "integral_y", "integral_z")
 
 def fly(folder: Path, seconds: float, seed: int = 0) -> dict[str, np.ndarray]:
     """Hover through the firmware with a doublet of a rate now and then; states and commands of each period."""
-    settings = folder / "settings"
-    if not (settings / "eeprom.bin").exists():
-        Firmware(bench.program(), settings).set_up(needed(config.load(HilParams, config.find("hil", "betaflight_sitl")).betaflight))
+    params = config.load(HilParams, config.find("hil", "betaflight_sitl"))
+    settings = set_up(bench.program(), folder, params).parent
     run = folder / "run"
     run.mkdir(parents=True, exist_ok=True)
     desk = bench.Bench(run, settings)
+    backend, seen, mocap = Held(desk.backend, params.delay.hold), FlightRecorder({"source": "doublets"}), Mocap(MocapParams(), seed)
     rng, plant = np.random.default_rng(seed), desk.plant
     hover = HoverController(HoverParams(max_thrust=plant.max_thrust), bench.TICK)
     rows, starts = [], []
     try:
         desk.take()
+        clock = FlightClock(desk.fake)
+        while mocap.due(plant.time):  # what was seen before is not kept
+            mocap.measure(plant.time, plant.state)
         end, due, doublet, lift = plant.time + seconds, plant.time + 2.0, None, 1.0
         while plant.time < end:
             state = plant.state
@@ -81,8 +89,9 @@ def fly(folder: Path, seconds: float, seed: int = 0) -> dict[str, np.ndarray]:
             if doublet is not None and plant.time - doublet[2] < 2 * doublet[3] - 1e-6:
                 command[1:] = 0.0
                 command[1 + doublet[0]] = doublet[1] if plant.time - doublet[2] < doublet[3] - 1e-6 else -doublet[1]
-            desk.backend.send(command, plant.time)
-            desk.backend.service(plant.time)
+            backend.send(command, plant.time)
+            seen.add(plant.time, command=command)
+            backend.service(plant.time)
             for _ in range(round(bench.TICK / PERIOD)):
                 now = plant.look()
                 pos = plant.state["pos_w"]
@@ -90,9 +99,17 @@ def fly(folder: Path, seconds: float, seed: int = 0) -> dict[str, np.ndarray]:
                 inside = (now["voltage"], now["charge_used"], *now["motor_speed"])
                 moving = (plant.time, *now["rate_b"], *now["quat_wb"], *now["vel_w"], *pos)
                 rows.append((*moving, *command, answered, *inside, *np.ravel(plant.rope())))
-                desk.fake.step()
+                end_of_period = plant.time + PERIOD
+                if (waits := backend.due()) is not None and waits < end_of_period - SLACK:
+                    clock.sleep_until(waits)
+                    backend.service(waits)
+                clock.sleep_until(end_of_period)
+                for pose in mocap.measure(plant.time, plant.state) if mocap.due(plant.time) else ():
+                    ours = {"payload_pos_w": pose.pos} if pose.body == PAYLOAD else {"pos_w": pose.pos, "quat_wb": pose.quat}
+                    seen.add(plant.time, **ours)
     finally:
         desk.close()
+    seen.log().save(folder / "doublets.npz")
     return {"rows": np.array(rows), "starts": np.array(starts)}
 
 

@@ -1,7 +1,7 @@
-"""Several logs of one flight, each on a clock of its own, as one flight log: what one measured twice tells how they lie.
+"""Several logs of one flight, each on a clock of its own, as one flight log: what was measured twice tells how they lie.
 
 ``LOG00001.BFL+mocap.csv`` names such a flight. Body rates by gyro and by attitude, positions, or accelerations are compared;
-the first log's clock counts.
+the first log's clock counts. What a log worked out of its other channels (``estimated`` of its metadata) is not compared.
 """
 
 from collections.abc import Sequence
@@ -19,26 +19,33 @@ RATE = 50.0
 LEAST = 0.6
 """Correlation of what was measured twice, below which two logs are not taken for one flight."""
 _FINE = 0.1  # around the coarse answer [s]
+_SPAN = 0.1  # of turns: rates of attitudes with 0.2 deg of noise are good to 0.05 rad/s then [s]
+_STEP, _FINE_RATE = 0.001, 200.0  # of lags there, through whose best three a parabola is laid [s]; of samples compared there [Hz]
+
+Signal = tuple[np.ndarray, np.ndarray]
+"""Times [s], shape (T,), and values, shape (T, 1 or 3)."""
 
 
 def join(logs: Sequence[FlightLog]) -> FlightLog:
-    """Put logs of one flight together; of a channel that several hold, the first log's stays.
+    """Put logs of one flight together; of a channel that several measured, the first log's stays, and an estimated one where none did.
 
     Raises:
         LogError: Nothing was measured in both, or it does not go together.
     """
     whole, *others = logs
-    channels, meta = dict(whole.channels), dict(whole.meta)
+    channels, meta, estimated = dict(whole.channels), dict(whole.meta), set(whole.meta.get("estimated", ()))
     meta["joined"] = []
     for log in others:
-        offset, correlation, by = offset_of(FlightLog(channels), log)
-        moved = {name: replace(channel, time=channel.time + offset) for name, channel in log.channels.items()}
-        channels = {**moved, **channels}
+        offset, correlation, by = offset_of(FlightLog(channels, {"estimated": estimated}), log)
+        own = set(log.meta.get("estimated", ()))
+        new = {name for name in log.channels if name not in channels or (name in estimated and name not in own)}
+        channels |= {name: replace(log[name], time=log[name].time + offset) for name in new}
+        estimated = estimated - new | own & new
         source = str(log.meta.get("source", ""))
         meta["joined"].append({"source": source, "offset_s": offset, "correlation": correlation, "by": by})
-        notes = {name: {**note, "clock": source} for name, note in log.meta.get("ingest", {}).items()}
-        meta["ingest"] = {**notes, **meta.get("ingest", {})}
-    return FlightLog(channels, meta)
+        notes = log.meta.get("ingest", {})
+        meta["ingest"] = {**meta.get("ingest", {}), **{name: {**notes[name], "clock": source} for name in notes if name in new}}
+    return FlightLog(channels, meta | {"estimated": sorted(estimated)} if estimated else meta)
 
 
 def offset_of(first: FlightLog, second: FlightLog) -> tuple[float, float, str]:
@@ -48,8 +55,8 @@ def offset_of(first: FlightLog, second: FlightLog) -> tuple[float, float, str]:
         LogError: Nothing was measured in both, or it does not go together.
     """
     tried = []
-    for by, signal in (("body rates", _turning), ("speed", _speed), ("force", _force)):
-        a, b = signal(first), signal(second)
+    for by, signal in (("body rates", _turning), ("speed", _velocity), ("force", _force)):
+        a, b = signal(first.measured()), signal(second.measured())
         if a is not None and b is not None and min(len(a[0]), len(b[0])) > RATE:
             tried.append((by, *_lag(a, b)))
     if not tried:
@@ -63,59 +70,69 @@ def offset_of(first: FlightLog, second: FlightLog) -> tuple[float, float, str]:
     return offset, correlation, by
 
 
-def _turning(log: FlightLog) -> tuple[np.ndarray, np.ndarray] | None:
-    """Size of the body rates, which no axes change."""
-    if "rate_b" in log:
-        return _size(log["rate_b"])
-    if "quat_wb" not in log:
-        return None
-    good = log["quat_wb"].valid
-    time, rate = relations.rates_of(log["quat_wb"].time[good], log["quat_wb"].values[good].astype(float))
-    return time, np.linalg.norm(rate, axis=1)
+def _turning(log: FlightLog) -> Signal | None:
+    """Body rates over ``_SPAN``: by gyro, else by attitude."""
+    if "rate_b" not in log:
+        return relations.rates_of(*_valid(log["quat_wb"]), _SPAN) if "quat_wb" in log else None
+    time, rate = _valid(log["rate_b"])
+    inside = time[(time > time[0] + 0.5 * _SPAN) & (time < time[-1] - 0.5 * _SPAN)] if len(time) else time
+    return (inside, relations.mean_over(time, rate, inside, _SPAN)) if len(inside) else None
 
 
-def _velocity(log: FlightLog) -> tuple[np.ndarray, np.ndarray]:
-    """Times and velocities from measured positions."""
-    good = log["pos_w"].valid
-    return relations.derivative(log["pos_w"].time[good], log["pos_w"].values[good].astype(float))
-
-
-def _speed(log: FlightLog) -> tuple[np.ndarray, np.ndarray] | None:
+def _velocity(log: FlightLog) -> Signal | None:
     if "vel_w" in log:
-        return _size(log["vel_w"])
-    if "pos_w" not in log:
-        return None
-    time, vel = _velocity(log)
-    return time, np.linalg.norm(vel, axis=1)
+        return _valid(log["vel_w"])
+    return relations.derivative(*_valid(log["pos_w"])) if "pos_w" in log else None
 
 
-def _force(log: FlightLog) -> tuple[np.ndarray, np.ndarray] | None:
+def _force(log: FlightLog) -> Signal | None:
+    """Size of the specific force: the accelerometer's axes turn in the world."""
     if "acc_b" in log:
-        return _size(log["acc_b"])
+        return _sized(*_valid(log["acc_b"]))
     if "pos_w" not in log:
         return None
-    time, acc = relations.derivative(*_velocity(log))
-    return time, np.linalg.norm(acc + [0.0, 0.0, GRAVITY], axis=1)
+    time, acc = relations.derivative(*relations.derivative(*_valid(log["pos_w"])))
+    return _sized(time, acc + [0.0, 0.0, GRAVITY])
 
 
-def _size(channel: Channel) -> tuple[np.ndarray, np.ndarray]:
-    return channel.time[channel.valid], np.linalg.norm(channel.values[channel.valid].astype(float), axis=1)
+def _valid(channel: Channel) -> Signal:
+    return channel.time[channel.valid], channel.values[channel.valid].astype(float)
 
 
-def _lag(a: tuple[np.ndarray, np.ndarray], b: tuple[np.ndarray, np.ndarray]) -> tuple[float, float]:
-    """Offset of the second [s] and the correlation: all lags at once by Fourier transform, then finely about the best."""
-    grids = [np.arange(time[0], time[-1], 1.0 / RATE) for time, _ in (a, b)]
-    x, y = (np.interp(grid, *signal) - np.mean(signal[1]) for grid, signal in zip(grids, (a, b)))
+def _sized(time: np.ndarray, values: np.ndarray) -> Signal:
+    return time, np.linalg.norm(values, axis=1, keepdims=True)
+
+
+def _lag(a: Signal, b: Signal) -> tuple[float, float]:
+    """Offset of the second [s] and the correlation of sizes, which no axes change.
+
+    All lags at once by Fourier transform of the sizes; about the best one by one, the components in the axes that fit best.
+    """
+    sizes = _sized(*a), _sized(*b)
+    grids = [np.arange(time[0], time[-1], 1.0 / RATE) for time, _ in sizes]
+    x, y = (np.interp(grid, time, size[:, 0]) - np.mean(size) for grid, (time, size) in zip(grids, sizes))
     size = 2 ** int(np.ceil(np.log2(len(x) + len(y))))
     cross = np.fft.irfft(np.fft.rfft(x, size) * np.conj(np.fft.rfft(y, size)), size)
     lags = np.concatenate([np.arange(len(x)), np.arange(-len(y) + 1, 0)])
-    at = int(lags[np.argmax(cross[lags % size])])
-    coarse = grids[0][0] - grids[1][0] + at / RATE
-    best = (coarse, -1.0)
-    for fine in coarse + np.arange(-_FINE, _FINE + 1e-9, 0.001):
-        inside = (grids[0] > b[0][0] + fine) & (grids[0] < b[0][-1] + fine)
-        if np.sum(inside) < RATE:
-            continue
-        correlation = float(np.corrcoef(x[inside], np.interp(grids[0][inside] - fine, *b))[0, 1])
-        best = max(best, (float(fine), correlation), key=lambda of: of[1])
-    return best
+    coarse = grids[0][0] - grids[1][0] + int(lags[np.argmax(cross[lags % size])]) / RATE
+    near = coarse + np.arange(-_FINE, _FINE + 1e-9, _STEP)
+    scores = np.array([_alignment(*_both(a, b, offset)) for offset in near])
+    at = int(np.argmax(scores))
+    offset = float(near[at] + _STEP * relations.peak(scores, at)[0])
+    both = _both(*sizes, offset)
+    return offset, float(np.corrcoef(np.hstack(both).T)[0, 1]) if len(both[0]) >= RATE else -1.0
+
+
+def _both(a: Signal, b: Signal, offset: float) -> tuple[np.ndarray, np.ndarray]:
+    """Values of both on a grid of the first's clock, the same for any offset, where there are both."""
+    grid = np.arange(a[0][0], a[0][-1], 1.0 / _FINE_RATE)
+    grid = grid[(grid > b[0][0] + offset) & (grid < b[0][-1] + offset)]
+    return relations.on_grid(*a, grid), relations.on_grid(*b, grid - offset)
+
+
+def _alignment(x: np.ndarray, y: np.ndarray) -> float:
+    """Correlation of components once one is turned, or mirrored, to fit the other best: the sum of the covariance's singular values."""
+    if len(x) < RATE:
+        return -1.0
+    x, y = x - np.mean(x, axis=0), y - np.mean(y, axis=0)
+    return float(np.sum(np.linalg.svd(x.T @ y, compute_uv=False)) / max(np.sqrt(np.sum(x**2) * np.sum(y**2)), 1e-12))

@@ -5,7 +5,7 @@ is read from the firmware's own channels by MSP on its second serial port. The r
 the poses of both bodies beside it. Until the rotors carry it the vehicle hangs in a stand.
 """
 
-import socket
+import math
 from typing import Any
 
 import numpy as np
@@ -14,9 +14,9 @@ from hil.backends.betaflight import BOX_ARM, HIGH, NEAR, STICKS, BetaflightParam
 from hil.fakes.base import Fake, Options, WirePlant
 from hil.fakes.mocap import SLACK, MocapParams
 from hil.fakes.sitl.firmware import PORTS
-from hil.fakes.sitl.packets import MOTORS, Sensors, motors
+from hil.fakes.sitl.packets import Sensors
 from hil.links import msp
-from hil.links.device import LARGEST_DATAGRAM, Device, Port, TcpPort, chunks
+from hil.links.device import Device, TcpPort, chunks
 from hil.links.mavlink_link import Link
 
 ASK = {msp.RC: 0.002, msp.STATUS: 0.1}
@@ -39,34 +39,6 @@ class MotorPlant(WirePlant):
     force_b: np.ndarray
 
 
-class MotorPort:
-    """Where the firmware's motor outputs come in; a `hil.links.device.Port` that is only read."""
-
-    whole = True
-
-    def __init__(self) -> None:
-        """Listen on the firmware's port, loopback only."""
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.bind(("127.0.0.1", MOTORS))
-        self._socket.setblocking(False)
-
-    def read(self) -> bytes | None:
-        try:
-            return self._socket.recv(LARGEST_DATAGRAM)
-        except OSError:
-            return None
-
-    def write(self, data: bytes) -> bool:
-        """See `Port`: nothing goes out here."""
-        return False
-
-    def fileno(self) -> int:
-        return self._socket.fileno()
-
-    def close(self) -> None:
-        self._socket.close()
-
-
 class BetaflightSitl(Fake):
     """See the head of this module.
 
@@ -76,7 +48,7 @@ class BetaflightSitl(Fake):
 
     def __init__(
         self, plant: MotorPlant, link: Link, mocap: MocapParams | None, seed: int, options: Options, params: BetaflightParams,
-        stands: int | None,
+        stands: int,
     ) -> None:  # fmt: skip
         """Connect to a firmware that runs.
 
@@ -87,8 +59,7 @@ class BetaflightSitl(Fake):
         """
         super().__init__(plant, link, mocap, seed, options)
         self.params, self.armed = params, False
-        self.port, self.sensors = MotorPort(), Sensors(stands)
-        self._msp: Port = TcpPort(Device("tcp", "127.0.0.1", PORTS[1]))
+        self.port, self.sensors = TcpPort(Device("tcp", "127.0.0.1", PORTS[1])), Sensors(stands)
         self._parser, self._asked = msp.Parser(), dict.fromkeys(ASK, -1e9)
         self._boxes: tuple[int, ...] = ()
         self._open = False
@@ -96,16 +67,17 @@ class BetaflightSitl(Fake):
         self.motors = np.zeros(4)
         self.answered = 0
         self.cycles: list[int] = []
-        self._fresh = False
+        self._outputs: list[np.ndarray] = []
         self._rate_b, self._sent = plant.rate_b, 0  # at the beginning of the last period; samples sent in this one
 
     def run_on(self, when: float) -> None:
         """See `Fake`: samples by the rates at the period's beginning and their last change."""
-        plant = self.plant
-        step, change = plant.period / SAMPLES, (plant.rate_b - self._rate_b) / SAMPLES
-        while self._sent < SAMPLES and plant.time + self._sent * step < when - SLACK:
-            self.sensors.send(plant.rate_b + self._sent * change, plant.force_b, plant.quat_wb, step)
-            self._sent += 1
+        plant, step = self.plant, self.plant.period / SAMPLES
+        due = np.arange(self._sent, min(max(math.ceil((when - SLACK - plant.time) / step), self._sent), SAMPLES))
+        if len(due):
+            rates_b = plant.rate_b + due[:, None] * ((plant.rate_b - self._rate_b) / SAMPLES)
+            self._outputs.append(self.sensors.send(rates_b, plant.force_b, plant.quat_wb, step))
+            self._sent += len(due)
 
     def fly(self) -> None:
         """See `Fake`: a period by what the firmware made of the samples within it."""
@@ -114,12 +86,9 @@ class BetaflightSitl(Fake):
         super().fly()
 
     def hear(self) -> None:
-        """See `Fake`: motors, and what the firmware says of itself."""
+        """See `Fake`: what the firmware says of itself."""
         super().hear()
-        came = [outputs for packet in chunks(self.port) if (outputs := motors(packet)) is not None]
-        if came:
-            self.motors, self._fresh = np.mean(came, axis=0), True
-        for data in chunks(self._msp):
+        for data in chunks(self.port):
             self.heard = self.wall()
             for frame in self._parser.parse(data):
                 self._hear(frame)
@@ -148,8 +117,9 @@ class BetaflightSitl(Fake):
 
     def flown(self) -> np.ndarray:
         """See `Fake`: the firmware's motor outputs."""
-        self.answered += self._fresh
-        self._fresh = False
+        came, self._outputs = np.concatenate(self._outputs), []
+        if len(came):
+            self.motors, self.answered = came.mean(axis=0, dtype=float), self.answered + 1
         return self.motors
 
     def speak(self) -> None:
@@ -158,9 +128,9 @@ class BetaflightSitl(Fake):
         for command, period in ASK.items():
             if plant.time - self._asked[command] >= period:
                 self._asked[command] = plant.time
-                self._msp.write(msp.pack(msp.Frame(command)))
+                self.port.write(msp.pack(msp.Frame(command)))
         if not self._boxes and self._asked[msp.STATUS] == plant.time:
-            self._msp.write(msp.pack(msp.Frame(msp.BOXIDS)))
+            self.port.write(msp.pack(msp.Frame(msp.BOXIDS)))
 
     def take(self) -> None:
         """See `Fake`: there is no pilot; all channels are the runner's."""
@@ -173,5 +143,5 @@ class BetaflightSitl(Fake):
 
     def close(self) -> None:
         super().close()
-        for port in (self.port, self.sensors, self._msp):
+        for port in (self.port, self.sensors):
             port.close()

@@ -4,7 +4,8 @@ Convention: the firmware wants rates forward, right, down; the negative of the s
 w, x, y, z of forward, left, up in north, west, up. It answers every packet of samples with one of motors, in the order front
 right, rear left, front left, rear right.
 
-A stamp says up to when the firmware may run (``lockstep.c``).
+A stamp says up to when the firmware may run. The packets of a datagram are taken one after the other, and answered together
+(``lockstep.c``).
 
 Source: betaflight 4.6, src/platform/SIMULATOR/sitl.c (updateState, micros64, pwmCompleteMotorUpdate) and target/SITL/target.h.
 """
@@ -14,6 +15,7 @@ import select
 import socket
 import struct
 import threading
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -22,16 +24,17 @@ from hil.errors import RunError
 GRAVITY = 9.80665
 """Of the firmware's accelerometer [m/s^2]."""
 
-MOTORS, SENSORS = 9002, 9003
-"""UDP ports: motor outputs come there, samples go there."""
+SENSORS = 9003
+"""UDP port that samples go to."""
 
 FDM = struct.Struct("<18d")
 """Stamp, rates (3), acceleration (3), attitude (4), velocity (3), position (3), pressure."""
 
-PWM = struct.Struct("<4f")
+TIME, MOTORS, LARGEST_ANSWER = 8, 4, 4096
+"""Bytes of the firmware's time before its answers; motors in one; bytes of all."""
 
 OURS = (2, 0, 1, 3)
-"""Where front left, front right, rear left, rear right stand in the packet of motors."""
+"""Where front left, front right, rear left, rear right stand in an answer."""
 
 SEA_LEVEL = 101325.0
 """[Pa]"""
@@ -43,55 +46,61 @@ PATIENCE = 10.0
 """For the firmware to come to a stamp [s], on the wall's clock: a tenth of a millisecond is usual."""
 
 
-def samples(stamp: float, rate_b: np.ndarray, force_b: np.ndarray, quat_wb: np.ndarray) -> bytes:
-    """Packet of body rates [rad/s], specific force [m/s^2], shapes (3,), body frame, and attitude xyzw, shape (4,)."""
+def sample(stamp: float, rate_b: Sequence[float], force_b: Sequence[float], quat_wb: Sequence[float]) -> bytes:
+    """Packet of body rates [rad/s], specific force [m/s^2], body frame, and attitude xyzw."""
     x, y, z, w = quat_wb
+    back, right, up = force_b
     return FDM.pack(
-        stamp, rate_b[0], -rate_b[1], -rate_b[2], *(-force_b), w, x, y, z, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, SEA_LEVEL
+        stamp, rate_b[0], -rate_b[1], -rate_b[2], -back, -right, -up, w, x, y, z, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, SEA_LEVEL
     )  # fmt: skip
 
 
-def motors(packet: bytes) -> np.ndarray | None:
-    """Motor outputs, 0 to 1, shape (4,), in our order; None where the packet holds none."""
-    if len(packet) != PWM.size:
-        return None
-    values = PWM.unpack(packet)
-    return np.array([values[at] for at in OURS])
-
-
-def stood(stands: int, most: float) -> bool:
-    """Whether a firmware in lock step says on its pipe, within a time [s], that it stands still."""
-    return bool(select.select([stands], [], [], most)[0]) and bool(os.read(stands, 8))
+def stood(stands: int, most: float) -> bytes:
+    """What a firmware in lock step says on its pipe once it stands still; nothing where it does not within a time [s]."""
+    return os.read(stands, LARGEST_ANSWER) if select.select([stands], [], [], most)[0] else b""
 
 
 class Sensors:
     """Where samples are sent to, and the firmware's clock."""
 
-    def __init__(self, stands: int | None = None) -> None:
-        """Open a socket.
+    def __init__(self, stands: int) -> None:
+        """Open a socket; ``stands``: pipe on which the firmware says that it has come to a stamp."""
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.connect(("127.0.0.1", SENSORS))
+        self._stands, self._stamp = stands, 0.0
+        self._last: tuple[Sequence[float], ...] = ((0.0, 0.0, 0.0), (0.0, 0.0, GRAVITY), (0.0, 0.0, 0.0, 1.0))
+
+    def send(self, rates_b: np.ndarray, force_b: np.ndarray, quat_wb: np.ndarray, period: float) -> np.ndarray:
+        """Send samples, let the firmware run for a period [s] with each, and wait until it has.
 
         Args:
-            stands: pipe on which the firmware says that it has come to a stamp; None for one that runs by itself.
-        """
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._stands, self._stamp = stands, 0.0
-        self._last: tuple[np.ndarray, ...] = (np.zeros(3), np.array([0.0, 0.0, GRAVITY]), np.array([0.0, 0.0, 0.0, 1.0]))
+            rates_b: [rad/s], shape (N, 3), body frame; N at most 16.
+            force_b: specific force [m/s^2], shape (3,), body frame. quat_wb: attitude xyzw.
+            period: between two samples [s].
 
-    def send(self, rate_b: np.ndarray, force_b: np.ndarray, quat_wb: np.ndarray, period: float) -> None:
-        """Send samples, see `samples`, let the firmware run for a period [s], and wait until it has.
+        Returns:
+            Motor outputs that came, 0 to 1, shape (M, 4), in our order; M is N, or less where the firmware is not ready.
 
         Raises:
-            RunError: it does not.
+            RunError: it does not run.
         """
-        self._last = (rate_b, force_b, quat_wb)
-        self._stamp += period
-        self._socket.sendto(samples(self._stamp, *self._last), ("127.0.0.1", SENSORS))
-        if self._stands is not None and not stood(self._stands, PATIENCE):
+        force, quat, packets = force_b.tolist(), quat_wb.tolist(), []
+        for rate in rates_b.tolist():
+            self._stamp, self._last = self._stamp + period, (rate, force, quat)
+            packets.append(sample(self._stamp, *self._last))
+        return self._run(b"".join(packets))
+
+    def _run(self, packets: bytes) -> np.ndarray:
+        self._socket.send(packets)
+        answer = stood(self._stands, PATIENCE)
+        if not answer:
             raise RunError(f"the firmware has not come to the time {self._stamp:.3f} s of its samples after {PATIENCE:g} s")
+        return np.frombuffer(answer, np.float32, offset=TIME).reshape(-1, MOTORS)[:, OURS]
 
     def rest(self, period: float) -> None:
-        """The same with a vehicle that stands still, as at the last time."""
-        self.send(*self._last, period)
+        """Let it run for a period [s] with a vehicle that stands still, as at the last time."""
+        self._stamp += period
+        self._run(sample(self._stamp, *self._last))
 
     def start(self) -> None:
         """Let the firmware calibrate its sensors, the vehicle standing still.
@@ -110,7 +119,7 @@ class Sensors:
 class StillSensors:
     """A vehicle at rest, while nothing flies yet: the firmware calibrates its gyro and answers only with samples."""
 
-    def __init__(self, stands: int | None) -> None:
+    def __init__(self, stands: int) -> None:
         self._done, self._sensors = threading.Event(), Sensors(stands)
 
     def __enter__(self) -> "StillSensors":

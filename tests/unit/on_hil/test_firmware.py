@@ -38,18 +38,11 @@ def free_port(kind=socket.SOCK_STREAM):
 
 def test_samples_are_forward_right_down_and_the_force_turned_round():
     """The firmware's own wrapper: rates FRD, acceleration the negative of FLU, attitude w first."""
-    values = packets.FDM.unpack(packets.samples(1.0, np.array([0.1, 0.2, 0.3]), np.array([1.0, 2.0, 9.8]), np.array([0.0, 0.1, 0.2, 0.9])))
+    values = packets.FDM.unpack(packets.sample(1.0, (0.1, 0.2, 0.3), (1.0, 2.0, 9.8), (0.0, 0.1, 0.2, 0.9)))
     assert values[1:4] == (0.1, -0.2, -0.3)
     assert values[4:7] == (-1.0, -2.0, -9.8)
     assert values[7:11] == (0.9, 0.0, 0.1, 0.2)
     assert len(values) == 18
-
-
-def test_motors_come_in_our_order():
-    """Betaflight's motors 1 rear right, 2 front right, 3 rear left, 4 front left go out as 2, 3, 4, 1."""
-    packet = packets.PWM.pack(2.0, 3.0, 4.0, 1.0)
-    assert packets.motors(packet).tolist() == [4.0, 2.0, 3.0, 1.0]
-    assert packets.motors(packet[:-1]) is None
 
 
 STUB = r"""
@@ -61,11 +54,13 @@ STUB = r"""
 #include <time.h>
 #include <unistd.h>
 static int state, serves;
+static double rate;
 static void *samples(void *unused) {
     for (;;) {
         double data[18]; fd_set set; struct timeval most = {0, 100000};
         FD_ZERO(&set); FD_SET(state, &set);
-        if (select(state + 1, &set, NULL, NULL, &most) == 1) recvfrom(state, data, sizeof data, 0, NULL, NULL);
+        int ready = select(state + 1, &set, NULL, NULL, &most);
+        if (ready == 1 && recvfrom(state, data, sizeof data, 0, NULL, NULL) == sizeof data) rate = data[1];
     }
 }
 static void *ports(void *unused) {
@@ -73,7 +68,7 @@ static void *ports(void *unused) {
     for (;;) { struct timeval most = {0, 9999}; select(0, NULL, NULL, NULL, &most); }
 }
 int main(int argc, char **argv) {
-    struct sockaddr_in at = {.sin_family = AF_INET}; pthread_t a, b; long turns = 0;
+    struct sockaddr_in at = {.sin_family = AF_INET}; pthread_t a, b; long turns = 0; double before = 0.0;
     int port; sscanf(argv[1], "%d", &port); at.sin_port = htons(port); at.sin_addr.s_addr = htonl(INADDR_LOOPBACK);
     pthread_create(&b, NULL, ports, NULL);
     state = socket(AF_INET, SOCK_DGRAM, 0); bind(state, (struct sockaddr *)&at, sizeof at);
@@ -81,7 +76,11 @@ int main(int argc, char **argv) {
     pthread_create(&a, NULL, samples, NULL);
     for (;;) {
         struct timespec now, nap = {0, 50000}; clock_gettime(CLOCK_MONOTONIC, &now); nanosleep(&nap, NULL);
-        printf("%ld %ld.%09ld\n", ++turns, now.tv_sec, now.tv_nsec); fflush(stdout);
+        printf("%ld %ld.%09ld %g\n", ++turns, now.tv_sec, now.tv_nsec, rate); fflush(stdout);
+        if (rate != before) {
+            float motors[4] = {2.0, 3.0, 4.0, rate}; before = rate; at.sin_port = htons(9002);
+            sendto(state, motors, sizeof motors, 0, (struct sockaddr *)&at, sizeof at);
+        }
     }
 }
 """
@@ -89,33 +88,58 @@ int main(int argc, char **argv) {
 a port only once the thread of ports serves."""
 
 
-@pytest.mark.skipif(shutil.which("gcc") is None, reason="no C compiler")
-def test_a_clock_in_lock_step_goes_as_far_as_the_samples_let_it(tmp_path, monkeypatch):
-    """Loops of 50.1 us: 2 s after the start it stands still; each packet lets it go on by its period, twice the same in two runs."""
+@pytest.fixture
+def stub(tmp_path, monkeypatch):
+    """Run `STUB` in lock step with samples of ours; returns what came of them, and what it printed."""
+    if shutil.which("gcc") is None:
+        pytest.skip("no C compiler")
     source, program, port = tmp_path / "stub.c", tmp_path / "stub", free_port(socket.SOCK_DGRAM)
     source.write_text(STUB)
     subprocess.run(["gcc", "-o", program, source, "-lpthread"], check=True)
     monkeypatch.setattr(packets, "SENSORS", port)
-    told = []
-    for _ in range(2):
+
+    def run(feed):
         stands, said = os.pipe()
         environment = os.environ | {"LD_PRELOAD": str(firmware.compiled(tmp_path)), "VISTHROW_STANDS": str(said)}
         command = [program, str(port)]
-        with open(tmp_path / "told.txt", "w") as out, subprocess.Popen(command, env=environment, pass_fds=[said], stdout=out) as stub:
+        with open(tmp_path / "told.txt", "w") as out, subprocess.Popen(command, env=environment, pass_fds=[said], stdout=out) as process:
             assert packets.stood(stands, 10.0)
             sensors = packets.Sensors(stands)
-            for period in (0.002, 0.002, 0.010):
-                sensors.rest(period)
+            came = feed(sensors)
             assert not packets.stood(stands, 0.05), "it stands until the next packet"
-            stub.kill()
+            process.kill()
             sensors.close()
         os.close(stands)
         os.close(said)
-        told.append((tmp_path / "told.txt").read_text().splitlines()[-1])
-    turns, now = told[0].split()
+        return came, [line.split() for line in (tmp_path / "told.txt").read_text().splitlines()]
+
+    return run
+
+
+def test_a_clock_in_lock_step_goes_as_far_as_the_samples_let_it(stub):
+    """Loops of 50.1 us: 2 s after the start it stands still; each packet lets it go on by its period, twice the same in two runs."""
+    told = [stub(lambda sensors: [sensors.rest(period) for period in (0.002, 0.002, 0.010)])[1][-1] for _ in range(2)]
+    turns, now, _ = told[0]
     assert float(now) == pytest.approx(1.0 + 2.0 + 0.014, abs=1e-4)
     assert int(turns) == pytest.approx(2.014 / 50.1e-6, rel=1e-3)
     assert told[0] == told[1]
+
+
+def test_samples_of_a_datagram_are_taken_one_after_the_other(stub):
+    """Four samples at once are four of 0.5 ms each, as if they had come alone; each is answered, in our order: front left, front
+    right, rear left, rear right come as 2, 3, 4, 1."""
+    rates = np.array([[1.0, 0.0, 0.0], [2.0, 0.0, 0.0], [3.0, 0.0, 0.0], [4.0, 0.0, 0.0]])
+    still = np.array([0.0, 0.0, 9.8]), np.array([0.0, 0.0, 0.0, 1.0])
+
+    def one_by_one(sensors):
+        return np.concatenate([sensors.send(rates[i : i + 1], *still, 0.0005) for i in range(4)])
+
+    came, told = stub(lambda sensors: sensors.send(rates, *still, 0.0005))
+    alone, as_told = stub(one_by_one)
+    assert told == as_told
+    assert came.tolist() == alone.tolist() == [[4.0, 2.0, 3.0, rate] for rate in (1.0, 2.0, 3.0, 4.0)]
+    for rate in (1.0, 2.0, 3.0, 4.0):
+        assert sum(float(words[2]) == rate for words in told) == pytest.approx(0.0005 / 50.1e-6, abs=1.0)
 
 
 class Answers:
@@ -189,13 +213,13 @@ def test_settings_follow_the_runs_configuration(params):
 
 def test_the_bridge_sees_arming_and_the_release_channel(params, monkeypatch):
     """What the firmware says by MSP becomes events, and the release's channel opens the mechanism once."""
-    mine, motor = free_port(), free_port(socket.SOCK_DGRAM)
+    mine = free_port()
     monkeypatch.setattr(betaflight, "PORTS", (0, mine))
-    monkeypatch.setattr(betaflight, "MOTORS", motor)
+    monkeypatch.setattr(packets.Sensors, "_run", lambda sensors, data: np.array([[0.4, 0.2, 0.3, 0.1]]))
     serial = ListeningPort(mine)
     fake = BetaflightSitl(
         make_motors("vision", 0), Link(UdpPort(Device("udpout", "127.0.0.1", 14999)), *VEHICLE_ID), MocapParams(), 0,
-        Options(), params, None,
+        Options(), params, -1,
     )  # fmt: skip
     parser, channels = msp.Parser(), [1500, 1500, 1500, 1000, LOW, LOW, LOW, LOW]
     flags = [0]
@@ -208,13 +232,11 @@ def test_the_bridge_sees_arming_and_the_release_channel(params, monkeypatch):
         serial.write(msp.pack(msp.Frame(frame.command, payloads[frame.command], msp.ANSWER)))
 
     def turn(count):
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as firm:
-            for _ in range(count):
-                firm.sendto(packets.PWM.pack(0.2, 0.3, 0.4, 0.1), ("127.0.0.1", motor))
-                fake.step()
-                data = serial.read()
-                for frame in parser.parse(data or b""):
-                    answer(frame)
+        for _ in range(count):
+            fake.step()
+            data = serial.read()
+            for frame in parser.parse(data or b""):
+                answer(frame)
 
     turn(120)
     assert fake.motors == pytest.approx([0.4, 0.2, 0.3, 0.1])

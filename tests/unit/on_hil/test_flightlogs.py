@@ -65,6 +65,20 @@ def test_a_log_a_throw_with_what_was_decided(run, logs):
         np.testing.assert_allclose(length, length[0], atol=0.01)
 
 
+def test_commands_before_the_autopilot_follows_are_no_valid_ones(run, tmp_path):
+    """As Betaflight has it while it is not armed: frames go out, motors stand still."""
+    folder = shutil.copytree(run[0], tmp_path / "late")
+    lines = [json.loads(text) for text in (folder / "ticks.jsonl").read_text().splitlines()]
+    first = next(n for n, line in enumerate(lines) if line["command"] is not None)
+    late = [line["time"] for line in lines[first : first + 3]]
+    for line in lines[: first + 3]:
+        line["status"][3] = "wait"
+    (folder / "ticks.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    command = flightlogs.whole(read(folder))["command"]
+    assert command.time[~command.valid].tolist() == late
+    assert len(command.time) > 10
+
+
 def test_what_the_other_tools_read_of_it(run, logs, tmp_path):
     log = logs[0]
     for name in ("pos_w", "quat_wb", "vel_w", "rate_b", "payload_pos_w", "command", "observation", "keypoints", "goal_w"):

@@ -15,6 +15,9 @@ NEVER = 1e9  # a time after every flight [s]
 LEAST_SIGMA = {"pos_w": 2e-5, "quat_wb": 1e-4, "payload_pos_w": 2e-5, "rate_b": 1e-3}
 """Noise below which no channel is believed: what numerics and rounding leave [m], [rad], [m], [rad/s]."""
 
+UNIFORM = 12.0**-0.5
+"""Standard deviation of what rounding takes, of its step."""
+
 BETWEEN = 0.05
 """Attitudes further apart [s] tell nothing of the times between them."""
 AT_START = 0.25  # of a log, whose voltages tell how much charge was used before [s]
@@ -75,17 +78,31 @@ def _samples(log: FlightLog, name: str) -> Samples | None:
     if channel is None:
         return None
     time, values = channel.time[channel.valid], np.asarray(channel.values, dtype=float)[channel.valid]
+    step = resolution(values)
     fresh = np.ones(len(time), dtype=bool)
     fresh[1:] = np.any(values[1:] != values[:-1], axis=1)  # a repeated sample is a stale one
     if np.count_nonzero(fresh) < 5:
         return None
-    time, values = time[fresh], values[fresh]
+    if not step:
+        time, values = time[fresh], values[fresh]
     if name == "quat_wb":
         values = continuous(values / np.linalg.norm(values, axis=1, keepdims=True))
-        sigma = 2.0 * float(np.sqrt(np.sum(highpass_sigma(values) ** 2) / 3.0))  # an angle moves three of four by its half
-    else:
-        sigma = float(np.median(highpass_sigma(values)))
-    return Samples(time, values, max(sigma, LEAST_SIGMA[name]))
+    noise = np.hypot(highpass_sigma(values), step * UNIFORM)
+    # An angle moves three of four numbers of an attitude by its half.
+    sigma = 2.0 * np.sqrt(np.sum(noise**2) / 3.0) if name == "quat_wb" else np.median(noise)
+    return Samples(time, values, max(float(sigma), LEAST_SIGMA[name]))
+
+
+def resolution(values: np.ndarray) -> float:
+    """Step that a channel was recorded in, of shape (T, N), where most of its changes are of one step; 0 where they are not.
+
+    Such samples repeat themselves without being stale. Without the repeated ones those would be left at which a step was just
+    taken: half a step ahead of what was measured.
+    """
+    changes = np.abs(np.diff(values, axis=0))
+    changes = changes[changes > 0.0]
+    least = float(np.min(changes, initial=np.inf))
+    return least if len(changes) and np.median(changes) < 1.5 * least else 0.0
 
 
 def record_of(log: FlightLog, number: int = 0) -> Recorded:

@@ -79,7 +79,7 @@ def relate(time_a: np.ndarray, a: np.ndarray, time_b: np.ndarray, b: np.ndarray,
     scale_of = np.sqrt(power * norms)
     own = np.trace(cross) / scale_of
     at = int(np.argmax(own))
-    offset, curve = _peak(own, at)
+    offset, curve = peak(own, at)
     names, best, best_at = _best_axes(cross / scale_of) if a.shape[1] == 3 else _best_sign(own)
     effective = max(count * min(1.0, period / INDEPENDENT), 10.0)
     sd = period * np.sqrt(max(1.0 - own[at] ** 2, 1e-6) / effective / max(curve, 1e-9))
@@ -108,7 +108,7 @@ def _centred(values: np.ndarray) -> np.ndarray:
     return values - np.mean(values, axis=0)
 
 
-def _peak(score: np.ndarray, at: int) -> tuple[float, float]:
+def peak(score: np.ndarray, at: int) -> tuple[float, float]:
     """Vertex of the parabola through the peak and its neighbours, and its curvature [1/step^2]."""
     if not 0 < at < len(score) - 1:
         return 0.0, 1e-9
