@@ -44,7 +44,7 @@ def tether_lengths(rope: RopeParams, z: RandomizationParams) -> list[RopeParams]
     Environment e gets entry ``e % tether_variants`` (the paper, Sec. III-C).
     """
     if z.tether_variants < 1:
-        raise ValueError(f"tether_variants {z.tether_variants}: expected 1 or more")
+        raise ValueError(f"tether_variants {z.tether_variants}; expected 1 or more")
     factors = (
         [1.0] if z.tether_variants == 1 else np.linspace(1 - z.tether_spread, 1 + z.tether_spread, z.tether_variants)
     )
@@ -61,7 +61,7 @@ def rope_variants(rope: RopeParams, z: RandomizationParams) -> list[RopeParams]:
     """
     spreads = {"payload_spread": z.payload_spread, "drag_spread": z.drag_spread}
     if z.payload_variants < 1 or not all(0.0 <= spread < 1.0 for spread in spreads.values()):
-        raise ValueError(f"payload_variants {z.payload_variants}, {spreads}: expected 1 or more, and 0 to below 1")
+        raise ValueError(f"payload_variants {z.payload_variants}, {spreads}; expected 1 or more, and 0 to below 1")
     masses, drags = (
         [1.0] if spread == 0.0 or z.payload_variants == 1 else np.linspace(1 - spread, 1 + spread, z.payload_variants)
         for spread in spreads.values()
@@ -82,7 +82,7 @@ def rope_variants(rope: RopeParams, z: RandomizationParams) -> list[RopeParams]:
 def _check(params: PlantParams, count: int, ropes: list[RopeParams]) -> None:
     """Refuse a batch that cannot be simulated."""
     if count < 1:
-        raise ValueError(f"HybridSim of {count} environments: expected 1 or more")
+        raise ValueError(f"HybridSim of {count} environments; expected 1 or more")
     check_laws(params.laws)
     if {r.segments for r in ropes} != {params.rope.segments}:
         raise ValueError(f"ropes of {sorted({r.segments for r in ropes})} segments in one batch of {params.rope.segments}")
@@ -260,7 +260,7 @@ class HybridSim:
         """
         asked = np.zeros(self.count) if release is None else np.asarray(release)
         if asked.shape != (self.count,):
-            raise ValueError(f"release of shape {asked.shape}: expected {(self.count,)}")
+            raise ValueError(f"release of shape {asked.shape}; expected {(self.count,)}")
         st.put(self.types, self, {"command": (command, np.zeros(4))}, self.count)
         self.release.assign(asked.astype(np.int32))
 

@@ -18,14 +18,14 @@ def require_positive(owner: str, **values: float) -> None:
     """Raise ValueError for the first value that is not finite and above zero, naming it."""
     for name, value in values.items():
         if not (math.isfinite(value) and value > 0.0):
-            raise ValueError(f"{owner}.{name} is {value}: expected a finite value above 0")
+            raise ValueError(f"{owner}.{name} is {value}; expected above 0")
 
 
 def require_not_negative(owner: str, **values: float) -> None:
     """Raise ValueError for the first value that is not finite and 0 or more, naming it."""
     for name, value in values.items():
         if not (math.isfinite(value) and value >= 0.0):
-            raise ValueError(f"{owner}.{name} is {value}: expected a finite value of 0 or more")
+            raise ValueError(f"{owner}.{name} is {value}; expected 0 or more")
 
 
 @dataclass(frozen=True)
@@ -235,11 +235,11 @@ class VehicleParams:
         require_not_negative("vehicle.controller", min_thrust=c.min_thrust)
         if not c.min_thrust < c.max_thrust:
             raise ValueError(
-                f"vehicle.controller.min_thrust is {c.min_thrust} N: expected less than max_thrust {c.max_thrust} N"
+                f"vehicle.controller.min_thrust is {c.min_thrust} N; expected less than max_thrust {c.max_thrust} N"
             )
         if not (any(rotors.x) and any(rotors.y)) or abs(sum(rotors.spin)) > 0:
             raise ValueError(
-                f"rotors at x={rotors.x}, y={rotors.y} with spin {rotors.spin}: expected four rotors spread along x and y, "
+                f"rotors at x={rotors.x}, y={rotors.y} with spin {rotors.spin}; expected four rotors spread along x and y, "
                 "two turning each way"
             )
 
@@ -284,7 +284,7 @@ class RopeParams:
     def __post_init__(self) -> None:
         """Raise ValueError for a number of segments outside 1 to 64, or masses and lengths that no rope has."""
         if not 1 <= self.segments <= 64:
-            raise ValueError(f"rope of {self.segments} segments: expected 1 to 64")
+            raise ValueError(f"rope of {self.segments} segments; expected 1 to 64")
         require_positive("rope", length=self.length, rope_mass=self.rope_mass, payload_mass=self.payload_mass)
         require_not_negative("rope", payload_inertia=self.payload_inertia, payload_offset=self.payload_offset)
         require_not_negative("rope", joint_damping=self.joint_damping)
@@ -292,7 +292,7 @@ class RopeParams:
         require_not_negative("rope", swing_damping=self.swing_damping, downwash=self.downwash, compliance=self.compliance)
         for name in ("payload_side", "payload_lift"):
             if not math.isfinite(getattr(self, name)):
-                raise ValueError(f"rope.{name} is {getattr(self, name)}: expected a finite value")
+                raise ValueError(f"rope.{name} is {getattr(self, name)}; expected a finite value")
 
     @property
     def hanging_mass(self) -> float:
@@ -316,7 +316,7 @@ class AirParams:
         """Raise ValueError for wind or a ground effect that is not finite."""
         for name, value in (("wind_w", sum(self.wind_w)), ("ground_effect", self.ground_effect)):
             if not math.isfinite(value):
-                raise ValueError(f"air.{name} is {getattr(self, name)}: expected finite values")
+                raise ValueError(f"air.{name} is {getattr(self, name)}; expected finite values")
 
 
 @dataclass(frozen=True)
@@ -347,11 +347,11 @@ class ReleaseParams:
         require_not_negative("release", lag=self.lag, rope_tail=self.rope_tail)
         for name, value in (("lag_tension", self.lag_tension), ("kick_w", sum(self.kick_w)), ("kick_along", self.kick_along)):
             if not math.isfinite(value):
-                raise ValueError(f"release.{name} is {getattr(self, name)}: expected finite values")
+                raise ValueError(f"release.{name} is {getattr(self, name)}; expected finite values")
         if self.rope_tail > 1.0:
-            raise ValueError(f"release.rope_tail is {self.rope_tail}: expected a share from 0 to 1")
+            raise ValueError(f"release.rope_tail is {self.rope_tail}; expected a share from 0 to 1")
         if self.clearance_samples < 2:
-            raise ValueError(f"release.clearance_samples is {self.clearance_samples}: expected 2 or more")
+            raise ValueError(f"release.clearance_samples is {self.clearance_samples}; expected 2 or more")
 
 
 @dataclass(frozen=True)

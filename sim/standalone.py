@@ -204,12 +204,12 @@ class QuadSim:
                 of other kinds of blocks, or an unphysical parameter.
         """
         if count < 1:
-            raise ValueError(f"QuadSim of {count} environments: expected 1 or more")
+            raise ValueError(f"QuadSim of {count} environments; expected 1 or more")
         if integrator not in INTEGRATORS:
-            raise ValueError(f"integrator {integrator!r}: expected one of {INTEGRATORS}")
+            raise ValueError(f"integrator {integrator!r}; expected one of {INTEGRATORS}")
         for name, value in (("step", step), ("control_period", control_period)):
             if not (math.isfinite(value) and value > 0):
-                raise ValueError(f"{name} {value} s: expected a finite, positive time")
+                raise ValueError(f"{name} {value} s; expected a finite, positive time")
         vehicles = vehicles or [vehicle]
         t = types(precision)
         rows = pack_vehicle(t, vehicles, kinds_of(vehicle))

@@ -246,5 +246,5 @@ def _stamps(path: Path, header: tuple[str, str]) -> list[tuple[str, float]]:
         raise SourceError(f"{path}: cannot be read: {error}; expected lines of {','.join(header)}") from error
     times = [time for _, time in found]
     if not found or [cell.strip() for cell in rows[0]] != list(header) or times != sorted(times):
-        raise SourceError(f"{path}: expected a first line {','.join(header)}, then a picture a line, times [s] ascending")
+        raise SourceError(f"{path}; expected a first line {','.join(header)}, then a picture a line, times [s] ascending")
     return found

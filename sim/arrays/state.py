@@ -96,7 +96,7 @@ def put(t: Types, struct, given: Mapping[str, tuple[np.ndarray | None, np.ndarra
     for name, (value, default) in given.items():
         value = np.broadcast_to(default, (count, *np.shape(default))) if value is None else np.asarray(value, dtype=float)
         if value.shape != (count, *np.shape(default)):
-            raise ValueError(f"{name} of shape {value.shape}: expected {(count, *np.shape(default))}")
+            raise ValueError(f"{name} of shape {value.shape}; expected {(count, *np.shape(default))}")
         getattr(struct, name).assign((np.swapaxes(value, 0, 1) if value.ndim == 3 else value).astype(real))
 
 

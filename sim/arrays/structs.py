@@ -107,7 +107,7 @@ class Types:
 def types(precision: str) -> Types:
     """Types of ``"float32"`` or ``"float64"``; made once, so that kernels of one precision share their structs."""
     if precision not in ("float32", "float64"):
-        raise ValueError(f"precision {precision!r}: expected 'float32' or 'float64'")
+        raise ValueError(f"precision {precision!r}; expected 'float32' or 'float64'")
     return Types(wp.float32 if precision == "float32" else wp.float64)
 
 
@@ -198,7 +198,7 @@ def pack_vehicle(t: Types, vehicles: list[P.VehicleParams], kinds: tuple[str, st
     for row, vehicle in zip(rows, vehicles, strict=True):
         if kinds_of(vehicle) != kinds:
             raise ValueError(
-                f"vehicle of the kinds {kinds_of(vehicle)} in a batch of {kinds}: expected the same blocks"
+                f"vehicle of the kinds {kinds_of(vehicle)} in a batch of {kinds}; expected the same blocks"
             )
         P.require_positive("vehicle.thrust", torque_ratio=vehicle.thrust.torque_ratio)  # the mixer divides by it
         _fill(row, vehicle)
@@ -244,7 +244,7 @@ def ropes_on(vehicles: list[P.VehicleParams], ropes: list[P.RopeParams]) -> list
     if len(set(coms)) > 1:
         if len(ropes) not in (1, len(vehicles)):
             raise ValueError(
-                f"{len(ropes)} ropes on {len(vehicles)} vehicles of different centres of mass: expected one rope, or one each"
+                f"{len(ropes)} ropes on {len(vehicles)} vehicles of different centres of mass; expected one rope, or one each"
             )
         ropes = ropes * len(vehicles) if len(ropes) == 1 else ropes
     else:

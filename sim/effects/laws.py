@@ -224,12 +224,12 @@ def check_laws(laws: tuple[LawParams, ...]) -> None:
     """Raise ValueError for a law that no block can be made of."""
     scalars, vectors = names() if laws else ((), {})
     if len(laws) > MOST_LAWS:
-        raise ValueError(f"{len(laws)} laws: expected at most {MOST_LAWS}")
+        raise ValueError(f"{len(laws)} laws; expected at most {MOST_LAWS}")
     for law in laws:
         unknown = [name for name in law.factors if name not in scalars]
         if law.block not in BLOCKS or unknown or law.vector not in vectors[law.block] or len(law.factors) > 2:
             raise ValueError(
-                f"law {law}: expected a block of {BLOCKS}, up to two factors of {scalars}, and a vector of "
+                f"law {law}; expected a block of {BLOCKS}, up to two factors of {scalars}, and a vector of "
                 f"{vectors.get(law.block, BLOCKS)}"
             )
 

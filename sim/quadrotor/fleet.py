@@ -61,10 +61,10 @@ class FleetParams:
         require_positive("fleet", rope_length=self.rope_length, total_mass=self.total_mass)
         require_positive("fleet", least_thrust=self.least_thrust, yaw_loop=1.0 if self.yaw_loop is None else self.yaw_loop)
         if self.count < 0 or self.first < 0 or self.seed < 0:
-            raise ValueError(f"fleet.count is {self.count}, first {self.first}, seed {self.seed}: expected 0 or more of each")
+            raise ValueError(f"fleet.count is {self.count}, first {self.first}, seed {self.seed}; expected 0 or more of each")
         for name, (low, high) in self.ranges.items():
             if not 0.0 < low <= high < math.inf:
-                raise ValueError(f"fleet.{name} is {low} to {high}: expected an ascending range above 0")
+                raise ValueError(f"fleet.{name} is {low} to {high}; expected an ascending range above 0")
 
     @property
     def ranges(self) -> dict[str, Range]:

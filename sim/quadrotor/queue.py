@@ -14,7 +14,7 @@ import warp as wp
 def queue_depth(delay: float, period: float) -> int:
     """Slots that a delay needs. Raises ValueError for a negative or non-finite one."""
     if not (math.isfinite(delay) and delay >= 0):
-        raise ValueError(f"command delay {delay} s: expected a finite value of 0 or more")
+        raise ValueError(f"command delay {delay} s; expected 0 or more")
     return int(math.floor(delay / period + 1e-6)) + 2
 
 

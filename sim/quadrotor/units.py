@@ -86,7 +86,7 @@ def in_units(value: Value, units: Units, dimensions: Mapping[str, Mapping[Dimens
         ValueError: a field whose dimension is not told, or a plant with laws, whose coefficients have none of their own.
     """
     if isinstance(value, PlantParams) and value.laws:
-        raise ValueError(f"a plant with {len(value.laws)} laws in other units: expected none, their coefficients have no dimension")
+        raise ValueError(f"a plant with {len(value.laws)} laws in other units; expected none, their coefficients have no dimension")
     own = dimensions.get(type(value).__name__, {})
     known = {name: dimension for dimension, names in own.items() for name in names.split()}
 

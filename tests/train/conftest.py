@@ -24,17 +24,17 @@ def signalled(monkeypatch):
     """Function that runs a command's training of four iterations, sends a signal in the second, and resumes it."""
 
     def run(algorithm, words, number):
-        step = algorithm.step
+        learn = algorithm.learn
 
         def interrupted(self, done):
-            figures = step(self, done)
+            figures = learn(self, done)
             if done == 1 / 4:
                 os.kill(os.getpid(), number)
             return figures
 
-        monkeypatch.setattr(algorithm, "step", interrupted)
+        monkeypatch.setattr(algorithm, "learn", interrupted)
         assert cli.main(words) == 130
-        monkeypatch.setattr(algorithm, "step", step)
+        monkeypatch.setattr(algorithm, "learn", learn)
         assert cli.main([*words, "--resume"]) == 0
 
     return run

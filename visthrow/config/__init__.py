@@ -231,7 +231,7 @@ def _override(schema: type, tree: Table, override: str) -> None:
     path, equals, text = override.partition("=")
     keys = [key.strip() for key in path.split(".")]
     if not equals or not all(keys):
-        raise ConfigError(f"{source}: expected key.path=value, for instance vehicle.body.mass=0.25")
+        raise ConfigError(f"{source}; expected key.path=value, for instance vehicle.body.mass=0.25")
     current: Any = schema
     for depth, key in enumerate(keys):
         here = ".".join(keys[:depth])

@@ -55,7 +55,7 @@ class Estimator:
             if not bool(torch.isfinite(getattr(self, field.name)).all()):
                 raise PolicyError(f"estimator: {field.name} holds numbers that are not finite")
         if not bool(((self.kept >= 0) & (self.kept <= width)).all()) or not bool((self.std > 0.0).all()):
-            raise PolicyError(f"estimator: expected entries of 0 to {width} in kept and numbers above 0 in std")
+            raise PolicyError(f"estimator; expected entries of 0 to {width} in kept and numbers above 0 in std")
 
     @property
     def obs_dim(self) -> int:

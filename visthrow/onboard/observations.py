@@ -83,7 +83,7 @@ def layout_of(params: Any) -> Layout:
         ValueError: an unknown layout or a negative history.
     """
     if params.history < 0:
-        raise ValueError(f"observation history {params.history}: expected 0 or more")
+        raise ValueError(f"observation history {params.history}; expected 0 or more")
     motion = 2 if getattr(params, "goal_velocity", False) else 0  # contracts hold what differs from the default
     response, setup = getattr(params, "response", 0), SETUPS[getattr(params, "setup", "none")]
     if params.layout == "state":
@@ -91,7 +91,7 @@ def layout_of(params: Any) -> Layout:
     if params.layout == "vision":
         bits, places = (KEYPOINTS if params.validity else 0), (LOCATED if getattr(params, "located", False) else 0)
         return Layout("vision", 8, 8, params.history, bits, motion, places, response, setup)
-    raise ValueError(f"observation layout {params.layout!r}: expected 'state' or 'vision'")
+    raise ValueError(f"observation layout {params.layout!r}; expected 'state' or 'vision'")
 
 
 def resampled(history: Tensor, newest: Tensor, ages: list[float], period: float) -> Tensor:

@@ -155,7 +155,7 @@ def load(path: str | Path) -> list[Result]:
         value = json.loads(Path(path).read_text(encoding="utf-8"))
         return [_from_json(item) for item in value.get("results", [value])]
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise StorageError(f"{path}: expected throws as visthrow writes them; got {type(error).__name__}: {error}") from error
+        raise StorageError(f"{path}; expected throws as visthrow writes them; got {type(error).__name__}: {error}") from error
 
 
 def load_all(places: Iterable[str | Path]) -> dict[str, Result]:

@@ -7,7 +7,6 @@ through the whole throw. Throws that the exact observation flies would teach it 
 """
 
 import math
-import time
 from types import SimpleNamespace
 
 import torch
@@ -78,18 +77,6 @@ class Distillation:
     """
 
     def __init__(self, experiment: Experiment, device: str, seed: int, ranks: Ranks):
-        """Load the state policy and start the network.
-
-        Args:
-            experiment: the run's configuration; the environments of ``ppo`` are the throws of an iteration.
-            device: "cpu" or "cuda:0".
-            seed: of the environment; torch's own generators are the caller's to seed.
-            ranks: this process among those of the training.
-
-        Raises:
-            ConfigError: Moving goals, another layout than vision, or a teacher that is no state policy for still goals.
-            MismatchError: The state policy acts otherwise than this task.
-        """
         self.cfg, self.p = experiment, experiment.distillation
         seen = experiment.task.observation
         if experiment.task.target.moves or seen.layout != "vision":
@@ -142,22 +129,18 @@ class Distillation:
             observations, _, done, _ = env.step(policy.decide(estimate))
             seen, alive = observations["actor"], alive * (done == 0)
 
-    def step(self, done: float) -> dict[str, float]:
-        """One rollout and the gradient steps on it at this share of the training; returns its figures."""
-        p, start = self.p, time.perf_counter()
+    def collect(self, done: float) -> None:
         self.env.clear_totals()
         self.rollout()
-        if self.env.device.startswith("cuda"):
-            torch.cuda.synchronize()
-        middle = time.perf_counter()
+
+    def learn(self, done: float) -> dict[str, float]:
+        p = self.p
         rate = p.final_rate + 0.5 * (p.learning_rate - p.final_rate) * (1.0 + math.cos(math.pi * done))
         for group in self.optimizer.param_groups:
             group["lr"] = rate
         if done * self.iterations < WATCHED:
             self.network.normalizer.update(self._obs.flatten(0, 1))
-        figures = self._descend()
-        times = {"rollout_s": middle - start, "learning_s": time.perf_counter() - middle}
-        return figures | self.env.episode_means() | times | {"learning_rate": rate}
+        return self._descend() | self.env.episode_means() | {"learning_rate": rate}
 
     def _descend(self) -> dict[str, float]:
         """Fit the last rollout, each throw once an epoch."""
@@ -187,13 +170,11 @@ class Distillation:
             getattr(self._flying, name).copy_(value)
 
     def export(self, contract: dict, made_by: dict) -> Policy:
-        """The policy as a file's content."""
         t = self.teacher.to("cpu")
         estimator = Estimator(**{name: value.detach().cpu().clone() for name, value in vars(self.average.module.frozen()).items()})
         return Policy(t.weights, t.biases, t.activation, contract, made_by, t.mean, t.std, t.eps, estimator)
 
     def take_up(self, policy: Policy) -> None:
-        """Start from a policy with an estimator of the same shape."""
         e, n = policy.estimator, self.network
         if e is None or e.input_weight.shape != n.gru.weight_ih_l0.shape:
             raise ConfigError("--from: the policy has no estimator of this configuration's shape to start from")
@@ -206,11 +187,9 @@ class Distillation:
         self._refresh()
 
     def state_dict(self) -> dict:
-        """All that the next iteration depends on, besides torch's generators."""
         return {name: getattr(self, name).state_dict() for name in ("network", "average", "optimizer", "env")}
 
     def load_state_dict(self, saved: dict, own_throws: bool = True) -> None:
-        """Take up a state of :meth:`state_dict`; its environment too where ``own_throws`` is set."""
         self.network.load_state_dict(saved["network"])
         self.average.load_state_dict(saved["average"])
         self.optimizer.load_state_dict(saved["optimizer"])

@@ -500,5 +500,5 @@ class ThrowEnv(VecEnv):
         for name, target in self._tensors().items():
             if name not in saved or saved[name].shape != target.shape:
                 have = tuple(saved[name].shape) if name in saved else "nothing"
-                raise ValueError(f"environment state {name!r}: expected shape {tuple(target.shape)}, got {have}")
+                raise ValueError(f"environment state {name!r}; expected shape {tuple(target.shape)}, got {have}")
             target.copy_(saved[name])

@@ -93,7 +93,7 @@ def _check(args: Options) -> None:
     for name in ("iterations", "minutes", "until", "evaluate_every", "checkpoint_every"):
         value = getattr(args, name)
         if value is not None and not value > 0:
-            raise TrainError(f"--{name.replace('_', '-')} {value}: expected a number above 0")
+            raise TrainError(f"--{name.replace('_', '-')} {value}; expected a number above 0")
     if args.resume and args.start:
         raise TrainError("--resume goes on with its own policy; --from starts a new run")
     if args.resume and not args.out and not args.config:

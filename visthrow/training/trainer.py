@@ -2,6 +2,7 @@
 
 import dataclasses
 import io
+import time
 from pathlib import Path
 from typing import Protocol
 
@@ -44,15 +45,28 @@ class Algorithm(Protocol):
     iterations: int
     samples: int
 
-    def step(self, done: float) -> dict[str, float]:
-        """One iteration.
+    def __init__(self, experiment: Experiment, device: str, seed: int, ranks: Ranks):
+        """Build environment and networks.
 
         Args:
-            done: share of the whole training that lies behind, 0 to 1, for schedules.
+            experiment: the run's configuration.
+            device: "cpu" or "cuda:0".
+            seed: of the environment; torch's own generators are the caller's to seed.
+            ranks: this process among those of the training.
+
+        Raises:
+            ConfigError: what this algorithm cannot train.
+        """
+
+    def collect(self, done: float) -> None:
+        """Fly one batch; ``done``: share of the whole training that lies behind, 0 to 1, for schedules."""
+
+    def learn(self, done: float) -> dict[str, float]:
+        """Learn from the last batch.
 
         Returns:
-            Figures for the log, :data:`visthrow.training.progress.COLUMNS` of those that the algorithm has; always
-            ``rollout_s`` and ``learning_s`` [s] and the finished episodes' :meth:`ThrowEnv.episode_means`.
+            Figures for the log, :data:`visthrow.training.progress.COLUMNS` of those that the algorithm has; always the finished
+            episodes' :meth:`ThrowEnv.episode_means`.
         """
 
     def export(self, contract: dict, made_by: dict) -> Policy:
@@ -129,12 +143,18 @@ class Trainer:
         self.seconds = {"rollout": 0.0, "learning": 0.0}
 
     def step(self) -> dict[str, float]:
-        """One iteration; returns losses and the finished episodes' means."""
-        figures = self.algorithm.step(min(self.iteration / self.algorithm.iterations, 1.0))
+        """One iteration; returns losses, the finished episodes' means, ``rollout_s`` and ``learning_s`` [s]."""
+        start, done = time.perf_counter(), min(self.iteration / self.algorithm.iterations, 1.0)
+        self.algorithm.collect(done)
+        if self.device.startswith("cuda"):
+            torch.cuda.synchronize()
+        middle = time.perf_counter()
+        figures = self.algorithm.learn(done)
+        times = {"rollout": middle - start, "learning": time.perf_counter() - middle}
         self.iteration += 1
-        for part in self.seconds:
-            self.seconds[part] += figures[f"{part}_s"]
-        return figures | {"iteration": self.iteration}
+        for part, spent in times.items():
+            self.seconds[part] += spent
+        return figures | {f"{part}_s": spent for part, spent in times.items()} | {"iteration": self.iteration}
 
     def take_up(self, policy: Policy) -> None:
         """Start from a policy that :func:`fitted` found to fit."""

@@ -42,8 +42,8 @@ VEHICLE = [
     ("vehicle.queue.delay", float("inf"), "command delay inf"),
 ]
 PLANT = [
-    ("rope.segments", 0, "0 segments: expected 1 to 64"),
-    ("rope.segments", 65, "65 segments: expected 1 to 64"),
+    ("rope.segments", 0, "0 segments; expected 1 to 64"),
+    ("rope.segments", 65, "65 segments; expected 1 to 64"),
     ("rope.length", -0.3, "rope.length is -0.3"),
     ("rope.payload_mass", 0.0, "rope.payload_mass is 0.0"),
     ("rope.joint_damping", -1e-5, "rope.joint_damping is -1e-05"),
@@ -52,7 +52,7 @@ PLANT = [
     ("sim.substep", 0.0, "sim.substep is 0.0"),
     ("sim.control_period", -0.02, "sim.control_period is -0.02"),
     ("sim.gamma", NAN, "sim.gamma is nan"),
-    ("sim.precision", "float16", "'float16': expected 'float32' or 'float64'"),
+    ("sim.precision", "float16", "'float16'; expected 'float32' or 'float64'"),
 ]
 
 
@@ -71,11 +71,11 @@ def test_bad_vehicles_are_refused_alone_too(path, value, message):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"count": 0}, "0 environments: expected 1 or more"),
-        ({"integrator": "rk5"}, r"'rk5': expected one of \('euler', 'rk4'\)"),
+        ({"count": 0}, "0 environments; expected 1 or more"),
+        ({"integrator": "rk5"}, r"'rk5'; expected one of \('euler', 'rk4'\)"),
         ({"step": 0.0}, "step 0.0 s"),
         ({"control_period": NAN}, "control_period nan s"),
-        ({"precision": "half"}, "'half': expected 'float32' or 'float64'"),
+        ({"precision": "half"}, "'half'; expected 'float32' or 'float64'"),
     ],
 )
 def test_bad_options_of_the_quadrotor(options, message):
@@ -84,7 +84,7 @@ def test_bad_options_of_the_quadrotor(options, message):
 
 
 def test_a_batch_of_no_environments():
-    with pytest.raises(ValueError, match="0 environments: expected 1 or more"):
+    with pytest.raises(ValueError, match="0 environments; expected 1 or more"):
         HybridSim(paper_plant(), 0)
 
 
@@ -114,8 +114,8 @@ def test_no_tethers():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"pos_w": np.zeros((2, 3))}, r"pos_w of shape \(2, 3\): expected \(3, 3\)"),
-        ({"pos_w": np.zeros((3, 3)), "quat_wb": np.zeros((3, 3))}, r"quat_wb of shape \(3, 3\): expected \(3, 4\)"),
+        ({"pos_w": np.zeros((2, 3))}, r"pos_w of shape \(2, 3\); expected \(3, 3\)"),
+        ({"pos_w": np.zeros((3, 3)), "quat_wb": np.zeros((3, 3))}, r"quat_wb of shape \(3, 3\); expected \(3, 4\)"),
         ({"pos_w": np.zeros((3, 3)), "rate_b": np.zeros(3)}, r"rate_b of shape \(3,\)"),
     ],
 )
@@ -126,7 +126,7 @@ def test_shapes_of_poses(arguments, message):
 
 
 def test_shape_of_the_cable():
-    with pytest.raises(ValueError, match=r"cable_dir_w of shape \(3, 14, 3\): expected \(3, 15, 3\)"):
+    with pytest.raises(ValueError, match=r"cable_dir_w of shape \(3, 14, 3\); expected \(3, 15, 3\)"):
         HybridSim(paper_plant(), 3).place(np.zeros((3, 3)), cable_dir_w=np.zeros((3, 14, 3)))
 
 
@@ -134,11 +134,11 @@ def test_shapes_of_commands():
     """Twelve numbers are no command of three environments just because they fit."""
     sim, quad = HybridSim(paper_plant(), 3), QuadSim(paper_plant().vehicle, 3)
     for target in (sim, quad):
-        with pytest.raises(ValueError, match=r"command of shape \(4, 3\): expected \(3, 4\)"):
+        with pytest.raises(ValueError, match=r"command of shape \(4, 3\); expected \(3, 4\)"):
             target.set_command(np.zeros((4, 3)))
-    with pytest.raises(ValueError, match=r"release of shape \(2,\): expected \(3,\)"):
+    with pytest.raises(ValueError, match=r"release of shape \(2,\); expected \(3,\)"):
         sim.set_command(np.zeros((3, 4)), np.zeros(2))
-    with pytest.raises(ValueError, match=r"force_w of shape \(3,\): expected \(3, 3\)"):
+    with pytest.raises(ValueError, match=r"force_w of shape \(3,\); expected \(3, 3\)"):
         quad.set_wrench(np.zeros(3), np.zeros((3, 3)))
 
 

@@ -70,7 +70,7 @@ def test_packed_record_does_not_depend_on_the_order(tmp_path):
 def test_a_file_that_is_no_record_is_named(tmp_path, text):
     path = tmp_path / "x.json"
     path.write_text(text)
-    with pytest.raises(StorageError, match=r"x\.json: expected throws"):
+    with pytest.raises(StorageError, match=r"x\.json; expected throws"):
         results.load(path)
 
 

@@ -98,7 +98,7 @@ def advance(fo, true, k, x, response, commands):
 def reference(fo, by):
     """Derivatives by the actions of ``sum_k <by[k], state k>`` through the closed loop, by torch's autograd."""
     true, b, layout = SimpleNamespace(**fo.flights.x), fo, fo.env.layout
-    extra = torch.zeros_like(b.action, requires_grad=True)
+    extra = torch.zeros_like(b.layers.action, requires_grad=True)
     rots, late = ob.rotation_from_quat(true.quat), (b.env.pose_age / fo.cfg.sim.control_period)[:, None]
     x = {name: getattr(true, name)[0].clone() for name in ("pos", "vel", "load_pos", "load_vel", "response")} | {"rot": rots[0]}
     poses, responses, commands, cost = [], [], [], 0.0
@@ -113,8 +113,8 @@ def reference(fo, by):
         obs, history = ob.observe(layout, frame, None, previous, torch.ones(24), history, fresh)
         obs = at(b.flights.obs[k], obs)
         action = decided(fo, obs) + extra[k]
-        previous = at(act.clip_action(b.action[k]), action)
-        throttle = (0.5 * (b.action[k, :, :1] + 1.0)).clamp(0.05, 1.0)
+        previous = at(act.clip_action(b.layers.action[k]), action)
+        throttle = (0.5 * (b.layers.action[k, :, :1] + 1.0)).clamp(0.05, 1.0)
         scale = torch.cat([fo.cfg.task.action.max_thrust * throttle, fo.env._max_rate.expand(24, -1)], -1)
         commands.append(action[:, :4] * scale)
         x = advance(fo, true, k, x, responses, commands)
@@ -127,8 +127,7 @@ def backward(fo, by):
     """The same by the kernel."""
     for name, tensor in fo.adjoint.items():
         tensor.copy_(by[name]) if name in by else tensor.zero_()
-    for tensor in (fo.by_clipped, fo.layers.by_action):
-        tensor.zero_()
+    fo.layers.by_action.zero_()
     fo.layers.prepare(fo.flights.last)
     fo.backward()
     return fo.layers.by_action.clone()
@@ -139,7 +138,7 @@ def test_backward_pass_equals_autograd_of_the_same_surrogate():
     fo = first_order("state")
     fo.rollout()
     assert (fo.flights.steps == fo.p.horizon).all()
-    assert fo.action.abs().max() < 1.0
+    assert fo.layers.action.abs().max() < 1.0
     torch.manual_seed(0)
     by = {n: torch.randn_like(fo.flights.x[n]) for n in ("pos", "vel", "load_pos", "load_vel", "response")}
     found, expected = backward(fo, by), reference(fo, by)
@@ -200,7 +199,7 @@ def test_slopes_are_those_of_the_simulator(vehicle, monkeypatch):
     def fly(actions):
         fo.env.load_state_dict(start)
         left = iter(actions)
-        monkeypatch.setattr(fo.layers, "forward", lambda k, seen: fo.action[k].copy_(next(left)))
+        monkeypatch.setattr(fo.layers, "forward", lambda k, seen: fo.layers.action[k].copy_(next(left)))
         fo.rollout()
         return fo.flights.landing[-1].clone()
 

@@ -208,7 +208,7 @@ def test_the_shipped_policy_throws_with_a_named_vehicle_through_the_pilot(name, 
 
 
 def test_ranges_that_nothing_can_be_drawn_from_are_refused():
-    with pytest.raises(config.ConfigError, match=r"fleet\.mass is 2\.0 to 0\.03: expected an ascending range above 0"):
+    with pytest.raises(config.ConfigError, match=r"fleet\.mass is 2\.0 to 0\.03; expected an ascending range above 0"):
         experiment("fleet.mass=[2.0, 0.03]")
     with pytest.raises(config.ConfigError, match=r"fleet\.count is -1"):
         experiment("fleet.count=-1")

@@ -68,5 +68,5 @@ def parsed(items: Sequence[str]) -> dict[str, float]:
         try:
             out[name.strip()] = float(sd)
         except ValueError as error:
-            raise DiagnoseError(f"--measured {item}: expected NAME=DEVIATION, such as mass_quad=0.0003") from error
+            raise DiagnoseError(f"--measured {item}; expected NAME=DEVIATION, such as mass_quad=0.0003") from error
     return out

@@ -134,4 +134,4 @@ def numbers(text: str) -> tuple[int, ...]:
     try:
         return tuple(int(part) for part in text.split(",") if part.strip())
     except ValueError as error:
-        raise DiagnoseError(f"--without {text}: expected numbers of flights between commas, such as 0,3") from error
+        raise DiagnoseError(f"--without {text}; expected numbers of flights between commas, such as 0,3") from error

@@ -84,7 +84,7 @@ def record_path(name: str) -> Path:
         StorageError: a name that is no plain word.
     """
     if not _NAME.fullmatch(name):
-        raise StorageError(f"record name '{name}': expected lower-case letters, digits, '-' and '_'")
+        raise StorageError(f"record name '{name}'; expected lower-case letters, digits, '-' and '_'")
     return FOLDER / f"{name}.json"
 
 

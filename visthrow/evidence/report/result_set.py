@@ -118,7 +118,7 @@ def _runs(path: Path) -> list[dict[str, Any]]:
     try:
         return json.loads(path.read_text(encoding="utf-8"))["runs"]
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise StorageError(f"{path}: expected a record of training runs; got {type(error).__name__}: {error}") from error
+        raise StorageError(f"{path}; expected a record of training runs; got {type(error).__name__}: {error}") from error
 
 
 def errors(results: Iterable[Result]) -> list[np.ndarray]:

@@ -79,7 +79,7 @@ def _read(path: Path) -> list[dict[str, Any]]:
     try:
         return json.loads(path.read_text(encoding="utf-8"))["runs"]
     except (OSError, ValueError, KeyError) as error:
-        raise StorageError(f"{path}: expected a record of trainings; got {type(error).__name__}: {error}") from error
+        raise StorageError(f"{path}; expected a record of trainings; got {type(error).__name__}: {error}") from error
 
 
 def _progress(source: Source, out: Path) -> list[dict[str, str]]:

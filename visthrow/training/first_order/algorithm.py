@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-import time
 from types import SimpleNamespace
 
 import torch
@@ -18,54 +17,30 @@ from visthrow.onboard.policy import Policy
 from visthrow.task import Experiment
 from visthrow.training import rewards
 from visthrow.training.env import ThrowEnv
-from visthrow.training.first_order.backward import Setting, build_backward
-from visthrow.training.first_order.flights import Flights, course
-from visthrow.training.first_order.layers import Layers
-from visthrow.training.first_order.surrogate import fit
+from visthrow.training.first_order.backward import Layers, Setting, backward
+from visthrow.training.first_order.surrogate import Course, Flights, course, fit
 from visthrow.training.ppo.network import Network
 from visthrow.training.ranks import Ranks
 
-BARRIER = 600.0
-"""Barriers cost this times the square of how far a state is within their margins."""
-MARGINS = {"altitude": 0.15, "ground": 0.1, "above": 0.08, "upright": 0.15}
-"""Reach of the barriers: of altitude, payload over ground, payload below vehicle [m], cosine of the tilt."""
+ALTITUDE, GROUND, ABOVE, UPRIGHT = 0.15, 0.1, 0.08, 0.15
+"""Reach of the barriers: of altitude and distance, payload over ground, payload below vehicle [m], cosine of the tilt."""
+BARRIER = 600.0  # cost of the square of how far a state is within it
 ROUND = 0.02
 """Landing errors are smooth below this [m]: the slope of a distance turns round at the goal, which is noise where throws are good."""
-OUTLIER = 4.0
-"""A flight's derivatives are shortened to this many times the median flight's."""
-NODES = (-1, 0, 1, 2)
-"""Steps about a separation that a cubic goes through."""
-STATES = ("pos", "vel", "load_pos", "load_vel", "response")
+OUTLIER = 4.0  # a flight's derivatives are shortened to this many times the median flight's
+NODES = (-1, 0, 1, 2)  # steps about a separation that a cubic goes through
 
 
 class FirstOrder:
-    """First-order training; see :class:`visthrow.training.trainer.Algorithm`.
-
-    Attributes:
-        surrogate: fitted to the environment's plants at the start.
-        network: of the policy, with its normaliser.
-        rollout: flies one batch without release.
-    """
+    """First-order training by a surrogate that is fitted to the environment's plants; :class:`visthrow.training.trainer.Algorithm`."""
 
     def __init__(self, experiment: Experiment, device: str, seed: int, ranks: Ranks):
-        """Fit the surrogate and start the network near hover.
-
-        Args:
-            experiment: the run's configuration; the environments of ``ppo`` are the throws of a gradient, its network the policy's.
-            device: "cpu" or "cuda:0".
-            seed: of the environment; torch's own generators are the caller's to seed.
-            ranks: this process among those of the training.
-
-        Raises:
-            ConfigError: Goals that move, a fleet, a vision layout, or a horizon too short for a release.
-        """
         self.cfg, self.p, self._ranks = experiment, experiment.first_order, ranks
         seen, p, on_gpu = experiment.task.observation, experiment.ppo, device.startswith("cuda")
-        if seen.layout != "state" or seen.oldest > experiment.sim.control_period:
-            expected = 'observation.layout = "state" and a latency of one period at most'
+        late, others = seen.oldest > experiment.sim.control_period, experiment.task.target.moves or experiment.fleet is not None
+        if seen.layout != "state" or late or others:
+            expected = 'observation.layout = "state", a latency of one period at most, one vehicle and goals that stand still'
             raise ConfigError(f'algorithm = "first_order" takes {expected}; "distillation" makes a vision policy of its policy')
-        if experiment.task.target.moves or experiment.fleet is not None:
-            raise ConfigError('algorithm = "first_order" trains for one vehicle and goals that stand still; "ppo" for the others too')
         lag = experiment.release.lag / experiment.sim.control_period
         self.lag, rest = int(lag + 1e-6), max(lag - int(lag + 1e-6), 0.0)
         if self.p.horizon < self.lag + NODES[-1]:
@@ -74,18 +49,16 @@ class FirstOrder:
         blind = dataclasses.replace(experiment, ppo=dataclasses.replace(p, privileged=()))  # there is no critic
         self.env = env = ThrowEnv(blind, device, seed)
         self.samples = env.num_envs * self.p.horizon * ranks.world
-        groups = {"actor": ["actor"]}
-        self.network = Network(env.get_observations(), groups, "actor", act.ACTIONS, p.hidden, p.activation, p.normalize).to(device)
+        shape = {"hidden_dims": p.hidden, "activation": p.activation, "obs_normalization": p.normalize}
+        self.network = Network(env.get_observations(), {"actor": ["actor"]}, "actor", act.ACTIONS, **shape).to(device)
         with torch.no_grad():  # random commands give every observation a spread to start from
-            self.surrogate = fit(env, self._watch)
-            last = self.network.mlp[-1]  # hover with the latch at rest, whatever is seen
-            last.weight.mul_(0.1)
+            self.surrogate, last = fit(env, self.network), self.network.mlp[-1]
+            last.weight.mul_(0.1)  # hover with the latch at rest, whatever is seen
             last.bias.copy_(env._start_action)
             last.bias[act.COMMANDS] = self.p.initial_release
         ranks.share(self.network)
         self.flights, (self.adjoint, adjoint) = Flights(env, self.p.horizon), course(self.p.horizon, env.num_envs, device)
         self.layers = Layers(self.network, self.flights.obs)
-        self.action, self.by_clipped = self.layers.action, torch.zeros_like(self.layers.action)
         self._launches, self._adapting = self._recorded(adjoint), False
         self._schedule(0.0)
         rate = torch.tensor(self.p.learning_rate, device=device) if on_gpu else self.p.learning_rate
@@ -107,16 +80,14 @@ class FirstOrder:
     @torch.no_grad()
     def _fly(self) -> None:
         """Fly one batch without release, on a CPU each flight until nothing that follows has a derivative: its latch asked twice."""
-        stops, wait = self._latched == 1.0 and self.env.device == "cpu", self.lag + NODES[-1] + 1
-        asked = torch.zeros_like(self.flights.steps)
+        stops, asked = self._latched == 1.0 and self.env.device == "cpu", torch.zeros_like(self.flights.steps)
 
         def decide(k: int, seen: Tensor) -> Tensor | None:
-            if stops and k - wait >= self._first:
-                asked.add_(self.action[k - wait, :, act.COMMANDS] > self.cfg.release.threshold)
+            before = k - (self.lag + NODES[-1] + 1)  # all that a release there depends on is known
+            if stops and before >= self._first:
+                asked.add_(self.layers.action[before, :, act.COMMANDS] > self.cfg.release.threshold)
                 torch.lt(asked, 2, out=self.flights.flying)
-                if not self.flights.flying.any():
-                    return None
-            return self.layers.forward(k, seen)
+            return self.layers.forward(k, seen) if not stops or self.flights.flying.any() else None
 
         self.flights.fly(decide)
 
@@ -133,8 +104,7 @@ class FirstOrder:
         path[..., 2] -= 0.5 * GRAVITY * share**2
         clearance = (path.square().sum(-1) + 1e-12).sqrt().amin(-1)
         rows = [(torch.arange(count, device=fall.device) + (self.lag + node)).clamp(min=0) for node in NODES]
-        values = (sum(w * value[i] for w, i in zip(self._shares, rows)) for value in (landing, fall, clearance))
-        landing, fall, clearance = values
+        landing, fall, clearance = (sum(w * v[i] for w, i in zip(self._shares, rows)) for v in (landing, fall, clearance))
         error = ((landing - self.env.views.goal_w[:, :2]).square().sum(-1) + ROUND**2).sqrt()
         reward = rewards.landing(p, error) + rewards.time_of_flight(p, fall)
         return reward + rewards.proximity(p, clearance, release.clearance_margin), error, fall
@@ -142,22 +112,16 @@ class FirstOrder:
     def _carrying(self, x: SimpleNamespace) -> Tensor:
         """Rewards of each step while carrying, barriers included, shape (T, E)."""
         task, env = self.cfg.task, self.env
-        p, bounds = task.reward, task.bounds
-        rate, height, load = x.response[1:, :, 1:], x.pos[1:, :, 2], x.load_pos[1:, :, 2]
-        before = torch.cat([env._start_action.expand_as(x.clipped[:1]), x.clipped[:-1]])
-        now, before = x.clipped.flatten(0, 1), before.flatten(0, 1)
-        on_action = rewards.command(p, now, env._rate_weights) + rewards.change(p, now, before, env._change_weights)
-        inside = [
-            height - bounds.altitude[0] - MARGINS["altitude"],
-            bounds.altitude[1] - MARGINS["altitude"] - height,
-            load - self.cfg.release.landing_height - MARGINS["ground"],
-            height - load - MARGINS["above"],
-            x.upright[1:] - math.cos(math.radians(bounds.tilt_deg)) - MARGINS["upright"],
-            bounds.horizontal - MARGINS["altitude"] - x.pos[1:, :, :2].norm(dim=-1),
-        ]
+        p, bounds, rate, height, load = task.reward, task.bounds, x.response[1:, :, 1:], x.pos[1:, :, 2], x.load_pos[1:, :, 2]
+        now = act.clip_action(x.action)
+        now, before = (a.flatten(0, 1) for a in (now, torch.cat([env._start_action.expand_as(now[:1]), now[:-1]])))
+        acting = rewards.command(p, now, env._rate_weights) + rewards.change(p, now, before, env._change_weights)
+        inside = [height - bounds.altitude[0] - ALTITUDE, bounds.altitude[1] - ALTITUDE - height, height - load - ABOVE,
+                  load - self.cfg.release.landing_height - GROUND, bounds.horizontal - ALTITUDE - x.pos[1:, :, :2].norm(dim=-1),
+                  x.tilt[1:, :, 2] - math.cos(math.radians(bounds.tilt_deg)) - UPRIGHT]  # fmt: skip
         barrier = BARRIER * sum(gap.clamp(max=0.0).square() for gap in inside)
         moving = rewards.kinetic(p, x.vel[1:], rate, x.load_vel[1:])
-        return moving + on_action.view_as(moving) + rewards.carry_time(p, self.cfg.sim.control_period) - barrier
+        return moving + acting.view_as(moving) + rewards.carry_time(p, self.cfg.sim.control_period) - barrier
 
     def _cost(self, x: SimpleNamespace) -> tuple[Tensor, dict[str, Tensor]]:
         """Mean cost of the flights and figures of what is released."""
@@ -165,58 +129,48 @@ class FirstOrder:
         k, K = torch.arange(T, device=steps.device)[:, None], T - lag - 1  # the cubic looks a step past the separation
         reward, error, fall = self._rewards_at_release(x, K)
         asked = x.action[:K, :, act.COMMANDS] - self.cfg.release.threshold
-        hazard = torch.sigmoid(asked / self._width)
-        hazard = hazard + self._latched * ((asked > 0.0).float() - hazard).detach()  # the slope stays that of the smooth one
-        hazard = hazard * (k[:K] >= self._first)
-        ended, cut = k[:K] > steps, k[:K] + lag + 2 > steps
-        hazard = torch.where(ended, 1.0, hazard)
+        smooth, cut = torch.sigmoid(asked / self._width), k[:K] + lag + 2 > steps
+        hazard = smooth + self._latched * ((asked > 0.0).float() - smooth).detach()  # the slope stays that of the smooth one
+        hazard = torch.where(k[:K] > steps, 1.0, hazard * (k[:K] >= self._first))
         reward = torch.where(cut, -p.termination, reward)
         survival = torch.cat([torch.ones_like(hazard[:1]), (1.0 - hazard).cumprod(0)])
         chance = survival[:-1] * hazard
         carried = survival[(k[:, 0] - lag).clamp(0, K)] * (k < steps)
         past = (x.action.abs() - 1.0).clamp(min=0.0).square().sum(-1) * carried.detach()
         gain = (chance * reward).sum(0) + (carried * self._carrying(x)).sum(0) - p.termination * survival[-1]
-        done = (chance * ~cut).detach()
-        total = done.sum().clamp(min=1e-6)
-        error = (error.square() - ROUND**2).clamp(min=0.0).sqrt()
-        duration = (k[:K] + 1) * self.cfg.sim.control_period + self.cfg.release.lag + fall
-        figures = {"released": done.sum() / done.shape[1], "landing_error": (done * error).sum() / total,
-                   "duration": (done * duration).sum() / total}  # fmt: skip
+        done, error = (chance * ~cut).detach(), (error.square() - ROUND**2).clamp(min=0.0).sqrt()
+        duration, share = (k[:K] + 1) * self.cfg.sim.control_period + self.cfg.release.lag + fall, done / done.sum().clamp(min=1e-6)
+        figures = {"landing_error": (share * error).sum(), "duration": (share * duration).sum(), "released": done.sum(0).mean()}
         return (self.p.saturation * past.sum(0) - gain).mean() * p.scale, figures
 
     def derivatives(self) -> dict[str, Tensor]:
         """Derivatives of the cost of the last rollout by the actions, as the layers hold them; returns figures."""
-        f, T = self.flights.x, self.flights.last
+        f, T, states = self.flights.x, self.flights.last, ("pos", "vel", "load_pos", "load_vel", "response")
         tilt = ob.rotation_from_quat(f["quat"][: T + 1])[..., 2, :]  # world z in the body frame
-        leaves = {name: f[name][: T + 1].clone() for name in STATES} | {"upright": tilt[..., 2].clone()}
-        leaves |= {"action": self.action[:T].clone(), "clipped": act.clip_action(self.action[:T])}
+        leaves = {name: f[name][: T + 1].clone() for name in states} | {"tilt": tilt, "action": self.layers.action[:T].clone()}
         with torch.enable_grad():
             cost, figures = self._cost(SimpleNamespace(**{name: leaf.requires_grad_() for name, leaf in leaves.items()}))
         by = dict(zip(leaves, torch.autograd.grad(cost, list(leaves.values()))))
-        for name in STATES:
+        for name in states:
             self.adjoint[name][: T + 1] = by[name]
-        turn = torch.stack([-tilt[..., 1], tilt[..., 0], torch.zeros_like(tilt[..., 0])], -1) * by["upright"][..., None]
-        self.adjoint["turn"][: T + 1] = turn
+        self.adjoint["turn"][: T + 1] = torch.linalg.cross(by["tilt"], tilt)
         self.adjoint["command"].zero_()
-        self.by_clipped[:T], self.layers.by_action[:T] = by["clipped"], by["action"]
+        self.layers.by_action[:T] = by["action"]
         self.layers.prepare(T)
         self.backward()
         return {name: figure.detach() for name, figure in (figures | {"cost": cost}).items()}
 
-    def _recorded(self, adjoint: wp.struct) -> list[wp.Launch]:
+    def _recorded(self, adjoint: Course) -> list[wp.Launch]:
         """Launches of the backward kernel, a step each."""
         env, flights, action, p = self.env, self.flights, self.cfg.task.action, Setting()
-        p.max_thrust, p.max_rate = action.max_thrust, wp.vec3(*action.max_rate)
+        p.max_thrust, p.max_rate, p.history = action.max_thrust, wp.vec3(*action.max_rate), env.layout.history
         p.period, p.decay = self.cfg.sim.control_period, self.p.decay
-        plants = {"mass": flights.mass, "load_mass": flights.load_mass, "age": env.pose_age, "mount": flights.mount}
+        plants = {"mass": flights.mass, "load_mass": flights.load_mass, "mount": flights.mount, "age": env.pose_age}
         for name, tensor in (self.surrogate | plants).items():
-            kind = wp.vec3 if name == "mount" else wp.vec4 if name == "response" else wp.float32
-            setattr(p, name, wp.from_torch(tensor, dtype=kind))
-        tensors = (flights.steps, self.action, self.layers.by_seen, self.layers.by_action, self.by_clipped)
-        *rest, clipped = map(wp.from_torch, tensors)
-        kernel, given = build_backward(env.layout), (adjoint, clipped, flights.course, *rest)
-        how = {"device": env.device, "block_dim": 64, "record_cmd": True}
-        return [wp.launch(kernel, env.num_envs, [p, k, *given], **how) for k in range(self.p.horizon)]
+            setattr(p, name, wp.from_torch(tensor, dtype=Setting.vars[name].type.dtype))
+        rest = map(wp.from_torch, (flights.steps, self.layers.action, self.layers.by_seen, self.layers.by_action))
+        given, how = (adjoint, flights.course, *rest), {"device": env.device, "block_dim": 64, "record_cmd": True}
+        return [wp.launch(backward, env.num_envs, [p, k, *given], **how) for k in range(self.p.horizon)]
 
     @torch.no_grad()
     def _back(self) -> None:
@@ -226,46 +180,28 @@ class FirstOrder:
                 self._launches[k].launch()
             self.layers.back(k)
 
-    def step(self, done: float) -> dict[str, float]:
-        """One rollout and one step of Adam at this share of the training; returns its figures."""
-        p, start = self.p, time.perf_counter()
+    def collect(self, done: float) -> None:
         self._schedule(1.0 if self._adapting else done)
+        self.rollout()
+
+    @torch.no_grad()
+    def learn(self, done: float) -> dict[str, float]:
+        p, parameters, T = self.p, list(self.network.mlp.parameters()), self.flights.last
         highest, lowest = (p.adapting_rate, 0.1 * p.adapting_rate) if self._adapting else (p.learning_rate, p.final_rate)
         rate = lowest + 0.5 * (highest - lowest) * (1.0 + math.cos(math.pi * done))
         for group in self.optimizer.param_groups:
             group["lr"] = group["lr"].fill_(rate) if isinstance(group["lr"], Tensor) else rate
-        self.rollout()
-        if self.env.device.startswith("cuda"):
-            torch.cuda.synchronize()
-        middle = time.perf_counter()
-        figures = {name: float(value) for name, value in self._descend().items()}
-        times = {"rollout_s": middle - start, "learning_s": time.perf_counter() - middle}
-        return figures | times | {"learning_rate": rate, "episodes": float(self.env.num_envs)}
-
-    @torch.no_grad()
-    def _descend(self) -> dict[str, Tensor]:
-        """Gradient of the last rollout, Adam, observation statistics; returns figures."""
-        figures, parameters, T = self.derivatives(), list(self.network.mlp.parameters()), self.flights.last
-        size = self.layers.by_action[:T].square().sum((0, 2)).sqrt()  # a few wild flights must not outweigh the rest
-        median = size.kthvalue(len(size) // 2 + 1).values
-        self.layers.gradients(self.flights.obs[:T], (OUTLIER * median / size.clamp(min=1e-12)).clamp(max=1.0))
+        figures = self.derivatives()
+        size = self.layers.by_action[:T].square().sum((0, 2)).sqrt().clamp(min=1e-12)
+        most = OUTLIER * size.kthvalue(len(size) // 2 + 1).values  # a few wild flights must not outweigh the rest
+        self.layers.gradients(self.flights.obs[:T], (most / size).clamp(max=1.0))
         self._ranks.average(parameters)
-        figures["gradient_norm"] = torch.nn.utils.clip_grad_norm_(parameters, self.p.max_grad_norm)
-        figures["ended"] = self.flights.ended.float().mean()
+        figures["gradient_norm"] = torch.nn.utils.clip_grad_norm_(parameters, p.max_grad_norm)
         self.optimizer.step()
-        self._watch(self.flights.observed())
-        return figures
-
-    def _watch(self, seen: Tensor) -> None:
-        """Take observations, shape (N, D), into the normaliser's statistics."""
-        if self.network.obs_normalization:
-            normalizer = self.network.obs_normalizer
-            std = normalizer._std  # the update makes a new tensor; a graph reads this one
-            normalizer.update(seen)
-            normalizer._std = std.copy_(normalizer._std)
+        self.network.update_normalization(self.flights.observed())
+        return {name: float(value) for name, value in figures.items()} | {"learning_rate": rate, "episodes": float(self.env.num_envs)}
 
     def export(self, contract: dict, made_by: dict) -> Policy:
-        """The policy as a file's content."""
         return Policy.from_actor_state(self.network.state_dict(), self.cfg.ppo.activation, contract, made_by)
 
     def take_up(self, policy: Policy) -> None:
@@ -274,9 +210,8 @@ class FirstOrder:
         self._adapting = True
 
     def state_dict(self) -> dict:
-        """All that the next iteration depends on, besides torch's generators."""
-        learnt = {name: getattr(self, name).state_dict() for name in ("network", "optimizer", "env")}
-        return learnt | {"adapting": self._adapting, "surrogate": self.surrogate}
+        parts = {name: getattr(self, name).state_dict() for name in ("network", "optimizer", "env")}
+        return parts | {"adapting": self._adapting, "surrogate": self.surrogate}
 
     def load_state_dict(self, saved: dict, own_throws: bool = True) -> None:
         self._adapting = saved["adapting"]

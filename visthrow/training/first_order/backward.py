@@ -1,25 +1,26 @@
-"""Backward pass of flights through the surrogate, a kernel a step, a thread a flight; the network's part lies between two of them.
+"""Backward pass of flights: through the surrogate a kernel a step, a thread a flight, and between two of them through the network.
 
-Derivatives are written by hand; a rotation's is that by a turn about the body axes, R exp(turn). Equations:
-:mod:`visthrow.training.first_order.surrogate`.
+Derivatives are written by hand; a rotation's is that by a turn about the body axes, R exp(turn). What a derivative by a state is
+worth is known once all later steps are done: so the network's own are products with one vector a step, those by its weights products
+over all steps at the end.
 """
 
-from functools import lru_cache
-
+import torch
 import warp as wp
+from torch import Tensor, nn
 
 from sim.params import GRAVITY
 from visthrow.onboard import observations as ob
-from visthrow.training.first_order.flights import Course
-from visthrow.training.first_order.surrogate import TAUT
+from visthrow.training.first_order.surrogate import TAUT, Course
+from visthrow.training.ppo.network import Network
 
-SLACK_THROTTLE = 0.05
-"""Least throttle at which the slope of the thrust is taken: at none it is nought, and nothing would lead away from there."""
+SLACK_THROTTLE = 0.05  # least at which the slope of the thrust is taken: at none it is nought, and nothing would lead away from there
+PREVIOUS_AT, GOAL_AT, LOAD_AT = ob.VEHICLE, ob.VEHICLE + 5, ob.VEHICLE + 7  # columns of a state observation where these begin
 
 
 @wp.struct
 class Setting:
-    """What flights and policy are like: the surrogate, the plants, what the actor sees and how it reacts."""
+    """What flights and policy are like."""
 
     response: wp.array(dtype=wp.vec4)
     force: wp.array(dtype=float)
@@ -27,11 +28,12 @@ class Setting:
     mass: wp.array(dtype=float)
     load_mass: wp.array(dtype=float)
     mount: wp.array(dtype=wp.vec3)
+    age: wp.array(dtype=float)  # of poses [s]
+    history: int
     max_thrust: float
     max_rate: wp.vec3
     period: float
     decay: float  # of derivatives, per step
-    age: wp.array(dtype=float)  # of poses [s]
 
 
 @wp.func
@@ -46,51 +48,42 @@ def step_back(p: Setting, x: Course, adj: Course, k: int, e: int):
     dt, half, up = p.period, 0.5 * p.period, wp.vec3(0.0, 0.0, 1.0)
     mass, load_mass, mount = p.mass[e], p.load_mass[e], p.mount[e]
     rot, rot_next = x.quat[k, e], x.quat[k + 1, e]
-    g_pos = p.decay * adj.pos[k + 1, e]
-    g_load = p.decay * adj.load_pos[k + 1, e]
-    g_vel = p.decay * adj.vel[k + 1, e] + half * g_pos
-    g_load_vel = p.decay * adj.load_vel[k + 1, e] + half * g_load
-    g_turn = p.decay * adj.turn[k + 1, e]
-    g_response = p.decay * adj.response[k + 1, e]
-
+    g_pos, g_load = p.decay * adj.pos[k + 1, e], p.decay * adj.load_pos[k + 1, e]
+    g_vel, g_load_vel = p.decay * adj.vel[k + 1, e] + half * g_pos, p.decay * adj.load_vel[k + 1, e] + half * g_load
+    g_turn, g_response = p.decay * adj.turn[k + 1, e], p.decay * adj.response[k + 1, e]
     z = 0.5 * (wp.quat_rotate(rot, up) + wp.quat_rotate(rot_next, up))
-    thrust = 0.5 * p.force[0] * (x.response[k, e][0] + x.response[k + 1, e][0])
-    drag = wp.vec3(p.force[1], p.force[2], p.force[3])
+    rates = x.response[k, e] + x.response[k + 1, e]
+    thrust, drag = 0.5 * p.force[0] * rates[0], wp.vec3(p.force[1], p.force[2], p.force[3])
     f = thrust * z - wp.quat_rotate(rot, wp.cw_mul(drag, wp.quat_rotate_inv(rot, x.vel[k, e])))
     arm = 0.5 * (x.load_pos[k, e] - x.pos[k, e] + x.load_pos[k + 1, e] - x.pos[k + 1, e])
     arm = arm - 0.5 * (wp.quat_rotate(rot, mount) + wp.quat_rotate(rot_next, mount))
-    length = wp.length(arm)
-    n = arm / length
+    length, n = wp.length(arm), wp.normalize(arm)
     u = 0.5 * (x.load_vel[k, e] - x.vel[k, e] + x.load_vel[k + 1, e] - x.vel[k + 1, e])
-    along = wp.dot(n, u)
-    across = u - along * n
+    across = u - wp.dot(n, u) * n
     pull = -load_mass * wp.dot(n, (x.load_vel[k + 1, e] - x.load_vel[k, e]) / dt + GRAVITY * up)
 
     g_f = dt / mass * g_vel
-    g_u = wp.vec3(0.0, 0.0, 0.0)
-    g_arm = wp.vec3(0.0, 0.0, 0.0)
+    g_u, g_arm = wp.vec3(), wp.vec3()
     if pull > TAUT * GRAVITY * load_mass:
         both = g_f - dt / load_mass * g_load_vel
         g_pull = wp.dot(n, both) * mass * load_mass / (mass + load_mass)
         swing = g_pull * p.tension[1] / length
-        g_n = pull * both - g_pull * p.tension[0] / mass * f - 2.0 * swing * along * u
+        g_n = pull * both - g_pull * p.tension[0] / mass * f - 2.0 * swing * wp.dot(n, u) * u
         g_u = 2.0 * swing * across
         g_f = g_f - g_pull * p.tension[0] / mass * n
         g_arm = (g_n - wp.dot(n, g_n) * n - swing * wp.dot(across, across) * n) / length
 
     g_z = 0.5 * thrust * g_f
-    g_turn = g_turn + turned(rot_next, up, g_z)
-    rates = x.response[k, e] + x.response[k + 1, e]
+    g_turn += turned(rot_next, up, g_z)
     phi = half * wp.vec3(rates[1], rates[2], rates[3])
     g_rate = half * (g_turn + 0.5 * wp.cross(phi, g_turn) + wp.cross(phi, wp.cross(phi, g_turn)) / 6.0)
     g_mean = wp.vec4(0.5 * p.force[0] * wp.dot(z, g_f), g_rate[0], g_rate[1], g_rate[2])
-    g_response = g_response + g_mean
+    g_response += g_mean
     adj.response[k, e] += g_mean + wp.cw_mul(p.response[0], g_response)
     if k > 0:
         adj.response[k - 1, e] += wp.cw_mul(p.response[1], g_response)
-    for j in range(p.response.shape[0] - 2):
-        if k >= j:
-            adj.command[k - j, e] += wp.cw_mul(p.response[2 + j], g_response)
+    for j in range(wp.min(p.response.shape[0] - 2, k + 1)):
+        adj.command[k - j, e] += wp.cw_mul(p.response[2 + j], g_response)
     adj.pos[k, e] += g_pos - g_arm
     adj.load_pos[k, e] += g_load + g_arm
     g_drag = wp.quat_rotate(rot, wp.cw_mul(drag, wp.quat_rotate_inv(rot, g_f)))
@@ -100,71 +93,100 @@ def step_back(p: Setting, x: Course, adj: Course, k: int, e: int):
     adj.turn[k, e] += before + turned(rot, up, g_z) - turned(rot, mount, g_arm)
 
 
-@lru_cache
-def build_backward(layout: ob.Layout) -> wp.Kernel:
-    """Backward pass of step k of flights whose actor sees a state layout."""
-    history, width = layout.history, layout.payload
-    previous_at, goal_at, load_at = ob.VEHICLE, ob.VEHICLE + 5, ob.VEHICLE + 5 + layout.goal
+@wp.func
+def three(by_seen: wp.array2d(dtype=float), e: int, i: int):
+    """Derivative by three columns of an observation."""
+    return wp.vec3(by_seen[e, i], by_seen[e, i + 1], by_seen[e, i + 2])
 
-    @wp.func
-    def three(by_seen: wp.array2d(dtype=float), e: int, i: int):
-        return wp.vec3(by_seen[e, i], by_seen[e, i + 1], by_seen[e, i + 2])
 
-    @wp.func
-    def vehicle_back(by_seen: wp.array2d(dtype=float), x: Course, adj: Course, i: int, e: int, share: float):
-        """From an observation to state i, of which ``share`` is in it: the vehicle and the goal."""
-        adj.pos[i, e] += share * three(by_seen, e, 0)
-        adj.vel[i, e] += share * three(by_seen, e, 3)
-        rate = share * three(by_seen, e, 6)
-        adj.response[i, e] += wp.vec4(0.0, rate[0], rate[1], rate[2])
-        x_axis = turned(x.quat[i, e], wp.vec3(1.0, 0.0, 0.0), three(by_seen, e, 9))
-        adj.turn[i, e] += share * (x_axis + turned(x.quat[i, e], wp.vec3(0.0, 1.0, 0.0), three(by_seen, e, 12)))
-        adj.load_pos[i, e] -= share * wp.vec3(by_seen[e, goal_at], by_seen[e, goal_at + 1], 0.0)
+@wp.func
+def seen_back(p: Setting, x: Course, adj: Course, by_seen: wp.array2d(dtype=float), i: int, e: int, share: float):
+    """From an observation to state i, of which ``share`` is in it, and to the payload as it was up to ``history`` steps before."""
+    adj.pos[i, e] += share * three(by_seen, e, 0)
+    adj.vel[i, e] += share * three(by_seen, e, 3)
+    rate = share * three(by_seen, e, 6)
+    adj.response[i, e] += wp.vec4(0.0, rate[0], rate[1], rate[2])
+    for axis in range(2):
+        unit = wp.vec3(1.0 - float(axis), float(axis), 0.0)
+        adj.turn[i, e] += share * turned(x.quat[i, e], unit, three(by_seen, e, 9 + 3 * axis))
+    adj.load_pos[i, e] -= share * wp.vec3(by_seen[e, GOAL_AT], by_seen[e, GOAL_AT + 1], 0.0)
+    for age in range(p.history + 1):
+        offset = share * three(by_seen, e, LOAD_AT + 3 * age)
+        adj.load_pos[wp.max(i - age, 0), e] += offset
+        adj.pos[wp.max(i - age, 0), e] -= offset
 
-    @wp.func
-    def load_back(by_seen: wp.array2d(dtype=float), adj: Course, age: int, i: int, e: int, share: float):
-        """From an observation to state i: the payload as it was ``age`` observations ago."""
-        offset = share * three(by_seen, e, load_at + width * age)
-        adj.load_pos[i, e] += offset
-        adj.pos[i, e] -= offset
 
-    @wp.kernel(module="unique", enable_backward=False)
-    def backward_kernel(
-        # Params:
-        p: Setting,
-        k: int,
-        # State in:
-        adj: Course,
-        by_clipped: wp.array3d(dtype=float),
-        # In:
-        x: Course,
-        steps: wp.array(dtype=wp.int32),
-        action: wp.array3d(dtype=float),
-        by_seen: wp.array2d(dtype=float),  # by observation k + 1
-        # Out:
-        by_action: wp.array3d(dtype=float),
-    ):
-        e = wp.tid()
+@wp.kernel(module="unique", enable_backward=False)
+def backward(
+    # Params:
+    p: Setting,
+    k: int,
+    # State in:
+    adj: Course,
+    # In:
+    x: Course,
+    steps: wp.array(dtype=wp.int32),
+    action: wp.array3d(dtype=float),
+    by_seen: wp.array2d(dtype=float),  # by observation k + 1
+    # Out:
+    by_action: wp.array3d(dtype=float),
+):
+    e = wp.tid()
+    if k < steps[e]:
         late = p.age[e] / p.period
-        command = wp.vec4()
-        if k < steps[e]:
-            for j in range(5):
-                by_clipped[k, e, j] += by_seen[e, previous_at + j]
-            vehicle_back(by_seen, x, adj, k + 1, e, 1.0 - late)
-            vehicle_back(by_seen, x, adj, k, e, late)
-            for age in range(history + 1):
-                load_back(by_seen, adj, age, wp.max(k + 1 - age, 0), e, 1.0 - late)
-                load_back(by_seen, adj, age, wp.max(k - age, 0), e, late)
-            step_back(p, x, adj, k, e)
-            throttle = wp.clamp(0.5 * (action[k, e, 0] + 1.0), SLACK_THROTTLE, 1.0)
-            scale = wp.vec4(p.max_thrust * throttle, p.max_rate[0], p.max_rate[1], p.max_rate[2])
-            command = wp.cw_mul(scale, adj.command[k, e])
+        seen_back(p, x, adj, by_seen, k + 1, e, 1.0 - late)
+        seen_back(p, x, adj, by_seen, k, e, late)
+        step_back(p, x, adj, k, e)
+        throttle = wp.clamp(0.5 * (action[k, e, 0] + 1.0), SLACK_THROTTLE, 1.0)
+        command = wp.cw_mul(wp.vec4(p.max_thrust * throttle, p.max_rate[0], p.max_rate[1], p.max_rate[2]), adj.command[k, e])
         for j in range(5):
-            total = by_clipped[k, e, j]
-            if j < 4:
-                total += command[j]
-            if wp.abs(action[k, e, j]) > 1.0:
-                total = 0.0
-            by_action[k, e, j] = wp.where(k > steps[e], 0.0, by_action[k, e, j] + total)
+            if wp.abs(action[k, e, j]) <= 1.0:
+                by_action[k, e, j] += by_seen[e, PREVIOUS_AT + j]
+                if j < 4:
+                    by_action[k, e, j] += command[j]
 
-    return backward_kernel
+
+class Layers:
+    """What a network's layers made of the steps of flights, the last one ``action``, shape (T, E, N) each, and derivatives by it.
+
+    ``by_seen`` has those by the observations of the last step that :meth:`back` was called for, shape (E, D).
+    """
+
+    def __init__(self, network: Network, obs: Tensor):
+        self._network, self._linear = network, [layer for layer in network.mlp if isinstance(layer, nn.Linear)]
+        rooms = [[obs.new_zeros(*obs.shape[:2], layer.out_features) for layer in self._linear] for _ in range(3)]
+        self._inner, self._by_inner, (*self._slope, _) = rooms
+        self._first = torch.zeros_like(self._linear[0].weight)  # with the normaliser's spread
+        self.action, self.by_action, self.by_seen = self._inner[-1], self._by_inner[-1], torch.zeros_like(obs[0])
+
+    def forward(self, k: int, seen: Tensor) -> Tensor:
+        """Actions of step k, shape (E, 5), for observations, shape (E, D)."""
+        x = self._network.obs_normalizer(seen)
+        for layer, inner in zip(self._linear, self._inner):
+            torch.addmm(layer.bias, x, layer.weight.T, out=inner[k])
+            x = self._network.mlp[1](inner[k])
+        return self.action[k]
+
+    def prepare(self, steps: int) -> None:
+        """Begin a way back from this step."""
+        for inner, slope in zip(self._inner, self._slope):
+            slope[:steps] = torch.func.vjp(self._network.mlp[1], inner[:steps])[1](torch.ones_like(inner[:steps]))[0]
+        seen = self._network.obs_normalizer
+        spread = seen.std + seen.eps if self._network.obs_normalization else 1.0
+        self._first.copy_(self._linear[0].weight.detach() / spread)
+        self.by_seen.zero_()
+
+    def back(self, k: int) -> None:
+        """From derivatives by the actions of step k to those by its observations."""
+        for i in range(len(self._linear) - 1, 0, -1):
+            out = self._by_inner[i - 1][k]
+            torch.mm(self._by_inner[i][k], self._linear[i].weight, out=out).mul_(self._slope[i - 1][k])
+        torch.mm(self._by_inner[0][k], self._first, out=self.by_seen)
+
+    def gradients(self, seen: Tensor, shares: Tensor) -> None:
+        """Give the weights their derivatives; flights, shape (E,), count by these shares. seen: the first observations, shape (T, E, D)."""
+        x, steps = self._network.obs_normalizer(seen), len(seen)
+        for layer, inner, by_inner in zip(self._linear, self._inner, self._by_inner):
+            by = (by_inner[:steps] * shares[:, None]).flatten(0, 1)
+            layer.weight.grad, layer.bias.grad = by.mT @ x.flatten(0, 1), by.sum(0)
+            x = self._network.mlp[1](inner[:steps])

@@ -16,24 +16,106 @@ commands by linear least squares; :mod:`visthrow.training.first_order.backward` 
 from collections.abc import Callable
 
 import torch
+import warp as wp
 from torch import Tensor
 
+from sim.arrays.torch_bridge import on_torch_stream
 from sim.params import GRAVITY
 from sim.quadrotor.queue import queue_depth
 from visthrow.onboard import observations as ob
+from visthrow.training import terminations
 from visthrow.training.env import ThrowEnv
-from visthrow.training.first_order.flights import Flights
+from visthrow.training.ppo.network import Network
 
-EXCITED, KEPT = (0.35, 0.5, 0.5, 0.5, 0.0), 0.7
-"""Random actions of the fit: spread about hover, and the share of one that the next keeps."""
-FITTED = 8000
-"""Steps of flight that the fit rests on."""
-TAUT = 0.1
-"""Pull on the payload in its weights above which the rope counts as taut."""
+EXCITED, KEPT = (0.35, 0.5, 0.5, 0.5, 0.0), 0.7  # random actions of the fit: spread about hover, share of one that the next keeps
+FITTED = 8000  # steps of flight that the fit rests on
+TAUT = 0.1  # pull on the payload in its weights above which the rope counts as taut
 
 
-def fit(env: ThrowEnv, watch: Callable[[Tensor], None], steps: int = 40) -> dict[str, Tensor]:
-    """Fit the surrogate to random flights; ``watch`` is shown what the actor observed in them, shape (N, D).
+@wp.struct
+class Course:
+    """Course of flights, or derivatives of a cost by it: (T + 1, E)."""
+
+    pos: wp.array2d(dtype=wp.vec3)
+    vel: wp.array2d(dtype=wp.vec3)
+    turn: wp.array2d(dtype=wp.vec3)  # derivatives alone
+    load_pos: wp.array2d(dtype=wp.vec3)
+    load_vel: wp.array2d(dtype=wp.vec3)
+    response: wp.array2d(dtype=wp.vec4)  # thrust, body rates
+    command: wp.array2d(dtype=wp.vec4)
+    quat: wp.array2d(dtype=wp.quat)  # flights alone
+
+
+def course(steps: int, count: int, device: str) -> tuple[dict[str, Tensor], Course]:
+    """Tensors of shape (T + 1, E, 3 or 4) by the names of :class:`Course`, and the same memory for kernels."""
+    x, made = {}, Course()
+    for name, field in Course.vars.items():
+        x[name] = torch.zeros(steps + 1, count, field.type.dtype._length_, device=device)
+        setattr(made, name, wp.from_torch(x[name], dtype=field.type.dtype))
+    return x, made
+
+
+class Flights:
+    """Flights without release and the plants that make them.
+
+    Attributes:
+        x, course: states and commands; see :func:`course`. obs: what the actor observes, shape (T, E, D).
+        landing, time: of a payload that separates at a state, [m], shape (T + 1, E, 2), and [s], shape (T + 1, E).
+        mass, load_mass: of vehicles with their ropes and of payloads [kg], shape (E,). mount: of the ropes [m], shape (E, 3).
+        flying: whether a flight goes on, int32, shape (E,). steps: until it was over, likewise. last: of the longest.
+    """
+
+    def __init__(self, env: ThrowEnv, steps: int):
+        E, make = env.num_envs, {"device": env.device}
+        self.env, (self.x, self.course), self.last = env, course(steps, E, env.device), steps
+        self.obs, self.landing = torch.zeros(steps, E, env.layout.dimension, **make), torch.zeros(steps + 1, E, 2, **make)
+        self.time, self.status = torch.zeros(steps + 1, E, **make), torch.zeros(steps + 1, E, dtype=torch.int32, **make)
+        self.flying, self.steps = (torch.zeros(E, dtype=torch.int32, **make) for _ in range(2))
+        self._mask, (vehicle, rope) = wp.from_torch(self.flying), env.sim.plants()
+        load = rope["payload_mass"]
+        parts = (vehicle["body"]["mass"], rope["total_mass"] - load, load, rope["mount"], vehicle["thrust"]["k_f"])
+        rows = (torch.tensor(part, dtype=torch.float32, **make) for part in parts)
+        self._body, self._rope, self.load_mass, self.mount, self._thrust = rows
+        self.mass = self._body + self._rope
+
+    def observed(self) -> dict[str, Tensor]:
+        """What the actor observed while flights lasted, shape (N, D), under its group's name."""
+        return {"actor": self.obs[torch.arange(len(self.obs), device=self.steps.device)[:, None] <= self.steps]}
+
+    def fly(self, act: Callable[[int, Tensor], Tensor | None]) -> None:
+        """Fly from new starts under actions ``act(k, observations)``; where it has none, all flights are over."""
+        env, x, state, out = self.env, self.x, self.env.views.state, self.env.views.out
+        loads = {"load_pos": out["payload_pos_w"], "load_vel": out["payload_vel_w"]}
+        sources = {"pos": state["pos_w"], "vel": state["vel_w"], "quat": state["quat_wb"]} | loads
+        seen = env.reset()["actor"]
+        torch.add(self._body * state["mass_scale"], self._rope, out=self.mass)
+        self.flying[:], self.steps[:] = 1, 0
+        for k in range(len(self.obs) + 1):
+            with on_torch_stream(env.device):
+                env.sim.foresee()
+            for name, source in sources.items():
+                x[name][k] = source
+            torch.mul(self._thrust, state["motor_speed"].square().sum(-1), out=x["response"][k, :, 0])
+            x["response"][k, :, 1:], self.status[k] = state["rate_b"], state["status"]
+            self.landing[k], self.time[k] = env.views.foreseen["landing_w"][:, :2], env.views.foreseen["time_to_impact"]
+            self.last = k
+            if k == len(self.obs):
+                break
+            self.obs[k] = seen
+            if (action := act(k, seen)) is None:
+                break
+            self.steps.add_(self.flying)
+            seen = env.carry(action, self._mask)["actor"]
+            x["command"][k] = env.views.command
+        flown = (x["pos"][1:], ob.rotation_from_quat(x["quat"][1:]), x["load_pos"][1:], self.status[1:])
+        pos, rot, load_pos, status = (value.flatten(0, 1) for value in flown)
+        held, time, height = torch.zeros_like(status, dtype=torch.bool), torch.zeros_like(pos[:, 0]), env.cfg.release.landing_height
+        ends = terminations.negative(env.cfg.task.bounds, pos, rot, load_pos, status, held, time, height)
+        self.steps.clamp_(max=(~ends).view(len(self.obs), -1).int().cumprod(0).sum(0))
+
+
+def fit(env: ThrowEnv, network: Network, steps: int = 40) -> dict[str, Tensor]:
+    """Fit the surrogate to random flights, whose observations the network's normaliser is shown.
 
     Returns:
         ``response``: rows A0, A1, B_0, ..., shape (2 + D, 4); ``force``: kappa and drag [N s/m], shape (4,); ``tension``: a, b.
@@ -50,23 +132,23 @@ def fit(env: ThrowEnv, watch: Callable[[Tensor], None], steps: int = 40) -> dict
 
     for _ in range(FITTED // (env.num_envs * steps) + 1):
         flights.fly(act)
-        watch(flights.observed())
+        network.update_normalization(flights.observed())
         parts.append(_regressors(flights, lags, period))
     rows = {name: torch.cat([part[name] for part in parts]).double() for name in parts[0]}
     response = [_solve(rows["lagged"][..., c], rows["next"][:, c])[:-1] for c in range(4)]
     force = _solve(rows["push"].flatten(0, 1), rows["momentum"].flatten())
     pulled = -(rows["along"] * (rows["push"] @ force)).sum(-1) / rows["mass"]
     tension = _solve(torch.stack([pulled, rows["swing"]], -1) * rows["reduced"][:, None], rows["tension"])
-    found = {"response": torch.stack(response, -1), "force": force, "tension": tension}
-    return {name: value.float().contiguous() for name, value in found.items()}
+    found = (("response", torch.stack(response, -1)), ("force", force), ("tension", tension))
+    return {name: value.float().contiguous() for name, value in found}
 
 
 def _solve(features: Tensor, target: Tensor) -> Tensor:
     """Least-squares coefficients; what nothing excites gets none."""
     scale = features.square().mean(0).sqrt().clamp(min=1e-12)
-    normal = (features / scale).mT @ (features / scale) / len(features)
-    ridge = 1e-9 * torch.eye(len(scale), dtype=normal.dtype, device=normal.device)
-    return torch.linalg.solve(normal + ridge, (features / scale).mT @ target / len(features)) / scale
+    scaled = features / scale
+    ridge = 1e-9 * len(features) * torch.eye(len(scale), dtype=scale.dtype, device=scale.device)
+    return torch.linalg.solve(scaled.mT @ scaled + ridge, scaled.mT @ target) / scale
 
 
 def _regressors(flights: Flights, lags: int, period: float) -> dict[str, Tensor]:
@@ -79,21 +161,14 @@ def _regressors(flights: Flights, lags: int, period: float) -> dict[str, Tensor]
     drag = [-rot[k, :, :, i] * (rot[k, :, :, i] * f["vel"][k]).sum(-1, keepdim=True) for i in range(3)]
     gravity = torch.tensor([0.0, 0.0, GRAVITY], device=mass.device)
     load_force = load_mass[:, None] * ((f["load_vel"][k + 1] - f["load_vel"][k]) / period + gravity)
+    momentum = mass[:, None] * ((f["vel"][k + 1] - f["vel"][k]) / period + gravity) + load_force
     arm = f["load_pos"] - f["pos"] - (rot @ flights.mount[:, :, None]).squeeze(-1)
     arm, u = (0.5 * (path[k] + path[k + 1]) for path in (arm, f["load_vel"] - f["vel"]))
     length = arm.norm(dim=-1)
     n = arm / length[..., None]
     tension = -(n * load_force).sum(-1)
-    taut = tension > TAUT * GRAVITY * load_mass
-    rows = {
-        "next": y[k + 1],
-        "lagged": torch.stack(lagged, -2),
-        "push": torch.stack([thrust_w, *drag], -1),
-        "momentum": mass[:, None] * ((f["vel"][k + 1] - f["vel"][k]) / period + gravity) + load_force,
-        "along": n,
-        "mass": mass.expand_as(tension),
-        "reduced": taut * mass * load_mass / (mass + load_mass),
-        "swing": (u - (n * u).sum(-1, keepdim=True) * n).square().sum(-1) / length,
-        "tension": tension * taut,
-    }
+    taut, swing = tension > TAUT * GRAVITY * load_mass, (u - (n * u).sum(-1, keepdim=True) * n).square().sum(-1) / length
+    rows = {"next": y[k + 1], "lagged": torch.stack(lagged, -2), "push": torch.stack([thrust_w, *drag], -1), "momentum": momentum,
+            "along": n, "mass": mass.expand_as(tension), "reduced": taut * mass * load_mass / (mass + load_mass), "swing": swing,
+            "tension": tension * taut}  # fmt: skip
     return {name: row[k[:, None] < flights.steps] for name, row in rows.items()}

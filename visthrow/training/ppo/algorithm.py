@@ -2,7 +2,6 @@
 
 import contextlib
 import io
-import time
 
 import torch
 from rsl_rl.algorithms import PPO
@@ -63,17 +62,6 @@ class PPOTraining:
     """
 
     def __init__(self, experiment: Experiment, device: str, seed: int, ranks: Ranks):
-        """Build environment and networks.
-
-        Args:
-            experiment: the run's configuration.
-            device: "cpu" or "cuda:0".
-            seed: of the environment; torch's own generators are the caller's to seed.
-            ranks: this process among those of the training.
-
-        Raises:
-            ConfigError: samples that do not divide into minibatches.
-        """
         p = experiment.ppo
         if (p.environments * p.steps) % p.minibatches:
             raise ConfigError(f"ppo: {p.environments} x {p.steps} samples do not divide into {p.minibatches} minibatches")
@@ -114,21 +102,16 @@ class PPOTraining:
             self._graph.replay()
         self._rollouts += 1
 
-    def step(self, done: float) -> dict[str, float]:
-        """One iteration, rollout and update, at this share of the training; returns its figures."""
-        p = self.experiment.ppo
+    def collect(self, done: float) -> None:
         self.env.clear_totals()
-        start = time.perf_counter()
         self.rollout()
-        if self.device.startswith("cuda"):
-            torch.cuda.synchronize()
-        middle = time.perf_counter()
+
+    def learn(self, done: float) -> dict[str, float]:
+        p = self.experiment.ppo
         self.alg.desired_kl = (1.0 - done) * p.desired_kl + done * p.final_kl
         self._warm_up(round(done * p.iterations))
         figures = self.alg.update()
-        end = time.perf_counter()
-        times = {"rollout_s": middle - start, "learning_s": end - middle}
-        return {**figures, **self.env.episode_means(), "learning_rate": self.alg.learning_rate, **times}
+        return {**figures, **self.env.episode_means(), "learning_rate": self.alg.learning_rate}
 
     def _warm_up(self, iteration: int) -> None:
         """Let the critic alone learn in the first iterations, faster, and the actor from there at the rate that is set."""
@@ -142,20 +125,16 @@ class PPOTraining:
         return self.alg.actor(TensorDict({"actor": obs}, batch_size=[len(obs)], device=obs.device))
 
     def export(self, contract: dict, made_by: dict) -> Policy:
-        """The policy as a file's content."""
         return Policy.from_actor_state(self.alg.actor.state_dict(), self.experiment.ppo.activation, contract, made_by)
 
     @torch.no_grad()
     def take_up(self, policy: Policy) -> None:
-        """Start from a policy of the same layers: its weights, and its normaliser, which hardly moves from there."""
         self.alg.actor.take_up(policy)
 
     def state_dict(self) -> dict:
-        """All that the next iteration depends on, besides torch's generators."""
         return {"networks": self.alg.save(), "env": self.env.state_dict(), "obs": {k: v.clone() for k, v in self._obs.items()}}
 
     def load_state_dict(self, saved: dict, own_throws: bool = True) -> None:
-        """Take up a state of :meth:`state_dict`; its environment too where ``own_throws`` is set."""
         self.alg.load(saved["networks"], None, True)
         if own_throws:
             self.env.load_state_dict(saved["env"])

@@ -50,6 +50,13 @@ class Network(MLPModel):
         self.distribution.update(output)
         return self.distribution.sample()
 
+    def update_normalization(self, obs: TensorDict) -> None:
+        """rsl_rl's update of the observations' statistics; it makes a new tensor of the spread, graphs read the old one."""
+        if self.obs_normalization:
+            captured = self.obs_normalizer._std
+            super().update_normalization(obs)
+            self.obs_normalizer._std = captured.copy_(self.obs_normalizer._std)
+
     @torch.no_grad()
     def take_up(self, policy: Policy) -> None:
         """Start from a policy of the same layers: its weights, and its normaliser, which hardly moves from there."""

@@ -58,7 +58,7 @@ class CapturedPPO(PPO):
             ValueError: the environment bootstraps at its time limit, which is not served here.
         """
         if "time_outs" in extras:
-            raise ValueError("time_outs of the environment: expected none; its time limit is an end like others")
+            raise ValueError("time_outs of the environment; expected none; its time limit is an end like others")
         storage = self.storage
         storage.rewards[storage.step].copy_(rewards[:, None])
         storage.dones[storage.step].copy_(dones[:, None])
@@ -108,7 +108,8 @@ class CapturedPPO(PPO):
                     self._epochs()
             self._graph.replay()
         self._updates += 1
-        self._update_normalizers()
+        for model in (self.actor, self.critic):
+            model.update_normalization(self.storage.observations.flatten(0, 1))
         self.storage.clear()
         *losses, self.learning_rate = torch.cat([self._totals, self.rate]).tolist()
         count = self.num_learning_epochs * self.num_mini_batches
@@ -156,15 +157,6 @@ class CapturedPPO(PPO):
         for model in (self.actor, self.critic):
             torch.nn.utils.clip_grad_norm_(model.parameters(), self.max_grad_norm)
         self.optimizer.step()
-
-    def _update_normalizers(self) -> None:
-        """rsl_rl's update of the observations' statistics; it makes a new tensor of the spread, graphs read the old one."""
-        obs = self.storage.observations.flatten(0, 1)
-        for model in (self.actor, self.critic):
-            if model.obs_normalization:
-                captured = model.obs_normalizer._std
-                model.update_normalization(obs)
-                model.obs_normalizer._std = captured.copy_(model.obs_normalizer._std)
 
     def load(self, loaded_dict: dict, load_cfg: dict | None, strict: bool) -> bool:
         """Take up a state of :meth:`save`; the rate keeps its place on the device, graphs are captured anew."""
