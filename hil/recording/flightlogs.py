@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from hil.backends.base import FOLLOW, Status
+from hil.backends.base import FOLLOW, ROUNDING, Status
 from hil.control.landing import Landing
 from hil.control.states import State
 from hil.errors import RunError
@@ -26,6 +26,10 @@ from visthrow.logs.flightlog import FlightLog, FlightRecorder
 
 LEAD, AFTER = 2.0, 0.5  # a throw's log begins this long before it and ends this long after its recovery [s]
 LEAST_STEP = 1e-6  # between two samples of a channel [s]: poses that were taken in together keep their order
+SPUN_UP = 0.2
+"""After an autopilot begins to follow, its vehicle flies by the commands [s]: rotors that stood carried it after 0.09 s (Betaflight, twelve
+throws). Commands before that are no valid ones."""
+
 ABOUT = 25  # poses on either side that a clock's offset is the median of: jitter of the transport goes, drift stays
 AFTERWARDS = (State.THROW, State.RECOVER, State.ABORT)  # states that belong to a throw
 
@@ -95,6 +99,7 @@ class Samples:
         self._declare()
         self._last: dict[str, float] = {}
         self._vehicle: Pose | None = None  # the last one: where the rope hangs
+        self._follows: float | None = None  # since when the autopilot does
 
     def flush(self) -> FlightLog:
         """Return the log of what was added since the last call."""
@@ -126,8 +131,13 @@ class Samples:
         values |= {f"age_{name}": age for name, age in tick.ages.items() if np.isfinite(age)}
         if tick.goal_w is not None:
             values["goal_w"] = tick.goal_w
-        if d.command is not None:  # what goes out before the autopilot follows moves nothing
-            self.recorder.add(now, Status(*tick.line["status"]).mode == FOLLOW, command=np.array(d.command, dtype=float))
+        if Status(*tick.line["status"]).mode != FOLLOW:
+            self._follows = None
+        elif self._follows is None:
+            self._follows = now
+        if d.command is not None:
+            acts = self._follows is not None and now - self._follows >= SPUN_UP - ROUNDING
+            self.recorder.add(now, acts, command=np.array(d.command, dtype=float))
         for name in ("action", "observation", "keypoints"):
             if getattr(d, name) is not None:
                 values[name] = np.array(getattr(d, name), dtype=float)

@@ -21,6 +21,7 @@ from visthrow.diagnose.select.point import Problem, curvature, linearise, moved
 from visthrow.diagnose.throw import initial_fit
 from visthrow.diagnose.throw.initial_fit import InitialFit
 from visthrow.diagnose.throw.recorded import record_of
+from visthrow.diagnose.throw.replay import STABLE, rough_step
 from visthrow.diagnose.throw.states import hover_state
 from visthrow.diagnose.throw.throw_model import ThrowModel
 from visthrow.logs.flightlog import Channel, FlightLog
@@ -71,6 +72,32 @@ def test_silent_at_the_truth(planted):
     wrong = model.residuals({})
     right = model.residuals(PLANTED)
     assert sum(np.sum(r**2) for r in right) < sum(np.sum(r**2) for r in wrong)
+
+
+def test_a_log_that_begins_in_flight_is_followed_from_its_first_window_on():
+    """Of before nothing is known: which command acted, and what the integrals hold, here against a centre of mass that lies off."""
+    setting = setting_with({"motor_mixing": 1.0, "com_y": 4e-3})
+    (log,) = fly(setting, noise=0.2, free=1, throws=0, seconds=2.6)
+    late = {
+        name: dataclasses.replace(c, time=c.time[c.time > 1.0], values=c.values[c.time > 1.0], valid=c.valid[c.time > 1.0])
+        for name, c in log.channels.items()
+    }
+    model = ThrowModel([FlightLog(late, {})], setting.plant, only=["rope_length"])
+    assert model.flights.cuts[0].start == pytest.approx(late["command"].time[0] + setting.plant.vehicle.queue.delay)
+    first = model.windows({})[0]
+    start, z = first.nuisance * first.nuisance_sd / first.sigma[:, None], first.residual / first.sigma
+    z = z - start @ np.linalg.lstsq(start, z, rcond=None)[0]
+    assert np.mean(z**2) < 1.3, np.mean(z**2)
+
+
+@pytest.mark.parametrize("blocks", [{}, {"motor_mixing": 1.0}])
+def test_rough_steps_are_as_short_as_the_controllers_filters_ask(blocks):
+    """Betaflight's gyro filters of 250 and 500 Hz, D's of 150: 2 ms."""
+    setting = setting_with(blocks)
+    vehicle = setting.plant.vehicle
+    quick = dataclasses.replace(vehicle, controller=dataclasses.replace(vehicle.controller, gyro_time_constant=2e-3))
+    setting = dataclasses.replace(setting, plant=dataclasses.replace(setting.plant, vehicle=quick))
+    assert rough_step(setting, 2e-3) == pytest.approx(STABLE * 2e-3)
 
 
 def test_derivatives_are_derivatives(planted):

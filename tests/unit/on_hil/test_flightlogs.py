@@ -66,11 +66,11 @@ def test_a_log_a_throw_with_what_was_decided(run, logs):
 
 
 def test_commands_before_the_autopilot_follows_are_no_valid_ones(run, tmp_path):
-    """As Betaflight has it while it is not armed: frames go out, motors stand still."""
+    """As Betaflight has it while it is not armed: frames go out, motors stand still, and have to spin up."""
     folder = shutil.copytree(run[0], tmp_path / "late")
     lines = [json.loads(text) for text in (folder / "ticks.jsonl").read_text().splitlines()]
     first = next(n for n, line in enumerate(lines) if line["command"] is not None)
-    late = [line["time"] for line in lines[first : first + 3]]
+    late = [line["time"] for line in lines[first : first + 3 + round(flightlogs.SPUN_UP / TICK)]]
     for line in lines[: first + 3]:
         line["status"][3] = "wait"
     (folder / "ticks.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))

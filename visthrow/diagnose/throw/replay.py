@@ -203,7 +203,7 @@ def downloaded(array: wp.array) -> np.ndarray:
 def rough_step(setting: Setting, substep: float) -> float:
     """Length of a rough lane's steps [s]: twice the nominal one, as far as the vehicle's shortest lag allows."""
     controller, motor = setting.plant.vehicle.controller, setting.plant.vehicle.motor
-    lags = [controller.gyro_time_constant, controller.setpoint_time_constant] if controller.kind == "betaflight" else []
+    lags = [controller.gyro_time_constant, controller.setpoint_time_constant] if controller.kind != "geometric" else []
     lags += [motor.time_constant] if motor.kind != "instant" else []
     lags += [motor.time_constant_down] if motor.kind == "asymmetric" else []
     nominal = substep * np.sqrt(max(setting.step_square, FINEST))

@@ -64,7 +64,7 @@ def directions(plant: PlantParams) -> tuple[Direction, ...]:
     found += [Direction("quat_wb", i, 0.1, 1e-4) for i in range(3)]
     found += [Direction("vel_w", i, 1.0, 1e-3) for i in range(3)]
     found += [Direction("rate_b", i, 3.0, 1e-3) for i in range(3)]
-    if plant.vehicle.controller.kind == "betaflight":
+    if plant.vehicle.controller.kind != "geometric":
         found += [Direction("integral", i, INTEGRAL * gain[i], 1e-3 * gain[i]) for i in range(3) if gain[i] > 0.0]
     if plant.vehicle.motor.kind != "instant":
         found += [Direction("motor_speed", i, 0.15 * hover, 1e-4 * hover) for i in range(4)]
