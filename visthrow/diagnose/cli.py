@@ -10,7 +10,7 @@ ACTIONS = {
     "explain": ("say what the simulation gets wrong about flights, and what that is worth", "visthrow.diagnose.reporting.explain_cli"),
     "apply": ("write the configuration that a diagnosis asks for, ready to train in", "visthrow.diagnose.extend.apply_cli"),
     "fit": ("make the first configuration of your own vehicle or motor, from flights without payload", "visthrow.diagnose.inputs.fit_cli"),
-    "plan": ("propose the manoeuvre that separates what could not be separated", "visthrow.diagnose.reporting.plan_cli"),
+    "plan": ("find the flight that tells most of what could not be told", "visthrow.diagnose.reporting.plan_cli"),
     "blind": ("hide effects in your own noise: which sizes would be named", "visthrow.diagnose.reporting.blind_cli"),
 }
 

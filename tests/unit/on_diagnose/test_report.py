@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,7 +16,6 @@ from visthrow.diagnose.planning import fly_manoeuvres, manoeuvres, plan
 from visthrow.diagnose.reporting import blackbox, blind, gain, pictures, report
 from visthrow.diagnose.select import held_out, point, result, search
 from visthrow.diagnose.throw.landing import Landings
-from visthrow.logs.flightlog import Channel, FlightLog
 
 EFFECTS = catalogue(12)
 TRUTH = {"effect_03": 12.0, "effect_04": -9.0}
@@ -253,9 +251,10 @@ def degenerate():
 def test_the_plan_prefers_the_manoeuvre_that_separates(degenerate):
     apart = SyntheticModel(effects=EFFECTS, truth={"effect_03": 12.0}, throws=1, free=0, seed=9)
     alike = SyntheticModel(effects=EFFECTS, same={"effect_07": ("effect_03", 0.5)}, throws=1, free=0, seed=9)
-    chosen = [m for m in manoeuvres.catalogue() if m.name in ("hover", "circle", "thrust steps")]
-    models = {"hover": alike, "circle": apart, "thrust steps": None}
-    ranked = plan.propose(degenerate, chosen, lambda ms: [models[m.name] for m in ms])
+    aim = plan.Aim(degenerate)
+    models = {"hover": alike, "circle": apart}
+    told = [(m, aim.information(models[m.name])) for m in manoeuvres.catalogue() if m.name in models]
+    ranked = plan.propose(aim, told)
     assert [p.name for p in ranked] == ["circle", "hover"]
     assert ranked[0].nats > plan.DECISIVE > ranked[1].nats
     assert ranked[0].repeats == 1
@@ -281,10 +280,10 @@ def test_a_scale_settles_what_no_flight_separates(degenerate, monkeypatch):
     floor = {e.name: e.floor for e in EFFECTS}
     scale = measures.Measurement("weigh", "effect_07", floor["effect_07"], 60.0)
     monkeypatch.setattr(plan, "MEASUREMENTS", (scale,))
-    (proposal,) = plan.propose(degenerate, [], lambda _: [], ("effect_03",))
+    (proposal,) = plan.propose(plan.Aim(degenerate, ("effect_03",)), [])
     assert proposal.name == "weigh"
     assert {frozenset(pair) for pair in proposal.separates} == {frozenset(("effect_03", "effect_07"))}
-    assert not plan.propose(degenerate, [], lambda _: [], ("effect_00",))
+    assert not plan.propose(plan.Aim(degenerate, ("effect_00",)), [])
     model = SyntheticModel(effects=EFFECTS, truth={"effect_03": 12.0}, same={"effect_07": ("effect_03", 0.5)}, seed=2)
     model.effects = measures.narrowed(EFFECTS, measures.parsed([f"effect_07={scale.sd}"]))
     assert search.explain(model, laws=False)["effect_03"].verdict == result.FOUND
@@ -334,26 +333,22 @@ def test_no_manoeuvre_swings_the_payload_near_the_rotors_or_slackens_its_rope(ma
     assert tension > 0.2
 
 
-def test_a_manoeuvre_in_which_the_payload_swings_too_far_is_not_proposed(monkeypatch):
+def test_a_flight_in_which_the_payload_swings_too_far_has_no_model():
     """With the rope level, and the vehicle tilted by a tenth of a turn towards it, the swing is 54 degrees; upright it is 90."""
 
-    def level(turn: float) -> FlightLog:
-        time = np.arange(3) * 0.1
-        there = {"pos_w": np.zeros((3, 3)), "payload_pos_w": np.tile([-0.38, 0.0, 0.0], (3, 1)),
-                 "quat_wb": np.tile([0.0, np.sin(0.5 * turn), 0.0, np.cos(0.5 * turn)], (3, 1))}  # fmt: skip
-        there["payload_pos_w"][2] = [0.0, 0.0, 5.0]  # let go
-        channels = {name: Channel(time, values, "1" if name == "quat_wb" else "m", "world") for name, values in there.items()}
-        return FlightLog(channels | {"release_command": Channel(time, np.array([0.0, 0.0, 1.0]), "1")}, {})
+    def level(turn: float) -> fly_manoeuvres.Flight:
+        chosen = next(m for m in manoeuvres.catalogue() if m.name == "throw at 2 m/s")
+        reference = chosen.reference()
+        rows = 4 * len(reference.time)
+        place = np.repeat(reference.pos_w, 4, axis=0)
+        hangs = np.where(np.arange(rows)[:, None] < 4 * np.argmax(reference.release), [-0.38, 0.0, 0.0], [0.0, 0.0, 5.0])  # then let go
+        quat = np.tile([0.0, np.sin(0.5 * turn), 0.0, np.cos(0.5 * turn)], (rows, 1))
+        truth = {"pos_w": place, "payload_pos_w": place + hangs, "quat_wb": quat}
+        return fly_manoeuvres.Flight(chosen, reference, None, truth, None, None)
 
-    chosen = [m for m in manoeuvres.catalogue() if m.name in ("circle", "thrust steps")]
-    logs = [level(0.0), level(0.2 * np.pi)]
-    assert [fly_manoeuvres.swing(log) for log in logs] == pytest.approx([90.0, 54.0])
-    monkeypatch.setattr(fly_manoeuvres, "_sensor_noise", lambda _: {})
-    monkeypatch.setattr(fly_manoeuvres, "fly", lambda *_: logs)
-    monkeypatch.setattr(fly_manoeuvres, "effects_for", lambda *_: {})
-    monkeypatch.setattr(fly_manoeuvres, "ThrowModel", lambda *_, **__: "a model")
-    anything = SimpleNamespace(effects=(), setting=SimpleNamespace(plant=None, sensing=None), device="cpu", substep=1.0, theta={})
-    assert fly_manoeuvres.simulator_of(anything, anything)(chosen) == [None, "a model"]
+    flights = [level(0.0), level(0.2 * np.pi)]
+    assert [flight.swing for flight in flights] == pytest.approx([90.0, 54.0])
+    assert [flight.simulated(lambda _: "a model").model for flight in flights] == [None, "a model"]
 
 
 def test_the_report_holds_sentences_pictures_and_numbers(tmp_path, found, measured, hidden, degenerate):

@@ -104,17 +104,17 @@ class _Part:
     """A model with some of its effects."""
 
     def __init__(self, model: Model, keep: Sequence[int]) -> None:
-        self._model, self._keep = model, list(keep)
+        self.whole, self._keep = model, list(keep)
         self.effects, self.channels = [model.effects[j] for j in keep], model.channels
 
     def __getattr__(self, name: str):
-        return getattr(self._model, name)
+        return getattr(self.whole, name)
 
     def windows(self, theta):
         """See :class:`visthrow.diagnose.models.interface.Model`."""
         from dataclasses import replace
 
-        return [replace(w, effects=w.effects[:, self._keep]) for w in self._model.windows(theta)]
+        return [replace(w, effects=w.effects[:, self._keep]) for w in self.whole.windows(theta)]
 
 
 def _only(model: Model, names: Sequence[str]) -> Model:

@@ -1,20 +1,26 @@
 """Manoeuvres flown in the simulator as the diagnosis left it, recorded as the user records: all of them in one batch."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
 from sim.effects.effect import apply
+from sim.params import PlantParams
+from sim.quadrotor.units import Units, in_units
 from visthrow.common import mocap
-from visthrow.common.errors import DiagnoseError
+from visthrow.common.constants import GRAVITY
+from visthrow.common.errors import DiagnoseError, LogError
+from visthrow.common.rotations import matrix_of_quat
+from visthrow.diagnose.models.flyer import FlyerModel
+from visthrow.diagnose.models.flyer_params import FlyerParams
 from visthrow.diagnose.models.interface import Model
+from visthrow.diagnose.models.trim import command_of
 from visthrow.diagnose.planning.manoeuvres import PERIOD, Manoeuvre, Reference
-from visthrow.diagnose.planning.plan import log_of
 from visthrow.diagnose.select.result import Diagnosis
 from visthrow.diagnose.throw.effects import effects_for
 from visthrow.diagnose.throw.throw_model import ThrowModel
-from visthrow.logs.flightlog import FlightLog
+from visthrow.logs.flightlog import Channel, FlightLog
 from visthrow.onboard.hover import HoverController, HoverParams
 
 SAMPLE_PERIOD = 0.005
@@ -29,51 +35,96 @@ AWAY = 1.5
 HIGHEST = 75.0
 """Swing of the payload from the rotors' axis [deg] beyond which it nears the rotors, or a string hangs slack."""
 
+ASTRAY = 0.5
+"""Distance from the reference [m] beyond which a flight is aborted: as :meth:`Reference.limits` says, its box is wider by that."""
+
 TRACKING = HoverParams(max_speed=8.0, max_tilt=0.9, integral_limit=2.0)
 """A controller that follows a moving reference: the hover controller with room for it."""
 
+LOST = 10.0
+"""The same of a vehicle that flies off."""
 
-def simulator_of(model: ThrowModel, diagnosis: Diagnosis, *, seed: int = 0) -> Callable[[Sequence[Manoeuvre]], list[Model | None]]:
-    """Make the function that :func:`visthrow.diagnose.planning.plan.propose` simulates with.
+SAMPLED = ("pos_w", "quat_wb", "payload_pos_w", "vel_w", "rate_b", "motor_speed", "voltage")
 
-    A manoeuvre in which this vehicle's payload swings beyond ``HIGHEST`` has no model: it is not to be flown.
+
+@dataclass(frozen=True)
+class Simulated:
+    """A manoeuvre as it was flown in the simulator."""
+
+    model: Model | None  # of this flight alone, with the diagnosis' catalogue; None where it is aborted or cannot be replayed
+    used: float  # the largest part of ``HIGHEST`` or ``ASTRAY`` that was reached
+
+
+Simulate = Callable[[Sequence[Manoeuvre]], list[Simulated]]
+
+
+def simulator_of(model: Model, diagnosis: Diagnosis, made: Callable[[Sequence[FlightLog]], Model] | None = None, *,
+                 seed: int = 0) -> tuple[Simulate, Callable[[Manoeuvre], Manoeuvre | None]]:  # fmt: skip
+    """Make what simulates manoeuvres for a plan, and what tells how this vehicle flies one, if it can.
 
     Args:
         model: of the flights at hand.
         diagnosis: for the sizes of what was found and the sensors' noise.
+        made: gives a setup's own model of some logs.
         seed: of the noise.
+
+    Raises:
+        DiagnoseError: no vehicle flies in this model.
     """
-    noise = _sensor_noise(diagnosis)
-    asked = {e.name for e in model.effects}
-
-    def simulate(manoeuvres: Sequence[Manoeuvre]) -> list[Model | None]:
-        models: list[Model | None] = []
-        for log, manoeuvre in zip(fly(model, diagnosis.theta, manoeuvres, noise, seed), manoeuvres):
-            if manoeuvre.payload and not swing(log) < HIGHEST:
-                models.append(None)
-                continue
-            there = effects_for(model.setting, set(log.channels), manoeuvre.payload, np.isfinite(manoeuvre.release))
-            try:
-                models.append(ThrowModel([log], model.setting.plant, sensing=model.setting.sensing, device=model.device,
-                                         substep=COARSE * model.substep, only=[n for n in there if n in asked],
-                                         carries=manoeuvre.payload))  # fmt: skip
-            except DiagnoseError:
-                models.append(None)
-        return models
-
-    return simulate
+    whole = getattr(model, "whole", model)
+    if isinstance(whole, ThrowModel):
+        return _of_throw(whole, diagnosis, seed), lambda manoeuvre: manoeuvre
+    if isinstance(whole, FlyerModel) and made is not None:
+        return _of_flyer(whole, diagnosis, made, seed), lambda manoeuvre: carried(manoeuvre, whole.params)
+    raise DiagnoseError("manoeuvres are flown by a vehicle; a plan needs the model of the throw, or of a quadrotor with or without payload")
 
 
-def swing(log: FlightLog) -> float:
-    """Largest angle between the rope and the rotors' axis while the payload hangs [deg]; nan where it was not followed."""
-    from scipy.spatial.transform import Rotation
+def _of_throw(model: ThrowModel, diagnosis: Diagnosis, seed: int) -> Simulate:
+    noise, asked = _sensor_noise(diagnosis), {e.name for e in model.effects}
+    plant = apply(model.entries, model.setting, diagnosis.theta).plant
 
-    asked = log["release_command"]
-    held = log["pos_w"].time < np.min(asked.time[asked.values > 0.5], initial=np.inf)
-    hangs = log["payload_pos_w"].values[held] - log["pos_w"].values[held]
-    axis = Rotation.from_quat(log["quat_wb"].values[held]).apply([0.0, 0.0, -1.0])
-    cosine = np.einsum("ni,ni->n", hangs, axis) / np.linalg.norm(hangs, axis=1)
-    return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))).max())
+    def own(flight: "Flight") -> Model:
+        log, carries = flight.log(noise), flight.manoeuvre.payload
+        there = effects_for(model.setting, set(log.channels), carries, np.isfinite(flight.manoeuvre.release))
+        return ThrowModel([log], model.setting.plant, sensing=model.setting.sensing, device=model.device,
+                          substep=COARSE * model.substep, only=[n for n in there if n in asked], carries=carries)  # fmt: skip
+
+    return lambda manoeuvres: [flight.simulated(own) for flight in fly(plant, manoeuvres, seed, model.device)]
+
+
+def _of_flyer(model: FlyerModel, diagnosis: Diagnosis, made: Callable[[Sequence[FlightLog]], Model], seed: int) -> Simulate:
+    from visthrow import config
+    from visthrow.task import Experiment, plant_of
+
+    plant = vehicle_of(model.params, plant_of(config.load(Experiment, config.find("train", "state"))))
+    noise, extra = _sensor_noise(diagnosis), ("battery_voltage",) * model.has_voltage
+
+    def own(flight: "Flight") -> Model:
+        return made([flight.setup_log(model.params, noise, extra)])
+
+    return lambda manoeuvres: [flight.simulated(own) for flight in fly(plant, manoeuvres, seed)]
+
+
+def carried(manoeuvre: Manoeuvre, params: FlyerParams) -> Manoeuvre | None:
+    """The manoeuvre with what a setup's vehicle carries; None where it would have to drop it."""
+    carries = params.cable is not None
+    if np.isfinite(manoeuvre.release) or (carries and not manoeuvre.payload):
+        return None
+    return replace(manoeuvre, payload=carries)
+
+
+def vehicle_of(params: FlyerParams, known: PlantParams) -> PlantParams:
+    """Plant of a setup's vehicle: a known one made to its mass, at equal Froude number, with the numbers that the setup tells."""
+    ratio = known.vehicle.body.mass / params.mass
+    alike = Units(ratio ** (1 / 3), ratio)
+    v, rope = in_units(known.vehicle, alike), in_units(known.rope, alike)
+    still = {f.name: 0.0 for f in fields(v.aero) if f.name != "kind"}
+    aero = replace(v.aero, **{**still, "drag_x": params.drag_xy, "drag_y": params.drag_xy, "drag_z": params.drag_z})
+    v = replace(v, body=replace(v.body, mass=params.mass), queue=replace(v.queue, delay=params.command_delay), aero=aero,
+                motor=replace(v.motor, time_constant=params.motor_time_constant))  # fmt: skip
+    if params.cable is not None:
+        rope = replace(rope, length=params.cable.length - rope.payload_offset, payload_mass=params.cable.mass, mount=(0.0, 0.0, 0.0))
+    return replace(known, vehicle=v, rope=rope)
 
 
 def _sensor_noise(diagnosis: Diagnosis) -> dict[str, float]:
@@ -87,43 +138,121 @@ def _sensor_noise(diagnosis: Diagnosis) -> dict[str, float]:
     return out
 
 
-def fly(
-    model: ThrowModel, theta: Mapping[str, float], manoeuvres: Sequence[Manoeuvre], noise: dict[str, float], seed: int
-) -> list[FlightLog]:
-    """Fly all manoeuvres at once in the plant of the model and record poses with noise.
+@dataclass(frozen=True)
+class Flight:
+    """What the simulator tells of one manoeuvre; arrays of :data:`SAMPLED`, without noise, every ``SAMPLE_PERIOD``."""
+
+    manoeuvre: Manoeuvre
+    reference: Reference
+    plant: PlantParams
+    truth: Mapping[str, np.ndarray]
+    commands: np.ndarray  # [N, rad/s], shape (rows of the reference, 4)
+    rng: np.random.Generator
+
+    @property
+    def time(self) -> np.ndarray:
+        """Of the samples [s]."""
+        return SAMPLE_PERIOD * np.arange(len(self.truth["pos_w"]))
+
+    def simulated(self, own: Callable[["Flight"], Model]) -> Simulated:
+        """Say how near it came to being aborted, and give it the model that ``own`` makes of it if it was not."""
+        places = self.truth["pos_w"][:: round(PERIOD / SAMPLE_PERIOD)]
+        used = max(self.swing / HIGHEST, float(np.linalg.norm(places - self.reference.pos_w, axis=1).max()) / ASTRAY)
+        used = min(used, LOST) if np.isfinite(used) else LOST
+        try:
+            return Simulated(own(self) if used < 1.0 else None, used)
+        except (DiagnoseError, LogError):
+            return Simulated(None, used)
+
+    @property
+    def swing(self) -> float:
+        """Largest angle between the rope and the rotors' axis while the payload hangs [deg]; 0 without payload."""
+        if not self.manoeuvre.payload:
+            return 0.0
+        held = self.time < np.min(self.reference.time[self.reference.release], initial=np.inf)
+        hangs = (self.truth["payload_pos_w"] - self.truth["pos_w"])[held]
+        along = -matrix_of_quat(self.truth["quat_wb"][held])[:, :, 2]
+        cosine = np.einsum("ni,ni->n", hangs, along) / np.linalg.norm(hangs, axis=1)
+        return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))).max())
+
+    def log(self, noise: Mapping[str, float]) -> FlightLog:
+        """As the throw's logs are: poses from motion capture, commands as sent."""
+        poses = {name: self.truth[name] for name in ("pos_w", "payload_pos_w", "quat_wb")}
+        seen = mocap.measured(poses, {"payload_pos_w": noise["pos_w"], **noise}, self.rng)
+        channels = {
+            "pos_w": Channel(self.time, seen["pos_w"], "m", "world"), "quat_wb": Channel(self.time, seen["quat_wb"], "1", "world"),
+            "command": Channel(self.reference.time, self.commands, "N, rad/s", "body"),
+        }  # fmt: skip
+        if self.manoeuvre.payload:
+            channels["payload_pos_w"] = Channel(self.time, seen["payload_pos_w"], "m", "world")
+            channels["release_command"] = Channel(self.reference.time, self.reference.release.astype(float), "1")
+        return FlightLog(channels, {"period": PERIOD})
+
+    def setup_log(self, params: FlyerParams, noise: Mapping[str, float], extra: Sequence[str] = ()) -> FlightLog:
+        """As the logs of a setup are: its own names, inputs through its map of thrust, and what an IMU on board tells."""
+        truth, time = self.truth, self.time
+        force_w = np.gradient(truth["vel_w"], SAMPLE_PERIOD, axis=0) + [0.0, 0.0, GRAVITY]
+        volts = params.reference_voltage * truth["voltage"] / self.plant.vehicle.battery.reference_voltage
+        seen = {params.position: truth["pos_w"], "payload_pos_w": truth["payload_pos_w"], "rate_b": truth["rate_b"]}
+        channels = {name: Channel(time, values + noise.get(name, 0.0) * self.rng.standard_normal(values.shape), unit, frame)
+                    for (name, values), unit, frame in zip(seen.items(), ("m", "m", "rad/s"), ("world", "world", "body"))}  # fmt: skip
+        channels |= {
+            params.attitude: Channel(time, truth["quat_wb"], "1", "world"), params.input: self._input(params),
+            "acc_b": Channel(time, np.einsum("nji,nj->ni", matrix_of_quat(truth["quat_wb"]), force_w), "m/s^2", "body"),
+            "battery_voltage": Channel(time, volts, "V"),
+        }  # fmt: skip
+        absent = {"battery_voltage"} - set(extra) | (set() if self.manoeuvre.payload else {"payload_pos_w"})
+        return FlightLog({name: channel for name, channel in channels.items() if name not in absent}, {})
+
+    def _input(self, params: FlyerParams) -> Channel:
+        """What a setup's log holds as the input: the map of thrust, the lag and the delay inverted."""
+        if params.input in ("command", "thrust_command"):
+            told = command_of(params.thrust_map, self.commands[:, :1])
+            values = np.hstack((told, self.commands[:, 1:])) if params.input == "command" else told
+            return Channel(self.reference.time, values, "N, rad/s" if params.input == "command" else "N")
+        thrust = self.plant.vehicle.thrust.k_f * self.truth["motor_speed"] ** 2
+        wanted = thrust + params.motor_time_constant * np.gradient(thrust, SAMPLE_PERIOD, axis=0)
+        return Channel(self.time - params.command_delay, command_of(params.thrust_map, wanted), "1")
+
+
+def fly(plant: PlantParams, manoeuvres: Sequence[Manoeuvre], seed: int, device: str = "cpu") -> list[Flight]:
+    """Fly all manoeuvres at once; those without payload drop it first.
 
     Args:
-        model: for the plant.
-        theta: sizes of the effects in the plant that flies.
-        manoeuvres: to fly; those without payload drop it first.
-        noise: deviation by channel [m; rad].
-        seed: of the noise.
+        plant: that flies.
+        manoeuvres: to fly.
+        seed: of the noise that is added later.
+        device: of the simulator.
     """
     from sim.hybrid import HybridSim
 
     references = [m.reference() for m in manoeuvres]
-    plant = apply(model.entries, model.setting, theta).plant
     plant = replace(plant, sim=replace(plant.sim, control_period=SAMPLE_PERIOD))
-    sim = HybridSim(plant, len(references), model.device)
+    sim = HybridSim(plant, len(references), device)
     start = np.array([r.pos_w[0] for r in references])
     sim.place(start)
-    carried = np.array([m.payload for m in manoeuvres])
-    pilot = _Pilot(sim, references, carried, plant.total_mass, plant.vehicle.body.mass)
+    pilot = _Pilot(sim, plant, references, np.array([m.payload for m in manoeuvres]))
     for _ in range(round(AWAY / PERIOD)):
         pilot.step(None)
-    rows = max(len(r.time) for r in references)
-    sampled = [pilot.step(i) for i in range(rows)]
-    return [_recorded(r, m, e, pilot, sampled, noise, np.random.default_rng([seed, e]))
-            for e, (r, m) in enumerate(zip(references, manoeuvres))]  # fmt: skip
+    sampled = [pilot.step(i) for i in range(max(len(r.time) for r in references))]
+    flights = []
+    for e, (r, m) in enumerate(zip(references, manoeuvres)):
+        rows = len(r.time)
+        truth = {name: np.concatenate([s[name][:, e] for s in sampled[:rows]]) for name in SAMPLED}
+        commands = np.array([row[e] for row in pilot.sent[:rows]])
+        flights.append(Flight(m, r, plant, truth, commands, np.random.default_rng([seed, e])))
+    return flights
 
 
 class _Pilot:
     """Follows the references and keeps what it sent."""
 
-    def __init__(self, sim, references: Sequence[Reference], carried: np.ndarray, loaded: float, bare: float) -> None:
-        self.sim, self.references, self.carried = sim, references, carried
-        self.loaded, self.bare = loaded, bare
-        self.controller = HoverController(TRACKING, PERIOD, len(references))
+    def __init__(self, sim, plant: PlantParams, references: Sequence[Reference], carried: np.ndarray) -> None:
+        self.sim, self.references = sim, references
+        self.loaded, self.bare = plant.total_mass, plant.vehicle.body.mass
+        motors = plant.vehicle.controller
+        limits = replace(TRACKING, min_thrust=4.0 * motors.min_thrust, max_thrust=4.0 * motors.max_thrust)
+        self.controller = HoverController(limits, PERIOD, len(references))
         self.sent: list[np.ndarray] = []
         self.let_go = ~carried
 
@@ -131,7 +260,7 @@ class _Pilot:
         """Send one command and hold it for a period; without a row, hover where the reference begins.
 
         Returns:
-            Samples of the period: ``pos_w`` (S, E, 3), ``quat_wb``, ``payload_pos_w``.
+            Samples of the period: :data:`SAMPLED`, shape (S, E, ...).
         """
         at = [min(row or 0, len(r.time) - 1) for r in self.references]
         place, speed, push = (np.array([getattr(r, name)[i] for r, i in zip(self.references, at)])
@@ -148,19 +277,9 @@ class _Pilot:
             self.let_go = self.let_go | np.array([r.release[i] for r, i in zip(self.references, at)])
             self.sent.append(command)
         self.sim.set_command(command, self.let_go)
-        samples: dict[str, list[np.ndarray]] = {"pos_w": [], "quat_wb": [], "payload_pos_w": []}
+        samples: dict[str, list[np.ndarray]] = {name: [] for name in SAMPLED}
         for _ in range(round(PERIOD / SAMPLE_PERIOD)):
             for name, values in samples.items():
                 values.append(self.sim.get(name).astype(float))
             self.sim.step()
         return {name: np.array(values) for name, values in samples.items()}
-
-
-def _recorded(reference: Reference, manoeuvre: Manoeuvre, e: int, pilot: _Pilot, sampled, noise: dict[str, float],
-              rng: np.random.Generator) -> FlightLog:  # fmt: skip
-    rows = len(reference.time)
-    flown = {name: np.concatenate([s[name][:, e] for s in sampled[:rows]]) for name in ("pos_w", "payload_pos_w", "quat_wb")}
-    flown = mocap.measured(flown, {"payload_pos_w": noise["pos_w"], **noise}, rng)
-    flown["time"] = SAMPLE_PERIOD * np.arange(len(flown["pos_w"]))
-    commands = np.array([row[e] for row in pilot.sent[:rows]])
-    return log_of(reference, flown, commands, payload=manoeuvre.payload)

@@ -83,7 +83,7 @@ class Manoeuvre:
         return Reference(time, self.path(inner), self.yaw(inner), rates, thrust, time - SETTLE >= self.release)
 
 
-def _rise(t: np.ndarray, begin: float, length: float) -> np.ndarray:
+def rise(t: np.ndarray, begin: float, length: float) -> np.ndarray:
     """From 0 to 1 with speed and acceleration 0 at both ends."""
     s = np.clip((t - begin) / length, 0.0, 1.0)
     return s**3 * (10.0 + s * (-15.0 + 6.0 * s))
@@ -103,7 +103,7 @@ def _passes(length: float, speeds: tuple[float, ...]) -> tuple[Callable[[np.ndar
     def along(t: np.ndarray) -> np.ndarray:
         value, begin, forth = np.zeros_like(t), 0.0, 1.0
         for speed in speeds:
-            value += forth * length * _rise(t, begin, length / speed)
+            value += forth * length * rise(t, begin, length / speed)
             begin, forth = begin + length / speed + 1.0, -forth
         return value - 0.5 * length
 
@@ -130,11 +130,11 @@ def _steps(t: np.ndarray) -> np.ndarray:
 
 
 def _sideways_step(t: np.ndarray) -> np.ndarray:
-    return 0.35 * _rise(t, 0.0, 0.8)
+    return 0.35 * rise(t, 0.0, 0.8)
 
 
 def _risen(t: np.ndarray, begin: float, length: float) -> np.ndarray:
-    """Integral of :func:`_rise` over time."""
+    """Integral of :func:`rise` over time."""
     s = np.clip((t - begin) / length, 0.0, 1.0)
     return length * s**4 * (2.5 + s * (-3.0 + s)) + np.maximum(t - begin - length, 0.0)
 
@@ -143,20 +143,20 @@ def _stop(t: np.ndarray) -> np.ndarray:
     """Gather 1.5 m/s over 1.6 s, stop within 0.3 s, come back slowly: from this speed the rope stays taut."""
     far = 1.5 * 0.5 * (1.6 + 0.3)
     there = 1.5 * (_risen(t, 0.0, 1.6) - _risen(t, 1.6, 0.3))
-    return there - far * _rise(t, 3.9, 2.5) - 0.5 * far
+    return there - far * rise(t, 3.9, 2.5) - 0.5 * far
 
 
 def _run(speed: float) -> Callable[[np.ndarray], np.ndarray]:
-    return lambda t: RUN * _rise(t, 0.0, RUN * 1.875 / speed) - 0.5 * RUN
+    return lambda t: RUN * rise(t, 0.0, RUN * 1.875 / speed) - 0.5 * RUN
 
 
 def _round(t: np.ndarray) -> np.ndarray:
     """Angle of two turns in eight seconds."""
-    return 4.0 * np.pi * _rise(t, 0.0, 8.0)
+    return 4.0 * np.pi * rise(t, 0.0, 8.0)
 
 
 def _turns(t: np.ndarray) -> np.ndarray:
-    return 0.5 * np.pi * sum(_rise(t, 2.0 + 3.0 * i, 1.0) for i in range(4))
+    return 0.5 * np.pi * sum(rise(t, 2.0 + 3.0 * i, 1.0) for i in range(4))
 
 
 def catalogue() -> tuple[Manoeuvre, ...]:
@@ -172,10 +172,10 @@ def catalogue() -> tuple[Manoeuvre, ...]:
         Manoeuvre("hover", "thrust against weight, battery, frame against gravity", 8.0, _at()),
         Manoeuvre("hover without payload", "thrust against the vehicle's weight alone", 7.0, _at(), payload=False),
         Manoeuvre("hover low without payload", "ground effect", 11.0,
-                  _at(z=lambda t: 0.6 - 0.3 * _rise(t, 0.0, 1.5) - 0.15 * _rise(t, 4.0, 1.0) - 0.04 * _rise(t, 6.5, 0.7)),
+                  _at(z=lambda t: 0.6 - 0.3 * rise(t, 0.0, 1.5) - 0.15 * rise(t, 4.0, 1.0) - 0.04 * rise(t, 6.5, 0.7)),
                   payload=False),
         Manoeuvre("vertical sine", "drag and inflow along the rotors' axis, delay against clock", 8.0,
-                  _at(z=lambda t: HEIGHT + 0.25 * np.sin(2 * np.pi * 0.8 * t) * _rise(t, 0.0, 1.0) * (1.0 - _rise(t, 5.0, 1.0)))),
+                  _at(z=lambda t: HEIGHT + 0.25 * np.sin(2 * np.pi * 0.8 * t) * rise(t, 0.0, 1.0) * (1.0 - rise(t, 5.0, 1.0)))),
         Manoeuvre("thrust steps", "motor lag, thrust curve", 8.0, _at(), thrust=_steps),
         Manoeuvre("rate doublets", "motor lag, rate controller, inertia, delay", 8.0, _at(), rates=_doublets(3.0, 0.08)),
         Manoeuvre("yaw turns", "centre of mass and markers (turn along) against frame and wind (stay)", 16.0, _at(), yaw=_turns),

@@ -16,10 +16,9 @@ from visthrow.diagnose.likelihood.evidence import STRONG, Priors, covariance, lo
 from visthrow.diagnose.likelihood.marginal import Noise, correlated, gram_of
 from visthrow.diagnose.likelihood.stack import integrals
 from visthrow.diagnose.models.interface import LATENT_BLOCKS, Model
-from visthrow.diagnose.planning.manoeuvres import PERIOD, Manoeuvre, Reference
+from visthrow.diagnose.planning.manoeuvres import Manoeuvre
 from visthrow.diagnose.select import result
 from visthrow.diagnose.select.result import Diagnosis
-from visthrow.logs.flightlog import Channel, FlightLog
 
 DECISIVE = 11.0
 """Expected nats that tell two members of a class apart: those that come scatter with twice their mean as variance, and exceed
@@ -59,42 +58,73 @@ def unclear(diagnosis: Diagnosis) -> list[str]:
     return [f.name for f in diagnosis.findings if f.verdict == result.NOT_IDENTIFIABLE]
 
 
-def propose(
-    diagnosis: Diagnosis, manoeuvres: Sequence[Manoeuvre], simulate: Callable[[Sequence[Manoeuvre]], Sequence[Model | None]],
-    about: Sequence[str] = (),
-) -> list[Proposal]:  # fmt: skip
+class Aim:
+    """What the flights to come are to settle, and what the information of one is worth for that."""
+
+    def __init__(self, diagnosis: Diagnosis, about: Sequence[str] = ()) -> None:
+        """Take the classes to be separated, or else what could not be identified, or else every effect that can be seen.
+
+        Args:
+            diagnosis: of the flights at hand.
+            about: names of the effects to plan for; empty for all.
+
+        Raises:
+            DiagnoseError: An effect that the diagnosis does not know.
+        """
+        work = diagnosis.work
+        self.diagnosis, self.base, self.priors = diagnosis, work.after, work.problem.priors
+        self.names = [e.name for e in work.problem.model.effects]
+        for name in about:
+            if name not in self.names:
+                raise DiagnoseError(f"no effect '{name}' in this diagnosis; {suggest(name, self.names)}")
+        number = self.names.index
+        self.pairs = [(number(a), number(b)) for a, b in pairs_of(diagnosis) if not about or {a, b} & set(about)]
+        graded = [e.name for e, seen in zip(work.problem.model.effects, self.priors.visible) if seen and not e.switch]
+        self.vague = [] if self.pairs else [number(name) for name in about or unclear(diagnosis) or graded]
+
+    def information(self, model: Model) -> np.ndarray:
+        """Expected information of one simulated flight."""
+        return expected_information(model, self.diagnosis.theta, self.base.noise, self.names, self.priors)
+
+    def nats(self, new: np.ndarray) -> float:
+        """Expected nats between the members of the pair that is hardest, or the mean logarithm by which deviations shrink."""
+        if self.pairs:
+            return min(self._gap(pair, new) for pair in self.pairs)
+        return float(np.mean(np.log(self._deviations(0.0 * new) / self._deviations(new))))
+
+    def settled(self, new: np.ndarray) -> tuple[list[tuple[int, ...]], int]:
+        """Pairs apart, or effects that can be named, after the fewest flights that settle the most; and the number of these."""
+        if self.pairs:
+            return _most(lambda count: [pair for pair in self.pairs if self._gap(pair, count * new) > DECISIVE], len(self.pairs))
+        able = np.array([self.priors.slab[j] for j in self.vague]) * NAMEABLE
+        unknown = able < self._deviations(0.0 * new)
+        return _most(lambda count: [(j,) for j, shows in zip(self.vague, unknown & (self._deviations(count * new) < able)) if shows],
+                     len(self.vague))  # fmt: skip
+
+    def _gap(self, pair: tuple[int, int], new: np.ndarray) -> float:
+        return _gap(self.diagnosis, self.base.information, self.base.score, new, self.priors, pair)
+
+    def _deviations(self, new: np.ndarray) -> np.ndarray:
+        """Posterior deviation of each effect that is planned for, if it were named, with more information."""
+        total, active = self.base.information + new, self.diagnosis.work.active
+        return np.array([np.sqrt(covariance(total, self.priors.deviation([*active, j]))[j, j]) for j in self.vague])
+
+    def proposal(self, manoeuvre: Manoeuvre, new: np.ndarray) -> Proposal:
+        """What a manoeuvre of this information promises."""
+        separated, repeats = self.settled(new)
+        separates = tuple(tuple(self.names[j] for j in group) for group in separated)
+        return Proposal(manoeuvre.name, manoeuvre.purpose, manoeuvre.seconds, self.nats(new), separates, repeats,
+                        manoeuvre.reference().limits())  # fmt: skip
+
+
+def propose(aim: Aim, told: Sequence[tuple[Manoeuvre, np.ndarray]]) -> list[Proposal]:
     """Rank manoeuvres and measurements, best first.
 
     Args:
-        diagnosis: whose classes, or else whose effects that could not be identified, are to be separated.
-        manoeuvres: to choose among.
-        simulate: gives for each manoeuvre a model of its simulated flight with the same catalogue; None where it cannot be flown.
-        about: names of the effects to plan for; empty for all classes, or else all effects that the flights could not show.
-
-    Raises:
-        DiagnoseError: An effect that the diagnosis does not know.
+        aim: what is to be settled.
+        told: manoeuvres to choose among, and the expected information of each.
     """
-    work = diagnosis.work
-    names = [e.name for e in work.problem.model.effects]
-    for name in about:
-        if name not in names:
-            raise DiagnoseError(f"no effect '{name}' in this diagnosis; {suggest(name, names)}")
-    base, priors = work.after, work.problem.priors
-    pairs = [(names.index(a), names.index(b)) for a, b in pairs_of(diagnosis) if not about or {a, b} & set(about)]
-    vague = [names.index(name) for name in about or unclear(diagnosis)]
-    proposals = []
-    for manoeuvre, model in zip(manoeuvres, simulate(manoeuvres)):
-        if model is None:
-            continue
-        new = expected_information(model, diagnosis.theta, base.noise, names, priors)
-        if pairs:
-            nats, separated, repeats = _classes(diagnosis, new, pairs)
-        else:
-            nats, separated, repeats = _shrinking(base.information, new, priors, vague, work.active)
-        separates = tuple(tuple(names[j] for j in group) for group in separated)
-        proposals.append(Proposal(manoeuvre.name, manoeuvre.purpose, manoeuvre.seconds, nats, separates, repeats,
-                                  manoeuvre.reference().limits()))  # fmt: skip
-    return sorted([*proposals, *_measured(diagnosis, names, pairs)], key=_worth, reverse=True)
+    return sorted([*(aim.proposal(*each) for each in told), *_measured(aim)], key=_worth, reverse=True)
 
 
 def session(proposals: Sequence[Proposal]) -> tuple[Proposal, ...]:
@@ -112,8 +142,9 @@ def _worth(p: Proposal) -> tuple[float, float]:
     return len(p.separates) / np.sqrt(p.seconds * max(p.repeats, 1)), p.nats / np.sqrt(p.seconds)
 
 
-def _measured(diagnosis: Diagnosis, names: Sequence[str], pairs: Sequence[tuple[int, int]]) -> list[Proposal]:
+def _measured(aim: Aim) -> list[Proposal]:
     """Measurements on the ground that settle members of classes."""
+    diagnosis, names, pairs = aim.diagnosis, aim.names, aim.pairs
     findings = {f.name: f for f in diagnosis.findings}
     out = []
     for m in MEASUREMENTS:
@@ -191,17 +222,6 @@ def _gap(diagnosis: Diagnosis, information: np.ndarray, score: np.ndarray, new: 
     return float(min(gaps))
 
 
-def _classes(diagnosis: Diagnosis, new: np.ndarray, pairs: Sequence[tuple[int, int]]):
-    """Nats of the pair that is hardest, pairs apart after ``repeats`` flights, and that number."""
-    base, priors = diagnosis.work.after, diagnosis.work.problem.priors
-
-    def gaps(count: int) -> list[float]:
-        return [_gap(diagnosis, base.information, base.score, count * new, priors, pair) for pair in pairs]
-
-    apart = _most(lambda count: [pair for pair, gap in zip(pairs, gaps(count)) if gap > DECISIVE], len(pairs))
-    return float(min(gaps(1))), *apart
-
-
 def _most(settled: Callable[[int], list], all_of_them: int) -> tuple[list, int]:
     """What the fewest flights settle that settle the most, and their number."""
     best: tuple[list, int] = [], 0
@@ -212,24 +232,6 @@ def _most(settled: Callable[[int], list], all_of_them: int) -> tuple[list, int]:
         if len(best[0]) == all_of_them:
             break
     return best
-
-
-def _shrinking(information: np.ndarray, new: np.ndarray, priors: Priors, vague: Sequence[int], active: Sequence[int]):
-    """Mean logarithm by which the deviations of effects shrink, those that can then be named, and the number of flights."""
-
-    def deviations(total: np.ndarray) -> np.ndarray:
-        return np.array([np.sqrt(covariance(total, priors.deviation([*active, j]))[j, j]) for j in vague])
-
-    if not vague:
-        return 0.0, [], 0
-    before, once = deviations(information), deviations(information + new)
-    able = np.array([priors.slab[j] for j in vague]) * NAMEABLE
-
-    def shown(count: int) -> list[tuple[int]]:
-        after = deviations(information + count * new)
-        return [(j,) for j, shows in zip(vague, (after < able) & (able < before)) if shows]
-
-    return float(np.mean(np.log(before / once))), *_most(shown, len(vague))
 
 
 def write_references(folder: str | Path, manoeuvres: Sequence[Manoeuvre], proposals: Sequence[Proposal]) -> list[Proposal]:
@@ -245,23 +247,3 @@ def write_references(folder: str | Path, manoeuvres: Sequence[Manoeuvre], propos
         atomic_write(Path(folder) / name, by_name[p.name].reference().csv())
         written.append(replace(p, reference=name))
     return written
-
-
-def log_of(reference: Reference, sampled: Mapping[str, np.ndarray], commands: np.ndarray, *, payload: bool) -> FlightLog:
-    """A simulated flight as a log: poses as sampled, commands as sent.
-
-    Args:
-        reference: whose stamps the commands have.
-        sampled: ``time``, ``pos_w``, ``quat_wb`` and, with a payload, ``payload_pos_w``.
-        commands: [N, rad/s], shape (N, 4).
-        payload: whether it is carried.
-    """
-    time = sampled["time"]
-    channels = {
-        "pos_w": Channel(time, sampled["pos_w"], "m", "world"), "quat_wb": Channel(time, sampled["quat_wb"], "1", "world"),
-        "command": Channel(reference.time, commands, "N, rad/s", "body"),
-    }  # fmt: skip
-    if payload:
-        channels["payload_pos_w"] = Channel(time, sampled["payload_pos_w"], "m", "world")
-        channels["release_command"] = Channel(reference.time, reference.release.astype(float), "1")
-    return FlightLog(channels, {"period": PERIOD})

@@ -1,6 +1,6 @@
 """Pictures of a diagnosis, in the style of :mod:`visthrow.common.style`; each function returns a PNG."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -9,6 +9,7 @@ from visthrow.diagnose.likelihood.evidence import covariance
 from visthrow.diagnose.likelihood.forms import READABLE, unit_of
 from visthrow.diagnose.likelihood.marginal import Noise
 from visthrow.diagnose.models.interface import Window
+from visthrow.diagnose.planning.manoeuvres import Manoeuvre
 from visthrow.diagnose.reporting.blind import Blind
 from visthrow.diagnose.reporting.gain import Gain
 from visthrow.diagnose.reporting.landing_gain import LandingGain
@@ -67,6 +68,32 @@ def left_over(window: Window, noise: Noise) -> np.ndarray:
     normal = states.T @ states + np.eye(states.shape[1])
     fitted = np.linalg.solve(normal, states.T @ (window.residual * weight))
     return window.residual - window.nuisance * window.nuisance_sd @ fitted
+
+
+def planned(base: Manoeuvre, found: Manoeuvre, rates: Mapping[str, float]) -> bytes:
+    """What an optimised manoeuvre lays over the one that it began with, and what each manoeuvre promises.
+
+    Args:
+        base: manoeuvre that it began with.
+        found: the optimised one.
+        rates: expected nats a second of manoeuvres by their name.
+    """
+    rows = {"x [m]": lambda r: r.pos_w[:, 0], "y [m]": lambda r: r.pos_w[:, 1], "z [m]": lambda r: r.pos_w[:, 2],
+            "heading [deg]": lambda r: np.degrees(r.yaw), "thrust [%]": lambda r: 100.0 * (r.thrust_factor - 1.0),
+            "rate x [rad/s]": lambda r: r.rates_b[:, 0], "rate y [rad/s]": lambda r: r.rates_b[:, 1],
+            "rate z [rad/s]": lambda r: r.rates_b[:, 2]}  # fmt: skip
+    figure, axes = _figure(3, 3, 6.0)
+    for axis, (label, value) in zip(axes.flat, rows.items()):
+        for manoeuvre, colour in ((base, BEFORE), (found, AFTER)):
+            reference = manoeuvre.reference()
+            axis.plot(reference.time, value(reference), color=colour, lw=1.0, label=manoeuvre.name)
+        axis.set(ylabel=label, xlabel="time [s]")
+    axes[0, 0].legend(loc="lower left", fontsize=6)
+    best = sorted(rates, key=rates.get)[-6:]
+    axes[2, 2].barh(best, [rates[name] for name in best], color=[AFTER if name == found.name else BEFORE for name in best])
+    axes[2, 2].tick_params(axis="y", labelsize=6)
+    axes[2, 2].set(xlabel="expected nats a second")
+    return png_of(figure)
 
 
 def residuals(work: Work, channel: int) -> bytes:

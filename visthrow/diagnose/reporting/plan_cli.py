@@ -1,4 +1,4 @@
-"""``visthrow diagnose plan``: which manoeuvre separates what could not be separated, with its reference to fly."""
+"""``visthrow diagnose plan``: the flight that tells most of what could not be told, with its reference to fly."""
 
 import argparse
 from pathlib import Path
@@ -14,56 +14,89 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "examples:\n"
         "  visthrow diagnose plan flights/*.npz                                the next flight after these\n"
         "  visthrow diagnose plan flights/*.npz --about ground_effect          what would show this effect\n"
-        "  visthrow diagnose plan flights/*.npz --manoeuvres hover,circle      choose among some\n"
+        "  visthrow diagnose plan flights/*.npz --hall 4,3,2.5 --speed 2       in a small hall\n"
+        "  visthrow diagnose plan log*.csv --config cf_payload --steps 0   only rank the manoeuvres that there are\n"
     )
     shared(parser)
     parser.add_argument("--manoeuvres", metavar="NAMES", help="choose among these, by commas; default all")
     parser.add_argument("--about", metavar="NAMES", default="", help="plan for these effects, by commas; default: all unclear ones")
+    parser.add_argument("--steps", type=int, default=6, help="generations of the optimiser; 0: only rank manoeuvres (default: 6)")
+    parser.add_argument("--hall", metavar="X,Y,Z", default="5,5,2.6", help="room that the path stays in [m] (default: 5,5,2.6)")
+    parser.add_argument("--speed", type=float, default=3.0, help="of the vehicle at most [m/s] (default: 3)")
     add_out(parser, "out/plan", "of references and JSON")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Search, simulate the manoeuvres, rank, write."""
+    """Search, simulate the manoeuvres, optimise, rank, write."""
     import dataclasses
 
-    from visthrow.common.errors import DiagnoseError, suggest
-    from visthrow.common.storage import write_json
-    from visthrow.diagnose.inputs import opening
-    from visthrow.diagnose.planning import excitation, manoeuvres, plan
+    from visthrow.common.errors import DiagnoseError
+    from visthrow.common.storage import atomic_write, write_json
+    from visthrow.diagnose.inputs import opening, setup
+    from visthrow.diagnose.planning import design, excitation, plan
     from visthrow.diagnose.planning.fly_manoeuvres import simulator_of
-    from visthrow.diagnose.reporting import report
+    from visthrow.diagnose.reporting import pictures, report
     from visthrow.diagnose.select import search
-    from visthrow.diagnose.throw.throw_model import ThrowModel
 
     model, _ = opening.open_model(args)
-    if not isinstance(model, ThrowModel):
-        raise DiagnoseError("manoeuvres are flown by the vehicle; a plan needs the model of the throw, not of a setup")
-    known = {m.name: m for m in manoeuvres.catalogue()}
-    chosen = args.manoeuvres.split(",") if args.manoeuvres else list(known)
-    for name in chosen:
-        if name not in known:
-            raise DiagnoseError(f"no manoeuvre '{name}'; {suggest(name, known)}")
+    limits = _limits(args)
     diagnosis = search.explain(model, seed=args.seed, without=opening.numbers(args.without), laws=False)
     print(report.summary(diagnosis) + "\n")
     if diagnosis.work is None:
         raise DiagnoseError(f"{diagnosis.overall}: {'; '.join(diagnosis.reasons)}")
-    flights = [known[name] for name in chosen]
-    about = tuple(name for name in args.about.split(",") if name)
-    ranked = plan.propose(diagnosis, flights, simulator_of(model, diagnosis, seed=args.seed), about)
-    ranked = plan.write_references(args.out, flights, ranked)
-    print(f"{'manoeuvre or measurement':28} {'seconds':>7} {'nats':>8} {'times':>7}  separates")
-    for p in ranked:
-        separates = "; ".join(" from ".join(group) for group in p.separates) or "-"
-        print(f"{p.name:28} {p.seconds:7.1f} {p.nats:8.1f} {p.repeats or '-':>7}  {separates}")
+    aim = plan.Aim(diagnosis, tuple(name for name in args.about.split(",") if name))
+    simulate, flown = simulator_of(model, diagnosis, lambda logs: setup.model_of(setup.load(args.config), logs), seed=args.seed)
+    manoeuvres = [m for m in map(flown, _chosen(args.manoeuvres)) if m is not None]
+    told = [(m, aim.information(s.model)) for m, s in zip(manoeuvres, simulate(manoeuvres)) if s.model is not None]
+    found = None
+    if told and args.steps > 0:
+        base = max(told, key=lambda each: aim.nats(each[1]) / each[0].seconds)[0]
+        found = design.optimise(aim, base, simulate, limits, seed=args.seed, steps=args.steps, progress=print)
+    if found:
+        told.append((found.manoeuvre, found.information))
+        rates = {m.name: aim.nats(information) / m.seconds for m, information in told}
+        atomic_write(Path(args.out) / "plan.png", pictures.planned(found.base, found.manoeuvre, rates))
+    ranked = plan.write_references(args.out, [m for m, _ in told], plan.propose(aim, told))
+    _print(ranked)
     session = plan.session(ranked)
     if session:
         print(f"together they settle the most: {', '.join(p.name + f' x{p.repeats}' * (p.repeats > 1) for p in session)}")
-    value = report.to_json(
-        diagnosis, extra={"proposals": [dataclasses.asdict(p) for p in ranked], "session": [p.name for p in session]}
-    )
+    extra = {"proposals": [dataclasses.asdict(p) for p in ranked], "session": [p.name for p in session],
+             "optimised": found.said() if found else None}  # fmt: skip
+    value = report.to_json(diagnosis, extra=extra)
     write_json(Path(args.out) / "plan.json", value)
     print(f"references as CSV: {args.out}")
     print(f"sweeps that autopilots fly by themselves: {', '.join(path.name for path in excitation.write(args.out))}")
     if args.json:
         write_json(args.json, value)
     return 0
+
+
+def _limits(args: argparse.Namespace):
+    from visthrow.common.errors import DiagnoseError
+    from visthrow.diagnose.planning.design import Limits
+
+    try:
+        x, y, z = (float(part) for part in args.hall.split(","))
+    except ValueError as error:
+        raise DiagnoseError(f"--hall {args.hall}: expected three lengths in metres between commas, such as 5,5,2.6") from error
+    return Limits(half=(0.5 * x, 0.5 * y), highest=z, speed=args.speed)
+
+
+def _chosen(names: str | None):
+    from visthrow.common.errors import DiagnoseError, suggest
+    from visthrow.diagnose.planning import manoeuvres
+
+    known = {m.name: m for m in manoeuvres.catalogue()}
+    chosen = names.split(",") if names else list(known)
+    for name in chosen:
+        if name not in known:
+            raise DiagnoseError(f"no manoeuvre '{name}'; {suggest(name, known)}")
+    return [known[name] for name in chosen]
+
+
+def _print(ranked) -> None:
+    print(f"{'manoeuvre or measurement':40} {'seconds':>7} {'nats':>8} {'a second':>8} {'times':>5}  separates")
+    for p in ranked:
+        separates = "; ".join(" from ".join(group) for group in p.separates) or "-"
+        print(f"{p.name:40} {p.seconds:7.1f} {p.nats:8.2f} {p.nats / p.seconds:8.3f} {p.repeats or '-':>5}  {separates}")

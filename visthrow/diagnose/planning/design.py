@@ -1,0 +1,252 @@
+"""Excitation that is optimised: sweeps laid over a manoeuvre, within limits, for the most expected nats a second.
+
+What is varied: how much of the manoeuvre is kept; a sweep of the path along each axis and one of the heading, from one frequency to
+another; sweeps that are added to rates and thrust, at frequencies that no path follows. A sweep moves as far at each of its frequencies as
+its share of the limits lets, and all are made smaller until the path keeps within them, so that every design does.
+
+The objective is that of :class:`visthrow.diagnose.planning.plan.Aim` for the Fisher information of the simulated flight, by the linearised
+model that the selection uses, over its seconds. The search is differential evolution from a Sobol sequence about the
+manoeuvre: where the rope goes slack, how near a flight comes to being aborted has no derivative. A generation's flights are one batch.
+
+Source: Bayesian optimal designs: Chaloner and Verdinelli 1995; inputs for flight vehicles: Morelli 2021, multisines.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.optimize import differential_evolution
+from scipy.stats import qmc
+
+from visthrow.common.errors import DiagnoseError
+from visthrow.diagnose.planning.fly_manoeuvres import Simulate, Simulated
+from visthrow.diagnose.planning.manoeuvres import PERIOD, SETTLE, Manoeuvre, rise
+from visthrow.diagnose.planning.plan import Aim
+
+SLOWEST, FASTEST = 0.08, 2.0
+"""Frequencies of a path's sweep [Hz]: once through the hall and back, and what a position loop still follows."""
+
+ADDED = 0.5, 12.0
+"""Frequencies of what is added to the commands [Hz]: above the position loop, up to a quarter of the rate of the reference's rows."""
+
+FADE = 1.0
+"""In which sweeps begin and end [s]."""
+
+YAW_RATE = 1.5
+"""Of the heading's sweep [rad/s]: within what the hover controller asks for."""
+
+HALVINGS = 20
+"""Of the interval of a share of the sweeps: to a millionth."""
+
+ABORTED = 1e3
+"""Cost of a flight that is aborted at the limit: above what any other costs [nats/s]."""
+
+NEAR = 0.5
+"""Way from the manoeuvre to the corners of the box of numbers that the first look goes at most: with all sweeps at once, few fly."""
+
+SCATTERED = 16
+"""Points of the first look, a power of 2 as a Sobol sequence wants it."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What vehicle and hall allow.
+
+    Raises:
+        DiagnoseError: one that is not above 0, or a ceiling below the floor.
+    """
+
+    half: tuple[float, float] = (2.5, 2.5)  # of the hall, from its middle, that the path stays in [m]
+    lowest: float = 0.8  # [m]
+    highest: float = 2.6  # [m]
+    speed: float = 3.0  # [m/s]
+    acceleration: float = 4.0  # [m/s^2]
+    rate: float = 3.0  # added to the body rates: that of the doublets, at which motors do not saturate [rad/s]
+    thrust: float = 0.4  # added to the thrust, as a share of it
+
+    def __post_init__(self) -> None:
+        if not (min(*self.half, self.speed, self.acceleration, self.rate, self.thrust) > 0.0 and self.highest > self.lowest > 0.0):
+            raise DiagnoseError(f"{self}: expected limits above 0, and a highest above the lowest")
+
+    def share(self, path: np.ndarray, more: np.ndarray) -> float:
+        """Largest share of a further way, 1 at most, that keeps a path within the limits; rows of both ``PERIOD`` apart, (N, 3)."""
+        inside, outside = 0.0, 2.0
+        for _ in range(HALVINGS):
+            tried = 0.5 * (inside + outside)
+            inside, outside = (tried, outside) if self._hold(path + tried * more) else (inside, tried)
+        return min(inside, 1.0)
+
+    def _hold(self, path: np.ndarray) -> bool:
+        low, high, (speed, acceleration) = path.min(0), path.max(0), _fastest(path)
+        level = np.maximum(-low, high)[:2] <= self.half
+        return bool(np.all(level) and self.lowest <= low[2] <= high[2] <= self.highest and speed <= self.speed
+                    and acceleration <= self.acceleration)  # fmt: skip
+
+    def around(self, path: np.ndarray) -> "Limits":
+        """Limits that hold a path that is known to be safe too."""
+        speed, acceleration = _fastest(path)
+        return replace(
+            self, half=tuple(np.maximum(self.half, np.abs(path[:, :2]).max(0)).tolist()), lowest=min(self.lowest, path[:, 2].min()),
+            highest=max(self.highest, path[:, 2].max()), speed=max(self.speed, speed), acceleration=max(self.acceleration, acceleration),
+        )  # fmt: skip
+
+
+def _fastest(path: np.ndarray) -> tuple[float, float]:
+    """Largest speed [m/s] and acceleration [m/s^2] of a path."""
+    vel = np.gradient(path, PERIOD, axis=0)
+    acc = np.gradient(vel, PERIOD, axis=0)
+    return float(np.linalg.norm(vel, axis=1).max()), float(np.linalg.norm(acc, axis=1).max())
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """A sine that runs from one frequency to another over a time and fades in and out."""
+
+    low: float  # [Hz]
+    high: float  # [Hz]
+    seconds: float
+    phase: float = 0.0  # at the start [rad]
+
+    def at(self, t: np.ndarray, most: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+        """Values at times after its start [s], with the amplitude that ``most`` gives for a frequency [Hz]."""
+        frequency = self.low + (self.high - self.low) * t / self.seconds
+        turned = 2.0 * np.pi * (self.low + 0.5 * (self.high - self.low) * t / self.seconds) * t
+        fade = rise(t, 0.0, FADE) * (1.0 - rise(t, self.seconds - FADE, FADE))
+        return most(frequency) * fade * np.sin(turned + self.phase)
+
+
+NUMBERS = ("kept", *(f"{what}_{axis}" for axis in ("x", "y", "z", "yaw") for what in ("share", "from", "to")),
+           "rate_x", "rate_y", "rate_z", "thrust", "added_to")  # fmt: skip
+"""What is varied, each from 0 to 1: shares of the limits, frequencies by their logarithm."""
+
+START = np.array([1.0, *(0.0, 0.3, 0.7) * 4, 0.0, 0.0, 0.0, 0.0, 0.7])
+"""The manoeuvre as it is."""
+
+
+def designed(base: Manoeuvre, limits: Limits, numbers: np.ndarray) -> Manoeuvre:
+    """Lay the sweeps of a vector of :data:`NUMBERS` over a manoeuvre."""
+    x = dict(zip(NUMBERS, np.clip(numbers, 0.0, 1.0).tolist()))
+    seconds = base.seconds - 2.0 * SETTLE
+    limits = limits.around(base.reference().pos_w)
+    middle = np.array([0.0, 0.0, base.path(np.zeros(1))[0, 2]])
+
+    def sweep(axis: str) -> Sweep:
+        low, high = (SLOWEST * (FASTEST / SLOWEST) ** x[f"{end}_{axis}"] for end in ("from", "to"))
+        return Sweep(low, high, seconds)
+
+    def farthest(reach: float, speed: float, acceleration: float) -> Callable[[np.ndarray], np.ndarray]:
+        return lambda f: np.minimum(np.minimum(reach, speed / (2.0 * np.pi * f)), acceleration / (2.0 * np.pi * f) ** 2)
+
+    reach = dict(zip("xyz", (*limits.half, 0.5 * (limits.highest - limits.lowest))))
+
+    def kept(t: np.ndarray) -> np.ndarray:
+        return middle + x["kept"] * (base.path(t) - middle)
+
+    def swept(t: np.ndarray) -> np.ndarray:
+        return np.column_stack([x[f"share_{axis}"] * sweep(axis).at(t, farthest(reach[axis], limits.speed, limits.acceleration))
+                                for axis in "xyz"])  # fmt: skip
+
+    rows = np.arange(0.0, seconds + 0.5 * PERIOD, PERIOD)
+    fitting = limits.share(kept(rows), swept(rows))
+    top = ADDED[0] * (ADDED[1] / ADDED[0]) ** x["added_to"]
+    added = [Sweep(ADDED[0], top, seconds, phase=2.0 * np.pi * i / 3.0) for i in range(3)]
+
+    def rates(t: np.ndarray) -> np.ndarray:
+        own = [limits.rate * x[f"rate_{axis}"] * s.at(t, np.ones_like) for axis, s in zip("xyz", added)]
+        return x["kept"] * base.rates(t) + np.column_stack(own)
+
+    return replace(
+        base, name=f"{base.name}, optimised", purpose="the most nats a second within the limits", rates=rates,
+        path=lambda t: kept(t) + fitting * swept(t),
+        yaw=lambda t: x["kept"] * base.yaw(t) + x["share_yaw"] * sweep("yaw").at(t, farthest(np.pi, YAW_RATE, np.inf)),
+        thrust=lambda t: 1.0 + x["kept"] * (base.thrust(t) - 1.0)
+        + limits.thrust * x["thrust"] * Sweep(top, ADDED[0], seconds).at(t, np.ones_like),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Design:
+    """What was found.
+
+    Attributes:
+        start: expected nats a second of the manoeuvre that it began with.
+        rate: the same of what was found.
+    """
+
+    base: Manoeuvre
+    manoeuvre: Manoeuvre
+    numbers: np.ndarray
+    information: np.ndarray
+    start: float
+    rate: float
+    flights: int  # simulated
+
+    def said(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "base": self.base.name, "manoeuvre": self.manoeuvre.name, "nats_a_second": self.rate, "of_the_base": self.start,
+            "flights": self.flights, "numbers": dict(zip(NUMBERS, self.numbers.tolist())),
+        }  # fmt: skip
+
+
+def optimise(aim: Aim, base: Manoeuvre, simulate: Simulate, limits: Limits, *, seed: int = 0, steps: int = 6,
+             progress: Callable[[str], None] = lambda text: None) -> Design | None:  # fmt: skip
+    """Find the sweeps over a manoeuvre that promise the most nats a second; None where nothing that was tried can be flown.
+
+    Args:
+        aim: what is to be settled.
+        base: manoeuvre to begin with.
+        simulate: flies manoeuvres in the simulator.
+        limits: of vehicle and hall.
+        seed: of the search.
+        steps: generations of the search, of as many flights as the first look.
+        progress: is told what was reached.
+    """
+    count = len(NUMBERS)
+    scattered = START + NEAR * (qmc.Sobol(count, seed=seed).random(SCATTERED) - START)
+    search = _Search(aim, base, simulate, limits)
+    start = search.costs(START[:, None])[0]
+
+    def generation(columns: np.ndarray) -> np.ndarray:
+        costs = search.costs(columns)
+        best = f"{search.best[0]:.3g} nats a second" if search.best else "nothing that can be flown"
+        progress(f"{search.flights} simulated flights: {best}")
+        return costs
+
+    differential_evolution(
+        generation, [(0.0, 1.0)] * count, init=np.vstack((START, scattered)), maxiter=steps, vectorized=True, updating="deferred",
+        strategy="currenttobest1bin", mutation=(0.3, 0.6), recombination=0.5, polish=False, seed=seed,
+    )  # fmt: skip
+    if search.best is None:
+        return None
+    rate, numbers, information = search.best
+    return Design(base, designed(base, limits, numbers), numbers, information, -float(start), rate, search.flights)
+
+
+class _Search:
+    """What designs cost, and the best that can be flown."""
+
+    def __init__(self, aim: Aim, base: Manoeuvre, simulate: Simulate, limits: Limits) -> None:
+        self.aim, self.base, self.simulate, self.limits = aim, base, simulate, limits
+        self.best: tuple[float, np.ndarray, np.ndarray] | None = None
+        self.flights = 0
+
+    def costs(self, columns: np.ndarray) -> np.ndarray:
+        """Less for more expected nats a second; of what would be aborted, more than of all others and the more the nearer to a crash.
+
+        Args:
+            columns: designs, shape (numbers, n).
+        """
+        self.flights += columns.shape[1]
+        simulated = self.simulate([designed(self.base, self.limits, x) for x in columns.T])
+        return np.array([self._cost(x, s) for x, s in zip(columns.T, simulated)])
+
+    def _cost(self, x: np.ndarray, simulated: Simulated) -> float:
+        if simulated.model is None:
+            return ABORTED * simulated.used
+        information = self.aim.information(simulated.model)
+        rate = self.aim.nats(information) / self.base.seconds
+        if self.best is None or rate > self.best[0]:
+            self.best = rate, x.copy(), information
+        return -rate
