@@ -11,12 +11,12 @@ from tests.diagnose import finding
 from visthrow.config.effects import catalogue
 
 SPOILT = {
-    "always NO EFFECT": lambda kinds: finding.blind,
-    "always the most common name": lambda kinds: finding.always(most_common(kinds)),
-    "reads file names": lambda kinds: finding.reader_of_file_names,
-    "takes two effects for each other": lambda kinds: finding.exchanged(kinds[0].hidden[0], kinds[1].hidden[0]),
+    "always NO EFFECT": lambda kinds, real: finding.blind,
+    "always the most common name": lambda kinds, real: finding.always(most_common(kinds)),
+    "reads file names": lambda kinds, real: finding.reader_of_file_names,
+    "takes two effects for each other": lambda kinds, real: finding.exchanged(kinds[0].hidden[0], kinds[1].hidden[0], real),
 }
-"""What is wrong with a tool -> it, made for these kinds of worlds."""
+"""What is wrong with a tool -> it, made for these kinds of worlds and from the real one."""
 
 
 def most_common(kinds) -> str:
@@ -32,15 +32,21 @@ def suite():
     return finding.kinds(np.random.default_rng(seed)), seed
 
 
-def test_what_is_hidden_is_found(suite):
-    finding.require(finding.explain, *suite)
+@pytest.fixture(scope="module")
+def real():
+    """The tool itself, which is asked once about the same logs."""
+    return finding.once(finding.explain)
+
+
+def test_what_is_hidden_is_found(suite, real):
+    finding.require(real, *suite)
 
 
 @pytest.mark.parametrize("name", list(SPOILT))
-def test_a_spoilt_tool_is_caught(name, suite):
+def test_a_spoilt_tool_is_caught(name, suite, real):
     kinds, seed = suite
     with pytest.raises(AssertionError, match="seed"):
-        finding.require(SPOILT[name](kinds), kinds, seed)
+        finding.require(SPOILT[name](kinds, real), kinds, seed)
 
 
 @pytest.mark.slow
