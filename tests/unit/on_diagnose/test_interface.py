@@ -80,8 +80,8 @@ def test_good_logs_and_logs_that_disagree_are_not_suspected():
     assert suspected(heavier, PLANT) == []
 
 
-def simulated(logs, mistakes):
-    return ThrowModel(logs, PLANT, only=["com_x"], mistakes=mistakes)
+def simulated(logs):
+    return ThrowModel(logs, PLANT, only=["com_x"])
 
 
 @pytest.mark.parametrize(("change", "names"), [("rate_axes", ["rate_axes", "rate_unit"]), ("", [])])

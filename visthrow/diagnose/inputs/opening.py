@@ -97,7 +97,7 @@ def throw_model(args: argparse.Namespace, logs: Sequence[FlightLog]) -> tuple[Mo
     known = {"sensing": experiment.sensing, "camera": experiment.camera, "device": resolve(args.device)}
     known |= {"only": only, "simpler": only is not None}
     plant = plant_of(experiment)
-    return put_right([log.measured() for log in logs], plant, lambda logs, mistakes: ThrowModel(logs, plant, mistakes=mistakes, **known))
+    return put_right([log.measured() for log in logs], plant, lambda logs: ThrowModel(logs, plant, **known))
 
 
 class _Part:

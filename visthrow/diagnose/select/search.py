@@ -78,17 +78,17 @@ def explain(
 
 
 def put_right(
-    logs: Sequence[FlightLog], plant: PlantParams, build: Callable[[Sequence[FlightLog], tuple[Mistake, ...]], Model]
+    logs: Sequence[FlightLog], plant: PlantParams, build: Callable[[Sequence[FlightLog]], Model]
 ) -> tuple[Model, list[FlightLog]]:
     """A model of logs whose commands are as the simulation takes them: without each suspected mistake that does not earn its price.
 
     Args:
         logs: of flights.
         plant: that the commands are for.
-        build: makes a model of logs, given the mistakes that were put right in them.
+        build: makes a model of logs.
 
     Returns:
-        The model, and its logs.
+        The model, which names what was put right as its ``mistakes``, and its logs.
     """
     made, known = interface.commanded(logs, plant)
     kept = interface.suspected(made, plant)
@@ -97,7 +97,7 @@ def put_right(
         mended = list(made)
         for mistake in mistakes:
             mended = [mistake.mended(log) for log in mended]
-        return build(mended, (*known, *mistakes)), mended
+        return build(mended), mended
 
     here = built(kept)
     for mistake in list(kept):

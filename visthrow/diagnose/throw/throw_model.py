@@ -25,7 +25,6 @@ from visthrow.diagnose.throw.direct import channels_of, direct_measurements, nee
 from visthrow.diagnose.throw.dropped import without_each_command
 from visthrow.diagnose.throw.effects import effects_for
 from visthrow.diagnose.throw.initial_fit import InitialFit, following, perturbed
-from visthrow.diagnose.throw.interface import Mistake
 from visthrow.diagnose.throw.landing import Landings, landings
 from visthrow.diagnose.throw.linearising import Plan, exact, lanes_of, still
 from visthrow.diagnose.throw.recorded import NEVER, Recorded, carriers, record_of
@@ -69,7 +68,6 @@ class ThrowModel:
         carries: bool | None = None,
         simpler: bool = False,
         camera: CameraParams | None = None,
-        mistakes: tuple[Mistake, ...] = (),
     ):
         """Cut the flights and find the windows' initial states.
 
@@ -84,13 +82,12 @@ class ThrowModel:
             carries: whether a payload hangs below in all flights; default: in those in which one was measured or released.
             simpler: consider also blocks simpler than the plant's, such as a rigid rope; each compiles a kernel.
             camera: whose keypoints the logs hold.
-            mistakes: of the logs' interface that were put right before.
 
         Raises:
             DiagnoseError: no flight can be replayed, or ``only`` names what does not exist.
         """
         self.setting = generalised(Setting(plant, sensing or SensingParams(), camera=camera))
-        self.device, self.substep, self.mistakes = device, substep, mistakes
+        self.device, self.substep = device, substep
         if device != "cpu":
             aside()
         flights = [record_of(log, i) for i, log in enumerate(logs)]
