@@ -11,10 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import stdtrit
-from scipy.stats import chi2
 
 from visthrow.diagnose.likelihood.evidence import (
-    CALIBRATION_QUANTILE,
     NORMAL_95,
     OWN_FLOOR,
     STRONG,
@@ -29,7 +27,7 @@ from visthrow.diagnose.likelihood.marginal import Statistics, gather
 from visthrow.diagnose.select import result
 from visthrow.diagnose.select.point import UNKNOWN_RATIO, Point
 from visthrow.diagnose.select.result import ChannelGain, Diagnosis, Finding, HeldOut
-from visthrow.diagnose.select.scatter import deviations, freed
+from visthrow.diagnose.select.scatter import allowed, deviations, differences, freed
 from visthrow.diagnose.select.selector import MOST_NAMES
 from visthrow.diagnose.select.state import Work
 
@@ -42,8 +40,6 @@ TELLING = 0.1
 """Of what flights promise in the mean, from which one counts among those that can tell."""
 MOSTLY = 0.6
 """Share of what is left from which it is said to lie in one axis or one flight."""
-SEEN = 1e-6
-"""Share of the strongest direction below which a group says nothing of another."""
 
 
 @dataclass(frozen=True)
@@ -106,39 +102,6 @@ def groups_of(point: Point, kept: Sequence[int]) -> tuple[list[int], str]:
 def regrouped(point: Point, groups: Sequence[int]) -> Statistics:
     parts = point.integrals.shares(point.grams, point.noise)
     return gather([replace(gram, flight=g) for gram, g in zip(point.grams, groups)], parts, point.theta)
-
-
-def tempered(point: Point, groups: Statistics, priors: Priors, active: Sequence[int]) -> Point:
-    """The point with its flights' evidence divided by how many times more they differ than they should; as it is where they agree.
-
-    Args:
-        point: at the sizes of the named causes.
-        groups: the same windows by flight, or by parts of flights.
-        priors: of the effects.
-        active: the named ones.
-    """
-    ratio = birge(groups, priors, active, point.theta) if active else 1.0
-    plain = replace(point.plain, information=point.plain.information / ratio, score=point.plain.score / ratio)
-    return point if ratio == 1.0 else replace(point, plain=plain)
-
-
-def birge(groups: Statistics, priors: Priors, active: Sequence[int], theta: np.ndarray) -> float:
-    """Square of the Birge ratio: of the groups' scores at common sizes, against noise and unnamed effects within floors; at least 1.
-
-    Source: Birge 1932; the scores are those of Rao 1948.
-    """
-    named, own = list(active), priors.deviation(active)
-    own[named] = 0.0  # the names' sizes are common, all others may differ
-    square, seen = 0.0, 0
-    for information, score in zip(groups.information, groups.absolute - groups.information @ theta):
-        spread = (information + (information * own**2) @ information)[np.ix_(named, named)]
-        scale = np.sqrt(np.maximum(np.diag(spread), 1e-300))
-        values, vectors = np.linalg.eigh(spread / np.outer(scale, scale))
-        told = values > SEEN * values[-1]
-        square += float(((vectors.T @ (score[named] / scale))[told] ** 2 / values[told]).sum())
-        seen += int(told.sum())
-    free = seen - len(named)
-    return max(square / free, 1.0) if free > 0 and square > chi2.ppf(CALIBRATION_QUANTILE, free) else 1.0
 
 
 def folds_of(count: int) -> list[np.ndarray]:
@@ -329,10 +292,19 @@ def _sized(work: Work, names: Sequence[str]) -> tuple[dict[str, float], tuple[tu
     if not active:
         return {}, (), replace(work, after=work.before, active=())
     theta = estimate(point.information, point.score, priors, active)
-    spread = covariance(point.information, priors.deviation(active))[np.ix_(active, active)]
-    scaled = (spread + OWN_FLOOR**2 * np.eye(len(active))) * np.outer(priors.floor[active], priors.floor[active])
+    unlike = differences(point.statistics, priors, active, theta)
+    scaled = joint(covariance(point.information, priors.deviation(active)), unlike, theta, active, priors.floor)
     sizes = {name: float(theta[j] * priors.floor[j]) for name, j in zip(names, active)}
-    return sizes, tuple(tuple(map(float, row)) for row in scaled), replace(work, active=tuple(active))
+    return sizes, scaled, replace(work, active=tuple(active))
+
+
+def joint(
+    spread: np.ndarray, unlike: np.ndarray, theta: np.ndarray, active: Sequence[int], floor: np.ndarray
+) -> tuple[tuple[float, ...], ...]:
+    """Covariance of named sizes in their units, with what numerics and differences among flights add."""
+    more = OWN_FLOOR**2 + unlike * allowed(theta) ** 2
+    own = (spread + np.diag(more))[np.ix_(active, active)] * np.outer(floor[active], floor[active])
+    return tuple(tuple(map(float, row)) for row in own)
 
 
 def _share(held: HeldOut) -> str:

@@ -242,13 +242,8 @@ def _ahead(
 ) -> np.ndarray:  # fmt: skip
     """Nats of deviations of some effects against none, beside what varies already; all flights may share any size of these effects."""
     named = sorted({*active, *at})
-
-    def evidence(varies: Varies) -> float:
-        left = freed(statistics, varies)
-        return log_evidence(left.information.sum(0), left.absolute.sum(0), priors, named) - 0.5 * float(left.absolute_square.sum())
-
-    nothing = evidence(drawn)
-    return np.array([evidence(drawn.also(at, size / priors.floor, by)) - nothing for size in sizes])
+    nothing = _evidence(freed(statistics, drawn), priors, named)
+    return np.array([_evidence(freed(statistics, drawn.also(at, size / priors.floor, by)), priors, named) - nothing for size in sizes])
 
 
 def disagreement(
@@ -275,8 +270,8 @@ def disagreement(
     def apart(statistics: Statistics, active: Sequence[int]) -> bool:
         left = freed(statistics, drawn)
         size = estimate(left.information.sum(0), left.absolute.sum(0), priors, active)[j]
-        allowed = max(np.hypot(1.0, share * size), drawn.effects.get(j, 0.0))
-        reach = allowed * np.geomspace(1.0, max(REACH[-1] * priors.slab[j] / allowed, 2.0), len(REACH[::LOOK]))
+        least_sd = max(allowed(size, share), drawn.effects.get(j, 0.0))
+        reach = least_sd * np.geomspace(1.0, max(REACH[-1] * priors.slab[j] / least_sd, 2.0), len(REACH[::LOOK]))
         nats = _ahead(statistics, [j], reach * priors.floor[j], priors, drawn, active)
         return bool(nats.max() - nats[0] > least)
 
@@ -290,6 +285,39 @@ def disagreement(
         if alone < least and not apart(others, active):
             return (int(statistics.flights[f]),)
     return (None,)
+
+
+def allowed(size: np.ndarray | float, share: float = INEXACT) -> np.ndarray | float:
+    """Deviation among flights that is no disagreement: a floor, and a part of the effect's size, in floors."""
+    return np.hypot(1.0, share * size)
+
+
+def differences(statistics: Statistics, priors: Priors, active: Sequence[int], theta: np.ndarray) -> np.ndarray:
+    """Variance that differences among flights add to the estimates of effects, in that which is :func:`allowed`, shape (K,).
+
+    In each flight a name may have a share of its own, whose deviation is u times what is allowed. What the flights say of u, which is
+    half normal before, is integrated over: one flight alone says nothing of it, and many that agree leave little. Where nothing is
+    named, nothing is added.
+
+    Args:
+        statistics: of the flights.
+        priors: of the effects.
+        active: the named ones.
+        theta: their sizes, in floors.
+
+    Source: Laird and Ware 1982; Gelman 2006 (half-normal deviations of few groups).
+    """
+    own = statistics.information.diagonal(axis1=1, axis2=2)
+    alone = ((own / np.maximum(own.sum(0), 1e-300)) ** 2).sum(0)  # 1 for one flight, 1 / F for F that say as much
+    apart = [freed(statistics, Varies(flights={j: u * allowed(theta[j]) for j in active})) for u in REACH]
+    value = np.array([_evidence(each, priors, active) for each in apart])
+    weight = REACH * np.exp(value - value.max() - 0.5 * REACH**2)  # steps of u grow with u
+    return weight @ REACH**2 / weight.sum() * alone * bool(active)
+
+
+def _evidence(statistics: Statistics, priors: Priors, named: Sequence[int]) -> float:
+    total = statistics.information.sum(0), statistics.absolute.sum(0)
+    return log_evidence(*total, priors, named) - 0.5 * float(statistics.absolute_square.sum())
 
 
 def _one_alone(v: RandomEffect, statistics: Statistics, at: Sequence[int], *given) -> bool:

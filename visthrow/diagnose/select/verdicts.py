@@ -20,10 +20,10 @@ from visthrow.diagnose.likelihood.marginal import TAIL
 from visthrow.diagnose.models.interface import Model, Window
 from visthrow.diagnose.select import result
 from visthrow.diagnose.select.excess import acts_on, levels, too_strong
-from visthrow.diagnose.select.held_out import PARTS, groups_of, regrouped, tempered
+from visthrow.diagnose.select.held_out import joint
 from visthrow.diagnose.select.point import SMALL_STEP, Point, moved, with_fitted_noise, with_floors_noise, with_varying
 from visthrow.diagnose.select.result import Diagnosis, Finding, Law, Level
-from visthrow.diagnose.select.scatter import CHAIN, FORM, Varies, deviations, freed
+from visthrow.diagnose.select.scatter import CHAIN, FORM, Varies, allowed, deviations, differences, freed
 from visthrow.diagnose.select.selector import Selector
 from visthrow.diagnose.select.state import Work
 from visthrow.diagnose.select.terms import bare
@@ -67,17 +67,12 @@ def conclude(search: Selector) -> Diagnosis:
         point = search.nominal
     point = replace(point, plain=search.about_means(active, varies) if here else freed(point.plain, varies), varies=Varies())
     point = replace(point, theta=estimate(point.information, point.score, search.priors, active))
-    few = len(point.plain.flights) < PARTS
-    groups = regrouped(point, groups_of(point, search.problem.kept)[0]) if few else point.plain
-    point = tempered(point, groups, search.priors, active)
-    spread = covariance(point.information, search.priors.deviation(active))
-    findings = tuple(_finding(search, point, j, active, spread, withdrawn) for j in range(len(model.effects)))
-    floor = search.priors.floor
-    own = spread[np.ix_(active, active)] + OWN_FLOOR**2 * np.eye(len(active))
-    scaled = own * np.outer(floor[active], floor[active])
+    spread, floor = covariance(point.information, search.priors.deviation(active)), search.priors.floor
+    unlike = differences(point.plain, search.priors, active, point.theta)
+    findings = tuple(_finding(search, point, j, active, spread, unlike[j], withdrawn) for j in range(len(model.effects)))
     return Diagnosis(
         overall, block, tuple(reasons), findings, {search.name(j): float(point.theta[j] * floor[j]) for j in active},
-        tuple(tuple(map(float, row)) for row in scaled), search.least, tuple(search.steps),
+        joint(spread, unlike, point.theta, active, floor), search.least, tuple(search.steps),
         tuple((tuple(map(search.name, m.active)), 0.0 - m.nats) for m in search.sets), found, _different(explanations),
         _events(search, point),
         sensor_scale={name: float(point.noise.scale[c]) for c, name in enumerate(model.channels)},
@@ -195,7 +190,9 @@ def _on_bound(search: Selector, j: int) -> bool:
     return bool(at and push * point.theta[j] > 0.0 and 0.5 * push**2 / point.information[j, j] > search.least)
 
 
-def _finding(search: Selector, point: Point, j: int, active: list[int], spread: np.ndarray, withdrawn: set[int]) -> Finding:
+def _finding(
+    search: Selector, point: Point, j: int, active: list[int], spread: np.ndarray, unlike: float, withdrawn: set[int]
+) -> Finding:
     effect, priors = search.problem.effects[j], search.priors
     blank = Finding(effect.name, result.UNOBSERVABLE, effect.block, effect.cause, effect.equation, effect.unit, 0.0,
                     effect.prior_sd, *effect.bounds, effect.floor, 0.0, manoeuvres=tuple(effect.manoeuvres))  # fmt: skip
@@ -204,10 +201,9 @@ def _finding(search: Selector, point: Point, j: int, active: list[int], spread: 
         return replace(blank, missing=missing, sentence=f"{effect.name}: not to be seen without {', '.join(missing)}.")
     partners, home = _class_of(search, j, active)
     if j in active or partners:
-        return _named(search, point, blank, j, home, partners, active, spread)
+        return _named(search, point, blank, j, home, partners, active, spread, unlike)
     wide = _wide(point, priors, j, active)
-    mean, sd = (value * effect.floor for value in wide)
-    own = float(np.hypot(sd, OWN_FLOOR * effect.floor))
+    mean, own = wide[0] * effect.floor, _deviation(*wide, unlike) * effect.floor
     low, high = (float(np.clip(mean + side * NORMAL_95 * own, *effect.bounds)) + 0.0 for side in (-1.0, 1.0))  # no -0
     gain = _worth(point, priors, j, active)
     blank = replace(blank, sd=own, low=low, high=high, nats=gain)
@@ -230,6 +226,11 @@ def _wide(point: Point, priors: Priors, j: int, active: Sequence[int]) -> tuple[
     return float(sigma[j] @ point.score), float(np.sqrt(sigma[j, j]))
 
 
+def _deviation(size: float, sd: float, unlike: float) -> float:
+    """Deviation of an estimate with what numerics and differences among flights add, in floors."""
+    return float(np.sqrt(sd**2 + OWN_FLOOR**2 + unlike * allowed(size) ** 2))
+
+
 def _worth(point: Point, priors: Priors, j: int, active: Sequence[int]) -> float:
     rest = [k for k in active if k != j]
     return point.evidence(priors, [*rest, j]) - point.evidence(priors, rest)
@@ -249,15 +250,14 @@ def _class_of(search: Selector, j: int, active: Sequence[int]) -> tuple[tuple[in
 
 
 def _named(search: Selector, point: Point, blank: Finding, j: int, home: int, partners: tuple[int, ...], active: list[int],
-           spread: np.ndarray) -> Finding:  # fmt: skip
+           spread: np.ndarray, unlike: float) -> Finding:  # fmt: skip
     priors, floor = search.priors, blank.floor
     if j in active:
-        size, variance = spread[j] @ point.score, spread[j, j]
+        size, sd = spread[j] @ point.score, np.sqrt(spread[j, j])
     else:
         stead = [j if k == home else k for k in active]
         size, sd = _wide(point, priors, j, stead[:-1] if stead[-1] == j else [k for k in stead if k != j])
-        variance = sd**2
-    sd = float(np.hypot(np.sqrt(variance), OWN_FLOOR)) * floor
+    sd = _deviation(size, sd, unlike) * floor
     size = float(np.clip(size, priors.low[j], priors.high[j]) * floor) + 0.0  # no -0
     low = max(priors.low[j] * floor, size - NORMAL_95 * sd) + 0.0
     high = min(priors.high[j] * floor, size + NORMAL_95 * sd) + 0.0

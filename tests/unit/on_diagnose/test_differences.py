@@ -1,0 +1,66 @@
+"""Intervals of sizes are widened by what flights may differ by, as far as the flights do not say otherwise."""
+
+import numpy as np
+
+from visthrow.diagnose.likelihood.evidence import OWN_FLOOR, Priors, covariance
+from visthrow.diagnose.likelihood.marginal import Statistics
+from visthrow.diagnose.select.scatter import allowed, differences
+
+SIZE, OTHER = 20.0, 0.3
+"""Of the named effect and of one that is not named, in floors."""
+KNOWN = 25.0
+"""Information of a flight on either: a deviation of a fifth of a floor."""
+TRIED = 200
+LEAST = 0.9
+"""Of 200 intervals of 95 % that must hold: fewer come of them in less than one of a thousand."""
+
+
+def flights(shares: np.ndarray, rng: np.random.Generator) -> Statistics:
+    """Statistics of flights with these sizes of the named effect."""
+    information = np.tile(KNOWN * np.array([[1.0, 0.3], [0.3, 1.0]]), (len(shares), 1, 1))
+    sizes = np.column_stack((shares, np.full(len(shares), OTHER)))
+    noise = rng.multivariate_normal(np.zeros(2), information[0], len(shares))
+    score = np.einsum("fij,fj->fi", information, sizes) + noise
+    square = np.einsum("fi,fij,fj->f", score, np.linalg.inv(information), score)
+    return Statistics(np.arange(len(shares)), information, score, square, np.ones(len(shares)), np.zeros(2))
+
+
+PRIORS = Priors(np.ones(2), np.full(2, 50.0), np.full(2, -500.0), np.full(2, 500.0), np.ones(2, dtype=bool))
+
+
+def interval(statistics: Statistics) -> tuple[float, float]:
+    """Estimate of the named effect and its deviation."""
+    spread = covariance(statistics.information.sum(0), PRIORS.deviation([0]))
+    size = spread[0] @ statistics.absolute.sum(0)
+    more = differences(statistics, PRIORS, [0], np.array([size, 0.0]))[0] * allowed(size) ** 2
+    return size, np.sqrt(spread[0, 0] + OWN_FLOOR**2 + more)
+
+
+def test_one_flight_alone_tells_a_size_to_a_floor_and_a_third():
+    """Nothing tells how flights differ, so that the prior stands."""
+    unlike = differences(flights(np.full(1, SIZE), np.random.default_rng(1)), PRIORS, [0], np.array([SIZE, 0.0]))
+    np.testing.assert_allclose(unlike, 1.0, rtol=0.05)  # of the half-normal's square, over the grid
+
+
+def test_flights_that_agree_leave_little_and_flights_that_differ_their_scatter():
+    """Of sixteen flights nothing of a third of the size is left; where they scatter by more than that, the scatter is."""
+    rng = np.random.default_rng(2)
+    assert interval(flights(np.full(16, SIZE), rng))[1] < 0.3
+    apart = 2.0 * allowed(SIZE) * rng.standard_normal(16)
+    found = interval(flights(SIZE + apart, rng))[1]
+    np.testing.assert_allclose(found, apart.std(ddof=1) / 4.0, rtol=0.3)
+
+
+def test_intervals_hold_where_flights_differ_by_what_the_prior_says():
+    """Worlds of three to eight flights, each with its own deviation among them."""
+    rng, held = np.random.default_rng(3), 0
+    for _ in range(TRIED):
+        deviation = abs(rng.standard_normal()) * allowed(SIZE)
+        size, sd = interval(flights(SIZE + deviation * rng.standard_normal(rng.integers(3, 9)), rng))
+        held += abs(size - SIZE) < 1.96 * sd
+    assert held > LEAST * TRIED
+
+
+def test_without_names_nothing_is_added():
+    """Bounds of a model that explains its flights are those of its noise and its floors."""
+    assert not differences(flights(np.zeros(3), np.random.default_rng(4)), PRIORS, [], np.zeros(2)).any()
