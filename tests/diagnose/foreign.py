@@ -1,0 +1,187 @@
+"""Worlds of another author's generator: a quadrotor with a ball on a cable, flown by another controller, for named vehicles.
+
+    python -m tests.diagnose.foreign --seeds tests/diagnose/bank-foreign.txt --jobs 6 --ledger foreign.jsonl
+
+Written from the equations alone: bodies in maximal coordinates with the cable as a constraint (Udwadia and Kalaba 1992), the controller
+of Lee, Leok and McClamroch 2010, rotors with a lag, an integrator of scipy. Noise, sampling and names are its own. It is frozen: nothing of
+the tool was changed for what it shows. A world hides one thing or nothing, or a force that no catalogue holds, and the tool is asked with
+the numbers of the vehicle that its owner would have.
+
+Each line of the seed list is a seed; vehicle, kind and size follow from it.
+"""
+
+import argparse
+import json
+import multiprocessing as mp
+import time
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
+
+from visthrow.common.errors import VisthrowError
+from visthrow.diagnose.models.flyer import FlyerModel
+from visthrow.diagnose.models.flyer_effects import effects_of
+from visthrow.diagnose.models.flyer_params import CableParams, FlyerParams
+from visthrow.diagnose.select import search
+from visthrow.logs.flightlog import Channel, FlightLog
+
+G, TICK, SHOT = 9.80665, 0.01, 1.0 / 120.0  # [m/s^2]; between commands, between pictures of the capture [s]
+CRAFT = {  # configs/vehicle and configs/rope; body [kg, kg m^2], all rotors' full thrust [N], lag [s], cable [m], ball [kg]
+    "crazyflie": dict(body=0.0393, J=(2.4e-5, 2.4e-5, 3.2e-5), top=0.8, lag=0.025, cable=0.5, ball=0.0054),
+    "five_inch": dict(body=0.6, J=(3e-3, 3e-3, 5e-3), top=38.0, lag=0.03, cable=0.7, ball=0.08),
+}
+HIDDEN = {
+    "thrust_gain": "gain", "mass_quad": "body", "motor_tau": "lag", "cmd_delay": "late", "rotor_drag_xy": "drag", "parasitic": "square",
+    "wind_x": "wind", "pose_delay": "stamp", "frame_tilt_y": "tilt", "marker_x": "arm", "rope_length": "cable", "mass_payload": "ball",
+    "payload_drag": "ball_square", "payload_delay": "ball_stamp",
+}  # fmt: skip
+"""Effect of the catalogue -> number of a world that it changes."""
+ALIKE = ({"thrust_gain", "mass_quad"}, {"frame_tilt_y", "marker_rot_y", "wind_x"}, {"motor_tau", "cmd_delay", "pose_delay"})
+"""What flights of this kind may take for one another: a class is right that holds the truth and is within one of these."""
+ONE_SIDED = ("cmd_delay", "parasitic", "payload_drag")
+FLIGHTS, FLOORS = 4, 10.0
+
+
+def drawn(seed: int) -> tuple[str, str, dict[str, float]]:
+    """Vehicle, what is hidden ("" for nothing, "swirl" for what no catalogue holds), and the world's numbers."""
+    rng = np.random.default_rng([20261124, seed])
+    name = ("crazyflie", "five_inch")[seed // 6 % 2]
+    kind = ("", "swirl", *[None] * 4)[seed % 6]
+    base = CRAFT[name]
+    usual = dict.fromkeys(("late", "drag", "square", "wind", "stamp", "tilt", "arm", "ball_square", "ball_stamp", "swirl"), 0.0)
+    world = usual | {key: base[key] for key in ("body", "lag", "cable", "ball", "top")} | {"gain": 1.0, "J": np.array(base["J"])}
+    if kind == "swirl":
+        world["swirl"] = 0.25 * (base["body"] + base["ball"]) * rng.choice([-1.0, 1.0])  # [kg/s]: a fortieth of the weight at 1 m/s
+    elif kind is None:
+        kind = str(rng.choice(list(HIDDEN)))
+        floor = next(e.floor for e in effects_of(known(name), False) if e.name == kind)
+        world[HIDDEN[kind]] += FLOORS * floor * (1.0 if kind in ONE_SIDED else rng.choice([-1.0, 1.0]))
+    return name, kind, world
+
+
+def known(name: str) -> FlyerParams:
+    """The vehicle as its owner knows it."""
+    c = CRAFT[name]
+    return FlyerParams(
+        input="thrust_command", position="pos_w", attitude="quat_wb", mass=c["body"], gravity=G, thrust_map=(0.0, c["top"], 0.0),
+        motor_time_constant=c["lag"], command_delay=0.0, reference_voltage=4.0, voltage_coefficient=0.0, drag_xy=0.0, drag_z=0.0,
+        lowest=0.3, window=1.0, step=0.02, every=3, most_windows=32, cable=CableParams(c["cable"], c["ball"]),
+    )  # fmt: skip
+
+
+def flown(world: dict, rng: np.random.Generator, seconds: float = 12.0) -> FlightLog:
+    """One flight along a Lissajous figure, as its owner records it."""
+    M, m, L, J = world["body"], world["ball"], world["cable"], world["J"]
+    swing, beat, turned = rng.uniform(0.4, 0.9, 3) * [1.0, 1.0, 0.35], rng.uniform(0.9, 2.2, 3), rng.uniform(0.0, 2.0 * np.pi, 4)
+
+    def wanted(t: float) -> np.ndarray:
+        """Place, speed and acceleration, shape (3, 3)."""
+        a, fade = beat * t + turned[:3], 1.0 - np.exp(-t * t)
+        return fade * swing * np.array([np.sin(a), beat * np.cos(a), -beat * beat * np.sin(a)]) + [[0.0, 0.0, 2.0], [0.0] * 3, [0.0] * 3]
+
+    def slope(t: float, y: np.ndarray, sent: np.ndarray, torque: np.ndarray) -> np.ndarray:
+        r, p, v, u, q, w, f = y[:3], y[3:6], y[6:9], y[9:12], y[12:16], y[16:19], y[19]
+        turn = Rotation.from_quat(q).as_matrix()
+        air, ball_air = v - [world["wind"], 0.0, 0.0], u - [world["wind"], 0.0, 0.0]
+        across = turn.T @ air * [1.0, 1.0, 0.0]
+        push = turn @ (np.array([0.0, 0.0, world["gain"] * f]) - world["drag"] * across) - world["square"] * np.linalg.norm(air) * air
+        push = push + world["swirl"] * np.array([v[1], -v[0], 0.0]) - [0.0, 0.0, M * G]
+        pull = -world["ball_square"] * np.linalg.norm(ball_air) * ball_air - np.array([0.0, 0.0, m * G])
+        gap, rate = p - r, u - v  # |gap|^2 = L^2: gap . (p'' - r'') = -|rate|^2, and back to it where rounding left it
+        along = gap @ (pull / m - push / M) + rate @ rate + 40.0 * gap @ rate + 200.0 * (gap @ gap - L * L)
+        tie = max(along / (gap @ gap) / (1.0 / m + 1.0 / M), 0.0) * gap
+        asked = sent[1][max(np.searchsorted(sent[0], t - world["late"], "right") - 1, 0)]
+        spun = 0.5 * np.array([*(q[3] * w + np.cross(q[:3], w)), -q[:3] @ w])
+        turning = (torque - np.cross(w, J * w)) / J
+        return np.concatenate([v, u, (push + tie) / M, (pull - tie) / m, spun, turning, [(asked - f) / world["lag"]]])
+
+    start = wanted(0.0)[0]
+    hold = (M + m) * G / world["gain"]
+    y = np.concatenate([start, start - [0, 0, L], np.zeros(6), [0, 0, 0, 1.0], np.zeros(3), [hold]])
+    times, sent, path = TICK * np.arange(round(seconds / TICK)), [], [y]
+    for t in times:
+        place, speed, pushed = wanted(t)
+        force = (M + m) * (4.0 * (place - y[:3]) + 3.5 * (speed - y[6:9]) + pushed + [0.0, 0.0, G])
+        turn = Rotation.from_quat(y[12:16]).as_matrix()
+        up = force / np.linalg.norm(force)
+        head = 0.4 * np.sin(0.5 * t + turned[3])
+        left = np.cross(up, [np.cos(head), np.sin(head), 0.0])
+        left /= np.linalg.norm(left)
+        aim = np.column_stack([np.cross(left, up), left, up])
+        off = 0.5 * (aim.T @ turn - turn.T @ aim)
+        torque = J * (-160.0 * np.array([off[2, 1], off[0, 2], off[1, 0]]) - 20.0 * y[16:19])
+        sent.append(float(np.clip(force @ turn[:, 2], 0.05, world["top"])))
+        held = np.array([times[: len(sent)], sent])
+        y = solve_ivp(slope, (t, t + TICK), y, args=(held, torque), method="RK45", rtol=1e-6, atol=1e-8, max_step=0.5 * TICK).y[:, -1]
+        y[12:16] /= np.linalg.norm(y[12:16])
+        path.append(y)
+    return recorded(world, np.append(times, seconds), np.array(path), times, np.array(sent), rng)
+
+
+def recorded(world: dict, clock: np.ndarray, path: np.ndarray, times: np.ndarray, sent: np.ndarray, rng: np.random.Generator) -> FlightLog:
+    """What the capture sees at its own rate, with double exponential noise, rounded to a tenth of a millimetre; the throttle as sent."""
+    from scipy.interpolate import CubicSpline
+    from scipy.spatial.transform import Slerp
+
+    shots = np.arange(0.05, clock[-1] - 0.05, SHOT) + 0.002 * rng.uniform()
+    spline, slerp = CubicSpline(clock, path[:, :6]), Slerp(clock, Rotation.from_quat(path[:, 12:16]))
+    tilt = Rotation.from_rotvec([0.0, world["tilt"], 0.0])
+    turn = slerp(shots)
+    seen = tilt.apply(spline(shots - world["stamp"])[:, :3] + slerp(shots - world["stamp"]).apply([world["arm"], 0.0, 0.0]))
+    ball = tilt.apply(spline(shots - world["ball_stamp"])[:, 3:])
+    seen, ball = (np.round(x + rng.laplace(0.0, 2e-4, x.shape), 4) for x in (seen, ball))
+    quat = (tilt * turn * Rotation.from_rotvec(rng.laplace(0.0, 6e-4, (len(shots), 3)))).as_quat()
+    return FlightLog({
+        "pos_w": Channel(shots, seen, "m", "world"), "payload_pos_w": Channel(shots, ball, "m", "world"),
+        "quat_wb": Channel(shots, quat, "1", "world"), "thrust_command": Channel(times, sent[:, None] / world["top"], "N"),
+    })  # fmt: skip
+
+
+def asked(seed: int) -> dict:
+    """A world, and what the tool says of it."""
+    name, hidden, world = drawn(seed)
+    line, begin = {"seed": seed, "vehicle": name, "hidden": hidden}, time.process_time()
+    try:
+        logs = [flown(world, np.random.default_rng([seed, i])) for i in range(FLIGHTS)]
+        said = search.explain(FlyerModel(logs, known(name)), seed=seed)
+    except (VisthrowError, ValueError, FloatingPointError) as error:
+        return line | {"verdict": "failed", "why": str(error)[:200]}
+    groups = [{f.name, *f.partners} for f in said.findings if f.name in said.theta]
+    return line | {"verdict": said.overall, "groups": [sorted(g) for g in groups], "laws": [law.formula for law in said.laws[:1]],
+                   "judged": judged(hidden, groups, said.overall), "seconds": time.process_time() - begin}  # fmt: skip
+
+
+def judged(hidden: str, groups: list[set[str]], overall: str) -> str:
+    """Of an answer: right, class, missed, false, or for what no catalogue holds unknown."""
+    if hidden in ("", "swirl"):
+        return "false" if groups else ("right" if not hidden else "unknown" if overall in ("UNKNOWN", "EXPLAINED IN PART") else "missed")
+    own = [g for g in groups if hidden in g]
+    if not own:
+        return "false" if groups else "missed"
+    fits = own[0] == {hidden} or any(own[0] <= alike for alike in ALIKE)
+    return ("right" if own[0] == {hidden} else "class") if fits and all(hidden in g for g in groups) else "false"
+
+
+def main() -> None:
+    """Ask about every seed of a list; a line for each, and what came of them."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=Path, required=True)
+    parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--ledger", type=Path, required=True)
+    args = parser.parse_args()
+    seeds = [int(line) for line in args.seeds.read_text().split()]
+    count: Counter[tuple[str, str]] = Counter()
+    with mp.get_context("spawn").Pool(args.jobs, maxtasksperchild=4) as pool, args.ledger.open("a") as ledger:
+        for line in pool.imap_unordered(asked, seeds):
+            ledger.write(json.dumps(line) + "\n")
+            ledger.flush()
+            count[line["hidden"] if line["hidden"] in ("", "swirl") else "hidden", line.get("judged", "failed")] += 1
+    for (kind, judged_), number in sorted(count.items()):
+        print(f"{kind or 'null':8} {judged_:8} {number}")
+
+
+if __name__ == "__main__":
+    main()
