@@ -34,7 +34,7 @@ def hovered(params):
 
 @pytest.fixture(scope="module")
 def quadrotor():
-    params = replace(setup.load("nanobench_cf21").flyer, every=6, step=0.03)
+    params = replace(setup.load("nanobench_cf21").flyer, every=6, window=2.0, step=0.04)
     return hovered(params)
 
 

@@ -12,13 +12,7 @@ import numpy as np
 from scipy.linalg import lapack
 
 from visthrow.diagnose.likelihood import designs
-from visthrow.diagnose.likelihood.marginal import (
-    TAIL,
-    Gram,
-    Noise,
-    hidden_gram,
-    without_effects,
-)
+from visthrow.diagnose.likelihood.marginal import TAIL, Gram, Noise, hidden_gram, without_effects
 from visthrow.diagnose.likelihood.stack import Stack
 from visthrow.diagnose.likelihood.threads import each
 from visthrow.diagnose.models.interface import LATENT_BLOCKS, Window
