@@ -166,7 +166,8 @@ def _run_row(run: dict) -> tuple[str, ...]:
     device = run.get("device", "-")
     seconds = run.get("wall_s") or run.get("seconds")
     return (
-        run["name"].rpartition("-")[0] or run["run"], str(run.get("train_seed", "-")), number((run.get("steps") or 0) / 1e6, "{:.0f}"), str(run.get("pieces", "-")),
+        run["name"].rpartition("-")[0] or run["run"], str(run.get("train_seed", "-")),
+        number((run.get("steps") or 0) / 1e6, "{:.0f}"), str(run.get("pieces", "-")),
         number(seconds, "{:.0f}"), number(final.get("error_mean")), number(final.get("duration_mean")),
         device if isinstance(device, str) else ", ".join(map(str, device)), str(run.get("commit", "-"))[:9],
     )  # fmt: skip
