@@ -106,7 +106,7 @@ class Runner:
         self._reach = math.hypot(*rope["mount"]) + rope["length"] + rope["payload_offset"] + params.check.rope_tolerance
         self.guard = Guard(params.guard, float(action["max_thrust"]), tuple(map(float, action["max_rate"])))
         self.tracks = {name: Track(frames, params.gate, params.estimate, name == VEHICLE) for name, frames in params.frames.items()}
-        self.machine = Machine(params.states, params.throws, params.observe)
+        self.machine = Machine(params.states, params.throws, params.observe, params.backend != "dry-run")
         heading = math.radians(params.check.heading_deg)
         self.hovering = Hovering(params.home_w, heading, float(action["max_thrust"]), self.pilot.period)
         self._aged = 0.5 * sum(contract["observation"]["latency"])

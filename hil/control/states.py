@@ -88,9 +88,15 @@ class Machine:
         left_fence: how the vehicle left its fence after a throw; that ends the run by a landing, and is no abort.
     """
 
-    def __init__(self, params: StateParams, throws: int, patient: bool = False) -> None:
-        """Begin in idle, which with check may last for ever if ``patient``, as where poses are only looked at; lands after some throws."""
-        self.params, self.most, self.patient = params, throws, patient
+    def __init__(self, params: StateParams, throws: int, patient: bool = False, sends: bool = True) -> None:
+        """Begin in idle.
+
+        Args:
+            params: times. throws: after which it lands.
+            patient: idle and check may last for ever, as where poses are only looked at.
+            sends: whether commands go to a vehicle. Where they do not, no fence ends what others fly before a throw is armed.
+        """
+        self.params, self.most, self.patient, self.sends = params, throws, patient, sends
         self.state, self.reason = State.IDLE, "start"
         self.since: float | None = None
         self.throws = self.cancelled = 0
@@ -123,7 +129,8 @@ class Machine:
             return None
         if seen.vehicle >= ABORT:
             return "no new pose of the vehicle"
-        if seen.fence is not None and not (self.state is State.RECOVER and seen.released):
+        others = self.state is State.READY and not self.sends
+        if seen.fence is not None and not others and not (self.state is State.RECOVER and seen.released):
             return f"fence: {seen.fence}"
         if not seen.connected:
             return "the autopilot is silent, disarmed or in another mode" + (f": {seen.note}" if seen.note else "")

@@ -46,6 +46,7 @@ FOR_THUMBS = {
     "tpa_rate": "0", "tpa_low_rate": "0",  # D goes with the throttle
     "gyro_lpf1_dyn_min_hz": "0", "dterm_lpf1_dyn_min_hz": "0",  # filters that go with the throttle: static ones in their place
     "dterm_lpf1_static_hz": "0",  # of two filters of D the second is left, 150 Hz
+    "yaw_lowpass_hz": "0",  # P of yaw alone is smoothed by it, the command's steps as well; the gyro has filters of its own
     "pidsum_limit": "1000", "pidsum_limit_yaw": "1000",  # the mixer knows how much the motors can
 }  # fmt: skip
 """What the firmware does for a pilot's thumbs or with the throttle, and is better off where a computer commands: the vehicle then is

@@ -8,6 +8,7 @@ import pytest
 
 from hil.backends import Status
 from hil.control.runner import WARM_CALLS, OperatorInput, Runner
+from hil.control.states import Inputs, Machine
 from hil.errors import RunError
 from hil.params import HilParams
 from hil.poses.detection import Detection, Detections
@@ -385,6 +386,15 @@ def test_a_fence_that_is_left_with_the_payload_on_still_aborts():
     decisions = fly(pilot, 20.0, watch=narrowed(pilot, -0.5))
     safe(pilot, decisions)
     assert dict(changes(decisions))["abort"].startswith("fence: vehicle x")
+
+
+@pytest.mark.parametrize(("sends", "ended"), [(True, ["check", "ready", "abort"]), (False, ["check", "ready"])])
+def test_a_fence_that_others_leave_ends_no_run_that_looks_on(sends, ended):
+    """A recorded throw brakes below the floor: whoever only looks on flies nothing there. A vehicle of ours comes down."""
+    machine, states = Machine(runner().params.states, 1, patient=True, sends=sends), []
+    for tick in range(500):
+        states.append(machine.step(tick * TICK, Inputs(0, 0, fence="vehicle's braking point z" if tick > 300 else None)))
+    assert list(dict.fromkeys(states)) == ended
 
 
 def test_a_throw_that_does_not_begin_says_what_is_in_the_way():
