@@ -87,7 +87,10 @@ def hover_of_run(folder: str | Path) -> tuple[bool, str]:
         if hovering > SETTLING:
             thrusts.append(line["command"][0])
     if len(thrusts) < LEAST_SHARES:
-        raise RunError(f"{folder}: {len(thrusts)} ticks of steady hover before throws; expected {LEAST_SHARES} or more")
+        raise RunError(
+            f"{folder}: {len(thrusts)} ticks of steady hover before throws; expected {LEAST_SHARES} or more, after {SETTLING}: hover "
+            "longer before a throw, as with --set states.armed_least=3.0"
+        )
     thrust = getattr(params, params.backend).thrust
     asked, weight = sum(thrusts) / len(thrusts), mass * GRAVITY
     ratio = asked / weight

@@ -14,7 +14,6 @@ from typing import Any
 from hil.control.realtime import collected
 from hil.errors import LinkError, RunError
 from hil.fakes import KINDS, VEHICLE_ID, Fake, Options, WirePlant
-from hil.fakes import FakeArduPilot as FakeAutopilot
 from hil.fakes.mocap import MocapParams
 from hil.links.clock import Clock
 from hil.links.device import LARGEST_DATAGRAM, Port
@@ -110,17 +109,11 @@ class AnsweringPort:
         """Take a port that listens."""
         self._port = port
 
-    def read(self) -> bytes | None:
-        return self._port.read()
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._port, name)
 
     def write(self, data: bytes, to: tuple[str, int] | None = None) -> bool:
         return self._port.write(data, to or self._port.sender)
-
-    def fileno(self) -> int:
-        return self._port.fileno()
-
-    def close(self) -> None:
-        self._port.close()
 
 
 def make_fake(
@@ -228,6 +221,6 @@ def serve(
 
 
 __all__ = [
-    "KINDS", "VEHICLE_ID", "AnsweringPort", "FakeAutopilot", "ListeningPort", "MocapParams", "Options", "Paced", "WirePlant", "load_plant",
+    "KINDS", "VEHICLE_ID", "AnsweringPort", "ListeningPort", "MocapParams", "Options", "Paced", "WirePlant", "load_plant",
     "make_fake", "read_options", "serve",
 ]  # fmt: skip

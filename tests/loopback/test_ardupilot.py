@@ -8,7 +8,8 @@ import pytest
 from hil.backends import ArduPilot
 from hil.backends.ardupilot import GUIDED, LAND_MODE
 from hil.errors import RunError
-from hil.fakes.process import VEHICLE_ID, FakeAutopilot, MocapParams, Options, load_plant
+from hil.fakes import FakeArduPilot
+from hil.fakes.process import VEHICLE_ID, MocapParams, Options, load_plant
 from hil.links.mavlink_link import Link, attitude_target
 from hil.params import HilParams
 from tests.hil_flight import simple_policy
@@ -22,7 +23,7 @@ AT_ONCE = simple_policy((-0.1269, 0.0, 0.0, 0.0, 1.0))
 
 def pair(answer="accepted", **options):
     here, there = pipe()
-    fake = FakeAutopilot(LevelPlant(), Link(there, *VEHICLE_ID), MocapParams(loss=0.0), 0, Options(answer=answer, **options))
+    fake = FakeArduPilot(LevelPlant(), Link(there, *VEHICLE_ID), MocapParams(loss=0.0), 0, Options(answer=answer, **options))
     link = Link(here)
     return ArduPilot(link, PARAMS), link, fake
 

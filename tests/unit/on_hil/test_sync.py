@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from hil.fakes.process import VEHICLE_ID, FakeAutopilot, MocapParams, Options
+from hil.fakes import FakeArduPilot
+from hil.fakes.process import VEHICLE_ID, MocapParams, Options
 from hil.links.clock import TimeSync
 from hil.links.mavlink_link import Link
 from hil.links.pymav import mav
@@ -66,7 +67,7 @@ def test_one_wild_exchange_changes_nothing():
 def dated(offset, seconds=2.0, stamp_offset=None):
     """Poses of the fake over a pipe whose clock is off; with ``stamp_offset`` its stamps are of yet another clock."""
     here, there = pipe()
-    fake = FakeAutopilot(LevelPlant(), Link(there, *VEHICLE_ID), MocapParams(loss=0.0), 0, Options(clock_offset=offset))
+    fake = FakeArduPilot(LevelPlant(), Link(there, *VEHICLE_ID), MocapParams(loss=0.0), 0, Options(clock_offset=offset))
     if stamp_offset is not None:
         plain = fake.wall
         fake.wall = lambda: plain() + stamp_offset
