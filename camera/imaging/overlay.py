@@ -16,11 +16,7 @@ SHIFT = 4
 
 
 def draw_overlay(
-    camera: KeypointCamera,
-    keypoints: torch.Tensor,
-    valid: torch.Tensor,
-    image: np.ndarray | None = None,
-    label: str = "",
+    camera: KeypointCamera, keypoints: torch.Tensor, valid: torch.Tensor, image: np.ndarray | None = None
 ) -> np.ndarray:
     """Draw keypoints, field of view and body axes.
 
@@ -32,7 +28,6 @@ def draw_overlay(
         keypoints: Normalised [-], shape (8, 2).
         valid: Validity, shape (8,).
         image: Frame to draw on, BGR, uint8, shape (H, W, 3) of the camera's size; black if left out.
-        label: Text for the top left corner.
 
     Returns:
         A new picture, BGR, uint8, shape (H, W, 3).
@@ -40,8 +35,6 @@ def draw_overlay(
     Raises:
         ValueError: The image's shape or type is not the camera's.
     """
-    import cv2
-
     lens = camera.fisheye
     shape = (lens.params.height, lens.params.width, 3)
     if image is not None and (image.shape != shape or image.dtype != np.uint8):
@@ -57,18 +50,6 @@ def draw_overlay(
     left, top, right, bottom = box[0, 0], box[1, 1], box[2, 0], box[3, 1]
     rectangle = np.array([[left, top], [right, top], [right, bottom], [left, bottom]])
     _draw_group(canvas, box, seen[GOAL_KEYPOINTS:], rectangle, RED, thick)
-    if label:
-        size = min(shape[:2]) / 900
-        cv2.putText(
-            canvas,
-            label,
-            (round(20 * size) + 4, round(34 * size) + 4),
-            cv2.FONT_HERSHEY_SIMPLEX,
-            size,
-            WHITE,
-            thick,
-            cv2.LINE_AA,
-        )
     return canvas
 
 

@@ -6,16 +6,18 @@ import numpy as np
 import pytest
 import torch
 
+from camera.detectors.contours import Known
 from camera.detectors.learnt import Networks
 from camera.keypoints import KeypointCamera, keypoints
 from camera.params import CameraParams
-from camera.scenes.scene import Nuisances
+from camera.scenes.scene import Nuisances, Truth
 from sim.params import RopeParams
 from visthrow import cli, config
+from visthrow.cli import detector
 from visthrow.throws.flight import Flight, Policies, hover, throw
 from visthrow.throws.loading import load_policy
 from visthrow.throws.reference_protocol import Job, batch_plant, fly_batch, place_in_hover
-from visthrow.view.eyes import Eyes
+from visthrow.view.eyes import HANGING, Eyes
 
 SMALL = ["fresh=2", "pool=4", "reuse=1", "batch=2", "patches=8", "samples=1", "calibration=2"]
 NEAR = {"contours": 0.01, "learnt": 0.015}
@@ -109,6 +111,21 @@ def test_a_throw_is_refused_where_the_hover_sees_no_ball():
     assert flight.open.tolist() == [False, True]
     off = np.linalg.norm(plant.state.pos_w - home, axis=1)
     assert off[0] < 0.3, "it hovers on"
+
+
+def test_what_a_detector_is_told_is_true_but_for_the_ball_a_frame_ago():
+    """The ball hangs 0.4 m below the first lens and flies 1.5 m beside the second."""
+    rot = torch.linalg.qr(torch.randn(2, 3, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64))[0]
+    ball = torch.tensor([[0.1, 0.2, 0.3], [1.5, 0.0, 0.1]], dtype=torch.float64)
+    truth = Truth(ball, torch.zeros(2, 4, 3), rot, torch.ones(2), torch.ones(2))
+    asked = [("nothing", 0), ("pose", 1), ("track", 0), ("track", 1)]
+    nothing, pose, *tracks = (detector.known_of(known, truth, 1.2, e, np.random.default_rng(e)) for known, e in asked)
+    assert nothing == Known()
+    np.testing.assert_allclose([pose.up_c, pose.north_c], rot[1, [2, 0]])
+    assert (pose.height, pose.ball_ray_c, pose.ball_distance) == (1.2, None, None)
+    assert [track.ball_distance for track in tracks] == [HANGING, None]
+    for track, ray in zip(tracks, truth.ball_ray.numpy()):
+        assert 1e-3 < np.arccos(track.ball_ray_c @ ray) < track.within
 
 
 @pytest.mark.parametrize(

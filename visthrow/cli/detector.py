@@ -40,6 +40,13 @@ BENT = {"fx": 232.0, "fy": 232.0, "k1": 0.05, "k2": -0.006, "fov_deg": 145.0}
 HIT = 4.0
 """A detection whose points are off by more than this on average is of something else [px]."""
 
+KNOWN = ("nothing", "pose", "track")
+"""What detectors are told besides the picture: nothing; attitude and height; also where the ball was a frame ago, and how far it can
+be while it hangs. The runner tells all of it."""
+
+TRACK_ERROR = math.radians(4.0)
+"""Of the ball's direction by the frame before [rad]: 20 ms at 3.5 rad/s."""
+
 TOGETHER = 20
 """Throws in one process at a time."""
 
@@ -59,6 +66,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     check = actions.add_parser("check", help="recall and pixel error by nuisance, beside the OpenCV detector")
     check.add_argument("--weights", metavar="FILE", help="of visthrow detector train (default: those that are shipped)")
     check.add_argument("--frames", type=int, default=100, metavar="N", help="a nuisance (default: 100)")
+    check.add_argument("--known", default="pose", choices=KNOWN, help="what the detectors are told; track: as in flight (default: pose)")
     check.add_argument("--textures", metavar="FOLDER", help="photographs (default: those of scikit-image that were not trained on)")
     check.add_argument("--seed", type=int, default=0, help="of the scenes")
     check.add_argument("--out", metavar="FILE", help="picture of the first frames of each nuisance with what was found, .png")
@@ -194,7 +202,7 @@ def check(args: argparse.Namespace) -> int:
             camera = replace(camera, fisheye=replace(camera.fisheye, **BENT))
             parts = Fisheye(camera.fisheye), camera.payload_radius, camera.goal_side
             detectors = {"learnt": LearntDetector(*parts, networks=learnt.networks), "opencv": Detector(*parts)}
-        counts, pictures = counted(camera, renderer, detectors, nuisances, args.frames, args.seed)
+        counts, pictures = counted(camera, renderer, detectors, nuisances, args.frames, args.seed, args.known)
         table[level] = {name: count.figures() for name, count in counts.items()}
         rows.append(pictures)
         _print(level, table[level], first=len(rows) == 1)
@@ -271,9 +279,24 @@ class Count:
         return found | {"seconds": float(np.median(self.spent)), "overconfidence": float(told[:, 0].mean() - told[:, 1].mean())}
 
 
-def counted(camera, renderer, detectors: dict, nuisances: dict[str, float], frames: int, seed: int) -> tuple[dict[str, Count], list]:
+def known_of(known: str, truth, height: float, e: int, rng: np.random.Generator):
+    """What a detector is told of scene e; see :data:`KNOWN`."""
+    from camera.detectors.contours import Known
+    from visthrow.view.eyes import HANGING
+
+    rot_wc, distance = truth.rot_wc[e].numpy(), float(truth.ball_c[e].norm())
+    pose = {"up_c": rot_wc[2], "height": height, "north_c": rot_wc[0]} if known != "nothing" else {}
+    if known != "track":
+        return Known(**pose)
+    ray = truth.ball_ray[e].numpy() + TRACK_ERROR / math.sqrt(2.0) * rng.standard_normal(3)
+    return Known(**pose, ball_ray_c=ray / np.linalg.norm(ray), ball_distance=HANGING if distance < HANGING[1] else None)
+
+
+def counted(
+    camera, renderer, detectors: dict, nuisances: dict[str, float], frames: int, seed: int, known: str
+) -> tuple[dict[str, Count], list]:
     """Counts of each detector in random frames, and pictures of the first four with what the first detector found."""
-    from camera.detectors.contours import Known, detected_keypoints
+    from camera.detectors.contours import detected_keypoints
     from camera.fisheye import Fisheye
     from camera.imaging.overlay import draw_overlay
     from camera.keypoints import GOAL_KEYPOINTS, KeypointCamera, payload_keypoints
@@ -292,10 +315,10 @@ def counted(camera, renderer, detectors: dict, nuisances: dict[str, float], fram
         true = np.concatenate([corners.numpy(), lens.denormalize(box).numpy()], 1)
         for e, image in enumerate(images[..., ::-1]):
             rot_wc = truth.rot_wc[e].numpy()
-            known = Known(up_c=rot_wc[2], height=float(scenes.pose[e, 2]), north_c=rot_wc[0])
+            knows = known_of(known, truth, float(scenes.pose[e, 2]), e, np.random.default_rng([number, e]))
             for name, detector in detectors.items():
                 begin = time.perf_counter()
-                seen = detector.detect(image, known)
+                seen = detector.detect(image, knows)
                 counts[name].spent.append(time.perf_counter() - begin)
                 points, valid = detected_keypoints(eyes, seen, rot_wc @ nominal_rot_cb(camera.mount).numpy())
                 off = np.linalg.norm(lens.denormalize(points).numpy() - true[e], axis=1)

@@ -12,8 +12,8 @@ from camera.detectors.edges import cone_fit
 from camera.keypoints import KeypointCamera, goal_square, keypoints
 from camera.mount import rotation_from_vector
 from camera.params import CameraParams, FisheyeParams, KeypointNoiseParams, MountParams
-from tests.bench.nuisance import NuisanceParams, degrade
 from tests.drawn import Clutter, render_scene
+from tests.unit.on_camera.nuisance import NuisanceParams, degrade
 
 LENS = FisheyeParams(400, 400, 104.2, 104.2, 199.5, 199.5)
 CAMERA = KeypointCamera(

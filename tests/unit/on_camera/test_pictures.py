@@ -66,7 +66,7 @@ def test_pixel_rays_hit_pixel_centres():
 def test_overlay_colours_the_points_and_leaves_the_input():
     points, valid, _ = throw_scene(0.0)
     before = np.full((320, 320, 3), 7, np.uint8)
-    image = draw_overlay(CAMERA, points, valid, before, "t = 0")
+    image = draw_overlay(CAMERA, points, valid, before)
     assert image.dtype == np.uint8
     assert (before == 7).all()
     pixels = CAMERA.fisheye.denormalize(points).round().long()

@@ -1,6 +1,5 @@
 """Benchmarks run with tiny sizes, count what the kernel does, and keep well-formed records; no time is judged."""
 
-import dataclasses
 import json
 import os
 import sys
@@ -9,9 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from camera.params import CameraParams
 from tests.bench import camera as bench_camera
-from tests.bench import commands, detector, mpc, sim_gpu
+from tests.bench import commands, mpc, sim_gpu
 from tests.bench import mujoco_warp as bench_mujoco_warp
 from tests.bench import sim as sim_cpu
 from visthrow import cli, config
@@ -178,25 +176,6 @@ def test_every_measurement_can_be_kept(kind):
     needed = {"explain": ["flight.npz"], "fleet": ["any"]}
     args = cli.build_parser().parse_args(["bench", kind, *needed.get(kind, [])])
     assert (args.json, args.record) == (None, None), "what the end of each one asks for"
-
-
-@pytest.mark.parametrize("words", ["--frames 0", "--jobs 0", "--out {}/sheet.jpg", "--out {}/file/sheet.png"])
-def test_a_detector_is_not_measured_for_nothing(words, tmp_path, capsys):
-    (tmp_path / "file").touch()
-    assert detector.main(words.format(tmp_path).split()) == 2
-    assert "expected" in capsys.readouterr().err
-
-
-@pytest.mark.slow
-def test_the_detector_counts_the_same_in_one_process_and_in_two():
-    params = config.load(CameraParams, config.find("camera", "fisheye"))
-    lens = dataclasses.replace(params.fisheye, width=200, height=200, fx=52.0, fy=52.0, cx=99.5, cy=99.5)
-    measure = detector.Measure(dataclasses.replace(params, fisheye=lens), 0)
-    alone = detector.levels(measure, 2)
-    assert len(measure.spent) == 2 * sum(len(detector.TOLD.get(name, ("",))) for name in detector.LEVELS)
-    both = detector.levels(measure, 2, jobs=2)
-    assert str(alone) == str(both), "NaN is NaN"
-    assert alone["clean; pose and track"]["ball"]["visible"] == 2
 
 
 def test_mpc_steps_are_timed_and_recorded(tmp_path, monkeypatch, capsys):

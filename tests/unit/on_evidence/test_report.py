@@ -8,8 +8,8 @@ import time
 import numpy as np
 import pytest
 
-from tests import made_up_results as made_up
 from tests.bench import baseline as baseline_record
+from tests.unit.on_evidence import made_up_results as made_up
 from visthrow import cli
 from visthrow.baseline import spline, thrower
 from visthrow.cli import report as command
