@@ -13,6 +13,7 @@ from visthrow import config
 
 WEIGHT = 0.272 * GRAVITY
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
+STEP = 2e-3  # s, at most; of order 4, and some nanometres off a quarter of it
 
 
 def short(plant, segments=2):
@@ -21,7 +22,7 @@ def short(plant, segments=2):
 
 
 def start(extras, plant=None, count=1, speed=0.0, height=1.5, seed=0, segments=2):
-    reference = ReferencePlant(short(plant or plain_plant(), segments), extras, seed, count)
+    reference = ReferencePlant(short(plant or plain_plant(), segments), extras, seed, count, step=STEP)
     velocity = np.tile([speed, 0.0, 0.0], (count, 1))
     reference.reset(np.tile([0.0, 0.0, height], (count, 1)), np.tile(LEVEL, (count, 1)), velocity, np.zeros((count, 3)))
     return reference
