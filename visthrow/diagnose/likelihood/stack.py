@@ -27,6 +27,7 @@ ROUNDING = 1e-10
 """Relative growth of the normal equations' diagonal where they are positive definite but for rounding."""
 
 BATCH = 8  # windows of a batch on the CPU
+BEGUN = 4  # noise levels that are kept: a round's, and those that its candidates come to while sizes and levels are estimated in turn
 BLOCKS = len(LATENT_BLOCKS)
 
 
@@ -44,14 +45,14 @@ class _Columns:
         self._inner, self._sizes, self._device = inner, sizes, device
         whole = inner[0].of if isinstance(inner[0], There) else inner[0]
         self._channels, self._effects = len(whole), whole.shape[1] - sizes[0]
-        self._begun, self._lock = (None, None), Lock()
+        self._begun, self._lock = {}, Lock()
 
     def begun(self, noise: tuple, shaped: Callable[[], T]) -> T:
         """What belongs to noise levels at which several searches begin, calculated by the first of them."""
         with self._lock:
-            if self._begun[0] != noise:
-                self._begun = noise, shaped()
-            return self._begun[1]
+            found = self._begun.pop(noise, None) or shaped()
+            self._begun = dict([*self._begun.items(), (noise, found)][-BEGUN:])
+            return found
 
     @cached_property
     def hidden(self) -> torch.Tensor:
