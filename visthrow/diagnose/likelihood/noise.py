@@ -56,8 +56,6 @@ compared."""
 LONGEST_FALL = 1.0
 """Of the logarithm of a level in one step: its variance may be predicted to fall below 0."""
 HALVINGS = 8
-ALIGNED, LONGEST_SERIES = 0.9, 0.9
-"""Cosine of two steps that follow one line, and the most by which the second may be as long as the first."""
 STALLED = 1e-9
 """Of the step: limits and levels count as met within this."""
 
@@ -230,12 +228,10 @@ def _maximise(grams: Sequence[Gram], noise: Noise, device: str, enough: float = 
         return _likelihood(stack, layout.unpack(x, noise), layout, first)
 
     value, slope, curvature = look(x, first=True)
-    last = np.zeros_like(x)
     for _ in range(ITERATIONS):
-        plain, promised = _scoring_step(layout, x, slope, curvature, low, high)
-        if promised < enough:  # and leaves less than a tenth of that: it is taken without another look
-            return layout.unpack(x + plain, noise), value + 0.5 * promised
-        step, last = np.clip(x + _stride(plain, last) * plain, low, high) - x, plain
+        step, promised = _scoring_step(layout, x, slope, curvature, low, high)
+        if promised < enough:  # it is taken without another look
+            return layout.unpack(x + step, noise), value + 0.5 * promised
         for _ in range(HALVINGS):
             tried, its_slope, expected = look(x + step)
             if tried > value:
@@ -245,16 +241,6 @@ def _maximise(grams: Sequence[Gram], noise: Noise, device: str, enough: float = 
             break
         x, value, slope, curvature = x + step, tried, its_slope, expected
     return layout.unpack(x, noise), value
-
-
-def _stride(step: np.ndarray, last: np.ndarray) -> float:
-    """By how much to lengthen a step that repeats the last one, shortened: such steps shrink like a geometric series (Aitken)."""
-    square = last @ last
-    if square == 0.0:
-        return 1.0
-    ratio = float(step @ last / square)
-    alike = ratio * np.sqrt(square) > ALIGNED * np.linalg.norm(step)
-    return 1.0 / (1.0 - min(ratio, LONGEST_SERIES)) if alike and ratio > 0.0 else 1.0
 
 
 def _scoring_step(
