@@ -221,12 +221,8 @@ class HybridSim:
         st.put(self.types, self.state, given, self.count)
         self.state.mass_scale.fill_(1.0)
         self._used.fill_(battery_used)
-        wp.launch(
-            self._reset.place,
-            self.count,
-            [self._vehicles, self._ropes, self.gravity, self.state, self._all, self._used],
-            device=self.device,
-        )
+        inputs = [self._vehicles, self._ropes, self.gravity, self.state, self._all, self._used]
+        wp.launch(self._reset.place, self.count, inputs, device=self.device)
         self._update_payload()
 
     def _update_payload(self) -> None:

@@ -230,29 +230,14 @@ class QuadSim:
 
     def step(self) -> None:
         """Advance every quadrotor by one control period under ``command``, ``force_w`` and ``torque_b``."""
-        wp.launch(
-            self._step,
-            self.count,
-            [
-                self._vehicles,
-                self._airs,
-                self.control_period,
-                self.integration_step,
-                self.gravity,
-                self.state,
-                self.command,
-                self.force_w,
-                self.torque_b,
-            ],
-            device=self.device,
-        )
+        given = [self._vehicles, self._airs, self.control_period, self.integration_step, self.gravity]
+        given += [self.state, self.command, self.force_w, self.torque_b]
+        wp.launch(self._step, self.count, given, device=self.device)
 
     def reset(self, mask: wp.array | None = None) -> None:
         """Put environments back to ``start``, in hover, where ``mask`` (shape (E,), int) is non-zero; all without one."""
         mask = self._all if mask is None else mask
-        wp.launch(
-            self._reset, self.count, [self._vehicles, self.gravity, self.state, self.start, mask], device=self.device
-        )
+        wp.launch(self._reset, self.count, [self._vehicles, self.gravity, self.state, self.start, mask], device=self.device)
 
     def place(
         self,

@@ -217,8 +217,7 @@ def build_step(
             s = load(state, env)
             load_rope(state, env, n, u, stiffness)
         if attached != 0:
-            mount = s.pos_w + wp.quat_rotate(s.quat_wb, rope.mount)
-            pos, vel = chain.payload(rope, mount, coupled.mount_velocity(rope, s), n, u)
+            pos, vel = coupled.payload(rope, s, n, u)
             out.payload_pos_w[env] = pos
             out.payload_vel_w[env] = vel
             if wp.length(pos - s.pos_w) < rope.payload_radius + p.collision_radius:
@@ -246,8 +245,7 @@ def build_step(
         load_rope(state, env, n, u, stiffness)
         rope = chain.stretched(natural, natural, stiffness, u, real(0.0))
         if state.attached[env] != 0:
-            mount = s.pos_w + wp.quat_rotate(s.quat_wb, rope.mount)
-            pos, vel = chain.payload(rope, mount, coupled.mount_velocity(rope, s), n, u)
+            pos, vel = coupled.payload(rope, s, n, u)
             out.payload_pos_w[env] = pos
             out.payload_vel_w[env] = vel
 

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 import numpy as np
 import warp as wp
 
-from sim.arrays.structs import Types, make_struct
+from sim.arrays.structs import QUAD_STATE, Types, make_struct
 
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
 """Attitude of a level vehicle, xyzw."""
@@ -24,18 +24,7 @@ COLLISION = 4
 ROPE_IN_ROTOR = 8
 """Status bit: a joint of the rope passed through a propeller disc."""
 
-QUAD_FIELDS = {  # name: (type, also by row); the fields of t.QuadState in its order
-    "pos_w": ("vec3", False),
-    "quat_wb": ("quat", False),
-    "vel_w": ("vec3", False),
-    "rate_b": ("vec3", False),
-    "motor_speed": ("vec4", False),
-    "integral": ("vec3", False),
-    "setpoint": ("vec3", False),
-    "gyro": ("vec3", False),
-    "charge_used": ("real", False),
-    "voltage": ("real", False),
-}
+QUAD_FIELDS = {name: (kind, False) for name, kind in QUAD_STATE.items()}  # name: (type, also by row)
 
 STATE_FIELDS = QUAD_FIELDS | {  # those by row have a row a segment, the queue a row a slot
     "mass_scale": ("real", False),

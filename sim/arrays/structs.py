@@ -32,6 +32,14 @@ ROPE_NUMBERS = (
 """Scalars of the device's rope, beside its mount."""
 
 
+QUAD_STATE = {"pos_w": "vec3", "quat_wb": "quat", "vel_w": "vec3", "rate_b": "vec3", "motor_speed": "vec4", "integral": "vec3",
+              "setpoint": "vec3", "gyro": "vec3", "charge_used": "real", "voltage": "real"}  # fmt: skip
+"""State of a quadrotor: name -> type."""
+FLOW = {"force_b": "vec3", "torque_b": "vec3", "motor_speed": "vec4", "motor_rate": "vec4", "integral_rate": "vec3",
+        "setpoint_rate": "vec3", "gyro_rate": "vec3", "charge_rate": "real", "voltage_rate": "real"}  # fmt: skip
+"""What the blocks make of it: wrench and derivatives of their own states."""
+
+
 class Types:
     """Scalar, vector and struct types of one precision.
 
@@ -57,33 +65,9 @@ class Types:
         pushes = {"laws": self.vec4, "push_w": self.vec3, "twist_b": self.vec3, "payload_push_w": self.vec3}
         self.Air = self.from_dataclass(P.AirParams, pushes)
         self.Rope = make_struct("Rope", {"mount": self.vec3, **dict.fromkeys(ROPE_NUMBERS, real)})
-        fields = {
-            "pos_w": self.vec3,
-            "quat_wb": self.quat,
-            "vel_w": self.vec3,
-            "rate_b": self.vec3,
-            "motor_speed": self.vec4,
-            "integral": self.vec3,
-            "setpoint": self.vec3,
-            "gyro": self.vec3,
-            "charge_used": real,
-            "voltage": real,
-        }
-        self.QuadState = make_struct("QuadState", fields)
-        self.QuadRate = make_struct("QuadRate", dict(fields))
-        self.Flow = make_struct(
-            "Flow",
-            {
-                "force_b": self.vec3,
-                "torque_b": self.vec3,
-                "motor_speed": self.vec4,
-                "motor_rate": self.vec4,
-                "integral_rate": self.vec3,
-                "setpoint_rate": self.vec3,
-                "gyro_rate": self.vec3,
-                "charge_rate": real,
-                "voltage_rate": real,
-            },
+        self.QuadState, self.QuadRate, self.Flow = (
+            make_struct(name, {k: getattr(self, kind) for k, kind in fields.items()})
+            for name, fields in (("QuadState", QUAD_STATE), ("QuadRate", QUAD_STATE), ("Flow", FLOW))
         )
 
     def _field_type(self, annotation) -> type | None:

@@ -275,9 +275,7 @@ def build_replay(t: Types, vehicle: VehicleParams, segments: int, laws: tuple[La
         pay = ball.pos
         pay_vel = ball.vel
         if mode == attached_code:
-            pos0, vel0 = chain.payload(
-                rope, s.pos_w + wp.quat_rotate(s.quat_wb, rope.mount), coupled.mount_velocity(rope, s), n, u
-            )
+            pos0, vel0 = coupled.payload(rope, s, n, u)
             pay = pos0
             pay_vel = vel0
         resume = lanes.resume[lane]
@@ -371,9 +369,7 @@ def build_replay(t: Types, vehicle: VehicleParams, segments: int, laws: tuple[La
                     s, total, fell_back = coupled.step(
                         p, rope, pushed, s, total, active, n, u, stiffness, g, gamma, max_turn, h
                     )
-                    pos1, vel1 = chain.payload(
-                        rope, s.pos_w + wp.quat_rotate(s.quat_wb, rope.mount), coupled.mount_velocity(rope, s), n, u
-                    )
+                    pos1, vel1 = coupled.payload(rope, s, n, u)
                     pay = pos1
                     pay_vel = vel1
                     if chain.pull(rope, stiffness, u) < real(SLACK) * rope.payload_mass * gravity:

@@ -97,7 +97,7 @@ def build_coupled_step(
     Returns:
         Namespace of Warp functions ``step`` (new state, new total momentum, whether it fell back; the arrays n, u and
         stiffness change in place), ``step_alone`` (the vehicle after the payload has left), ``momentum`` (total linear
-        momentum [N s]) and ``mount_velocity`` [m/s].
+        momentum [N s]), ``mount_velocity`` [m/s] and ``payload`` (position and velocity of its centre, world frame).
     """
     vec3, vec4, real = t.vec3, t.vec4, t.real
     Vehicle, Rope, Air, QuadState = t.Vehicle, t.Rope, t.Air, t.QuadState
@@ -109,6 +109,10 @@ def build_coupled_step(
     @wp.func
     def mount_velocity(rope: Rope, s: QuadState):
         return s.vel_w + wp.quat_rotate(s.quat_wb, wp.cross(s.rate_b, rope.mount))
+
+    @wp.func
+    def payload_state(rope: Rope, s: QuadState, n: wp.array(dtype=vec3), u: wp.array(dtype=vec3)):
+        return chain.payload(rope, s.pos_w + wp.quat_rotate(s.quat_wb, rope.mount), mount_velocity(rope, s), n, u)
 
     load_first, load_second, add_impulse = build_load(t, chain, payload, mount_velocity, extensions)
 
@@ -191,4 +195,6 @@ def build_coupled_step(
         out.motor_speed = motor_advance(out.motor_speed, f2.motor_speed)
         return out
 
-    return SimpleNamespace(step=step, step_alone=step_alone, mount_velocity=mount_velocity, momentum=momentum)
+    return SimpleNamespace(
+        step=step, step_alone=step_alone, mount_velocity=mount_velocity, momentum=momentum, payload=payload_state
+    )

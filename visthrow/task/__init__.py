@@ -5,7 +5,7 @@ parameters; :func:`plant_of` gives what the simulator needs of it.
 """
 
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from camera.params import CameraParams
 from sim.params import (
@@ -18,33 +18,33 @@ from sim.params import (
     SensingParams,
     SimParams,
     VehicleParams,
-    require_not_negative,
-    require_positive,
 )
 from sim.quadrotor.fleet import FleetParams
 from visthrow.common.errors import ConfigError, suggest
+from visthrow.config.bounds import Bound, Bounded, NotNegative, Positive
+
+Count = Annotated[int, Bound(1)]
+Counts = tuple[Count, ...]
+Share = Annotated[float, Bound(0.0, 1.0, "(]")]
 
 
 @dataclass(frozen=True)
-class ActionParams:
+class ActionParams(Bounded):
     """Limits of the command; see :mod:`visthrow.onboard.actions`."""
 
-    max_thrust: float  # collective thrust at +1 [N]
-    max_rate: tuple[float, float, float]  # body rates at +-1 [rad/s]
-
-    def __post_init__(self) -> None:
-        require_positive("task.action", max_thrust=self.max_thrust, max_rate=min(self.max_rate))
+    max_thrust: Positive  # collective thrust at +1 [N]
+    max_rate: tuple[Positive, Positive, Positive]  # body rates at +-1 [rad/s]
 
 
 @dataclass(frozen=True)
-class ObservationParams:
+class ObservationParams(Bounded):
     """What the actor sees; see :mod:`visthrow.onboard.observations`."""
 
     layout: Literal["state", "vision"]
     history: int  # earlier payload measurements beside the current one
     validity: bool  # vision: whether the actor is told which keypoints are valid
     latency: tuple[float, float]  # age of all that is measured, drawn per episode from this range [s]
-    latency_jitter: float = 0.0  # of that age, uniform up to this to either side, drawn per step [s]
+    latency_jitter: NotNegative = 0.0  # of that age, uniform up to this to either side, drawn per step [s]
     goal_velocity: bool = False  # whether the actor is given a fit of the goal's velocity; see visthrow.onboard.goal_motion
     located: bool = False  # vision: whether the actor is given where the keypoints lie too; see visthrow.onboard.located
     response: int = 0  # earlier steps of which the actor is given velocity, body rates and action: how this vehicle answers
@@ -56,41 +56,35 @@ class ObservationParams:
         return self.latency[1] + self.latency_jitter
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         low, high = self.latency
         if not 0.0 <= low <= high < 1.0:
             raise ConfigError(f"task.observation.latency is {low} to {high} s; expected an ascending range from 0 up to a second")
-        require_not_negative("task.observation", latency_jitter=self.latency_jitter)
         if self.latency_jitter > low:
             raise ConfigError(f"task.observation.latency_jitter is {self.latency_jitter} s; expected at most the shortest latency, {low} s")
 
 
 @dataclass(frozen=True)
-class NoiseParams:
+class NoiseParams(Bounded):
     """Gaussian noise of measurements and commands (the paper, Sec. III-C). Keypoints have their own in the camera."""
 
-    observation_step: float  # per step, in each entry's SI unit
-    observation_bias: float  # per episode
-    command_step: float  # per step, in normalised commands
-    command_bias: float  # per episode
-
-    def __post_init__(self) -> None:
-        require_not_negative(
-            "task.noise", observation_step=self.observation_step, observation_bias=self.observation_bias,
-            command_step=self.command_step, command_bias=self.command_bias,
-        )  # fmt: skip
+    observation_step: NotNegative  # per step, in each entry's SI unit
+    observation_bias: NotNegative  # per episode
+    command_step: NotNegative  # per step, in normalised commands
+    command_bias: NotNegative  # per episode
 
 
 @dataclass(frozen=True)
-class BoundsParams:
+class BoundsParams(Bounded):
     """Ends of an episode (the paper, Sec. III-C); the numbers are ours."""
 
     altitude: tuple[float, float]  # of the vehicle [m]
-    horizontal: float  # distance of the vehicle from the spawn axis [m]
-    tilt_deg: float  # between body z and the vertical [deg]
-    time_limit: float  # a negative end, never bootstrapped [s]
+    horizontal: Positive  # distance of the vehicle from the spawn axis [m]
+    tilt_deg: Positive  # between body z and the vertical [deg]
+    time_limit: Positive  # a negative end, never bootstrapped [s]
 
     def __post_init__(self) -> None:
-        require_positive("task.bounds", horizontal=self.horizontal, tilt_deg=self.tilt_deg, time_limit=self.time_limit)
+        super().__post_init__()
         if not self.altitude[0] < self.altitude[1]:
             raise ValueError(f"task.bounds.altitude is {self.altitude} m; expected the lower limit before the upper one")
 
@@ -152,55 +146,47 @@ PRIVILEGED = (
 
 
 @dataclass(frozen=True)
-class PPOParams:
+class PPOParams(Bounded):
     """Learning parameters of rsl_rl's PPO."""
 
-    environments: int
-    steps: int  # per environment and iteration
-    iterations: int
-    hidden: tuple[int, ...]
+    environments: Count
+    steps: Count  # per environment and iteration
+    iterations: Count
+    hidden: Counts
     activation: str
     normalize: bool  # empirical observation normalisation
-    initial_std: float
-    epochs: int
-    minibatches: int
-    learning_rate: float
+    initial_std: Positive
+    epochs: Count
+    minibatches: Count
+    learning_rate: Positive
     schedule: Literal["adaptive", "fixed"]
     desired_kl: float  # at the first iteration
     final_kl: float  # at the last one; linear between
-    discount: float
-    gae_lambda: float
-    clip: float
-    entropy: float
-    value_coefficient: float
-    max_grad_norm: float
+    discount: Share
+    gae_lambda: Share
+    clip: Positive
+    entropy: NotNegative
+    value_coefficient: NotNegative
+    max_grad_norm: Positive
     products: Literal["float32", "bfloat16"] = "float32"  # of the hidden layers; weights are float32 either way
-    critic: tuple[int, ...] = ()  # hidden layers of the critic; empty for the actor's
-    critic_first: int = 0  # iterations at the beginning in which the critic alone learns
+    critic: Counts = ()  # hidden layers of the critic; empty for the actor's
+    critic_first: Annotated[int, Bound(0)] = 0  # iterations at the beginning in which the critic alone learns
     privileged: tuple[str, ...] = PRIVILEGED[:8]  # inputs of the critic alone, of PRIVILEGED; what a task lacks is left out
 
     def __post_init__(self) -> None:
-        counts = {name: getattr(self, name) for name in ("environments", "steps", "iterations", "epochs", "minibatches")}
-        if min(counts.values()) < 1 or not self.hidden or min(self.hidden + self.critic) < 1:
-            layers = f"hidden layers of {self.hidden}, the critic's of {self.critic or self.hidden}"
-            raise ConfigError(f"ppo: {counts} and {layers}; expected 1 or more of each")
-        require_positive(
-            "ppo", initial_std=self.initial_std, learning_rate=self.learning_rate, clip=self.clip, max_grad_norm=self.max_grad_norm
-        )
-        require_not_negative("ppo", critic_first=self.critic_first, entropy=self.entropy, value_coefficient=self.value_coefficient)
+        super().__post_init__()
+        if not self.hidden:
+            raise ConfigError("hidden is empty; expected one layer or more")
         for name in self.privileged:
             if name not in PRIVILEGED or self.privileged.count(name) > 1:
                 raise ConfigError(f"ppo.privileged has {name!r}; {suggest(name, PRIVILEGED)}, each once")
-        for name in ("discount", "gae_lambda"):
-            if not 0.0 < getattr(self, name) <= 1.0:
-                raise ConfigError(f"ppo.{name} is {getattr(self, name)}; expected a number above 0 and up to 1")
 
 
 @dataclass(frozen=True)
-class FirstOrderParams:
+class FirstOrderParams(Bounded):
     """Learning parameters of :mod:`visthrow.training.first_order`; ``ppo`` has the throws a gradient and the network."""
 
-    iterations: int = 1000  # gradients
+    iterations: Count = 1000  # gradients
     horizon: int = 48  # of a flight [control steps]; the latch trips near the 35th
     decay: float = 0.985  # of derivatives, per step backward
     learning_rate: float = 2e-3  # at the first iteration
@@ -209,9 +195,9 @@ class FirstOrderParams:
     adapting_width: float = 0.15  # of the hazard in them
     final_rate: float = 5e-5  # at the last one; half a cosine between
     max_grad_norm: float = 1.0
-    width: float = 0.5  # of the hazard at the first iteration, in units of the fifth action
-    final_width: float = 0.35
-    sharp: float = 0.3  # share of the training after which the width is the final one; geometric till then
+    width: Positive = 0.5  # of the hazard at the first iteration, in units of the fifth action
+    final_width: Positive = 0.35  # at most the first
+    sharp: Positive = 0.3  # share of the training after which the width is the final one; geometric till then
     latched: tuple[float, float] = (0.1, 0.2)  # shares of the training between which the hazard's value becomes the latch's
     first_release: int = 24  # step before which nothing is released at the beginning: else the payload is dropped at once
     free: tuple[float, float] = (0.05, 0.15)  # shares of the training between which that step comes down to 0
@@ -219,39 +205,30 @@ class FirstOrderParams:
     saturation: float = 1.0  # cost of the square that an action is past its limits by
 
     def __post_init__(self) -> None:
-        ascending = all(0.0 <= low < high for low, high in (self.free, self.latched))
-        if not (self.iterations > 0 and ascending and self.sharp > 0.0 and 0.0 < self.final_width <= self.width):
-            raise ConfigError(
-                f"first_order: iterations {self.iterations}, free {self.free}, latched {self.latched}, sharp {self.sharp}, "
-                f"widths {self.width} to {self.final_width}; expected 1 or more, ascending ranges, a share above 0, falling widths above 0"
-            )
+        super().__post_init__()
+        if not all(0.0 <= low < high for low, high in (self.free, self.latched)) or self.final_width > self.width:
+            came = f"free is {self.free}, latched {self.latched}, the hazard {self.width} to {self.final_width} wide"
+            raise ConfigError(f"{came}; expected ascending ranges from 0 or more, and a width that falls")
 
 
 @dataclass(frozen=True)
-class DistillationParams:
+class DistillationParams(Bounded):
     """Learning parameters of :mod:`visthrow.training.distillation`; ``ppo.environments`` has the throws of an iteration."""
 
     teacher: str = "state"  # state policy: a shipped name or a file
-    iterations: int = 500
-    horizon: int = 72  # of a throw [control steps]
-    hidden: int = 256  # of the encoder
-    memory: int = 128  # of the recurrent unit
-    epochs: int = 1
-    minibatches: int = 4
-    learning_rate: float = 2e-3  # at the first iteration
-    final_rate: float = 5e-5  # at the last one; half a cosine between
-    action_weight: float = 0.3  # of what an error of the estimate does to the action
-
-    def __post_init__(self) -> None:
-        require_positive(
-            "distillation", iterations=self.iterations, horizon=self.horizon, hidden=self.hidden, memory=self.memory,
-            epochs=self.epochs, minibatches=self.minibatches, learning_rate=self.learning_rate,
-        )  # fmt: skip
-        require_not_negative("distillation", final_rate=self.final_rate, action_weight=self.action_weight)
+    iterations: Count = 500
+    horizon: Count = 72  # of a throw [control steps]
+    hidden: Count = 256  # of the encoder
+    memory: Count = 128  # of the recurrent unit
+    epochs: Count = 1
+    minibatches: Count = 4
+    learning_rate: Positive = 2e-3  # at the first iteration
+    final_rate: NotNegative = 5e-5  # at the last one; half a cosine between
+    action_weight: NotNegative = 0.3  # of what an error of the estimate does to the action
 
 
 @dataclass(frozen=True)
-class DiagnosedParams:
+class DiagnosedParams(Bounded):
     """What a diagnosis leaves uncertain about the plant (``visthrow diagnose apply`` writes it).
 
     Training draws ``plants`` plants from the joint posterior: deviations theta of the effects, normal with this covariance
@@ -261,11 +238,10 @@ class DiagnosedParams:
 
     effects: tuple[str, ...] = ()  # of the catalogue
     covariance: tuple[tuple[float, ...], ...] = ()  # of their deviations, in their units
-    plants: int = 1
+    plants: Count = 1
 
     def __post_init__(self) -> None:
-        if self.plants < 1:
-            raise ConfigError(f"diagnosed.plants is {self.plants}; expected 1 or more")
+        super().__post_init__()
         if len(self.covariance) != len(self.effects) or any(len(row) != len(self.effects) for row in self.covariance):
             raise ConfigError(
                 f"diagnosed.covariance has rows of {[len(row) for row in self.covariance]} for {len(self.effects)} effects; "

@@ -376,10 +376,9 @@ class ThrowEnv(VecEnv):
     def _observe(self, fresh: Tensor) -> TensorDict:
         """Actor's and critic's view of the current state."""
         state, memory, noise = self.views.state, self._memory, self.cfg.task.noise
-        payload, goal = self.views.out["payload_pos_w"], self.views.goal_w
+        payload = self.views.out["payload_pos_w"]
         rot_wb = ob.rotation_from_quat(state["quat_wb"])
         vehicle = ob.vehicle_part(state["pos_w"], state["vel_w"], state["rate_b"], rot_wb)
-        exact = torch.cat([vehicle, ob.state_part(state["pos_w"], goal, payload)], dim=-1)
         attached = state["attached"].to(torch.float32)
         pose = self._late(torch.cat([vehicle, payload], dim=-1), fresh)
         late_goal = self._late_goal()
@@ -407,18 +406,18 @@ class ThrowEnv(VecEnv):
             self._setup,
         )
         memory["history"].copy_(history)
-        observed = {"actor": actor, "critic": self._privileged(actor, exact, time, fresh)}
+        observed = {"actor": actor, "critic": self._privileged(actor, vehicle, payload, time, fresh)}
         return TensorDict(observed, batch_size=[self.num_envs], device=self.device)
 
-    def _privileged(self, actor: Tensor, exact: Tensor, time: Tensor, fresh: Tensor) -> Tensor:
+    def _privileged(self, actor: Tensor, vehicle: Tensor, payload: Tensor, time: Tensor, fresh: Tensor) -> Tensor:
         """Critic's view: what ``ppo.privileged`` names."""
         state, memory, named = self.views.state, self._memory, self.cfg.ppo.privileged
         parts = [actor]
         if "exact" in named:
-            vehicle, goal_offset, relative = exact.split([ob.VEHICLE, 2, 3], dim=-1)
-            true_history = hist.push(memory["true_history"], relative, fresh)
+            offset = ob.state_part(state["pos_w"], self.views.goal_w, payload)
+            true_history = hist.push(memory["true_history"], offset[:, 2:], fresh)
             memory["true_history"].copy_(true_history)
-            parts = [vehicle, memory["previous"], goal_offset, true_history.flatten(1)]
+            parts = [vehicle, memory["previous"], offset[:, :2], true_history.flatten(1)]
         known = {
             "payload_velocity": self.views.out["payload_vel_w"],
             "release_timer": state["release_timer"][:, None],
@@ -439,7 +438,7 @@ class ThrowEnv(VecEnv):
             parts.append(memory["pose_age"][:, None])
         if "vehicle" in named and self._known is not None:
             parts.append(self._known)
-        return torch.cat(parts, dim=-1)
+        return torch.cat(parts, dim=-1) if len(parts) > 1 else actor
 
     def _late_goal(self) -> Tensor:
         """Goal [m], shape (E, 3), where it was when what is measured now was measured."""

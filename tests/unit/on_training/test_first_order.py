@@ -153,7 +153,7 @@ def test_weights_get_what_autograd_gives_them():
     fo.rollout()
     assert fo.derivatives()["cost"].isfinite()
     shares = torch.rand(24, generator=torch.Generator().manual_seed(0))
-    fo.layers.gradients(fo.flights.obs, shares)
+    fo.layers.gradients(fo.flights.obs, fo.flights.flown(), shares)
     by_action = fo.layers.by_action * shares[:, None]
     parameters = list(fo.network.mlp.parameters())
     expected = torch.autograd.grad(decided(fo, fo.flights.obs), parameters, by_action)
@@ -179,7 +179,7 @@ def test_flights_stop_where_nothing_counts_any_more():
     assert (stopped_at < flown_to).all()
     assert flown.any()
     assert not flown[short:].any()
-    torch.testing.assert_close(stopped, flown[:short], rtol=0, atol=0)
+    torch.testing.assert_close(stopped, flown[:short], rtol=1e-3, atol=1e-5 * flown.abs().max().item())  # products of fewer rows
 
 
 SLOWER = ["vehicle.queue.delay=0.045", "vehicle.motor.time_constant=0.06", "rope.payload_mass=0.08", "rope.length=0.5"]
@@ -199,7 +199,7 @@ def test_slopes_are_those_of_the_simulator(vehicle, monkeypatch):
     def fly(actions):
         fo.env.load_state_dict(start)
         left = iter(actions)
-        monkeypatch.setattr(fo.layers, "forward", lambda k, seen: fo.layers.action[k].copy_(next(left)))
+        monkeypatch.setattr(fo.layers, "forward", lambda k, seen, flying: fo.layers.action[k].copy_(next(left)))
         fo.rollout()
         return fo.flights.landing[-1].clone()
 
@@ -210,7 +210,7 @@ def test_slopes_are_those_of_the_simulator(vehicle, monkeypatch):
     time = (up + (up.square() + 2 * GRAVITY * (x["load_pos"][-1, :, 2] - fo.cfg.release.landing_height)).sqrt()) / GRAVITY
     point = x["load_pos"][-1, :, :2] + x["load_vel"][-1, :, :2] * time[:, None]
     torch.testing.assert_close(point.detach(), fo.flights.landing[-1], atol=1e-4, rtol=0)
-    monkeypatch.setattr(fo.layers, "back", lambda k: None)
+    monkeypatch.setattr(fo.layers, "back", lambda k, flown: None)
     found = []
     for axis in range(2):
         by = dict(zip(x, torch.autograd.grad(point[:, axis].sum(), list(x.values()), retain_graph=True), strict=True))

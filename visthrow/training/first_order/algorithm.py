@@ -87,7 +87,7 @@ class FirstOrder:
             if stops and before >= self._first:
                 asked.add_(self.layers.action[before, :, act.COMMANDS] > self.cfg.release.threshold)
                 torch.lt(asked, 2, out=self.flights.flying)
-            return self.layers.forward(k, seen) if not stops or self.flights.flying.any() else None
+            return self.layers.forward(k, seen, self.flights.flying) if not stops or self.flights.flying.any() else None
 
         self.flights.fly(decide)
 
@@ -178,7 +178,7 @@ class FirstOrder:
         for k in reversed(range(self.flights.last)):
             with on_torch_stream(self.env.device):
                 self._launches[k].launch()
-            self.layers.back(k)
+            self.layers.back(k, self.flights.steps >= k)
 
     def collect(self, done: float) -> None:
         self._schedule(1.0 if self._adapting else done)
@@ -194,11 +194,11 @@ class FirstOrder:
         figures = self.derivatives()
         size = self.layers.by_action[:T].square().sum((0, 2)).sqrt().clamp(min=1e-12)
         most = OUTLIER * size.kthvalue(len(size) // 2 + 1).values  # a few wild flights must not outweigh the rest
-        self.layers.gradients(self.flights.obs[:T], (most / size).clamp(max=1.0))
+        self.layers.gradients(self.flights.obs[:T], self.flights.flown()[:T], (most / size).clamp(max=1.0))
         self._ranks.average(parameters)
         figures["gradient_norm"] = torch.nn.utils.clip_grad_norm_(parameters, p.max_grad_norm)
         self.optimizer.step()
-        self.network.update_normalization(self.flights.observed())
+        self.network.update_normalization({"actor": self.flights.obs[self.flights.flown()]})
         return {name: float(value) for name, value in figures.items()} | {"learning_rate": rate, "episodes": float(self.env.num_envs)}
 
     def export(self, contract: dict, made_by: dict) -> Policy:

@@ -46,8 +46,7 @@ def turned(quat: wp.quat, arm_b: wp.vec3, grad_w: wp.vec3):
 def step_back(p: Setting, x: Course, adj: Course, k: int, e: int):
     """Add to the derivatives by state k, k - 1 and by the commands up to k what those by state k + 1 make of them."""
     dt, half, up = p.period, 0.5 * p.period, wp.vec3(0.0, 0.0, 1.0)
-    mass, load_mass, mount = p.mass[e], p.load_mass[e], p.mount[e]
-    rot, rot_next = x.quat[k, e], x.quat[k + 1, e]
+    mass, load_mass, mount, rot, rot_next = p.mass[e], p.load_mass[e], p.mount[e], x.quat[k, e], x.quat[k + 1, e]
     g_pos, g_load = p.decay * adj.pos[k + 1, e], p.decay * adj.load_pos[k + 1, e]
     g_vel, g_load_vel = p.decay * adj.vel[k + 1, e] + half * g_pos, p.decay * adj.load_vel[k + 1, e] + half * g_load
     g_turn, g_response = p.decay * adj.turn[k + 1, e], p.decay * adj.response[k + 1, e]
@@ -104,8 +103,7 @@ def seen_back(p: Setting, x: Course, adj: Course, by_seen: wp.array2d(dtype=floa
     """From an observation to state i, of which ``share`` is in it, and to the payload as it was up to ``history`` steps before."""
     adj.pos[i, e] += share * three(by_seen, e, 0)
     adj.vel[i, e] += share * three(by_seen, e, 3)
-    rate = share * three(by_seen, e, 6)
-    adj.response[i, e] += wp.vec4(0.0, rate[0], rate[1], rate[2])
+    adj.response[i, e] += share * wp.vec4(0.0, by_seen[e, 6], by_seen[e, 7], by_seen[e, 8])
     for axis in range(2):
         unit = wp.vec3(1.0 - float(axis), float(axis), 0.0)
         adj.turn[i, e] += share * turned(x.quat[i, e], unit, three(by_seen, e, 9 + 3 * axis))
@@ -133,9 +131,8 @@ def backward(
 ):
     e = wp.tid()
     if k < steps[e]:
-        late = p.age[e] / p.period
-        seen_back(p, x, adj, by_seen, k + 1, e, 1.0 - late)
-        seen_back(p, x, adj, by_seen, k, e, late)
+        seen_back(p, x, adj, by_seen, k + 1, e, 1.0 - p.age[e] / p.period)
+        seen_back(p, x, adj, by_seen, k, e, p.age[e] / p.period)
         step_back(p, x, adj, k, e)
         throttle = wp.clamp(0.5 * (action[k, e, 0] + 1.0), SLACK_THROTTLE, 1.0)
         command = wp.cw_mul(wp.vec4(p.max_thrust * throttle, p.max_rate[0], p.max_rate[1], p.max_rate[2]), adj.command[k, e])
@@ -147,10 +144,7 @@ def backward(
 
 
 class Layers:
-    """What a network's layers made of the steps of flights, the last one ``action``, shape (T, E, N) each, and derivatives by it.
-
-    ``by_seen`` has those by the observations of the last step that :meth:`back` was called for, shape (E, D).
-    """
+    """What a network's layers made of the steps of flights, shape (T, E, N), and derivatives by it; by what one step saw, shape (E, D)."""
 
     def __init__(self, network: Network, obs: Tensor):
         self._network, self._linear = network, [layer for layer in network.mlp if isinstance(layer, nn.Linear)]
@@ -159,34 +153,43 @@ class Layers:
         self._first = torch.zeros_like(self._linear[0].weight)  # with the normaliser's spread
         self.action, self.by_action, self.by_seen = self._inner[-1], self._by_inner[-1], torch.zeros_like(obs[0])
 
-    def forward(self, k: int, seen: Tensor) -> Tensor:
-        """Actions of step k, shape (E, 5), for observations, shape (E, D)."""
-        x = self._network.obs_normalizer(seen)
+    def forward(self, k: int, seen: Tensor, flying: Tensor) -> Tensor:
+        """Actions of step k, shape (E, 5), for observations, shape (E, D), of the flights that are flying, shape (E,)."""
+        rows = _picked(flying)
+        x = self._network.obs_normalizer(seen[rows])
         for layer, inner in zip(self._linear, self._inner):
-            torch.addmm(layer.bias, x, layer.weight.T, out=inner[k])
-            x = self._network.mlp[1](inner[k])
+            out = torch.addmm(layer.bias, x, layer.weight.T)
+            inner[k, rows], x = out, self._network.mlp[1](out)
         return self.action[k]
 
     def prepare(self, steps: int) -> None:
         """Begin a way back from this step."""
         for inner, slope in zip(self._inner, self._slope):
-            slope[:steps] = torch.func.vjp(self._network.mlp[1], inner[:steps])[1](torch.ones_like(inner[:steps]))[0]
-        seen = self._network.obs_normalizer
-        spread = seen.std + seen.eps if self._network.obs_normalization else 1.0
+            for x, out in zip(inner[:steps].split(4), slope[:steps].split(4)):  # pieces that caches hold
+                with torch.enable_grad():
+                    out.copy_(torch.autograd.grad(self._network.mlp[1](leaf := x.detach().requires_grad_()).sum(), leaf)[0])
+        spread = self._network.obs_normalizer.std + self._network.obs_normalizer.eps if self._network.obs_normalization else 1.0
         self._first.copy_(self._linear[0].weight.detach() / spread)
         self.by_seen.zero_()
 
-    def back(self, k: int) -> None:
-        """From derivatives by the actions of step k to those by its observations."""
-        for i in range(len(self._linear) - 1, 0, -1):
-            out = self._by_inner[i - 1][k]
-            torch.mm(self._by_inner[i][k], self._linear[i].weight, out=out).mul_(self._slope[i - 1][k])
-        torch.mm(self._by_inner[0][k], self._first, out=self.by_seen)
+    def back(self, k: int, flown: Tensor) -> None:
+        """From derivatives by the actions of step k to those by its observations, of the flights that flew it, shape (E,)."""
+        rows = _picked(flown)
+        by = self.by_action[k, rows]
+        for layer, slope, by_inner in reversed(list(zip(self._linear[1:], self._slope, self._by_inner))):
+            by = by_inner[k, rows] = (by @ layer.weight).mul_(slope[k, rows])
+        self.by_seen[rows] = by @ self._first
 
-    def gradients(self, seen: Tensor, shares: Tensor) -> None:
-        """Give the weights their derivatives; flights, shape (E,), count by these shares. seen: the first observations, shape (T, E, D)."""
-        x, steps = self._network.obs_normalizer(seen), len(seen)
+    def gradients(self, seen: Tensor, flown: Tensor, shares: Tensor) -> None:
+        """Give the weights their derivatives: seen, shape (T, E, D), at steps that were flown, (T, E); flights count by shares, (E,)."""
+        rows = _picked(flown.flatten())
+        x, shares = self._network.obs_normalizer(seen.flatten(0, 1)[rows]), shares.expand(flown.shape).flatten()[rows, None]
         for layer, inner, by_inner in zip(self._linear, self._inner, self._by_inner):
-            by = (by_inner[:steps] * shares[:, None]).flatten(0, 1)
-            layer.weight.grad, layer.bias.grad = by.mT @ x.flatten(0, 1), by.sum(0)
-            x = self._network.mlp[1](inner[:steps])
+            by = by_inner.flatten(0, 1)[rows] * shares
+            layer.weight.grad, layer.bias.grad = by.mT @ x, by.sum(0)
+            x = self._network.mlp[1](inner.flatten(0, 1)[rows])
+
+
+def _picked(mask: Tensor) -> Tensor | slice:
+    """Rows where a mask, shape (N,), is not 0; all of them where that is so, and on a GPU, which would have to wait to know."""
+    return slice(0, len(mask)) if mask.is_cuda or bool(mask.all()) else mask.nonzero()[:, 0]

@@ -72,15 +72,14 @@ class Flights:
         self.time, self.status = torch.zeros(steps + 1, E, **make), torch.zeros(steps + 1, E, dtype=torch.int32, **make)
         self.flying, self.steps = (torch.zeros(E, dtype=torch.int32, **make) for _ in range(2))
         self._mask, (vehicle, rope) = wp.from_torch(self.flying), env.sim.plants()
-        load = rope["payload_mass"]
-        parts = (vehicle["body"]["mass"], rope["total_mass"] - load, load, rope["mount"], vehicle["thrust"]["k_f"])
-        rows = (torch.tensor(part, dtype=torch.float32, **make) for part in parts)
-        self._body, self._rope, self.load_mass, self.mount, self._thrust = rows
+        above = rope["total_mass"] - rope["payload_mass"]
+        parts = (vehicle["body"]["mass"], above, rope["payload_mass"], rope["mount"], vehicle["thrust"]["k_f"])
+        self._body, self._rope, self.load_mass, self.mount, self._thrust = (torch.tensor(p, dtype=torch.float32, **make) for p in parts)
         self.mass = self._body + self._rope
 
-    def observed(self) -> dict[str, Tensor]:
-        """What the actor observed while flights lasted, shape (N, D), under its group's name."""
-        return {"actor": self.obs[torch.arange(len(self.obs), device=self.steps.device)[:, None] <= self.steps]}
+    def flown(self) -> Tensor:
+        """Whether a flight was not over at a step, bool, shape (T, E)."""
+        return torch.arange(len(self.obs), device=self.steps.device)[:, None] <= self.steps
 
     def fly(self, act: Callable[[int, Tensor], Tensor | None]) -> None:
         """Fly from new starts under actions ``act(k, observations)``; where it has none, all flights are over."""
@@ -115,10 +114,8 @@ class Flights:
 
 
 def fit(env: ThrowEnv, network: Network, steps: int = 40) -> dict[str, Tensor]:
-    """Fit the surrogate to random flights, whose observations the network's normaliser is shown.
-
-    Returns:
-        ``response``: rows A0, A1, B_0, ..., shape (2 + D, 4); ``force``: kappa and drag [N s/m], shape (4,); ``tension``: a, b.
+    """Fit to random flights, whose observations the network's normaliser is shown: ``response``, rows A0, A1, B_0, ..., shape (2 + D, 4),
+    ``force``, kappa and drag [N s/m], shape (4,), and ``tension``, a and b.
     """
     period = env.cfg.sim.control_period
     lags = max(queue_depth(v.queue.delay, period) for v in env.sim.vehicles)
@@ -132,7 +129,7 @@ def fit(env: ThrowEnv, network: Network, steps: int = 40) -> dict[str, Tensor]:
 
     for _ in range(FITTED // (env.num_envs * steps) + 1):
         flights.fly(act)
-        network.update_normalization(flights.observed())
+        network.update_normalization({"actor": flights.obs[flights.flown()]})
         parts.append(_regressors(flights, lags, period))
     rows = {name: torch.cat([part[name] for part in parts]).double() for name in parts[0]}
     response = [_solve(rows["lagged"][..., c], rows["next"][:, c])[:-1] for c in range(4)]
