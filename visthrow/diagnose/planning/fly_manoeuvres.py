@@ -44,6 +44,9 @@ TRACKING = HoverParams(max_speed=8.0, max_tilt=0.9, integral_limit=2.0)
 LOST = 10.0
 """The same of a vehicle that flies off."""
 
+THREAD = 1e-3
+"""Mass of a setup's cable, in that of its payload: the setup's model has it without mass."""
+
 SAMPLED = ("pos_w", "quat_wb", "payload_pos_w", "vel_w", "rate_b", "motor_speed", "voltage")
 
 
@@ -121,9 +124,11 @@ def vehicle_of(params: FlyerParams, known: PlantParams) -> PlantParams:
     still = {f.name: 0.0 for f in fields(v.aero) if f.name != "kind"}
     aero = replace(v.aero, **{**still, "drag_x": params.drag_xy, "drag_y": params.drag_xy, "drag_z": params.drag_z})
     v = replace(v, body=replace(v.body, mass=params.mass), queue=replace(v.queue, delay=params.command_delay), aero=aero,
-                motor=replace(v.motor, time_constant=params.motor_time_constant))  # fmt: skip
+                motor=replace(v.motor, time_constant=params.motor_time_constant), thrust=replace(v.thrust, voltage_coefficient=0.0),
+                controller=replace(v.controller, voltage_compensation=1.0))  # fmt: skip
     if params.cable is not None:
-        rope = replace(rope, length=params.cable.length - rope.payload_offset, payload_mass=params.cable.mass, mount=(0.0, 0.0, 0.0))
+        rope = replace(rope, length=params.cable.length - rope.payload_offset, payload_mass=params.cable.mass, mount=(0.0, 0.0, 0.0),
+                       rope_mass=THREAD * params.cable.mass)  # fmt: skip
     return replace(known, vehicle=v, rope=rope)
 
 
@@ -212,7 +217,8 @@ class Flight:
             return Channel(self.reference.time, values, "N, rad/s" if params.input == "command" else "N")
         thrust = self.plant.vehicle.thrust.k_f * self.truth["motor_speed"] ** 2
         wanted = thrust + params.motor_time_constant * np.gradient(thrust, SAMPLE_PERIOD, axis=0)
-        return Channel(self.time - params.command_delay, command_of(params.thrust_map, wanted), "1")
+        stamps = self.time - params.command_delay - 0.5 * SAMPLE_PERIOD  # samples that are held stand for what lies about them
+        return Channel(stamps, command_of(params.thrust_map, wanted), "1")
 
 
 def fly(plant: PlantParams, manoeuvres: Sequence[Manoeuvre], seed: int, device: str = "cpu") -> list[Flight]:

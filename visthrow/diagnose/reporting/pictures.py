@@ -82,13 +82,13 @@ def planned(base: Manoeuvre, found: Manoeuvre, rates: Mapping[str, float]) -> by
             "heading [deg]": lambda r: np.degrees(r.yaw), "thrust [%]": lambda r: 100.0 * (r.thrust_factor - 1.0),
             "rate x [rad/s]": lambda r: r.rates_b[:, 0], "rate y [rad/s]": lambda r: r.rates_b[:, 1],
             "rate z [rad/s]": lambda r: r.rates_b[:, 2]}  # fmt: skip
-    figure, axes = _figure(3, 3, 6.0)
+    figure, axes = _figure(3, 3, 6.2)
     for axis, (label, value) in zip(axes.flat, rows.items()):
         for manoeuvre, colour in ((base, BEFORE), (found, AFTER)):
             reference = manoeuvre.reference()
             axis.plot(reference.time, value(reference), color=colour, lw=1.0, label=manoeuvre.name)
         axis.set(ylabel=label, xlabel="time [s]")
-    axes[0, 0].legend(loc="lower left", fontsize=6)
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=2)
     best = sorted(rates, key=rates.get)[-6:]
     axes[2, 2].barh(best, [rates[name] for name in best], color=[AFTER if name == found.name else BEFORE for name in best])
     axes[2, 2].tick_params(axis="y", labelsize=6)
