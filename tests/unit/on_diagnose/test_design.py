@@ -79,7 +79,7 @@ def test_a_payload_is_never_dropped_where_the_vehicle_cannot():
 
 @pytest.mark.parametrize("name", ["cf_payload", "nanobench_cf21"])
 def test_the_simulated_flight_of_a_setup_is_one_that_its_own_model_explains(name):
-    """The log's input, attitude and path belong together by the setup's own numbers: residuals of a third of a millimetre without any effect."""
+    """The log's input, attitude and path belong together by the setup's own numbers: hardly anything is left without any effect."""
     params = setup.load(name).flyer
     chosen = [fly_manoeuvres.carried(BASES[m], params) for m in ("fast passes x", "circle")]
     for flight in fly_manoeuvres.fly(plant(params), chosen, 0):
