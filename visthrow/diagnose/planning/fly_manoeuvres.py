@@ -216,7 +216,7 @@ class Flight:
             values = np.hstack((told, self.commands[:, 1:])) if params.input == "command" else told
             return Channel(self.reference.time, values, "N, rad/s" if params.input == "command" else "N")
         thrust = self.plant.vehicle.thrust.k_f * self.truth["motor_speed"] ** 2
-        wanted = thrust + params.motor_time_constant * np.gradient(thrust, SAMPLE_PERIOD, axis=0)
+        wanted = thrust + self.plant.vehicle.motor.time_constant * np.gradient(thrust, SAMPLE_PERIOD, axis=0)
         stamps = self.time - params.command_delay - 0.5 * SAMPLE_PERIOD  # samples that are held stand for what lies about them
         return Channel(stamps, command_of(params.thrust_map, wanted), "1")
 
