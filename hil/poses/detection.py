@@ -97,8 +97,8 @@ class Detections:
                 self._points[part], self._valid[part] = points[part], valid[part]
 
     def problems(self, now: float) -> list[str]:
-        """Return what speaks against a throw at a time [s]: a ball that hangs in view is seen."""
-        return ["the pictures show no ball"] if now - self._times["ball"] > self._hold else []
+        """Return what speaks against a throw at a time [s]: a ball that hangs and a goal that lies in view are seen."""
+        return [f"the pictures show no {name}" for name, stamp in self._times.items() if now - stamp > self._hold]
 
     def _carried(self, seen: Seen, when: float) -> Seen:
         """Return what was seen at a time as the camera of training would see it now: the goal lies, the ball goes with the vehicle."""

@@ -1,6 +1,8 @@
 """The one bridge between the simulator's Warp arrays and torch tensors: views of the same memory, no copies."""
 
+import gc
 from collections.abc import Callable
+from typing import Any
 
 import torch
 import warp as wp
@@ -36,6 +38,23 @@ def on_torch_stream(device: str):
     return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream()), sync_enter=not capturing)
 
 
+def captured(work: Callable[[], Any], **options: Any) -> "torch.cuda.CUDAGraph":
+    """A CUDA graph of what ``work`` launches; ``options`` of `torch.cuda.graph`.
+
+    Python collects no garbage meanwhile: an array or graph of Warp that it frees ends the capture.
+    """
+    torch.cuda.synchronize()
+    graph = torch.cuda.CUDAGraph()
+    gc.collect()
+    gc.disable()
+    try:
+        with torch.cuda.graph(graph, **options):
+            work()
+    finally:
+        gc.enable()
+    return graph
+
+
 class Replayed:
     """Work on fixed tensors of a GPU: done eagerly at first, then captured in a CUDA graph and replayed, on a stream of its own.
 
@@ -51,10 +70,7 @@ class Replayed:
         """Do the work."""
         self._stream.wait_stream(torch.cuda.current_stream())
         if self._graph is None and self._done == self.EAGER:
-            torch.cuda.synchronize()
-            self._graph = torch.cuda.CUDAGraph()
-            with torch.cuda.graph(self._graph, stream=self._stream):
-                self._work()
+            self._graph = captured(self._work, stream=self._stream)
         with torch.cuda.stream(self._stream):
             if self._graph is None:
                 self._work()

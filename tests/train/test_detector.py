@@ -76,8 +76,8 @@ def test_keypoints_of_a_picture_are_those_that_poses_project_to(by):
 class Blind:
     """Eyes that see nothing, and say of some vehicles that they do not; counts how often they are asked."""
 
-    def __init__(self, lost=(False, False)) -> None:
-        self.looks, self.seen, self._lost = 0, None, np.array(lost)
+    def __init__(self, lost=None) -> None:
+        self.looks, self.seen, self._lost = 0, None, lost or {}
 
     def lost(self):
         return self._lost
@@ -100,14 +100,15 @@ def test_a_throw_flies_on_what_its_eyes_see_alone():
     assert not (without["success"] & (without["error"] < 0.5)).any()
 
 
-def test_a_throw_is_refused_where_the_hover_sees_no_ball():
+@pytest.mark.parametrize("name", ["ball", "goal"])
+def test_a_throw_is_refused_where_the_hover_does_not_see(name):
     loaded = load_policy("vision")
     plant, rng = batch_plant(loaded.experiment, "hybrid", 2.0, 0, 2, 0)
     home = place_in_hover(plant, loaded.experiment, loaded.experiment.task.start, rng)
-    pilots = Policies([loaded], np.tile([2.0, 0.0, 0.0], (2, 1)), eyes=Blind((True, False)))
+    pilots = Policies([loaded], np.tile([2.0, 0.0, 0.0], (2, 1)), eyes=Blind({0: name}))
     flight = Flight(plant, pilots, home_w=home)
     flight.run([hover(0.5), throw(0.2)])
-    assert flight.failures == ["refused: the ball is not seen in the hover", None]
+    assert flight.failures == [f"refused: the {name} is not seen in the hover", None]
     assert flight.open.tolist() == [False, True]
     off = np.linalg.norm(plant.state.pos_w - home, axis=1)
     assert off[0] < 0.3, "it hovers on"

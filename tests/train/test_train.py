@@ -167,7 +167,7 @@ def test_a_policy_of_another_task_is_not_taken_up(tmp_path, capsys):
         (["--until", "-0.1"], "--until -0.1"),
         (["--set", "vehicle.body.mass=-1"], "mass"),
         (["--set", "rope.length=-0.2"], "length"),
-        (["--set", "ppo.epochs=0"], "'epochs': 0"),
+        (["--set", "ppo.epochs=0"], "epochs is 0; expected 1 or more"),
         (["--set", "ppo.learning_rate=-1e-3"], "learning_rate is -0.001"),
         (["--resume", "--from", "state"], "--from"),
     ],

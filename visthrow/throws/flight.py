@@ -92,7 +92,7 @@ class Policies(Pilots):
         self._waited += 1
         if self.eyes is not None and self._waited % LOOK_EVERY == 0:
             self.eyes.look(flight.plant.exposed, seen, self.goal_w, seen.attached)
-            self._lost = dict.fromkeys(np.flatnonzero(self.eyes.lost()), "refused: the ball is not seen in the hover")
+            self._lost = {e: f"refused: the {name} is not seen in the hover" for e, name in self.eyes.lost().items()}
         return self._lost
 
     def decide(self, flight: "Flight", seen: Snapshot, held: np.ndarray) -> Decision:

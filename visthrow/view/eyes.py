@@ -27,10 +27,13 @@ HOLD = 5
 """Frames for which a ball that is not seen reads as if it went on hanging as it did."""
 
 SURE = 0.5
-"""Share of the looks in a hover in which the ball must be found."""
+"""Share of the looks in a hover in which ball and goal must be found."""
 
 BY = ("learnt", "contours")
 """Detectors."""
+
+THINGS = ("ball", "goal")
+"""What they look for."""
 
 
 class Eyes:
@@ -76,8 +79,8 @@ class Eyes:
         self._balls: list[Following] = []
         self.frames: list[tuple[np.ndarray, torch.Tensor, torch.Tensor]] = []
         self.seen: tuple[np.ndarray, np.ndarray] | None = None
-        self.found = {"ball": 0, "goal": 0, "frames": 0, "refused": 0}
-        self._hits = np.zeros(count, int)  # looks of each vehicle in which its ball was found
+        self.found = {**dict.fromkeys(THINGS, 0), "frames": 0, "refused": 0}
+        self._hits = {name: np.zeros(count, int) for name in THINGS}  # looks of each vehicle in which it was found
 
     def look(self, now: Any, measured: Any, goal_w: np.ndarray, carried: Sequence[bool] | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Take and look at a picture of each vehicle.
@@ -105,10 +108,10 @@ class Eyes:
         self.seen = points, valid
         return points, valid
 
-    def lost(self) -> np.ndarray:
-        """Vehicles whose ball was found too seldom to throw with, shape (E,), bool; asked in a hover."""
-        lost: np.ndarray = self._hits < SURE * self._looks
-        self.found["refused"] = int(lost.sum())
+    def lost(self) -> dict[int, str]:
+        """By vehicle, which of ball and goal was found too seldom to throw with; asked in a hover."""
+        lost = {int(e): name for name in THINGS for e in np.flatnonzero(self._hits[name] < SURE * self._looks)}
+        self.found["refused"] = len(lost)
         return lost
 
     def _hanging(self, rot_wb: np.ndarray) -> Following:
@@ -123,9 +126,9 @@ class Eyes:
         height = float(pos_w[2] + rot_wb[2] @ np.array(self.params.mount.position_b))
         seen = self.detector.detect(picture, self._balls[e].known(rot_wc, height, HANGING if carried else None))
         self.found["frames"] += 1
-        for name in ("ball", "goal"):
+        for name in THINGS:
+            self._hits[name][e] += getattr(seen, name) is not None
             self.found[name] += getattr(seen, name) is not None
-        self._hits[e] += seen.ball is not None
         return self._balls[e].take(seen, rot_wc, self._looks)
 
     def sheet(self, path: Path, columns: int = 3) -> Path:

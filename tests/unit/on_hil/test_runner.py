@@ -272,20 +272,24 @@ def test_a_payload_that_comes_off_takes_no_pose_of_the_vehicle_with_it():
     assert when(decisions, "recover") < begun + 0.2, "a fall of the tolerance, 10 cm"
 
 
-def test_no_throw_on_pictures_that_show_no_ball():
+@pytest.mark.parametrize("name", ["ball", "goal"])
+def test_no_throw_on_pictures_that_do_not_show(name):
     """Seen in the hover and then lost, it goes back to ready; seen again, it throws."""
     hidden = (1.6, 2.6)
+    ahead = np.array([[-0.1, -0.8, 0.7], [0.1, -0.8, 0.7], [0.1, -0.6, 0.7], [-0.1, -0.6, 0.7]])
+    corners = tuple(map(tuple, (ahead / np.linalg.norm(ahead, axis=1, keepdims=True)).tolist()))
+    shown = {"goal": corners, "ball": (0.0, 0.1, math.sqrt(0.99), 0.08)}
     pilot = runner(NEVER)
     pilot.detections = Detections(pilot.pilot.camera, 0.1)
 
     def watch(time, decision):
-        ball = None if hidden[0] <= time < hidden[1] else (0.0, 0.1, math.sqrt(0.99), 0.08)
-        pilot.look([Detection(time, None, ball)])
+        seen = {thing: None if thing == name and hidden[0] <= time < hidden[1] else rays for thing, rays in shown.items()}
+        pilot.look([Detection(time, seen["goal"], seen["ball"])])
 
     decisions = fly(pilot, hidden[1] + 2.0, watch=watch)
     begun = when(decisions, "throw")
     assert hidden[1] < begun < hidden[1] + 1.5
-    assert any("the pictures show no ball" in d.waits for d in decisions)
+    assert any(f"the pictures show no {name}" in d.waits for d in decisions)
 
 
 def test_bodies_exchanged_from_the_start_are_noticed():

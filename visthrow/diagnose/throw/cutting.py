@@ -59,8 +59,8 @@ def payload_down(flight: Recorded, landing_height: float) -> float:
     return min(flight.landing, float(flight.payload.time[low][0])) if np.any(low) else flight.landing
 
 
-def cut(flight: Recorded, number: int, lag: float, landing_height: float, carries: bool, delay: float = 0.0) -> list[Cut]:
-    """Cut one flight, from when its first command acts: what acted before is not known.
+def cut(flight: Recorded, number: int, lag: float, landing_height: float, carries: bool) -> list[Cut]:
+    """Cut one flight.
 
     Args:
         flight: what was recorded.
@@ -68,9 +68,8 @@ def cut(flight: Recorded, number: int, lag: float, landing_height: float, carrie
         lag: of the release, as far as known [s].
         landing_height: of the payload's centre [m].
         carries: whether the flight carries a payload.
-        delay: of commands, as far as known [s].
     """
-    first, last = max(flight.start, flight.command_time[0] + delay), flight.end
+    first, last = flight.start, flight.end
     separation = flight.latch + lag
     hanging = ATTACHED if carries else NO_PAYLOAD
     down = payload_down(flight, landing_height)

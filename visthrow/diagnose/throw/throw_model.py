@@ -92,8 +92,8 @@ class ThrowModel:
             aside()
         flights = [record_of(log, i) for i, log in enumerate(logs)]
         hangs = carriers(flights) if carries is None else [carries] * len(flights)
-        carries, release, delay = any(hangs), (plant.release.lag, plant.release.landing_height), plant.vehicle.queue.delay
-        cuts = thinned([c for i, f in enumerate(flights) for c in cut(f, i, *release, hangs[i], delay)])
+        carries, release = any(hangs), (plant.release.lag, plant.release.landing_height)
+        cuts = thinned([c for i, f in enumerate(flights) for c in cut(f, i, *release, hangs[i])])
         if not cuts:
             raise DiagnoseError(f"{len(flights)} flights hold no stretch of poses and commands long enough to replay")
         self.channels = [*_measured(flights, carries), *channels_of(logs, flights, camera)]

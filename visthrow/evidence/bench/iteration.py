@@ -35,11 +35,9 @@ class Stretch:
         self._settle = torch.cuda.synchronize if device.startswith("cuda") else (lambda: None)
         function()
         if device.startswith("cuda"):
-            self._settle()
-            graph = torch.cuda.CUDAGraph()
-            with torch.cuda.graph(graph):
-                function()
-            self._run = graph.replay
+            from sim.arrays.torch_bridge import captured
+
+            self._run = captured(function).replay
 
     def seconds(self, before: Callable[[], Any] = lambda: None) -> float:
         """Wall time of one run [s]; ``before`` is not timed."""

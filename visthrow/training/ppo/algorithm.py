@@ -8,6 +8,7 @@ from rsl_rl.algorithms import PPO
 from tensordict import TensorDict
 from torch import Tensor
 
+from sim.arrays.torch_bridge import captured
 from visthrow.common.errors import ConfigError
 from visthrow.onboard.policy import Policy
 from visthrow.task import Experiment, PPOParams
@@ -95,10 +96,7 @@ class PPOTraining:
         else:
             if self._graph is None:
                 self.alg.storage.clear()
-                torch.cuda.synchronize()
-                self._graph = torch.cuda.CUDAGraph()
-                with torch.cuda.graph(self._graph):
-                    self._rollout()
+                self._graph = captured(self._rollout)
             self._graph.replay()
         self._rollouts += 1
 

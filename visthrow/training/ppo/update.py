@@ -8,7 +8,7 @@ from rsl_rl.algorithms import PPO
 from tensordict import TensorDict
 from torch import Tensor
 
-from sim.arrays.torch_bridge import on_torch_stream
+from sim.arrays.torch_bridge import captured, on_torch_stream
 from visthrow.training.ppo import loss
 from visthrow.training.ppo.network import Network
 
@@ -102,10 +102,7 @@ class CapturedPPO(PPO):
             self._epochs()
         else:
             if self._graph is None:
-                torch.cuda.synchronize()
-                self._graph = torch.cuda.CUDAGraph()
-                with torch.cuda.graph(self._graph, capture_error_mode="thread_local"):  # NCCL's watchdog asks beside
-                    self._epochs()
+                self._graph = captured(self._epochs, capture_error_mode="thread_local")  # NCCL's watchdog asks beside
             self._graph.replay()
         self._updates += 1
         for model in (self.actor, self.critic):
