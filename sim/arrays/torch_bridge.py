@@ -46,12 +46,14 @@ def captured(work: Callable[[], Any], **options: Any) -> "torch.cuda.CUDAGraph":
     torch.cuda.synchronize()
     graph = torch.cuda.CUDAGraph()
     gc.collect()
+    collects = gc.isenabled()
     gc.disable()
     try:
         with torch.cuda.graph(graph, **options):
             work()
     finally:
-        gc.enable()
+        if collects:
+            gc.enable()
     return graph
 
 

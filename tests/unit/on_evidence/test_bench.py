@@ -15,7 +15,7 @@ from tests.bench import sim as sim_cpu
 from visthrow import cli, config
 from visthrow.cli import bench
 from visthrow.common.errors import StorageError, VisthrowError
-from visthrow.evidence.bench import records
+from visthrow.evidence.bench import records, time_to_error
 from visthrow.task import Experiment, plant_of
 
 
@@ -193,3 +193,14 @@ def test_mpc_steps_are_timed_and_recorded(tmp_path, monkeypatch, capsys):
         assert row["steps"] > 40
     assert "| 1.5 m" in capsys.readouterr().out
     assert mpc.main(["--throws", "0"]) == 2
+
+
+def test_a_training_to_an_error_is_told_as_it_ends(capsys):
+    """What the first seeds took is not lost with the last one."""
+    small = ["ppo.environments=16", "ppo.iterations=2", "ppo.hidden=[8]", "ppo.steps=4"]
+    experiment = config.load(Experiment, config.find("train", "laptop"), small)
+    report = time_to_error.measure({"laptop": experiment}, "cpu", [100.0, 1e-6], [3, 4], 1.0, 1)
+    told = capsys.readouterr().err.splitlines()
+    assert [line.split(":")[0] for line in told] == ["seed 3", "seed 4"]
+    assert all("1e-06 m never" in line for line in told)
+    assert len(report.figures["runs"]["laptop"]) == 2

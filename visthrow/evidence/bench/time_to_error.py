@@ -2,6 +2,7 @@
 
 import math
 import statistics
+import sys
 import time
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -38,6 +39,8 @@ def train(experiment: Any, device: str, seed: int, errors: Sequence[float], minu
         for error in errors:
             if throws.within(error):
                 reached[f"{error:g}"] = reached[f"{error:g}"] or curve[-1]
+    told = ", ".join(f"{error} m {_seconds(hit[0] if hit else math.inf)}" for error, hit in reached.items())
+    print(f"seed {seed}: {told}; {spent:.0f} s in all", file=sys.stderr, flush=True)
     return {"seed": seed, "curve": curve, "reached": reached, "seconds": spent}
 
 
