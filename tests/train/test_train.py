@@ -14,8 +14,10 @@ import torch
 
 from visthrow import cli, config
 from visthrow.common import storage
+from visthrow.onboard import observations
 from visthrow.onboard.policy import Policy, find_policy
 from visthrow.task import Experiment, contract_of
+from visthrow.training.ppo.algorithm import PPOTraining
 from visthrow.training.trainer import CHECKPOINT, Trainer
 
 SMALL = ["ppo.environments=32", "ppo.steps=8", "ppo.hidden=[16,16]", "ppo.iterations=4", "task.bounds.time_limit=0.4"]
@@ -59,6 +61,25 @@ def test_exported_policy_equals_the_network(whole):
     with torch.inference_mode():
         difference = (trainer.algorithm.act(obs) - Policy.load(whole / "policy.npz").act(obs)).abs().max()
     assert difference < 1e-6
+
+
+def test_networks_may_round_their_products_and_observations_do_not(whole, monkeypatch):
+    experiment, allowed = config.load(Experiment, whole / "config.toml"), {"observed": set(), "learnt": set()}
+
+    def watched(owner, name, place):
+        work = getattr(owner, name)
+
+        def noted(*args, **kwargs):
+            allowed[place].add(torch.backends.cuda.matmul.allow_tf32)
+            return work(*args, **kwargs)
+
+        monkeypatch.setattr(owner, name, noted)
+
+    watched(observations, "observe", "observed")
+    watched(PPOTraining, "learn", "learnt")
+    Trainer(experiment, "cpu", 1).step()
+    assert allowed == {"observed": {False}, "learnt": {True}}
+    assert not torch.backends.cuda.matmul.allow_tf32, "left on for whatever comes after"
 
 
 def test_resume_goes_on_bit_for_bit(whole, tmp_path):

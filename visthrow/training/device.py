@@ -1,4 +1,7 @@
-"""Choice of the compute device."""
+"""Choice of the compute device, and how exact its products are."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 from sim.arrays.cores import cores as cores
 from visthrow.common.errors import DeviceError
@@ -33,3 +36,19 @@ def device_name(device: str) -> str:
     import torch
 
     return torch.cuda.get_device_name(device)
+
+
+@contextmanager
+def rounded_products(allowed: bool) -> Iterator[None]:
+    """Whether float32 products on a GPU may have TF32's ten bits while this lasts, which networks bear and rays of keypoints do not.
+
+    A CUDA graph keeps what held when it was captured.
+    """
+    import torch
+
+    held = torch.backends.cuda.matmul.allow_tf32
+    torch.backends.cuda.matmul.allow_tf32 = allowed
+    try:
+        yield
+    finally:
+        torch.backends.cuda.matmul.allow_tf32 = held

@@ -25,6 +25,7 @@ from visthrow.onboard.located import fitted_goal
 from visthrow.task import Experiment, drawn_plants, plant_of
 from visthrow.task.fleet import members
 from visthrow.training import rewards, terminations
+from visthrow.training.device import rounded_products
 
 RESULTS = ("episodes", "released", "landing_error", "duration")
 """Sums over finished episodes; landing error [m] and duration [s] over the released ones."""
@@ -373,6 +374,7 @@ class ThrowEnv(VecEnv):
         newer, older = (poses.gather(1, row + k)[:, 0] for k in (0, 1))
         return newer + (older - newer) * (age - before)[:, None]
 
+    @rounded_products(False)
     def _observe(self, fresh: Tensor) -> TensorDict:
         """Actor's and critic's view of the current state."""
         state, memory, noise = self.views.state, self._memory, self.cfg.task.noise

@@ -16,6 +16,7 @@ from visthrow.onboard.policy import Policy
 from visthrow.task import Experiment, contract_of
 from visthrow.task.measurement import Throws
 from visthrow.training import protocol
+from visthrow.training.device import rounded_products
 from visthrow.training.env import ThrowEnv
 from visthrow.training.ranks import Ranks
 
@@ -136,12 +137,12 @@ class Trainer:
         torch.manual_seed(seed * 1000 + ranks.rank)
         if device.startswith("cuda"):
             torch.cuda.set_device(device)  # captures and synchronisation go to the current device
-            torch.backends.cuda.matmul.allow_tf32 = True
         self.experiment, self.device, self.seed, self.ranks = experiment, device, seed, ranks
         self.algorithm = build(experiment, device, seed * 1000 + ranks.rank, ranks)
         self.iteration = 0
         self.seconds = {"rollout": 0.0, "learning": 0.0}
 
+    @rounded_products(True)
     def step(self) -> dict[str, float]:
         """One iteration; returns losses, the finished episodes' means, ``rollout_s`` and ``learning_s`` [s]."""
         start, done = time.perf_counter(), min(self.iteration / self.algorithm.iterations, 1.0)

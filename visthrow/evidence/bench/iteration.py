@@ -11,7 +11,7 @@ from visthrow.common.arguments import add_common
 from visthrow.common.errors import VisthrowError
 from visthrow.evidence.bench import records
 from visthrow.evidence.bench.records import Report, Table, rate
-from visthrow.training.device import device_name
+from visthrow.training.device import device_name, rounded_products
 
 WARM_UP = 3
 """Iterations before measuring: the first runs eagerly, the second captures the CUDA graph."""
@@ -57,6 +57,7 @@ def whole(trainer: Any, iterations: int) -> dict[str, list[float]]:
     return {"rollout": [r["rollout_s"] for r in rows], "learning": [r["learning_s"] for r in rows]}
 
 
+@rounded_products(True)
 def alone(trainer: Any, repeats: int) -> dict[str, float]:
     """Median wall time [s] of an iteration's simulator steps, environment steps and policy calls, each alone.
 
