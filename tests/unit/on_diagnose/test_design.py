@@ -10,7 +10,7 @@ from visthrow.diagnose.inputs import setup
 from visthrow.diagnose.models.ball import BallModel
 from visthrow.diagnose.models.flyer import FlyerModel
 from visthrow.diagnose.planning import design, fly_manoeuvres, plan
-from visthrow.diagnose.planning.manoeuvres import Manoeuvre, catalogue
+from visthrow.diagnose.planning.manoeuvres import PERIOD, Manoeuvre, catalogue
 from visthrow.diagnose.select import search
 from visthrow.task import Experiment, plant_of
 
@@ -67,6 +67,20 @@ def test_the_start_is_the_manoeuvre_and_every_design_keeps_within_the_limits(bas
         assert allowed.lowest - 1e-9 <= r.pos_w[:, 2].min() <= r.pos_w[:, 2].max() <= allowed.highest + 1e-9
         assert np.linalg.norm(r.vel_w, axis=1).max() <= 1.02 * allowed.speed  # the hover before and after is not part of the fit
         assert np.abs(r.rates_b).max() <= limits.rate + np.abs(own.rates_b).max() + 1e-9
+
+
+def test_sweeps_go_as_far_as_the_limits_let_them():
+    t, rng = np.arange(0.0, 8.0, PERIOD)[:, None], np.random.default_rng(5)
+    path = np.sin(t + [0.0, 1.0, 2.0]) * [0.3, 0.3, 0.1] + [0.0, 0.0, 1.5]
+    held, shares = design.Limits(), []
+    for _ in range(30):
+        more = rng.uniform(0.0, 3.0) ** 3 * np.sin(rng.uniform(0.2, 4.0, 3) * t)
+        shares.append(held.share(path, more))
+        within = held.around(path + 0.9999 * shares[-1] * more)
+        assert within == held
+        assert shares[-1] == 1.0 or held.around(path + 1.0001 * shares[-1] * more) != held
+    assert min(shares) < 0.3 < max(shares) == 1.0
+    assert held.share(path, 0.0 * path) == 1.0, "what does not move is nowhere too far"
 
 
 def test_a_payload_is_never_dropped_where_the_vehicle_cannot():

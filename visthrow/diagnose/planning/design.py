@@ -36,9 +36,6 @@ FADE = 1.0
 YAW_RATE = 1.5
 """Of the heading's sweep [rad/s]: within what the hover controller asks for."""
 
-HALVINGS = 20
-"""Of the interval of a share of the sweeps: to a millionth."""
-
 ABORTED = 1e3
 """Cost of a flight that is aborted at the limit: above what any other costs [nats/s]."""
 
@@ -71,32 +68,31 @@ class Limits:
 
     def share(self, path: np.ndarray, more: np.ndarray) -> float:
         """Largest share of a further way, 1 at most, that keeps a path within the limits; rows of both ``PERIOD`` apart, (N, 3)."""
-        inside, outside = 0.0, 2.0
-        for _ in range(HALVINGS):
-            tried = 0.5 * (inside + outside)
-            inside, outside = (tried, outside) if self._hold(path + tried * more) else (inside, tried)
-        return min(inside, 1.0)
-
-    def _hold(self, path: np.ndarray) -> bool:
-        low, high, (speed, acceleration) = path.min(0), path.max(0), _fastest(path)
-        level = np.maximum(-low, high)[:2] <= self.half
-        return bool(np.all(level) and self.lowest <= low[2] <= high[2] <= self.highest and speed <= self.speed
-                    and acceleration <= self.acceleration)  # fmt: skip
+        middle, room = (0.0, 0.0, 0.5 * (self.highest + self.lowest)), (*self.half, 0.5 * (self.highest - self.lowest))
+        ways = [((path - middle)[:, [i]], more[:, [i]], room[i]) for i in range(3)]
+        ways += zip(_derivatives(path), _derivatives(more), (self.speed, self.acceleration))
+        return min(1.0, *(_leaving(*way) for way in ways))
 
     def around(self, path: np.ndarray) -> "Limits":
         """Limits that hold a path that is known to be safe too."""
-        speed, acceleration = _fastest(path)
+        speed, acceleration = (float(np.linalg.norm(rows, axis=1).max()) for rows in _derivatives(path))
         return replace(
             self, half=tuple(np.maximum(self.half, np.abs(path[:, :2]).max(0)).tolist()), lowest=min(self.lowest, path[:, 2].min()),
             highest=max(self.highest, path[:, 2].max()), speed=max(self.speed, speed), acceleration=max(self.acceleration, acceleration),
         )  # fmt: skip
 
 
-def _fastest(path: np.ndarray) -> tuple[float, float]:
-    """Largest speed [m/s] and acceleration [m/s^2] of a path."""
+def _derivatives(path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Velocity [m/s] and acceleration [m/s^2]."""
     vel = np.gradient(path, PERIOD, axis=0)
-    acc = np.gradient(vel, PERIOD, axis=0)
-    return float(np.linalg.norm(vel, axis=1).max()), float(np.linalg.norm(acc, axis=1).max())
+    return vel, np.gradient(vel, PERIOD, axis=0)
+
+
+def _leaving(at: np.ndarray, along: np.ndarray, radius: float) -> float:
+    """Share of a way from within a ball about 0 at which its first row leaves it, shapes (N, D)."""
+    inward, square, slack = -(at * along).sum(1), (along**2).sum(1), np.maximum(radius**2 - (at**2).sum(1), 0.0)
+    with np.errstate(divide="ignore", invalid="ignore"):  # of a row that does not move
+        return float(np.nanmin((inward + np.sqrt(inward**2 + square * slack)) / square, initial=np.inf))
 
 
 @dataclass(frozen=True)
