@@ -15,7 +15,7 @@ from tests.bench import sim as sim_cpu
 from visthrow import cli, config
 from visthrow.cli import bench
 from visthrow.common.errors import StorageError, VisthrowError
-from visthrow.evidence.bench import records, time_to_error
+from visthrow.evidence.bench import fleet, records, time_to_error
 from visthrow.task import Experiment, plant_of
 
 
@@ -204,3 +204,14 @@ def test_a_training_to_an_error_is_told_as_it_ends(capsys):
     assert [line.split(":")[0] for line in told] == ["seed 3", "seed 4"]
     assert all("1e-06 m never" in line for line in told)
     assert len(report.figures["runs"]["laptop"]) == 2
+
+
+def test_of_a_fleet_is_kept_how_its_vehicles_spread_and_no_row_of_each():
+    vehicles = [*map(str, range(41)), "x500"]
+    rows = [fleet.Row("any", v, t, 6, 6, 0.001 * i + 0.01 * t, 1.0) for i, v in enumerate(vehicles) for t in fleet.TARGETS]
+    report = fleet._report(rows, {})
+    assert [row[:3] for row in report.tables[0].rows] == [("drawn", "any", "41"), ("x500", "any", "1")]
+    (spread,) = report.figures["spread"]
+    assert (spread["vehicles"], spread["n"]) == ("drawn", 41)
+    assert spread["error"]["2"] == pytest.approx(0.02 + 0.04 * np.array(fleet.QUANTILES), abs=5e-5)
+    assert spread["error"]["all"] == spread["error"]["2"], "the mean target is the middle one"

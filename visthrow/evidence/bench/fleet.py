@@ -25,6 +25,8 @@ DRAWN, OWN = "drawn", "its own"
 """What tables call all drawn vehicles, and a policy that was trained for one vehicle."""
 THROWS = 1200
 """Throws at each target on one vehicle."""
+QUANTILES = (0.0, 0.05, 0.25, 0.5, 0.75, 0.95, 1.0)
+"""Of vehicles that are kept of a group of them."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -188,13 +190,22 @@ def _report(rows: Sequence[Row], seconds: dict[str, float]) -> Report:
     groups |= {"those with a policy of their own": rivals} if len(rivals) > 1 else {}
     found = {(row.policy, row.vehicle) for row in rows}
     policies = list(dict.fromkeys(row.policy for row in rows))
-    table = [
-        cells(label, policy, vehicles)
+    shown = [
+        (label, policy, vehicles)
         for label, vehicles in groups.items()
         for policy in policies
         if vehicles and all((policy, vehicle) in found for vehicle in vehicles)
     ]
     header = ("vehicles", "policy", "n", *(f"{target:g} m" for target in TARGETS), "landed, least [%]")
     spent = (f"Training one policy: {np.mean(list(seconds.values())):.0f} s, mean of {len(seconds)}.",) if seconds else ()
-    tables = (Table("Mean landing error [m at a rope of 0.33 m]", header, tuple(table)),)
-    return Report("fleet", "One policy for many vehicles", tables, spent, {"rows": [vars(row) for row in rows], "seconds": seconds})
+    tables = (Table("Mean landing error [m at a rope of 0.33 m]", header, tuple(cells(*group) for group in shown)),)
+    spread = [_spread(*group, rows) for group in shown if len(group[2]) > 1]
+    return Report("fleet", "One policy for many vehicles", tables, spent, {"spread": spread, "seconds": seconds})
+
+
+def _spread(label: str, policy: str, vehicles: Sequence[str], rows: Sequence[Row]) -> dict[str, Any]:
+    """How the vehicles' mean errors spread, at each target and over all of them; the rows themselves are in ``fleet.csv``."""
+    of = np.array([[r.error for r in rows if r.policy == policy and r.vehicle in vehicles and r.target == t] for t in TARGETS])
+    named = zip((*(f"{t:g}" for t in TARGETS), "all"), (*of, of.mean(0)))
+    errors = {name: np.nanquantile(values, QUANTILES).round(4).tolist() for name, values in named}
+    return {"vehicles": label, "policy": policy, "n": len(vehicles), "quantiles": QUANTILES, "error": errors}
