@@ -6,6 +6,7 @@ Where the payload let go and came down is found in its own poses.
 """
 
 import json
+import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -26,9 +27,9 @@ from visthrow.logs.flightlog import FlightLog, FlightRecorder
 
 LEAD, AFTER = 2.0, 0.5  # a throw's log begins this long before it and ends this long after its recovery [s]
 LEAST_STEP = 1e-6  # between two samples of a channel [s]: poses that were taken in together keep their order
-SPUN_UP = 0.2
-"""After an autopilot begins to follow, its vehicle flies by the commands [s]: rotors that stood carried it after 0.09 s (Betaflight, twelve
-throws). Commands before that are no valid ones."""
+SPUN_UP = math.log(100.0)
+"""After an autopilot begins to follow, rotors that stood turn as the commands ask, to 1 % [lags of a motor]; before that commands are no
+valid ones."""
 
 ABOUT = 25  # poses on either side that a clock's offset is the median of: jitter of the transport goes, drift stays
 AFTERWARDS = (State.THROW, State.RECOVER, State.ABORT)  # states that belong to a throw
@@ -100,6 +101,7 @@ class Samples:
         self._last: dict[str, float] = {}
         self._vehicle: Pose | None = None  # the last one: where the rope hangs
         self._follows: float | None = None  # since when the autopilot does
+        self.spun_up = SPUN_UP * self.runner.pilot.policy.contract["vehicle"]["motor"]["time_constant"]
 
     def flush(self) -> FlightLog:
         """Return the log of what was added since the last call."""
@@ -136,7 +138,7 @@ class Samples:
         elif self._follows is None:
             self._follows = now
         if d.command is not None:
-            acts = self._follows is not None and now - self._follows >= SPUN_UP - ROUNDING
+            acts = self._follows is not None and now - self._follows >= self.spun_up - ROUNDING
             self.recorder.add(now, acts, command=np.array(d.command, dtype=float))
         for name in ("action", "observation", "keypoints"):
             if getattr(d, name) is not None:

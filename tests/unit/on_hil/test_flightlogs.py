@@ -70,7 +70,8 @@ def test_commands_before_the_autopilot_follows_are_no_valid_ones(run, tmp_path):
     folder = shutil.copytree(run[0], tmp_path / "late")
     lines = [json.loads(text) for text in (folder / "ticks.jsonl").read_text().splitlines()]
     first = next(n for n, line in enumerate(lines) if line["command"] is not None)
-    late = [line["time"] for line in lines[first : first + 3 + round(flightlogs.SPUN_UP / TICK)]]
+    lag = read(run[0]).playback.runner.pilot.policy.contract["vehicle"]["motor"]["time_constant"]
+    late = [line["time"] for line in lines[first : first + 3 + math.ceil(flightlogs.SPUN_UP * lag / TICK)]]
     for line in lines[: first + 3]:
         line["status"][3] = "wait"
     (folder / "ticks.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
