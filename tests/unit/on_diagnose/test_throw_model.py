@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from camera.keypoints import KeypointCamera, keypoints
 from camera.params import CameraParams
 from sim.effects.setting import generalised
-from sim.params import SensingParams
+from sim.params import GRAVITY, SensingParams
 from tests.flown import fly, setting_with
 from tests.plants import paper_plant
 from visthrow import config
@@ -326,11 +326,15 @@ def test_what_a_simplified_simulator_lacks_stands_out(part, kind, name):
 
 
 def test_a_charge_that_nobody_logged_is_that_of_the_throttles_calibration(planted):
-    """Where a controller makes up for no voltage: it carries the weight at the share of throttle that was told."""
+    """Where a controller makes up for no voltage: it carries the weight at the share of throttle, whatever a log begins with."""
     flight, plant = dataclasses.replace(record_of(planted[0][0]), voltage=None), paper_plant()
-    mixing = dataclasses.replace(plant.vehicle.controller, kind="motor_mixing", calibration_voltage=16.5)
-    told = hover_state(flight, dataclasses.replace(plant, vehicle=dataclasses.replace(plant.vehicle, controller=mixing)), 1)
+    climbing = dataclasses.replace(flight, command=flight.command * [2.0, 1.0, 1.0, 1.0])
+    weight = 0.25 * plant.total_mass * GRAVITY
+    mixing = dataclasses.replace(plant.vehicle.controller, kind="motor_mixing", calibration_voltage=16.5, mix_thrust=weight)
+    calibrated = dataclasses.replace(plant, vehicle=dataclasses.replace(plant.vehicle, controller=mixing))
+    told = hover_state(flight, calibrated, 1)
     assert told["voltage"][0] == pytest.approx(16.5, abs=0.02)
+    assert hover_state(climbing, calibrated, 1)["charge_used"][0] == told["charge_used"][0]
     assert hover_state(flight, plant, 1)["charge_used"][0] == 0.2
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sim.effects.setting import Setting
-from sim.params import GRAVITY, PlantParams
+from sim.params import GRAVITY, PlantParams, VehicleParams
 from sim.replay.kernel import ATTACHED, LOOSE, STATE_FIELDS
 from visthrow.common.rotations import cross
 from visthrow.diagnose.throw.cutting import Cut
@@ -240,9 +240,8 @@ def hover_state(flight: Recorded, plant: PlantParams, payload: int) -> States:
     """A state in hover at the flight's start: what the first window's measurements do not tell."""
     v, rope, L = plant.vehicle, plant.rope, plant.rope.segments
     thrust = max(float(flight.command[0, 0]), 0.05)
-    speed = np.sqrt(thrust / 4.0 / v.thrust.k_f)
-    power = v.battery.idle_power + thrust * speed * v.thrust.torque_ratio / v.battery.efficiency
-    used = _charge(flight, plant, power)
+    speed, power = np.sqrt(thrust / 4.0 / v.thrust.k_f), _power(v, thrust)
+    used = _charge(flight, v, power)
     open_volts = float(np.polynomial.polynomial.polyval(used, v.battery.ocv))
     sagged = 0.5 * (open_volts + np.sqrt(max(open_volts**2 - 4.0 * v.battery.resistance * power, 0.0)))
     down = np.array([0.0, 0.0, -1.0])
@@ -258,11 +257,19 @@ def hover_state(flight: Recorded, plant: PlantParams, payload: int) -> States:
     return state
 
 
-def _charge(flight: Recorded, plant: PlantParams, power: float) -> float:
-    """Fraction of the charge used at the start, from the first voltage under load. Where none was logged: from the voltage in hover that
-    throttle was calibrated at, where the controller makes up for no other; else a fifth."""
-    cell, c = plant.vehicle.battery, plant.vehicle.controller
-    volts = c.calibration_voltage if flight.voltage is None and c.kind == "motor_mixing" else flight.voltage
+def _power(v: VehicleParams, thrust: float) -> float:
+    """Power drawn from the battery under a steady collective thrust [N]: [W]."""
+    speed = np.sqrt(thrust / 4.0 / v.thrust.k_f)
+    return float(v.battery.idle_power + thrust * speed * v.thrust.torque_ratio / v.battery.efficiency)
+
+
+def _charge(flight: Recorded, v: VehicleParams, power: float) -> float:
+    """Fraction of the charge used at the start, from the first voltage and the power [W] drawn then. Where none was logged: from that of
+    the hover in which throttle was calibrated, where the controller makes up for no other; else a fifth."""
+    cell, c = v.battery, v.controller
+    volts = flight.voltage
+    if volts is None and c.kind == "motor_mixing":
+        volts, power = c.calibration_voltage, _power(v, 4.0 * c.mix_thrust)
     if volts is None or cell.kind != "sag":
         return 0.2 if cell.kind == "sag" else 0.0
     grid = np.linspace(0.0, 1.0, 201)
