@@ -7,7 +7,6 @@ from visthrow.common.arguments import add_commands, run_command
 ACTIONS = {
     "train": ("where the wall time of a training goes: in an iteration, or to an error", "visthrow.evidence.bench.iteration"),
     "explain": ("seconds of a diagnosis and of its report, on logs of one's own", "visthrow.evidence.bench.explain"),
-    "fleet": ("a policy for many vehicles, thrown on them, and beside one trained for each", "visthrow.evidence.bench.fleet"),
     "records": ("print the recorded measurements as Markdown", "visthrow.evidence.bench.records"),
 }
 
@@ -18,8 +17,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "examples:\n"
         "  visthrow bench train state --device cuda       simulation, environment, inference and learning\n"
         "  visthrow bench train laptop --until 0.06 0.04  seconds of a whole training to these errors, over seeds\n"
-        "  visthrow bench explain flights/*.npz            seconds of a diagnosis and of its report\n"
-        "  visthrow bench fleet any --rivals 20           landing errors over a class of vehicles\n"
+        "  visthrow bench explain flights/*.npz           seconds of a diagnosis and of its report\n"
         "  visthrow bench records                         what was measured before, on which machine and commit\n"
     )
     add_commands(parser, ACTIONS, "bench")

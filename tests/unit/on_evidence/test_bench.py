@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from tests.bench import camera as bench_camera
-from tests.bench import commands, mpc, sim_gpu
+from tests.bench import commands, fleet, mpc, sim_gpu
 from tests.bench import mujoco_warp as bench_mujoco_warp
 from tests.bench import sim as sim_cpu
 from visthrow import cli, config
 from visthrow.cli import bench
 from visthrow.common.errors import StorageError, VisthrowError
-from visthrow.evidence.bench import fleet, records, time_to_error
+from visthrow.evidence.bench import records, time_to_error
 from visthrow.task import Experiment, plant_of
 
 
@@ -173,7 +173,7 @@ def test_mistakes_of_developers_are_told(of, words, message, capsys):
 
 @pytest.mark.parametrize("kind", sorted(bench.ACTIONS.keys() - {"records"}))
 def test_every_measurement_can_be_kept(kind):
-    needed = {"explain": ["flight.npz"], "fleet": ["any"]}
+    needed = {"explain": ["flight.npz"]}
     args = cli.build_parser().parse_args(["bench", kind, *needed.get(kind, [])])
     assert (args.json, args.record) == (None, None), "what the end of each one asks for"
 

@@ -1,10 +1,14 @@
-"""``visthrow bench fleet``: a policy for many vehicles, thrown on vehicles it never saw, and beside policies trained for each of some.
+"""A policy for many vehicles, thrown on vehicles it never saw, and beside policies trained for each of some.
 
 Errors are in units of the rope: metres at a rope of ``fleet.rope_length``, whatever a vehicle's own is.
+
+    python -m tests.bench.fleet any any_vision --device cuda
+    python -m tests.bench.fleet any --rivals 20 --minutes 10 --device cuda    # goes on where it stopped
 """
 
 import argparse
 import math
+import sys
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -13,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from tests.bench import start
 from visthrow.common.arguments import add_common, add_out
 from visthrow.common.storage import atomic_write
 from visthrow.common.workers import status
@@ -27,23 +32,6 @@ THROWS = 1200
 """Throws at each target on one vehicle."""
 QUANTILES = (0.0, 0.05, 0.25, 0.5, 0.75, 0.95, 1.0)
 """Of vehicles that are kept of a group of them."""
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the action."""
-    parser.add_argument("policies", metavar="POLICY", nargs="+", help="trained for a fleet: shipped names or files")
-    parser.add_argument("--vehicles", type=int, default=500, metavar="N", help="drawn, numbers 0 to N - 1 (default: 500)")
-    parser.add_argument("--throws", type=int, default=6, metavar="N", help="on each of them and target, one a rope's length (default: 6)")
-    parser.add_argument("--named", nargs="*", default=list(NAMED), metavar="NAME", help=f"of configs/vehicle (default: {' '.join(NAMED)})")
-    rivals = "train a policy for each of the first N as well, as configs/train/state_fast.toml does; those in the folder are kept"
-    parser.add_argument("--rivals", type=int, default=0, metavar="N", help=rivals)
-    parser.add_argument("--rival-iterations", type=int, metavar="N", help="of such a training (default: the configuration's)")
-    parser.add_argument("--named-rivals", action="store_true", help="train one for each named vehicle too")
-    parser.add_argument("--minutes", type=float, default=math.inf, metavar="T", help="begin no training that would end later")
-    parser.add_argument("--seed", type=int, default=0, help="of starts and noise (default: 0)")
-    add_out(parser, "out/fleet", "for tables and the rivals' policies")
-    parser.add_argument("--record", metavar="NAME", help="keep the result in the package's records under this name")
-    add_common(parser)
 
 
 @dataclass(frozen=True)
@@ -209,3 +197,25 @@ def _spread(label: str, policy: str, vehicles: Sequence[str], rows: Sequence[Row
     named = zip((*(f"{t:g}" for t in TARGETS), "all"), (*of, of.mean(0)))
     errors = {name: np.nanquantile(values, QUANTILES).round(4).tolist() for name, values in named}
     return {"vehicles": label, "policy": policy, "n": len(vehicles), "quantiles": QUANTILES, "error": errors}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command."""
+    parser = start.parser_of(__doc__)
+    parser.add_argument("policies", metavar="POLICY", nargs="+", help="trained for a fleet: shipped names or files")
+    parser.add_argument("--vehicles", type=int, default=500, metavar="N", help="drawn, numbers 0 to N - 1 (default: 500)")
+    parser.add_argument("--throws", type=int, default=6, metavar="N", help="on each of them and target, one a rope's length (default: 6)")
+    parser.add_argument("--named", nargs="*", default=list(NAMED), metavar="NAME", help=f"of configs/vehicle (default: {' '.join(NAMED)})")
+    rivals = "train a policy for each of the first N as well, as configs/train/state_fast.toml does; those in the folder are kept"
+    parser.add_argument("--rivals", type=int, default=0, metavar="N", help=rivals)
+    parser.add_argument("--rival-iterations", type=int, metavar="N", help="of such a training (default: the configuration's)")
+    parser.add_argument("--named-rivals", action="store_true", help="train one for each named vehicle too")
+    parser.add_argument("--minutes", type=float, default=math.inf, metavar="T", help="begin no training that would end later")
+    parser.add_argument("--seed", type=int, default=0, help="of starts and noise (default: 0)")
+    add_out(parser, "out/fleet", "for tables and the rivals' policies")
+    add_common(parser, json=False)
+    return start.main(parser, run, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
