@@ -1,4 +1,4 @@
-"""``visthrow hil check``: the poses that come and the autopilot, a hand-carry, the hover of a run, a camera's recording."""
+"""``visthrow hil check``: the poses that come and the autopilot, a hand-carry, the hover of a run."""
 
 import argparse
 import dataclasses
